@@ -1,0 +1,1 @@
+"""A MAVLink offboard controller: telemetry in, attitude and thrust setpoints out."""

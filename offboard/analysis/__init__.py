@@ -1,0 +1,1 @@
+"""After the flight: everything here reads logs and nothing here flies."""

@@ -1,0 +1,1 @@
+"""What to command: observer, swarm, objectives, controllers. Knows no MAVLink and no clock."""

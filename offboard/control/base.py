@@ -1,0 +1,97 @@
+"""The contract of every controller: a situation in, a decision out. Values only, all frozen."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.reference.base import Reference
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """One setpoint. `thrust_mps2` is the collective thrust per unit of mass (0 .. thrust_max);
+    `thrust_direction_ned` the commanded third body axis (unit, (0, 0, 1) when level);
+    `course_rad` the commanded heading of the nose.
+
+    Thrust is per unit of mass because only its ratio to the hover thrust crosses the wire, and
+    the mass of a real vehicle is not observable from telemetry.
+    """
+
+    thrust_mps2: float
+    thrust_direction_ned: tuple[float, float, float]
+    course_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class PredictedState:
+    """The observer's state at `time_s`, vehicle time, when a command sent now takes effect.
+
+    Shapes (3,), NED, SI. `thrust_direction_ned` is the third body axis b and
+    `thrust_direction_rate_ned_ps` its derivative; acceleration = g e3 - T b - c v + d with
+    `disturbance_ned_mps2` d and `thrust_mps2` T (after the thrust's lag).
+    """
+
+    time_s: float
+    position_ned_m: Array
+    velocity_ned_mps: Array
+    thrust_direction_ned: Array
+    thrust_direction_rate_ned_ps: Array
+    course_rad: float
+    course_rate_radps: float
+    thrust_mps2: float
+    disturbance_ned_mps2: Array
+    rates_frd_radps: Array
+
+
+@dataclass(frozen=True, slots=True)
+class Situation:
+    """All a controller may know. `time_s` is the vehicle time of the tick; the reference's time
+    axis is vehicle time too. `previous` is the command in force; `deadline_s` is the time budget
+    of this decision in seconds (None: unbounded, as in lockstep)."""
+
+    time_s: float
+    state: PredictedState
+    reference: Reference
+    previous: Command
+    deadline_s: float | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Certificate:
+    """How good a decision is, and what it cost to find.
+
+    `cost` is J of the chosen input, `optimal_cost` J of the exact minimiser in the same box
+    (daqp), `gap` their relative difference (J - J*) / max(|J*|, tiny), `spread` epsilon of
+    Eq. 29. NaN where a controller has no such figure.
+    """
+
+    cost: float = float("nan")
+    optimal_cost: float = float("nan")
+    gap: float = float("nan")
+    spread: float = float("nan")
+    iterations: int = 0
+    cut_short: bool = False
+    solve_time_s: float = float("nan")
+    at_bound: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Decision:
+    command: Command
+    certificate: Certificate = field(default_factory=Certificate)
+
+
+class Controller(Protocol):
+    """`decide` is called once per tick; `warm_up` calls every code path once before engaging."""
+
+    def decide(self, situation: Situation) -> Decision: ...
+
+    def reset(self) -> None:
+        """Forget everything of the previous flight, the random stream included."""
+        ...

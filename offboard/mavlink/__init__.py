@@ -1,0 +1,1 @@
+"""The MAVLink boundary, sans-I/O: bytes in, events out; values in, bytes out."""

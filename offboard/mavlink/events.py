@@ -1,0 +1,103 @@
+"""What the session tells the flight: one frozen value per thing that happened on the wire.
+
+NED, FRD, SI and vehicle time (`time_boot_ms` in seconds) everywhere; all fields are finite and in
+range, or the message was dropped and counted.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+Triple = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleFound:
+    """The first HEARTBEAT of an autopilot: from here on the session is pinned to it."""
+
+    system_id: int
+    component_id: int
+    autopilot: str  # a key of the dialect table: "px4", "ardupilot"
+
+
+@dataclass(frozen=True, slots=True)
+class Heartbeat:
+    mode: str  # the dialect's name of custom_mode: "OFFBOARD", "AUTO.LOITER", ...
+    armed: bool
+    system_status: int  # MAV_STATE: 3 standby, 4 active, 5 critical, 6 emergency
+
+
+@dataclass(frozen=True, slots=True)
+class LocalPosition:
+    """LOCAL_POSITION_NED."""
+
+    time_s: float
+    position_ned_m: Triple
+    velocity_ned_mps: Triple
+
+
+@dataclass(frozen=True, slots=True)
+class Attitude:
+    """ATTITUDE_QUATERNION."""
+
+    time_s: float
+    attitude: Quaternion
+    rates_frd_radps: Triple
+
+
+@dataclass(frozen=True, slots=True)
+class SystemHealth:
+    """SYS_STATUS: whether the vehicle's own pre-arm checks pass, and its battery."""
+
+    prearm_ok: bool
+    battery_voltage_v: float | None
+    battery_remaining: float | None  # 0 .. 1
+
+
+@dataclass(frozen=True, slots=True)
+class Landed:
+    """EXTENDED_SYS_STATE.landed_state: "unknown", "on_ground", "in_air", "takeoff", "landing"."""
+
+    state: str
+
+
+@dataclass(frozen=True, slots=True)
+class CommandAck:
+    """COMMAND_ACK addressed to us. `result` is the name without prefix: "ACCEPTED", "DENIED" ..."""
+
+    command: int
+    result: str
+
+
+@dataclass(frozen=True, slots=True)
+class StatusText:
+    severity: int  # MAV_SEVERITY, 0 emergency .. 7 debug
+    text: str  # chunks joined, trailing tab and NUL removed
+
+
+@dataclass(frozen=True, slots=True)
+class Parameter:
+    name: str
+    value: float
+
+
+@dataclass(frozen=True, slots=True)
+class Reset:
+    """The vehicle's time went backwards by more than reordering explains: it was rebooted."""
+
+    time_s: float
+
+
+Event = (
+    VehicleFound
+    | Heartbeat
+    | LocalPosition
+    | Attitude
+    | SystemHealth
+    | Landed
+    | CommandAck
+    | StatusText
+    | Parameter
+    | Reset
+)

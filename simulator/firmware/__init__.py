@@ -1,0 +1,1 @@
+"""Autopilot personalities: modes, numbers, texts and timeouts as data, one module each."""
