@@ -1,0 +1,140 @@
+"""Rotations between NED and the body (FRD): quaternions, Euler angles, the thrust direction.
+
+A quaternion is [w, x, y, z], Hamilton, unit, and turns FRD components into NED components (the
+convention of ATTITUDE_QUATERNION and SET_ATTITUDE_TARGET). Euler angles are Z-Y-X (yaw psi, pitch
+theta, roll phi), rad. The thrust direction b is the third body axis in NED, (0, 0, 1) when level.
+
+All functions broadcast over leading axes and are pure. Single rotations take a path over Python
+floats, because the control loop asks for them hundreds of times a second. Knows no vehicle.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any, overload
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Array = NDArray[np.float64]
+
+_TURN = 2.0 * math.pi
+
+
+@overload
+def wrap_pi(angle_rad: float) -> float: ...
+@overload
+def wrap_pi(angle_rad: Array) -> Array: ...
+def wrap_pi(angle_rad: float | Array) -> float | Array:
+    """Angle (...) rad -> the same angle in [-pi, pi]; exact for angles already inside."""
+    if isinstance(angle_rad, (float, int)):
+        return math.remainder(angle_rad, _TURN) if math.isfinite(angle_rad) else math.nan
+    angles: Array = np.asarray(angle_rad, dtype=np.float64)
+    return angles - _TURN * np.rint(angles / _TURN)
+
+
+def quaternion_from_euler(phi_rad: ArrayLike, theta_rad: ArrayLike, psi_rad: ArrayLike) -> Array:
+    """Roll, pitch, yaw, each (...) rad -> quaternion (..., 4)."""
+    sin_phi, cos_phi = _half_sine_cosine(phi_rad)
+    sin_theta, cos_theta = _half_sine_cosine(theta_rad)
+    sin_psi, cos_psi = _half_sine_cosine(psi_rad)
+    return _stack(
+        cos_phi * cos_theta * cos_psi + sin_phi * sin_theta * sin_psi,
+        sin_phi * cos_theta * cos_psi - cos_phi * sin_theta * sin_psi,
+        cos_phi * sin_theta * cos_psi + sin_phi * cos_theta * sin_psi,
+        cos_phi * cos_theta * sin_psi - sin_phi * sin_theta * cos_psi,
+    )
+
+
+def euler_from_quaternion(quaternion: ArrayLike) -> Array:
+    """Quaternion (..., 4) of any non-zero length -> [phi, theta, psi] (..., 3) rad.
+
+    theta in [-pi/2, pi/2], phi and psi in [-pi, pi]. Half sum and half difference of roll and yaw
+    are found apart, so that the angles still describe the rotation when theta is +-pi/2.
+    """
+    w, x, y, z = _components(quaternion)
+    half_sum = np.arctan2(x + z, w - y)
+    half_difference = np.arctan2(z - x, w + y)
+    theta = 2.0 * np.arctan2(np.hypot(z - x, w + y), np.hypot(x + z, w - y)) - 0.5 * math.pi
+    return _stack(wrap_pi(half_sum - half_difference), theta, wrap_pi(half_sum + half_difference))
+
+
+def course_from_quaternion(quaternion: ArrayLike) -> Any:
+    """Quaternion (..., 4) -> heading of the nose (...), Euler psi in [-pi, pi] rad, 0 = north."""
+    w, x, y, z = _components(quaternion)
+    return wrap_pi(np.arctan2(x + z, w - y) + np.arctan2(z - x, w + y))
+
+
+def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
+    """Unit quaternion (..., 4) -> rotation matrix (..., 3, 3), FRD -> NED; columns = body axes."""
+    w, x, y, z = _components(quaternion)
+    entries = _stack(
+        1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y),
+        2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x),
+        2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y),
+    )  # fmt: skip
+    return entries.reshape(*entries.shape[:-1], 3, 3)
+
+
+def quaternion_multiply(left: ArrayLike, right: ArrayLike) -> Array:
+    """Hamilton product (..., 4): the rotation `right` followed by `left`."""
+    lw, lx, ly, lz = _components(left)
+    rw, rx, ry, rz = _components(right)
+    return _stack(
+        lw * rw - lx * rx - ly * ry - lz * rz,
+        lw * rx + lx * rw + ly * rz - lz * ry,
+        lw * ry - lx * rz + ly * rw + lz * rx,
+        lw * rz + lx * ry - ly * rx + lz * rw,
+    )
+
+
+def quaternion_conjugate(quaternion: ArrayLike) -> Array:
+    """Conjugate (..., 4): the inverse rotation of a unit quaternion."""
+    w, x, y, z = _components(quaternion)
+    return _stack(w, -x, -y, -z)
+
+
+def thrust_direction_from_quaternion(quaternion: ArrayLike) -> Array:
+    """Unit quaternion (..., 4) -> third body axis b in NED (..., 3)."""
+    w, x, y, z = _components(quaternion)
+    return _stack(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y))
+
+
+def quaternion_from_thrust_direction(direction_ned: ArrayLike, course_rad: ArrayLike) -> Array:
+    """Third body axis b (..., 3) of any length and course psi (...) -> quaternion (..., 4).
+
+    The body y axis is normal to the plane of b and the course, hence Euler psi is the course
+    (also upside down). Safe where that is not defined: b along the course's own y axis rolls
+    +-pi/2, b zero or not finite is taken as level, a course not finite as north.
+    """
+    north, east, down = _components(direction_ned)
+    course: Any = np.where(np.isfinite(course_rad), course_rad, 0.0)[()]
+    usable = np.isfinite(north + east + down)
+    north, east = np.where(usable, north, 0.0)[()], np.where(usable, east, 0.0)[()]
+    level = ~usable | ((north == 0.0) & (east == 0.0) & (down == 0.0))
+    down = np.where(level, 1.0, down)[()]
+    ahead = north * np.cos(course) + east * np.sin(course)
+    right = east * np.cos(course) - north * np.sin(course)
+    upright = np.copysign(1.0, down)
+    phi = np.arctan2(-right, upright * np.hypot(ahead, down))
+    theta = np.arctan2(upright * ahead, upright * down)
+    return quaternion_from_euler(phi, theta, course)
+
+
+def _half_sine_cosine(angle_rad: Any) -> tuple[Any, Any]:
+    if isinstance(angle_rad, (float, int)):
+        return math.sin(0.5 * angle_rad), math.cos(0.5 * angle_rad)
+    half = 0.5 * np.asarray(angle_rad, dtype=np.float64)
+    return np.sin(half), np.cos(half)
+
+
+def _components(vectors: ArrayLike) -> Any:
+    """Last axis apart: Python floats for a single vector, views (...) for many."""
+    array = np.asarray(vectors, dtype=np.float64)
+    return array.tolist() if array.ndim == 1 else np.moveaxis(array, -1, 0)
+
+
+def _stack(*parts: Any) -> Array:
+    if all(isinstance(part, float) for part in parts):
+        return np.array(parts, dtype=np.float64)
+    return np.stack(np.broadcast_arrays(*parts), axis=-1)
