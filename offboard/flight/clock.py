@@ -1,0 +1,26 @@
+"""The only module that reads the clock. Everything else is handed the time as an argument."""
+
+from __future__ import annotations
+
+import time
+
+
+def monotonic_s() -> float:
+    """Seconds on a clock that never jumps; its zero is arbitrary."""
+    return time.monotonic()
+
+
+def unix_us() -> int:
+    """Microseconds since 1970-01-01 UTC, for log stamps only."""
+    return time.time_ns() // 1000
+
+
+def sleep_until(deadline_s: float) -> float:
+    """Sleep until the absolute `deadline_s` of `monotonic_s`; return the lateness in seconds.
+
+    Absolute deadlines do not drift: a loop that sleeps relative to itself loses 60-90 ms a minute.
+    """
+    remaining_s = deadline_s - time.monotonic()
+    if remaining_s > 0:
+        time.sleep(remaining_s)
+    return time.monotonic() - deadline_s
