@@ -1,0 +1,52 @@
+"""The flight directory and its .tlog: every frame that crossed the link, and our own records.
+
+A .tlog record is a big-endian uint64 of Unix microseconds, low two bits zero, then the frame
+unchanged. Each record is one unbuffered write, so a crash loses at most the last one.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from types import TracebackType
+
+_STAMP = struct.Struct(">Q")
+
+
+class LogError(Exception):
+    """The flight directory cannot be written: one sentence for the user."""
+
+
+class FlightLog:
+    """Writes DIR/flight.tlog. Never overwrites: a directory that holds a flight is refused."""
+
+    def __init__(self, directory: Path) -> None:
+        self.directory = directory
+        self.path = directory / "flight.tlog"
+
+    def __enter__(self) -> FlightLog:
+        try:
+            self.directory.mkdir(parents=True, exist_ok=True)
+            self._file = self.path.open("xb", buffering=0)
+        except FileExistsError:
+            raise LogError(
+                f"{self.path} already holds a flight; choose another directory with --out"
+            ) from None
+        except OSError as error:
+            raise LogError(
+                f"the flight cannot be recorded in {self.directory}: {error.strerror}; "
+                "choose a directory that can be written with --out"
+            ) from None
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._file.close()
+
+    def write(self, unix_us: int, frame: bytes) -> None:
+        """Append one frame with its time of crossing. A full disk raises OSError."""
+        self._file.write(_STAMP.pack(unix_us & ~3) + frame)

@@ -1,0 +1,57 @@
+"""One record per control tick: what the law saw, decided and cost, as floats for the log.
+
+The names below are the layout of DEBUG_FLOAT_ARRAY.data (name "pso", array_id 1) in the .tlog;
+score, report and replay read the log through the same table.
+"""
+
+from __future__ import annotations
+
+from dataclasses import astuple, dataclass, fields
+
+RECORD_NAME = "pso"
+RECORD_ID = 1
+
+
+@dataclass(frozen=True, slots=True)
+class TickRecord:
+    """All floats, SI, NED, vehicle time. NaN where a phase has no such figure."""
+
+    phase: float  # index of flight.phases.Phase
+    thrust_mps2: float
+    thrust_direction_north: float
+    thrust_direction_east: float
+    thrust_direction_down: float
+    course_rad: float
+    cost: float
+    optimal_cost: float
+    gap: float
+    spread: float
+    iterations: float
+    cut_short: float
+    at_bound: float
+    solve_time_s: float
+    lateness_s: float  # from the arrival of the telemetry that made the tick to the decision
+    missed_ticks: float  # ticks skipped since the previous record
+    predicted_north_m: float
+    predicted_east_m: float
+    predicted_down_m: float
+    predicted_velocity_north_mps: float
+    predicted_velocity_east_mps: float
+    predicted_velocity_down_mps: float
+    disturbance_north_mps2: float
+    disturbance_east_mps2: float
+    disturbance_down_mps2: float
+    hover_thrust: float
+    track_time_s: float  # time on the reference's own axis; NaN before it starts
+
+    def data(self) -> tuple[float, ...]:
+        """The values in the order of DEBUG_FLOAT_ARRAY.data."""
+        return astuple(self)
+
+    @classmethod
+    def from_data(cls, data: tuple[float, ...]) -> TickRecord:
+        """Read back a record; longer arrays (zero padding) are cut, shorter ones refused."""
+        names = fields(cls)
+        if len(data) < len(names):
+            raise ValueError(f"a tick record has {len(names)} floats, this one {len(data)}")
+        return cls(*data[: len(names)])

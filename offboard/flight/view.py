@@ -1,0 +1,87 @@
+"""What is known of the vehicle from its telemetry so far. Events in, facts out; no decisions."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass, field
+
+from offboard.mavlink.events import (
+    Attitude,
+    CommandAck,
+    Event,
+    Heartbeat,
+    Landed,
+    LocalPosition,
+    Parameter,
+    StatusText,
+    SystemHealth,
+    VehicleFound,
+)
+
+HEARD = 12  # texts and refusals kept for the sentence that explains a failure
+
+
+@dataclass(slots=True)
+class VehicleView:
+    """The newest of everything. `None` means never heard."""
+
+    found: VehicleFound | None = None
+    heartbeat: Heartbeat | None = None
+    health: SystemHealth | None = None
+    landed: str = "unknown"
+    position: LocalPosition | None = None
+    attitude: Attitude | None = None
+    parameters: dict[str, float] = field(default_factory=dict)
+    said: deque[str] = field(default_factory=lambda: deque(maxlen=HEARD))
+
+    @property
+    def time_s(self) -> float:
+        """Vehicle time of the newest telemetry; 0 before any."""
+        stamps = [event.time_s for event in (self.position, self.attitude) if event is not None]
+        return max(stamps, default=0.0)
+
+    @property
+    def armed(self) -> bool:
+        return self.heartbeat is not None and self.heartbeat.armed
+
+    @property
+    def mode(self) -> str:
+        return self.heartbeat.mode if self.heartbeat else "unknown"
+
+    @property
+    def has_state(self) -> bool:
+        return self.position is not None and self.attitude is not None
+
+    @property
+    def prearm_ok(self) -> bool:
+        """SYS_STATUS says that the vehicle's pre-arm checks pass."""
+        return self.health is not None and self.health.prearm_ok
+
+    def note(self, event: Event) -> None:
+        """Take one event in."""
+        match event:
+            case Heartbeat():
+                self.heartbeat = event
+            case LocalPosition():
+                self.position = event
+            case Attitude():
+                self.attitude = event
+            case SystemHealth():
+                self.health = event
+            case Landed(state):
+                self.landed = state
+            case VehicleFound():
+                self.found = event
+            case Parameter(name, value):
+                self.parameters[name] = value
+            case StatusText(severity, text) if severity <= 4:
+                self.said.append(text)
+            case CommandAck(command, result) if result not in ("ACCEPTED", "IN_PROGRESS"):
+                self.said.append(f"command {command} {result}")
+
+    def explanation(self) -> str:
+        """The vehicle's own last words, for the end of a sentence; empty if it said nothing."""
+        if not self.said:
+            return ""
+        recent = list(dict.fromkeys(self.said))[-3:]
+        return "; the vehicle said: " + " | ".join(recent)
