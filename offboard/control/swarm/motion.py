@@ -1,0 +1,116 @@
+"""How particles move and what they remember, compiled: the one copy of the law of motion.
+
+Structure of arrays: positions, velocities and personal bests have shape (n, particles), so that
+the innermost loop runs over particles and vectorises. Arrays are changed in place; nothing is
+allocated. Knows no objective.
+"""
+
+from __future__ import annotations
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+States = NDArray[np.uint64]
+
+_SHIFT_A = np.uint64(13)
+_SHIFT_B = np.uint64(7)
+_SHIFT_C = np.uint64(17)
+_HIGH = np.uint64(33)
+_LOW_31 = np.uint64(0x7FFFFFFF)
+_UNIT_31 = 2.0**-31  # one draw gives two uniform numbers of 31 bits in [0, 1)
+
+
+@numba.njit(cache=True)
+def scatter(  # type: ignore[no-untyped-def]
+    lanes, lower, upper, initial_velocity, positions, velocities
+) -> None:
+    """Uniform positions in the box and uniform velocities of either sign."""
+    for j in range(positions.shape[0]):
+        low = lower[j]
+        high = upper[j]
+        width = high - low
+        for i in range(positions.shape[1]):
+            x = lanes[i]
+            x ^= x << _SHIFT_A
+            x ^= x >> _SHIFT_B
+            x ^= x << _SHIFT_C
+            lanes[i] = x
+            r1 = np.int32(x >> _HIGH) * _UNIT_31
+            r2 = np.int32(x & _LOW_31) * _UNIT_31
+            positions[j, i] = min(max(low + r1 * width, low), high)
+            velocities[j, i] = initial_velocity * (2.0 * r2 - 1.0) * width
+
+
+@numba.njit(cache=True)
+def move(  # type: ignore[no-untyped-def]
+    lanes, lower, upper, inertia, personal, social, damping, positions, velocities, bests, leader
+) -> None:
+    """Eqs. 30 and 20 with a random number per dimension; Eq. 22 by clamping.
+
+    A clamped component loses its velocity: a particle that keeps it stays pressed on the wall.
+    """
+    for j in range(positions.shape[0]):
+        low = lower[j]
+        high = upper[j]
+        target = leader[j]
+        for i in range(positions.shape[1]):
+            x = lanes[i]
+            x ^= x << _SHIFT_A
+            x ^= x >> _SHIFT_B
+            x ^= x << _SHIFT_C
+            lanes[i] = x
+            r1 = np.int32(x >> _HIGH) * _UNIT_31
+            r2 = np.int32(x & _LOW_31) * _UNIT_31
+            here = positions[j, i]
+            velocity = damping * (
+                inertia * velocities[j, i]
+                + personal * r1 * (bests[j, i] - here)
+                + social * r2 * (target - here)
+            )  # Eq. 30
+            there = here + velocity  # Eq. 20
+            inside = low <= there <= high
+            velocities[j, i] = velocity if inside else 0.0
+            positions[j, i] = min(max(there, low), high)  # Eq. 22
+
+
+@numba.njit(cache=True)
+def remember(  # type: ignore[no-untyped-def]
+    costs, positions, bests, best_costs, leader, leader_cost
+):
+    """Update personal bests and the leader in place; (leader's cost, number of rejected costs).
+
+    Of equal costs the earlier one stands; a cost that is not finite never becomes a best.
+    """
+    dimensions, particles = positions.shape
+    rejected = 0
+    winner = -1
+    for i in range(particles):
+        cost = costs[i]
+        if not np.isfinite(cost):
+            rejected += 1
+        elif cost < best_costs[i]:
+            best_costs[i] = cost
+            for j in range(dimensions):
+                bests[j, i] = positions[j, i]
+            if cost < leader_cost:
+                leader_cost = cost
+                winner = i
+    if winner >= 0:
+        for j in range(dimensions):
+            leader[j] = positions[j, winner]
+    return leader_cost, rejected
+
+
+@numba.njit(cache=True)
+def spread_about(positions, leader):  # type: ignore[no-untyped-def]
+    """Mean distance of all particles from the leader, Eqs. 28-29."""
+    dimensions, particles = positions.shape
+    total = 0.0
+    for i in range(particles):
+        squared = 0.0
+        for j in range(dimensions):
+            squared += (leader[j] - positions[j, i]) ** 2
+        total += np.sqrt(squared)
+    return total / particles

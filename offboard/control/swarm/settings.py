@@ -1,0 +1,62 @@
+"""What a swarm is told and what it answers: values only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from offboard.model.vehicle import Parameters
+
+Array = NDArray[np.float64]
+
+
+class SwarmSettings(Parameters):
+    """The swarm of the paper's section 4.1 with the damping of Table 2.
+
+    `damping` is lambda of Eq. 30 (1 gives Eq. 19). `initial_velocity` bounds the first velocities,
+    as a fraction of the box's width. A swarm whose spread (Eq. 29) falls to `tolerance`, in the
+    unit of the inputs, stops early; at 0 it uses all its iterations.
+    """
+
+    particles: int = Field(default=40, ge=2, le=10_000)
+    iterations: int = Field(default=150, ge=1, le=100_000)
+    inertia: float = Field(default=0.9298, ge=0, le=2)
+    personal: float = Field(default=1.4986, ge=0, le=4)  # c1
+    social: float = Field(default=1.4986, ge=0, le=4)  # c2
+    damping: float = Field(default=0.65, gt=0, le=1)
+    initial_velocity: float = Field(default=0.1, ge=0, le=1)
+    tolerance: float = Field(default=0.0, ge=0)
+
+
+@dataclass(frozen=True, slots=True)
+class SwarmHistory:
+    """Every iteration of one search, for plots.
+
+    positions (iterations, particles, n); costs (iterations,) of the best so far; spreads
+    (iterations,), Eq. 29.
+    """
+
+    positions: Array
+    costs: Array
+    spreads: Array
+
+
+@dataclass(frozen=True, slots=True)
+class SwarmResult:
+    """The answer of one search.
+
+    `best` (n,) is always finite and inside the box; `cost` is inf if no particle ever had a
+    finite cost. `spread` is epsilon of Eq. 29 in the last iteration. `cut_short` says that the
+    caller's time ran out, `rejected` how many costs were not finite.
+    """
+
+    best: Array
+    cost: float
+    spread: float
+    iterations: int
+    cut_short: bool = False
+    rejected: int = 0
+    history: SwarmHistory | None = None
