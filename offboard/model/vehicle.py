@@ -64,8 +64,10 @@ class Vehicle(Parameters):
 
     @property
     def drag_per_mass_ps(self) -> float:
-        """Linear drag of the lateral axes per unit of mass, 1/s (`c` of acceleration = ... - c v)."""
-        return 0.5 * (self.drag_translation_npmps[0] + self.drag_translation_npmps[1]) / self.mass_kg
+        """Lateral linear drag per unit of mass, 1/s (`c` of acceleration = ... - c v)."""
+        return (
+            0.5 * (self.drag_translation_npmps[0] + self.drag_translation_npmps[1]) / self.mass_kg
+        )
 
     @property
     def thrust_max_mps2(self) -> float:
