@@ -52,7 +52,8 @@ class ExactMinimum:
         minimiser, _, status, _ = self._model.solve()
         if status < 1:
             return unsolved
-        return np.clip(minimiser, problem.lower, problem.upper)
+        inside: Array = np.clip(minimiser, problem.lower, problem.upper)
+        return inside
 
 
 def certify(
