@@ -1,0 +1,249 @@
+"""The nonlinear rigid body of Eqs. 1-8: forces and torques in, motion out. Compiled.
+
+One function, `body_accelerations`, holds the physics (Newton-Euler with linear drag); two charts
+around it hold only kinematics: the paper's 12 states (Eq. 5, Euler angles, body velocity) and 13
+states with a quaternion and NED velocity, without singularity. The length of the state tells
+which. The simulator, the swarm's roll-outs and the linearisation all run this code.
+
+`derivative` and `rk4_step` broadcast over leading axes. `derivative_into` and `rk4_into` are the
+same for one state, allocate nothing and can be called from other compiled code. All accept
+complex numbers, for differentiation by complex step. Inputs are total: hover is [m g, 0, 0, 0].
+
+Knows no rotors, ground, sensors or randomness.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from offboard.model.state import EULER, INPUT_SIZE, QUATERNION
+from offboard.model.vehicle import Vehicle
+
+Array = NDArray[np.float64]
+
+RK4_SCRATCH_ROWS = 3
+_STILL_AIR = np.zeros(3)
+
+
+def pack(vehicle: Vehicle) -> Array:
+    """Vehicle -> (12,) parameters of the compiled functions, SI:
+    [mass, gravity, I_x, I_y, I_z, arm, D_t (3), D_r (3)]."""
+    return np.array(
+        [
+            vehicle.mass_kg,
+            vehicle.gravity_mps2,
+            *vehicle.inertia_kgm2,
+            vehicle.arm_m,
+            *vehicle.drag_translation_npmps,
+            *vehicle.drag_rotation_nmpradps,
+        ]
+    )
+
+
+def hover_input(vehicle: Vehicle) -> Array:
+    """Inputs (4,) that hold the vehicle still (u* of Eq. 8); deviations are counted from here."""
+    return np.array([vehicle.mass_kg * vehicle.gravity_mps2, 0.0, 0.0, 0.0])
+
+
+def derivative(
+    state: ArrayLike, inputs: ArrayLike, parameters: Array, wind_ned_mps: ArrayLike = _STILL_AIR
+) -> Any:
+    """x' = f(x, u), Eq. 7: state (..., 12 or 13), inputs (..., 4), wind (..., 3) -> like state.
+
+    Leading axes broadcast against each other. Raises ValueError for other lengths.
+    """
+    states, flat_inputs, flat_wind, shape = _flatten(state, inputs, wind_ned_mps)
+    result = np.empty_like(states)
+    _derivative_each(states, flat_inputs, flat_wind, parameters, result)
+    return result.reshape(shape)
+
+
+def rk4_step(
+    state: ArrayLike,
+    inputs: ArrayLike,
+    parameters: Array,
+    step_s: float,
+    wind_ned_mps: ArrayLike = _STILL_AIR,
+) -> Any:
+    """State after `step_s` seconds of held inputs and wind, by one classical Runge-Kutta step.
+
+    Shapes as for `derivative`. The quaternion of a 13-state leaves with unit length.
+    """
+    states, flat_inputs, flat_wind, shape = _flatten(state, inputs, wind_ned_mps)
+    result = np.empty_like(states)
+    _rk4_each(states, flat_inputs, flat_wind, parameters, step_s, result)
+    return result.reshape(shape)
+
+
+@numba.njit(cache=True)
+def body_accelerations(air_velocity: Any, rates: Any, inputs: Any, parameters: Any) -> Any:
+    """Newton and Euler in body axes: the one place where forces and torques are.
+
+    `air_velocity` is the velocity relative to the air in body axes, (u, v, w); `rates` (p, q, r).
+    Returns six scalars: specific force (what an accelerometer feels, m/s^2) and angular
+    acceleration (rad/s^2). Lift acts along -z, drag D_t (Eq. 3) on the velocity relative to the
+    air, D_r (Eq. 4) on the rates.
+    """
+    u, v, w = air_velocity
+    p, q, r = rates
+    mass, arm = parameters[0], parameters[5]
+    inertia_x, inertia_y, inertia_z = parameters[2], parameters[3], parameters[4]
+    force_x = -parameters[6] * u
+    force_y = -parameters[7] * v
+    force_z = -parameters[8] * w - inputs[0]
+    torque_x = arm * inputs[1] - parameters[9] * p - (inertia_z - inertia_y) * q * r
+    torque_y = arm * inputs[2] - parameters[10] * q - (inertia_x - inertia_z) * r * p
+    torque_z = inputs[3] - parameters[11] * r - (inertia_y - inertia_x) * p * q
+    return (
+        force_x / mass,
+        force_y / mass,
+        force_z / mass,
+        torque_x / inertia_x,
+        torque_y / inertia_y,
+        torque_z / inertia_z,
+    )
+
+
+@numba.njit(cache=True)
+def _euler_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, out: Any) -> None:
+    p, q, r = state[3], state[4], state[5]
+    u, v, w = state[6], state[7], state[8]
+    sin_phi, cos_phi = np.sin(state[0]), np.cos(state[0])
+    sin_theta, cos_theta = np.sin(state[1]), np.cos(state[1])
+    sin_psi, cos_psi = np.sin(state[2]), np.cos(state[2])
+    # Body axes in NED, columns of the rotation FRD -> NED
+    xn, xe, xd = cos_theta * cos_psi, cos_theta * sin_psi, -sin_theta
+    yn = sin_phi * sin_theta * cos_psi - cos_phi * sin_psi
+    ye = sin_phi * sin_theta * sin_psi + cos_phi * cos_psi
+    yd = sin_phi * cos_theta
+    zn = cos_phi * sin_theta * cos_psi + sin_phi * sin_psi
+    ze = cos_phi * sin_theta * sin_psi - sin_phi * cos_psi
+    zd = cos_phi * cos_theta
+    air_u = u - (xn * wind_ned[0] + xe * wind_ned[1] + xd * wind_ned[2])
+    air_v = v - (yn * wind_ned[0] + ye * wind_ned[1] + yd * wind_ned[2])
+    air_w = w - (zn * wind_ned[0] + ze * wind_ned[1] + zd * wind_ned[2])
+    force_x, force_y, force_z, turn_x, turn_y, turn_z = body_accelerations(
+        (air_u, air_v, air_w), (p, q, r), inputs, parameters
+    )
+    gravity = parameters[1]
+    out[0] = p + (q * sin_phi + r * cos_phi) * sin_theta / cos_theta
+    out[1] = q * cos_phi - r * sin_phi
+    out[2] = (q * sin_phi + r * cos_phi) / cos_theta
+    out[3], out[4], out[5] = turn_x, turn_y, turn_z
+    out[6] = r * v - q * w + gravity * xd + force_x
+    out[7] = p * w - r * u + gravity * yd + force_y
+    out[8] = q * u - p * v + gravity * zd + force_z
+    out[9] = xn * u + yn * v + zn * w
+    out[10] = xe * u + ye * v + ze * w
+    out[11] = xd * u + yd * v + zd * w
+
+
+@numba.njit(cache=True)
+def _quaternion_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, out: Any) -> None:
+    qw, qx, qy, qz = state[0], state[1], state[2], state[3]
+    p, q, r = state[4], state[5], state[6]
+    # Body axes in NED, columns of the rotation FRD -> NED
+    xn, xe, xd = (
+        1.0 - 2.0 * (qy * qy + qz * qz),
+        2.0 * (qx * qy + qw * qz),
+        2.0 * (qx * qz - qw * qy),
+    )
+    yn, ye, yd = (
+        2.0 * (qx * qy - qw * qz),
+        1.0 - 2.0 * (qx * qx + qz * qz),
+        2.0 * (qy * qz + qw * qx),
+    )
+    zn, ze, zd = (
+        2.0 * (qx * qz + qw * qy),
+        2.0 * (qy * qz - qw * qx),
+        1.0 - 2.0 * (qx * qx + qy * qy),
+    )
+    north, east, down = state[7] - wind_ned[0], state[8] - wind_ned[1], state[9] - wind_ned[2]
+    air_u = xn * north + xe * east + xd * down
+    air_v = yn * north + ye * east + yd * down
+    air_w = zn * north + ze * east + zd * down
+    force_x, force_y, force_z, turn_x, turn_y, turn_z = body_accelerations(
+        (air_u, air_v, air_w), (p, q, r), inputs, parameters
+    )
+    out[0] = -0.5 * (qx * p + qy * q + qz * r)
+    out[1] = 0.5 * (qw * p + qy * r - qz * q)
+    out[2] = 0.5 * (qw * q + qz * p - qx * r)
+    out[3] = 0.5 * (qw * r + qx * q - qy * p)
+    out[4], out[5], out[6] = turn_x, turn_y, turn_z
+    out[7] = xn * force_x + yn * force_y + zn * force_z
+    out[8] = xe * force_x + ye * force_y + ze * force_z
+    out[9] = xd * force_x + yd * force_y + zd * force_z + parameters[1]
+    out[10], out[11], out[12] = state[7], state[8], state[9]
+
+
+@numba.njit(cache=True)
+def derivative_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, out: Any) -> None:
+    """One state (12,) or (13,), inputs (4,), wind (3,) m/s, `pack`ed parameters -> `out`."""
+    if state.shape[0] == 12:
+        _euler_into(state, inputs, wind_ned, parameters, out)
+    else:
+        _quaternion_into(state, inputs, wind_ned, parameters, out)
+
+
+@numba.njit(cache=True)
+def rk4_into(
+    state: Any, inputs: Any, wind_ned: Any, parameters: Any, step_s: float, scratch: Any, out: Any
+) -> None:
+    """One RK4 step of one state into `out`, which may be `state`. `scratch` is (3, state size)."""
+    slope, total, probe = scratch[0], scratch[1], scratch[2]
+    derivative_into(state, inputs, wind_ned, parameters, total)
+    for stage in range(1, 4):
+        reach = step_s if stage == 3 else 0.5 * step_s
+        previous = total if stage == 1 else slope
+        for i in range(state.shape[0]):
+            probe[i] = state[i] + reach * previous[i]
+        derivative_into(probe, inputs, wind_ned, parameters, slope)
+        weight = 1.0 if stage == 3 else 2.0
+        for i in range(state.shape[0]):
+            total[i] += weight * slope[i]
+    for i in range(state.shape[0]):
+        out[i] = state[i] + step_s / 6.0 * total[i]
+    if state.shape[0] == 13:
+        length = np.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2] + out[3] * out[3])
+        for i in range(4):
+            out[i] /= length
+
+
+@numba.njit(cache=True)
+def _derivative_each(states: Any, inputs: Any, wind: Any, parameters: Any, out: Any) -> None:
+    for i in range(states.shape[0]):
+        derivative_into(states[i], inputs[i], wind[i], parameters, out[i])
+
+
+@numba.njit(cache=True)
+def _rk4_each(
+    states: Any, inputs: Any, wind: Any, parameters: Any, step_s: float, out: Any
+) -> None:
+    scratch = np.empty((RK4_SCRATCH_ROWS, states.shape[1]), states.dtype)
+    for i in range(states.shape[0]):
+        rk4_into(states[i], inputs[i], wind[i], parameters, step_s, scratch, out[i])
+
+
+def _flatten(
+    state: ArrayLike, inputs: ArrayLike, wind: ArrayLike
+) -> tuple[Any, Any, Any, tuple[int, ...]]:
+    """Contiguous (N, 12 or 13), (N, 4), (N, 3) of one dtype, and the shape of the result."""
+    arrays = [np.asarray(part) for part in (state, inputs, wind)]
+    sizes = tuple(part.shape[-1] if part.ndim else 0 for part in arrays)
+    if sizes[0] not in (EULER.size, QUATERNION.size) or sizes[1:] != (INPUT_SIZE, 3):
+        raise ValueError(
+            f"state, inputs and wind must end in 12 or 13, 4 and 3 elements, not {sizes}"
+        )
+    dtype = np.result_type(np.float64, *arrays)
+    lead = np.broadcast_shapes(*(part.shape[:-1] for part in arrays))
+    flat = []
+    for part, size in zip(arrays, sizes, strict=True):
+        # Always a fresh writable array: views would have the loops compiled once more per kind
+        rows = np.empty((*lead, size), dtype)
+        rows[...] = part
+        flat.append(rows.reshape(-1, size))
+    return flat[0], flat[1], flat[2], (*lead, sizes[0])
