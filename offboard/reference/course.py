@@ -1,0 +1,165 @@
+"""Where the nose points along a path: fixed, given by a table, or along the horizontal velocity.
+
+A course is a function of the path's time s like the path itself. Velocity by s has the direction
+of velocity by t, so that starting from rest on a moving path needs no special case; only where
+the path itself stands still (`HOLD_SPEED_MPS`) has the direction to be made up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Protocol
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BPoly, PPoly
+
+from offboard.reference.path import Path, Polynomial
+
+Array = NDArray[np.float64]
+
+HOLD_SPEED_MPS = 0.1
+_STEP_S = 0.02
+_NODES_MAX = 200_000
+
+
+class Course(Protocol):
+    def jet(self, path_time_s: Array, path_jet: Array) -> Array:
+        """Course (unwrapped), its first and second derivative by s, shape (3, N), rad and s.
+
+        path_time_s (N,); path_jet (5, N, 3) is the path at the same times."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Fixed:
+    """The same course everywhere."""
+
+    course_rad: float
+
+    def jet(self, path_time_s: Array, path_jet: Array) -> Array:
+        result = np.zeros((3, path_time_s.size))
+        result[0] = self.course_rad
+        return result
+
+
+@dataclass(frozen=True, slots=True)
+class Tabulated:
+    """A course of its own, a polynomial of one column in radians (a column of a table)."""
+
+    polynomial: Polynomial
+
+    def jet(self, path_time_s: Array, path_jet: Array) -> Array:
+        return np.ascontiguousarray(self.polynomial.jet(path_time_s)[:3, :, 0])
+
+
+@dataclass(frozen=True, slots=True)
+class AlongVelocity:
+    """The direction of the horizontal velocity, unwrapped from the start of the path.
+
+    nodes_rad (K,): the unwrapped course every `step_s` from s = 0, to find the turn a direction
+    belongs to. slow_s (M, 2): intervals in which the horizontal speed falls below
+    `HOLD_SPEED_MPS` and a quintic, slow_coefficients (M, 6) in powers of s - slow_s[:, 0],
+    replaces the direction: it meets course, rate and acceleration at both ends of the interval,
+    turns the short way, and comes to rest where the path begins or ends.
+    """
+
+    step_s: float
+    nodes_rad: Array
+    slow_s: Array
+    slow_coefficients: Array
+
+    def jet(self, path_time_s: Array, path_jet: Array) -> Array:
+        return along(
+            path_time_s, path_jet, self.step_s, self.nodes_rad, self.slow_s, self.slow_coefficients
+        )
+
+
+def along_velocity(path: Path, length_s: float, standstill_rad: float = 0.0) -> Course:
+    """The course along the horizontal velocity of a path, for s in [0, length_s].
+
+    A path that never moves horizontally has the fixed course `standstill_rad`.
+    """
+    count = int(np.clip(np.ceil(length_s / _STEP_S), 50, _NODES_MAX)) + 1
+    nodes_s = np.linspace(0.0, length_s, count)
+    path_jet = path.jet(nodes_s)
+    fast = np.hypot(path_jet[1, :, 0], path_jet[1, :, 1]) >= HOLD_SPEED_MPS
+    if not fast.any():
+        return Fixed(standstill_rad)
+    direction = direction_jet(path_jet)
+    held = direction[0].copy()
+    # a slow node takes the course of the nearest fast one, which also unwraps across it
+    fast_index = np.flatnonzero(fast)
+    nearest = fast_index[
+        np.clip(np.searchsorted(fast_index, np.arange(count)), 0, fast_index.size - 1)
+    ]
+    direction[0] = np.unwrap(held[nearest])
+    slow_s, coefficients = _bridges(nodes_s, direction, fast)
+    return AlongVelocity(float(nodes_s[1]), direction[0], slow_s, coefficients)
+
+
+def _bridges(nodes_s: Array, direction: Array, fast: NDArray[np.bool_]) -> tuple[Array, Array]:
+    """Intervals (M, 2) and quintics (M, 6) over the runs of slow nodes; direction (3, K)."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[True], fast, [True]]).astype(np.int8)))
+    last = fast.size - 1
+    intervals: list[tuple[float, float]] = []
+    coefficients: list[Array] = []
+    for first_slow, first_fast in zip(edges[::2], edges[1::2], strict=True):
+        left, right = max(first_slow - 1, 0), min(first_fast, last)
+        start = direction[:, left] if fast[left] else np.array([direction[0, right], 0.0, 0.0])
+        end = direction[:, right] if fast[right] else np.array([direction[0, left], 0.0, 0.0])
+        interval = (float(nodes_s[left]), float(nodes_s[right]))
+        quintic = PPoly.from_bernstein_basis(BPoly.from_derivatives(interval, [start, end]))
+        intervals.append(interval)
+        coefficients.append(quintic.c[::-1, 0])
+    return np.reshape(intervals, (-1, 2)).astype(np.float64), np.reshape(coefficients, (-1, 6))
+
+
+@numba.njit(cache=True)
+def direction_jet(path_jet: Array) -> Array:
+    """Direction of the horizontal velocity in (-pi, pi], its rate and acceleration: (3, N).
+
+    path_jet (5, N, 3). Finite at any speed: the squared speed is floored at 1e-6 m^2/s^2.
+    """
+    out = np.empty((3, path_jet.shape[1]))
+    for i in range(path_jet.shape[1]):
+        vn, ve = path_jet[1, i, 0], path_jet[1, i, 1]
+        an, ae = path_jet[2, i, 0], path_jet[2, i, 1]
+        jn, je = path_jet[3, i, 0], path_jet[3, i, 1]
+        square = max(vn * vn + ve * ve, 1e-6)
+        rate = (vn * ae - ve * an) / square
+        out[0, i] = np.arctan2(ve, vn)
+        out[1, i] = rate
+        out[2, i] = (vn * je - ve * jn - 2.0 * rate * (vn * an + ve * ae)) / square
+    return out
+
+
+@numba.njit(cache=True)
+def along(
+    path_time_s: Array,
+    path_jet: Array,
+    step_s: float,
+    nodes_rad: Array,
+    slow_s: Array,
+    slow_coefficients: Array,
+) -> Array:
+    """`AlongVelocity.jet`, compiled."""
+    out = direction_jet(path_jet)
+    for i in range(path_time_s.size):
+        s = path_time_s[i]
+        node = min(max(int(np.rint(s / step_s)), 0), nodes_rad.size - 1)
+        out[0, i] += 2.0 * np.pi * np.rint((nodes_rad[node] - out[0, i]) / (2.0 * np.pi))
+        for k in range(slow_s.shape[0]):
+            if slow_s[k, 0] <= s <= slow_s[k, 1]:
+                quintic(s - slow_s[k, 0], slow_coefficients[k], out[:, i])
+                break
+    return out
+
+
+@numba.njit(cache=True)
+def quintic(x: float, c: Array, out: Array) -> None:
+    """Value, first and second derivative at x of the polynomial with coefficients (6,)."""
+    out[0] = c[0] + x * (c[1] + x * (c[2] + x * (c[3] + x * (c[4] + x * c[5]))))
+    out[1] = c[1] + x * (2.0 * c[2] + x * (3.0 * c[3] + x * (4.0 * c[4] + x * 5.0 * c[5])))
+    out[2] = 2.0 * c[2] + x * (6.0 * c[3] + x * (12.0 * c[4] + x * 20.0 * c[5]))

@@ -1,0 +1,133 @@
+"""Can this vehicle fly that reference? Asked before anything is sent."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.model.vehicle import Vehicle
+from offboard.reference.base import Reference
+from offboard.reference.flatness import flat_state
+
+Array = NDArray[np.float64]
+
+_STEP_S = 0.01
+_CHUNK = 20_000
+
+
+class InfeasibleReference(ValueError):
+    """The reference asks for more than the vehicle has; one sentence with time, value, limit."""
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """What is demanded beyond the vehicle's own thrust and tilt limits.
+
+    Thrust must stay within fractions of the full thrust: the rest is for the feedback. Rates as
+    PX4's defaults MC_ROLLRATE_MAX, MC_PITCHRATE_MAX (220 deg/s) and MC_YAWRATE_MAX (200 deg/s).
+    """
+
+    height_min_m: float = 0.3
+    speed_max_mps: float = 12.0
+    thrust_fraction_min: float = 0.05
+    thrust_fraction_max: float = 0.95
+    rates_max_frd_radps: tuple[float, float, float] = (3.84, 3.84, 3.49)
+
+
+@dataclass(frozen=True, slots=True)
+class Envelope:
+    """The extremes that a reference asks for. SI; rates are magnitudes per body axis."""
+
+    thrust_min_mps2: float
+    thrust_max_mps2: float
+    tilt_max_rad: float
+    rates_max_frd_radps: tuple[float, float, float]
+    speed_max_mps: float
+    height_min_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Demand:
+    """One quantity over time and what it may be; `sign` -1 marks a lower limit."""
+
+    what: str
+    unit: str
+    values: Array
+    limit: float
+    sign: float = 1.0
+
+    @property
+    def extreme(self) -> float:
+        return self.sign * float((self.sign * self.values).max())
+
+
+def check(
+    reference: Reference, vehicle: Vehicle, ground_down_m: float = 0.0, bounds: Bounds = Bounds()
+) -> Envelope:
+    """The extremes of a reference, sampled every 10 ms from 0 to its end, without wind.
+
+    `ground_down_m` is the ground in the reference's own frame (NED, positive down): 0 when
+    positions are relative to the take-off point. Raises InfeasibleReference at the earliest time
+    at which something is beyond its limit.
+    """
+    count = int(np.ceil(reference.duration_s / _STEP_S)) + 1
+    times = np.linspace(0.0, reference.duration_s, count)
+    parts = [
+        _envelope(reference, vehicle, times[first : first + _CHUNK], ground_down_m, bounds)
+        for first in range(0, count, _CHUNK)
+    ]
+    lowest, highest = np.min(parts, axis=0), np.max(parts, axis=0)
+    return Envelope(
+        thrust_min_mps2=float(lowest[0]),
+        thrust_max_mps2=float(highest[1]),
+        tilt_max_rad=float(highest[2]),
+        rates_max_frd_radps=(float(highest[3]), float(highest[4]), float(highest[5])),
+        speed_max_mps=float(highest[6]),
+        height_min_m=float(lowest[7]),
+    )
+
+
+def _envelope(
+    reference: Reference, vehicle: Vehicle, times: Array, ground_down_m: float, bounds: Bounds
+) -> list[float]:
+    demands = _demands(reference, vehicle, times, ground_down_m, bounds)
+    broken: list[tuple[int, _Demand]] = []
+    for demand in demands:
+        # written so that a value that is not a number counts as broken
+        within = demand.sign * demand.values <= demand.sign * demand.limit
+        if not within.all():
+            broken.append((int(np.argmin(within)), demand))
+    if broken:
+        index, demand = min(broken, key=lambda item: item[0])
+        raise InfeasibleReference(
+            f"at {times[index]:.2f} s the reference asks for {demand.what} "
+            f"{demand.values[index]:.3g} {demand.unit}, beyond the limit of "
+            f"{demand.limit:.3g} {demand.unit} (worst: {demand.extreme:.3g} {demand.unit})"
+        )
+    return [demand.extreme for demand in demands]
+
+
+def _demands(
+    reference: Reference, vehicle: Vehicle, times: Array, ground_down_m: float, bounds: Bounds
+) -> tuple[_Demand, ...]:
+    sample = reference.sample(times)
+    state = flat_state(sample, vehicle.gravity_mps2, vehicle.drag_per_mass_ps)
+    thrust_max = vehicle.thrust_max_mps2
+    tilt = np.arccos(np.clip(state.thrust_direction_ned[:, 2], -1.0, 1.0))
+    rates = np.abs(state.rates_frd_radps)
+    rates_max = bounds.rates_max_frd_radps
+    speed = np.linalg.norm(sample.velocity_ned_mps, axis=-1)
+    height = ground_down_m - sample.position_ned_m[:, 2]
+    thrust = state.thrust_mps2
+    return (
+        _Demand("a thrust of", "m/s^2", thrust, bounds.thrust_fraction_min * thrust_max, -1.0),
+        _Demand("a thrust of", "m/s^2", thrust, bounds.thrust_fraction_max * thrust_max),
+        _Demand("a tilt of", "rad", tilt, vehicle.tilt_max_rad),
+        _Demand("a roll rate of", "rad/s", rates[:, 0], rates_max[0]),
+        _Demand("a pitch rate of", "rad/s", rates[:, 1], rates_max[1]),
+        _Demand("a yaw rate of", "rad/s", rates[:, 2], rates_max[2]),
+        _Demand("a speed of", "m/s", speed, bounds.speed_max_mps),
+        _Demand("a height of", "m", height, bounds.height_min_m, -1.0),
+    )

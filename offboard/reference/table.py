@@ -1,0 +1,154 @@
+"""A path given as a table: CSV text in, a smooth path (and course) out. Reads no file.
+
+Columns, named in the first row and in any order: `time_s`; `north_m` or `x`, `x_m`; `east_m` or
+`y`, `y_m`; `down_m` or `z`, `z_m` (positive down), or `altitude_m` (positive up); optionally
+`course_deg` (heading of the nose, clockwise from north). Other columns are refused.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline, make_lsq_spline
+
+from offboard.reference.path import Polynomial
+
+Array = NDArray[np.float64]
+
+ROWS_MIN = 4
+_NAMES = {
+    "time_s": "time_s",
+    "north_m": "north_m", "x": "north_m", "x_m": "north_m",
+    "east_m": "east_m", "y": "east_m", "y_m": "east_m",
+    "down_m": "down_m", "z": "down_m", "z_m": "down_m",
+    "altitude_m": "altitude_m",
+    "course_deg": "course_deg",
+}  # fmt: skip
+_DEGREE = 5
+_NATURAL_END = [(3, 0.0), (4, 0.0)]
+
+
+class TableError(ValueError):
+    """The table cannot be flown; the sentence names the file, the row and the column."""
+
+
+@dataclass(frozen=True, slots=True)
+class Table:
+    """Rows: times_s (N,) from 0, points_ned_m (N, 3), course_rad (N,) unwrapped or None."""
+
+    times_s: Array
+    points_ned_m: Array
+    course_rad: Array | None
+
+
+def parse(text: str, name: str) -> Table:
+    """Parse CSV text; `name` stands for the file in errors. Rows count from 1, the header's.
+
+    Times are shifted to begin at 0. Raises TableError."""
+    rows = [
+        (number, row)
+        for number, row in enumerate(_rows(text, name), start=1)
+        if any(cell.strip() for cell in row)
+    ]
+    if not rows:
+        raise TableError(f"{name} is empty: it needs a header and at least {ROWS_MIN} rows")
+    columns = _header(rows[0][1], name, rows[0][0])
+    body = rows[1:]
+    if len(body) < ROWS_MIN:
+        raise TableError(f"{name} has {len(body)} rows of data: at least {ROWS_MIN} are needed")
+    values = np.array([_numbers(row, columns, name, number) for number, row in body])
+    by_name = dict(zip(columns, values.T, strict=True))
+    times = by_name["time_s"]
+    for index in range(1, len(body)):
+        if times[index] <= times[index - 1]:
+            raise TableError(
+                f"{name}, row {body[index][0]}, column time_s: {times[index]:g} does not come "
+                f"after {times[index - 1]:g}; times must increase"
+            )
+    down = by_name["down_m"] if "down_m" in by_name else -by_name["altitude_m"]
+    course = np.unwrap(np.radians(by_name["course_deg"])) if "course_deg" in by_name else None
+    points = np.stack([by_name["north_m"], by_name["east_m"], down], axis=1)
+    return Table(times - times[0], points, course)
+
+
+def interpolate(times_s: Array, values: Array, knot_spacing_s: float = 0.0) -> Polynomial:
+    """A quintic spline, continuous to its 4th derivative, for values (N, C) at times (N,).
+
+    It passes through every row, which is the smoothest (least jerk) way to do so; third and
+    fourth derivative vanish at the ends. With a positive `knot_spacing_s` it is a least-squares
+    fit with knots no closer than that, which forgives rounded or noisy rows.
+    """
+    knots = _knots(times_s, knot_spacing_s)
+    if knots is None:
+        spline = make_interp_spline(
+            times_s, values, k=_DEGREE, bc_type=(_ends(values), _ends(values))
+        )
+    else:
+        spline = make_lsq_spline(times_s, values, knots, k=_DEGREE)
+    return Polynomial.from_spline(spline)
+
+
+def _rows(text: str, name: str) -> list[list[str]]:
+    try:
+        return list(csv.reader(io.StringIO(text.removeprefix("\ufeff"))))
+    except csv.Error as error:
+        raise TableError(f"{name} is not a CSV table: {error}") from None
+
+
+def _header(cells: list[str], name: str, number: int) -> list[str]:
+    columns = []
+    for cell in cells:
+        column = _NAMES.get(cell.strip().lower())
+        if column is None:
+            raise TableError(
+                f"{name}, row {number}: unknown column {cell.strip()!r}; known are "
+                "time_s, north_m, east_m, down_m (or altitude_m), course_deg"
+            )
+        if column in columns:
+            raise TableError(f"{name}, row {number}: column {column} is there twice")
+        columns.append(column)
+    for column in ("time_s", "north_m", "east_m"):
+        if column not in columns:
+            raise TableError(f"{name}, row {number}: column {column} is missing")
+    if ("down_m" in columns) == ("altitude_m" in columns):
+        raise TableError(f"{name}, row {number}: one of down_m and altitude_m is needed, not both")
+    return columns
+
+
+def _numbers(row: list[str], columns: list[str], name: str, number: int) -> list[float]:
+    if len(row) != len(columns):
+        raise TableError(f"{name}, row {number}: {len(row)} cells for {len(columns)} columns")
+    values = []
+    for cell, column in zip(row, columns, strict=True):
+        try:
+            value = float(cell)
+        except ValueError:
+            value = math.nan
+        if not math.isfinite(value):
+            raise TableError(
+                f"{name}, row {number}, column {column}: {cell.strip()!r} is not a finite number"
+            )
+        values.append(value)
+    return values
+
+
+def _ends(values: Array) -> list[tuple[int, Array]]:
+    return [(order, np.full(values.shape[1:], value)) for order, value in _NATURAL_END]
+
+
+def _knots(times_s: Array, spacing_s: float) -> Array | None:
+    """Knots of a least-squares fit, or None where interpolation is as coarse already."""
+    intervals = int(times_s[-1] / spacing_s) if spacing_s > 0.0 else times_s.size
+    if intervals + _DEGREE >= times_s.size:
+        return None
+    # knots on rows, evenly many rows apart: every span holds data (Schoenberg-Whitney)
+    on_rows = np.rint(np.linspace(0, times_s.size - 1, intervals + 1)).astype(np.int64)
+    inner = times_s[on_rows[1:-1]]
+    return np.concatenate(
+        [np.full(_DEGREE + 1, times_s[0]), inner, np.full(_DEGREE + 1, times_s[-1])]
+    )
