@@ -117,7 +117,8 @@ def _value(node: yaml.Node, seen: set[int]) -> Any:
         return mapping
     if isinstance(node, yaml.SequenceNode):
         return [_value(item, seen) for item in node.value]
-    return _scalar(node.value) if node.style is None else node.value
+    plain = getattr(node, "style", None) is None
+    return _scalar(node.value) if plain else node.value
 
 
 _PLAIN_TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("str", "seq", "map")}
