@@ -1,0 +1,174 @@
+"""The autopilot's attitude loop: demands, their delays, and the angular acceleration they produce.
+
+A cascade as PX4 flies it: the attitude error, thrust axis first, gives a rate, the rate error an
+angular acceleration, which is limited per axis. Linearised it is the identified response
+s'' = wn^2 (s_c(t - D) - s) - 2 z wn s' of each axis. It knows the estimated attitude only, never
+the true one, and neither modes nor MAVLink.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.model.vehicle import Vehicle
+
+Array = NDArray[np.float64]
+Integers = NDArray[np.int64]
+Triple = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+# PX4's defaults of MC_ROLLRATE_MAX, MC_PITCHRATE_MAX (220 deg/s) and MC_YAWRATE_MAX (200 deg/s)
+RATE_LIMIT_RADPS: Triple = (3.84, 3.84, 3.49)
+
+# A rate demand skips the attitude half of the cascade: with half the identified delay PX4's
+# measured rate steps come out (roll t63 .10-.11 s, yaw .45 s).
+_RATE_DELAY_SHARE = 0.5
+
+# One row per step of the demand history.
+_IS_ATTITUDE, _QUATERNION, _RATES, _THRUST, ROW_WIDTH = 0, 1, 5, 8, 9
+
+
+@dataclass(frozen=True, slots=True)
+class Demand:
+    """What the flight stack asks of the attitude loop; attitude wins if both are given.
+
+    attitude: quaternion wxyz FRD -> NED, any length; rates_frd_radps: body rates; thrust:
+    normalised collective 0..1. Without attitude and rates: zero rates. Values that are not finite
+    are taken as PX4 does: thrust as 0, the attitude as undefined (here: zero rates).
+    """
+
+    motors_on: bool = False
+    thrust: float = 0.0
+    attitude: Quaternion | None = None
+    rates_frd_radps: Triple | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Loop:
+    """Constants of the compiled loop: gains (3,), limits (3,), delays in steps."""
+
+    gains: Array  # (3, 3): rows attitude gain 1/s, rate gain 1/s, acceleration limit rad/s^2
+    delays: Integers  # tilt, yaw, thrust, tilt rate, yaw rate
+
+    @property
+    def history(self) -> Array:
+        """An empty demand history (rows, ROW_WIDTH) long enough for the longest delay."""
+        return np.zeros((int(self.delays.max()) + 1, ROW_WIDTH))
+
+
+def build_loop(vehicle: Vehicle, step_s: float) -> Loop:
+    """Gains K = 2 z wn and wn / 2z per axis, and the delays, half a step less for the hold."""
+    axes = (vehicle.tilt, vehicle.tilt, vehicle.yaw)
+    gains = np.array(
+        [
+            [axis.natural_frequency_radps / (2.0 * axis.damping) for axis in axes],
+            [2.0 * axis.damping * axis.natural_frequency_radps for axis in axes],
+            vehicle.angular_acceleration_limit_radps2,
+        ]
+    )
+    delays_s = np.array(
+        [
+            vehicle.tilt.delay_s,
+            vehicle.yaw.delay_s,
+            vehicle.thrust_delay_s,
+            _RATE_DELAY_SHARE * vehicle.tilt.delay_s,
+            _RATE_DELAY_SHARE * vehicle.yaw.delay_s,
+        ]
+    )
+    steps = np.maximum(np.rint(delays_s / step_s - 0.5), 0.0).astype(np.int64)
+    return Loop(gains, steps)
+
+
+def encode(demand: Demand, row: Array) -> None:
+    """Write the sanitised demand into a history row (ROW_WIDTH,); every number finite."""
+    row[:] = 0.0
+    thrust = demand.thrust if demand.motors_on and not math.isnan(demand.thrust) else 0.0
+    row[_THRUST] = min(max(thrust, 0.0), 1.0)
+    if demand.attitude is not None:
+        largest = max(map(abs, demand.attitude))
+        if math.isfinite(sum(demand.attitude)) and largest > 0.0:
+            scaled = [component / largest for component in demand.attitude]
+            norm = math.hypot(*scaled)
+            row[_IS_ATTITUDE] = 1.0
+            row[_QUATERNION:_RATES] = [component / norm for component in scaled]
+    elif demand.rates_frd_radps is not None:
+        for i, rate in enumerate(demand.rates_frd_radps):
+            limit = RATE_LIMIT_RADPS[i]
+            row[_RATES + i] = 0.0 if math.isnan(rate) else min(max(rate, -limit), limit)
+
+
+@numba.njit(cache=True)
+def delayed_row(history: Array, step: int, delay: int) -> Array:
+    """The demand of `delay` steps ago."""
+    row: Array = history[(step - delay) % history.shape[0]]
+    return row
+
+
+@numba.njit(cache=True)
+def delayed_thrust(history: Array, step: int, delays: Integers) -> float:
+    """Normalised collective thrust demanded the thrust delay ago."""
+    thrust: float = delayed_row(history, step, delays[2])[_THRUST]
+    return thrust
+
+
+@numba.njit(cache=True)
+def _attitude_error(quaternion: Array, row: Array, error: Array) -> None:
+    """Body-frame error (3,) rad of the demanded attitude: tilt (x, y) first, then the twist (z).
+
+    2 sin(half angle) along the axis, as PX4's reduced attitude control has it: the shortest
+    rotation of the thrust axis gives x and y, what is left about the demanded axis gives z.
+    """
+    w, x, y, z = quaternion
+    dw, dx, dy, dz = row[1], row[2], row[3], row[4]
+    # conj(q) * q_demanded: the demanded attitude seen from the body
+    ew = w * dw + x * dx + y * dy + z * dz
+    ex = w * dx - x * dw - y * dz + z * dy
+    ey = w * dy + x * dz - y * dw - z * dx
+    ez = w * dz - x * dy + y * dx - z * dw
+    # swing-twist: e = swing * twist, twist about z by atan2(ez, ew) * 2
+    norm = math.sqrt(ew * ew + ez * ez)
+    if norm < 1e-9:  # upside down: any axis is as good; the twist is undefined
+        error[0], error[1], error[2] = 2.0 * ex, 2.0 * ey, 0.0
+        return
+    cosine, sine = ew / norm, ez / norm
+    error[0] = 2.0 * (ex * cosine - ey * sine)
+    error[1] = 2.0 * (ey * cosine + ex * sine)
+    error[2] = 2.0 * sine if cosine >= 0.0 else -2.0 * sine
+
+
+@numba.njit(cache=True)
+def angular_acceleration(
+    quaternion: Array,
+    rates: Array,
+    history: Array,
+    step: int,
+    delays: Integers,
+    gains: Array,
+    error: Array,
+    out: Array,
+) -> None:
+    """Demanded angular acceleration (3,) FRD rad/s^2 from the *estimated* attitude and the rates.
+
+    `error` (3,) is scratch. Tilt and yaw read the history at their own delays.
+    """
+    for first, last, attitude_delay, rate_delay in (
+        (0, 2, delays[0], delays[3]),
+        (2, 3, delays[1], delays[4]),
+    ):
+        row = delayed_row(history, step, rate_delay)
+        if row[_IS_ATTITUDE] > 0.5:
+            row = delayed_row(history, step, attitude_delay)
+        by_attitude = row[_IS_ATTITUDE] > 0.5
+        if by_attitude:
+            _attitude_error(quaternion, row, error)
+        for i in range(first, last):
+            rate = gains[0, i] * error[i] if by_attitude else row[_RATES + i]
+            limit = RATE_LIMIT_RADPS[i]
+            rate = min(max(rate, -limit), limit)
+            demand = gains[1, i] * (rate - rates[i])
+            out[i] = min(max(demand, -gains[2, i]), gains[2, i])

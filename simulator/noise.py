@@ -1,0 +1,123 @@
+"""Seeded normal numbers and linear stochastic processes: where all randomness of the truth is.
+
+A normal number is a pure function of (seed, lane, step): nothing is carried along, so a run of
+n steps gives the same bytes whether it is advanced at once or step by step. Knows no vehicle.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.linalg import expm
+
+Array = NDArray[np.float64]
+
+_TWO_TO_MINUS_53 = 2.0**-53
+_STEP_STRIDE = np.uint64(0x9E3779B97F4A7C15)
+_LANE_STRIDE = np.uint64(0xD1342543DE82EF95)
+_PAIR_STRIDE = np.uint64(0xA24BAED4963EE407)
+
+
+@dataclass(frozen=True, slots=True)
+class LinearProcess:
+    """x[k+1] = transition x[k] + scale xi[k], xi standard normal; both (n, n)."""
+
+    transition: Array
+    scale: Array
+    stationary_scale: Array  # (n, n): stationary_scale @ xi has the stationary covariance
+
+
+def seed_word(seed: int) -> np.uint64:
+    """Any integer seed -> the 64-bit word that `fill_normals` wants."""
+    entropy = seed if seed >= 0 else (-seed << 1) | (1 << 64)
+    return np.uint64(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0])
+
+
+def discretise(drift: ArrayLike, densities: ArrayLike, step_s: float) -> LinearProcess:
+    """x' = A x + w sampled exactly (Van Loan 1978, matrix exponential of the doubled system).
+
+    `drift` (n, n) 1/s; `densities` (n,) or the noise input matrix (n, m), in units of x per root
+    second. A drift that is not stable has no stationary covariance: its stationary scale is zero.
+    """
+    a = np.asarray(drift, dtype=np.float64)
+    b = np.asarray(densities, dtype=np.float64)
+    b = np.diag(b) if b.ndim == 1 else b
+    n = len(a)
+    doubled = np.block([[-a, b @ b.T], [np.zeros((n, n)), a.T]])
+    exponential = expm(doubled * step_s)
+    transition = np.ascontiguousarray(exponential[n:, n:].T)
+    covariance = transition @ exponential[:n, n:]
+    stable = np.all(np.linalg.eigvals(a).real < 0.0)
+    stationary = _stationary_covariance(transition, covariance) if stable else np.zeros((n, n))
+    return LinearProcess(transition, _square_root(covariance), _square_root(stationary))
+
+
+def block_diagonal(*processes: LinearProcess) -> LinearProcess:
+    """Independent processes side by side in one state vector."""
+    sizes = [len(process.transition) for process in processes]
+    ends = np.cumsum(sizes)
+    joined = LinearProcess(*(np.zeros((ends[-1], ends[-1])) for _ in range(3)))
+    for process, size, end in zip(processes, sizes, ends, strict=True):
+        span = slice(end - size, end)
+        joined.transition[span, span] = process.transition
+        joined.scale[span, span] = process.scale
+        joined.stationary_scale[span, span] = process.stationary_scale
+    return joined
+
+
+def _stationary_covariance(transition: Array, covariance: Array) -> Array:
+    """Sum of F^k Q F^k' by doubling; converges for every stable F."""
+    total, power = covariance, transition
+    for _ in range(64):
+        total = total + power @ total @ power.T
+        power = power @ power
+    return total
+
+
+def _square_root(covariance: Array) -> Array:
+    """Symmetric-definite factor R with R R' = covariance; tolerates zero and rounding."""
+    values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
+    return np.ascontiguousarray(vectors * np.sqrt(np.maximum(values, 0.0)))
+
+
+@numba.njit(cache=True)
+def _scramble(word: np.uint64) -> np.uint64:
+    """Finaliser of the SplitMix64 generator (Steele, Lea, Flood 2014)."""
+    word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
+    word = (word ^ (word >> np.uint64(27))) * np.uint64(0x94D049BB133111EB)
+    return word ^ (word >> np.uint64(31))
+
+
+@numba.njit(cache=True)
+def fill_normals(seed: np.uint64, lane: int, step: int, out: Array) -> None:
+    """Fill `out` (n,) with the standard normals of this lane and step (Box-Muller)."""
+    key = _scramble(seed + np.uint64(step) * _STEP_STRIDE + np.uint64(lane) * _LANE_STRIDE)
+    count = out.shape[0]
+    for i in range(0, count, 2):
+        word = _scramble(key + np.uint64(i + 1) * _PAIR_STRIDE)
+        other = _scramble(word + _STEP_STRIDE)
+        uniform = (np.float64(word >> np.uint64(11)) + 0.5) * _TWO_TO_MINUS_53
+        angle = 2.0 * math.pi * np.float64(other >> np.uint64(11)) * _TWO_TO_MINUS_53
+        radius = math.sqrt(-2.0 * math.log(uniform))
+        out[i] = radius * math.cos(angle)
+        if i + 1 < count:
+            out[i + 1] = radius * math.sin(angle)
+
+
+@numba.njit(cache=True)
+def advance_process(
+    transition: Array, scale: Array, gain: float, normals: Array, x: Array, work: Array
+) -> None:
+    """One step of a LinearProcess in place; `gain` multiplies the noise, `work` is scratch (n,)."""
+    n = x.shape[0]
+    for i in range(n):
+        total = 0.0
+        for j in range(n):
+            total += transition[i, j] * x[j] + gain * scale[i, j] * normals[j]
+        work[i] = total
+    for i in range(n):
+        x[i] = work[i]

@@ -1,0 +1,291 @@
+"""The simulated vehicle below the autopilot: airframe, air, attitude loop and estimator as one.
+
+`Plant` takes a `Demand` and a duration, and shows the `Truth` and the `Estimate`. Fixed steps,
+one compiled call per `advance`. It knows no modes, no arming and no MAVLink.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.model.rigid_body import RK4_SCRATCH_ROWS
+from offboard.model.state import QUATERNION
+from offboard.model.vehicle import Triple, Vehicle
+from simulator.airframe import (
+    ACCELERATION,
+    CONTACT,
+    ROTOR_SIZE,
+    THRUST,
+    BatteryState,
+    advance_airframe,
+    build_airframe,
+)
+from simulator.attitude import (
+    ROW_WIDTH,
+    Demand,
+    angular_acceleration,
+    build_loop,
+    delayed_thrust,
+    encode,
+)
+from simulator.conditions import Conditions
+from simulator.noise import advance_process, fill_normals, seed_word
+from simulator.sensors import (
+    ATTITUDE,
+    EAST,
+    ERROR_COUNT,
+    NORTH,
+    POSITION,
+    RATES,
+    REPORT_WIDTH,
+    STANDING_NOISE,
+    VELOCITY,
+    YAW,
+    error_model,
+    error_process,
+    report,
+    turn_estimate,
+    white_sds,
+)
+from simulator.wind import dryden, wind_axes
+
+__all__ = ["STEP_S", "Conditions", "Demand", "Estimate", "Plant", "Truth"]
+
+Array = NDArray[np.float64]
+
+STEP_S = 0.004
+"""Length of an integration step, s; `advance` moves in whole steps."""
+
+_ERROR_LANE, _GUST_LANE, _WHITE_LANE = 0, 1, 2
+
+
+@dataclass(frozen=True, slots=True)
+class Truth:
+    """Where the vehicle really is. Arrays (3,) NED or FRD, SI; quaternion (4,) wxyz FRD -> NED."""
+
+    position_ned_m: Array
+    velocity_ned_mps: Array
+    acceleration_ned_mps2: Array
+    attitude: Array
+    rates_frd_radps: Array
+    on_ground: bool
+    thrust: float  # actual normalised collective thrust, behind the rotor lag
+    wind_ned_mps: Array  # steady wind and gust
+    battery: BatteryState
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """Where the autopilot believes the vehicle is, as it would report it now. As in `Truth`."""
+
+    position_ned_m: Array
+    velocity_ned_mps: Array
+    attitude: Array
+    rates_frd_radps: Array
+    reset_counter: int
+
+
+class Plant:
+    """One vehicle standing at the origin, level, nose north, motors off.
+
+    The estimator's errors start at zero and are driven by a tenth of the noise until the motors
+    first run: as on real vehicles, they reach their full size in the first tens of seconds of a
+    flight. The same seed gives the same bytes, however the time is cut into calls.
+    """
+
+    def __init__(self, vehicle: Vehicle, conditions: Conditions, seed: int) -> None:
+        self._seed = seed_word(seed)
+        self._step = 0
+        self._due_s = 0.0
+        self._loop = build_loop(vehicle, STEP_S)
+        self._airframe = build_airframe(
+            vehicle,
+            STEP_S,
+            thrust_scale=conditions.thrust_scale,
+            mass_scale=conditions.mass_scale,
+            ground_effect=conditions.ground_effect,
+            battery=conditions.battery,
+        )
+        model = error_model(conditions.estimator, conditions.white_noise)
+        self._lag_s = model.lag_s
+        self._white_sds = white_sds(model)
+        self._errors = error_process(model, STEP_S)
+        self._gusts = dryden(conditions.gusts, STEP_S)
+        weakening = conditions.weakening
+        self._air = np.array(
+            [
+                *conditions.wind_ned_mps,
+                *wind_axes(conditions.wind_ned_mps),
+                weakening.at_s if weakening else np.inf,
+                weakening.thrust_scale if weakening else 1.0,
+            ]
+        )
+        self._start_state()
+
+    def _start_state(self) -> None:
+        self._history = self._loop.history
+        self._row = np.zeros(ROW_WIDTH)
+        self._demand: Demand | None = None
+        self._motors_on = False
+        self._body = np.zeros(QUATERNION.size)
+        self._body[0] = 1.0
+        self._rotor = np.zeros(ROTOR_SIZE)
+        self._rotor[CONTACT] = 1.0
+        self._error = np.zeros(ERROR_COUNT)
+        self._gust = np.zeros(len(self._gusts.transition))
+        fill_normals(self._seed, _GUST_LANE, -1, self._gust)
+        self._gust = self._gusts.stationary_scale @ self._gust
+        self._wind = self._air[:3].copy()
+        self._offset_ned_m = np.zeros(3)
+        self._reset_counter = 0
+
+    @property
+    def time_s(self) -> float:
+        """Virtual time since boot."""
+        return self._step * STEP_S
+
+    def advance(self, duration_s: float, demand: Demand) -> None:
+        """Hold the demand for `duration_s`; what is left of a step is owed to the next call."""
+        if demand is not self._demand:
+            encode(demand, self._row)
+            self._motors_on = demand.motors_on
+            self._demand = demand
+        self._due_s += duration_s
+        count = int(self._due_s / STEP_S + 1e-6)
+        self._due_s -= count * STEP_S
+        if count > 0:
+            _advance(
+                count,
+                self._step,
+                self._motors_on,
+                self._row,
+                self._history,
+                self._loop.delays,
+                self._loop.gains,
+                self._body,
+                self._rotor,
+                self._airframe.body,
+                self._airframe.rotor,
+                self._airframe.substeps,
+                self._error,
+                self._errors.transition,
+                self._errors.scale,
+                self._gust,
+                self._gusts.transition,
+                self._gusts.scale,
+                self._air,
+                self._wind,
+                self._seed,
+            )
+            self._step += count
+
+    def reset_estimate(self, offset_ned_m: Triple) -> None:
+        """The estimator jumps by this much from now on, and says so by its reset counter."""
+        self._offset_ned_m += offset_ned_m
+        self._reset_counter = (self._reset_counter + 1) % 256
+
+    @property
+    def truth(self) -> Truth:
+        """A copy of the true state now."""
+        body = self._body.copy()
+        return Truth(
+            position_ned_m=body[QUATERNION.position],
+            velocity_ned_mps=body[QUATERNION.velocity],
+            acceleration_ned_mps2=self._rotor[ACCELERATION].copy(),
+            attitude=body[QUATERNION.attitude],
+            rates_frd_radps=body[QUATERNION.rates],
+            on_ground=bool(self._rotor[CONTACT]),
+            thrust=float(self._rotor[THRUST]),
+            wind_ned_mps=self._wind.copy(),
+            battery=self._airframe.battery_state(self._rotor),
+        )
+
+    @property
+    def estimate(self) -> Estimate:
+        """What the autopilot reports now; the same however often it is asked within a step."""
+        out = np.empty(REPORT_WIDTH)
+        report(
+            self._body,
+            self._rotor[ACCELERATION],
+            self._error,
+            self._offset_ned_m,
+            self._lag_s,
+            self._white_sds,
+            1.0 if self._motors_on else STANDING_NOISE,
+            self._seed,
+            _WHITE_LANE,
+            self._step,
+            out,
+        )
+        return Estimate(
+            out[POSITION], out[VELOCITY], out[ATTITUDE], out[RATES], self._reset_counter
+        )
+
+
+@numba.njit(cache=True)
+def _advance(
+    count: int,
+    first_step: int,
+    motors_on: bool,
+    row: Array,
+    history: Array,
+    delays: NDArray[np.int64],
+    gains: Array,
+    body: Array,
+    rotor: Array,
+    body_constants: Array,
+    rotor_constants: Array,
+    substeps: int,
+    error: Array,
+    error_transition: Array,
+    error_scale: Array,
+    gust: Array,
+    gust_transition: Array,
+    gust_scale: Array,
+    air: Array,
+    wind: Array,
+    seed: np.uint64,
+) -> None:
+    """`count` steps in place. Per step: demand into history, air, loop on the estimate, airframe,
+    estimator errors."""
+    normals, work = np.empty(ERROR_COUNT), np.empty(ERROR_COUNT)
+    estimated, turn, turn_error = np.empty(4), np.empty(3), np.empty(3)
+    inputs, scratch = np.empty(4), np.empty((RK4_SCRATCH_ROWS, 13))
+    noisy = np.any(error_scale != 0.0)
+    gusty = np.any(gust != 0.0)
+    noise_gain = 1.0 if motors_on else STANDING_NOISE
+    for step in range(first_step, first_step + count):
+        history[step % history.shape[0], :] = row
+        if gusty:
+            fill_normals(seed, _GUST_LANE, step, normals[: gust.shape[0]])
+            advance_process(gust_transition, gust_scale, 1.0, normals, gust, work)
+        wind[0] = air[0] + air[3] * gust[0] - air[4] * gust[1]
+        wind[1] = air[1] + air[4] * gust[0] + air[3] * gust[1]
+        wind[2] = air[2] + gust[3]
+        turn_error[0], turn_error[1] = -error[EAST + 2], error[NORTH + 2]
+        turn_error[2] = error[YAW]
+        turn_estimate(body[:4], turn_error, estimated)
+        angular_acceleration(estimated, body[4:7], history, step, delays, gains, turn_error, turn)
+        thrust = delayed_thrust(history, step, delays) if motors_on else 0.0
+        strength = air[6] if step * STEP_S >= air[5] else 1.0
+        advance_airframe(
+            body,
+            rotor,
+            thrust,
+            turn,
+            wind,
+            body_constants,
+            rotor_constants,
+            strength,
+            STEP_S,
+            substeps,
+            inputs,
+            scratch,
+        )
+        if noisy:
+            fill_normals(seed, _ERROR_LANE, step, normals)
+            advance_process(error_transition, error_scale, noise_gain, normals, error, work)
