@@ -1,0 +1,126 @@
+"""The observer's small Kalman filters, compiled: covariances and what a measurement corrects.
+
+Covariances are propagated for the actual interval between messages, so no sampling rate is
+assumed. Axes with the same model share one covariance (both lateral axes do): `places` (m, n)
+tells for each of m axes where its n filter states stand in the observer's state vector. Their
+order is position, velocity, ..., bias of the reported velocity, or b and b', or psi and psi'.
+Arrays are changed in place. Nothing here knows messages, settings or the motion itself.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Places = NDArray[np.int64]
+
+GATE_SDS = 3.0
+
+
+@numba.njit(cache=True)
+def spread(
+    covariance: Array, dynamics: Array, densities: Array, interval_s: float, longest_s: float
+) -> None:
+    """Covariance (n, n) over `interval_s`: P' = F P + P F' + diag(densities^2).
+
+    dynamics F (n, n); densities (n,) per root second; steps of at most `longest_s`.
+    """
+    steps = math.ceil(interval_s / longest_s - 1e-6)
+    if steps <= 0:
+        return
+    h = interval_s / steps
+    scaled = dynamics * h
+    square = scaled @ scaled
+    transition = np.eye(len(dynamics)) + scaled + 0.5 * square + square @ scaled / 6.0
+    noise = np.diag(densities * densities * (0.5 * h))
+    noise = noise + transition @ noise @ transition.T
+    for _ in range(steps):
+        covariance[:] = transition @ covariance @ transition.T + noise
+
+
+@numba.njit(cache=True)
+def absorb(covariance: Array, row: Array, variance: float) -> Array:
+    """Scalar measurement row @ x with the given variance: updates the covariance (n, n) and
+    returns the gain (n,)."""
+    projected = covariance @ row
+    gain = projected / (row @ projected + variance)
+    size = len(row)
+    for i in range(size):
+        for j in range(i + 1):
+            value = covariance[i, j] - 0.5 * (gain[i] * projected[j] + gain[j] * projected[i])
+            covariance[i, j] = value
+            covariance[j, i] = value
+    return gain
+
+
+@numba.njit(cache=True)
+def correct(
+    state: Array, places: Places, covariance: Array, row: Array, innovation: Array, sd: float
+) -> None:
+    """One scalar measurement row @ x per axis, innovation (m,), standard deviation `sd`."""
+    gain = absorb(covariance, row, sd * sd)
+    for k in range(len(places)):
+        for i in range(len(row)):
+            state[places[k, i]] += gain[i] * innovation[k]
+
+
+@numba.njit(cache=True)
+def _jumped(covariance: Array, row: Array, innovation: Array, sd: float, gate: float) -> bool:
+    deviation = math.sqrt(row @ (covariance @ row) + sd * sd)
+    largest = 0.0
+    for value in innovation:
+        largest = max(largest, abs(value))
+    return largest > gate + GATE_SDS * deviation
+
+
+@numba.njit(cache=True)
+def correct_position(
+    state: Array, places: Places, covariance: Array, measured: Array, sd: float, gate: float
+) -> int:
+    """Position (m,) of a group of axes. Further off than `gate` beyond the expected spread it is
+    a jump of the estimate: the position is re-anchored and nothing else moves.
+
+    Returns the number of jumps, 0 or 1.
+    """
+    row = np.zeros(len(covariance))
+    row[0] = 1.0
+    innovation = np.empty(len(places))
+    for k in range(len(places)):
+        innovation[k] = measured[k] - state[places[k, 0]]
+    if not _jumped(covariance, row, innovation, sd, gate):
+        correct(state, places, covariance, row, innovation, sd)
+        return 0
+    for k in range(len(places)):
+        state[places[k, 0]] = measured[k]
+    covariance[0, :] = 0.0
+    covariance[:, 0] = 0.0
+    covariance[0, 0] = sd * sd
+    return 1
+
+
+@numba.njit(cache=True)
+def correct_velocity(
+    state: Array, places: Places, covariance: Array, measured: Array, sd: float, gate: float
+) -> int:
+    """Reported velocity (m,) = velocity + bias. A jump (as in `correct_position`) goes into the
+    bias. Returns the number of jumps, 0 or 1."""
+    bias = len(covariance) - 1
+    row = np.zeros(len(covariance))
+    row[1] = 1.0
+    row[bias] = 1.0
+    innovation = np.empty(len(places))
+    for k in range(len(places)):
+        innovation[k] = measured[k] - state[places[k, 1]] - state[places[k, bias]]
+    if not _jumped(covariance, row, innovation, sd, gate):
+        correct(state, places, covariance, row, innovation, sd)
+        return 0
+    for k in range(len(places)):
+        state[places[k, bias]] += innovation[k]
+    covariance[bias, :] = -covariance[1, :]
+    covariance[:, bias] = covariance[bias, :]
+    covariance[bias, bias] = covariance[1, 1] + sd * sd
+    return 1

@@ -1,0 +1,390 @@
+"""Where the vehicle is, what pushes it, and where it will be when a command sent now takes effect.
+
+The autopilot's reported velocity need not be the derivative of the position it reports (PX4: wrong
+by 0.2-0.3 m/s for seconds, with the position not following), so velocity comes from position and
+from the commands *sent*, replayed through the attitude response; the reported velocity is used
+with a bias of its own or not at all. A disturbance acceleration absorbs wrong thrust, mass, wind.
+Vehicle time everywhere; no clock, no MAVLink, no reference.
+"""
+
+from __future__ import annotations
+
+import math
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from offboard.control.base import Command, PredictedState
+from offboard.control.filtering import correct, correct_position, correct_velocity, spread
+from offboard.control.propagation import (
+    BIAS,
+    BIAS_TIME_CONSTANT,
+    COMMAND_SIZE,
+    COURSE,
+    COURSE_RATE,
+    DISTURBANCE,
+    DRAG,
+    GRAVITY,
+    PLANT_SIZE,
+    POSITION,
+    SENT_AT,
+    SENT_THRUST,
+    STATE_SIZE,
+    THRUST,
+    THRUST_DELAY,
+    THRUST_LAG,
+    TILT,
+    TILT_DAMPING,
+    TILT_DELAY,
+    TILT_FREQUENCY,
+    TILT_RATE,
+    VELOCITY,
+    YAW_DAMPING,
+    YAW_DELAY,
+    YAW_FREQUENCY,
+    advance,
+    upright,
+)
+from offboard.control.response import lateral_model
+from offboard.model.frames import (
+    course_from_quaternion,
+    thrust_direction_from_quaternion,
+    wrap_pi,
+)
+from offboard.model.vehicle import Parameters, Vehicle
+
+Array = NDArray[np.float64]
+Triple = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+
+# Places in the state vector: per lateral axis [p v b b' d beta], vertical [p v d beta].
+LATERAL = np.array(
+    [
+        [POSITION + i, VELOCITY + i, TILT + i, TILT_RATE + i, DISTURBANCE + i, BIAS + i]
+        for i in (0, 1)
+    ]
+)
+VERTICAL = np.array([[POSITION + 2, VELOCITY + 2, DISTURBANCE + 2, BIAS + 2]])
+HEADING = np.array([[COURSE, COURSE_RATE]])
+# What is believed at the first message: the reported velocity, no disturbance, no bias.
+LATERAL_START_SD = np.array([0.1, 0.3, 0.02, 0.3, 1.0, 0.3])
+VERTICAL_START_SD = np.array([0.1, 0.3, 1.5, 0.3])
+HEADING_START_SD = np.array([0.05, 0.3])
+MEASURES_TILT = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+MEASURES_COURSE = np.array([1.0, 0.0])
+
+COMMANDS_KEPT = 128
+# Telemetry that arrives later than this after newer telemetry says nothing worth having.
+LATEST_S = 0.1
+# A longer silence, or step back in time, is a new start (a silence keeps the disturbance).
+LONGEST_GAP_S = 1.0
+
+
+class VelocitySource(StrEnum):
+    """What the reported velocity is used for."""
+
+    POSITION = "position"  # nothing: velocity from position and commands
+    BIAS = "bias"  # measured with a slowly varying bias
+    REPORTED = "reported"  # fed back raw, no disturbance: here only to be shown as worse
+
+
+class ObserverSettings(Parameters):
+    """Densities per root second and standard deviations of the filters. The defaults flew PX4 and
+    ArduCopter; twice or half of them made no visible difference."""
+
+    velocity: VelocitySource = VelocitySource.BIAS
+    acceleration_density_mps: float = Field(default=0.2, gt=0, le=10)
+    disturbance_density_mps2: float = Field(default=0.15, gt=0, le=10)
+    tilt_density_radps: float = Field(default=0.6, gt=0, le=50)
+    course_density_radps: float = Field(default=0.6, gt=0, le=50)
+    bias_density_mps: float = Field(default=0.08, gt=0, le=10)
+    bias_time_constant_s: float = Field(default=10.0, gt=0.1, le=1000)
+    position_sd_m: float = Field(default=0.002, gt=0, le=1)
+    velocity_sd_mps: float = Field(default=0.005, gt=0, le=5)
+    attitude_sd_rad: float = Field(default=0.001, gt=0, le=0.5)
+    position_jump_m: float = Field(default=0.3, gt=0, le=100)
+    velocity_jump_mps: float = Field(default=0.5, gt=0, le=100)
+    disturbance_limit_mps2: float = Field(default=5.0, gt=0, le=20)
+
+
+class Observer:
+    """One vehicle's observer. Feed it every message and every command; ask it before deciding."""
+
+    def __init__(self, vehicle: Vehicle, settings: ObserverSettings) -> None:
+        self._settings = settings
+        self._position_at: float | None = None
+        self._attitude_at: float | None = None
+        self._adopt(vehicle)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything of the previous flight."""
+        self.position_jumps = 0
+        self.velocity_jumps = 0
+        self.stale_messages = 0
+        self._frozen = False
+        self._history = np.zeros((COMMANDS_KEPT, COMMAND_SIZE))
+        self._sent = 0
+        self._state = np.zeros(STATE_SIZE)
+        self._rates: Array = np.zeros(3)
+        self._restart()
+
+    def adopt(self, vehicle: Vehicle) -> None:
+        """Go on with a newly identified vehicle. The thrust that crosses the wire is a ratio to
+        the hover thrust, so what was commanded is read on the new scale and the disturbance gives
+        up what the new hover thrust explains."""
+        ratio = self._vehicle.hover_thrust / vehicle.hover_thrust
+        self._history[:, SENT_THRUST] *= ratio
+        self._state[THRUST] *= ratio
+        down = (self._gravity + self._state[DISTURBANCE + 2]) * ratio - vehicle.gravity_mps2
+        self._adopt(vehicle)
+        self._state[DISTURBANCE + 2] = down
+        self._bound_disturbance()
+
+    @property
+    def ready(self) -> bool:
+        """Whether position and attitude have both been heard since the start or a long silence."""
+        return self._position_at is not None and self._attitude_at is not None
+
+    @property
+    def hover_thrust_estimate(self) -> float:
+        """Normalised thrust that hovers: u_h (1 + d_z / g); within 2-3 % five seconds after
+        take-off."""
+        down = float(self._state[DISTURBANCE + 2])
+        return self._vehicle.hover_thrust * (1.0 + down / self._gravity)
+
+    @property
+    def velocity_bias_ned_mps(self) -> Array:
+        """Reported minus believed velocity (3,), zero unless the source is `bias`."""
+        return self._state[BIAS : BIAS + 3].copy()
+
+    def freeze(self, grounded: bool) -> None:
+        """While the vehicle does not fly our commands nothing integrates: velocity as reported,
+        no disturbance, thrust direction as measured. Released, the filters start from there."""
+        if grounded != self._frozen:
+            self._start_filters()
+        self._frozen = grounded
+
+    def on_command(self, time_s: float, command: Command) -> None:
+        """A command sent when the newest telemetry had vehicle time `time_s`."""
+        north, east, _ = command.thrust_direction_ned
+        if self._sent == COMMANDS_KEPT:
+            self._history[:-1] = self._history[1:]
+            self._sent -= 1
+        if self._sent and time_s < self._history[self._sent - 1, SENT_AT]:
+            time_s = self._history[self._sent - 1, SENT_AT]
+        self._history[self._sent] = time_s, north, east, command.thrust_mps2, command.course_rad
+        self._sent += 1
+
+    def on_attitude(self, time_s: float, q: Quaternion, rates: Triple) -> None:
+        """Attitude quaternion (FRD -> NED) and body rates (rad/s, FRD) of vehicle time `time_s`."""
+        if not self._admit(time_s, self._attitude_at):
+            return
+        direction = thrust_direction_from_quaternion(q)
+        course = float(course_from_quaternion(q))
+        first = self._attitude_at is None or self._frozen
+        self._advance(time_s)
+        self._attitude_at = time_s
+        self._rates = np.array(rates)
+        state = self._state
+        if first:  # taken as it is
+            state[TILT : TILT + 2] = direction[:2]
+            state[TILT_RATE : TILT_RATE + 2] = 0.0
+            state[COURSE], state[COURSE_RATE] = course, 0.0
+            state[THRUST] = self._gravity / upright(direction[0], direction[1])
+            return
+        late_s = self._time_s - time_s
+        innovation = (
+            direction[:2] - state[TILT : TILT + 2] + late_s * state[TILT_RATE : TILT_RATE + 2]
+        )
+        turn = np.array([wrap_pi(course - state[COURSE] + late_s * state[COURSE_RATE])])
+        sd = self._settings.attitude_sd_rad
+        correct(state, LATERAL, self._lateral, MEASURES_TILT, innovation, sd)
+        correct(state, HEADING, self._heading, MEASURES_COURSE, turn, sd)
+        self._bound_disturbance()
+
+    def on_position(self, time_s: float, position_ned_m: Triple, velocity_ned_mps: Triple) -> None:
+        """Reported position and velocity of vehicle time `time_s`."""
+        if not self._admit(time_s, self._position_at):
+            return
+        first = self._position_at is None or self._frozen
+        self._advance(time_s)
+        self._position_at = time_s
+        state = self._state
+        position, velocity = np.array(position_ned_m), np.array(velocity_ned_mps)
+        if first or self._settings.velocity is VelocitySource.REPORTED:
+            state[POSITION : POSITION + 3] = position
+            state[VELOCITY : VELOCITY + 3] = velocity
+            return
+        late_s = self._time_s - time_s
+        if late_s > 0.0:
+            position += late_s * state[VELOCITY : VELOCITY + 3]
+            velocity += late_s * self._acceleration()
+        self._correct(position, velocity)
+        self._bound_disturbance()
+
+    def predict(self, time_s: float) -> PredictedState:
+        """The state at `time_s` + tilt delay, when the tilt of a command sent at `time_s` begins
+        to act, replaying the commands sent. Meaningful once `ready`."""
+        state = self._state.copy()
+        until_s = time_s + self._vehicle.tilt.delay_s
+        ahead_s = min(max(until_s - self._time_s, 0.0), LONGEST_GAP_S)
+        if self._frozen:
+            state[POSITION : POSITION + 3] += ahead_s * state[VELOCITY : VELOCITY + 3]
+        else:
+            start_s = self._time_s
+            advance(state, start_s, start_s + ahead_s, self._history, self._sent, self._plant)
+        north, east = state[TILT], state[TILT + 1]
+        down = upright(north, east)
+        rate_n, rate_e = state[TILT_RATE], state[TILT_RATE + 1]
+        return PredictedState(
+            time_s=until_s,
+            position_ned_m=state[POSITION : POSITION + 3],
+            velocity_ned_mps=state[VELOCITY : VELOCITY + 3],
+            thrust_direction_ned=np.array([north, east, down]),
+            thrust_direction_rate_ned_ps=np.array(
+                [rate_n, rate_e, -(north * rate_n + east * rate_e) / down]
+            ),
+            course_rad=wrap_pi(float(state[COURSE])),
+            course_rate_radps=float(state[COURSE_RATE]),
+            thrust_mps2=float(state[THRUST]),
+            disturbance_ned_mps2=state[DISTURBANCE : DISTURBANCE + 3],
+            rates_frd_radps=self._rates.copy(),
+        )
+
+    @staticmethod
+    def warm_up(vehicle: Vehicle, settings: ObserverSettings) -> None:
+        """Call every code path once, so that none compiles in flight."""
+        observer = Observer(vehicle, settings)
+        level = Command(vehicle.gravity_mps2, (0.0, 0.0, 1.0), 0.0)
+        for time_s in (0.0, 0.01, 0.02):
+            observer.on_command(time_s, level)
+            observer.on_attitude(time_s, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+            observer.on_position(time_s, (time_s * 100.0, 0.0, 0.0), (time_s * 100.0, 0.0, 0.0))
+        observer.predict(0.02)
+
+    def _adopt(self, vehicle: Vehicle) -> None:
+        self._vehicle = vehicle
+        self._gravity = vehicle.gravity_mps2
+        self._plant = _plant(vehicle, self._settings)
+        self._filters = _filters(vehicle, self._settings)
+        frequency = max(vehicle.tilt.natural_frequency_radps, vehicle.yaw.natural_frequency_radps)
+        damping = max(vehicle.tilt.damping, vehicle.yaw.damping, 0.5)
+        self._longest_spread_s = min(0.02, 0.25 / (2.0 * damping * frequency))
+
+    def _restart(self) -> None:
+        """The next message of each stream is taken as it is."""
+        self._time_s = -math.inf
+        self._position_at = None
+        self._attitude_at = None
+        self._state[THRUST] = self._gravity
+        self._start_filters()
+
+    def _start_filters(self) -> None:
+        self._lateral = np.diag(LATERAL_START_SD**2)
+        self._vertical = np.diag(VERTICAL_START_SD**2)
+        self._heading = np.diag(HEADING_START_SD**2)
+        if self._settings.velocity is VelocitySource.REPORTED:
+            self._lateral[4, 4] = 0.0
+        self._state[DISTURBANCE : DISTURBANCE + 3] = 0.0
+        self._state[BIAS : BIAS + 3] = 0.0
+
+    def _admit(self, time_s: float, last_s: float | None) -> bool:
+        """Whether a message of a stream last heard at `last_s` says something new."""
+        if abs(time_s - self._time_s) > LONGEST_GAP_S:
+            if time_s < self._time_s:
+                self._sent = 0
+            disturbance = self._state[DISTURBANCE : DISTURBANCE + 3].copy()
+            self._restart()
+            self._state[DISTURBANCE : DISTURBANCE + 3] = disturbance
+            return True
+        if time_s < self._time_s - LATEST_S or (last_s is not None and time_s <= last_s):
+            self.stale_messages += 1
+            return False
+        return True
+
+    def _advance(self, time_s: float) -> None:
+        """Replay to `time_s`, or stay if newer telemetry came first."""
+        if time_s <= self._time_s:
+            return
+        if self.ready and not self._frozen:
+            start_s, interval_s = self._time_s, time_s - self._time_s
+            advance(self._state, start_s, time_s, self._history, self._sent, self._plant)
+            covariances = self._lateral, self._vertical, self._heading
+            for covariance, (dynamics, densities) in zip(covariances, self._filters, strict=True):
+                spread(covariance, dynamics, densities, interval_s, self._longest_spread_s)
+        self._time_s = time_s
+
+    def _correct(self, position: Array, velocity: Array) -> None:
+        settings, state = self._settings, self._state
+        sd, gate = settings.position_sd_m, settings.position_jump_m
+        self.position_jumps += max(
+            correct_position(state, LATERAL, self._lateral, position[:2], sd, gate),
+            correct_position(state, VERTICAL, self._vertical, position[2:], sd, gate),
+        )
+        if settings.velocity is VelocitySource.POSITION:
+            return
+        sd, gate = settings.velocity_sd_mps, settings.velocity_jump_mps
+        self.velocity_jumps += max(
+            correct_velocity(state, LATERAL, self._lateral, velocity[:2], sd, gate),
+            correct_velocity(state, VERTICAL, self._vertical, velocity[2:], sd, gate),
+        )
+
+    def _acceleration(self) -> Array:
+        north, east = self._state[TILT : TILT + 2]
+        velocity = self._state[VELOCITY : VELOCITY + 3]
+        acceleration: Array = np.array([north, east, upright(north, east)]) * -self._state[THRUST]
+        acceleration += self._state[DISTURBANCE : DISTURBANCE + 3]
+        acceleration -= self._vehicle.drag_per_mass_ps * velocity
+        acceleration[2] += self._gravity
+        return acceleration
+
+    def _bound_disturbance(self) -> None:
+        limit = self._settings.disturbance_limit_mps2
+        for i in range(DISTURBANCE, DISTURBANCE + 3):
+            self._state[i] = min(max(self._state[i], -limit), limit)
+
+
+def _plant(vehicle: Vehicle, settings: ObserverSettings) -> Array:
+    """The plant vector of `propagation`."""
+    plant = np.empty(PLANT_SIZE)
+    plant[GRAVITY] = vehicle.gravity_mps2
+    plant[DRAG] = vehicle.drag_per_mass_ps
+    plant[TILT_FREQUENCY] = vehicle.tilt.natural_frequency_radps
+    plant[TILT_DAMPING] = vehicle.tilt.damping
+    plant[TILT_DELAY] = vehicle.tilt.delay_s
+    plant[THRUST_LAG] = vehicle.thrust_lag_s
+    plant[THRUST_DELAY] = vehicle.thrust_delay_s
+    plant[YAW_FREQUENCY] = vehicle.yaw.natural_frequency_radps
+    plant[YAW_DAMPING] = vehicle.yaw.damping
+    plant[YAW_DELAY] = vehicle.yaw.delay_s
+    plant[BIAS_TIME_CONSTANT] = settings.bias_time_constant_s
+    return plant
+
+
+def _filters(vehicle: Vehicle, settings: ObserverSettings) -> tuple[tuple[Array, Array], ...]:
+    """Dynamics (n, n) and densities (n,) of the lateral, vertical and course filters.
+
+    Linear about hover: an error of b accelerates by g whatever the thrust is at the moment.
+    """
+    trusted = settings.velocity is VelocitySource.REPORTED
+    drift = 0.0 if trusted else settings.disturbance_density_mps2
+    motion, bias = settings.acceleration_density_mps, settings.bias_density_mps
+    forgetting = -1.0 / settings.bias_time_constant_s
+    lateral = np.zeros((6, 6))
+    lateral[:4, :4] = lateral_model(vehicle).dynamics
+    lateral[1, 4], lateral[5, 5] = 1.0, forgetting
+    vertical = np.zeros((4, 4))
+    vertical[0, 1] = vertical[1, 2] = 1.0
+    vertical[1, 1], vertical[3, 3] = -vehicle.drag_per_mass_ps, forgetting
+    heading = np.zeros((2, 2))
+    frequency = vehicle.yaw.natural_frequency_radps
+    heading[0, 1] = 1.0
+    heading[1] = -(frequency**2), -2.0 * vehicle.yaw.damping * frequency
+    return (
+        (lateral, np.array([0.0, motion, 0.0, settings.tilt_density_radps, drift, bias])),
+        (vertical, np.array([0.0, motion, drift, bias])),
+        (heading, np.array([0.0, settings.course_density_radps])),
+    )

@@ -1,0 +1,145 @@
+"""The plant as an attitude setpoint sees it: the autopilot's attitude loop is part of the model.
+
+Written in the thrust direction b, acceleration = g e3 - T b - c v + d, the two lateral axes, the
+vertical and the course decouple and no heading frame is needed. Here live the linear error models
+of the axes, their zero-order-hold samples and the stabilising Riccati solution that turns one
+decision into an infinite horizon. Delay is not part of these models: the observer predicts through
+it. Nothing here knows a reference, a measurement or a search.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm
+
+from offboard.control.one_step import cost_to_go
+from offboard.model.vehicle import AxisResponse, Vehicle
+
+Array = NDArray[np.float64]
+
+# A thrust without lag would be a feed-through; this lag is far below every sampling period.
+SHORTEST_THRUST_LAG_S = 1e-3
+# The block exponential holds exp(-A t) too, which overflows for loops much faster than the hold.
+DOUBLINGS = 10
+
+
+@dataclass(frozen=True, slots=True)
+class LinearModel:
+    """x' = A x + B u with one input: dynamics (n, n), input_map (n, 1)."""
+
+    dynamics: Array
+    input_map: Array
+
+
+@dataclass(frozen=True, slots=True)
+class CostToGo:
+    """The sampled model of one axis with the optimal cost that follows one held input.
+
+    J(u; x) = integral over the hold of (x' Q x + R u^2) + x(k+1)' P x(k+1)
+            = 1/2 curvature u^2 + (coupling x) u + 1/2 x' state_cost x, minimal at u = -gain x,
+    all in deviations from the reference. transition (n, n), input_map (n, 1), terminal P (n, n),
+    coupling and gain (n,).
+    """
+
+    transition: Array
+    input_map: Array
+    terminal: Array
+    curvature: float
+    coupling: Array
+    state_cost: Array
+    gain: Array
+
+
+def lateral_model(vehicle: Vehicle) -> LinearModel:
+    """One lateral axis, deviations [p, v, b, b'], input b_c: v' = -g b - c v, b'' = wn^2 (b_c - b)
+    - 2 z wn b' (the tilt response of `AxisResponse`)."""
+    stiffness = vehicle.tilt.natural_frequency_radps**2
+    dynamics = np.zeros((4, 4))
+    dynamics[0, 1] = 1.0
+    dynamics[1, 1:3] = -vehicle.drag_per_mass_ps, -vehicle.gravity_mps2
+    dynamics[2, 3] = 1.0
+    dynamics[3, 2] = -stiffness
+    dynamics[3, 3] = -2.0 * vehicle.tilt.damping * vehicle.tilt.natural_frequency_radps
+    return LinearModel(dynamics, np.array([[0.0], [0.0], [0.0], [stiffness]]))
+
+
+def vertical_model(vehicle: Vehicle) -> LinearModel:
+    """The vertical axis, deviations [z, v_z, f_z], input f_c: v_z' = -f_z - c v_z,
+    f_z' = (f_c - f_z) / lag, f_z = T b_z being the vertical part of the thrust, m/s^2."""
+    rate = 1.0 / max(vehicle.thrust_lag_s, SHORTEST_THRUST_LAG_S)
+    drag = vehicle.drag_per_mass_ps
+    dynamics = np.array([[0.0, 1.0, 0.0], [0.0, -drag, -1.0], [0.0, 0.0, -rate]])
+    return LinearModel(dynamics, np.array([[0.0], [0.0], [rate]]))
+
+
+def sampled_cost_to_go(
+    model: LinearModel, state_weight: Array, input_weight: float, period_s: float
+) -> CostToGo:
+    """Sample `model` with its stage cost integrated over the hold (C. F. Van Loan, 1978) and close
+    the horizon with the stabilising solution of the discrete Riccati equation.
+
+    state_weight (n, n) and input_weight are the continuous weights of x' Q x + R u^2.
+    """
+    transition, stage = _sample_with_cost(model, state_weight, input_weight, period_s)
+    size = len(model.dynamics)
+    a, b = transition[:size, :size], transition[:size, size:]
+    q, s, r = stage[:size, :size], stage[:size, size:], stage[size:, size:]
+    terminal = cost_to_go(a, b, q, r, s)
+    curvature = float((r + b.T @ terminal @ b)[0, 0])
+    coupling = (b.T @ terminal @ a + s.T)[0]
+    return CostToGo(
+        transition=a,
+        input_map=b,
+        terminal=terminal,
+        curvature=2.0 * curvature,
+        coupling=2.0 * coupling,
+        state_cost=2.0 * (q + a.T @ terminal @ a),
+        gain=coupling / curvature,
+    )
+
+
+def _sample_with_cost(
+    model: LinearModel, state_weight: Array, input_weight: float, period_s: float
+) -> tuple[Array, Array]:
+    """Transition and stage cost, both (n + 1, n + 1), of [x, u] with u held for `period_s`."""
+    size = len(model.dynamics)
+    flow = np.zeros((size + 1, size + 1))
+    flow[:size, :size] = model.dynamics
+    flow[:size, size:] = model.input_map
+    weight = np.zeros_like(flow)
+    weight[:size, :size] = state_weight
+    weight[size, size] = input_weight
+    step_s = period_s / 2**DOUBLINGS
+    block = expm(np.block([[-flow.T, weight], [np.zeros_like(flow), flow]]) * step_s)
+    transition: Array = block[size + 1 :, size + 1 :]
+    stage: Array = transition.T @ block[: size + 1, size + 1 :]
+    for _ in range(DOUBLINGS):
+        stage = stage + transition.T @ stage @ transition
+        transition = transition @ transition
+    return transition, 0.5 * (stage + stage.T)
+
+
+def lateral_cost_to_go(vehicle: Vehicle, bandwidth_radps: float, period_s: float) -> CostToGo:
+    """Weights 1 on position and g^2 / wc^4 on b_c: one number, the bandwidth wc, sets the law."""
+    weight = np.diag([1.0, 0.0, 0.0, 0.0])
+    effort = vehicle.gravity_mps2**2 / bandwidth_radps**4
+    return sampled_cost_to_go(lateral_model(vehicle), weight, effort, period_s)
+
+
+def vertical_cost_to_go(vehicle: Vehicle, bandwidth_radps: float, period_s: float) -> CostToGo:
+    """Weights 1 on height and 1 / wc^4 on the vertical thrust."""
+    weight = np.diag([1.0, 0.0, 0.0])
+    return sampled_cost_to_go(vertical_model(vehicle), weight, bandwidth_radps**-4, period_s)
+
+
+def lead(value: Array, rate: Array, acceleration: Array, response: AxisResponse) -> Array:
+    """The command whose second-order response (delay aside) is the given motion:
+    s + 2 z / wn s' + s'' / wn^2. Any common shape."""
+    frequency = response.natural_frequency_radps
+    command: Array = (
+        value + (2.0 * response.damping / frequency) * rate + acceleration / frequency**2
+    )
+    return command

@@ -1,0 +1,260 @@
+"""The tracking law behind `pso` and `lqr`: one held input, then the optimal cost-to-go.
+
+Each decision is a convex quadratic in u = [T, b_cx, b_cy, course] in a box: the stage cost over the
+hold plus the Riccati solution of the state it leads to, in deviations from what flatness asks of
+the vehicle and inverted through the attitude loop. `pso` searches it with the swarm, `lqr` takes
+its closed form: the axes decouple, so that is clip(-f / h). Knows no autopilot and reads no clock.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from offboard.control.base import Certificate, Command, Decision, PredictedState, Situation
+from offboard.control.certificate import ExactMinimum, at_bound, certify
+from offboard.control.cost import BoxQuadratic
+from offboard.control.response import lateral_cost_to_go, lead, vertical_cost_to_go
+from offboard.control.swarm import QuadraticSwarm, RandomLanes, SwarmSettings
+from offboard.model.frames import wrap_pi
+from offboard.model.vehicle import Parameters, Vehicle
+from offboard.reference.base import FlatSample, Reference
+from offboard.reference.flatness import flat_state
+
+Array = NDArray[np.float64]
+
+COURSE_BOX_RAD = 0.5  # about its feed-forward: the autopilot closes the yaw loop, we only lead it
+COURSE_CURVATURE = 1.0
+
+
+class Search(StrEnum):
+    """How the quadratic of one decision is minimised."""
+
+    SWARM = "pso"
+    CLOSED_FORM = "lqr"
+
+
+class TrackingSettings(Parameters):
+    """One number, the bandwidth, sets the law: weights 1 on position, g^2 / wc^4 on b_c and
+    1 / wc^4 on the vertical thrust. 5 rad/s is the knee between error and agitation on PX4 and
+    ArduCopter; 7 wants the delay identified in flight.
+
+    `feedback_limit` bounds each lateral component of b_c about its feed-forward (a swing between
+    the tilt limits runs into the attitude loop's acceleration limit and cycles), `tilt_limit`
+    each component itself. `thrust_floor` is the least thrust as a fraction of g.
+    """
+
+    bandwidth_radps: float = Field(default=5.0, ge=0.5, le=20)
+    feedback_limit: float = Field(default=0.3, gt=0, le=1)
+    tilt_limit: float = Field(default=0.6, gt=0, le=0.7)
+    thrust_floor: float = Field(default=0.2, ge=0, lt=1)
+    period_s: float = Field(default=0.1, ge=0.005, le=0.5)
+    swarm: SwarmSettings = SwarmSettings()
+    seed: int = Field(default=0, ge=0, lt=2**64)
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """What the reference asks when the command acts, NED, SI.
+
+    position_ned_m, velocity_ned_mps, direction, direction_rate (3,) and vertical_thrust_mps2 (the
+    part T b_z) at the predicted time; the feed-forward tilt (2,), vertical thrust and course each
+    half a decision after its own delay, led through its own response.
+    """
+
+    position_ned_m: Array
+    velocity_ned_mps: Array
+    direction_ned: Array
+    direction_rate_ned_ps: Array
+    vertical_thrust_mps2: float
+    tilt_feedforward: Array
+    vertical_feedforward_mps2: float
+    course_feedforward_rad: float
+
+
+class TrackingLaw:
+    """The controllers `pso` and `lqr`. `stopwatch` () -> s lets the swarm keep a deadline and
+    report its time; without one it takes all its iterations."""
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        settings: TrackingSettings | None = None,
+        search: Search = Search.SWARM,
+        stopwatch: Callable[[], float] | None = None,
+    ) -> None:
+        self._vehicle = vehicle
+        self._settings = settings or TrackingSettings()
+        self._search = search
+        self._stopwatch = stopwatch
+        bandwidth, period_s = self._settings.bandwidth_radps, self._settings.period_s
+        self.lateral = lateral_cost_to_go(vehicle, bandwidth, period_s)
+        self.vertical = vertical_cost_to_go(vehicle, bandwidth, period_s)
+        self._swarm = QuadraticSwarm(self._settings.swarm, 4)
+        self._lanes = RandomLanes(self._settings.seed)
+        self._exact = ExactMinimum(4)
+
+    def decide(self, situation: Situation) -> Decision:
+        """The command for one tick; the one in force again where anything is not finite."""
+        started = self._stopwatch() if self._stopwatch else math.nan
+        state = situation.state
+        target = self.target(situation.reference, situation.time_s, state)
+        problem = self.problem(state, target)
+        if not _finite(problem):
+            return Decision(situation.previous)
+        if self._search is Search.CLOSED_FORM:
+            inputs = closed_form(problem)
+            certificate = _exact_certificate(problem, inputs)
+        else:
+            remaining = self._remaining(situation.deadline_s, started)
+            result = self._swarm.minimise(problem, self._lanes, (), remaining)
+            inputs, certificate = result.best, certify(problem, result, self._exact)
+        if self._stopwatch:
+            certificate = replace(certificate, solve_time_s=self._stopwatch() - started)
+        return Decision(_command(inputs), certificate)
+
+    def reset(self) -> None:
+        """Forget everything of the previous flight, the random stream included."""
+        self._lanes.reset()
+
+    def target(self, reference: Reference, time_s: float, state: PredictedState) -> Target:
+        """What to be and what to ask, for a decision at `time_s` with the state predicted to
+        `state.time_s`, when its tilt begins to act. The disturbance is part of both."""
+        vehicle, half_s = self._vehicle, 0.5 * self._settings.period_s
+        sample = reference.sample(
+            np.array(
+                [
+                    state.time_s,
+                    state.time_s + half_s,
+                    time_s + vehicle.thrust_delay_s + half_s,
+                    time_s + vehicle.yaw.delay_s + half_s,
+                ]
+            )
+        )
+        flat = flat_state(
+            sample, vehicle.gravity_mps2, vehicle.drag_per_mass_ps, state.disturbance_ned_mps2
+        )
+        b, b1 = flat.thrust_direction_ned, flat.thrust_direction_rate_ned_ps
+        b2 = flat.thrust_direction_acceleration_ned_ps2
+        vertical = flat.thrust_mps2 * b[:, 2]
+        vertical_rate = flat.thrust_rate_mps3[2] * b[2, 2] + flat.thrust_mps2[2] * b1[2, 2]
+        course = lead(
+            sample.course_rad[3],
+            sample.course_rate_radps[3],
+            sample.course_acceleration_radps2[3],
+            vehicle.yaw,
+        )
+        return Target(
+            position_ned_m=sample.position_ned_m[0],
+            velocity_ned_mps=sample.velocity_ned_mps[0],
+            direction_ned=b[0],
+            direction_rate_ned_ps=b1[0],
+            vertical_thrust_mps2=float(vertical[0]),
+            tilt_feedforward=lead(b[1, :2], b1[1, :2], b2[1, :2], vehicle.tilt),
+            vertical_feedforward_mps2=float(vertical[2] + vehicle.thrust_lag_s * vertical_rate),
+            course_feedforward_rad=float(course),
+        )
+
+    def problem(self, state: PredictedState, target: Target) -> BoxQuadratic:
+        """J(u) of u = [T (m/s^2), b_cx, b_cy, course (rad)] and its box."""
+        off_position = state.position_ned_m - target.position_ned_m
+        off_velocity = state.velocity_ned_mps - target.velocity_ned_mps
+        off_direction = state.thrust_direction_ned - target.direction_ned
+        off_rate = state.thrust_direction_rate_ned_ps - target.direction_rate_ned_ps
+        upright = float(state.thrust_direction_ned[2])
+        off_thrust = state.thrust_mps2 * upright - target.vertical_thrust_mps2
+        lateral = np.stack([off_position, off_velocity, off_direction, off_rate])[:, :2]
+        vertical = np.array([off_position[2], off_velocity[2], off_thrust])
+
+        nominal = np.empty(4)
+        nominal[0] = target.vertical_feedforward_mps2 / upright
+        nominal[1:3] = target.tilt_feedforward
+        nominal[3] = target.course_feedforward_rad
+        curvature = np.empty(4)
+        curvature[0] = self.vertical.curvature * upright**2
+        curvature[1:3] = self.lateral.curvature
+        curvature[3] = COURSE_CURVATURE
+        slope = np.zeros(4)  # of J at the nominal input
+        slope[0] = upright * (self.vertical.coupling @ vertical)
+        slope[1:3] = self.lateral.coupling @ lateral
+        rest = vertical @ self.vertical.state_cost @ vertical
+        rest += np.sum(lateral * (self.lateral.state_cost @ lateral))
+        gradient = slope - curvature * nominal
+        constant = 0.5 * rest + nominal @ (0.5 * curvature * nominal - slope)
+        lower, upper = self._box(nominal)
+        return BoxQuadratic(np.diag(curvature), gradient, float(constant), lower, upper)
+
+    def warm_up(self) -> None:
+        """Call every code path once, compiled and daqp's, and forget it again."""
+        gravity = self._vehicle.gravity_mps2
+        down = np.array([0.0, 0.0, 1.0])
+        state = PredictedState(
+            0.0, np.zeros(3), np.zeros(3), down, np.zeros(3), 0.0, 0.0, gravity, np.zeros(3),
+            np.zeros(3),
+        )  # fmt: skip
+        level = Command(gravity, (0.0, 0.0, 1.0), 0.0)
+        self.decide(Situation(0.0, state, _Rest(), level, math.inf))
+        self.reset()
+
+    def _box(self, nominal: Array) -> tuple[Array, Array]:
+        """Lower and upper (4,): thrust, |b_c| and |b_c - b_ff| per axis, course about its
+        feed-forward. A feed-forward beyond the tilt limit counts as on it."""
+        settings, vehicle = self._settings, self._vehicle
+        limit = min(settings.tilt_limit, math.sin(vehicle.tilt_max_rad))
+        centre = np.clip(nominal[1:3], -limit, limit)
+        lower, upper = np.empty(4), np.empty(4)
+        lower[0], upper[0] = settings.thrust_floor * vehicle.gravity_mps2, vehicle.thrust_max_mps2
+        lower[1:3] = np.maximum(centre - settings.feedback_limit, -limit)
+        upper[1:3] = np.minimum(centre + settings.feedback_limit, limit)
+        lower[3], upper[3] = nominal[3] - COURSE_BOX_RAD, nominal[3] + COURSE_BOX_RAD
+        return lower, upper
+
+    def _remaining(self, deadline_s: float | None, started: float) -> Callable[[], float] | None:
+        stopwatch = self._stopwatch
+        if stopwatch is None or deadline_s is None:
+            return None
+        return lambda: deadline_s - (stopwatch() - started)
+
+
+class _Rest:
+    """A reference at rest in the origin, for warming up."""
+
+    duration_s = 0.0
+
+    def sample(self, time_s: float | Array) -> FlatSample:
+        scalars = np.zeros(np.shape(time_s))
+        vectors = np.zeros((*scalars.shape, 3))
+        return FlatSample(vectors, vectors, vectors, vectors, vectors, scalars, scalars, scalars)
+
+
+def closed_form(problem: BoxQuadratic) -> Array:
+    """The exact minimiser (n,) of a quadratic whose Hessian is diagonal: clip(-f / h)."""
+    free = -problem.gradient / np.diag(problem.hessian)
+    clipped: Array = np.clip(free, problem.lower, problem.upper)
+    return clipped
+
+
+def _exact_certificate(problem: BoxQuadratic, inputs: Array) -> Certificate:
+    cost = float(problem(inputs))
+    return Certificate(cost=cost, optimal_cost=cost, gap=0.0, at_bound=at_bound(problem, inputs))
+
+
+def _command(inputs: Array) -> Command:
+    thrust, north, east, course = (float(value) for value in inputs)
+    down = math.sqrt(1.0 - north * north - east * east)
+    return Command(thrust, (north, east, down), wrap_pi(course))
+
+
+def _finite(problem: BoxQuadratic) -> bool:
+    return bool(
+        math.isfinite(problem.constant)
+        and np.isfinite(problem.gradient).all()
+        and np.isfinite(problem.lower).all()
+        and np.isfinite(np.diag(problem.hessian)).all()
+    )

@@ -1,0 +1,246 @@
+"""A vehicle behind an autopilot's attitude loop, for tests; independent of observer and law.
+
+The tilt loop is of second order with delay and a limit on its angular acceleration and closes on
+the autopilot's *estimate*; thrust lags; drag; and the estimate errs as PX4's does on its SIH
+simulator, e' = A e + w per axis with true tilt = estimated - e_b. Integrated in steps of 1 ms.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numba
+import numpy as np
+
+from offboard.control.base import Command, Controller, PredictedState, Situation
+from offboard.control.observer import Observer, ObserverSettings
+from offboard.model.frames import quaternion_from_thrust_direction
+from offboard.model.vehicle import Vehicle
+from offboard.reference.base import FlatSample
+
+STEP_S = 1e-3
+
+# e = [e_p, e_v, e_b] north and east, [e_p, e_v] down; densities per root second.
+DRIFT_NORTH = np.array([[-0.06, 0.13, -0.55], [-0.06, -0.135, -2.6], [-0.006, 0.029, -0.0175]])
+DRIFT_EAST = np.array([[-0.34, 0.30, -0.78], [-0.28, -0.06, -4.5], [-0.014, 0.026, 0.008]])
+DRIFT_DOWN = np.array([[-0.05, 0.36, 0.0], [-0.02, -0.07, 0.0], [0.0, 0.0, 0.0]])
+DRIFTS = np.stack([DRIFT_NORTH, DRIFT_EAST, DRIFT_DOWN])
+DENSITIES = np.array([[0.030, 0.044, 0.010], [0.0225, 0.097, 0.012], [0.013, 0.082, 0.0]])
+# Sample to sample: position, velocity, attitude.
+WHITE_SDS = np.array([0.0003, 0.004, 0.0005])
+GAPS_S = (0.008, 0.008, 0.008, 0.016)
+
+
+@dataclass
+class Truth:
+    """What the plant really is; `thrust_scale` is true over believed thrust."""
+
+    vehicle: Vehicle
+    thrust_scale: float = 1.0
+    wind_force_ned_mps2: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    extra_delay_s: float = 0.0
+    noisy: bool = True
+
+
+@numba.njit(cache=True)
+def _run(x, errors, commands, walks, drifts, constants, wind):
+    """x = [p3 v3 b_est2 b_est'2 T psi psi']; commands (n, 5) = [b_n, b_e, b2?, T, course]."""
+    g, c, wn, z, lag, wy, zy, limit = constants
+    h = STEP_S
+    for i in range(len(commands)):
+        bn, be = x[6] - errors[0, 2], x[7] - errors[1, 2]
+        down = np.sqrt(1.0 - bn * bn - be * be)
+        x[10] += (commands[i, 2] - x[10]) * (1.0 - np.exp(-h / lag) if lag > 0 else 1.0)
+        acceleration = (-x[10] * bn, -x[10] * be, g - x[10] * down)
+        for axis in range(3):
+            a = acceleration[axis] - c * x[3 + axis] + wind[axis]
+            x[axis] += h * x[3 + axis] + 0.5 * h * h * a
+            x[3 + axis] += h * a
+        for axis in range(2):
+            twist = wn * wn * (commands[i, axis] - x[6 + axis]) - 2.0 * z * wn * x[8 + axis]
+            twist = min(max(twist, -limit), limit)
+            x[6 + axis] += h * x[8 + axis] + 0.5 * h * h * twist
+            x[8 + axis] += h * twist
+        turn = wy * wy * (commands[i, 3] - x[11]) - 2.0 * zy * wy * x[12]
+        x[11] += h * x[12]
+        x[12] += h * turn
+        for axis in range(3):
+            errors[axis] += h * (drifts[axis] @ errors[axis]) + walks[i, axis]
+
+
+@dataclass
+class Plant:
+    truth: Truth
+    rng: np.random.Generator
+    time_s: float = 0.0
+    x: np.ndarray = field(default_factory=lambda: np.zeros(13))
+    errors: np.ndarray = field(default_factory=lambda: np.zeros((3, 3)))
+
+    def __post_init__(self) -> None:
+        vehicle = self.truth.vehicle
+        self.sent: list[tuple[float, Command]] = []
+        if self.x[10] == 0.0:
+            self.x[10] = vehicle.gravity_mps2
+        self.constants = (
+            vehicle.gravity_mps2,
+            vehicle.drag_per_mass_ps,
+            vehicle.tilt.natural_frequency_radps,
+            vehicle.tilt.damping,
+            vehicle.thrust_lag_s,
+            vehicle.yaw.natural_frequency_radps,
+            vehicle.yaw.damping,
+            vehicle.angular_acceleration_limit_radps2[0],
+        )
+
+    def command(self, command: Command) -> None:
+        self.sent.append((self.time_s, command))
+
+    def advance(self, interval_s: float) -> None:
+        steps = round(interval_s / STEP_S)
+        times = self.time_s + STEP_S * np.arange(steps)
+        rows = np.empty((steps, 4))
+        vehicle, extra = self.truth.vehicle, self.truth.extra_delay_s
+        delays = (vehicle.tilt.delay_s, vehicle.thrust_delay_s, vehicle.yaw.delay_s)
+        for i, time in enumerate(times):
+            rows[i, :2] = self._in_force(time - delays[0] - extra)[1].thrust_direction_ned[:2]
+            thrust = self._in_force(time - delays[1] - extra)[1].thrust_mps2
+            rows[i, 2] = self.truth.thrust_scale * thrust
+            rows[i, 3] = self._in_force(time - delays[2] - extra)[1].course_rad
+        walks = np.zeros((steps, 3, 3))
+        drifts = np.zeros((3, 3, 3))
+        if self.truth.noisy:
+            walks = self.rng.normal(size=walks.shape) * DENSITIES * np.sqrt(STEP_S)
+            drifts = DRIFTS
+        wind = np.array(self.truth.wind_force_ned_mps2)
+        _run(self.x, self.errors, rows, walks, drifts, self.constants, wind)
+        self.time_s = round((self.time_s + interval_s) / STEP_S) * STEP_S
+        self.sent = [s for s in self.sent if s[0] > self.time_s - 1.0] or self.sent[-1:]
+
+    def _in_force(self, time_s: float) -> tuple[float, Command]:
+        held = self.sent[0]
+        for item in self.sent:
+            if item[0] <= time_s + 1e-9:
+                held = item
+        return held
+
+    def position(self) -> tuple[np.ndarray, np.ndarray]:
+        """Position and velocity as the autopilot reports them."""
+        white = self.rng.normal(size=6) * self.truth.noisy
+        position = self.x[:3] + self.errors[:, 0] + WHITE_SDS[0] * white[:3]
+        return position, self.x[3:6] + self.errors[:, 1] + WHITE_SDS[1] * white[3:]
+
+    def attitude(self) -> np.ndarray:
+        """The estimated attitude, FRD -> NED."""
+        tilt = self.x[6:8] + WHITE_SDS[2] * self.truth.noisy * self.rng.normal(size=2)
+        direction = np.array([tilt[0], tilt[1], np.sqrt(1.0 - tilt @ tilt)])
+        return quaternion_from_thrust_direction(direction, self.x[11])
+
+
+@dataclass
+class Lemniscate:
+    """2 sin wt north, 1 sin 2wt east, 3 m high; from rest over the first `run_in_s`."""
+
+    period_s: float
+    run_in_s: float = 4.0
+    course_rad: float = 0.0
+
+    @property
+    def duration_s(self) -> float:
+        return 3600.0
+
+    def sample(self, time_s: float | np.ndarray) -> FlatSample:
+        time = np.asarray(time_s, dtype=np.float64)
+        omega = 2.0 * np.pi / self.period_s
+        phase = _run_in(time, self.run_in_s)
+        north = _composed(2.0, omega, phase)
+        east = _composed(1.0, 2.0 * omega, phase)
+        derivatives = []
+        for order in range(5):
+            down = np.full_like(time, -3.0 if order == 0 else 0.0)
+            derivatives.append(np.stack([north[order], east[order], down], axis=-1))
+        zero = np.zeros_like(time)
+        return FlatSample(*derivatives, zero + self.course_rad, zero, zero)
+
+
+def _run_in(time: np.ndarray, run_in_s: float) -> list[np.ndarray]:
+    """Path time and its derivatives to the fourth: speed 0 -> 1 by a septic smooth step."""
+    speed = np.polynomial.Polynomial([0, 0, 0, 0, 35, -84, 70, -20])
+    u = np.clip(time / run_in_s, 0.0, 1.0)
+    path = speed.integ()(u) * run_in_s + np.maximum(time - run_in_s, 0.0)
+    return [path] + [speed.deriv(k)(u) / run_in_s**k for k in range(4)]
+
+
+def _composed(amplitude: float, omega: float, phase: list[np.ndarray]) -> list[np.ndarray]:
+    """a sin(w s(t)) and its first four time derivatives (Faa di Bruno)."""
+    s, s1, s2, s3, s4 = phase
+    f = [amplitude * omega**k * np.sin(omega * s + 0.5 * np.pi * k) for k in range(5)]
+    return [
+        f[0],
+        f[1] * s1,
+        f[2] * s1**2 + f[1] * s2,
+        f[3] * s1**3 + 3 * f[2] * s1 * s2 + f[1] * s3,
+        f[4] * s1**4 + 6 * f[3] * s1**2 * s2 + f[2] * (3 * s2**2 + 4 * s1 * s3) + f[1] * s4,
+    ]
+
+
+@dataclass
+class Flight:
+    """What a flight left: RMSE and largest error (estimate against reference, 3D) after the
+    run-in, the observer, and how agitated the vehicle was."""
+
+    rmse_m: float
+    largest_m: float
+    rate_sd_radps: float
+    observer: Observer
+    at_bound: float
+
+
+def fly(
+    truth: Truth,
+    controller: Controller,
+    believed: Vehicle,
+    reference: Lemniscate,
+    seed: int,
+    settings: ObserverSettings | None = None,
+    laps: float = 2.0,
+    period_s: float = 0.1,
+    score_from_s: float = 8.0,
+    offset_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    change_state=lambda state: state,
+) -> Flight:
+    """Fly `reference` from rest at its start; decisions at multiples of `period_s`."""
+    plant = Plant(truth, np.random.default_rng(seed))
+    plant.x[:3] = reference.sample(0.0).position_ned_m + np.array(offset_ned_m)
+    plant.x[10] = believed.gravity_mps2
+    observer = Observer(believed, settings or ObserverSettings())
+    command = Command(believed.gravity_mps2, (0.0, 0.0, 1.0), reference.course_rad)
+    plant.command(command)
+    observer.on_command(0.0, command)
+    errors, rates, bounds = [], [], []
+    next_decision_s, message = period_s, 0
+    while plant.time_s < score_from_s + laps * reference.period_s:
+        plant.advance(GAPS_S[message % len(GAPS_S)])
+        message += 1
+        now = plant.time_s
+        observer.on_attitude(now, plant.attitude(), np.zeros(3))
+        position, velocity = plant.position()
+        observer.on_position(now, position, velocity)
+        if now >= score_from_s:
+            errors.append(position - reference.sample(now).position_ned_m)
+            rates.append(plant.x[8:10].copy())
+        if now >= next_decision_s - 1e-9:
+            next_decision_s = (np.floor(now / period_s + 1e-6) + 1) * period_s
+            state: PredictedState = change_state(observer.predict(now))
+            decision = controller.decide(Situation(now, state, reference, command))
+            command = decision.command
+            bounds.append(decision.certificate.at_bound)
+            observer.on_command(now, command)
+            plant.command(command)
+    distances = np.linalg.norm(errors, axis=1)
+    return Flight(
+        rmse_m=float(np.sqrt(np.mean(distances**2))),
+        largest_m=float(distances.max()),
+        rate_sd_radps=float(np.std(np.array(rates)[:, 0])),
+        observer=observer,
+        at_bound=float(np.mean(bounds)),
+    )
