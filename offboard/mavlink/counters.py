@@ -1,0 +1,87 @@
+"""What arrived and what was thrown away, counted by reason.
+
+Knows no message contents. Two sums hold at any time and are tested: every byte received is framed,
+skipped or still pending; every frame is decoded, ignored (nobody asked for that message) or
+dropped for one reason.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import dataclass, field
+from enum import Enum
+
+
+class DropReason(Enum):
+    """Why something that arrived did not become an event; the value is for a human."""
+
+    # bytes that did not become a frame
+    TRUNCATED = "a frame cut short by the end of its datagram"
+    BAD_CRC = "checksum wrong, or no frame at all"
+    INCOMPATIBLE = "incompatibility flags of a later MAVLink"
+    FOREIGN_PEER = "a datagram from somebody other than the vehicle's address"
+    # frames
+    UNKNOWN_ID = "a message id without known checksum seed"
+    ECHO = "our own frame come back"
+    NO_VEHICLE = "before the first heartbeat of an autopilot"
+    UNSUPPORTED_AUTOPILOT = "the heartbeat of an autopilot without dialect"
+    FOREIGN_SYSTEM = "another system id than the vehicle's"
+    FOREIGN_COMPONENT = "another component of the vehicle than its autopilot"
+    NOT_FOR_US = "an acknowledgement addressed to somebody else"
+    IMPLAUSIBLE = "not finite, or out of range"
+    STALE = "older than what was already received of this message"
+
+
+NOT_A_FRAME = frozenset(
+    {
+        DropReason.TRUNCATED,
+        DropReason.BAD_CRC,
+        DropReason.INCOMPATIBLE,
+        DropReason.FOREIGN_PEER,
+    }
+)
+
+
+@dataclass(slots=True)
+class Counters:
+    """Totals since the session began. `lost` counts gaps in the vehicle's sequence numbers."""
+
+    bytes_received: int = 0
+    bytes_framed: int = 0
+    bytes_skipped: int = 0
+    bytes_pending: int = 0
+    frames: int = 0
+    decoded: int = 0
+    ignored: int = 0
+    sequenced: int = 0
+    lost: int = 0
+    dropped: Counter[DropReason] = field(default_factory=Counter)
+
+    @property
+    def dropped_frames(self) -> int:
+        return sum(n for reason, n in self.dropped.items() if reason not in NOT_A_FRAME)
+
+    @property
+    def link_loss(self) -> float:
+        """Share of the vehicle's frames that never arrived, 0 .. 1."""
+        total = self.sequenced + self.lost
+        return self.lost / total if total else 0.0
+
+
+class SequenceTracker:
+    """Counts gaps in one sender's 8-bit sequence numbers into `Counters`."""
+
+    def __init__(self) -> None:
+        self._last: int | None = None
+
+    def note(self, sequence: int, counters: Counters) -> None:
+        counters.sequenced += 1
+        if self._last is None:
+            self._last = sequence
+            return
+        ahead = (sequence - self._last - 1) % 256
+        if ahead < 128:
+            counters.lost += ahead
+            self._last = sequence
+        elif ahead != 255 and counters.lost:  # late, not lost; 255 is a duplicate
+            counters.lost -= 1

@@ -1,0 +1,127 @@
+"""What differs between autopilots at the MAVLink boundary, as data. px4.py and ardupilot.py are
+the instances; nothing else in the product branches on the autopilot's name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum
+
+from offboard.mavlink.outgoing import CommandLong
+
+SET_MODE, TAKEOFF = 176, 22  # MAV_CMD
+CUSTOM_MODE_ENABLED = 1.0  # MAV_MODE_FLAG_CUSTOM_MODE_ENABLED
+TYPE_ONBOARD_CONTROLLER, TYPE_GCS = 18, 6  # MAV_TYPE
+
+
+class ThrustRule(Enum):
+    """What the autopilot does with the normalised thrust."""
+
+    COLLECTIVE = "applies it along the body axis as it is"
+    TILT_COMPENSATED = "divides it by the cosine of the body's tilt"
+
+
+class ParameterEncoding(Enum):
+    """How integers travel in the float of PARAM_VALUE and PARAM_SET."""
+
+    BYTEWISE = "the integer's four bytes"
+    CAST = "the integer's value"
+
+
+class Takeoff(Enum):
+    SETPOINT = "setpoints lift it off"
+    COMMAND = "MAV_CMD_NAV_TAKEOFF lifts it off, altitude above home"
+
+
+@dataclass(frozen=True, slots=True)
+class WantedMessage:
+    """A telemetry message and its rate. An optional one is asked for and not insisted on."""
+
+    message_id: int
+    name: str
+    rate_hz: float
+    optional: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class WatchedParameter:
+    """A parameter read before flight. `required_bits` and `allowed` say what it must be."""
+
+    name: str
+    meaning: str
+    required_bits: int = 0
+    allowed: tuple[float, float] | None = None
+
+    def complaint(self, value: float) -> str | None:
+        """A sentence with the line that mends it, or None when `value` will do."""
+        bits = int(value)
+        if bits & self.required_bits != self.required_bits:
+            mended: float = bits | self.required_bits
+        elif self.allowed is not None and not self.allowed[0] <= value <= self.allowed[1]:
+            mended = min(max(value, self.allowed[0]), self.allowed[1])
+        else:
+            return None
+        return f"{self.name} is {value:g}: {self.meaning}. Mend: param set {self.name} {mended:g}"
+
+
+@dataclass(frozen=True)
+class Dialect:
+    """One autopilot. Modes go by name; `modes` maps HEARTBEAT.custom_mode to it."""
+
+    name: str
+    mav_autopilot: int
+    heartbeat_type: int  # what we say we are
+    modes: Mapping[int, str]
+    mode_parameters: Callable[[int], tuple[float, float, float]]  # custom_mode -> MAV_CMD 176
+    engage_mode: str
+    hold_mode: str
+    land_mode: str
+    return_mode: str
+    first_ack_is_verdict: bool  # of a mode change; else a second one follows within 0.1 s
+    takeoff: Takeoff
+    unused_parameter: float  # of a COMMAND_LONG: "not given" to this autopilot
+    thrust_rule: ThrustRule
+    attitude_type_mask: int  # the one legal SET_ATTITUDE_TARGET.type_mask for attitude + thrust
+    parameter_encoding: ParameterEncoding
+    hover_thrust_parameter: str
+    watched_parameters: tuple[WatchedParameter, ...]
+    stream_timeout_s: float  # vehicle time after which a silent stream is noticed
+    wanted: tuple[WantedMessage, ...]
+
+    def mode_name(self, custom_mode: int) -> str:
+        return self.modes.get(custom_mode) or f"UNKNOWN(0x{custom_mode:08x})"
+
+    def set_mode(self, name: str) -> CommandLong:
+        """MAV_CMD_DO_SET_MODE; ValueError names the modes there are."""
+        for custom_mode, known in self.modes.items():
+            if known == name:
+                return CommandLong(SET_MODE, self.mode_parameters(custom_mode))
+        raise ValueError(
+            f"{self.name} has no mode {name!r}; it has {', '.join(self.modes.values())}"
+        )
+
+    def engage(self) -> CommandLong:
+        return self.set_mode(self.engage_mode)
+
+    def hold(self) -> CommandLong:
+        return self.set_mode(self.hold_mode)
+
+    def land(self) -> CommandLong:
+        return CommandLong.land()
+
+    def take_off(self, altitude_m: float) -> CommandLong:
+        """MAV_CMD_NAV_TAKEOFF here; above home on ArduCopter, above mean sea level on PX4."""
+        unused = self.unused_parameter
+        return CommandLong(TAKEOFF, (0.0, 0.0, 0.0, unused, unused, unused, altitude_m))
+
+    def return_to_launch(self) -> CommandLong:
+        return CommandLong.return_to_launch()
+
+
+TRACKING_TELEMETRY = (
+    WantedMessage(31, "ATTITUDE_QUATERNION", 100.0),
+    WantedMessage(32, "LOCAL_POSITION_NED", 100.0),
+    WantedMessage(245, "EXTENDED_SYS_STATE", 5.0),
+    WantedMessage(1, "SYS_STATUS", 2.0),
+)
