@@ -41,10 +41,9 @@ def sentence(detail: ErrorDetails, document: Any, root: Schema) -> str:
     path, value = _path(location, document)
     allowed = expected(_at(location, root), root)
     if kind in ("union_tag_invalid", "union_tag_not_found"):
-        schema = _at(location, root) or {}
-        tag = str(schema["discriminator"]["propertyName"])
-        path, value = _path((*location, tag), document)
-        allowed = "one of " + ", ".join(schema["discriminator"]["mapping"])
+        discriminator = _discriminator(_at(location, root) or {})
+        path, value = _path((*location, str(discriminator.get("propertyName"))), document)
+        allowed = "one of " + ", ".join(discriminator.get("mapping", ()))
     if kind == "extra_forbidden":
         return _unknown_key(path, _at(location[:-1], root))
     must = f" (must be {allowed})" if allowed else ""
@@ -128,6 +127,13 @@ def _path(location: tuple[int | str, ...], document: Any) -> tuple[str, Any]:
             continue
         keys.append(str(part))
     return ".".join(keys), value
+
+
+def _discriminator(schema: Schema) -> Schema:
+    """Of a tagged union, also of one that may be empty."""
+    unions = (schema, *schema.get("anyOf", ()))
+    found: Schema = next((u["discriminator"] for u in unions if "discriminator" in u), {})
+    return found
 
 
 def _at(location: tuple[int | str, ...], root: Schema) -> Schema | None:

@@ -1,0 +1,333 @@
+"""The rigid body against closed forms, conservation laws and Newton in the inertial frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+from numpy.testing import assert_allclose, assert_array_equal
+from numpy.typing import NDArray
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
+
+from offboard.model.rigid_body import (
+    RK4_SCRATCH_ROWS,
+    derivative,
+    hover_input,
+    pack,
+    rk4_into,
+    rk4_step,
+)
+from offboard.model.state import EULER, QUATERNION, Chart, euler_state, quaternion_state
+from offboard.model.vehicle import Vehicle
+
+Array = NDArray[np.float64]
+
+CHARTS = pytest.mark.parametrize("chart", [EULER, QUATERNION], ids=["euler", "quaternion"])
+NO_INPUT = np.zeros(4)
+
+
+def as_chart(euler: Array, chart: Chart) -> Array:
+    return euler if chart is EULER else quaternion_state(euler)
+
+
+def rotation(state: Array) -> Rotation:
+    """FRD -> NED by SciPy, whichever the chart."""
+    if state.shape[-1] == EULER.size:
+        return Rotation.from_euler("ZYX", state[[2, 1, 0]])
+    return Rotation.from_quat(state[QUATERNION.attitude], scalar_first=True)
+
+
+def velocity_ned(state: Array) -> Array:
+    velocity: Array = (
+        rotation(state).apply(state[EULER.velocity])
+        if state.shape[-1] == EULER.size
+        else state[QUATERNION.velocity]
+    )
+    return velocity
+
+
+def fly(
+    state: Array,
+    inputs: Callable[[float], Array],
+    parameters: Array,
+    duration_s: float,
+    step_s: float,
+    wind_ned: Array | None = None,
+) -> Array:
+    wind = np.zeros(3) if wind_ned is None else wind_ned
+    for k in range(round(duration_s / step_s)):
+        state = rk4_step(state, inputs(k * step_s), parameters, step_s, wind)
+    return state
+
+
+def random_states(count: int, seed: int) -> Array:
+    """Eq. 5 states away from the Euler singularity."""
+    generator = np.random.default_rng(seed)
+    scale = np.repeat([0.8, 2.0, 3.0, 10.0], 3)
+    return generator.uniform(-1.0, 1.0, (count, 12)) * scale
+
+
+@pytest.fixture
+def lopsided() -> Vehicle:
+    """Three different moments of inertia and drags, so that no axis can stand in for another."""
+    return Vehicle(
+        name="lopsided",
+        mass_kg=1.3,
+        inertia_kgm2=(0.02, 0.05, 0.09),
+        arm_m=0.3,
+        drag_translation_npmps=(0.2, 0.5, 0.9),
+        drag_rotation_nmpradps=(0.01, 0.02, 0.03),
+        hover_thrust=0.5,
+        tilt={"delay_s": 0.05, "natural_frequency_radps": 12, "damping": 0.6},
+        yaw={"delay_s": 0.1, "natural_frequency_radps": 4, "damping": 0.6},
+    )
+
+
+@pytest.fixture
+def dragless(lopsided: Vehicle) -> Vehicle:
+    none = (0.0, 0.0, 0.0)
+    return lopsided.model_copy(
+        update={"drag_translation_npmps": none, "drag_rotation_nmpradps": none}
+    )
+
+
+@CHARTS
+def test_free_fall_is_half_g_t_squared(dragless: Vehicle, chart: Chart) -> None:
+    start = as_chart(np.array([0.3, -0.2, 1.0, 0, 0, 0, 0, 0, 0, 1.0, 2.0, -50.0]), chart)
+    end = fly(start, lambda t: NO_INPUT, pack(dragless), duration_s=2.0, step_s=0.1)
+    fallen = 0.5 * dragless.gravity_mps2 * 2.0**2
+    assert_allclose(end[chart.position], [1.0, 2.0, -50.0 + fallen], atol=1e-12)
+    assert_allclose(velocity_ned(end), [0, 0, dragless.gravity_mps2 * 2.0], atol=1e-12)
+
+
+@CHARTS
+def test_hover_is_an_equilibrium_at_every_course(lopsided: Vehicle, chart: Chart) -> None:
+    for course in np.linspace(-3.0, 3.0, 7):
+        state = as_chart(np.array([0, 0, course, 0, 0, 0, 0, 0, 0, 5.0, -7.0, -3.0]), chart)
+        assert_allclose(derivative(state, hover_input(lopsided), pack(lopsided)), 0, atol=1e-15)
+
+
+@CHARTS
+def test_free_spin_keeps_energy_and_angular_momentum(dragless: Vehicle, chart: Chart) -> None:
+    """A torque-free asymmetric body near its unstable middle axis; momentum in NED."""
+    inertia = np.array(dragless.inertia_kgm2)
+    state = as_chart(np.array([0.1, 0.2, 0.3, 0.05, 2.0, 0.02, 1.0, -2.0, 0.5, 0, 0, 0]), chart)
+
+    def energy_and_momentum(state: Array) -> tuple[float, Array]:
+        rates = state[chart.rates]
+        height, speed = -state[chart.position][2], np.linalg.norm(velocity_ned(state))
+        mechanical = dragless.mass_kg * (0.5 * speed**2 + dragless.gravity_mps2 * height)
+        return mechanical + 0.5 * rates @ (inertia * rates), rotation(state).apply(inertia * rates)
+
+    energy, momentum = energy_and_momentum(state)
+    duration_s = 0.5 if chart is EULER else 10.0  # Euler angles would meet their singularity
+    state = fly(state, lambda t: NO_INPUT, pack(dragless), duration_s, step_s=0.001)
+    energy_after, momentum_after = energy_and_momentum(state)
+    assert energy_after == pytest.approx(energy, abs=1e-8)  # of up to 6 kJ falling
+    assert_allclose(momentum_after, momentum, atol=1e-11)
+    if chart is QUATERNION:
+        assert np.linalg.norm(state[QUATERNION.attitude]) == pytest.approx(1.0, abs=1e-15)
+
+
+def test_the_middle_axis_flips(dragless: Vehicle) -> None:
+    """Without the gyroscopic term the conservation test above would hold trivially."""
+    state = quaternion_state(np.array([0, 0, 0, 0.01, 5.0, 0, 0, 0, 0, 0, 0, 0]))
+    rates_y = []
+    for _ in range(400):
+        state = rk4_step(state, NO_INPUT, pack(dragless), 0.01)
+        rates_y.append(state[5])
+    assert min(rates_y) < -4.9
+    assert max(rates_y) > 4.9
+
+
+@CHARTS
+def test_falling_with_drag_approaches_terminal_speed(lopsided: Vehicle, chart: Chart) -> None:
+    """v(t) = (m g / k) (1 - exp(-k t / m)) for a level body."""
+    drag, mass = lopsided.drag_translation_npmps[2], lopsided.mass_kg
+    end = fly(as_chart(np.zeros(12), chart), lambda t: NO_INPUT, pack(lopsided), 3.0, 0.01)
+    terminal = mass * lopsided.gravity_mps2 / drag
+    assert velocity_ned(end)[2] == pytest.approx(terminal * (1 - np.exp(-drag * 3.0 / mass)), 1e-9)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_spin_about_an_axis_decays_with_its_own_drag(lopsided: Vehicle, axis: int) -> None:
+    start = np.zeros(12)
+    start[3 + axis] = 1.5
+    end = fly(quaternion_state(start), lambda t: NO_INPUT, pack(lopsided), 1.0, 0.005)
+    rate = lopsided.drag_rotation_nmpradps[axis] / lopsided.inertia_kgm2[axis]
+    assert end[4 + axis] == pytest.approx(1.5 * np.exp(-rate), rel=1e-9)
+
+
+@pytest.mark.parametrize(("column", "lever"), [(1, 0.3), (2, 0.3), (3, 1.0)])
+def test_only_roll_and_pitch_inputs_have_the_arm(
+    lopsided: Vehicle, column: int, lever: float
+) -> None:
+    inputs = hover_input(lopsided)
+    inputs[column] = 0.07
+    rates_dot = derivative(np.zeros(12), inputs, pack(lopsided))[EULER.rates]
+    expected = np.zeros(3)
+    expected[column - 1] = lever * 0.07 / lopsided.inertia_kgm2[column - 1]
+    assert_allclose(rates_dot, expected, rtol=1e-14)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_acceleration_is_newtons_in_the_inertial_frame(lopsided: Vehicle, seed: int) -> None:
+    """m a = m g + R (lift along -z) - R D R^T (v - wind), with SciPy's rotation."""
+    state = quaternion_state(random_states(1, seed)[0])
+    wind, inputs = np.array([2.0, -1.0, 0.5]), np.array([15.0, 0.1, -0.2, 0.05])
+    turn = rotation(state).as_matrix()
+    drag = turn @ np.diag(lopsided.drag_translation_npmps) @ turn.T
+    force = turn @ [0, 0, -15.0] - drag @ (state[QUATERNION.velocity] - wind)
+    expected = force / lopsided.mass_kg + [0, 0, lopsided.gravity_mps2]
+    slope = derivative(state, inputs, pack(lopsided), wind)
+    assert_allclose(slope[QUATERNION.velocity], expected, rtol=1e-12)
+    assert_allclose(slope[QUATERNION.position], state[QUATERNION.velocity])
+
+
+@CHARTS
+def test_attitude_turns_by_the_body_rates(lopsided: Vehicle, chart: Chart) -> None:
+    """A short step composes with SciPy's exponential of the rates, on the body's side."""
+    step_s = 1e-4
+    state = as_chart(random_states(1, 11)[0], chart)
+    after = rk4_step(state, hover_input(lopsided), pack(lopsided), step_s)
+    middle = 0.5 * (state[chart.rates] + after[chart.rates])
+    expected = rotation(state) * Rotation.from_rotvec(middle * step_s)
+    assert (expected.inv() * rotation(after)).magnitude() < 1e-10
+
+
+@CHARTS
+@pytest.mark.parametrize("wind", [(3.0, -2.0, 0.0), (0.0, 4.0, -1.0)])
+def test_a_level_vehicle_ends_drifting_with_the_wind(
+    lopsided: Vehicle, chart: Chart, wind: tuple[float, float, float]
+) -> None:
+    start = np.zeros(12)
+    start[2] = 0.9
+    end = fly(
+        as_chart(start, chart),
+        lambda t: hover_input(lopsided),
+        pack(lopsided),
+        duration_s=120.0,
+        step_s=0.05,
+        wind_ned=np.array(wind),
+    )
+    assert_allclose(velocity_ned(end), wind, atol=1e-6)
+
+
+def manoeuvre(vehicle: Vehicle, seed: int) -> Callable[[float], Array]:
+    """Smooth random inputs: three sines each, gentle enough to stay off the singularity."""
+    generator = np.random.default_rng(seed)
+    size = np.array([3.0, 0.08, 0.08, 0.03])[:, None] * generator.uniform(-1, 1, (4, 3))
+    frequency = generator.uniform(2.0, 9.0, (4, 3))
+    phase = generator.uniform(0, 2 * np.pi, (4, 3))
+
+    def inputs(time_s: float) -> Array:
+        swing = (size * np.sin(frequency * time_s + phase)).sum(axis=1)
+        return hover_input(vehicle) + swing
+
+    return inputs
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_both_charts_fly_the_same_manoeuvre(lopsided: Vehicle, seed: int) -> None:
+    euler = np.zeros(12)
+    quaternion = quaternion_state(euler)
+    inputs, parameters = manoeuvre(lopsided, seed), pack(lopsided)
+    wind = np.array([1.0, -2.0, 0.3])
+    steepest, drift = 0.0, 0.0
+    for k in range(3000):
+        euler = rk4_step(euler, inputs(k * 0.001), parameters, 0.001, wind)
+        quaternion = rk4_step(quaternion, inputs(k * 0.001), parameters, 0.001, wind)
+        steepest = max(steepest, abs(euler[1]), abs(euler[0]))
+        drift = max(drift, float(np.abs(euler_state(quaternion)[3:] - euler[3:]).max()))
+    assert 0.2 < steepest < 1.4  # a manoeuvre worth the name, off the singularity
+    assert drift < 1e-9
+    assert (rotation(euler).inv() * rotation(quaternion)).magnitude() < 1e-9
+
+
+@CHARTS
+def test_rk4_global_error_falls_with_the_fourth_power(lopsided: Vehicle, chart: Chart) -> None:
+    """Against DOP853 at 1e-13: halving the step divides the error by 16."""
+    inputs, parameters = hover_input(lopsided) + np.array([1, 0.05, -0.04, 0.02]), pack(lopsided)
+    start = as_chart(np.array([0.2, -0.1, 0.4, 2.0, -1.5, 1.0, 3.0, 1.0, -1.0, 0, 0, 0]), chart)
+    exact = solve_ivp(
+        lambda _, x: derivative(x, inputs, parameters),
+        (0.0, 0.8),
+        start,
+        method="DOP853",
+        rtol=1e-13,
+        atol=1e-13,
+    ).y[:, -1]
+    steps = np.array([0.08, 0.04, 0.02, 0.01])
+    errors = [
+        np.abs(fly(start, lambda t: inputs, parameters, 0.8, step_s) - exact).max()
+        for step_s in steps
+    ]
+    order = np.polyfit(np.log(steps), np.log(errors), 1)[0]
+    assert order == pytest.approx(4.0, abs=0.15)
+
+
+@CHARTS
+def test_a_batch_is_the_loop(lopsided: Vehicle, chart: Chart) -> None:
+    generator = np.random.default_rng(5)
+    parameters = pack(lopsided)
+    states = as_chart(random_states(12, 7), chart).reshape(3, 4, chart.size)
+    inputs = hover_input(lopsided) + generator.normal(0, 0.1, (4, 4))
+    wind = generator.normal(0, 2.0, (3, 1, 3))
+    slopes = derivative(states, inputs, parameters, wind)
+    steps = rk4_step(states, inputs, parameters, 0.02, wind)
+    assert slopes.shape == steps.shape == (3, 4, chart.size)
+    for i, j in np.ndindex(3, 4):
+        one = states[i, j], inputs[j], parameters
+        assert_array_equal(slopes[i, j], derivative(*one, wind[i, 0]))
+        assert_array_equal(steps[i, j], rk4_step(*one, 0.02, wind[i, 0]))
+
+
+@CHARTS
+def test_the_compiled_step_may_write_over_its_state(lopsided: Vehicle, chart: Chart) -> None:
+    state = as_chart(random_states(1, 3)[0], chart)
+    inputs, wind = hover_input(lopsided), np.array([1.0, 2.0, 3.0])
+    expected = rk4_step(state, inputs, pack(lopsided), 0.03, wind)
+    scratch = np.empty((RK4_SCRATCH_ROWS, chart.size))
+    rk4_into(state, inputs, wind, pack(lopsided), 0.03, scratch, state)
+    assert_array_equal(state, expected)
+
+
+@CHARTS
+def test_complex_numbers_pass_for_differentiation(lopsided: Vehicle, chart: Chart) -> None:
+    """The complex step through an RK4 step agrees with a five-point difference."""
+    state = as_chart(random_states(1, 9)[0], chart)
+    direction = np.random.default_rng(4).normal(size=chart.size)
+    inputs, parameters = hover_input(lopsided), pack(lopsided)
+
+    def stepped(scale: complex) -> NDArray[np.complex128]:
+        return np.asarray(rk4_step(state + scale * direction, inputs, parameters, 0.05))
+
+    exact = stepped(1e-30j).imag / 1e-30
+    h = 1e-3
+    near, far = stepped(h) - stepped(-h), stepped(2 * h) - stepped(-2 * h)
+    assert_allclose(exact, (8 * near - far).real / (12 * h), rtol=1e-7, atol=1e-8)
+
+
+@pytest.mark.parametrize(
+    "shapes", [((11,), (4,), (3,)), ((12,), (3,), (3,)), ((13,), (4,), (2,)), ((), (4,), (3,))]
+)
+def test_other_lengths_are_refused(
+    lopsided: Vehicle, shapes: tuple[tuple[int, ...], tuple[int, ...], tuple[int, ...]]
+) -> None:
+    state, inputs, wind = (np.zeros(shape) for shape in shapes)
+    with pytest.raises(ValueError, match="12 or 13, 4 and 3"):
+        derivative(state, inputs, pack(lopsided), wind)
+
+
+def test_the_way_between_the_charts_is_a_round_trip() -> None:
+    states = random_states(50, 21).reshape(5, 10, 12)
+    assert_allclose(euler_state(quaternion_state(states)), states, atol=1e-13)
+
+
+def test_velocity_turns_with_the_chart() -> None:
+    """Nose east and body velocity forward: NED velocity is east."""
+    state = np.zeros(12)
+    state[2], state[6] = np.pi / 2, 4.0
+    assert_allclose(quaternion_state(state)[QUATERNION.velocity], [0, 4.0, 0], atol=1e-15)

@@ -1,0 +1,253 @@
+"""Documents: what is accepted, and the exact sentence for what is not."""
+
+from __future__ import annotations
+
+import math
+from enum import Enum
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pydantic import Field, model_validator
+
+from offboard.model.document import DocumentError, override, parse, read, validate
+from offboard.model.vehicle import Parameters, Vehicle
+
+VEHICLES = sorted((Path(__file__).parents[2] / "config" / "vehicles").glob("*.yaml"))
+
+
+class Colour(Enum):
+    RED = "red"
+    BLUE = "blue"
+
+
+class Circle(Parameters):
+    kind: Literal["circle"]
+    radius_m: float = Field(gt=0, le=100)
+
+
+class Line(Parameters):
+    kind: Literal["line"]
+    points: int = Field(ge=2, le=9)
+
+
+class Drawing(Parameters):
+    title: str = Field(min_length=1, max_length=5)
+    scale: float = Field(default=1.0, gt=0, lt=10)
+    tilt_rad: float = 0.0
+    visible: bool = True
+    colour: Colour = Colour.RED
+    corner: tuple[float, float] = (0.0, 0.0)
+    shape: Annotated[Circle | Line, Field(discriminator="kind")] | None = None
+    circles: list[Circle] = Field(default=[])
+    named: dict[str, Circle] = Field(default={})
+
+    @model_validator(mode="after")
+    def _blue_is_flat(self) -> Drawing:
+        if self.colour is Colour.BLUE and self.tilt_rad != 0.0:
+            raise ValueError("a blue drawing is not tilted")
+        return self
+
+
+def problems(text: str, model: type[Parameters] = Drawing) -> tuple[str, ...]:
+    with pytest.raises(DocumentError) as caught:
+        parse(text, model, "d.yaml")
+    assert str(caught.value) == "\n".join(caught.value.problems)
+    return caught.value.problems
+
+
+@pytest.mark.parametrize("path", VEHICLES, ids=lambda path: path.stem)
+def test_the_vehicles_we_ship_are_valid(path: Path) -> None:
+    assert parse(path.read_text(), Vehicle, path.name).name == path.stem
+
+
+@pytest.mark.parametrize(
+    ("text", "number"),
+    [
+        ("1e-3", 1e-3),
+        ("1E3", 1000.0),
+        ("-2.5e+1", -25.0),
+        (".5", 0.5),
+        ("3.", 3.0),
+        ("7", 7.0),
+        ("+4", 4.0),
+        ("010", 10.0),
+        ("0x10", 16.0),
+    ],
+)
+def test_numbers_are_those_of_yaml_1_2(text: str, number: float) -> None:
+    assert parse(f"title: a\ntilt_rad: {text}", Drawing, "d.yaml").tilt_rad == number
+
+
+@pytest.mark.parametrize("text", ["no", "12:30", "off", "'1'", '"true"', "a:b"])
+def test_words_stay_text(text: str) -> None:
+    assert parse(f"title: {text}", Drawing, "d.yaml").title == text.strip("'\"")
+
+
+def test_lists_become_tuples_text_an_enum_and_tags_choose_the_model() -> None:
+    drawing = parse(
+        "title: x\ncolour: blue\ncorner: [1, 2.5]\nshape: {kind: line, points: 3}\n"
+        "named: {sun: {kind: circle, radius_m: 2}}\nvisible: false\n",
+        Drawing,
+        "d.yaml",
+    )
+    assert drawing.colour is Colour.BLUE
+    assert drawing.corner == (1.0, 2.5)
+    assert drawing.shape == Line(kind="line", points=3)
+    assert drawing.named["sun"].radius_m == 2.0
+    assert drawing.visible is False
+
+
+@pytest.mark.parametrize(
+    ("text", "sentences"),
+    [
+        ("scale: -1", ["scale: -1 is out of range (must be a number > 0 and < 10)"]),
+        ("scale: 10.0", ["scale: 10.0 is out of range (must be a number > 0 and < 10)"]),
+        ("scale: big", ["scale: 'big' is not a number > 0 and < 10"]),
+        ("scale: '2'", ["scale: '2' is not a number > 0 and < 10"]),
+        ("scale: true", ["scale: true is not a number > 0 and < 10"]),
+        ("scale:", ["scale: an empty value is not a number > 0 and < 10"]),
+        ("scale: .inf", ["scale: inf is not finite (must be a number > 0 and < 10)"]),
+        ("tilt_rad: .nan", ["tilt_rad: nan is not finite (must be a number)"]),
+        ("tilt_rad: 1e999", ["tilt_rad: inf is not finite (must be a number)"]),
+        ("visible: 1", ["visible: 1 is not true or false"]),
+        ("colour: green", ["colour: 'green' is not one of red, blue"]),
+        ("corner: [1, x]", ["corner.1: 'x' is not a number"]),
+        ("corner: 3", ["corner: 3 is not a list of 2 entries, each a number"]),
+        (
+            "shape: {kind: line, points: 2.5}",
+            ["shape.points: 2.5 is not a whole number >= 2 and <= 9"],
+        ),
+        ("shape: {kind: square}", ["shape.kind: 'square' is not one of circle, line"]),
+        ("shape: {points: 3}", ["shape.kind is missing (must be one of circle, line)"]),
+        (
+            "circles: [{kind: circle, radius_m: 1}, {kind: circle, radius_m: 0}]",
+            ["circles.1.radius_m: 0 is out of range (must be a number > 0 and <= 100)"],
+        ),
+        (
+            "named: {sun: {kind: circle}}",
+            ["named.sun.radius_m is missing (must be a number > 0 and <= 100)"],
+        ),
+        (
+            "shape: {kind: line, point: 3}",
+            [
+                "shape.points is missing (must be a whole number >= 2 and <= 9)",
+                "shape.point is not a known key, did you mean points? (known keys: kind, points)",
+            ],
+        ),
+        (
+            "zzz: 3",
+            [
+                "zzz is not a known key (known keys: circles, colour, corner, named, scale, shape,"
+                " tilt_rad, title, visible)"
+            ],
+        ),
+        ("colour: blue\ntilt_rad: 1", ["a blue drawing is not tilted"]),
+        (
+            "scale: 0\nvisible: maybe",
+            [
+                "scale: 0 is out of range (must be a number > 0 and < 10)",
+                "visible: 'maybe' is not true or false",
+            ],
+        ),
+    ],
+)
+def test_each_problem_is_one_sentence(text: str, sentences: list[str]) -> None:
+    assert problems(f"title: x\n{text}") == tuple(f"d.yaml: {each}" for each in sentences)
+
+
+def test_a_missing_key_says_what_belongs_there() -> None:
+    assert problems("") == ("d.yaml: title is missing (must be text of 1 to 5 characters)",)
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("title: [1", "d.yaml, line 1, column 10: expected ',' or ']', but got '<stream end>'"),
+        ("title: x\n a: b: c", "d.yaml, line 2, column 3: mapping values are not allowed here"),
+        ("title: x\ntitle: y", "d.yaml, line 2, column 1: the key 'title' is given twice"),
+        (
+            "named:\n  a: {kind: circle, kind: line}",
+            "d.yaml, line 2, column 21: the key 'kind' is given twice",
+        ),
+        ("- a\n- b", "d.yaml: expected a mapping of keys to values, not ['a', 'b']"),
+        ("just text", "d.yaml: expected a mapping of keys to values, not 'just text'"),
+        (
+            "title: &t x\ncolour: *t",
+            "d.yaml, line 1, column 8: a value is used twice: aliases are not allowed",
+        ),
+        (
+            "title: &t [*t]",
+            "d.yaml, line 1, column 8: a value is used twice: aliases are not allowed",
+        ),
+        ("title: !!python/name:os.system x", "d.yaml, line 1, column 8: tags are not allowed"),
+        ("? [1, 2]\n: 3", "d.yaml, line 1, column 3: a key must be a single word"),
+        ("a: 1\n---\nb: 2", "d.yaml, line 2, column 1: but found another document"),
+        ("[" * 5000, "d.yaml: nested too deeply"),
+    ],
+)
+def test_what_is_no_document_is_refused_with_its_place(text: str, sentence: str) -> None:
+    assert problems(text) == (sentence,)
+
+
+def test_override_sets_a_copy() -> None:
+    raw = read("title: x\nshape: {kind: line, points: 3}\ncorner: [1, 2]", "d.yaml")
+    changed = override(override(raw, "shape.points=4"), "corner.1=1e-1")
+    changed = override(changed, "named.sun={kind: circle, radius_m: 2}")
+    drawing = validate(changed, Drawing, "d.yaml")
+    assert drawing.shape == Line(kind="line", points=4)
+    assert drawing.corner == (1.0, 0.1)
+    assert drawing.named["sun"].radius_m == 2.0
+    assert raw == {"title": "x", "shape": {"kind": "line", "points": 3}, "corner": [1, 2]}
+
+
+def test_override_keeps_an_equals_sign_in_the_value() -> None:
+    assert override({}, "title=a=b") == {"title": "a=b"}
+
+
+@pytest.mark.parametrize(
+    ("assignment", "sentence"),
+    [
+        (
+            "scal=2",
+            "--set: scal is not a known key, did you mean scale? (known keys: circles, colour,"
+            " corner, named, scale, shape, tilt_rad, title, visible)",
+        ),
+        ("scale.x=2", "--set: scale: {'x': 2} is not a number > 0 and < 10"),
+        ("corner.5=2", "--set: corner: {'5': 2} is not a list of 2 entries, each a number"),
+        ("scale=12", "--set: scale: 12 is out of range (must be a number > 0 and < 10)"),
+        ("scale", "--set scale: expected key.path=value"),
+        ("=3", "--set =3: expected key.path=value"),
+        ("a..b=3", "--set a..b=3: expected key.path=value"),
+        (
+            "scale=[",
+            "--set scale=[, line 1, column 2: expected the node content, but found '<stream end>'",
+        ),
+    ],
+)
+def test_a_bad_override_is_refused_with_the_same_sentences(assignment: str, sentence: str) -> None:
+    raw = read("title: x\ncorner: [1, 2]", "d.yaml")
+    with pytest.raises(DocumentError) as caught:
+        validate(override(raw, assignment), Drawing, "--set")
+    assert caught.value.problems == (sentence,)
+
+
+@given(st.text(st.sampled_from("ab:-[]{}&*!?|>'\"%@#,.0123 \n\t\\\x00\ud800é~"), max_size=40))
+def test_no_text_whatever_raises_anything_else(text: str) -> None:
+    refused: tuple[str, ...] = ()
+    title: object = None
+    try:
+        title = parse(text, Drawing, "fuzz").title
+    except DocumentError as error:
+        refused = error.problems
+    assert bool(refused) != bool(title)
+    assert all(problem.startswith("fuzz") for problem in refused)
+
+
+@given(st.floats(allow_nan=False, allow_infinity=False))
+def test_numbers_survive_to_the_last_bit(number: float) -> None:
+    value = parse(f"title: x\ntilt_rad: {number!r}", Drawing, "d.yaml").tilt_rad
+    assert value == number
+    assert math.copysign(1.0, value) == math.copysign(1.0, number)
