@@ -59,8 +59,13 @@ class _Demand:
     sign: float = 1.0
 
     @property
+    def worst(self) -> int:
+        """Index of the extreme, or of the first value that is not a number."""
+        return int(np.argmax(self.sign * self.values))
+
+    @property
     def extreme(self) -> float:
-        return self.sign * float((self.sign * self.values).max())
+        return float(self.values[self.worst])
 
 
 def check(
@@ -69,8 +74,8 @@ def check(
     """The extremes of a reference, sampled every 10 ms from 0 to its end, without wind.
 
     `ground_down_m` is the ground in the reference's own frame (NED, positive down): 0 when
-    positions are relative to the take-off point. Raises InfeasibleReference at the earliest time
-    at which something is beyond its limit.
+    positions are relative to the take-off point. Raises InfeasibleReference for what is beyond
+    its limit first.
     """
     count = int(np.ceil(reference.duration_s / _STEP_S)) + 1
     times = np.linspace(0.0, reference.duration_s, count)
@@ -102,9 +107,9 @@ def _envelope(
     if broken:
         index, demand = min(broken, key=lambda item: item[0])
         raise InfeasibleReference(
-            f"at {times[index]:.2f} s the reference asks for {demand.what} "
-            f"{demand.values[index]:.3g} {demand.unit}, beyond the limit of "
-            f"{demand.limit:.3g} {demand.unit} (worst: {demand.extreme:.3g} {demand.unit})"
+            f"the reference asks for {demand.what} {demand.extreme:.3g} {demand.unit} at "
+            f"{times[demand.worst]:.2f} s, beyond the limit of {demand.limit:.3g} {demand.unit} "
+            f"(first at {times[index]:.2f} s)"
         )
     return [demand.extreme for demand in demands]
 

@@ -1,0 +1,115 @@
+"""What a vehicle cannot fly is refused with time, value and limit; the figures are hand-made."""
+
+from __future__ import annotations
+
+import math
+import re
+
+import numpy as np
+import pytest
+
+from offboard.model.vehicle import Vehicle
+from offboard.reference.base import FlatSample
+from offboard.reference.catalogue import adapter, build
+from offboard.reference.feasibility import Bounds, InfeasibleReference, check
+from offboard.reference.track import Track
+from offboard.reference.transfer import Hold
+
+
+def vehicle(**changes: object) -> Vehicle:
+    response = {"delay_s": 0.05, "natural_frequency_radps": 11, "damping": 0.6}
+    values = {
+        "name": "test", "mass_kg": 1.0, "gravity_mps2": 9.8, "inertia_kgm2": [0.02, 0.02, 0.03],
+        "drag_translation_npmps": [0, 0, 0], "drag_rotation_nmpradps": [0, 0, 0],
+        "hover_thrust": 0.5, "tilt": response, "yaw": response, "tilt_max_rad": 0.7,
+    }  # fmt: skip
+    return Vehicle.model_validate(values | changes)
+
+
+def track(**settings: object) -> Track:
+    return build(adapter.validate_python(settings))
+
+
+def test_envelope_of_a_circle_by_hand() -> None:
+    envelope = check(
+        track(shape="circle", radius_m=2.0, period_s=8.0, run_in_s=30, run_out_s=30), vehicle()
+    )
+    inward = (2 * math.pi / 8) ** 2 * 2.0
+    assert envelope.thrust_max_mps2 == pytest.approx(math.hypot(9.8, inward), rel=1e-3)
+    assert envelope.tilt_max_rad == pytest.approx(math.atan2(inward, 9.8), rel=1e-3)
+    assert envelope.speed_max_mps == pytest.approx(math.pi / 2, rel=1e-6)
+    assert envelope.height_min_m == 3.0
+    assert envelope.thrust_min_mps2 == pytest.approx(9.8)
+
+
+UP = {"shape": "line", "to_north_m": 0, "speed_mps": 10, "run_out_s": 6, "height_m": 100}
+
+
+@pytest.mark.parametrize(
+    ("settings", "what", "limit"),
+    [
+        ({"shape": "circle", "period_s": 4.0}, "a tilt of", "0.4 rad"),
+        (
+            {"shape": "line", "to_north_m": 200, "speed_mps": 13, "run_in_s": 10},
+            "a speed of",
+            "12 m/s",
+        ),
+        ({"shape": "helix", "climb_mps": -0.4}, "a height of", "0.3 m"),
+        (
+            {"shape": "lemniscate", "period_s": 3.0, "half_length_m": 0.5, "half_width_m": 0.06}
+            | {"course": "along_velocity"},
+            "a yaw rate of",
+            "3.49 rad/s",
+        ),
+        (UP | {"climb_m": 90, "run_in_s": 1.5}, "a thrust of", "18.6 m/s^2"),
+        (UP | {"climb_m": -60, "run_in_s": 1.6}, "a thrust of", "0.98 m/s^2"),
+    ],
+)
+def test_refused_with_time_value_and_limit(
+    settings: dict[str, object], what: str, limit: str
+) -> None:
+    flown = track(**settings)
+    with pytest.raises(InfeasibleReference) as caught:
+        check(flown, vehicle(tilt_max_rad=0.4))
+    sentence = str(caught.value)
+    assert f"beyond the limit of {limit}" in sentence
+    found = re.match(rf"the reference asks for {what} (-?[\d.e+]+) \S+ at ([\d.]+) s, ", sentence)
+    assert found, sentence
+    assert 0.0 < float(found[2]) <= flown.duration_s
+
+
+def test_the_earliest_time_is_named() -> None:
+    class Leap:
+        """Speed grows with time, height falls: the limit met first is the one to name."""
+
+        duration_s = 10.0
+
+        def sample(self, time_s: object) -> FlatSample:
+            time = np.asarray(time_s, dtype=np.float64)
+            zero = np.zeros((*time.shape, 3))
+            position, velocity = zero.copy(), zero.copy()
+            position[..., 2] = -5.0 + time
+            velocity[..., 0] = 2.0 * time
+            course = np.zeros(time.shape)
+            return FlatSample(position, velocity, zero, zero, zero, course, course, course)
+
+    with pytest.raises(
+        InfeasibleReference, match=r"a height of -5 m at 10.00 s, .* 0.3 m \(first at 4.7[01] s"
+    ):
+        check(Leap(), vehicle())
+    with pytest.raises(
+        InfeasibleReference, match=r"a speed of 20 m/s at 10.00 s, .* \(first at 6.0[01] s"
+    ):
+        check(Leap(), vehicle(), ground_down_m=10.0)
+    assert check(Leap(), vehicle(), 10.0, Bounds(speed_max_mps=21.0)).height_min_m == 5.0
+
+
+def test_what_is_not_a_number_is_refused() -> None:
+    with pytest.raises(InfeasibleReference, match="a height of nan m"):
+        check(Hold((0.0, 0.0, math.nan), 0.0), vehicle())
+
+
+def test_long_references_are_checked_in_parts() -> None:
+    envelope = check(track(shape="hover", duration_s=900.0, height_m=2.0), vehicle())
+    assert envelope.height_min_m == 2.0
+    assert envelope.speed_max_mps == 0.0

@@ -1,0 +1,134 @@
+"""CSV tables: what they mean, how smooth they become, and the sentence for every wrong one."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from offboard.model.vehicle import Vehicle
+from offboard.reference.catalogue import adapter, build
+from offboard.reference.feasibility import InfeasibleReference, check
+from offboard.reference.table import TableError, interpolate, parse
+from offboard.reference.track import Track
+
+GOOD = "time_s,north_m,east_m,down_m\n0,0,0,-2\n1,1,0,-2\n2,2,1,-2\n3,3,3,-2.5\n"
+
+
+def table_track(text: str, **settings: object) -> Track:
+    config = adapter.validate_python({"shape": "table", "file": "flown.csv"} | settings)
+    return build(config, text)
+
+
+def test_columns_in_any_order_and_by_any_name() -> None:
+    text = (
+        "\ufeffY_m, altitude_m ,x,time_s,course_deg\n\n"
+        "1,2,3,10,350\n4,5,6,11,10\n7,8,9,12.5,30\n1,1,1,14,0\n"
+    )
+    rows = parse(text, "a.csv")
+    np.testing.assert_allclose(rows.times_s, [0, 1, 2.5, 4])
+    np.testing.assert_allclose(rows.points_ned_m[:2], [[3, 1, -2], [6, 4, -5]])
+    assert rows.course_rad is not None
+    np.testing.assert_allclose(np.degrees(rows.course_rad), [350, 370, 390, 360])
+
+
+def test_passes_through_every_row_with_its_course() -> None:
+    times = np.linspace(0, 12, 25)
+    course = (300 + 15 * times) % 360
+    rows = "".join(
+        f"{t},{2 * math.sin(0.5 * t)},{math.cos(0.5 * t)},{3 + 0.1 * t},{c}\n"
+        for t, c in zip(times, course, strict=True)
+    )
+    track = table_track("time_s,x,y,altitude_m,course_deg\n" + rows)
+    # half of the run-in is spent on the path: rows lie 1 s later, inside the full-speed part
+    inner = (times > 1.0) & (times < 11.0)
+    sample = track.sample(times[inner] + 1.0)
+    t = times[inner]
+    expected = np.stack([2 * np.sin(0.5 * t), np.cos(0.5 * t), -3 - 0.1 * t], -1)
+    np.testing.assert_allclose(sample.position_ned_m, expected, atol=1e-9)
+    np.testing.assert_allclose(np.degrees(sample.course_rad), 300 + 15 * t, atol=1e-8)
+    np.testing.assert_allclose(np.degrees(sample.course_rate_radps), 15, atol=1e-6)
+    middle = np.abs(t - 6.0) < 3.0
+    expected_acceleration = -0.25 * np.stack([2 * np.sin(0.5 * t), np.cos(0.5 * t)], -1)
+    np.testing.assert_allclose(
+        sample.acceleration_ned_mps2[middle, :2], expected_acceleration[middle], atol=2e-3
+    )
+
+
+def test_knots_forgive_rounded_rows() -> None:
+    """100 Hz rows rounded to a millimetre: interpolated they cannot be flown, fitted they can."""
+    times = np.arange(0, 10, 0.01)
+    rows = "".join(
+        f"{t:.2f},{2 * math.sin(0.7 * t):.3f},{math.cos(0.7 * t):.3f},3.000\n" for t in times
+    )
+    text = "time_s,x,y,altitude_m\n" + rows
+    vehicle = Vehicle.model_validate(
+        {
+            "name": "test", "mass_kg": 1.0, "inertia_kgm2": [0.02, 0.02, 0.03],
+            "drag_translation_npmps": [1, 1, 1], "drag_rotation_nmpradps": [0, 0, 0],
+            "hover_thrust": 0.5,
+            "tilt": {"delay_s": 0, "natural_frequency_radps": 10, "damping": 0.6},
+            "yaw": {"delay_s": 0, "natural_frequency_radps": 3, "damping": 0.6},
+        }
+    )  # fmt: skip
+    with pytest.raises(InfeasibleReference, match=r"rate of|tilt of"):
+        check(table_track(text), vehicle)
+    fitted = table_track(text, knot_spacing_s=0.5)
+    envelope = check(fitted, vehicle)
+    assert envelope.rates_max_frd_radps[1] < 0.5
+    s = np.linspace(2.0, 7.0, 100)
+    expected = np.stack([2 * np.sin(0.7 * s), np.cos(0.7 * s)], -1)
+    assert np.abs(fitted.sample(s + 1.0).position_ned_m[:, :2] - expected).max() < 1e-3
+
+
+def test_four_rows_are_enough_and_continuous_to_the_fourth_derivative() -> None:
+    rows = parse(GOOD, "a.csv")
+    spline = interpolate(rows.times_s, rows.points_ned_m)
+    np.testing.assert_allclose(spline.jet(rows.times_s)[0], rows.points_ned_m, atol=1e-12)
+    for knot in rows.times_s[1:-1]:
+        jet = spline.jet(np.array([knot - 1e-9, knot + 1e-9]))
+        np.testing.assert_allclose(jet[:, 0], jet[:, 1], atol=1e-6)
+
+
+def test_a_table_without_course_takes_the_configured_one() -> None:
+    track = table_track(GOOD, course_deg=90.0, run_in_s=1.0, run_out_s=1.0)
+    assert float(track.sample(2.0).course_rad) == math.radians(90.0)
+
+
+def test_an_unread_table_is_a_mistake_of_the_caller() -> None:
+    with pytest.raises(ValueError, match=r"flown\.csv has not been read"):
+        build(adapter.validate_python({"shape": "table", "file": "flown.csv"}))
+
+
+HEAD = "time_s,north_m,east_m,down_m\n"
+BODY = "0,0,0,-2\n1,1,0,-2\n2,2,1,-2\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [
+        ("", r"a\.csv is empty: .* at least 4 rows"),
+        ("\n \n", r"a\.csv is empty"),
+        (HEAD, r"a\.csv has 0 rows of data: at least 4"),
+        (HEAD + BODY, r"a\.csv has 3 rows of data: at least 4"),
+        (HEAD + BODY + "3,x,0,-2\n", r"a\.csv, row 5, column north_m: 'x' is not a finite number"),
+        (HEAD + BODY + "3,0,,-2\n", r"row 5, column east_m: '' is not a finite number"),
+        (HEAD + BODY + "3,0,nan,-2\n", r"row 5, column east_m: 'nan' is not a finite"),
+        (HEAD + BODY + "inf,0,0,-2\n", r"row 5, column time_s: 'inf' is not a finite"),
+        (HEAD + BODY + "\n2,0,0,-2\n", r"row 6, column time_s: 2 does not come after 2"),
+        (HEAD + BODY + "1.5,0,0,-2\n", r"row 5, column time_s: 1\.5 does not come after 2"),
+        (HEAD + BODY + "3,0,0\n", r"row 5: 3 cells for 4 columns"),
+        (HEAD + BODY + "3,0,0,0,0\n", r"row 5: 5 cells for 4 columns"),
+        ("t,x,y,z\n" + BODY, r"row 1: unknown column 't'; known are time_s"),
+        ("time_s,x,y\n" + BODY, r"row 1: one of down_m and altitude_m is needed"),
+        ("time_s,x,y,z,altitude_m\n" + BODY, r"one of down_m and altitude_m is needed, not both"),
+        ("time_s,x,z\n" + BODY, r"row 1: column east_m is missing"),
+        ("time_s,x,y,x_m\n" + BODY, r"row 1: column north_m is there twice"),
+        ("\x00\x01\x02PK", r"a\.csv, row 1: unknown column|not a CSV"),
+        ("0,0,0,-2\n" + BODY, r"row 1: unknown column '0'"),
+    ],
+)
+def test_bad_tables_name_file_row_and_column(text: str, sentence: str) -> None:
+    with pytest.raises(TableError, match=sentence):
+        parse(text, "a.csv")

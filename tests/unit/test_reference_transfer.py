@@ -1,0 +1,106 @@
+"""Transfers against their limits, their ends and the closed form; references moved about."""
+
+from __future__ import annotations
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+
+from offboard.reference.base import FlatSample
+from offboard.reference.catalogue import adapter, build
+from offboard.reference.transfer import Hold, Limits, Placed, Shifted, Transfer, transfer
+
+
+def peaks(flown: Transfer) -> tuple[float, float, float]:
+    sample = flown.sample(np.linspace(0.0, flown.duration_s, 2001))
+    return (
+        float(np.linalg.norm(sample.velocity_ned_mps, axis=-1).max()),
+        float(np.linalg.norm(sample.acceleration_ned_mps2, axis=-1).max()),
+        float(np.abs(sample.course_rate_radps).max()),
+    )
+
+
+def test_rest_to_rest_is_the_smoothstep_of_degree_nine() -> None:
+    flown = transfer((1.0, 2.0, 0.0), (1.0, 2.0, -3.0), 0.3, 0.3)
+    x = np.linspace(0.0, 1.0, 21)
+    smoothstep = 126 * x**5 - 420 * x**6 + 540 * x**7 - 315 * x**8 + 70 * x**9
+    sample = flown.sample(x * flown.duration_s)
+    np.testing.assert_allclose(sample.position_ned_m[:, 2], -3.0 * smoothstep, atol=1e-10)
+    np.testing.assert_allclose(sample.position_ned_m[:, :2], [[1.0, 2.0]] * 21, atol=1e-12)
+    np.testing.assert_allclose(sample.course_rad, 0.3, atol=1e-12)
+
+
+@pytest.mark.parametrize("distance_m", [0.0, 0.2, 3.0, 40.0])
+def test_as_fast_as_the_limits_allow(distance_m: float) -> None:
+    limits = Limits(speed_mps=2.0, acceleration_mps2=1.5, course_rate_radps=0.5)
+    flown = transfer((0, 0, -3), (distance_m, 0, -3), 0.0, 1.0, limits)
+    speed, acceleration, rate = peaks(flown)
+    ratio = max(speed / 2.0, acceleration / 1.5, rate / 0.5)
+    assert 0.85 < ratio <= 1.001
+
+
+def test_moving_start_is_taken_over_and_ends_at_rest() -> None:
+    flown = transfer(
+        (1, 2, -3), (4, 0, -5), 3.0, -3.0, Limits(speed_mps=3.0),
+        start_velocity_ned_mps=(1.0, -0.5, 0.2), start_acceleration_ned_mps2=(0.3, 0.1, -0.2),
+    )  # fmt: skip
+    start, end = flown.sample(0.0), flown.sample(flown.duration_s)
+    np.testing.assert_allclose(start.position_ned_m, [1, 2, -3], atol=1e-12)
+    np.testing.assert_allclose(start.velocity_ned_mps, [1.0, -0.5, 0.2], atol=1e-12)
+    np.testing.assert_allclose(start.acceleration_ned_mps2, [0.3, 0.1, -0.2], atol=1e-12)
+    np.testing.assert_allclose(end.position_ned_m, [4, 0, -5], atol=1e-9)
+    for name in ("velocity_ned_mps", "acceleration_ned_mps2", "jerk_ned_mps3", "snap_ned_mps4"):
+        np.testing.assert_allclose(getattr(end, name), 0.0, atol=1e-8)
+    # the short way through pi
+    assert float(start.course_rad) == pytest.approx(3.0)
+    assert float(end.course_rad) == pytest.approx(2 * math.pi - 3.0)
+    assert peaks(flown)[0] <= 3.001
+
+
+def test_a_start_faster_than_the_limit_still_stops() -> None:
+    flown = transfer((0, 0, -10), (1, 0, -10), 0, 0, start_velocity_ned_mps=(6.0, 0, 0))
+    assert flown.duration_s < 60
+    assert np.all(flown.sample(flown.duration_s + 5).velocity_ned_mps == 0)
+    np.testing.assert_allclose(flown.sample(1e6).position_ned_m, [1, 0, -10], atol=1e-8)
+
+
+def test_a_start_that_is_not_finite_is_refused() -> None:
+    with pytest.raises(ValueError, match="finite start"):
+        transfer((math.nan, 0, 0), (1, 0, 0), 0, 0)
+
+
+def test_derivatives_are_those_of_the_position() -> None:
+    flown = transfer((0, 0, 0), (2, 1, -3), 0.1, 2.0, start_velocity_ned_mps=(0.5, 0, 0))
+    times = np.linspace(0.1, flown.duration_s - 0.1, 50)
+    h = 1e-4
+    names = FlatSample.__slots__
+    for lower, upper in itertools.pairwise(names):
+        if upper == "course_rad":  # snap and course: no derivative of one another
+            continue
+        slope = (
+            getattr(flown.sample(times + h), lower) - getattr(flown.sample(times - h), lower)
+        ) / (2 * h)
+        np.testing.assert_allclose(getattr(flown.sample(times), upper), slope, atol=1e-5)
+
+
+def test_shifted_placed_and_held() -> None:
+    track = build(adapter.validate_python({"shape": "circle", "course": "along_velocity"}))
+    moved = Placed(Shifted(track, 100.0), (10.0, -5.0, 2.0))
+    assert moved.duration_s == track.duration_s + 100.0
+    times = np.array([[90.0, 101.0], [110.0, 200.0]])
+    there, here = moved.sample(times), track.sample(times - 100.0)
+    np.testing.assert_allclose(
+        there.position_ned_m - here.position_ned_m, np.broadcast_to([10, -5, 2], (2, 2, 3))
+    )
+    for name in FlatSample.__slots__[1:]:
+        np.testing.assert_array_equal(getattr(there, name), getattr(here, name))
+    hold = Hold((1.0, 2.0, -3.0), 0.4)
+    assert hold.duration_s == 0.0
+    for time_s in (5.0, times):
+        sample = hold.sample(time_s)
+        assert sample.position_ned_m.shape == (*np.shape(time_s), 3)
+        np.testing.assert_array_equal(sample.position_ned_m[..., 2], -3.0)
+        np.testing.assert_array_equal(sample.course_rad, np.full(np.shape(time_s), 0.4))
+        assert np.all(sample.velocity_ned_mps == 0.0)
