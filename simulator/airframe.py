@@ -130,11 +130,16 @@ def advance_airframe(
     mean = 0.5 * (before + rotor[THRUST])
     north, east, down = body[7], body[8], body[9]
     inputs[0] = strength * rotor_constants[0] * mean * _ground_gain(body[12], rotor_constants[3])
-    _torques(body, turn_demand, min(mean / rotor_constants[2], 1.0), body_constants, inputs)
+    # Standing on its legs it cannot be turned
+    authority = 0.0 if rotor[CONTACT] > 0.5 else min(mean / rotor_constants[2], 1.0)
+    _torques(body, turn_demand, authority, body_constants, inputs)
     part_s = step_s / substeps
     for _ in range(substeps):
+        stands, stand_north, stand_east = rotor[CONTACT] > 0.5, body[10], body[11]
         rk4_into(body, inputs, wind_ned, body_constants, part_s, scratch, body)
         rotor[CONTACT] = _touch_ground(body, part_s)
+        if stands and rotor[CONTACT] > 0.5 and body[7] == 0.0 and body[8] == 0.0:
+            body[10], body[11] = stand_north, stand_east  # gripped: it did not creep either
     rotor[3] = (body[7] - north) / step_s
     rotor[4] = (body[8] - east) / step_s
     rotor[5] = (body[9] - down) / step_s

@@ -1,0 +1,57 @@
+"""Flights the simulator tests start from: vehicle files, a settled hover, a recorded response."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from offboard.model.frames import euler_from_quaternion, quaternion_from_euler
+from offboard.model.vehicle import Vehicle
+from simulator.plant import STEP_S, Conditions, Demand, Plant
+
+VEHICLES = Path(__file__).parents[2] / "config" / "vehicles"
+CALM = Conditions()
+
+
+def load(name: str) -> Vehicle:
+    return Vehicle(**yaml.safe_load((VEHICLES / f"{name}.yaml").read_text()))
+
+
+def attitude(roll_deg: float = 0.0, pitch_deg: float = 0.0, yaw_deg: float = 0.0):
+    angles = [math.radians(angle) for angle in (roll_deg, pitch_deg, yaw_deg)]
+    return tuple(quaternion_from_euler(*angles))
+
+
+def hovering(vehicle: Vehicle, conditions: Conditions = CALM, seed: int = 1) -> Plant:
+    """At rest (1 mm/s by truth, if the air is calm) some metres up, level, nose north."""
+    plant = Plant(vehicle, conditions, seed)
+    plant.advance(1.5, Demand(True, 1.4 * vehicle.hover_thrust, attitude()))
+    for _ in range(500):
+        down = plant.truth.velocity_ned_mps[2]
+        thrust = vehicle.hover_thrust * (1.0 + 0.2 * down)
+        plant.advance(0.02, Demand(True, thrust, attitude()))
+    return plant
+
+
+def response(plant: Plant, demand: Demand, duration_s: float, read) -> tuple:
+    """Times since the demand and what `read(truth)` says, at every step."""
+    values = []
+    for _ in range(round(duration_s / STEP_S)):
+        plant.advance(STEP_S, demand)
+        values.append(read(plant.truth))
+    return np.arange(1, len(values) + 1) * STEP_S, np.array(values)
+
+
+def euler_deg(truth) -> np.ndarray:
+    return np.degrees(euler_from_quaternion(truth.attitude))
+
+
+def crossing(times, values, level: float) -> float:
+    """First time at which the response passes `level` (interpolated)."""
+    i = int(np.argmax(values > level))
+    before = values[i - 1] if i else 0.0
+    start = times[i - 1] if i else 0.0
+    return start + (times[i] - start) * (level - before) / (values[i] - before)

@@ -1,0 +1,227 @@
+"""Rotors, ground and battery round the rigid body, against closed forms and measured figures."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from sim_hover import attitude, hovering, load, response
+
+from offboard.model.frames import euler_from_quaternion, thrust_direction_from_quaternion
+from simulator.airframe import Battery
+from simulator.plant import STEP_S, Conditions, Demand, Plant
+
+PX4 = load("px4_sih")
+G = PX4.gravity_mps2
+LEVEL = attitude()
+
+
+def _down_velocity(truth) -> float:
+    return truth.velocity_ned_mps[2]
+
+
+def _climbing(thrust: float, duration_s: float, **more) -> Plant:
+    plant = Plant(PX4, Conditions(**more), 1)
+    plant.advance(duration_s, Demand(True, thrust, LEVEL))
+    return plant
+
+
+# Measured on PX4: up .70, 1.72, 2.82 and down .82, 1.04, 2.89 m/s^2 for the same three steps
+@pytest.mark.parametrize(("step", "measured"), [(0.05, 0.76), (0.10, 1.38), (0.20, 2.855)])
+def test_thrust_step_on_px4_gives_the_measured_vertical_acceleration(step, measured):
+    means = []
+    for sign in (1.0, -1.0):
+        demand = Demand(True, 0.489 + sign * step, LEVEL)
+        _, down = response(hovering(PX4), demand, 0.6, _down_velocity)
+        means.append(-sign * (down[124] - down[24]) / 0.4)  # 0.1 to 0.5 s
+    assert np.mean(means) == pytest.approx(measured, rel=0.15)
+
+
+# Measured on ArduCopter: mean vertical acceleration .3-.9 s after the step, with its drag
+@pytest.mark.parametrize(
+    ("step", "measured"),
+    [(-0.15, -3.45), (-0.10, -2.20), (-0.05, -1.08), (0.05, 1.18), (0.10, 2.16), (0.15, 3.12)],
+)
+def test_thrust_step_on_arducopter_gives_the_measured_vertical_acceleration(step, measured):
+    vehicle = load("arducopter")
+    demand = Demand(True, vehicle.hover_thrust + step, LEVEL)
+    times, down = response(hovering(vehicle), demand, 1.0, _down_velocity)
+    at = np.interp([0.3, 0.9], times, down)
+    assert -(at[1] - at[0]) / 0.6 == pytest.approx(measured, rel=0.12)
+
+
+def test_thrust_follows_with_delay_and_first_order_lag():
+    demand = Demand(True, 0.6, LEVEL)
+    times, thrust = response(hovering(PX4), demand, 0.5, lambda t: t.thrust)
+    start = PX4.hover_thrust
+    share = (thrust - start) / (0.6 - start)
+    expected = 1.0 - np.exp(-np.maximum(times - 0.015, 0.0) / 0.05)
+    assert np.abs(share - expected).max() < 0.06  # one step of 4 ms on a lag of 50 ms
+    assert share[-1] == pytest.approx(1.0, abs=1e-3)
+
+
+def test_motors_off_in_the_air_is_free_fall_with_drag():
+    plant = hovering(PX4)
+    times, down = response(plant, Demand(False), 0.6, _down_velocity)
+    rate = PX4.drag_translation_npmps[2] / PX4.mass_kg
+    # the rotors run down with their lag: thrust g exp(-t/lag)
+    decay = np.exp(-times / PX4.thrust_lag_s)
+    still = np.exp(-rate * times)
+    expected = G * (1 - still) / rate - G * (decay - still) / (rate - 1 / PX4.thrust_lag_s)
+    assert np.abs(down - expected).max() < 0.02
+    assert down[-1] > 3.4  # PX4, zero thrust: 3.4 m/s after 0.6 s from the command
+
+
+def test_nan_thrust_falls_as_zero_thrust_does():
+    falls = [
+        response(hovering(PX4), Demand(True, thrust, LEVEL), 0.6, _down_velocity)[1]
+        for thrust in (math.nan, 0.0)
+    ]
+    assert falls[0][-1] > 3.0
+    assert np.array_equal(falls[0], falls[1])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5, 0.98])
+def test_vehicle_stays_on_the_ground_below_its_weight(share):
+    tilted = attitude(roll_deg=15.0)
+    plant = Plant(PX4, Conditions(wind_ned_mps=(4.0, -3.0, 0.0)), 1)
+    plant.advance(5.0, Demand(True, share * PX4.hover_thrust, LEVEL))
+    assert plant.truth.on_ground
+    plant.advance(5.0, Demand(True, 0.5 * share * PX4.hover_thrust, tilted))
+    truth = plant.truth
+    assert truth.on_ground
+    assert truth.position_ned_m[2] == 0.0
+    assert truth.attitude == pytest.approx([1.0, 0.0, 0.0, 0.0], abs=1e-12)
+    if share < 0.9:
+        assert np.abs(truth.position_ned_m).max() < 1e-12
+        assert np.abs(truth.velocity_ned_mps).max() < 1e-12
+
+
+def test_vehicle_lifts_off_just_above_its_weight_and_not_before_the_delay():
+    plant = Plant(PX4, Conditions(), 1)
+    demand = Demand(True, 1.02 * PX4.hover_thrust, LEVEL)
+    times, carried = response(plant, demand, 1.0, lambda t: t.on_ground)
+    spool_up = PX4.thrust_delay_s + PX4.thrust_lag_s * math.log(1.02 / 0.02)
+    assert times[np.argmin(carried)] == pytest.approx(spool_up, abs=2 * STEP_S)
+    assert not carried[-1]
+
+
+def test_landing_at_seven_tenths_of_a_metre_per_second_ends_at_rest():
+    plant = hovering(PX4)
+    plant.advance(0.5, Demand(True, PX4.hover_thrust, attitude(pitch_deg=-5.0)))
+    heights, speeds = [], []
+    while not plant.truth.on_ground:
+        error = plant.truth.velocity_ned_mps[2] - 0.7
+        thrust = PX4.hover_thrust * (1.0 + error)
+        plant.advance(0.02, Demand(True, thrust, LEVEL))
+        speeds.append(plant.truth.velocity_ned_mps[2])
+        assert len(speeds) < 2000
+    assert speeds[-2] == pytest.approx(0.7, abs=0.15)
+    for _ in range(100):
+        plant.advance(0.02, Demand(True, 0.3 * PX4.hover_thrust, LEVEL))
+        heights.append(-plant.truth.position_ned_m[2])
+    assert max(map(abs, heights)) == 0.0
+    assert np.abs(plant.truth.velocity_ned_mps).max() < 1e-12
+
+
+def test_crash_upside_down_at_speed_is_survived_and_ends_level():
+    plant = _climbing(0.9, 4.0)
+    plant.advance(0.8, Demand(True, 0.5, attitude(roll_deg=180.0, yaw_deg=40.0)))
+    assert thrust_direction_from_quaternion(plant.truth.attitude)[2] < 0.0
+    _, heights = response(plant, Demand(False), 6.0, lambda t: -t.position_ned_m[2])
+    truth = plant.truth
+    assert heights.max() > 5.0
+    assert heights.min() == 0.0
+    assert truth.on_ground
+    assert thrust_direction_from_quaternion(truth.attitude) == pytest.approx([0, 0, 1], abs=1e-9)
+    assert np.linalg.norm(truth.attitude) == pytest.approx(1.0, abs=1e-12)
+    assert np.abs(truth.velocity_ned_mps).max() < 1e-12
+
+
+def test_course_survives_standing_on_the_ground():
+    plant = hovering(PX4)
+    plant.advance(4.0, Demand(True, PX4.hover_thrust, attitude(yaw_deg=70.0)))
+    course = euler_from_quaternion(plant.truth.attitude)[2]
+    plant.advance(6.0, Demand(False))
+    assert plant.truth.on_ground
+    assert euler_from_quaternion(plant.truth.attitude)[2] == pytest.approx(course, abs=0.05)
+    assert math.degrees(course) == pytest.approx(70.0, abs=2.0)
+
+
+@pytest.mark.parametrize(("thrust_scale", "mass_scale"), [(0.85, 1.0), (1.0, 1.2), (0.85, 1.2)])
+def test_wrong_thrust_and_mass_act_as_they_should(thrust_scale, mass_scale):
+    plant = _climbing(
+        0.8, 0.5, thrust_scale=thrust_scale, mass_scale=mass_scale
+    )  # still slow: read the acceleration with its drag taken off
+    truth = plant.truth
+    drag = PX4.drag_translation_npmps[2] / (PX4.mass_kg * mass_scale)
+    felt = truth.acceleration_ned_mps2[2] + drag * truth.velocity_ned_mps[2]
+    expected = G * (1.0 - 0.8 / PX4.hover_thrust * thrust_scale / mass_scale)
+    assert felt == pytest.approx(expected, rel=5e-3)
+
+
+def test_motor_weakening_begins_at_its_time():
+    weakened = {"at_s": 0.8, "thrust_scale": 0.7}
+    plant = _climbing(0.8, 0.8, weakening=weakened)
+    before = plant.truth.acceleration_ned_mps2[2]
+    assert before == pytest.approx(_climbing(0.8, 0.8).truth.acceleration_ned_mps2[2], abs=1e-12)
+    plant.advance(STEP_S, Demand(True, 0.8, LEVEL))
+    after = plant.truth.acceleration_ned_mps2[2]
+    assert after - before == pytest.approx(0.3 * G * 0.8 / PX4.hover_thrust, rel=0.02)
+
+
+def test_ground_effect_lifts_near_the_ground_only():
+    share = 0.96  # of hover thrust: flies in ground effect and not without it
+    assert not _climbing(share * PX4.hover_thrust, 2.0, ground_effect=True).truth.on_ground
+    assert _climbing(share * PX4.hover_thrust, 2.0).truth.on_ground
+    high = _climbing(share * PX4.hover_thrust, 60.0, ground_effect=True).truth
+    assert 0.0 < -high.position_ned_m[2] < 0.3
+
+
+def test_torque_needs_thrust():
+    """With the rotors stopped an attitude demand turns nothing; with thrust it does."""
+    plant = _climbing(0.8, 2.0)
+    plant.advance(0.3, Demand(True, 0.0, LEVEL))
+    plant.advance(0.3, Demand(True, 0.0, attitude(roll_deg=30.0)))
+    assert abs(euler_from_quaternion(plant.truth.attitude)[0]) < math.radians(0.5)
+    plant.advance(0.4, Demand(True, 0.5, attitude(roll_deg=30.0)))
+    assert abs(euler_from_quaternion(plant.truth.attitude)[0]) > math.radians(15.0)
+
+
+def test_level_flight_drifts_with_the_wind():
+    wind = (3.0, -1.5, 0.0)
+    plant = hovering(PX4, Conditions(wind_ned_mps=wind))
+    plant.advance(10.0, Demand(True, PX4.hover_thrust, LEVEL))
+    assert plant.truth.velocity_ned_mps == pytest.approx(wind, abs=0.01)
+    assert plant.truth.wind_ned_mps == pytest.approx(wind, abs=1e-12)
+
+
+def test_battery_empties_by_the_current_and_sags_under_load():
+    battery = Battery(capacity_ah=1.0, hover_current_a=12.0, resistance_ohm=0.05)
+    plant = Plant(PX4, Conditions(battery=battery), 1)
+    full = plant.truth.battery
+    assert (full.voltage_v, full.current_a, full.remaining) == pytest.approx((16.8, 0.0, 1.0))
+    plant.advance(60.0, Demand(True, PX4.hover_thrust, LEVEL))
+    used = plant.truth.battery
+    assert used.current_a == pytest.approx(12.0, rel=1e-6)
+    assert used.remaining == pytest.approx(1.0 - 12.0 * 60.0 / 3600.0, abs=1e-3)
+    assert used.voltage_v == pytest.approx(4 * (3.5 + 0.7 * 0.8) - 0.05 * 12.0, abs=0.01)
+    plant.advance(600.0, Demand(True, PX4.hover_thrust, LEVEL))
+    assert plant.truth.battery.remaining == 0.0
+
+
+def test_a_vehicle_of_almost_pure_drag_stays_finite():
+    """Explicit integration of a drag of 1000 1/s at 4 ms would explode."""
+    feather = PX4.model_copy(
+        update={
+            "mass_kg": 0.02,
+            "drag_translation_npmps": (20.0, 20.0, 20.0),
+            "drag_rotation_nmpradps": (5.0, 5.0, 5.0),
+            "inertia_kgm2": (0.01, 0.01, 0.01),
+        }
+    )
+    plant = Plant(feather, Conditions(wind_ned_mps=(5.0, 0.0, 0.0)), 1)
+    plant.advance(4.0, Demand(True, 0.9, attitude(roll_deg=20.0)))
+    assert plant.truth.velocity_ned_mps[0] == pytest.approx(5.0, abs=0.1)
+    assert np.isfinite(plant.truth.attitude).all()
