@@ -24,3 +24,8 @@ def sleep_until(deadline_s: float) -> float:
     if remaining_s > 0:
         time.sleep(remaining_s)
     return time.monotonic() - deadline_s
+
+
+def local_stamp() -> str:
+    """Local date and time for the names of things, as 20261121-093000."""
+    return time.strftime("%Y%m%d-%H%M%S")

@@ -1,9 +1,9 @@
 """Byte links: UDP, TCP and serial behind one small contract. No MAVLink here.
 
-    udpin:HOST:PORT    wait on a port; the peer is whoever the session accepts
-    udpout:HOST:PORT   send to a fixed peer
-    tcp:HOST:PORT      connect to a listening autopilot (ArduPilot SITL)
-    serial:DEVICE:BAUD
+udpin:HOST:PORT    wait on a port; the peer is whoever the session accepts
+udpout:HOST:PORT   send to a fixed peer
+tcp:HOST:PORT      connect to a listening autopilot (ArduPilot SITL)
+serial:DEVICE:BAUD
 """
 
 from __future__ import annotations
@@ -124,7 +124,9 @@ class SerialLink:
         try:
             self._port = serial.Serial(device, baud, timeout=0, write_timeout=0.05)
         except (serial.SerialException, ValueError) as error:
-            raise LinkError(f"serial port {device} at {baud} baud cannot be opened: {error}") from None
+            raise LinkError(
+                f"serial port {device} at {baud} baud cannot be opened: {error}"
+            ) from None
         self._error = serial.SerialException
         self.send_errors = 0
 

@@ -1,4 +1,4 @@
-"""The references of one flight in vehicle time: climb to the start, the track, the rest after it."""
+"""The references of one flight in vehicle time: climb to the start, the track, the rest."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from offboard.reference.base import FlatSample, Reference
 from offboard.reference.track import Track
-from offboard.reference.transfer import Hold, Placed, Shifted, Transfer
+from offboard.reference.transfer import Placed, Shifted, transfer
 
 Array = NDArray[np.float64]
 SETTLED_DISTANCE_M = 0.3
@@ -21,7 +21,7 @@ class Mission:
 
     def __init__(self, track: Track) -> None:
         self._track = track
-        self._origin_ned_m = np.zeros(3)
+        self._origin_ned_m = (0.0, 0.0, 0.0)
         self._join_s = math.nan
         self._arrival_s = math.nan
         self.reference: Reference | None = None
@@ -30,31 +30,27 @@ class Mission:
     def track(self) -> Track:
         return self._track
 
-    def settle(self, position_ned_m: Array) -> None:
+    def settle(self, position_ned_m: tuple[float, float, float]) -> None:
         """Remember the take-off point: references are given relative to it."""
-        self._origin_ned_m = np.array(position_ned_m, dtype=float)
+        self._origin_ned_m = position_ned_m
 
     def lift_off(self, time_s: float, position: Array, velocity: Array, course_rad: float) -> None:
         """Plan from the present state to rest at the start of the track."""
         start = self._placed().sample(0.0)
-        transfer = Transfer(
-            position_ned_m=position,
-            velocity_ned_mps=velocity,
-            course_rad=course_rad,
-            target_ned_m=start.position_ned_m,
-            target_course_rad=float(start.course_rad),
+        climb = transfer(
+            position,
+            start.position_ned_m,
+            course_rad,
+            float(start.course_rad),
+            start_velocity_ned_mps=velocity,
         )
-        self._arrival_s = time_s + transfer.duration_s
-        self.reference = Shifted(transfer, time_s)
+        self._arrival_s = time_s + climb.duration_s
+        self.reference = Shifted(climb, time_s)
 
     def join(self, time_s: float) -> None:
         """Start the track's own clock."""
         self._join_s = time_s
         self.reference = Shifted(self._placed(), time_s)
-
-    def hold(self, position_ned_m: Array, course_rad: float) -> None:
-        """Rest at a point, for rehearsals."""
-        self.reference = Hold(position_ned_m, course_rad)
 
     def track_time_s(self, time_s: float) -> float:
         """Time on the track's own axis; NaN before it is joined."""

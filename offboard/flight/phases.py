@@ -10,6 +10,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
+from pydantic import Field
+
+from offboard.model.vehicle import Parameters
+
 
 class Phase(Enum):
     """In flight order; the last three end the flight."""
@@ -32,12 +36,8 @@ class Phase(Enum):
 
 PHASES = tuple(Phase)
 ENDS = frozenset({Phase.DISARMED, Phase.YIELDED, Phase.FAILED})
-ON_GROUND = frozenset(
-    {Phase.CONNECT, Phase.HEALTH, Phase.STREAM, Phase.ENGAGE, Phase.ARM}
-)
-UNDER_CONTROL = frozenset(
-    {Phase.TAKEOFF, Phase.CLIMB, Phase.JOIN, Phase.TRACK, Phase.HOVER}
-)
+ON_GROUND = frozenset({Phase.CONNECT, Phase.HEALTH, Phase.STREAM, Phase.ENGAGE, Phase.ARM})
+UNDER_CONTROL = frozenset({Phase.TAKEOFF, Phase.CLIMB, Phase.JOIN, Phase.TRACK, Phase.HOVER})
 
 
 class ExitCode:
@@ -50,21 +50,21 @@ class ExitCode:
     ABORTED = 4
 
 
-@dataclass(frozen=True, slots=True)
-class Limits:
-    """How long each wait may last, and what is flown no further. Seconds and SI."""
+class Limits(Parameters):
+    """How long each wait may last, and what is flown no further. Seconds of vehicle time (wall
+    time before telemetry flows and for silence), SI."""
 
-    connect_s: float = 20.0
-    health_s: float = 90.0
-    stream_s: float = 1.0
-    engage_s: float = 10.0
-    arm_s: float = 15.0
-    lift_off_s: float = 15.0
-    climb_s: float = 60.0
-    land_s: float = 90.0
-    silence_s: float = 1.0
-    position_error_m: float = 5.0
-    tilt_rad: float = 1.3
+    connect_s: float = Field(default=20.0, gt=0, le=600)
+    health_s: float = Field(default=90.0, gt=0, le=600)
+    stream_s: float = Field(default=1.0, ge=0.6, le=10)
+    engage_s: float = Field(default=10.0, gt=0, le=60)
+    arm_s: float = Field(default=15.0, gt=0, le=60)
+    lift_off_s: float = Field(default=8.0, gt=0, le=30)
+    climb_s: float = Field(default=120.0, gt=0, le=600)
+    land_s: float = Field(default=90.0, gt=0, le=600)
+    silence_s: float = Field(default=1.0, ge=0.2, le=60)
+    position_error_m: float = Field(default=5.0, gt=0.1, le=100)
+    tilt_rad: float = Field(default=1.3, gt=0.2, le=1.5)
 
 
 @dataclass(frozen=True, slots=True)

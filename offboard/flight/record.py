@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import astuple, dataclass, fields
 
+from offboard.control.base import Decision, PredictedState
+
 RECORD_NAME = "pso"
 RECORD_ID = 1
 
@@ -47,6 +49,50 @@ class TickRecord:
     def data(self) -> tuple[float, ...]:
         """The values in the order of DEBUG_FLOAT_ARRAY.data."""
         return astuple(self)
+
+    @classmethod
+    def of(
+        cls,
+        *,
+        phase: int,
+        decision: Decision,
+        state: PredictedState,
+        lateness_s: float,
+        missed_ticks: int,
+        hover_thrust: float,
+        track_time_s: float,
+    ) -> TickRecord:
+        """Gather one tick: the decision, the state it was made for, and the loop's own figures."""
+        command, certificate = decision.command, decision.certificate
+        return cls(
+            float(phase),
+            command.thrust_mps2,
+            command.thrust_direction_ned[0],
+            command.thrust_direction_ned[1],
+            command.thrust_direction_ned[2],
+            command.course_rad,
+            certificate.cost,
+            certificate.optimal_cost,
+            certificate.gap,
+            certificate.spread,
+            float(certificate.iterations),
+            float(certificate.cut_short),
+            float(certificate.at_bound),
+            certificate.solve_time_s,
+            lateness_s,
+            float(missed_ticks),
+            float(state.position_ned_m[0]),
+            float(state.position_ned_m[1]),
+            float(state.position_ned_m[2]),
+            float(state.velocity_ned_mps[0]),
+            float(state.velocity_ned_mps[1]),
+            float(state.velocity_ned_mps[2]),
+            float(state.disturbance_ned_mps2[0]),
+            float(state.disturbance_ned_mps2[1]),
+            float(state.disturbance_ned_mps2[2]),
+            hover_thrust,
+            track_time_s,
+        )
 
     @classmethod
     def from_data(cls, data: tuple[float, ...]) -> TickRecord:

@@ -1,0 +1,262 @@
+"""The figures of one flight, from its History: how well it tracked, and what that took.
+
+Only the phase TRACK is scored; setpoint gaps count from take-off to landing. A figure that the
+log does not hold is NaN.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import asdict, dataclass, field, fields
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import BPoly
+
+from offboard.analysis.history import Happening, History
+from offboard.flight.phases import PHASES, Phase
+from offboard.model.frames import (
+    course_from_quaternion,
+    rotation_from_quaternion,
+    thrust_direction_from_quaternion,
+    wrap_pi,
+)
+
+Array = NDArray[np.float64]
+NAN = math.nan
+
+
+def _figure(meaning: str, unit: str = "") -> float:
+    value: float = field(default=NAN, metadata={"meaning": meaning, "unit": unit})
+    return value
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """All figures that --require may name."""
+
+    rmse_position_m: float = _figure("position against the vehicle's estimate, RMSE", "m")
+    mean_position_m: float = _figure("the same, mean", "m")
+    p95_position_m: float = _figure("the same, 95th percentile", "m")
+    max_position_m: float = _figure("the same, largest", "m")
+    rmse_truth_m: float = _figure("position against the simulated truth, RMSE", "m")
+    max_truth_m: float = _figure("the same, largest", "m")
+    rmse_velocity_mps: float = _figure("velocity as the vehicle reports it, RMSE", "m/s")
+    p95_velocity_mps: float = _figure("the same, 95th percentile", "m/s")
+    max_velocity_mps: float = _figure("the same, largest", "m/s")
+    rmse_course_deg: float = _figure("course, RMSE", "deg")
+    max_course_deg: float = _figure("course, largest", "deg")
+    mu_e: float = _figure("the paper's fitness, Eq. 31 (course in degrees)")
+    e_u: float = _figure("Eq. 32, body velocity u", "m2/s2")
+    e_v: float = _figure("Eq. 32, body velocity v", "m2/s2")
+    e_w: float = _figure("Eq. 32, body velocity w", "m2/s2")
+    e_x: float = _figure("Eq. 32, north", "m2")
+    e_y: float = _figure("Eq. 32, east", "m2")
+    e_z: float = _figure("Eq. 32, down", "m2")
+    e_psi: float = _figure("Eq. 32, course", "deg2")
+    tracked_s: float = _figure("time scored", "s")
+    thrust_sd: float = _figure("normalised thrust commanded, standard deviation")
+    tilt_command_step_deg: float = _figure("commanded tilt, RMS change per setpoint", "deg")
+    tilt_max_deg: float = _figure("tilt flown, largest", "deg")
+    roll_rate_sd_radps: float = _figure("roll rate, standard deviation", "rad/s")
+    pitch_rate_sd_radps: float = _figure("pitch rate, standard deviation", "rad/s")
+    setpoint_hz: float = _figure("setpoints per second of vehicle time", "Hz")
+    setpoint_gap_max_s: float = _figure("largest gap between setpoints, vehicle time", "s")
+    setpoint_gap_wall_max_s: float = _figure("the same, wall time", "s")
+    lateness_p99_ms: float = _figure("telemetry to setpoint, 99th percentile", "ms")
+    lateness_max_ms: float = _figure("the same, largest", "ms")
+    missed_ticks: float = _figure("control ticks that no telemetry came for")
+    solve_time_p50_ms: float = _figure("time to decide, median", "ms")
+    solve_time_p99_ms: float = _figure("the same, 99th percentile", "ms")
+    gap_median: float = _figure("cost above the exact optimum, relative, median")
+    gap_max: float = _figure("the same, largest")
+    spread_median: float = _figure("epsilon of Eq. 29, median")
+    at_bound_share: float = _figure("share of decisions at a bound")
+    cut_short_share: float = _figure("share of decisions cut short by their deadline")
+    position_hz: float = _figure("LOCAL_POSITION_NED received", "Hz")
+    attitude_hz: float = _figure("ATTITUDE_QUATERNION received", "Hz")
+    hover_thrust: float = _figure("normalised hover thrust, estimated at the end")
+    flight_s: float = _figure("from arming to the end of the log, vehicle time", "s")
+
+    def figures(self) -> dict[str, float]:
+        return asdict(self)
+
+
+FIGURES = {figure.name: figure.metadata for figure in fields(Score)}
+
+
+def phases(history: History) -> tuple[Happening, ...]:
+    """What the flight went through: vehicle time and 'phase: reason'."""
+    return history.phases
+
+
+def score(history: History) -> Score:
+    """Compute every figure that the history supports."""
+    values: dict[str, float] = {}
+    window = _window(history)
+    if window is not None:
+        values |= _tracking(history, *window)
+        values |= _activity(history, *window)
+        values |= _truth(history, *window)
+        values["tracked_s"] = window[1] - window[0]
+    values |= _stream(history)
+    values |= _decisions(history)
+    return Score(**values)
+
+
+def _window(history: History) -> tuple[float, float] | None:
+    """First and last vehicle time of the phase TRACK."""
+    track = float(PHASES.index(Phase.TRACK))
+    times = [
+        time_s
+        for time_s, record in zip(history.record_time_s, history.records, strict=True)
+        if record.phase == track
+    ]
+    return (times[0], times[-1]) if len(times) > 1 and len(history.position) else None
+
+
+def _between(rows: Array, begin_s: float, end_s: float) -> Array:
+    inside: Array = rows[(rows[:, 0] >= begin_s) & (rows[:, 0] <= end_s)]
+    return inside
+
+
+def _reference(history: History, times: Array) -> tuple[Array, Array, Array]:
+    """Reference position, velocity (N, 3) and course (N,) at any times: the records are joined by
+    the quintic that their position, velocity and acceleration determine."""
+    rows = history.reference
+    rows = rows[np.concatenate(([True], np.diff(rows[:, 0]) > 0))]
+    knots = np.stack((rows[:, 1:4], rows[:, 4:7], rows[:, 7:10]), axis=1)
+    curve = BPoly.from_derivatives(rows[:, 0], knots)
+    course = np.interp(times, rows[:, 0], np.unwrap(rows[:, 10]))
+    return curve(times), curve.derivative()(times), course
+
+
+def _tracking(history: History, begin_s: float, end_s: float) -> dict[str, float]:
+    position = _between(history.position, begin_s, end_s)
+    place, velocity, _ = _reference(history, position[:, 0])
+    error_m = np.linalg.norm(position[:, 1:4] - place, axis=1)
+    slip_mps = np.linalg.norm(position[:, 4:7] - velocity, axis=1)
+    attitude = _between(history.attitude, begin_s, end_s)
+    _, _, course = _reference(history, attitude[:, 0])
+    turn = np.degrees(wrap_pi(course_from_quaternion(attitude[:, 1:5]) - course))
+    return {
+        "rmse_position_m": _rms(error_m),
+        "mean_position_m": float(error_m.mean()),
+        "p95_position_m": float(np.percentile(error_m, 95)),
+        "max_position_m": float(error_m.max()),
+        "rmse_velocity_mps": _rms(slip_mps),
+        "p95_velocity_mps": float(np.percentile(slip_mps, 95)),
+        "max_velocity_mps": float(slip_mps.max()),
+        "rmse_course_deg": _rms(turn),
+        "max_course_deg": float(np.abs(turn).max(initial=0.0)),
+        "position_hz": _hz(position),
+        "attitude_hz": _hz(attitude),
+    } | _fitness(history, begin_s, end_s)
+
+
+def _fitness(history: History, begin_s: float, end_s: float) -> dict[str, float]:
+    """Eqs. 31-32 at the control ticks: velocities in the body frame, course in degrees."""
+    ticks = history.record_time_s[
+        (history.record_time_s >= begin_s) & (history.record_time_s <= end_s)
+    ]
+    place, velocity, course = _reference(history, ticks)
+    attitude = history.attitude[_nearest(history.attitude[:, 0], ticks), 1:5]
+    body = rotation_from_quaternion(attitude).swapaxes(-1, -2)
+    flown = _at(history.position, ticks)
+    slip = np.einsum("nij,nj->ni", body, velocity - flown[:, 3:6])
+    away = place - flown[:, 0:3]
+    turn = np.degrees(wrap_pi(course - course_from_quaternion(attitude)))
+    columns = (*slip.T, *away.T, turn)
+    names = ("e_u", "e_v", "e_w", "e_x", "e_y", "e_z", "e_psi")
+    parts = {name: float((column**2).sum()) for name, column in zip(names, columns, strict=True)}
+    return parts | {"mu_e": sum(parts.values())}
+
+
+def _truth(history: History, begin_s: float, end_s: float) -> dict[str, float]:
+    truth = _between(history.truth, begin_s, end_s)
+    if not len(truth):
+        return {}
+    place, _, _ = _reference(history, truth[:, 0])
+    error_m = np.linalg.norm(truth[:, 1:4] - place, axis=1)
+    return {"rmse_truth_m": _rms(error_m), "max_truth_m": float(error_m.max())}
+
+
+def _activity(history: History, begin_s: float, end_s: float) -> dict[str, float]:
+    setpoint = _between(history.setpoint, begin_s, end_s)
+    attitude = _between(history.attitude, begin_s, end_s)
+    commanded = thrust_direction_from_quaternion(setpoint[:, 2:6])
+    steps = np.degrees(np.linalg.norm(np.diff(commanded, axis=0), axis=1))
+    down = thrust_direction_from_quaternion(attitude[:, 1:5])[:, 2]
+    return {
+        "thrust_sd": float(setpoint[:, 6].std()),
+        "tilt_command_step_deg": _rms(steps),
+        "tilt_max_deg": float(np.degrees(np.arccos(np.clip(down, -1, 1))).max(initial=0.0)),
+        "roll_rate_sd_radps": float(attitude[:, 5].std()),
+        "pitch_rate_sd_radps": float(attitude[:, 6].std()),
+    }
+
+
+def _stream(history: History) -> dict[str, float]:
+    """Setpoints from the first one to the landing."""
+    begun = {what.what.partition(":")[0]: what.time_s for what in history.phases}
+    end_s = begun.get("land", math.inf)
+    armed_s = begun.get("takeoff", NAN)
+    last_s = history.position[-1, 0] if len(history.position) else NAN
+    values = {"flight_s": last_s - armed_s}
+    setpoint = history.setpoint[history.setpoint[:, 0] < end_s]
+    if len(setpoint) > 1:
+        gaps = np.diff(setpoint[:, 0:2], axis=0)
+        values["setpoint_hz"] = _hz(setpoint)
+        values["setpoint_gap_max_s"], values["setpoint_gap_wall_max_s"] = map(float, gaps.max(0))
+    return values
+
+
+def _decisions(history: History) -> dict[str, float]:
+    records = history.records
+    if not records:
+        return {}
+
+    def column(name: str) -> Array:
+        values: Array = np.array([getattr(record, name) for record in records])
+        finite: Array = values[np.isfinite(values)]
+        return finite
+
+    late_ms, solve_ms = 1e3 * column("lateness_s"), 1e3 * column("solve_time_s")
+    gap, spread = column("gap"), column("spread")
+    return {
+        "lateness_p99_ms": _percentile(late_ms, 99),
+        "lateness_max_ms": _percentile(late_ms, 100),
+        "missed_ticks": float(column("missed_ticks").sum()),
+        "solve_time_p50_ms": _percentile(solve_ms, 50),
+        "solve_time_p99_ms": _percentile(solve_ms, 99),
+        "gap_median": _percentile(gap, 50),
+        "gap_max": _percentile(gap, 100),
+        "spread_median": _percentile(spread, 50),
+        "at_bound_share": float(column("at_bound").mean()),
+        "cut_short_share": float(column("cut_short").mean()),
+        "hover_thrust": records[-1].hover_thrust,
+    }
+
+
+def _rms(values: Array) -> float:
+    return float(np.sqrt(np.mean(values**2))) if len(values) else NAN
+
+
+def _percentile(values: Array, share: float) -> float:
+    return float(np.percentile(values, share)) if len(values) else NAN
+
+
+def _hz(rows: Array) -> float:
+    span_s = rows[-1, 0] - rows[0, 0] if len(rows) > 1 else 0.0
+    return float((len(rows) - 1) / span_s) if span_s > 0 else NAN
+
+
+def _at(rows: Array, times: Array) -> Array:
+    """Columns after the first, interpolated linearly at `times`."""
+    return np.stack([np.interp(times, rows[:, 0], column) for column in rows[:, 1:].T], axis=1)
+
+
+def _nearest(stamps: Array, times: Array) -> NDArray[np.intp]:
+    right = np.clip(np.searchsorted(stamps, times), 1, len(stamps) - 1)
+    nearest: NDArray[np.intp] = right - (times - stamps[right - 1] < stamps[right] - times)
+    return nearest

@@ -1,0 +1,148 @@
+"""From names, files and --set to one validated `FlightConfig`. Only this module reads YAML files.
+
+A configuration refers to its vehicle, controller and reference by name (a file of `config/`), by
+file, or spells them out. Packaged, `config/` lies inside the package; in a checkout beside it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import yaml
+from pydantic import BaseModel, Field
+
+from offboard.control.catalogue import LAWS, ControllerConfig
+from offboard.control.observer import ObserverSettings
+from offboard.flight.phases import Limits
+from offboard.model.document import DocumentError, override, read, validate
+from offboard.model.vehicle import Parameters, Vehicle
+from offboard.reference.catalogue import SHAPES, FromTable, ReferenceConfig, build
+from offboard.reference.feasibility import check
+from offboard.reference.track import Track
+
+Raw = dict[str, Any]
+FOLDERS = {"vehicle": "vehicles", "controller": "controllers", "reference": "references"}
+
+
+class FlightConfig(Parameters):
+    """Everything that decides a flight, resolved. `flight.yaml` of a flight directory is one."""
+
+    vehicle: Vehicle
+    controller: ControllerConfig
+    reference: ReferenceConfig
+    observer: ObserverSettings = ObserverSettings()
+    limits: Limits = Limits()
+    period_s: float = Field(default=0.1, ge=0.01, le=0.5)  # control period, vehicle time
+    deadline_s: float = Field(default=0.05, gt=0.0005, le=0.5)  # for one decision, wall time
+    seed: int = Field(default=7, ge=0, lt=2**32)
+
+
+def shipped() -> Path:
+    """The folder of shipped configuration: inside an installed package, or the checkout's."""
+    package = Path(str(resources.files("offboard")))
+    inside = package / "_config"
+    return inside if inside.is_dir() else package.parent / "config"
+
+
+def load(
+    name: str,
+    *,
+    choices: Mapping[str, str] | None = None,
+    assignments: Iterable[str] = (),
+    seed: int | None = None,
+) -> FlightConfig:
+    """Resolve a flight configuration. Raises DocumentError with every problem found.
+
+    `name` is a shipped configuration or a file; `choices` replaces its vehicle, controller or
+    reference by another name or file; `assignments` are `key.path=value` of --set.
+    """
+    path = _locate(name, "", "configuration")
+    raw = read(_text(path), str(path))
+    for part in FOLDERS:
+        chosen = (choices or {}).get(part, raw.get(part))
+        if isinstance(chosen, str):
+            raw[part] = _part(part, chosen)
+        elif part not in raw:
+            raise DocumentError(f"{path}: {part} is missing; give a name, a file or a mapping")
+    for assignment in assignments:
+        raw = override(raw, assignment)
+    if seed is not None:
+        raw["seed"] = seed
+    return validate(raw, FlightConfig, str(path))
+
+
+def build_track(config: FlightConfig) -> Track:
+    """The configured reference, checked against the vehicle before anything is sent.
+
+    Raises DocumentError naming time, value and limit where it cannot be flown.
+    """
+    text = None
+    if isinstance(config.reference, FromTable):
+        text = _text(Path(config.reference.file))
+    try:
+        track = build(config.reference, text)
+        check(track, config.vehicle)
+    except ValueError as error:
+        raise DocumentError(f"reference {config.reference.shape}: {error}") from None
+    return track
+
+
+def check_file(path: Path) -> str:
+    """Validate one configuration file of any kind; return what it is. Raises DocumentError."""
+    raw = read(_text(path), str(path))
+    if "shape" in raw:
+        kind = "reference"
+    elif "law" in raw:
+        kind = "controller"
+    elif "mass_kg" in raw:
+        kind = "vehicle"
+    else:
+        build_track(load(str(path)))
+        return "flight configuration"
+    validate(raw, _model(kind, raw, str(path)), str(path))
+    return kind
+
+
+def dump(config: FlightConfig) -> str:
+    """The resolved configuration as YAML that `load` accepts."""
+    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+
+
+def _part(part: str, name: str) -> Raw:
+    if part == "reference" and name.lower().endswith(".csv"):
+        return {"shape": "table", "file": name}
+    path = _locate(name, FOLDERS[part], part)
+    raw = read(_text(path), str(path))
+    validate(raw, _model(part, raw, str(path)), str(path))
+    return raw
+
+
+def _model(part: str, raw: Raw, source: str) -> type[BaseModel]:
+    if part == "vehicle":
+        return Vehicle
+    key, table = ("law", LAWS) if part == "controller" else ("shape", SHAPES)
+    chosen = raw.get(key)
+    if not isinstance(chosen, str) or chosen not in table:
+        raise DocumentError(f"{source}: {key} is {chosen!r}; known are {', '.join(table)}")
+    return table[chosen]
+
+
+def _locate(name: str, folder: str, kind: str) -> Path:
+    if name.endswith((".yaml", ".yml")) or "/" in name:
+        return Path(name)
+    candidate = shipped() / folder / f"{name}.yaml"
+    if candidate.is_file():
+        return candidate
+    known = sorted(path.stem for path in (shipped() / folder).glob("*.yaml"))
+    raise DocumentError(f"there is no {kind} named {name!r}; known are {', '.join(known)}")
+
+
+def _text(path: Path) -> str:
+    try:
+        return path.read_text(encoding="utf-8")
+    except (OSError, UnicodeDecodeError) as error:
+        reason = getattr(error, "strerror", None) or "not UTF-8 text"
+        raise DocumentError(f"{path} cannot be read: {reason}") from None

@@ -1,0 +1,61 @@
+"""The controllers by name: one configuration value per law, and the controller built from it.
+
+A controller file (`config/controllers/*.yaml`) is one of these values, told apart by `law`. The
+table is also the test matrix.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from offboard.control.base import Controller
+from offboard.control.paper import PaperController, PaperSettings
+from offboard.control.tracking import Search, TrackingLaw, TrackingSettings
+from offboard.model.vehicle import Parameters, Vehicle
+
+
+class Pso(TrackingSettings):
+    """Cost-to-go over one held input, searched by the swarm."""
+
+    law: Literal["pso"]
+
+
+class Lqr(TrackingSettings):
+    """The exact minimiser of the same cost."""
+
+    law: Literal["lqr"]
+
+
+class Paper(PaperSettings):
+    """The paper's law, one step ahead."""
+
+    law: Literal["paper"]
+
+
+Law = Pso | Lqr | Paper
+ControllerConfig = Annotated[Law, Field(discriminator="law")]
+LAWS: Mapping[str, type[Parameters]] = {"pso": Pso, "lqr": Lqr, "paper": Paper}
+
+
+def build(
+    config: Law,
+    vehicle: Vehicle,
+    period_s: float,
+    seed: int,
+    stopwatch: Callable[[], float] | None = None,
+) -> Controller:
+    """A controller for `vehicle`, deciding every `period_s`, its random stream from `seed`.
+
+    `stopwatch` () -> s keeps deadlines and measures solve times; without one there are neither.
+    """
+    settings = config.model_copy(update={"seed": seed, "period_s": period_s})
+    match settings:
+        case Pso():
+            return TrackingLaw(vehicle, settings, Search.SWARM, stopwatch)
+        case Lqr():
+            return TrackingLaw(vehicle, settings, Search.CLOSED_FORM, stopwatch)
+        case Paper():
+            return PaperController(vehicle, settings, period_s, stopwatch)

@@ -1,0 +1,118 @@
+"""The loop on real sockets: link -> companion -> link and log, paced by the vehicle's telemetry."""
+
+from __future__ import annotations
+
+import gc
+import signal
+from collections.abc import Callable, Hashable, Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+from offboard.flight import clock
+from offboard.flight.companion import Companion, Outcome, Output
+from offboard.flight.link import Link
+from offboard.flight.log import FlightLog
+from offboard.flight.phases import ExitCode, Phase
+
+POLL_S = 0.02
+
+
+class Loop:
+    """Moves bytes between one link, one companion and one log until the flight ends.
+
+    `lockstep` makes the vehicle's time the link's time: then nothing that is sent depends on the
+    wall clock, and two flights with one seed send the same bytes.
+    """
+
+    def __init__(
+        self,
+        companion: Companion,
+        link: Link,
+        log: FlightLog,
+        *,
+        lockstep: bool,
+        progress: Callable[[Companion], None],
+        vehicle_process_ended: Callable[[], str | None] = lambda: None,
+    ) -> None:
+        self._companion = companion
+        self._link = link
+        self._log = log
+        self._lockstep = lockstep
+        self._progress = progress
+        self._vehicle_process_ended = vehicle_process_ended
+        self._log_error: str | None = None
+        self._interrupts = 0
+        self._ended_early: Outcome | None = None
+
+    def run(self) -> Outcome:
+        """Fly to the end. SIGINT and SIGTERM land; a second one leaves at once."""
+        gc.collect()
+        gc.freeze()
+        with self._signals():
+            self._fly()
+        if self._ended_early:
+            return self._ended_early
+        outcome = self._companion.outcome
+        if outcome is None:
+            return Outcome(
+                ExitCode.ABORTED,
+                "interrupted twice: the stream stopped and the vehicle is left to its own failsafe",
+            )
+        if self._log_error:
+            return Outcome(outcome.exit_code or ExitCode.ABORTED, self._log_error)
+        return outcome
+
+    def _fly(self) -> None:
+        companion, link = self._companion, self._link
+        heard_s = polled_s = clock.monotonic_s()
+        while not companion.has_ended() and self._interrupts < 2 and not self._ended_early:
+            chunks = link.receive(POLL_S)
+            now_s = clock.monotonic_s()
+            for data, peer in chunks:
+                output = companion.receive(data, peer, self._time_s(now_s))
+                if output.alive:
+                    heard_s = now_s
+                self._deliver(output, peer)
+                if companion.has_ended():
+                    break
+            if not chunks or now_s - polled_s > POLL_S:
+                polled_s = now_s
+                self._deliver(companion.poll(self._time_s(now_s), now_s - heard_s), companion.peer)
+                self._progress(companion)
+                self._check_process()
+
+    def _time_s(self, now_s: float) -> float:
+        return self._companion.view.time_s if self._lockstep else now_s
+
+    def _deliver(self, output: Output, peer: Hashable | None) -> None:
+        target = self._companion.peer or peer
+        for frame in output.send:
+            self._link.send(frame, target)
+        if self._log_error:
+            return
+        try:
+            stamp = clock.unix_us()
+            for frame in (*output.heard, *output.send):
+                self._log.write(stamp, frame)
+        except OSError as error:
+            self._log_error = f"the log {self._log.path} cannot be written ({error.strerror})"
+            self._companion.request_stop()
+
+    def _check_process(self) -> None:
+        """A simulator that ended before it was heard will not be waited for."""
+        if self._companion.phase is Phase.CONNECT:
+            ended = self._vehicle_process_ended()
+            self._ended_early = Outcome(ExitCode.REFUSED, ended) if ended else None
+
+    @contextmanager
+    def _signals(self) -> Iterator[None]:
+        def on_signal(number: int, frame: FrameType | None) -> None:
+            self._interrupts += 1
+            self._companion.request_stop()
+
+        before = {kind: signal.signal(kind, on_signal) for kind in (signal.SIGINT, signal.SIGTERM)}
+        try:
+            yield
+        finally:
+            for kind, handler in before.items():
+                signal.signal(kind, handler)

@@ -1,0 +1,132 @@
+"""One flight from a resolved configuration: build everything, rehearse, connect, fly, close.
+
+Everything that may be slow (compiling, starting a simulator) happens before the vehicle is heard.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+
+from offboard.control.base import Command, Controller, Situation
+from offboard.control.observer import Observer
+from offboard.flight import clock
+from offboard.flight.companion import Companion, Outcome
+from offboard.flight.daemon import Loop
+from offboard.flight.link import UdpLink, open_link
+from offboard.flight.log import FlightLog
+from offboard.flight.mission import Mission
+from offboard.flight.phases import Limits
+from offboard.flight.sitl import SimulatorProcess
+from offboard.mavlink.session import Session, SessionSettings
+from offboard.model.vehicle import Vehicle
+from offboard.reference.track import Track
+from offboard.reference.transfer import Hold
+
+SITL_PATIENCE_S = 60.0  # a bundled simulator may compile first, on a machine that does much else
+
+
+@dataclass(frozen=True, slots=True)
+class Bundled:
+    """The bundled simulator, in lockstep: `vehicle` None flies its default."""
+
+    scenario: str
+    seed: int
+    vehicle: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Crew:
+    """What one flight is made of, built from the configuration by the caller."""
+
+    vehicle: Vehicle
+    controller: Controller
+    make_observer: Callable[[], Observer]
+    track: Track
+    limits: Limits
+    period_s: float
+    deadline_s: float
+
+
+def rehearse(crew: Crew) -> float:
+    """Call every code path of observer and controller, compiled ones included, and forget it.
+
+    A stall of seconds at the first decision in flight is a crash. Returns the seconds it took.
+    """
+    began_s = clock.monotonic_s()
+    observer = crew.make_observer()
+    reference = Hold((0.0, 0.0, -2.0), 0.1)
+    previous = Command(crew.vehicle.gravity_mps2, (0.0, 0.0, 1.0), 0.0)
+    observer.freeze(True)
+    for step in range(60):
+        time_s = 0.01 * step
+        if step == 20:
+            observer.freeze(False)
+        observer.on_attitude(time_s, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        observer.on_position(time_s, (0.0, 0.0, -2.0), (0.0, 0.0, 0.0))
+        if step >= 20 and step % 10 == 0:
+            state = observer.predict(time_s)
+            situation = Situation(time_s, state, reference, previous, crew.deadline_s)
+            previous = crew.controller.decide(situation).command
+            observer.on_command(time_s, previous)
+    crew.track.sample(np.array([0.0, 1.0]))
+    crew.controller.reset()
+    return clock.monotonic_s() - began_s
+
+
+def fly(
+    crew: Crew,
+    log: FlightLog,
+    *,
+    connection: str,
+    bundled: Bundled | None,
+    progress: Callable[[Companion], None],
+    prepared: Callable[[float], None] = lambda seconds: None,
+) -> Outcome:
+    """Fly once over `connection`, or on a bundled simulator of our own. LinkError: not opened."""
+    with ExitStack() as stack:
+        link = open_link("udpin:127.0.0.1:0" if bundled else connection)
+        stack.callback(link.close)
+        simulator = None
+        limits = crew.limits
+        if bundled:
+            assert isinstance(link, UdpLink)
+            simulator = stack.enter_context(
+                SimulatorProcess(
+                    port=link.port,
+                    seed=bundled.seed,
+                    scenario=bundled.scenario,
+                    vehicle=bundled.vehicle,
+                )
+            )
+            # In lockstep the vehicle waits for us: silence only says that the machine is busy
+            patience = {"connect_s": SITL_PATIENCE_S, "silence_s": SITL_PATIENCE_S}
+            limits = limits.model_copy(update=patience)
+        prepared(rehearse(crew))
+        companion = Companion(
+            vehicle=crew.vehicle,
+            session=Session(
+                SessionSettings(
+                    stream=link.is_stream, speaks_first=not connection.startswith("udpin")
+                )
+            ),
+            observer=crew.make_observer(),
+            controller=crew.controller,
+            mission=Mission(crew.track),
+            limits=limits,
+            period_s=crew.period_s,
+            deadline_s=None if bundled else crew.deadline_s,
+            stopwatch=clock.monotonic_s,
+        )
+        loop = Loop(
+            companion,
+            link,
+            log,
+            lockstep=bundled is not None,
+            progress=progress,
+            vehicle_process_ended=simulator.ended if simulator else lambda: None,
+        )
+        return loop.run()
