@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 import numba
 import numpy as np
 
-from offboard.control.base import Command, Controller, PredictedState, Situation
+from offboard.control.base import Command, Controller, Situation
 from offboard.control.observer import Observer, ObserverSettings
 from offboard.model.frames import quaternion_from_thrust_direction
 from offboard.model.vehicle import Vehicle
@@ -28,6 +28,9 @@ DRIFTS = np.stack([DRIFT_NORTH, DRIFT_EAST, DRIFT_DOWN])
 DENSITIES = np.array([[0.030, 0.044, 0.010], [0.0225, 0.097, 0.012], [0.013, 0.082, 0.0]])
 # Sample to sample: position, velocity, attitude.
 WHITE_SDS = np.array([0.0003, 0.004, 0.0005])
+# Septic smooth step of the path's speed, highest power first, its derivatives and integral.
+SPEED = [np.polyder(np.array([-20, 70, -84, 35, 0, 0, 0, 0]), k) for k in range(4)]
+SPEED_INTEGRAL = np.polyint(SPEED[0])
 GAPS_S = (0.008, 0.008, 0.008, 0.016)
 
 
@@ -44,7 +47,8 @@ class Truth:
 
 @numba.njit(cache=True)
 def _run(x, errors, commands, walks, drifts, constants, wind):
-    """x = [p3 v3 b_est2 b_est'2 T psi psi']; commands (n, 5) = [b_n, b_e, b2?, T, course]."""
+    """x = [p (3), v (3), b_est (2), b_est' (2), T, psi, psi'], commands (n, 4) = [b_n, b_e, T,
+    course], one row per step; errors (3, 3) as DRIFTS; walks (n, 3, 3) their increments."""
     g, c, wn, z, lag, wy, zy, limit = constants
     h = STEP_S
     for i in range(len(commands)):
@@ -78,7 +82,7 @@ class Plant:
 
     def __post_init__(self) -> None:
         vehicle = self.truth.vehicle
-        self.sent: list[tuple[float, Command]] = []
+        self.sent: list[tuple[float, ...]] = []  # time, b_n, b_e, thrust, course
         if self.x[10] == 0.0:
             self.x[10] = vehicle.gravity_mps2
         self.constants = (
@@ -93,19 +97,18 @@ class Plant:
         )
 
     def command(self, command: Command) -> None:
-        self.sent.append((self.time_s, command))
+        north, east, _ = command.thrust_direction_ned
+        self.sent.append((self.time_s, north, east, command.thrust_mps2, command.course_rad))
 
     def advance(self, interval_s: float) -> None:
         steps = round(interval_s / STEP_S)
-        times = self.time_s + STEP_S * np.arange(steps)
+        times = self.time_s + STEP_S * np.arange(steps) - self.truth.extra_delay_s
+        vehicle = self.truth.vehicle
         rows = np.empty((steps, 4))
-        vehicle, extra = self.truth.vehicle, self.truth.extra_delay_s
-        delays = (vehicle.tilt.delay_s, vehicle.thrust_delay_s, vehicle.yaw.delay_s)
-        for i, time in enumerate(times):
-            rows[i, :2] = self._in_force(time - delays[0] - extra)[1].thrust_direction_ned[:2]
-            thrust = self._in_force(time - delays[1] - extra)[1].thrust_mps2
-            rows[i, 2] = self.truth.thrust_scale * thrust
-            rows[i, 3] = self._in_force(time - delays[2] - extra)[1].course_rad
+        rows[:, :2] = self._in_force(times - vehicle.tilt.delay_s)[:, 1:3]
+        thrust = self._in_force(times - vehicle.thrust_delay_s)[:, 3]
+        rows[:, 2] = self.truth.thrust_scale * thrust
+        rows[:, 3] = self._in_force(times - vehicle.yaw.delay_s)[:, 4]
         walks = np.zeros((steps, 3, 3))
         drifts = np.zeros((3, 3, 3))
         if self.truth.noisy:
@@ -114,14 +117,13 @@ class Plant:
         wind = np.array(self.truth.wind_force_ned_mps2)
         _run(self.x, self.errors, rows, walks, drifts, self.constants, wind)
         self.time_s = round((self.time_s + interval_s) / STEP_S) * STEP_S
-        self.sent = [s for s in self.sent if s[0] > self.time_s - 1.0] or self.sent[-1:]
+        if len(self.sent) > 60:
+            self.sent = self.sent[-30:]
 
-    def _in_force(self, time_s: float) -> tuple[float, Command]:
-        held = self.sent[0]
-        for item in self.sent:
-            if item[0] <= time_s + 1e-9:
-                held = item
-        return held
+    def _in_force(self, times: np.ndarray) -> np.ndarray:
+        """Rows of `sent` that act at `times`, the first one for ever before."""
+        sent = np.array(self.sent)
+        return sent[np.maximum(np.searchsorted(sent[:, 0], times + 1e-9, side="right") - 1, 0)]
 
     def position(self) -> tuple[np.ndarray, np.ndarray]:
         """Position and velocity as the autopilot reports them."""
@@ -164,10 +166,9 @@ class Lemniscate:
 
 def _run_in(time: np.ndarray, run_in_s: float) -> list[np.ndarray]:
     """Path time and its derivatives to the fourth: speed 0 -> 1 by a septic smooth step."""
-    speed = np.polynomial.Polynomial([0, 0, 0, 0, 35, -84, 70, -20])
     u = np.clip(time / run_in_s, 0.0, 1.0)
-    path = speed.integ()(u) * run_in_s + np.maximum(time - run_in_s, 0.0)
-    return [path] + [speed.deriv(k)(u) / run_in_s**k for k in range(4)]
+    path = np.polyval(SPEED_INTEGRAL, u) * run_in_s + np.maximum(time - run_in_s, 0.0)
+    return [path] + [np.polyval(SPEED[k], u) / run_in_s**k for k in range(4)]
 
 
 def _composed(amplitude: float, omega: float, phase: list[np.ndarray]) -> list[np.ndarray]:
@@ -206,7 +207,7 @@ def fly(
     period_s: float = 0.1,
     score_from_s: float = 8.0,
     offset_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    change_state=lambda state: state,
+    gaps_s: tuple[float, ...] = GAPS_S,
 ) -> Flight:
     """Fly `reference` from rest at its start; decisions at multiples of `period_s`."""
     plant = Plant(truth, np.random.default_rng(seed))
@@ -219,7 +220,7 @@ def fly(
     errors, rates, bounds = [], [], []
     next_decision_s, message = period_s, 0
     while plant.time_s < score_from_s + laps * reference.period_s:
-        plant.advance(GAPS_S[message % len(GAPS_S)])
+        plant.advance(gaps_s[message % len(gaps_s)])
         message += 1
         now = plant.time_s
         observer.on_attitude(now, plant.attitude(), np.zeros(3))
@@ -230,8 +231,8 @@ def fly(
             rates.append(plant.x[8:10].copy())
         if now >= next_decision_s - 1e-9:
             next_decision_s = (np.floor(now / period_s + 1e-6) + 1) * period_s
-            state: PredictedState = change_state(observer.predict(now))
-            decision = controller.decide(Situation(now, state, reference, command))
+            situation = Situation(now, observer.predict(now), reference, command)
+            decision = controller.decide(situation)
             command = decision.command
             bounds.append(decision.certificate.at_bound)
             observer.on_command(now, command)

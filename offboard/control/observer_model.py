@@ -1,0 +1,125 @@
+"""What the observer believes: its settings, the plant it replays and the filters it corrects with.
+
+Pure values made from a `Vehicle` and `ObserverSettings`; no state and no message passes here.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from offboard.control.propagation import (
+    BIAS,
+    BIAS_TIME_CONSTANT,
+    COURSE,
+    COURSE_RATE,
+    DISTURBANCE,
+    DRAG,
+    GRAVITY,
+    PLANT_SIZE,
+    POSITION,
+    THRUST_DELAY,
+    THRUST_LAG,
+    TILT,
+    TILT_DAMPING,
+    TILT_DELAY,
+    TILT_FREQUENCY,
+    TILT_RATE,
+    VELOCITY,
+    YAW_DAMPING,
+    YAW_DELAY,
+    YAW_FREQUENCY,
+)
+from offboard.control.response import lateral_model
+from offboard.model.vehicle import Parameters, Vehicle
+
+Array = NDArray[np.float64]
+
+# Places in the state vector: per lateral axis [p v b b' d beta], vertical [p v d beta].
+LATERAL = np.array(
+    [
+        [POSITION + i, VELOCITY + i, TILT + i, TILT_RATE + i, DISTURBANCE + i, BIAS + i]
+        for i in (0, 1)
+    ]
+)
+VERTICAL = np.array([[POSITION + 2, VELOCITY + 2, DISTURBANCE + 2, BIAS + 2]])
+HEADING = np.array([[COURSE, COURSE_RATE]])
+# What is believed at the first message: the reported velocity, no disturbance, no bias.
+LATERAL_START_SD = np.array([0.1, 0.3, 0.02, 0.3, 1.0, 0.3])
+VERTICAL_START_SD = np.array([0.1, 0.3, 1.5, 0.3])
+HEADING_START_SD = np.array([0.05, 0.3])
+MEASURES_TILT = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
+MEASURES_COURSE = np.array([1.0, 0.0])
+
+
+class VelocitySource(StrEnum):
+    """What the reported velocity is used for."""
+
+    POSITION = "position"  # nothing: velocity from position and commands
+    BIAS = "bias"  # measured with a slowly varying bias
+    REPORTED = "reported"  # fed back raw, no disturbance: here only to be shown as worse
+
+
+class ObserverSettings(Parameters):
+    """Densities per root second and standard deviations of the filters. The defaults flew PX4 and
+    ArduCopter; twice or half of them made no visible difference."""
+
+    velocity: VelocitySource = VelocitySource.BIAS
+    acceleration_density_mps: float = Field(default=0.2, gt=0, le=10)
+    disturbance_density_mps2: float = Field(default=0.15, gt=0, le=10)
+    tilt_density_radps: float = Field(default=0.6, gt=0, le=50)
+    course_density_radps: float = Field(default=0.6, gt=0, le=50)
+    bias_density_mps: float = Field(default=0.08, gt=0, le=10)
+    bias_time_constant_s: float = Field(default=10.0, gt=0.1, le=1000)
+    position_sd_m: float = Field(default=0.002, gt=0, le=1)
+    velocity_sd_mps: float = Field(default=0.005, gt=0, le=5)
+    attitude_sd_rad: float = Field(default=0.001, gt=0, le=0.5)
+    position_jump_m: float = Field(default=0.3, gt=0, le=100)
+    velocity_jump_mps: float = Field(default=0.5, gt=0, le=100)
+    disturbance_limit_mps2: float = Field(default=5.0, gt=0, le=20)
+
+
+def plant_vector(vehicle: Vehicle, settings: ObserverSettings) -> Array:
+    """The plant vector of `propagation`."""
+    plant = np.empty(PLANT_SIZE)
+    plant[GRAVITY] = vehicle.gravity_mps2
+    plant[DRAG] = vehicle.drag_per_mass_ps
+    plant[TILT_FREQUENCY] = vehicle.tilt.natural_frequency_radps
+    plant[TILT_DAMPING] = vehicle.tilt.damping
+    plant[TILT_DELAY] = vehicle.tilt.delay_s
+    plant[THRUST_LAG] = vehicle.thrust_lag_s
+    plant[THRUST_DELAY] = vehicle.thrust_delay_s
+    plant[YAW_FREQUENCY] = vehicle.yaw.natural_frequency_radps
+    plant[YAW_DAMPING] = vehicle.yaw.damping
+    plant[YAW_DELAY] = vehicle.yaw.delay_s
+    plant[BIAS_TIME_CONSTANT] = settings.bias_time_constant_s
+    return plant
+
+
+def filter_models(vehicle: Vehicle, settings: ObserverSettings) -> tuple[tuple[Array, Array], ...]:
+    """Dynamics (n, n) and densities (n,) of the lateral, vertical and course filters.
+
+    Linear about hover: an error of b accelerates by g whatever the thrust is at the moment.
+    """
+    trusted = settings.velocity is VelocitySource.REPORTED
+    drift = 0.0 if trusted else settings.disturbance_density_mps2
+    motion, bias = settings.acceleration_density_mps, settings.bias_density_mps
+    forgetting = -1.0 / settings.bias_time_constant_s
+    lateral = np.zeros((6, 6))
+    lateral[:4, :4] = lateral_model(vehicle).dynamics
+    lateral[1, 4], lateral[5, 5] = 1.0, forgetting
+    vertical = np.zeros((4, 4))
+    vertical[0, 1] = vertical[1, 2] = 1.0
+    vertical[1, 1], vertical[3, 3] = -vehicle.drag_per_mass_ps, forgetting
+    heading = np.zeros((2, 2))
+    frequency = vehicle.yaw.natural_frequency_radps
+    heading[0, 1] = 1.0
+    heading[1] = -(frequency**2), -2.0 * vehicle.yaw.damping * frequency
+    return (
+        (lateral, np.array([0.0, motion, 0.0, settings.tilt_density_radps, drift, bias])),
+        (vertical, np.array([0.0, motion, drift, bias])),
+        (heading, np.array([0.0, settings.course_density_radps])),
+    )
