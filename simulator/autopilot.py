@@ -1,0 +1,278 @@
+"""The autopilot's state: armed, mode, health, failsafe; and the engine that runs its rule table.
+
+What happens (a command, a stream that stops, a landing) is an event; the first row of the
+firmware's table whose mode and guards fit decides the next mode, the actions, the answer and the
+text. Nothing here depends on which firmware it is. Knows no MAVLink frames, sockets or clock: the
+vehicle's time is the plant's.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from simulator.firmware.base import (
+    AttitudeSetpoint,
+    Behaviour,
+    Firmware,
+    Mode,
+    MotionSetpoint,
+    Result,
+    Rule,
+    Say,
+)
+from simulator.parameters import ParameterTable
+from simulator.pilot import Nav, Pilot
+from simulator.plant import STEP_S, Plant, Truth
+
+
+class Autopilot:
+    """One autopilot on one plant. `step` moves both by STEP_S; texts pile up in `texts`."""
+
+    def __init__(self, firmware: Firmware, plant: Plant) -> None:
+        self.firmware = firmware
+        self.plant = plant
+        self.parameters = ParameterTable(firmware)
+        self.pilot = Pilot(firmware, self.parameters)
+        self.mode: Mode = firmware.modes[firmware.boot_mode]
+        self.intended = self.remembered = firmware.boot_mode
+        self.armed = self.failsafe = False
+        self.texts: list[Say] = []
+        self.steps = 0
+        self._truth: Truth | None = None
+        self._nav: Nav | None = None
+        self._armed_s = self._landed_s = -math.inf
+        self._flown = False
+        self._setpoint_s = -math.inf
+        self._requested = ""
+
+    # -- what others see ---------------------------------------------------------------------
+
+    @property
+    def time_s(self) -> float:
+        """Vehicle time since boot."""
+        return self.steps * STEP_S
+
+    @property
+    def stream_alive(self) -> bool:
+        """A setpoint stream newer than the firmware's time-out."""
+        return self.time_s - self._setpoint_s <= self.parameters.role("stream_timeout_s")
+
+    @property
+    def landed(self) -> bool:
+        return self.pilot.landed
+
+    @property
+    def healthy(self) -> bool:
+        """The pre-arm checks pass, for the mode that was chosen."""
+        waits = self.firmware.modes[self.intended].behaviour is Behaviour.SETPOINT
+        booted = self.time_s >= self.firmware.healthy_after_s
+        return booted and (self.stream_alive or not waits)
+
+    @property
+    def system_status(self) -> int:
+        """MAV_STATE: 0 not ready, 3 standby, 4 active, 5 critical."""
+        if self.armed:
+            return 5 if self.failsafe else 4
+        return 3 if self.healthy else 0
+
+    @property
+    def base_mode(self) -> int:
+        """MAV_MODE_FLAG bits; a mode that waits for its stream shows only "custom mode"."""
+        if not self.armed and self.mode.behaviour is Behaviour.SETPOINT and not self.stream_alive:
+            return 1
+        return self.mode.base_mode | (128 if self.armed else 0)
+
+    @property
+    def landed_state(self) -> int:
+        """MAV_LANDED_STATE: 1 on ground, 2 in air, 3 taking off, 4 landing."""
+        if self.landed:
+            return 1
+        return {Behaviour.TAKEOFF: 3, Behaviour.LAND: 4}.get(self.mode.behaviour, 2)
+
+    # -- what comes in -----------------------------------------------------------------------
+
+    def happen(self, event: str, *, mode: str = "", takeoff_z_m: float = math.nan) -> Result:
+        """Run the rule table for an event; `mode` is the one asked for, if the event asks."""
+        self._requested = mode
+        for rule in self.firmware.rules:
+            if rule.event == event and self._fits(rule):
+                self._apply(rule, takeoff_z_m)
+                return rule.result
+        return Result.ACCEPTED
+
+    def obey_attitude(self, values: Mapping[str, Any]) -> None:
+        """Fields of SET_ATTITUDE_TARGET."""
+        self._obey(self.firmware.attitude_setpoint(values))
+
+    def obey_motion(self, values: Mapping[str, Any]) -> None:
+        """Fields of SET_POSITION_TARGET_LOCAL_NED."""
+        self._obey(self.firmware.motion_setpoint(values))
+
+    def _obey(self, setpoint: AttitudeSetpoint | MotionSetpoint | None) -> None:
+        if setpoint is not None:
+            self._setpoint_s = self.time_s
+            self.pilot.setpoint = setpoint
+
+    # -- time --------------------------------------------------------------------------------
+
+    def step(self) -> None:
+        """Fly STEP_S, then see what happened."""
+        was_landed = self.landed
+        demand = self.pilot.fly(self.time_s, self.armed, self.look)
+        self.plant.advance(STEP_S, demand)
+        self.steps += 1
+        self._truth = self._nav = None
+        if self.failsafe or self.mode.behaviour is Behaviour.SETPOINT:
+            self._watch_stream()
+        if self.armed:
+            self._watch_flight(was_landed)
+
+    @property
+    def truth(self) -> Truth:
+        """Where the vehicle really is now."""
+        if self._truth is None:
+            self._truth = self.plant.truth
+        return self._truth
+
+    def look(self) -> Nav:
+        """The estimate now, and whether the feet touch the ground."""
+        if self._nav is None:
+            estimate = self.plant.estimate
+            w, x, y, z = estimate.attitude.tolist()
+            north, east, down = estimate.position_ned_m.tolist()
+            v_north, v_east, v_down = estimate.velocity_ned_mps.tolist()
+            p, q, r = estimate.rates_frd_radps.tolist()
+            self._nav = Nav(
+                (north, east, down),
+                (v_north, v_east, v_down),
+                (w, x, y, z),
+                (p, q, r),
+                self.truth.on_ground,
+                estimate.reset_counter,
+            )
+        return self._nav
+
+    def _watch_stream(self) -> None:
+        if self.failsafe and self.stream_alive:
+            self.happen("stream found")
+        elif self.armed and self.mode.behaviour is Behaviour.SETPOINT:
+            age_s = self.time_s - self._setpoint_s - self.firmware.stream_reaction_s
+            if age_s > self.parameters.role("stream_timeout_s"):
+                self.happen("stream lost")
+
+    def _watch_flight(self, was_landed: bool) -> None:
+        if was_landed and not self.landed:
+            self._flown = True
+            self.happen("took off")
+        elif self.landed and not was_landed:
+            self._landed_s = self.time_s
+            self.happen("landed")
+        if self.pilot.climbed:
+            self.happen("climbed")
+        if self.landed and self._flown:
+            self._expire("settled", self._landed_s, "disarm_landed_s")
+        elif not self._flown:
+            self._expire("idle", self._armed_s, "disarm_idle_s")
+
+    def _expire(self, event: str, since_s: float, role: str) -> None:
+        limit_s = self.parameters.role(role)
+        if limit_s > 0 and self.time_s - since_s >= limit_s - 1e-6:
+            self.happen(event)
+
+    # -- the engine --------------------------------------------------------------------------
+
+    def _fits(self, rule: Rule) -> bool:
+        return rule.mode in ("*", self.mode.name) and all(self._holds(g) for g in rule.when)
+
+    def _holds(self, guard: str) -> bool:
+        if guard.startswith("not "):
+            return not self._holds(guard[4:])
+        name, compares, value = guard.partition("=")
+        if compares:
+            return self.parameters[name] == float(value)
+        return GUARDS[guard](self)
+
+    def _apply(self, rule: Rule, takeoff_z_m: float) -> None:
+        asked = self._requested
+        for action in rule.do:
+            ACTIONS[action](self)
+        target = {
+            "*": self.mode.name if rule.to == "*" else rule.to,
+            "requested": asked,
+            "intended": self.intended,
+            "remembered": self.remembered,
+        }.get(rule.to, rule.to)
+        if rule.to != "*":
+            self._enter(target, by_failsafe="failsafe" in rule.do, takeoff_z_m=takeoff_z_m)
+        if rule.say is not None:
+            title = self.firmware.modes[asked].title if asked else ""
+            self.texts.append(Say(rule.say.severity, rule.say.text.format(mode=title)))
+
+    def _enter(self, name: str, *, by_failsafe: bool, takeoff_z_m: float) -> None:
+        mode = self.firmware.modes[name]
+        if not by_failsafe:
+            self.failsafe = False
+            self.intended = name
+            if mode.remembered:
+                self.remembered = name
+        if mode is not self.mode or mode.behaviour is not Behaviour.SETPOINT:
+            self.pilot.enter(mode.behaviour, self.look(), takeoff_z_m)
+        self.mode = mode
+
+    def _mode_can_run(self) -> bool:
+        mode = self.firmware.modes[self._requested]
+        if mode.behaviour is Behaviour.SETPOINT:
+            return self.stream_alive
+        return not mode.needs_sticks
+
+    def _arm(self) -> None:
+        self.armed, self._flown, self._armed_s = True, not self.landed, self.time_s
+        self.pilot.arm(self.look())
+
+    def _disarm(self) -> None:
+        self.armed = self._flown = False
+
+    def _fail(self) -> None:
+        self.failsafe = True
+
+    def _recover(self) -> None:
+        self.failsafe = False
+
+
+GUARDS: dict[str, Callable[[Autopilot], bool]] = {
+    "armed": lambda autopilot: autopilot.armed,
+    "landed": lambda autopilot: autopilot.landed,
+    "failsafe": lambda autopilot: autopilot.failsafe,
+    "ready": lambda autopilot: autopilot.healthy and autopilot.mode.arms,
+    "mode can run": Autopilot._mode_can_run,
+}
+
+ACTIONS: dict[str, Callable[[Autopilot], None]] = {
+    "arm": Autopilot._arm,
+    "disarm": Autopilot._disarm,
+    "failsafe": Autopilot._fail,
+    "recover": Autopilot._recover,
+}
+
+
+def describe(firmware: Firmware) -> list[tuple[str, str, str, str, str]]:
+    """The rule table for people: event, in mode, when, then mode, answer and text."""
+    return [
+        (
+            rule.event,
+            "any" if rule.mode == "*" else rule.mode,
+            " and ".join(rule.when),
+            "" if rule.to == "*" else rule.to,
+            " ".join(
+                part
+                for part in (
+                    rule.result.name if rule.result is not Result.ACCEPTED else "",
+                    f'"{rule.say.text}"' if rule.say else "",
+                )
+                if part
+            ),
+        )
+        for rule in firmware.rules
+    ]

@@ -1,0 +1,135 @@
+"""The `simulator` command: options in, one vehicle running until it is told to stop."""
+
+from __future__ import annotations
+
+import signal
+import sys
+from typing import Annotated, NoReturn
+
+import typer
+
+FIRMWARES = ("px4",)
+COMPANION_PORT, GROUND_PORT = 14540, 14550
+LOCAL_COMPANION_PORT, LOCAL_GROUND_PORT = 14580, 18570  # PX4's
+NO_LINK = "none"
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+def _refuse(sentence: str) -> NoReturn:
+    print(sentence, file=sys.stderr)
+    raise typer.Exit(2)
+
+
+@app.command()
+def simulate(
+    connect: Annotated[
+        str | None, typer.Option(help="Companion link: udpout:HOST:PORT or udpin:HOST:PORT.")
+    ] = None,
+    gcs: Annotated[
+        str, typer.Option(help=f"Ground station link, or {NO_LINK}.")
+    ] = f"udpout:127.0.0.1:{GROUND_PORT}",
+    firmware: Annotated[str, typer.Option(help="Whose behaviour: px4.")] = "px4",
+    speed: Annotated[float | None, typer.Option(help="Times real time, 0.1 .. 1000.")] = None,
+    lockstep: Annotated[
+        bool, typer.Option("--lockstep", help="Virtual time that waits for the companion.")
+    ] = False,
+    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Of all randomness.")] = 7,
+    scenario: Annotated[str, typer.Option(help="Name or file.")] = "px4_like",
+    vehicle: Annotated[str, typer.Option(help="Name or file.")] = "px4_sih",
+    duration: Annotated[
+        float | None, typer.Option(min=0.0, help="Stop after so many vehicle seconds.")
+    ] = None,
+    instance: Annotated[
+        int, typer.Option(min=0, max=249, help="Shifts ports and the system id, as PX4's.")
+    ] = 0,
+    patience: Annotated[
+        float, typer.Option(min=0.1, max=600.0, help="Seconds to wait for a silent companion.")
+    ] = 5.0,
+) -> None:
+    """Fly one simulated vehicle that speaks MAVLink like a real autopilot."""
+    if firmware not in FIRMWARES:
+        _refuse(f"--firmware {firmware}: unknown; there is {', '.join(FIRMWARES)}")
+    if lockstep and speed is not None:
+        _refuse("--speed and --lockstep exclude each other: lockstep has no speed")
+    if speed is not None and not 0.1 <= speed <= 1000.0:
+        _refuse(f"--speed {speed:g}: must be 0.1 .. 1000")
+    stopping = _stop_on_signals()
+
+    # late, so that a wrong option is answered at once
+    from offboard.flight.clock import unix_us
+    from offboard.model.document import DocumentError
+    from simulator import config
+    from simulator.udp import LinkError, open_link
+
+    connect = connect or f"udpout:127.0.0.1:{COMPANION_PORT + instance}"
+    try:
+        flown = config.scenario(scenario)
+        flyer = config.vehicle(vehicle)
+        companion = open_link(connect, LOCAL_COMPANION_PORT + instance)
+        ground = None if gcs == NO_LINK else open_link(gcs, LOCAL_GROUND_PORT + instance)
+    except (DocumentError, LinkError) as error:
+        _refuse(str(error))
+
+    _announce_compilation()
+    from simulator.firmware.px4 import PX4
+    from simulator.instance import VIRTUAL_EPOCH_US, Instance
+    from simulator.run import Runner
+
+    simulated = Instance(
+        PX4,
+        flyer,
+        flown.conditions,
+        seed,
+        system=instance + 1,
+        lockstep=lockstep,
+        epoch_us=VIRTUAL_EPOCH_US if lockstep else unix_us(),
+    )
+    print(
+        f"{firmware} vehicle {flyer.name}, system {instance + 1}, scenario {flown.name},"
+        f" seed {seed}: {connect.replace('udpout:', 'sending to ').replace('udpin:', 'waiting at ')}",
+        flush=True,
+    )
+    runner = Runner(
+        simulated, companion, ground, stopping=stopping, tell=_tell, duration_s=duration
+    )
+    outcome = runner.lockstep(patience) if lockstep else runner.real_time(speed or 1.0)
+    if outcome.sentence:
+        _tell(outcome.sentence)
+    raise typer.Exit(outcome.code)
+
+
+def _tell(sentence: str) -> None:
+    print(f"simulator: {sentence}", file=sys.stderr, flush=True)
+
+
+def _stop_on_signals() -> "Stop":
+    stop = Stop()
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, stop.note)
+    return stop
+
+
+class Stop:
+    """Becomes true with the first SIGTERM or SIGINT."""
+
+    def __init__(self) -> None:
+        self._noted = False
+
+    def note(self, number: int, frame: object) -> None:
+        self._noted = True
+
+    def __call__(self) -> bool:
+        return self._noted
+
+
+def _announce_compilation() -> None:
+    from offboard.model.compilation import prepare_cache
+
+    if not any(prepare_cache().rglob("plant.*.nbi")):
+        _tell("compiling the flight dynamics, once (some seconds)")
+
+
+def main() -> None:
+    """Console entry point. Exit codes: 0 stopped, 2 usage or configuration, 3 no companion."""
+    app()

@@ -1,0 +1,209 @@
+"""MAVLink 2 frames to and from plain values: the simulator's own reading of the protocol.
+
+Only the message tables (ids, field order, CRC extra) come from the dialect; packing, checksums and
+framing are written here, apart from the companion's codec, so that a mistake in one of them shows
+on the wire. Knows no vehicle, no socket and no clock. Nothing a peer sends makes it raise.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections import Counter
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from functools import cache
+from operator import itemgetter
+from typing import Any
+
+from fastcrc.crc16 import mcrf4xx
+from pymavlink.dialects.v20 import common as dialect
+
+MAGIC_V1 = 0xFE
+MAGIC_V2 = 0xFD
+SIGNED = 0x01  # incompatibility flag: 13 bytes of signature follow
+SIGNATURE_LENGTH = 13
+
+_HEADER_V2 = struct.Struct("<BBBBBBBHB")  # magic, length, flags x 2, seq, sys, comp, id (24 bit)
+
+
+@dataclass(frozen=True, slots=True)
+class Message:
+    """One decoded frame: `values` by field name, strings without padding, arrays as tuples."""
+
+    name: str
+    id: int
+    system: int
+    component: int
+    values: dict[str, Any]
+
+    def __getattr__(self, field_name: str) -> Any:
+        try:
+            return self.values[field_name]
+        except KeyError:
+            raise AttributeError(field_name) from None
+
+
+class Layout:
+    """How one message lies in its payload. `pack` takes the values in the order of the XML."""
+
+    def __init__(self, message: Any) -> None:
+        self.id: int = message.id
+        self.name: str = message.msgname
+        self.crc_extra: int = message.crc_extra
+        self._struct: struct.Struct = message.unpacker
+        self._wire_names: Sequence[str] = message.ordered_fieldnames
+        self._names: Sequence[str] = message.fieldnames
+        is_text = [fmt.endswith("s") for fmt in _formats(message)]
+        self._spans = [
+            1 if text else length for text, length in zip(is_text, message.lengths, strict=True)
+        ]
+        self._is_text = is_text
+        order = tuple(self._names.index(name) for name in self._wire_names)
+        self._to_wire: Callable[[Sequence[Any]], Any] = (
+            itemgetter(*order) if len(order) > 1 else tuple
+        )
+        self._flat = all(span == 1 for span in self._spans)
+
+    @property
+    def size(self) -> int:
+        return self._struct.size
+
+    def pack(self, values: Sequence[Any]) -> bytes:
+        """Payload with its trailing zeros removed (at least one byte stays)."""
+        wire = self._to_wire(values)
+        if not self._flat:
+            flat: list[Any] = []
+            for span, value in zip(self._spans, wire, strict=True):
+                if span == 1:
+                    flat.append(value)
+                else:
+                    flat.extend(value)
+            wire = flat
+        payload: bytes = self._struct.pack(*wire)
+        if payload[-1]:
+            return payload
+        return payload.rstrip(b"\0") or b"\0"
+
+    def unpack(self, payload: bytes) -> dict[str, Any]:
+        """Values by name; a short payload is filled with zeros, a long one cut (MAVLink 2)."""
+        size = self._struct.size
+        if len(payload) != size:
+            payload = payload[:size].ljust(size, b"\0")
+        flat = self._struct.unpack(payload)
+        values: dict[str, Any] = {}
+        at = 0
+        for name, span, text in zip(self._wire_names, self._spans, self._is_text, strict=True):
+            if span == 1:
+                value = flat[at]
+                values[name] = (
+                    value.split(b"\0", 1)[0].decode("ascii", "replace") if text else value
+                )
+            else:
+                values[name] = flat[at : at + span]
+            at += span
+        return values
+
+
+def _formats(message: Any) -> list[str]:
+    """One struct format per wire field, taken from the payload's format string."""
+    formats: list[str] = []
+    digits = ""
+    for letter in message.unpacker.format.lstrip("<"):
+        if letter.isdigit():
+            digits += letter
+        else:
+            formats.append(digits + letter)
+            digits = ""
+    return formats
+
+
+@cache
+def layout(name: str) -> Layout:
+    """Layout of the message called `name`; KeyError when the dialect has none."""
+    return Layout(dialect.mavlink_map[getattr(dialect, f"MAVLINK_MSG_ID_{name}")])
+
+
+@cache
+def layout_by_id(message_id: int) -> Layout | None:
+    """Layout of message `message_id`, or None when the dialect has none."""
+    message = dialect.mavlink_map.get(message_id)
+    return None if message is None else Layout(message)
+
+
+def name_of(message_id: int) -> str | None:
+    """Name of message `message_id`, or None when the dialect has none."""
+    found = layout_by_id(message_id)
+    return None if found is None else found.name
+
+
+def frame(sequence: int, system: int, component: int, message: Layout, payload: bytes) -> bytes:
+    """One unsigned MAVLink 2 frame round a packed payload."""
+    head = _HEADER_V2.pack(
+        MAGIC_V2,
+        len(payload),
+        0,
+        0,
+        sequence,
+        system,
+        component,
+        message.id & 0xFFFF,
+        message.id >> 16,
+    )
+    body = head + payload
+    crc = mcrf4xx(body[1:] + bytes((message.crc_extra,)))
+    return body + crc.to_bytes(2, "little")
+
+
+@dataclass
+class Decoder:
+    """Datagrams -> messages. What cannot be read is dropped and counted by reason.
+
+    A datagram holds whole frames: nothing is carried over, so that garbage in one cannot delay or
+    swallow a command in the next.
+    """
+
+    dropped: Counter[str] = field(default_factory=Counter)
+
+    def read(self, datagram: bytes) -> list[Message]:
+        """All intact messages of `datagram`, in order; frames are found behind garbage too."""
+        messages: list[Message] = []
+        at = 0
+        while at < len(datagram):
+            length, message = self._at(datagram, at)
+            if message is not None:
+                messages.append(message)
+            at += length
+        return messages
+
+    def _at(self, data: bytes, at: int) -> tuple[int, Message | None]:
+        """Bytes to move on, and the message that begins at `at`, if one does."""
+        left = len(data) - at
+        if data[at] == MAGIC_V2 and left >= 12:
+            head, message_id = 10, data[at + 7] | data[at + 8] << 8 | data[at + 9] << 16
+            system, component, flags = data[at + 5], data[at + 6], data[at + 2]
+        elif data[at] == MAGIC_V1 and left >= 8:
+            head, message_id = 6, data[at + 5]
+            system, component, flags = data[at + 3], data[at + 4], 0
+        else:
+            return self._skip("not a frame")
+        stop = at + head + data[at + 1]
+        length = stop + 2 - at + (SIGNATURE_LENGTH if flags & SIGNED else 0)
+        known = layout_by_id(message_id)
+        if flags & ~SIGNED:
+            return self._skip("incompatible flags")
+        if length > left:
+            return self._skip("truncated")
+        if known is None:
+            # no CRC extra to verify with: believed only when a frame, or nothing, follows
+            self.dropped["unknown message"] += 1
+            follows = length == left or data[at + length] in (MAGIC_V1, MAGIC_V2)
+            return (length if follows else 1), None
+        crc = mcrf4xx(data[at + 1 : stop] + bytes((known.crc_extra,)))
+        if data[stop] | data[stop + 1] << 8 != crc:
+            return self._skip("checksum")
+        values = known.unpack(data[at + head : stop])
+        return length, Message(known.name, message_id, system, component, values)
+
+    def _skip(self, reason: str) -> tuple[int, None]:
+        self.dropped[reason] += 1
+        return 1, None

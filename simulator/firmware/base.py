@@ -1,0 +1,174 @@
+"""What a firmware personality consists of: data the core of the simulator runs on.
+
+The core (`simulator.autopilot`, `simulator.server`) never asks which firmware it is: modes, the
+transition table, texts, numbers, timeouts, stream rates, parameters and the reading of setpoints
+all come from one `Firmware` value. A further personality is one more module that builds one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from enum import Enum, IntEnum
+from typing import Any, Literal
+
+Triple = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
+NAN3: Triple = (math.nan, math.nan, math.nan)
+
+
+class Result(IntEnum):
+    """MAV_RESULT."""
+
+    ACCEPTED = 0
+    TEMPORARILY_REJECTED = 1
+    DENIED = 2
+    UNSUPPORTED = 3
+    FAILED = 4
+
+
+class Severity(IntEnum):
+    """MAV_SEVERITY, those in use."""
+
+    CRITICAL = 2
+    INFO = 6
+
+
+class Behaviour(Enum):
+    """What the vehicle does in a mode."""
+
+    HOLD = "holds position"
+    TAKEOFF = "climbs to the takeoff height"
+    LAND = "descends where it is and lands"
+    RETURN = "flies home and lands"
+    DESCEND = "sinks slowly, as sticks that are not there ask for"
+    LEVEL = "level, least throttle: sticks that are not there"
+    SETPOINT = "obeys setpoints"
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """One flight mode. `base_mode`: MAV_MODE_FLAG bits without the armed bit."""
+
+    name: str
+    title: str  # in texts
+    custom_mode: int
+    base_mode: int
+    behaviour: Behaviour
+    arms: bool = True  # the vehicle may be armed in it
+    remembered: bool = True  # comes back after an automatic disarm
+    needs_sticks: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Say:
+    severity: Severity
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Rule:
+    """One row of the state table: the first row that fits an event decides.
+
+    event: name of what happened. mode: name of the mode it happened in, or "*".
+    when: names of guards that must all hold; "NAME=2" compares a parameter, "not X" negates.
+    to: next mode, "*" none, "requested" the mode asked for, "remembered" the last one chosen.
+    do: actions ("arm", "disarm", "failsafe", "recover").
+    result: what a command is answered with.
+    """
+
+    event: str
+    mode: str = "*"
+    when: tuple[str, ...] = ()
+    to: str = "*"
+    do: tuple[str, ...] = ()
+    result: Result = Result.ACCEPTED
+    say: Say | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ParameterSpec:
+    """One parameter: `kind` is "int32" or "real32"; values outside [minimum, maximum] refused."""
+
+    name: str
+    kind: Literal["int32", "real32"]
+    default: float
+    minimum: float
+    maximum: float
+    meaning: str
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeSetpoint:
+    """What the firmware makes of a SET_ATTITUDE_TARGET. None: keep what was demanded before."""
+
+    attitude: Quaternion | None
+    rates_frd_radps: Triple | None
+    thrust: float  # 0 .. 1
+
+
+@dataclass(frozen=True, slots=True)
+class MotionSetpoint:
+    """Position, velocity, acceleration (NED, SI), yaw (rad), yaw rate; NaN where not demanded."""
+
+    position_ned_m: Triple = NAN3
+    velocity_ned_mps: Triple = NAN3
+    acceleration_ned_mps2: Triple = NAN3
+    yaw_rad: float = math.nan
+    yaw_rate_radps: float = math.nan
+
+
+@dataclass(frozen=True, slots=True)
+class ModeRequest:
+    """What a mode command asks for: a mode's name, or the result to refuse it with."""
+
+    mode: str | None
+    refusal: Result = Result.DENIED
+
+
+@dataclass(frozen=True, slots=True)
+class PositionGains:
+    """Cascaded position loop: P on position, PID on velocity (acceleration out), and limits."""
+
+    position_xy_ps: float
+    position_z_ps: float
+    velocity_xy: Triple  # P 1/s, I 1/s^2, D -
+    velocity_z: Triple
+    speed_xy_mps: float
+    speed_up_mps: float
+    speed_down_mps: float
+    tilt_max_rad: float
+    derivative_cutoff_hz: float
+
+
+@dataclass(frozen=True, slots=True)
+class Firmware:
+    """A personality. Roles of parameters: `parameter_roles` maps what the core needs to names."""
+
+    name: str
+    mav_autopilot: int
+    version: int  # AUTOPILOT_VERSION.flight_sw_version
+    capabilities: int  # MAV_PROTOCOL_CAPABILITY
+    origin: tuple[float, float, float]  # of the local frame: latitude, longitude deg, AMSL m
+    boot_mode: str
+    modes: Mapping[str, Mode]
+    rules: tuple[Rule, ...]
+    parameters: tuple[ParameterSpec, ...]
+    parameter_roles: Mapping[str, str]
+    parameters_bytewise: bool  # INT32 lies in the float's bytes, not as its value
+    companion_rates_hz: Mapping[str, float]
+    ground_rates_hz: Mapping[str, float]
+    fixed_rate: frozenset[str]  # messages whose interval cannot be changed
+    mode_acked_twice: bool  # the receiver acks a mode command before the commander does
+    text_to_ground_stations_only: bool
+    text_suffix: str
+    healthy_after_s: float  # boot until the pre-arm checks pass
+    stream_reaction_s: float  # time-out of the stream until the failsafe acts
+    descend_speed_mps: float
+    spool_up_s: float
+    thrust_ramp_s: float
+    gains: PositionGains
+    command_mode: Callable[[tuple[float, ...]], ModeRequest]
+    attitude_setpoint: Callable[[Mapping[str, Any]], AttitudeSetpoint | None]
+    motion_setpoint: Callable[[Mapping[str, Any]], MotionSetpoint | None]

@@ -1,0 +1,316 @@
+"""PX4 1.16 multicopter: its modes, rules, texts, numbers, rates and parameters, as data.
+
+Measured on PX4 1.16.1 SITL where the wire shows it. Knows no simulator core and no socket.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from simulator.firmware.base import (
+    AttitudeSetpoint,
+    Behaviour,
+    Firmware,
+    Mode,
+    ModeRequest,
+    MotionSetpoint,
+    ParameterSpec,
+    PositionGains,
+    Result,
+    Rule,
+    Say,
+    Severity,
+    Triple,
+)
+
+# MAV_MODE_FLAG: 1 custom mode, 4 auto, 8 guided, 16 stabilise, 64 manual input
+AUTO, OFFBOARD, MANUAL = 29, 17, 81
+
+MODES = {
+    mode.name: mode
+    for mode in (
+        Mode("AUTO.LOITER", "Hold", 0x03040000, AUTO, Behaviour.HOLD),
+        Mode("AUTO.TAKEOFF", "Takeoff", 0x02040000, AUTO, Behaviour.TAKEOFF),
+        Mode("AUTO.LAND", "Land", 0x06040000, AUTO, Behaviour.LAND, arms=False, remembered=False),
+        Mode(
+            "AUTO.RTL", "Return", 0x05040000, AUTO, Behaviour.RETURN, arms=False, remembered=False
+        ),
+        Mode("OFFBOARD", "Offboard", 0x00060000, OFFBOARD, Behaviour.SETPOINT),
+        Mode("POSCTL", "Position", 0x00030000, MANUAL, Behaviour.DESCEND, needs_sticks=True),
+        Mode("ALTCTL", "Altitude", 0x00020000, MANUAL, Behaviour.DESCEND, needs_sticks=True),
+        Mode("STABILIZED", "Stabilized", 0x00070000, MANUAL, Behaviour.LEVEL, needs_sticks=True),
+    )
+}
+
+
+def _info(text: str) -> Say:
+    return Say(Severity.INFO, text)
+
+
+def _critical(text: str) -> Say:
+    return Say(Severity.CRITICAL, text)
+
+
+_LATER = Result.TEMPORARILY_REJECTED
+_LOST = _critical("Failsafe activated")
+_NOT_AVAILABLE = _critical("Switching to {mode} is currently not available")
+
+RULES = (
+    Rule("mode", when=("not armed",), to="requested"),
+    Rule("mode", when=("mode can run",), to="requested"),
+    Rule("mode", result=_LATER, say=_NOT_AVAILABLE),
+    Rule("takeoff", to="AUTO.TAKEOFF"),
+    Rule("land", to="AUTO.LAND", say=_info("Landing at current position")),
+    Rule("return", to="AUTO.RTL", say=_info("Returning to launch")),
+    Rule("arm", when=("armed",)),
+    Rule("arm", when=("ready",), do=("arm",), say=_info("Armed by external command")),
+    Rule(
+        "arm", result=_LATER, say=_critical("Arming denied: Resolve system health failures first")
+    ),
+    Rule("force arm", when=("armed",)),
+    Rule("force arm", do=("arm",), say=_info("Armed by external command")),
+    Rule("disarm", when=("not armed",)),
+    Rule(
+        "disarm",
+        when=("landed",),
+        do=("disarm",),
+        to="remembered",
+        say=_info("Disarmed by external command"),
+    ),
+    Rule("disarm", result=_LATER, say=_critical("Disarming denied: not landed")),
+    Rule("force disarm", when=("not armed",)),
+    Rule(
+        "force disarm", do=("disarm",), to="remembered", say=_info("Disarmed by external command")
+    ),
+    *(
+        Rule(
+            "stream lost",
+            "OFFBOARD",
+            when=("armed", f"COM_OBL_RC_ACT={action}"),
+            to=fallback,
+            do=("failsafe",),
+            say=_LOST,
+        )
+        for action, fallback in enumerate(
+            ("POSCTL", "ALTCTL", "STABILIZED", "AUTO.RTL", "AUTO.LAND", "AUTO.LOITER")
+        )
+    ),
+    Rule("stream found", when=("failsafe",), to="intended", do=("recover",)),
+    Rule("climbed", "AUTO.TAKEOFF", to="AUTO.LOITER"),
+    Rule("took off", say=_info("Takeoff detected")),
+    Rule("landed", say=_info("Landing detected")),
+    Rule("settled", do=("disarm",), to="remembered", say=_info("Disarmed by landing")),
+    Rule(
+        "idle",
+        do=("disarm",),
+        to="remembered",
+        say=_info("Disarmed by auto preflight disarming"),
+    ),
+)
+
+
+def _real(name: str, default: float, low: float, high: float, meaning: str) -> ParameterSpec:
+    return ParameterSpec(name, "real32", default, low, high, meaning)
+
+
+def _int(name: str, default: int, low: int, high: int, meaning: str) -> ParameterSpec:
+    return ParameterSpec(name, "int32", default, low, high, meaning)
+
+
+PARAMETERS = (
+    _real("COM_DISARM_LAND", 2.0, -1, 20, "s from landing to disarming, < 0 never"),
+    _real("COM_DISARM_PRFLT", 10.0, -1, 100, "s armed without takeoff until disarming, < 0 never"),
+    _int("COM_OBL_RC_ACT", 0, 0, 5, "offboard lost: POSCTL ALTCTL STABILIZED RTL LAND LOITER"),
+    _real("COM_OF_LOSS_T", 1.0, 0, 60, "s without setpoint until offboard is lost"),
+    _int("COM_RCL_EXCEPT", 0, 0, 31, "modes in which lost sticks do not matter, bit 2 offboard"),
+    _int("COM_RC_IN_MODE", 1, 0, 4, "manual input: 0 RC, 1 joystick, 4 none"),
+    _int("MAV_SYS_ID", 1, 1, 250, "system id; read at start"),
+    _int("MAV_TYPE", 2, 0, 22, "MAV_TYPE"),
+    _real("MIS_TAKEOFF_ALT", 2.5, 0, 80, "m, takeoff height"),
+    _real("MPC_LAND_SPEED", 0.7, 0.6, 10, "m/s near the ground"),
+    _real("MPC_THR_HOVER", 0.5, 0.1, 0.8, "normalised thrust believed to hover"),
+    _real("MPC_TKO_SPEED", 1.5, 1, 5, "m/s of climb at takeoff"),
+    _real("MPC_XY_CRUISE", 5.0, 3, 20, "m/s of automatic flight"),
+    _real("MPC_Z_V_AUTO_DN", 1.5, 0.5, 4, "m/s of automatic descent"),
+    _int("NAV_DLL_ACT", 0, 0, 6, "ground station lost: 0 nothing"),
+    _int("NAV_RCL_ACT", 2, 1, 6, "sticks lost: 2 return"),
+    _real("RTL_RETURN_ALT", 30.0, 0, 150, "m above home while returning"),
+    _int("SYS_AUTOSTART", 10040, 0, 9999999, "airframe"),
+)
+
+ROLES = {
+    "stream_timeout_s": "COM_OF_LOSS_T",
+    "disarm_landed_s": "COM_DISARM_LAND",
+    "disarm_idle_s": "COM_DISARM_PRFLT",
+    "takeoff_height_m": "MIS_TAKEOFF_ALT",
+    "takeoff_speed_mps": "MPC_TKO_SPEED",
+    "land_speed_mps": "MPC_LAND_SPEED",
+    "descent_speed_mps": "MPC_Z_V_AUTO_DN",
+    "cruise_speed_mps": "MPC_XY_CRUISE",
+    "return_height_m": "RTL_RETURN_ALT",
+    "hover_thrust": "MPC_THR_HOVER",
+}
+
+COMPANION_RATES_HZ = {
+    "HEARTBEAT": 1.0,
+    "ATTITUDE": 100.0,
+    "ATTITUDE_QUATERNION": 50.0,
+    "GLOBAL_POSITION_INT": 50.0,
+    "HIGHRES_IMU": 50.0,
+    "LOCAL_POSITION_NED": 30.0,
+    "ODOMETRY": 30.0,
+    "ALTITUDE": 10.0,
+    "ATTITUDE_TARGET": 10.0,
+    "POSITION_TARGET_LOCAL_NED": 10.0,
+    "TIMESYNC": 10.0,
+    "VFR_HUD": 10.0,
+    "GPS_RAW_INT": 8.0,
+    "SYS_STATUS": 5.0,
+    "EXTENDED_SYS_STATE": 5.0,
+    "ESTIMATOR_STATUS": 1.0,
+    "SYSTEM_TIME": 1.0,
+    "PING": 1.0,
+    "BATTERY_STATUS": 0.5,
+    "HOME_POSITION": 0.5,
+}
+
+GROUND_RATES_HZ = {
+    "HEARTBEAT": 1.0,
+    "ATTITUDE": 15.0,
+    "ATTITUDE_QUATERNION": 10.0,
+    "GLOBAL_POSITION_INT": 5.0,
+    "GPS_RAW_INT": 5.0,
+    "VFR_HUD": 4.0,
+    "ATTITUDE_TARGET": 2.0,
+    "POSITION_TARGET_LOCAL_NED": 1.5,
+    "ALTITUDE": 1.0,
+    "LOCAL_POSITION_NED": 1.0,
+    "SYS_STATUS": 1.0,
+    "EXTENDED_SYS_STATE": 1.0,
+    "SYSTEM_TIME": 1.0,
+    "ESTIMATOR_STATUS": 0.5,
+    "BATTERY_STATUS": 0.5,
+    "HOME_POSITION": 0.5,
+    "PING": 0.1,
+}
+
+# PX4_CUSTOM_MAIN_MODE, PX4_CUSTOM_SUB_MODE_AUTO
+_MAIN = {2: "ALTCTL", 3: "POSCTL", 6: "OFFBOARD", 7: "STABILIZED"}
+_AUTO_SUB = {2: "AUTO.TAKEOFF", 3: "AUTO.LOITER", 5: "AUTO.RTL", 6: "AUTO.LAND"}
+_CUSTOM_MODE_ENABLED = 1
+
+
+def command_mode(params: tuple[float, ...]) -> ModeRequest:
+    """MAV_CMD_DO_SET_MODE (176): param1 base mode, param2 main mode, param3 sub mode of AUTO."""
+    base, main, sub = (int(p) if math.isfinite(p) else 0 for p in params[:3])
+    if not base & _CUSTOM_MODE_ENABLED:
+        return ModeRequest(None, Result.DENIED)
+    if main == 4:
+        return ModeRequest(_AUTO_SUB.get(sub), Result.TEMPORARILY_REJECTED)
+    return ModeRequest(_MAIN.get(main), Result.DENIED)
+
+
+_RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b011, 64, 128
+
+
+def attitude_setpoint(values: Mapping[str, Any]) -> AttitudeSetpoint | None:
+    """SET_ATTITUDE_TARGET, with PX4's lack of checks; None when it is no stream (mask 135).
+
+    Only the roll and pitch rate bits count as "no rates". A thrust that is ignored or NaN is zero
+    thrust. A quaternion of any length flies; one without direction leaves the last attitude.
+    """
+    mask = values["type_mask"]
+    attitude_given = not mask & _ATTITUDE_IGNORED
+    rates_given = not mask & _RATES_IGNORED
+    if not attitude_given and not rates_given:
+        return None
+    thrust = 0.0 if mask & _THRUST_IGNORED else values["thrust"]
+    thrust = min(1.0, max(0.0, thrust)) if not math.isnan(thrust) else 0.0
+    if attitude_given:
+        w, x, y, z = values["q"]
+        norm = math.sqrt(w * w + x * x + y * y + z * z)
+        if not (math.isfinite(norm) and norm > 1e-6):
+            return AttitudeSetpoint(None, None, thrust)
+        return AttitudeSetpoint((w / norm, x / norm, y / norm, z / norm), None, thrust)
+    rates = (values["body_roll_rate"], values["body_pitch_rate"], values["body_yaw_rate"])
+    finite: Triple = (
+        rates[0] if math.isfinite(rates[0]) else 0.0,
+        rates[1] if math.isfinite(rates[1]) else 0.0,
+        rates[2] if math.isfinite(rates[2]) else 0.0,
+    )
+    return AttitudeSetpoint(None, finite, thrust)
+
+
+_LOCAL_NED = 1  # MAV_FRAME
+_YAW_IGNORED, _YAW_RATE_IGNORED = 1024, 2048
+
+
+def motion_setpoint(values: Mapping[str, Any]) -> MotionSetpoint | None:
+    """SET_POSITION_TARGET_LOCAL_NED in frame 1; None when nothing is demanded."""
+    if values["coordinate_frame"] != _LOCAL_NED:
+        return None
+    mask = values["type_mask"]
+
+    def triple(names: tuple[str, str, str], shift: int) -> Triple:
+        a, b, c = (
+            math.nan if mask >> (shift + i) & 1 or math.isinf(values[name]) else values[name]
+            for i, name in enumerate(names)
+        )
+        return (a, b, c)
+
+    position = triple(("x", "y", "z"), 0)
+    velocity = triple(("vx", "vy", "vz"), 3)
+    acceleration = triple(("afx", "afy", "afz"), 6)
+    if all(math.isnan(value) for value in (*position, *velocity, *acceleration)):
+        return None
+    yaw, yaw_rate = values["yaw"], values["yaw_rate"]
+    return MotionSetpoint(
+        position,
+        velocity,
+        acceleration,
+        math.nan if mask & _YAW_IGNORED or math.isinf(yaw) else yaw,
+        math.nan if mask & _YAW_RATE_IGNORED or math.isinf(yaw_rate) else yaw_rate,
+    )
+
+
+PX4 = Firmware(
+    name="px4",
+    mav_autopilot=12,
+    version=0x011001FF,  # 1.16.1, release
+    # float parameters, COMMAND_INT, bytewise parameters, attitude and position targets, MAVLink 2
+    capabilities=0x20DA,
+    origin=(47.397742, 8.545594, 489.4),
+    boot_mode="AUTO.LOITER",
+    modes=MODES,
+    rules=RULES,
+    parameters=PARAMETERS,
+    parameter_roles=ROLES,
+    parameters_bytewise=True,
+    companion_rates_hz=COMPANION_RATES_HZ,
+    ground_rates_hz=GROUND_RATES_HZ,
+    fixed_rate=frozenset({"HEARTBEAT"}),
+    mode_acked_twice=True,
+    text_to_ground_stations_only=True,
+    text_suffix="\t",
+    healthy_after_s=4.0,
+    stream_reaction_s=0.036,
+    descend_speed_mps=0.6,
+    spool_up_s=1.0,
+    thrust_ramp_s=1.5,
+    gains=PositionGains(
+        position_xy_ps=0.95,
+        position_z_ps=1.0,
+        velocity_xy=(1.8, 0.4, 0.2),
+        velocity_z=(4.0, 2.0, 0.0),
+        speed_xy_mps=12.0,
+        speed_up_mps=3.0,
+        speed_down_mps=1.5,
+        tilt_max_rad=math.radians(45.0),
+        derivative_cutoff_hz=5.0,
+    ),
+    command_mode=command_mode,
+    attitude_setpoint=attitude_setpoint,
+    motion_setpoint=motion_setpoint,
+)

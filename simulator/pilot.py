@@ -1,0 +1,266 @@
+"""What the vehicle does in each mode: behaviour and estimate in, demand on the attitude loop out.
+
+Knows position, time and parameters; knows no modes by name, no rules and no MAVLink. Decisions
+about modes are the autopilot's (`simulator.autopilot`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from simulator.firmware.base import (
+    AttitudeSetpoint,
+    Behaviour,
+    Firmware,
+    MotionSetpoint,
+    Quaternion,
+    Triple,
+)
+from simulator.parameters import ParameterTable
+from simulator.plant import Demand
+from simulator.position_loop import PositionLoop
+
+LOOP_S = 0.008  # the position loop runs at every second step, as PX4's does on its estimate
+CONTACT_S = 0.3  # on the ground, wanting down: then the motors idle
+LANDED_S = 1.0  # this long of it is a landing
+AIRBORNE_S = 0.1
+_LAND_SLOW_BELOW_M, _LAND_FAST_ABOVE_M = 5.0, 10.0
+_ARRIVED_M = 1.0
+_CLIMBED_M = 0.3
+_STICK_LESS_THRUST = 0.08  # MPC_MANTHR_MIN
+_LOW_THRUST_SHARE = 0.6  # of hover: less cannot lift
+OFF = Demand()
+
+
+@dataclass(frozen=True, slots=True)
+class Nav:
+    """The estimate as plain floats, and whether the feet touch the ground."""
+
+    position_ned_m: Triple
+    velocity_ned_mps: Triple
+    attitude: Quaternion
+    rates_frd_radps: Triple
+    on_ground: bool
+    reset_counter: int = 0
+
+    @property
+    def yaw_rad(self) -> float:
+        w, x, y, z = self.attitude
+        return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+class Pilot:
+    """Flies one behaviour at a time. `landed` is its land detector's verdict."""
+
+    def __init__(self, firmware: Firmware, parameters: ParameterTable) -> None:
+        self._firmware = firmware
+        self._parameters = parameters
+        self._loop = PositionLoop(firmware.gains)
+        self._behaviour = Behaviour.HOLD
+        self._hold: Triple = (0.0, 0.0, 0.0)
+        self._takeoff_z_m = math.nan
+        self._return_stage = 0
+        self._demand = OFF
+        self._source: AttitudeSetpoint | None = None
+        self._attitude: Quaternion = (1.0, 0.0, 0.0, 0.0)
+        self._next_loop_s = 0.0
+        self._ground_s = self._air_s = 0.0
+        self._ramp_s = 0.0
+        self._wants_down = True
+        self.home_ned_m: Triple = (0.0, 0.0, 0.0)
+        self.landed = True
+        self.climbed = False
+        self.setpoint: AttitudeSetpoint | MotionSetpoint | None = None
+        self.motion = MotionSetpoint()  # what the position loop was last asked for
+
+    @property
+    def demand(self) -> Demand:
+        """The demand in force."""
+        return self._demand
+
+    def enter(self, behaviour: Behaviour, nav: Nav, takeoff_z_m: float = math.nan) -> None:
+        """Begin a behaviour here. `takeoff_z_m`: NED height to climb to; NaN the default one."""
+        self._behaviour = behaviour
+        self._hold = _ahead(nav)
+        self._takeoff_z_m = takeoff_z_m
+        self._return_stage = 0
+        self.climbed = False
+        self._next_loop_s = 0.0
+        self._source = None
+        self._loop.reset(nav.yaw_rad)
+
+    def arm(self, nav: Nav) -> None:
+        """The motors begin to turn: home is here."""
+        self.home_ned_m = nav.position_ned_m
+        self._ramp_s = -self._firmware.spool_up_s
+        self._hold = nav.position_ned_m
+        self._attitude = _level(nav.yaw_rad)
+        self._loop.reset(nav.yaw_rad)
+
+    def fly(self, time_s: float, armed: bool, look: Callable[[], Nav]) -> Demand:
+        """The demand for the step that begins now. `look` gives the estimate when it is needed."""
+        if not armed:
+            self._demand, self._source = OFF, None
+            self.landed = self.landed or look().on_ground
+            return OFF
+        by_setpoint = self._obeys_attitude
+        if by_setpoint and isinstance(self.setpoint, AttitudeSetpoint):
+            self._obey(self.setpoint)
+        if time_s >= self._next_loop_s - 1e-6:
+            self._next_loop_s = time_s + LOOP_S
+            nav = look()
+            if self._behaviour is Behaviour.LEVEL:
+                self._set(_level(self._loop.yaw_rad), None, _STICK_LESS_THRUST)
+            elif not by_setpoint:
+                self._fly_motion(nav)
+            self._detect(nav)
+        return self._demand
+
+    @property
+    def _obeys_attitude(self) -> bool:
+        return self._behaviour is Behaviour.SETPOINT and isinstance(self.setpoint, AttitudeSetpoint)
+
+    def _obey(self, setpoint: AttitudeSetpoint) -> None:
+        if setpoint is self._source:
+            return
+        self._source = setpoint
+        if setpoint.attitude is not None:
+            self._attitude = setpoint.attitude
+        if setpoint.rates_frd_radps is not None:
+            self._set(None, setpoint.rates_frd_radps, setpoint.thrust)
+        else:
+            self._set(self._attitude, None, setpoint.thrust)
+
+    def _set(self, attitude: Quaternion | None, rates: Triple | None, thrust: float) -> None:
+        demand = Demand(True, thrust, attitude, rates)
+        if demand != self._demand:
+            self._demand = demand
+
+    # -- motion ------------------------------------------------------------------------------
+
+    def _fly_motion(self, nav: Nav) -> None:
+        lifting = self._behaviour in (Behaviour.TAKEOFF, Behaviour.SETPOINT)
+        if self.landed and lifting and self._ramp_s < 0.0:
+            self._hold = nav.position_ned_m
+        motion = self._motion(nav)
+        cruise, up = math.inf, math.inf
+        if self._behaviour is not Behaviour.SETPOINT:
+            cruise = self._parameters.role("cruise_speed_mps")
+        if self._behaviour is Behaviour.TAKEOFF:
+            up = self._parameters.role("takeoff_speed_mps")
+        hover = self._parameters.role("hover_thrust")
+        self.motion = motion
+        attitude, thrust, wanted = self._loop.step(
+            LOOP_S,
+            nav.position_ned_m,
+            nav.velocity_ned_mps,
+            motion,
+            hover,
+            speed_xy_mps=cruise,
+            speed_up_mps=up,
+            integrate=not nav.on_ground,
+        )
+        if self.landed:
+            attitude, thrust = self._lift(lifting and _wants_up(wanted, motion), thrust, hover, nav)
+        elif self._ground_s > CONTACT_S:
+            attitude, thrust = _level(nav.yaw_rad), 0.0
+        self._attitude = attitude
+        self._wants_down = not _wants_up(wanted, motion)
+        self._set(attitude, None, thrust)
+
+    def _lift(
+        self, wants_up: bool, thrust: float, hover: float, nav: Nav
+    ) -> tuple[Quaternion, float]:
+        """On the ground: spool up, then ramp the thrust until the vehicle leaves it."""
+        if self._ramp_s < 0.0 or wants_up:
+            self._ramp_s += LOOP_S
+        if self._ramp_s <= 0.0 or not wants_up:
+            self._loop.reset(nav.yaw_rad)
+            return _level(nav.yaw_rad), 0.0
+        share = min(1.0, self._ramp_s / self._firmware.thrust_ramp_s)
+        return _level(self._loop.yaw_rad), share * max(thrust, 1.2 * hover)
+
+    def _motion(self, nav: Nav) -> MotionSetpoint:
+        hold_x, hold_y, hold_z = self._hold
+        if self._behaviour is Behaviour.SETPOINT and isinstance(self.setpoint, MotionSetpoint):
+            return self.setpoint
+        if self._behaviour is Behaviour.TAKEOFF:
+            return self._takeoff(nav)
+        if self._behaviour is Behaviour.RETURN:
+            return self._return(nav)
+        if self._behaviour is Behaviour.LAND:
+            return _sink(self._hold, self._land_speed(nav))
+        if self._behaviour is Behaviour.DESCEND:
+            return _sink(self._hold, self._firmware.descend_speed_mps)
+        return MotionSetpoint((hold_x, hold_y, hold_z))
+
+    def _takeoff(self, nav: Nav) -> MotionSetpoint:
+        target_z = self._takeoff_z_m
+        if math.isnan(target_z):
+            target_z = self.home_ned_m[2] - self._parameters.role("takeoff_height_m")
+        if nav.position_ned_m[2] < target_z + _CLIMBED_M:
+            self.climbed = not self.landed
+        return MotionSetpoint((self._hold[0], self._hold[1], target_z))
+
+    def _return(self, nav: Nav) -> MotionSetpoint:
+        """Climb (lower the nearer home is, under a cone of 45 degrees), fly home, land."""
+        home_x, home_y, home_z = self.home_ned_m
+        x, y, z = nav.position_ned_m
+        distance = math.hypot(x - home_x, y - home_y)
+        if self._return_stage == 0:
+            height = min(self._parameters.role("return_height_m"), distance)
+            self._hold = (self._hold[0], self._hold[1], min(z, home_z - height))
+            self._return_stage = 1
+        if self._return_stage == 1 and z < self._hold[2] + _ARRIVED_M:
+            self._hold = (home_x, home_y, self._hold[2])
+            self._return_stage = 2
+        if self._return_stage == 2 and distance < _ARRIVED_M:
+            self._return_stage = 3
+        if self._return_stage == 3:
+            return _sink(self._hold, self._land_speed(nav))
+        return MotionSetpoint(self._hold)
+
+    def _land_speed(self, nav: Nav) -> float:
+        height_m = self.home_ned_m[2] - nav.position_ned_m[2]
+        slow = self._parameters.role("land_speed_mps")
+        fast = max(slow, self._parameters.role("descent_speed_mps"))
+        share = (height_m - _LAND_SLOW_BELOW_M) / (_LAND_FAST_ABOVE_M - _LAND_SLOW_BELOW_M)
+        return slow + min(1.0, max(0.0, share)) * (fast - slow)
+
+    # -- land detector -----------------------------------------------------------------------
+
+    def _detect(self, nav: Nav) -> None:
+        """Contact and the wish to go down make a landing; a moment without contact a takeoff."""
+        low = self._demand.thrust < _LOW_THRUST_SHARE * self._parameters.role("hover_thrust")
+        if not self._obeys_attitude:
+            low = low or self._wants_down
+        self._ground_s = self._ground_s + LOOP_S if nav.on_ground and low else 0.0
+        self._air_s = 0.0 if nav.on_ground else self._air_s + LOOP_S
+        if not self.landed and self._ground_s >= LANDED_S:
+            self.landed = True
+            self._ramp_s = 0.0
+        elif self.landed and self._air_s >= AIRBORNE_S:
+            self.landed = False
+            self._loop.reset(self._loop.yaw_rad)
+
+
+def _level(yaw_rad: float) -> Quaternion:
+    return (math.cos(0.5 * yaw_rad), 0.0, 0.0, math.sin(0.5 * yaw_rad))
+
+
+def _ahead(nav: Nav) -> Triple:
+    """Where a vehicle comes to rest that brakes gently from here."""
+    (x, y, z), (vx, vy, vz) = nav.position_ned_m, nav.velocity_ned_mps
+    return (x + 0.5 * vx, y + 0.5 * vy, z + 0.2 * vz)
+
+
+def _sink(hold: Triple, speed_mps: float) -> MotionSetpoint:
+    return MotionSetpoint((hold[0], hold[1], math.nan), (math.nan, math.nan, speed_mps))
+
+
+def _wants_up(wanted: Triple, motion: MotionSetpoint) -> bool:
+    if math.isnan(wanted[2]):
+        return motion.acceleration_ned_mps2[2] < -0.1
+    return wanted[2] < -0.1

@@ -1,0 +1,181 @@
+"""An instance in time and on sockets: real time, any speed, or lockstep with its companion.
+
+Lockstep is MAVLink's own: at each barrier the simulator sends a TIMESYNC request after the
+telemetry and waits for the answer. The companion answers in the order in which it reads, so by
+then it has handled that telemetry, and all it sent before the answer is applied at that instant.
+Input is read at barriers only, hence a flight is a function of its seed.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from offboard.flight.clock import monotonic_s
+from simulator.instance import Instance
+from simulator.plant import STEP_S
+from simulator.udp import UdpLink, wait
+
+RESEND_S = 0.05  # until the companion is first heard
+RESEND_SILENT_S = 1.0
+FIRST_CONTACT_S = 30.0
+FREE_RUN_S = 60.0  # vehicle time after the companion fell silent
+POLL_S = 0.05  # so that a stop is noticed in time
+BEHIND_S = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Exit code and, unless all is well, a sentence."""
+
+    code: int
+    sentence: str = ""
+
+
+class Runner:
+    """One instance and its sockets. `stopping` is asked often; `tell` gets sentences."""
+
+    def __init__(
+        self,
+        instance: Instance,
+        companion: UdpLink,
+        ground: UdpLink | None,
+        *,
+        stopping: Callable[[], bool],
+        tell: Callable[[str], None],
+        duration_s: float | None = None,
+    ) -> None:
+        self._instance = instance
+        self._companion = companion
+        self._ground = ground
+        self._links = [companion] if ground is None else [companion, ground]
+        self._stopping = stopping
+        self._tell = tell
+        self._duration_s = duration_s
+
+    def _over(self) -> bool:
+        expired = self._duration_s is not None and self._instance.time_s >= self._duration_s
+        return expired or self._stopping()
+
+    def _send(self) -> list[bytes]:
+        """Send what both links have queued; return the companion's datagrams."""
+        datagrams = self._instance.companion.drain()
+        self._companion.send(datagrams)
+        self._send_ground()
+        return datagrams
+
+    def _send_ground(self) -> None:
+        datagrams = self._instance.ground.drain()
+        if self._ground is not None:
+            self._ground.send(datagrams)
+
+    def _read_ground(self) -> None:
+        while self._ground is not None and (datagram := self._ground.receive()) is not None:
+            self._instance.feed_ground(datagram)
+
+    # -- real time ---------------------------------------------------------------------------
+
+    def real_time(self, speed: float) -> Outcome:
+        """`speed` x real time, by absolute deadlines; answers go out as soon as they are due."""
+        instance = self._instance
+        gc.collect()
+        gc.freeze()
+        epoch_s = monotonic_s() - instance.time_s / speed
+        while not self._over():
+            deadline_s = epoch_s + (instance.time_s + STEP_S) / speed
+            self._serve_until(deadline_s)
+            instance.advance()
+            self._send()
+            behind_s = monotonic_s() - deadline_s
+            if behind_s > BEHIND_S:  # suspended or overloaded: go on from here, do not race
+                self._tell(
+                    f"{behind_s:.1f} s behind at {instance.time_s:.1f} s: going on from here"
+                )
+                epoch_s += behind_s
+        return Outcome(0)
+
+    def _serve_until(self, deadline_s: float) -> None:
+        """Handle what arrives before the deadline; once in any case."""
+        while True:
+            remaining_s = deadline_s - monotonic_s()
+            wait(self._links, min(remaining_s, POLL_S))
+            answered = False
+            while (datagram := self._companion.receive()) is not None:
+                self._instance.feed(datagram)
+                answered = True
+            self._read_ground()
+            if answered:
+                self._send()
+            else:
+                self._send_ground()
+            if remaining_s <= 0 or self._stopping():
+                return
+
+    # -- lockstep ----------------------------------------------------------------------------
+
+    def lockstep(self, patience_s: float) -> Outcome:
+        """Virtual time that waits for the companion at every barrier."""
+        gc.collect()
+        gc.freeze()
+        while not self._over():
+            self._instance.advance()
+            if not self._instance.barrier_due():
+                continue
+            stamp_ns = self._instance.companion.send_barrier()
+            datagrams = self._send()
+            self._read_ground()
+            if self._answered(stamp_ns, datagrams, patience_s) or self._stopping():
+                continue
+            if not self._instance.companion.heard:
+                return Outcome(
+                    3,
+                    f"no companion answered within {FIRST_CONTACT_S:.0f} s: start one that speaks"
+                    " MAVLink and answers TIMESYNC, or leave --lockstep away",
+                )
+            self._tell(f"the companion fell silent at {self._instance.time_s:.2f} s")
+            if not self._free_run():
+                return Outcome(3, "the companion did not come back")
+        return Outcome(0)
+
+    def _answered(self, stamp_ns: int, datagrams: list[bytes], patience_s: float) -> bool:
+        """Wait for the answer to this barrier, applying all that comes before it."""
+        server = self._instance.companion
+        begun_s = sent_s = monotonic_s()
+        first = not server.heard
+        while server.answered_ns != stamp_ns:
+            datagram = self._companion.receive()
+            if datagram is not None:
+                self._instance.feed(datagram)
+                continue
+            if self._stopping():
+                return False
+            now_s = monotonic_s()
+            if now_s - begun_s > (FIRST_CONTACT_S if first else patience_s):
+                return False
+            if now_s - sent_s >= (RESEND_SILENT_S if server.heard else RESEND_S):
+                self._companion.send(datagrams)
+                sent_s = now_s
+            wait([self._companion], POLL_S)
+        return True
+
+    def _free_run(self) -> bool:
+        """Let the failsafe play out at full speed; True as soon as the companion answers again."""
+        instance = self._instance
+        end_s = instance.time_s + FREE_RUN_S
+        known_ns = instance.companion.answered_ns
+        while instance.time_s < end_s and not (instance.idle or self._over()):
+            instance.advance()
+            if not instance.barrier_due():
+                continue
+            instance.companion.send_barrier()
+            self._send()
+            while (datagram := self._companion.receive()) is not None:
+                instance.feed(datagram)
+            self._read_ground()
+            if instance.companion.answered_ns != known_ns:
+                self._tell(f"the companion is back at {instance.time_s:.2f} s")
+                return True
+        state = "landed and disarmed" if instance.idle else "still flying"
+        self._tell(f"without it the vehicle is {state} at {instance.time_s:.1f} s")
+        return False

@@ -1,0 +1,244 @@
+"""The MAVLink side of one link, without I/O: datagrams in, frames out.
+
+Each link has its own sequence numbers, rates and clients. Answers and telemetry wait in order
+until `drain` takes them. Knows no socket and no clock: time is the autopilot's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+from simulator.codec import Decoder, Message, frame, layout
+from simulator.commands import Command, Commands
+from simulator.firmware.base import Say
+from simulator.telemetry import (
+    BUILDERS,
+    MAV_COMP_ID_AUTOPILOT,
+    ON_POSITION_GRID,
+    POSITION_GRID_STEPS,
+    View,
+)
+
+MAV_TYPE_GCS = 6
+TEXT_LENGTH = 50
+DATAGRAM_MAX = 1400
+PARAMETERS_PER_STEP = 4
+_FTP_NAK, _FTP_ERROR_NOT_FOUND = 128 + 1, 10
+
+
+@dataclass(slots=True)
+class Stream:
+    """One message sent by itself: interval and next time, microseconds of vehicle time."""
+
+    interval_us: int
+    due_us: int
+
+
+@dataclass(slots=True)
+class Server:
+    """One link of one vehicle. `rates_hz`: what it sends without being asked.
+
+    `barrier` leaves TIMESYNC requests to `send_barrier`: in lockstep they are the clock.
+    """
+
+    view: View
+    rates_hz: Mapping[str, float]
+    barrier: bool = False
+    decoder: Decoder = field(default_factory=Decoder)
+    heard: bool = False
+    answered_ns: int = -1  # ts1 of the newest TIMESYNC answer
+    _ground_station: bool = False
+    _sequence: int = 0
+    _out: list[bytes] = field(default_factory=list)
+    _streams: dict[str, Stream] = field(default_factory=dict)
+    _next_us: int = 0
+    _text_id: int = 0
+    _parameters_due: list[str] = field(default_factory=list)
+    _commands: Commands = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._commands = Commands(self)
+        for name, rate_hz in self.rates_hz.items():
+            if not (self.barrier and name == "TIMESYNC"):
+                self._streams[name] = Stream(round(1e6 / rate_hz), 0)
+
+    # -- out ---------------------------------------------------------------------------------
+
+    def send(self, name: str, *values: object) -> None:
+        """Queue one message; `values` in the order of the XML."""
+        self._frame(name, layout(name).pack(values))
+
+    def send_now(self, name: str) -> None:
+        """Queue the message of `BUILDERS` called `name`, as it is now."""
+        self._frame(name, self.view.payload(name))
+
+    def _frame(self, name: str, payload: bytes) -> None:
+        system = self.view.system
+        self._out.append(
+            frame(self._sequence, system, MAV_COMP_ID_AUTOPILOT, layout(name), payload)
+        )
+        self._sequence = (self._sequence + 1) & 0xFF
+
+    def drain(self) -> list[bytes]:
+        """Everything queued, as datagrams of whole frames."""
+        datagrams: list[bytes] = []
+        size, start = 0, 0
+        for i, queued in enumerate(self._out):
+            if size and size + len(queued) > DATAGRAM_MAX:
+                datagrams.append(b"".join(self._out[start:i]))
+                size, start = 0, i
+            size += len(queued)
+        if start < len(self._out):
+            datagrams.append(b"".join(self._out[start:]))
+        self._out = []
+        return datagrams
+
+    def step(self) -> None:
+        """Queue the telemetry that is due at this step."""
+        now_us = self.view.time_us
+        if self._parameters_due:
+            for name in self._parameters_due[:PARAMETERS_PER_STEP]:
+                self.send_parameter(name)
+            del self._parameters_due[:PARAMETERS_PER_STEP]
+        if now_us < self._next_us:
+            return
+        on_grid = self.view.autopilot.steps % POSITION_GRID_STEPS == 0
+        for name, stream in self._streams.items():
+            if stream.due_us <= now_us and (on_grid or name not in ON_POSITION_GRID):
+                self.send_now(name)
+                stream.due_us = _next_multiple(now_us, stream)
+        self._next_us = min((s.due_us for s in self._streams.values()), default=1 << 62)
+
+    def send_barrier(self) -> int:
+        """Queue a TIMESYNC request; return its ts1, nanoseconds of vehicle time."""
+        self.send_now("TIMESYNC")
+        return self.view.time_us * 1000
+
+    def say(self, said: Say) -> None:
+        """Queue a STATUSTEXT in chunks, if this link gets texts at all."""
+        firmware = self.view.autopilot.firmware
+        if firmware.text_to_ground_stations_only and not self._ground_station:
+            return
+        text = (said.text + firmware.text_suffix).encode("ascii", "replace")
+        for chunk, at in enumerate(range(0, len(text), TEXT_LENGTH)):
+            piece = text[at : at + TEXT_LENGTH]
+            self.send("STATUSTEXT", int(said.severity), piece, self._text_id, chunk)
+        self._text_id = (self._text_id + 1) & 0xFFFF
+
+    def send_parameter(self, name: str) -> None:
+        """Queue PARAM_VALUE."""
+        table = self.view.autopilot.parameters
+        value, kind = table.to_wire(name)
+        index = table.names.index(name)
+        self.send("PARAM_VALUE", name.encode(), value, kind, len(table.names), index)
+
+    def set_interval(self, name: str, interval_us: float) -> bool:
+        """0 restores the default, < 0 stops; False when the message has no settable rate."""
+        if name not in BUILDERS or name in self.view.autopilot.firmware.fixed_rate:
+            return False
+        if interval_us == 0:
+            rate_hz = self.rates_hz.get(name)
+            interval_us = -1.0 if rate_hz is None else 1e6 / rate_hz
+        if interval_us < 0:
+            self._streams.pop(name, None)
+            return True
+        stream = Stream(max(1, round(interval_us)), 0)
+        stream.due_us = _next_multiple(self.view.time_us, stream)
+        self._streams[name] = stream
+        self._next_us = 0
+        return True
+
+    def interval_us(self, name: str) -> int:
+        """Interval of a message; -1 when it is not sent by itself."""
+        stream = self._streams.get(name)
+        return -1 if stream is None else stream.interval_us
+
+    # -- in ----------------------------------------------------------------------------------
+
+    def receive(self, datagram: bytes) -> None:
+        """Handle everything in one datagram; no bytes make this raise."""
+        for message in self.decoder.read(datagram):
+            self.heard = True
+            handler = HANDLERS.get(message.name)
+            if handler is not None and self._is_for_us(message):
+                handler(self, message)
+
+    def _is_for_us(self, message: Message) -> bool:
+        """To our system or all, to the autopilot or all of it."""
+        system = message.values.get("target_system", 0)
+        component = message.values.get("target_component", 0)
+        return system in (0, self.view.system) and component in (0, MAV_COMP_ID_AUTOPILOT)
+
+    def _heartbeat(self, message: Message) -> None:
+        self._ground_station = self._ground_station or message.type == MAV_TYPE_GCS
+
+    def _command_long(self, message: Message) -> None:
+        params = tuple(message.values[f"param{i}"] for i in range(1, 8))
+        self._commands.run(Command(message.command, params, message.system, message.component))
+
+    def _command_int(self, message: Message) -> None:
+        params = tuple(message.values[f"param{i}"] for i in range(1, 5))
+        params += (message.x * 1e-7, message.y * 1e-7, message.z)
+        self._commands.run(Command(message.command, params, message.system, message.component))
+
+    def _set_attitude_target(self, message: Message) -> None:
+        self.view.autopilot.obey_attitude(message.values)
+
+    def _set_position_target(self, message: Message) -> None:
+        self.view.autopilot.obey_motion(message.values)
+
+    def _timesync(self, message: Message) -> None:
+        if message.tc1 == 0:
+            self.send("TIMESYNC", self.view.time_us * 1000, message.ts1)
+        else:
+            self.answered_ns = message.ts1
+
+    def _ping(self, message: Message) -> None:
+        if message.target_system == 0:
+            self.send("PING", message.time_usec, message.seq, message.system, message.component)
+
+    def _param_request_read(self, message: Message) -> None:
+        names = self.view.autopilot.parameters.names
+        if message.param_index >= 0:
+            if message.param_index < len(names):
+                self.send_parameter(names[message.param_index])
+        elif message.param_id in names:
+            self.send_parameter(message.param_id)
+
+    def _param_request_list(self, _: Message) -> None:
+        self._parameters_due = list(self.view.autopilot.parameters.names)
+
+    def _param_set(self, message: Message) -> None:
+        table = self.view.autopilot.parameters
+        if message.param_id in table:
+            table.set_from_wire(message.param_id, message.param_value)
+            self.send_parameter(message.param_id)
+
+    def _file_transfer(self, message: Message) -> None:
+        asked = message.payload
+        number = (asked[0] | asked[1] << 8) + 1 & 0xFFFF
+        head = (number & 0xFF, number >> 8, asked[2], _FTP_NAK, 1, asked[3])
+        answer = head + (0,) * 6 + (_FTP_ERROR_NOT_FOUND,)
+        padded = answer + (0,) * (len(asked) - len(answer))
+        self.send("FILE_TRANSFER_PROTOCOL", 0, message.system, message.component, padded)
+
+
+HANDLERS: dict[str, Callable[[Server, Message], None]] = {
+    "HEARTBEAT": Server._heartbeat,
+    "COMMAND_LONG": Server._command_long,
+    "COMMAND_INT": Server._command_int,
+    "SET_ATTITUDE_TARGET": Server._set_attitude_target,
+    "SET_POSITION_TARGET_LOCAL_NED": Server._set_position_target,
+    "TIMESYNC": Server._timesync,
+    "PING": Server._ping,
+    "PARAM_REQUEST_READ": Server._param_request_read,
+    "PARAM_REQUEST_LIST": Server._param_request_list,
+    "PARAM_SET": Server._param_set,
+    "FILE_TRANSFER_PROTOCOL": Server._file_transfer,
+}
+
+
+def _next_multiple(now_us: int, stream: Stream) -> int:
+    """Streams keep to the multiples of their interval, so that the mean rate is exact."""
+    return (now_us // stream.interval_us + 1) * stream.interval_us

@@ -1,0 +1,358 @@
+"""The messages the vehicle sends by itself: its state as field values, in the order of the XML.
+
+One function per message, all in `BUILDERS`. Units and scales of MAVLink are applied here and
+nowhere else on the simulator's side. Knows no links, rates or sequence numbers.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from offboard.model.frames import rotation_from_quaternion
+from simulator.autopilot import Autopilot
+from simulator.codec import layout
+from simulator.firmware.base import MotionSetpoint, Triple
+from simulator.position_loop import GRAVITY_MPS2
+
+EARTH_RADIUS_M = 6_371_000.0
+POSITION_GRID_STEPS = 2  # the estimator's position is new at every second step, as PX4's
+ON_POSITION_GRID = frozenset(
+    {"LOCAL_POSITION_NED", "ODOMETRY", "GLOBAL_POSITION_INT", "HIL_STATE_QUATERNION"}
+)
+
+MAV_TYPE_QUADROTOR = 2
+MAV_COMP_ID_AUTOPILOT = 1
+_NAN21 = (math.nan,) * 21
+# MAV_SYS_STATUS_SENSOR: gyro, accelerometer, magnetometer, absolute pressure, GPS; battery, AHRS
+_PRESENT, _ENABLED = 0x0300402F, 0x0301402F
+_HEALTH = 0x0330C83F  # with geofence: MAVProxy else reports a breach
+_PREARM = 0x10000000
+_FIRST_FIX_S = 3.0  # position reported as healthy from here on
+
+
+@dataclass(slots=True)
+class View:
+    """What builders read: the autopilot, and what one step's messages share."""
+
+    autopilot: Autopilot
+    system: int
+    epoch_us: int  # Unix time of boot
+    ping_sequence: int = 0
+    payloads: dict[str, bytes] = field(default_factory=dict)
+    _at_step: int = -1
+
+    def payload(self, name: str) -> bytes:
+        """Packed payload of message `name` now; built once per step for all links."""
+        if self._at_step != self.autopilot.steps:
+            self._at_step = self.autopilot.steps
+            self.payloads.clear()
+        packed = self.payloads.get(name)
+        if packed is None:
+            packed = self.payloads[name] = layout(name).pack(BUILDERS[name](self))
+        return packed
+
+    @property
+    def time_ms(self) -> int:
+        return self.autopilot.steps * 4
+
+    @property
+    def time_us(self) -> int:
+        return self.autopilot.steps * 4000
+
+    def geodetic(self, north_m: float, east_m: float) -> tuple[int, int]:
+        """Latitude and longitude in 1e-7 deg of a point near the origin (spherical Earth)."""
+        latitude, longitude, _ = self.autopilot.firmware.origin
+        north_deg = math.degrees(north_m / EARTH_RADIUS_M)
+        east_deg = math.degrees(east_m / (EARTH_RADIUS_M * math.cos(math.radians(latitude))))
+        return _fit((latitude + north_deg) * 1e7, 32), _fit((longitude + east_deg) * 1e7, 32)
+
+    def altitude_mm(self, down_m: float) -> int:
+        """AMSL, mm."""
+        return _fit((self.autopilot.firmware.origin[2] - down_m) * 1e3, 32)
+
+
+def _fit(value: float, bits: int, *, signed: bool = True) -> int:
+    """Nearest integer that a field of `bits` holds; what is not finite becomes 0."""
+    if not math.isfinite(value):
+        return 0
+    low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+    return min(high, max(low, round(value)))
+
+
+def _centi(velocity: Triple) -> tuple[int, int, int]:
+    return _fit(velocity[0] * 100, 16), _fit(velocity[1] * 100, 16), _fit(velocity[2] * 100, 16)
+
+
+def _heading_cdeg(yaw_rad: float) -> int:
+    return round(math.degrees(yaw_rad) * 100) % 36000
+
+
+def heartbeat(view: View) -> Sequence[Any]:
+    autopilot = view.autopilot
+    return (
+        MAV_TYPE_QUADROTOR,
+        autopilot.firmware.mav_autopilot,
+        autopilot.base_mode,
+        autopilot.mode.custom_mode,
+        autopilot.system_status,
+        3,
+    )
+
+
+def attitude(view: View) -> Sequence[Any]:
+    nav = view.autopilot.look()
+    w, x, y, z = nav.attitude
+    roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    pitch = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
+    return (view.time_ms, roll, pitch, nav.yaw_rad, *nav.rates_frd_radps)
+
+
+def attitude_quaternion(view: View) -> Sequence[Any]:
+    nav = view.autopilot.look()
+    return (view.time_ms, *nav.attitude, *nav.rates_frd_radps, (0.0, 0.0, 0.0, 0.0))
+
+
+def local_position_ned(view: View) -> Sequence[Any]:
+    nav = view.autopilot.look()
+    return (view.time_ms, *nav.position_ned_m, *nav.velocity_ned_mps)
+
+
+def odometry(view: View) -> Sequence[Any]:
+    nav = view.autopilot.look()
+    frame = 1  # MAV_FRAME_LOCAL_NED, velocities too, as PX4 sends it
+    return (
+        view.time_us,
+        frame,
+        frame,
+        *nav.position_ned_m,
+        nav.attitude,
+        *nav.velocity_ned_mps,
+        *nav.rates_frd_radps,
+        _NAN21,
+        _NAN21,
+        nav.reset_counter,
+        8,  # MAV_ESTIMATOR_TYPE_AUTOPILOT
+        0,
+    )
+
+
+def global_position_int(view: View) -> Sequence[Any]:
+    nav = view.autopilot.look()
+    north, east, down = nav.position_ned_m
+    home_down = view.autopilot.pilot.home_ned_m[2]
+    return (
+        view.time_ms,
+        *view.geodetic(north, east),
+        view.altitude_mm(down),
+        _fit((home_down - down) * 1e3, 32),
+        *_centi(nav.velocity_ned_mps),
+        _heading_cdeg(nav.yaw_rad),
+    )
+
+
+def altitude(view: View) -> Sequence[Any]:
+    down = view.autopilot.look().position_ned_m[2]
+    amsl = view.altitude_mm(down) / 1e3
+    relative = view.autopilot.pilot.home_ned_m[2] - down
+    return (view.time_us, amsl, amsl, -down, relative, math.nan, math.nan)
+
+
+def highres_imu(view: View) -> Sequence[Any]:
+    """Specific force of the truth in body axes, rates as estimated."""
+    truth, nav = view.autopilot.truth, view.autopilot.look()
+    force_ned = truth.acceleration_ned_mps2.copy()
+    force_ned[2] -= GRAVITY_MPS2
+    force = (rotation_from_quaternion(truth.attitude).T @ force_ned).tolist()
+    height = -float(truth.position_ned_m[2]) + view.autopilot.firmware.origin[2]
+    pressure_hpa = 1013.25 * (1.0 - 2.25577e-5 * height) ** 5.25588
+    return (
+        view.time_us,
+        *force,
+        *nav.rates_frd_radps,
+        *(0.21, 0.0, 0.43),
+        pressure_hpa,
+        0.0,
+        height,
+        15.0,
+        0x1BFF,
+        0,
+    )
+
+
+def attitude_target(view: View) -> Sequence[Any]:
+    demand = view.autopilot.pilot.demand
+    rates = demand.rates_frd_radps or (0.0, 0.0, 0.0)
+    return (view.time_ms, 0, demand.attitude or (1.0, 0.0, 0.0, 0.0), *rates, demand.thrust)
+
+
+def position_target_local_ned(view: View) -> Sequence[Any]:
+    motion: MotionSetpoint = view.autopilot.pilot.motion
+    return (
+        view.time_ms,
+        1,
+        0,
+        *motion.position_ned_m,
+        *motion.velocity_ned_mps,
+        *motion.acceleration_ned_mps2,
+        motion.yaw_rad,
+        motion.yaw_rate_radps,
+    )
+
+
+def timesync(view: View) -> Sequence[Any]:
+    return (0, view.time_us * 1000)
+
+
+def vfr_hud(view: View) -> Sequence[Any]:
+    autopilot = view.autopilot
+    nav = autopilot.look()
+    north, east, down = nav.velocity_ned_mps
+    return (
+        0.0,
+        math.hypot(north, east),
+        _heading_cdeg(nav.yaw_rad) // 100,
+        _fit(autopilot.pilot.demand.thrust * 100, 16, signed=False),
+        view.altitude_mm(nav.position_ned_m[2]) / 1e3,
+        -down,
+    )
+
+
+def gps_raw_int(view: View) -> Sequence[Any]:
+    truth = view.autopilot.truth
+    north, east, down = truth.position_ned_m.tolist()
+    v_north, v_east, _ = truth.velocity_ned_mps.tolist()
+    course = _heading_cdeg(math.atan2(v_east, v_north))
+    speed = _fit(math.hypot(v_north, v_east) * 100, 16, signed=False)
+    height = view.altitude_mm(down)
+    latitude, longitude = view.geodetic(north, east)
+    return (
+        view.time_us, 3, latitude, longitude, height, 70, 110, speed, course, 10, height,
+        900, 1780, 400, 0, 0,
+    )  # fmt: skip
+
+
+def sys_status(view: View) -> Sequence[Any]:
+    autopilot = view.autopilot
+    battery = autopilot.truth.battery
+    present, enabled, health = _PRESENT, _ENABLED, _HEALTH
+    if autopilot.time_s < _FIRST_FIX_S:
+        present, enabled, health = present & ~0x20, enabled & ~0x20, health & ~0x20
+    if autopilot.healthy:
+        health |= _PREARM
+    return (
+        present, enabled, health, 80,
+        _fit(battery.voltage_v * 1e3, 16, signed=False),
+        _fit(battery.current_a * 100, 16),
+        _fit(battery.remaining * 100, 8),
+        0, 0, 0, 0, 0, 0, 0, 0, 1,
+    )  # fmt: skip
+
+
+def extended_sys_state(view: View) -> Sequence[Any]:
+    return (0, view.autopilot.landed_state)
+
+
+def estimator_status(view: View) -> Sequence[Any]:
+    flags = 895 if view.autopilot.time_s >= _FIRST_FIX_S else 1024
+    return (view.time_us, flags, 0.12, 0.03, 0.03, 0.14, 0.02, math.nan, 0.3, 0.31)
+
+
+def system_time(view: View) -> Sequence[Any]:
+    return (view.epoch_us + view.time_us, view.time_ms)
+
+
+def ping(view: View) -> Sequence[Any]:
+    view.ping_sequence += 1
+    return (view.time_us, view.ping_sequence & 0xFFFFFFFF, 0, 0)
+
+
+def battery_status(view: View) -> Sequence[Any]:
+    battery = view.autopilot.truth.battery
+    voltage = _fit(battery.voltage_v * 1e3, 16, signed=False)
+    return (
+        0, 1, 1, 32767, (voltage, *(65535,) * 9), _fit(battery.current_a * 100, 16), 0, -1,
+        _fit(battery.remaining * 100, 8), 0, 1, (0, 0, 0, 0), 0, 0,
+    )  # fmt: skip
+
+
+def home_position(view: View) -> Sequence[Any]:
+    north, east, down = view.autopilot.pilot.home_ned_m
+    return (
+        *view.geodetic(north, east),
+        view.altitude_mm(down),
+        north,
+        east,
+        down,
+        (1.0, 0.0, 0.0, 0.0),
+        0.0,
+        0.0,
+        0.0,
+        view.time_us,
+    )
+
+
+def hil_state_quaternion(view: View) -> Sequence[Any]:
+    """The truth. Latitude and longitude are in steps of 1 cm; PX4 leaves time_usec 0."""
+    truth = view.autopilot.truth
+    north, east, down = truth.position_ned_m.tolist()
+    a, b, c = (_fit(value / GRAVITY_MPS2 * 1e3, 16) for value in truth.acceleration_ned_mps2)
+    v_north, v_east, v_down = truth.velocity_ned_mps.tolist()
+    airspeed = _fit(math.hypot(v_north, v_east) * 100, 16, signed=False)
+    return (
+        view.time_us,
+        truth.attitude.tolist(),
+        *truth.rates_frd_radps.tolist(),
+        *view.geodetic(north, east),
+        view.altitude_mm(down),
+        *_centi((v_north, v_east, v_down)),
+        airspeed,
+        airspeed,
+        a,
+        b,
+        c,
+    )
+
+
+def gps_global_origin(view: View) -> Sequence[Any]:
+    return (*view.geodetic(0.0, 0.0), view.altitude_mm(0.0), view.time_us)
+
+
+def autopilot_version(view: View) -> Sequence[Any]:
+    firmware = view.autopilot.firmware
+    return (
+        firmware.capabilities, firmware.version, 0, 0, 0,
+        (0,) * 8, (0,) * 8, (0,) * 8, 0, 0, view.system, (0,) * 18,
+    )  # fmt: skip
+
+
+BUILDERS: dict[str, Callable[[View], Sequence[Any]]] = {
+    builder.__name__.upper(): builder
+    for builder in (
+        heartbeat,
+        attitude,
+        attitude_quaternion,
+        local_position_ned,
+        odometry,
+        global_position_int,
+        altitude,
+        highres_imu,
+        attitude_target,
+        position_target_local_ned,
+        timesync,
+        vfr_hud,
+        gps_raw_int,
+        sys_status,
+        extended_sys_state,
+        estimator_status,
+        system_time,
+        ping,
+        battery_status,
+        home_position,
+        hil_state_quaternion,
+        gps_global_origin,
+        autopilot_version,
+    )
+}
