@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 from typing import Annotated, NoReturn
 
 import typer
 
-FIRMWARES = ("px4",)
+from simulator.firmware.catalogue import FIRMWARES
+
 COMPANION_PORT, GROUND_PORT = 14540, 14550
 LOCAL_COMPANION_PORT, LOCAL_GROUND_PORT = 14580, 18570  # PX4's
 NO_LINK = "none"
@@ -48,13 +50,14 @@ def simulate(
     ] = 5.0,
 ) -> None:
     """Fly one simulated vehicle that speaks MAVLink like a real autopilot."""
-    if firmware not in FIRMWARES:
+    personality = FIRMWARES.get(firmware)
+    if personality is None:
         _refuse(f"--firmware {firmware}: unknown; there is {', '.join(FIRMWARES)}")
     if lockstep and speed is not None:
         _refuse("--speed and --lockstep exclude each other: lockstep has no speed")
     if speed is not None and not 0.1 <= speed <= 1000.0:
         _refuse(f"--speed {speed:g}: must be 0.1 .. 1000")
-    stopping = _stop_on_signals()
+    stopping = Stop()
 
     # late, so that a wrong option is answered at once
     from offboard.flight.clock import unix_us
@@ -72,12 +75,11 @@ def simulate(
         _refuse(str(error))
 
     _announce_compilation()
-    from simulator.firmware.px4 import PX4
     from simulator.instance import VIRTUAL_EPOCH_US, Instance
     from simulator.run import Runner
 
     simulated = Instance(
-        PX4,
+        personality,
         flyer,
         flown.conditions,
         seed,
@@ -85,11 +87,13 @@ def simulate(
         lockstep=lockstep,
         epoch_us=VIRTUAL_EPOCH_US if lockstep else unix_us(),
     )
+    purpose = "waiting at" if connect.startswith("udpin:") else "sending to"
     print(
         f"{firmware} vehicle {flyer.name}, system {instance + 1}, scenario {flown.name},"
-        f" seed {seed}: {connect.replace('udpout:', 'sending to ').replace('udpin:', 'waiting at ')}",
+        f" seed {seed}: {purpose} {connect.partition(':')[2]}",
         flush=True,
     )
+    stopping.running = True
     runner = Runner(
         simulated, companion, ground, stopping=stopping, tell=_tell, duration_s=duration
     )
@@ -103,21 +107,19 @@ def _tell(sentence: str) -> None:
     print(f"simulator: {sentence}", file=sys.stderr, flush=True)
 
 
-def _stop_on_signals() -> "Stop":
-    stop = Stop()
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, stop.note)
-    return stop
-
-
 class Stop:
-    """Becomes true with the first SIGTERM or SIGINT."""
+    """Becomes true with the first SIGTERM or SIGINT; ends the process at once while starting."""
 
     def __init__(self) -> None:
+        self.running = False
         self._noted = False
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._note)
 
-    def note(self, number: int, frame: object) -> None:
+    def _note(self, number: int, frame: object) -> None:
         self._noted = True
+        if not self.running:
+            os._exit(0)  # nothing is open yet that could be left half done
 
     def __call__(self) -> bool:
         return self._noted

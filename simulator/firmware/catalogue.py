@@ -1,0 +1,8 @@
+"""The personalities by name: the one place that lists them."""
+
+from __future__ import annotations
+
+from simulator.firmware.base import Firmware
+from simulator.firmware.px4 import PX4
+
+FIRMWARES: dict[str, Firmware] = {firmware.name: firmware for firmware in (PX4,)}
