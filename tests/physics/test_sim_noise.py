@@ -1,0 +1,136 @@
+"""Normal numbers and linear processes of the simulator, and the wind made of them."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy import stats
+from scipy.integrate import quad_vec
+from scipy.linalg import expm, solve_continuous_lyapunov
+from scipy.signal import welch
+
+from simulator.noise import advance_process, block_diagonal, discretise, fill_normals, seed_word
+from simulator.plant import STEP_S
+from simulator.wind import Gusts, dryden, wind_axes
+
+
+def _normals(seed: int, lane: int, steps: int, width: int) -> np.ndarray:
+    out = np.empty((steps, width))
+    for step in range(steps):
+        fill_normals(seed_word(seed), lane, step, out[step])
+    return out
+
+
+def _simulate(process, steps: int, seed: int) -> np.ndarray:
+    """(steps, n) path that starts in the stationary distribution."""
+    normals = _normals(seed, 0, steps, len(process.transition))
+    path = np.empty_like(normals)
+    x = process.stationary_scale @ normals[0]
+    work = np.empty_like(x)
+    for step in range(steps):
+        advance_process(process.transition, process.scale, 1.0, normals[step], x, work)
+        path[step] = x
+    return path
+
+
+@pytest.mark.parametrize("width", [1, 4, 9])
+def test_normals_are_standard_and_independent(width):
+    values = _normals(3, 0, 30000 // width, width)
+    assert stats.kstest(values.ravel(), "norm").pvalue > 0.01
+    assert abs(stats.kurtosis(values.ravel())) < 0.1
+    if width > 1:
+        correlation = np.corrcoef(values.T) - np.eye(width)
+        assert np.abs(correlation).max() < 4.5 / math.sqrt(len(values))
+    for lag in (1, 2, 3):
+        assert abs(np.mean(values[lag:] * values[:-lag])) < 4.0 / math.sqrt(values.size)
+
+
+def test_lanes_and_seeds_are_independent_and_repeatable():
+    series = [_normals(seed, lane, 10000, 1)[:, 0] for seed in (0, 1, -1) for lane in (0, 1, 2)]
+    correlation = np.corrcoef(series) - np.eye(len(series))
+    assert np.abs(correlation).max() < 4.5 / math.sqrt(10000)
+    assert np.array_equal(series[4], _normals(1, 1, 10000, 1)[:, 0])
+
+
+def test_discretisation_is_exact():
+    """Against the definition: F = expm(A h), Q = integral of expm(A s) B B' expm(A s)' ds."""
+    drift = np.array([[-0.34, 0.30, -0.78], [-0.28, -0.06, -4.5], [-0.014, 0.026, 0.008]])
+    densities = np.array([0.0225, 0.097, 0.012])
+    for step_s in (0.004, 0.5):
+        process = discretise(drift, densities, step_s)
+
+        def growth(s):
+            half = expm(drift * s) * densities
+            return half @ half.T
+
+        covariance = quad_vec(growth, 0.0, step_s, epsrel=1e-12)[0]
+        assert process.transition == pytest.approx(expm(drift * step_s), rel=1e-10, abs=1e-14)
+        assert process.scale @ process.scale.T == pytest.approx(covariance, rel=1e-6, abs=1e-16)
+        stationary = solve_continuous_lyapunov(drift, -np.diag(densities**2))
+        found = process.stationary_scale @ process.stationary_scale.T
+        assert found == pytest.approx(stationary, rel=1e-6)
+
+
+def test_unstable_process_has_no_stationary_start():
+    assert np.all(discretise([[0.1]], [1.0], 0.01).stationary_scale == 0.0)
+
+
+def test_path_has_the_stationary_covariance():
+    drift = np.array([[-1.0, 2.0], [-1.5, -0.5]])
+    path = _simulate(discretise(drift, [0.3, 0.5], 0.1), 100_000, seed=11)
+    expected = solve_continuous_lyapunov(drift, -np.diag([0.09, 0.25]))
+    assert np.cov(path.T) == pytest.approx(expected, rel=0.06, abs=0.005)
+
+
+def test_blocks_do_not_mix():
+    joined = block_diagonal(discretise([[-1.0]], [1.0], 0.1), discretise([[-2.0]], [3.0], 0.1))
+    assert np.count_nonzero(joined.transition) == 2
+    assert joined.transition[1, 1] == pytest.approx(math.exp(-0.2), rel=1e-12)
+
+
+GUSTS = Gusts(
+    intensity_mps=2.0, vertical_ratio=0.5, length_m=10.0, vertical_length_m=4.0, speed_mps=5.0
+)
+STATE = {"along": 0, "across": 1, "down": 3}
+
+
+def _sd_and_time(component: str) -> tuple[float, float]:
+    return (1.0, 0.8) if component == "down" else (2.0, 2.0)
+
+
+def test_dryden_covariance_is_the_intensity_squared():
+    process = dryden(GUSTS, STEP_S)
+    variance = np.diag(process.stationary_scale @ process.stationary_scale.T)
+    for component, state in STATE.items():
+        assert math.sqrt(variance[state]) == pytest.approx(_sd_and_time(component)[0], rel=1e-5)
+
+
+@pytest.mark.parametrize("component", STATE)
+def test_dryden_spectrum_and_variance_of_a_long_run(component):
+    """MIL-F-8785C: u: 2 s^2 T / (1 + (T w)^2); v, w: s^2 T (1 + 3 (T w)^2) / (1 + (T w)^2)^2."""
+    step_s = 0.05
+    path = _simulate(dryden(GUSTS, step_s), 100_000, seed=2)[:, STATE[component]]
+    sd, time_s = _sd_and_time(component)
+    assert path.std() == pytest.approx(sd, rel=0.05)
+    frequency, power = welch(path, fs=1.0 / step_s, nperseg=2000)
+    band = (frequency > 0.02) & (frequency < 1.0)
+    x = (2.0 * math.pi * frequency[band] * time_s) ** 2
+    shape = 2.0 / (1.0 + x) if component == "along" else (1.0 + 3.0 * x) / (1.0 + x) ** 2
+    expected = 2.0 * sd**2 * time_s * shape  # one-sided, per Hz
+    ratio = power[band] / expected
+    assert np.mean(ratio) == pytest.approx(1.0, abs=0.06)
+    for part in np.array_split(ratio, 5):
+        assert np.mean(part) == pytest.approx(1.0, abs=0.15)
+
+
+def test_still_air_has_no_gusts():
+    process = dryden(Gusts(), STEP_S)
+    visible = [process.stationary_scale[state] for state in STATE.values()]
+    assert np.abs(visible).max() == 0.0
+
+
+def test_gusts_lie_along_the_steady_wind():
+    assert wind_axes((0.0, -3.0, 1.0)) == pytest.approx((0.0, -1.0))
+    assert wind_axes((0.0, 0.0, 2.0)) == (1.0, 0.0)

@@ -1,0 +1,148 @@
+"""The plant as a whole: determinism, time, and demands no sane flight stack would send."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from sim_hover import attitude, hovering, load
+
+from simulator.plant import STEP_S, Conditions, Demand, Plant
+
+PX4 = load("px4_sih")
+ROUGH = Conditions(
+    estimator="px4_like",
+    wind_ned_mps=(3.0, 1.0, 0.0),
+    gusts={"intensity_mps": 1.5},
+    ground_effect=True,
+)
+
+
+def _bytes(plant: Plant) -> bytes:
+    truth, estimate = plant.truth, plant.estimate
+    return b"".join(
+        part.tobytes()
+        for part in (
+            truth.position_ned_m,
+            truth.velocity_ned_mps,
+            truth.attitude,
+            truth.rates_frd_radps,
+            truth.wind_ned_mps,
+            estimate.position_ned_m,
+            estimate.velocity_ned_mps,
+            estimate.attitude,
+            estimate.rates_frd_radps,
+        )
+    )
+
+
+def _fly(seed: int, cut: int) -> bytes:
+    plant = Plant(PX4, ROUGH, seed)
+    for thrust, angles in ((0.7, (0, 0, 0)), (0.45, (8, -4, 30)), (0.5, (-8, 4, -30))):
+        for _ in range(240 // cut):
+            plant.advance(cut * STEP_S, Demand(True, thrust, attitude(*angles)))
+    return _bytes(plant)
+
+
+@pytest.mark.parametrize("cut", [1, 3, 40, 240])
+def test_same_seed_gives_the_same_bytes_however_time_is_cut(cut):
+    assert _fly(17, cut) == _fly(17, 24)
+
+
+def test_another_seed_gives_another_flight():
+    assert _fly(17, 24) != _fly(18, 24)
+
+
+def test_asking_changes_nothing():
+    asked, silent = hovering(PX4, ROUGH), hovering(PX4, ROUGH)
+    first = asked.estimate.position_ned_m
+    assert np.array_equal(first, asked.estimate.position_ned_m)
+    first[:] = math.nan  # nor does what the asker does with the answer
+    asked.truth.attitude[:] = 0.0
+    for plant in (asked, silent):
+        plant.advance(1.0, Demand(True, 0.5, attitude()))
+    assert _bytes(asked) == _bytes(silent)
+
+
+def test_time_moves_in_whole_steps_and_owes_the_rest():
+    plant = Plant(PX4, Conditions(), 1)
+    assert plant.time_s == 0.0
+    for _ in range(1000):
+        plant.advance(0.01, Demand(False))
+    assert plant.time_s == pytest.approx(10.0, abs=STEP_S)
+    plant.advance(0.1, Demand(False))
+    plant.advance(0.001, Demand(False))
+    assert plant.time_s == pytest.approx(10.1, abs=STEP_S)
+
+
+HOSTILE = [math.nan, math.inf, -math.inf, 0.0, -1.0, 1e300, -1e300, 1e-300, 1.5, 0.5]
+
+
+def test_hostile_demands_never_make_anything_infinite():
+    generator = np.random.default_rng(42)
+    plant = Plant(PX4, ROUGH, 1)
+    for _ in range(100_000):
+        hostile = generator.random() < 0.5
+        values = generator.choice(HOSTILE, 8) if hostile else generator.normal(0.0, 2.0, 8)
+        kind = generator.integers(3)
+        demand = Demand(
+            motors_on=bool(generator.random() < 0.9),
+            thrust=float(values[7]) if hostile else float(generator.random()),
+            attitude=tuple(values[:4].tolist()) if kind == 0 else None,
+            rates_frd_radps=tuple(values[4:7].tolist()) if kind == 1 else None,
+        )
+        plant.advance(STEP_S * int(generator.integers(1, 4)), demand)
+        if not np.isfinite(plant._body).all():
+            break
+    truth, estimate = plant.truth, plant.estimate
+    for part in (truth.position_ned_m, truth.velocity_ned_mps, truth.acceleration_ned_mps2):
+        assert np.isfinite(part).all()
+    assert np.linalg.norm(truth.velocity_ned_mps) < 100.0
+    assert np.linalg.norm(truth.attitude) == pytest.approx(1.0, abs=1e-9)
+    assert np.linalg.norm(estimate.attitude) == pytest.approx(1.0, abs=1e-9)
+    assert np.abs(truth.rates_frd_radps).max() < 20.0
+    assert truth.position_ned_m[2] <= 0.0
+
+
+@pytest.mark.parametrize(
+    "quaternion",
+    [
+        (math.nan, 0.0, 0.0, 0.0),
+        (0.0, 0.0, 0.0, 0.0),
+        (math.inf, 0.0, 0.0, 0.0),
+        (1e308, 1e308, 1e308, 1e308),
+    ],
+)
+def test_undefined_attitude_stops_the_turning(quaternion):
+    plant = hovering(PX4)
+    plant.advance(0.15, Demand(True, PX4.hover_thrust, attitude(roll_deg=10.0)))
+    plant.advance(1.0, Demand(True, PX4.hover_thrust, quaternion))
+    assert np.abs(plant.truth.rates_frd_radps).max() < 0.02
+
+
+def test_attitude_of_any_length_and_sign_is_the_same_attitude():
+    flights = []
+    for scale in (1.0, 2.0, -1.0, 1e-200, 1e200):
+        plant = hovering(PX4)
+        goal = tuple(scale * part for part in attitude(roll_deg=10.0, yaw_deg=20.0))
+        plant.advance(1.0, Demand(True, PX4.hover_thrust, goal))
+        flights.append(plant.truth.attitude)
+    for flight in flights[1:]:
+        assert flight == pytest.approx(flights[0], abs=1e-9)
+
+
+def test_every_estimator_and_condition_is_accepted_from_plain_data():
+    for estimator in ("perfect", "white", "px4_like", "ardupilot_like"):
+        conditions = Conditions.model_validate(
+            {
+                "estimator": estimator,
+                "wind_ned_mps": [1.0, 2.0, 0.0],
+                "gusts": {"intensity_mps": 1.0},
+                "weakening": {"at_s": 5.0, "thrust_scale": 0.9},
+            }
+        )
+        plant = hovering(PX4, conditions)
+        assert np.isfinite(plant.estimate.position_ned_m).all()
+    with pytest.raises(ValueError, match="thrust_scale"):
+        Conditions.model_validate({"thrust_scale": -1.0})

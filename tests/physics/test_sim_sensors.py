@@ -1,0 +1,184 @@
+"""Estimator errors of the simulator against the statistics measured on PX4 and ArduCopter."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+from sim_hover import attitude, hovering, load
+
+from offboard.model.frames import thrust_direction_from_quaternion
+from simulator.plant import STEP_S, Conditions, Demand, Plant
+
+FLIGHTS, SECONDS, RATE_HZ = 16, 60, 10
+
+
+def _errors(estimator: str) -> dict[str, np.ndarray]:
+    """Estimate minus truth, (flight, sample, axis), 20 to 80 s after take-off, hover."""
+    vehicle = load("px4_sih" if estimator == "px4_like" else "arducopter")
+    level = Demand(True, vehicle.hover_thrust, attitude())
+    believed, true = [], []
+    for seed in range(FLIGHTS):
+        plant = Plant(vehicle, Conditions(estimator=estimator), seed)
+        plant.advance(1.0, Demand(True, 1.4 * vehicle.hover_thrust, attitude()))
+        plant.advance(19.0, level)
+        for _ in range(SECONDS * RATE_HZ):
+            plant.advance(1.0 / RATE_HZ, level)
+            for rows, source in ((believed, plant.estimate), (true, plant.truth)):
+                parts = (source.position_ned_m, source.velocity_ned_mps, source.attitude)
+                rows.append(np.concatenate(parts))
+    estimate, truth = np.array(believed), np.array(true)
+    turn = Rotation.from_quat(estimate[:, 6:], scalar_first=True) * (
+        Rotation.from_quat(truth[:, 6:], scalar_first=True).inv()
+    )
+    east, minus_north, down = turn.as_rotvec().T
+    error = np.column_stack([(estimate - truth)[:, :6], minus_north, -east, down])
+    flights = error.reshape(FLIGHTS, SECONDS * RATE_HZ, 9)
+    return {
+        "position": flights[:, :, 0:3],
+        "velocity": flights[:, :, 3:6],
+        "tilt": flights[:, :, 6:8],
+        "yaw": flights[:, :, 8:9],
+    }
+
+
+@pytest.fixture(scope="module")
+def errors() -> dict[str, dict[str, np.ndarray]]:
+    return {name: _errors(name) for name in ("px4_like", "ardupilot_like")}
+
+
+def _rms(values: np.ndarray) -> np.ndarray:
+    return np.sqrt(np.mean(values**2, axis=(0, 1)))
+
+
+def _correlation_time_s(values: np.ndarray) -> np.ndarray:
+    """Lag at which the autocorrelation falls below 1/e, per axis.
+
+    As it was measured: on two laps (30 s), their mean removed.
+    """
+    values = values.reshape(2 * FLIGHTS, -1, values.shape[2])
+    centred = values - values.mean(axis=1, keepdims=True)
+    power = np.mean(centred**2, axis=(0, 1))
+    times = []
+    for axis in range(values.shape[2]):
+        x = centred[:, :, axis]
+        lag = 1
+        while np.mean(x[:, lag:] * x[:, :-lag]) > power[axis] / math.e:
+            lag += 1
+        times.append(lag / RATE_HZ)
+    return np.array(times)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "quantity", "measured", "slack"),
+    [
+        ("px4_like", "position", (0.26, 0.21, 0.48), 0.35),
+        ("px4_like", "velocity", (0.17, 0.29, 0.18), 0.25),
+        ("px4_like", "tilt", (0.019, 0.021), 0.25),
+        ("px4_like", "yaw", (math.radians(2.5),), 0.25),
+        ("ardupilot_like", "position", (0.06, 0.06, 0.025), 0.15),
+        ("ardupilot_like", "velocity", (0.024, 0.024, 0.006), 0.15),
+        ("ardupilot_like", "tilt", (0.002, 0.002), 0.15),
+        ("ardupilot_like", "yaw", (math.radians(0.5),), 0.25),
+    ],
+)
+def test_error_has_the_measured_standard_deviation(errors, estimator, quantity, measured, slack):
+    assert _rms(errors[estimator][quantity]) == pytest.approx(measured, rel=slack)
+
+
+@pytest.mark.parametrize(
+    ("estimator", "quantity", "low_s", "high_s"),
+    [
+        ("px4_like", "position", 3.5, 7.0),  # measured 4-5 s
+        ("px4_like", "velocity", 2.5, 6.5),  # 3-4 s
+        ("ardupilot_like", "position", 1.0, 1.9),  # 1.2-1.7 s
+        ("ardupilot_like", "velocity", 0.9, 1.7),
+    ],
+)
+def test_error_has_the_measured_correlation_time(errors, estimator, quantity, low_s, high_s):
+    times = _correlation_time_s(errors[estimator][quantity])
+    assert np.all((times >= low_s) & (times <= high_s)), times
+
+
+def test_px4_velocity_is_not_the_derivative_of_its_position_and_ardupilot_nearly(errors):
+    """sd of (mean reported velocity - change of reported position / time), N and E: PX4 .17-.29
+    for seconds on end; ArduCopter noisy .05-.06 over 1 s, .02 over 4 s."""
+    found = {}
+    for name, error in errors.items():
+        for seconds in (1, 4):
+            lag = seconds * RATE_HZ
+            moved = (error["position"][:, lag:] - error["position"][:, :-lag]) / seconds
+            total = np.cumsum(error["velocity"], axis=1)
+            mean = (total[:, lag:] - total[:, :-lag]) / lag
+            found[name, seconds] = (mean - moved)[:, :, :2].std(axis=(0, 1))
+    assert np.all(found["px4_like", 4] > 0.1)
+    assert found["px4_like", 1] == pytest.approx((0.17, 0.29), rel=0.35)
+    assert found["ardupilot_like", 1] == pytest.approx((0.055, 0.055), rel=0.2)
+    assert found["ardupilot_like", 4] == pytest.approx((0.02, 0.02), rel=0.2)
+
+
+def test_white_part_is_as_small_as_measured():
+    """From sample to sample: what is left of a quadratic over neighbouring steps."""
+    vehicle = load("px4_sih")
+    plant = hovering(vehicle, Conditions(estimator="px4_like"), seed=4)
+    samples = []
+    for _ in range(4000):
+        plant.advance(STEP_S, Demand(True, vehicle.hover_thrust, attitude()))
+        truth, seen = plant.truth, plant.estimate
+        b = thrust_direction_from_quaternion(seen.attitude)
+        rates = seen.rates_frd_radps - truth.rates_frd_radps
+        offset = seen.position_ned_m - truth.position_ned_m + 0.004 * truth.velocity_ned_mps
+        speed = seen.velocity_ned_mps - truth.velocity_ned_mps
+        samples.append(np.concatenate([offset, speed, b[:2], rates]))
+    values = np.array(samples)
+    third = np.diff(values, n=3, axis=0).std(axis=0) / math.sqrt(20.0)
+    assert np.all((third[:3] > 0.0002) & (third[:3] < 0.002))
+    assert np.all((third[3:6] > 0.002) & (third[3:6] < 0.006))
+    assert np.all((third[6:8] > 0.0003) & (third[6:8] < 0.001))
+    assert values[:, 8:].std(axis=0) == pytest.approx((0.07, 0.035, 0.014), rel=0.1)
+
+
+def test_perfect_estimator_reports_the_truth():
+    plant = hovering(load("px4_sih"), Conditions(gusts={"intensity_mps": 1.0}))
+    truth, seen = plant.truth, plant.estimate
+    for name in ("position_ned_m", "velocity_ned_mps", "attitude", "rates_frd_radps"):
+        assert getattr(seen, name) == pytest.approx(getattr(truth, name), abs=1e-12)
+
+
+def test_white_estimator_has_the_configured_noise_and_nothing_else():
+    noise = {"position_m": 0.05, "velocity_mps": 0.1, "attitude_rad": 0.01}
+    vehicle = load("px4_sih")
+    plant = hovering(vehicle, Conditions(estimator="white", white_noise=noise), seed=9)
+    position, velocity = [], []
+    for _ in range(3000):
+        plant.advance(STEP_S, Demand(True, vehicle.hover_thrust, attitude()))
+        position.append(plant.estimate.position_ned_m - plant.truth.position_ned_m)
+        velocity.append(plant.estimate.velocity_ned_mps - plant.truth.velocity_ned_mps)
+    assert np.std(position, axis=0) == pytest.approx([0.05] * 3, rel=0.06)
+    assert np.std(velocity, axis=0) == pytest.approx([0.1] * 3, rel=0.06)
+    neighbours = np.corrcoef(np.array(position)[1:, 0], np.array(position)[:-1, 0])[0, 1]
+    assert abs(neighbours) < 0.08
+
+
+def test_standing_vehicle_has_a_quiet_estimate():
+    plant = Plant(load("px4_sih"), Conditions(estimator="px4_like"), 3)
+    drift = []
+    for _ in range(600):
+        plant.advance(0.1, Demand(False))
+        drift.append(plant.estimate.position_ned_m)
+    assert plant.truth.position_ned_m == pytest.approx([0.0] * 3, abs=1e-12)
+    assert 1e-4 < np.abs(drift).max() < 0.25
+
+
+def test_estimate_reset_jumps_and_is_counted():
+    plant = hovering(load("px4_sih"))
+    before = plant.estimate
+    plant.reset_estimate((1.5, -0.5, 0.2))
+    after = plant.estimate
+    assert after.position_ned_m - before.position_ned_m == pytest.approx([1.5, -0.5, 0.2])
+    assert after.reset_counter == before.reset_counter + 1
+    for _ in range(255):
+        plant.reset_estimate((0.0, 0.0, 0.0))
+    assert plant.estimate.reset_counter == before.reset_counter  # MAVLink: one byte
