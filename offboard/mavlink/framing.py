@@ -50,12 +50,13 @@ class Frame(NamedTuple):
 
 class FrameSplitter:
     """Bytes in, frames out. A datagram holds whole frames; a stream (serial, TCP) holds any part,
-    and the unfinished end, never more than one frame, waits for the next call."""
+    and the unfinished end, at most one frame, waits for the next call."""
 
     def __init__(self, stream: bool, counters: Counters) -> None:
         self._stream = stream
         self._counters = counters
         self._rest = b""
+        self._aligned = True  # nothing was skipped since the last frame
 
     def split(self, data: bytes) -> list[Frame]:
         counters = self._counters
@@ -66,28 +67,45 @@ class FrameSplitter:
         at, end = 0, len(data)
         while at < end:
             start = _next_magic(data, at)
-            counters.bytes_skipped += start - at
+            self._skip(start - at)
             at = start
             if at == end:
                 break
-            size = _frame_size(data, at)
-            if size is None or at + size > end:
-                if self._stream:
-                    break
-                outcome: Frame | DropReason = DropReason.TRUNCATED
-            else:
-                outcome = _parse(data, at, at + size)
+            outcome = self._parse_at(data, at)
+            if outcome is None:
+                break
             if isinstance(outcome, DropReason):
                 counters.dropped[outcome] += 1
-                counters.bytes_skipped += 1
+                self._skip(1)
                 at += 1
             else:
                 counters.bytes_framed += len(outcome.raw)
+                self._aligned = True
                 frames.append(outcome)
                 at += len(outcome.raw)
         self._rest = data[at:]
         counters.bytes_pending = end - at
         return frames
+
+    def _skip(self, count: int) -> None:
+        if count:
+            self._counters.bytes_skipped += count
+            self._aligned = False
+
+    def _parse_at(self, data: bytes, at: int) -> Frame | DropReason | None:
+        """The frame that begins at `at`, why there is none, or None to wait for more bytes."""
+        size = _frame_size(data, at)
+        if size is None or at + size > len(data):
+            return None if self._stream else DropReason.TRUNCATED
+        frame = _parse(data, at, at + size)
+        if isinstance(frame, DropReason) or frame.verified:
+            return frame
+        # without a checksum a frame is believed only if it fills the space between two others
+        if not self._aligned:
+            return DropReason.BAD_CRC
+        if at + size == len(data):
+            return None if self._stream else frame
+        return frame if data[at + size] in (_V2, _V1) else DropReason.BAD_CRC
 
 
 def pack(
@@ -147,8 +165,6 @@ def _parse(data: bytes, at: int, end: int) -> Frame | DropReason:
         crc = _crc(extra, _crc(data[at + 1 : crc_at]))
         if crc != data[crc_at] | data[crc_at + 1] << 8:
             return DropReason.BAD_CRC
-    elif end < len(data) and data[end] not in (_V2, _V1):
-        return DropReason.BAD_CRC  # an unknown id is believed only if another frame follows it
     return Frame(
         data[at:end],
         message_id,

@@ -38,7 +38,7 @@ DIALECTS: Mapping[str, Dialect] = MappingProxyType({d.name: d for d in (PX4, ARD
 _HEARTBEAT, _COMMAND_ACK, _TIMESYNC, _STATUSTEXT = 0, 77, 111, 253
 _AUTOPILOT_COMPONENT = 1
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
-_HEARTBEAT_PERIOD_S = 1.0
+_HEARTBEAT_PERIOD_S = 0.999  # 1 Hz, and no cycle late for a rounding error
 _REORDERING_S = 2.0  # older than this against the newest is a reboot, not a late packet
 
 

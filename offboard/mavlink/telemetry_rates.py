@@ -28,22 +28,23 @@ class LinkTime:
     def __init__(self) -> None:
         self.seconds = 0.0
         self._vehicle_s: float | None = None
+        self._heard_s: float | None = None
         self._host_s: float | None = None
 
     def vehicle(self, time_s: float, now_s: float) -> None:
         """A stamp of the vehicle; streams overtake each other, so an older one changes nothing."""
-        self._host_s = now_s
+        self._heard_s = now_s
         step_s = 0.0 if self._vehicle_s is None else time_s - self._vehicle_s
         if self._vehicle_s is None or step_s > 0.0 or step_s < -_REBOOT_S:
             self.seconds += min(max(step_s, 0.0), _SILENCE_S)
             self._vehicle_s = time_s
 
     def host(self, now_s: float) -> None:
-        if self._host_s is None:
-            self._host_s = now_s
-        elif now_s - self._host_s > _SILENCE_S:
-            self.seconds += now_s - self._host_s
-            self._host_s = now_s
+        """Our time goes on; it counts once the vehicle has been silent for a second."""
+        flowing = self._heard_s is not None and now_s - self._heard_s <= _SILENCE_S
+        if not flowing and self._host_s is not None:
+            self.seconds += max(now_s - self._host_s, 0.0)
+        self._host_s = now_s
 
 
 @dataclass(slots=True)

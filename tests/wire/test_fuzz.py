@@ -1,0 +1,192 @@
+"""No bytes whatever may raise, fill the memory, or vanish uncounted."""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from vehicle_frames import ARDUPILOT, PEER, PX4, PX4_RECORDING, Sender, pinned, recorded
+
+from offboard.mavlink import events
+from offboard.mavlink.counters import DropReason
+from offboard.mavlink.framing import FrameSplitter
+from offboard.mavlink.session import Reception, Session
+
+LONGEST_FRAME = 10 + 255 + 2 + 13
+
+
+def check(session: Session) -> None:
+    """The two sums of counters.py."""
+    counted = session.counters
+    assert counted.bytes_received == (
+        counted.bytes_framed + counted.bytes_skipped + counted.bytes_pending
+    )
+    assert counted.frames == counted.decoded + counted.ignored + counted.dropped_frames
+    assert counted.bytes_pending <= LONGEST_FRAME
+    assert min(counted.lost, counted.decoded, counted.ignored) >= 0
+
+
+def floats(value: object) -> Iterator[float]:
+    if isinstance(value, float):
+        yield value
+    elif isinstance(value, tuple):
+        for part in value:
+            yield from floats(part)
+
+
+def check_events(reception: Reception) -> None:
+    for event in reception.events:
+        for name in event.__dataclass_fields__:
+            assert all(math.isfinite(x) for x in floats(getattr(event, name)))
+        if isinstance(event, events.Attitude):
+            assert math.hypot(*event.attitude) == pytest.approx(1.0)
+
+
+@pytest.fixture(scope="module")
+def traffic() -> list[bytes]:
+    """Real frames of every kind that PX4 sends."""
+    kinds: dict[str, list[bytes]] = {}
+    for message in recorded(PX4_RECORDING):
+        kinds.setdefault(message.get_type(), []).append(bytes(message.get_msgbuf()))
+    return [frame for frames in kinds.values() for frame in frames[:8]]
+
+
+@given(
+    st.lists(st.binary(max_size=400), max_size=8), st.booleans(), st.sampled_from([PX4, ARDUPILOT])
+)
+@settings(max_examples=300, deadline=None, derandomize=True)
+def test_any_bytes(portions: list[bytes], stream: bool, autopilot: int) -> None:
+    session = pinned(Sender(), autopilot, stream=stream)
+    for portion in portions:
+        check_events(session.receive(portion, PEER, 0.0))
+        check(session)
+
+
+@given(st.binary(max_size=255), st.sampled_from(sorted(mavlink.mavlink_map)), st.booleans())
+@settings(max_examples=500, deadline=None, derandomize=True)
+def test_any_payload_with_a_right_checksum(payload: bytes, message_id: int, px4: bool) -> None:
+    """Lengths that no sender would use, too: shorter is padded, longer is a later MAVLink."""
+    session = pinned(Sender(), PX4 if px4 else ARDUPILOT)
+    body = struct.pack(
+        "<BBBBBBHB", len(payload), 0, 0, 7, 1, 1, message_id & 0xFFFF, message_id >> 16
+    )
+    crc = mavlink.x25crc(body + payload)
+    crc.accumulate(bytes([mavlink.mavlink_map[message_id].crc_extra]))
+    frame = b"\xfd" + body + payload + struct.pack("<H", crc.crc)
+    reception = session.receive(frame, PEER, 0.0)
+    assert reception.frames == (frame,)
+    check_events(reception)
+    check(session)
+
+
+WANTED = [0, 1, 22, 31, 32, 77, 111, 245, 253]
+
+
+@pytest.mark.parametrize("message_id", WANTED)
+def test_random_payloads_of_what_is_decoded(message_id: int) -> None:
+    generator = np.random.default_rng(message_id)
+    size = mavlink.mavlink_map[message_id].unpacker.size
+    session = pinned(Sender(), PX4)
+    for _ in range(300):
+        payload = generator.bytes(size)
+        body = struct.pack("<BBBBBBHB", size, 0, 0, 7, 1, 1, message_id, 0)
+        crc = mavlink.x25crc(body + payload)
+        crc.accumulate(bytes([mavlink.mavlink_map[message_id].crc_extra]))
+        frame = b"\xfd" + body + payload + struct.pack("<H", crc.crc)
+        check_events(session.receive(frame, PEER, 0.0))
+    check(session)
+    assert session.counters.frames == 301
+
+
+@pytest.mark.parametrize("stream", [False, True])
+@pytest.mark.parametrize("seed", range(5))
+def test_damaged_frames(traffic: list[bytes], seed: int, stream: bool) -> None:
+    generator = np.random.default_rng(seed)
+    session = pinned(Sender(7), PX4, stream=stream)
+    for frame in traffic * 4:
+        damaged = bytearray(frame)
+        for _ in range(generator.integers(0, 4)):
+            damaged[generator.integers(len(damaged))] = generator.integers(256)
+        if generator.random() < 0.2:
+            del damaged[generator.integers(len(damaged)) :]
+        if generator.random() < 0.2:
+            damaged += generator.bytes(generator.integers(1, 50))
+        check_events(session.receive(bytes(damaged), PEER, 0.0))
+        check(session)
+    assert session.counters.dropped[DropReason.BAD_CRC] > 50
+    assert session.counters.frames > 200  # a fifth goes undamaged
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_good_frames_survive_garbage_between_them(traffic: list[bytes], seed: int) -> None:
+    """Even garbage that begins like a long frame swallows none of those behind it."""
+    generator = np.random.default_rng(seed)
+    session = pinned(Sender(7), PX4, stream=True)
+    data = b""
+    for frame in traffic:
+        data += generator.bytes(generator.integers(0, 40)) + b"\xfd\xff" + frame
+    found: list[bytes] = []
+    for at in range(0, len(data), 100):
+        found += session.receive(data[at : at + 100], PEER, 0.0).frames
+    found += session.receive(bytes(LONGEST_FRAME), PEER, 0.0).frames
+    ours = [frame for frame in traffic if frame[6] == 191]
+    assert found == [frame for frame in traffic if frame not in ours]
+    assert session.counters.dropped[DropReason.ECHO] == len(ours)
+    check(session)
+
+
+@pytest.mark.parametrize(
+    ("flags", "reason"), [(0x02, DropReason.INCOMPATIBLE), (0xFE, DropReason.INCOMPATIBLE)]
+)
+def test_later_incompatibilities_are_refused(flags: int, reason: DropReason) -> None:
+    session = pinned(Sender())
+    frame = bytearray(Sender().position(1000))
+    frame[2] = flags
+    assert session.receive(bytes(frame), PEER, 0.0).frames == ()
+    assert session.counters.dropped[reason] == 1
+
+
+def test_signed_frames_are_framed_with_their_signature() -> None:
+    link = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    link.signing.secret_key = bytes(32)
+    link.signing.sign_outgoing = True
+    frame = mavlink.MAVLink_local_position_ned_message(1000, 1, 2, 3, 0, 0, 0).pack(link)
+    vehicle = Sender()
+    session = pinned(vehicle)
+    reception = session.receive(frame + vehicle.position(2000), PEER, 0.0)
+    assert reception.frames[0] == frame
+    assert len(reception.events) == 2
+
+
+def test_an_unknown_id_is_skipped_whole_only_before_another_frame() -> None:
+    good = Sender().position(1000)
+    unknown = b"\xfd\x03\x00\x00\x00\x01\x01\xff\xff\xff" + b"abc" + b"\x00\x00"
+    session = pinned(Sender())
+    assert len(session.receive(unknown + good, PEER, 0.0).frames) == 1
+    assert session.counters.dropped[DropReason.UNKNOWN_ID] == 1
+    check(session)
+
+
+def test_a_flood_of_frame_beginnings_is_cheap_and_bounded() -> None:
+    session = pinned(Sender(), stream=True)
+    for _ in range(20):
+        session.receive(b"\xfd" * 10_000, PEER, 0.0)
+        session.receive(b"\xfe" * 10_000, PEER, 0.0)
+    check(session)
+    assert session.counters.bytes_skipped > 390_000
+
+
+def test_a_splitter_forgets_nothing_between_calls() -> None:
+    counters = pinned(Sender()).counters
+    splitter = FrameSplitter(True, counters)
+    sender = Sender()
+    frames = [sender.position(i) for i in range(50)]
+    data = b"".join(frames)
+    found = [f.raw for i in range(len(data)) for f in splitter.split(data[i : i + 1])]
+    assert found == frames

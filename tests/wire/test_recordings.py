@@ -1,0 +1,262 @@
+"""Real autopilots, recorded: what the session must find in them, in order and with numbers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from vehicle_frames import ARDUCOPTER_RECORDING, PX4_RECORDING, recorded
+
+from offboard.mavlink import events
+from offboard.mavlink.counters import DropReason
+from offboard.mavlink.session import Session, SessionSettings
+
+PEER = "recorded"
+
+
+class Replay:
+    """A recording gone through a session frame by frame."""
+
+    def __init__(self, path: Path) -> None:
+        self.messages = list(recorded(path))
+        self.session = Session(SessionSettings())
+        self.events: list[tuple[float, events.Event]] = []
+        self.logged: list[bytes] = []
+        start_s = self.messages[0]._timestamp
+        for message in self.messages:
+            time_s = message._timestamp - start_s
+            reception = self.session.receive(bytes(message.get_msgbuf()), PEER, time_s)
+            self.events += [(time_s, event) for event in reception.events]
+            self.logged += reception.frames
+
+    def of(self, kind: type) -> list[Any]:
+        return [event for _, event in self.events if isinstance(event, kind)]
+
+    def transitions(self) -> list[tuple[str, bool, int]]:
+        states: list[tuple[str, bool, int]] = []
+        for beat in self.of(events.Heartbeat):
+            state = (beat.mode, beat.armed, beat.system_status)
+            if not states or states[-1] != state:
+                states.append(state)
+        return states
+
+    def acks(self) -> list[tuple[int, str]]:
+        return [(ack.command, ack.result) for ack in self.of(events.CommandAck)]
+
+
+@pytest.fixture(scope="module")
+def px4() -> Replay:
+    return Replay(PX4_RECORDING)
+
+
+@pytest.fixture(scope="module")
+def arducopter() -> Replay:
+    return Replay(ARDUCOPTER_RECORDING)
+
+
+@pytest.fixture(params=["px4", "arducopter"])
+def replay(request: pytest.FixtureRequest) -> Replay:
+    found: Replay = request.getfixturevalue(request.param)
+    return found
+
+
+def test_every_byte_is_framed_and_no_frame_lost(replay: Replay) -> None:
+    counters = replay.session.counters
+    ours = [m for m in replay.messages if m.get_msgbuf()[6] == 191]
+    assert counters.bytes_framed == sum(len(m.get_msgbuf()) for m in replay.messages)
+    assert counters.bytes_skipped == counters.bytes_pending == counters.lost == 0
+    assert counters.frames == len(replay.messages)
+    assert counters.dropped[DropReason.ECHO] == len(ours)
+    assert set(counters.dropped) <= {DropReason.ECHO, DropReason.NO_VEHICLE}
+    assert counters.decoded + counters.ignored + counters.dropped_frames == counters.frames
+    assert replay.logged == [
+        bytes(m.get_msgbuf()) for m in replay.messages if m.get_msgbuf()[6] != 191
+    ]
+
+
+def test_positions_are_what_pymavlink_reads(replay: Replay) -> None:
+    heard = False
+    expected = []
+    for message in replay.messages:
+        heard = heard or (message.get_type() == "HEARTBEAT" and message.get_srcComponent() == 1)
+        if heard and message.get_type() == "LOCAL_POSITION_NED":
+            expected.append(
+                events.LocalPosition(
+                    message.time_boot_ms / 1000.0,
+                    (message.x, message.y, message.z),
+                    (message.vx, message.vy, message.vz),
+                )
+            )
+    assert len(expected) > 2600
+    assert replay.of(events.LocalPosition) == expected
+
+
+def test_attitudes_are_what_pymavlink_reads(px4: Replay) -> None:
+    messages = [m for m in px4.messages if m.get_type() == "ATTITUDE_QUATERNION"]
+    attitudes = px4.of(events.Attitude)
+    assert len(attitudes) == len(messages) == 3488
+    for attitude, message in zip(attitudes, messages, strict=True):
+        sent = (message.q1, message.q2, message.q3, message.q4)
+        assert attitude.attitude == pytest.approx(sent, abs=1e-6)
+        assert attitude.rates_frd_radps == (
+            message.rollspeed,
+            message.pitchspeed,
+            message.yawspeed,
+        )
+
+
+def test_px4_modes(px4: Replay) -> None:
+    assert px4.session.vehicle == events.VehicleFound(7, 1, "px4")
+    assert px4.transitions() == [
+        ("AUTO.LOITER", False, 0),
+        ("AUTO.LOITER", False, 3),
+        ("OFFBOARD", False, 0),  # asked for without a stream: accepted, and unhealthy
+        ("OFFBOARD", False, 3),
+        ("OFFBOARD", True, 4),
+        ("POSCTL", True, 5),  # the stream stopped
+        ("OFFBOARD", True, 4),  # and resumed, without a request
+        ("AUTO.LOITER", True, 4),
+        ("POSCTL", True, 5),  # OFFBOARD without a stream, in the air
+        ("AUTO.LAND", True, 4),
+        ("OFFBOARD", False, 0),  # reverts after disarming
+    ]
+
+
+def test_px4_acks_modes_twice(px4: Replay) -> None:
+    twice = [(176, "ACCEPTED")] * 2
+    assert px4.acks() == [
+        *twice,
+        (400, "TEMPORARILY_REJECTED"),
+        (511, "ACCEPTED"),
+        (511, "ACCEPTED"),
+        *twice,
+        (400, "ACCEPTED"),
+        (400, "TEMPORARILY_REJECTED"),
+        *twice,
+        *twice,
+        (21, "ACCEPTED"),
+    ]
+
+
+def test_px4_texts_and_when_they_came(px4: Replay) -> None:
+    texts = [(t, e.severity, e.text) for t, e in px4.events if isinstance(e, events.StatusText)]
+    assert [(severity, text) for _, severity, text in texts] == [
+        (6, "[logger] ./log/2026-11-20/22_33_27.ulg"),
+        (2, "Arming denied: Resolve system health failures first"),  # two chunks
+        (6, "Armed by external command"),
+        (6, "Takeoff detected"),
+        (2, "Failsafe activated"),
+        (2, "Disarming denied: not landed"),
+        (2, "Failsafe activated"),
+        (6, "Landing at current position"),
+        (6, "Landing detected"),
+        (6, "Disarmed by landing"),
+    ]
+    setpoints = [m._timestamp for m in px4.messages if m.get_type() == "SET_ATTITUDE_TARGET"]
+    setpoints += [
+        m._timestamp for m in px4.messages if m.get_type() == "SET_POSITION_TARGET_LOCAL_NED"
+    ]
+    failsafe_s = texts[4][0] + px4.messages[0]._timestamp
+    last_setpoint_s = max(s for s in setpoints if s < failsafe_s)
+    assert failsafe_s - last_setpoint_s == pytest.approx(1.05, abs=0.05)  # COM_OF_LOSS_T
+
+
+def test_px4_parameters_are_bytewise(px4: Replay) -> None:
+    assert {p.name: p.value for p in px4.of(events.Parameter)} == {
+        "MPC_THR_HOVER": 0.5,
+        "COM_OF_LOSS_T": 1.0,
+        "COM_OBL_RC_ACT": 0.0,
+        "COM_RC_IN_MODE": 1.0,  # INT32: 1.4e-45 if it were read as a float
+        "NAV_DLL_ACT": 0.0,
+        "COM_RCL_EXCEPT": 0.0,
+        "MIS_TAKEOFF_ALT": 2.5,
+    }
+
+
+def test_px4_lands(px4: Replay) -> None:
+    states = [event.state for event in px4.of(events.Landed)]
+    changes = [s for i, s in enumerate(states) if i == 0 or states[i - 1] != s]
+    assert changes[0] == changes[-1] == "on_ground"
+    assert "in_air" in changes
+    assert any(health.prearm_ok for health in px4.of(events.SystemHealth))
+    voltages = [health.battery_voltage_v for health in px4.of(events.SystemHealth)]
+    assert all(voltage is not None and 14.0 < voltage < 17.0 for voltage in voltages[-50:])
+
+
+def test_arducopter_modes(arducopter: Replay) -> None:
+    assert arducopter.session.vehicle == events.VehicleFound(1, 1, "ardupilot")
+    assert arducopter.transitions() == [
+        ("STABILIZE", False, 1),
+        ("STABILIZE", False, 3),
+        ("GUIDED", False, 3),
+        ("GUIDED", True, 3),
+        ("GUIDED", True, 4),  # stays through four seconds without a stream
+        ("LAND", True, 4),
+        ("LAND", True, 3),
+        ("LAND", False, 3),
+    ]
+
+
+def test_arducopter_acks_once_with_the_verdict(arducopter: Replay) -> None:
+    assert [ack for ack in arducopter.acks() if ack[0] not in (511, 512)] == [
+        (400, "FAILED"),  # not initialised
+        (176, "ACCEPTED"),
+        (22, "FAILED"),  # takeoff while disarmed
+        (400, "FAILED"),
+        (176, "FAILED"),  # mode 99
+        (400, "FAILED"),  # at 25 s: no position
+        (400, "ACCEPTED"),
+        (22, "ACCEPTED"),
+        (400, "FAILED"),  # disarm in the air
+        (21, "ACCEPTED"),
+    ]
+    assert arducopter.acks().count((511, "ACCEPTED")) == 16
+
+
+def test_arducopter_texts(arducopter: Replay) -> None:
+    texts = [event.text for event in arducopter.of(events.StatusText)]
+    assert len(texts) == 32
+    told = [
+        "Arm: System not initialised",
+        "ArduPilot Ready",
+        "Arm: Need Alt Estimate",
+        "Arm: Accels inconsistent",
+        "Arm: EKF attitude is bad",
+        "Arm: AHRS: waiting for home",
+        "No such mode 99",
+        "Arm: Need Position Estimate",
+        "EKF3 IMU0 is using GPS",
+        "Arming motors",
+        "SIM Hit ground at 0.497647 m/s",
+        "Disarming motors",
+    ]
+    assert [text for text in texts if text in told] == told
+
+
+def test_arducopter_position_comes_late(arducopter: Replay) -> None:
+    first_s = next(t for t, e in arducopter.events if isinstance(e, events.LocalPosition))
+    assert first_s == pytest.approx(41.7, abs=0.2)
+
+
+def test_arducopter_parameters_are_cast(arducopter: Replay) -> None:
+    last = {p.name: p.value for p in arducopter.of(events.Parameter)}
+    assert last["GUID_OPTIONS"] == 8.0
+    assert last["ATC_ANGLE_BOOST"] == 1.0
+    assert last["SYSID_MYGCS"] == 255.0
+    assert last["MOT_THST_HOVER"] == pytest.approx(0.39)
+
+
+@pytest.mark.parametrize("portion", [1, 7, 64, 1000])
+def test_a_stream_in_any_portions_gives_the_same_events(px4: Replay, portion: int) -> None:
+    messages = px4.messages[:3000]
+    data = b"".join(bytes(m.get_msgbuf()) for m in messages)
+    whole, pieces = Session(SessionSettings()), Session(SessionSettings(stream=True))
+    expected = [e for m in messages for e in whole.receive(bytes(m.get_msgbuf()), PEER, 0.0).events]
+    found = []
+    for at in range(0, len(data), portion):
+        found += pieces.receive(data[at : at + portion], PEER, 0.0).events
+    assert len(expected) > 500
+    assert found == expected
+    assert pieces.counters.frames == 3000
+    assert pieces.counters.bytes_skipped == 0

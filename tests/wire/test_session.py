@@ -1,0 +1,420 @@
+"""Who is believed, what is dropped and why, and what is answered and asked unprompted."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from vehicle_frames import ARDUPILOT, OFFBOARD, PEER, PX4, Sender, pinned, understood
+
+from offboard.mavlink import events
+from offboard.mavlink.counters import DropReason
+from offboard.mavlink.session import Session, SessionSettings
+from offboard.mavlink.wire import Heartbeat
+
+STRANGER = ("10.0.0.9", 4000)
+Triple = tuple[float, float, float]
+
+
+def dropped(session: Session, reason: DropReason) -> int:
+    return session.counters.dropped[reason]
+
+
+# --- pinning ---
+
+
+def test_the_first_autopilot_heard_is_the_vehicle() -> None:
+    session = Session(SessionSettings())
+    reception = session.receive(Sender(42).heartbeat(), PEER, 0.0)
+    assert reception.events == (
+        events.VehicleFound(42, 1, "px4"),
+        events.Heartbeat("OFFBOARD", False, 3),
+    )
+    assert session.dialect is not None
+    assert session.dialect.name == "px4"
+    assert session.encode(Heartbeat(18))[5:7] == bytes([42, 191])
+
+
+@pytest.mark.parametrize(
+    ("sender", "autopilot", "vehicle_type", "reason"),
+    [
+        (Sender(255, 190), 8, 6, DropReason.FOREIGN_COMPONENT),
+        (Sender(255, 1), 8, 6, DropReason.NO_VEHICLE),
+        (Sender(255, 1), PX4, 6, DropReason.NO_VEHICLE),
+        (Sender(1, 154), 8, 26, DropReason.FOREIGN_COMPONENT),
+        (Sender(1, 1), 0, 2, DropReason.UNSUPPORTED_AUTOPILOT),
+    ],
+    ids=["ground station", "on component 1", "claiming PX4", "gimbal", "generic autopilot"],
+)
+def test_others_do_not_pin(
+    sender: Sender, autopilot: int, vehicle_type: int, reason: DropReason
+) -> None:
+    session = Session(SessionSettings())
+    frame = sender.heartbeat(autopilot, vehicle_type=vehicle_type)
+    reception = session.receive(frame, PEER, 0.0)
+    assert reception.events == ()
+    assert reception.frames == (frame,)
+    assert session.vehicle is None
+    assert dropped(session, reason) == 1
+
+
+def test_a_system_id_asked_for_is_waited_for() -> None:
+    session = Session(SessionSettings(system_id=7))
+    session.receive(Sender(1).heartbeat(), PEER, 0.0)
+    assert session.vehicle is None
+    assert dropped(session, DropReason.FOREIGN_SYSTEM) == 1
+    session.receive(Sender(7).heartbeat(), PEER, 0.0)
+    assert session.vehicle == events.VehicleFound(7, 1, "px4")
+
+
+def test_telemetry_before_the_first_heartbeat_waits() -> None:
+    session = Session(SessionSettings())
+    reception = session.receive(Sender().position(1000), PEER, 0.0)
+    assert (reception.events, len(reception.frames)) == ((), 1)
+    assert dropped(session, DropReason.NO_VEHICLE) == 1
+
+
+def test_others_are_dropped_once_pinned() -> None:
+    vehicle = Sender(1)
+    session = pinned(vehicle)
+    assert session.receive(vehicle.position(1000), STRANGER, 0.0).frames == ()
+    assert dropped(session, DropReason.FOREIGN_PEER) == 1
+    assert session.receive(Sender(2).position(1000), PEER, 0.0).events == ()
+    assert dropped(session, DropReason.FOREIGN_SYSTEM) == 1
+    assert session.receive(Sender(1, 154).position(1000), PEER, 0.0).events == ()
+    assert dropped(session, DropReason.FOREIGN_COMPONENT) == 1
+    assert len(session.receive(vehicle.position(1000), PEER, 0.0).events) == 1
+
+
+def test_our_own_frames_come_back_unheeded_and_unlogged() -> None:
+    session = pinned(Sender())
+    reception = session.receive(session.encode(Heartbeat(18)), PEER, 0.0)
+    assert (reception.frames, reception.events) == ((), ())
+    assert dropped(session, DropReason.ECHO) == 1
+
+
+def test_acks_for_others_are_not_ours() -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    for system_id, component_id in ((255, 190), (1, 190)):
+        frame = vehicle.ack(400, 0, system_id, component_id)
+        assert session.receive(frame, PEER, 0.0).events == ()
+    assert dropped(session, DropReason.NOT_FOR_US) == 2
+    for address in ((1, 191), (0, 0)):
+        reception = session.receive(vehicle.ack(400, 0, *address), PEER, 0.0)
+        assert reception.events == (events.CommandAck(400, "ACCEPTED"),)
+
+
+@pytest.mark.parametrize(
+    ("number", "name"),
+    [
+        *(
+            (number, entry.name.removeprefix("MAV_RESULT_"))
+            for number, entry in mavlink.enums["MAV_RESULT"].items()
+            if not entry.name.endswith("ENUM_END")
+        ),
+        (200, "UNKNOWN(200)"),
+    ],
+)
+def test_ack_results_have_the_names_of_the_specification(number: int, name: str) -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    reception = session.receive(vehicle.ack(21, number), PEER, 0.0)
+    assert reception.events == (events.CommandAck(21, name),)
+
+
+# --- contents ---
+
+NAN, INF = math.nan, math.inf
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+
+@pytest.mark.parametrize(
+    "frame",
+    [
+        lambda v: v.position(1000, NAN, 0, 0, 0, 0, 0),
+        lambda v: v.position(1000, 0, INF, 0, 0, 0, 0),
+        lambda v: v.position(1000, 0, 0, 1.1e5, 0, 0, 0),
+        lambda v: v.position(1000, 0, 0, 0, -201.0, 0, 0),
+        lambda v: v.position(1000, 0, 0, 0, 0, NAN, 0),
+        lambda v: v.position(1000, 0, 0, 0, 0, 0, -INF),
+        lambda v: v.attitude(1000, 0, 0, 0, 0, 0, 0, 0),
+        lambda v: v.attitude(1000, 2.0, 0, 0, 0, 0, 0, 0),
+        lambda v: v.attitude(1000, NAN, 0, 0, 0, 0, 0, 0),
+        lambda v: v.attitude(1000, *LEVEL, 0, NAN, 0),
+        lambda v: v.attitude(1000, *LEVEL, 0, 0, 101.0),
+        lambda v: v.frame(mavlink.MAVLink_param_value_message(b"X", NAN, 9, 1, 0)),
+        lambda v: v.frame(mavlink.MAVLink_param_value_message(b"", 1.0, 9, 1, 0)),
+        lambda v: v.frame(mavlink.MAVLink_param_value_message(b"X", 1.0, 77, 1, 0)),
+    ],
+)
+def test_implausible_contents_are_dropped_but_logged(frame: Callable[[Sender], bytes]) -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    reception = session.receive(frame(vehicle), PEER, 0.0)
+    assert (reception.events, len(reception.frames)) == ((), 1)
+    assert dropped(session, DropReason.IMPLAUSIBLE) == 1
+
+
+def test_a_quaternion_nearly_unit_is_normalised() -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    frame = vehicle.attitude(1500, 0.0, 1.05, 0.0, 0.0, 0.1, 0.2, 0.3)
+    (event,) = session.receive(frame, PEER, 0.0).events
+    assert isinstance(event, events.Attitude)
+    assert event.time_s == 1.5
+    assert event.attitude == pytest.approx((0.0, 1.0, 0.0, 0.0))
+    assert event.rates_frd_radps == pytest.approx((0.1, 0.2, 0.3))
+
+
+@pytest.mark.parametrize(
+    ("health", "millivolts", "percent", "expected"),
+    [
+        (0x10000000, 15800, 87, events.SystemHealth(True, pytest.approx(15.8), 0.87)),
+        (0x0FFFFFFF, 65535, -1, events.SystemHealth(False, None, None)),
+    ],
+)
+def test_system_health(
+    health: int, millivolts: int, percent: int, expected: events.SystemHealth
+) -> None:
+    vehicle = Sender()
+    frame = vehicle.frame(
+        mavlink.MAVLink_sys_status_message(
+            0, 0, health, 0, millivolts, -1, percent, 0, 0, 0, 0, 0, 0
+        )
+    )
+    assert pinned(vehicle).receive(frame, PEER, 0.0).events == (expected,)
+
+
+@pytest.mark.parametrize(
+    ("number", "state"),
+    [
+        (0, "unknown"),
+        (1, "on_ground"),
+        (2, "in_air"),
+        (3, "takeoff"),
+        (4, "landing"),
+        (99, "unknown"),
+    ],
+)
+def test_landed(number: int, state: str) -> None:
+    vehicle = Sender()
+    frame = vehicle.frame(mavlink.MAVLink_extended_sys_state_message(0, number))
+    assert pinned(vehicle).receive(frame, PEER, 0.0).events == (events.Landed(state),)
+
+
+def test_an_unknown_mode_has_a_name_too() -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    reception = session.receive(vehicle.heartbeat(custom_mode=0x12345678), PEER, 0.0)
+    assert reception.events == (events.Heartbeat("UNKNOWN(0x12345678)", False, 3),)
+
+
+# --- time ---
+
+
+def times(session: Session, *frames: bytes) -> list[float]:
+    found = []
+    for frame in frames:
+        for event in session.receive(frame, PEER, 0.0).events:
+            assert isinstance(event, events.LocalPosition | events.Attitude)
+            found.append(event.time_s)
+    return found
+
+
+def test_late_and_double_messages_are_stale_each_kind_for_itself() -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    frames = [
+        vehicle.position(5000),
+        vehicle.attitude(4990),  # another message may lag
+        vehicle.position(4990),
+        vehicle.position(5000),
+        vehicle.position(5010),
+        vehicle.position(3010),  # two seconds late is still late
+    ]
+    assert times(session, *frames) == [5.0, 4.99, 5.01]
+    assert dropped(session, DropReason.STALE) == 3
+
+
+def test_a_jump_back_is_a_reboot() -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    times(session, vehicle.position(60000), vehicle.attitude(60000))
+    reception = session.receive(vehicle.position(500), PEER, 0.0)
+    assert reception.events[0] == events.Reset(0.5)
+    assert isinstance(reception.events[1], events.LocalPosition)
+    assert times(session, vehicle.attitude(510), vehicle.position(510)) == [0.51, 0.51]
+    assert len(session.poll(0.0)) > 4  # the intervals are asked for again
+
+
+def test_link_loss_is_counted_from_sequence_numbers() -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    frames = [vehicle.position(1000 + 10 * i) for i in range(100)]
+    late = frames.pop(50)
+    del frames[10:20]
+    for frame in frames:
+        session.receive(frame, PEER, 0.0)
+    assert session.counters.lost == 11
+    session.receive(late, PEER, 0.0)
+    session.receive(frames[-1], PEER, 0.0)
+    assert session.counters.lost == 10
+    assert session.counters.link_loss == pytest.approx(10 / 102, abs=2e-3)
+
+
+# --- STATUSTEXT ---
+
+
+def texts(session: Session, *frames: bytes, now_s: float = 0.0) -> list[str]:
+    return [
+        event.text
+        for frame in frames
+        for event in session.receive(frame, PEER, now_s).events
+        if isinstance(event, events.StatusText)
+    ]
+
+
+LONG = b"Preflight Fail: " + bytes(range(65, 91)) * 4  # 120 bytes: chunks of 50, 50 and 20
+CHUNKS = (LONG[:50], LONG[50:100], LONG[100:] + b"\t")
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 0, 1), (1, 0, 2), (0, 1, 1, 0, 2)])
+def test_chunks_are_joined_in_any_order(order: tuple[int, ...]) -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    frames = [vehicle.text(CHUNKS[i], 9, i) for i in order]
+    assert texts(session, *frames[:-1]) == []
+    assert texts(session, frames[-1]) == [LONG.decode()]
+
+
+def test_two_texts_interleaved() -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    frames = [
+        vehicle.text(b"a" * 50, 1, 0),
+        vehicle.text(b"b" * 50, 2, 0),
+        vehicle.text(b"B", 2, 1),
+        vehicle.text(b"A", 1, 1),
+    ]
+    assert texts(session, *frames) == ["b" * 50 + "B", "a" * 50 + "A"]
+
+
+def test_a_lost_chunk_leaves_a_mark_after_a_second() -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    first, last = vehicle.text(CHUNKS[0], 3, 0), vehicle.text(CHUNKS[2], 3, 2)
+    assert texts(session, first, last) == []
+    other = vehicle.text(b"other")
+    assert texts(session, other, now_s=0.9) == ["other"]
+    mark = CHUNKS[0].decode() + "[...]" + CHUNKS[2].decode().strip()
+    assert texts(session, vehicle.text(b"other"), now_s=1.1) == [mark, "other"]
+
+
+def test_unfinished_texts_do_not_pile_up() -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    frames = [vehicle.text(b"x" * 50, text_id, 0) for text_id in range(1, 101)]
+    assert len(texts(session, *frames)) == 92
+    assert texts(session, vehicle.text(b"x" * 50, 500, 200)) == []
+
+
+@pytest.mark.parametrize(
+    ("data", "text"),
+    [
+        (b"Takeoff detected\t", "Takeoff detected"),
+        (b"x" * 50, "x" * 50),  # id 0: complete in itself
+        (b"\x1b[31mred\x07", "[31mred"),  # no control sequences reach a terminal
+        (b"\xff\xfe", "\ufffd\ufffd"),
+        ("3 \u00b0 tilt".encode(), "3 \u00b0 tilt"),
+    ],
+)
+def test_texts_are_printable(data: bytes, text: str) -> None:
+    vehicle = Sender()
+    assert texts(pinned(vehicle), vehicle.text(data)) == [text]
+
+
+# --- what is sent unprompted ---
+
+
+def test_timesync_is_answered_after_the_events_of_its_datagram() -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    request = vehicle.frame(mavlink.MAVLink_timesync_message(0, 123_456_789_012))
+    reception = session.receive(vehicle.position(1000) + request, PEER, 2.5)
+    assert len(reception.events) == 1
+    assert len(reception.frames) == 2
+    (reply,) = map(understood, reception.replies)
+    assert (reply.tc1, reply.ts1) == (2_500_000_000, 123_456_789_012)
+    answer = vehicle.frame(mavlink.MAVLink_timesync_message(1, 2))
+    assert session.receive(answer, PEER, 2.5).replies == ()
+
+
+def test_timesync_is_answered_before_the_first_heartbeat() -> None:
+    session = Session(SessionSettings())
+    request = Sender(7).frame(mavlink.MAVLink_timesync_message(0, 5))
+    (reply,) = session.receive(request, PEER, 1.0).replies
+    assert understood(reply).ts1 == 5
+    ground_station = Sender(255, 190).frame(mavlink.MAVLink_timesync_message(0, 5))
+    assert session.receive(ground_station, PEER, 1.0).replies == ()
+
+
+def kinds(frames: tuple[bytes, ...]) -> list[str]:
+    return [understood(frame).get_type() for frame in frames]
+
+
+def test_nothing_is_said_into_the_void_unless_asked() -> None:
+    assert Session(SessionSettings()).poll(0.0) == ()
+    assert kinds(Session(SessionSettings(speaks_first=True)).poll(0.0)) == ["HEARTBEAT"]
+    session = Session(SessionSettings())
+    session.receive(Sender(255, 190).heartbeat(8, vehicle_type=6), PEER, 0.0)
+    assert kinds(session.poll(0.0)) == ["HEARTBEAT"]
+
+
+@pytest.mark.parametrize(("autopilot", "vehicle_type"), [(PX4, 6), (ARDUPILOT, 18)])
+def test_heartbeat_of_the_type_the_autopilot_wants(autopilot: int, vehicle_type: int) -> None:
+    session = pinned(Sender(), autopilot, requests_intervals=False)
+    beats = [(0.1 * i, frame) for i in range(100) for frame in session.poll(0.1 * i)]
+    assert [understood(frame).type for _, frame in beats] == [vehicle_type] * 10
+    assert [t for t, _ in beats] == pytest.approx(list(range(10)))
+
+
+def test_heartbeat_follows_vehicle_time_when_that_is_faster() -> None:
+    vehicle = Sender()
+    session = pinned(vehicle, requests_intervals=False)
+    beats = 0
+    for tick in range(1001):  # ten seconds of the vehicle in 0.2 of ours
+        session.receive(vehicle.position(10 * tick + 10), PEER, 0.0002 * tick)
+        beats += len(session.poll(0.0002 * tick))
+    assert beats == 11
+
+
+def test_intervals_are_asked_for_at_once() -> None:
+    session = pinned(Sender())
+    first = [understood(frame) for frame in session.poll(0.0)]
+    assert [m.get_type() for m in first] == ["HEARTBEAT"] + ["COMMAND_LONG"] * 5
+    asked = {int(m.param1): m.param2 for m in first[1:]}
+    assert all(m.command == 511 for m in first[1:])
+    assert asked == {31: 10000.0, 32: 10000.0, 245: 200000.0, 1: 500000.0, 115: 20000.0}
+    assert session.poll(0.01) == ()
+
+
+def test_mavlink_1_frames_are_understood() -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    message = mavlink.MAVLink_attitude_quaternion_message(1000, *LEVEL, 0.1, 0.2, 0.3)
+    frame = vehicle.frame(message, mavlink1=True)
+    assert frame[0] == 0xFE
+    reception = session.receive(frame + vehicle.position(1000), PEER, 0.0)
+    assert [type(e).__name__ for e in reception.events] == ["Attitude", "LocalPosition"]
+    assert reception.frames[0] == frame
+
+
+def test_mode_bits() -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    frame = vehicle.frame(mavlink.MAVLink_heartbeat_message(2, PX4, 128 | 1, OFFBOARD, 4, 3))
+    reception = session.receive(frame, PEER, 0.0)
+    assert reception.events == (events.Heartbeat("OFFBOARD", True, 4),)

@@ -1,0 +1,77 @@
+"""Frames as an autopilot would send them, made by pymavlink: an encoder that is not ours."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from offboard.mavlink.session import Session, SessionSettings
+
+RECORDINGS = Path(__file__).parent / "recordings"
+PX4_RECORDING = RECORDINGS / "px4-1.16.1-offboard.tlog"
+ARDUCOPTER_RECORDING = RECORDINGS / "arducopter-4.6.3-guided.tlog"
+PX4, ARDUPILOT = mavlink.MAV_AUTOPILOT_PX4, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+PEER = ("127.0.0.1", 14580)
+OFFBOARD = 0x00060000
+
+
+class Sender:
+    """One component on the network, with its own sequence numbers."""
+
+    def __init__(self, system_id: int = 1, component_id: int = 1) -> None:
+        self._link = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
+
+    def frame(self, message: Any, mavlink1: bool = False) -> bytes:
+        packed: bytes = message.pack(self._link, force_mavlink1=mavlink1)
+        self._link.seq = (self._link.seq + 1) % 256
+        return packed
+
+    def heartbeat(
+        self, autopilot: int = PX4, custom_mode: int = OFFBOARD, vehicle_type: int = 2
+    ) -> bytes:
+        return self.frame(
+            mavlink.MAVLink_heartbeat_message(vehicle_type, autopilot, 1, custom_mode, 3, 3)
+        )
+
+    def position(self, time_boot_ms: int, *state: float) -> bytes:
+        values = state or (1.0, 2.0, -3.0, 0.1, 0.2, -0.3)
+        return self.frame(mavlink.MAVLink_local_position_ned_message(time_boot_ms, *values))
+
+    def attitude(self, time_boot_ms: int, *state: float) -> bytes:
+        values = state or (1.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.03)
+        return self.frame(mavlink.MAVLink_attitude_quaternion_message(time_boot_ms, *values))
+
+    def ack(self, command: int, result: int, system_id: int = 1, component_id: int = 191) -> bytes:
+        return self.frame(
+            mavlink.MAVLink_command_ack_message(command, result, 0, 0, system_id, component_id)
+        )
+
+    def text(self, data: bytes, text_id: int = 0, chunk: int = 0) -> bytes:
+        return self.frame(mavlink.MAVLink_statustext_message(2, data, text_id, chunk))
+
+
+def pinned(vehicle: Sender, autopilot: int = PX4, **settings: Any) -> Session:
+    """A session that has just heard `vehicle`."""
+    session = Session(SessionSettings(**settings))
+    reception = session.receive(vehicle.heartbeat(autopilot), PEER, 0.0)
+    assert len(reception.events) == 2
+    return session
+
+
+def understood(frame: bytes) -> Any:
+    """What pymavlink, standing in for the autopilot, reads in one of our frames."""
+    return mavlink.MAVLink(None).decode(bytearray(frame))
+
+
+def recorded(path: Path) -> Iterator[Any]:
+    """Messages of a .tlog as pymavlink reads them, with `_timestamp`."""
+    log = mavutil.mavlink_connection(str(path), dialect="ardupilotmega")
+    try:
+        while (message := log.recv_msg()) is not None:
+            yield message
+    finally:
+        log.close()
