@@ -22,6 +22,13 @@ GATE_SDS = 3.0
 
 
 @numba.njit(cache=True)
+def _transition(scaled: Array) -> Array:
+    """exp of a small matrix to fourth order."""
+    square = scaled @ scaled
+    return np.eye(len(scaled)) + scaled + 0.5 * square + square @ (scaled / 6.0 + square / 24.0)
+
+
+@numba.njit(cache=True)
 def spread(
     covariance: Array, dynamics: Array, densities: Array, interval_s: float, longest_s: float
 ) -> None:
@@ -33,11 +40,11 @@ def spread(
     if steps <= 0:
         return
     h = interval_s / steps
-    scaled = dynamics * h
-    square = scaled @ scaled
-    transition = np.eye(len(dynamics)) + scaled + 0.5 * square + square @ scaled / 6.0
-    noise = np.diag(densities * densities * (0.5 * h))
-    noise = noise + transition @ noise @ transition.T
+    half = _transition(dynamics * (0.5 * h))
+    transition = half @ half
+    density = np.diag(densities * densities)
+    noise = density + 4.0 * (half @ density @ half.T) + transition @ density @ transition.T
+    noise *= h / 6.0  # Simpson's rule: exact for a chain of two integrators
     for _ in range(steps):
         covariance[:] = transition @ covariance @ transition.T + noise
 
