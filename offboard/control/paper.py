@@ -49,6 +49,10 @@ class PaperSettings(Parameters):
     another vehicle's are scaled so that the same numbers accelerate it alike, and box and weights
     keep their meaning. They are relative to hover; f_t is cut further where the total thrust
     would be negative or above the vehicle's maximum.
+
+    The attitude sent is the one predicted for k+1. `attitude_lead` sends instead what the
+    autopilot's loop must be asked for so that it follows that prediction: without it a slow or
+    well damped loop realises a fraction of the torques only.
     """
 
     fitness: TwelveWeights = (1, 1, 25, 1, 1, 1, 20, 20, 5, 20, 20, 5)  # diag Q, Eq. 33
@@ -63,8 +67,13 @@ class PaperSettings(Parameters):
 
     @classmethod
     def first_configuration(cls) -> PaperSettings:
-        """Section 4.1: Q = I (Eq. 23 is lost; I gives the paper's magnitudes) and R of Eq. 24."""
-        return cls(fitness=(1,) * 12, energy=(0.0057, 1.25, 1.25, 5.0))
+        """Section 4.1: Q = I (Eq. 23 is lost; I gives the paper's magnitudes), R of Eq. 24, no
+        damping, and no rebound, which gives the paper's epsilon."""
+        return cls(
+            fitness=(1,) * 12,
+            energy=(0.0057, 1.25, 1.25, 5.0),
+            swarm=SwarmSettings(damping=1.0, rebound=0.0),
+        )
 
 
 @dataclass(frozen=True, slots=True)

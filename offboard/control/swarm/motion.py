@@ -45,11 +45,13 @@ def scatter(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True)
 def move(  # type: ignore[no-untyped-def]
-    lanes, lower, upper, inertia, personal, social, damping, positions, velocities, bests, leader
-) -> None:
+    lanes, lower, upper, inertia, personal, social, damping, rebound,
+    positions, velocities, bests, leader,
+) -> None:  # fmt: skip
     """Eqs. 30 and 20 with a random number per dimension; Eq. 22 by clamping.
 
-    A clamped component loses its velocity: a particle that keeps it stays pressed on the wall.
+    A clamped component turns its velocity round, times `rebound`: a particle that keeps it stays
+    pressed on the wall, and where all lose it beside their leader, that dimension is dead.
     """
     for j in range(positions.shape[0]):
         low = lower[j]
@@ -71,7 +73,7 @@ def move(  # type: ignore[no-untyped-def]
             )  # Eq. 30
             there = here + velocity  # Eq. 20
             inside = low <= there <= high
-            velocities[j, i] = velocity if inside else 0.0
+            velocities[j, i] = velocity if inside else -rebound * velocity
             positions[j, i] = min(max(there, low), high)  # Eq. 22
 
 

@@ -89,7 +89,7 @@ class Swarm:
             s = self._settings
             move(
                 self._lanes.states(s.particles), *self._box,
-                s.inertia, s.personal, s.social, s.damping,
+                s.inertia, s.personal, s.social, s.damping, s.rebound,
                 self._positions, self._velocities, self._bests, self._leader,
             )  # fmt: skip
             self._told = False

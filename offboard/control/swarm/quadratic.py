@@ -63,7 +63,7 @@ def _costs_of_four(  # type: ignore[no-untyped-def]
 
 @numba.njit(cache=True)
 def _iterate(  # type: ignore[no-untyped-def]
-    first, last, lanes, lower, upper, inertia, personal, social, damping,
+    first, last, lanes, lower, upper, inertia, personal, social, damping, rebound,
     positions, velocities, bests, best_costs, leader, leader_cost,
     hessian, gradient, constant, costs,
 ):  # fmt: skip
@@ -72,7 +72,7 @@ def _iterate(  # type: ignore[no-untyped-def]
     for iteration in range(first, last):
         if iteration > 0:
             move(
-                lanes, lower, upper, inertia, personal, social, damping,
+                lanes, lower, upper, inertia, personal, social, damping, rebound,
                 positions, velocities, bests, leader,
             )  # fmt: skip
         quadratic_costs(hessian, gradient, constant, positions, costs)
@@ -156,7 +156,7 @@ class QuadraticSwarm:
         s = self._settings
         answer: tuple[float, int, float] = _iterate(
             first, last, lanes.states(s.particles), *self._bounds,
-            s.inertia, s.personal, s.social, s.damping,
+            s.inertia, s.personal, s.social, s.damping, s.rebound,
             self._positions, self._velocities, self._bests, self._best_costs,
             self._leader, cost, self._hessian, self._gradient, self._constant, self._costs,
         )  # fmt: skip
