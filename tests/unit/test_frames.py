@@ -30,7 +30,7 @@ RANDOM = Rotation.random(500, random_state=17)
 QUATERNIONS = RANDOM.as_quat(scalar_first=True)
 
 angles = st.floats(-math.pi, math.pi)
-any_float = st.floats(allow_nan=True, allow_infinity=True)
+any_float = st.floats() | st.sampled_from([math.nan, math.inf, -math.inf, 0.0, -0.0])
 
 
 def scipy_rotation(quaternion: Array) -> Rotation:
@@ -145,6 +145,15 @@ def test_an_attitude_is_finite_and_unit_whatever_is_asked(
 ) -> None:
     quaternion = quaternion_from_thrust_direction((north, east, down), course)
     assert np.linalg.norm(quaternion) == pytest.approx(1.0, abs=1e-15)
+
+
+@pytest.mark.parametrize("course", [math.nan, math.inf, -math.inf])
+def test_a_course_that_is_none_is_north(course: float) -> None:
+    direction = [0.1, -0.2, 0.9]
+    assert_array_equal(
+        quaternion_from_thrust_direction(direction, course),
+        quaternion_from_thrust_direction(direction, 0.0),
+    )
 
 
 @given(st.floats(-1e6, 1e6))
