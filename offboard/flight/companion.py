@@ -326,7 +326,7 @@ class Companion:
             self._ask(self._dialect.engage(), time_s)
         elif self.phase is Phase.ARM:
             self._ask(CommandLong.arm(), time_s)
-        elif self.phase is Phase.LAND:
+        elif self.phase is Phase.LAND and self.view.mode != self._dialect.land_mode:
             self._ask(self._dialect.land(), time_s)
         if self.phase in (Phase.STREAM, Phase.ENGAGE, Phase.ARM):
             self._emit(time_s, Command(0.0, LEVEL, self._course_rad()))
