@@ -12,7 +12,8 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from offboard.control.base import Controller
-from offboard.control.paper import PaperController, PaperSettings
+from offboard.control.paper import PaperController
+from offboard.control.paper_law import PaperSettings
 from offboard.control.tracking import Search, TrackingLaw, TrackingSettings
 from offboard.model.vehicle import Parameters, Vehicle
 

@@ -9,129 +9,30 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Annotated
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from offboard.control.base import Command, Decision, PredictedState, Situation
 from offboard.control.certificate import ExactMinimum, certify
-from offboard.control.cost import BoxQuadratic
-from offboard.control.one_step import OneStep
-from offboard.control.swarm import QuadraticSwarm, RandomLanes, SwarmResult, SwarmSettings
+from offboard.control.integral import ErrorIntegral
+from offboard.control.paper_law import (
+    PAPER_ARM_M,
+    PAPER_INERTIA_KGM2,
+    PAPER_MASS_KG,
+    PAPER_STEP_S,
+    Move,
+    PaperLaw,
+    PaperSettings,
+)
 from offboard.model.frames import wrap_pi
 from offboard.model.linear import sampled_matrices
 from offboard.model.state import PHI, PSI, THETA, THRUST, P, R, U, W, X, Z
-from offboard.model.vehicle import Parameters, Vehicle
+from offboard.model.vehicle import Vehicle
 from offboard.reference.base import FlatSample
 
 Array = NDArray[np.float64]
-
-PAPER_STEP_S = 0.1  # what Eq. 16 is sampled with, though it says 0.05
-PAPER_MASS_KG = 0.4  # Table 1
-PAPER_INERTIA_KGM2 = (0.0196, 0.0196, 0.0264)  # Table 1
-PAPER_ARM_M = 0.225  # not in Table 1, but Eq. 16 is only reproduced with it
-
-Weight = Annotated[float, Field(ge=0)]
-Four = tuple[float, float, float, float]
-FourWeights = tuple[Weight, Weight, Weight, Weight]
-TwelveWeights = tuple[
-    Weight, Weight, Weight, Weight, Weight, Weight, Weight, Weight, Weight, Weight, Weight, Weight
-]
-
-
-class PaperSettings(Parameters):
-    """Weights, box and swarm of the paper, by default the final ones (section 4.3).
-
-    States in the order of Eq. 5 in SI (psi in radians). Inputs are those of the paper's vehicle:
-    another vehicle's are scaled so that the same numbers accelerate it alike, and box and weights
-    keep their meaning. They are relative to hover; f_t is cut further where the total thrust
-    would be negative or above the vehicle's maximum.
-
-    The attitude sent is the one predicted for k+1. `attitude_lead` sends instead what the
-    autopilot's loop must be asked for so that it follows that prediction: without it a slow or
-    well damped loop realises a fraction of the torques only.
-    """
-
-    fitness: TwelveWeights = (1, 1, 25, 1, 1, 1, 20, 20, 5, 20, 20, 5)  # diag Q, Eq. 33
-    energy: FourWeights = (0.00057, 0.125, 0.125, 0.5)  # diag R, Eq. 34
-    rate: FourWeights = (1, 1, 1, 1)  # diag R_du, Eqs. 25 and 35
-    lower: Four = (-4.0, -0.2, -0.2, -0.1)  # N, N, N, N m, Eq. 26
-    upper: Four = (3.942, 0.2, 0.2, 0.1)  # Eq. 26
-    attitude_lead: bool = False
-    keep_constant: bool = True  # of J; epsilon of Eq. 29 rests on its rounding
-    swarm: SwarmSettings = SwarmSettings()
-    seed: int = Field(default=0, ge=0, lt=2**64)
-
-    @classmethod
-    def first_configuration(cls) -> PaperSettings:
-        """Section 4.1: Q = I (Eq. 23 is lost; I gives the paper's magnitudes), R of Eq. 24, no
-        damping, and no rebound, which gives the paper's epsilon."""
-        return cls(
-            fitness=(1,) * 12,
-            energy=(0.0057, 1.25, 1.25, 5.0),
-            swarm=SwarmSettings(damping=1.0, rebound=0.0),
-        )
-
-
-@dataclass(frozen=True, slots=True)
-class Move:
-    """What the law chose: inputs u(k) (4,), the state (12,) they lead to, and how it was found."""
-
-    inputs: Array
-    following: Array
-    problem: BoxQuadratic
-    result: SwarmResult
-
-
-class PaperLaw:
-    """The law on any plant of Eq. 14: dynamics (12, 12), inputs (12, 4), box (4,), (4,).
-
-    Remembers the last input (for R_du) and the random stream; `reset` forgets both. `terminal`
-    (12, 12) takes the place of diag(Q), for instance `cost_to_go` of the same weights.
-    """
-
-    def __init__(
-        self,
-        dynamics: Array,
-        inputs: Array,
-        settings: PaperSettings,
-        lower: Array | None = None,
-        upper: Array | None = None,
-        terminal: Array | None = None,
-    ) -> None:
-        weight = np.diag(settings.fitness) if terminal is None else terminal
-        self._step = OneStep(
-            dynamics, inputs, weight, np.diag(settings.energy), np.diag(settings.rate)
-        )
-        self._lower = np.array(settings.lower if lower is None else lower, np.float64)
-        self._upper = np.array(settings.upper if upper is None else upper, np.float64)
-        self._keep_constant = settings.keep_constant
-        self._swarm = QuadraticSwarm(settings.swarm, len(self._lower))
-        self._lanes = RandomLanes(settings.seed)
-        self._nominal = np.zeros(len(self._lower))
-        self._previous = self._nominal
-
-    def move(
-        self,
-        state: Array,
-        reference_next: Array,
-        remaining_s: Callable[[], float] | None = None,
-    ) -> Move:
-        """u(k) for the state x(k) (12,) towards x_ref(k+1) (12,), Eq. 27."""
-        problem = self._step.problem(
-            state, reference_next, self._nominal, self._previous, self._lower, self._upper,
-            keep_constant=self._keep_constant,
-        )  # fmt: skip
-        result = self._swarm.minimise(problem, self._lanes, remaining_s=remaining_s)
-        self._previous = result.best
-        return Move(result.best, self._step.predict(state, result.best), problem, result)
-
-    def reset(self) -> None:
-        self._previous = self._nominal
-        self._lanes.reset()
 
 
 class PaperController:
@@ -152,7 +53,11 @@ class PaperController:
         self._settings = settings
         self._step_s = step_s
         self._stopwatch = stopwatch
-        self._law = PaperLaw(dynamics, inputs * input_scale(vehicle), settings, lower, upper)
+        self._law = PaperLaw(
+            dynamics, inputs * input_scale(vehicle), settings, lower, upper, step_s=step_s
+        )
+        self._integral = ErrorIntegral(settings.integral, step_s) if settings.integral else None
+        self._held = False  # the input was at its bound: the integral waits
         self._exact = ExactMinimum(len(lower))
 
     def decide(self, situation: Situation) -> Decision:
@@ -162,10 +67,16 @@ class PaperController:
         if not _usable(situation.state):
             return Decision(situation.previous)
         state, reference = heading_frame(situation.state, target)
-        move = self._law.move(state, reference, self._remaining(situation.deadline_s, started))
+        move = self._law.move(
+            state,
+            reference,
+            self._remaining(situation.deadline_s, started),
+            integral=self._summed(situation),
+        )
         if not math.isfinite(move.result.cost):
             return Decision(situation.previous)
         certificate = certify(move.problem, move.result, self._exact)
+        self._held = certificate.at_bound
         if self._stopwatch:
             certificate = replace(certificate, solve_time_s=self._stopwatch() - started)
         return Decision(self._command(move, state, float(target.course_rad)), certificate)
@@ -173,12 +84,26 @@ class PaperController:
     def reset(self) -> None:
         """Forget everything of the previous flight, the random stream included."""
         self._law.reset()
+        self._held = False
+        if self._integral:
+            self._integral.reset()
 
     def warm_up(self) -> None:
         """Call every code path once, compiled and daqp's, and forget it again."""
         move = self._law.move(np.zeros(12), np.zeros(12), lambda: math.inf)
         certify(move.problem, move.result, self._exact)
         self.reset()
+
+    def _summed(self, situation: Situation) -> Array | None:
+        """The integral (4,) turned to the heading; summed in NED, where the wind stands still."""
+        if not self._integral:
+            return None
+        state, now = situation.state, situation.reference.sample(situation.state.time_s)
+        course = wrap_pi(state.course_rad - float(now.course_rad))
+        error = np.append(state.position_ned_m - now.position_ned_m, course)
+        summed = self._integral.add(error, self._held).copy()
+        summed[:3] = _turn(-state.course_rad) @ summed[:3]
+        return summed
 
     def _remaining(self, deadline_s: float | None, started: float) -> Callable[[], float] | None:
         stopwatch = self._stopwatch
