@@ -86,20 +86,30 @@ def build_loop(vehicle: Vehicle, step_s: float) -> Loop:
 
 def encode(demand: Demand, row: Array) -> None:
     """Write the sanitised demand into a history row (ROW_WIDTH,); every number finite."""
-    row[:] = 0.0
     thrust = demand.thrust if demand.motors_on and not math.isnan(demand.thrust) else 0.0
-    row[_THRUST] = min(max(thrust, 0.0), 1.0)
-    if demand.attitude is not None:
-        largest = max(map(abs, demand.attitude))
-        if math.isfinite(sum(demand.attitude)) and largest > 0.0:
-            scaled = [component / largest for component in demand.attitude]
-            norm = math.hypot(*scaled)
-            row[_IS_ATTITUDE] = 1.0
-            row[_QUATERNION:_RATES] = [component / norm for component in scaled]
-    elif demand.rates_frd_radps is not None:
-        for i, rate in enumerate(demand.rates_frd_radps):
-            limit = RATE_LIMIT_RADPS[i]
-            row[_RATES + i] = 0.0 if math.isnan(rate) else min(max(rate, -limit), limit)
+    attitude = _unit(demand.attitude) if demand.attitude is not None else None
+    rates = demand.rates_frd_radps if demand.attitude is None else None
+    row[:] = (
+        0.0 if attitude is None else 1.0,
+        *(attitude or (0.0, 0.0, 0.0, 0.0)),
+        *(map(_within, rates, RATE_LIMIT_RADPS) if rates is not None else (0.0, 0.0, 0.0)),
+        min(max(thrust, 0.0), 1.0),
+    )
+
+
+def _unit(quaternion: Quaternion) -> Quaternion | None:
+    """The same attitude with unit length; None if it has no direction or is not finite."""
+    w, x, y, z = quaternion
+    if not math.isfinite(w + x + y + z) or w == x == y == z == 0.0:
+        return None
+    largest = max(abs(w), abs(x), abs(y), abs(z))
+    w, x, y, z = w / largest, x / largest, y / largest, z / largest
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    return w / norm, x / norm, y / norm, z / norm
+
+
+def _within(rate: float, limit: float) -> float:
+    return 0.0 if math.isnan(rate) else min(max(rate, -limit), limit)
 
 
 @numba.njit(cache=True)

@@ -62,6 +62,9 @@ STEP_S = 0.004
 
 _ERROR_LANE, _GUST_LANE, _WHITE_LANE = 0, 1, 2
 
+# The state vector: rigid body, rotors, wind, estimator errors, gusts.
+_STATE_ENDS = np.cumsum([QUATERNION.size, ROTOR_SIZE, 3, ERROR_COUNT, 5])
+
 
 @dataclass(frozen=True, slots=True)
 class Truth:
@@ -113,33 +116,42 @@ class Plant:
         model = error_model(conditions.estimator, conditions.white_noise)
         self._lag_s = model.lag_s
         self._white_sds = white_sds(model)
-        self._errors = error_process(model, STEP_S)
+        errors = error_process(model, STEP_S)
         self._gusts = dryden(conditions.gusts, STEP_S)
         weakening = conditions.weakening
-        self._air = np.array(
-            [
-                *conditions.wind_ned_mps,
-                *wind_axes(conditions.wind_ned_mps),
-                weakening.at_s if weakening else np.inf,
-                weakening.thrust_scale if weakening else 1.0,
-            ]
+        air = [
+            *conditions.wind_ned_mps,
+            *wind_axes(conditions.wind_ned_mps),
+            weakening.at_s if weakening else np.inf,
+            weakening.thrust_scale if weakening else 1.0,
+        ]
+        blocks = (
+            self._airframe.body,
+            self._airframe.rotor,
+            self._loop.gains,
+            air,
+            errors.transition,
+            errors.scale,
+            self._gusts.transition,
+            self._gusts.scale,
         )
-        self._start_state()
+        self._constants = np.concatenate([np.ravel(block) for block in blocks])
+        self._start_state(conditions.wind_ned_mps)
 
-    def _start_state(self) -> None:
+    def _start_state(self, wind_ned_mps: Triple) -> None:
         self._history = self._loop.history
         self._row = np.zeros(ROW_WIDTH)
         self._demand: Demand | None = None
         self._motors_on = False
-        self._body = np.zeros(QUATERNION.size)
+        self._state = np.zeros(_STATE_ENDS[-1])
+        self._body, self._rotor, self._wind, self._error, gust = np.split(
+            self._state, _STATE_ENDS[:-1]
+        )
         self._body[0] = 1.0
-        self._rotor = np.zeros(ROTOR_SIZE)
         self._rotor[CONTACT] = 1.0
-        self._error = np.zeros(ERROR_COUNT)
-        self._gust = np.zeros(len(self._gusts.transition))
-        fill_normals(self._seed, _GUST_LANE, -1, self._gust)
-        self._gust = self._gusts.stationary_scale @ self._gust
-        self._wind = self._air[:3].copy()
+        self._wind[:] = wind_ned_mps
+        fill_normals(self._seed, _GUST_LANE, -1, gust)
+        gust[:] = self._gusts.stationary_scale @ gust
         self._offset_ned_m = np.zeros(3)
         self._reset_counter = 0
 
@@ -162,24 +174,13 @@ class Plant:
                 count,
                 self._step,
                 self._motors_on,
+                self._airframe.substeps,
+                self._seed,
                 self._row,
                 self._history,
                 self._loop.delays,
-                self._loop.gains,
-                self._body,
-                self._rotor,
-                self._airframe.body,
-                self._airframe.rotor,
-                self._airframe.substeps,
-                self._error,
-                self._errors.transition,
-                self._errors.scale,
-                self._gust,
-                self._gusts.transition,
-                self._gusts.scale,
-                self._air,
-                self._wind,
-                self._seed,
+                self._constants,
+                self._state,
             )
             self._step += count
 
@@ -231,27 +232,24 @@ def _advance(
     count: int,
     first_step: int,
     motors_on: bool,
+    substeps: int,
+    seed: np.uint64,
     row: Array,
     history: Array,
     delays: NDArray[np.int64],
-    gains: Array,
-    body: Array,
-    rotor: Array,
-    body_constants: Array,
-    rotor_constants: Array,
-    substeps: int,
-    error: Array,
-    error_transition: Array,
-    error_scale: Array,
-    gust: Array,
-    gust_transition: Array,
-    gust_scale: Array,
-    air: Array,
-    wind: Array,
-    seed: np.uint64,
+    constants: Array,
+    state: Array,
 ) -> None:
     """`count` steps in place. Per step: demand into history, air, loop on the estimate, airframe,
-    estimator errors."""
+    estimator errors. Packed, because unpacking one argument costs a tenth of a step."""
+    body, rotor, wind = state[:13], state[13:19], state[19:22]
+    error, gust = state[22:31], state[31:36]
+    body_constants, rotor_constants = constants[:12], constants[12:18]
+    gains, air = constants[18:27].reshape(3, 3), constants[27:34]
+    error_transition = constants[34:115].reshape(9, 9)
+    error_scale = constants[115:196].reshape(9, 9)
+    gust_transition = constants[196:221].reshape(5, 5)
+    gust_scale = constants[221:246].reshape(5, 5)
     normals, work = np.empty(ERROR_COUNT), np.empty(ERROR_COUNT)
     estimated, turn, turn_error = np.empty(4), np.empty(3), np.empty(3)
     inputs, scratch = np.empty(4), np.empty((RK4_SCRATCH_ROWS, 13))
