@@ -136,10 +136,10 @@ class Waypoints(_Shape):
 
     def path(self) -> Path:
         points = np.array(self.points_m, dtype=np.float64) * (1.0, 1.0, -1.0)
-        if self.times_s is not None:
-            times = np.array(self.times_s, dtype=np.float64)
+        if self.speed_mps is not None:
+            times = waypoints.times_from_speed(points, self.speed_mps)
         else:
-            times = waypoints.times_from_speed(points, self.speed_mps or 1.0)
+            times = np.array(self.times_s or (), dtype=np.float64)
         return waypoints.through(points, times, self.minimise)
 
 

@@ -71,7 +71,8 @@ def transfer(
     """From a start (3,), NED, to rest at a target, as fast as the limits allow; turning the short
     way. The course ends at `target_course_rad` plus whole turns, next to the start's.
 
-    A moving start that breaks the limits by itself is allowed its own speed and acceleration.
+    A moving start that breaks the limits by itself is allowed its own speed and acceleration. It
+    overshoots in the direction it moves in: nothing here knows where the ground is.
     Raises ValueError for anything not finite.
     """
     start, target, velocity, acceleration = (

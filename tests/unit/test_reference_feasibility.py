@@ -110,6 +110,13 @@ def test_what_is_not_a_number_is_refused() -> None:
 
 
 def test_long_references_are_checked_in_parts() -> None:
-    envelope = check(track(shape="hover", duration_s=900.0, height_m=2.0), vehicle())
+    # brisk and low at first, gentle and high at last, 500 s apart
+    climb = track(
+        shape="line", to_north_m=0, climb_m=100, speed_mps=0.2, height_m=2.0, run_in_s=2, run_out_s=50
+    )  # fmt: skip
+    envelope = check(climb, vehicle())
     assert envelope.height_min_m == 2.0
-    assert envelope.speed_max_mps == 0.0
+    assert envelope.speed_max_mps == pytest.approx(0.2)
+    # smoothstep of degree 9: its steepest rate is 630 / 256 of the mean
+    assert envelope.thrust_max_mps2 == pytest.approx(9.8 + 630 / 256 * 0.2 / 2.0, rel=1e-6)
+    assert envelope.thrust_min_mps2 == pytest.approx(9.8 - 630 / 256 * 0.2 / 50.0, rel=1e-6)

@@ -226,6 +226,8 @@ def test_course_holds_where_the_path_stands_still() -> None:
     assert course.slow_s.shape == (2, 2)  # at both ends
     start, end = course.slow_s[0]
     assert start == 0.0
+    ends = np.array([0.0, path.length_s])
+    np.testing.assert_allclose(course.jet(ends, path.jet(ends))[1:], 0.0, atol=1e-9)
     speed = np.linalg.norm(path.jet(np.array([end]))[1, 0, :2])
     assert HOLD_SPEED_MPS <= speed < 2 * HOLD_SPEED_MPS
     position, jet = orders(track.sample(np.linspace(-1, track.duration_s + 1, 3000)))

@@ -61,7 +61,7 @@ def test_moving_start_is_taken_over_and_ends_at_rest() -> None:
 
 def test_a_start_faster_than_the_limit_still_stops() -> None:
     flown = transfer((0, 0, -10), (1, 0, -10), 0, 0, start_velocity_ned_mps=(6.0, 0, 0))
-    assert flown.duration_s < 60
+    assert flown.duration_s < 20  # it may brake at its own speed, not creep below the limit
     assert np.all(flown.sample(flown.duration_s + 5).velocity_ned_mps == 0)
     np.testing.assert_allclose(flown.sample(1e6).position_ned_m, [1, 0, -10], atol=1e-8)
 
