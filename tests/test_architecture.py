@@ -1,0 +1,97 @@
+"""The house rules, checked on every run: format, lint, strict types, imports, one clock, layout."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("offboard", "simulator")
+SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+SCRIPTS = Path(sys.executable).parent
+
+CHECKS = {
+    "format": (str(SCRIPTS / "ruff"), "format", "--check", "--quiet", "."),
+    "lint": (str(SCRIPTS / "ruff"), "check", "--quiet", "."),
+    "types": (sys.executable, "-m", "mypy"),
+    "imports": (str(SCRIPTS / "lint-imports"), "--no-cache"),
+}
+
+
+@pytest.mark.parametrize("check", CHECKS)
+def test_tool_is_content(check: str) -> None:
+    done = subprocess.run(CHECKS[check], cwd=ROOT, capture_output=True, text=True, timeout=170)
+    assert done.returncode == 0, done.stdout + done.stderr
+
+
+def _names(path: Path) -> set[str]:
+    """Modules imported by a file, as dotted names."""
+    names: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            names |= {node.module} | {f"{node.module}.{alias.name}" for alias in node.names}
+    return names
+
+
+def test_only_the_clock_reads_the_time() -> None:
+    readers = {
+        str(path.relative_to(ROOT))
+        for path in SOURCES
+        if any(name.split(".")[0] in ("time", "datetime") for name in _names(path))
+    }
+    assert readers == {"offboard/flight/clock.py"}
+
+
+def test_only_the_edges_open_sockets() -> None:
+    openers = {
+        str(path.relative_to(ROOT))
+        for path in SOURCES
+        if any(name.split(".")[0] in ("socket", "select", "serial") for name in _names(path))
+    }
+    assert openers <= {"offboard/flight/link.py", "simulator/udp.py"}
+
+
+def test_the_simulator_shares_only_model_and_clock() -> None:
+    shared = {
+        name
+        for path in (ROOT / "simulator").rglob("*.py")
+        for name in _names(path)
+        if name.split(".")[0] == "offboard"
+    }
+    foreign = {
+        name
+        for name in shared
+        if not name.startswith(("offboard.model", "offboard.flight.clock"))
+        and name not in ("offboard", "offboard.flight")
+    }
+    assert foreign == set()
+
+
+def test_one_place_makes_a_setpoint() -> None:
+    makers = {
+        str(path.relative_to(ROOT))
+        for path in SOURCES
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call)
+        and isinstance(node.func, ast.Name)
+        and node.func.id == "AttitudeTarget"
+    }
+    assert makers == {"offboard/flight/companion.py"}
+
+
+def test_top_level_holds_only_what_the_layout_names() -> None:
+    listed = subprocess.run(
+        ("git", "ls-files"), cwd=ROOT, capture_output=True, text=True, check=True
+    ).stdout.split()
+    top = {name.split("/")[0] for name in listed}
+    allowed = {"pyproject.toml", "offboard", "simulator", "config", "tests", "README.md"}
+    assert {name for name in top - allowed if not name.startswith(".")} <= {
+        "LICENSE",
+        "CHANGELOG.md",
+    }
