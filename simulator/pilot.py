@@ -81,9 +81,13 @@ class Pilot:
         return self._demand
 
     def enter(self, behaviour: Behaviour, nav: Nav, takeoff_z_m: float = math.nan) -> None:
-        """Begin a behaviour here. `takeoff_z_m`: NED height to climb to; NaN the default one."""
+        """Begin a behaviour here; hold after a climb keeps the climb's target.
+
+        `takeoff_z_m`: NED height to climb to; NaN the default one.
+        """
+        if not (self.climbed and behaviour is Behaviour.HOLD):
+            self._hold = _ahead(nav)
         self._behaviour = behaviour
-        self._hold = _ahead(nav)
         self._takeoff_z_m = takeoff_z_m
         self._return_stage = 0
         self.climbed = False
@@ -202,7 +206,8 @@ class Pilot:
             target_z = self.home_ned_m[2] - self._parameters.role("takeoff_height_m")
         if nav.position_ned_m[2] < target_z + _CLIMBED_M:
             self.climbed = not self.landed
-        return MotionSetpoint((self._hold[0], self._hold[1], target_z))
+        self._hold = (self._hold[0], self._hold[1], target_z)
+        return MotionSetpoint(self._hold)
 
     def _return(self, nav: Nav) -> MotionSetpoint:
         """Climb (lower the nearer home is, under a cone of 45 degrees), fly home, land."""

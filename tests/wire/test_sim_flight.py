@@ -1,0 +1,297 @@
+"""Flights of the simulated PX4: stream loss, takeoff, landing, automatic disarm, setpoint rules."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+from sim_bench import HOVER, LAND, LOITER, NAN, OFFBOARD, POSCTL, RTL, TAKEOFF, Bench
+
+from simulator.autopilot import ACTIONS, GUARDS, describe
+from simulator.firmware.px4 import PX4
+from simulator.sensors import EstimatorName
+
+
+def set_parameter(bench: Bench, name: str, value: float) -> None:
+    assert bench.instance.autopilot.parameters.set(name, value)
+
+
+def offboard_attitude() -> Bench:
+    """In the air, level, engaged by attitude setpoints that have just ended."""
+    bench = Bench()
+    bench.fly_offboard()
+    bench.run(0.5, bench.attitude)
+    return bench
+
+
+# -- the stream ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("period_s", [0.02, 0.05, 0.1])
+def test_stream_loss_trips_a_little_after_one_second(period_s: float) -> None:
+    bench = offboard_attitude()
+    bench.run(1.0, bench.attitude, period_s)
+    bench.attitude()
+    last_s = bench.time_s
+    bench.run(1.5)
+    assert 1.03 <= bench.text_at("Failsafe activated") - last_s <= 1.06
+    assert (bench.mode, bench.instance.autopilot.system_status) == (POSCTL, 5)
+
+
+def test_until_then_the_last_attitude_and_thrust_go_on() -> None:
+    bench = offboard_attitude()
+    roll = math.radians(8.0)
+    bench.run(0.8, lambda: bench.attitude((math.cos(roll / 2), math.sin(roll / 2), 0, 0)))
+    bench.run(0.9)
+    _, attitude = bench.of("ATTITUDE")[-1]
+    assert attitude.roll == pytest.approx(roll, abs=0.01)
+    assert bench.mode == OFFBOARD
+
+
+def test_without_sticks_it_sinks_lands_and_disarms_back_into_offboard() -> None:
+    bench = offboard_attitude()
+    bench.run(2.5)
+    before_m = bench.height_m
+    bench.run(2.0)
+    assert 0.5 <= (before_m - bench.height_m) / 2.0 <= 0.8
+    bench.run_until(lambda: not bench.armed, 15.0)
+    bench.run(0.1)
+    assert bench.texts()[-2:] == ["Landing detected", "Disarmed by landing"]
+    assert bench.mode == OFFBOARD
+
+
+def test_resuming_the_stream_returns_to_offboard_by_itself() -> None:
+    bench = offboard_attitude()
+    bench.run(3.0)
+    assert bench.mode == POSCTL
+    begun_s = bench.time_s
+    bench.run(2.0, lambda: bench.position(0, 0, -5))
+    shown_s = next(t for t, m in bench.of("HEARTBEAT", begun_s) if m.custom_mode == OFFBOARD)
+    assert shown_s - begun_s < 1.1
+    assert bench.instance.autopilot.system_status == 4
+
+
+@pytest.mark.parametrize(("period_s", "trips"), [(0.8, False), (1 / 1.5, False), (1 / 0.9, True)])
+def test_the_least_rate(period_s: float, trips: bool) -> None:
+    bench = offboard_attitude()
+    bench.run(6.0, bench.attitude, period_s)
+    assert ("Failsafe activated" in bench.texts()) is trips
+
+
+@pytest.mark.parametrize(
+    ("action", "mode"), [(0, POSCTL), (1, 0x00020000), (3, RTL), (4, LAND), (5, LOITER)]
+)
+def test_what_follows_is_a_parameter(action: int, mode: int) -> None:
+    bench = offboard_attitude()
+    set_parameter(bench, "COM_OBL_RC_ACT", action)
+    bench.run(1.5)
+    assert bench.mode == mode
+    bench.run(0.2, bench.attitude)
+    assert bench.mode == OFFBOARD
+
+
+def test_time_out_is_a_parameter() -> None:
+    bench = offboard_attitude()
+    set_parameter(bench, "COM_OF_LOSS_T", 2.0)
+    bench.run(1.9)
+    assert bench.mode == OFFBOARD
+    bench.run(0.3)
+    assert bench.mode == POSCTL
+
+
+def test_a_mode_chosen_in_the_failsafe_stays() -> None:
+    bench = offboard_attitude()
+    bench.run(2.0)
+    assert bench.command(21) == [0]
+    bench.run(1.0, bench.attitude)
+    assert (bench.mode, bench.instance.autopilot.system_status) == (LAND, 4)
+
+
+# -- automatic flight ------------------------------------------------------------------------
+
+
+def test_takeoff_land_and_a_second_flight() -> None:
+    bench = Bench()
+    bench.boot()
+    for _ in range(2):
+        begun_s = bench.time_s
+        assert bench.command(22, *(NAN,) * 7) == [0]
+        assert bench.command(400, 1) == [0]
+        bench.run_until(lambda: bench.mode == LOITER, 12.0)
+        bench.run(4.0)
+        assert bench.height_m == pytest.approx(2.5, abs=0.2)
+        landed_states = {m.landed_state for _, m in bench.of("EXTENDED_SYS_STATE", begun_s)}
+        assert landed_states == {1, 2, 3}
+        assert bench.command(21) == [0]
+        bench.run_until(lambda: not bench.armed, 15.0)
+        bench.run(1.0)
+        assert bench.texts(begun_s) == [
+            "Armed by external command",
+            "Takeoff detected",
+            "Landing at current position",
+            "Landing detected",
+            "Disarmed by landing",
+        ]
+        settled_s = bench.text_at("Disarmed by landing") - bench.text_at("Landing detected")
+        assert settled_s == pytest.approx(2.0, abs=0.02)
+        assert bench.mode == LOITER
+
+
+def test_takeoff_height_is_above_sea() -> None:
+    bench = Bench()
+    bench.boot()
+    assert bench.command(22, 0, 0, 0, NAN, NAN, NAN, PX4.origin[2] + 6.0) == [0]
+    assert bench.mode == TAKEOFF
+    assert bench.command(400, 1) == [0]
+    bench.run(12.0)
+    assert bench.height_m == pytest.approx(6.0, abs=0.2)
+
+
+def test_return_flies_home_and_lands() -> None:
+    bench = Bench()
+    bench.fly_offboard()
+    bench.run(10.0, lambda: bench.position(8, 4, -5))
+    assert bench.command(20) == [0]
+    bench.run_until(lambda: not bench.armed, 40.0)
+    x, y, z = bench.instance.autopilot.truth.position_ned_m
+    assert math.hypot(x, y) < 1.0
+    assert abs(z) < 0.05
+
+
+@pytest.mark.parametrize("estimator", [EstimatorName.PERFECT, EstimatorName.PX4_LIKE])
+def test_hold_by_position_setpoints_is_as_good_as_the_estimate(estimator: EstimatorName) -> None:
+    """Its own loop feeds the raw velocity back: PX4 wanders by 0.47 m in hover, 0.26-0.56."""
+    bench = Bench(estimator, seed=3)
+    bench.boot()
+    bench.run(0.6, lambda: bench.position(0, 0, -5))
+    bench.ask_mode(OFFBOARD)
+    bench.command(400, 1)
+    bench.run(12.0, lambda: bench.position(0, 0, -5))
+    begun_s = bench.time_s
+    bench.run(60.0, lambda: bench.position(0, 0, -5))
+    squares = [
+        m.x**2 + m.y**2 + (m.z + 5) ** 2 for _, m in bench.of("LOCAL_POSITION_NED", begun_s)
+    ]
+    rms_m = math.sqrt(sum(squares) / len(squares))
+    if estimator is EstimatorName.PERFECT:
+        assert rms_m < 0.02
+    else:
+        assert 0.15 < rms_m < 0.8
+
+
+def test_velocity_and_yaw_setpoints() -> None:
+    bench = Bench()
+    bench.fly_offboard()
+
+    def ask() -> None:
+        bench.send(
+            mavlink.MAVLink_set_position_target_local_ned_message(
+                0, 1, 1, 1, 0b100111000111, 0, 0, 0, 1.0, -0.5, 0.0, 0, 0, 0, 1.2, 0
+            )
+        )
+
+    bench.run(16.0, ask)
+    _, position = bench.of("LOCAL_POSITION_NED")[-1]
+    _, attitude = bench.of("ATTITUDE")[-1]
+    assert (position.vx, position.vy) == pytest.approx((1.0, -0.5), abs=0.05)
+    assert attitude.yaw == pytest.approx(1.2, abs=0.05)
+
+
+# -- attitude setpoints: PX4's rules and lack of checks ---------------------------------------
+
+
+def climb_rate_after(bench: Bench, duration_s: float, **setpoint: object) -> float:
+    bench.run(duration_s, lambda: bench.attitude(**setpoint))
+    return -float(bench.instance.autopilot.truth.velocity_ned_mps[2])
+
+
+@pytest.mark.parametrize(
+    ("setpoint", "low", "high"),
+    [
+        ({"thrust": HOVER}, -0.1, 0.1),
+        ({"thrust": math.nan}, -5.0, -2.5),
+        ({"thrust": HOVER, "mask": 71}, -5.0, -2.5),
+        ({"thrust": -1.0}, -5.0, -2.5),
+        ({"thrust": 1.5}, 2.5, 6.0),
+        ({"quaternion": (2.0, 0, 0, 0)}, -0.1, 0.1),
+        ({"quaternion": (0.0, 0, 0, 0)}, -0.1, 0.1),
+        ({"quaternion": (NAN, 0, 0, 0)}, -0.1, 0.1),
+    ],
+)
+def test_thrust_is_taken_as_it_comes(setpoint: dict, low: float, high: float) -> None:
+    bench = offboard_attitude()
+    assert low < climb_rate_after(bench, 0.6, **setpoint) < high
+
+
+def test_sixty_degrees_of_roll_pass() -> None:
+    bench = offboard_attitude()
+    half = math.radians(30.0)
+    bench.run(0.8, lambda: bench.attitude((math.cos(half), math.sin(half), 0, 0)))
+    assert math.degrees(bench.of("ATTITUDE")[-1][1].roll) == pytest.approx(60.0, abs=7.0)
+
+
+def test_rates_fly_with_mask_128() -> None:
+    bench = offboard_attitude()
+    bench.run(0.6, lambda: bench.attitude(mask=128, rates=(0.0, 0.0, 0.6)))
+    bench.run(0.6, lambda: bench.attitude(mask=128, rates=(0.0, 0.0, 0.6)))
+    assert bench.of("ATTITUDE")[-1][1].yawspeed == pytest.approx(0.6, abs=0.1)
+
+
+@pytest.mark.parametrize(
+    "setpoint",
+    [{"mask": 135}, {"to": (2, 1)}, {"to": (1, 2)}],
+    ids=["all ignored", "to another system", "to another component"],
+)
+def test_what_is_no_stream_does_not_keep_offboard(setpoint: dict) -> None:
+    bench = offboard_attitude()
+    bench.run(1.5, lambda: bench.attitude(**setpoint))
+    assert bench.mode == POSCTL
+
+
+@pytest.mark.parametrize("to", [(1, 0), (0, 0), (0, 1)])
+def test_setpoints_to_all_are_obeyed(to: tuple[int, int]) -> None:
+    bench = offboard_attitude()
+    bench.run(1.5, lambda: bench.attitude(to=to))
+    assert bench.mode == OFFBOARD
+
+
+def test_takeoff_by_attitude_setpoints_alone() -> None:
+    bench = Bench()
+    bench.boot()
+    bench.run(0.6, bench.attitude)
+    bench.ask_mode(OFFBOARD)
+    bench.command(400, 1)
+    bench.run(2.0, lambda: bench.attitude(thrust=1.1 * HOVER))
+    assert bench.height_m > 0.3
+    assert bench.texts()[-1] == "Takeoff detected"
+
+
+# -- determinism -----------------------------------------------------------------------------
+
+
+def scripted_bytes(seed: int) -> bytes:
+    bench = Bench(EstimatorName.PX4_LIKE, seed=seed)
+    bench.fly_offboard(height_m=3.0)
+    bench.run(2.0, bench.attitude)
+    bench.command(21)
+    bench.run(8.0)
+    return bytes(bench.raw)
+
+
+def test_the_same_seed_gives_the_same_bytes() -> None:
+    first, second, other = scripted_bytes(5), scripted_bytes(5), scripted_bytes(6)
+    assert len(first) > 300_000
+    assert first == second
+    assert first != other
+
+
+def test_every_rule_names_modes_guards_and_actions_that_exist() -> None:
+    special = {"*", "requested", "intended", "remembered"}
+    for rule in PX4.rules:
+        assert {rule.to, rule.mode} <= set(PX4.modes) | special
+        assert set(rule.do) <= set(ACTIONS)
+        for guard in rule.when:
+            name, compares, _ = guard.removeprefix("not ").partition("=")
+            assert (name in {p.name for p in PX4.parameters}) if compares else (name in GUARDS)
+    assert len(describe(PX4)) == len(PX4.rules)
