@@ -111,9 +111,8 @@ def test_what_is_not_a_number_is_refused() -> None:
 
 def test_long_references_are_checked_in_parts() -> None:
     # brisk and low at first, gentle and high at last, 500 s apart
-    climb = track(
-        shape="line", to_north_m=0, climb_m=100, speed_mps=0.2, height_m=2.0, run_in_s=2, run_out_s=50
-    )  # fmt: skip
+    settings = {"speed_mps": 0.2, "height_m": 2.0, "run_in_s": 2, "run_out_s": 50}
+    climb = track(shape="line", to_north_m=0, climb_m=100, **settings)
     envelope = check(climb, vehicle())
     assert envelope.height_min_m == 2.0
     assert envelope.speed_max_mps == pytest.approx(0.2)
