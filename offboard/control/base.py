@@ -29,12 +29,26 @@ class Command:
 
 
 @dataclass(frozen=True, slots=True)
+class PredictedHeave:
+    """The vertical motion at `time_s`, vehicle time, when the *thrust* of a command sent now takes
+    effect: down is positive; `thrust_down_mps2` is T b_z."""
+
+    time_s: float
+    position_down_m: float
+    velocity_down_mps: float
+    thrust_down_mps2: float
+
+
+@dataclass(frozen=True, slots=True)
 class PredictedState:
     """The observer's state at `time_s`, vehicle time, when a command sent now takes effect.
 
     Shapes (3,), NED, SI. `thrust_direction_ned` is the third body axis b and
     `thrust_direction_rate_ned_ps` its derivative; acceleration = g e3 - T b - c v + d with
     `disturbance_ned_mps2` d and `thrust_mps2` T (after the thrust's lag).
+
+    Thrust acts sooner than tilt. A vertical loop closed on `time_s` would wait for the tilt and,
+    from a difference of about 0.1 s on, cycle; `heave` is the vertical motion at its own time.
     """
 
     time_s: float
@@ -47,6 +61,7 @@ class PredictedState:
     thrust_mps2: float
     disturbance_ned_mps2: Array
     rates_frd_radps: Array
+    heave: PredictedHeave | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.base import Command, PredictedState
+from offboard.control.base import Command, PredictedHeave, PredictedState
 from offboard.control.filtering import correct, correct_position, correct_velocity, spread
 from offboard.control.observer_model import (
     HEADING,
@@ -186,14 +186,8 @@ class Observer:
     def predict(self, time_s: float) -> PredictedState:
         """The state at `time_s` + tilt delay, when the tilt of a command sent at `time_s` begins
         to act, replaying the commands sent. Meaningful once `ready`."""
-        state = self._state.copy()
         until_s = time_s + self._vehicle.tilt.delay_s
-        ahead_s = min(max(until_s - self._time_s, 0.0), LONGEST_GAP_S)
-        if self._frozen:
-            state[POSITION : POSITION + 3] += ahead_s * state[VELOCITY : VELOCITY + 3]
-        else:
-            start_s = self._time_s
-            advance(state, start_s, start_s + ahead_s, self._history, self._sent, self._plant)
+        state = self._state_at(until_s)
         north, east = state[TILT], state[TILT + 1]
         down = upright(north, east)
         rate_n, rate_e = state[TILT_RATE], state[TILT_RATE + 1]
@@ -210,6 +204,27 @@ class Observer:
             thrust_mps2=float(state[THRUST]),
             disturbance_ned_mps2=state[DISTURBANCE : DISTURBANCE + 3],
             rates_frd_radps=self._rates.copy(),
+            heave=self._heave(time_s + self._vehicle.thrust_delay_s),
+        )
+
+    def _state_at(self, time_s: float) -> Array:
+        """A copy of the state, replayed forward to `time_s`."""
+        state = self._state.copy()
+        ahead_s = min(max(time_s - self._time_s, 0.0), LONGEST_GAP_S)
+        if self._frozen:
+            state[POSITION : POSITION + 3] += ahead_s * state[VELOCITY : VELOCITY + 3]
+        else:
+            start_s = self._time_s
+            advance(state, start_s, start_s + ahead_s, self._history, self._sent, self._plant)
+        return state
+
+    def _heave(self, time_s: float) -> PredictedHeave:
+        state = self._state_at(time_s)
+        return PredictedHeave(
+            time_s=time_s,
+            position_down_m=float(state[POSITION + 2]),
+            velocity_down_mps=float(state[VELOCITY + 2]),
+            thrust_down_mps2=float(state[THRUST] * upright(state[TILT], state[TILT + 1])),
         )
 
     @staticmethod

@@ -17,7 +17,14 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from offboard.control.base import Certificate, Command, Decision, PredictedState, Situation
+from offboard.control.base import (
+    Certificate,
+    Command,
+    Decision,
+    PredictedHeave,
+    PredictedState,
+    Situation,
+)
 from offboard.control.certificate import ExactMinimum, at_bound, certify
 from offboard.control.cost import BoxQuadratic
 from offboard.control.response import lateral_cost_to_go, lead, vertical_cost_to_go
@@ -63,18 +70,21 @@ class TrackingSettings(Parameters):
 class Target:
     """What the reference asks when the command acts, NED, SI.
 
-    position_ned_m, velocity_ned_mps, direction, direction_rate (3,) and vertical_thrust_mps2 (the
-    part T b_z) at the predicted time; the feed-forward tilt (2,), vertical thrust and course each
-    half a decision after its own delay, led through its own response.
+    Lateral at the predicted time: position_ne_m, velocity_ne_mps, direction_ne and
+    direction_rate_ne_ps, each (2,). Vertical when the thrust acts: position_down_m,
+    velocity_down_mps, thrust_down_mps2 (the part T b_z). Feed-forward: tilt (2,), vertical thrust
+    and course, each half a decision after its own delay and led through its own response.
     """
 
-    position_ned_m: Array
-    velocity_ned_mps: Array
-    direction_ned: Array
-    direction_rate_ned_ps: Array
-    vertical_thrust_mps2: float
+    position_ne_m: Array
+    velocity_ne_mps: Array
+    direction_ne: Array
+    direction_rate_ne_ps: Array
+    position_down_m: float
+    velocity_down_mps: float
+    thrust_down_mps2: float
     tilt_feedforward: Array
-    vertical_feedforward_mps2: float
+    thrust_down_feedforward_mps2: float
     course_feedforward_rad: float
 
 
@@ -127,53 +137,42 @@ class TrackingLaw:
         """What to be and what to ask, for a decision at `time_s` with the state predicted to
         `state.time_s`, when its tilt begins to act. The disturbance is part of both."""
         vehicle, half_s = self._vehicle, 0.5 * self._settings.period_s
-        sample = reference.sample(
-            np.array(
-                [
-                    state.time_s,
-                    state.time_s + half_s,
-                    time_s + vehicle.thrust_delay_s + half_s,
-                    time_s + vehicle.yaw.delay_s + half_s,
-                ]
-            )
-        )
+        heave_s = heave_of(state).time_s
+        course_s = time_s + vehicle.yaw.delay_s + half_s
+        times = [state.time_s, state.time_s + half_s, heave_s, heave_s + half_s, course_s]
+        sample = reference.sample(np.array(times))
         flat = flat_state(
             sample, vehicle.gravity_mps2, vehicle.drag_per_mass_ps, state.disturbance_ned_mps2
         )
         b, b1 = flat.thrust_direction_ned, flat.thrust_direction_rate_ned_ps
         b2 = flat.thrust_direction_acceleration_ned_ps2
-        vertical = flat.thrust_mps2 * b[:, 2]
-        vertical_rate = flat.thrust_rate_mps3[2] * b[2, 2] + flat.thrust_mps2[2] * b1[2, 2]
+        thrust_down = flat.thrust_mps2 * b[:, 2]
+        led_thrust = flat.thrust_mps2[3] + vehicle.thrust_lag_s * flat.thrust_rate_mps3[3]
         course = lead(
-            sample.course_rad[3],
-            sample.course_rate_radps[3],
-            sample.course_acceleration_radps2[3],
+            sample.course_rad[4],
+            sample.course_rate_radps[4],
+            sample.course_acceleration_radps2[4],
             vehicle.yaw,
         )
         return Target(
-            position_ned_m=sample.position_ned_m[0],
-            velocity_ned_mps=sample.velocity_ned_mps[0],
-            direction_ned=b[0],
-            direction_rate_ned_ps=b1[0],
-            vertical_thrust_mps2=float(vertical[0]),
+            position_ne_m=sample.position_ned_m[0, :2],
+            velocity_ne_mps=sample.velocity_ned_mps[0, :2],
+            direction_ne=b[0, :2],
+            direction_rate_ne_ps=b1[0, :2],
+            position_down_m=float(sample.position_ned_m[2, 2]),
+            velocity_down_mps=float(sample.velocity_ned_mps[2, 2]),
+            thrust_down_mps2=float(thrust_down[2]),
             tilt_feedforward=lead(b[1, :2], b1[1, :2], b2[1, :2], vehicle.tilt),
-            vertical_feedforward_mps2=float(vertical[2] + vehicle.thrust_lag_s * vertical_rate),
+            thrust_down_feedforward_mps2=float(led_thrust * b[3, 2]),  # T lags, not T b_z
             course_feedforward_rad=float(course),
         )
 
     def problem(self, state: PredictedState, target: Target) -> BoxQuadratic:
         """J(u) of u = [T (m/s^2), b_cx, b_cy, course (rad)] and its box."""
-        off_position = state.position_ned_m - target.position_ned_m
-        off_velocity = state.velocity_ned_mps - target.velocity_ned_mps
-        off_direction = state.thrust_direction_ned - target.direction_ned
-        off_rate = state.thrust_direction_rate_ned_ps - target.direction_rate_ned_ps
+        lateral, vertical = errors(state, target)
         upright = float(state.thrust_direction_ned[2])
-        off_thrust = state.thrust_mps2 * upright - target.vertical_thrust_mps2
-        lateral = np.stack([off_position, off_velocity, off_direction, off_rate])[:, :2]
-        vertical = np.array([off_position[2], off_velocity[2], off_thrust])
-
         nominal = np.empty(4)
-        nominal[0] = target.vertical_feedforward_mps2 / upright
+        nominal[0] = target.thrust_down_feedforward_mps2 / upright
         nominal[1:3] = target.tilt_feedforward
         nominal[3] = target.course_feedforward_rad
         curvature = np.empty(4)
@@ -231,6 +230,35 @@ class _Rest:
         scalars = np.zeros(np.shape(time_s))
         vectors = np.zeros((*scalars.shape, 3))
         return FlatSample(vectors, vectors, vectors, vectors, vectors, scalars, scalars, scalars)
+
+
+def errors(state: PredictedState, target: Target) -> tuple[Array, Array]:
+    """Deviations from the target: lateral [p, v, b, b'] x [north, east] (4, 2) and vertical
+    [z, v_z, T b_z] (3,)."""
+    lateral = np.empty((4, 2))
+    lateral[0] = state.position_ned_m[:2] - target.position_ne_m
+    lateral[1] = state.velocity_ned_mps[:2] - target.velocity_ne_mps
+    lateral[2] = state.thrust_direction_ned[:2] - target.direction_ne
+    lateral[3] = state.thrust_direction_rate_ned_ps[:2] - target.direction_rate_ne_ps
+    heave = heave_of(state)
+    vertical = np.array(
+        [
+            heave.position_down_m - target.position_down_m,
+            heave.velocity_down_mps - target.velocity_down_mps,
+            heave.thrust_down_mps2 - target.thrust_down_mps2,
+        ]
+    )
+    return lateral, vertical
+
+
+def heave_of(state: PredictedState) -> PredictedHeave:
+    """The vertical motion when the thrust acts; with the tilt, where nothing else was predicted."""
+    return state.heave or PredictedHeave(
+        time_s=state.time_s,
+        position_down_m=float(state.position_ned_m[2]),
+        velocity_down_mps=float(state.velocity_ned_mps[2]),
+        thrust_down_mps2=float(state.thrust_mps2 * state.thrust_direction_ned[2]),
+    )
 
 
 def closed_form(problem: BoxQuadratic) -> Array:

@@ -194,6 +194,7 @@ class Flight:
     rate_sd_radps: float
     observer: Observer
     at_bound: float
+    end_s: float
 
 
 def fly(
@@ -244,4 +245,5 @@ def fly(
         rate_sd_radps=float(np.std(np.array(rates)[:, 0])),
         observer=observer,
         at_bound=float(np.mean(bounds)),
+        end_s=now,
     )

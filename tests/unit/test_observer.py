@@ -176,6 +176,24 @@ def test_a_command_shows_in_the_prediction_only_after_its_delay() -> None:
     assert later.thrust_direction_ned[0] == pytest.approx(expected, rel=0.3)
 
 
+def test_the_vertical_is_predicted_to_when_the_thrust_acts() -> None:
+    """Falling at 2 m/s with thrust delay 15 ms, tilt delay 57 ms: two times, two heights."""
+    observer = Observer(PX4, ObserverSettings())
+    thrust = G - 1.02 * 2.0
+    observer.on_command(0.0, command(0.0, 0.0, thrust))
+    for i in range(301):
+        observer.on_attitude(0.01 * i, UPRIGHT, STILL)
+        observer.on_position(0.01 * i, (0.0, 0.0, 0.02 * i), (0.0, 0.0, 2.0))
+    state = observer.predict(3.0)
+    assert state.time_s == pytest.approx(3.057)
+    assert state.position_ned_m[2] == pytest.approx(6.114, abs=1e-3)
+    assert state.heave is not None
+    assert state.heave.time_s == pytest.approx(3.015)
+    assert state.heave.position_down_m == pytest.approx(6.03, abs=1e-3)
+    assert state.heave.velocity_down_mps == pytest.approx(2.0, abs=5e-3)
+    assert state.heave.thrust_down_mps2 == pytest.approx(thrust, abs=1e-6)
+
+
 # ---------------------------------------------------------------- what is learned
 
 
