@@ -164,10 +164,12 @@ def test_white_estimator_has_the_configured_noise_and_nothing_else():
 
 def test_standing_vehicle_has_a_quiet_estimate():
     plant = Plant(load("px4_sih"), Conditions(estimator="px4_like"), 3)
-    drift = []
+    drift, rates = [], []
     for _ in range(600):
         plant.advance(0.1, Demand(False))
         drift.append(plant.estimate.position_ned_m)
+        rates.append(plant.estimate.rates_frd_radps)
+    assert np.std(rates, axis=0) == pytest.approx((0.007, 0.0035, 0.0014), rel=0.1)
     assert plant.truth.position_ned_m == pytest.approx([0.0] * 3, abs=1e-12)
     assert 1e-4 < np.abs(drift).max() < 0.25
 
