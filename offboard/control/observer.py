@@ -145,7 +145,7 @@ class Observer:
         first = self._attitude_at is None or self._frozen
         self._advance(time_s)
         self._attitude_at = time_s
-        self._rates = np.array(rates)
+        self._rates = np.array(rates, dtype=np.float64)
         state = self._state
         if first:  # taken as it is
             state[TILT : TILT + 2] = direction[:2]
@@ -171,7 +171,8 @@ class Observer:
         self._advance(time_s)
         self._position_at = time_s
         state = self._state
-        position, velocity = np.array(position_ned_m), np.array(velocity_ned_mps)
+        position = np.array(position_ned_m, dtype=np.float64)
+        velocity = np.array(velocity_ned_mps, dtype=np.float64)
         if first or self._settings.velocity is VelocitySource.REPORTED:
             state[POSITION : POSITION + 3] = position
             state[VELOCITY : VELOCITY + 3] = velocity

@@ -140,11 +140,13 @@ class Plant:
 
 @dataclass
 class Lemniscate:
-    """2 sin wt north, 1 sin 2wt east, 3 m high; from rest over the first `run_in_s`."""
+    """2 sin wt north, 1 sin 2wt east, 3 m high, heaving with sin 3wt; from rest over the first
+    `run_in_s`."""
 
     period_s: float
     run_in_s: float = 4.0
     course_rad: float = 0.0
+    heave_m: float = 0.0
 
     @property
     def duration_s(self) -> float:
@@ -156,10 +158,11 @@ class Lemniscate:
         phase = _run_in(time, self.run_in_s)
         north = _composed(2.0, omega, phase)
         east = _composed(1.0, 2.0 * omega, phase)
+        down = _composed(self.heave_m, 3.0 * omega, phase)
+        down[0] = down[0] - 3.0
         derivatives = []
         for order in range(5):
-            down = np.full_like(time, -3.0 if order == 0 else 0.0)
-            derivatives.append(np.stack([north[order], east[order], down], axis=-1))
+            derivatives.append(np.stack([north[order], east[order], down[order]], axis=-1))
         zero = np.zeros_like(time)
         return FlatSample(*derivatives, zero + self.course_rad, zero, zero)
 

@@ -370,7 +370,7 @@ def test_a_long_silence_is_a_new_start_that_keeps_the_disturbance() -> None:
         lateral = 0.5 * 0.01 * i / 1.02  # a push of .5 at its terminal speed
         observer.on_position(0.01 * i, (lateral, 0.0, 0.0), (0.5 / 1.02, 0.0, 0.0))
     assert observer.ready
-    observer.on_position(9.0, (7.0, 7.0, -7.0), (1.0, 0.0, 0.0))
+    observer.on_position(9.0, (7, 7, -7), (1, 0, 0))  # whole numbers are numbers too
     assert not observer.ready
     observer.on_attitude(9.0, UPRIGHT, STILL)
     state = observer.predict(9.0)

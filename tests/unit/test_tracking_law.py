@@ -318,6 +318,8 @@ def test_without_noise_the_reference_is_flown_to_a_millimetre() -> None:
     silent = Truth(PX4, noisy=False)
     assert flight(period_s=15.0, truth=silent).rmse_m < 0.0005
     assert flight(period_s=8.0, truth=silent).rmse_m < 0.0011
+    heaving = Lemniscate(8.0, heave_m=0.3)
+    assert flight(period_s=8.0, truth=silent, reference=heaving).rmse_m < 0.002
 
 
 @pytest.mark.parametrize(
