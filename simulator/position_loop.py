@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from offboard.model.frames import quaternion_from_thrust_direction, wrap_pi
+from offboard.model.frames import wrap_pi
 from simulator.firmware.base import NAN3, MotionSetpoint, PositionGains, Quaternion, Triple
 
 GRAVITY_MPS2 = 9.80665
@@ -141,5 +141,22 @@ class PositionLoop:
         thrust = _clamp(
             vertical / max(direction[2], _TILT_LIMIT_OF_THRUST), _THRUST_MIN, _THRUST_MAX
         )
-        w, x, y, z = quaternion_from_thrust_direction(direction, self.yaw_rad).tolist()
-        return (w, x, y, z), thrust
+        return _facing(direction, self.yaw_rad), thrust
+
+
+def _facing(direction: Triple, yaw_rad: float) -> Quaternion:
+    """Attitude with the third body axis along `direction` (unit, NED) and Euler yaw `yaw_rad`."""
+    cos_yaw, sin_yaw = math.cos(yaw_rad), math.sin(yaw_rad)
+    ahead = cos_yaw * direction[0] + sin_yaw * direction[1]
+    aside = cos_yaw * direction[1] - sin_yaw * direction[0]
+    half_roll = 0.5 * math.asin(_clamp(-aside, -1.0, 1.0))
+    half_pitch = 0.5 * math.atan2(ahead, direction[2])
+    sr, cr = math.sin(half_roll), math.cos(half_roll)
+    sp, cp = math.sin(half_pitch), math.cos(half_pitch)
+    sy, cy = math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )

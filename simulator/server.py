@@ -24,6 +24,7 @@ MAV_TYPE_GCS = 6
 TEXT_LENGTH = 50
 DATAGRAM_MAX = 1400
 PARAMETERS_PER_STEP = 4
+INTERVAL_MAX_US = 2.0**31 - 1  # MESSAGE_INTERVAL.interval_us is an int32
 _FTP_NAK, _FTP_ERROR_NOT_FOUND = 128 + 1, 10
 
 
@@ -143,7 +144,7 @@ class Server:
         if interval_us < 0:
             self._streams.pop(name, None)
             return True
-        stream = Stream(max(1, round(interval_us)), 0)
+        stream = Stream(round(min(INTERVAL_MAX_US, max(1.0, interval_us))), 0)
         stream.due_us = _next_multiple(self.view.time_us, stream)
         self._streams[name] = stream
         self._next_us = 0

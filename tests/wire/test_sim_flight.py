@@ -170,9 +170,7 @@ def test_hold_by_position_setpoints_is_as_good_as_the_estimate(estimator: Estima
     bench.run(12.0, lambda: bench.position(0, 0, -5))
     begun_s = bench.time_s
     bench.run(60.0, lambda: bench.position(0, 0, -5))
-    squares = [
-        m.x**2 + m.y**2 + (m.z + 5) ** 2 for _, m in bench.of("LOCAL_POSITION_NED", begun_s)
-    ]
+    squares = [m.x**2 + m.y**2 + (m.z + 5) ** 2 for _, m in bench.of("LOCAL_POSITION_NED", begun_s)]
     rms_m = math.sqrt(sum(squares) / len(squares))
     if estimator is EstimatorName.PERFECT:
         assert rms_m < 0.02
@@ -281,7 +279,7 @@ def scripted_bytes(seed: int) -> bytes:
 
 def test_the_same_seed_gives_the_same_bytes() -> None:
     first, second, other = scripted_bytes(5), scripted_bytes(5), scripted_bytes(6)
-    assert len(first) > 300_000
+    assert len(first) > 200_000
     assert first == second
     assert first != other
 

@@ -1,0 +1,147 @@
+"""A companion over UDP for tests of the simulator's process: pymavlink and a socket, no more."""
+
+from __future__ import annotations
+
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+from pymavlink.dialects.v20 import common as mavlink
+
+HOVER = 0.4895
+OFFBOARD = 0x00060000
+STOP_S = 5.0
+
+
+class Process:
+    """`python -m simulator` with what it said, stopped when the block ends however it ends."""
+
+    def __init__(self, *options: str) -> None:
+        self.popen = subprocess.Popen(
+            [sys.executable, "-m", "simulator", *options],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def ready_line(self) -> str:
+        """Its first line, printed when it is about to send."""
+        assert self.popen.stdout is not None
+        return self.popen.stdout.readline().strip()
+
+    def finish(self, timeout_s: float) -> tuple[int, str]:
+        """Wait for its own end; exit code and stderr."""
+        _, errors = self.popen.communicate(timeout=timeout_s)
+        return self.popen.returncode, errors
+
+    def stop(self) -> float:
+        """SIGTERM; seconds until it was gone."""
+        begun_s = time.monotonic()
+        self.popen.terminate()
+        self.popen.wait(STOP_S)
+        return time.monotonic() - begun_s
+
+
+@contextmanager
+def simulator(*options: str) -> Iterator[Process]:
+    process = Process(*options)
+    try:
+        yield process
+    finally:
+        if process.popen.poll() is None:
+            process.popen.kill()
+        process.popen.communicate()
+
+
+class Peer:
+    """A bound UDP socket that answers TIMESYNC and remembers what it heard."""
+
+    def __init__(self) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.bind(("127.0.0.1", 0))
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4 << 20)
+        self.port = self._socket.getsockname()[1]
+        self.codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
+        self.vehicle: tuple[str, int] | None = None
+        self.time_s = 0.0  # vehicle time of the newest position
+        self.received: list[tuple[float, Any]] = []
+        self.raw = bytearray()
+        self.answers_timesync = True
+        self._parser = mavlink.MAVLink(None)
+
+    def __enter__(self) -> Peer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._socket.close()
+
+    def send(self, message: Any) -> None:
+        assert self.vehicle is not None
+        self._socket.sendto(message.pack(self.codec), self.vehicle)
+
+    def listen(
+        self,
+        until: Callable[[], bool],
+        *,
+        each: Callable[[], None] | None = None,
+        period_s: float = 0.05,
+        wall_s: float = 30.0,
+    ) -> None:
+        """Receive until `until`; `each` is called every `period_s` of vehicle time."""
+        deadline_s = time.monotonic() + wall_s
+        next_s = self.time_s
+        while not until():
+            remaining_s = deadline_s - time.monotonic()
+            assert remaining_s > 0, f"not reached within {wall_s} s of wall time"
+            self._socket.settimeout(remaining_s)
+            datagram, self.vehicle = self._socket.recvfrom(65535)
+            self.raw += datagram
+            for message in self._parser.parse_buffer(datagram) or []:
+                if message.get_type() == "LOCAL_POSITION_NED":
+                    self.time_s = message.time_boot_ms / 1000.0
+                    if each is not None and self.time_s >= next_s:
+                        each()
+                        next_s += period_s
+                self.received.append((self.time_s, message))
+                if message.get_type() == "TIMESYNC" and message.tc1 == 0 and self.answers_timesync:
+                    self.send(mavlink.MAVLink_timesync_message(1, message.ts1))
+
+    def of(self, kind: str) -> list[Any]:
+        return [message for _, message in self.received if message.get_type() == kind]
+
+    @property
+    def texts(self) -> list[str]:
+        return [message.text.rstrip("\t") for message in self.of("STATUSTEXT")]
+
+    def heartbeat(self) -> None:
+        self.send(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
+
+    def command(self, number: int, *params: float) -> None:
+        filled = (*params, *(0.0,) * (7 - len(params)))
+        self.send(mavlink.MAVLink_command_long_message(1, 1, number, 0, *filled))
+
+    def attitude(self, thrust: float) -> None:
+        self.send(
+            mavlink.MAVLink_set_attitude_target_message(
+                0, 1, 1, 7, (1.0, 0.0, 0.0, 0.0), 0, 0, 0, thrust
+            )
+        )
+
+    def fly(self) -> None:
+        """Boot, engage, arm, climb and hover by attitude setpoints, then land and disarm."""
+        self.listen(lambda: self.vehicle is not None)
+        self.heartbeat()
+        self.listen(lambda: self.time_s > 4.2)
+        start_s = self.time_s
+        self.listen(lambda: self.time_s > start_s + 0.6, each=lambda: self.attitude(HOVER))
+        self.command(176, 1, 6)
+        self.command(400, 1)
+        self.listen(lambda: self.time_s > start_s + 2.0, each=lambda: self.attitude(1.15 * HOVER))
+        self.listen(lambda: self.time_s > start_s + 3.0, each=lambda: self.attitude(HOVER))
+        self.command(21)
+        self.listen(lambda: "Disarmed by landing" in self.texts)

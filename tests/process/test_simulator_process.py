@@ -1,0 +1,195 @@
+"""The `simulator` process: real UDP, real time and lockstep, start, stop and wrong options."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import time
+from pathlib import Path
+
+import pytest
+from sim_peer import OFFBOARD, Peer, simulator
+
+QUIET = ("--gcs", "none")
+FLIGHT_TEXTS = [
+    "Armed by external command",
+    "Takeoff detected",
+    "Landing at current position",
+    "Landing detected",
+    "Disarmed by landing",
+]
+
+
+def to(peer: Peer) -> tuple[str, str]:
+    return "--connect", f"udpout:127.0.0.1:{peer.port}"
+
+
+def test_a_flight_in_real_time() -> None:
+    with Peer() as peer, simulator(*to(peer), *QUIET, "--scenario", "calm") as process:
+        peer.listen(lambda: peer.time_s > 0.5)
+        begun = time.monotonic(), peer.time_s
+        peer.fly()
+        ratio = (peer.time_s - begun[1]) / (time.monotonic() - begun[0])
+        assert process.stop() < 0.5
+    assert peer.texts == FLIGHT_TEXTS
+    assert 0.95 < ratio < 1.05
+    assert [m.result for m in peer.of("COMMAND_ACK")] == [0, 0, 0, 0]
+    assert OFFBOARD in {m.custom_mode for m in peer.of("HEARTBEAT")}
+
+
+def test_speed() -> None:
+    with Peer() as peer, simulator(*to(peer), *QUIET, "--speed", "5") as process:
+        peer.listen(lambda: peer.time_s > 1.0)
+        begun = time.monotonic(), peer.time_s
+        peer.listen(lambda: peer.time_s > begun[1] + 10.0)
+        ratio = (peer.time_s - begun[1]) / (time.monotonic() - begun[0])
+        assert process.popen.poll() is None
+    assert 4.5 < ratio < 5.5
+
+
+def lockstep_bytes(seed: str) -> bytes:
+    with Peer() as peer, simulator(*to(peer), *QUIET, "--lockstep", "--seed", seed) as process:
+        peer.fly()
+        assert process.popen.poll() is None
+    assert peer.texts == FLIGHT_TEXTS
+    return bytes(peer.raw)
+
+
+def test_lockstep_flights_with_one_seed_are_byte_identical() -> None:
+    first, second, other = (lockstep_bytes(seed) for seed in ("3", "3", "4"))
+    assert len(first) > 100_000
+    assert first == second
+    assert first != other
+
+
+def test_lockstep_waits_for_a_slow_companion() -> None:
+    """Virtual time stands still while nobody answers; what comes before the answer counts."""
+    with Peer() as peer, simulator(*to(peer), *QUIET, "--lockstep", "--patience", "20"):
+        peer.listen(lambda: peer.time_s > 1.0)
+        peer.answers_timesync = False
+        known = peer.time_s
+        peer.listen(lambda: peer.of("TIMESYNC")[-1].ts1 > known * 1e9)
+        stamp_ns = peer.of("TIMESYNC")[-1].ts1
+        count = len(peer.received)
+        time.sleep(0.3)
+        peer.answers_timesync = True
+        peer.listen(lambda: len(peer.received) > count + 50)  # it asks again after a second
+        later = [m.ts1 for _, m in peer.received[count:] if m.get_type() == "TIMESYNC"]
+    assert later[0] == stamp_ns
+    assert 16_000_000 <= later[1] - stamp_ns <= 24_000_000
+
+
+def test_before_the_companion_is_heard_the_same_datagrams_are_repeated() -> None:
+    with Peer() as peer, simulator(*to(peer), *QUIET, "--lockstep"):
+        peer.answers_timesync = False
+        peer.listen(lambda: len(peer.of("TIMESYNC")) >= 6)
+    stamps = {m.ts1 for m in peer.of("TIMESYNC")}
+    sequences = {m.get_seq() for m in peer.of("HEARTBEAT")}
+    assert len(stamps) == len(sequences) == 1
+
+
+def test_a_companion_that_falls_silent_in_flight_is_noticed() -> None:
+    options = (*QUIET, "--lockstep", "--patience", "0.5", "--scenario", "calm")
+    with Peer() as peer, simulator(*to(peer), *options) as process:
+        peer.listen(lambda: peer.vehicle is not None)
+        peer.heartbeat()
+        peer.listen(lambda: peer.time_s > 4.2)
+        peer.command(400, 1)
+        peer.command(22, *(float("nan"),) * 7)
+        peer.listen(lambda: peer.time_s > 12.0)
+        peer.attitude(0.49)
+        peer.command(176, 1, 6)
+        peer.listen(lambda: peer.time_s > 12.5)
+        peer.answers_timesync = False
+        code, errors = process.finish(20.0)
+    assert code == 3
+    assert "fell silent at 12." in errors
+    assert "landed and disarmed" in errors
+    assert "Traceback" not in errors
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+@pytest.mark.parametrize("options", [(), ("--lockstep",)], ids=["real time", "lockstep"])
+def test_signals_stop_it_cleanly(number: int, options: tuple[str, ...]) -> None:
+    with Peer() as peer, simulator(*to(peer), *QUIET, *options) as process:
+        assert process.ready_line() == (
+            "px4 vehicle px4_sih, system 1, scenario px4_like, seed 7:"
+            f" sending to 127.0.0.1:{peer.port}"
+        )
+        peer.listen(lambda: len(peer.received) > 3)
+        begun_s = time.monotonic()
+        os.kill(process.popen.pid, number)
+        code, errors = process.finish(5.0)
+    assert time.monotonic() - begun_s < 0.5
+    assert (code, errors) == (0, "")
+
+
+def test_duration_ends_it() -> None:
+    with (
+        Peer() as peer,
+        simulator(*to(peer), *QUIET, "--duration", "2", "--speed", "20") as process,
+    ):
+        assert process.finish(20.0) == (0, "")
+
+
+def test_nobody_at_the_other_end_is_no_trouble() -> None:
+    with simulator("--connect", "udpout:127.0.0.1:9", *QUIET, "--duration", "1") as process:
+        assert process.finish(20.0) == (0, "")
+
+
+def test_it_can_wait_to_be_spoken_to_and_shifts_its_system() -> None:
+    with Peer() as peer:
+        free = Peer()
+        port = free.port
+        free.__exit__()
+        options = ("--connect", f"udpin:127.0.0.1:{port}", "--instance", "6")
+        with simulator(*options, *QUIET) as process:
+            assert process.ready_line().endswith(f"waiting at 127.0.0.1:{port}")
+            peer.vehicle = ("127.0.0.1", port)
+            peer.heartbeat()
+            peer.listen(lambda: len(peer.of("HEARTBEAT")) > 0)
+    assert peer.of("HEARTBEAT")[0].get_srcSystem() == 7
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        (("--scenario", "storm"), "scenario storm not found: give a file or one of calm, "),
+        (("--vehicle", "no/such.yaml"), "vehicle no/such.yaml not found"),
+        (("--firmware", "betaflight"), "--firmware betaflight: unknown; there is px4"),
+        (("--connect", "tcp:127.0.0.1:1"), "tcp:127.0.0.1:1 is no link"),
+        (("--connect", "udpout:127.0.0.1:99999"), "is no link"),
+        (("--speed", "0"), "--speed 0: must be 0.1 .. 1000"),
+        (("--speed", "nan"), "--speed nan: must be 0.1 .. 1000"),
+        (("--speed", "2", "--lockstep"), "exclude each other"),
+        (("--seed", "-1"), "--seed"),
+        (("--no-such-option",), "--no-such-option"),
+    ],
+)
+def test_wrong_options_are_refused(options: tuple[str, ...], says: str) -> None:
+    with simulator(*QUIET, *options) as process:
+        code, errors = process.finish(20.0)
+    assert code == 2
+    assert says in errors
+    assert "Traceback" not in errors
+
+
+def test_a_port_in_use_is_refused() -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
+        taken.bind(("127.0.0.1", 0))
+        port = taken.getsockname()[1]
+        with simulator("--connect", f"udpin:127.0.0.1:{port}", *QUIET) as process:
+            code, errors = process.finish(20.0)
+    assert code == 2
+    assert errors == f"udpin:127.0.0.1:{port} cannot be opened: Address already in use\n"
+
+
+def test_a_wrong_scenario_file_names_key_and_range(tmp_path: Path) -> None:
+    path = tmp_path / "windy.yaml"
+    path.write_text("name: windy\nconditions: {mass_scale: 50, wnd: 3}\n")
+    with simulator("--scenario", str(path), *QUIET) as process:
+        code, errors = process.finish(20.0)
+    assert code == 2
+    assert "conditions.mass_scale" in errors
+    assert "conditions.wnd" in errors

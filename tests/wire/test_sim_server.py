@@ -1,0 +1,324 @@
+"""The simulated vehicle's link: rates, requests, texts, parameters, truth, hostile input."""
+
+from __future__ import annotations
+
+import itertools
+import math
+import random
+import struct
+from collections import Counter
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+from sim_bench import LOITER, NAN, OFFBOARD, Bench
+
+from simulator.firmware.px4 import COMPANION_RATES_HZ, GROUND_RATES_HZ, PX4
+from simulator.sensors import EstimatorName
+from simulator.server import DATAGRAM_MAX
+
+LOCAL_POSITION, ATTITUDE, HIL_STATE = 32, 30, 115
+
+
+def read(datagrams: list[bytes]) -> list[object]:
+    parser = mavlink.MAVLink(None)
+    return [m for datagram in datagrams for m in parser.parse_buffer(datagram) or []]
+
+
+# -- rates -----------------------------------------------------------------------------------
+
+
+def test_default_rates_are_px4s() -> None:
+    bench = Bench()
+    bench.run(20.0)
+    counts = Counter(m.get_type() for _, m in bench.received)
+    assert {name: counts[name] / 20.0 for name in COMPANION_RATES_HZ} == {
+        name: pytest.approx(rate, abs=0.1) for name, rate in COMPANION_RATES_HZ.items()
+    }
+
+
+def test_the_ground_link_has_rates_and_a_sequence_of_its_own() -> None:
+    bench = Bench()
+    companion, ground = [], []
+    for _ in range(2500):
+        bench.instance.advance()
+        companion += bench.instance.companion.drain()
+        ground += bench.instance.ground.drain()
+    heard = read(ground)
+    counts = Counter(m.get_type() for m in heard)
+    assert {name: counts[name] / 10.0 for name in GROUND_RATES_HZ} == {
+        name: pytest.approx(rate, abs=0.2) for name, rate in GROUND_RATES_HZ.items()
+    }
+    for messages in (heard, read(companion)):
+        sequence = [m.get_seq() for m in messages]
+        assert sequence == [i % 256 for i in range(len(sequence))]
+
+
+def test_a_hundred_hertz_come_in_gaps_of_8_and_16_ms() -> None:
+    bench = Bench()
+    assert bench.command(511, LOCAL_POSITION, 10_000) == [0]
+    begun_s = bench.time_s
+    bench.run(4.0)
+    stamps = [m.time_boot_ms for _, m in bench.of("LOCAL_POSITION_NED", begun_s)]
+    gaps = Counter(b - a for a, b in itertools.pairwise(stamps))
+    assert set(gaps) == {8, 16}
+    assert gaps[8] / gaps[16] == pytest.approx(3.0, rel=0.05)
+    assert len(stamps) == pytest.approx(400, abs=2)
+
+
+def test_stamps_are_the_time_of_the_step() -> None:
+    bench = Bench()
+    bench.run(3.0)
+    for kind in ("ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED"):
+        assert all(m.time_boot_ms == round(at_s * 1000) for at_s, m in bench.of(kind))
+
+
+@pytest.mark.parametrize("number", [0, 27, 65000, -1, NAN])
+def test_intervals_that_cannot_be_set_fail(number: float) -> None:
+    """HEARTBEAT, RAW_IMU, unknown and senseless ids."""
+    assert Bench().command(511, number, 20_000) == [4]
+
+
+def test_an_interval_can_be_stopped_restored_and_asked_for() -> None:
+    bench = Bench()
+    for interval_us, shown_us, expected in (
+        (20_000, 20_000, 50),
+        (-1, -1, 0),
+        (0, 33_333, 30),
+        (3e38, 2**31 - 1, 0),
+    ):
+        bench.command(511, LOCAL_POSITION, interval_us)
+        begun_s = bench.time_s
+        bench.run(2.0)
+        heard = len(bench.of("LOCAL_POSITION_NED", begun_s)) / 2.0
+        assert heard == pytest.approx(expected, abs=1)
+        assert bench.command(510, LOCAL_POSITION) == [0]
+        assert bench.of("MESSAGE_INTERVAL")[-1][1].interval_us == shown_us
+
+
+@pytest.mark.parametrize(
+    ("number", "kind"),
+    [(242, "HOME_POSITION"), (148, "AUTOPILOT_VERSION"), (115, "HIL_STATE_QUATERNION")],
+)
+def test_messages_on_request(number: int, kind: str) -> None:
+    bench = Bench()
+    bench.run(1.0)
+    begun_s = bench.time_s
+    assert bench.command(512, number, *(NAN,) * 6) == [0]
+    assert len(bench.of(kind, begun_s)) >= 1
+
+
+@pytest.mark.parametrize("number", [27, 65000, NAN, -5])
+def test_unknown_requests_are_denied(number: float) -> None:
+    assert Bench().command(512, number) == [2]
+
+
+def test_datagrams_hold_whole_frames_and_fit() -> None:
+    bench = Bench()
+    bench.send(mavlink.MAVLink_param_request_list_message(1, 1))
+    sizes = []
+    for _ in range(1000):
+        for datagram in bench.instance.step():
+            sizes.append(len(datagram))
+            parser = mavlink.MAVLink(None)
+            messages = parser.parse_buffer(datagram)
+            assert sum(len(m.get_msgbuf()) for m in messages) == len(datagram)
+    assert max(sizes) <= DATAGRAM_MAX
+
+
+# -- texts -----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("kind", "heard"), [(6, True), (18, False), (None, False)])
+def test_texts_reach_ground_stations_only(kind: int | None, heard: bool) -> None:
+    bench = Bench(heartbeat_type=kind)
+    bench.boot()
+    bench.command(400, 1)
+    assert ("Armed by external command" in bench.texts()) is heard
+
+
+def test_long_texts_come_in_chunks_and_end_in_a_tab() -> None:
+    bench = Bench()
+    bench.run(1.0)
+    bench.command(400, 1)
+    chunks = [(m.chunk_seq, m.text, m.severity) for _, m in bench.of("STATUSTEXT")]
+    assert chunks == [
+        (0, "Arming denied: Resolve system health failures firs", 2),
+        (1, "t\t", 2),
+    ]
+
+
+# -- time, ping, files -----------------------------------------------------------------------
+
+
+def test_timesync_is_answered_with_the_vehicles_time() -> None:
+    bench = Bench()
+    bench.run(2.0)
+    bench.send(mavlink.MAVLink_timesync_message(0, 123456789))
+    bench.run(0.02)
+    answers = [m for _, m in bench.of("TIMESYNC") if m.tc1 != 0]
+    assert [(m.tc1, m.ts1) for m in answers] == [(2_000_000_000, 123456789)]
+
+
+def test_ping_is_answered() -> None:
+    bench = Bench()
+    bench.send(mavlink.MAVLink_ping_message(5, 77, 0, 0))
+    bench.run(0.02)
+    (answer,) = [m for _, m in bench.of("PING") if m.target_system == 1]
+    assert (answer.time_usec, answer.seq, answer.target_component) == (5, 77, 191)
+
+
+def test_file_transfer_is_refused() -> None:
+    bench = Bench()
+    request = struct.pack("<HBBBBBBI", 41, 3, 4, 2, 0, 0, 0, 0) + b"@PARAM/param.pck"
+    payload = list(request.ljust(251, b"\0"))
+    bench.send(mavlink.MAVLink_file_transfer_protocol_message(0, 1, 1, payload))
+    bench.run(0.02)
+    ((_, answer),) = bench.of("FILE_TRANSFER_PROTOCOL")
+    head = struct.unpack_from("<HBBBB", bytes(answer.payload))
+    assert head == (42, 3, 129, 1, 4)
+    assert answer.payload[12] == 10
+
+
+# -- parameters ------------------------------------------------------------------------------
+
+
+def parameter(bench: Bench, name: str) -> tuple[float, int]:
+    """Value (integers from their bytes) and type, as answered on the wire."""
+    bench.send(mavlink.MAVLink_param_request_read_message(1, 1, name.encode(), -1))
+    bench.run(0.02)
+    message = next(m for _, m in reversed(bench.of("PARAM_VALUE")) if m.param_id == name)
+    if message.param_type == 6:
+        return struct.unpack("<i", struct.pack("<f", message.param_value))[0], 6
+    return message.param_value, message.param_type
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "kind"),
+    [
+        ("MPC_THR_HOVER", 0.5, 9),
+        ("COM_OF_LOSS_T", 1.0, 9),
+        ("COM_OBL_RC_ACT", 0, 6),
+        ("COM_RC_IN_MODE", 1, 6),
+        ("NAV_DLL_ACT", 0, 6),
+        ("COM_RCL_EXCEPT", 0, 6),
+        ("MIS_TAKEOFF_ALT", 2.5, 9),
+    ],
+)
+def test_parameters_are_px4s(name: str, value: float, kind: int) -> None:
+    """Names, values and types as PX4 1.16.1 answers them."""
+    assert parameter(Bench(), name) == (value, kind)
+
+
+def test_parameters_are_listed_once_each() -> None:
+    bench = Bench()
+    bench.send(mavlink.MAVLink_param_request_list_message(1, 0))
+    bench.run(0.5)
+    listed = [(m.param_index, m.param_id, m.param_count) for _, m in bench.of("PARAM_VALUE")]
+    names = [spec.name for spec in PX4.parameters]
+    assert listed == [(i, name, len(names)) for i, name in enumerate(names)]
+
+
+def test_parameters_are_set_within_their_range() -> None:
+    bench = Bench()
+    for name, value, expected in (
+        ("COM_OF_LOSS_T", 2.5, 2.5),
+        ("COM_OF_LOSS_T", -1.0, 2.5),
+        ("COM_OF_LOSS_T", NAN, 2.5),
+    ):
+        bench.send(mavlink.MAVLink_param_set_message(1, 1, name.encode(), value, 9))
+        bench.run(0.02)
+        assert bench.of("PARAM_VALUE")[-1][1].param_value == expected
+    bytewise = struct.unpack("<f", struct.pack("<i", 4))[0]
+    bench.send(mavlink.MAVLink_param_set_message(1, 1, b"COM_OBL_RC_ACT", bytewise, 6))
+    assert parameter(bench, "COM_OBL_RC_ACT") == (4, 6)
+
+
+def test_an_unknown_parameter_is_not_answered() -> None:
+    bench = Bench()
+    bench.send(mavlink.MAVLink_param_request_read_message(1, 1, b"NO_SUCH", -1))
+    bench.send(mavlink.MAVLink_param_request_read_message(1, 1, b"", 999))
+    bench.send(mavlink.MAVLink_param_set_message(1, 1, b"NO_SUCH", 1.0, 9))
+    bench.run(0.1)
+    assert bench.of("PARAM_VALUE") == []
+
+
+# -- truth -----------------------------------------------------------------------------------
+
+
+def test_truth_is_sent_on_request() -> None:
+    bench = Bench(EstimatorName.PX4_LIKE, seed=4)
+    assert bench.command(511, HIL_STATE, 10_000) == [0]
+    bench.boot()
+    bench.run(0.6, bench.attitude)
+    bench.ask_mode(OFFBOARD)
+    bench.command(400, 1)
+    tilted = (math.cos(0.05), math.sin(0.05), 0.0, 0.0)
+    bench.run(3.0, lambda: bench.attitude(tilted, 0.56))
+    at_s, state = bench.of("HIL_STATE_QUATERNION")[-1]
+    bench.run_until(lambda: bench.instance.companion.view.time_ms % 40 == 0, 0.1)
+    bench.run(0.0)
+    at_s, state = bench.of("HIL_STATE_QUATERNION")[-1]
+    truth = bench.instance.autopilot.truth
+    assert state.time_usec == round(at_s * 1e6) == round(bench.time_s * 1e6)
+    latitude, longitude, amsl = PX4.origin
+    north = math.radians(state.lat * 1e-7 - latitude) * 6_371_000
+    east = math.radians(state.lon * 1e-7 - longitude) * 6_371_000 * math.cos(math.radians(latitude))
+    assert (north, east) == pytest.approx(truth.position_ned_m[:2], abs=0.012)
+    assert state.alt / 1e3 - amsl == pytest.approx(-truth.position_ned_m[2], abs=0.001)
+    assert state.vy / 100 == pytest.approx(truth.velocity_ned_mps[1], abs=0.006)
+    assert state.attitude_quaternion == pytest.approx(truth.attitude, abs=1e-6)
+    assert abs(east) > 1.0
+
+
+# -- hostile input ---------------------------------------------------------------------------
+
+
+def hostile_values(kind: type, rng: random.Random) -> list[object]:
+    values: list[object] = []
+    for index, field_type in zip(kind.orders, kind.fieldtypes, strict=True):
+        length = kind.array_lengths[index]
+        if field_type == "char":
+            values.append(bytes(rng.randrange(256) for _ in range(length)))
+        elif length:
+            values.append([hostile_number(field_type, rng) for _ in range(length)])
+        else:
+            values.append(hostile_number(field_type, rng))
+    return values
+
+
+def hostile_number(field_type: str, rng: random.Random) -> float | int:
+    if field_type in ("float", "double"):
+        return rng.choice([NAN, math.inf, -math.inf, 3.4e38, -3.4e38, 0.0, 1e-42, 1.0, 6.0])
+    bits = int("".join(c for c in field_type if c.isdigit()))
+    signed = not field_type.startswith("uint")
+    edge = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+    return rng.choice([*edge, 0, 1, 1, 1])
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_hostile_frames_and_then_a_normal_flight(seed: int) -> None:
+    rng = random.Random(seed)
+    bench = Bench()
+    bench.fly_offboard()
+    kinds = list(mavlink.mavlink_map.values())
+    favourites = [mavlink.mavlink_map[i] for i in (11, 20, 23, 75, 76, 82, 84, 110, 111)]
+    for count in range(1500):
+        kind = rng.choice(favourites if count % 2 else kinds)
+        raw = bytearray(kind(*hostile_values(kind, rng)).pack(bench.codec))
+        if count % 5 == 0:
+            raw[rng.randrange(len(raw))] ^= 1 << rng.randrange(8)
+        bench.instance.feed(bytes(raw))
+        if count % 10 == 0:
+            bench.run(0.02)
+    bench.command(21)
+    bench.run_until(lambda: bench.instance.autopilot.landed, 300.0)
+    bench.command(400, 0, 21196)
+    autopilot = bench.instance.autopilot
+    for spec in PX4.parameters:
+        autopilot.parameters.set(spec.name, spec.default)
+    assert bench.ask_mode(LOITER) == [0, 0]
+    assert bench.command(22, *(NAN,) * 7) == [0]
+    assert bench.command(400, 1) == [0]
+    bench.run_until(lambda: bench.mode == LOITER, 15.0)
+    assert bench.height_m > 1.5
+    assert all(math.isfinite(m.x) for _, m in bench.of("LOCAL_POSITION_NED"))
