@@ -11,6 +11,7 @@ from sim_hover import attitude, hovering, load
 
 from offboard.model.frames import thrust_direction_from_quaternion
 from simulator.plant import STEP_S, Conditions, Demand, Plant
+from simulator.sensors import ARDUPILOT_LIKE, PX4_LIKE, YAW, error_process
 
 FLIGHTS, SECONDS, RATE_HZ = 16, 60, 10
 
@@ -86,6 +87,15 @@ def _correlation_time_s(values: np.ndarray) -> np.ndarray:
 )
 def test_error_has_the_measured_standard_deviation(errors, estimator, quantity, measured, slack):
     assert _rms(errors[estimator][quantity]) == pytest.approx(measured, rel=slack)
+
+
+@pytest.mark.parametrize(("model", "sd_deg"), [(PX4_LIKE, 2.5), (ARDUPILOT_LIKE, 0.5)])
+def test_yaw_error_has_the_measured_stationary_statistics(model, sd_deg):
+    """Flights are too short to tell: its correlation time is 15 s."""
+    process = error_process(model, 1.5)
+    assert process.transition[YAW, YAW] == pytest.approx(math.exp(-0.1), rel=1e-9)
+    sd_rad = np.linalg.norm(process.stationary_scale[YAW])
+    assert math.degrees(sd_rad) == pytest.approx(sd_deg, rel=1e-6)
 
 
 @pytest.mark.parametrize(
