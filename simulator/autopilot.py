@@ -56,8 +56,9 @@ class Autopilot:
 
     @property
     def stream_alive(self) -> bool:
-        """A setpoint stream newer than the firmware's time-out."""
-        return self.time_s - self._setpoint_s <= self.parameters.role("stream_timeout_s")
+        """Not lost: the firmware notices a little later than its time-out."""
+        age_s = self.time_s - self._setpoint_s - self.firmware.stream_reaction_s
+        return age_s <= self.parameters.role("stream_timeout_s")
 
     @property
     def landed(self) -> bool:
@@ -79,9 +80,9 @@ class Autopilot:
 
     @property
     def base_mode(self) -> int:
-        """MAV_MODE_FLAG bits; a mode that waits for its stream shows only "custom mode"."""
-        if not self.armed and self.mode.behaviour is Behaviour.SETPOINT and not self.stream_alive:
-            return 1
+        """MAV_MODE_FLAG bits; a mode that never had a setpoint shows only "custom mode"."""
+        if self.mode.behaviour is Behaviour.SETPOINT and self.pilot.setpoint is None:
+            return 1 | (128 if self.armed else 0)
         return self.mode.base_mode | (128 if self.armed else 0)
 
     @property
@@ -157,10 +158,8 @@ class Autopilot:
     def _watch_stream(self) -> None:
         if self.failsafe and self.stream_alive:
             self.happen("stream found")
-        elif self.armed and self.mode.behaviour is Behaviour.SETPOINT:
-            age_s = self.time_s - self._setpoint_s - self.firmware.stream_reaction_s
-            if age_s > self.parameters.role("stream_timeout_s"):
-                self.happen("stream lost")
+        elif self.armed and self.mode.behaviour is Behaviour.SETPOINT and not self.stream_alive:
+            self.happen("stream lost")
 
     def _watch_flight(self, was_landed: bool) -> None:
         if was_landed and not self.landed:

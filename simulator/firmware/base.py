@@ -164,7 +164,7 @@ class Firmware:
     text_to_ground_stations_only: bool
     text_suffix: str
     healthy_after_s: float  # boot until the pre-arm checks pass
-    stream_reaction_s: float  # time-out of the stream until the failsafe acts
+    stream_reaction_s: float  # from the stream's time-out until it counts as lost
     descend_speed_mps: float
     spool_up_s: float
     thrust_ramp_s: float
