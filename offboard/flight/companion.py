@@ -12,24 +12,16 @@ from collections.abc import Callable, Hashable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from offboard.control.base import Command, Controller, Decision, PredictedState, Situation
 from offboard.control.observer import Observer
+from offboard.flight.assessment import Assessment, Course
 from offboard.flight.mission import Mission
-from offboard.flight.phases import (
-    ENDS,
-    ON_GROUND,
-    PHASES,
-    UNDER_CONTROL,
-    ExitCode,
-    Limits,
-    Phase,
-    Picture,
-    Row,
-    next_row,
-)
-from offboard.flight.record import RECORD_ID, RECORD_NAME, TickRecord
+from offboard.flight.phases import BEFORE_FLIGHT, ENDS, PHASES, TRACKING, ExitCode, Limits, Phase
+from offboard.flight.readiness import Readiness
+from offboard.flight.record import RECORD_ID, RECORD_NAME, TickRecord, reference_record
+from offboard.flight.setpoint import LEVEL, clamp, usable
+from offboard.flight.table import Row, next_row
 from offboard.flight.view import VehicleView
 from offboard.mavlink.dialect import Dialect
 from offboard.mavlink.events import Attitude, Event, LocalPosition, Reset
@@ -37,33 +29,29 @@ from offboard.mavlink.outgoing import (
     AttitudeTarget,
     CommandLong,
     Outgoing,
-    ReferenceRecord,
+    Record,
     SolverRecord,
     StatusTextOut,
 )
 from offboard.mavlink.session import Session
-from offboard.model.frames import course_from_quaternion, thrust_direction_from_quaternion
+from offboard.model.frames import course_from_quaternion
 from offboard.model.vehicle import Vehicle
 
-Array = NDArray[np.float64]
-INFO = 6  # MAV_SEVERITY
-LEVEL = (0.0, 0.0, 1.0)
+WARNING, INFO = 4, 6  # MAV_SEVERITY
 ASK_AGAIN_S = 1.0  # between repetitions of a command the vehicle has not obeyed
 SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
 SPOOL_MAX = 1.6
-LIFT_OFF_HEIGHT_M = 0.15
-LIFT_OFF_CLIMB_MPS = 0.4
 LAND_STREAM_S = 3.0  # a refused landing ends in silence: the autopilot's own failsafe lands
-MINIMUM_TELEMETRY_HZ = 10.0
+BRIDGED_SHARE = 0.3  # of the longest silence, after which level setpoints bridge it
 
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """What one call produced, in order: frames heard (for the log), then frames to send."""
+    """What one call produced: frames to send, and all frames for the log, records included."""
 
-    heard: tuple[bytes, ...] = ()
-    alive: bool = False  # the vehicle itself said something
     send: tuple[bytes, ...] = ()
+    log: tuple[bytes, ...] = ()
+    alive: bool = False  # the vehicle itself said something
 
 
 @dataclass(frozen=True, slots=True)
@@ -99,30 +87,30 @@ class Companion:
         self._period_s = period_s
         self._deadline_s = deadline_s
         self._stopwatch = stopwatch
+        self._readiness = Readiness()
         self.view = VehicleView()
-        self._peer: Hashable | None = None
+        self._assessment = Assessment(
+            self.view, session, mission, observer, self._readiness, limits
+        )
         self.phase = Phase.CONNECT
+        self.peer: Hashable | None = None  # where the vehicle's datagrams come from
         self.outcome: Outcome | None = None
-        self._row: Row | None = None
-        self._phase_began_s = math.nan  # vehicle time, or link time before telemetry
-        self._tick = -1
-        self._missed = 0
-        self._asked_s = -math.inf
-        self._last_emit_s = -math.inf
-        self._command = Command(0.0, LEVEL, 0.0)
-        self._ground_height_m = 0.0
-        self._stop_requested = False
-        self._failure = ""
-        self._silence_s = 0.0
-        self._out: list[bytes] = []
         self.announced: list[str] = []
+        self._phase_began_s = 0.0  # on the session's link time
+        self._tick = -1
+        self._missed_ticks = 0
+        self._missed_decisions = 0
+        self._failure = ""
+        self._asked_s = -math.inf
+        self._command = Command(0.0, LEVEL, 0.0)
+        self._stop_requested = False
+        self._rebooted = False
+        self._silence_s = 0.0
+        self._bridged_s = 0.0
+        self._send_out: list[bytes] = []
+        self._log_out: list[bytes] = []
 
     # ------------------------------------------------------------------ the outside calls these
-
-    @property
-    def peer(self) -> Hashable | None:
-        """Where the vehicle is: the peer that its datagrams come from."""
-        return self._peer
 
     def has_ended(self) -> bool:
         return self.phase in ENDS
@@ -136,30 +124,28 @@ class Companion:
         arrived_s = self._stopwatch()
         reception = self._session.receive(datagram, peer, now_s)
         if reception.events:
-            self._silence_s = 0.0
-            self._peer = peer
+            self._silence_s = self._bridged_s = 0.0
+            self.peer = peer
         for event in reception.events:
             self._note(event)
         if self.view.has_state and not self.has_ended():
-            self._tick_if_due(now_s, arrived_s)
-        self._out.extend(self._session.poll(now_s))
-        send = (*self._take(), *reception.replies)
-        return Output(reception.frames, bool(reception.events), send)
+            self._tick_if_due(arrived_s)
+        self._collect(self._session.poll(now_s))
+        self._collect(reception.replies)
+        return self._output(reception.frames, bool(reception.events))
 
     def poll(self, now_s: float, silence_s: float) -> Output:
-        """Call when nothing arrives. `silence_s`: wall time since the last datagram."""
+        """Call when nothing arrives. `silence_s`: wall time since the vehicle was heard."""
         self._silence_s = silence_s
-        if not self.has_ended():
-            if (
-                not self.view.has_state
-                or silence_s > self._limits.silence_s
-                or self._stop_requested
-            ):
-                self._advance(now_s)
-            if self.phase in UNDER_CONTROL and silence_s > 0.3 * self._limits.silence_s:
-                self._bridge_silence(now_s, silence_s)
-        self._out.extend(self._session.poll(now_s))
-        return Output(send=self._take())
+        patience_s = min(self._limits.silence_s, self._limits.connect_s)
+        if not self.has_ended() and (
+            not self.view.has_state or self._stop_requested or silence_s > patience_s
+        ):
+            self._advance()
+        if not self.has_ended() and silence_s > BRIDGED_SHARE * self._limits.silence_s:
+            self._bridge_silence()
+        self._collect(self._session.poll(now_s))
+        return self._output((), False)
 
     # ------------------------------------------------------------------ telemetry in
 
@@ -173,212 +159,175 @@ class Companion:
             case Reset():
                 self._observer.reset()
                 self._tick = -1
+                self._asked_s = -math.inf
+                self._rebooted = self.phase not in (Phase.CONNECT, Phase.HEALTH)
+                self._advance()
 
-    def _tick_if_due(self, now_s: float, arrived_s: float) -> None:
+    def _tick_if_due(self, arrived_s: float) -> None:
         time_s = self.view.time_s
         tick = math.floor(time_s / self._period_s + 1e-6)
         if tick <= self._tick:
             return
-        self._missed = tick - self._tick - 1 if self._tick >= 0 else 0
+        self._missed_ticks = tick - self._tick - 1 if self._tick >= 0 else 0
         self._tick = tick
-        self._advance(now_s)
+        self._advance()
         if not self.has_ended():
             self._act(time_s, arrived_s)
 
     # ------------------------------------------------------------------ phases
 
-    def _advance(self, now_s: float) -> None:
-        clock_s = self.view.time_s if self.view.has_state else now_s
-        if math.isnan(self._phase_began_s):
-            self._phase_began_s = clock_s
-        while (row := next_row(self.phase, self._picture(clock_s))) is not None:
-            self._enter(row, clock_s)
+    def _advance(self) -> None:
+        while not self.has_ended():
+            course = Course(
+                phase=self.phase,
+                in_phase_s=self._in_phase_s(),
+                silence_s=self._silence_s,
+                rebooted=self._rebooted,
+                stop_requested=self._stop_requested,
+                missed_decisions=self._missed_decisions,
+                failure=self._failure,
+            )
+            picture = self._assessment.picture(course)
+            row = next_row(self.phase, picture)
+            if row is None:
+                return
+            self._enter(row, row.reason.format(**self._assessment.words(picture, course)))
 
-    def _enter(self, row: Row, clock_s: float) -> None:
-        picture = self._picture(clock_s)
-        reason = row.reason.format(**self._words(picture))
+    def _in_phase_s(self) -> float:
+        return self._session.link_time_s - self._phase_began_s
+
+    def _enter(self, row: Row, reason: str) -> None:
         self.announced.append(f"{row.target.value}: {reason}")
-        if row.exit_code is not None and (self._row is None or self._row.exit_code is None):
-            self._row = row
-            self.outcome = Outcome(row.exit_code, reason + self.view.explanation())
+        self._conclude(row, reason)
+        self.view.said.clear()
         self.phase = row.target
-        self._phase_began_s = clock_s
+        self._phase_began_s = self._session.link_time_s
         self._asked_s = -math.inf
-        self._send(StatusTextOut(INFO, f"offboard: {row.target.value}: {reason}"[:50]))
+        self._send(StatusTextOut(INFO, f"offboard: {row.target.value}: {reason}"))
         if row.target is Phase.TAKEOFF:
             self._begin_takeoff()
         elif row.target is Phase.CLIMB:
-            self._begin_climb()
+            self._begin_climb(in_the_air=row.source is Phase.ENGAGE)
         elif row.target is Phase.JOIN:
             self._mission.join(self.view.time_s)
+
+    def _conclude(self, row: Row, reason: str) -> None:
+        """The first row with an exit code decides it; what follows is added to the sentence."""
+        if row.exit_code is not None:
+            if self.outcome is None:
+                self.outcome = Outcome(row.exit_code, reason + self.view.explanation())
+            else:
+                said = f"{self.outcome.sentence}; {reason}"
+                self.outcome = Outcome(self.outcome.exit_code, said)
         elif row.target is Phase.DISARMED and self.outcome is None:
             self.outcome = Outcome(ExitCode.FLOWN, "flown and landed")
 
     def _begin_takeoff(self) -> None:
         assert self.view.position is not None
         self._mission.settle(self.view.position.position_ned_m)
-        self._ground_height_m = -self.view.position.position_ned_m[2]
 
-    def _begin_climb(self) -> None:
+    def _begin_climb(self, *, in_the_air: bool) -> None:
         assert self.view.position is not None
+        north, east, down = self.view.position.position_ned_m
+        velocity = np.array(self.view.position.velocity_ned_mps)
+        if in_the_air:  # nobody saw the take-off: below us, at the height of the local origin
+            self._mission.settle((north, east, 0.0))
         self._observer.freeze(False)
         self._mission.lift_off(
-            self.view.time_s,
-            np.array(self.view.position.position_ned_m),
-            np.array(self.view.position.velocity_ned_mps),
-            self._course_rad(),
+            self.view.time_s, np.array([north, east, down]), velocity, self._course_rad()
         )
 
-    def _picture(self, clock_s: float) -> Picture:
-        view, mission, time_s = self.view, self._mission, self.view.time_s
-        track, dialect = mission.track, self._session.dialect
-        return Picture(
-            limits=self._limits,
-            in_phase_s=0.0 if math.isnan(self._phase_began_s) else clock_s - self._phase_began_s,
-            silence_s=self._silence_s,
-            found=view.found is not None,
-            telemetry_ok=view.has_state and self._telemetry_hz() >= MINIMUM_TELEMETRY_HZ,
-            prearm_ok=view.prearm_ok,
-            configured=True,
-            engaged=dialect is not None and view.mode == dialect.engage_mode,
-            armed=view.armed,
-            airborne=view.landed == "in_air",
-            lifted_off=self._lifted_off(),
-            at_start=self._at_start(time_s),
-            track_time_s=mission.track_time_s(time_s),
-            track_start_s=track.track_start_s,
-            track_end_s=track.track_end_s,
-            rest_time_s=track.duration_s + 0.5,
-            position_error_m=self._position_error_m(),
-            tilt_rad=self._tilt_rad(),
-            stop_requested=self._stop_requested,
-            controller_failed=bool(self._failure),
-        )
+    # ------------------------------------------------------------------ actions of one tick
 
-    def _words(self, picture: Picture) -> dict[str, object]:
-        """The figures that a row's reason may quote."""
-        dialect = self._session.dialect
-        return {
-            "mode": self.view.mode,
-            "mode_wanted": dialect.engage_mode if dialect else "offboard mode",
-            "silence_s": picture.silence_s,
-            "in_phase_s": picture.in_phase_s,
-            "tilt_deg": math.degrees(picture.tilt_rad),
-            "position_error_m": picture.position_error_m,
-            "position_error_limit_m": self._limits.position_error_m,
-            "failure": self._failure,
-            "unready": self._unready(),
-        }
+    def _act(self, time_s: float, arrived_s: float) -> None:
+        if self.phase in BEFORE_FLIGHT:
+            self._observer.freeze(True)
+            self._prepare(time_s)
+        elif self.phase is Phase.TAKEOFF:
+            spool = min(SPOOL_MAX, SPOOL_UP_PER_S * self._in_phase_s())
+            thrust_mps2 = spool * self._vehicle.gravity_mps2
+            self._emit(time_s, Command(thrust_mps2, LEVEL, self._command.course_rad))
+        elif self.phase in TRACKING:
+            self._decide(time_s, arrived_s)
+        else:
+            self._hold(time_s)
 
-    def _unready(self) -> str:
-        if not self.view.has_state:
-            return "no LOCAL_POSITION_NED or ATTITUDE_QUATERNION arrives"
-        if self._telemetry_hz() < MINIMUM_TELEMETRY_HZ:
-            return (
-                f"telemetry arrives at {self._telemetry_hz():.1f} Hz, "
-                f"{MINIMUM_TELEMETRY_HZ:.0f} Hz are needed"
-            )
-        return "its pre-arm checks do not pass"
+    def _prepare(self, time_s: float) -> None:
+        if self.phase is Phase.HEALTH:
+            known, now_s = self.view.parameters, self._session.link_time_s
+            for request in self._readiness.due(self._dialect, known, now_s):
+                self._send(request)
+            return
+        if self.phase is Phase.ENGAGE:
+            self._ask(self._dialect.engage(), time_s)
+        elif self.phase is Phase.ARM:
+            self._ask(CommandLong.arm(), time_s)
+        # On the ground without thrust; in the air with what takes over from the autopilot
+        flying = self.view.armed and self.view.in_the_air
+        thrust_mps2 = self._hover_mps2() if flying else 0.0
+        self._emit(time_s, Command(thrust_mps2, LEVEL, self._course_rad()))
 
-    def _telemetry_hz(self) -> float:
-        rates = self._session.rates_hz
-        return min(rates.get(name, 0.0) for name in ("LOCAL_POSITION_NED", "ATTITUDE_QUATERNION"))
+    def _hold(self, time_s: float) -> None:
+        """What a phase does that needs no state: level, and the request that ends the flight."""
+        if self.phase is Phase.TAKEOFF or self.phase in TRACKING:
+            self._emit(time_s, self._level())
+        elif self.phase is Phase.LAND:
+            if self.view.mode != self._dialect.land_mode:
+                self._ask(self._dialect.land(), time_s)
+            engaged = self.view.mode == self._dialect.engage_mode
+            if engaged and self._in_phase_s() < LAND_STREAM_S:
+                self._emit(time_s, self._level())
+        elif self.phase is Phase.STAND_DOWN:
+            self._ask(CommandLong.disarm(), time_s)
+            self._emit(time_s, Command(0.0, LEVEL, self._command.course_rad))
 
-    # ------------------------------------------------------------------ facts from the state
+    def _bridge_silence(self) -> None:
+        """Telemetry stopped: go on without, each period of wall time, until the table ends it."""
+        if self._silence_s - self._bridged_s >= self._period_s:
+            self._bridged_s = self._silence_s
+            self._hold(self.view.time_s + self._silence_s)
+
+    def _decide(self, time_s: float, arrived_s: float) -> None:
+        reference = self._mission.reference
+        assert reference is not None
+        try:
+            state = self._observer.predict(time_s)
+            situation = Situation(time_s, state, reference, self._command, self._deadline_s)
+            decision = self._controller.decide(situation)
+            if not usable(decision.command):
+                raise ArithmeticError(f"unusable {decision.command}")
+        except Exception as error:  # whatever it is, the vehicle is in the air
+            self._miss(f"{type(error).__name__}: {error}")
+            self._emit(time_s, self._level())
+            return
+        self._missed_decisions = 0
+        self._emit(time_s, clamp(decision.command, self._vehicle))
+        self._record(time_s, state, decision, arrived_s)
+
+    def _miss(self, failure: str) -> None:
+        self._missed_decisions += 1
+        self._failure = failure
+        self._send(StatusTextOut(WARNING, f"decision missed: {failure}"))
+
+    def _level(self) -> Command:
+        """Level, at the thrust that hovers; before lift-off at the thrust reached."""
+        flying = self._mission.reference is not None
+        thrust_mps2 = self._hover_mps2() if flying else self._command.thrust_mps2
+        return Command(thrust_mps2, LEVEL, self._command.course_rad)
+
+    def _hover_mps2(self) -> float:
+        """Thrust that holds the weight, by the observer's account."""
+        share = self._observer.hover_thrust_estimate / self._vehicle.hover_thrust
+        return (share if math.isfinite(share) else 1.0) * self._vehicle.gravity_mps2
 
     def _course_rad(self) -> float:
         assert self.view.attitude is not None
         return float(course_from_quaternion(np.array(self.view.attitude.attitude)))
 
-    def _tilt_rad(self) -> float:
-        if self.view.attitude is None:
-            return 0.0
-        down = thrust_direction_from_quaternion(np.array(self.view.attitude.attitude))[2]
-        return math.acos(min(1.0, max(-1.0, float(down))))
-
-    def _lifted_off(self) -> bool:
-        position = self.view.position
-        if position is None or self.phase is not Phase.TAKEOFF:
-            return False
-        height_m = -position.position_ned_m[2] - self._ground_height_m
-        return height_m > LIFT_OFF_HEIGHT_M or -position.velocity_ned_mps[2] > LIFT_OFF_CLIMB_MPS
-
-    def _position_error_m(self) -> float:
-        position = self.view.position
-        sample = self._mission.sample(position.time_s) if position else None
-        if position is None or sample is None:
-            return 0.0
-        return float(np.linalg.norm(np.array(position.position_ned_m) - sample.position_ned_m))
-
-    def _at_start(self, time_s: float) -> bool:
-        if self.phase is not Phase.CLIMB or self.view.position is None:
-            return False
-        state = self._observer.predict(time_s)
-        position = np.array(self.view.position.position_ned_m)
-        return self._mission.at_start(time_s, position, state.velocity_ned_mps)
-
-    # ------------------------------------------------------------------ actions of one tick
-
-    def _act(self, time_s: float, arrived_s: float) -> None:
-        if self.phase in ON_GROUND:
-            self._observer.freeze(True)
-        if self.phase is Phase.ENGAGE:
-            self._ask(self._dialect.engage(), time_s)
-        elif self.phase is Phase.ARM:
-            self._ask(CommandLong.arm(), time_s)
-        elif self.phase is Phase.LAND and self.view.mode != self._dialect.land_mode:
-            self._ask(self._dialect.land(), time_s)
-        if self.phase in (Phase.STREAM, Phase.ENGAGE, Phase.ARM):
-            self._emit(time_s, Command(0.0, LEVEL, self._course_rad()))
-        elif self.phase is Phase.TAKEOFF:
-            in_phase_s = time_s - self._phase_began_s
-            spool = min(SPOOL_MAX, SPOOL_UP_PER_S * in_phase_s) * self._vehicle.gravity_mps2
-            self._emit(time_s, Command(spool, LEVEL, self._command.course_rad))
-        elif self.phase is Phase.LAND:
-            if self._engaged_still() and time_s - self._phase_began_s < LAND_STREAM_S:
-                self._emit(time_s, self._level())
-        elif self.phase in UNDER_CONTROL:
-            self._decide(time_s, arrived_s)
-
     @property
     def _dialect(self) -> Dialect:
         assert self._session.dialect is not None
         return self._session.dialect
-
-    def _engaged_still(self) -> bool:
-        return self.view.mode == self._dialect.engage_mode
-
-    def _decide(self, time_s: float, arrived_s: float) -> None:
-        reference = self._mission.reference
-        assert reference is not None
-        state = self._observer.predict(time_s)
-        situation = Situation(time_s, state, reference, self._command, self._deadline_s)
-        try:
-            decision = self._controller.decide(situation)
-        except (ArithmeticError, ValueError, np.linalg.LinAlgError) as error:
-            self._failure = f"{type(error).__name__}: {error}"
-            self._emit(time_s, self._level())
-            return
-        if not _finite(decision.command):
-            self._failure = "the decision was not finite"
-            self._emit(time_s, self._level())
-            return
-        self._emit(time_s, decision.command)
-        self._record(time_s, state, decision, arrived_s)
-
-    def _level(self) -> Command:
-        """Level, at the thrust that hovers by the observer's account."""
-        hover = self._observer.hover_thrust_estimate / self._vehicle.hover_thrust
-        return Command(hover * self._vehicle.gravity_mps2, LEVEL, self._command.course_rad)
-
-    def _bridge_silence(self, now_s: float, silence_s: float) -> None:
-        """Telemetry stopped: level hold, then a landing request; the table ends it in silence."""
-        if now_s - self._last_emit_s < self._period_s:
-            return
-        self._last_emit_s = now_s
-        self._emit(self.view.time_s + silence_s, self._level())
-        if silence_s > 0.7 * self._limits.silence_s:
-            self._ask(self._dialect.land(), self.view.time_s + silence_s)
 
     # ------------------------------------------------------------------ frames out
 
@@ -408,39 +357,30 @@ class Companion:
     ) -> None:
         sample = self._mission.sample(time_s)
         assert sample is not None
-        self._send(
-            ReferenceRecord(
-                time_s=time_s,
-                position_ned_m=_triple(sample.position_ned_m),
-                velocity_ned_mps=_triple(sample.velocity_ned_mps),
-                acceleration_ned_mps2=_triple(sample.acceleration_ned_mps2),
-                course_rad=float(sample.course_rad),
-                course_rate_radps=float(sample.course_rate_radps),
-            )
-        )
+        self._note_down(reference_record(time_s, sample))
         record = TickRecord.of(
             phase=PHASES.index(self.phase),
             decision=decision,
             state=state,
             lateness_s=self._stopwatch() - arrived_s,
-            missed_ticks=self._missed,
+            missed_ticks=self._missed_ticks,
             hover_thrust=self._observer.hover_thrust_estimate,
             track_time_s=self._mission.track_time_s(time_s),
         )
-        self._send(SolverRecord(time_s, record.data(), RECORD_ID, RECORD_NAME))
+        self._note_down(SolverRecord(time_s, record.data(), RECORD_ID, RECORD_NAME))
+
+    def _note_down(self, record: Record) -> None:
+        """For the log alone."""
+        self._log_out.append(self._session.encode(record))
 
     def _send(self, outgoing: Outgoing) -> None:
-        self._out.append(self._session.encode(outgoing))
+        self._collect((self._session.encode(outgoing),))
 
-    def _take(self) -> tuple[bytes, ...]:
-        taken, self._out = tuple(self._out), []
-        return taken
+    def _collect(self, frames: tuple[bytes, ...]) -> None:
+        self._send_out.extend(frames)
+        self._log_out.extend(frames)
 
-
-def _finite(command: Command) -> bool:
-    values = (command.thrust_mps2, *command.thrust_direction_ned, command.course_rad)
-    return all(math.isfinite(value) for value in values)
-
-
-def _triple(values: Array) -> tuple[float, float, float]:
-    return float(values[0]), float(values[1]), float(values[2])
+    def _output(self, heard: tuple[bytes, ...], alive: bool) -> Output:
+        send, log = tuple(self._send_out), (*heard, *self._log_out)
+        self._send_out, self._log_out = [], []
+        return Output(send, log, alive)

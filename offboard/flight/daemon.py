@@ -50,6 +50,7 @@ class Loop:
         gc.freeze()
         with self._signals():
             self._fly()
+        self._progress(self._companion)
         if self._ended_early:
             return self._ended_early
         outcome = self._companion.outcome
@@ -92,7 +93,7 @@ class Loop:
             return
         try:
             stamp = clock.unix_us()
-            for frame in (*output.heard, *output.send):
+            for frame in output.log:
                 self._log.write(stamp, frame)
         except OSError as error:
             self._log_error = f"the log {self._log.path} cannot be written ({error.strerror})"

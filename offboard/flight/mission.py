@@ -21,7 +21,7 @@ class Mission:
 
     def __init__(self, track: Track) -> None:
         self._track = track
-        self._origin_ned_m = (0.0, 0.0, 0.0)
+        self.origin_ned_m = (0.0, 0.0, 0.0)
         self._join_s = math.nan
         self._arrival_s = math.nan
         self.reference: Reference | None = None
@@ -32,7 +32,7 @@ class Mission:
 
     def settle(self, position_ned_m: tuple[float, float, float]) -> None:
         """Remember the take-off point: references are given relative to it."""
-        self._origin_ned_m = position_ned_m
+        self.origin_ned_m = position_ned_m
 
     def lift_off(self, time_s: float, position: Array, velocity: Array, course_rad: float) -> None:
         """Plan from the present state to rest at the start of the track."""
@@ -71,4 +71,4 @@ class Mission:
         return None if self.reference is None else self.reference.sample(time_s)
 
     def _placed(self) -> Reference:
-        return Placed(self._track, self._origin_ned_m)
+        return Placed(self._track, self.origin_ned_m)

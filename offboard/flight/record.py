@@ -8,7 +8,12 @@ from __future__ import annotations
 
 from dataclasses import astuple, dataclass, fields
 
+import numpy as np
+from numpy.typing import NDArray
+
 from offboard.control.base import Decision, PredictedState
+from offboard.mavlink.outgoing import ReferenceRecord
+from offboard.reference.base import FlatSample
 
 RECORD_NAME = "pso"
 RECORD_ID = 1
@@ -101,3 +106,19 @@ class TickRecord:
         if len(data) < len(names):
             raise ValueError(f"a tick record has {len(names)} floats, this one {len(data)}")
         return cls(*data[: len(names)])
+
+
+def reference_record(time_s: float, sample: FlatSample) -> ReferenceRecord:
+    """What was to be flown at a tick."""
+    return ReferenceRecord(
+        time_s=time_s,
+        position_ned_m=_triple(sample.position_ned_m),
+        velocity_ned_mps=_triple(sample.velocity_ned_mps),
+        acceleration_ned_mps2=_triple(sample.acceleration_ned_mps2),
+        course_rad=float(sample.course_rad),
+        course_rate_radps=float(sample.course_rate_radps),
+    )
+
+
+def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    return float(values[0]), float(values[1]), float(values[2])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -13,12 +14,14 @@ from offboard.mavlink.events import (
     Landed,
     LocalPosition,
     Parameter,
+    Reset,
     StatusText,
     SystemHealth,
     VehicleFound,
 )
 
 HEARD = 12  # texts and refusals kept for the sentence that explains a failure
+SET_MESSAGE_INTERVAL = 511  # MAV_CMD: a rate that is refused explains no failure
 
 
 @dataclass(slots=True)
@@ -39,6 +42,21 @@ class VehicleView:
         """Vehicle time of the newest telemetry; 0 before any."""
         stamps = [event.time_s for event in (self.position, self.attitude) if event is not None]
         return max(stamps, default=0.0)
+
+    @property
+    def position_age_s(self) -> float:
+        """Vehicle time since the newest position; NaN before any."""
+        return self.time_s - self.position.time_s if self.position else math.nan
+
+    @property
+    def attitude_age_s(self) -> float:
+        """Vehicle time since the newest attitude; NaN before any."""
+        return self.time_s - self.attitude.time_s if self.attitude else math.nan
+
+    @property
+    def in_the_air(self) -> bool:
+        """The vehicle says that it flies; false while it says nothing."""
+        return self.landed in ("in_air", "takeoff", "landing")
 
     @property
     def armed(self) -> bool:
@@ -76,8 +94,19 @@ class VehicleView:
                 self.parameters[name] = value
             case StatusText(severity, text) if severity <= 4:
                 self.said.append(text)
-            case CommandAck(command, result) if result not in ("ACCEPTED", "IN_PROGRESS"):
+            case CommandAck(command, result) if command != SET_MESSAGE_INTERVAL and result not in (
+                "ACCEPTED",
+                "IN_PROGRESS",
+            ):
                 self.said.append(f"command {command} {result}")
+            case Reset():
+                self._forget()
+
+    def _forget(self) -> None:
+        """A vehicle that restarted is in no state that was known before."""
+        self.heartbeat = self.health = self.position = self.attitude = None
+        self.landed = "unknown"
+        self.parameters.clear()
 
     def explanation(self) -> str:
         """The vehicle's own last words, for the end of a sentence; empty if it said nothing."""

@@ -74,6 +74,7 @@ ARDUPILOT = Dialect(
             "GUID_OPTIONS",
             "without bit 8 the thrust field is a climb rate",
             required_bits=8,
+            must_answer=True,
         ),
         WatchedParameter(
             "GUID_TIMEOUT",
@@ -85,6 +86,7 @@ ARDUPILOT = Dialect(
             "ATC_ANGLE_BOOST",
             "the autopilot must divide thrust by the tilt, since we do not",
             allowed=(1.0, 1.0),
+            must_answer=True,
         ),
         WatchedParameter("FS_GCS_ENABLE", "what the vehicle does when the ground station is lost"),
         WatchedParameter("FS_THR_ENABLE", "what the vehicle does when the radio is lost"),

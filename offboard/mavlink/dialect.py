@@ -46,12 +46,14 @@ class WantedMessage:
 
 @dataclass(frozen=True, slots=True)
 class WatchedParameter:
-    """A parameter read before flight. `required_bits` and `allowed` say what it must be."""
+    """A parameter read before flight. `required_bits` and `allowed` say what it must be;
+    without an answer to one that `must_answer` nothing flies."""
 
     name: str
     meaning: str
     required_bits: int = 0
     allowed: tuple[float, float] | None = None
+    must_answer: bool = False
 
     def complaint(self, value: float) -> str | None:
         """A sentence with the line that mends it, or None when `value` will do."""

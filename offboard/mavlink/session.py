@@ -289,6 +289,11 @@ class Session:
     # --- what is known of the link ---
 
     @property
+    def link_time_s(self) -> float:
+        """Seconds that follow the vehicle's time while it flows, else the host's."""
+        return self._link_time.seconds
+
+    @property
     def rates_hz(self) -> dict[str, float]:
         """Measured rate of each wanted message over the last two seconds of vehicle time."""
         return self._rates.measured_hz(self._link_time.seconds)

@@ -1,0 +1,36 @@
+"""The last look at a command before it leaves: PX4 flies whatever it is sent, so we are the guard.
+
+Independent of the control laws and of their own limits.
+"""
+
+from __future__ import annotations
+
+import math
+
+from offboard.control.base import Command
+from offboard.model.vehicle import Vehicle
+
+LEVEL = (0.0, 0.0, 1.0)
+_LENGTH_TOLERANCE = 0.01
+
+
+def usable(command: Command) -> bool:
+    """Finite, and its thrust direction a unit vector."""
+    values = (command.thrust_mps2, *command.thrust_direction_ned, command.course_rad)
+    if not all(math.isfinite(value) for value in values):
+        return False
+    return abs(math.hypot(*command.thrust_direction_ned) - 1.0) <= _LENGTH_TOLERANCE
+
+
+def clamp(command: Command, vehicle: Vehicle) -> Command:
+    """The usable command nearest to `command` within the vehicle's thrust and tilt.
+
+    A direction beyond `tilt_max_rad` is turned back to it in its own vertical plane.
+    """
+    thrust = min(max(command.thrust_mps2, 0.0), vehicle.thrust_max_mps2)
+    north, east, down = command.thrust_direction_ned
+    lateral = math.hypot(north, east)
+    if math.atan2(lateral, down) > vehicle.tilt_max_rad and lateral > 0.0:
+        scale = math.sin(vehicle.tilt_max_rad) / lateral
+        north, east, down = scale * north, scale * east, math.cos(vehicle.tilt_max_rad)
+    return Command(thrust, (north, east, down), command.course_rad)
