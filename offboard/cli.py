@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import platform
 import sys
-from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated
 
@@ -79,7 +77,7 @@ def fly(
     """Connect, arm, take off, track the reference, land; log everything and score it."""
     from offboard.analysis.requirement import Requirement
     from offboard.analysis.score import FIGURES
-    from offboard.config import build_track, load
+    from offboard.config import build_track, dump, load
     from offboard.control.catalogue import build
     from offboard.control.observer import Observer
     from offboard.flight import clock
@@ -126,9 +124,9 @@ def fly(
             out.print(f"compiled in {seconds:.1f} s; the next start finds it cached")
 
     directory = out_directory or Path("flights") / clock.local_stamp()
-    with FlightLog(directory) as log:
-        _write_configuration(directory, resolved)
-        out.print("preparing the controller (its first run on a machine compiles for seconds)")
+    log = FlightLog(directory, dump(resolved))
+    out.print("preparing the controller (its first run on a machine compiles for seconds)")
+    try:
         outcome = fly_once(
             crew,
             log,
@@ -137,6 +135,10 @@ def fly(
             progress=progress,
             prepared=prepared,
         )
+    except KeyboardInterrupt:  # in flight it lands instead
+        raise Refusal("interrupted before anything was sent", ExitCode.ABORTED) from None
+    if outcome.exit_code == ExitCode.USAGE:
+        raise Refusal(outcome.sentence)
     if outcome.exit_code != ExitCode.FLOWN:
         _score(directory, [], as_json=False)
         raise Refusal(f"{outcome.sentence} (log: {log.path})", outcome.exit_code)
@@ -199,19 +201,6 @@ def _score(flight: Path, requirements: list, as_json: bool) -> list[str]:  # typ
         show(out, result, flown)
     verdicts = [requirement.verdict(result.figures()) for requirement in requirements]
     return [verdict for verdict in verdicts if verdict]
-
-
-def _write_configuration(directory: Path, config: object) -> None:
-    """flight.yaml: the resolved configuration, headed by what it was flown with."""
-    from offboard.config import FlightConfig, dump
-
-    assert isinstance(config, FlightConfig)
-    packages = " ".join(
-        f"{name} {version(name)}"
-        for name in ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
-    )
-    heading = f"# Resolved configuration. {packages}, Python {platform.python_version()}\n"
-    (directory / "flight.yaml").write_text(heading + dump(config), encoding="utf-8")
 
 
 def main() -> None:

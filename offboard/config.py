@@ -6,8 +6,10 @@ file, or spells them out. Packaged, `config/` lies inside the package; in a chec
 
 from __future__ import annotations
 
+import platform
 from collections.abc import Iterable, Mapping
 from importlib import resources
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ from offboard.reference.feasibility import check
 from offboard.reference.track import Track
 
 Raw = dict[str, Any]
+RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
 FOLDERS = {"vehicle": "vehicles", "controller": "controllers", "reference": "references"}
 
 
@@ -71,7 +74,7 @@ def load(
         raw = override(raw, assignment)
     if seed is not None:
         raw["seed"] = seed
-    return validate(raw, FlightConfig, str(path))
+    return _with_table(validate(raw, FlightConfig, str(path)))
 
 
 def build_track(config: FlightConfig) -> Track:
@@ -79,11 +82,8 @@ def build_track(config: FlightConfig) -> Track:
 
     Raises DocumentError naming time, value and limit where it cannot be flown.
     """
-    text = None
-    if isinstance(config.reference, FromTable):
-        text = _text(Path(config.reference.file))
     try:
-        track = build(config.reference, text)
+        track = build(config.reference)
         check(track, config.vehicle)
     except ValueError as error:
         raise DocumentError(f"reference {config.reference.shape}: {error}") from None
@@ -107,8 +107,25 @@ def check_file(path: Path) -> str:
 
 
 def dump(config: FlightConfig) -> str:
-    """The resolved configuration as YAML that `load` accepts."""
-    return yaml.safe_dump(config.model_dump(mode="json"), sort_keys=False)
+    """The resolved configuration as YAML that `load` accepts, headed by what it is flown with."""
+    packages = " ".join(f"{name} {version(name)}" for name in RECORDED_VERSIONS)
+    heading = f"# Resolved configuration. {packages}, Python {platform.python_version()}\n"
+    document = config.model_dump(mode="json", exclude_none=True)
+    return heading + yaml.safe_dump(document, sort_keys=False)
+
+
+def flown(text: str) -> FlightConfig:
+    """The configuration in a log (`dump`ed then). Raises DocumentError."""
+    return validate(read(text, "the log's configuration"), FlightConfig, "the log's configuration")
+
+
+def _with_table(config: FlightConfig) -> FlightConfig:
+    """With the content of the table that it names, so that it stands alone."""
+    reference = config.reference
+    if not isinstance(reference, FromTable) or reference.text is not None:
+        return config
+    content = {"text": _text(Path(reference.file))}
+    return config.model_copy(update={"reference": reference.model_copy(update=content)})
 
 
 def _part(part: str, name: str) -> Raw:

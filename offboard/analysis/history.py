@@ -15,12 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.analysis.tlog import LoggedMessage, Tlog
-from offboard.flight.record import RECORD_ID, RECORD_NAME, TickRecord
+from offboard.flight import manifest
+from offboard.flight.record import (
+    COMPONENT_ID,
+    RECORD_COMPONENT_ID,
+    RECORD_ID,
+    RECORD_NAME,
+    TickRecord,
+)
 from offboard.mavlink.dialect import Dialect
 from offboard.mavlink.session import DIALECTS
 
 Array = NDArray[np.float64]
-COMPANION_COMPONENT = 191
+OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
 EARTH_RADIUS_M = 6378137.0
 ATTITUDE_FIELDS = "q1 q2 q3 q4 rollspeed pitchspeed yawspeed"
 REFERENCE_FIELDS = "x y z vx vy vz afx afy afz yaw"
@@ -76,7 +83,7 @@ def gather(log: Tlog) -> History:
     now_s = math.nan
     for entry in log.messages:
         message = entry.message
-        ours = entry.component_id == COMPANION_COMPONENT
+        ours = entry.component_id in OUR_COMPONENTS
         if not ours and entry.system_id != vehicle_id:
             continue
         match entry.name:
@@ -134,6 +141,17 @@ def gather(log: Tlog) -> History:
         said=tuple(said),
         messages=Counter(entry.name for entry in log.messages),
         wall_s=(stamps[-1] - stamps[0]) / 1e6 if stamps else 0.0,
+    )
+
+
+def configuration(log: Tlog) -> str | None:
+    """What the flight was flown with, as `config.flown` reads it; None where the log lacks it."""
+    return manifest.join(
+        bytes(entry.message.payload[: entry.message.payload_length])
+        for entry in log.messages
+        if entry.name == "TUNNEL"
+        and entry.component_id in OUR_COMPONENTS
+        and entry.message.payload_type == manifest.PAYLOAD_TYPE
     )
 
 

@@ -131,7 +131,8 @@ class Companion:
         if self.view.has_state and not self.has_ended():
             self._tick_if_due(arrived_s)
         self._collect(self._session.poll(now_s))
-        self._collect(reception.replies)
+        for reply in reception.replies:
+            self._send(reply)
         return self._output(reception.frames, bool(reception.events))
 
     def poll(self, now_s: float, silence_s: float) -> Output:

@@ -12,7 +12,8 @@ from offboard.flight import clock
 from offboard.flight.companion import Companion, Outcome, Output
 from offboard.flight.link import Link
 from offboard.flight.log import FlightLog
-from offboard.flight.phases import ExitCode, Phase
+from offboard.flight.phases import BEFORE_FLIGHT, ExitCode
+from offboard.flight.sitl import Ending
 
 POLL_S = 0.02
 
@@ -32,7 +33,7 @@ class Loop:
         *,
         lockstep: bool,
         progress: Callable[[Companion], None],
-        vehicle_process_ended: Callable[[], str | None] = lambda: None,
+        vehicle_process_ended: Callable[[], Ending | None] = lambda: None,
     ) -> None:
         self._companion = companion
         self._link = link
@@ -65,6 +66,7 @@ class Loop:
 
     def _fly(self) -> None:
         companion, link = self._companion, self._link
+        link.receive(0.0)  # what waited while we prepared is old
         heard_s = polled_s = clock.monotonic_s()
         while not companion.has_ended() and self._interrupts < 2 and not self._ended_early:
             chunks = link.receive(POLL_S)
@@ -100,10 +102,14 @@ class Loop:
             self._companion.request_stop()
 
     def _check_process(self) -> None:
-        """A simulator that ended before it was heard will not be waited for."""
-        if self._companion.phase is Phase.CONNECT:
-            ended = self._vehicle_process_ended()
-            self._ended_early = Outcome(ExitCode.REFUSED, ended) if ended else None
+        """A simulator that ended will not be waited for."""
+        ended = None if self._companion.has_ended() else self._vehicle_process_ended()
+        if ended is None:
+            return
+        code = ExitCode.ABORTED
+        if self._companion.phase in BEFORE_FLIGHT:
+            code = ExitCode.USAGE if ended.unusable else ExitCode.REFUSED
+        self._ended_early = Outcome(code, ended.sentence)
 
     @contextmanager
     def _signals(self) -> Iterator[None]:

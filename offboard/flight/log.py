@@ -18,16 +18,22 @@ class LogError(Exception):
 
 
 class FlightLog:
-    """Writes DIR/flight.tlog. Never overwrites: a directory that holds a flight is refused."""
+    """Writes DIR/flight.tlog, and beside it flight.yaml with what the flight is flown with.
 
-    def __init__(self, directory: Path) -> None:
+    Never overwrites: a directory that holds a flight is refused.
+    """
+
+    def __init__(self, directory: Path, configuration: str) -> None:
         self.directory = directory
         self.path = directory / "flight.tlog"
+        self.configuration = configuration
 
     def __enter__(self) -> FlightLog:
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
             self._file = self.path.open("xb", buffering=0)
+            text = self.configuration
+            (self.directory / "flight.yaml").write_text(text, encoding="utf-8")
         except FileExistsError:
             raise LogError(
                 f"{self.path} already holds a flight; choose another directory with --out"

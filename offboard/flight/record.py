@@ -15,6 +15,10 @@ from offboard.control.base import Decision, PredictedState
 from offboard.mavlink.outgoing import ReferenceRecord
 from offboard.reference.base import FlatSample
 
+COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: what is sent
+# MAV_COMP_ID_ONBOARD_COMPUTER2, for what only the log sees: with sequence numbers of its own it
+# leaves no gap in those that the vehicle counts
+RECORD_COMPONENT_ID = 192
 RECORD_NAME = "pso"
 RECORD_ID = 1
 

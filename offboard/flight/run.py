@@ -13,13 +13,14 @@ import numpy as np
 
 from offboard.control.base import Command, Controller, Situation
 from offboard.control.observer import Observer
-from offboard.flight import clock
+from offboard.flight import clock, manifest
 from offboard.flight.companion import Companion, Outcome
 from offboard.flight.daemon import Loop
 from offboard.flight.link import UdpLink, open_link
 from offboard.flight.log import FlightLog
 from offboard.flight.mission import Mission
 from offboard.flight.phases import Limits
+from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.flight.sitl import SimulatorProcess
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.model.vehicle import Vehicle
@@ -86,10 +87,15 @@ def fly(
     progress: Callable[[Companion], None],
     prepared: Callable[[float], None] = lambda seconds: None,
 ) -> Outcome:
-    """Fly once over `connection`, or on a bundled simulator of our own. LinkError: not opened."""
+    """Fly once over `connection`, or on a bundled simulator of our own.
+
+    Raises LinkError or LogError before anything is sent. The log is opened after the link, so
+    that a flight which cannot begin leaves no directory behind.
+    """
     with ExitStack() as stack:
         link = open_link("udpin:127.0.0.1:0" if bundled else connection)
         stack.callback(link.close)
+        stack.enter_context(log)
         simulator = None
         limits = crew.limits
         if bundled:
@@ -106,13 +112,19 @@ def fly(
             patience = {"connect_s": SITL_PATIENCE_S, "silence_s": SITL_PATIENCE_S}
             limits = limits.model_copy(update=patience)
         prepared(rehearse(crew))
+        session = Session(
+            SessionSettings(
+                component_id=COMPONENT_ID,
+                record_component_id=RECORD_COMPONENT_ID,
+                stream=link.is_stream,
+                speaks_first=not (bundled or connection.startswith("udpin")),
+            )
+        )
+        for piece in manifest.pieces(log.configuration):
+            log.write(clock.unix_us(), session.encode(piece))
         companion = Companion(
             vehicle=crew.vehicle,
-            session=Session(
-                SessionSettings(
-                    stream=link.is_stream, speaks_first=not connection.startswith("udpin")
-                )
-            ),
+            session=session,
             observer=crew.make_observer(),
             controller=crew.controller,
             mission=Mission(crew.track),

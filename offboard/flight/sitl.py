@@ -8,9 +8,19 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
+from dataclasses import dataclass
 from types import TracebackType
 
 STOP_S = 2.0
+USAGE = 2  # the simulator's exit code for options and files that it cannot use
+
+
+@dataclass(frozen=True, slots=True)
+class Ending:
+    """Why a simulator is gone: one sentence, and whether its options or files are to blame."""
+
+    sentence: str
+    unusable: bool
 
 
 class SimulatorProcess:
@@ -45,20 +55,18 @@ class SimulatorProcess:
         )
         return self
 
-    def ended(self) -> str | None:
-        """One sentence if the process is gone, with its own last words."""
+    def ended(self) -> Ending | None:
+        """How the process ended, or None while it runs."""
         code = self._process.poll()
         if code is None:
             return None
         self._errors.seek(0)
         words = self._errors.read().decode(errors="replace").strip().splitlines()
-        return (
-            f"the bundled simulator ended (exit code {code}): {words[-1] if words else 'silently'}"
-        )
-
-    @property
-    def exit_code(self) -> int | None:
-        return self._process.poll()
+        if code == USAGE:
+            return Ending(words[-1] if words else "the bundled simulator was refused", True)
+        how = f"signal {-code}" if code < 0 else f"exit code {code}"
+        said = f": {words[-1]}" if words else ""
+        return Ending(f"the bundled simulator ended ({how}){said}", False)
 
     def __exit__(
         self,

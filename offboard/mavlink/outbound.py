@@ -19,6 +19,7 @@ from offboard.mavlink.inbound import Address
 from offboard.mavlink.outgoing import (
     AttitudeTarget,
     CommandLong,
+    ConfigurationRecord,
     Heartbeat,
     Outgoing,
     ParamRead,
@@ -57,6 +58,8 @@ def encode(outgoing: Outgoing, target: Address | None, dialect: Dialect | None) 
         return _encode_reference(outgoing)
     if isinstance(outgoing, SolverRecord):
         return _encode_solver(outgoing)
+    if isinstance(outgoing, ConfigurationRecord):
+        return _encode_configuration(outgoing)
     return _encode_housekeeping(outgoing)
 
 
@@ -256,6 +259,21 @@ def _encode_solver(value: SolverRecord) -> Packed:
         name=value.name.encode("ascii", errors="replace")[:10],
         array_id=value.array_id,
         data=data,
+    )
+
+
+def _encode_configuration(value: ConfigurationRecord) -> Packed:
+    message = mavlink.MAVLink_tunnel_message
+    room = message.array_lengths[message.ordered_fieldnames.index("payload")]
+    if len(value.data) > room:
+        raise ValueError(f"TUNNEL holds {room} bytes, not {len(value.data)}")
+    return _pack(
+        message,
+        target_system=0,
+        target_component=0,
+        payload_type=value.payload_type,
+        payload_length=len(value.data),
+        payload=tuple(value.data.ljust(room, b"\0")),
     )
 
 

@@ -1,7 +1,7 @@
 """What the flight asks to be sent: one frozen value per message, the twin of events.py.
 
 NED, FRD, SI and vehicle time; conversion to the wire's units and frames happens in wire.py. The
-last two values, ReferenceRecord and SolverRecord, are for our own log and are never sent.
+last three values, the records, are for our own log and are never sent.
 """
 
 from __future__ import annotations
@@ -140,6 +140,14 @@ class SolverRecord:
     name: str = "pso"
 
 
+@dataclass(frozen=True, slots=True)
+class ConfigurationRecord:
+    """One piece of what the flight was flown with, logged as TUNNEL: at most 128 bytes."""
+
+    data: bytes
+    payload_type: int
+
+
 Outgoing = (
     AttitudeTarget
     | PositionTarget
@@ -151,5 +159,6 @@ Outgoing = (
     | StatusTextOut
     | ReferenceRecord
     | SolverRecord
+    | ConfigurationRecord
 )
-Record = ReferenceRecord | SolverRecord
+Record = ReferenceRecord | SolverRecord | ConfigurationRecord

@@ -25,8 +25,7 @@ from offboard.mavlink.outgoing import (
     CommandLong,
     Heartbeat,
     Outgoing,
-    ReferenceRecord,
-    SolverRecord,
+    Record,
     TimesyncReply,
 )
 from offboard.mavlink.px4 import PX4
@@ -64,11 +63,11 @@ class SessionSettings:
 class Reception:
     """What one portion of bytes brought, to be handled in this order: log `frames` (all with a
     correct checksum, whatever became of their content, except our own echoes), process `events`,
-    then send `replies`."""
+    then encode and send `replies` (sequence numbers are given in the order of sending)."""
 
     frames: tuple[bytes, ...] = ()
     events: tuple[Event, ...] = ()
-    replies: tuple[bytes, ...] = ()
+    replies: tuple[Outgoing, ...] = ()
 
 
 _NOTHING = Reception()
@@ -111,7 +110,6 @@ class Session:
         self.dialect: Dialect | None = None
         self._own = Address(settings.system_id or 1, settings.component_id)
         self._peer: Hashable | None = None
-        self._heard = settings.speaks_first
         self._splitter = framing.FrameSplitter(settings.stream, self.counters)
         self._sequence_in = SequenceTracker()
         self._sequence_out: dict[int, int] = {}
@@ -141,9 +139,8 @@ class Session:
             else:
                 self.counters.ignored += 1
             if frame.verified and outcome is not DropReason.ECHO:
-                self._heard = True
                 frames.append(frame.raw)
-        return Reception(tuple(frames), tuple(events), tuple(self.encode(r) for r in replies))
+        return Reception(tuple(frames), tuple(events), tuple(replies))
 
     def _accept(
         self,
@@ -254,8 +251,8 @@ class Session:
         """Frames that are due: our heartbeat (1 Hz of host or vehicle time, whichever is faster)
         and requests for telemetry that is missing or too slow. Call it every cycle."""
         self._link_time.host(now_s)
-        if not self._heard:
-            return ()
+        if self.dialect is None and not self.settings.speaks_first:
+            return ()  # PX4 remembers the type of every heartbeat and misses the one that changed
         due: list[Outgoing] = []
         link_s = self._link_time.seconds
         if self._heartbeat_sent is None or (
@@ -280,7 +277,7 @@ class Session:
             target = Address(self.vehicle.system_id, self.vehicle.component_id)
         packed = outbound.encode(outgoing, target, self.dialect)
         component_id = self.settings.component_id
-        if isinstance(outgoing, (ReferenceRecord, SolverRecord)):
+        if isinstance(outgoing, Record):
             component_id = self.settings.record_component_id
         sequence = self._sequence_out.get(component_id, 0)
         self._sequence_out[component_id] = (sequence + 1) % 256

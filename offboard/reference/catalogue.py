@@ -147,11 +147,13 @@ class FromTable(_Shape):
     """A CSV table (see `table`); positions relative to the take-off point, heights as written.
 
     `course: table` takes the column course_deg, and the fixed `course_deg` where there is none.
-    `knot_spacing_s` > 0 smooths rounded or noisy rows.
+    `knot_spacing_s` > 0 smooths rounded or noisy rows. `text` is the file's content, kept by
+    whoever read the file, so that a recorded configuration stands alone.
     """
 
     shape: Literal["table"]
     file: Annotated[str, Field(min_length=1, max_length=4096)]
+    text: str | None = None
     height_m: Literal[0] = 0
     knot_spacing_s: Annotated[float, Field(ge=0, le=60)] = 0.0
     course: CourseMode = CourseMode.TABLE  # type: ignore[assignment]  # one choice more than others
@@ -177,14 +179,15 @@ SHAPES: Mapping[str, type[Shape]] = {
 def build(config: Shape, table_text: str | None = None) -> Track:
     """The track of a configuration, NED relative to the take-off point.
 
-    `table_text` is the content of the file that a table names. Raises ValueError (TableError for
+    `table_text` is the content of the file that a table names, if the table has no `text`. Raises ValueError (TableError for
     a table) with one sentence where the configuration does not make a path.
     """
     columns_course: Course | None = None
     if isinstance(config, FromTable):
-        if table_text is None:
+        text = config.text or table_text
+        if text is None:
             raise ValueError(f"the table {config.file} has not been read")
-        path, columns_course = _from_table(config, table_text)
+        path, columns_course = _from_table(config, text)
     else:
         path = config.path()
     if config.course is CourseMode.ALONG_VELOCITY:

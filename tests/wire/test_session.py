@@ -161,11 +161,11 @@ def test_implausible_contents_are_dropped_but_logged(frame: Callable[[Sender], b
 def test_a_quaternion_nearly_unit_is_normalised() -> None:
     vehicle = Sender()
     session = pinned(vehicle)
-    frame = vehicle.attitude(1500, 0.0, 1.05, 0.0, 0.0, 0.1, 0.2, 0.3)
+    frame = vehicle.attitude(1500, 0.84, 0.0, -0.63, 0.0, 0.1, 0.2, 0.3)  # length 1.05
     (event,) = session.receive(frame, PEER, 0.0).events
     assert isinstance(event, events.Attitude)
     assert event.time_s == 1.5
-    assert event.attitude == pytest.approx((0.0, 1.0, 0.0, 0.0))
+    assert event.attitude == pytest.approx((0.8, 0.0, -0.6, 0.0))
     assert event.rates_frd_radps == pytest.approx((0.1, 0.2, 0.3))
 
 
@@ -243,6 +243,8 @@ def test_a_jump_back_is_a_reboot() -> None:
     vehicle = Sender()
     session = pinned(vehicle)
     times(session, vehicle.position(60000), vehicle.attitude(60000))
+    assert len(session.poll(0.0)) > 4
+    assert session.poll(0.0) == ()
     reception = session.receive(vehicle.position(500), PEER, 0.0)
     assert reception.events[0] == events.Reset(0.5)
     assert isinstance(reception.events[1], events.LocalPosition)
@@ -346,7 +348,7 @@ def test_timesync_is_answered_after_the_events_of_its_datagram() -> None:
     reception = session.receive(vehicle.position(1000) + request, PEER, 2.5)
     assert len(reception.events) == 1
     assert len(reception.frames) == 2
-    (reply,) = map(understood, reception.replies)
+    (reply,) = (understood(session.encode(reply)) for reply in reception.replies)
     assert (reply.tc1, reply.ts1) == (2_500_000_000, 123_456_789_012)
     answer = vehicle.frame(mavlink.MAVLink_timesync_message(1, 2))
     assert session.receive(answer, PEER, 2.5).replies == ()
@@ -356,7 +358,7 @@ def test_timesync_is_answered_before_the_first_heartbeat() -> None:
     session = Session(SessionSettings())
     request = Sender(7).frame(mavlink.MAVLink_timesync_message(0, 5))
     (reply,) = session.receive(request, PEER, 1.0).replies
-    assert understood(reply).ts1 == 5
+    assert understood(session.encode(reply)).ts1 == 5
     ground_station = Sender(255, 190).frame(mavlink.MAVLink_timesync_message(0, 5))
     assert session.receive(ground_station, PEER, 1.0).replies == ()
 
@@ -370,7 +372,7 @@ def test_nothing_is_said_into_the_void_unless_asked() -> None:
     assert kinds(Session(SessionSettings(speaks_first=True)).poll(0.0)) == ["HEARTBEAT"]
     session = Session(SessionSettings())
     session.receive(Sender(255, 190).heartbeat(8, vehicle_type=6), PEER, 0.0)
-    assert kinds(session.poll(0.0)) == ["HEARTBEAT"]
+    assert session.poll(0.0) == ()
 
 
 @pytest.mark.parametrize(("autopilot", "vehicle_type"), [(PX4, 6), (ARDUPILOT, 18)])
@@ -379,6 +381,14 @@ def test_heartbeat_of_the_type_the_autopilot_wants(autopilot: int, vehicle_type:
     beats = [(0.1 * i, frame) for i in range(100) for frame in session.poll(0.1 * i)]
     assert [understood(frame).type for _, frame in beats] == [vehicle_type] * 10
     assert [t for t, _ in beats] == pytest.approx(list(range(10)))
+
+
+def test_heartbeat_of_the_right_type_at_once_when_found() -> None:
+    session = Session(SessionSettings(speaks_first=True, requests_intervals=False))
+    (before,) = session.poll(0.0)
+    session.receive(Sender().heartbeat(PX4), PEER, 0.1)
+    (after,) = session.poll(0.1)
+    assert (understood(before).type, understood(after).type) == (18, 6)
 
 
 def test_heartbeat_follows_vehicle_time_when_that_is_faster() -> None:

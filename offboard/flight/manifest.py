@@ -1,0 +1,43 @@
+"""What a flight was flown with, inside its own log: one text in numbered, compressed pieces.
+
+The pieces are TUNNEL messages under our own component id, the first records of the .tlog. Twin
+functions: what `pieces` cuts, `join` puts together.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from collections.abc import Iterable
+
+from offboard.mavlink.outgoing import ConfigurationRecord
+
+PAYLOAD_TYPE = 0xC0F1  # TUNNEL.payload_type; above 32767 a number needs no registration
+_HEAD = struct.Struct("<HH")  # index of the piece, number of pieces
+_ROOM = 128 - _HEAD.size
+
+
+def pieces(text: str) -> list[ConfigurationRecord]:
+    """Records that hold `text`, in order."""
+    data = zlib.compress(text.encode("utf-8"), 9)
+    parts = [data[at : at + _ROOM] for at in range(0, len(data), _ROOM)]
+    return [
+        ConfigurationRecord(_HEAD.pack(index, len(parts)) + part, PAYLOAD_TYPE)
+        for index, part in enumerate(parts)
+    ]
+
+
+def join(payloads: Iterable[bytes]) -> str | None:
+    """The text in the payloads of TUNNEL messages in the order of the log; None if incomplete."""
+    parts: dict[int, bytes] = {}
+    count = 0
+    for payload in payloads:
+        if len(payload) > _HEAD.size:
+            index, count = _HEAD.unpack_from(payload)
+            parts[index] = payload[_HEAD.size :]
+    if not count or sorted(parts) != list(range(count)):
+        return None
+    try:
+        return zlib.decompress(b"".join(parts[index] for index in range(count))).decode("utf-8")
+    except (zlib.error, UnicodeDecodeError):
+        return None
