@@ -28,7 +28,7 @@ class IntegralSettings(Parameters):
     stays within +-`limits`."""
 
     weights: tuple[Weight, Weight, Weight, Weight] = (80.0, 80.0, 15.0, 0.0)
-    limits: tuple[Limit, Limit, Limit, Limit] = (20.0, 20.0, 20.0, 2.0)
+    limits: tuple[Limit, Limit, Limit, Limit] = (200.0, 200.0, 200.0, 5.0)
 
 
 def augmented(dynamics: Array, inputs: Array, step_s: float) -> tuple[Array, Array]:
