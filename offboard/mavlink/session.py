@@ -163,7 +163,8 @@ class Session:
         if frame.message_id == _TIMESYNC:
             tc1_ns, ts1_ns = inbound.decode_timesync(frame.payload)
             if tc1_ns == 0:
-                replies.append(TimesyncReply(int(now_s * 1e9), ts1_ns))
+                # at time 0 the answer would be taken for a question
+                replies.append(TimesyncReply(max(1, int(now_s * 1e9)), ts1_ns))
             return tc1_ns == 0
         return self._interpret(frame, now_s, events)
 

@@ -357,8 +357,10 @@ def test_timesync_is_answered_after_the_events_of_its_datagram() -> None:
 def test_timesync_is_answered_before_the_first_heartbeat() -> None:
     session = Session(SessionSettings())
     request = Sender(7).frame(mavlink.MAVLink_timesync_message(0, 5))
-    (reply,) = session.receive(request, PEER, 1.0).replies
-    assert understood(session.encode(reply)).ts1 == 5
+    (reply,) = session.receive(request, PEER, 0.0).replies
+    answer = understood(session.encode(reply))
+    assert answer.ts1 == 5
+    assert answer.tc1 != 0
     ground_station = Sender(255, 190).frame(mavlink.MAVLink_timesync_message(0, 5))
     assert session.receive(ground_station, PEER, 1.0).replies == ()
 
