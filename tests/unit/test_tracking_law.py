@@ -154,6 +154,10 @@ def test_unconstrained_minimiser_is_the_lqr_law() -> None:
         assert minimiser[1:3] == pytest.approx(expected_tilt, abs=1e-9)
         assert minimiser[0] == pytest.approx(force / upright, abs=1e-9)
         assert minimiser[3] == pytest.approx(target.course_feedforward_rad)
+        # what an optimal law has left to pay is x' P x
+        left = np.sum(np.array(off) * (law.lateral.terminal @ np.array(off)))
+        left += vertical @ law.vertical.terminal @ np.array(vertical)
+        assert float(problem(minimiser)) == pytest.approx(left, rel=1e-9)
 
 
 def test_cost_vanishes_on_the_reference_and_never_goes_below_zero() -> None:
