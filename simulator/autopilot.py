@@ -200,7 +200,6 @@ class Autopilot:
         target = {
             "*": self.mode.name if rule.to == "*" else rule.to,
             "requested": asked,
-            "intended": self.intended,
             "remembered": self.remembered,
         }.get(rule.to, rule.to)
         if rule.to != "*":

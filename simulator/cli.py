@@ -85,6 +85,7 @@ def simulate(
         seed,
         system=instance + 1,
         lockstep=lockstep,
+        ground_link=ground is not None,
         epoch_us=VIRTUAL_EPOCH_US if lockstep else unix_us(),
     )
     purpose = "waiting at" if connect.startswith("udpin:") else "sending to"

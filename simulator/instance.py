@@ -23,7 +23,8 @@ _POSITION_INTERVAL_MS = 8
 class Instance:
     """A vehicle in the air or on the ground, its autopilot and its companion and ground links.
 
-    `lockstep` replaces the companion link's TIMESYNC stream by barriers (see `barrier_due`).
+    `lockstep` replaces the companion link's TIMESYNC stream by barriers (see `barrier_due`);
+    without `ground_link` nothing is built for a ground station.
     """
 
     def __init__(
@@ -35,12 +36,13 @@ class Instance:
         *,
         system: int = 1,
         lockstep: bool = False,
+        ground_link: bool = True,
         epoch_us: int = VIRTUAL_EPOCH_US,
     ) -> None:
         self.autopilot = Autopilot(firmware, Plant(vehicle, conditions, seed))
         view = View(self.autopilot, system, epoch_us)
         self.companion = Server(view, firmware.companion_rates_hz, barrier=lockstep)
-        self.ground = Server(view, firmware.ground_rates_hz)
+        self.ground = Server(view, firmware.ground_rates_hz if ground_link else {})
         self._barrier_ms = 0
 
     @property

@@ -127,11 +127,11 @@ class Runner:
             self._read_ground()
             if self._answered(stamp_ns, datagrams, patience_s) or self._stopping():
                 continue
-            if not self._instance.companion.heard:
+            if self._instance.companion.answered_ns < 0:
                 return Outcome(
                     3,
-                    f"no companion answered within {FIRST_CONTACT_S:.0f} s: start one that speaks"
-                    " MAVLink and answers TIMESYNC, or leave --lockstep away",
+                    f"no companion answered TIMESYNC within {FIRST_CONTACT_S:.0f} s:"
+                    " start one, or leave --lockstep away",
                 )
             self._tell(f"the companion fell silent at {self._instance.time_s:.2f} s")
             if not self._free_run():

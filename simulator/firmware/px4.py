@@ -97,7 +97,7 @@ RULES = (
             ("POSCTL", "ALTCTL", "STABILIZED", "AUTO.RTL", "AUTO.LAND", "AUTO.LOITER")
         )
     ),
-    Rule("stream found", when=("failsafe",), to="intended", do=("recover",)),
+    Rule("stream found", when=("failsafe",), to="remembered", do=("recover",)),
     Rule("climbed", "AUTO.TAKEOFF", to="AUTO.LOITER"),
     Rule("took off", say=_info("Takeoff detected")),
     Rule("landed", say=_info("Landing detected")),

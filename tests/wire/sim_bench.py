@@ -36,9 +36,12 @@ class Bench:
         seed: int = 1,
         heartbeat_type: int | None = mavlink.MAV_TYPE_GCS,
         system: int = 1,
+        ground_link: bool = False,
     ) -> None:
         conditions = Conditions(estimator=estimator)
-        self.instance = Instance(PX4, px4_vehicle(), conditions, seed, system=system)
+        self.instance = Instance(
+            PX4, px4_vehicle(), conditions, seed, system=system, ground_link=ground_link
+        )
         self.system = system
         self.codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
         self.raw = bytearray()

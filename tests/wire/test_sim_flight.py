@@ -285,7 +285,7 @@ def test_the_same_seed_gives_the_same_bytes() -> None:
 
 
 def test_every_rule_names_modes_guards_and_actions_that_exist() -> None:
-    special = {"*", "requested", "intended", "remembered"}
+    special = {"*", "requested", "remembered"}
     for rule in PX4.rules:
         assert {rule.to, rule.mode} <= set(PX4.modes) | special
         assert set(rule.do) <= set(ACTIONS)

@@ -37,7 +37,7 @@ def test_default_rates_are_px4s() -> None:
 
 
 def test_the_ground_link_has_rates_and_a_sequence_of_its_own() -> None:
-    bench = Bench()
+    bench = Bench(ground_link=True)
     companion, ground = [], []
     for _ in range(2500):
         bench.instance.advance()

@@ -1,0 +1,112 @@
+"""Lockstep and its ends, on loopback sockets in one thread: what a process test would wait for."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Iterator
+
+import pytest
+from pymavlink.dialects.v20 import common as mavlink
+from sim_bench import px4_vehicle
+
+from simulator import run
+from simulator.conditions import Conditions
+from simulator.firmware.px4 import PX4
+from simulator.instance import Instance
+from simulator.run import Outcome, Runner
+from simulator.udp import LinkError, UdpLink, open_link
+
+
+@pytest.fixture
+def companion() -> Iterator[socket.socket]:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as sock:
+        sock.bind(("127.0.0.1", 0))
+        sock.setblocking(False)
+        yield sock
+
+
+@pytest.fixture
+def link(companion: socket.socket) -> Iterator[UdpLink]:
+    opened = open_link(f"udpout:127.0.0.1:{companion.getsockname()[1]}", 0)
+    yield opened
+    opened.close()
+
+
+def runner(link: UdpLink, told: list[str]) -> Runner:
+    instance = Instance(PX4, px4_vehicle(), Conditions(), 1, lockstep=True)
+    return Runner(instance, link, None, stopping=lambda: False, tell=told.append)
+
+
+def test_without_a_companion_it_gives_up(link: UdpLink, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(run, "FIRST_CONTACT_S", 0.1)
+    told: list[str] = []
+    outcome = runner(link, told).lockstep(5.0)
+    assert outcome == Outcome(
+        3, "no companion answered TIMESYNC within 0 s: start one, or leave --lockstep away"
+    )
+    assert told == []
+
+
+def test_one_that_answers_once_and_then_never_is_missed(
+    link: UdpLink, companion: socket.socket
+) -> None:
+    answer = mavlink.MAVLink_timesync_message(1, 8_000_000).pack(mavlink.MAVLink(None))
+    companion.sendto(answer, ("127.0.0.1", link.port))
+    told: list[str] = []
+    outcome = runner(link, told).lockstep(0.1)
+    assert outcome == Outcome(3, "the companion did not come back")
+    assert told == [
+        "the companion fell silent at 0.02 s",
+        "without it the vehicle is landed and disarmed at 0.0 s",
+    ]
+
+
+def test_an_answer_to_another_barrier_does_not_count(
+    link: UdpLink, companion: socket.socket, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "FIRST_CONTACT_S", 0.1)
+    answer = mavlink.MAVLink_timesync_message(1, 123).pack(mavlink.MAVLink(None))
+    companion.sendto(answer, ("127.0.0.1", link.port))
+    told: list[str] = []
+    outcome = runner(link, told).lockstep(0.1)
+    assert outcome.code == 3
+    assert told[0] == "the companion fell silent at 0.01 s"
+
+
+def test_peers_are_learned_and_bounded(link: UdpLink, companion: socket.socket) -> None:
+    others = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(20)]
+    for other in others:
+        other.bind(("127.0.0.1", 0))
+        other.setblocking(False)
+        other.sendto(b"x", ("127.0.0.1", link.port))
+        run.wait([link], 1.0)
+        assert link.receive() == b"x"
+    link.send([b"telemetry"])
+    heard = [_received(other) for other in others]
+    for other in others:
+        other.close()
+    assert heard == [None] * 5 + [b"telemetry"] * 15
+    assert _received(companion) == b"telemetry"
+
+
+def _received(sock: socket.socket) -> bytes | None:
+    try:
+        return sock.recv(100)
+    except BlockingIOError:
+        return None
+
+
+@pytest.mark.parametrize(
+    "url", ["", "udp:127.0.0.1:1", "udpout:127.0.0.1", "udpout::5", "udpin:127.0.0.1:x"]
+)
+def test_what_is_no_link_is_refused(url: str) -> None:
+    with pytest.raises(LinkError, match="is no link"):
+        open_link(url, 0)
+
+
+def test_a_taken_preferred_port_gives_way(link: UdpLink) -> None:
+    second = open_link("udpout:127.0.0.1:9", link.port)
+    try:
+        assert second.port != link.port
+    finally:
+        second.close()
