@@ -128,7 +128,7 @@ def _model_rows() -> list[Row]:
             "printed": "order of Eq. 5 (11 rows)",
             "holds": "φ p ψ r θ q x u (y, lost) v z w",
             "shown_by": "in the order of Eq. 5 row 2 would be θ, which τ_x moves by "
-            f"{right[printed.STATE_NAMES.index('theta'), 1]:.4f}; printed is 0.8992, p's value",
+            f"{right[printed.STATE_NAMES.index('theta'), 1]:g}; printed is 0.8992, p's value",
         },
         {
             "where": "Eq. 16, sign",

@@ -59,6 +59,11 @@ def line(
     }  # fmt: skip
 
 
+def legend_beside() -> dict[str, Any]:
+    """For many entries: a column at the right, clear of the toolbar."""
+    return {"orientation": "v", "x": 1.01, "y": 1.0, "yanchor": "top"}
+
+
 def axis(letter: str, panel: int) -> str:
     return letter if panel == 1 else f"{letter}{panel}"
 

@@ -39,7 +39,7 @@ Flown = Mapping[PlantKind, Flight]
 def search_motion(searches: Sequence[Search]) -> Figure:
     """Fig. 4: the particles in [f_t, tau_x], one row per lambda, four iterations each."""
     traces: list[Trace] = []
-    layout: dict[str, object] = {"height": 60 + 300 * len(searches), "showlegend": False}
+    layout: dict[str, object] = {"height": 90 + 250 * len(searches), "showlegend": False}
     notes = []
     wide, tall = 1.0 / len(SHOWN_ITERATIONS), 1.0 / len(searches)
     for row, found in enumerate(searches):
@@ -48,20 +48,21 @@ def search_motion(searches: Sequence[Search]) -> Figure:
             traces += _cloud(found, column, panel)
             left, bottom = column * wide, 1.0 - (row + 1) * tall
             number = "" if panel == 1 else str(panel)
+            below = {"text": "f_t, N" if found is searches[-1] else "", "standoff": 4}
             layout[f"xaxis{number}"] = {
                 "domain": [left + 0.035, left + wide - 0.01], "anchor": axis("y", panel),
-                "range": _padded(found.lower[0], found.upper[0]), "title": {"text": "f_t, N"},
+                "range": _padded(found.lower[0], found.upper[0]), "title": below,
                 "gridcolor": "#e4e7eb", "zeroline": False,
             }  # fmt: skip
             layout[f"yaxis{number}"] = {
-                "domain": [bottom + 0.09, bottom + tall - 0.07], "anchor": axis("x", panel),
+                "domain": [bottom + 0.04, bottom + tall - 0.06], "anchor": axis("x", panel),
                 "range": _padded(found.lower[1], found.upper[1]), "gridcolor": "#e4e7eb",
                 "zeroline": False, **({"title": {"text": "τ_x, N"}} if column == 0 else {}),
             }  # fmt: skip
             notes.append(
                 {
                     "text": f"{'abcd'[column]})  λ = {found.damping:g}, iteration {iteration}",
-                    "x": left + 0.035, "y": bottom + tall - 0.055, "xref": "paper",
+                    "x": left + 0.035, "y": bottom + tall - 0.05, "xref": "paper",
                     "yref": "paper", "showarrow": False, "xanchor": "left", "yanchor": "bottom",
                 }
             )  # fmt: skip
@@ -129,7 +130,8 @@ def reference_path(way: Reach, flights: Mapping[str, Flight]) -> Figure:
     scene = {
         "xaxis": {"title": {"text": "north, m"}}, "yaxis": {"title": {"text": "east, m"}},
         "zaxis": {"title": {"text": "height, m"}}, "aspectmode": "manual",
-        "aspectratio": {"x": 1.2, "y": 1.2, "z": 0.5},
+        "aspectratio": {"x": 1.5, "y": 1.5, "z": 0.6},
+        "camera": {"eye": {"x": 1.2, "y": 1.3, "z": 0.8}, "center": {"x": 0, "y": 0, "z": -0.2}},
     }  # fmt: skip
     return Figure(
         "Fig. 6: the path", traces, {"height": 560, "scene": scene},

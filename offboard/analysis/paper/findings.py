@@ -19,6 +19,7 @@ from offboard.analysis.paper.figure import (
     RED,
     Figure,
     Trace,
+    legend_beside,
     line,
     numbers,
     panels,
@@ -102,13 +103,13 @@ def both_laws(
     slow = next(mode.time_constant_s for mode in modes if mode.name == "one step, Eqs. 33-35")
     times = np.linspace(0.0, 100.0, 50)
     traces.append(
-        line(times, np.exp(-times / slow), f"e^(-t / {slow:.1f} s), from the model", GREY,
+        line(times, np.exp(-times / slow), f"model: e^(-t / {slow:.1f} s)", GREY,
              dash="dash")
     )  # fmt: skip
     layout = panels(("1 m off at hover: error, m", "tour: position error, m"), "t, s")
     for number in ("", "2"):
         layout[f"yaxis{number}"].update({"type": "log", "range": [-5, 0.7]})
-    layout["height"] = 640
+    layout |= {"height": 640, "legend": legend_beside()}
     return Figure(
         "One step and cost-to-go, flown", traces, layout,
         "Same weights (Eqs. 33-35), same swarm, same box; the cost-to-go also gets a reference "
@@ -132,7 +133,7 @@ def integral(flown: Mapping[tuple[str, str, PlantKind], Flight]) -> Figure:
     layout = panels([f"{case}: error, m" for case in cases], "t, s")
     for number in range(len(cases)):
         layout[f"yaxis{number + 1 if number else ''}"].update({"type": "log", "range": [-6, 1.5]})
-    layout["height"] = 640
+    layout |= {"height": 640, "legend": legend_beside()}
     return Figure(
         "Integral term", traces, layout, "Hover from the reference's start; error against time."
     )
@@ -182,6 +183,7 @@ def peers(heats: Sequence[Heat]) -> Figure:
     layout = single(
         "time for one solve, ms", "gap to J*, median",
         x={"type": "log"}, y={"type": "log"}, height=520,
+        legend=legend_beside(),
     )  # fmt: skip
     budgets = ", ".join(str(budget) for budget in BUDGETS)
     return Figure(

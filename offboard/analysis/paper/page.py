@@ -31,7 +31,7 @@ SECTIONS: tuple[tuple[str, tuple[str, ...]], ...] = (
 _STYLE = """
 :root { color-scheme: light; }
 body { font: 15px/1.5 system-ui, sans-serif; color: #1f2933; background: #f5f7fa; margin: 0; }
-main { max-width: 1180px; margin: 0 auto; padding: 1rem 1.5rem 4rem; }
+main { max-width: 1280px; margin: 0 auto; padding: 1rem 1.5rem 4rem; }
 h1 { font-size: 1.6rem; margin: 1rem 0 .3rem; } h2 { font-size: 1.3rem; margin: 2.5rem 0 .6rem; }
 h3 { font-size: 1.05rem; margin: 0 0 .5rem; }
 nav a { margin-right: 1.2rem; }
@@ -40,16 +40,20 @@ section > article { background: #fff; border: 1px solid #e4e7eb; border-radius: 
   padding: 1rem 1.2rem; margin: 0 0 1.2rem; }
 .scroll { overflow-x: auto; }
 table { border-collapse: collapse; font-size: 13px; font-variant-numeric: tabular-nums; }
-th, td { padding: .25rem .6rem; border-bottom: 1px solid #e4e7eb; text-align: right;
+th, td { padding: .25rem .5rem; border-bottom: 1px solid #e4e7eb; text-align: right;
   vertical-align: top; white-space: nowrap; }
 th { background: #f0f4f8; font-weight: 600; white-space: normal; vertical-align: bottom; }
-td.text { text-align: left; white-space: normal; min-width: 6rem; max-width: 30rem; }
+th.text, td.text { text-align: left; }
+td.long { white-space: normal; min-width: 12rem; max-width: 30rem; }
 td.printed { color: #829ab1; }
 .note { color: #52606d; font-size: 13px; margin: .5rem 0 0; }
 .missing { background: #fffbea; border: 1px solid #f0b429; padding: .6rem 1rem; }
 dl.run { display: grid; grid-template-columns: max-content auto; gap: 0 1rem; font-size: 13px; }
 dd { margin: 0; }
 """
+
+_WORDS = ' class="text"'
+_LONG = 44  # characters; a longer cell may break
 
 _SCRIPT = """
 for (const element of document.querySelectorAll(".figure")) {
@@ -114,13 +118,22 @@ def _article(name: str, piece: Piece) -> str:
 
 
 def _table(table: Table) -> str:
-    heads = "".join(f"<th>{html.escape(column.heading)}</th>" for column in table.columns)
+    worded = {
+        column.key
+        for column in table.columns
+        if any(isinstance(row.get(column.key), str) for row in table.rows)
+    }
+    heads = "".join(
+        f"<th{_WORDS if column.key in worded else ''}>{html.escape(column.heading)}</th>"
+        for column in table.columns
+    )
     rows = []
     for row in table.rows:
         cells = []
         for column in table.columns:
             value = row.get(column.key)
-            kinds = ["text"] if isinstance(value, str) else []
+            kinds = ["text"] if column.key in worded else []
+            kinds += ["long"] if isinstance(value, str) and len(value) > _LONG else []
             kinds += ["printed"] if "printed" in column.key else []
             mark = f' class="{" ".join(kinds)}"' if kinds else ""
             cells.append(f"<td{mark}>{html.escape(shown(value))}</td>")

@@ -275,5 +275,6 @@ CAPTIONS = {
     14: "Hardly different from Fig. 9, as in the paper.",
     15: "Weights of Eqs. 33-35.",
     16: "Velocities now follow the reference closely.",
-    17: "The visible steady error of the conclusions: a time constant of 39 s.",
+    17: "The visible steady error of the conclusions: a time constant of 39 s. On the nonlinear "
+    "plant tilt costs lift, and the height errs too.",
 }

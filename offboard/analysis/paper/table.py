@@ -60,7 +60,7 @@ def shown(cell: Cell) -> str:
         return cell
     if isinstance(cell, int) or (cell == round(cell) and abs(cell) < 1e5):
         return f"{cell:.0f}"
-    if 1e-3 <= abs(cell) < 1e5:
+    if 1e-4 <= abs(cell) < 1e5:
         return f"{cell:.4g}"
     return f"{cell:.3e}"
 
