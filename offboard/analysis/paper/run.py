@@ -9,10 +9,10 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from concurrent.futures import Executor, Future, ProcessPoolExecutor, as_completed
 from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from importlib import metadata
 from pathlib import Path
@@ -58,10 +58,10 @@ def reproduce(options: PaperOptions, console: Console | None = None) -> Outcome:
     )  # fmt: skip
     interrupted = False
     try:
-        with progress:
+        with progress, closing(_results(plan, options.workers)) as results:
             bar = progress.add_task("paper", total=len(plan.jobs))
             desk.write_ready()
-            for key, result in _results(plan, options.workers):
+            for key, result in results:
                 desk.receive(key, result)
                 progress.advance(bar)
                 progress.update(bar, description=desk.last_written or "paper")
@@ -125,7 +125,7 @@ class _Failure:
     reason: str
 
 
-def _results(plan: Plan, workers: int | None) -> Iterator[tuple[Key, Any]]:
+def _results(plan: Plan, workers: int | None) -> Generator[tuple[Key, Any]]:
     """(key, result) as they come; a job that fails gives a `_Failure`."""
     count = min(workers or _processors(), len(plan.jobs))
     if count <= 1:
@@ -137,10 +137,11 @@ def _results(plan: Plan, workers: int | None) -> Iterator[tuple[Key, Any]]:
 
 
 def _from_pool(pool: Executor, jobs: dict[Key, Job]) -> Iterator[tuple[Key, Any]]:
-    futures: dict[Future[Any], Key] = {
-        pool.submit(_guarded, function, *arguments): key
-        for key, (function, arguments) in jobs.items()
-    }
+    with _deaf_to_interrupts():  # the processes start here, and stay so
+        futures: dict[Future[Any], Key] = {
+            pool.submit(_guarded, function, *arguments): key
+            for key, (function, arguments) in jobs.items()
+        }
     for future in as_completed(futures):
         try:
             yield futures[future], future.result()
@@ -165,6 +166,20 @@ def _pool(count: int) -> Iterator[ProcessPoolExecutor]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
+
+
+@contextmanager
+def _deaf_to_interrupts() -> Iterator[None]:
+    """An interrupt of meanwhile comes afterwards; processes started meanwhile never hear one, not
+    even before `_start_worker`. Without signal masks (Windows) nothing changes."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _start_worker() -> None:

@@ -1,0 +1,137 @@
+"""The page of `offboard paper`, opened in Chromium without a network."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from playwright.sync_api import Page, sync_playwright
+from rich.console import Console
+
+from offboard.analysis.paper import peers
+from offboard.analysis.paper.options import FIGURES, TABLES, PaperOptions
+from offboard.analysis.paper.run import Outcome, reproduce
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
+# WebGL (Fig. 6) in software: a machine that tests has no graphics card
+FLAGS = (
+    "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--use-gl=angle",
+    "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+)  # fmt: skip
+PNG = b"\x89PNG\r\n\x1a\n"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+    options = PaperOptions(tmp_path_factory.mktemp("paper"), quick=True, seeds=1, workers=2)
+    return reproduce(options, Console(file=io.StringIO()))
+
+
+@pytest.fixture(scope="module")
+def browser() -> str:
+    found = next(filter(None, map(shutil.which, BROWSERS)), None)
+    if found is None:
+        pytest.fail(f"the page must be opened in a browser; install one of {', '.join(BROWSERS)}")
+    return found
+
+
+class Opened:
+    """The page in a browser, and everything it complained about or asked the network for."""
+
+    def __init__(self, page: Page, file: Path) -> None:
+        self.page = page
+        self.problems: list[str] = []
+        self.requests: list[str] = []
+        page.on("console", self._heard)
+        page.on("pageerror", lambda error: self.problems.append(str(error)))
+        page.on("request", lambda request: self.requests.append(request.url))
+        page.goto(file.as_uri())
+        page.wait_for_function(
+            "[...document.querySelectorAll('.figure')].every(f => f.dataset.drawn === 'yes')",
+            timeout=60_000,
+        )
+
+    def _heard(self, message: object) -> None:
+        if getattr(message, "type", "") == "error":
+            self.problems.append(str(getattr(message, "text", "")))
+
+
+@pytest.fixture(scope="module")
+def opened(run: Outcome, browser: str) -> Iterator[Opened]:
+    with sync_playwright() as playwright:
+        chromium = playwright.chromium.launch(executable_path=browser, args=list(FLAGS))
+        context = chromium.new_context(offline=True, viewport={"width": 1280, "height": 900})
+        yield Opened(context.new_page(), run.page)
+        chromium.close()
+
+
+def test_everything_is_on_the_page(run: Outcome) -> None:
+    assert not run.missing
+    wanted = {f"table {name}" for name in TABLES} | {f"figure {name}" for name in FIGURES}
+    assert set(run.finished) == wanted
+
+
+def test_the_page_opens_without_an_error_and_without_the_network(opened: Opened) -> None:
+    assert opened.problems == []
+    assert [url for url in opened.requests if not url.startswith(("file:", "data:", "blob:"))] == []
+
+
+def test_every_figure_is_drawn(opened: Opened) -> None:
+    drawn = opened.page.evaluate(
+        "[...document.querySelectorAll('.figure')].map(f => [f.id.replace('figure_', ''), "
+        "!!f.querySelector('.main-svg'), "
+        "f.querySelectorAll('.scatterlayer .trace path, .scatterlayer .trace').length "
+        "+ f.querySelectorAll('.gl-container canvas').length, f.clientHeight])"
+    )
+    assert {name for name, *_ in drawn} == set(FIGURES)
+    for name, svg, marks, height in drawn:
+        assert svg, name
+        assert marks > 0, name
+        assert height > 300, name
+
+
+def test_every_table_is_there_with_its_rows(opened: Opened) -> None:
+    rows = opened.page.evaluate(
+        "Object.fromEntries([...document.querySelectorAll('article[id^=table]')]"
+        ".map(a => [a.id.replace('table_', ''), a.querySelectorAll('tr').length - 1]))"
+    )
+    assert set(rows) == set(TABLES)
+    assert rows["2"] == 24
+    assert rows["4"] == 8
+    assert rows["bd"] == 12
+
+
+def test_a_figure_is_saved_as_an_image(opened: Opened, tmp_path: Path) -> None:
+    figure = opened.page.locator("#figure_5")
+    figure.scroll_into_view_if_needed()
+    assert opened.page.locator(".figure .modebar-btn").count() >= 2 * len(FIGURES)
+    with opened.page.expect_download(timeout=30_000) as download:
+        figure.locator(".modebar-btn").first.click()
+    download.value.save_as(tmp_path / "figure.png")
+    assert (tmp_path / "figure.png").read_bytes().startswith(PNG)
+
+
+def test_absent_peers_are_listed_as_absent(run: Outcome) -> None:
+    document = json.loads((run.page.parent / "table_peers.json").read_text(encoding="utf-8"))
+    solvers = " ".join(row["solver"] for row in document["rows"])
+    for name in peers.SOLVERS:
+        assert name in solvers
+    assert solvers.count("absent") == len(peers.absent())
+
+
+def test_the_swarm_reaches_the_optimum_within_the_papers_budget() -> None:
+    heats = peers.race("this swarm, λ = 0.65", PaperOptions(Path()).first_settings, 3)
+    assert heats[-1].budget == 6000
+    assert heats[-1].gap_p90 <= 1e-9
+    assert heats[0].gap_median > 1e-6
+
+
+def test_a_peer_whose_package_is_missing_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(peers, "_PACKAGES", {"CMA-ES": "no_such_package_anywhere"})
+    assert peers.absent() == ["CMA-ES"]
+    assert "CMA-ES" not in peers.present()
+    assert "CMA-ES: absent" in str(peers.peers_table([]).rows[0]["solver"])
