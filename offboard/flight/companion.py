@@ -200,7 +200,7 @@ class Companion:
     def _enter(self, row: Row, reason: str) -> None:
         self.announced.append(f"{row.target.value}: {reason}")
         self._conclude(row, reason)
-        self.view.said.clear()
+        self.view.forget_words()
         self.phase = row.target
         self._phase_began_s = self._session.link_time_s
         self._asked_s = -math.inf

@@ -137,9 +137,7 @@ TABLE: tuple[Row, ...] = (
     ),
     Row(Phase.STAND_DOWN, guards.rebooted, Phase.FAILED, _REBOOTED, REFUSED),
     Row(Phase.STAND_DOWN, guards.lost, Phase.FAILED, _SILENT, REFUSED),
-    Row(
-        Phase.STAND_DOWN, guards.disarmed_for_good, Phase.FAILED, "disarmed on the ground", REFUSED
-    ),
+    Row(Phase.STAND_DOWN, guards.disarmed_for_good, Phase.FAILED, _DISARMED),
     _too_long(
         Phase.STAND_DOWN,
         "disarm_s",

@@ -36,6 +36,7 @@ class VehicleView:
     attitude: Attitude | None = None
     parameters: dict[str, float] = field(default_factory=dict)
     said: deque[str] = field(default_factory=lambda: deque(maxlen=HEARD))
+    refused: deque[str] = field(default_factory=lambda: deque(maxlen=HEARD))
 
     @property
     def time_s(self) -> float:
@@ -98,7 +99,7 @@ class VehicleView:
                 "ACCEPTED",
                 "IN_PROGRESS",
             ):
-                self.said.append(f"command {command} {result}")
+                self.refused.append(f"command {command} {result}")
             case Reset():
                 self._forget()
 
@@ -110,7 +111,10 @@ class VehicleView:
 
     def explanation(self) -> str:
         """The vehicle's own last words, for the end of a sentence; empty if it said nothing."""
-        if not self.said:
-            return ""
-        recent = list(dict.fromkeys(self.said))[-3:]
-        return "; the vehicle said: " + " | ".join(recent)
+        words = list(dict.fromkeys(self.said or self.refused))[-3:]
+        return "; the vehicle said: " + " | ".join(words) if words else ""
+
+    def forget_words(self) -> None:
+        """What was said up to now explains nothing that happens from now on."""
+        self.said.clear()
+        self.refused.clear()

@@ -1,0 +1,186 @@
+"""What tests do to a flight: links that lose and shuffle, vehicles that refuse, laws that fail."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable
+from dataclasses import replace
+
+from pair import LEAN, Bytes, Filter, Pair, frames_of
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from offboard.control.base import Command, Controller, Decision, Situation
+from simulator import config
+from simulator.firmware.base import Firmware, Result, Rule, Say, Severity
+from simulator.instance import Instance
+
+ATTITUDE, POSITION, PARAM_VALUE = 31, 32, 22
+Action = Callable[[Pair], None]
+
+
+# --- vehicles -------------------------------------------------------------------------------------
+
+
+def refusing(event: str, text: str) -> Firmware:
+    """A vehicle that refuses one thing, with its reason."""
+    rule = Rule(event, result=Result.TEMPORARILY_REJECTED, say=Say(Severity.CRITICAL, text))
+    return replace(LEAN, rules=(rule, *LEAN.rules))
+
+
+def with_default(name: str, value: float) -> Firmware:
+    """A vehicle with one parameter set otherwise."""
+    parameters = (
+        replace(spec, default=value) if spec.name == name else spec for spec in LEAN.parameters
+    )
+    return replace(LEAN, parameters=tuple(parameters))
+
+
+def slow(rate_hz: float) -> Firmware:
+    """A vehicle that sends its state at `rate_hz` whatever it is asked for."""
+    state = ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
+    rates = {name: rate_hz if name in state else hz for name, hz in LEAN.companion_rates_hz.items()}
+    return replace(LEAN, companion_rates_hz=rates, fixed_rate=LEAN.fixed_rate | frozenset(state))
+
+
+# --- links ----------------------------------------------------------------------------------------
+
+
+def losing(share: float, seed: int = 3) -> Filter:
+    """A link that loses datagrams."""
+    chance = random.Random(seed)
+    return lambda _, datagrams: [d for d in datagrams if chance.random() >= share]
+
+
+def shuffling(seed: int = 5) -> Filter:
+    """A link that delays one datagram in five by 20 ms and duplicates another one in five."""
+    chance = random.Random(seed)
+    late: list[tuple[float, bytes]] = []
+
+    def shuffle(time_s: float, datagrams: Bytes) -> Bytes:
+        arriving = [datagram for due_s, datagram in late if due_s <= time_s]
+        late[:] = [entry for entry in late if entry[0] > time_s]
+        for datagram in datagrams:
+            draw = chance.random()
+            if draw < 0.2:
+                late.append((time_s + 0.02, datagram))
+            else:
+                arriving.extend([datagram] * (2 if draw < 0.4 else 1))
+        return arriving
+
+    return shuffle
+
+
+def noisy(_: float, datagrams: Bytes) -> Bytes:
+    """The vehicle's datagrams between garbage."""
+    return [part for d in datagrams for part in (b"\xfd\x09garbage", d, b"\x00" * 7)]
+
+
+def without(*message_ids: int) -> Filter:
+    """A link on which messages with these ids do not arrive."""
+    return lambda _, datagrams: [
+        b"".join(frame for frame in frames_of(d) if frame_id(frame) not in message_ids)
+        for d in datagrams
+    ]
+
+
+def frame_id(frame: bytes) -> int:
+    return int.from_bytes(frame[7:10], "little")
+
+
+def upside_down() -> Filter:
+    """A link on which every attitude is a roll by 180 degrees."""
+    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+
+    def turn(frame: bytes) -> bytes:
+        if frame_id(frame) != ATTITUDE:
+            return frame
+        stamp_ms = mavlink.MAVLink(None).decode(bytearray(frame)).time_boot_ms
+        message = mavlink.MAVLink_attitude_quaternion_message(stamp_ms, 0, 1, 0, 0, 0, 0, 0)
+        codec.seq = frame[4]
+        return bytes(message.pack(codec))
+
+    return lambda _, datagrams: [b"".join(map(turn, frames_of(d))) for d in datagrams]
+
+
+# --- events ---------------------------------------------------------------------------------------
+
+
+def stop(pair: Pair) -> None:
+    pair.companion.request_stop()
+
+
+def take_over(pair: Pair) -> None:
+    pair.pilot_takes_over()
+
+
+def die(pair: Pair) -> None:
+    pair.dead = True
+
+
+def kill_motors(pair: Pair) -> None:
+    pair.ground(400, 0, 21196)
+
+
+def restart(pair: Pair) -> None:
+    """The vehicle boots: on the ground, disarmed, its time from zero."""
+    conditions = config.scenario("calm").conditions
+    pair.instance = Instance(LEAN, config.vehicle("px4_sih"), conditions, 7)
+
+
+def jump(metres: float) -> Action:
+    """The estimator finds that it was `metres` further south."""
+    return lambda pair: pair.instance.autopilot.plant.reset_estimate((metres, 0.0, 0.0))
+
+
+def downlink(fault: Filter) -> Action:
+    """From now on telemetry comes through `fault`."""
+
+    def change(pair: Pair) -> None:
+        pair.down = fault
+
+    return change
+
+
+# --- laws -----------------------------------------------------------------------------------------
+
+
+class Failing:
+    """A controller that fails from its `after`-th decision on, for `times` decisions."""
+
+    def __init__(
+        self, law: Controller, fail: Callable[[Situation], Decision], after: int, times: float
+    ) -> None:
+        self._law, self._fail, self._after, self._times = law, fail, after, times
+        self._count = 0
+
+    def decide(self, situation: Situation) -> Decision:
+        self._count += 1
+        if self._after < self._count <= self._after + self._times:
+            return self._fail(situation)
+        return self._law.decide(situation)
+
+    def reset(self) -> None:
+        self._law.reset()
+
+
+def failing(
+    fail: Callable[[Situation], Decision], times: float = math.inf, after: int = 30
+) -> Callable[[Controller], Controller]:
+    return lambda law: Failing(law, fail, after, times)
+
+
+def raises(_: Situation) -> Decision:
+    raise ZeroDivisionError("nothing to divide by")
+
+
+def not_a_number(_: Situation) -> Decision:
+    return Decision(Command(math.nan, (0.0, 0.0, 1.0), 0.0))
+
+
+def no_direction(_: Situation) -> Decision:
+    return Decision(Command(9.8, (0.0, 0.0, 0.0), 0.0))
+
+
+def overturns(_: Situation) -> Decision:
+    return Decision(Command(1e6, (math.sin(2.5), 0.0, math.cos(2.5)), 0.0))

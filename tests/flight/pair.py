@@ -1,0 +1,225 @@
+"""Companion and simulated vehicle joined byte by byte in vehicle time, without socket or clock.
+
+`Pair.fly` steps the vehicle by 4 ms and hands every datagram over at once, through faults that a
+test puts on the two directions. Host time runs with vehicle time but from another zero, so that
+code which mixes them up fails.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from offboard import config
+from offboard.analysis import history, tlog
+from offboard.analysis.score import Score, score
+from offboard.control.base import Controller
+from offboard.control.catalogue import build
+from offboard.control.observer import Observer
+from offboard.flight.companion import Companion, Outcome
+from offboard.flight.log import FlightLog
+from offboard.flight.mission import Mission
+from offboard.flight.phases import Phase
+from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
+from offboard.mavlink.session import Session, SessionSettings
+from simulator import config as simulated
+from simulator.firmware.base import Firmware
+from simulator.firmware.px4 import PX4
+from simulator.instance import Instance
+from simulator.plant import STEP_S
+
+HOST_EPOCH_S = 5000.0
+POLL_STEPS = 5
+UNIX_EPOCH_US = 1_767_225_600_000_000
+LONGEST_S = 150.0
+LOITER = 3  # sub mode of PX4's AUTO
+
+Bytes = list[bytes]
+Filter = Callable[[float, Bytes], Bytes]
+
+# What the flight needs and no more: a third of the default traffic
+LEAN = replace(
+    PX4,
+    companion_rates_hz={
+        name: PX4.companion_rates_hz[name]
+        for name in ("HEARTBEAT", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "SYS_STATUS",
+                     "EXTENDED_SYS_STATE", "HOME_POSITION")
+    },
+)  # fmt: skip
+
+
+def through(_: float, datagrams: Bytes) -> Bytes:
+    """The link without a fault."""
+    return datagrams
+
+
+@dataclass
+class Pair:
+    """One flight. `at` maps moments to actions: each is done once, when its test first holds.
+
+    `down` and `up` see all datagrams (frames, up) with the vehicle time and return those that
+    arrive. With `dead` set the vehicle's process is gone while time goes on.
+    """
+
+    companion: Companion
+    instance: Instance
+    down: Filter = through
+    up: Filter = through
+    at: list[tuple[Callable[[Pair], bool], Callable[[Pair], object]]] = field(default_factory=list)
+    dead: bool = False
+    time_s: float = 0.0
+    sent: list[tuple[float, Phase, bytes]] = field(default_factory=list)  # by the companion
+    logged: Bytes = field(default_factory=list)
+    phases: list[tuple[float, Phase]] = field(default_factory=list)
+    heard_s: float = 0.0
+
+    def fly(self, longest_s: float = LONGEST_S) -> Outcome:
+        """To the end of the flight, which must come within `longest_s`."""
+        step = 0
+        while not self.companion.has_ended():
+            assert self.time_s < longest_s, f"no end after {longest_s} s: {self.companion.phase}"
+            step += 1
+            self.time_s = step * STEP_S
+            self._step()
+            if step % POLL_STEPS == 0 and not self.companion.has_ended():
+                now_s = HOST_EPOCH_S + self.time_s
+                self._take(self.companion.poll(now_s, self.time_s - self.heard_s))
+            for moment in [moment for moment in self.at if moment[0](self)]:
+                self.at.remove(moment)
+                moment[1](self)
+            if not self.phases or self.phases[-1][1] is not self.companion.phase:
+                self.phases.append((self.time_s, self.companion.phase))
+        assert self.companion.outcome is not None
+        return self.companion.outcome
+
+    def _step(self) -> None:
+        if self.dead:
+            return
+        for datagram in self.down(self.time_s, self.instance.step()):
+            if self.companion.has_ended():
+                return
+            output = self.companion.receive(datagram, "vehicle", HOST_EPOCH_S + self.time_s)
+            if output.alive:
+                self.heard_s = self.time_s
+            self._take(output)
+
+    def _take(self, output: Any) -> None:
+        self.logged.extend(output.log)
+        self.sent.extend((self.time_s, self.companion.phase, frame) for frame in output.send)
+        for frame in self.up(self.time_s, list(output.send)):
+            if not self.dead:
+                self.instance.feed(frame)
+
+    # -- what a test may do to the vehicle ------------------------------------------------------
+
+    def ground(self, number: int, *params: float) -> None:
+        """A command of the ground station, on its own link."""
+        codec = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+        filled = (*params, *(0.0,) * (7 - len(params)))
+        message = mavlink.MAVLink_command_long_message(1, 1, number, 0, *filled)
+        self.instance.feed_ground(message.pack(codec))
+
+    def pilot_takes_over(self) -> None:
+        self.ground(176, 1, 4, LOITER)
+
+    # -- what a test may ask afterwards -----------------------------------------------------------
+
+    @property
+    def setpoints(self) -> list[tuple[float, Phase, Any]]:
+        """Time, phase and decoded SET_ATTITUDE_TARGET."""
+        decoded = ((at_s, phase, decode(frame)) for at_s, phase, frame in self.sent)
+        return [row for row in decoded if row[2].get_type() == "SET_ATTITUDE_TARGET"]
+
+    @property
+    def payloads(self) -> Bytes:
+        """Of every SET_ATTITUDE_TARGET, as on the wire."""
+        return [frame[10:-2] for _, _, frame in self.sent if frame[7:10] == b"\x52\0\0"]
+
+    def commands(self, number: int) -> list[Any]:
+        """Every COMMAND_LONG with this MAV_CMD."""
+        decoded = (decode(frame) for _, _, frame in self.sent)
+        return [m for m in decoded if m.get_type() == "COMMAND_LONG" and m.command == number]
+
+    def went_through(self, phase: Phase) -> bool:
+        return any(flown is phase for _, flown in self.phases)
+
+    def score(self, directory: Path) -> Score:
+        """Of the log that this flight would have left."""
+        log = FlightLog(directory, "")
+        with log:
+            for index, frame in enumerate(self.logged):
+                log.write(UNIX_EPOCH_US + 100 * index, frame)
+        return score(history.gather(tlog.read(log.path)))
+
+
+def decode(frame: bytes) -> Any:
+    return mavlink.MAVLink(None).decode(bytearray(frame))
+
+
+def frames_of(datagram: bytes) -> Iterable[bytes]:
+    """The MAVLink 2 frames of a datagram, unsigned."""
+    at = 0
+    while at < len(datagram):
+        size = 12 + datagram[at + 1]
+        yield datagram[at : at + size]
+        at += size
+
+
+def in_phase(phase: Phase, for_s: float = 0.0) -> Callable[[Pair], bool]:
+    """The moment when the companion has been in `phase` for `for_s`."""
+
+    def now(pair: Pair) -> bool:
+        return (
+            pair.companion.phase is phase
+            and bool(pair.phases)
+            and pair.phases[-1][1] is phase
+            and pair.time_s - pair.phases[-1][0] >= for_s
+        )
+
+    return now
+
+
+def make(
+    *assignments: str,
+    name: str = "flight",
+    reference: str | None = None,
+    seed: int = 7,
+    scenario: str = "calm",
+    firmware: Firmware = LEAN,
+    wrap: Callable[[Controller], Controller] = lambda controller: controller,
+    limits: dict[str, float] | None = None,
+    **options: Any,
+) -> Pair:
+    """A pair as `offboard fly --sitl` would make it, and what a test changes about it."""
+    choices = {"reference": reference} if reference else {}
+    resolved = config.load(name, choices=choices, assignments=assignments, seed=seed)
+    vehicle = resolved.vehicle
+    controller = build(resolved.controller, vehicle, resolved.period_s, resolved.seed)
+    companion = Companion(
+        vehicle=vehicle,
+        session=Session(
+            SessionSettings(component_id=COMPONENT_ID, record_component_id=RECORD_COMPONENT_ID)
+        ),
+        observer=Observer(vehicle, resolved.observer),
+        controller=wrap(controller),
+        mission=Mission(config.build_track(resolved)),
+        limits=resolved.limits.model_copy(update=limits or {}),
+        period_s=resolved.period_s,
+        deadline_s=None,
+        stopwatch=lambda: 0.0,
+    )
+    conditions = simulated.scenario(scenario).conditions
+    instance = Instance(firmware, simulated.vehicle("px4_sih"), conditions, seed)
+    return Pair(companion, instance, **options)
+
+
+SHORT = ("reference.height_m=1.0", "reference.duration_s=3.0")
+
+
+def hover(*assignments: str, **options: Any) -> Pair:
+    """A flight of 20 s: up to 1 m, three seconds of hover, down."""
+    return make(*SHORT, *assignments, reference="hover", **options)

@@ -1,0 +1,69 @@
+"""What a flight must achieve, in numbers: the default, the paper's law, and a bad one."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import pytest
+from pair import make
+
+from offboard.flight.phases import Phase
+
+
+@pytest.mark.parametrize(
+    ("scenario", "seed", "most_m"),
+    [
+        ("calm", 7, 0.02),
+        ("calm", 1, 0.02),
+        ("px4_like", 7, 0.05),
+        ("px4_like", 1, 0.05),
+        ("px4_like", 2, 0.05),
+    ],
+)
+def test_default_flight(scenario: str, seed: int, most_m: float, tmp_path: Path) -> None:
+    pair = make(scenario=scenario, seed=seed)
+    outcome = pair.fly()
+    score = pair.score(tmp_path)
+    assert (outcome.exit_code, outcome.sentence) == (0, "flown and landed")
+    assert score.rmse_position_m <= most_m
+    assert score.tracked_s == pytest.approx(16.0, abs=0.3)
+    assert score.setpoint_gap_max_s <= 0.12
+    assert score.missed_ticks == 0
+    assert score.gap_median <= 1e-9
+    assert abs(pair.instance.autopilot.truth.position_ned_m[2]) < 0.05
+    assert not pair.instance.autopilot.armed
+
+
+def test_raw_velocity_shows_what_the_estimator_does(tmp_path: Path) -> None:
+    pair = make("observer.velocity=reported", scenario="px4_like")
+    pair.fly()
+    assert pair.score(tmp_path).rmse_position_m > 0.1
+
+
+def test_paper_law_flies_and_lands(tmp_path: Path) -> None:
+    pair = make(name="paper", scenario="px4_like")
+    assert pair.fly().exit_code == 0
+    assert pair.went_through(Phase.TRACK)
+    assert 0.1 < pair.score(tmp_path).rmse_position_m < 2.5
+
+
+def test_same_seed_same_bytes_another_seed_others() -> None:
+    short = ("reference.laps=1", "reference.period_s=6", "reference.half_length_m=1")
+    first, again, other = (make(*short, scenario="px4_like", seed=seed) for seed in (7, 7, 8))
+    for pair in (first, again, other):
+        assert pair.fly().exit_code == 0
+    assert len(first.payloads) > 200
+    assert first.payloads == again.payloads
+    assert first.payloads != other.payloads
+
+
+def test_every_setpoint_is_finite_and_within_the_vehicle(tmp_path: Path) -> None:
+    pair = make(scenario="px4_like", reference="lemniscate_4mps")
+    assert pair.fly().exit_code == 0
+    for _, _, setpoint in pair.setpoints:
+        w, x, y, z = setpoint.q
+        assert math.sqrt(w * w + x * x + y * y + z * z) == pytest.approx(1.0, abs=1e-6)
+        assert 0.0 <= setpoint.thrust <= 1.0
+        assert 1.0 - 2.0 * (x * x + y * y) >= math.cos(0.7) - 1e-6
+        assert setpoint.type_mask == 7

@@ -1,0 +1,120 @@
+"""Small parts of the flight: the last look at a setpoint, parameters before it, its manifest."""
+
+from __future__ import annotations
+
+import math
+import random
+
+import numpy as np
+import pytest
+from pair import hover
+
+from offboard import config
+from offboard.control.base import Command
+from offboard.flight import manifest
+from offboard.flight.readiness import Readiness
+from offboard.flight.setpoint import clamp, usable
+from offboard.mavlink.ardupilot import ARDUPILOT
+from offboard.mavlink.px4 import PX4
+from offboard.model.vehicle import Vehicle
+
+NAN, INF = math.nan, math.inf
+
+
+@pytest.fixture(scope="module")
+def vehicle() -> Vehicle:
+    return config.load("flight").vehicle
+
+
+@pytest.mark.parametrize(
+    ("command", "expected"),
+    [
+        (Command(9.8, (0.0, 0.0, 1.0), 0.0), True),
+        (Command(9.8, (0.6, 0.0, 0.8), 3.0), True),
+        (Command(NAN, (0.0, 0.0, 1.0), 0.0), False),
+        (Command(INF, (0.0, 0.0, 1.0), 0.0), False),
+        (Command(9.8, (0.0, NAN, 1.0), 0.0), False),
+        (Command(9.8, (0.0, 0.0, 1.0), NAN), False),
+        (Command(9.8, (0.0, 0.0, 0.0), 0.0), False),
+        (Command(9.8, (0.0, 0.0, 1.02), 0.0), False),
+    ],
+)
+def test_usable(command: Command, expected: bool) -> None:
+    assert usable(command) is expected
+
+
+def test_clamp_leaves_what_is_within_and_turns_back_what_is_not(vehicle: Vehicle) -> None:
+    generator = np.random.default_rng(4)
+    for drawn in generator.normal(size=(500, 3)):
+        direction = drawn / np.linalg.norm(drawn)
+        command = Command(generator.uniform(-50, 50), tuple(direction), 0.3)
+        clamped = clamp(command, vehicle)
+        given = np.array(clamped.thrust_direction_ned)
+        assert np.linalg.norm(given) == pytest.approx(1.0)
+        assert given[2] >= math.cos(vehicle.tilt_max_rad) - 1e-9
+        assert 0.0 <= clamped.thrust_mps2 <= vehicle.thrust_max_mps2
+        assert clamped.course_rad == 0.3
+        across = direction[0] * given[1] - direction[1] * given[0]
+        assert across == pytest.approx(0.0, abs=1e-9)
+        assert direction[:2] @ given[:2] > 0.0
+        if direction[2] >= math.cos(vehicle.tilt_max_rad):
+            assert clamped.thrust_direction_ned == command.thrust_direction_ned
+
+
+def test_parameters_are_asked_for_again_until_they_answer() -> None:
+    readiness, known = Readiness(), {"MPC_THR_HOVER": 0.5}
+    first = [request.name for request in readiness.due(PX4, known, 10.0)]
+    assert first == [p.name for p in PX4.watched_parameters if p.name not in known]
+    assert readiness.due(PX4, known, 10.4) == []
+    assert len(readiness.due(PX4, known, 10.5)) == len(first)
+    assert not readiness.settled(PX4, known, 11.9)
+    assert readiness.settled(PX4, known, 12.0)
+    everything = {parameter.name: 1.0 for parameter in PX4.watched_parameters}
+    assert readiness.settled(PX4, everything, 10.6)
+
+
+def test_arducopter_must_tell_what_would_make_thrust_a_climb_rate() -> None:
+    readiness = Readiness()
+    readiness.due(ARDUPILOT, {}, 0.0)
+    assert readiness.unanswered(ARDUPILOT, {}) == ["GUID_OPTIONS", "ATC_ANGLE_BOOST"]
+    assert not readiness.settled(ARDUPILOT, {}, 100.0)
+    (complaint,) = readiness.complaints(ARDUPILOT, {"GUID_OPTIONS": 0.0, "ATC_ANGLE_BOOST": 1.0})
+    assert complaint.endswith("Mend: param set GUID_OPTIONS 8")
+    assert readiness.settled(ARDUPILOT, {"GUID_OPTIONS": 8.0, "ATC_ANGLE_BOOST": 1.0}, 2.1)
+
+
+@pytest.mark.parametrize("length", [0, 1, 123, 124, 125, 20_000])
+def test_manifest_round_trip(length: int) -> None:
+    source = random.Random(length)
+    text = "".join(chr(source.randrange(32, 500)) for _ in range(length))
+    records = manifest.pieces(text)
+    assert all(len(record.data) <= 128 for record in records)
+    assert manifest.join(record.data for record in records) == text
+
+
+def test_a_damaged_manifest_is_none() -> None:
+    source = random.Random(1)
+    text = "".join(chr(source.randrange(32, 500)) for _ in range(1000))
+    payloads = [record.data for record in manifest.pieces(text)]
+    assert len(payloads) > 3
+    assert manifest.join(payloads) == text
+    assert manifest.join(payloads[1:]) is None
+    assert manifest.join(payloads[:-1]) is None
+    assert manifest.join([]) is None
+    assert manifest.join([b"", b"\1"]) is None
+    assert manifest.join([b"\0\0\1\0 not compressed"]) is None
+    assert manifest.join([*payloads[:2], payloads[2][:-3] + b"???", *payloads[3:]]) is None
+
+
+def test_records_stay_at_home_and_no_sequence_has_a_gap() -> None:
+    """What the vehicle does not need goes to the log alone, under a component id of its own."""
+    pair = hover()
+    pair.fly()
+    assert {frame[6] for _, _, frame in pair.sent} == {191}
+    assert {frame[6] for frame in pair.logged} == {1, 191, 192}
+    for component in (191, 192):
+        numbers = [frame[4] for frame in pair.logged if frame[6] == component]
+        assert len(numbers) > 50
+        assert numbers == [index % 256 for index in range(len(numbers))]
+    sent = [frame for _, _, frame in pair.sent]
+    assert [frame for frame in pair.logged if frame[6] == 191] == sent

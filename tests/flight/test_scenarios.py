@@ -1,0 +1,416 @@
+"""What can go wrong in a flight, one row each: title, what happens, how it must end, and checks.
+
+Whatever the row: every setpoint is finite and legal, and none follows the end.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from faults import (
+    ATTITUDE,
+    PARAM_VALUE,
+    POSITION,
+    die,
+    downlink,
+    failing,
+    jump,
+    kill_motors,
+    losing,
+    no_direction,
+    noisy,
+    not_a_number,
+    overturns,
+    raises,
+    refusing,
+    restart,
+    shuffling,
+    slow,
+    stop,
+    take_over,
+    upside_down,
+    with_default,
+    without,
+)
+from pair import Pair, hover, in_phase, make
+
+from offboard.flight.phases import Phase
+
+SET_MODE, LAND, ARM_DISARM = 176, 21, 400
+FLOWN = "flown and landed"
+Checks = Iterator[bool]
+
+
+def lemniscate(**options: Any) -> Pair:
+    """One lap, 1 m high."""
+    quick = ("reference.laps=1", "reference.height_m=1.0", "reference.period_s=6")
+    return make(*quick, **options)
+
+
+def in_track(action: Callable[[Pair], None], flight: Callable[..., Pair] = lemniscate) -> Any:
+    """The flight to which `action` happens one second into the track."""
+    return lambda: flight(at=[(in_phase(Phase.TRACK, 1.0), action)])
+
+
+# --- checks: what must be true when all is over ---------------------------------------------------
+
+
+def never_armed(pair: Pair) -> Checks:
+    yield not pair.instance.autopilot.armed
+    yield not pair.went_through(Phase.TAKEOFF)
+
+
+def nothing_asked(pair: Pair) -> Checks:
+    yield not pair.setpoints
+    yield not pair.commands(SET_MODE)
+    yield not pair.commands(ARM_DISARM)
+
+
+def disarmed_by_us(pair: Pair) -> Checks:
+    yield from never_armed(pair)
+    yield pair.commands(ARM_DISARM)[-1].param1 == 0.0
+
+
+def landed(pair: Pair) -> Checks:
+    autopilot = pair.instance.autopilot
+    yield not autopilot.armed
+    yield autopilot.landed
+    yield len(pair.commands(LAND)) >= 1
+
+
+def flown(pair: Pair) -> Checks:
+    yield from landed(pair)
+    yield pair.went_through(Phase.TRACK)
+    yield pair.went_through(Phase.HOVER)
+
+
+def soft_landing(pair: Pair) -> Checks:
+    """Landed, and the setpoints after the fault were level ones."""
+    yield from landed(pair)
+    level = [setpoint for _, phase, setpoint in pair.setpoints if phase is Phase.LAND]
+    yield len(level) >= 1
+    yield all(abs(setpoint.q[1]) + abs(setpoint.q[2]) < 1e-6 for setpoint in level)
+
+
+def left_to_the_pilot(pair: Pair) -> Checks:
+    autopilot = pair.instance.autopilot
+    yield autopilot.armed
+    yield autopilot.mode.name == "AUTO.LOITER"
+    yield not pair.commands(LAND)
+
+
+def held_then_silent(pair: Pair) -> Checks:
+    """Level for less than 2 s after the last telemetry, landing requests, then nothing."""
+    after = [(at_s - pair.heard_s, s) for at_s, _, s in pair.setpoints if at_s > pair.heard_s + 0.2]
+    yield 15 <= len(after) <= 20
+    yield after[-1][0] < 2.1
+    yield all(abs(setpoint.q[1]) + abs(setpoint.q[2]) < 1e-6 for _, setpoint in after)
+    yield len(pair.commands(LAND)) >= 1
+
+
+def smooth(pair: Pair) -> Checks:
+    """The jump is taken with the tilt that the law allows itself, not with more."""
+    yield from flown(pair)
+    yield max(math.hypot(s.q[1], s.q[2]) for _, _, s in pair.setpoints) < math.sin(0.5 * 0.7)
+
+
+def no_take_off_of_ours(pair: Pair) -> Checks:
+    yield from flown(pair)
+    yield not pair.commands(ARM_DISARM)
+    yield not pair.went_through(Phase.TAKEOFF)
+    # never less thrust than flies: the vehicle was in the air all the time
+    yield min(setpoint.thrust for _, _, setpoint in pair.setpoints) > 0.3
+
+
+def unhurt(pair: Pair) -> Checks:
+    """One missed decision is bridged."""
+    yield from flown(pair)
+    texts = [frame for _, _, frame in pair.sent if b"decision missed" in frame]
+    yield len(texts) == 2
+
+
+@dataclass(frozen=True)
+class Row:
+    title: str
+    flight: Callable[[], Pair]
+    code: int
+    says: str
+    end: Phase
+    checks: Callable[[Pair], Checks]
+
+
+def already_flying() -> Pair:
+    """A vehicle that holds at 2.5 m when we come."""
+    pair = hover("reference.height_m=2.5")
+    instance = pair.instance
+    nan = math.nan
+    while instance.time_s < 5.0:
+        instance.step()
+    pair.ground(22, 0, 0, 0, nan, nan, nan, instance.autopilot.firmware.origin[2] + 2.5)
+    pair.ground(ARM_DISARM, 1)
+    while instance.time_s < 17.0:
+        instance.step()
+    assert instance.autopilot.mode.name == "AUTO.LOITER"
+    assert not instance.autopilot.landed
+    return pair
+
+
+def already_armed_on_ground() -> Pair:
+    return hover(at=[(in_phase(Phase.STREAM, 0.5), lambda pair: pair.ground(ARM_DISARM, 1))])
+
+
+def silent_vehicle() -> Pair:
+    return hover(dead=True, limits={"connect_s": 3.0})
+
+
+def stopped(phase: Phase, for_s: float, end: Phase, checks: Callable[[Pair], Checks]) -> Row:
+    flight = lambda: hover(at=[(in_phase(phase, for_s), stop)])  # noqa: E731
+    return Row(f"stop in {phase.value}", flight, 4, "stop requested by the operator", end, checks)
+
+
+TRACK = Phase.TRACK
+ROWS = (
+    Row("hover", hover, 0, FLOWN, Phase.DISARMED, flown),
+    Row("armed by another", already_armed_on_ground, 0, FLOWN, Phase.DISARMED, flown),
+    Row("found in the air", already_flying, 0, FLOWN, Phase.DISARMED, no_take_off_of_ours),
+    # the operator
+    Row(
+        "stop before a vehicle is heard",
+        lambda: hover(dead=True, at=[(in_phase(Phase.CONNECT, 0.5), stop)]),
+        4,
+        "stop requested by the operator",
+        Phase.FAILED,
+        nothing_asked,
+    ),
+    stopped(Phase.HEALTH, 1.0, Phase.FAILED, nothing_asked),
+    stopped(Phase.STREAM, 0.5, Phase.FAILED, never_armed),
+    stopped(Phase.ENGAGE, 0.1, Phase.FAILED, never_armed),
+    stopped(Phase.ARM, 0.0, Phase.FAILED, disarmed_by_us),
+    stopped(Phase.ARM, 0.3, Phase.FAILED, disarmed_by_us),
+    stopped(Phase.TAKEOFF, 0.3, Phase.DISARMED, landed),
+    stopped(Phase.TAKEOFF, 1.5, Phase.DISARMED, landed),
+    stopped(Phase.CLIMB, 0.5, Phase.DISARMED, landed),
+    stopped(Phase.TRACK, 1.0, Phase.DISARMED, landed),
+    stopped(Phase.HOVER, 0.2, Phase.DISARMED, landed),
+    # the vehicle refuses or is not there
+    Row("no vehicle", silent_vehicle, 3, "no vehicle heard in 3 s", Phase.FAILED, nothing_asked),
+    Row(
+        "arming refused",
+        lambda: hover(firmware=refusing("arm", "Arming denied: no joystick"), limits={"arm_s": 3}),
+        3,
+        "the vehicle did not arm in 3 s; the vehicle said: Arming denied: no joystick",
+        Phase.FAILED,
+        never_armed,
+    ),
+    Row(
+        "mode refused",
+        lambda: hover(
+            firmware=refusing("mode", "Switching to Offboard is not available"),
+            limits={"engage_s": 3},
+        ),
+        3,
+        "the vehicle did not enter OFFBOARD in 3 s (it shows AUTO.LOITER); "
+        "the vehicle said: Switching to Offboard is not available",
+        Phase.FAILED,
+        never_armed,
+    ),
+    Row(
+        "parameter wrong",
+        lambda: hover(firmware=with_default("COM_OF_LOSS_T", 30.0)),
+        3,
+        "COM_OF_LOSS_T is 30: seconds without setpoints before the failsafe. "
+        "Mend: param set COM_OF_LOSS_T 5",
+        Phase.FAILED,
+        nothing_asked,
+    ),
+    Row(
+        "parameters not answered",
+        lambda: hover(down=without(PARAM_VALUE)),
+        0,
+        FLOWN,
+        Phase.DISARMED,
+        flown,
+    ),
+    Row(
+        "no position",
+        lambda: hover(down=without(POSITION), limits={"health_s": 8}),
+        3,
+        "not ready: no LOCAL_POSITION_NED or no ATTITUDE_QUATERNION arrives",
+        Phase.FAILED,
+        nothing_asked,
+    ),
+    Row(
+        "telemetry too slow",
+        lambda: hover(firmware=slow(4.0), limits={"health_s": 8}),
+        3,
+        "not ready: ATTITUDE_QUATERNION arrives at 4.0 Hz, at least 10 Hz are needed",
+        Phase.FAILED,
+        nothing_asked,
+    ),
+    Row(
+        "restart on the ground",
+        lambda: hover(at=[(in_phase(Phase.STREAM, 0.5), restart)]),
+        3,
+        "the vehicle restarted",
+        Phase.FAILED,
+        never_armed,
+    ),
+    Row(
+        "restart while waiting for health",
+        lambda: hover(at=[(in_phase(Phase.HEALTH, 3.0), restart)]),
+        0,
+        FLOWN,
+        Phase.DISARMED,
+        flown,
+    ),
+    # the pilot
+    Row(
+        "pilot takes over",
+        in_track(take_over),
+        4,
+        "the vehicle left OFFBOARD for AUTO.LOITER",
+        Phase.YIELDED,
+        left_to_the_pilot,
+    ),
+    Row(
+        "pilot takes over while landing",
+        lambda: hover(at=[(in_phase(Phase.LAND, 1.2), take_over)]),
+        4,
+        "the vehicle left OFFBOARD for AUTO.LOITER",
+        Phase.YIELDED,
+        lambda pair: iter([pair.instance.autopilot.mode.name == "AUTO.LOITER"]),
+    ),
+    Row(
+        "motors cut in flight",
+        in_track(kill_motors),
+        4,
+        "the vehicle disarmed in flight",
+        Phase.FAILED,
+        lambda pair: iter([not pair.instance.autopilot.armed]),
+    ),
+    # the link
+    Row("20 Hz", lambda: lemniscate(firmware=slow(20.0)), 0, FLOWN, Phase.DISARMED, flown),
+    Row(
+        "a fifth is lost, both ways",
+        lambda: lemniscate(down=losing(0.2), up=losing(0.2, seed=4)),
+        0,
+        FLOWN,
+        Phase.DISARMED,
+        flown,
+    ),
+    Row(
+        "duplicated and reordered",
+        lambda: lemniscate(down=shuffling()),
+        0,
+        FLOWN,
+        Phase.DISARMED,
+        flown,
+    ),
+    Row("garbage between", lambda: hover(down=noisy), 0, FLOWN, Phase.DISARMED, flown),
+    Row(
+        "dies in flight", in_track(die), 4, "no telemetry for 1.0 s", Phase.FAILED, held_then_silent
+    ),
+    Row(
+        "restart in flight",
+        in_track(restart),
+        4,
+        "the vehicle restarted in flight",
+        Phase.FAILED,
+        lambda pair: iter([not pair.instance.autopilot.armed]),
+    ),
+    Row(
+        "position stops",
+        in_track(downlink(without(POSITION))),
+        4,
+        "no LOCAL_POSITION_NED for 0.",
+        Phase.DISARMED,
+        soft_landing,
+    ),
+    Row(
+        "attitude stops",
+        in_track(downlink(without(ATTITUDE))),
+        4,
+        "no ATTITUDE_QUATERNION for 0.",
+        Phase.DISARMED,
+        soft_landing,
+    ),
+    # the estimate
+    Row("a jump of 1 m", in_track(jump(1.0)), 0, FLOWN, Phase.DISARMED, smooth),
+    Row(
+        "a jump of 9 m",
+        in_track(jump(9.0)),
+        4,
+        "m from the reference (limit 5.0 m)",
+        Phase.DISARMED,
+        soft_landing,
+    ),
+    Row(
+        "upside down",
+        in_track(downlink(upside_down())),
+        4,
+        "tilt 180 deg",
+        Phase.DISARMED,
+        soft_landing,
+    ),
+    # the law
+    *(
+        Row(
+            f"a law that {fail.__name__.replace('_', ' ')}",
+            lambda fail=fail: lemniscate(wrap=failing(fail)),
+            4,
+            f"the controller failed: {says}",
+            Phase.DISARMED,
+            soft_landing,
+        )
+        for fail, says in (
+            (raises, "ZeroDivisionError: nothing to divide by"),
+            (not_a_number, "ArithmeticError: unusable Command(thrust_mps2=nan"),
+            (no_direction, "ArithmeticError: unusable Command"),
+        )
+    ),
+    Row(
+        "a law that fails twice",
+        lambda: lemniscate(wrap=failing(raises, times=2)),
+        0,
+        FLOWN,
+        Phase.DISARMED,
+        unhurt,
+    ),
+    Row(
+        "a law that overturns for a moment",
+        lambda: lemniscate(wrap=failing(overturns, times=1)),
+        0,
+        FLOWN,
+        Phase.DISARMED,
+        flown,
+    ),
+)
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: row.title)
+def test_flight(row: Row) -> None:
+    pair = row.flight()
+    outcome = pair.fly()
+    assert outcome.exit_code == row.code, outcome
+    assert row.says in outcome.sentence
+    assert pair.companion.phase is row.end
+    for index, check in enumerate(row.checks(pair)):
+        assert check, f"check {index} of {row.checks.__name__} ({pair.phases})"
+    for _, phase, setpoint in pair.setpoints:
+        assert phase not in (Phase.YIELDED, Phase.FAILED, Phase.DISARMED)
+        assert all(math.isfinite(value) for value in (*setpoint.q, setpoint.thrust))
+        assert 0.0 <= setpoint.thrust <= 1.0
+        assert setpoint.type_mask == 7
+
+
+def test_stream_has_no_gap() -> None:
+    """From the first setpoint to the landing, also while phases change and messages are lost."""
+    pair = lemniscate(down=losing(0.2))
+    pair.fly()
+    times = [at_s for at_s, phase, _ in pair.setpoints if phase is not Phase.LAND]
+    assert max(after - before for before, after in pairwise(times)) < 0.2
