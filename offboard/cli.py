@@ -182,6 +182,71 @@ def check(
         raise Refusal("\n".join(problems))
 
 
+@app.command(epilog=EXIT_HELP)
+def identify(
+    flight: Annotated[
+        Path | None, typer.Argument(metavar="[FLIGHT]", help="A flight directory or a .tlog file.")
+    ] = None,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="The vehicle file to write.")
+    ] = None,
+    page: Annotated[
+        Path | None, typer.Option(help="The page with the fits; beside the log by default.")
+    ] = None,
+    connect: Annotated[
+        str | None, typer.Option(help="Fly the reference `identify` there first, then use its log.")
+    ] = None,
+    sitl: Annotated[
+        bool, typer.Option("--sitl", help="The same on the bundled simulator.")
+    ] = False,
+    vehicle: Annotated[
+        str | None, typer.Option(help="Believed beforehand: a shipped vehicle, or a file.")
+    ] = None,
+    out_directory: Annotated[
+        Path | None, typer.Option("--out", help="Flight directory of --connect and --sitl.")
+    ] = None,
+) -> None:
+    """Delay, attitude response, thrust, drag and noise from a log: a vehicle file and a page."""
+    from offboard.analysis import history, tlog
+    from offboard.analysis.identify import identify_flight, vehicle_file
+    from offboard.analysis.identify_page import page as fits
+    from offboard.config import flown, load
+    from offboard.flight import clock
+
+    if (flight is None) == (connect is None and not sitl):
+        raise Refusal("name a FLIGHT, or fly one first with --connect or --sitl; not both")
+    if flight is None:
+        flight = out_directory or Path("flights") / f"identify-{clock.local_stamp()}"
+        fly(
+            sitl=sitl,
+            connect=connect or DEFAULT_CONNECTION,
+            reference="identify",
+            vehicle=vehicle,
+            out_directory=flight,
+        )
+    path = tlog.find(flight)
+    log = tlog.read(path)
+    with_what = history.configuration(log)
+    if vehicle is None and with_what is not None:
+        believed = flown(with_what).vehicle
+    else:
+        believed = load("flight", choices={"vehicle": vehicle} if vehicle else {}).vehicle
+    found, trace = identify_flight(log, history.gather(log), believed)
+    text = vehicle_file(found, believed, flight.name)
+    shown = page or path.with_name("identify.html")
+    try:
+        if output is not None:
+            output.write_text(text, encoding="utf-8")
+        shown.write_text(fits(flight.name, found, trace, believed), encoding="utf-8")
+    except OSError as error:
+        raise Refusal(f"{error.filename} cannot be written ({error.strerror})") from None
+    out.print(text, end="", markup=False, soft_wrap=True)
+    written = f"{output} and {shown}" if output else f"{shown}; -o FILE writes the vehicle file"
+    out.print(f"written: {written}", markup=False, soft_wrap=True)
+    if not found.supported:
+        raise Refusal("nothing could be identified from this flight", 1)
+
+
 def _score(flight: Path, requirements: list, as_json: bool) -> list[str]:  # type: ignore[type-arg]
     """Score, write score.json beside a flight's log, print; return the missed requirements."""
     from offboard.analysis import history, tlog

@@ -81,6 +81,12 @@ class Identified:
     noise: EstimatorNoise | None = None
     refusals: Mapping[str, str] = field(default_factory=dict)
 
+    @property
+    def supported(self) -> bool:
+        """Whether anything at all was identified."""
+        found = (self.tilt, self.yaw, self.hover_thrust, self.thrust_lag_s, self.drag_ps)
+        return any(each is not None for each in found)
+
     def applied_to(self, vehicle: Vehicle) -> Vehicle:
         """`vehicle` with what was identified; the rest as it was."""
         found: dict[str, object] = {}

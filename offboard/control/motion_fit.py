@@ -4,7 +4,7 @@ Reported velocity is not used: on PX4 it is not the derivative of the reported p
 Kalman filter per axis follows the position under the acceleration that attitude and thrust must
 have given, allowing for an estimator that wanders and for a disturbance that drifts; what it could
 not foresee, its innovations, is white for the right constants, and least squares on it finds them
-(maximum likelihood; L. Ljung, System Identification, 1999, 7.4). Knows arrays, no vehicle.
+(maximum likelihood; L. Ljung, System Identification, 1999, 7.4). Knows arrays and no flight.
 """
 
 from __future__ import annotations
@@ -26,6 +26,7 @@ from offboard.control.trace import (
     STAMP,
     Trace,
 )
+from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
@@ -238,6 +239,25 @@ def fit_vertical(
         thrust_effect_s=Estimate(effect_s, float(sds[1])),
         drag_ps=Estimate(drag_ps, float(sds[3])),
     )
+
+
+def specific_velocity(motion: Motion, vehicle: Vehicle) -> Array:
+    """Velocity (3, N) that thrust, attitude and drag alone give, its mean that of the positions."""
+    thrust = vehicle.thrust_max_mps2 * motion.thrust(vehicle.thrust_delay_s, vehicle.thrust_lag_s)
+    down = vehicle.gravity_mps2 - thrust * motion.upright
+    push = np.vstack((-thrust * motion.direction_ne, down))
+    push -= push.mean(axis=1, keepdims=True)  # a constant disturbance
+    steps = np.diff(motion.times)
+    travelled = motion.positions[:, -1] - motion.positions[:, 0]
+    mean = travelled / max(motion.times[-1] - motion.times[0], 1e-3)
+    push += vehicle.drag_per_mass_ps * mean[:, None]
+    velocity = np.empty_like(push)
+    velocity[:, 0] = 0.0
+    for i, step_s in enumerate(steps):
+        keep = math.exp(-vehicle.drag_per_mass_ps * step_s)
+        velocity[:, i + 1] = keep * velocity[:, i] + step_s * push[:, i]
+    velocity += (mean - velocity.mean(axis=1))[:, None]
+    return velocity
 
 
 def _long_run(score: Array, lags: int) -> float:

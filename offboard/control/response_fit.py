@@ -178,6 +178,23 @@ class ResponseProblem:
         return covariance
 
 
+def predicted(
+    times: Array,
+    sent_at: Array,
+    commands: Array,
+    delay_s: float,
+    frequency_radps: float,
+    damping: float,
+) -> Array:
+    """The response (N, axes) to `commands` (M, axes), at rest at the start."""
+    out = np.empty((len(times), commands.shape[1] + 2))
+    if len(times) and len(sent_at):
+        arrays = (np.ascontiguousarray(each) for each in (times, sent_at, commands))
+        respond(*arrays, delay_s, frequency_radps, damping, out)
+    response: Array = out[:, :-2]
+    return response
+
+
 def commanded_rms(times: Array, sent_at: Array, commands: Array) -> float:
     """How much the commands that acted within `times` moved about their mean."""
     within = (sent_at >= times[0] - UPPER[DELAY]) & (sent_at <= times[-1])

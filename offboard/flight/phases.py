@@ -19,6 +19,7 @@ class Phase(Enum):
     ARM = "arm"
     TAKEOFF = "takeoff"
     CLIMB = "climb"
+    EXCITE = "excite"
     JOIN = "join"
     TRACK = "track"
     HOVER = "hover"
@@ -32,7 +33,7 @@ class Phase(Enum):
 PHASES = tuple(Phase)
 ENDS = frozenset({Phase.DISARMED, Phase.YIELDED, Phase.FAILED})
 BEFORE_FLIGHT = frozenset({Phase.CONNECT, Phase.HEALTH, Phase.STREAM, Phase.ENGAGE, Phase.ARM})
-TRACKING = frozenset({Phase.CLIMB, Phase.JOIN, Phase.TRACK, Phase.HOVER})
+TRACKING = frozenset({Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.HOVER})
 
 
 class ExitCode:

@@ -1,0 +1,148 @@
+"""A flight's log to its vehicle's constants: the trace of the log, and the vehicle file it makes.
+
+What counts is the flight from lift-off to landing, whoever commanded it over SET_ATTITUDE_TARGET.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.analysis.history import History
+from offboard.analysis.tlog import Tlog
+from offboard.control.identification import Estimate, Identified, ResponseFit, identify
+from offboard.control.trace import Trace, clean
+from offboard.flight.phases import PHASES, Phase
+from offboard.mavlink.dialect import ThrustRule
+from offboard.mavlink.session import DIALECTS
+from offboard.model.frames import course_from_quaternion, thrust_direction_from_quaternion
+from offboard.model.vehicle import Vehicle
+
+Array = NDArray[np.float64]
+
+FLOWN = (Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.HOVER)
+LIFTED_OFF_S = 0.5  # the ground's effect on the thrust ends
+NOT_IDENTIFIED = "not identified: {sentence}"
+
+
+def identify_flight(log: Tlog, history: History, vehicle: Vehicle) -> tuple[Identified, Trace]:
+    """Everything that the log says of its vehicle, and the stretch it was taken from; `vehicle`
+    is where the search begins."""
+    trace = trace_of(log, history)
+    return identify(trace, vehicle), trace
+
+
+def trace_of(log: Tlog, history: History) -> Trace:
+    """The flown part of a log. A log without our phases is taken whole."""
+    setpoint, attitude = history.setpoint, history.attitude
+    commanded = thrust_direction_from_quaternion(setpoint[:, 2:6])
+    direction = thrust_direction_from_quaternion(attitude[:, 1:5])
+    thrust = setpoint[:, 6]
+    if _thrust_rule(log) is ThrustRule.TILT_COMPENSATED:
+        thrust = thrust / np.maximum(commanded[:, 2], 0.3)
+    trace = clean(
+        np.column_stack(
+            (setpoint[:, 0], commanded[:, :2], thrust, course_from_quaternion(setpoint[:, 2:6]))
+        ),
+        np.column_stack(
+            (attitude[:, 0], direction[:, :2], course_from_quaternion(attitude[:, 1:5]))
+        ),
+        history.position,
+    )
+    return trace.between(*_flown(history))
+
+
+def _flown(history: History) -> tuple[float, float]:
+    indices = {float(PHASES.index(phase)) for phase in FLOWN}
+    times = [
+        time_s
+        for time_s, record in zip(history.record_time_s, history.records, strict=True)
+        if record.phase in indices
+    ]
+    return (times[0] + LIFTED_OFF_S, times[-1]) if times else (-math.inf, math.inf)
+
+
+def _thrust_rule(log: Tlog) -> ThrustRule:
+    known = {dialect.mav_autopilot: dialect.thrust_rule for dialect in DIALECTS.values()}
+    for entry in log.messages:
+        if entry.name == "HEARTBEAT" and entry.message.autopilot in known:
+            return known[entry.message.autopilot]
+    return ThrustRule.COLLECTIVE
+
+
+def rows(found: Identified) -> Iterator[tuple[str, Estimate | None, str, str]]:
+    """(what, estimate, unit, why not) of everything that can be identified, in reading order."""
+    for name, fit in (("tilt", found.tilt), ("yaw", found.yaw)):
+        why = found.refusals.get(name, "")
+        yield f"{name} delay", fit.delay_s if fit else None, "s", why
+        yield (
+            f"{name} natural frequency",
+            fit.natural_frequency_radps if fit else None,
+            "rad/s",
+            why,
+        )
+        yield f"{name} damping", fit.damping if fit else None, "", why
+    yield "hover thrust", found.hover_thrust, "", found.refusals.get("hover_thrust", "")
+    lag = found.refusals.get("thrust_lag_s", "")
+    yield "thrust lag", found.thrust_lag_s, "s", lag
+    yield "thrust delay", found.thrust_delay_s, "s", lag
+    yield "drag", found.drag_ps, "1/s", found.refusals.get("drag_ps", "")
+
+
+def vehicle_file(found: Identified, believed: Vehicle, flight: str) -> str:
+    """YAML of a vehicle file: what was identified, with its uncertainty, and for the rest what was
+    `believed`, with why it could not be identified."""
+    vehicle = found.applied_to(believed)
+    whys, lag = found.refusals, _comment(found, found.thrust_lag_s, "thrust_lag_s", "s")
+    drag = _comment(found, found.drag_ps, "drag_ps", "1/s times the mass believed")
+    lines = [
+        f"# Identified from {found.seconds:.0f} s of {flight}; the sd of each constant beside it.",
+        f"name: {vehicle.name}",
+        f"mass_kg: {vehicle.mass_kg:g}  # believed: telemetry does not show it",
+        f"gravity_mps2: {vehicle.gravity_mps2:g}",
+        f"inertia_kgm2: {_list(vehicle.inertia_kgm2)}  # believed",
+        f"arm_m: {vehicle.arm_m:g}  # believed",
+        f"drag_translation_npmps: {_list(vehicle.drag_translation_npmps)}  # {drag}",
+        f"drag_rotation_nmpradps: {_list(vehicle.drag_rotation_nmpradps)}  # believed",
+        f"hover_thrust: {vehicle.hover_thrust:.4f}"
+        f"  # {_comment(found, found.hover_thrust, 'hover_thrust', '')}",
+        f"thrust_delay_s: {vehicle.thrust_delay_s:.4f}  # {lag}",
+        f"thrust_lag_s: {vehicle.thrust_lag_s:.4f}  # {lag}",
+    ]
+    for name, fit in (("tilt", found.tilt), ("yaw", found.yaw)):
+        axis = getattr(vehicle, name)
+        lines += [
+            f"{name}:  # {_fit_comment(fit, whys.get(name, ''))}",
+            f"  delay_s: {axis.delay_s:.4f}",
+            f"  natural_frequency_radps: {axis.natural_frequency_radps:.3f}",
+            f"  damping: {axis.damping:.3f}",
+        ]
+    limits = _list(vehicle.angular_acceleration_limit_radps2)
+    lines += [
+        f"angular_acceleration_limit_radps2: {limits}  # believed",
+        f"tilt_max_rad: {vehicle.tilt_max_rad:g}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def _comment(found: Identified, estimate: Estimate | None, name: str, unit: str) -> str:
+    if estimate is None:
+        return f"believed; {NOT_IDENTIFIED.format(sentence=found.refusals.get(name, ''))}"
+    return f"+- {estimate.sd:.2g} {unit}".rstrip()
+
+
+def _fit_comment(fit: ResponseFit | None, why: str) -> str:
+    if fit is None:
+        return f"believed; {NOT_IDENTIFIED.format(sentence=why)}"
+    return (
+        f"+- {fit.delay_s.sd:.2g} s, {fit.natural_frequency_radps.sd:.2g} rad/s, "
+        f"{fit.damping.sd:.2g}; {1e3 * fit.residual_rms:.1f} mrad rms left of "
+        f"{1e3 * fit.commanded_rms:.0f} commanded"
+    )
+
+
+def _list(values: tuple[float, ...]) -> str:
+    return "[" + ", ".join(f"{value:.4g}" for value in values) + "]"

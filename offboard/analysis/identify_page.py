@@ -1,0 +1,172 @@
+"""The page of an identification: the constants, and how well they reproduce the flight."""
+
+from __future__ import annotations
+
+import html
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+from plotly.offline import get_plotlyjs
+
+from offboard.analysis.identify import rows
+from offboard.analysis.paper.figure import BLUE, GREY, RED, Figure, line, panels
+from offboard.control.identification import EstimatorNoise, Identified
+from offboard.control.motion_fit import Motion, specific_velocity
+from offboard.control.response_fit import predicted
+from offboard.control.trace import COURSE, NORTH, SENT_AT, SENT_COURSE, SENT_NORTH, STAMP, Trace
+from offboard.model.vehicle import AxisResponse, Vehicle
+
+Array = NDArray[np.float64]
+
+SHOWN_S = 20.0  # of the flight, its last part: more cannot be seen
+_STYLE = (
+    "body{font:15px/1.5 system-ui,sans-serif;margin:1.5rem auto;max-width:1100px;color:#1f2933}"
+    "table{border-collapse:collapse;font-variant-numeric:tabular-nums}"
+    "td,th{padding:.25rem .7rem;border-bottom:1px solid #e4e7eb;text-align:left}"
+    "td.number{text-align:right}h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}"
+)
+_SCRIPT = (
+    'for(const e of document.querySelectorAll(".figure")){'
+    "const f=JSON.parse(document.getElementById(e.dataset.source).textContent);"
+    "Plotly.newPlot(e,f.data,f.layout,{responsive:true,displaylogo:false})"
+    '.then(()=>{e.dataset.drawn="yes"})}'
+)
+
+
+def page(flight: str, found: Identified, trace: Trace, believed: Vehicle) -> str:
+    """One self-contained HTML document; `flight` is the name of the log."""
+    vehicle = found.applied_to(believed)
+    last = trace.between(max(trace.begin_s, trace.end_s - SHOWN_S), trace.end_s)
+    figures = [] if math.isnan(trace.begin_s) else [_tilt(last, vehicle), _yaw(last, vehicle)]
+    if len(trace.commands) and len(last.position) > 2:
+        figures.append(_motion(last, vehicle))
+    parts = [_figure(index, figure) for index, figure in enumerate(figures)]
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
+        f"<title>Identified: {html.escape(flight)}</title><style>{_STYLE}</style>"
+        f"<script>{get_plotlyjs()}</script></head><body>"
+        f"<h1>Identified from {found.seconds:.1f} s of {html.escape(flight)}</h1>"
+        f"{_table(found)}{_noise(found.noise)}{''.join(parts)}<script>{_SCRIPT}</script>"
+        "</body></html>"
+    )
+
+
+def _table(found: Identified) -> str:
+    body = []
+    for what, estimate, unit, why in rows(found):
+        if estimate is None:
+            cells = f'<td colspan="3">not identified: {html.escape(why)}</td>'
+        else:
+            cells = (
+                f'<td class="number">{estimate.value:.4g}</td>'
+                f'<td class="number">{estimate.sd:.2g}</td><td>{unit}</td>'
+            )
+        body.append(f"<tr><td>{what}</td>{cells}</tr>")
+    head = "<tr><th>constant</th><th>value</th><th>sd</th><th>unit</th></tr>"
+    return f"<table>{head}{''.join(body)}</table>"
+
+
+def _noise(noise: EstimatorNoise | None) -> str:
+    if noise is None:
+        return ""
+    return (
+        f"<p>The estimator, sample to sample: position {1e3 * noise.position_m:.2g} mm, velocity "
+        f"{1e3 * noise.velocity_mps:.2g} mm/s, attitude {1e3 * noise.attitude_rad:.2g} mrad. Its "
+        f"velocity contradicts its position by {noise.velocity_contradiction_mps:.2g} m/s over "
+        "half a second.</p>"
+    )
+
+
+def _figure(index: int, figure: Figure) -> str:
+    data = figure.to_json().replace("</", "<\\/")
+    return (
+        f"<h2>{html.escape(figure.title)}</h2><p>{html.escape(figure.caption)}</p>"
+        f'<script type="application/json" id="data{index}">{data}</script>'
+        f'<div class="figure" data-source="data{index}"></div>'
+    )
+
+
+def _tilt(trace: Trace, vehicle: Vehicle) -> Figure:
+    measured = trace.attitude[:, NORTH : NORTH + 2]
+    sent = trace.commands[:, SENT_NORTH : SENT_NORTH + 2]
+    names = ("thrust direction north", "thrust direction east")
+    return _response("Tilt", names, trace, measured, sent, vehicle.tilt, 1.0)
+
+
+def _yaw(trace: Trace, vehicle: Vehicle) -> Figure:
+    measured = np.unwrap(trace.attitude[:, COURSE])[:, None]
+    sent = np.unwrap(trace.commands[:, SENT_COURSE])[:, None]
+    names = ("course, deg",)
+    return _response("Course", names, trace, measured, sent, vehicle.yaw, math.degrees(1.0))
+
+
+def _response(
+    title: str,
+    names: tuple[str, ...],
+    trace: Trace,
+    measured: Array,
+    sent: Array,
+    response: AxisResponse,
+    scale: float,
+) -> Figure:
+    times, sent_at = trace.attitude[:, STAMP], trace.commands[:, SENT_AT]
+    fitted = predicted(
+        times,
+        sent_at,
+        sent,
+        response.delay_s,
+        response.natural_frequency_radps,
+        response.damping,
+    )
+    shown = sent_at >= times[0]
+    traces = []
+    for axis in range(measured.shape[1]):
+        panel, legend = axis + 1, {"showlegend": axis == 0}
+        steps = {"line": {"color": GREY, "width": 1.0, "shape": "hv"}, **legend}
+        traces += [
+            line(sent_at[shown], scale * sent[shown, axis], "commanded", GREY, panel=panel) | steps,
+            line(times, scale * measured[:, axis], "estimated", BLUE, panel=panel, **legend),
+            line(times, scale * fitted[:, axis], "response", RED, panel=panel, **legend),
+        ]
+    return Figure(
+        title,
+        traces,
+        panels(names, "vehicle time, s"),
+        "The response should lie on what was estimated.",
+    )
+
+
+def _motion(trace: Trace, vehicle: Vehicle) -> Figure:
+    motion = Motion(trace)
+    names = ("north, m/s", "east, m/s", "down, m/s")
+    traces = []
+    with_drag = specific_velocity(motion, vehicle)
+    measured = np.gradient(motion.positions, motion.times, axis=1)
+    for axis in range(3):
+        legend = {"showlegend": axis == 0}
+        traces += [
+            line(
+                motion.times,
+                measured[axis],
+                "position, differentiated",
+                BLUE,
+                panel=axis + 1,
+                **legend,
+            ),
+            line(
+                motion.times,
+                with_drag[axis],
+                "thrust, attitude and drag",
+                RED,
+                panel=axis + 1,
+                **legend,
+            ),
+        ]
+    return Figure(
+        "Motion",
+        traces,
+        panels(names, "vehicle time, s"),
+        "Velocity from thrust, attitude and drag alone drifts slowly with what the estimator's "
+        "attitude is wrong by; it must not swing with the velocity.",
+    )
