@@ -1,0 +1,60 @@
+"""Our commands as real processes, each ended with its test whatever becomes of the test."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+
+Spawn = Callable[..., subprocess.Popen[str]]
+
+
+def free_port() -> int:
+    """A UDP port that nobody used a moment ago."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def spawning(directory: Path) -> Iterator[Spawn]:
+    """`spawn("offboard", ...)` starts a command in `directory`, `more` environment added."""
+    running: list[subprocess.Popen[str]] = []
+
+    def spawn(program: str, *arguments: object, **more: str) -> subprocess.Popen[str]:
+        process = subprocess.Popen(
+            [sys.executable, "-m", program, *map(str, arguments)],
+            cwd=directory,
+            env={**os.environ, "PYTHONUNBUFFERED": "1", "COLUMNS": "200", **more},
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+        )
+        running.append(process)
+        return process
+
+    try:
+        yield spawn
+    finally:
+        for process in running:
+            if process.poll() is None:
+                for pid in (*children(process.pid), process.pid):
+                    with suppress(ProcessLookupError):
+                        os.kill(pid, signal.SIGKILL)
+            process.communicate()
+
+
+def children(pid: int) -> list[int]:
+    """Process ids of the children of `pid`."""
+    try:
+        listing = Path(f"/proc/{pid}/task/{pid}/children").read_text()
+    except OSError:
+        return []
+    return [int(child) for child in listing.split()]

@@ -1,0 +1,189 @@
+"""Bad input: one sentence that says what, where and what to do, the right exit code, no traceback.
+
+What ends before anything is sent is called in this process; the rest are real processes.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from processes import Spawn, children
+
+from offboard import cli
+from offboard.analysis import history, tlog
+
+Capture = pytest.CaptureFixture[str]
+Call = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def offboard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> Call:
+    """`offboard("fly", ...)` -> (exit code, stderr)."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(*arguments: object) -> tuple[int, str]:
+        monkeypatch.setattr(sys, "argv", ["offboard", *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        return int(ended.value.code or 0), capsys.readouterr().err
+
+    return call
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--config", "nonsense"), "no configuration named 'nonsense'; known are flight, paper"),
+        (("--config", "missing.yaml"), "missing.yaml cannot be read: No such file"),
+        (("--controller", "pid2"), "no controller named 'pid2'; known are"),
+        (("--reference", "spiral"), "no reference named 'spiral'; known are circle"),
+        (("--reference", "missing.csv"), "missing.csv cannot be read: No such file"),
+        (("--vehicle", "tank"), "no vehicle named 'tank'; known are"),
+        (("--set", "period_s=7"), "period_s"),
+        (("--set", "no.such.key=1"), "no"),
+        (("--set", "controller.bandwidth_radps=fast"), "bandwidth_radps"),
+        (("--seed", "-1"), "seed"),
+        (("--require", "rmse<1"), "there is no figure 'rmse'; there are rmse_position_m"),
+        (("--connect", "udpin:127.0.0.1"), "is not understood; use udpin:HOST:PORT"),
+        (("--connect", "udpin:127.0.0.1:99999"), "port 99999 is not within 0 .. 65535"),
+        (("--connect", "tcp:127.0.0.1:1"), "cannot be opened: Connection refused"),
+        (("--connect", "serial:/dev/nonexistent:57600"), "cannot be opened"),
+        (("--out", "/proc/nowhere"), "choose a directory that can be written with --out"),
+        (("--sitl", "--scenario", "storm"), "storm"),
+    ],
+)
+def test_usage_is_refused_before_anything_is_sent(
+    arguments: tuple[str, ...], says: str, offboard: Call, tmp_path: Path
+) -> None:
+    code, said = offboard("fly", "--connect", "udpin:127.0.0.1:0", *arguments)
+    assert code == 2, said
+    assert says in said
+    assert "Traceback" not in said
+    if "--scenario" not in arguments:
+        assert len(said.strip().splitlines()) == 1
+        assert not list(tmp_path.iterdir())
+
+
+def test_infeasible_reference_names_time_value_and_limit(offboard: Call) -> None:
+    code, said = offboard("fly", "--set", "reference.period_s=2.0")
+    assert code == 2
+    assert "reference lemniscate" in said
+    assert " s" in said
+    assert "limit" in said
+
+
+def test_port_in_use(offboard: Call) -> None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.bind(("127.0.0.1", 0))
+        port = other.getsockname()[1]
+        code, said = offboard("fly", "--connect", f"udpin:127.0.0.1:{port}")
+    assert code == 2
+    assert f"udpin:127.0.0.1:{port} cannot be opened" in said
+    assert "another program uses the port" in said
+
+
+def test_a_flight_is_never_overwritten(offboard: Call, tmp_path: Path) -> None:
+    (tmp_path / "old").mkdir()
+    (tmp_path / "old" / "flight.tlog").write_bytes(b"precious")
+    code, said = offboard("fly", "--out", "old", "--connect", "udpin:127.0.0.1:0")
+    assert code == 2
+    assert "already holds a flight; choose another directory with --out" in said
+    assert (tmp_path / "old" / "flight.tlog").read_bytes() == b"precious"
+
+
+@pytest.mark.parametrize(
+    ("content", "says"),
+    [
+        (b"", "is not a .tlog, or empty"),
+        (b"PK\3\4" + bytes(500), "is not a .tlog"),
+        (b"\x00" * 11, "is not a .tlog"),
+    ],
+)
+def test_foreign_log(content: bytes, says: str, offboard: Call, tmp_path: Path) -> None:
+    (tmp_path / "x.tlog").write_bytes(content)
+    code, said = offboard("score", "x.tlog")
+    assert (code, "Traceback" in said) == (2, False)
+    assert says in said
+
+
+def test_missing_log(offboard: Call) -> None:
+    code, said = offboard("score", "nowhere")
+    assert code == 2
+    assert "nowhere does not exist; name a flight directory or a .tlog file" in said
+
+
+def test_truncated_log_is_scored_up_to_there(offboard: Call, tmp_path: Path) -> None:
+    whole = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
+    (tmp_path / "cut.tlog").write_bytes(whole.read_bytes()[:-7])
+    code, said = offboard("score", "cut.tlog")
+    assert (code, said) == (0, "")
+
+
+def test_no_vehicle(offboard: Call, tmp_path: Path) -> None:
+    code, said = offboard(
+        "fly", "--connect", "udpin:127.0.0.1:0", "--set", "limits.connect_s=0.3", "--out", "x"
+    )
+    assert code == 3
+    assert said.startswith("no vehicle heard in 0 s; is it running, and sending to this port?")
+    assert len(said.strip().splitlines()) == 1
+    log = tlog.read(tmp_path / "x" / "flight.tlog")
+    assert history.configuration(log) == (tmp_path / "x" / "flight.yaml").read_text()
+
+
+def in_flight(spawn: Spawn, *arguments: str) -> subprocess.Popen[str]:
+    """A bundled flight that hovers for an hour and has just begun to."""
+    process = spawn(
+        "offboard", "fly", "--sitl", "--scenario", "calm", "--out", "x", "--reference", "hover",
+        "--set", "reference.duration_s=3600", *arguments,
+    )  # fmt: skip
+    assert process.stdout is not None
+    for line in process.stdout:
+        if "track: " in line:
+            return process
+    raise AssertionError(process.communicate()[1])
+
+
+def test_interrupt_lands(spawn: Spawn, tmp_path: Path) -> None:
+    process = in_flight(spawn)
+    process.send_signal(signal.SIGINT)
+    _, said = process.communicate(timeout=60)
+    assert process.returncode == 4
+    assert said.startswith("stop requested by the operator (log: x/flight.tlog)")
+    assert len(said.strip().splitlines()) == 1
+    flown = history.gather(tlog.read(tmp_path / "x" / "flight.tlog"))
+    assert "AUTO.LAND" in [mode.what for mode in flown.modes]
+    assert flown.phases[-1].what.startswith("disarmed")
+
+
+def test_simulator_killed_in_flight(spawn: Spawn, tmp_path: Path) -> None:
+    process = in_flight(spawn)
+    (simulator,) = children(process.pid)
+    os.kill(simulator, signal.SIGKILL)
+    _, said = process.communicate(timeout=30)
+    assert process.returncode == 4
+    assert said.startswith("the bundled simulator ended (signal 9) (log: x/flight.tlog)")
+    assert len(said.strip().splitlines()) == 1
+    flown = history.gather(tlog.read(tmp_path / "x" / "flight.tlog"))
+    assert len(flown.setpoint) > 50
+
+
+def test_full_disk_lands(spawn: Spawn, tmp_path: Path) -> None:
+    """A file size limit stands for the full disk."""
+    limited = "import resource, signal, runpy, sys; signal.signal(signal.SIGXFSZ, signal.SIG_IGN);"
+    limited += "resource.setrlimit(resource.RLIMIT_FSIZE, (600_000, 600_000));"
+    limited += "sys.argv[0] = 'offboard'; runpy.run_module('offboard', run_name='__main__')"
+    process = subprocess.run(
+        [sys.executable, "-c", limited, "fly", "--sitl", "--out", "x", "--reference", "hover"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=60,
+    )  # fmt: skip
+    assert process.returncode == 4, process.stderr
+    assert "flight.tlog cannot be written (File too large)" in process.stderr
+    assert "Traceback" not in process.stderr
+    assert len(tlog.read(tmp_path / "x" / "flight.tlog").messages) > 1000

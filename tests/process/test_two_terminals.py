@@ -1,0 +1,32 @@
+"""`simulator` and `offboard fly` as two processes in real time, compiling everything first."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+from processes import Spawn
+
+SHORT = ("--reference", "hover", "--set", "reference.duration_s=2", "--set", "reference.height_m=1")
+
+
+def test_real_time_after_the_compilation_cache_was_deleted(
+    spawn: Spawn, port: int, tmp_path: Path
+) -> None:
+    cache = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    simulator = spawn(
+        "simulator", "--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", **cache
+    )
+    flight = spawn(
+        "offboard", "fly", "--connect", f"udpin:127.0.0.1:{port}", "--out", "x", *SHORT,
+        "--set", "limits.connect_s=120", **cache,
+    )  # fmt: skip
+    shown, said = flight.communicate(timeout=150)
+    assert (flight.returncode, said) == (0, ""), shown
+    assert "compiled in" in shown
+    assert simulator.poll() is None
+    score = json.loads((tmp_path / "x" / "score.json").read_text())
+    assert score["setpoint_gap_wall_max_s"] < 0.2
+    assert score["setpoint_gap_max_s"] < 0.2
+    assert score["tracked_s"] > 1.8
+    assert score["rmse_position_m"] < 0.1
