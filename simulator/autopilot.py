@@ -30,15 +30,18 @@ from simulator.plant import STEP_S, Plant, Truth
 class Autopilot:
     """One autopilot on one plant. `step` moves both by STEP_S; texts pile up in `texts`."""
 
-    def __init__(self, firmware: Firmware, plant: Plant) -> None:
+    def __init__(
+        self, firmware: Firmware, plant: Plant, parameters: ParameterTable | None = None
+    ) -> None:
         self.firmware = firmware
         self.plant = plant
-        self.parameters = ParameterTable(firmware)
+        self.parameters = parameters or ParameterTable(firmware)
         self.pilot = Pilot(firmware, self.parameters)
         self.mode: Mode = firmware.modes[firmware.boot_mode]
         self.intended = self.remembered = firmware.boot_mode
         self.armed = self.failsafe = False
         self.texts: list[Say] = []
+        self.refused: dict[str, Say] = {}  # events, and "offboard", that are refused by a fault
         self.steps = 0
         self._truth: Truth | None = None
         self._nav: Nav | None = None
@@ -97,11 +100,18 @@ class Autopilot:
     def happen(self, event: str, *, mode: str = "", takeoff_z_m: float = math.nan) -> Result:
         """Run the rule table for an event; `mode` is the one asked for, if the event asks."""
         self._requested = mode
+        if self.refused and (said := self.refused.get(self._wish(event, mode))) is not None:
+            self.texts.append(said)
+            return Result.TEMPORARILY_REJECTED
         for rule in self.firmware.rules:
             if rule.event == event and self._fits(rule):
                 self._apply(rule, takeoff_z_m)
                 return rule.result
         return Result.ACCEPTED
+
+    def _wish(self, event: str, mode: str) -> str:
+        by_setpoint = event == "mode" and self.firmware.modes[mode].behaviour is Behaviour.SETPOINT
+        return "offboard" if by_setpoint else event
 
     def obey_attitude(self, values: Mapping[str, Any]) -> None:
         """Fields of SET_ATTITUDE_TARGET."""

@@ -87,6 +87,7 @@ def simulate(
         lockstep=lockstep,
         ground_link=ground is not None,
         epoch_us=VIRTUAL_EPOCH_US if lockstep else unix_us(),
+        faults=flown.faults,
     )
     purpose = "waiting at" if connect.startswith("udpin:") else "sending to"
     print(

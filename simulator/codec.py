@@ -130,6 +130,12 @@ def layout_by_id(message_id: int) -> Layout | None:
     return None if message is None else Layout(message)
 
 
+def id_of(name: str) -> int | None:
+    """Id of the message called `name`, or None when the dialect has none."""
+    found = getattr(dialect, f"MAVLINK_MSG_ID_{name}", None)
+    return found if found in dialect.mavlink_map else None
+
+
 def name_of(message_id: int) -> str | None:
     """Name of message `message_id`, or None when the dialect has none."""
     found = layout_by_id(message_id)

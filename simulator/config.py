@@ -13,6 +13,7 @@ from pydantic import Field
 from offboard.model.document import DocumentError, M, parse
 from offboard.model.vehicle import Parameters, Vehicle
 from simulator.conditions import Conditions
+from simulator.faults import Fault
 
 
 class Scenario(Parameters):
@@ -21,6 +22,7 @@ class Scenario(Parameters):
     name: str = Field(min_length=1, max_length=40)
     description: str = Field(default="", max_length=200)
     conditions: Conditions = Conditions()
+    faults: tuple[Fault, ...] = Field(default=(), max_length=50)
 
 
 def scenario(name: str) -> Scenario:

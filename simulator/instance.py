@@ -6,10 +6,16 @@ same seed and the same bytes in at the same steps give the same bytes out.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from offboard.model.vehicle import Vehicle
+from simulator.attitude import Demand
 from simulator.autopilot import Autopilot
 from simulator.conditions import Conditions
+from simulator.faults import Fault
 from simulator.firmware.base import Firmware
+from simulator.impairment import frames
+from simulator.injection import prepare
 from simulator.plant import STEP_S, Plant
 from simulator.server import Server
 from simulator.telemetry import View
@@ -18,6 +24,8 @@ STEP_MS = round(STEP_S * 1000)
 VIRTUAL_EPOCH_US = 1_767_225_600_000_000  # 2026-01-01, where virtual time begins
 BARRIER_INTERVAL_MS = 20
 _POSITION_INTERVAL_MS = 8
+_TIMESYNC = 111
+_OFF = Demand()
 
 
 class Instance:
@@ -38,17 +46,22 @@ class Instance:
         lockstep: bool = False,
         ground_link: bool = True,
         epoch_us: int = VIRTUAL_EPOCH_US,
+        faults: Sequence[Fault] = (),
     ) -> None:
         self.autopilot = Autopilot(firmware, Plant(vehicle, conditions, seed))
-        view = View(self.autopilot, system, epoch_us)
-        self.companion = Server(view, firmware.companion_rates_hz, barrier=lockstep)
-        self.ground = Server(view, firmware.ground_rates_hz if ground_link else {})
+        self.view = View(self.autopilot, system, epoch_us)
+        self.companion = Server(self.view, firmware.companion_rates_hz, barrier=lockstep)
+        self.ground = Server(self.view, firmware.ground_rates_hz if ground_link else {})
+        self.steps = 0
+        self._injection = prepare(faults, seed)
+        self._arrived: list[bytes] = []
         self._barrier_ms = 0
+        self._back_at_step = 0
 
     @property
     def time_s(self) -> float:
-        """Vehicle time."""
-        return self.autopilot.time_s
+        """Time since the start; the vehicle's own until it reboots."""
+        return self.steps * STEP_S
 
     @property
     def idle(self) -> bool:
@@ -57,24 +70,47 @@ class Instance:
 
     def advance(self) -> None:
         """One step of STEP_S; what it has to say waits in the links."""
+        self.steps += 1
+        if self._injection is not None:
+            self._inject()
+        if self.steps <= self._back_at_step:
+            self.autopilot.plant.advance(STEP_S, _OFF)
+            return
         self.autopilot.step()
-        self._spread_texts()
+        if self.autopilot.texts:
+            self._spread_texts()
         self.companion.step()
         self.ground.step()
+        if self._injection is not None:
+            self._arrived += self._injection.down.carry(self.companion.drain(), self._now_us)
 
     def step(self) -> list[bytes]:
         """`advance`, and the companion link's datagrams; the ground link's are dropped."""
         self.advance()
         self.ground.drain()
-        return self.companion.drain()
+        return self.drain()
+
+    def drain(self) -> list[bytes]:
+        """The companion link's datagrams that have arrived at its other end."""
+        if self._injection is None:
+            return self.companion.drain()
+        said = self._injection.down.carry(self.companion.drain(), self._now_us)
+        arrived, self._arrived = self._arrived + said, []
+        return arrived
 
     def feed(self, datagram: bytes) -> None:
         """One datagram from the companion, handled at the present vehicle time."""
-        self.companion.receive(datagram)
-        self._spread_texts()
+        if self._injection is None:
+            self._handle(datagram)
+            return
+        for piece in self._without_clock(datagram):
+            for arrived in self._injection.up.carry([piece], self._now_us):
+                self._handle(arrived)
 
     def feed_ground(self, datagram: bytes) -> None:
         """One datagram from the ground station."""
+        if self.steps < self._back_at_step:
+            return
         self.ground.receive(datagram)
         self._spread_texts()
 
@@ -84,11 +120,68 @@ class Instance:
         True at the first step with a position at or after each multiple of 20 ms, so that a
         command takes effect at the stamp of the newest position, as it nearly does in real time.
         """
-        now_ms = self.autopilot.steps * STEP_MS
+        now_ms = self.steps * STEP_MS
         if now_ms < self._barrier_ms or now_ms % _POSITION_INTERVAL_MS:
             return False
         self._barrier_ms = (now_ms // BARRIER_INTERVAL_MS + 1) * BARRIER_INTERVAL_MS
         return True
+
+    def barrier(self) -> tuple[int, list[bytes]]:
+        """Lockstep's question for the time, behind all telemetry: its stamp, and all datagrams.
+
+        It is the clock of the simulation and no part of the flight: no fault touches it.
+        """
+        stamp_ns = self.steps * STEP_MS * 1_000_000
+        if self._injection is None:
+            self.companion.send_barrier(stamp_ns)
+            return stamp_ns, self.companion.drain()
+        datagrams = self.drain()
+        self.companion.send_barrier(stamp_ns)
+        return stamp_ns, datagrams + self.companion.drain()
+
+    def reboot(self, silent_s: float) -> None:
+        """The autopilot is gone for so long and starts anew; the vehicle goes on falling."""
+        old = self.autopilot
+        self.autopilot = Autopilot(old.firmware, old.plant, old.parameters)
+        self.autopilot.pilot.landed = old.truth.on_ground
+        self.view.restart(self.autopilot)
+        self.companion.restart()
+        self.ground.restart()
+        self._back_at_step = self.steps + round(silent_s / STEP_S)
+
+    @property
+    def _now_us(self) -> int:
+        return self.steps * STEP_MS * 1000
+
+    def _inject(self) -> None:
+        assert self._injection is not None
+        self._injection.step(self.time_s, self)
+        for datagram in self._injection.up.carry([], self._now_us):
+            self._handle(datagram)
+
+    def _handle(self, datagram: bytes) -> None:
+        if self.steps < self._back_at_step and not self._is_clock(datagram):
+            return
+        self.companion.receive(datagram)
+        self._spread_texts()
+
+    def _without_clock(self, datagram: bytes) -> list[bytes]:
+        """Answer lockstep's question at once; what is left takes the way up."""
+        pieces = [frame for _, frame in frames(datagram)]
+        if not (self.companion.barrier and any(map(self._is_clock, pieces))):
+            return [datagram]
+        rest: list[bytes] = []
+        for piece in pieces:
+            if self._is_clock(piece):
+                self._handle(piece)
+            else:
+                rest.append(piece)
+        return rest
+
+    def _is_clock(self, frame: bytes) -> bool:
+        """A TIMESYNC answer (tc1 is not 0) in lockstep."""
+        is_timesync = frames(frame)[0][0] == _TIMESYNC if frame else False
+        return self.companion.barrier and is_timesync and any(frame[10:18])
 
     def _spread_texts(self) -> None:
         for said in self.autopilot.texts:

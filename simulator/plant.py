@@ -17,6 +17,7 @@ from offboard.model.state import QUATERNION
 from offboard.model.vehicle import Triple, Vehicle
 from simulator.airframe import (
     ACCELERATION,
+    CHARGE,
     CONTACT,
     ROTOR_SIZE,
     THRUST,
@@ -64,6 +65,10 @@ _ERROR_LANE, _GUST_LANE, _WHITE_LANE = 0, 1, 2
 
 # The state vector: rigid body, rotors, wind, estimator errors, gusts.
 _STATE_ENDS = np.cumsum([QUATERNION.size, ROTOR_SIZE, 3, ERROR_COUNT, 5])
+
+
+# Places in the packed constants: body_constants[0] and rotor_constants[0] of `_advance`.
+_MASS, _THRUST_MAX = 0, 12
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,6 +193,24 @@ class Plant:
         """The estimator jumps by this much from now on, and says so by its reset counter."""
         self._offset_ned_m += offset_ned_m
         self._reset_counter = (self._reset_counter + 1) % 256
+
+    def drift_estimate(self, offset_ned_m: Triple) -> None:
+        """The estimate moves off by this much, and the estimator does not notice."""
+        self._offset_ned_m += offset_ned_m
+
+    def scale_mass(self, factor: float) -> None:
+        """From now on the vehicle is this much heavier."""
+        self._constants[_MASS] *= factor
+
+    def scale_thrust(self, factor: float) -> None:
+        """From now on the rotors give this much more."""
+        self._constants[_THRUST_MAX] *= factor
+
+    def set_battery(self, remaining: float) -> None:
+        """From now on the battery has this share of its capacity, 0 .. 1."""
+        battery = self._airframe.battery
+        drawn = battery.remaining - remaining
+        self._rotor[CHARGE] = 3600.0 * battery.capacity_ah * drawn
 
     @property
     def truth(self) -> Truth:

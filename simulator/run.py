@@ -58,12 +58,17 @@ class Runner:
         expired = self._duration_s is not None and self._instance.time_s >= self._duration_s
         return expired or self._stopping()
 
-    def _send(self) -> list[bytes]:
-        """Send what both links have queued; return the companion's datagrams."""
-        datagrams = self._instance.companion.drain()
+    def _send(self) -> None:
+        """Send what both links have queued."""
+        self._companion.send(self._instance.drain())
+        self._send_ground()
+
+    def _send_barrier(self) -> tuple[int, list[bytes]]:
+        """Send everything and the question for the time; return its stamp and the datagrams."""
+        stamp_ns, datagrams = self._instance.barrier()
         self._companion.send(datagrams)
         self._send_ground()
-        return datagrams
+        return stamp_ns, datagrams
 
     def _send_ground(self) -> None:
         datagrams = self._instance.ground.drain()
@@ -122,8 +127,7 @@ class Runner:
             self._instance.advance()
             if not self._instance.barrier_due():
                 continue
-            stamp_ns = self._instance.companion.send_barrier()
-            datagrams = self._send()
+            stamp_ns, datagrams = self._send_barrier()
             self._read_ground()
             if self._answered(stamp_ns, datagrams, patience_s) or self._stopping():
                 continue
@@ -168,8 +172,7 @@ class Runner:
             instance.advance()
             if not instance.barrier_due():
                 continue
-            instance.companion.send_barrier()
-            self._send()
+            self._send_barrier()
             while (datagram := self._companion.receive()) is not None:
                 instance.feed(datagram)
             self._read_ground()

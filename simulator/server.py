@@ -60,6 +60,9 @@ class Server:
 
     def __post_init__(self) -> None:
         self._commands = Commands(self)
+        self._start_streams()
+
+    def _start_streams(self) -> None:
         for name, rate_hz in self.rates_hz.items():
             if not (self.barrier and name == "TIMESYNC"):
                 self._streams[name] = Stream(round(1e6 / rate_hz), 0)
@@ -97,7 +100,7 @@ class Server:
 
     def step(self) -> None:
         """Queue the telemetry that is due at this step."""
-        now_us = self.view.time_us
+        now_us = self._now_us
         if self._parameters_due:
             for name in self._parameters_due[:PARAMETERS_PER_STEP]:
                 self.send_parameter(name)
@@ -107,14 +110,28 @@ class Server:
         on_grid = self.view.autopilot.steps % POSITION_GRID_STEPS == 0
         for name, stream in self._streams.items():
             if stream.due_us <= now_us and (on_grid or name not in ON_POSITION_GRID):
-                self.send_now(name)
+                if name not in self.view.silent:
+                    self.send_now(name)
                 stream.due_us = _next_multiple(now_us, stream)
         self._next_us = min((s.due_us for s in self._streams.values()), default=1 << 62)
 
-    def send_barrier(self) -> int:
-        """Queue a TIMESYNC request; return its ts1, nanoseconds of vehicle time."""
-        self.send_now("TIMESYNC")
-        return self.view.time_us * 1000
+    @property
+    def _now_us(self) -> int:
+        """Time by which streams are due; no clock that a fault can turn back."""
+        return self.view.autopilot.steps * 4000
+
+    def send_barrier(self, stamp_ns: int) -> None:
+        """Queue a TIMESYNC request."""
+        self.send("TIMESYNC", 0, stamp_ns)
+
+    def restart(self) -> None:
+        """As after boot: default rates, nothing queued, nobody known."""
+        self._out = []
+        self._parameters_due = []
+        self._streams = {}
+        self._next_us = self._sequence = self._text_id = 0
+        self._ground_station = False
+        self._start_streams()
 
     def say(self, said: Say) -> None:
         """Queue a STATUSTEXT in chunks, if this link gets texts at all."""
@@ -145,7 +162,7 @@ class Server:
             self._streams.pop(name, None)
             return True
         stream = Stream(round(min(INTERVAL_MAX_US, max(1.0, interval_us))), 0)
-        stream.due_us = _next_multiple(self.view.time_us, stream)
+        stream.due_us = _next_multiple(self._now_us, stream)
         self._streams[name] = stream
         self._next_us = 0
         return True

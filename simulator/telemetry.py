@@ -34,6 +34,19 @@ _FIRST_FIX_S = 3.0  # position reported as healthy from here on
 
 
 @dataclass(slots=True)
+class Stuck:
+    """A message that repeats its content; its first field, the time stamp, may run on."""
+
+    stamp_runs: bool
+    values: Sequence[Any] | None = None
+
+    def instead_of(self, values: Sequence[Any]) -> Sequence[Any]:
+        if self.values is None:
+            self.values = values
+        return (values[0], *self.values[1:]) if self.stamp_runs else self.values
+
+
+@dataclass(slots=True)
 class View:
     """What builders read: the autopilot, and what one step's messages share."""
 
@@ -42,6 +55,11 @@ class View:
     epoch_us: int  # Unix time of boot
     ping_sequence: int = 0
     payloads: dict[str, bytes] = field(default_factory=dict)
+    # What faults do to it
+    has_fix: bool = True
+    clock_offset_us: int = 0
+    silent: set[str] = field(default_factory=set)
+    stuck: dict[str, Stuck] = field(default_factory=dict)
     _at_step: int = -1
 
     def payload(self, name: str) -> bytes:
@@ -51,16 +69,26 @@ class View:
             self.payloads.clear()
         packed = self.payloads.get(name)
         if packed is None:
-            packed = self.payloads[name] = layout(name).pack(BUILDERS[name](self))
+            values = BUILDERS[name](self)
+            if name in self.stuck:
+                values = self.stuck[name].instead_of(values)
+            packed = self.payloads[name] = layout(name).pack(values)
         return packed
+
+    def restart(self, autopilot: Autopilot) -> None:
+        """Another autopilot, after a reboot."""
+        self.autopilot = autopilot
+        self.clock_offset_us = self.ping_sequence = 0
+        self._at_step = -1
 
     @property
     def time_ms(self) -> int:
-        return self.autopilot.steps * 4
+        return self.time_us // 1000 & 0xFFFFFFFF
 
     @property
     def time_us(self) -> int:
-        return self.autopilot.steps * 4000
+        """The vehicle's clock, as its stamps show it."""
+        return max(0, self.autopilot.steps * 4000 + self.clock_offset_us)
 
     def geodetic(self, north_m: float, east_m: float) -> tuple[int, int]:
         """Latitude and longitude in 1e-7 deg of a point near the origin (spherical Earth)."""
@@ -228,6 +256,8 @@ def gps_raw_int(view: View) -> Sequence[Any]:
     speed = _fit(math.hypot(v_north, v_east) * 100, 16, signed=False)
     height = view.altitude_mm(down)
     latitude, longitude = view.geodetic(north, east)
+    if not view.has_fix:
+        return (view.time_us, 1, 0, 0, 0, 65535, 65535, 65535, 65535, 0, *(0,) * 6)
     return (
         view.time_us, 3, latitude, longitude, height, 70, 110, speed, course, 10, height,
         900, 1780, 400, 0, 0,
@@ -240,6 +270,8 @@ def sys_status(view: View) -> Sequence[Any]:
     present, enabled, health = _PRESENT, _ENABLED, _HEALTH
     if autopilot.time_s < _FIRST_FIX_S:
         present, enabled, health = present & ~0x20, enabled & ~0x20, health & ~0x20
+    elif not view.has_fix:
+        health &= ~0x20
     if autopilot.healthy:
         health |= _PREARM
     return (

@@ -1,0 +1,144 @@
+"""What a link does to datagrams on their way: delay, loss, repetition, disorder, damage.
+
+Wrapped round the byte channel, so that neither the autopilot nor its MAVLink side knows of it.
+Time is an argument, in microseconds; randomness is the generator handed in, so that a flight with
+bad links is as reproducible as one with good ones.
+"""
+
+from __future__ import annotations
+
+import heapq
+from random import Random
+
+from pydantic import Field
+
+from offboard.model.vehicle import Parameters
+
+# Answers and announcements, which a rate limit per message does not thin: PARAM_VALUE, MISSION_*,
+# COMMAND_ACK, FILE_TRANSFER_PROTOCOL, TIMESYNC, AUTOPILOT_VERSION, MESSAGE_INTERVAL, STATUSTEXT
+_NOT_STREAMED = frozenset((22, *range(37, 48), 51, 73, 77, 110, 111, 148, 244, 253))
+_MAGIC_V2, _SIGNED, _SIGNATURE_BYTES = 0xFD, 0x01, 13
+
+
+class Impairment(Parameters):
+    """One direction of a link. Shares are probabilities per datagram, 0 .. 1."""
+
+    latency_s: float = Field(default=0.0, ge=0, le=10)
+    jitter_s: float = Field(default=0.0, ge=0, le=5)  # further delay, uniform; order is kept
+    loss: float = Field(default=0.0, ge=0, le=1)
+    duplication: float = Field(default=0.0, ge=0, le=1)
+    reorder: float = Field(default=0.0, ge=0, le=1)  # share held back by `reorder_s`
+    reorder_s: float = Field(default=0.02, ge=0, le=5)
+    corruption: float = Field(default=0.0, ge=0, le=1)  # share in which one bit is flipped
+    rate_bytes_ps: float | None = Field(default=None, ge=100, le=1e9)
+    queue_bytes: int = Field(default=4096, ge=280, le=10_000_000)  # what finds it full is lost
+    message_rate_hz: float | None = Field(default=None, ge=0.1, le=1000)  # of each message id
+
+
+class Channel:
+    """One direction: `put` datagrams in, `take` those that have arrived."""
+
+    def __init__(self, settings: Impairment, random: Random) -> None:
+        self._settings = settings
+        self._random = random
+        self.on = True  # what is under way arrives in any case
+        self._under_way: list[tuple[int, int, bytes]] = []
+        self._count = 0
+        self._newest_us = self._idle_us = 0
+        self._slots: dict[int, int] = {}
+
+    def put(self, datagram: bytes, now_us: int) -> None:
+        """Send one datagram off at `now_us`."""
+        if not self.on:
+            self._deliver(now_us, datagram)
+            return
+        settings, chance = self._settings, self._random.random
+        if settings.message_rate_hz is not None:
+            datagram = self._thinned(datagram, now_us, settings.message_rate_hz)
+        if not datagram or (settings.loss and chance() < settings.loss):
+            return
+        sent_us = self._transmitted(len(datagram), now_us)
+        if sent_us is None:
+            return
+        if settings.corruption and chance() < settings.corruption:
+            datagram = self._damaged(datagram)
+        twice = bool(settings.duplication) and chance() < settings.duplication
+        delay_s = settings.latency_s + (settings.jitter_s * chance() if settings.jitter_s else 0.0)
+        due_us = max(sent_us + round(delay_s * 1e6), self._newest_us)
+        if settings.reorder and chance() < settings.reorder:
+            due_us += round(settings.reorder_s * 1e6)
+        else:
+            self._newest_us = due_us
+        for _ in range(1 + twice):
+            self._deliver(due_us, datagram)
+
+    def take(self, now_us: int) -> list[bytes]:
+        """What has arrived by `now_us`, in the order of arrival."""
+        arrived: list[bytes] = []
+        while self._under_way and self._under_way[0][0] <= now_us:
+            arrived.append(heapq.heappop(self._under_way)[2])
+        return arrived
+
+    def _deliver(self, due_us: int, datagram: bytes) -> None:
+        heapq.heappush(self._under_way, (due_us, self._count, datagram))
+        self._count += 1
+
+    def _transmitted(self, size: int, now_us: int) -> int | None:
+        """When the last byte is through a narrow link; None when its queue is full."""
+        rate = self._settings.rate_bytes_ps
+        if rate is None:
+            return now_us
+        waiting = max(0, self._idle_us - now_us) * 1e-6 * rate
+        if waiting + size > self._settings.queue_bytes:
+            return None
+        self._idle_us = max(self._idle_us, now_us) + round(1e6 * size / rate)
+        return self._idle_us
+
+    def _damaged(self, datagram: bytes) -> bytes:
+        bit = self._random.randrange(8 * len(datagram))
+        damaged = bytearray(datagram)
+        damaged[bit >> 3] ^= 1 << (bit & 7)
+        return bytes(damaged)
+
+    def _thinned(self, datagram: bytes, now_us: int, rate_hz: float) -> bytes:
+        """The datagram without the messages that came in the same 1/rate already."""
+        slot = int(now_us * 1e-6 * rate_hz + 1e-9)
+        kept: list[bytes] = []
+        for message_id, frame in frames(datagram):
+            if message_id not in _NOT_STREAMED:
+                if self._slots.get(message_id) == slot:
+                    continue
+                self._slots[message_id] = slot
+            kept.append(frame)
+        return b"".join(kept)
+
+
+class Path:
+    """One direction through any number of channels, one behind the other."""
+
+    def __init__(self, channels: tuple[Channel, ...] = ()) -> None:
+        self.channels = channels
+
+    def carry(self, datagrams: list[bytes], now_us: int) -> list[bytes]:
+        """Send these off and return what arrives now."""
+        for channel in self.channels:
+            for datagram in datagrams:
+                channel.put(datagram, now_us)
+            datagrams = channel.take(now_us)
+        return datagrams
+
+
+def frames(datagram: bytes) -> list[tuple[int, bytes]]:
+    """(message id, frame) of each MAVLink 2 frame; what is none is one piece with id -1."""
+    found: list[tuple[int, bytes]] = []
+    at = 0
+    while at < len(datagram):
+        left = len(datagram) - at
+        if datagram[at] != _MAGIC_V2 or left < 12:
+            found.append((-1, datagram[at:]))
+            break
+        size = 12 + datagram[at + 1] + (_SIGNATURE_BYTES if datagram[at + 2] & _SIGNED else 0)
+        message_id = int.from_bytes(datagram[at + 7 : at + 10], "little")
+        found.append((message_id, datagram[at : at + size]))
+        at += size
+    return found

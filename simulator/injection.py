@@ -1,0 +1,250 @@
+"""Faults at work: begins and ends each one of a scenario at its time, on one vehicle.
+
+What a fault *is* lies in `simulator.faults`; what a bad link does, in `simulator.impairment`. This
+module knows the whole vehicle, and nothing of the vehicle knows it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from random import Random
+from typing import Any, Protocol
+
+from simulator import faults
+from simulator.autopilot import Autopilot
+from simulator.faults import Direction, Fault, Moment, Refusable
+from simulator.firmware.base import Behaviour, Say, Severity
+from simulator.impairment import Channel, Path
+from simulator.plant import STEP_S
+from simulator.telemetry import Stuck, View
+
+_REFUSED_EVENTS = {
+    Refusable.ARM: ("arm", "force arm"),
+    Refusable.OFFBOARD: ("offboard",),
+    Refusable.TAKEOFF: ("takeoff",),
+}
+_REFUSED_TITLES = {
+    Refusable.ARM: "Arming denied",
+    Refusable.OFFBOARD: "Switching to Offboard denied",
+    Refusable.TAKEOFF: "Takeoff denied",
+}
+
+
+class Vehicle(Protocol):
+    """What faults take hold of."""
+
+    autopilot: Autopilot
+    view: View
+
+    def reboot(self, silent_s: float) -> None: ...
+
+
+@dataclass(slots=True)
+class Running:
+    """One fault of the scenario, and where it stands."""
+
+    fault: Any
+    channels: list[Channel]
+    begins_s: float | None = None  # None: its moment has not come
+    begun: bool = False
+    over: bool = False
+    memory: Any = None  # what its end needs to know
+
+
+@dataclass(slots=True)
+class Injection:
+    """All faults of one flight. `down` and `up` are the companion link's directions."""
+
+    down: Path
+    up: Path
+    _waiting: list[Running]
+    _moments: dict[Moment, float] = field(default_factory=dict)
+    _flown: bool = False
+
+    def step(self, now_s: float, vehicle: Vehicle) -> None:
+        """Begin and end what is due at `now_s`, seconds since the start (no reboot resets it)."""
+        self._note_moments(now_s, vehicle.autopilot)
+        for running in self._waiting:
+            self._advance(running, now_s + 1e-6, vehicle)
+        if any(running.over for running in self._waiting):
+            self._waiting = [running for running in self._waiting if not running.over]
+
+    def _note_moments(self, now_s: float, autopilot: Autopilot) -> None:
+        self._flown = self._flown or not autopilot.landed
+        by_setpoint = autopilot.mode.behaviour is Behaviour.SETPOINT
+        for moment, reached in (
+            (Moment.BOOT, True),
+            (Moment.ARMED, autopilot.armed),
+            (Moment.TOOK_OFF, not autopilot.landed),
+            (Moment.ENGAGED, by_setpoint and autopilot.armed),
+            (Moment.LANDED, self._flown and autopilot.landed),
+        ):
+            if reached:
+                self._moments.setdefault(moment, now_s)
+
+    def _advance(self, running: Running, now_s: float, vehicle: Vehicle) -> None:
+        fault = running.fault
+        if running.begins_s is None:
+            since_s = self._moments.get(fault.after)
+            if since_s is None:
+                return
+            running.begins_s = since_s + fault.at_s
+        if now_s < running.begins_s:
+            return
+        begin, during, end = EFFECTS[type(fault)]
+        if not running.begun:
+            running.begun = True
+            begin(vehicle, running)
+        if fault.for_s is not None and now_s >= running.begins_s + fault.for_s:
+            end(vehicle, running)
+            running.over = True
+        elif during is not _nothing:
+            during(vehicle, running)
+        elif fault.for_s is None:
+            running.over = True
+
+
+def prepare(scenario: Sequence[Fault], seed: int) -> Injection | None:
+    """Faults that have not begun; None when the scenario has none."""
+    if not scenario:
+        return None
+    ways: dict[Direction, list[Channel]] = {Direction.DOWN: [], Direction.UP: []}
+    waiting: list[Running] = []
+    for number, fault in enumerate(scenario):
+        channels = []
+        for direction, way in ways.items():
+            if isinstance(fault, faults.LinkFault) and fault.direction in (direction, "both"):
+                channels.append(Channel(fault, Random(f"{seed} {number} {direction}")))
+                channels[-1].on = False
+                way.append(channels[-1])
+        waiting.append(Running(fault, channels))
+    down, up = (Path(tuple(way)) for way in ways.values())
+    return Injection(down, up, waiting)
+
+
+def _nothing(vehicle: Vehicle, running: Running) -> None:
+    pass
+
+
+def _link_down(vehicle: Vehicle, running: Running) -> None:
+    for channel in running.channels:
+        channel.on = True
+
+
+def _link_up(vehicle: Vehicle, running: Running) -> None:
+    for channel in running.channels:
+        channel.on = False
+
+
+def _jump(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.plant.reset_estimate(running.fault.offset_ned_m)
+
+
+def _lose_fix(vehicle: Vehicle, running: Running) -> None:
+    vehicle.view.has_fix = False
+    running.memory = 0.0
+
+
+def _drift(vehicle: Vehicle, running: Running) -> None:
+    step_m = running.fault.drift_mps * STEP_S * 0.5**0.5
+    running.memory += step_m
+    vehicle.autopilot.plant.drift_estimate((step_m, step_m, 0.0))
+
+
+def _regain_fix(vehicle: Vehicle, running: Running) -> None:
+    vehicle.view.has_fix = True
+    if running.memory:
+        vehicle.autopilot.plant.reset_estimate((-running.memory, -running.memory, 0.0))
+
+
+def _silence(vehicle: Vehicle, running: Running) -> None:
+    vehicle.view.silent.add(running.fault.message)
+
+
+def _speak(vehicle: Vehicle, running: Running) -> None:
+    vehicle.view.silent.discard(running.fault.message)
+
+
+def _stick(vehicle: Vehicle, running: Running) -> None:
+    vehicle.view.stuck[running.fault.message] = Stuck(running.fault.stamp_runs)
+
+
+def _unstick(vehicle: Vehicle, running: Running) -> None:
+    vehicle.view.stuck.pop(running.fault.message, None)
+
+
+def _weaken_motor(vehicle: Vehicle, running: Running) -> None:
+    running.memory = (3.0 + running.fault.motor_scale) / 4.0
+    vehicle.autopilot.plant.scale_thrust(running.memory)
+
+
+def _change_thrust(vehicle: Vehicle, running: Running) -> None:
+    running.memory = running.fault.thrust_scale
+    vehicle.autopilot.plant.scale_thrust(running.memory)
+
+
+def _restore_thrust(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.plant.scale_thrust(1.0 / running.memory)
+
+
+def _change_mass(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.plant.scale_mass(running.fault.mass_scale)
+
+
+def _restore_mass(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.plant.scale_mass(1.0 / running.fault.mass_scale)
+
+
+def _drop_battery(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.plant.set_battery(running.fault.remaining)
+
+
+def _reboot(vehicle: Vehicle, running: Running) -> None:
+    vehicle.reboot(running.fault.for_s)
+
+
+def _jump_clock(vehicle: Vehicle, running: Running) -> None:
+    vehicle.view.clock_offset_us += round(running.fault.jump_s * 1e6)
+
+
+def _jump_clock_back(vehicle: Vehicle, running: Running) -> None:
+    vehicle.view.clock_offset_us -= round(running.fault.jump_s * 1e6)
+
+
+def _refuse(vehicle: Vehicle, running: Running) -> None:
+    of = running.fault.of
+    said = Say(Severity.CRITICAL, f"{_REFUSED_TITLES[of]}: {running.fault.text}")
+    for event in _REFUSED_EVENTS[of]:
+        vehicle.autopilot.refused[event] = said
+
+
+def _allow(vehicle: Vehicle, running: Running) -> None:
+    for event in _REFUSED_EVENTS[running.fault.of]:
+        vehicle.autopilot.refused.pop(event, None)
+
+
+def _take_over(vehicle: Vehicle, running: Running) -> None:
+    modes = vehicle.autopilot.firmware.modes.values()
+    hold = next(mode.name for mode in modes if mode.behaviour is Behaviour.HOLD)
+    vehicle.autopilot.happen("mode", mode=hold)
+
+
+Effect = Callable[[Vehicle, Running], None]
+
+# Per fault: how it begins, what it does at every step, how it ends.
+EFFECTS: dict[type, tuple[Effect, Effect, Effect]] = {
+    faults.LinkFault: (_link_down, _nothing, _link_up),
+    faults.EstimatorJump: (_jump, _nothing, _nothing),
+    faults.GpsLoss: (_lose_fix, _drift, _regain_fix),
+    faults.SilentMessage: (_silence, _nothing, _speak),
+    faults.StuckMessage: (_stick, _nothing, _unstick),
+    faults.WeakMotor: (_weaken_motor, _nothing, _restore_thrust),
+    faults.ThrustChange: (_change_thrust, _nothing, _restore_thrust),
+    faults.MassChange: (_change_mass, _nothing, _restore_mass),
+    faults.BatteryDrop: (_drop_battery, _nothing, _nothing),
+    faults.Reboot: (_reboot, _nothing, _nothing),
+    faults.ClockJump: (_jump_clock, _nothing, _jump_clock_back),
+    faults.Refusal: (_refuse, _nothing, _allow),
+    faults.PilotTakesOver: (_take_over, _nothing, _nothing),
+}
