@@ -22,7 +22,7 @@ def _commands() -> list[str]:
 
 def test_ci_runs_exactly_the_test_command() -> None:
     command = _commands()[1]
-    assert command.endswith("pytest")
+    assert command.endswith("pytest -n auto")
     assert (ROOT / ".ci" / "run").read_text().splitlines()[-1] == command
 
 
