@@ -15,6 +15,7 @@ from typing import Any
 from simulator.firmware.base import (
     AttitudeSetpoint,
     Behaviour,
+    Condition,
     Firmware,
     Mode,
     MotionSetpoint,
@@ -31,7 +32,12 @@ class Autopilot:
     """One autopilot on one plant. `step` moves both by STEP_S; texts pile up in `texts`."""
 
     def __init__(
-        self, firmware: Firmware, plant: Plant, parameters: ParameterTable | None = None
+        self,
+        firmware: Firmware,
+        plant: Plant,
+        parameters: ParameterTable | None = None,
+        *,
+        boot_scale: float = 1.0,
     ) -> None:
         self.firmware = firmware
         self.plant = plant
@@ -39,8 +45,15 @@ class Autopilot:
         self.pilot = Pilot(firmware, self.parameters)
         self.mode: Mode = firmware.modes[firmware.boot_mode]
         self.intended = self.remembered = firmware.boot_mode
-        self.armed = self.failsafe = False
+        self.armed = self.failsafe = self.faulty = False
         self.texts: list[Say] = []
+        self.announcements: list[str] = []  # messages for every link
+        self.reached: frozenset[str] = frozenset()  # boot events
+        self.boot_scale = boot_scale
+        self._boot = sorted((at_s * boot_scale, name) for name, at_s in firmware.boot.items())
+        self._rules: dict[str, list[Rule]] = {}
+        for rule in firmware.rules:
+            self._rules.setdefault(rule.event, []).append(rule)
         self.refused: dict[str, Say] = {}  # events, and "offboard", that are refused by a fault
         self.steps = 0
         self._truth: Truth | None = None
@@ -49,6 +62,7 @@ class Autopilot:
         self._flown = False
         self._setpoint_s = -math.inf
         self._requested = ""
+        self._takeoff_z_m = math.nan
 
     # -- what others see ---------------------------------------------------------------------
 
@@ -70,41 +84,59 @@ class Autopilot:
     @property
     def healthy(self) -> bool:
         """The pre-arm checks pass, for the mode that was chosen."""
-        waits = self.firmware.modes[self.intended].behaviour is Behaviour.SETPOINT
-        booted = self.time_s >= self.firmware.healthy_after_s
+        firmware, mode = self.firmware, self.firmware.modes[self.intended]
+        after_s = firmware.healthy_without_position_after_s
+        if mode.needs_position:
+            after_s = firmware.healthy_after_s
+        waits = firmware.setpoint_mode_needs_stream and mode.behaviour is Behaviour.SETPOINT
+        booted = self.time_s >= after_s * self.boot_scale and not self.faulty
         return booted and (self.stream_alive or not waits)
 
     @property
+    def has_fix(self) -> bool:
+        """GPS reports a position."""
+        return self.time_s >= self.firmware.sensors.first_fix_s * self.boot_scale
+
+    @property
+    def _condition(self) -> Condition:
+        return Condition(
+            mode=self.mode,
+            reached=self.reached,
+            armed=self.armed,
+            landed=self.landed,
+            healthy=self.healthy,
+            failsafe=self.failsafe,
+            faulty=self.faulty,
+            setpoint=self.pilot.setpoint,
+        )
+
+    @property
     def system_status(self) -> int:
-        """MAV_STATE: 0 not ready, 3 standby, 4 active, 5 critical."""
-        if self.armed:
-            return 5 if self.failsafe else 4
-        return 3 if self.healthy else 0
+        """MAV_STATE."""
+        return self.firmware.heartbeat(self._condition)[1]
 
     @property
     def base_mode(self) -> int:
-        """MAV_MODE_FLAG bits; a mode that never had a setpoint shows only "custom mode"."""
-        if self.mode.behaviour is Behaviour.SETPOINT and self.pilot.setpoint is None:
-            return 1 | (128 if self.armed else 0)
-        return self.mode.base_mode | (128 if self.armed else 0)
+        """MAV_MODE_FLAG bits."""
+        return self.firmware.heartbeat(self._condition)[0] | (128 if self.armed else 0)
 
     @property
     def landed_state(self) -> int:
         """MAV_LANDED_STATE: 1 on ground, 2 in air, 3 taking off, 4 landing."""
         if self.landed:
             return 1
-        return {Behaviour.TAKEOFF: 3, Behaviour.LAND: 4}.get(self.mode.behaviour, 2)
+        return {Behaviour.TAKEOFF: 3, Behaviour.LAND: 4}.get(self.pilot.behaviour, 2)
 
     # -- what comes in -----------------------------------------------------------------------
 
     def happen(self, event: str, *, mode: str = "", takeoff_z_m: float = math.nan) -> Result:
         """Run the rule table for an event; `mode` is the one asked for, if the event asks."""
-        self._requested = mode
+        self._requested, self._takeoff_z_m = mode, takeoff_z_m
         if self.refused and (said := self.refused.get(self._wish(event, mode))) is not None:
             self.texts.append(said)
             return Result.TEMPORARILY_REJECTED
-        for rule in self.firmware.rules:
-            if rule.event == event and self._fits(rule):
+        for rule in self._rules.get(event, ()):
+            if self._fits(rule):
                 self._apply(rule, takeoff_z_m)
                 return rule.result
         return Result.ACCEPTED
@@ -115,16 +147,30 @@ class Autopilot:
 
     def obey_attitude(self, values: Mapping[str, Any]) -> None:
         """Fields of SET_ATTITUDE_TARGET."""
-        self._obey(self.firmware.attitude_setpoint(values))
+        if self._obeys_setpoints:
+            self._obey(self.firmware.attitude_setpoint(values, self.parameters.__getitem__))
 
     def obey_motion(self, values: Mapping[str, Any]) -> None:
         """Fields of SET_POSITION_TARGET_LOCAL_NED."""
-        self._obey(self.firmware.motion_setpoint(values))
+        if self._obeys_setpoints and (
+            self.mode.needs_position or self.firmware.setpoints_outlive_modes
+        ):
+            self._obey(self.firmware.motion_setpoint(values))
+
+    @property
+    def _obeys_setpoints(self) -> bool:
+        in_mode = self.mode.behaviour is Behaviour.SETPOINT
+        return in_mode or self.firmware.setpoints_outlive_modes
 
     def _obey(self, setpoint: AttitudeSetpoint | MotionSetpoint | None) -> None:
-        if setpoint is not None:
-            self._setpoint_s = self.time_s
-            self.pilot.setpoint = setpoint
+        if setpoint is None:
+            return
+        self._setpoint_s = self.time_s
+        self.pilot.setpoint = setpoint
+        if self.pilot.behaviour is not self.mode.behaviour:  # a takeoff within the mode ends
+            self.pilot.enter(self.mode.behaviour, self.look())
+        if isinstance(setpoint, AttitudeSetpoint) and setpoint.event:
+            self.happen(setpoint.event)
 
     # -- time --------------------------------------------------------------------------------
 
@@ -135,6 +181,10 @@ class Autopilot:
         self.plant.advance(STEP_S, demand)
         self.steps += 1
         self._truth = self._nav = None
+        while self._boot and self.time_s >= self._boot[0][0]:
+            _, event = self._boot.pop(0)
+            self.reached |= {event}
+            self.happen(event)
         if self.failsafe or self.mode.behaviour is Behaviour.SETPOINT:
             self._watch_stream()
         if self.armed:
@@ -198,6 +248,8 @@ class Autopilot:
     def _holds(self, guard: str) -> bool:
         if guard.startswith("not "):
             return not self._holds(guard[4:])
+        if guard.startswith("reached "):
+            return guard[8:] in self.reached
         name, compares, value = guard.partition("=")
         if compares:
             return self.parameters[name] == float(value)
@@ -214,9 +266,10 @@ class Autopilot:
         }.get(rule.to, rule.to)
         if rule.to != "*":
             self._enter(target, by_failsafe="failsafe" in rule.do, takeoff_z_m=takeoff_z_m)
-        if rule.say is not None:
-            title = self.firmware.modes[asked].title if asked else ""
-            self.texts.append(Say(rule.say.severity, rule.say.text.format(mode=title)))
+        title = self.firmware.modes[asked].title if asked else self.mode.title
+        for say in (*((rule.say,) if rule.say else ()), *rule.also):
+            self.texts.append(Say(say.severity, say.text.format(mode=title)))
+        self.announcements += rule.send
 
     def _enter(self, name: str, *, by_failsafe: bool, takeoff_z_m: float) -> None:
         mode = self.firmware.modes[name]
@@ -225,9 +278,32 @@ class Autopilot:
             self.intended = name
             if mode.remembered:
                 self.remembered = name
+        if mode is not self.mode and not self.firmware.setpoints_outlive_modes:
+            self.pilot.setpoint = None
         if mode is not self.mode or mode.behaviour is not Behaviour.SETPOINT:
             self.pilot.enter(mode.behaviour, self.look(), takeoff_z_m)
         self.mode = mode
+
+    def _position_missing(self) -> bool:
+        mode = self.firmware.modes[self._requested] if self._requested else self.mode
+        return mode.needs_position and "position" not in self.reached
+
+    def _climb_asked(self) -> bool:
+        return self._takeoff_z_m <= self.pilot.home_ned_m[2]
+
+    def _take_off(self) -> None:
+        self.pilot.setpoint = None
+        self.pilot.enter(Behaviour.TAKEOFF, self.look(), self._takeoff_z_m)
+
+    def _hold(self) -> None:
+        self.pilot.setpoint = None
+        self.pilot.enter(self.mode.behaviour, self.look())
+
+    def _level(self) -> None:
+        self.pilot.level(self.look())
+
+    def _latch(self) -> None:
+        self.faulty = True
 
     def _mode_can_run(self) -> bool:
         mode = self.firmware.modes[self._requested]
@@ -255,6 +331,13 @@ GUARDS: dict[str, Callable[[Autopilot], bool]] = {
     "failsafe": lambda autopilot: autopilot.failsafe,
     "ready": lambda autopilot: autopilot.healthy and autopilot.mode.arms,
     "mode can run": Autopilot._mode_can_run,
+    "mode arms": lambda autopilot: autopilot.mode.arms,
+    "faulty": lambda autopilot: autopilot.faulty,
+    "position missing": Autopilot._position_missing,
+    "climb asked": Autopilot._climb_asked,
+    "climbing": lambda autopilot: autopilot.pilot.behaviour is Behaviour.TAKEOFF,
+    "obeys attitude": lambda autopilot: autopilot.pilot.obeys_attitude,
+    "obeys motion": lambda autopilot: autopilot.pilot.obeys_motion,
 }
 
 ACTIONS: dict[str, Callable[[Autopilot], None]] = {
@@ -262,6 +345,10 @@ ACTIONS: dict[str, Callable[[Autopilot], None]] = {
     "disarm": Autopilot._disarm,
     "failsafe": Autopilot._fail,
     "recover": Autopilot._recover,
+    "take off": Autopilot._take_off,
+    "hold": Autopilot._hold,
+    "level": Autopilot._level,
+    "latch": Autopilot._latch,
 }
 
 
@@ -277,7 +364,7 @@ def describe(firmware: Firmware) -> list[tuple[str, str, str, str, str]]:
                 part
                 for part in (
                     rule.result.name if rule.result is not Result.ACCEPTED else "",
-                    f'"{rule.say.text}"' if rule.say else "",
+                    " ".join(f'"{say.text}"' for say in (rule.say, *rule.also) if say),
                 )
                 if part
             ),

@@ -31,14 +31,18 @@ def simulate(
     gcs: Annotated[
         str, typer.Option(help=f"Ground station link, or {NO_LINK}.")
     ] = f"udpout:127.0.0.1:{GROUND_PORT}",
-    firmware: Annotated[str, typer.Option(help="Whose behaviour: px4.")] = "px4",
+    firmware: Annotated[str, typer.Option(help="Whose behaviour: px4 or ardupilot.")] = "px4",
     speed: Annotated[float | None, typer.Option(help="Times real time, 0.1 .. 1000.")] = None,
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Virtual time that waits for the companion.")
     ] = False,
     seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Of all randomness.")] = 7,
-    scenario: Annotated[str, typer.Option(help="Name or file.")] = "px4_like",
-    vehicle: Annotated[str, typer.Option(help="Name or file.")] = "px4_sih",
+    scenario: Annotated[
+        str | None, typer.Option(help="Name or file; the firmware's own estimator errors.")
+    ] = None,
+    vehicle: Annotated[
+        str | None, typer.Option(help="Name or file; the firmware's SITL vehicle.")
+    ] = None,
     duration: Annotated[
         float | None, typer.Option(min=0.0, help="Stop after so many vehicle seconds.")
     ] = None,
@@ -67,8 +71,8 @@ def simulate(
 
     connect = connect or f"udpout:127.0.0.1:{COMPANION_PORT + instance}"
     try:
-        flown = config.scenario(scenario)
-        flyer = config.vehicle(vehicle)
+        flown = config.scenario(scenario or personality.scenario)
+        flyer = config.vehicle(vehicle or personality.vehicle)
         companion = open_link(connect, LOCAL_COMPANION_PORT + instance)
         ground = None if gcs == NO_LINK else open_link(gcs, LOCAL_GROUND_PORT + instance)
     except (DocumentError, LinkError) as error:

@@ -16,7 +16,7 @@ from operator import itemgetter
 from typing import Any
 
 from fastcrc.crc16 import mcrf4xx
-from pymavlink.dialects.v20 import common as dialect
+from pymavlink.dialects.v20 import ardupilotmega as dialect  # common and ArduPilot's own
 
 MAGIC_V1 = 0xFE
 MAGIC_V2 = 0xFD

@@ -12,10 +12,8 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from simulator.codec import name_of
-from simulator.firmware.base import Result
-from simulator.telemetry import BUILDERS, View
-
-FORCE = 21196.0
+from simulator.firmware.base import Result, Say, Severity
+from simulator.telemetry import View
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,6 +33,7 @@ class Link(Protocol):
     def send_now(self, name: str) -> None: ...
     def set_interval(self, name: str, interval_us: float) -> bool: ...
     def interval_us(self, name: str) -> int: ...
+    def withheld(self, name: str) -> bool: ...
 
 
 @dataclass(slots=True)
@@ -58,6 +57,8 @@ class Commands:
             self._acknowledge(command, Result.ACCEPTED)
         request = autopilot.firmware.command_mode(command.params)
         if request.mode is None:
+            if request.say is not None:
+                autopilot.texts.append(request.say)
             return request.refusal
         return autopilot.happen("mode", mode=request.mode)
 
@@ -66,13 +67,18 @@ class Commands:
         if wish not in (0.0, 1.0):
             return Result.UNSUPPORTED
         event = "arm" if wish == 1.0 else "disarm"
-        return self.link.view.autopilot.happen(f"force {event}" if force == FORCE else event)
+        autopilot = self.link.view.autopilot
+        forced = force == autopilot.firmware.force_codes[event]
+        return autopilot.happen(f"force {event}" if forced else event)
 
     def _takeoff(self, command: Command) -> Result:
-        amsl_m = command.params[6]
+        asked_m = command.params[6]
         autopilot = self.link.view.autopilot
-        above_m = amsl_m - autopilot.firmware.origin[2]
-        known = math.isfinite(above_m) and above_m > -autopilot.pilot.home_ned_m[2]
+        home_down_m = autopilot.pilot.home_ned_m[2]
+        if autopilot.firmware.takeoff_above_home:
+            return autopilot.happen("takeoff", takeoff_z_m=home_down_m - asked_m)
+        above_m = asked_m - autopilot.firmware.origin[2]
+        known = math.isfinite(above_m) and above_m > -home_down_m
         return autopilot.happen("takeoff", takeoff_z_m=-above_m if known else math.nan)
 
     def _land(self, _: Command) -> Result:
@@ -82,15 +88,26 @@ class Commands:
         return self.link.view.autopilot.happen("return")
 
     def _set_interval(self, command: Command) -> Result:
-        name = message_name(command.params[0])
-        interval_us = command.params[1]
+        number, interval_us = command.params[:2]
+        streams = self.link.view.autopilot.firmware.streams
+        name = message_name(number)
+        if 0 < interval_us < 1e6 / streams.rate_max_hz:
+            return self._refuse_interval(number, streams.too_fast_text)
         if name is None or not math.isfinite(interval_us):
-            return Result.FAILED
-        return Result.ACCEPTED if self.link.set_interval(name, interval_us) else Result.FAILED
+            return self._refuse_interval(number, streams.refusal_text)
+        if not self.link.set_interval(name, interval_us):
+            return self._refuse_interval(number, streams.refusal_text)
+        return Result.ACCEPTED
+
+    def _refuse_interval(self, number: float, text: str) -> Result:
+        autopilot = self.link.view.autopilot
+        if text and math.isfinite(number):
+            autopilot.texts.append(Say(Severity.INFO, text.format(id=int(number))))
+        return autopilot.firmware.streams.refusal
 
     def _get_interval(self, command: Command) -> Result:
         name = message_name(command.params[0])
-        if name is None or name not in BUILDERS:
+        if name is None or name not in self.link.view.builders:
             return Result.DENIED
         number = int(command.params[0]) & 0xFFFF
         self.link.send("MESSAGE_INTERVAL", number, self.link.interval_us(name))
@@ -98,8 +115,8 @@ class Commands:
 
     def _request_message(self, command: Command) -> Result:
         name = message_name(command.params[0])
-        if name not in BUILDERS:
-            return Result.DENIED
+        if name not in self.link.view.builders or self.link.withheld(name):
+            return self.link.view.autopilot.firmware.streams.request_refusal
         self.link.send_now(name)
         return Result.ACCEPTED
 

@@ -32,3 +32,4 @@ class Conditions(Parameters):
     weakening: Weakening | None = None
     ground_effect: bool = False
     battery: Battery = Battery()
+    boot_scale: float = Field(default=1.0, ge=0.02, le=10)  # of the times of the vehicle's start

@@ -23,7 +23,6 @@ from simulator.telemetry import View
 STEP_MS = round(STEP_S * 1000)
 VIRTUAL_EPOCH_US = 1_767_225_600_000_000  # 2026-01-01, where virtual time begins
 BARRIER_INTERVAL_MS = 20
-_POSITION_INTERVAL_MS = 8
 _TIMESYNC = 111
 _OFF = Demand()
 
@@ -48,7 +47,9 @@ class Instance:
         epoch_us: int = VIRTUAL_EPOCH_US,
         faults: Sequence[Fault] = (),
     ) -> None:
-        self.autopilot = Autopilot(firmware, Plant(vehicle, conditions, seed))
+        self.autopilot = Autopilot(
+            firmware, Plant(vehicle, conditions, seed), boot_scale=conditions.boot_scale
+        )
         self.view = View(self.autopilot, system, epoch_us)
         self.companion = Server(self.view, firmware.companion_rates_hz, barrier=lockstep)
         self.ground = Server(self.view, firmware.ground_rates_hz if ground_link else {})
@@ -56,6 +57,7 @@ class Instance:
         self._injection = prepare(faults, seed)
         self._arrived: list[bytes] = []
         self._barrier_ms = 0
+        self._position_interval_ms = firmware.position_grid_steps * STEP_MS
         self._back_at_step = 0
 
     @property
@@ -77,7 +79,7 @@ class Instance:
             self.autopilot.plant.advance(STEP_S, _OFF)
             return
         self.autopilot.step()
-        if self.autopilot.texts:
+        if self.autopilot.texts or self.autopilot.announcements:
             self._spread_texts()
         self.companion.step()
         self.ground.step()
@@ -121,7 +123,7 @@ class Instance:
         command takes effect at the stamp of the newest position, as it nearly does in real time.
         """
         now_ms = self.steps * STEP_MS
-        if now_ms < self._barrier_ms or now_ms % _POSITION_INTERVAL_MS:
+        if now_ms < self._barrier_ms or now_ms % self._position_interval_ms:
             return False
         self._barrier_ms = (now_ms // BARRIER_INTERVAL_MS + 1) * BARRIER_INTERVAL_MS
         return True
@@ -142,7 +144,9 @@ class Instance:
     def reboot(self, silent_s: float) -> None:
         """The autopilot is gone for so long and starts anew; the vehicle goes on falling."""
         old = self.autopilot
-        self.autopilot = Autopilot(old.firmware, old.plant, old.parameters)
+        self.autopilot = Autopilot(
+            old.firmware, old.plant, old.parameters, boot_scale=old.boot_scale
+        )
         self.autopilot.pilot.landed = old.truth.on_ground
         self.view.restart(self.autopilot)
         self.companion.restart()
@@ -188,3 +192,7 @@ class Instance:
             self.companion.say(said)
             self.ground.say(said)
         self.autopilot.texts.clear()
+        for name in self.autopilot.announcements:
+            self.companion.send_now(name)
+            self.ground.send_now(name)
+        self.autopilot.announcements.clear()

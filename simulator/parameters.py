@@ -9,9 +9,9 @@ import math
 import struct
 from collections.abc import Mapping
 
-from simulator.firmware.base import Firmware, ParameterSpec
+from simulator.firmware.base import Firmware, ParameterSpec, Role
 
-MAV_PARAM_TYPE = {"int32": 6, "real32": 9}
+MAV_PARAM_TYPE = {"int8": 2, "int16": 4, "int32": 6, "real32": 9}
 _FLOAT, _INT = struct.Struct("<f"), struct.Struct("<i")
 
 
@@ -21,7 +21,7 @@ class ParameterTable:
     def __init__(self, firmware: Firmware) -> None:
         self._specs = {spec.name: spec for spec in firmware.parameters}
         self._values = {spec.name: spec.default for spec in firmware.parameters}
-        self._roles: Mapping[str, str] = firmware.parameter_roles
+        self._roles: Mapping[str, Role] = firmware.parameter_roles
         self._bytewise = firmware.parameters_bytewise
         self.names = tuple(self._specs)
 
@@ -32,8 +32,13 @@ class ParameterTable:
         return self._values[name]
 
     def role(self, role: str) -> float:
-        """Value of the parameter that plays `role` in this firmware."""
-        return self._values[self._roles[role]]
+        """What this firmware has for `role`, in SI units."""
+        filler = self._roles[role]
+        if isinstance(filler, str):
+            return self._values[filler]
+        if isinstance(filler, tuple):
+            return self._values[filler[0]] * filler[1]
+        return filler
 
     def set(self, name: str, value: float) -> bool:
         """Set one; False (and unchanged) when unknown, not finite or out of range."""
@@ -42,7 +47,7 @@ class ParameterTable:
             return False
         if not spec.minimum <= value <= spec.maximum:
             return False
-        self._values[name] = float(round(value)) if spec.kind == "int32" else value
+        self._values[name] = value if spec.kind == "real32" else float(int(value))
         return True
 
     def set_from_wire(self, name: str, wire: float) -> bool:
@@ -60,4 +65,4 @@ class ParameterTable:
         return value, MAV_PARAM_TYPE[spec.kind]
 
     def _is_bytewise(self, spec: ParameterSpec) -> bool:
-        return self._bytewise and spec.kind == "int32"
+        return self._bytewise and spec.kind != "real32"

@@ -24,12 +24,10 @@ from simulator.position_loop import PositionLoop
 
 LOOP_S = 0.008  # the position loop runs at every second step, as PX4's does on its estimate
 CONTACT_S = 0.3  # on the ground, wanting down: then the motors idle
-LANDED_S = 1.0  # this long of it is a landing
 AIRBORNE_S = 0.1
-_LAND_SLOW_BELOW_M, _LAND_FAST_ABOVE_M = 5.0, 10.0
 _ARRIVED_M = 1.0
-_CLIMBED_M = 0.3
 _STICK_LESS_THRUST = 0.08  # MPC_MANTHR_MIN
+_TILT_BOOST_MAX = 10.0
 _LOW_THRUST_SHARE = 0.6  # of hover: less cannot lift
 OFF = Demand()
 
@@ -58,7 +56,7 @@ class Pilot:
         self._firmware = firmware
         self._parameters = parameters
         self._loop = PositionLoop(firmware.gains)
-        self._behaviour = Behaviour.HOLD
+        self.behaviour = Behaviour.HOLD
         self._hold: Triple = (0.0, 0.0, 0.0)
         self._takeoff_z_m = math.nan
         self._return_stage = 0
@@ -66,6 +64,9 @@ class Pilot:
         self._source: AttitudeSetpoint | None = None
         self._attitude: Quaternion = (1.0, 0.0, 0.0, 0.0)
         self._next_loop_s = 0.0
+        self._armed_for_s = 0.0
+        self._climb_thrust = 0.0
+        self._levelling: AttitudeSetpoint | None = None  # the last one of our own
         self._ground_s = self._air_s = 0.0
         self._ramp_s = 0.0
         self._wants_down = True
@@ -74,6 +75,7 @@ class Pilot:
         self.climbed = False
         self.setpoint: AttitudeSetpoint | MotionSetpoint | None = None
         self.motion = MotionSetpoint()  # what the position loop was last asked for
+        self.thrust_demanded = 0.0  # before it is raised for the tilt
 
     @property
     def demand(self) -> Demand:
@@ -85,9 +87,9 @@ class Pilot:
 
         `takeoff_z_m`: NED height to climb to; NaN the default one.
         """
-        if not (self.climbed and behaviour is Behaviour.HOLD):
+        if not (self.climbed and behaviour in (Behaviour.HOLD, Behaviour.SETPOINT)):
             self._hold = _ahead(nav)
-        self._behaviour = behaviour
+        self.behaviour = behaviour
         self._takeoff_z_m = takeoff_z_m
         self._return_stage = 0
         self.climbed = False
@@ -99,6 +101,7 @@ class Pilot:
         """The motors begin to turn: home is here."""
         self.home_ned_m = nav.position_ned_m
         self._ramp_s = -self._firmware.spool_up_s
+        self._armed_for_s = 0.0
         self._hold = nav.position_ned_m
         self._attitude = _level(nav.yaw_rad)
         self._loop.reset(nav.yaw_rad)
@@ -106,36 +109,88 @@ class Pilot:
     def fly(self, time_s: float, armed: bool, look: Callable[[], Nav]) -> Demand:
         """The demand for the step that begins now. `look` gives the estimate when it is needed."""
         if not armed:
-            self._demand, self._source = OFF, None
+            self._demand, self._source, self.thrust_demanded = OFF, None, 0.0
             self.landed = self.landed or look().on_ground
             return OFF
-        by_setpoint = self._obeys_attitude
-        if by_setpoint and isinstance(self.setpoint, AttitudeSetpoint):
-            self._obey(self.setpoint)
+        setpoint = self._attitude_setpoint
+        if setpoint is not None:
+            self._obey(setpoint, look)
         if time_s >= self._next_loop_s - 1e-6:
             self._next_loop_s = time_s + LOOP_S
+            self._armed_for_s += LOOP_S
             nav = look()
-            if self._behaviour is Behaviour.LEVEL:
+            if self.behaviour is Behaviour.LEVEL:
                 self._set(_level(self._loop.yaw_rad), None, _STICK_LESS_THRUST)
-            elif not by_setpoint:
+            elif setpoint is None:
                 self._fly_motion(nav)
+            elif setpoint.climb_mps is not None or self._boosts_thrust:
+                self._fly_vertical(setpoint, nav)
             self._detect(nav)
         return self._demand
 
-    @property
-    def _obeys_attitude(self) -> bool:
-        return self._behaviour is Behaviour.SETPOINT and isinstance(self.setpoint, AttitudeSetpoint)
+    def level(self, nav: Nav) -> None:
+        """Nobody says what to do: level, course and height as they are."""
+        self._levelling = AttitudeSetpoint(_level(nav.yaw_rad), None, 0.0, climb_mps=0.0)
+        self.setpoint = self._levelling
+        self._loop.reset(nav.yaw_rad)
 
-    def _obey(self, setpoint: AttitudeSetpoint) -> None:
+    @property
+    def obeys_attitude(self) -> bool:
+        """Somebody else's attitude setpoint is flown."""
+        setpoint = self._attitude_setpoint
+        return setpoint is not None and setpoint is not self._levelling
+
+    @property
+    def obeys_motion(self) -> bool:
+        """Somebody else's position, velocity or acceleration is flown."""
+        return self.behaviour is Behaviour.SETPOINT and isinstance(self.setpoint, MotionSetpoint)
+
+    @property
+    def _attitude_setpoint(self) -> AttitudeSetpoint | None:
+        if self.behaviour is Behaviour.SETPOINT and isinstance(self.setpoint, AttitudeSetpoint):
+            return self.setpoint
+        return None
+
+    @property
+    def _boosts_thrust(self) -> bool:
+        return self._parameters.role("tilt_boost") != 0.0
+
+    def _obey(self, setpoint: AttitudeSetpoint, look: Callable[[], Nav]) -> None:
         if setpoint is self._source:
             return
+        if self._source is None:
+            self._climb_thrust = self._demand.thrust
         self._source = setpoint
         if setpoint.attitude is not None:
             self._attitude = setpoint.attitude
-        if setpoint.rates_frd_radps is not None:
-            self._set(None, setpoint.rates_frd_radps, setpoint.thrust)
-        else:
-            self._set(self._attitude, None, setpoint.thrust)
+        self._command(setpoint, look)
+
+    def _command(self, setpoint: AttitudeSetpoint, look: Callable[[], Nav]) -> None:
+        """Its attitude or rates, and its thrust as this firmware takes it."""
+        thrust = setpoint.thrust if setpoint.climb_mps is None else self._climb_thrust
+        if self._armed_for_s < self._firmware.setpoint_spool_s:
+            thrust = 0.0
+        self.thrust_demanded = thrust
+        if self._boosts_thrust:
+            thrust = min(1.0, thrust * _tilt_boost(look()))
+        attitude = self._attitude if setpoint.rates_frd_radps is None else None
+        self._set(attitude, setpoint.rates_frd_radps, thrust)
+
+    def _fly_vertical(self, setpoint: AttitudeSetpoint, nav: Nav) -> None:
+        """What of an attitude setpoint needs the estimate: the climb rate, the tilt."""
+        if setpoint.climb_mps is not None:
+            climb = MotionSetpoint(velocity_ned_mps=(math.nan, math.nan, -setpoint.climb_mps))
+            _, self._climb_thrust, _ = self._loop.step(
+                LOOP_S,
+                nav.position_ned_m,
+                nav.velocity_ned_mps,
+                climb,
+                self._parameters.role("hover_thrust"),
+                integrate=not nav.on_ground,
+            )
+            if self.landed and setpoint.climb_mps <= 0.0:
+                self._climb_thrust = 0.0
+        self._command(setpoint, lambda: nav)
 
     def _set(self, attitude: Quaternion | None, rates: Triple | None, thrust: float) -> None:
         demand = Demand(True, thrust, attitude, rates)
@@ -145,14 +200,14 @@ class Pilot:
     # -- motion ------------------------------------------------------------------------------
 
     def _fly_motion(self, nav: Nav) -> None:
-        lifting = self._behaviour in (Behaviour.TAKEOFF, Behaviour.SETPOINT)
+        lifting = self.behaviour in (Behaviour.TAKEOFF, Behaviour.SETPOINT)
         if self.landed and lifting and self._ramp_s < 0.0:
             self._hold = nav.position_ned_m
         motion = self._motion(nav)
         cruise, up = math.inf, math.inf
-        if self._behaviour is not Behaviour.SETPOINT:
+        if self.behaviour is not Behaviour.SETPOINT:
             cruise = self._parameters.role("cruise_speed_mps")
-        if self._behaviour is Behaviour.TAKEOFF:
+        if self.behaviour is Behaviour.TAKEOFF:
             up = self._parameters.role("takeoff_speed_mps")
         hover = self._parameters.role("hover_thrust")
         self.motion = motion
@@ -172,6 +227,7 @@ class Pilot:
             attitude, thrust = _level(nav.yaw_rad), 0.0
         self._attitude = attitude
         self._wants_down = not _wants_up(wanted, motion)
+        self.thrust_demanded = thrust
         self._set(attitude, None, thrust)
 
     def _lift(
@@ -188,15 +244,15 @@ class Pilot:
 
     def _motion(self, nav: Nav) -> MotionSetpoint:
         hold_x, hold_y, hold_z = self._hold
-        if self._behaviour is Behaviour.SETPOINT and isinstance(self.setpoint, MotionSetpoint):
+        if self.behaviour is Behaviour.SETPOINT and isinstance(self.setpoint, MotionSetpoint):
             return self.setpoint
-        if self._behaviour is Behaviour.TAKEOFF:
+        if self.behaviour is Behaviour.TAKEOFF:
             return self._takeoff(nav)
-        if self._behaviour is Behaviour.RETURN:
+        if self.behaviour is Behaviour.RETURN:
             return self._return(nav)
-        if self._behaviour is Behaviour.LAND:
+        if self.behaviour is Behaviour.LAND:
             return _sink(self._hold, self._land_speed(nav))
-        if self._behaviour is Behaviour.DESCEND:
+        if self.behaviour is Behaviour.DESCEND:
             return _sink(self._hold, self._firmware.descend_speed_mps)
         return MotionSetpoint((hold_x, hold_y, hold_z))
 
@@ -204,7 +260,7 @@ class Pilot:
         target_z = self._takeoff_z_m
         if math.isnan(target_z):
             target_z = self.home_ned_m[2] - self._parameters.role("takeoff_height_m")
-        if nav.position_ned_m[2] < target_z + _CLIMBED_M:
+        if nav.position_ned_m[2] < target_z + self._firmware.climbed_within_m:
             self.climbed = not self.landed
         self._hold = (self._hold[0], self._hold[1], target_z)
         return MotionSetpoint(self._hold)
@@ -231,19 +287,26 @@ class Pilot:
         height_m = self.home_ned_m[2] - nav.position_ned_m[2]
         slow = self._parameters.role("land_speed_mps")
         fast = max(slow, self._parameters.role("descent_speed_mps"))
-        share = (height_m - _LAND_SLOW_BELOW_M) / (_LAND_FAST_ABOVE_M - _LAND_SLOW_BELOW_M)
+        slow_below_m, fast_above_m = self._firmware.landing_heights_m
+        share = (height_m - slow_below_m) / (fast_above_m - slow_below_m)
         return slow + min(1.0, max(0.0, share)) * (fast - slow)
 
     # -- land detector -----------------------------------------------------------------------
 
     def _detect(self, nav: Nav) -> None:
         """Contact and the wish to go down make a landing; a moment without contact a takeoff."""
+        setpoint = self._attitude_setpoint
+        if setpoint is not None and self._firmware.setpoint_decides_flight:
+            self._ground_s = 0.0
+            pushed = self.thrust_demanded > 0.0
+            self.landed = self.landed and not pushed
+            return
         low = self._demand.thrust < _LOW_THRUST_SHARE * self._parameters.role("hover_thrust")
-        if not self._obeys_attitude:
+        if setpoint is None:
             low = low or self._wants_down
         self._ground_s = self._ground_s + LOOP_S if nav.on_ground and low else 0.0
         self._air_s = 0.0 if nav.on_ground else self._air_s + LOOP_S
-        if not self.landed and self._ground_s >= LANDED_S:
+        if not self.landed and self._ground_s >= self._firmware.landed_after_s:
             self.landed = True
             self._ramp_s = 0.0
         elif self.landed and self._air_s >= AIRBORNE_S:
@@ -253,6 +316,12 @@ class Pilot:
 
 def _level(yaw_rad: float) -> Quaternion:
     return (math.cos(0.5 * yaw_rad), 0.0, 0.0, math.sin(0.5 * yaw_rad))
+
+
+def _tilt_boost(nav: Nav) -> float:
+    """1 / cos(tilt) of the body."""
+    _, x, y, _ = nav.attitude
+    return 1.0 / max(1.0 - 2.0 * (x * x + y * y), 1.0 / _TILT_BOOST_MAX)
 
 
 def _ahead(nav: Nav) -> Triple:

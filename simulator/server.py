@@ -13,10 +13,8 @@ from simulator.codec import Decoder, Message, frame, layout
 from simulator.commands import Command, Commands
 from simulator.firmware.base import Say
 from simulator.telemetry import (
-    BUILDERS,
     MAV_COMP_ID_AUTOPILOT,
     ON_POSITION_GRID,
-    POSITION_GRID_STEPS,
     View,
 )
 
@@ -24,6 +22,7 @@ MAV_TYPE_GCS = 6
 TEXT_LENGTH = 50
 DATAGRAM_MAX = 1400
 PARAMETERS_PER_STEP = 4
+PARAMETER_BY_NAME = 65535  # PARAM_VALUE.param_index of an answer that has none
 INTERVAL_MAX_US = 2.0**31 - 1  # MESSAGE_INTERVAL.interval_us is an int32
 _FTP_NAK, _FTP_ERROR_NOT_FOUND = 128 + 1, 10
 
@@ -103,17 +102,24 @@ class Server:
         now_us = self._now_us
         if self._parameters_due:
             for name in self._parameters_due[:PARAMETERS_PER_STEP]:
-                self.send_parameter(name)
+                self.send_parameter(name, listed=True)
             del self._parameters_due[:PARAMETERS_PER_STEP]
         if now_us < self._next_us:
             return
-        on_grid = self.view.autopilot.steps % POSITION_GRID_STEPS == 0
+        autopilot = self.view.autopilot
+        on_grid = autopilot.steps % autopilot.firmware.position_grid_steps == 0
         for name, stream in self._streams.items():
             if stream.due_us <= now_us and (on_grid or name not in ON_POSITION_GRID):
-                if name not in self.view.silent:
+                if name not in self.view.silent and not self.withheld(name):
                     self.send_now(name)
                 stream.due_us = _next_multiple(now_us, stream)
         self._next_us = min((s.due_us for s in self._streams.values()), default=1 << 62)
+
+    def withheld(self, name: str) -> bool:
+        """What the vehicle cannot say yet, whatever rate it granted."""
+        autopilot = self.view.autopilot
+        event = autopilot.firmware.withheld_until.get(name)
+        return event is not None and event not in autopilot.reached
 
     @property
     def _now_us(self) -> int:
@@ -138,22 +144,25 @@ class Server:
         firmware = self.view.autopilot.firmware
         if firmware.text_to_ground_stations_only and not self._ground_station:
             return
+        if not self.heard:
+            return
         text = (said.text + firmware.text_suffix).encode("ascii", "replace")
         for chunk, at in enumerate(range(0, len(text), TEXT_LENGTH)):
             piece = text[at : at + TEXT_LENGTH]
             self.send("STATUSTEXT", int(said.severity), piece, self._text_id, chunk)
         self._text_id = (self._text_id + 1) & 0xFFFF
 
-    def send_parameter(self, name: str) -> None:
-        """Queue PARAM_VALUE."""
+    def send_parameter(self, name: str, *, listed: bool = False) -> None:
+        """Queue PARAM_VALUE; `listed`: its number was asked for."""
         table = self.view.autopilot.parameters
         value, kind = table.to_wire(name)
-        index = table.names.index(name)
+        numbered = listed or self.view.autopilot.firmware.answers_carry_index
+        index = table.names.index(name) if numbered else PARAMETER_BY_NAME
         self.send("PARAM_VALUE", name.encode(), value, kind, len(table.names), index)
 
     def set_interval(self, name: str, interval_us: float) -> bool:
         """0 restores the default, < 0 stops; False when the message has no settable rate."""
-        if name not in BUILDERS or name in self.view.autopilot.firmware.fixed_rate:
+        if name not in self.view.builders or name in self.view.autopilot.firmware.streams.fixed:
             return False
         if interval_us == 0:
             rate_hz = self.rates_hz.get(name)
@@ -186,7 +195,9 @@ class Server:
         """To our system or all, to the autopilot or all of it."""
         system = message.values.get("target_system", 0)
         component = message.values.get("target_component", 0)
-        return system in (0, self.view.system) and component in (0, MAV_COMP_ID_AUTOPILOT)
+        checked = self.view.autopilot.firmware.target_component_checked
+        for_autopilot = component in (0, MAV_COMP_ID_AUTOPILOT) or not checked
+        return system in (0, self.view.system) and for_autopilot
 
     def _heartbeat(self, message: Message) -> None:
         self._ground_station = self._ground_station or message.type == MAV_TYPE_GCS
@@ -220,9 +231,16 @@ class Server:
         names = self.view.autopilot.parameters.names
         if message.param_index >= 0:
             if message.param_index < len(names):
-                self.send_parameter(names[message.param_index])
+                self.send_parameter(names[message.param_index], listed=True)
         elif message.param_id in names:
             self.send_parameter(message.param_id)
+
+    def _request_data_stream(self, message: Message) -> None:
+        """Not acknowledged; a rate of 0 is as good as a stop."""
+        names = self.view.autopilot.firmware.streams.groups.get(message.req_stream_id, ())
+        rate_hz = message.req_message_rate if message.start_stop else 0
+        for name in names:
+            self.set_interval(name, 1e6 / rate_hz if rate_hz else -1.0)
 
     def _param_request_list(self, _: Message) -> None:
         self._parameters_due = list(self.view.autopilot.parameters.names)
@@ -253,6 +271,7 @@ HANDLERS: dict[str, Callable[[Server, Message], None]] = {
     "PARAM_REQUEST_READ": Server._param_request_read,
     "PARAM_REQUEST_LIST": Server._param_request_list,
     "PARAM_SET": Server._param_set,
+    "REQUEST_DATA_STREAM": Server._request_data_stream,
     "FILE_TRANSFER_PROTOCOL": Server._file_transfer,
 }
 

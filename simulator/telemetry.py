@@ -18,7 +18,6 @@ from simulator.firmware.base import MotionSetpoint, Triple
 from simulator.position_loop import GRAVITY_MPS2
 
 EARTH_RADIUS_M = 6_371_000.0
-POSITION_GRID_STEPS = 2  # the estimator's position is new at every second step, as PX4's
 ON_POSITION_GRID = frozenset(
     {"LOCAL_POSITION_NED", "ODOMETRY", "GLOBAL_POSITION_INT", "HIL_STATE_QUATERNION"}
 )
@@ -26,11 +25,7 @@ ON_POSITION_GRID = frozenset(
 MAV_TYPE_QUADROTOR = 2
 MAV_COMP_ID_AUTOPILOT = 1
 _NAN21 = (math.nan,) * 21
-# MAV_SYS_STATUS_SENSOR: gyro, accelerometer, magnetometer, absolute pressure, GPS; battery, AHRS
-_PRESENT, _ENABLED = 0x0300402F, 0x0301402F
-_HEALTH = 0x0330C83F  # with geofence: MAVProxy else reports a breach
-_PREARM = 0x10000000
-_FIRST_FIX_S = 3.0  # position reported as healthy from here on
+_GPS, _PREARM = 0x20, 0x10000000  # MAV_SYS_STATUS_SENSOR
 
 
 @dataclass(slots=True)
@@ -60,7 +55,13 @@ class View:
     clock_offset_us: int = 0
     silent: set[str] = field(default_factory=set)
     stuck: dict[str, Stuck] = field(default_factory=dict)
+    builders: dict[str, Callable[[View], Sequence[Any]]] = field(init=False)
     _at_step: int = -1
+
+    def __post_init__(self) -> None:
+        firmware = self.autopilot.firmware
+        known = {n: b for n, b in BUILDERS.items() if n not in firmware.unknown_messages}
+        self.builders = {**known, **firmware.own_messages}
 
     def payload(self, name: str) -> bytes:
         """Packed payload of message `name` now; built once per step for all links."""
@@ -69,7 +70,7 @@ class View:
             self.payloads.clear()
         packed = self.payloads.get(name)
         if packed is None:
-            values = BUILDERS[name](self)
+            values = self.builders[name](self)
             if name in self.stuck:
                 values = self.stuck[name].instead_of(values)
             packed = self.payloads[name] = layout(name).pack(values)
@@ -213,7 +214,13 @@ def highres_imu(view: View) -> Sequence[Any]:
 def attitude_target(view: View) -> Sequence[Any]:
     demand = view.autopilot.pilot.demand
     rates = demand.rates_frd_radps or (0.0, 0.0, 0.0)
-    return (view.time_ms, 0, demand.attitude or (1.0, 0.0, 0.0, 0.0), *rates, demand.thrust)
+    return (
+        view.time_ms,
+        0,
+        demand.attitude or (1.0, 0.0, 0.0, 0.0),
+        *rates,
+        view.autopilot.pilot.thrust_demanded,
+    )
 
 
 def position_target_local_ned(view: View) -> Sequence[Any]:
@@ -267,11 +274,12 @@ def gps_raw_int(view: View) -> Sequence[Any]:
 def sys_status(view: View) -> Sequence[Any]:
     autopilot = view.autopilot
     battery = autopilot.truth.battery
-    present, enabled, health = _PRESENT, _ENABLED, _HEALTH
-    if autopilot.time_s < _FIRST_FIX_S:
-        present, enabled, health = present & ~0x20, enabled & ~0x20, health & ~0x20
+    sensors = autopilot.firmware.sensors
+    present, enabled, health = sensors.present, sensors.enabled, sensors.health
+    if not autopilot.has_fix:
+        present, enabled, health = present & ~_GPS, enabled & ~_GPS, health & ~_GPS
     elif not view.has_fix:
-        health &= ~0x20
+        health &= ~_GPS
     if autopilot.healthy:
         health |= _PREARM
     return (
@@ -288,7 +296,7 @@ def extended_sys_state(view: View) -> Sequence[Any]:
 
 
 def estimator_status(view: View) -> Sequence[Any]:
-    flags = 895 if view.autopilot.time_s >= _FIRST_FIX_S else 1024
+    flags = 895 if view.autopilot.has_fix else 1024
     return (view.time_us, flags, 0.12, 0.03, 0.03, 0.14, 0.02, math.nan, 0.3, 0.31)
 
 

@@ -8,13 +8,14 @@ all come from one `Firmware` value. A further personality is one more module tha
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import Any, Literal
 
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
+ReadParameter = Callable[[str], float]
 NAN3: Triple = (math.nan, math.nan, math.nan)
 
 
@@ -32,6 +33,7 @@ class Severity(IntEnum):
     """MAV_SEVERITY, those in use."""
 
     CRITICAL = 2
+    WARNING = 4
     INFO = 6
 
 
@@ -59,6 +61,7 @@ class Mode:
     arms: bool = True  # the vehicle may be armed in it
     remembered: bool = True  # comes back after an automatic disarm
     needs_sticks: bool = False
+    needs_position: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,8 +77,8 @@ class Rule:
     event: name of what happened. mode: name of the mode it happened in, or "*".
     when: names of guards that must all hold; "NAME=2" compares a parameter, "not X" negates.
     to: next mode, "*" none, "requested" the mode asked for, "remembered" the last one chosen.
-    do: actions ("arm", "disarm", "failsafe", "recover").
-    result: what a command is answered with.
+    do: actions ("arm", "disarm", "failsafe", "recover", "take off", "hold", "level", "latch").
+    result: what a command is answered with. say, also: texts. send: messages to every link.
     """
 
     event: str
@@ -85,27 +88,39 @@ class Rule:
     do: tuple[str, ...] = ()
     result: Result = Result.ACCEPTED
     say: Say | None = None
+    also: tuple[Say, ...] = ()
+    send: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterSpec:
-    """One parameter: `kind` is "int32" or "real32"; values outside [minimum, maximum] refused."""
+    """One parameter; values outside [minimum, maximum] are refused."""
 
     name: str
-    kind: Literal["int32", "real32"]
+    kind: Literal["int8", "int16", "int32", "real32"]
     default: float
     minimum: float
     maximum: float
     meaning: str
 
 
+Role = str | float | tuple[str, float]
+"""What fills a role: a parameter, a constant, or a parameter and the factor to SI."""
+
+
 @dataclass(frozen=True, slots=True)
 class AttitudeSetpoint:
-    """What the firmware makes of a SET_ATTITUDE_TARGET. None: keep what was demanded before."""
+    """What the firmware makes of a SET_ATTITUDE_TARGET. None: keep what was demanded before.
+
+    `climb_mps` not None: the autopilot's own vertical loop makes the thrust. `event` happens when
+    the setpoint is taken, for what a firmware does about values that it should have refused.
+    """
 
     attitude: Quaternion | None
     rates_frd_radps: Triple | None
     thrust: float  # 0 .. 1
+    climb_mps: float | None = None
+    event: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,6 +140,47 @@ class ModeRequest:
 
     mode: str | None
     refusal: Result = Result.DENIED
+    say: Say | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """What a heartbeat depends on."""
+
+    mode: Mode
+    reached: frozenset[str]  # boot events so far
+    armed: bool
+    landed: bool
+    healthy: bool
+    failsafe: bool
+    faulty: bool
+    setpoint: AttitudeSetpoint | MotionSetpoint | None  # in force
+
+
+@dataclass(frozen=True, slots=True)
+class Streams:
+    """Telemetry on request: what is refused and how, and the groups of REQUEST_DATA_STREAM.
+
+    Texts may name the message's {id}; an empty text says nothing.
+    """
+
+    fixed: frozenset[str]  # messages whose interval cannot be changed
+    groups: Mapping[int, tuple[str, ...]]  # MAV_DATA_STREAM -> messages
+    rate_max_hz: float
+    refusal: Result  # of an interval
+    refusal_text: str
+    too_fast_text: str
+    request_refusal: Result  # of MAV_CMD_REQUEST_MESSAGE
+
+
+@dataclass(frozen=True, slots=True)
+class Sensors:
+    """SYS_STATUS: MAV_SYS_STATUS_SENSOR bits once GPS has a fix, and when that is."""
+
+    present: int
+    enabled: int
+    health: int
+    first_fix_s: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,6 +203,8 @@ class Firmware:
     """A personality. Roles of parameters: `parameter_roles` maps what the core needs to names."""
 
     name: str
+    vehicle: str  # flown when no other is named
+    scenario: str
     mav_autopilot: int
     version: int  # AUTOPILOT_VERSION.flight_sw_version
     capabilities: int  # MAV_PROTOCOL_CAPABILITY
@@ -155,20 +213,41 @@ class Firmware:
     modes: Mapping[str, Mode]
     rules: tuple[Rule, ...]
     parameters: tuple[ParameterSpec, ...]
-    parameter_roles: Mapping[str, str]
+    parameter_roles: Mapping[str, Role]
     parameters_bytewise: bool  # INT32 lies in the float's bytes, not as its value
     companion_rates_hz: Mapping[str, float]
     ground_rates_hz: Mapping[str, float]
-    fixed_rate: frozenset[str]  # messages whose interval cannot be changed
+    streams: Streams
+    own_messages: Mapping[str, Callable[[Any], Sequence[Any]]]  # beside `telemetry.BUILDERS`
+    unknown_messages: frozenset[str]  # of `telemetry.BUILDERS`
+    withheld_until: Mapping[str, str]  # message -> boot event before which it is not sent
+    sensors: Sensors
+    position_grid_steps: int  # the estimator's position is new at every such step
+    boot: Mapping[str, float]  # events of the start, s of vehicle time
     mode_acked_twice: bool  # the receiver acks a mode command before the commander does
     text_to_ground_stations_only: bool
     text_suffix: str
+    target_component_checked: bool
+    answers_carry_index: bool  # PARAM_VALUE; else 65535 unless the list was asked for
+    takeoff_above_home: bool  # MAV_CMD_NAV_TAKEOFF: else above mean sea level
+    force_codes: Mapping[str, float]  # param2 of MAV_CMD_COMPONENT_ARM_DISARM: arm, disarm
     healthy_after_s: float  # boot until the pre-arm checks pass
+    healthy_without_position_after_s: float  # the same for modes that need none
+    setpoint_mode_needs_stream: bool
+    setpoints_outlive_modes: bool  # else obeyed only in their mode, forgotten on entering it
+    setpoint_decides_flight: bool  # any thrust is flight; the land detector rests meanwhile
+    setpoint_spool_s: float  # from arming until a setpoint's thrust acts
     stream_reaction_s: float  # from the stream's time-out until it counts as lost
     descend_speed_mps: float
     spool_up_s: float
     thrust_ramp_s: float
+    landed_after_s: float  # of contact
+    climbed_within_m: float
+    landing_heights_m: tuple[float, float]  # slow below the first, fast above the second
     gains: PositionGains
+    heartbeat: Callable[[Condition], tuple[int, int]]  # base_mode but the armed bit, MAV_STATE
     command_mode: Callable[[tuple[float, ...]], ModeRequest]
-    attitude_setpoint: Callable[[Mapping[str, Any]], AttitudeSetpoint | None]
+    attitude_setpoint: Callable[
+        [Mapping[str, Any], ReadParameter], AttitudeSetpoint | MotionSetpoint | None
+    ]
     motion_setpoint: Callable[[Mapping[str, Any]], MotionSetpoint | None]

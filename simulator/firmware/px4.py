@@ -12,16 +12,21 @@ from typing import Any
 from simulator.firmware.base import (
     AttitudeSetpoint,
     Behaviour,
+    Condition,
     Firmware,
     Mode,
     ModeRequest,
     MotionSetpoint,
     ParameterSpec,
     PositionGains,
+    ReadParameter,
     Result,
+    Role,
     Rule,
     Say,
+    Sensors,
     Severity,
+    Streams,
     Triple,
 )
 
@@ -140,7 +145,7 @@ PARAMETERS = (
     _int("SYS_AUTOSTART", 10040, 0, 9999999, "airframe"),
 )
 
-ROLES = {
+ROLES: dict[str, Role] = {
     "stream_timeout_s": "COM_OF_LOSS_T",
     "disarm_landed_s": "COM_DISARM_LAND",
     "disarm_idle_s": "COM_DISARM_PRFLT",
@@ -151,6 +156,7 @@ ROLES = {
     "cruise_speed_mps": "MPC_XY_CRUISE",
     "return_height_m": "RTL_RETURN_ALT",
     "hover_thrust": "MPC_THR_HOVER",
+    "tilt_boost": 0.0,
 }
 
 COMPANION_RATES_HZ = {
@@ -202,6 +208,15 @@ _AUTO_SUB = {2: "AUTO.TAKEOFF", 3: "AUTO.LOITER", 5: "AUTO.RTL", 6: "AUTO.LAND"}
 _CUSTOM_MODE_ENABLED = 1
 
 
+def heartbeat(now: Condition) -> tuple[int, int]:
+    """base_mode and MAV_STATE; offboard that never had a setpoint shows only "custom mode"."""
+    waits = now.mode.behaviour is Behaviour.SETPOINT and now.setpoint is None
+    base_mode = 1 if waits else now.mode.base_mode
+    if now.armed:
+        return base_mode, 5 if now.failsafe else 4
+    return base_mode, 3 if now.healthy else 0
+
+
 def command_mode(params: tuple[float, ...]) -> ModeRequest:
     """MAV_CMD_DO_SET_MODE (176): param1 base mode, param2 main mode, param3 sub mode of AUTO."""
     base, main, sub = (int(p) if math.isfinite(p) else 0 for p in params[:3])
@@ -215,7 +230,7 @@ def command_mode(params: tuple[float, ...]) -> ModeRequest:
 _RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b011, 64, 128
 
 
-def attitude_setpoint(values: Mapping[str, Any]) -> AttitudeSetpoint | None:
+def attitude_setpoint(values: Mapping[str, Any], _: ReadParameter) -> AttitudeSetpoint | None:
     """SET_ATTITUDE_TARGET, with PX4's lack of checks; None when it is no stream (mask 135).
 
     Only the roll and pitch rate bits count as "no rates". A thrust that is ignored or NaN is zero
@@ -277,6 +292,8 @@ def motion_setpoint(values: Mapping[str, Any]) -> MotionSetpoint | None:
 
 PX4 = Firmware(
     name="px4",
+    vehicle="px4_sih",
+    scenario="px4_like",
     mav_autopilot=12,
     version=0x011001FF,  # 1.16.1, release
     # float parameters, COMMAND_INT, bytewise parameters, attitude and position targets, MAVLink 2
@@ -290,15 +307,43 @@ PX4 = Firmware(
     parameters_bytewise=True,
     companion_rates_hz=COMPANION_RATES_HZ,
     ground_rates_hz=GROUND_RATES_HZ,
-    fixed_rate=frozenset({"HEARTBEAT"}),
+    streams=Streams(
+        fixed=frozenset({"HEARTBEAT"}),
+        groups={},
+        rate_max_hz=math.inf,
+        refusal=Result.FAILED,
+        refusal_text="",
+        too_fast_text="",
+        request_refusal=Result.DENIED,
+    ),
+    own_messages={},
+    unknown_messages=frozenset(),
+    withheld_until={},
+    # gyro, accelerometer, magnetometer, absolute pressure, GPS; battery, AHRS; health with
+    # geofence, or MAVProxy reports a breach
+    sensors=Sensors(0x0300402F, 0x0301402F, 0x0330C83F, first_fix_s=3.0),
+    position_grid_steps=2,
+    boot={},
     mode_acked_twice=True,
     text_to_ground_stations_only=True,
     text_suffix="\t",
+    target_component_checked=True,
+    answers_carry_index=True,
+    takeoff_above_home=False,
+    force_codes={"arm": 21196.0, "disarm": 21196.0},
     healthy_after_s=4.0,
+    healthy_without_position_after_s=4.0,
+    setpoint_mode_needs_stream=True,
+    setpoints_outlive_modes=True,
+    setpoint_decides_flight=False,
+    setpoint_spool_s=0.0,
     stream_reaction_s=0.036,
     descend_speed_mps=0.6,
     spool_up_s=1.0,
     thrust_ramp_s=1.5,
+    landed_after_s=1.0,
+    climbed_within_m=0.3,
+    landing_heights_m=(5.0, 10.0),
     gains=PositionGains(
         position_xy_ps=0.95,
         position_z_ps=1.0,
@@ -310,6 +355,7 @@ PX4 = Firmware(
         tilt_max_rad=math.radians(45.0),
         derivative_cutoff_hz=5.0,
     ),
+    heartbeat=heartbeat,
     command_mode=command_mode,
     attitude_setpoint=attitude_setpoint,
     motion_setpoint=motion_setpoint,

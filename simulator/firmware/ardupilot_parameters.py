@@ -1,0 +1,58 @@
+"""ArduCopter 4.6's parameters: those that clients read and those that the vehicle obeys.
+
+ArduCopter takes values far out of the documented range, so the limits are those of the type.
+"""
+
+from __future__ import annotations
+
+from simulator.firmware.base import ParameterSpec
+
+
+def _real(name: str, default: float, meaning: str) -> ParameterSpec:
+    return ParameterSpec(name, "real32", default, -3.4e38, 3.4e38, meaning)
+
+
+def _int8(name: str, default: int, meaning: str) -> ParameterSpec:
+    return ParameterSpec(name, "int8", default, -128, 127, meaning)
+
+
+def _int16(name: str, default: int, meaning: str) -> ParameterSpec:
+    return ParameterSpec(name, "int16", default, -32768, 32767, meaning)
+
+
+def _int32(name: str, default: int, meaning: str) -> ParameterSpec:
+    return ParameterSpec(name, "int32", default, -(2**31), 2**31 - 1, meaning)
+
+
+PARAMETERS = (
+    _int16("ANGLE_MAX", 3000, "cdeg, greatest tilt of its own position control"),
+    _int32("ARMING_CHECK", 1, "pre-arm checks, 1 all"),
+    _real("ATC_ACCEL_P_MAX", 110000.0, "cdeg/s^2 of pitch"),
+    _real("ATC_ACCEL_R_MAX", 110000.0, "cdeg/s^2 of roll"),
+    _int8("ATC_ANGLE_BOOST", 1, "divide thrust by the cosine of the tilt"),
+    _real("ATC_INPUT_TC", 0.15, "s, shaping of demanded attitudes"),
+    _int8("BATT_MONITOR", 4, "battery monitor, 4 voltage and current"),
+    _int8("DISARM_DELAY", 10, "s armed on the ground until disarming, 0 never"),
+    _int8("FLTMODE_CH", 5, "channel of the mode switch"),
+    _int8("FRAME_CLASS", 1, "1 quadrotor"),
+    _int8("FRAME_TYPE", 0, "0 plus"),
+    _int8("FS_GCS_ENABLE", 0, "ground station lost: 0 nothing, 1 RTL, 5 LAND"),
+    _real("FS_GCS_TIMEOUT", 5.0, "s without heartbeat until the ground station is lost"),
+    _int32("FS_OPTIONS", 16, "what a failsafe leaves alone"),
+    _int8("FS_THR_ENABLE", 1, "radio lost: 0 nothing, 1 RTL"),
+    _int32("GUID_OPTIONS", 0, "bit 3: the thrust field is thrust, not a climb rate"),
+    _real("GUID_TIMEOUT", 3.0, "s without setpoint until the vehicle levels or stops"),
+    _int16("LAND_SPEED", 50, "cm/s near the ground"),
+    _int16("LAND_SPEED_HIGH", 0, "cm/s higher up, 0 WPNAV_SPEED_DN"),
+    _int8("MOT_HOVER_LEARN", 2, "learn the hover thrust, 2 and keep it"),
+    _real("MOT_THST_EXPO", 0.65, "curve of thrust over throttle"),
+    _real("MOT_THST_HOVER", 0.39, "normalised thrust believed to hover"),
+    _int32("RTL_ALT", 1500, "cm above home while returning"),
+    _int16("SCHED_LOOP_RATE", 400, "Hz"),
+    _int8("SYSID_ENFORCE", 0, "obey SYSID_MYGCS alone"),
+    _int16("SYSID_MYGCS", 255, "system id of the ground station"),
+    _int16("SYSID_THISMAV", 1, "system id"),
+    _real("WPNAV_SPEED", 1000.0, "cm/s of automatic flight"),
+    _real("WPNAV_SPEED_DN", 150.0, "cm/s of descent"),
+    _real("WPNAV_SPEED_UP", 250.0, "cm/s of climb"),
+)
