@@ -102,10 +102,17 @@ class Decision:
     certificate: Certificate = field(default_factory=Certificate)
 
 
+class DecisionError(ArithmeticError):
+    """There is no decision: the situation, or what follows from it, is not finite. The flight
+    bridges it, and lands when it lasts; the command in force again would hide a dead law."""
+
+
 class Controller(Protocol):
     """`decide` is called once per tick; `warm_up` calls every code path once before engaging."""
 
-    def decide(self, situation: Situation) -> Decision: ...
+    def decide(self, situation: Situation) -> Decision:
+        """The command for one tick. Raises DecisionError."""
+        ...
 
     def reset(self) -> None:
         """Forget everything of the previous flight, the random stream included."""

@@ -14,7 +14,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.base import Command, Decision, PredictedState, Situation
+from offboard.control.base import Command, Decision, DecisionError, PredictedState, Situation
 from offboard.control.certificate import ExactMinimum, certify
 from offboard.control.integral import ErrorIntegral
 from offboard.control.paper_law import (
@@ -61,11 +61,11 @@ class PaperController:
         self._exact = ExactMinimum(len(lower))
 
     def decide(self, situation: Situation) -> Decision:
-        """The command for one tick; the one in force again where the state has no finite cost."""
+        """The command for one tick. Raises DecisionError where the state has no finite cost."""
         started = self._stopwatch() if self._stopwatch else math.nan
         target = situation.reference.sample(situation.state.time_s + self._step_s)
         if not _usable(situation.state):
-            return Decision(situation.previous)
+            raise DecisionError("the predicted state is not finite")
         state, reference = heading_frame(situation.state, target)
         move = self._law.move(
             state,
@@ -74,7 +74,7 @@ class PaperController:
             integral=self._summed(situation),
         )
         if not math.isfinite(move.result.cost):
-            return Decision(situation.previous)
+            raise DecisionError("the cost of this decision is not finite")
         certificate = certify(move.problem, move.result, self._exact)
         self._held = certificate.at_bound
         if self._stopwatch:

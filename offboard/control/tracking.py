@@ -21,6 +21,7 @@ from offboard.control.base import (
     Certificate,
     Command,
     Decision,
+    DecisionError,
     PredictedHeave,
     PredictedState,
     Situation,
@@ -111,13 +112,13 @@ class TrackingLaw:
         self._exact = ExactMinimum(4)
 
     def decide(self, situation: Situation) -> Decision:
-        """The command for one tick; the one in force again where anything is not finite."""
+        """The command for one tick. Raises DecisionError where anything is not finite."""
         started = self._stopwatch() if self._stopwatch else math.nan
         state = situation.state
         target = self.target(situation.reference, situation.time_s, state)
         problem = self.problem(state, target)
         if not _finite(problem):
-            return Decision(situation.previous)
+            raise DecisionError("the cost of this decision is not finite")
         if self._search is Search.CLOSED_FORM:
             inputs = closed_form(problem)
             certificate = _exact_certificate(problem, inputs)

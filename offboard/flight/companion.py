@@ -13,7 +13,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from offboard.control.base import Command, Controller, Decision, PredictedState, Situation
+from offboard.control.base import (
+    Command,
+    Controller,
+    Decision,
+    DecisionError,
+    PredictedState,
+    Situation,
+)
 from offboard.control.observer import Observer
 from offboard.flight.assessment import Assessment, Course
 from offboard.flight.mission import Mission
@@ -296,7 +303,7 @@ class Companion:
             situation = Situation(time_s, state, reference, self._command, self._deadline_s)
             decision = self._controller.decide(situation)
             if not usable(decision.command):
-                raise ArithmeticError(f"unusable {decision.command}")
+                raise DecisionError(f"unusable {decision.command}")
         except Exception as error:  # whatever it is, the vehicle is in the air
             self._miss(f"{type(error).__name__}: {error}")
             self._emit(time_s, self._level())

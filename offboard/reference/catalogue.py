@@ -179,8 +179,9 @@ SHAPES: Mapping[str, type[Shape]] = {
 def build(config: Shape, table_text: str | None = None) -> Track:
     """The track of a configuration, NED relative to the take-off point.
 
-    `table_text` is the content of the file that a table names, if the table has no `text`. Raises ValueError (TableError for
-    a table) with one sentence where the configuration does not make a path.
+    `table_text` is the content of the file that a table names, where its `text` is not given.
+    Raises ValueError (TableError for a table) with one sentence where the configuration does not
+    make a path.
     """
     columns_course: Course | None = None
     if isinstance(config, FromTable):

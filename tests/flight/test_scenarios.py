@@ -369,8 +369,8 @@ ROWS = (
         )
         for fail, says in (
             (raises, "ZeroDivisionError: nothing to divide by"),
-            (not_a_number, "ArithmeticError: unusable Command(thrust_mps2=nan"),
-            (no_direction, "ArithmeticError: unusable Command"),
+            (not_a_number, "DecisionError: unusable Command(thrust_mps2=nan"),
+            (no_direction, "DecisionError: unusable Command"),
         )
     ),
     Row(

@@ -14,7 +14,7 @@ import pytest
 from attitude_plant import Flight, Lemniscate, Truth, fly
 from scipy.linalg import expm
 
-from offboard.control.base import Command, PredictedState, Situation
+from offboard.control.base import Command, DecisionError, PredictedState, Situation
 from offboard.control.observer import ObserverSettings, VelocitySource
 from offboard.control.response import lateral_model, lead, vertical_model
 from offboard.control.swarm import SwarmSettings
@@ -272,16 +272,15 @@ def test_reset_gives_the_same_decisions_again_and_seeds_differ() -> None:
     assert decisions(law_of(search=Search.SWARM, swarm=settings, seed=1)) != first
 
 
-def test_what_is_not_finite_is_not_sent() -> None:
+def test_what_is_not_finite_is_no_decision() -> None:
     reference = Lemniscate(8.0)
     for search in Search:
         law = law_of(search=search)
         state = state_of(np.random.default_rng(0), reference, 0.1)
         for broken in (math.nan, math.inf):
             wrong = replace(state, velocity_ned_mps=np.array([0.0, broken, 0.0]))
-            with np.errstate(invalid="ignore"):
-                decision = law.decide(Situation(5.0, wrong, reference, LEVEL))
-            assert decision.command == LEVEL
+            with np.errstate(invalid="ignore"), pytest.raises(DecisionError, match="not finite"):
+                law.decide(Situation(5.0, wrong, reference, LEVEL))
 
 
 def test_the_deadline_cuts_the_swarm_short() -> None:
