@@ -128,10 +128,25 @@ def no_take_off_of_ours(pair: Pair) -> Checks:
 
 
 def unhurt(pair: Pair) -> Checks:
-    """One missed decision is bridged."""
+    """Two missed decisions are bridged, and forgotten with the next good one."""
     yield from flown(pair)
     texts = [frame for _, _, frame in pair.sent if b"decision missed" in frame]
-    yield len(texts) == 2
+    yield len(texts) == 4
+
+
+def stayed_down(pair: Pair) -> Checks:
+    """Stopped before lift-off: no setpoint asks for more thrust than there was."""
+    yield from landed(pair)
+    reached = [s.thrust for _, phase, s in pair.setpoints if phase is Phase.TAKEOFF][-1]
+    yield reached < 0.3
+    yield all(s.thrust <= reached for _, phase, s in pair.setpoints if phase is Phase.LAND)
+
+
+def landed_by_failsafe(pair: Pair) -> Checks:
+    """A landing that is refused ends in silence, so that the vehicle comes down by itself."""
+    yield from flown(pair)
+    yield 25 <= sum(phase is Phase.LAND for _, phase, _ in pair.setpoints) <= 32
+    yield len(pair.commands(LAND)) > 3
 
 
 @dataclass(frozen=True)
@@ -192,7 +207,7 @@ ROWS = (
     stopped(Phase.ENGAGE, 0.1, Phase.FAILED, never_armed),
     stopped(Phase.ARM, 0.0, Phase.FAILED, disarmed_by_us),
     stopped(Phase.ARM, 0.3, Phase.FAILED, disarmed_by_us),
-    stopped(Phase.TAKEOFF, 0.3, Phase.DISARMED, landed),
+    stopped(Phase.TAKEOFF, 0.3, Phase.DISARMED, stayed_down),
     stopped(Phase.TAKEOFF, 1.5, Phase.DISARMED, landed),
     stopped(Phase.CLIMB, 0.5, Phase.DISARMED, landed),
     stopped(Phase.TRACK, 1.0, Phase.DISARMED, landed),
@@ -267,6 +282,14 @@ ROWS = (
         FLOWN,
         Phase.DISARMED,
         flown,
+    ),
+    Row(
+        "landing refused",
+        lambda: hover(firmware=refusing("land", "No.")),
+        0,
+        FLOWN,
+        Phase.DISARMED,
+        landed_by_failsafe,
     ),
     # the pilot
     Row(
@@ -374,8 +397,8 @@ ROWS = (
         )
     ),
     Row(
-        "a law that fails twice",
-        lambda: lemniscate(wrap=failing(raises, times=2)),
+        "a law that fails twice, and twice more",
+        lambda: lemniscate(wrap=lambda law: failing(raises, 2, 34)(failing(raises, 2, 30)(law))),
         0,
         FLOWN,
         Phase.DISARMED,
