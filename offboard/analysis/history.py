@@ -28,7 +28,7 @@ from offboard.mavlink.session import DIALECTS
 
 Array = NDArray[np.float64]
 OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
-EARTH_RADIUS_M = 6378137.0
+EARTH_RADIUS_M = 6371000.0  # of PX4 map projection
 ATTITUDE_FIELDS = "q1 q2 q3 q4 rollspeed pitchspeed yawspeed"
 REFERENCE_FIELDS = "x y z vx vy vz afx afy afz yaw"
 Geodetic = tuple[float, float, float]  # latitude and longitude in degrees, altitude in m

@@ -58,6 +58,8 @@ class Score:
     thrust_sd: float = _figure("normalised thrust commanded, standard deviation")
     tilt_command_step_deg: float = _figure("commanded tilt, RMS change per setpoint", "deg")
     tilt_max_deg: float = _figure("tilt flown, largest", "deg")
+    tilt_agitation_deg: float = _figure("tilt about what the reference asks, RMS", "deg")
+    rate_agitation_radps: float = _figure("roll and pitch rate about it, RMS", "rad/s")
     roll_rate_sd_radps: float = _figure("roll rate, standard deviation", "rad/s")
     pitch_rate_sd_radps: float = _figure("pitch rate, standard deviation", "rad/s")
     setpoint_hz: float = _figure("setpoints per second of vehicle time", "Hz")
@@ -120,13 +122,18 @@ def _between(rows: Array, begin_s: float, end_s: float) -> Array:
     return inside
 
 
-def _reference(history: History, times: Array) -> tuple[Array, Array, Array]:
-    """Reference position, velocity (N, 3) and course (N,) at any times: the records are joined by
-    the quintic that their position, velocity and acceleration determine."""
+def _curve(history: History) -> tuple[BPoly, Array]:
+    """The reference as a function of vehicle time, and its rows: the records are joined by the
+    quintic that their position, velocity and acceleration determine."""
     rows = history.reference
     rows = rows[np.concatenate(([True], np.diff(rows[:, 0]) > 0))]
     knots = np.stack((rows[:, 1:4], rows[:, 4:7], rows[:, 7:10]), axis=1)
-    curve = BPoly.from_derivatives(rows[:, 0], knots)
+    return BPoly.from_derivatives(rows[:, 0], knots), rows
+
+
+def _reference(history: History, times: Array) -> tuple[Array, Array, Array]:
+    """Reference position, velocity (N, 3) and course (N,) at any times."""
+    curve, rows = _curve(history)
     course = np.interp(times, rows[:, 0], np.unwrap(rows[:, 10]))
     return curve(times), curve.derivative()(times), course
 
@@ -187,12 +194,29 @@ def _activity(history: History, begin_s: float, end_s: float) -> dict[str, float
     commanded = thrust_direction_from_quaternion(setpoint[:, 2:6])
     steps = np.degrees(np.linalg.norm(np.diff(commanded, axis=0), axis=1))
     down = thrust_direction_from_quaternion(attitude[:, 1:5])[:, 2]
-    return {
+    return _agitation(history, attitude) | {
         "thrust_sd": float(setpoint[:, 6].std()),
         "tilt_command_step_deg": _rms(steps),
         "tilt_max_deg": float(np.degrees(np.arccos(np.clip(down, -1, 1))).max(initial=0.0)),
         "roll_rate_sd_radps": float(attitude[:, 5].std()),
         "pitch_rate_sd_radps": float(attitude[:, 6].std()),
+    }
+
+
+def _agitation(history: History, attitude: Array) -> dict[str, float]:
+    """Motion that the reference does not explain: thrust direction and rates less their best
+    linear fit by the reference's velocity, acceleration and jerk (drag and lag need no model)."""
+    curve, _ = _curve(history)
+    times = attitude[:, 0]
+    explained = [curve.derivative(order)(times)[:, :2] for order in (1, 2, 3)]
+    regressors = np.hstack((*explained, np.ones((len(times), 1))))
+    direction = thrust_direction_from_quaternion(attitude[:, 1:5])[:, :2]
+    motion = np.hstack((direction, attitude[:, 5:7]))
+    fit, *_ = np.linalg.lstsq(regressors, motion, rcond=None)
+    rest = motion - regressors @ fit
+    return {
+        "tilt_agitation_deg": float(np.degrees(np.sqrt((rest[:, :2] ** 2).sum(axis=1).mean()))),
+        "rate_agitation_radps": float(np.sqrt((rest[:, 2:] ** 2).sum(axis=1).mean())),
     }
 
 
