@@ -26,7 +26,7 @@ from offboard.analysis.paper.figure import (
     single,
 )
 from offboard.analysis.paper.horizon import LONGEST, Modes
-from offboard.analysis.paper.peers import BUDGETS, DIRECT, Heat
+from offboard.analysis.paper.peers import DIRECT, Heat
 from offboard.analysis.paper.plant import PlantKind
 from offboard.analysis.paper.tables import MISS
 from offboard.control.paper_law import PAPER_STEP_S
@@ -185,7 +185,7 @@ def peers(heats: Sequence[Heat]) -> Figure:
         x={"type": "log"}, y={"type": "log"}, height=520,
         legend=legend_beside(),
     )  # fmt: skip
-    budgets = ", ".join(str(budget) for budget in BUDGETS)
+    budgets = ", ".join(str(n) for n in sorted({heat.budget for heat in heats}))
     return Figure(
         "The swarm among its peers", traces, layout,
         f"Points: {budgets} evaluations of J. Down and left is better; 1e-17 stands for rounding.",

@@ -35,6 +35,7 @@ Solver = Callable[[BoxQuadratic, int, int], Array]  # problem, evaluations, seed
 PARTICLES = 40
 PAPER_EVALUATIONS = 40 * 150
 BUDGETS = (80, 200, 400, 1000, 2000, PAPER_EVALUATIONS)
+FEW_BUDGETS = (200, 1000, PAPER_EVALUATIONS)
 GAP_SHOWN_FROM = 1e-17  # below is rounding; a logarithmic axis has no zero
 
 
@@ -61,15 +62,17 @@ def problems(count: int, settings: PaperSettings) -> list[BoxQuadratic]:
     return [met[k] for k in np.linspace(20, 999, count).astype(int)]
 
 
-def race(solver: str, settings: PaperSettings, count: int) -> list[Heat]:
+def race(
+    solver: str, settings: PaperSettings, count: int, budgets: Sequence[int] = BUDGETS
+) -> list[Heat]:
     """`solver` at every budget (one heat, for a solver that takes none)."""
     course, solve = problems(count, settings), SOLVERS[solver]
     exact = ExactMinimum(4)
     heats = []
     with _quiet():
         for problem in course[:3]:
-            solve(problem, BUDGETS[0], 0)  # compile, import, warm caches
-        for budget in BUDGETS if solver not in DIRECT else (PAPER_EVALUATIONS,):
+            solve(problem, budgets[0], 0)  # compile, import, warm caches
+        for budget in budgets if solver not in DIRECT else (PAPER_EVALUATIONS,):
             gaps, times = [], []
             for seed, problem in enumerate(course):
                 started = monotonic_s()

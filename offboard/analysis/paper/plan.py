@@ -197,8 +197,12 @@ class Plan:
         return self._of_tasks("limits", extensions.limit_tasks(), make)
 
     def _of_peers(self, make: Callable[[Any], Table | Figure]) -> Recipe:
-        names, count = peers.present(), self._options.peer_problems
-        keys = [self._job(("peer", name), peers.race, name, self._final, count) for name in names]
+        count = self._options.peer_problems
+        budgets = peers.FEW_BUDGETS if self._options.quick else peers.BUDGETS
+        keys = [
+            self._job(("peer", name), peers.race, name, self._final, count, budgets)
+            for name in peers.present()
+        ]
         return keys, lambda results: make([heat for key in keys for heat in results[key]])
 
     def _search(self) -> Recipe:
