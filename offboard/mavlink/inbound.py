@@ -55,7 +55,7 @@ class Identity(NamedTuple):
 
 
 class TextChunk(NamedTuple):
-    """STATUSTEXT as it arrives: `last` when nothing follows. `text_id` 0: complete in itself."""
+    """STATUSTEXT as it arrives: `last` when its end was marked. `text_id` 0: complete in itself."""
 
     severity: int
     data: bytes
@@ -96,7 +96,7 @@ def decode_timesync(payload: bytes) -> tuple[int, int]:
 def decode_text_chunk(payload: bytes) -> TextChunk:
     severity, text, text_id, chunk = _unpack(mavlink.MAVLink_statustext_message, payload)
     data, terminator, _ = text.partition(b"\0")
-    return TextChunk(severity, data, text_id, chunk, bool(terminator) or text_id == 0)
+    return TextChunk(severity, data, text_id, chunk, bool(terminator))
 
 
 def _heartbeat(payload: bytes, dialect: Dialect) -> events.Event:

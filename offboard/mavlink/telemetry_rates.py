@@ -71,7 +71,7 @@ class _Stream:
         if now_s - self.asked_s < self.wait_s:
             return False
         if self.enough(now_s):
-            self.wait_s = _FIRST_WAIT_S
+            self.wait_s, self.asked = _FIRST_WAIT_S, 0
             return False
         return not (self.wanted.optional and self.asked >= _OPTIONAL_TRIES)
 

@@ -173,6 +173,15 @@ def test_an_unknown_id_is_skipped_whole_only_before_another_frame() -> None:
     check(session)
 
 
+def test_garbage_like_an_unknown_frame_swallows_nothing() -> None:
+    inner = Sender().position(1000)
+    unknown = bytes([0xFD, len(inner), 0, 0, 0, 1, 1, 0xFF, 0xFF, 0xFF]) + inner + b"\0\0"
+    outer = Sender().position(2000)
+    session = pinned(Sender())
+    assert session.receive(b"\0" + unknown + outer, PEER, 0.0).frames == (inner, outer)
+    check(session)
+
+
 def test_a_flood_of_frame_beginnings_is_cheap_and_bounded() -> None:
     session = pinned(Sender(), stream=True)
     for _ in range(20):

@@ -180,6 +180,24 @@ def test_sequence_numbers_count_per_component() -> None:
     assert session.encode(Heartbeat(18))[4] == 1
 
 
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        (
+            CommandLong.arm(),
+            mavlink.MAVLink_command_long_message(7, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0),
+        ),
+        (Heartbeat(0), mavlink.MAVLink_heartbeat_message(0, 8, 0, 0, 4, 3)),
+        (StatusTextOut(0, ""), mavlink.MAVLink_statustext_message(0, b"", 0, 0)),
+    ],
+    ids=["zeros at the end", "zeros at the beginning", "nothing but zeros"],
+)
+def test_frames_are_byte_for_byte_those_of_pymavlink(
+    value: CommandLong | Heartbeat | StatusTextOut, message: object
+) -> None:
+    assert pinned(Sender(7)).encode(value) == Sender(7, 191).frame(message)
+
+
 def test_heartbeat_and_text_of_ours() -> None:
     session = pinned(Sender(7))
     message = understood(session.encode(Heartbeat(18)))

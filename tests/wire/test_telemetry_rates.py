@@ -68,10 +68,19 @@ def test_reset_by_somebody_else_is_noticed_within_seconds() -> None:
     vehicle = Vehicle()
     vehicle.run(30.0, 1)
     assert vehicle.session.shortfalls == []
-    vehicle.run(5.0, 4)  # a ground station has set 25 Hz
+    vehicle.run(3.5, 4)  # a ground station has set 25 Hz
     assert vehicle.session.shortfalls[0].measured_hz == pytest.approx(25.0, abs=1.0)
     assert len(vehicle.asked_s) == 2
     assert 30.0 < vehicle.asked_s[1] < 32.0
+
+
+def test_patience_begins_anew_after_good_service() -> None:
+    vehicle = Vehicle()
+    vehicle.run(50.0, 4)
+    vehicle.run(60.0, 1)
+    vehicle.asked_s.clear()
+    vehicle.run(8.0, 4)
+    assert [t - 110.0 for t in vehicle.asked_s] == pytest.approx([1.0, 4.0], abs=0.7)
 
 
 def test_silence_counts_in_our_time() -> None:
@@ -98,7 +107,10 @@ def test_link_time_follows_the_vehicle_and_falls_back_to_ours() -> None:
     assert link.seconds == pytest.approx(1.0)
     for i in range(1, 51):
         link.host(0.02 + 0.1 * i)
-    assert link.seconds == pytest.approx(5.0, abs=0.11)  # the first second was patience
+    before_s = link.seconds
+    assert before_s == pytest.approx(5.0, abs=0.11)  # the first second was patience
     link.vehicle(0.5, 5.1)  # a reboot
-    link.vehicle(0.6, 5.2)
-    assert link.seconds == pytest.approx(5.1, abs=0.11)
+    link.vehicle(0.7, 5.2)
+    assert link.seconds - before_s == pytest.approx(0.2)
+    link.vehicle(60.7, 65.2)  # a minute without telemetry has been counted by our own time
+    assert link.seconds - before_s == pytest.approx(1.2)
