@@ -40,7 +40,8 @@ def slow(rate_hz: float) -> Firmware:
     """A vehicle that sends its state at `rate_hz` whatever it is asked for."""
     state = ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
     rates = {name: rate_hz if name in state else hz for name, hz in LEAN.companion_rates_hz.items()}
-    return replace(LEAN, companion_rates_hz=rates, fixed_rate=LEAN.fixed_rate | frozenset(state))
+    streams = replace(LEAN.streams, fixed=LEAN.streams.fixed | frozenset(state))
+    return replace(LEAN, companion_rates_hz=rates, streams=streams)
 
 
 # --- links ----------------------------------------------------------------------------------------
