@@ -65,6 +65,9 @@ def fly(
     scenario: Annotated[
         str, typer.Option(help="With --sitl: a shipped scenario, or a file.")
     ] = "px4_like",
+    sim_vehicle: Annotated[
+        str, typer.Option(help="With --sitl: what flies, whatever is believed of it.")
+    ] = "px4_sih",
     seed: Annotated[
         int | None, typer.Option(help="Of the swarm, and with --sitl of the simulator.")
     ] = None,
@@ -110,6 +113,7 @@ def fly(
         limits=resolved.limits,
         period_s=resolved.period_s,
         deadline_s=resolved.deadline_s,
+        learning=resolved.identify,
     )
     shown = 0
 
@@ -131,7 +135,7 @@ def fly(
             crew,
             log,
             connection=connect,
-            bundled=Bundled(scenario, resolved.seed, vehicle) if sitl else None,
+            bundled=Bundled(scenario, resolved.seed, sim_vehicle) if sitl else None,
             progress=progress,
             prepared=prepared,
         )

@@ -18,6 +18,7 @@ from pydantic import BaseModel, Field
 
 from offboard.control.catalogue import LAWS, ControllerConfig
 from offboard.control.observer import ObserverSettings
+from offboard.flight.learning import IdentifySettings
 from offboard.flight.phases import Limits
 from offboard.model.document import DocumentError, override, read, validate
 from offboard.model.vehicle import Parameters, Vehicle
@@ -38,6 +39,7 @@ class FlightConfig(Parameters):
     reference: ReferenceConfig
     observer: ObserverSettings = ObserverSettings()
     limits: Limits = Limits()
+    identify: IdentifySettings = IdentifySettings()
     period_s: float = Field(default=0.1, ge=0.01, le=0.5)  # control period, vehicle time
     deadline_s: float = Field(default=0.05, gt=0.0005, le=0.5)  # for one decision, wall time
     seed: int = Field(default=7, ge=0, lt=2**32)

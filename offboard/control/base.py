@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.model.vehicle import Vehicle
 from offboard.reference.base import Reference
 
 Array = NDArray[np.float64]
@@ -116,4 +117,21 @@ class Controller(Protocol):
 
     def reset(self) -> None:
         """Forget everything of the previous flight, the random stream included."""
+        ...
+
+
+@runtime_checkable
+class Adopting(Protocol):
+    """A controller that can go on with constants identified in flight."""
+
+    @property
+    def bandwidth_radps(self) -> float:
+        """The bandwidth that was asked for."""
+        ...
+
+    def adopt(
+        self, vehicle: Vehicle, bandwidth_limit_radps: float = ..., *, gains: bool = ...
+    ) -> None:
+        """Plan with `vehicle` from the next decision on, at no more than this bandwidth. Without
+        `gains` only what costs nothing changes: one step of a blend that has not ended."""
         ...

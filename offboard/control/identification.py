@@ -37,7 +37,15 @@ from offboard.control.trace import (
 from offboard.control.trace import VELOCITY as REPORTED_VELOCITY
 from offboard.model.vehicle import AxisResponse, Vehicle
 
-__all__ = ["Estimate", "EstimatorNoise", "Identified", "ResponseFit", "identify", "warm_up"]
+__all__ = [
+    "Estimate",
+    "EstimatorNoise",
+    "Identified",
+    "ResponseFit",
+    "identify",
+    "identify_drag",
+    "warm_up",
+]
 
 Array = NDArray[np.float64]
 
@@ -126,7 +134,9 @@ def identify(trace: Trace, vehicle: Vehicle) -> Identified:
         refusals |= dict.fromkeys(("hover_thrust", "thrust_lag_s", "drag_ps"), said)
         return Identified(seconds, tilt, yaw, refusals=refusals)
     vertical = fit_vertical(motion, vehicle.gravity_mps2, DRAG_BEFOREHAND, vehicle.hover_thrust)
-    drag = _drag(motion, vertical, vehicle.gravity_mps2, refusals)
+    thrust = motion.thrust(vertical.thrust_delay_s.value, vertical.thrust_lag_s.value)
+    thrust_mps2 = vehicle.gravity_mps2 / vertical.hover_thrust.value * thrust
+    drag = _drag(motion, thrust_mps2, refusals)
     if drag is not None:
         beforehand = Estimate(drag.value, max(drag.sd, 0.2 * drag.value, 0.05))
         hover = vertical.hover_thrust.value
@@ -143,6 +153,20 @@ def identify(trace: Trace, vehicle: Vehicle) -> Identified:
         noise=_noise(trace),
         refusals=refusals,
     )
+
+
+def identify_drag(trace: Trace, vehicle: Vehicle) -> Identified:
+    """The drag alone, the rest of `vehicle` taken for granted: some milliseconds for 20 s of
+    flight."""
+    refusals: dict[str, str] = {}
+    seconds = trace.end_s - trace.begin_s
+    drag = None
+    if seconds >= 2.0 and (motion := Motion(trace)).usable:
+        thrust = motion.thrust(vehicle.thrust_delay_s, vehicle.thrust_lag_s)
+        drag = _drag(motion, vehicle.thrust_max_mps2 * thrust, refusals)
+    else:
+        refusals["drag_ps"] = "too few positions and commands"
+    return Identified(seconds, drag_ps=drag, refusals=refusals)
 
 
 def warm_up(vehicle: Vehicle) -> None:
@@ -222,17 +246,14 @@ def _refusal(fit: ResponseFit, limits: tuple[float, float, float]) -> str | None
     return None
 
 
-def _drag(
-    motion: Motion, vertical: VerticalFit, gravity_mps2: float, refusals: dict[str, str]
-) -> Estimate | None:
+def _drag(motion: Motion, thrust_mps2: Array, refusals: dict[str, str]) -> Estimate | None:
     speed_mps = _speed_rms(motion)
     if speed_mps < SPEED_MPS:
         refusals["drag_ps"] = (
             f"{speed_mps:.2f} m/s rms over ground, {SPEED_MPS} are needed: drag needs motion"
         )
         return None
-    thrust = motion.thrust(vertical.thrust_delay_s.value, vertical.thrust_lag_s.value)
-    drag = fit_drag(motion, gravity_mps2 / vertical.hover_thrust.value * thrust)
+    drag = fit_drag(motion, thrust_mps2)
     if not 1e-3 < drag.value < 0.99 * DRAG_UPPER:
         refusals["drag_ps"] = f"the drag ends at the edge of its range, {drag.value:.3g} 1/s"
     elif not drag.sd <= DRAG_SD_PS:

@@ -92,13 +92,15 @@ class Observer:
     def adopt(self, vehicle: Vehicle) -> None:
         """Go on with a newly identified vehicle. The thrust that crosses the wire is a ratio to
         the hover thrust, so what was commanded is read on the new scale and the disturbance gives
-        up what the new hover thrust explains."""
+        up what the new hover thrust and the new drag explain."""
         ratio = self._vehicle.hover_thrust / vehicle.hover_thrust
         self._history[:, SENT_THRUST] *= ratio
         self._state[THRUST] *= ratio
         down = (self._gravity + self._state[DISTURBANCE + 2]) * ratio - vehicle.gravity_mps2
+        slowed = vehicle.drag_per_mass_ps - self._vehicle.drag_per_mass_ps
         self._adopt(vehicle)
         self._state[DISTURBANCE + 2] = down
+        self._state[DISTURBANCE : DISTURBANCE + 3] += slowed * self._state[VELOCITY : VELOCITY + 3]
         self._bound_disturbance()
 
     @property

@@ -130,7 +130,8 @@ class ResponseProblem:
     def residual(self, parameters: Array) -> Array:
         """Signals less response (N, axes), free motion and a constant offset projected out."""
         axes = self._signals.shape[1]
-        respond(self._times, self._sent_at, self._commands, *parameters, self._out)
+        delay_s, frequency, damping = parameters
+        respond(self._times, self._sent_at, self._commands, delay_s, frequency, damping, self._out)
         missing = self._signals - self._out[:, :axes]
         basis = np.linalg.qr(np.column_stack((self._out[:, axes:], np.ones(len(missing)))))[0]
         rest: Array = missing - basis @ (basis.T @ missing)
@@ -189,8 +190,8 @@ def predicted(
     """The response (N, axes) to `commands` (M, axes), at rest at the start."""
     out = np.empty((len(times), commands.shape[1] + 2))
     if len(times) and len(sent_at):
-        arrays = (np.ascontiguousarray(each) for each in (times, sent_at, commands))
-        respond(*arrays, delay_s, frequency_radps, damping, out)
+        signal, sent, held = (np.ascontiguousarray(each) for each in (times, sent_at, commands))
+        respond(signal, sent, held, delay_s, frequency_radps, damping, out)
     response: Array = out[:, :-2]
     return response
 
@@ -208,8 +209,13 @@ def fit_response(times: Array, signals: Array, sent_at: Array, commands: Array) 
     problem = ResponseProblem(times, signals, sent_at, commands)
     best, covariance = problem.solve()
     sds = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    delay, frequency, damping = (
+        Estimate(float(value), float(sd)) for value, sd in zip(best, sds, strict=True)
+    )
     return ResponseFit(
-        *(Estimate(float(value), float(sd)) for value, sd in zip(best, sds, strict=True)),
+        delay,
+        frequency,
+        damping,
         residual_rms=float(np.sqrt(np.mean(problem.residual(best) ** 2))),
         commanded_rms=commanded_rms(times, sent_at, commands),
     )

@@ -100,13 +100,11 @@ class TrackingLaw:
         search: Search = Search.SWARM,
         stopwatch: Callable[[], float] | None = None,
     ) -> None:
-        self._vehicle = vehicle
         self._settings = settings or TrackingSettings()
         self._search = search
         self._stopwatch = stopwatch
-        bandwidth, period_s = self._settings.bandwidth_radps, self._settings.period_s
-        self.lateral = lateral_cost_to_go(vehicle, bandwidth, period_s)
-        self.vertical = vertical_cost_to_go(vehicle, bandwidth, period_s)
+        self._file = vehicle
+        self.adopt(vehicle)
         self._swarm = QuadraticSwarm(self._settings.swarm, 4)
         self._lanes = RandomLanes(self._settings.seed)
         self._exact = ExactMinimum(4)
@@ -133,6 +131,24 @@ class TrackingLaw:
     def reset(self) -> None:
         """Forget everything of the previous flight, the random stream included."""
         self._lanes.reset()
+        if self._vehicle is not self._file:
+            self.adopt(self._file)
+
+    @property
+    def bandwidth_radps(self) -> float:
+        """The bandwidth that was asked for."""
+        return self._settings.bandwidth_radps
+
+    def adopt(
+        self, vehicle: Vehicle, bandwidth_limit_radps: float = math.inf, *, gains: bool = True
+    ) -> None:
+        """Go on with a newly identified vehicle, at most this bandwidth; without `gains` only the
+        feed-forward changes, which costs nothing."""
+        self._vehicle = vehicle
+        if gains:
+            bandwidth = min(self._settings.bandwidth_radps, bandwidth_limit_radps)
+            self.lateral = lateral_cost_to_go(vehicle, bandwidth, self._settings.period_s)
+            self.vertical = vertical_cost_to_go(vehicle, bandwidth, self._settings.period_s)
 
     def target(self, reference: Reference, time_s: float, state: PredictedState) -> Target:
         """What to be and what to ask, for a decision at `time_s` with the state predicted to

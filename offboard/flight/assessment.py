@@ -36,6 +36,8 @@ class Course:
     stop_requested: bool
     missed_decisions: int
     failure: str
+    excites: bool = False
+    learnt: bool = False
 
 
 class Assessment:
@@ -78,11 +80,13 @@ class Assessment:
             in_the_air=view.in_the_air,
             lifted_off=course.phase is Phase.TAKEOFF and self._lifted_off(),
             at_start=course.phase is Phase.CLIMB and self._at_start(time_s),
+            excites=course.excites,
+            learnt=course.learnt,
             track_time_s=mission.track_time_s(time_s),
             track_start_s=track.track_start_s,
             track_end_s=track.track_end_s,
             rest_time_s=track.duration_s + 0.5,
-            position_error_m=self._position_error_m(),
+            position_error_m=self.position_error_m(),
             tilt_rad=self._tilt_rad(),
             stop_requested=course.stop_requested,
             missed_decisions=course.missed_decisions,
@@ -148,7 +152,8 @@ class Assessment:
         height_m = self._mission.origin_ned_m[2] - position.position_ned_m[2]
         return height_m > LIFT_OFF_HEIGHT_M or -position.velocity_ned_mps[2] > LIFT_OFF_CLIMB_MPS
 
-    def _position_error_m(self) -> float:
+    def position_error_m(self) -> float:
+        """Distance of the reported position from the reference in force."""
         position = self._view.position
         sample = self._mission.sample(position.time_s) if position else None
         if position is None or sample is None:

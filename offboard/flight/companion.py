@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from offboard.control.base import (
+    Adopting,
     Command,
     Controller,
     Decision,
@@ -23,6 +24,9 @@ from offboard.control.base import (
 )
 from offboard.control.observer import Observer
 from offboard.flight.assessment import Assessment, Course
+from offboard.flight.learning import RECORD_ID as IDENTIFIED_ID
+from offboard.flight.learning import RECORD_NAME as IDENTIFIED_NAME
+from offboard.flight.learning import Adoption, IdentifySettings, Learner
 from offboard.flight.mission import Mission
 from offboard.flight.phases import BEFORE_FLIGHT, ENDS, PHASES, TRACKING, ExitCode, Limits, Phase
 from offboard.flight.readiness import Readiness
@@ -84,6 +88,7 @@ class Companion:
         period_s: float,
         deadline_s: float | None,
         stopwatch: Callable[[], float],
+        learning: IdentifySettings | None = None,
     ) -> None:
         self._vehicle = vehicle
         self._session = session
@@ -99,6 +104,7 @@ class Companion:
         self._assessment = Assessment(
             self.view, session, mission, observer, self._readiness, limits
         )
+        self._learner = _learner(vehicle, controller, period_s, learning)
         self.phase = Phase.CONNECT
         self.peer: Hashable | None = None  # where the vehicle's datagrams come from
         self.outcome: Outcome | None = None
@@ -162,8 +168,12 @@ class Companion:
         match event:
             case Attitude(time_s, attitude, rates):
                 self._observer.on_attitude(time_s, attitude, rates)
+                if self._learner:
+                    self._learner.on_attitude(time_s, attitude)
             case LocalPosition(time_s, position, velocity):
                 self._observer.on_position(time_s, position, velocity)
+                if self._learner:
+                    self._learner.on_position(time_s, position, velocity)
             case Reset():
                 self._observer.reset()
                 self._tick = -1
@@ -194,6 +204,8 @@ class Companion:
                 stop_requested=self._stop_requested,
                 missed_decisions=self._missed_decisions,
                 failure=self._failure,
+                excites=self._learner is not None and self._learner.wants_excitation,
+                learnt=self._learner is not None and self._learner.finished(self.view.time_s),
             )
             picture = self._assessment.picture(course)
             row = next_row(self.phase, picture)
@@ -212,6 +224,8 @@ class Companion:
         self._phase_began_s = self._session.link_time_s
         self._asked_s = -math.inf
         self._send(StatusTextOut(INFO, f"offboard: {row.target.value}: {reason}"))
+        if self._learner:
+            self._learner.on_phase(row.target, self.view.time_s)
         if row.target is Phase.TAKEOFF:
             self._begin_takeoff()
         elif row.target is Phase.CLIMB:
@@ -309,8 +323,39 @@ class Companion:
             self._emit(time_s, self._level())
             return
         self._missed_decisions = 0
-        self._emit(time_s, clamp(decision.command, self._vehicle))
+        self._emit(time_s, clamp(self._excited(decision.command, time_s), self._vehicle))
         self._record(time_s, state, decision, arrived_s)
+        self._learn(time_s)
+
+    def _excited(self, command: Command, time_s: float) -> Command:
+        if self._learner is None or self.phase is not Phase.EXCITE:
+            return command
+        return self._learner.excited(command, time_s, self._assessment.position_error_m())
+
+    def _learn(self, time_s: float) -> None:
+        """After the setpoint has left, so that it waits for nothing."""
+        if self._learner is None:
+            return
+        try:
+            adoption = self._learner.learn(self.phase, time_s)
+            if adoption is not None:
+                self._adopt(time_s, adoption)
+        except Exception as error:  # flying on with what is believed is always possible
+            self._learner.give_up()
+            self._send(StatusTextOut(WARNING, f"identification ended: {error}"))
+
+    def _adopt(self, time_s: float, adoption: Adoption) -> None:
+        assert isinstance(self._controller, Adopting)
+        limit = adoption.bandwidth_limit_radps
+        self._controller.adopt(adoption.vehicle, limit, gains=adoption.gains)
+        self._observer.adopt(adoption.vehicle)
+        self._vehicle = adoption.vehicle
+        if adoption.record:
+            record = SolverRecord(time_s, adoption.record, IDENTIFIED_ID, IDENTIFIED_NAME)
+            self._note_down(record)
+        for sentence in adoption.sentences:
+            self.announced.append(sentence)
+            self._send(StatusTextOut(INFO, sentence))
 
     def _miss(self, failure: str) -> None:
         self._missed_decisions += 1
@@ -349,6 +394,8 @@ class Companion:
         """The one place that emits a setpoint."""
         self._command = command
         self._observer.on_command(time_s, command)
+        if self._learner:
+            self._learner.on_command(time_s, command)
         self._send(
             AttitudeTarget(
                 time_s=time_s,
@@ -392,3 +439,13 @@ class Companion:
         send, log = tuple(self._send_out), (*heard, *self._log_out)
         self._send_out, self._log_out = [], []
         return Output(send, log, alive)
+
+
+def _learner(
+    vehicle: Vehicle, controller: Controller, period_s: float, settings: IdentifySettings | None
+) -> Learner | None:
+    """Nothing is learnt for a controller that could not take it over."""
+    if settings is None or not settings.online or not isinstance(controller, Adopting):
+        return None
+    bandwidth = controller.bandwidth_radps
+    return Learner(vehicle, settings, period_s=period_s, bandwidth_radps=bandwidth)

@@ -36,6 +36,8 @@ class Picture:
     tilt_rad: float
     stop_requested: bool
     missed_decisions: int  # one after the other
+    excites: bool = False  # steps are wanted before the reference is joined
+    learnt: bool = False  # what they showed is taken over
 
 
 Guard = Callable[[Picture], bool]
@@ -79,6 +81,14 @@ def lifted_off(now: Picture) -> bool:
 
 def at_start(now: Picture) -> bool:
     return now.at_start
+
+
+def at_start_to_excite(now: Picture) -> bool:
+    return now.at_start and now.excites
+
+
+def learnt(now: Picture) -> bool:
+    return now.learnt
 
 
 def at_full_speed(now: Picture) -> bool:

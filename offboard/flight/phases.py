@@ -57,6 +57,7 @@ class Limits(Parameters):
     arm_s: float = Field(default=15.0, gt=0, le=60)
     lift_off_s: float = Field(default=8.0, gt=0, le=30)
     climb_s: float = Field(default=120.0, gt=0, le=600)
+    excite_s: float = Field(default=30.0, gt=5, le=600)
     land_s: float = Field(default=90.0, gt=0, le=600)
     disarm_s: float = Field(default=5.0, ge=2, le=60)
     silence_s: float = Field(default=1.0, ge=0.2, le=60)  # of everything: then a landing is asked

@@ -11,11 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from offboard.control import identification
 from offboard.control.base import Command, Controller, Situation
 from offboard.control.observer import Observer
 from offboard.flight import clock, manifest
 from offboard.flight.companion import Companion, Outcome
 from offboard.flight.daemon import Loop
+from offboard.flight.learning import IdentifySettings
 from offboard.flight.link import UdpLink, open_link
 from offboard.flight.log import FlightLog
 from offboard.flight.mission import Mission
@@ -50,6 +52,7 @@ class Crew:
     limits: Limits
     period_s: float
     deadline_s: float
+    learning: IdentifySettings | None = None
 
 
 def rehearse(crew: Crew) -> float:
@@ -74,6 +77,8 @@ def rehearse(crew: Crew) -> float:
             previous = crew.controller.decide(situation).command
             observer.on_command(time_s, previous)
     crew.track.sample(np.array([0.0, 1.0]))
+    if crew.learning and crew.learning.online:
+        identification.warm_up(crew.vehicle)
     crew.controller.reset()
     return clock.monotonic_s() - began_s
 
@@ -132,6 +137,7 @@ def fly(
             period_s=crew.period_s,
             deadline_s=None if bundled else crew.deadline_s,
             stopwatch=clock.monotonic_s,
+            learning=crew.learning,
         )
         loop = Loop(
             companion,

@@ -57,6 +57,8 @@ EVENTS: dict[str, dict[str, object]] = {  # the least that makes each guard hold
     "armed": {"armed": True},
     "lifted_off": {"lifted_off": True},
     "at_start": {"at_start": True},
+    "at_start_to_excite": {"at_start": True, "excites": True},
+    "learnt": {"learnt": True},
     "at_full_speed": {"track_time_s": 4.0},
     "track_over": {"track_time_s": 20.0},
     "at_rest": {"track_time_s": 23.5},

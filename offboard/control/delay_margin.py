@@ -1,0 +1,111 @@
+"""How much delay that nobody knows of the tracking loop bears, and the bandwidth that bears enough.
+
+A known delay is predicted through and costs little; what makes the loop unstable is a delay other
+than the one believed. One lateral axis is closed exactly as it is flown (law every period on the
+state predicted by replaying the commands sent, observer corrected by position and attitude) with
+the plant's delay longer than believed; the eigenvalues of the map over one period decide.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import expm, solve_discrete_are
+
+from offboard.control.response import lateral_cost_to_go, lateral_model
+from offboard.model.vehicle import Vehicle
+
+Array = NDArray[np.float64]
+
+# The delay not known of that must be borne: a share of the delay, this much, and 3 sd.
+LEAST_MARGIN_S, SHARE_OF_DELAY, SDS = 0.03, 0.25, 3.0
+BANDWIDTH_STEP_RADPS, LEAST_BANDWIDTH_RADPS = 0.25, 1.0
+SUBSTEPS = 10
+LONGEST_S = 0.6
+STABLE = 1.0 - 1e-6
+# Of the observer, see ObserverSettings: densities of v', b'', d' and sds of position and attitude.
+_DENSITIES = np.array([0.0, 0.2, 0.0, 0.6, 0.15])
+_SDS = np.array([0.002, 0.001])
+
+
+def delay_margin(vehicle: Vehicle, bandwidth_radps: float, period_s: float) -> float:
+    """The least delay beyond the believed one at which the loop is unstable, s; or LONGEST_S."""
+    loop = _Loop(vehicle, bandwidth_radps, period_s)
+    extra_s = 0.0
+    while extra_s < LONGEST_S and loop.radius(extra_s) < STABLE:
+        extra_s += loop.step_s
+    return extra_s
+
+
+def needed_margin(vehicle: Vehicle, delay_sd_s: float) -> float:
+    """What must be borne: 30 ms, a quarter of the delay (jitter grows with it), or three standard
+    deviations of it, whichever is longest."""
+    return max(LEAST_MARGIN_S, SHARE_OF_DELAY * vehicle.tilt.delay_s, SDS * delay_sd_s)
+
+
+def supported_bandwidth(
+    vehicle: Vehicle, bandwidth_radps: float, period_s: float, delay_sd_s: float
+) -> float:
+    """`bandwidth_radps`, or the greatest below it whose delay margin suffices."""
+    needed_s = needed_margin(vehicle, delay_sd_s)
+    bandwidth = bandwidth_radps
+    while bandwidth > LEAST_BANDWIDTH_RADPS:
+        loop = _Loop(vehicle, bandwidth, period_s)
+        tried = np.linspace(0.0, needed_s, 4)
+        if all(loop.radius(float(extra_s)) < STABLE for extra_s in tried):
+            return bandwidth
+        bandwidth -= BANDWIDTH_STEP_RADPS
+    return min(LEAST_BANDWIDTH_RADPS, bandwidth_radps)
+
+
+class _Loop:
+    """One lateral axis, SUBSTEPS samples a period: plant [p v b b'], observer [p v b b' d]."""
+
+    def __init__(self, vehicle: Vehicle, bandwidth_radps: float, period_s: float) -> None:
+        model = lateral_model(vehicle)
+        self.step_s = period_s / SUBSTEPS
+        self._delay_s = vehicle.tilt.delay_s
+        dynamics = np.zeros((5, 5))
+        dynamics[:4, :4], dynamics[1, 4] = model.dynamics, 1.0
+        inputs = np.append(model.input_map[:, 0], 0.0)
+        block = np.zeros((6, 6))
+        block[:5, :5], block[:5, 5] = dynamics, inputs
+        step = expm(block * self.step_s)
+        self._flow, self._push = step[:5, :5], step[:5, 5:]
+        measures = np.zeros((2, 5))
+        measures[0, 0] = measures[1, 2] = 1.0
+        noise = np.diag(_DENSITIES**2 * self.step_s)
+        noise[0, 0] += 1e-12
+        noise[2, 2] += 1e-12
+        sds = np.diag(_SDS**2)
+        prior = solve_discrete_are(self._flow.T, measures.T, noise, sds)
+        self._correction = prior @ measures.T @ np.linalg.inv(measures @ prior @ measures.T + sds)
+        self._measures = measures
+        gain = lateral_cost_to_go(vehicle, bandwidth_radps, period_s).gain
+        # The reference leans into the disturbance: b_r = b_ff = d / g
+        self._gain = np.append(gain, -(1.0 + gain[2]) / vehicle.gravity_mps2)[None, :]
+
+    def radius(self, extra_s: float) -> float:
+        """Spectral radius of the map over one period with the plant's delay `extra_s` longer."""
+        ahead = round(self._delay_s / self.step_s)
+        behind = round((self._delay_s + extra_s) / self.step_s)
+        kept = max(ahead, behind) // SUBSTEPS + 3  # commands of this and earlier periods
+        state = np.eye(9 + kept)
+        plant, observer, sent = state[:4], state[4:9], state[9:]
+        predicted = observer
+        for i in range(ahead):
+            predicted = self._flow @ predicted + self._push * _in_force(sent, i - ahead)
+        sent = np.vstack((-self._gain @ predicted, sent[:-1]))
+        for i in range(-SUBSTEPS, 0):
+            plant = self._flow[:4, :4] @ plant + self._push[:4] * _in_force(sent, i - behind)
+            observer = self._flow @ observer + self._push * _in_force(sent, i - ahead)
+            seen = plant[[0, 2]] - self._measures @ observer
+            observer = observer + self._correction @ seen
+        passed = np.vstack((plant, observer, sent))
+        return float(np.abs(np.linalg.eigvals(passed)).max())
+
+
+def _in_force(sent: Array, substep: int) -> Array:
+    """The command of `substep` < 0, counted from the end of the period of sent[0]."""
+    row: Array = sent[-(substep // SUBSTEPS) - 1]
+    return row

@@ -1,0 +1,334 @@
+"""Identification while flying: what the flight shows of its vehicle is taken over, within bounds.
+
+After the climb small steps show how tilt, course and thrust answer; from then on the flight itself
+shows the drag. What is found is checked against the vehicle file, blended in over a second and
+announced; what is not found, or out of bounds, stays as the vehicle file has it. Knows values and
+vehicle time, no link and no clock.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Any
+
+from pydantic import Field
+
+from offboard.control.base import Command
+from offboard.control.delay_margin import supported_bandwidth
+from offboard.control.identification import Identified, identify, identify_drag
+from offboard.control.response_fit import Estimate
+from offboard.control.trace import Recorder
+from offboard.flight.excitation import LENGTH_S, excited
+from offboard.flight.phases import Phase
+from offboard.model.frames import course_from_quaternion, thrust_direction_from_quaternion
+from offboard.model.vehicle import AxisResponse, Parameters, Vehicle
+
+RECORD_NAME, RECORD_ID = "identified", 2  # of the DEBUG_FLOAT_ARRAY in the log
+LIFTED_OFF_S = 0.5  # the ground's effect on the thrust ends
+DRAG_FIRST_S, DRAG_EVERY_S, DRAG_OVER_S = 3.0, 1.0, 25.0
+DRAG_NEWS_PS = 0.03  # a smaller change is not worth a word
+MOVING = (Phase.JOIN, Phase.TRACK)
+
+
+class IdentifySettings(Parameters):
+    """Identification in flight. A constant further from the vehicle file than `factor` either
+    way, or outside the absolute ranges of `BOUNDS`, is not taken over."""
+
+    online: bool = True
+    excite: bool = True  # False: learn from climb and flight as they are
+    tilt_step_deg: float = Field(default=2.0, ge=0.2, le=6)
+    thrust_step: float = Field(default=0.05, ge=0, le=0.2)
+    box_m: float = Field(default=0.6, ge=0.1, le=5)  # from the start; further out the steps end
+    factor: float = Field(default=4.0, ge=1, le=20)
+    blend_s: float = Field(default=1.0, ge=0, le=10)
+
+
+# Least and greatest value, and what a delay may differ by whatever the factor.
+BOUNDS = {
+    "delay": (0.0, 0.30),
+    "frequency": (2.0, 45.0),
+    "damping": (0.2, 2.5),
+    "hover thrust": (0.1, 0.8),
+    "thrust lag": (0.0, 0.25),
+    "thrust delay": (0.0, 0.25),
+    "drag": (0.02, 3.0),
+}
+DELAY_SLACK_S = 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Adoption:
+    """What the companion shall fly with from now on. `bandwidth_limit_radps` is what the delay
+    supports; `sentences` for the log and the user, `record` for the log (empty: nothing new)."""
+
+    vehicle: Vehicle
+    bandwidth_limit_radps: float
+    gains: bool  # whether the law should solve for its gains anew: the last step of a blend
+    sentences: tuple[str, ...] = ()
+    record: tuple[float, ...] = ()
+
+
+class Learner:
+    """One flight's identification. `vehicle` is the vehicle file's."""
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        settings: IdentifySettings,
+        *,
+        period_s: float,
+        bandwidth_radps: float,
+    ) -> None:
+        self._file = vehicle
+        self._settings = settings
+        self._period_s = period_s
+        self._bandwidth_radps = bandwidth_radps
+        self._recorder = Recorder()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything of the previous flight."""
+        self._recorder.clear()
+        self._from = self._to = self._now = self._file
+        self._blend_began_s = -math.inf
+        self._climb_s = self._excite_s = self._moving_s = math.nan
+        self._looked_s = -math.inf
+        self._identified = False
+        self._gave_up = False
+        self._left_box = False
+        self._delay_sd_s = 0.0
+        self._limit_radps = math.inf
+
+    # ------------------------------------------------------------------ what happened
+
+    def on_attitude(self, time_s: float, q: tuple[float, float, float, float]) -> None:
+        if not math.isnan(self._climb_s):
+            north, east, _ = thrust_direction_from_quaternion(q)
+            course = float(course_from_quaternion(q))
+            self._recorder.on_attitude(time_s, (float(north), float(east)), course)
+
+    def on_position(
+        self,
+        time_s: float,
+        position_ned_m: tuple[float, float, float],
+        velocity_ned_mps: tuple[float, float, float],
+    ) -> None:
+        if not math.isnan(self._climb_s):
+            self._recorder.on_position(time_s, position_ned_m, velocity_ned_mps)
+
+    def on_command(self, time_s: float, command: Command) -> None:
+        """A command sent, as scaled by the vehicle now adopted."""
+        north, east, _ = command.thrust_direction_ned
+        share = command.thrust_mps2 / self._now.thrust_max_mps2
+        self._recorder.on_command(time_s, (north, east), share, command.course_rad)
+
+    def on_phase(self, phase: Phase, time_s: float) -> None:
+        if phase is Phase.CLIMB:
+            self._climb_s = time_s
+        elif phase is Phase.EXCITE:
+            self._excite_s = time_s
+        elif phase is Phase.JOIN:
+            self._moving_s = time_s
+
+    # ------------------------------------------------------------------ what to do
+
+    @property
+    def wants_excitation(self) -> bool:
+        return self._settings.online and self._settings.excite
+
+    def excited(self, command: Command, time_s: float, error_m: float) -> Command:
+        """In the phase EXCITE: the command with its step, unless the vehicle left the box."""
+        self._left_box = self._left_box or error_m > self._settings.box_m
+        if self._left_box:
+            return command
+        tilt_rad = math.radians(self._settings.tilt_step_deg)
+        return excited(command, time_s - self._excite_s, tilt_rad, self._settings.thrust_step)
+
+    def finished(self, time_s: float) -> bool:
+        """Whether the steps are over and what they showed is taken over."""
+        if self._gave_up:
+            return True
+        return self._identified and time_s >= self._blend_began_s + self._settings.blend_s
+
+    def give_up(self) -> None:
+        """Learn nothing more in this flight."""
+        self._gave_up = True
+
+    def learn(self, phase: Phase, time_s: float) -> Adoption | None:
+        """After a tick's command was sent: what to fly with from the next tick on."""
+        if self._gave_up or not self._settings.online:
+            return None
+        sentences: list[str] = []
+        record: tuple[float, ...] = ()
+        if not self._identified and self._steps_are_over(phase, time_s):
+            self._identified = True
+            trace = self._recorder.trace(self._climb_s + LIFTED_OFF_S, time_s)
+            found = identify(trace, self._file)
+            sentences += self._take(found, time_s)
+            record = _record(found)
+        elif phase in MOVING and self._drag_is_due(time_s):
+            self._looked_s = time_s
+            begin_s = max(self._moving_s, time_s - DRAG_OVER_S)
+            found = identify_drag(self._recorder.trace(begin_s, time_s), self._to)
+            if self._is_news(found.drag_ps):
+                sentences += self._take(found, time_s)
+                record = _record(found)
+        if self._to == self._now and not sentences:
+            return None
+        return self._step(time_s, tuple(sentences), record)
+
+    def _steps_are_over(self, phase: Phase, time_s: float) -> bool:
+        if phase is Phase.EXCITE:
+            return self._left_box or time_s >= self._excite_s + LENGTH_S
+        return phase in MOVING and not self.wants_excitation
+
+    def _drag_is_due(self, time_s: float) -> bool:
+        return (
+            time_s >= self._moving_s + DRAG_FIRST_S
+            and time_s >= self._looked_s + DRAG_EVERY_S - 1e-6
+            and self._to == self._now
+        )
+
+    def _is_news(self, drag: Estimate | None) -> bool:
+        if drag is None:
+            return False
+        change = abs(drag.value - self._to.drag_per_mass_ps)
+        return change > max(DRAG_NEWS_PS, drag.sd)
+
+    # ------------------------------------------------------------------ taking over
+
+    def _take(self, found: Identified, time_s: float) -> list[str]:
+        """Set the target of the blend; what was taken, refused or out of bounds, in sentences."""
+        within, sentences = bounded(found, self._file, self._settings.factor)
+        target = within.applied_to(self._to)
+        if target != self._to:
+            self._from, self._to, self._blend_began_s = self._now, target, time_s
+            sentences.insert(0, _told(within))
+        else:
+            self._blend_began_s = time_s
+        if within.tilt is not None:
+            self._delay_sd_s = within.tilt.delay_s.sd
+            sentences += self._check_bandwidth()
+        return sentences
+
+    def _check_bandwidth(self) -> list[str]:
+        limit = supported_bandwidth(
+            self._to, self._bandwidth_radps, self._period_s, self._delay_sd_s
+        )
+        self._limit_radps = limit
+        if limit >= self._bandwidth_radps:
+            return []
+        return [
+            f"bandwidth lowered from {self._bandwidth_radps:.1f} to {limit:.1f} rad/s: a delay of "
+            f"{1e3 * self._to.tilt.delay_s:.0f} ms supports no more"
+        ]
+
+    def _step(
+        self, time_s: float, sentences: tuple[str, ...], record: tuple[float, ...]
+    ) -> Adoption:
+        share = 1.0
+        if self._settings.blend_s > 0.0:
+            passed_s = time_s - self._blend_began_s + self._period_s
+            share = min(passed_s / self._settings.blend_s, 1.0)
+        self._now = self._to if share > 1.0 - 1e-6 else _mixed(self._from, self._to, share)
+        return Adoption(self._now, self._limit_radps, self._now == self._to, sentences, record)
+
+
+def bounded(found: Identified, believed: Vehicle, factor: float) -> tuple[Identified, list[str]]:
+    """Without what is out of bounds or too far from what was believed; sentences say which."""
+    sentences: list[str] = []
+    refused: dict[str, Any] = {}
+
+    def outside(what: str, value: float, near: float, kind: str, slack: float = 0.0) -> bool:
+        low, high = BOUNDS[kind]
+        low = max(low, near / factor - slack)
+        high = min(high, near * factor + slack)
+        if low <= value <= high:
+            return False
+        sentences.append(f"{what} {value:.3g} is outside {low:.3g} .. {high:.3g}: not taken over")
+        return True
+
+    for name in ("tilt", "yaw"):
+        fit, axis = getattr(found, name), getattr(believed, name)
+        if fit is None:
+            continue
+        assert isinstance(axis, AxisResponse)
+        frequency = axis.natural_frequency_radps
+        if (
+            outside(f"{name} delay", fit.delay_s.value, axis.delay_s, "delay", DELAY_SLACK_S)
+            or outside(
+                f"{name} frequency", fit.natural_frequency_radps.value, frequency, "frequency"
+            )
+            or outside(f"{name} damping", fit.damping.value, axis.damping, "damping")
+        ):
+            refused[name] = None
+    for name, what, near, slack in (
+        ("hover_thrust", "hover thrust", believed.hover_thrust, 0.0),
+        ("thrust_lag_s", "thrust lag", believed.thrust_lag_s, DELAY_SLACK_S),
+        ("thrust_delay_s", "thrust delay", believed.thrust_delay_s, DELAY_SLACK_S),
+        ("drag_ps", "drag", believed.drag_per_mass_ps, 0.0),
+    ):
+        estimate: Estimate | None = getattr(found, name)
+        if estimate is not None and outside(what, estimate.value, near, what, slack):
+            refused[name] = None
+    if refused:
+        found = replace(found, **refused)
+    return found, sentences
+
+
+def _told(found: Identified) -> str:
+    """What was taken over, in one line."""
+    said = []
+    for name, fit in (("tilt", found.tilt), ("yaw", found.yaw)):
+        if fit is not None:
+            said.append(
+                f"{name} {1e3 * fit.delay_s.value:.0f} ms {fit.natural_frequency_radps.value:.1f} "
+                f"rad/s {fit.damping.value:.2f}"
+            )
+    if found.hover_thrust is not None:
+        said.append(f"hover thrust {found.hover_thrust.value:.3f}")
+    if found.thrust_lag_s is not None:
+        said.append(f"lag {1e3 * found.thrust_lag_s.value:.0f} ms")
+    if found.drag_ps is not None:
+        said.append(f"drag {found.drag_ps.value:.2f} +- {found.drag_ps.sd:.2f} 1/s")
+    return "identified " + ", ".join(said)
+
+
+def _record(found: Identified) -> tuple[float, ...]:
+    """Value and sd of tilt (delay, frequency, damping), yaw, hover thrust, lag, thrust delay,
+    drag; NaN where nothing was identified."""
+    estimates: list[Estimate | None] = []
+    for fit in (found.tilt, found.yaw):
+        estimates += (fit.delay_s, fit.natural_frequency_radps, fit.damping) if fit else (None,) * 3
+    estimates += [found.hover_thrust, found.thrust_lag_s, found.thrust_delay_s, found.drag_ps]
+    numbers: list[float] = []
+    for each in estimates:
+        numbers += (each.value, each.sd) if each else (math.nan, math.nan)
+    return tuple(numbers)
+
+
+def _mixed(before: Vehicle, after: Vehicle, share: float) -> Vehicle:
+    """A vehicle between two, constant by constant."""
+
+    def between(a: float, b: float) -> float:
+        return a + share * (b - a)
+
+    def axis(a: AxisResponse, b: AxisResponse) -> AxisResponse:
+        return AxisResponse(
+            delay_s=between(a.delay_s, b.delay_s),
+            natural_frequency_radps=between(a.natural_frequency_radps, b.natural_frequency_radps),
+            damping=between(a.damping, b.damping),
+        )
+
+    drag = zip(before.drag_translation_npmps, after.drag_translation_npmps, strict=True)
+    return after.model_copy(
+        update={
+            "tilt": axis(before.tilt, after.tilt),
+            "yaw": axis(before.yaw, after.yaw),
+            "hover_thrust": between(before.hover_thrust, after.hover_thrust),
+            "thrust_lag_s": between(before.thrust_lag_s, after.thrust_lag_s),
+            "thrust_delay_s": between(before.thrust_delay_s, after.thrust_delay_s),
+            "drag_translation_npmps": tuple(between(a, b) for a, b in drag),
+        }
+    )
