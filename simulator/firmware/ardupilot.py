@@ -55,6 +55,7 @@ BOOT = {
     "barometer": 1.94,
     "initialised": 2.47,
     "estimator": 4.45,
+    "aligning": 5.40,
     "tilt": 5.80,
     "attitude": 5.90,
     "gps": 9.83,
@@ -201,7 +202,7 @@ ROLES: dict[str, Role] = {
     "disarm_landed_s": 0.45,
     "disarm_idle_s": "DISARM_DELAY",
     "takeoff_height_m": 0.0,  # the command always tells
-    "takeoff_speed_mps": ("WPNAV_SPEED_UP", _CENTI),
+    "takeoff_speed_mps": ("WPNAV_SPEED_UP", 0.7 * _CENTI),  # 5 m are too few to reach it
     "land_speed_mps": ("LAND_SPEED", _CENTI),
     "descent_speed_mps": ("WPNAV_SPEED_DN", _CENTI),
     "cruise_speed_mps": ("WPNAV_SPEED", _CENTI),
@@ -387,9 +388,9 @@ ARDUPILOT = Firmware(
     stream_reaction_s=0.0,
     descend_speed_mps=2.4,  # LOITER with the throttle stick down
     spool_up_s=2.5,
-    thrust_ramp_s=1.2,
+    thrust_ramp_s=1.7,
     landed_after_s=1.65,
-    climbed_within_m=0.05,
+    climbed_within_m=0.1,
     landing_heights_m=(10.0, 11.0),
     gains=PositionGains(
         position_xy_ps=1.0,

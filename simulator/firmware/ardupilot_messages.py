@@ -11,7 +11,7 @@ from simulator.position_loop import GRAVITY_MPS2
 from simulator.telemetry import View
 
 # EKF_STATUS_FLAGS from a boot event on
-_EKF_FLAGS = (("position", 831), ("attitude", 167), ("tilt", 0))
+_EKF_FLAGS = (("position", 831), ("attitude", 167), ("aligning", 0))
 _EKF_UNINITIALISED = 1024
 # The sticks that SITL feigns: throttle down, mode switch
 _STICKS = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)

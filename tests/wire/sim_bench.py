@@ -6,11 +6,12 @@ import math
 from collections.abc import Callable
 from typing import Any
 
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.model.vehicle import Vehicle
 from simulator import config
 from simulator.conditions import Conditions
+from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
 from simulator.plant import STEP_S
@@ -37,10 +38,13 @@ class Bench:
         heartbeat_type: int | None = mavlink.MAV_TYPE_GCS,
         system: int = 1,
         ground_link: bool = False,
+        firmware: Firmware = PX4,
+        boot_scale: float = 1.0,
     ) -> None:
-        conditions = Conditions(estimator=estimator)
+        conditions = Conditions(estimator=estimator, boot_scale=boot_scale)
+        vehicle = config.vehicle(firmware.vehicle)
         self.instance = Instance(
-            PX4, px4_vehicle(), conditions, seed, system=system, ground_link=ground_link
+            firmware, vehicle, conditions, seed, system=system, ground_link=ground_link
         )
         self.system = system
         self.codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
