@@ -21,11 +21,13 @@ from offboard.control.base import Controller
 from offboard.control.catalogue import build
 from offboard.control.observer import Observer
 from offboard.flight.companion import Companion, Outcome
+from offboard.flight.learning import IdentifySettings
 from offboard.flight.log import FlightLog
 from offboard.flight.mission import Mission
 from offboard.flight.phases import Phase
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.mavlink.session import Session, SessionSettings
+from offboard.model.vehicle import Vehicle
 from simulator import config as simulated
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
@@ -147,13 +149,17 @@ class Pair:
     def went_through(self, phase: Phase) -> bool:
         return any(flown is phase for _, flown in self.phases)
 
-    def score(self, directory: Path) -> Score:
-        """Of the log that this flight would have left."""
+    def log(self, directory: Path) -> tlog.Tlog:
+        """The log that this flight would have left."""
         log = FlightLog(directory, "")
         with log:
             for index, frame in enumerate(self.logged):
                 log.write(UNIX_EPOCH_US + 100 * index, frame)
-        return score(history.gather(tlog.read(log.path)))
+        return tlog.read(log.path)
+
+    def score(self, directory: Path) -> Score:
+        """Of that log."""
+        return score(history.gather(self.log(directory)))
 
 
 def decode(frame: bytes) -> Any:
@@ -192,9 +198,12 @@ def make(
     firmware: Firmware = LEAN,
     wrap: Callable[[Controller], Controller] = lambda controller: controller,
     limits: dict[str, float] | None = None,
+    flies: Vehicle | None = None,
+    learning: IdentifySettings | None = None,
     **options: Any,
 ) -> Pair:
-    """A pair as `offboard fly --sitl` would make it, and what a test changes about it."""
+    """A pair as `offboard fly --sitl` would make it, and what a test changes about it: what
+    `flies` whatever is believed, and `learning` what it is."""
     choices = {"reference": reference} if reference else {}
     resolved = config.load(name, choices=choices, assignments=assignments, seed=seed)
     vehicle = resolved.vehicle
@@ -211,9 +220,10 @@ def make(
         period_s=resolved.period_s,
         deadline_s=None,
         stopwatch=lambda: 0.0,
+        learning=learning,
     )
     conditions = simulated.scenario(scenario).conditions
-    instance = Instance(firmware, simulated.vehicle("px4_sih"), conditions, seed)
+    instance = Instance(firmware, flies or simulated.vehicle("px4_sih"), conditions, seed)
     return Pair(companion, instance, **options)
 
 

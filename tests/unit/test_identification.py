@@ -1,0 +1,268 @@
+"""Identification against SciPy's simulation of the same equations, with noise, and its refusals."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from scipy import signal
+from scipy.integrate import solve_ivp
+
+from offboard.control.identification import Identified, identify
+from offboard.control.motion_fit import lagged_thrust
+from offboard.control.response_fit import fit_response, predicted
+from offboard.control.trace import Recorder, Trace, clean
+from offboard.model.vehicle import AxisResponse, Vehicle
+
+G = 9.80665
+BELIEVED = Vehicle(
+    name="believed",
+    mass_kg=1.0,
+    inertia_kgm2=(0.02, 0.02, 0.03),
+    drag_translation_npmps=(0.6, 0.6, 0.6),
+    drag_rotation_nmpradps=(0.0, 0.0, 0.0),
+    hover_thrust=0.42,
+    tilt=AxisResponse(delay_s=0.04, natural_frequency_radps=11.0, damping=0.85),
+    yaw=AxisResponse(delay_s=0.2, natural_frequency_radps=3.5, damping=0.5),
+)
+FINE_S = 1e-3
+
+
+def answered(commands, sent_at, delay_s, frequency, damping, times):
+    """The second-order answer by SciPy's linear simulation on a grid of 1 ms."""
+    grid = np.arange(0.0, times[-1] + 0.01, FINE_S)
+    rows = np.searchsorted(sent_at + delay_s, grid + 1e-9, side="right") - 1
+    held = np.where(rows < 0, 0.0, commands[np.maximum(rows, 0)])
+    system = signal.StateSpace(
+        [[0.0, 1.0], [-(frequency**2), -2.0 * damping * frequency]],
+        [[0.0], [frequency**2]],
+        [[1.0, 0.0]],
+        [[0.0]],
+    )
+    discrete = system.to_discrete(FINE_S)  # zero-order hold
+    _, output = signal.dlsim(discrete, held[:, None])[:2]
+    return np.interp(times, grid, output[:, 0])
+
+
+def steps(seed, count=60, period_s=0.1, size=0.035):
+    """Random steps, at rest for the first half second."""
+    generator = np.random.default_rng(seed)
+    values = size * generator.choice([-1.0, 0.0, 1.0], count)
+    values[:5] = 0.0
+    return np.arange(count) * period_s, values
+
+
+@pytest.mark.parametrize("damping", [0.3, 0.999, 1.0, 1.7])
+def test_response_is_that_of_scipy(damping):
+    sent_at, values = steps(3)
+    times = 0.3 + np.cumsum(np.random.default_rng(4).choice([0.008, 0.016, 0.004], 500))
+    ours = predicted(times, sent_at, values[:, None], 0.057, 11.4, damping)[:, 0]
+    theirs = answered(values, sent_at, 0.057, 11.4, damping, times)
+    assert np.abs(ours - theirs).max() < 2e-5
+    assert np.abs(theirs).max() > 0.02
+
+
+def test_response_fits_what_scipy_made_to_four_digits():
+    sent_at, values = steps(5)
+    times = np.arange(0.3, 5.9, 0.01)
+    signals = answered(values, sent_at, 0.123, 7.0, 1.2, times)[:, None]
+    fit = fit_response(times, signals, sent_at, values[:, None])
+    assert fit.delay_s.value == pytest.approx(0.123, abs=5e-4)
+    assert fit.natural_frequency_radps.value == pytest.approx(7.0, rel=2e-3)
+    assert fit.damping.value == pytest.approx(1.2, rel=2e-3)
+
+
+def test_uncertainty_is_what_repetition_shows():
+    """Noise related over 0.2 s, as an estimator's is: errors over their sd have an rms near 1."""
+    sent_at, values = steps(6)
+    times = np.arange(0.3, 5.9, 0.01)
+    clean_signal = answered(values, sent_at, 0.05, 11.0, 0.6, times)
+    truth = np.array([0.05, 11.0, 0.6])
+    shares = []
+    for seed in range(40):
+        white = np.random.default_rng(seed).normal(size=len(times) + 200)
+        related = signal.lfilter([math.sqrt(1.0 - 0.95**2)], [1.0, -0.95], white)[200:]
+        noisy = clean_signal + 0.002 * related
+        fit = fit_response(times, noisy[:, None], sent_at, values[:, None])
+        found = (fit.delay_s, fit.natural_frequency_radps, fit.damping)
+        shares.append([(e.value - t) / e.sd for e, t in zip(found, truth, strict=True)])
+    rms = np.sqrt(np.mean(np.square(shares), axis=0))
+    assert np.all(rms > 0.5)
+    assert np.all(rms < 1.8)
+
+
+def test_lagged_thrust_is_that_of_scipy():
+    sent_at = np.array([0.0, 0.5, 0.9, 1.4])
+    thrust = np.array([0.4, 0.5, 0.35, 0.45])
+    times = np.arange(0.4, 2.0, 0.013)
+
+    def rate(t, u):
+        row = max(int(np.searchsorted(sent_at + 0.02, t, side="right")) - 1, 0)
+        return (thrust[row] - u) / 0.08
+
+    solved = solve_ivp(rate, (0.0, 2.0), [0.4], t_eval=times, max_step=1e-3, rtol=1e-8)
+    ours = lagged_thrust(times, sent_at, thrust, 0.02, 0.08)
+    assert np.abs(ours - solved.y[0]).max() < 5e-4
+
+
+def flown(
+    *, tilt=0.25, course=0.1, heave=0.06, hover=0.5, drag=0.8, noise=0.0, seconds=12.0, seed=1
+) -> Trace:
+    """A vehicle that swings under open-loop commands, integrated by SciPy: tilt answers with
+    D .06, wn 12, z .7, course with D .1, wn 4, z .6, thrust with D .02, lag .05."""
+    sent_at = np.arange(0.0, seconds, 0.1)
+    generator = np.random.default_rng(seed)
+    swing = tilt * np.sin(1.6 * sent_at), tilt * np.cos(2.3 * sent_at)
+    tilts = [each + 0.1 * tilt * generator.choice([-1, 0, 1], len(sent_at)) for each in swing]
+    thrust = hover * (1.0 + heave * np.sign(np.sin(2.0 * sent_at)))
+    courses = course * np.sign(np.sin(1.1 * sent_at))
+    grid = np.arange(0.0, seconds, 0.01)
+    b = [answered(each, sent_at, 0.06, 12.0, 0.7, grid) for each in tilts]
+    turned = answered(courses, sent_at, 0.1, 4.0, 0.6, grid)
+
+    def rate(t, x):
+        row = max(int(np.searchsorted(sent_at + 0.02, t + 1e-12, side="right")) - 1, 0)
+        push = G / hover * x[6]
+        north, east = (np.interp(t, grid, each) for each in b)
+        down = G - push * math.sqrt(1.0 - north**2 - east**2)
+        pulls = np.array([-push * north, -push * east, down])
+        return np.concatenate((x[3:6], pulls - drag * x[3:6], [(thrust[row] - x[6]) / 0.05]))
+
+    start = np.array([0, 0, 0, 0, 0, 0, hover], float)
+    solved = solve_ivp(rate, (0.0, seconds), start, t_eval=grid, max_step=0.01, rtol=1e-7)
+    position = solved.y[:3].T + noise * generator.normal(size=(len(grid), 3))
+    velocity = solved.y[3:6].T
+    direction = np.array(b).T + 0.2 * noise * generator.normal(size=(len(grid), 2))
+    whole = Trace(
+        np.column_stack((sent_at, *tilts, thrust, courses)),
+        np.column_stack((grid, direction, turned)),
+        np.column_stack((grid, position, velocity)),
+    )
+    return whole.between(0.5, seconds)  # what was commanded before is known
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.001])
+def test_everything_comes_back(noise):
+    found = identify(flown(noise=noise), BELIEVED)
+    assert not found.refusals
+    assert found.tilt is not None
+    assert found.yaw is not None
+    assert found.hover_thrust is not None
+    assert found.thrust_lag_s is not None
+    assert found.thrust_delay_s is not None
+    assert found.drag_ps is not None
+    assert found.tilt.delay_s.value == pytest.approx(0.06, abs=0.002)
+    assert found.tilt.natural_frequency_radps.value == pytest.approx(12.0, rel=0.02)
+    assert found.tilt.damping.value == pytest.approx(0.7, abs=0.02)
+    assert found.yaw.delay_s.value == pytest.approx(0.1, abs=0.01)
+    assert found.yaw.natural_frequency_radps.value == pytest.approx(4.0, rel=0.03)
+    assert found.yaw.damping.value == pytest.approx(0.6, abs=0.03)
+    assert found.hover_thrust.value == pytest.approx(0.5, rel=0.01)
+    effect_s = found.thrust_lag_s.value + found.thrust_delay_s.value
+    assert effect_s == pytest.approx(0.07, abs=0.015)
+    assert found.drag_ps.value == pytest.approx(0.8, rel=0.05)
+    applied = found.applied_to(BELIEVED)
+    assert applied.drag_per_mass_ps == pytest.approx(found.drag_ps.value)
+    assert applied.tilt.damping == found.tilt.damping.value
+
+
+def test_reported_velocity_is_not_believed():
+    """A velocity that is wrong by 0.4 m/s for seconds changes nothing but the noise figure."""
+    true = flown()
+    wrong = true.position.copy()
+    wrong[:, 4:7] += 0.4 * np.sin(1.5 * wrong[:, :1])
+    honest, misled = (
+        identify(Trace(true.commands, true.attitude, each), BELIEVED)
+        for each in (true.position, wrong)
+    )
+    assert misled.drag_ps == honest.drag_ps
+    assert misled.hover_thrust == honest.hover_thrust
+    assert honest.noise is not None
+    assert misled.noise is not None
+    assert honest.noise.velocity_contradiction_mps < 0.002
+    assert 0.2 < misled.noise.velocity_contradiction_mps < 0.4
+
+
+def test_noise_from_sample_to_sample_is_measured():
+    trace = flown(noise=0.004)
+    noise = identify(trace, BELIEVED).noise
+    assert noise is not None
+    assert noise.position_m == pytest.approx(0.004, rel=0.1)
+    assert noise.attitude_rad == pytest.approx(0.0008, rel=0.15)
+    assert noise.velocity_mps < 1e-4
+
+
+def silent() -> Trace:
+    return flown(tilt=0.0, course=0.0, heave=0.0)
+
+
+@pytest.mark.parametrize(
+    ("trace", "name", "words"),
+    [
+        (silent(), "tilt", "moved by 0.0 mrad rms"),
+        (silent(), "yaw", "moved by 0.0 mrad rms"),
+        (silent(), "thrust_lag_s", "the thrust moved by 0.0 %"),
+        (silent(), "drag_ps", "drag needs motion"),
+        (flown(tilt=0.01), "drag_ps", "drag needs motion"),
+        (flown(seconds=2.0), "tilt", "1.5 s of flight, 2 s are needed"),
+    ],
+)
+def test_what_a_flight_does_not_show_is_refused(trace, name, words):
+    found = identify(trace, BELIEVED)
+    assert words in found.refusals[name]
+    assert getattr(found, name) is None
+    assert getattr(found.applied_to(BELIEVED), name, None) == getattr(BELIEVED, name, None)
+
+
+def test_silent_hover_still_shows_its_thrust():
+    found = identify(silent(), BELIEVED)
+    assert found.hover_thrust is not None
+    assert found.hover_thrust.value == pytest.approx(0.5, rel=0.005)
+
+
+def test_attitude_that_follows_something_else_is_refused():
+    """Another's commands: the fit must not be taken for an answer."""
+    ours, other = flown(seed=1), flown(seed=2)
+    swapped = other.commands.copy()
+    swapped[:, 1:3] = np.roll(swapped[:, 1:3], 17, axis=0)
+    found = identify(Trace(swapped, ours.attitude, ours.position), BELIEVED)
+    assert found.tilt is None
+    assert "does not follow" in found.refusals["tilt"] or "edge" in found.refusals["tilt"]
+
+
+@pytest.mark.parametrize("rows", [0, 1, 5])
+def test_next_to_nothing_is_refused(rows):
+    trace = flown(seconds=3.0)
+    cut = Trace(trace.commands[:rows], trace.attitude[:rows], trace.position[:rows])
+    found = identify(cut, BELIEVED)
+    assert found == Identified(0.0, refusals=found.refusals)
+    assert set(found.refusals) >= {"tilt", "yaw", "hover_thrust", "drag_ps"}
+    assert not found.supported
+
+
+def test_trace_is_cleaned():
+    stamps = [0.0, 0.1, 0.1, 0.05, 0.2, 0.3]
+    north = [1.0, 2.0, 3.0, 9.0, math.nan, 4.0]
+    rows = np.column_stack((stamps, north, np.zeros(6), np.full(6, 0.5), np.zeros(6)))
+    samples = rows[:, :4]
+    trace = clean(rows, samples, np.zeros((0, 7)))
+    assert trace.commands[:, 1].tolist() == [1.0, 3.0, 4.0]
+    assert trace.attitude[:, 1].tolist() == [1.0, 2.0, 4.0]
+    assert math.isnan(trace.begin_s)
+
+
+def test_recorder_keeps_the_last_stretch():
+    recorder = Recorder(kept_s=2.0, rate_hz=100.0)
+    for step in range(2000):
+        time_s = 0.01 * step
+        recorder.on_attitude(time_s, (0.1, 0.2), 0.0)
+        recorder.on_position(time_s, (time_s, 0.0, 0.0), (1.0, 0.0, 0.0))
+        if step % 10 == 0:
+            recorder.on_command(time_s, (0.1, 0.2), 0.5, 0.0)
+    trace = recorder.trace(18.5, 19.5)
+    assert trace.begin_s == pytest.approx(18.5)
+    assert trace.end_s == pytest.approx(19.5)
+    assert len(trace.position) == 101
+    assert trace.commands[-1, 0] == pytest.approx(19.5)
+    assert len(recorder.trace(0.0, 20.0).attitude) <= 400
