@@ -113,11 +113,25 @@ def advance_process(
     transition: Array, scale: Array, gain: float, normals: Array, x: Array, work: Array
 ) -> None:
     """One step of a LinearProcess in place; `gain` multiplies the noise, `work` is scratch (n,)."""
-    n = x.shape[0]
-    for i in range(n):
+    advance_block(transition, scale, 0, x.shape[0], gain, normals, x, work)
+
+
+@numba.njit(cache=True)
+def advance_block(
+    transition: Array,
+    scale: Array,
+    first: int,
+    end: int,
+    gain: float,
+    normals: Array,
+    x: Array,
+    work: Array,
+) -> None:
+    """The same of one diagonal block, the states `first` to `end` - 1; the others stay."""
+    for i in range(first, end):
         total = 0.0
-        for j in range(n):
+        for j in range(first, end):
             total += transition[i, j] * x[j] + gain * scale[i, j] * normals[j]
         work[i] = total
-    for i in range(n):
+    for i in range(first, end):
         x[i] = work[i]

@@ -34,10 +34,11 @@ from simulator.attitude import (
     encode,
 )
 from simulator.conditions import Conditions
-from simulator.noise import advance_process, fill_normals, seed_word
+from simulator.noise import advance_block, advance_process, fill_normals, seed_word
 from simulator.sensors import (
     ATTITUDE,
     EAST,
+    ERROR_BLOCKS,
     ERROR_COUNT,
     NORTH,
     POSITION,
@@ -266,13 +267,13 @@ def _advance(
     """`count` steps in place. Per step: demand into history, air, loop on the estimate, airframe,
     estimator errors. Packed, because unpacking one argument costs a tenth of a step."""
     body, rotor, wind = state[:13], state[13:19], state[19:22]
-    error, gust = state[22:31], state[31:36]
+    error, gust = state[22:34], state[34:39]
     body_constants, rotor_constants = constants[:12], constants[12:18]
     gains, air = constants[18:27].reshape(3, 3), constants[27:34]
-    error_transition = constants[34:115].reshape(9, 9)
-    error_scale = constants[115:196].reshape(9, 9)
-    gust_transition = constants[196:221].reshape(5, 5)
-    gust_scale = constants[221:246].reshape(5, 5)
+    error_transition = constants[34:178].reshape(12, 12)
+    error_scale = constants[178:322].reshape(12, 12)
+    gust_transition = constants[322:347].reshape(5, 5)
+    gust_scale = constants[347:372].reshape(5, 5)
     normals, work = np.empty(ERROR_COUNT), np.empty(ERROR_COUNT)
     estimated, turn, turn_error = np.empty(4), np.empty(3), np.empty(3)
     inputs, scratch = np.empty(4), np.empty((RK4_SCRATCH_ROWS, 13))
@@ -309,4 +310,7 @@ def _advance(
         )
         if noisy:
             fill_normals(seed, _ERROR_LANE, step, normals)
-            advance_process(error_transition, error_scale, noise_gain, normals, error, work)
+            for first, end in ERROR_BLOCKS:
+                advance_block(
+                    error_transition, error_scale, first, end, noise_gain, normals, error, work
+                )

@@ -1,10 +1,11 @@
 """What the autopilot believes: estimator errors as data, and the estimate made of truth and error.
 
-An estimator is a linear error process per NED axis, e = [e_p, e_v, e_b] with e' = A e + w, plus a
-white part from sample to sample. e_p and e_v are estimated minus true position and velocity; e_b
-is estimated minus true thrust direction (so the true tilt is the estimated one less e_b). The
-process was identified on real autopilots; it reproduces that PX4's velocity is *not* the
-derivative of PX4's position, which white noise does not. Knows no vehicle and no MAVLink.
+An estimator is a linear error process per NED axis, e = [e_p, e_v, e_b, e_r] with e' = A e + w,
+plus a white part from sample to sample. e_p and e_v are estimated minus true position and velocity;
+e_b is estimated minus true thrust direction (so the true tilt is the estimated one less e_b); e_r
+is the rate of e_p where e_p is smooth. The processes were identified on real autopilots; PX4's
+reproduces that its velocity is *not* the derivative of its position, and that its position is
+smooth all the same, which white noise does not. Knows no vehicle and no MAVLink.
 """
 
 from __future__ import annotations
@@ -24,8 +25,10 @@ from simulator.noise import LinearProcess, block_diagonal, discretise, fill_norm
 Array = NDArray[np.float64]
 Rows = tuple[tuple[float, ...], ...]
 
-# Order of the error state: north p v b, east p v b, down p v, yaw.
-NORTH, EAST, DOWN, YAW, ERROR_COUNT = 0, 3, 6, 8, 9
+# Order of the error state: north p v b r, east p v b r, down p v r, yaw.
+NORTH, EAST, DOWN, YAW, ERROR_COUNT = 0, 4, 8, 11, 12
+ERROR_BLOCKS = ((NORTH, EAST), (EAST, DOWN), (DOWN, YAW), (YAW, ERROR_COUNT))
+_AXIS_STRIDE = 4
 
 # Of the noise, with the motors standing: the IMU is far quieter then.
 STANDING_NOISE = 0.1
@@ -50,12 +53,23 @@ class WhiteNoise(Parameters):
 
 
 @dataclass(frozen=True, slots=True)
-class ErrorModel:
-    """One estimator. Drifts per second, densities per root second; p in m, v in m/s, b in rad."""
+class AxisError:
+    """e' = drift e + noise xi of one axis, xi white with unit density; p in m, v in m/s, b in rad.
 
-    north: tuple[Rows, tuple[float, ...]] | None
-    east: tuple[Rows, tuple[float, ...]] | None
-    down: tuple[Rows, tuple[float, ...]] | None
+    As many states as it needs, in the order of the error state; the others stay zero.
+    """
+
+    drift: Rows = ()
+    noise: Rows = ()
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorModel:
+    """One estimator."""
+
+    north: AxisError
+    east: AxisError
+    down: AxisError
     yaw_sd_rad: float
     yaw_time_s: float
     white: WhiteNoise
@@ -65,27 +79,53 @@ class ErrorModel:
 _SILENT = WhiteNoise(
     position_m=0.0, velocity_mps=0.0, attitude_rad=0.0, rates_radps=(0.0, 0.0, 0.0)
 )
-PERFECT = ErrorModel(None, None, None, 0.0, 15.0, _SILENT, 0.0)
+_NONE = AxisError()
+PERFECT = ErrorModel(_NONE, _NONE, _NONE, 0.0, 15.0, _SILENT, 0.0)
 
-# PX4 1.16 SITL with its SIH quadrotor: identified from estimate against simulated truth. North and
-# east differ because SIH's gyro noise is per body axis. Started from zero the standard deviations
-# after some tens of seconds are N .26 m .17 m/s .019 rad, E .21 .29 .021, D .48 .18.
+# PX4 1.16 SITL with its SIH quadrotor: identified from estimate against simulated truth, flown in
+# hover and on lemniscates. e_v is what the accelerometer's noise drives. e_p does not follow it:
+# the filter's position corrections undo it within half a second or so. They arrive smoothed by
+# the output predictor, so e_p has a rate of its own, e_r, whose drive shares in e_v's. North and
+# east differ because SIH's IMU noise is per body axis.
 PX4_LIKE = ErrorModel(
-    north=(
-        ((-0.06, 0.13, -0.55), (-0.06, -0.135, -2.6), (-0.006, 0.029, -0.0175)),
-        (0.030, 0.044, 0.010),
+    north=AxisError(
+        drift=(
+            (0.0, 0.0, 0.0, 1.0),
+            (-0.087, -0.249, -3.36, 0.753),
+            (-0.010, 0.014, -0.175, -0.016),
+            (-0.318, -0.151, -6.65, -2.40),
+        ),
+        noise=(
+            (0.0, 0.0, 0.0),
+            (0.037, 0.0, 0.0),
+            (0.0, 0.009, 0.0),
+            (0.050, 0.0, 0.122),
+        ),
     ),
-    east=(
-        ((-0.34, 0.30, -0.78), (-0.28, -0.06, -4.5), (-0.014, 0.026, 0.008)),
-        (0.0225, 0.097, 0.012),
+    east=AxisError(
+        drift=(
+            (0.0, 0.0, 0.0, 1.0),
+            (0.039, -0.379, -4.24, 0.968),
+            (-0.013, 0.025, -0.004, -0.014),
+            (-0.275, -0.123, -5.25, -1.49),
+        ),
+        noise=(
+            (0.0, 0.0, 0.0),
+            (0.102, 0.0, 0.0),
+            (0.0, 0.009, 0.0),
+            (0.121, 0.0, 0.112),
+        ),
     ),
-    down=(((-0.05, 0.36), (-0.02, -0.07)), (0.013, 0.082)),
+    down=AxisError(
+        drift=((0.0, 0.0, 1.0), (-0.031, -0.131, 0.293), (-0.274, 0.556, -1.97)),
+        noise=((0.0, 0.0), (0.085, 0.0), (0.090, 0.157)),
+    ),
     yaw_sd_rad=math.radians(2.5),
     yaw_time_s=15.0,
     white=WhiteNoise(
-        position_m=0.0003,
-        velocity_mps=0.0035,
-        attitude_rad=0.0006,
+        position_m=0.00005,
+        velocity_mps=0.0005,
+        attitude_rad=0.0001,
         rates_radps=(0.07, 0.035, 0.014),
     ),
     lag_s=0.004,
@@ -94,21 +134,22 @@ PX4_LIKE = ErrorModel(
 
 def _consistent_axis(
     position_sd: float, position_time_s: float, velocity_sd: float, velocity_time_s: float
-) -> tuple[Rows, tuple[float, float]]:
-    """Drift and densities of e_p' = -e_p/T_p + e_v + w, e_v' = -e_v/T_v + w of given statistics."""
+) -> AxisError:
+    """e_p' = -e_p/T_p + e_v + w, e_v' = -e_v/T_v + w of given statistics."""
     a, b = 1.0 / position_time_s, 1.0 / velocity_time_s
     shared = velocity_sd**2 / (a + b)  # stationary covariance of e_p and e_v
     position_density = math.sqrt(2.0 * a * position_sd**2 - 2.0 * shared)
-    return ((-a, 1.0), (0.0, -b)), (position_density, velocity_sd * math.sqrt(2.0 * b))
+    velocity_density = velocity_sd * math.sqrt(2.0 * b)
+    return AxisError(((-a, 1.0), (0.0, -b)), ((position_density, 0.0), (0.0, velocity_density)))
 
 
-def _with_tilt(
-    axis: tuple[Rows, tuple[float, float]], tilt_sd: float, tilt_time_s: float
-) -> tuple[Rows, tuple[float, ...]]:
+def _with_tilt(axis: AxisError, tilt_sd: float, tilt_time_s: float) -> AxisError:
     """The same axis with an independent tilt error of given statistics."""
-    (position, velocity), densities = axis
-    drift = ((*position, 0.0), (*velocity, 0.0), (0.0, 0.0, -1.0 / tilt_time_s))
-    return drift, (*densities, tilt_sd * math.sqrt(2.0 / tilt_time_s))
+    density = tilt_sd * math.sqrt(2.0 / tilt_time_s)
+    return AxisError(
+        (*((*row, 0.0) for row in axis.drift), (0.0, 0.0, -1.0 / tilt_time_s)),
+        (*((*row, 0.0) for row in axis.noise), (0.0, 0.0, density)),
+    )
 
 
 # ArduCopter 4.6 EKF3 on noisy sensors ("noisy", not the near-silent ones SITL ships with: there
@@ -135,21 +176,32 @@ def error_model(name: EstimatorName, white: WhiteNoise) -> ErrorModel:
     """The estimator of this name; `white` only matters for WHITE."""
     return {
         EstimatorName.PERFECT: PERFECT,
-        EstimatorName.WHITE: ErrorModel(None, None, None, 0.0, 15.0, white, 0.0),
+        EstimatorName.WHITE: ErrorModel(_NONE, _NONE, _NONE, 0.0, 15.0, white, 0.0),
         EstimatorName.PX4_LIKE: PX4_LIKE,
         EstimatorName.ARDUPILOT_LIKE: ARDUPILOT_LIKE,
     }[name]
 
 
 def error_process(model: ErrorModel, step_s: float) -> LinearProcess:
-    """The nine error states (NORTH, EAST, DOWN, YAW) sampled exactly at `step_s`."""
-    parts = []
-    for axis, size in ((model.north, 3), (model.east, 3), (model.down, 2)):
-        drift, densities = axis or (-np.eye(size), (0.0,) * size)
-        parts.append(discretise(drift, densities, step_s))
+    """The error state (NORTH, EAST, DOWN, YAW) sampled exactly at `step_s`."""
+    parts = [
+        discretise(*_padded(axis, end - first), step_s)
+        for axis, (first, end) in zip(
+            (model.north, model.east, model.down), ERROR_BLOCKS, strict=False
+        )
+    ]
     yaw_density = model.yaw_sd_rad * math.sqrt(2.0 / model.yaw_time_s)
     parts.append(discretise([[-1.0 / model.yaw_time_s]], [yaw_density], step_s))
     return block_diagonal(*parts)
+
+
+def _padded(axis: AxisError, size: int) -> tuple[Array, Array]:
+    """Drift and noise (size, size); the states that the axis does not have decay undriven."""
+    drift, noise = -np.eye(size), np.zeros((size, size))
+    for i, (drift_row, noise_row) in enumerate(zip(axis.drift, axis.noise, strict=True)):
+        drift[i, : len(drift_row)] = drift_row
+        noise[i, : len(noise_row)] = noise_row
+    return drift, noise
 
 
 def white_sds(model: ErrorModel) -> Array:
@@ -206,9 +258,9 @@ def report(
         white[i] *= gain * sds[i]
     for axis in range(3):
         late = body[10 + axis] - lag_s * body[7 + axis]
-        out[axis] = late + errors[3 * axis] + offset[axis] + white[axis]
+        out[axis] = late + errors[_AXIS_STRIDE * axis] + offset[axis] + white[axis]
         slow = body[7 + axis] - lag_s * acceleration[axis]
-        out[3 + axis] = slow + errors[3 * axis + 1] + white[3 + axis]
+        out[3 + axis] = slow + errors[_AXIS_STRIDE * axis + 1] + white[3 + axis]
         out[10 + axis] = body[4 + axis] + white[9 + axis]
     turn = white[6:9]
     turn[0] -= errors[EAST + 2]
