@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-import json
 import sys
+from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
@@ -62,12 +63,16 @@ def fly(
         str | None, typer.Option(help="A shipped reference, or a .yaml or .csv file.")
     ] = None,
     vehicle: Annotated[str | None, typer.Option(help="A shipped vehicle, or a file.")] = None,
+    firmware: Annotated[
+        str, typer.Option(help="With --sitl: whose behaviour, px4 or ardupilot.")
+    ] = "px4",
     scenario: Annotated[
-        str, typer.Option(help="With --sitl: a shipped scenario, or a file.")
-    ] = "px4_like",
+        str | None, typer.Option(help="With --sitl: a scenario or a file; else the firmware's own.")
+    ] = None,
     sim_vehicle: Annotated[
-        str, typer.Option(help="With --sitl: what flies, whatever is believed of it.")
-    ] = "px4_sih",
+        str | None,
+        typer.Option(help="With --sitl: what flies, whatever is believed of it."),
+    ] = None,
     seed: Annotated[
         int | None, typer.Option(help="Of the swarm, and with --sitl of the simulator.")
     ] = None,
@@ -80,41 +85,13 @@ def fly(
     """Connect, arm, take off, track the reference, land; log everything and score it."""
     from offboard.analysis.requirement import Requirement
     from offboard.analysis.score import FIGURES
-    from offboard.config import build_track, dump, load
-    from offboard.control.catalogue import build
-    from offboard.control.observer import Observer
     from offboard.flight import clock
     from offboard.flight.companion import Companion
-    from offboard.flight.log import FlightLog
     from offboard.flight.phases import ExitCode
-    from offboard.flight.run import Bundled, Crew
-    from offboard.flight.run import fly as fly_once
+    from offboard.sortie import Order, fly_order
 
     named = {"controller": controller, "reference": reference, "vehicle": vehicle}
-    resolved = load(
-        config,
-        choices={part: name for part, name in named.items() if name is not None},
-        assignments=assignments or (),
-        seed=seed,
-    )
     requirements = [Requirement.parse(text, FIGURES) for text in require or ()]
-    track = build_track(resolved)
-    crew = Crew(
-        vehicle=resolved.vehicle,
-        controller=build(
-            resolved.controller,
-            resolved.vehicle,
-            resolved.period_s,
-            resolved.seed,
-            clock.monotonic_s,
-        ),
-        make_observer=lambda: Observer(resolved.vehicle, resolved.observer),
-        track=track,
-        limits=resolved.limits,
-        period_s=resolved.period_s,
-        deadline_s=resolved.deadline_s,
-        learning=resolved.identify,
-    )
     shown = 0
 
     def progress(companion: Companion) -> None:
@@ -128,24 +105,30 @@ def fly(
             out.print(f"compiled in {seconds:.1f} s; the next start finds it cached")
 
     directory = out_directory or Path("flights") / clock.local_stamp()
-    log = FlightLog(directory, dump(resolved))
+    order = Order(
+        directory=directory,
+        config=config,
+        choices={part: name for part, name in named.items() if name is not None},
+        assignments=tuple(assignments or ()),
+        seed=seed,
+        connection=connect,
+        sitl=sitl,
+        firmware=firmware,
+        scenario=scenario,
+        sim_vehicle=sim_vehicle,
+    )
+    order.resolve()
     out.print("preparing the controller (its first run on a machine compiles for seconds)")
     try:
-        outcome = fly_once(
-            crew,
-            log,
-            connection=connect,
-            bundled=Bundled(scenario, resolved.seed, sim_vehicle) if sitl else None,
-            progress=progress,
-            prepared=prepared,
-        )
+        outcome = fly_order(order, progress, prepared)
     except KeyboardInterrupt:  # in flight it lands instead
         raise Refusal("interrupted before anything was sent", ExitCode.ABORTED) from None
     if outcome.exit_code == ExitCode.USAGE:
         raise Refusal(outcome.sentence)
     if outcome.exit_code != ExitCode.FLOWN:
         _score(directory, [], as_json=False)
-        raise Refusal(f"{outcome.sentence} (log: {log.path})", outcome.exit_code)
+        log = directory / "flight.tlog"
+        raise Refusal(f"{outcome.sentence} (log: {log})", outcome.exit_code)
     missed = _score(directory, requirements, as_json=False)
     out.print(f"{outcome.sentence}; recorded in {directory}")
     if missed:
@@ -251,21 +234,123 @@ def identify(
         raise Refusal("nothing could be identified from this flight", 1)
 
 
+@app.command(epilog=EXIT_HELP)
+def compare(
+    controllers: Annotated[
+        str, typer.Option(help="Comma-separated names or files, or 'all'.")
+    ] = "pso,lqr,paper",
+    reference: Annotated[str, typer.Option(help="Comma-separated names or files.")] = "lemniscate",
+    scenario: Annotated[
+        str, typer.Option(help="Comma-separated names or files of the simulator.")
+    ] = "calm,px4_like",
+    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Flights of each, seeds 1 ...")] = 3,
+    vehicle: Annotated[str | None, typer.Option(help="A shipped vehicle, or a file.")] = None,
+    connect: Annotated[
+        str | None,
+        typer.Option(help="Fly whatever is there, one flight after the other, not the simulator."),
+    ] = None,
+    workers: Annotated[
+        int | None, typer.Option(min=1, max=256, help="Processes; one per processor by default.")
+    ] = None,
+    out_directory: Annotated[
+        Path | None, typer.Option("--out", help="Directory of all flights; a new one by default.")
+    ] = None,
+    assignments: Assignments = None,
+) -> None:
+    """Fly controllers x references x scenarios x seeds; one table with medians and ranges."""
+    from offboard.analysis.comparison import compare_all
+    from offboard.config import shipped
+    from offboard.flight import clock
+    from offboard.sortie import Order, fly_trial
+
+    known = sorted(path.stem for path in (shipped() / "controllers").glob("*.yaml"))
+    directory = out_directory or Path("flights") / f"compare-{clock.local_stamp()}"
+    order = Order(
+        directory=directory,
+        choices={"vehicle": vehicle} if vehicle else {},
+        assignments=tuple(assignments or ()),
+        connection=connect or DEFAULT_CONNECTION,
+        sitl=connect is None,
+    )
+    failed = compare_all(
+        partial(fly_trial, order),
+        controllers=_list(controllers, known),
+        references=_list(reference),
+        scenarios=_list(scenario) if connect is None else ["connected"],
+        seeds=range(1, seeds + 1),
+        directory=directory,
+        workers=workers if connect is None else 0,
+        console=out,
+    )
+    if failed:
+        raise Refusal(f"{failed} flights failed; the table says why", 4)
+
+
+@app.command(epilog=EXIT_HELP)
+def paper(
+    out_directory: Annotated[
+        Path | None, typer.Option("--out", help="Where page, tables and figures go.")
+    ] = None,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="Few seeds: seconds, not minutes.")
+    ] = False,
+    seeds: Annotated[int | None, typer.Option(help="Flights per row; 20 by default.")] = None,
+    initial_q: Annotated[
+        str | None, typer.Option(help="diag(Q) of Eq. 23, 1 or 12 comma-separated weights.")
+    ] = None,
+    figure: Annotated[list[str] | None, typer.Option(help="Only this figure, repeatable.")] = None,
+    table: Annotated[list[str] | None, typer.Option(help="Only this table, repeatable.")] = None,
+    workers: Annotated[
+        int | None, typer.Option(help="Processes; one per processor by default.")
+    ] = None,
+) -> None:
+    """Tables 2-4 and figures 4-17 of the paper, ours beside theirs, certified, on one page."""
+    from offboard.analysis.paper.options import PaperError, PaperOptions
+    from offboard.analysis.paper.run import reproduce
+    from offboard.flight import clock
+
+    try:
+        weights = None if initial_q is None else tuple(float(w) for w in initial_q.split(","))
+    except ValueError:
+        raise Refusal(f"--initial-q {initial_q}: 1 or 12 numbers with commas between") from None
+    options = PaperOptions(
+        out=out_directory or Path("flights") / f"paper-{clock.local_stamp()}",
+        quick=quick,
+        seeds=seeds,
+        initial_q=weights,
+        figures=tuple(figure or ()),
+        tables=tuple(table or ()),
+        workers=workers,
+    )
+    try:
+        outcome = reproduce(options, err)
+    except PaperError as error:
+        raise Refusal(error) from None
+    out.print(f"written: {outcome.page}", markup=False, soft_wrap=True)
+    if outcome.missing:
+        parts = "; ".join(f"{label}: {why}" for label, why in outcome.missing.items())
+        raise Refusal(f"missing: {parts}", 1)
+
+
+def _list(text: str, known: Sequence[str] = ()) -> list[str]:
+    """Comma-separated names; 'all' stands for every known one."""
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    if not parts:
+        raise Refusal("an empty list of names; give at least one")
+    return list(known) if parts == ["all"] and known else list(dict.fromkeys(parts))
+
+
 def _score(flight: Path, requirements: list, as_json: bool) -> list[str]:  # type: ignore[type-arg]
     """Score, write score.json beside a flight's log, print; return the missed requirements."""
-    from offboard.analysis import history, tlog
-    from offboard.analysis import score as scoring
-    from offboard.analysis.document import as_document
+    from offboard.analysis.document import as_text
     from offboard.analysis.table import show
+    from offboard.sortie import keep_score, score_flight
 
-    path = tlog.find(flight)
-    flown = history.gather(tlog.read(path))
-    result = scoring.score(flown)
-    text = json.dumps(as_document(result, flown), indent=2, allow_nan=False)
+    result, flown = score_flight(flight)
     if flight.is_dir():
-        (flight / "score.json").write_text(text + "\n", encoding="utf-8")
+        keep_score(flight, result, flown)
     if as_json:
-        sys.stdout.write(text + "\n")
+        sys.stdout.write(as_text(result, flown))
     else:
         show(out, result, flown)
     verdicts = [requirement.verdict(result.figures()) for requirement in requirements]

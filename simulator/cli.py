@@ -9,6 +9,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from simulator.firmware.base import Firmware
 from simulator.firmware.catalogue import FIRMWARES
 
 COMPANION_PORT, GROUND_PORT = 14540, 14550
@@ -42,6 +43,9 @@ def simulate(
     ] = None,
     vehicle: Annotated[
         str | None, typer.Option(help="Name or file; the firmware's SITL vehicle.")
+    ] = None,
+    param: Annotated[
+        list[str] | None, typer.Option(metavar="NAME=VALUE", help="Set a parameter of the vehicle.")
     ] = None,
     duration: Annotated[
         float | None, typer.Option(min=0.0, help="Stop after so many vehicle seconds.")
@@ -79,6 +83,7 @@ def simulate(
         _refuse(str(error))
 
     _announce_compilation()
+    parameters = _parameters(personality, param or [])
     from simulator.instance import VIRTUAL_EPOCH_US, Instance
     from simulator.run import Runner
 
@@ -93,6 +98,8 @@ def simulate(
         epoch_us=VIRTUAL_EPOCH_US if lockstep else unix_us(),
         faults=flown.faults,
     )
+    for name, value in parameters.items():
+        simulated.autopilot.parameters.set(name, value)
     purpose = "waiting at" if connect.startswith("udpin:") else "sending to"
     print(
         f"{firmware} vehicle {flyer.name}, system {instance + 1}, scenario {flown.name},"
@@ -107,6 +114,24 @@ def simulate(
     if outcome.sentence:
         _tell(outcome.sentence)
     raise typer.Exit(outcome.code)
+
+
+def _parameters(firmware: Firmware, assignments: list[str]) -> dict[str, float]:
+    """Values by name, each known and in range; else a sentence."""
+    known = {spec.name: spec for spec in firmware.parameters}
+    values: dict[str, float] = {}
+    for text in assignments:
+        name, _, number = text.partition("=")
+        if name not in known:
+            _refuse(f"--param {text}: {firmware.name} has no parameter {name}")
+        spec = known[name]
+        try:
+            values[name] = float(number)
+        except ValueError:
+            _refuse(f"--param {text}: give NAME=NUMBER")
+        if not spec.minimum <= values[name] <= spec.maximum:
+            _refuse(f"--param {text}: must be {spec.minimum:g} .. {spec.maximum:g}")
+    return values
 
 
 def _tell(sentence: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from typing import Any
 
@@ -19,6 +20,11 @@ def as_document(score: Score, history: History) -> dict[str, Any]:
         "messages": dict(sorted(history.messages.items())),
         "wall_s": history.wall_s,
     }
+
+
+def as_text(score: Score, history: History) -> str:
+    """The document as JSON text."""
+    return json.dumps(as_document(score, history), indent=2, allow_nan=False) + "\n"
 
 
 def _plain(value: float) -> float | None:

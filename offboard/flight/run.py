@@ -24,7 +24,7 @@ from offboard.flight.mission import Mission
 from offboard.flight.phases import Limits
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.flight.sitl import SimulatorProcess
-from offboard.mavlink.session import Session, SessionSettings
+from offboard.mavlink.session import DIALECTS, Session, SessionSettings
 from offboard.model.vehicle import Vehicle
 from offboard.reference.track import Track
 from offboard.reference.transfer import Hold
@@ -34,11 +34,18 @@ SITL_PATIENCE_S = 60.0  # a bundled simulator may compile first, on a machine th
 
 @dataclass(frozen=True, slots=True)
 class Bundled:
-    """The bundled simulator, in lockstep: `vehicle` None flies its default."""
+    """The bundled simulator, in lockstep; `scenario` and `vehicle` None are the firmware's own."""
 
-    scenario: str
+    scenario: str | None
     seed: int
     vehicle: str | None = None
+    firmware: str = "px4"
+
+    def parameters(self) -> dict[str, float]:
+        """What a user would set once on this autopilot to fly with us."""
+        dialect = DIALECTS.get(self.firmware)
+        watched = dialect.watched_parameters if dialect else ()
+        return {p.name: float(p.required_bits) for p in watched if p.required_bits}
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,8 +116,10 @@ def fly(
                 SimulatorProcess(
                     port=link.port,
                     seed=bundled.seed,
+                    firmware=bundled.firmware,
                     scenario=bundled.scenario,
                     vehicle=bundled.vehicle,
+                    parameters=bundled.parameters(),
                 )
             )
             # In lockstep the vehicle waits for us: silence only says that the machine is busy

@@ -8,9 +8,11 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from types import TracebackType
 
+OWN_VEHICLES = {"ardupilot": "arducopter"}  # flown by the simulator, so believed of it as well
 STOP_S = 2.0
 USAGE = 2  # the simulator's exit code for options and files that it cannot use
 
@@ -26,7 +28,16 @@ class Ending:
 class SimulatorProcess:
     """`python -m simulator` sending to a port of ours, in lockstep. A context manager."""
 
-    def __init__(self, *, port: int, seed: int, scenario: str, vehicle: str | None) -> None:
+    def __init__(
+        self,
+        *,
+        port: int,
+        seed: int,
+        firmware: str,
+        scenario: str | None,
+        vehicle: str | None,
+        parameters: Mapping[str, float],
+    ) -> None:
         self._command = [
             sys.executable,
             "-m",
@@ -38,9 +49,11 @@ class SimulatorProcess:
             "--lockstep",
             "--seed",
             str(seed),
-            "--scenario",
-            scenario,
+            "--firmware",
+            firmware,
+            *(("--scenario", scenario) if scenario else ()),
             *(("--vehicle", vehicle) if vehicle else ()),
+            *(f"--param={name}={value:g}" for name, value in parameters.items()),
         ]
 
     def __enter__(self) -> SimulatorProcess:

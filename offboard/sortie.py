@@ -1,0 +1,114 @@
+"""One configured flight, from names to a scored directory: what fly, compare and identify share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from offboard.analysis import history, tlog
+from offboard.analysis import score as scoring
+from offboard.analysis.compare import Result, Trial
+from offboard.analysis.document import as_text
+from offboard.analysis.history import History
+from offboard.analysis.score import Score
+from offboard.analysis.tlog import TlogError
+from offboard.config import FlightConfig, build_track, dump, load
+from offboard.control.catalogue import build
+from offboard.control.observer import Observer
+from offboard.flight import clock
+from offboard.flight.companion import Companion, Outcome
+from offboard.flight.link import LinkError
+from offboard.flight.log import FlightLog, LogError
+from offboard.flight.run import Bundled, Crew, fly
+from offboard.flight.sitl import OWN_VEHICLES
+from offboard.model.document import DocumentError
+
+
+@dataclass(frozen=True, slots=True)
+class Order:
+    """What to fly and where: `choices` replaces vehicle, controller or reference by name or file,
+    `bundled` None flies whatever is at `connection`."""
+
+    directory: Path
+    config: str = "flight"
+    choices: Mapping[str, str] = field(default_factory=dict)
+    assignments: tuple[str, ...] = ()
+    seed: int | None = None
+    connection: str = "udpin:127.0.0.1:14540"
+    sitl: bool = False  # on a bundled simulator: the next three are its own, None its default
+    firmware: str = "px4"
+    scenario: str | None = None
+    sim_vehicle: str | None = None
+
+    def resolve(self) -> FlightConfig:
+        """The validated configuration. Raises DocumentError."""
+        own = {"vehicle": OWN_VEHICLES[self.firmware]} if self.firmware in OWN_VEHICLES else {}
+        choices = {**(own if self.sitl else {}), **self.choices}
+        return load(self.config, choices=choices, assignments=self.assignments, seed=self.seed)
+
+
+def crew(config: FlightConfig) -> Crew:
+    """Everything that flies, built. Raises DocumentError where the reference cannot be flown."""
+    return Crew(
+        vehicle=config.vehicle,
+        controller=build(
+            config.controller, config.vehicle, config.period_s, config.seed, clock.monotonic_s
+        ),
+        make_observer=lambda: Observer(config.vehicle, config.observer),
+        track=build_track(config),
+        limits=config.limits,
+        period_s=config.period_s,
+        deadline_s=config.deadline_s,
+        learning=config.identify,
+    )
+
+
+def fly_order(
+    order: Order,
+    progress: Callable[[Companion], None] = lambda companion: None,
+    prepared: Callable[[float], None] = lambda seconds: None,
+) -> Outcome:
+    """Fly and log. Raises DocumentError, LinkError or LogError before anything is sent."""
+    config = order.resolve()
+    bundled = None
+    if order.sitl:
+        bundled = Bundled(order.scenario, config.seed, order.sim_vehicle, order.firmware)
+    return fly(
+        crew(config),
+        FlightLog(order.directory, dump(config)),
+        connection=order.connection,
+        bundled=bundled,
+        progress=progress,
+        prepared=prepared,
+    )
+
+
+def score_flight(flight: Path) -> tuple[Score, History]:
+    """Score FLIGHT, a directory or a .tlog, from its log alone. Raises TlogError."""
+    flown = history.gather(tlog.read(tlog.find(flight)))
+    return scoring.score(flown), flown
+
+
+def keep_score(directory: Path, score: Score, flown: History) -> None:
+    """Write score.json into a flight directory."""
+    (directory / "score.json").write_text(as_text(score, flown), encoding="utf-8")
+
+
+def fly_trial(order: Order, trial: Trial) -> Result:
+    """Fly one row of a comparison like `order`; a flight that cannot be flown is a result too."""
+    choices = {**order.choices, "controller": trial.controller, "reference": trial.reference}
+    ordered = replace(
+        order,
+        directory=trial.directory,
+        choices=choices,
+        scenario=trial.scenario,
+        seed=trial.seed,
+    )
+    try:
+        outcome = fly_order(ordered)
+        score, flown = score_flight(trial.directory)
+        keep_score(trial.directory, score, flown)
+    except (DocumentError, LinkError, LogError, TlogError) as error:
+        return Result(trial, 2, str(error), {})
+    return Result(trial, outcome.exit_code, outcome.sentence, score.figures())
