@@ -11,8 +11,10 @@ import contextlib
 import importlib.util
 import io
 import logging
+import os
+import tempfile
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -182,18 +184,33 @@ def _direct(problem: BoxQuadratic, evaluations: int, seed: int) -> Array:
 
 
 def _pyswarms(problem: BoxQuadratic, evaluations: int, seed: int) -> Array:
-    import pyswarms
+    with _no_log_file():
+        import pyswarms
 
     np.random.seed(seed)  # noqa: NPY002  # pyswarms draws from nothing else
     weights = SwarmSettings()
     scale = weights.damping  # Eq. 30: lambda on all three terms
-    swarm = pyswarms.single.GlobalBestPSO(
-        PARTICLES, 4, bounds=(problem.lower, problem.upper),
-        options={"w": scale * weights.inertia, "c1": scale * weights.personal,
-                 "c2": scale * weights.social},
-    )  # fmt: skip
+    with _no_log_file():
+        swarm = pyswarms.single.GlobalBestPSO(
+            PARTICLES, 4, bounds=(problem.lower, problem.upper),
+            options={"w": scale * weights.inertia, "c1": scale * weights.personal,
+                     "c2": scale * weights.social},
+        )  # fmt: skip
     _, best = swarm.optimize(problem, max(evaluations // PARTICLES, 1), verbose=False)
     return np.asarray(best)
+
+
+@contextlib.contextmanager
+def _no_log_file() -> Iterator[None]:
+    """pyswarms opens report.log in the working directory unless LOG_CFG names a configuration."""
+    with tempfile.NamedTemporaryFile("w", suffix=".yaml") as nothing:
+        nothing.write("{version: 1, disable_existing_loggers: false}")
+        nothing.flush()
+        os.environ["LOG_CFG"] = nothing.name
+        try:
+            yield
+        finally:
+            del os.environ["LOG_CFG"]
 
 
 def _cma(problem: BoxQuadratic, evaluations: int, seed: int) -> Array:
