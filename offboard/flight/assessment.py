@@ -16,11 +16,13 @@ from offboard.flight.mission import Mission
 from offboard.flight.phases import Limits, Phase
 from offboard.flight.readiness import Readiness
 from offboard.flight.view import VehicleView
+from offboard.mavlink.dialect import Takeoff
 from offboard.mavlink.session import Session
 from offboard.model.frames import thrust_direction_from_quaternion
 
 LIFT_OFF_HEIGHT_M = 0.15
 LIFT_OFF_CLIMB_MPS = 0.4
+TAKE_OVER_HEIGHT_M = 1.0  # of an autopilot's own takeoff
 MINIMUM_TELEMETRY_HZ = 10.0
 FAILSAFE_STATUS = 5  # MAV_STATE_CRITICAL; 6 is an emergency
 
@@ -80,6 +82,7 @@ class Assessment:
             in_the_air=view.in_the_air,
             lifted_off=course.phase is Phase.TAKEOFF and self._lifted_off(),
             at_start=course.phase is Phase.CLIMB and self._at_start(time_s),
+            lifted_by_command=self._lifted_by_command,
             excites=course.excites,
             learnt=course.learnt,
             track_time_s=mission.track_time_s(time_s),
@@ -145,11 +148,18 @@ class Assessment:
         down = thrust_direction_from_quaternion(np.array(self._view.attitude.attitude))[2]
         return math.acos(min(1.0, max(-1.0, float(down))))
 
+    @property
+    def _lifted_by_command(self) -> bool:
+        dialect = self._session.dialect
+        return dialect is not None and dialect.takeoff is Takeoff.COMMAND
+
     def _lifted_off(self) -> bool:
         position = self._view.position
         if position is None:
             return False
         height_m = self._mission.origin_ned_m[2] - position.position_ned_m[2]
+        if self._lifted_by_command:
+            return height_m > TAKE_OVER_HEIGHT_M
         return height_m > LIFT_OFF_HEIGHT_M or -position.velocity_ned_mps[2] > LIFT_OFF_CLIMB_MPS
 
     def position_error_m(self) -> float:

@@ -34,7 +34,7 @@ from offboard.flight.record import RECORD_ID, RECORD_NAME, TickRecord, reference
 from offboard.flight.setpoint import LEVEL, clamp, usable
 from offboard.flight.table import Row, next_row
 from offboard.flight.view import VehicleView
-from offboard.mavlink.dialect import Dialect
+from offboard.mavlink.dialect import TAKEOFF, Dialect, Takeoff
 from offboard.mavlink.events import Attitude, Event, LocalPosition, Reset
 from offboard.mavlink.outgoing import (
     AttitudeTarget,
@@ -52,6 +52,7 @@ WARNING, INFO = 4, 6  # MAV_SEVERITY
 ASK_AGAIN_S = 1.0  # between repetitions of a command the vehicle has not obeyed
 SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
 SPOOL_MAX = 1.6
+TAKEOFF_HEIGHT_M = 3.0  # asked of an autopilot that takes off by itself; we take over on the way
 LAND_STREAM_S = 3.0  # a refused landing ends in silence: the autopilot's own failsafe lands
 BRIDGED_SHARE = 0.3  # of the longest silence, after which level setpoints bridge it
 
@@ -255,6 +256,8 @@ class Companion:
         if in_the_air:  # nobody saw the take-off: below us, at the height of the local origin
             self._mission.settle((north, east, 0.0))
         self._observer.freeze(False)
+        if self._learner and isinstance(self._controller, Adopting):
+            self._controller.adopt(self._vehicle, self._learner.cautious_bandwidth_radps)
         self._mission.lift_off(
             self.view.time_s, np.array([north, east, down]), velocity, self._course_rad()
         )
@@ -265,6 +268,8 @@ class Companion:
         if self.phase in BEFORE_FLIGHT:
             self._observer.freeze(True)
             self._prepare(time_s)
+        elif self.phase is Phase.TAKEOFF and self._lifted_by_command:
+            self._watch_takeoff(time_s)
         elif self.phase is Phase.TAKEOFF:
             spool = min(SPOOL_MAX, SPOOL_UP_PER_S * self._in_phase_s())
             thrust_mps2 = spool * self._vehicle.gravity_mps2
@@ -286,12 +291,26 @@ class Companion:
             self._ask(CommandLong.arm(), time_s)
         # On the ground without thrust; in the air with what takes over from the autopilot
         flying = self.view.armed and self.view.in_the_air
+        if self._lifted_by_command and not flying:
+            return
         thrust_mps2 = self._hover_mps2() if flying else 0.0
         self._emit(time_s, Command(thrust_mps2, LEVEL, self._course_rad()))
 
+    def _watch_takeoff(self, time_s: float) -> None:
+        """The autopilot lifts off; a setpoint without thrust would cancel that, so none is sent.
+
+        Its thrust is about what hovers, which the observer must know to take over from it.
+        """
+        if TAKEOFF not in self.view.accepted:
+            self._ask(self._dialect.take_off(TAKEOFF_HEIGHT_M), time_s)
+        self._command = Command(self._vehicle.gravity_mps2, LEVEL, self._course_rad())
+        self._observer.on_command(time_s, self._command)
+
     def _hold(self, time_s: float) -> None:
         """What a phase does that needs no state: level, and the request that ends the flight."""
-        if self.phase is Phase.TAKEOFF or self.phase in TRACKING:
+        if self._lifted_by_command and self._mission.reference is None:
+            self._hold_on_the_ground(time_s)
+        elif self.phase is Phase.TAKEOFF or self.phase in TRACKING:
             self._emit(time_s, self._level())
         elif self.phase is Phase.LAND:
             if self.view.mode != self._dialect.land_mode:
@@ -302,6 +321,13 @@ class Companion:
         elif self.phase is Phase.STAND_DOWN:
             self._ask(CommandLong.disarm(), time_s)
             self._emit(time_s, Command(0.0, LEVEL, self._command.course_rad))
+
+    def _hold_on_the_ground(self, time_s: float) -> None:
+        """Without setpoints: not ours to fly before the autopilot's takeoff is taken over."""
+        if self.phase is Phase.LAND and self.view.mode != self._dialect.land_mode:
+            self._ask(self._dialect.land(), time_s)
+        elif self.phase is Phase.STAND_DOWN:
+            self._ask(CommandLong.disarm(), time_s)
 
     def _bridge_silence(self) -> None:
         """Telemetry stopped: go on without, each period of wall time, until the table ends it."""
@@ -323,7 +349,9 @@ class Companion:
             self._emit(time_s, self._level())
             return
         self._missed_decisions = 0
-        self._emit(time_s, clamp(self._excited(decision.command, time_s), self._vehicle))
+        body_z_down = float(state.thrust_direction_ned[2])
+        command = clamp(self._excited(decision.command, time_s), self._vehicle)
+        self._emit(time_s, command, body_z_down)
         self._record(time_s, state, decision, arrived_s)
         self._learn(time_s)
 
@@ -378,6 +406,11 @@ class Companion:
         return float(course_from_quaternion(np.array(self.view.attitude.attitude)))
 
     @property
+    def _lifted_by_command(self) -> bool:
+        dialect = self._session.dialect
+        return dialect is not None and dialect.takeoff is Takeoff.COMMAND
+
+    @property
     def _dialect(self) -> Dialect:
         assert self._session.dialect is not None
         return self._session.dialect
@@ -390,8 +423,8 @@ class Companion:
             self._asked_s = time_s
             self._send(request)
 
-    def _emit(self, time_s: float, command: Command) -> None:
-        """The one place that emits a setpoint."""
+    def _emit(self, time_s: float, command: Command, body_z_down: float | None = None) -> None:
+        """The one place that emits a setpoint. `body_z_down`: of the body, when it acts."""
         self._command = command
         self._observer.on_command(time_s, command)
         if self._learner:
@@ -404,6 +437,7 @@ class Companion:
                 course_rad=command.course_rad,
                 hover_thrust=self._vehicle.hover_thrust,
                 gravity_mps2=self._vehicle.gravity_mps2,
+                body_z_down=body_z_down,
             )
         )
 

@@ -36,6 +36,7 @@ class Picture:
     tilt_rad: float
     stop_requested: bool
     missed_decisions: int  # one after the other
+    lifted_by_command: bool = False  # the autopilot takes off by itself, without setpoints
     excites: bool = False  # steps are wanted before the reference is joined
     learnt: bool = False  # what they showed is taken over
 
@@ -61,6 +62,10 @@ def rebooted(now: Picture) -> bool:
 
 def streamed(now: Picture) -> bool:
     return now.in_phase_s >= now.limits.stream_s
+
+
+def needs_no_stream(now: Picture) -> bool:
+    return now.lifted_by_command
 
 
 def engaged(now: Picture) -> bool:

@@ -88,6 +88,7 @@ TABLE: tuple[Row, ...] = (
     Row(Phase.HEALTH, guards.ready, Phase.STREAM, "telemetry flows and the vehicle can arm"),
     _too_long(Phase.HEALTH, "health_s", Phase.FAILED, "not ready: {unready}", REFUSED),
     *_streaming_rows(Phase.STREAM),
+    Row(Phase.STREAM, guards.needs_no_stream, Phase.ENGAGE, "the autopilot takes off by itself"),
     Row(Phase.STREAM, guards.streamed, Phase.ENGAGE, "setpoints stream"),
     *_streaming_rows(Phase.ENGAGE),
     Row(Phase.ENGAGE, guards.engaged_in_the_air, Phase.CLIMB, "{mode} in the air"),

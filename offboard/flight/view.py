@@ -37,6 +37,7 @@ class VehicleView:
     parameters: dict[str, float] = field(default_factory=dict)
     said: deque[str] = field(default_factory=lambda: deque(maxlen=HEARD))
     refused: deque[str] = field(default_factory=lambda: deque(maxlen=HEARD))
+    accepted: set[int] = field(default_factory=set)  # commands
 
     @property
     def time_s(self) -> float:
@@ -95,9 +96,10 @@ class VehicleView:
                 self.parameters[name] = value
             case StatusText(severity, text) if severity <= 4:
                 self.said.append(text)
-            case CommandAck(command, result) if command != SET_MESSAGE_INTERVAL and result not in (
-                "ACCEPTED",
-                "IN_PROGRESS",
+            case CommandAck(command, "ACCEPTED"):
+                self.accepted.add(command)
+            case CommandAck(command, result) if (
+                command != SET_MESSAGE_INTERVAL and result != "IN_PROGRESS"
             ):
                 self.refused.append(f"command {command} {result}")
             case Reset():
@@ -118,3 +120,4 @@ class VehicleView:
         """What was said up to now explains nothing that happens from now on."""
         self.said.clear()
         self.refused.clear()
+        self.accepted.clear()

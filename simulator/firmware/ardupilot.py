@@ -77,6 +77,7 @@ def _critical(text: str) -> Say:
 _FAILED = Result.FAILED
 _NO_POSITION = Say(Severity.WARNING, "Mode change to {mode} failed: requires position")
 _NEED_POSITION = _critical("Arm: Need Position Estimate")
+_HEARTBEAT = ("HEARTBEAT",)
 _ORIGIN_AND_HOME = ("GPS_GLOBAL_ORIGIN", "HOME_POSITION")
 _ARMING = Rule("arm", do=("arm",), say=_info("Arming motors"), send=_ORIGIN_AND_HOME)
 _DISARMING = _info("Disarming motors")
@@ -130,15 +131,16 @@ RULES = (
         say=_info("EKF3 IMU0 is using GPS"),
         also=(_info("EKF3 IMU1 is using GPS"),),
     ),
-    Rule("mode", when=("not armed",), to="requested"),
-    Rule("mode", when=("not position missing",), to="requested"),
+    # A change of mode is shown by a heartbeat at once
+    Rule("mode", when=("not armed",), to="requested", send=_HEARTBEAT),
+    Rule("mode", when=("not position missing",), to="requested", send=_HEARTBEAT),
     Rule("mode", result=_FAILED, say=_NO_POSITION),
     Rule("takeoff", "GUIDED", when=("armed", "landed", "climb asked"), do=("take off",)),
     Rule("takeoff", "GUIDED", when=("armed", "climbing", "climb asked"), do=("take off",)),
     Rule("takeoff", result=_FAILED),
     Rule("climbed", "GUIDED", do=("hold",)),
-    Rule("land", to="LAND"),
-    Rule("return", when=("reached position",), to="RTL"),
+    Rule("land", to="LAND", send=_HEARTBEAT),
+    Rule("return", when=("reached position",), to="RTL", send=_HEARTBEAT),
     Rule("return", result=_FAILED, say=_critical("Mode change to RTL failed: requires position")),
     Rule("arm", when=("armed",)),
     Rule(

@@ -51,6 +51,7 @@ EVENTS: dict[str, dict[str, object]] = {  # the least that makes each guard hold
     "ready": {"ready": True},
     "misconfigured": {"misconfigured": True},
     "rebooted": {"rebooted": True},
+    "needs_no_stream": {"lifted_by_command": True},
     "streamed": {"in_phase_s": 1.0},
     "engaged": {"engaged": True},
     "engaged_in_the_air": {"engaged": True, "armed": True, "in_the_air": True},

@@ -69,7 +69,7 @@ def test_every_parameter_asked_for_is_the_same(talks: tuple[Talk, Talk]) -> None
 
 
 def test_heartbeats_go_through_the_same_states(talks: tuple[Talk, Talk]) -> None:
-    """The real one sends a heartbeat at once when its mode changes, ours waits for the next."""
+    """At once when the mode changes, else with the next of the second."""
     real, ours = talks
     theirs = dict(zip(real.states, real.state_times_s, strict=True))
     mine = dict(zip(ours.states, ours.state_times_s, strict=True))
