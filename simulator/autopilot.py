@@ -200,18 +200,17 @@ class Autopilot:
     def look(self) -> Nav:
         """The estimate now, and whether the feet touch the ground."""
         if self._nav is None:
-            estimate = self.plant.estimate
-            w, x, y, z = estimate.attitude.tolist()
-            north, east, down = estimate.position_ned_m.tolist()
-            v_north, v_east, v_down = estimate.velocity_ned_mps.tolist()
-            p, q, r = estimate.rates_frd_radps.tolist()
+            plant = self.plant
+            (north, east, down, v_north, v_east, v_down, w, x, y, z, p, q, r) = (
+                plant.report().tolist()
+            )
             self._nav = Nav(
                 (north, east, down),
                 (v_north, v_east, v_down),
                 (w, x, y, z),
                 (p, q, r),
-                self.truth.on_ground,
-                estimate.reset_counter,
+                plant.on_ground,
+                plant.reset_counter,
             )
         return self._nav
 

@@ -15,6 +15,7 @@ from simulator.firmware.catalogue import FIRMWARES
 COMPANION_PORT, GROUND_PORT = 14540, 14550
 LOCAL_COMPANION_PORT, LOCAL_GROUND_PORT = 14580, 18570  # PX4's
 NO_LINK = "none"
+SYSTEM_MAX = 250
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
@@ -53,11 +54,19 @@ def simulate(
     instance: Annotated[
         int, typer.Option(min=0, max=249, help="Shifts ports and the system id, as PX4's.")
     ] = 0,
+    instances: Annotated[
+        int, typer.Option(min=1, max=100, help="So many vehicles, numbered from --instance on.")
+    ] = 1,
     patience: Annotated[
         float, typer.Option(min=0.1, max=600.0, help="Seconds to wait for a silent companion.")
     ] = 5.0,
+    list_scenarios: Annotated[
+        bool, typer.Option("--list-scenarios", help="Name and describe the scenarios, and stop.")
+    ] = False,
 ) -> None:
-    """Fly one simulated vehicle that speaks MAVLink like a real autopilot."""
+    """Fly simulated vehicles that speak MAVLink like a real autopilot; each option for each."""
+    if list_scenarios:
+        _list_scenarios()
     personality = FIRMWARES.get(firmware)
     if personality is None:
         _refuse(f"--firmware {firmware}: unknown; there is {', '.join(FIRMWARES)}")
@@ -65,55 +74,85 @@ def simulate(
         _refuse("--speed and --lockstep exclude each other: lockstep has no speed")
     if speed is not None and not 0.1 <= speed <= 1000.0:
         _refuse(f"--speed {speed:g}: must be 0.1 .. 1000")
+    if lockstep and instances > 1:
+        _refuse("--lockstep and --instances exclude each other: time waits for one companion")
+    if instance + instances > SYSTEM_MAX:
+        _refuse(f"--instance {instance} --instances {instances}: system ids end at {SYSTEM_MAX}")
     stopping = Stop()
 
     # late, so that a wrong option is answered at once
     from offboard.flight.clock import unix_us
     from offboard.model.document import DocumentError
     from simulator import config
-    from simulator.udp import LinkError, open_link
+    from simulator.udp import LinkError, open_link, shifted
 
     connect = connect or f"udpout:127.0.0.1:{COMPANION_PORT + instance}"
+    numbers = range(instance, instance + instances)
     try:
         flown = config.scenario(scenario or personality.scenario)
         flyer = config.vehicle(vehicle or personality.vehicle)
-        companion = open_link(connect, LOCAL_COMPANION_PORT + instance)
-        ground = None if gcs == NO_LINK else open_link(gcs, LOCAL_GROUND_PORT + instance)
+        companions = [
+            open_link(shifted(connect, number - instance), LOCAL_COMPANION_PORT + number)
+            for number in numbers
+        ]
+        grounds = [
+            None if gcs == NO_LINK else open_link(gcs, LOCAL_GROUND_PORT + number)
+            for number in numbers
+        ]
     except (DocumentError, LinkError) as error:
         _refuse(str(error))
 
     _announce_compilation()
     parameters = _parameters(personality, param or [])
     from simulator.instance import VIRTUAL_EPOCH_US, Instance
-    from simulator.run import Runner
+    from simulator.run import Berth, Runner
 
-    simulated = Instance(
-        personality,
-        flyer,
-        flown.conditions,
-        seed,
-        system=instance + 1,
-        lockstep=lockstep,
-        ground_link=ground is not None,
-        epoch_us=VIRTUAL_EPOCH_US if lockstep else unix_us(),
-        faults=flown.faults,
-    )
-    for name, value in parameters.items():
-        simulated.autopilot.parameters.set(name, value)
+    epoch_us = VIRTUAL_EPOCH_US if lockstep else unix_us()
+    berths = [
+        Berth(
+            Instance(
+                personality,
+                flyer,
+                flown.conditions,
+                seed + number - instance,
+                system=number + 1,
+                lockstep=lockstep,
+                ground_link=ground is not None,
+                epoch_us=epoch_us,
+                faults=flown.faults,
+            ),
+            companion,
+            ground,
+        )
+        for number, companion, ground in zip(numbers, companions, grounds, strict=True)
+    ]
+    for berth in berths:
+        for name, value in parameters.items():
+            berth.instance.autopilot.parameters.set(name, value)
     purpose = "waiting at" if connect.startswith("udpin:") else "sending to"
-    print(
-        f"{firmware} vehicle {flyer.name}, system {instance + 1}, scenario {flown.name},"
-        f" seed {seed}: {purpose} {connect.partition(':')[2]}",
-        flush=True,
-    )
+    for number in numbers:
+        place = shifted(connect, number - instance).partition(":")[2]
+        print(
+            f"{firmware} vehicle {flyer.name}, system {number + 1}, scenario {flown.name},"
+            f" seed {seed + number - instance}: {purpose} {place}",
+            flush=True,
+        )
     stopping.running = True
-    runner = Runner(
-        simulated, companion, ground, stopping=stopping, tell=_tell, duration_s=duration
-    )
+    runner = Runner(berths, stopping=stopping, tell=_tell, duration_s=duration)
     outcome = runner.lockstep(patience) if lockstep else runner.real_time(speed or 1.0)
     if outcome.sentence:
         _tell(outcome.sentence)
+    if instances > 1:
+        print(f"{instances} vehicles: {runner.punctuality}", flush=True)
     raise typer.Exit(outcome.code)
+
+
+def _list_scenarios() -> NoReturn:
+    from simulator import config
+
+    for name in config.shipped_names("scenarios"):
+        print(f"{name:18s} {config.scenario(name).description}")
+    raise typer.Exit(0)
 
 
 def _parameters(firmware: Firmware, assignments: list[str]) -> dict[str, float]:

@@ -229,9 +229,31 @@ class Plant:
             battery=self._airframe.battery_state(self._rotor),
         )
 
+    def motion(self) -> list[float]:
+        """The truth as plain numbers: attitude wxyz, rates FRD, then NED velocity, position,
+        acceleration."""
+        return [*self._body.tolist(), *self._rotor[ACCELERATION].tolist()]
+
+    @property
+    def on_ground(self) -> bool:
+        """Whether the ground carries the vehicle."""
+        return bool(self._rotor[CONTACT])
+
+    @property
+    def reset_counter(self) -> int:
+        """How often the estimate was reset, 0 .. 255."""
+        return self._reset_counter
+
     @property
     def estimate(self) -> Estimate:
         """What the autopilot reports now; the same however often it is asked within a step."""
+        out = self.report()
+        return Estimate(
+            out[POSITION], out[VELOCITY], out[ATTITUDE], out[RATES], self._reset_counter
+        )
+
+    def report(self) -> Array:
+        """The estimate in one array (REPORT_WIDTH,), laid out as `simulator.sensors` says."""
         out = np.empty(REPORT_WIDTH)
         report(
             self._body,
@@ -246,9 +268,7 @@ class Plant:
             self._step,
             out,
         )
-        return Estimate(
-            out[POSITION], out[VELOCITY], out[ATTITUDE], out[RATES], self._reset_counter
-        )
+        return out
 
 
 @numba.njit(cache=True)

@@ -1,4 +1,4 @@
-"""An instance in time and on sockets: real time, any speed, or lockstep with its companion.
+"""Instances in time and on sockets: real time, any speed, or lockstep with a companion.
 
 Lockstep is MAVLink's own: at each barrier the simulator sends a TIMESYNC request after the
 telemetry and waits for the answer. The companion answers in the order in which it reads, so by
@@ -9,7 +9,7 @@ Input is read at barriers only, hence a flight is a function of its seed.
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from offboard.flight.clock import monotonic_s
@@ -33,66 +33,112 @@ class Outcome:
     sentence: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Berth:
+    """One instance and its sockets."""
+
+    instance: Instance
+    companion: UdpLink
+    ground: UdpLink | None = None
+
+    @property
+    def links(self) -> list[UdpLink]:
+        return [self.companion] if self.ground is None else [self.companion, self.ground]
+
+    def send(self) -> None:
+        """Send what both links have queued."""
+        self.companion.send(self.instance.drain())
+        self.send_ground()
+
+    def send_ground(self) -> None:
+        datagrams = self.instance.ground.drain()
+        if self.ground is not None:
+            self.ground.send(datagrams)
+
+    def send_barrier(self) -> tuple[int, list[bytes]]:
+        """Send everything and the question for the time; return its stamp and the datagrams."""
+        stamp_ns, datagrams = self.instance.barrier()
+        self.companion.send(datagrams)
+        self.send_ground()
+        return stamp_ns, datagrams
+
+    def read(self) -> bool:
+        """Handle what has arrived; whether the companion sent anything."""
+        spoken = False
+        while (datagram := self.companion.receive()) is not None:
+            self.instance.feed(datagram)
+            spoken = True
+        self.read_ground()
+        return spoken
+
+    def read_ground(self) -> None:
+        while self.ground is not None and (datagram := self.ground.receive()) is not None:
+            self.instance.feed_ground(datagram)
+
+
+@dataclass(slots=True)
+class Punctuality:
+    """Of a run in real time: steps, and how late they ended. Missed: later than the next one."""
+
+    steps: int = 0
+    missed: int = 0
+    worst_s: float = 0.0
+
+    def note(self, late_s: float, allowed_s: float) -> None:
+        self.steps += 1
+        self.missed += late_s > allowed_s
+        self.worst_s = max(self.worst_s, late_s)
+
+    def __str__(self) -> str:
+        return (
+            f"{self.missed} of {self.steps} deadlines missed,"
+            f" at worst {1e3 * self.worst_s:.1f} ms late"
+        )
+
+
 class Runner:
-    """One instance and its sockets. `stopping` is asked often; `tell` gets sentences."""
+    """Instances and their sockets in one time; lockstep is for one. `stopping` is asked often."""
 
     def __init__(
         self,
-        instance: Instance,
-        companion: UdpLink,
-        ground: UdpLink | None,
+        berths: Sequence[Berth],
         *,
         stopping: Callable[[], bool],
         tell: Callable[[str], None],
         duration_s: float | None = None,
     ) -> None:
-        self._instance = instance
-        self._companion = companion
-        self._ground = ground
-        self._links = [companion] if ground is None else [companion, ground]
+        self._berths = berths
+        self._berth = berths[0]
+        self._instance = self._berth.instance
+        self._companion = self._berth.companion
+        self._owner = {link: berth for berth in berths for link in berth.links}
+        self._links = list(self._owner)
         self._stopping = stopping
         self._tell = tell
         self._duration_s = duration_s
+        self.punctuality = Punctuality()
 
     def _over(self) -> bool:
         expired = self._duration_s is not None and self._instance.time_s >= self._duration_s
         return expired or self._stopping()
-
-    def _send(self) -> None:
-        """Send what both links have queued."""
-        self._companion.send(self._instance.drain())
-        self._send_ground()
-
-    def _send_barrier(self) -> tuple[int, list[bytes]]:
-        """Send everything and the question for the time; return its stamp and the datagrams."""
-        stamp_ns, datagrams = self._instance.barrier()
-        self._companion.send(datagrams)
-        self._send_ground()
-        return stamp_ns, datagrams
-
-    def _send_ground(self) -> None:
-        datagrams = self._instance.ground.drain()
-        if self._ground is not None:
-            self._ground.send(datagrams)
-
-    def _read_ground(self) -> None:
-        while self._ground is not None and (datagram := self._ground.receive()) is not None:
-            self._instance.feed_ground(datagram)
 
     # -- real time ---------------------------------------------------------------------------
 
     def real_time(self, speed: float) -> Outcome:
         """`speed` x real time, by absolute deadlines; answers go out as soon as they are due."""
         instance = self._instance
+        self._stagger()
         gc.collect()
         gc.freeze()
         epoch_s = monotonic_s() - instance.time_s / speed
         while not self._over():
             deadline_s = epoch_s + (instance.time_s + STEP_S) / speed
             self._serve_until(deadline_s)
-            instance.advance()
-            self._send()
+            for berth in self._berths:
+                berth.instance.advance()
+                berth.send()
             behind_s = monotonic_s() - deadline_s
+            self.punctuality.note(behind_s, STEP_S / speed)
             if behind_s > BEHIND_S:  # suspended or overloaded: go on from here, do not race
                 self._tell(
                     f"{behind_s:.1f} s behind at {instance.time_s:.1f} s: going on from here"
@@ -100,20 +146,23 @@ class Runner:
                 epoch_s += behind_s
         return Outcome(0)
 
+    def _stagger(self) -> None:
+        """Start each vehicle a step after the next, so that their streams do not fall together."""
+        for ahead, berth in enumerate(self._berths):
+            for _ in range(ahead):
+                berth.instance.advance()
+                berth.send()
+
     def _serve_until(self, deadline_s: float) -> None:
         """Handle what arrives before the deadline; once in any case."""
         while True:
             remaining_s = deadline_s - monotonic_s()
-            wait(self._links, min(remaining_s, POLL_S))
-            answered = False
-            while (datagram := self._companion.receive()) is not None:
-                self._instance.feed(datagram)
-                answered = True
-            self._read_ground()
-            if answered:
-                self._send()
-            else:
-                self._send_ground()
+            ready = wait(self._links, min(remaining_s, POLL_S))
+            for berth in dict.fromkeys(self._owner[link] for link in ready):
+                if berth.read():
+                    berth.send()
+                else:
+                    berth.send_ground()
             if remaining_s <= 0 or self._stopping():
                 return
 
@@ -127,8 +176,8 @@ class Runner:
             self._instance.advance()
             if not self._instance.barrier_due():
                 continue
-            stamp_ns, datagrams = self._send_barrier()
-            self._read_ground()
+            stamp_ns, datagrams = self._berth.send_barrier()
+            self._berth.read_ground()
             if self._answered(stamp_ns, datagrams, patience_s) or self._stopping():
                 continue
             if self._instance.companion.answered_ns < 0:
@@ -172,10 +221,10 @@ class Runner:
             instance.advance()
             if not instance.barrier_due():
                 continue
-            self._send_barrier()
+            self._berth.send_barrier()
             while (datagram := self._companion.receive()) is not None:
                 instance.feed(datagram)
-            self._read_ground()
+            self._berth.read_ground()
             if instance.companion.answered_ns != known_ns:
                 self._tell(f"the companion is back at {instance.time_s:.2f} s")
                 return True

@@ -85,6 +85,8 @@ class Server:
 
     def drain(self) -> list[bytes]:
         """Everything queued, as datagrams of whole frames."""
+        if not self._out:
+            return []
         datagrams: list[bytes] = []
         size, start = 0, 0
         for i, queued in enumerate(self._out):
@@ -108,12 +110,16 @@ class Server:
             return
         autopilot = self.view.autopilot
         on_grid = autopilot.steps % autopilot.firmware.position_grid_steps == 0
+        next_us = 1 << 62
+        silent, withheld = self.view.silent, autopilot.firmware.withheld_until
         for name, stream in self._streams.items():
             if stream.due_us <= now_us and (on_grid or name not in ON_POSITION_GRID):
-                if name not in self.view.silent and not self.withheld(name):
+                if name not in silent and not (name in withheld and self.withheld(name)):
                     self.send_now(name)
-                stream.due_us = _next_multiple(now_us, stream)
-        self._next_us = min((s.due_us for s in self._streams.values()), default=1 << 62)
+                stream.due_us = (now_us // stream.interval_us + 1) * stream.interval_us
+            if stream.due_us < next_us:
+                next_us = stream.due_us
+        self._next_us = next_us
 
     def withheld(self, name: str) -> bool:
         """What the vehicle cannot say yet, whatever rate it granted."""

@@ -11,13 +11,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
-from offboard.model.frames import rotation_from_quaternion
 from simulator.autopilot import Autopilot
 from simulator.codec import layout
-from simulator.firmware.base import MotionSetpoint, Triple
+from simulator.firmware.base import MotionSetpoint, Quaternion, Triple
 from simulator.position_loop import GRAVITY_MPS2
 
 EARTH_RADIUS_M = 6_371_000.0
+_DEGREES_PER_M = math.degrees(1.0 / EARTH_RADIUS_M)
 ON_POSITION_GRID = frozenset(
     {"LOCAL_POSITION_NED", "ODOMETRY", "GLOBAL_POSITION_INT", "HIL_STATE_QUATERNION"}
 )
@@ -57,9 +57,11 @@ class View:
     stuck: dict[str, Stuck] = field(default_factory=dict)
     builders: dict[str, Callable[[View], Sequence[Any]]] = field(init=False)
     _at_step: int = -1
+    _east_degrees_per_m: float = field(init=False)
 
     def __post_init__(self) -> None:
         firmware = self.autopilot.firmware
+        self._east_degrees_per_m = _DEGREES_PER_M / math.cos(math.radians(firmware.origin[0]))
         known = {n: b for n, b in BUILDERS.items() if n not in firmware.unknown_messages}
         self.builders = {**known, **firmware.own_messages}
 
@@ -94,8 +96,8 @@ class View:
     def geodetic(self, north_m: float, east_m: float) -> tuple[int, int]:
         """Latitude and longitude in 1e-7 deg of a point near the origin (spherical Earth)."""
         latitude, longitude, _ = self.autopilot.firmware.origin
-        north_deg = math.degrees(north_m / EARTH_RADIUS_M)
-        east_deg = math.degrees(east_m / (EARTH_RADIUS_M * math.cos(math.radians(latitude))))
+        north_deg = north_m * _DEGREES_PER_M
+        east_deg = east_m * self._east_degrees_per_m
         return _fit((latitude + north_deg) * 1e7, 32), _fit((longitude + east_deg) * 1e7, 32)
 
     def altitude_mm(self, down_m: float) -> int:
@@ -103,11 +105,18 @@ class View:
         return _fit((self.autopilot.firmware.origin[2] - down_m) * 1e3, 32)
 
 
+_RANGES = {
+    (bits, signed): (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+    for bits in (8, 16, 32)
+    for signed in (False, True)
+}
+
+
 def _fit(value: float, bits: int, *, signed: bool = True) -> int:
     """Nearest integer that a field of `bits` holds; what is not finite becomes 0."""
-    if not math.isfinite(value):
+    if value - value != 0.0:  # infinite or not a number
         return 0
-    low, high = (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+    low, high = _RANGES[bits, signed]
     return min(high, max(low, round(value)))
 
 
@@ -117,6 +126,19 @@ def _centi(velocity: Triple) -> tuple[int, int, int]:
 
 def _heading_cdeg(yaw_rad: float) -> int:
     return round(math.degrees(yaw_rad) * 100) % 36000
+
+
+def _in_body(attitude: Quaternion, vector_ned: Triple) -> Triple:
+    """An NED vector in body axes: v + 2 r x (r x v - w v) with the quaternion (w, r)."""
+    w, x, y, z = attitude
+    north, east, down = vector_ned
+    a, b, c = y * down - z * east, z * north - x * down, x * east - y * north
+    a, b, c = a - w * north, b - w * east, c - w * down
+    return (
+        north + 2.0 * (y * c - z * b),
+        east + 2.0 * (z * a - x * c),
+        down + 2.0 * (x * b - y * a),
+    )
 
 
 def heartbeat(view: View) -> Sequence[Any]:
@@ -191,11 +213,10 @@ def altitude(view: View) -> Sequence[Any]:
 
 def highres_imu(view: View) -> Sequence[Any]:
     """Specific force of the truth in body axes, rates as estimated."""
-    truth, nav = view.autopilot.truth, view.autopilot.look()
-    force_ned = truth.acceleration_ned_mps2.copy()
-    force_ned[2] -= GRAVITY_MPS2
-    force = (rotation_from_quaternion(truth.attitude).T @ force_ned).tolist()
-    height = -float(truth.position_ned_m[2]) + view.autopilot.firmware.origin[2]
+    nav = view.autopilot.look()
+    w, x, y, z, *_, down, a_north, a_east, a_down = view.autopilot.plant.motion()
+    force = _in_body((w, x, y, z), (a_north, a_east, a_down - GRAVITY_MPS2))
+    height = view.autopilot.firmware.origin[2] - down
     pressure_hpa = 1013.25 * (1.0 - 2.25577e-5 * height) ** 5.25588
     return (
         view.time_us,

@@ -67,9 +67,9 @@ class UdpLink:
         self._socket.close()
 
 
-def wait(links: Sequence[UdpLink], timeout_s: float) -> None:
-    """Return when a datagram waits at one of the links, at the latest after `timeout_s`."""
-    select.select(links, [], [], max(0.0, timeout_s))
+def wait(links: Sequence[UdpLink], timeout_s: float) -> list[UdpLink]:
+    """The links at which a datagram waits, as soon as there is one, at the latest `timeout_s`."""
+    return select.select(links, [], [], max(0.0, timeout_s))[0]
 
 
 def open_link(url: str, preferred_port: int) -> UdpLink:
@@ -94,6 +94,12 @@ def open_link(url: str, preferred_port: int) -> UdpLink:
         sock.close()
         raise LinkError(f"{url} cannot be opened: {error.strerror or error}") from None
     return UdpLink(sock, address)
+
+
+def shifted(url: str, by: int) -> str:
+    """The same link `by` ports further on. Raises LinkError with a sentence."""
+    kind, host, port = _split(url)
+    return f"{kind}:{host}:{port + by}"
 
 
 def _split(url: str) -> tuple[str, str, int]:

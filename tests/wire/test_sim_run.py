@@ -13,7 +13,7 @@ from simulator import run
 from simulator.conditions import Conditions
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
-from simulator.run import Outcome, Runner
+from simulator.run import Berth, Outcome, Runner
 from simulator.udp import LinkError, UdpLink, open_link
 
 
@@ -34,7 +34,7 @@ def link(companion: socket.socket) -> Iterator[UdpLink]:
 
 def runner(link: UdpLink, told: list[str]) -> Runner:
     instance = Instance(PX4, px4_vehicle(), Conditions(), 1, lockstep=True)
-    return Runner(instance, link, None, stopping=lambda: False, tell=told.append)
+    return Runner([Berth(instance, link)], stopping=lambda: False, tell=told.append)
 
 
 def test_without_a_companion_it_gives_up(link: UdpLink, monkeypatch: pytest.MonkeyPatch) -> None:
