@@ -26,7 +26,7 @@ from offboard.model.vehicle import AxisResponse, Parameters, Vehicle
 
 RECORD_NAME, RECORD_ID = "identified", 2  # of the DEBUG_FLOAT_ARRAY in the log
 LIFTED_OFF_S = 0.5  # the ground's effect on the thrust ends
-DRAG_FIRST_S, DRAG_EVERY_S, DRAG_OVER_S = 3.0, 1.0, 25.0
+DRAG_FIRST_S, DRAG_EVERY_S, DRAG_OVER_S = 3.0, 0.5, 25.0
 DRAG_NEWS_PS = 0.03  # a smaller change is not worth a word
 MOVING = (Phase.JOIN, Phase.TRACK)
 
@@ -39,6 +39,8 @@ class IdentifySettings(Parameters):
     excite: bool = True  # False: learn from climb and flight as they are
     tilt_step_deg: float = Field(default=2.0, ge=0.2, le=6)
     thrust_step: float = Field(default=0.05, ge=0, le=0.2)
+    # Until the delay is known: 3 rad/s bears 0.25 s more than believed, 5 rad/s 0.13 s
+    cautious_bandwidth_radps: float = Field(default=3.0, ge=0.5, le=20)
     box_m: float = Field(default=0.6, ge=0.1, le=5)  # from the start; further out the steps end
     factor: float = Field(default=4.0, ge=1, le=20)
     blend_s: float = Field(default=1.0, ge=0, le=10)
@@ -97,7 +99,6 @@ class Learner:
         self._identified = False
         self._gave_up = False
         self._left_box = False
-        self._delay_sd_s = 0.0
         self._limit_radps = math.inf
 
     # ------------------------------------------------------------------ what happened
@@ -137,6 +138,11 @@ class Learner:
     def wants_excitation(self) -> bool:
         return self._settings.online and self._settings.excite
 
+    @property
+    def cautious_bandwidth_radps(self) -> float:
+        """What the law may use until the delay is known."""
+        return self._settings.cautious_bandwidth_radps
+
     def excited(self, command: Command, time_s: float, error_m: float) -> Command:
         """In the phase EXCITE: the command with its step, unless the vehicle left the box."""
         self._left_box = self._left_box or error_m > self._settings.box_m
@@ -166,6 +172,7 @@ class Learner:
             trace = self._recorder.trace(self._climb_s + LIFTED_OFF_S, time_s)
             found = identify(trace, self._file)
             sentences += self._take(found, time_s)
+            sentences += self._conclude(found)
             record = _record(found)
         elif phase in MOVING and self._drag_is_due(time_s):
             self._looked_s = time_s
@@ -174,7 +181,7 @@ class Learner:
             if self._is_news(found.drag_ps):
                 sentences += self._take(found, time_s)
                 record = _record(found)
-        if self._to == self._now and not sentences:
+        if self._to == self._now and not sentences and not record:
             return None
         return self._step(time_s, tuple(sentences), record)
 
@@ -187,7 +194,6 @@ class Learner:
         return (
             time_s >= self._moving_s + DRAG_FIRST_S
             and time_s >= self._looked_s + DRAG_EVERY_S - 1e-6
-            and self._to == self._now
         )
 
     def _is_news(self, drag: Estimate | None) -> bool:
@@ -207,21 +213,26 @@ class Learner:
             sentences.insert(0, _told(within))
         else:
             self._blend_began_s = time_s
-        if within.tilt is not None:
-            self._delay_sd_s = within.tilt.delay_s.sd
-            sentences += self._check_bandwidth()
         return sentences
 
-    def _check_bandwidth(self) -> list[str]:
-        limit = supported_bandwidth(
-            self._to, self._bandwidth_radps, self._period_s, self._delay_sd_s
-        )
+    def _conclude(self, found: Identified) -> list[str]:
+        """After the steps: the bandwidth that the delay bears, and what they did not show."""
+        tilt = found.tilt
+        taken = tilt is not None and tilt.delay_s.value == self._to.tilt.delay_s
+        delay_sd_s = tilt.delay_s.sd if tilt is not None and taken else 0.0
+        limit = supported_bandwidth(self._to, self._bandwidth_radps, self._period_s, delay_sd_s)
         self._limit_radps = limit
+        silent = [
+            f"{name} as in the vehicle file: {found.refusals[name]}"
+            for name in ("tilt", "hover_thrust")
+            if name in found.refusals
+        ]
         if limit >= self._bandwidth_radps:
-            return []
+            return silent
         return [
+            *silent,
             f"bandwidth lowered from {self._bandwidth_radps:.1f} to {limit:.1f} rad/s: a delay of "
-            f"{1e3 * self._to.tilt.delay_s:.0f} ms supports no more"
+            f"{1e3 * self._to.tilt.delay_s:.0f} ms supports no more",
         ]
 
     def _step(

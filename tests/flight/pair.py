@@ -193,6 +193,7 @@ def make(
     *assignments: str,
     name: str = "flight",
     reference: str | None = None,
+    vehicle: str | None = None,
     seed: int = 7,
     scenario: str = "calm",
     firmware: Firmware = LEAN,
@@ -204,16 +205,17 @@ def make(
 ) -> Pair:
     """A pair as `offboard fly --sitl` would make it, and what a test changes about it: what
     `flies` whatever is believed, and `learning` what it is."""
-    choices = {"reference": reference} if reference else {}
+    named = {"reference": reference, "vehicle": vehicle}
+    choices = {part: chosen for part, chosen in named.items() if chosen}
     resolved = config.load(name, choices=choices, assignments=assignments, seed=seed)
-    vehicle = resolved.vehicle
-    controller = build(resolved.controller, vehicle, resolved.period_s, resolved.seed)
+    believed = resolved.vehicle
+    controller = build(resolved.controller, believed, resolved.period_s, resolved.seed)
     companion = Companion(
-        vehicle=vehicle,
+        vehicle=believed,
         session=Session(
             SessionSettings(component_id=COMPONENT_ID, record_component_id=RECORD_COMPONENT_ID)
         ),
-        observer=Observer(vehicle, resolved.observer),
+        observer=Observer(believed, resolved.observer),
         controller=wrap(controller),
         mission=Mission(config.build_track(resolved)),
         limits=resolved.limits.model_copy(update=limits or {}),

@@ -1,0 +1,73 @@
+"""The delay margin against flights: an independent plant, integrated in steps of 1 ms, with the
+observer and the law as they fly, delayed by a little less and a little more than the margin."""
+
+from __future__ import annotations
+
+import pytest
+from attitude_plant import Flight, Lemniscate, Truth, fly
+
+from offboard.control.delay_margin import delay_margin, needed_margin, supported_bandwidth
+from offboard.control.observer import ObserverSettings
+from offboard.control.tracking import Search, TrackingLaw, TrackingSettings
+from offboard.model.vehicle import AxisResponse, Vehicle
+
+PX4 = Vehicle(
+    name="px4",
+    mass_kg=1.0,
+    inertia_kgm2=(0.025, 0.025, 0.03),
+    drag_translation_npmps=(1.02, 1.02, 1.02),
+    drag_rotation_nmpradps=(0.02, 0.02, 0.02),
+    hover_thrust=0.49,
+    thrust_delay_s=0.015,
+    thrust_lag_s=0.05,
+    tilt=AxisResponse(delay_s=0.057, natural_frequency_radps=11.4, damping=0.56),
+    yaw=AxisResponse(delay_s=0.148, natural_frequency_radps=3.1, damping=0.4),
+)
+
+
+def delayed(delay_s: float) -> Vehicle:
+    tilt = PX4.tilt.model_copy(update={"delay_s": delay_s})
+    return PX4.model_copy(update={"tilt": tilt})
+
+
+def flown(believed: Vehicle, bandwidth: float, extra_s: float) -> Flight:
+    late = believed.tilt.model_copy(update={"delay_s": believed.tilt.delay_s + extra_s})
+    truth = Truth(believed.model_copy(update={"tilt": late}), noisy=False)
+    law = TrackingLaw(believed, TrackingSettings(bandwidth_radps=bandwidth), Search.CLOSED_FORM)
+    return fly(
+        truth, law, believed, Lemniscate(15.0), 1, ObserverSettings(velocity="position"),
+        score_from_s=12.0, laps=1.0, offset_ned_m=(0.05, 0.05, 0.0),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("delay_s", "bandwidth"), [(0.057, 5.0), (0.057, 7.0), (0.17, 5.0), (0.17, 7.0)]
+)
+def test_margin_divides_flights_that_settle_from_those_that_do_not(delay_s, bandwidth):
+    believed = delayed(delay_s)
+    margin_s = delay_margin(believed, bandwidth, 0.1)
+    assert flown(believed, bandwidth, margin_s - 0.03).rmse_m < 0.03
+    assert flown(believed, bandwidth, margin_s + 0.03).rmse_m > 0.08
+
+
+def test_margins_of_the_flights_on_a_real_px4():
+    """113 ms that nobody knew of: bandwidth 5 flew, bandwidth 7 diverged, 10 was worse."""
+    margins = [delay_margin(PX4, bandwidth, 0.1) for bandwidth in (3.0, 5.0, 7.0, 10.0)]
+    assert margins == sorted(margins, reverse=True)
+    assert margins[1] > 0.113 > margins[2]
+
+
+def test_bandwidth_is_kept_where_the_delay_bears_it():
+    for delay_s in (0.01, 0.057, 0.17):
+        for bandwidth in (3.0, 5.0, 7.0):
+            assert supported_bandwidth(delayed(delay_s), bandwidth, 0.1, 0.002) == bandwidth
+
+
+@pytest.mark.parametrize(("delay_s", "sd_s"), [(0.3, 0.002), (0.057, 0.05), (0.45, 0.002)])
+def test_bandwidth_is_lowered_until_the_margin_suffices(delay_s, sd_s):
+    vehicle = delayed(delay_s)
+    lowered = supported_bandwidth(vehicle, 7.0, 0.1, sd_s)
+    assert 1.0 <= lowered < 7.0
+    needed_s = needed_margin(vehicle, sd_s)
+    assert delay_margin(vehicle, lowered, 0.1) >= needed_s - 0.01
+    assert delay_margin(vehicle, lowered + 0.5, 0.1) <= needed_s + 0.02
