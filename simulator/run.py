@@ -19,7 +19,7 @@ from simulator.udp import UdpLink, wait
 
 RESEND_S = 0.05  # until the companion is first heard
 RESEND_SILENT_S = 1.0
-FIRST_CONTACT_S = 30.0
+FIRST_CONTACT_S = 180.0  # a companion may compile first, on a machine that does much else
 FREE_RUN_S = 60.0  # vehicle time after the companion fell silent
 POLL_S = 0.05  # so that a stop is noticed in time
 BEHIND_S = 0.5

@@ -15,7 +15,7 @@ from offboard.analysis.history import History
 from offboard.analysis.tlog import Tlog
 from offboard.control.identification import Estimate, Identified, ResponseFit, identify
 from offboard.control.trace import Trace, clean
-from offboard.flight.phases import PHASES, Phase
+from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.mavlink.dialect import ThrustRule
 from offboard.mavlink.session import DIALECTS
 from offboard.model.frames import course_from_quaternion, thrust_direction_from_quaternion
@@ -56,7 +56,7 @@ def trace_of(log: Tlog, history: History) -> Trace:
 
 
 def _flown(history: History) -> tuple[float, float]:
-    indices = {float(PHASES.index(phase)) for phase in FLOWN}
+    indices = {float(PHASE_CODES[phase]) for phase in FLOWN}
     times = [
         time_s
         for time_s, record in zip(history.record_time_s, history.records, strict=True)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BPoly
 
 from offboard.analysis.history import Happening, History
-from offboard.flight.phases import PHASES, Phase
+from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.model.frames import (
     course_from_quaternion,
     rotation_from_quaternion,
@@ -108,7 +108,7 @@ def score(history: History) -> Score:
 
 def _window(history: History) -> tuple[float, float] | None:
     """First and last vehicle time of the phase TRACK."""
-    track = float(PHASES.index(Phase.TRACK))
+    track = float(PHASE_CODES[Phase.TRACK])
     times = [
         time_s
         for time_s, record in zip(history.record_time_s, history.records, strict=True)

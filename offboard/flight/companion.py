@@ -28,7 +28,7 @@ from offboard.flight.learning import RECORD_ID as IDENTIFIED_ID
 from offboard.flight.learning import RECORD_NAME as IDENTIFIED_NAME
 from offboard.flight.learning import Adoption, IdentifySettings, Learner
 from offboard.flight.mission import Mission
-from offboard.flight.phases import BEFORE_FLIGHT, ENDS, PHASES, TRACKING, ExitCode, Limits, Phase
+from offboard.flight.phases import BEFORE_FLIGHT, ENDS, PHASE_CODES, TRACKING, ExitCode, Limits, Phase
 from offboard.flight.readiness import Readiness
 from offboard.flight.record import RECORD_ID, RECORD_NAME, TickRecord, reference_record
 from offboard.flight.setpoint import LEVEL, clamp, usable
@@ -448,7 +448,7 @@ class Companion:
         assert sample is not None
         self._note_down(reference_record(time_s, sample))
         record = TickRecord.of(
-            phase=PHASES.index(self.phase),
+            phase=PHASE_CODES[self.phase],
             decision=decision,
             state=state,
             lateness_s=self._stopwatch() - arrived_s,

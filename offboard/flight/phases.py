@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from enum import Enum
 
 from pydantic import Field
@@ -30,7 +31,25 @@ class Phase(Enum):
     FAILED = "failed"
 
 
-PHASES = tuple(Phase)
+# What a log holds for a phase; numbers are never given anew, so that old logs stay readable
+PHASE_CODES: Mapping[Phase, int] = {
+    Phase.CONNECT: 0,
+    Phase.HEALTH: 1,
+    Phase.STREAM: 2,
+    Phase.ENGAGE: 3,
+    Phase.ARM: 4,
+    Phase.TAKEOFF: 5,
+    Phase.CLIMB: 6,
+    Phase.JOIN: 7,
+    Phase.TRACK: 8,
+    Phase.HOVER: 9,
+    Phase.LAND: 10,
+    Phase.DISARMED: 11,
+    Phase.YIELDED: 12,
+    Phase.FAILED: 13,
+    Phase.EXCITE: 14,
+    Phase.STAND_DOWN: 15,
+}
 ENDS = frozenset({Phase.DISARMED, Phase.YIELDED, Phase.FAILED})
 BEFORE_FLIGHT = frozenset({Phase.CONNECT, Phase.HEALTH, Phase.STREAM, Phase.ENGAGE, Phase.ARM})
 TRACKING = frozenset({Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.HOVER})

@@ -27,7 +27,7 @@ RECORD_ID = 1
 class TickRecord:
     """All floats, SI, NED, vehicle time. NaN where a phase has no such figure."""
 
-    phase: float  # index of flight.phases.Phase
+    phase: float  # of flight.phases.PHASE_CODES
     thrust_mps2: float
     thrust_direction_north: float
     thrust_direction_east: float

@@ -29,7 +29,7 @@ from offboard.model.vehicle import Vehicle
 from offboard.reference.track import Track
 from offboard.reference.transfer import Hold
 
-SITL_PATIENCE_S = 60.0  # a bundled simulator may compile first, on a machine that does much else
+SITL_PATIENCE_S = 180.0  # a bundled simulator may compile first, on a machine that does much else
 
 
 @dataclass(frozen=True, slots=True)
