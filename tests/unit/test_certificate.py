@@ -165,4 +165,6 @@ def test_a_problem_that_is_not_finite_has_no_certificate_and_spoils_no_later_one
     certificate = certify(spoilt, answer(spoilt, np.zeros(4)), exact)
     assert np.isnan(certificate.gap)
     assert np.isnan(certificate.optimal_cost)
+    steep = BoxQuadratic(np.eye(4), np.array([np.nan, 0, 0, 0]), 0.0, sound.lower, sound.upper)
+    assert np.isnan(exact.minimise(steep)).all()
     assert exact.minimise(sound) == pytest.approx(np.full(4, -0.5), abs=1e-9)

@@ -165,6 +165,7 @@ def test_seed_particles_bound_the_answer_and_are_put_inside_the_box() -> None:
     unusable = np.full(4, np.nan)
     result = swarm.minimise(problem, RandomLanes(7), seeds=(unusable, minimiser))
     assert np.array_equal(result.best, minimiser)
+    assert np.isfinite(result.spread)
     corner = BoxQuadratic(np.eye(4), -9 * np.ones(4), 0.0, -np.ones(4), np.ones(4))
     result = swarm.minimise(corner, RandomLanes(7), seeds=(9 * np.ones(4),))
     assert np.array_equal(result.best, np.ones(4))
