@@ -12,8 +12,10 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from offboard.control.base import Controller
+from offboard.control.mpc import MpcLaw, MpcSettings
 from offboard.control.paper import PaperController
 from offboard.control.paper_law import PaperSettings
+from offboard.control.pid import PidLaw, PidSettings
 from offboard.control.tracking import Search, TrackingLaw, TrackingSettings
 from offboard.model.vehicle import Parameters, Vehicle
 
@@ -30,15 +32,33 @@ class Lqr(TrackingSettings):
     law: Literal["lqr"]
 
 
+class Mpc(MpcSettings):
+    """The same cost over N steps in their boxes, exactly."""
+
+    law: Literal["mpc"]
+
+
+class Pid(PidSettings):
+    """Cascaded position and velocity loops with the same feed-forward and observer."""
+
+    law: Literal["pid"]
+
+
 class Paper(PaperSettings):
     """The paper's law, one step ahead."""
 
     law: Literal["paper"]
 
 
-Law = Pso | Lqr | Paper
+Law = Pso | Lqr | Mpc | Pid | Paper
 ControllerConfig = Annotated[Law, Field(discriminator="law")]
-LAWS: Mapping[str, type[Parameters]] = {"pso": Pso, "lqr": Lqr, "paper": Paper}
+LAWS: Mapping[str, type[Parameters]] = {
+    "pso": Pso,
+    "lqr": Lqr,
+    "mpc": Mpc,
+    "pid": Pid,
+    "paper": Paper,
+}
 
 
 def build(
@@ -58,5 +78,9 @@ def build(
             return TrackingLaw(vehicle, settings, Search.SWARM, stopwatch)
         case Lqr():
             return TrackingLaw(vehicle, settings, Search.CLOSED_FORM, stopwatch)
+        case Mpc():
+            return MpcLaw(vehicle, settings, stopwatch)
+        case Pid():
+            return PidLaw(vehicle, settings, stopwatch)
         case Paper():
             return PaperController(vehicle, settings, period_s, stopwatch)

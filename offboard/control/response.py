@@ -40,12 +40,13 @@ class CostToGo:
 
     J(u; x) = integral over the hold of (x' Q x + R u^2) + x(k+1)' P x(k+1)
             = 1/2 curvature u^2 + (coupling x) u + 1/2 x' state_cost x, minimal at u = -gain x,
-    all in deviations from the reference. transition (n, n), input_map (n, 1), terminal P (n, n),
-    coupling and gain (n,).
+    all in deviations from the reference. transition (n, n), input_map (n, 1), stage (n + 1, n + 1)
+    the cost of one hold as [x, u]' stage [x, u], terminal P (n, n), coupling and gain (n,).
     """
 
     transition: Array
     input_map: Array
+    stage: Array
     terminal: Array
     curvature: float
     coupling: Array
@@ -93,6 +94,7 @@ def sampled_cost_to_go(
     return CostToGo(
         transition=a,
         input_map=b,
+        stage=stage,
         terminal=terminal,
         curvature=2.0 * curvature,
         coupling=2.0 * coupling,

@@ -117,16 +117,26 @@ class TrackingLaw:
         problem = self.problem(state, target)
         if not _finite(problem):
             raise DecisionError("the cost of this decision is not finite")
-        if self._search is Search.CLOSED_FORM:
-            inputs = closed_form(problem)
-            certificate = _exact_certificate(problem, inputs)
-        else:
-            remaining = self._remaining(situation.deadline_s, started)
-            result = self._swarm.minimise(problem, self._lanes, (), remaining)
-            inputs, certificate = result.best, certify(problem, result, self._exact)
+        remaining = self._remaining(situation.deadline_s, started)
+        inputs, certificate = self.answer(situation, target, problem, remaining)
         if self._stopwatch:
             certificate = replace(certificate, solve_time_s=self._stopwatch() - started)
         return Decision(_command(inputs), certificate)
+
+    def answer(
+        self,
+        situation: Situation,
+        target: Target,
+        problem: BoxQuadratic,
+        remaining_s: Callable[[], float] | None,
+    ) -> tuple[Array, Certificate]:
+        """The input (4,) in the problem's box and what it is worth. Laws that share target, box
+        and course, but not the search, replace this."""
+        if self._search is Search.CLOSED_FORM:
+            inputs = closed_form(problem)
+            return inputs, _exact_certificate(problem, inputs)
+        result = self._swarm.minimise(problem, self._lanes, (), remaining_s)
+        return result.best, certify(problem, result, self._exact)
 
     def reset(self) -> None:
         """Forget everything of the previous flight, the random stream included."""
