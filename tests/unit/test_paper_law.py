@@ -151,6 +151,28 @@ def test_epsilon_of_the_first_configuration_is_the_papers() -> None:
     assert spreads.max() < 2.4
 
 
+def test_the_input_applied_last_is_what_r_du_holds_on_to() -> None:
+    """Eq. 21's last term: its slope is -2 R_du u(k-1); a reset forgets u(k-1)."""
+    settings = PaperSettings(rate=(1.0, 2.0, 3.0, 4.0))
+    law = PaperLaw(*sampled_matrices(PAPER, 0.1), settings)
+    state = np.linspace(-0.05, 0.06, 12)
+    first, second = law.move(state, np.zeros(12)), law.move(state, np.zeros(12))
+    change = second.problem.gradient - first.problem.gradient
+    assert np.abs(first.inputs).min() > 1e-3
+    assert change == pytest.approx(-2 * np.array([1, 2, 3, 4]) * first.inputs, rel=1e-9)
+    law.reset()
+    again = law.move(state, np.zeros(12))
+    assert np.array_equal(again.problem.gradient, first.problem.gradient)
+
+
+def test_the_final_energy_weights_are_a_tenth_of_the_first() -> None:
+    """Eq. 34 against Eq. 24."""
+    first, final = PaperSettings.first_configuration(), PaperSettings()
+    assert np.array(final.energy) == pytest.approx(0.1 * np.array(first.energy), rel=1e-12)
+    assert first.fitness == (1,) * 12
+    assert first.rate == final.rate == (1, 1, 1, 1)
+
+
 # ---------------------------------------------------------------- over attitude setpoints
 
 
