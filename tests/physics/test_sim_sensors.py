@@ -80,8 +80,9 @@ def _correlation_time_s(values: np.ndarray) -> np.ndarray:
         ("px4_like", "velocity", (0.17, 0.29, 0.18), 0.25),
         ("px4_like", "tilt", (0.019, 0.021), 0.25),
         ("px4_like", "yaw", (math.radians(2.5),), 0.25),
-        ("ardupilot_like", "position", (0.06, 0.06, 0.025), 0.15),
-        ("ardupilot_like", "velocity", (0.024, 0.024, 0.006), 0.15),
+        # ArduCopter .06 .025 and .024 .006 in one set, .057 .023 and .027 .006 in another
+        ("ardupilot_like", "position", (0.057, 0.057, 0.023), 0.15),
+        ("ardupilot_like", "velocity", (0.026, 0.026, 0.006), 0.15),
         ("ardupilot_like", "tilt", (0.002, 0.002), 0.15),
         ("ardupilot_like", "yaw", (math.radians(0.5),), 0.25),
     ],
@@ -105,7 +106,7 @@ def test_yaw_error_has_the_measured_stationary_statistics(model, sd_deg):
         ("px4_like", "position", 2.5, 7.0),  # measured 4-5 s, east in other flights 2.5 s
         ("px4_like", "velocity", 2.0, 6.5),  # 3-4 s, east 2.1 s
         ("ardupilot_like", "position", 1.0, 1.9),  # 1.2-1.7 s
-        ("ardupilot_like", "velocity", 0.9, 1.7),
+        ("ardupilot_like", "velocity", 0.9, 2.0),  # .9-1.7 s, down 1.5-2.0 s
     ],
 )
 def test_error_has_the_measured_correlation_time(errors, estimator, quantity, low_s, high_s):
@@ -158,6 +159,18 @@ def _changes(values: np.ndarray) -> np.ndarray:
 def test_px4_error_changes_as_much_as_measured_over_every_time(errors, quantity, measured, slack):
     found = 1e3 * _changes(errors["px4_like"][quantity])
     assert found == pytest.approx(np.array(measured), rel=slack)
+
+
+# ArduCopter 4.6 SITL on noisy sensors, in the same way, median of five flights; N and E alike.
+ARDUPILOT_POSITION_CHANGES_MM = ((1.75, 8.1, 15.3, 33.2, 54.7),) * 2 + ((0.4, 2.1, 4.0, 9.1, 15.4),)
+ARDUPILOT_VELOCITY_CHANGES_MMPS = ((7.8, 17.5, 29.5),) * 2 + ((1.6, 3.3, 4.7),)  # from .2 s on
+
+
+def test_ardupilot_error_changes_as_much_as_measured_over_every_time(errors):
+    found = {name: 1e3 * _changes(x) for name, x in errors["ardupilot_like"].items()}
+    position, velocity = np.array(ARDUPILOT_POSITION_CHANGES_MM), ARDUPILOT_VELOCITY_CHANGES_MMPS
+    assert found["position"] == pytest.approx(position, rel=0.25)
+    assert found["velocity"][:, 2:] == pytest.approx(np.array(velocity), rel=0.3)
 
 
 def test_px4_position_error_is_smooth_and_its_velocity_error_is_not(errors):
