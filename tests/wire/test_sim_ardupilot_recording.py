@@ -28,6 +28,9 @@ ASKED = {
 }  # fmt: skip
 BRIEFLY = (9, 217, 3)  # landed and armed lasts .5 s: a heartbeat a second may miss it
 NORTH, EAST = 1, 2
+# The commands' thrust is .14 % less than holds the weight here: after 27 s of it the landing at
+# .5 m/s begins a metre lower
+LANDING_S = 2.5
 
 
 @pytest.fixture(scope="module")
@@ -54,7 +57,7 @@ def test_every_text_is_the_same_in_order(talks: tuple[Talk, Talk]) -> None:
     assert len(real.texts) == 28
     for (_, text, our_s), (_, _, real_s) in zip(ours.texts, real.texts, strict=True):
         # IMU1 finds its origin .19 s after IMU0; here in one event
-        limit_s = {"Disarming motors": 1.0, "EKF3 IMU1 origin set": 0.25}.get(text, 0.06)
+        limit_s = {"Disarming motors": LANDING_S, "EKF3 IMU1 origin set": 0.25}.get(text, 0.06)
         assert abs(our_s - real_s) < limit_s, text
 
 
@@ -77,15 +80,18 @@ def test_heartbeats_go_through_the_same_states(talks: tuple[Talk, Talk]) -> None
     mine.pop(BRIEFLY, None)
     assert list(mine) == list(theirs)
     assert len(theirs) == 8
-    assert max(abs(mine[state] - theirs[state]) for state in theirs) < 1.3
+    late = [abs(mine[state] - theirs[state]) for state in theirs]
+    assert max(late[:-1]) < 1.1
+    assert late[-1] < LANDING_S
 
 
 def test_landed_states_are_the_same(talks: tuple[Talk, Talk]) -> None:
     """On the ground, taking off, in the air, landing, on the ground: four changes."""
     real, ours = talks
     assert ours.landed == real.landed == [1, 3, 2, 4, 1]
-    late = [a - b for a, b in zip(ours.landed_times_s, real.landed_times_s, strict=True)]
-    assert np.abs(late[1:]) == pytest.approx(0.0, abs=0.8)
+    late = [abs(a - b) for a, b in zip(ours.landed_times_s, real.landed_times_s, strict=True)]
+    assert max(late[1:4]) < 0.3
+    assert late[-1] < LANDING_S
 
 
 def test_the_filter_reports_the_same_progress(talks: tuple[Talk, Talk]) -> None:

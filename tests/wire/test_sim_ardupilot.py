@@ -1,0 +1,591 @@
+"""The simulated ArduCopter: what it says unasked, its arming rules, setpoints and their limits.
+
+Expected values are those of ArduCopter 4.6.3 SITL. The start is ten times as fast as its 42 s.
+"""
+
+from __future__ import annotations
+
+import itertools
+import math
+from collections import Counter
+from collections.abc import Callable
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from sim_bench import NAN, Bench
+
+from simulator.firmware.ardupilot import ARDUPILOT
+from simulator.sensors import EstimatorName
+
+STABILIZE, GUIDED, LOITER, RTL, LAND, BRAKE, GUIDED_NOGPS = 0, 4, 5, 6, 9, 17, 20
+ACCEPTED, DENIED, FAILED = 0, 2, 4
+ONBOARD = mavlink.MAV_TYPE_ONBOARD_CONTROLLER
+BOOT_SCALE = 0.1
+HOVER = 0.3655
+LEVEL = (1.0, 0.0, 0.0, 0.0)
+
+
+def bench(heartbeat_type: int | None = ONBOARD, boot_scale: float = BOOT_SCALE) -> Bench:
+    return Bench(
+        EstimatorName.PERFECT,
+        heartbeat_type=heartbeat_type,
+        firmware=ARDUPILOT,
+        boot_scale=boot_scale,
+    )
+
+
+def roll(degrees: float, length: float = 1.0) -> tuple[float, float, float, float]:
+    half = math.radians(degrees) / 2.0
+    return length * math.cos(half), length * math.sin(half), 0.0, 0.0
+
+
+def ask_mode(vehicle: Bench, number: int) -> list[int]:
+    return vehicle.command(176, 1, number)
+
+
+def set_parameter(vehicle: Bench, name: str, value: float) -> None:
+    vehicle.send(mavlink.MAVLink_param_set_message(1, 1, name.encode(), value, 9))
+
+
+def roll_deg(vehicle: Bench) -> float:
+    w, x, y, z = vehicle.instance.autopilot.truth.attitude
+    return math.degrees(math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)))
+
+
+def climb_mps(vehicle: Bench) -> float:
+    return -float(vehicle.instance.autopilot.truth.velocity_ned_mps[2])
+
+
+def ready(mode: int = GUIDED) -> Bench:
+    """Booted and in a mode, thrust is thrust."""
+    vehicle = bench()
+    vehicle.run(4.5)
+    set_parameter(vehicle, "GUID_OPTIONS", 8)
+    assert ask_mode(vehicle, mode) == [ACCEPTED]
+    return vehicle
+
+
+def flying(height_m: float = 5.0) -> Bench:
+    """Hovering in GUIDED after a takeoff by command."""
+    vehicle = ready()
+    assert vehicle.command(400, 1) == [ACCEPTED]
+    assert vehicle.command(22, *(0.0,) * 6, height_m) == [ACCEPTED]
+    vehicle.run(9.0)
+    assert vehicle.height_m == pytest.approx(height_m, abs=0.2)
+    return vehicle
+
+
+# -- telemetry -------------------------------------------------------------------------------
+
+
+def test_unasked_it_sends_heartbeats_time_questions_and_where_home_is() -> None:
+    """And texts, once somebody spoke; origin and home when the filter has found them."""
+    vehicle = bench()
+    vehicle.run(20.0)
+    counts = Counter(m.get_type() for _, m in vehicle.received)
+    counts.pop("STATUSTEXT")
+    assert counts == {
+        "HEARTBEAT": 21,  # the first at once, where the real one waits a second
+        "TIMESYNC": 3,
+        "GPS_GLOBAL_ORIGIN": 1,
+        "HOME_POSITION": 1,
+    }
+
+
+def test_texts_reach_whoever_has_spoken_whatever_it_says_to_be() -> None:
+    silent, spoken = bench(heartbeat_type=None), bench(heartbeat_type=None)
+    spoken.send(mavlink.MAVLink_timesync_message(0, 1))
+    for vehicle in (silent, spoken):
+        vehicle.run(1.0)
+    assert silent.texts() == []
+    assert "ArduPilot Ready" in spoken.texts()
+
+
+@pytest.mark.parametrize(
+    ("message", "rate_hz"), [(30, 50), (31, 100), (32, 100), (83, 200), (164, 50), (108, 50)]
+)
+def test_granted_rates_are_exact(message: int, rate_hz: float) -> None:
+    vehicle = bench()
+    vehicle.run(4.5)
+    assert vehicle.command(511, message, 1e6 / rate_hz) == [ACCEPTED]
+    begun_s = vehicle.time_s
+    vehicle.run(4.0)
+    name = mavlink.mavlink_map[message].msgname
+    assert len(vehicle.of(name, begun_s)) == pytest.approx(4 * rate_hz, abs=1)
+
+
+@pytest.mark.parametrize(
+    ("message", "rate_hz", "text"),
+    [
+        (30, 400, "Requested rate for message ID 30 too fast. Increase SCHED_LOOP_RATE"),
+        (331, 50, "No ap_message for mavlink id (331)"),
+        (230, 1, "No ap_message for mavlink id (230)"),
+        (115, 50, "No ap_message for mavlink id (115)"),
+        (111, 1, "No ap_message for mavlink id (111)"),
+        (9999, 1, "No ap_message for mavlink id (9999)"),
+    ],
+)
+def test_refused_rates_say_why(message: int, rate_hz: float, text: str) -> None:
+    vehicle = bench()
+    assert vehicle.command(511, message, 1e6 / rate_hz) == [DENIED]
+    assert text in vehicle.texts()
+
+
+def test_a_refused_rate_leaves_the_old_one() -> None:
+    vehicle = bench()
+    assert vehicle.command(511, 30, 20_000) == [ACCEPTED]
+    assert vehicle.command(511, 30, 2_500) == [DENIED]
+    begun_s = vehicle.time_s
+    vehicle.run(2.0)
+    assert len(vehicle.of("ATTITUDE", begun_s + 1e-6)) == 100
+
+
+def test_all_streams_at_once() -> None:
+    """REQUEST_DATA_STREAM is not acknowledged; position waits for the filter all the same."""
+    vehicle = bench()
+    vehicle.run(1.0)
+    vehicle.send(mavlink.MAVLink_request_data_stream_message(1, 1, 0, 4, 1))
+    vehicle.run(2.0)
+    counts = Counter(m.get_type() for _, m in vehicle.received)
+    assert counts["ATTITUDE"] == counts["SYS_STATUS"] == counts["SIMSTATE"] == 8
+    assert counts["LOCAL_POSITION_NED"] == counts["COMMAND_ACK"] == 0
+    vehicle.run(2.0)
+    first_s = vehicle.of("LOCAL_POSITION_NED")[0][0]
+    assert first_s == pytest.approx(41.6 * BOOT_SCALE, abs=0.26)
+
+
+def test_version_is_told_on_request() -> None:
+    vehicle = bench()
+    assert vehicle.command(512, 148) == [ACCEPTED]
+    ((_, version),) = vehicle.of("AUTOPILOT_VERSION")
+    assert (version.flight_sw_version, version.capabilities) == (0x040603FF, 64495)
+    assert vehicle.command(512, 331) == [FAILED]
+
+
+def test_truth_is_told_on_request() -> None:
+    vehicle = flying()
+    assert vehicle.command(512, 108) == [ACCEPTED]
+    _, truth = vehicle.of("SIM_STATE")[-1]
+    assert truth.alt == pytest.approx(584.09 + vehicle.height_m, abs=0.02)
+    assert truth.lat_int == pytest.approx(-353632621, abs=3)
+    assert truth.zacc == pytest.approx(-9.81, abs=0.3)
+
+
+# -- addresses -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("to", "heard"),
+    [((1, 1), True), ((0, 0), True), ((1, 191), True), ((1, 5), True), ((7, 1), False)],
+)
+def test_the_component_is_not_checked(to: tuple[int, int], heard: bool) -> None:
+    vehicle = ready()
+    acks = vehicle.command(400, 1, to=to)
+    assert acks == ([ACCEPTED] if heard else [])
+    assert vehicle.armed == heard
+
+
+# -- modes and arming ------------------------------------------------------------------------
+
+
+def test_a_mode_asked_for_too_early_is_acknowledged_and_lost() -> None:
+    vehicle = bench()
+    assert ask_mode(vehicle, GUIDED) == [ACCEPTED]
+    assert vehicle.mode == GUIDED
+    vehicle.run(1.0)
+    assert vehicle.mode == STABILIZE
+
+
+@pytest.mark.parametrize(
+    ("params", "result", "texts"),
+    [
+        ((1, GUIDED), ACCEPTED, []),
+        ((129, LAND), ACCEPTED, []),
+        ((0, GUIDED), DENIED, []),
+        ((128, GUIDED), DENIED, []),
+        ((1, 99), FAILED, ["No such mode 99"]),
+        ((1, NAN), ACCEPTED, []),
+    ],
+)
+def test_mode_command(params: tuple[float, float], result: int, texts: list[str]) -> None:
+    vehicle = bench()
+    vehicle.run(4.5)
+    begun_s = vehicle.time_s
+    assert vehicle.command(176, *params) == [result]
+    assert vehicle.texts(begun_s) == texts
+
+
+def test_a_heartbeat_shows_a_new_mode_at_once() -> None:
+    vehicle = bench()
+    vehicle.run(4.5)
+    asked_s = vehicle.time_s
+    ask_mode(vehicle, BRAKE)
+    ((at_s, heartbeat),) = vehicle.of("HEARTBEAT", asked_s + 1e-6)
+    assert heartbeat.custom_mode == BRAKE
+    assert at_s - asked_s < 0.01
+
+
+@pytest.mark.parametrize(
+    ("at_s", "mode", "text"),
+    [
+        (1.0, STABILIZE, "Arm: System not initialised"),
+        (5.0, GUIDED, "Arm: EKF attitude is bad"),
+        (25.0, GUIDED, "Arm: Need Position Estimate"),
+        (12.0, GUIDED_NOGPS, "Arm: Gyros inconsistent"),
+        (45.0, RTL, "Arm: RTL mode not armable"),
+        (45.0, LAND, "Arm: LAND mode not armable"),
+    ],
+)
+def test_arming_is_refused_with_a_text(at_s: float, mode: int, text: str) -> None:
+    vehicle = bench()
+    vehicle.run(at_s * BOOT_SCALE)
+    ask_mode(vehicle, mode)
+    assert vehicle.command(400, 1) == [FAILED]
+    assert text in vehicle.texts()
+    assert not vehicle.armed
+
+
+def test_what_needs_no_position_arms_before_there_is_one() -> None:
+    vehicle = bench()
+    vehicle.run(3.0)
+    ask_mode(vehicle, GUIDED_NOGPS)
+    assert vehicle.command(400, 1) == [ACCEPTED]
+    assert ask_mode(vehicle, GUIDED) == [FAILED]
+    assert "Mode change to GUIDED failed: requires position" in vehicle.texts()
+
+
+def test_the_prearm_bit_is_judged_for_the_present_mode() -> None:
+    vehicle = bench()
+    vehicle.run(3.0)
+    bits = []
+    for mode in (STABILIZE, GUIDED):
+        ask_mode(vehicle, mode)
+        vehicle.command(512, 1)
+        _, status = vehicle.of("SYS_STATUS")[-1]
+        bits.append(bool(status.onboard_control_sensors_health & 0x10000000))
+    assert bits == [True, False]
+
+
+def test_arming_twice_forced_and_disarming() -> None:
+    vehicle = ready()
+    assert vehicle.command(400, 0) == [ACCEPTED]
+    assert vehicle.command(400, 1) == vehicle.command(400, 1) == [ACCEPTED]
+    assert vehicle.command(400, 0) == [ACCEPTED]
+    assert ask_mode(vehicle, RTL) == [ACCEPTED]
+    assert vehicle.command(400, 1, 2989) == [ACCEPTED]
+
+
+def test_armed_and_not_flown_it_disarms_after_ten_seconds() -> None:
+    vehicle = ready()
+    vehicle.command(400, 1)
+    armed_s = vehicle.text_at("Arming motors")
+    vehicle.run(11.0)
+    assert vehicle.text_at("Disarming motors") - armed_s == pytest.approx(10.0, abs=0.05)
+
+
+# -- takeoff and landing ---------------------------------------------------------------------
+
+
+def test_takeoff_is_refused_on_the_ground_downwards_and_after_the_climb() -> None:
+    vehicle = ready()
+    assert vehicle.command(22, *(0.0,) * 6, 5.0) == [FAILED]
+    vehicle.command(400, 1)
+    assert vehicle.command(22, *(0.0,) * 6, -1.0) == [FAILED]
+    assert vehicle.command(22, *(NAN,) * 7) == [FAILED]
+    assert vehicle.command(22, *(0.0,) * 6, 3.0) == [ACCEPTED]
+    vehicle.run(4.0)
+    assert vehicle.command(22, *(0.0,) * 6, 4.0) == [ACCEPTED]  # another height on the way
+    vehicle.run(8.0)
+    assert vehicle.height_m == pytest.approx(4.0, abs=0.15)
+    assert vehicle.command(22, *(0.0,) * 6, 6.0) == [FAILED]
+
+
+def test_from_arming_to_five_metres_in_seven_to_nine_seconds() -> None:
+    vehicle = ready()
+    vehicle.command(400, 1)
+    vehicle.command(22, *(0.0,) * 6, 5.0)
+    begun_s = vehicle.text_at("Arming motors")
+    reached_s = vehicle.run_until(lambda: vehicle.height_m > 4.8, 12.0)
+    assert 6.5 < reached_s - begun_s < 9.0  # 7.5 s
+
+
+def test_a_stream_without_thrust_cancels_the_takeoff() -> None:
+    vehicle = ready()
+    vehicle.command(400, 1)
+    assert vehicle.command(22, *(0.0,) * 6, 5.0) == [ACCEPTED]
+    vehicle.run(8.0, lambda: vehicle.attitude(thrust=0.0))
+    assert vehicle.height_m < 0.01
+    assert vehicle.instance.autopilot.landed
+
+
+def test_setpoints_alone_lift_off() -> None:
+    """.3 m after 3.3-3.9 s; any thrust is flight, even if it cannot lift."""
+    vehicle = ready()
+    vehicle.command(400, 1)
+    armed_s = vehicle.time_s
+    lifted: list[float] = []
+
+    def push() -> None:
+        vehicle.attitude(thrust=0.45)
+        if vehicle.height_m > 0.3:
+            lifted.append(vehicle.time_s)
+
+    vehicle.run(5.0, push)
+    assert 3.3 <= lifted[0] - armed_s <= 3.9
+
+    weak = ready()
+    weak.command(400, 1)
+    weak.run(12.0, lambda: weak.attitude(thrust=0.05))
+    assert weak.height_m < 0.01
+    assert weak.instance.autopilot.landed_state == 2
+    assert weak.armed
+
+
+def test_set_down_by_setpoints_it_stays_in_the_air_until_land() -> None:
+    vehicle = flying(2.0)
+    vehicle.run(12.0, lambda: vehicle.attitude(thrust=0.3))
+    assert vehicle.height_m < 0.02
+    assert vehicle.armed
+    assert vehicle.instance.autopilot.landed_state == 2
+    assert vehicle.command(21) == [ACCEPTED]
+    vehicle.run(4.0)
+    assert not vehicle.armed
+
+
+def test_land_descends_at_half_a_metre_per_second_and_disarms() -> None:
+    vehicle = flying()
+    assert vehicle.command(400, 0) == [FAILED]
+    assert vehicle.command(21) == [ACCEPTED]
+    vehicle.run(4.0)
+    assert climb_mps(vehicle) == pytest.approx(-0.5, abs=0.03)
+    down_s = vehicle.run_until(lambda: vehicle.instance.autopilot.truth.on_ground, 12.0)
+    vehicle.run(3.0)
+    assert vehicle.text_at("Disarming motors") - down_s == pytest.approx(2.1, abs=0.3)
+    assert vehicle.mode == LAND
+
+
+def test_a_forced_disarm_in_the_air_falls() -> None:
+    vehicle = flying()
+    assert vehicle.command(400, 0, 21196) == [ACCEPTED]
+    vehicle.run(0.5)
+    assert climb_mps(vehicle) < -4.0
+
+
+# -- setpoints -------------------------------------------------------------------------------
+
+
+def test_base_mode_says_who_controls_the_position() -> None:
+    """The guided bit, 8, is 0 while attitude setpoints fly: it says nothing about the mode."""
+    vehicle = flying()
+    seen = []
+    for mask in (7, 2552):
+        if mask == 7:
+            vehicle.run(1.2, lambda: vehicle.attitude(thrust=HOVER))
+        else:
+            vehicle.run(1.2, lambda: vehicle.position(0, 0, -5))
+        _, heartbeat = vehicle.of("HEARTBEAT")[-1]
+        seen.append((heartbeat.base_mode, heartbeat.custom_mode, heartbeat.system_status))
+    assert seen == [(209, GUIDED, 4), (217, GUIDED, 4)]
+
+
+@pytest.mark.parametrize(
+    ("mask", "length", "rolls"),
+    [
+        (7, 1.0, True),
+        (7 + 8 + 32, 1.0, True),
+        (7, -1.0, True),
+        (7, 1.0004, True),
+        (7, 1.0006, False),
+        (7, 2.0, False),
+        (7, 0.0, False),
+        (7, NAN, False),
+        (71, 1.0, False),
+        (3, 1.0, False),
+        (4, 1.0, False),
+        (199, 1.0, False),
+    ],
+)
+def test_which_attitudes_fly(mask: int, length: float, rolls: bool) -> None:
+    vehicle = flying()
+    vehicle.run(0.6, lambda: vehicle.attitude(roll(8.0, length), HOVER, mask))
+    assert (abs(roll_deg(vehicle) - 8.0) < 1.0) == rolls
+
+
+def test_rates_beside_an_attitude_are_added() -> None:
+    """.3 rad/s beside roll 8 settles at 11 degrees."""
+    vehicle = flying()
+    vehicle.run(1.5, lambda: vehicle.attitude(roll(8.0), HOVER, 0, (0.3, 0.0, 0.0)))
+    assert roll_deg(vehicle) == pytest.approx(11.0, abs=0.5)
+
+
+def test_rates_alone_fly_with_mask_128() -> None:
+    vehicle = flying()
+    vehicle.run(0.5, lambda: vehicle.attitude(LEVEL, HOVER, 128, (0.5, 0.0, 0.0)))
+    assert roll_deg(vehicle) == pytest.approx(math.degrees(0.5 * 0.5), abs=4.0)
+
+
+@pytest.mark.parametrize("tilt_deg", [20.0, 30.0])
+def test_hover_thrust_holds_the_height_at_any_tilt(tilt_deg: float) -> None:
+    """ATC_ANGLE_BOOST divides by the body's tilt; without it -.35 and -.72 m/s after 1 s."""
+    lost = []
+    for boost in (1.0, 0.0):
+        vehicle = flying()
+        vehicle.run(0.4, lambda v=vehicle: v.attitude(LEVEL, HOVER))
+        set_parameter(vehicle, "ATC_ANGLE_BOOST", boost)
+        vehicle.run(1.0, lambda v=vehicle: v.attitude(roll(tilt_deg), HOVER))
+        lost.append(climb_mps(vehicle))
+    assert lost[0] == pytest.approx(0.0, abs=0.06)
+    assert lost[1] == pytest.approx({20.0: -0.35, 30.0: -0.72}[tilt_deg], abs=0.25)
+
+
+@pytest.mark.parametrize(
+    ("thrust", "climb"), [(0.5, 0.0), (1.0, 2.5), (0.75, 1.25), (0.0, -1.5), (2.0, 2.5)]
+)
+def test_without_guid_options_thrust_is_a_climb_rate(thrust: float, climb: float) -> None:
+    vehicle = flying()
+    set_parameter(vehicle, "GUID_OPTIONS", 0)
+    vehicle.run(2.0, lambda: vehicle.attitude(LEVEL, thrust))
+    assert climb_mps(vehicle) == pytest.approx(climb, abs=0.1)
+
+
+def test_a_thrust_that_is_no_number_is_none_and_is_remembered() -> None:
+    vehicle = flying()
+    vehicle.run(0.5, lambda: vehicle.attitude(LEVEL, NAN))
+    assert climb_mps(vehicle) < -2.0
+    assert vehicle.instance.autopilot.system_status == 5
+    vehicle.command(400, 0, 21196)
+    vehicle.run(3.0)
+    ask_mode(vehicle, GUIDED)
+    assert vehicle.command(400, 1) == [FAILED]
+    assert "Arm: Internal Errors 0x400" in vehicle.texts()
+
+
+@pytest.mark.parametrize("mode", [STABILIZE, LOITER, BRAKE, RTL, LAND])
+def test_other_modes_ignore_setpoints(mode: int) -> None:
+    vehicle = flying()
+    assert ask_mode(vehicle, mode) == [ACCEPTED]
+    vehicle.run(0.6, lambda: vehicle.attitude(roll(8.0), HOVER))
+    assert abs(roll_deg(vehicle)) < 1.0
+    assert vehicle.mode == mode
+
+
+def test_a_pilot_keeps_the_vehicle_until_guided_is_asked_for_again() -> None:
+    vehicle = flying()
+    stream = lambda: vehicle.attitude(roll(5.0), HOVER)  # noqa: E731
+    vehicle.run(0.5, stream)
+    ask_mode(vehicle, BRAKE)
+    vehicle.run(1.5, stream)
+    assert abs(roll_deg(vehicle)) < 5.0
+    assert vehicle.mode == BRAKE
+    ask_mode(vehicle, GUIDED)
+    vehicle.run(0.6, stream)
+    assert roll_deg(vehicle) == pytest.approx(5.0, abs=0.5)
+
+
+@pytest.mark.parametrize("timeout_s", [3.0, 1.0, 0.5])
+def test_a_lost_stream_levels_after_guid_timeout_and_nothing_is_said(timeout_s: float) -> None:
+    vehicle = flying()
+    set_parameter(vehicle, "GUID_TIMEOUT", timeout_s)
+    vehicle.run(1.0, lambda: vehicle.attitude(roll(5.0), HOVER))
+    lost_s = vehicle.time_s
+    vehicle.run(timeout_s - 0.1)
+    assert roll_deg(vehicle) == pytest.approx(5.0, abs=0.2)
+    levelled_s = vehicle.run_until(lambda: roll_deg(vehicle) < 2.5, 1.0)
+    assert levelled_s - lost_s == pytest.approx(timeout_s + 0.15, abs=0.15)
+    height_m = vehicle.height_m
+    vehicle.run(4.0)
+    assert vehicle.height_m == pytest.approx(height_m, abs=0.15)
+    drift_mps = math.hypot(*vehicle.instance.autopilot.truth.velocity_ned_mps[:2])
+    assert drift_mps > 0.1  # nobody holds the position
+    assert vehicle.texts(lost_s) == []
+    assert vehicle.mode == GUIDED
+    vehicle.run(0.6, lambda: vehicle.attitude(roll(5.0), HOVER))
+    assert roll_deg(vehicle) == pytest.approx(5.0, abs=0.5)
+
+
+@pytest.mark.parametrize(("period_s", "levels"), [(2.94, False), (3.3, True)])
+def test_one_setpoint_in_three_seconds_is_enough(period_s: float, levels: bool) -> None:
+    vehicle = flying()
+    vehicle.attitude(roll(3.0), HOVER)
+    vehicle.run(1.0)
+    seen_deg = []
+    for step in range(round(7.0 / 0.02)):
+        if step % round(period_s / 0.02) == 0:
+            vehicle.attitude(roll(3.0), HOVER)
+        vehicle.run(0.02)
+        seen_deg.append(roll_deg(vehicle))
+    assert (min(seen_deg) < 1.5) == levels
+    assert max(seen_deg) == pytest.approx(3.0, abs=0.1)
+
+
+def step_times(vehicle: Bench, axis_deg: Callable[[], float], target: float) -> tuple[float, float]:
+    """Time to 63 % and peak of the answer to what is demanded from now on."""
+    begun_s, values = vehicle.time_s, []
+    for _ in range(300):
+        vehicle.run(0.004)
+        values.append((vehicle.time_s - begun_s, axis_deg()))
+    return next(t for t, v in values if v >= 0.63 * target), max(v for _, v in values)
+
+
+def test_a_step_of_ten_degrees_as_measured() -> None:
+    """t63 .20-.21 s, peak 10.1 degrees."""
+    vehicle = flying()
+    vehicle.run(0.5, lambda: vehicle.attitude(LEVEL, HOVER))
+    vehicle.attitude(roll(10.0), HOVER)
+    t63_s, peak_deg = step_times(vehicle, lambda: roll_deg(vehicle), 10.0)
+    assert t63_s == pytest.approx(0.205, abs=0.025)
+    assert peak_deg == pytest.approx(10.1, abs=0.15)
+
+
+def test_the_echo_is_the_demand_before_the_boost() -> None:
+    vehicle = flying()
+    vehicle.command(511, 83, 20_000)
+    vehicle.run(1.0, lambda: vehicle.attitude(roll(30.0), HOVER))
+    _, echo = vehicle.of("ATTITUDE_TARGET")[-1]
+    assert echo.type_mask == 0
+    assert echo.thrust == pytest.approx(HOVER, abs=1e-6)
+    assert echo.q == pytest.approx(roll(30.0), abs=1e-6)
+
+
+# -- parameters ------------------------------------------------------------------------------
+
+
+def test_parameters_carry_values_whatever_their_type() -> None:
+    vehicle = bench()
+    for name, sent in (("GUID_OPTIONS", 8.6), ("GUID_TIMEOUT", 50.0), ("DISARM_DELAY", 1.1e-44)):
+        set_parameter(vehicle, name, sent)
+    set_parameter(vehicle, "GUID_TIMEOUT", NAN)
+    set_parameter(vehicle, "NO_SUCH", 1.0)
+    vehicle.run(0.1)
+    told = [(m.param_id, m.param_value, m.param_type, m.param_index)
+            for _, m in vehicle.of("PARAM_VALUE")]  # fmt: skip
+    assert told[:3] == [
+        ("GUID_OPTIONS", 8.0, 6, 65535),
+        ("GUID_TIMEOUT", 50.0, 9, 65535),
+        ("DISARM_DELAY", 0.0, 2, 65535),
+    ]
+    assert all(name != "NO_SUCH" for name, *_ in told)
+
+
+def test_the_list_is_numbered() -> None:
+    vehicle = bench()
+    vehicle.send(mavlink.MAVLink_param_request_list_message(1, 1))
+    vehicle.run(1.0)
+    told = [m for _, m in vehicle.of("PARAM_VALUE")]
+    assert [m.param_index for m in told] == list(range(len(ARDUPILOT.parameters)))
+    assert {m.param_count for m in told} == {len(ARDUPILOT.parameters)}
+    assert {m.param_type for m in told} == {2, 4, 6, 9}
+
+
+def test_two_vehicles_of_one_seed_say_the_same_bytes() -> None:
+    said = []
+    for _ in range(2):
+        vehicle = Bench(
+            EstimatorName.ARDUPILOT_LIKE, seed=5, firmware=ARDUPILOT, boot_scale=BOOT_SCALE
+        )
+        for message, period_us in itertools.product((31, 32, 108), (20_000,)):
+            vehicle.command(511, message, period_us)
+        vehicle.run(6.0)
+        said.append(bytes(vehicle.raw))
+    assert len(said[0]) > 10_000
+    assert said[0] == said[1]
