@@ -69,13 +69,17 @@ class PredictedState:
 class Situation:
     """All a controller may know. `time_s` is the vehicle time of the tick; the reference's time
     axis is vehicle time too. `previous` is the command in force; `deadline_s` is the time budget
-    of this decision in seconds (None: unbounded, as in lockstep)."""
+    of this decision in seconds (None: unbounded, as in lockstep). `origin_ned_m` is the take-off
+    point, which references and keep-out volumes are given relative to; `track_time_s` the time on
+    the reference's own axis, NaN before it is joined."""
 
     time_s: float
     state: PredictedState
     reference: Reference
     previous: Command
     deadline_s: float | None = None
+    origin_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    track_time_s: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +88,8 @@ class Certificate:
 
     `cost` is J of the chosen input, `optimal_cost` J of the exact minimiser in the same box
     (daqp), `gap` their relative difference (J - J*) / max(|J*|, tiny), `spread` epsilon of
-    Eq. 29. NaN where a controller has no such figure.
+    Eq. 29, `seed_cost` J of the best plan that the search started from. NaN where a controller
+    has no such figure.
     """
 
     cost: float = float("nan")
@@ -95,6 +100,7 @@ class Certificate:
     cut_short: bool = False
     solve_time_s: float = float("nan")
     at_bound: bool = False
+    seed_cost: float = float("nan")
 
 
 @dataclass(frozen=True, slots=True)

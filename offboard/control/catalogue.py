@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from offboard.control.base import Controller
+from offboard.control.horizon.law import HorizonLaw, HorizonSettings, Method
 from offboard.control.mpc import MpcLaw, MpcSettings
 from offboard.control.paper import PaperController
 from offboard.control.paper_law import PaperSettings
@@ -38,6 +39,24 @@ class Mpc(MpcSettings):
     law: Literal["mpc"]
 
 
+class Horizon(HorizonSettings):
+    """N steps of nonlinear roll-outs, limits and keep-out volumes, searched by the swarm."""
+
+    law: Literal["horizon"]
+
+
+class Mppi(HorizonSettings):
+    """The same roll-outs, searched by model predictive path integral control."""
+
+    law: Literal["mppi"]
+
+
+class Cem(HorizonSettings):
+    """The same roll-outs, searched by the cross-entropy method."""
+
+    law: Literal["cem"]
+
+
 class Pid(PidSettings):
     """Cascaded position and velocity loops with the same feed-forward and observer."""
 
@@ -50,12 +69,15 @@ class Paper(PaperSettings):
     law: Literal["paper"]
 
 
-Law = Pso | Lqr | Mpc | Pid | Paper
+Law = Pso | Lqr | Mpc | Horizon | Mppi | Cem | Pid | Paper
 ControllerConfig = Annotated[Law, Field(discriminator="law")]
 LAWS: Mapping[str, type[Parameters]] = {
     "pso": Pso,
     "lqr": Lqr,
     "mpc": Mpc,
+    "horizon": Horizon,
+    "mppi": Mppi,
+    "cem": Cem,
     "pid": Pid,
     "paper": Paper,
 }
@@ -80,6 +102,8 @@ def build(
             return TrackingLaw(vehicle, settings, Search.CLOSED_FORM, stopwatch)
         case Mpc():
             return MpcLaw(vehicle, settings, stopwatch)
+        case Horizon() | Mppi() | Cem():
+            return HorizonLaw(vehicle, settings, Method(settings.law), stopwatch)
         case Pid():
             return PidLaw(vehicle, settings, stopwatch)
         case Paper():

@@ -28,7 +28,15 @@ from offboard.flight.learning import RECORD_ID as IDENTIFIED_ID
 from offboard.flight.learning import RECORD_NAME as IDENTIFIED_NAME
 from offboard.flight.learning import Adoption, IdentifySettings, Learner
 from offboard.flight.mission import Mission
-from offboard.flight.phases import BEFORE_FLIGHT, ENDS, PHASE_CODES, TRACKING, ExitCode, Limits, Phase
+from offboard.flight.phases import (
+    BEFORE_FLIGHT,
+    ENDS,
+    PHASE_CODES,
+    TRACKING,
+    ExitCode,
+    Limits,
+    Phase,
+)
 from offboard.flight.readiness import Readiness
 from offboard.flight.record import RECORD_ID, RECORD_NAME, TickRecord, reference_record
 from offboard.flight.setpoint import LEVEL, clamp, usable
@@ -340,7 +348,15 @@ class Companion:
         assert reference is not None
         try:
             state = self._observer.predict(time_s)
-            situation = Situation(time_s, state, reference, self._command, self._deadline_s)
+            situation = Situation(
+                time_s,
+                state,
+                reference,
+                previous=self._command,
+                deadline_s=self._deadline_s,
+                origin_ned_m=self._mission.origin_ned_m,
+                track_time_s=self._mission.track_time_s(time_s),
+            )
             decision = self._controller.decide(situation)
             if not usable(decision.command):
                 raise DecisionError(f"unusable {decision.command}")

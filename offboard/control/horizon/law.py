@@ -1,0 +1,216 @@
+"""The predictive law over nonlinear roll-outs: `horizon` searches with the swarm, `mppi` and `cem`
+with theirs.
+
+The base of each search is the best of the seeds: the closed form flown to the end of the horizon,
+the exact plan of the linear problem, and the previous plan's tail. The swarm's answer is never
+worse than any of them. Knows no autopilot and reads no clock.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from enum import StrEnum
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+
+from offboard.control.base import Certificate, DecisionError, Situation
+from offboard.control.certificate import ExactMinimum, certify
+from offboard.control.cost import BoxQuadratic
+from offboard.control.horizon.keep_out import KeepOut, pack, placed_at
+from offboard.control.horizon.outlook import bounds, look_ahead
+from offboard.control.horizon.quadratic import HorizonQuadratic
+from offboard.control.horizon.roll_out import (
+    INPUTS,
+    STATE_SIZE,
+    plant_of,
+    scene_of,
+    start_state,
+)
+from offboard.control.horizon.sampling import SamplingSettings, cem, mppi
+from offboard.control.horizon.search import Evaluator, Found, Plan, polish, swarm
+from offboard.control.mpc import one_decision
+from offboard.control.response import lateral_cost_to_go
+from offboard.control.swarm import RandomLanes, SwarmResult, SwarmSettings
+from offboard.control.tracking import Search, Target, TrackingLaw, TrackingSettings, errors
+from offboard.model.vehicle import Vehicle
+
+Array = NDArray[np.float64]
+
+HEAVE_REACH_MPS2 = 3.0  # of the knots of the vertical thrust
+
+
+class Method(StrEnum):
+    """Who searches the knots."""
+
+    SWARM = "horizon"
+    MPPI = "mppi"
+    CEM = "cem"
+
+
+class Dynamics(StrEnum):
+    """What the roll-outs fly: thrust times direction, or its linear model about hover."""
+
+    NONLINEAR = "nonlinear"
+    LINEAR = "linear"
+
+
+class HorizonSettings(TrackingSettings):
+    """The tracking law's settings, `steps` decisions ahead, around `keep_out` with `clearance_m`
+    to spare and at most `speed_limit_mps` (none: unlimited). `seed_with_qp`: whether the linear
+    problem's exact plan is a seed; `polish_steps` bounds the Newton steps on the swarm's answer.
+    """
+
+    steps: int = Field(default=10, ge=2, le=40)
+    dynamics: Dynamics = Dynamics.NONLINEAR
+    keep_out: tuple[KeepOut, ...] = ()
+    clearance_m: float = Field(default=0.3, ge=0, le=50)
+    speed_limit_mps: float | None = Field(default=None, gt=0, le=50)
+    seed_with_qp: bool = True
+    polish_steps: int = Field(default=4, ge=0, le=50)
+    swarm: SwarmSettings = SwarmSettings(iterations=60, damping=0.8)
+    sampling: SamplingSettings = SamplingSettings()
+
+
+class HorizonLaw(TrackingLaw):
+    """The controllers `horizon`, `mppi` and `cem`."""
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        settings: HorizonSettings | None = None,
+        method: Method = Method.SWARM,
+        stopwatch: Callable[[], float] | None = None,
+    ) -> None:
+        self._plans = settings or HorizonSettings()
+        self._method = method
+        self._volumes = pack(self._plans.keep_out)
+        self._evaluate = Evaluator(self._plans.steps)
+        self._planner = ExactMinimum(INPUTS * self._plans.steps)
+        super().__init__(vehicle, self._plans, Search.SWARM, stopwatch)
+        self.previous: tuple[float, Plan] | None = None
+        self._start_over()
+
+    def adopt(
+        self, vehicle: Vehicle, bandwidth_limit_radps: float = math.inf, *, gains: bool = True
+    ) -> None:
+        super().adopt(vehicle, bandwidth_limit_radps, gains=gains)
+        if not gains:
+            return
+        plans = self._plans
+        bandwidth = min(plans.bandwidth_radps, bandwidth_limit_radps)
+        self._quadratic = HorizonQuadratic(self.lateral, self.vertical, plans.steps)
+        self._plant = plant_of(
+            vehicle,
+            self.lateral,
+            self.vertical,
+            plans.period_s,
+            half=lateral_cost_to_go(vehicle, bandwidth, 0.5 * plans.period_s),
+            nonlinear=plans.dynamics is Dynamics.NONLINEAR,
+            thrust_mps2=(plans.thrust_floor * vehicle.gravity_mps2, vehicle.thrust_max_mps2),
+            speed_limit_mps=plans.speed_limit_mps or math.inf,
+            clearance_m=plans.clearance_m,
+        )
+
+    def reset(self) -> None:
+        """Forget everything of the previous flight, the plan and the random streams included."""
+        super().reset()
+        self._start_over()
+
+    def answer(
+        self,
+        situation: Situation,
+        target: Target,
+        problem: BoxQuadratic,
+        remaining_s: Callable[[], float] | None,
+    ) -> tuple[Array, Certificate]:
+        """The first input of the best plan found."""
+        linear = self._settle(situation, target, problem)
+        seeds = self._seeds(situation.time_s, linear)
+        base = min(seeds, key=lambda plan: plan.cost)
+        if not math.isfinite(base.cost):
+            raise DecisionError("no plan of the horizon has a finite cost")
+        found = self._find(base, remaining_s)
+        self.previous = (situation.time_s, found.plan)
+        certificate = self._certificate(found, linear)
+        certificate = replace(certificate, seed_cost=base.cost)
+        upright = float(situation.state.thrust_direction_ned[2])
+        return one_decision(found.plan.inputs[0], upright, target, problem), certificate
+
+    def _start_over(self) -> None:
+        self.previous = None
+        self._generator = np.random.default_rng(self._plans.seed)
+        self._lanes = RandomLanes(self._plans.seed)
+
+    def _settle(self, situation: Situation, target: Target, problem: BoxQuadratic) -> BoxQuadratic:
+        """Prepare the roll-outs of this situation; the linear problem that comes with it."""
+        state, plans = situation.state, self._plans
+        ahead = look_ahead(self._vehicle, situation.reference, state, plans.period_s, plans.steps)
+        limit = min(plans.tilt_limit, math.sin(self._vehicle.tilt_max_rad))
+        thrusts = (float(problem.lower[0]), float(problem.upper[0]))
+        upright = float(state.thrust_direction_ned[2])
+        within = bounds(ahead, upright, limit, plans.feedback_limit, thrusts)
+        delay_s = state.time_s - situation.time_s
+        volumes = placed_at(
+            self._volumes,
+            np.array(situation.origin_ned_m, np.float64),
+            situation.track_time_s + delay_s,
+        )
+        scene = scene_of(ahead, within, volumes)
+        lateral, vertical = errors(state, target)
+        self._evaluate.settle(self._plant, scene, start_state(lateral, vertical, scene))
+        return self._quadratic.problem(lateral, vertical, within)
+
+    def _seeds(self, time_s: float, linear: BoxQuadratic) -> list[Plan]:
+        """The closed form, the linear problem's exact plan and the previous plan's tail."""
+        steps = self._plans.steps
+        inputs, states = np.zeros((steps, INPUTS)), np.zeros((steps + 1, STATE_SIZE))
+        seeds = [self._evaluate.held(inputs, states)]
+        if self._method is Method.SWARM and self._plans.seed_with_qp:
+            exact = self._planner.minimise(linear)
+            if np.isfinite(exact).all():
+                sequence = np.ascontiguousarray(self._quadratic.plan(exact)[:, :, None])
+                self._evaluate.of_inputs(sequence)
+                seeds.append(self._evaluate.picked(1, 0))
+        if self.previous is not None:
+            gone = round((time_s - self.previous[0]) / self._plans.period_s)
+            if 0 <= gone < steps:
+                before = self.previous[1]
+                inputs[: steps - gone] = before.inputs[gone:]
+                states[: steps - gone + 1] = before.states[gone:]
+                seeds.append(self._evaluate.held(inputs, states))
+        return seeds
+
+    def _find(self, base: Plan, remaining_s: Callable[[], float] | None) -> Found:
+        plans, evaluate = self._plans, self._evaluate
+        reach = np.full((evaluate.knots.shape[1], INPUTS), plans.feedback_limit)
+        reach[:, 2] = HEAVE_REACH_MPS2
+        if self._method is not Method.SWARM:
+            sample = mppi if self._method is Method.MPPI else cem
+            return sample(evaluate, base, reach, plans.sampling, self._generator, remaining_s)
+        found = swarm(evaluate, base, reach, plans.swarm, self._lanes, remaining_s)
+        better, late = polish(
+            evaluate, found.plan, self._quadratic.hessian, plans.polish_steps, remaining_s
+        )
+        return replace(found, plan=better, cut_short=found.cut_short or late)
+
+    def _certificate(self, found: Found, linear: BoxQuadratic) -> Certificate:
+        """Against the exact plan where the problem is a quadratic: nothing nonlinear in it."""
+        plan, plans = found.plan, self._plans
+        if plans.dynamics is Dynamics.LINEAR and not plans.keep_out and not plans.speed_limit_mps:
+            stacked = plan.inputs.T.ravel()
+            result = SwarmResult(
+                stacked, plan.cost, found.spread, found.iterations, found.cut_short
+            )
+            return certify(linear, result, self._planner)
+        lower, upper = self._evaluate.lower[0], self._evaluate.upper[0]
+        return Certificate(
+            cost=plan.cost,
+            spread=found.spread,
+            iterations=found.iterations,
+            cut_short=found.cut_short,
+            at_bound=bool(((plan.inputs[0] <= lower) | (plan.inputs[0] >= upper)).any()),
+        )

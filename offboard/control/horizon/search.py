@@ -1,0 +1,182 @@
+"""Searches for the knots of a plan, and the polish of what they find.
+
+A plan is a base (inputs and the states they lead to), held by the closed form's feedback, plus a
+few knots interpolated over its steps. The searches know it only through `Evaluator`, which runs
+the roll-outs; `swarm`, `mppi` and `cem` spend the same number of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.control.horizon.roll_out import INPUTS, STATE_SIZE, Plant, Scene, roll_out
+from offboard.control.swarm import RandomLanes, Swarm, SwarmSettings
+
+Array = NDArray[np.float64]
+Remaining = Callable[[], float] | None
+
+# Steps of the knots: dense where the next command is, sparse where it will be decided again
+KNOT_SHARES = (0.0, 0.15, 0.4, 0.8)
+DIFFERENCE = 1e-4  # for slopes, by central differences: exact on a quadratic
+STRIDES = 2.0 ** -np.arange(0.0, 12.0)
+
+
+@dataclass(frozen=True, slots=True)
+class Plan:
+    """Inputs (N, 3), the states (N + 1, STATE_SIZE) they lead to, and the cost."""
+
+    inputs: Array
+    states: Array
+    cost: float
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """The plan a search ended with and how."""
+
+    plan: Plan
+    spread: float
+    iterations: int
+    cut_short: bool
+
+
+def knot_weights(steps: int) -> Array:
+    """(N, M): linear between knots, held after the last one."""
+    places = sorted({round(share * (steps - 1)) for share in KNOT_SHARES})
+    weights = np.zeros((steps, len(places)))
+    for step in range(steps):
+        for m in range(len(places)):
+            unit = np.zeros(len(places))
+            unit[m] = 1.0
+            weights[step, m] = np.interp(step, places, unit)
+    return weights
+
+
+class Evaluator:
+    """Runs roll-outs of one situation; arrays are made once per number of particles."""
+
+    def __init__(self, steps: int) -> None:
+        self.steps = steps
+        self.knots = knot_weights(steps)
+        self._each_step = np.eye(steps)
+        self._arrays: dict[int, tuple[Array, Array, Array]] = {}
+        self._no_states = np.zeros((steps + 1, STATE_SIZE))
+
+    def settle(self, plant: Plant, scene: Scene, start: Array) -> None:
+        """The situation of the roll-outs that follow."""
+        self._plant, self._scene, self._start = plant, scene, start
+
+    @property
+    def lower(self) -> Array:
+        return self._scene.lower
+
+    @property
+    def upper(self) -> Array:
+        return self._scene.upper
+
+    def of_knots(self, base: Plan, knots: Array) -> Array:
+        """Costs (n,) of knots (M, 3, n) about `base`; a plan is read with `picked`."""
+        return self._run(base.inputs, base.states, 1.0, self.knots, knots)
+
+    def of_inputs(self, inputs: Array) -> Array:
+        """Costs (n,) of input sequences (N, 3, n), clipped to the bounds."""
+        nothing = np.zeros((self.steps, INPUTS))
+        return self._run(nothing, self._no_states, 0.0, self._each_step, inputs)
+
+    def held(self, inputs: Array, states: Array) -> Plan:
+        """What becomes of inputs (N, 3) with the feedback that holds states (N + 1, .)."""
+        none = np.zeros((self.knots.shape[1], INPUTS, 1))
+        self._run(inputs, states, 1.0, self.knots, none)
+        return self.picked(1, 0)
+
+    def picked(self, count: int, index: int) -> Plan:
+        """Plan `index` of the last roll-outs with `count` particles."""
+        states, inputs, costs = self._arrays[count]
+        return Plan(inputs[:, :, index].copy(), states[:, :, index].copy(), float(costs[index]))
+
+    def _run(
+        self, inputs: Array, states: Array, feedback: float, weights: Array, knots: Array
+    ) -> Array:
+        count = knots.shape[2]
+        if count not in self._arrays:
+            self._arrays[count] = (
+                np.empty((self.steps + 1, STATE_SIZE, count)),
+                np.empty((self.steps, INPUTS, count)),
+                np.empty(count),
+            )
+        arrays = self._arrays[count]
+        roll_out(
+            self._plant, self._scene, self._start, inputs, states, feedback, weights, knots, *arrays
+        )
+        return arrays[2]
+
+
+def swarm(
+    evaluate: Evaluator,
+    base: Plan,
+    reach: Array,
+    settings: SwarmSettings,
+    lanes: RandomLanes,
+    remaining_s: Remaining,
+) -> Found:
+    """Particles of knots within +-reach (M, 3) of `base`; the first one stands on it, and so
+    the answer is never worse."""
+    limit = reach.ravel()
+    particles = Swarm(-limit, limit, settings, lanes, [np.zeros_like(limit)])
+    shape = (*reach.shape, settings.particles)
+    best, cut_short = base, False
+    for iteration in range(settings.iterations):
+        knots = np.ascontiguousarray(particles.ask().T).reshape(shape)
+        costs = evaluate.of_knots(base, knots)
+        first = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+        if costs[first] < best.cost:
+            best = evaluate.picked(settings.particles, first)
+        particles.tell(costs)
+        if remaining_s is not None and remaining_s() <= 0 and iteration + 1 < settings.iterations:
+            cut_short = True
+            break
+    result = particles.result(cut_short)
+    return Found(best, result.spread, result.iterations, cut_short)
+
+
+def polish(
+    evaluate: Evaluator, plan: Plan, hessian: Array, most: int, remaining_s: Remaining
+) -> tuple[Plan, bool]:
+    """Projected Newton steps on all inputs of `plan`, with the slope of its roll-outs and the
+    curvature (3 N, 3 N) of the linear problem; whether time ran out."""
+    lower, upper = evaluate.lower.T.ravel(), evaluate.upper.T.ravel()
+    size = len(lower)
+    for _ in range(most):
+        if remaining_s is not None and remaining_s() <= 0:
+            return plan, True
+        here = plan.inputs.T.ravel()
+        probes = np.repeat(here[:, None], 2 * size, axis=1)
+        probes[np.arange(size), np.arange(size)] += DIFFERENCE
+        probes[np.arange(size), size + np.arange(size)] -= DIFFERENCE
+        costs = evaluate.of_inputs(_sequences(probes)).copy()
+        width = np.minimum(here + DIFFERENCE, upper) - np.maximum(here - DIFFERENCE, lower)
+        slope = (costs[:size] - costs[size:]) / np.maximum(width, 1e-9)
+        bound = ((here <= lower) & (slope > 0)) | ((here >= upper) & (slope < 0))
+        free = ~bound & np.isfinite(slope)
+        step = np.zeros(size)
+        step[free] = np.linalg.solve(hessian[np.ix_(free, free)], -slope[free])
+        tried = np.clip(here[:, None] + STRIDES * step[:, None], lower[:, None], upper[:, None])
+        costs = evaluate.of_inputs(_sequences(tried))
+        first = int(np.argmin(costs))
+        if not costs[first] < plan.cost:
+            return plan, False
+        gained = plan.cost - float(costs[first])
+        plan = evaluate.picked(len(STRIDES), first)
+        if gained < 1e-9 * abs(plan.cost):
+            return plan, False
+    return plan, False
+
+
+def _sequences(stacked: Array) -> Array:
+    """(3 N, n) of the quadratic's order to (N, 3, n)."""
+    size, count = stacked.shape
+    return np.ascontiguousarray(stacked.reshape(INPUTS, size // INPUTS, count).transpose(1, 0, 2))
