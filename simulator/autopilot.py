@@ -23,9 +23,13 @@ from simulator.firmware.base import (
     Rule,
     Say,
 )
+from simulator.geodesy import to_metres
+from simulator.mission import GLOBAL_FRAMES, RELATIVE_FRAMES, Mission
 from simulator.parameters import ParameterTable
 from simulator.pilot import Nav, Pilot
 from simulator.plant import STEP_S, Plant, Truth
+
+_POSITION_IGNORED, _LOCAL_NED = 0b111, 1  # type_mask; MAV_FRAME
 
 
 class Autopilot:
@@ -36,13 +40,15 @@ class Autopilot:
         firmware: Firmware,
         plant: Plant,
         parameters: ParameterTable | None = None,
+        mission: Mission | None = None,
         *,
         boot_scale: float = 1.0,
     ) -> None:
         self.firmware = firmware
         self.plant = plant
         self.parameters = parameters or ParameterTable(firmware)
-        self.pilot = Pilot(firmware, self.parameters)
+        self.mission = mission or Mission(firmware.origin)
+        self.pilot = Pilot(firmware, self.parameters, self.mission)
         self.mode: Mode = firmware.modes[firmware.boot_mode]
         self.intended = self.remembered = firmware.boot_mode
         self.armed = self.failsafe = self.faulty = False
@@ -90,6 +96,8 @@ class Autopilot:
             after_s = firmware.healthy_after_s
         waits = firmware.setpoint_mode_needs_stream and mode.behaviour is Behaviour.SETPOINT
         booted = self.time_s >= after_s * self.boot_scale and not self.faulty
+        if mode.behaviour is Behaviour.MISSION:
+            return booted and self.mission.flyable
         return booted and (self.stream_alive or not waits)
 
     @property
@@ -141,6 +149,10 @@ class Autopilot:
                 return rule.result
         return Result.ACCEPTED
 
+    def knows(self, event: str) -> bool:
+        """Whether the firmware has rules for an event."""
+        return event in self._rules
+
     def _wish(self, event: str, mode: str) -> str:
         by_setpoint = event == "mode" and self.firmware.modes[mode].behaviour is Behaviour.SETPOINT
         return "offboard" if by_setpoint else event
@@ -155,7 +167,32 @@ class Autopilot:
         if self._obeys_setpoints and (
             self.mode.needs_position or self.firmware.setpoints_outlive_modes
         ):
-            self._obey(self.firmware.motion_setpoint(values))
+            local = self.firmware.in_local_frame(values, self.look().attitude)
+            self._obey_motion("SET_POSITION_TARGET_LOCAL_NED", local)
+
+    def obey_global_motion(self, values: Mapping[str, Any]) -> None:
+        """Fields of SET_POSITION_TARGET_GLOBAL_INT."""
+        if not self._obeys_setpoints:
+            return
+        frame, given = values["coordinate_frame"], not values["type_mask"] & _POSITION_IGNORED
+        if frame in GLOBAL_FRAMES:
+            z = self.firmware.origin[2] - values["alt"]
+        elif frame in RELATIVE_FRAMES:
+            z = self.pilot.home_ned_m[2] - values["alt"]
+        else:
+            z = math.nan
+        x, y = to_metres(self.firmware.origin, values["lat_int"] * 1e-7, values["lon_int"] * 1e-7)
+        known = {} if math.isnan(z) else {"coordinate_frame": _LOCAL_NED}
+        mask = values["type_mask"] if given else values["type_mask"] | _POSITION_IGNORED
+        local = {**values, **known, "x": x, "y": y, "z": z, "type_mask": mask}
+        self._obey_motion("SET_POSITION_TARGET_GLOBAL_INT", local)
+
+    def _obey_motion(self, message: str, values: Mapping[str, Any]) -> None:
+        setpoint = self.firmware.motion_setpoint(values)
+        if setpoint is None:
+            complaint = self.firmware.motion_complaint(message, values)
+            self.texts += () if complaint is None else (complaint,)
+        self._obey(setpoint)
 
     @property
     def _obeys_setpoints(self) -> bool:
@@ -229,6 +266,10 @@ class Autopilot:
             self.happen("landed")
         if self.pilot.climbed:
             self.happen("climbed")
+        if self.pilot.events:
+            events, self.pilot.events[:] = tuple(self.pilot.events), ()
+            for event in events:
+                self.happen(event)
         if self.landed and self._flown:
             self._expire("settled", self._landed_s, "disarm_landed_s")
         elif not self._flown:
@@ -267,8 +308,20 @@ class Autopilot:
             self._enter(target, by_failsafe="failsafe" in rule.do, takeoff_z_m=takeoff_z_m)
         title = self.firmware.modes[asked].title if asked else self.mode.title
         for say in (*((rule.say,) if rule.say else ()), *rule.also):
-            self.texts.append(Say(say.severity, say.text.format(mode=title)))
+            self.texts.append(Say(say.severity, say.text.format(mode=title, **self._figures)))
         self.announcements += rule.send
+
+    @property
+    def _figures(self) -> dict[str, float]:
+        """What texts may name."""
+        above_home_m = self.pilot.target_height_m
+        amsl_m = self.firmware.origin[2] - self.pilot.home_ned_m[2] + above_home_m
+        return {
+            "takeoff_m": self.parameters.role("takeoff_height_m"),
+            "climb_m": self.mission.climb_m,
+            "target_m": above_home_m,
+            "target_amsl_m": amsl_m,
+        }
 
     def _enter(self, name: str, *, by_failsafe: bool, takeoff_z_m: float) -> None:
         mode = self.firmware.modes[name]
@@ -308,6 +361,8 @@ class Autopilot:
         mode = self.firmware.modes[self._requested]
         if mode.behaviour is Behaviour.SETPOINT:
             return self.stream_alive
+        if mode.behaviour is Behaviour.MISSION:
+            return self.mission.flyable
         return not mode.needs_sticks
 
     def _arm(self) -> None:
@@ -333,6 +388,7 @@ GUARDS: dict[str, Callable[[Autopilot], bool]] = {
     "mode arms": lambda autopilot: autopilot.mode.arms,
     "faulty": lambda autopilot: autopilot.faulty,
     "position missing": Autopilot._position_missing,
+    "mission missing": lambda autopilot: not autopilot.mission.flyable,
     "climb asked": Autopilot._climb_asked,
     "climbing": lambda autopilot: autopilot.pilot.behaviour is Behaviour.TAKEOFF,
     "obeys attitude": lambda autopilot: autopilot.pilot.obeys_attitude,

@@ -87,6 +87,20 @@ class Commands:
     def _return(self, _: Command) -> Result:
         return self.link.view.autopilot.happen("return")
 
+    def _start_mission(self, command: Command) -> Result:
+        autopilot = self.link.view.autopilot
+        first = command.params[0]
+        if not autopilot.knows("mission"):
+            return Result.UNSUPPORTED
+        if not -1 <= first < max(1, len(autopilot.mission.items)):
+            return Result.DENIED
+        return autopilot.happen("mission")
+
+    def _set_current_item(self, command: Command) -> Result:
+        number = command.params[0]
+        known = math.isfinite(number) and self.link.view.autopilot.mission.go_to(int(number))
+        return Result.ACCEPTED if known else Result.DENIED
+
     def _set_interval(self, command: Command) -> Result:
         number, interval_us = command.params[:2]
         streams = self.link.view.autopilot.firmware.streams
@@ -134,6 +148,8 @@ HANDLERS: dict[int, Callable[[Commands, Command], Result]] = {
     21: Commands._land,
     22: Commands._takeoff,
     176: Commands._set_mode,
+    224: Commands._set_current_item,
+    300: Commands._start_mission,
     400: Commands._arm_disarm,
     410: Commands._request_home,
     510: Commands._get_interval,

@@ -145,7 +145,7 @@ class Instance:
         """The autopilot is gone for so long and starts anew; the vehicle goes on falling."""
         old = self.autopilot
         self.autopilot = Autopilot(
-            old.firmware, old.plant, old.parameters, boot_scale=old.boot_scale
+            old.firmware, old.plant, old.parameters, old.mission, boot_scale=old.boot_scale
         )
         self.autopilot.pilot.landed = old.truth.on_ground
         self.view.restart(self.autopilot)

@@ -18,6 +18,7 @@ from simulator.firmware.base import (
     Quaternion,
     Triple,
 )
+from simulator.mission import Mission
 from simulator.parameters import ParameterTable
 from simulator.plant import Demand
 from simulator.position_loop import PositionLoop
@@ -29,6 +30,7 @@ _ARRIVED_M = 1.0
 _STICK_LESS_THRUST = 0.08  # MPC_MANTHR_MIN
 _TILT_BOOST_MAX = 10.0
 _LOW_THRUST_SHARE = 0.6  # of hover: less cannot lift
+_LIFTING = frozenset({Behaviour.TAKEOFF, Behaviour.SETPOINT, Behaviour.MISSION})
 OFF = Demand()
 
 
@@ -52,10 +54,14 @@ class Nav:
 class Pilot:
     """Flies one behaviour at a time. `landed` is its land detector's verdict."""
 
-    def __init__(self, firmware: Firmware, parameters: ParameterTable) -> None:
+    def __init__(
+        self, firmware: Firmware, parameters: ParameterTable, mission: Mission | None = None
+    ) -> None:
         self._firmware = firmware
         self._parameters = parameters
         self._loop = PositionLoop(firmware.gains)
+        self.mission = mission or Mission(firmware.origin)
+        self.events = self.mission.events  # for the autopilot
         self.behaviour = Behaviour.HOLD
         self._hold: Triple = (0.0, 0.0, 0.0)
         self._takeoff_z_m = math.nan
@@ -78,6 +84,11 @@ class Pilot:
         self.thrust_demanded = 0.0  # before it is raised for the tilt
 
     @property
+    def target_height_m(self) -> float:
+        """Of what it holds or climbs to, above home."""
+        return self.home_ned_m[2] - self._hold[2]
+
+    @property
     def demand(self) -> Demand:
         """The demand in force."""
         return self._demand
@@ -96,6 +107,8 @@ class Pilot:
         self._next_loop_s = 0.0
         self._source = None
         self._loop.reset(nav.yaw_rad)
+        if behaviour is Behaviour.MISSION:
+            self.mission.begin(nav.position_ned_m, self.landed, self.home_ned_m)
 
     def arm(self, nav: Nav) -> None:
         """The motors begin to turn: home is here."""
@@ -122,7 +135,7 @@ class Pilot:
             if self.behaviour is Behaviour.LEVEL:
                 self._set(_level(self._loop.yaw_rad), None, _STICK_LESS_THRUST)
             elif setpoint is None:
-                self._fly_motion(nav)
+                self._fly_motion(nav, time_s)
             elif setpoint.climb_mps is not None or self._boosts_thrust:
                 self._fly_vertical(setpoint, nav)
             self._detect(nav)
@@ -199,14 +212,16 @@ class Pilot:
 
     # -- motion ------------------------------------------------------------------------------
 
-    def _fly_motion(self, nav: Nav) -> None:
-        lifting = self.behaviour in (Behaviour.TAKEOFF, Behaviour.SETPOINT)
+    def _fly_motion(self, nav: Nav, time_s: float) -> None:
+        lifting = self.behaviour in _LIFTING
         if self.landed and lifting and self._ramp_s < 0.0:
             self._hold = nav.position_ned_m
-        motion = self._motion(nav)
+        motion = self._motion(nav, time_s)
         cruise, up = math.inf, math.inf
         if self.behaviour is not Behaviour.SETPOINT:
             cruise = self._parameters.role("cruise_speed_mps")
+        if self.behaviour is Behaviour.MISSION:
+            cruise = min(cruise, self.mission.speed_mps)
         if self.behaviour is Behaviour.TAKEOFF:
             up = self._parameters.role("takeoff_speed_mps")
         hover = self._parameters.role("hover_thrust")
@@ -242,7 +257,7 @@ class Pilot:
         share = min(1.0, self._ramp_s / self._firmware.thrust_ramp_s)
         return _level(self._loop.yaw_rad), share * max(thrust, 1.2 * hover)
 
-    def _motion(self, nav: Nav) -> MotionSetpoint:
+    def _motion(self, nav: Nav, time_s: float) -> MotionSetpoint:
         hold_x, hold_y, hold_z = self._hold
         if self.behaviour is Behaviour.SETPOINT and isinstance(self.setpoint, MotionSetpoint):
             return self.setpoint
@@ -250,6 +265,8 @@ class Pilot:
             return self._takeoff(nav)
         if self.behaviour is Behaviour.RETURN:
             return self._return(nav)
+        if self.behaviour is Behaviour.MISSION:
+            return self._follow_mission(nav, time_s)
         if self.behaviour is Behaviour.LAND:
             return _sink(self._hold, self._land_speed(nav))
         if self.behaviour is Behaviour.DESCEND:
@@ -259,7 +276,9 @@ class Pilot:
     def _takeoff(self, nav: Nav) -> MotionSetpoint:
         target_z = self._takeoff_z_m
         if math.isnan(target_z):
-            target_z = self.home_ned_m[2] - self._parameters.role("takeoff_height_m")
+            target_z = nav.position_ned_m[2] - self._parameters.role("takeoff_height_m")
+            self._takeoff_z_m = target_z
+            self.events.append("default height")
         if nav.position_ned_m[2] < target_z + self._firmware.climbed_within_m:
             self.climbed = not self.landed
         self._hold = (self._hold[0], self._hold[1], target_z)
@@ -274,14 +293,22 @@ class Pilot:
             height = min(self._parameters.role("return_height_m"), distance)
             self._hold = (self._hold[0], self._hold[1], min(z, home_z - height))
             self._return_stage = 1
+            self.events.append("return begun")
         if self._return_stage == 1 and z < self._hold[2] + _ARRIVED_M:
             self._hold = (home_x, home_y, self._hold[2])
             self._return_stage = 2
         if self._return_stage == 2 and distance < _ARRIVED_M:
             self._return_stage = 3
+            self.events.append("return lands")
         if self._return_stage == 3:
             return _sink(self._hold, self._land_speed(nav))
         return MotionSetpoint(self._hold)
+
+    def _follow_mission(self, nav: Nav, time_s: float) -> MotionSetpoint:
+        motion = self.mission.fly(time_s, nav.position_ned_m, self.home_ned_m)
+        if self.mission.landing:
+            return _sink(motion.position_ned_m, self._land_speed(nav))
+        return motion
 
     def _land_speed(self, nav: Nav) -> float:
         height_m = self.home_ned_m[2] - nav.position_ned_m[2]

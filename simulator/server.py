@@ -12,6 +12,8 @@ from dataclasses import dataclass, field
 from simulator.codec import Decoder, Message, frame, layout
 from simulator.commands import Command, Commands
 from simulator.firmware.base import Say
+from simulator.mission_transfer import HANDLERS as MISSION_HANDLERS
+from simulator.mission_transfer import Transfer
 from simulator.telemetry import (
     MAV_COMP_ID_AUTOPILOT,
     ON_POSITION_GRID,
@@ -56,9 +58,11 @@ class Server:
     _text_id: int = 0
     _parameters_due: list[str] = field(default_factory=list)
     _commands: Commands = field(init=False)
+    _transfer: Transfer = field(init=False)
 
     def __post_init__(self) -> None:
         self._commands = Commands(self)
+        self._transfer = Transfer(self, self.view.autopilot.mission)
         self._start_streams()
 
     def _start_streams(self) -> None:
@@ -102,6 +106,8 @@ class Server:
     def step(self) -> None:
         """Queue the telemetry that is due at this step."""
         now_us = self._now_us
+        if self._transfer.uploading:
+            self._transfer.step(now_us * 1e-6)
         if self._parameters_due:
             for name in self._parameters_due[:PARAMETERS_PER_STEP]:
                 self.send_parameter(name, listed=True)
@@ -142,6 +148,7 @@ class Server:
         self._parameters_due = []
         self._streams = {}
         self._next_us = self._sequence = self._text_id = 0
+        self._transfer = Transfer(self, self.view.autopilot.mission)
         self._ground_station = False
         self._start_streams()
 
@@ -223,6 +230,12 @@ class Server:
     def _set_position_target(self, message: Message) -> None:
         self.view.autopilot.obey_motion(message.values)
 
+    def _set_global_position_target(self, message: Message) -> None:
+        self.view.autopilot.obey_global_motion(message.values)
+
+    def _mission(self, message: Message) -> None:
+        self._transfer.handle(message, self._now_us * 1e-6)
+
     def _timesync(self, message: Message) -> None:
         if message.tc1 == 0:
             self.send("TIMESYNC", self.view.time_us * 1000, message.ts1)
@@ -272,6 +285,8 @@ HANDLERS: dict[str, Callable[[Server, Message], None]] = {
     "COMMAND_INT": Server._command_int,
     "SET_ATTITUDE_TARGET": Server._set_attitude_target,
     "SET_POSITION_TARGET_LOCAL_NED": Server._set_position_target,
+    "SET_POSITION_TARGET_GLOBAL_INT": Server._set_global_position_target,
+    **dict.fromkeys(MISSION_HANDLERS, Server._mission),
     "TIMESYNC": Server._timesync,
     "PING": Server._ping,
     "PARAM_REQUEST_READ": Server._param_request_read,

@@ -14,9 +14,9 @@ from typing import Any
 from simulator.autopilot import Autopilot
 from simulator.codec import layout
 from simulator.firmware.base import MotionSetpoint, Quaternion, Triple
+from simulator.geodesy import EARTH_RADIUS_M
 from simulator.position_loop import GRAVITY_MPS2
 
-EARTH_RADIUS_M = 6_371_000.0
 _DEGREES_PER_M = math.degrees(1.0 / EARTH_RADIUS_M)
 ON_POSITION_GRID = frozenset(
     {"LOCAL_POSITION_NED", "ODOMETRY", "GLOBAL_POSITION_INT", "HIL_STATE_QUATERNION"}
@@ -381,6 +381,16 @@ def gps_global_origin(view: View) -> Sequence[Any]:
     return (*view.geodetic(0.0, 0.0), view.altitude_mm(0.0), view.time_us)
 
 
+def mission_current(view: View) -> Sequence[Any]:
+    """Number and count of items; PX4 has 65535 items when it has none, and leaves the rest 0."""
+    mission = view.autopilot.mission
+    return (mission.current, len(mission.items) or 65535, 0, 0)
+
+
+def mission_item_reached(view: View) -> Sequence[Any]:
+    return (max(0, view.autopilot.mission.reached),)
+
+
 def autopilot_version(view: View) -> Sequence[Any]:
     firmware = view.autopilot.firmware
     return (
@@ -414,6 +424,8 @@ BUILDERS: dict[str, Callable[[View], Sequence[Any]]] = {
         home_position,
         hil_state_quaternion,
         gps_global_origin,
+        mission_current,
+        mission_item_reached,
         autopilot_version,
     )
 }

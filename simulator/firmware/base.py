@@ -44,6 +44,7 @@ class Behaviour(Enum):
     TAKEOFF = "climbs to the takeoff height"
     LAND = "descends where it is and lands"
     RETURN = "flies home and lands"
+    MISSION = "flies the mission"
     DESCEND = "sinks slowly, as sticks that are not there ask for"
     LEVEL = "level, least throttle: sticks that are not there"
     SETPOINT = "obeys setpoints"
@@ -198,6 +199,14 @@ class PositionGains:
     derivative_cutoff_hz: float
 
 
+def as_given(values: Mapping[str, Any], _: Quaternion) -> Mapping[str, Any]:
+    return values
+
+
+def no_complaint(message: str, values: Mapping[str, Any]) -> Say | None:
+    return None
+
+
 @dataclass(frozen=True, slots=True)
 class Firmware:
     """A personality. Roles of parameters: `parameter_roles` maps what the core needs to names."""
@@ -251,3 +260,7 @@ class Firmware:
         [Mapping[str, Any], ReadParameter], AttitudeSetpoint | MotionSetpoint | None
     ]
     motion_setpoint: Callable[[Mapping[str, Any]], MotionSetpoint | None]
+    # a SET_POSITION_TARGET in another local frame, by the vehicle's attitude, in MAV_FRAME 1
+    in_local_frame: Callable[[Mapping[str, Any], Quaternion], Mapping[str, Any]] = as_given
+    # what is said about the named setpoint message when it demands nothing
+    motion_complaint: Callable[[str, Mapping[str, Any]], Say | None] = no_complaint

@@ -9,6 +9,9 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
+from offboard.model.frames import rotation_from_quaternion
 from simulator.firmware.base import (
     AttitudeSetpoint,
     Behaviour,
@@ -19,6 +22,7 @@ from simulator.firmware.base import (
     MotionSetpoint,
     ParameterSpec,
     PositionGains,
+    Quaternion,
     ReadParameter,
     Result,
     Role,
@@ -42,6 +46,7 @@ MODES = {
         Mode(
             "AUTO.RTL", "Return", 0x05040000, AUTO, Behaviour.RETURN, arms=False, remembered=False
         ),
+        Mode("AUTO.MISSION", "Mission", 0x04040000, AUTO, Behaviour.MISSION),
         Mode("OFFBOARD", "Offboard", 0x00060000, OFFBOARD, Behaviour.SETPOINT),
         Mode("POSCTL", "Position", 0x00030000, MANUAL, Behaviour.DESCEND, needs_sticks=True),
         Mode("ALTCTL", "Altitude", 0x00020000, MANUAL, Behaviour.DESCEND, needs_sticks=True),
@@ -104,6 +109,40 @@ RULES = (
     ),
     Rule("stream found", when=("failsafe",), to="remembered", do=("recover",)),
     Rule("climbed", "AUTO.TAKEOFF", to="AUTO.LOITER"),
+    Rule("default height", say=_info("Using default takeoff altitude: {takeoff_m:.1f} m")),
+    Rule(
+        "return begun",
+        say=_info(
+            "RTL: start return at {target_amsl_m:.0f} m ({target_m:.0f} m above destination)"
+        ),
+    ),
+    Rule("return lands", say=_info("RTL: land at destination")),
+    Rule(
+        "mission",
+        when=("mission missing",),
+        result=Result.DENIED,
+        say=_critical("Mission start denied! No valid mission"),
+    ),
+    Rule("mission", when=("armed",), to="AUTO.MISSION"),
+    Rule(
+        "mission",
+        when=("ready",),
+        do=("arm",),
+        to="AUTO.MISSION",
+        say=_info("Armed by mission start"),
+    ),
+    Rule(
+        "mission", result=_LATER, say=_critical("Switching to Mission is currently not available")
+    ),
+    Rule(
+        "mission climbs",
+        say=_info("Executing Mission"),
+        also=(_info("Climb to {climb_m:.1f} meters above home"),),
+    ),
+    Rule("mission progress", send=("MISSION_CURRENT",)),
+    Rule("item reached", send=("MISSION_ITEM_REACHED",)),
+    Rule("mission return", "AUTO.MISSION", to="AUTO.RTL", say=_info("Returning to launch")),
+    Rule("mission finished", say=_info("Mission finished, loitering")),
     Rule("took off", say=_info("Takeoff detected")),
     Rule("landed", say=_info("Landing detected")),
     Rule("settled", do=("disarm",), to="remembered", say=_info("Disarmed by landing")),
@@ -177,6 +216,7 @@ COMPANION_RATES_HZ = {
     "EXTENDED_SYS_STATE": 5.0,
     "ESTIMATOR_STATUS": 1.0,
     "SYSTEM_TIME": 1.0,
+    "MISSION_CURRENT": 1.0,
     "PING": 1.0,
     "BATTERY_STATUS": 0.5,
     "HOME_POSITION": 0.5,
@@ -196,6 +236,7 @@ GROUND_RATES_HZ = {
     "SYS_STATUS": 1.0,
     "EXTENDED_SYS_STATE": 1.0,
     "SYSTEM_TIME": 1.0,
+    "MISSION_CURRENT": 1.0,
     "ESTIMATOR_STATUS": 0.5,
     "BATTERY_STATUS": 0.5,
     "HOME_POSITION": 0.5,
@@ -204,7 +245,13 @@ GROUND_RATES_HZ = {
 
 # PX4_CUSTOM_MAIN_MODE, PX4_CUSTOM_SUB_MODE_AUTO
 _MAIN = {2: "ALTCTL", 3: "POSCTL", 6: "OFFBOARD", 7: "STABILIZED"}
-_AUTO_SUB = {2: "AUTO.TAKEOFF", 3: "AUTO.LOITER", 5: "AUTO.RTL", 6: "AUTO.LAND"}
+_AUTO_SUB = {
+    2: "AUTO.TAKEOFF",
+    3: "AUTO.LOITER",
+    4: "AUTO.MISSION",
+    5: "AUTO.RTL",
+    6: "AUTO.LAND",
+}
 _CUSTOM_MODE_ENABLED = 1
 
 
@@ -258,8 +305,46 @@ def attitude_setpoint(values: Mapping[str, Any], _: ReadParameter) -> AttitudeSe
     return AttitudeSetpoint(None, finite, thrust)
 
 
-_LOCAL_NED = 1  # MAV_FRAME
+_LOCAL_NED, _BODY_NED = 1, 8  # MAV_FRAME
 _YAW_IGNORED, _YAW_RATE_IGNORED = 1024, 2048
+
+
+def in_local_frame(values: Mapping[str, Any], attitude: Quaternion) -> Mapping[str, Any]:
+    """BODY_NED: velocity turned by the course, acceleration by the attitude, no position.
+
+    A vector is whole or ignored there.
+    """
+    if values["coordinate_frame"] != _BODY_NED:
+        return values
+    w, x, y, z = attitude
+    yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    ahead, aside = values["vx"], values["vy"]
+    turned = rotation_from_quaternion(np.array(attitude)) @ (
+        [values["afx"], values["afy"], values["afz"]]
+    )
+    mask = values["type_mask"] | 0b111
+    mask |= 0b111_000 if mask & 0b111_000 else 0
+    mask |= 0b111_000_000 if mask & 0b111_000_000 else 0
+    return {
+        **values,
+        "coordinate_frame": _LOCAL_NED,
+        "type_mask": mask,
+        "vx": math.cos(yaw) * ahead - math.sin(yaw) * aside,
+        "vy": math.sin(yaw) * ahead + math.cos(yaw) * aside,
+        "afx": float(turned[0]),
+        "afy": float(turned[1]),
+        "afz": float(turned[2]),
+    }
+
+
+def motion_complaint(message: str, values: Mapping[str, Any]) -> Say:
+    """About a setpoint that demands nothing."""
+    frame = values["coordinate_frame"]
+    if frame == _LOCAL_NED:
+        return _critical(f"{message} invalid")
+    if message.endswith("GLOBAL_INT"):
+        return _critical(f"{message} invalid coordinate frame {frame}")
+    return _critical(f"{message} coordinate frame {frame} unsupported")
 
 
 def motion_setpoint(values: Mapping[str, Any]) -> MotionSetpoint | None:
@@ -296,8 +381,9 @@ PX4 = Firmware(
     scenario="px4_like",
     mav_autopilot=12,
     version=0x011001FF,  # 1.16.1, release
-    # float parameters, COMMAND_INT, bytewise parameters, attitude and position targets, MAVLink 2
-    capabilities=0x20DA,
+    # float parameters, missions and commands in integers, bytewise parameters, targets of attitude,
+    # local and global position, MAVLink 2
+    capabilities=0x21DE,
     origin=(47.397742, 8.545594, 489.4),
     boot_mode="AUTO.LOITER",
     modes=MODES,
@@ -359,4 +445,6 @@ PX4 = Firmware(
     command_mode=command_mode,
     attitude_setpoint=attitude_setpoint,
     motion_setpoint=motion_setpoint,
+    in_local_frame=in_local_frame,
+    motion_complaint=motion_complaint,
 )

@@ -1,0 +1,208 @@
+"""A mission: its items, how far it has come, and where it wants the vehicle to be.
+
+Knows positions and time; knows no modes, no links and no protocol (`simulator.mission_transfer`).
+What it comes upon (an item reached, its end, a return asked for) it says as events.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from enum import IntEnum
+
+from simulator.firmware.base import NAN3, MotionSetpoint, Triple
+from simulator.geodesy import Origin, to_metres
+
+ITEMS_MAX = 500
+_ACCEPTED_M, _ACCEPTED_HEIGHT_M = 2.0, 0.8  # NAV_ACC_RAD of multicopters, NAV_MC_ALT_RAD
+
+
+class Kind(IntEnum):
+    """MAV_CMD, those that are flown; every other item is passed over."""
+
+    WAYPOINT = 16
+    LOITER_UNLIMITED = 17
+    LOITER_TIME = 19
+    RETURN = 20
+    LAND = 21
+    TAKEOFF = 22
+    DELAY = 93
+    CHANGE_SPEED = 178
+
+
+_PLACES = frozenset(
+    {Kind.WAYPOINT, Kind.LOITER_UNLIMITED, Kind.LOITER_TIME, Kind.LAND, Kind.TAKEOFF}
+)
+_WAITS = frozenset({Kind.WAYPOINT, Kind.LOITER_TIME, Kind.DELAY})
+GLOBAL_FRAMES = frozenset({0, 5})  # MAV_FRAME, altitude above sea level
+RELATIVE_FRAMES = frozenset({3, 6})  # above home
+
+
+@dataclass(frozen=True, slots=True)
+class Item:
+    """One item as it was uploaded: x and y in 1e-7 deg, z in m, of `frame`."""
+
+    frame: int
+    command: int
+    params: tuple[float, float, float, float]
+    x: int
+    y: int
+    z: float
+
+    @property
+    def is_place(self) -> bool:
+        return self.command in _PLACES
+
+    @property
+    def flyable(self) -> bool:
+        """A place needs a frame and finite coordinates."""
+        known = self.frame in GLOBAL_FRAMES | RELATIVE_FRAMES
+        return not self.is_place or (known and math.isfinite(self.z))
+
+
+@dataclass(slots=True)
+class Mission:
+    """Items and progress; `events` are for whoever flies it to take away."""
+
+    origin: Origin
+    items: tuple[Item, ...] = ()
+    current: int = 0
+    reached: int = -1
+    finished: bool = False
+    speed_mps: float = math.inf
+    climb_m: float = math.nan  # above home, of the climb it begins with
+    events: list[str] = field(default_factory=list)
+    _climb_to_z_m: float = math.nan  # first, from the ground, straight up to here
+    _since_s: float = math.nan  # when the current item's place was reached
+    _held: Triple = NAN3
+
+    @property
+    def flyable(self) -> bool:
+        return any(item.is_place or item.command == Kind.RETURN for item in self.items)
+
+    def replace(self, items: tuple[Item, ...]) -> None:
+        """Another mission, or none; from its beginning."""
+        self.items = items
+        self.current, self.reached, self.finished = 0, -1, False
+        self._since_s = math.nan
+
+    def go_to(self, number: int) -> bool:
+        """Continue with this item; False when there is none."""
+        if not 0 <= number < len(self.items):
+            return False
+        self.current, self.finished, self._since_s = number, False, math.nan
+        return True
+
+    def begin(self, position_ned_m: Triple, landed: bool, home_ned_m: Triple) -> None:
+        """Start, or continue where it was left; anew if it had come to its end."""
+        if self.finished:
+            self.go_to(0)
+        self.speed_mps = math.inf
+        self._held = position_ned_m
+        self._since_s = self._climb_to_z_m = math.nan
+        first = next((item for item in self.items[self.current :] if item.is_place), None)
+        if landed and first is not None and first.command != Kind.LAND:
+            self._climb_to_z_m = self._place(first, home_ned_m)[2]
+            self.climb_m = home_ned_m[2] - self._climb_to_z_m
+            self.events.append("mission climbs")
+
+    @property
+    def landing(self) -> bool:
+        """On the spot where it lands."""
+        return not math.isnan(self._since_s) and self._item_is(Kind.LAND)
+
+    def fly(self, now_s: float, position_ned_m: Triple, home_ned_m: Triple) -> MotionSetpoint:
+        """Where to be now. `landing` tells that the height is the pilot's affair."""
+        if not math.isnan(self._climb_to_z_m):
+            self._held = (self._held[0], self._held[1], self._climb_to_z_m)
+            if position_ned_m[2] < self._climb_to_z_m + _ACCEPTED_HEIGHT_M:
+                self._climb_to_z_m = math.nan
+            return MotionSetpoint(self._held)
+        self._pass_over()
+        if self.finished:
+            return MotionSetpoint(self._held)
+        item = self.items[self.current]
+        if item.is_place:
+            self._held = self._target(item, position_ned_m, home_ned_m)
+        if self._arrived(item, position_ned_m) and math.isnan(self._since_s):
+            self._since_s = now_s
+            self._note_reached()
+        if not math.isnan(self._since_s) and now_s - self._since_s >= self._stay_s(item):
+            self._advance()
+        return MotionSetpoint(self._held, yaw_rad=self._yaw(item))
+
+    # -- one item ----------------------------------------------------------------------------
+
+    def _item_is(self, kind: Kind) -> bool:
+        return self.current < len(self.items) and self.items[self.current].command == kind
+
+    def _pass_over(self) -> None:
+        """Items that are done at once, up to one that is flown, or to the end."""
+        while not self.finished:
+            if self.current >= len(self.items):
+                self._end("mission finished")
+                return
+            item = self.items[self.current]
+            if item.command == Kind.CHANGE_SPEED and item.params[1] > 0:
+                self.speed_mps = item.params[1]
+            elif item.command == Kind.RETURN:
+                self._end("mission return")
+                return
+            elif item.is_place or item.command == Kind.DELAY:
+                return
+            self._advance()
+
+    def _advance(self) -> None:
+        """To the next item, or to the end."""
+        self._since_s = math.nan
+        if self.current + 1 < len(self.items):
+            self.current += 1
+            self.events.append("mission progress")
+        else:
+            self._end("mission finished")
+
+    def _end(self, event: str) -> None:
+        self.finished = True
+        self.events.append(event)
+
+    def _note_reached(self) -> None:
+        self.reached = self.current
+        self.events.append("item reached")
+
+    def _place(self, item: Item, home_ned_m: Triple) -> Triple:
+        north, east = to_metres(self.origin, item.x * 1e-7, item.y * 1e-7)
+        if item.frame in RELATIVE_FRAMES:
+            return north, east, home_ned_m[2] - item.z
+        return north, east, self.origin[2] - item.z
+
+    def _target(self, item: Item, position_ned_m: Triple, home_ned_m: Triple) -> Triple:
+        north, east, down = self._place(item, home_ned_m)
+        nowhere = item.x == 0 and item.y == 0
+        if item.command == Kind.TAKEOFF or nowhere:
+            north, east = self._held[0], self._held[1]
+        if item.command == Kind.LAND:
+            down = position_ned_m[2] if self.landing else self._held[2]
+        return north, east, down
+
+    def _arrived(self, item: Item, position_ned_m: Triple) -> bool:
+        if not item.is_place:
+            return True
+        asked_m = item.params[1]
+        radius_m = asked_m if item.command == Kind.WAYPOINT and asked_m > 0 else _ACCEPTED_M
+        north, east, down = self._held
+        x, y, z = position_ned_m
+        near = math.hypot(x - north, y - east) < radius_m
+        return near and abs(z - down) < _ACCEPTED_HEIGHT_M
+
+    def _stay_s(self, item: Item) -> float:
+        if item.command in (Kind.LOITER_UNLIMITED, Kind.LAND):
+            return math.inf
+        asked_s = item.params[0] if item.command in _WAITS else 0.0
+        return asked_s if math.isfinite(asked_s) else 0.0
+
+    def _yaw(self, item: Item) -> float:
+        """Asked for; NaN keeps the course."""
+        asked_deg = item.params[3]
+        if item.command == Kind.WAYPOINT and math.isfinite(asked_deg):
+            return math.remainder(math.radians(asked_deg), 2.0 * math.pi)
+        return math.nan

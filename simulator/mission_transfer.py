@@ -1,0 +1,174 @@
+"""The mission protocol of one link: upload item by item, download, clear, current item.
+
+Knows messages and the mission's items; how a mission is flown is `simulator.mission`'s affair.
+Only missions are kept: fences and rally points are empty lists that take nothing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Protocol
+
+from simulator.codec import Message
+from simulator.mission import GLOBAL_FRAMES, ITEMS_MAX, RELATIVE_FRAMES, Item, Mission
+
+ASK_AGAIN_S, GIVE_UP_S = 0.25, 5.0
+_ANY_TYPE = 255
+_COMMAND_FRAME = 2  # MAV_FRAME_MISSION: no place
+
+
+class Ack(IntEnum):
+    """MAV_MISSION_RESULT, those in use."""
+
+    ACCEPTED = 0
+    ERROR = 1
+    UNSUPPORTED_FRAME = 2
+    UNSUPPORTED = 3
+    NO_SPACE = 4
+    INVALID_SEQUENCE = 13
+    CANCELLED = 15
+
+
+class Link(Protocol):
+    """What a transfer needs of the link it came by."""
+
+    def send(self, name: str, *values: object) -> None: ...
+    def send_now(self, name: str) -> None: ...
+
+
+@dataclass(slots=True)
+class Upload:
+    """Under way: from whom, what has come, when the next item was asked for."""
+
+    peer: tuple[int, int]
+    count: int
+    items: list[Item]
+    begun_s: float
+    asked_s: float
+
+
+@dataclass(slots=True)
+class Transfer:
+    link: Link
+    mission: Mission
+    _upload: Upload | None = None
+
+    @property
+    def uploading(self) -> bool:
+        return self._upload is not None
+
+    def handle(self, message: Message, now_s: float) -> None:
+        """One message of the mission protocol, addressed to us."""
+        HANDLERS[message.name](self, message, now_s)
+
+    def step(self, now_s: float) -> None:
+        """Ask again for an item that does not come; after a while no more."""
+        upload = self._upload
+        if upload is None:
+            return
+        if now_s - upload.begun_s > GIVE_UP_S:
+            self._acknowledge(upload.peer, Ack.CANCELLED)
+            self._upload = None
+        elif now_s - upload.asked_s > ASK_AGAIN_S:
+            self._ask(upload, now_s)
+
+    # -- up ----------------------------------------------------------------------------------
+
+    def _count(self, message: Message, now_s: float) -> None:
+        peer = (message.system, message.component)
+        if message.mission_type:
+            known = Ack.UNSUPPORTED if message.count else Ack.ACCEPTED
+            self._acknowledge(peer, known, message.mission_type)
+        elif message.count > ITEMS_MAX:
+            self._acknowledge(peer, Ack.NO_SPACE)
+        elif message.count == 0:
+            self.mission.replace(())
+            self._acknowledge(peer, Ack.ACCEPTED)
+        else:
+            self._upload = Upload(peer, message.count, [], now_s, now_s)
+            self._ask(self._upload, now_s)
+
+    def _ask(self, upload: Upload, now_s: float) -> None:
+        upload.asked_s = now_s
+        self.link.send("MISSION_REQUEST_INT", *upload.peer, len(upload.items), 0)
+
+    def _item(self, message: Message, now_s: float) -> None:
+        upload = self._upload
+        if upload is None or upload.peer != (message.system, message.component):
+            return
+        if message.seq != len(upload.items):  # one that came twice
+            return
+        item = _read(message)
+        known = GLOBAL_FRAMES | RELATIVE_FRAMES | {_COMMAND_FRAME}
+        if item.frame not in known or not item.flyable:
+            self._acknowledge(upload.peer, Ack.UNSUPPORTED_FRAME)
+            self._upload = None
+            return
+        upload.items.append(item)
+        upload.begun_s = now_s
+        if len(upload.items) < upload.count:
+            self._ask(upload, now_s)
+            return
+        self.mission.replace(tuple(upload.items))
+        self._upload = None
+        self._acknowledge(upload.peer, Ack.ACCEPTED)
+
+    def _acknowledge(self, peer: tuple[int, int], ack: Ack, kind: int = 0) -> None:
+        self.link.send("MISSION_ACK", *peer, int(ack), kind)
+
+    # -- down, and the rest ------------------------------------------------------------------
+
+    def _list(self, message: Message, _: float) -> None:
+        count = 0 if message.mission_type else len(self.mission.items)
+        peer = (message.system, message.component)
+        self.link.send("MISSION_COUNT", *peer, count, message.mission_type)
+
+    def _request(self, message: Message, _: float) -> None:
+        peer = (message.system, message.component)
+        if message.mission_type or message.seq >= len(self.mission.items):
+            self._acknowledge(peer, Ack.INVALID_SEQUENCE, message.mission_type)
+            return
+        item = self.mission.items[message.seq]
+        whole = message.name == "MISSION_REQUEST_INT"
+        places = (item.x, item.y) if whole else (item.x * 1e-7, item.y * 1e-7)
+        current = int(message.seq == self.mission.current)
+        head = (*peer, message.seq, item.frame, item.command, current, 1)
+        name = "MISSION_ITEM_INT" if whole else "MISSION_ITEM"
+        self.link.send(name, *head, *item.params, *places, item.z, 0)
+
+    def _clear(self, message: Message, _: float) -> None:
+        if message.mission_type in (0, _ANY_TYPE):
+            self.mission.replace(())
+        peer = (message.system, message.component)
+        self._acknowledge(peer, Ack.ACCEPTED, message.mission_type)
+
+    def _set_current(self, message: Message, _: float) -> None:
+        if self.mission.go_to(message.seq):
+            self.link.send_now("MISSION_CURRENT")
+
+
+def _read(message: Message) -> Item:
+    """MISSION_ITEM_INT, or MISSION_ITEM with its places in degrees."""
+    x, y = message.x, message.y
+    if message.name == "MISSION_ITEM":
+        x, y = (_whole(value * 1e7) for value in (x, y))
+    params = (message.param1, message.param2, message.param3, message.param4)
+    return Item(message.frame, message.command, params, x, y, message.z)
+
+
+def _whole(value: float) -> int:
+    return int(min(2e9, max(-2e9, value))) if value == value else 0
+
+
+HANDLERS: dict[str, Callable[[Transfer, Message, float], None]] = {
+    "MISSION_COUNT": Transfer._count,
+    "MISSION_ITEM": Transfer._item,
+    "MISSION_ITEM_INT": Transfer._item,
+    "MISSION_REQUEST_LIST": Transfer._list,
+    "MISSION_REQUEST": Transfer._request,
+    "MISSION_REQUEST_INT": Transfer._request,
+    "MISSION_CLEAR_ALL": Transfer._clear,
+    "MISSION_SET_CURRENT": Transfer._set_current,
+}

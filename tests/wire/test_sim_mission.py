@@ -1,0 +1,197 @@
+"""Missions: the protocol item by item, and what is flown of them."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from sim_bench import LOITER, NAN, RTL, Bench
+
+from simulator.firmware.px4 import PX4
+
+MISSION = 0x04040000
+WAYPOINT, LOITER_UNLIMITED, LOITER_TIME, RETURN, LAND, TAKEOFF, SPEED = 16, 17, 19, 20, 21, 22, 178
+RELATIVE_INT, COMMAND_FRAME = 6, 2
+Row = tuple[int, tuple[float, float, float, float], float, float, float]  # north, east, height m
+
+
+def place(command: int, north: float, east: float, up: float, *params: float) -> Row:
+    filled = (*params, *(NAN,) * (4 - len(params)))
+    return command, filled, north, east, up
+
+
+def act(command: int, *params: float) -> Row:
+    return command, (*params, *(0.0,) * (4 - len(params))), NAN, NAN, NAN
+
+
+def item(seq: int, row: Row, frame: int | None = None) -> object:
+    command, params, north, east, up = row
+    latitude, longitude, _ = PX4.origin
+    x = y = 0
+    if not math.isnan(north):
+        x = round((latitude + math.degrees(north / 6_371_000)) * 1e7)
+        shrink = math.cos(math.radians(latitude))
+        y = round((longitude + math.degrees(east / 6_371_000 / shrink)) * 1e7)
+    known = COMMAND_FRAME if math.isnan(up) else RELATIVE_INT
+    used = known if frame is None else frame
+    z = 0.0 if math.isnan(up) else up
+    return mavlink.MAVLink_mission_item_int_message(1, 1, seq, used, command, 0, 1, *params, x, y, z)
+
+
+def upload(bench: Bench, rows: list[Row]) -> int:
+    """The answer to a whole upload, item by item as it is asked for."""
+    bench.send(mavlink.MAVLink_mission_count_message(1, 1, len(rows)))
+    for seq, row in enumerate(rows):
+        bench.run(0.02)
+        assert bench.of("MISSION_REQUEST_INT")[-1][1].seq == seq
+        bench.send(item(seq, row))
+    bench.run(0.02)
+    return int(bench.of("MISSION_ACK")[-1][1].type)
+
+
+def reached(bench: Bench) -> list[int]:
+    return [m.seq for _, m in bench.of("MISSION_ITEM_REACHED")]
+
+
+ROUND = [
+    place(TAKEOFF, 0, 0, 4),
+    act(SPEED, 1, 2.0, -1, 0),
+    place(WAYPOINT, 12, 0, 4, 0, 1.0),
+    place(LOITER_TIME, 12, 6, 6, 3.0),
+    act(RETURN),
+]
+
+
+def test_a_mission_is_kept_as_it_was_sent_and_cleared() -> None:
+    bench = Bench()
+    bench.boot()
+    assert upload(bench, ROUND) == 0
+    bench.send(mavlink.MAVLink_mission_request_list_message(1, 1))
+    bench.run(0.02)
+    assert bench.of("MISSION_COUNT")[-1][1].count == len(ROUND)
+    for seq, row in enumerate(ROUND):
+        bench.send(mavlink.MAVLink_mission_request_int_message(1, 1, seq))
+        bench.run(0.02)
+        sent, kept = item(seq, row), bench.of("MISSION_ITEM_INT")[-1][1]
+        for name in ("seq", "frame", "command", "x", "y", "z", "param1", "param2"):
+            assert getattr(kept, name) == pytest.approx(getattr(sent, name), nan_ok=True)
+    bench.send(mavlink.MAVLink_mission_clear_all_message(1, 1))
+    bench.send(mavlink.MAVLink_mission_request_list_message(1, 1))
+    bench.run(0.02)
+    assert bench.of("MISSION_COUNT")[-1][1].count == 0
+
+
+def test_items_that_do_not_come_are_asked_for_again_and_given_up() -> None:
+    bench = Bench()
+    bench.send(mavlink.MAVLink_mission_count_message(1, 1, 2))
+    bench.run(1.0)
+    asked = [m.seq for _, m in bench.of("MISSION_REQUEST_INT")]
+    assert asked == [0] * len(asked)
+    assert 3 <= len(asked) <= 5
+    bench.run(5.0)
+    assert [m.type for _, m in bench.of("MISSION_ACK")] == [15]
+    bench.send(item(0, ROUND[0]))
+    bench.run(0.1)
+    assert len(bench.of("MISSION_ACK")) == 1
+
+
+@pytest.mark.parametrize(
+    ("message", "answer"),
+    [
+        (mavlink.MAVLink_mission_count_message(1, 1, 65535), 4),
+        (mavlink.MAVLink_mission_count_message(1, 1, 0), 0),
+        (mavlink.MAVLink_mission_count_message(1, 1, 3, 1), 3),
+        (mavlink.MAVLink_mission_request_int_message(1, 1, 0), 13),
+        (mavlink.MAVLink_mission_request_int_message(1, 1, 0, 2), 13),
+        (mavlink.MAVLink_mission_clear_all_message(1, 1, 255), 0),
+    ],
+)
+def test_what_cannot_be_is_answered(message: object, answer: int) -> None:
+    bench = Bench()
+    bench.send(message)
+    bench.run(0.02)
+    assert [m.type for _, m in bench.of("MISSION_ACK")] == [answer]
+
+
+@pytest.mark.parametrize(
+    ("row", "frame"), [(ROUND[0], 1), (place(WAYPOINT, 1, 1, math.inf), RELATIVE_INT)]
+)
+def test_places_in_no_known_frame_end_the_upload(row: Row, frame: int) -> None:
+    bench = Bench()
+    bench.send(mavlink.MAVLink_mission_count_message(1, 1, 1))
+    bench.send(item(0, row, frame))
+    bench.run(0.02)
+    assert [m.type for _, m in bench.of("MISSION_ACK")] == [2]
+    assert bench.instance.autopilot.mission.items == ()
+
+
+def test_a_mission_is_flown_and_returns_and_is_flown_again() -> None:
+    bench = Bench()
+    bench.boot()
+    upload(bench, ROUND)
+    for _ in range(2):
+        begun_s = bench.time_s
+        assert bench.command(300) == [0]
+        assert (bench.armed, bench.mode) == (True, MISSION)
+        bench.run_until(lambda: bench.instance.autopilot.mission.current == 2, 20.0)
+        assert bench.height_m == pytest.approx(4.0, abs=1.0)
+        leg_s = bench.time_s
+        bench.run_until(lambda: bench.instance.autopilot.mission.current == 4, 30.0)
+        speeds = [math.hypot(m.vx, m.vy) for _, m in bench.of("LOCAL_POSITION_NED", leg_s)]
+        assert max(speeds) == pytest.approx(1.9, abs=0.3)
+        at_s, here = bench.of("LOCAL_POSITION_NED")[-1]
+        assert (here.x, here.y, here.z) == pytest.approx((12, 6, -6), abs=1.0)
+        arrived_s = [t for t, m in bench.of("MISSION_ITEM_REACHED") if m.seq == 3][-1]
+        assert at_s - arrived_s == pytest.approx(3.0, abs=0.1)
+        bench.run(0.1)
+        assert bench.mode == RTL
+        bench.run_until(lambda: not bench.armed, 60.0)
+        _, here = bench.of("LOCAL_POSITION_NED")[-1]
+        assert (here.x, here.y) == pytest.approx((0, 0), abs=0.7)
+        bench.run(0.5)
+        texts = bench.texts(begun_s)
+        assert texts[:2] == ["Armed by mission start", "Executing Mission"]
+        assert texts[-1] == "Disarmed by landing"
+    assert reached(bench) == [0, 2, 3] * 2
+
+
+def test_a_mission_lands() -> None:
+    bench = Bench()
+    bench.boot()
+    upload(bench, [place(WAYPOINT, 0, 0, 3), place(LAND, 5, 5, 0)])
+    assert bench.command(400, 1) == [0]
+    assert bench.ask_mode(MISSION) == [0, 0]
+    bench.run_until(lambda: not bench.armed, 60.0)
+    _, here = bench.of("LOCAL_POSITION_NED")[-1]
+    assert (here.x, here.y, here.z) == pytest.approx((5, 5, 0), abs=0.7)
+
+
+def test_a_mission_is_paused_by_hold_and_goes_on() -> None:
+    bench = Bench()
+    bench.boot()
+    upload(bench, [place(WAYPOINT, 0, 0, 3), place(LOITER_UNLIMITED, 40, 0, 3)])
+    bench.command(300)
+    bench.run_until(lambda: bench.instance.autopilot.mission.current == 1, 20.0)
+    bench.run(2.0)
+    bench.ask_mode(LOITER)
+    bench.run(5.0)
+    _, here = bench.of("LOCAL_POSITION_NED")[-1]
+    assert 5.0 < here.x < 25.0
+    assert abs(here.vx) < 0.1
+    bench.ask_mode(MISSION)
+    bench.run_until(lambda: reached(bench) == [0, 1], 20.0)
+    _, here = bench.of("LOCAL_POSITION_NED")[-1]
+    assert here.x == pytest.approx(40, abs=2.1)
+
+
+def test_without_a_mission_none_starts() -> None:
+    bench = Bench()
+    bench.boot()
+    assert bench.command(300) == [2]
+    assert bench.texts() == ["Mission start denied! No valid mission"]
+    assert bench.ask_mode(MISSION) == [0, 0]
+    assert bench.command(400, 1) == [1]
+    bench.ask_mode(LOITER)
+    bench.fly_offboard()
+    assert bench.ask_mode(MISSION) == [0, 1]
