@@ -1,5 +1,5 @@
 """A MAVLink offboard controller: telemetry in, attitude and thrust setpoints out."""
 
-from offboard.model.compilation import prepare_cache
+from offboard.model.compilation import prepare_before_numba
 
-prepare_cache()  # before any module of this package has numba compile something
+prepare_before_numba()

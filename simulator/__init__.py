@@ -1,5 +1,5 @@
 """A software-in-the-loop vehicle that behaves like an autopilot at its MAVLink boundary."""
 
-from offboard.model.compilation import prepare_cache
+from offboard.model.compilation import prepare_before_numba
 
-prepare_cache()  # before any module of this package has numba compile something
+prepare_before_numba()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
@@ -60,6 +61,9 @@ def simulate(
     patience: Annotated[
         float, typer.Option(min=0.1, max=600.0, help="Seconds to wait for a silent companion.")
     ] = 5.0,
+    log: Annotated[
+        Path | None, typer.Option(help="Record the companion link as a .tlog; never overwrites.")
+    ] = None,
     list_scenarios: Annotated[
         bool, typer.Option("--list-scenarios", help="Name and describe the scenarios, and stop.")
     ] = False,
@@ -84,6 +88,7 @@ def simulate(
     from offboard.flight.clock import unix_us
     from offboard.model.document import DocumentError
     from simulator import config
+    from simulator.recorder import Recorder
     from simulator.udp import LinkError, open_link, shifted
 
     connect = connect or f"udpout:127.0.0.1:{COMPANION_PORT + instance}"
@@ -101,6 +106,13 @@ def simulate(
         ]
     except (DocumentError, LinkError) as error:
         _refuse(str(error))
+
+    recorder = None
+    if log is not None:
+        try:
+            recorder = Recorder(log)
+        except OSError as error:
+            _refuse(f"--log {log} cannot be written: {error.strerror}")
 
     _announce_compilation()
     parameters = _parameters(personality, param or [])
@@ -123,6 +135,7 @@ def simulate(
             ),
             companion,
             ground,
+            recorder,
         )
         for number, companion, ground in zip(numbers, companions, grounds, strict=True)
     ]

@@ -12,9 +12,10 @@ import gc
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from offboard.flight.clock import monotonic_s
+from offboard.flight.clock import monotonic_s, unix_us
 from simulator.instance import Instance
 from simulator.plant import STEP_S
+from simulator.recorder import Recorder
 from simulator.udp import UdpLink, wait
 
 RESEND_S = 0.05  # until the companion is first heard
@@ -40,6 +41,7 @@ class Berth:
     instance: Instance
     companion: UdpLink
     ground: UdpLink | None = None
+    recorder: Recorder | None = None  # of the companion link
 
     @property
     def links(self) -> list[UdpLink]:
@@ -47,7 +49,9 @@ class Berth:
 
     def send(self) -> None:
         """Send what both links have queued."""
-        self.companion.send(self.instance.drain())
+        datagrams = self.instance.drain()
+        self._record(datagrams)
+        self.companion.send(datagrams)
         self.send_ground()
 
     def send_ground(self) -> None:
@@ -58,6 +62,7 @@ class Berth:
     def send_barrier(self) -> tuple[int, list[bytes]]:
         """Send everything and the question for the time; return its stamp and the datagrams."""
         stamp_ns, datagrams = self.instance.barrier()
+        self._record(datagrams)
         self.companion.send(datagrams)
         self.send_ground()
         return stamp_ns, datagrams
@@ -66,10 +71,19 @@ class Berth:
         """Handle what has arrived; whether the companion sent anything."""
         spoken = False
         while (datagram := self.companion.receive()) is not None:
-            self.instance.feed(datagram)
+            self.hear(datagram)
             spoken = True
         self.read_ground()
         return spoken
+
+    def hear(self, datagram: bytes) -> None:
+        """Handle one datagram of the companion."""
+        self._record([datagram])
+        self.instance.feed(datagram)
+
+    def _record(self, datagrams: list[bytes]) -> None:
+        if self.recorder is not None:
+            self.recorder.write(unix_us(), datagrams)
 
     def read_ground(self) -> None:
         while self.ground is not None and (datagram := self.ground.receive()) is not None:
@@ -199,7 +213,7 @@ class Runner:
         while server.answered_ns != stamp_ns:
             datagram = self._companion.receive()
             if datagram is not None:
-                self._instance.feed(datagram)
+                self._berth.hear(datagram)
                 continue
             if self._stopping():
                 return False
@@ -223,7 +237,7 @@ class Runner:
                 continue
             self._berth.send_barrier()
             while (datagram := self._companion.receive()) is not None:
-                instance.feed(datagram)
+                self._berth.hear(datagram)
             self._berth.read_ground()
             if instance.companion.answered_ns != known_ns:
                 self._tell(f"the companion is back at {instance.time_s:.2f} s")

@@ -67,6 +67,18 @@ class UdpLink:
         self._socket.close()
 
 
+def free_ports(count: int) -> list[int]:
+    """UDP ports that nobody used a moment ago."""
+    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
+    try:
+        for sock in sockets:
+            sock.bind(("127.0.0.1", 0))
+        return [int(sock.getsockname()[1]) for sock in sockets]
+    finally:
+        for sock in sockets:
+            sock.close()
+
+
 def wait(links: Sequence[UdpLink], timeout_s: float) -> list[UdpLink]:
     """The links at which a datagram waits, as soon as there is one, at the latest `timeout_s`."""
     return select.select(links, [], [], max(0.0, timeout_s))[0]

@@ -13,8 +13,10 @@ import os
 import stat
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from importlib.abc import MetaPathFinder
 from pathlib import Path
+from types import ModuleType
 
 _VARIABLE = "NUMBA_CACHE_DIR"
 
@@ -32,6 +34,28 @@ def prepare_cache() -> Path:
     if numba is not None:  # imported before us: it has read its environment already
         numba.config.CACHE_DIR = chosen
     return Path(chosen)
+
+
+class _BeforeNumba(MetaPathFinder):
+    """Prepares the cache when somebody imports numba, and finds nothing itself."""
+
+    def find_spec(
+        self, fullname: str, path: Sequence[str] | None, target: ModuleType | None = None
+    ) -> None:
+        if fullname == "numba" and self in sys.meta_path:
+            sys.meta_path.remove(self)
+            prepare_cache()
+
+
+def prepare_before_numba() -> None:
+    """Have `prepare_cache` called before numba is imported; now, when it already is.
+
+    Not at once, because whoever only loads our pytest plugins shall not pay for it.
+    """
+    if "numba" in sys.modules:
+        prepare_cache()
+    elif not any(isinstance(finder, _BeforeNumba) for finder in sys.meta_path):
+        sys.meta_path.insert(0, _BeforeNumba())
 
 
 def _sources_digest() -> str:

@@ -1,0 +1,153 @@
+"""The fixtures `sitl` and `fly` in a user's own test suite, run by pytest in pytest."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from offboard.model.compilation import prepare_cache
+
+CACHE = prepare_cache()  # pytester moves the home directory, where it would be compiled anew
+
+
+@pytest.fixture(autouse=True)
+def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(CACHE))
+
+
+TAKES_OFF = """
+import math, os, pathlib
+import pytest
+from pymavlink import mavutil
+
+def climb(sitl):
+    vehicle = mavutil.mavlink_connection(sitl.connection, source_system=255)
+    vehicle.wait_heartbeat(timeout=20)
+    vehicle.mav.heartbeat_send(6, 8, 0, 0, 4)
+    healthy = 0
+    while not healthy & 1 << 28:
+        status = vehicle.recv_match(type="SYS_STATUS", blocking=True)
+        healthy = status.onboard_control_sensors_health
+    vehicle.mav.command_long_send(1, 1, 22, 0, *[math.nan] * 7)
+    vehicle.mav.command_long_send(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)
+    height = 0.0
+    while height < 2.0:
+        height = -vehicle.recv_match(type="LOCAL_POSITION_NED", blocking=True).z
+    vehicle.close()
+    return height
+"""
+
+FLIES = (
+    TAKES_OFF
+    + """
+@pytest.mark.sitl(scenario="calm", speed=10)
+@pytest.mark.parametrize("run", [1, 2])
+def test_climbs(sitl, run):
+    assert climb(sitl) >= 2.0
+"""
+)
+
+FAILS = (
+    TAKES_OFF
+    + """
+@pytest.mark.sitl(scenario="calm", speed=10)
+def test_fails(sitl):
+    pathlib.Path("pid").write_text(str(sitl.process.pid))
+    assert climb(sitl) < 0.0
+"""
+)
+
+
+def is_running(pid: int) -> bool:
+    try:
+        os.kill(pid, 0)
+    except ProcessLookupError:
+        return False
+    return True
+
+
+def named_logs(result: pytest.RunResult) -> list[Path]:
+    return [Path(line) for line in result.outlines if line.endswith(".tlog")]
+
+
+@pytest.mark.parametrize("workers", [(), ("-n", "2")], ids=["alone", "xdist"])
+def test_a_vehicle_for_a_test(pytester: pytest.Pytester, workers: tuple[str, ...]) -> None:
+    pytester.makepyfile(FLIES)
+    result = pytester.runpytest_subprocess("-q", "--strict-markers", *workers, timeout=90)
+    result.assert_outcomes(passed=2)
+    assert named_logs(result) == []
+
+
+def test_a_failed_test_keeps_its_log_and_stops_its_vehicle(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(FAILS)
+    result = pytester.runpytest_subprocess("-q", timeout=90)
+    result.assert_outcomes(failed=1)
+    (log,) = named_logs(result)
+    assert log.stat().st_size > 10_000
+    assert not is_running(int((pytester.path / "pid").read_text()))
+
+
+WRONG = {
+    'scenario="storm"': "*scenario storm not found: give a file or one of*",
+    "weather=3": "*pytest.mark.sitl: weather is unknown; there is scenario, firmware*",
+}
+
+
+@pytest.mark.parametrize("arguments", WRONG)
+def test_a_wrong_marker_is_one_sentence(pytester: pytest.Pytester, arguments: str) -> None:
+    pytester.makepyfile(
+        f"import pytest\n@pytest.mark.sitl({arguments})\ndef test_it(sitl):\n    pass\n"
+    )
+    result = pytester.runpytest_subprocess("-q", timeout=60)
+    result.assert_outcomes(errors=1)
+    result.stdout.fnmatch_lines(WRONG[arguments])
+    assert "Traceback" not in result.stdout.str()
+
+
+def test_a_flight_in_one_call(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(
+        """
+        SHORT = ("reference.duration_s=3.0", "identify.online=false")
+
+        def test_hovers(fly):
+            flight = fly(reference="hover", scenario="calm", seed=3, settings=SHORT)
+            assert flight.score.rmse_position_m < 0.05
+            again = fly(reference="hover", scenario="calm", seed=3, settings=SHORT)
+            assert again.score.rmse_position_m == flight.score.rmse_position_m
+            assert again.log != flight.log
+
+        def test_fails(fly):
+            flight = fly(reference="hover", scenario="calm", seed=3, settings=SHORT)
+            assert flight.score.rmse_position_m < 0.0
+        """
+    )
+    result = pytester.runpytest_subprocess("-q", timeout=120)
+    result.assert_outcomes(passed=1, failed=1)
+    (log,) = named_logs(result)
+    assert log.stat().st_size > 10_000
+
+
+def test_a_flight_of_nothing_known_is_one_sentence(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile('def test_it(fly):\n    fly(reference="moon")\n')
+    result = pytester.runpytest_subprocess("-q", timeout=60)
+    result.assert_outcomes(failed=1)
+    result.stdout.fnmatch_lines("nothing was flown: there is no reference named 'moon'*")
+    assert named_logs(result) == []
+
+
+def test_other_tests_pay_nothing(pytester: pytest.Pytester) -> None:
+    pytester.makepyfile(
+        """
+        import os, sys
+
+        def test_nothing_is_imported():
+            heavy = {"numba", "numpy", "scipy", "pymavlink", "pydantic", "typer"}
+            assert heavy & set(sys.modules) == set()
+            assert "offboard.pytest_plugin" in sys.modules
+            assert "simulator.pytest_plugin" in sys.modules
+        """
+    )
+    result = pytester.runpytest_subprocess("-q", "-p", "no:hypothesispytest", timeout=60)
+    result.assert_outcomes(passed=1)
