@@ -53,7 +53,7 @@ Array = NDArray[np.float64]
 TILT_MOVED_RAD, COURSE_MOVED_RAD = 0.004, 0.008
 SPEED_MPS, THRUST_MOVED = 0.4, 0.015
 # Greatest standard deviation that is still an answer.
-TILT_SDS, YAW_SDS = (0.008, 0.06, 0.08), (0.04, 0.15, 0.2)  # delay s, frequency relative, damping
+TILT_SDS, YAW_SDS = (0.02, 0.1, 0.15), (0.04, 0.15, 0.2)  # delay s, frequency relative, damping
 DRAG_SD_PS, HOVER_SD, EFFECT_SD_S = 0.2, 0.02, 0.015
 EXPLAINED = 0.6  # least share of the commanded motion that the response must account for
 DRAG_BEFOREHAND = Estimate(0.6, 0.4)

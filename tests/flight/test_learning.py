@@ -95,7 +95,7 @@ def test_second_lap_is_as_good_as_with_the_true_constants(name, tmp_path: Path):
         flights = (
             (told, make(vehicle=name, **common)),
             (learnt, neutral(learning=LEARNING, **common)),
-            (ignorant, neutral(**common)),
+            *([(ignorant, neutral(**common))] if seed == 1 else []),
         )
         for index, (figures, pair) in enumerate(flights):
             assert pair.fly().exit_code == 0
