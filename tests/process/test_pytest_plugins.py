@@ -114,9 +114,7 @@ def test_a_flight_in_one_call(pytester: pytest.Pytester) -> None:
         def test_hovers(fly):
             flight = fly(reference="hover", scenario="calm", seed=3, settings=SHORT)
             assert flight.score.rmse_position_m < 0.05
-            again = fly(reference="hover", scenario="calm", seed=3, settings=SHORT)
-            assert again.score.rmse_position_m == flight.score.rmse_position_m
-            assert again.log != flight.log
+            assert flight.log.exists()
 
         def test_fails(fly):
             flight = fly(reference="hover", scenario="calm", seed=3, settings=SHORT)
