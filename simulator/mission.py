@@ -54,6 +54,11 @@ class Item:
         return self.command in _PLACES
 
     @property
+    def is_flown(self) -> bool:
+        """Takes time, unlike a setting or a return, which is another mode's."""
+        return self.is_place or self.command == Kind.DELAY
+
+    @property
     def flyable(self) -> bool:
         """A place needs a frame and finite coordinates."""
         known = self.frame in GLOBAL_FRAMES | RELATIVE_FRAMES
@@ -118,10 +123,12 @@ class Mission:
             if position_ned_m[2] < self._climb_to_z_m + _ACCEPTED_HEIGHT_M:
                 self._climb_to_z_m = math.nan
             return MotionSetpoint(self._held)
-        self._pass_over()
-        if self.finished:
+        if self.finished or not self.items:
             return MotionSetpoint(self._held)
         item = self.items[self.current]
+        if not item.is_flown:
+            self._pass_over(item)
+            return MotionSetpoint(self._held)
         if item.is_place:
             self._held = self._target(item, position_ned_m, home_ned_m)
         if self._arrived(item, position_ned_m) and math.isnan(self._since_s):
@@ -136,20 +143,14 @@ class Mission:
     def _item_is(self, kind: Kind) -> bool:
         return self.current < len(self.items) and self.items[self.current].command == kind
 
-    def _pass_over(self) -> None:
-        """Items that are done at once, up to one that is flown, or to the end."""
-        while not self.finished:
-            if self.current >= len(self.items):
-                self._end("mission finished")
-                return
-            item = self.items[self.current]
-            if item.command == Kind.CHANGE_SPEED and item.params[1] > 0:
-                self.speed_mps = item.params[1]
-            elif item.command == Kind.RETURN:
-                self._end("mission return")
-                return
-            elif item.is_place or item.command == Kind.DELAY:
-                return
+    def _pass_over(self, item: Item) -> None:
+        """An item that is done at once; one at a time, so that each is told of."""
+        if item.command == Kind.CHANGE_SPEED and item.params[1] > 0:
+            self.speed_mps = item.params[1]
+        self._note_reached()
+        if item.command == Kind.RETURN:
+            self._end("mission return")
+        else:
             self._advance()
 
     def _advance(self) -> None:

@@ -36,7 +36,9 @@ def item(seq: int, row: Row, frame: int | None = None) -> object:
     known = COMMAND_FRAME if math.isnan(up) else RELATIVE_INT
     used = known if frame is None else frame
     z = 0.0 if math.isnan(up) else up
-    return mavlink.MAVLink_mission_item_int_message(1, 1, seq, used, command, 0, 1, *params, x, y, z)
+    return mavlink.MAVLink_mission_item_int_message(
+        1, 1, seq, used, command, 0, 1, *params, x, y, z
+    )
 
 
 def upload(bench: Bench, rows: list[Row]) -> int:
@@ -153,7 +155,7 @@ def test_a_mission_is_flown_and_returns_and_is_flown_again() -> None:
         texts = bench.texts(begun_s)
         assert texts[:2] == ["Armed by mission start", "Executing Mission"]
         assert texts[-1] == "Disarmed by landing"
-    assert reached(bench) == [0, 2, 3] * 2
+    assert reached(bench) == [0, 1, 2, 3, 4] * 2
 
 
 def test_a_mission_lands() -> None:
