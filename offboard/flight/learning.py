@@ -58,6 +58,7 @@ BOUNDS = {
     "thrust delay": (0.0, 0.45),
     "drag": (0.02, 3.0),
 }
+LINK_S = 0.03  # a smaller difference of delays is the vehicle's
 DELAY_SLACK_S = 0.4  # a link may be slow
 
 
@@ -225,7 +226,7 @@ class Learner:
     def _take(self, found: Identified, time_s: float) -> list[str]:
         """Set the target of the blend; what was taken, refused or out of bounds, in sentences."""
         within, sentences = bounded(found, self._file, self._settings.factor)
-        target = within.applied_to(self._to)
+        target = _with_link(within, within.applied_to(self._to), self._file)
         if target != self._to:
             self._from, self._to, self._blend_began_s = self._now, target, time_s
             sentences.insert(0, _told(within))
@@ -261,6 +262,25 @@ class Learner:
             share = min(passed_s / self._settings.blend_s, 1.0)
         self._now = self._to if share > 1.0 - 1e-6 else _mixed(self._from, self._to, share)
         return Adoption(self._now, self._limit_radps, self._now == self._to, sentences, record)
+
+
+def _with_link(found: Identified, target: Vehicle, believed: Vehicle) -> Vehicle:
+    """What a slow link adds to the tilt's delay it adds to those of thrust and course: they follow
+    it while they have not been identified themselves."""
+    if found.tilt is None:
+        return target
+    added_s = found.tilt.delay_s.value - believed.tilt.delay_s
+    if added_s < LINK_S:
+        return target
+    update: dict[str, Any] = {}
+    if target.thrust_delay_s < believed.thrust_delay_s + added_s - LINK_S and (
+        found.thrust_delay_s is None
+    ):
+        update["thrust_delay_s"] = believed.thrust_delay_s + added_s
+    if found.yaw is None and target.yaw.delay_s < believed.yaw.delay_s + added_s - LINK_S:
+        delay_s = min(believed.yaw.delay_s + added_s, BOUNDS["delay"][1])
+        update["yaw"] = target.yaw.model_copy(update={"delay_s": delay_s})
+    return target.model_copy(update=update)
 
 
 def bounded(found: Identified, believed: Vehicle, factor: float) -> tuple[Identified, list[str]]:
