@@ -1,4 +1,4 @@
-"""The README is executable: its commands are the ones that work, and name every command there is."""
+"""The README is executable: its commands are the ones that work, and every command is named."""
 
 from __future__ import annotations
 
