@@ -226,7 +226,7 @@ class Learner:
     def _take(self, found: Identified, time_s: float) -> list[str]:
         """Set the target of the blend; what was taken, refused or out of bounds, in sentences."""
         within, sentences = bounded(found, self._file, self._settings.factor)
-        target = _with_link(within, within.applied_to(self._to), self._file)
+        target = with_link(within, within.applied_to(self._to), self._file)
         if target != self._to:
             self._from, self._to, self._blend_began_s = self._now, target, time_s
             sentences.insert(0, _told(within))
@@ -264,7 +264,7 @@ class Learner:
         return Adoption(self._now, self._limit_radps, self._now == self._to, sentences, record)
 
 
-def _with_link(found: Identified, target: Vehicle, believed: Vehicle) -> Vehicle:
+def with_link(found: Identified, target: Vehicle, believed: Vehicle) -> Vehicle:
     """What a slow link adds to the tilt's delay it adds to those of thrust and course: they follow
     it while they have not been identified themselves."""
     if found.tilt is None:

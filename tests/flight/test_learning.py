@@ -13,9 +13,10 @@ from scipy.interpolate import CubicHermiteSpline
 from offboard.analysis import history
 from offboard.analysis.identify import identify_flight, vehicle_file
 from offboard.control.base import Command
+from offboard.control.identification import Estimate, Identified, ResponseFit
 from offboard.control.observer import Observer, ObserverSettings
 from offboard.flight.excitation import LENGTH_S, excited
-from offboard.flight.learning import RECORD_ID, IdentifySettings
+from offboard.flight.learning import RECORD_ID, IdentifySettings, with_link
 from offboard.flight.phases import Phase
 from offboard.model.document import parse
 from offboard.model.vehicle import AxisResponse, Vehicle
@@ -222,3 +223,18 @@ def test_observer_goes_on_smoothly_with_another_drag():
     change = new.disturbance_ned_mps2 - old.disturbance_ned_mps2
     assert change == pytest.approx(0.8 * old.velocity_ned_mps, abs=0.02)
     assert new.velocity_ned_mps == pytest.approx(old.velocity_ned_mps, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("tilt_s", "thrust_s", "yaw_s"), [(0.24, 0.21, 0.4), (0.06, 0.01, 0.2), (0.02, 0.01, 0.2)]
+)
+def test_what_the_link_adds_to_tilt_it_adds_to_thrust_and_course(tilt_s, thrust_s, yaw_s):
+    """Believed are 0.04, 0.01 and 0.2 s; a little more or less is the vehicle's own."""
+    fit = ResponseFit(Estimate(tilt_s, 0.002), Estimate(11.0, 0.1), Estimate(0.8, 0.01), 0.0, 0.1)
+    found = Identified(4.0, tilt=fit)
+    linked = with_link(found, found.applied_to(NEUTRAL), NEUTRAL)
+    assert linked.tilt.delay_s == tilt_s
+    assert linked.thrust_delay_s == pytest.approx(thrust_s)
+    assert linked.yaw.delay_s == pytest.approx(yaw_s)
+    known = Identified(4.0, tilt=fit, thrust_delay_s=Estimate(0.05, 0.01))
+    assert with_link(known, known.applied_to(NEUTRAL), NEUTRAL).thrust_delay_s == 0.05

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from scipy import signal
 from scipy.integrate import solve_ivp
+from scipy.linalg import expm
 
 from offboard.control.identification import Identified, identify
-from offboard.control.motion_fit import lagged_thrust
+from offboard.control.motion_fit import innovations, lagged_thrust
 from offboard.control.response_fit import fit_response, predicted
 from offboard.control.trace import Recorder, Trace, clean
 from offboard.model.vehicle import AxisResponse, Vehicle
@@ -61,6 +62,33 @@ def test_response_is_that_of_scipy(damping):
     theirs = answered(values, sent_at, 0.057, 11.4, damping, times)
     assert np.abs(ours - theirs).max() < 2e-5
     assert np.abs(theirs).max() > 0.02
+
+
+def test_command_under_way_acts_when_its_delay_is_over():
+    """Sent at 0.40 s, it acts at 0.457 s; the first sample is of 0.42 s."""
+    sent_at, values = np.array([0.0, 0.4]), np.array([0.0, 0.03])
+    times = np.arange(0.42, 1.5, 0.01)
+    ours = predicted(times, sent_at, values[:, None], 0.057, 11.4, 0.6)[:, 0]
+    assert np.abs(ours - answered(values, sent_at, 0.057, 11.4, 0.6, times)).max() < 2e-5
+    assert np.abs(ours[:4]).max() == 0.0
+
+
+def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():
+    """Position, speed and disturbance driven by the densities that the filter is told."""
+    generator = np.random.default_rng(11)
+    step_s, count, drag = 0.02, 20000, 0.7
+    densities = np.array([0.02, 0.3, 0.5])
+    drift = expm(np.array([[0.0, 1.0, 0.0], [0.0, -drag, 1.0], [0.0, 0.0, 0.0]]) * step_s)
+    kicks = generator.normal(size=(count, 3)) * densities * math.sqrt(step_s)
+    state, positions = np.zeros(3), np.empty(count)
+    for i in range(count):
+        positions[i] = state[0] + 0.01 * generator.normal()
+        state = drift @ state + kicks[i]
+    times = step_s * np.arange(count)
+    start_sds = np.array([1.0, 1.0])
+    white = innovations(times, positions, np.zeros(count), drag, densities, 0.01, start_sds)[200:]
+    assert np.mean(white**2) == pytest.approx(1.0, abs=0.03)
+    assert abs(np.mean(white[1:] * white[:-1])) < 0.02
 
 
 def test_response_fits_what_scipy_made_to_four_digits():
