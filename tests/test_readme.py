@@ -46,6 +46,19 @@ def test_first_command_flies_and_scores(tmp_path: Path) -> None:
     assert {path.name for path in flight.iterdir()} >= {"flight.tlog", "flight.yaml", "score.json"}
 
 
+def test_its_own_tests_pass(tmp_path: Path) -> None:
+    for number, block in enumerate(re.findall(r"```python\n(.*?)```", README, re.DOTALL)):
+        (tmp_path / f"test_{number}.py").write_text(block)
+    done = subprocess.run(
+        (sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", "."),
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=170,
+    )
+    assert "3 passed" in done.stdout, done.stdout + done.stderr
+
+
 def _subcommands() -> list[str]:
     from offboard.cli import app
 
