@@ -16,8 +16,9 @@ from offboard.control.base import Command
 from offboard.control.identification import Estimate, Identified, ResponseFit
 from offboard.control.observer import Observer, ObserverSettings
 from offboard.flight.excitation import LENGTH_S, excited
-from offboard.flight.learning import RECORD_ID, IdentifySettings, with_link
+from offboard.flight.learning import RECORD_ID, IdentifySettings
 from offboard.flight.phases import Phase
+from offboard.flight.takeover import with_link
 from offboard.model.document import parse
 from offboard.model.vehicle import AxisResponse, Vehicle
 from simulator import config as simulated
