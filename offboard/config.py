@@ -17,6 +17,8 @@ import yaml
 from pydantic import BaseModel, Field
 
 from offboard.control.catalogue import LAWS, ControllerConfig
+from offboard.control.horizon.keep_out import refusal
+from offboard.control.horizon.law import HorizonSettings
 from offboard.control.observer import ObserverSettings
 from offboard.flight.learning import IdentifySettings
 from offboard.flight.phases import Limits
@@ -80,7 +82,8 @@ def load(
 
 
 def build_track(config: FlightConfig) -> Track:
-    """The configured reference, checked against the vehicle before anything is sent.
+    """The configured reference, checked against the vehicle and the controller's keep-out volumes
+    before anything is sent.
 
     Raises DocumentError naming time, value and limit where it cannot be flown.
     """
@@ -89,6 +92,11 @@ def build_track(config: FlightConfig) -> Track:
         check(track, config.vehicle)
     except ValueError as error:
         raise DocumentError(f"reference {config.reference.shape}: {error}") from None
+    controller = config.controller
+    if isinstance(controller, HorizonSettings):
+        refused = refusal(controller.keep_out, controller.clearance_m, track)
+        if refused:
+            raise DocumentError(f"controller: {refused}")
     return track
 
 

@@ -1,8 +1,9 @@
 """The predictive law over nonlinear roll-outs: `horizon` searches with the swarm, `mppi` and `cem`
 with theirs.
 
-The base of each search is the best of the seeds: the closed form flown to the end of the horizon,
-the exact plan of the linear problem, and the previous plan's tail. The swarm's answer is never
+A search begins on a seed: the better of the closed form flown to the end of the horizon and the
+previous plan's tail; and where they are better than it, the best of the linear problem's exact plan
+and of the ways past each side of a keep-out volume. The swarm's answer is never
 worse than any of them. Knows no autopilot and reads no clock.
 """
 
@@ -20,6 +21,7 @@ from pydantic import Field
 from offboard.control.base import Certificate, DecisionError, Situation
 from offboard.control.certificate import ExactMinimum, certify
 from offboard.control.cost import BoxQuadratic
+from offboard.control.horizon.detour import detours
 from offboard.control.horizon.keep_out import KeepOut, pack, placed_at
 from offboard.control.horizon.outlook import bounds, look_ahead
 from offboard.control.horizon.quadratic import HorizonQuadratic
@@ -41,6 +43,7 @@ from offboard.model.vehicle import Vehicle
 Array = NDArray[np.float64]
 
 HEAVE_REACH_MPS2 = 3.0  # of the knots of the vertical thrust
+PLANNED_MARGIN_M = 0.05  # beyond the clearance: for tracking, and for a limit that is bought softly
 
 
 class Method(StrEnum):
@@ -112,7 +115,7 @@ class HorizonLaw(TrackingLaw):
             nonlinear=plans.dynamics is Dynamics.NONLINEAR,
             thrust_mps2=(plans.thrust_floor * vehicle.gravity_mps2, vehicle.thrust_max_mps2),
             speed_limit_mps=plans.speed_limit_mps or math.inf,
-            clearance_m=plans.clearance_m,
+            clearance_m=plans.clearance_m + PLANNED_MARGIN_M,
         )
 
     def reset(self) -> None:
@@ -129,14 +132,15 @@ class HorizonLaw(TrackingLaw):
     ) -> tuple[Array, Certificate]:
         """The first input of the best plan found."""
         linear = self._settle(situation, target, problem)
-        seeds = self._seeds(situation.time_s, linear)
-        base = min(seeds, key=lambda plan: plan.cost)
-        if not math.isfinite(base.cost):
+        own, others = self._seeds(situation.time_s, linear)
+        base = min(own, key=_cost)
+        seed_cost = min(plan.cost for plan in (base, *others))
+        if not math.isfinite(seed_cost):
             raise DecisionError("no plan of the horizon has a finite cost")
-        found = self._find(base, remaining_s)
+        rivals = sorted((plan for plan in others if plan.cost < base.cost), key=_cost)
+        found = self._find([base, *rivals[:1]], remaining_s)
         self.previous = (situation.time_s, found.plan)
-        certificate = self._certificate(found, linear)
-        certificate = replace(certificate, seed_cost=base.cost)
+        certificate = replace(self._certificate(found, linear), seed_cost=seed_cost)
         upright = float(situation.state.thrust_direction_ned[2])
         return one_decision(found.plan.inputs[0], upright, target, problem), certificate
 
@@ -159,43 +163,53 @@ class HorizonLaw(TrackingLaw):
             np.array(situation.origin_ned_m, np.float64),
             situation.track_time_s + delay_s,
         )
-        scene = scene_of(ahead, within, volumes)
+        floor_down_m = situation.origin_ned_m[2] - plans.clearance_m
+        scene = scene_of(ahead, within, volumes, floor_down_m)
         lateral, vertical = errors(state, target)
         self._evaluate.settle(self._plant, scene, start_state(lateral, vertical, scene))
         return self._quadratic.problem(lateral, vertical, within)
 
-    def _seeds(self, time_s: float, linear: BoxQuadratic) -> list[Plan]:
-        """The closed form, the linear problem's exact plan and the previous plan's tail."""
-        steps = self._plans.steps
+    def _seeds(self, time_s: float, linear: BoxQuadratic) -> tuple[list[Plan], list[Plan]]:
+        """Our own plans (the closed form and the previous plan's tail), and others: the linear
+        problem's exact plan, and a way past each side of each volume that is near."""
+        steps, evaluate = self._plans.steps, self._evaluate
         inputs, states = np.zeros((steps, INPUTS)), np.zeros((steps + 1, STATE_SIZE))
-        seeds = [self._evaluate.held(inputs, states)]
+        own, others = [evaluate.held(inputs, states)], []
         if self._method is Method.SWARM and self._plans.seed_with_qp:
             exact = self._planner.minimise(linear)
             if np.isfinite(exact).all():
-                sequence = np.ascontiguousarray(self._quadratic.plan(exact)[:, :, None])
-                self._evaluate.of_inputs(sequence)
-                seeds.append(self._evaluate.picked(1, 0))
+                others.append(evaluate.flown(self._quadratic.plan(exact)))
+        if self._method is Method.SWARM and len(self._volumes):
+            reach = self._plans.clearance_m + PLANNED_MARGIN_M
+            others.extend(evaluate.held(inputs, way) for way in detours(evaluate.scene, reach))
         if self.previous is not None:
             gone = round((time_s - self.previous[0]) / self._plans.period_s)
             if 0 <= gone < steps:
                 before = self.previous[1]
                 inputs[: steps - gone] = before.inputs[gone:]
                 states[: steps - gone + 1] = before.states[gone:]
-                seeds.append(self._evaluate.held(inputs, states))
-        return seeds
+                own.append(evaluate.held(inputs, states))
+        return own, others
 
-    def _find(self, base: Plan, remaining_s: Callable[[], float] | None) -> Found:
+    def _find(self, bases: list[Plan], remaining_s: Callable[[], float] | None) -> Found:
+        """The best plan about any of the bases, which share the budget. Searching only about the
+        best of all seeds ends in worse valleys than searching about our own."""
         plans, evaluate = self._plans, self._evaluate
         reach = np.full((evaluate.knots.shape[1], INPUTS), plans.feedback_limit)
         reach[:, 2] = HEAVE_REACH_MPS2
         if self._method is not Method.SWARM:
             sample = mppi if self._method is Method.MPPI else cem
-            return sample(evaluate, base, reach, plans.sampling, self._generator, remaining_s)
-        found = swarm(evaluate, base, reach, plans.swarm, self._lanes, remaining_s)
-        better, late = polish(
-            evaluate, found.plan, self._quadratic.hessian, plans.polish_steps, remaining_s
-        )
-        return replace(found, plan=better, cut_short=found.cut_short or late)
+            return sample(evaluate, bases[0], reach, plans.sampling, self._generator, remaining_s)
+        share = max(1, plans.swarm.iterations // len(bases))
+        settings = plans.swarm.model_copy(update={"iterations": share})
+        answers = []
+        for base in bases:
+            found = swarm(evaluate, base, reach, settings, self._lanes, remaining_s)
+            better, late = polish(
+                evaluate, found.plan, self._quadratic.hessian, plans.polish_steps, remaining_s
+            )
+            answers.append(replace(found, plan=better, cut_short=found.cut_short or late))
+        return min(answers, key=lambda found: found.plan.cost)
 
     def _certificate(self, found: Found, linear: BoxQuadratic) -> Certificate:
         """Against the exact plan where the problem is a quadratic: nothing nonlinear in it."""
@@ -214,3 +228,7 @@ class HorizonLaw(TrackingLaw):
             cut_short=found.cut_short,
             at_bound=bool(((plan.inputs[0] <= lower) | (plan.inputs[0] >= upper)).any()),
         )
+
+
+def _cost(plan: Plan) -> float:
+    return plan.cost if math.isfinite(plan.cost) else math.inf

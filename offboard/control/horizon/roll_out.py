@@ -113,9 +113,10 @@ class Scene(NamedTuple):
     lower: Array  # (N, 3)
     upper: Array
     volumes: Array  # (V, PACKED_SIZE), where they are at the first node
+    floor_down_m: float  # no way round a volume leads below, where the reference does not
 
 
-def scene_of(outlook: Outlook, within: Bounds, volumes: Array) -> Scene:
+def scene_of(outlook: Outlook, within: Bounds, volumes: Array, floor_down_m: float) -> Scene:
     return Scene(
         outlook.positions_ned_m,
         outlook.velocities_ned_mps,
@@ -127,6 +128,7 @@ def scene_of(outlook: Outlook, within: Bounds, volumes: Array) -> Scene:
         within.lower,
         within.upper,
         volumes,
+        floor_down_m,
     )
 
 
@@ -334,6 +336,11 @@ def _penalise(plant, scene, k, before, after, costs) -> None:  # type: ignore[no
         for n in range(particles):
             north, east = b[0] + after[B, n], b[1] + after[B + 1, n]
             costs[n] += hold * _excess(math.sqrt(north * north + east * east) - c[TILT_MOST])
+    if scene.volumes.shape[0]:
+        down = scene.positions[end, 2]
+        room = max(scene.floor_down_m - down, 0.0)
+        for n in range(particles):
+            costs[n] += hold * _excess(after[Z, n] - room)
     for i in range(scene.volumes.shape[0]):
         for node in range(2 * k + 1, 2 * k + 3):
             volume = scene.volumes[i].copy()

@@ -22,6 +22,7 @@ Remaining = Callable[[], float] | None
 # Steps of the knots: dense where the next command is, sparse where it will be decided again
 KNOT_SHARES = (0.0, 0.15, 0.4, 0.8)
 DIFFERENCE = 1e-4  # for slopes, by central differences: exact on a quadratic
+SCATTER = 1.0  # of the knots' reach, for the particle that starts furthest from the base
 STRIDES = 2.0 ** -np.arange(0.0, 12.0)
 
 
@@ -71,6 +72,10 @@ class Evaluator:
         self._plant, self._scene, self._start = plant, scene, start
 
     @property
+    def scene(self) -> Scene:
+        return self._scene
+
+    @property
     def lower(self) -> Array:
         return self._scene.lower
 
@@ -91,6 +96,11 @@ class Evaluator:
         """What becomes of inputs (N, 3) with the feedback that holds states (N + 1, .)."""
         none = np.zeros((self.knots.shape[1], INPUTS, 1))
         self._run(inputs, states, 1.0, self.knots, none)
+        return self.picked(1, 0)
+
+    def flown(self, inputs: Array) -> Plan:
+        """What becomes of inputs (N, 3) without feedback."""
+        self.of_inputs(np.ascontiguousarray(inputs[:, :, None]))
         return self.picked(1, 0)
 
     def picked(self, count: int, index: int) -> Plan:
@@ -126,7 +136,7 @@ def swarm(
     """Particles of knots within +-reach (M, 3) of `base`; the first one stands on it, and so
     the answer is never worse."""
     limit = reach.ravel()
-    particles = Swarm(-limit, limit, settings, lanes, [np.zeros_like(limit)])
+    particles = Swarm(-limit, limit, settings, lanes, _graded(limit, settings.particles))
     shape = (*reach.shape, settings.particles)
     best, cut_short = base, False
     for iteration in range(settings.iterations):
@@ -141,6 +151,14 @@ def swarm(
             break
     result = particles.result(cut_short)
     return Found(best, result.spread, result.iterations, cut_short)
+
+
+def _graded(limit: Array, count: int) -> list[Array]:
+    """Where the particles start, (n,) each: the first on the base, the others scattered about it,
+    ever wider. The same at each decision: what differs is their motion."""
+    directions = np.random.default_rng(count).uniform(-1.0, 1.0, (count, len(limit)))
+    widths = np.linspace(0.0, SCATTER, count)[:, None]
+    return list(widths * directions * limit)
 
 
 def polish(
