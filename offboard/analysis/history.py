@@ -52,7 +52,8 @@ class History:
     attitude: t, w, x, y, z, p, q, r (ATTITUDE_QUATERNION)
     truth: t, north, east, down (HIL_STATE_QUATERNION or SIM_STATE; empty without)
     reference: t, position 3, velocity 3, acceleration 3, course (POSITION_TARGET_LOCAL_NED)
-    setpoint: t, wall time s, w, x, y, z, thrust (SET_ATTITUDE_TARGET)
+    setpoint: t, wall time s, w, x, y, z, thrust (SET_ATTITUDE_TARGET); NaN from the third on where
+        the autopilot's own position loop was given one
     """
 
     position: Array
@@ -112,6 +113,9 @@ def gather(log: Tlog) -> History:
             case "SET_ATTITUDE_TARGET" if ours:
                 stamp_s = message.time_boot_ms / 1e3
                 rows["setpoint"].append((stamp_s, entry.unix_us / 1e6, *message.q, message.thrust))
+            case "SET_POSITION_TARGET_LOCAL_NED" if ours:
+                stamp_s = message.time_boot_ms / 1e3
+                rows["setpoint"].append((stamp_s, entry.unix_us / 1e6, *(math.nan,) * 5))
             case "DEBUG_FLOAT_ARRAY" if ours and _is_record(message):
                 records.append((message.time_usec / 1e6, TickRecord.from_data(message.data)))
             case "STATUSTEXT":

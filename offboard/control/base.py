@@ -30,6 +30,17 @@ class Command:
 
 
 @dataclass(frozen=True, slots=True)
+class PositionCommand:
+    """A setpoint for the autopilot's own position loop, NED, SI; `course_rad` of the nose."""
+
+    position_ned_m: tuple[float, float, float]
+    velocity_ned_mps: tuple[float, float, float]
+    acceleration_ned_mps2: tuple[float, float, float]
+    course_rad: float
+    course_rate_radps: float
+
+
+@dataclass(frozen=True, slots=True)
 class PredictedHeave:
     """The vertical motion at `time_s`, vehicle time, when the *thrust* of a command sent now takes
     effect: down is positive; `thrust_down_mps2` is T b_z."""
@@ -105,7 +116,7 @@ class Certificate:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    command: Command
+    command: Command | PositionCommand
     certificate: Certificate = field(default_factory=Certificate)
 
 

@@ -11,6 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
+from offboard.control.autopilot import AutopilotLaw, AutopilotSettings
 from offboard.control.base import Controller
 from offboard.control.horizon.law import HorizonLaw, HorizonSettings, Method
 from offboard.control.mpc import MpcLaw, MpcSettings
@@ -63,13 +64,19 @@ class Pid(PidSettings):
     law: Literal["pid"]
 
 
+class Autopilot(AutopilotSettings):
+    """The autopilot's own position loop."""
+
+    law: Literal["autopilot"]
+
+
 class Paper(PaperSettings):
     """The paper's law, one step ahead."""
 
     law: Literal["paper"]
 
 
-Law = Pso | Lqr | Mpc | Horizon | Mppi | Cem | Pid | Paper
+Law = Pso | Lqr | Mpc | Horizon | Mppi | Cem | Pid | Autopilot | Paper
 ControllerConfig = Annotated[Law, Field(discriminator="law")]
 LAWS: Mapping[str, type[Parameters]] = {
     "pso": Pso,
@@ -79,6 +86,7 @@ LAWS: Mapping[str, type[Parameters]] = {
     "mppi": Mppi,
     "cem": Cem,
     "pid": Pid,
+    "autopilot": Autopilot,
     "paper": Paper,
 }
 
@@ -106,5 +114,7 @@ def build(
             return HorizonLaw(vehicle, settings, Method(settings.law), stopwatch)
         case Pid():
             return PidLaw(vehicle, settings, stopwatch)
+        case Autopilot():
+            return AutopilotLaw(settings)
         case Paper():
             return PaperController(vehicle, settings, period_s, stopwatch)

@@ -2,7 +2,7 @@
 
 One instance flies one flight. Telemetry goes to the view and the observer; when vehicle time
 crosses a multiple of the control period the phase table is asked, and `_emit` (the only place
-that makes a setpoint) answers with at most one SET_ATTITUDE_TARGET.
+that makes a setpoint; `_hand_over` for the autopilot's own loop) answers with at most one.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from offboard.control.base import (
     Controller,
     Decision,
     DecisionError,
+    PositionCommand,
     PredictedState,
     Situation,
 )
@@ -48,6 +49,7 @@ from offboard.mavlink.outgoing import (
     AttitudeTarget,
     CommandLong,
     Outgoing,
+    PositionTarget,
     Record,
     SolverRecord,
     StatusTextOut,
@@ -365,9 +367,13 @@ class Companion:
             self._emit(time_s, self._level())
             return
         self._missed_decisions = 0
-        body_z_down = float(state.thrust_direction_ned[2])
-        command = clamp(self._excited(decision.command, time_s), self._vehicle)
-        self._emit(time_s, command, body_z_down)
+        command = decision.command
+        if isinstance(command, PositionCommand):
+            self._hand_over(time_s, command)
+        else:
+            body_z_down = float(state.thrust_direction_ned[2])
+            command = clamp(self._excited(command, time_s), self._vehicle)
+            self._emit(time_s, command, body_z_down)
         self._record(time_s, state, decision, arrived_s)
         self._learn(time_s)
 
@@ -454,6 +460,22 @@ class Companion:
                 hover_thrust=self._vehicle.hover_thrust,
                 gravity_mps2=self._vehicle.gravity_mps2,
                 body_z_down=body_z_down,
+            )
+        )
+
+    def _hand_over(self, time_s: float, command: PositionCommand) -> None:
+        """Emit a setpoint for the autopilot's own position loop. What it commands its attitude
+        loop is not ours to know: the observer only listens."""
+        self._observer.freeze(True)
+        self._command = Command(self._vehicle.gravity_mps2, LEVEL, command.course_rad)
+        self._send(
+            PositionTarget(
+                time_s=time_s,
+                position_ned_m=command.position_ned_m,
+                velocity_ned_mps=command.velocity_ned_mps,
+                acceleration_ned_mps2=command.acceleration_ned_mps2,
+                course_rad=command.course_rad,
+                course_rate_radps=command.course_rate_radps,
             )
         )
 

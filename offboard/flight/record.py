@@ -11,7 +11,7 @@ from dataclasses import astuple, dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.base import Decision, PredictedState
+from offboard.control.base import Command, Decision, PredictedState
 from offboard.mavlink.outgoing import ReferenceRecord
 from offboard.reference.base import FlatSample
 
@@ -20,6 +20,7 @@ COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: what is sent
 # leaves no gap in those that the vehicle counts
 RECORD_COMPONENT_ID = 192
 RECORD_NAME = "pso"
+NAN = float("nan")
 RECORD_ID = 1
 
 
@@ -54,6 +55,7 @@ class TickRecord:
     disturbance_down_mps2: float
     hover_thrust: float
     track_time_s: float  # time on the reference's own axis; NaN before it starts
+    seed_cost: float = NAN  # of the best plan a search started from
 
     def data(self) -> tuple[float, ...]:
         """The values in the order of DEBUG_FLOAT_ARRAY.data."""
@@ -73,12 +75,12 @@ class TickRecord:
     ) -> TickRecord:
         """Gather one tick: the decision, the state it was made for, and the loop's own figures."""
         command, certificate = decision.command, decision.certificate
+        # The autopilot's own loop chooses thrust and direction itself
+        direction = command.thrust_direction_ned if isinstance(command, Command) else (NAN,) * 3
         return cls(
             float(phase),
-            command.thrust_mps2,
-            command.thrust_direction_ned[0],
-            command.thrust_direction_ned[1],
-            command.thrust_direction_ned[2],
+            command.thrust_mps2 if isinstance(command, Command) else NAN,
+            *direction,
             command.course_rad,
             certificate.cost,
             certificate.optimal_cost,
@@ -101,6 +103,7 @@ class TickRecord:
             float(state.disturbance_ned_mps2[2]),
             hover_thrust,
             track_time_s,
+            certificate.seed_cost,
         )
 
     @classmethod

@@ -5,9 +5,10 @@ Everything that may be slow (compiling, starting a simulator) happens before the
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -25,10 +26,12 @@ from offboard.flight.phases import Limits
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.flight.sitl import SimulatorProcess
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
+from offboard.model.document import DocumentError
 from offboard.model.vehicle import Vehicle
 from offboard.reference.track import Track
 from offboard.reference.transfer import Hold
 
+REHEARSED_DECISIONS = 5  # of which the fastest counts: the machine may do something else too
 SITL_PATIENCE_S = 180.0  # a bundled simulator may compile first, on a machine that does much else
 
 
@@ -66,6 +69,7 @@ def rehearse(crew: Crew) -> float:
     """Call every code path of observer and controller, compiled ones included, and forget it.
 
     A stall of seconds at the first decision in flight is a crash. Returns the seconds it took.
+    Raises DocumentError where no decision can be had within the deadline.
     """
     began_s = clock.monotonic_s()
     observer = crew.make_observer()
@@ -81,13 +85,30 @@ def rehearse(crew: Crew) -> float:
         if step >= 20 and step % 10 == 0:
             state = observer.predict(time_s)
             situation = Situation(time_s, state, reference, previous, crew.deadline_s)
-            previous = crew.controller.decide(situation).command
-            observer.on_command(time_s, previous)
+            command = crew.controller.decide(situation).command
+            if isinstance(command, Command):
+                previous = command
+                observer.on_command(time_s, command)
+    _check_deadline(crew, replace(situation, deadline_s=0.0))
     crew.track.sample(np.array([0.0, 1.0]))
     if crew.learning and crew.learning.online:
         identification.warm_up(crew.vehicle)
     crew.controller.reset()
     return clock.monotonic_s() - began_s
+
+
+def _check_deadline(crew: Crew, cut_short: Situation) -> None:
+    """The least a decision takes, a search's first look included, must fit in its deadline."""
+    least_s = math.inf
+    for _ in range(REHEARSED_DECISIONS):
+        began_s = clock.monotonic_s()
+        crew.controller.decide(cut_short)
+        least_s = min(least_s, clock.monotonic_s() - began_s)
+    if least_s > crew.deadline_s:
+        raise DocumentError(
+            f"controller: a decision takes at least {1e3 * least_s:.1f} ms here, longer than "
+            f"deadline_s ({1e3 * crew.deadline_s:.1f} ms); plan fewer steps or allow more time"
+        )
 
 
 def fly(

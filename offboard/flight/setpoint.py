@@ -7,15 +7,23 @@ from __future__ import annotations
 
 import math
 
-from offboard.control.base import Command
+from offboard.control.base import Command, PositionCommand
 from offboard.model.vehicle import Vehicle
 
 LEVEL = (0.0, 0.0, 1.0)
 _LENGTH_TOLERANCE = 0.01
 
 
-def usable(command: Command) -> bool:
+def usable(command: Command | PositionCommand) -> bool:
     """Finite, and its thrust direction a unit vector."""
+    if isinstance(command, PositionCommand):
+        vectors = (
+            command.position_ned_m,
+            command.velocity_ned_mps,
+            command.acceleration_ned_mps2,
+            (command.course_rad, command.course_rate_radps),
+        )
+        return all(math.isfinite(value) for vector in vectors for value in vector)
     values = (command.thrust_mps2, *command.thrust_direction_ned, command.course_rad)
     if not all(math.isfinite(value) for value in values):
         return False
