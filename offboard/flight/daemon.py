@@ -46,12 +46,12 @@ class Loop:
         self._ended_early: Outcome | None = None
 
     def run(self) -> Outcome:
-        """Fly to the end. SIGINT and SIGTERM land; a second one leaves at once."""
+        """Fly to the end. SIGINT, SIGTERM and SIGHUP land; a second of the first two leaves."""
         gc.collect()
         gc.freeze()
         with self._signals():
             self._fly()
-        self._progress(self._companion)
+        self._show()
         if self._ended_early:
             return self._ended_early
         outcome = self._companion.outcome
@@ -81,7 +81,7 @@ class Loop:
             if not chunks or now_s - polled_s > POLL_S:
                 polled_s = now_s
                 self._deliver(companion.poll(self._time_s(now_s), now_s - heard_s), companion.peer)
-                self._progress(companion)
+                self._show()
                 self._check_process()
 
     def _time_s(self, now_s: float) -> float:
@@ -101,6 +101,13 @@ class Loop:
             self._log_error = f"the log {self._log.path} cannot be written ({error.strerror})"
             self._companion.request_stop()
 
+    def _show(self) -> None:
+        """Tell the user. A closed pipe or a lost terminal ends the showing, not the flight."""
+        try:
+            self._progress(self._companion)
+        except (Exception, SystemExit):
+            self._progress = lambda companion: None
+
     def _check_process(self) -> None:
         """A simulator that ended will not be waited for."""
         ended = None if self._companion.has_ended() else self._vehicle_process_ended()
@@ -114,10 +121,14 @@ class Loop:
     @contextmanager
     def _signals(self) -> Iterator[None]:
         def on_signal(number: int, frame: FrameType | None) -> None:
-            self._interrupts += 1
+            # a closing terminal may send SIGHUP twice
+            self._interrupts += number != signal.SIGHUP
             self._companion.request_stop()
 
-        before = {kind: signal.signal(kind, on_signal) for kind in (signal.SIGINT, signal.SIGTERM)}
+        kinds = [signal.SIGINT, signal.SIGTERM]
+        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup has it
+            kinds.append(signal.SIGHUP)
+        before = {kind: signal.signal(kind, on_signal) for kind in kinds}
         try:
             yield
         finally:

@@ -53,10 +53,10 @@ class UdpLink:
         while ready:
             try:
                 chunks.append(self._socket.recvfrom(DATAGRAM_SIZE))
-            except (BlockingIOError, InterruptedError):
-                break
             except ConnectionError:
                 continue  # the peer's port is closed: an ICMP answer to an earlier datagram
+            except OSError:
+                break  # nothing waits, or the interface went away
         return chunks
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
@@ -127,22 +127,22 @@ class SerialLink:
             raise LinkError(
                 f"serial port {device} at {baud} baud cannot be opened: {error}"
             ) from None
-        self._error = serial.SerialException
         self.send_errors = 0
 
     def receive(self, timeout_s: float) -> list[Chunk]:
-        self._port.timeout = max(0.0, timeout_s)
         try:
+            self._port.timeout = max(0.0, timeout_s)
             first = self._port.read(1)
             data = first + self._port.read(self._port.in_waiting) if first else b""
-        except self._error:
+        except OSError:  # unplugged, which pyserial tells in more than one way
+            select.select([], [], [], max(0.0, timeout_s))
             return []
         return [(data, "serial")] if data else []
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
         try:
             self._port.write(data)
-        except self._error:
+        except OSError:
             self.send_errors += 1
 
     def close(self) -> None:

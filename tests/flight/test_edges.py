@@ -1,0 +1,108 @@
+"""The loop and the links where the world outside fails: a terminal, a pipe, a cable."""
+
+from __future__ import annotations
+
+import os
+import pty
+import signal
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, cast
+
+import pytest
+
+from offboard.flight.companion import Companion, Outcome, Output
+from offboard.flight.daemon import Loop
+from offboard.flight.link import SerialLink
+from offboard.flight.log import FlightLog
+
+
+class Wire:
+    """A link on which nothing happens."""
+
+    is_stream = False
+
+    def receive(self, timeout_s: float) -> list[Any]:
+        return []
+
+    def send(self, data: bytes, peer: object) -> None: ...
+
+    def close(self) -> None: ...
+
+
+class Flight:
+    """A companion whose flight lasts `polls`, and which notes what it is asked."""
+
+    peer = None
+
+    def __init__(self, polls: int, during: Callable[[int], object]) -> None:
+        self.polls, self.during = polls, during
+        self.stops = 0
+        self.outcome: Outcome | None = None
+
+    def has_ended(self) -> bool:
+        return self.outcome is not None
+
+    def request_stop(self) -> None:
+        self.stops += 1
+
+    def poll(self, now_s: float, silence_s: float) -> Output:
+        self.polls -= 1
+        self.during(self.polls)
+        if self.polls == 0:
+            self.outcome = Outcome(0, "flown and landed")
+        return Output()
+
+
+def fly(flight: Flight, directory: Path, progress: Callable[[Any], None]) -> Outcome:
+    with FlightLog(directory / "flight", "") as log:
+        loop = Loop(cast(Companion, flight), Wire(), log, lockstep=False, progress=progress)
+        return loop.run()
+
+
+@pytest.mark.parametrize("failure", [SystemExit(1), BrokenPipeError(), OSError(5, "lost")])
+def test_a_terminal_that_went_away_ends_no_flight(tmp_path: Path, failure: BaseException) -> None:
+    shown = 0
+
+    def progress(companion: Any) -> None:
+        nonlocal shown
+        shown += 1
+        raise failure
+
+    flight = Flight(5, lambda left: None)
+    assert fly(flight, tmp_path, progress).sentence == "flown and landed"
+    assert (flight.polls, shown, flight.stops) == (0, 1, 0)
+
+
+@pytest.mark.parametrize(
+    ("number", "polls_left"), [(signal.SIGHUP, 0), (signal.SIGINT, 3), (signal.SIGTERM, 3)]
+)
+def test_two_signals(tmp_path: Path, number: int, polls_left: int) -> None:
+    """Both ask for a landing; only a hang-up, which comes twice by itself, never leaves."""
+    flight = Flight(5, lambda left: os.kill(os.getpid(), number) if left >= 3 else None)
+    outcome = fly(flight, tmp_path, lambda companion: None)
+    assert (flight.polls, flight.stops) == (polls_left, 2)
+    assert (outcome.exit_code == 0) is (polls_left == 0)
+
+
+def test_an_ignored_hang_up_stays_ignored(tmp_path: Path) -> None:
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        flight = Flight(5, lambda left: os.kill(os.getpid(), signal.SIGHUP))
+        assert fly(flight, tmp_path, lambda companion: None).exit_code == 0
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert flight.stops == 0
+
+
+def test_an_unplugged_serial_link_is_silent() -> None:
+    ours, theirs = pty.openpty()
+    link = SerialLink(os.ttyname(theirs), 57600)
+    os.write(ours, b"abc")
+    assert link.receive(0.5) == [(b"abc", "serial")]
+    os.close(theirs)
+    os.close(ours)
+    assert link.receive(0.01) == []
+    assert link.receive(0.02) == []
+    link.send(b"x", None)
+    link.close()
