@@ -13,6 +13,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from simulator.firmware.base import (
+    AT_LAST,
     AttitudeSetpoint,
     Behaviour,
     Condition,
@@ -28,6 +29,7 @@ from simulator.mission import GLOBAL_FRAMES, RELATIVE_FRAMES, Mission
 from simulator.parameters import ParameterTable
 from simulator.pilot import Nav, Pilot
 from simulator.plant import STEP_S, Plant, Truth
+from simulator.watch import EVERY_STEPS, Watch
 
 _POSITION_IGNORED, _LOCAL_NED = 0b111, 1  # type_mask; MAV_FRAME
 
@@ -67,8 +69,12 @@ class Autopilot:
         self._armed_s = self._landed_s = -math.inf
         self._flown = False
         self._setpoint_s = -math.inf
-        self._requested = ""
+        self._requested = self._event = ""
         self._takeoff_z_m = math.nan
+        self.gps_healthy = True
+        self._watch = Watch(firmware, self.parameters)
+        self._cause = ""  # of the failsafe
+        self._awaited: tuple[float, str] | None = None  # when a failsafe is carried out
 
     # -- what others see ---------------------------------------------------------------------
 
@@ -139,7 +145,7 @@ class Autopilot:
 
     def happen(self, event: str, *, mode: str = "", takeoff_z_m: float = math.nan) -> Result:
         """Run the rule table for an event; `mode` is the one asked for, if the event asks."""
-        self._requested, self._takeoff_z_m = mode, takeoff_z_m
+        self._requested, self._takeoff_z_m, self._event = mode, takeoff_z_m, event
         if self.refused and (said := self.refused.get(self._wish(event, mode))) is not None:
             self.texts.append(said)
             return Result.TEMPORARILY_REJECTED
@@ -226,6 +232,8 @@ class Autopilot:
             self._watch_stream()
         if self.armed:
             self._watch_flight(was_landed)
+        if self.steps % EVERY_STEPS == 0:
+            self._watch_surroundings()
 
     @property
     def truth(self) -> Truth:
@@ -250,6 +258,18 @@ class Autopilot:
                 plant.reset_counter,
             )
         return self._nav
+
+    def hear_ground_station(self) -> None:
+        """A heartbeat of one, on any link."""
+        self._watch.hear_ground_station(self.time_s)
+
+    def _watch_surroundings(self) -> None:
+        remaining = self.truth.battery.remaining if self.armed else 1.0
+        for event in self._watch.step(self.time_s, self.armed, remaining, self.gps_healthy):
+            self.happen(event)
+        if self._awaited is not None and self.time_s >= self._awaited[0]:
+            event, self._awaited = self._awaited[1], None
+            self.happen(event)
 
     def _watch_stream(self) -> None:
         if self.failsafe and self.stream_alive:
@@ -288,6 +308,8 @@ class Autopilot:
     def _holds(self, guard: str) -> bool:
         if guard.startswith("not "):
             return not self._holds(guard[4:])
+        if guard.startswith("since "):
+            return self.failsafe and self._cause == guard[6:]
         if guard.startswith("reached "):
             return guard[8:] in self.reached
         name, compares, value = guard.partition("=")
@@ -321,12 +343,14 @@ class Autopilot:
             "climb_m": self.mission.climb_m,
             "target_m": above_home_m,
             "target_amsl_m": amsl_m,
+            "delay_s": self.parameters.role("failsafe_delay_s"),
         }
 
     def _enter(self, name: str, *, by_failsafe: bool, takeoff_z_m: float) -> None:
         mode = self.firmware.modes[name]
         if not by_failsafe:
             self.failsafe = False
+            self._awaited = None
             self.intended = name
             if mode.remembered:
                 self.remembered = name
@@ -371,9 +395,16 @@ class Autopilot:
 
     def _disarm(self) -> None:
         self.armed = self._flown = False
+        self._awaited = None
 
     def _fail(self) -> None:
         self.failsafe = True
+        self._cause = self._event.removesuffix(AT_LAST)
+
+    def _await(self) -> None:
+        """Carry the failsafe out later, so that a pilot can take over before."""
+        delay_s = self.parameters.role("failsafe_delay_s")
+        self._awaited = (self.time_s + delay_s, self._event + AT_LAST)
 
     def _recover(self) -> None:
         self.failsafe = False
@@ -399,6 +430,7 @@ ACTIONS: dict[str, Callable[[Autopilot], None]] = {
     "arm": Autopilot._arm,
     "disarm": Autopilot._disarm,
     "failsafe": Autopilot._fail,
+    "await": Autopilot._await,
     "recover": Autopilot._recover,
     "take off": Autopilot._take_off,
     "hold": Autopilot._hold,

@@ -142,7 +142,7 @@ def _jump(vehicle: Vehicle, running: Running) -> None:
 
 
 def _lose_fix(vehicle: Vehicle, running: Running) -> None:
-    vehicle.view.has_fix = False
+    vehicle.autopilot.gps_healthy = False
     running.memory = 0.0
 
 
@@ -153,7 +153,7 @@ def _drift(vehicle: Vehicle, running: Running) -> None:
 
 
 def _regain_fix(vehicle: Vehicle, running: Running) -> None:
-    vehicle.view.has_fix = True
+    vehicle.autopilot.gps_healthy = True
     if running.memory:
         vehicle.autopilot.plant.reset_estimate((-running.memory, -running.memory, 0.0))
 

@@ -213,7 +213,9 @@ class Server:
         return system in (0, self.view.system) and for_autopilot
 
     def _heartbeat(self, message: Message) -> None:
-        self._ground_station = self._ground_station or message.type == MAV_TYPE_GCS
+        if message.type == MAV_TYPE_GCS:
+            self._ground_station = True
+            self.view.autopilot.hear_ground_station()
 
     def _command_long(self, message: Message) -> None:
         params = tuple(message.values[f"param{i}"] for i in range(1, 8))

@@ -51,7 +51,6 @@ class View:
     ping_sequence: int = 0
     payloads: dict[str, bytes] = field(default_factory=dict)
     # What faults do to it
-    has_fix: bool = True
     clock_offset_us: int = 0
     silent: set[str] = field(default_factory=set)
     stuck: dict[str, Stuck] = field(default_factory=dict)
@@ -80,9 +79,15 @@ class View:
 
     def restart(self, autopilot: Autopilot) -> None:
         """Another autopilot, after a reboot."""
+        autopilot.gps_healthy = self.autopilot.gps_healthy
         self.autopilot = autopilot
         self.clock_offset_us = self.ping_sequence = 0
         self._at_step = -1
+
+    @property
+    def has_fix(self) -> bool:
+        """No fault takes it away."""
+        return self.autopilot.gps_healthy
 
     @property
     def time_ms(self) -> int:

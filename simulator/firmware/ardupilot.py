@@ -211,6 +211,8 @@ ROLES: dict[str, Role] = {
     "return_height_m": ("RTL_ALT", _CENTI),
     "hover_thrust": "MOT_THST_HOVER",
     "tilt_boost": "ATC_ANGLE_BOOST",
+    "ground_station_timeout_s": math.inf,
+    "failsafe_delay_s": 0.0,
 }
 
 DEFAULT_RATES_HZ = {"HEARTBEAT": 1.0, "TIMESYNC": 0.1}

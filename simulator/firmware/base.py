@@ -17,6 +17,7 @@ Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
 ReadParameter = Callable[[str], float]
 NAN3: Triple = (math.nan, math.nan, math.nan)
+AT_LAST = ", at last"  # ends the event of a failsafe that was put off
 
 
 class Result(IntEnum):
@@ -32,6 +33,7 @@ class Result(IntEnum):
 class Severity(IntEnum):
     """MAV_SEVERITY, those in use."""
 
+    EMERGENCY = 0
     CRITICAL = 2
     WARNING = 4
     INFO = 6
@@ -76,9 +78,11 @@ class Rule:
     """One row of the state table: the first row that fits an event decides.
 
     event: name of what happened. mode: name of the mode it happened in, or "*".
-    when: names of guards that must all hold; "NAME=2" compares a parameter, "not X" negates.
+    when: names of guards that must all hold; "NAME=2" compares a parameter, "not X" negates,
+        "since X" is a failsafe because of event X.
     to: next mode, "*" none, "requested" the mode asked for, "remembered" the last one chosen.
-    do: actions ("arm", "disarm", "failsafe", "recover", "take off", "hold", "level", "latch").
+    do: actions ("arm", "disarm", "failsafe", "await", "recover", "take off", "hold", "level",
+        "latch").
     result: what a command is answered with. say, also: texts. send: messages to every link.
     """
 
@@ -260,6 +264,8 @@ class Firmware:
         [Mapping[str, Any], ReadParameter], AttitudeSetpoint | MotionSetpoint | None
     ]
     motion_setpoint: Callable[[Mapping[str, Any]], MotionSetpoint | None]
+    battery_events: tuple[tuple[str, str], ...] = ()  # and parameters: the share below which
+    position_without_fix_s: float = math.inf  # until the estimate of position is given up
     # a SET_POSITION_TARGET in another local frame, by the vehicle's attitude, in MAV_FRAME 1
     in_local_frame: Callable[[Mapping[str, Any], Quaternion], Mapping[str, Any]] = as_given
     # what is said about the named setpoint message when it demands nothing

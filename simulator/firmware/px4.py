@@ -13,6 +13,7 @@ import numpy as np
 
 from offboard.model.frames import rotation_from_quaternion
 from simulator.firmware.base import (
+    AT_LAST,
     AttitudeSetpoint,
     Behaviour,
     Condition,
@@ -67,6 +68,44 @@ _LATER = Result.TEMPORARILY_REJECTED
 _LOST = _critical("Failsafe activated")
 _NOT_AVAILABLE = _critical("Switching to {mode} is currently not available")
 
+_RTL, _LAND = "AUTO.RTL", "AUTO.LAND"
+_REGAINED = _info("GCS connection regained")
+_WARNINGS = {
+    "battery low": Say(Severity.EMERGENCY, "Low battery"),
+    "battery critical": Say(Severity.EMERGENCY, "Critical battery"),
+    "battery emergency": Say(Severity.EMERGENCY, "Emergency battery level"),
+    "ground station lost": _info("Connection to ground station lost"),
+}
+
+
+def _put_off(event: str, parameter: str, modes: Mapping[int, str]) -> list[Rule]:
+    """First hold, so that a pilot can take over; then the mode that the parameter's value names."""
+    chosen = [(f"{parameter}={value}", mode) for value, mode in modes.items()]
+    return [
+        *(
+            Rule(
+                event,
+                when=("armed", "not landed", value),
+                to="AUTO.LOITER",
+                do=("failsafe", "await"),
+                say=_WARNINGS[event],
+                also=(_critical("Failsafe activated: entering Hold for {delay_s:.0f} seconds"),),
+            )
+            for value, _ in chosen
+        ),
+        *(
+            Rule(
+                event + AT_LAST,
+                when=(f"since {event}", value),
+                to=mode,
+                do=("failsafe",),
+                say=_LOST,
+            )
+            for value, mode in chosen
+        ),
+    ]
+
+
 RULES = (
     Rule("mode", when=("not armed",), to="requested"),
     Rule("mode", when=("mode can run",), to="requested"),
@@ -107,7 +146,22 @@ RULES = (
             ("POSCTL", "ALTCTL", "STABILIZED", "AUTO.RTL", "AUTO.LAND", "AUTO.LOITER")
         )
     ),
-    Rule("stream found", when=("failsafe",), to="remembered", do=("recover",)),
+    Rule("stream found", when=("since stream lost",), to="remembered", do=("recover",)),
+    *_put_off("battery critical", "COM_LOW_BAT_ACT", {1: _RTL, 2: _LAND, 3: _RTL}),
+    *_put_off("battery emergency", "COM_LOW_BAT_ACT", {1: _RTL, 2: _LAND, 3: _LAND}),
+    *_put_off("ground station lost", "NAV_DLL_ACT", {1: "AUTO.LOITER", 2: _RTL, 3: _LAND}),
+    *(Rule(event, say=said) for event, said in _WARNINGS.items()),
+    Rule(
+        "ground station found",
+        when=("since ground station lost",),
+        to="remembered",
+        do=("recover",),
+        say=_REGAINED,
+    ),
+    Rule("ground station found", say=_REGAINED),
+    Rule("position lost", "OFFBOARD", when=("not obeys motion",)),
+    Rule("position lost", when=("armed", "not landed"), to=_LAND, do=("failsafe",), say=_LOST),
+    Rule("position found", when=("since position lost",), to="remembered", do=("recover",)),
     Rule("climbed", "AUTO.TAKEOFF", to="AUTO.LOITER"),
     Rule("default height", say=_info("Using default takeoff altitude: {takeoff_m:.1f} m")),
     Rule(
@@ -164,8 +218,14 @@ def _int(name: str, default: int, low: int, high: int, meaning: str) -> Paramete
 
 
 PARAMETERS = (
+    _real("BAT_CRIT_THR", 0.07, 0.05, 0.5, "share of the battery that is critical"),
+    _real("BAT_EMERGEN_THR", 0.05, 0.03, 0.5, "share of the battery that is an emergency"),
+    _real("BAT_LOW_THR", 0.15, 0.12, 0.5, "share of the battery that is low"),
+    _int("COM_DL_LOSS_T", 10, 5, 300, "s without ground station until it is lost"),
     _real("COM_DISARM_LAND", 2.0, -1, 20, "s from landing to disarming, < 0 never"),
     _real("COM_DISARM_PRFLT", 10.0, -1, 100, "s armed without takeoff until disarming, < 0 never"),
+    _real("COM_FAIL_ACT_T", 5.0, 0, 25, "s of hold before a failsafe is carried out"),
+    _int("COM_LOW_BAT_ACT", 0, 0, 3, "battery: 0 warning, 1 return, 2 land, 3 return or land"),
     _int("COM_OBL_RC_ACT", 0, 0, 5, "offboard lost: POSCTL ALTCTL STABILIZED RTL LAND LOITER"),
     _real("COM_OF_LOSS_T", 1.0, 0, 60, "s without setpoint until offboard is lost"),
     _int("COM_RCL_EXCEPT", 0, 0, 31, "modes in which lost sticks do not matter, bit 2 offboard"),
@@ -178,7 +238,7 @@ PARAMETERS = (
     _real("MPC_TKO_SPEED", 1.5, 1, 5, "m/s of climb at takeoff"),
     _real("MPC_XY_CRUISE", 5.0, 3, 20, "m/s of automatic flight"),
     _real("MPC_Z_V_AUTO_DN", 1.5, 0.5, 4, "m/s of automatic descent"),
-    _int("NAV_DLL_ACT", 0, 0, 6, "ground station lost: 0 nothing"),
+    _int("NAV_DLL_ACT", 0, 0, 6, "ground station lost: 0 nothing, 1 hold, 2 return, 3 land"),
     _int("NAV_RCL_ACT", 2, 1, 6, "sticks lost: 2 return"),
     _real("RTL_RETURN_ALT", 30.0, 0, 150, "m above home while returning"),
     _int("SYS_AUTOSTART", 10040, 0, 9999999, "airframe"),
@@ -196,6 +256,8 @@ ROLES: dict[str, Role] = {
     "return_height_m": "RTL_RETURN_ALT",
     "hover_thrust": "MPC_THR_HOVER",
     "tilt_boost": 0.0,
+    "ground_station_timeout_s": "COM_DL_LOSS_T",
+    "failsafe_delay_s": "COM_FAIL_ACT_T",
 }
 
 COMPANION_RATES_HZ = {
@@ -319,9 +381,9 @@ def in_local_frame(values: Mapping[str, Any], attitude: Quaternion) -> Mapping[s
     w, x, y, z = attitude
     yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
     ahead, aside = values["vx"], values["vy"]
-    turned = rotation_from_quaternion(np.array(attitude)) @ (
-        [values["afx"], values["afy"], values["afz"]]
-    )
+    given = (values["afx"], values["afy"], values["afz"])
+    finite = all(map(math.isfinite, given))
+    turned = rotation_from_quaternion(np.array(attitude)) @ given if finite else given
     mask = values["type_mask"] | 0b111
     mask |= 0b111_000 if mask & 0b111_000 else 0
     mask |= 0b111_000_000 if mask & 0b111_000_000 else 0
@@ -445,6 +507,12 @@ PX4 = Firmware(
     command_mode=command_mode,
     attitude_setpoint=attitude_setpoint,
     motion_setpoint=motion_setpoint,
+    battery_events=(
+        ("battery low", "BAT_LOW_THR"),
+        ("battery critical", "BAT_CRIT_THR"),
+        ("battery emergency", "BAT_EMERGEN_THR"),
+    ),
+    position_without_fix_s=5.0,  # EKF2_NOAID_TOUT
     in_local_frame=in_local_frame,
     motion_complaint=motion_complaint,
 )

@@ -21,6 +21,7 @@ OFFBOARD, LOITER, POSCTL = 0x00060000, 0x03040000, 0x00030000
 TAKEOFF, LAND, RTL = 0x02040000, 0x06040000, 0x05040000
 HOVER = 0.4895
 NAN = math.nan
+STEPS_PER_HEARTBEAT = 250
 
 
 def px4_vehicle() -> Vehicle:
@@ -52,8 +53,8 @@ class Bench:
         self._received: list[tuple[float, Any]] = []
         self._unread: list[tuple[float, bytes]] = []
         self._parser = mavlink.MAVLink(None)
-        if heartbeat_type is not None:
-            self.send(mavlink.MAVLink_heartbeat_message(heartbeat_type, 8, 0, 0, 4, 3))
+        self.heartbeat_type = heartbeat_type
+        self._heartbeat()
 
     @property
     def time_s(self) -> float:
@@ -67,6 +68,10 @@ class Bench:
 
     def send(self, message: Any) -> None:
         self.instance.feed(message.pack(self.codec))
+
+    def _heartbeat(self) -> None:
+        if self.heartbeat_type is not None:
+            self.send(mavlink.MAVLink_heartbeat_message(self.heartbeat_type, 8, 0, 0, 4, 3))
 
     def command(self, number: int, *params: float, to: tuple[int, int] | None = None) -> list[int]:
         """Send COMMAND_LONG, let a moment pass and return the results of its acks."""
@@ -116,6 +121,8 @@ class Bench:
         for step in range(round(duration_s / STEP_S)):
             if each is not None and step % every == 0:
                 each()
+            if self.instance.steps % STEPS_PER_HEARTBEAT == 0:
+                self._heartbeat()
             for datagram in self.instance.step():
                 self.raw += datagram
                 self._unread.append((self.time_s, datagram))

@@ -12,10 +12,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_frames import ARDUCOPTER_RECORDING, PX4_RECORDING
 
 KINDS = list(mavlink.mavlink_map.values())
-OBEYED = [
+OBEYED = [  # what a vehicle answers or obeys
     mavlink.mavlink_map[number]
-    for number in (0, 4, 11, 20, 21, 23, 39, 40, 41, 43, 44, 45, 51, 66, 73, 75, 76, 82, 84, 86)
-    + (110, 111)
+    for number in (
+        *(0, 4, 11, 20, 21, 23, 66, 75, 76, 82, 84, 86, 110, 111),
+        *(39, 40, 41, 43, 44, 45, 51, 73),  # missions
+    )
 ]
 COMMANDS = (20, 21, 22, 176, 224, 300, 400, 410, 510, 511, 512, 520)
 FLOATS = (math.nan, math.inf, -math.inf, 3.4e38, -3.4e38, 0.0, 1e-42, -1.0, 1.0, 6.0, 493.0)

@@ -291,6 +291,9 @@ def test_every_rule_names_modes_guards_and_actions_that_exist() -> None:
         assert {rule.to, rule.mode} <= set(PX4.modes) | special
         assert set(rule.do) <= set(ACTIONS)
         for guard in rule.when:
+            if guard.startswith("since "):
+                assert guard[6:] in {rule.event for rule in PX4.rules}
+                continue
             name, compares, _ = guard.removeprefix("not ").partition("=")
             assert (name in {p.name for p in PX4.parameters}) if compares else (name in GUARDS)
     assert len(describe(PX4)) == len(PX4.rules)

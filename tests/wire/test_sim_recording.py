@@ -14,7 +14,8 @@ from sim_talk import Talk, ask_again
 from simulator.sensors import EstimatorName
 
 RECORDING = Path(__file__).parent / "recordings" / "px4-1.16.1-offboard.tlog"
-NOT_OURS = ("[logger]",)  # PX4 announces its log file; the simulator writes none
+# PX4 announces its log file, the simulator writes none; the simulator hears that the recording ends
+NOT_OURS = ("[logger]", "Connection to ground station lost")
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,65 @@
+"""What happens to a vehicle by itself: ground station, battery and position lost and found.
+
+Knows how long and how low by the firmware's parameters; what is done about it is for the rules.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from simulator.firmware.base import Firmware
+from simulator.parameters import ParameterTable
+
+EVERY_STEPS = 25  # 0.1 s
+
+
+@dataclass(slots=True)
+class Watch:
+    firmware: Firmware
+    parameters: ParameterTable
+    _ground_station_s: float = math.nan  # last heard
+    _ground_station_lost: bool = False
+    _battery_level: int = 0  # of `firmware.battery_events`, already told
+    _fix_s: float = 0.0
+    _position_lost: bool = False
+
+    def hear_ground_station(self, now_s: float) -> None:
+        self._ground_station_s = now_s
+
+    def step(self, now_s: float, armed: bool, remaining: float, has_fix: bool) -> list[str]:
+        """Events since the last step; `remaining` is the battery's share."""
+        return [
+            *self._ground_station(now_s),
+            *self._battery(armed, remaining),
+            *self._position(now_s, has_fix),
+        ]
+
+    def _ground_station(self, now_s: float) -> list[str]:
+        timeout_s = self.parameters.role("ground_station_timeout_s")
+        lost = now_s - self._ground_station_s > timeout_s  # never heard is not lost
+        if lost == self._ground_station_lost:
+            return []
+        self._ground_station_lost = lost
+        return ["ground station lost" if lost else "ground station found"]
+
+    def _battery(self, armed: bool, remaining: float) -> list[str]:
+        """It only gets worse in flight; told anew of the next one."""
+        if not armed:
+            self._battery_level = 0
+            return []
+        known = self._battery_level
+        for level, (event, threshold) in enumerate(self.firmware.battery_events, 1):
+            if level > self._battery_level and remaining < self.parameters[threshold]:
+                self._battery_level = level
+                worst = event
+        return [worst] if self._battery_level > known else []
+
+    def _position(self, now_s: float, has_fix: bool) -> list[str]:
+        if has_fix:
+            self._fix_s = now_s
+        lost = now_s - self._fix_s > self.firmware.position_without_fix_s
+        if lost == self._position_lost:
+            return []
+        self._position_lost = lost
+        return ["position lost" if lost else "position found"]
