@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Sequence
 from functools import partial
@@ -97,7 +98,7 @@ def fly(
     def progress(companion: Companion) -> None:
         nonlocal shown
         for line in companion.announced[shown:]:
-            out.print(f"{companion.view.time_s:8.2f} s  {line}")
+            out.print(f"{companion.view.time_s:8.2f} s  {line}", markup=False, soft_wrap=True)
         shown = len(companion.announced)
 
     def prepared(seconds: float) -> None:
@@ -119,6 +120,7 @@ def fly(
     )
     order.resolve()
     out.print("preparing the controller (its first run on a machine compiles for seconds)")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # leave no simulator behind
     try:
         outcome = fly_order(order, progress, prepared)
     except KeyboardInterrupt:  # in flight it lands instead
@@ -344,11 +346,15 @@ def _score(flight: Path, requirements: list, as_json: bool) -> list[str]:  # typ
     """Score, write score.json beside a flight's log, print; return the missed requirements."""
     from offboard.analysis.document import as_text
     from offboard.analysis.table import show
+    from offboard.flight.log import LogError
     from offboard.sortie import keep_score, score_flight
 
     result, flown = score_flight(flight)
     if flight.is_dir():
-        keep_score(flight, result, flown)
+        try:
+            keep_score(flight, result, flown)
+        except LogError as error:  # the score itself is still worth printing
+            err.print(str(error), markup=False)
     if as_json:
         sys.stdout.write(as_text(result, flown))
     else:

@@ -91,8 +91,13 @@ def score_flight(flight: Path) -> tuple[Score, History]:
 
 
 def keep_score(directory: Path, score: Score, flown: History) -> None:
-    """Write score.json into a flight directory."""
-    (directory / "score.json").write_text(as_text(score, flown), encoding="utf-8")
+    """Write score.json into a flight directory. Raises LogError."""
+    try:
+        (directory / "score.json").write_text(as_text(score, flown), encoding="utf-8")
+    except OSError as error:
+        raise LogError(
+            f"{error.filename or directory} cannot be written ({error.strerror})"
+        ) from None
 
 
 def fly_trial(order: Order, trial: Trial) -> Result:

@@ -10,6 +10,7 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -160,6 +161,35 @@ def test_interrupt_lands(spawn: Spawn, tmp_path: Path) -> None:
     flown = history.gather(tlog.read(tmp_path / "x" / "flight.tlog"))
     assert "AUTO.LAND" in [mode.what for mode in flown.modes]
     assert flown.phases[-1].what.startswith("disarmed")
+
+
+def test_terminated_before_flight_leaves_no_simulator(spawn: Spawn, tmp_path: Path) -> None:
+    process = spawn("offboard", "fly", "--sitl", "--out", "x")
+    while process.poll() is None and not children(process.pid):
+        time.sleep(0.01)
+    (simulator,) = children(process.pid)
+    process.send_signal(signal.SIGTERM)
+    _, said = process.communicate(timeout=60)
+    assert (process.returncode, said) == (4, "interrupted before anything was sent\n")
+    assert not Path(f"/proc/{simulator}").exists()
+
+
+def test_a_pipe_that_closes_ends_no_flight(spawn: Spawn, tmp_path: Path) -> None:
+    process = spawn("offboard", "fly", "--sitl", "--out", "x", "--reference", "hover")
+    assert process.stdout is not None
+    assert process.stdout.readline()
+    process.stdout.close()
+    assert process.wait(timeout=60) == 0
+    flown = history.gather(tlog.read(tmp_path / "x" / "flight.tlog"))
+    assert flown.phases[-1].what.startswith("disarmed")
+
+
+def test_a_score_that_cannot_be_kept_is_told(spawn: Spawn, offboard: Call, tmp_path: Path) -> None:
+    process = spawn("offboard", "fly", "--sitl", "--out", "x", "--reference", "hover")
+    assert process.wait(timeout=60) == 0
+    (tmp_path / "x" / "score.json").unlink()
+    (tmp_path / "x" / "score.json").mkdir()
+    assert offboard("score", "x") == (0, "x/score.json cannot be written (Is a directory)\n")
 
 
 def test_simulator_killed_in_flight(spawn: Spawn, tmp_path: Path) -> None:
