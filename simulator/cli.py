@@ -15,6 +15,7 @@ from simulator.firmware.catalogue import FIRMWARES
 
 COMPANION_PORT, GROUND_PORT = 14540, 14550
 LOCAL_COMPANION_PORT, LOCAL_GROUND_PORT = 14580, 18570  # PX4's
+ANY_PORT = 0
 NO_LINK = "none"
 SYSTEM_MAX = 250
 
@@ -91,13 +92,18 @@ def simulate(
     from simulator.recorder import Recorder
     from simulator.udp import LinkError, open_link, shifted
 
+    # PX4's own local ports only in PX4's place: beside a real one they would starve it
+    own_ports = connect is None
     connect = connect or f"udpout:127.0.0.1:{COMPANION_PORT + instance}"
     numbers = range(instance, instance + instances)
     try:
         flown = config.scenario(scenario or personality.scenario)
         flyer = config.vehicle(vehicle or personality.vehicle)
         companions = [
-            open_link(shifted(connect, number - instance), LOCAL_COMPANION_PORT + number)
+            open_link(
+                shifted(connect, number - instance),
+                LOCAL_COMPANION_PORT + number if own_ports else ANY_PORT,
+            )
             for number in numbers
         ]
         grounds = [
