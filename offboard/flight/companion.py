@@ -323,10 +323,10 @@ class Companion:
         elif self.phase is Phase.TAKEOFF or self.phase in TRACKING:
             self._emit(time_s, self._level())
         elif self.phase is Phase.LAND:
-            if self.view.mode != self._dialect.land_mode:
-                self._ask(self._dialect.land(), time_s)
-            engaged = self.view.mode == self._dialect.engage_mode
-            if engaged and self._in_phase_s() < LAND_STREAM_S:
+            if not self._has_the_vehicle:
+                return
+            self._ask(self._dialect.land(), time_s)
+            if self._in_phase_s() < LAND_STREAM_S:
                 self._emit(time_s, self._level())
         elif self.phase is Phase.STAND_DOWN:
             self._ask(CommandLong.disarm(), time_s)
@@ -334,7 +334,7 @@ class Companion:
 
     def _hold_on_the_ground(self, time_s: float) -> None:
         """Without setpoints: not ours to fly before the autopilot's takeoff is taken over."""
-        if self.phase is Phase.LAND and self.view.mode != self._dialect.land_mode:
+        if self.phase is Phase.LAND and self._has_the_vehicle:
             self._ask(self._dialect.land(), time_s)
         elif self.phase is Phase.STAND_DOWN:
             self._ask(CommandLong.disarm(), time_s)
@@ -431,6 +431,11 @@ class Companion:
     def _lifted_by_command(self) -> bool:
         dialect = self._session.dialect
         return dialect is not None and dialect.takeoff is Takeoff.COMMAND
+
+    @property
+    def _has_the_vehicle(self) -> bool:
+        """The vehicle obeys us: in any other mode it lands, or a failsafe or a pilot has it."""
+        return self.view.mode == self._dialect.engage_mode
 
     @property
     def _dialect(self) -> Dialect:
