@@ -15,7 +15,7 @@ from simulator import config
 from simulator.firmware.base import Firmware, Result, Rule, Say, Severity
 from simulator.instance import Instance
 
-ATTITUDE, POSITION, PARAM_VALUE = 31, 32, 22
+HEARTBEAT, ATTITUDE, POSITION, PARAM_VALUE = 0, 31, 32, 22
 Action = Callable[[Pair], None]
 
 
@@ -102,6 +102,23 @@ def upside_down() -> Filter:
         return bytes(message.pack(codec))
 
     return lambda _, datagrams: [b"".join(map(turn, frames_of(d))) for d in datagrams]
+
+
+def critical() -> Filter:
+    """A link on which the vehicle shows a failsafe whatever it does, as with a battery low."""
+    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+
+    def change(frame: bytes) -> bytes:
+        if frame_id(frame) != HEARTBEAT:
+            return frame
+        told = mavlink.MAVLink(None).decode(bytearray(frame))
+        message = mavlink.MAVLink_heartbeat_message(
+            told.type, told.autopilot, told.base_mode, told.custom_mode, 5, 3
+        )
+        codec.seq = frame[4]
+        return bytes(message.pack(codec))
+
+    return lambda _, datagrams: [b"".join(map(change, frames_of(d))) for d in datagrams]
 
 
 # --- events ---------------------------------------------------------------------------------------

@@ -16,6 +16,7 @@ from faults import (
     ATTITUDE,
     PARAM_VALUE,
     POSITION,
+    critical,
     die,
     downlink,
     failing,
@@ -37,7 +38,7 @@ from faults import (
     with_default,
     without,
 )
-from pair import Pair, hover, in_phase, make
+from pair import Pair, decode, hover, in_phase, make
 
 from offboard.flight.phases import Phase
 
@@ -102,6 +103,17 @@ def left_to_the_pilot(pair: Pair) -> Checks:
     yield autopilot.armed
     yield autopilot.mode.name == "AUTO.LOITER"
     yield not pair.commands(LAND)
+
+
+def landing_left_to_the_pilot(pair: Pair) -> Checks:
+    """Nothing is asked once the heartbeat, at 1 Hz, has shown the pilot's mode."""
+    autopilot = pair.instance.autopilot
+    yield autopilot.armed
+    yield autopilot.mode.name == "AUTO.LOITER"
+    (began_s,) = (at_s for at_s, phase in pair.phases if phase is Phase.LAND)
+    frames = [(at_s, decode(frame)) for at_s, _, frame in pair.sent if at_s > began_s + 2.6]
+    yield len(frames) > 10
+    yield not any(m.get_type() in ("COMMAND_LONG", "SET_ATTITUDE_TARGET") for _, m in frames)
 
 
 def held_then_silent(pair: Pair) -> Checks:
@@ -292,6 +304,21 @@ ROWS = (
         landed_by_failsafe,
     ),
     # the pilot
+    Row(
+        "pilot takes over the landing while a failsafe shows",
+        lambda: hover(
+            "reference.height_m=3.0",
+            limits={"land_s": 20.0},
+            at=[
+                (in_phase(Phase.HOVER, 0.2), downlink(critical())),
+                (in_phase(Phase.LAND, 1.5), take_over),
+            ],
+        ),
+        4,
+        "not landed and disarmed after 20 s",
+        Phase.FAILED,
+        landing_left_to_the_pilot,
+    ),
     Row(
         "pilot takes over",
         in_track(take_over),
