@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import socket
 import subprocess
 import sys
@@ -72,6 +73,7 @@ class Peer:
         self.received: list[tuple[float, Any]] = []
         self.raw = bytearray()
         self.answers_timesync = True
+        self._heartbeat_s = math.inf  # when the next is due
         self._parser = mavlink.MAVLink(None)
 
     def __enter__(self) -> Peer:
@@ -104,6 +106,8 @@ class Peer:
             for message in self._parser.parse_buffer(datagram) or []:
                 if message.get_type() == "LOCAL_POSITION_NED":
                     self.time_s = message.time_boot_ms / 1000.0
+                    if self.time_s >= self._heartbeat_s:
+                        self.heartbeat()
                     if each is not None and self.time_s >= next_s:
                         each()
                         next_s += period_s
@@ -119,6 +123,8 @@ class Peer:
         return [message.text.rstrip("\t") for message in self.of("STATUSTEXT")]
 
     def heartbeat(self) -> None:
+        """One now and, from now on, one every second of vehicle time while it listens."""
+        self._heartbeat_s = self.time_s + 1.0
         self.send(mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3))
 
     def command(self, number: int, *params: float) -> None:
