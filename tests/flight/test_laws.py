@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
-from pair import Pair, make
+from pair import Pair, decode, make
+from pydantic import TypeAdapter
 
 from offboard.control.catalogue import LAWS
+from offboard.control.horizon.keep_out import KeepOut, clearances
+from offboard.flight.phases import Phase
 
-# RMSE in m that is to be undercut in calm; the paper's law has a time constant of 39 s
-MOST_M = dict.fromkeys(LAWS, 0.01) | {"paper": 2.5}
+# RMSE in m that is to be undercut in calm; the paper's law has a time constant of 39 s, the
+# autopilot's own loop lags
+MOST_M = dict.fromkeys(LAWS, 0.01) | {"paper": 2.5, "autopilot": 1.0}
 SHORT = ("reference.laps=1", "reference.period_s=6", "reference.half_length_m=1")
 
 
 def flying(controller: str, tmp_path: Path, *assignments: str, **options: object) -> Pair:
     """A pair that flies the shipped `controller`."""
+    tmp_path.mkdir(exist_ok=True)
     chosen = tmp_path / "chosen.yaml"
     chosen.write_text(f"vehicle: px4_sih\ncontroller: {controller}\nreference: lemniscate\n")
     return make(*assignments, name=str(chosen), **options)
@@ -30,3 +38,70 @@ def test_flies_a_short_lemniscate_and_lands(law: str, tmp_path: Path) -> None:
     assert score.rmse_position_m < MOST_M[law]
     assert score.tracked_s == pytest.approx(6.0, abs=0.3)
     assert not pair.instance.autopilot.armed
+
+
+def test_autopilot_gets_positions_while_tracking_and_attitudes_before(tmp_path: Path) -> None:
+    pair = flying("autopilot", tmp_path, *SHORT)
+    pair.fly()
+    sent: dict[Phase, set[str]] = {}
+    for _, phase, frame in pair.sent:
+        name = decode(frame).get_type()
+        if name.startswith("SET_"):
+            sent.setdefault(phase, set()).add(name)
+    assert sent[Phase.TAKEOFF] == {"SET_ATTITUDE_TARGET"}
+    for phase in (Phase.JOIN, Phase.TRACK):
+        assert sent[phase] == {"SET_POSITION_TARGET_LOCAL_NED"}
+    targets = [
+        decode(f) for _, phase, f in pair.sent if phase is Phase.TRACK and f[7:10] == b"T\0\0"
+    ]
+    assert len(targets) == pytest.approx(60, abs=3)
+    assert {target.type_mask for target in targets} == {0}
+    score = pair.score(tmp_path)
+    assert score.setpoint_gap_max_s <= 0.12
+    assert score.hover_thrust == pytest.approx(0.4895)  # the observer only listened
+
+
+AT_THE_TOP = {"shape": "sphere", "north_m": 1.41, "east_m": 1.0, "height_m": 3.0, "radius_m": 0.4}
+CROSSING = AT_THE_TOP | {"east_m": -6.0, "velocity_east_mps": 1.0}
+TOWER = {"shape": "cylinder", "north_m": -1.41, "east_m": 1.0, "height_m": 3.0, "radius_m": 0.3,
+         "length_m": 10.0}  # fmt: skip
+
+
+def flown_clearance(
+    law: str, volumes: list[dict[str, Any]], tmp_path: Path, *assignments: str
+) -> tuple[float, float]:
+    """The least distance to any volume, by the truth, from the climb to the landing; the RMSE."""
+    pair = flying(law, tmp_path, *assignments)
+    times, places = [], []
+    step = pair._step
+
+    def watched() -> None:
+        step()
+        companion = pair.companion
+        if companion.phase in (Phase.CLIMB, Phase.JOIN, Phase.TRACK, Phase.HOVER):
+            mission = companion._mission
+            times.append(mission.track_time_s(companion.view.time_s))
+            truth = np.array(pair.instance.autopilot.truth.position_ned_m)
+            places.append(truth - mission.origin_ned_m)
+
+    pair._step = watched  # type: ignore[method-assign]
+    assert pair.fly().exit_code == 0
+    keep_out = TypeAdapter(tuple[KeepOut, ...]).validate_python(volumes)
+    nearest = clearances(keep_out, np.array(times[::5]), np.array(places[::5]))
+    return float(nearest.min()), pair.score(tmp_path).rmse_position_m
+
+
+@pytest.mark.parametrize("volumes", [[AT_THE_TOP], [CROSSING], [AT_THE_TOP, TOWER]])
+def test_volumes_are_kept_clear_of(volumes: list[dict[str, Any]], tmp_path: Path) -> None:
+    keep_out = f"controller.keep_out={json.dumps(volumes)}"
+    nearest, rmse_m = flown_clearance("horizon", volumes, tmp_path, keep_out)
+    assert nearest > 0.3  # clearance_m
+    assert rmse_m < 0.4  # and back to the reference behind them
+
+
+@pytest.mark.parametrize("law", ["lqr", "mpc"])
+def test_others_fly_through(law: str, tmp_path: Path) -> None:
+    nearest, _ = flown_clearance(law, [AT_THE_TOP], tmp_path / "rest")
+    assert nearest < -0.3
+    nearest, _ = flown_clearance(law, [CROSSING], tmp_path / "moving")
+    assert nearest < -0.3

@@ -58,6 +58,17 @@ def offboard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -
         (("--connect", "serial:/dev/nonexistent:57600"), "cannot be opened"),
         (("--out", "/proc/nowhere"), "choose a directory that can be written with --out"),
         (("--sitl", "--scenario", "storm"), "storm"),
+        (
+            (
+                "--controller",
+                "horizon",
+                "--set",
+                "controller.keep_out=[{shape: sphere, north_m: 0, "
+                "east_m: 0, height_m: 3, radius_m: 0.5}]",
+            ),
+            "keep_out[0] (sphere) contains the start of the reference",
+        ),
+        (("--controller", "horizon", "--set", "controller.keep_out=[{shape: cone}]"), "keep_out"),
     ],
 )
 def test_usage_is_refused_before_anything_is_sent(

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +23,6 @@ Remaining = Callable[[], float] | None
 # Steps of the knots: dense where the next command is, sparse where it will be decided again
 KNOT_SHARES = (0.0, 0.15, 0.4, 0.8)
 DIFFERENCE = 1e-4  # for slopes, by central differences: exact on a quadratic
-SCATTER = 1.0  # of the knots' reach, for the particle that starts furthest from the base
 STRIDES = 2.0 ** -np.arange(0.0, 12.0)
 
 
@@ -156,9 +156,14 @@ def swarm(
 def _graded(limit: Array, count: int) -> list[Array]:
     """Where the particles start, (n,) each: the first on the base, the others scattered about it,
     ever wider. The same at each decision: what differs is their motion."""
-    directions = np.random.default_rng(count).uniform(-1.0, 1.0, (count, len(limit)))
-    widths = np.linspace(0.0, SCATTER, count)[:, None]
-    return list(widths * directions * limit)
+    return list(_directions(count, len(limit)) * limit)
+
+
+@cache
+def _directions(count: int, size: int) -> Array:
+    drawn = np.random.default_rng(count).uniform(-1.0, 1.0, (count, size))
+    widened: Array = np.linspace(0.0, 1.0, count)[:, None] * drawn
+    return widened
 
 
 def polish(
