@@ -16,14 +16,17 @@ from numpy.typing import NDArray
 
 from offboard.control.base import Command, PredictedHeave, PredictedState
 from offboard.control.filtering import correct, correct_position, correct_velocity, spread
+from offboard.control.observer_adaptation import DOWN, NORTH_EAST, Adaptation
 from offboard.control.observer_model import (
     HEADING,
     HEADING_START_SD,
     LATERAL,
+    LATERAL_DRIFT,
     LATERAL_START_SD,
     MEASURES_COURSE,
     MEASURES_TILT,
     VERTICAL,
+    VERTICAL_DRIFT,
     VERTICAL_START_SD,
     ObserverSettings,
     VelocitySource,
@@ -45,6 +48,7 @@ from offboard.control.propagation import (
     TILT_RATE,
     VELOCITY,
     advance,
+    missed,
     upright,
 )
 from offboard.model.frames import (
@@ -72,6 +76,12 @@ class Observer:
 
     def __init__(self, vehicle: Vehicle, settings: ObserverSettings) -> None:
         self._settings = settings
+        self._adaptation = Adaptation(
+            settings.position_sd_m,
+            settings.velocity_sd_mps,
+            settings.disturbance_density_mps2,
+            settings.disturbance_density_limit_mps2,
+        )
         self._position_at: float | None = None
         self._attitude_at: float | None = None
         self._adopt(vehicle)
@@ -87,6 +97,7 @@ class Observer:
         self._sent = 0
         self._state = np.zeros(STATE_SIZE)
         self._rates: Array = np.zeros(3)
+        self._adaptation.reset()
         self._restart()
 
     def adopt(self, vehicle: Vehicle) -> None:
@@ -99,6 +110,7 @@ class Observer:
         down = (self._gravity + self._state[DISTURBANCE + 2]) * ratio - vehicle.gravity_mps2
         slowed = vehicle.drag_per_mass_ps - self._vehicle.drag_per_mass_ps
         self._adopt(vehicle)
+        self._adaptation.trust_thrust()
         self._state[DISTURBANCE + 2] = down
         self._state[DISTURBANCE : DISTURBANCE + 3] += slowed * self._state[VELOCITY : VELOCITY + 3]
         self._bound_disturbance()
@@ -266,6 +278,7 @@ class Observer:
             self._lateral[4, 4] = 0.0
         self._state[DISTURBANCE : DISTURBANCE + 3] = 0.0
         self._state[BIAS : BIAS + 3] = 0.0
+        self._adaptation.interrupt()
 
     def _admit(self, time_s: float, last_s: float | None) -> bool:
         """Whether a message of a stream last heard at `last_s` says something new."""
@@ -294,19 +307,40 @@ class Observer:
         self._time_s = time_s
 
     def _correct(self, position: Array, velocity: Array) -> None:
+        settings, adaptation = self._settings, self._adaptation
+        if not settings.adaptive:
+            self._correct_by(position, velocity, settings.position_sd_m, settings.velocity_sd_mps)
+            return
+        innovation = missed(self._state, position, velocity)
+        sds = adaptation.position_sd_m, adaptation.velocity_sd_mps
+        if self._correct_by(position, velocity, *sds):
+            adaptation.interrupt()
+            return
+        residual = missed(self._state, position, velocity)
+        adaptation.note(self._time_s, innovation, residual)
+        self._filters[0][1][LATERAL_DRIFT] = adaptation.densities_mps2[NORTH_EAST]
+        self._filters[1][1][VERTICAL_DRIFT] = adaptation.densities_mps2[DOWN]
+
+    def _correct_by(
+        self, position: Array, velocity: Array, position_sd_m: float, velocity_sd_mps: float
+    ) -> bool:
+        """Whether either of them jumped."""
         settings, state = self._settings, self._state
-        sd, gate = settings.position_sd_m, settings.position_jump_m
-        self.position_jumps += max(
+        sd, gate = position_sd_m, settings.position_jump_m
+        moved = max(
             correct_position(state, LATERAL, self._lateral, position[:2], sd, gate),
             correct_position(state, VERTICAL, self._vertical, position[2:], sd, gate),
         )
+        self.position_jumps += moved
         if settings.velocity is VelocitySource.POSITION:
-            return
-        sd, gate = settings.velocity_sd_mps, settings.velocity_jump_mps
-        self.velocity_jumps += max(
+            return moved > 0
+        sd, gate = velocity_sd_mps, settings.velocity_jump_mps
+        leapt = max(
             correct_velocity(state, LATERAL, self._lateral, velocity[:2], sd, gate),
             correct_velocity(state, VERTICAL, self._vertical, velocity[2:], sd, gate),
         )
+        self.velocity_jumps += leapt
+        return moved + leapt > 0
 
     def _acceleration(self) -> Array:
         north, east = self._state[TILT : TILT + 2]

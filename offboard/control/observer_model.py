@@ -47,6 +47,7 @@ LATERAL = np.array(
 )
 VERTICAL = np.array([[POSITION + 2, VELOCITY + 2, DISTURBANCE + 2, BIAS + 2]])
 HEADING = np.array([[COURSE, COURSE_RATE]])
+LATERAL_DRIFT, VERTICAL_DRIFT = 4, 2  # of the disturbance among these
 # What is believed at the first message: the reported velocity, no disturbance, no bias.
 LATERAL_START_SD = np.array([0.1, 0.3, 0.02, 0.3, 1.0, 0.3])
 VERTICAL_START_SD = np.array([0.1, 0.3, 1.5, 0.3])
@@ -80,6 +81,9 @@ class ObserverSettings(Parameters):
     position_jump_m: float = Field(default=0.3, gt=0, le=100)
     velocity_jump_mps: float = Field(default=0.5, gt=0, le=100)
     disturbance_limit_mps2: float = Field(default=5.0, gt=0, le=20)
+    # Noise and drift beyond what stands above are learnt from the innovations; the drift so far
+    adaptive: bool = True
+    disturbance_density_limit_mps2: float = Field(default=1.0, gt=0, le=10)
 
 
 def plant_vector(vehicle: Vehicle, settings: ObserverSettings) -> Array:

@@ -154,5 +154,15 @@ def advance(
 
 
 @numba.njit(cache=True)
+def missed(state: Array, position: Array, velocity: Array) -> Array:
+    """Measured less believed position and reported velocity (6,)."""
+    out = np.empty(6)
+    for axis in range(3):
+        out[axis] = position[axis] - state[POSITION + axis]
+        out[3 + axis] = velocity[axis] - state[VELOCITY + axis] - state[BIAS + axis]
+    return out
+
+
+@numba.njit(cache=True)
 def wrapped(angle_rad: float) -> float:
     return angle_rad - 2.0 * math.pi * math.floor(angle_rad / (2.0 * math.pi) + 0.5)

@@ -1,0 +1,179 @@
+"""What the observer's innovations say of its own constants, compiled: noise and drift, online.
+
+With the right constants innovations are white (R. Mehra, 1970). What differs between neighbouring
+messages and comes back at once is noise of the measurement itself, more of it than believed. What
+stays for a fifth of a second is a disturbance that drifts faster than believed (gusts); PX4's and
+ArduCopter's estimators wander, but their innovations are over by then. Both estimates are slow,
+bounded, and never below what is configured. Knows no message, no plant and no clock.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+NOISE_TIME_S = 3.0
+NOISE_OUTLIER = 25.0  # a single product counts for at most so many times the variance
+# Innovations are averaged over SPAN_S and compared with those two spans earlier.
+SPAN_S, DRIFT_TIME_S = 0.1, 3.0
+RELATED = 0.25  # the correlation above which the density grows, by e in a second at 1 above
+VISIBLE_M = 5e-5  # innovations smaller than this say nothing
+LONGEST_SPAN_S = 0.3
+NORTH_EAST, DOWN = 0, 1
+
+# Rows of the memory, six numbers each: position and velocity, NED.
+RESIDUAL, CHANGE = 0, 1  # of the last message, see `weigh`
+MEANS = 2  # of the innovations over the newest three spans, newest first; position only
+RELATION = 5  # mean product (lateral, vertical) and mean square (the same) of the means
+SUM = 6  # of the innovations in this span
+COUNTS = 7  # messages in this span, neighbours heard, spans ended, begin of the span, last message
+MEMORY_SHAPE = (8, 6)
+IN_SPAN, NEIGHBOURS, SPANS, BEGAN_S, LAST_S = 0, 1, 2, 3, 4
+
+
+@numba.njit(cache=True)
+def weigh(
+    innovation: Array, memory: Array, interval_s: float, least: Array, variance: Array
+) -> None:
+    """White variance (2,) of position and velocity from their innovations (6,).
+
+    The measured change since the last message less the predicted one is innovation - residual;
+    for white noise of variance s^2 neighbouring changes have the covariance -s^2, for a measured
+    value that wanders none.
+    """
+    share = min(interval_s / NOISE_TIME_S, 0.1)
+    for kind in range(2):
+        product = 0.0
+        for i in range(3 * kind, 3 * kind + 3):
+            product -= (innovation[i] - memory[RESIDUAL, i]) * memory[CHANGE, i] / 3.0
+        limit = NOISE_OUTLIER * max(variance[kind], least[kind])
+        product = min(max(product, -limit), limit)
+        variance[kind] += share * (product - variance[kind])
+
+
+@numba.njit(cache=True)
+def relate(memory: Array, span_s: float, bounds: Array, density: Array) -> None:
+    """Densities (2,) of the disturbance, lateral and vertical, from the means of three spans.
+
+    bounds (2, 2): least and greatest of each.
+    """
+    share = span_s / DRIFT_TIME_S
+    relation = memory[RELATION]
+    for group in range(2):
+        product, square = 0.0, 0.0
+        first, end = (0, 2) if group == NORTH_EAST else (2, 3)
+        for axis in range(first, end):
+            now, before = memory[MEANS, axis], memory[MEANS + 2, axis]
+            product += now * before / (end - first)
+            square += 0.5 * (now**2 + before**2) / (end - first)
+        relation[group] += share * (product - relation[group])
+        relation[2 + group] += share * (square - relation[2 + group])
+        correlation = relation[group] / (relation[2 + group] + VISIBLE_M**2)
+        grown = density[group] * math.exp(span_s * (correlation - RELATED))
+        density[group] = min(max(grown, bounds[group, 0]), bounds[group, 1])
+
+
+@numba.njit(cache=True)
+def _end_span(memory: Array, time_s: float) -> None:
+    counts = memory[COUNTS]
+    memory[MEANS + 2] = memory[MEANS + 1]
+    memory[MEANS + 1] = memory[MEANS]
+    memory[MEANS] = memory[SUM] / counts[IN_SPAN]
+    memory[SUM] = 0.0
+    counts[IN_SPAN] = 0.0
+    counts[BEGAN_S] = time_s
+    counts[SPANS] += 1.0
+
+
+@numba.njit(cache=True)
+def note(
+    memory: Array,
+    time_s: float,
+    innovation: Array,
+    residual: Array,
+    least: Array,
+    variance: Array,
+    bounds: Array,
+    density: Array,
+) -> None:
+    """One message: innovation (6,) before and residual (6,) after its correction."""
+    counts = memory[COUNTS]
+    if counts[NEIGHBOURS] == 0.0:
+        counts[BEGAN_S] = time_s
+    elif counts[NEIGHBOURS] > 1.0:
+        weigh(innovation, memory, time_s - counts[LAST_S], least, variance)
+    memory[CHANGE] = innovation - memory[RESIDUAL]
+    memory[RESIDUAL] = residual
+    memory[SUM] += innovation
+    counts[IN_SPAN] += 1.0
+    counts[NEIGHBOURS] += 1.0
+    counts[LAST_S] = time_s
+    span_s = time_s - counts[BEGAN_S]
+    if span_s >= SPAN_S - 1e-6:
+        _end_span(memory, time_s)
+        if counts[SPANS] > 2.0:
+            relate(memory, min(span_s, LONGEST_SPAN_S), bounds, density)
+
+
+class Adaptation:
+    """White standard deviations of position and velocity, densities of the disturbance.
+
+    `position_sd_m`, `velocity_sd_mps` and `density_mps2`, `density_limit_mps2` are the least and
+    (of the density) greatest values.
+    """
+
+    def __init__(
+        self,
+        position_sd_m: float,
+        velocity_sd_mps: float,
+        density_mps2: float,
+        density_limit_mps2: float,
+    ) -> None:
+        self._least = np.array([position_sd_m, velocity_sd_mps]) ** 2
+        self._limit_mps2 = max(density_mps2, density_limit_mps2)
+        self._bounds = np.full((2, 2), density_mps2)
+        self.reset()
+
+    def reset(self) -> None:
+        """Believe what is configured."""
+        self._variance = np.zeros(2)
+        self._memory = np.zeros(MEMORY_SHAPE)
+        self._bounds[NORTH_EAST, 1] = self._limit_mps2
+        self._bounds[DOWN, 1] = self._bounds[DOWN, 0]
+        self.densities_mps2: Array = self._bounds[:, 0].copy()  # lateral, vertical
+
+    def trust_thrust(self) -> None:
+        """From now on the vertical density may grow too. A thrust that acts later than believed
+        looks like drift, and answering it faster makes it oscillate."""
+        self._bounds[DOWN, 1] = self._limit_mps2
+
+    def interrupt(self) -> None:
+        """The next innovation is no neighbour of the last one: a jump, a gap, a new start."""
+        self._memory[SUM:] = 0.0
+
+    @property
+    def position_sd_m(self) -> float:
+        return math.sqrt(max(self._variance[0], self._least[0]))
+
+    @property
+    def velocity_sd_mps(self) -> float:
+        return math.sqrt(max(self._variance[1], self._least[1]))
+
+    def note(self, time_s: float, innovation: Array, residual: Array) -> None:
+        """Innovation before and residual after the correction by one message, (6,) each: position
+        (m) and velocity (m/s), NED."""
+        note(
+            self._memory,
+            time_s,
+            innovation,
+            residual,
+            self._least,
+            self._variance,
+            self._bounds,
+            self.densities_mps2,
+        )

@@ -1,0 +1,167 @@
+"""What the observer learns of its own constants, against motions and noises made with NumPy."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from offboard.control.base import Command
+from offboard.control.observer import Observer, ObserverSettings
+from offboard.control.observer_adaptation import DOWN, NORTH_EAST, Adaptation
+from offboard.model.vehicle import AxisResponse, Vehicle
+
+Array = NDArray[np.float64]
+G = 9.80665
+UPRIGHT, STILL = (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)
+DRAG = 1.02
+VEHICLE = Vehicle(
+    name="hovering",
+    mass_kg=1.0,
+    inertia_kgm2=(0.025, 0.025, 0.03),
+    drag_translation_npmps=(DRAG,) * 3,
+    drag_rotation_nmpradps=(0.02, 0.02, 0.02),
+    hover_thrust=0.5,
+    tilt=AxisResponse(delay_s=0.0, natural_frequency_radps=11.4, damping=0.56),
+    yaw=AxisResponse(delay_s=0.148, natural_frequency_radps=3.1, damping=0.4),
+)
+SETTINGS = ObserverSettings()
+
+
+@dataclass(frozen=True)
+class Hover:
+    """A level vehicle that only a disturbance moves: rows of NED at `times`."""
+
+    times: Array
+    positions: Array
+    velocities: Array
+    disturbances: Array
+
+
+def hover(seconds: float, gap_s: float, seed: int, drift: float = 0.0, kicks: float = 0.0) -> Hover:
+    """v' = d - c v, d a random walk of density `drift` (m/s^2 per root second), v kicked with
+    density `kicks` (m/s per root second); per axis, steps of 1 ms."""
+    rng = np.random.default_rng(seed)
+    steps, root = round(seconds / 1e-3), np.sqrt(1e-3)
+    disturbances = np.cumsum(drift * root * rng.standard_normal((steps, 3)), axis=0)
+    pushes = 1e-3 * disturbances + kicks * root * rng.standard_normal((steps, 3))
+    velocities = np.zeros((steps, 3))
+    for i in range(1, steps):
+        velocities[i] = (1.0 - 1e-3 * DRAG) * velocities[i - 1] + pushes[i]
+    positions = 1e-3 * np.cumsum(velocities, axis=0)
+    rows = slice(None, None, round(gap_s / 1e-3))
+    times: Array = np.arange(0.0, steps)[rows] * 1e-3
+    return Hover(times, positions[rows], velocities[rows], disturbances[rows])
+
+
+def watch(
+    flown: Hover,
+    settings: ObserverSettings = SETTINGS,
+    white: tuple[float, float] = (0.0, 0.0),
+    adopted: bool = True,
+) -> tuple[Observer, Array, Array]:
+    """An observer that has heard it all with white noise on position and velocity; believed
+    positions and disturbances (N, 3)."""
+    rng = np.random.default_rng(99)
+    observer = Observer(VEHICLE, settings)
+    observer.on_command(0.0, Command(G, (0.0, 0.0, 1.0), 0.0))
+    positions, disturbances = np.empty_like(flown.positions), np.empty_like(flown.positions)
+    if adopted:
+        observer.adopt(VEHICLE)
+    for i, time_s in enumerate(flown.times.tolist()):
+        position = flown.positions[i] + white[0] * rng.standard_normal(3)
+        velocity = flown.velocities[i] + white[1] * rng.standard_normal(3)
+        observer.on_attitude(time_s, UPRIGHT, STILL)
+        observer.on_position(time_s, tuple(position), tuple(velocity))
+        believed = observer.predict(time_s)
+        positions[i] = believed.position_ned_m
+        disturbances[i] = believed.disturbance_ned_mps2
+    return observer, positions, disturbances
+
+
+def learnt(observer: Observer) -> Adaptation:
+    return observer._adaptation
+
+
+def rms(errors: Array, share: float = 0.5) -> float:
+    """Of the last `share` of the rows, per axis."""
+    return float(np.sqrt(np.mean(errors[-round(share * len(errors)) :] ** 2)))
+
+
+@pytest.mark.parametrize("gap_s", [0.008, 0.02, 0.05])
+def test_white_noise_is_measured(gap_s: float) -> None:
+    """2 cm and 5 cm/s on a drifting hover, at 125, 50 and 20 Hz: found within a quarter."""
+    flown = hover(25.0, gap_s, seed=1, drift=0.1)
+    observer, _, _ = watch(flown, white=(0.02, 0.05))
+    assert learnt(observer).position_sd_m == pytest.approx(0.02, rel=0.25)
+    assert learnt(observer).velocity_sd_mps == pytest.approx(0.05, rel=0.25)
+
+
+def test_white_noise_is_smoothed_away() -> None:
+    """Of 2 cm per sample less than 0.6 cm are left; with the constants configured, over 1 cm."""
+    flown = hover(20.0, 0.01, seed=2, drift=0.05)
+    _, adapted, _ = watch(flown, white=(0.02, 0.02))
+    _, fixed, _ = watch(flown, SETTINGS.model_copy(update={"adaptive": False}), (0.02, 0.02))
+    assert rms(adapted - flown.positions) < 0.006
+    assert rms(fixed - flown.positions) > 0.010
+
+
+def test_an_estimate_that_wanders_is_not_noise_nor_gusts() -> None:
+    """A velocity kicked as PX4's frame of reference is (0.2 m/s per root second), smooth from
+    sample to sample: nothing is changed, on three seeds."""
+    for seed in (3, 4, 5):
+        observer, _, _ = watch(hover(20.0, 0.008, seed=seed, kicks=0.2))
+        assert learnt(observer).position_sd_m < 1.1 * SETTINGS.position_sd_m
+        floor = SETTINGS.disturbance_density_mps2
+        assert learnt(observer).densities_mps2 == pytest.approx([floor, floor], rel=0.3)
+
+
+def test_gusts_are_followed_faster() -> None:
+    """A disturbance drifting by 0.7 m/s^2 per root second: both densities grow, and the believed
+    disturbance is off by less than 0.7 of what it is with the density configured."""
+    flown = hover(20.0, 0.01, seed=6, drift=0.7)
+    observer, _, adapted = watch(flown)
+    _, _, fixed = watch(flown, SETTINGS.model_copy(update={"adaptive": False}))
+    assert min(learnt(observer).densities_mps2) > 0.5
+    assert rms(adapted - flown.disturbances) < 0.7 * rms(fixed - flown.disturbances)
+
+
+def test_the_density_falls_again_when_the_gusts_are_over() -> None:
+    gusts = hover(15.0, 0.01, seed=7, drift=0.7)
+    observer, _, _ = watch(gusts)
+    grown = learnt(observer).densities_mps2.copy()
+    for i in range(2000):
+        time_s = 15.0 + 0.01 * i
+        observer.on_attitude(time_s, UPRIGHT, STILL)
+        observer.on_position(time_s, tuple(gusts.positions[-1]), STILL)
+    assert grown[NORTH_EAST] > 0.5
+    assert learnt(observer).densities_mps2 == pytest.approx([0.15, 0.15])
+
+
+def test_the_vertical_waits_until_the_thrust_is_known() -> None:
+    """A thrust that acts later than believed looks like drift."""
+    flown = hover(15.0, 0.01, seed=8, drift=0.7)
+    observer, _, _ = watch(flown, adopted=False)
+    assert learnt(observer).densities_mps2[DOWN] == SETTINGS.disturbance_density_mps2
+    assert learnt(observer).densities_mps2[NORTH_EAST] > 0.5
+
+
+def test_a_jump_is_not_noise() -> None:
+    """Ten resets of the estimator's position by 2 m in 10 s."""
+    flown = hover(15.0, 0.01, seed=9)
+    jumps = 2.0 * np.cumsum(np.arange(len(flown.times)) % 100 == 50)[:, None]
+    observer, _, _ = watch(Hover(flown.times, flown.positions + jumps, *[flown.velocities] * 2))
+    assert observer.position_jumps == 15
+    assert learnt(observer).position_sd_m == SETTINGS.position_sd_m
+
+
+def test_learnt_constants_are_bounded_and_forgotten_by_a_reset() -> None:
+    settings = SETTINGS.model_copy(update={"disturbance_density_limit_mps2": 0.4})
+    observer, _, _ = watch(hover(15.0, 0.01, seed=10, drift=2.0), settings, (0.05, 0.0))
+    assert learnt(observer).position_sd_m > 0.03
+    assert max(learnt(observer).densities_mps2) <= 0.4
+    observer.reset()
+    assert learnt(observer).position_sd_m == SETTINGS.position_sd_m
+    assert learnt(observer).densities_mps2 == pytest.approx([0.15, 0.15])
