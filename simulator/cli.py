@@ -62,6 +62,9 @@ def simulate(
     patience: Annotated[
         float, typer.Option(min=0.1, max=600.0, help="Seconds to wait for a silent companion.")
     ] = 5.0,
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Say and count what the autopilot would swallow.")
+    ] = False,
     log: Annotated[
         Path | None, typer.Option(help="Record the companion link as a .tlog; never overwrites.")
     ] = None,
@@ -138,6 +141,7 @@ def simulate(
                 ground_link=ground is not None,
                 epoch_us=epoch_us,
                 faults=flown.faults,
+                strict=strict,
             ),
             companion,
             ground,
@@ -163,6 +167,9 @@ def simulate(
         _tell(outcome.sentence)
     if instances > 1:
         print(f"{instances} vehicles: {runner.punctuality}", flush=True)
+    for berth in berths:
+        for sentence, count in berth.instance.swallowed.items():
+            print(f"{count} x {sentence}", flush=True)
     raise typer.Exit(outcome.code)
 
 

@@ -6,7 +6,7 @@ same seed and the same bytes in at the same steps give the same bytes out.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from offboard.model.vehicle import Vehicle
 from simulator.attitude import Demand
@@ -18,6 +18,7 @@ from simulator.impairment import frames
 from simulator.injection import prepare
 from simulator.plant import STEP_S, Plant
 from simulator.server import Server
+from simulator.strict import Strict
 from simulator.telemetry import View
 
 STEP_MS = round(STEP_S * 1000)
@@ -46,13 +47,19 @@ class Instance:
         ground_link: bool = True,
         epoch_us: int = VIRTUAL_EPOCH_US,
         faults: Sequence[Fault] = (),
+        strict: bool = False,
     ) -> None:
         self.autopilot = Autopilot(
             firmware, Plant(vehicle, conditions, seed), boot_scale=conditions.boot_scale
         )
         self.view = View(self.autopilot, system, epoch_us)
-        self.companion = Server(self.view, firmware.companion_rates_hz, barrier=lockstep)
-        self.ground = Server(self.view, firmware.ground_rates_hz if ground_link else {})
+        self._strict = Strict(system, self.autopilot.parameters) if strict else None
+        self.companion = Server(
+            self.view, firmware.companion_rates_hz, barrier=lockstep, strict=self._strict
+        )
+        self.ground = Server(
+            self.view, firmware.ground_rates_hz if ground_link else {}, strict=self._strict
+        )
         self.steps = 0
         self._injection = prepare(faults, seed)
         self._arrived: list[bytes] = []
@@ -64,6 +71,11 @@ class Instance:
     def time_s(self) -> float:
         """Time since the start; the vehicle's own until it reboots."""
         return self.steps * STEP_S
+
+    @property
+    def swallowed(self) -> Mapping[str, int]:
+        """How often each thing was complained of (`strict`)."""
+        return {} if self._strict is None else self._strict.swallowed
 
     @property
     def idle(self) -> bool:

@@ -5,7 +5,6 @@ Knows names, kinds and ranges from the firmware's data; knows no socket.
 
 from __future__ import annotations
 
-import math
 import struct
 from collections.abc import Mapping
 
@@ -40,22 +39,30 @@ class ParameterTable:
             return self._values[filler[0]] * filler[1]
         return filler
 
+    def _takes(self, spec: ParameterSpec | None, value: float) -> bool:
+        return spec is not None and spec.minimum <= value <= spec.maximum
+
     def set(self, name: str, value: float) -> bool:
         """Set one; False (and unchanged) when unknown, not finite or out of range."""
         spec = self._specs.get(name)
-        if spec is None or not math.isfinite(value):
-            return False
-        if not spec.minimum <= value <= spec.maximum:
+        if spec is None or not self._takes(spec, value):
             return False
         self._values[name] = value if spec.kind == "real32" else float(int(value))
         return True
 
+    def takes(self, name: str, wire: float) -> bool:
+        """Whether `set_from_wire` would set it."""
+        return self._takes(self._specs.get(name), self._from_wire(name, wire))
+
     def set_from_wire(self, name: str, wire: float) -> bool:
         """Set from PARAM_SET.param_value, which carries an integer as its bytes or its value."""
+        return self.set(name, self._from_wire(name, wire))
+
+    def _from_wire(self, name: str, wire: float) -> float:
         spec = self._specs.get(name)
         if spec is not None and self._is_bytewise(spec):
-            return self.set(name, float(_INT.unpack(_FLOAT.pack(wire))[0]))
-        return self.set(name, wire)
+            return float(_INT.unpack(_FLOAT.pack(wire))[0])
+        return wire
 
     def to_wire(self, name: str) -> tuple[float, int]:
         """(param_value, param_type) of PARAM_VALUE."""

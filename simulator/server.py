@@ -14,6 +14,7 @@ from simulator.commands import Command, Commands
 from simulator.firmware.base import Say
 from simulator.mission_transfer import HANDLERS as MISSION_HANDLERS
 from simulator.mission_transfer import Transfer
+from simulator.strict import Strict
 from simulator.telemetry import (
     MAV_COMP_ID_AUTOPILOT,
     ON_POSITION_GRID,
@@ -47,6 +48,7 @@ class Server:
     view: View
     rates_hz: Mapping[str, float]
     barrier: bool = False
+    strict: Strict | None = None
     decoder: Decoder = field(default_factory=Decoder)
     heard: bool = False
     answered_ns: int = -1  # ts1 of the newest TIMESYNC answer
@@ -200,9 +202,17 @@ class Server:
         """Handle everything in one datagram; no bytes make this raise."""
         for message in self.decoder.read(datagram):
             self.heard = True
+            if self.strict is not None:
+                self._judge(message)
             handler = HANDLERS.get(message.name)
             if handler is not None and self._is_for_us(message):
                 handler(self, message)
+
+    def _judge(self, message: Message) -> None:
+        assert self.strict is not None
+        said = self.strict.complaint(message, self._now_us * 1e-6)
+        if said is not None:
+            self.view.autopilot.texts.append(said)
 
     def _is_for_us(self, message: Message) -> bool:
         """To our system or all, to the autopilot or all of it."""

@@ -41,11 +41,18 @@ class Bench:
         ground_link: bool = False,
         firmware: Firmware = PX4,
         boot_scale: float = 1.0,
+        strict: bool = False,
     ) -> None:
         conditions = Conditions(estimator=estimator, boot_scale=boot_scale)
         vehicle = config.vehicle(firmware.vehicle)
         self.instance = Instance(
-            firmware, vehicle, conditions, seed, system=system, ground_link=ground_link
+            firmware,
+            vehicle,
+            conditions,
+            seed,
+            system=system,
+            ground_link=ground_link,
+            strict=strict,
         )
         self.system = system
         self.codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
