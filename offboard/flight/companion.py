@@ -73,7 +73,7 @@ class Output:
 
     send: tuple[bytes, ...] = ()
     log: tuple[bytes, ...] = ()
-    alive: bool = False  # the vehicle itself said something
+    alive: bool = False  # the vehicle was heard: its state, once that flows
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,19 +148,21 @@ class Companion:
         arrived_s = self._stopwatch()
         reception = self._session.receive(datagram, peer, now_s)
         if reception.events:
-            self._silence_s = self._bridged_s = 0.0
             self.peer = peer
         for event in reception.events:
             self._note(event)
+        alive = any(self._is_sign_of_life(event) for event in reception.events)
+        if alive:
+            self._silence_s = self._bridged_s = 0.0
         if self.view.has_state and not self.has_ended():
             self._tick_if_due(arrived_s)
         self._collect(self._session.poll(now_s))
         for reply in reception.replies:
             self._send(reply)
-        return self._output(reception.frames, bool(reception.events))
+        return self._output(reception.frames, alive)
 
     def poll(self, now_s: float, silence_s: float) -> Output:
-        """Call when nothing arrives. `silence_s`: wall time since the vehicle was heard."""
+        """Call when nothing arrives. `silence_s`: wall time since `Output.alive`."""
         self._silence_s = silence_s
         patience_s = min(self._limits.silence_s, self._limits.connect_s)
         if not self.has_ended() and (
@@ -173,6 +175,11 @@ class Companion:
         return self._output((), False)
 
     # ------------------------------------------------------------------ telemetry in
+
+    def _is_sign_of_life(self, event: Event) -> bool:
+        """Whether the vehicle is heard: by its state once that flows, for without it vehicle time
+        stands still and nothing is decided, whatever heartbeats say."""
+        return isinstance(event, (Attitude, LocalPosition)) or not self.view.has_state
 
     def _note(self, event: Event) -> None:
         self.view.note(event)

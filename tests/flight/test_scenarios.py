@@ -125,6 +125,15 @@ def held_then_silent(pair: Pair) -> Checks:
     yield len(pair.commands(LAND)) >= 1
 
 
+def told_to_land(pair: Pair) -> Checks:
+    """Level setpoints while nothing is seen, at most 0.5 s of silence before the first of them."""
+    yield pair.instance.autopilot.mode.name == "AUTO.LAND"
+    blind_s = pair.heard_s
+    after = [(at_s, s) for at_s, _, s in pair.setpoints if at_s > blind_s + 0.2]
+    yield len(after) >= 5 and after[0][0] < blind_s + 0.5
+    yield all(abs(setpoint.q[1]) + abs(setpoint.q[2]) < 1e-6 for _, setpoint in after)
+
+
 def smooth(pair: Pair) -> Checks:
     """The jump is taken with the tilt that the law allows itself, not with more."""
     yield from flown(pair)
@@ -372,6 +381,14 @@ ROWS = (
         "the vehicle restarted in flight",
         Phase.FAILED,
         lambda pair: iter([not pair.instance.autopilot.armed]),
+    ),
+    Row(
+        "position and attitude stop, heartbeats go on",
+        in_track(downlink(without(POSITION, ATTITUDE))),
+        4,
+        "no telemetry for 1.0 s; no telemetry for 2.0 s while landing",
+        Phase.FAILED,
+        told_to_land,
     ),
     Row(
         "position stops",
