@@ -107,14 +107,18 @@ def score(history: History) -> Score:
 
 
 def _window(history: History) -> tuple[float, float] | None:
-    """First and last vehicle time of the phase TRACK."""
+    """First and last vehicle time of the phase TRACK; None where the log holds too little of it."""
     track = float(PHASE_CODES[Phase.TRACK])
     times = [
         time_s
         for time_s, record in zip(history.record_time_s, history.records, strict=True)
         if record.phase == track
     ]
-    return (times[0], times[-1]) if len(times) > 1 and len(history.position) else None
+    if len(times) < 2 or len(history.reference) < 2:
+        return None
+    seen = (history.position, history.attitude, history.setpoint)
+    heard = all(len(_between(rows, times[0], times[-1])) > 1 for rows in seen)
+    return (times[0], times[-1]) if heard else None
 
 
 def _between(rows: Array, begin_s: float, end_s: float) -> Array:
@@ -126,7 +130,8 @@ def _curve(history: History) -> tuple[BPoly, Array]:
     """The reference as a function of vehicle time, and its rows: the records are joined by the
     quintic that their position, velocity and acceleration determine."""
     rows = history.reference
-    rows = rows[np.concatenate(([True], np.diff(rows[:, 0]) > 0))]
+    newest = np.maximum.accumulate(rows[:, 0])
+    rows = rows[np.concatenate(([True], rows[1:, 0] > newest[:-1]))]
     knots = np.stack((rows[:, 1:4], rows[:, 4:7], rows[:, 7:10]), axis=1)
     return BPoly.from_derivatives(rows[:, 0], knots), rows
 

@@ -55,4 +55,6 @@ class FlightLog:
 
     def write(self, unix_us: int, frame: bytes) -> None:
         """Append one frame with its time of crossing. A full disk raises OSError."""
-        self._file.write(_STAMP.pack(unix_us & ~3) + frame)
+        rest = _STAMP.pack(unix_us & ~3) + frame
+        while rest:  # a disk that fills up takes a part; what came next would lie inside it
+            rest = rest[self._file.write(rest) :]

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
-from pair import make
+from pair import SHORT, make
 
+from offboard.analysis import history
+from offboard.analysis.score import score
 from offboard.flight.phases import Phase
 
 
@@ -56,6 +60,20 @@ def test_same_seed_same_bytes_another_seed_others() -> None:
     assert len(first.payloads) > 200
     assert first.payloads == again.payloads
     assert first.payloads != other.payloads
+
+
+def test_a_log_with_parts_missing_is_scored_as_far_as_it_goes(tmp_path: Path) -> None:
+    pair = make(*SHORT, reference="hover")
+    assert pair.fly().exit_code == 0
+    flown = history.gather(pair.log(tmp_path))
+    whole = score(flown)
+    assert whole.rmse_position_m < 0.05
+    for part in ("position", "attitude", "setpoint", "reference"):
+        rows = getattr(flown, part)
+        for kept in (rows[:0], rows[:1]):
+            assert math.isnan(score(replace(flown, **{part: kept})).rmse_position_m)
+    twice = np.vstack((flown.reference, flown.reference))
+    assert score(replace(flown, reference=twice)).rmse_position_m == whole.rmse_position_m
 
 
 def test_every_setpoint_is_finite_and_within_the_vehicle(tmp_path: Path) -> None:
