@@ -236,6 +236,29 @@ class Autopilot:
             self._watch_surroundings()
 
     @property
+    def quiet_steps(self) -> int:
+        """Steps from now in which nothing can happen unless somebody speaks or the ground is
+        touched or left; a step too few rather than one too many."""
+        if self.failsafe or not self.pilot.flies_itself(self.armed, self.plant.on_ground):
+            return 0
+        until_s = self._boot[0][0] if self._boot else math.inf
+        if self.armed:
+            if self.mode.behaviour is Behaviour.SETPOINT:
+                patience_s = self.parameters.role("stream_timeout_s")
+                lost_s = self._setpoint_s + self.firmware.stream_reaction_s + patience_s
+                until_s = min(until_s, lost_s)
+            if not self._flown:
+                until_s = min(until_s, self._armed_s + self.parameters.role("disarm_idle_s"))
+        watched = self.steps // EVERY_STEPS * EVERY_STEPS + EVERY_STEPS
+        return int(min(until_s / STEP_S, watched)) - 1 - self.steps
+
+    def flown(self, count: int) -> None:
+        """The plant is so many quiet steps further."""
+        self.pilot.flown(self.steps, count)
+        self.steps += count
+        self._truth = self._nav = None
+
+    @property
     def truth(self) -> Truth:
         """Where the vehicle really is now."""
         if self._truth is None:

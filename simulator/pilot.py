@@ -20,7 +20,7 @@ from simulator.firmware.base import (
 )
 from simulator.mission import Mission
 from simulator.parameters import ParameterTable
-from simulator.plant import Demand
+from simulator.plant import STEP_S, Demand
 from simulator.position_loop import PositionLoop
 
 LOOP_S = 0.008  # the position loop runs at every second step, as PX4's does on its estimate
@@ -140,6 +140,32 @@ class Pilot:
                 self._fly_vertical(setpoint, nav)
             self._detect(nav)
         return self._demand
+
+    def flies_itself(self, armed: bool, on_ground: bool) -> bool:
+        """Whether `fly` will repeat its demand until somebody speaks or the ground is touched."""
+        if not armed:
+            return self.landed and self._demand is OFF
+        setpoint = self._attitude_setpoint
+        return (
+            setpoint is not None
+            and setpoint is self._source
+            and setpoint.climb_mps is None
+            and not (self.landed or on_ground or self.climbed or self.events)
+            and not self._boosts_thrust
+        )
+
+    def flown(self, first_step: int, count: int) -> None:
+        """Keep `fly`'s clocks for steps in which it was not asked, as `flies_itself` allows."""
+        if self._demand is OFF:
+            return
+        for step in range(first_step, first_step + count):
+            time_s = step * STEP_S
+            if time_s >= self._next_loop_s - 1e-6:
+                self._next_loop_s = time_s + LOOP_S
+                self._armed_for_s += LOOP_S
+                self._ground_s = 0.0
+                if not self._firmware.setpoint_decides_flight:
+                    self._air_s += LOOP_S
 
     def level(self, nav: Nav) -> None:
         """Nobody says what to do: level, course and height as they are."""

@@ -68,8 +68,14 @@ _ERROR_LANE, _GUST_LANE, _WHITE_LANE = 0, 1, 2
 _STATE_ENDS = np.cumsum([QUATERNION.size, ROTOR_SIZE, 3, ERROR_COUNT, 5])
 
 
-# Places in the packed constants: body_constants[0] and rotor_constants[0] of `_advance`.
+# Places in the packed constants: body_constants[0] and rotor_constants[0] of `advance_steps`.
 _MASS, _THRUST_MAX = 0, 12
+
+# Places in the state vector, for compiled callers.
+CONTACT_PLACE = QUATERNION.size + CONTACT
+ACCELERATION_PLACES = slice(QUATERNION.size + 3, QUATERNION.size + 6)
+
+Compiled = tuple[int, bool, int, np.uint64, Array, Array, NDArray[np.int64], Array, Array, Array]
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +164,8 @@ class Plant:
         self._wind[:] = wind_ned_mps
         fill_normals(self._seed, _GUST_LANE, -1, gust)
         gust[:] = self._gusts.stationary_scale @ gust
-        self._offset_ned_m = np.zeros(3)
+        self._believed = np.concatenate([np.zeros(3), [self._lag_s], self._white_sds])
+        self._offset_ned_m = self._believed[:3]
         self._reset_counter = 0
 
     @property
@@ -176,7 +183,7 @@ class Plant:
         count = int(self._due_s / STEP_S + 1e-6)
         self._due_s -= count * STEP_S
         if count > 0:
-            _advance(
+            advance_steps(
                 count,
                 self._step,
                 self._motors_on,
@@ -187,8 +194,29 @@ class Plant:
                 self._loop.delays,
                 self._constants,
                 self._state,
+                False,
             )
             self._step += count
+
+    def compiled(self) -> Compiled:
+        """What `advance_steps` and `report_state` want, in the order of the former: for a caller
+        that is compiled itself, and tells `flown` afterwards. The demand is the last one."""
+        return (
+            self._step,
+            self._motors_on,
+            self._airframe.substeps,
+            self._seed,
+            self._row,
+            self._history,
+            self._loop.delays,
+            self._constants,
+            self._state,
+            self._believed,
+        )
+
+    def flown(self, count: int) -> None:
+        """A compiled caller took the state so many steps further."""
+        self._step += count
 
     def reset_estimate(self, offset_ned_m: Triple) -> None:
         """The estimator jumps by this much from now on, and says so by its reset counter."""
@@ -255,24 +283,32 @@ class Plant:
     def report(self) -> Array:
         """The estimate in one array (REPORT_WIDTH,), laid out as `simulator.sensors` says."""
         out = np.empty(REPORT_WIDTH)
-        report(
-            self._body,
-            self._rotor[ACCELERATION],
-            self._error,
-            self._offset_ned_m,
-            self._lag_s,
-            self._white_sds,
-            1.0 if self._motors_on else STANDING_NOISE,
-            self._seed,
-            _WHITE_LANE,
-            self._step,
-            out,
-        )
+        report_state(self._state, self._believed, self._motors_on, self._seed, self._step, out)
         return out
 
 
 @numba.njit(cache=True)
-def _advance(
+def report_state(
+    state: Array, believed: Array, motors_on: bool, seed: np.uint64, step: int, out: Array
+) -> None:
+    """The estimate of this state; `believed`: reset offset (3,), lag, white deviations (12,)."""
+    report(
+        state[:13],
+        state[16:19],
+        state[22:34],
+        believed[:3],
+        believed[3],
+        believed[4:],
+        1.0 if motors_on else STANDING_NOISE,
+        seed,
+        _WHITE_LANE,
+        step,
+        out,
+    )
+
+
+@numba.njit(cache=True)
+def advance_steps(
     count: int,
     first_step: int,
     motors_on: bool,
@@ -283,9 +319,11 @@ def _advance(
     delays: NDArray[np.int64],
     constants: Array,
     state: Array,
-) -> None:
-    """`count` steps in place. Per step: demand into history, air, loop on the estimate, airframe,
-    estimator errors. Packed, because unpacking one argument costs a tenth of a step."""
+    until_contact: bool,
+) -> int:
+    """`count` steps in place; the steps done, which are fewer if `until_contact` and the ground is
+    touched or left. Per step: demand into history, air, loop on the estimate, airframe, estimator
+    errors. Packed, because unpacking one argument costs a tenth of a step."""
     body, rotor, wind = state[:13], state[13:19], state[19:22]
     error, gust = state[22:34], state[34:39]
     body_constants, rotor_constants = constants[:12], constants[12:18]
@@ -300,6 +338,7 @@ def _advance(
     noisy = np.any(error_scale != 0.0)
     gusty = np.any(gust != 0.0)
     noise_gain = 1.0 if motors_on else STANDING_NOISE
+    contact = rotor[CONTACT]
     for step in range(first_step, first_step + count):
         history[step % history.shape[0], :] = row
         if gusty:
@@ -334,3 +373,6 @@ def _advance(
                 advance_block(
                     error_transition, error_scale, first, end, noise_gain, normals, error, work
                 )
+        if until_contact and rotor[CONTACT] != contact:
+            return step + 1 - first_step
+    return count

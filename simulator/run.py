@@ -9,6 +9,7 @@ Input is read at barriers only, hence a flight is a function of its seed.
 from __future__ import annotations
 
 import gc
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -129,12 +130,11 @@ class Runner:
         self._links = list(self._owner)
         self._stopping = stopping
         self._tell = tell
-        self._duration_s = duration_s
+        self._end_s = math.inf if duration_s is None else duration_s
         self.punctuality = Punctuality()
 
     def _over(self) -> bool:
-        expired = self._duration_s is not None and self._instance.time_s >= self._duration_s
-        return expired or self._stopping()
+        return self._instance.time_s >= self._end_s or self._stopping()
 
     # -- real time ---------------------------------------------------------------------------
 
@@ -187,8 +187,7 @@ class Runner:
         gc.collect()
         gc.freeze()
         while not self._over():
-            self._instance.advance()
-            if not self._instance.barrier_due():
+            if not self._instance.advance_to_barrier(self._end_s):
                 continue
             stamp_ns, datagrams = self._berth.send_barrier()
             self._berth.read_ground()

@@ -12,10 +12,13 @@ from dataclasses import dataclass, field
 from simulator.codec import Decoder, Message, frame, layout
 from simulator.commands import Command, Commands
 from simulator.firmware.base import Say
+from simulator.frame_writer import KINDS
 from simulator.mission_transfer import HANDLERS as MISSION_HANDLERS
 from simulator.mission_transfer import Transfer
+from simulator.stretch import SILENT, SLOW, Stretch
 from simulator.strict import Strict
 from simulator.telemetry import (
+    BUILDERS,
     MAV_COMP_ID_AUTOPILOT,
     ON_POSITION_GRID,
     View,
@@ -23,6 +26,7 @@ from simulator.telemetry import (
 
 MAV_TYPE_GCS = 6
 TEXT_LENGTH = 50
+STEP_US = 4000
 DATAGRAM_MAX = 1400
 PARAMETERS_PER_STEP = 4
 PARAMETER_BY_NAME = 65535  # PARAM_VALUE.param_index of an answer that has none
@@ -59,15 +63,20 @@ class Server:
     _next_us: int = 0
     _text_id: int = 0
     _parameters_due: list[str] = field(default_factory=list)
+    _stretch: Stretch = field(init=False)
+    _scheduled: bool = False  # whether the stretch knows the streams
+    _odd: bool = False  # something is silent, stuck or withheld now
     _commands: Commands = field(init=False)
     _transfer: Transfer = field(init=False)
 
     def __post_init__(self) -> None:
         self._commands = Commands(self)
+        self._stretch = Stretch(self.view)
         self._transfer = Transfer(self, self.view.autopilot.mission)
         self._start_streams()
 
     def _start_streams(self) -> None:
+        self._scheduled = False
         for name, rate_hz in self.rates_hz.items():
             if not (self.barrier and name == "TIMESYNC"):
                 self._streams[name] = Stream(round(1e6 / rate_hz), 0)
@@ -93,6 +102,10 @@ class Server:
         """Everything queued, as datagrams of whole frames."""
         if not self._out:
             return []
+        together = b"".join(self._out)
+        if len(together) <= DATAGRAM_MAX:
+            self._out = []
+            return [together]
         datagrams: list[bytes] = []
         size, start = 0, 0
         for i, queued in enumerate(self._out):
@@ -114,20 +127,69 @@ class Server:
             for name in self._parameters_due[:PARAMETERS_PER_STEP]:
                 self.send_parameter(name, listed=True)
             del self._parameters_due[:PARAMETERS_PER_STEP]
+        view = self.view
+        if self._odd or view.silent or view.stuck:
+            self._release()
         if now_us < self._next_us:
             return
-        autopilot = self.view.autopilot
-        on_grid = autopilot.steps % autopilot.firmware.position_grid_steps == 0
-        next_us = 1 << 62
-        silent, withheld = self.view.silent, autopilot.firmware.withheld_until
+        self.fly(0)
+
+    @property
+    def mute_steps(self) -> int:
+        """Steps from now in which this link says nothing by itself."""
+        if self._transfer.uploading or self._parameters_due:
+            return 0
+        return -(-self._next_us // STEP_US) - self.view.autopilot.steps - 1
+
+    @property
+    def only_streams(self) -> bool:
+        """Nothing but streams has this link to say by itself."""
+        return not (self._transfer.uploading or self._parameters_due or self._odd)
+
+    def fly(self, count: int) -> int:
+        """Take the vehicle at most `count` steps on and queue what is due; the steps flown.
+
+        0: queue what is due now. Ends early behind a step that a slow message describes.
+        """
+        if not self._scheduled:
+            self._schedule()
+        done, said, next_step = self._stretch.fly(count, self._sequence)
+        self._next_us = next_step * STEP_US
+        if done:
+            self.view.autopilot.flown(done)
+        for frame_or_name in said:
+            if isinstance(frame_or_name, bytes):
+                self._out.append(frame_or_name)
+                self._sequence = (self._sequence + 1) & 0xFF
+            else:
+                self.send_now(frame_or_name)
+        return done
+
+    def _schedule(self) -> None:
+        """Hand the streams to the compiled code, as far as it can write them."""
+        view = self.view
+        firmware = view.autopilot.firmware
+        withheld = {name for name in firmware.withheld_until if self.withheld(name)}
+        grid = firmware.position_grid_steps
+        rows = []
         for name, stream in self._streams.items():
-            if stream.due_us <= now_us and (on_grid or name not in ON_POSITION_GRID):
-                if name not in silent and not (name in withheld and self.withheld(name)):
-                    self.send_now(name)
-                stream.due_us = (now_us // stream.interval_us + 1) * stream.interval_us
-            if stream.due_us < next_us:
-                next_us = stream.due_us
-        self._next_us = next_us
+            kind = SLOW
+            if name in view.silent or name in withheld:
+                kind = SILENT
+            elif name in KINDS and name not in view.stuck and view.builders[name] is BUILDERS[name]:
+                kind = KINDS.index(name)
+            steps = grid if name in ON_POSITION_GRID else 1
+            rows.append((name, kind, stream.interval_us, stream.due_us, steps))
+        self._stretch.schedule(rows)
+        self._scheduled = True
+        self._odd = bool(view.silent or view.stuck or withheld)
+
+    def _release(self) -> None:
+        """Take the streams back, because one of them changes."""
+        if self._scheduled:
+            for name, due_us in self._stretch.due_us.items():
+                self._streams[name].due_us = due_us
+        self._scheduled = False
 
     def withheld(self, name: str) -> bool:
         """What the vehicle cannot say yet, whatever rate it granted."""
@@ -138,7 +200,7 @@ class Server:
     @property
     def _now_us(self) -> int:
         """Time by which streams are due; no clock that a fault can turn back."""
-        return self.view.autopilot.steps * 4000
+        return self.view.autopilot.steps * STEP_US
 
     def send_barrier(self, stamp_ns: int) -> None:
         """Queue a TIMESYNC request."""
@@ -182,6 +244,7 @@ class Server:
         if interval_us == 0:
             rate_hz = self.rates_hz.get(name)
             interval_us = -1.0 if rate_hz is None else 1e6 / rate_hz
+        self._release()
         if interval_us < 0:
             self._streams.pop(name, None)
             return True

@@ -56,11 +56,11 @@ class View:
     stuck: dict[str, Stuck] = field(default_factory=dict)
     builders: dict[str, Callable[[View], Sequence[Any]]] = field(init=False)
     _at_step: int = -1
-    _east_degrees_per_m: float = field(init=False)
+    east_degrees_per_m: float = field(init=False)
 
     def __post_init__(self) -> None:
         firmware = self.autopilot.firmware
-        self._east_degrees_per_m = _DEGREES_PER_M / math.cos(math.radians(firmware.origin[0]))
+        self.east_degrees_per_m = _DEGREES_PER_M / math.cos(math.radians(firmware.origin[0]))
         known = {n: b for n, b in BUILDERS.items() if n not in firmware.unknown_messages}
         self.builders = {**known, **firmware.own_messages}
 
@@ -102,7 +102,7 @@ class View:
         """Latitude and longitude in 1e-7 deg of a point near the origin (spherical Earth)."""
         latitude, longitude, _ = self.autopilot.firmware.origin
         north_deg = north_m * _DEGREES_PER_M
-        east_deg = east_m * self._east_degrees_per_m
+        east_deg = east_m * self.east_degrees_per_m
         return _fit((latitude + north_deg) * 1e7, 32), _fit((longitude + east_deg) * 1e7, 32)
 
     def altitude_mm(self, down_m: float) -> int:

@@ -1,0 +1,156 @@
+"""Stretches flown in one compiled call give the bytes of single steps, whatever goes on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from sim_bench import OFFBOARD, TAKEOFF
+
+from simulator import config
+from simulator.codec import frame, layout
+from simulator.conditions import Conditions
+from simulator.firmware.ardupilot import ARDUPILOT
+from simulator.firmware.base import Firmware
+from simulator.firmware.px4 import PX4
+from simulator.frame_writer import FRAME_MAX, KINDS, PAYLOAD_MAX, SEEN_WIDTH, write_frame
+from simulator.instance import Instance
+from simulator.sensors import EstimatorName
+from simulator.stretch import Stretch
+
+SEED = 7
+
+
+def _instance(firmware: Firmware = PX4, *, ground_link: bool = False) -> Instance:
+    return Instance(
+        firmware,
+        config.vehicle(firmware.vehicle),
+        Conditions(estimator=EstimatorName.PX4_LIKE),
+        SEED,
+        lockstep=True,
+        ground_link=ground_link,
+    )
+
+
+def _single_steps(instance: Instance, end_s: float) -> bool:
+    while instance.time_s < end_s:
+        instance.advance()
+        if instance.barrier_due():
+            return True
+    return False
+
+
+def _script() -> Iterator[tuple[float, object]]:
+    """Times and what the companion sends then: boot, takeoff, offboard by attitude, silence."""
+    codec = mavlink.MAVLink_command_long_message
+    yield 0.1, mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+    yield 1.0, codec(1, 1, 511, 0, 32, 12_345, 0, 0, 0, 0, 0)  # LOCAL_POSITION_NED at an odd rate
+    yield 1.5, codec(1, 1, 511, 0, 30, -1, 0, 0, 0, 0, 0)  # no more ATTITUDE
+    yield 2.0, mavlink.MAVLink_param_request_list_message(1, 1)
+    yield 2.5, codec(1, 1, 511, 0, 30, 4_000, 0, 0, 0, 0, 0)  # at every step
+    yield 5.0, codec(1, 1, 176, 0, 1, TAKEOFF >> 16 & 0xFF, TAKEOFF >> 24, 0, 0, 0, 0)
+    yield 5.0, codec(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)
+    for i in range(100):
+        q = (0.9999, 0.01 * (i % 2), -0.01, 0.0)
+        yield (
+            13.0 + 0.05 * i,
+            mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, q, 0, 0, 0, 0.49),
+        )
+        if i == 10:
+            yield 13.55, codec(1, 1, 176, 0, 1, OFFBOARD >> 16 & 0xFF, 0, 0, 0, 0, 0)
+            yield (
+                13.55,
+                mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, q, 0, 0, 0, 0.49),
+            )
+
+
+def _flown(
+    instance: Instance, advance: Callable[[Instance, float], bool], duration_s: float
+) -> list[list[bytes]]:
+    """The datagrams of every barrier; input is heard at barriers, as in lockstep."""
+    codec, script = mavlink.MAVLink(None, 255, 190), list(_script())
+    said = []
+    while instance.time_s < duration_s:
+        if not advance(instance, duration_s):
+            break
+        said.append(instance.barrier()[1])
+        while script and script[0][0] <= instance.time_s:
+            instance.feed(script.pop(0)[1].pack(codec))  # type: ignore[attr-defined]
+        said.append(instance.ground.drain())
+    return [*said, instance.drain()]
+
+
+@pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
+@pytest.mark.parametrize("ground_link", [False, True], ids=["alone", "with a ground link"])
+def test_a_flight_in_stretches_has_the_bytes_of_single_steps(
+    firmware: Firmware, ground_link: bool
+) -> None:
+    one, other = (_instance(firmware, ground_link=ground_link) for _ in range(2))
+    expected = _flown(one, _single_steps, 27.0)
+    assert _flown(other, Instance.advance_to_barrier, 27.0) == expected
+    assert one.steps == other.steps == 6_750
+
+
+def test_the_script_flies_by_attitude_and_lands_after_its_end() -> None:
+    instance = _instance()
+    _flown(instance, Instance.advance_to_barrier, 17.0)
+    assert instance.autopilot.armed
+    assert instance.autopilot.mode.custom_mode == OFFBOARD
+    _flown(instance, Instance.advance_to_barrier, 60.0)
+    assert instance.autopilot.landed
+
+
+def test_most_steps_of_a_vehicle_left_alone_are_flown_in_stretches(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    instance = _instance()
+    while instance.time_s < 6.0:
+        instance.advance_to_barrier()
+    single: list[int] = []
+    advance = Instance.advance
+
+    def counted(self: Instance) -> None:
+        single.append(self.steps)
+        advance(self)
+
+    monkeypatch.setattr(Instance, "advance", counted)
+    before = instance.steps
+    while instance.time_s < 10.0:
+        instance.advance_to_barrier()
+    assert len(single) < 0.1 * (instance.steps - before)
+
+
+def test_a_duration_ends_between_barriers() -> None:
+    instance = _instance()
+    while instance.advance_to_barrier(1.012):
+        instance.barrier()
+    assert instance.steps == 253
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_compiled_frames_are_the_readable_ones(name: str) -> None:
+    """Random states, huge ones and zeros: every byte, the cut of trailing zeros, the checksum."""
+    instance = _instance()
+    autopilot, plant = instance.autopilot, instance.autopilot.plant
+    random = np.random.default_rng(SEED)
+    out = np.zeros(FRAME_MAX, np.uint8)
+    for case in range(200):
+        scale = (1.0, 30.0, 1e5, 0.0)[case % 4]
+        plant._state[:19] = scale * random.standard_normal(19)
+        attitude = random.standard_normal(4)
+        plant._state[:4] = attitude / np.linalg.norm(attitude)
+        plant._state[12] = -abs(plant._state[12]) % 9e3
+        autopilot.steps = int(random.integers(0, 2**31))
+        autopilot._nav = None
+        autopilot.pilot.home_ned_m = (0.0, 0.0, scale)
+        sequence = int(random.integers(0, 256))
+        expected = frame(sequence, 1, 1, layout(name), instance.view.payload(name))
+        stretch = Stretch(instance.view)
+        stretch.schedule([(name, KINDS.index(name), 1 << 40, 0, 1)])
+        _, said, _ = stretch.fly(0, sequence)
+        assert said == [expected]
+    seen = np.zeros(SEEN_WIDTH)
+    seen[:3] = np.nan, np.inf, -np.inf
+    assert write_frame(4, seen, 0, 0, 1, 0, np.zeros(PAYLOAD_MAX, np.uint8), out, 0) > 12
