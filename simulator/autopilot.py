@@ -32,6 +32,7 @@ from simulator.plant import STEP_S, Plant, Truth
 from simulator.watch import EVERY_STEPS, Watch
 
 _POSITION_IGNORED, _LOCAL_NED = 0b111, 1  # type_mask; MAV_FRAME
+_GLOBAL_TARGET = "SET_POSITION_TARGET_GLOBAL_INT"
 
 
 class Autopilot:
@@ -180,25 +181,29 @@ class Autopilot:
         """Fields of SET_POSITION_TARGET_GLOBAL_INT."""
         if not self._obeys_setpoints:
             return
-        frame, given = values["coordinate_frame"], not values["type_mask"] & _POSITION_IGNORED
-        if frame in GLOBAL_FRAMES:
-            z = self.firmware.origin[2] - values["alt"]
+        frame, mask = values["coordinate_frame"], values["type_mask"]
+        x, y = to_metres(self.firmware.origin, values["lat_int"] * 1e-7, values["lon_int"] * 1e-7)
+        z = self.firmware.origin[2] - values["alt"]
+        if mask & _POSITION_IGNORED:
+            mask |= _POSITION_IGNORED
         elif frame in RELATIVE_FRAMES:
             z = self.pilot.home_ned_m[2] - values["alt"]
-        else:
-            z = math.nan
-        x, y = to_metres(self.firmware.origin, values["lat_int"] * 1e-7, values["lon_int"] * 1e-7)
-        known = {} if math.isnan(z) else {"coordinate_frame": _LOCAL_NED}
-        mask = values["type_mask"] if given else values["type_mask"] | _POSITION_IGNORED
-        local = {**values, **known, "x": x, "y": y, "z": z, "type_mask": mask}
-        self._obey_motion("SET_POSITION_TARGET_GLOBAL_INT", local)
+        elif frame not in GLOBAL_FRAMES:
+            self._complain(_GLOBAL_TARGET, frame)
+            return
+        place = {"coordinate_frame": _LOCAL_NED, "x": x, "y": y, "z": z, "type_mask": mask}
+        self._obey_motion(_GLOBAL_TARGET, {**values, **place})
 
     def _obey_motion(self, message: str, values: Mapping[str, Any]) -> None:
         setpoint = self.firmware.motion_setpoint(values)
         if setpoint is None:
-            complaint = self.firmware.motion_complaint(message, values)
-            self.texts += () if complaint is None else (complaint,)
+            frame = values["coordinate_frame"]
+            self._complain(message, None if frame == _LOCAL_NED else frame)
         self._obey(setpoint)
+
+    def _complain(self, message: str, frame: int | None) -> None:
+        complaint = self.firmware.motion_complaint(message, frame)
+        self.texts += () if complaint is None else (complaint,)
 
     @property
     def _obeys_setpoints(self) -> bool:

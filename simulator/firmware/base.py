@@ -207,7 +207,7 @@ def as_given(values: Mapping[str, Any], _: Quaternion) -> Mapping[str, Any]:
     return values
 
 
-def no_complaint(message: str, values: Mapping[str, Any]) -> Say | None:
+def no_complaint(message: str, frame: int | None) -> Say | None:
     return None
 
 
@@ -268,5 +268,5 @@ class Firmware:
     position_without_fix_s: float = math.inf  # until the estimate of position is given up
     # a SET_POSITION_TARGET in another local frame, by the vehicle's attitude, in MAV_FRAME 1
     in_local_frame: Callable[[Mapping[str, Any], Quaternion], Mapping[str, Any]] = as_given
-    # what is said about the named setpoint message when it demands nothing
-    motion_complaint: Callable[[str, Mapping[str, Any]], Say | None] = no_complaint
+    # what is said about the named setpoint message in an unknown MAV_FRAME, or demanding nothing
+    motion_complaint: Callable[[str, int | None], Say | None] = no_complaint

@@ -399,10 +399,9 @@ def in_local_frame(values: Mapping[str, Any], attitude: Quaternion) -> Mapping[s
     }
 
 
-def motion_complaint(message: str, values: Mapping[str, Any]) -> Say:
-    """About a setpoint that demands nothing."""
-    frame = values["coordinate_frame"]
-    if frame == _LOCAL_NED:
+def motion_complaint(message: str, frame: int | None) -> Say:
+    """About a setpoint in an unknown frame; None: one that demands nothing."""
+    if frame is None:
         return _critical(f"{message} invalid")
     if message.endswith("GLOBAL_INT"):
         return _critical(f"{message} invalid coordinate frame {frame}")
