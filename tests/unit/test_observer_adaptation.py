@@ -115,6 +115,7 @@ def test_an_estimate_that_wanders_is_not_noise_nor_gusts() -> None:
     for seed in (3, 4, 5):
         observer, _, _ = watch(hover(20.0, 0.008, seed=seed, kicks=0.2))
         assert learnt(observer).position_sd_m < 1.1 * SETTINGS.position_sd_m
+        assert learnt(observer).velocity_sd_mps < 1.5 * SETTINGS.velocity_sd_mps
         floor = SETTINGS.disturbance_density_mps2
         assert learnt(observer).densities_mps2 == pytest.approx([floor, floor], rel=0.3)
 
@@ -156,6 +157,15 @@ def test_a_jump_is_not_noise() -> None:
     observer, _, _ = watch(Hover(flown.times, flown.positions + jumps, *[flown.velocities] * 2))
     assert observer.position_jumps == 15
     assert learnt(observer).position_sd_m == SETTINGS.position_sd_m
+
+
+def test_one_wrong_position_counts_for_little() -> None:
+    """20 cm off, too little for a jump, in one message of a perfect hover."""
+    flown = hover(5.0, 0.01, seed=11, drift=0.05)
+    flown.positions[-3] += 0.2
+    observer, _, _ = watch(flown)
+    assert observer.position_jumps == 0
+    assert learnt(observer).position_sd_m < 1.5 * SETTINGS.position_sd_m
 
 
 def test_learnt_constants_are_bounded_and_forgotten_by_a_reset() -> None:
