@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -10,7 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import OFFBOARD, TAKEOFF
 
 from simulator import config
-from simulator.codec import frame, layout
+from simulator.codec import Decoder, frame, layout
 from simulator.conditions import Conditions
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
@@ -43,7 +44,8 @@ def _single_steps(instance: Instance, end_s: float) -> bool:
 
 
 def _script() -> Iterator[tuple[float, object]]:
-    """Times and what the companion sends then: boot, takeoff, offboard by attitude, silence."""
+    """Times and what the companion sends then: boot, takeoff, offboard by attitude, sinking to the
+    ground, silence."""
     codec = mavlink.MAVLink_command_long_message
     yield 0.1, mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
     yield 1.0, codec(1, 1, 511, 0, 32, 12_345, 0, 0, 0, 0, 0)  # LOCAL_POSITION_NED at an odd rate
@@ -52,11 +54,11 @@ def _script() -> Iterator[tuple[float, object]]:
     yield 2.5, codec(1, 1, 511, 0, 30, 4_000, 0, 0, 0, 0, 0)  # at every step
     yield 5.0, codec(1, 1, 176, 0, 1, TAKEOFF >> 16 & 0xFF, TAKEOFF >> 24, 0, 0, 0, 0)
     yield 5.0, codec(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0)
-    for i in range(100):
-        q = (0.9999, 0.01 * (i % 2), -0.01, 0.0)
+    for i in range(160):
+        q, thrust = (0.9999, 0.01 * (i % 2), -0.01, 0.0), 0.49 if i < 90 else 0.2
         yield (
             13.0 + 0.05 * i,
-            mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, q, 0, 0, 0, 0.49),
+            mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, q, 0, 0, 0, thrust),
         )
         if i == 10:
             yield 13.55, codec(1, 1, 176, 0, 1, OFFBOARD >> 16 & 0xFF, 0, 0, 0, 0, 0)
@@ -120,6 +122,22 @@ def test_most_steps_of_a_vehicle_left_alone_are_flown_in_stretches(
     while instance.time_s < 10.0:
         instance.advance_to_barrier()
     assert len(single) < 0.1 * (instance.steps - before)
+
+
+def test_another_rate_of_one_message_leaves_the_others_their_times() -> None:
+    instance = _instance()
+    while instance.time_s < 3.1:
+        instance.advance()
+    instance.drain()
+    slower = mavlink.MAVLink_command_long_message(1, 1, 511, 0, 31, 40_000, 0, 0, 0, 0, 0)
+    instance.feed(slower.pack(mavlink.MAVLink(None, 255, 190)))
+    said = Counter[str]()
+    while instance.time_s < 3.9:
+        for datagram in instance.step():
+            said.update(message.name for message in Decoder().read(datagram))
+    assert "HEARTBEAT" not in said
+    assert said["ATTITUDE_QUATERNION"] == 20
+    assert said["ATTITUDE"] == 80
 
 
 def test_a_duration_ends_between_barriers() -> None:

@@ -1,0 +1,50 @@
+"""What a second of the simulated vehicle costs: run with `--benchmark-enable`.
+
+In memory, default rates of PX4's companion link, PX4's estimator. Nothing here asserts on time:
+1000 / (milliseconds per second of flight) is the ratio to real time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from simulator import config
+from simulator.conditions import Conditions
+from simulator.firmware.px4 import PX4
+from simulator.instance import Instance
+from simulator.sensors import EstimatorName
+
+
+def _fly(instance: Instance, duration_s: float) -> int:
+    """Bytes said at the barriers of so much flight."""
+    end_s, said = instance.time_s + duration_s, 0
+    while instance.advance_to_barrier(end_s):
+        said += sum(map(len, instance.barrier()[1]))
+    return said
+
+
+def _standing() -> Instance:
+    conditions = Conditions(estimator=EstimatorName.PX4_LIKE)
+    vehicle = config.vehicle(PX4.vehicle)
+    instance = Instance(PX4, vehicle, conditions, 1, lockstep=True, ground_link=False)
+    _fly(instance, 6.0)
+    return instance
+
+
+def _holding() -> Instance:
+    instance = _standing()
+    instance.autopilot.happen("mode", mode="AUTO.TAKEOFF")
+    instance.autopilot.happen("arm")
+    _fly(instance, 12.0)
+    return instance
+
+
+@pytest.mark.benchmark(group="a second of the simulator")
+@pytest.mark.parametrize("begin", [_standing, _holding], ids=["on the ground", "holding position"])
+def test_a_second_in_memory(benchmark: Any, begin: Callable[[], Instance]) -> None:
+    instance = begin()
+    said = benchmark(_fly, instance, 1.0)
+    assert 20_000 < said < 60_000
