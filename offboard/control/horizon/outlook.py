@@ -29,7 +29,9 @@ class Outlook:
     positions_ned_m, velocities_ned_mps, directions_ned (2 N + 1, 3), each axis at its own clock;
     thrusts_tilt_mps2 and thrusts_heave_mps2 (2 N + 1,) T at the clocks of tilt and thrust,
     uprights_heave (2 N + 1,) b_z at that of the thrust. feedforward (N, 3): b_c north and east and
-    the vertical thrust, led and half a hold late.
+    the vertical thrust, led and half a hold late. A steady vertical disturbance is nearly always a
+    wrong thrust or mass, so the tilted thrust pushes sideways with `thrust_share` of what is
+    believed: g of it holds the weight.
     """
 
     positions_ned_m: Array
@@ -39,6 +41,7 @@ class Outlook:
     thrusts_heave_mps2: Array
     uprights_heave: Array
     feedforward: Array
+    thrust_share: float
 
     @property
     def steps(self) -> int:
@@ -78,6 +81,8 @@ def look_ahead(
         thrusts_heave_mps2=flat.thrust_mps2[count:].copy(),
         uprights_heave=b[count:, 2].copy(),
         feedforward=np.column_stack((led_tilt, led_down)),
+        thrust_share=vehicle.gravity_mps2
+        / (vehicle.gravity_mps2 + float(state.disturbance_ned_mps2[2])),
     )
 
 

@@ -113,6 +113,7 @@ class Scene(NamedTuple):
     lower: Array  # (N, 3)
     upper: Array
     volumes: Array  # (V, PACKED_SIZE), where they are at the first node
+    thrust_share: float  # of the thrust believed, what is there, by the vertical disturbance
     floor_down_m: float  # no way round a volume leads below, where the reference does not
 
 
@@ -128,6 +129,7 @@ def scene_of(outlook: Outlook, within: Bounds, volumes: Array, floor_down_m: flo
         within.lower,
         within.upper,
         volumes,
+        outlook.thrust_share,
         floor_down_m,
     )
 
@@ -272,7 +274,7 @@ def _hold(plant, scene, k, before, chosen, after, costs) -> None:  # type: ignor
 def _bend(plant, scene, k, before, chosen, after) -> None:  # type: ignore[no-untyped-def]
     """Add what T b does beyond the linear model: at start, middle and end of the hold."""
     c, tilt = plant.scalars, plant.tilt_half
-    g = c[GRAVITY]
+    g, share = c[GRAVITY], scene.thrust_share
     ref = scene.directions[2 * k : 2 * k + 3]
     thrusts = scene.thrusts_tilt[2 * k : 2 * k + 3]
     heaves = scene.thrusts_heave[2 * k : 2 * k + 3]
@@ -298,12 +300,12 @@ def _bend(plant, scene, k, before, chosen, after) -> None:  # type: ignore[no-un
         t1 = asked + (t0 - asked) * c[LAG_HALF]
         t2 = asked + (t0 - asked) * c[LAG_FULL]
         # residual accelerations: -(T b - T_r b_r), less the linear model's
-        x0 = g * n0 - (thrusts[0] + t0) * n0 - t0 * ref[0, 0]
-        x1 = g * n1 - (thrusts[1] + t1) * n1 - t1 * ref[1, 0]
-        x2 = g * n2 - (thrusts[2] + t2) * n2 - t2 * ref[2, 0]
-        y0 = g * e0 - (thrusts[0] + t0) * e0 - t0 * ref[0, 1]
-        y1 = g * e1 - (thrusts[1] + t1) * e1 - t1 * ref[1, 1]
-        y2 = g * e2 - (thrusts[2] + t2) * e2 - t2 * ref[2, 1]
+        x0 = g * n0 - share * ((thrusts[0] + t0) * n0 + t0 * ref[0, 0])
+        x1 = g * n1 - share * ((thrusts[1] + t1) * n1 + t1 * ref[1, 0])
+        x2 = g * n2 - share * ((thrusts[2] + t2) * n2 + t2 * ref[2, 0])
+        y0 = g * e0 - share * ((thrusts[0] + t0) * e0 + t0 * ref[0, 1])
+        y1 = g * e1 - share * ((thrusts[1] + t1) * e1 + t1 * ref[1, 1])
+        y2 = g * e2 - share * ((thrusts[2] + t2) * e2 + t2 * ref[2, 1])
         z0 = f - ((heaves[0] + t0) * d0 + t0 * uprights[0])
         z1 = w + (f - w) * c[LAG_HALF] - ((heaves[1] + t1) * d1 + t1 * uprights[1])
         z2 = w + (f - w) * c[LAG_FULL] - ((heaves[2] + t2) * d2 + t2 * uprights[2])
