@@ -150,13 +150,14 @@ def test_the_vertical_waits_until_the_thrust_is_known() -> None:
     assert learnt(observer).densities_mps2[NORTH_EAST] > 0.5
 
 
-def test_a_jump_is_not_noise() -> None:
-    """Ten resets of the estimator's position by 2 m in 10 s."""
-    flown = hover(15.0, 0.01, seed=9)
+def test_a_jump_is_not_noise_and_hides_no_gusts() -> None:
+    """Fifteen resets of the estimator's position by 2 m in 15 s of gusts."""
+    flown = hover(15.0, 0.01, seed=9, drift=0.7)
     jumps = 2.0 * np.cumsum(np.arange(len(flown.times)) % 100 == 50)[:, None]
     observer, _, _ = watch(Hover(flown.times, flown.positions + jumps, *[flown.velocities] * 2))
     assert observer.position_jumps == 15
     assert learnt(observer).position_sd_m == SETTINGS.position_sd_m
+    assert learnt(observer).densities_mps2[NORTH_EAST] > 0.5
 
 
 def test_one_wrong_position_counts_for_little() -> None:
