@@ -91,6 +91,8 @@ def fly(
     from offboard.flight.phases import ExitCode
     from offboard.sortie import Order, fly_order
 
+    if not sitl and (scenario or sim_vehicle or firmware != "px4"):
+        raise Refusal("--scenario, --sim-vehicle and --firmware are the simulator's: add --sitl")
     named = {"controller": controller, "reference": reference, "vehicle": vehicle}
     requirements = [Requirement.parse(text, FIGURES) for text in require or ()]
     shown = 0

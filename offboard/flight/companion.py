@@ -301,6 +301,9 @@ class Companion:
             known, now_s = self.view.parameters, self._session.link_time_s
             for request in self._readiness.due(self._dialect, known, now_s):
                 self._send(request)
+            stale = self.view.mode == self._dialect.engage_mode and not self.view.armed
+            if stale and not self.view.prearm_ok:  # PX4 shows OFFBOARD again after a landing
+                self._ask(self._dialect.hold(), time_s)
             return
         if self.phase is Phase.ENGAGE:
             self._ask(self._dialect.engage(), time_s)
@@ -367,19 +370,20 @@ class Companion:
                 track_time_s=self._mission.track_time_s(time_s),
             )
             decision = self._controller.decide(situation)
-            if not usable(decision.command):
-                raise DecisionError(f"unusable {decision.command}")
+            command = decision.command
+            if isinstance(command, Command):
+                command = clamp(self._excited(command, time_s), self._vehicle)
+            if not usable(command):
+                raise DecisionError(f"unusable {command}")
         except Exception as error:  # whatever it is, the vehicle is in the air
             self._miss(f"{type(error).__name__}: {error}")
             self._emit(time_s, self._level())
             return
         self._missed_decisions = 0
-        command = decision.command
         if isinstance(command, PositionCommand):
             self._hand_over(time_s, command)
         else:
             body_z_down = float(state.thrust_direction_ned[2])
-            command = clamp(self._excited(command, time_s), self._vehicle)
             self._emit(time_s, command, body_z_down)
         self._record(time_s, state, decision, arrived_s)
         self._learn(time_s)

@@ -83,6 +83,7 @@ class Learner:
         self._recorder.clear()
         self._from = self._to = self._now = self._file
         self._blend_began_s = -math.inf
+        self._refused_drag_ps = math.inf
         self._climb_s = self._excite_s = self._moving_s = math.nan
         self._looked_s = self._tilt_looked_s = -math.inf
         self._delay_sd_s = math.inf
@@ -204,8 +205,8 @@ class Learner:
     def _is_news(self, drag: Estimate | None) -> bool:
         if drag is None:
             return False
-        change = abs(drag.value - self._to.drag_per_mass_ps)
-        return change > max(DRAG_NEWS_PS, drag.sd)
+        known = (self._to.drag_per_mass_ps, self._refused_drag_ps)
+        return all(abs(drag.value - each) > max(DRAG_NEWS_PS, drag.sd) for each in known)
 
     # ------------------------------------------------------------------ taking over
 
@@ -216,8 +217,8 @@ class Learner:
         if target != self._to:
             self._from, self._to, self._blend_began_s = self._now, target, time_s
             sentences.insert(0, told(within))
-        else:
-            self._blend_began_s = time_s
+        if within.drag_ps is None and found.drag_ps is not None:
+            self._refused_drag_ps = found.drag_ps.value
         return sentences
 
     def _conclude(self, found: Identified) -> list[str]:

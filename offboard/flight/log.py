@@ -32,18 +32,29 @@ class FlightLog:
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
             self._file = self.path.open("xb", buffering=0)
-            text = self.configuration
-            (self.directory / "flight.yaml").write_text(text, encoding="utf-8")
+            self._write_configuration()
         except FileExistsError:
             raise LogError(
                 f"{self.path} already holds a flight; choose another directory with --out"
             ) from None
         except OSError as error:
-            raise LogError(
-                f"the flight cannot be recorded in {self.directory}: {error.strerror}; "
-                "choose a directory that can be written with --out"
-            ) from None
+            raise self._unwritable(error) from None
         return self
+
+    def _write_configuration(self) -> None:
+        try:
+            text = self.configuration
+            (self.directory / "flight.yaml").write_text(text, encoding="utf-8")
+        except OSError:
+            self._file.close()
+            self.path.unlink()  # an empty log is no flight that must be kept
+            raise
+
+    def _unwritable(self, error: OSError) -> LogError:
+        return LogError(
+            f"the flight cannot be recorded in {self.directory}: {error.strerror}; "
+            "choose a directory that can be written with --out"
+        )
 
     def __exit__(
         self,
@@ -52,6 +63,13 @@ class FlightLog:
         trace: TracebackType | None,
     ) -> None:
         self._file.close()
+
+    def begin(self, unix_us: int, frame: bytes) -> None:
+        """Append a frame before anything was sent: a disk that is full then refuses the flight."""
+        try:
+            self.write(unix_us, frame)
+        except OSError as error:
+            raise self._unwritable(error) from None
 
     def write(self, unix_us: int, frame: bytes) -> None:
         """Append one frame with its time of crossing. A full disk raises OSError."""

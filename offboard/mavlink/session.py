@@ -129,6 +129,7 @@ class Session:
         frames: list[bytes] = []
         events: list[Event] = []
         replies: list[Outgoing] = []
+        events.extend(self._texts.expire(now_s))
         for frame in self._splitter.split(datagram):
             self.counters.frames += 1
             outcome = self._accept(frame, peer, now_s, events, replies)
@@ -210,19 +211,24 @@ class Session:
     ) -> DropReason | bool:
         """Turn a frame of the vehicle into events."""
         assert self.dialect is not None
-        self._rates.count(frame.message_id, self._link_time.seconds)
         if frame.message_id == _STATUSTEXT:
             events.extend(self._texts.add(inbound.decode_text_chunk(frame.payload), now_s))
             return True
         if frame.message_id == _COMMAND_ACK and not self._for_us(frame.payload):
             return DropReason.NOT_FOR_US
         event = inbound.decode(frame.message_id, frame.payload, self.dialect)
-        if event is None or isinstance(event, DropReason):
-            return event or False
+        if isinstance(event, DropReason):
+            return event
+        age = _Age.FRESH
         if isinstance(event, (LocalPosition, Attitude)):
             age = self._time.judge(frame.message_id, event.time_s)
             if age is _Age.STALE:
                 return DropReason.STALE
+        # only now: a stream that repeats itself must not look fast enough to fly on
+        self._rates.count(frame.message_id, self._link_time.seconds)
+        if event is None:
+            return False
+        if isinstance(event, (LocalPosition, Attitude)):
             if age is _Age.REBOOTED:
                 self._begin_anew()
                 events.append(Reset(event.time_s))
