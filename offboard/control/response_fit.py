@@ -20,7 +20,13 @@ Array = NDArray[np.float64]
 
 DELAY, FREQUENCY, DAMPING = 0, 1, 2
 # Where the search starts: of these the best two are followed to the end.
-STARTS = ((0.01, 12.0, 1.0), (0.06, 11.0, 0.6), (0.15, 8.0, 0.7), (0.3, 10.0, 0.7), (0.15, 3.5, 0.5))
+STARTS = (
+    (0.01, 12.0, 1.0),
+    (0.06, 11.0, 0.6),
+    (0.15, 8.0, 0.7),
+    (0.3, 10.0, 0.7),
+    (0.15, 3.5, 0.5),
+)
 FOLLOWED = 2
 LOWER = np.array([0.0, 0.5, 0.1])
 UPPER = np.array([0.5, 60.0, 3.0])
