@@ -80,9 +80,9 @@ def test_one_place_makes_a_setpoint() -> None:
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.Call)
         and isinstance(node.func, ast.Name)
-        and node.func.id == "AttitudeTarget"
+        and node.func.id in ("AttitudeTarget", "PositionTarget")
     }
-    assert makers == {"offboard/flight/companion.py"}
+    assert makers == {"offboard/flight/emission.py"}
 
 
 def test_top_level_holds_only_what_the_layout_names() -> None:

@@ -82,7 +82,7 @@ class Assessment:
             in_the_air=view.in_the_air,
             lifted_off=course.phase is Phase.TAKEOFF and self._lifted_off(),
             at_start=course.phase is Phase.CLIMB and self._at_start(time_s),
-            lifted_by_command=self._lifted_by_command,
+            lifted_by_command=self.lifted_by_command,
             excites=course.excites,
             learnt=course.learnt,
             track_time_s=mission.track_time_s(time_s),
@@ -149,7 +149,8 @@ class Assessment:
         return math.acos(min(1.0, max(-1.0, float(down))))
 
     @property
-    def _lifted_by_command(self) -> bool:
+    def lifted_by_command(self) -> bool:
+        """The autopilot takes off by itself, without setpoints."""
         dialect = self._session.dialect
         return dialect is not None and dialect.takeoff is Takeoff.COMMAND
 
@@ -158,7 +159,7 @@ class Assessment:
         if position is None:
             return False
         height_m = self._mission.origin_ned_m[2] - position.position_ned_m[2]
-        if self._lifted_by_command:
+        if self.lifted_by_command:
             return height_m > TAKE_OVER_HEIGHT_M
         return height_m > LIFT_OFF_HEIGHT_M or -position.velocity_ned_mps[2] > LIFT_OFF_CLIMB_MPS
 

@@ -19,6 +19,7 @@ from offboard.mavlink.events import (
     SystemHealth,
     VehicleFound,
 )
+from offboard.model.frames import course_from_quaternion
 
 HEARD = 12  # texts and refusals kept for the sentence that explains a failure
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD: a rate that is refused explains no failure
@@ -71,6 +72,12 @@ class VehicleView:
     @property
     def has_state(self) -> bool:
         return self.position is not None and self.attitude is not None
+
+    @property
+    def course_rad(self) -> float:
+        """Of the nose, by the newest attitude; asked once that has come."""
+        assert self.attitude is not None
+        return float(course_from_quaternion(self.attitude.attitude))
 
     @property
     def prearm_ok(self) -> bool:

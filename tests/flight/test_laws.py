@@ -79,7 +79,7 @@ def flown_clearance(
         step()
         companion = pair.companion
         if companion.phase in (Phase.CLIMB, Phase.JOIN, Phase.TRACK, Phase.HOVER):
-            mission = companion._mission
+            mission = companion.mission
             times.append(mission.track_time_s(companion.view.time_s))
             truth = np.array(pair.instance.autopilot.truth.position_ned_m)
             places.append(truth - mission.origin_ned_m)

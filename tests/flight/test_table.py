@@ -130,8 +130,8 @@ def test_in_the_air_nothing_is_called_refused() -> None:
 
 
 def test_every_reason_has_its_words() -> None:
-    companion = hover().companion
+    assessment = hover().companion._progress._assessment
     course = Course(Phase.CONNECT, 0.0, 0.0, False, False, 0, "")
-    words = companion._assessment.words(companion._assessment.picture(course), course)
+    words = assessment.words(assessment.picture(course), course)
     for row in TABLE:
         assert "{" not in row.reason.format(**words)
