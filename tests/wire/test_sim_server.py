@@ -12,7 +12,8 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from sim_bench import LOITER, NAN, OFFBOARD, Bench
 
-from simulator.firmware.px4 import COMPANION_RATES_HZ, GROUND_RATES_HZ, PX4
+from simulator.firmware.px4 import PX4
+from simulator.firmware.px4.streams import COMPANION_RATES_HZ, GROUND_RATES_HZ
 from simulator.sensors import EstimatorName
 from simulator.server import DATAGRAM_MAX
 

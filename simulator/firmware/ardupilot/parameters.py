@@ -5,7 +5,9 @@ ArduCopter takes values far out of the documented range, so the limits are those
 
 from __future__ import annotations
 
-from simulator.firmware.base import ParameterSpec
+import math
+
+from simulator.firmware.base import ParameterSpec, Role
 
 
 def _real(name: str, default: float, meaning: str) -> ParameterSpec:
@@ -56,3 +58,20 @@ PARAMETERS = (
     _real("WPNAV_SPEED_DN", 150.0, "cm/s of descent"),
     _real("WPNAV_SPEED_UP", 250.0, "cm/s of climb"),
 )
+
+_CENTI = 0.01
+ROLES: dict[str, Role] = {
+    "stream_timeout_s": "GUID_TIMEOUT",
+    "disarm_landed_s": 0.45,
+    "disarm_idle_s": "DISARM_DELAY",
+    "takeoff_height_m": 0.0,  # the command always tells
+    "takeoff_speed_mps": ("WPNAV_SPEED_UP", 0.7 * _CENTI),  # 5 m are too few to reach it
+    "land_speed_mps": ("LAND_SPEED", _CENTI),
+    "descent_speed_mps": ("WPNAV_SPEED_DN", _CENTI),
+    "cruise_speed_mps": ("WPNAV_SPEED", _CENTI),
+    "return_height_m": ("RTL_ALT", _CENTI),
+    "hover_thrust": "MOT_THST_HOVER",
+    "tilt_boost": "ATC_ANGLE_BOOST",
+    "ground_station_timeout_s": math.inf,
+    "failsafe_delay_s": 0.0,
+}

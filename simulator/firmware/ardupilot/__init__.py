@@ -1,0 +1,82 @@
+"""ArduCopter 4.6, as data: here its numbers, in the rooms beside what they are made of.
+
+Measured on ArduCopter 4.6.3 SITL where the wire shows it. Knows no simulator core and no socket.
+"""
+
+from __future__ import annotations
+
+import math
+
+from simulator.firmware.ardupilot.messages import MESSAGES
+from simulator.firmware.ardupilot.modes import MODES, command_mode, heartbeat
+from simulator.firmware.ardupilot.parameters import PARAMETERS, ROLES
+from simulator.firmware.ardupilot.rules import BOOT, RULES
+from simulator.firmware.ardupilot.setpoints import attitude_setpoint, motion_setpoint
+from simulator.firmware.ardupilot.streams import DEFAULT_RATES_HZ, STREAMS
+from simulator.firmware.base import Firmware, PositionGains, Sensors
+
+ARDUPILOT = Firmware(
+    name="ardupilot",
+    vehicle="arducopter",
+    scenario="ardupilot_like",
+    mav_autopilot=3,
+    version=0x040603FF,  # 4.6.3, release
+    capabilities=64495,
+    origin=(-35.3632621, 149.1652374, 584.09),
+    boot_mode="STABILIZE",
+    modes=MODES,
+    rules=RULES,
+    parameters=PARAMETERS,
+    parameter_roles=ROLES,
+    parameters_bytewise=False,
+    companion_rates_hz=DEFAULT_RATES_HZ,
+    ground_rates_hz=DEFAULT_RATES_HZ,
+    streams=STREAMS,
+    own_messages=MESSAGES,
+    unknown_messages=frozenset(
+        {"ODOMETRY", "ESTIMATOR_STATUS", "HIL_STATE_QUATERNION", "ALTITUDE", "HIGHRES_IMU", "PING"}
+    ),
+    withheld_until={
+        "LOCAL_POSITION_NED": "position",
+        "GPS_GLOBAL_ORIGIN": "origin",
+        "HOME_POSITION": "origin",
+    },
+    sensors=Sensors(0x5371FC2F, 0x5361FC2F, 0x4771FC2F, first_fix_s=10.2),
+    position_grid_steps=1,
+    boot=BOOT,
+    mode_acked_twice=False,
+    text_to_ground_stations_only=False,
+    text_suffix="",
+    target_component_checked=False,
+    answers_carry_index=False,
+    takeoff_above_home=True,
+    force_codes={"arm": 2989.0, "disarm": 21196.0},
+    healthy_after_s=42.5,
+    healthy_without_position_after_s=24.0,
+    setpoint_mode_needs_stream=False,
+    setpoints_outlive_modes=False,
+    setpoint_decides_flight=True,
+    setpoint_spool_s=2.8,
+    stream_reaction_s=0.0,
+    descend_speed_mps=2.4,  # LOITER with the throttle stick down
+    spool_up_s=2.5,
+    thrust_ramp_s=1.7,
+    landed_after_s=1.65,
+    climbed_within_m=0.1,
+    landing_heights_m=(10.0, 11.0),
+    gains=PositionGains(
+        position_xy_ps=1.0,
+        position_z_ps=1.0,
+        velocity_xy=(2.0, 1.0, 0.25),
+        velocity_z=(5.0, 10.0, 0.0),
+        speed_xy_mps=10.0,
+        speed_up_mps=2.5,
+        speed_down_mps=2.5,
+        tilt_max_rad=math.radians(30.0),
+        derivative_cutoff_hz=5.0,
+    ),
+    heartbeat=heartbeat,
+    command_mode=command_mode,
+    attitude_setpoint=attitude_setpoint,
+    motion_setpoint=motion_setpoint,
+)

@@ -1,0 +1,58 @@
+"""ArduCopter's flight modes, the command that asks for them, and what a heartbeat shows."""
+
+from __future__ import annotations
+
+import math
+
+from simulator.firmware.base import (
+    AttitudeSetpoint,
+    Behaviour,
+    Condition,
+    Mode,
+    ModeRequest,
+    Result,
+    Say,
+    Severity,
+)
+
+# MAV_MODE_FLAG: 1 custom mode, 8 guided, 16 stabilise, 64 manual input. "Guided" shows whether
+# the position controller runs, not the mode.
+BY_POSITION, BY_HAND = 89, 81
+
+MODES = {
+    mode.name: mode
+    for mode in (
+        Mode("STABILIZE", "STABILIZE", 0, BY_HAND, Behaviour.LEVEL),
+        Mode("ALT_HOLD", "ALT_HOLD", 2, BY_HAND, Behaviour.DESCEND),
+        Mode("GUIDED", "GUIDED", 4, BY_POSITION, Behaviour.SETPOINT, needs_position=True),
+        Mode("LOITER", "LOITER", 5, BY_POSITION, Behaviour.DESCEND, needs_position=True),
+        Mode("RTL", "RTL", 6, BY_POSITION, Behaviour.RETURN, arms=False, needs_position=True),
+        Mode("LAND", "LAND", 9, BY_POSITION, Behaviour.LAND, arms=False),
+        Mode("BRAKE", "BRAKE", 17, BY_POSITION, Behaviour.HOLD, arms=False, needs_position=True),
+        Mode("GUIDED_NOGPS", "GUIDED_NOGPS", 20, BY_HAND, Behaviour.SETPOINT),
+    )
+}
+
+
+def heartbeat(now: Condition) -> tuple[int, int]:
+    """base_mode and MAV_STATE: 1 booting, 3 on the ground, 4 in the air, 5 in trouble."""
+    if "initialised" not in now.reached:
+        return BY_POSITION, 1
+    base_mode = BY_HAND if isinstance(now.setpoint, AttitudeSetpoint) else now.mode.base_mode
+    if now.faulty or now.failsafe:
+        return base_mode, 5
+    return base_mode, 4 if now.armed and not now.landed else 3
+
+
+_CUSTOM_MODE_ENABLED = 1
+_BY_NUMBER = {mode.custom_mode: mode.name for mode in MODES.values()}
+
+
+def command_mode(params: tuple[float, ...]) -> ModeRequest:
+    """MAV_CMD_DO_SET_MODE (176): param1 base mode, param2 the mode's number."""
+    base, number = (int(p) if math.isfinite(p) else 0 for p in params[:2])
+    if not base & _CUSTOM_MODE_ENABLED:
+        return ModeRequest(None, Result.DENIED)
+    known = _BY_NUMBER.get(number)
+    unknown = None if known else Say(Severity.WARNING, f"No such mode {number}")
+    return ModeRequest(known, Result.FAILED, unknown)

@@ -1,0 +1,153 @@
+"""ArduCopter's state table: its start, what happens to it, and what it does and says then."""
+
+from __future__ import annotations
+
+from simulator.firmware.base import Result, Rule, Say, Severity
+
+# Seconds after boot at which an event of this name happens
+BOOT = {
+    "barometer": 1.94,
+    "initialised": 2.47,
+    "estimator": 4.45,
+    "aligning": 5.40,
+    "tilt": 5.80,
+    "attitude": 5.90,
+    "gps": 9.83,
+    "origin": 20.02,
+    "gyros": 24.0,
+    "reminder": 30.45,
+    "position": 41.61,
+}
+
+
+def _info(text: str) -> Say:
+    return Say(Severity.INFO, text)
+
+
+def _critical(text: str) -> Say:
+    return Say(Severity.CRITICAL, text)
+
+
+_FAILED = Result.FAILED
+_NO_POSITION = Say(Severity.WARNING, "Mode change to {mode} failed: requires position")
+_NEED_POSITION = _critical("Arm: Need Position Estimate")
+_HEARTBEAT = ("HEARTBEAT",)
+_ORIGIN_AND_HOME = ("GPS_GLOBAL_ORIGIN", "HOME_POSITION")
+_ARMING = Rule("arm", do=("arm",), say=_info("Arming motors"), send=_ORIGIN_AND_HOME)
+_DISARMING = _info("Disarming motors")
+
+RULES = (
+    Rule(
+        "barometer",
+        say=_info("Barometer 1 calibration complete"),
+        also=(_info("Barometer 2 calibration complete"),),
+    ),
+    # A mode asked for before was acknowledged and is lost
+    Rule(
+        "initialised",
+        to="STABILIZE",
+        say=_info("ArduPilot Ready"),
+        also=(_info("AHRS: DCM active"),),
+    ),
+    Rule(
+        "estimator",
+        say=_info("EKF3 IMU0 initialised"),
+        also=(_info("EKF3 IMU1 initialised"), _info("AHRS: EKF3 active")),
+    ),
+    Rule(
+        "tilt",
+        say=_info("EKF3 IMU0 tilt alignment complete"),
+        also=(_info("EKF3 IMU1 tilt alignment complete"),),
+    ),
+    Rule(
+        "attitude",
+        say=_info("EKF3 IMU0 MAG0 initial yaw alignment complete"),
+        also=(_info("EKF3 IMU1 MAG0 initial yaw alignment complete"),),
+    ),
+    Rule(
+        "gps",
+        say=_info("GPS 1: probing for u-blox at 230400 baud"),
+        also=(_info("GPS 1: detected u-blox"),),
+    ),
+    Rule(
+        "origin",
+        say=_info("EKF3 IMU0 origin set"),
+        also=(_info("Field Elevation Set: 584m"), _info("EKF3 IMU1 origin set")),
+        send=_ORIGIN_AND_HOME,
+    ),
+    Rule(
+        "reminder",
+        when=("not armed", "position missing"),
+        say=_critical("PreArm: Need Position Estimate"),
+    ),
+    Rule(
+        "position",
+        say=_info("EKF3 IMU0 is using GPS"),
+        also=(_info("EKF3 IMU1 is using GPS"),),
+    ),
+    # A change of mode is shown by a heartbeat at once
+    Rule("mode", when=("not armed",), to="requested", send=_HEARTBEAT),
+    Rule("mode", when=("not position missing",), to="requested", send=_HEARTBEAT),
+    Rule("mode", result=_FAILED, say=_NO_POSITION),
+    Rule("takeoff", "GUIDED", when=("armed", "landed", "climb asked"), do=("take off",)),
+    Rule("takeoff", "GUIDED", when=("armed", "climbing", "climb asked"), do=("take off",)),
+    Rule("takeoff", result=_FAILED),
+    Rule("climbed", "GUIDED", do=("hold",)),
+    Rule("land", to="LAND", send=_HEARTBEAT),
+    Rule("return", when=("reached position",), to="RTL", send=_HEARTBEAT),
+    Rule("return", result=_FAILED, say=_critical("Mode change to RTL failed: requires position")),
+    Rule("arm", when=("armed",)),
+    Rule(
+        "arm",
+        when=("not reached initialised",),
+        result=_FAILED,
+        say=_critical("Arm: System not initialised"),
+    ),
+    Rule("arm", when=("faulty",), result=_FAILED, say=_critical("Arm: Internal Errors 0x400")),
+    Rule(
+        "arm",
+        when=("not reached attitude",),
+        result=_FAILED,
+        say=_critical("Arm: Need Alt Estimate"),
+        also=(
+            _critical("Arm: Accels inconsistent"),
+            _critical("Arm: EKF attitude is bad"),
+            _critical("Arm: AHRS: waiting for home"),
+        ),
+    ),
+    Rule(
+        "arm",
+        when=("not mode arms",),
+        result=_FAILED,
+        say=_critical("Arm: {mode} mode not armable"),
+    ),
+    Rule(
+        "arm",
+        when=("position missing", "not reached origin"),
+        result=_FAILED,
+        say=_NEED_POSITION,
+        also=(_critical("Arm: AHRS: waiting for home"),),
+    ),
+    Rule("arm", when=("position missing",), result=_FAILED, say=_NEED_POSITION),
+    Rule(
+        "arm",
+        when=("not reached gyros",),
+        result=_FAILED,
+        say=_critical("Arm: Accels inconsistent"),
+        also=(_critical("Arm: Gyros inconsistent"),),
+    ),
+    _ARMING,
+    Rule("force arm", when=("armed",)),
+    Rule("force arm", do=_ARMING.do, say=_ARMING.say, send=_ARMING.send),
+    Rule("disarm", when=("not armed",)),
+    Rule("disarm", when=("landed",), do=("disarm",), say=_DISARMING),
+    Rule("disarm", result=_FAILED),
+    Rule("force disarm", when=("not armed",)),
+    Rule("force disarm", do=("disarm",), say=_DISARMING),
+    # No failsafe and no text: level, height held, or standing still, and still GUIDED
+    Rule("stream lost", when=("obeys attitude",), do=("level",)),
+    Rule("stream lost", when=("obeys motion",), do=("hold",)),
+    Rule("thrust not a number", do=("latch",)),
+    Rule("settled", do=("disarm",), say=_DISARMING),
+    Rule("idle", do=("disarm",), say=_DISARMING),
+)

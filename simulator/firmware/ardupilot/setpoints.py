@@ -1,0 +1,94 @@
+"""What ArduCopter makes of setpoint messages."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from simulator.firmware.base import AttitudeSetpoint, MotionSetpoint, ReadParameter, Triple
+
+_CENTI = 0.01
+_RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b111, 64, 128
+_NORM_TOLERANCE = 0.0005
+_THRUST_IS_THRUST = 8  # GUID_OPTIONS
+_STOP = MotionSetpoint(velocity_ned_mps=(0.0, 0.0, 0.0))
+# Beside an attitude, rates of .3 rad/s move the equilibrium by 3 degrees
+_RATE_LEAD_S = 0.175
+
+
+def attitude_setpoint(
+    values: Mapping[str, Any], parameter: ReadParameter
+) -> AttitudeSetpoint | MotionSetpoint | None:
+    """SET_ATTITUDE_TARGET. None: dropped in silence, and what was demanded before goes on.
+
+    Dropped: thrust to be ignored, a quaternion off unit length. Rates of which some are to be
+    ignored make the vehicle hold its position. A thrust that is not a number is none, and latches
+    an internal error (the real SITL stops at a quaternion that is not a number; a board drops it).
+    """
+    mask = values["type_mask"]
+    ignored = mask & _RATES_IGNORED
+    if mask & _THRUST_IGNORED:
+        return None
+    if ignored not in (0, _RATES_IGNORED):
+        return _STOP
+    given = (values["body_roll_rate"], values["body_pitch_rate"], values["body_yaw_rate"])
+    rates: Triple = (0.0, 0.0, 0.0) if ignored else given
+    if not all(map(math.isfinite, rates)):
+        return None
+    thrust, climb_mps, event = _vertical(values["thrust"], parameter)
+    if mask & _ATTITUDE_IGNORED:
+        return AttitudeSetpoint(None, rates, thrust, climb_mps, event)
+    w, x, y, z = values["q"]
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    if not abs(norm - 1.0) <= _NORM_TOLERANCE:
+        return None
+    p, q, r = (0.5 * _RATE_LEAD_S * rate for rate in rates)
+    ahead = (
+        w - x * p - y * q - z * r,
+        x + w * p + y * r - z * q,
+        y + w * q + z * p - x * r,
+        z + w * r + x * q - y * p,
+    )
+    return AttitudeSetpoint(ahead, None, thrust, climb_mps, event)
+
+
+def _vertical(thrust: float, parameter: ReadParameter) -> tuple[float, float | None, str]:
+    """Thrust, climb rate (None: the thrust is one) and the event of a value that is no number."""
+    by_thrust = int(parameter("GUID_OPTIONS")) & _THRUST_IS_THRUST
+    event = ""
+    if math.isnan(thrust):
+        thrust, event = 0.0 if by_thrust else 0.5, "thrust not a number"
+    thrust = min(1.0, max(-1.0, thrust))
+    if by_thrust:
+        return max(0.0, thrust), None, event
+    up = parameter("WPNAV_SPEED_UP") if thrust > 0.5 else parameter("WPNAV_SPEED_DN")
+    return 0.0, (max(0.0, thrust) - 0.5) / 0.5 * up * _CENTI, event
+
+
+_LOCAL_NED = 1  # MAV_FRAME
+_POSITION, _VELOCITY, _ACCELERATION, _YAW, _YAW_RATE = 0o007, 0o070, 0o700, 1024, 2048
+_NOTHING: Triple = (math.nan, math.nan, math.nan)
+
+
+def motion_setpoint(values: Mapping[str, Any]) -> MotionSetpoint | None:
+    """SET_POSITION_TARGET_LOCAL_NED in frame 1: each vector wholly given or ignored."""
+    if values["coordinate_frame"] != _LOCAL_NED:
+        return None
+    mask = values["type_mask"]
+
+    def given(names: tuple[str, str, str], bits: int) -> Triple:
+        if mask & bits:
+            return _NOTHING
+        a, b, c = (values[name] for name in names)
+        return (a, b, c)
+
+    position = given(("x", "y", "z"), _POSITION)
+    velocity = given(("vx", "vy", "vz"), _VELOCITY)
+    acceleration = given(("afx", "afy", "afz"), _ACCELERATION)
+    yaw = math.nan if mask & _YAW else values["yaw"]
+    yaw_rate = math.nan if mask & _YAW_RATE else values["yaw_rate"]
+    numbers = (*position, *velocity, *acceleration)
+    if any(map(math.isinf, (*numbers, yaw, yaw_rate))) or all(map(math.isnan, numbers)):
+        return None
+    return MotionSetpoint(position, velocity, acceleration, yaw, yaw_rate)
