@@ -137,6 +137,44 @@ def vertical_cost_to_go(vehicle: Vehicle, bandwidth_radps: float, period_s: floa
     return sampled_cost_to_go(vertical_model(vehicle), weight, bandwidth_radps**-4, period_s)
 
 
+def tilt_ripple(vehicle: Vehicle, period_s: float) -> Array:
+    """`hold_ripple` (2,) of [b, b'], per unit of slope of b_c."""
+    whole = lateral_model(vehicle)
+    return hold_ripple(LinearModel(whole.dynamics[2:, 2:], whole.input_map[2:]), period_s)
+
+
+def thrust_ripple(vehicle: Vehicle, period_s: float) -> float:
+    """`hold_ripple` of T b_z, per unit of slope of f_c."""
+    whole = vertical_model(vehicle)
+    return float(hold_ripple(LinearModel(whole.dynamics[2:, 2:], whole.input_map[2:]), period_s)[0])
+
+
+def hold_ripple(model: LinearModel, period_s: float) -> Array:
+    """How far a stable model (n,) is from its answer to the ramp u = t at the moments when a
+    staircase through the ramp's middles steps up. A sampled law looks exactly there: without this
+    part in its target it fights the ripple of its own hold, which no held input can avoid.
+    """
+    size = len(model.dynamics)
+    flow = np.zeros((size + 1, size + 1))
+    flow[:size, :size], flow[:size, size:] = model.dynamics, model.input_map
+    step = expm(flow * period_s)
+    # The ramp's answer is slope t + smooth; the staircase's, where it steps up, slope t + stepped
+    slope = -np.linalg.solve(model.dynamics, model.input_map[:, 0])
+    smooth = np.linalg.solve(model.dynamics, slope)
+    pushed = (0.5 * step[:size, size] - slope) * period_s
+    stepped: Array = np.linalg.solve(np.eye(size) - step[:size, :size], pushed)
+    return stepped - smooth
+
+
+def held_lead(
+    value: Array, rate: Array, acceleration: Array, response: AxisResponse, period_s: float
+) -> Array:
+    """`lead` in the middle of a hold, less what holding adds to a curved command (its mean over
+    the hold, to second order). Any common shape."""
+    led: Array = lead(value, rate, acceleration, response) - period_s**2 / 24.0 * acceleration
+    return led
+
+
 def lead(value: Array, rate: Array, acceleration: Array, response: AxisResponse) -> Array:
     """The command whose second-order response (delay aside) is the given motion:
     s + 2 z / wn s' + s'' / wn^2. Any common shape."""

@@ -28,7 +28,14 @@ from offboard.control.base import (
 )
 from offboard.control.certificate import ExactMinimum, at_bound, certify
 from offboard.control.cost import BoxQuadratic
-from offboard.control.response import lateral_cost_to_go, lead, vertical_cost_to_go
+from offboard.control.response import (
+    held_lead,
+    lateral_cost_to_go,
+    lead,
+    thrust_ripple,
+    tilt_ripple,
+    vertical_cost_to_go,
+)
 from offboard.control.swarm import QuadraticSwarm, RandomLanes, SwarmSettings
 from offboard.model.frames import wrap_pi
 from offboard.model.vehicle import Parameters, Vehicle
@@ -69,7 +76,7 @@ class TrackingSettings(Parameters):
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """What the reference asks when the command acts, NED, SI.
+    """What the reference asks when the command acts, NED, SI, the ripple of held commands included.
 
     Lateral at the predicted time: position_ne_m, velocity_ne_mps, direction_ne and
     direction_rate_ne_ps, each (2,). Vertical when the thrust acts: position_down_m,
@@ -155,6 +162,8 @@ class TrackingLaw:
         """Go on with a newly identified vehicle, at most this bandwidth; without `gains` only the
         feed-forward changes, which costs nothing."""
         self._vehicle = vehicle
+        self._tilt_ripple = tilt_ripple(vehicle, self._settings.period_s)
+        self._thrust_ripple = thrust_ripple(vehicle, self._settings.period_s)
         if gains:
             bandwidth = min(self._settings.bandwidth_radps, bandwidth_limit_radps)
             self.lateral = lateral_cost_to_go(vehicle, bandwidth, self._settings.period_s)
@@ -163,7 +172,8 @@ class TrackingLaw:
     def target(self, reference: Reference, time_s: float, state: PredictedState) -> Target:
         """What to be and what to ask, for a decision at `time_s` with the state predicted to
         `state.time_s`, when its tilt begins to act. The disturbance is part of both."""
-        vehicle, half_s = self._vehicle, 0.5 * self._settings.period_s
+        vehicle, period_s = self._vehicle, self._settings.period_s
+        half_s = 0.5 * period_s
         heave_s = heave_of(state).time_s
         course_s = time_s + vehicle.yaw.delay_s + half_s
         times = [state.time_s, state.time_s + half_s, heave_s, heave_s + half_s, course_s]
@@ -173,7 +183,9 @@ class TrackingLaw:
         )
         b, b1 = flat.thrust_direction_ned, flat.thrust_direction_rate_ned_ps
         b2 = flat.thrust_direction_acceleration_ned_ps2
-        thrust_down = flat.thrust_mps2 * b[:, 2]
+        tilt_slope = lead(b1[0, :2], b2[0, :2], np.zeros(2), vehicle.tilt)
+        thrust_slope = flat.thrust_rate_mps3[2] * b[2, 2] + flat.thrust_mps2[2] * b1[2, 2]
+        thrust_down = flat.thrust_mps2[2] * b[2, 2] + self._thrust_ripple * thrust_slope
         led_thrust = flat.thrust_mps2[3] + vehicle.thrust_lag_s * flat.thrust_rate_mps3[3]
         course = lead(
             sample.course_rad[4],
@@ -184,12 +196,12 @@ class TrackingLaw:
         return Target(
             position_ne_m=sample.position_ned_m[0, :2],
             velocity_ne_mps=sample.velocity_ned_mps[0, :2],
-            direction_ne=b[0, :2],
-            direction_rate_ne_ps=b1[0, :2],
+            direction_ne=b[0, :2] + self._tilt_ripple[0] * tilt_slope,
+            direction_rate_ne_ps=b1[0, :2] + self._tilt_ripple[1] * tilt_slope,
             position_down_m=float(sample.position_ned_m[2, 2]),
             velocity_down_mps=float(sample.velocity_ned_mps[2, 2]),
-            thrust_down_mps2=float(thrust_down[2]),
-            tilt_feedforward=lead(b[1, :2], b1[1, :2], b2[1, :2], vehicle.tilt),
+            thrust_down_mps2=float(thrust_down),
+            tilt_feedforward=held_lead(b[1, :2], b1[1, :2], b2[1, :2], vehicle.tilt, period_s),
             thrust_down_feedforward_mps2=float(led_thrust * b[3, 2]),  # T lags, not T b_z
             course_feedforward_rad=float(course),
         )

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.control.base import PredictedState
-from offboard.control.response import lead
+from offboard.control.response import held_lead
 from offboard.control.tracking import heave_of
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import Reference
@@ -65,11 +65,12 @@ def look_ahead(
     velocities[:, 2] = sample.velocity_ned_mps[count:, 2]
     b = flat.thrust_direction_ned
     middle = slice(1, count, 2)
-    led_tilt = lead(
+    led_tilt = held_lead(
         b[:count][middle, :2],
         flat.thrust_direction_rate_ned_ps[:count][middle, :2],
         flat.thrust_direction_acceleration_ned_ps2[:count][middle, :2],
         vehicle.tilt,
+        period_s,
     )
     led_thrust = flat.thrust_mps2 + vehicle.thrust_lag_s * flat.thrust_rate_mps3
     led_down = (led_thrust * b[:, 2])[count:][middle]
