@@ -7,14 +7,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from operator import itemgetter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.tlog import LoggedMessage, Tlog
+from offboard.analysis.tlog import LoggedMessage, Tlog, columns, name_of
 from offboard.flight import manifest
 from offboard.flight.record import (
     COMPONENT_ID,
@@ -29,9 +30,13 @@ from offboard.mavlink.session import DIALECTS
 Array = NDArray[np.float64]
 OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
 EARTH_RADIUS_M = 6371000.0  # of PX4 map projection
+POSITION_FIELDS = "x y z vx vy vz"
 ATTITUDE_FIELDS = "q1 q2 q3 q4 rollspeed pitchspeed yawspeed"
 REFERENCE_FIELDS = "x y z vx vy vz afx afy afz yaw"
 Geodetic = tuple[float, float, float]  # latitude and longitude in degrees, altitude in m
+OUR_WORDS = "offboard: "  # before every phase that we announce
+# (system, component, message id) -> (place in the log, message), in order
+Streams = dict[tuple[int, int, int], list[tuple[int, LoggedMessage]]]
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: ground stations and companions
 
 
@@ -72,78 +77,35 @@ class History:
 
 def gather(log: Tlog) -> History:
     """Sort a log's messages into a History. A log without a vehicle gives empty arrays."""
+    streams = _streams(log)
     vehicle_id, dialect = _vehicle(log.messages)
-    rows: dict[str, list[tuple[float, ...]]] = {
-        name: [] for name in ("position", "attitude", "truth", "reference", "setpoint")
-    }
-    records: list[tuple[float, TickRecord]] = []
-    phases: list[Happening] = []
-    modes: list[Happening] = []
-    said: list[Happening] = []
-    origin: Geodetic | None = None
-    now_s = math.nan
-    for entry in log.messages:
-        message = entry.message
-        ours = entry.component_id in OUR_COMPONENTS
-        if not ours and entry.system_id != vehicle_id:
-            continue
-        match entry.name:
-            case "LOCAL_POSITION_NED":
-                now_s = message.time_boot_ms / 1e3
-                rows["position"].append(
-                    (now_s, message.x, message.y, message.z, message.vx, message.vy, message.vz)
-                )
-            case "ATTITUDE_QUATERNION":
-                now_s = message.time_boot_ms / 1e3
-                rows["attitude"].append((now_s, *_values(message, ATTITUDE_FIELDS)))
-            case "HOME_POSITION":
-                origin = _origin_of_home(message)
-            case "GPS_GLOBAL_ORIGIN":
-                origin = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
-            case "HIL_STATE_QUATERNION" if origin:
-                stamp_s = message.time_usec / 1e6 or now_s
-                place = message.lat / 1e7, message.lon / 1e7, message.alt / 1e3
-                rows["truth"].append((stamp_s, *_local(*place, origin)))
-            case "SIM_STATE" if origin:
-                place = message.lat_int / 1e7, message.lon_int / 1e7, message.alt
-                rows["truth"].append((now_s, *_local(*place, origin)))
-            case "POSITION_TARGET_LOCAL_NED" if ours:
-                stamp_s = message.time_boot_ms / 1e3
-                rows["reference"].append((stamp_s, *_values(message, REFERENCE_FIELDS)))
-            case "SET_ATTITUDE_TARGET" if ours:
-                stamp_s = message.time_boot_ms / 1e3
-                rows["setpoint"].append((stamp_s, entry.unix_us / 1e6, *message.q, message.thrust))
-            case "SET_POSITION_TARGET_LOCAL_NED" if ours:
-                stamp_s = message.time_boot_ms / 1e3
-                rows["setpoint"].append((stamp_s, entry.unix_us / 1e6, *(math.nan,) * 5))
-            case "DEBUG_FLOAT_ARRAY" if ours and _is_record(message):
-                records.append((message.time_usec / 1e6, TickRecord.from_data(message.data)))
-            case "STATUSTEXT":
-                text = message.text.rstrip("\t")
-                if ours and text.startswith("offboard: "):
-                    phases.append(Happening(now_s, "offboard", text.removeprefix("offboard: ")))
-                elif not ours:
-                    said.append(Happening(now_s, "vehicle", text))
-            case "COMMAND_ACK" if message.result not in (0, 5):
-                refusal = f"command {message.command} refused, result {message.result}"
-                said.append(Happening(now_s, "vehicle", refusal))
-            case "HEARTBEAT" if dialect and entry.component_id == 1:
-                mode = dialect.mode_name(message.custom_mode)
-                if not modes or modes[-1].what != mode:
-                    modes.append(Happening(now_s, "vehicle", mode))
+    ours = _Party(streams, lambda system, component: component in OUR_COMPONENTS)
+    theirs = _Party(
+        streams,
+        lambda system, component: system == vehicle_id and component not in OUR_COMPONENTS,
+    )
+    clock = _Clock(theirs)
+    records = [
+        (message.time_usec / 1e6, TickRecord.from_data(message.data))
+        for message in (entry.message for _, entry in ours.of("DEBUG_FLOAT_ARRAY"))
+        if _is_record(message)
+    ]
     stamps = [entry.unix_us for entry in log.messages]
+    counts: Counter[str] = Counter()
+    for (_, _, kind), stream in streams.items():
+        counts[name_of(kind)] += len(stream)
     return History(
-        position=_table(rows["position"], 7),
-        attitude=_table(rows["attitude"], 8),
-        truth=_table(rows["truth"], 4),
-        reference=_table(rows["reference"], 11),
-        setpoint=_table(rows["setpoint"], 7),
+        position=theirs.table("LOCAL_POSITION_NED", POSITION_FIELDS),
+        attitude=theirs.table("ATTITUDE_QUATERNION", ATTITUDE_FIELDS),
+        truth=_truth(theirs, clock),
+        reference=ours.table("POSITION_TARGET_LOCAL_NED", REFERENCE_FIELDS),
+        setpoint=_setpoints(ours),
         record_time_s=np.array([time_s for time_s, _ in records]),
         records=tuple(record for _, record in records),
-        phases=tuple(phases),
-        modes=tuple(modes),
-        said=tuple(said),
-        messages=Counter(entry.name for entry in log.messages),
+        phases=_phases(ours, clock),
+        modes=_modes(theirs, clock, dialect),
+        said=_said(theirs, clock),
+        messages=counts,
         wall_s=(stamps[-1] - stamps[0]) / 1e6 if stamps else 0.0,
     )
 
@@ -159,12 +121,141 @@ def configuration(log: Tlog) -> str | None:
     )
 
 
+def _streams(log: Tlog) -> Streams:
+    streams: Streams = {}
+    for place, entry in enumerate(log.messages):
+        frame = entry.frame
+        key = frame.system_id, frame.component_id, frame.message_id
+        streams.setdefault(key, []).append((place, entry))
+    return streams
+
+
+class _Party:
+    """What one side of the link sent: messages by name, each with its place in the log."""
+
+    def __init__(self, streams: Streams, sent: Callable[[int, int], bool]) -> None:
+        self._kinds: dict[str, list[tuple[int, LoggedMessage]]] = {}
+        for (system, component, kind), stream in streams.items():
+            if sent(system, component):
+                self._kinds.setdefault(name_of(kind), []).extend(stream)
+        for stream in self._kinds.values():
+            stream.sort(key=itemgetter(0))
+
+    def of(self, name: str) -> list[tuple[int, LoggedMessage]]:
+        """(place, message) of all messages of that name."""
+        return self._kinds.get(name, [])
+
+    def places(self, name: str) -> NDArray[np.intp]:
+        return np.array([place for place, _ in self.of(name)], dtype=np.intp)
+
+    def columns(self, name: str, fields: str) -> Array:
+        """(N, columns): the fields of all messages of that name."""
+        return columns(name, [entry for _, entry in self.of(name)], fields)
+
+    def table(self, name: str, fields: str) -> Array:
+        """The same after their vehicle time in seconds."""
+        rows = self.columns(name, f"time_boot_ms {fields}")
+        rows[:, 0] /= 1e3
+        return rows
+
+
+class _Clock:
+    """Vehicle time at a place in the log: the newest that telemetry had told by then."""
+
+    def __init__(self, theirs: _Party) -> None:
+        names = ("LOCAL_POSITION_NED", "ATTITUDE_QUATERNION")
+        places = np.concatenate([theirs.places(name) for name in names])
+        times = np.concatenate([theirs.table(name, "")[:, 0] for name in names])
+        order = np.argsort(places)
+        self._places, self._times = places[order], np.append(math.nan, times[order])
+
+    def at(self, places: NDArray[np.intp]) -> Array:
+        """(N,) seconds, NaN before any telemetry."""
+        times: Array = self._times[np.searchsorted(self._places, places)]
+        return times
+
+    def story(self, who: str, told: Iterable[tuple[int, str]]) -> tuple[Happening, ...]:
+        """What was told at places in the log, in their order."""
+        ordered = sorted(told)
+        times = self.at(np.array([place for place, _ in ordered], dtype=np.intp))
+        return tuple(
+            Happening(float(time_s), who, what)
+            for time_s, (_, what) in zip(times, ordered, strict=True)
+        )
+
+
+def _setpoints(ours: _Party) -> Array:
+    """Of both kinds, in the order in which they were sent."""
+    kinds = ("SET_ATTITUDE_TARGET", "SET_POSITION_TARGET_LOCAL_NED")
+    attitude, position = (ours.table(kind, "") for kind in kinds)
+    aims = ours.columns(kinds[0], "q thrust")
+    stamps = np.array([entry.unix_us / 1e6 for kind in kinds for _, entry in ours.of(kind)])
+    rows = np.full((len(stamps), 7), math.nan)
+    rows[:, 0] = np.concatenate((attitude[:, 0], position[:, 0]))
+    rows[:, 1] = stamps
+    rows[: len(aims), 2:] = aims
+    return rows[np.argsort(np.concatenate([ours.places(kind) for kind in kinds]))]
+
+
+def _truth(theirs: _Party, clock: _Clock) -> Array:
+    """Where the simulated vehicle is, once its log has said where the local frame's origin is."""
+    homes = [(place, _origin_of_home(entry.message)) for place, entry in theirs.of("HOME_POSITION")]
+    given = [
+        (place, _origin_given(entry.message)) for place, entry in theirs.of("GPS_GLOBAL_ORIGIN")
+    ]
+    hil = theirs.columns("HIL_STATE_QUATERNION", "time_usec lat lon alt") / (1e6, 1e7, 1e7, 1e3)
+    state = theirs.columns("SIM_STATE", "lat_int lon_int alt") / (1e7, 1e7, 1.0)
+    rows = np.vstack((hil, np.insert(state, 0, 0.0, axis=1)))
+    places = np.concatenate([theirs.places("HIL_STATE_QUATERNION"), theirs.places("SIM_STATE")])
+    rows[:, 0] = np.where(rows[:, 0] > 0.0, rows[:, 0], clock.at(places))
+    origins = sorted(homes + given)
+    newest = np.searchsorted([place for place, _ in origins], places)
+    known = np.flatnonzero(newest)
+    known = known[np.argsort(places[known])]
+    told = [(rows[row, 0], *_local(rows[row, 1:], origins[newest[row] - 1][1])) for row in known]
+    return np.array(told, dtype=np.float64).reshape(-1, 4)
+
+
+def _phases(ours: _Party, clock: _Clock) -> tuple[Happening, ...]:
+    texts = [(place, entry.message.text.rstrip("\t")) for place, entry in ours.of("STATUSTEXT")]
+    told = [
+        (place, text.removeprefix(OUR_WORDS)) for place, text in texts if text.startswith(OUR_WORDS)
+    ]
+    return clock.story("offboard", told)
+
+
+def _modes(theirs: _Party, clock: _Clock, dialect: Dialect | None) -> tuple[Happening, ...]:
+    told: list[tuple[int, str]] = []
+    if dialect is None:
+        return ()
+    for place, entry in theirs.of("HEARTBEAT"):
+        mode = dialect.mode_name(entry.message.custom_mode)
+        if entry.component_id == 1 and (not told or told[-1][1] != mode):
+            told.append((place, mode))
+    return clock.story("vehicle", told)
+
+
+def _said(theirs: _Party, clock: _Clock) -> tuple[Happening, ...]:
+    words = [(place, entry.message.text.rstrip("\t")) for place, entry in theirs.of("STATUSTEXT")]
+    acks = [(place, entry.message) for place, entry in theirs.of("COMMAND_ACK")]
+    refused = [
+        (place, f"command {ack.command} refused, result {ack.result}")
+        for place, ack in acks
+        if ack.result not in (0, 5)
+    ]
+    return clock.story("vehicle", words + refused)
+
+
 def _vehicle(messages: Iterable[LoggedMessage]) -> tuple[int | None, Dialect | None]:
     for entry in messages:
         if entry.name == "HEARTBEAT" and entry.message.autopilot != _NO_AUTOPILOT:
             known = {dialect.mav_autopilot: dialect for dialect in DIALECTS.values()}
             return entry.system_id, known.get(entry.message.autopilot)
     return None, None
+
+
+def _origin_given(message: Any) -> Geodetic:
+    return message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
 
 
 def _origin_of_home(message: Any) -> Geodetic:
@@ -178,10 +269,10 @@ def _origin_of_home(message: Any) -> Geodetic:
     )
 
 
-def _local(
-    latitude: float, longitude: float, altitude_m: float, origin: Geodetic
-) -> tuple[float, ...]:
-    """North, east, down from the origin; the plane is exact to a millimetre within 100 m."""
+def _local(place: Array, origin: Geodetic) -> tuple[float, ...]:
+    """North, east, down of (latitude, longitude, altitude) from the origin; the plane is exact to a
+    millimetre within 100 m."""
+    latitude, longitude, altitude_m = place.tolist()
     metres = math.radians(1.0) * EARTH_RADIUS_M
     return (
         (latitude - origin[0]) * metres,
@@ -190,13 +281,5 @@ def _local(
     )
 
 
-def _values(message: Any, names: str) -> tuple[float, ...]:
-    return tuple(getattr(message, name) for name in names.split())
-
-
 def _is_record(message: Any) -> bool:
     return (message.array_id, message.name.rstrip("\0")) == (RECORD_ID, RECORD_NAME)
-
-
-def _table(rows: list[tuple[float, ...]], columns: int) -> Array:
-    return np.array(rows, dtype=np.float64).reshape(-1, columns)

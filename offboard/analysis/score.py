@@ -97,9 +97,11 @@ def score(history: History) -> Score:
     values: dict[str, float] = {}
     window = _window(history)
     if window is not None:
-        values |= _tracking(history, *window)
-        values |= _activity(history, *window)
-        values |= _truth(history, *window)
+        reference = _Reference(history.reference)
+        values |= _tracking(history, reference, *window)
+        values |= _fitness(history, reference, *window)
+        values |= _activity(history, reference, *window)
+        values |= _truth(history, reference, *window)
         values["tracked_s"] = window[1] - window[0]
     values |= _stream(history)
     values |= _decisions(history)
@@ -126,30 +128,35 @@ def _between(rows: Array, begin_s: float, end_s: float) -> Array:
     return inside
 
 
-def _curve(history: History) -> tuple[BPoly, Array]:
-    """The reference as a function of vehicle time, and its rows: the records are joined by the
+class _Reference:
+    """What was to be flown, as functions of vehicle time (N,): the records are joined by the
     quintic that their position, velocity and acceleration determine."""
-    rows = history.reference
-    newest = np.maximum.accumulate(rows[:, 0])
-    rows = rows[np.concatenate(([True], rows[1:, 0] > newest[:-1]))]
-    knots = np.stack((rows[:, 1:4], rows[:, 4:7], rows[:, 7:10]), axis=1)
-    return BPoly.from_derivatives(rows[:, 0], knots), rows
+
+    def __init__(self, rows: Array) -> None:
+        newest = np.maximum.accumulate(rows[:, 0])
+        rows = rows[np.concatenate(([True], rows[1:, 0] > newest[:-1]))]
+        knots = np.stack((rows[:, 1:4], rows[:, 4:7], rows[:, 7:10]), axis=1)
+        self._times, self._course = rows[:, 0], np.unwrap(rows[:, 10])
+        self._curve = BPoly.from_derivatives(self._times, knots)
+
+    def position(self, times: Array, derivative: int = 0) -> Array:
+        """(N, 3) NED, or one of its derivatives."""
+        values: Array = self._curve.derivative(derivative)(times)
+        return values
+
+    def course(self, times: Array) -> Array:
+        return np.interp(times, self._times, self._course)
 
 
-def _reference(history: History, times: Array) -> tuple[Array, Array, Array]:
-    """Reference position, velocity (N, 3) and course (N,) at any times."""
-    curve, rows = _curve(history)
-    course = np.interp(times, rows[:, 0], np.unwrap(rows[:, 10]))
-    return curve(times), curve.derivative()(times), course
-
-
-def _tracking(history: History, begin_s: float, end_s: float) -> dict[str, float]:
+def _tracking(
+    history: History, reference: _Reference, begin_s: float, end_s: float
+) -> dict[str, float]:
     position = _between(history.position, begin_s, end_s)
-    place, velocity, _ = _reference(history, position[:, 0])
-    error_m = np.linalg.norm(position[:, 1:4] - place, axis=1)
-    slip_mps = np.linalg.norm(position[:, 4:7] - velocity, axis=1)
+    times = position[:, 0]
+    error_m = np.linalg.norm(position[:, 1:4] - reference.position(times), axis=1)
+    slip_mps = np.linalg.norm(position[:, 4:7] - reference.position(times, 1), axis=1)
     attitude = _between(history.attitude, begin_s, end_s)
-    _, _, course = _reference(history, attitude[:, 0])
+    course = reference.course(attitude[:, 0])
     turn = np.degrees(wrap_pi(course_from_quaternion(attitude[:, 1:5]) - course))
     return {
         "rmse_position_m": _rms(error_m),
@@ -163,43 +170,47 @@ def _tracking(history: History, begin_s: float, end_s: float) -> dict[str, float
         "max_course_deg": float(np.abs(turn).max(initial=0.0)),
         "position_hz": _hz(position),
         "attitude_hz": _hz(attitude),
-    } | _fitness(history, begin_s, end_s)
+    }
 
 
-def _fitness(history: History, begin_s: float, end_s: float) -> dict[str, float]:
+def _fitness(
+    history: History, reference: _Reference, begin_s: float, end_s: float
+) -> dict[str, float]:
     """Eqs. 31-32 at the control ticks: velocities in the body frame, course in degrees."""
     ticks = history.record_time_s[
         (history.record_time_s >= begin_s) & (history.record_time_s <= end_s)
     ]
-    place, velocity, course = _reference(history, ticks)
     attitude = history.attitude[_nearest(history.attitude[:, 0], ticks), 1:5]
     body = rotation_from_quaternion(attitude).swapaxes(-1, -2)
     flown = _at(history.position, ticks)
-    slip = np.einsum("nij,nj->ni", body, velocity - flown[:, 3:6])
-    away = place - flown[:, 0:3]
-    turn = np.degrees(wrap_pi(course - course_from_quaternion(attitude)))
+    slip = np.einsum("nij,nj->ni", body, reference.position(ticks, 1) - flown[:, 3:6])
+    away = reference.position(ticks) - flown[:, 0:3]
+    turn = np.degrees(wrap_pi(reference.course(ticks) - course_from_quaternion(attitude)))
     columns = (*slip.T, *away.T, turn)
     names = ("e_u", "e_v", "e_w", "e_x", "e_y", "e_z", "e_psi")
     parts = {name: float((column**2).sum()) for name, column in zip(names, columns, strict=True)}
     return parts | {"mu_e": sum(parts.values())}
 
 
-def _truth(history: History, begin_s: float, end_s: float) -> dict[str, float]:
+def _truth(
+    history: History, reference: _Reference, begin_s: float, end_s: float
+) -> dict[str, float]:
     truth = _between(history.truth, begin_s, end_s)
     if not len(truth):
         return {}
-    place, _, _ = _reference(history, truth[:, 0])
-    error_m = np.linalg.norm(truth[:, 1:4] - place, axis=1)
+    error_m = np.linalg.norm(truth[:, 1:4] - reference.position(truth[:, 0]), axis=1)
     return {"rmse_truth_m": _rms(error_m), "max_truth_m": float(error_m.max())}
 
 
-def _activity(history: History, begin_s: float, end_s: float) -> dict[str, float]:
+def _activity(
+    history: History, reference: _Reference, begin_s: float, end_s: float
+) -> dict[str, float]:
     setpoint = _between(history.setpoint, begin_s, end_s)
     attitude = _between(history.attitude, begin_s, end_s)
     commanded = thrust_direction_from_quaternion(setpoint[:, 2:6])
     steps = np.degrees(np.linalg.norm(np.diff(commanded, axis=0), axis=1))
     down = thrust_direction_from_quaternion(attitude[:, 1:5])[:, 2]
-    return _agitation(history, attitude) | {
+    return _agitation(reference, attitude) | {
         "thrust_sd": float(setpoint[:, 6].std()),
         "tilt_command_step_deg": _rms(steps),
         "tilt_max_deg": float(np.degrees(np.arccos(np.clip(down, -1, 1))).max(initial=0.0)),
@@ -208,12 +219,11 @@ def _activity(history: History, begin_s: float, end_s: float) -> dict[str, float
     }
 
 
-def _agitation(history: History, attitude: Array) -> dict[str, float]:
+def _agitation(reference: _Reference, attitude: Array) -> dict[str, float]:
     """Motion that the reference does not explain: thrust direction and rates less their best
     linear fit by the reference's velocity, acceleration and jerk (drag and lag need no model)."""
-    curve, _ = _curve(history)
     times = attitude[:, 0]
-    explained = [curve.derivative(order)(times)[:, :2] for order in (1, 2, 3)]
+    explained = [reference.position(times, order)[:, :2] for order in (1, 2, 3)]
     regressors = np.hstack((*explained, np.ones((len(times), 1))))
     direction = thrust_direction_from_quaternion(attitude[:, 1:5])[:, :2]
     motion = np.hstack((direction, attitude[:, 5:7]))

@@ -6,31 +6,54 @@ off in its last record (a crash) is read up to there; a file that is no .tlog is
 
 from __future__ import annotations
 
+import math
 import struct
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as dialect
+
+from offboard.mavlink.counters import DropReason
+from offboard.mavlink.framing import Frame, frame_size, parse
 
 _STAMP = struct.Struct(">Q")
 _YEAR_2000_US, _YEAR_2100_US = 946_684_800_000_000, 4_102_444_800_000_000
+_MAGIC = (0xFD, 0xFE)
+_codec = dialect.MAVLink(None)
 
 
 class TlogError(Exception):
     """A file that cannot be read as a .tlog: one sentence for the user."""
 
 
-@dataclass(frozen=True, slots=True)
-class LoggedMessage:
-    """One decoded frame and when it crossed the link."""
+class LoggedMessage(NamedTuple):
+    """One frame and when it crossed the link."""
 
     unix_us: int
-    system_id: int
-    component_id: int
-    name: str
-    message: Any
+    frame: Frame
+
+    @property
+    def system_id(self) -> int:
+        return self.frame.system_id
+
+    @property
+    def component_id(self) -> int:
+        return self.frame.component_id
+
+    @property
+    def name(self) -> str:
+        """As pymavlink calls it, UNKNOWN_<id> where it does not know it."""
+        return name_of(self.frame.message_id)
+
+    @property
+    def message(self) -> Any:
+        """Decoded by pymavlink, anew each time that it is asked for."""
+        return _codec.decode(bytearray(self.frame.raw))
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,26 +79,15 @@ def read(path: Path) -> Tlog:
         data = path.read_bytes()
     except OSError as error:
         raise TlogError(f"{path} cannot be read: {error.strerror}") from None
-    codec = dialect.MAVLink(None)
     messages: list[LoggedMessage] = []
-    at = undecodable = 0
+    end = undecodable = 0
     for begin, end, stamp in _records(data, path):
-        at = end
-        try:
-            message = codec.decode(bytearray(data[begin:end]))
-        except dialect.MAVError:
+        frame = parse(data, begin, end)
+        if isinstance(frame, DropReason):
             undecodable += 1
-            continue
-        messages.append(
-            LoggedMessage(
-                stamp,
-                message.get_srcSystem(),
-                message.get_srcComponent(),
-                message.get_type(),
-                message,
-            )
-        )
-    return Tlog(tuple(messages), len(data) - at, undecodable)
+        else:
+            messages.append(LoggedMessage(stamp, frame))
+    return Tlog(tuple(messages), len(data) - end, undecodable)
 
 
 def _records(data: bytes, path: Path) -> Iterator[tuple[int, int, int]]:
@@ -83,16 +95,48 @@ def _records(data: bytes, path: Path) -> Iterator[tuple[int, int, int]]:
     at = 0
     while at + 11 <= len(data):
         (stamp,) = _STAMP.unpack_from(data, at)
-        magic = data[at + 8]
-        if magic not in (0xFD, 0xFE) or not _YEAR_2000_US < stamp < _YEAR_2100_US:
+        if data[at + 8] not in _MAGIC or not _YEAR_2000_US < stamp < _YEAR_2100_US:
             raise TlogError(f"{path} is not a .tlog: no time stamp and MAVLink frame at byte {at}")
-        size = data[at + 9] + (8 if magic == 0xFE else 12)
-        if magic == 0xFD and data[at + 10] & 1:
-            size += 13
-        end = at + 8 + size
-        if end > len(data):
+        size = frame_size(data, at + 8)
+        if size is None or at + 8 + size > len(data):
             return
-        yield at + 8, end, stamp
-        at = end
+        yield at + 8, at + 8 + size, stamp
+        at += 8 + size
     if at == 0:
         raise TlogError(f"{path} is not a .tlog, or empty: it holds no whole MAVLink frame")
+
+
+@cache
+def name_of(message_id: int) -> str:
+    """The name of a message, UNKNOWN_<id> where pymavlink does not know it."""
+    kind = dialect.mavlink_map.get(message_id)
+    return kind.msgname if kind else f"UNKNOWN_{message_id}"
+
+
+def columns(name: str, messages: Sequence[LoggedMessage], fields: str) -> NDArray[np.float64]:
+    """Fields of messages that all are called `name`, (N, columns): `fields` with spaces between, an
+    array field filling as many columns as it has elements. What decoding one by one would give."""
+    layout = _layout(name)
+    size = layout.itemsize
+    payloads = b"".join(entry.frame.payload[:size].ljust(size, b"\0") for entry in messages)
+    rows = np.frombuffer(payloads, layout)
+    parts = []
+    for field in fields.split():
+        width = math.prod(layout[field].shape)
+        parts.append(rows[field].reshape(len(rows), width).astype(np.float64))
+    return np.hstack(parts)
+
+
+@cache
+def _layout(name: str) -> np.dtype[np.void]:
+    """The payload as it lies on the wire, from pymavlink's own description of the message."""
+    kind = getattr(dialect, f"MAVLink_{name.lower()}_message")
+    formats = kind.native_format.decode().lstrip("<")
+    return np.dtype(
+        [
+            (field, f"<{code}", (length,) if length else ())
+            for field, code, length in zip(
+                kind.ordered_fieldnames, formats, kind.array_lengths, strict=True
+            )
+        ]
+    )

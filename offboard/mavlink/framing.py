@@ -94,10 +94,10 @@ class FrameSplitter:
 
     def _parse_at(self, data: bytes, at: int) -> Frame | DropReason | None:
         """The frame that begins at `at`, why there is none, or None to wait for more bytes."""
-        size = _frame_size(data, at)
+        size = frame_size(data, at)
         if size is None or at + size > len(data):
             return None if self._stream else DropReason.TRUNCATED
-        frame = _parse(data, at, at + size)
+        frame = parse(data, at, at + size)
         if isinstance(frame, DropReason) or frame.verified:
             return frame
         # without a checksum a frame is believed only if it fills the space between two others
@@ -137,7 +137,7 @@ def _next_magic(data: bytes, at: int) -> int:
     return min(candidates, default=len(data))
 
 
-def _frame_size(data: bytes, at: int) -> int | None:
+def frame_size(data: bytes, at: int) -> int | None:
     """Length announced by the header at `at`; None while the header itself is unfinished."""
     if at + 3 > len(data):
         return None
@@ -147,7 +147,8 @@ def _frame_size(data: bytes, at: int) -> int | None:
     return _HEADER_BYTES_V2 + data[at + 1] + _CRC_BYTES + signature
 
 
-def _parse(data: bytes, at: int, end: int) -> Frame | DropReason:
+def parse(data: bytes, at: int, end: int) -> Frame | DropReason:
+    """The frame of `frame_size` bytes in data[at:end], or what is wrong with it."""
     if data[at] == _V1:
         _, length, sequence, system, component, message_id = data[at : at + _HEADER_BYTES_V1]
         payload_at = at + _HEADER_BYTES_V1
