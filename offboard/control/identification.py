@@ -1,7 +1,7 @@
 """One vehicle's constants from a stretch of its flight, each with its uncertainty or a refusal.
 
-`identify` is a pure function of a `Trace`; it takes some milliseconds for ten seconds of flight, so
-that it can be called between two ticks. What the flight does not support is not guessed: the value
+`identify` is a pure function of a `Trace`, and `stages` the same in pieces of some milliseconds, so
+that one can be done between two ticks. What the flight does not support is not guessed: the value
 stays None and a sentence says why. A hover without noise shows no attitude loop, drag needs motion,
 thrust lag a thrust that varies. Knows no clock, no file and no MAVLink.
 """
@@ -9,32 +9,32 @@ thrust lag a thrust that varies. Knows no clock, no file and no MAVLink.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.motion_fit import DRAG_UPPER, Motion, VerticalFit, fit_drag, fit_vertical
-from offboard.control.response_fit import (
-    LOWER,
-    UPPER,
-    Estimate,
-    ResponseFit,
-    commanded_rms,
-    fit_response,
+from offboard.control.estimator_noise import SLOWNESS_S, EstimatorNoise, noise_of
+from offboard.control.motion_fit import (
+    DRAG_UPPER,
+    Motion,
+    VerticalFit,
+    VerticalPrior,
+    fit_drag,
+    fit_vertical,
 )
+from offboard.control.response_fit import Estimate, ResponseFit, commanded_rms, fit_response
+from offboard.control.response_search import LOWER, UPPER
 from offboard.control.trace import (
     COURSE,
     NORTH,
-    POSITION,
     SENT_AT,
     SENT_COURSE,
     SENT_NORTH,
     STAMP,
     Trace,
 )
-from offboard.control.trace import VELOCITY as REPORTED_VELOCITY
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 __all__ = [
@@ -44,6 +44,7 @@ __all__ = [
     "ResponseFit",
     "identify",
     "identify_drag",
+    "stages",
     "warm_up",
 ]
 
@@ -53,23 +54,13 @@ Array = NDArray[np.float64]
 TILT_MOVED_RAD, COURSE_MOVED_RAD = 0.004, 0.008
 SPEED_MPS, THRUST_MOVED = 0.4, 0.015
 # Greatest standard deviation that is still an answer.
-TILT_SDS, YAW_SDS = (0.02, 0.1, 0.15), (0.04, 0.15, 0.2)  # delay s, frequency relative, damping
-DRAG_SD_PS, HOVER_SD, EFFECT_SD_S = 0.2, 0.02, 0.015
+TILT_SDS, YAW_SDS = (0.01, 0.15, 0.15), (0.04, 0.15, 0.2)  # delay s, frequency relative, damping
+DRAG_SD_PS, HOVER_SD, EFFECT_SD_S = 0.2, 0.02, 0.03
 EXPLAINED = 0.6  # least share of the commanded motion that the response must account for
 DRAG_BEFOREHAND = Estimate(0.6, 0.4)
-SLOWNESS_S = 0.5  # over which a velocity is judged
-
-
-@dataclass(frozen=True, slots=True)
-class EstimatorNoise:
-    """Standard deviations: from sample to sample of position (m), reported velocity (m/s) and
-    thrust direction (rad); and the part of the reported velocity that is not the derivative of the
-    reported position, as means over half a second."""
-
-    position_m: float
-    velocity_mps: float
-    attitude_rad: float
-    velocity_contradiction_mps: float
+# A link adds the same to all delays. How far the rest of them, relative to the tilt's, and the
+# thrust's lag are from the vehicle file's, s; and the link itself while the tilt is not known.
+YAW_DELAY_SD_S, THRUST_DELAY_SD_S, THRUST_LAG_SD_S, LINK_SD_S = 0.1, 0.03, 0.05, 0.15
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,8 +109,19 @@ class Identified:
 
 
 def identify(trace: Trace, vehicle: Vehicle) -> Identified:
-    """Everything that `trace` supports. `vehicle` gives gravity and where a search begins; nothing
-    of it comes back as identified. Never raises for what a flight may hold."""
+    """Everything that `trace` supports. `vehicle` gives gravity, where a search begins, and how
+    the delays of its axes differ. Never raises for what a flight may hold."""
+    work = stages(trace, vehicle)
+    while True:
+        try:
+            next(work)
+        except StopIteration as done:
+            found: Identified = done.value
+            return found
+
+
+def stages(trace: Trace, vehicle: Vehicle) -> Generator[None, None, Identified]:
+    """`identify`, a piece at each step."""
     refusals: dict[str, str] = {}
     seconds = trace.end_s - trace.begin_s
     if not seconds >= 2.0:
@@ -127,20 +129,31 @@ def identify(trace: Trace, vehicle: Vehicle) -> Identified:
         names = ("tilt", "yaw", "hover_thrust", "thrust_lag_s", "drag_ps", "noise")
         return Identified(0.0, refusals=dict.fromkeys(names, said))
     tilt = _tilt(trace, refusals)
-    yaw = _yaw(trace, refusals)
+    yield
+    link = _link(tilt, vehicle)
+    yaw = _yaw(trace, _shifted(vehicle.yaw.delay_s, YAW_DELAY_SD_S, link), refusals)
+    yield
     motion = Motion(trace)
     if not motion.usable:
         said = f"{len(motion.times)} positions and {len(trace.commands)} commands are too few"
         refusals |= dict.fromkeys(("hover_thrust", "thrust_lag_s", "drag_ps"), said)
         return Identified(seconds, tilt, yaw, refusals=refusals)
-    vertical = fit_vertical(motion, vehicle.gravity_mps2, DRAG_BEFOREHAND, vehicle.hover_thrust)
+    prior = VerticalPrior(
+        vehicle.hover_thrust,
+        _shifted(vehicle.thrust_delay_s, THRUST_DELAY_SD_S, link),
+        Estimate(vehicle.thrust_lag_s, THRUST_LAG_SD_S),
+        DRAG_BEFOREHAND,
+    )
+    vertical = fit_vertical(motion, vehicle.gravity_mps2, prior)
+    yield
     thrust = motion.thrust(vertical.thrust_delay_s.value, vertical.thrust_lag_s.value)
     thrust_mps2 = vehicle.gravity_mps2 / vertical.hover_thrust.value * thrust
     drag = _drag(motion, thrust_mps2, refusals)
     if drag is not None:
-        beforehand = Estimate(drag.value, max(drag.sd, 0.2 * drag.value, 0.05))
-        hover = vertical.hover_thrust.value
-        vertical = fit_vertical(motion, vehicle.gravity_mps2, beforehand, hover)
+        yield
+        drag_ps = Estimate(drag.value, max(drag.sd, 0.2 * drag.value, 0.05))
+        prior = replace(prior, hover_thrust=vertical.hover_thrust.value, drag_ps=drag_ps)
+        vertical = fit_vertical(motion, vehicle.gravity_mps2, prior)
     hover_thrust, lag_s, delay_s = _vertical(motion, vertical, refusals)
     return Identified(
         seconds=seconds,
@@ -150,9 +163,20 @@ def identify(trace: Trace, vehicle: Vehicle) -> Identified:
         thrust_lag_s=lag_s,
         thrust_delay_s=delay_s,
         drag_ps=drag,
-        noise=_noise(trace),
+        noise=noise_of(trace),
         refusals=refusals,
     )
+
+
+def _link(tilt: ResponseFit | None, vehicle: Vehicle) -> Estimate:
+    """What is added to the delays of the vehicle file, by the tilt's account."""
+    if tilt is None:
+        return Estimate(0.0, LINK_SD_S)
+    return Estimate(tilt.delay_s.value - vehicle.tilt.delay_s, tilt.delay_s.sd)
+
+
+def _shifted(delay_s: float, own_sd_s: float, link: Estimate) -> Estimate:
+    return Estimate(max(delay_s + link.value, 0.0), math.hypot(own_sd_s, link.sd))
 
 
 def identify_drag(trace: Trace, vehicle: Vehicle) -> Identified:
@@ -188,20 +212,22 @@ def _tilt(trace: Trace, refusals: dict[str, str]) -> ResponseFit | None:
     return _response(trace, _Axis("tilt", TILT_MOVED_RAD, TILT_SDS), signals, commands, refusals)
 
 
-def _yaw(trace: Trace, refusals: dict[str, str]) -> ResponseFit | None:
+def _yaw(trace: Trace, delay: Estimate, refusals: dict[str, str]) -> ResponseFit | None:
     signals = np.unwrap(trace.attitude[:, COURSE])[:, None]
     commands = np.unwrap(trace.commands[:, SENT_COURSE])[:, None]
-    axis = _Axis("yaw", COURSE_MOVED_RAD, YAW_SDS)
+    axis = _Axis("yaw", COURSE_MOVED_RAD, YAW_SDS, delay)
     return _response(trace, axis, signals, commands, refusals)
 
 
 @dataclass(frozen=True, slots=True)
 class _Axis:
-    """What is asked of the fit of one axis: least motion, greatest uncertainties."""
+    """What is asked of the fit of one axis: least motion, greatest uncertainties; and its delay as
+    known beforehand."""
 
     name: str
     moved_rad: float
     sds: tuple[float, float, float]
+    delay: Estimate | None = None
 
 
 def _response(
@@ -218,7 +244,7 @@ def _response(
             f"{1e3 * axis.moved_rad:.0f} are needed: fly steps"
         )
         return None
-    fit = fit_response(times, signals, sent_at, commands)
+    fit = fit_response(times, signals, sent_at, commands, axis.delay)
     if (refusal := _refusal(fit, axis.sds)) is not None:
         refusals[axis.name] = refusal
         return None
@@ -304,49 +330,3 @@ def _speed_rms(motion: Motion) -> float:
         for along in motion.positions[:2]
     ]
     return float(np.sqrt(np.mean(np.sum(np.square(moved), axis=0)))) / SLOWNESS_S
-
-
-def _noise(trace: Trace) -> EstimatorNoise:
-    velocity = trace.position[:, REPORTED_VELOCITY]
-    return EstimatorNoise(
-        position_m=_white_sd(trace.position[:, STAMP], trace.position[:, POSITION]),
-        velocity_mps=_white_sd(trace.position[:, STAMP], velocity),
-        attitude_rad=_white_sd(trace.attitude[:, STAMP], trace.attitude[:, NORTH : NORTH + 2]),
-        velocity_contradiction_mps=_contradiction(trace),
-    )
-
-
-def _white_sd(stamps: Array, signals: Array) -> float:
-    """What differs from sample to sample, (N, axes): each against the cubic through its two
-    neighbours on either side, which any motion follows; median, so that jumps do not count."""
-    if len(signals) < 10:
-        return math.nan
-    away = np.stack([stamps[i : len(stamps) - 4 + i] - stamps[2:-2] for i in (0, 1, 3, 4)])
-    weights = np.ones_like(away)
-    for i in range(4):
-        for j in range(4):
-            if i != j:
-                weights[i] *= away[j] / (away[j] - away[i])
-    around = np.stack([signals[i : len(signals) - 4 + i] for i in (0, 1, 3, 4)])
-    surprise = signals[2:-2] - np.einsum("kn,kna->na", weights, around)
-    white = surprise / np.sqrt(1.0 + np.sum(weights**2, axis=0))[:, None]
-    return float(np.median(np.abs(white))) / 0.6745  # of a normal distribution
-
-
-def _contradiction(trace: Trace) -> float:
-    """Mean reported velocity less the mean velocity of the reported position, over SLOWNESS_S."""
-    stamps = trace.position[:, STAMP]
-    starts = np.arange(stamps[0], stamps[-1] - SLOWNESS_S, SLOWNESS_S)
-    if len(starts) < 2:
-        return math.nan
-    differences = []
-    for axis in range(3):
-        position, velocity = trace.position[:, 1 + axis], trace.position[:, 4 + axis]
-        travelled = np.concatenate(
-            ([0.0], np.cumsum(0.5 * (velocity[1:] + velocity[:-1]) * np.diff(stamps)))
-        )
-        gap = travelled - position
-        differences.append(
-            np.interp(starts + SLOWNESS_S, stamps, gap) - np.interp(starts, stamps, gap)
-        )
-    return float(np.std(differences) / SLOWNESS_S)

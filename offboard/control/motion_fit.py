@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from offboard.control.response_fit import Estimate
+from offboard.control.response_fit import Estimate, thinned
 from offboard.control.trace import (
     NORTH,
     POSITION,
@@ -39,10 +39,12 @@ POSITION_SD_M = 0.001
 START_SPEED_SD_MPS, START_DISTURBANCE_SD_MPS2 = 3.0, 0.5
 # Innovations of a wandering estimator stay related for this long.
 RELATED_S = 2.0
-STEPS_S = 0.0075  # closer positions are thinned: nothing is learnt from them
+STEPS_S = 0.018  # closer positions are thinned: nothing is learnt from them
 
 DRAG_START, DRAG_UPPER = 0.6, 5.0
-LAG_UPPER_S, THRUST_DELAY_UPPER_S = 0.4, 0.3
+# Least values to search from: without a lag thrust jumps between samples and has no slope.
+SEARCHED_FROM = (0.005, 0.03, 0.01)
+LAG_UPPER_S, THRUST_DELAY_UPPER_S = 0.4, 0.5
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,7 +144,7 @@ class Motion:
     """Positions of a trace with the attitude at their times, thinned to what is worth having."""
 
     def __init__(self, trace: Trace) -> None:
-        rows = trace.position[_thinned(trace.position[:, STAMP])]
+        rows = trace.position[thinned(trace.position[:, STAMP], STEPS_S)]
         inside = (rows[:, STAMP] >= trace.begin_s) & (rows[:, STAMP] <= trace.end_s)
         rows = rows[inside]
         self.times = np.ascontiguousarray(rows[:, STAMP])
@@ -158,6 +160,11 @@ class Motion:
     def thrust(self, delay_s: float, lag_s: float) -> Array:
         """Thrust (N,) as a fraction of full throttle."""
         return np.asarray(lagged_thrust(self.times, self._sent_at, self._thrust, delay_s, lag_s))
+
+    @property
+    def spacing_s(self) -> float:
+        """Mean time from one position to the next."""
+        return float(self.times[-1] - self.times[0]) / (len(self.times) - 1)
 
     @property
     def usable(self) -> bool:
@@ -193,52 +200,78 @@ def fit_drag(motion: Motion, thrust_mps2: Array) -> Estimate:
     if slope <= 0.0:
         return Estimate(float(result.x[0]), math.inf)
     count = len(motion.times) - 1
-    lags = round(RELATED_S * count / (motion.times[-1] - motion.times[0]))
-    score = (result.jac[:, 0] * result.fun).reshape(2, count)
-    variance = sum(_long_run(row, min(lags, count // 4)) for row in score)
+    lags = min(round(RELATED_S / motion.spacing_s), count // 4)
+    score = (result.jac[:, 0] * result.fun).reshape(2, count, 1)
+    variance = sum(float(_long_run(rows, lags)[0, 0]) for rows in score)
     return Estimate(float(result.x[0]), math.sqrt(max(variance, 0.0)) / slope)
 
 
-def fit_vertical(
-    motion: Motion, gravity_mps2: float, drag: Estimate, hover_thrust: float
-) -> VerticalFit:
-    """Hover thrust, lag and delay of the thrust, with `drag` as known beforehand and a search that
-    begins at `hover_thrust`."""
+@dataclass(frozen=True, slots=True)
+class VerticalPrior:
+    """What is known of the vertical beforehand: where the search for the hover thrust begins, and
+    the rest with its uncertainty."""
+
+    hover_thrust: float
+    delay_s: Estimate
+    lag_s: Estimate
+    drag_ps: Estimate
+
+
+def fit_vertical(motion: Motion, gravity_mps2: float, prior: VerticalPrior) -> VerticalFit:
+    """Hover thrust, lag and delay of the thrust."""
     densities = np.array([POSITION_DENSITY, ACCELERATION_DENSITY, VERTICAL_DRIFT])
     starts = np.array([START_SPEED_SD_MPS, 1e-3])
+    known = (prior.delay_s, prior.lag_s, prior.drag_ps)
 
     def surprises(parameters: Array) -> Array:
-        inverse, effect_s, share, drag_ps = parameters
-        thrust = motion.thrust(effect_s * share, effect_s * (1.0 - share))
+        inverse, delay_s, lag_s, drag_ps = parameters
+        thrust = motion.thrust(delay_s, lag_s)
         pull = gravity_mps2 * (1.0 - inverse * thrust * motion.upright)
-        missed = innovations(
+        return innovations(
             motion.times, motion.positions[2], pull, drag_ps, densities, POSITION_SD_M, starts
         )
-        return np.concatenate(
-            (missed, [(drag_ps - drag.value) / drag.sd, (effect_s - 0.05) / 0.1, share - 0.3])
-        )
 
+    upper = np.array((50.0, THRUST_DELAY_UPPER_S, LAG_UPPER_S, DRAG_UPPER))
+    start = np.clip(
+        [1.0 / prior.hover_thrust, *(each.value for each in known)],
+        (1.01, *SEARCHED_FROM),
+        upper - 1e-3,
+    )
+    # What is known weighs as much as the innovations really are
+    scale = min(float(np.sqrt(np.mean(surprises(start) ** 2))), 1.0)
+    means, sds = (np.array([getattr(each, name) for each in known]) for name in ("value", "sd"))
     result = least_squares(
-        surprises,
-        [1.0 / hover_thrust, 0.05, 0.3, min(max(drag.value, 0.01), DRAG_UPPER - 0.01)],
-        bounds=([1.0, 0.0, 0.0, 0.0], [50.0, LAG_UPPER_S, 1.0, DRAG_UPPER]),
-        x_scale=(1.0, 0.03, 0.5, 0.3),
+        lambda x: np.concatenate((surprises(x), scale * (x[1:] - means) / sds)),
+        start,
+        bounds=((1.0, 0.0, 0.0, 0.0), upper),
+        x_scale=(1.0, 0.03, 0.03, 0.3),
         xtol=1e-4,
-        ftol=1e-8,
-        max_nfev=30,
+        ftol=1e-6,
+        max_nfev=12,
     )
-    inverse, effect_s, share, drag_ps = result.x
-    scale = max(float(np.mean(result.fun**2)), 0.0)
-    sds = np.sqrt(np.maximum(np.diag(np.linalg.pinv(result.jac.T @ result.jac)), 0.0))
-    sds *= math.sqrt(max(scale, 0.05))
-    spread = math.hypot(sds[1], effect_s * sds[2])
+    inverse, delay_s, lag_s, drag_ps = result.x
+    covariance = _covariance(result.jac, result.fun, motion.spacing_s, len(known))
+    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    effect_sd = math.sqrt(max(float(np.sum(covariance[1:3, 1:3])), 0.0))
     return VerticalFit(
-        hover_thrust=Estimate(1.0 / inverse, float(sds[0] / inverse**2)),
-        thrust_lag_s=Estimate(effect_s * (1.0 - share), spread),
-        thrust_delay_s=Estimate(effect_s * share, spread),
-        thrust_effect_s=Estimate(effect_s, float(sds[1])),
-        drag_ps=Estimate(drag_ps, float(sds[3])),
+        hover_thrust=Estimate(1.0 / inverse, float(spread[0] / inverse**2)),
+        thrust_lag_s=Estimate(lag_s, float(spread[2])),
+        thrust_delay_s=Estimate(delay_s, float(spread[1])),
+        thrust_effect_s=Estimate(delay_s + lag_s, effect_sd),
+        drag_ps=Estimate(drag_ps, float(spread[3])),
     )
+
+
+def _covariance(jacobian: Array, residual: Array, spacing_s: float, known: int) -> Array:
+    """Of least squares on innovations that stay related for RELATED_S, the last `known` rows being
+    what was known beforehand."""
+    rows = len(residual) - known
+    score = jacobian[:rows] * residual[:rows, None]
+    lags = min(round(RELATED_S / spacing_s), rows // 4)
+    meat = _long_run(score, lags) + jacobian[rows:].T @ jacobian[rows:]
+    bread = np.linalg.pinv(jacobian.T @ jacobian)
+    covariance: Array = bread @ meat @ bread
+    return covariance
 
 
 def specific_velocity(motion: Motion, vehicle: Vehicle) -> Array:
@@ -260,20 +293,10 @@ def specific_velocity(motion: Motion, vehicle: Vehicle) -> Array:
     return velocity
 
 
-def _long_run(score: Array, lags: int) -> float:
-    """Variance of the sum of a related series (W. Newey and K. West, 1987)."""
-    total = float(score @ score)
+def _long_run(score: Array, lags: int) -> Array:
+    """Covariance (k, k) of the sum of a related series (N, k) (W. Newey and K. West, 1987)."""
+    total: Array = score.T @ score
     for lag in range(1, lags + 1):
-        total += 2.0 * (1.0 - lag / (lags + 1.0)) * float(score[lag:] @ score[:-lag])
+        related = score[lag:].T @ score[:-lag]
+        total += (1.0 - lag / (lags + 1.0)) * (related + related.T)
     return total
-
-
-def _thinned(stamps: Array) -> NDArray[np.intp]:
-    """Rows at least STEPS_S apart."""
-    kept: list[int] = []
-    last = -math.inf
-    for row, stamp in enumerate(stamps):
-        if stamp - last >= STEPS_S:
-            kept.append(row)
-            last = stamp
-    return np.array(kept, dtype=np.intp)

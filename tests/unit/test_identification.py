@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 from offboard.control.identification import Identified, identify
 from offboard.control.motion_fit import innovations, lagged_thrust
-from offboard.control.response_fit import fit_response, predicted
+from offboard.control.response_fit import Estimate, fit_response, predicted
 from offboard.control.trace import Recorder, Trace, clean
 from offboard.model.vehicle import AxisResponse, Vehicle
 
@@ -118,6 +118,43 @@ def test_uncertainty_is_what_repetition_shows():
     rms = np.sqrt(np.mean(np.square(shares), axis=0))
     assert np.all(rms > 0.5)
     assert np.all(rms < 1.8)
+
+
+def test_lost_commands_mislead_no_fit():
+    """One command in twelve never acts, which nobody tells: the fit is right by its own account."""
+    shares, errors_s = [], []
+    times = np.arange(0.3, 7.9, 0.02)
+    for seed in range(30):
+        sent_at, values = steps(seed, count=80)
+        generator = np.random.default_rng(seed)
+        acts = generator.random(80) > 1 / 12
+        acts[0] = True
+        signals = answered(values[acts], sent_at[acts], 0.15, 11.0, 0.6, times)
+        signals += 0.001 * generator.normal(size=len(times))
+        fit = fit_response(times, signals[:, None], sent_at, values[:, None])
+        shares.append((fit.delay_s.value - 0.15) / fit.delay_s.sd)
+        errors_s.append(fit.delay_s.value - 0.15)
+    assert np.max(np.abs(errors_s)) < 0.015
+    assert np.max(np.abs(shares)) < 3.5
+    assert 0.3 < np.sqrt(np.mean(np.square(shares))) < 1.5
+
+
+def test_delay_known_beforehand_counts_by_its_uncertainty():
+    """A vague word changes nothing, a sure one decides and takes what depends on it along."""
+    sent_at, values = steps(5)
+    times = np.arange(0.3, 5.9, 0.01)
+    noise = 0.004 * np.random.default_rng(1).normal(size=len(times))
+    signals = (answered(values, sent_at, 0.123, 7.0, 1.2, times) + noise)[:, None]
+    alone, vague, sure = (
+        fit_response(times, signals, sent_at, values[:, None], delay)
+        for delay in (None, Estimate(0.3, 10.0), Estimate(0.123, 1e-5))
+    )
+    assert vague.delay_s.value == pytest.approx(alone.delay_s.value, abs=1e-6)
+    assert vague.delay_s.sd == pytest.approx(alone.delay_s.sd, rel=1e-3)
+    assert sure.delay_s.value == pytest.approx(0.123, abs=1e-4)
+    assert sure.delay_s.sd < 1e-4
+    wrong = [abs(each.natural_frequency_radps.value - 7.0) for each in (alone, sure)]
+    assert wrong[1] < 0.7 * wrong[0]
 
 
 def test_lagged_thrust_is_that_of_scipy():
