@@ -18,17 +18,17 @@ from offboard.control.mpc import MpcLaw, MpcSettings
 from offboard.control.paper import PaperController
 from offboard.control.paper_law import PaperSettings
 from offboard.control.pid import PidLaw, PidSettings
-from offboard.control.tracking import Search, TrackingLaw, TrackingSettings
+from offboard.control.tracking import OneDecisionSettings, Search, TrackingLaw
 from offboard.model.vehicle import Parameters, Vehicle
 
 
-class Pso(TrackingSettings):
+class Pso(OneDecisionSettings):
     """Cost-to-go over one held input, searched by the swarm."""
 
     law: Literal["pso"]
 
 
-class Lqr(TrackingSettings):
+class Lqr(OneDecisionSettings):
     """The exact minimiser of the same cost."""
 
     law: Literal["lqr"]
@@ -105,9 +105,10 @@ def build(
     settings = config.model_copy(update={"seed": seed, "period_s": period_s})
     match settings:
         case Pso():
-            return TrackingLaw(vehicle, settings, Search.SWARM, stopwatch)
+            return TrackingLaw(vehicle, settings, Search.SWARM, stopwatch, settings.feedforward)
         case Lqr():
-            return TrackingLaw(vehicle, settings, Search.CLOSED_FORM, stopwatch)
+            share = settings.feedforward
+            return TrackingLaw(vehicle, settings, Search.CLOSED_FORM, stopwatch, share)
         case Mpc():
             return MpcLaw(vehicle, settings, stopwatch)
         case Horizon() | Mppi() | Cem():

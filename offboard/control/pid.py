@@ -16,19 +16,13 @@ from pydantic import Field
 from offboard.control.base import Certificate, Situation
 from offboard.control.certificate import at_bound
 from offboard.control.cost import BoxQuadratic
-from offboard.control.tracking import (
-    Search,
-    Target,
-    TrackingLaw,
-    TrackingSettings,
-    errors,
-)
+from offboard.control.tracking import OneDecisionSettings, Search, Target, TrackingLaw, errors
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
 
-class PidSettings(TrackingSettings):
+class PidSettings(OneDecisionSettings):
     """Gains of the two cascades. `position_gain_ps` turns metres into m/s, `velocity_gain_ps` m/s
     into m/s^2, `integral_gain_ps3` metre seconds into m/s^2; `integral_limit_mps2` bounds the
     integral's part. The defaults are the best of a grid on the PX4-like vehicle. `bandwidth_radps`
@@ -55,7 +49,8 @@ class PidLaw(TrackingLaw):
     ) -> None:
         self._gains = settings or PidSettings()
         self._integral = np.zeros(3)
-        super().__init__(vehicle, self._gains, Search.CLOSED_FORM, stopwatch)
+        feedforward = self._gains.feedforward
+        super().__init__(vehicle, self._gains, Search.CLOSED_FORM, stopwatch, feedforward)
 
     def answer(
         self,

@@ -12,10 +12,11 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from enum import StrEnum
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
 from offboard.control.base import (
     Certificate,
@@ -74,6 +75,19 @@ class TrackingSettings(Parameters):
     seed: int = Field(default=0, ge=0, lt=2**64)
 
 
+def _share(value: object) -> object:
+    return float(value) if isinstance(value, bool) else value
+
+
+class OneDecisionSettings(TrackingSettings):
+    """Of laws that see the reference at one moment only. `feedforward`, a share or false and true,
+    is how much of the reference's own motion (acceleration, drag and what follows) is asked of
+    attitude and thrust before any error shows; the disturbance is answered in full either way.
+    """
+
+    feedforward: Annotated[float, BeforeValidator(_share), Field(ge=0, le=1)] = 1.0
+
+
 @dataclass(frozen=True, slots=True)
 class Target:
     """What the reference asks when the command acts, NED, SI, the ripple of held commands included.
@@ -98,7 +112,8 @@ class Target:
 
 class TrackingLaw:
     """The controllers `pso` and `lqr`. `stopwatch` () -> s lets the swarm keep a deadline and
-    report its time; without one it takes all its iterations."""
+    report its time; without one it takes all its iterations. `feedforward`: see
+    `OneDecisionSettings`."""
 
     def __init__(
         self,
@@ -106,8 +121,10 @@ class TrackingLaw:
         settings: TrackingSettings | None = None,
         search: Search = Search.SWARM,
         stopwatch: Callable[[], float] | None = None,
+        feedforward: float = 1.0,
     ) -> None:
         self._settings = settings or TrackingSettings()
+        self._feedforward = feedforward
         self._search = search
         self._stopwatch = stopwatch
         self._file = vehicle
@@ -179,7 +196,10 @@ class TrackingLaw:
         times = [state.time_s, state.time_s + half_s, heave_s, heave_s + half_s, course_s]
         sample = reference.sample(np.array(times))
         flat = flat_state(
-            sample, vehicle.gravity_mps2, vehicle.drag_per_mass_ps, state.disturbance_ned_mps2
+            _eased(sample, self._feedforward),
+            vehicle.gravity_mps2,
+            vehicle.drag_per_mass_ps,
+            state.disturbance_ned_mps2,
         )
         b, b1 = flat.thrust_direction_ned, flat.thrust_direction_rate_ned_ps
         b2 = flat.thrust_direction_acceleration_ned_ps2
@@ -258,6 +278,19 @@ class TrackingLaw:
         if stopwatch is None or deadline_s is None:
             return None
         return lambda: deadline_s - (stopwatch() - started)
+
+
+def _eased(sample: FlatSample, share: float) -> FlatSample:
+    """The sample as if it moved by this share of its motion."""
+    if share == 1.0:
+        return sample
+    return replace(
+        sample,
+        velocity_ned_mps=share * sample.velocity_ned_mps,
+        acceleration_ned_mps2=share * sample.acceleration_ned_mps2,
+        jerk_ned_mps3=share * sample.jerk_ned_mps3,
+        snap_ned_mps4=share * sample.snap_ned_mps4,
+    )
 
 
 class _Rest:

@@ -39,12 +39,6 @@ def test_default_flight(scenario: str, seed: int, most_m: float, tmp_path: Path)
     assert not pair.instance.autopilot.armed
 
 
-def test_raw_velocity_shows_what_the_estimator_does(tmp_path: Path) -> None:
-    pair = make("observer.velocity=reported", scenario="px4_like")
-    pair.fly()
-    assert pair.score(tmp_path).rmse_position_m > 0.1
-
-
 def test_paper_law_flies_and_lands(tmp_path: Path) -> None:
     pair = make(name="paper", scenario="px4_like")
     assert pair.fly().exit_code == 0
