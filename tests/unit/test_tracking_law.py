@@ -131,28 +131,26 @@ def test_lead_inverts_the_second_order_response() -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
 def test_feed_forward_is_of_a_share_of_the_motion(share: float) -> None:
-    """f = g e3 - share (a + c v) + d, its direction led through the attitude response; the place
-    to be and the course stay the reference's."""
+    """What is fed forward is that of half the path, flown in the same time; the place to be and
+    the course stay the reference's."""
     reference, state = Lemniscate(8.0), state_of(np.random.default_rng(3), Lemniscate(8.0), 0.3)
-    settings = TrackingSettings()
-    law = TrackingLaw(PX4, settings, Search.CLOSED_FORM, feedforward=share)
-    target, whole = law.target(reference, 5.0, state), law_of().target(reference, 5.0, state)
 
-    def direction(time_s: float) -> np.ndarray:
-        at = reference.sample(time_s)
-        pull = at.acceleration_ned_mps2 + PX4.drag_per_mass_ps * at.velocity_ned_mps
-        f = np.array([0.0, 0.0, G]) - share * pull + state.disturbance_ned_mps2
-        return f / np.linalg.norm(f)
+    class Smaller:
+        duration_s = reference.duration_s
 
-    h, half = 1e-3, state.time_s + 0.05
-    before, now, after = (direction(half + step) for step in (-h, 0.0, h))
-    led = now + 2 * 0.56 / 11.4 * (after - before) / (2 * h)
-    led += (after - 2 * now + before) / (11.4 * h) ** 2
-    assert target.tilt_feedforward == pytest.approx(led[:2], abs=1e-5)
-    assert target.direction_ne == pytest.approx(direction(state.time_s)[:2], abs=1e-12)
-    assert np.all(target.position_ne_m == whole.position_ne_m)
-    assert np.all(target.velocity_ne_mps == whole.velocity_ne_mps)
-    assert target.course_feedforward_rad == whole.course_feedforward_rad
+        def sample(self, time_s: np.ndarray) -> FlatSample:
+            whole = reference.sample(time_s)
+            moved = {name: share * getattr(whole, name) for name in FlatSample.__slots__[:5]}
+            return replace(whole, **moved)
+
+    law = TrackingLaw(PX4, TrackingSettings(), Search.CLOSED_FORM, feedforward=share)
+    target, small = law.target(reference, 5.0, state), law_of().target(Smaller(), 5.0, state)
+    for name in ("tilt_feedforward", "direction_ne", "direction_rate_ne_ps"):
+        assert getattr(target, name) == pytest.approx(getattr(small, name), abs=1e-12)
+    assert target.thrust_down_feedforward_mps2 == small.thrust_down_feedforward_mps2
+    sample = reference.sample(state.time_s)
+    assert target.position_ne_m == pytest.approx(sample.position_ned_m[:2])
+    assert target.velocity_ne_mps == pytest.approx(sample.velocity_ned_mps[:2])
 
 
 def test_unconstrained_minimiser_is_the_lqr_law() -> None:
