@@ -4,7 +4,8 @@ Covariances are propagated for the actual interval between messages, so no sampl
 assumed. Axes with the same model share one covariance (both lateral axes do): `places` (m, n)
 tells for each of m axes where its n filter states stand in the observer's state vector. Their
 order is position, velocity, ..., bias of the reported velocity, or b and b', or psi and psi'.
-Arrays are changed in place. Nothing here knows messages, settings or the motion itself.
+Arrays are changed in place. Nothing here knows messages, settings or the motion itself. Loops over
+single numbers throughout: array expressions of so few compile for seconds.
 """
 
 from __future__ import annotations
@@ -22,10 +23,35 @@ GATE_SDS = 3.0
 
 
 @numba.njit(cache=True)
-def _transition(scaled: Array) -> Array:
-    """exp of a small matrix to fourth order."""
-    square = scaled @ scaled
-    return np.eye(len(scaled)) + scaled + 0.5 * square + square @ (scaled / 6.0 + square / 24.0)
+def _product(left: Array, right: Array) -> Array:
+    """left @ right, both (n, n): small matrices, and a tenth of the time to compile."""
+    size = len(left)
+    out = np.empty((size, size))
+    for i in range(size):
+        for j in range(size):
+            total = 0.0
+            for k in range(size):
+                total += left[i, k] * right[k, j]
+            out[i, j] = total
+    return out
+
+
+@numba.njit(cache=True)
+def _transition(dynamics: Array, interval_s: float) -> Array:
+    """exp(dynamics interval_s), (n, n), to fourth order."""
+    size = len(dynamics)
+    scaled = np.empty((size, size))
+    for i in range(size):
+        for j in range(size):
+            scaled[i, j] = interval_s * dynamics[i, j]
+    square = _product(scaled, scaled)
+    cube = _product(square, scaled)
+    fourth = _product(square, square)
+    for i in range(size):
+        for j in range(size):
+            scaled[i, j] += square[i, j] / 2.0 + cube[i, j] / 6.0 + fourth[i, j] / 24.0
+        scaled[i, i] += 1.0
+    return scaled
 
 
 @numba.njit(cache=True)
@@ -40,22 +66,61 @@ def spread(
     if steps <= 0:
         return
     h = interval_s / steps
-    half = _transition(dynamics * (0.5 * h))
-    transition = half @ half
-    density = np.diag(densities * densities)
-    noise = density + 4.0 * (half @ density @ half.T) + transition @ density @ transition.T
-    noise *= h / 6.0  # Simpson's rule: exact for a chain of two integrators
+    half = _transition(dynamics, 0.5 * h)
+    transition = _product(half, half)
+    noise = _noise(half, transition, densities, h)
+    size = len(covariance)
     for _ in range(steps):
-        covariance[:] = transition @ covariance @ transition.T + noise
+        moved = _product(transition, covariance)
+        for i in range(size):
+            for j in range(size):
+                total = noise[i, j]
+                for k in range(size):
+                    total += moved[i, k] * transition[j, k]
+                covariance[i, j] = total
+
+
+@numba.njit(cache=True)
+def _noise(half: Array, transition: Array, densities: Array, interval_s: float) -> Array:
+    """What the densities add to a covariance, by Simpson's rule: exact for a chain of two
+    integrators."""
+    size = len(half)
+    noise = np.empty((size, size))
+    for i in range(size):
+        for j in range(size):
+            total = densities[i] ** 2 if i == j else 0.0
+            for k in range(size):
+                middle, end = half[i, k] * half[j, k], transition[i, k] * transition[j, k]
+                total += densities[k] ** 2 * (4.0 * middle + end)
+            noise[i, j] = total * interval_s / 6.0
+    return noise
+
+
+@numba.njit(cache=True)
+def _projected(covariance: Array, row: Array) -> Array:
+    """covariance (n, n) @ row (n,)."""
+    size = len(row)
+    out = np.empty(size)
+    for i in range(size):
+        total = 0.0
+        for k in range(size):
+            total += covariance[i, k] * row[k]
+        out[i] = total
+    return out
 
 
 @numba.njit(cache=True)
 def absorb(covariance: Array, row: Array, variance: float) -> Array:
     """Scalar measurement row @ x with the given variance: updates the covariance (n, n) and
     returns the gain (n,)."""
-    projected = covariance @ row
-    gain = projected / (row @ projected + variance)
+    projected = _projected(covariance, row)
     size = len(row)
+    total = variance
+    for i in range(size):
+        total += row[i] * projected[i]
+    gain = np.empty(size)
+    for i in range(size):
+        gain[i] = projected[i] / total
     for i in range(size):
         for j in range(i + 1):
             value = covariance[i, j] - 0.5 * (gain[i] * projected[j] + gain[j] * projected[i])
@@ -77,11 +142,14 @@ def correct(
 
 @numba.njit(cache=True)
 def _jumped(covariance: Array, row: Array, innovation: Array, sd: float, gate: float) -> bool:
-    deviation = math.sqrt(row @ (covariance @ row) + sd * sd)
+    projected = _projected(covariance, row)
+    variance = sd * sd
+    for i in range(len(row)):
+        variance += row[i] * projected[i]
     largest = 0.0
     for value in innovation:
         largest = max(largest, abs(value))
-    return largest > gate + GATE_SDS * deviation
+    return largest > gate + GATE_SDS * math.sqrt(variance)
 
 
 @numba.njit(cache=True)
@@ -103,8 +171,8 @@ def correct_position(
         return 0
     for k in range(len(places)):
         state[places[k, 0]] = measured[k]
-    covariance[0, :] = 0.0
-    covariance[:, 0] = 0.0
+    for i in range(len(covariance)):
+        covariance[0, i] = covariance[i, 0] = 0.0
     covariance[0, 0] = sd * sd
     return 1
 
@@ -127,7 +195,9 @@ def correct_velocity(
         return 0
     for k in range(len(places)):
         state[places[k, bias]] += innovation[k]
-    covariance[bias, :] = -covariance[1, :]
-    covariance[:, bias] = covariance[bias, :]
+    for i in range(len(covariance)):
+        covariance[bias, i] = -covariance[1, i]
+    for i in range(len(covariance)):
+        covariance[i, bias] = covariance[bias, i]
     covariance[bias, bias] = covariance[1, 1] + sd * sd
     return 1

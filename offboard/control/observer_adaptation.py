@@ -81,10 +81,11 @@ def relate(memory: Array, span_s: float, bounds: Array, density: Array) -> None:
 @numba.njit(cache=True)
 def _end_span(memory: Array, time_s: float) -> None:
     counts = memory[COUNTS]
-    memory[MEANS + 2] = memory[MEANS + 1]
-    memory[MEANS + 1] = memory[MEANS]
-    memory[MEANS] = memory[SUM] / counts[IN_SPAN]
-    memory[SUM] = 0.0
+    for i in range(6):
+        memory[MEANS + 2, i] = memory[MEANS + 1, i]
+        memory[MEANS + 1, i] = memory[MEANS, i]
+        memory[MEANS, i] = memory[SUM, i] / counts[IN_SPAN]
+        memory[SUM, i] = 0.0
     counts[IN_SPAN] = 0.0
     counts[BEGAN_S] = time_s
     counts[SPANS] += 1.0
@@ -107,9 +108,10 @@ def note(
         counts[BEGAN_S] = time_s
     elif counts[NEIGHBOURS] > 1.0:
         weigh(innovation, memory, time_s - counts[LAST_S], least, variance)
-    memory[CHANGE] = innovation - memory[RESIDUAL]
-    memory[RESIDUAL] = residual
-    memory[SUM] += innovation
+    for i in range(6):
+        memory[CHANGE, i] = innovation[i] - memory[RESIDUAL, i]
+        memory[RESIDUAL, i] = residual[i]
+        memory[SUM, i] += innovation[i]
     counts[IN_SPAN] += 1.0
     counts[NEIGHBOURS] += 1.0
     counts[LAST_S] = time_s

@@ -107,6 +107,14 @@ def _lagged(thrust: float, commanded: float, lag_s: float, step_s: float) -> flo
 
 
 @numba.njit(cache=True)
+def _moved(state: Array, h: float, rate: Array) -> Array:
+    out = np.empty(STATE_SIZE)
+    for i in range(STATE_SIZE):
+        out[i] = state[i] + h * rate[i]
+    return out
+
+
+@numba.njit(cache=True)
 def _step(
     state: Array, h: float, tilt_n: float, tilt_e: float, thrust: float, course: float, plant: Array
 ) -> None:
@@ -116,9 +124,9 @@ def _step(
     end = _lagged(state[THRUST], thrust, lag, h)
     start = state[THRUST] if lag > 0.0 else thrust
     k1 = _derivative(state, start, tilt_n, tilt_e, course, plant)
-    k2 = _derivative(state + 0.5 * h * k1, middle, tilt_n, tilt_e, course, plant)
-    k3 = _derivative(state + 0.5 * h * k2, middle, tilt_n, tilt_e, course, plant)
-    k4 = _derivative(state + h * k3, end, tilt_n, tilt_e, course, plant)
+    k2 = _derivative(_moved(state, 0.5 * h, k1), middle, tilt_n, tilt_e, course, plant)
+    k3 = _derivative(_moved(state, 0.5 * h, k2), middle, tilt_n, tilt_e, course, plant)
+    k4 = _derivative(_moved(state, h, k3), end, tilt_n, tilt_e, course, plant)
     for i in range(STATE_SIZE):
         state[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
     state[THRUST] = end
