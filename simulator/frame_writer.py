@@ -32,9 +32,9 @@ PAYLOAD_MAX = 256
 
 # What the writer reads of the vehicle: its estimate (`simulator.sensors`), the true attitude,
 # height and acceleration, and what is fixed: origin, degrees east per metre, home.
-TRUE_ATTITUDE = slice(REPORT_WIDTH, REPORT_WIDTH + 4)
+TRUE_ATTITUDE = REPORT_WIDTH  # and the next three
 TRUE_DOWN = REPORT_WIDTH + 4
-TRUE_ACCELERATION = slice(REPORT_WIDTH + 5, REPORT_WIDTH + 8)
+TRUE_ACCELERATION = REPORT_WIDTH + 5  # and the next two
 ORIGIN = slice(REPORT_WIDTH + 8, REPORT_WIDTH + 11)
 EAST_DEGREES_PER_M = REPORT_WIDTH + 11
 HOME_DOWN = REPORT_WIDTH + 12
@@ -46,6 +46,7 @@ _SIZES = np.array([28, 48, 28, 233, 28, 63], dtype=np.int64)
 _DEGREES_PER_M = math.degrees(1.0 / EARTH_RADIUS_M)
 _NAN_WORD = np.uint32(0x7FC00000)
 _ONE_DEGREE = 180.0 / math.pi
+_LIMIT_16, _LIMIT_32 = np.int64(1 << 15), np.int64(1 << 31)
 
 
 def _checksum_table() -> NDArray[np.uint16]:
@@ -60,11 +61,10 @@ _CHECKSUM = _checksum_table()
 
 
 @numba.njit(cache=True)
-def _fitted(value: float, bits: int) -> int:
-    """Nearest integer that a signed field holds; what is not finite becomes 0."""
+def _fitted(value: float, limit: int) -> int:
+    """Nearest integer that a signed field of -limit .. limit - 1 holds; 0 if not finite."""
     if value - value != 0.0:
         return 0
-    limit = 1 << (bits - 1)
     if value >= limit:
         return limit - 1
     return max(-limit, int(np.rint(value)))
@@ -77,9 +77,9 @@ def _yaw(seen: Array) -> float:
 
 
 @numba.njit(cache=True)
-def _put_floats(seen: Array, first: int, count: int, out: NDArray[np.float32], at: int) -> None:
-    for i in range(count):
-        out[at + i] = np.float32(seen[first + i])
+def _put_floats(seen: Array, out: NDArray[np.float32]) -> None:
+    for i in range(seen.shape[0]):
+        out[i] = np.float32(seen[i])
 
 
 @numba.njit(cache=True)
@@ -88,18 +88,19 @@ def _put_attitude(seen: Array, floats: NDArray[np.float32]) -> None:
     floats[1] = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     floats[2] = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
     floats[3] = _yaw(seen)
-    _put_floats(seen, 10, 3, floats, 4)
+    _put_floats(seen[10:13], floats[4:7])
 
 
 @numba.njit(cache=True)
 def _put_odometry(
     seen: Array, resets: int, floats: NDArray[np.float32], words: NDArray[np.uint32], octets: Bytes
 ) -> None:
-    _put_floats(seen, 0, 3, floats, 2)
-    _put_floats(seen, 6, 4, floats, 5)
-    _put_floats(seen, 3, 3, floats, 9)
-    _put_floats(seen, 10, 3, floats, 12)
-    words[15:57] = _NAN_WORD
+    _put_floats(seen[0:3], floats[2:5])
+    _put_floats(seen[6:10], floats[5:9])
+    _put_floats(seen[3:6], floats[9:12])
+    _put_floats(seen[10:13], floats[12:15])
+    for i in range(15, 57):
+        words[i] = _NAN_WORD
     octets[228] = 1  # MAV_FRAME_LOCAL_NED, velocities too
     octets[229] = 1
     octets[230] = resets
@@ -112,12 +113,12 @@ def _put_global_position(
     seen: Array, integers: NDArray[np.int32], shorts: NDArray[np.int16]
 ) -> None:
     latitude, longitude, altitude = seen[21], seen[22], seen[23]
-    integers[1] = _fitted((latitude + seen[0] * _DEGREES_PER_M) * 1e7, 32)
-    integers[2] = _fitted((longitude + seen[1] * seen[24]) * 1e7, 32)
-    integers[3] = _fitted((altitude - seen[2]) * 1e3, 32)
-    integers[4] = _fitted((seen[25] - seen[2]) * 1e3, 32)
+    integers[1] = _fitted((latitude + seen[0] * _DEGREES_PER_M) * 1e7, _LIMIT_32)
+    integers[2] = _fitted((longitude + seen[1] * seen[24]) * 1e7, _LIMIT_32)
+    integers[3] = _fitted((altitude - seen[2]) * 1e3, _LIMIT_32)
+    integers[4] = _fitted((seen[25] - seen[2]) * 1e3, _LIMIT_32)
     for i in range(3):
-        shorts[10 + i] = _fitted(seen[3 + i] * 100, 16)
+        shorts[10 + i] = _fitted(seen[3 + i] * 100, _LIMIT_16)
     heading = int(np.rint(_yaw(seen) * _ONE_DEGREE * 100)) % 36000
     shorts[13] = np.int16(heading if heading < 32768 else heading - 65536)
 
@@ -131,7 +132,7 @@ def _put_imu(seen: Array, floats: NDArray[np.float32], octets: Bytes) -> None:
     floats[2] = north + 2.0 * (y * c - z * b)
     floats[3] = east + 2.0 * (z * a - x * c)
     floats[4] = down + 2.0 * (x * b - y * a)
-    _put_floats(seen, 10, 3, floats, 5)
+    _put_floats(seen[10:13], floats[5:8])
     floats[8], floats[9], floats[10] = 0.21, 0.0, 0.43
     height = seen[23] - seen[17]
     floats[11] = 1013.25 * (1.0 - 2.25577e-5 * height) ** 5.25588
@@ -167,10 +168,11 @@ def write_frame(
     if kind == 0:
         _put_attitude(seen, floats)
     elif kind == 1:
-        _put_floats(seen, 6, 7, floats, 1)
-        words[8:12] = np.uint32(0)
+        _put_floats(seen[6:13], floats[1:8])
+        for i in range(8, 12):
+            words[i] = 0
     elif kind == 2:
-        _put_floats(seen, 0, 6, floats, 1)
+        _put_floats(seen[0:6], floats[1:7])
     elif kind == 3:
         _put_odometry(seen, resets, floats, words, payload)
     elif kind == 4:
@@ -189,7 +191,8 @@ def write_frame(
     out[at + 7] = _IDS[kind] & 0xFF
     out[at + 8] = _IDS[kind] >> 8
     out[at + 9] = 0
-    out[at + 10 : at + 10 + size] = payload[:size]
+    for i in range(size):
+        out[at + 10 + i] = payload[i]
     end = at + 10 + size
     crc = np.uint32(0xFFFF)
     for i in range(at + 1, end):

@@ -93,9 +93,9 @@ def _scramble(word: np.uint64) -> np.uint64:
 
 
 @numba.njit(cache=True)
-def fill_normals(seed: np.uint64, lane: int, step: int, out: Array) -> None:
+def fill_normals(seed: np.uint64, lane: np.uint64, step: int, out: Array) -> None:
     """Fill `out` (n,) with the standard normals of this lane and step (Box-Muller)."""
-    key = _scramble(seed + np.uint64(step) * _STEP_STRIDE + np.uint64(lane) * _LANE_STRIDE)
+    key = _scramble(seed + np.uint64(step) * _STEP_STRIDE + lane * _LANE_STRIDE)
     count = out.shape[0]
     for i in range(0, count, 2):
         word = _scramble(key + np.uint64(i + 1) * _PAIR_STRIDE)
@@ -109,14 +109,6 @@ def fill_normals(seed: np.uint64, lane: int, step: int, out: Array) -> None:
 
 
 @numba.njit(cache=True)
-def advance_process(
-    transition: Array, scale: Array, gain: float, normals: Array, x: Array, work: Array
-) -> None:
-    """One step of a LinearProcess in place; `gain` multiplies the noise, `work` is scratch (n,)."""
-    advance_block(transition, scale, 0, x.shape[0], gain, normals, x, work)
-
-
-@numba.njit(cache=True)
 def advance_block(
     transition: Array,
     scale: Array,
@@ -127,7 +119,8 @@ def advance_block(
     x: Array,
     work: Array,
 ) -> None:
-    """The same of one diagonal block, the states `first` to `end` - 1; the others stay."""
+    """One step of a LinearProcess in place, of one diagonal block: the states `first` to `end` - 1;
+    the others stay. `gain` multiplies the noise, `work` is scratch (n,)."""
     for i in range(first, end):
         total = 0.0
         for j in range(first, end):

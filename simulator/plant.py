@@ -34,7 +34,7 @@ from simulator.attitude import (
     encode,
 )
 from simulator.conditions import Conditions
-from simulator.noise import advance_block, advance_process, fill_normals, seed_word
+from simulator.noise import advance_block, fill_normals, seed_word
 from simulator.sensors import (
     ATTITUDE,
     EAST,
@@ -62,7 +62,9 @@ Array = NDArray[np.float64]
 STEP_S = 0.004
 """Length of an integration step, s; `advance` moves in whole steps."""
 
-_ERROR_LANE, _GUST_LANE, _WHITE_LANE = 0, 1, 2
+# As typed numbers: compiled code is made once more for each plain constant that is handed on
+_ERROR_LANE, _GUST_LANE, _WHITE_LANE = np.uint64(0), np.uint64(1), np.uint64(2)
+_GUST_BLOCKS = ((0, 5),)
 
 # The state vector: rigid body, rotors, wind, estimator errors, gusts.
 _STATE_ENDS = np.cumsum([QUATERNION.size, ROTOR_SIZE, 3, ERROR_COUNT, 5])
@@ -73,7 +75,7 @@ _MASS, _THRUST_MAX = 0, 12
 
 # Places in the state vector, for compiled callers.
 CONTACT_PLACE = QUATERNION.size + CONTACT
-ACCELERATION_PLACES = slice(QUATERNION.size + 3, QUATERNION.size + 6)
+ACCELERATION_PLACE = QUATERNION.size + 3  # and the next two
 
 Compiled = tuple[int, bool, int, np.uint64, Array, Array, NDArray[np.int64], Array, Array, Array]
 
@@ -182,8 +184,8 @@ class Plant:
         self._due_s += duration_s
         count = int(self._due_s / STEP_S + 1e-6)
         self._due_s -= count * STEP_S
-        if count > 0:
-            advance_steps(
+        while count > 0:
+            done = advance_steps(
                 count,
                 self._step,
                 self._motors_on,
@@ -194,9 +196,9 @@ class Plant:
                 self._loop.delays,
                 self._constants,
                 self._state,
-                False,
             )
-            self._step += count
+            self._step += done
+            count -= done
 
     def compiled(self) -> Compiled:
         """What `advance_steps` and `report_state` want, in the order of the former: for a caller
@@ -308,6 +310,14 @@ def report_state(
 
 
 @numba.njit(cache=True)
+def _stirs(values: Array) -> bool:
+    for value in values:  # noqa: SIM110 (any() compiles for longer)
+        if value != 0.0:
+            return True
+    return False
+
+
+@numba.njit(cache=True)
 def advance_steps(
     count: int,
     first_step: int,
@@ -319,11 +329,10 @@ def advance_steps(
     delays: NDArray[np.int64],
     constants: Array,
     state: Array,
-    until_contact: bool,
 ) -> int:
-    """`count` steps in place; the steps done, which are fewer if `until_contact` and the ground is
-    touched or left. Per step: demand into history, air, loop on the estimate, airframe, estimator
-    errors. Packed, because unpacking one argument costs a tenth of a step."""
+    """`count` steps in place; the steps done, which are fewer if the ground is touched or left.
+    Per step: demand into history, air, loop on the estimate, airframe, estimator errors. Packed,
+    because unpacking one argument costs a tenth of a step."""
     body, rotor, wind = state[:13], state[13:19], state[19:22]
     error, gust = state[22:34], state[34:39]
     body_constants, rotor_constants = constants[:12], constants[12:18]
@@ -335,15 +344,16 @@ def advance_steps(
     normals, work = np.empty(ERROR_COUNT), np.empty(ERROR_COUNT)
     estimated, turn, turn_error = np.empty(4), np.empty(3), np.empty(3)
     inputs, scratch = np.empty(4), np.empty((RK4_SCRATCH_ROWS, 13))
-    noisy = np.any(error_scale != 0.0)
-    gusty = np.any(gust != 0.0)
+    noisy, gusty = _stirs(constants[178:322]), _stirs(gust)
     noise_gain = 1.0 if motors_on else STANDING_NOISE
     contact = rotor[CONTACT]
     for step in range(first_step, first_step + count):
-        history[step % history.shape[0], :] = row
+        for i in range(row.shape[0]):
+            history[step % history.shape[0], i] = row[i]
         if gusty:
             fill_normals(seed, _GUST_LANE, step, normals[: gust.shape[0]])
-            advance_process(gust_transition, gust_scale, 1.0, normals, gust, work)
+            for first, end in _GUST_BLOCKS:
+                advance_block(gust_transition, gust_scale, first, end, 1.0, normals, gust, work)
         wind[0] = air[0] + air[3] * gust[0] - air[4] * gust[1]
         wind[1] = air[1] + air[4] * gust[0] + air[3] * gust[1]
         wind[2] = air[2] + gust[3]
@@ -373,6 +383,6 @@ def advance_steps(
                 advance_block(
                     error_transition, error_scale, first, end, noise_gain, normals, error, work
                 )
-        if until_contact and rotor[CONTACT] != contact:
+        if rotor[CONTACT] != contact:
             return step + 1 - first_step
     return count

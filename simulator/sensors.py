@@ -240,7 +240,7 @@ def report(
     sds: Array,
     gain: float,
     seed: np.uint64,
-    lane: int,
+    lane: np.uint64,
     step: int,
     out: Array,
 ) -> None:

@@ -26,7 +26,7 @@ from simulator.frame_writer import (
     TRUE_DOWN,
     write_frame,
 )
-from simulator.plant import ACCELERATION_PLACES, CONTACT_PLACE, advance_steps, report_state
+from simulator.plant import ACCELERATION_PLACE, CONTACT_PLACE, advance_steps, report_state
 from simulator.sensors import REPORT_WIDTH
 
 if TYPE_CHECKING:
@@ -142,7 +142,7 @@ def _fly(
     believed: Array,
 ) -> tuple[int, int, int]:
     """Fly to the next step at which a stream speaks, write what is due, and so on."""
-    done, spoken, at = 0, 0, 0
+    done, spoken, at = 0, 0, np.int64(0)  # not a constant: see `simulator.plant`
     payload = np.empty(PAYLOAD_MAX, np.uint8)
     contact, slow = state[CONTACT_PLACE], False
     while True:
@@ -159,7 +159,6 @@ def _fly(
                 delays,
                 constants,
                 state,
-                True,
             )
         now = step + done
         if now == speaks:
@@ -195,6 +194,8 @@ def _see(
     state: Array, believed: Array, motors_on: bool, seed: np.uint64, step: int, seen: Array
 ) -> None:
     report_state(state, believed, motors_on, seed, step, seen[:REPORT_WIDTH])
-    seen[TRUE_ATTITUDE] = state[:4]
+    for i in range(4):
+        seen[TRUE_ATTITUDE + i] = state[i]
     seen[TRUE_DOWN] = state[12]
-    seen[TRUE_ACCELERATION] = state[ACCELERATION_PLACES]
+    for i in range(3):
+        seen[TRUE_ACCELERATION + i] = state[ACCELERATION_PLACE + i]

@@ -11,7 +11,7 @@ from scipy.integrate import quad_vec
 from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.signal import welch
 
-from simulator.noise import advance_process, block_diagonal, discretise, fill_normals, seed_word
+from simulator.noise import advance_block, block_diagonal, discretise, fill_normals, seed_word
 from simulator.plant import STEP_S
 from simulator.wind import Gusts, dryden, wind_axes
 
@@ -19,7 +19,7 @@ from simulator.wind import Gusts, dryden, wind_axes
 def _normals(seed: int, lane: int, steps: int, width: int) -> np.ndarray:
     out = np.empty((steps, width))
     for step in range(steps):
-        fill_normals(seed_word(seed), lane, step, out[step])
+        fill_normals(seed_word(seed), np.uint64(lane), step, out[step])
     return out
 
 
@@ -30,7 +30,7 @@ def _simulate(process, steps: int, seed: int) -> np.ndarray:
     x = process.stationary_scale @ normals[0]
     work = np.empty_like(x)
     for step in range(steps):
-        advance_process(process.transition, process.scale, 1.0, normals[step], x, work)
+        advance_block(process.transition, process.scale, 0, len(x), 1.0, normals[step], x, work)
         path[step] = x
     return path
 
