@@ -126,7 +126,9 @@ def simulate(
     _announce_compilation()
     parameters = _parameters(personality, param or [])
     from simulator.instance import VIRTUAL_EPOCH_US, Instance
-    from simulator.run import Berth, Runner
+    from simulator.run import Berth, Runner, rehearse
+
+    rehearse(Instance(personality, flyer, flown.conditions, seed, lockstep=True))
 
     epoch_us = VIRTUAL_EPOCH_US if lockstep else unix_us()
     berths = [

@@ -61,13 +61,13 @@ _CHECKSUM = _checksum_table()
 
 
 @numba.njit(cache=True)
-def _fitted(value: float, limit: int) -> int:
+def _fitted(value: float, limit: np.int64) -> int:
     """Nearest integer that a signed field of -limit .. limit - 1 holds; 0 if not finite."""
     if value - value != 0.0:
         return 0
     if value >= limit:
-        return limit - 1
-    return max(-limit, int(np.rint(value)))
+        return int(limit) - 1
+    return max(-int(limit), int(np.rint(value)))
 
 
 @numba.njit(cache=True)

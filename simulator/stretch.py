@@ -142,7 +142,7 @@ def _fly(
     believed: Array,
 ) -> tuple[int, int, int]:
     """Fly to the next step at which a stream speaks, write what is due, and so on."""
-    done, spoken, at = 0, 0, np.int64(0)  # not a constant: see `simulator.plant`
+    done, spoken, at = 0, 0, int(np.int64(0))  # not a constant: see `simulator.plant`
     payload = np.empty(PAYLOAD_MAX, np.uint8)
     contact, slow = state[CONTACT_PLACE], False
     while True:
