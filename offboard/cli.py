@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
+
+if TYPE_CHECKING:
+    from offboard.flight.companion import Companion
 
 app = typer.Typer(
     help="Fly a trajectory over MAVLink with a particle-swarm receding-horizon law, and score it.",
@@ -84,59 +88,65 @@ def fly(
     assignments: Assignments = None,
 ) -> None:
     """Connect, arm, take off, track the reference, land; log everything and score it."""
-    from offboard.analysis.requirement import Requirement
-    from offboard.analysis.score import FIGURES
-    from offboard.flight import clock
-    from offboard.flight.companion import Companion
-    from offboard.flight.phases import ExitCode
-    from offboard.sortie import Order, fly_order
+    from offboard.flight.sitl import Hangar
 
     if not sitl and (scenario or sim_vehicle or firmware != "px4"):
         raise Refusal("--scenario, --sim-vehicle and --firmware are the simulator's: add --sitl")
     named = {"controller": controller, "reference": reference, "vehicle": vehicle}
-    requirements = [Requirement.parse(text, FIGURES) for text in require or ()]
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # leave no simulator behind
+    try:
+        with Hangar() if sitl else nullcontext() as hangar:  # it loads while we do
+            from offboard.analysis.requirement import Requirement
+            from offboard.analysis.score import FIGURES
+            from offboard.flight import clock
+            from offboard.sortie import Order, fly_order
+
+            requirements = [Requirement.parse(text, FIGURES) for text in require or ()]
+            directory = out_directory or Path("flights") / clock.local_stamp()
+            order = Order(
+                directory=directory,
+                config=config,
+                choices={part: name for part, name in named.items() if name is not None},
+                assignments=tuple(assignments or ()),
+                seed=seed,
+                connection=connect,
+                sitl=sitl,
+                firmware=firmware,
+                scenario=scenario,
+                sim_vehicle=sim_vehicle,
+            )
+            order.resolve()
+            out.print("preparing the controller (its first run on a machine compiles for seconds)")
+            outcome = fly_order(order, _announcer(), _prepared, hangar)
+    except KeyboardInterrupt:  # in flight it lands instead
+        raise Refusal("interrupted before anything was sent", 4) from None
+    if outcome.exit_code == 2:
+        raise Refusal(outcome.sentence)
+    missed = _score(directory, [] if outcome.exit_code else requirements, as_json=False)
+    if outcome.exit_code:
+        log = directory / "flight.tlog"
+        raise Refusal(f"{outcome.sentence} (log: {log})", outcome.exit_code)
+    out.print(f"{outcome.sentence}; recorded in {directory}")
+    if missed:
+        raise Refusal("; ".join(missed), 1)
+
+
+def _announcer() -> Callable[[Companion], None]:
+    """Prints what is new each time that it is called."""
     shown = 0
 
-    def progress(companion: Companion) -> None:
+    def announce(companion: Companion) -> None:
         nonlocal shown
         for line in companion.announced[shown:]:
             out.print(f"{companion.view.time_s:8.2f} s  {line}", markup=False, soft_wrap=True)
         shown = len(companion.announced)
 
-    def prepared(seconds: float) -> None:
-        if seconds > 2.0:
-            out.print(f"compiled in {seconds:.1f} s; the next start finds it cached")
+    return announce
 
-    directory = out_directory or Path("flights") / clock.local_stamp()
-    order = Order(
-        directory=directory,
-        config=config,
-        choices={part: name for part, name in named.items() if name is not None},
-        assignments=tuple(assignments or ()),
-        seed=seed,
-        connection=connect,
-        sitl=sitl,
-        firmware=firmware,
-        scenario=scenario,
-        sim_vehicle=sim_vehicle,
-    )
-    order.resolve()
-    out.print("preparing the controller (its first run on a machine compiles for seconds)")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # leave no simulator behind
-    try:
-        outcome = fly_order(order, progress, prepared)
-    except KeyboardInterrupt:  # in flight it lands instead
-        raise Refusal("interrupted before anything was sent", ExitCode.ABORTED) from None
-    if outcome.exit_code == ExitCode.USAGE:
-        raise Refusal(outcome.sentence)
-    if outcome.exit_code != ExitCode.FLOWN:
-        _score(directory, [], as_json=False)
-        log = directory / "flight.tlog"
-        raise Refusal(f"{outcome.sentence} (log: {log})", outcome.exit_code)
-    missed = _score(directory, requirements, as_json=False)
-    out.print(f"{outcome.sentence}; recorded in {directory}")
-    if missed:
-        raise Refusal("; ".join(missed), ExitCode.REQUIREMENT_MISSED)
+
+def _prepared(seconds: float) -> None:
+    if seconds > 2.0:
+        out.print(f"compiled in {seconds:.1f} s; the next start finds it cached")
 
 
 @app.command(epilog=EXIT_HELP)

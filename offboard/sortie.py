@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import atexit
 from collections.abc import Callable, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 
 from offboard.analysis import history, tlog
@@ -21,7 +24,7 @@ from offboard.flight.companion import Companion, Outcome
 from offboard.flight.link import LinkError
 from offboard.flight.log import FlightLog, LogError
 from offboard.flight.run import Bundled, Crew, fly
-from offboard.flight.sitl import OWN_VEHICLES
+from offboard.flight.sitl import OWN_VEHICLES, Hangar
 from offboard.model.document import DocumentError
 
 
@@ -68,20 +71,31 @@ def fly_order(
     order: Order,
     progress: Callable[[Companion], None] = lambda companion: None,
     prepared: Callable[[float], None] = lambda seconds: None,
+    hangar: Hangar | None = None,
 ) -> Outcome:
-    """Fly and log. Raises DocumentError, LinkError or LogError before anything is sent."""
+    """Fly and log; a bundled simulator comes from `hangar`, or one for this flight alone.
+
+    Raises DocumentError, LinkError or LogError before anything is sent.
+    """
     config = order.resolve()
-    bundled = None
-    if order.sitl:
-        bundled = Bundled(order.scenario, config.seed, order.sim_vehicle, order.firmware)
-    return fly(
-        crew(config),
-        FlightLog(order.directory, dump(config)),
-        connection=order.connection,
-        bundled=bundled,
-        progress=progress,
-        prepared=prepared,
-    )
+    with ExitStack() as stack:
+        bundled = None
+        if order.sitl:
+            bundled = Bundled(
+                hangar or stack.enter_context(Hangar()),
+                order.scenario,
+                config.seed,
+                order.sim_vehicle,
+                order.firmware,
+            )
+        return fly(
+            crew(config),
+            FlightLog(order.directory, dump(config)),
+            connection=order.connection,
+            bundled=bundled,
+            progress=progress,
+            prepared=prepared,
+        )
 
 
 def score_flight(flight: Path) -> tuple[Score, History]:
@@ -100,6 +114,14 @@ def keep_score(directory: Path, score: Score, flown: History) -> None:
         ) from None
 
 
+@cache
+def _hangar() -> Hangar:
+    """Of this process, for all flights of a comparison that it flies."""
+    hangar = Hangar().__enter__()
+    atexit.register(hangar.close)
+    return hangar
+
+
 def fly_trial(order: Order, trial: Trial) -> Result:
     """Fly one row of a comparison like `order`; a flight that cannot be flown is a result too."""
     choices = {**order.choices, "controller": trial.controller, "reference": trial.reference}
@@ -111,7 +133,7 @@ def fly_trial(order: Order, trial: Trial) -> Result:
         seed=trial.seed,
     )
     try:
-        outcome = fly_order(ordered)
+        outcome = fly_order(ordered, hangar=_hangar() if order.sitl else None)
         score, flown = score_flight(trial.directory)
         keep_score(trial.directory, score, flown)
     except (DocumentError, LinkError, LogError, TlogError) as error:

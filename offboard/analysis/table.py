@@ -22,10 +22,13 @@ SECTIONS = {
 
 def show(console: Console, score: Score, history: History) -> None:
     """Print phases, modes, what the vehicle said, and every figure that the log holds."""
-    console.print(_story("phase", history.phases))
-    console.print(_story("mode", history.modes))
-    if history.said:
-        console.print(_story("the vehicle said", history.said))
+    told = {"phase": history.phases, "mode": history.modes, "the vehicle said": history.said}
+    for title, happenings in told.items():
+        if happenings:
+            console.print(_story(title, happenings))
+    if all(math.isnan(value) for value in score.figures().values()):
+        console.print("nothing was flown that could be scored")
+        return
     table = Table(title="score", title_justify="left", box=None, pad_edge=False)
     table.add_column("figure", style="bold")
     table.add_column("value", justify="right")

@@ -24,7 +24,7 @@ from offboard.flight.log import FlightLog
 from offboard.flight.mission import Mission
 from offboard.flight.phases import Limits
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
-from offboard.flight.sitl import SimulatorProcess
+from offboard.flight.sitl import Hangar
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
 from offboard.model.document import DocumentError
 from offboard.model.vehicle import Vehicle
@@ -37,14 +37,26 @@ SITL_PATIENCE_S = 180.0  # a bundled simulator may compile first, on a machine t
 
 @dataclass(frozen=True, slots=True)
 class Bundled:
-    """The bundled simulator, in lockstep; `scenario` and `vehicle` None are the firmware's own."""
+    """A vehicle of the bundled simulator, in lockstep; `scenario` and `vehicle` None are the
+    firmware's own."""
 
+    hangar: Hangar
     scenario: str | None
     seed: int
     vehicle: str | None = None
     firmware: str = "px4"
 
-    def parameters(self) -> dict[str, float]:
+    def options(self, port: int) -> list[str]:
+        """Of the `simulator` command: this vehicle, sending to a port of ours."""
+        return [
+            *("--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", "--lockstep"),
+            *("--seed", str(self.seed), "--firmware", self.firmware),
+            *(("--scenario", self.scenario) if self.scenario else ()),
+            *(("--vehicle", self.vehicle) if self.vehicle else ()),
+            *(f"--param={name}={value:g}" for name, value in self._parameters().items()),
+        ]
+
+    def _parameters(self) -> dict[str, float]:
         """What a user would set once on this autopilot to fly with us."""
         dialect = DIALECTS.get(self.firmware)
         watched = dialect.watched_parameters if dialect else ()
@@ -129,23 +141,10 @@ def fly(
     with ExitStack() as stack:
         link = open_link("udpin:127.0.0.1:0" if bundled else connection)
         stack.callback(link.close)
-        simulator = None
-        limits = crew.limits
         if bundled:
             assert isinstance(link, UdpLink)
-            simulator = stack.enter_context(
-                SimulatorProcess(
-                    port=link.port,
-                    seed=bundled.seed,
-                    firmware=bundled.firmware,
-                    scenario=bundled.scenario,
-                    vehicle=bundled.vehicle,
-                    parameters=bundled.parameters(),
-                )
-            )
-            # In lockstep the vehicle waits for us: silence only says that the machine is busy
-            patience = {"connect_s": SITL_PATIENCE_S, "silence_s": SITL_PATIENCE_S}
-            limits = limits.model_copy(update=patience)
+            bundled.hangar.launch(bundled.options(link.port))
+            stack.callback(bundled.hangar.recall)
         prepared(rehearse(crew, keeps_deadline=bundled is None))
         stack.enter_context(log)
         session = Session(
@@ -158,24 +157,31 @@ def fly(
         )
         for piece in manifest.pieces(log.configuration):
             log.begin(clock.unix_us(), session.encode(piece))
-        companion = Companion(
-            vehicle=crew.vehicle,
-            session=session,
-            observer=crew.make_observer(),
-            controller=crew.controller,
-            mission=Mission(crew.track),
-            limits=limits,
-            period_s=crew.period_s,
-            deadline_s=None if bundled else crew.deadline_s,
-            stopwatch=clock.monotonic_s,
-            learning=crew.learning,
-        )
         loop = Loop(
-            companion,
+            _companion(crew, session, lockstep=bundled is not None),
             link,
             log,
             lockstep=bundled is not None,
             progress=progress,
-            vehicle_process_ended=simulator.ended if simulator else lambda: None,
+            vehicle_process_ended=bundled.hangar.ended if bundled else lambda: None,
         )
         return loop.run()
+
+
+def _companion(crew: Crew, session: Session, *, lockstep: bool) -> Companion:
+    limits = crew.limits
+    if lockstep:  # the vehicle waits for us: silence only says that the machine is busy
+        patience = {"connect_s": SITL_PATIENCE_S, "silence_s": SITL_PATIENCE_S}
+        limits = limits.model_copy(update=patience)
+    return Companion(
+        vehicle=crew.vehicle,
+        session=session,
+        observer=crew.make_observer(),
+        controller=crew.controller,
+        mission=Mission(crew.track),
+        limits=limits,
+        period_s=crew.period_s,
+        deadline_s=None if lockstep else crew.deadline_s,
+        stopwatch=clock.monotonic_s,
+        learning=crew.learning,
+    )

@@ -1,19 +1,25 @@
-"""The bundled simulator as a process of its own: started, watched and always stopped.
+"""The bundled simulator as processes of their own: started, watched and always stopped.
 
-`offboard` never imports `simulator`; they meet on the wire.
+`offboard` never imports `simulator`; they meet on the wire, and on a pipe that says what to fly.
 """
 
 from __future__ import annotations
 
+import json
+import os
+import select
+import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from types import TracebackType
 
 OWN_VEHICLES = {"ardupilot": "arducopter"}  # flown by the simulator, so believed of it as well
 STOP_S = 2.0
+ERRORS_BYTES = 65536
 USAGE = 2  # the simulator's exit code for options and files that it cannot use
 
 
@@ -25,61 +31,80 @@ class Ending:
     unusable: bool
 
 
-class SimulatorProcess:
-    """`python -m simulator` sending to a port of ours, in lockstep. A context manager."""
+class Hangar:
+    """`python -m simulator.hangar`: loads from when it is entered, then flies vehicles one after
+    the other, each a process of its own. A context manager; leaving it ends everything."""
 
-    def __init__(
-        self,
-        *,
-        port: int,
-        seed: int,
-        firmware: str,
-        scenario: str | None,
-        vehicle: str | None,
-        parameters: Mapping[str, float],
-    ) -> None:
-        self._command = [
-            sys.executable,
-            "-m",
-            "simulator",
-            "--connect",
-            f"udpout:127.0.0.1:{port}",
-            "--gcs",
-            "none",
-            "--lockstep",
-            "--seed",
-            str(seed),
-            "--firmware",
-            firmware,
-            *(("--scenario", scenario) if scenario else ()),
-            *(("--vehicle", vehicle) if vehicle else ()),
-            *(f"--param={name}={value:g}" for name, value in parameters.items()),
-        ]
+    def __init__(self) -> None:
+        self._ending: Ending | None = None
 
-    def __enter__(self) -> SimulatorProcess:
-        self._errors = tempfile.TemporaryFile()
+    def __enter__(self) -> Hangar:
+        self._open()
+        return self
+
+    def _open(self) -> None:
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
         self._process = subprocess.Popen(
-            self._command,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
+            [sys.executable, "-m", "simulator.hangar"],
+            bufsize=0,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
             stderr=self._errors,
             # Ctrl-C in the terminal must land the vehicle, not kill it
             start_new_session=True,
         )
-        return self
 
-    def ended(self) -> Ending | None:
-        """How the process ended, or None while it runs."""
-        code = self._process.poll()
-        if code is None:
-            return None
-        self._errors.seek(0)
-        words = self._errors.read().decode(errors="replace").strip().splitlines()
+    def launch(self, options: Sequence[str]) -> None:
+        """Start a vehicle with `options` of the `simulator` command."""
+        if self._process.poll() is not None:  # a flight that lost it shall not be the last one
+            self.close()
+            self._open()
+        self._said_before = os.fstat(self._errors.fileno()).st_size
+        self._ending = None
+        self._tell(json.dumps(options).encode() + b"\n")
+
+    @property
+    def pid(self) -> int:
+        """Of the process that loaded; a vehicle is its child."""
+        return self._process.pid
+
+    def ended(self, patience_s: float = 0.0) -> Ending | None:
+        """How the vehicle's process ended, or None while it runs; waits for its end so long."""
+        assert self._process.stdout is not None
+        if self._ending is None and select.select([self._process.stdout], [], [], patience_s)[0]:
+            answer = self._process.stdout.readline()
+            self._ending = self._explained(int(answer) if answer else self._process.wait())
+        return self._ending
+
+    def recall(self) -> None:
+        """End the vehicle's process."""
+        if self.ended() is None:
+            self._tell(b"\n")
+            if self.ended(STOP_S) is None:
+                self.close()
+
+    def _tell(self, order: bytes) -> None:
+        assert self._process.stdin is not None
+        with suppress(BrokenPipeError):  # it is gone, which `ended` will say
+            self._process.stdin.write(order)
+
+    def _explained(self, code: int) -> Ending:
+        errors = os.pread(self._errors.fileno(), ERRORS_BYTES, self._said_before)
+        words = errors.decode(errors="replace").strip().splitlines()
         if code == USAGE:
             return Ending(words[-1] if words else "the bundled simulator was refused", True)
         how = f"signal {-code}" if code < 0 else f"exit code {code}"
         said = f": {words[-1]}" if words else ""
         return Ending(f"the bundled simulator ended ({how}){said}", False)
+
+    def close(self) -> None:
+        """End everything."""
+        if self._process.poll() is None:
+            os.killpg(self._process.pid, signal.SIGKILL)  # itself and what it flies
+            self._process.wait()
+        for pipe in (self._process.stdin, self._process.stdout, self._errors):
+            assert pipe is not None
+            pipe.close()
 
     def __exit__(
         self,
@@ -87,10 +112,4 @@ class SimulatorProcess:
         value: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._process.terminate()
-        try:
-            self._process.wait(STOP_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
-        self._errors.close()
+        self.close()
