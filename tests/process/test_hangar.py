@@ -77,6 +77,11 @@ def test_wrong_options_are_told_in_the_simulators_words(hangar: Hangar) -> None:
     again = hangar.ended(10.0)
     assert again is not None
     assert again.sentence.startswith("--firmware betaflight: unknown")
+    with flying(hangar):
+        os.kill(vehicles(hangar)[0], signal.SIGKILL)
+        last = hangar.ended(10.0)
+        assert last is not None
+        assert last.sentence == "the bundled simulator ended (signal 9)"  # not the words before
 
 
 def test_a_hangar_that_was_lost_is_replaced() -> None:
