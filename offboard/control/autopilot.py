@@ -19,16 +19,14 @@ class AutopilotSettings(Parameters):
     """`lead_s`: how far ahead of now the reference is taken, beyond half a period for the hold."""
 
     lead_s: float = Field(default=0.0, ge=0, le=1)
-    period_s: float = Field(default=0.1, ge=0.005, le=0.5)
-    seed: int = Field(default=0, ge=0, lt=2**64)  # nothing is random here
 
 
 class AutopilotLaw:
     """The controller `autopilot`."""
 
-    def __init__(self, settings: AutopilotSettings | None = None) -> None:
+    def __init__(self, settings: AutopilotSettings | None = None, *, period_s: float = 0.1) -> None:
         settings = settings or AutopilotSettings()
-        self._ahead_s = settings.lead_s + 0.5 * settings.period_s
+        self._ahead_s = settings.lead_s + 0.5 * period_s
 
     def decide(self, situation: Situation) -> Decision:
         """The reference as it will be. Raises DecisionError where it is not finite."""

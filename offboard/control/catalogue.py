@@ -102,20 +102,25 @@ def build(
 
     `stopwatch` () -> s keeps deadlines and measures solve times; without one there are neither.
     """
-    settings = config.model_copy(update={"seed": seed, "period_s": period_s})
-    match settings:
-        case Pso():
-            return TrackingLaw(vehicle, settings, Search.SWARM, stopwatch, settings.feedforward)
-        case Lqr():
-            share = settings.feedforward
-            return TrackingLaw(vehicle, settings, Search.CLOSED_FORM, stopwatch, share)
+    match config:
+        case Pso() | Lqr():
+            return TrackingLaw(
+                vehicle,
+                config,
+                Search(config.law),
+                stopwatch,
+                config.feedforward,
+                period_s=period_s,
+                seed=seed,
+            )
         case Mpc():
-            return MpcLaw(vehicle, settings, stopwatch)
+            return MpcLaw(vehicle, config, stopwatch, period_s=period_s)
         case Horizon() | Mppi() | Cem():
-            return HorizonLaw(vehicle, settings, Method(settings.law), stopwatch)
+            method = Method(config.law)
+            return HorizonLaw(vehicle, config, method, stopwatch, period_s=period_s, seed=seed)
         case Pid():
-            return PidLaw(vehicle, settings, stopwatch)
+            return PidLaw(vehicle, config, stopwatch, period_s=period_s)
         case Autopilot():
-            return AutopilotLaw(settings)
+            return AutopilotLaw(config, period_s=period_s)
         case Paper():
-            return PaperController(vehicle, settings, period_s, stopwatch)
+            return PaperController(vehicle, config, period_s, stopwatch, seed)

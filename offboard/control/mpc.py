@@ -38,10 +38,14 @@ class MpcLaw(TrackingLaw):
         vehicle: Vehicle,
         settings: MpcSettings | None = None,
         stopwatch: Callable[[], float] | None = None,
+        *,
+        period_s: float = 0.1,
     ) -> None:
         self._steps = (settings or MpcSettings()).steps
         self._planner = ExactMinimum(3 * self._steps)
-        super().__init__(vehicle, settings or MpcSettings(), Search.CLOSED_FORM, stopwatch)
+        super().__init__(
+            vehicle, settings or MpcSettings(), Search.CLOSED_FORM, stopwatch, period_s=period_s
+        )
 
     def adopt(
         self, vehicle: Vehicle, bandwidth_limit_radps: float = math.inf, *, gains: bool = True
@@ -60,9 +64,7 @@ class MpcLaw(TrackingLaw):
         """The first input of the exact plan."""
         state, settings = situation.state, self._settings
         upright = float(state.thrust_direction_ned[2])
-        ahead = look_ahead(
-            self._vehicle, situation.reference, state, settings.period_s, self._steps
-        )
+        ahead = look_ahead(self._vehicle, situation.reference, state, self._period_s, self._steps)
         limit = min(settings.tilt_limit, math.sin(self._vehicle.tilt_max_rad))
         thrusts = (float(problem.lower[0]), float(problem.upper[0]))
         within = bounds(ahead, upright, limit, settings.feedback_limit, thrusts)

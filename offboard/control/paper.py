@@ -45,6 +45,7 @@ class PaperController:
         settings: PaperSettings | None = None,
         step_s: float = PAPER_STEP_S,
         stopwatch: Callable[[], float] | None = None,
+        seed: int = 0,
     ) -> None:
         settings = settings or PaperSettings()
         dynamics, inputs = sampled_matrices(vehicle, step_s)
@@ -54,7 +55,13 @@ class PaperController:
         self._step_s = step_s
         self._stopwatch = stopwatch
         self._law = PaperLaw(
-            dynamics, inputs * input_scale(vehicle), settings, lower, upper, step_s=step_s
+            dynamics,
+            inputs * input_scale(vehicle),
+            settings,
+            lower,
+            upper,
+            step_s=step_s,
+            seed=seed,
         )
         self._integral = ErrorIntegral(settings.integral, step_s) if settings.integral else None
         self._held = False  # the input was at its bound: the integral waits

@@ -68,7 +68,6 @@ class PaperSettings(Parameters):
     integral: IntegralSettings | None = None
     limits: StateLimits | None = None
     swarm: SwarmSettings = SwarmSettings()
-    seed: int = Field(default=0, ge=0, lt=2**64)
 
     @classmethod
     def first_configuration(cls) -> PaperSettings:
@@ -109,6 +108,7 @@ class PaperLaw:
         upper: Array | None = None,
         terminal: Array | None = None,
         step_s: float = PAPER_STEP_S,
+        seed: int = 0,
     ) -> None:
         weight = np.diag(settings.fitness) if terminal is None else terminal
         self._step_s = step_s
@@ -128,7 +128,7 @@ class PaperLaw:
         )
         self._keep_constant = settings.keep_constant
         self._swarm = QuadraticSwarm(settings.swarm, len(self._lower))
-        self._lanes = RandomLanes(settings.seed)
+        self._lanes = RandomLanes(seed)
         self._hover = np.zeros(len(self._lower))
         self._previous = self._hover
 

@@ -46,11 +46,15 @@ class PidLaw(TrackingLaw):
         vehicle: Vehicle,
         settings: PidSettings | None = None,
         stopwatch: Callable[[], float] | None = None,
+        *,
+        period_s: float = 0.1,
     ) -> None:
         self._gains = settings or PidSettings()
         self._integral = np.zeros(3)
         feedforward = self._gains.feedforward
-        super().__init__(vehicle, self._gains, Search.CLOSED_FORM, stopwatch, feedforward)
+        super().__init__(
+            vehicle, self._gains, Search.CLOSED_FORM, stopwatch, feedforward, period_s=period_s
+        )
 
     def answer(
         self,
@@ -86,7 +90,7 @@ class PidLaw(TrackingLaw):
         """Only axes whose command is not on its bound: what winds up there overshoots later."""
         gains = self._gains
         rates = np.array([gains.integral_gain_ps3] * 2 + [gains.height_integral_gain_ps3])
-        step = gains.period_s * rates * off_ned_m
+        step = self._period_s * rates * off_ned_m
         limit = gains.integral_limit_mps2
         self._integral = np.clip(
             np.where(free, self._integral + step, self._integral), -limit, limit

@@ -70,9 +70,7 @@ class TrackingSettings(Parameters):
     feedback_limit: float = Field(default=0.3, gt=0, le=1)
     tilt_limit: float = Field(default=0.6, gt=0, le=0.7)
     thrust_floor: float = Field(default=0.2, ge=0, lt=1)
-    period_s: float = Field(default=0.1, ge=0.005, le=0.5)
     swarm: SwarmSettings = SwarmSettings()
-    seed: int = Field(default=0, ge=0, lt=2**64)
 
 
 def _share(value: object) -> object:
@@ -111,9 +109,9 @@ class Target:
 
 
 class TrackingLaw:
-    """The controllers `pso` and `lqr`. `stopwatch` () -> s lets the swarm keep a deadline and
-    report its time; without one it takes all its iterations. `feedforward`: see
-    `OneDecisionSettings`."""
+    """The controllers `pso` and `lqr`, deciding every `period_s`. `stopwatch` () -> s lets the
+    swarm keep a deadline and report its time; without one it takes all its iterations.
+    `feedforward`: see `OneDecisionSettings`."""
 
     def __init__(
         self,
@@ -122,15 +120,19 @@ class TrackingLaw:
         search: Search = Search.SWARM,
         stopwatch: Callable[[], float] | None = None,
         feedforward: float = 1.0,
+        *,
+        period_s: float = 0.1,
+        seed: int = 0,
     ) -> None:
         self._settings = settings or TrackingSettings()
+        self._period_s = period_s
         self._feedforward = feedforward
         self._search = search
         self._stopwatch = stopwatch
         self._file = vehicle
         self.adopt(vehicle)
         self._swarm = QuadraticSwarm(self._settings.swarm, 4)
-        self._lanes = RandomLanes(self._settings.seed)
+        self._lanes = RandomLanes(seed)
         self._exact = ExactMinimum(4)
 
     def decide(self, situation: Situation) -> Decision:
@@ -179,17 +181,17 @@ class TrackingLaw:
         """Go on with a newly identified vehicle, at most this bandwidth; without `gains` only the
         feed-forward changes, which costs nothing."""
         self._vehicle = vehicle
-        self._tilt_ripple = tilt_ripple(vehicle, self._settings.period_s)
-        self._thrust_ripple = thrust_ripple(vehicle, self._settings.period_s)
+        self._tilt_ripple = tilt_ripple(vehicle, self._period_s)
+        self._thrust_ripple = thrust_ripple(vehicle, self._period_s)
         if gains:
             bandwidth = min(self._settings.bandwidth_radps, bandwidth_limit_radps)
-            self.lateral = lateral_cost_to_go(vehicle, bandwidth, self._settings.period_s)
-            self.vertical = vertical_cost_to_go(vehicle, bandwidth, self._settings.period_s)
+            self.lateral = lateral_cost_to_go(vehicle, bandwidth, self._period_s)
+            self.vertical = vertical_cost_to_go(vehicle, bandwidth, self._period_s)
 
     def target(self, reference: Reference, time_s: float, state: PredictedState) -> Target:
         """What to be and what to ask, for a decision at `time_s` with the state predicted to
         `state.time_s`, when its tilt begins to act. The disturbance is part of both."""
-        vehicle, period_s = self._vehicle, self._settings.period_s
+        vehicle, period_s = self._vehicle, self._period_s
         half_s = 0.5 * period_s
         heave_s = heave_of(state).time_s
         course_s = time_s + vehicle.yaw.delay_s + half_s

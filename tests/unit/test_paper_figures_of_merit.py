@@ -23,14 +23,13 @@ def flown(damping: float, keep_constant: bool = True) -> tuple[Summary, ...]:
     swarm = first.swarm.model_copy(update={"damping": damping})
     changes = {"swarm": swarm, "keep_constant": keep_constant}
     return tuple(
-        summarised(FlightTask(first.model_copy(update={**changes, "seed": seed})))
-        for seed in range(SEEDS)
+        summarised(FlightTask(first.model_copy(update=changes), seed=seed)) for seed in range(SEEDS)
     )
 
 
 @cache
 def reweighted() -> tuple[Summary, ...]:
-    return tuple(summarised(FlightTask(PaperSettings(seed=seed))) for seed in range(SEEDS))
+    return tuple(summarised(FlightTask(PaperSettings(), seed=seed)) for seed in range(SEEDS))
 
 
 def mean_spread(flights: tuple[Summary, ...]) -> float:
@@ -135,7 +134,7 @@ def test_errata_name_their_numbers() -> None:
 
 
 def test_a_flight_is_a_function_of_its_task() -> None:
-    task = FlightTask(PaperSettings(seed=5), PlantKind.NONLINEAR, steps=50)
+    task = FlightTask(PaperSettings(), PlantKind.NONLINEAR, seed=5, steps=50)
     one, other = fly(task), fly(task)
     np.testing.assert_array_equal(one.states, other.states)
     np.testing.assert_array_equal(one.spreads, other.spreads)

@@ -336,7 +336,7 @@ def test_flights_with_the_same_seed_decide_the_same() -> None:
     situation = Situation(0.0, state, reference, HOVER)
     few = SwarmSettings(iterations=10)
     controller, twin, other = (
-        PaperController(PAPER, PaperSettings(swarm=few, seed=seed)) for seed in (1, 1, 2)
+        PaperController(PAPER, PaperSettings(swarm=few), seed=seed) for seed in (1, 1, 2)
     )
     controller.warm_up()
     first, second = (controller.decide(situation).command for _ in range(2))

@@ -47,10 +47,10 @@ LEVEL = Command(G, (0.0, 0.0, 1.0), 0.0)
 
 
 def law_of(
-    bandwidth: float = 5.0, search: Search = Search.CLOSED_FORM, **more: object
+    bandwidth: float = 5.0, search: Search = Search.CLOSED_FORM, seed: int = 0, **more: object
 ) -> TrackingLaw:
     settings = TrackingSettings.model_validate({"bandwidth_radps": bandwidth, **more})
-    return TrackingLaw(PX4, settings, search)
+    return TrackingLaw(PX4, settings, search, seed=seed)
 
 
 def state_of(rng: np.random.Generator, reference: Lemniscate, size: float) -> PredictedState:

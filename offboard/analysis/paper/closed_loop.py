@@ -57,6 +57,7 @@ class FlightTask:
     wind_ned_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
     thrust_loss: float = 0.0
     start_offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    seed: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -151,7 +152,9 @@ class _Pilot:
                 np.diag(task.settings.energy),
             )
         self._terminal = terminal
-        self._law = PaperLaw(self._dynamics, self._inputs, task.settings, lower, upper, terminal)
+        self._law = PaperLaw(
+            self._dynamics, self._inputs, task.settings, lower, upper, terminal, seed=task.seed
+        )
         self._integral = (
             ErrorIntegral(task.settings.integral, PAPER_STEP_S) if task.settings.integral else None
         )

@@ -102,14 +102,14 @@ class Plan:
         self.jobs.setdefault(key, (function, arguments))
         return key
 
-    def _damped(self, damping: float, seed: int = 0, **changes: Any) -> PaperSettings:
+    def _damped(self, damping: float, **changes: Any) -> PaperSettings:
         swarm = self._first.swarm.model_copy(update={"damping": damping, **changes})
-        return self._first.model_copy(update={"swarm": swarm, "seed": seed})
+        return self._first.model_copy(update={"swarm": swarm})
 
-    def _flights(self, name: Key, settings: Callable[[int], PaperSettings], count: int,
+    def _flights(self, name: Key, settings: PaperSettings, count: int,
                  plant: PlantKind = LINEAR) -> list[Key]:  # fmt: skip
         return [
-            self._job((name, plant, seed), summarised, FlightTask(settings(seed), plant))
+            self._job((name, plant, seed), summarised, FlightTask(settings, plant, seed=seed))
             for seed in range(count)
         ]
 
@@ -117,14 +117,10 @@ class Plan:
         count = self._options.seed_count
         if self._options.quick and plant is NONLINEAR:
             count = 1
-        return self._flights(
-            ("lambda", damping), lambda seed: self._damped(damping, seed), count, plant
-        )
+        return self._flights(("lambda", damping), self._damped(damping), count, plant)
 
     def _reweighted(self) -> list[Key]:
-        return self._flights(
-            "final", lambda seed: PaperSettings(seed=seed), self._options.seed_count
-        )
+        return self._flights("final", self._final, self._options.seed_count)
 
     def _by_damping(self, make: Callable[[Any], Table | Figure]) -> Recipe:
         rows = {
@@ -151,19 +147,13 @@ class Plan:
 
     def _errata(self) -> Recipe:
         few = min(self._options.seed_count, 3)
-
-        def without(seed: int) -> PaperSettings:
-            settings = self._damped(BEST_DAMPING, seed)
-            return settings.model_copy(update={"keep_constant": False})
-
+        without = self._damped(BEST_DAMPING).model_copy(update={"keep_constant": False})
         groups = [
             self._by_lambda(BEST_DAMPING),
             self._flights("no constant", without, few),
             self._by_lambda(LEAST_DAMPING),
             self._by_lambda(UNDAMPED),
-            self._flights(
-                "rebound", lambda seed: self._damped(UNDAMPED, seed, rebound=REBOUND), few
-            ),
+            self._flights("rebound", self._damped(UNDAMPED, rebound=REBOUND), few),
             self._reweighted(),
         ]
         needs = [key for group in groups for key in group]

@@ -87,13 +87,19 @@ class HorizonLaw(TrackingLaw):
         settings: HorizonSettings | None = None,
         method: Method = Method.SWARM,
         stopwatch: Callable[[], float] | None = None,
+        *,
+        period_s: float = 0.1,
+        seed: int = 0,
     ) -> None:
         self._plans = settings or HorizonSettings()
+        self._seed = seed
         self._method = method
         self._volumes = pack(self._plans.keep_out)
         self._evaluate = Evaluator(self._plans.steps)
         self._planner = ExactMinimum(INPUTS * self._plans.steps)
-        super().__init__(vehicle, self._plans, Search.SWARM, stopwatch)
+        super().__init__(
+            vehicle, self._plans, Search.SWARM, stopwatch, period_s=period_s, seed=seed
+        )
         self.previous: tuple[float, Plan] | None = None
         self._start_over()
 
@@ -110,8 +116,8 @@ class HorizonLaw(TrackingLaw):
             vehicle,
             self.lateral,
             self.vertical,
-            plans.period_s,
-            half=lateral_cost_to_go(vehicle, bandwidth, 0.5 * plans.period_s),
+            self._period_s,
+            half=lateral_cost_to_go(vehicle, bandwidth, 0.5 * self._period_s),
             nonlinear=plans.dynamics is Dynamics.NONLINEAR,
             thrust_mps2=(plans.thrust_floor * vehicle.gravity_mps2, vehicle.thrust_max_mps2),
             speed_limit_mps=plans.speed_limit_mps or math.inf,
@@ -146,13 +152,13 @@ class HorizonLaw(TrackingLaw):
 
     def _start_over(self) -> None:
         self.previous = None
-        self._generator = np.random.default_rng(self._plans.seed)
-        self._lanes = RandomLanes(self._plans.seed)
+        self._generator = np.random.default_rng(self._seed)
+        self._lanes = RandomLanes(self._seed)
 
     def _settle(self, situation: Situation, target: Target, problem: BoxQuadratic) -> BoxQuadratic:
         """Prepare the roll-outs of this situation; the linear problem that comes with it."""
         state, plans = situation.state, self._plans
-        ahead = look_ahead(self._vehicle, situation.reference, state, plans.period_s, plans.steps)
+        ahead = look_ahead(self._vehicle, situation.reference, state, self._period_s, plans.steps)
         limit = min(plans.tilt_limit, math.sin(self._vehicle.tilt_max_rad))
         thrusts = (float(problem.lower[0]), float(problem.upper[0]))
         upright = float(state.thrust_direction_ned[2])
@@ -183,7 +189,7 @@ class HorizonLaw(TrackingLaw):
             reach = self._plans.clearance_m + PLANNED_MARGIN_M
             others.extend(evaluate.held(inputs, way) for way in detours(evaluate.scene, reach))
         if self.previous is not None:
-            gone = round((time_s - self.previous[0]) / self._plans.period_s)
+            gone = round((time_s - self.previous[0]) / self._period_s)
             if 0 <= gone < steps:
                 before = self.previous[1]
                 inputs[: steps - gone] = before.inputs[gone:]
