@@ -10,11 +10,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from offboard.model.kernel import kernel
 from offboard.model.rigid_body import pack, rk4_into
 from offboard.model.vehicle import Parameters, Vehicle
 
@@ -105,7 +105,7 @@ def build_airframe(
     return Airframe(body, rotor, substeps, battery, vehicle.hover_thrust)
 
 
-@numba.njit(cache=True)
+@kernel
 def advance_airframe(
     body: Array,
     rotor: Array,
@@ -146,14 +146,14 @@ def advance_airframe(
     rotor[CHARGE] += rotor_constants[5] * (mean / rotor_constants[4]) ** 1.5 * step_s
 
 
-@numba.njit(cache=True)
+@kernel
 def _ground_gain(down_m: float, enabled: float) -> float:
     height = _ROTOR_HEIGHT_M + max(-down_m, 0.0)
     gain: float = 1.0 / (1.0 - enabled * (_ROTOR_RADIUS_M / (4.0 * height)) ** 2)
     return gain
 
 
-@numba.njit(cache=True)
+@kernel
 def _torques(body: Array, turn: Array, authority: float, constants: Array, inputs: Array) -> None:
     """Inputs 1..3 that realise the angular acceleration: perfect mixing, faded by authority.
 
@@ -169,7 +169,7 @@ def _torques(body: Array, turn: Array, authority: float, constants: Array, input
     inputs[3] = authority * yaw
 
 
-@numba.njit(cache=True)
+@kernel
 def _touch_ground(body: Array, step_s: float) -> float:
     """Ground at down = 0, inelastic, with friction; returns 1 while it carries the vehicle."""
     if body[12] < 0.0:
@@ -189,7 +189,7 @@ def _touch_ground(body: Array, step_s: float) -> float:
     return 1.0
 
 
-@numba.njit(cache=True)
+@kernel
 def _set_level(body: Array, share: float) -> None:
     """Turn the attitude by this share of the way to level, keeping the twist about down."""
     norm = math.hypot(body[0], body[3])

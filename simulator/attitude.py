@@ -10,11 +10,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.model.kernel import kernel
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
@@ -29,8 +30,10 @@ RATE_LIMIT_RADPS: Triple = (3.84, 3.84, 3.49)
 # measured rate steps come out (roll t63 .10-.11 s, yaw .45 s).
 _RATE_DELAY_SHARE = 0.5
 
+_NO_ATTITUDE = (0.0, 0.0, 0.0, 0.0)
+
 # One row per step of the demand history.
-_IS_ATTITUDE, _QUATERNION, _RATES, _THRUST, ROW_WIDTH = 0, 1, 5, 8, 9
+_IS_ATTITUDE, _RATES, _THRUST, ROW_WIDTH = 0, 5, 8, 9
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,11 +57,6 @@ class Loop:
 
     gains: Array  # (3, 3): rows attitude gain 1/s, rate gain 1/s, acceleration limit rad/s^2
     delays: Integers  # tilt, yaw, thrust, tilt rate, yaw rate
-
-    @property
-    def history(self) -> Array:
-        """An empty demand history (rows, ROW_WIDTH) long enough for the longest delay."""
-        return np.zeros((int(self.delays.max()) + 1, ROW_WIDTH))
 
 
 def build_loop(vehicle: Vehicle, step_s: float) -> Loop:
@@ -86,54 +84,55 @@ def build_loop(vehicle: Vehicle, step_s: float) -> Loop:
 
 def encode(demand: Demand, row: Array) -> None:
     """Write the sanitised demand into a history row (ROW_WIDTH,); every number finite."""
-    thrust = demand.thrust if demand.motors_on and not math.isnan(demand.thrust) else 0.0
-    attitude = _unit(demand.attitude) if demand.attitude is not None else None
-    rates = demand.rates_frd_radps if demand.attitude is None else None
-    row[:] = (
-        0.0 if attitude is None else 1.0,
-        *(attitude or (0.0, 0.0, 0.0, 0.0)),
-        *(map(_within, rates, RATE_LIMIT_RADPS) if rates is not None else (0.0, 0.0, 0.0)),
-        min(max(thrust, 0.0), 1.0),
-    )
+    thrust = demand.thrust if demand.motors_on else 0.0
+    encode_attitude.function(demand.attitude or _NO_ATTITUDE, thrust, row)
+    if demand.attitude is None and demand.rates_frd_radps is not None:
+        row[_RATES:_THRUST] = [*map(_within, demand.rates_frd_radps, RATE_LIMIT_RADPS)]
 
 
-def _unit(quaternion: Quaternion) -> Quaternion | None:
-    """The same attitude with unit length; None if it has no direction or is not finite."""
-    w, x, y, z = quaternion
-    if not math.isfinite(w + x + y + z) or w == x == y == z == 0.0:
-        return None
+@kernel
+def encode_attitude(attitude: Any, thrust: float, row: Array) -> None:
+    """The same of an attitude (wxyz, any length) alone; without direction or not finite: none."""
+    for i in range(ROW_WIDTH):
+        row[i] = 0.0
+    if not math.isnan(thrust):
+        row[_THRUST] = min(max(thrust, 0.0), 1.0)
+    w, x, y, z = attitude[0], attitude[1], attitude[2], attitude[3]
     largest = max(abs(w), abs(x), abs(y), abs(z))
+    if not math.isfinite(w + x + y + z) or largest == 0.0:
+        return
     w, x, y, z = w / largest, x / largest, y / largest, z / largest
     norm = math.sqrt(w * w + x * x + y * y + z * z)
-    return w / norm, x / norm, y / norm, z / norm
+    row[_IS_ATTITUDE] = 1.0
+    row[1], row[2], row[3], row[4] = w / norm, x / norm, y / norm, z / norm
 
 
 def _within(rate: float, limit: float) -> float:
     return 0.0 if math.isnan(rate) else min(max(rate, -limit), limit)
 
 
-@numba.njit(cache=True)
+@kernel
 def delayed_row(history: Array, step: int, delay: int) -> Array:
     """The demand of `delay` steps ago."""
     row: Array = history[(step - delay) % history.shape[0]]
     return row
 
 
-@numba.njit(cache=True)
+@kernel
 def delayed_thrust(history: Array, step: int, delays: Integers) -> float:
     """Normalised collective thrust demanded the thrust delay ago."""
     thrust: float = delayed_row(history, step, delays[2])[_THRUST]
     return thrust
 
 
-@numba.njit(cache=True)
+@kernel
 def _attitude_error(quaternion: Array, row: Array, error: Array) -> None:
     """Body-frame error (3,) rad of the demanded attitude: tilt (x, y) first, then the twist (z).
 
     2 sin(half angle) along the axis, as PX4's reduced attitude control has it: the shortest
     rotation of the thrust axis gives x and y, what is left about the demanded axis gives z.
     """
-    w, x, y, z = quaternion
+    w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     dw, dx, dy, dz = row[1], row[2], row[3], row[4]
     # conj(q) * q_demanded: the demanded attitude seen from the body
     ew = w * dw + x * dx + y * dy + z * dz
@@ -151,10 +150,10 @@ def _attitude_error(quaternion: Array, row: Array, error: Array) -> None:
     error[2] = 2.0 * sine if cosine >= 0.0 else -2.0 * sine
 
 
-@numba.njit(cache=True)
+@kernel
 def angular_acceleration(
     quaternion: Array,
-    rates: Array,
+    body: Array,
     history: Array,
     step: int,
     delays: Integers,
@@ -162,7 +161,8 @@ def angular_acceleration(
     error: Array,
     out: Array,
 ) -> None:
-    """Demanded angular acceleration (3,) FRD rad/s^2 from the *estimated* attitude and the rates.
+    """Demanded angular acceleration (3,) FRD rad/s^2 from the *estimated* attitude and the rates,
+    which are those of `body`.
 
     `error` (3,) is scratch. Tilt and yaw read the history at their own delays.
     """
@@ -180,5 +180,5 @@ def angular_acceleration(
             rate = gains[0, i] * error[i] if by_attitude else row[_RATES + i]
             limit = RATE_LIMIT_RADPS[i]
             rate = min(max(rate, -limit), limit)
-            demand = gains[1, i] * (rate - rates[i])
+            demand = gains[1, i] * (rate - body[4 + i])
             out[i] = min(max(demand, -gains[2, i]), gains[2, i])

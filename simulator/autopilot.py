@@ -246,16 +246,27 @@ class Autopilot:
         touched or left; a step too few rather than one too many."""
         if self.failsafe or not self.pilot.flies_itself(self.armed, self.plant.on_ground):
             return 0
-        until_s = self._boot[0][0] if self._boot else math.inf
-        if self.armed:
-            if self.mode.behaviour is Behaviour.SETPOINT:
-                patience_s = self.parameters.role("stream_timeout_s")
-                lost_s = self._setpoint_s + self.firmware.stream_reaction_s + patience_s
-                until_s = min(until_s, lost_s)
-            if not self._flown:
-                until_s = min(until_s, self._armed_s + self.parameters.role("disarm_idle_s"))
+        until_s = self._steady_until_s
+        if self.armed and not self._flown:
+            until_s = min(until_s, self._armed_s + self.parameters.role("disarm_idle_s"))
         watched = self.steps // EVERY_STEPS * EVERY_STEPS + EVERY_STEPS
         return int(min(until_s / STEP_S, watched)) - 1 - self.steps
+
+    @property
+    def _steady_until_s(self) -> float:
+        """When boot, the health of the sensors or the stream of setpoints changes by itself."""
+        firmware, scale, now_s = self.firmware, self.boot_scale, self.time_s
+        changes_s = (
+            self._boot[0][0] if self._boot else math.inf,
+            firmware.healthy_after_s * scale,
+            firmware.healthy_without_position_after_s * scale,
+            firmware.sensors.first_fix_s * scale,
+        )
+        until_s = min((at_s for at_s in changes_s if at_s > now_s), default=math.inf)
+        lost_s = self._setpoint_s + firmware.stream_reaction_s
+        lost_s += self.parameters.role("stream_timeout_s")
+        watched = self.armed and self.mode.behaviour is Behaviour.SETPOINT
+        return min(until_s, lost_s) if watched or lost_s >= now_s else until_s
 
     def flown(self, count: int) -> None:
         """The plant is so many quiet steps further."""

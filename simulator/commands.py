@@ -33,7 +33,6 @@ class Link(Protocol):
     def send_now(self, name: str) -> None: ...
     def set_interval(self, name: str, interval_us: float) -> bool: ...
     def interval_us(self, name: str) -> int: ...
-    def withheld(self, name: str) -> bool: ...
 
 
 @dataclass(slots=True)
@@ -129,7 +128,7 @@ class Commands:
 
     def _request_message(self, command: Command) -> Result:
         name = message_name(command.params[0])
-        if name not in self.link.view.builders or self.link.withheld(name):
+        if name not in self.link.view.builders or self.link.view.withheld(name):
             return self.link.view.autopilot.firmware.streams.request_refusal
         self.link.send_now(name)
         return Result.ACCEPTED

@@ -1,4 +1,4 @@
-"""The six messages that are four fifths of the traffic, written by compiled code.
+"""The messages that are nearly all of the traffic, written by compiled code.
 
 Each is laid out here byte for byte, apart from `simulator.telemetry`, which says the same slowly
 and readably: a test holds every byte of the one against the other. Knows no rates and no links.
@@ -7,46 +7,84 @@ and readably: a test holds every byte of the one against the other. Knows no rat
 from __future__ import annotations
 
 import math
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.model.kernel import kernel
+from simulator.airframe import CHARGE, THRUST
 from simulator.geodesy import EARTH_RADIUS_M
 from simulator.position_loop import GRAVITY_MPS2
-from simulator.sensors import REPORT_WIDTH
 
 Array = NDArray[np.float64]
-Bytes = NDArray[np.uint8]
 
-KINDS = (
-    "ATTITUDE",
-    "ATTITUDE_QUATERNION",
-    "LOCAL_POSITION_NED",
-    "ODOMETRY",
-    "GLOBAL_POSITION_INT",
-    "HIGHRES_IMU",
+# Message, its id, CRC extra and length; what stamp it begins with
+_NONE, _MILLISECONDS, _MICROSECONDS = range(3)
+_TABLE = (
+    ("ATTITUDE", 30, 39, 28, _MILLISECONDS),
+    ("ATTITUDE_QUATERNION", 31, 246, 48, _MILLISECONDS),
+    ("LOCAL_POSITION_NED", 32, 185, 28, _MILLISECONDS),
+    ("ODOMETRY", 331, 91, 233, _MICROSECONDS),
+    ("GLOBAL_POSITION_INT", 33, 104, 28, _MILLISECONDS),
+    ("HIGHRES_IMU", 105, 93, 63, _MICROSECONDS),
+    ("ALTITUDE", 141, 47, 32, _MICROSECONDS),
+    ("VFR_HUD", 74, 20, 20, _NONE),
+    ("ATTITUDE_TARGET", 83, 22, 37, _MILLISECONDS),
+    ("POSITION_TARGET_LOCAL_NED", 85, 140, 51, _MILLISECONDS),
+    ("GPS_RAW_INT", 24, 24, 52, _MICROSECONDS),
+    ("SYS_STATUS", 1, 124, 43, _NONE),
+    ("EXTENDED_SYS_STATE", 245, 130, 2, _NONE),
+    ("HIL_STATE_QUATERNION", 115, 4, 64, _MICROSECONDS),
+    ("TIMESYNC", 111, 34, 16, _NONE),
 )
-FRAME_MAX = 12 + 233  # header, checksum, ODOMETRY
-PAYLOAD_MAX = 256
+KINDS = tuple(row[0] for row in _TABLE)
+_IDS, _EXTRAS, _SIZES, _STAMPS = (
+    np.array(column, np.int64) for column in list(zip(*_TABLE, strict=True))[1:]
+)
+FRAME_MAX = 12 + max(row[3] for row in _TABLE)  # header, checksum
 
-# What the writer reads of the vehicle: its estimate (`simulator.sensors`), the true attitude,
-# height and acceleration, and what is fixed: origin, degrees east per metre, home.
-TRUE_ATTITUDE = REPORT_WIDTH  # and the next three
-TRUE_DOWN = REPORT_WIDTH + 4
-TRUE_ACCELERATION = REPORT_WIDTH + 5  # and the next two
-ORIGIN = slice(REPORT_WIDTH + 8, REPORT_WIDTH + 11)
-EAST_DEGREES_PER_M = REPORT_WIDTH + 11
-HOME_DOWN = REPORT_WIDTH + 12
-SEEN_WIDTH = REPORT_WIDTH + 13
+RECORD = np.dtype(
+    [
+        ("system", "i8"),
+        ("clock_offset_us", "i8"),
+        ("resets", "i8"),
+        ("origin", "f8", 3),
+        ("east_degrees_per_m", "f8"),
+        ("home_down_m", "f8"),
+        # what is demanded of the attitude loop and of the position loop
+        ("attitude", "f8", 4),
+        ("rates_radps", "f8", 3),
+        ("thrust", "f8"),  # before it is raised for the tilt
+        ("throttle", "f8"),
+        ("motion", "f8", 11),
+        # MAV_SYS_STATUS_SENSOR bits: present, enabled, healthy
+        ("sensors", "i8", 3),
+        ("has_fix", "i8"),
+        ("landed_state", "i8"),
+        # cells, capacity A s, share at boot, resistance, current and thrust in hover
+        ("battery", "f8", 6),
+    ],
+    align=True,
+)
+"""What the writer reads beside the plant's record."""
 
-_IDS = np.array([30, 31, 32, 331, 33, 105], dtype=np.int64)
-_EXTRAS = np.array([39, 246, 185, 91, 104, 93], dtype=np.int64)
-_SIZES = np.array([28, 48, 28, 233, 28, 63], dtype=np.int64)
+PAYLOAD = np.dtype(
+    {
+        "names": ["octets", "shorts", "words", "integers", "floats"],
+        "formats": [("u1", 256), ("u2", 128), ("u4", 64), ("i4", 64), ("f4", 64)],
+        "offsets": [0] * 5,
+    }
+)
+"""Scratch: one message's payload, in whatever size its fields have."""
+
 _DEGREES_PER_M = math.degrees(1.0 / EARTH_RADIUS_M)
-_NAN_WORD = np.uint32(0x7FC00000)
+_NAN_WORD = 0x7FC00000
 _ONE_DEGREE = 180.0 / math.pi
-_LIMIT_16, _LIMIT_32 = np.int64(1 << 15), np.int64(1 << 31)
+# As typed numbers: compiled code is made once more for each plain constant that is handed on
+_ZERO, _BYTE_MAX, _SHORT_MAX, _USHORT_MAX, _LONG_MAX = (
+    np.int64(value) for value in (0, 0x7F, 0x7FFF, 0xFFFF, 0x7FFFFFFF)
+)
 
 
 def _checksum_table() -> NDArray[np.uint16]:
@@ -60,146 +98,298 @@ def _checksum_table() -> NDArray[np.uint16]:
 _CHECKSUM = _checksum_table()
 
 
-@numba.njit(cache=True)
-def _fitted(value: float, limit: np.int64) -> int:
-    """Nearest integer that a signed field of -limit .. limit - 1 holds; 0 if not finite."""
+@kernel
+def _fitted(value: float, low: int, high: int) -> int:
+    """Nearest integer within these bounds; what is not finite becomes 0."""
     if value - value != 0.0:
         return 0
-    if value >= limit:
-        return int(limit) - 1
-    return max(-int(limit), int(np.rint(value)))
+    if value >= high:
+        return high
+    return max(low, int(np.rint(value)))
 
 
-@numba.njit(cache=True)
-def _yaw(seen: Array) -> float:
-    w, x, y, z = seen[6], seen[7], seen[8], seen[9]
+@kernel
+def _fitted_short(value: float) -> int:
+    """As a field of two bytes holds it, signed, in its unsigned reading."""
+    return _fitted(value, -_SHORT_MAX - 1, _SHORT_MAX) & 0xFFFF
+
+
+@kernel
+def _fitted_long(value: float) -> int:
+    return _fitted(value, -_LONG_MAX - 1, _LONG_MAX)
+
+
+@kernel
+def _centidegrees(angle_rad: float) -> int:
+    """0 .. 35999."""
+    return int(np.rint(angle_rad * _ONE_DEGREE * 100)) % 36000
+
+
+@kernel
+def _yaw(plant: Any) -> float:
+    w, x, y, z = plant.report[6], plant.report[7], plant.report[8], plant.report[9]
     return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
-@numba.njit(cache=True)
-def _put_floats(seen: Array, out: NDArray[np.float32]) -> None:
-    for i in range(seen.shape[0]):
-        out[i] = np.float32(seen[i])
+@kernel
+def _altitude_mm(seen: Any, down_m: float) -> int:
+    return _fitted_long((seen.origin[2] - down_m) * 1e3)
 
 
-@numba.njit(cache=True)
-def _put_attitude(seen: Array, floats: NDArray[np.float32]) -> None:
-    w, x, y, z = seen[6], seen[7], seen[8], seen[9]
-    floats[1] = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
-    floats[2] = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
-    floats[3] = _yaw(seen)
-    _put_floats(seen[10:13], floats[4:7])
+@kernel
+def _put_place(seen: Any, north_m: float, east_m: float, out: NDArray[np.int32]) -> None:
+    """Latitude and longitude in 1e-7 deg."""
+    north_deg, east_deg = north_m * _DEGREES_PER_M, east_m * seen.east_degrees_per_m
+    out[0] = _fitted_long((seen.origin[0] + north_deg) * 1e7)
+    out[1] = _fitted_long((seen.origin[1] + east_deg) * 1e7)
 
 
-@numba.njit(cache=True)
-def _put_odometry(
-    seen: Array, resets: int, floats: NDArray[np.float32], words: NDArray[np.uint32], octets: Bytes
-) -> None:
-    _put_floats(seen[0:3], floats[2:5])
-    _put_floats(seen[6:10], floats[5:9])
-    _put_floats(seen[3:6], floats[9:12])
-    _put_floats(seen[10:13], floats[12:15])
+@kernel
+def _put_floats(values: Array, out: NDArray[np.float32]) -> None:
+    for i in range(values.shape[0]):
+        out[i] = values[i]
+
+
+@kernel
+def _put_attitude(plant: Any, payload: Any) -> None:
+    w, x, y, z = plant.report[6], plant.report[7], plant.report[8], plant.report[9]
+    payload.floats[1] = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
+    payload.floats[2] = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
+    payload.floats[3] = _yaw(plant)
+    _put_floats(plant.report[10:13], payload.floats[4:7])
+
+
+@kernel
+def _put_odometry(plant: Any, seen: Any, payload: Any) -> None:
+    _put_floats(plant.report[0:3], payload.floats[2:5])
+    _put_floats(plant.report[6:10], payload.floats[5:9])
+    _put_floats(plant.report[3:6], payload.floats[9:12])
+    _put_floats(plant.report[10:13], payload.floats[12:15])
     for i in range(15, 57):
-        words[i] = _NAN_WORD
-    octets[228] = 1  # MAV_FRAME_LOCAL_NED, velocities too
-    octets[229] = 1
-    octets[230] = resets
-    octets[231] = 8  # MAV_ESTIMATOR_TYPE_AUTOPILOT
-    octets[232] = 0
+        payload.words[i] = _NAN_WORD
+    payload.octets[228] = 1  # MAV_FRAME_LOCAL_NED, velocities too
+    payload.octets[229] = 1
+    payload.octets[230] = seen.resets
+    payload.octets[231] = 8  # MAV_ESTIMATOR_TYPE_AUTOPILOT
+    payload.octets[232] = 0
 
 
-@numba.njit(cache=True)
-def _put_global_position(
-    seen: Array, integers: NDArray[np.int32], shorts: NDArray[np.int16]
-) -> None:
-    latitude, longitude, altitude = seen[21], seen[22], seen[23]
-    integers[1] = _fitted((latitude + seen[0] * _DEGREES_PER_M) * 1e7, _LIMIT_32)
-    integers[2] = _fitted((longitude + seen[1] * seen[24]) * 1e7, _LIMIT_32)
-    integers[3] = _fitted((altitude - seen[2]) * 1e3, _LIMIT_32)
-    integers[4] = _fitted((seen[25] - seen[2]) * 1e3, _LIMIT_32)
+@kernel
+def _put_global_position(plant: Any, seen: Any, payload: Any) -> None:
+    _put_place(seen, plant.report[0], plant.report[1], payload.integers[1:3])
+    payload.integers[3] = _altitude_mm(seen, plant.report[2])
+    payload.integers[4] = _fitted_long((seen.home_down_m - plant.report[2]) * 1e3)
     for i in range(3):
-        shorts[10 + i] = _fitted(seen[3 + i] * 100, _LIMIT_16)
-    heading = int(np.rint(_yaw(seen) * _ONE_DEGREE * 100)) % 36000
-    shorts[13] = np.int16(heading if heading < 32768 else heading - 65536)
+        payload.shorts[10 + i] = _fitted_short(plant.report[3 + i] * 100)
+    payload.shorts[13] = _centidegrees(_yaw(plant))
 
 
-@numba.njit(cache=True)
-def _put_imu(seen: Array, floats: NDArray[np.float32], octets: Bytes) -> None:
-    w, x, y, z = seen[13], seen[14], seen[15], seen[16]
-    north, east, down = seen[18], seen[19], seen[20] - GRAVITY_MPS2
+@kernel
+def _put_imu(plant: Any, seen: Any, payload: Any) -> None:
+    w, x, y, z = plant.body[0], plant.body[1], plant.body[2], plant.body[3]
+    north, east, down = plant.rotor[3], plant.rotor[4], plant.rotor[5] - GRAVITY_MPS2
     a, b, c = y * down - z * east, z * north - x * down, x * east - y * north
     a, b, c = a - w * north, b - w * east, c - w * down
-    floats[2] = north + 2.0 * (y * c - z * b)
-    floats[3] = east + 2.0 * (z * a - x * c)
-    floats[4] = down + 2.0 * (x * b - y * a)
-    _put_floats(seen[10:13], floats[5:8])
-    floats[8], floats[9], floats[10] = 0.21, 0.0, 0.43
-    height = seen[23] - seen[17]
-    floats[11] = 1013.25 * (1.0 - 2.25577e-5 * height) ** 5.25588
-    floats[12] = 0.0
-    floats[13] = height
-    floats[14] = 15.0
-    octets[60] = 0xFF
-    octets[61] = 0x1B
-    octets[62] = 0
+    payload.floats[2] = north + 2.0 * (y * c - z * b)
+    payload.floats[3] = east + 2.0 * (z * a - x * c)
+    payload.floats[4] = down + 2.0 * (x * b - y * a)
+    _put_floats(plant.report[10:13], payload.floats[5:8])
+    payload.floats[8], payload.floats[9], payload.floats[10] = 0.21, 0.0, 0.43
+    height = seen.origin[2] - plant.body[12]
+    payload.floats[11] = 1013.25 * (1.0 - 2.25577e-5 * height) ** 5.25588
+    payload.floats[12] = 0.0
+    payload.floats[13] = height
+    payload.floats[14] = 15.0
+    payload.octets[60] = 0xFF
+    payload.octets[61] = 0x1B
+    payload.octets[62] = 0
 
 
-@numba.njit(cache=True)
+@kernel
+def _put_altitude(plant: Any, seen: Any, payload: Any) -> None:
+    down = plant.report[2]
+    amsl = _altitude_mm(seen, down) / 1e3
+    payload.floats[2] = amsl
+    payload.floats[3] = amsl
+    payload.floats[4] = -down
+    payload.floats[5] = seen.home_down_m - down
+    payload.words[6] = _NAN_WORD
+    payload.words[7] = _NAN_WORD
+
+
+@kernel
+def _put_hud(plant: Any, seen: Any, payload: Any) -> None:
+    payload.floats[0] = 0.0
+    payload.floats[1] = math.hypot(plant.report[3], plant.report[4])
+    payload.floats[2] = _altitude_mm(seen, plant.report[2]) / 1e3
+    payload.floats[3] = -plant.report[5]
+    payload.shorts[8] = _centidegrees(_yaw(plant)) // 100
+    payload.shorts[9] = _fitted(seen.throttle * 100, _ZERO, _USHORT_MAX)
+
+
+@kernel
+def _put_targets(kind: int, seen: Any, payload: Any) -> None:
+    if kind == 8:
+        _put_floats(seen.attitude[0:4], payload.floats[1:5])
+        _put_floats(seen.rates_radps[0:3], payload.floats[5:8])
+        payload.floats[8] = seen.thrust
+        payload.octets[36] = 0
+    else:
+        _put_floats(seen.motion[0:11], payload.floats[1:12])
+        payload.shorts[24] = 0
+        payload.octets[50] = 1
+
+
+@kernel
+def _put_gps(plant: Any, seen: Any, payload: Any) -> None:
+    for i in range(2, 13):
+        payload.words[i] = 0
+    if not seen.has_fix:
+        payload.words[5] = payload.words[6] = 0xFFFFFFFF
+        payload.octets[28] = 1
+        return
+    _put_place(seen, plant.body[10], plant.body[11], payload.integers[2:4])
+    height = _altitude_mm(seen, plant.body[12])
+    north, east = plant.body[7], plant.body[8]
+    payload.integers[4] = height
+    payload.shorts[10], payload.shorts[11] = 70, 110
+    payload.shorts[12] = _fitted(math.hypot(north, east) * 100, _ZERO, _USHORT_MAX)
+    payload.shorts[13] = _centidegrees(math.atan2(east, north))
+    payload.octets[28], payload.octets[29] = 3, 10
+    for i in range(4):  # from here on no field lies at a multiple of its size
+        payload.octets[30 + i] = height >> 8 * i & 0xFF
+    payload.octets[34], payload.octets[35] = 900 & 0xFF, 900 >> 8
+    payload.octets[38], payload.octets[39] = 1780 & 0xFF, 1780 >> 8
+    payload.octets[42], payload.octets[43] = 400 & 0xFF, 400 >> 8
+
+
+@kernel
+def _put_status(plant: Any, seen: Any, payload: Any) -> None:
+    cells, capacity, at_boot, resistance = (
+        seen.battery[0],
+        seen.battery[1],
+        seen.battery[2],
+        seen.battery[3],
+    )
+    remaining = max(at_boot - plant.rotor[CHARGE] / capacity, 0.0)
+    current = seen.battery[4] * (plant.rotor[THRUST] / seen.battery[5]) ** 1.5
+    voltage = max(cells * (3.5 + 0.7 * remaining) - resistance * current, 0.0)
+    for i in range(3):
+        payload.words[i] = seen.sensors[i]
+    for i in range(3, 11):
+        payload.words[i] = 0
+    payload.shorts[6] = 80
+    payload.shorts[7] = _fitted(voltage * 1e3, _ZERO, _USHORT_MAX)
+    payload.shorts[8] = _fitted_short(current * 100)
+    payload.octets[30] = _fitted(remaining * 100, -_BYTE_MAX - 1, _BYTE_MAX) & 0xFF
+    payload.octets[39] = 1
+
+
+@kernel
+def _put_truth(plant: Any, seen: Any, payload: Any) -> None:
+    body = plant.body
+    _put_floats(body[0:7], payload.floats[2:9])
+    _put_place(seen, body[10], body[11], payload.integers[9:11])
+    payload.integers[11] = _altitude_mm(seen, body[12])
+    for i in range(3):
+        payload.shorts[24 + i] = _fitted_short(body[7 + i] * 100)
+        payload.shorts[29 + i] = _fitted_short(plant.rotor[3 + i] / GRAVITY_MPS2 * 1e3)
+    airspeed = _fitted(math.hypot(body[7], body[8]) * 100, _ZERO, _USHORT_MAX)
+    payload.shorts[27] = payload.shorts[28] = airspeed
+
+
+@kernel
+def _put_fast(kind: int, plant: Any, seen: Any, payload: Any) -> None:
+    """The messages of a pilot's instruments, sent many times a second."""
+    if kind == 0:
+        _put_attitude(plant, payload)
+    elif kind == 1:
+        _put_floats(plant.report[6:13], payload.floats[1:8])
+        for i in range(8, 12):
+            payload.words[i] = 0
+    elif kind == 2:
+        _put_floats(plant.report[0:6], payload.floats[1:7])
+    elif kind == 3:
+        _put_odometry(plant, seen, payload)
+    elif kind == 4:
+        _put_global_position(plant, seen, payload)
+    else:
+        _put_imu(plant, seen, payload)
+
+
+@kernel
+def _put_slow(kind: int, plant: Any, seen: Any, time_us: int, payload: Any) -> None:
+    if kind == 6:
+        _put_altitude(plant, seen, payload)
+    elif kind == 7:
+        _put_hud(plant, seen, payload)
+    elif kind == 8 or kind == 9:
+        _put_targets(kind, seen, payload)
+    elif kind == 10:
+        _put_gps(plant, seen, payload)
+    elif kind == 11:
+        _put_status(plant, seen, payload)
+    elif kind == 12:
+        payload.octets[0] = 0
+        payload.octets[1] = seen.landed_state
+    elif kind == 13:
+        _put_truth(plant, seen, payload)
+    else:
+        payload.words[0] = payload.words[1] = 0
+        payload.words[2] = time_us * 1000 & 0xFFFFFFFF
+        payload.words[3] = time_us * 1000 >> 32
+
+
+@kernel
 def write_frame(
     kind: int,
-    seen: Array,
+    plant: Any,
+    seen: Any,
     time_us: int,
-    resets: int,
-    system: int,
     sequence: int,
-    payload: Bytes,
-    out: Bytes,
+    payload: Any,
+    out: Any,
     at: int,
 ) -> int:
     """Write the frame of message KINDS[kind] into `out` from `at`; the place behind it.
 
-    `seen` (SEEN_WIDTH,), `payload` (PAYLOAD_MAX,) scratch; autopilot's component id 1.
+    `plant`, `seen` and `payload`: records. Component id 1, the autopilot's.
     """
-    words, floats = payload.view(np.uint32), payload.view(np.float32)
-    if kind == 3 or kind == 5:
-        words[0], words[1] = time_us & 0xFFFFFFFF, time_us >> 32
+    if _STAMPS[kind] == _MICROSECONDS:
+        payload.words[0], payload.words[1] = time_us & 0xFFFFFFFF, time_us >> 32
+    elif _STAMPS[kind] == _MILLISECONDS:
+        payload.words[0] = time_us // 1000 & 0xFFFFFFFF
+    if kind < 6:
+        _put_fast(kind, plant, seen, payload)
     else:
-        words[0] = time_us // 1000 & 0xFFFFFFFF
-    if kind == 0:
-        _put_attitude(seen, floats)
-    elif kind == 1:
-        _put_floats(seen[6:13], floats[1:8])
-        for i in range(8, 12):
-            words[i] = 0
-    elif kind == 2:
-        _put_floats(seen[0:6], floats[1:7])
-    elif kind == 3:
-        _put_odometry(seen, resets, floats, words, payload)
-    elif kind == 4:
-        _put_global_position(seen, payload.view(np.int32), payload.view(np.int16))
-    else:
-        _put_imu(seen, floats, payload)
+        _put_slow(kind, plant, seen, time_us, payload)
     size = _SIZES[kind]
-    while size > 1 and payload[size - 1] == 0:
+    while size > 1 and payload.octets[size - 1] == 0:
         size -= 1
     out[at] = 0xFD
     out[at + 1] = size
     out[at + 2] = out[at + 3] = 0
     out[at + 4] = sequence
-    out[at + 5] = system
+    out[at + 5] = seen.system
     out[at + 6] = 1
     out[at + 7] = _IDS[kind] & 0xFF
     out[at + 8] = _IDS[kind] >> 8
     out[at + 9] = 0
-    for i in range(size):
-        out[at + 10 + i] = payload[i]
     end = at + 10 + size
-    crc = np.uint32(0xFFFF)
-    for i in range(at + 1, end):
-        crc = crc >> np.uint32(8) ^ np.uint32(_CHECKSUM[(crc ^ out[i]) & np.uint32(0xFF)])
-    extra = np.uint32(_EXTRAS[kind])
-    crc = crc >> np.uint32(8) ^ np.uint32(_CHECKSUM[(crc ^ extra) & np.uint32(0xFF)])
-    out[end] = crc & np.uint32(0xFF)
-    out[end + 1] = crc >> np.uint32(8)
+    for i in range(size):
+        out[at + 10 + i] = payload.octets[i]
+    crc = _checksum(out, at + 1, end, _EXTRAS[kind])
+    out[end] = crc & 0xFF
+    out[end + 1] = crc >> 8
     behind: int = end + 2
     return behind
+
+
+@kernel
+def _checksum(octets: Any, begin: int, end: int, extra: int) -> int:
+    """CRC-16/MCRF4XX of these octets and the message's extra one."""
+    crc: Any = np.int64(0xFFFF)
+    for i in range(begin, end):
+        crc = crc >> 8 ^ np.int64(_CHECKSUM[(crc ^ octets[i]) & 0xFF])
+    whole: int = crc >> 8 ^ np.int64(_CHECKSUM[(crc ^ extra) & 0xFF])
+    return whole

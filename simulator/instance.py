@@ -19,7 +19,7 @@ from simulator.impairment import frames
 from simulator.injection import prepare
 from simulator.plant import STEP_S, Plant
 from simulator.server import Server
-from simulator.stretch import LONGEST
+from simulator.stretch import LONGEST, Stretch
 from simulator.strict import Strict
 from simulator.telemetry import View
 
@@ -62,6 +62,7 @@ class Instance:
         self.ground = Server(
             self.view, firmware.ground_rates_hz if ground_link else {}, strict=self._strict
         )
+        self._stretch = Stretch(self.view, (self.companion, self.ground))
         self.steps = 0
         self._injection = prepare(faults, seed)
         self._arrived: list[bytes] = []
@@ -97,6 +98,7 @@ class Instance:
             self._spread_texts()
         self.companion.step()
         self.ground.step()
+        self._stretch.say()
         if self._injection is not None:
             self._arrived += self._injection.down.carry(self.companion.drain(), self._now_us)
 
@@ -106,22 +108,22 @@ class Instance:
         while self.time_s < end_s:
             first_ms = -(-self._barrier_ms // interval_ms) * interval_ms
             left = min(first_ms / STEP_MS - self.steps, (end_s - self.time_s) / STEP_S)
-            if not self._stretch(int(left)):
+            if not self._leap(int(left)):
                 self.advance()
             if self.barrier_due():
                 return True
         return False
 
-    def _stretch(self, most: int) -> bool:
+    def _leap(self, most: int) -> bool:
         """Fly up to so many steps in one go, if nothing but flight and telemetry is in them."""
         if self._injection is not None or self.steps < self._back_at_step:
             return False
-        if not self.companion.only_streams:
+        if not self._stretch.possible:
             return False
-        count = min(most, LONGEST, self.autopilot.quiet_steps, self.ground.mute_steps)
+        count = min(most, LONGEST, self.autopilot.quiet_steps)
         if count < 1:
             return False
-        self.steps += self.companion.fly(count)
+        self.steps += self._stretch.fly(count)
         return True
 
     def step(self) -> list[bytes]:

@@ -9,10 +9,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.linalg import expm
+
+from offboard.model.kernel import kernel
 
 Array = NDArray[np.float64]
 
@@ -84,7 +85,7 @@ def _square_root(covariance: Array) -> Array:
     return np.ascontiguousarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
 
-@numba.njit(cache=True)
+@kernel
 def _scramble(word: np.uint64) -> np.uint64:
     """Finaliser of the SplitMix64 generator (Steele, Lea, Flood 2014)."""
     word = (word ^ (word >> np.uint64(30))) * np.uint64(0xBF58476D1CE4E5B9)
@@ -92,7 +93,7 @@ def _scramble(word: np.uint64) -> np.uint64:
     return word ^ (word >> np.uint64(31))
 
 
-@numba.njit(cache=True)
+@kernel
 def fill_normals(seed: np.uint64, lane: np.uint64, step: int, out: Array) -> None:
     """Fill `out` (n,) with the standard normals of this lane and step (Box-Muller)."""
     key = _scramble(seed + np.uint64(step) * _STEP_STRIDE + lane * _LANE_STRIDE)
@@ -108,7 +109,7 @@ def fill_normals(seed: np.uint64, lane: np.uint64, step: int, out: Array) -> Non
             out[i + 1] = radius * math.sin(angle)
 
 
-@numba.njit(cache=True)
+@kernel
 def advance_block(
     transition: Array,
     scale: Array,

@@ -23,7 +23,8 @@ from simulator.parameters import ParameterTable
 from simulator.plant import STEP_S, Demand
 from simulator.position_loop import PositionLoop
 
-LOOP_S = 0.008  # the position loop runs at every second step, as PX4's does on its estimate
+LOOP_STEPS = 2  # the position loop runs at every second step, as PX4's does on its estimate
+LOOP_S = LOOP_STEPS * STEP_S
 CONTACT_S = 0.3  # on the ground, wanting down: then the motors idle
 AIRBORNE_S = 0.1
 _ARRIVED_M = 1.0
@@ -31,6 +32,7 @@ _STICK_LESS_THRUST = 0.08  # MPC_MANTHR_MIN
 _TILT_BOOST_MAX = 10.0
 _LOW_THRUST_SHARE = 0.6  # of hover: less cannot lift
 _LIFTING = frozenset({Behaviour.TAKEOFF, Behaviour.SETPOINT, Behaviour.MISSION})
+_STANDING = frozenset({Behaviour.HOLD, Behaviour.SETPOINT})
 OFF = Demand()
 
 
@@ -59,11 +61,12 @@ class Pilot:
     ) -> None:
         self._firmware = firmware
         self._parameters = parameters
-        self._loop = PositionLoop(firmware.gains)
+        self.loop = PositionLoop(firmware.gains)
         self.mission = mission or Mission(firmware.origin)
         self.events = self.mission.events  # for the autopilot
         self.behaviour = Behaviour.HOLD
         self._hold: Triple = (0.0, 0.0, 0.0)
+        self._held = MotionSetpoint(self._hold)
         self._takeoff_z_m = math.nan
         self._return_stage = 0
         self._demand = OFF
@@ -106,7 +109,7 @@ class Pilot:
         self.climbed = False
         self._next_loop_s = 0.0
         self._source = None
-        self._loop.reset(nav.yaw_rad)
+        self.loop.reset(nav.yaw_rad)
         if behaviour is Behaviour.MISSION:
             self.mission.begin(nav.position_ned_m, self.landed, self.home_ned_m)
 
@@ -117,7 +120,7 @@ class Pilot:
         self._armed_for_s = 0.0
         self._hold = nav.position_ned_m
         self._attitude = _level(nav.yaw_rad)
-        self._loop.reset(nav.yaw_rad)
+        self.loop.reset(nav.yaw_rad)
 
     def fly(self, time_s: float, armed: bool, look: Callable[[], Nav]) -> Demand:
         """The demand for the step that begins now. `look` gives the estimate when it is needed."""
@@ -133,7 +136,7 @@ class Pilot:
             self._armed_for_s += LOOP_S
             nav = look()
             if self.behaviour is Behaviour.LEVEL:
-                self._set(_level(self._loop.yaw_rad), None, _STICK_LESS_THRUST)
+                self._set(_level(self.loop.yaw_rad), None, _STICK_LESS_THRUST)
             elif setpoint is None:
                 self._fly_motion(nav, time_s)
             elif setpoint.climb_mps is not None or self._boosts_thrust:
@@ -142,36 +145,53 @@ class Pilot:
         return self._demand
 
     def flies_itself(self, armed: bool, on_ground: bool) -> bool:
-        """Whether `fly` will repeat its demand until somebody speaks or the ground is touched."""
+        """Whether `fly` will do no more than repeat its demand, or run the position loop on an
+        unchanged setpoint, until somebody speaks or the ground is touched."""
         if not armed:
             return self.landed and self._demand is OFF
+        if self.landed or on_ground or self.climbed or self.events or self._ground_s:
+            return False
         setpoint = self._attitude_setpoint
-        return (
-            setpoint is not None
-            and setpoint is self._source
-            and setpoint.climb_mps is None
-            and not (self.landed or on_ground or self.climbed or self.events)
-            and not self._boosts_thrust
-        )
+        if setpoint is None:
+            return self.behaviour in _STANDING
+        return setpoint is self._source and setpoint.climb_mps is None and not self._boosts_thrust
+
+    def next_loop_step(self, step: int, never: int) -> int:
+        """When the position loop, told all it needs, is to be run in place of `fly`."""
+        if self._demand is OFF or self._attitude_setpoint is not None:
+            return never
+        self.motion = self._standing_motion()
+        self.loop.demand(LOOP_S, self.motion, *self._limits)
+        self.loop.record["integrates"] = True
+        return self._loop_step(step)
+
+    def _loop_step(self, step: int) -> int:
+        """The first step from this one on at which `fly` does more than repeat its demand."""
+        return max(step, math.ceil((self._next_loop_s - 1e-6) / STEP_S))
 
     def flown(self, first_step: int, count: int) -> None:
-        """Keep `fly`'s clocks for steps in which it was not asked, as `flies_itself` allows."""
-        if self._demand is OFF:
+        """Keep up with steps in which `fly` was not asked, as `flies_itself` allows."""
+        loop_step = self._loop_step(first_step)
+        if self._demand is OFF or loop_step >= first_step + count:
             return
-        for step in range(first_step, first_step + count):
-            time_s = step * STEP_S
-            if time_s >= self._next_loop_s - 1e-6:
-                self._next_loop_s = time_s + LOOP_S
-                self._armed_for_s += LOOP_S
-                self._ground_s = 0.0
-                if not self._firmware.setpoint_decides_flight:
-                    self._air_s += LOOP_S
+        loops = (first_step + count - 1 - loop_step) // LOOP_STEPS + 1
+        self._next_loop_s = (loop_step + LOOP_STEPS * (loops - 1)) * STEP_S + LOOP_S
+        for _ in range(loops):
+            self._armed_for_s += LOOP_S
+            if not self._firmware.setpoint_decides_flight:
+                self._air_s += LOOP_S
+        if self._attitude_setpoint is None:
+            attitude, thrust, wanted = self.loop.result
+            self._attitude = attitude
+            self._wants_down = not _wants_up(wanted, self.motion)
+            self.thrust_demanded = thrust
+            self._set(attitude, None, thrust)
 
     def level(self, nav: Nav) -> None:
         """Nobody says what to do: level, course and height as they are."""
         self._levelling = AttitudeSetpoint(_level(nav.yaw_rad), None, 0.0, climb_mps=0.0)
         self.setpoint = self._levelling
-        self._loop.reset(nav.yaw_rad)
+        self.loop.reset(nav.yaw_rad)
 
     @property
     def obeys_attitude(self) -> bool:
@@ -219,7 +239,7 @@ class Pilot:
         """What of an attitude setpoint needs the estimate: the climb rate, the tilt."""
         if setpoint.climb_mps is not None:
             climb = MotionSetpoint(velocity_ned_mps=(math.nan, math.nan, -setpoint.climb_mps))
-            _, self._climb_thrust, _ = self._loop.step(
+            _, self._climb_thrust, _ = self.loop.step(
                 LOOP_S,
                 nav.position_ned_m,
                 nav.velocity_ned_mps,
@@ -243,16 +263,9 @@ class Pilot:
         if self.landed and lifting and self._ramp_s < 0.0:
             self._hold = nav.position_ned_m
         motion = self._motion(nav, time_s)
-        cruise, up = math.inf, math.inf
-        if self.behaviour is not Behaviour.SETPOINT:
-            cruise = self._parameters.role("cruise_speed_mps")
-        if self.behaviour is Behaviour.MISSION:
-            cruise = min(cruise, self.mission.speed_mps)
-        if self.behaviour is Behaviour.TAKEOFF:
-            up = self._parameters.role("takeoff_speed_mps")
-        hover = self._parameters.role("hover_thrust")
+        hover, cruise, up = self._limits
         self.motion = motion
-        attitude, thrust, wanted = self._loop.step(
+        attitude, thrust, wanted = self.loop.step(
             LOOP_S,
             nav.position_ned_m,
             nav.velocity_ned_mps,
@@ -271,6 +284,26 @@ class Pilot:
         self.thrust_demanded = thrust
         self._set(attitude, None, thrust)
 
+    @property
+    def _limits(self) -> tuple[float, float, float]:
+        """Hover thrust, and the speeds that the behaviour allows, across and upwards, m/s."""
+        cruise, up = math.inf, math.inf
+        if self.behaviour is not Behaviour.SETPOINT:
+            cruise = self._parameters.role("cruise_speed_mps")
+        if self.behaviour is Behaviour.MISSION:
+            cruise = min(cruise, self.mission.speed_mps)
+        if self.behaviour is Behaviour.TAKEOFF:
+            up = self._parameters.role("takeoff_speed_mps")
+        return self._parameters.role("hover_thrust"), cruise, up
+
+    def _standing_motion(self) -> MotionSetpoint:
+        """What is held or asked for, the same object as long as it is the same."""
+        if self.behaviour is Behaviour.SETPOINT and isinstance(self.setpoint, MotionSetpoint):
+            return self.setpoint
+        if self._held.position_ned_m is not self._hold:
+            self._held = MotionSetpoint(self._hold)
+        return self._held
+
     def _lift(
         self, wants_up: bool, thrust: float, hover: float, nav: Nav
     ) -> tuple[Quaternion, float]:
@@ -278,15 +311,12 @@ class Pilot:
         if self._ramp_s < 0.0 or wants_up:
             self._ramp_s += LOOP_S
         if self._ramp_s <= 0.0 or not wants_up:
-            self._loop.reset(nav.yaw_rad)
+            self.loop.reset(nav.yaw_rad)
             return _level(nav.yaw_rad), 0.0
         share = min(1.0, self._ramp_s / self._firmware.thrust_ramp_s)
-        return _level(self._loop.yaw_rad), share * max(thrust, 1.2 * hover)
+        return _level(self.loop.yaw_rad), share * max(thrust, 1.2 * hover)
 
     def _motion(self, nav: Nav, time_s: float) -> MotionSetpoint:
-        hold_x, hold_y, hold_z = self._hold
-        if self.behaviour is Behaviour.SETPOINT and isinstance(self.setpoint, MotionSetpoint):
-            return self.setpoint
         if self.behaviour is Behaviour.TAKEOFF:
             return self._takeoff(nav)
         if self.behaviour is Behaviour.RETURN:
@@ -297,7 +327,7 @@ class Pilot:
             return _sink(self._hold, self._land_speed(nav))
         if self.behaviour is Behaviour.DESCEND:
             return _sink(self._hold, self._firmware.descend_speed_mps)
-        return MotionSetpoint((hold_x, hold_y, hold_z))
+        return self._standing_motion()
 
     def _takeoff(self, nav: Nav) -> MotionSetpoint:
         target_z = self._takeoff_z_m
@@ -364,7 +394,7 @@ class Pilot:
             self._ramp_s = 0.0
         elif self.landed and self._air_s >= AIRBORNE_S:
             self.landed = False
-            self._loop.reset(self._loop.yaw_rad)
+            self.loop.reset(self.loop.yaw_rad)
 
 
 def _level(yaw_rad: float) -> Quaternion:

@@ -7,11 +7,12 @@ one compiled call per `advance`. It knows no modes, no arming and no MAVLink.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.model.kernel import address, entry, kernel
 from offboard.model.rigid_body import RK4_SCRATCH_ROWS
 from offboard.model.state import QUATERNION
 from offboard.model.vehicle import Triple, Vehicle
@@ -34,7 +35,7 @@ from simulator.attitude import (
     encode,
 )
 from simulator.conditions import Conditions
-from simulator.noise import advance_block, fill_normals, seed_word
+from simulator.noise import LinearProcess, advance_block, fill_normals, seed_word
 from simulator.sensors import (
     ATTITUDE,
     EAST,
@@ -46,6 +47,7 @@ from simulator.sensors import (
     REPORT_WIDTH,
     STANDING_NOISE,
     VELOCITY,
+    WHITE_COUNT,
     YAW,
     error_model,
     error_process,
@@ -53,31 +55,70 @@ from simulator.sensors import (
     turn_estimate,
     white_sds,
 )
-from simulator.wind import dryden, wind_axes
+from simulator.wind import GUST_COUNT, dryden, wind_axes
 
 __all__ = ["STEP_S", "Conditions", "Demand", "Estimate", "Plant", "Truth"]
 
 Array = NDArray[np.float64]
+
+_MASS, _THRUST_MAX = 0, 0  # places in the constants of body and rotors
 
 STEP_S = 0.004
 """Length of an integration step, s; `advance` moves in whole steps."""
 
 # As typed numbers: compiled code is made once more for each plain constant that is handed on
 _ERROR_LANE, _GUST_LANE, _WHITE_LANE = np.uint64(0), np.uint64(1), np.uint64(2)
-_GUST_BLOCKS = ((0, 5),)
+_GUST_BLOCKS = ((0, GUST_COUNT),)
 
-# The state vector: rigid body, rotors, wind, estimator errors, gusts.
-_STATE_ENDS = np.cumsum([QUATERNION.size, ROTOR_SIZE, 3, ERROR_COUNT, 5])
+# Rows of the demand history, a power of two: more steps than any vehicle's longest delay
+_HISTORY_ROWS = 128
 
-
-# Places in the packed constants: body_constants[0] and rotor_constants[0] of `advance_steps`.
-_MASS, _THRUST_MAX = 0, 12
-
-# Places in the state vector, for compiled callers.
-CONTACT_PLACE = QUATERNION.size + CONTACT
-ACCELERATION_PLACE = QUATERNION.size + 3  # and the next two
-
-Compiled = tuple[int, bool, int, np.uint64, Array, Array, NDArray[np.int64], Array, Array, Array]
+RECORD = np.dtype(
+    [
+        ("step", "i8"),
+        ("seed", "u8"),
+        ("motors_on", "i8"),
+        ("substeps", "i8"),
+        ("gusty", "i8"),
+        ("noisy", "i8"),
+        # the truth
+        ("body", "f8", QUATERNION.size),
+        ("rotor", "f8", ROTOR_SIZE),
+        ("wind", "f8", 3),
+        ("gust", "f8", GUST_COUNT),
+        # the estimator
+        ("error", "f8", ERROR_COUNT),
+        ("offset", "f8", 3),
+        ("lag_s", "f8"),
+        ("white_sds", "f8", WHITE_COUNT),
+        # the attitude loop
+        ("row", "f8", ROW_WIDTH),
+        ("history", "f8", (_HISTORY_ROWS, ROW_WIDTH)),
+        ("delays", "i8", 5),
+        ("gains", "f8", (3, 3)),
+        # constants
+        ("body_constants", "f8", 12),
+        ("rotor_constants", "f8", 6),
+        ("air", "f8", 7),
+        ("error_transition", "f8", (ERROR_COUNT, ERROR_COUNT)),
+        ("error_scale", "f8", (ERROR_COUNT, ERROR_COUNT)),
+        ("gust_transition", "f8", (GUST_COUNT, GUST_COUNT)),
+        ("gust_scale", "f8", (GUST_COUNT, GUST_COUNT)),
+        # scratch
+        ("normals", "f8", WHITE_COUNT),
+        ("gust_normals", "f8", GUST_COUNT),
+        ("work", "f8", ERROR_COUNT),
+        ("estimated", "f8", 4),
+        ("turn", "f8", 3),
+        ("turn_error", "f8", 3),
+        ("inputs", "f8", 4),
+        ("slopes", "f8", (RK4_SCRATCH_ROWS, QUATERNION.size)),
+        # what `report_state` says
+        ("report", "f8", REPORT_WIDTH),
+    ],
+    align=True,
+)
+"""All that compiled code knows of one vehicle below its autopilot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,10 +156,10 @@ class Plant:
     """
 
     def __init__(self, vehicle: Vehicle, conditions: Conditions, seed: int) -> None:
-        self._seed = seed_word(seed)
+        self.record = np.zeros(1, RECORD)
+        self.address = address(self.record)
         self._step = 0
         self._due_s = 0.0
-        self._loop = build_loop(vehicle, STEP_S)
         self._airframe = build_airframe(
             vehicle,
             STEP_S,
@@ -128,47 +169,51 @@ class Plant:
             battery=conditions.battery,
         )
         model = error_model(conditions.estimator, conditions.white_noise)
-        self._lag_s = model.lag_s
-        self._white_sds = white_sds(model)
         errors = error_process(model, STEP_S)
-        self._gusts = dryden(conditions.gusts, STEP_S)
+        gusts = dryden(conditions.gusts, STEP_S)
+        loop = build_loop(vehicle, STEP_S)
         weakening = conditions.weakening
-        air = [
+        air = (
             *conditions.wind_ned_mps,
             *wind_axes(conditions.wind_ned_mps),
             weakening.at_s if weakening else np.inf,
             weakening.thrust_scale if weakening else 1.0,
-        ]
-        blocks = (
-            self._airframe.body,
-            self._airframe.rotor,
-            self._loop.gains,
-            air,
-            errors.transition,
-            errors.scale,
-            self._gusts.transition,
-            self._gusts.scale,
         )
-        self._constants = np.concatenate([np.ravel(block) for block in blocks])
-        self._start_state(conditions.wind_ned_mps)
+        constants = {
+            "seed": seed_word(seed),
+            "substeps": self._airframe.substeps,
+            "noisy": np.any(errors.scale != 0.0),
+            "lag_s": model.lag_s,
+            "white_sds": white_sds(model),
+            "delays": loop.delays,
+            "gains": loop.gains,
+            "body_constants": self._airframe.body,
+            "rotor_constants": self._airframe.rotor,
+            "air": air,
+            "error_transition": errors.transition,
+            "error_scale": errors.scale,
+            "gust_transition": gusts.transition,
+            "gust_scale": gusts.scale,
+        }
+        for name, value in constants.items():
+            self.record[name] = value
+        self._start(conditions.wind_ned_mps, gusts)
 
-    def _start_state(self, wind_ned_mps: Triple) -> None:
-        self._history = self._loop.history
-        self._row = np.zeros(ROW_WIDTH)
+    def _start(self, wind_ned_mps: Triple, gusts: LinearProcess) -> None:
+        record = self.record
         self._demand: Demand | None = None
-        self._motors_on = False
-        self._state = np.zeros(_STATE_ENDS[-1])
-        self._body, self._rotor, self._wind, self._error, gust = np.split(
-            self._state, _STATE_ENDS[:-1]
+        self._body, self._rotor, self._wind = (
+            record[name][0] for name in ("body", "rotor", "wind")
         )
+        self._row, self._report = record["row"][0], record["report"][0]
+        self._offset_ned_m = record["offset"][0]
+        self._reset_counter = 0
         self._body[0] = 1.0
         self._rotor[CONTACT] = 1.0
         self._wind[:] = wind_ned_mps
-        fill_normals(self._seed, _GUST_LANE, -1, gust)
-        gust[:] = self._gusts.stationary_scale @ gust
-        self._believed = np.concatenate([np.zeros(3), [self._lag_s], self._white_sds])
-        self._offset_ned_m = self._believed[:3]
-        self._reset_counter = 0
+        _draw_gusts.call(self.address)
+        record["gust"][0] = gusts.stationary_scale @ record["gust_normals"][0]
+        record["gusty"] = np.any(record["gust"] != 0.0)
 
     @property
     def time_s(self) -> float:
@@ -177,47 +222,23 @@ class Plant:
 
     def advance(self, duration_s: float, demand: Demand) -> None:
         """Hold the demand for `duration_s`; what is left of a step is owed to the next call."""
-        if demand is not self._demand:
-            encode(demand, self._row)
-            self._motors_on = demand.motors_on
-            self._demand = demand
+        self.obey(demand)
         self._due_s += duration_s
         count = int(self._due_s / STEP_S + 1e-6)
         self._due_s -= count * STEP_S
-        while count > 0:
-            done = advance_steps(
-                count,
-                self._step,
-                self._motors_on,
-                self._airframe.substeps,
-                self._seed,
-                self._row,
-                self._history,
-                self._loop.delays,
-                self._constants,
-                self._state,
-            )
-            self._step += done
-            count -= done
+        if count > 0:
+            _advance.call(count, self.address)
+            self._step += count
 
-    def compiled(self) -> Compiled:
-        """What `advance_steps` and `report_state` want, in the order of the former: for a caller
-        that is compiled itself, and tells `flown` afterwards. The demand is the last one."""
-        return (
-            self._step,
-            self._motors_on,
-            self._airframe.substeps,
-            self._seed,
-            self._row,
-            self._history,
-            self._loop.delays,
-            self._constants,
-            self._state,
-            self._believed,
-        )
+    def obey(self, demand: Demand) -> None:
+        """From the next step on this is the demand."""
+        if demand is not self._demand:
+            encode(demand, self._row)
+            self.record["motors_on"] = demand.motors_on
+            self._demand = demand
 
     def flown(self, count: int) -> None:
-        """A compiled caller took the state so many steps further."""
+        """Compiled code took the record so many steps further."""
         self._step += count
 
     def reset_estimate(self, offset_ned_m: Triple) -> None:
@@ -231,11 +252,11 @@ class Plant:
 
     def scale_mass(self, factor: float) -> None:
         """From now on the vehicle is this much heavier."""
-        self._constants[_MASS] *= factor
+        self.record["body_constants"][0, _MASS] *= factor
 
     def scale_thrust(self, factor: float) -> None:
         """From now on the rotors give this much more."""
-        self._constants[_THRUST_MAX] *= factor
+        self.record["rotor_constants"][0, _THRUST_MAX] *= factor
 
     def set_battery(self, remaining: float) -> None:
         """From now on the battery has this share of its capacity, 0 .. 1."""
@@ -259,6 +280,19 @@ class Plant:
             battery=self._airframe.battery_state(self._rotor),
         )
 
+    @property
+    def battery_constants(self) -> tuple[float, ...]:
+        """Cells, capacity A s, share at boot, resistance ohm; current A and thrust in hover."""
+        battery = self._airframe.battery
+        return (
+            battery.cells,
+            3600.0 * battery.capacity_ah,
+            battery.remaining,
+            battery.resistance_ohm,
+            battery.hover_current_a,
+            self._airframe.hover_thrust,
+        )
+
     def motion(self) -> list[float]:
         """The truth as plain numbers: attitude wxyz, rates FRD, then NED velocity, position,
         acceleration."""
@@ -277,112 +311,134 @@ class Plant:
     @property
     def estimate(self) -> Estimate:
         """What the autopilot reports now; the same however often it is asked within a step."""
-        out = self.report()
+        out = self.report().copy()
         return Estimate(
             out[POSITION], out[VELOCITY], out[ATTITUDE], out[RATES], self._reset_counter
         )
 
     def report(self) -> Array:
-        """The estimate in one array (REPORT_WIDTH,), laid out as `simulator.sensors` says."""
-        out = np.empty(REPORT_WIDTH)
-        report_state(self._state, self._believed, self._motors_on, self._seed, self._step, out)
-        return out
+        """The estimate in one array (REPORT_WIDTH,), laid out as `simulator.sensors` says; it
+        changes with the next call."""
+        _report.call(self.address)
+        seen: Array = self._report
+        return seen
 
 
-@numba.njit(cache=True)
-def report_state(
-    state: Array, believed: Array, motors_on: bool, seed: np.uint64, step: int, out: Array
-) -> None:
-    """The estimate of this state; `believed`: reset offset (3,), lag, white deviations (12,)."""
+@entry(RECORD)
+def _draw_gusts(plant: Any) -> int:
+    fill_normals(plant.seed, _GUST_LANE, -1, plant.gust_normals)
+    return 0
+
+
+@entry(RECORD)
+def _report(plant: Any) -> int:
+    report_state(plant)
+    return 0
+
+
+@entry(int, RECORD)
+def _advance(count: int, plant: Any) -> int:
+    done = 0
+    while done < count:
+        done += advance_steps(count - done, plant)
+    return done
+
+
+@kernel
+def report_state(plant: Any) -> None:
+    """Fill in the report of this state."""
     report(
-        state[:13],
-        state[16:19],
-        state[22:34],
-        believed[:3],
-        believed[3],
-        believed[4:],
-        1.0 if motors_on else STANDING_NOISE,
-        seed,
+        plant.body,
+        plant.rotor,
+        plant.error,
+        plant.offset,
+        plant.lag_s,
+        plant.white_sds,
+        1.0 if plant.motors_on else STANDING_NOISE,
+        plant.seed,
         _WHITE_LANE,
-        step,
-        out,
+        plant.step,
+        plant.normals,
+        plant.report,
     )
 
 
-@numba.njit(cache=True)
-def _stirs(values: Array) -> bool:
-    for value in values:  # noqa: SIM110 (any() compiles for longer)
-        if value != 0.0:
-            return True
-    return False
-
-
-@numba.njit(cache=True)
-def advance_steps(
-    count: int,
-    first_step: int,
-    motors_on: bool,
-    substeps: int,
-    seed: np.uint64,
-    row: Array,
-    history: Array,
-    delays: NDArray[np.int64],
-    constants: Array,
-    state: Array,
-) -> int:
-    """`count` steps in place; the steps done, which are fewer if the ground is touched or left.
-    Per step: demand into history, air, loop on the estimate, airframe, estimator errors. Packed,
-    because unpacking one argument costs a tenth of a step."""
-    body, rotor, wind = state[:13], state[13:19], state[19:22]
-    error, gust = state[22:34], state[34:39]
-    body_constants, rotor_constants = constants[:12], constants[12:18]
-    gains, air = constants[18:27].reshape(3, 3), constants[27:34]
-    error_transition = constants[34:178].reshape(12, 12)
-    error_scale = constants[178:322].reshape(12, 12)
-    gust_transition = constants[322:347].reshape(5, 5)
-    gust_scale = constants[347:372].reshape(5, 5)
-    normals, work = np.empty(ERROR_COUNT), np.empty(ERROR_COUNT)
-    estimated, turn, turn_error = np.empty(4), np.empty(3), np.empty(3)
-    inputs, scratch = np.empty(4), np.empty((RK4_SCRATCH_ROWS, 13))
-    noisy, gusty = _stirs(constants[178:322]), _stirs(gust)
-    noise_gain = 1.0 if motors_on else STANDING_NOISE
-    contact = rotor[CONTACT]
-    for step in range(first_step, first_step + count):
-        for i in range(row.shape[0]):
-            history[step % history.shape[0], i] = row[i]
-        if gusty:
-            fill_normals(seed, _GUST_LANE, step, normals[: gust.shape[0]])
-            for first, end in _GUST_BLOCKS:
-                advance_block(gust_transition, gust_scale, first, end, 1.0, normals, gust, work)
-        wind[0] = air[0] + air[3] * gust[0] - air[4] * gust[1]
-        wind[1] = air[1] + air[4] * gust[0] + air[3] * gust[1]
-        wind[2] = air[2] + gust[3]
+@kernel
+def advance_steps(count: int, plant: Any) -> int:
+    """`count` steps in place; the steps done, which are fewer if the ground is touched or left. Per step: demand into history, air, loop on the estimate, airframe, estimator
+    errors."""
+    contact = plant.rotor[CONTACT]
+    noise_gain = 1.0 if plant.motors_on else STANDING_NOISE
+    error, turn_error = plant.error, plant.turn_error
+    first = plant.step
+    for step in range(first, first + count):
+        for i in range(ROW_WIDTH):
+            plant.history[step % _HISTORY_ROWS, i] = plant.row[i]
+        _move_air(plant, step)
         turn_error[0], turn_error[1] = -error[EAST + 2], error[NORTH + 2]
         turn_error[2] = error[YAW]
-        turn_estimate(body[:4], turn_error, estimated)
-        angular_acceleration(estimated, body[4:7], history, step, delays, gains, turn_error, turn)
-        thrust = delayed_thrust(history, step, delays) if motors_on else 0.0
-        strength = air[6] if step * STEP_S >= air[5] else 1.0
-        advance_airframe(
-            body,
-            rotor,
-            thrust,
-            turn,
-            wind,
-            body_constants,
-            rotor_constants,
-            strength,
-            STEP_S,
-            substeps,
-            inputs,
-            scratch,
+        turn_estimate(plant.body, turn_error, plant.estimated)
+        angular_acceleration(
+            plant.estimated,
+            plant.body,
+            plant.history,
+            step,
+            plant.delays,
+            plant.gains,
+            turn_error,
+            plant.turn,
         )
-        if noisy:
-            fill_normals(seed, _ERROR_LANE, step, normals)
-            for first, end in ERROR_BLOCKS:
+        advance_airframe(
+            plant.body,
+            plant.rotor,
+            delayed_thrust(plant.history, step, plant.delays) if plant.motors_on else 0.0,
+            plant.turn,
+            plant.wind,
+            plant.body_constants,
+            plant.rotor_constants,
+            plant.air[6] if step * STEP_S >= plant.air[5] else 1.0,
+            STEP_S,
+            plant.substeps,
+            plant.inputs,
+            plant.slopes,
+        )
+        if plant.noisy:
+            fill_normals(plant.seed, _ERROR_LANE, step, plant.normals)
+            for start, end in ERROR_BLOCKS:
                 advance_block(
-                    error_transition, error_scale, first, end, noise_gain, normals, error, work
+                    plant.error_transition,
+                    plant.error_scale,
+                    start,
+                    end,
+                    noise_gain,
+                    plant.normals,
+                    error,
+                    plant.work,
                 )
-        if rotor[CONTACT] != contact:
-            return step + 1 - first_step
+        plant.step = step + 1
+        if plant.rotor[CONTACT] != contact:
+            done: int = step + 1 - first
+            return done
     return count
+
+
+@kernel
+def _move_air(plant: Any, step: int) -> None:
+    """Steady wind and gusts, along and across it."""
+    gust, air, wind = plant.gust, plant.air, plant.wind
+    if plant.gusty:
+        fill_normals(plant.seed, _GUST_LANE, step, plant.gust_normals)
+        for start, end in _GUST_BLOCKS:
+            advance_block(
+                plant.gust_transition,
+                plant.gust_scale,
+                start,
+                end,
+                1.0,
+                plant.gust_normals,
+                gust,
+                plant.work,
+            )
+    wind[0] = air[0] + air[3] * gust[0] - air[4] * gust[1]
+    wind[1] = air[1] + air[4] * gust[0] + air[3] * gust[1]
+    wind[2] = air[2] + gust[3]

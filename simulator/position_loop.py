@@ -7,13 +7,12 @@ velocity: with a wandering estimate it wanders, as the real ones do. Knows no mo
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.model.frames import wrap_pi
+from offboard.model.kernel import address, entry, kernel
 from simulator.firmware.base import NAN3, MotionSetpoint, PositionGains, Quaternion, Triple
 
 Array = NDArray[np.float64]
@@ -29,35 +28,70 @@ _AT_REST = (0.0,) * 6 + NAN3
 # Gains: position P, velocity P, I and D of north, east and down, and then these.
 _SPEED_DOWN, _CUTOFF = 12, 13
 
+RECORD = np.dtype(
+    [
+        ("state", "f8", 9),
+        ("gains", "f8", 14),
+        ("tilt_max_rad", "f8"),
+        # what is demanded, NED; not a number where nothing is
+        ("position", "f8", 3),
+        ("velocity", "f8", 3),
+        ("acceleration", "f8", 3),
+        ("yaw_rad", "f8"),
+        ("yaw_rate_radps", "f8"),
+        # and how
+        ("period_s", "f8"),
+        ("speed_xy_mps", "f8"),
+        ("speed_up_mps", "f8"),
+        ("hover_thrust", "f8"),
+        ("integrates", "i8"),
+        # the estimate: position and velocity NED
+        ("estimate", "f8", 6),
+        # what comes out
+        ("course_rad", "f8"),
+        ("attitude", "f8", 4),
+        ("thrust", "f8"),
+        ("wanted_velocity", "f8", 3),
+        ("wanted_acceleration", "f8", 3),
+    ],
+    align=True,
+)
+"""All that compiled code knows of one position loop."""
 
-@numba.njit(cache=True)
+
+@kernel
 def _or_zero(value: float) -> float:
     return 0.0 if math.isnan(value) else value
 
 
-@dataclass(slots=True)
 class PositionLoop:
     """Loop with its integrators."""
 
-    gains: PositionGains
-    yaw_rad: float = 0.0
-    _state: Array = field(default_factory=lambda: np.array(_AT_REST))
-    _packed: Array = field(init=False)
-
-    def __post_init__(self) -> None:
-        gains = self.gains
+    def __init__(self, gains: PositionGains) -> None:
+        self.gains = gains
+        self.record = np.zeros(1, RECORD)
+        self.address = address(self.record)
         across = (gains.position_xy_ps, *gains.velocity_xy)
         up = (gains.position_z_ps, *gains.velocity_z)
         limits = (gains.speed_down_mps, gains.derivative_cutoff_hz)
-        self._packed = np.array([*across, *across, *up, *limits])
+        self.record["gains"] = (*across, *across, *up, *limits)
+        self.record["tilt_max_rad"] = gains.tilt_max_rad
+        self._estimate = self.record["estimate"][0]
+        self._state = self.record["state"][0]
+        self._demand: MotionSetpoint | None = None
         # compiles, which would be a stall of a second in flight
         self.step(1.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), MotionSetpoint(), 0.5)
-        self.reset(self.yaw_rad)
+        self.reset(0.0)
+
+    @property
+    def yaw_rad(self) -> float:
+        """The course that it flies."""
+        return float(self.record["course_rad"][0])
 
     def reset(self, yaw_rad: float) -> None:
         """Forget integrators and derivative; hold the present course."""
         self._state[:] = _AT_REST
-        self.yaw_rad = yaw_rad
+        self.record["course_rad"] = yaw_rad
 
     def step(
         self,
@@ -75,34 +109,72 @@ class PositionLoop:
 
         The speeds lower the limits of the gains. `integrate` False freezes the integrators.
         """
-        gains = self.gains
-        acceleration, wanted = _demand(
-            self._state,
-            self._packed,
-            position_ned_m,
-            velocity_ned_mps,
-            demand.position_ned_m,
-            demand.velocity_ned_mps,
-            demand.acceleration_ned_mps2,
-            (
-                duration_s,
-                min(speed_xy_mps, gains.speed_xy_mps),
-                min(speed_up_mps, gains.speed_up_mps),
-            ),
-            integrate,
-        )
-        self._turn(duration_s, demand)
-        attitude, thrust = _compose(acceleration, gains.tilt_max_rad, hover_thrust, self.yaw_rad)
-        return attitude, thrust, wanted
+        self.demand(duration_s, demand, hover_thrust, speed_xy_mps, speed_up_mps)
+        self.record["integrates"] = integrate
+        self._estimate[:] = (*position_ned_m, *velocity_ned_mps)
+        _step.call(self.address)
+        return self.result
 
-    def _turn(self, duration_s: float, demand: MotionSetpoint) -> None:
-        if not math.isnan(demand.yaw_rad):
-            self.yaw_rad = demand.yaw_rad
-        elif not math.isnan(demand.yaw_rate_radps):
-            self.yaw_rad = wrap_pi(self.yaw_rad + demand.yaw_rate_radps * duration_s)
+    def demand(
+        self,
+        duration_s: float,
+        demand: MotionSetpoint,
+        hover_thrust: float,
+        speed_xy_mps: float = math.inf,
+        speed_up_mps: float = math.inf,
+    ) -> None:
+        """What `step_loop` is to fly from now on, as `step` is told."""
+        record, gains = self.record, self.gains
+        if demand is not self._demand:
+            self._demand = demand
+            record["position"] = demand.position_ned_m
+            record["velocity"] = demand.velocity_ned_mps
+            record["acceleration"] = demand.acceleration_ned_mps2
+            record["yaw_rad"] = demand.yaw_rad
+            record["yaw_rate_radps"] = demand.yaw_rate_radps
+        record["period_s"] = duration_s
+        record["speed_xy_mps"] = min(speed_xy_mps, gains.speed_xy_mps)
+        record["speed_up_mps"] = min(speed_up_mps, gains.speed_up_mps)
+        record["hover_thrust"] = hover_thrust
+
+    @property
+    def result(self) -> tuple[Quaternion, float, Triple]:
+        """What the last step gave, as `step` returns it."""
+        record = self.record
+        attitude, wanted = record["attitude"][0].tolist(), record["wanted_velocity"][0].tolist()
+        return tuple(attitude), float(record["thrust"][0]), tuple(wanted)
 
 
-@numba.njit(cache=True)
+@entry(RECORD)
+def _step(loop: Any) -> int:
+    step_loop(loop, loop.estimate)
+    return 0
+
+
+@kernel
+def step_loop(loop: Any, estimate: Array) -> None:
+    """One period on this estimate, which begins with position and velocity."""
+    _accelerate(loop, estimate)
+    if not math.isnan(loop.yaw_rad):
+        loop.course_rad = loop.yaw_rad
+    elif not math.isnan(loop.yaw_rate_radps):
+        loop.course_rad = _wrapped(loop.course_rad + loop.yaw_rate_radps * loop.period_s)
+    _compose(loop)
+
+
+@kernel
+def _wrapped(angle_rad: float) -> float:
+    """The same angle in [-pi, pi], without rounding; what is not finite is no number."""
+    if angle_rad - angle_rad != 0.0:
+        return math.nan
+    turn = 2.0 * math.pi
+    rest: float = np.fmod(angle_rad, turn)
+    if abs(rest) > math.pi:
+        rest -= math.copysign(turn, rest)
+    return rest
+
+
+@kernel
 def _facing(direction: Triple, yaw_rad: float) -> Quaternion:
     """Attitude with the third body axis along `direction` (unit, NED) and Euler yaw `yaw_rad`."""
     cos_yaw, sin_yaw = math.cos(yaw_rad), math.sin(yaw_rad)
@@ -121,67 +193,65 @@ def _facing(direction: Triple, yaw_rad: float) -> Quaternion:
     )
 
 
-@numba.njit(cache=True)
-def _demand(
-    state: Array,
-    gains: Array,
-    position: Triple,
-    velocity: Triple,
-    wanted_position: Triple,
-    wanted_velocity: Triple,
-    wanted_acceleration: Triple,
-    options: Triple,
-    integrate: bool,
-) -> tuple[Triple, Triple]:
-    """Acceleration to fly (NED) and the velocity wanted; `state` is moved on by one period.
-
-    `options`: duration s, speed limit across and upwards m/s.
-    """
-    duration_s, speed_xy_mps, speed_up_mps = options
+@kernel
+def _accelerate(loop: Any, estimate: Array) -> None:
+    """The velocity wanted and the acceleration to fly (NED); the state is moved on."""
+    state, gains, wanted, out = (
+        loop.state,
+        loop.gains,
+        loop.wanted_velocity,
+        loop.wanted_acceleration,
+    )
     if not math.isnan(state[_VELOCITY]):
-        share = duration_s * 2.0 * math.pi * gains[_CUTOFF]
+        share = loop.period_s * 2.0 * math.pi * gains[_CUTOFF]
         share = share / (1.0 + share)
         for i in range(3):
-            slope = (velocity[i] - state[_VELOCITY + i]) / duration_s
+            slope = (estimate[3 + i] - state[_VELOCITY + i]) / loop.period_s
             state[_DERIVATIVE + i] += share * (slope - state[_DERIVATIVE + i])
-    wanted, out = np.empty(3), np.empty(3)
     for i in range(3):
-        state[_VELOCITY + i] = velocity[i]
+        state[_VELOCITY + i] = estimate[3 + i]
         # P on the position error plus the velocity demanded; NaN where neither is given
-        error = wanted_position[i] - position[i]
-        wanted[i] = wanted_velocity[i]
+        error = loop.position[i] - estimate[i]
+        wanted[i] = loop.velocity[i]
         if not math.isnan(error):
             wanted[i] = gains[4 * i] * error + _or_zero(wanted[i])
-    speed = math.hypot(_or_zero(wanted[0]), _or_zero(wanted[1]))
-    if speed > speed_xy_mps:
-        wanted[0] *= speed_xy_mps / speed
-        wanted[1] *= speed_xy_mps / speed
-    if not math.isnan(wanted[2]):
-        wanted[2] = min(gains[_SPEED_DOWN], max(-speed_up_mps, wanted[2]))
+    _limit_speed(loop)
     for i in range(3):
-        out[i] = _or_zero(wanted_acceleration[i])
+        out[i] = _or_zero(loop.acceleration[i])
         if math.isnan(wanted[i]):
             continue
         p, integral_gain, d = gains[4 * i + 1], gains[4 * i + 2], gains[4 * i + 3]
-        error = wanted[i] - velocity[i]
+        error = wanted[i] - estimate[3 + i]
         out[i] += p * error + state[i] - d * state[_DERIVATIVE + i]
-        if integrate:
-            moved = state[i] + integral_gain * error * duration_s
+        if loop.integrates:
+            moved = state[i] + integral_gain * error * loop.period_s
             state[i] = min(_INTEGRAL_MAX_MPS2, max(-_INTEGRAL_MAX_MPS2, moved))
-    return (out[0], out[1], out[2]), (wanted[0], wanted[1], wanted[2])
 
 
-@numba.njit(cache=True)
-def _compose(
-    acceleration: Triple, tilt_max_rad: float, hover_thrust: float, yaw_rad: float
-) -> tuple[Quaternion, float]:
+@kernel
+def _limit_speed(loop: Any) -> None:
+    wanted = loop.wanted_velocity
+    speed = math.hypot(_or_zero(wanted[0]), _or_zero(wanted[1]))
+    if speed > loop.speed_xy_mps:
+        wanted[0] *= loop.speed_xy_mps / speed
+        wanted[1] *= loop.speed_xy_mps / speed
+    if not math.isnan(wanted[2]):
+        wanted[2] = min(loop.gains[_SPEED_DOWN], max(-loop.speed_up_mps, wanted[2]))
+
+
+@kernel
+def _compose(loop: Any) -> None:
     """Thrust along the body axis that gives the acceleration; the vertical comes first."""
+    acceleration = loop.wanted_acceleration
     lateral = math.hypot(acceleration[0], acceleration[1])
-    lateral_max = GRAVITY_MPS2 * math.tan(tilt_max_rad)
+    lateral_max = GRAVITY_MPS2 * math.tan(loop.tilt_max_rad)
     scale = lateral_max / lateral if lateral > lateral_max else 1.0
     north, east = -acceleration[0] * scale, -acceleration[1] * scale
     length = math.sqrt(north**2 + east**2 + GRAVITY_MPS2**2)
     direction = (north / length, east / length, GRAVITY_MPS2 / length)
-    vertical = hover_thrust * (1.0 - acceleration[2] / GRAVITY_MPS2)
+    vertical = loop.hover_thrust * (1.0 - acceleration[2] / GRAVITY_MPS2)
     thrust = vertical / max(direction[2], _TILT_LIMIT_OF_THRUST)
-    return _facing(direction, yaw_rad), min(_THRUST_MAX, max(_THRUST_MIN, thrust))
+    loop.thrust = min(_THRUST_MAX, max(_THRUST_MIN, thrust))
+    attitude = _facing(direction, loop.course_rad)
+    for i in range(4):
+        loop.attitude[i] = attitude[i]

@@ -14,11 +14,11 @@ import math
 from dataclasses import dataclass
 from enum import StrEnum
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from offboard.model.kernel import kernel
 from offboard.model.vehicle import NonNegativeTriple, Parameters
 from simulator.noise import LinearProcess, block_diagonal, discretise, fill_normals
 
@@ -29,6 +29,8 @@ Rows = tuple[tuple[float, ...], ...]
 NORTH, EAST, DOWN, YAW, ERROR_COUNT = 0, 4, 8, 11, 12
 ERROR_BLOCKS = ((NORTH, EAST), (EAST, DOWN), (DOWN, YAW), (YAW, ERROR_COUNT))
 _AXIS_STRIDE = 4
+
+WHITE_COUNT = 12  # position, velocity, attitude, rates
 
 # Of the noise, with the motors standing: the IMU is far quieter then.
 STANDING_NOISE = 0.1
@@ -208,13 +210,14 @@ def white_sds(model: ErrorModel) -> Array:
     return np.concatenate([lateral, white.rates_radps])
 
 
-@numba.njit(cache=True)
-def turn_estimate(quaternion: Array, error: Array, out: Array) -> None:
-    """Quaternion (4,) turned by the small NED rotation `error` (3,) rad, into `out`, unit length.
+@kernel
+def turn_estimate(body: Array, error: Array, out: Array) -> None:
+    """The quaternion that `body` begins with, turned by the small NED rotation `error` (3,) rad,
+    into `out` (4,), unit length.
 
     A rotation (-e_bE, e_bN, e_psi) moves the thrust direction of a level body by (e_bN, e_bE).
     """
-    w, x, y, z = quaternion
+    w, x, y, z = body[0], body[1], body[2], body[3]
     a, b, c = 0.5 * error[0], 0.5 * error[1], 0.5 * error[2]
     out[0] = w - a * x - b * y - c * z
     out[1] = x + a * w + b * z - c * y
@@ -230,7 +233,7 @@ POSITION, VELOCITY, ATTITUDE, RATES = slice(0, 3), slice(3, 6), slice(6, 10), sl
 REPORT_WIDTH = 13
 
 
-@numba.njit(cache=True)
+@kernel
 def report(
     body: Array,
     acceleration: Array,
@@ -242,25 +245,25 @@ def report(
     seed: np.uint64,
     lane: np.uint64,
     step: int,
+    white: Array,
     out: Array,
 ) -> None:
     """Truth (13,) plus error, reset offset (3,) and `gain` times the white part of this step.
 
     Into `out` (REPORT_WIDTH,). `body` is [attitude, rates, velocity, position] as the rigid body
-    has it, `acceleration` NED.
+    has it; `acceleration` holds the NED one from place 3 on; `white` (WHITE_COUNT,) is scratch.
     """
-    white = np.empty(12)
     fill_normals(seed, lane, step, white)
-    for i in range(12):
+    for i in range(WHITE_COUNT):
         white[i] *= gain * sds[i]
     for axis in range(3):
         late = body[10 + axis] - lag_s * body[7 + axis]
         out[axis] = late + errors[_AXIS_STRIDE * axis] + offset[axis] + white[axis]
-        slow = body[7 + axis] - lag_s * acceleration[axis]
+        slow = body[7 + axis] - lag_s * acceleration[3 + axis]
         out[3 + axis] = slow + errors[_AXIS_STRIDE * axis + 1] + white[3 + axis]
         out[10 + axis] = body[4 + axis] + white[9 + axis]
     turn = white[6:9]
     turn[0] -= errors[EAST + 2]
     turn[1] += errors[NORTH + 2]
     turn[2] += errors[YAW]
-    turn_estimate(body[0:4], turn, out[6:10])
+    turn_estimate(body, turn, out[6:10])

@@ -12,17 +12,10 @@ from dataclasses import dataclass, field
 from simulator.codec import Decoder, Message, frame, layout
 from simulator.commands import Command, Commands
 from simulator.firmware.base import Say
-from simulator.frame_writer import KINDS
 from simulator.mission_transfer import HANDLERS as MISSION_HANDLERS
 from simulator.mission_transfer import Transfer
-from simulator.stretch import SILENT, SLOW, Stretch
 from simulator.strict import Strict
-from simulator.telemetry import (
-    BUILDERS,
-    MAV_COMP_ID_AUTOPILOT,
-    ON_POSITION_GRID,
-    View,
-)
+from simulator.telemetry import MAV_COMP_ID_AUTOPILOT, View
 
 MAV_TYPE_GCS = 6
 TEXT_LENGTH = 50
@@ -46,7 +39,8 @@ class Stream:
 class Server:
     """One link of one vehicle. `rates_hz`: what it sends without being asked.
 
-    `barrier` leaves TIMESYNC requests to `send_barrier`: in lockstep they are the clock.
+    `barrier` leaves TIMESYNC requests to `send_barrier`: in lockstep they are the clock. What
+    `streams` are due is found and written by `simulator.stretch`, which hands it to `take`.
     """
 
     view: View
@@ -56,30 +50,26 @@ class Server:
     decoder: Decoder = field(default_factory=Decoder)
     heard: bool = False
     answered_ns: int = -1  # ts1 of the newest TIMESYNC answer
+    sequence: int = 0
+    streams: dict[str, Stream] = field(default_factory=dict)
+    rescheduled: bool = True  # the streams are others than they were
     _ground_station: bool = False
-    _sequence: int = 0
     _out: list[bytes] = field(default_factory=list)
-    _streams: dict[str, Stream] = field(default_factory=dict)
-    _next_us: int = 0
     _text_id: int = 0
     _parameters_due: list[str] = field(default_factory=list)
-    _stretch: Stretch = field(init=False)
-    _scheduled: bool = False  # whether the stretch knows the streams
-    _odd: bool = False  # something is silent, stuck or withheld now
     _commands: Commands = field(init=False)
     _transfer: Transfer = field(init=False)
 
     def __post_init__(self) -> None:
         self._commands = Commands(self)
-        self._stretch = Stretch(self.view)
         self._transfer = Transfer(self, self.view.autopilot.mission)
         self._start_streams()
 
     def _start_streams(self) -> None:
-        self._scheduled = False
+        self.rescheduled = True
         for name, rate_hz in self.rates_hz.items():
             if not (self.barrier and name == "TIMESYNC"):
-                self._streams[name] = Stream(round(1e6 / rate_hz), 0)
+                self.streams[name] = Stream(round(1e6 / rate_hz), 0)
 
     # -- out ---------------------------------------------------------------------------------
 
@@ -91,111 +81,38 @@ class Server:
         """Queue the message of `BUILDERS` called `name`, as it is now."""
         self._frame(name, self.view.payload(name))
 
+    def take(self, frames: bytes, next_sequence: int) -> None:
+        """Queue whole frames written elsewhere, numbered from `sequence` to below this."""
+        if frames:
+            self._out.append(frames)
+        self.sequence = next_sequence
+
     def _frame(self, name: str, payload: bytes) -> None:
         system = self.view.system
-        self._out.append(
-            frame(self._sequence, system, MAV_COMP_ID_AUTOPILOT, layout(name), payload)
-        )
-        self._sequence = (self._sequence + 1) & 0xFF
+        self._out.append(frame(self.sequence, system, MAV_COMP_ID_AUTOPILOT, layout(name), payload))
+        self.sequence = (self.sequence + 1) & 0xFF
 
     def drain(self) -> list[bytes]:
         """Everything queued, as datagrams of whole frames."""
         if not self._out:
             return []
-        together = b"".join(self._out)
-        if len(together) <= DATAGRAM_MAX:
-            self._out = []
-            return [together]
-        datagrams: list[bytes] = []
-        size, start = 0, 0
-        for i, queued in enumerate(self._out):
-            if size and size + len(queued) > DATAGRAM_MAX:
-                datagrams.append(b"".join(self._out[start:i]))
-                size, start = 0, i
-            size += len(queued)
-        if start < len(self._out):
-            datagrams.append(b"".join(self._out[start:]))
-        self._out = []
-        return datagrams
+        together = self._out[0] if len(self._out) == 1 else b"".join(self._out)
+        self._out.clear()
+        return [together] if len(together) <= DATAGRAM_MAX else _datagrams(together)
 
     def step(self) -> None:
-        """Queue the telemetry that is due at this step."""
-        now_us = self._now_us
+        """Queue what is asked for and goes out bit by bit: missions, lists of parameters."""
         if self._transfer.uploading:
-            self._transfer.step(now_us * 1e-6)
+            self._transfer.step(self._now_us * 1e-6)
         if self._parameters_due:
             for name in self._parameters_due[:PARAMETERS_PER_STEP]:
                 self.send_parameter(name, listed=True)
             del self._parameters_due[:PARAMETERS_PER_STEP]
-        view = self.view
-        if self._odd or view.silent or view.stuck:
-            self._release()
-        if now_us < self._next_us:
-            return
-        self.fly(0)
-
-    @property
-    def mute_steps(self) -> int:
-        """Steps from now in which this link says nothing by itself."""
-        if self._transfer.uploading or self._parameters_due:
-            return 0
-        return -(-self._next_us // STEP_US) - self.view.autopilot.steps - 1
 
     @property
     def only_streams(self) -> bool:
         """Nothing but streams has this link to say by itself."""
-        return not (self._transfer.uploading or self._parameters_due or self._odd)
-
-    def fly(self, count: int) -> int:
-        """Take the vehicle at most `count` steps on and queue what is due; the steps flown.
-
-        0: queue what is due now. Ends early behind a step that a slow message describes.
-        """
-        if not self._scheduled:
-            self._schedule()
-        done, said, next_step = self._stretch.fly(count, self._sequence)
-        self._next_us = next_step * STEP_US
-        if done:
-            self.view.autopilot.flown(done)
-        for frame_or_name in said:
-            if isinstance(frame_or_name, bytes):
-                self._out.append(frame_or_name)
-                self._sequence = (self._sequence + 1) & 0xFF
-            else:
-                self.send_now(frame_or_name)
-        return done
-
-    def _schedule(self) -> None:
-        """Hand the streams to the compiled code, as far as it can write them."""
-        view = self.view
-        firmware = view.autopilot.firmware
-        withheld = {name for name in firmware.withheld_until if self.withheld(name)}
-        grid = firmware.position_grid_steps
-        rows = []
-        for name, stream in self._streams.items():
-            kind = SLOW
-            if name in view.silent or name in withheld:
-                kind = SILENT
-            elif name in KINDS and name not in view.stuck and view.builders[name] is BUILDERS[name]:
-                kind = KINDS.index(name)
-            steps = grid if name in ON_POSITION_GRID else 1
-            rows.append((name, kind, stream.interval_us, stream.due_us, steps))
-        self._stretch.schedule(rows)
-        self._scheduled = True
-        self._odd = bool(view.silent or view.stuck or withheld)
-
-    def _release(self) -> None:
-        """Take the streams back, because one of them changes."""
-        if self._scheduled:
-            for name, due_us in self._stretch.due_us.items():
-                self._streams[name].due_us = due_us
-        self._scheduled = False
-
-    def withheld(self, name: str) -> bool:
-        """What the vehicle cannot say yet, whatever rate it granted."""
-        autopilot = self.view.autopilot
-        event = autopilot.firmware.withheld_until.get(name)
-        return event is not None and event not in autopilot.reached
+        return not (self._transfer.uploading or self._parameters_due)
 
     @property
     def _now_us(self) -> int:
@@ -210,8 +127,8 @@ class Server:
         """As after boot: default rates, nothing queued, nobody known."""
         self._out = []
         self._parameters_due = []
-        self._streams = {}
-        self._next_us = self._sequence = self._text_id = 0
+        self.streams = {}
+        self.sequence = self._text_id = 0
         self._transfer = Transfer(self, self.view.autopilot.mission)
         self._ground_station = False
         self._start_streams()
@@ -244,19 +161,18 @@ class Server:
         if interval_us == 0:
             rate_hz = self.rates_hz.get(name)
             interval_us = -1.0 if rate_hz is None else 1e6 / rate_hz
-        self._release()
+        self.rescheduled = True
         if interval_us < 0:
-            self._streams.pop(name, None)
+            self.streams.pop(name, None)
             return True
         stream = Stream(round(min(INTERVAL_MAX_US, max(1.0, interval_us))), 0)
         stream.due_us = _next_multiple(self._now_us, stream)
-        self._streams[name] = stream
-        self._next_us = 0
+        self.streams[name] = stream
         return True
 
     def interval_us(self, name: str) -> int:
         """Interval of a message; -1 when it is not sent by itself."""
-        stream = self._streams.get(name)
+        stream = self.streams.get(name)
         return -1 if stream is None else stream.interval_us
 
     # -- in ----------------------------------------------------------------------------------
@@ -370,6 +286,19 @@ HANDLERS: dict[str, Callable[[Server, Message], None]] = {
     "REQUEST_DATA_STREAM": Server._request_data_stream,
     "FILE_TRANSFER_PROTOCOL": Server._file_transfer,
 }
+
+
+def _datagrams(frames: bytes) -> list[bytes]:
+    """Many unsigned frames, cut between frames into pieces that a datagram holds."""
+    datagrams: list[bytes] = []
+    begin = at = 0
+    while at < len(frames):
+        length = 12 + frames[at + 1]
+        if at + length - begin > DATAGRAM_MAX:
+            datagrams.append(frames[begin:at])
+            begin = at
+        at += length
+    return [*datagrams, frames[begin:]]
 
 
 def _next_multiple(now_us: int, stream: Stream) -> int:

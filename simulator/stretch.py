@@ -1,201 +1,253 @@
 """Stretches of flight in which nothing happens, in one compiled call.
 
-While the demand stands, nobody speaks and no rule can fire, a vehicle only flies and reports. A
-`Stretch` takes a link's streams through such steps with the bytes that single steps would give.
-How long a stretch may be is for others to say (`simulator.instance`).
+While the demand stands or only the position loop changes it, nobody speaks and no rule can fire, a
+vehicle only flies and reports. A `Stretch` takes it through such steps and fills its links with the
+bytes that single steps would give. How long a stretch may be is for others to say
+(`simulator.instance`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Any
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
 
-from simulator.frame_writer import (
-    EAST_DEGREES_PER_M,
-    FRAME_MAX,
-    HOME_DOWN,
-    ORIGIN,
-    PAYLOAD_MAX,
-    SEEN_WIDTH,
-    TRUE_ACCELERATION,
-    TRUE_ATTITUDE,
-    TRUE_DOWN,
-    write_frame,
-)
-from simulator.plant import ACCELERATION_PLACE, CONTACT_PLACE, advance_steps, report_state
-from simulator.sensors import REPORT_WIDTH
+from offboard.model.kernel import address, entry, kernel
+from simulator import frame_writer, plant, position_loop
+from simulator.airframe import CONTACT
+from simulator.attitude import encode_attitude
+from simulator.frame_writer import FRAME_MAX, KINDS, write_frame
+from simulator.plant import advance_steps, report_state
+from simulator.position_loop import step_loop
+from simulator.server import Server, Stream
+from simulator.telemetry import ON_POSITION_GRID, View
 
-if TYPE_CHECKING:
-    from simulator.telemetry import View
-
-Array = NDArray[np.float64]
-Integers = NDArray[np.int64]
-Bytes = NDArray[np.uint8]
-
-LONGEST = 25  # steps of one stretch, so that its frames fit the buffer
-_FOREVER = 1 << 62
-_KIND, _INTERVAL_US, _DUE_US, _GRID = range(4)
+LONGEST = 25  # steps of one stretch
+NO_LOOP = 1 << 62  # the step at which a position loop runs that does not
 _STEP_US = 4000
+_LOOP_STEPS = 2  # `simulator.pilot.LOOP_S`
+_ROWS_MAX = 128
+_OUT_BYTES = 65536
+_LINK, _KIND, _INTERVAL_US, _DUE_US, _GRID = range(5)
+_SLOW, _SILENT = -1, -2  # instead of a place in KINDS: Python writes it; it is not to be said
+_ENDS, _SEQUENCES, _GAP_COUNT, _NEXT_STEP = 0, 2, 4, 5
 
-
-SLOW, SILENT = -1, -2  # instead of a place in KINDS: Python writes it; it is not to be said
+LINKS = np.dtype(
+    [
+        ("count", "i8"),
+        ("rows", "i8", (_ROWS_MAX, 5)),  # the streams, those of one link together
+        # per link: end of what it said, its next sequence number; then how many gaps there are,
+        # and the step at which somebody speaks next
+        ("tally", "i8", 6),
+        ("gaps", "i8", (_ROWS_MAX, 4)),  # left to Python: row, link, place in `out`, number
+        ("out", "u1", (2, _OUT_BYTES)),
+    ],
+    align=True,
+)
+"""What the links of one vehicle say by themselves, and what they said in a stretch."""
 
 
 class Stretch:
-    """The streams of one link, kept for compiled code."""
+    """The streams of a vehicle's two links, kept for compiled code."""
 
-    def __init__(self, view: View) -> None:
+    def __init__(self, view: View, links: tuple[Server, Server]) -> None:
         self._view = view
-        self._seen = np.zeros(SEEN_WIDTH)
-        self._seen[ORIGIN] = view.autopilot.firmware.origin
-        self._seen[EAST_DEGREES_PER_M] = view.east_degrees_per_m
-        self._frames = np.zeros(0, np.uint8)
-        self._ends = np.zeros((0, 2), np.int64)
-        self._rows = np.zeros((0, 4), np.int64)
-        self._names: list[str] = []
+        self._links = links
+        self._streams: list[tuple[str, Stream]] = []
+        self._record = np.zeros(1, LINKS)
+        self._rows, self._gaps = self._record["rows"][0], self._record["gaps"][0]
+        self._tally, self._out = self._record["tally"][0], self._record["out"][0]
+        self._payload = np.zeros(1, frame_writer.PAYLOAD)
+        self._fixed = (address(view.record), address(self._record), address(self._payload))
+        self._next_step = 0
+        self._odd = False  # something is silent, stuck or withheld now
 
-    def schedule(self, streams: Sequence[tuple[str, int, int, int, int]]) -> None:
-        """Take these streams, in this order: name, place in KINDS (or SLOW or SILENT), interval
-        and next time in microseconds, and of how many steps it keeps to the multiples."""
-        self._names = [stream[0] for stream in streams]
-        self._rows = np.array([stream[1:] for stream in streams], np.int64).reshape(-1, 4)
-        self._ends = np.zeros((LONGEST * len(streams), 2), np.int64)
-        self._frames = np.zeros(len(self._ends) * FRAME_MAX, np.uint8)
+    def say(self) -> None:
+        """Queue on each link what is due at this step."""
+        view = self._view
+        if self._odd or view.silent or view.stuck or self._rescheduled:
+            self._schedule()
+        if view.autopilot.steps >= self._next_step:
+            self._fly(0, NO_LOOP)
 
     @property
-    def due_us(self) -> dict[str, int]:
-        """When each stream is due next."""
-        return dict(zip(self._names, self._rows[:, _DUE_US].tolist(), strict=True))
+    def possible(self) -> bool:
+        """Nothing but streams has either link to say by itself, and none of them is tampered with;
+        what tampers with them is no stranger to single steps."""
+        one, other = self._links
+        return one.only_streams and other.only_streams and not self._odd
 
-    def fly(self, count: int, sequence: int) -> tuple[int, list[bytes | str], int]:
-        """At most `count` steps (no more than LONGEST), and what is due in them; 0: due now.
+    def fly(self, count: int) -> int:
+        """Take the vehicle at most `count` steps on (no more than LONGEST) and queue what is due.
 
-        Ends behind the step in which the ground is touched or left, or a slow message is due.
-        Returns the steps, frames or names of slow messages whose numbers are kept free, and the
-        next step at which something is due.
+        Ends behind the step in which the ground is touched or left, or one that a slow message
+        describes. Returns the steps.
         """
+        if self._rescheduled:
+            self._schedule()
+        autopilot = self._view.autopilot
+        return self._fly(count, autopilot.pilot.next_loop_step(autopilot.steps, NO_LOOP))
+
+    def _fly(self, count: int, loop_step: int) -> int:
         view = self._view
         autopilot = view.autopilot
-        plant = autopilot.plant
-        self._seen[HOME_DOWN] = autopilot.pilot.home_ned_m[2]
-        done, spoken, next_step = _fly(
+        view.note()
+        one, other = self._links
+        self._tally[_SEQUENCES:_GAP_COUNT] = one.sequence, other.sequence
+        done = _fly.call(
             count,
             autopilot.steps,
-            view.clock_offset_us,
-            plant.reset_counter,
-            view.system,
-            sequence,
-            self._rows,
-            self._seen,
-            self._frames,
-            self._ends,
-            *plant.compiled(),
+            loop_step,
+            autopilot.plant.address,
+            autopilot.pilot.loop.address,
+            *self._fixed,
         )
-        plant.flown(done)
-        said: list[bytes | str] = []
-        if spoken:
-            ends = self._ends[:spoken].tolist()
-            data = self._frames[: ends[-1][0]].tobytes()
-            begin = 0
-            for end, slow in ends:
-                said.append(data[begin:end] if slow < 0 else self._names[slow])
-                begin = end
-        return done, said, next_step
+        if done:
+            autopilot.flown(done)
+        self._deliver()
+        return done
+
+    def _deliver(self) -> None:
+        """Give each link what it said; ask for what only Python can say."""
+        *tally, gap_count, self._next_step = self._tally.tolist()
+        begun = [0, 0]
+        if gap_count:
+            for row, number, place, sequence in self._gaps[:gap_count].tolist():
+                link = self._links[number]
+                link.take(self._out[number, begun[number] : place].tobytes(), sequence)
+                link.send_now(self._streams[row][0])
+                begun[number] = place
+        for number, link in enumerate(self._links):
+            if tally[number] > begun[number]:
+                said = self._out[number, begun[number] : tally[number]].tobytes()
+                link.take(said, tally[_SEQUENCES + number])
+
+    # -- the streams -------------------------------------------------------------------------
+
+    @property
+    def _rescheduled(self) -> bool:
+        return self._links[0].rescheduled or self._links[1].rescheduled
+
+    def _schedule(self) -> None:
+        """Take the links' streams, as far as compiled code can write them."""
+        view = self._view
+        self._hand_back()
+        firmware = view.autopilot.firmware
+        withheld = {name for name in firmware.withheld_until if view.withheld(name)}
+        rows = []
+        for number, link in enumerate(self._links):
+            link.rescheduled = False
+            for name, stream in link.streams.items():
+                kind = _SLOW
+                if name in view.silent or name in withheld:
+                    kind = _SILENT
+                elif name not in view.stuck and view.is_common(name) and name in KINDS:
+                    kind = KINDS.index(name)
+                grid = firmware.position_grid_steps if name in ON_POSITION_GRID else 1
+                rows.append((number, kind, stream.interval_us, stream.due_us, grid))
+                self._streams.append((name, stream))
+        self._rows[: len(rows)] = np.array(rows, np.int64).reshape(-1, 5)
+        self._record["count"] = len(rows)
+        self._odd = bool(view.silent or view.stuck or withheld)
+        self._next_step = 0
+
+    def _hand_back(self) -> None:
+        """Tell the streams when they are due, and forget them."""
+        dues = self._rows[: len(self._streams), _DUE_US].tolist()
+        for (_, stream), due_us in zip(self._streams, dues, strict=True):
+            stream.due_us = due_us
+        self._streams.clear()
 
 
-@numba.njit(cache=True)
-def _next_step(rows: Integers, now: int) -> int:
-    """The first step behind `now` at which one of the streams speaks."""
-    first = _FOREVER
-    for i in range(rows.shape[0]):
-        step = max(now + 1, -(-rows[i, _DUE_US] // _STEP_US))
-        step = -(-step // rows[i, _GRID]) * rows[i, _GRID]
-        first = min(first, step)
-    return first
-
-
-@numba.njit(cache=True)
+@entry(
+    int,
+    int,
+    int,
+    plant.RECORD,
+    position_loop.RECORD,
+    frame_writer.RECORD,
+    LINKS,
+    frame_writer.PAYLOAD,
+)
 def _fly(
     count: int,
     step: int,
-    clock_offset_us: int,
-    resets: int,
-    system: int,
-    sequence: int,
-    rows: Integers,
-    seen: Array,
-    out: Bytes,
-    ends: Integers,
-    plant_step: int,
-    motors_on: bool,
-    substeps: int,
-    seed: np.uint64,
-    row: Array,
-    history: Array,
-    delays: Integers,
-    constants: Array,
-    state: Array,
-    believed: Array,
-) -> tuple[int, int, int]:
-    """Fly to the next step at which a stream speaks, write what is due, and so on."""
-    done, spoken, at = 0, 0, int(np.int64(0))  # not a constant: see `simulator.plant`
-    payload = np.empty(PAYLOAD_MAX, np.uint8)
-    contact, slow = state[CONTACT_PLACE], False
+    loop_step: int,
+    plant: Any,
+    loop: Any,
+    seen: Any,
+    links: Any,
+    scratch: Any,
+) -> int:
+    """Fly to the next step at which a link speaks, write what is due, and so on."""
+    tally = links.tally
+    tally[0] = tally[1] = tally[_GAP_COUNT] = 0
+    contact, done, reported = plant.rotor[CONTACT], 0, False
+    speaks = step
     while True:
-        speaks = step if count == 0 else _next_step(rows, step + done)
         if count > 0:
-            done += advance_steps(
-                min(count, speaks - step) - done,
-                plant_step + done,
-                motors_on,
-                substeps,
-                seed,
-                row,
-                history,
-                delays,
-                constants,
-                state,
-            )
-        now = step + done
-        if now == speaks:
-            seen_yet = False
-            for i in range(rows.shape[0]):
-                if rows[i, _DUE_US] > now * _STEP_US or now % rows[i, _GRID]:
-                    continue
-                interval_us = rows[i, _INTERVAL_US]
-                rows[i, _DUE_US] = (now * _STEP_US // interval_us + 1) * interval_us
-                kind = rows[i, _KIND]
-                if kind == SILENT:
-                    continue
-                if kind == SLOW:
-                    slow = True
-                else:
-                    if not seen_yet:
-                        _see(state, believed, motors_on, seed, plant_step + done, seen)
-                        seen_yet = True
-                    time_us = max(0, now * _STEP_US + clock_offset_us)
-                    at = write_frame(
-                        kind, seen, time_us, resets, system, sequence, payload, out, at
-                    )
-                sequence = (sequence + 1) & 0xFF
-                ends[spoken, 0] = at
-                ends[spoken, 1] = i if kind == SLOW else -1
-                spoken += 1
-        if done >= count or slow or state[CONTACT_PLACE] != contact:
-            return done, spoken, _next_step(rows, now)
+            speaks = _next_step(links, step + done)
+            goal = min(count, speaks - step)
+            while done < goal and plant.rotor[CONTACT] == contact:
+                if step + done >= loop_step:
+                    if not reported:
+                        report_state(plant)
+                    _hold(plant, loop, seen)
+                    loop_step = step + done + _LOOP_STEPS
+                done += advance_steps(min(goal, loop_step - step) - done, plant)
+                reported = False
+        if step + done == speaks:
+            if not reported:
+                report_state(plant)
+            reported = True
+            _speak(step + done, plant, seen, links, scratch)
+        full = max(tally[0], tally[1]) > _OUT_BYTES - _ROWS_MAX * FRAME_MAX
+        if done >= count or full or tally[_GAP_COUNT] or plant.rotor[CONTACT] != contact:
+            tally[_NEXT_STEP] = _next_step(links, step + done)
+            return done
 
 
-@numba.njit(cache=True)
-def _see(
-    state: Array, believed: Array, motors_on: bool, seed: np.uint64, step: int, seen: Array
-) -> None:
-    report_state(state, believed, motors_on, seed, step, seen[:REPORT_WIDTH])
+@kernel
+def _hold(plant: Any, loop: Any, seen: Any) -> None:
+    """Run the position loop on the estimate and demand what it gives."""
+    step_loop(loop, plant.report)
+    encode_attitude(loop.attitude, loop.thrust, plant.row)
     for i in range(4):
-        seen[TRUE_ATTITUDE + i] = state[i]
-    seen[TRUE_DOWN] = state[12]
-    for i in range(3):
-        seen[TRUE_ACCELERATION + i] = state[ACCELERATION_PLACE + i]
+        seen.attitude[i] = loop.attitude[i]
+    seen.thrust = seen.throttle = loop.thrust
+
+
+@kernel
+def _next_step(links: Any, now: int) -> int:
+    """The first step behind `now` at which one of the streams speaks."""
+    first = NO_LOOP
+    for i in range(links.count):
+        step = max(now + 1, -(-links.rows[i, _DUE_US] // _STEP_US))
+        grid = links.rows[i, _GRID]
+        first = min(first, -(-step // grid) * grid)
+    return first
+
+
+@kernel
+def _speak(now: int, plant: Any, seen: Any, links: Any, scratch: Any) -> None:
+    """Write what is due now."""
+    tally = links.tally
+    time_us = max(0, now * _STEP_US + seen.clock_offset_us)
+    for i in range(links.count):
+        row = links.rows[i]
+        if row[_DUE_US] > now * _STEP_US or now % row[_GRID]:
+            continue
+        row[_DUE_US] = (now * _STEP_US // row[_INTERVAL_US] + 1) * row[_INTERVAL_US]
+        link, kind = row[_LINK], row[_KIND]
+        sequence = tally[_SEQUENCES + link]
+        if kind == _SILENT:
+            continue
+        if kind == _SLOW:
+            gap = links.gaps[tally[_GAP_COUNT]]
+            gap[0], gap[1], gap[2], gap[3] = i, link, tally[link], sequence
+            tally[_GAP_COUNT] += 1
+        else:
+            tally[link] = write_frame(
+                kind, plant, seen, time_us, sequence, scratch, links.out[link], tally[link]
+            )
+        tally[_SEQUENCES + link] = (sequence + 1) & 0xFF

@@ -11,9 +11,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
+from simulator.attitude import Demand
 from simulator.autopilot import Autopilot
 from simulator.codec import layout
 from simulator.firmware.base import MotionSetpoint, Quaternion, Triple
+from simulator.frame_writer import RECORD
 from simulator.geodesy import EARTH_RADIUS_M
 from simulator.position_loop import GRAVITY_MPS2
 
@@ -57,12 +61,49 @@ class View:
     builders: dict[str, Callable[[View], Sequence[Any]]] = field(init=False)
     _at_step: int = -1
     east_degrees_per_m: float = field(init=False)
+    record: Any = field(init=False)  # what of this compiled code reads (`simulator.frame_writer`)
+    _noted: tuple[Demand, MotionSetpoint] | None = None
 
     def __post_init__(self) -> None:
         firmware = self.autopilot.firmware
         self.east_degrees_per_m = _DEGREES_PER_M / math.cos(math.radians(firmware.origin[0]))
         known = {n: b for n, b in BUILDERS.items() if n not in firmware.unknown_messages}
         self.builders = {**known, **firmware.own_messages}
+        self.record = np.zeros(1, RECORD)
+        self.record["system"] = self.system
+        self.record["origin"] = firmware.origin
+        self.record["east_degrees_per_m"] = self.east_degrees_per_m
+        self.record["battery"] = self.autopilot.plant.battery_constants
+
+    def is_common(self, name: str) -> bool:
+        """Built here, not by the firmware in a way of its own."""
+        return self.builders[name] is BUILDERS.get(name)
+
+    def withheld(self, name: str) -> bool:
+        """What the vehicle cannot say yet, whatever rate it granted."""
+        autopilot = self.autopilot
+        event = autopilot.firmware.withheld_until.get(name)
+        return event is not None and event not in autopilot.reached
+
+    def note(self) -> None:
+        """Bring the record up to date."""
+        record, autopilot = self.record, self.autopilot
+        pilot = autopilot.pilot
+        record["clock_offset_us"] = self.clock_offset_us
+        record["resets"] = autopilot.plant.reset_counter
+        record["home_down_m"] = pilot.home_ned_m[2]
+        record["sensors"] = self.sensor_bits
+        record["has_fix"] = self.has_fix
+        record["landed_state"] = autopilot.landed_state
+        record["thrust"] = pilot.thrust_demanded
+        demand, motion = pilot.demand, pilot.motion
+        if self._noted is not None and self._noted[0] is demand and self._noted[1] is motion:
+            return
+        self._noted = (demand, motion)
+        record["throttle"] = demand.thrust
+        record["attitude"] = demand.attitude or (1.0, 0.0, 0.0, 0.0)
+        record["rates_radps"] = demand.rates_frd_radps or (0.0, 0.0, 0.0)
+        record["motion"] = _fields(motion)
 
     def payload(self, name: str) -> bytes:
         """Packed payload of message `name` now; built once per step for all links."""
@@ -88,6 +129,20 @@ class View:
     def has_fix(self) -> bool:
         """No fault takes it away."""
         return self.autopilot.gps_healthy
+
+    @property
+    def sensor_bits(self) -> tuple[int, int, int]:
+        """MAV_SYS_STATUS_SENSOR: present, enabled, healthy."""
+        autopilot = self.autopilot
+        sensors = autopilot.firmware.sensors
+        present, enabled, health = sensors.present, sensors.enabled, sensors.health
+        if not autopilot.has_fix:
+            present, enabled, health = present & ~_GPS, enabled & ~_GPS, health & ~_GPS
+        elif not self.has_fix:
+            health &= ~_GPS
+        if autopilot.healthy:
+            health |= _PREARM
+        return present, enabled, health
 
     @property
     def time_ms(self) -> int:
@@ -250,11 +305,12 @@ def attitude_target(view: View) -> Sequence[Any]:
 
 
 def position_target_local_ned(view: View) -> Sequence[Any]:
-    motion: MotionSetpoint = view.autopilot.pilot.motion
+    return (view.time_ms, 1, 0, *_fields(view.autopilot.pilot.motion))
+
+
+def _fields(motion: MotionSetpoint) -> tuple[float, ...]:
+    """As POSITION_TARGET_LOCAL_NED and its like have them."""
     return (
-        view.time_ms,
-        1,
-        0,
         *motion.position_ned_m,
         *motion.velocity_ned_mps,
         *motion.acceleration_ned_mps2,
@@ -300,14 +356,7 @@ def gps_raw_int(view: View) -> Sequence[Any]:
 def sys_status(view: View) -> Sequence[Any]:
     autopilot = view.autopilot
     battery = autopilot.truth.battery
-    sensors = autopilot.firmware.sensors
-    present, enabled, health = sensors.present, sensors.enabled, sensors.health
-    if not autopilot.has_fix:
-        present, enabled, health = present & ~_GPS, enabled & ~_GPS, health & ~_GPS
-    elif not view.has_fix:
-        health &= ~_GPS
-    if autopilot.healthy:
-        health |= _PREARM
+    present, enabled, health = view.sensor_bits
     return (
         present, enabled, health, 80,
         _fit(battery.voltage_v * 1e3, 16, signed=False),

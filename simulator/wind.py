@@ -16,6 +16,9 @@ from simulator.noise import LinearProcess, block_diagonal, discretise
 
 Array = NDArray[np.float64]
 
+GUST_COUNT = 5
+"""States of the gust process."""
+
 
 class Gusts(Parameters):
     """Dryden turbulence. Standard deviations in m/s, scale lengths in m; intensity 0 is still air.

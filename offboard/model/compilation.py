@@ -8,6 +8,7 @@ all compiled sources. The user's NUMBA_CACHE_DIR has precedence.
 
 from __future__ import annotations
 
+import functools
 import hashlib
 import os
 import stat
@@ -28,7 +29,7 @@ def prepare_cache() -> Path:
     """
     chosen = os.environ.get(_VARIABLE)
     if not chosen:
-        chosen = str(_writable_directory(_sources_digest()))
+        chosen = str(_writable_directory(sources_digest()))
         os.environ[_VARIABLE] = chosen
     numba = sys.modules.get("numba")
     if numba is not None:  # imported before us: it has read its environment already
@@ -58,14 +59,15 @@ def prepare_before_numba() -> None:
         sys.meta_path.insert(0, _BeforeNumba())
 
 
-def _sources_digest() -> str:
+@functools.cache
+def sources_digest() -> str:
     """Hash of every module beside us that compiles something: their caches stand or fall as one."""
     root = Path(__file__).resolve().parents[2]
     digest = hashlib.sha256()
     for package in ("offboard", "simulator"):
         for path in sorted((root / package).rglob("*.py")):
             content = path.read_bytes()
-            if b"njit" in content:
+            if b"njit" in content or b"@kernel" in content:
                 digest.update(str(path.relative_to(root)).encode() + b"\0" + content)
     return digest.hexdigest()[:16]
 
@@ -77,7 +79,7 @@ def _writable_directory(name: str) -> Path:
             base.parent.mkdir(parents=True, exist_ok=True)
             base.mkdir(mode=0o700, exist_ok=True)
             directory.mkdir(exist_ok=True)
-            if _is_private(base):
+            if is_private(base):
                 with tempfile.TemporaryFile(dir=directory):
                     return directory
         except OSError:
@@ -91,7 +93,7 @@ def _bases() -> Iterator[Path]:
     yield Path(tempfile.gettempdir()) / f"pso-offboard-{_user()}"
 
 
-def _is_private(directory: Path) -> bool:
+def is_private(directory: Path) -> bool:
     """Cached code is executed: a directory another user owns or can write to is not for us."""
     status = directory.lstat()
     ours = os.name != "posix" or status.st_uid == _user()

@@ -16,10 +16,10 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from offboard.model.kernel import kernel
 from offboard.model.state import EULER, INPUT_SIZE, QUATERNION
 from offboard.model.vehicle import Vehicle
 
@@ -79,7 +79,7 @@ def rk4_step(
     return result.reshape(shape)
 
 
-@numba.njit(cache=True)
+@kernel
 def body_accelerations(air_velocity: Any, rates: Any, inputs: Any, parameters: Any) -> Any:
     """Newton and Euler in body axes: the one place where forces and torques are.
 
@@ -108,7 +108,7 @@ def body_accelerations(air_velocity: Any, rates: Any, inputs: Any, parameters: A
     )
 
 
-@numba.njit(cache=True)
+@kernel
 def _euler_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, out: Any) -> None:
     p, q, r = state[3], state[4], state[5]
     u, v, w = state[6], state[7], state[8]
@@ -142,7 +142,7 @@ def _euler_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, out: An
     out[11] = xd * u + yd * v + zd * w
 
 
-@numba.njit(cache=True)
+@kernel
 def _quaternion_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, out: Any) -> None:
     qw, qx, qy, qz = state[0], state[1], state[2], state[3]
     p, q, r = state[4], state[5], state[6]
@@ -180,7 +180,7 @@ def _quaternion_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, ou
     out[10], out[11], out[12] = state[7], state[8], state[9]
 
 
-@numba.njit(cache=True)
+@kernel
 def derivative_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, out: Any) -> None:
     """One state (12,) or (13,), inputs (4,), wind (3,) m/s, `pack`ed parameters -> `out`."""
     if state.shape[0] == 12:
@@ -189,7 +189,7 @@ def derivative_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, out
         _quaternion_into(state, inputs, wind_ned, parameters, out)
 
 
-@numba.njit(cache=True)
+@kernel
 def rk4_into(
     state: Any, inputs: Any, wind_ned: Any, parameters: Any, step_s: float, scratch: Any, out: Any
 ) -> None:
@@ -213,13 +213,13 @@ def rk4_into(
             out[i] /= length
 
 
-@numba.njit(cache=True)
+@kernel
 def _derivative_each(states: Any, inputs: Any, wind: Any, parameters: Any, out: Any) -> None:
     for i in range(states.shape[0]):
         derivative_into(states[i], inputs[i], wind[i], parameters, out[i])
 
 
-@numba.njit(cache=True)
+@kernel
 def _rk4_each(
     states: Any, inputs: Any, wind: Any, parameters: Any, step_s: float, out: Any
 ) -> None:

@@ -11,15 +11,16 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import OFFBOARD, TAKEOFF
 
 from simulator import config
+from simulator.attitude import Demand
 from simulator.codec import Decoder, frame, layout
 from simulator.conditions import Conditions
 from simulator.firmware.ardupilot import ARDUPILOT
-from simulator.firmware.base import Firmware
+from simulator.firmware.base import Firmware, MotionSetpoint
 from simulator.firmware.px4 import PX4
-from simulator.frame_writer import FRAME_MAX, KINDS, PAYLOAD_MAX, SEEN_WIDTH, write_frame
+from simulator.frame_writer import KINDS
 from simulator.instance import Instance
 from simulator.sensors import EstimatorName
-from simulator.stretch import Stretch
+from simulator.server import Stream
 
 SEED = 7
 
@@ -147,28 +148,57 @@ def test_a_duration_ends_between_barriers() -> None:
     assert instance.steps == 253
 
 
+def _shake(instance: Instance, random: np.random.Generator, scale: float) -> None:
+    """Some state of everything that messages tell of."""
+    autopilot, plant = instance.autopilot, instance.autopilot.plant
+    for field in ("body", "rotor", "error", "offset"):
+        values = plant.record[field][0]
+        values[:] = scale * random.standard_normal(len(values))
+    attitude = random.standard_normal(4)
+    body, rotor = plant.record["body"][0], plant.record["rotor"][0]
+    body[:4] = attitude / np.linalg.norm(attitude)
+    body[12] = -abs(body[12]) % 9e3
+    rotor[:3] = random.random(), 0.0, 10.0 * abs(rotor[2])
+    autopilot._nav = autopilot._truth = None
+    autopilot.steps = 2 * int(random.integers(0, 2**30))
+    autopilot.gps_healthy = bool(random.random() < 0.5)
+    pilot = autopilot.pilot
+    pilot.home_ned_m = (0.0, 0.0, scale)
+    pilot.landed = bool(random.random() < 0.5)
+    pilot.motion = MotionSetpoint(*(tuple(scale * random.standard_normal(3)) for _ in range(2)))
+    pilot.thrust_demanded = float(random.random())
+    given = tuple(random.standard_normal(4).tolist())
+    by_attitude = random.random() < 0.5
+    pilot._demand = Demand(
+        True, 2.0 * scale - 0.5, given if by_attitude else None, None if by_attitude else given[:3]
+    )
+
+
 @pytest.mark.parametrize("name", KINDS)
 def test_compiled_frames_are_the_readable_ones(name: str) -> None:
     """Random states, huge ones and zeros: every byte, the cut of trailing zeros, the checksum."""
     instance = _instance()
-    autopilot, plant = instance.autopilot, instance.autopilot.plant
     random = np.random.default_rng(SEED)
-    out = np.zeros(FRAME_MAX, np.uint8)
+    instance.companion.streams.clear()
+    instance.companion.streams[name] = stream = Stream(1 << 40, 0)
     for case in range(200):
-        scale = (1.0, 30.0, 1e5, 0.0)[case % 4]
-        plant._state[:19] = scale * random.standard_normal(19)
-        attitude = random.standard_normal(4)
-        plant._state[:4] = attitude / np.linalg.norm(attitude)
-        plant._state[12] = -abs(plant._state[12]) % 9e3
-        autopilot.steps = int(random.integers(0, 2**31))
-        autopilot._nav = None
-        autopilot.pilot.home_ned_m = (0.0, 0.0, scale)
-        sequence = int(random.integers(0, 256))
-        expected = frame(sequence, 1, 1, layout(name), instance.view.payload(name))
-        stretch = Stretch(instance.view)
-        stretch.schedule([(name, KINDS.index(name), 1 << 40, 0, 1)])
-        _, said, _ = stretch.fly(0, sequence)
-        assert said == [expected]
-    seen = np.zeros(SEEN_WIDTH)
-    seen[:3] = np.nan, np.inf, -np.inf
-    assert write_frame(4, seen, 0, 0, 1, 0, np.zeros(PAYLOAD_MAX, np.uint8), out, 0) > 12
+        _shake(instance, random, (1.0, 30.0, 1e5, 0.0)[case % 4])
+        instance.companion.sequence = int(random.integers(0, 256))
+        payload = instance.view.payload(name)
+        expected = frame(instance.companion.sequence, 1, 1, layout(name), payload)
+        stream.due_us = 0
+        instance.companion.rescheduled = True
+        instance._stretch.say()
+        stream.due_us = 0
+        instance._stretch._streams.clear()
+        assert instance.companion.drain() == [expected]
+
+
+def test_states_that_are_no_numbers_are_written_all_the_same() -> None:
+    instance = _instance()
+    instance.autopilot.plant.record["body"][0, 10:] = np.nan, np.inf, -np.inf
+    for name in KINDS:
+        instance.companion.set_interval(name, 4_000)
+    instance.advance_to_barrier()
+    told = {message.name for message in Decoder().read(b"".join(instance.drain()))}
+    assert told >= set(KINDS)

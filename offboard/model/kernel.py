@@ -1,0 +1,219 @@
+"""Compiled functions for processes that must not pay for numba.
+
+numba costs 100 MB and a third of a second of every start. A `Kernel` is a function that numba
+compiles when somebody first calls it. An `Entry` is what a program without numba calls instead: its
+machine code, with that of all the kernels in it, is compiled once, kept as an object file beside
+numba's own cache and loaded by llvmlite alone. Entries take integers and records (one-element
+structured arrays, by address) and return an integer; they allocate nothing and raise nothing.
+Knows neither vehicle nor controller.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import functools
+import hashlib
+import os
+import re
+import tempfile
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Generic, ParamSpec, TypeVar, cast
+
+import numpy as np
+
+from offboard.model.compilation import is_private, prepare_cache, sources_digest
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+# What machine code may leave to the process it is loaded into; numba's and Python's own are left
+# over from errors that cannot happen here
+_LIBRARY = frozenset(
+    {"sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sincos", "exp", "log", "pow", "sqrt"}
+    | {"hypot", "fmod", "floor", "rint"}
+)
+_DECLARATION = re.compile(r"^declare (?P<head>[^@\n]*)@(?P<name>[\w.]+)\((?P<rest>.*)$", re.M)
+
+
+class Kernel(Generic[P, R]):
+    """A function compiled by numba when first called from Python or from compiled code."""
+
+    def __init__(self, function: Callable[P, R]) -> None:
+        self.function = function
+        functools.update_wrapper(self, function)
+
+    @functools.cached_property
+    def dispatcher(self) -> Any:
+        import numba
+
+        return numba.njit(cache=True, error_model="numpy")(self.function)
+
+    @property
+    def _numba_type_(self) -> Any:
+        """As numba asks for it: to compiled code a kernel is its dispatcher."""
+        return self.dispatcher._numba_type_
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        return cast(R, self.dispatcher(*args, **kwargs))
+
+
+kernel = Kernel
+"""The decorator."""
+
+
+class Entry:
+    """A kernel in machine code. Call it with integers and the addresses of records."""
+
+    def __init__(self, function: Callable[..., int], parameters: tuple[Any, ...]) -> None:
+        self._function = function
+        self._parameters = parameters
+        self.symbol = f"{function.__module__}.{function.__name__}"
+
+    @functools.cached_property
+    def call(self) -> Callable[..., int]:
+        """The machine code as a function; compiled, or read from the cache, when first asked."""
+        path = _place(self.symbol)
+        code = _read(path)
+        if code is None:
+            code = self._compiled()
+            _write(path, code)
+        kinds = (ctypes.c_int64 if p is int else ctypes.c_void_p for p in self._parameters)
+        prototype = ctypes.CFUNCTYPE(ctypes.c_int64, *kinds)
+        return cast(Callable[..., int], prototype(_load(code, self.symbol)))
+
+    def _compiled(self) -> bytes:
+        import llvmlite.binding as llvm
+        from numba import cfunc, types
+
+        kinds = (types.int64 if p is int else types.voidptr for p in self._parameters)
+        compiled = cfunc(types.int64(*kinds), error_model="numpy")(self._taking_addresses())
+        module = llvm.parse_assembly(_self_contained(compiled.inspect_llvm()))
+        for function in module.functions:
+            if function.name == compiled.native_name:
+                function.name = self.symbol
+            elif not function.is_declaration:
+                function.linkage = "internal"
+        return cast(bytes, _machine().emit_object(module))
+
+    def _taking_addresses(self) -> Callable[..., int]:
+        """The function with records by address, written out, as numba wants its arguments."""
+        import numba
+
+        names = [f"a{i}" for i in range(len(self._parameters))]
+        scope: dict[str, Any] = {
+            "function": kernel(self._function),
+            "carray": vars(numba)["carray"],
+        }
+        given = []
+        for name, parameter in zip(names, self._parameters, strict=True):
+            scope[f"{name}_record"] = parameter
+            given.append(name if parameter is int else f"carray({name}, 1, {name}_record)[0]")
+        listed = ", ".join(names)
+        exec(f"def entry({listed}):\n    return function({', '.join(given)})", scope)
+        return cast(Callable[..., int], scope["entry"])
+
+
+def entry(*parameters: Any) -> Callable[[Callable[..., int]], Entry]:
+    """Decorator: `parameters` are `int` or the dtype of a record, one per argument."""
+    return lambda function: Entry(function, parameters)
+
+
+def address(record: np.ndarray[Any, Any]) -> ctypes.c_void_p:
+    """Of a record, for calls of an `Entry`; the record must outlive it."""
+    return ctypes.c_void_p(record.ctypes.data)
+
+
+def _self_contained(assembly: str) -> str:
+    """Without the parts of numba's runtime: what would raise or allocate stops the process."""
+
+    def definition(found: re.Match[str]) -> str:
+        name = found["name"]
+        if name.startswith("llvm.") or name in _LIBRARY:
+            return found[0]
+        rest = re.sub(r"\s*#\d+|\s*local_unnamed_addr", "", found["rest"])
+        return (
+            f"define internal {found['head']}@{name}({rest} {{\n"
+            "  call void @llvm.trap()\n  unreachable\n}"
+        )
+
+    text = _DECLARATION.sub(definition, assembly)
+    return text if "declare void @llvm.trap" in text else text + "\ndeclare void @llvm.trap()\n"
+
+
+# -- the cache ---------------------------------------------------------------------------------
+
+
+def _place(symbol: str) -> Path:
+    """Where the object file of this entry is for these sources, compilers and processor."""
+    import llvmlite.binding as llvm
+
+    identity = (
+        sources_digest(),
+        metadata.version("numba"),
+        metadata.version("llvmlite"),
+        llvm.get_process_triple(),
+        llvm.get_host_cpu_name(),
+        llvm.get_host_cpu_features().flatten(),
+    )
+    key = hashlib.sha256("\0".join(identity).encode()).hexdigest()[:16]
+    return prepare_cache() / f"{symbol}-{key}.o"
+
+
+def _read(path: Path) -> bytes | None:
+    """The machine code in a file of ours; None when there is none, or it is damaged."""
+    try:
+        if not is_private(path.parent):
+            return None
+        content = path.read_bytes()
+    except OSError:
+        return None
+    seal, code = content[:32], content[32:]
+    return code if hashlib.sha256(code).digest() == seal else None
+
+
+def _write(path: Path, code: bytes) -> None:
+    """Whole or not at all; without it the next start compiles again."""
+    try:
+        handle, name = tempfile.mkstemp(dir=path.parent)
+        with os.fdopen(handle, "wb") as file:
+            file.write(hashlib.sha256(code).digest() + code)
+        os.replace(name, path)
+    except OSError:
+        pass
+
+
+# -- the processor -----------------------------------------------------------------------------
+
+
+def _machine() -> Any:
+    import llvmlite.binding as llvm
+
+    llvm.initialize_native_target()
+    llvm.initialize_native_asmprinter()
+    return llvm.Target.from_default_triple().create_target_machine(
+        cpu=llvm.get_host_cpu_name(),
+        features=llvm.get_host_cpu_features().flatten(),
+        opt=3,
+        reloc="default",
+        codemodel="jitdefault",
+        jit=True,
+    )
+
+
+@functools.cache
+def _engine() -> Any:
+    import llvmlite.binding as llvm
+
+    return llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
+
+
+def _load(code: bytes, symbol: str) -> int:
+    """Address of a function in machine code."""
+    import llvmlite.binding as llvm
+
+    engine = _engine()
+    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
+    engine.finalize_object()
+    return int(engine.get_function_address(symbol))
