@@ -99,13 +99,13 @@ _CHECKSUM = _checksum_table()
 
 
 @kernel
-def _fitted(value: float, low: int, high: int) -> int:
+def _fitted(value: float, low: np.int64, high: np.int64) -> int:
     """Nearest integer within these bounds; what is not finite becomes 0."""
     if value - value != 0.0:
         return 0
     if value >= high:
-        return high
-    return max(low, int(np.rint(value)))
+        return int(high)
+    return max(int(low), int(np.rint(value)))
 
 
 @kernel

@@ -365,8 +365,10 @@ def report_state(plant: Any) -> None:
 
 @kernel
 def advance_steps(count: int, plant: Any) -> int:
-    """`count` steps in place; the steps done, which are fewer if the ground is touched or left. Per step: demand into history, air, loop on the estimate, airframe, estimator
-    errors."""
+    """`count` steps in place; the steps done, which are fewer if the ground is touched or left.
+
+    Per step: demand into history, air, loop on the estimate, airframe, estimator errors.
+    """
     contact = plant.rotor[CONTACT]
     noise_gain = 1.0 if plant.motors_on else STANDING_NOISE
     error, turn_error = plant.error, plant.turn_error
