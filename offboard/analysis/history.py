@@ -25,7 +25,9 @@ from offboard.flight.record import (
     TickRecord,
 )
 from offboard.mavlink.dialect import Dialect
+from offboard.mavlink.inbound import decode_text_chunk
 from offboard.mavlink.session import DIALECTS
+from offboard.mavlink.texts import TextAssembler
 
 Array = NDArray[np.float64]
 OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
@@ -217,11 +219,21 @@ def _truth(theirs: _Party, clock: _Clock) -> Array:
 
 
 def _phases(ours: _Party, clock: _Clock) -> tuple[Happening, ...]:
-    texts = [(place, entry.message.text.rstrip("\t")) for place, entry in ours.of("STATUSTEXT")]
     told = [
-        (place, text.removeprefix(OUR_WORDS)) for place, text in texts if text.startswith(OUR_WORDS)
+        (place, text.removeprefix(OUR_WORDS))
+        for place, text in _texts(ours)
+        if text.startswith(OUR_WORDS)
     ]
     return clock.story("offboard", told)
+
+
+def _texts(party: _Party) -> list[tuple[int, str]]:
+    """All that was said, joined from its chunks, each at the place of its last one."""
+    assembler, said = TextAssembler(), []
+    for place, entry in party.of("STATUSTEXT"):
+        whole = assembler.add(decode_text_chunk(entry.frame.payload), entry.unix_us / 1e6)
+        said += [(place, text.text) for text in whole]
+    return said
 
 
 def _modes(theirs: _Party, clock: _Clock, dialect: Dialect | None) -> tuple[Happening, ...]:
@@ -236,7 +248,7 @@ def _modes(theirs: _Party, clock: _Clock, dialect: Dialect | None) -> tuple[Happ
 
 
 def _said(theirs: _Party, clock: _Clock) -> tuple[Happening, ...]:
-    words = [(place, entry.message.text.rstrip("\t")) for place, entry in theirs.of("STATUSTEXT")]
+    words = _texts(theirs)
     acks = [(place, entry.message) for place, entry in theirs.of("COMMAND_ACK")]
     refused = [
         (place, f"command {ack.command} refused, result {ack.result}")

@@ -18,12 +18,13 @@ from offboard.mavlink.outgoing import (
     Outgoing,
     PositionTarget,
     Record,
-    StatusTextOut,
 )
 from offboard.mavlink.session import Session
+from offboard.mavlink.texts import chunks
 from offboard.model.vehicle import Vehicle
 
 WARNING, INFO = 4, 6  # MAV_SEVERITY
+MOST_TEXTS = 65535  # STATUSTEXT.id; 0 is for those that are complete in themselves
 ASK_AGAIN_S = 1.0  # between repetitions of a command the vehicle has not obeyed
 
 
@@ -49,6 +50,7 @@ class Emission:
         self.command = Command(0.0, LEVEL, 0.0)  # in force
         self.announced: list[str] = []
         self._asked_s = -math.inf
+        self._texts = 0  # id of the last one
         self._send_out: list[bytes] = []
         self._log_out: list[bytes] = []
 
@@ -112,11 +114,16 @@ class Emission:
     def announce(self, sentence: str, title: str = "") -> None:
         """Tell the user here and at the ground station, there under a title."""
         self.announced.append(sentence)
-        self.send(StatusTextOut(INFO, title + sentence))
+        self._say(INFO, title + sentence)
 
     def warn(self, sentence: str) -> None:
         """Tell the ground station and the log."""
-        self.send(StatusTextOut(WARNING, sentence))
+        self._say(WARNING, sentence)
+
+    def _say(self, severity: int, sentence: str) -> None:
+        self._texts = self._texts % MOST_TEXTS + 1
+        for chunk in chunks(severity, sentence, self._texts):
+            self.send(chunk)
 
     def send(self, outgoing: Outgoing) -> None:
         self.pass_on((self._session.encode(outgoing),))

@@ -298,7 +298,7 @@ def _encode_housekeeping(value: Heartbeat | TimesyncReply | StatusTextOut) -> Pa
     return _pack(
         mavlink.MAVLink_statustext_message,
         severity=value.severity,
-        text=value.text.encode("utf-8")[:50],
-        id=0,
-        chunk_seq=0,
+        text=value.data,
+        id=value.text_id,
+        chunk_seq=value.chunk,
     )

@@ -111,10 +111,13 @@ class TimesyncReply:
 
 @dataclass(frozen=True, slots=True)
 class StatusTextOut:
-    """STATUSTEXT, one chunk: longer than 50 bytes is cut."""
+    """STATUSTEXT, one chunk of at most 50 bytes (`texts.chunks` cuts longer ones); `text_id` 0:
+    complete in itself."""
 
     severity: int
-    text: str
+    data: bytes
+    text_id: int = 0
+    chunk: int = 0
 
 
 @dataclass(frozen=True, slots=True)

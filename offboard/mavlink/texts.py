@@ -1,4 +1,7 @@
-"""STATUSTEXT put together from its 50-byte chunks. Knows severity, id and chunk number, no more."""
+"""STATUSTEXT cut into its 50-byte chunks and put together from them.
+
+Knows severity, id and chunk number, no more. Twins: what `chunks` cuts, `TextAssembler` joins.
+"""
 
 from __future__ import annotations
 
@@ -6,10 +9,24 @@ from dataclasses import dataclass, field
 
 from offboard.mavlink.events import StatusText
 from offboard.mavlink.inbound import TextChunk, printable
+from offboard.mavlink.outgoing import StatusTextOut
 
+_ROOM = 50  # bytes; a chunk that is shorter is the last one
 _MOST_CHUNKS, _MOST_PENDING = 20, 8
 _PATIENCE_S = 1.0
 _GAP = b"[...]"
+
+
+def chunks(severity: int, text: str, text_id: int) -> list[StatusTextOut]:
+    """The messages that say `text`; its end beyond 999 bytes is cut. `text_id`, 1 .. 65535, tells
+    texts apart that are under way together."""
+    data = text.encode("utf-8")[: _MOST_CHUNKS * _ROOM - 1]
+    if len(data) <= _ROOM:
+        return [StatusTextOut(severity, data)]
+    return [  # one more, empty, where the last one is full
+        StatusTextOut(severity, data[at : at + _ROOM], text_id, at // _ROOM)
+        for at in range(0, len(data) + 1, _ROOM)
+    ]
 
 
 @dataclass(slots=True)

@@ -11,8 +11,10 @@ from vehicle_frames import ARDUPILOT, PX4, Sender, pinned, understood
 
 from offboard.mavlink.ardupilot import ARDUPILOT as ARDUPILOT_DIALECT
 from offboard.mavlink.dialect import Dialect
+from offboard.mavlink.inbound import decode_text_chunk
 from offboard.mavlink.px4 import PX4 as PX4_DIALECT
 from offboard.mavlink.session import Session, SessionSettings
+from offboard.mavlink.texts import TextAssembler, chunks
 from offboard.mavlink.wire import (
     CommandLong,
     Heartbeat,
@@ -188,7 +190,7 @@ def test_sequence_numbers_count_per_component() -> None:
             mavlink.MAVLink_command_long_message(7, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0),
         ),
         (Heartbeat(0), mavlink.MAVLink_heartbeat_message(0, 8, 0, 0, 4, 3)),
-        (StatusTextOut(0, ""), mavlink.MAVLink_statustext_message(0, b"", 0, 0)),
+        (StatusTextOut(0, b""), mavlink.MAVLink_statustext_message(0, b"", 0, 0)),
     ],
     ids=["zeros at the end", "zeros at the beginning", "nothing but zeros"],
 )
@@ -203,8 +205,23 @@ def test_heartbeat_and_text_of_ours() -> None:
     message = understood(session.encode(Heartbeat(18)))
     assert (message.type, message.autopilot, message.mavlink_version) == (18, 8, 3)
     assert (message.get_srcSystem(), message.get_srcComponent()) == (7, 191)
-    message = understood(session.encode(StatusTextOut(4, "x" * 60)))
-    assert (message.severity, message.text) == (4, "x" * 50)
+    message = understood(session.encode(StatusTextOut(4, b"x" * 50)))
+    assert (message.severity, message.text, message.id) == (4, "x" * 50, 0)
+
+
+@pytest.mark.parametrize("length", [0, 1, 50, 51, 99, 100, 101, 999])
+def test_long_texts_are_joined_again(length: int) -> None:
+    text = ("to the vehicle file: hover_thrust, " * 30)[:length]
+    session, assembler = pinned(Sender(7)), TextAssembler()
+    frames = [session.encode(chunk) for chunk in chunks(4, text, 7)]
+    messages = [understood(frame) for frame in frames]
+    assert len(messages) == (1 if length <= 50 else length // 50 + 1)
+    assert "".join(message.text for message in messages) == text
+    assert [message.chunk_seq for message in messages] == list(range(len(messages)))
+    joined = [
+        whole for frame in frames for whole in assembler.add(decode_text_chunk(frame[10:-2]), 0.0)
+    ]
+    assert [(whole.severity, whole.text) for whole in joined] == [(4, text)]
 
 
 def test_nothing_is_sent_to_nobody() -> None:
