@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from functools import partial
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -17,7 +18,6 @@ if TYPE_CHECKING:
     from offboard.flight.companion import Companion
 
 app = typer.Typer(
-    help="Fly a trajectory over MAVLink with a particle-swarm receding-horizon law, and score it.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -43,6 +43,22 @@ Assignments = Annotated[
 FlightArgument = Annotated[
     Path, typer.Argument(metavar="FLIGHT", help="A flight directory or a .tlog file.")
 ]
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        out.print(f"pso-offboard {version('pso-offboard')}")
+        raise typer.Exit
+
+
+@app.callback()
+def offboard(
+    show_version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Say which one it is."),
+    ] = False,
+) -> None:
+    """Fly a trajectory over MAVLink with a particle-swarm receding-horizon law, and score it."""
 
 
 class Refusal(Exception):
@@ -115,11 +131,9 @@ def fly(
                 scenario=scenario,
                 sim_vehicle=sim_vehicle,
             )
-            order.resolve()
-            out.print("preparing the controller (its first run on a machine compiles for seconds)")
-            outcome = fly_order(order, _announcer(), _prepared, hangar)
+            outcome = fly_order(order, _announcer(), out.print, hangar)
     except KeyboardInterrupt:  # in flight it lands instead
-        raise Refusal("interrupted before anything was sent", 4) from None
+        raise Refusal("interrupted before anything was sent") from None
     if outcome.exit_code == 2:
         raise Refusal(outcome.sentence)
     missed = _score(directory, [] if outcome.exit_code else requirements, as_json=False)
@@ -142,11 +156,6 @@ def _announcer() -> Callable[[Companion], None]:
         shown = len(companion.announced)
 
     return announce
-
-
-def _prepared(seconds: float) -> None:
-    if seconds > 2.0:
-        out.print(f"compiled in {seconds:.1f} s; the next start finds it cached")
 
 
 @app.command(epilog=EXIT_HELP)

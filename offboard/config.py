@@ -66,7 +66,7 @@ def load(
     `name` is a shipped configuration or a file; `choices` replaces its vehicle, controller or
     reference by another name or file; `assignments` are `key.path=value` of --set.
     """
-    path = _locate(name, "", "configuration")
+    path = locate(name, "", "configuration")
     raw = read(_text(path), str(path))
     for part in FOLDERS:
         chosen = (choices or {}).get(part, raw.get(part))
@@ -74,11 +74,16 @@ def load(
             raw[part] = _part(part, chosen)
         elif part not in raw:
             raise DocumentError(f"{path}: {part} is missing; give a name, a file or a mapping")
+    options: dict[str, str] = {}
     for assignment in assignments:
         raw = override(raw, assignment)
+        key = assignment.partition("=")[0].strip()
+        options[key] = f"--set {assignment}"
+        if key in FOLDERS and isinstance(raw[key], str):
+            raw[key] = _part(key, raw[key])
     if seed is not None:
-        raw["seed"] = seed
-    return _with_table(validate(raw, FlightConfig, str(path)))
+        raw["seed"], options["seed"] = seed, f"--seed {seed}"
+    return _with_table(validate(raw, FlightConfig, str(path), options))
 
 
 def build_track(config: FlightConfig) -> Track:
@@ -141,7 +146,7 @@ def _with_table(config: FlightConfig) -> FlightConfig:
 def _part(part: str, name: str) -> Raw:
     if part == "reference" and name.lower().endswith(".csv"):
         return {"shape": "table", "file": name}
-    path = _locate(name, FOLDERS[part], part)
+    path = locate(name, FOLDERS[part], part)
     raw = read(_text(path), str(path))
     validate(raw, _model(part, raw, str(path)), str(path))
     return raw
@@ -157,7 +162,8 @@ def _model(part: str, raw: Raw, source: str) -> type[BaseModel]:
     return table[chosen]
 
 
-def _locate(name: str, folder: str, kind: str) -> Path:
+def locate(name: str, folder: str, kind: str) -> Path:
+    """The file of a shipped name, or the file named. Raises DocumentError where there is none."""
     if name.endswith((".yaml", ".yml")) or "/" in name:
         return Path(name)
     candidate = shipped() / folder / f"{name}.yaml"

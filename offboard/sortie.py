@@ -16,7 +16,7 @@ from offboard.analysis.document import as_text
 from offboard.analysis.history import History
 from offboard.analysis.score import Score
 from offboard.analysis.tlog import TlogError
-from offboard.config import FlightConfig, build_track, dump, load
+from offboard.config import FlightConfig, build_track, dump, load, locate
 from offboard.control.catalogue import build
 from offboard.control.observer import Observer
 from offboard.flight import clock
@@ -48,6 +48,8 @@ class Order:
         """The validated configuration. Raises DocumentError."""
         own = {"vehicle": OWN_VEHICLES[self.firmware]} if self.firmware in OWN_VEHICLES else {}
         choices = {**(own if self.sitl else {}), **self.choices}
+        if self.sitl and self.scenario is not None:
+            locate(self.scenario, "scenarios", "scenario")
         return load(self.config, choices=choices, assignments=self.assignments, seed=self.seed)
 
 
@@ -70,7 +72,7 @@ def crew(config: FlightConfig) -> Crew:
 def fly_order(
     order: Order,
     progress: Callable[[Companion], None] = lambda companion: None,
-    prepared: Callable[[float], None] = lambda seconds: None,
+    tell: Callable[[str], None] = lambda sentence: None,
     hangar: Hangar | None = None,
 ) -> Outcome:
     """Fly and log; a bundled simulator comes from `hangar`, or one for this flight alone.
@@ -94,7 +96,7 @@ def fly_order(
             connection=order.connection,
             bundled=bundled,
             progress=progress,
-            prepared=prepared,
+            tell=tell,
         )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+from importlib.metadata import version
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -68,11 +69,17 @@ def simulate(
     log: Annotated[
         Path | None, typer.Option(help="Record the companion link as a .tlog; never overwrites.")
     ] = None,
+    show_version: Annotated[
+        bool, typer.Option("--version", help="Say which one it is, and stop.")
+    ] = False,
     list_scenarios: Annotated[
         bool, typer.Option("--list-scenarios", help="Name and describe the scenarios, and stop.")
     ] = False,
 ) -> None:
     """Fly simulated vehicles that speak MAVLink like a real autopilot; each option for each."""
+    if show_version:
+        print(f"pso-offboard {version('pso-offboard')}")
+        raise typer.Exit(0)
     if list_scenarios:
         _list_scenarios()
     personality = FIRMWARES.get(firmware)

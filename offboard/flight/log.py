@@ -6,7 +6,9 @@ unchanged. Each record is one unbuffered write, so a crash loses at most the las
 
 from __future__ import annotations
 
+import os
 import struct
+from errno import EACCES, ENOTDIR
 from pathlib import Path
 from types import TracebackType
 
@@ -28,15 +30,24 @@ class FlightLog:
         self.path = directory / "flight.tlog"
         self.configuration = configuration
 
+    def check(self) -> None:
+        """Raise LogError for what can be told without making anything."""
+        if self.path.exists():
+            raise self._taken()
+        places = (self.directory, *self.directory.absolute().parents)
+        place = next(path for path in places if path.exists())
+        if not place.is_dir():
+            raise self._unwritable(NotADirectoryError(ENOTDIR, os.strerror(ENOTDIR)))
+        if not os.access(place, os.W_OK | os.X_OK):
+            raise self._unwritable(PermissionError(EACCES, os.strerror(EACCES)))
+
     def __enter__(self) -> FlightLog:
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
             self._file = self.path.open("xb", buffering=0)
             self._write_configuration()
         except FileExistsError:
-            raise LogError(
-                f"{self.path} already holds a flight; choose another directory with --out"
-            ) from None
+            raise self._taken() from None
         except OSError as error:
             raise self._unwritable(error) from None
         return self
@@ -49,6 +60,9 @@ class FlightLog:
             self._file.close()
             self.path.unlink()  # an empty log is no flight that must be kept
             raise
+
+    def _taken(self) -> LogError:
+        return LogError(f"{self.path} already holds a flight; choose another directory with --out")
 
     def _unwritable(self, error: OSError) -> LogError:
         return LogError(

@@ -31,6 +31,7 @@ from offboard.model.vehicle import Vehicle
 from offboard.reference.track import Track
 from offboard.reference.transfer import Hold
 
+COMPILED_S = 2.0  # a rehearsal that takes longer has compiled
 REHEARSED_DECISIONS = 5  # of which the fastest counts: the machine may do something else too
 SITL_PATIENCE_S = 180.0  # a bundled simulator may compile first, on a machine that does much else
 
@@ -131,21 +132,26 @@ def fly(
     connection: str,
     bundled: Bundled | None,
     progress: Callable[[Companion], None],
-    prepared: Callable[[float], None] = lambda seconds: None,
+    tell: Callable[[str], None] = lambda sentence: None,
 ) -> Outcome:
     """Fly once over `connection`, or on a bundled simulator of our own.
 
-    Raises LinkError, DocumentError or LogError before anything is sent. The log is opened last,
-    so that a flight which cannot begin leaves no directory behind.
+    Raises LinkError, DocumentError or LogError before anything is sent, what can be known at once
+    before anything slow. The log is opened last, so that a flight which cannot begin leaves no
+    directory behind. `tell` is given a sentence about what takes so long.
     """
     with ExitStack() as stack:
+        log.check()
         link = open_link("udpin:127.0.0.1:0" if bundled else connection)
         stack.callback(link.close)
         if bundled:
             assert isinstance(link, UdpLink)
             bundled.hangar.launch(bundled.options(link.port))
             stack.callback(bundled.hangar.recall)
-        prepared(rehearse(crew, keeps_deadline=bundled is None))
+        tell("preparing the controller (its first run on a machine compiles for seconds)")
+        took_s = rehearse(crew, keeps_deadline=bundled is None)
+        if took_s > COMPILED_S:
+            tell(f"compiled in {took_s:.1f} s; the next start finds it cached")
         stack.enter_context(log)
         session = Session(
             SessionSettings(

@@ -12,12 +12,13 @@ import json
 import math
 import re
 from collections.abc import Mapping
+from types import MappingProxyType
 from typing import Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from offboard.model.expectation import sentence, shown
+from offboard.model.expectation import place, sentence, shown
 
 M = TypeVar("M", bound=BaseModel)
 Json = dict[str, Any]
@@ -73,17 +74,39 @@ def override(mapping: Mapping[str, Any], assignment: str) -> Json:
     return changed
 
 
-def validate(mapping: Mapping[str, Any], model: type[M], source: str) -> M:
-    """Raw mapping -> an instance of `model`. Raises DocumentError with every problem found."""
+def validate(
+    mapping: Mapping[str, Any],
+    model: type[M],
+    source: str,
+    options: Mapping[str, str] = MappingProxyType({}),
+) -> M:
+    """Raw mapping -> an instance of `model`. Raises DocumentError with every problem found.
+
+    `source` names where the mapping is from, but for what the command line has put in: `options`,
+    key path -> option as it was given.
+    """
     try:
         # As JSON: strict about scalars, yet lists may become tuples and text an enum
         return model.model_validate_json(json.dumps(mapping), strict=True)
     except ValidationError as error:
         schema = model.model_json_schema()
         details = error.errors(include_url=False)
+        problems = [
+            (_origin(place(detail, mapping), options, source), detail) for detail in details
+        ]
         raise DocumentError(
-            *(f"{source}: {sentence(detail, mapping, schema)}" for detail in details)
+            *(f"{origin}: {sentence(detail, mapping, schema)}" for origin, detail in problems)
         ) from None
+
+
+def _origin(path: str, options: Mapping[str, str], source: str) -> str:
+    """The last option that touched the value at `path`, else `source`."""
+    problem = path.split(".")
+    for assigned, option in reversed(list(options.items())):
+        keys = [key.strip() for key in assigned.split(".")]
+        if all(mine == theirs for mine, theirs in zip(keys, problem, strict=False)):
+            return option
+    return source
 
 
 def _loaded(text: str, source: str) -> Any:

@@ -61,6 +61,11 @@ def sentence(detail: ErrorDetails, document: Any, root: Schema) -> str:
     return f"{where}{shown(value)}: {detail['msg'][:1].lower()}{detail['msg'][1:]}"
 
 
+def place(detail: ErrorDetails, document: Any) -> str:
+    """The dotted key path that one pydantic error about `document` is about."""
+    return _path(detail["loc"], document)[0]
+
+
 def expected(schema: Schema | None, root: Schema) -> str:
     """A phrase such as `a number > 0 and <= 2`, or empty when the schema does not say."""
     if schema is None:
