@@ -7,6 +7,7 @@ feed-forward's. Knows no autopilot and reads no clock.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
@@ -26,9 +27,10 @@ class PidSettings(OneDecisionSettings):
     """Gains of the two cascades. `position_gain_ps` turns metres into m/s, `velocity_gain_ps` m/s
     into m/s^2, `integral_gain_ps3` metre seconds into m/s^2; `integral_limit_mps2` bounds the
     integral's part. The defaults are the best of a grid on the PX4-like vehicle. `bandwidth_radps`
-    is only what an identified delay is judged against: with these gains the loop is as fast.
+    is how fast the loop is with these gains: where the delay bears less, all are lowered with it.
     """
 
+    bandwidth_radps: float = Field(default=5.0, ge=0.5, le=20)
     position_gain_ps: float = Field(default=1.8, ge=0, le=20)
     velocity_gain_ps: float = Field(default=4.6, ge=0, le=50)
     integral_gain_ps3: float = Field(default=0.2, ge=0, le=50)
@@ -56,6 +58,13 @@ class PidLaw(TrackingLaw):
             vehicle, self._gains, Search.CLOSED_FORM, stopwatch, feedforward, period_s=period_s
         )
 
+    def adopt(
+        self, vehicle: Vehicle, bandwidth_limit_radps: float = math.inf, *, gains: bool = True
+    ) -> None:
+        super().adopt(vehicle, bandwidth_limit_radps, gains=gains)
+        if gains:
+            self._slower = min(1.0, bandwidth_limit_radps / self._settings.bandwidth_radps)
+
     def answer(
         self,
         situation: Situation,
@@ -68,8 +77,11 @@ class PidLaw(TrackingLaw):
         lateral, vertical = errors(state, target)
         upright = float(state.thrust_direction_ned[2])
         asked = np.empty(3)  # acceleration against the error, m/s^2: north, east, down
-        asked[:2] = gains.velocity_gain_ps * (lateral[1] + gains.position_gain_ps * lateral[0])
-        asked[2] = gains.climb_gain_ps * (vertical[1] + gains.height_gain_ps * vertical[0])
+        slower = self._slower
+        lateral_mps = lateral[1] + slower * gains.position_gain_ps * lateral[0]
+        climb_mps = vertical[1] + slower * gains.height_gain_ps * vertical[0]
+        asked[:2] = slower * gains.velocity_gain_ps * lateral_mps
+        asked[2] = slower * gains.climb_gain_ps * climb_mps
         asked += self._integral
         inputs = np.empty(4)
         inputs[0] = (target.thrust_down_feedforward_mps2 + asked[2]) / upright
@@ -90,7 +102,7 @@ class PidLaw(TrackingLaw):
         """Only axes whose command is not on its bound: what winds up there overshoots later."""
         gains = self._gains
         rates = np.array([gains.integral_gain_ps3] * 2 + [gains.height_integral_gain_ps3])
-        step = self._period_s * rates * off_ned_m
+        step = self._slower**3 * self._period_s * rates * off_ned_m
         limit = gains.integral_limit_mps2
         self._integral = np.clip(
             np.where(free, self._integral + step, self._integral), -limit, limit
