@@ -24,6 +24,7 @@ from offboard.control.cost import BoxQuadratic
 from offboard.control.horizon.detour import detours
 from offboard.control.horizon.keep_out import KeepOut, pack, placed_at
 from offboard.control.horizon.outlook import bounds, look_ahead
+from offboard.control.horizon.polish import Ended, polish
 from offboard.control.horizon.quadratic import HorizonQuadratic
 from offboard.control.horizon.roll_out import (
     INPUTS,
@@ -33,7 +34,7 @@ from offboard.control.horizon.roll_out import (
     start_state,
 )
 from offboard.control.horizon.sampling import SamplingSettings, cem, mppi
-from offboard.control.horizon.search import Evaluator, Found, Plan, polish, swarm
+from offboard.control.horizon.search import Evaluator, Found, Plan, swarm
 from offboard.control.mpc import one_decision
 from offboard.control.response import lateral_cost_to_go
 from offboard.control.swarm import RandomLanes, SwarmResult, SwarmSettings
@@ -43,6 +44,9 @@ from offboard.model.vehicle import Vehicle
 Array = NDArray[np.float64]
 
 HEAVE_REACH_MPS2 = 3.0  # of the knots of the vertical thrust
+STEPS, STEPS_AROUND = 10, 20
+RIVALS = 2  # of the best plan of our own, that are searched about as well
+MET_M = 0.3  # from the clearance of a volume: further outside, a plan does not meet it
 PLANNED_MARGIN_M = 0.05  # beyond the clearance: for tracking, and for a limit that is bought softly
 
 
@@ -62,20 +66,26 @@ class Dynamics(StrEnum):
 
 
 class HorizonSettings(TrackingSettings):
-    """The tracking law's settings, `steps` decisions ahead, around `keep_out` with `clearance_m`
-    to spare and at most `speed_limit_mps` (none: unlimited). `seed_with_qp`: whether the linear
-    problem's exact plan is a seed; `polish_steps` bounds the Newton steps on the swarm's answer.
+    """The tracking law's settings, `steps` decisions ahead (none: 10, and 20 around volumes: the
+    way past one must fit in), around `keep_out` with `clearance_m` to spare and at most
+    `speed_limit_mps` (none: unlimited). `seed_with_qp`: whether the linear problem's exact plan is
+    a seed; `polish_steps` bounds the steps from each answer of the swarm to its local minimum.
     """
 
-    steps: int = Field(default=10, ge=2, le=40)
+    steps: int | None = Field(default=None, ge=2, le=40)
     dynamics: Dynamics = Dynamics.NONLINEAR
     keep_out: tuple[KeepOut, ...] = ()
     clearance_m: float = Field(default=0.3, ge=0, le=50)
     speed_limit_mps: float | None = Field(default=None, gt=0, le=50)
     seed_with_qp: bool = True
-    polish_steps: int = Field(default=4, ge=0, le=50)
-    swarm: SwarmSettings = SwarmSettings(iterations=60, damping=0.8)
+    polish_steps: int = Field(default=8, ge=0, le=50)
+    swarm: SwarmSettings = SwarmSettings(particles=20, iterations=40, damping=0.8)
     sampling: SamplingSettings = SamplingSettings()
+
+    @property
+    def planned(self) -> int:
+        """The decisions ahead, as chosen or by default."""
+        return self.steps or (STEPS_AROUND if self.keep_out else STEPS)
 
 
 class HorizonLaw(TrackingLaw):
@@ -95,8 +105,8 @@ class HorizonLaw(TrackingLaw):
         self._seed = seed
         self._method = method
         self._volumes = pack(self._plans.keep_out)
-        self._evaluate = Evaluator(self._plans.steps)
-        self._planner = ExactMinimum(INPUTS * self._plans.steps)
+        self._evaluate = Evaluator(self._plans.planned)
+        self._planner = ExactMinimum(INPUTS * self._plans.planned)
         super().__init__(
             vehicle, self._plans, Search.SWARM, stopwatch, period_s=period_s, seed=seed
         )
@@ -111,7 +121,7 @@ class HorizonLaw(TrackingLaw):
             return
         plans = self._plans
         bandwidth = min(plans.bandwidth_radps, bandwidth_limit_radps)
-        self._quadratic = HorizonQuadratic(self.lateral, self.vertical, plans.steps)
+        self._quadratic = HorizonQuadratic(self.lateral, self.vertical, plans.planned)
         self._plant = plant_of(
             vehicle,
             self.lateral,
@@ -144,7 +154,9 @@ class HorizonLaw(TrackingLaw):
         if not math.isfinite(seed_cost):
             raise DecisionError("no plan of the horizon has a finite cost")
         rivals = sorted((plan for plan in others if plan.cost < base.cost), key=_cost)
-        found = self._find([base, *rivals[:1]], remaining_s)
+        found = self._settled([base, *rivals], remaining_s)
+        if found is None:
+            found = self._find([base, *rivals[:RIVALS]], remaining_s)
         self.previous = (situation.time_s, found.plan)
         certificate = replace(self._certificate(found, linear), seed_cost=seed_cost)
         upright = float(situation.state.thrust_direction_ned[2])
@@ -158,7 +170,7 @@ class HorizonLaw(TrackingLaw):
     def _settle(self, situation: Situation, target: Target, problem: BoxQuadratic) -> BoxQuadratic:
         """Prepare the roll-outs of this situation; the linear problem that comes with it."""
         state, plans = situation.state, self._plans
-        ahead = look_ahead(self._vehicle, situation.reference, state, self._period_s, plans.steps)
+        ahead = look_ahead(self._vehicle, situation.reference, state, self._period_s, plans.planned)
         limit = min(plans.tilt_limit, math.sin(self._vehicle.tilt_max_rad))
         thrusts = (float(problem.lower[0]), float(problem.upper[0]))
         upright = float(state.thrust_direction_ned[2])
@@ -178,7 +190,7 @@ class HorizonLaw(TrackingLaw):
     def _seeds(self, time_s: float, linear: BoxQuadratic) -> tuple[list[Plan], list[Plan]]:
         """Our own plans (the closed form and the previous plan's tail), and others: the linear
         problem's exact plan, and a way past each side of each volume that is near."""
-        steps, evaluate = self._plans.steps, self._evaluate
+        steps, evaluate = self._plans.planned, self._evaluate
         inputs, states = np.zeros((steps, INPUTS)), np.zeros((steps + 1, STATE_SIZE))
         own, others = [evaluate.held(inputs, states)], []
         if self._method is Method.SWARM and self._plans.seed_with_qp:
@@ -197,6 +209,22 @@ class HorizonLaw(TrackingLaw):
                 own.append(evaluate.held(inputs, states))
         return own, others
 
+    def _settled(self, seeds: list[Plan], remaining_s: Callable[[], float] | None) -> Found | None:
+        """The best seed, polished, where that leaves nothing to search for: no limit or volume
+        near, and the quadratic about it as good as solved."""
+        plans, evaluate = self._plans, self._evaluate
+        alone = self._method is Method.SWARM and plans.seed_with_qp and not plans.speed_limit_mps
+        if not alone or any(evaluate.meets(plan, MET_M) for plan in seeds):
+            return None
+        best, ended = polish(
+            evaluate,
+            min(seeds, key=_cost),
+            self._quadratic.hessian,
+            plans.polish_steps,
+            remaining_s,
+        )
+        return Found(best, math.nan, 0, False) if ended is Ended.SETTLED else None
+
     def _find(self, bases: list[Plan], remaining_s: Callable[[], float] | None) -> Found:
         """The best plan about any of the bases, which share the budget. Searching only about the
         best of all seeds ends in worse valleys than searching about our own."""
@@ -211,10 +239,11 @@ class HorizonLaw(TrackingLaw):
         answers = []
         for base in bases:
             found = swarm(evaluate, base, reach, settings, self._lanes, remaining_s)
-            better, late = polish(
+            better, ended = polish(
                 evaluate, found.plan, self._quadratic.hessian, plans.polish_steps, remaining_s
             )
-            answers.append(replace(found, plan=better, cut_short=found.cut_short or late))
+            late = found.cut_short or ended is Ended.LATE
+            answers.append(replace(found, plan=better, cut_short=late))
         return min(answers, key=lambda found: found.plan.cost)
 
     def _certificate(self, found: Found, linear: BoxQuadratic) -> Certificate:

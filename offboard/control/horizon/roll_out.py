@@ -341,22 +341,44 @@ def _penalise(plant, scene, k, before, after, costs) -> None:  # type: ignore[no
     if scene.volumes.shape[0]:
         down = scene.positions[end, 2]
         room = max(scene.floor_down_m - down, 0.0)
+        depths = np.empty(particles)
         for n in range(particles):
             costs[n] += hold * _excess(after[Z, n] - room)
     for i in range(scene.volumes.shape[0]):
         for node in range(2 * k + 1, 2 * k + 3):
-            volume = scene.volumes[i].copy()
-            for axis in range(3):
-                volume[CENTRE + axis] += 0.5 * hold * node * volume[VELOCITY + axis]
-            at = scene.positions[node]
+            _intrude(plant, scene, i, node, before, after, depths)
             for n in range(particles):
-                if node == end:
-                    x, y, z = after[P, n], after[P + 1, n], after[Z, n]
-                else:  # halfway, as position and velocity at both ends have it
-                    bow = 0.125 * hold
-                    x = 0.5 * (before[P, n] + after[P, n]) + bow * (before[V, n] - after[V, n])
-                    y = 0.5 * (before[P + 1, n] + after[P + 1, n])
-                    y += bow * (before[V + 1, n] - after[V + 1, n])
-                    z = 0.5 * (before[Z, n] + after[Z, n]) + bow * (before[W, n] - after[W, n])
-                gap = distance(volume, at[0] + x, at[1] + y, at[2] + z)
-                costs[n] += 0.5 * hold * _excess(c[CLEARANCE] - gap)
+                costs[n] += 0.5 * hold * _excess(depths[n])
+
+
+@numba.njit(cache=True)
+def intrusions(plant, scene, states, depths) -> None:  # type: ignore[no-untyped-def]
+    """How deep plans are within the clearance of each volume at each node, metres, negative
+    outside: depths (V 2 N, particles) of states (N + 1, STATE_SIZE, particles)."""
+    nodes = 2 * (states.shape[0] - 1)
+    for i in range(scene.volumes.shape[0]):
+        for node in range(1, nodes + 1):
+            k = (node - 1) // 2
+            row = depths[i * nodes + node - 1]
+            _intrude(plant, scene, i, node, states[k], states[k + 1], row)
+
+
+@numba.njit(cache=True)
+def _intrude(plant, scene, i, node, before, after, depths) -> None:  # type: ignore[no-untyped-def]
+    """Depths (particles,) within the clearance of volume i at a middle or an end of a hold."""
+    c = plant.scalars
+    hold = c[HOLD]
+    volume = scene.volumes[i].copy()
+    for axis in range(3):
+        volume[CENTRE + axis] += 0.5 * hold * node * volume[VELOCITY + axis]
+    at = scene.positions[node]
+    bow = 0.125 * hold
+    for n in range(depths.shape[0]):
+        if node % 2 == 0:
+            x, y, z = after[P, n], after[P + 1, n], after[Z, n]
+        else:  # halfway, as position and velocity at both ends have it
+            x = 0.5 * (before[P, n] + after[P, n]) + bow * (before[V, n] - after[V, n])
+            y = 0.5 * (before[P + 1, n] + after[P + 1, n])
+            y += bow * (before[V + 1, n] - after[V + 1, n])
+            z = 0.5 * (before[Z, n] + after[Z, n]) + bow * (before[W, n] - after[W, n])
+        depths[n] = c[CLEARANCE] - distance(volume, at[0] + x, at[1] + y, at[2] + z)

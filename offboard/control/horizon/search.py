@@ -14,7 +14,15 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.horizon.roll_out import INPUTS, STATE_SIZE, Plant, Scene, roll_out
+from offboard.control.horizon.roll_out import (
+    HOLD,
+    INPUTS,
+    STATE_SIZE,
+    Plant,
+    Scene,
+    intrusions,
+    roll_out,
+)
 from offboard.control.swarm import RandomLanes, Swarm, SwarmSettings
 
 Array = NDArray[np.float64]
@@ -22,8 +30,6 @@ Remaining = Callable[[], float] | None
 
 # Steps of the knots: dense where the next command is, sparse where it will be decided again
 KNOT_SHARES = (0.0, 0.15, 0.4, 0.8)
-DIFFERENCE = 1e-4  # for slopes, by central differences: exact on a quadratic
-STRIDES = 2.0 ** -np.arange(0.0, 12.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,6 +114,24 @@ class Evaluator:
         states, inputs, costs = self._arrays[count]
         return Plan(inputs[:, :, index].copy(), states[:, :, index].copy(), float(costs[index]))
 
+    @property
+    def hold_s(self) -> float:
+        return float(self._plant.scalars[HOLD])
+
+    def depths(self, count: int) -> Array:
+        """(V 2 N, count) of the last roll-outs with `count` particles: see `intrusions`."""
+        depths = np.empty((2 * self.steps * len(self._scene.volumes), count))
+        intrusions(self._plant, self._scene, self._arrays[count][0], depths)
+        return depths
+
+    def meets(self, plan: Plan, margin_m: float) -> bool:
+        """Whether a plan comes closer to the clearance of any volume than `margin_m`."""
+        if not len(self._scene.volumes):
+            return False
+        depths = np.empty((2 * self.steps * len(self._scene.volumes), 1))
+        intrusions(self._plant, self._scene, plan.states[:, :, None], depths)
+        return bool((depths > -margin_m).any())
+
     def _run(
         self, inputs: Array, states: Array, feedback: float, weights: Array, knots: Array
     ) -> Array:
@@ -166,40 +190,7 @@ def _directions(count: int, size: int) -> Array:
     return widened
 
 
-def polish(
-    evaluate: Evaluator, plan: Plan, hessian: Array, most: int, remaining_s: Remaining
-) -> tuple[Plan, bool]:
-    """Projected Newton steps on all inputs of `plan`, with the slope of its roll-outs and the
-    curvature (3 N, 3 N) of the linear problem; whether time ran out."""
-    lower, upper = evaluate.lower.T.ravel(), evaluate.upper.T.ravel()
-    size = len(lower)
-    for _ in range(most):
-        if remaining_s is not None and remaining_s() <= 0:
-            return plan, True
-        here = plan.inputs.T.ravel()
-        probes = np.repeat(here[:, None], 2 * size, axis=1)
-        probes[np.arange(size), np.arange(size)] += DIFFERENCE
-        probes[np.arange(size), size + np.arange(size)] -= DIFFERENCE
-        costs = evaluate.of_inputs(_sequences(probes)).copy()
-        width = np.minimum(here + DIFFERENCE, upper) - np.maximum(here - DIFFERENCE, lower)
-        slope = (costs[:size] - costs[size:]) / np.maximum(width, 1e-9)
-        bound = ((here <= lower) & (slope > 0)) | ((here >= upper) & (slope < 0))
-        free = ~bound & np.isfinite(slope)
-        step = np.zeros(size)
-        step[free] = np.linalg.solve(hessian[np.ix_(free, free)], -slope[free])
-        tried = np.clip(here[:, None] + STRIDES * step[:, None], lower[:, None], upper[:, None])
-        costs = evaluate.of_inputs(_sequences(tried))
-        first = int(np.argmin(costs))
-        if not costs[first] < plan.cost:
-            return plan, False
-        gained = plan.cost - float(costs[first])
-        plan = evaluate.picked(len(STRIDES), first)
-        if gained < 1e-9 * abs(plan.cost):
-            return plan, False
-    return plan, False
-
-
-def _sequences(stacked: Array) -> Array:
+def sequences(stacked: Array) -> Array:
     """(3 N, n) of the quadratic's order to (N, 3, n)."""
     size, count = stacked.shape
     return np.ascontiguousarray(stacked.reshape(INPUTS, size // INPUTS, count).transpose(1, 0, 2))
