@@ -31,6 +31,7 @@ from simulator.pilot import Nav, Pilot
 from simulator.plant import STEP_S, Plant, Truth
 from simulator.watch import EVERY_STEPS, Watch
 
+_RESTS_STEPS = 250  # at most, so that what is changed behind its back is seen soon
 _POSITION_IGNORED, _LOCAL_NED = 0b111, 1  # type_mask; MAV_FRAME
 _GLOBAL_TARGET = "SET_POSITION_TARGET_GLOBAL_INT"
 
@@ -75,6 +76,8 @@ class Autopilot:
         self.gps_healthy = True
         self._watch = Watch(firmware, self.parameters)
         self._cause = ""  # of the failsafe
+        self.resting = False  # compiled code flies
+        self.calm_until = self._rests_since = 0
         self._awaited: tuple[float, str] | None = None  # when a failsafe is carried out
 
     # -- what others see ---------------------------------------------------------------------
@@ -146,6 +149,7 @@ class Autopilot:
 
     def happen(self, event: str, *, mode: str = "", takeoff_z_m: float = math.nan) -> Result:
         """Run the rule table for an event; `mode` is the one asked for, if the event asks."""
+        self.wake()
         self._requested, self._takeoff_z_m, self._event = mode, takeoff_z_m, event
         if self.refused and (said := self.refused.get(self._wish(event, mode))) is not None:
             self.texts.append(said)
@@ -224,6 +228,7 @@ class Autopilot:
 
     def step(self) -> None:
         """Fly STEP_S, then see what happened."""
+        self.wake()
         was_landed = self.landed
         demand = self.pilot.fly(self.time_s, self.armed, self.look)
         self.plant.advance(STEP_S, demand)
@@ -240,17 +245,38 @@ class Autopilot:
         if self.steps % EVERY_STEPS == 0:
             self._watch_surroundings()
 
-    @property
-    def quiet_steps(self) -> int:
-        """Steps from now in which nothing can happen unless somebody speaks or the ground is
-        touched or left; a step too few rather than one too many."""
+    def rest(self) -> bool:
+        """Leave the flight to compiled code until `wake` or `calm_until`, the step before which
+        nothing can happen unless somebody speaks or the ground is touched or left.
+
+        A step too early rather than one too late; False when that is now.
+        """
         if self.failsafe or not self.pilot.flies_itself(self.armed, self.plant.on_ground):
-            return 0
-        until_s = self._steady_until_s
-        if self.armed and not self._flown:
-            until_s = min(until_s, self._armed_s + self.parameters.role("disarm_idle_s"))
-        watched = self.steps // EVERY_STEPS * EVERY_STEPS + EVERY_STEPS
-        return int(min(until_s / STEP_S, watched)) - 1 - self.steps
+            return False
+        until_s = min(self._steady_until_s, self._watch.calm_until_s(self.gps_healthy))
+        if self.armed:
+            until_s = min(until_s, self.time_s + self._battery_lasts_s)
+            if not self._flown:
+                until_s = min(until_s, self._armed_s + self.parameters.role("disarm_idle_s"))
+        self.calm_until = int(min(until_s / STEP_S, self.steps + _RESTS_STEPS)) - 1
+        self.resting = self.calm_until > self.steps
+        self._rests_since = self.steps
+        return self.resting
+
+    def wake(self) -> None:
+        """Something is to happen: catch up with what compiled code flew."""
+        if self.resting:
+            self.resting = False
+            self.pilot.flown(self._rests_since, self.steps - self._rests_since)
+            watched = self.steps // EVERY_STEPS * EVERY_STEPS
+            if watched > self._rests_since:
+                self._watch.passed(watched * STEP_S, self.gps_healthy)
+
+    @property
+    def _battery_lasts_s(self) -> float:
+        """Until the next warning, at full thrust."""
+        battery = self.truth.battery
+        return self._watch.battery_share(battery.remaining) / self.plant.drain_max_ps
 
     @property
     def _steady_until_s(self) -> float:
@@ -269,8 +295,7 @@ class Autopilot:
         return min(until_s, lost_s) if watched or lost_s >= now_s else until_s
 
     def flown(self, count: int) -> None:
-        """The plant is so many quiet steps further."""
-        self.pilot.flown(self.steps, count)
+        """The plant is so many steps further, in which nothing happened."""
         self.steps += count
         self._truth = self._nav = None
 

@@ -105,9 +105,9 @@ class Instance:
     def advance_to_barrier(self, end_s: float = math.inf) -> bool:
         """`advance` until `barrier_due` (True) or `end_s`: the same bytes, in fewer calls."""
         interval_ms = self._position_interval_ms
+        first = -(-self._barrier_ms // interval_ms) * interval_ms // STEP_MS
         while self.time_s < end_s:
-            first_ms = -(-self._barrier_ms // interval_ms) * interval_ms
-            left = min(first_ms / STEP_MS - self.steps, (end_s - self.time_s) / STEP_S)
+            left = min(first - self.steps, (end_s - self.time_s) / STEP_S)
             if not self._leap(int(left)):
                 self.advance()
             if self.barrier_due():
@@ -118,9 +118,16 @@ class Instance:
         """Fly up to so many steps in one go, if nothing but flight and telemetry is in them."""
         if self._injection is not None or self.steps < self._back_at_step:
             return False
+        autopilot = self.autopilot
+        if autopilot.steps >= autopilot.calm_until:
+            autopilot.wake()
         if not self._stretch.possible:
             return False
-        count = min(most, LONGEST, self.autopilot.quiet_steps)
+        if not autopilot.resting:
+            if not autopilot.rest():
+                return False
+            self._stretch.prepare()
+        count = min(most, LONGEST, autopilot.calm_until - autopilot.steps)
         if count < 1:
             return False
         self.steps += self._stretch.fly(count)

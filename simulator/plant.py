@@ -293,6 +293,12 @@ class Plant:
             self._airframe.hover_thrust,
         )
 
+    @property
+    def drain_max_ps(self) -> float:
+        """Share of the battery's capacity that full thrust draws in a second."""
+        _, capacity_as, *_, current_a, hover = self.battery_constants
+        return float(current_a * (1.0 / hover) ** 1.5 / capacity_as)
+
     def motion(self) -> list[float]:
         """The truth as plain numbers: attitude wxyz, rates FRD, then NED velocity, position,
         acceleration."""

@@ -181,6 +181,8 @@ class Server:
         """Handle everything in one datagram; no bytes make this raise."""
         for message in self.decoder.read(datagram):
             self.heard = True
+            if message.name != "TIMESYNC":
+                self.view.autopilot.wake()
             if self.strict is not None:
                 self._judge(message)
             handler = HANDLERS.get(message.name)

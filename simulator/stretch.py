@@ -30,15 +30,16 @@ _ROWS_MAX = 128
 _OUT_BYTES = 65536
 _LINK, _KIND, _INTERVAL_US, _DUE_US, _GRID = range(5)
 _SLOW, _SILENT = -1, -2  # instead of a place in KINDS: Python writes it; it is not to be said
-_ENDS, _SEQUENCES, _GAP_COUNT, _NEXT_STEP = 0, 2, 4, 5
+_SEQUENCES, _GAP_COUNT, _NEXT_STEP, _EVENTFUL = 2, 4, 5, 6
 
 LINKS = np.dtype(
     [
         ("count", "i8"),
+        ("loop_step", "i8"),  # when the position loop runs next, or NO_LOOP
         ("rows", "i8", (_ROWS_MAX, 5)),  # the streams, those of one link together
         # per link: end of what it said, its next sequence number; then how many gaps there are,
-        # and the step at which somebody speaks next
-        ("tally", "i8", 6),
+        # the step at which somebody speaks next, and whether the autopilot is to look
+        ("tally", "i8", 7),
         ("gaps", "i8", (_ROWS_MAX, 4)),  # left to Python: row, link, place in `out`, number
         ("out", "u1", (2, _OUT_BYTES)),
     ],
@@ -68,14 +69,20 @@ class Stretch:
         if self._odd or view.silent or view.stuck or self._rescheduled:
             self._schedule()
         if view.autopilot.steps >= self._next_step:
-            self._fly(0, NO_LOOP)
+            view.note()
+            self._fly(0)
 
     @property
     def possible(self) -> bool:
-        """Nothing but streams has either link to say by itself, and none of them is tampered with;
-        what tampers with them is no stranger to single steps."""
+        """Nothing but streams has either link to say by itself, and none is tampered with."""
         one, other = self._links
         return one.only_streams and other.only_streams and not self._odd
+
+    def prepare(self) -> None:
+        """Take over from the autopilot, which rests: what `fly` flies and tells until it wakes."""
+        autopilot = self._view.autopilot
+        self._record["loop_step"] = autopilot.pilot.next_loop_step(autopilot.steps, NO_LOOP)
+        self._view.note()
 
     def fly(self, count: int) -> int:
         """Take the vehicle at most `count` steps on (no more than LONGEST) and queue what is due.
@@ -85,32 +92,31 @@ class Stretch:
         """
         if self._rescheduled:
             self._schedule()
-        autopilot = self._view.autopilot
-        return self._fly(count, autopilot.pilot.next_loop_step(autopilot.steps, NO_LOOP))
+        return self._fly(count)
 
-    def _fly(self, count: int, loop_step: int) -> int:
-        view = self._view
-        autopilot = view.autopilot
-        view.note()
+    def _fly(self, count: int) -> int:
+        autopilot = self._view.autopilot
         one, other = self._links
         self._tally[_SEQUENCES:_GAP_COUNT] = one.sequence, other.sequence
         done = _fly.call(
             count,
             autopilot.steps,
-            loop_step,
             autopilot.plant.address,
             autopilot.pilot.loop.address,
             *self._fixed,
         )
         if done:
+            autopilot.plant.flown(done)
             autopilot.flown(done)
         self._deliver()
         return done
 
     def _deliver(self) -> None:
         """Give each link what it said; ask for what only Python can say."""
-        *tally, gap_count, self._next_step = self._tally.tolist()
+        *tally, gap_count, self._next_step, eventful = self._tally.tolist()
         begun = [0, 0]
+        if eventful:
+            self._view.autopilot.wake()
         if gap_count:
             for row, number, place, sequence in self._gaps[:gap_count].tolist():
                 link = self._links[number]
@@ -162,7 +168,6 @@ class Stretch:
 @entry(
     int,
     int,
-    int,
     plant.RECORD,
     position_loop.RECORD,
     frame_writer.RECORD,
@@ -172,7 +177,6 @@ class Stretch:
 def _fly(
     count: int,
     step: int,
-    loop_step: int,
     plant: Any,
     loop: Any,
     seen: Any,
@@ -189,12 +193,12 @@ def _fly(
             speaks = _next_step(links, step + done)
             goal = min(count, speaks - step)
             while done < goal and plant.rotor[CONTACT] == contact:
-                if step + done >= loop_step:
+                if step + done >= links.loop_step:
                     if not reported:
                         report_state(plant)
                     _hold(plant, loop, seen)
-                    loop_step = step + done + _LOOP_STEPS
-                done += advance_steps(min(goal, loop_step - step) - done, plant)
+                    links.loop_step = step + done + _LOOP_STEPS
+                done += advance_steps(min(goal, links.loop_step - step) - done, plant)
                 reported = False
         if step + done == speaks:
             if not reported:
@@ -204,6 +208,7 @@ def _fly(
         full = max(tally[0], tally[1]) > _OUT_BYTES - _ROWS_MAX * FRAME_MAX
         if done >= count or full or tally[_GAP_COUNT] or plant.rotor[CONTACT] != contact:
             tally[_NEXT_STEP] = _next_step(links, step + done)
+            tally[_EVENTFUL] = tally[_GAP_COUNT] > 0 or plant.rotor[CONTACT] != contact
             return done
 
 

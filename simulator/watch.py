@@ -35,6 +35,26 @@ class Watch:
             *self._position(now_s, has_fix),
         ]
 
+    def calm_until_s(self, has_fix: bool) -> float:
+        """Until when `step` will have nothing to tell but of the battery, if nobody speaks."""
+        until_s = math.inf
+        if not (self._ground_station_lost or math.isnan(self._ground_station_s)):
+            until_s = self._ground_station_s + self.parameters.role("ground_station_timeout_s")
+        if not has_fix and not self._position_lost:
+            until_s = min(until_s, self._fix_s + self.firmware.position_without_fix_s)
+        return -math.inf if has_fix and self._position_lost else until_s
+
+    def battery_share(self, remaining: float) -> float:
+        """What may be drawn until the next warning; infinite behind the last."""
+        thresholds = self.firmware.battery_events[self._battery_level :]
+        next_one = max((self.parameters[name] for _, name in thresholds), default=-math.inf)
+        return remaining - next_one
+
+    def passed(self, now_s: float, has_fix: bool) -> None:
+        """A step in which there was nothing to tell."""
+        if has_fix:
+            self._fix_s = now_s
+
     def _ground_station(self, now_s: float) -> list[str]:
         timeout_s = self.parameters.role("ground_station_timeout_s")
         lost = now_s - self._ground_station_s > timeout_s  # never heard is not lost
