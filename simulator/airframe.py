@@ -66,11 +66,15 @@ class Airframe:
     battery: Battery
     hover_thrust: float
 
+    def battery_remaining(self, drawn_as: float) -> float:
+        """Share left after the charge drawn so far."""
+        battery = self.battery
+        return max(battery.remaining - drawn_as / (3600.0 * battery.capacity_ah), 0.0)
+
     def battery_state(self, rotor: Array) -> BatteryState:
         """Battery after the charge drawn so far, at the present thrust."""
         battery = self.battery
-        drawn = rotor[CHARGE] / (3600.0 * battery.capacity_ah)
-        remaining = max(battery.remaining - drawn, 0.0)
+        remaining = self.battery_remaining(rotor[CHARGE])
         current = battery.hover_current_a * (rotor[THRUST] / self.hover_thrust) ** 1.5
         voltage = battery.cells * (3.5 + 0.7 * remaining) - battery.resistance_ohm * current
         return BatteryState(max(voltage, 0.0), current, remaining)

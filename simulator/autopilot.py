@@ -61,6 +61,10 @@ class Autopilot:
         self.reached: frozenset[str] = frozenset()  # boot events
         self.boot_scale = boot_scale
         self._boot = sorted((at_s * boot_scale, name) for name, at_s in firmware.boot.items())
+        healthy_s = (firmware.healthy_after_s, firmware.healthy_without_position_after_s)
+        grows_s = (*firmware.boot.values(), *healthy_s, firmware.sensors.first_fix_s)
+        self._growth_s = [at_s * boot_scale for at_s in grows_s]
+        self._grown_up_s = max(self._growth_s)
         self._rules: dict[str, list[Rule]] = {}
         for rule in firmware.rules:
             self._rules.setdefault(rule.event, []).append(rule)
@@ -253,9 +257,10 @@ class Autopilot:
         """
         if self.failsafe or not self.pilot.flies_itself(self.armed, self.plant.on_ground):
             return False
+        now_s = self.time_s
         until_s = min(self._steady_until_s, self._watch.calm_until_s(self.gps_healthy))
         if self.armed:
-            until_s = min(until_s, self.time_s + self._battery_lasts_s)
+            until_s = min(until_s, now_s + self._battery_lasts_s)
             if not self._flown:
                 until_s = min(until_s, self._armed_s + self.parameters.role("disarm_idle_s"))
         self.calm_until = int(min(until_s / STEP_S, self.steps + _RESTS_STEPS)) - 1
@@ -275,21 +280,16 @@ class Autopilot:
     @property
     def _battery_lasts_s(self) -> float:
         """Until the next warning, at full thrust."""
-        battery = self.truth.battery
-        return self._watch.battery_share(battery.remaining) / self.plant.drain_max_ps
+        left = self._watch.battery_share(self.plant.battery_remaining)
+        return left / self.plant.drain_max_ps if self.plant.drain_max_ps else math.inf
 
     @property
     def _steady_until_s(self) -> float:
         """When boot, the health of the sensors or the stream of setpoints changes by itself."""
-        firmware, scale, now_s = self.firmware, self.boot_scale, self.time_s
-        changes_s = (
-            self._boot[0][0] if self._boot else math.inf,
-            firmware.healthy_after_s * scale,
-            firmware.healthy_without_position_after_s * scale,
-            firmware.sensors.first_fix_s * scale,
-        )
-        until_s = min((at_s for at_s in changes_s if at_s > now_s), default=math.inf)
-        lost_s = self._setpoint_s + firmware.stream_reaction_s
+        now_s, until_s = self.time_s, math.inf
+        if now_s <= self._grown_up_s:
+            until_s = min(at_s for at_s in self._growth_s if at_s >= now_s)
+        lost_s = self._setpoint_s + self.firmware.stream_reaction_s
         lost_s += self.parameters.role("stream_timeout_s")
         watched = self.armed and self.mode.behaviour is Behaviour.SETPOINT
         return min(until_s, lost_s) if watched or lost_s >= now_s else until_s

@@ -55,12 +55,12 @@ class Layout:
         self._wire_names: Sequence[str] = message.ordered_fieldnames
         self._names: Sequence[str] = message.fieldnames
         is_text = [fmt.endswith("s") for fmt in _formats(message)]
-        self._spans = [
+        spans = [
             1 if text else length for text, length in zip(is_text, message.lengths, strict=True)
         ]
-        self._is_text = is_text
         order = tuple(self._names.index(name) for name in self._wire_names)
-        self._pack = _packer(self._struct, order, self._spans)
+        self._pack = _packer(self._struct, order, spans)
+        self._named = _namer(self._wire_names, spans, is_text)
 
     @property
     def size(self) -> int:
@@ -78,19 +78,7 @@ class Layout:
         size = self._struct.size
         if len(payload) != size:
             payload = payload[:size].ljust(size, b"\0")
-        flat = self._struct.unpack(payload)
-        values: dict[str, Any] = {}
-        at = 0
-        for name, span, text in zip(self._wire_names, self._spans, self._is_text, strict=True):
-            if span == 1:
-                value = flat[at]
-                values[name] = (
-                    value.split(b"\0", 1)[0].decode("ascii", "replace") if text else value
-                )
-            else:
-                values[name] = flat[at : at + span]
-            at += span
-        return values
+        return self._named(self._struct.unpack(payload))
 
 
 def _packer(
@@ -108,6 +96,26 @@ def _packer(
         f"lambda v: pack({', '.join(terms)})", {"pack": layout.pack}
     )
     return packer
+
+
+def _namer(
+    names: Sequence[str], spans: Sequence[int], is_text: Sequence[bool]
+) -> Callable[[tuple[Any, ...]], dict[str, Any]]:
+    """What a struct unpacks, in the order of the wire -> values by name; written out likewise."""
+    terms = []
+    at = 0
+    for name, span, text in zip(names, spans, is_text, strict=True):
+        value = f"v[{at}]" if span == 1 else f"v[{at}:{at + span}]"
+        terms.append(f"{name!r}: {f'text({value})' if text else value}")
+        at += span
+    namer: Callable[[tuple[Any, ...]], dict[str, Any]] = eval(
+        f"lambda v: {{{', '.join(terms)}}}", {"text": _text}
+    )
+    return namer
+
+
+def _text(value: bytes) -> str:
+    return value.split(b"\0", 1)[0].decode("ascii", "replace")
 
 
 def _formats(message: Any) -> list[str]:

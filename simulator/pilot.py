@@ -145,8 +145,8 @@ class Pilot:
         return self._demand
 
     def flies_itself(self, armed: bool, on_ground: bool) -> bool:
-        """Whether `fly` will do no more than repeat its demand, or run the position loop on an
-        unchanged setpoint, until somebody speaks or the ground is touched."""
+        """Whether `fly` will do no more than demand the attitude asked for, or run the position
+        loop on an unchanged setpoint, until somebody speaks or the ground is touched."""
         if not armed:
             return self.landed and self._demand is OFF
         if self.landed or on_ground or self.climbed or self.events or self._ground_s:
@@ -154,11 +154,15 @@ class Pilot:
         setpoint = self._attitude_setpoint
         if setpoint is None:
             return self.behaviour in _STANDING
-        return setpoint is self._source and setpoint.climb_mps is None and not self._boosts_thrust
+        return setpoint.climb_mps is None and not self._boosts_thrust
 
-    def next_loop_step(self, step: int, never: int) -> int:
+    def next_loop_step(self, step: int, look: Callable[[], Nav], never: int) -> int:
         """When the position loop, told all it needs, is to be run in place of `fly`."""
-        if self._demand is OFF or self._attitude_setpoint is not None:
+        if self._demand is OFF:
+            return never
+        setpoint = self._attitude_setpoint
+        if setpoint is not None:
+            self._obey(setpoint, look)
             return never
         self.motion = self._standing_motion()
         self.loop.demand(LOOP_S, self.motion, *self._limits)

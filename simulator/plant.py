@@ -197,6 +197,8 @@ class Plant:
         }
         for name, value in constants.items():
             self.record[name] = value
+        _, capacity_as, *_, current_a, hover_thrust = self.battery_constants
+        self.drain_max_ps: float = current_a * hover_thrust**-1.5 / capacity_as  # share at full thrust
         self._start(conditions.wind_ned_mps, gusts)
 
     def _start(self, wind_ned_mps: Triple, gusts: LinearProcess) -> None:
@@ -294,10 +296,9 @@ class Plant:
         )
 
     @property
-    def drain_max_ps(self) -> float:
-        """Share of the battery's capacity that full thrust draws in a second."""
-        _, capacity_as, *_, current_a, hover = self.battery_constants
-        return float(current_a * (1.0 / hover) ** 1.5 / capacity_as)
+    def battery_remaining(self) -> float:
+        """Share of its capacity, 0 .. 1."""
+        return self._airframe.battery_remaining(float(self._rotor[CHARGE]))
 
     def motion(self) -> list[float]:
         """The truth as plain numbers: attitude wxyz, rates FRD, then NED velocity, position,

@@ -81,7 +81,9 @@ class Stretch:
     def prepare(self) -> None:
         """Take over from the autopilot, which rests: what `fly` flies and tells until it wakes."""
         autopilot = self._view.autopilot
-        self._record["loop_step"] = autopilot.pilot.next_loop_step(autopilot.steps, NO_LOOP)
+        pilot = autopilot.pilot
+        self._record["loop_step"] = pilot.next_loop_step(autopilot.steps, autopilot.look, NO_LOOP)
+        autopilot.plant.obey(pilot.demand)
         self._view.note()
 
     def fly(self, count: int) -> int:

@@ -17,7 +17,7 @@ from simulator.attitude import Demand
 from simulator.autopilot import Autopilot
 from simulator.codec import layout
 from simulator.firmware.base import MotionSetpoint, Quaternion, Triple
-from simulator.frame_writer import RECORD
+from simulator.frame_writer import RECORD, STATE
 from simulator.geodesy import EARTH_RADIUS_M
 from simulator.position_loop import GRAVITY_MPS2
 
@@ -62,7 +62,9 @@ class View:
     _at_step: int = -1
     east_degrees_per_m: float = field(init=False)
     record: Any = field(init=False)  # what of this compiled code reads (`simulator.frame_writer`)
-    _noted: tuple[Demand, MotionSetpoint] | None = None
+    _noted: tuple[Any, ...] = ()
+    _noted_motion: MotionSetpoint | None = None
+    _noted_demand: Demand | None = None
 
     def __post_init__(self) -> None:
         firmware = self.autopilot.firmware
@@ -87,23 +89,30 @@ class View:
 
     def note(self) -> None:
         """Bring the record up to date."""
-        record, autopilot = self.record, self.autopilot
+        autopilot, record = self.autopilot, self.record
         pilot = autopilot.pilot
-        record["clock_offset_us"] = self.clock_offset_us
-        record["resets"] = autopilot.plant.reset_counter
-        record["home_down_m"] = pilot.home_ned_m[2]
-        record["sensors"] = self.sensor_bits
-        record["has_fix"] = self.has_fix
-        record["landed_state"] = autopilot.landed_state
+        state = (
+            self.clock_offset_us,
+            autopilot.plant.reset_counter,
+            pilot.home_ned_m[2],
+            self.sensor_bits,
+            self.has_fix,
+            autopilot.landed_state,
+        )
+        if state != self._noted:
+            self._noted = state
+            for name, value in zip(STATE, state, strict=True):
+                record[name] = value
+        if pilot.motion is not self._noted_motion:
+            self._noted_motion = pilot.motion
+            record["motion"] = _fields(pilot.motion)
+        demand = pilot.demand
         record["thrust"] = pilot.thrust_demanded
-        demand, motion = pilot.demand, pilot.motion
-        if self._noted is not None and self._noted[0] is demand and self._noted[1] is motion:
-            return
-        self._noted = (demand, motion)
-        record["throttle"] = demand.thrust
-        record["attitude"] = demand.attitude or (1.0, 0.0, 0.0, 0.0)
-        record["rates_radps"] = demand.rates_frd_radps or (0.0, 0.0, 0.0)
-        record["motion"] = _fields(motion)
+        if demand is not self._noted_demand:
+            self._noted_demand = demand
+            record["throttle"] = demand.thrust
+            record["attitude"] = demand.attitude or (1.0, 0.0, 0.0, 0.0)
+            record["rates_radps"] = demand.rates_frd_radps or (0.0, 0.0, 0.0)
 
     def payload(self, name: str) -> bytes:
         """Packed payload of message `name` now; built once per step for all links."""
