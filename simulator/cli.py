@@ -233,7 +233,7 @@ class Stop:
 def _announce_compilation() -> None:
     from offboard.model.compilation import prepare_cache
 
-    if not any(prepare_cache().rglob("plant.*.nbi")):
+    if not any(prepare_cache().glob("simulator.stretch.*.o")):
         _tell("compiling the flight dynamics, once (some seconds)")
 
 
