@@ -198,7 +198,9 @@ class Plant:
         for name, value in constants.items():
             self.record[name] = value
         _, capacity_as, *_, current_a, hover_thrust = self.battery_constants
-        self.drain_max_ps: float = current_a * hover_thrust**-1.5 / capacity_as  # share at full thrust
+        self.drain_max_ps: float = (
+            current_a * hover_thrust**-1.5 / capacity_as
+        )  # share at full thrust
         self._start(conditions.wind_ned_mps, gusts)
 
     def _start(self, wind_ned_mps: Triple, gusts: LinearProcess) -> None:
