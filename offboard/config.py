@@ -17,6 +17,8 @@ import yaml
 from pydantic import BaseModel, Field
 
 from offboard.control.catalogue import LAWS, ControllerConfig
+from offboard.control.fusion import FollowedEstimate
+from offboard.control.fusion_filter import FusionSettings
 from offboard.control.horizon.keep_out import refusal
 from offboard.control.horizon.law import HorizonSettings
 from offboard.control.observer import ObserverSettings
@@ -39,6 +41,8 @@ class FlightConfig(Parameters):
     vehicle: Vehicle
     controller: ControllerConfig
     reference: ReferenceConfig
+    estimate: FollowedEstimate = FollowedEstimate.VEHICLE
+    fusion: FusionSettings = FusionSettings()
     observer: ObserverSettings = ObserverSettings()
     limits: Limits = Limits()
     identify: IdentifySettings = IdentifySettings()

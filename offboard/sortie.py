@@ -18,7 +18,7 @@ from offboard.analysis.score import Score
 from offboard.analysis.tlog import TlogError
 from offboard.config import FlightConfig, build_track, dump, load, locate
 from offboard.control.catalogue import build
-from offboard.control.observer import Observer
+from offboard.control.fusion import observer_of
 from offboard.flight import clock
 from offboard.flight.companion import Companion, Outcome
 from offboard.flight.link import LinkError
@@ -60,7 +60,9 @@ def crew(config: FlightConfig) -> Crew:
         controller=build(
             config.controller, config.vehicle, config.period_s, config.seed, clock.monotonic_s
         ),
-        make_observer=lambda: Observer(config.vehicle, config.observer),
+        make_observer=lambda: observer_of(
+            config.estimate, config.vehicle, config.observer, config.fusion
+        ),
         track=build_track(config),
         limits=config.limits,
         period_s=config.period_s,

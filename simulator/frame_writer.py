@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from offboard.model.kernel import kernel
 from simulator.airframe import CHARGE, THRUST
 from simulator.geodesy import EARTH_RADIUS_M
+from simulator.plant import receive_fix
 from simulator.position_loop import GRAVITY_MPS2
 
 Array = NDArray[np.float64]
@@ -255,9 +256,10 @@ def _put_gps(plant: Any, seen: Any, payload: Any) -> None:
         payload.words[5] = payload.words[6] = 0xFFFFFFFF
         payload.octets[28] = 1
         return
-    _put_place(seen, plant.body[10], plant.body[11], payload.integers[2:4])
-    height = _altitude_mm(seen, plant.body[12])
-    north, east = plant.body[7], plant.body[8]
+    receive_fix(plant)
+    _put_place(seen, plant.fix[0], plant.fix[1], payload.integers[2:4])
+    height = _altitude_mm(seen, plant.fix[2])
+    north, east = plant.fix[3], plant.fix[4]
     payload.integers[4] = height
     payload.shorts[10], payload.shorts[11] = 70, 110
     payload.shorts[12] = _fitted(math.hypot(north, east) * 100, _ZERO, _USHORT_MAX)

@@ -67,7 +67,7 @@ STEP_S = 0.004
 """Length of an integration step, s; `advance` moves in whole steps."""
 
 # As typed numbers: compiled code is made once more for each plain constant that is handed on
-_ERROR_LANE, _GUST_LANE, _WHITE_LANE = np.uint64(0), np.uint64(1), np.uint64(2)
+_ERROR_LANE, _GUST_LANE, _WHITE_LANE, _RECEIVER_LANE = (np.uint64(lane) for lane in range(4))
 _GUST_BLOCKS = ((0, GUST_COUNT),)
 
 # Rows of the demand history, a power of two: more steps than any vehicle's longest delay
@@ -91,6 +91,9 @@ RECORD = np.dtype(
         ("offset", "f8", 3),
         ("lag_s", "f8"),
         ("white_sds", "f8", WHITE_COUNT),
+        # the satellite receiver: position NED and velocity NE
+        ("fix_sds", "f8", 5),
+        ("fix_offset", "f8", 3),
         # the attitude loop
         ("row", "f8", ROW_WIDTH),
         ("history", "f8", (_HISTORY_ROWS, ROW_WIDTH)),
@@ -115,6 +118,8 @@ RECORD = np.dtype(
         ("slopes", "f8", (RK4_SCRATCH_ROWS, QUATERNION.size)),
         # what `report_state` says
         ("report", "f8", REPORT_WIDTH),
+        # what `receive_fix` says
+        ("fix", "f8", 5),
     ],
     align=True,
 )
@@ -145,6 +150,14 @@ class Estimate:
     attitude: Array
     rates_frd_radps: Array
     reset_counter: int
+
+
+@dataclass(frozen=True, slots=True)
+class Fix:
+    """What the satellite receiver says, NED: position (3,) and velocity (2,)."""
+
+    position_ned_m: Array
+    velocity_ne_mps: Array
 
 
 class Plant:
@@ -185,6 +198,7 @@ class Plant:
             "noisy": np.any(errors.scale != 0.0),
             "lag_s": model.lag_s,
             "white_sds": white_sds(model),
+            "fix_sds": (*model.receiver.position_m, *model.receiver.velocity_mps),
             "delays": loop.delays,
             "gains": loop.gains,
             "body_constants": self._airframe.body,
@@ -302,6 +316,17 @@ class Plant:
         """Share of its capacity, 0 .. 1."""
         return self._airframe.battery_remaining(float(self._rotor[CHARGE]))
 
+    @property
+    def fix(self) -> Fix:
+        """A satellite fix of now; the same however often it is asked within a step."""
+        _receive.call(self.address)
+        fix = self.record["fix"][0].copy()
+        return Fix(fix[:3], fix[3:])
+
+    def shift_fixes(self, offset_ned_m: Triple) -> None:
+        """Fixes are off by this much more from now on."""
+        self.record["fix_offset"][0] += offset_ned_m
+
     def motion(self) -> list[float]:
         """The truth as plain numbers: attitude wxyz, rates FRD, then NED velocity, position,
         acceleration."""
@@ -345,6 +370,12 @@ def _report(plant: Any) -> int:
     return 0
 
 
+@entry(RECORD)
+def _receive(plant: Any) -> int:
+    receive_fix(plant)
+    return 0
+
+
 @entry(int, RECORD)
 def _advance(count: int, plant: Any) -> int:
     done = 0
@@ -370,6 +401,18 @@ def report_state(plant: Any) -> None:
         plant.normals,
         plant.report,
     )
+
+
+@kernel
+def receive_fix(plant: Any) -> None:
+    """Fill in the satellite fix of this state."""
+    fill_normals(plant.seed, _RECEIVER_LANE, plant.step, plant.fix)
+    for i in range(5):
+        plant.fix[i] *= plant.fix_sds[i]
+    for i in range(3):
+        plant.fix[i] += plant.body[10 + i] + plant.fix_offset[i]
+    for i in range(2):
+        plant.fix[3 + i] += plant.body[7 + i]
 
 
 @kernel

@@ -15,7 +15,7 @@ from simulator.firmware.base import Say
 from simulator.mission_transfer import HANDLERS as MISSION_HANDLERS
 from simulator.mission_transfer import Transfer
 from simulator.strict import Strict
-from simulator.telemetry import MAV_COMP_ID_AUTOPILOT, View
+from simulator.telemetry import LEAST_INTERVAL_US, MAV_COMP_ID_AUTOPILOT, View
 
 MAV_TYPE_GCS = 6
 TEXT_LENGTH = 50
@@ -165,7 +165,8 @@ class Server:
         if interval_us < 0:
             self.streams.pop(name, None)
             return True
-        stream = Stream(round(min(INTERVAL_MAX_US, max(1.0, interval_us))), 0)
+        least_us = LEAST_INTERVAL_US.get(name, 1.0)
+        stream = Stream(round(min(INTERVAL_MAX_US, max(least_us, interval_us))), 0)
         stream.due_us = _next_multiple(self._now_us, stream)
         self.streams[name] = stream
         return True

@@ -29,6 +29,7 @@ ON_POSITION_GRID = frozenset(
 MAV_TYPE_QUADROTOR = 2
 MAV_COMP_ID_AUTOPILOT = 1
 _NAN21 = (math.nan,) * 21
+LEAST_INTERVAL_US = {"GPS_RAW_INT": 125_000.0}  # a receiver gives eight fixes a second
 _GPS, _PREARM = 0x20, 0x10000000  # MAV_SYS_STATUS_SENSOR
 
 
@@ -347,15 +348,16 @@ def vfr_hud(view: View) -> Sequence[Any]:
 
 
 def gps_raw_int(view: View) -> Sequence[Any]:
-    truth = view.autopilot.truth
-    north, east, down = truth.position_ned_m.tolist()
-    v_north, v_east, _ = truth.velocity_ned_mps.tolist()
+    """Its accuracies are PX4's SIH's: larger than the errors."""
+    if not view.has_fix:
+        return (view.time_us, 1, 0, 0, 0, 65535, 65535, 65535, 65535, 0, *(0,) * 6)
+    fix = view.autopilot.plant.fix
+    north, east, down = fix.position_ned_m.tolist()
+    v_north, v_east = fix.velocity_ne_mps.tolist()
     course = _heading_cdeg(math.atan2(v_east, v_north))
     speed = _fit(math.hypot(v_north, v_east) * 100, 16, signed=False)
     height = view.altitude_mm(down)
     latitude, longitude = view.geodetic(north, east)
-    if not view.has_fix:
-        return (view.time_us, 1, 0, 0, 0, 65535, 65535, 65535, 65535, 0, *(0,) * 6)
     return (
         view.time_us, 3, latitude, longitude, height, 70, 110, speed, course, 10, height,
         900, 1780, 400, 0, 0,

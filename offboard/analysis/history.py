@@ -28,14 +28,13 @@ from offboard.mavlink.dialect import Dialect
 from offboard.mavlink.inbound import decode_text_chunk
 from offboard.mavlink.session import DIALECTS
 from offboard.mavlink.texts import TextAssembler
+from offboard.model.geodesy import Geodetic, origin_of, position_ned_m
 
 Array = NDArray[np.float64]
 OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
-EARTH_RADIUS_M = 6371000.0  # of PX4 map projection
 POSITION_FIELDS = "x y z vx vy vz"
 ATTITUDE_FIELDS = "q1 q2 q3 q4 rollspeed pitchspeed yawspeed"
 REFERENCE_FIELDS = "x y z vx vy vz afx afy afz yaw"
-Geodetic = tuple[float, float, float]  # latitude and longitude in degrees, altitude in m
 OUR_WORDS = "offboard: "  # before every phase that we announce
 # (system, component, message id) -> (place in the log, message), in order
 Streams = dict[tuple[int, int, int], list[tuple[int, LoggedMessage]]]
@@ -214,7 +213,13 @@ def _truth(theirs: _Party, clock: _Clock) -> Array:
     newest = np.searchsorted([place for place, _ in origins], places)
     known = np.flatnonzero(newest)
     known = known[np.argsort(places[known])]
-    told = [(rows[row, 0], *_local(rows[row, 1:], origins[newest[row] - 1][1])) for row in known]
+    told = [
+        (
+            rows[row, 0],
+            *position_ned_m(Geodetic(*rows[row, 1:].tolist()), origins[newest[row] - 1][1]),
+        )
+        for row in known
+    ]
     return np.array(told, dtype=np.float64).reshape(-1, 4)
 
 
@@ -267,30 +272,13 @@ def _vehicle(messages: Iterable[LoggedMessage]) -> tuple[int | None, Dialect | N
 
 
 def _origin_given(message: Any) -> Geodetic:
-    return message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
+    return Geodetic(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
 
 
 def _origin_of_home(message: Any) -> Geodetic:
     """Where the local frame's origin is: HOME_POSITION gives one point in both frames."""
-    latitude, longitude = message.latitude / 1e7, message.longitude / 1e7
-    metres = math.radians(1.0) * EARTH_RADIUS_M
-    return (
-        latitude - message.x / metres,
-        longitude - message.y / (metres * math.cos(math.radians(latitude))),
-        message.altitude / 1e3 + message.z,
-    )
-
-
-def _local(place: Array, origin: Geodetic) -> tuple[float, ...]:
-    """North, east, down of (latitude, longitude, altitude) from the origin; the plane is exact to a
-    millimetre within 100 m."""
-    latitude, longitude, altitude_m = place.tolist()
-    metres = math.radians(1.0) * EARTH_RADIUS_M
-    return (
-        (latitude - origin[0]) * metres,
-        (longitude - origin[1]) * metres * math.cos(math.radians(origin[0])),
-        origin[2] - altitude_m,
-    )
+    place = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
+    return origin_of(Geodetic(*place), (message.x, message.y, message.z))
 
 
 def _is_record(message: Any) -> bool:

@@ -12,6 +12,7 @@ import math
 from collections.abc import Callable, Hashable
 
 from offboard.control.base import Adopting, Controller
+from offboard.control.fusion import FusedObserver
 from offboard.control.observer import Observer
 from offboard.flight.assessment import Assessment
 from offboard.flight.decision import Decider, Tick
@@ -23,7 +24,7 @@ from offboard.flight.phases import Limits, Phase
 from offboard.flight.progress import Outcome, Progress
 from offboard.flight.readiness import Readiness
 from offboard.flight.view import VehicleView
-from offboard.mavlink.events import Attitude, Event, LocalPosition, Reset
+from offboard.mavlink.events import Attitude, Event, GpsFix, LocalPosition, Origin, Reset
 from offboard.mavlink.session import Session
 from offboard.model.vehicle import Vehicle
 
@@ -124,7 +125,7 @@ class Companion:
         if reception.events:
             self.peer = peer
         for event in reception.events:
-            self._note(event)
+            self._note(self._followed(event))
         alive = any(self._is_sign_of_life(event) for event in reception.events)
         if alive:
             self._progress.silence_s = self._bridged_s = 0.0
@@ -153,6 +154,22 @@ class Companion:
         """Whether the vehicle is heard: by its state once that flows, for without it vehicle time
         stands still and nothing is decided, whatever heartbeats say."""
         return isinstance(event, (Attitude, LocalPosition)) or not self.view.has_state
+
+    def _followed(self, event: Event) -> Event:
+        """The event with the position that counts: the vehicle's own, or that of our fusion."""
+        if not isinstance(self._observer, FusedObserver):
+            return event
+        fusion = self._observer.fusion
+        match event:
+            case GpsFix(time_s, place, velocity, accuracy_m):
+                fusion.on_fix(time_s, place, velocity, accuracy_m)
+            case Origin(place, said):
+                fusion.on_origin(place, said)
+            case LocalPosition(time_s, position, speed):
+                event = LocalPosition(time_s, *fusion.follow(time_s, position, speed))
+        while fusion.news:
+            self._emission.announce(fusion.news.pop(0))
+        return event
 
     def _note(self, event: Event) -> None:
         self.view.note(event)

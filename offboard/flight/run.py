@@ -14,6 +14,7 @@ import numpy as np
 
 from offboard.control import identification
 from offboard.control.base import Command, Controller, Situation
+from offboard.control.fusion import FusedObserver
 from offboard.control.observer import Observer
 from offboard.flight import clock, manifest
 from offboard.flight.companion import Companion, Outcome
@@ -25,6 +26,7 @@ from offboard.flight.mission import Mission
 from offboard.flight.phases import Limits
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.flight.sitl import Hangar
+from offboard.mavlink.dialect import POSITIONING_TELEMETRY
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
 from offboard.model.document import DocumentError
 from offboard.model.vehicle import Vehicle
@@ -153,18 +155,21 @@ def fly(
         if took_s > COMPILED_S:
             tell(f"compiled in {took_s:.1f} s; the next start finds it cached")
         stack.enter_context(log)
+        observer = crew.make_observer()
+        fuses = isinstance(observer, FusedObserver)
         session = Session(
             SessionSettings(
                 component_id=COMPONENT_ID,
                 record_component_id=RECORD_COMPONENT_ID,
                 stream=link.is_stream,
                 speaks_first=not (bundled or connection.startswith("udpin")),
+                wanted_too=POSITIONING_TELEMETRY if fuses else (),
             )
         )
         for piece in manifest.pieces(log.configuration):
             log.begin(clock.unix_us(), session.encode(piece))
         loop = Loop(
-            _companion(crew, session, lockstep=bundled is not None),
+            _companion(crew, session, observer, lockstep=bundled is not None),
             link,
             log,
             lockstep=bundled is not None,
@@ -174,7 +179,7 @@ def fly(
         return loop.run()
 
 
-def _companion(crew: Crew, session: Session, *, lockstep: bool) -> Companion:
+def _companion(crew: Crew, session: Session, observer: Observer, *, lockstep: bool) -> Companion:
     limits = crew.limits
     if lockstep:  # the vehicle waits for us: silence only says that the machine is busy
         patience = {"connect_s": SITL_PATIENCE_S, "silence_s": SITL_PATIENCE_S}
@@ -182,7 +187,7 @@ def _companion(crew: Crew, session: Session, *, lockstep: bool) -> Companion:
     return Companion(
         vehicle=crew.vehicle,
         session=session,
-        observer=crew.make_observer(),
+        observer=observer,
         controller=crew.controller,
         mission=Mission(crew.track),
         limits=limits,

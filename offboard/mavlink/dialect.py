@@ -127,3 +127,10 @@ TRACKING_TELEMETRY = (
     WantedMessage(245, "EXTENDED_SYS_STATE", 5.0),
     WantedMessage(1, "SYS_STATUS", 2.0),
 )
+
+# For whom the vehicle's own position will not do
+POSITIONING_TELEMETRY = (
+    WantedMessage(24, "GPS_RAW_INT", 10.0, optional=True),
+    WantedMessage(49, "GPS_GLOBAL_ORIGIN", 1.0, optional=True),
+    WantedMessage(242, "HOME_POSITION", 1.0, optional=True),
+)

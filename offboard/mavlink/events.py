@@ -8,6 +8,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from offboard.model.geodesy import Geodetic
+
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
 
@@ -44,6 +46,25 @@ class Attitude:
     time_s: float
     attitude: Quaternion
     rates_frd_radps: Triple
+
+
+@dataclass(frozen=True, slots=True)
+class GpsFix:
+    """GPS_RAW_INT with a 3D fix; `time_s` None where its stamp is not vehicle time."""
+
+    time_s: float | None
+    place: Geodetic
+    velocity_ne_mps: tuple[float, float] | None
+    accuracy_m: float | None  # horizontal, by the receiver's own account
+
+
+@dataclass(frozen=True, slots=True)
+class Origin:
+    """Where the local frame's origin is: said by GPS_GLOBAL_ORIGIN, or by HOME_POSITION, which
+    gives one point in both frames."""
+
+    place: Geodetic
+    said: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,6 +115,8 @@ Event = (
     | Heartbeat
     | LocalPosition
     | Attitude
+    | GpsFix
+    | Origin
     | SystemHealth
     | Landed
     | CommandAck

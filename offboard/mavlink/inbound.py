@@ -16,12 +16,16 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from offboard.mavlink import events
 from offboard.mavlink.counters import DropReason
 from offboard.mavlink.dialect import Dialect, ParameterEncoding
+from offboard.model.geodesy import Geodetic, origin_of
 
 POSITION_LIMIT_M = 1e5
 VELOCITY_LIMIT_MPS = 200.0
 RATE_LIMIT_RADPS = 100.0
 _PREARM_CHECK = 0x10000000  # MAV_SYS_STATUS_PREARM_CHECK
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
+_FIX_3D = 3  # GPS_FIX_TYPE
+_UNKNOWN16 = 0xFFFF
+_LONGEST_UPTIME_US = 10**15  # a larger stamp is Unix time
 _REAL32 = 9  # MAV_PARAM_TYPE
 _UNSIGNED_TYPES, _SIGNED_TYPES = (1, 3, 5), (2, 4, 6)
 _LANDED = ("unknown", "on_ground", "in_air", "takeoff", "landing")  # MAV_LANDED_STATE
@@ -128,6 +132,48 @@ def _attitude(payload: bytes, _: Dialect) -> events.Event | DropReason:
     return events.Attitude(boot_ms / 1000.0, (w / norm, x / norm, y / norm, z / norm), (p, q, r))
 
 
+def _gps_fix(payload: bytes, _: Dialect) -> events.Event | DropReason | None:
+    stamp_us, latitude, longitude, altitude, _, _, speed, course, fix, _, _, accuracy, *_more = (
+        _unpack(mavlink.MAVLink_gps_raw_int_message, payload)
+    )
+    if fix < _FIX_3D:
+        return None
+    place = _place(latitude, longitude, altitude)
+    if place is None:
+        return DropReason.IMPLAUSIBLE
+    velocity = None
+    if speed < _UNKNOWN16 and course < _UNKNOWN16:
+        ahead = math.radians(course * 1e-2)
+        velocity = (speed * 1e-2 * math.cos(ahead), speed * 1e-2 * math.sin(ahead))
+    time_s = stamp_us * 1e-6 if 0 < stamp_us < _LONGEST_UPTIME_US else None
+    return events.GpsFix(time_s, place, velocity, accuracy * 1e-3 if accuracy else None)
+
+
+def _place(latitude: int, longitude: int, altitude_mm: int) -> Geodetic | None:
+    """From degrees * 1e7 and mm above mean sea level; None where no such place is."""
+    if abs(latitude) > 900_000_000 or abs(longitude) > 1_800_000_000:
+        return None
+    return Geodetic(latitude * 1e-7, longitude * 1e-7, altitude_mm * 1e-3)
+
+
+def _global_origin(payload: bytes, _: Dialect) -> events.Event | DropReason:
+    latitude, longitude, altitude, *_time = _unpack(
+        mavlink.MAVLink_gps_global_origin_message, payload
+    )
+    place = _place(latitude, longitude, altitude)
+    return DropReason.IMPLAUSIBLE if place is None else events.Origin(place, said=True)
+
+
+def _home(payload: bytes, _: Dialect) -> events.Event | DropReason:
+    latitude, longitude, altitude, x, y, z, *_more = _unpack(
+        mavlink.MAVLink_home_position_message, payload
+    )
+    place, far = _place(latitude, longitude, altitude), POSITION_LIMIT_M
+    if place is None or not (-far < x < far and -far < y < far and -far < z < far):
+        return DropReason.IMPLAUSIBLE
+    return events.Origin(origin_of(place, (x, y, z)), said=False)
+
+
 def _system_health(payload: bytes, _: Dialect) -> events.Event:
     fields = _unpack(mavlink.MAVLink_sys_status_message, payload)
     health, millivolts, percent = fields[2], fields[4], fields[12]
@@ -169,12 +215,15 @@ def printable(data: bytes) -> str:
     return "".join(c if c.isprintable() else " " for c in text).strip()
 
 
-_DECODERS: Mapping[int, Callable[[bytes, Dialect], events.Event | DropReason]] = {
+_DECODERS: Mapping[int, Callable[[bytes, Dialect], events.Event | DropReason | None]] = {
     0: _heartbeat,
     1: _system_health,
     22: _parameter,
     31: _attitude,
+    24: _gps_fix,
     32: _local_position,
+    49: _global_origin,
     77: _command_ack,
+    242: _home,
     245: _landed,
 }

@@ -46,8 +46,8 @@ class SessionSettings:
     """`system_id` None takes the first autopilot heard. `stream`: serial or TCP, where bytes come
     in any portions. `speaks_first`: heartbeat before anybody was heard (somebody listens at the
     other end). `requests_intervals` False leaves the vehicle's rates alone. `wanted` replaces the
-    dialect's telemetry. `record_component_id` stamps the records that only our log sees; each
-    component id has its own sequence numbers.
+    dialect's telemetry, `wanted_too` adds to it. `record_component_id` stamps the records that only
+    our log sees; each component id has its own sequence numbers.
     """
 
     system_id: int | None = None
@@ -56,6 +56,7 @@ class SessionSettings:
     speaks_first: bool = False
     requests_intervals: bool = True
     wanted: tuple[WantedMessage, ...] | None = None
+    wanted_too: tuple[WantedMessage, ...] = ()
     record_component_id: int = 191
 
 
@@ -250,7 +251,7 @@ class Session:
     def _watch_rates(self) -> None:
         assert self.dialect is not None
         wanted = self.dialect.wanted if self.settings.wanted is None else self.settings.wanted
-        self._rates = TelemetryRates(wanted, self._link_time.seconds)
+        self._rates = TelemetryRates((*wanted, *self.settings.wanted_too), self._link_time.seconds)
 
     # --- out ---
 

@@ -19,13 +19,14 @@ from offboard.analysis import history, tlog
 from offboard.analysis.score import Score, score
 from offboard.control.base import Controller
 from offboard.control.catalogue import build
-from offboard.control.observer import Observer
+from offboard.control.fusion import FusedObserver, observer_of
 from offboard.flight.companion import Companion, Outcome
 from offboard.flight.learning import IdentifySettings
 from offboard.flight.log import FlightLog
 from offboard.flight.mission import Mission
 from offboard.flight.phases import Phase
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
+from offboard.mavlink.dialect import POSITIONING_TELEMETRY
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.model.vehicle import Vehicle
 from simulator import config as simulated
@@ -210,12 +211,17 @@ def make(
     resolved = config.load(name, choices=choices, assignments=assignments, seed=seed)
     believed = resolved.vehicle
     controller = build(resolved.controller, believed, resolved.period_s, resolved.seed)
+    observer = observer_of(resolved.estimate, believed, resolved.observer, resolved.fusion)
     companion = Companion(
         vehicle=believed,
         session=Session(
-            SessionSettings(component_id=COMPONENT_ID, record_component_id=RECORD_COMPONENT_ID)
+            SessionSettings(
+                component_id=COMPONENT_ID,
+                record_component_id=RECORD_COMPONENT_ID,
+                wanted_too=POSITIONING_TELEMETRY if isinstance(observer, FusedObserver) else (),
+            )
         ),
-        observer=Observer(believed, resolved.observer),
+        observer=observer,
         controller=wrap(controller),
         mission=Mission(config.build_track(resolved)),
         limits=resolved.limits.model_copy(update=limits or {}),

@@ -8,6 +8,7 @@ import random
 import struct
 from collections import Counter
 
+import numpy as np
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from sim_bench import LOITER, NAN, OFFBOARD, Bench
@@ -17,7 +18,7 @@ from simulator.firmware.px4.streams import COMPANION_RATES_HZ, GROUND_RATES_HZ
 from simulator.sensors import EstimatorName
 from simulator.server import DATAGRAM_MAX
 
-LOCAL_POSITION, ATTITUDE, HIL_STATE = 32, 30, 115
+LOCAL_POSITION, ATTITUDE, HIL_STATE, GPS_RAW = 32, 30, 115, 24
 
 
 def read(datagrams: list[bytes]) -> list[object]:
@@ -269,6 +270,37 @@ def test_truth_is_sent_on_request() -> None:
     assert state.vy / 100 == pytest.approx(truth.velocity_ned_mps[1], abs=0.006)
     assert state.attitude_quaternion == pytest.approx(truth.attitude, abs=1e-6)
     assert abs(east) > 1.0
+
+
+def test_satellite_fixes_are_as_wrong_as_sih_s() -> None:
+    """Standing still: eight fixes a second however fast they are asked for, white about the truth
+    with the deviations measured on PX4's SIH (N .19, E .13, D .52 m; .062 and .072 m/s)."""
+    bench = Bench(EstimatorName.PX4_LIKE, seed=4)
+    bench.boot()
+    assert bench.command(511, GPS_RAW, 10_000) == [0]
+    begun_s = bench.time_s
+    bench.run(60.0)
+    fixes = [message for _, message in bench.of("GPS_RAW_INT", begun_s)]
+    assert len(fixes) == pytest.approx(480, abs=2)
+    latitude, longitude, amsl = PX4.origin
+    degree_m = math.radians(1.0) * 6_371_000
+    shrink = math.cos(math.radians(latitude))
+    rows = np.array(
+        [
+            (
+                (f.lat * 1e-7 - latitude) * degree_m,
+                (f.lon * 1e-7 - longitude) * degree_m * shrink,
+                f.alt / 1e3 - amsl,
+                f.vel / 100 * math.cos(math.radians(f.cog / 100)),
+                f.vel / 100 * math.sin(math.radians(f.cog / 100)),
+            )
+            for f in fixes
+        ]
+    )
+    assert rows.std(axis=0) == pytest.approx((0.19, 0.13, 0.52, 0.062, 0.072), rel=0.12)
+    assert np.abs(rows.mean(axis=0)).max() < 0.08
+    neighbours = [np.corrcoef(column[1:], column[:-1])[0, 1] for column in rows.T]
+    assert np.abs(neighbours).max() < 0.15
 
 
 # -- hostile input ---------------------------------------------------------------------------
