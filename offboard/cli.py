@@ -178,14 +178,16 @@ def score(
 def check(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Configuration files.")],
 ) -> None:
-    """Validate configuration files without flying; a flight's reference must be flyable too."""
+    """Validate what a flight may be given, without flying: configurations, vehicles, controllers,
+    references (.yaml or .csv; they must be flyable too) and the simulator's scenarios."""
     from offboard.config import check_file
+    from offboard.flight.sitl import check_scenario
     from offboard.model.document import DocumentError
 
     problems = []
     for path in files:
         try:
-            out.print(f"{path}: {check_file(path)}, valid")
+            out.print(f"{path}: {check_file(path, check_scenario)}, valid")
         except DocumentError as error:
             problems.append(str(error))
     if problems:

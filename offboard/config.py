@@ -7,7 +7,7 @@ file, or spells them out. Packaged, `config/` lies inside the package; in a chec
 from __future__ import annotations
 
 import platform
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
@@ -100,7 +100,9 @@ def build_track(config: FlightConfig) -> Track:
         track = build(config.reference)
         check(track, config.vehicle)
     except ValueError as error:
-        raise DocumentError(f"reference {config.reference.shape}: {error}") from None
+        given = config.reference
+        name = given.file if isinstance(given, FromTable) else given.shape
+        raise DocumentError(f"reference {name}: {error}") from None
     controller = config.controller
     if isinstance(controller, HorizonSettings):
         refused = refusal(controller.keep_out, controller.clearance_m, track)
@@ -109,20 +111,28 @@ def build_track(config: FlightConfig) -> Track:
     return track
 
 
-def check_file(path: Path) -> str:
-    """Validate one configuration file of any kind; return what it is. Raises DocumentError."""
+def check_file(path: Path, check_scenario: Callable[[Path], None]) -> str:
+    """Validate one file of any kind that a flight may be given; return what it is.
+
+    A reference is built and must be flyable by the default flight's vehicle, a flight's by its
+    own. Scenarios are the simulator's: `check_scenario` asks it. Raises DocumentError.
+    """
+    if path.suffix.lower() == ".csv":
+        build_track(load("flight", choices={"reference": str(path)}))
+        return "reference"
     raw = read(_text(path), str(path))
-    if "shape" in raw:
-        kind = "reference"
-    elif "law" in raw:
-        kind = "controller"
-    elif "mass_kg" in raw:
-        kind = "vehicle"
-    else:
-        build_track(load(str(path)))
-        return "flight configuration"
-    validate(raw, _model(kind, raw, str(path)), str(path))
-    return kind
+    name = str(path if path.suffix in (".yaml", ".yml") else path.absolute())
+    if "conditions" in raw or "faults" in raw:
+        check_scenario(path)
+        return "scenario"
+    for kind, key in (("reference", "shape"), ("controller", "law"), ("vehicle", "mass_kg")):
+        if key in raw:
+            validate(raw, _model(kind, raw, str(path)), str(path))
+            if kind == "reference":
+                build_track(load("flight", choices={kind: name}))
+            return kind
+    build_track(load(name))
+    return "flight configuration"
 
 
 def dump(config: FlightConfig) -> str:

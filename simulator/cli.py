@@ -69,6 +69,9 @@ def simulate(
     log: Annotated[
         Path | None, typer.Option(help="Record the companion link as a .tlog; never overwrites.")
     ] = None,
+    check: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Validate a scenario file, and stop.")
+    ] = None,
     show_version: Annotated[
         bool, typer.Option("--version", help="Say which one it is, and stop.")
     ] = False,
@@ -82,6 +85,8 @@ def simulate(
         raise typer.Exit(0)
     if list_scenarios:
         _list_scenarios()
+    if check is not None:
+        _check(check)
     personality = FIRMWARES.get(firmware)
     if personality is None:
         _refuse(f"--firmware {firmware}: unknown; there is {', '.join(FIRMWARES)}")
@@ -180,6 +185,18 @@ def simulate(
         for sentence, count in berth.instance.swallowed.items():
             print(f"{count} x {sentence}", flush=True)
     raise typer.Exit(outcome.code)
+
+
+def _check(path: Path) -> NoReturn:
+    from offboard.model.document import DocumentError
+    from simulator import config
+
+    try:
+        config.scenario(str(path if path.suffix in (".yaml", ".yml") else path.absolute()))
+    except DocumentError as error:
+        _refuse(str(error))
+    print(f"{path}: scenario, valid")
+    raise typer.Exit(0)
 
 
 def _list_scenarios() -> NoReturn:

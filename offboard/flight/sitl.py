@@ -15,7 +15,10 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
+
+from offboard.model.document import DocumentError
 
 OWN_VEHICLES = {"ardupilot": "arducopter"}  # flown by the simulator, so believed of it as well
 STOP_S = 2.0
@@ -29,6 +32,14 @@ class Ending:
 
     sentence: str
     unusable: bool
+
+
+def check_scenario(path: Path) -> None:
+    """Have the simulator read a scenario file. Raises DocumentError with what is wrong in it."""
+    command = [sys.executable, "-m", "simulator", "--check", str(path)]
+    answer = subprocess.run(command, capture_output=True, text=True, check=False)
+    if answer.returncode:
+        raise DocumentError(*answer.stderr.strip().splitlines())
 
 
 class Hangar:

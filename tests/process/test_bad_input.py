@@ -21,6 +21,7 @@ from offboard import cli
 from offboard.analysis import history, tlog
 
 Capture = pytest.CaptureFixture[str]
+CONFIG = Path(__file__).parents[2] / "config"
 Call = Callable[..., tuple[int, str]]
 
 
@@ -90,6 +91,44 @@ def test_usage_is_refused_before_anything_is_sent(
     assert "Traceback" not in said
     assert len(said.strip().splitlines()) == 1
     assert not list(tmp_path.iterdir())
+
+
+CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3\n"
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "says"),
+    [
+        ("flight.yaml", "vehicle: px4_sih", "flight.yaml: controller is missing"),
+        ("flight.yaml", "seed: 0.5", "flight.yaml: vehicle is missing"),
+        ("path.csv", CSV.format(east="two"), "path.csv, row 4, column east_m: 'two' is not a"),
+        ("path.csv", CSV.format(east=90), "reference path.csv: the reference asks for"),
+        ("circle.yaml", "shape: circle\nperiod_s: 0", "circle.yaml: period_s: 0 is out of range"),
+        ("circle.yaml", "shape: circle\nperiod_s: 1", "reference circle: the reference asks for"),
+        ("law.yaml", "law: pid\nseed: 3", "law.yaml: seed is not a known key"),
+        ("mine.yaml", "mass_kg: -1", "mine.yaml: mass_kg: -1 is out of range (must be a number >"),
+        (
+            "storm.yaml",
+            "name: storm\nconditions: {thrust_scale: 9}",
+            "storm.yaml: conditions.thrust_scale: 9 is out of range (must be",
+        ),
+        ("storm.yaml", "name: s\nfaults: [{kind: frogs}]", "storm.yaml: faults.0"),
+    ],
+)
+def test_every_kind_of_file_is_checked(
+    name: str, content: str, says: str, offboard: Call, tmp_path: Path
+) -> None:
+    (tmp_path / name).write_text(content)
+    code, said = offboard("check", name)
+    assert (code, "Traceback" in said) == (2, False)
+    assert says in said
+
+
+def test_all_shipped_files_are_valid(offboard: Call) -> None:
+    files = [path for path in CONFIG.rglob("*.yaml") if "scenarios" not in path.parts]
+    assert len(files) > 25
+    scenario = CONFIG / "scenarios" / "all_together.yaml"
+    assert offboard("check", scenario, *files) == (0, "")
 
 
 def test_infeasible_reference_names_time_value_and_limit(offboard: Call) -> None:
