@@ -24,7 +24,15 @@ from offboard.flight.phases import Limits, Phase
 from offboard.flight.progress import Outcome, Progress
 from offboard.flight.readiness import Readiness
 from offboard.flight.view import VehicleView
-from offboard.mavlink.events import Attitude, Event, GpsFix, LocalPosition, Origin, Reset
+from offboard.mavlink.events import (
+    Attitude,
+    Event,
+    GpsFix,
+    LocalPosition,
+    Moved,
+    Origin,
+    Reset,
+)
 from offboard.mavlink.session import Session
 from offboard.model.vehicle import Vehicle
 
@@ -182,6 +190,8 @@ class Companion:
                 self._observer.on_position(time_s, position, velocity)
                 if self._learner:
                     self._learner.on_position(time_s, position, velocity)
+            case Moved(peer):
+                self._emission.announce(f"the vehicle is heard from another port now: {peer}")
             case Reset():
                 self._observer.reset()
                 self._tick = -1

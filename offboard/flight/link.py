@@ -1,4 +1,4 @@
-"""Byte links: UDP, TCP and serial behind one small contract. No MAVLink here.
+"""Byte links: UDP, TCP and serial behind one small contract. Of MAVLink they know setpoints by id.
 
 udpin:HOST:PORT    wait on a port; the peer is whoever the session accepts
 udpout:HOST:PORT   send to a fixed peer
@@ -10,11 +10,15 @@ from __future__ import annotations
 
 import select
 import socket
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
+from contextlib import suppress
 from typing import Protocol
 
 Chunk = tuple[bytes, Hashable]
 DATAGRAM_SIZE = 65535
+WAITING_MAX = 50  # frames
+SETPOINTS = frozenset({82, 84, 86})  # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_*
+TCP_NOTSENT_LOWAT = 25  # Linux's option, which the socket module names since Python 3.12
 
 
 class LinkError(Exception):
@@ -31,7 +35,8 @@ class Link(Protocol):
         ...
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
-        """Send to `peer` (UDP) or the only other end. A full or refused link drops, uncounted."""
+        """Send one frame to `peer` (UDP) or the only other end. Never waits: what does not fit is
+        dropped, or kept a while where a part of a frame would spoil the stream."""
         ...
 
     def close(self) -> None: ...
@@ -77,20 +82,51 @@ class UdpLink:
         return int(self._socket.getsockname()[1])
 
 
+class Backlog:
+    """Whole frames that wait for room in a stream. A setpoint takes the place of the one that
+    waits, for an old one is worse than none; of too many frames the oldest are given up."""
+
+    def __init__(self) -> None:
+        self._begun = b""
+        self._waiting: list[bytes] = []
+
+    def add(self, frame: bytes) -> None:
+        if _is_setpoint(frame):
+            self._waiting = [other for other in self._waiting if not _is_setpoint(other)]
+        self._waiting = [*self._waiting, frame][-WAITING_MAX:]
+
+    def flush(self, send: Callable[[bytes], int]) -> None:
+        """Send what goes; `send` returns how many bytes went, or raises as sockets do."""
+        with suppress(BlockingIOError):
+            while self._begun or self._waiting:
+                if not self._begun:
+                    self._begun = self._waiting.pop(0)
+                self._begun = self._begun[send(self._begun) :]
+
+
+def _is_setpoint(frame: bytes) -> bool:
+    return int.from_bytes(frame[7:10], "little") in SETPOINTS
+
+
 class TcpLink:
     """A TCP connection to an autopilot that listens."""
 
     is_stream = True
 
     def __init__(self, sock: socket.socket) -> None:
+        sock.setblocking(False)
+        with suppress(OSError):  # what waits shall wait here, where it can still be replaced
+            sock.setsockopt(socket.IPPROTO_TCP, TCP_NOTSENT_LOWAT, 1)
         self._socket = sock
         self._open = True
+        self._backlog = Backlog()
         self.send_errors = 0
 
     def receive(self, timeout_s: float) -> list[Chunk]:
         if not self._open:
             select.select([], [], [], max(0.0, timeout_s))
             return []
+        self._flush()
         ready, _, _ = select.select([self._socket], [], [], max(0.0, timeout_s))
         if not ready:
             return []
@@ -104,8 +140,12 @@ class TcpLink:
         return [(data, "tcp")] if data else []
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
+        self._backlog.add(data)
+        self._flush()
+
+    def _flush(self) -> None:
         try:
-            self._socket.sendall(data)
+            self._backlog.flush(self._socket.send)
         except OSError:
             self.send_errors += 1
 
@@ -171,7 +211,6 @@ def _open_socket(kind: str, host: str, port: int, address: str) -> Link:
         if kind == "tcp":
             connection = socket.create_connection((host, port), timeout=5.0)
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            connection.settimeout(1.0)
             return TcpLink(connection)
         peer = (socket.gethostbyname(host), port)
         sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)

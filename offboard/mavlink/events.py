@@ -6,6 +6,7 @@ range, or the message was dropped and counted.
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
 from offboard.model.geodesy import Geodetic
@@ -104,6 +105,14 @@ class Parameter:
 
 
 @dataclass(frozen=True, slots=True)
+class Moved:
+    """The vehicle is heard from another port of its host, and no longer from the one before: a
+    router was started again. `peer` is what it sends from now."""
+
+    peer: Hashable
+
+
+@dataclass(frozen=True, slots=True)
 class Reset:
     """The vehicle's time went backwards by more than reordering explains: it was rebooted."""
 
@@ -122,5 +131,6 @@ Event = (
     | CommandAck
     | StatusText
     | Parameter
+    | Moved
     | Reset
 )

@@ -4,22 +4,22 @@ Bytes and `now_s` (monotonic host seconds) come in as arguments; events, frames 
 frames to send go out as values. No socket, no file, no clock. Nothing that arrives can raise.
 
 The session pins itself to the first autopilot it hears, by system, component and peer, and from
-then on drops and counts everybody else. Our system id is the vehicle's, so that it takes us for
-a part of itself.
+then on drops and counts everybody else. Only where that peer has fallen silent may another port of
+the same host go on as the vehicle (`Peer`). Our system id is the vehicle's, so that it takes us
+for a part of itself.
 """
 
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
-from enum import Enum, auto
 from types import MappingProxyType
 
 from offboard.mavlink import framing, inbound, outbound
 from offboard.mavlink.ardupilot import ARDUPILOT
 from offboard.mavlink.counters import Counters, DropReason, SequenceTracker
 from offboard.mavlink.dialect import TYPE_GCS, TYPE_ONBOARD_CONTROLLER, Dialect, WantedMessage
-from offboard.mavlink.events import Attitude, Event, LocalPosition, Reset, VehicleFound
+from offboard.mavlink.events import Attitude, Event, LocalPosition, Moved, Reset, VehicleFound
 from offboard.mavlink.inbound import Address
 from offboard.mavlink.outgoing import (
     CommandLong,
@@ -28,9 +28,11 @@ from offboard.mavlink.outgoing import (
     Record,
     TimesyncReply,
 )
+from offboard.mavlink.peer import Peer
 from offboard.mavlink.px4 import PX4
 from offboard.mavlink.telemetry_rates import LinkTime, Shortfall, TelemetryRates
 from offboard.mavlink.texts import TextAssembler
+from offboard.mavlink.vehicle_time import Age, VehicleTime
 
 DIALECTS: Mapping[str, Dialect] = MappingProxyType({d.name: d for d in (PX4, ARDUPILOT)})
 
@@ -38,7 +40,6 @@ _HEARTBEAT, _COMMAND_ACK, _TIMESYNC, _STATUSTEXT = 0, 77, 111, 253
 _AUTOPILOT_COMPONENT = 1
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 _HEARTBEAT_PERIOD_S = 0.999  # 1 Hz, and no cycle late for a rounding error
-_REORDERING_S = 2.0  # older than this against the newest is a reboot, not a late packet
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,33 +75,6 @@ class Reception:
 _NOTHING = Reception()
 
 
-class _Age(Enum):
-    FRESH = auto()
-    STALE = auto()
-    REBOOTED = auto()
-
-
-class _VehicleTime:
-    """Judges time stamps: each message's must rise, and none may lie far behind the newest."""
-
-    def __init__(self) -> None:
-        self._newest_s = 0.0
-        self._last_s: dict[int, float] = {}
-
-    def judge(self, message_id: int, time_s: float) -> _Age:
-        if time_s < self._newest_s - _REORDERING_S:
-            self._newest_s = time_s
-            self._last_s = {message_id: time_s}
-            return _Age.REBOOTED
-        last_s = self._last_s.get(message_id)
-        if last_s is not None and time_s <= last_s:
-            return _Age.STALE
-        self._last_s[message_id] = time_s
-        if time_s > self._newest_s:
-            self._newest_s = time_s
-        return _Age.FRESH
-
-
 class Session:
     """See the module. `vehicle` and `dialect` are None until an autopilot was heard."""
 
@@ -110,12 +84,12 @@ class Session:
         self.vehicle: VehicleFound | None = None
         self.dialect: Dialect | None = None
         self._own = Address(settings.system_id or 1, settings.component_id)
-        self._peer: Hashable | None = None
+        self._peer = Peer()
         self._splitter = framing.FrameSplitter(settings.stream, self.counters)
         self._sequence_in = SequenceTracker()
         self._sequence_out: dict[int, int] = {}
         self._texts = TextAssembler()
-        self._time = _VehicleTime()
+        self._time = VehicleTime()
         self._link_time = LinkTime()
         self._rates = TelemetryRates((), 0.0)
         self._heartbeat_sent: tuple[float, float] | None = None  # host time, link time
@@ -124,11 +98,14 @@ class Session:
 
     def receive(self, datagram: bytes, peer: Hashable, now_s: float) -> Reception:
         """Take a datagram (or any portion of a stream) that came from `peer`. Never raises."""
-        if self._peer is not None and peer != self._peer:
-            self.counters.dropped[DropReason.FOREIGN_PEER] += 1
-            return _NOTHING
         frames: list[bytes] = []
         events: list[Event] = []
+        if self._peer.is_foreign(peer):
+            if not self._peer.moves_to(peer, datagram, now_s):
+                self.counters.dropped[DropReason.FOREIGN_PEER] += 1
+                return _NOTHING
+            self._heartbeat_sent = None  # a router learns from it where we are
+            events.append(Moved(peer))
         replies: list[Outgoing] = []
         events.extend(self._texts.expire(now_s))
         for frame in self._splitter.split(datagram):
@@ -159,6 +136,7 @@ class Session:
         if stranger is not None:
             return stranger
         if self.vehicle is not None:
+            self._peer.heard_s = now_s
             self._sequence_in.note(frame.sequence, self.counters)
         if not frame.verified:
             return DropReason.UNKNOWN_ID
@@ -199,8 +177,9 @@ class Session:
         )
         if dialect is None:
             return DropReason.UNSUPPORTED_AUTOPILOT
-        self.dialect, self._peer = dialect, peer
+        self.dialect = dialect
         self.vehicle = VehicleFound(frame.system_id, frame.component_id, dialect.name)
+        self._peer.pin(peer, Address(frame.system_id, frame.component_id))
         self._own = Address(frame.system_id, self.settings.component_id)
         self._heartbeat_sent = None  # the dialect may want another type: say it at once
         self._watch_rates()
@@ -220,17 +199,17 @@ class Session:
         event = inbound.decode(frame.message_id, frame.payload, self.dialect)
         if isinstance(event, DropReason):
             return event
-        age = _Age.FRESH
+        age = Age.FRESH
         if isinstance(event, (LocalPosition, Attitude)):
             age = self._time.judge(frame.message_id, event.time_s)
-            if age is _Age.STALE:
+            if age is Age.STALE:
                 return DropReason.STALE
         # only now: a stream that repeats itself must not look fast enough to fly on
         self._rates.count(frame.message_id, self._link_time.seconds)
         if event is None:
             return False
         if isinstance(event, (LocalPosition, Attitude)):
-            if age is _Age.REBOOTED:
+            if age is Age.REBOOTED:
                 self._begin_anew()
                 events.append(Reset(event.time_s))
             self._link_time.vehicle(event.time_s, now_s)

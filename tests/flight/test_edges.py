@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pty
 import signal
+import socket
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, cast
@@ -13,8 +14,10 @@ import pytest
 
 from offboard.flight.companion import Companion, Outcome, Output
 from offboard.flight.daemon import Loop
-from offboard.flight.link import SerialLink
+from offboard.flight.link import SerialLink, open_link
 from offboard.flight.log import FlightLog
+from offboard.mavlink.counters import Counters
+from offboard.mavlink.framing import FrameSplitter, pack
 
 
 class Wire:
@@ -93,6 +96,34 @@ def test_an_ignored_hang_up_stays_ignored(tmp_path: Path) -> None:
     finally:
         signal.signal(signal.SIGHUP, before)
     assert flight.stops == 0
+
+
+def setpoint(number: int) -> bytes:
+    return pack(82, number.to_bytes(4, "little") + bytes(33) + b"\1\1", number % 256, 1, 191)
+
+
+def test_a_stream_that_is_full_delays_nothing_and_sends_the_newest_setpoint() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        link = open_link(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        theirs, _ = server.accept()
+    theirs.settimeout(10.0)
+    count, heartbeat = 200_000, pack(0, b"\1" * 9, 7, 1, 191)
+    for number in range(count):  # some 10 MB, more than both ends hold
+        link.send(setpoint(number), None)
+    link.send(heartbeat, None)
+    link.send(setpoint(count), None)
+    splitter, frames = FrameSplitter(True, Counters()), []
+    while not frames or frames[-1].raw != setpoint(count):
+        link.receive(0.0)
+        frames += splitter.split(theirs.recv(65536))
+    numbers = [int.from_bytes(f.payload[:4], "little") for f in frames if f.message_id == 82]
+    assert all(frame.verified for frame in frames)
+    assert numbers == sorted(numbers)
+    assert len(numbers) < count  # those that waited have been replaced
+    assert numbers[-2] < count - 1  # by the last one
+    assert frames[-2].raw == heartbeat
+    link.close()
+    theirs.close()
 
 
 def test_an_unplugged_serial_link_is_silent() -> None:

@@ -88,6 +88,44 @@ def test_others_are_dropped_once_pinned() -> None:
     assert len(session.receive(vehicle.position(1000), PEER, 0.0).events) == 1
 
 
+RESTARTED = (PEER[0], 50123)
+
+
+def test_a_router_that_restarts_goes_on_as_the_vehicle() -> None:
+    vehicle = Sender(1)
+    session = pinned(vehicle)
+    session.receive(vehicle.position(1000), PEER, 10.0)
+    assert session.receive(vehicle.position(1020), RESTARTED, 10.5).events == ()
+    assert dropped(session, DropReason.FOREIGN_PEER) == 1
+    moved, position = session.receive(vehicle.position(1040), RESTARTED, 10.51).events
+    assert moved == events.Moved(RESTARTED)
+    assert isinstance(position, events.LocalPosition)
+    assert b"\xfd" in b"".join(session.poll(10.52))[:1]  # a heartbeat at once
+    assert session.receive(vehicle.position(1060), PEER, 10.53).events == ()  # the old one is back
+
+
+@pytest.mark.parametrize(
+    ("sender", "place", "silence_s"),
+    [
+        (Sender(1), RESTARTED, 0.5),
+        (Sender(1), STRANGER, 60.0),
+        (Sender(2), RESTARTED, 60.0),
+        (Sender(1, 154), RESTARTED, 60.0),
+    ],
+    ids=["beside the vehicle", "from another host", "another vehicle", "another component"],
+)
+def test_nobody_else_takes_the_vehicles_place(
+    sender: Sender, place: tuple[str, int], silence_s: float
+) -> None:
+    vehicle = Sender(1)
+    session = pinned(vehicle)
+    session.receive(vehicle.position(1000), PEER, 10.0)
+    assert session.receive(sender.position(1020), place, 10.0 + silence_s).events == ()
+    assert session.receive(b"\xfd nonsense", place, 10.0 + silence_s).events == ()
+    assert dropped(session, DropReason.FOREIGN_PEER) == 2
+    assert len(session.receive(vehicle.position(1040), PEER, 99.0).events) == 1
+
+
 def test_our_own_frames_come_back_unheeded_and_unlogged() -> None:
     session = pinned(Sender())
     reception = session.receive(session.encode(Heartbeat(18)), PEER, 0.0)
