@@ -102,6 +102,11 @@ class Instance:
         if self._injection is not None:
             self._arrived += self._injection.down.carry(self.companion.drain(), self._now_us)
 
+    def tick(self) -> None:
+        """`advance`, the same bytes, in compiled code when nothing happens."""
+        if not self._leap(1):
+            self.advance()
+
     def advance_to_barrier(self, end_s: float = math.inf) -> bool:
         """`advance` until `barrier_due` (True) or `end_s`: the same bytes, in fewer calls."""
         interval_ms = self._position_interval_ms

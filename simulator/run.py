@@ -157,7 +157,7 @@ class Runner:
             deadline_s = epoch_s + (instance.time_s + STEP_S) / speed
             self._serve_until(deadline_s)
             for berth in self._berths:
-                berth.instance.advance()
+                berth.instance.tick()
                 berth.send()
             behind_s = monotonic_s() - deadline_s
             self.punctuality.note(behind_s, STEP_S / speed)
@@ -172,7 +172,7 @@ class Runner:
         """Start each vehicle a step after the next, so that their streams do not fall together."""
         for ahead, berth in enumerate(self._berths):
             for _ in range(ahead):
-                berth.instance.advance()
+                berth.instance.tick()
                 berth.send()
 
     def _serve_until(self, deadline_s: float) -> None:
@@ -239,8 +239,7 @@ class Runner:
         end_s = instance.time_s + FREE_RUN_S
         known_ns = instance.companion.answered_ns
         while instance.time_s < end_s and not (instance.idle or self._over()):
-            instance.advance()
-            if not instance.barrier_due():
+            if not instance.advance_to_barrier(end_s):
                 continue
             self._berth.send_barrier()
             while (datagram := self._companion.receive()) is not None:

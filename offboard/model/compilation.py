@@ -11,6 +11,7 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
+import re
 import stat
 import sys
 import tempfile
@@ -20,6 +21,9 @@ from pathlib import Path
 from types import ModuleType
 
 _VARIABLE = "NUMBA_CACHE_DIR"
+_COMPILES = re.compile(rb"njit|^@kernel", re.M)
+_IMPORT = re.compile(rb"^from ((?:offboard|simulator)[.\w]*) import (\([^)]*\)|.*)", re.M)
+_CONSTANT = re.compile(rb"\b[A-Z][A-Z0-9_]+\b")
 
 
 def prepare_cache() -> Path:
@@ -61,14 +65,22 @@ def prepare_before_numba() -> None:
 
 @functools.cache
 def sources_digest() -> str:
-    """Hash of every module beside us that compiles something: their caches stand or fall as one."""
+    """Hash of every module that compiles something, and of those whose constants it takes: their
+    machine code stands or falls as one."""
     root = Path(__file__).resolve().parents[2]
+    sources = {
+        path.relative_to(root).as_posix(): path.read_bytes()
+        for package in ("offboard", "simulator")
+        for path in (root / package).rglob("*.py")
+    }
+    compiled = {name for name, content in sources.items() if _COMPILES.search(content)}
+    for name in tuple(compiled):
+        for module, names in _IMPORT.findall(sources[name]):
+            if _CONSTANT.search(names):
+                compiled.add(module.decode().replace(".", "/") + ".py")
     digest = hashlib.sha256()
-    for package in ("offboard", "simulator"):
-        for path in sorted((root / package).rglob("*.py")):
-            content = path.read_bytes()
-            if b"njit" in content or b"@kernel" in content:
-                digest.update(str(path.relative_to(root)).encode() + b"\0" + content)
+    for name in sorted(compiled & sources.keys()):
+        digest.update(name.encode() + b"\0" + sources[name])
     return digest.hexdigest()[:16]
 
 

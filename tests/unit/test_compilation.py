@@ -38,15 +38,25 @@ def cache_directory(package_root: Path, **environment: str) -> Path:
     return Path(done.stdout.strip())
 
 
-def test_a_changed_compiled_source_gets_a_new_cache(tmp_path: Path) -> None:
+@pytest.mark.parametrize("changed", ["rigid_body.py", "state.py"])  # its sizes are compiled in
+def test_a_changed_compiled_source_gets_a_new_cache(tmp_path: Path, changed: str) -> None:
     root = copy_of_the_package(tmp_path)
     home = str(tmp_path / "cache")
     first = cache_directory(root, XDG_CACHE_HOME=home)
     assert first.parent == tmp_path / "cache" / "pso-offboard"
     assert first == cache_directory(root, XDG_CACHE_HOME=home)
-    with (root / "offboard" / "model" / "rigid_body.py").open("a") as source:
+    with (root / "offboard" / "model" / changed).open("a") as source:
         source.write("\n# changed\n")
     assert cache_directory(root, XDG_CACHE_HOME=home) != first
+
+
+def test_a_changed_source_that_compiles_nothing_keeps_the_cache(tmp_path: Path) -> None:
+    root = copy_of_the_package(tmp_path)
+    home = str(tmp_path / "cache")
+    first = cache_directory(root, XDG_CACHE_HOME=home)
+    with (root / "offboard" / "model" / "document.py").open("a") as source:
+        source.write("\n# changed\n")
+    assert cache_directory(root, XDG_CACHE_HOME=home) == first
 
 
 def test_without_a_writable_home_the_cache_is_temporary(tmp_path: Path) -> None:
