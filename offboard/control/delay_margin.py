@@ -8,6 +8,8 @@ the plant's delay longer than believed; the eigenvalues of the map over one peri
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
@@ -44,18 +46,27 @@ def needed_margin(vehicle: Vehicle, delay_sd_s: float) -> float:
 
 
 def supported_bandwidth(
-    vehicle: Vehicle, bandwidth_radps: float, period_s: float, delay_sd_s: float
+    vehicle: Vehicle, bandwidth_radps: float, period_s: float, needed_s: float
 ) -> float:
-    """`bandwidth_radps`, or the greatest below it whose delay margin suffices."""
-    needed_s = needed_margin(vehicle, delay_sd_s)
-    bandwidth = bandwidth_radps
-    while bandwidth > LEAST_BANDWIDTH_RADPS:
+    """`bandwidth_radps`, or the greatest below it that bears a delay `needed_s` longer than
+    believed, found by halving in steps of BANDWIDTH_STEP_RADPS."""
+    fractions = np.linspace(0.0, needed_s, 4)
+
+    def bears(bandwidth: float) -> bool:
         loop = _Loop(vehicle, bandwidth, period_s)
-        tried = np.linspace(0.0, needed_s, 4)
-        if all(loop.radius(float(extra_s)) < STABLE for extra_s in tried):
-            return bandwidth
-        bandwidth -= BANDWIDTH_STEP_RADPS
-    return min(LEAST_BANDWIDTH_RADPS, bandwidth_radps)
+        return all(loop.radius(float(extra_s)) < STABLE for extra_s in fractions)
+
+    if bandwidth_radps <= LEAST_BANDWIDTH_RADPS or bears(bandwidth_radps):
+        return bandwidth_radps
+    steps = math.ceil((bandwidth_radps - LEAST_BANDWIDTH_RADPS) / BANDWIDTH_STEP_RADPS)
+    low, high = 0, steps  # LEAST_BANDWIDTH_RADPS is taken as borne
+    while high - low > 1:
+        middle = (low + high) // 2
+        if bears(LEAST_BANDWIDTH_RADPS + middle * BANDWIDTH_STEP_RADPS):
+            low = middle
+        else:
+            high = middle
+    return LEAST_BANDWIDTH_RADPS + low * BANDWIDTH_STEP_RADPS
 
 
 class _Loop:

@@ -44,6 +44,7 @@ __all__ = [
     "ResponseFit",
     "identify",
     "identify_drag",
+    "identify_tilt",
     "stages",
     "warm_up",
 ]
@@ -191,6 +192,13 @@ def identify_drag(trace: Trace, vehicle: Vehicle) -> Identified:
     else:
         refusals["drag_ps"] = "too few positions and commands"
     return Identified(seconds, drag_ps=drag, refusals=refusals)
+
+
+def identify_tilt(trace: Trace) -> Identified:
+    """The tilt alone."""
+    refusals: dict[str, str] = {}
+    seconds = trace.end_s - trace.begin_s
+    return Identified(seconds, tilt=_tilt(trace, refusals), refusals=refusals)
 
 
 def warm_up(vehicle: Vehicle) -> None:

@@ -26,6 +26,8 @@ from offboard.control.response_search import (
     slopes,
     weigh,
 )
+from offboard.control.trace import NORTH, SENT_AT, SENT_NORTH, STAMP, Trace
+from offboard.model.vehicle import AxisResponse
 
 Array = NDArray[np.float64]
 
@@ -41,9 +43,11 @@ FOLLOWED = 2
 # Residuals of an estimator wander for this long: the uncertainty counts them as related.
 RELATED_S = 0.3
 SPACING_S = 0.018  # closer samples are thinned: the responses sought are slower
-# What no residual shows: a real loop is of no order, and commands act on a grid (delay s, frequency
-# relative, damping). Added to the uncertainty.
-MODEL_SDS = (0.002, 0.01, 0.006)
+# More than this, and than this share of what was commanded, contradicts what is believed.
+UNEXPLAINED, UNEXPLAINED_SHARE = 0.008, 0.3
+# What no residual shows: commands act on a grid, and a real loop is not of second order: PX4's,
+# fitted to steps, swings or hover, differs by so much (delay s, frequency relative, damping).
+MODEL_SDS = (0.002, 0.025, 0.025)
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,6 +127,42 @@ class ResponseProblem:
         inverse = np.linalg.pinv(bread)
         covariance: Array = inverse @ meat @ inverse
         return covariance
+
+
+@dataclass(frozen=True, slots=True)
+class Unexplained:
+    """What a believed tilt response leaves unexplained of a stretch, of the bulk, and how much the
+    command moved; parts of a unit vector."""
+
+    scale: float
+    moved: float
+
+    @property
+    def limit(self) -> float:
+        return max(UNEXPLAINED, UNEXPLAINED_SHARE * self.moved)
+
+    @property
+    def contradicts(self) -> bool:
+        return self.scale > self.limit
+
+    @property
+    def told(self) -> str:
+        return (
+            f"{1e3 * self.scale:.0f} mrad of tilt unexplained (limit {1e3 * self.limit:.0f}) "
+            f"of {1e3 * self.moved:.0f} commanded"
+        )
+
+
+def unexplained(trace: Trace, response: AxisResponse) -> Unexplained:
+    """By `response`, of the tilt in `trace`."""
+    times, sent_at = trace.attitude[:, STAMP], trace.commands[:, SENT_AT]
+    if len(times) < 20 or len(sent_at) < 3:
+        return Unexplained(0.0, 0.0)
+    signals = trace.attitude[:, NORTH : NORTH + 2]
+    commands = trace.commands[:, SENT_NORTH : SENT_NORTH + 2]
+    parameters = (response.delay_s, response.natural_frequency_radps, response.damping)
+    left = ResponseProblem(times, signals, sent_at, commands).residual(np.array(parameters))
+    return Unexplained(float(scale_of(left)), commanded_rms(times, sent_at, commands))
 
 
 def predicted(

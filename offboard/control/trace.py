@@ -117,8 +117,11 @@ class Recorder:
 
     def trace(self, begin_s: float, end_s: float) -> Trace:
         """A copy of what is kept of that time."""
-        rows = (self._commands.kept, self._attitude.kept, self._position.kept)
-        return clean(*rows).between(begin_s, end_s)
+        telemetry = (
+            rows[(rows[:, STAMP] >= begin_s) & (rows[:, STAMP] <= end_s)]
+            for rows in (self._attitude.kept, self._position.kept)
+        )
+        return clean(self._commands.kept, *telemetry).between(begin_s, end_s)
 
 
 class _Rows:

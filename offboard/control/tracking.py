@@ -59,7 +59,7 @@ class Search(StrEnum):
 class TrackingSettings(Parameters):
     """One number, the bandwidth, sets the law: weights 1 on position, g^2 / wc^4 on b_c and
     1 / wc^4 on the vertical thrust. 5 rad/s is the knee between error and agitation on PX4 and
-    ArduCopter; 7 wants the delay identified in flight.
+    ArduCopter; 7 wants the delay known, to which `delay_margin` holds it in flight.
 
     `feedback_limit` bounds each lateral component of b_c about its feed-forward (a swing between
     the tilt limits runs into the attitude loop's acceleration limit and cycles), `tilt_limit`

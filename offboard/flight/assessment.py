@@ -38,6 +38,7 @@ class Course:
     stop_requested: bool
     missed_decisions: int
     failure: str
+    contradiction: str = ""
     excites: bool = False
     learnt: bool = False
 
@@ -93,6 +94,7 @@ class Assessment:
             tilt_rad=self._tilt_rad(),
             stop_requested=course.stop_requested,
             missed_decisions=course.missed_decisions,
+            contradicted=bool(course.contradiction),
         )
 
     def words(self, picture: Picture, course: Course) -> dict[str, object]:
@@ -110,6 +112,7 @@ class Assessment:
             "position_error_m": picture.position_error_m,
             "position_error_limit_m": self._limits.position_error_m,
             "failure": course.failure,
+            "contradiction": course.contradiction,
             "complaint": "; ".join(self._complaints()),
             "unready": self.unready(),
         }

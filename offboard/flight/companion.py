@@ -225,7 +225,7 @@ def _learner(
     vehicle: Vehicle, controller: Controller, period_s: float, settings: IdentifySettings | None
 ) -> Learner | None:
     """Nothing is learnt for a controller that could not take it over."""
-    if settings is None or not settings.online or not isinstance(controller, Adopting):
+    if settings is None or not isinstance(controller, Adopting):
         return None
     bandwidth = controller.bandwidth_radps
     return Learner(vehicle, settings, period_s=period_s, bandwidth_radps=bandwidth)

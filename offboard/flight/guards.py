@@ -36,6 +36,7 @@ class Picture:
     tilt_rad: float
     stop_requested: bool
     missed_decisions: int  # one after the other
+    contradicted: bool  # the vehicle file, by telemetry
     lifted_by_command: bool = False  # the autopilot takes off by itself, without setpoints
     excites: bool = False  # steps are wanted before the reference is joined
     learnt: bool = False  # what they showed is taken over
@@ -156,6 +157,10 @@ def toppled(now: Picture) -> bool:
 
 def controller_failed(now: Picture) -> bool:
     return now.missed_decisions >= now.limits.missed_decisions
+
+
+def contradicted(now: Picture) -> bool:
+    return now.contradicted
 
 
 def longer_than(limit: str) -> Guard:

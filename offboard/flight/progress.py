@@ -92,6 +92,7 @@ class Progress:
             stop_requested=self.stop_requested,
             missed_decisions=self._decider.missed,
             failure=self._decider.failure,
+            contradiction=learner.contradiction if learner else "",
             excites=learner is not None and learner.wants_excitation,
             learnt=learner is not None and learner.finished(self._view.time_s),
         )

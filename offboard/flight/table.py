@@ -71,6 +71,7 @@ def _tracking_rows(source: Phase) -> tuple[Row, ...]:
     return (
         *_flying_rows(source),
         Row(source, guards.controller_failed, Phase.LAND, failed, ABORTED),
+        Row(source, guards.contradicted, Phase.LAND, "{contradiction}", ABORTED),
         Row(source, guards.diverged, Phase.LAND, _DIVERGED, ABORTED),
     )
 

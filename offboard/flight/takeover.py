@@ -57,7 +57,10 @@ def bounded(found: Identified, believed: Vehicle, factor: float) -> tuple[Identi
         high = min(high, near * factor + slack)
         if low <= value <= high:
             return False
-        sentences.append(f"{what} {value:.3g} is outside {low:.3g} .. {high:.3g}: not taken over")
+        sentences.append(
+            f"{what} {value:.3g} contradicts the vehicle file's {near:.3g} "
+            f"({low:.3g} .. {high:.3g} allowed), not taken over"
+        )
         return True
 
     for name in ("tilt", "yaw"):

@@ -202,14 +202,15 @@ def make(
     limits: dict[str, float] | None = None,
     flies: Vehicle | None = None,
     learning: IdentifySettings | None = None,
+    believed: Vehicle | None = None,
     **options: Any,
 ) -> Pair:
     """A pair as `offboard fly --sitl` would make it, and what a test changes about it: what
-    `flies` whatever is believed, and `learning` what it is."""
+    `flies` whatever is `believed`, and `learning` what it is."""
     named = {"reference": reference, "vehicle": vehicle}
     choices = {part: chosen for part, chosen in named.items() if chosen}
     resolved = config.load(name, choices=choices, assignments=assignments, seed=seed)
-    believed = resolved.vehicle
+    believed = believed or resolved.vehicle
     controller = build(resolved.controller, believed, resolved.period_s, resolved.seed)
     observer = observer_of(resolved.estimate, believed, resolved.observer, resolved.fusion)
     companion = Companion(

@@ -38,6 +38,7 @@ UNEVENTFUL = Picture(
     tilt_rad=0.0,
     stop_requested=False,
     missed_decisions=0,
+    contradicted=False,
 )
 QUIET = {  # what else a phase shows while it waits
     Phase.ENGAGE: {"engaged": False, "armed": False},
@@ -75,6 +76,7 @@ EVENTS: dict[str, dict[str, object]] = {  # the least that makes each guard hold
     "diverged": {"position_error_m": 5.1},
     "toppled": {"tilt_rad": 1.31},
     "controller_failed": {"missed_decisions": 3},
+    "contradicted": {"contradicted": True},
 }
 
 

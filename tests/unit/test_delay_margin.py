@@ -60,14 +60,16 @@ def test_margins_of_the_flights_on_a_real_px4():
 def test_bandwidth_is_kept_where_the_delay_bears_it():
     for delay_s in (0.01, 0.057, 0.17):
         for bandwidth in (3.0, 5.0, 7.0):
-            assert supported_bandwidth(delayed(delay_s), bandwidth, 0.1, 0.002) == bandwidth
+            vehicle = delayed(delay_s)
+            needed_s = needed_margin(vehicle, 0.002)
+            assert supported_bandwidth(vehicle, bandwidth, 0.1, needed_s) == bandwidth
 
 
 @pytest.mark.parametrize(("delay_s", "sd_s"), [(0.3, 0.002), (0.057, 0.05), (0.45, 0.002)])
 def test_bandwidth_is_lowered_until_the_margin_suffices(delay_s, sd_s):
     vehicle = delayed(delay_s)
-    lowered = supported_bandwidth(vehicle, 7.0, 0.1, sd_s)
-    assert 1.0 <= lowered < 7.0
     needed_s = needed_margin(vehicle, sd_s)
+    lowered = supported_bandwidth(vehicle, 7.0, 0.1, needed_s)
+    assert 1.0 <= lowered < 7.0
     assert delay_margin(vehicle, lowered, 0.1) >= needed_s - 0.01
     assert delay_margin(vehicle, lowered + 0.5, 0.1) <= needed_s + 0.02
