@@ -268,14 +268,14 @@ def compare(
     scenario: Annotated[
         str, typer.Option(help="Comma-separated names or files of the simulator.")
     ] = "calm,px4_like",
-    seeds: Annotated[int, typer.Option(min=1, max=1000, help="Flights of each, seeds 1 ...")] = 3,
+    seeds: Annotated[int, typer.Option(help="Flights of each, seeds 1 .. this, at most 1000.")] = 3,
     vehicle: Annotated[str | None, typer.Option(help="A shipped vehicle, or a file.")] = None,
     connect: Annotated[
         str | None,
         typer.Option(help="Fly whatever is there, one flight after the other, not the simulator."),
     ] = None,
     workers: Annotated[
-        int | None, typer.Option(min=1, max=256, help="Processes; one per processor by default.")
+        int | None, typer.Option(help="Processes, 1 .. 256; one per processor by default.")
     ] = None,
     out_directory: Annotated[
         Path | None, typer.Option("--out", help="Directory of all flights; a new one by default.")
@@ -283,12 +283,21 @@ def compare(
     assignments: Assignments = None,
 ) -> None:
     """Fly controllers x references x scenarios x seeds; one table with medians and ranges."""
+    if workers is not None and not 1 <= workers <= 256:
+        raise Refusal(f"--workers {workers}: give 1 .. 256")
+    if not 1 <= seeds <= 1000:
+        raise Refusal(f"--seeds {seeds}: give 1 .. 1000")
     from offboard.analysis.comparison import compare_all
-    from offboard.config import shipped
+    from offboard.config import located, shipped
     from offboard.flight import clock
-    from offboard.sortie import Order, fly_trial
+    from offboard.sortie import Order, check_flyable, fly_trial
 
     known = sorted(path.stem for path in (shipped() / "controllers").glob("*.yaml"))
+    laws, references = _list(controllers, known), _list(reference)
+    scenarios = _list(scenario) if connect is None else ["connected"]
+    if connect is None:
+        for name in scenarios:
+            located(name, "scenario")
     directory = out_directory or Path("flights") / f"compare-{clock.local_stamp()}"
     order = Order(
         directory=directory,
@@ -297,18 +306,19 @@ def compare(
         connection=connect or DEFAULT_CONNECTION,
         sitl=connect is None,
     )
-    failed = compare_all(
+    check_flyable(order, laws, references)
+    problem = compare_all(
         partial(fly_trial, order),
-        controllers=_list(controllers, known),
-        references=_list(reference),
-        scenarios=_list(scenario) if connect is None else ["connected"],
+        controllers=laws,
+        references=references,
+        scenarios=scenarios,
         seeds=range(1, seeds + 1),
         directory=directory,
         workers=workers if connect is None else 0,
         console=out,
     )
-    if failed:
-        raise Refusal(f"{failed} flights failed; the table says why", 4)
+    if problem:
+        raise Refusal(problem, 4)
 
 
 @app.command(epilog=EXIT_HELP)

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import atexit
-from collections.abc import Callable, Mapping
+import itertools
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field, replace
 from functools import cache
@@ -25,6 +26,7 @@ from offboard.flight.link import LinkError
 from offboard.flight.log import FlightLog, LogError
 from offboard.flight.run import Bundled, Crew, fly
 from offboard.flight.sitl import OWN_VEHICLES, Hangar
+from offboard.flight.table import STOPPED
 from offboard.model.document import DocumentError
 
 
@@ -118,6 +120,17 @@ def keep_score(directory: Path, score: Score, flown: History) -> None:
         ) from None
 
 
+def check_flyable(order: Order, controllers: Sequence[str], references: Sequence[str]) -> None:
+    """Every controller with every reference, before the first flight. Raises DocumentError."""
+    for controller, reference in itertools.product(controllers, references):
+        build_track(_of_trial(order, controller, reference).resolve())
+
+
+def _of_trial(order: Order, controller: str, reference: str) -> Order:
+    named = {"controller": controller, "reference": reference}
+    return replace(order, choices={**order.choices, **named})
+
+
 @cache
 def _hangar() -> Hangar:
     """Of this process, for all flights of a comparison that it flies."""
@@ -128,11 +141,9 @@ def _hangar() -> Hangar:
 
 def fly_trial(order: Order, trial: Trial) -> Result:
     """Fly one row of a comparison like `order`; a flight that cannot be flown is a result too."""
-    choices = {**order.choices, "controller": trial.controller, "reference": trial.reference}
     ordered = replace(
-        order,
+        _of_trial(order, trial.controller, trial.reference),
         directory=trial.directory,
-        choices=choices,
         scenario=trial.scenario,
         seed=trial.seed,
     )
@@ -142,4 +153,5 @@ def fly_trial(order: Order, trial: Trial) -> Result:
         keep_score(trial.directory, score, flown)
     except (DocumentError, LinkError, LogError, TlogError) as error:
         return Result(trial, 2, str(error), {})
-    return Result(trial, outcome.exit_code, outcome.sentence, score.figures())
+    stopped = outcome.sentence.startswith(STOPPED)
+    return Result(trial, outcome.exit_code, outcome.sentence, score.figures(), stopped)

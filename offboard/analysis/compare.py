@@ -12,11 +12,15 @@ import itertools
 import json
 import math
 import statistics
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, Future, as_completed
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+EQUAL_SHARE = 0.01  # of the best median: nearer is no difference, whatever the spread
+POLL_S = 0.2
 FIGURES = (
     "rmse_position_m",
     "max_position_m",
@@ -48,25 +52,51 @@ class Result:
     sentence: str
     figures: dict[str, float]
 
+    stopped: bool = False  # by the operator, and so not flown
+
     @property
     def flown(self) -> bool:
         return self.exit_code == 0 and math.isfinite(self.figures.get("rmse_position_m", math.nan))
 
 
 @dataclass(frozen=True, slots=True)
+class Failure:
+    """A flight without figures, and why."""
+
+    seed: int
+    sentence: str
+
+
+@dataclass(frozen=True, slots=True)
 class Row:
-    """All seeds of one controller on one reference in one scenario: median and range."""
+    """All seeds of one controller on one reference in one scenario: median and range.
+
+    `best`: none failed, and its median error is the lowest there, or equal to that: within the
+    range of the flights of the lowest, or within EQUAL_SHARE of its median.
+    """
 
     controller: str
     reference: str
     scenario: str
     flights: int
-    failed: int
+    failures: tuple[Failure, ...]
     median: dict[str, float]
     lowest: dict[str, float]
     highest: dict[str, float]
-    best: bool
-    why: str
+    best: bool = False
+
+    @property
+    def failed(self) -> int:
+        return len(self.failures)
+
+    @property
+    def flown(self) -> int:
+        return self.flights - self.failed
+
+    @property
+    def why(self) -> str:
+        """Every different reason once."""
+        return "; ".join(dict.fromkeys(failure.sentence for failure in self.failures))
 
 
 Fly = Callable[[Trial], Result]
@@ -94,63 +124,89 @@ def trials(
     ]
 
 
-def run(planned: Sequence[Trial], fly: Fly, pool: Executor) -> Iterator[Result]:
-    """Fly all in `pool`, yielding each result as it ends. A worker that dies is a failed row."""
-    waiting: dict[Future[Result], Trial] = {pool.submit(fly, trial): trial for trial in planned}
-    for done in as_completed(waiting):
-        error = done.exception()
-        if error is None:
-            yield done.result()
-        else:
-            yield Result(waiting[done], 4, f"{type(error).__name__}: {error}", {})
+def run(
+    planned: Sequence[Trial],
+    fly: Fly,
+    open_worker: Callable[[], AbstractContextManager[Executor]],
+    width: int,
+    ending: Callable[[], bool],
+) -> Iterator[Result]:
+    """Fly all in `width` workers, yielding each result as it ends; once `ending`, no more take off.
+
+    Every worker is an executor of its own: one that dies is a failed row, and is replaced.
+    """
+    waiting = deque(planned)
+    with ExitStack() as stack:
+        idle = [stack.enter_context(open_worker()) for _ in range(min(width, len(planned)))]
+        flying: dict[Future[Result], tuple[Trial, Executor]] = {}
+        while flying or (waiting and not ending()):
+            while idle and waiting and not ending():
+                trial, worker = waiting.popleft(), idle.pop()
+                flying[worker.submit(fly, trial)] = trial, worker
+            for done in wait(flying, POLL_S, FIRST_COMPLETED).done:
+                trial, worker = flying.pop(done)
+                error = done.exception()
+                if isinstance(error, BrokenExecutor):
+                    worker = stack.enter_context(open_worker())
+                idle.append(worker)
+                yield done.result() if error is None else Result(trial, 4, _why(error), {})
+
+
+def _why(error: BaseException) -> str:
+    if isinstance(error, BrokenExecutor):
+        return "the process that flew it ended"
+    return f"{type(error).__name__}: {error}"
 
 
 def table(results: Iterable[Result]) -> list[Row]:
-    """One row per controller, reference and scenario; the lowest median error of each reference
-    and scenario, with no flight failed, is marked best."""
+    """One row per controller, reference and scenario, the best of each scenario marked."""
     groups: dict[tuple[str, str, str], list[Result]] = {}
     for result in results:
         trial = result.trial
         key = (trial.reference, trial.scenario, trial.controller)
         groups.setdefault(key, []).append(result)
     rows = [_row(key, groups[key]) for key in groups]
-    best: dict[tuple[str, str], float] = {}
+    best: dict[tuple[str, str], Row] = {}
     for row in rows:
-        if not row.failed:
-            cell = (row.reference, row.scenario)
-            error = row.median["rmse_position_m"]
-            best[cell] = min(error, best.get(cell, math.inf))
+        cell = (row.reference, row.scenario)
+        if not row.failed and (cell not in best or _error(row) < _error(best[cell])):
+            best[cell] = row
     return [
-        replace(
-            row,
-            best=not row.failed
-            and row.median["rmse_position_m"] == best[row.reference, row.scenario],
-        )
-        for row in rows
+        replace(row, best=_equals(row, best.get((row.reference, row.scenario)))) for row in rows
     ]
+
+
+def _error(row: Row) -> float:
+    return row.median["rmse_position_m"]
+
+
+def _equals(row: Row, best: Row | None) -> bool:
+    if best is None or row.failed:
+        return False
+    bound = max(best.highest["rmse_position_m"], (1.0 + EQUAL_SHARE) * _error(best))
+    return _error(row) <= bound
 
 
 def _row(key: tuple[str, str, str], results: list[Result]) -> Row:
     reference, scenario, controller = key
-    flown = [result for result in results if result.flown]
     columns = {
-        name: _finite(result.figures.get(name, math.nan) for result in flown) for name in FIGURES
+        name: _finite(result.figures.get(name, math.nan) for result in results if result.flown)
+        for name in FIGURES
     }
-    failed = [result.sentence for result in results if not result.flown]
     return Row(
         controller=controller,
         reference=reference,
         scenario=scenario,
         flights=len(results),
-        failed=len(failed),
+        failures=tuple(
+            Failure(result.trial.seed, result.sentence) for result in results if not result.flown
+        ),
         median={
             name: statistics.median(values) if values else math.nan
             for name, values in columns.items()
         },
         lowest={name: min(values, default=math.nan) for name, values in columns.items()},
         highest={name: max(values, default=math.nan) for name, values in columns.items()},
-        best=False,
-        why=failed[0] if failed else "",
     )
 
 
@@ -184,6 +240,8 @@ def _finite(values: Iterable[float]) -> list[float]:
 def _plain(value: object) -> object:
     if isinstance(value, dict):
         return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value

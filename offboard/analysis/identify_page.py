@@ -7,10 +7,10 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from plotly.offline import get_plotlyjs
 
+from offboard.analysis import page as shell
+from offboard.analysis.figure import BLUE, GREY, RED, Figure, line, panels
 from offboard.analysis.identify import rows
-from offboard.analysis.paper.figure import BLUE, GREY, RED, Figure, line, panels
 from offboard.control.identification import EstimatorNoise, Identified
 from offboard.control.motion_fit import Motion, specific_velocity
 from offboard.control.response_fit import predicted
@@ -20,18 +20,6 @@ from offboard.model.vehicle import AxisResponse, Vehicle
 Array = NDArray[np.float64]
 
 SHOWN_S = 20.0  # of the flight, its last part: more cannot be seen
-_STYLE = (
-    "body{font:15px/1.5 system-ui,sans-serif;margin:1.5rem auto;max-width:1100px;color:#1f2933}"
-    "table{border-collapse:collapse;font-variant-numeric:tabular-nums}"
-    "td,th{padding:.25rem .7rem;border-bottom:1px solid #e4e7eb;text-align:left}"
-    "td.number{text-align:right}h1{font-size:1.5rem}h2{font-size:1.15rem;margin-top:2rem}"
-)
-_SCRIPT = (
-    'for(const e of document.querySelectorAll(".figure")){'
-    "const f=JSON.parse(document.getElementById(e.dataset.source).textContent);"
-    "Plotly.newPlot(e,f.data,f.layout,{responsive:true,displaylogo:false})"
-    '.then(()=>{e.dataset.drawn="yes"})}'
-)
 
 
 def page(flight: str, found: Identified, trace: Trace, believed: Vehicle) -> str:
@@ -41,49 +29,39 @@ def page(flight: str, found: Identified, trace: Trace, believed: Vehicle) -> str
     figures = [] if math.isnan(trace.begin_s) else [_tilt(last, vehicle), _yaw(last, vehicle)]
     if len(trace.commands) and len(last.position) > 2:
         figures.append(_motion(last, vehicle))
-    parts = [_figure(index, figure) for index, figure in enumerate(figures)]
-    return (
-        '<!doctype html><html lang="en"><head><meta charset="utf-8">'
-        f"<title>Identified: {html.escape(flight)}</title><style>{_STYLE}</style>"
-        f"<script>{get_plotlyjs()}</script></head><body>"
-        f"<h1>Identified from {found.seconds:.1f} s of {html.escape(flight)}</h1>"
-        f"{_table(found)}{_noise(found.noise)}{''.join(parts)}<script>{_SCRIPT}</script>"
-        "</body></html>"
-    )
+    drawn = [shell.drawing(f"figure_{n}", figure) for n, figure in enumerate(figures)]
+    title = f"Identified from {found.seconds:.1f} s of {flight}"
+    constants = f"<article>{_table(found)}{_noise(found.noise)}</article>"
+    body = f"<h1>{html.escape(title)}</h1>{constants}{''.join(drawn)}"
+    return shell.document(title, body)
 
 
 def _table(found: Identified) -> str:
     body = []
     for what, estimate, unit, why in rows(found):
         if estimate is None:
-            cells = f'<td colspan="3">not identified: {html.escape(why)}</td>'
+            cells = f'<td class="text long" colspan="3">not identified: {html.escape(why)}</td>'
         else:
             cells = (
-                f'<td class="number">{estimate.value:.4g}</td>'
-                f'<td class="number">{estimate.sd:.2g}</td><td>{unit}</td>'
+                f"<td>{estimate.value:.4g}</td>"
+                f'<td>{estimate.sd:.2g}</td><td class="text">{unit}</td>'
             )
-        body.append(f"<tr><td>{what}</td>{cells}</tr>")
-    head = "<tr><th>constant</th><th>value</th><th>sd</th><th>unit</th></tr>"
-    return f"<table>{head}{''.join(body)}</table>"
+        body.append(f'<tr><td class="text">{what}</td>{cells}</tr>')
+    text = ' class="text"'
+    head = f"<th{text}>constant</th><th>value</th><th>sd</th><th{text}>unit</th>"
+    return shell.table(head, body)
 
 
 def _noise(noise: EstimatorNoise | None) -> str:
     if noise is None:
         return ""
-    return (
-        f"<p>The estimator, sample to sample: position {1e3 * noise.position_m:.2g} mm, velocity "
-        f"{1e3 * noise.velocity_mps:.2g} mm/s, attitude {1e3 * noise.attitude_rad:.2g} mrad. Its "
-        f"velocity contradicts its position by {noise.velocity_contradiction_mps:.2g} m/s over "
-        "half a second.</p>"
-    )
-
-
-def _figure(index: int, figure: Figure) -> str:
-    data = figure.to_json().replace("</", "<\\/")
-    return (
-        f"<h2>{html.escape(figure.title)}</h2><p>{html.escape(figure.caption)}</p>"
-        f'<script type="application/json" id="data{index}">{data}</script>'
-        f'<div class="figure" data-source="data{index}"></div>'
+    return shell.notes(
+        [
+            f"The estimator, sample to sample: position {1e3 * noise.position_m:.2g} mm, "
+            f"velocity {1e3 * noise.velocity_mps:.2g} mm/s, attitude "
+            f"{1e3 * noise.attitude_rad:.2g} mrad. Its velocity contradicts its position by "
+            f"{noise.velocity_contradiction_mps:.2g} m/s over half a second."
+        ]
     )
 
 

@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.paper.closed_loop import Flight
-from offboard.analysis.paper.figure import (
+from offboard.analysis.figure import (
     BLUE,
     GREEN,
     GREY,
@@ -21,6 +20,7 @@ from offboard.analysis.paper.figure import (
     panels,
     single,
 )
+from offboard.analysis.paper.closed_loop import Flight
 from offboard.analysis.paper.plant import PlantKind
 from offboard.analysis.paper.search import SHOWN_ITERATIONS, Search
 from offboard.analysis.paper.trajectory import Reach

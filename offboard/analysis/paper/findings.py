@@ -9,9 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from offboard.analysis.paper.closed_loop import Flight, LawName, Summary
-from offboard.analysis.paper.extensions import LIMITS, limited_states
-from offboard.analysis.paper.figure import (
+from offboard.analysis.figure import (
     BLUE,
     GREY,
     INK,
@@ -25,6 +23,8 @@ from offboard.analysis.paper.figure import (
     panels,
     single,
 )
+from offboard.analysis.paper.closed_loop import Flight, LawName, Summary
+from offboard.analysis.paper.extensions import LIMITS, limited_states
 from offboard.analysis.paper.horizon import LONGEST, Modes
 from offboard.analysis.paper.peers import DIRECT, Heat
 from offboard.analysis.paper.plant import PlantKind

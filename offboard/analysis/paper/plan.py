@@ -10,9 +10,9 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from offboard.analysis.figure import Figure
 from offboard.analysis.paper import errata, extensions, figures, findings, horizon, peers, tables
 from offboard.analysis.paper.closed_loop import FlightTask, LawName, fly, summarised
-from offboard.analysis.paper.figure import Figure
 from offboard.analysis.paper.options import PaperOptions
 from offboard.analysis.paper.plant import PlantKind
 from offboard.analysis.paper.printed import BEST_DAMPING, LEAST_DAMPING, TABLE_2, UNDAMPED

@@ -21,7 +21,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
-from offboard.analysis.paper.figure import Figure
+from offboard.analysis.figure import Figure
 from offboard.analysis.paper.options import PaperError, PaperOptions, check
 from offboard.analysis.paper.page import facts_json, page
 from offboard.analysis.paper.plan import Job, Key, Piece, Plan
