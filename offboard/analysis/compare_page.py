@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import html
 import itertools
-import math
 from collections.abc import Sequence
 
 from offboard.analysis import page as shell
 from offboard.analysis.compare import EQUAL_SHARE, FIGURES, Row
+from offboard.analysis.compare_table import digits
 from offboard.analysis.figure import GREY, PALETTE, Figure, Trace, numbers, single
 
 SHOWN = {
@@ -25,7 +25,12 @@ _ROW_PX, _BETWEEN, _FRAME_PX = 17, 1, 130
 
 def page(rows: Sequence[Row], missing: Sequence[str] = ()) -> str:
     """One self-contained HTML document; `missing` says what was not flown."""
-    body = ["<h1>Controllers side by side</h1>"]
+    references = ", ".join(dict.fromkeys(row.reference for row in rows))
+    flights = sum(row.flights for row in rows)
+    body = [
+        "<h1>Controllers side by side</h1>",
+        f"<p>{html.escape(references)}: {flights} flights, each law with the same seeds.</p>",
+    ]
     if missing:
         items = "".join(f"<li>{html.escape(line)}</li>" for line in missing)
         body.append(f'<div class="missing">Interrupted:<ul>{items}</ul></div>')
@@ -150,7 +155,5 @@ def _line(row: Row) -> str:
 
 
 def _value(row: Row, name: str) -> str:
-    middle, low, high = (f"{ends[name]:.3g}" for ends in (row.median, row.lowest, row.highest))
-    if math.isnan(row.median[name]):
-        return ""
+    middle, low, high = (digits(ends[name]) for ends in (row.median, row.lowest, row.highest))
     return middle if low == high else f"{middle} [{low}–{high}]"

@@ -107,7 +107,7 @@ class Layout:
             yield Text(f"{mark:2}{name}", style)
             mark = name = ""
         spreads = [_range(row, column) if self.ranges[i] else "" for i, column in _numbered()]
-        medians = [_digits(row.median[column.figure]) for column in COLUMNS]
+        medians = [digits(row.median[column.figure]) for column in COLUMNS]
         beside = spreads if self.beside else [""] * len(COLUMNS)
         cells = [self._placed(i, medians[i], beside[i]) for i, _ in _numbered()]
         yield Text(self._line(mark, name, cells), style)
@@ -128,7 +128,7 @@ def _fitting(rows: Sequence[Row], width: int) -> Layout:
     """The fullest layout that fits: ranges beside, below, below the error only, names apart."""
     names = max((len(_name(row)) for row in rows if row.flown), default=0)
     medians = tuple(
-        max([len(c.title), len(c.unit) + 2, *(len(_digits(row.median[c.figure])) for row in rows)])
+        max([len(c.title), len(c.unit) + 2, *(len(digits(row.median[c.figure])) for row in rows)])
         for c in COLUMNS
     )
     ranges = tuple(max(len(_range(row, c)) for row in rows) for c in COLUMNS)
@@ -152,7 +152,7 @@ def _name(row: Row) -> str:
     return row.controller + part
 
 
-def _digits(value: float) -> str:
+def digits(value: float) -> str:
     """Three significant digits."""
     if not math.isfinite(value):
         return ""
@@ -162,7 +162,7 @@ def _digits(value: float) -> str:
 
 
 def _range(row: Row, column: Column) -> str:
-    low, high = (_digits(ends[column.figure]) for ends in (row.lowest, row.highest))
+    low, high = (digits(ends[column.figure]) for ends in (row.lowest, row.highest))
     return "" if low == high else f"[{low}\N{EN DASH}{high}]"
 
 
