@@ -288,16 +288,19 @@ def compare(
     if not 1 <= seeds <= 1000:
         raise Refusal(f"--seeds {seeds}: give 1 .. 1000")
     from offboard.analysis.comparison import compare_all
-    from offboard.config import located, shipped
+    from offboard.config import locate, shipped
     from offboard.flight import clock
+    from offboard.flight.sitl import check_scenario
     from offboard.sortie import Order, check_flyable, fly_trial
 
     known = sorted(path.stem for path in (shipped() / "controllers").glob("*.yaml"))
     laws, references = _list(controllers, known), _list(reference)
     scenarios = _list(scenario) if connect is None else ["connected"]
     if connect is None:
-        for name in scenarios:
-            located(name, "scenario")
+        files = [locate(name, "scenarios", "scenario") for name in scenarios]
+        for path in files:
+            if shipped() not in path.parents:
+                check_scenario(path)
     directory = out_directory or Path("flights") / f"compare-{clock.local_stamp()}"
     order = Order(
         directory=directory,

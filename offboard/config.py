@@ -58,17 +58,6 @@ def shipped() -> Path:
     return inside if inside.is_dir() else package.parent / "config"
 
 
-def located(name: str, kind: str) -> Path:
-    """The file of a scenario, vehicle, controller or reference, shipped or the user's own.
-
-    Raises DocumentError with the names that there are.
-    """
-    path = _locate(name, f"{kind}s", kind)
-    if not path.is_file():
-        raise DocumentError(f"{path} cannot be read: No such file or directory")
-    return path
-
-
 def load(
     name: str,
     *,
