@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.control.horizon.keep_out import CENTRE, HALF, RADIUS, ROUND
-from offboard.control.horizon.roll_out import STATE_SIZE, P, Scene, V, W, Z
+from offboard.control.horizon.plant import STATE_SIZE, P, Scene, V, W, Z
 
 Array = NDArray[np.float64]
 

@@ -24,15 +24,15 @@ from offboard.control.cost import BoxQuadratic
 from offboard.control.horizon.detour import detours
 from offboard.control.horizon.keep_out import KeepOut, pack, placed_at
 from offboard.control.horizon.outlook import bounds, look_ahead
-from offboard.control.horizon.polish import Ended, polish
-from offboard.control.horizon.quadratic import HorizonQuadratic
-from offboard.control.horizon.roll_out import (
+from offboard.control.horizon.plant import (
     INPUTS,
     STATE_SIZE,
     plant_of,
     scene_of,
     start_state,
 )
+from offboard.control.horizon.polish import Ended, polish
+from offboard.control.horizon.quadratic import HorizonQuadratic
 from offboard.control.horizon.sampling import SamplingSettings, cem, mppi
 from offboard.control.horizon.search import Evaluator, Found, Plan, swarm
 from offboard.control.mpc import one_decision
@@ -210,19 +210,13 @@ class HorizonLaw(TrackingLaw):
         return own, others
 
     def _settled(self, seeds: list[Plan], remaining_s: Callable[[], float] | None) -> Found | None:
-        """The best seed, polished, where that leaves nothing to search for: no limit or volume
-        near, and the quadratic about it as good as solved."""
+        """The best seed, polished, where that leaves nothing to search for: no volume is near,
+        and the convex problem that remains is as good as solved."""
         plans, evaluate = self._plans, self._evaluate
-        alone = self._method is Method.SWARM and plans.seed_with_qp and not plans.speed_limit_mps
+        alone = self._method is Method.SWARM and plans.seed_with_qp
         if not alone or any(evaluate.meets(plan, MET_M) for plan in seeds):
             return None
-        best, ended = polish(
-            evaluate,
-            min(seeds, key=_cost),
-            self._quadratic.hessian,
-            plans.polish_steps,
-            remaining_s,
-        )
+        best, ended = polish(evaluate, min(seeds, key=_cost), plans.polish_steps, remaining_s)
         return Found(best, math.nan, 0, False) if ended is Ended.SETTLED else None
 
     def _find(self, bases: list[Plan], remaining_s: Callable[[], float] | None) -> Found:
@@ -239,9 +233,7 @@ class HorizonLaw(TrackingLaw):
         answers = []
         for base in bases:
             found = swarm(evaluate, base, reach, settings, self._lanes, remaining_s)
-            better, ended = polish(
-                evaluate, found.plan, self._quadratic.hessian, plans.polish_steps, remaining_s
-            )
+            better, ended = polish(evaluate, found.plan, plans.polish_steps, remaining_s)
             late = found.cut_short or ended is Ended.LATE
             answers.append(replace(found, plan=better, cut_short=late))
         return min(answers, key=lambda found: found.plan.cost)

@@ -14,15 +14,9 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.horizon.roll_out import (
-    HOLD,
-    INPUTS,
-    STATE_SIZE,
-    Plant,
-    Scene,
-    intrusions,
-    roll_out,
-)
+from offboard.control.horizon.limits import VOLUME, excesses, limits_of, share_of
+from offboard.control.horizon.plant import INPUTS, STATE_SIZE, Plant, Scene
+from offboard.control.horizon.roll_out import roll_out
 from offboard.control.swarm import RandomLanes, Swarm, SwarmSettings
 
 Array = NDArray[np.float64]
@@ -115,22 +109,27 @@ class Evaluator:
         return Plan(inputs[:, :, index].copy(), states[:, :, index].copy(), float(costs[index]))
 
     @property
-    def hold_s(self) -> float:
-        return float(self._plant.scalars[HOLD])
+    def plant(self) -> Plant:
+        return self._plant
 
-    def depths(self, count: int) -> Array:
-        """(V 2 N, count) of the last roll-outs with `count` particles: see `intrusions`."""
-        depths = np.empty((2 * self.steps * len(self._scene.volumes), count))
-        intrusions(self._plant, self._scene, self._arrays[count][0], depths)
-        return depths
+    def rolled(self, count: int) -> tuple[Array, Array]:
+        """States (N + 1, STATE_SIZE, count) of the last roll-outs with `count` particles, and by
+        how much they exceed each limit: see `excesses`."""
+        states = self._arrays[count][0]
+        over = np.empty((self.steps * limits_of(self._scene), count))
+        excesses(self._plant, self._scene, states, over)
+        return states, over
+
+    def shares(self) -> Array:
+        """(N * limits,): for how many seconds each of `excesses` is paid."""
+        limits = range(limits_of(self._scene))
+        return np.tile([share_of(self._plant, limit) for limit in limits], self.steps)
 
     def meets(self, plan: Plan, margin_m: float) -> bool:
         """Whether a plan comes closer to the clearance of any volume than `margin_m`."""
-        if not len(self._scene.volumes):
-            return False
-        depths = np.empty((2 * self.steps * len(self._scene.volumes), 1))
-        intrusions(self._plant, self._scene, plan.states[:, :, None], depths)
-        return bool((depths > -margin_m).any())
+        over = np.empty((self.steps * limits_of(self._scene), 1))
+        excesses(self._plant, self._scene, plan.states[:, :, None], over)
+        return bool((over.reshape(self.steps, -1)[:, VOLUME:] > -margin_m).any())
 
     def _run(
         self, inputs: Array, states: Array, feedback: float, weights: Array, knots: Array
