@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 
 from offboard.analysis.tlog import LoggedMessage, Tlog, columns, name_of
 from offboard.flight import manifest
+from offboard.flight.learning import RECORD_ID as IDENTIFIED_ID
+from offboard.flight.learning import RECORD_NAME as IDENTIFIED_NAME
 from offboard.flight.record import (
     COMPONENT_ID,
     RECORD_COMPONENT_ID,
@@ -31,6 +33,7 @@ from offboard.mavlink.texts import TextAssembler
 from offboard.model.geodesy import Geodetic, origin_of, position_ned_m
 
 Array = NDArray[np.float64]
+IDENTIFIED_SIZE = 20
 OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
 POSITION_FIELDS = "x y z vx vy vz"
 ATTITUDE_FIELDS = "q1 q2 q3 q4 rollspeed pitchspeed yawspeed"
@@ -60,6 +63,7 @@ class History:
     reference: t, position 3, velocity 3, acceleration 3, course (POSITION_TARGET_LOCAL_NED)
     setpoint: t, wall time s, w, x, y, z, thrust (SET_ATTITUDE_TARGET); NaN from the third on where
         the autopilot's own position loop was given one
+    identified: t, then what `flight.takeover.record_of` says
     """
 
     position: Array
@@ -69,6 +73,7 @@ class History:
     setpoint: Array
     record_time_s: Array
     records: tuple[TickRecord, ...]
+    identified: Array
     phases: tuple[Happening, ...]
     modes: tuple[Happening, ...]
     said: tuple[Happening, ...]
@@ -86,10 +91,16 @@ def gather(log: Tlog) -> History:
         lambda system, component: system == vehicle_id and component not in OUR_COMPONENTS,
     )
     clock = _Clock(theirs)
+    arrays = [entry.message for _, entry in ours.of("DEBUG_FLOAT_ARRAY")]
     records = [
         (message.time_usec / 1e6, TickRecord.from_data(message.data))
-        for message in (entry.message for _, entry in ours.of("DEBUG_FLOAT_ARRAY"))
-        if _is_record(message)
+        for message in arrays
+        if _is(message, RECORD_ID, RECORD_NAME)
+    ]
+    identified = [
+        (message.time_usec / 1e6, *message.data[:IDENTIFIED_SIZE])
+        for message in arrays
+        if _is(message, IDENTIFIED_ID, IDENTIFIED_NAME)
     ]
     stamps = [entry.unix_us for entry in log.messages]
     counts: Counter[str] = Counter()
@@ -103,6 +114,7 @@ def gather(log: Tlog) -> History:
         setpoint=_setpoints(ours),
         record_time_s=np.array([time_s for time_s, _ in records]),
         records=tuple(record for _, record in records),
+        identified=np.array(identified, dtype=np.float64).reshape(-1, 1 + IDENTIFIED_SIZE),
         phases=_phases(ours, clock),
         modes=_modes(theirs, clock, dialect),
         said=_said(theirs, clock),
@@ -281,5 +293,5 @@ def _origin_of_home(message: Any) -> Geodetic:
     return origin_of(Geodetic(*place), (message.x, message.y, message.z))
 
 
-def _is_record(message: Any) -> bool:
-    return (message.array_id, message.name.rstrip("\0")) == (RECORD_ID, RECORD_NAME)
+def _is(message: Any, array_id: int, name: str) -> bool:
+    return (message.array_id, message.name.rstrip("\0")) == (array_id, name)

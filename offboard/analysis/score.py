@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BPoly
 
+from offboard.analysis import link
 from offboard.analysis.history import Happening, History
 from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.model.frames import (
@@ -77,6 +78,10 @@ class Score:
     cut_short_share: float = _figure("share of decisions cut short by their deadline")
     position_hz: float = _figure("LOCAL_POSITION_NED received", "Hz")
     attitude_hz: float = _figure("ATTITUDE_QUATERNION received", "Hz")
+    position_gap_max_s: float = _figure("largest gap between positions, vehicle time", "s")
+    stale_share: float = _figure("share of positions that came again or after newer ones")
+    delay_ms: float = _figure("delay identified, newest telemetry to effect", "ms")
+    delay_sd_ms: float = _figure("its standard deviation", "ms")
     hover_thrust: float = _figure("normalised hover thrust, estimated at the end")
     flight_s: float = _figure("from arming to the end of the log, vehicle time", "s")
 
@@ -103,7 +108,9 @@ def score(history: History) -> Score:
         values |= _activity(history, reference, *window)
         values |= _truth(history, reference, *window)
         values["tracked_s"] = window[1] - window[0]
-    values |= _stream(history)
+        values |= link.telemetry(history, *window)
+    values |= link.setpoints(history)
+    values |= link.delay(history)
     values |= _decisions(history)
     return Score(**values)
 
@@ -151,7 +158,7 @@ class _Reference:
 def _tracking(
     history: History, reference: _Reference, begin_s: float, end_s: float
 ) -> dict[str, float]:
-    position = _between(history.position, begin_s, end_s)
+    position = link.each_once(_between(history.position, begin_s, end_s))
     times = position[:, 0]
     error_m = np.linalg.norm(position[:, 1:4] - reference.position(times), axis=1)
     slip_mps = np.linalg.norm(position[:, 4:7] - reference.position(times, 1), axis=1)
@@ -168,8 +175,6 @@ def _tracking(
         "max_velocity_mps": float(slip_mps.max()),
         "rmse_course_deg": _rms(turn),
         "max_course_deg": float(np.abs(turn).max(initial=0.0)),
-        "position_hz": _hz(position),
-        "attitude_hz": _hz(attitude),
     }
 
 
@@ -235,21 +240,6 @@ def _agitation(reference: _Reference, attitude: Array) -> dict[str, float]:
     }
 
 
-def _stream(history: History) -> dict[str, float]:
-    """Setpoints from the first one to the landing."""
-    begun = {what.what.partition(":")[0]: what.time_s for what in history.phases}
-    end_s = begun.get("land", math.inf)
-    armed_s = begun.get("takeoff", NAN)
-    last_s = history.position[-1, 0] if len(history.position) else NAN
-    values = {"flight_s": last_s - armed_s}
-    setpoint = history.setpoint[history.setpoint[:, 0] < end_s]
-    if len(setpoint) > 1:
-        gaps = np.diff(setpoint[:, 0:2], axis=0)
-        values["setpoint_hz"] = _hz(setpoint)
-        values["setpoint_gap_max_s"], values["setpoint_gap_wall_max_s"] = map(float, gaps.max(0))
-    return values
-
-
 def _decisions(history: History) -> dict[str, float]:
     records = history.records
     if not records:
@@ -283,11 +273,6 @@ def _rms(values: Array) -> float:
 
 def _percentile(values: Array, share: float) -> float:
     return float(np.percentile(values, share)) if len(values) else NAN
-
-
-def _hz(rows: Array) -> float:
-    span_s = rows[-1, 0] - rows[0, 0] if len(rows) > 1 else 0.0
-    return float((len(rows) - 1) / span_s) if span_s > 0 else NAN
 
 
 def _at(rows: Array, times: Array) -> Array:

@@ -53,6 +53,39 @@ def losing(share: float, seed: int = 3) -> Filter:
     return lambda _, datagrams: [d for d in datagrams if chance.random() >= share]
 
 
+def stuttering(hold_s: float, every_s: float) -> Filter:
+    """A link that stops for `hold_s` in every `every_s` and then hands over all at once."""
+    held: Bytes = []
+
+    def arriving(time_s: float, datagrams: Bytes) -> Bytes:
+        held.extend(datagrams)
+        if time_s % every_s < hold_s:
+            return []
+        now, held[:] = list(held), []
+        return now
+
+    return arriving
+
+
+def late(delay_s: float) -> Filter:
+    """A link on which everything takes so long."""
+    under_way: list[tuple[float, bytes]] = []
+
+    def arriving(time_s: float, datagrams: Bytes) -> Bytes:
+        under_way.extend((time_s + delay_s, datagram) for datagram in datagrams)
+        now = [datagram for due_s, datagram in under_way if due_s <= time_s]
+        under_way[:] = [entry for entry in under_way if entry[0] > time_s]
+        return now
+
+    return arriving
+
+
+def repeating(again_s: float) -> Filter:
+    """A link that brings everything twice at once, and once more later."""
+    again = late(again_s)
+    return lambda time_s, datagrams: [*datagrams, *datagrams, *again(time_s, datagrams)]
+
+
 def shuffling(seed: int = 5) -> Filter:
     """A link that delays one datagram in five by 20 ms and duplicates another one in five."""
     chance = random.Random(seed)

@@ -1,0 +1,66 @@
+"""What the link was like: rates, gaps and repetitions of telemetry, gaps of setpoints, the delay.
+
+All by the vehicle's time stamps, as the flight itself takes them; arrays of a History in, figures
+of a Score out.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.analysis.history import History
+
+Array = NDArray[np.float64]
+
+
+def each_once(rows: Array) -> Array:
+    """Rows (N, columns) by their times, the first column, in order; of equal times the first."""
+    _, first = np.unique(rows[:, 0], return_index=True)
+    once: Array = rows[first]
+    return once
+
+
+def telemetry(history: History, begin_s: float, end_s: float) -> dict[str, float]:
+    """Between two vehicle times, both included."""
+    position, attitude = (
+        rows[(rows[:, 0] >= begin_s) & (rows[:, 0] <= end_s)]
+        for rows in (history.position, history.attitude)
+    )
+    newest = np.maximum.accumulate(position[:, 0])
+    return {
+        "position_hz": _hz(each_once(position)),
+        "attitude_hz": _hz(each_once(attitude)),
+        "position_gap_max_s": float(np.diff(newest).max(initial=0.0)),
+        "stale_share": float(np.mean(position[1:, 0] <= newest[:-1])),
+    }
+
+
+def setpoints(history: History) -> dict[str, float]:
+    """Setpoints from the first one to the landing."""
+    begun = {what.what.partition(":")[0]: what.time_s for what in history.phases}
+    end_s = begun.get("land", math.inf)
+    armed_s = begun.get("takeoff", math.nan)
+    last_s = history.position[-1, 0] if len(history.position) else math.nan
+    values = {"flight_s": last_s - armed_s}
+    setpoint = history.setpoint[history.setpoint[:, 0] < end_s]
+    if len(setpoint) > 1:
+        gaps = np.diff(setpoint[:, 0:2], axis=0)
+        values["setpoint_hz"] = _hz(setpoint)
+        values["setpoint_gap_max_s"], values["setpoint_gap_wall_max_s"] = map(float, gaps.max(0))
+    return values
+
+
+def delay(history: History) -> dict[str, float]:
+    """The last one that the flight identified."""
+    known = history.identified[np.isfinite(history.identified[:, 1])]
+    if not len(known):
+        return {}
+    return {"delay_ms": 1e3 * float(known[-1, 1]), "delay_sd_ms": 1e3 * float(known[-1, 2])}
+
+
+def _hz(rows: Array) -> float:
+    span_s = rows[-1, 0] - rows[0, 0] if len(rows) > 1 else 0.0
+    return float((len(rows) - 1) / span_s) if span_s > 0 else math.nan
