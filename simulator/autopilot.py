@@ -23,11 +23,13 @@ from simulator.firmware.base import (
     Result,
     Rule,
     Say,
+    Triple,
 )
 from simulator.geodesy import to_metres
 from simulator.mission import GLOBAL_FRAMES, RELATIVE_FRAMES, Mission
+from simulator.nav import Nav
 from simulator.parameters import ParameterTable
-from simulator.pilot import Nav, Pilot
+from simulator.pilot import Pilot
 from simulator.plant import STEP_S, Plant, Truth
 from simulator.watch import EVERY_STEPS, Watch
 
@@ -69,6 +71,7 @@ class Autopilot:
         for rule in firmware.rules:
             self._rules.setdefault(rule.event, []).append(rule)
         self.refused: dict[str, Say] = {}  # events, and "offboard", that are refused by a fault
+        self.restarts = False  # a reboot was asked for and granted
         self.steps = 0
         self._truth: Truth | None = None
         self._nav: Nav | None = None
@@ -110,6 +113,8 @@ class Autopilot:
             after_s = firmware.healthy_after_s
         waits = firmware.setpoint_mode_needs_stream and mode.behaviour is Behaviour.SETPOINT
         booted = self.time_s >= after_s * self.boot_scale and not self.faulty
+        if self.firmware.unhealthy_where_unarmable and not mode.arms:
+            return False
         if mode.behaviour is Behaviour.MISSION:
             return booted and self.mission.flyable
         return booted and (self.stream_alive or not waits)
@@ -147,7 +152,9 @@ class Autopilot:
         """MAV_LANDED_STATE: 1 on ground, 2 in air, 3 taking off, 4 landing."""
         if self.landed:
             return 1
-        return {Behaviour.TAKEOFF: 3, Behaviour.LAND: 4}.get(self.pilot.behaviour, 2)
+        if self.pilot.landing:
+            return 4
+        return 3 if self.pilot.behaviour is Behaviour.TAKEOFF else 2
 
     # -- what comes in -----------------------------------------------------------------------
 
@@ -184,6 +191,23 @@ class Autopilot:
         ):
             local = self.firmware.in_local_frame(values, self.look().attitude)
             self._obey_motion("SET_POSITION_TARGET_LOCAL_NED", local)
+
+    def set_home(self, place_ned_m: Triple) -> None:
+        """Home is there until the next arming."""
+        self.pilot.home_ned_m = place_ned_m
+
+    def reposition(self, latitude: float, longitude: float, height_m: float, frame: int) -> Result:
+        """MAV_CMD_DO_REPOSITION: degrees; height above home or sea level, as the frame has it."""
+        result = self.happen("mode", mode=self.firmware.reposition_mode)
+        if result is Result.ACCEPTED and self.armed:
+            here = self.look().position_ned_m
+            north, east = to_metres(self.firmware.origin, latitude, longitude)
+            relative = frame in RELATIVE_FRAMES
+            down = (self.pilot.home_ned_m[2] if relative else self.firmware.origin[2]) - height_m
+            known = math.isfinite(north + east)
+            place = (*((north, east) if known else here[:2]), down if down == down else here[2])
+            self.pilot.go_to(place)
+        return result
 
     def obey_global_motion(self, values: Mapping[str, Any]) -> None:
         """Fields of SET_POSITION_TARGET_GLOBAL_INT."""
@@ -320,6 +344,7 @@ class Autopilot:
                 (p, q, r),
                 plant.on_ground,
                 plant.reset_counter,
+                plant.height_m,
             )
         return self._nav
 
@@ -473,6 +498,9 @@ class Autopilot:
     def _recover(self) -> None:
         self.failsafe = False
 
+    def _restart(self) -> None:
+        self.restarts = True
+
 
 GUARDS: dict[str, Callable[[Autopilot], bool]] = {
     "armed": lambda autopilot: autopilot.armed,
@@ -488,6 +516,7 @@ GUARDS: dict[str, Callable[[Autopilot], bool]] = {
     "climbing": lambda autopilot: autopilot.pilot.behaviour is Behaviour.TAKEOFF,
     "obeys attitude": lambda autopilot: autopilot.pilot.obeys_attitude,
     "obeys motion": lambda autopilot: autopilot.pilot.obeys_motion,
+    "obeys velocity": lambda autopilot: autopilot.pilot.obeys_velocity,
 }
 
 ACTIONS: dict[str, Callable[[Autopilot], None]] = {
@@ -500,6 +529,7 @@ ACTIONS: dict[str, Callable[[Autopilot], None]] = {
     "hold": Autopilot._hold,
     "level": Autopilot._level,
     "latch": Autopilot._latch,
+    "restart": Autopilot._restart,
 }
 
 

@@ -11,17 +11,21 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
-from simulator.codec import name_of
-from simulator.firmware.base import Result, Say, Severity
+from simulator.codec import id_of, name_of
+from simulator.firmware.base import ModeRequest, Result, Say, Severity
+from simulator.geodesy import to_metres
 from simulator.telemetry import View
+
+_CHANGE_MODE = 1.0  # MAV_DO_REPOSITION_FLAGS
 
 
 @dataclass(frozen=True, slots=True)
 class Command:
     number: int
-    params: tuple[float, ...]  # param1 .. param7
+    params: tuple[float, ...]  # param1 .. param7, places in degrees
     system: int  # of the sender
     component: int
+    frame: int = 0  # MAV_FRAME of the place
 
 
 class Link(Protocol):
@@ -41,9 +45,22 @@ class Commands:
 
     def run(self, command: Command) -> None:
         """Carry out and acknowledge, on the same link."""
-        handler = HANDLERS.get(command.number)
-        result = Result.UNSUPPORTED if handler is None else handler(self, command)
-        self._acknowledge(command, result)
+        answers = self.link.view.autopilot.firmware.command_answers
+        result: Result | None
+        if command.number in answers:
+            result = answers[command.number]
+        elif (handler := HANDLERS.get(command.number)) is not None:
+            result = handler(self, command)
+        else:
+            result = Result.UNSUPPORTED
+        if result is not None:
+            self._acknowledge(command, result)
+
+    def set_mode(self, base_mode: int, custom_mode: int, sender: tuple[int, int]) -> None:
+        """SET_MODE, the message that came before the command."""
+        firmware = self.link.view.autopilot.firmware
+        result = self._request(firmware.set_mode(base_mode, custom_mode))
+        self._acknowledge(Command(firmware.set_mode_acked_as, (), *sender), result)
 
     def _acknowledge(self, command: Command, result: Result) -> None:
         self.link.send(
@@ -54,21 +71,24 @@ class Commands:
         autopilot = self.link.view.autopilot
         if autopilot.firmware.mode_acked_twice:
             self._acknowledge(command, Result.ACCEPTED)
-        request = autopilot.firmware.command_mode(command.params)
+        return self._request(autopilot.firmware.command_mode(command.params))
+
+    def _request(self, request: ModeRequest) -> Result:
+        autopilot = self.link.view.autopilot
         if request.mode is None:
             if request.say is not None:
                 autopilot.texts.append(request.say)
             return request.refusal
         return autopilot.happen("mode", mode=request.mode)
 
-    def _arm_disarm(self, command: Command) -> Result:
-        wish, force = command.params[0], command.params[1]
-        if wish not in (0.0, 1.0):
-            return Result.UNSUPPORTED
-        event = "arm" if wish == 1.0 else "disarm"
+    def _arm_disarm(self, command: Command) -> Result | None:
         autopilot = self.link.view.autopilot
-        forced = force == autopilot.firmware.force_codes[event]
-        return autopilot.happen(f"force {event}" if forced else event)
+        wish = autopilot.firmware.arm_wish(command.params[0])
+        if not wish.event:
+            autopilot.texts += () if wish.say is None else (wish.say,)
+            return wish.refusal
+        forced = command.params[1] == autopilot.firmware.force_codes[wish.event]
+        return autopilot.happen(f"force {wish.event}" if forced else wish.event)
 
     def _takeoff(self, command: Command) -> Result:
         asked_m = command.params[6]
@@ -86,9 +106,33 @@ class Commands:
     def _return(self, _: Command) -> Result:
         return self.link.view.autopilot.happen("return")
 
+    def _set_home(self, command: Command) -> Result:
+        """param1 = 1: here; else a place in degrees and metres above the sea."""
+        latitude, longitude, height_m = command.params[4:7]
+        autopilot = self.link.view.autopilot
+        if command.params[0] == 1.0:
+            autopilot.set_home(autopilot.look().position_ned_m)
+        elif math.isfinite(latitude + longitude + height_m):
+            north, east = to_metres(autopilot.firmware.origin, latitude, longitude)
+            autopilot.set_home((north, east, autopilot.firmware.origin[2] - height_m))
+        else:
+            return Result.DENIED
+        return Result.ACCEPTED
+
+    def _reposition(self, command: Command) -> Result:
+        """Hold there from now on; what is not a number of the place stays as it is."""
+        if command.params[1] != _CHANGE_MODE:
+            return Result.UNSUPPORTED
+        latitude, longitude, height_m = command.params[4:7]
+        return self.link.view.autopilot.reposition(latitude, longitude, height_m, command.frame)
+
+    def _reboot(self, command: Command) -> Result:
+        wish = command.params[0]
+        return self.link.view.autopilot.happen("reboot") if wish else Result.UNSUPPORTED
+
     def _start_mission(self, command: Command) -> Result:
         autopilot = self.link.view.autopilot
-        first = command.params[0]
+        first = command.params[0] if math.isfinite(command.params[0]) else 0.0
         if not autopilot.knows("mission"):
             return Result.UNSUPPORTED
         if not -1 <= first < max(1, len(autopilot.mission.items)):
@@ -122,8 +166,7 @@ class Commands:
         name = message_name(command.params[0])
         if name is None or name not in self.link.view.builders:
             return Result.DENIED
-        number = int(command.params[0]) & 0xFFFF
-        self.link.send("MESSAGE_INTERVAL", number, self.link.interval_us(name))
+        self.link.send("MESSAGE_INTERVAL", id_of(name), self.link.interval_us(name))
         return Result.ACCEPTED
 
     def _request_message(self, command: Command) -> Result:
@@ -142,12 +185,15 @@ class Commands:
         return Result.ACCEPTED
 
 
-HANDLERS: dict[int, Callable[[Commands, Command], Result]] = {
+HANDLERS: dict[int, Callable[[Commands, Command], Result | None]] = {
     20: Commands._return,
     21: Commands._land,
     22: Commands._takeoff,
     176: Commands._set_mode,
+    179: Commands._set_home,
+    192: Commands._reposition,
     224: Commands._set_current_item,
+    246: Commands._reboot,
     300: Commands._start_mission,
     400: Commands._arm_disarm,
     410: Commands._request_home,
@@ -159,5 +205,7 @@ HANDLERS: dict[int, Callable[[Commands, Command], Result]] = {
 
 
 def message_name(number: float) -> str | None:
-    """Name of the message with this id, as a command's float parameter carries it."""
+    """Name of the message with this id, as a command's float parameter carries it; NaN is 0."""
+    if number != number:
+        return name_of(0)
     return name_of(int(number)) if math.isfinite(number) and number >= 0 else None

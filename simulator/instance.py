@@ -26,6 +26,7 @@ from simulator.telemetry import View
 STEP_MS = round(STEP_S * 1000)
 VIRTUAL_EPOCH_US = 1_767_225_600_000_000  # 2026-01-01, where virtual time begins
 BARRIER_INTERVAL_MS = 20
+RESTART_S = 1.0  # that a reboot on request takes
 _TIMESYNC = 111
 _OFF = Demand()
 
@@ -54,6 +55,7 @@ class Instance:
         self.autopilot = Autopilot(
             firmware, Plant(vehicle, conditions, seed), boot_scale=conditions.boot_scale
         )
+        self.autopilot.parameters.set(firmware.system_parameter, system)
         self.view = View(self.autopilot, system, epoch_us)
         self._strict = Strict(system, self.autopilot.parameters) if strict else None
         self.companion = Server(
@@ -94,6 +96,9 @@ class Instance:
             self.autopilot.plant.advance(STEP_S, _OFF)
             return
         self.autopilot.step()
+        if self.autopilot.restarts:
+            self.reboot(RESTART_S)
+            return
         if self.autopilot.texts or self.autopilot.announcements:
             self._spread_texts()
         self.companion.step()
@@ -199,7 +204,7 @@ class Instance:
         self.autopilot = Autopilot(
             old.firmware, old.plant, old.parameters, old.mission, boot_scale=old.boot_scale
         )
-        self.autopilot.pilot.landed = old.truth.on_ground
+        self.autopilot.pilot.fall(old.truth.on_ground)
         self.view.restart(self.autopilot)
         self.companion.restart()
         self.ground.restart()

@@ -5,12 +5,14 @@ Knows names, kinds and ranges from the firmware's data; knows no socket.
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Mapping
 
 from simulator.firmware.base import Firmware, ParameterSpec, Role
 
 MAV_PARAM_TYPE = {"int8": 2, "int16": 4, "int32": 6, "real32": 9}
+WHOLE = {"int8": (-128, 127), "int16": (-32768, 32767), "int32": (-(2**31), 2**31 - 1)}
 _FLOAT, _INT = struct.Struct("<f"), struct.Struct("<i")
 
 
@@ -23,20 +25,25 @@ class ParameterTable:
         self._roles: Mapping[str, Role] = firmware.parameter_roles
         self._bytewise = firmware.parameters_bytewise
         self.names = tuple(self._specs)
+        self.changes = 0
 
     def __contains__(self, name: object) -> bool:
         return name in self._specs
 
     def __getitem__(self, name: str) -> float:
-        return self._values[name]
+        """What the vehicle obeys: the value, brought into its range."""
+        spec, value = self._specs[name], self._values[name]
+        if value != value:  # not a number
+            return spec.default
+        return min(spec.maximum, max(spec.minimum, value))
 
     def role(self, role: str) -> float:
         """What this firmware has for `role`, in SI units."""
         filler = self._roles[role]
         if isinstance(filler, str):
-            return self._values[filler]
+            return self[filler]
         if isinstance(filler, tuple):
-            return self._values[filler[0]] * filler[1]
+            return self[filler[0]] * filler[1]
         return filler
 
     def _takes(self, spec: ParameterSpec | None, value: float) -> bool:
@@ -47,16 +54,34 @@ class ParameterTable:
         spec = self._specs.get(name)
         if spec is None or not self._takes(spec, value):
             return False
-        self._values[name] = value if spec.kind == "real32" else float(int(value))
+        self._keep(spec, value)
         return True
+
+    def _keep(self, spec: ParameterSpec, value: float) -> None:
+        self.changes += 1
+        if spec.kind == "real32":
+            self._values[spec.name] = value
+        elif math.isfinite(value):
+            low, high = WHOLE[spec.kind]
+            self._values[spec.name] = float(min(high, max(low, int(value))))
 
     def takes(self, name: str, wire: float) -> bool:
         """Whether `set_from_wire` would set it."""
         return self._takes(self._specs.get(name), self._from_wire(name, wire))
 
-    def set_from_wire(self, name: str, wire: float) -> bool:
-        """Set from PARAM_SET.param_value, which carries an integer as its bytes or its value."""
-        return self.set(name, self._from_wire(name, wire))
+    def set_from_wire(self, name: str, wire: float, kind: int) -> bool:
+        """Set from PARAM_SET, out of range too; False when it is not taken, and not answered.
+
+        An integer comes as its bytes, and then its type must fit, or as its value, and then no
+        type matters but what is not a number is not taken.
+        """
+        spec = self._specs.get(name)
+        if spec is None or (self._bytewise and kind != MAV_PARAM_TYPE[spec.kind]):
+            return False
+        if not self._bytewise and wire != wire:
+            return False
+        self._keep(spec, self._from_wire(name, wire))
+        return True
 
     def _from_wire(self, name: str, wire: float) -> float:
         spec = self._specs.get(name)

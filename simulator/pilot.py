@@ -8,8 +8,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
 
+from simulator.descent import Return, land_speed_mps, sink
 from simulator.firmware.base import (
     AttitudeSetpoint,
     Behaviour,
@@ -18,57 +18,41 @@ from simulator.firmware.base import (
     Quaternion,
     Triple,
 )
+from simulator.land_detector import LandDetector
 from simulator.mission import Mission
+from simulator.nav import Nav
 from simulator.parameters import ParameterTable
 from simulator.plant import STEP_S, Demand
 from simulator.position_loop import PositionLoop
+from simulator.takeoff import Takeoff
 
 LOOP_STEPS = 2  # the position loop runs at every second step, as PX4's does on its estimate
 LOOP_S = LOOP_STEPS * STEP_S
-CONTACT_S = 0.3  # on the ground, wanting down: then the motors idle
-AIRBORNE_S = 0.1
-_ARRIVED_M = 1.0
-_STICK_LESS_THRUST = 0.08  # MPC_MANTHR_MIN
 _TILT_BOOST_MAX = 10.0
-_LOW_THRUST_SHARE = 0.6  # of hover: less cannot lift
 _LIFTING = frozenset({Behaviour.TAKEOFF, Behaviour.SETPOINT, Behaviour.MISSION})
 _STANDING = frozenset({Behaviour.HOLD, Behaviour.SETPOINT})
 OFF = Demand()
 
 
-@dataclass(frozen=True, slots=True)
-class Nav:
-    """The estimate as plain floats, and whether the feet touch the ground."""
-
-    position_ned_m: Triple
-    velocity_ned_mps: Triple
-    attitude: Quaternion
-    rates_frd_radps: Triple
-    on_ground: bool
-    reset_counter: int = 0
-
-    @property
-    def yaw_rad(self) -> float:
-        w, x, y, z = self.attitude
-        return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-
-
 class Pilot:
-    """Flies one behaviour at a time. `landed` is its land detector's verdict."""
+    """Flies one behaviour at a time."""
 
     def __init__(
         self, firmware: Firmware, parameters: ParameterTable, mission: Mission | None = None
     ) -> None:
         self._firmware = firmware
         self._parameters = parameters
-        self.loop = PositionLoop(firmware.gains)
+        self._tuned = parameters.changes
+        self.loop = PositionLoop(firmware.gains(parameters.__getitem__))
+        self._detector = LandDetector(firmware.landing, parameters)
+        self._takeoff = Takeoff(parameters)
         self.mission = mission or Mission(firmware.origin)
         self.events = self.mission.events  # for the autopilot
         self.behaviour = Behaviour.HOLD
+        self._return = Return(parameters, firmware.return_height_m, self.events)
         self._hold: Triple = (0.0, 0.0, 0.0)
         self._held = MotionSetpoint(self._hold)
         self._takeoff_z_m = math.nan
-        self._return_stage = 0
         self._demand = OFF
         self._source: AttitudeSetpoint | None = None
         self._attitude: Quaternion = (1.0, 0.0, 0.0, 0.0)
@@ -76,25 +60,41 @@ class Pilot:
         self._armed_for_s = 0.0
         self._climb_thrust = 0.0
         self._levelling: AttitudeSetpoint | None = None  # the last one of our own
-        self._ground_s = self._air_s = 0.0
-        self._ramp_s = 0.0
-        self._wants_down = True
+        self._wanted_z_mps = 0.0
         self.home_ned_m: Triple = (0.0, 0.0, 0.0)
-        self.landed = True
         self.climbed = False
         self.setpoint: AttitudeSetpoint | MotionSetpoint | None = None
         self.motion = MotionSetpoint()  # what the position loop was last asked for
         self.thrust_demanded = 0.0  # before it is raised for the tilt
 
     @property
+    def landed(self) -> bool:
+        """The land detector's verdict."""
+        return self._detector.landed
+
+    @property
+    def landing(self) -> bool:
+        """On the last way down."""
+        return self.behaviour is Behaviour.LAND or (
+            self._return.landing
+            if self.behaviour is Behaviour.RETURN
+            else self.behaviour is Behaviour.MISSION and self.mission.landing
+        )
+
+    @property
     def target_height_m(self) -> float:
         """Of what it holds or climbs to, above home."""
-        return self.home_ned_m[2] - self._hold[2]
+        place = self._return.place if self.behaviour is Behaviour.RETURN else self._hold
+        return self.home_ned_m[2] - place[2]
 
     @property
     def demand(self) -> Demand:
         """The demand in force."""
         return self._demand
+
+    def fall(self, on_ground: bool) -> None:
+        """The vehicle as a reboot finds it."""
+        self._detector.landed = on_ground
 
     def enter(self, behaviour: Behaviour, nav: Nav, takeoff_z_m: float = math.nan) -> None:
         """Begin a behaviour here; hold after a climb keeps the climb's target.
@@ -105,7 +105,7 @@ class Pilot:
             self._hold = _ahead(nav)
         self.behaviour = behaviour
         self._takeoff_z_m = takeoff_z_m
-        self._return_stage = 0
+        self._return = Return(self._parameters, self._firmware.return_height_m, self.events)
         self.climbed = False
         self._next_loop_s = 0.0
         self._source = None
@@ -113,10 +113,18 @@ class Pilot:
         if behaviour is Behaviour.MISSION:
             self.mission.begin(nav.position_ned_m, self.landed, self.home_ned_m)
 
+    def go_to(self, place_ned_m: Triple) -> None:
+        """Hold there, in a mode that holds or obeys."""
+        self._hold = place_ned_m
+        if self.behaviour is Behaviour.SETPOINT:
+            self.setpoint = MotionSetpoint(place_ned_m)
+
     def arm(self, nav: Nav) -> None:
         """The motors begin to turn: home is here."""
         self.home_ned_m = nav.position_ned_m
-        self._ramp_s = -self._firmware.spool_up_s
+        self._takeoff.arm()
+        if not self.landed:
+            self._takeoff.fly()
         self._armed_for_s = 0.0
         self._hold = nav.position_ned_m
         self._attitude = _level(nav.yaw_rad)
@@ -126,7 +134,8 @@ class Pilot:
         """The demand for the step that begins now. `look` gives the estimate when it is needed."""
         if not armed:
             self._demand, self._source, self.thrust_demanded = OFF, None, 0.0
-            self.landed = self.landed or look().on_ground
+            if not self.landed and look().on_ground:
+                self._detector.stand()
             return OFF
         setpoint = self._attitude_setpoint
         if setpoint is not None:
@@ -134,22 +143,33 @@ class Pilot:
         if time_s >= self._next_loop_s - 1e-6:
             self._next_loop_s = time_s + LOOP_S
             self._armed_for_s += LOOP_S
-            nav = look()
-            if self.behaviour is Behaviour.LEVEL:
-                self._set(_level(self.loop.yaw_rad), None, _STICK_LESS_THRUST)
-            elif setpoint is None:
-                self._fly_motion(nav, time_s)
-            elif setpoint.climb_mps is not None or self._boosts_thrust:
-                self._fly_vertical(setpoint, nav)
-            self._detect(nav)
+            self._loop_once(setpoint, look(), time_s)
         return self._demand
+
+    def _loop_once(self, setpoint: AttitudeSetpoint | None, nav: Nav, time_s: float) -> None:
+        """One period of the position loop's."""
+        self._tune()
+        if self.behaviour is Behaviour.LEVEL:
+            thrust = self._parameters.role("stick_thrust_least")
+            self._set(_level(self.loop.yaw_rad), None, thrust)
+        elif setpoint is not None:
+            if setpoint.climb_mps is not None or self._boosts_thrust:
+                self._fly_vertical(setpoint, nav)
+        elif self.behaviour is not Behaviour.COAST:
+            self._fly_motion(nav, time_s)
+        self._detect(setpoint, nav)
+
+    def _tune(self) -> None:
+        if self._tuned != self._parameters.changes:
+            self._tuned = self._parameters.changes
+            self.loop.tune(self._firmware.gains(self._parameters.__getitem__))
 
     def flies_itself(self, armed: bool, on_ground: bool) -> bool:
         """Whether `fly` will do no more than demand the attitude asked for, or run the position
         loop on an unchanged setpoint, until somebody speaks or the ground is touched."""
         if not armed:
             return self.landed and self._demand is OFF
-        if self.landed or on_ground or self.climbed or self.events or self._ground_s:
+        if self.landed or on_ground or self.climbed or self.events or not self._takeoff.flying:
             return False
         setpoint = self._attitude_setpoint
         if setpoint is None:
@@ -164,6 +184,7 @@ class Pilot:
         if setpoint is not None:
             self._obey(setpoint, look)
             return never
+        self._tune()
         self.motion = self._standing_motion()
         self.loop.demand(LOOP_S, self.motion, *self._limits)
         self.loop.record["integrates"] = True
@@ -182,12 +203,11 @@ class Pilot:
         self._next_loop_s = (loop_step + LOOP_STEPS * (loops - 1)) * STEP_S + LOOP_S
         for _ in range(loops):
             self._armed_for_s += LOOP_S
-            if not self._firmware.setpoint_decides_flight:
-                self._air_s += LOOP_S
+        self._detector.rest()
         if self._attitude_setpoint is None:
             attitude, thrust, wanted = self.loop.result
             self._attitude = attitude
-            self._wants_down = not _wants_up(wanted, self.motion)
+            self._wanted_z_mps = wanted[2]
             self.thrust_demanded = thrust
             self._set(attitude, None, thrust)
 
@@ -207,6 +227,14 @@ class Pilot:
     def obeys_motion(self) -> bool:
         """Somebody else's position, velocity or acceleration is flown."""
         return self.behaviour is Behaviour.SETPOINT and isinstance(self.setpoint, MotionSetpoint)
+
+    @property
+    def obeys_velocity(self) -> bool:
+        """The same, but somebody must go on saying so."""
+        if not (self.obeys_motion and isinstance(self.setpoint, MotionSetpoint)):
+            return False
+        rates = (*self.setpoint.velocity_ned_mps, *self.setpoint.acceleration_ned_mps2)
+        return not all(map(math.isnan, rates))
 
     @property
     def _attitude_setpoint(self) -> AttitudeSetpoint | None:
@@ -263,42 +291,51 @@ class Pilot:
     # -- motion ------------------------------------------------------------------------------
 
     def _fly_motion(self, nav: Nav, time_s: float) -> None:
-        lifting = self.behaviour in _LIFTING
-        if self.landed and lifting and self._ramp_s < 0.0:
+        lifts = self.behaviour in _LIFTING
+        if self.landed and self._takeoff.spooling and lifts:
             self._hold = nav.position_ned_m
-        motion = self._motion(nav, time_s)
-        hover, cruise, up = self._limits
-        self.motion = motion
+        self.motion = self._motion(nav, time_s)
+        wants_up = lifts and self._asks_up(nav)
+        self._takeoff.step(LOOP_S, wants_up)
+        rises = self._takeoff.lifting
+        hover, cruise_mps, climb_mps, least = self._limits
         attitude, thrust, wanted = self.loop.step(
             LOOP_S,
             nav.position_ned_m,
             nav.velocity_ned_mps,
-            motion,
+            self.motion,
             hover,
-            speed_xy_mps=cruise,
-            speed_up_mps=up,
-            integrate=not nav.on_ground,
+            speed_xy_mps=cruise_mps,
+            speed_up_mps=climb_mps,
+            thrust_least=least,
+            integrate=not (nav.on_ground and (rises or self.landed)),
         )
-        if self.landed:
-            attitude, thrust = self._lift(lifting and _wants_up(wanted, motion), thrust, hover, nav)
-        elif self._ground_s > CONTACT_S:
+        self._wanted_z_mps = wanted[2]
+        if rises:
+            attitude = _level(self.loop.yaw_rad) if nav.on_ground else attitude
+        elif self.landed:
+            self.loop.reset(nav.yaw_rad)
             attitude, thrust = _level(nav.yaw_rad), 0.0
+        elif self._detector.contact:
+            attitude, thrust = _level(nav.yaw_rad), self._parameters.role("thrust_least")
         self._attitude = attitude
-        self._wants_down = not _wants_up(wanted, motion)
         self.thrust_demanded = thrust
         self._set(attitude, None, thrust)
 
     @property
-    def _limits(self) -> tuple[float, float, float]:
-        """Hover thrust, and the speeds that the behaviour allows, across and upwards, m/s."""
-        cruise, up = math.inf, math.inf
+    def _limits(self) -> tuple[float, float, float, float]:
+        """Hover thrust, the speeds that the behaviour allows, across and upwards, m/s, and the
+        least thrust."""
+        role = self._parameters.role
+        across_mps, up_mps = math.inf, self._takeoff.speed_up_mps(self.loop.velocity_p_ps)
         if self.behaviour is not Behaviour.SETPOINT:
-            cruise = self._parameters.role("cruise_speed_mps")
+            across_mps = role("cruise_speed_mps")
         if self.behaviour is Behaviour.MISSION:
-            cruise = min(cruise, self.mission.speed_mps)
+            across_mps = min(across_mps, self.mission.speed_mps)
         if self.behaviour is Behaviour.TAKEOFF:
-            up = self._parameters.role("takeoff_speed_mps")
-        return self._parameters.role("hover_thrust"), cruise, up
+            up_mps = min(up_mps, role("takeoff_speed_mps"))
+        least = 0.0 if self._takeoff.lifting else role("thrust_least")
+        return role("hover_thrust"), across_mps, up_mps, least
 
     def _standing_motion(self) -> MotionSetpoint:
         """What is held or asked for, the same object as long as it is the same."""
@@ -308,97 +345,69 @@ class Pilot:
             self._held = MotionSetpoint(self._hold)
         return self._held
 
-    def _lift(
-        self, wants_up: bool, thrust: float, hover: float, nav: Nav
-    ) -> tuple[Quaternion, float]:
-        """On the ground: spool up, then ramp the thrust until the vehicle leaves it."""
-        if self._ramp_s < 0.0 or wants_up:
-            self._ramp_s += LOOP_S
-        if self._ramp_s <= 0.0 or not wants_up:
-            self.loop.reset(nav.yaw_rad)
-            return _level(nav.yaw_rad), 0.0
-        share = min(1.0, self._ramp_s / self._firmware.thrust_ramp_s)
-        return _level(self.loop.yaw_rad), share * max(thrust, 1.2 * hover)
+    def _asks_up(self, nav: Nav) -> bool:
+        """Something above is demanded: a height, a climb or an acceleration."""
+        motion = self.motion
+        return (
+            motion.position_ned_m[2] < nav.position_ned_m[2]
+            or motion.velocity_ned_mps[2] < 0.0
+            or motion.acceleration_ned_mps2[2] < 0.0
+        )
 
     def _motion(self, nav: Nav, time_s: float) -> MotionSetpoint:
         if self.behaviour is Behaviour.TAKEOFF:
-            return self._takeoff(nav)
+            return self._climb(nav)
         if self.behaviour is Behaviour.RETURN:
-            return self._return(nav)
+            return self._return.fly(time_s, nav, self.home_ned_m)
         if self.behaviour is Behaviour.MISSION:
             return self._follow_mission(nav, time_s)
         if self.behaviour is Behaviour.LAND:
-            return _sink(self._hold, self._land_speed(nav))
+            return sink(self._hold, land_speed_mps(nav, self.home_ned_m[2], self._parameters))
         if self.behaviour is Behaviour.DESCEND:
-            return _sink(self._hold, self._firmware.descend_speed_mps)
+            return sink(self._hold, self._firmware.descend_speed_mps)
         return self._standing_motion()
 
-    def _takeoff(self, nav: Nav) -> MotionSetpoint:
+    def _climb(self, nav: Nav) -> MotionSetpoint:
         target_z = self._takeoff_z_m
         if math.isnan(target_z):
             target_z = nav.position_ned_m[2] - self._parameters.role("takeoff_height_m")
             self._takeoff_z_m = target_z
             self.events.append("default height")
-        if nav.position_ned_m[2] < target_z + self._firmware.climbed_within_m:
+        if nav.position_ned_m[2] < target_z + self._parameters.role("climbed_within_m"):
             self.climbed = not self.landed
         self._hold = (self._hold[0], self._hold[1], target_z)
-        return MotionSetpoint(self._hold)
-
-    def _return(self, nav: Nav) -> MotionSetpoint:
-        """Climb (lower the nearer home is, under a cone of 45 degrees), fly home, land."""
-        home_x, home_y, home_z = self.home_ned_m
-        x, y, z = nav.position_ned_m
-        distance = math.hypot(x - home_x, y - home_y)
-        if self._return_stage == 0:
-            height = min(self._parameters.role("return_height_m"), distance)
-            self._hold = (self._hold[0], self._hold[1], min(z, home_z - height))
-            self._return_stage = 1
-            self.events.append("return begun")
-        if self._return_stage == 1 and z < self._hold[2] + _ARRIVED_M:
-            self._hold = (home_x, home_y, self._hold[2])
-            self._return_stage = 2
-        if self._return_stage == 2 and distance < _ARRIVED_M:
-            self._return_stage = 3
-            self.events.append("return lands")
-        if self._return_stage == 3:
-            return _sink(self._hold, self._land_speed(nav))
         return MotionSetpoint(self._hold)
 
     def _follow_mission(self, nav: Nav, time_s: float) -> MotionSetpoint:
         motion = self.mission.fly(time_s, nav.position_ned_m, self.home_ned_m)
         if self.mission.landing:
-            return _sink(motion.position_ned_m, self._land_speed(nav))
+            speed_mps = land_speed_mps(nav, self.home_ned_m[2], self._parameters)
+            return sink(motion.position_ned_m, speed_mps)
         return motion
-
-    def _land_speed(self, nav: Nav) -> float:
-        height_m = self.home_ned_m[2] - nav.position_ned_m[2]
-        slow = self._parameters.role("land_speed_mps")
-        fast = max(slow, self._parameters.role("descent_speed_mps"))
-        slow_below_m, fast_above_m = self._firmware.landing_heights_m
-        share = (height_m - slow_below_m) / (fast_above_m - slow_below_m)
-        return slow + min(1.0, max(0.0, share)) * (fast - slow)
 
     # -- land detector -----------------------------------------------------------------------
 
-    def _detect(self, nav: Nav) -> None:
-        """Contact and the wish to go down make a landing; a moment without contact a takeoff."""
-        setpoint = self._attitude_setpoint
+    def _detect(self, setpoint: AttitudeSetpoint | None, nav: Nav) -> None:
+        was_landed = self.landed
         if setpoint is not None and self._firmware.setpoint_decides_flight:
-            self._ground_s = 0.0
-            pushed = self.thrust_demanded > 0.0
-            self.landed = self.landed and not pushed
-            return
-        low = self._demand.thrust < _LOW_THRUST_SHARE * self._parameters.role("hover_thrust")
-        if setpoint is None:
-            low = low or self._wants_down
-        self._ground_s = self._ground_s + LOOP_S if nav.on_ground and low else 0.0
-        self._air_s = 0.0 if nav.on_ground else self._air_s + LOOP_S
-        if not self.landed and self._ground_s >= self._firmware.landed_after_s:
-            self.landed = True
-            self._ramp_s = 0.0
-        elif self.landed and self._air_s >= AIRBORNE_S:
-            self.landed = False
-            self.loop.reset(self.loop.yaw_rad)
+            self._detector.rest()
+            if self.thrust_demanded > 0.0:
+                self._detector.lift_off()
+        else:
+            by_motion = setpoint is None
+            sinks = by_motion and self._sinks
+            self._detector.step(LOOP_S, nav, self._demand.thrust, by_motion=by_motion, sinks=sinks)
+        if self.landed and not was_landed:
+            self._takeoff.land()
+        elif was_landed and not self.landed and not self._takeoff.lifting:
+            self._takeoff.fly()
+
+    @property
+    def _sinks(self) -> bool:
+        """It was told to go down; where a place below is as good as a speed, by that too."""
+        landing = self._firmware.landing
+        told = self.motion.velocity_ned_mps[2] >= landing.sinking_mps
+        return told or (landing.place_below_is_descent and self._wanted_z_mps > landing.sinking_mps)
 
 
 def _level(yaw_rad: float) -> Quaternion:
@@ -415,13 +424,3 @@ def _ahead(nav: Nav) -> Triple:
     """Where a vehicle comes to rest that brakes gently from here."""
     (x, y, z), (vx, vy, vz) = nav.position_ned_m, nav.velocity_ned_mps
     return (x + 0.5 * vx, y + 0.5 * vy, z + 0.2 * vz)
-
-
-def _sink(hold: Triple, speed_mps: float) -> MotionSetpoint:
-    return MotionSetpoint((hold[0], hold[1], math.nan), (math.nan, math.nan, speed_mps))
-
-
-def _wants_up(wanted: Triple, motion: MotionSetpoint) -> bool:
-    if math.isnan(wanted[2]):
-        return motion.acceleration_ned_mps2[2] < -0.1
-    return wanted[2] < -0.1

@@ -333,6 +333,11 @@ class Plant:
         return [*self._body.tolist(), *self._rotor[ACCELERATION].tolist()]
 
     @property
+    def height_m(self) -> float:
+        """True, above the ground."""
+        return -float(self._body[12])
+
+    @property
     def on_ground(self) -> bool:
         """Whether the ground carries the vehicle."""
         return bool(self._rotor[CONTACT])

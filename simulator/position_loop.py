@@ -20,7 +20,6 @@ Array = NDArray[np.float64]
 GRAVITY_MPS2 = 9.80665
 _TILT_LIMIT_OF_THRUST = 0.1  # least cosine by which thrust is divided
 _INTEGRAL_MAX_MPS2 = 4.0
-_THRUST_MIN, _THRUST_MAX = 0.06, 1.0
 
 # State: integrals m/s^2, filtered derivative of the velocity, velocity of the last period.
 _DERIVATIVE, _VELOCITY = 3, 6
@@ -44,6 +43,8 @@ RECORD = np.dtype(
         ("speed_xy_mps", "f8"),
         ("speed_up_mps", "f8"),
         ("hover_thrust", "f8"),
+        ("thrust_least", "f8"),
+        ("thrust_max", "f8"),
         ("integrates", "i8"),
         # the estimate: position and velocity NED
         ("estimate", "f8", 6),
@@ -68,14 +69,9 @@ class PositionLoop:
     """Loop with its integrators."""
 
     def __init__(self, gains: PositionGains) -> None:
-        self.gains = gains
         self.record = np.zeros(1, RECORD)
         self.address = address(self.record)
-        across = (gains.position_xy_ps, *gains.velocity_xy)
-        up = (gains.position_z_ps, *gains.velocity_z)
-        limits = (gains.speed_down_mps, gains.derivative_cutoff_hz)
-        self.record["gains"] = (*across, *across, *up, *limits)
-        self.record["tilt_max_rad"] = gains.tilt_max_rad
+        self.tune(gains)
         self._estimate = self.record["estimate"][0]
         self._state = self.record["state"][0]
         self._demand: MotionSetpoint | None = None
@@ -87,6 +83,21 @@ class PositionLoop:
     def yaw_rad(self) -> float:
         """The course that it flies."""
         return float(self.record["course_rad"][0])
+
+    @property
+    def velocity_p_ps(self) -> float:
+        """Gain on the vertical velocity."""
+        return self.gains.velocity_z[0]
+
+    def tune(self, gains: PositionGains) -> None:
+        """Other gains from now on."""
+        self.gains = gains
+        across = (gains.position_xy_ps, *gains.velocity_xy)
+        up = (gains.position_z_ps, *gains.velocity_z)
+        limits = (gains.speed_down_mps, gains.derivative_cutoff_hz)
+        self.record["gains"] = (*across, *across, *up, *limits)
+        self.record["tilt_max_rad"] = gains.tilt_max_rad
+        self.record["thrust_max"] = gains.thrust_max
 
     def reset(self, yaw_rad: float) -> None:
         """Forget integrators and derivative; hold the present course."""
@@ -103,13 +114,15 @@ class PositionLoop:
         *,
         speed_xy_mps: float = math.inf,
         speed_up_mps: float = math.inf,
+        thrust_least: float = 0.0,
         integrate: bool = True,
     ) -> tuple[Quaternion, float, Triple]:
         """Attitude (wxyz), normalised thrust and the velocity (NED, m/s) that it tries to fly.
 
-        The speeds lower the limits of the gains. `integrate` False freezes the integrators.
+        The speeds lower the limits of the gains; below 0, `speed_up_mps` is a descent.
+        `integrate` False freezes the integrators.
         """
-        self.demand(duration_s, demand, hover_thrust, speed_xy_mps, speed_up_mps)
+        self.demand(duration_s, demand, hover_thrust, speed_xy_mps, speed_up_mps, thrust_least)
         self.record["integrates"] = integrate
         self._estimate[:] = (*position_ned_m, *velocity_ned_mps)
         _step.call(self.address)
@@ -122,6 +135,7 @@ class PositionLoop:
         hover_thrust: float,
         speed_xy_mps: float = math.inf,
         speed_up_mps: float = math.inf,
+        thrust_least: float = 0.0,
     ) -> None:
         """What `step_loop` is to fly from now on, as `step` is told."""
         record, gains = self.record, self.gains
@@ -136,6 +150,7 @@ class PositionLoop:
         record["speed_xy_mps"] = min(speed_xy_mps, gains.speed_xy_mps)
         record["speed_up_mps"] = min(speed_up_mps, gains.speed_up_mps)
         record["hover_thrust"] = hover_thrust
+        record["thrust_least"] = thrust_least
 
     @property
     def result(self) -> tuple[Quaternion, float, Triple]:
@@ -236,7 +251,7 @@ def _limit_speed(loop: Any) -> None:
         wanted[0] *= loop.speed_xy_mps / speed
         wanted[1] *= loop.speed_xy_mps / speed
     if not math.isnan(wanted[2]):
-        wanted[2] = min(loop.gains[_SPEED_DOWN], max(-loop.speed_up_mps, wanted[2]))
+        wanted[2] = max(-loop.speed_up_mps, min(loop.gains[_SPEED_DOWN], wanted[2]))
 
 
 @kernel
@@ -251,7 +266,7 @@ def _compose(loop: Any) -> None:
     direction = (north / length, east / length, GRAVITY_MPS2 / length)
     vertical = loop.hover_thrust * (1.0 - acceleration[2] / GRAVITY_MPS2)
     thrust = vertical / max(direction[2], _TILT_LIMIT_OF_THRUST)
-    loop.thrust = min(_THRUST_MAX, max(_THRUST_MIN, thrust))
+    loop.thrust = min(loop.thrust_max, max(loop.thrust_least, thrust))
     attitude = _facing(direction, loop.course_rad)
     for i in range(4):
         loop.attitude[i] = attitude[i]

@@ -216,7 +216,8 @@ class Server:
     def _command_int(self, message: Message) -> None:
         params = tuple(message.values[f"param{i}"] for i in range(1, 5))
         params += (message.x * 1e-7, message.y * 1e-7, message.z)
-        self._commands.run(Command(message.command, params, message.system, message.component))
+        sender = (message.system, message.component)
+        self._commands.run(Command(message.command, params, *sender, message.frame))
 
     def _set_attitude_target(self, message: Message) -> None:
         self.view.autopilot.obey_attitude(message.values)
@@ -226,6 +227,10 @@ class Server:
 
     def _set_global_position_target(self, message: Message) -> None:
         self.view.autopilot.obey_global_motion(message.values)
+
+    def _set_mode(self, message: Message) -> None:
+        sender = (message.system, message.component)
+        self._commands.set_mode(message.base_mode, message.custom_mode, sender)
 
     def _mission(self, message: Message) -> None:
         self._transfer.handle(message, self._now_us * 1e-6)
@@ -260,8 +265,7 @@ class Server:
 
     def _param_set(self, message: Message) -> None:
         table = self.view.autopilot.parameters
-        if message.param_id in table:
-            table.set_from_wire(message.param_id, message.param_value)
+        if table.set_from_wire(message.param_id, message.param_value, message.param_type):
             self.send_parameter(message.param_id)
 
     def _file_transfer(self, message: Message) -> None:
@@ -277,6 +281,7 @@ HANDLERS: dict[str, Callable[[Server, Message], None]] = {
     "HEARTBEAT": Server._heartbeat,
     "COMMAND_LONG": Server._command_long,
     "COMMAND_INT": Server._command_int,
+    "SET_MODE": Server._set_mode,
     "SET_ATTITUDE_TARGET": Server._set_attitude_target,
     "SET_POSITION_TARGET_LOCAL_NED": Server._set_position_target,
     "SET_POSITION_TARGET_GLOBAL_INT": Server._set_global_position_target,

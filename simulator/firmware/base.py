@@ -28,6 +28,7 @@ class Result(IntEnum):
     DENIED = 2
     UNSUPPORTED = 3
     FAILED = 4
+    CANCELLED = 6
 
 
 class Severity(IntEnum):
@@ -48,7 +49,8 @@ class Behaviour(Enum):
     RETURN = "flies home and lands"
     MISSION = "flies the mission"
     DESCEND = "sinks slowly, as sticks that are not there ask for"
-    LEVEL = "level, least throttle: sticks that are not there"
+    LEVEL = "level, least throttle: sticks that are down"
+    COAST = "goes on as last demanded: sticks that are not there"
     SETPOINT = "obeys setpoints"
 
 
@@ -82,7 +84,7 @@ class Rule:
         "since X" is a failsafe because of event X.
     to: next mode, "*" none, "requested" the mode asked for, "remembered" the last one chosen.
     do: actions ("arm", "disarm", "failsafe", "await", "recover", "take off", "hold", "level",
-        "latch").
+        "latch", "restart").
     result: what a command is answered with. say, also: texts. send: messages to every link.
     """
 
@@ -99,7 +101,7 @@ class Rule:
 
 @dataclass(frozen=True, slots=True)
 class ParameterSpec:
-    """One parameter; values outside [minimum, maximum] are refused."""
+    """One parameter. Any value is taken by the wire; the vehicle obeys [minimum, maximum]."""
 
     name: str
     kind: Literal["int8", "int16", "int32", "real32"]
@@ -145,6 +147,15 @@ class ModeRequest:
 
     mode: str | None
     refusal: Result = Result.DENIED
+    say: Say | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ArmWish:
+    """What an arm or disarm command asks for: an event, or what it is refused with."""
+
+    event: str = ""
+    refusal: Result | None = None  # None: no answer
     say: Say | None = None
 
 
@@ -200,7 +211,21 @@ class PositionGains:
     speed_up_mps: float
     speed_down_mps: float
     tilt_max_rad: float
+    thrust_max: float
     derivative_cutoff_hz: float
+
+
+@dataclass(frozen=True, slots=True)
+class Landing:
+    """How the land detector finds out. Shares are between the least and the hover thrust."""
+
+    low_thrust_share: float  # no more than this can be a landing
+    idle_thrust_share: float  # more than this is a takeoff
+    sinking_mps: float  # told to go down at this is told to land
+    speed_down_mps: float  # estimated, of a vehicle that stands
+    speed_across_mps: float
+    rate_radps: float  # roll and pitch together
+    place_below_is_descent: bool
 
 
 def as_given(values: Mapping[str, Any], _: Quaternion) -> Mapping[str, Any]:
@@ -223,10 +248,12 @@ class Firmware:
     capabilities: int  # MAV_PROTOCOL_CAPABILITY
     origin: tuple[float, float, float]  # of the local frame: latitude, longitude deg, AMSL m
     boot_mode: str
+    reposition_mode: str  # in which it goes where MAV_CMD_DO_REPOSITION says
     modes: Mapping[str, Mode]
     rules: tuple[Rule, ...]
     parameters: tuple[ParameterSpec, ...]
     parameter_roles: Mapping[str, Role]
+    system_parameter: str  # that has the system id
     parameters_bytewise: bool  # INT32 lies in the float's bytes, not as its value
     companion_rates_hz: Mapping[str, float]
     ground_rates_hz: Mapping[str, float]
@@ -246,20 +273,23 @@ class Firmware:
     force_codes: Mapping[str, float]  # param2 of MAV_CMD_COMPONENT_ARM_DISARM: arm, disarm
     healthy_after_s: float  # boot until the pre-arm checks pass
     healthy_without_position_after_s: float  # the same for modes that need none
+    unhealthy_where_unarmable: bool  # the pre-arm checks fail in a mode that does not arm
     setpoint_mode_needs_stream: bool
     setpoints_outlive_modes: bool  # else obeyed only in their mode, forgotten on entering it
     setpoint_decides_flight: bool  # any thrust is flight; the land detector rests meanwhile
     setpoint_spool_s: float  # from arming until a setpoint's thrust acts
     stream_reaction_s: float  # from the stream's time-out until it counts as lost
     descend_speed_mps: float
-    spool_up_s: float
-    thrust_ramp_s: float
-    landed_after_s: float  # of contact
-    climbed_within_m: float
-    landing_heights_m: tuple[float, float]  # slow below the first, fast above the second
-    gains: PositionGains
+    landing: Landing
+    gains: Callable[[ReadParameter], PositionGains]
+    return_height_m: Callable[[float, ReadParameter], float]  # above home, by the distance to it
     heartbeat: Callable[[Condition], tuple[int, int]]  # base_mode but the armed bit, MAV_STATE
     command_mode: Callable[[tuple[float, ...]], ModeRequest]
+    set_mode: Callable[[int, int], ModeRequest]  # SET_MODE: base_mode, custom_mode
+    set_mode_acked_as: int  # what the acknowledgement of SET_MODE names
+    arm_wish: Callable[[float], ArmWish]  # param1 of MAV_CMD_COMPONENT_ARM_DISARM
+    # MAV_CMD that are not carried out: their answers, None for silence; the rest is UNSUPPORTED
+    command_answers: Mapping[int, Result | None]
     attitude_setpoint: Callable[
         [Mapping[str, Any], ReadParameter], AttitudeSetpoint | MotionSetpoint | None
     ]

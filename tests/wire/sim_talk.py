@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import lzma
 import struct
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import Bench
@@ -68,6 +70,8 @@ def _note_change(rows: list[Any], times_s: list[float], row: Any, time_s: float)
 def recorded_frames(recording: Path) -> list[tuple[float, bytes, Any]]:
     """Host seconds since the first, frame, and the message if pymavlink knows it."""
     data, frames, at = recording.read_bytes(), [], 0
+    if recording.suffix == ".xz":
+        data = lzma.decompress(data)
     parser = mavlink.MAVLink(None)
     parser.robust_parsing = True
     first_us = struct.unpack_from(">Q", data)[0]
@@ -79,10 +83,24 @@ def recorded_frames(recording: Path) -> list[tuple[float, bytes, Any]]:
     return frames
 
 
-def ask_again(recording: Path, bench: Bench, real: Talk, ours: Talk, run_on_s: float) -> None:
+class Listener(Protocol):
+    """What takes in what an autopilot said."""
+
+    def hear(self, time_s: float, message: Any) -> None: ...
+
+
+def ask_again(
+    recording: Path,
+    bench: Bench,
+    real: Listener,
+    ours: Listener,
+    run_on_s: float,
+    each: Callable[[Any], None] = lambda message: None,
+) -> None:
     """Send what the companion sent, at the same vehicle times; both talks are filled.
 
-    `run_on_s`: how long the simulator goes on after the last question.
+    `run_on_s`: how long the simulator goes on after the last question. `each` sees what the real
+    one said, in time.
     """
     system = bench.system
     offset_s = 0.0  # vehicle time minus host time, from the newest stamp
@@ -94,6 +112,7 @@ def ask_again(recording: Path, bench: Bench, real: Talk, ours: Talk, run_on_s: f
             if message.get_type() == "ATTITUDE":
                 offset_s = message.time_boot_ms / 1000 - host_s
             real.hear(host_s + offset_s, message)
+            each(message)
         elif source == (system, COMPANION_COMPONENT):
             bench.run(max(0.0, host_s + offset_s - bench.time_s))
             bench.instance.feed(frame)

@@ -217,14 +217,14 @@ def test_refusals(of: str, number: int, params: tuple[float, ...], text: str, re
 
 
 def test_the_pilot_takes_over() -> None:
-    bench = hovering({"fault": "pilot_takes_over", "at_s": 6.0})
+    bench = hovering({"fault": "pilot_takes_over", "at_s": 9.0})
     since_s = engaged_s(bench)
-    hold(bench, since_s + 7.0 - bench.time_s)
+    hold(bench, since_s + 10.0 - bench.time_s)
     assert bench.mode == 0x03040000
     switched_s = next(
         at_s for at_s, m in bench.of("HEARTBEAT", since_s + 1) if m.custom_mode == 0x03040000
     )
-    assert since_s + 4.9 < switched_s <= since_s + 7.1
+    assert since_s + 8.9 < switched_s <= since_s + 10.1
 
 
 def test_a_flight_with_every_kind_of_fault_is_reproducible() -> None:

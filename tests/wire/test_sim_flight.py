@@ -297,3 +297,62 @@ def test_every_rule_names_modes_guards_and_actions_that_exist() -> None:
             name, compares, _ = guard.removeprefix("not ").partition("=")
             assert (name in {p.name for p in PX4.parameters}) if compares else (name in GUARDS)
     assert len(describe(PX4)) == len(PX4.rules)
+
+
+# -- going where it is told --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("frame", "height_m"), [(0, PX4.origin[2] + 5.0), (3, 5.0)])
+def test_reposition_holds_somewhere_else(frame: int, height_m: float) -> None:
+    """COMMAND_INT 192: a frame above sea level, one above home."""
+    bench = Bench()
+    bench.fly_offboard()
+    latitude = round((PX4.origin[0] + math.degrees(10.0 / 6_371_000)) * 1e7)
+    longitude = round(PX4.origin[1] * 1e7)
+    bench.send(
+        mavlink.MAVLink_command_int_message(
+            1, 1, frame, 192, 0, 0, -1, 1, 0, NAN, latitude, longitude, height_m
+        )
+    )
+    bench.run(12.0)
+    assert bench.mode == LOITER
+    place = bench.instance.autopilot.truth.position_ned_m
+    assert place == pytest.approx([10.0, 0.0, -5.0], abs=0.2)
+
+
+def test_the_older_message_sets_the_mode_and_is_acknowledged_once() -> None:
+    bench = Bench()
+    bench.boot()
+    bench.send(mavlink.MAVLink_set_mode_message(1, 1, POSCTL))
+    bench.run(0.05)
+    assert [(m.command, m.result) for _, m in bench.of("COMMAND_ACK")] == [(176, 0)]
+    assert bench.mode == POSCTL
+
+
+def test_stabilized_without_sticks_goes_on_as_last_demanded() -> None:
+    bench = Bench()
+    bench.instance.autopilot.parameters.set("COM_OBL_RC_ACT", 2)
+    bench.fly_offboard()
+    bench.run(4.0)
+    assert bench.mode == 0x00070000
+    assert bench.height_m == pytest.approx(3.0, abs=0.3)
+
+
+def test_position_gains_and_speeds_are_obeyed_while_flying() -> None:
+    bench = Bench()
+    bench.fly_offboard()
+    assert bench.instance.autopilot.parameters.set("MPC_XY_VEL_MAX", 1.0)
+    bench.run(9.0, lambda: bench.position(20, 0, -3))
+    speed_mps = math.hypot(*bench.instance.autopilot.truth.velocity_ned_mps[:2])
+    assert speed_mps == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_landing_is_felt_three_stages_after_the_touch() -> None:
+    """A second of contact without thrust, and two of rest; LNDMC_TRIG_TIME each."""
+    bench = Bench()
+    bench.fly_offboard(2.0)
+    bench.command(21)
+    plant = bench.instance.autopilot.plant
+    touched_s = bench.run_until(lambda: plant.on_ground, 10.0)
+    bench.run_until(lambda: bench.instance.autopilot.landed, 5.0)
+    assert bench.time_s - touched_s == pytest.approx(3.3, abs=0.3)

@@ -10,7 +10,10 @@ from scipy.spatial.transform import Rotation
 
 from simulator.firmware.base import NAN3, MotionSetpoint
 from simulator.firmware.px4 import PX4
+from simulator.parameters import ParameterTable
 from simulator.position_loop import GRAVITY_MPS2, PositionLoop
+
+GAINS = PX4.gains(ParameterTable(PX4).__getitem__)
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 0.7, math.pi / 2, 2.5, math.pi, -1.9])
@@ -21,7 +24,7 @@ def test_attitude_and_thrust_give_the_acceleration(
     yaw_rad: float, acceleration: tuple[float, float, float]
 ) -> None:
     """Thrust along the body axis, hover thrust per g: lateral as asked at constant height."""
-    loop = PositionLoop(PX4.gains)
+    loop = PositionLoop(GAINS)
     motion = MotionSetpoint(NAN3, NAN3, acceleration, yaw_rad)
     attitude, thrust, _ = loop.step(0.008, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), motion, 0.5)
     w, x, y, z = attitude
@@ -35,17 +38,17 @@ def test_attitude_and_thrust_give_the_acceleration(
 
 
 def test_tilt_and_thrust_are_limited() -> None:
-    loop = PositionLoop(PX4.gains)
+    loop = PositionLoop(GAINS)
     motion = MotionSetpoint(NAN3, NAN3, (100.0, 0.0, 100.0))
     attitude, thrust, _ = loop.step(0.008, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), motion, 0.5)
     w, x, y, z = attitude
     down = Rotation.from_quat([x, y, z, w]).apply([0.0, 0.0, 1.0])
-    assert math.acos(down[2]) == pytest.approx(PX4.gains.tilt_max_rad)
+    assert math.acos(down[2]) == pytest.approx(GAINS.tilt_max_rad)
     assert 0.0 < thrust < 0.1
 
 
 def test_speed_limits() -> None:
-    loop = PositionLoop(PX4.gains)
+    loop = PositionLoop(GAINS)
     motion = MotionSetpoint((300.0, 400.0, -100.0))
     *_, wanted = loop.step(0.008, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), motion, 0.5, speed_xy_mps=5.0)
-    assert wanted == pytest.approx((3.0, 4.0, -PX4.gains.speed_up_mps))
+    assert wanted == pytest.approx((3.0, 4.0, -GAINS.speed_up_mps))

@@ -46,6 +46,11 @@ def landing_mode(bench: Bench) -> None:
     bench.command(21)
 
 
+def posctl(bench: Bench) -> None:
+    booted(bench)
+    bench.ask_mode(POSCTL)
+
+
 def flying(bench: Bench) -> None:
     bench.boot()
     bench.command(22, *(NAN,) * 7)
@@ -88,8 +93,10 @@ ROWS = [
     Row("disarm in the air", flying, (400, 0), [LATER], LOITER, True,
         "Disarming denied: not landed"),
     Row("disarm in the air, forced", flying, (400, 0, 21196), [0], LOITER, False),
-    Row("arm with a strange wish", booted, (400, 2), [UNSUPPORTED], LOITER, False),
-    Row("arm with NaN", booted, (400, NAN), [UNSUPPORTED], LOITER, False),
+    Row("arm with a strange wish", booted, (400, 2), [], LOITER, False,
+        "Unsupported ARM_DISARM param: 2.000"),
+    Row("arm with half a wish, which is rounded", booted, (400, 0.6), [0], LOITER, True),
+    Row("arm with NaN, which disarms", armed, (400, NAN), [0], LOITER, False),
     Row("offboard in the air, no stream", flying, SET_OFFBOARD, [0, LATER], LOITER, True,
         "Switching to Offboard is currently not available"),
     Row("position control without sticks", flying, (176, 1, 3, 0), [0, LATER], LOITER, True),
@@ -98,10 +105,18 @@ ROWS = [
     Row("land", flying, (21, 0, 0, 0, NAN), [0], LAND, True, "Landing at current position"),
     Row("return", flying, (20,), [0], RTL, True, "Returning to launch"),
     Row("takeoff, disarmed", booted, (22, *(NAN,) * 7)[:8], [0], TAKEOFF, False),
-    Row("unknown main mode", booted, (176, 1, 99, 0), [0, DENIED], LOITER, False),
-    Row("unknown auto mode", booted, (176, 1, 4, 99), [0, LATER], LOITER, False),
-    Row("mode without custom flag", booted, (176, 0, 6, 0), [0, DENIED], LOITER, False),
-    Row("mode of NaN", booted, (176, *(NAN,) * 7)[:8], [0, DENIED], LOITER, False),
+    Row("unknown main mode", booted, (176, 1, 99, 0), [0, 0], LOITER, False),
+    Row("unknown auto mode", booted, (176, 1, 4, 99), [0, LATER], LOITER, False,
+        "Unsupported auto mode"),
+    Row("mode without custom flag", booted, (176, 0, 6, 0), [0, 0], LOITER, False),
+    Row("mode of NaN", booted, (176, *(NAN,) * 7)[:8], [0, 0], LOITER, False),
+    Row("arm in position control", posctl, (400, 1), [LATER], POSCTL, False, DENIED_TEXT),
+    Row("reboot, which SITL cannot", booted, (246, 1), [DENIED], LOITER, False),
+    Row("taken and not carried out", booted, (80,), [0], LOITER, False),
+    Row("not answered", booted, (93,), [], LOITER, False),
+    Row("reposition on the ground", booted, (192, -1, 1, 0, NAN, 47.4, 8.5, 500), [0, ],
+        LOITER, False),
+    Row("reposition without a change of mode", flying, (192, -1, 0), [UNSUPPORTED], LOITER, True),
     Row("unknown command", booted, (31000,), [UNSUPPORTED], LOITER, False),
 ]  # fmt: skip
 

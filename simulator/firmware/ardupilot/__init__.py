@@ -8,12 +8,44 @@ from __future__ import annotations
 import math
 
 from simulator.firmware.ardupilot.messages import MESSAGES
-from simulator.firmware.ardupilot.modes import MODES, command_mode, heartbeat
+from simulator.firmware.ardupilot.modes import (
+    COMMAND_ANSWERS,
+    MODES,
+    arm_wish,
+    command_mode,
+    heartbeat,
+    set_mode,
+)
 from simulator.firmware.ardupilot.parameters import PARAMETERS, ROLES
 from simulator.firmware.ardupilot.rules import BOOT, RULES
 from simulator.firmware.ardupilot.setpoints import attitude_setpoint, motion_setpoint
 from simulator.firmware.ardupilot.streams import DEFAULT_RATES_HZ, STREAMS
-from simulator.firmware.base import Firmware, PositionGains, Sensors
+from simulator.firmware.base import Firmware, Landing, PositionGains, ReadParameter, Sensors
+
+RETURN_LEAST_M = 2.0  # RTL_ALT_MIN
+
+
+def gains(parameter: ReadParameter) -> PositionGains:
+    """The position loop as its parameters have it."""
+    return PositionGains(
+        position_xy_ps=parameter("PSC_POSXY_P"),
+        position_z_ps=parameter("PSC_POSZ_P"),
+        velocity_xy=(parameter("PSC_VELXY_P"), 1.0, 0.25),
+        velocity_z=(5.0, 10.0, 0.0),
+        speed_xy_mps=10.0,
+        speed_up_mps=2.5,
+        speed_down_mps=2.5,
+        tilt_max_rad=math.radians(parameter("ANGLE_MAX") * 0.01),
+        thrust_max=1.0,
+        derivative_cutoff_hz=5.0,
+    )
+
+
+def return_height_m(distance_m: float, parameter: ReadParameter) -> float:
+    """Under a cone near home (RTL_CONE_SLOPE), so that a short way needs no high climb."""
+    highest_m, slope = parameter("RTL_ALT") * 0.01, parameter("RTL_CONE_SLOPE")
+    return min(highest_m, max(distance_m * slope, RETURN_LEAST_M)) if slope > 0 else highest_m
+
 
 ARDUPILOT = Firmware(
     name="ardupilot",
@@ -24,10 +56,12 @@ ARDUPILOT = Firmware(
     capabilities=64495,
     origin=(-35.3632621, 149.1652374, 584.09),
     boot_mode="STABILIZE",
+    reposition_mode="GUIDED",
     modes=MODES,
     rules=RULES,
     parameters=PARAMETERS,
     parameter_roles=ROLES,
+    system_parameter="SYSID_THISMAV",
     parameters_bytewise=False,
     companion_rates_hz=DEFAULT_RATES_HZ,
     ground_rates_hz=DEFAULT_RATES_HZ,
@@ -53,30 +87,30 @@ ARDUPILOT = Firmware(
     force_codes={"arm": 2989.0, "disarm": 21196.0},
     healthy_after_s=42.5,
     healthy_without_position_after_s=24.0,
+    unhealthy_where_unarmable=False,
     setpoint_mode_needs_stream=False,
     setpoints_outlive_modes=False,
     setpoint_decides_flight=True,
     setpoint_spool_s=2.8,
     stream_reaction_s=0.0,
     descend_speed_mps=2.4,  # LOITER with the throttle stick down
-    spool_up_s=2.5,
-    thrust_ramp_s=1.7,
-    landed_after_s=1.65,
-    climbed_within_m=0.1,
-    landing_heights_m=(10.0, 11.0),
-    gains=PositionGains(
-        position_xy_ps=1.0,
-        position_z_ps=1.0,
-        velocity_xy=(2.0, 1.0, 0.25),
-        velocity_z=(5.0, 10.0, 0.0),
-        speed_xy_mps=10.0,
-        speed_up_mps=2.5,
-        speed_down_mps=2.5,
-        tilt_max_rad=math.radians(30.0),
-        derivative_cutoff_hz=5.0,
+    landing=Landing(
+        low_thrust_share=1.0,
+        idle_thrust_share=math.inf,
+        sinking_mps=0.1,
+        speed_down_mps=math.inf,
+        speed_across_mps=math.inf,
+        rate_radps=math.inf,
+        place_below_is_descent=True,
     ),
+    gains=gains,
+    return_height_m=return_height_m,
     heartbeat=heartbeat,
     command_mode=command_mode,
+    set_mode=set_mode,
+    set_mode_acked_as=11,
+    arm_wish=arm_wish,
+    command_answers=COMMAND_ANSWERS,
     attitude_setpoint=attitude_setpoint,
     motion_setpoint=motion_setpoint,
 )

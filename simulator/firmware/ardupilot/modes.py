@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 from simulator.firmware.base import (
+    ArmWish,
     AttitudeSetpoint,
     Behaviour,
     Condition,
@@ -56,3 +57,25 @@ def command_mode(params: tuple[float, ...]) -> ModeRequest:
     known = _BY_NUMBER.get(number)
     unknown = None if known else Say(Severity.WARNING, f"No such mode {number}")
     return ModeRequest(known, Result.FAILED, unknown)
+
+
+def set_mode(base_mode: int, custom_mode: int) -> ModeRequest:
+    """SET_MODE: the mode's number is custom_mode."""
+    return command_mode((base_mode, custom_mode))
+
+
+def arm_wish(param: float) -> ArmWish:
+    """1 arms, 0 disarms, anything else is not supported."""
+    if param in (0.0, 1.0):
+        return ArmWish("arm" if param else "disarm")
+    return ArmWish(refusal=Result.UNSUPPORTED)
+
+
+# Taken by their receivers, which change nothing that shows here, or failed without their devices
+_TAKEN = (115, 181, 195, 197, 203, 206, 207, 208, 401, 2001, 5300, 42003, 42424)
+_FAILED = (84, 178, 183, 184, 189, 193, 205, 211, 218, 500, 2000, 2500)
+COMMAND_ANSWERS: dict[int, Result | None] = {
+    **dict.fromkeys(_TAKEN, Result.ACCEPTED),
+    **dict.fromkeys(_FAILED, Result.FAILED),
+    532: Result.DENIED,
+}

@@ -146,8 +146,10 @@ RULES = (
     Rule("force disarm", do=("disarm",), say=_DISARMING),
     # No failsafe and no text: level, height held, or standing still, and still GUIDED
     Rule("stream lost", when=("obeys attitude",), do=("level",)),
-    Rule("stream lost", when=("obeys motion",), do=("hold",)),
+    Rule("stream lost", when=("obeys velocity",), do=("hold",)),
     Rule("thrust not a number", do=("latch",)),
+    Rule("reboot", when=("not armed",), do=("restart",)),
+    Rule("reboot", result=_FAILED),
     Rule("settled", do=("disarm",), say=_DISARMING),
     Rule("idle", do=("disarm",), say=_DISARMING),
 )

@@ -7,8 +7,15 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.base import Firmware, PositionGains, Sensors
-from simulator.firmware.px4.modes import MODES, command_mode, heartbeat
+from simulator.firmware.base import Firmware, Landing, PositionGains, ReadParameter, Sensors
+from simulator.firmware.px4.modes import (
+    COMMAND_ANSWERS,
+    MODES,
+    arm_wish,
+    command_mode,
+    heartbeat,
+    set_mode,
+)
 from simulator.firmware.px4.parameters import PARAMETERS, ROLES
 from simulator.firmware.px4.rules import RULES
 from simulator.firmware.px4.setpoints import (
@@ -18,6 +25,37 @@ from simulator.firmware.px4.setpoints import (
     motion_setpoint,
 )
 from simulator.firmware.px4.streams import COMPANION_RATES_HZ, GROUND_RATES_HZ, STREAMS
+
+
+def gains(parameter: ReadParameter) -> PositionGains:
+    """The position loop as its parameters have it."""
+    across = tuple(parameter(f"MPC_XY_VEL_{term}_ACC") for term in "PID")
+    up = tuple(parameter(f"MPC_Z_VEL_{term}_ACC") for term in "PID")
+    return PositionGains(
+        position_xy_ps=parameter("MPC_XY_P"),
+        position_z_ps=parameter("MPC_Z_P"),
+        velocity_xy=(across[0], across[1], across[2]),
+        velocity_z=(up[0], up[1], up[2]),
+        speed_xy_mps=parameter("MPC_XY_VEL_MAX"),
+        speed_up_mps=parameter("MPC_Z_VEL_MAX_UP"),
+        speed_down_mps=parameter("MPC_Z_VEL_MAX_DN"),
+        tilt_max_rad=math.radians(parameter("MPC_TILTMAX_AIR")),
+        thrust_max=parameter("MPC_THR_MAX"),
+        derivative_cutoff_hz=5.0,
+    )
+
+
+def return_height_m(distance_m: float, parameter: ReadParameter) -> float:
+    """Under a cone near home, so that it comes down there and not beside it."""
+    highest_m, accepted_m = parameter("RTL_RETURN_ALT"), parameter("NAV_ACC_RAD")
+    if distance_m <= accepted_m:
+        return min(2.0 * distance_m, highest_m)
+    height_m = highest_m
+    if distance_m <= parameter("RTL_MIN_DIST"):
+        cone_rad = math.radians(min(89.0, max(1.0, parameter("RTL_CONE_ANG"))))
+        height_m = min(distance_m / math.tan(cone_rad), highest_m)
+    return min(max(height_m, 2.0 * accepted_m), highest_m)
+
 
 PX4 = Firmware(
     name="px4",
@@ -30,10 +68,12 @@ PX4 = Firmware(
     capabilities=0x21DE,
     origin=(47.397742, 8.545594, 489.4),
     boot_mode="AUTO.LOITER",
+    reposition_mode="AUTO.LOITER",
     modes=MODES,
     rules=RULES,
     parameters=PARAMETERS,
     parameter_roles=ROLES,
+    system_parameter="MAV_SYS_ID",
     parameters_bytewise=True,
     companion_rates_hz=COMPANION_RATES_HZ,
     ground_rates_hz=GROUND_RATES_HZ,
@@ -55,30 +95,30 @@ PX4 = Firmware(
     force_codes={"arm": 21196.0, "disarm": 21196.0},
     healthy_after_s=4.0,
     healthy_without_position_after_s=4.0,
+    unhealthy_where_unarmable=True,
     setpoint_mode_needs_stream=True,
     setpoints_outlive_modes=True,
     setpoint_decides_flight=False,
     setpoint_spool_s=0.0,
     stream_reaction_s=0.036,
     descend_speed_mps=0.6,
-    spool_up_s=1.0,
-    thrust_ramp_s=1.5,
-    landed_after_s=1.0,
-    climbed_within_m=0.3,
-    landing_heights_m=(5.0, 10.0),
-    gains=PositionGains(
-        position_xy_ps=0.95,
-        position_z_ps=1.0,
-        velocity_xy=(1.8, 0.4, 0.2),
-        velocity_z=(4.0, 2.0, 0.0),
-        speed_xy_mps=12.0,
-        speed_up_mps=3.0,
-        speed_down_mps=1.5,
-        tilt_max_rad=math.radians(45.0),
-        derivative_cutoff_hz=5.0,
+    landing=Landing(
+        low_thrust_share=0.95,  # of estimates that wander on the ground, too
+        idle_thrust_share=0.1,
+        sinking_mps=0.09,
+        speed_down_mps=0.2,
+        speed_across_mps=1.5,  # LNDMC_XY_VEL_MAX
+        rate_radps=math.radians(20.0),  # LNDMC_ROT_MAX
+        place_below_is_descent=False,
     ),
+    gains=gains,
+    return_height_m=return_height_m,
     heartbeat=heartbeat,
     command_mode=command_mode,
+    set_mode=set_mode,
+    set_mode_acked_as=176,
+    arm_wish=arm_wish,
+    command_answers=COMMAND_ANSWERS,
     attitude_setpoint=attitude_setpoint,
     motion_setpoint=motion_setpoint,
     battery_events=(

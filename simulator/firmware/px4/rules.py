@@ -148,6 +148,7 @@ RULES = (
     Rule("item reached", send=("MISSION_ITEM_REACHED",)),
     Rule("mission return", "AUTO.MISSION", to="AUTO.RTL", say=_info("Returning to launch")),
     Rule("mission finished", say=_info("Mission finished, loitering")),
+    Rule("reboot", result=Result.DENIED),  # as SITL does, which cannot
     Rule("took off", say=_info("Takeoff detected")),
     Rule("landed", say=_info("Landing detected")),
     Rule("settled", do=("disarm",), to="remembered", say=_info("Disarmed by landing")),

@@ -1,0 +1,90 @@
+"""How fast to go down, and the way home: climb, fly there, go down, land.
+
+Knows position, height and parameters; knows no modes and no thrust.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from enum import Enum
+
+from simulator.firmware.base import MotionSetpoint, Triple
+from simulator.nav import Nav
+from simulator.parameters import ParameterTable
+
+_ARRIVED_M = 1.0
+
+ReturnHeight = Callable[[float, Callable[[str], float]], float]
+
+
+def sink(place: Triple, speed_mps: float) -> MotionSetpoint:
+    """Straight down at this speed."""
+    return MotionSetpoint((place[0], place[1], math.nan), (math.nan, math.nan, speed_mps))
+
+
+def land_speed_mps(nav: Nav, home_down_m: float, parameters: ParameterTable) -> float:
+    """Slower the nearer home's height is, and slowest above the ground that is felt."""
+    role = parameters.role
+    slow = role("land_speed_mps")
+    if nav.ground_m <= role("crawl_below_m"):
+        return min(slow, role("crawl_speed_mps"))
+    fast = max(slow, role("descent_speed_mps"))
+    slow_below_m, fast_above_m = role("slow_below_m"), role("fast_above_m")
+    height_m = home_down_m - nav.position_ned_m[2]
+    share = (height_m - slow_below_m) / max(fast_above_m - slow_below_m, 1e-3)
+    return slow + min(1.0, max(0.0, share)) * (fast - slow)
+
+
+class Stage(Enum):
+    """Of a return."""
+
+    BEGIN, CLIMB, FLY, DESCEND, WAIT, LAND = range(6)
+
+
+@dataclass(slots=True)
+class Return:
+    """One return to `home_ned_m`; what it comes upon it says in `events`."""
+
+    parameters: ParameterTable
+    return_height: ReturnHeight
+    events: list[str]
+    stage: Stage = Stage.BEGIN
+    place: Triple = field(default=(0.0, 0.0, 0.0))
+    _until_s: float = math.inf
+
+    @property
+    def landing(self) -> bool:
+        return self.stage is Stage.LAND
+
+    def fly(self, now_s: float, nav: Nav, home_ned_m: Triple) -> MotionSetpoint:
+        """Where to be now."""
+        x, y, z = nav.position_ned_m
+        home_x, home_y, home_z = home_ned_m
+        distance_m = math.hypot(x - home_x, y - home_y)
+        if self.stage is Stage.BEGIN:
+            height_m = self.return_height(distance_m, self.parameters.__getitem__)
+            self.place = (x, y, min(z, home_z - height_m))
+            self._go(Stage.CLIMB, "return begun")
+        if self.stage is Stage.CLIMB and z < self.place[2] + _ARRIVED_M:
+            self.place = (home_x, home_y, self.place[2])
+            self._go(Stage.FLY)
+        if self.stage is Stage.FLY and distance_m < _ARRIVED_M:
+            waits = self.parameters.role("return_waits_s") != 0.0
+            self._go(Stage.DESCEND) if waits else self._go(Stage.LAND, "return lands")
+            lower_m = self.parameters.role("return_descends_to_m")
+            self.place = (home_x, home_y, max(self.place[2], home_z - lower_m))
+        if self.stage is Stage.DESCEND and z > self.place[2] - _ARRIVED_M:
+            waits_s = self.parameters.role("return_waits_s")
+            self._until_s = now_s + waits_s if waits_s >= 0.0 else math.inf
+            self._go(Stage.WAIT)
+        if self.stage is Stage.WAIT and now_s >= self._until_s:
+            self._go(Stage.LAND, "return lands")
+        if self.stage is Stage.LAND:
+            return sink(self.place, land_speed_mps(nav, home_z, self.parameters))
+        return MotionSetpoint(self.place)
+
+    def _go(self, stage: Stage, event: str = "") -> None:
+        self.stage = stage
+        self.events += (event,) if event else ()

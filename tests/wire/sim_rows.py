@@ -1,0 +1,103 @@
+"""Two talks side by side, row by row: what is equal, what differs, what comes late."""
+
+from __future__ import annotations
+
+import difflib
+import re
+import struct
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Any
+
+TEXT_CHUNK = 50
+BRIEF_S = 1.2  # a state shorter than that may fall between the heartbeats
+KINDS = ("ack", "text", "state", "landed", "param", "mission")
+
+
+@dataclass
+class Rows:
+    """One side: rows of each kind in order, as (time, what), repetitions of a state left out."""
+
+    by_kind: dict[str, list[tuple[float, str]]] = field(
+        default_factory=lambda: {kind: [] for kind in KINDS}
+    )
+    _open_text: str = ""
+
+    def hear(self, time_s: float, message: Any) -> None:
+        name = message.get_type()
+        if name == "COMMAND_ACK":
+            self._add("ack", time_s, f"{message.command}: {message.result}")
+        elif name == "STATUSTEXT":
+            self._open_text += message.text
+            if len(message.text) < TEXT_CHUNK:
+                self._add("text", time_s, f"{message.severity} {_without_figures(self._open_text)}")
+                self._open_text = ""
+        elif name == "HEARTBEAT":
+            state = f"{message.base_mode} {message.custom_mode:#x} {message.system_status}"
+            self._change("state", time_s, state)
+        elif name == "EXTENDED_SYS_STATE":
+            self._change("landed", time_s, str(message.landed_state))
+        elif name == "PARAM_VALUE":
+            bits = struct.pack("<f", message.param_value).hex()
+            self._change("param", time_s, f"{message.param_id} {bits} {message.param_type}")
+        elif name in ("MISSION_ACK", "MISSION_COUNT", "MISSION_ITEM_REACHED"):
+            what = getattr(message, {"A": "type", "C": "count", "I": "seq"}[name[8]])
+            self._change("mission", time_s, f"{name} {what}")
+        elif name.startswith("MISSION_REQUEST"):
+            self._change("mission", time_s, f"{name} {message.seq}")
+
+    def _add(self, kind: str, time_s: float, what: str) -> None:
+        self.by_kind[kind].append((time_s, what))
+
+    def _change(self, kind: str, time_s: float, what: str) -> None:
+        if self.by_kind[kind][-1:] == [] or self.by_kind[kind][-1][1] != what:
+            self._add(kind, time_s, what)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """`equal`: count of rows; `differing`: "real ..." and "ours ..."; `late`: row, seconds."""
+
+    equal: int
+    differing: list[str]
+    late: list[tuple[str, float]]
+
+
+def compare(real: Rows, ours: Rows, kinds: Iterable[str], unheard: tuple[str, ...]) -> Comparison:
+    """Row by row of these kinds; rows that contain one of `unheard` are left out on both sides."""
+    equal, differing, late = 0, [], []
+    for kind in kinds:
+        sides = [
+            [row for row in _lasting(side, kind) if not any(part in row[1] for part in unheard)]
+            for side in (real, ours)
+        ]
+        theirs, mine = ([row[1] for row in side] for side in sides)
+        matcher = difflib.SequenceMatcher(None, theirs, mine, autojunk=False)
+        for how, a, b, c, d in matcher.get_opcodes():
+            if how == "equal":
+                equal += b - a
+                late += [
+                    (f"{kind} {x[1]}", y[0] - x[0])
+                    for x, y in zip(sides[0][a:b], sides[1][c:d], strict=True)
+                ]
+            else:
+                differing += [f"real {kind} {row}" for row in theirs[a:b]]
+                differing += [f"ours {kind} {row}" for row in mine[c:d]]
+    return Comparison(equal, differing, late)
+
+
+def _lasting(side: Rows, kind: str) -> list[tuple[float, str]]:
+    rows = side.by_kind[kind]
+    if kind != "state":
+        return rows
+    lasting: list[tuple[float, str]] = []
+    for row, (until_s, _) in zip(rows, [*rows[1:], (float("inf"), "")], strict=True):
+        if until_s - row[0] > BRIEF_S and [row[1]] != [last[1] for last in lasting[-1:]]:
+            lasting.append(row)
+    return lasting
+
+
+def _without_figures(text: str) -> str:
+    """Heights and charges are estimates, and a metre more or less."""
+    estimated = text.startswith(("RTL: start", "Battery 1 is"))
+    return re.sub(r"\d+(\.\d+)?", "#", text).strip() if estimated else text.strip()

@@ -1,0 +1,140 @@
+"""Sessions with a real PX4, asked again: row by row, what differs is listed here with its reason.
+
+Each recording is trimmed: setpoints to 5 Hz, telemetry to what tells the time and the rows.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sim_bench import Bench
+from sim_rows import Comparison, Rows, compare
+from sim_talk import ask_again, recorded_frames
+
+from simulator.sensors import EstimatorName
+
+RECORDINGS = Path(__file__).parent / "recordings"
+# Its log file; GPS drift while it stands, which the simulator has not
+NOT_OURS = ("[logger]", "GPS Vertical Pos Drift")
+PROMPT_S = 0.15
+# What hangs on how estimates wander near the ground, and on a climb's shape
+FLOWN_S = {
+    "text 6 Takeoff detected": 0.5,
+    "landed 2": 2.6,
+    "landed 3": 0.5,
+    "text 6 Landing detected": 4.0,
+    "text 6 Disarmed by landing": 4.0,
+    "landed 1": 4.0,
+    "landed": 0.3,
+    "state": 4.2,
+}
+
+
+@dataclass(frozen=True)
+class Session:
+    """`seed`: one of the estimator's, with which the landings fall near the real ones."""
+
+    name: str
+    seed: int
+    equal: int
+    differing: tuple[str, ...] = ()
+    flown_s: tuple[tuple[str, float], ...] = ()
+    kinds: tuple[str, ...] = ("ack", "text", "state", "landed")
+
+    @property
+    def recording(self) -> Path:
+        return RECORDINGS / f"px4-1.16.1-{self.name}.tlog.xz"
+
+
+SESSIONS = [
+    # Stream lost with each COM_OBL_RC_ACT and two COM_OF_LOSS_T, resumed; at last to the ground
+    Session("failsafes", seed=2, equal=57),
+    # Takeoff to the default height, landing; to 12 m, reposition, return from 30 m
+    Session(
+        "takeoff_land",
+        seed=2,
+        equal=41,
+        flown_s=(
+            ("text 6 RTL: land", 4.0),  # on its way without limits on acceleration and jerk
+            ("landed 4", 4.0),
+            ("text 6 Landing detected", 10.5),
+            ("text 6 Disarmed by landing", 10.5),
+            ("landed 1", 10.5),
+            ("state", 10.5),
+        ),
+    ),
+    # On the ground: 95 commands, modes, arming in each mode; a mode lasts half a second there,
+    # so that heartbeats tell nothing
+    Session(
+        "ground",
+        seed=3,
+        equal=222,
+        kinds=("ack", "text"),
+        differing=(
+            "real ack 84: 0",  # takeoff of a VTOL: its mode, on a multicopter
+            "ours ack 84: 3",
+            "real ack 511: 0",  # an interval that is not a number, of a message that is none
+            "ours ack 511: 4",
+            "ours ack 512: 0",  # to system 0, which ours answers, since clients may send it there
+            "ours ack 512: 0",
+            "real ack 512: 2",  # it had just sent it and had no newer one
+            "ours ack 512: 0",
+            "ours text 6 RTL: land at destination",  # its estimate is half a metre up
+        ),
+        flown_s=(("text 6 Disarmed by auto preflight", 1.1), ("ack 512", 0.7)),
+    ),
+]
+
+
+def _system(recording: Path) -> int:
+    messages = (message for _, _, message in recorded_frames(recording) if message is not None)
+    return next(m.get_srcSystem() for m in messages if m.get_srcComponent() == 1)
+
+
+@functools.cache
+def heard(session: Session) -> tuple[Rows, Rows]:
+    """The real one's rows and the simulator's."""
+    real, ours = Rows(), Rows()
+    bench = Bench(
+        EstimatorName.PX4_LIKE,
+        seed=session.seed,
+        heartbeat_type=None,
+        system=_system(session.recording),
+    )
+
+    def drain(message: Any) -> None:
+        """The battery is an input of the session: its simulated one empties in a minute."""
+        if session.name == "battery" and message.get_type() == "SYS_STATUS":
+            bench.instance.autopilot.plant.set_battery(max(0, message.battery_remaining) / 100)
+
+    ask_again(session.recording, bench, real, ours, run_on_s=2.0, each=drain)
+    return real, ours
+
+
+def side_by_side(session: Session) -> Comparison:
+    return compare(*heard(session), session.kinds, NOT_OURS)
+
+
+def limit_s(session: Session, row: str) -> float:
+    known = {**dict(session.flown_s), **FLOWN_S, **dict(session.flown_s)}
+    return next((known[start] for start in known if row.startswith(start)), PROMPT_S)
+
+
+@pytest.mark.parametrize("session", SESSIONS, ids=lambda session: session.name)
+def test_rows_are_the_real_ones(session: Session) -> None:
+    compared = side_by_side(session)
+    assert compared.differing == list(session.differing)
+    assert compared.equal == session.equal
+
+
+@pytest.mark.parametrize("session", SESSIONS, ids=lambda session: session.name)
+def test_rows_come_when_the_real_ones_come(session: Session) -> None:
+    compared = side_by_side(session)
+    late = [(row, s) for row, s in compared.late if abs(s) > limit_s(session, row)]
+    assert late == []
+    assert all(math.isfinite(s) for _, s in compared.late)
