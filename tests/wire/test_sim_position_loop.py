@@ -44,7 +44,7 @@ def test_tilt_and_thrust_are_limited() -> None:
     w, x, y, z = attitude
     down = Rotation.from_quat([x, y, z, w]).apply([0.0, 0.0, 1.0])
     assert math.acos(down[2]) == pytest.approx(GAINS.tilt_max_rad)
-    assert 0.0 < thrust < 0.1
+    assert thrust == 0.0
 
 
 def test_speed_limits() -> None:

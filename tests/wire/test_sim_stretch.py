@@ -164,7 +164,7 @@ def _shake(instance: Instance, random: np.random.Generator, scale: float) -> Non
     autopilot.gps_healthy = bool(random.random() < 0.5)
     pilot = autopilot.pilot
     pilot.home_ned_m = (0.0, 0.0, scale)
-    pilot.landed = bool(random.random() < 0.5)
+    pilot.fall(on_ground=bool(random.random() < 0.5))
     pilot.motion = MotionSetpoint(*(tuple(scale * random.standard_normal(3)) for _ in range(2)))
     pilot.thrust_demanded = float(random.random())
     given = tuple(random.standard_normal(4).tolist())
