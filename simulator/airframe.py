@@ -37,7 +37,8 @@ _STIFFNESS_LIMIT = 0.5
 
 
 class Battery(Parameters):
-    """A lithium pack: open-circuit voltage linear in what remains, sagging with the current."""
+    """A lithium pack: open-circuit voltage linear in what remains, and on when nothing does;
+    sagging with the current."""
 
     cells: int = Field(default=4, ge=1, le=16)
     capacity_ah: float = Field(default=5.0, gt=0.01, le=200)
@@ -68,16 +69,18 @@ class Airframe:
 
     def battery_remaining(self, drawn_as: float) -> float:
         """Share left after the charge drawn so far."""
-        battery = self.battery
-        return max(battery.remaining - drawn_as / (3600.0 * battery.capacity_ah), 0.0)
+        return max(self._charge_left(drawn_as), 0.0)
 
     def battery_state(self, rotor: Array) -> BatteryState:
         """Battery after the charge drawn so far, at the present thrust."""
         battery = self.battery
-        remaining = self.battery_remaining(rotor[CHARGE])
+        left = self._charge_left(rotor[CHARGE])
         current = battery.hover_current_a * (rotor[THRUST] / self.hover_thrust) ** 1.5
-        voltage = battery.cells * (3.5 + 0.7 * remaining) - battery.resistance_ohm * current
-        return BatteryState(max(voltage, 0.0), current, remaining)
+        voltage = battery.cells * (3.5 + 0.7 * left) - battery.resistance_ohm * current
+        return BatteryState(max(voltage, 0.0), current, max(left, 0.0))
+
+    def _charge_left(self, drawn_as: float) -> float:
+        return self.battery.remaining - drawn_as / (3600.0 * self.battery.capacity_ah)
 
 
 def build_airframe(

@@ -115,6 +115,8 @@ class Autopilot:
         booted = self.time_s >= after_s * self.boot_scale and not self.faulty
         if self.firmware.unhealthy_where_unarmable and not mode.arms:
             return False
+        if self._watch.ground_station_lost and self.parameters.role("ground_station_needed") > 0:
+            return False
         if mode.behaviour is Behaviour.MISSION:
             return booted and self.mission.flyable
         return booted and (self.stream_alive or not waits)
@@ -353,8 +355,8 @@ class Autopilot:
         self._watch.hear_ground_station(self.time_s)
 
     def _watch_surroundings(self) -> None:
-        remaining = self.truth.battery.remaining if self.armed else 1.0
-        for event in self._watch.step(self.time_s, self.armed, remaining, self.gps_healthy):
+        battery = self.truth.battery
+        for event in self._watch.step(self.time_s, self.armed, battery, self.gps_healthy):
             self.happen(event)
         if self._awaited is not None and self.time_s >= self._awaited[0]:
             event, self._awaited = self._awaited[1], None
@@ -432,6 +434,8 @@ class Autopilot:
             "climb_m": self.mission.climb_m,
             "target_m": above_home_m,
             "target_amsl_m": amsl_m,
+            "battery_v": self.truth.battery.voltage_v,
+            "used_mah": self.plant.used_mah,
             "delay_s": self.parameters.role("failsafe_delay_s"),
         }
 
@@ -491,9 +495,17 @@ class Autopilot:
         self._cause = self._event.removesuffix(AT_LAST)
 
     def _await(self) -> None:
-        """Carry the failsafe out later, so that a pilot can take over before."""
-        delay_s = self.parameters.role("failsafe_delay_s")
-        self._awaited = (self.time_s + delay_s, self._event + AT_LAST)
+        """Carry the failsafe out later, so that a pilot can take over before; no later than one
+        that waits already."""
+        at_s = self.time_s + self.parameters.role("failsafe_delay_s")
+        if self._awaited is not None:
+            at_s = self._awaited[0]
+        self._awaited = (at_s, self._event + AT_LAST)
+
+    @property
+    def awaits(self) -> bool:
+        """A failsafe is put off."""
+        return self._awaited is not None
 
     def _recover(self) -> None:
         self.failsafe = False
@@ -506,6 +518,7 @@ GUARDS: dict[str, Callable[[Autopilot], bool]] = {
     "armed": lambda autopilot: autopilot.armed,
     "landed": lambda autopilot: autopilot.landed,
     "failsafe": lambda autopilot: autopilot.failsafe,
+    "waiting": lambda autopilot: autopilot.awaits,
     "ready": lambda autopilot: autopilot.healthy and autopilot.mode.arms,
     "mode can run": Autopilot._mode_can_run,
     "mode arms": lambda autopilot: autopilot.mode.arms,

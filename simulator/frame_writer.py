@@ -280,9 +280,10 @@ def _put_status(plant: Any, seen: Any, payload: Any) -> None:
         seen.battery[2],
         seen.battery[3],
     )
-    remaining = max(at_boot - plant.rotor[CHARGE] / capacity, 0.0)
+    left = at_boot - plant.rotor[CHARGE] / capacity
+    remaining = max(left, 0.0)
     current = seen.battery[4] * (plant.rotor[THRUST] / seen.battery[5]) ** 1.5
-    voltage = max(cells * (3.5 + 0.7 * remaining) - resistance * current, 0.0)
+    voltage = max(cells * (3.5 + 0.7 * left) - resistance * current, 0.0)
     for i in range(3):
         payload.words[i] = seen.sensors[i]
     for i in range(3, 11):

@@ -6,6 +6,7 @@ until `drain` takes them. Knows no socket and no clock: time is the autopilot's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
@@ -17,7 +18,7 @@ from simulator.mission_transfer import Transfer
 from simulator.strict import Strict
 from simulator.telemetry import LEAST_INTERVAL_US, MAV_COMP_ID_AUTOPILOT, View
 
-MAV_TYPE_GCS = 6
+TEXT_KEPT_US = 5_000_000
 TEXT_LENGTH = 50
 STEP_US = 4000
 DATAGRAM_MAX = 1400
@@ -53,7 +54,8 @@ class Server:
     sequence: int = 0
     streams: dict[str, Stream] = field(default_factory=dict)
     rescheduled: bool = True  # the streams are others than they were
-    _ground_station: bool = False
+    _ground_station_us: float = -math.inf  # last heard
+    _texts_kept: list[tuple[int, Say]] = field(default_factory=list)
     _out: list[bytes] = field(default_factory=list)
     _text_id: int = 0
     _parameters_due: list[str] = field(default_factory=list)
@@ -130,13 +132,14 @@ class Server:
         self.streams = {}
         self.sequence = self._text_id = 0
         self._transfer = Transfer(self, self.view.autopilot.mission)
-        self._ground_station = False
+        self._ground_station_us, self._texts_kept = -math.inf, []
         self._start_streams()
 
     def say(self, said: Say) -> None:
         """Queue a STATUSTEXT in chunks, if this link gets texts at all."""
         firmware = self.view.autopilot.firmware
-        if firmware.text_to_ground_stations_only and not self._ground_station:
+        if firmware.text_to_ground_stations_only and not self._ground_station_is_there:
+            self._texts_kept.append((self._now_us, said))
             return
         if not self.heard:
             return
@@ -145,6 +148,18 @@ class Server:
             piece = text[at : at + TEXT_LENGTH]
             self.send("STATUSTEXT", int(said.severity), piece, self._text_id, chunk)
         self._text_id = (self._text_id + 1) & 0xFFFF
+
+    @property
+    def _ground_station_is_there(self) -> bool:
+        stays_us = self.view.autopilot.firmware.ground_station_stays_s * 1e6
+        return self._now_us - self._ground_station_us <= stays_us
+
+    def _say_what_was_kept(self) -> None:
+        """Texts wait for a ground station, but not for long."""
+        kept, self._texts_kept = self._texts_kept, []
+        for at_us, said in kept:
+            if self._now_us - at_us < TEXT_KEPT_US:
+                self.say(said)
 
     def send_parameter(self, name: str, *, listed: bool = False) -> None:
         """Queue PARAM_VALUE; `listed`: its number was asked for."""
@@ -202,12 +217,17 @@ class Server:
         component = message.values.get("target_component", 0)
         checked = self.view.autopilot.firmware.target_component_checked
         for_autopilot = component in (0, MAV_COMP_ID_AUTOPILOT) or not checked
-        return system in (0, self.view.system) and for_autopilot
+        read = self.view.autopilot.parameters.__getitem__
+        obeyed = self.view.autopilot.firmware.obeys_system(message.system, self.view.system, read)
+        return system in (0, self.view.system) and for_autopilot and obeyed
 
     def _heartbeat(self, message: Message) -> None:
-        if message.type == MAV_TYPE_GCS:
-            self._ground_station = True
-            self.view.autopilot.hear_ground_station()
+        autopilot = self.view.autopilot
+        read = autopilot.parameters.__getitem__
+        if autopilot.firmware.is_ground_station(message.type, message.system, read):
+            self._ground_station_us = self._now_us
+            autopilot.hear_ground_station()
+            self._say_what_was_kept()
 
     def _command_long(self, message: Message) -> None:
         params = tuple(message.values[f"param{i}"] for i in range(1, 8))

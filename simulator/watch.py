@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from simulator.airframe import BatteryState
 from simulator.firmware.base import Firmware
 from simulator.parameters import ParameterTable
 
@@ -21,17 +22,22 @@ class Watch:
     _ground_station_s: float = math.nan  # last heard
     _ground_station_lost: bool = False
     _battery_level: int = 0  # of `firmware.battery_events`, already told
+    _worse_s: float = math.nan  # since when it is worse than that
     _fix_s: float = 0.0
     _position_lost: bool = False
 
     def hear_ground_station(self, now_s: float) -> None:
         self._ground_station_s = now_s
 
-    def step(self, now_s: float, armed: bool, remaining: float, has_fix: bool) -> list[str]:
-        """Events since the last step; `remaining` is the battery's share."""
+    @property
+    def ground_station_lost(self) -> bool:
+        return self._ground_station_lost
+
+    def step(self, now_s: float, armed: bool, battery: BatteryState, has_fix: bool) -> list[str]:
+        """Events since the last step."""
         return [
             *self._ground_station(now_s),
-            *self._battery(armed, remaining),
+            *self._battery(now_s, armed, battery),
             *self._position(now_s, has_fix),
         ]
 
@@ -57,23 +63,28 @@ class Watch:
 
     def _ground_station(self, now_s: float) -> list[str]:
         timeout_s = self.parameters.role("ground_station_timeout_s")
+        timeout_s += self.firmware.ground_station_stays_s
         lost = now_s - self._ground_station_s > timeout_s  # never heard is not lost
         if lost == self._ground_station_lost:
             return []
         self._ground_station_lost = lost
         return ["ground station lost" if lost else "ground station found"]
 
-    def _battery(self, armed: bool, remaining: float) -> list[str]:
-        """It only gets worse in flight; told anew of the next one."""
+    def _battery(self, now_s: float, armed: bool, battery: BatteryState) -> list[str]:
+        """It only gets worse in flight, and is believed to when it stays so for a while."""
         if not armed:
-            self._battery_level = 0
+            self._battery_level, self._worse_s = 0, math.nan
             return []
-        known = self._battery_level
-        for level, (event, threshold) in enumerate(self.firmware.battery_events, 1):
-            if level > self._battery_level and remaining < self.parameters[threshold]:
-                self._battery_level = level
-                worst = event
-        return [worst] if self._battery_level > known else []
+        level = self.firmware.battery_level(battery, self.parameters.__getitem__)
+        if level <= self._battery_level:
+            self._worse_s = math.nan
+            return []
+        if math.isnan(self._worse_s):
+            self._worse_s = now_s
+        if now_s - self._worse_s < self.parameters.role("battery_patience_s"):
+            return []
+        self._battery_level, self._worse_s = level, math.nan
+        return [self.firmware.battery_events[level - 1]]
 
     def _position(self, now_s: float, has_fix: bool) -> list[str]:
         if has_fix:

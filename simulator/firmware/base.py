@@ -13,6 +13,8 @@ from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import Any, Literal
 
+from simulator.airframe import BatteryState
+
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
 ReadParameter = Callable[[str], float]
@@ -266,6 +268,9 @@ class Firmware:
     boot: Mapping[str, float]  # events of the start, s of vehicle time
     mode_acked_twice: bool  # the receiver acks a mode command before the commander does
     text_to_ground_stations_only: bool
+    is_ground_station: Callable[[int, int, ReadParameter], bool]  # MAV_TYPE, system of a heartbeat
+    ground_station_stays_s: float  # after its last heartbeat
+    obeys_system: Callable[[int, int, ReadParameter], bool]  # sender, own
     text_suffix: str
     target_component_checked: bool
     answers_carry_index: bool  # PARAM_VALUE; else 65535 unless the list was asked for
@@ -283,6 +288,9 @@ class Firmware:
     landing: Landing
     gains: Callable[[ReadParameter], PositionGains]
     return_height_m: Callable[[float, ReadParameter], float]  # above home, by the distance to it
+    # how bad the battery is, and the events of becoming so bad, from 1 on
+    battery_level: Callable[[BatteryState, ReadParameter], int]
+    battery_events: tuple[str, ...]
     heartbeat: Callable[[Condition], tuple[int, int]]  # base_mode but the armed bit, MAV_STATE
     command_mode: Callable[[tuple[float, ...]], ModeRequest]
     set_mode: Callable[[int, int], ModeRequest]  # SET_MODE: base_mode, custom_mode
@@ -294,7 +302,6 @@ class Firmware:
         [Mapping[str, Any], ReadParameter], AttitudeSetpoint | MotionSetpoint | None
     ]
     motion_setpoint: Callable[[Mapping[str, Any]], MotionSetpoint | None]
-    battery_events: tuple[tuple[str, str], ...] = ()  # and parameters: the share below which
     position_without_fix_s: float = math.inf  # until the estimate of position is given up
     # a SET_POSITION_TARGET in another local frame, by the vehicle's attitude, in MAV_FRAME 1
     in_local_frame: Callable[[Mapping[str, Any], Quaternion], Mapping[str, Any]] = as_given

@@ -5,8 +5,6 @@ from __future__ import annotations
 import pytest
 from sim_bench import LAND, LOITER, NAN, OFFBOARD, RTL, Bench
 
-LOST = "Connection to ground station lost"
-
 
 def flying(parameter: str = "COM_LOW_BAT_ACT", value: float = 0) -> Bench:
     """In AUTO.LOITER, 2.5 m up."""
@@ -57,7 +55,12 @@ def test_by_default_a_battery_only_warns_of_each_level_once() -> None:
     for remaining in (0.14, 0.06, 0.04):
         drain(bench, remaining)
         bench.run(1.0)
-    assert bench.texts(begun_s) == ["Low battery", "Critical battery", "Emergency battery level"]
+    assert bench.texts(begun_s) == [
+        "Low battery",
+        "Failsafe activated",
+        "Critical battery",
+        "Emergency battery level",
+    ]
     assert (bench.mode, bench.instance.autopilot.system_status) == (LOITER, 4)
 
 
@@ -80,17 +83,53 @@ def test_a_stream_does_not_end_a_battery_failsafe() -> None:
 
 @pytest.mark.parametrize(("action", "mode"), [(0, LOITER), (1, LOITER), (2, RTL), (3, LAND)])
 def test_a_lost_ground_station(action: int, mode: int) -> None:
+    """Lost COM_DL_LOSS_T after it counts as gone, 2.5 s; its return ends no failsafe."""
     bench = flying("NAV_DLL_ACT", action)
+    autopilot = bench.instance.autopilot
     begun_s, bench.heartbeat_type = bench.time_s, None
-    bench.run_until(lambda: LOST in bench.texts(begun_s), 11.0)
-    assert bench.time_s - begun_s > 9.0
+    bench.run(11.3)
+    assert (bench.mode, autopilot.system_status) == (LOITER, 4)
+    bench.run(1.5)
+    assert (bench.mode, autopilot.system_status) == (LOITER, 5 if action else 4)
     bench.run(5.3)
     assert bench.mode == mode
-    assert bench.instance.autopilot.system_status == (5 if action else 4)
+    assert "Connection to ground station lost" not in bench.texts(begun_s)  # nobody was there
     bench.heartbeat_type = 6
     bench.run(1.5)
     assert bench.texts(begun_s)[-1] == "GCS connection regained"
-    assert (bench.mode, bench.instance.autopilot.system_status) == (LOITER, 4)
+    assert (bench.mode, autopilot.system_status) == (mode, 5 if action else 4)
+
+
+def test_texts_wait_for_a_ground_station_five_seconds() -> None:
+    bench = flying("COM_LOW_BAT_ACT", 0)
+    begun_s, bench.heartbeat_type = bench.time_s, None
+    bench.run(4.0)
+    drain(bench, 0.14)
+    bench.run(2.0)
+    drain(bench, 0.06)
+    bench.run(3.8)
+    assert bench.texts(begun_s) == []
+    bench.heartbeat_type = 6
+    bench.run(1.0)
+    assert bench.texts(begun_s) == ["Critical battery"]  # the other was too old
+
+
+def test_a_worse_battery_changes_what_is_awaited() -> None:
+    bench = flying("COM_LOW_BAT_ACT", 3)
+    begun_s = bench.time_s
+    drain(bench, 0.06)
+    bench.run(2.0)
+    drain(bench, 0.04)
+    bench.run(2.8)
+    assert bench.mode == LOITER
+    bench.run(0.5)
+    assert bench.mode == LAND  # and not RTL, and no later
+    assert bench.texts(begun_s) == [
+        "Critical battery",
+        "Failsafe activated: entering Hold for 5 seconds",
+        "Emergency battery level",
+        "Failsafe activated",
+    ]
 
 
 def test_without_position_automatic_flight_lands_and_attitude_flies_on() -> None:

@@ -88,6 +88,32 @@ SESSIONS = [
         ),
         flown_s=(("text 6 Disarmed by auto preflight", 1.1), ("ack 512", 0.7)),
     ),
+    # Ground station lost with each NAV_DLL_ACT, in the air and on the ground
+    Session(
+        "losses",
+        seed=2,
+        equal=51,
+        differing=(
+            # said 5 s before a ground station hears it: a tenth of a second less, and it is told
+            "ours text 6 Connection to ground station lost",
+        ),
+    ),
+    # The battery emptied in half a minute, COM_LOW_BAT_ACT 3
+    Session(
+        "battery",
+        seed=2,
+        equal=24,
+        differing=(
+            "real text 2 System does not support shutdown",  # SITL's own
+            "real text 0 Low battery",  # its battery refills while it stands disarmed
+        ),
+        # the thresholds by SYS_STATUS, which shows hundredths and comes each second
+        flown_s=(
+            ("text 0", 1.1),
+            ("text 2 Failsafe", 1.1),
+            ("landed 4", 1.1),
+        ),
+    ),
 ]
 
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+from simulator.airframe import BatteryState
 from simulator.firmware.ardupilot.messages import MESSAGES
 from simulator.firmware.ardupilot.modes import (
     COMMAND_ANSWERS,
@@ -47,6 +48,27 @@ def return_height_m(distance_m: float, parameter: ReadParameter) -> float:
     return min(highest_m, max(distance_m * slope, RETURN_LEAST_M)) if slope > 0 else highest_m
 
 
+def battery_level(battery: BatteryState, parameter: ReadParameter) -> int:
+    """By voltage, or by the charge that remains of BATT_CAPACITY; 0 asks for neither."""
+
+    def below(kind: str) -> bool:
+        left_mah = battery.remaining * parameter("BATT_CAPACITY")
+        by_voltage = battery.voltage_v < parameter(f"BATT_{kind}_VOLT")
+        return by_voltage or left_mah < parameter(f"BATT_{kind}_MAH")
+
+    return 2 if below("CRT") else int(below("LOW"))
+
+
+def is_ground_station(_: int, system: int, parameter: ReadParameter) -> bool:
+    """By its system id, whatever it is."""
+    return system == parameter("SYSID_MYGCS")
+
+
+def obeys_system(sender: int, own: int, parameter: ReadParameter) -> bool:
+    """All, or its ground station and its own components alone."""
+    return not parameter("SYSID_ENFORCE") or sender in (own, parameter("SYSID_MYGCS"))
+
+
 ARDUPILOT = Firmware(
     name="ardupilot",
     vehicle="arducopter",
@@ -80,6 +102,9 @@ ARDUPILOT = Firmware(
     boot=BOOT,
     mode_acked_twice=False,
     text_to_ground_stations_only=False,
+    is_ground_station=is_ground_station,
+    ground_station_stays_s=0.0,
+    obeys_system=obeys_system,
     text_suffix="",
     target_component_checked=False,
     answers_carry_index=False,
@@ -105,6 +130,8 @@ ARDUPILOT = Firmware(
     ),
     gains=gains,
     return_height_m=return_height_m,
+    battery_level=battery_level,
+    battery_events=("battery low", "battery critical"),
     heartbeat=heartbeat,
     command_mode=command_mode,
     set_mode=set_mode,

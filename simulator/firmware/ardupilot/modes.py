@@ -24,13 +24,27 @@ MODES = {
     mode.name: mode
     for mode in (
         Mode("STABILIZE", "STABILIZE", 0, BY_HAND, Behaviour.LEVEL),
+        Mode("ACRO", "ACRO", 1, BY_HAND, Behaviour.LEVEL),
         Mode("ALT_HOLD", "ALT_HOLD", 2, BY_HAND, Behaviour.DESCEND),
+        Mode("AUTO", "AUTO", 3, BY_POSITION, Behaviour.MISSION, arms=False, needs_position=True),
         Mode("GUIDED", "GUIDED", 4, BY_POSITION, Behaviour.SETPOINT, needs_position=True),
         Mode("LOITER", "LOITER", 5, BY_POSITION, Behaviour.DESCEND, needs_position=True),
         Mode("RTL", "RTL", 6, BY_POSITION, Behaviour.RETURN, arms=False, needs_position=True),
+        Mode("CIRCLE", "CIRCLE", 7, BY_POSITION, Behaviour.HOLD, arms=False, needs_position=True),
         Mode("LAND", "LAND", 9, BY_POSITION, Behaviour.LAND, arms=False),
+        Mode("DRIFT", "DRIFT", 11, BY_HAND, Behaviour.DESCEND, needs_position=True),
+        Mode("POSHOLD", "POSHOLD", 16, BY_POSITION, Behaviour.DESCEND, needs_position=True),
         Mode("BRAKE", "BRAKE", 17, BY_POSITION, Behaviour.HOLD, arms=False, needs_position=True),
         Mode("GUIDED_NOGPS", "GUIDED_NOGPS", 20, BY_HAND, Behaviour.SETPOINT),
+        Mode(
+            "SMART_RTL",
+            "SMARTRTL",
+            21,
+            BY_POSITION,
+            Behaviour.RETURN,
+            arms=False,
+            needs_position=True,
+        ),
     )
 }
 
@@ -46,6 +60,11 @@ def heartbeat(now: Condition) -> tuple[int, int]:
 
 
 _CUSTOM_MODE_ENABLED = 1
+# Modes that it has and does not enter here, as it enters some only under conditions
+_NOT_ENTERED = {
+    14: "FLIP", 15: "AUTOTUNE", 18: "THROW", 19: "AVOID_ADSB", 22: "FLOWHOLD", 23: "FOLLOW",
+    24: "ZIGZAG", 25: "SYSTEMID", 27: "AUTO RTL", 28: "TURTLE",
+}  # fmt: skip
 _BY_NUMBER = {mode.custom_mode: mode.name for mode in MODES.values()}
 
 
@@ -55,8 +74,10 @@ def command_mode(params: tuple[float, ...]) -> ModeRequest:
     if not base & _CUSTOM_MODE_ENABLED:
         return ModeRequest(None, Result.DENIED)
     known = _BY_NUMBER.get(number)
-    unknown = None if known else Say(Severity.WARNING, f"No such mode {number}")
-    return ModeRequest(known, Result.FAILED, unknown)
+    said = f"No such mode {number}"
+    if number in _NOT_ENTERED:
+        said = f"Mode change to {_NOT_ENTERED[number]} failed: init failed"
+    return ModeRequest(known, Result.FAILED, None if known else Say(Severity.WARNING, said))
 
 
 def set_mode(base_mode: int, custom_mode: int) -> ModeRequest:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from simulator.firmware.base import Result, Rule, Say, Severity
 
 # Seconds after boot at which an event of this name happens
@@ -24,6 +26,10 @@ def _info(text: str) -> Say:
     return Say(Severity.INFO, text)
 
 
+def _warning(text: str) -> Say:
+    return Say(Severity.WARNING, text)
+
+
 def _critical(text: str) -> Say:
     return Say(Severity.CRITICAL, text)
 
@@ -35,6 +41,39 @@ _HEARTBEAT = ("HEARTBEAT",)
 _ORIGIN_AND_HOME = ("GPS_GLOBAL_ORIGIN", "HOME_POSITION")
 _ARMING = Rule("arm", do=("arm",), say=_info("Arming motors"), send=_ORIGIN_AND_HOME)
 _DISARMING = _info("Disarming motors")
+
+_FAILSAFE = {
+    "ground station lost": (_warning("GCS Failsafe"),),
+    "battery low": (
+        _warning("Battery 1 is low {battery_v:.2f}V used {used_mah:.0f} mAh"),
+        _warning("Battery Failsafe"),
+    ),
+    "battery critical": (
+        _warning("Battery 1 is critical {battery_v:.2f}V used {used_mah:.0f} mAh"),
+        _warning("Battery Failsafe"),
+    ),
+}
+
+
+def _failsafe(event: str, parameter: str, modes: Mapping[int, str]) -> list[Rule]:
+    """At once to the mode that the parameter's value names, unless it stands disarmed."""
+    say, *also = _FAILSAFE[event]
+    return [
+        Rule(
+            event,
+            when=("armed", f"{parameter}={value}"),
+            to=mode,
+            do=("failsafe",),
+            say=say,
+            also=tuple(also),
+            send=_HEARTBEAT,
+        )
+        for value, mode in modes.items()
+    ]
+
+
+_BATTERY_MODES = {1: "LAND", 2: "RTL", 3: "SMART_RTL", 4: "SMART_RTL", 7: "BRAKE"}
+_GROUND_MODES = {**_BATTERY_MODES, 1: "RTL", 5: "LAND", 6: "RTL"}
 
 RULES = (
     Rule(
@@ -147,6 +186,17 @@ RULES = (
     # No failsafe and no text: level, height held, or standing still, and still GUIDED
     Rule("stream lost", when=("obeys attitude",), do=("level",)),
     Rule("stream lost", when=("obeys velocity",), do=("hold",)),
+    *_failsafe("ground station lost", "FS_GCS_ENABLE", _GROUND_MODES),
+    Rule(
+        "ground station found",
+        when=("since ground station lost",),
+        do=("recover",),
+        say=_warning("GCS Failsafe Cleared"),
+    ),
+    *_failsafe("battery low", "BATT_FS_LOW_ACT", _BATTERY_MODES),
+    *_failsafe("battery critical", "BATT_FS_CRT_ACT", _BATTERY_MODES),
+    Rule("battery low", say=_FAILSAFE["battery low"][0]),
+    Rule("battery critical", say=_FAILSAFE["battery critical"][0]),
     Rule("thrust not a number", do=("latch",)),
     Rule("reboot", when=("not armed",), do=("restart",)),
     Rule("reboot", result=_FAILED),

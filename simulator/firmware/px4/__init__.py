@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 
+from simulator.airframe import BatteryState
 from simulator.firmware.base import Firmware, Landing, PositionGains, ReadParameter, Sensors
 from simulator.firmware.px4.modes import (
     COMMAND_ANSWERS,
@@ -57,6 +58,24 @@ def return_height_m(distance_m: float, parameter: ReadParameter) -> float:
     return min(max(height_m, 2.0 * accepted_m), highest_m)
 
 
+_BATTERY_THRESHOLDS = ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")
+_MAV_TYPE_GCS = 6
+
+
+def battery_level(battery: BatteryState, parameter: ReadParameter) -> int:
+    """By the share that remains."""
+    return sum(battery.remaining < parameter(name) for name in _BATTERY_THRESHOLDS)
+
+
+def is_ground_station(kind: int, _: int, __: ReadParameter) -> bool:
+    """By its type, whoever it is."""
+    return kind == _MAV_TYPE_GCS
+
+
+def obeys_system(_: int, __: int, ___: ReadParameter) -> bool:
+    return True
+
+
 PX4 = Firmware(
     name="px4",
     vehicle="px4_sih",
@@ -88,6 +107,9 @@ PX4 = Firmware(
     boot={},
     mode_acked_twice=True,
     text_to_ground_stations_only=True,
+    is_ground_station=is_ground_station,
+    ground_station_stays_s=2.5,
+    obeys_system=obeys_system,
     text_suffix="\t",
     target_component_checked=True,
     answers_carry_index=True,
@@ -121,11 +143,8 @@ PX4 = Firmware(
     command_answers=COMMAND_ANSWERS,
     attitude_setpoint=attitude_setpoint,
     motion_setpoint=motion_setpoint,
-    battery_events=(
-        ("battery low", "BAT_LOW_THR"),
-        ("battery critical", "BAT_CRIT_THR"),
-        ("battery emergency", "BAT_EMERGEN_THR"),
-    ),
+    battery_level=battery_level,
+    battery_events=("battery low", "battery critical", "battery emergency"),
     position_without_fix_s=5.0,  # EKF2_NOAID_TOUT
     in_local_frame=in_local_frame,
     motion_complaint=motion_complaint,

@@ -95,6 +95,8 @@ ROLES: dict[str, Role] = {
     "hover_thrust": "MPC_THR_HOVER",
     "tilt_boost": 0.0,
     "ground_station_timeout_s": "COM_DL_LOSS_T",
+    "ground_station_needed": "NAV_DLL_ACT",  # to arm
+    "battery_patience_s": 0.0,
     "failsafe_delay_s": "COM_FAIL_ACT_T",
     "spool_up_s": "COM_SPOOLUP_TIME",
     "takeoff_ramp_s": "MPC_TKO_RAMP_T",

@@ -30,9 +30,13 @@ _WARNINGS = {
 
 
 def _put_off(event: str, parameter: str, modes: Mapping[int, str]) -> list[Rule]:
-    """First hold, so that a pilot can take over; then the mode that the parameter's value names."""
+    """First hold, so that a pilot can take over; then the mode that the parameter's value names.
+
+    While another waits already, only what is done at last changes.
+    """
     chosen = [(f"{parameter}={value}", mode) for value, mode in modes.items()]
     return [
+        Rule(event, when=("waiting",), do=("failsafe", "await"), say=_WARNINGS[event]),
         *(
             Rule(
                 event,
@@ -100,15 +104,17 @@ RULES = (
     Rule("stream found", when=("since stream lost",), to="remembered", do=("recover",)),
     *_put_off("battery critical", "COM_LOW_BAT_ACT", {1: _RTL, 2: _LAND, 3: _RTL}),
     *_put_off("battery emergency", "COM_LOW_BAT_ACT", {1: _RTL, 2: _LAND, 3: _LAND}),
-    *_put_off("ground station lost", "NAV_DLL_ACT", {1: "AUTO.LOITER", 2: _RTL, 3: _LAND}),
-    *(Rule(event, say=said) for event, said in _WARNINGS.items()),
+    *_put_off("ground station lost", "NAV_DLL_ACT", {2: _RTL, 3: _LAND}),
     Rule(
-        "ground station found",
-        when=("since ground station lost",),
-        to="remembered",
-        do=("recover",),
-        say=_REGAINED,
+        "ground station lost",
+        when=("armed", "not landed", "NAV_DLL_ACT=1"),
+        to="AUTO.LOITER",
+        do=("failsafe",),
+        say=_WARNINGS["ground station lost"],
+        also=(_LOST,),
     ),
+    Rule("battery low", when=("armed",), say=_WARNINGS["battery low"], also=(_LOST,)),
+    *(Rule(event, say=said) for event, said in _WARNINGS.items()),
     Rule("ground station found", say=_REGAINED),
     Rule("position lost", "OFFBOARD", when=("not obeys motion",)),
     Rule("position lost", when=("armed", "not landed"), to=_LAND, do=("failsafe",), say=_LOST),
