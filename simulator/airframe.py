@@ -67,20 +67,13 @@ class Airframe:
     battery: Battery
     hover_thrust: float
 
-    def battery_remaining(self, drawn_as: float) -> float:
-        """Share left after the charge drawn so far."""
-        return max(self._charge_left(drawn_as), 0.0)
-
-    def battery_state(self, rotor: Array) -> BatteryState:
-        """Battery after the charge drawn so far, at the present thrust."""
+    def battery_state(self, drawn_as: float, thrust: float) -> BatteryState:
+        """Battery after the charge drawn so far, at this normalised thrust."""
         battery = self.battery
-        left = self._charge_left(rotor[CHARGE])
-        current = battery.hover_current_a * (rotor[THRUST] / self.hover_thrust) ** 1.5
+        left = battery.remaining - drawn_as / (3600.0 * battery.capacity_ah)
+        current = battery.hover_current_a * (thrust / self.hover_thrust) ** 1.5
         voltage = battery.cells * (3.5 + 0.7 * left) - battery.resistance_ohm * current
         return BatteryState(max(voltage, 0.0), current, max(left, 0.0))
-
-    def _charge_left(self, drawn_as: float) -> float:
-        return self.battery.remaining - drawn_as / (3600.0 * self.battery.capacity_ah)
 
 
 def build_airframe(

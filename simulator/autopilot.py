@@ -283,10 +283,11 @@ class Autopilot:
         """
         if self.failsafe or not self.pilot.flies_itself(self.armed, self.plant.on_ground):
             return False
-        now_s = self.time_s
-        until_s = min(self._steady_until_s, self._watch.calm_until_s(self.gps_healthy))
+        watched_s = self._watch.calm_until_s(self.time_s, self.gps_healthy)
+        until_s = min(self._steady_until_s, watched_s)
         if self.armed:
-            until_s = min(until_s, now_s + self._battery_lasts_s)
+            if not self._watch.calm_with(self.plant.battery_at_worst(_RESTS_STEPS * STEP_S)):
+                return False
             if not self._flown:
                 until_s = min(until_s, self._armed_s + self.parameters.role("disarm_idle_s"))
         self.calm_until = int(min(until_s / STEP_S, self.steps + _RESTS_STEPS)) - 1
@@ -302,12 +303,6 @@ class Autopilot:
             watched = self.steps // EVERY_STEPS * EVERY_STEPS
             if watched > self._rests_since:
                 self._watch.passed(watched * STEP_S, self.gps_healthy)
-
-    @property
-    def _battery_lasts_s(self) -> float:
-        """Until the next warning, at full thrust."""
-        left = self._watch.battery_share(self.plant.battery_remaining)
-        return left / self.plant.drain_max_ps if self.plant.drain_max_ps else math.inf
 
     @property
     def _steady_until_s(self) -> float:

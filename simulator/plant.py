@@ -211,10 +211,8 @@ class Plant:
         }
         for name, value in constants.items():
             self.record[name] = value
-        _, capacity_as, *_, current_a, hover_thrust = self.battery_constants
-        self.drain_max_ps: float = (
-            current_a * hover_thrust**-1.5 / capacity_as
-        )  # share at full thrust
+        *_, current_a, hover_thrust = self.battery_constants
+        self._drain_max_a = current_a * hover_thrust**-1.5
         self._start(conditions.wind_ned_mps, gusts)
 
     def _start(self, wind_ned_mps: Triple, gusts: LinearProcess) -> None:
@@ -300,7 +298,7 @@ class Plant:
             on_ground=bool(self._rotor[CONTACT]),
             thrust=float(self._rotor[THRUST]),
             wind_ned_mps=self._wind.copy(),
-            battery=self._airframe.battery_state(self._rotor),
+            battery=self._battery(0.0, float(self._rotor[THRUST])),
         )
 
     @property
@@ -316,10 +314,12 @@ class Plant:
             self._airframe.hover_thrust,
         )
 
-    @property
-    def battery_remaining(self) -> float:
-        """Share of its capacity, 0 .. 1."""
-        return self._airframe.battery_remaining(float(self._rotor[CHARGE]))
+    def battery_at_worst(self, after_s: float) -> BatteryState:
+        """What the battery may be by then: at full thrust from now on."""
+        return self._battery(self._drain_max_a * after_s, 1.0)
+
+    def _battery(self, more_as: float, thrust: float) -> BatteryState:
+        return self._airframe.battery_state(float(self._rotor[CHARGE]) + more_as, thrust)
 
     @property
     def fix(self) -> Fix:

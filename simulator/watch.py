@@ -41,20 +41,33 @@ class Watch:
             *self._position(now_s, has_fix),
         ]
 
-    def calm_until_s(self, has_fix: bool) -> float:
+    def calm_until_s(self, now_s: float, has_fix: bool) -> float:
         """Until when `step` will have nothing to tell but of the battery, if nobody speaks."""
+        if self._ground_station_lost != self._silent(now_s):
+            return -math.inf
         until_s = math.inf
         if not (self._ground_station_lost or math.isnan(self._ground_station_s)):
-            until_s = self._ground_station_s + self.parameters.role("ground_station_timeout_s")
+            until_s = self._ground_station_s + self._patience_s
         if not has_fix and not self._position_lost:
             until_s = min(until_s, self._fix_s + self.firmware.position_without_fix_s)
         return -math.inf if has_fix and self._position_lost else until_s
 
-    def battery_share(self, remaining: float) -> float:
-        """What may be drawn until the next warning; infinite behind the last."""
-        thresholds = self.firmware.battery_events[self._battery_level :]
-        next_one = max((self.parameters[name] for _, name in thresholds), default=-math.inf)
-        return remaining - next_one
+    def calm_with(self, battery: BatteryState) -> bool:
+        """`step` has nothing to tell of the battery until it is worse than this one."""
+        return math.isnan(self._worse_s) and self._level(battery) <= self._battery_level
+
+    @property
+    def _patience_s(self) -> float:
+        """From a ground station's last heartbeat until it is lost."""
+        timeout_s = self.parameters.role("ground_station_timeout_s")
+        return timeout_s + self.firmware.ground_station_stays_s
+
+    def _silent(self, now_s: float) -> bool:
+        """The ground station has been for too long; never heard is not lost."""
+        return now_s - self._ground_station_s > self._patience_s
+
+    def _level(self, battery: BatteryState) -> int:
+        return self.firmware.battery_level(battery, self.parameters.__getitem__)
 
     def passed(self, now_s: float, has_fix: bool) -> None:
         """A step in which there was nothing to tell."""
@@ -62,9 +75,7 @@ class Watch:
             self._fix_s = now_s
 
     def _ground_station(self, now_s: float) -> list[str]:
-        timeout_s = self.parameters.role("ground_station_timeout_s")
-        timeout_s += self.firmware.ground_station_stays_s
-        lost = now_s - self._ground_station_s > timeout_s  # never heard is not lost
+        lost = self._silent(now_s)
         if lost == self._ground_station_lost:
             return []
         self._ground_station_lost = lost
@@ -75,7 +86,7 @@ class Watch:
         if not armed:
             self._battery_level, self._worse_s = 0, math.nan
             return []
-        level = self.firmware.battery_level(battery, self.parameters.__getitem__)
+        level = self._level(battery)
         if level <= self._battery_level:
             self._worse_s = math.nan
             return []

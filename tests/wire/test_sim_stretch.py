@@ -11,6 +11,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import OFFBOARD, TAKEOFF
 
 from simulator import config
+from simulator.airframe import Battery
 from simulator.attitude import Demand
 from simulator.codec import Decoder, frame, layout
 from simulator.conditions import Conditions
@@ -25,11 +26,13 @@ from simulator.server import Stream
 SEED = 7
 
 
-def _instance(firmware: Firmware = PX4, *, ground_link: bool = False) -> Instance:
+def _instance(
+    firmware: Firmware = PX4, *, ground_link: bool = False, battery: Battery | None = None
+) -> Instance:
     return Instance(
         firmware,
         config.vehicle(firmware.vehicle),
-        Conditions(estimator=EstimatorName.PX4_LIKE),
+        Conditions(estimator=EstimatorName.PX4_LIKE, battery=battery or Battery()),
         SEED,
         lockstep=True,
         ground_link=ground_link,
@@ -61,6 +64,8 @@ def _script() -> Iterator[tuple[float, object]]:
             13.0 + 0.05 * i,
             mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, q, 0, 0, 0, thrust),
         )
+        if i % 40 == 0:
+            yield 13.0 + 0.05 * i, mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
         if i == 10:
             yield 13.55, codec(1, 1, 176, 0, 1, OFFBOARD >> 16 & 0xFF, 0, 0, 0, 0, 0)
             yield (
@@ -94,6 +99,16 @@ def test_a_flight_in_stretches_has_the_bytes_of_single_steps(
     expected = _flown(one, _single_steps, 27.0)
     assert _flown(other, Instance.advance_to_barrier, 27.0) == expected
     assert one.steps == other.steps == 6_750
+
+
+def test_stretches_end_before_a_battery_is_found_empty() -> None:
+    battery = Battery(capacity_ah=0.035)  # ten seconds of flight
+    one, other = (_instance(battery=battery) for _ in range(2))
+    expected = _flown(one, _single_steps, 27.0)
+    assert _flown(other, Instance.advance_to_barrier, 27.0) == expected
+    said = b"".join(frames for datagrams in expected for frames in datagrams)
+    levels = (b"Low battery", b"Critical battery", b"Emergency battery level")
+    assert [said.count(level) for level in levels] == [1, 1, 1]
 
 
 def test_the_script_flies_by_attitude_and_lands_after_its_end() -> None:
