@@ -44,13 +44,13 @@ class Watch:
     def calm_until_s(self, now_s: float, has_fix: bool) -> float:
         """Until when `step` will have nothing to tell but of the battery, if nobody speaks."""
         if self._ground_station_lost != self._silent(now_s):
-            return -math.inf
+            return now_s
         until_s = math.inf
         if not (self._ground_station_lost or math.isnan(self._ground_station_s)):
             until_s = self._ground_station_s + self._patience_s
         if not has_fix and not self._position_lost:
             until_s = min(until_s, self._fix_s + self.firmware.position_without_fix_s)
-        return -math.inf if has_fix and self._position_lost else until_s
+        return now_s if has_fix and self._position_lost else until_s
 
     def calm_with(self, battery: BatteryState) -> bool:
         """`step` has nothing to tell of the battery until it is worse than this one."""
