@@ -24,6 +24,7 @@ FREEDOM = 3.0  # of Student's t
 LEAST_SCALE = 2e-4  # of residuals: below it all weigh the same
 PLAIN_STEPS, STEPS, DESCENTS = 4, 14, 6  # unweighted at first; of one search; tries of one step
 STEP_SCALES = np.array([0.03, 5.0, 0.3])
+HALVINGS = 30  # of the range in which a median is sought
 CONVERGED = 2e-4  # of STEP_SCALES
 DIFFERENCE = 1e-3  # of them too, for slopes
 
@@ -98,6 +99,26 @@ def respond(
 
 
 @numba.njit(cache=True)
+def _solve(matrix: Array, right: Array) -> None:
+    """In place: `right` (n, m) becomes the solution, for a positive definite `matrix` (n, n).
+    Elimination written out: numba's solver compiles for five seconds."""
+    size, width = right.shape
+    for pivot in range(size):
+        for row in range(pivot + 1, size):
+            share = matrix[row, pivot] / matrix[pivot, pivot]
+            for column in range(pivot, size):
+                matrix[row, column] -= share * matrix[pivot, column]
+            for column in range(width):
+                right[row, column] -= share * right[pivot, column]
+    for row in range(size - 1, -1, -1):
+        for column in range(width):
+            total = right[row, column]
+            for k in range(row + 1, size):
+                total -= matrix[row, k] * right[k, column]
+            right[row, column] = total / matrix[row, row]
+
+
+@numba.njit(cache=True)
 def residual(
     times: Array,
     signals: Array,
@@ -126,20 +147,31 @@ def residual(
                 reach[j, axis] += weights[i] * basis[j] * left[i, axis]
     for j in range(3):
         gram[j, j] += 1e-12 + 1e-9 * gram[j, j]
-    shares = np.linalg.solve(gram, reach)
+    _solve(gram, reach)
     for i in range(count):
         for axis in range(axes):
             left[i, axis] -= (
-                out[i, axes] * shares[0, axis]
-                + out[i, axes + 1] * shares[1, axis]
-                + shares[2, axis]
+                out[i, axes] * reach[0, axis] + out[i, axes + 1] * reach[1, axis] + reach[2, axis]
             )
 
 
 @numba.njit(cache=True)
 def scale_of(left: Array) -> float:
-    """Standard deviation of the bulk."""
-    return max(float(np.median(np.abs(left))) / 0.6745, LEAST_SCALE)
+    """Standard deviation of the bulk: the median size, halved into, over 0.6745."""
+    low, high = 0.0, 0.0
+    for i in range(left.shape[0]):
+        for axis in range(left.shape[1]):
+            high = max(high, abs(left[i, axis]))
+    for _ in range(HALVINGS):
+        middle, below = 0.5 * (low + high), 0
+        for i in range(left.shape[0]):
+            for axis in range(left.shape[1]):
+                below += abs(left[i, axis]) <= middle
+        if 2 * below >= left.size:
+            high = middle
+        else:
+            low = middle
+    return max(high / 0.6745, LEAST_SCALE)
 
 
 @numba.njit(cache=True)
@@ -190,15 +222,15 @@ def slopes(
 
 @numba.njit(cache=True)
 def _normal(slope: Array, left: Array, weights: Array) -> tuple[Array, Array]:
-    """Normal matrix (3, 3) and gradient (3,), in units of STEP_SCALES."""
-    normal, gradient = np.zeros((3, 3)), np.zeros(3)
+    """Normal matrix (3, 3) and gradient (3, 1), in units of STEP_SCALES."""
+    normal, gradient = np.zeros((3, 3)), np.zeros((3, 1))
     row = np.empty(3)
     for i in range(left.shape[0]):
         for axis in range(left.shape[1]):
             for j in range(3):
                 row[j] = slope[j, i, axis] * STEP_SCALES[j]
             for j in range(3):
-                gradient[j] += weights[i] * row[j] * left[i, axis]
+                gradient[j, 0] += weights[i] * row[j] * left[i, axis]
                 for k in range(3):
                     normal[j, k] += weights[i] * row[j] * row[k]
     return normal, gradient
@@ -214,7 +246,7 @@ def search(
     weights = np.ones(count)
     out = np.empty((count, axes + 2))
     left, tried_left = np.empty((count, axes)), np.empty((count, axes))
-    best = start.copy()
+    best, tried = start.copy(), start.copy()
     damping = 1e-3
     residual(times, signals, sent_at, commands, best, weights, out, left)
     for step in range(STEPS):
@@ -229,13 +261,17 @@ def search(
             damped = normal.copy()
             for j in range(3):
                 damped[j, j] += damping * normal[j, j] + 1e-12
-            change = -np.linalg.solve(damped, gradient) * STEP_SCALES
-            tried = np.minimum(np.maximum(best + change, LOWER), UPPER)
+            change = gradient.copy()
+            _solve(damped, change)
+            for j in range(3):
+                aim = best[j] - change[j, 0] * STEP_SCALES[j]
+                tried[j] = min(max(aim, LOWER[j]), UPPER[j])
             residual(times, signals, sent_at, commands, tried, weights, out, tried_left)
             if _cost(tried_left, weights) < cost:
-                moved = float(np.max(np.abs(tried - best) / STEP_SCALES))
-                best = tried
-                left[:] = tried_left
+                for j in range(3):
+                    moved = max(moved, abs(tried[j] - best[j]) / STEP_SCALES[j])
+                    best[j] = tried[j]
+                left, tried_left = tried_left, left
                 damping = max(0.1 * damping, 1e-7)
                 break
             damping *= 10.0
