@@ -28,6 +28,7 @@ class Picture:
     in_the_air: bool  # by the vehicle's own account
     lifted_off: bool
     at_start: bool
+    late_s: float  # since the start of the reference should have been reached
     track_time_s: float
     track_start_s: float
     track_end_s: float
@@ -87,6 +88,10 @@ def lifted_off(now: Picture) -> bool:
 
 def at_start(now: Picture) -> bool:
     return now.at_start
+
+
+def too_late_at_start(now: Picture) -> bool:
+    return now.late_s > now.limits.late_s
 
 
 def at_start_to_excite(now: Picture) -> bool:

@@ -56,6 +56,10 @@ class Mission:
         """Time on the track's own axis; NaN before it is joined."""
         return time_s - self._join_s
 
+    def late_s(self, time_s: float) -> float:
+        """How long ago the start should have been reached; negative before, NaN without a plan."""
+        return time_s - self._arrival_s
+
     def at_start(self, time_s: float, position: Array, velocity: Array) -> bool:
         """The climb's plan is over and the vehicle rests at its end."""
         if not time_s >= self._arrival_s or self.reference is None:

@@ -114,11 +114,12 @@ TABLE: tuple[Row, ...] = (
     *_tracking_rows(Phase.CLIMB),
     Row(Phase.CLIMB, guards.at_start_to_excite, Phase.EXCITE, "small steps, to see the answer"),
     Row(Phase.CLIMB, guards.at_start, Phase.JOIN, "hovers at the start of the reference"),
-    _too_long(
+    Row(
         Phase.CLIMB,
-        "climb_s",
+        guards.too_late_at_start,
         Phase.LAND,
-        "the start of the reference was not reached in {in_phase_s:.0f} s",
+        "the start of the reference was not reached, {position_error_m:.1f} m off "
+        "{late_s:.0f} s after it should have been",
         ABORTED,
     ),
     *_tracking_rows(Phase.EXCITE),

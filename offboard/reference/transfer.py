@@ -5,6 +5,7 @@ Used for the climb after take-off and for flying to the start of a track.
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -22,6 +23,9 @@ Vector = Array | Iterable[float]
 _DURATION_MIN_S = 0.5
 _DURATION_MAX_S = 600.0
 _GROWTH = 1.08
+_CRUISE_FROM_S = 15.0  # a way that takes longer in one piece is flown in three
+_RAMPS_SHARE = 0.6  # most of such a way that gaining and losing speed may take
+_SMOOTH_PEAK = 35.0 / 16.0  # slope of the smoothstep of degree 7
 _OVERSHOOT = 1.1  # a moving start may exceed the limits by its own speed; allow it this much more
 
 
@@ -32,11 +36,15 @@ class Limits:
     speed_mps: float = 1.5
     acceleration_mps2: float = 2.0
     course_rate_radps: float = 0.8
+    # Of a way so long that it is flown at constant speed in between (MPC_XY_CRUISE and
+    # MPC_Z_V_AUTO_DN of PX4 are 5 and 1.5 m/s)
+    cruise_mps: float = 4.0
+    cruise_vertical_mps: float = 1.5
 
 
 @dataclass(frozen=True, slots=True)
 class Transfer:
-    """A polynomial of degree 9 in position and course; at rest, to snap, at its end.
+    """Polynomials of degree 9 in position and course; at rest, to snap, at their end.
 
     `polynomial` has the columns north, east, down (m) and course (rad). Before time 0 it rests
     at its start, after `duration_s` at its target.
@@ -69,7 +77,8 @@ def transfer(
     start_acceleration_ned_mps2: Vector = (0.0, 0.0, 0.0),
 ) -> Transfer:
     """From a start (3,), NED, to rest at a target, as fast as the limits allow; turning the short
-    way. The course ends at `target_course_rad` plus whole turns, next to the start's.
+    way. The course ends at `target_course_rad` plus whole turns, next to the start's. A long way
+    is flown straight, at constant speed between gaining and losing it.
 
     A moving start that breaks the limits by itself is allowed its own speed and acceleration. It
     overshoots in the direction it moves in: nothing here knows where the ground is.
@@ -98,7 +107,11 @@ def transfer(
             limits.acceleration_mps2, _OVERSHOOT * float(np.linalg.norm(acceleration))
         ),
     )
-    return Transfer(_shortest(begin, end, allowed))
+    hop = Transfer(_shortest(begin, end, allowed))
+    if hop.duration_s <= _CRUISE_FROM_S:
+        return hop
+    cruise = _cruising(begin, end, allowed)
+    return hop if cruise is None else Transfer(cruise)
 
 
 def _shortest(begin: Array, end: Array, limits: Limits) -> Polynomial:
@@ -121,15 +134,58 @@ def _shortest(begin: Array, end: Array, limits: Limits) -> Polynomial:
     return best
 
 
+def _cruising(begin: Array, end: Array, limits: Limits) -> Polynomial | None:
+    """Gain speed, keep it, lose it; None where the way is too short."""
+    moving = begin[1]
+    ramp_s = _SMOOTH_PEAK * _cruise_mps(end[0] - begin[0], limits) / limits.acceleration_mps2
+    while True:
+        # on average a ramp moves at the mean of the speeds at its ends
+        way = end[0] - begin[0] - moving * (ramp_s / 2.0)
+        speed_mps = _cruise_mps(way, limits)
+        straight_s = _length_m(way) / speed_mps
+        if straight_s <= ramp_s:
+            return None
+        slope = way / straight_s
+        fast, slow = np.zeros((5, 4)), np.zeros((5, 4))
+        fast[0], fast[1] = begin[0] + (moving + slope) * (ramp_s / 2.0), slope
+        slow[0], slow[1] = end[0] - slope * (ramp_s / 2.0), slope
+        times_s = np.cumsum([0.0, ramp_s, straight_s - ramp_s, ramp_s])
+        candidate = _through(times_s, [begin, fast, slow, end])
+        if _excess(candidate, replace(limits, speed_mps=speed_mps)) <= 1.0 + 1e-6:
+            return candidate
+        ramp_s *= _GROWTH  # a start that moves otherwise
+
+
+def _length_m(way: Array) -> float:
+    return max(float(np.linalg.norm(way[:3])), 1e-6)
+
+
+def _cruise_mps(way: Array, limits: Limits) -> float:
+    """Along a way (4,) in position and course; less where gaining speed would take most of it."""
+    distance_m = _length_m(way)
+    return min(
+        max(limits.cruise_mps, limits.speed_mps),
+        limits.cruise_vertical_mps * distance_m / max(abs(float(way[2])), 1e-6),
+        limits.course_rate_radps * distance_m / max(abs(float(way[3])), 1e-6),
+        math.sqrt(_RAMPS_SHARE * distance_m * limits.acceleration_mps2 / _SMOOTH_PEAK),
+    )
+
+
 def _polynomial(begin: Array, end: Array, duration_s: float) -> Polynomial:
-    bernstein = BPoly.from_derivatives([0.0, duration_s], [begin, end])
+    return _through([0.0, duration_s], [begin, end])
+
+
+def _through(times_s: Array | list[float], jets: list[Array]) -> Polynomial:
+    """Degree 9 from each (5, 4) jet, position to snap, to the next."""
+    bernstein = BPoly.from_derivatives(times_s, jets)
     taylor = PPoly.from_bernstein_basis(bernstein).c[::-1].transpose(1, 0, 2)
     return Polynomial.from_taylor(bernstein.x, taylor)
 
 
 def _excess(polynomial: Polynomial, limits: Limits) -> float:
     """The largest ratio of a peak to its limit."""
-    jet = polynomial.jet(np.linspace(0.0, polynomial.length_s, 101))
+    times_s = [np.linspace(*piece, 101) for piece in itertools.pairwise(polynomial.breaks_s)]
+    jet = polynomial.jet(np.concatenate(times_s))
     return max(
         float(np.linalg.norm(jet[1, :, :3], axis=-1).max()) / limits.speed_mps,
         float(np.linalg.norm(jet[2, :, :3], axis=-1).max()) / limits.acceleration_mps2,

@@ -30,6 +30,7 @@ UNEVENTFUL = Picture(
     in_the_air=False,
     lifted_off=False,
     at_start=False,
+    late_s=math.nan,
     track_time_s=math.nan,
     track_start_s=4.0,
     track_end_s=20.0,
@@ -57,6 +58,7 @@ EVENTS: dict[str, dict[str, object]] = {  # the least that makes each guard hold
     "engaged": {"engaged": True},
     "engaged_in_the_air": {"engaged": True, "armed": True, "in_the_air": True},
     "armed": {"armed": True},
+    "too_late_at_start": {"late_s": 31.0},
     "lifted_off": {"lifted_off": True},
     "at_start": {"at_start": True},
     "at_start_to_excite": {"at_start": True, "excites": True},
@@ -96,6 +98,8 @@ def event_of(row: Row) -> dict[str, object]:
 def test_nothing_happens_by_itself_but_time_ends_every_wait(phase: Phase) -> None:
     assert next_row(phase, quiet(phase)) is None
     later = {"track_time_s": 1e4} if phase in ON_TRACK else {"in_phase_s": 1e4}
+    if phase is Phase.CLIMB:
+        later = {"late_s": 1e4}  # after the way that was planned
     if phase is Phase.CONNECT:
         later = {"silence_s": 1e4}  # only the wall clock runs before there is telemetry
     assert next_row(phase, replace(quiet(phase), **later)) is not None

@@ -32,7 +32,7 @@ def test_rest_to_rest_is_the_smoothstep_of_degree_nine() -> None:
     np.testing.assert_allclose(sample.course_rad, 0.3, atol=1e-12)
 
 
-@pytest.mark.parametrize("distance_m", [0.0, 0.2, 3.0, 40.0])
+@pytest.mark.parametrize("distance_m", [0.0, 0.2, 3.0, 10.0])
 def test_as_fast_as_the_limits_allow(distance_m: float) -> None:
     limits = Limits(speed_mps=2.0, acceleration_mps2=1.5, course_rate_radps=0.5)
     flown = transfer((0, 0, -3), (distance_m, 0, -3), 0.0, 1.0, limits)
@@ -57,6 +57,35 @@ def test_moving_start_is_taken_over_and_ends_at_rest() -> None:
     assert float(start.course_rad) == pytest.approx(3.0)
     assert float(end.course_rad) == pytest.approx(2 * math.pi - 3.0)
     assert peaks(flown)[0] <= 3.001
+
+
+@pytest.mark.parametrize("target", [(60.0, -40.0, -20.0), (900.0, 0.0, -3.0), (0.0, 5.0, -60.0)])
+@pytest.mark.parametrize("velocity", [(0.0, 0.0, 0.0), (-1.0, 0.5, -0.8)])
+def test_a_long_way_is_flown_at_constant_speed(
+    target: tuple[float, float, float], velocity: tuple[float, float, float]
+) -> None:
+    limits = Limits(cruise_mps=4.0, cruise_vertical_mps=1.5, acceleration_mps2=2.0)
+    flown = transfer((0, 0, -3), target, 3.0, -3.0, limits, start_velocity_ned_mps=velocity)
+    times = np.linspace(0.0, flown.duration_s, 4001)
+    sample = flown.sample(times)
+    distance_m = math.dist((0, 0, -3), target)
+    cruise_mps = min(4.0, 1.5 * distance_m / max(abs(target[2] + 3.0), 1e-9))
+    speed_mps, acceleration_mps2, _ = peaks(flown)
+    assert speed_mps <= cruise_mps * 1.001
+    assert acceleration_mps2 <= 2.001
+    assert np.abs(sample.velocity_ned_mps[:, 2]).max() <= 1.501
+    # no slower than at constant acceleration with twice the time for gaining and losing the speed
+    gained_mps = cruise_mps + float(np.linalg.norm(velocity))
+    assert flown.duration_s < distance_m / cruise_mps + 3.0 * gained_mps / 2.0
+    start, end = flown.sample(0.0), flown.sample(flown.duration_s)
+    np.testing.assert_allclose(start.velocity_ned_mps, velocity, atol=1e-9)
+    np.testing.assert_allclose(end.position_ned_m, target, atol=1e-6)
+    assert float(end.course_rad) == pytest.approx(2 * math.pi - 3.0)
+    for name in ("velocity_ned_mps", "acceleration_ned_mps2", "jerk_ned_mps3", "snap_ned_mps4"):
+        np.testing.assert_allclose(getattr(end, name), 0.0, atol=1e-6)
+        for knot_s in flown.polynomial.breaks_s[1:-1]:  # no kink between the pieces
+            before, after = (getattr(flown.sample(knot_s + h), name) for h in (-1e-7, 1e-7))
+            np.testing.assert_allclose(before, after, atol=1e-4)
 
 
 def test_a_start_faster_than_the_limit_still_stops() -> None:
