@@ -80,7 +80,7 @@ class ObserverSettings(Parameters):
     attitude_sd_rad: float = Field(default=0.001, gt=0, le=0.5)
     position_jump_m: float = Field(default=0.3, gt=0, le=100)
     velocity_jump_mps: float = Field(default=0.5, gt=0, le=100)
-    disturbance_limit_mps2: float = Field(default=5.0, gt=0, le=20)
+    disturbance_limit_mps2: float = Field(default=8.0, gt=0, le=20)
     # Noise and drift beyond what stands above are learnt from the innovations; the drift so far
     adaptive: bool = True
     disturbance_density_limit_mps2: float = Field(default=1.0, gt=0, le=10)

@@ -68,7 +68,7 @@ class TrackingSettings(Parameters):
 
     bandwidth_radps: float = Field(default=5.0, ge=0.5, le=20)
     feedback_limit: float = Field(default=0.3, gt=0, le=1)
-    tilt_limit: float = Field(default=0.6, gt=0, le=0.7)
+    tilt_limit: float = Field(default=0.7, gt=0, le=0.7)
     thrust_floor: float = Field(default=0.2, ge=0, lt=1)
     swarm: SwarmSettings = SwarmSettings()
 

@@ -75,7 +75,7 @@ class Limits(Parameters):
     engage_s: float = Field(default=10.0, gt=0, le=60)
     arm_s: float = Field(default=15.0, gt=0, le=60)
     lift_off_s: float = Field(default=8.0, gt=0, le=30)
-    late_s: float = Field(default=30.0, gt=0, le=600)  # at the start of the reference
+    late_s: float = Field(default=90.0, gt=0, le=600)  # at the start of the reference
     excite_s: float = Field(default=30.0, gt=5, le=600)
     land_s: float = Field(default=90.0, gt=0, le=600)
     disarm_s: float = Field(default=5.0, ge=2, le=60)

@@ -25,14 +25,16 @@ class InfeasibleReference(ValueError):
 class Bounds:
     """What is demanded beyond the vehicle's own thrust and tilt limits.
 
-    Thrust must stay within fractions of the full thrust: the rest is for the feedback. Rates as
-    PX4's defaults MC_ROLLRATE_MAX, MC_PITCHRATE_MAX (220 deg/s) and MC_YAWRATE_MAX (200 deg/s).
+    Thrust and tilt must stay within fractions of the full ones: the rest is for the feedback.
+    Rates as PX4's defaults MC_ROLLRATE_MAX, MC_PITCHRATE_MAX (220 deg/s) and MC_YAWRATE_MAX
+    (200 deg/s).
     """
 
     height_min_m: float = 0.3
     speed_max_mps: float = 12.0
     thrust_fraction_min: float = 0.05
     thrust_fraction_max: float = 0.95
+    tilt_fraction_max: float = 0.9
     rates_max_frd_radps: tuple[float, float, float] = (3.84, 3.84, 3.49)
 
 
@@ -129,7 +131,7 @@ def _demands(
     return (
         _Demand("a thrust of", "m/s^2", thrust, bounds.thrust_fraction_min * thrust_max, -1.0),
         _Demand("a thrust of", "m/s^2", thrust, bounds.thrust_fraction_max * thrust_max),
-        _Demand("a tilt of", "rad", tilt, vehicle.tilt_max_rad),
+        _Demand("a tilt of", "rad", tilt, bounds.tilt_fraction_max * vehicle.tilt_max_rad),
         _Demand("a roll rate of", "rad/s", rates[:, 0], rates_max[0]),
         _Demand("a pitch rate of", "rad/s", rates[:, 1], rates_max[1]),
         _Demand("a yaw rate of", "rad/s", rates[:, 2], rates_max[2]),

@@ -77,5 +77,14 @@ def test_every_setpoint_is_finite_and_within_the_vehicle(tmp_path: Path) -> None
         w, x, y, z = setpoint.q
         assert math.sqrt(w * w + x * x + y * y + z * z) == pytest.approx(1.0, abs=1e-6)
         assert 0.0 <= setpoint.thrust <= 1.0
-        assert 1.0 - 2.0 * (x * x + y * y) >= math.cos(0.7) - 1e-6
+        assert 1.0 - 2.0 * (x * x + y * y) >= math.cos(0.785) - 1e-6
         assert setpoint.type_mask == 7
+
+
+def test_a_wide_fast_circle_that_begins_far_away(tmp_path: Path) -> None:
+    """7.5 m/s at 39 degrees of tilt, 60 m from the take-off point."""
+    wide = {"radius_m": 30, "period_s": 25, "laps": 1, "run_in_s": 8, "origin_north_m": 50}
+    assignments = (f"reference.{key}={value}" for key, value in wide.items())
+    pair = make(*assignments, scenario="px4_like", reference="circle_course")
+    assert pair.fly().exit_code == 0
+    assert pair.score(tmp_path).rmse_position_m < 0.08

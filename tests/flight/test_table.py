@@ -58,7 +58,7 @@ EVENTS: dict[str, dict[str, object]] = {  # the least that makes each guard hold
     "engaged": {"engaged": True},
     "engaged_in_the_air": {"engaged": True, "armed": True, "in_the_air": True},
     "armed": {"armed": True},
-    "too_late_at_start": {"late_s": 31.0},
+    "too_late_at_start": {"late_s": 91.0},
     "lifted_off": {"lifted_off": True},
     "at_start": {"at_start": True},
     "at_start_to_excite": {"at_start": True, "excites": True},

@@ -70,7 +70,7 @@ def test_refused_with_time_value_and_limit(
 ) -> None:
     flown = track(**settings)
     with pytest.raises(InfeasibleReference) as caught:
-        check(flown, vehicle(tilt_max_rad=0.4))
+        check(flown, vehicle(tilt_max_rad=0.4 / 0.9))
     sentence = str(caught.value)
     assert f"beyond the limit of {limit}" in sentence
     found = re.match(rf"the reference asks for {what} (-?[\d.e+]+) \S+ at ([\d.]+) s, ", sentence)

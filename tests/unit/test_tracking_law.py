@@ -209,15 +209,15 @@ def test_cost_vanishes_on_the_reference_and_never_goes_below_zero() -> None:
 @pytest.mark.parametrize(("size", "least", "most"), [(0.01, 0, 0), (1, 20, 50), (10, 50, 50)])
 def test_bounds_hold_and_the_feedback_is_limited(size: float, least: int, most: int) -> None:
     law, rng, reference = law_of(), np.random.default_rng(3), Lemniscate(8.0)
-    touched = 0
+    touched, limit = 0, math.sin(PX4.tilt_max_rad)
     for _ in range(50):
         state = state_of(rng, reference, size)
         target = law.target(reference, 5.0, state)
         decision = law.decide(Situation(5.0, state, reference, LEVEL))
         tilt = np.array(decision.command.thrust_direction_ned)
-        fed_forward = np.clip(target.tilt_feedforward, -0.6, 0.6)
+        fed_forward = np.clip(target.tilt_feedforward, -limit, limit)
         assert np.abs(tilt[:2] - fed_forward).max() <= 0.3 + 1e-12
-        assert np.abs(tilt[:2]).max() <= 0.6 + 1e-12
+        assert np.abs(tilt[:2]).max() <= limit + 1e-12
         assert np.linalg.norm(tilt) == pytest.approx(1.0)
         assert 0.2 * G <= decision.command.thrust_mps2 <= G / 0.4895
         touched += decision.certificate.at_bound
