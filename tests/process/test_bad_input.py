@@ -5,6 +5,7 @@ What ends before anything is sent is called in this process; the rest are real p
 
 from __future__ import annotations
 
+import json
 import os
 import signal
 import socket
@@ -39,6 +40,12 @@ def offboard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -
     return call
 
 
+def kept_out(north_m: float, east_m: float, height_m: float, radius_m: float) -> tuple[str, ...]:
+    sphere = {"north_m": north_m, "east_m": east_m, "height_m": height_m, "radius_m": radius_m}
+    volumes = json.dumps([{"shape": "sphere"} | sphere])
+    return ("--controller", "horizon", "--set", f"controller.keep_out={volumes}")
+
+
 @pytest.mark.parametrize(
     ("arguments", "says"),
     [
@@ -69,15 +76,21 @@ def offboard(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -
         (("--out", "/dev/null/x"), "recorded in /dev/null/x: Not a directory; choose a directory"),
         (("--out", "/proc/nowhere"), "choose a directory that can be written with --out"),
         (("--sitl", "--scenario", "storm"), "storm"),
+        (kept_out(0, 0, 3, 0.5), "keep_out[0] (sphere) contains the start of the reference"),
+        (kept_out(0, 0, 0, 0.5), "keep_out[0] (sphere) contains the take-off point with its"),
+        (kept_out(0, 0, 6, 5), "keep_out[0] (sphere) contains the whole path with its clearance"),
         (
             (
                 "--controller",
                 "horizon",
                 "--set",
-                "controller.keep_out=[{shape: sphere, north_m: 0, "
-                "east_m: 0, height_m: 3, radius_m: 0.5}]",
+                "controller.steps=40",
+                "--set",
+                "controller.swarm.particles=10000",
+                "--set",
+                "deadline_s=0.0006",
             ),
-            "keep_out[0] (sphere) contains the start of the reference",
+            "longer than deadline_s (0.6 ms); plan fewer steps or allow more time",
         ),
         (("--controller", "horizon", "--set", "controller.keep_out=[{shape: cone}]"), "keep_out"),
     ],
