@@ -24,6 +24,7 @@ RESEND_SILENT_S = 1.0
 FIRST_CONTACT_S = 180.0  # a companion may compile first, on a machine that does much else
 FREE_RUN_S = 60.0  # vehicle time after the companion fell silent
 REHEARSAL_S = 0.2  # every fast message is due in it
+SPIN_S = 50e-6  # an answer comes sooner than a sleeping core wakes up
 POLL_S = 0.05  # so that a stop is noticed in time
 BEHIND_S = 0.5
 
@@ -230,7 +231,7 @@ class Runner:
             if now_s - sent_s >= (RESEND_SILENT_S if server.heard else RESEND_S):
                 self._companion.send(datagrams)
                 sent_s = now_s
-            wait([self._companion], POLL_S)
+            wait([self._companion], POLL_S if now_s - begun_s > SPIN_S else 0.0)
         return True
 
     def _free_run(self) -> bool:
