@@ -19,12 +19,13 @@ from offboard.control.response_search import (
     FREQUENCY,
     LOWER,
     UPPER,
+    Data,
     residual,
     respond,
     scale_of,
     search,
     slopes,
-    weigh,
+    weights_of,
 )
 from offboard.control.trace import NORTH, SENT_AT, SENT_NORTH, STAMP, Trace
 from offboard.model.vehicle import AxisResponse
@@ -75,34 +76,24 @@ class ResponseProblem:
 
     def __init__(self, times: Array, signals: Array, sent_at: Array, commands: Array) -> None:
         kept = thinned(times, SPACING_S)
-        self._times = np.ascontiguousarray(times[kept])
-        self._signals = np.ascontiguousarray(signals[kept])
-        self._sent_at = np.ascontiguousarray(sent_at)
-        self._commands = np.ascontiguousarray(commands)
-        self._out = np.empty((len(self._times), signals.shape[1] + 2))
+        arrays = (times[kept], signals[kept], sent_at, commands)
+        self._data = Data(*map(np.ascontiguousarray, arrays))
 
     def residual(self, parameters: Array, weights: Array | None = None) -> Array:
         """Signals less response (N, axes), free motion and a constant offset projected out."""
-        left = np.empty_like(self._signals)
         if weights is None:
-            weights = np.ones(len(left))
-        residual(*self._data, parameters, weights, self._out, left)
-        return left
-
-    @property
-    def _data(self) -> tuple[Array, Array, Array, Array]:
-        return self._times, self._signals, self._sent_at, self._commands
+            weights = np.ones(len(self._data.times))
+        return residual(self._data, parameters, weights)
 
     def solve(self) -> tuple[Array, Array, float]:
         """The best parameters (3,), their covariance (3, 3) and the scale of what is left."""
         misses = [float(np.sum(self.residual(np.array(start)) ** 2)) for start in STARTS]
         nearest = np.argsort(misses)[:FOLLOWED]
-        found = [search(*self._data, np.array(STARTS[index])) for index in nearest]
+        found = [search(self._data, np.array(STARTS[index])) for index in nearest]
         best = min(found, key=lambda each: each[1])[0]
-        weights = np.ones(len(self._times))
         left = self.residual(best)
-        scale = float(scale_of(left))
-        weigh(left, scale, weights)
+        scale = scale_of(left)
+        weights = weights_of(left, scale)
         left = self.residual(best, weights)
         return best, self._covariance(best, left, weights, scale), scale
 
@@ -110,8 +101,9 @@ class ResponseProblem:
         """Of an M-estimate (P. Huber, 1967) whose residuals are related over RELATED_S (W. Newey
         and K. West, 1987, per axis)."""
         count, axes = left.shape
-        slope = slopes(*self._data, best, weights, left, self._out)
-        spacing_s = (self._times[-1] - self._times[0]) / max(count - 1, 1)
+        slope = slopes(self._data, best, weights, left)
+        times = self._data.times
+        spacing_s = (times[-1] - times[0]) / max(count - 1, 1)
         lags = min(max(round(RELATED_S / max(spacing_s, 1e-4)), 1), count // 4)
         far = FREEDOM * scale**2 + np.sum(left**2, axis=1)
         meat, bread = np.zeros((3, 3)), np.zeros((3, 3))

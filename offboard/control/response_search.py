@@ -1,5 +1,6 @@
 """The response of a second-order loop to commands held between events, and the search for its
-three parameters: compiled, with a bounded number of steps, so that it takes some milliseconds.
+three parameters, with a bounded number of steps, so that it takes some milliseconds. Only the
+response is compiled: the rest is a few operations on long arrays.
 
 The command is constant from one event to the next, so the response is followed exactly; its
 unknown start and offset are projected out. A link loses commands, and what follows a lost one
@@ -10,6 +11,7 @@ are (K. Lange, R. Little and J. Taylor, 1989). Times in s, signals in any unit; 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -27,6 +29,17 @@ STEP_SCALES = np.array([0.03, 5.0, 0.3])
 HALVINGS = 30  # of the range in which a median is sought
 CONVERGED = 2e-4  # of STEP_SCALES
 DIFFERENCE = 1e-3  # of them too, for slopes
+
+
+@dataclass(frozen=True, slots=True)
+class Data:
+    """Signals (N, axes) at `times` (N,) under `commands` (M, axes) sent at `sent_at` (M,), each
+    contiguous and in the order of time."""
+
+    times: Array
+    signals: Array
+    sent_at: Array
+    commands: Array
 
 
 @numba.njit(cache=True)
@@ -118,170 +131,87 @@ def _solve(matrix: Array, right: Array) -> None:
             right[row, column] = total / matrix[row, row]
 
 
-@numba.njit(cache=True)
-def residual(
-    times: Array,
-    signals: Array,
-    sent_at: Array,
-    commands: Array,
-    parameters: Array,
-    weights: Array,
-    out: Array,
-    left: Array,
-) -> None:
-    """Signals less response into `left` (N, axes), free motion and a constant offset projected out
-    under `weights` (N,); `out` (N, axes + 2) as in `respond`."""
-    count, axes = signals.shape
-    respond(times, sent_at, commands, parameters[0], parameters[1], parameters[2], out)
-    gram = np.zeros((3, 3))
-    reach = np.zeros((3, axes))
-    basis = np.ones(3)
-    for i in range(count):
-        basis[0], basis[1] = out[i, axes], out[i, axes + 1]
-        for axis in range(axes):
-            left[i, axis] = signals[i, axis] - out[i, axis]
-        for j in range(3):
-            for k in range(3):
-                gram[j, k] += weights[i] * basis[j] * basis[k]
-            for axis in range(axes):
-                reach[j, axis] += weights[i] * basis[j] * left[i, axis]
-    for j in range(3):
-        gram[j, j] += 1e-12 + 1e-9 * gram[j, j]
-    _solve(gram, reach)
-    for i in range(count):
-        for axis in range(axes):
-            left[i, axis] -= (
-                out[i, axes] * reach[0, axis] + out[i, axes + 1] * reach[1, axis] + reach[2, axis]
-            )
+def residual(data: Data, parameters: Array, weights: Array) -> Array:
+    """Signals less response (N, axes), free motion and a constant offset projected out under
+    `weights` (N,)."""
+    axes = data.signals.shape[1]
+    out = np.empty((len(data.times), axes + 2))
+    delay_s, frequency, damping = parameters.tolist()
+    respond(data.times, data.sent_at, data.commands, delay_s, frequency, damping, out)
+    left = data.signals - out[:, :axes]
+    basis = np.column_stack((out[:, axes:], np.ones(len(out))))
+    weighted = basis.T * weights
+    gram = weighted @ basis
+    gram += np.diag(1e-12 + 1e-9 * np.diag(gram))
+    left -= basis @ np.linalg.solve(gram, weighted @ left)
+    return left
 
 
-@numba.njit(cache=True)
 def scale_of(left: Array) -> float:
-    """Standard deviation of the bulk: the median size, halved into, over 0.6745."""
-    low, high = 0.0, 0.0
-    for i in range(left.shape[0]):
-        for axis in range(left.shape[1]):
-            high = max(high, abs(left[i, axis]))
-    for _ in range(HALVINGS):
-        middle, below = 0.5 * (low + high), 0
-        for i in range(left.shape[0]):
-            for axis in range(left.shape[1]):
-                below += abs(left[i, axis]) <= middle
-        if 2 * below >= left.size:
-            high = middle
-        else:
-            low = middle
-    return max(high / 0.6745, LEAST_SCALE)
+    """Standard deviation of the bulk."""
+    return max(float(np.median(np.abs(left))) / 0.6745, LEAST_SCALE)
 
 
-@numba.njit(cache=True)
-def weigh(left: Array, scale: float, weights: Array) -> None:
-    """Weights of Student's t, one for all axes of a sample."""
-    axes = left.shape[1]
-    for i in range(left.shape[0]):
-        far = 0.0
-        for axis in range(axes):
-            far += left[i, axis] ** 2
-        weights[i] = (FREEDOM + axes) / (FREEDOM + far / scale**2)
+def weights_of(left: Array, scale: float) -> Array:
+    """Weights (N,) of Student's t, one for all axes of a sample."""
+    far = np.sum(left**2, axis=1)
+    weights: Array = (FREEDOM + left.shape[1]) / (FREEDOM + far / scale**2)
+    return weights
 
 
-@numba.njit(cache=True)
-def _cost(left: Array, weights: Array) -> float:
-    total = 0.0
-    for i in range(left.shape[0]):
-        for axis in range(left.shape[1]):
-            total += weights[i] * left[i, axis] ** 2
-    return total
-
-
-@numba.njit(cache=True)
-def slopes(
-    times: Array,
-    signals: Array,
-    sent_at: Array,
-    commands: Array,
-    parameters: Array,
-    weights: Array,
-    left: Array,
-    out: Array,
-) -> Array:
+def slopes(data: Data, parameters: Array, weights: Array, left: Array) -> Array:
     """Of the residual `left` (N, axes) by the parameters: (3, N, axes)."""
     slope = np.empty((3, *left.shape))
     for j in range(3):
-        moved = parameters.copy()
         step = DIFFERENCE * STEP_SCALES[j]
-        if moved[j] + step > UPPER[j]:
+        if parameters[j] + step > UPPER[j]:
             step = -step
+        moved = parameters.copy()
         moved[j] += step
-        residual(times, signals, sent_at, commands, moved, weights, out, slope[j])
-        for i in range(left.shape[0]):
-            for axis in range(left.shape[1]):
-                slope[j, i, axis] = (slope[j, i, axis] - left[i, axis]) / step
+        slope[j] = (residual(data, moved, weights) - left) / step
     return slope
 
 
-@numba.njit(cache=True)
-def _normal(slope: Array, left: Array, weights: Array) -> tuple[Array, Array]:
-    """Normal matrix (3, 3) and gradient (3, 1), in units of STEP_SCALES."""
-    normal, gradient = np.zeros((3, 3)), np.zeros((3, 1))
-    row = np.empty(3)
-    for i in range(left.shape[0]):
-        for axis in range(left.shape[1]):
-            for j in range(3):
-                row[j] = slope[j, i, axis] * STEP_SCALES[j]
-            for j in range(3):
-                gradient[j, 0] += weights[i] * row[j] * left[i, axis]
-                for k in range(3):
-                    normal[j, k] += weights[i] * row[j] * row[k]
-    return normal, gradient
+def _cost(left: Array, weights: Array) -> float:
+    return float(weights @ np.sum(left**2, axis=1))
 
 
-@numba.njit(cache=True)
-def search(
-    times: Array, signals: Array, sent_at: Array, commands: Array, start: Array
-) -> tuple[Array, float]:
+def search(data: Data, start: Array) -> tuple[Array, float]:
     """The parameters (3,) that a damped Gauss-Newton search from `start` ends at, and the
     negative log likelihood there."""
-    count, axes = signals.shape
-    weights = np.ones(count)
-    out = np.empty((count, axes + 2))
-    left, tried_left = np.empty((count, axes)), np.empty((count, axes))
-    best, tried = start.copy(), start.copy()
-    damping = 1e-3
-    residual(times, signals, sent_at, commands, best, weights, out, left)
+    weights = np.ones(len(data.times))
+    best, damping = start, 1e-3
+    left = residual(data, best, weights)
     for step in range(STEPS):
         if step >= PLAIN_STEPS:
-            weigh(left, scale_of(left), weights)
-            residual(times, signals, sent_at, commands, best, weights, out, left)
-        cost = _cost(left, weights)
-        slope = slopes(times, signals, sent_at, commands, best, weights, left, out)
-        normal, gradient = _normal(slope, left, weights)
-        moved = 0.0
-        for _ in range(DESCENTS):
-            damped = normal.copy()
-            for j in range(3):
-                damped[j, j] += damping * normal[j, j] + 1e-12
-            change = gradient.copy()
-            _solve(damped, change)
-            for j in range(3):
-                aim = best[j] - change[j, 0] * STEP_SCALES[j]
-                tried[j] = min(max(aim, LOWER[j]), UPPER[j])
-            residual(times, signals, sent_at, commands, tried, weights, out, tried_left)
-            if _cost(tried_left, weights) < cost:
-                for j in range(3):
-                    moved = max(moved, abs(tried[j] - best[j]) / STEP_SCALES[j])
-                    best[j] = tried[j]
-                left, tried_left = tried_left, left
-                damping = max(0.1 * damping, 1e-7)
-                break
-            damping *= 10.0
+            weights = weights_of(left, scale_of(left))
+            left = residual(data, best, weights)
+        tried, left, damping = _descend(data, best, weights, left, damping)
+        moved = np.max(np.abs(tried - best) / STEP_SCALES)
+        best = tried
         if moved < CONVERGED and step >= PLAIN_STEPS:
             break
     scale = scale_of(left)
-    unlikely = count * axes * math.log(scale)
-    for i in range(count):
-        far = 0.0
-        for axis in range(axes):
-            far += left[i, axis] ** 2
-        unlikely += 0.5 * (FREEDOM + axes) * math.log(1.0 + far / (FREEDOM * scale**2))
-    return best, unlikely
+    far = np.sum(left**2, axis=1)
+    unlikely = left.size * math.log(scale)
+    unlikely += 0.5 * (FREEDOM + left.shape[1]) * np.sum(np.log1p(far / (FREEDOM * scale**2)))
+    return best, float(unlikely)
+
+
+def _descend(
+    data: Data, best: Array, weights: Array, left: Array, damping: float
+) -> tuple[Array, Array, float]:
+    """One step from `best`, where `left` is the residual: the parameters and the residual behind
+    it, the same if none is better, and the damping of the next."""
+    cost = _cost(left, weights)
+    slope = slopes(data, best, weights, left).reshape(3, -1) * STEP_SCALES[:, None]
+    weighted = slope * np.repeat(weights, left.shape[1])
+    normal, gradient = weighted @ slope.T, weighted @ left.ravel()
+    for _ in range(DESCENTS):
+        damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
+        tried = np.clip(best - np.linalg.solve(damped, gradient) * STEP_SCALES, LOWER, UPPER)
+        tried_left = residual(data, tried, weights)
+        if _cost(tried_left, weights) < cost:
+            return tried, tried_left, max(0.1 * damping, 1e-7)
+        damping *= 10.0
+    return best, left, damping

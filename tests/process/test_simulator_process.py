@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import signal
 import socket
 import time
@@ -191,3 +192,11 @@ def test_a_wrong_scenario_file_names_key_and_range(tmp_path: Path) -> None:
     assert code == 2
     assert "conditions.mass_scale" in errors
     assert "conditions.wnd" in errors
+
+
+def test_a_vehicle_takes_little_memory() -> None:
+    with Peer() as peer, simulator(*to(peer), "--speed", "20") as process:
+        peer.listen(lambda: peer.time_s > 10.0)
+        status = Path(f"/proc/{process.popen.pid}/status").read_text()
+    (peak_kb,) = re.findall(r"VmHWM:\s+(\d+) kB", status)
+    assert int(peak_kb) < 120_000
