@@ -26,7 +26,7 @@ from simulator.firmware.base import (
     Triple,
 )
 from simulator.geodesy import to_metres
-from simulator.mission import GLOBAL_FRAMES, RELATIVE_FRAMES, Mission
+from simulator.mission import RELATIVE_FRAMES, TERRAIN_FRAMES, Mission
 from simulator.nav import Nav
 from simulator.parameters import ParameterTable
 from simulator.pilot import Pilot
@@ -34,6 +34,7 @@ from simulator.plant import STEP_S, Plant, Truth
 from simulator.watch import EVERY_STEPS, Watch
 
 _RESTS_STEPS = 250  # at most, so that what is changed behind its back is seen soon
+_GO_ON = frozenset({Behaviour.SETPOINT, Behaviour.MISSION})  # when asked for again
 _POSITION_IGNORED, _LOCAL_NED = 0b111, 1  # type_mask; MAV_FRAME
 _GLOBAL_TARGET = "SET_POSITION_TARGET_GLOBAL_INT"
 
@@ -156,7 +157,7 @@ class Autopilot:
             return 1
         if self.pilot.landing:
             return 4
-        return 3 if self.pilot.behaviour is Behaviour.TAKEOFF else 2
+        return 3 if self.pilot.climbing else 2
 
     # -- what comes in -----------------------------------------------------------------------
 
@@ -220,11 +221,13 @@ class Autopilot:
         z = self.firmware.origin[2] - values["alt"]
         if mask & _POSITION_IGNORED:
             mask |= _POSITION_IGNORED
-        elif frame in RELATIVE_FRAMES:
-            z = self.pilot.home_ned_m[2] - values["alt"]
-        elif frame not in GLOBAL_FRAMES:
+        elif frame not in self.firmware.global_frames:
             self._complain(_GLOBAL_TARGET, frame)
             return
+        elif frame in RELATIVE_FRAMES:
+            z = self.pilot.home_ned_m[2] - values["alt"]
+        elif frame in TERRAIN_FRAMES:
+            z = -values["alt"]
         place = {"coordinate_frame": _LOCAL_NED, "x": x, "y": y, "z": z, "type_mask": mask}
         self._obey_motion(_GLOBAL_TARGET, {**values, **place})
 
@@ -376,6 +379,8 @@ class Autopilot:
             events, self.pilot.events[:] = tuple(self.pilot.events), ()
             for event in events:
                 self.happen(event)
+        if not self.armed:
+            return
         if self.landed and self._flown:
             self._expire("settled", self._landed_s, "disarm_landed_s")
         elif not self._flown:
@@ -444,7 +449,7 @@ class Autopilot:
                 self.remembered = name
         if mode is not self.mode and not self.firmware.setpoints_outlive_modes:
             self.pilot.setpoint = None
-        if mode is not self.mode or mode.behaviour is not Behaviour.SETPOINT:
+        if mode is not self.mode or mode.behaviour not in _GO_ON:
             self.pilot.enter(mode.behaviour, self.look(), takeoff_z_m)
         self.mode = mode
 

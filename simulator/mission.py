@@ -36,6 +36,7 @@ _PLACES = frozenset(
 _WAITS = frozenset({Kind.WAYPOINT, Kind.LOITER_TIME, Kind.DELAY})
 GLOBAL_FRAMES = frozenset({0, 5})  # MAV_FRAME, altitude above sea level
 RELATIVE_FRAMES = frozenset({3, 6})  # above home
+TERRAIN_FRAMES = frozenset({10, 11})  # above the ground
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,6 +78,7 @@ class Mission:
     speed_mps: float = math.inf
     climb_m: float = math.nan  # above home, of the climb it begins with
     events: list[str] = field(default_factory=list)
+    _under_way: bool = False
     _climb_to_z_m: float = math.nan  # first, from the ground, straight up to here
     _since_s: float = math.nan  # when the current item's place was reached
     _held: Triple = NAN3
@@ -98,8 +100,14 @@ class Mission:
         self.current, self.finished, self._since_s = number, False, math.nan
         return True
 
-    def begin(self, position_ned_m: Triple, landed: bool, home_ned_m: Triple) -> None:
+    def pause(self) -> None:
+        """It is not flown for now; the next `fly` begins it."""
+        self._under_way = False
+
+    def _begin(self, position_ned_m: Triple, landed: bool, home_ned_m: Triple) -> None:
         """Start, or continue where it was left; anew if it had come to its end."""
+        self._under_way = True
+        self.events.append("mission begun")
         if self.finished:
             self.go_to(0)
         self.speed_mps = math.inf
@@ -112,63 +120,87 @@ class Mission:
             self.events.append("mission climbs")
 
     @property
+    def climbing(self) -> bool:
+        """Straight up from the ground."""
+        return self._under_way and not math.isnan(self._climb_to_z_m)
+
+    @property
     def landing(self) -> bool:
         """On the spot where it lands."""
         return not math.isnan(self._since_s) and self._item_is(Kind.LAND)
 
-    def fly(self, now_s: float, position_ned_m: Triple, home_ned_m: Triple) -> MotionSetpoint:
+    def fly(
+        self, now_s: float, position_ned_m: Triple, home_ned_m: Triple, *, landed: bool
+    ) -> MotionSetpoint:
         """Where to be now. `landing` tells that the height is the pilot's affair."""
+        if not self._under_way:
+            self._begin(position_ned_m, landed, home_ned_m)
         if not math.isnan(self._climb_to_z_m):
             self._held = (self._held[0], self._held[1], self._climb_to_z_m)
             if position_ned_m[2] < self._climb_to_z_m + _ACCEPTED_HEIGHT_M:
                 self._climb_to_z_m = math.nan
             return MotionSetpoint(self._held)
+        self._pass_over()
         if self.finished or not self.items:
             return MotionSetpoint(self._held)
         item = self.items[self.current]
-        if not item.is_flown:
-            self._pass_over(item)
-            return MotionSetpoint(self._held)
         if item.is_place:
             self._held = self._target(item, position_ned_m, home_ned_m)
-        if self._arrived(item, position_ned_m) and math.isnan(self._since_s):
-            self._since_s = now_s
-            self._note_reached()
-        if not math.isnan(self._since_s) and now_s - self._since_s >= self._stay_s(item):
-            self._advance()
+        self._progress(item, now_s, position_ned_m, landed)
+        self._pass_over()
         return MotionSetpoint(self._held, yaw_rad=self._yaw(item))
 
     # -- one item ----------------------------------------------------------------------------
 
+    def _progress(self, item: Item, now_s: float, position_ned_m: Triple, landed: bool) -> None:
+        """See whether its place is reached, and whether it is done there."""
+        if math.isnan(self._since_s) and self._arrived(item, position_ned_m):
+            self._since_s = now_s
+            if item.command != Kind.LAND:
+                self._note_reached()
+        if math.isnan(self._since_s):
+            return
+        if item.command == Kind.LAND and landed:
+            self._note_reached()
+            self._advance()
+        elif now_s - self._since_s >= self._stay_s(item):
+            self._advance()
+
     def _item_is(self, kind: Kind) -> bool:
         return self.current < len(self.items) and self.items[self.current].command == kind
 
-    def _pass_over(self, item: Item) -> None:
-        """An item that is done at once; one at a time, so that each is told of."""
-        if item.command == Kind.CHANGE_SPEED and item.params[1] > 0:
-            self.speed_mps = item.params[1]
-        self._note_reached()
-        if item.command == Kind.RETURN:
-            self._end("mission return")
-        else:
-            self._advance()
+    def _pass_over(self) -> None:
+        """Items that are done at once; of several the last is told."""
+        while self.items and not (self.finished or self.items[self.current].is_flown):
+            item = self.items[self.current]
+            if item.command == Kind.CHANGE_SPEED and item.params[1] > 0:
+                self.speed_mps = item.params[1]
+            if item.command == Kind.RETURN:
+                self._end("mission return")
+            else:
+                self._note_reached()
+                self._advance()
 
     def _advance(self) -> None:
         """To the next item, or to the end."""
         self._since_s = math.nan
         if self.current + 1 < len(self.items):
             self.current += 1
-            self.events.append("mission progress")
+            self._tell("mission progress")
         else:
             self._end("mission finished")
 
     def _end(self, event: str) -> None:
         self.finished = True
-        self.events.append(event)
+        self._tell(event)
 
     def _note_reached(self) -> None:
         self.reached = self.current
-        self.events.append("item reached")
+        self._tell("item reached")
+
+    def _tell(self, event: str) -> None:
+        if event not in self.events:
+            self.events.append(event)
 
     def _place(self, item: Item, home_ned_m: Triple) -> Triple:
         north, east = to_metres(self.origin, item.x * 1e-7, item.y * 1e-7)

@@ -36,6 +36,7 @@ class Link(Protocol):
 
     def send(self, name: str, *values: object) -> None: ...
     def send_now(self, name: str) -> None: ...
+    def complain(self, text: str) -> None: ...
 
 
 @dataclass(slots=True)
@@ -50,10 +51,23 @@ class Upload:
 
 
 @dataclass(slots=True)
+class Download:
+    """Under way: to whom, which item comes next."""
+
+    peer: tuple[int, int]
+    due: int = 0
+
+
+@dataclass(slots=True)
 class Transfer:
+    """`strictly`: items go down in order alone, and are asked for in the kind that came last."""
+
     link: Link
     mission: Mission
+    strictly: bool
     _upload: Upload | None = None
+    _download: Download | None = None
+    _whole: bool = False  # places come in whole 1e-7 degrees
 
     @property
     def uploading(self) -> bool:
@@ -92,9 +106,12 @@ class Transfer:
 
     def _ask(self, upload: Upload, now_s: float) -> None:
         upload.asked_s = now_s
-        self.link.send("MISSION_REQUEST_INT", *upload.peer, len(upload.items), 0)
+        whole = self._whole and self.strictly
+        kind = "MISSION_REQUEST_INT" if whole else "MISSION_REQUEST"
+        self.link.send(kind, *upload.peer, len(upload.items), 0)
 
     def _item(self, message: Message, now_s: float) -> None:
+        self._whole = message.name == "MISSION_ITEM_INT"
         upload = self._upload
         if upload is None or upload.peer != (message.system, message.component):
             return
@@ -123,20 +140,37 @@ class Transfer:
     def _list(self, message: Message, _: float) -> None:
         count = 0 if message.mission_type else len(self.mission.items)
         peer = (message.system, message.component)
+        self._download = None if message.mission_type else Download(peer)
         self.link.send("MISSION_COUNT", *peer, count, message.mission_type)
 
     def _request(self, message: Message, _: float) -> None:
         peer = (message.system, message.component)
-        if message.mission_type or message.seq >= len(self.mission.items):
+        self._whole = whole = message.name == "MISSION_REQUEST_INT"
+        there = not message.mission_type and message.seq < len(self.mission.items)
+        if self.strictly and not self._is_due(peer, message.seq, there):
+            return
+        if not there:
             self._acknowledge(peer, Ack.INVALID_SEQUENCE, message.mission_type)
             return
         item = self.mission.items[message.seq]
-        whole = message.name == "MISSION_REQUEST_INT"
         places = (item.x, item.y) if whole else (item.x * 1e-7, item.y * 1e-7)
         current = int(message.seq == self.mission.current)
         head = (*peer, message.seq, item.frame, item.command, current, 1)
         name = "MISSION_ITEM_INT" if whole else "MISSION_ITEM"
         self.link.send(name, *head, *item.params, *places, item.z, 0)
+
+    def _is_due(self, peer: tuple[int, int], number: int, there: bool) -> bool:
+        """The item that comes next, or the last one again; another ends the download."""
+        download = self._download
+        if download is None or download.peer != peer:
+            return False
+        if not there or number not in (download.due - 1, download.due):
+            self._download = None
+            self._acknowledge(peer, Ack.ERROR)
+            self.link.complain("WPM: REJ. CMD: Req. WP was unexpected")
+            return False
+        download.due = number + 1
+        return True
 
     def _clear(self, message: Message, _: float) -> None:
         if message.mission_type in (0, _ANY_TYPE):

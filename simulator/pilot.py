@@ -82,6 +82,12 @@ class Pilot:
         )
 
     @property
+    def climbing(self) -> bool:
+        """Taking off, by itself."""
+        by_mission = self.behaviour is Behaviour.MISSION and self.mission.climbing
+        return by_mission or self.behaviour is Behaviour.TAKEOFF
+
+    @property
     def target_height_m(self) -> float:
         """Of what it holds or climbs to, above home."""
         place = self._return.place if self.behaviour is Behaviour.RETURN else self._hold
@@ -110,8 +116,7 @@ class Pilot:
         self._next_loop_s = 0.0
         self._source = None
         self.loop.reset(nav.yaw_rad)
-        if behaviour is Behaviour.MISSION:
-            self.mission.begin(nav.position_ned_m, self.landed, self.home_ned_m)
+        self.mission.pause()
 
     def go_to(self, place_ned_m: Triple) -> None:
         """Hold there, in a mode that holds or obeys."""
@@ -123,6 +128,7 @@ class Pilot:
         """The motors begin to turn: home is here."""
         self.home_ned_m = nav.position_ned_m
         self._takeoff.arm()
+        self.mission.pause()
         if not self.landed:
             self._takeoff.fly()
         self._armed_for_s = 0.0
@@ -332,7 +338,7 @@ class Pilot:
             across_mps = role("cruise_speed_mps")
         if self.behaviour is Behaviour.MISSION:
             across_mps = min(across_mps, self.mission.speed_mps)
-        if self.behaviour is Behaviour.TAKEOFF:
+        if self.climbing:
             up_mps = min(up_mps, role("takeoff_speed_mps"))
         least = 0.0 if self._takeoff.lifting else role("thrust_least")
         return role("hover_thrust"), across_mps, up_mps, least
@@ -379,7 +385,7 @@ class Pilot:
         return MotionSetpoint(self._hold)
 
     def _follow_mission(self, nav: Nav, time_s: float) -> MotionSetpoint:
-        motion = self.mission.fly(time_s, nav.position_ned_m, self.home_ned_m)
+        motion = self.mission.fly(time_s, nav.position_ned_m, self.home_ned_m, landed=self.landed)
         if self.mission.landing:
             speed_mps = land_speed_mps(nav, self.home_ned_m[2], self._parameters)
             return sink(motion.position_ned_m, speed_mps)

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 
 from simulator.codec import Decoder, Message, frame, layout
 from simulator.commands import Command, Commands
-from simulator.firmware.base import Say
+from simulator.firmware.base import Say, Severity
 from simulator.mission_transfer import HANDLERS as MISSION_HANDLERS
 from simulator.mission_transfer import Transfer
 from simulator.strict import Strict
@@ -64,8 +64,12 @@ class Server:
 
     def __post_init__(self) -> None:
         self._commands = Commands(self)
-        self._transfer = Transfer(self, self.view.autopilot.mission)
+        self._transfer = self._new_transfer()
         self._start_streams()
+
+    def _new_transfer(self) -> Transfer:
+        autopilot = self.view.autopilot
+        return Transfer(self, autopilot.mission, autopilot.firmware.missions_strictly)
 
     def _start_streams(self) -> None:
         self.rescheduled = True
@@ -131,7 +135,7 @@ class Server:
         self._parameters_due = []
         self.streams = {}
         self.sequence = self._text_id = 0
-        self._transfer = Transfer(self, self.view.autopilot.mission)
+        self._transfer = self._new_transfer()
         self._ground_station_us, self._texts_kept = -math.inf, []
         self._start_streams()
 
@@ -148,6 +152,10 @@ class Server:
             piece = text[at : at + TEXT_LENGTH]
             self.send("STATUSTEXT", int(said.severity), piece, self._text_id, chunk)
         self._text_id = (self._text_id + 1) & 0xFFFF
+
+    def complain(self, text: str) -> None:
+        """A STATUSTEXT on this link alone."""
+        self.say(Say(Severity.CRITICAL, text))
 
     @property
     def _ground_station_is_there(self) -> bool:

@@ -266,6 +266,7 @@ class Firmware:
     sensors: Sensors
     position_grid_steps: int  # the estimator's position is new at every such step
     boot: Mapping[str, float]  # events of the start, s of vehicle time
+    missions_strictly: bool  # uploads ask as the client writes, downloads go item by item
     mode_acked_twice: bool  # the receiver acks a mode command before the commander does
     text_to_ground_stations_only: bool
     is_ground_station: Callable[[int, int, ReadParameter], bool]  # MAV_TYPE, system of a heartbeat
@@ -302,6 +303,7 @@ class Firmware:
         [Mapping[str, Any], ReadParameter], AttitudeSetpoint | MotionSetpoint | None
     ]
     motion_setpoint: Callable[[Mapping[str, Any]], MotionSetpoint | None]
+    global_frames: frozenset[int]  # MAV_FRAME that SET_POSITION_TARGET_GLOBAL_INT may come in
     position_without_fix_s: float = math.inf  # until the estimate of position is given up
     # a SET_POSITION_TARGET in another local frame, by the vehicle's attitude, in MAV_FRAME 1
     in_local_frame: Callable[[Mapping[str, Any], Quaternion], Mapping[str, Any]] = as_given

@@ -16,11 +16,13 @@ KINDS = ("ack", "text", "state", "landed", "param", "mission")
 
 @dataclass
 class Rows:
-    """One side: rows of each kind in order, as (time, what), repetitions of a state left out."""
+    """One side: rows of each kind in order, as (time, what), repetitions of a state left out,
+    and where it was, as (time, north, east, down)."""
 
     by_kind: dict[str, list[tuple[float, str]]] = field(
         default_factory=lambda: {kind: [] for kind in KINDS}
     )
+    positions_ned_m: list[tuple[float, float, float, float]] = field(default_factory=list)
     _open_text: str = ""
 
     def hear(self, time_s: float, message: Any) -> None:
@@ -30,13 +32,18 @@ class Rows:
         elif name == "STATUSTEXT":
             self._open_text += message.text
             if len(message.text) < TEXT_CHUNK:
-                self._add("text", time_s, f"{message.severity} {_without_figures(self._open_text)}")
+                text = _without_figures(self._open_text)
+                per_setpoint = text.startswith("SET_POSITION_TARGET")
+                add = self._change if per_setpoint else self._add
+                add("text", time_s, f"{message.severity} {text}")
                 self._open_text = ""
         elif name == "HEARTBEAT":
             state = f"{message.base_mode} {message.custom_mode:#x} {message.system_status}"
             self._change("state", time_s, state)
         elif name == "EXTENDED_SYS_STATE":
             self._change("landed", time_s, str(message.landed_state))
+        elif name == "LOCAL_POSITION_NED":
+            self.positions_ned_m.append((time_s, message.x, message.y, message.z))
         elif name == "PARAM_VALUE":
             bits = struct.pack("<f", message.param_value).hex()
             self._change("param", time_s, f"{message.param_id} {bits} {message.param_type}")

@@ -12,7 +12,7 @@ from sim_bench import NAN, Bench
 from simulator.firmware.px4 import PX4
 
 POSITION, VELOCITY, YAWED_POSITION = 2552 | 1024, 0b1101_1100_0111, 2552
-GLOBAL, RELATIVE, BODY = 5, 6, 8
+GLOBAL, RELATIVE, TERRAIN, BODY = 5, 6, 11, 8
 NORTH, EAST, UP = 3.0, -2.0, 4.0
 
 
@@ -42,7 +42,7 @@ def flown(send: Callable[[Bench], None], duration_s: float) -> Bench:
 
 
 @pytest.mark.parametrize(
-    ("frame", "altitude_m"), [(GLOBAL, PX4.origin[2] + UP), (RELATIVE, UP), (0, PX4.origin[2] + UP)]
+    ("frame", "altitude_m"), [(GLOBAL, PX4.origin[2] + UP), (RELATIVE, UP), (TERRAIN, UP)]
 )
 def test_a_global_position_is_flown_to(frame: int, altitude_m: float) -> None:
     bench = flown(lambda b: b.send(global_target(frame, altitude_m)), 10.0)

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from sim_bench import Bench
 from sim_rows import Comparison, Rows, compare
@@ -114,6 +115,45 @@ SESSIONS = [
             ("landed 4", 1.1),
         ),
     ),
+    # Two missions, one that returns and one that lands, the first paused and told to jump
+    Session(
+        "mission",
+        seed=2,
+        equal=73,
+        kinds=("ack", "text", "state", "landed", "mission"),
+        differing=(
+            "ours state 29 0x4040000 0",  # after the recording's end: a mission, and none there
+        ),
+        # on its way without limits on acceleration and jerk, so a second earlier at each item
+        flown_s=(
+            ("text 6 Returning", 6.0),
+            ("text 6 RTL: ", 6.0),
+            ("text 6 Landing detected", 6.0),
+            ("text 6 Mission finished", 6.0),
+            ("text 6 Disarmed by landing", 6.0),
+            ("landed", 6.0),
+            ("state", 6.0),
+            ("mission MISSION_ITEM_REACHED 3", 9.5),  # paused on its way there, the real one
+            ("mission MISSION_ITEM_REACHED", 7.0),
+        ),
+    ),
+    # By place, speed, acceleration, course and its rate, in every frame that there is; by rates
+    Session(
+        "setpoints",
+        seed=2,
+        equal=29,
+        differing=(
+            # it lands 5 s earlier, and then the recording ends
+            "ours text 6 Disarmed by landing",
+            "ours state 17 0x60000 0",
+        ),
+        flown_s=(
+            ("text 6 Landing detected", 5.5),
+            ("landed 1", 5.5),
+            # by setpoints, of which the recording has every fourth
+            ("text 2", 0.25),
+        ),
+    ),
 ]
 
 
@@ -164,3 +204,18 @@ def test_rows_come_when_the_real_ones_come(session: Session) -> None:
     late = [(row, s) for row, s in compared.late if abs(s) > limit_s(session, row)]
     assert late == []
     assert all(math.isfinite(s) for _, s in compared.late)
+
+
+@pytest.mark.parametrize(
+    "until_s",
+    [57.2, 63.1, 66.1, 69.1, 81.0, 84.0, 87.0, 98.9, 104.8, 119.6, 134.5],
+)
+def test_setpoints_lead_to_the_real_one_s_place(until_s: float) -> None:
+    """At the ends of those that name one, metres; estimates of either wander half a metre."""
+    session = next(session for session in SESSIONS if session.name == "setpoints")
+    real, ours = (np.array(rows.positions_ned_m) for rows in heard(session))
+    there, here = (
+        [np.interp(until_s, path[:, 0], path[:, axis]) for axis in (1, 2, 3)]
+        for path in (real, ours)
+    )
+    assert np.linalg.norm(np.subtract(there, here)) < 1.1

@@ -100,6 +100,7 @@ ARDUPILOT = Firmware(
     sensors=Sensors(0x5371FC2F, 0x5361FC2F, 0x4771FC2F, first_fix_s=10.2),
     position_grid_steps=1,
     boot=BOOT,
+    missions_strictly=False,
     mode_acked_twice=False,
     text_to_ground_stations_only=False,
     is_ground_station=is_ground_station,
@@ -140,4 +141,5 @@ ARDUPILOT = Firmware(
     command_answers=COMMAND_ANSWERS,
     attitude_setpoint=attitude_setpoint,
     motion_setpoint=motion_setpoint,
+    global_frames=frozenset({0, 3, 5, 6, 10, 11}),
 )

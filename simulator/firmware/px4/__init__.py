@@ -105,6 +105,7 @@ PX4 = Firmware(
     sensors=Sensors(0x0300402F, 0x0301402F, 0x0330C83F, first_fix_s=3.0),
     position_grid_steps=2,
     boot={},
+    missions_strictly=True,
     mode_acked_twice=True,
     text_to_ground_stations_only=True,
     is_ground_station=is_ground_station,
@@ -143,6 +144,7 @@ PX4 = Firmware(
     command_answers=COMMAND_ANSWERS,
     attitude_setpoint=attitude_setpoint,
     motion_setpoint=motion_setpoint,
+    global_frames=frozenset({5, 6, 11}),
     battery_level=battery_level,
     battery_events=("battery low", "battery critical", "battery emergency"),
     position_without_fix_s=5.0,  # EKF2_NOAID_TOUT

@@ -145,14 +145,19 @@ RULES = (
     Rule(
         "mission", result=_LATER, say=_critical("Switching to Mission is currently not available")
     ),
-    Rule(
-        "mission climbs",
-        say=_info("Executing Mission"),
-        also=(_info("Climb to {climb_m:.1f} meters above home"),),
-    ),
+    Rule("mission begun", say=_info("Executing Mission")),
+    Rule("mission climbs", say=_info("Climb to {climb_m:.1f} meters above home")),
     Rule("mission progress", send=("MISSION_CURRENT",)),
     Rule("item reached", send=("MISSION_ITEM_REACHED",)),
     Rule("mission return", "AUTO.MISSION", to="AUTO.RTL", say=_info("Returning to launch")),
+    Rule(
+        "mission finished",
+        when=("landed",),
+        do=("disarm",),
+        to="remembered",
+        say=_info("Mission finished, landed"),
+        also=(_info("Disarmed by landing"),),
+    ),
     Rule("mission finished", say=_info("Mission finished, loitering")),
     Rule("reboot", result=Result.DENIED),  # as SITL does, which cannot
     Rule("took off", say=_info("Takeoff detected")),
