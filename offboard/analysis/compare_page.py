@@ -4,23 +4,30 @@ from __future__ import annotations
 
 import html
 import itertools
+import math
 from collections.abc import Sequence
 
 from offboard.analysis import page as shell
 from offboard.analysis.compare import EQUAL_SHARE, FIGURES, Row
 from offboard.analysis.compare_table import digits
-from offboard.analysis.figure import GREY, PALETTE, Figure, Trace, numbers, single
+from offboard.analysis.figure import GREY, GRID, PALETTE, Figure, Trace, axis, numbers
 
-SHOWN = {
-    "rmse_position_m": "Position error, RMSE [m]",
-    "tilt_agitation_deg": "Tilt about what the reference asks for, RMS [deg]",
-    "rate_agitation_radps": "Roll and pitch rate about what the reference asks for, RMS [rad/s]",
+PANELS = {  # figure of the score: title, and the share of the width it is drawn in
+    "rmse_position_m": ("position error, RMSE [m]", (0.0, 0.5)),
+    "tilt_agitation_deg": ("tilt not asked for, RMS [deg]", (0.53, 0.75)),
+    "rate_agitation_radps": ("rates not asked for, RMS [rad/s]", (0.78, 1.0)),
 }
 EQUALS = (
-    "Filled: the lowest median error of its scenario, and its equals, which are all whose median "
-    f"lies within the range of that one's flights, or within {EQUAL_SHARE:.0%} of its median."
+    "the lowest median error of its scenario, and its equals, which are all whose median lies "
+    f"within the range of that one's flights, or within {EQUAL_SHARE:.0%} of its median."
 )
-_ROW_PX, _BETWEEN, _FRAME_PX = 17, 1, 130
+CAPTION = (
+    "Dot: median; line: range over the seeds. Not asked for: about what the reference asks of an "
+    f"ideal vehicle. Filled and bold: {EQUALS}"
+)
+FAILED = "#ba2525"
+FEW_DECADES = 2
+_ROW_PX, _FRAME_PX = 18, 100  # the toolbar and the axes above
 
 
 def page(rows: Sequence[Row], missing: Sequence[str] = ()) -> str:
@@ -34,70 +41,80 @@ def page(rows: Sequence[Row], missing: Sequence[str] = ()) -> str:
     if missing:
         items = "".join(f"<li>{html.escape(line)}</li>" for line in missing)
         body.append(f'<div class="missing">Interrupted:<ul>{items}</ul></div>')
-    body += [shell.drawing(name, _figure(rows, name, title)) for name, title in SHOWN.items()]
+    body.append(shell.drawing("comparison", _figure(rows)))
     body.append(f"<article><h3>All figures: median [lowest–highest]</h3>{_table(rows)}</article>")
     return shell.document("Controllers side by side", "".join(body))
 
 
-def _figure(rows: Sequence[Row], name: str, title: str) -> Figure:
-    """A dot and its range for every law, scenarios one below the other."""
-    places, heads = _places(rows)
+def _figure(rows: Sequence[Row]) -> Figure:
+    """Panels side by side with one line for every law, under the name of its scenario."""
+    lines = _lines(rows)
+    placed = [(row, place) for place, row in enumerate(lines) if isinstance(row, Row)]
     controllers = list(dict.fromkeys(row.controller for row in rows))
-    placed = list(zip(rows, places, strict=True))
     traces = [
-        _trace([pair for pair in placed if pair[0].controller == law], name, colour)
+        _trace([pair for pair in placed if pair[0].controller == law], name, colour, panel)
         for law, colour in zip(controllers, itertools.cycle(PALETTE), strict=False)
+        for panel, name in enumerate(PANELS, 1)
     ]
-    below = max(places, default=0) + 1
-    layout = single(
-        title,
-        "",
-        height=_FRAME_PX + _ROW_PX * (below + 1),
-        x={"type": "log", "side": "bottom", "minor": {"showgrid": True}},
-        y={
-            "tickvals": list(heads.values()),
-            "ticktext": list(heads),
-            "range": [below, -1],
+    layout = {
+        "height": _FRAME_PX + _ROW_PX * len(lines),
+        "margin": {"l": 120, "r": 20, "t": 90, "b": 10},
+        "showlegend": False,
+        "yaxis": {
+            "tickvals": list(range(len(lines))),
+            "ticktext": [_label(line) for line in lines],
+            "range": [len(lines) - 0.3, -0.7],
             "showgrid": False,
             "zeroline": False,
+            "fixedrange": True,
         },
-        shapes=[_border(place) for place in _borders(rows, places)],
-        annotations=[_failure(row, at) for row, at in placed if row.failed],
-    )
-    return Figure(title, traces, layout, f"Dot: median; line: range over the seeds. {EQUALS}")
+        "shapes": [_border(at) for at, line in enumerate(lines) if at and isinstance(line, str)],
+        "annotations": [_failure(row, at) for row, at in placed if row.failed],
+    }
+    for panel, (name, (title, domain)) in enumerate(PANELS.items(), 1):
+        layout["xaxis" if panel == 1 else f"xaxis{panel}"] = {
+            **_logarithmic(rows, name), "title": {"text": title}, "domain": domain,
+        }  # fmt: skip
+    return Figure("Error, and the agitation that it took", traces, layout, CAPTION)
 
 
-def _places(rows: Sequence[Row]) -> tuple[list[int], dict[str, float]]:
-    """Where each row is drawn, and where the name of each reference and scenario stands."""
-    places: list[int] = []
-    heads: dict[str, float] = {}
+def _lines(rows: Sequence[Row]) -> list[Row | str]:
+    """The rows, above each block the name of its scenario, and of the reference if it varies."""
     several = len({row.reference for row in rows}) > 1
-    at = 0
+    lines: list[Row | str] = []
     for (reference, scenario), block in itertools.groupby(rows, _cell):
-        count = len(list(block))
-        heads[f"{scenario}, {reference}" if several else scenario] = at + (count - 1) / 2
-        places += range(at, at + count)
-        at += count + _BETWEEN
-    return places, heads
+        lines += [f"{scenario}, {reference}" if several else scenario, *block]
+    return lines
 
 
 def _cell(row: Row) -> tuple[str, str]:
     return row.reference, row.scenario
 
 
-def _borders(rows: Sequence[Row], places: Sequence[int]) -> list[float]:
-    pairs = itertools.pairwise(zip(rows, places, strict=True))
-    return [
-        (first + second) / 2
-        for (row, first), (next_row, second) in pairs
-        if _cell(row) != _cell(next_row)
-    ]
+def _label(line: Row | str) -> str:
+    if isinstance(line, str):
+        return f"<b>{html.escape(line)}</b>"
+    name = html.escape(line.controller)
+    return f"<b>{name}</b>" if line.best else name
 
 
-def _trace(own: Sequence[tuple[Row, int]], name: str, colour: str) -> Trace:
+def _logarithmic(rows: Sequence[Row], name: str) -> dict[str, object]:
+    """An axis above its panel, at 1 or at 1, 2 and 5 of every decade."""
+    ends = [end for row in rows for end in (row.lowest[name], row.highest[name]) if end > 0.0]
+    low = math.floor(math.log10(min(ends, default=1.0)))
+    high = math.ceil(math.log10(max(ends, default=1.0)))
+    steps = (1, 2, 5) if high - low <= FEW_DECADES else (1,)
+    ticks = [float(f"{step}e{power}") for power in range(low, high + 1) for step in steps]
+    return {
+        "type": "log", "side": "top", "tickvals": ticks, "ticktext": [f"{at:g}" for at in ticks],
+        "gridcolor": GRID, "linecolor": GREY, "showline": True, "minor": {"showgrid": False},
+    }  # fmt: skip
+
+
+def _trace(own: Sequence[tuple[Row, int]], name: str, colour: str, panel: int) -> Trace:
     shown = [(row, place) for row, place in own if row.flown]
     return {
-        "type": "scatter", "mode": "markers", "name": own[0][0].controller,
+        "type": "scatter", "mode": "markers", "xaxis": axis("x", panel), "yaxis": "y",
         "x": numbers([row.median[name] for row, _ in shown]),
         "y": [place for _, place in shown],
         "text": [_hover(row, name) for row, _ in shown], "hoverinfo": "text",
@@ -117,25 +134,26 @@ def _hover(row: Row, name: str) -> str:
     return html.escape(f"{row.controller}, {row.scenario}, {row.reference}: {_value(row, name)}")
 
 
-def _border(place: float) -> dict[str, object]:
+def _border(heading: int) -> dict[str, object]:
+    place = heading - 0.5
     return {
         "type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": place, "y1": place,
-        "line": {"color": GREY, "width": 0.5},
+        "line": {"color": GRID, "width": 1},
     }  # fmt: skip
 
 
 def _failure(row: Row, place: int) -> dict[str, object]:
     return {
-        "xref": "paper", "x": 1, "xanchor": "right", "y": place, "showarrow": False,
-        "text": html.escape(f"{row.controller}: {row.failed} of {row.flights} failed"),
-        "font": {"color": "#ba2525", "size": 11},
+        "xref": "paper", "x": PANELS["rmse_position_m"][1][1], "xanchor": "right", "y": place,
+        "showarrow": False, "text": f"{row.failed} of {row.flights} failed",
+        "font": {"color": FAILED, "size": 11},
     }  # fmt: skip
 
 
 def _table(rows: Sequence[Row]) -> str:
     head = "".join(f'<th class="text">{name}</th>' for name in ("reference", "scenario", "law"))
     head += "<th>flights</th>" + "".join(f"<th>{name}</th>" for name in FIGURES)
-    note = shell.notes([EQUALS.replace("Filled", "Bold, with a star")])
+    note = shell.notes([f"Bold, with a star: {EQUALS}"])
     return shell.table(head, [_line(row) for row in rows]) + note
 
 

@@ -4,24 +4,17 @@ from __future__ import annotations
 
 import io
 import json
-import shutil
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
-from playwright.sync_api import Page, sync_playwright
+from browser import Opened, opening
 from rich.console import Console
 
 from offboard.analysis.paper import peers
 from offboard.analysis.paper.options import FIGURES, TABLES, PaperOptions
 from offboard.analysis.paper.run import Outcome, reproduce
 
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-# WebGL (Fig. 6) in software: a machine that tests has no graphics card
-FLAGS = (
-    "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--use-gl=angle",
-    "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
-)  # fmt: skip
 PNG = b"\x89PNG\r\n\x1a\n"
 
 
@@ -32,41 +25,9 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
 
 
 @pytest.fixture(scope="module")
-def browser() -> str:
-    found = next(filter(None, map(shutil.which, BROWSERS)), None)
-    if found is None:
-        pytest.fail(f"the page must be opened in a browser; install one of {', '.join(BROWSERS)}")
-    return found
-
-
-class Opened:
-    """The page in a browser, and everything it complained about or asked the network for."""
-
-    def __init__(self, page: Page, file: Path) -> None:
-        self.page = page
-        self.problems: list[str] = []
-        self.requests: list[str] = []
-        page.on("console", self._heard)
-        page.on("pageerror", lambda error: self.problems.append(str(error)))
-        page.on("request", lambda request: self.requests.append(request.url))
-        page.goto(file.as_uri())
-        page.wait_for_function(
-            "[...document.querySelectorAll('.figure')].every(f => f.dataset.drawn === 'yes')",
-            timeout=60_000,
-        )
-
-    def _heard(self, message: object) -> None:
-        if getattr(message, "type", "") == "error":
-            self.problems.append(str(getattr(message, "text", "")))
-
-
-@pytest.fixture(scope="module")
-def opened(run: Outcome, browser: str) -> Iterator[Opened]:
-    with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=browser, args=list(FLAGS))
-        context = chromium.new_context(offline=True, viewport={"width": 1280, "height": 900})
-        yield Opened(context.new_page(), run.page)
-        chromium.close()
+def opened(run: Outcome) -> Iterator[Opened]:
+    with opening(run.page) as opened:
+        yield opened
 
 
 def test_everything_is_on_the_page(run: Outcome) -> None:
@@ -77,7 +38,7 @@ def test_everything_is_on_the_page(run: Outcome) -> None:
 
 def test_the_page_opens_without_an_error_and_without_the_network(opened: Opened) -> None:
     assert opened.problems == []
-    assert [url for url in opened.requests if not url.startswith(("file:", "data:", "blob:"))] == []
+    assert opened.fetched == []
 
 
 def test_every_figure_is_drawn(opened: Opened) -> None:

@@ -1,0 +1,139 @@
+"""Many flights, one table: what is best, what failed and why, and that it can be read."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import json
+import math
+import os
+import signal
+from pathlib import Path
+
+import pytest
+from browser import opening
+from rich.console import Console
+
+from offboard.analysis.compare import (
+    FIGURES,
+    Failure,
+    Result,
+    Row,
+    Trial,
+    as_csv,
+    as_json,
+    table,
+    trials,
+)
+from offboard.analysis.compare_page import page
+from offboard.analysis.compare_table import lines
+from offboard.analysis.comparison import compare_all
+
+LAWS = ("pso", "lqr", "an/uncommonly/long/name.yaml", "lost")
+SCENARIOS = ("calm", "all_together")
+# Position RMSE in m of seeds 1, 2, 3
+ERRORS_M = {
+    ("pso", "calm"): (0.010, 0.012, 0.011),
+    ("lqr", "calm"): (0.0109, 0.0119, 0.0121),  # within the range of pso's flights
+    (LAWS[2], "calm"): (0.0125, 0.0125, 0.0125),
+    ("lost", "calm"): (0.001, 0.001, math.nan),  # the lowest, but one failed
+    ("pso", "all_together"): (0.2, 0.2, 0.2),
+    ("lqr", "all_together"): (0.201, 0.201, 0.201),  # within one per cent
+    (LAWS[2], "all_together"): (0.21, 0.19, 0.21),
+    ("lost", "all_together"): (math.nan,) * 3,
+}
+WHY = "7.1 m <b>away</b>"
+
+
+def flown(trial: Trial) -> Result:
+    error_m = ERRORS_M[trial.controller, trial.scenario][trial.seed - 1]
+    if math.isnan(error_m):
+        return Result(trial, 4, WHY, {})
+    figures = {name: error_m * (1 + index) for index, name in enumerate(FIGURES)}
+    return Result(trial, 0, "flown and landed", figures)
+
+
+@pytest.fixture(scope="module")
+def rows() -> list[Row]:
+    planned = trials(LAWS, ["lemniscate"], SCENARIOS, range(1, 4), Path("x"))
+    return table(map(flown, planned))
+
+
+def row_of(rows: list[Row], law: str, scenario: str) -> Row:
+    (found,) = [row for row in rows if (row.controller, row.scenario) == (law, scenario)]
+    return found
+
+
+def test_best_is_the_lowest_median_of_those_that_all_flew_and_its_equals(rows: list[Row]) -> None:
+    best = {(row.controller, row.scenario) for row in rows if row.best}
+    assert best == {(law, scenario) for law in ("pso", "lqr") for scenario in SCENARIOS}
+
+
+def test_median_and_range_are_of_the_flights_that_landed(rows: list[Row]) -> None:
+    lqr, lost = row_of(rows, "lqr", "calm"), row_of(rows, "lost", "calm")
+    ends = (lqr.lowest, lqr.median, lqr.highest)
+    assert [end["rmse_position_m"] for end in ends] == [0.0109, 0.0119, 0.0121]
+    assert (lost.flown, lost.median["rmse_position_m"]) == (2, 0.001)
+    assert lost.failures == (Failure(3, WHY),)
+
+
+def test_files_hold_every_figure(rows: list[Row]) -> None:
+    read = list(csv.DictReader(io.StringIO(as_csv(rows))))
+    document = json.loads(as_json(rows))
+    assert len(read) == len(document) == len(rows)
+    for name, which in itertools.product(FIGURES, ("median", "lowest", "highest")):
+        for row, line, entry in zip(rows, read, document, strict=True):
+            value = getattr(row, which)[name]
+            assert entry[which][name] == (value if row.flown else None)
+            assert line[f"{name}_{which}"] == (f"{value:.6g}" if row.flown else "")
+    assert document[-1]["failures"] == [{"seed": seed, "sentence": WHY} for seed in (1, 2, 3)]
+
+
+@pytest.mark.parametrize("width", [60, 80, 120, 200])
+def test_no_line_of_the_table_is_wider_than_the_window(rows: list[Row], width: int) -> None:
+    told = [line.plain for line in lines(rows, width)]
+    assert max(map(len, told)) <= width
+    whole = "\n".join(told)
+    for words in (*LAWS[:2], *SCENARIOS, "[0.0109\N{EN DASH}0.0121]", "0.0119", "lost (2 of 3)"):
+        assert words in whole, words
+    assert [line.split()[1] for line in told if line.startswith("* ")][:4] == ["pso", "lqr"] * 2
+
+
+def test_the_page_opens_without_an_error_and_shows_every_row(
+    rows: list[Row], tmp_path: Path
+) -> None:
+    file = tmp_path / "compare.html"
+    file.write_text(page(rows, ["not flown: <i>calm</i>"]), encoding="utf-8")
+    with opening(file) as opened:
+        assert opened.problems == opened.fetched == []
+        dots = opened.page.locator(".scatterlayer .point").count()
+        assert dots == 3 * sum(row.flown > 0 for row in rows)  # error, tilt, rates
+        assert opened.page.locator("table tr").count() == 1 + len(rows)
+        assert opened.page.locator("tr.best").count() == 4
+        told = opened.page.inner_text("main")
+    for words in (*LAWS, *SCENARIOS, WHY, "3 of 3 failed", "<i>calm</i>"):
+        assert words in told, words
+
+
+def dies_with_seed_2(trial: Trial) -> Result:
+    if trial.seed == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+    return Result(trial, 0, "flown and landed", dict.fromkeys(FIGURES, 1.0))
+
+
+def test_a_worker_that_dies_costs_its_own_flight(tmp_path: Path) -> None:
+    problem = compare_all(
+        dies_with_seed_2,
+        controllers=["pso"],
+        references=["hover"],
+        scenarios=["calm"],
+        seeds=range(1, 5),
+        directory=tmp_path / "all",
+        workers=1,
+        console=Console(file=io.StringIO()),
+    )
+    assert problem == "1 of 4 flights failed; the table says why"
+    (row,) = csv.DictReader((tmp_path / "all" / "compare.csv").open(encoding="utf-8"))
+    assert row["failed"] == "1"
+    assert row["why"] == "the process that flew it ended"
