@@ -32,6 +32,7 @@ from offboard.reference.track import Track
 
 Raw = dict[str, Any]
 RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
+UNKNOWN_VEHICLE = "neutral"
 FOLDERS = {"vehicle": "vehicles", "controller": "controllers", "reference": "references"}
 
 
@@ -64,14 +65,18 @@ def load(
     choices: Mapping[str, str] | None = None,
     assignments: Iterable[str] = (),
     seed: int | None = None,
+    known_vehicle: str | None = None,
 ) -> FlightConfig:
     """Resolve a flight configuration. Raises DocumentError with every problem found.
 
     `name` is a shipped configuration or a file; `choices` replaces its vehicle, controller or
-    reference by another name or file; `assignments` are `key.path=value` of --set.
+    reference by another name or file; `assignments` are `key.path=value` of --set. `known_vehicle`
+    stands in for the file's `neutral`, of which nothing is known.
     """
     path = locate(name, "", "configuration")
     raw = read(_text(path), str(path))
+    if known_vehicle and raw.get("vehicle") == UNKNOWN_VEHICLE:
+        raw["vehicle"] = known_vehicle
     for part in FOLDERS:
         chosen = (choices or {}).get(part, raw.get(part))
         if isinstance(chosen, str):

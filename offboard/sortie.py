@@ -48,11 +48,15 @@ class Order:
 
     def resolve(self) -> FlightConfig:
         """The validated configuration. Raises DocumentError."""
-        own = {"vehicle": OWN_VEHICLES[self.firmware]} if self.firmware in OWN_VEHICLES else {}
-        choices = {**(own if self.sitl else {}), **self.choices}
         if self.sitl and self.scenario is not None:
             locate(self.scenario, "scenarios", "scenario")
-        return load(self.config, choices=choices, assignments=self.assignments, seed=self.seed)
+        return load(
+            self.config,
+            choices=self.choices,
+            assignments=self.assignments,
+            seed=self.seed,
+            known_vehicle=OWN_VEHICLES.get(self.firmware) if self.sitl else None,
+        )
 
 
 def crew(config: FlightConfig) -> Crew:

@@ -20,7 +20,7 @@ from types import TracebackType
 
 from offboard.model.document import DocumentError
 
-OWN_VEHICLES = {"ardupilot": "arducopter"}  # flown by the simulator, so believed of it as well
+OWN_VEHICLES = {"px4": "px4_sih", "ardupilot": "arducopter"}  # flown by default, so known
 STOP_S = 2.0
 ERRORS_BYTES = 65536
 USAGE = 2  # the simulator's exit code for options and files that it cannot use

@@ -209,7 +209,9 @@ def make(
     `flies` whatever is `believed`, and `learning` what it is."""
     named = {"reference": reference, "vehicle": vehicle}
     choices = {part: chosen for part, chosen in named.items() if chosen}
-    resolved = config.load(name, choices=choices, assignments=assignments, seed=seed)
+    resolved = config.load(
+        name, choices=choices, assignments=assignments, seed=seed, known_vehicle="px4_sih"
+    )
     believed = believed or resolved.vehicle
     controller = build(resolved.controller, believed, resolved.period_s, resolved.seed)
     observer = observer_of(resolved.estimate, believed, resolved.observer, resolved.fusion)
