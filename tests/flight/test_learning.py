@@ -19,6 +19,7 @@ from offboard.analysis.identify import identify_flight, vehicle_file
 from offboard.control.base import Command
 from offboard.control.identification import Estimate, Identified, ResponseFit
 from offboard.control.observer import Observer, ObserverSettings
+from offboard.flight.belief import Belief
 from offboard.flight.excitation import LENGTH_S, excited
 from offboard.flight.learning import RECORD_ID, IdentifySettings
 from offboard.flight.phases import Phase
@@ -221,7 +222,27 @@ def test_bandwidth_that_the_delay_does_not_bear_is_lowered():
         learning=IdentifySettings(box_m=5.0),
     )  # fmt: skip
     assert pair.fly().exit_code == 0
-    assert any("of 10.0 rad/s" in line for line in pair.companion.announced)
+    (said,) = (line for line in pair.companion.announced if " of 10.0 rad/s" in line)
+    assert 4.0 < float(said.split()[1]) < 9.0
+
+
+def test_what_was_found_is_blended_in_over_a_second():
+    belief = Belief(
+        NEUTRAL, factor=4.0, blend_s=1.0, unknown_delay_s=0.28, period_s=0.1, bandwidth_radps=7.0
+    )
+    fit = ResponseFit(Estimate(0.09, 0.002), Estimate(14.0, 0.1), Estimate(1.1, 0.01), 0.0, 0.1)
+    found = Identified(4.0, tilt=fit, hover_thrust=Estimate(0.5, 0.01), drag_ps=Estimate(1.2, 0.1))
+    belief.take(found, 10.0)
+    way = [NEUTRAL]
+    for tick in range(12):
+        belief.step(10.0 + 0.1 * tick)
+        way.append(belief.now)
+    numbers = np.array(
+        [[v.drag_per_mass_ps, v.hover_thrust, *v.tilt.model_dump().values()] for v in way]
+    )
+    share = (numbers - numbers[0]) / (np.array([1.2, 0.5, 0.09, 14.0, 1.1]) - numbers[0])
+    expected = np.minimum(0.1 * np.arange(13), 1.0)
+    assert share == pytest.approx(np.tile(expected[:, None], 5), abs=1e-9)
 
 
 def test_steps_end_where_they_began():
