@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 from faults import late, losing, repeating, stuttering
-from pair import Filter, make, through
+from pair import Filter, Pair, make, through
 
 from offboard.analysis.score import Score
 from offboard.flight.learning import IdentifySettings
@@ -53,3 +53,30 @@ def test_gaps_of_a_link_that_loses_are_told(tmp_path: Path) -> None:
     score = flown_over(losing(0.3), tmp_path)
     assert 0.04 <= score.position_gap_max_s < 0.3
     assert score.position_hz == pytest.approx(0.7 * SENT_HZ, rel=0.1)
+
+
+def sixty_ms_each_way(bandwidth_radps: int, seed: int, learning: IdentifySettings | None) -> Pair:
+    """On PX4's vehicle file, which knows of none of it."""
+    law = f"controller={{law: lqr, feedback_limit: 0.6, bandwidth_radps: {bandwidth_radps}}}"
+    pair = make(
+        law, "reference.height_m=1.0", scenario="px4_like", vehicle="px4_sih", seed=seed,
+        down=late(0.06), up=late(0.06), learning=learning,
+    )  # fmt: skip
+    assert pair.fly().exit_code == 0
+    return pair
+
+
+def test_sixty_ms_each_way_are_a_limit_cycle_until_they_are_known(tmp_path: Path) -> None:
+    """As on the real PX4: 0.5 to 0.9 m unknown, 0.05 m known, at the bandwidth that it bears."""
+    unknown = sixty_ms_each_way(5, 1, None).score(tmp_path / "unknown")
+    assert unknown.rmse_position_m > 0.3
+    assert unknown.tilt_agitation_deg > 12.0
+    for seed in (1, 2):
+        known = sixty_ms_each_way(10, seed, IdentifySettings())
+        score = known.score(tmp_path / str(seed))
+        (said,) = [line for line in known.companion.announced if line.startswith("bandwidth")]
+        used_radps = float(said.removeprefix("bandwidth ").split()[0])
+        assert 6.0 < used_radps < 10.0
+        assert f"of 10.0 rad/s: what a delay of {score.delay_ms:.0f} " in said
+        assert score.rmse_position_m < 0.06
+        assert score.delay_ms == pytest.approx(PLAIN_DELAY_MS + 120.0, abs=10.0)
