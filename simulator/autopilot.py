@@ -54,11 +54,12 @@ class Autopilot:
         self.firmware = firmware
         self.plant = plant
         self.parameters = parameters or ParameterTable(firmware)
-        self.mission = mission or Mission(firmware.origin)
+        self.mission = mission or Mission(firmware.origin, firmware.mission_first)
         self.pilot = Pilot(firmware, self.parameters, self.mission)
         self.mode: Mode = firmware.modes[firmware.boot_mode]
         self.intended = self.remembered = firmware.boot_mode
-        self.armed = self.failsafe = self.faulty = False
+        self.armed = self.failsafe = False
+        self.latched: frozenset[str] = frozenset()  # events that a reboot alone undoes
         self.texts: list[Say] = []
         self.announcements: list[str] = []  # messages for every link
         self.reached: frozenset[str] = frozenset()  # boot events
@@ -113,7 +114,7 @@ class Autopilot:
         if mode.needs_position:
             after_s = firmware.healthy_after_s
         waits = firmware.setpoint_mode_needs_stream and mode.behaviour is Behaviour.SETPOINT
-        booted = self.time_s >= after_s * self.boot_scale and not self.faulty
+        booted = self.time_s >= after_s * self.boot_scale and not self.latched
         if self.firmware.unhealthy_where_unarmable and not mode.arms:
             return False
         if self._watch.ground_station_lost and self.parameters.role("ground_station_needed") > 0:
@@ -136,7 +137,7 @@ class Autopilot:
             landed=self.landed,
             healthy=self.healthy,
             failsafe=self.failsafe,
-            faulty=self.faulty,
+            faulty=bool(self.latched),
             setpoint=self.pilot.setpoint,
         )
 
@@ -403,6 +404,8 @@ class Autopilot:
             return self.failsafe and self._cause == guard[6:]
         if guard.startswith("reached "):
             return guard[8:] in self.reached
+        if guard.startswith("latched "):
+            return guard[8:] in self.latched
         name, compares, value = guard.partition("=")
         if compares:
             return self.parameters[name] == float(value)
@@ -472,7 +475,7 @@ class Autopilot:
         self.pilot.level(self.look())
 
     def _latch(self) -> None:
-        self.faulty = True
+        self.latched |= {self._event}
 
     def _mode_can_run(self) -> bool:
         mode = self.firmware.modes[self._requested]
@@ -522,7 +525,6 @@ GUARDS: dict[str, Callable[[Autopilot], bool]] = {
     "ready": lambda autopilot: autopilot.healthy and autopilot.mode.arms,
     "mode can run": Autopilot._mode_can_run,
     "mode arms": lambda autopilot: autopilot.mode.arms,
-    "faulty": lambda autopilot: autopilot.faulty,
     "position missing": Autopilot._position_missing,
     "mission missing": lambda autopilot: not autopilot.mission.flyable,
     "climb asked": Autopilot._climb_asked,

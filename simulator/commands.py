@@ -60,7 +60,8 @@ class Commands:
         """SET_MODE, the message that came before the command."""
         firmware = self.link.view.autopilot.firmware
         result = self._request(firmware.set_mode(base_mode, custom_mode))
-        self._acknowledge(Command(firmware.set_mode_acked_as, (), *sender), result)
+        if firmware.set_mode_acked_as is not None:
+            self._acknowledge(Command(firmware.set_mode_acked_as, (), *sender), result)
 
     def _acknowledge(self, command: Command, result: Result) -> None:
         self.link.send(
@@ -105,6 +106,10 @@ class Commands:
 
     def _return(self, _: Command) -> Result:
         return self.link.view.autopilot.happen("return")
+
+    def _loiter(self, _: Command) -> Result:
+        autopilot = self.link.view.autopilot
+        return autopilot.happen("loiter") if autopilot.knows("loiter") else Result.UNSUPPORTED
 
     def _set_home(self, command: Command) -> Result:
         """param1 = 1: here; else a place in degrees and metres above the sea."""
@@ -186,6 +191,7 @@ class Commands:
 
 
 HANDLERS: dict[int, Callable[[Commands, Command], Result | None]] = {
+    17: Commands._loiter,
     20: Commands._return,
     21: Commands._land,
     22: Commands._takeoff,

@@ -77,7 +77,8 @@ class Return:
             self.place = (home_x, home_y, max(self.place[2], home_z - lower_m))
         if self.stage is Stage.DESCEND and z > self.place[2] - _ARRIVED_M:
             waits_s = self.parameters.role("return_waits_s")
-            self._until_s = now_s + waits_s if waits_s >= 0.0 else math.inf
+            settles_s = self.parameters.role("return_settles_s")
+            self._until_s = now_s + waits_s + settles_s if waits_s >= 0.0 else math.inf
             self._go(Stage.WAIT)
         if self.stage is Stage.WAIT and now_s >= self._until_s:
             self._go(Stage.LAND, "return lands")

@@ -71,6 +71,7 @@ class Mission:
     """Items and progress; `events` are for whoever flies it to take away."""
 
     origin: Origin
+    first: int = 0  # the item with which it begins
     items: tuple[Item, ...] = ()
     current: int = 0
     reached: int = -1
@@ -85,12 +86,13 @@ class Mission:
 
     @property
     def flyable(self) -> bool:
-        return any(item.is_place or item.command == Kind.RETURN for item in self.items)
+        to_do = self.items[self.first :]
+        return any(item.is_place or item.command == Kind.RETURN for item in to_do)
 
     def replace(self, items: tuple[Item, ...]) -> None:
         """Another mission, or none; from its beginning."""
         self.items = items
-        self.current, self.reached, self.finished = 0, -1, False
+        self.current, self.reached, self.finished = self.first, -1, False
         self._since_s = math.nan
 
     def go_to(self, number: int) -> bool:
@@ -109,7 +111,7 @@ class Mission:
         self._under_way = True
         self.events.append("mission begun")
         if self.finished:
-            self.go_to(0)
+            self.go_to(self.first)
         self.speed_mps = math.inf
         self._held = position_ned_m
         self._since_s = self._climb_to_z_m = math.nan

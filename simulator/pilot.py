@@ -46,7 +46,7 @@ class Pilot:
         self.loop = PositionLoop(firmware.gains(parameters.__getitem__))
         self._detector = LandDetector(firmware.landing, parameters)
         self._takeoff = Takeoff(parameters)
-        self.mission = mission or Mission(firmware.origin)
+        self.mission = mission or Mission(firmware.origin, firmware.mission_first)
         self.events = self.mission.events  # for the autopilot
         self.behaviour = Behaviour.HOLD
         self._return = Return(parameters, firmware.return_height_m, self.events)

@@ -130,8 +130,7 @@ class Server:
         self.send("TIMESYNC", 0, stamp_ns)
 
     def restart(self) -> None:
-        """As after boot: default rates, nothing queued, nobody known."""
-        self._out = []
+        """As after boot: default rates, nobody known; what was said is said."""
         self._parameters_due = []
         self.streams = {}
         self.sequence = self._text_id = 0

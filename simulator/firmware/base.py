@@ -266,6 +266,7 @@ class Firmware:
     sensors: Sensors
     position_grid_steps: int  # the estimator's position is new at every such step
     boot: Mapping[str, float]  # events of the start, s of vehicle time
+    mission_first: int  # item with which a mission begins: before it, home
     missions_strictly: bool  # uploads ask as the client writes, downloads go item by item
     mode_acked_twice: bool  # the receiver acks a mode command before the commander does
     text_to_ground_stations_only: bool
@@ -295,7 +296,7 @@ class Firmware:
     heartbeat: Callable[[Condition], tuple[int, int]]  # base_mode but the armed bit, MAV_STATE
     command_mode: Callable[[tuple[float, ...]], ModeRequest]
     set_mode: Callable[[int, int], ModeRequest]  # SET_MODE: base_mode, custom_mode
-    set_mode_acked_as: int  # what the acknowledgement of SET_MODE names
+    set_mode_acked_as: int | None  # what the acknowledgement of SET_MODE names; None: there is none
     arm_wish: Callable[[float], ArmWish]  # param1 of MAV_CMD_COMPONENT_ARM_DISARM
     # MAV_CMD that are not carried out: their answers, None for silence; the rest is UNSUPPORTED
     command_answers: Mapping[int, Result | None]

@@ -550,6 +550,28 @@ def test_the_echo_is_the_demand_before_the_boost() -> None:
 # -- parameters ------------------------------------------------------------------------------
 
 
+def test_a_mission_begins_behind_its_item_for_home() -> None:
+    vehicle = ready()
+    latitude, longitude = (round(degrees * 1e7) for degrees in ARDUPILOT.origin[:2])
+    ahead = latitude + round(math.degrees(6.0 / 6_371_000) * 1e7)
+    rows = ((16, latitude, 0.0), (22, latitude, 4.0), (16, ahead, 4.0), (21, ahead, 0.0))
+    vehicle.send(mavlink.MAVLink_mission_count_message(1, 1, len(rows)))
+    for seq, (command, where, up_m) in enumerate(rows):
+        vehicle.run(0.02)
+        assert vehicle.of("MISSION_REQUEST")[-1][1].seq == seq
+        vehicle.send(
+            mavlink.MAVLink_mission_item_int_message(
+                1, 1, seq, 6, command, 0, 1, 0, 0, 0, NAN, where, longitude, up_m
+            )
+        )
+    assert vehicle.command(400, 1) == [ACCEPTED]
+    assert vehicle.command(300) == [ACCEPTED]
+    vehicle.run_until(lambda: not vehicle.armed, 60.0)
+    assert vehicle.texts()[-1] == "Disarming motors"
+    assert [m.seq for _, m in vehicle.of("MISSION_ITEM_REACHED")] == [1, 2, 3]
+    assert vehicle.instance.autopilot.truth.position_ned_m[0] == pytest.approx(6.0, abs=0.3)
+
+
 def test_parameters_carry_values_whatever_their_type() -> None:
     vehicle = bench()
     for name, sent in (("GUID_OPTIONS", 8.6), ("GUID_TIMEOUT", 50.0), ("DISARM_DELAY", 1.1e-44)):

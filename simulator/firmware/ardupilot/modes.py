@@ -35,6 +35,17 @@ MODES = {
         Mode("DRIFT", "DRIFT", 11, BY_HAND, Behaviour.DESCEND, needs_position=True),
         Mode("POSHOLD", "POSHOLD", 16, BY_POSITION, Behaviour.DESCEND, needs_position=True),
         Mode("BRAKE", "BRAKE", 17, BY_POSITION, Behaviour.HOLD, arms=False, needs_position=True),
+        Mode("THROW", "THROW", 18, BY_POSITION, Behaviour.LEVEL, needs_position=True),
+        Mode(
+            "AVOID_ADSB",
+            "AVOID_ADSB",
+            19,
+            BY_POSITION,
+            Behaviour.HOLD,
+            arms=False,
+            needs_position=True,
+        ),
+        Mode("ZIGZAG", "ZIGZAG", 24, BY_POSITION, Behaviour.DESCEND, needs_position=True),
         Mode("GUIDED_NOGPS", "GUIDED_NOGPS", 20, BY_HAND, Behaviour.SETPOINT),
         Mode(
             "SMART_RTL",
@@ -62,9 +73,19 @@ def heartbeat(now: Condition) -> tuple[int, int]:
 _CUSTOM_MODE_ENABLED = 1
 # Modes that it has and does not enter here, as it enters some only under conditions
 _NOT_ENTERED = {
-    14: "FLIP", 15: "AUTOTUNE", 18: "THROW", 19: "AVOID_ADSB", 22: "FLOWHOLD", 23: "FOLLOW",
-    24: "ZIGZAG", 25: "SYSTEMID", 27: "AUTO RTL", 28: "TURTLE",
-}  # fmt: skip
+    **{
+        number: f"{title} failed: init failed"
+        for number, title in (
+            (14, "FLIP"),
+            (15, "AUTOTUNE"),
+            (22, "FLOWHOLD"),
+            (23, "FOLLOW"),
+            (25, "SYSTEMID"),
+            (28, "TURTLE"),
+        )
+    },
+    27: "AUTO RTL failed: No return path or landing sequence found",
+}
 _BY_NUMBER = {mode.custom_mode: mode.name for mode in MODES.values()}
 
 
@@ -76,7 +97,7 @@ def command_mode(params: tuple[float, ...]) -> ModeRequest:
     known = _BY_NUMBER.get(number)
     said = f"No such mode {number}"
     if number in _NOT_ENTERED:
-        said = f"Mode change to {_NOT_ENTERED[number]} failed: init failed"
+        said = f"Mode change to {_NOT_ENTERED[number]}"
     return ModeRequest(known, Result.FAILED, None if known else Say(Severity.WARNING, said))
 
 
@@ -93,7 +114,7 @@ def arm_wish(param: float) -> ArmWish:
 
 
 # Taken by their receivers, which change nothing that shows here, or failed without their devices
-_TAKEN = (115, 181, 195, 197, 203, 206, 207, 208, 401, 2001, 5300, 42003, 42424)
+_TAKEN = (115, 181, 195, 197, 203, 206, 207, 208, 401, 2001, 5300, 42001, 42003, 42424)
 _FAILED = (84, 178, 183, 184, 189, 193, 205, 211, 218, 500, 2000, 2500)
 COMMAND_ANSWERS: dict[int, Result | None] = {
     **dict.fromkeys(_TAKEN, Result.ACCEPTED),

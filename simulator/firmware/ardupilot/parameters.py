@@ -109,4 +109,5 @@ ROLES: dict[str, Role] = {
     "crawl_speed_mps": 0.0,
     "return_descends_to_m": math.inf,
     "return_waits_s": ("RTL_LOIT_TIME", 1e-3),
+    "return_settles_s": 1.8,  # stops and turns first
 }

@@ -16,6 +16,7 @@ BOOT = {
     "attitude": 5.90,
     "gps": 9.83,
     "origin": 20.02,
+    "other origin": 20.21,
     "gyros": 24.0,
     "reminder": 30.45,
     "position": 41.61,
@@ -42,6 +43,16 @@ _ORIGIN_AND_HOME = ("GPS_GLOBAL_ORIGIN", "HOME_POSITION")
 _ARMING = Rule("arm", do=("arm",), say=_info("Arming motors"), send=_ORIGIN_AND_HOME)
 _DISARMING = _info("Disarming motors")
 
+_FOR_GOOD = ("failsafe", "latch")
+# FS_GCS_ENABLE 6 looks for a landing sequence in the mission first
+_INSTEAD = {
+    ("ground station lost", 6): (
+        _warning("Unable to start landing sequence"),
+        _warning("Mode change to AUTO RTL failed: No return path or landing sequence found"),
+        _warning("Trying RTL Mode"),
+    ),
+}
+
 _FAILSAFE = {
     "ground station lost": (_warning("GCS Failsafe"),),
     "battery low": (
@@ -55,7 +66,9 @@ _FAILSAFE = {
 }
 
 
-def _failsafe(event: str, parameter: str, modes: Mapping[int, str]) -> list[Rule]:
+def _failsafe(
+    event: str, parameter: str, modes: Mapping[int, str], do: tuple[str, ...] = ("failsafe",)
+) -> list[Rule]:
     """At once to the mode that the parameter's value names, unless it stands disarmed."""
     say, *also = _FAILSAFE[event]
     return [
@@ -63,9 +76,9 @@ def _failsafe(event: str, parameter: str, modes: Mapping[int, str]) -> list[Rule
             event,
             when=("armed", f"{parameter}={value}"),
             to=mode,
-            do=("failsafe",),
+            do=do,
             say=say,
-            also=tuple(also),
+            also=(*also, *_INSTEAD.get((event, value), ())),
             send=_HEARTBEAT,
         )
         for value, mode in modes.items()
@@ -111,9 +124,10 @@ RULES = (
     Rule(
         "origin",
         say=_info("EKF3 IMU0 origin set"),
-        also=(_info("Field Elevation Set: 584m"), _info("EKF3 IMU1 origin set")),
+        also=(_info("Field Elevation Set: 584m"),),
         send=_ORIGIN_AND_HOME,
     ),
+    Rule("other origin", say=_info("EKF3 IMU1 origin set")),
     Rule(
         "reminder",
         when=("not armed", "position missing"),
@@ -128,6 +142,14 @@ RULES = (
     Rule("mode", when=("not armed",), to="requested", send=_HEARTBEAT),
     Rule("mode", when=("not position missing",), to="requested", send=_HEARTBEAT),
     Rule("mode", result=_FAILED, say=_NO_POSITION),
+    Rule("loiter", when=("not position missing",), to="LOITER", send=_HEARTBEAT),
+    Rule("loiter", result=_FAILED),
+    Rule("mission", when=("not position missing",), to="AUTO", send=_HEARTBEAT),
+    Rule("mission", result=_FAILED),
+    Rule("mission progress", send=("MISSION_CURRENT",)),
+    Rule("item reached", send=("MISSION_ITEM_REACHED",)),
+    Rule("mission return", "AUTO", to="RTL", send=_HEARTBEAT),
+    Rule("mission finished", when=("landed",), do=("disarm",), say=_DISARMING),
     Rule("takeoff", "GUIDED", when=("armed", "landed", "climb asked"), do=("take off",)),
     Rule("takeoff", "GUIDED", when=("armed", "climbing", "climb asked"), do=("take off",)),
     Rule("takeoff", result=_FAILED),
@@ -142,7 +164,21 @@ RULES = (
         result=_FAILED,
         say=_critical("Arm: System not initialised"),
     ),
-    Rule("arm", when=("faulty",), result=_FAILED, say=_critical("Arm: Internal Errors 0x400")),
+    Rule(
+        "arm",
+        when=("latched thrust not a number",),
+        result=_FAILED,
+        say=_critical("Arm: Internal Errors 0x400"),
+    ),
+    *(
+        Rule(
+            "arm",
+            when=(f"latched {event}",),
+            result=_FAILED,
+            say=_critical("Arm: Battery failsafe"),
+        )
+        for event in ("battery low", "battery critical")
+    ),
     Rule(
         "arm",
         when=("not reached attitude",),
@@ -153,6 +189,13 @@ RULES = (
             _critical("Arm: EKF attitude is bad"),
             _critical("Arm: AHRS: waiting for home"),
         ),
+    ),
+    Rule(
+        "arm",
+        "AUTO",
+        when=("mission missing",),
+        result=_FAILED,
+        say=_critical("Arm: Mode requires mission"),
     ),
     Rule(
         "arm",
@@ -193,8 +236,8 @@ RULES = (
         do=("recover",),
         say=_warning("GCS Failsafe Cleared"),
     ),
-    *_failsafe("battery low", "BATT_FS_LOW_ACT", _BATTERY_MODES),
-    *_failsafe("battery critical", "BATT_FS_CRT_ACT", _BATTERY_MODES),
+    *_failsafe("battery low", "BATT_FS_LOW_ACT", _BATTERY_MODES, _FOR_GOOD),
+    *_failsafe("battery critical", "BATT_FS_CRT_ACT", _BATTERY_MODES, _FOR_GOOD),
     Rule("battery low", say=_FAILSAFE["battery low"][0]),
     Rule("battery critical", say=_FAILSAFE["battery critical"][0]),
     Rule("thrust not a number", do=("latch",)),

@@ -105,6 +105,7 @@ PX4 = Firmware(
     sensors=Sensors(0x0300402F, 0x0301402F, 0x0330C83F, first_fix_s=3.0),
     position_grid_steps=2,
     boot={},
+    mission_first=0,
     missions_strictly=True,
     mode_acked_twice=True,
     text_to_ground_stations_only=True,

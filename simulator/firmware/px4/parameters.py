@@ -111,4 +111,5 @@ ROLES: dict[str, Role] = {
     "crawl_speed_mps": "MPC_LAND_CRWL",
     "return_descends_to_m": "RTL_DESCEND_ALT",
     "return_waits_s": "RTL_LAND_DELAY",
+    "return_settles_s": 0.0,
 }
