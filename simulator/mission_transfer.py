@@ -132,6 +132,19 @@ class Transfer:
         self._upload = None
         self._acknowledge(upload.peer, Ack.ACCEPTED)
 
+    def _heard_ack(self, message: Message, now_s: float) -> None:
+        """The peer wants to be asked in the other kind, or no more."""
+        peer, upload = (message.system, message.component), self._upload
+        if self._download is not None and self._download.peer == peer:
+            self._download = None
+        if upload is None or upload.peer != peer:
+            return
+        if message.type == Ack.UNSUPPORTED:
+            self._whole = not self._whole
+            self._ask(upload, now_s)
+        elif message.type == Ack.CANCELLED:
+            self._upload = None
+
     def _acknowledge(self, peer: tuple[int, int], ack: Ack, kind: int = 0) -> None:
         self.link.send("MISSION_ACK", *peer, int(ack), kind)
 
@@ -197,6 +210,7 @@ def _whole(value: float) -> int:
 
 
 HANDLERS: dict[str, Callable[[Transfer, Message, float], None]] = {
+    "MISSION_ACK": Transfer._heard_ack,
     "MISSION_COUNT": Transfer._count,
     "MISSION_ITEM": Transfer._item,
     "MISSION_ITEM_INT": Transfer._item,

@@ -104,6 +104,18 @@ def test_items_go_down_in_order_or_the_download_ends() -> None:
     assert bench.texts() == ["WPM: REJ. CMD: Req. WP was unexpected"]
 
 
+def test_who_knows_whole_coordinates_alone_says_so_and_may_stop() -> None:
+    bench = Bench()
+    bench.send(mavlink.MAVLink_mission_count_message(1, 1, 2))
+    bench.send(mavlink.MAVLink_mission_ack_message(1, 1, 3))  # unsupported
+    bench.run(0.02)
+    assert [m.seq for _, m in bench.of("MISSION_REQUEST")] == [0]
+    assert [m.seq for _, m in bench.of("MISSION_REQUEST_INT")] == [0]
+    bench.send(mavlink.MAVLink_mission_ack_message(1, 1, 15))  # cancelled
+    bench.run(1.0)
+    assert asked(bench) == [0, 0]
+
+
 def test_items_that_do_not_come_are_asked_for_again_and_given_up() -> None:
     bench = Bench()
     bench.send(mavlink.MAVLink_mission_count_message(1, 1, 2))
