@@ -13,11 +13,12 @@ import math
 from offboard.control.delay_margin import needed_margin, supported_bandwidth
 from offboard.control.identification import Identified
 from offboard.control.response_fit import Estimate, Unexplained
-from offboard.flight.takeover import bounded, mixed, told, with_link
+from offboard.flight.takeover import LINK_S, bounded, later, mixed, told, with_link
 from offboard.model.vehicle import Vehicle
 
 BETTER = 0.7  # another look at the tilt is taken if its delay is this much surer, and one before
 # if it leaves this much less unexplained
+DIRECT_LINK_S = 0.01  # of the vehicle file's delay: telemetry's age where nothing is in between
 LEAST_JUMP_S, JUMP_SDS = 0.015, 4.0  # delays further apart contradict each other
 DECISIVE = ("tilt", "hover_thrust")  # far from the vehicle file's, the flight ends
 MOST_DOUBTS = 2  # so often contradicted, the bandwidth stays low for good
@@ -83,6 +84,18 @@ class Belief:
         return all(abs(drag.value - each) > max(least_ps, drag.sd) for each in known)
 
     # ------------------------------------------------------------------ what was found
+
+    def expect_link(self, late: Estimate, file_delay_s: float) -> list[str]:
+        """The link's delay is known before the flight: what remains unknown is what the vehicle
+        file may be wrong by, `file_delay_s`, and the link's own scatter."""
+        added_s = late.value - DIRECT_LINK_S
+        sentences = []
+        if added_s >= LINK_S:
+            self.target = self.now = self._from = self._before = later(self._file, added_s)
+            sentences = [f"the link is {_told(late)} late, telemetry and setpoint together"]
+        self.cautious_radps = self._borne(file_delay_s + JUMP_SDS * late.sd)
+        self.limit_radps = self.cautious_radps
+        return sentences
 
     def take(self, found: Identified, time_s: float) -> list[str]:
         """Set out for what was found; what was taken, refused or out of bounds, in sentences."""

@@ -18,6 +18,7 @@ from offboard.flight.assessment import Assessment
 from offboard.flight.decision import Decider, Tick
 from offboard.flight.duties import Duties
 from offboard.flight.emission import Emission, Output
+from offboard.flight.link_delay import LinkDelay
 from offboard.flight.learning import IdentifySettings, Learner
 from offboard.flight.mission import Mission
 from offboard.flight.phases import Limits, Phase
@@ -32,12 +33,16 @@ from offboard.mavlink.events import (
     Moved,
     Origin,
     Reset,
+    TimeAnswer,
 )
 from offboard.mavlink.session import Session
 from offboard.model.vehicle import Vehicle
 
 __all__ = ["Companion", "Outcome", "Output"]
 
+# When the link's delay is asked for with every setpoint; later with every tenth, for the log
+TIMED = (Phase.STREAM, Phase.ENGAGE, Phase.ARM, Phase.TAKEOFF)
+TIMED_EVERY = 10
 BRIDGED_SHARE = 0.3  # of the longest silence, after which level setpoints bridge it
 
 
@@ -70,6 +75,7 @@ class Companion:
         self._bridged_s = 0.0
         self._learner = _learner(vehicle, controller, period_s, learning)
         self._emission = Emission(session, observer, vehicle, self._learner)
+        self._link_delay = LinkDelay()
         readiness = Readiness()
         assessment = Assessment(self.view, session, mission, observer, readiness, limits)
         decider = Decider(
@@ -91,6 +97,7 @@ class Companion:
             decider=decider,
             learner=self._learner,
             emission=self._emission,
+            link_delay=self._link_delay,
         )
         self._duties = Duties(
             view=self.view,
@@ -190,10 +197,13 @@ class Companion:
                 self._observer.on_position(time_s, position, velocity)
                 if self._learner:
                     self._learner.on_position(time_s, position, velocity)
+            case TimeAnswer():
+                self._link_delay.note(event)
             case Moved(peer):
                 self._emission.announce(f"the vehicle is heard from another port now: {peer}")
             case Reset():
                 self._observer.reset()
+                self._link_delay.forget()
                 self._tick = -1
                 self._emission.forget_asking()
                 self._progress.note_reboot()
@@ -211,6 +221,8 @@ class Companion:
         if not self.has_ended():
             tick = Tick(time_s, self.phase, self._progress.in_phase_s, arrived_s, missed)
             self._duties.act(tick)
+            if tick.phase in TIMED or number % TIMED_EVERY == 0:
+                self._emission.send(self._link_delay.question(time_s))
 
     def _bridge(self, silence_s: float) -> None:
         """Telemetry stopped: go on without, each period of wall time, until the table ends it."""

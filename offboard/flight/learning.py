@@ -16,7 +16,7 @@ from pydantic import Field
 
 from offboard.control.base import Command
 from offboard.control.identification import identify_drag, identify_tilt, stages
-from offboard.control.response_fit import unexplained
+from offboard.control.response_fit import Estimate, unexplained
 from offboard.control.trace import Recorder
 from offboard.flight.belief import Belief
 from offboard.flight.excitation import LENGTH_S, excited
@@ -134,6 +134,11 @@ class Learner:
         north, east, _ = command.thrust_direction_ned
         share = command.thrust_mps2 / self._belief.now.thrust_max_mps2
         self._recorder.on_command(time_s, (north, east), share, command.course_rad)
+
+    def on_link_delay(self, late: Estimate | None) -> None:
+        """How late the link is, measured before lift-off; None: the vehicle did not tell."""
+        if late is not None:
+            self._sentences += self._belief.expect_link(late, self._settings.file_delay_s)
 
     def on_phase(self, phase: Phase, time_s: float) -> None:
         if not self._settings.online:

@@ -14,6 +14,7 @@ from offboard.flight.assessment import Assessment, Course
 from offboard.flight.decision import Decider
 from offboard.flight.emission import Emission
 from offboard.flight.learning import Learner
+from offboard.flight.link_delay import LinkDelay
 from offboard.flight.mission import Mission
 from offboard.flight.phases import ENDS, ExitCode, Phase
 from offboard.flight.table import Row, next_row
@@ -43,6 +44,7 @@ class Progress:
         decider: Decider,
         learner: Learner | None,
         emission: Emission,
+        link_delay: LinkDelay,
     ) -> None:
         self._view = view
         self._session = session
@@ -52,6 +54,7 @@ class Progress:
         self._decider = decider
         self._learner = learner
         self._emission = emission
+        self._link_delay = link_delay
         self.phase = Phase.CONNECT
         self.outcome: Outcome | None = None
         self.stop_requested = False
@@ -105,6 +108,8 @@ class Progress:
         self._emission.forget_asking()
         self._emission.announce(f"{row.target.value}: {reason}", title="offboard: ")
         if self._learner:
+            if row.target is Phase.CLIMB:
+                self._learner.on_link_delay(self._link_delay.estimate)
             self._learner.on_phase(row.target, self._view.time_s)
         if row.target is Phase.TAKEOFF:
             self._begin_takeoff()

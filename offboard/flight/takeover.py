@@ -46,6 +46,22 @@ def with_link(found: Identified, target: Vehicle, believed: Vehicle) -> Vehicle:
     return target.model_copy(update=update)
 
 
+def later(vehicle: Vehicle, added_s: float) -> Vehicle:
+    """The vehicle behind a link that adds to every delay."""
+    most_s = BOUNDS["delay"][1]
+
+    def axis(response: AxisResponse) -> AxisResponse:
+        return response.model_copy(update={"delay_s": min(response.delay_s + added_s, most_s)})
+
+    return vehicle.model_copy(
+        update={
+            "tilt": axis(vehicle.tilt),
+            "yaw": axis(vehicle.yaw),
+            "thrust_delay_s": min(vehicle.thrust_delay_s + added_s, most_s),
+        }
+    )
+
+
 def bounded(found: Identified, believed: Vehicle, factor: float) -> tuple[Identified, list[str]]:
     """Without what is out of bounds or too far from what was believed; sentences say which."""
     sentences: list[str] = []

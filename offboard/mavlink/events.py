@@ -113,6 +113,14 @@ class Moved:
 
 
 @dataclass(frozen=True, slots=True)
+class TimeAnswer:
+    """TIMESYNC, answered: what we stamped our question with, and the vehicle's time then."""
+
+    asked_ns: int
+    vehicle_ns: int
+
+
+@dataclass(frozen=True, slots=True)
 class Reset:
     """The vehicle's time went backwards by more than reordering explains: it was rebooted."""
 
@@ -132,5 +140,6 @@ Event = (
     | StatusText
     | Parameter
     | Moved
+    | TimeAnswer
     | Reset
 )

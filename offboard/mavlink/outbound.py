@@ -28,7 +28,7 @@ from offboard.mavlink.outgoing import (
     ReferenceRecord,
     SolverRecord,
     StatusTextOut,
-    TimesyncReply,
+    Timesync,
 )
 from offboard.model import frames
 
@@ -282,7 +282,7 @@ def _float32(value: float) -> float:
     return value if not abs(value) > _FLOAT32_MAX else math.copysign(math.inf, value)
 
 
-def _encode_housekeeping(value: Heartbeat | TimesyncReply | StatusTextOut) -> Packed:
+def _encode_housekeeping(value: Heartbeat | Timesync | StatusTextOut) -> Packed:
     if isinstance(value, Heartbeat):
         return _pack(
             mavlink.MAVLink_heartbeat_message,
@@ -293,7 +293,7 @@ def _encode_housekeeping(value: Heartbeat | TimesyncReply | StatusTextOut) -> Pa
             system_status=mavlink.MAV_STATE_ACTIVE,
             mavlink_version=3,
         )
-    if isinstance(value, TimesyncReply):
+    if isinstance(value, Timesync):
         return _pack(mavlink.MAVLink_timesync_message, tc1=value.tc1_ns, ts1=value.ts1_ns)
     return _pack(
         mavlink.MAVLink_statustext_message,

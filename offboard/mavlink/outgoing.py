@@ -102,8 +102,8 @@ class Heartbeat:
 
 
 @dataclass(frozen=True, slots=True)
-class TimesyncReply:
-    """TIMESYNC: our time, and the asker's stamp returned unchanged."""
+class Timesync:
+    """TIMESYNC. Answer: our time, and the asker's stamp unchanged; question: 0 and our stamp."""
 
     tc1_ns: int
     ts1_ns: int
@@ -158,7 +158,7 @@ Outgoing = (
     | ParamRead
     | ParamSet
     | Heartbeat
-    | TimesyncReply
+    | Timesync
     | StatusTextOut
     | ReferenceRecord
     | SolverRecord

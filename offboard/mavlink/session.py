@@ -19,14 +19,14 @@ from offboard.mavlink import framing, inbound, outbound
 from offboard.mavlink.ardupilot import ARDUPILOT
 from offboard.mavlink.counters import Counters, DropReason, SequenceTracker
 from offboard.mavlink.dialect import TYPE_GCS, TYPE_ONBOARD_CONTROLLER, Dialect, WantedMessage
-from offboard.mavlink.events import Attitude, Event, LocalPosition, Moved, Reset, VehicleFound
+from offboard.mavlink.events import Attitude, Event, LocalPosition, Moved, Reset, TimeAnswer, VehicleFound
 from offboard.mavlink.inbound import Address
 from offboard.mavlink.outgoing import (
     CommandLong,
     Heartbeat,
     Outgoing,
     Record,
-    TimesyncReply,
+    Timesync,
 )
 from offboard.mavlink.peer import Peer
 from offboard.mavlink.px4 import PX4
@@ -144,8 +144,10 @@ class Session:
             tc1_ns, ts1_ns = inbound.decode_timesync(frame.payload)
             if tc1_ns == 0:
                 # at time 0 the answer would be taken for a question
-                replies.append(TimesyncReply(max(1, int(now_s * 1e9)), ts1_ns))
-            return tc1_ns == 0
+                replies.append(Timesync(max(1, int(now_s * 1e9)), ts1_ns))
+            elif self.vehicle is not None:
+                events.append(TimeAnswer(ts1_ns, tc1_ns))
+            return True
         return self._interpret(frame, now_s, events)
 
     def _stranger(

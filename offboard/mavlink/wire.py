@@ -18,7 +18,7 @@ from offboard.mavlink.outgoing import (
     ReferenceRecord,
     SolverRecord,
     StatusTextOut,
-    TimesyncReply,
+    Timesync,
 )
 
 __all__ = [
@@ -35,7 +35,7 @@ __all__ = [
     "ReferenceRecord",
     "SolverRecord",
     "StatusTextOut",
-    "TimesyncReply",
+    "Timesync",
     "decode",
     "encode",
     "normalised_thrust",
