@@ -64,6 +64,7 @@ class History:
     setpoint: t, wall time s, w, x, y, z, thrust (SET_ATTITUDE_TARGET); NaN from the third on where
         the autopilot's own position loop was given one
     identified: t, then what `flight.takeover.record_of` says
+    link_delay: t of the telemetry a question was stamped with, s until it arrived (TIMESYNC)
     """
 
     position: Array
@@ -74,6 +75,7 @@ class History:
     record_time_s: Array
     records: tuple[TickRecord, ...]
     identified: Array
+    link_delay: Array
     phases: tuple[Happening, ...]
     modes: tuple[Happening, ...]
     said: tuple[Happening, ...]
@@ -115,6 +117,7 @@ def gather(log: Tlog) -> History:
         record_time_s=np.array([time_s for time_s, _ in records]),
         records=tuple(record for _, record in records),
         identified=np.array(identified, dtype=np.float64).reshape(-1, 1 + IDENTIFIED_SIZE),
+        link_delay=_link_delay(ours, theirs),
         phases=_phases(ours, clock),
         modes=_modes(theirs, clock, dialect),
         said=_said(theirs, clock),
@@ -208,6 +211,14 @@ def _setpoints(ours: _Party) -> Array:
     rows[:, 1] = stamps
     rows[: len(aims), 2:] = aims
     return rows[np.argsort(np.concatenate([ours.places(kind) for kind in kinds]))]
+
+
+def _link_delay(ours: _Party, theirs: _Party) -> Array:
+    """By the answers to our own questions."""
+    questions, answers = (party.columns("TIMESYNC", "ts1 tc1") for party in (ours, theirs))
+    asked = questions[questions[:, 1] == 0.0, 0]
+    answered = answers[(answers[:, 1] != 0.0) & np.isin(answers[:, 0], asked)]
+    return np.column_stack((answered[:, 0], answered[:, 1] - answered[:, 0])) * 1e-9
 
 
 def _truth(theirs: _Party, clock: _Clock) -> Array:

@@ -54,11 +54,15 @@ def setpoints(history: History) -> dict[str, float]:
 
 
 def delay(history: History) -> dict[str, float]:
-    """The last one that the flight identified."""
+    """The link's own, and the last one that the flight identified, vehicle included."""
+    values = {}
+    if len(history.link_delay):
+        late_ms = 1e3 * history.link_delay[:, 1]
+        values["link_delay_p50_ms"], values["link_delay_p99_ms"] = np.percentile(late_ms, (50, 99))
     known = history.identified[np.isfinite(history.identified[:, 1])]
-    if not len(known):
-        return {}
-    return {"delay_ms": 1e3 * float(known[-1, 1]), "delay_sd_ms": 1e3 * float(known[-1, 2])}
+    if len(known):
+        values["delay_ms"], values["delay_sd_ms"] = 1e3 * known[-1, 1:3]
+    return {name: float(value) for name, value in values.items()}
 
 
 def _hz(rows: Array) -> float:

@@ -80,6 +80,8 @@ class Score:
     attitude_hz: float = _figure("ATTITUDE_QUATERNION received", "Hz")
     position_gap_max_s: float = _figure("largest gap between positions, vehicle time", "s")
     stale_share: float = _figure("share of positions that came again or after newer ones")
+    link_delay_p50_ms: float = _figure("age of the telemetry when its setpoint arrived", "ms")
+    link_delay_p99_ms: float = _figure("the same, 99th percentile", "ms")
     delay_ms: float = _figure("delay identified, newest telemetry to effect", "ms")
     delay_sd_ms: float = _figure("its standard deviation", "ms")
     hover_thrust: float = _figure("normalised hover thrust, estimated at the end")

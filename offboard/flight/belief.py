@@ -18,7 +18,7 @@ from offboard.model.vehicle import Vehicle
 
 BETTER = 0.7  # another look at the tilt is taken if its delay is this much surer, and one before
 # if it leaves this much less unexplained
-DIRECT_LINK_S = 0.01  # of the vehicle file's delay: telemetry's age where nothing is in between
+DIRECT_LINK_S = 0.004  # of the vehicle file's delay: telemetry's age where nothing is in between
 LEAST_JUMP_S, JUMP_SDS = 0.015, 4.0  # delays further apart contradict each other
 DECISIVE = ("tilt", "hover_thrust")  # far from the vehicle file's, the flight ends
 MOST_DOUBTS = 2  # so often contradicted, the bandwidth stays low for good
@@ -44,7 +44,7 @@ class Belief:
         self._period_s = period_s
         self._bandwidth_radps = bandwidth_radps
         self.target = vehicle
-        self.cautious_radps = self._borne(unknown_delay_s)
+        self._unknown_delay_s = unknown_delay_s
         self.reset()
 
     def reset(self) -> None:
@@ -56,7 +56,7 @@ class Belief:
         self._doubts = 0
         self.delay: Estimate | None = None  # of the tilt, once identified
         self.doubted = False
-        self.limit_radps = self.cautious_radps
+        self.limit_radps = self.cautious_radps = self._borne(self._unknown_delay_s)
         self.contradiction = ""  # why this vehicle file must not be flown with
 
     # ------------------------------------------------------------------ on the way
@@ -85,16 +85,16 @@ class Belief:
 
     # ------------------------------------------------------------------ what was found
 
-    def expect_link(self, late: Estimate, file_delay_s: float) -> list[str]:
-        """The link's delay is known before the flight: what remains unknown is what the vehicle
-        file may be wrong by, `file_delay_s`, and the link's own scatter."""
+    def expect_link(self, late: Estimate) -> list[str]:
+        """The link's delay is known before the flight: what remains unknown is the vehicle's own,
+        and the link's scatter."""
         added_s = late.value - DIRECT_LINK_S
         sentences = []
         if added_s >= LINK_S:
             self.target = self.now = self._from = self._before = later(self._file, added_s)
             sentences = [f"the link is {_told(late)} late, telemetry and setpoint together"]
-        self.cautious_radps = self._borne(file_delay_s + JUMP_SDS * late.sd)
-        self.limit_radps = self.cautious_radps
+        unknown_s = self._unknown_delay_s + JUMP_SDS * late.sd
+        self.limit_radps = self.cautious_radps = self._borne(unknown_s)
         return sentences
 
     def take(self, found: Identified, time_s: float) -> list[str]:

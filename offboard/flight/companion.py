@@ -18,8 +18,8 @@ from offboard.flight.assessment import Assessment
 from offboard.flight.decision import Decider, Tick
 from offboard.flight.duties import Duties
 from offboard.flight.emission import Emission, Output
-from offboard.flight.link_delay import LinkDelay
 from offboard.flight.learning import IdentifySettings, Learner
+from offboard.flight.link_delay import LinkDelay
 from offboard.flight.mission import Mission
 from offboard.flight.phases import Limits, Phase
 from offboard.flight.progress import Outcome, Progress

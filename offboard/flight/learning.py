@@ -138,7 +138,7 @@ class Learner:
     def on_link_delay(self, late: Estimate | None) -> None:
         """How late the link is, measured before lift-off; None: the vehicle did not tell."""
         if late is not None:
-            self._sentences += self._belief.expect_link(late, self._settings.file_delay_s)
+            self._sentences += self._belief.expect_link(late)
 
     def on_phase(self, phase: Phase, time_s: float) -> None:
         if not self._settings.online:

@@ -1,7 +1,7 @@
 """How late the link is, by the vehicle's own clock.
 
-A TIMESYNC answer gives back our stamp beside the vehicle's time. Stamped with the vehicle time of the
-newest telemetry and sent with a setpoint, it says how old that telemetry was when the setpoint
+A TIMESYNC answer gives back our stamp beside the vehicle's time. Stamped with the vehicle time of
+the newest telemetry and sent with a setpoint, it says how old that telemetry was when the setpoint
 arrived: what the link adds to the delay between telemetry and effect, both ways together. No clock
 of ours is in it, and the answer's own way back is not either.
 """

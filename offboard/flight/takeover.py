@@ -15,12 +15,12 @@ from offboard.model.vehicle import AxisResponse, Vehicle
 
 # Least and greatest value, and what a delay may differ by whatever the factor.
 BOUNDS = {
-    "delay": (0.0, 0.45),
+    "delay": (0.0, 0.5),
     "frequency": (2.0, 45.0),
     "damping": (0.2, 2.5),
     "hover thrust": (0.1, 0.8),
     "thrust lag": (0.0, 0.25),
-    "thrust delay": (0.0, 0.45),
+    "thrust delay": (0.0, 0.5),
     "drag": (0.02, 3.0),
 }
 LINK_S = 0.03  # a smaller difference of delays is the vehicle's

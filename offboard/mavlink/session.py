@@ -19,7 +19,15 @@ from offboard.mavlink import framing, inbound, outbound
 from offboard.mavlink.ardupilot import ARDUPILOT
 from offboard.mavlink.counters import Counters, DropReason, SequenceTracker
 from offboard.mavlink.dialect import TYPE_GCS, TYPE_ONBOARD_CONTROLLER, Dialect, WantedMessage
-from offboard.mavlink.events import Attitude, Event, LocalPosition, Moved, Reset, TimeAnswer, VehicleFound
+from offboard.mavlink.events import (
+    Attitude,
+    Event,
+    LocalPosition,
+    Moved,
+    Reset,
+    TimeAnswer,
+    VehicleFound,
+)
 from offboard.mavlink.inbound import Address
 from offboard.mavlink.outgoing import (
     CommandLong,

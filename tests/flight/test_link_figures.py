@@ -8,7 +8,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from faults import late, losing, repeating, stuttering
+from faults import late, losing, repeating, stuttering, without
 from pair import Filter, Pair, make, through
 
 from offboard.analysis.score import Score
@@ -17,12 +17,17 @@ from offboard.flight.learning import IdentifySettings
 LAP = ("controller={law: lqr}", "reference.laps=1", "reference.height_m=1.0")
 PLAIN_DELAY_MS = 57.0  # of the vehicle itself
 SENT_HZ = 100.0
+TIMESYNC = 111
+
+
+def over(down: Filter) -> Pair:
+    return make(
+        *LAP, scenario="px4_like", vehicle="px4_sih", down=down, learning=IdentifySettings()
+    )
 
 
 def flown_over(down: Filter, directory: Path) -> Score:
-    pair = make(
-        *LAP, scenario="px4_like", vehicle="px4_sih", down=down, learning=IdentifySettings()
-    )
+    pair = over(down)
     assert pair.fly().exit_code == 0
     return pair.score(directory)
 
@@ -44,9 +49,19 @@ def test_delay_and_repetitions_are_told(
     assert score.stale_share == pytest.approx(stale_share, abs=0.01)
     assert score.delay_ms == pytest.approx(PLAIN_DELAY_MS + later_ms, abs=10.0)
     assert 0.0 < score.delay_sd_ms < 10.0
+    assert score.link_delay_p50_ms == pytest.approx(later_ms, abs=5.0)
     assert score.rmse_position_m < rmse_m
     assert score.position_hz == pytest.approx(SENT_HZ, rel=0.02)
     assert score.position_gap_max_s == pytest.approx(1.0 / SENT_HZ, abs=0.007)
+
+
+def test_a_slow_link_is_known_before_it_is_flown_on(tmp_path: Path) -> None:
+    """0.3 s: the vehicle's answers to TIMESYNC are what keeps it in the air."""
+    assert flown_over(late(0.3), tmp_path).rmse_position_m < 0.15
+    silent, slow = without(TIMESYNC), late(0.3)
+    unasked = over(lambda time_s, datagrams: slow(time_s, silent(time_s, datagrams)))
+    outcome = unasked.fly()
+    assert (outcome.exit_code, outcome.sentence[-13:]) == (4, "(limit 5.0 m)")
 
 
 def test_gaps_of_a_link_that_loses_are_told(tmp_path: Path) -> None:

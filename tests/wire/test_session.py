@@ -12,7 +12,7 @@ from vehicle_frames import ARDUPILOT, OFFBOARD, PEER, PX4, Sender, pinned, under
 from offboard.mavlink import events
 from offboard.mavlink.counters import DropReason
 from offboard.mavlink.session import Session, SessionSettings
-from offboard.mavlink.wire import Heartbeat
+from offboard.mavlink.wire import Heartbeat, Timesync
 
 STRANGER = ("10.0.0.9", 4000)
 Triple = tuple[float, float, float]
@@ -441,7 +441,11 @@ def test_timesync_is_answered_after_the_events_of_its_datagram() -> None:
     (reply,) = (understood(session.encode(reply)) for reply in reception.replies)
     assert (reply.tc1, reply.ts1) == (2_500_000_000, 123_456_789_012)
     answer = vehicle.frame(mavlink.MAVLink_timesync_message(1, 2))
-    assert session.receive(answer, PEER, 2.5).replies == ()
+    reception = session.receive(answer, PEER, 2.5)
+    assert reception.replies == ()
+    assert reception.events == (events.TimeAnswer(asked_ns=2, vehicle_ns=1),)
+    question = understood(session.encode(Timesync(0, 77)))
+    assert (question.tc1, question.ts1) == (0, 77)
 
 
 def test_timesync_is_answered_before_the_first_heartbeat() -> None:
