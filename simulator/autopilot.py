@@ -317,7 +317,7 @@ class Autopilot:
         lost_s = self._setpoint_s + self.firmware.stream_reaction_s
         lost_s += self.parameters.role("stream_timeout_s")
         watched = self.armed and self.mode.behaviour is Behaviour.SETPOINT
-        return min(until_s, lost_s) if watched or lost_s >= now_s else until_s
+        return max(now_s, min(until_s, lost_s)) if watched or lost_s >= now_s else until_s
 
     def flown(self, count: int) -> None:
         """The plant is so many steps further, in which nothing happened."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import Counter
 from collections.abc import Callable, Iterator
 
@@ -27,12 +28,20 @@ SEED = 7
 
 
 def _instance(
-    firmware: Firmware = PX4, *, ground_link: bool = False, battery: Battery | None = None
+    firmware: Firmware = PX4,
+    *,
+    ground_link: bool = False,
+    battery: Battery | None = None,
+    boot_scale: float = 1.0,
 ) -> Instance:
     return Instance(
         firmware,
         config.vehicle(firmware.vehicle),
-        Conditions(estimator=EstimatorName.PX4_LIKE, battery=battery or Battery()),
+        Conditions(
+            estimator=EstimatorName.PX4_LIKE,
+            battery=battery or Battery(),
+            boot_scale=boot_scale,
+        ),
         SEED,
         lockstep=True,
         ground_link=ground_link,
@@ -99,6 +108,34 @@ def test_a_flight_in_stretches_has_the_bytes_of_single_steps(
     expected = _flown(one, _single_steps, 27.0)
     assert _flown(other, Instance.advance_to_barrier, 27.0) == expected
     assert one.steps == other.steps == 6_750
+
+
+def test_an_arducopter_flies_in_stretches_without_a_setpoint_and_behind_the_last() -> None:
+    """In GUIDED: takeoff, hold, a velocity of which the stream stops, hold."""
+    command = mavlink.MAVLink_command_long_message
+    velocity = mavlink.MAVLink_set_position_target_local_ned_message(
+        0, 1, 1, 1, 0b1101_1100_0111, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0
+    )
+    script = {
+        4.0: command(1, 1, 176, 0, 1, 4, 0, 0, 0, 0, 0),
+        4.1: command(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0),
+        4.2: command(1, 1, 22, 0, 0, 0, 0, 0, 0, 0, 5),
+        13.0: velocity,
+    }
+    codec = mavlink.MAVLink(None, 255, 190)
+    said: list[list[bytes]] = []
+    for step in (Instance.advance, Instance.tick):
+        instance = _instance(ARDUPILOT, boot_scale=0.05)
+        said.append([])
+        for at_s, until_s in itertools.pairwise((0.0, *script, 20.0)):
+            if at_s in script:
+                instance.feed(script[at_s].pack(codec))
+            while instance.time_s < until_s:
+                step(instance)
+                said[-1] += instance.drain()
+        assert instance.autopilot.truth.position_ned_m[2] == pytest.approx(-5.0, abs=0.5)
+        assert instance.autopilot.truth.position_ned_m[0] > 2.0
+    assert said[0] == said[1]
 
 
 def test_stretches_end_before_a_battery_is_found_empty() -> None:
