@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 from attitude_plant import Lemniscate, Truth, fly
 from scipy.integrate import solve_ivp
-from test_tracking_law import PX4, law_of
+from test_law_signs import at
+from test_tracking_law import PX4, G, law_of
 
 from offboard.control.response import thrust_ripple, tilt_ripple
+from offboard.control.tracking import TrackingLaw
+from offboard.reference.base import FlatSample
 
 PERIOD_S = 0.1
 HOLDS = 60
@@ -35,6 +40,34 @@ def test_ripple_is_what_a_staircase_leaves_where_it_steps() -> None:
     off = _after(held=True) - _after(held=False)
     assert tilt_ripple(PX4, PERIOD_S) == pytest.approx(off[:2], abs=1e-6)
     assert thrust_ripple(PX4, PERIOD_S) == pytest.approx(off[2], abs=1e-6)
+
+
+@dataclass
+class Jerking:
+    """At rest, level and unaccelerated at 0.057 s, with a constant jerk, NED."""
+
+    jerk_ned_mps3: tuple[float, float, float]
+    duration_s = 3600.0
+
+    def sample(self, time_s: float | np.ndarray) -> FlatSample:
+        time = np.asarray(time_s, dtype=np.float64)[..., None] - 0.057
+        jerk = np.array(self.jerk_ned_mps3) + 0.0 * time
+        none, still = np.zeros_like(jerk), np.zeros_like(time[..., 0])
+        position, velocity = time**3 / 6.0 * jerk, 0.5 * time**2 * jerk
+        return FlatSample(position, velocity, time * jerk, jerk, none, still, still, still)
+
+
+def test_the_target_ripples_as_the_staircase_does() -> None:
+    """Of a jerk of 1 m/s^3 b_c is a ramp of -1 / g per second, T one of -1 m/s^2 per second."""
+    law = TrackingLaw(PX4.model_copy(update={"drag_translation_npmps": (0.0,) * 3}))
+    off = _after(held=True) - _after(held=False)
+    level = at((0.0, 0.0, 0.0), 0.0)
+    target = law.target(Jerking((1.0, -1.0, 0.0)), 0.0, level)
+    assert target.direction_ne == pytest.approx(np.array([-1.0, 1.0]) / G * off[0], rel=1e-3)
+    leaning = np.array([-1.0, 1.0]) / G
+    assert target.direction_rate_ne_ps == pytest.approx(leaning * (1.0 + off[1]), rel=1e-3)
+    climbing = law.target(Jerking((0.0, 0.0, 1.0)), 0.0, level)
+    assert climbing.thrust_down_mps2 - G == pytest.approx(-off[2], rel=1e-3)
 
 
 @pytest.mark.parametrize(("heave_m", "most_m"), [(0.0, 0.0002), (0.4, 0.0008)])
