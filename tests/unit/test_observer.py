@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -58,9 +59,15 @@ def hovering(
 
 
 def follow(
-    plant: Plant, observer: Observer, seconds: float, seed: int, gap_s: float = 0.01
+    plant: Plant,
+    observer: Observer,
+    seconds: float,
+    seed: int,
+    gap_s: float = 0.01,
+    about_rad: float = 0.0,
 ) -> list[tuple[PredictedState, np.ndarray]]:
-    """Random tilt and course at 10 Hz to both; predictions and what the plant then was."""
+    """Random tilt, and course `about_rad`, at 10 Hz to both; predictions and what the plant then
+    was."""
     rng = np.random.default_rng(seed)
     pairs, pending = [], []
     for i in range(round(seconds / gap_s)):
@@ -69,9 +76,10 @@ def follow(
         observer.on_position(now, *plant.position())
         if i % round(0.1 / gap_s) == 0:
             pending.append(observer.predict(now))
-            sent = command(*rng.uniform(-0.15, 0.15, 2), G + 0.1, rng.uniform(-0.5, 0.5))
+            course = about_rad + rng.uniform(-0.5, 0.5)
+            sent = command(*rng.uniform(-0.15, 0.15, 2), G + 0.1, course)
             plant.command(sent)
-            observer.on_command(now, sent)
+            observer.on_command(now, replace(sent, course_rad=math.remainder(course, math.tau)))
         # the plant is at multiples of 1 ms, so is the delay
         target = pending[-1].time_s if pending else math.inf
         if now < target <= now + gap_s + 1e-9:
@@ -150,19 +158,25 @@ def test_replay_agrees_with_scipy(damping: float) -> None:
     assert replayed == pytest.approx(x, abs=3e-6)
 
 
-def test_prediction_is_exact_on_a_matching_plant() -> None:
+@pytest.mark.parametrize("about_rad", [0.0, math.pi, -math.pi])
+def test_prediction_is_exact_on_a_matching_plant(about_rad: float) -> None:
+    """Facing south, course, its telemetry and its commands are now on one side of the wrap, now on
+    the other."""
     plant = Plant(Truth(PX4, noisy=False), np.random.default_rng(0))
-    plant.command(LEVEL)
+    plant.x[11] = about_rad
+    plant.command(replace(LEVEL, course_rad=about_rad))
     observer = Observer(PX4, ObserverSettings())
-    observer.on_command(0.0, LEVEL)
-    pairs = follow(plant, observer, 6.0, seed=5)[20:]
+    observer.on_command(0.0, replace(LEVEL, course_rad=about_rad))
+    pairs = follow(plant, observer, 6.0, seed=5, about_rad=about_rad)[20:]
     assert len(pairs) > 30
     for state, truth in pairs:
         assert state.position_ned_m == pytest.approx(truth[:3], abs=2e-4)
         assert state.velocity_ned_mps == pytest.approx(truth[3:6], abs=3e-3)
         assert state.thrust_direction_ned[:2] == pytest.approx(truth[6:8], abs=1e-3)
         assert state.thrust_direction_rate_ned_ps[:2] == pytest.approx(truth[8:10], abs=1e-2)
-        assert state.course_rad == pytest.approx(truth[11], abs=1e-3)
+        assert abs(state.course_rad) <= math.pi
+        apart = math.remainder(state.course_rad - truth[11], math.tau)
+        assert apart == pytest.approx(0.0, abs=1e-3)
 
 
 def test_a_command_shows_in_the_prediction_only_after_its_delay() -> None:
