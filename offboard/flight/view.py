@@ -21,6 +21,7 @@ from offboard.mavlink.events import (
 )
 from offboard.model.frames import course_from_quaternion
 
+OUTAGE_S = 0.3  # a longer gap of all telemetry is the link's, not one message's
 HEARD = 12  # texts and refusals kept for the sentence that explains a failure
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD: a rate that is refused explains no failure
 
@@ -39,6 +40,7 @@ class VehicleView:
     said: deque[str] = field(default_factory=lambda: deque(maxlen=HEARD))
     refused: deque[str] = field(default_factory=lambda: deque(maxlen=HEARD))
     accepted: set[int] = field(default_factory=set)  # commands
+    resumed_s: float = -math.inf  # vehicle time at which telemetry flowed again after an outage
 
     @property
     def time_s(self) -> float:
@@ -48,13 +50,14 @@ class VehicleView:
 
     @property
     def position_age_s(self) -> float:
-        """Vehicle time since the newest position; NaN before any."""
-        return self.time_s - self.position.time_s if self.position else math.nan
+        """Vehicle time since the newest position, an outage of the whole link aside; NaN before
+        any."""
+        return self._age_s(self.position)
 
     @property
     def attitude_age_s(self) -> float:
-        """Vehicle time since the newest attitude; NaN before any."""
-        return self.time_s - self.attitude.time_s if self.attitude else math.nan
+        """The same of the newest attitude."""
+        return self._age_s(self.attitude)
 
     @property
     def in_the_air(self) -> bool:
@@ -86,6 +89,8 @@ class VehicleView:
 
     def note(self, event: Event) -> None:
         """Take one event in."""
+        if isinstance(event, (LocalPosition, Attitude)) and event.time_s > self.time_s + OUTAGE_S:
+            self.resumed_s = event.time_s
         match event:
             case Heartbeat():
                 self.heartbeat = event
@@ -112,10 +117,16 @@ class VehicleView:
             case Reset():
                 self._forget()
 
+    def _age_s(self, newest: LocalPosition | Attitude | None) -> float:
+        if newest is None:
+            return math.nan
+        return self.time_s - max(newest.time_s, self.resumed_s)
+
     def _forget(self) -> None:
         """A vehicle that restarted is in no state that was known before."""
         self.heartbeat = self.health = self.position = self.attitude = None
         self.landed = "unknown"
+        self.resumed_s = -math.inf
         self.parameters.clear()
 
     def explanation(self) -> str:

@@ -67,6 +67,21 @@ def stuttering(hold_s: float, every_s: float) -> Filter:
     return arriving
 
 
+def interrupted(for_s: float) -> Filter:
+    """A link on which nothing arrives for so long, and attitude 50 ms later than the rest."""
+    began: list[float] = []
+    rest = without(ATTITUDE)
+
+    def arriving(time_s: float, datagrams: Bytes) -> Bytes:
+        began.append(time_s)
+        passed_s = time_s - began[0]
+        if passed_s > for_s + 0.05:
+            return datagrams
+        return rest(time_s, datagrams) if passed_s > for_s else []
+
+    return arriving
+
+
 def late(delay_s: float) -> Filter:
     """A link on which everything takes so long."""
     under_way: list[tuple[float, bytes]] = []

@@ -20,6 +20,7 @@ from faults import (
     die,
     downlink,
     failing,
+    interrupted,
     jump,
     kill_motors,
     losing,
@@ -405,6 +406,14 @@ ROWS = (
         "no ATTITUDE_QUATERNION for 0.",
         Phase.DISARMED,
         soft_landing,
+    ),
+    Row(
+        "everything stops for 0.8 s",
+        in_track(downlink(interrupted(0.8))),
+        0,
+        FLOWN,
+        Phase.DISARMED,
+        flown,
     ),
     # the estimate
     Row("a jump of 1 m", in_track(jump(1.0)), 0, FLOWN, Phase.DISARMED, smooth),
