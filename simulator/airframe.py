@@ -136,7 +136,7 @@ def advance_airframe(
     part_s = step_s / substeps
     for _ in range(substeps):
         stands, stand_north, stand_east = rotor[CONTACT] > 0.5, body[10], body[11]
-        rk4_into(body, inputs, wind_ned, body_constants, part_s, scratch, body)
+        rk4_into(body[:], inputs, wind_ned, body_constants, part_s, scratch, body[:])
         rotor[CONTACT] = _touch_ground(body, part_s)
         if stands and rotor[CONTACT] > 0.5 and body[7] == 0.0 and body[8] == 0.0:
             body[10], body[11] = stand_north, stand_east  # gripped: it did not creep either

@@ -135,11 +135,13 @@ def simulate(
         except OSError as error:
             _refuse(f"--log {log} cannot be written: {error.strerror}")
 
-    _announce_compilation()
     parameters = _parameters(personality, param or [])
+    from offboard.model.kernel import Entry
     from simulator.instance import VIRTUAL_EPOCH_US, Instance
     from simulator.run import Berth, Runner, rehearse
 
+    if not Entry.all_kept():
+        _tell("compiling the flight dynamics, once (some seconds)")
     rehearse(Instance(personality, flyer, flown.conditions, seed, lockstep=True))
 
     epoch_us = VIRTUAL_EPOCH_US if lockstep else unix_us()
@@ -245,13 +247,6 @@ class Stop:
 
     def __call__(self) -> bool:
         return self._noted
-
-
-def _announce_compilation() -> None:
-    from offboard.model.compilation import prepare_cache
-
-    if not any(prepare_cache().glob("simulator.stretch.*.o")):
-        _tell("compiling the flight dynamics, once (some seconds)")
 
 
 def main() -> None:

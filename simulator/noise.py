@@ -108,7 +108,7 @@ def _scramble(word: np.uint64) -> np.uint64:
 
 
 @kernel
-def fill_normals(seed: np.uint64, lane: np.uint64, step: int, out: Array) -> None:
+def fill_normals(seed: np.uint64, lane: np.uint64, step: int | np.int64, out: Array) -> None:
     """Fill `out` (n,) with the standard normals of this lane and step (Box-Muller)."""
     key = _scramble(seed + np.uint64(step) * _STEP_STRIDE + lane * _LANE_STRIDE)
     count = out.shape[0]

@@ -242,9 +242,9 @@ class Plant:
         self._due_s += duration_s
         count = int(self._due_s / STEP_S + 1e-6)
         self._due_s -= count * STEP_S
-        if count > 0:
-            _advance.call(count, self.address)
-            self._step += count
+        self._step += count
+        while count > 0:
+            count -= advance_steps.call(count, self.address)
 
     def obey(self, demand: Demand) -> None:
         """From the next step on this is the demand."""
@@ -324,7 +324,7 @@ class Plant:
     @property
     def fix(self) -> Fix:
         """A satellite fix of now; the same however often it is asked within a step."""
-        _receive.call(self.address)
+        receive_fix.call(self.address)
         fix = self.record["fix"][0].copy()
         return Fix(fix[:3], fix[3:])
 
@@ -363,39 +363,19 @@ class Plant:
     def report(self) -> Array:
         """The estimate in one array (REPORT_WIDTH,), laid out as `simulator.sensors` says; it
         changes with the next call."""
-        _report.call(self.address)
+        report_state.call(self.address)
         seen: Array = self._report
         return seen
 
 
 @entry(RECORD)
 def _draw_gusts(plant: Any) -> int:
-    fill_normals(plant.seed, _GUST_LANE, -1, plant.gust_normals)
+    fill_normals(plant.seed, _GUST_LANE, np.int64(-1), plant.gust_normals[:])
     return 0
 
 
 @entry(RECORD)
-def _report(plant: Any) -> int:
-    report_state(plant)
-    return 0
-
-
-@entry(RECORD)
-def _receive(plant: Any) -> int:
-    receive_fix(plant)
-    return 0
-
-
-@entry(int, RECORD)
-def _advance(count: int, plant: Any) -> int:
-    done = 0
-    while done < count:
-        done += advance_steps(count - done, plant)
-    return done
-
-
-@kernel
-def report_state(plant: Any) -> None:
+def report_state(plant: Any) -> int:
     """Fill in the report of this state."""
     report(
         plant.body,
@@ -411,21 +391,23 @@ def report_state(plant: Any) -> None:
         plant.normals,
         plant.report,
     )
+    return 0
 
 
-@kernel
-def receive_fix(plant: Any) -> None:
+@entry(RECORD)
+def receive_fix(plant: Any) -> int:
     """Fill in the satellite fix of this state."""
-    fill_normals(plant.seed, _RECEIVER_LANE, plant.step, plant.fix)
+    fill_normals(plant.seed, _RECEIVER_LANE, plant.step, plant.fix[:])
     for i in range(5):
         plant.fix[i] *= plant.fix_sds[i]
     for i in range(3):
         plant.fix[i] += plant.body[10 + i] + plant.fix_offset[i]
     for i in range(2):
         plant.fix[3 + i] += plant.body[7 + i]
+    return 0
 
 
-@kernel
+@entry(int, RECORD)
 def advance_steps(count: int, plant: Any) -> int:
     """`count` steps in place; the steps done, which are fewer if the ground is touched or left.
 
@@ -441,7 +423,7 @@ def advance_steps(count: int, plant: Any) -> int:
         _move_air(plant, step)
         turn_error[0], turn_error[1] = -error[EAST + 2], error[NORTH + 2]
         turn_error[2] = error[YAW]
-        turn_estimate(plant.body, turn_error, plant.estimated)
+        turn_estimate(plant.body, turn_error[:], plant.estimated[:])
         angular_acceleration(
             plant.estimated,
             plant.body,
@@ -467,17 +449,17 @@ def advance_steps(count: int, plant: Any) -> int:
             plant.slopes,
         )
         if plant.noisy:
-            fill_normals(plant.seed, _ERROR_LANE, step, plant.normals)
+            fill_normals(plant.seed, _ERROR_LANE, step, plant.normals[:])
             for start, end in ERROR_BLOCKS:
                 advance_block(
-                    plant.error_transition,
-                    plant.error_scale,
+                    plant.error_transition[:],
+                    plant.error_scale[:],
                     start,
                     end,
                     noise_gain,
-                    plant.normals,
-                    error,
-                    plant.work,
+                    plant.normals[:],
+                    error[:],
+                    plant.work[:],
                 )
         plant.step = step + 1
         if plant.rotor[CONTACT] != contact:
@@ -491,17 +473,17 @@ def _move_air(plant: Any, step: int) -> None:
     """Steady wind and gusts, along and across it."""
     gust, air, wind = plant.gust, plant.air, plant.wind
     if plant.gusty:
-        fill_normals(plant.seed, _GUST_LANE, step, plant.gust_normals)
+        fill_normals(plant.seed, _GUST_LANE, step, plant.gust_normals[:])
         for start, end in _GUST_BLOCKS:
             advance_block(
-                plant.gust_transition,
-                plant.gust_scale,
+                plant.gust_transition[:],
+                plant.gust_scale[:],
                 start,
                 end,
                 1.0,
-                plant.gust_normals,
-                gust,
-                plant.work,
+                plant.gust_normals[:],
+                gust[:],
+                plant.work[:],
             )
     wind[0] = air[0] + air[3] * gust[0] - air[4] * gust[1]
     wind[1] = air[1] + air[4] * gust[0] + air[3] * gust[1]

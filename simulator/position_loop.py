@@ -125,7 +125,7 @@ class PositionLoop:
         self.demand(duration_s, demand, hover_thrust, speed_xy_mps, speed_up_mps, thrust_least)
         self.record["integrates"] = integrate
         self._estimate[:] = (*position_ned_m, *velocity_ned_mps)
-        _step.call(self.address)
+        step_loop.call(self.address)
         return self.result
 
     def demand(
@@ -161,20 +161,15 @@ class PositionLoop:
 
 
 @entry(RECORD)
-def _step(loop: Any) -> int:
-    step_loop(loop, loop.estimate)
-    return 0
-
-
-@kernel
-def step_loop(loop: Any, estimate: Array) -> None:
-    """One period on this estimate, which begins with position and velocity."""
-    _accelerate(loop, estimate)
+def step_loop(loop: Any) -> int:
+    """One period on the estimate."""
+    _accelerate(loop, loop.estimate)
     if not math.isnan(loop.yaw_rad):
         loop.course_rad = loop.yaw_rad
     elif not math.isnan(loop.yaw_rate_radps):
         loop.course_rad = _wrapped(loop.course_rad + loop.yaw_rate_radps * loop.period_s)
     _compose(loop)
+    return 0
 
 
 @kernel

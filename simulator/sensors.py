@@ -268,7 +268,7 @@ def report(
     Into `out` (REPORT_WIDTH,). `body` is [attitude, rates, velocity, position] as the rigid body
     has it; `acceleration` holds the NED one from place 3 on; `white` (WHITE_COUNT,) is scratch.
     """
-    fill_normals(seed, lane, step, white)
+    fill_normals(seed, lane, step, white[:])
     for i in range(WHITE_COUNT):
         white[i] *= gain * sds[i]
     for axis in range(3):

@@ -217,7 +217,9 @@ def _fly(
 @kernel
 def _hold(plant: Any, loop: Any, seen: Any) -> None:
     """Run the position loop on the estimate and demand what it gives."""
-    step_loop(loop, plant.report)
+    for i in range(6):
+        loop.estimate[i] = plant.report[i]
+    step_loop(loop)
     encode_attitude(loop.attitude, loop.thrust, plant.row)
     for i in range(4):
         seen.attitude[i] = loop.attitude[i]

@@ -28,6 +28,7 @@ from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.flight.sitl import Hangar
 from offboard.mavlink.dialect import POSITIONING_TELEMETRY
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
+from offboard.model.compilation import without_garbage_collection
 from offboard.model.document import DocumentError
 from offboard.model.vehicle import Vehicle
 from offboard.reference.track import Track
@@ -80,6 +81,7 @@ class Crew:
     learning: IdentifySettings | None = None
 
 
+@without_garbage_collection()
 def rehearse(crew: Crew, *, keeps_deadline: bool) -> float:
     """Call every code path of observer and controller, compiled ones included, and forget it.
 

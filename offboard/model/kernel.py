@@ -6,6 +6,9 @@ machine code, with that of all the kernels in it, is compiled once, kept as an o
 numba's own cache and loaded by llvmlite alone. Entries take integers and records (one-element
 structured arrays, by address) and return an integer; they allocate nothing and raise nothing.
 Knows neither vehicle nor controller.
+
+What compiles in seconds: a function is compiled once for each type of its arguments, and of an
+array in a record the size is part of the type; handed on as `record.array[:]` it is not.
 """
 
 from __future__ import annotations
@@ -19,21 +22,22 @@ import tempfile
 from collections.abc import Callable
 from importlib import metadata
 from pathlib import Path
-from typing import Any, Generic, ParamSpec, TypeVar, cast
+from typing import Any, ClassVar, Generic, ParamSpec, TypeVar, cast
 
 import numpy as np
 
-from offboard.model.compilation import is_private, prepare_cache, sources_digest
+from offboard.model.compilation import (
+    is_private,
+    prepare_cache,
+    sources_digest,
+    without_garbage_collection,
+)
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# What machine code may leave to the process it is loaded into; numba's and Python's own are left
-# over from errors that cannot happen here
-_LIBRARY = frozenset(
-    {"sin", "cos", "tan", "asin", "acos", "atan", "atan2", "sincos", "exp", "log", "pow", "sqrt"}
-    | {"hypot", "fmod", "floor", "rint"}
-)
+# Numba's and Python's runtime: left over from errors that cannot happen here
+_RUNTIME = ("NRT_", "Py", "_Py", "numba_")
 _DECLARATION = re.compile(r"^declare (?P<head>[^@\n]*)@(?P<name>[\w.]+)\((?P<rest>.*)$", re.M)
 
 
@@ -72,25 +76,56 @@ kernel = Kernel
 
 
 class Entry:
-    """A kernel in machine code. Call it with integers and the addresses of records."""
+    """A kernel in machine code, and in compiled code a function that is not compiled with it.
+
+    Called from Python, by `call`, it takes integers and the addresses of records; called from a
+    kernel, or from an entry defined later, integers and records.
+    """
+
+    _defined: ClassVar[list[Entry]] = []
 
     def __init__(self, function: Callable[..., int], parameters: tuple[Any, ...]) -> None:
         self._function = function
         self._parameters = parameters
+        self._before = tuple(Entry._defined)
+        Entry._defined.append(self)
         self.symbol = f"{function.__module__}.{function.__name__}"
+
+    def __call__(self, *args: Any) -> int:
+        """What the machine code does, as Python."""
+        return self._function(*args)
 
     @functools.cached_property
     def call(self) -> Callable[..., int]:
         """The machine code as a function; compiled, or read from the cache, when first asked."""
+        *_, place = [entry._address for entry in (*self._before, self)]  # it may call the others
+        kinds = (ctypes.c_int64 if p is int else ctypes.c_void_p for p in self._parameters)
+        prototype = ctypes.CFUNCTYPE(ctypes.c_int64, *kinds)
+        return cast(Callable[..., int], prototype(place))
+
+    @classmethod
+    def all_kept(cls) -> bool:
+        """Whether the machine code of all entries so far need not be compiled."""
+        return all(_read(_place(entry.symbol)) is not None for entry in cls._defined)
+
+    @functools.cached_property
+    def _address(self) -> int:
         path = _place(self.symbol)
         code = _read(path)
         if code is None:
             code = self._compiled()
             _write(path, code)
-        kinds = (ctypes.c_int64 if p is int else ctypes.c_void_p for p in self._parameters)
-        prototype = ctypes.CFUNCTYPE(ctypes.c_int64, *kinds)
-        return cast(Callable[..., int], prototype(_load(code, self.symbol)))
+        return _load(code, self.symbol)
 
+    @property
+    def _numba_type_(self) -> Any:
+        """As numba asks for it: to compiled code an entry is a function somewhere else."""
+        from numba import from_dtype, types
+
+        kinds = (types.int64 if p is int else from_dtype(p) for p in self._parameters)
+        return types.ExternalFunction(self.symbol, types.int64(*kinds))
+
+    @without_garbage_collection()
     def _compiled(self) -> bytes:
         import llvmlite.binding as llvm
         from numba import cfunc, types
@@ -138,7 +173,7 @@ def _self_contained(assembly: str) -> str:
 
     def definition(found: re.Match[str]) -> str:
         name = found["name"]
-        if name.startswith("llvm.") or name in _LIBRARY:
+        if not name.startswith(_RUNTIME):
             return found[0]
         rest = re.sub(r"\s*#\d+|\s*local_unnamed_addr", "", found["rest"])
         return (
@@ -154,7 +189,12 @@ def _self_contained(assembly: str) -> str:
 
 
 def _place(symbol: str) -> Path:
-    """Where the object file of this entry is for these sources, compilers and processor."""
+    return prepare_cache() / f"{symbol}-{_identity()}.o"
+
+
+@functools.cache
+def _identity() -> str:
+    """Of these sources, compilers and this processor: machine code of others is not for us."""
     import llvmlite.binding as llvm
 
     identity = (
@@ -165,8 +205,7 @@ def _place(symbol: str) -> Path:
         llvm.get_host_cpu_name(),
         llvm.get_host_cpu_features().flatten(),
     )
-    key = hashlib.sha256("\0".join(identity).encode()).hexdigest()[:16]
-    return prepare_cache() / f"{symbol}-{key}.o"
+    return hashlib.sha256("\0".join(identity).encode()).hexdigest()[:16]
 
 
 def _read(path: Path) -> bytes | None:
@@ -224,4 +263,6 @@ def _load(code: bytes, symbol: str) -> int:
     engine = _engine()
     engine.add_object_file(llvm.ObjectFileRef.from_data(code))
     engine.finalize_object()
-    return int(engine.get_function_address(symbol))
+    place = int(engine.get_function_address(symbol))
+    llvm.add_symbol(symbol, place)
+    return place
