@@ -152,6 +152,24 @@ def test_signs(name: str, heading_deg: float, check: Callable[..., None]) -> Non
     check(law_named(name), math.radians(heading_deg))
 
 
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+@pytest.mark.parametrize("axis", range(3))
+def test_an_error_that_stays_is_answered_ever_more_by_the_integral(axis: int, sign: float) -> None:
+    """5 cm for 3 s: 0.03 m/s^2 more along north and east, 0.15 along the vertical."""
+    law, off = law_named("pid"), np.zeros(3)
+    off[axis] = 0.05 * sign
+    situation = Situation(0.0, at((off[0], off[1], off[2]), 0.0), Hold((0, 0, 0), 0.0), LEVEL)
+    pushed = []
+    for _ in range(31):
+        command = law.decide(situation).command
+        assert isinstance(command, Command)
+        north, east, _ = command.thrust_direction_ned
+        pushed.append(np.array([north * G, east * G, command.thrust_mps2]))
+    more = np.zeros(3)
+    more[axis] = sign * (0.03, 0.03, 0.15)[axis]
+    assert pushed[-1] - pushed[0] == pytest.approx(more, abs=1e-9)
+
+
 @pytest.mark.parametrize("check", CHECKS)
 @pytest.mark.parametrize("output", ["north", "east", "thrust", "course"])
 @pytest.mark.parametrize("name", TRACKING)
