@@ -81,6 +81,7 @@ class Autopilot:
         self._flown = False
         self._setpoint_s = -math.inf
         self._requested = self._event = ""
+        self.asked_by_planner = False  # the last event, by the component of a ground station
         self._takeoff_z_m = math.nan
         self.gps_healthy = True
         self._watch = Watch(firmware, self.parameters)
@@ -162,10 +163,18 @@ class Autopilot:
 
     # -- what comes in -----------------------------------------------------------------------
 
-    def happen(self, event: str, *, mode: str = "", takeoff_z_m: float = math.nan) -> Result:
+    def happen(
+        self,
+        event: str,
+        *,
+        mode: str = "",
+        takeoff_z_m: float = math.nan,
+        by_planner: bool = False,
+    ) -> Result:
         """Run the rule table for an event; `mode` is the one asked for, if the event asks."""
         self.wake()
         self._requested, self._takeoff_z_m, self._event = mode, takeoff_z_m, event
+        self.asked_by_planner = by_planner
         if self.refused and (said := self.refused.get(self._wish(event, mode))) is not None:
             self.texts.append(said)
             return Result.TEMPORARILY_REJECTED
@@ -200,8 +209,13 @@ class Autopilot:
         """Home is there until the next arming."""
         self.pilot.home_ned_m = place_ned_m
 
-    def reposition(self, latitude: float, longitude: float, height_m: float, frame: int) -> Result:
-        """MAV_CMD_DO_REPOSITION: degrees; height above home or sea level, as the frame has it."""
+    def reposition(
+        self, latitude: float, longitude: float, height_m: float, frame: int, yaw_rad: float
+    ) -> Result:
+        """MAV_CMD_DO_REPOSITION: degrees; height above home or sea level, as the frame has it.
+
+        What is not a number stays as it is.
+        """
         result = self.happen("mode", mode=self.firmware.reposition_mode)
         if result is Result.ACCEPTED and self.armed:
             here = self.look().position_ned_m
@@ -210,7 +224,7 @@ class Autopilot:
             down = (self.pilot.home_ned_m[2] if relative else self.firmware.origin[2]) - height_m
             known = math.isfinite(north + east)
             place = (*((north, east) if known else here[:2]), down if down == down else here[2])
-            self.pilot.go_to(place)
+            self.pilot.go_to(place, yaw_rad)
         return result
 
     def obey_global_motion(self, values: Mapping[str, Any]) -> None:
@@ -524,6 +538,7 @@ GUARDS: dict[str, Callable[[Autopilot], bool]] = {
     "waiting": lambda autopilot: autopilot.awaits,
     "ready": lambda autopilot: autopilot.healthy and autopilot.mode.arms,
     "mode can run": Autopilot._mode_can_run,
+    "planner asks": lambda autopilot: autopilot.asked_by_planner,
     "mode arms": lambda autopilot: autopilot.mode.arms,
     "position missing": Autopilot._position_missing,
     "mission missing": lambda autopilot: not autopilot.mission.flyable,

@@ -17,6 +17,8 @@ from simulator.geodesy import to_metres
 from simulator.telemetry import View
 
 _CHANGE_MODE = 1.0  # MAV_DO_REPOSITION_FLAGS
+_MISSION_PLANNER = 190  # MAV_COMPONENT, as ground stations call themselves
+_VERTICAL_SPEEDS = (2.0, 3.0)  # SPEED_TYPE: climb, descent
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,7 +61,8 @@ class Commands:
     def set_mode(self, base_mode: int, custom_mode: int, sender: tuple[int, int]) -> None:
         """SET_MODE, the message that came before the command."""
         firmware = self.link.view.autopilot.firmware
-        result = self._request(firmware.set_mode(base_mode, custom_mode))
+        request = firmware.set_mode(base_mode, custom_mode)
+        result = self._request(request, sender[1] == _MISSION_PLANNER)
         if firmware.set_mode_acked_as is not None:
             self._acknowledge(Command(firmware.set_mode_acked_as, (), *sender), result)
 
@@ -72,15 +75,16 @@ class Commands:
         autopilot = self.link.view.autopilot
         if autopilot.firmware.mode_acked_twice:
             self._acknowledge(command, Result.ACCEPTED)
-        return self._request(autopilot.firmware.command_mode(command.params))
+        by_planner = command.component == _MISSION_PLANNER
+        return self._request(autopilot.firmware.command_mode(command.params), by_planner)
 
-    def _request(self, request: ModeRequest) -> Result:
+    def _request(self, request: ModeRequest, by_planner: bool) -> Result:
         autopilot = self.link.view.autopilot
         if request.mode is None:
             if request.say is not None:
                 autopilot.texts.append(request.say)
             return request.refusal
-        return autopilot.happen("mode", mode=request.mode)
+        return autopilot.happen("mode", mode=request.mode, by_planner=by_planner)
 
     def _arm_disarm(self, command: Command) -> Result | None:
         autopilot = self.link.view.autopilot
@@ -128,8 +132,32 @@ class Commands:
         """Hold there from now on; what is not a number of the place stays as it is."""
         if command.params[1] != _CHANGE_MODE:
             return Result.UNSUPPORTED
-        latitude, longitude, height_m = command.params[4:7]
-        return self.link.view.autopilot.reposition(latitude, longitude, height_m, command.frame)
+        yaw_rad, latitude, longitude, height_m = command.params[3:7]
+        return self.link.view.autopilot.reposition(
+            latitude, longitude, height_m, command.frame, yaw_rad
+        )
+
+    def _change_speed(self, command: Command) -> Result:
+        """Of automatic flight across the ground, until another mode; none is its own again."""
+        kind, speed_mps = command.params[:2]
+        autopilot = self.link.view.autopilot
+        if speed_mps > 0.0 and kind in _VERTICAL_SPEEDS:
+            return Result.ACCEPTED
+        known = 0.0 < speed_mps < math.inf
+        autopilot.pilot.cruise_mps = speed_mps if known else math.inf
+        return Result.ACCEPTED if known else autopilot.firmware.speed_refusal
+
+    def _turn(self, command: Command) -> Result:
+        """To a course, or by so much: degrees."""
+        asked_deg, _, sense, relative = command.params[:4]
+        autopilot = self.link.view.autopilot
+        if not autopilot.knows("turn"):
+            return Result.UNSUPPORTED
+        if math.isfinite(asked_deg):
+            from_rad = autopilot.look().yaw_rad if relative else 0.0
+            turn_rad = math.radians(asked_deg) * (-1.0 if relative and sense < 0 else 1.0)
+            autopilot.pilot.turn_to(math.remainder(from_rad + turn_rad, 2.0 * math.pi))
+        return autopilot.happen("turn")
 
     def _reboot(self, command: Command) -> Result:
         wish = command.params[0]
@@ -155,6 +183,8 @@ class Commands:
         name = message_name(number)
         if 0 < interval_us < 1e6 / streams.rate_max_hz:
             return self._refuse_interval(number, streams.too_fast_text)
+        if number in streams.idle and math.isfinite(interval_us):
+            return Result.ACCEPTED
         if name is None or not math.isfinite(interval_us):
             return self._refuse_interval(number, streams.refusal_text)
         if not self.link.set_interval(name, interval_us):
@@ -176,8 +206,11 @@ class Commands:
 
     def _request_message(self, command: Command) -> Result:
         name = message_name(command.params[0])
+        streams = self.link.view.autopilot.firmware.streams
         if name not in self.link.view.builders or self.link.view.withheld(name):
-            return self.link.view.autopilot.firmware.streams.request_refusal
+            return streams.request_refusal
+        if name in streams.by_itself:
+            return streams.request_refusal
         self.link.send_now(name)
         return Result.ACCEPTED
 
@@ -195,7 +228,9 @@ HANDLERS: dict[int, Callable[[Commands, Command], Result | None]] = {
     20: Commands._return,
     21: Commands._land,
     22: Commands._takeoff,
+    115: Commands._turn,
     176: Commands._set_mode,
+    178: Commands._change_speed,
     179: Commands._set_home,
     192: Commands._reposition,
     224: Commands._set_current_item,

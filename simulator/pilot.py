@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 
 from simulator.descent import Return, land_speed_mps, sink
 from simulator.firmware.base import (
@@ -62,6 +63,7 @@ class Pilot:
         self._levelling: AttitudeSetpoint | None = None  # the last one of our own
         self._wanted_z_mps = 0.0
         self.home_ned_m: Triple = (0.0, 0.0, 0.0)
+        self.cruise_mps = math.inf  # asked for, in automatic flight
         self.climbed = False
         self.setpoint: AttitudeSetpoint | MotionSetpoint | None = None
         self.motion = MotionSetpoint()  # what the position loop was last asked for
@@ -109,6 +111,8 @@ class Pilot:
         """
         if not (self.climbed and behaviour in (Behaviour.HOLD, Behaviour.SETPOINT)):
             self._hold = _ahead(nav)
+        if behaviour is not self.behaviour:
+            self.cruise_mps = math.inf
         self.behaviour = behaviour
         self._takeoff_z_m = takeoff_z_m
         self._return = Return(self._parameters, self._firmware.return_height_m, self.events)
@@ -118,11 +122,18 @@ class Pilot:
         self.loop.reset(nav.yaw_rad)
         self.mission.pause()
 
-    def go_to(self, place_ned_m: Triple) -> None:
-        """Hold there, in a mode that holds or obeys."""
+    def go_to(self, place_ned_m: Triple, yaw_rad: float) -> None:
+        """Hold there, in a mode that holds or obeys; no number keeps the course."""
         self._hold = place_ned_m
+        self._held = MotionSetpoint(place_ned_m, yaw_rad=yaw_rad)
         if self.behaviour is Behaviour.SETPOINT:
-            self.setpoint = MotionSetpoint(place_ned_m)
+            self.setpoint = self._held
+
+    def turn_to(self, yaw_rad: float) -> None:
+        """Keep this course while holding or obeying."""
+        self._held = MotionSetpoint(self._hold, yaw_rad=yaw_rad)
+        if isinstance(self.setpoint, MotionSetpoint):
+            self.setpoint = replace(self.setpoint, yaw_rad=yaw_rad)
 
     def arm(self, nav: Nav) -> None:
         """The motors begin to turn: home is here."""
@@ -336,6 +347,8 @@ class Pilot:
         across_mps, up_mps = math.inf, self._takeoff.speed_up_mps(self.loop.velocity_p_ps)
         if self.behaviour is not Behaviour.SETPOINT:
             across_mps = role("cruise_speed_mps")
+        if self.behaviour is not Behaviour.SETPOINT or self.setpoint is self._held:
+            across_mps = min(across_mps, self.cruise_mps)
         if self.behaviour is Behaviour.MISSION:
             across_mps = min(across_mps, self.mission.speed_mps)
         if self.climbing:

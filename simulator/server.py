@@ -269,7 +269,7 @@ class Server:
             self.answered_ns = message.ts1
 
     def _ping(self, message: Message) -> None:
-        if message.target_system == 0:
+        if message.target_system == 0 and "PING" in self.view.builders:
             self.send("PING", message.time_usec, message.seq, message.system, message.component)
 
     def _param_request_read(self, message: Message) -> None:

@@ -183,6 +183,8 @@ class Streams:
     """
 
     fixed: frozenset[str]  # messages whose interval cannot be changed
+    by_itself: frozenset[str]  # said when it happens, and not on request
+    idle: frozenset[int]  # ids of which an interval is taken, and nothing ever said
     groups: Mapping[int, tuple[str, ...]]  # MAV_DATA_STREAM -> messages
     rate_max_hz: float
     refusal: Result  # of an interval
@@ -296,6 +298,7 @@ class Firmware:
     heartbeat: Callable[[Condition], tuple[int, int]]  # base_mode but the armed bit, MAV_STATE
     command_mode: Callable[[tuple[float, ...]], ModeRequest]
     set_mode: Callable[[int, int], ModeRequest]  # SET_MODE: base_mode, custom_mode
+    speed_refusal: Result  # of MAV_CMD_DO_CHANGE_SPEED to no speed
     set_mode_acked_as: int | None  # what the acknowledgement of SET_MODE names; None: there is none
     arm_wish: Callable[[float], ArmWish]  # param1 of MAV_CMD_COMPONENT_ARM_DISARM
     # MAV_CMD that are not carried out: their answers, None for silence; the rest is UNSUPPORTED

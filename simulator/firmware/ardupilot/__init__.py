@@ -21,7 +21,14 @@ from simulator.firmware.ardupilot.parameters import PARAMETERS, ROLES
 from simulator.firmware.ardupilot.rules import BOOT, RULES
 from simulator.firmware.ardupilot.setpoints import attitude_setpoint, motion_setpoint
 from simulator.firmware.ardupilot.streams import DEFAULT_RATES_HZ, STREAMS
-from simulator.firmware.base import Firmware, Landing, PositionGains, ReadParameter, Sensors
+from simulator.firmware.base import (
+    Firmware,
+    Landing,
+    PositionGains,
+    ReadParameter,
+    Result,
+    Sensors,
+)
 
 RETURN_LEAST_M = 2.0  # RTL_ALT_MIN
 
@@ -137,6 +144,7 @@ ARDUPILOT = Firmware(
     heartbeat=heartbeat,
     command_mode=command_mode,
     set_mode=set_mode,
+    speed_refusal=Result.FAILED,
     set_mode_acked_as=None,
     arm_wish=arm_wish,
     command_answers=COMMAND_ANSWERS,

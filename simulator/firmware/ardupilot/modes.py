@@ -114,8 +114,8 @@ def arm_wish(param: float) -> ArmWish:
 
 
 # Taken by their receivers, which change nothing that shows here, or failed without their devices
-_TAKEN = (115, 181, 195, 197, 203, 206, 207, 208, 401, 2001, 5300, 42001, 42003, 42424)
-_FAILED = (84, 178, 183, 184, 189, 193, 205, 211, 218, 500, 2000, 2500)
+_TAKEN = (181, 195, 197, 203, 206, 207, 208, 401, 2001, 5300, 42001, 42003, 42424)
+_FAILED = (84, 183, 184, 189, 193, 205, 211, 218, 500, 2000, 2500)
 COMMAND_ANSWERS: dict[int, Result | None] = {
     **dict.fromkeys(_TAKEN, Result.ACCEPTED),
     **dict.fromkeys(_FAILED, Result.FAILED),

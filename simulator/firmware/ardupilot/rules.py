@@ -142,6 +142,7 @@ RULES = (
     Rule("mode", when=("not armed",), to="requested", send=_HEARTBEAT),
     Rule("mode", when=("not position missing",), to="requested", send=_HEARTBEAT),
     Rule("mode", result=_FAILED, say=_NO_POSITION),
+    Rule("turn"),
     Rule("loiter", when=("not position missing",), to="LOITER", send=_HEARTBEAT),
     Rule("loiter", result=_FAILED),
     Rule("mission", when=("not position missing",), to="AUTO", send=_HEARTBEAT),

@@ -16,8 +16,15 @@ _GROUPS = {
     11: ("VFR_HUD",),
     12: ("SYSTEM_TIME", "BATTERY_STATUS", "EKF_STATUS_REPORT"),
 }
+_IDLE = frozenset({
+    22, 26, 29, 34, 35, 62, 87, 100, 105, 116, 124, 125, 127, 128, 129, 132, 133, 136, 137,
+    143, 152, 162, 163, 165, 168, 173, 178, 180, 191, 192, 194, 195, 225, 226, 235, 241, 246,
+    259, 260, 262, 269, 271, 277, 280, 281, 285, 286, 295, 301, 373, 376, 9005,
+})  # fmt: skip
 STREAMS = Streams(
     fixed=frozenset({"TIMESYNC"}),
+    by_itself=frozenset({"TIMESYNC"}),
+    idle=_IDLE,
     groups={0: tuple(name for names in _GROUPS.values() for name in names), **_GROUPS},
     rate_max_hz=200.0,
     refusal=Result.DENIED,

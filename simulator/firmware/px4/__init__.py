@@ -8,7 +8,14 @@ from __future__ import annotations
 import math
 
 from simulator.airframe import BatteryState
-from simulator.firmware.base import Firmware, Landing, PositionGains, ReadParameter, Sensors
+from simulator.firmware.base import (
+    Firmware,
+    Landing,
+    PositionGains,
+    ReadParameter,
+    Result,
+    Sensors,
+)
 from simulator.firmware.px4.modes import (
     COMMAND_ANSWERS,
     MODES,
@@ -140,6 +147,7 @@ PX4 = Firmware(
     heartbeat=heartbeat,
     command_mode=command_mode,
     set_mode=set_mode,
+    speed_refusal=Result.ACCEPTED,
     set_mode_acked_as=176,
     arm_wish=arm_wish,
     command_answers=COMMAND_ANSWERS,

@@ -111,7 +111,7 @@ def arm_wish(param: float) -> ArmWish:
 
 
 # Taken by its receivers, which change nothing that shows here, or do not answer
-_TAKEN = (80, 178, 187, 191, 195, 197, 201, 401, 519, 525, 528)
+_TAKEN = (80, 187, 191, 195, 197, 201, 401, 519, 525, 528)
 _UNANSWERED = (
     1, 93, 203, 204, 205, 206, 214, 220, 242, 243, 260, 310, 420, 500, 521, 530, 531, 532, 3000
 )  # fmt: skip

@@ -64,7 +64,8 @@ def _put_off(event: str, parameter: str, modes: Mapping[int, str]) -> list[Rule]
 RULES = (
     Rule("mode", when=("not armed",), to="requested"),
     Rule("mode", when=("mode can run",), to="requested"),
-    Rule("mode", result=_LATER, say=_NOT_AVAILABLE),
+    Rule("mode", when=("planner asks",), result=_LATER, say=_NOT_AVAILABLE),
+    Rule("mode", result=_LATER),
     Rule("takeoff", to="AUTO.TAKEOFF"),
     Rule("land", to="AUTO.LAND", say=_info("Landing at current position")),
     Rule("return", to="AUTO.RTL", say=_info("Returning to launch")),

@@ -51,8 +51,17 @@ GROUND_RATES_HZ = {
     "PING": 0.1,
 }
 
+_BY_ITSELF = frozenset({"MISSION_CURRENT", "MISSION_ITEM_REACHED"})
+_IDLE = frozenset({
+    8, 25, 26, 29, 36, 62, 65, 69, 76, 87, 93, 106, 112, 116, 124, 129, 132, 137, 143, 149,
+    192, 225, 231, 233, 235, 241, 246, 250, 251, 253, 254, 261, 263, 264, 265, 280, 281, 283,
+    284, 285, 286, 290, 291, 300, 330, 339, 350, 360, 361, 371, 372, 375, 380, 395, 397, 435,
+    12900, 12901, 12904, 12918, 12920,
+})  # fmt: skip
 STREAMS = Streams(
-    fixed=frozenset({"HEARTBEAT"}),
+    fixed=_BY_ITSELF | {"HEARTBEAT"},
+    by_itself=_BY_ITSELF,
+    idle=_IDLE,
     groups={},
     rate_max_hz=math.inf,
     refusal=Result.FAILED,
