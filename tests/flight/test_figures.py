@@ -12,21 +12,27 @@ from pair import SHORT, make
 
 from offboard.analysis import history
 from offboard.analysis.score import score
+from offboard.flight.learning import IdentifySettings
 from offboard.flight.phases import Phase
+from simulator import config as simulated
 
 
 @pytest.mark.parametrize(
-    ("scenario", "seed", "most_m"),
+    ("scenario", "most_m"),
     [
-        ("calm", 7, 0.02),
-        ("calm", 1, 0.02),
-        ("px4_like", 7, 0.05),
-        ("px4_like", 1, 0.05),
-        ("px4_like", 2, 0.05),
+        ("calm", 0.01),
+        ("px4_like", 0.04),
+        ("noise", 0.04),
+        ("thrust_minus_15", 0.02),
+        ("mass_plus_20", 0.03),
+        ("wind_2mps", 0.03),
+        ("gusts", 0.06),
     ],
 )
-def test_default_flight(scenario: str, seed: int, most_m: float, tmp_path: Path) -> None:
-    pair = make(scenario=scenario, seed=seed)
+def test_default_flight(scenario: str, most_m: float, tmp_path: Path) -> None:
+    """On a vehicle of which nothing is known: one profile for all rows, identified in flight."""
+    neutral = simulated.vehicle("neutral")
+    pair = make(scenario=scenario, believed=neutral, learning=IdentifySettings())
     outcome = pair.fly()
     score = pair.score(tmp_path)
     assert (outcome.exit_code, outcome.sentence) == (0, "flown and landed")
