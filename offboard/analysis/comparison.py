@@ -21,6 +21,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from offboard.analysis.compare import Fly, Result, Trial, as_csv, as_json, run, table, trials
 from offboard.analysis.compare_page import page
 from offboard.analysis.compare_table import lines, numbered_seeds
+from offboard.analysis.interrupts import deaf_to_interrupts
 from offboard.flight.log import LogError
 
 ORPHANED = 1
@@ -126,6 +127,8 @@ def _worker() -> Iterator[ProcessPoolExecutor]:
     # spawn: a forked child would share compiled code and threads in unknown states
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(1, mp_context=context, initializer=_settle)
+    with deaf_to_interrupts():
+        pool.submit(os.getpid)  # starts it
     try:
         yield pool
     except BaseException:
@@ -137,7 +140,7 @@ def _worker() -> Iterator[ProcessPoolExecutor]:
 
 
 def _settle() -> None:
-    """In a worker: Ctrl-C in the terminal is not for us, and without our parent we are not."""
+    """In a worker: a terminal that closes is not for us, and without our parent we are not."""
     os.setpgrp()
     parent = multiprocessing.parent_process()
     assert parent is not None

@@ -7,11 +7,11 @@ of both, flown longer.
 from __future__ import annotations
 
 from pathlib import Path
-from statistics import median
+from statistics import mean
 
 from pair import make
 
-SEEDS = (1, 2, 3)
+SEEDS = (1, 2)
 # One lap of the lemniscate in 8 s, at once; `lqr` is what the swarm finds, sooner
 SHORT = (
     "controller={law: lqr, feedback_limit: 0.6}",
@@ -21,13 +21,11 @@ SHORT = (
     "reference.run_out_s=1",
 )
 RAW = "observer.velocity=reported"
-
-
 WITHOUT = "controller.feedforward=false"
 
 
 def rmse_m(directory: Path, bandwidth_radps: int, *assignments: str) -> float:
-    """By the vehicle's estimate, median of the seeds."""
+    """By the vehicle's estimate, mean of the seeds."""
     chosen = (*SHORT, f"controller.bandwidth_radps={bandwidth_radps}", *assignments)
     flown = []
     for seed in SEEDS:
@@ -35,7 +33,7 @@ def rmse_m(directory: Path, bandwidth_radps: int, *assignments: str) -> float:
         assert pair.fly().exit_code == 0
         log = directory / "-".join((str(bandwidth_radps), *assignments, str(seed)))
         flown.append(pair.score(log).rmse_position_m)
-    return median(flown)
+    return mean(flown)
 
 
 def test_ranking_of_laws(tmp_path: Path) -> None:

@@ -3,25 +3,34 @@
 from __future__ import annotations
 
 import csv
+import os
 import signal
+import subprocess
 import time
 from pathlib import Path
 
-from processes import Spawn
+from processes import Spawn, children
 
 SEEDS = 12
+COMPARE = (
+    "compare", "--controllers", "lqr", "--reference", "hover", "--scenario", "calm",
+    "--seeds", SEEDS, "--workers", 2, "--set", "reference.duration_s=1", "--out", "x",
+)  # fmt: skip
+
+
+def as_a_terminal_interrupts(process: subprocess.Popen[str]) -> tuple[str, str]:
+    os.killpg(process.pid, signal.SIGINT)
+    told, said = process.communicate(timeout=60)
+    assert process.returncode == 4
+    assert "Traceback" not in said
+    return told, said
 
 
 def test_interrupted_it_keeps_what_landed(spawn: Spawn, tmp_path: Path) -> None:
-    process = spawn(
-        "offboard", "compare", "--controllers", "lqr", "--reference", "hover", "--scenario", "calm",
-        "--seeds", SEEDS, "--workers", 2, "--set", "reference.duration_s=1", "--out", "x",
-    )  # fmt: skip
+    process = spawn("offboard", *COMPARE)
     while process.poll() is None and not list(tmp_path.rglob("score.json")):
         time.sleep(0.01)
-    process.send_signal(signal.SIGINT)
-    told, said = process.communicate(timeout=60)
-    assert process.returncode == 4
+    told, said = as_a_terminal_interrupts(process)
     (row,) = csv.DictReader((tmp_path / "x" / "compare.csv").open(encoding="utf-8"))
     flights = int(row["flights"])
     assert (row["controller"], row["failed"]) == ("lqr", "0")
@@ -30,3 +39,12 @@ def test_interrupted_it_keeps_what_landed(spawn: Spawn, tmp_path: Path) -> None:
     assert "not flown: hover, calm: lqr seed" in told
     assert "not flown" in (tmp_path / "x" / "compare.html").read_text(encoding="utf-8")
     assert len(list(tmp_path.rglob("score.json"))) == flights
+
+
+def test_interrupted_while_its_processes_load_it_ends_in_order(spawn: Spawn) -> None:
+    process = spawn("offboard", *COMPARE)
+    while process.poll() is None and len(children(process.pid)) < 3:  # a tracker, two of ours
+        time.sleep(0.01)
+    told, said = as_a_terminal_interrupts(process)
+    assert "the process that flew it ended" not in told
+    assert "flights missing" in said

@@ -22,6 +22,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from offboard.analysis.figure import Figure
+from offboard.analysis.interrupts import deaf_to_interrupts
 from offboard.analysis.paper.options import PaperError, PaperOptions, check
 from offboard.analysis.paper.page import facts_json, page
 from offboard.analysis.paper.plan import Job, Key, Piece, Plan
@@ -137,7 +138,7 @@ def _results(plan: Plan, workers: int | None) -> Generator[tuple[Key, Any]]:
 
 
 def _from_pool(pool: Executor, jobs: dict[Key, Job]) -> Iterator[tuple[Key, Any]]:
-    with _deaf_to_interrupts():  # the processes start here, and stay so
+    with deaf_to_interrupts():  # the processes start here, and stay so
         futures: dict[Future[Any], Key] = {
             pool.submit(_guarded, function, *arguments): key
             for key, (function, arguments) in jobs.items()
@@ -166,20 +167,6 @@ def _pool(count: int) -> Iterator[ProcessPoolExecutor]:
                 os.environ.pop(name, None)
             else:
                 os.environ[name] = value
-
-
-@contextmanager
-def _deaf_to_interrupts() -> Iterator[None]:
-    """An interrupt of meanwhile comes afterwards; processes started meanwhile never hear one, not
-    even before `_start_worker`. Without signal masks (Windows) nothing changes."""
-    if not hasattr(signal, "pthread_sigmask"):
-        yield
-        return
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-    try:
-        yield
-    finally:
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def _start_worker() -> None:

@@ -1,0 +1,21 @@
+"""Processes that work for us and leave Ctrl-C, which a terminal sends to all of them, to us."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+
+@contextmanager
+def deaf_to_interrupts() -> Iterator[None]:
+    """An interrupt of meanwhile comes afterwards; processes started meanwhile never hear one, not
+    even while they load. Without signal masks (Windows) nothing changes."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
