@@ -142,6 +142,7 @@ def simulate(
 
     if not Entry.all_kept():
         _tell("compiling the flight dynamics, once (some seconds)")
+    Entry.compile_all()
     rehearse(Instance(personality, flyer, flown.conditions, seed, lockstep=True))
 
     epoch_us = VIRTUAL_EPOCH_US if lockstep else unix_us()

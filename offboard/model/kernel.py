@@ -15,30 +15,27 @@ from __future__ import annotations
 
 import ctypes
 import functools
-import hashlib
 import os
-import re
-import tempfile
+import subprocess
+import sys
 from collections.abc import Callable
-from importlib import metadata
-from pathlib import Path
 from typing import Any, ClassVar, Generic, ParamSpec, TypeVar, cast
 
 import numpy as np
 
-from offboard.model.compilation import (
-    is_private,
-    prepare_cache,
-    sources_digest,
-    without_garbage_collection,
-)
+from offboard.model import machine_code
+from offboard.model.compilation import without_garbage_collection
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
-# Numba's and Python's runtime: left over from errors that cannot happen here
-_RUNTIME = ("NRT_", "Py", "_Py", "numba_")
-_DECLARATION = re.compile(r"^declare (?P<head>[^@\n]*)@(?P<name>[\w.]+)\((?P<rest>.*)$", re.M)
+_COMPILE_ONE = """
+import importlib, sys
+from offboard.model.kernel import Entry
+
+importlib.import_module(sys.argv[1])
+Entry.compile_one(sys.argv[2])
+"""
 
 
 class Kernel(Generic[P, R]):
@@ -87,6 +84,7 @@ class Entry:
     def __init__(self, function: Callable[..., int], parameters: tuple[Any, ...]) -> None:
         self._function = function
         self._parameters = parameters
+        self._address: int | None = None
         self._before = tuple(Entry._defined)
         Entry._defined.append(self)
         self.symbol = f"{function.__module__}.{function.__name__}"
@@ -98,24 +96,47 @@ class Entry:
     @functools.cached_property
     def call(self) -> Callable[..., int]:
         """The machine code as a function; compiled, or read from the cache, when first asked."""
-        *_, place = [entry._address for entry in (*self._before, self)]  # it may call the others
+        *_, place = [entry._load() for entry in (*self._before, self)]  # it may call the others
         kinds = (ctypes.c_int64 if p is int else ctypes.c_void_p for p in self._parameters)
         prototype = ctypes.CFUNCTYPE(ctypes.c_int64, *kinds)
         return cast(Callable[..., int], prototype(place))
 
     @classmethod
     def all_kept(cls) -> bool:
-        """Whether the machine code of all entries so far need not be compiled."""
-        return all(_read(_place(entry.symbol)) is not None for entry in cls._defined)
+        """Whether nothing of the entries defined so far has to be compiled."""
+        return all(machine_code.kept(entry.symbol) is not None for entry in cls._defined)
 
-    @functools.cached_property
-    def _address(self) -> int:
-        path = _place(self.symbol)
-        code = _read(path)
-        if code is None:
-            code = self._compiled()
-            _write(path, code)
-        return _load(code, self.symbol)
+    @classmethod
+    def compile_all(cls) -> None:
+        """Compile what is not kept; the last entry in another process, which halves the time."""
+        if cls.all_kept():
+            return
+        *others, last = cls._defined
+        command = (sys.executable, "-c", _COMPILE_ONE, last._function.__module__, last.symbol)
+        found = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+        silent = subprocess.DEVNULL
+        with subprocess.Popen(command, env=found, stdin=silent, stdout=silent, stderr=silent):
+            for entry in others:
+                entry._load()
+        last._load()  # compiles it after all where the other process could not
+
+    @classmethod
+    def compile_one(cls, symbol: str) -> None:
+        """Compile this entry and keep it, in a process that does not call it."""
+        (entry,) = (each for each in cls._defined if each.symbol == symbol)
+        for other in entry._before:
+            machine_code.pretend(other.symbol)
+        machine_code.keep(symbol, entry._compiled())
+
+    def _load(self) -> int:
+        """The address of the machine code in this process."""
+        if self._address is None:
+            code = machine_code.kept(self.symbol)
+            if code is None:
+                code = self._compiled()
+                machine_code.keep(self.symbol, code)
+            self._address = machine_code.load(self.symbol, code)
+        return self._address
 
     @property
     def _numba_type_(self) -> Any:
@@ -127,18 +148,12 @@ class Entry:
 
     @without_garbage_collection()
     def _compiled(self) -> bytes:
-        import llvmlite.binding as llvm
         from numba import cfunc, types
 
         kinds = (types.int64 if p is int else types.voidptr for p in self._parameters)
         compiled = cfunc(types.int64(*kinds), error_model="numpy")(self._taking_addresses())
-        module = llvm.parse_assembly(_self_contained(compiled.inspect_llvm()))
-        for function in module.functions:
-            if function.name == compiled.native_name:
-                function.name = self.symbol
-            elif not function.is_declaration:
-                function.linkage = "internal"
-        return cast(bytes, _machine().emit_object(module))
+        assembly = compiled.inspect_llvm()
+        return machine_code.assemble(assembly, compiled.native_name, self.symbol)
 
     def _taking_addresses(self) -> Callable[..., int]:
         """The function with records by address, written out, as numba wants its arguments."""
@@ -166,103 +181,3 @@ def entry(*parameters: Any) -> Callable[[Callable[..., int]], Entry]:
 def address(record: np.ndarray[Any, Any]) -> ctypes.c_void_p:
     """Of a record, for calls of an `Entry`; the record must outlive it."""
     return ctypes.c_void_p(record.ctypes.data)
-
-
-def _self_contained(assembly: str) -> str:
-    """Without the parts of numba's runtime: what would raise or allocate stops the process."""
-
-    def definition(found: re.Match[str]) -> str:
-        name = found["name"]
-        if not name.startswith(_RUNTIME):
-            return found[0]
-        rest = re.sub(r"\s*#\d+|\s*local_unnamed_addr", "", found["rest"])
-        return (
-            f"define internal {found['head']}@{name}({rest} {{\n"
-            "  call void @llvm.trap()\n  unreachable\n}"
-        )
-
-    text = _DECLARATION.sub(definition, assembly)
-    return text if "declare void @llvm.trap" in text else text + "\ndeclare void @llvm.trap()\n"
-
-
-# -- the cache ---------------------------------------------------------------------------------
-
-
-def _place(symbol: str) -> Path:
-    return prepare_cache() / f"{symbol}-{_identity()}.o"
-
-
-@functools.cache
-def _identity() -> str:
-    """Of these sources, compilers and this processor: machine code of others is not for us."""
-    import llvmlite.binding as llvm
-
-    identity = (
-        sources_digest(),
-        metadata.version("numba"),
-        metadata.version("llvmlite"),
-        llvm.get_process_triple(),
-        llvm.get_host_cpu_name(),
-        llvm.get_host_cpu_features().flatten(),
-    )
-    return hashlib.sha256("\0".join(identity).encode()).hexdigest()[:16]
-
-
-def _read(path: Path) -> bytes | None:
-    """The machine code in a file of ours; None when there is none, or it is damaged."""
-    try:
-        if not is_private(path.parent):
-            return None
-        content = path.read_bytes()
-    except OSError:
-        return None
-    seal, code = content[:32], content[32:]
-    return code if hashlib.sha256(code).digest() == seal else None
-
-
-def _write(path: Path, code: bytes) -> None:
-    """Whole or not at all; without it the next start compiles again."""
-    try:
-        handle, name = tempfile.mkstemp(dir=path.parent)
-        with os.fdopen(handle, "wb") as file:
-            file.write(hashlib.sha256(code).digest() + code)
-        os.replace(name, path)
-    except OSError:
-        pass
-
-
-# -- the processor -----------------------------------------------------------------------------
-
-
-def _machine() -> Any:
-    import llvmlite.binding as llvm
-
-    llvm.initialize_native_target()
-    llvm.initialize_native_asmprinter()
-    return llvm.Target.from_default_triple().create_target_machine(
-        cpu=llvm.get_host_cpu_name(),
-        features=llvm.get_host_cpu_features().flatten(),
-        opt=3,
-        reloc="default",
-        codemodel="jitdefault",
-        jit=True,
-    )
-
-
-@functools.cache
-def _engine() -> Any:
-    import llvmlite.binding as llvm
-
-    return llvm.create_mcjit_compiler(llvm.parse_assembly(""), _machine())
-
-
-def _load(code: bytes, symbol: str) -> int:
-    """Address of a function in machine code."""
-    import llvmlite.binding as llvm
-
-    engine = _engine()
-    engine.add_object_file(llvm.ObjectFileRef.from_data(code))
-    engine.finalize_object()
-    place = int(engine.get_function_address(symbol))
-    llvm.add_symbol(symbol, place)
-    return place

@@ -13,10 +13,9 @@ import pytest
 from offboard.model.kernel import kernel
 
 ROOT = Path(__file__).parents[2]
-PROGRAM = """
-import sys
+ENTRIES = """
 import numpy as np
-from offboard.model.kernel import Entry, address, entry, kernel
+from offboard.model.kernel import Entry, entry, kernel
 
 RECORD = np.dtype([("values", "f8", 3), ("total", "f8"), ("calls", "i8")], align=True)
 
@@ -38,44 +37,59 @@ def add(times, record):
 @entry(int, RECORD)
 def add_twice(times, record):
     return add(times, record) + add(times, record)
+"""
+PROGRAM = """
+import sys
+import numpy as np
+from entries import RECORD, Entry, add, add_twice
+from offboard.model.kernel import address
 
-
+compile_here, compiled_here = Entry._compiled, []
+Entry._compiled = lambda entry: compiled_here.append(entry.symbol) or compile_here(entry)
 kept = Entry.all_kept()
+Entry.compile_all()
 record = np.zeros(1, RECORD)
 record["values"] = (1.0, 2.0, 4.0)
 answers = [each.call(times, address(record)) for each, times in ((add_twice, 1), (add, 2))]
-print(kept, answers, float(record["total"][0]), int(record["calls"][0]), "numba" in sys.modules)
+print(kept, compiled_here, "numba" in sys.modules)
+print(answers, float(record["total"][0]), int(record["calls"][0]))
 """
-COMPILED, LOADED = ("False [20, 20] 14.0 3 True", "True [20, 20] 14.0 3 False")
+COMPILED = "False ['entries.add'] True"  # and the other one in another process
+COMPILED_ALONE = "False ['entries.add', 'entries.add_twice'] True"
+LOADED = "True [] False"
+COMPUTED = "[20, 20] 14.0 3"
 
 
 def _run(cache: Path) -> str:
+    """What a process says about where its machine code came from, once it has computed."""
+    (cache / "entries.py").write_text(ENTRIES)
     clean = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA")}
     done = subprocess.run(
         [sys.executable, "-c", PROGRAM],
         cwd=ROOT,
-        env=clean | {"XDG_CACHE_HOME": str(cache)},
+        env=clean | {"XDG_CACHE_HOME": str(cache), "PYTHONPATH": f"{ROOT}{os.pathsep}{cache}"},
         capture_output=True,
         text=True,
         check=True,
         timeout=120,
     )
-    return done.stdout.strip()
+    origin, computed = done.stdout.splitlines()
+    assert computed == COMPUTED
+    return origin
 
 
 def test_machine_code_is_compiled_once_and_loaded_without_numba(tmp_path: Path) -> None:
     assert _run(tmp_path) == COMPILED
     assert _run(tmp_path) == LOADED
-    kept, _ = sorted(tmp_path.rglob("*.o"))
+    kept, other = sorted(tmp_path.rglob("*.o"))
     content = bytearray(kept.read_bytes())
     content[len(content) // 2] ^= 1
     kept.write_bytes(content)
-    assert _run(tmp_path) == COMPILED
-    kept.write_bytes(content[:100])
+    other.write_bytes(other.read_bytes()[:100])
     assert _run(tmp_path) == COMPILED
     assert _run(tmp_path) == LOADED
     kept.parent.chmod(0o777)
-    assert _run(tmp_path) == COMPILED
+    assert _run(tmp_path) == COMPILED_ALONE
 
 
 def test_a_kernel_is_called_from_python_and_from_other_compiled_code() -> None:
