@@ -20,7 +20,7 @@ from offboard.mavlink.outgoing import CommandLong
 from offboard.mavlink.session import Session
 
 SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
-SPOOL_MAX = 1.6
+SPOOL_MAX = 2.0
 TAKEOFF_HEIGHT_M = 3.0  # asked of an autopilot that takes off by itself; we take over on the way
 LAND_STREAM_S = 3.0  # a refused landing ends in silence: the autopilot's own failsafe lands
 

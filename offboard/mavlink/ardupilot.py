@@ -68,7 +68,6 @@ ARDUPILOT = Dialect(
     # masks 1 to 6 throw the vehicle into position hold, 71 and 199 drop the message
     attitude_type_mask=7,
     parameter_encoding=ParameterEncoding.CAST,
-    hover_thrust_parameter="MOT_THST_HOVER",
     watched_parameters=(
         WatchedParameter(
             "GUID_OPTIONS",

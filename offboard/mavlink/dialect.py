@@ -86,7 +86,6 @@ class Dialect:
     thrust_rule: ThrustRule
     attitude_type_mask: int  # the one legal SET_ATTITUDE_TARGET.type_mask for attitude + thrust
     parameter_encoding: ParameterEncoding
-    hover_thrust_parameter: str
     watched_parameters: tuple[WatchedParameter, ...]
     stream_timeout_s: float  # vehicle time after which a silent stream is noticed
     wanted: tuple[WantedMessage, ...]

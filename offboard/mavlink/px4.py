@@ -63,7 +63,6 @@ PX4 = Dialect(
     thrust_rule=ThrustRule.COLLECTIVE,
     attitude_type_mask=7,
     parameter_encoding=ParameterEncoding.BYTEWISE,
-    hover_thrust_parameter="MPC_THR_HOVER",
     watched_parameters=(
         WatchedParameter("MPC_THR_HOVER", "normalised thrust that holds the weight"),
         WatchedParameter(
