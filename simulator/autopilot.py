@@ -299,7 +299,9 @@ class Autopilot:
 
         A step too early rather than one too late; False when that is now.
         """
-        if self.failsafe or not self.pilot.flies_itself(self.armed, self.plant.on_ground):
+        if self.failsafe or self.restarts:
+            return False
+        if not self.pilot.flies_itself(self.armed, self.plant.on_ground):
             return False
         watched_s = self._watch.calm_until_s(self.time_s, self.gps_healthy)
         until_s = min(self._steady_until_s, watched_s)

@@ -161,7 +161,7 @@ class Commands:
 
     def _reboot(self, command: Command) -> Result:
         wish = command.params[0]
-        return self.link.view.autopilot.happen("reboot") if wish else Result.UNSUPPORTED
+        return self.link.view.autopilot.happen("reboot") if wish >= 1.0 else Result.UNSUPPORTED
 
     def _start_mission(self, command: Command) -> Result:
         autopilot = self.link.view.autopilot

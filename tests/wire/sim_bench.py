@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -130,7 +130,8 @@ class Bench:
                 each()
             if self.instance.steps % STEPS_PER_HEARTBEAT == 0:
                 self._heartbeat()
-            for datagram in self.instance.step():
+            self.instance.tick()
+            for datagram in self.instance.drain():
                 self.raw += datagram
                 self._unread.append((self.time_s, datagram))
 
@@ -152,6 +153,17 @@ class Bench:
                 self._received.append((at_s, message))
         self._unread.clear()
         return self._received
+
+    def received_of(self, ids: frozenset[int]) -> Iterator[tuple[float, Any]]:
+        """Messages with these ids alone, of those that nobody has looked at; the rest is lost."""
+        for at_s, datagram in self._unread:
+            at = 0
+            while at < len(datagram):
+                end = at + 12 + datagram[at + 1]
+                if int.from_bytes(datagram[at + 7 : at + 10], "little") in ids:
+                    yield at_s, self._parser.parse_char(datagram[at:end])
+                at = end
+        self._unread.clear()
 
     def of(self, kind: str, since_s: float = 0.0) -> list[tuple[float, Any]]:
         return [

@@ -218,9 +218,10 @@ def test_a_mission_is_paused_by_hold_and_goes_on() -> None:
     assert 5.0 < here.x < 25.0
     assert abs(here.vx) < 0.1
     bench.ask_mode(MISSION)
-    bench.run_until(lambda: reached(bench) == [0, 1], 20.0)
+    bench.run_until(lambda: bench.instance.autopilot.mission.reached == 1, 20.0)
     _, here = bench.of("LOCAL_POSITION_NED")[-1]
     assert here.x == pytest.approx(40, abs=2.1)
+    assert reached(bench) == [0, 1]
 
 
 def test_without_a_mission_none_starts() -> None:
