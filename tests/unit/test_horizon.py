@@ -265,6 +265,27 @@ def test_law_finds_cheaper_plans_than_its_peers(volume: dict[str, object]) -> No
         assert np.median(paid[Method.SWARM] / paid[peer]) < 0.5
 
 
+def test_a_way_below_the_clearance_to_the_ground_costs() -> None:
+    """A linear plan down and its mirror image up, from 0.8 m: alike but for 20 a metre and 200 a
+    square metre and second, below 0.3 m."""
+    law = horizon(keep_out=[IN_THE_WAY], dynamics=Dynamics.LINEAR)
+    start = replace(
+        state_of(np.random.default_rng(0), Lemniscate(8.0), 0.0),
+        position_ned_m=np.array([5.0, 5.0, -0.8]), velocity_ned_mps=np.zeros(3),
+        thrust_direction_ned=np.array([0.0, 0.0, 1.0]), thrust_mps2=G,
+    )  # fmt: skip
+    hold = Hold((5.0, 5.0, -0.8), 0.0)
+    _, evaluate = prepared(law, Situation(5.0, start, hold, LEVEL))
+    down, up = np.zeros((STEPS_AROUND, 3)), np.zeros((STEPS_AROUND, 3))
+    down[:5, 2], up[:5, 2] = -3.0, 3.0
+    low, high = evaluate.flown(down), evaluate.flown(up)
+    assert low.states[:, Z] == pytest.approx(-high.states[:, Z], abs=1e-9)
+    over = np.maximum(low.states[1:, Z] - 0.5, 0.0)
+    assert over.max() > 0.1
+    paid = PERIOD_S * np.sum(20.0 * over + 200.0 * over**2)
+    assert low.cost - high.cost == pytest.approx(paid, rel=1e-9)
+
+
 class Recording:
     """A law and all that it was asked."""
 
