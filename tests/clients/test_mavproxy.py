@@ -1,26 +1,65 @@
-"""MAVProxy on a terminal flies the simulator, as it flies a real PX4 1.16.1."""
+"""MAVProxy on a terminal flies the simulator, as it flies a real PX4 1.16.1 and an ArduCopter."""
 
 from __future__ import annotations
 
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import pytest
 from terminal import Terminal
 from vehicle_process import vehicle
 
+from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.px4 import PX4
 
 MAVPROXY = Path(sys.executable).with_name("mavproxy.py")
 
 
+@contextmanager
+def proxied(directory: Path, *options: str) -> Iterator[Terminal]:
+    with vehicle(*options) as port:
+        command = (sys.executable, str(MAVPROXY), f"--master=udpin:127.0.0.1:{port}", "--no-state")
+        with Terminal(command, str(directory)) as terminal:
+            yield terminal
+
+
 @pytest.fixture
 def proxy(tmp_path: Path) -> Iterator[Terminal]:
-    with vehicle() as port:
-        command = (sys.executable, str(MAVPROXY), f"--master=udpin:127.0.0.1:{port}", "--no-state")
-        with Terminal(command, str(tmp_path)) as terminal:
-            yield terminal
+    with proxied(tmp_path) as terminal:
+        yield terminal
+
+
+def test_an_arducopter_takes_off_lands_and_boots_again(tmp_path: Path) -> None:
+    """Ten times as fast as real time, since it starts in 42 s."""
+    with proxied(tmp_path, "--firmware", "ardupilot", "--speed", "10") as proxy:
+        proxy.expect(rf"Received {len(ARDUPILOT.parameters)} parameters", 30.0)
+        proxy.expect("EKF3 IMU1 is using GPS", 30.0)
+        proxy.type("mode guided")
+        proxy.expect("Mode GUIDED")
+        proxy.type("arm throttle")
+        proxy.expect("Arming motors")
+        proxy.type("takeoff 5")
+        proxy.expect("NAV_TAKEOFF: ACCEPTED")
+        _reach_five_metres(proxy)
+        proxy.type("setspeed 3")
+        proxy.expect("DO_CHANGE_SPEED: ACCEPTED")
+        proxy.type("mode land")
+        proxy.expect("Mode LAND")
+        proxy.expect("Disarming motors", 20.0)
+        proxy.type("reboot")
+        proxy.expect("PREFLIGHT_REBOOT_SHUTDOWN: ACCEPTED")
+        proxy.expect("ArduPilot Ready", 20.0)
+
+
+def _reach_five_metres(proxy: Terminal) -> None:
+    for _ in range(40):
+        proxy.type("status GLOBAL_POSITION_INT")
+        with suppress(AssertionError):
+            proxy.expect(r"relative_alt : (4[7-9]|5[0-3])\d\d,", 0.5)
+            return
+    raise AssertionError(proxy.shown)
 
 
 def test_a_session_with_two_flights(proxy: Terminal) -> None:
