@@ -23,7 +23,7 @@ from pathlib import Path
 from types import ModuleType
 
 _VARIABLE = "NUMBA_CACHE_DIR"
-_COMPILES = re.compile(rb"njit|^@kernel", re.M)
+_COMPILES = re.compile(rb"njit|^@(?:kernel|entry)", re.M)
 _IMPORT = re.compile(rb"^from ((?:offboard|simulator)[.\w]*) import (\([^)]*\)|.*)", re.M)
 _CONSTANT = re.compile(rb"\b[A-Z][A-Z0-9_]+\b")
 
@@ -87,13 +87,16 @@ def sources_digest() -> str:
         for package in ("offboard", "simulator")
         for path in (root / package).rglob("*.py")
     }
-    compiled = {name for name, content in sources.items() if _COMPILES.search(content)}
-    for name in tuple(compiled):
+    pending = [name for name, content in sources.items() if _COMPILES.search(content)]
+    taken: set[str] = set()
+    while pending:
+        taken.add(name := pending.pop())
         for module, names in _IMPORT.findall(sources[name]):
-            if _CONSTANT.search(names):
-                compiled.add(module.decode().replace(".", "/") + ".py")
+            source = module.decode().replace(".", "/") + ".py"
+            if _CONSTANT.search(names) and source in sources and source not in taken:
+                pending.append(source)
     digest = hashlib.sha256()
-    for name in sorted(compiled & sources.keys()):
+    for name in sorted(taken):
         digest.update(name.encode() + b"\0" + sources[name])
     return digest.hexdigest()[:16]
 
