@@ -143,7 +143,7 @@ class Mission:
                 self._climb_to_z_m = math.nan
             return MotionSetpoint(self._held)
         self._pass_over()
-        if self.finished or not self.items:
+        if not self._to_do:
             return MotionSetpoint(self._held)
         item = self.items[self.current]
         if item.is_place:
@@ -168,12 +168,17 @@ class Mission:
         elif now_s - self._since_s >= self._stay_s(item):
             self._advance()
 
+    @property
+    def _to_do(self) -> bool:
+        """There is a current item; none where home is all there is."""
+        return not self.finished and self.current < len(self.items)
+
     def _item_is(self, kind: Kind) -> bool:
         return self.current < len(self.items) and self.items[self.current].command == kind
 
     def _pass_over(self) -> None:
         """Items that are done at once; of several the last is told."""
-        while self.items and not (self.finished or self.items[self.current].is_flown):
+        while self._to_do and not self.items[self.current].is_flown:
             item = self.items[self.current]
             if item.command == Kind.CHANGE_SPEED and item.params[1] > 0:
                 self.speed_mps = item.params[1]

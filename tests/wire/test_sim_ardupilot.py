@@ -550,6 +550,18 @@ def test_the_echo_is_the_demand_before_the_boost() -> None:
 # -- parameters ------------------------------------------------------------------------------
 
 
+def test_a_mission_of_home_alone_is_none() -> None:
+    vehicle = ready()
+    vehicle.send(mavlink.MAVLink_mission_count_message(1, 1, 1))
+    vehicle.send(mavlink.MAVLink_mission_item_int_message(1, 1, 0, 6, 16, 0, 1, *(0,) * 7))
+    assert vehicle.command(400, 1) == [ACCEPTED]
+    assert vehicle.command(300) == [ACCEPTED]
+    vehicle.run(2.0)
+    assert (vehicle.height_m, vehicle.armed) == (0.0, True)
+    vehicle.run(9.0)
+    assert vehicle.texts()[-1] == "Disarming motors"
+
+
 def test_a_mission_begins_behind_its_item_for_home() -> None:
     vehicle = ready()
     latitude, longitude = (round(degrees * 1e7) for degrees in ARDUPILOT.origin[:2])
