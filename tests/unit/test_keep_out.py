@@ -56,6 +56,8 @@ def test_moving_ones_start_with_the_reference() -> None:
     place = np.tile([1.0, 2.0, -3.0], (4, 1))
     found = clearances((moving,), np.array([math.nan, -5.0, 0.0, 3.0]), place)
     assert found == pytest.approx([-0.5, -0.5, -0.5, math.sqrt(45) - 0.5])
+    inside = clearances((moving,), np.array([3.0]), np.array([[4.0, 2.0, -9.0]]))
+    assert inside == pytest.approx([-0.5])  # 3 m further north, 6 m further up
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from offboard.control.base import Command, DecisionError, PredictedState, Situation
+from offboard.control.integral import IntegralSettings
 from offboard.control.one_step import OneStep
 from offboard.control.paper import (
     PaperController,
@@ -80,7 +81,8 @@ def tilted(course: float) -> tuple[PredictedState, Straight]:
         np.array([0.1, -0.2, 0.05]),
     )  # fmt: skip
     velocity = turn.apply([1.0, 0.5, -0.1])
-    return state, Straight(turn.apply([1.5, -1.0, 0.2]), velocity, course + 0.1)
+    goal_rad = np.remainder(course + 0.1 + np.pi, 2 * np.pi) - np.pi  # across the wrap at 3.1
+    return state, Straight(turn.apply([1.5, -1.0, 0.2]), velocity, float(goal_rad))
 
 
 # ---------------------------------------------------------------- the law on the paper's plant
@@ -185,15 +187,25 @@ def test_the_heading_frame_is_eq_5_at_course_north() -> None:
     assert target == pytest.approx([0] * 6 + [1.0, 0.5, -0.1] + [0] * 3, abs=1e-12)
 
 
-@pytest.mark.parametrize("lead", [False, True])
+SUMMED = IntegralSettings(weights=(80.0, 80.0, 15.0, 50.0))
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [PaperSettings(attitude_lead=False), PaperSettings(attitude_lead=True),
+     PaperSettings(integral=SUMMED)],
+)  # fmt: skip
 @pytest.mark.parametrize("course", [0.7, 2.0, -2.9, 3.1])
-def test_the_law_is_the_same_at_every_course(course: float, lead: bool) -> None:
-    controller = PaperController(PAPER, PaperSettings(attitude_lead=lead))
+def test_the_law_is_the_same_at_every_course(course: float, settings: PaperSettings) -> None:
+    """With the sum of three decisions, where there is one."""
+    controller = PaperController(PAPER, settings)
     commands = []
     for heading in (0.0, course):
         controller.reset()
         state, reference = tilted(heading)
-        commands.append(controller.decide(Situation(0.0, state, reference, HOVER)).command)
+        for _ in range(3):
+            decision = controller.decide(Situation(0.0, state, reference, HOVER))
+        commands.append(decision.command)
     north, turned = commands
     direction = Rotation.from_euler("Z", course).apply(north.thrust_direction_ned)
     assert turned.thrust_direction_ned == pytest.approx(direction, abs=1e-6)
