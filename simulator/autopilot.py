@@ -365,6 +365,11 @@ class Autopilot:
             )
         return self._nav
 
+    @property
+    def position_lost(self) -> bool:
+        """Without a fix for so long that the estimate is given up."""
+        return self._watch.position_lost
+
     def hear_ground_station(self) -> None:
         """A heartbeat of one, on any link."""
         self._watch.hear_ground_station(self.time_s)
@@ -541,6 +546,7 @@ GUARDS: dict[str, Callable[[Autopilot], bool]] = {
     "ready": lambda autopilot: autopilot.healthy and autopilot.mode.arms,
     "mode can run": Autopilot._mode_can_run,
     "planner asks": lambda autopilot: autopilot.asked_by_planner,
+    "mode needs position": lambda autopilot: autopilot.mode.needs_position,
     "mode arms": lambda autopilot: autopilot.mode.arms,
     "position missing": Autopilot._position_missing,
     "mission missing": lambda autopilot: not autopilot.mission.flyable,

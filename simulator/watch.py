@@ -33,6 +33,10 @@ class Watch:
     def ground_station_lost(self) -> bool:
         return self._ground_station_lost
 
+    @property
+    def position_lost(self) -> bool:
+        return self._position_lost
+
     def step(self, now_s: float, armed: bool, battery: BatteryState, has_fix: bool) -> list[str]:
         """Events since the last step."""
         return [

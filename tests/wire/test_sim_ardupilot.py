@@ -17,7 +17,7 @@ from sim_bench import NAN, Bench
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.sensors import EstimatorName
 
-STABILIZE, GUIDED, LOITER, RTL, LAND, BRAKE, GUIDED_NOGPS = 0, 4, 5, 6, 9, 17, 20
+STABILIZE, ALT_HOLD, GUIDED, LOITER, RTL, LAND, BRAKE, GUIDED_NOGPS = 0, 2, 4, 5, 6, 9, 17, 20
 ACCEPTED, DENIED, FAILED = 0, 2, 4
 ONBOARD = mavlink.MAV_TYPE_ONBOARD_CONTROLLER
 BOOT_SCALE = 0.1
@@ -548,6 +548,34 @@ def test_the_echo_is_the_demand_before_the_boost() -> None:
 
 
 # -- parameters ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("action", "mode", "said"),
+    [
+        (0, GUIDED, []),
+        (1, LAND, ["EKF variance", "EKF Failsafe: changed to LAND Mode"]),
+        (2, ALT_HOLD, ["EKF variance", "EKF Failsafe: changed to ALT_HOLD Mode"]),
+    ],
+)
+def test_without_satellites_the_estimate_is_given_up_after_eight_seconds(
+    action: int, mode: int, said: list[str]
+) -> None:
+    vehicle = flying()
+    set_parameter(vehicle, "FS_EKF_ACTION", action)
+    vehicle.command(511, 193, 100_000)
+    autopilot, begun_s = vehicle.instance.autopilot, vehicle.time_s
+    autopilot.gps_healthy = False
+    vehicle.run(7.8)
+    assert (vehicle.mode, autopilot.system_status) == (GUIDED, 4)
+    vehicle.run(0.5)
+    assert (vehicle.mode, autopilot.system_status) == (mode, 5 if said else 4)
+    assert vehicle.of("EKF_STATUS_REPORT")[-1][1].flags == 167
+    autopilot.gps_healthy = True
+    vehicle.run(0.5)
+    assert vehicle.of("EKF_STATUS_REPORT")[-1][1].flags == 831
+    assert (vehicle.mode, autopilot.system_status) == (mode, 4)
+    assert vehicle.texts(begun_s) == ([*said, "EKF Failsafe Cleared"] if said else [])
 
 
 def test_a_mission_of_home_alone_is_none() -> None:

@@ -150,5 +150,6 @@ ARDUPILOT = Firmware(
     command_answers=COMMAND_ANSWERS,
     attitude_setpoint=attitude_setpoint,
     motion_setpoint=motion_setpoint,
+    position_without_fix_s=8.0,
     global_frames=frozenset({0, 3, 5, 6, 10, 11}),
 )

@@ -62,6 +62,8 @@ def sim_state(view: View) -> Sequence[Any]:
 
 def ekf_status_report(view: View) -> Sequence[Any]:
     reached = view.autopilot.reached
+    if view.autopilot.position_lost:
+        reached -= {"position"}
     flags = next((bits for event, bits in _EKF_FLAGS if event in reached), _EKF_UNINITIALISED)
     return (flags, 0.02, 0.02, 0.02, 0.01, 0.0, 0.0)
 

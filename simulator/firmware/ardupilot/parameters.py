@@ -48,7 +48,7 @@ PARAMETERS = (
     _int8("FLTMODE_CH", 5, "channel of the mode switch"),
     _int8("FRAME_CLASS", 1, "1 quadrotor"),
     _int8("FRAME_TYPE", 0, "0 plus"),
-    _int8("FS_EKF_ACTION", 1, "estimator lost: 1 LAND, 2 ALT_HOLD"),
+    _int8("FS_EKF_ACTION", 1, "estimator lost: 0 nothing, 1 or 3 LAND, 2 ALT_HOLD"),
     _real("FS_EKF_THRESH", 0.8, "variance at which the estimator is lost"),
     _int8("FS_GCS_ENABLE", 0, "ground station lost: 0 nothing, 1 RTL, 5 LAND"),
     _real("FS_GCS_TIMEOUT", 5.0, "s without heartbeat until the ground station is lost"),

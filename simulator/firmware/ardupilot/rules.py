@@ -241,6 +241,24 @@ RULES = (
     *_failsafe("battery critical", "BATT_FS_CRT_ACT", _BATTERY_MODES, _FOR_GOOD),
     Rule("battery low", say=_FAILSAFE["battery low"][0]),
     Rule("battery critical", say=_FAILSAFE["battery critical"][0]),
+    *(
+        Rule(
+            "position lost",
+            when=("armed", "not landed", "mode needs position", f"FS_EKF_ACTION={value}"),
+            to=mode,
+            do=("failsafe",),
+            say=_critical("EKF variance"),
+            also=(_critical(f"EKF Failsafe: changed to {mode} Mode"),),
+            send=_HEARTBEAT,
+        )
+        for value, mode in ((1, "LAND"), (2, "ALT_HOLD"), (3, "LAND"))
+    ),
+    Rule(
+        "position found",
+        when=("since position lost",),
+        do=("recover",),
+        say=_critical("EKF Failsafe Cleared"),
+    ),
     Rule("thrust not a number", do=("latch",)),
     Rule("reboot", when=("not armed",), do=("restart",)),
     Rule("reboot", result=_FAILED),
