@@ -89,8 +89,8 @@ class VehicleView:
 
     def note(self, event: Event) -> None:
         """Take one event in."""
-        if isinstance(event, (LocalPosition, Attitude)) and event.time_s > self.time_s + OUTAGE_S:
-            self.resumed_s = event.time_s
+        if isinstance(event, (LocalPosition, Attitude)):
+            self._note_outage(event.time_s)
         match event:
             case Heartbeat():
                 self.heartbeat = event
@@ -116,6 +116,12 @@ class VehicleView:
                 self.refused.append(f"command {command} {result}")
             case Reset():
                 self._forget()
+
+    def _note_outage(self, time_s: float) -> None:
+        """Forgiven only after both streams were heard again: one that is slow hides no other."""
+        heard_s = [newest.time_s for newest in (self.position, self.attitude) if newest]
+        if time_s > self.time_s + OUTAGE_S and all(each >= self.resumed_s for each in heard_s):
+            self.resumed_s = time_s
 
     def _age_s(self, newest: LocalPosition | Attitude | None) -> float:
         if newest is None:

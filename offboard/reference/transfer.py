@@ -21,12 +21,13 @@ Array = NDArray[np.float64]
 Vector = Array | Iterable[float]
 
 _DURATION_MIN_S = 0.5
-_DURATION_MAX_S = 600.0
 _GROWTH = 1.08
 _CRUISE_FROM_S = 15.0  # a way that takes longer in one piece is flown in three
 _RAMPS_SHARE = 0.6  # most of such a way that gaining and losing speed may take
 _SMOOTH_PEAK = 35.0 / 16.0  # slope of the smoothstep of degree 7
-_OVERSHOOT = 1.1  # a moving start may exceed the limits by its own speed; allow it this much more
+_BRAKE_MIN_S = 1.5
+_CREEP_MPS = 0.5  # a start so slow needs no braking of its own
+_AHEAD = 0.7  # least cosine between a start's velocity and its way
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,86 +75,87 @@ def transfer(
     limits: Limits = Limits(),
     *,
     start_velocity_ned_mps: Vector = (0.0, 0.0, 0.0),
-    start_acceleration_ned_mps2: Vector = (0.0, 0.0, 0.0),
 ) -> Transfer:
     """From a start (3,), NED, to rest at a target, as fast as the limits allow; turning the short
-    way. The course ends at `target_course_rad` plus whole turns, next to the start's. A long way
-    is flown straight, at constant speed between gaining and losing it.
+    way. The course ends at `target_course_rad` plus whole turns, next to the start's.
 
-    A moving start that breaks the limits by itself is allowed its own speed and acceleration. It
-    overshoots in the direction it moves in: nothing here knows where the ground is.
-    Raises ValueError for anything not finite.
+    A start that moves too fast, or not towards the target, is first braked to rest, in the
+    direction that it moves in: nothing here knows where the ground is. A long way is flown
+    straight, at constant speed between gaining and losing it. Raises ValueError for anything not
+    finite.
     """
-    start, target, velocity, acceleration = (
+    start, target, velocity = (
         np.asarray(list(vector), dtype=np.float64)
-        for vector in (
-            start_ned_m,
-            target_ned_m,
-            start_velocity_ned_mps,
-            start_acceleration_ned_mps2,
-        )
+        for vector in (start_ned_m, target_ned_m, start_velocity_ned_mps)
     )
     turn_rad = math.remainder(target_course_rad - start_course_rad, 2.0 * math.pi)
     begin, end = np.zeros((5, 4)), np.zeros((5, 4))
     begin[0] = *start, start_course_rad
-    begin[1, :3], begin[2, :3] = velocity, acceleration
+    begin[1, :3] = velocity
     end[0] = *target, start_course_rad + turn_rad
     if not (np.all(np.isfinite(begin)) and np.all(np.isfinite(end))):
         raise ValueError("a transfer needs a finite start and a finite target")
-    allowed = replace(
-        limits,
-        speed_mps=max(limits.speed_mps, _OVERSHOOT * float(np.linalg.norm(velocity))),
-        acceleration_mps2=max(
-            limits.acceleration_mps2, _OVERSHOOT * float(np.linalg.norm(acceleration))
-        ),
-    )
-    hop = Transfer(_shortest(begin, end, allowed))
-    if hop.duration_s <= _CRUISE_FROM_S:
-        return hop
-    cruise = _cruising(begin, end, allowed)
-    return hop if cruise is None else Transfer(cruise)
+    if _moves_well(begin, end, limits):
+        hop = _shortest(begin, end, limits)
+        if hop.length_s <= _CRUISE_FROM_S:
+            return Transfer(hop)
+    times_s, jets = [0.0], [begin]
+    if velocity.any():
+        brake_s = _SMOOTH_PEAK * float(np.linalg.norm(velocity)) / limits.acceleration_mps2
+        brake_s = max(brake_s, _BRAKE_MIN_S)
+        begin = _at_rest(begin[0] + begin[1] * (brake_s / 2.0))
+        times_s, jets = [*times_s, brake_s], [*jets, begin]
+    hop = _shortest(begin, end, limits)
+    if hop.length_s <= _CRUISE_FROM_S:
+        legs = [(hop.length_s, end)]
+    else:
+        legs = _cruise(begin[0], end[0], limits)
+    for leg_s, jet in legs:
+        times_s.append(times_s[-1] + leg_s)
+        jets.append(jet)
+    return Transfer(_through(times_s, jets))
+
+
+def _moves_well(begin: Array, end: Array, limits: Limits) -> bool:
+    """Hardly, or towards the target at a speed that is no more than allowed."""
+    velocity, way = begin[1, :3], end[0, :3] - begin[0, :3]
+    speed_mps = float(np.linalg.norm(velocity))
+    ahead = float(velocity @ way) >= _AHEAD * speed_mps * float(np.linalg.norm(way))
+    return speed_mps <= _CREEP_MPS or (ahead and speed_mps <= limits.speed_mps)
+
+
+def _at_rest(place: Array) -> Array:
+    jet = np.zeros((5, 4))
+    jet[0] = place
+    return jet
 
 
 def _shortest(begin: Array, end: Array, limits: Limits) -> Polynomial:
-    """The shortest polynomial within the limits, or the one that breaks them least."""
+    """The shortest single polynomial within the limits, or the longest tried."""
     distance_m = float(np.linalg.norm(end[0, :3] - begin[0, :3]))
     turn_rad = abs(float(end[0, 3] - begin[0, 3]))
     # no polynomial is faster than the mean speed or turn rate
     duration_s = max(
         _DURATION_MIN_S, distance_m / limits.speed_mps, turn_rad / limits.course_rate_radps
     )
-    best, least = _polynomial(begin, end, duration_s), math.inf
-    while duration_s < _DURATION_MAX_S:
-        candidate = _polynomial(begin, end, duration_s)
-        excess = _excess(candidate, limits)
-        if excess < least:
-            best, least = candidate, excess
-        if excess <= 1.0:
-            break
-        duration_s *= _GROWTH
-    return best
-
-
-def _cruising(begin: Array, end: Array, limits: Limits) -> Polynomial | None:
-    """Gain speed, keep it, lose it; None where the way is too short."""
-    moving = begin[1]
-    ramp_s = _SMOOTH_PEAK * _cruise_mps(end[0] - begin[0], limits) / limits.acceleration_mps2
     while True:
-        # on average a ramp moves at the mean of the speeds at its ends
-        way = end[0] - begin[0] - moving * (ramp_s / 2.0)
-        speed_mps = _cruise_mps(way, limits)
-        straight_s = _length_m(way) / speed_mps
-        if straight_s <= ramp_s:
-            return None
-        slope = way / straight_s
-        fast, slow = np.zeros((5, 4)), np.zeros((5, 4))
-        fast[0], fast[1] = begin[0] + (moving + slope) * (ramp_s / 2.0), slope
-        slow[0], slow[1] = end[0] - slope * (ramp_s / 2.0), slope
-        times_s = np.cumsum([0.0, ramp_s, straight_s - ramp_s, ramp_s])
-        candidate = _through(times_s, [begin, fast, slow, end])
-        if _excess(candidate, replace(limits, speed_mps=speed_mps)) <= 1.0 + 1e-6:
+        candidate = _through([0.0, duration_s], [begin, end])
+        if duration_s > _CRUISE_FROM_S or _excess(candidate, limits) <= 1.0:
             return candidate
-        ramp_s *= _GROWTH  # a start that moves otherwise
+        duration_s *= _GROWTH
+
+
+def _cruise(start: Array, target: Array, limits: Limits) -> list[tuple[float, Array]]:
+    """From rest to rest, (4,) in position and course: gaining speed, keeping it, losing it."""
+    way = target - start
+    speed_mps = _cruise_mps(way, limits)
+    ramp_s = _SMOOTH_PEAK * speed_mps / limits.acceleration_mps2
+    straight_s = _length_m(way) / speed_mps
+    fast, slow = _at_rest(start), _at_rest(target)
+    fast[1] = slow[1] = way / straight_s
+    fast[0] += fast[1] * (ramp_s / 2.0)  # on average half as fast
+    slow[0] -= slow[1] * (ramp_s / 2.0)
+    return [(ramp_s, fast), (straight_s - ramp_s, slow), (ramp_s, _at_rest(target))]
 
 
 def _length_m(way: Array) -> float:
@@ -169,10 +171,6 @@ def _cruise_mps(way: Array, limits: Limits) -> float:
         limits.course_rate_radps * distance_m / max(abs(float(way[3])), 1e-6),
         math.sqrt(_RAMPS_SHARE * distance_m * limits.acceleration_mps2 / _SMOOTH_PEAK),
     )
-
-
-def _polynomial(begin: Array, end: Array, duration_s: float) -> Polynomial:
-    return _through([0.0, duration_s], [begin, end])
 
 
 def _through(times_s: Array | list[float], jets: list[Array]) -> Polynomial:

@@ -44,12 +44,11 @@ def test_as_fast_as_the_limits_allow(distance_m: float) -> None:
 def test_moving_start_is_taken_over_and_ends_at_rest() -> None:
     flown = transfer(
         (1, 2, -3), (4, 0, -5), 3.0, -3.0, Limits(speed_mps=3.0),
-        start_velocity_ned_mps=(1.0, -0.5, 0.2), start_acceleration_ned_mps2=(0.3, 0.1, -0.2),
+        start_velocity_ned_mps=(1.0, -0.5, -0.2),
     )  # fmt: skip
     start, end = flown.sample(0.0), flown.sample(flown.duration_s)
     np.testing.assert_allclose(start.position_ned_m, [1, 2, -3], atol=1e-12)
-    np.testing.assert_allclose(start.velocity_ned_mps, [1.0, -0.5, 0.2], atol=1e-12)
-    np.testing.assert_allclose(start.acceleration_ned_mps2, [0.3, 0.1, -0.2], atol=1e-12)
+    np.testing.assert_allclose(start.velocity_ned_mps, [1.0, -0.5, -0.2], atol=1e-12)
     np.testing.assert_allclose(end.position_ned_m, [4, 0, -5], atol=1e-9)
     for name in ("velocity_ned_mps", "acceleration_ned_mps2", "jerk_ned_mps3", "snap_ned_mps4"):
         np.testing.assert_allclose(getattr(end, name), 0.0, atol=1e-8)
@@ -93,6 +92,24 @@ def test_a_start_faster_than_the_limit_still_stops() -> None:
     assert flown.duration_s < 20  # it may brake at its own speed, not creep below the limit
     assert np.all(flown.sample(flown.duration_s + 5).velocity_ned_mps == 0)
     np.testing.assert_allclose(flown.sample(1e6).position_ned_m, [1, 0, -10], atol=1e-8)
+
+
+def test_no_start_is_planned_further_out_than_it_needs_to_brake() -> None:
+    """Climbing away, falling, sideways: the plan stays between start, target and braking point."""
+    rng, acceleration = np.random.default_rng(5), Limits().acceleration_mps2
+    for size_m, speed_mps in itertools.product((2.0, 30.0, 500.0), (0.5, 1.4, 3.0, 8.0)):
+        for _ in range(10):
+            start, target = rng.uniform(-size_m, size_m, (2, 3))
+            velocity = rng.normal(size=3)
+            velocity *= speed_mps / np.linalg.norm(velocity)
+            flown = transfer(start, target, 0.0, 1.0, start_velocity_ned_mps=velocity)
+            path = flown.sample(np.linspace(0.0, flown.duration_s, 501)).position_ned_m
+            braking_m = speed_mps * max(1.5, 35.0 / 16.0 * speed_mps / acceleration) / 2.0
+            lowest = np.minimum(start, target) - braking_m - 0.5
+            highest = np.maximum(start, target) + braking_m + 0.5
+            assert np.all((path >= lowest) & (path <= highest))
+            assert flown.duration_s < 20.0 + 2.0 * braking_m + size_m * math.sqrt(12.0)
+            np.testing.assert_allclose(path[-1], target, atol=1e-6)
 
 
 def test_a_start_that_is_not_finite_is_refused() -> None:
