@@ -1,7 +1,7 @@
 """Whatever arrives, the vehicle goes on, says only well-formed things, and flies afterwards.
 
-`FUZZ_DATAGRAMS=1000000 pytest tests/wire/test_sim_fuzz.py` sends a million to PX4 and half of that
-to ArduCopter.
+`FUZZ_DATAGRAMS=1000000 pytest tests/wire/test_sim_fuzz.py` sends half a million to each firmware
+and half a million more in flight, before a normal one.
 """
 
 from __future__ import annotations
