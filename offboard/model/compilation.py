@@ -29,18 +29,32 @@ _CONSTANT = re.compile(rb"\b[A-Z][A-Z0-9_]+\b")
 
 
 def prepare_cache() -> Path:
-    """Point numba at a writable cache directory for exactly these sources, and return it.
+    """Point numba at a writable, private cache directory for exactly these sources; return it.
 
-    Idempotent, cheap (no import of numba). Call before the first `njit(cache=True)`.
+    Idempotent, cheap (no import of numba). Call before the first `njit(cache=True)`. Says on
+    standard error when the user's choice cannot be used.
     """
-    chosen = os.environ.get(_VARIABLE)
-    if not chosen:
-        chosen = str(_writable_directory(sources_digest()))
-        os.environ[_VARIABLE] = chosen
+    directory = _settled(os.environ.get(_VARIABLE, ""))
+    os.environ[_VARIABLE] = str(directory)
     numba = sys.modules.get("numba")
     if numba is not None:  # imported before us: it has read its environment already
-        numba.config.CACHE_DIR = chosen
-    return Path(chosen)
+        numba.config.CACHE_DIR = str(directory)
+    return directory
+
+
+@functools.cache
+def _settled(chosen: str) -> Path:
+    wanted = Path(chosen).resolve()
+    trouble = _trouble(wanted) if chosen else ""
+    if chosen and not trouble:
+        return wanted
+    directory = _own_directory(sources_digest())
+    if trouble:
+        print(
+            f"{_VARIABLE}={chosen} is not used: {trouble}; compiled code is kept in {directory}",
+            file=sys.stderr,
+        )
+    return directory
 
 
 class _BeforeNumba(MetaPathFinder):
@@ -101,19 +115,24 @@ def sources_digest() -> str:
     return digest.hexdigest()[:16]
 
 
-def _writable_directory(name: str) -> Path:
+def _own_directory(name: str) -> Path:
     for base in _bases():
-        directory = base / name
-        try:
-            base.parent.mkdir(parents=True, exist_ok=True)
-            base.mkdir(mode=0o700, exist_ok=True)
-            directory.mkdir(exist_ok=True)
-            if is_private(base):
-                with tempfile.TemporaryFile(dir=directory):
-                    return directory
-        except OSError:
-            continue
+        if not (_trouble(base) or _trouble(base / name)):
+            return base / name
     return Path(tempfile.mkdtemp(prefix="pso-offboard-"))
+
+
+def _trouble(directory: Path) -> str:
+    """Why no code can be kept there, or "". What is missing of it is made."""
+    try:
+        for part in (*reversed(directory.parents), directory):
+            part.mkdir(mode=0o700, exist_ok=True)  # for us alone, whatever the umask
+        if not _is_private(directory):
+            return "others can write to it"
+        with tempfile.TemporaryFile(dir=directory):
+            return ""
+    except OSError as error:
+        return f"it cannot be written ({error.strerror})"
 
 
 def _bases() -> Iterator[Path]:
@@ -122,7 +141,7 @@ def _bases() -> Iterator[Path]:
     yield Path(tempfile.gettempdir()) / f"pso-offboard-{_user()}"
 
 
-def is_private(directory: Path) -> bool:
+def _is_private(directory: Path) -> bool:
     """Cached code is executed: a directory another user owns or can write to is not for us."""
     status = directory.lstat()
     ours = os.name != "posix" or status.st_uid == _user()

@@ -15,7 +15,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, cast
 
-from offboard.model.compilation import is_private, prepare_cache, sources_digest
+from offboard.model.compilation import prepare_cache, sources_digest
 
 # Numba's and Python's runtime: left over from errors that cannot happen here
 _RUNTIME = ("NRT_", "Py", "_Py", "numba_")
@@ -76,11 +76,8 @@ def _identity() -> str:
 
 def kept(symbol: str) -> bytes | None:
     """The machine code in a file of ours; None when there is none, or it is damaged."""
-    path = _file(symbol)
     try:
-        if not is_private(path.parent):
-            return None
-        content = path.read_bytes()
+        content = _file(symbol).read_bytes()
     except OSError:
         return None
     seal, code = content[:32], content[32:]
