@@ -144,9 +144,13 @@ def _hangar() -> Hangar:
 
 
 def fly_trial(order: Order, trial: Trial) -> Result:
-    """Fly one row of a comparison like `order`; a flight that cannot be flown is a result too."""
+    """Fly one row of a comparison like `order`; a flight that cannot be flown is a result too.
+
+    It begins disarmed, unless `order` says otherwise: in the air, somebody else has the vehicle.
+    """
     ordered = replace(
         _of_trial(order, trial.controller, trial.reference),
+        assignments=("limits.begin_armed=false", *order.assignments),
         directory=trial.directory,
         scenario=trial.scenario,
         seed=trial.seed,

@@ -23,6 +23,7 @@ from offboard.analysis.compare_page import page
 from offboard.analysis.compare_table import lines, numbered_seeds
 from offboard.analysis.interrupts import deaf_to_interrupts
 from offboard.flight.log import LogError
+from offboard.flight.phases import ExitCode
 
 ORPHANED = 1
 
@@ -41,8 +42,9 @@ def compare_all(
     """Fly everything, print and write the table; a sentence on what failed or is missing, or "".
 
     `workers` None: one process per processor; 0: in this process, one flight after the other (a
-    vehicle that is there once). Writes compare.csv, compare.json and compare.html. Raises LogError
-    before the first flight where `directory` cannot be written or holds something.
+    vehicle that is there once; it ends when the vehicle or its pilot no longer lets us fly, for
+    the next flight would take it back). Writes compare.csv, compare.json and compare.html. Raises
+    LogError before the first flight where `directory` cannot be written or holds something.
     """
     _claim(directory)
     planned = trials(controllers, references, scenarios, seeds, directory)
@@ -53,6 +55,9 @@ def compare_all(
         for line in lines(rows, console.width):
             console.print(line, soft_wrap=True)
     missing = _missing(planned, results)
+    ended = _ended(results) if missing and workers == 0 else ""
+    if ended:
+        missing.insert(0, f"{ended}; nothing more was flown")
     for words in missing:
         console.print(words, style="yellow", markup=False, soft_wrap=True)
     (directory / "compare.csv").write_text(as_csv(rows), encoding="utf-8")
@@ -62,7 +67,8 @@ def compare_all(
     failed = sum(not result.flown for result in results)
     told = [f"{failed} of {len(results)} flights failed; the table says why"] if failed else []
     if missing:
-        told.append(f"interrupted: {len(planned) - len(results)} of {len(planned)} flights missing")
+        count = f"{len(planned) - len(results)} of {len(planned)} flights missing"
+        told.append(f"{ended or 'interrupted'}: {count}")
     return "; ".join(told)
 
 
@@ -114,11 +120,23 @@ def _flown(
                 return
             result = fly(trial)
             yield result
-            if result.stopped:  # the flight heard the interruption, not we
+            if result.stopped or _taken(result):  # the flight heard the interruption, not we
                 return
     else:
         width = workers or len(os.sched_getaffinity(0))
         yield from run(planned, fly, _worker, width, ending)
+
+
+def _taken(result: Result) -> bool:
+    return result.exit_code in (ExitCode.REFUSED, ExitCode.ABORTED)
+
+
+def _ended(results: Sequence[Result]) -> str:
+    """Which flight on the one vehicle was the last, if it was the reason for that, or ""."""
+    if not results or not _taken(results[-1]):
+        return ""
+    trial, sentence = results[-1].trial, results[-1].sentence
+    return f"ended with {trial.controller} on {trial.reference}, seed {trial.seed} ({sentence})"
 
 
 @contextmanager

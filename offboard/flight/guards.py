@@ -58,6 +58,10 @@ def misconfigured(now: Picture) -> bool:
     return now.misconfigured
 
 
+def armed_by_another(now: Picture) -> bool:
+    return now.armed and not now.limits.begin_armed
+
+
 def rebooted(now: Picture) -> bool:
     return now.rebooted
 

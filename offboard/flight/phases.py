@@ -66,8 +66,8 @@ class ExitCode:
 
 
 class Limits(Parameters):
-    """How long each wait may last, and what is flown no further. SI; seconds of vehicle time,
-    but `connect_s` and `silence_s` are wall time."""
+    """How long each wait may last, and what is not flown, or no further. SI; seconds of vehicle
+    time, but `connect_s` and `silence_s` are wall time."""
 
     connect_s: float = Field(default=20.0, gt=0, le=600)
     health_s: float = Field(default=90.0, gt=0, le=600)
@@ -82,5 +82,6 @@ class Limits(Parameters):
     silence_s: float = Field(default=1.0, ge=0.2, le=60)  # of everything: then a landing is asked
     blind_s: float = Field(default=0.5, ge=0.15, le=10)  # of position or attitude alone
     missed_decisions: int = Field(default=3, ge=1, le=100)  # one after the other
+    begin_armed: bool = True  # false: a vehicle that somebody has armed already is refused
     position_error_m: float = Field(default=5.0, gt=0.1, le=100)
     tilt_rad: float = Field(default=1.3, gt=0.2, le=1.5)

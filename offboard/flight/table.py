@@ -31,6 +31,7 @@ _LEFT = "the vehicle left {mode_wanted} for {mode}"
 _SILENT = "no telemetry for {silence_s:.1f} s"
 _BLIND = "no {blind_to} for {blind_s:.1f} s"
 _REBOOTED = "the vehicle restarted"
+_ARMED_ALREADY = "the vehicle is armed already, and not by us"
 _DISARMED = "disarmed on the ground"
 STOPPED = "stop requested by the operator"
 _DIVERGED = "{position_error_m:.1f} m from the reference (limit {position_error_limit_m:.1f} m)"
@@ -41,6 +42,7 @@ _NOT_ENGAGED = "the vehicle did not enter {mode_wanted} in {in_phase_s:.0f} s (i
 
 def _ground_rows(source: Phase) -> tuple[Row, ...]:
     return (
+        Row(source, guards.armed_by_another, Phase.FAILED, _ARMED_ALREADY, REFUSED),
         Row(source, guards.silent_on_ground, Phase.FAILED, _SILENT, REFUSED),
         Row(source, guards.stop_requested, Phase.FAILED, f"{STOPPED} before take-off", ABORTED),
     )

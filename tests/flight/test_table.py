@@ -52,6 +52,7 @@ EVENTS: dict[str, dict[str, object]] = {  # the least that makes each guard hold
     "vehicle_found": {"found": True},
     "ready": {"ready": True},
     "misconfigured": {"misconfigured": True},
+    "armed_by_another": {"armed": True, "limits": Limits(begin_armed=False)},
     "rebooted": {"rebooted": True},
     "needs_no_stream": {"lifted_by_command": True},
     "streamed": {"in_phase_s": 1.0},

@@ -137,3 +137,38 @@ def test_a_worker_that_dies_costs_its_own_flight(tmp_path: Path) -> None:
     (row,) = csv.DictReader((tmp_path / "all" / "compare.csv").open(encoding="utf-8"))
     assert row["failed"] == "1"
     assert row["why"] == "the process that flew it ended"
+
+
+@pytest.mark.parametrize(
+    ("exit_code", "flown"),
+    [(2, "pso lqr pid mpc"), (3, "pso lqr"), (4, "pso lqr")],  # a file; refused; aborted
+)
+def test_on_one_vehicle_a_flight_that_it_did_not_let_us_end_is_the_last(
+    tmp_path: Path, exit_code: int, flown: str
+) -> None:
+    begun: list[str] = []
+
+    def fly(trial: Trial) -> Result:
+        begun.append(trial.controller)
+        if trial.controller == "lqr":
+            return Result(trial, exit_code, "left OFFBOARD for AUTO.LOITER", {})
+        return Result(trial, 0, "flown and landed", dict.fromkeys(FIGURES, 1.0))
+
+    console = Console(file=io.StringIO())
+    problem = compare_all(
+        fly,
+        controllers=["pso", "lqr", "pid", "mpc"],
+        references=["hover"],
+        scenarios=["connected"],
+        seeds=[1],
+        directory=tmp_path,
+        workers=0,
+        console=console,
+    )
+    assert " ".join(begun) == flown
+    rows = csv.DictReader((tmp_path / "compare.csv").open(encoding="utf-8"))
+    assert [row["controller"] for row in rows] == begun
+    words = "ended with lqr on hover, seed 1 (left OFFBOARD for AUTO.LOITER)"
+    failed = "1 of 2 flights failed; the table says why"
+    assert (problem == f"{failed}; {words}: 2 of 4 flights missing") == (exit_code != 2)
+    assert (words in (tmp_path / "compare.html").read_text(encoding="utf-8")) == (exit_code != 2)

@@ -7,6 +7,9 @@ from typing import Any
 
 import pytest
 
+from offboard import sortie
+from offboard.analysis.compare import Trial
+from offboard.flight.link import LinkError
 from offboard.sortie import Order
 
 
@@ -26,3 +29,25 @@ def test_vehicle_is_neutral_unless_one_is_named_or_the_simulator_flies_its_own(
     asked: dict[str, Any], believed: str
 ) -> None:
     assert Order(Path("unused"), **asked).resolve().vehicle.name == believed
+
+
+@pytest.mark.parametrize(
+    ("assignments", "allowed"), [((), False), (("limits.begin_armed=true",), True)]
+)
+def test_a_flight_that_is_compared_begins_disarmed_unless_told_otherwise(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    assignments: tuple[str, ...],
+    allowed: bool,
+) -> None:
+    flown: list[Order] = []
+
+    def refuses(order: Order, hangar: object) -> None:
+        flown.append(order)
+        raise LinkError("unused")
+
+    monkeypatch.setattr(sortie, "fly_order", refuses)
+    trial = Trial("lqr", "hover", "connected", 1, tmp_path)
+    sortie.fly_trial(Order(tmp_path, assignments=assignments), trial)
+    assert [order.resolve().limits.begin_armed for order in flown] == [allowed]
+    assert Order(tmp_path).resolve().limits.begin_armed
