@@ -2,13 +2,15 @@
 
 It begins with the vehicle file, takes over what identification found within bounds, blended over
 a second, and doubts what contradicts it: a delay that jumps, a tilt that does not answer as
-predicted. Doubt lowers the bandwidth at once; only a second look that agrees raises it again.
+predicted. Doubt lowers the bandwidth at once; only a look that explains the flight raises it again.
 Knows values and vehicle time, no flight and no trace.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import replace
+from typing import Any
 
 from offboard.control.delay_margin import needed_margin, supported_bandwidth
 from offboard.control.identification import Identified
@@ -16,12 +18,13 @@ from offboard.control.response_fit import Estimate, Unexplained
 from offboard.flight.takeover import LINK_S, bounded, later, mixed, told, with_link
 from offboard.model.vehicle import Vehicle
 
-BETTER = 0.7  # another look at the tilt is taken if its delay is this much surer, and one before
-# if it leaves this much less unexplained
+BETTER = 0.7  # another look at the tilt is taken if its delay is this much surer; in doubt, it or
+# what was believed before, if it leaves this much less unexplained
 DIRECT_LINK_S = 0.004  # of the vehicle file's delay: telemetry's age where nothing is in between
 LEAST_JUMP_S, JUMP_SDS = 0.015, 4.0  # delays further apart contradict each other
 DECISIVE = ("tilt", "hover_thrust")  # far from the vehicle file's, the flight ends
-MOST_DOUBTS = 2  # so often contradicted, the bandwidth stays low for good
+MOST_DOUBTS = 2  # so often contradicted, doubt and low bandwidth stay for good
+LINKED = ("yaw", "thrust_delay_s")  # moved by the tilt's delay, where they were not identified
 
 
 class Belief:
@@ -49,7 +52,8 @@ class Belief:
 
     def reset(self) -> None:
         """Forget everything of the previous flight."""
-        self._from = self.target = self.now = self._before = self._file
+        self._from = self.target = self.now = self._file
+        self._before: dict[str, Any] = {}  # what the tilt taken over last has replaced
         self._blend_began_s = -math.inf
         self._refused_drag_ps = math.inf
         self._doubt: Estimate | None = None
@@ -91,7 +95,7 @@ class Belief:
         added_s = late.value - DIRECT_LINK_S
         sentences = []
         if added_s >= LINK_S:
-            self.target = self.now = self._from = self._before = later(self._file, added_s)
+            self.target = self.now = self._from = later(self._file, added_s)
             sentences = [f"the link is {_told(late)} late, telemetry and setpoint together"]
         unknown_s = self._unknown_delay_s + JUMP_SDS * late.sd
         self.limit_radps = self.cautious_radps = self._borne(unknown_s)
@@ -103,9 +107,11 @@ class Belief:
         for name in DECISIVE:
             if getattr(found, name) is not None and getattr(within, name) is None:
                 self.contradiction = "; ".join(sentences)
-        target = with_link(within, within.applied_to(self.target), self._file)
+        applied = within.applied_to(self.target)
+        target = with_link(within, applied, self._file)
         if within.tilt is not None:
-            self._before = self.target
+            moved = [name for name in LINKED if getattr(target, name) != getattr(applied, name)]
+            self._before = {name: getattr(self.target, name) for name in ("tilt", *moved)}
             self.delay = within.tilt.delay_s
             self._doubt = None
         if target != self.target:
@@ -130,9 +136,11 @@ class Belief:
             self.limit_radps = self.cautious_radps
             return [f"tilt as believed, bandwidth {self.limit_radps:.1f} rad/s: {refusal}"]
         before = min(self.limit_radps, self._bandwidth_radps)
-        self.limit_radps = self._borne(needed_margin(self.target, self.delay.sd))
+        borne = self._borne(needed_margin(self.target, self.delay.sd))
+        trusted = self._doubts < MOST_DOUBTS
+        self.limit_radps = borne if trusted else min(borne, self.limit_radps)
         now = min(self.limit_radps, self._bandwidth_radps)
-        self.doubted = False
+        self.doubted = not trusted
         if now == before:
             return []
         return [
@@ -140,24 +148,31 @@ class Belief:
             f"{_told(self.delay)} bears"
         ]
 
-    def look_again(self, found: Identified, time_s: float) -> list[str]:
-        """A later look at the tilt: better, the same, or a contradiction."""
+    def look_again(self, found: Identified, now: Unexplained, time_s: float) -> list[str]:
+        """A later look at the tilt: better, the same, or a contradiction. `now`: what the belief
+        leaves of the same stretch."""
         tilt = found.tilt
         if tilt is None or bounded(found, self._file, self._factor)[1]:
             return []
         if self.delay is None:
-            return self.take(found, time_s) + self.conclude()
-        if not _apart(tilt.delay_s, self.delay):
-            surer = tilt.delay_s.sd < BETTER * self.delay.sd
-            sentences = self.take(found, time_s) if surer else []
-            trusted = self._doubts < MOST_DOUBTS
-            return sentences + (self.conclude() if trusted and (surer or self.doubted) else [])
-        if self._doubt is not None and not _apart(tilt.delay_s, self._doubt):
-            return self.take(found, time_s) + self.conclude()
-        self._doubt, self.doubted = tilt.delay_s, True
-        jump_s = abs(tilt.delay_s.value - self.delay.value)
-        said = f"tilt delay {_told(tilt.delay_s)} contradicts the {_told(self.delay)} identified"
-        return [f"{said}: {self._lowered(self._borne(jump_s + tilt.delay_s.sd))}"]
+            better = True
+        elif _apart(tilt.delay_s, self.delay):
+            if self._doubt is None or _apart(tilt.delay_s, self._doubt):
+                return self._doubt_delay(self.delay, tilt.delay_s)
+            better = True
+        else:
+            clearer = self.doubted and tilt.residual_rms < BETTER * now.scale
+            better = clearer or tilt.delay_s.sd < BETTER * self.delay.sd
+        sentences = self.take(found, time_s) if better else []
+        left = replace(now, scale=tilt.residual_rms) if better else now
+        certain = not left.contradicts if self.doubted else better
+        return sentences + (self.conclude() if certain else [])
+
+    def _doubt_delay(self, known: Estimate, seen: Estimate) -> list[str]:
+        self._doubt, self.doubted = seen, True
+        limit_radps = self._borne(abs(seen.value - known.value) + seen.sd)
+        said = f"tilt delay {_told(seen)} contradicts the {_told(known)} identified"
+        return [f"{said}: {self._lowered(limit_radps)}"]
 
     def contradict(self, now: Unexplained, before: Unexplained, time_s: float) -> list[str]:
         """The tilt does not answer as predicted; `before`: what the belief before leaves."""
@@ -168,9 +183,10 @@ class Belief:
         said += f" contradicts telemetry: {now.told}"
         if before.scale < BETTER * now.scale:
             self.delay = None
-            self._set_out(self._before, time_s)
+            self._set_out(self.before, time_s)
             said += f", {before.told} by the one before, which is flown again"
-        return [f"{said}; {self._lowered(self.cautious_radps)}"]
+        said += f"; {self._lowered(self.cautious_radps)}"
+        return [said + (" for good" if self._doubts >= MOST_DOUBTS else "")]
 
     def _set_out(self, target: Vehicle, time_s: float) -> None:
         self._from, self.target, self._blend_began_s = self.now, target, time_s
@@ -184,8 +200,8 @@ class Belief:
 
     @property
     def before(self) -> Vehicle:
-        """What was believed before the tilt was last taken over."""
-        return self._before
+        """With the tilt that was believed before the last was taken over."""
+        return self.target.model_copy(update=self._before)
 
 
 def _apart(one: Estimate, other: Estimate) -> bool:

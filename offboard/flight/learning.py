@@ -212,7 +212,7 @@ class Learner:
             return self._look_at_steps(phase) if self._steps_are_over(phase, time_s) else None
         if phase not in MOVING:
             return None
-        if self._is_due(self._watched_s, WATCH_EVERY_S):
+        if self._is_due(self._watched_s, WATCH_EVERY_S) and not self._belief.doubted:
             return self._watch()
         sure = self._belief.delay is not None and self._belief.delay.sd <= WELL_KNOWN_S
         if self._is_due(self._tilt_looked_s, TILT_EVERY_S) and (self._belief.doubted or not sure):
@@ -264,10 +264,12 @@ class Learner:
         begin_s = max(
             self._climb_s + LIFTED_OFF_S, self._time_s - TILT_OVER_S, self._doubted_from_s
         )
-        found = identify_tilt(self._recorder.trace(begin_s, self._time_s))
+        trace = self._recorder.trace(begin_s, self._time_s)
+        found = identify_tilt(trace)
         yield
         before = self._belief.delay
-        self._sentences += self._belief.look_again(found, self._time_s)
+        now = unexplained(trace, self._belief.target.tilt)
+        self._sentences += self._belief.look_again(found, now, self._time_s)
         if self._belief.delay is not before:
             self._record = record_of(found)
         yield
@@ -278,7 +280,8 @@ class Learner:
         trace = self._recorder.trace(self._time_s - WATCH_OVER_S, self._time_s)
         now = unexplained(trace, self._belief.target.tilt)
         self._contradictions = self._contradictions + 1 if now.contradicts else 0
-        if self._contradictions == WATCH_TWICE and not self._belief.doubted:
+        if self._contradictions >= WATCH_TWICE:
+            self._contradictions = 0
             before = unexplained(trace, self._belief.before.tilt)
             self._doubted_from_s = self._time_s - WATCH_OVER_S
             self._sentences += self._belief.contradict(now, before, self._time_s)

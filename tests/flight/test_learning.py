@@ -27,6 +27,8 @@ from offboard.flight.takeover import with_link
 from offboard.model.document import parse
 from offboard.model.vehicle import AxisResponse, Vehicle
 from simulator import config as simulated
+from simulator.attitude import build_loop
+from simulator.plant import STEP_S
 
 LEARNING = IdentifySettings()
 NEUTRAL = simulated.vehicle("neutral")
@@ -330,6 +332,29 @@ def test_delay_that_is_never_the_same_lowers_the_bandwidth(tmp_path: Path):
     assert "mrad of tilt unexplained (limit" in said[0]
     assert pair.score(tmp_path / "whole").max_position_m < 2.0
     assert second_lap_rmse_m(pair, tmp_path) < 0.3
+
+
+@pytest.mark.parametrize(("scenario", "most_m"), [("calm", 0.2), ("px4_like", 0.65)])
+def test_attitude_loop_that_slows_is_noticed_and_flown(scenario, most_m, tmp_path: Path):
+    """From 11.4 to 5 rad/s with the same delay. Unnoticed, it is 0.68 m off, and 0.98 m."""
+    pair = neutral(scenario=scenario, learning=LEARNING)
+    true = simulated.vehicle("px4_sih")
+    slow = true.tilt.model_copy(update={"natural_frequency_radps": 5.0})
+    loop = build_loop(true.model_copy(update={"tilt": slow}), STEP_S)
+
+    def slows(flying: Pair) -> None:
+        flying.instance.autopilot.plant.record["gains"][0] = loop.gains
+
+    pair.at.append((in_phase(Phase.TRACK, 3.0), slows))
+    assert pair.fly().exit_code == 0
+    said = " | ".join(pair.companion.announced)
+    doubt = said.index("the identified vehicle contradicts telemetry")
+    known = said.index("identified tilt", doubt)
+    assert "bandwidth lowered to 2.8 rad/s" in said[doubt:known]
+    assert float(said[known:].split()[4]) == pytest.approx(5.0, abs=0.2)
+    assert "bandwidth 7.0 of 7.0 rad/s" in said[known:]
+    assert "contradicts" not in said[known:]
+    assert pair.score(tmp_path).max_position_m < most_m
 
 
 def test_steps_are_repeated_while_the_delay_is_uncertain():
