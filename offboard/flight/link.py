@@ -8,6 +8,7 @@ serial:DEVICE:BAUD
 
 from __future__ import annotations
 
+import os
 import select
 import socket
 from collections.abc import Callable, Hashable
@@ -162,14 +163,16 @@ class SerialLink:
         import serial
 
         try:
-            self._port = serial.Serial(device, baud, timeout=0, write_timeout=0.05)
+            self._port = serial.Serial(device, baud, timeout=0)
         except (serial.SerialException, ValueError) as error:
             raise LinkError(
                 f"serial port {device} at {baud} baud cannot be opened: {error}"
             ) from None
+        self._backlog = Backlog()
         self.send_errors = 0
 
     def receive(self, timeout_s: float) -> list[Chunk]:
+        self._flush()
         try:
             self._port.timeout = max(0.0, timeout_s)
             first = self._port.read(1)
@@ -180,10 +183,18 @@ class SerialLink:
         return [(data, "serial")] if data else []
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
+        self._backlog.add(data)
+        self._flush()
+
+    def _flush(self) -> None:
         try:
-            self._port.write(data)
+            self._backlog.flush(self._write)
         except OSError:
             self.send_errors += 1
+
+    def _write(self, data: bytes) -> int:
+        # pyserial's own write spins until a full port has room again
+        return os.write(self._port.fileno(), data)
 
     def close(self) -> None:
         self._port.close()

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import os
 import pty
+import select
 import signal
 import socket
-from collections.abc import Callable
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, cast
 
@@ -14,7 +17,7 @@ import pytest
 
 from offboard.flight.companion import Companion, Outcome, Output
 from offboard.flight.daemon import Loop
-from offboard.flight.link import SerialLink, open_link
+from offboard.flight.link import Link, SerialLink, open_link
 from offboard.flight.log import FlightLog
 from offboard.mavlink.counters import Counters
 from offboard.mavlink.framing import FrameSplitter, pack
@@ -102,28 +105,55 @@ def setpoint(number: int) -> bytes:
     return pack(82, number.to_bytes(4, "little") + bytes(33) + b"\1\1", number % 256, 1, 191)
 
 
-def test_a_stream_that_is_full_delays_nothing_and_sends_the_newest_setpoint() -> None:
+@contextmanager
+def connection() -> Iterator[tuple[Link, Callable[[], bytes]]]:
     with socket.create_server(("127.0.0.1", 0)) as server:
         link = open_link(f"tcp:127.0.0.1:{server.getsockname()[1]}")
         theirs, _ = server.accept()
     theirs.settimeout(10.0)
-    count, heartbeat = 200_000, pack(0, b"\1" * 9, 7, 1, 191)
-    for number in range(count):  # some 10 MB, more than both ends hold
-        link.send(setpoint(number), None)
-    link.send(heartbeat, None)
-    link.send(setpoint(count), None)
-    splitter, frames = FrameSplitter(True, Counters()), []
-    while not frames or frames[-1].raw != setpoint(count):
-        link.receive(0.0)
-        frames += splitter.split(theirs.recv(65536))
+    yield link, lambda: theirs.recv(65536)
+    link.close()
+    theirs.close()
+
+
+@contextmanager
+def cable() -> Iterator[tuple[Link, Callable[[], bytes]]]:
+    theirs, ours = pty.openpty()
+    tty.setraw(ours)
+    link = open_link(f"serial:{os.ttyname(ours)}:57600")
+
+    def read() -> bytes:
+        assert select.select([theirs], [], [], 10.0)[0], "silent"
+        return os.read(theirs, 65536)
+
+    yield link, read
+    link.close()
+    os.close(ours)
+    os.close(theirs)
+
+
+@pytest.mark.parametrize(
+    ("ends", "count"), [(connection, 200_000), (cable, 5_000)]
+)  # some 10 MB and 250 kB, more than both ends hold
+def test_a_stream_that_is_full_delays_nothing_and_sends_the_newest_setpoint(
+    ends: Callable[[], AbstractContextManager[tuple[Link, Callable[[], bytes]]]], count: int
+) -> None:
+    heartbeat = pack(0, b"\1" * 9, 7, 1, 191)
+    with ends() as (link, read):
+        for number in range(count):
+            link.send(setpoint(number), None)
+        link.send(heartbeat, None)
+        link.send(setpoint(count), None)
+        splitter, frames = FrameSplitter(True, Counters()), []
+        while not frames or frames[-1].raw != setpoint(count):
+            link.receive(0.0)
+            frames += splitter.split(read())
     numbers = [int.from_bytes(f.payload[:4], "little") for f in frames if f.message_id == 82]
     assert all(frame.verified for frame in frames)
     assert numbers == sorted(numbers)
     assert len(numbers) < count  # those that waited have been replaced
     assert numbers[-2] < count - 1  # by the last one
     assert frames[-2].raw == heartbeat
-    link.close()
-    theirs.close()
 
 
 def test_an_unplugged_serial_link_is_silent() -> None:
