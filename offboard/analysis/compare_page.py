@@ -144,8 +144,8 @@ def _border(heading: int) -> dict[str, object]:
 
 def _failure(row: Row, place: int) -> dict[str, object]:
     return {
-        "xref": "paper", "x": PANELS["rmse_position_m"][1][1], "xanchor": "right", "y": place,
-        "showarrow": False, "text": f"{row.failed} of {row.flights} failed",
+        "xref": "paper", "x": 0, "xanchor": "left", "y": place, "showarrow": False,
+        "text": f"{row.failed} of {row.flights} failed",
         "font": {"color": FAILED, "size": 11},
     }  # fmt: skip
 
