@@ -19,7 +19,7 @@ Array = NDArray[np.float64]
 
 GRAVITY_MPS2 = 9.80665
 _TILT_LIMIT_OF_THRUST = 0.1  # least cosine by which thrust is divided
-_INTEGRAL_MAX_MPS2 = 4.0
+_INTEGRAL_ACROSS_MAX_MPS2 = 4.0  # of the vertical it is gravity, so that any vehicle hovers
 
 # State: integrals m/s^2, filtered derivative of the velocity, velocity of the last period.
 _DERIVATIVE, _VELOCITY = 3, 6
@@ -169,6 +169,8 @@ def step_loop(loop: Any) -> int:
     elif not math.isnan(loop.yaw_rate_radps):
         loop.course_rad = _wrapped(loop.course_rad + loop.yaw_rate_radps * loop.period_s)
     _compose(loop)
+    if loop.integrates:
+        _integrate(loop, loop.estimate)
     return 0
 
 
@@ -230,12 +232,25 @@ def _accelerate(loop: Any, estimate: Array) -> None:
         out[i] = _or_zero(loop.acceleration[i])
         if math.isnan(wanted[i]):
             continue
-        p, integral_gain, d = gains[4 * i + 1], gains[4 * i + 2], gains[4 * i + 3]
+        p, d = gains[4 * i + 1], gains[4 * i + 3]
         error = wanted[i] - estimate[3 + i]
         out[i] += p * error + state[i] - d * state[_DERIVATIVE + i]
-        if loop.integrates:
-            moved = state[i] + integral_gain * error * loop.period_s
-            state[i] = min(_INTEGRAL_MAX_MPS2, max(-_INTEGRAL_MAX_MPS2, moved))
+
+
+@kernel
+def _integrate(loop: Any, estimate: Array) -> None:
+    """Sum the velocity errors; the vertical one not further where the thrust is at that end."""
+    for i in range(3):
+        error = loop.wanted_velocity[i] - estimate[3 + i]
+        ends = i == 2 and (
+            (loop.thrust <= loop.thrust_least and error > 0.0)
+            or (loop.thrust >= loop.thrust_max and error < 0.0)
+        )
+        if math.isnan(error) or ends:
+            continue
+        most = GRAVITY_MPS2 if i == 2 else _INTEGRAL_ACROSS_MAX_MPS2
+        moved = loop.state[i] + loop.gains[4 * i + 2] * error * loop.period_s
+        loop.state[i] = min(most, max(-most, moved))
 
 
 @kernel

@@ -42,9 +42,10 @@ class Bench:
         firmware: Firmware = PX4,
         boot_scale: float = 1.0,
         strict: bool = False,
+        vehicle: Vehicle | None = None,
     ) -> None:
         conditions = Conditions(estimator=estimator, boot_scale=boot_scale)
-        vehicle = config.vehicle(firmware.vehicle)
+        vehicle = vehicle or config.vehicle(firmware.vehicle)
         self.instance = Instance(
             firmware,
             vehicle,

@@ -6,7 +6,7 @@ import math
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
-from sim_bench import HOVER, LAND, LOITER, NAN, OFFBOARD, POSCTL, RTL, TAKEOFF, Bench
+from sim_bench import HOVER, LAND, LOITER, NAN, OFFBOARD, POSCTL, RTL, TAKEOFF, Bench, px4_vehicle
 
 from simulator.autopilot import ACTIONS, GUARDS, describe
 from simulator.firmware.px4 import PX4
@@ -137,6 +137,18 @@ def test_takeoff_land_and_a_second_flight() -> None:
         settled_s = bench.text_at("Disarmed by landing") - bench.text_at("Landing detected")
         assert settled_s == pytest.approx(2.0, abs=0.02)
         assert bench.mode == LOITER
+
+
+@pytest.mark.parametrize("hover_thrust", [0.15, 0.2, 0.8])
+def test_vehicles_far_from_the_believed_hover_thrust_hold_and_land(hover_thrust: float) -> None:
+    """MPC_THR_HOVER is 0.5; the integral, of up to g, makes up for the rest."""
+    believed = px4_vehicle()
+    bench = Bench(vehicle=believed.model_copy(update={"hover_thrust": hover_thrust}))
+    bench.fly_offboard(2.0)
+    bench.run(8.0, lambda: bench.position(0, 0, -2))
+    assert bench.height_m == pytest.approx(2.0, abs=0.02)
+    bench.command(21)
+    bench.run_until(lambda: not bench.armed, 15.0)
 
 
 def test_takeoff_height_is_above_sea() -> None:
