@@ -66,6 +66,11 @@ def rebooted(now: Picture) -> bool:
     return now.rebooted
 
 
+def flown_by_another(now: Picture) -> bool:
+    """In the mode that only a stream of setpoints holds, before we sent one."""
+    return now.engaged and now.armed and not now.lifted_by_command
+
+
 def streamed(now: Picture) -> bool:
     return now.in_phase_s >= now.limits.stream_s
 

@@ -37,6 +37,7 @@ STOPPED = "stop requested by the operator"
 _DIVERGED = "{position_error_m:.1f} m from the reference (limit {position_error_limit_m:.1f} m)"
 _NOT_FOUND = "no vehicle heard in {silence_s:.0f} s; is it running, and sending to this port?"
 _NO_LIFT_OFF = "no lift-off in {in_phase_s:.0f} s; is hover_thrust in the vehicle file right?"
+_NOT_OURS = "the vehicle is armed and in {mode_wanted} already: another controller flies it"
 _NOT_ENGAGED = "the vehicle did not enter {mode_wanted} in {in_phase_s:.0f} s (it shows {mode})"
 
 
@@ -87,6 +88,7 @@ TABLE: tuple[Row, ...] = (
     Row(Phase.CONNECT, guards.vehicle_found, Phase.HEALTH, "vehicle found"),
     Row(Phase.CONNECT, guards.silent_on_ground, Phase.FAILED, _NOT_FOUND, REFUSED),
     *_ground_rows(Phase.HEALTH),
+    Row(Phase.HEALTH, guards.flown_by_another, Phase.FAILED, _NOT_OURS, REFUSED),
     Row(Phase.HEALTH, guards.misconfigured, Phase.FAILED, "{complaint}", REFUSED),
     Row(Phase.HEALTH, guards.ready, Phase.STREAM, "telemetry flows and the vehicle can arm"),
     _too_long(Phase.HEALTH, "health_s", Phase.FAILED, "not ready: {unready}", REFUSED),

@@ -31,6 +31,7 @@ class Bounds:
     """
 
     height_min_m: float = 0.3
+    distance_max_m: float = 2000.0
     speed_max_mps: float = 12.0
     thrust_fraction_min: float = 0.05
     thrust_fraction_max: float = 0.95
@@ -59,6 +60,7 @@ class _Demand:
     values: Array
     limit: float
     sign: float = 1.0
+    of_path: bool = False  # of the path itself, not of what it takes to fly it
 
     @property
     def worst(self) -> int:
@@ -76,8 +78,8 @@ def check(
     """The extremes of a reference, sampled every 10 ms from 0 to its end, without wind.
 
     `ground_down_m` is the ground in the reference's own frame (NED, positive down): 0 when
-    positions are relative to the take-off point. Raises InfeasibleReference for what is beyond
-    its limit first.
+    positions are relative to the take-off point. Raises InfeasibleReference for a path that
+    leads below or far away, else for what is beyond its limit first.
     """
     count = int(np.ceil(reference.duration_s / _STEP_S)) + 1
     times = np.linspace(0.0, reference.duration_s, count)
@@ -107,7 +109,7 @@ def _envelope(
         if not within.all():
             broken.append((int(np.argmin(within)), demand))
     if broken:
-        index, demand = min(broken, key=lambda item: item[0])
+        index, demand = min(broken, key=lambda item: (not item[1].of_path, item[0]))
         raise InfeasibleReference(
             f"the reference asks for {demand.what} {demand.extreme:.3g} {demand.unit} at "
             f"{times[demand.worst]:.2f} s, beyond the limit of {demand.limit:.3g} {demand.unit} "
@@ -127,6 +129,7 @@ def _demands(
     rates_max = bounds.rates_max_frd_radps
     speed = np.linalg.norm(sample.velocity_ned_mps, axis=-1)
     height = ground_down_m - sample.position_ned_m[:, 2]
+    distance = np.linalg.norm(sample.position_ned_m, axis=-1)
     thrust = state.thrust_mps2
     return (
         _Demand("a thrust of", "m/s^2", thrust, bounds.thrust_fraction_min * thrust_max, -1.0),
@@ -136,5 +139,6 @@ def _demands(
         _Demand("a pitch rate of", "rad/s", rates[:, 1], rates_max[1]),
         _Demand("a yaw rate of", "rad/s", rates[:, 2], rates_max[2]),
         _Demand("a speed of", "m/s", speed, bounds.speed_max_mps),
-        _Demand("a height of", "m", height, bounds.height_min_m, -1.0),
+        _Demand("a height of", "m", height, bounds.height_min_m, -1.0, of_path=True),
+        _Demand("a distance of", "m", distance, bounds.distance_max_m, of_path=True),
     )

@@ -40,6 +40,7 @@ from faults import (
     without,
 )
 from pair import Pair, decode, hover, in_phase, make
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.flight.phases import Phase
 
@@ -197,6 +198,26 @@ def already_flying() -> Pair:
     return pair
 
 
+def flown_by_another() -> Pair:
+    """The same in OFFBOARD, with another companion's stream of level setpoints."""
+    pair = already_flying()
+    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=195)
+    level = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, [1, 0, 0, 0], 0, 0, 0, 0.49)
+
+    def streaming(_: float, datagrams: list[bytes]) -> list[bytes]:
+        pair.instance.feed(level.pack(codec))
+        return datagrams
+
+    pair.down = streaming
+    for second in range(300):
+        streaming(0.0, [])
+        if second == 150:
+            pair.ground(SET_MODE, 1, 6)
+        pair.instance.step()
+    assert pair.instance.autopilot.mode.name == "OFFBOARD"
+    return pair
+
+
 def already_armed_on_ground() -> Pair:
     return hover(at=[(in_phase(Phase.STREAM, 0.5), lambda pair: pair.ground(ARM_DISARM, 1))])
 
@@ -214,6 +235,14 @@ TRACK = Phase.TRACK
 ROWS = (
     Row("hover", hover, 0, FLOWN, Phase.DISARMED, flown),
     Row("armed by another", already_armed_on_ground, 0, FLOWN, Phase.DISARMED, flown),
+    Row(
+        "flown by another",
+        flown_by_another,
+        3,
+        "the vehicle is armed and in OFFBOARD already: another controller flies it",
+        Phase.FAILED,
+        lambda pair: iter([not pair.setpoints]),
+    ),
     Row("found in the air", already_flying, 0, FLOWN, Phase.DISARMED, no_take_off_of_ours),
     # the operator
     Row(

@@ -42,6 +42,7 @@ UNEVENTFUL = Picture(
     contradicted=False,
 )
 QUIET = {  # what else a phase shows while it waits
+    Phase.HEALTH: {"engaged": False, "armed": False},
     Phase.ENGAGE: {"engaged": False, "armed": False},
     Phase.ARM: {"armed": False},
     Phase.JOIN: {"track_time_s": 0.0},
@@ -53,6 +54,7 @@ EVENTS: dict[str, dict[str, object]] = {  # the least that makes each guard hold
     "ready": {"ready": True},
     "misconfigured": {"misconfigured": True},
     "armed_by_another": {"armed": True, "limits": Limits(begin_armed=False)},
+    "flown_by_another": {"engaged": True, "armed": True},
     "rebooted": {"rebooted": True},
     "needs_no_stream": {"lifted_by_command": True},
     "streamed": {"in_phase_s": 1.0},
