@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import signal
+import os
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -27,6 +27,7 @@ out = Console(highlight=False)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 DEFAULT_CONNECTION = "udpin:127.0.0.1:14540"
+INTERRUPTED = "interrupted before anything was sent"
 EXIT_HELP = (
     "Exit codes: 0 flown and all requirements met; 1 a requirement missed; 2 usage or "
     "configuration error, nothing sent; 3 no vehicle, or refused; 4 aborted in flight."
@@ -75,9 +76,12 @@ def fly(
         bool, typer.Option("--sitl", help="Fly the bundled simulator, started for this flight.")
     ] = False,
     connect: Annotated[
-        str,
-        typer.Option(help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD."),
-    ] = DEFAULT_CONNECTION,
+        str | None,
+        typer.Option(
+            help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, serial:DEVICE:BAUD.",
+            show_default=DEFAULT_CONNECTION,
+        ),
+    ] = None,
     config: Annotated[str, typer.Option(help="A shipped configuration, or a file.")] = "flight",
     controller: Annotated[str | None, typer.Option(help="A shipped controller, or a file.")] = None,
     reference: Annotated[
@@ -105,13 +109,18 @@ def fly(
 ) -> None:
     """Connect, arm, take off, track the reference, land; log everything and score it."""
     from offboard.flight.sitl import Hangar
+    from offboard.flight.stop import StopRequests
 
+    if sitl and connect:
+        raise Refusal("--sitl flies a simulator of its own: leave --connect out, or --sitl")
     if not sitl and (scenario or sim_vehicle or firmware != "px4"):
         raise Refusal("--scenario, --sim-vehicle and --firmware are the simulator's: add --sitl")
     named = {"controller": controller, "reference": reference, "vehicle": vehicle}
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # leave no simulator behind
     try:
-        with Hangar() if sitl else nullcontext() as hangar:  # it loads while we do
+        with (
+            StopRequests(_leave) as stops,
+            Hangar() if sitl else nullcontext() as hangar,  # it loads while we do
+        ):
             from offboard.analysis.requirement import Requirement
             from offboard.analysis.score import FIGURES
             from offboard.flight import clock
@@ -125,15 +134,15 @@ def fly(
                 choices={part: name for part, name in named.items() if name is not None},
                 assignments=tuple(assignments or ()),
                 seed=seed,
-                connection=connect,
+                connection=connect or DEFAULT_CONNECTION,
                 sitl=sitl,
                 firmware=firmware,
                 scenario=scenario,
                 sim_vehicle=sim_vehicle,
             )
-            outcome = fly_order(order, _announcer(), out.print, hangar)
+            outcome = fly_order(order, _announcer(), out.print, hangar, stops)
     except KeyboardInterrupt:  # in flight it lands instead
-        raise Refusal("interrupted before anything was sent") from None
+        raise Refusal(INTERRUPTED) from None
     if outcome.exit_code == 2:
         raise Refusal(outcome.sentence)
     missed = _score(directory, [] if outcome.exit_code else requirements, as_json=False)
@@ -143,6 +152,12 @@ def fly(
     out.print(f"{outcome.sentence}; recorded in {directory}")
     if missed:
         raise Refusal("; ".join(missed), 1)
+
+
+def _leave() -> None:
+    """At once, whatever is being compiled; a simulator ends with the pipe that we hold."""
+    os.write(2, f"{INTERRUPTED}\n".encode())
+    os._exit(2)
 
 
 def _announcer() -> Callable[[Companion], None]:
@@ -231,7 +246,7 @@ def identify(
         flight = out_directory or Path("flights") / f"identify-{clock.local_stamp()}"
         fly(
             sitl=sitl,
-            connect=connect or DEFAULT_CONNECTION,
+            connect=connect,
             reference="identify",
             vehicle=vehicle,
             out_directory=flight,

@@ -26,6 +26,7 @@ from offboard.flight.link import LinkError
 from offboard.flight.log import FlightLog, LogError
 from offboard.flight.run import Bundled, Crew, fly
 from offboard.flight.sitl import OWN_VEHICLES, Hangar
+from offboard.flight.stop import StopRequests
 from offboard.flight.table import STOPPED
 from offboard.model.document import DocumentError
 
@@ -82,13 +83,16 @@ def fly_order(
     progress: Callable[[Companion], None] = lambda companion: None,
     tell: Callable[[str], None] = lambda sentence: None,
     hangar: Hangar | None = None,
+    stops: StopRequests | None = None,
 ) -> Outcome:
-    """Fly and log; a bundled simulator comes from `hangar`, or one for this flight alone.
+    """Fly and log; a bundled simulator comes from `hangar`, or one for this flight alone, and who
+    may stop us likewise from `stops`.
 
-    Raises DocumentError, LinkError or LogError before anything is sent.
+    Raises DocumentError, LinkError, LogError or KeyboardInterrupt before anything is sent.
     """
-    config = order.resolve()
     with ExitStack() as stack:
+        stops = stops or stack.enter_context(StopRequests())
+        config = order.resolve()
         bundled = None
         if order.sitl:
             bundled = Bundled(
@@ -103,6 +107,7 @@ def fly_order(
             FlightLog(order.directory, dump(config)),
             connection=order.connection,
             bundled=bundled,
+            stops=stops,
             progress=progress,
             tell=tell,
         )

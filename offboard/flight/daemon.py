@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import gc
-import signal
-from collections.abc import Callable, Hashable, Iterator
-from contextlib import contextmanager
-from types import FrameType
+from collections.abc import Callable, Hashable
 
 from offboard.flight import clock
 from offboard.flight.companion import Companion, Outcome, Output
@@ -14,6 +11,7 @@ from offboard.flight.link import Link
 from offboard.flight.log import FlightLog
 from offboard.flight.phases import BEFORE_FLIGHT, ExitCode
 from offboard.flight.sitl import Ending
+from offboard.flight.stop import StopRequests
 
 POLL_S = 0.02
 
@@ -31,6 +29,7 @@ class Loop:
         link: Link,
         log: FlightLog,
         *,
+        stops: StopRequests,
         lockstep: bool,
         progress: Callable[[Companion], None],
         vehicle_process_ended: Callable[[], Ending | None] = lambda: None,
@@ -38,19 +37,19 @@ class Loop:
         self._companion = companion
         self._link = link
         self._log = log
+        self._stops = stops
         self._lockstep = lockstep
         self._progress = progress
         self._vehicle_process_ended = vehicle_process_ended
         self._log_error: str | None = None
-        self._interrupts = 0
         self._ended_early: Outcome | None = None
 
     def run(self) -> Outcome:
-        """Fly to the end. SIGINT, SIGTERM and SIGHUP land; a second of the first two leaves."""
+        """Fly to the end. A stop request lands; who insists leaves."""
+        self._stops.in_flight = True
         gc.collect()
         gc.freeze()
-        with self._signals():
-            self._fly()
+        self._fly()
         self._show()
         if self._ended_early:
             return self._ended_early
@@ -68,7 +67,9 @@ class Loop:
         companion, link = self._companion, self._link
         link.receive(0.0)  # what waited while we prepared is old
         heard_s = polled_s = clock.monotonic_s()
-        while not companion.has_ended() and self._interrupts < 2 and not self._ended_early:
+        while not (companion.has_ended() or self._stops.insisted or self._ended_early):
+            if self._stops.asked:
+                companion.request_stop()
             chunks = link.receive(POLL_S)
             now_s = clock.monotonic_s()
             for data, peer in chunks:
@@ -117,20 +118,3 @@ class Loop:
         if self._companion.phase in BEFORE_FLIGHT:
             code = ExitCode.USAGE if ended.unusable else ExitCode.REFUSED
         self._ended_early = Outcome(code, ended.sentence)
-
-    @contextmanager
-    def _signals(self) -> Iterator[None]:
-        def on_signal(number: int, frame: FrameType | None) -> None:
-            # a closing terminal may send SIGHUP twice
-            self._interrupts += number != signal.SIGHUP
-            self._companion.request_stop()
-
-        kinds = [signal.SIGINT, signal.SIGTERM]
-        if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # as nohup has it
-            kinds.append(signal.SIGHUP)
-        before = {kind: signal.signal(kind, on_signal) for kind in kinds}
-        try:
-            yield
-        finally:
-            for kind, handler in before.items():
-                signal.signal(kind, handler)

@@ -11,6 +11,7 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numba.core.event import install_recorder
 
 from offboard.control import identification
 from offboard.control.base import Command, Controller, Situation
@@ -26,6 +27,7 @@ from offboard.flight.mission import Mission
 from offboard.flight.phases import Limits
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.flight.sitl import Hangar
+from offboard.flight.stop import StopRequests
 from offboard.mavlink.dialect import POSITIONING_TELEMETRY
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
 from offboard.model.compilation import without_garbage_collection
@@ -34,7 +36,7 @@ from offboard.model.vehicle import Vehicle
 from offboard.reference.track import Track
 from offboard.reference.transfer import Hold
 
-COMPILED_S = 2.0  # a rehearsal that takes longer has compiled
+COMPILED_S = 2.0  # worth a word
 REHEARSED_DECISIONS = 5  # of which the fastest counts: the machine may do something else too
 SITL_PATIENCE_S = 180.0  # a bundled simulator may compile first, on a machine that does much else
 
@@ -135,14 +137,16 @@ def fly(
     *,
     connection: str,
     bundled: Bundled | None,
+    stops: StopRequests,
     progress: Callable[[Companion], None],
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> Outcome:
     """Fly once over `connection`, or on a bundled simulator of our own.
 
     Raises LinkError, DocumentError or LogError before anything is sent, what can be known at once
-    before anything slow. The log is opened last, so that a flight which cannot begin leaves no
-    directory behind. `tell` is given a sentence about what takes so long.
+    before anything slow; KeyboardInterrupt where `stops` was asked meanwhile. The log is opened
+    last, so that a flight which cannot begin leaves no directory behind. `tell` is given a sentence
+    about what takes so long.
     """
     with ExitStack() as stack:
         log.check()
@@ -153,9 +157,11 @@ def fly(
             bundled.hangar.launch(bundled.options(link.port))
             stack.callback(bundled.hangar.recall)
         tell("preparing the controller (its first run on a machine compiles for seconds)")
-        took_s = rehearse(crew, keeps_deadline=bundled is None)
-        if took_s > COMPILED_S:
+        with install_recorder("numba:compile") as compiled:
+            took_s = rehearse(crew, keeps_deadline=bundled is None)
+        if compiled.buffer and took_s > COMPILED_S:
             tell(f"compiled in {took_s:.1f} s; the next start finds it cached")
+        stops.heed()
         stack.enter_context(log)
         observer = crew.make_observer()
         fuses = isinstance(observer, FusedObserver)
@@ -174,6 +180,7 @@ def fly(
             _companion(crew, session, observer, lockstep=bundled is not None),
             link,
             log,
+            stops=stops,
             lockstep=bundled is not None,
             progress=progress,
             vehicle_process_ended=bundled.hangar.ended if bundled else lambda: None,

@@ -5,6 +5,7 @@ What ends before anything is sent is called in this process; the rest are real p
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
 import signal
@@ -20,6 +21,7 @@ from processes import Spawn, children
 
 from offboard import cli
 from offboard.analysis import history, tlog
+from offboard.flight import run
 
 Capture = pytest.CaptureFixture[str]
 CONFIG = Path(__file__).parents[2] / "config"
@@ -75,7 +77,7 @@ def kept_out(north_m: float, east_m: float, height_m: float, radius_m: float) ->
         (("--connect", "serial:/dev/nonexistent:57600"), "cannot be opened"),
         (("--out", "/dev/null/x"), "recorded in /dev/null/x: Not a directory; choose a directory"),
         (("--out", "/proc/nowhere"), "choose a directory that can be written with --out"),
-        (("--sitl", "--scenario", "storm"), "storm"),
+        (("--sitl",), "--sitl flies a simulator of its own: leave --connect out, or --sitl"),
         (kept_out(0, 0, 3, 0.5), "keep_out[0] (sphere) contains the start of the reference"),
         (kept_out(0, 0, 0, 0.5), "keep_out[0] (sphere) contains the take-off point with its"),
         (kept_out(0, 0, 6, 5), "keep_out[0] (sphere) contains the whole path with its clearance"),
@@ -235,12 +237,32 @@ def test_interrupt_lands(spawn: Spawn, tmp_path: Path) -> None:
     assert flown.phases[-1].what.startswith("disarmed")
 
 
-def test_terminated_before_flight_leaves_no_simulator(spawn: Spawn, tmp_path: Path) -> None:
+def test_interrupted_while_it_compiles_it_does_not_fly(
+    offboard: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What is raised in a callback of the compiler goes no further than that."""
+
+    def compiles(*_: object, **__: object) -> float:
+        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()
+        return 0.0
+
+    monkeypatch.setattr(run, "rehearse", compiles)
+    code, said = offboard("fly", "--connect", "udpin:127.0.0.1:0", "--set", "limits.connect_s=0.3")
+    assert (code, said) == (2, "interrupted before anything was sent\n")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("signals", [[signal.SIGTERM], [signal.SIGINT, signal.SIGINT]])
+def test_ended_before_flight_it_leaves_no_simulator(
+    signals: list[int], spawn: Spawn, tmp_path: Path
+) -> None:
     process = spawn("offboard", "fly", "--sitl", "--out", "x")
     while process.poll() is None and not children(process.pid):
         time.sleep(0.01)
     (simulator,) = children(process.pid)
-    process.send_signal(signal.SIGTERM)
+    for number in signals:
+        process.send_signal(number)
+        time.sleep(0.05)
     _, said = process.communicate(timeout=60)
     assert (process.returncode, said) == (2, "interrupted before anything was sent\n")
     deadline_s = time.monotonic() + 10.0  # hit while it started: it ends by itself, alone
