@@ -85,6 +85,8 @@ class Hangar:
         if self._ending is None and select.select([self._process.stdout], [], [], patience_s)[0]:
             answer = self._process.stdout.readline()
             self._ending = self._explained(int(answer) if answer else self._process.wait())
+            if not answer:
+                self.close()  # what it flew lives on
         return self._ending
 
     def recall(self) -> None:
@@ -110,9 +112,11 @@ class Hangar:
 
     def close(self) -> None:
         """End everything."""
-        if self._process.poll() is None:
+        if self._errors.closed:
+            return
+        with suppress(ProcessLookupError, PermissionError):  # nobody is left
             os.killpg(self._process.pid, signal.SIGKILL)  # itself and what it flies
-            self._process.wait()
+        self._process.wait()
         for pipe in (self._process.stdin, self._process.stdout, self._errors):
             assert pipe is not None
             pipe.close()

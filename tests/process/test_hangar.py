@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -38,6 +39,22 @@ def flying(hangar: Hangar, *options: str) -> Iterator[bytes]:
 
 def vehicles(hangar: Hangar) -> list[int]:
     return children(hangar.pid)
+
+
+def gone(pid: int) -> bool:
+    """Within ten seconds, for whoever is not ours to wait for."""
+    for _ in range(1000):
+        if not Path(f"/proc/{pid}/exe").exists():
+            return True
+        time.sleep(0.01)
+    return False
+
+
+def test_a_hangar_that_dies_unnoticed_takes_its_vehicle_along() -> None:
+    with Hangar() as hangar, flying(hangar):
+        (orphan,) = vehicles(hangar)
+        os.kill(hangar.pid, signal.SIGKILL)
+    assert gone(orphan)
 
 
 def test_one_after_the_other_and_the_same_seed_says_the_same(hangar: Hangar) -> None:
@@ -93,9 +110,9 @@ def test_a_hangar_that_was_lost_is_replaced() -> None:
             assert ending is not None
             assert ending.sentence == "the bundled simulator ended (signal 9)"
         hangar.recall()
+        assert gone(orphan)
         with flying(hangar):
             assert hangar.pid != lost
-    os.kill(orphan, signal.SIGKILL)
     assert not Path(f"/proc/{hangar.pid}").exists()
 
 
