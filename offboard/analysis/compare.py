@@ -19,6 +19,8 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+from offboard.model.document import DocumentError
+
 EQUAL_SHARE = 0.01  # of the best median: nearer is no difference, whatever the spread
 POLL_S = 0.2
 FIGURES = (
@@ -109,8 +111,8 @@ def trials(
     seeds: Iterable[int],
     directory: Path,
 ) -> list[Trial]:
-    """Every combination, a directory for each."""
-    return [
+    """Every combination, a directory for each. Raises DocumentError where two would share one."""
+    planned = [
         Trial(
             controller,
             reference,
@@ -122,6 +124,19 @@ def trials(
             references, scenarios, controllers, seeds
         )
     ]
+    first: dict[Path, Trial] = {}
+    for trial in planned:
+        other = first.setdefault(trial.directory, trial)
+        if other is not trial:
+            raise DocumentError(
+                f"{_named(other)} and {_named(trial)} would both be recorded in "
+                f"{trial.directory}; name each once, and no two files alike"
+            )
+    return planned
+
+
+def _named(trial: Trial) -> str:
+    return f"{trial.controller} on {trial.reference} in {trial.scenario}"
 
 
 def run(

@@ -22,6 +22,7 @@ from offboard.analysis.compare import Fly, Result, Trial, as_csv, as_json, run, 
 from offboard.analysis.compare_page import page
 from offboard.analysis.compare_table import lines, numbered_seeds
 from offboard.analysis.interrupts import deaf_to_interrupts
+from offboard.analysis.processors import processors
 from offboard.flight.log import LogError
 from offboard.flight.phases import ExitCode
 
@@ -44,10 +45,11 @@ def compare_all(
     `workers` None: one process per processor; 0: in this process, one flight after the other (a
     vehicle that is there once; it ends when the vehicle or its pilot no longer lets us fly, for
     the next flight would take it back). Writes compare.csv, compare.json and compare.html. Raises
-    LogError before the first flight where `directory` cannot be written or holds something.
+    LogError before the first flight where `directory` cannot be written or holds something, and
+    DocumentError where two flights would share one.
     """
-    _claim(directory)
     planned = trials(controllers, references, scenarios, seeds, directory)
+    _claim(directory)
     results = _with_progress(planned, fly, workers, console)
     rows = table(sorted(results, key=lambda result: planned.index(result.trial)))
     if rows:
@@ -123,7 +125,7 @@ def _flown(
             if result.stopped or _taken(result):  # the flight heard the interruption, not we
                 return
     else:
-        width = workers or len(os.sched_getaffinity(0))
+        width = workers or processors()
         yield from run(planned, fly, _worker, width, ending)
 
 

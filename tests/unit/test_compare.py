@@ -29,6 +29,8 @@ from offboard.analysis.compare import (
 from offboard.analysis.compare_page import page
 from offboard.analysis.compare_table import lines
 from offboard.analysis.comparison import compare_all
+from offboard.analysis.processors import processors
+from offboard.model.document import DocumentError
 
 LAWS = ("pso", "lqr", "an/uncommonly/long/name.yaml", "lost")
 SCENARIOS = ("calm", "all_together")
@@ -172,3 +174,53 @@ def test_on_one_vehicle_a_flight_that_it_did_not_let_us_end_is_the_last(
     failed = "1 of 2 flights failed; the table says why"
     assert (problem == f"{failed}; {words}: 2 of 4 flights missing") == (exit_code != 2)
     assert (words in (tmp_path / "compare.html").read_text(encoding="utf-8")) == (exit_code != 2)
+
+
+@pytest.mark.parametrize(
+    ("controllers", "references"),
+    [
+        (["a/fast.yaml", "b/fast.yaml"], ["hover"]),
+        (["pso", "lqr", "pso"], ["hover"]),
+        (["pso"], ["a/way.yaml", "hover", "b/way.csv"]),
+        (["pso", "pso-slow"], ["slow-hover", "hover"]),
+    ],
+)
+def test_flights_that_would_share_a_directory_are_refused_before_the_first(
+    tmp_path: Path, controllers: list[str], references: list[str]
+) -> None:
+    with pytest.raises(DocumentError, match="would both be recorded in") as refused:
+        compare_all(
+            flown,
+            controllers=controllers,
+            references=references,
+            scenarios=["calm"],
+            seeds=[1],
+            directory=tmp_path / "all",
+            workers=0,
+            console=Console(file=io.StringIO()),
+        )
+    assert len(refused.value.problems) == 1
+    assert not (tmp_path / "all").exists()
+
+
+def lands(trial: Trial) -> Result:
+    return Result(trial, 0, "flown and landed", dict.fromkeys(FIGURES, 1.0))
+
+
+def test_where_the_system_tells_no_affinity_all_processors_count(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert processors() == len(os.sched_getaffinity(0))
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert processors() == os.cpu_count()
+    problem = compare_all(
+        lands,
+        controllers=["pso"],
+        references=["hover"],
+        scenarios=["calm"],
+        seeds=[1],
+        directory=tmp_path / "all",
+        workers=None,
+        console=Console(file=io.StringIO()),
+    )
+    assert not problem

@@ -27,6 +27,7 @@ from offboard.analysis.paper.options import PaperError, PaperOptions, check
 from offboard.analysis.paper.page import facts_json, page
 from offboard.analysis.paper.plan import Job, Key, Piece, Plan
 from offboard.analysis.paper.table import Table
+from offboard.analysis.processors import processors
 from offboard.control.swarm import warm_up
 
 PAGE = "paper.html"
@@ -128,7 +129,7 @@ class _Failure:
 
 def _results(plan: Plan, workers: int | None) -> Generator[tuple[Key, Any]]:
     """(key, result) as they come; a job that fails gives a `_Failure`."""
-    count = min(workers or _processors(), len(plan.jobs))
+    count = min(workers or processors(), len(plan.jobs))
     if count <= 1:
         for key, (function, arguments) in plan.jobs.items():
             yield key, _guarded(function, *arguments)
@@ -179,12 +180,6 @@ def _guarded(function: Any, *arguments: Any) -> Any:
         return function(*arguments)
     except Exception as error:  # a piece fails alone, and the page says so
         return _Failure(f"{type(error).__name__}: {error}")
-
-
-def _processors() -> int:
-    if hasattr(os, "sched_getaffinity"):
-        return len(os.sched_getaffinity(0))
-    return os.cpu_count() or 1
 
 
 def _facts(options: PaperOptions) -> list[tuple[str, str]]:
