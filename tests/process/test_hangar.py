@@ -54,6 +54,7 @@ def test_a_hangar_that_dies_unnoticed_takes_its_vehicle_along() -> None:
     with Hangar() as hangar, flying(hangar):
         (orphan,) = vehicles(hangar)
         os.kill(hangar.pid, signal.SIGKILL)
+        assert gone(hangar.pid)
     assert gone(orphan)
 
 
