@@ -30,7 +30,8 @@ DEFAULT_CONNECTION = "udpin:127.0.0.1:14540"
 INTERRUPTED = "interrupted before anything was sent"
 EXIT_HELP = (
     "Exit codes: 0 flown and all requirements met; 1 a requirement missed; 2 usage or "
-    "configuration error, nothing sent; 3 no vehicle, or refused; 4 aborted in flight."
+    "configuration error, nothing sent; 3 not flown: no vehicle, refused, or stopped on the "
+    "ground; 4 aborted in flight, or left armed."
 )
 
 Requirements = Annotated[

@@ -5,7 +5,7 @@ from __future__ import annotations
 import atexit
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
@@ -21,13 +21,12 @@ from offboard.config import FlightConfig, build_track, dump, load, locate
 from offboard.control.catalogue import build
 from offboard.control.fusion import observer_of
 from offboard.flight import clock
-from offboard.flight.companion import Companion, Outcome
+from offboard.flight.companion import STOPPED, Companion, Outcome
 from offboard.flight.link import LinkError
 from offboard.flight.log import FlightLog, LogError
 from offboard.flight.run import Bundled, Crew, fly
 from offboard.flight.sitl import OWN_VEHICLES, Hangar
 from offboard.flight.stop import StopRequests
-from offboard.flight.table import STOPPED
 from offboard.model.document import DocumentError
 
 
@@ -121,12 +120,13 @@ def score_flight(flight: Path) -> tuple[Score, History]:
 
 def keep_score(directory: Path, score: Score, flown: History) -> None:
     """Write score.json into a flight directory. Raises LogError."""
+    path = directory / "score.json"
     try:
-        (directory / "score.json").write_text(as_text(score, flown), encoding="utf-8")
+        path.write_text(as_text(score, flown), encoding="utf-8")
     except OSError as error:
-        raise LogError(
-            f"{error.filename or directory} cannot be written ({error.strerror})"
-        ) from None
+        with suppress(OSError):
+            path.unlink()  # half a score is none
+        raise LogError(f"{path} cannot be written ({error.strerror})") from None
 
 
 def check_flyable(order: Order, controllers: Sequence[str], references: Sequence[str]) -> None:

@@ -35,7 +35,7 @@ class Course:
     in_phase_s: float
     silence_s: float
     rebooted: bool
-    stop_requested: bool
+    stop_reason: str
     missed_decisions: int
     failure: str
     contradiction: str = ""
@@ -93,7 +93,7 @@ class Assessment:
             rest_time_s=track.duration_s + 0.5,
             position_error_m=self.position_error_m(),
             tilt_rad=self._tilt_rad(),
-            stop_requested=course.stop_requested,
+            stop_requested=bool(course.stop_reason),
             missed_decisions=course.missed_decisions,
             contradicted=bool(course.contradiction),
         )
@@ -113,6 +113,7 @@ class Assessment:
             "position_error_m": picture.position_error_m,
             "tilt_deg": math.degrees(picture.tilt_rad),
             "position_error_limit_m": self._limits.position_error_m,
+            "stop": course.stop_reason,
             "failure": course.failure,
             "contradiction": course.contradiction,
             "complaint": "; ".join(self._complaints()),

@@ -43,6 +43,7 @@ __all__ = ["Companion", "Outcome", "Output"]
 # When the link's delay is asked for with every setpoint; later with every tenth, for the log
 TIMED = (Phase.STREAM, Phase.ENGAGE, Phase.ARM, Phase.TAKEOFF)
 TIMED_EVERY = 10
+STOPPED = "stop requested by the operator"
 BRIDGED_SHARE = 0.3  # of the longest silence, after which level setpoints bridge it
 
 
@@ -129,9 +130,9 @@ class Companion:
     def has_ended(self) -> bool:
         return self._progress.has_ended()
 
-    def request_stop(self) -> None:
-        """The operator wants the vehicle on the ground: obeyed at the next tick or poll."""
-        self._progress.stop_requested = True
+    def request_stop(self, why: str = STOPPED) -> None:
+        """The vehicle shall be on the ground: obeyed at the next tick or poll."""
+        self._progress.stop_reason = self._progress.stop_reason or why
 
     def receive(self, datagram: bytes, peer: Hashable, now_s: float) -> Output:
         """Take one datagram in, decide if it completes a tick, answer in order."""
@@ -156,7 +157,7 @@ class Companion:
         progress = self._progress
         progress.silence_s = silence_s
         patience_s = min(self._limits.silence_s, self._limits.connect_s)
-        if not self.view.has_state or progress.stop_requested or silence_s > patience_s:
+        if not self.view.has_state or progress.stop_reason or silence_s > patience_s:
             progress.advance()
         if not self.has_ended() and silence_s > BRIDGED_SHARE * self._limits.silence_s:
             self._bridge(silence_s)

@@ -100,7 +100,7 @@ class Loop:
                 self._log.write(stamp, frame)
         except OSError as error:
             self._log_error = f"the log {self._log.path} cannot be written ({error.strerror})"
-            self._companion.request_stop()
+            self._companion.request_stop(self._log_error)
 
     def _show(self) -> None:
         """Tell the user. A closed pipe or a lost terminal ends the showing, not the flight."""

@@ -136,6 +136,11 @@ def mode_taken(now: Picture) -> bool:
     return not now.engaged
 
 
+def taken_armed(now: Picture) -> bool:
+    """A pilot took over just as it armed: whether it stays so is the pilot's to say."""
+    return now.armed and not now.engaged
+
+
 def landing_taken(now: Picture) -> bool:
     """A pilot took over; a failsafe that lands is left to finish."""
     return not (now.engaged or now.landing or now.failsafe)

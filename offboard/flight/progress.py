@@ -57,7 +57,7 @@ class Progress:
         self._link_delay = link_delay
         self.phase = Phase.CONNECT
         self.outcome: Outcome | None = None
-        self.stop_requested = False
+        self.stop_reason = ""  # why the flight shall end
         self.silence_s = 0.0  # wall time since the vehicle was heard
         self._rebooted = False
         self._began_s = 0.0  # on the session's link time
@@ -92,7 +92,7 @@ class Progress:
             in_phase_s=self.in_phase_s,
             silence_s=self.silence_s,
             rebooted=self._rebooted,
-            stop_requested=self.stop_requested,
+            stop_reason=self.stop_reason,
             missed_decisions=self._decider.missed,
             failure=self._decider.failure,
             contradiction=learner.contradiction if learner else "",
@@ -119,13 +119,13 @@ class Progress:
             self._mission.join(self._view.time_s)
 
     def _conclude(self, row: Row, reason: str) -> None:
-        """The first row with an exit code decides it; what follows is added to the sentence."""
+        """The gravest exit code counts; what follows the first is added to its sentence."""
         if row.exit_code is not None:
             if self.outcome is None:
                 self.outcome = Outcome(row.exit_code, reason + self._view.explanation())
             else:
                 said = f"{self.outcome.sentence}; {reason}"
-                self.outcome = Outcome(self.outcome.exit_code, said)
+                self.outcome = Outcome(max(self.outcome.exit_code, row.exit_code), said)
         elif row.target is Phase.DISARMED and self.outcome is None:
             self.outcome = Outcome(ExitCode.FLOWN, "flown and landed")
 

@@ -18,7 +18,7 @@ REFUSED, ABORTED = ExitCode.REFUSED, ExitCode.ABORTED
 @dataclass(frozen=True, slots=True)
 class Row:
     """From `source`, when `guard` holds, to `target`; `exit_code` where the flight's result is
-    decided by this row (kept by a landing that follows)."""
+    decided by this row (what follows may only make it graver)."""
 
     source: Phase
     guard: Guard
@@ -33,7 +33,7 @@ _BLIND = "no {blind_to} for {blind_s:.1f} s"
 _REBOOTED = "the vehicle restarted"
 _ARMED_ALREADY = "the vehicle is armed already, and not by us"
 _DISARMED = "disarmed on the ground"
-STOPPED = "stop requested by the operator"
+_STOP = "{stop}"
 _DIVERGED = "{position_error_m:.1f} m from the reference (limit {position_error_limit_m:.1f} m)"
 _NOT_FOUND = "no vehicle heard in {silence_s:.0f} s; is it running, and sending to this port?"
 _NO_LIFT_OFF = "no lift-off in {in_phase_s:.0f} s; is hover_thrust in the vehicle file right?"
@@ -45,7 +45,7 @@ def _ground_rows(source: Phase) -> tuple[Row, ...]:
     return (
         Row(source, guards.armed_by_another, Phase.FAILED, _ARMED_ALREADY, REFUSED),
         Row(source, guards.silent_on_ground, Phase.FAILED, _SILENT, REFUSED),
-        Row(source, guards.stop_requested, Phase.FAILED, f"{STOPPED} before take-off", ABORTED),
+        Row(source, guards.stop_requested, Phase.FAILED, "{stop} before take-off", REFUSED),
     )
 
 
@@ -64,7 +64,7 @@ def _flying_rows(source: Phase, when: str = "in flight") -> tuple[Row, ...]:
         Row(source, guards.mode_taken, Phase.YIELDED, _LEFT, ABORTED),
         Row(source, guards.silent, Phase.LAND, _SILENT, ABORTED),
         Row(source, guards.blind, Phase.LAND, _BLIND, ABORTED),
-        Row(source, guards.stop_requested, Phase.LAND, STOPPED, ABORTED),
+        Row(source, guards.stop_requested, Phase.LAND, _STOP, ABORTED),
         Row(source, guards.toppled, Phase.LAND, "tilt {tilt_deg:.0f} deg", ABORTED),
     )
 
@@ -84,7 +84,7 @@ def _too_long(source: Phase, limit: str, target: Phase, reason: str, exit_code: 
 
 
 TABLE: tuple[Row, ...] = (
-    Row(Phase.CONNECT, guards.stop_requested, Phase.FAILED, STOPPED, ABORTED),
+    Row(Phase.CONNECT, guards.stop_requested, Phase.FAILED, _STOP, REFUSED),
     Row(Phase.CONNECT, guards.vehicle_found, Phase.HEALTH, "vehicle found"),
     Row(Phase.CONNECT, guards.silent_on_ground, Phase.FAILED, _NOT_FOUND, REFUSED),
     *_ground_rows(Phase.HEALTH),
@@ -102,7 +102,8 @@ TABLE: tuple[Row, ...] = (
     Row(Phase.ARM, guards.rebooted, Phase.FAILED, _REBOOTED, REFUSED),
     Row(Phase.ARM, guards.silent, Phase.STAND_DOWN, _SILENT, REFUSED),
     Row(Phase.ARM, guards.blind, Phase.STAND_DOWN, _BLIND, REFUSED),
-    Row(Phase.ARM, guards.stop_requested, Phase.STAND_DOWN, STOPPED, ABORTED),
+    Row(Phase.ARM, guards.stop_requested, Phase.STAND_DOWN, _STOP, REFUSED),
+    Row(Phase.ARM, guards.taken_armed, Phase.YIELDED, f"{_LEFT} as it armed", ABORTED),
     Row(Phase.ARM, guards.mode_taken, Phase.FAILED, _LEFT, REFUSED),
     Row(Phase.ARM, guards.armed, Phase.TAKEOFF, "armed"),
     _too_long(

@@ -50,7 +50,7 @@ class Flight:
     def has_ended(self) -> bool:
         return self.outcome is not None
 
-    def request_stop(self) -> None:
+    def request_stop(self, why: str = "") -> None:
         self.stops += 1
 
     def poll(self, now_s: float, silence_s: float) -> Output:

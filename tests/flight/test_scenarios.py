@@ -42,7 +42,7 @@ from faults import (
 from pair import Pair, decode, hover, in_phase, make
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from offboard.flight.phases import Phase
+from offboard.flight.phases import BEFORE_FLIGHT, Phase
 
 SET_MODE, LAND, ARM_DISARM = 176, 21, 400
 FLOWN = "flown and landed"
@@ -228,7 +228,9 @@ def silent_vehicle() -> Pair:
 
 def stopped(phase: Phase, for_s: float, end: Phase, checks: Callable[[Pair], Checks]) -> Row:
     flight = lambda: hover(at=[(in_phase(phase, for_s), stop)])  # noqa: E731
-    return Row(f"stop in {phase.value}", flight, 4, "stop requested by the operator", end, checks)
+    code = 3 if phase in BEFORE_FLIGHT else 4
+    says = "stop requested by the operator"
+    return Row(f"stop in {phase.value}", flight, code, says, end, checks)
 
 
 TRACK = Phase.TRACK
@@ -248,7 +250,7 @@ ROWS = (
     Row(
         "stop before a vehicle is heard",
         lambda: hover(dead=True, at=[(in_phase(Phase.CONNECT, 0.5), stop)]),
-        4,
+        3,
         "stop requested by the operator",
         Phase.FAILED,
         nothing_asked,
@@ -258,6 +260,18 @@ ROWS = (
     stopped(Phase.ENGAGE, 0.1, Phase.FAILED, never_armed),
     stopped(Phase.ARM, 0.0, Phase.FAILED, disarmed_by_us),
     stopped(Phase.ARM, 0.3, Phase.FAILED, disarmed_by_us),
+    Row(
+        "stop in arm, and it cannot be disarmed",
+        lambda: hover(
+            firmware=refusing("disarm", "Disarming denied"),
+            limits={"disarm_s": 2},
+            at=[(in_phase(Phase.ARM, 0.3), stop)],
+        ),
+        4,
+        "stop requested by the operator; still armed after 2 s",
+        Phase.FAILED,
+        lambda pair: iter([pair.instance.autopilot.armed]),
+    ),
     stopped(Phase.TAKEOFF, 0.3, Phase.DISARMED, stayed_down),
     stopped(Phase.TAKEOFF, 1.5, Phase.DISARMED, landed),
     stopped(Phase.CLIMB, 0.5, Phase.DISARMED, landed),
@@ -357,6 +371,14 @@ ROWS = (
         "not landed and disarmed after 20 s",
         Phase.FAILED,
         landing_left_to_the_pilot,
+    ),
+    Row(
+        "pilot takes over as it arms",
+        lambda: hover(at=[(in_phase(Phase.ARM), take_over)]),
+        4,
+        "the vehicle left OFFBOARD for AUTO.LOITER as it armed",
+        Phase.YIELDED,
+        left_to_the_pilot,
     ),
     Row(
         "pilot takes over",

@@ -72,6 +72,7 @@ EVENTS: dict[str, dict[str, object]] = {  # the least that makes each guard hold
     "disarmed": {"armed": False},
     "disarmed_for_good": {"armed": False, "in_phase_s": 1.6},
     "mode_taken": {"engaged": False},
+    "taken_armed": {"engaged": False, "armed": True},
     "landing_taken": {"engaged": False},
     "silent": {"silence_s": 1.01},
     "lost": {"silence_s": 2.01},
@@ -140,7 +141,7 @@ def test_in_the_air_nothing_is_called_refused() -> None:
 
 def test_every_reason_has_its_words() -> None:
     assessment = hover().companion._progress._assessment
-    course = Course(Phase.CONNECT, 0.0, 0.0, False, False, 0, "")
+    course = Course(Phase.CONNECT, 0.0, 0.0, False, "", 0, "")
     words = assessment.words(assessment.picture(course), course)
     for row in TABLE:
         assert "{" not in row.reason.format(**words)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import ctypes
 import json
 import os
+import resource
 import signal
 import socket
 import subprocess
@@ -22,9 +23,12 @@ from processes import Spawn, children
 from offboard import cli
 from offboard.analysis import history, tlog
 from offboard.flight import run
+from offboard.flight.log import LogError
+from offboard.sortie import keep_score, score_flight
 
 Capture = pytest.CaptureFixture[str]
 CONFIG = Path(__file__).parents[2] / "config"
+RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
 Call = Callable[..., tuple[int, str]]
 
 
@@ -195,8 +199,7 @@ def test_missing_log(offboard: Call) -> None:
 
 
 def test_truncated_log_is_scored_up_to_there(offboard: Call, tmp_path: Path) -> None:
-    whole = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
-    (tmp_path / "cut.tlog").write_bytes(whole.read_bytes()[:-7])
+    (tmp_path / "cut.tlog").write_bytes(RECORDING.read_bytes()[:-7])
     code, said = offboard("score", "cut.tlog")
     assert (code, said) == (0, "")
 
@@ -289,6 +292,18 @@ def test_a_score_that_cannot_be_kept_is_told(spawn: Spawn, offboard: Call, tmp_p
     assert offboard("score", "x") == (0, "x/score.json cannot be written (Is a directory)\n")
 
 
+def test_half_a_score_is_not_kept(tmp_path: Path) -> None:
+    score, flown = score_flight(RECORDING)
+    limit = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (100, limit[1]))
+    try:
+        with pytest.raises(LogError, match=r"score\.json cannot be written"):
+            keep_score(tmp_path, score, flown)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limit)
+    assert not list(tmp_path.iterdir())
+
+
 def test_simulator_killed_in_flight(spawn: Spawn, tmp_path: Path) -> None:
     process = in_flight(spawn)
     (simulator,) = children(process.pid)
@@ -313,4 +328,6 @@ def test_full_disk_lands(spawn: Spawn, tmp_path: Path) -> None:
     assert process.returncode == 4, process.stderr
     assert "flight.tlog cannot be written (File too large)" in process.stderr
     assert "Traceback" not in process.stderr
+    assert "land: the log x/flight.tlog cannot be written (File too large)" in process.stdout
+    assert "by the operator" not in process.stdout
     assert len(tlog.read(tmp_path / "x" / "flight.tlog").messages) > 1000
