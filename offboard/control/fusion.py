@@ -24,6 +24,7 @@ from offboard.model.vehicle import Vehicle
 Array = NDArray[np.float64]
 
 SILENT_S = 1.0  # without a usable fix: then the vehicle's estimate counts again
+AHEAD_S = 0.5  # of telemetry: no fix is, and those after it would all be old
 LEARNT_FIXES = 16  # two seconds of them, before fusion begins
 SMOOTH_S = 0.25  # in which what a fix corrects is passed on
 # The vehicle's estimate wanders off the truth by so much per root second
@@ -139,8 +140,9 @@ class Fusion:
         velocity_ne_mps: tuple[float, float] | None,
         accuracy_m: float | None,
     ) -> None:
-        """`time_s` of its stamp; None: now."""
-        stamp_s = self._reported_s if time_s is None else time_s
+        """`time_s` of its stamp; None, or of another clock: now."""
+        now_s = self._reported_s
+        stamp_s = now_s if time_s is None or time_s > now_s + AHEAD_S else time_s
         if stamp_s <= self._stamp_s or not math.isfinite(stamp_s):
             return
         self._stamp_s = stamp_s
