@@ -74,13 +74,13 @@ def load(
     stands in for the file's `neutral`, of which nothing is known.
     """
     path = locate(name, "", "configuration")
-    raw = read(_text(path), str(path))
+    raw = read(read_text(path), str(path))
     if known_vehicle and raw.get("vehicle") == UNKNOWN_VEHICLE:
         raw["vehicle"] = known_vehicle
     for part in FOLDERS:
         chosen = (choices or {}).get(part, raw.get(part))
         if isinstance(chosen, str):
-            raw[part] = _part(part, chosen)
+            raw[part] = read_part(part, chosen)
         elif part not in raw:
             raise DocumentError(f"{path}: {part} is missing; give a name, a file or a mapping")
     options: dict[str, str] = {}
@@ -89,7 +89,7 @@ def load(
         key = assignment.partition("=")[0].strip()
         options[key] = f"--set {assignment}"
         if key in FOLDERS and isinstance(raw[key], str):
-            raw[key] = _part(key, raw[key])
+            raw[key] = read_part(key, raw[key])
     if seed is not None:
         raw["seed"], options["seed"] = seed, f"--seed {seed}"
     return _with_table(validate(raw, FlightConfig, str(path), options))
@@ -125,7 +125,7 @@ def check_file(path: Path, check_scenario: Callable[[Path], None]) -> str:
     if path.suffix.lower() == ".csv":
         build_track(load("flight", choices={"reference": str(path)}))
         return "reference"
-    raw = read(_text(path), str(path))
+    raw = read(read_text(path), str(path))
     name = str(path if path.suffix in (".yaml", ".yml") else path.absolute())
     if "conditions" in raw or "faults" in raw:
         check_scenario(path)
@@ -158,15 +158,16 @@ def _with_table(config: FlightConfig) -> FlightConfig:
     reference = config.reference
     if not isinstance(reference, FromTable) or reference.text is not None:
         return config
-    content = {"text": _text(Path(reference.file))}
+    content = {"text": read_text(Path(reference.file))}
     return config.model_copy(update={"reference": reference.model_copy(update=content)})
 
 
-def _part(part: str, name: str) -> Raw:
+def read_part(part: str, name: str) -> Raw:
+    """A vehicle, controller or reference by shipped name or file, valid. Raises DocumentError."""
     if part == "reference" and name.lower().endswith(".csv"):
         return {"shape": "table", "file": name}
     path = locate(name, FOLDERS[part], part)
-    raw = read(_text(path), str(path))
+    raw = read(read_text(path), str(path))
     validate(raw, _model(part, raw, str(path)), str(path))
     return raw
 
@@ -192,7 +193,8 @@ def locate(name: str, folder: str, kind: str) -> Path:
     raise DocumentError(f"there is no {kind} named {name!r}; known are {', '.join(known)}")
 
 
-def _text(path: Path) -> str:
+def read_text(path: Path) -> str:
+    """The content of a file. Raises DocumentError."""
     try:
         return path.read_text(encoding="utf-8")
     except (OSError, UnicodeDecodeError) as error:

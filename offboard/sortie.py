@@ -17,7 +17,7 @@ from offboard.analysis.document import as_text
 from offboard.analysis.history import History
 from offboard.analysis.score import Score
 from offboard.analysis.tlog import TlogError
-from offboard.config import FlightConfig, build_track, dump, load, locate
+from offboard.config import FlightConfig, build_track, dump, load, locate, read_part, read_text
 from offboard.control.catalogue import build
 from offboard.control.fusion import observer_of
 from offboard.flight import clock
@@ -48,15 +48,25 @@ class Order:
 
     def resolve(self) -> FlightConfig:
         """The validated configuration. Raises DocumentError."""
-        if self.sitl and self.scenario is not None:
-            locate(self.scenario, "scenarios", "scenario")
+        if self.sitl:
+            self._check_bundled()
         return load(
             self.config,
             choices=self.choices,
             assignments=self.assignments,
             seed=self.seed,
-            known_vehicle=OWN_VEHICLES.get(self.firmware) if self.sitl else None,
+            known_vehicle=OWN_VEHICLES[self.firmware] if self.sitl else None,
         )
+
+    def _check_bundled(self) -> None:
+        """Before anything is built, which may compile. Raises DocumentError."""
+        if self.firmware not in OWN_VEHICLES:
+            known = ", ".join(OWN_VEHICLES)
+            raise DocumentError(f"--firmware {self.firmware}: unknown; there is {known}")
+        if self.scenario is not None:
+            read_text(locate(self.scenario, "scenarios", "scenario"))
+        if self.sim_vehicle is not None:
+            read_part("vehicle", self.sim_vehicle)
 
 
 def crew(config: FlightConfig) -> Crew:

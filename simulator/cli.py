@@ -61,13 +61,21 @@ def simulate(
         int, typer.Option(min=1, max=100, help="So many vehicles, numbered from --instance on.")
     ] = 1,
     patience: Annotated[
-        float, typer.Option(min=0.1, max=600.0, help="Seconds to wait for a silent companion.")
-    ] = 5.0,
+        float | None,
+        typer.Option(
+            min=0.1,
+            max=600.0,
+            help="With --lockstep: seconds to wait for a silent companion; 5, and 180 at first.",
+        ),
+    ] = None,
     strict: Annotated[
         bool, typer.Option("--strict", help="Say and count what the autopilot would swallow.")
     ] = False,
     log: Annotated[
-        Path | None, typer.Option(help="Record the companion link as a .tlog; never overwrites.")
+        Path | None,
+        typer.Option(
+            help="Record the companion link, all vehicles in one, as a .tlog; never overwrites."
+        ),
     ] = None,
     check: Annotated[
         Path | None, typer.Option(metavar="FILE", help="Validate a scenario file, and stop.")
@@ -128,6 +136,7 @@ def simulate(
     except (DocumentError, LinkError) as error:
         _refuse(str(error))
 
+    parameters = _parameters(personality, param or [])
     recorder = None
     if log is not None:
         try:
@@ -135,7 +144,6 @@ def simulate(
         except OSError as error:
             _refuse(f"--log {log} cannot be written: {error.strerror}")
 
-    parameters = _parameters(personality, param or [])
     from offboard.model.kernel import Entry
     from simulator.instance import VIRTUAL_EPOCH_US, Instance
     from simulator.run import Berth, Runner, rehearse

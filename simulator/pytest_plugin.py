@@ -30,6 +30,7 @@ class Sitl:
     def __init__(self, directory: Path, options: dict[str, Any]) -> None:
         from simulator.udp import free_ports
 
+        self.scenario = options.get("scenario")
         self.port, self.ground_port = free_ports(2)
         self.log = directory / "sitl.tlog"
         self.output = directory / "sitl.txt"
@@ -46,6 +47,10 @@ class Sitl:
                 stderr=errors,
                 start_new_session=True,  # Ctrl-C is pytest's business
             )
+
+    def __repr__(self) -> str:
+        scenario = self.scenario or "the firmware's own"
+        return f"<Sitl at {self.connection}, scenario {scenario}>"
 
     @property
     def connection(self) -> str:

@@ -17,7 +17,6 @@ class Recorder:
     """Appends to a new file, each record at once, so that a killed process loses nothing."""
 
     def __init__(self, path: Path) -> None:
-        path.parent.mkdir(parents=True, exist_ok=True)
         self._file = path.open("xb", buffering=0)
 
     def write(self, unix_us: int, datagrams: list[bytes]) -> None:

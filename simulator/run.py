@@ -21,6 +21,7 @@ from simulator.udp import UdpLink, wait
 
 RESEND_S = 0.05  # until the companion is first heard
 RESEND_SILENT_S = 1.0
+PATIENCE_S = 5.0
 FIRST_CONTACT_S = 180.0  # a companion may compile first, on a machine that does much else
 FREE_RUN_S = 60.0  # vehicle time after the companion fell silent
 REHEARSAL_S = 0.2  # every fast message is due in it
@@ -191,8 +192,9 @@ class Runner:
 
     # -- lockstep ----------------------------------------------------------------------------
 
-    def lockstep(self, patience_s: float) -> Outcome:
-        """Virtual time that waits for the companion at every barrier."""
+    def lockstep(self, patience_s: float | None = None) -> Outcome:
+        """Virtual time that waits for the companion at every barrier, so long; not given, longer
+        for its first word."""
         gc.collect()
         gc.freeze()
         while not self._over():
@@ -200,12 +202,14 @@ class Runner:
                 continue
             stamp_ns, datagrams = self._berth.send_barrier()
             self._berth.read_ground()
-            if self._answered(stamp_ns, datagrams, patience_s) or self._stopping():
+            first = not self._instance.companion.heard
+            waits_s = patience_s or (FIRST_CONTACT_S if first else PATIENCE_S)
+            if self._answered(stamp_ns, datagrams, waits_s) or self._stopping():
                 continue
             if self._instance.companion.answered_ns < 0:
                 return Outcome(
                     3,
-                    f"no companion answered TIMESYNC within {FIRST_CONTACT_S:.0f} s:"
+                    f"no companion answered TIMESYNC within {waits_s:g} s:"
                     " start one, or leave --lockstep away",
                 )
             self._tell(f"the companion fell silent at {self._instance.time_s:.2f} s")
@@ -217,7 +221,6 @@ class Runner:
         """Wait for the answer to this barrier, applying all that comes before it."""
         server = self._instance.companion
         begun_s = sent_s = monotonic_s()
-        first = not server.heard
         while server.answered_ns != stamp_ns:
             datagram = self._companion.receive()
             if datagram is not None:
@@ -226,7 +229,7 @@ class Runner:
             if self._stopping():
                 return False
             now_s = monotonic_s()
-            if now_s - begun_s > (FIRST_CONTACT_S if first else patience_s):
+            if now_s - begun_s > patience_s:
                 return False
             if now_s - sent_s >= (RESEND_SILENT_S if server.heard else RESEND_S):
                 self._companion.send(datagrams)

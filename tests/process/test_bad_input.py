@@ -20,7 +20,7 @@ from pathlib import Path
 import pytest
 from processes import Spawn, children
 
-from offboard import cli
+from offboard import cli, sortie
 from offboard.analysis import history, tlog
 from offboard.flight import run
 from offboard.flight.log import LogError
@@ -50,6 +50,24 @@ def kept_out(north_m: float, east_m: float, height_m: float, radius_m: float) ->
     sphere = {"north_m": north_m, "east_m": east_m, "height_m": height_m, "radius_m": radius_m}
     volumes = json.dumps([{"shape": "sphere"} | sphere])
     return ("--controller", "horizon", "--set", f"controller.keep_out={volumes}")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("--firmware", "frog"), "--firmware frog: unknown; there is px4, ardupilot"),
+        (("--sim-vehicle", "tank"), "there is no vehicle named 'tank'; known are arducopter"),
+        (("--sim-vehicle", "no.yaml"), "no.yaml cannot be read: No such file"),
+        (("--scenario", "no.yaml"), "no.yaml cannot be read: No such file"),
+    ],
+)
+def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
+    arguments: tuple[str, ...], says: str, offboard: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sortie, "crew", pytest.fail)
+    code, said = offboard("fly", "--sitl", *arguments)
+    assert (code, len(said.splitlines())) == (2, 1)
+    assert says in said
 
 
 @pytest.mark.parametrize(

@@ -45,6 +45,7 @@ FLIES = (
 @pytest.mark.sitl(scenario="calm", speed=10)
 @pytest.mark.parametrize("run", [1, 2])
 def test_climbs(sitl, run):
+    assert repr(sitl) == f"<Sitl at {sitl.connection}, scenario calm>"
     assert climb(sitl) >= 2.0
 """
 )

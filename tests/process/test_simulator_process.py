@@ -163,6 +163,10 @@ def test_it_can_wait_to_be_spoken_to_and_shifts_its_system() -> None:
         (("--speed", "nan"), "--speed nan: must be 0.1 .. 1000"),
         (("--speed", "2", "--lockstep"), "exclude each other"),
         (("--seed", "-1"), "--seed"),
+        (
+            ("--log", "no/such/x.tlog"),
+            "--log no/such/x.tlog cannot be written: No such file or directory",
+        ),
         (("--no-such-option",), "--no-such-option"),
     ],
 )

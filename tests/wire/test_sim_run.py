@@ -40,11 +40,18 @@ def runner(link: UdpLink, told: list[str]) -> Runner:
 def test_without_a_companion_it_gives_up(link: UdpLink, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(run, "FIRST_CONTACT_S", 0.1)
     told: list[str] = []
-    outcome = runner(link, told).lockstep(5.0)
+    outcome = runner(link, told).lockstep()
     assert outcome == Outcome(
-        3, "no companion answered TIMESYNC within 0 s: start one, or leave --lockstep away"
+        3, "no companion answered TIMESYNC within 0.1 s: start one, or leave --lockstep away"
     )
     assert told == []
+
+
+def test_a_patience_that_is_given_is_for_the_first_word_too(link: UdpLink) -> None:
+    outcome = runner(link, []).lockstep(0.2)
+    assert outcome == Outcome(
+        3, "no companion answered TIMESYNC within 0.2 s: start one, or leave --lockstep away"
+    )
 
 
 def test_one_that_answers_once_and_then_never_is_missed(
