@@ -241,11 +241,10 @@ def test_what_is_not_usable_is_not_used() -> None:
     assert flown.fusion._fixed_s == before
 
 
-@pytest.mark.parametrize("ahead_s", [1.5, 3600.0])
-def test_a_stamp_far_ahead_spoils_no_later_fix(ahead_s: float) -> None:
+def test_a_stamp_far_ahead_spoils_no_later_fix() -> None:
     plain, spoilt = trial().fly(20.0), trial().fly(20.0)
     here = place_of(motion(spoilt.time_s - spoilt.delay_s)[0])
-    spoilt.fusion.on_fix(spoilt.time_s + ahead_s, here, None, 0.9)
+    spoilt.fusion.on_fix(spoilt.time_s + 3600.0, here, None, 0.9)
     difference = (spoilt.fly(30.0).table - plain.fly(30.0).table)[:, 7:10]
     assert spoilt.fusion.fused
     assert np.abs(difference).max() < 0.25
