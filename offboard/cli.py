@@ -243,6 +243,8 @@ def identify(
 
     if (flight is None) == (connect is None and not sitl):
         raise Refusal("name a FLIGHT, or fly one first with --connect or --sitl; not both")
+    if output is not None and output.exists():
+        raise Refusal(f"{output} exists already; choose another file with -o")
     if flight is None:
         flight = out_directory or Path("flights") / f"identify-{clock.local_stamp()}"
         fly(
@@ -263,16 +265,16 @@ def identify(
     text = vehicle_file(found, believed, flight.name)
     shown = page or path.with_name("identify.html")
     try:
+        shown.write_text(fits(flight.name, found, trace, believed), encoding="utf-8")
+        if not found.supported:
+            raise Refusal(f"nothing could be identified from this flight; {shown} says why", 1)
         if output is not None:
             output.write_text(text, encoding="utf-8")
-        shown.write_text(fits(flight.name, found, trace, believed), encoding="utf-8")
     except OSError as error:
         raise Refusal(f"{error.filename} cannot be written ({error.strerror})") from None
     out.print(text, end="", markup=False, soft_wrap=True)
     written = f"{output} and {shown}" if output else f"{shown}; -o FILE writes the vehicle file"
     out.print(f"written: {written}", markup=False, soft_wrap=True)
-    if not found.supported:
-        raise Refusal("nothing could be identified from this flight", 1)
 
 
 @app.command(epilog=EXIT_HELP)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import platform
 from collections.abc import Callable, Iterable, Mapping
+from difflib import get_close_matches
 from importlib import resources
 from importlib.metadata import version
 from pathlib import Path
@@ -81,8 +82,6 @@ def load(
         chosen = (choices or {}).get(part, raw.get(part))
         if isinstance(chosen, str):
             raw[part] = read_part(part, chosen)
-        elif part not in raw:
-            raise DocumentError(f"{path}: {part} is missing; give a name, a file or a mapping")
     options: dict[str, str] = {}
     for assignment in assignments:
         raw = override(raw, assignment)
@@ -90,6 +89,9 @@ def load(
         options[key] = f"--set {assignment}"
         if key in FOLDERS and isinstance(raw[key], str):
             raw[key] = read_part(key, raw[key])
+    missing = [_missing(part, raw) for part in FOLDERS if part not in raw]
+    if missing:
+        raise DocumentError(*(f"{path}: {sentence}" for sentence in missing))
     if seed is not None:
         raw["seed"], options["seed"] = seed, f"--seed {seed}"
     return _with_table(validate(raw, FlightConfig, str(path), options))
@@ -126,18 +128,39 @@ def check_file(path: Path, check_scenario: Callable[[Path], None]) -> str:
         build_track(load("flight", choices={"reference": str(path)}))
         return "reference"
     raw = read(read_text(path), str(path))
+    if not raw:
+        raise DocumentError(f"{path} is empty")
     name = str(path if path.suffix in (".yaml", ".yml") else path.absolute())
     if "conditions" in raw or "faults" in raw:
         check_scenario(path)
         return "scenario"
+    kind = _kind(raw)
+    if kind in FOLDERS:
+        validate(raw, _model(kind, raw, str(path)), str(path))
+        if kind == "reference":
+            build_track(load("flight", choices={kind: name}))
+    else:
+        build_track(load(name))
+    return kind
+
+
+def _kind(raw: Raw) -> str:
+    """What a file is meant to be: by the key that only this kind has, else by most of its keys."""
     for kind, key in (("reference", "shape"), ("controller", "law"), ("vehicle", "mass_kg")):
         if key in raw:
-            validate(raw, _model(kind, raw, str(path)), str(path))
-            if kind == "reference":
-                build_track(load("flight", choices={kind: name}))
             return kind
-    build_track(load(name))
-    return "flight configuration"
+    keys = {
+        "flight configuration": set(FlightConfig.model_fields),
+        "vehicle": set(Vehicle.model_fields),
+        "controller": {key for law in LAWS.values() for key in law.model_fields},
+        "reference": {key for shape in SHAPES.values() for key in shape.model_fields},
+    }
+
+    def likeness(kind: str) -> tuple[int, int]:
+        close = sum(bool(get_close_matches(key, keys[kind], n=1)) for key in raw)
+        return len(raw.keys() & keys[kind]), close
+
+    return max(keys, key=likeness)
 
 
 def dump(config: FlightConfig) -> str:
@@ -162,6 +185,12 @@ def _with_table(config: FlightConfig) -> FlightConfig:
     return config.model_copy(update={"reference": reference.model_copy(update=content)})
 
 
+def _missing(part: str, raw: Raw) -> str:
+    near = get_close_matches(part, raw, n=1)
+    hint = f" (is it meant by {near[0]}?)" if near else ""
+    return f"{part} is missing{hint}; give a name, a file or a mapping"
+
+
 def read_part(part: str, name: str) -> Raw:
     """A vehicle, controller or reference by shipped name or file, valid. Raises DocumentError."""
     if part == "reference" and name.lower().endswith(".csv"):
@@ -177,6 +206,8 @@ def _model(part: str, raw: Raw, source: str) -> type[BaseModel]:
         return Vehicle
     key, table = ("law", LAWS) if part == "controller" else ("shape", SHAPES)
     chosen = raw.get(key)
+    if key not in raw:
+        raise DocumentError(f"{source}: {key} is missing; known are {', '.join(table)}")
     if not isinstance(chosen, str) or chosen not in table:
         raise DocumentError(f"{source}: {key} is {chosen!r}; known are {', '.join(table)}")
     return table[chosen]

@@ -185,7 +185,7 @@ def build(config: Shape, table_text: str | None = None) -> Track:
     """
     columns_course: Course | None = None
     if isinstance(config, FromTable):
-        text = config.text or table_text
+        text = table_text if config.text is None else config.text
         if text is None:
             raise ValueError(f"the table {config.file} has not been read")
         path, columns_course = _from_table(config, text)

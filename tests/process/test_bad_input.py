@@ -138,6 +138,15 @@ CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3
     [
         ("flight.yaml", "vehicle: px4_sih", "flight.yaml: controller is missing"),
         ("flight.yaml", "seed: 0.5", "flight.yaml: vehicle is missing"),
+        ("flight.yaml", "seed: 3", "flight.yaml: reference is missing; give a name, a file or a"),
+        ("flight.yaml", "controler: pso", "controller is missing (is it meant by controler?)"),
+        ("flight.yaml", "# nothing yet", "flight.yaml is empty"),
+        ("path.csv", "", "path.csv is empty: it needs a header and at least 4 rows"),
+        ("mine.yaml", "mas_kg: 1", "mas_kg is not a known key, did you mean mass_kg?"),
+        ("mine.yaml", "hover_thrust: 0.5", "mine.yaml: mass_kg is missing (must be a number >"),
+        ("mine.yaml", "hover_thrust: 0.5", "mine.yaml: inertia_kgm2 is missing (must be a list"),
+        ("law.yaml", "bandwidth_radps: 5", "law.yaml: law is missing; known are pso, lqr"),
+        ("line.yaml", "laps: 5", "line.yaml: shape is missing; known are hover, line"),
         ("path.csv", CSV.format(east="two"), "path.csv, row 4, column east_m: 'two' is not a"),
         ("path.csv", CSV.format(east=90), "reference path.csv: the reference asks for"),
         ("circle.yaml", "shape: circle\nperiod_s: 0", "circle.yaml: period_s: 0 is out of range"),
@@ -208,6 +217,21 @@ def test_foreign_log(content: bytes, says: str, offboard: Call, tmp_path: Path) 
     code, said = offboard("score", "x.tlog")
     assert (code, "Traceback" in said) == (2, False)
     assert says in said
+
+
+def test_identification_overwrites_no_vehicle_file(offboard: Call, tmp_path: Path) -> None:
+    (tmp_path / "mine.yaml").write_text("precious")
+    code, said = offboard("identify", RECORDING, "-o", "mine.yaml", "--page", "page.html")
+    assert (code, said) == (2, "mine.yaml exists already; choose another file with -o\n")
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["precious"]
+
+
+def test_nothing_identified_is_no_vehicle_file(offboard: Call, tmp_path: Path) -> None:
+    still = RECORDING.with_name("arducopter-4.6.3-guided.tlog")
+    code, said = offboard("identify", still, "-o", "mine.yaml", "--page", "page.html")
+    assert code == 1
+    assert said == "nothing could be identified from this flight; page.html says why\n"
+    assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
 
 
 def test_missing_log(offboard: Call) -> None:
