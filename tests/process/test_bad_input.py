@@ -17,6 +17,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import numba
 import pytest
 from processes import Spawn, children
 
@@ -24,7 +25,7 @@ from offboard import cli, sortie
 from offboard.analysis import history, tlog
 from offboard.flight import run
 from offboard.flight.log import LogError
-from offboard.sortie import keep_score, score_flight
+from offboard.sortie import Order, fly_order, keep_score, score_flight
 
 Capture = pytest.CaptureFixture[str]
 CONFIG = Path(__file__).parents[2] / "config"
@@ -282,19 +283,49 @@ def test_interrupt_lands(spawn: Spawn, tmp_path: Path) -> None:
     assert flown.phases[-1].what.startswith("disarmed")
 
 
+def interrupted_while_compiling(*_: object, **__: object) -> float:
+    """A rehearsal: what is raised in a callback of the compiler goes no further than that."""
+    ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()
+    return 0.0
+
+
 def test_interrupted_while_it_compiles_it_does_not_fly(
     offboard: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """What is raised in a callback of the compiler goes no further than that."""
-
-    def compiles(*_: object, **__: object) -> float:
-        ctypes.CFUNCTYPE(None)(lambda: signal.raise_signal(signal.SIGINT))()
-        return 0.0
-
-    monkeypatch.setattr(run, "rehearse", compiles)
+    monkeypatch.setattr(run, "rehearse", interrupted_while_compiling)
     code, said = offboard("fly", "--connect", "udpin:127.0.0.1:0", "--set", "limits.connect_s=0.3")
     assert (code, said) == (2, "interrupted before anything was sent\n")
     assert not list(tmp_path.iterdir())
+
+
+def test_a_comparison_interrupted_while_it_compiles_does_not_fly(
+    offboard: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "rehearse", interrupted_while_compiling)
+    code, said = offboard(
+        "compare", "--connect", "udpin:127.0.0.1:0", "--controllers", "lqr", "--seeds", 2,
+        "--set", "limits.connect_s=0.3", "--out", "x",
+    )  # fmt: skip
+    assert (code, said) == (4, "interrupted: 2 of 2 flights missing\n")
+    assert not list(tmp_path.rglob("*.tlog"))
+
+
+@pytest.mark.parametrize("compiles", [True, False])
+def test_only_what_was_compiled_is_called_so(
+    compiles: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def rehearses(*_: object, **__: object) -> float:
+        if compiles:
+            numba.njit(lambda: 1)()
+        return 2.3
+
+    monkeypatch.setattr(run, "rehearse", rehearses)
+    heard: list[str] = []
+    order = Order(
+        tmp_path / "x", connection="udpin:127.0.0.1:0", assignments=("limits.connect_s=0.1",)
+    )
+    fly_order(order, tell=heard.append)
+    assert ("compiled in 2.3 s; the next start finds it cached" in heard) is compiles
 
 
 @pytest.mark.parametrize("signals", [[signal.SIGTERM], [signal.SIGINT, signal.SIGINT]])
