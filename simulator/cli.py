@@ -7,12 +7,15 @@ import signal
 import sys
 from importlib.metadata import version
 from pathlib import Path
-from typing import Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
 from simulator.firmware.base import Firmware
 from simulator.firmware.catalogue import FIRMWARES
+
+if TYPE_CHECKING:
+    from simulator.instance import Instance
 
 COMPANION_PORT, GROUND_PORT = 14540, 14550
 LOCAL_COMPANION_PORT, LOCAL_GROUND_PORT = 14580, 18570  # PX4's
@@ -177,6 +180,7 @@ def simulate(
     for berth in berths:
         for name, value in parameters.items():
             berth.instance.autopilot.parameters.set(name, value)
+    _tell_if_lifted(berths[0].instance, flyer.hover_thrust)
     purpose = "waiting at" if connect.startswith("udpin:") else "sending to"
     for number in numbers:
         place = shifted(connect, number - instance).partition(":")[2]
@@ -234,6 +238,17 @@ def _parameters(firmware: Firmware, assignments: list[str]) -> dict[str, float]:
         if not spec.minimum <= values[name] <= spec.maximum:
             _refuse(f"--param {text}: must be {spec.minimum:g} .. {spec.maximum:g}")
     return values
+
+
+def _tell_if_lifted(instance: Instance, hover_thrust: float) -> None:
+    """Say that the least thrust is more than the vehicle weighs, as it may be on a real one."""
+    firmware, parameters = instance.autopilot.firmware, instance.autopilot.parameters
+    least, name = parameters.role("thrust_least"), firmware.parameter_roles["thrust_least"]
+    if least >= hover_thrust:
+        _tell(
+            f"{name} is {least:.3g}, which lifts a vehicle that hovers at {hover_thrust:g}: it will"
+            f" not come down; --param {name}=... sets another"
+        )
 
 
 def _tell(sentence: str) -> None:

@@ -178,6 +178,19 @@ def test_wrong_options_are_refused(options: tuple[str, ...], says: str) -> None:
     assert "Traceback" not in errors
 
 
+def test_a_vehicle_that_cannot_come_down_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "light.yaml"
+    shipped = Path(__file__).parents[2] / "config" / "vehicles" / "px4_sih.yaml"
+    path.write_text(re.sub(r"hover_thrust: \S+", "hover_thrust: 0.1", shipped.read_text()))
+    options = ("--vehicle", str(path), "--connect", "udpout:127.0.0.1:9", "--duration", "0.1")
+    with simulator(*QUIET, *options) as process:
+        code, errors = process.finish(20.0)
+    with simulator(*QUIET, *options, "--param", "MPC_THR_MIN=0.09") as lower:
+        assert lower.finish(20.0) == (0, "")
+    assert code == 0
+    assert "MPC_THR_MIN is 0.12, which lifts a vehicle that hovers at 0.1" in errors
+
+
 def test_a_port_in_use_is_refused() -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))

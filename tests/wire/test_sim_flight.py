@@ -151,6 +151,17 @@ def test_vehicles_far_from_the_believed_hover_thrust_hold_and_land(hover_thrust:
     bench.run_until(lambda: not bench.armed, 15.0)
 
 
+def test_a_least_thrust_that_lifts_never_lands() -> None:
+    """PX4 1.16.1's SIH that hovers at 0.1 climbed in AUTO.LAND at 1.7 .. 2.3 m/s."""
+    bench = Bench(vehicle=px4_vehicle().model_copy(update={"hover_thrust": 0.1}))
+    bench.fly_offboard(2.0)
+    bench.command(21)
+    bench.run(10.0)
+    assert -bench.instance.autopilot.truth.velocity_ned_mps[2] == pytest.approx(2.0, abs=0.3)
+    set_parameter(bench, "MPC_THR_MIN", 0.05)
+    bench.run_until(lambda: not bench.armed, 60.0)
+
+
 def test_takeoff_height_is_above_sea() -> None:
     bench = Bench()
     bench.boot()
