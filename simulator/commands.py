@@ -23,6 +23,8 @@ _VERTICAL_SPEEDS = (2.0, 3.0)  # SPEED_TYPE: climb, descent
 
 @dataclass(frozen=True, slots=True)
 class Command:
+    """COMMAND_LONG or COMMAND_INT, as one."""
+
     number: int
     params: tuple[float, ...]  # param1 .. param7, places in degrees
     system: int  # of the sender
@@ -43,6 +45,8 @@ class Link(Protocol):
 
 @dataclass(slots=True)
 class Commands:
+    """What a client commands on one link, carried out and answered."""
+
     link: Link
 
     def run(self, command: Command) -> None:

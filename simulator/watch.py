@@ -17,6 +17,8 @@ EVERY_STEPS = 25  # 0.1 s
 
 @dataclass(slots=True)
 class Watch:
+    """Tells once of what changes by itself: ground station, battery, estimate."""
+
     firmware: Firmware
     parameters: ParameterTable
     _ground_station_s: float = math.nan  # last heard

@@ -65,6 +65,7 @@ def legend_beside() -> dict[str, Any]:
 
 
 def axis(letter: str, panel: int) -> str:
+    """Plotly's name of the axis of a panel, counted from 1: x, x2, x3 ..."""
     return letter if panel == 1 else f"{letter}{panel}"
 
 

@@ -116,6 +116,8 @@ class Certificate:
 
 @dataclass(frozen=True, slots=True)
 class Decision:
+    """What is commanded, and how good that is."""
+
     command: Command | PositionCommand
     certificate: Certificate = field(default_factory=Certificate)
 

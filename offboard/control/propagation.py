@@ -173,4 +173,5 @@ def missed(state: Array, position: Array, velocity: Array) -> Array:
 
 @numba.njit(cache=True)
 def wrapped(angle_rad: float) -> float:
+    """The same angle in -pi .. pi."""
     return angle_rad - 2.0 * math.pi * math.floor(angle_rad / (2.0 * math.pi) + 0.5)

@@ -26,7 +26,6 @@ FREEDOM = 3.0  # of Student's t
 LEAST_SCALE = 2e-4  # of residuals: below it all weigh the same
 PLAIN_STEPS, STEPS, DESCENTS = 4, 14, 6  # unweighted at first; of one search; tries of one step
 STEP_SCALES = np.array([0.03, 5.0, 0.3])
-HALVINGS = 30  # of the range in which a median is sought
 CONVERGED = 2e-4  # of STEP_SCALES
 DIFFERENCE = 1e-3  # of them too, for slopes
 
@@ -109,26 +108,6 @@ def respond(
                 break
         for axis in range(axes + 2):
             out[i, axis] = value[axis]
-
-
-@numba.njit(cache=True)
-def _solve(matrix: Array, right: Array) -> None:
-    """In place: `right` (n, m) becomes the solution, for a positive definite `matrix` (n, n).
-    Elimination written out: numba's solver compiles for five seconds."""
-    size, width = right.shape
-    for pivot in range(size):
-        for row in range(pivot + 1, size):
-            share = matrix[row, pivot] / matrix[pivot, pivot]
-            for column in range(pivot, size):
-                matrix[row, column] -= share * matrix[pivot, column]
-            for column in range(width):
-                right[row, column] -= share * right[pivot, column]
-    for row in range(size - 1, -1, -1):
-        for column in range(width):
-            total = right[row, column]
-            for k in range(row + 1, size):
-                total -= matrix[row, k] * right[k, column]
-            right[row, column] = total / matrix[row, row]
 
 
 def residual(data: Data, parameters: Array, weights: Array) -> Array:

@@ -46,7 +46,6 @@ class Belief:
         self._blend_s = blend_s
         self._period_s = period_s
         self._bandwidth_radps = bandwidth_radps
-        self.target = vehicle
         self._unknown_delay_s = unknown_delay_s
         self.reset()
 

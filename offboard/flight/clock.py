@@ -15,17 +15,6 @@ def unix_us() -> int:
     return time.time_ns() // 1000
 
 
-def sleep_until(deadline_s: float) -> float:
-    """Sleep until the absolute `deadline_s` of `monotonic_s`; return the lateness in seconds.
-
-    Absolute deadlines do not drift: a loop that sleeps relative to itself loses 60-90 ms a minute.
-    """
-    remaining_s = deadline_s - time.monotonic()
-    if remaining_s > 0:
-        time.sleep(remaining_s)
-    return time.monotonic() - deadline_s
-
-
 def local_stamp() -> str:
     """Local date and time for the names of things, as 20261121-093000."""
     return time.strftime("%Y%m%d-%H%M%S")

@@ -51,7 +51,6 @@ class UdpLink:
     def __init__(self, sock: socket.socket, peer: tuple[str, int] | None) -> None:
         self._socket = sock
         self._peer = peer
-        self.send_errors = 0
 
     def receive(self, timeout_s: float) -> list[Chunk]:
         ready, _, _ = select.select([self._socket], [], [], max(0.0, timeout_s))
@@ -69,10 +68,8 @@ class UdpLink:
         target = self._peer or peer
         if not isinstance(target, tuple):
             return
-        try:
+        with suppress(OSError):  # silence tells of a dead link
             self._socket.sendto(data, target)
-        except OSError:
-            self.send_errors += 1
 
     def close(self) -> None:
         self._socket.close()
@@ -121,7 +118,6 @@ class TcpLink:
         self._socket = sock
         self._open = True
         self._backlog = Backlog()
-        self.send_errors = 0
 
     def receive(self, timeout_s: float) -> list[Chunk]:
         if not self._open:
@@ -145,10 +141,8 @@ class TcpLink:
         self._flush()
 
     def _flush(self) -> None:
-        try:
+        with suppress(OSError):  # silence tells of a dead link
             self._backlog.flush(self._socket.send)
-        except OSError:
-            self.send_errors += 1
 
     def close(self) -> None:
         self._socket.close()
@@ -169,7 +163,6 @@ class SerialLink:
                 f"serial port {device} at {baud} baud cannot be opened: {error}"
             ) from None
         self._backlog = Backlog()
-        self.send_errors = 0
 
     def receive(self, timeout_s: float) -> list[Chunk]:
         self._flush()
@@ -187,10 +180,8 @@ class SerialLink:
         self._flush()
 
     def _flush(self) -> None:
-        try:
+        with suppress(OSError):  # silence tells of a dead link
             self._backlog.flush(self._write)
-        except OSError:
-            self.send_errors += 1
 
     def _write(self, data: bytes) -> int:
         # pyserial's own write spins until a full port has room again

@@ -12,6 +12,7 @@ from types import FrameType, TracebackType
 
 
 def interrupt() -> None:
+    """End at once."""
     raise KeyboardInterrupt
 
 

@@ -60,8 +60,6 @@ ARDUPILOT = Dialect(
     # LOITER obeys the throttle stick, and without one it descends or falls
     hold_mode="BRAKE",
     land_mode="LAND",
-    return_mode="RTL",
-    first_ack_is_verdict=True,
     takeoff=Takeoff.COMMAND,
     unused_parameter=0.0,  # NaN stops its SITL with a floating point exception
     thrust_rule=ThrustRule.TILT_COMPENSATED,  # ATC_ANGLE_BOOST 1
@@ -91,7 +89,6 @@ ARDUPILOT = Dialect(
         WatchedParameter("FS_THR_ENABLE", "what the vehicle does when the radio is lost"),
         WatchedParameter("SYSID_ENFORCE", "whether only SYSID_MYGCS is obeyed"),
     ),
-    stream_timeout_s=3.0,
     wanted=(
         *TRACKING_TELEMETRY,
         WantedMessage(108, "SIM_STATE", 50.0, optional=True),  # simulated truth

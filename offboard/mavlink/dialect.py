@@ -30,6 +30,8 @@ class ParameterEncoding(Enum):
 
 
 class Takeoff(Enum):
+    """How the autopilot leaves the ground."""
+
     SETPOINT = "setpoints lift it off"
     COMMAND = "MAV_CMD_NAV_TAKEOFF lifts it off, altitude above home"
 
@@ -79,15 +81,12 @@ class Dialect:
     engage_mode: str
     hold_mode: str
     land_mode: str
-    return_mode: str
-    first_ack_is_verdict: bool  # of a mode change; else a second one follows within 0.1 s
     takeoff: Takeoff
     unused_parameter: float  # of a COMMAND_LONG: "not given" to this autopilot
     thrust_rule: ThrustRule
     attitude_type_mask: int  # the one legal SET_ATTITUDE_TARGET.type_mask for attitude + thrust
     parameter_encoding: ParameterEncoding
     watched_parameters: tuple[WatchedParameter, ...]
-    stream_timeout_s: float  # vehicle time after which a silent stream is noticed
     wanted: tuple[WantedMessage, ...]
 
     def mode_name(self, custom_mode: int) -> str:

@@ -26,6 +26,8 @@ class VehicleFound:
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
+    """HEARTBEAT of our vehicle."""
+
     mode: str  # the dialect's name of custom_mode: "OFFBOARD", "AUTO.LOITER", ...
     armed: bool
     system_status: int  # MAV_STATE: 3 standby, 4 active, 5 critical, 6 emergency
@@ -94,12 +96,16 @@ class CommandAck:
 
 @dataclass(frozen=True, slots=True)
 class StatusText:
+    """STATUSTEXT, whole."""
+
     severity: int  # MAV_SEVERITY, 0 emergency .. 7 debug
     text: str  # chunks joined, trailing tab and NUL removed
 
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
+    """PARAM_VALUE, decoded as the dialect packs it."""
+
     name: str
     value: float
 

@@ -81,6 +81,7 @@ def decode(message_id: int, payload: bytes, dialect: Dialect) -> events.Event | 
 
 
 def decode_identity(payload: bytes) -> Identity:
+    """MAV_TYPE and MAV_AUTOPILOT of a HEARTBEAT."""
     _, vehicle_type, autopilot, *_ = _unpack(mavlink.MAVLink_heartbeat_message, payload)
     return Identity(vehicle_type, autopilot)
 
@@ -98,6 +99,7 @@ def decode_timesync(payload: bytes) -> tuple[int, int]:
 
 
 def decode_text_chunk(payload: bytes) -> TextChunk:
+    """One STATUSTEXT; the last chunk of a text has its terminator."""
     severity, text, text_id, chunk = _unpack(mavlink.MAVLink_statustext_message, payload)
     data, terminator, _ = text.partition(b"\0")
     return TextChunk(severity, data, text_id, chunk, bool(terminator))

@@ -38,6 +38,8 @@ _FLOAT32_MAX = 3.4028234663852886e38
 
 
 class Packed(NamedTuple):
+    """A message without its frame."""
+
     message_id: int
     payload: bytes
 

@@ -55,9 +55,7 @@ PX4 = Dialect(
     engage_mode="OFFBOARD",
     hold_mode="AUTO.LOITER",
     land_mode="AUTO.LAND",
-    return_mode="AUTO.RTL",
     # ACCEPTED by the receiver comes first, the commander's verdict up to 12 ms later
-    first_ack_is_verdict=False,
     takeoff=Takeoff.SETPOINT,
     unused_parameter=float("nan"),  # 0 would be a latitude
     thrust_rule=ThrustRule.COLLECTIVE,
@@ -75,7 +73,6 @@ PX4 = Dialect(
         WatchedParameter("COM_RCL_EXCEPT", "modes in which a lost radio is no failsafe"),
         WatchedParameter("NAV_DLL_ACT", "what the vehicle does when the ground station is lost"),
     ),
-    stream_timeout_s=1.0,
     wanted=(
         *TRACKING_TELEMETRY,
         WantedMessage(115, "HIL_STATE_QUATERNION", 50.0, optional=True),  # simulated truth

@@ -8,6 +8,8 @@ _REORDERING_S = 2.0  # older than this against the newest is a reboot, not a lat
 
 
 class Age(Enum):
+    """Of a message, by its time stamp."""
+
     FRESH = auto()
     STALE = auto()
     REBOOTED = auto()

@@ -25,6 +25,8 @@ _NODES_MAX = 200_000
 
 
 class Course(Protocol):
+    """Where the nose points along a path."""
+
     def jet(self, path_time_s: Array, path_jet: Array) -> Array:
         """Course (unwrapped), its first and second derivative by s, shape (3, N), rad and s.
 

@@ -73,6 +73,8 @@ class Mode:
 
 @dataclass(frozen=True, slots=True)
 class Say:
+    """A STATUSTEXT."""
+
     severity: Severity
     text: str
 
@@ -233,10 +235,12 @@ class Landing:
 
 
 def as_given(values: Mapping[str, Any], _: Quaternion) -> Mapping[str, Any]:
+    """Setpoints in any frame are taken as they are."""
     return values
 
 
 def no_complaint(message: str, frame: int | None) -> Say | None:
+    """Nothing is said of a setpoint's frame."""
     return None
 
 

@@ -66,7 +66,7 @@ def test_px4_takes_off_where_it_stands() -> None:
 
 @pytest.mark.parametrize("dialect", [PX4_DIALECT, ARDUPILOT_DIALECT], ids=lambda d: d.name)
 def test_modes_named_by_the_dialect_exist(dialect: Dialect) -> None:
-    for name in (dialect.engage_mode, dialect.hold_mode, dialect.land_mode, dialect.return_mode):
+    for name in (dialect.engage_mode, dialect.hold_mode, dialect.land_mode):
         assert name in dialect.modes.values()
     assert dialect.mode_name(0xFF00FFFF) == "UNKNOWN(0xff00ffff)"
     with pytest.raises(ValueError, match=f"no mode 'NONSENSE'; it has .*{dialect.engage_mode}"):

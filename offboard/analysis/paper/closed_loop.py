@@ -40,6 +40,8 @@ _STILL = np.zeros(3)
 
 
 class LawName(StrEnum):
+    """The laws compared."""
+
     ONE_STEP = "one step"  # Eq. 21
     COST_TO_GO = "cost-to-go"  # the Riccati solution in the place of Q, a consistent reference
 

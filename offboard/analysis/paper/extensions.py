@@ -83,6 +83,7 @@ def steady_error_m(flight: Flight) -> float:
 
 
 def integral_table(flown: Mapping[tuple[str, str, PlantKind], Flight]) -> Table:
+    """Steady and greatest errors (m) of flights by case, law and plant."""
     rows: list[Row] = [
         {
             "case": case,
@@ -105,6 +106,7 @@ def integral_table(flown: Mapping[tuple[str, str, PlantKind], Flight]) -> Table:
 
 
 def limits_table(flown: Mapping[tuple[str, PlantKind], Flight]) -> Table:
+    """What the limited states reached, and in how many samples they were beyond."""
     rows: list[Row] = []
     for (name, plant), flight in flown.items():
         reached = limited_states(flight, plant)

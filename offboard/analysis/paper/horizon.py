@@ -120,6 +120,7 @@ def study(settings: PaperSettings, first: PaperSettings) -> list[Modes]:
 
 
 def horizon_table(modes: list[Modes]) -> Table:
+    """Slowest eigenvalues and time constants (s) of the closed loops."""
     rows: list[Row] = [
         {
             "law": mode.name,

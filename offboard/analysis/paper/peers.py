@@ -92,10 +92,12 @@ def absent() -> list[str]:
 
 
 def present() -> list[str]:
+    """Names of the solvers that are installed."""
     return [name for name in SOLVERS if name not in absent()]
 
 
 def peers_table(heats: Sequence[Heat]) -> Table:
+    """Gap to the exact optimum and time (ms) by solver and budget."""
     rows: list[Row] = [
         {
             "solver": heat.solver,

@@ -27,6 +27,8 @@ _SUBSTEPS = 10
 
 
 class PlantKind(StrEnum):
+    """Eqs. 14-18, or the rigid body of Eqs. 1-8."""
+
     LINEAR = "linear"
     NONLINEAR = "nonlinear"
 

@@ -81,4 +81,3 @@ EQ_16: Final = (
 )
 LOST_ENTRY: Final = ("y", "tau_x")  # the twelfth row is not printed
 EQ_26_LOWER_THRUST: Final = -4.0
-EQ_26_UPPER_THRUST: Final = 3.942

@@ -112,6 +112,7 @@ def _gain_notes(flown: Mapping[tuple[PlantKind, float], Sequence[Summary]]) -> l
 
 
 def table_3(undamped: Sequence[Summary], damped: Sequence[Summary]) -> Table:
+    """The errors of Eq. 32 with and without damping, ours beside the printed."""
     return _errors_table(
         "Table 3: λ = 1 and λ = 0.65, first weights",
         ("λ = 1", printed.ERRORS_UNDAMPED, undamped),
@@ -123,6 +124,7 @@ def table_3(undamped: Sequence[Summary], damped: Sequence[Summary]) -> Table:
 
 
 def table_4(first: Sequence[Summary], final: Sequence[Summary]) -> Table:
+    """The same with the first weights and with those of Eqs. 33-35."""
     return _errors_table(
         "Table 4: first weights and those of Eqs. 33-35, λ = 0.65",
         ("R_0", printed.ERRORS_DAMPED, first),

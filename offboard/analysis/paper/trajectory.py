@@ -29,10 +29,11 @@ POINTS_M = (
     (50.0, 10.0, 2.0),
 )  # fmt: skip
 SPEED_MPS = 2.8  # mean of an inner leg
-DURATION_S = 100.0
 
 
 class PathName(StrEnum):
+    """What the paper flies."""
+
     TOUR = "tour"  # Figs. 5 and 6
     HOVER = "hover"
 
@@ -68,6 +69,7 @@ class Reach:
 
 @cache
 def reach(name: PathName, steps: int) -> Reach:
+    """A path sampled at the paper's 0.1 s: `steps` + 1 times, its states (steps + 1, 12)."""
     times_s: Array = PAPER_STEP_S * np.arange(steps + 1, dtype=np.float64)
     samples = reference(name).sample(times_s)
     tracked = np.zeros((steps + 1, 12))

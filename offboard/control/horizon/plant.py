@@ -111,6 +111,8 @@ class Scene(NamedTuple):
 
 
 def scene_of(outlook: Outlook, within: Bounds, volumes: Array, floor_down_m: float) -> Scene:
+    """All that a roll-out reads: an outlook (N steps), input bounds, volumes (K, columns of
+    `keep_out`), and the ground (m, NED down)."""
     return Scene(
         outlook.positions_ned_m,
         outlook.velocities_ned_mps,
@@ -141,4 +143,5 @@ def start_state(lateral: Array, vertical: Array, scene: Scene) -> Array:
 
 @numba.njit(cache=True)
 def upright(north: float, east: float) -> float:
+    """Down component of a thrust direction, a unit vector, by the other two (NED)."""
     return math.sqrt(max(1.0 - north * north - east * east, 0.01))

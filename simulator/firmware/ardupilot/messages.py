@@ -61,6 +61,7 @@ def sim_state(view: View) -> Sequence[Any]:
 
 
 def ekf_status_report(view: View) -> Sequence[Any]:
+    """EKF_STATUS_REPORT: flags grow as the estimate does; variances as of a good one."""
     reached = view.autopilot.reached
     if view.autopilot.position_lost:
         reached -= {"position"}
@@ -80,11 +81,13 @@ def _int16(value: float) -> int:
 
 
 def servo_output_raw(view: View) -> Sequence[Any]:
+    """SERVO_OUTPUT_RAW: four motors, us, by the collective thrust."""
     pwm = _PWM_LEAST + round(_PWM_SPAN * view.autopilot.pilot.demand.thrust)
     return (view.time_us & 0xFFFFFFFF, 0, *(pwm,) * 4, *(0,) * 12)
 
 
 def rc_channels(view: View) -> Sequence[Any]:
+    """RC_CHANNELS: sticks that nobody touches."""
     return (view.time_ms, len(_STICKS), *_STICKS, *(0,) * (18 - len(_STICKS)), 255)
 
 

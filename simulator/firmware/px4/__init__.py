@@ -80,6 +80,7 @@ def is_ground_station(kind: int, _: int, __: ReadParameter) -> bool:
 
 
 def obeys_system(_: int, __: int, ___: ReadParameter) -> bool:
+    """Everybody."""
     return True
 
 
