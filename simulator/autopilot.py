@@ -214,7 +214,7 @@ class Autopilot:
     ) -> Result:
         """MAV_CMD_DO_REPOSITION: degrees; height above home or sea level, as the frame has it.
 
-        What is not a number stays as it is.
+        What is not finite stays as it is.
         """
         result = self.happen("mode", mode=self.firmware.reposition_mode)
         if result is Result.ACCEPTED and self.armed:
@@ -223,8 +223,9 @@ class Autopilot:
             relative = frame in RELATIVE_FRAMES
             down = (self.pilot.home_ned_m[2] if relative else self.firmware.origin[2]) - height_m
             known = math.isfinite(north + east)
-            place = (*((north, east) if known else here[:2]), down if down == down else here[2])
-            self.pilot.go_to(place, yaw_rad)
+            down = down if math.isfinite(down) else here[2]
+            place = (*((north, east) if known else here[:2]), down)
+            self.pilot.go_to(place, yaw_rad if math.isfinite(yaw_rad) else math.nan)
         return result
 
     def obey_global_motion(self, values: Mapping[str, Any]) -> None:
@@ -301,7 +302,7 @@ class Autopilot:
         """
         if self.failsafe or self.restarts:
             return False
-        if not self.pilot.flies_itself(self.armed, self.plant.on_ground):
+        if not self.pilot.flies_itself(self.steps, self.armed, self.plant.on_ground):
             return False
         watched_s = self._watch.calm_until_s(self.time_s, self.gps_healthy)
         until_s = min(self._steady_until_s, watched_s)

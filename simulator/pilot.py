@@ -181,16 +181,17 @@ class Pilot:
             self._tuned = self._parameters.changes
             self.loop.tune(self._firmware.gains(self._parameters.__getitem__))
 
-    def flies_itself(self, armed: bool, on_ground: bool) -> bool:
-        """Whether `fly` will do no more than demand the attitude asked for, or run the position
-        loop on an unchanged setpoint, until somebody speaks or the ground is touched."""
+    def flies_itself(self, step: int, armed: bool, on_ground: bool) -> bool:
+        """Whether `fly` will from this step on do no more than demand the attitude asked for, or
+        run the position loop on one setpoint, until somebody speaks or the ground is touched."""
         if not armed:
             return self.landed and self._demand is OFF
         if self.landed or on_ground or self.climbed or self.events or not self._takeoff.flying:
             return False
         setpoint = self._attitude_setpoint
         if setpoint is None:
-            return self.behaviour in _STANDING
+            known = self.motion is self._standing_motion() or self._loop_step(step) == step
+            return known and self.behaviour in _STANDING
         return setpoint.climb_mps is None and not self._boosts_thrust
 
     def next_loop_step(self, step: int, look: Callable[[], Nav], never: int) -> int:

@@ -74,9 +74,21 @@ def test_px4_turns_to_the_course_of_a_place_and_stays_where_none_is_told() -> No
     go_north(bench, 3.0, math.pi / 2)
     bench.run(6.0)
     assert yaw_rad(bench) == pytest.approx(math.pi / 2, abs=0.03)
-    assert bench.command(REPOSITION, -1, 1, 0, NAN, NAN, NAN, NAN) == [ACCEPTED]
-    bench.run(3.0)
-    assert bench.instance.autopilot.truth.position_ned_m[0] == pytest.approx(3.0, abs=0.2)
+    for nothing in (NAN, math.inf):
+        assert bench.command(REPOSITION, -1, 1, 0, *(nothing,) * 4) == [ACCEPTED]
+        bench.run(3.0)
+        assert bench.instance.autopilot.truth.position_ned_m[0] == pytest.approx(3.0, abs=0.2)
+        assert bench.height_m == pytest.approx(5.0, abs=0.3)
+
+
+def test_arducopter_lifts_off_to_a_place_with_a_course_that_is_none() -> None:
+    bench = Bench(firmware=ARDUPILOT, boot_scale=0.1)
+    bench.boot()
+    bench.command(176, 1, GUIDED)
+    assert bench.command(400, 1) == [ACCEPTED]
+    go_north(bench, 0.0, math.inf)
+    bench.run(8.0)
+    assert bench.height_m > 2.0
 
 
 def test_arducopter_turns_to_a_course_and_by_an_angle() -> None:

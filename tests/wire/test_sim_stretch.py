@@ -111,16 +111,23 @@ def test_a_flight_in_stretches_has_the_bytes_of_single_steps(
 
 
 def test_an_arducopter_flies_in_stretches_without_a_setpoint_and_behind_the_last() -> None:
-    """In GUIDED: takeoff, hold, a velocity of which the stream stops, hold."""
+    """In GUIDED: takeoff, hold, velocities of which the stream stops, hold. One of them comes when
+    the position loop runs, and one between; what it is asked for is told all the time."""
     command = mavlink.MAVLink_command_long_message
-    velocity = mavlink.MAVLink_set_position_target_local_ned_message(
-        0, 1, 1, 1, 0b1101_1100_0111, 0, 0, 0, 1, 0, 0, 0, 0, 0, 0, 0
+    slow, fast = (
+        mavlink.MAVLink_set_position_target_local_ned_message(
+            0, 1, 1, 1, 0b1101_1100_0111, 0, 0, 0, north_mps, 0, 0, 0, 0, 0, 0, 0
+        )
+        for north_mps in (0.5, 1.0)
     )
     script = {
+        2.0: command(1, 1, 511, 0, 85, 5_000, 0, 0, 0, 0, 0),
         4.0: command(1, 1, 176, 0, 1, 4, 0, 0, 0, 0, 0),
         4.1: command(1, 1, 400, 0, 1, 0, 0, 0, 0, 0, 0),
         4.2: command(1, 1, 22, 0, 0, 0, 0, 0, 0, 0, 5),
-        13.0: velocity,
+        13.0: slow,
+        13.1: slow,
+        13.204: fast,
     }
     codec = mavlink.MAVLink(None, 255, 190)
     said: list[list[bytes]] = []
