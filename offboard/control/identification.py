@@ -15,26 +15,18 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.estimator_noise import SLOWNESS_S, EstimatorNoise, noise_of
+from offboard.control.axis_identification import tilt_of, yaw_of
+from offboard.control.estimator_noise import EstimatorNoise, noise_of
+from offboard.control.motion import Motion
 from offboard.control.motion_fit import (
     DRAG_UPPER,
-    Motion,
     VerticalFit,
     VerticalPrior,
     fit_drag,
     fit_vertical,
 )
-from offboard.control.response_fit import Estimate, ResponseFit, commanded_rms, fit_response
-from offboard.control.response_search import LOWER, UPPER
-from offboard.control.trace import (
-    COURSE,
-    NORTH,
-    SENT_AT,
-    SENT_COURSE,
-    SENT_NORTH,
-    STAMP,
-    Trace,
-)
+from offboard.control.response_fit import Estimate, ResponseFit
+from offboard.control.trace import Trace
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 __all__ = [
@@ -52,12 +44,9 @@ __all__ = [
 Array = NDArray[np.float64]
 
 # Least excitation: below it there is nothing to see.
-TILT_MOVED_RAD, COURSE_MOVED_RAD = 0.004, 0.008
 SPEED_MPS, THRUST_MOVED = 0.4, 0.015
 # Greatest standard deviation that is still an answer.
-TILT_SDS, YAW_SDS = (0.01, 0.15, 0.15), (0.04, 0.15, 0.2)  # delay s, frequency relative, damping
 DRAG_SD_PS, HOVER_SD, EFFECT_SD_S = 0.2, 0.02, 0.03
-EXPLAINED = 0.6  # least share of the commanded motion that the response must account for
 DRAG_BEFOREHAND = Estimate(0.6, 0.4)
 # A link adds the same to all delays. How far the rest of them, relative to the tilt's, and the
 # thrust's lag are from the vehicle file's, s; and the link itself while the tilt is not known.
@@ -129,10 +118,10 @@ def stages(trace: Trace, vehicle: Vehicle) -> Generator[None, None, Identified]:
         said = f"{max(seconds, 0.0) if seconds == seconds else 0.0:.1f} s of flight, 2 s are needed"
         names = ("tilt", "yaw", "hover_thrust", "thrust_lag_s", "drag_ps", "noise")
         return Identified(0.0, refusals=dict.fromkeys(names, said))
-    tilt = _tilt(trace, refusals)
+    tilt = tilt_of(trace, refusals)
     yield
     link = _link(tilt, vehicle)
-    yaw = _yaw(trace, _shifted(vehicle.yaw.delay_s, YAW_DELAY_SD_S, link), refusals)
+    yaw = yaw_of(trace, _shifted(vehicle.yaw.delay_s, YAW_DELAY_SD_S, link), refusals)
     yield
     motion = Motion(trace)
     if not motion.usable:
@@ -198,7 +187,7 @@ def identify_tilt(trace: Trace) -> Identified:
     """The tilt alone."""
     refusals: dict[str, str] = {}
     seconds = trace.end_s - trace.begin_s
-    return Identified(seconds, tilt=_tilt(trace, refusals), refusals=refusals)
+    return Identified(seconds, tilt=tilt_of(trace, refusals), refusals=refusals)
 
 
 def warm_up(vehicle: Vehicle) -> None:
@@ -214,74 +203,8 @@ def warm_up(vehicle: Vehicle) -> None:
     identify(Trace(commands, attitude, position), vehicle)
 
 
-def _tilt(trace: Trace, refusals: dict[str, str]) -> ResponseFit | None:
-    signals = trace.attitude[:, NORTH : NORTH + 2]
-    commands = trace.commands[:, SENT_NORTH : SENT_NORTH + 2]
-    return _response(trace, _Axis("tilt", TILT_MOVED_RAD, TILT_SDS), signals, commands, refusals)
-
-
-def _yaw(trace: Trace, delay: Estimate, refusals: dict[str, str]) -> ResponseFit | None:
-    signals = np.unwrap(trace.attitude[:, COURSE])[:, None]
-    commands = np.unwrap(trace.commands[:, SENT_COURSE])[:, None]
-    axis = _Axis("yaw", COURSE_MOVED_RAD, YAW_SDS, delay)
-    return _response(trace, axis, signals, commands, refusals)
-
-
-@dataclass(frozen=True, slots=True)
-class _Axis:
-    """What is asked of the fit of one axis: least motion, greatest uncertainties; and its delay as
-    known beforehand."""
-
-    name: str
-    moved_rad: float
-    sds: tuple[float, float, float]
-    delay: Estimate | None = None
-
-
-def _response(
-    trace: Trace, axis: _Axis, signals: Array, commands: Array, refusals: dict[str, str]
-) -> ResponseFit | None:
-    times, sent_at = trace.attitude[:, STAMP], trace.commands[:, SENT_AT]
-    if len(times) < 50 or len(sent_at) < 3:
-        refusals[axis.name] = f"{len(times)} attitudes and {len(sent_at)} commands are too few"
-        return None
-    moved = commanded_rms(times, sent_at, commands)
-    if moved < axis.moved_rad:
-        refusals[axis.name] = (
-            f"its command moved by {1e3 * moved:.1f} mrad rms, "
-            f"{1e3 * axis.moved_rad:.0f} are needed: fly steps"
-        )
-        return None
-    fit = fit_response(times, signals, sent_at, commands, axis.delay)
-    if (refusal := _refusal(fit, axis.sds)) is not None:
-        refusals[axis.name] = refusal
-        return None
-    return fit
-
-
-def _refusal(fit: ResponseFit, limits: tuple[float, float, float]) -> str | None:
-    """Why a fit is no answer, or None."""
-    if fit.residual_rms > (1.0 - EXPLAINED) * fit.commanded_rms:
-        return (
-            f"it does not follow its command: {1e3 * fit.residual_rms:.1f} mrad rms are left of "
-            f"{1e3 * fit.commanded_rms:.1f} commanded"
-        )
-    scales = (1.0, fit.natural_frequency_radps.value, 1.0)
-    names = ("delay in s", "natural frequency in rad/s", "damping")
-    estimates = (fit.delay_s, fit.natural_frequency_radps, fit.damping)
-    for index, (name, estimate) in enumerate(zip(names, estimates, strict=True)):
-        margin = 1e-3 * (UPPER[index] - LOWER[index])
-        low = index > 0 and estimate.value < LOWER[index] + margin
-        if low or estimate.value > UPPER[index] - margin:
-            return f"its {name} ends at the edge of its range, {estimate.value:.3g}"
-        limit = limits[index] * scales[index]
-        if not estimate.sd <= limit:
-            return f"its {name} is uncertain by {estimate.sd:.2g} (limit {limit:.2g}): fly steps"
-    return None
-
-
 def _drag(motion: Motion, thrust_mps2: Array, refusals: dict[str, str]) -> Estimate | None:
-    speed_mps = _speed_rms(motion)
+    speed_mps = motion.speed_mps
     if speed_mps < SPEED_MPS:
         refusals["drag_ps"] = (
             f"{speed_mps:.2f} m/s rms over ground, {SPEED_MPS} are needed: drag needs motion"
@@ -325,16 +248,3 @@ def _vertical(
     else:
         return hover, fit.thrust_lag_s, fit.thrust_delay_s
     return hover, None, None
-
-
-def _speed_rms(motion: Motion) -> float:
-    """Horizontal, from positions SLOWNESS_S apart."""
-    later = motion.times + SLOWNESS_S
-    within = later <= motion.times[-1]
-    if not within.any():
-        return 0.0
-    moved = [
-        np.interp(later[within], motion.times, along) - along[within]
-        for along in motion.positions[:2]
-    ]
-    return float(np.sqrt(np.mean(np.sum(np.square(moved), axis=0)))) / SLOWNESS_S

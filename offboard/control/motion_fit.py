@@ -1,7 +1,6 @@
 """Drag, hover thrust and thrust lag from positions, attitudes and the thrust commanded.
 
-Reported velocity is not used: on PX4 it is not the derivative of the reported position. Instead a
-Kalman filter per axis follows the position under the acceleration that attitude and thrust must
+A Kalman filter per axis follows the position under the acceleration that attitude and thrust must
 have given, allowing for an estimator that wanders and for a disturbance that drifts; what it could
 not foresee, its innovations, is white for the right constants, and least squares on it finds them
 (maximum likelihood; L. Ljung, System Identification, 1999, 7.4). Knows arrays and no flight.
@@ -17,29 +16,19 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from offboard.control.response_fit import Estimate, thinned
-from offboard.control.trace import (
-    NORTH,
-    POSITION,
-    SENT_AT,
-    SENT_THRUST,
-    STAMP,
-    Trace,
-)
-from offboard.model.vehicle import Vehicle
+from offboard.control.motion import Motion
+from offboard.control.response_fit import Estimate
 
 Array = NDArray[np.float64]
 
-# What is allowed for, per root second: a position that wanders (PX4: .013-.030 m), an acceleration
+# What is allowed for. Per root second: a position that wanders (PX4: .013-.030 m), an acceleration
 # that is not modelled (m/s), a disturbance that drifts (m/s^2; PX4's tilt error times g is .1).
-POSITION_DENSITY, ACCELERATION_DENSITY, DISTURBANCE_DENSITY = 0.05, 0.1, 0.08
+# Then: noise of the positions (m), speed and disturbance at the start (m/s, m/s^2).
+LATERAL = np.array([0.05, 0.1, 0.08, 0.001, 3.0, 0.5])
 # The vertical has no disturbance beside the hover thrust sought.
-VERTICAL_DRIFT = 0.03
-POSITION_SD_M = 0.001
-START_SPEED_SD_MPS, START_DISTURBANCE_SD_MPS2 = 3.0, 0.5
+VERTICAL = np.array([0.05, 0.1, 0.03, 0.001, 3.0, 0.001])
 # Innovations of a wandering estimator stay related for this long.
 RELATED_S = 2.0
-STEPS_S = 0.018  # closer positions are thinned: nothing is learnt from them
 
 DRAG_START, DRAG_UPPER = 0.6, 5.0
 # Least values to search from: without a lag thrust jumps between samples and has no slope.
@@ -59,54 +48,25 @@ class VerticalFit:
 
 
 @numba.njit(cache=True)
-def lagged_thrust(
-    times: Array, sent_at: Array, thrust: Array, delay_s: float, lag_s: float
-) -> Array:
-    """The thrust at `times` (N,): commands (M,) after delay and first-order lag, exact."""
-    out = np.empty(times.shape[0])
-    row = 0
-    while row + 1 < sent_at.shape[0] and sent_at[row + 1] + delay_s <= times[0] - 10.0 * lag_s:
-        row += 1
-    value = thrust[row]
-    now = min(sent_at[row] + delay_s, times[0])
-    for i in range(times.shape[0]):
-        while now < times[i]:
-            following = row + 1
-            until = times[i]
-            acts = following < sent_at.shape[0] and sent_at[following] + delay_s <= until
-            if acts:
-                until = max(sent_at[following] + delay_s, now)
-            left = math.exp(-(until - now) / lag_s) if lag_s > 1e-6 else 0.0
-            value = thrust[row] + (value - thrust[row]) * left
-            now = until
-            if acts:
-                row = following
-        out[i] = value if lag_s > 1e-6 else thrust[row]
-    return out
-
-
-@numba.njit(cache=True)
 def innovations(
     times: Array,
     positions: Array,
     accelerations: Array,
     drag: float,
-    densities: Array,
-    sd: float,
-    start_sds: Array,
-) -> Array:
-    """Normalised innovations (N - 1,) of a filter [p, v, d] along one axis.
+    allowed: Array,
+    out: Array,
+) -> None:
+    """Normalised innovations `out` (N - 1,) of a filter [p, v, d] along one axis.
 
-    v' = a - c v + d with `accelerations` (N,) joined by straight lines; densities (3,) per root
-    second of p, v, d; `sd` of the positions; start_sds (2,) of v and d.
+    v' = a - c v + d with `accelerations` (N,) joined by straight lines; `allowed` (6,): densities
+    per root second of p, v and d, sd of the positions, and of v and d at the start.
     """
-    count = times.shape[0]
-    out = np.empty(count - 1)
+    p_density, v_density, d_density = allowed[0], allowed[1], allowed[2]
+    noise, start_v, start_d = allowed[3] ** 2, allowed[4] ** 2, allowed[5] ** 2
     p, v, d = positions[0], 0.0, 0.0
-    pp, pv, pd = sd * sd, 0.0, 0.0
-    vv, vd, dd = start_sds[0] ** 2, 0.0, start_sds[1] ** 2
-    noise = sd * sd
-    for i in range(1, count):
+    pp, pv, pd = noise, 0.0, 0.0
+    vv, vd, dd = start_v, 0.0, start_d
+    for i in range(1, times.shape[0]):
         h = times[i] - times[i - 1]
         keep = math.exp(-drag * h)
         share = (1.0 - keep) / drag if drag > 1e-9 else h
@@ -118,12 +78,12 @@ def innovations(
         a0, a1, a2 = pp + share * pv + reach * pd, pv + share * vv + reach * vd, 0.0
         a2 = pd + share * vd + reach * dd
         b1, b2 = keep * vv + share * vd, keep * vd + share * dd
-        pp = a0 + share * a1 + reach * a2 + densities[0] ** 2 * h
+        pp = a0 + share * a1 + reach * a2 + p_density**2 * h
         pv = keep * a1 + share * a2
         pd = a2
-        vv = keep * b1 + share * b2 + densities[1] ** 2 * h
+        vv = keep * b1 + share * b2 + v_density**2 * h
         vd = b2
-        dd = dd + densities[2] ** 2 * h
+        dd = dd + d_density**2 * h
         spread = pp + noise
         surprise = positions[i] - p
         out[i - 1] = surprise / math.sqrt(spread)
@@ -137,61 +97,17 @@ def innovations(
         pd -= gain_p * pd
         pv -= gain_p * pv
         pp -= gain_p * pp
-    return out
-
-
-class Motion:
-    """Positions of a trace with the attitude at their times, thinned to what is worth having."""
-
-    def __init__(self, trace: Trace) -> None:
-        rows = trace.position[thinned(trace.position[:, STAMP], STEPS_S)]
-        inside = (rows[:, STAMP] >= trace.begin_s) & (rows[:, STAMP] <= trace.end_s)
-        rows = rows[inside]
-        self.times = np.ascontiguousarray(rows[:, STAMP])
-        self.positions = np.ascontiguousarray(rows[:, POSITION].T)
-        stamps = trace.attitude[:, STAMP]
-        self.direction_ne = np.array(
-            [np.interp(self.times, stamps, trace.attitude[:, NORTH + axis]) for axis in (0, 1)]
-        )
-        self.upright = np.sqrt(np.maximum(1.0 - np.sum(self.direction_ne**2, axis=0), 0.01))
-        self._sent_at = np.ascontiguousarray(trace.commands[:, SENT_AT])
-        self._thrust = np.ascontiguousarray(trace.commands[:, SENT_THRUST])
-
-    def thrust(self, delay_s: float, lag_s: float) -> Array:
-        """Thrust (N,) as a fraction of full throttle."""
-        return np.asarray(lagged_thrust(self.times, self._sent_at, self._thrust, delay_s, lag_s))
-
-    @property
-    def spacing_s(self) -> float:
-        """Mean time from one position to the next."""
-        return float(self.times[-1] - self.times[0]) / (len(self.times) - 1)
-
-    @property
-    def usable(self) -> bool:
-        return len(self.times) >= 50 and len(self._sent_at) >= 3
 
 
 def fit_drag(motion: Motion, thrust_mps2: Array) -> Estimate:
     """Lateral drag per unit of mass, 1/s; thrust_mps2 (N,) at the motion's times."""
-    densities = np.array([POSITION_DENSITY, ACCELERATION_DENSITY, DISTURBANCE_DENSITY])
-    starts = np.array([START_SPEED_SD_MPS, START_DISTURBANCE_SD_MPS2])
     pulls = -thrust_mps2 * motion.direction_ne
 
     def surprises(drag: Array) -> Array:
-        return np.concatenate(
-            [
-                innovations(
-                    motion.times,
-                    motion.positions[axis],
-                    pulls[axis],
-                    drag[0],
-                    densities,
-                    POSITION_SD_M,
-                    starts,
-                )
-                for axis in (0, 1)
-            ]
-        )
+        out = np.empty((2, len(motion.times) - 1))
+        for along, pull, white in zip(motion.positions, pulls, out, strict=False):
+            innovations(motion.times, along, pull, drag[0], LATERAL, white)
+        return out.ravel()
 
     result = least_squares(
         surprises, [DRAG_START], bounds=([0.0], [DRAG_UPPER]), xtol=1e-4, ftol=1e-9, max_nfev=12
@@ -219,17 +135,15 @@ class VerticalPrior:
 
 def fit_vertical(motion: Motion, gravity_mps2: float, prior: VerticalPrior) -> VerticalFit:
     """Hover thrust, lag and delay of the thrust."""
-    densities = np.array([POSITION_DENSITY, ACCELERATION_DENSITY, VERTICAL_DRIFT])
-    starts = np.array([START_SPEED_SD_MPS, 1e-3])
     known = (prior.delay_s, prior.lag_s, prior.drag_ps)
 
     def surprises(parameters: Array) -> Array:
         inverse, delay_s, lag_s, drag_ps = parameters
         thrust = motion.thrust(delay_s, lag_s)
         pull = gravity_mps2 * (1.0 - inverse * thrust * motion.upright)
-        return innovations(
-            motion.times, motion.positions[2], pull, drag_ps, densities, POSITION_SD_M, starts
-        )
+        out = np.empty(len(motion.times) - 1)
+        innovations(motion.times, motion.positions[2], pull, drag_ps, VERTICAL, out)
+        return out
 
     upper = np.array((50.0, THRUST_DELAY_UPPER_S, LAG_UPPER_S, DRAG_UPPER))
     start = np.clip(
@@ -272,25 +186,6 @@ def _covariance(jacobian: Array, residual: Array, spacing_s: float, known: int) 
     bread = np.linalg.pinv(jacobian.T @ jacobian)
     covariance: Array = bread @ meat @ bread
     return covariance
-
-
-def specific_velocity(motion: Motion, vehicle: Vehicle) -> Array:
-    """Velocity (3, N) that thrust, attitude and drag alone give, its mean that of the positions."""
-    thrust = vehicle.thrust_max_mps2 * motion.thrust(vehicle.thrust_delay_s, vehicle.thrust_lag_s)
-    down = vehicle.gravity_mps2 - thrust * motion.upright
-    push = np.vstack((-thrust * motion.direction_ne, down))
-    push -= push.mean(axis=1, keepdims=True)  # a constant disturbance
-    steps = np.diff(motion.times)
-    travelled = motion.positions[:, -1] - motion.positions[:, 0]
-    mean = travelled / max(motion.times[-1] - motion.times[0], 1e-3)
-    push += vehicle.drag_per_mass_ps * mean[:, None]
-    velocity = np.empty_like(push)
-    velocity[:, 0] = 0.0
-    for i, step_s in enumerate(steps):
-        keep = math.exp(-vehicle.drag_per_mass_ps * step_s)
-        velocity[:, i + 1] = keep * velocity[:, i] + step_s * push[:, i]
-    velocity += (mean - velocity.mean(axis=1))[:, None]
-    return velocity
 
 
 def _long_run(score: Array, lags: int) -> Array:

@@ -7,7 +7,6 @@ vehicle and no flight. Times in s, signals in rad or parts of a unit vector.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -27,7 +26,7 @@ from offboard.control.response_search import (
     slopes,
     weights_of,
 )
-from offboard.control.trace import NORTH, SENT_AT, SENT_NORTH, STAMP, Trace
+from offboard.control.trace import NORTH, SENT_AT, SENT_NORTH, STAMP, Trace, thinned
 from offboard.model.vehicle import AxisResponse
 
 Array = NDArray[np.float64]
@@ -166,11 +165,12 @@ def predicted(
     damping: float,
 ) -> Array:
     """The response (N, axes) to `commands` (M, axes), at rest at the start."""
-    out = np.empty((len(times), commands.shape[1] + 2))
+    axes = commands.shape[1]
+    motion, out = np.empty((2, axes + 2)), np.empty((len(times), axes + 2))
     if len(times) and len(sent_at):
         signal, sent, held = (np.ascontiguousarray(each) for each in (times, sent_at, commands))
-        respond(signal, sent, held, delay_s, frequency_radps, damping, out)
-    response: Array = out[:, :-2]
+        respond(signal, sent, held, delay_s, frequency_radps, damping, motion, out)
+    response: Array = out[:, :axes]
     return response
 
 
@@ -203,14 +203,3 @@ def fit_response(
     delay_s, frequency, damping = found
     moved = commanded_rms(times, sent_at, commands)
     return ResponseFit(delay_s, frequency, damping, residual_rms=scale, commanded_rms=moved)
-
-
-def thinned(stamps: Array, spacing_s: float) -> NDArray[np.intp]:
-    """Rows at least so far apart."""
-    kept: list[int] = []
-    last = -math.inf
-    for row, stamp in enumerate(stamps):
-        if stamp - last >= spacing_s:
-            kept.append(row)
-            last = stamp
-    return np.array(kept, dtype=np.intp)

@@ -11,7 +11,6 @@ are (K. Lange, R. Little and J. Taylor, 1989). Times in s, signals in any unit; 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numba
 import numpy as np
@@ -30,15 +29,18 @@ CONVERGED = 2e-4  # of STEP_SCALES
 DIFFERENCE = 1e-3  # of them too, for slopes
 
 
-@dataclass(frozen=True, slots=True)
 class Data:
     """Signals (N, axes) at `times` (N,) under `commands` (M, axes) sent at `sent_at` (M,), each
-    contiguous and in the order of time."""
+    contiguous and in the order of time; and room for one response."""
 
-    times: Array
-    signals: Array
-    sent_at: Array
-    commands: Array
+    def __init__(self, times: Array, signals: Array, sent_at: Array, commands: Array) -> None:
+        self.times, self.signals = times, signals
+        self.sent_at, self.commands = sent_at, commands
+        axes = signals.shape[1]
+        self.motion = np.empty((2, axes + 2))
+        self.response = np.empty((len(times), axes + 3))
+        """Of the axes, free of command from a unit offset and from a unit rate, and constant."""
+        self.response[:, -1] = 1.0
 
 
 @numba.njit(cache=True)
@@ -68,24 +70,23 @@ def respond(
     delay_s: float,
     frequency: float,
     damping: float,
+    motion: Array,
     out: Array,
 ) -> None:
     """The response at `times` (N,) to piecewise constant `commands` (M, axes), at rest on the
-    command in force at the start; `out` (N, axes + 2): the axes, then the free responses to a unit
-    offset and to a unit rate. Rows in the order of time; exact."""
+    command in force at the start; `out` (N, at least axes + 2): the axes, then the free responses
+    to a unit offset and to a unit rate. Rows in the order of time; exact. `motion` (2, axes + 2)
+    is scratch."""
     axes = commands.shape[1]
-    value = np.zeros(axes + 2)
-    rate = np.zeros(axes + 2)
-    held = np.zeros(axes + 2)
+    value, rate = motion[0], motion[1]
     now = times[0]
     row = -1
     while row + 1 < sent_at.shape[0] and sent_at[row + 1] + delay_s <= now:
         row += 1
-    first = max(row, 0)
     for axis in range(axes):
-        value[axis] = held[axis] = commands[first, axis]
-    value[axes] = 1.0
-    rate[axes + 1] = 1.0
+        value[axis], rate[axis] = commands[max(row, 0), axis], 0.0
+    value[axes], rate[axes] = 1.0, 0.0
+    value[axes + 1], rate[axes + 1] = 0.0, 1.0
     stiffness, friction = frequency * frequency, 2.0 * damping * frequency
     for i in range(times.shape[0]):
         while now < times[i]:
@@ -96,14 +97,13 @@ def respond(
                 until = max(sent_at[following] + delay_s, now)
             f0, f1 = _propagator(frequency, damping, until - now)
             for axis in range(axes + 2):
-                away, speed = value[axis] - held[axis], rate[axis]
-                value[axis] = held[axis] + f0 * away + f1 * speed
+                held = commands[max(row, 0), axis] if axis < axes else 0.0
+                away, speed = value[axis] - held, rate[axis]
+                value[axis] = held + f0 * away + f1 * speed
                 rate[axis] = f0 * speed + f1 * (-stiffness * away - friction * speed)
             now = until
             if acts:
                 row = following
-                for axis in range(axes):
-                    held[axis] = commands[row, axis]
             elif until >= times[i]:
                 break
         for axis in range(axes + 2):
@@ -113,15 +113,23 @@ def respond(
 def residual(data: Data, parameters: Array, weights: Array) -> Array:
     """Signals less response (N, axes), free motion and a constant offset projected out under
     `weights` (N,)."""
-    axes = data.signals.shape[1]
-    out = np.empty((len(data.times), axes + 2))
     delay_s, frequency, damping = parameters.tolist()
-    respond(data.times, data.sent_at, data.commands, delay_s, frequency, damping, out)
-    left = data.signals - out[:, :axes]
-    basis = np.column_stack((out[:, axes:], np.ones(len(out))))
+    respond(
+        data.times,
+        data.sent_at,
+        data.commands,
+        delay_s,
+        frequency,
+        damping,
+        data.motion,
+        data.response,
+    )
+    axes = data.signals.shape[1]
+    left: Array = data.signals - data.response[:, :axes]
+    basis = data.response[:, axes:]
     weighted = basis.T * weights
     gram = weighted @ basis
-    gram += np.diag(1e-12 + 1e-9 * np.diag(gram))
+    gram.flat[:: len(gram) + 1] += 1e-12 + 1e-9 * gram.diagonal()
     left -= basis @ np.linalg.solve(gram, weighted @ left)
     return left
 

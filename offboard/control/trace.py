@@ -83,6 +83,17 @@ def _latest(rows: Array) -> Array:
     return kept
 
 
+def thinned(stamps: Array, spacing_s: float) -> NDArray[np.intp]:
+    """Rows at least so far apart."""
+    kept: list[int] = []
+    last = -math.inf
+    for row, stamp in enumerate(stamps.tolist()):
+        if stamp - last >= spacing_s:
+            kept.append(row)
+            last = stamp
+    return np.array(kept, dtype=np.intp)
+
+
 class Recorder:
     """The last stretch of a flight, kept while it is flown. Memory is fixed."""
 

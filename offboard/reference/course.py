@@ -7,10 +7,10 @@ the path itself stands still (`HOLD_SPEED_MPS`) has the direction to be made up.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BPoly, PPoly
@@ -73,9 +73,19 @@ class AlongVelocity:
     slow_coefficients: Array
 
     def jet(self, path_time_s: Array, path_jet: Array) -> Array:
-        return along(
-            path_time_s, path_jet, self.step_s, self.nodes_rad, self.slow_s, self.slow_coefficients
-        )
+        jet = direction_jet(path_jet)
+        node = np.rint(path_time_s / self.step_s).astype(np.intp)
+        nearest_rad = self.nodes_rad[np.clip(node, 0, self.nodes_rad.size - 1)]
+        jet[0] += 2.0 * np.pi * np.rint((nearest_rad - jet[0]) / (2.0 * np.pi))
+        if len(self.slow_s):
+            # the first bridge that does not end before
+            bridge = np.searchsorted(self.slow_s[:-1, 1], path_time_s)
+            begin_s, end_s = self.slow_s[bridge].T
+            slow = (begin_s <= path_time_s) & (path_time_s <= end_s)
+            if slow.any():
+                coefficients = self.slow_coefficients[bridge[slow]].T
+                jet[:, slow] = _quintic((path_time_s - begin_s)[slow], coefficients)
+        return jet
 
 
 def along_velocity(path: Path, length_s: float, standstill_rad: float = 0.0) -> Course:
@@ -118,50 +128,27 @@ def _bridges(nodes_s: Array, direction: Array, fast: NDArray[np.bool_]) -> tuple
     return np.reshape(intervals, (-1, 2)).astype(np.float64), np.reshape(coefficients, (-1, 6))
 
 
-@numba.njit(cache=True)
 def direction_jet(path_jet: Array) -> Array:
     """Direction of the horizontal velocity in (-pi, pi], its rate and acceleration: (3, N).
 
     path_jet (5, N, 3). Finite at any speed: the squared speed is floored at 1e-6 m^2/s^2.
     """
-    out = np.empty((3, path_jet.shape[1]))
-    for i in range(path_jet.shape[1]):
-        vn, ve = path_jet[1, i, 0], path_jet[1, i, 1]
-        an, ae = path_jet[2, i, 0], path_jet[2, i, 1]
-        jn, je = path_jet[3, i, 0], path_jet[3, i, 1]
-        square = max(vn * vn + ve * ve, 1e-6)
-        rate = (vn * ae - ve * an) / square
-        out[0, i] = np.arctan2(ve, vn)
-        out[1, i] = rate
-        out[2, i] = (vn * je - ve * jn - 2.0 * rate * (vn * an + ve * ae)) / square
-    return out
+    (vn, ve), (an, ae), (jn, je) = path_jet[1:4, :, :2].transpose(0, 2, 1)
+    square = np.maximum(vn * vn + ve * ve, 1e-6)
+    rate = (vn * ae - ve * an) / square
+    # numpy's own differs in the last digit from one processor to another
+    direction = list(map(math.atan2, ve.tolist(), vn.tolist()))
+    acceleration = (vn * je - ve * jn - 2.0 * rate * (vn * an + ve * ae)) / square
+    return np.array((direction, rate, acceleration))
 
 
-@numba.njit(cache=True)
-def along(
-    path_time_s: Array,
-    path_jet: Array,
-    step_s: float,
-    nodes_rad: Array,
-    slow_s: Array,
-    slow_coefficients: Array,
-) -> Array:
-    """`AlongVelocity.jet`, compiled."""
-    out = direction_jet(path_jet)
-    for i in range(path_time_s.size):
-        s = path_time_s[i]
-        node = min(max(int(np.rint(s / step_s)), 0), nodes_rad.size - 1)
-        out[0, i] += 2.0 * np.pi * np.rint((nodes_rad[node] - out[0, i]) / (2.0 * np.pi))
-        for k in range(slow_s.shape[0]):
-            if slow_s[k, 0] <= s <= slow_s[k, 1]:
-                quintic(s - slow_s[k, 0], slow_coefficients[k], out[:, i])
-                break
-    return out
-
-
-@numba.njit(cache=True)
-def quintic(x: float, c: Array, out: Array) -> None:
-    """Value, first and second derivative at x of the polynomial with coefficients (6,)."""
-    out[0] = c[0] + x * (c[1] + x * (c[2] + x * (c[3] + x * (c[4] + x * c[5]))))
-    out[1] = c[1] + x * (2.0 * c[2] + x * (3.0 * c[3] + x * (4.0 * c[4] + x * 5.0 * c[5])))
-    out[2] = 2.0 * c[2] + x * (6.0 * c[3] + x * (12.0 * c[4] + x * 20.0 * c[5]))
+def _quintic(x: Array, c: Array) -> Array:
+    """Value, first and second derivative (3, N) at x (N,) of polynomials with coefficients
+    c (6, N)."""
+    return np.array(
+        (
+            c[0] + x * (c[1] + x * (c[2] + x * (c[3] + x * (c[4] + x * c[5])))),
+            c[1] + x * (2.0 * c[2] + x * (3.0 * c[3] + x * (4.0 * c[4] + x * 5.0 * c[5]))),
+            2.0 * c[2] + x * (6.0 * c[3] + x * (12.0 * c[4] + x * 20.0 * c[5])),
+        )
+    )

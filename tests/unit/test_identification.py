@@ -11,7 +11,8 @@ from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
 from offboard.control.identification import Identified, identify
-from offboard.control.motion_fit import innovations, lagged_thrust
+from offboard.control.motion import lagged_thrust
+from offboard.control.motion_fit import innovations
 from offboard.control.response_fit import Estimate, fit_response, predicted
 from offboard.control.trace import Recorder, Trace, clean
 from offboard.model.vehicle import AxisResponse, Vehicle
@@ -85,8 +86,9 @@ def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():
         positions[i] = state[0] + 0.01 * generator.normal()
         state = drift @ state + kicks[i]
     times = step_s * np.arange(count)
-    start_sds = np.array([1.0, 1.0])
-    white = innovations(times, positions, np.zeros(count), drag, densities, 0.01, start_sds)[200:]
+    allowed, white = np.array([*densities, 0.01, 1.0, 1.0]), np.empty(count - 1)
+    innovations(times, positions, np.zeros(count), drag, allowed, white)
+    white = white[200:]
     assert np.mean(white**2) == pytest.approx(1.0, abs=0.03)
     assert abs(np.mean(white[1:] * white[:-1])) < 0.02
 
@@ -167,7 +169,8 @@ def test_lagged_thrust_is_that_of_scipy():
         return (thrust[row] - u) / 0.08
 
     solved = solve_ivp(rate, (0.0, 2.0), [0.4], t_eval=times, max_step=1e-3, rtol=1e-8)
-    ours = lagged_thrust(times, sent_at, thrust, 0.02, 0.08)
+    ours = np.empty_like(times)
+    lagged_thrust(times, sent_at, thrust, 0.02, 0.08, ours)
     assert np.abs(ours - solved.y[0]).max() < 5e-4
 
 
