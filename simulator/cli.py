@@ -151,7 +151,7 @@ def simulate(
     from simulator.instance import VIRTUAL_EPOCH_US, Instance
     from simulator.run import Berth, Runner, rehearse
 
-    if not Entry.all_kept():
+    if not Entry.all_compiled():
         _tell("compiling the flight dynamics, once (some seconds)")
     Entry.compile_all()
     rehearse(Instance(personality, flyer, flown.conditions, seed, lockstep=True))

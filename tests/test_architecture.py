@@ -95,4 +95,5 @@ def test_top_level_holds_only_what_the_layout_names() -> None:
     assert {name for name in top - allowed if not name.startswith(".")} <= {
         "LICENSE",
         "CHANGELOG.md",
+        "hatch_build.py",
     }

@@ -23,7 +23,8 @@ from pathlib import Path
 from types import ModuleType
 
 _VARIABLE = "NUMBA_CACHE_DIR"
-_COMPILES = re.compile(rb"njit|^@(?:kernel|entry)", re.M)
+_COMPILES = re.compile(rb"njit|llvmlite|^@(?:kernel|entry)", re.M)
+_ENTRY = re.compile(rb"^@entry", re.M)
 _IMPORT = re.compile(rb"^from ((?:offboard|simulator)[.\w]*) import (\([^)]*\)|.*)", re.M)
 _CONSTANT = re.compile(rb"\b[A-Z][A-Z0-9_]+\b")
 
@@ -95,12 +96,7 @@ def without_garbage_collection() -> Iterator[None]:
 def sources_digest() -> str:
     """Hash of every module that compiles something, and of those whose constants it takes: their
     machine code stands or falls as one."""
-    root = Path(__file__).resolve().parents[2]
-    sources = {
-        path.relative_to(root).as_posix(): path.read_bytes()
-        for package in ("offboard", "simulator")
-        for path in (root / package).rglob("*.py")
-    }
+    sources = _sources()
     pending = [name for name, content in sources.items() if _COMPILES.search(content)]
     taken: set[str] = set()
     while pending:
@@ -113,6 +109,24 @@ def sources_digest() -> str:
     for name in sorted(taken):
         digest.update(name.encode() + b"\0" + sources[name])
     return digest.hexdigest()[:16]
+
+
+def entry_modules() -> list[str]:
+    """The modules with functions that are compiled for Python to call."""
+    return sorted(
+        name.removesuffix(".py").replace("/", ".")
+        for name, content in _sources().items()
+        if _ENTRY.search(content)
+    )
+
+
+def _sources() -> dict[str, bytes]:
+    root = Path(__file__).resolve().parents[2]
+    return {
+        path.relative_to(root).as_posix(): path.read_bytes()
+        for package in ("offboard", "simulator")
+        for path in (root / package).rglob("*.py")
+    }
 
 
 def _own_directory(name: str) -> Path:

@@ -1,10 +1,11 @@
 """Compiled functions for processes that must not pay for numba.
 
-numba costs 100 MB and a third of a second of every start. A `Kernel` is a function that numba
-compiles when somebody first calls it. An `Entry` is what a program without numba calls instead: its
-machine code, with that of all the kernels in it, is compiled once, kept as an object file beside
-numba's own cache and loaded by llvmlite alone. Entries take integers and records (one-element
-structured arrays, by address) and return an integer; they allocate nothing and raise nothing.
+numba costs 100 MB and a third of a second of every start. A `Kernel` is a function for other
+compiled functions to call. An `Entry` is what Python calls: its machine code, with that of all the
+kernels in it, comes with the package as bitcode or is compiled once, is kept as an object file and
+loaded by llvmlite alone. Entries take numbers, arrays and records (one-element structured arrays,
+by address) and return a number; they allocate nothing and raise nothing. Called by their own names,
+both run as Python: what the machine code does, step by step.
 Knows neither vehicle nor controller.
 
 What compiles in seconds: a function is compiled once for each type of its arguments, and of an
@@ -19,15 +20,16 @@ import os
 import subprocess
 import sys
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any, ClassVar, Generic, ParamSpec, TypeVar, cast
 
 import numpy as np
 
-from offboard.model import machine_code
-from offboard.model.compilation import without_garbage_collection
+from offboard.model import bitcode, machine_code
 
 P = ParamSpec("P")
 R = TypeVar("R")
+N = TypeVar("N", bound=float)
 
 _COMPILE_ONE = """
 import importlib, sys
@@ -39,80 +41,134 @@ Entry.compile_one(sys.argv[2])
 
 
 class Kernel(Generic[P, R]):
-    """A function compiled by numba when first called from Python or from compiled code."""
+    """A function for compiled code to call; called from Python it runs as Python."""
 
     def __init__(self, function: Callable[P, R]) -> None:
         self.function = function
         functools.update_wrapper(self, function)
 
-    @functools.cached_property
-    def dispatcher(self) -> Any:
-        import numba
-
-        return numba.njit(cache=True, error_model="numpy")(self.function)
-
-    @property
-    def _numba_type_(self) -> Any:
-        """As numba asks for it: to compiled code a kernel is a dispatcher, without the ways in from
-        Python, which take a third of the time that it takes to compile."""
-        return self._within._numba_type_
-
-    @functools.cached_property
-    def _within(self) -> Any:
-        import numba
-
-        bare: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-        return numba.njit(error_model="numpy", **bare)(self.function)
-
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        return cast(R, self.dispatcher(*args, **kwargs))
+        return self.function(*args, **kwargs)
+
+    @functools.cached_property
+    def _numba_type_(self) -> Any:
+        """As numba asks for it."""
+        return bitcode.callee_type(self.function)
 
 
 kernel = Kernel
 """The decorator."""
 
 
-class Entry:
-    """A kernel in machine code, and in compiled code a function that is not compiled with it.
+@dataclass(frozen=True, slots=True)
+class ArrayKind:
+    """A parameter that takes contiguous arrays of any lengths."""
 
-    Called from Python, by `call`, it takes integers and the addresses of records; called from a
-    kernel, or from an entry defined later, integers and records.
+    dimensions: int
+    dtype: np.dtype[Any]
+
+    def flat(self, value: np.ndarray[Any, Any]) -> tuple[int, ...]:
+        """Address and lengths, as the machine code takes them. Raises TypeError for another kind of
+        array, whose memory would be misread."""
+        flags = value.flags
+        if value.dtype != self.dtype or value.ndim != self.dimensions or not flags.c_contiguous:
+            raise TypeError(
+                f"compiled code takes a contiguous array of {self.dimensions} dimensions of"
+                f" {self.dtype} here, not {value.ndim} of {value.dtype}, strides {value.strides}"
+            )
+        if flags.writeable and value.size:
+            # A third of the next one's time
+            place = ctypes.addressof(ctypes.c_char.from_buffer(cast(Any, value)))
+        else:
+            place = value.ctypes.data
+        return (place, *value.shape)
+
+
+def array(dimensions: int, dtype: str = "f8") -> ArrayKind:
+    """A parameter of an entry: an array of so many dimensions."""
+    return ArrayKind(dimensions, np.dtype(dtype))
+
+
+Parameter = type[int] | type[float] | ArrayKind | np.dtype[Any]
+"""Of an entry: a number, an array, or a record."""
+
+
+class Entry(Generic[N]):
+    """A function in machine code for Python to call, by `call`.
+
+    Where it takes numbers and records alone, compiled code calls that same machine code; otherwise
+    it is compiled anew with whoever calls it.
     """
 
-    _defined: ClassVar[list[Entry]] = []
+    _defined: ClassVar[list[Entry[Any]]] = []
+    compilations: ClassVar[int] = 0
+    """How many entries numba compiled in this process."""
 
-    def __init__(self, function: Callable[..., int], parameters: tuple[Any, ...]) -> None:
+    def __init__(self, function: Callable[..., N], parameters: tuple[Parameter, ...]) -> None:
         self._function = function
         self._parameters = parameters
+        returns = function.__annotations__.get("return", "int")
+        self._returns = _NUMBERS[str(getattr(returns, "__name__", returns))]  # a type, or its name
         self._address: int | None = None
-        self._before = tuple(Entry._defined)
         Entry._defined.append(self)
         self.symbol = f"{function.__module__}.{function.__name__}"
+        functools.update_wrapper(self, function)
 
-    def __call__(self, *args: Any) -> int:
-        """What the machine code does, as Python."""
+    def __call__(self, *args: Any) -> N:
+        """What the machine code does, as Python; records are given as their only element."""
         return self._function(*args)
 
     @functools.cached_property
-    def call(self) -> Callable[..., int]:
-        """The machine code as a function; compiled, or read from the cache, when first asked."""
-        *_, place = [entry._load() for entry in (*self._before, self)]  # it may call the others
-        kinds = (ctypes.c_int64 if p is int else ctypes.c_void_p for p in self._parameters)
-        prototype = ctypes.CFUNCTYPE(ctypes.c_int64, *kinds)
-        return cast(Callable[..., int], prototype(place))
+    def call(self) -> Callable[..., N]:
+        """The machine code: takes numbers, arrays, and records by `address`. It is loaded, or
+        compiled when there is none, when first asked for."""
+        place = self._load()
+        kinds = [kind for parameter in self._parameters for kind in _passed(parameter)]
+        function = ctypes.CFUNCTYPE(_C_TYPES[self._returns], *kinds)(place)
+        if not self._takes_arrays:
+            return cast(Callable[..., N], function)
+        flatteners = [_flattener(parameter) for parameter in self._parameters]
+
+        def call(*args: Any) -> N:
+            flat: list[Any] = []
+            for flatten, arg in zip(flatteners, args, strict=True):
+                flat += flatten(arg)
+            return cast(N, function(*flat))
+
+        return call
+
+    @property
+    def _takes_arrays(self) -> bool:
+        return any(isinstance(parameter, ArrayKind) for parameter in self._parameters)
 
     @classmethod
-    def all_kept(cls) -> bool:
-        """Whether nothing of the entries defined so far has to be compiled."""
-        return all(machine_code.kept(entry.symbol) is not None for entry in cls._defined)
+    def defined(cls) -> tuple[Entry[Any], ...]:
+        """All of them in the modules imported so far."""
+        return tuple(cls._defined)
+
+    @classmethod
+    def all_compiled(cls) -> bool:
+        """Whether none of the entries defined so far is left to numba."""
+        return not cls._to_compile()
+
+    @classmethod
+    def _to_compile(cls) -> list[Entry[Any]]:
+        there = (machine_code.kept, bitcode.shipped)
+        return [
+            entry
+            for entry in cls._defined
+            if entry._address is None and not any(look(entry.symbol) for look in there)
+        ]
 
     @classmethod
     def compile_all(cls) -> None:
-        """Compile what is not kept; the last entry in another process, which halves the time."""
-        if cls.all_kept():
+        """Compile what is left to numba; the last entry in another process, which halves the
+        time."""
+        missing = cls._to_compile()
+        if not missing:
             return
-        *others, last = cls._defined
-        command = (sys.executable, "-c", _COMPILE_ONE, last._function.__module__, last.symbol)
+        *others, last = missing
+        command = (sys.executable, "-c", _COMPILE_ONE, last.__module__, last.symbol)
         found = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
         silent = subprocess.DEVNULL
         with subprocess.Popen(command, env=found, stdin=silent, stdout=silent, stderr=silent):
@@ -124,60 +180,63 @@ class Entry:
     def compile_one(cls, symbol: str) -> None:
         """Compile this entry and keep it, in a process that does not call it."""
         (entry,) = (each for each in cls._defined if each.symbol == symbol)
-        for other in entry._before:
-            machine_code.pretend(other.symbol)
-        machine_code.keep(symbol, entry._compiled())
+        machine_code.keep(symbol, machine_code.emitted(entry.bitcode()))
 
     def _load(self) -> int:
         """The address of the machine code in this process."""
         if self._address is None:
             code = machine_code.kept(self.symbol)
             if code is None:
-                code = self._compiled()
+                shipped = bitcode.shipped(self.symbol)
+                code = machine_code.emitted(shipped or self.bitcode())
                 machine_code.keep(self.symbol, code)
+            for entry in self._defined:
+                if entry is not self and machine_code.names(code, entry.symbol):
+                    entry._load()  # before whoever calls it
             self._address = machine_code.load(self.symbol, code)
         return self._address
 
-    @property
+    def bitcode(self) -> bytes:
+        """Compiled by numba, for any processor of this one's kind."""
+        Entry.compilations += 1
+        for entry in self._defined:
+            if entry._address is None:
+                machine_code.pretend(entry.symbol)  # numba looks up what nobody calls
+        return bitcode.compiled(self._function, self._parameters, self._returns, self.symbol)
+
+    @functools.cached_property
     def _numba_type_(self) -> Any:
-        """As numba asks for it: to compiled code an entry is a function somewhere else."""
-        from numba import from_dtype, types
-
-        kinds = (types.int64 if p is int else from_dtype(p) for p in self._parameters)
-        return types.ExternalFunction(self.symbol, types.int64(*kinds))
-
-    @without_garbage_collection()
-    def _compiled(self) -> bytes:
-        from numba import cfunc, types
-
-        kinds = (types.int64 if p is int else types.voidptr for p in self._parameters)
-        compiled = cfunc(types.int64(*kinds), error_model="numpy")(self._taking_addresses())
-        assembly = compiled.inspect_llvm()
-        return machine_code.assemble(assembly, compiled.native_name, self.symbol)
-
-    def _taking_addresses(self) -> Callable[..., int]:
-        """The function with records by address, written out, as numba wants its arguments."""
-        import numba
-
-        names = [f"a{i}" for i in range(len(self._parameters))]
-        scope: dict[str, Any] = {
-            "function": kernel(self._function),
-            "carray": vars(numba)["carray"],
-        }
-        given = []
-        for name, parameter in zip(names, self._parameters, strict=True):
-            scope[f"{name}_record"] = parameter
-            given.append(name if parameter is int else f"carray({name}, 1, {name}_record)[0]")
-        listed = ", ".join(names)
-        exec(f"def entry({listed}):\n    return function({', '.join(given)})", scope)
-        return cast(Callable[..., int], scope["entry"])
+        """As numba asks for it."""
+        if self._takes_arrays:
+            return bitcode.callee_type(self._function)
+        return bitcode.external_type(self.symbol, self._parameters, self._returns)
 
 
-def entry(*parameters: Any) -> Callable[[Callable[..., int]], Entry]:
-    """Decorator: `parameters` are `int` or the dtype of a record, one per argument."""
-    return lambda function: Entry(function, parameters)
+def entry(*parameters: Parameter) -> Callable[[Callable[..., N]], Entry[N]]:
+    """Decorator: one parameter per argument, `int`, `float`, `array(...)` or the dtype of a
+    record. The function's annotation says whether it returns `int` or `float`."""
+
+    def decorate(function: Callable[..., N]) -> Entry[N]:
+        return Entry(function, parameters)
+
+    return decorate
 
 
 def address(record: np.ndarray[Any, Any]) -> ctypes.c_void_p:
     """Of a record, for calls of an `Entry`; the record must outlive it."""
     return ctypes.c_void_p(record.ctypes.data)
+
+
+_NUMBERS: dict[str, type[Any]] = {"int": int, "float": float}
+_C_TYPES: dict[Any, Any] = {int: ctypes.c_int64, float: ctypes.c_double}
+
+
+def _passed(parameter: Parameter) -> list[Any]:
+    """The C types that a parameter comes as."""
+    if isinstance(parameter, ArrayKind):
+        return [ctypes.c_void_p, *[ctypes.c_int64] * parameter.dimensions]
+    return [_C_TYPES.get(parameter, ctypes.c_void_p)]
+
+
+def _flattener(parameter: Parameter) -> Callable[[Any], tuple[Any, ...]]:
+    return parameter.flat if isinstance(parameter, ArrayKind) else lambda value: (value,)

@@ -1,7 +1,7 @@
-"""Machine code of compiled functions: made from LLVM's assembly, kept in files, loaded again.
+"""Machine code of compiled functions: made from LLVM's bitcode, kept in files, loaded again.
 
 An object file is only ever loaded if this program wrote it, for these sources, compilers and this
-processor, and if it is whole. Knows LLVM and files; nothing of numba but the names of its runtime.
+processor, and if it is whole. Knows LLVM and files, and nothing of numba.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
-import re
 import tempfile
 from importlib import metadata
 from pathlib import Path
@@ -17,41 +16,20 @@ from typing import Any, cast
 
 from offboard.model.compilation import prepare_cache, sources_digest
 
-# Numba's and Python's runtime: left over from errors that cannot happen here
-_RUNTIME = ("NRT_", "Py", "_Py", "numba_")
 _NOWHERE = 1  # an address
-_DECLARATION = re.compile(r"^declare (?P<head>[^@\n]*)@(?P<name>[\w.]+)\((?P<rest>.*)$", re.M)
 
 
-def assemble(assembly: str, name: str, symbol: str) -> bytes:
-    """An object file in which the function `name` of this assembly is `symbol`, and nothing else
-    is to be seen."""
+def emitted(bitcode: bytes) -> bytes:
+    """An object file of this bitcode, made for the processor that is there."""
     import llvmlite.binding as llvm
 
-    module = llvm.parse_assembly(_self_contained(assembly))
-    for function in module.functions:
-        if function.name == name:
-            function.name = symbol
-        elif not function.is_declaration:
-            function.linkage = "internal"
-    return cast(bytes, _machine().emit_object(module))
-
-
-def _self_contained(assembly: str) -> str:
-    """Without the parts of numba's runtime: what would raise or allocate stops the process."""
-
-    def definition(found: re.Match[str]) -> str:
-        name = found["name"]
-        if not name.startswith(_RUNTIME):
-            return found[0]
-        rest = re.sub(r"\s*#\d+|\s*local_unnamed_addr", "", found["rest"])
-        return (
-            f"define internal {found['head']}@{name}({rest} {{\n"
-            "  call void @llvm.trap()\n  unreachable\n}"
-        )
-
-    text = _DECLARATION.sub(definition, assembly)
-    return text if "declare void @llvm.trap" in text else text + "\ndeclare void @llvm.trap()\n"
+    module = llvm.parse_bitcode(bitcode)
+    options = llvm.create_pipeline_tuning_options(speed_level=3)
+    options.loop_vectorization = True
+    machine = _machine()
+    builder = llvm.create_pass_builder(machine, options)
+    builder.getModulePassManager().run(module, builder)
+    return cast(bytes, machine.emit_object(module))
 
 
 def _file(symbol: str) -> Path:
@@ -128,6 +106,11 @@ def load(symbol: str, code: bytes) -> int:
     place = int(engine.get_function_address(symbol))
     llvm.add_symbol(symbol, place)
     return place
+
+
+def names(code: bytes, symbol: str) -> bool:
+    """Whether this machine code calls `symbol`: an object file holds the names of what it wants."""
+    return f"{symbol}\0".encode() in code
 
 
 def pretend(symbol: str) -> None:

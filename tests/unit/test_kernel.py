@@ -44,9 +44,9 @@ import numpy as np
 from entries import RECORD, Entry, add, add_twice
 from offboard.model.kernel import address
 
-compile_here, compiled_here = Entry._compiled, []
-Entry._compiled = lambda entry: compiled_here.append(entry.symbol) or compile_here(entry)
-kept = Entry.all_kept()
+compile_here, compiled_here = Entry.bitcode, []
+Entry.bitcode = lambda entry: compiled_here.append(entry.symbol) or compile_here(entry)
+kept = Entry.all_compiled()
 Entry.compile_all()
 record = np.zeros(1, RECORD)
 record["values"] = (1.0, 2.0, 4.0)

@@ -1,0 +1,170 @@
+"""LLVM bitcode of compiled functions: made by numba, or come with the package.
+
+Bitcode is for any processor of a kind: `offboard.model.machine_code` makes the best of it on the
+one that is there. A wheel carries all of it (`hatch_build.py`); a source tree, a changed source, or
+another kind of processor has it made by numba, which is imported nowhere else.
+
+    python -m offboard.model.bitcode DIRECTORY     write what a wheel carries
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+import re
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any, cast
+
+from offboard.model.compilation import entry_modules, sources_digest, without_garbage_collection
+
+SHIPPED = Path(__file__).resolve().parents[1] / "_bitcode"
+# Numba's and Python's runtime: left over from errors that cannot happen here
+_RUNTIME = ("NRT_", "Py", "_Py", "numba_")
+_DECLARATION = re.compile(r"^declare (?P<head>[^@\n]*)@(?P<name>[\w.]+)\((?P<rest>.*)$", re.M)
+# Enough to link and to inline: the rest is done for the processor that flies
+_LEVEL = 1
+
+
+def shipped(symbol: str) -> bytes | None:
+    """What came with the package for these sources and this kind of processor, if anything."""
+    try:
+        return (SHIPPED / _kind() / f"{symbol}.bc").read_bytes()
+    except OSError:
+        return None
+
+
+def write_shipped(directory: Path) -> int:
+    """Compile every entry of the program into `directory`, where `shipped` looks for it; how
+    many there are."""
+    from offboard.model.kernel import Entry
+
+    for name in entry_modules():
+        importlib.import_module(name)
+    place = directory / _kind()
+    place.mkdir(parents=True)
+    for entry in Entry.defined():
+        (place / f"{entry.symbol}.bc").write_bytes(entry.bitcode())
+    return len(Entry.defined())
+
+
+@functools.cache
+def _kind() -> str:
+    """Of bitcode: for these sources, this kind of processor and system, and LLVM."""
+    import llvmlite.binding as llvm
+
+    return f"{sources_digest()}-{llvm.get_process_triple()}-llvm{llvm.llvm_version_info[0]}"
+
+
+def callee_type(function: Callable[..., Any]) -> Any:
+    """The type by which numba compiles a function into its callers."""
+    return _callee(function)._numba_type_
+
+
+@functools.cache  # a type does not keep its function alive, and it is to be compiled once
+def _callee(function: Callable[..., Any]) -> Any:
+    """Without the ways in from Python, which take a third of the time that it takes to compile."""
+    import numba
+
+    bare: dict[str, Any] = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    return numba.njit(error_model="numpy", **bare)(function)
+
+
+def external_type(symbol: str, parameters: tuple[Any, ...], returns: type) -> Any:
+    """The type by which numba takes a function as machine code found elsewhere."""
+    from numba import from_dtype, types
+
+    numbers = {int: types.int64, float: types.float64}
+    kinds = (numbers.get(each) or from_dtype(each) for each in parameters)
+    return types.ExternalFunction(symbol, numbers[returns](*kinds))
+
+
+@without_garbage_collection()
+def compiled(
+    function: Callable[..., Any], parameters: tuple[Any, ...], returns: type, symbol: str
+) -> bytes:
+    """The function as `symbol`, and nothing else to be seen, compiled by numba.
+
+    parameters: per argument `int`, `float`, the dtype of a record that comes by address, or what
+    has `dimensions` and a `dtype`, an array that comes as its address and its lengths.
+    """
+    import llvmlite.binding as llvm
+    from numba import cfunc, types
+
+    numbers = {int: types.int64, float: types.float64}
+    kinds = []
+    for each in parameters:
+        kinds.append(numbers.get(each, types.voidptr))
+        kinds += [types.int64] * getattr(each, "dimensions", 0)
+    with _hardly_optimised():
+        made = cfunc(numbers[returns](*kinds), error_model="numpy")(_flat(function, parameters))
+        assembly = made.inspect_llvm()
+    module = llvm.parse_assembly(_self_contained(assembly))
+    for each in module.functions:
+        if each.name == made.native_name:
+            each.name = symbol
+        elif not each.is_declaration:
+            each.linkage = "internal"
+    return cast(bytes, module.as_bitcode())
+
+
+@contextmanager
+def _hardly_optimised() -> Iterator[None]:
+    """Have numba leave out what is only worth doing for the processor that flies."""
+    from numba import config
+
+    options = vars(config)
+    kept = {name: options[name] for name in ("OPT", "LOOP_VECTORIZE")}
+    options.update(OPT=type(kept["OPT"])(_LEVEL), LOOP_VECTORIZE=0)
+    try:
+        yield
+    finally:
+        options.update(kept)
+
+
+def _flat(function: Callable[..., Any], parameters: tuple[Any, ...]) -> Callable[..., Any]:
+    """The function with addresses and lengths for records and arrays, written out, as numba wants
+    its arguments."""
+    import numba
+
+    names: list[str] = []
+    given: list[str] = []
+    scope: dict[str, Any] = {"function": _callee(function), "carray": vars(numba)["carray"]}
+    for i, parameter in enumerate(parameters):
+        names.append(name := f"a{i}")
+        if isinstance(parameter, type):
+            given.append(name)
+            continue
+        lengths = [f"{name}_{axis}" for axis in range(getattr(parameter, "dimensions", 0))]
+        names += lengths
+        scope[f"{name}_dtype"] = getattr(parameter, "dtype", parameter)
+        if lengths:
+            given.append(f"carray({name}, ({', '.join(lengths)},), {name}_dtype)")
+        else:
+            given.append(f"carray({name}, 1, {name}_dtype)[0]")
+    exec(f"def entry({', '.join(names)}):\n    return function({', '.join(given)})", scope)
+    return cast(Callable[..., Any], scope["entry"])
+
+
+def _self_contained(assembly: str) -> str:
+    """Without the parts of numba's runtime: what would raise or allocate stops the process."""
+
+    def definition(found: re.Match[str]) -> str:
+        name = found["name"]
+        if not name.startswith(_RUNTIME):
+            return found[0]
+        rest = re.sub(r"\s*#\d+|\s*local_unnamed_addr", "", found["rest"])
+        return (
+            f"define internal {found['head']}@{name}({rest} {{\n"
+            "  call void @llvm.trap()\n  unreachable\n}"
+        )
+
+    text = _DECLARATION.sub(definition, assembly)
+    return text if "declare void @llvm.trap" in text else text + "\ndeclare void @llvm.trap()\n"
+
+
+if __name__ == "__main__":
+    count = write_shipped(Path(sys.argv[1]))
+    print(f"{count} compiled functions in {sys.argv[1]}")
