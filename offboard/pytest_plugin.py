@@ -10,7 +10,7 @@ Installed with the package; imports the rest of it when the first test flies.
 from __future__ import annotations
 
 import gc
-from collections.abc import Callable, Generator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +19,7 @@ import pytest
 
 if TYPE_CHECKING:
     from offboard.analysis.score import Score
+    from offboard.flight.sitl import Hangar
 
 FLIGHTS = pytest.StashKey[list[Path]]()
 
@@ -37,8 +38,17 @@ class Flight:
         return self.directory / "flight.tlog"
 
 
+@pytest.fixture(scope="session")
+def _hangar() -> Iterator[Hangar]:
+    """What the flights of all tests start from."""
+    from offboard.flight.sitl import Hangar
+
+    with Hangar() as hangar:
+        yield hangar
+
+
 @pytest.fixture
-def fly(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[..., Flight]:
+def fly(request: pytest.FixtureRequest, tmp_path: Path, _hangar: Hangar) -> Callable[..., Flight]:
     """Fly on the bundled simulator, in lockstep: a flight is a function of its arguments.
 
     The function takes reference, controller and vehicle (a shipped name or a file), scenario,
@@ -79,7 +89,7 @@ def fly(request: pytest.FixtureRequest, tmp_path: Path) -> Callable[..., Flight]
         )
         problem, outcome = "", None
         try:
-            outcome = fly_order(order)
+            outcome = fly_order(order, hangar=_hangar)
         except (DocumentError, LinkError, LogError) as error:
             problem = str(error)
         finally:

@@ -1,61 +1,24 @@
-"""LLVM bitcode of compiled functions: made by numba, or come with the package.
+"""LLVM bitcode of compiled functions, made by numba, which is imported nowhere else.
 
 Bitcode is for any processor of a kind: `offboard.model.machine_code` makes the best of it on the
-one that is there. A wheel carries all of it (`hatch_build.py`); a source tree, a changed source, or
-another kind of processor has it made by numba, which is imported nowhere else.
-
-    python -m offboard.model.bitcode DIRECTORY     write what a wheel carries
+one that is there.
 """
 
 from __future__ import annotations
 
 import functools
-import importlib
 import re
-import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any, cast
 
-from offboard.model.compilation import entry_modules, sources_digest, without_garbage_collection
+from offboard.model.compilation import without_garbage_collection
 
-SHIPPED = Path(__file__).resolve().parents[1] / "_bitcode"
 # Numba's and Python's runtime: left over from errors that cannot happen here
 _RUNTIME = ("NRT_", "Py", "_Py", "numba_")
 _DECLARATION = re.compile(r"^declare (?P<head>[^@\n]*)@(?P<name>[\w.]+)\((?P<rest>.*)$", re.M)
 # Enough to link and to inline: the rest is done for the processor that flies
 _LEVEL = 1
-
-
-def shipped(symbol: str) -> bytes | None:
-    """What came with the package for these sources and this kind of processor, if anything."""
-    try:
-        return (SHIPPED / _kind() / f"{symbol}.bc").read_bytes()
-    except OSError:
-        return None
-
-
-def write_shipped(directory: Path) -> int:
-    """Compile every entry of the program into `directory`, where `shipped` looks for it; how
-    many there are."""
-    from offboard.model.kernel import Entry
-
-    for name in entry_modules():
-        importlib.import_module(name)
-    place = directory / _kind()
-    place.mkdir(parents=True)
-    for entry in Entry.defined():
-        (place / f"{entry.symbol}.bc").write_bytes(entry.bitcode())
-    return len(Entry.defined())
-
-
-@functools.cache
-def _kind() -> str:
-    """Of bitcode: for these sources, this kind of processor and system, and LLVM."""
-    import llvmlite.binding as llvm
-
-    return f"{sources_digest()}-{llvm.get_process_triple()}-llvm{llvm.llvm_version_info[0]}"
 
 
 def callee_type(function: Callable[..., Any]) -> Any:
@@ -163,8 +126,3 @@ def _self_contained(assembly: str) -> str:
 
     text = _DECLARATION.sub(definition, assembly)
     return text if "declare void @llvm.trap" in text else text + "\ndeclare void @llvm.trap()\n"
-
-
-if __name__ == "__main__":
-    count = write_shipped(Path(sys.argv[1]))
-    print(f"{count} compiled functions in {sys.argv[1]}")

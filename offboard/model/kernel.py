@@ -25,7 +25,7 @@ from typing import Any, ClassVar, Generic, ParamSpec, TypeVar, cast
 
 import numpy as np
 
-from offboard.model import bitcode, machine_code
+from offboard.model import bitcode, machine_code, shipped
 
 P = ParamSpec("P")
 R = TypeVar("R")
@@ -153,7 +153,7 @@ class Entry(Generic[N]):
 
     @classmethod
     def _to_compile(cls) -> list[Entry[Any]]:
-        there = (machine_code.kept, bitcode.shipped)
+        there = (machine_code.kept, shipped.read)
         return [
             entry
             for entry in cls._defined
@@ -187,8 +187,7 @@ class Entry(Generic[N]):
         if self._address is None:
             code = machine_code.kept(self.symbol)
             if code is None:
-                shipped = bitcode.shipped(self.symbol)
-                code = machine_code.emitted(shipped or self.bitcode())
+                code = machine_code.emitted(shipped.read(self.symbol) or self.bitcode())
                 machine_code.keep(self.symbol, code)
             for entry in self._defined:
                 if entry is not self and machine_code.names(code, entry.symbol):
