@@ -202,7 +202,8 @@ class Autopilot:
         if self._obeys_setpoints and (
             self.mode.needs_position or self.firmware.setpoints_outlive_modes
         ):
-            local = self.firmware.in_local_frame(values, self.look().attitude)
+            nav = self.look()
+            local = self.firmware.in_local_frame(values, nav.position_ned_m, nav.attitude)
             self._obey_motion("SET_POSITION_TARGET_LOCAL_NED", local)
 
     def set_home(self, place_ned_m: Triple) -> None:

@@ -29,7 +29,7 @@ class Command:
     params: tuple[float, ...]  # param1 .. param7, places in degrees
     system: int  # of the sender
     component: int
-    frame: int = 0  # MAV_FRAME of the place
+    frame: int | None = None  # MAV_FRAME of the place, if it tells
 
 
 class Link(Protocol):
@@ -136,10 +136,15 @@ class Commands:
         """Hold there from now on; what is not a number of the place stays as it is."""
         if command.params[1] != _CHANGE_MODE:
             return Result.UNSUPPORTED
+        autopilot = self.link.view.autopilot
         yaw_rad, latitude, longitude, height_m = command.params[3:7]
-        return self.link.view.autopilot.reposition(
-            latitude, longitude, height_m, command.frame, yaw_rad
-        )
+        if autopilot.firmware.repositions_strictly:
+            if command.frame is None:
+                return Result.UNSUPPORTED
+            if not (latitude or longitude):
+                return Result.DENIED
+            yaw_rad = math.nan
+        return autopilot.reposition(latitude, longitude, height_m, command.frame or 0, yaw_rad)
 
     def _change_speed(self, command: Command) -> Result:
         """Of automatic flight across the ground, until another mode; none is its own again."""
@@ -153,14 +158,16 @@ class Commands:
 
     def _turn(self, command: Command) -> Result:
         """To a course, or by so much: degrees."""
-        asked_deg, _, sense, relative = command.params[:4]
+        asked_deg, speed_dps, sense, relative = command.params[:4]
         autopilot = self.link.view.autopilot
         if not autopilot.knows("turn"):
             return Result.UNSUPPORTED
         if math.isfinite(asked_deg):
             from_rad = autopilot.look().yaw_rad if relative else 0.0
             turn_rad = math.radians(asked_deg) * (-1.0 if relative and sense < 0 else 1.0)
-            autopilot.pilot.turn_to(math.remainder(from_rad + turn_rad, 2.0 * math.pi))
+            turn_radps = math.radians(speed_dps) if speed_dps > 0.0 else math.inf
+            yaw_rad = math.remainder(from_rad + turn_rad, 2.0 * math.pi)
+            autopilot.pilot.turn_to(yaw_rad, turn_radps)
         return autopilot.happen("turn")
 
     def _reboot(self, command: Command) -> Result:

@@ -6,22 +6,20 @@ Knows position, height and parameters; knows no modes and no thrust.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from enum import Enum
 
-from simulator.firmware.base import MotionSetpoint, Triple
+from simulator.firmware.base import Firmware, Heads, MotionSetpoint, Triple
 from simulator.nav import Nav
 from simulator.parameters import ParameterTable
 
 _ARRIVED_M = 1.0
 
-ReturnHeight = Callable[[float, Callable[[str], float]], float]
 
-
-def sink(place: Triple, speed_mps: float) -> MotionSetpoint:
+def sink(place: Triple, speed_mps: float, yaw_rad: float = math.nan) -> MotionSetpoint:
     """Straight down at this speed."""
-    return MotionSetpoint((place[0], place[1], math.nan), (math.nan, math.nan, speed_mps))
+    down = (math.nan, math.nan, speed_mps)
+    return MotionSetpoint((place[0], place[1], math.nan), down, yaw_rad=yaw_rad)
 
 
 def land_speed_mps(nav: Nav, home_down_m: float, parameters: ParameterTable) -> float:
@@ -47,24 +45,29 @@ class Stage(Enum):
 class Return:
     """One return to `home_ned_m`; what it comes upon it says in `events`."""
 
+    firmware: Firmware
     parameters: ParameterTable
-    return_height: ReturnHeight
     events: list[str]
     stage: Stage = Stage.BEGIN
     place: Triple = field(default=(0.0, 0.0, 0.0))
     _until_s: float = math.inf
+    _heads: Heads | None = None
 
     @property
     def landing(self) -> bool:
         return self.stage is Stage.LAND
 
-    def fly(self, now_s: float, nav: Nav, home_ned_m: Triple) -> MotionSetpoint:
+    def fly(
+        self, now_s: float, nav: Nav, home_ned_m: Triple, home_yaw_rad: float
+    ) -> MotionSetpoint:
         """Where to be now."""
         x, y, z = nav.position_ned_m
         home_x, home_y, home_z = home_ned_m
         distance_m = math.hypot(x - home_x, y - home_y)
         if self.stage is Stage.BEGIN:
-            height_m = self.return_height(distance_m, self.parameters.__getitem__)
+            read = self.parameters.__getitem__
+            height_m = self.firmware.return_height_m(distance_m, read)
+            self._heads = self.firmware.return_heads(distance_m, read)
             self.place = (x, y, min(z, home_z - height_m))
             self._go(Stage.CLIMB, "return begun")
         if self.stage is Stage.CLIMB and z < self.place[2] + _ARRIVED_M:
@@ -82,9 +85,15 @@ class Return:
             self._go(Stage.WAIT)
         if self.stage is Stage.WAIT and now_s >= self._until_s:
             self._go(Stage.LAND, "return lands")
+        if self._heads is not None and self.stage.value > Stage.FLY.value:
+            self._heads = Heads.AS_HOME
+        yaw_rad = math.nan
+        if self._heads is Heads.AS_HOME and self.stage is not Stage.CLIMB:
+            yaw_rad = home_yaw_rad
         if self.stage is Stage.LAND:
-            return sink(self.place, land_speed_mps(nav, home_z, self.parameters))
-        return MotionSetpoint(self.place)
+            return sink(self.place, land_speed_mps(nav, home_z, self.parameters), yaw_rad)
+        along = self._heads is Heads.ALONG
+        return MotionSetpoint(self.place, yaw_rad=yaw_rad, faces_way=along)
 
     def _go(self, stage: Stage, event: str = "") -> None:
         self.stage = stage

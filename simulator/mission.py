@@ -150,7 +150,7 @@ class Mission:
             self._held = self._target(item, position_ned_m, home_ned_m)
         self._progress(item, now_s, position_ned_m, landed)
         self._pass_over()
-        return MotionSetpoint(self._held, yaw_rad=self._yaw(item))
+        return MotionSetpoint(self._held, yaw_rad=self._yaw(item), faces_way=True)
 
     # -- one item ----------------------------------------------------------------------------
 

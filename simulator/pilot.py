@@ -50,7 +50,7 @@ class Pilot:
         self.mission = mission or Mission(firmware.origin, firmware.mission_first)
         self.events = self.mission.events  # for the autopilot
         self.behaviour = Behaviour.HOLD
-        self._return = Return(parameters, firmware.return_height_m, self.events)
+        self._return = Return(firmware, parameters, self.events)
         self._hold: Triple = (0.0, 0.0, 0.0)
         self._held = MotionSetpoint(self._hold)
         self._takeoff_z_m = math.nan
@@ -63,6 +63,7 @@ class Pilot:
         self._levelling: AttitudeSetpoint | None = None  # the last one of our own
         self._wanted_z_mps = 0.0
         self.home_ned_m: Triple = (0.0, 0.0, 0.0)
+        self.home_yaw_rad = 0.0
         self.cruise_mps = math.inf  # asked for, in automatic flight
         self.climbed = False
         self.setpoint: AttitudeSetpoint | MotionSetpoint | None = None
@@ -115,7 +116,7 @@ class Pilot:
             self.cruise_mps = math.inf
         self.behaviour = behaviour
         self._takeoff_z_m = takeoff_z_m
-        self._return = Return(self._parameters, self._firmware.return_height_m, self.events)
+        self._return = Return(self._firmware, self._parameters, self.events)
         self.climbed = False
         self._next_loop_s = 0.0
         self._source = None
@@ -125,19 +126,19 @@ class Pilot:
     def go_to(self, place_ned_m: Triple, yaw_rad: float) -> None:
         """Hold there, in a mode that holds or obeys; no number keeps the course."""
         self._hold = place_ned_m
-        self._held = MotionSetpoint(place_ned_m, yaw_rad=yaw_rad)
+        self._held = MotionSetpoint(place_ned_m, yaw_rad=yaw_rad, faces_way=True)
         if self.behaviour is Behaviour.SETPOINT:
             self.setpoint = self._held
 
-    def turn_to(self, yaw_rad: float) -> None:
+    def turn_to(self, yaw_rad: float, turn_radps: float) -> None:
         """Keep this course while holding or obeying."""
-        self._held = MotionSetpoint(self._hold, yaw_rad=yaw_rad)
+        self._held = MotionSetpoint(self._hold, yaw_rad=yaw_rad, turn_radps=turn_radps)
         if isinstance(self.setpoint, MotionSetpoint):
-            self.setpoint = replace(self.setpoint, yaw_rad=yaw_rad)
+            self.setpoint = replace(self.setpoint, yaw_rad=yaw_rad, turn_radps=turn_radps)
 
     def arm(self, nav: Nav) -> None:
         """The motors begin to turn: home is here."""
-        self.home_ned_m = nav.position_ned_m
+        self.home_ned_m, self.home_yaw_rad = nav.position_ned_m, nav.yaw_rad
         self._takeoff.arm()
         self.mission.pause()
         if not self.landed:
@@ -316,7 +317,7 @@ class Pilot:
         wants_up = lifts and self._asks_up(nav)
         self._takeoff.step(LOOP_S, wants_up)
         rises = self._takeoff.lifting
-        hover, cruise_mps, climb_mps, least = self._limits
+        hover, cruise_mps, climb_mps, least, turn_radps = self._limits
         attitude, thrust, wanted = self.loop.step(
             LOOP_S,
             nav.position_ned_m,
@@ -326,6 +327,7 @@ class Pilot:
             speed_xy_mps=cruise_mps,
             speed_up_mps=climb_mps,
             thrust_least=least,
+            turn_radps=turn_radps,
             integrate=not (nav.on_ground and (rises or self.landed)),
         )
         self._wanted_z_mps = wanted[2]
@@ -341,21 +343,24 @@ class Pilot:
         self._set(attitude, None, thrust)
 
     @property
-    def _limits(self) -> tuple[float, float, float, float]:
-        """Hover thrust, the speeds that the behaviour allows, across and upwards, m/s, and the
-        least thrust."""
+    def _limits(self) -> tuple[float, float, float, float, float]:
+        """Hover thrust, the speeds that the behaviour allows, across and upwards, m/s, the least
+        thrust and the fastest turn, rad/s."""
         role = self._parameters.role
         across_mps, up_mps = math.inf, self._takeoff.speed_up_mps(self.loop.velocity_p_ps)
-        if self.behaviour is not Behaviour.SETPOINT:
+        turn_radps = self.motion.turn_radps
+        by_setpoint = self.behaviour is Behaviour.SETPOINT
+        if not by_setpoint or self._firmware.setpoints_as_automatic:
             across_mps = role("cruise_speed_mps")
-        if self.behaviour is not Behaviour.SETPOINT or self.setpoint is self._held:
+            turn_radps = min(turn_radps, self.loop.gains.turn_radps)
+        if not math.isinf(across_mps) or self.setpoint is self._held:
             across_mps = min(across_mps, self.cruise_mps)
         if self.behaviour is Behaviour.MISSION:
             across_mps = min(across_mps, self.mission.speed_mps)
         if self.climbing:
             up_mps = min(up_mps, role("takeoff_speed_mps"))
         least = 0.0 if self._takeoff.lifting else role("thrust_least")
-        return role("hover_thrust"), across_mps, up_mps, least
+        return role("hover_thrust"), across_mps, up_mps, least, turn_radps
 
     def _standing_motion(self) -> MotionSetpoint:
         """What is held or asked for, the same object as long as it is the same."""
@@ -378,7 +383,7 @@ class Pilot:
         if self.behaviour is Behaviour.TAKEOFF:
             return self._climb(nav)
         if self.behaviour is Behaviour.RETURN:
-            return self._return.fly(time_s, nav, self.home_ned_m)
+            return self._return.fly(time_s, nav, self.home_ned_m, self.home_yaw_rad)
         if self.behaviour is Behaviour.MISSION:
             return self._follow_mission(nav, time_s)
         if self.behaviour is Behaviour.LAND:

@@ -38,6 +38,7 @@ RECORD = np.dtype(
         ("acceleration", "f8", 3),
         ("yaw_rad", "f8"),
         ("yaw_rate_radps", "f8"),
+        ("faces_way", "i8"),
         # and how
         ("period_s", "f8"),
         ("speed_xy_mps", "f8"),
@@ -45,9 +46,12 @@ RECORD = np.dtype(
         ("hover_thrust", "f8"),
         ("thrust_least", "f8"),
         ("thrust_max", "f8"),
+        ("turn_radps", "f8"),
+        ("facing_mps", "f8"),
         ("integrates", "i8"),
         # the estimate: position and velocity NED
         ("estimate", "f8", 6),
+        ("way", "f8", 2),  # velocity wanted across the ground before it is limited
         # what comes out
         ("course_rad", "f8"),
         ("attitude", "f8", 4),
@@ -98,6 +102,7 @@ class PositionLoop:
         self.record["gains"] = (*across, *across, *up, *limits)
         self.record["tilt_max_rad"] = gains.tilt_max_rad
         self.record["thrust_max"] = gains.thrust_max
+        self.record["facing_mps"] = gains.facing_mps
 
     def reset(self, yaw_rad: float) -> None:
         """Forget integrators and derivative; hold the present course."""
@@ -115,6 +120,7 @@ class PositionLoop:
         speed_xy_mps: float = math.inf,
         speed_up_mps: float = math.inf,
         thrust_least: float = 0.0,
+        turn_radps: float = math.inf,
         integrate: bool = True,
     ) -> tuple[Quaternion, float, Triple]:
         """Attitude (wxyz), normalised thrust and the velocity (NED, m/s) that it tries to fly.
@@ -122,7 +128,8 @@ class PositionLoop:
         The speeds lower the limits of the gains; below 0, `speed_up_mps` is a descent.
         `integrate` False freezes the integrators.
         """
-        self.demand(duration_s, demand, hover_thrust, speed_xy_mps, speed_up_mps, thrust_least)
+        limits = (speed_xy_mps, speed_up_mps, thrust_least, turn_radps)
+        self.demand(duration_s, demand, hover_thrust, *limits)
         self.record["integrates"] = integrate
         self._estimate[:] = (*position_ned_m, *velocity_ned_mps)
         step_loop.call(self.address)
@@ -136,6 +143,7 @@ class PositionLoop:
         speed_xy_mps: float = math.inf,
         speed_up_mps: float = math.inf,
         thrust_least: float = 0.0,
+        turn_radps: float = math.inf,
     ) -> None:
         """What `step_loop` is to fly from now on, as `step` is told."""
         record, gains = self.record, self.gains
@@ -146,11 +154,13 @@ class PositionLoop:
             record["acceleration"] = demand.acceleration_ned_mps2
             record["yaw_rad"] = demand.yaw_rad
             record["yaw_rate_radps"] = demand.yaw_rate_radps
+            record["faces_way"] = demand.faces_way
         record["period_s"] = duration_s
         record["speed_xy_mps"] = min(speed_xy_mps, gains.speed_xy_mps)
         record["speed_up_mps"] = min(speed_up_mps, gains.speed_up_mps)
         record["hover_thrust"] = hover_thrust
         record["thrust_least"] = thrust_least
+        record["turn_radps"] = turn_radps
 
     @property
     def result(self) -> tuple[Quaternion, float, Triple]:
@@ -164,14 +174,36 @@ class PositionLoop:
 def step_loop(loop: Any) -> int:
     """One period on the estimate."""
     _accelerate(loop, loop.estimate)
-    if not math.isnan(loop.yaw_rad):
-        loop.course_rad = loop.yaw_rad
+    course_rad = _course_wanted(loop)
+    if not math.isnan(course_rad):
+        _turn(loop, course_rad)
     elif not math.isnan(loop.yaw_rate_radps):
         loop.course_rad = _wrapped(loop.course_rad + loop.yaw_rate_radps * loop.period_s)
     _compose(loop)
     if loop.integrates:
         _integrate(loop, loop.estimate)
     return 0
+
+
+@kernel
+def _course_wanted(loop: Any) -> float:
+    """The course demanded, or the way that it wants to fly; no number keeps the present one."""
+    if not math.isnan(loop.yaw_rad) or not loop.faces_way:
+        return float(loop.yaw_rad)
+    ahead, aside = loop.way
+    if not math.hypot(ahead, aside) > loop.facing_mps:
+        return math.nan
+    return math.atan2(aside, ahead)
+
+
+@kernel
+def _turn(loop: Any, course_rad: float) -> None:
+    """Towards this course, the shorter way round."""
+    most_rad = loop.turn_radps * loop.period_s
+    left_rad = _wrapped(course_rad - loop.course_rad)
+    if abs(left_rad) > most_rad:
+        course_rad = _wrapped(loop.course_rad + math.copysign(most_rad, left_rad))
+    loop.course_rad = course_rad
 
 
 @kernel
@@ -227,6 +259,7 @@ def _accelerate(loop: Any, estimate: Array) -> None:
         wanted[i] = loop.velocity[i]
         if not math.isnan(error):
             wanted[i] = gains[4 * i] * error + _or_zero(wanted[i])
+    loop.way[0], loop.way[1] = wanted[0], wanted[1]
     _limit_speed(loop)
     for i in range(3):
         out[i] = _or_zero(loop.acceleration[i])

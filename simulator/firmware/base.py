@@ -115,6 +115,13 @@ class ParameterSpec:
     meaning: str
 
 
+class Heads(Enum):
+    """Course of an automatic flight."""
+
+    ALONG = "the way that it flies"
+    AS_HOME = "the course at home"
+
+
 Role = str | float | tuple[str, float]
 """What fills a role: a parameter, a constant, or a parameter and the factor to SI."""
 
@@ -143,6 +150,8 @@ class MotionSetpoint:
     acceleration_ned_mps2: Triple = NAN3
     yaw_rad: float = math.nan
     yaw_rate_radps: float = math.nan
+    faces_way: bool = False  # with neither yaw nor its rate demanded, the course is the way wanted
+    turn_radps: float = math.inf  # no faster
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,6 +228,8 @@ class PositionGains:
     tilt_max_rad: float
     thrust_max: float
     derivative_cutoff_hz: float
+    turn_radps: float  # of automatic flight, no faster
+    facing_mps: float  # wanted across the ground, from which on it faces its way
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,7 +245,7 @@ class Landing:
     place_below_is_descent: bool
 
 
-def as_given(values: Mapping[str, Any], _: Quaternion) -> Mapping[str, Any]:
+def as_given(values: Mapping[str, Any], _: Triple, __: Quaternion) -> Mapping[str, Any]:
     """Setpoints in any frame are taken as they are."""
     return values
 
@@ -257,6 +268,7 @@ class Firmware:
     origin: tuple[float, float, float]  # of the local frame: latitude, longitude deg, AMSL m
     boot_mode: str
     reposition_mode: str  # in which it goes where MAV_CMD_DO_REPOSITION says
+    repositions_strictly: bool  # its frame must be told and its place be one; yaw is ignored
     modes: Mapping[str, Mode]
     rules: tuple[Rule, ...]
     parameters: tuple[ParameterSpec, ...]
@@ -288,6 +300,7 @@ class Firmware:
     healthy_without_position_after_s: float  # the same for modes that need none
     unhealthy_where_unarmable: bool  # the pre-arm checks fail in a mode that does not arm
     setpoint_mode_needs_stream: bool
+    setpoints_as_automatic: bool  # they are flown at the speeds and turns of automatic flight
     setpoints_outlive_modes: bool  # else obeyed only in their mode, forgotten on entering it
     setpoint_decides_flight: bool  # any thrust is flight; the land detector rests meanwhile
     setpoint_spool_s: float  # from arming until a setpoint's thrust acts
@@ -296,6 +309,8 @@ class Firmware:
     landing: Landing
     gains: Callable[[ReadParameter], PositionGains]
     return_height_m: Callable[[float, ReadParameter], float]  # above home, by the distance to it
+    # where a return heads at this distance: home, home's own course, or None: as it did
+    return_heads: Callable[[float, ReadParameter], Heads | None]
     # how bad the battery is, and the events of becoming so bad, from 1 on
     battery_level: Callable[[BatteryState, ReadParameter], int]
     battery_events: tuple[str, ...]
@@ -313,7 +328,7 @@ class Firmware:
     motion_setpoint: Callable[[Mapping[str, Any]], MotionSetpoint | None]
     global_frames: frozenset[int]  # MAV_FRAME that SET_POSITION_TARGET_GLOBAL_INT may come in
     position_without_fix_s: float = math.inf  # until the estimate of position is given up
-    # a SET_POSITION_TARGET in another local frame, by the vehicle's attitude, in MAV_FRAME 1
-    in_local_frame: Callable[[Mapping[str, Any], Quaternion], Mapping[str, Any]] = as_given
+    # a SET_POSITION_TARGET in another local frame, by position and attitude, in MAV_FRAME 1
+    in_local_frame: Callable[[Mapping[str, Any], Triple, Quaternion], Mapping[str, Any]] = as_given
     # what is said about the named setpoint message in an unknown MAV_FRAME, or demanding nothing
     motion_complaint: Callable[[str, int | None], Say | None] = no_complaint

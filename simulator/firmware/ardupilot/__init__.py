@@ -19,10 +19,15 @@ from simulator.firmware.ardupilot.modes import (
 )
 from simulator.firmware.ardupilot.parameters import PARAMETERS, ROLES
 from simulator.firmware.ardupilot.rules import BOOT, RULES
-from simulator.firmware.ardupilot.setpoints import attitude_setpoint, motion_setpoint
+from simulator.firmware.ardupilot.setpoints import (
+    attitude_setpoint,
+    in_local_frame,
+    motion_setpoint,
+)
 from simulator.firmware.ardupilot.streams import DEFAULT_RATES_HZ, STREAMS
 from simulator.firmware.base import (
     Firmware,
+    Heads,
     Landing,
     PositionGains,
     ReadParameter,
@@ -35,17 +40,20 @@ RETURN_LEAST_M = 2.0  # RTL_ALT_MIN
 
 def gains(parameter: ReadParameter) -> PositionGains:
     """The position loop as its parameters have it."""
+    speed_mps = parameter("WPNAV_SPEED") * 0.01
     return PositionGains(
         position_xy_ps=parameter("PSC_POSXY_P"),
         position_z_ps=parameter("PSC_POSZ_P"),
         velocity_xy=(parameter("PSC_VELXY_P"), 1.0, 0.25),
         velocity_z=(5.0, 10.0, 0.0),
-        speed_xy_mps=10.0,
+        speed_xy_mps=speed_mps,
         speed_up_mps=2.5,
         speed_down_mps=2.5,
         tilt_max_rad=math.radians(parameter("ANGLE_MAX") * 0.01),
         thrust_max=1.0,
         derivative_cutoff_hz=5.0,
+        turn_radps=math.radians(parameter("ATC_SLEW_YAW") * 0.01),
+        facing_mps=0.05 * speed_mps if parameter("WP_YAW_BEHAVIOR") else math.inf,
     )
 
 
@@ -53,6 +61,11 @@ def return_height_m(distance_m: float, parameter: ReadParameter) -> float:
     """Under a cone near home (RTL_CONE_SLOPE), so that a short way needs no high climb."""
     highest_m, slope = parameter("RTL_ALT") * 0.01, parameter("RTL_CONE_SLOPE")
     return min(highest_m, max(distance_m * slope, RETURN_LEAST_M)) if slope > 0 else highest_m
+
+
+def return_heads(_: float, parameter: ReadParameter) -> Heads | None:
+    """As it did, by default."""
+    return Heads.ALONG if parameter("WP_YAW_BEHAVIOR") in (1.0, 3.0) else None
 
 
 def battery_level(battery: BatteryState, parameter: ReadParameter) -> int:
@@ -86,6 +99,7 @@ ARDUPILOT = Firmware(
     origin=(-35.3632621, 149.1652374, 584.09),
     boot_mode="STABILIZE",
     reposition_mode="GUIDED",
+    repositions_strictly=True,
     modes=MODES,
     rules=RULES,
     parameters=PARAMETERS,
@@ -123,6 +137,7 @@ ARDUPILOT = Firmware(
     healthy_without_position_after_s=24.0,
     unhealthy_where_unarmable=False,
     setpoint_mode_needs_stream=False,
+    setpoints_as_automatic=True,
     setpoints_outlive_modes=False,
     setpoint_decides_flight=True,
     setpoint_spool_s=2.8,
@@ -139,6 +154,7 @@ ARDUPILOT = Firmware(
     ),
     gains=gains,
     return_height_m=return_height_m,
+    return_heads=return_heads,
     battery_level=battery_level,
     battery_events=("battery low", "battery critical"),
     heartbeat=heartbeat,
@@ -150,6 +166,7 @@ ARDUPILOT = Firmware(
     command_answers=COMMAND_ANSWERS,
     attitude_setpoint=attitude_setpoint,
     motion_setpoint=motion_setpoint,
+    in_local_frame=in_local_frame,
     position_without_fix_s=8.0,
     global_frames=frozenset({0, 3, 5, 6, 10, 11}),
 )

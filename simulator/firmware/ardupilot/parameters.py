@@ -33,6 +33,7 @@ PARAMETERS = (
     _real("ATC_ACCEL_R_MAX", 110000.0, "cdeg/s^2 of roll"),
     _int8("ATC_ANGLE_BOOST", 1, "divide thrust by the cosine of the tilt"),
     _real("ATC_INPUT_TC", 0.15, "s, shaping of demanded attitudes"),
+    _real("ATC_SLEW_YAW", 6000.0, "cdeg/s of turns"),
     _int32("AUTO_OPTIONS", 0, "bit 0 arms in AUTO"),
     _real("BATT_ARM_VOLT", 0.0, "V below which it does not arm, 0 none"),
     _int32("BATT_CAPACITY", 3300, "mAh"),
@@ -78,6 +79,7 @@ PARAMETERS = (
     _real("WPNAV_SPEED", 1000.0, "cm/s of automatic flight"),
     _real("WPNAV_SPEED_DN", 150.0, "cm/s of descent"),
     _real("WPNAV_SPEED_UP", 250.0, "cm/s of climb"),
+    _int8("WP_YAW_BEHAVIOR", 2, "where it faces: 0 as it did, 1 its way, 2 its way but home"),
 )
 
 _CENTI = 0.01

@@ -6,7 +6,13 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from simulator.firmware.base import AttitudeSetpoint, MotionSetpoint, ReadParameter, Triple
+from simulator.firmware.base import (
+    AttitudeSetpoint,
+    MotionSetpoint,
+    Quaternion,
+    ReadParameter,
+    Triple,
+)
 
 _CENTI = 0.01
 _RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b111, 64, 128
@@ -66,15 +72,40 @@ def _vertical(thrust: float, parameter: ReadParameter) -> tuple[float, float | N
     return 0.0, (max(0.0, thrust) - 0.5) / 0.5 * up * _CENTI, event
 
 
-_LOCAL_NED = 1  # MAV_FRAME
-_POSITION, _VELOCITY, _ACCELERATION, _YAW, _YAW_RATE = 0o007, 0o070, 0o700, 1024, 2048
+_LOCAL_NED, _LOCAL_OFFSET_NED, _BODY_NED, _BODY_OFFSET_NED = 1, 7, 8, 9  # MAV_FRAME
+_OFFSET = frozenset({_LOCAL_OFFSET_NED, _BODY_NED, _BODY_OFFSET_NED})
+_BODY = frozenset({_BODY_NED, _BODY_OFFSET_NED})
+_POSITION, _VELOCITY, _ACCELERATION, _FORCE, _YAW, _YAW_RATE = 0o007, 0o070, 0o700, 512, 1024, 2048
 _NOTHING: Triple = (math.nan, math.nan, math.nan)
 
 
+def in_local_frame(
+    values: Mapping[str, Any], position_ned_m: Triple, attitude: Quaternion
+) -> Mapping[str, Any]:
+    """Offsets from where it is; in body frames turned by its course, and the yaw by so much."""
+    frame = values["coordinate_frame"]
+    if frame not in _OFFSET:
+        return values
+    w, x, y, z = attitude
+    course_rad = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    turn_rad = course_rad if frame in _BODY else 0.0
+    ahead, aside = math.cos(turn_rad), math.sin(turn_rad)
+    local = {**values, "coordinate_frame": _LOCAL_NED, "yaw": turn_rad + values["yaw"]}
+    for north, east in (("x", "y"), ("vx", "vy"), ("afx", "afy")):
+        local[north] = ahead * values[north] - aside * values[east]
+        local[east] = aside * values[north] + ahead * values[east]
+    for name, here_m in zip("xyz", position_ned_m, strict=True):
+        local[name] += here_m
+    return local
+
+
 def motion_setpoint(values: Mapping[str, Any]) -> MotionSetpoint | None:
-    """SET_POSITION_TARGET_LOCAL_NED in frame 1: each vector wholly given or ignored."""
-    if values["coordinate_frame"] != _LOCAL_NED:
-        return None
+    """SET_POSITION_TARGET_LOCAL_NED in frame 1: each vector wholly given or ignored.
+
+    What it cannot fly stops it: an unknown frame, nothing demanded, a position with an
+    acceleration alone, a velocity without a number. A force is dropped in silence, as is what has
+    no number elsewhere.
+    """
     mask = values["type_mask"]
 
     def given(names: tuple[str, str, str], bits: int) -> Triple:
@@ -86,9 +117,18 @@ def motion_setpoint(values: Mapping[str, Any]) -> MotionSetpoint | None:
     position = given(("x", "y", "z"), _POSITION)
     velocity = given(("vx", "vy", "vz"), _VELOCITY)
     acceleration = given(("afx", "afy", "afz"), _ACCELERATION)
+    if mask & _FORCE and not mask & _ACCELERATION:
+        return None
+    by_velocity, by_acceleration = not mask & _VELOCITY, not mask & _ACCELERATION
+    unflyable = not by_velocity and bool(mask & _POSITION) is not by_acceleration
+    if values["coordinate_frame"] != _LOCAL_NED or unflyable:
+        return _STOP
+    if by_velocity and not all(map(math.isfinite, velocity)):
+        return _STOP
     yaw = math.nan if mask & _YAW else values["yaw"]
     yaw_rate = math.nan if mask & _YAW_RATE else values["yaw_rate"]
     numbers = (*position, *velocity, *acceleration)
     if any(map(math.isinf, (*numbers, yaw, yaw_rate))) or all(map(math.isnan, numbers)):
         return None
-    return MotionSetpoint(position, velocity, acceleration, yaw, yaw_rate)
+    along = bool(mask & _YAW and mask & _YAW_RATE)
+    return MotionSetpoint(position, velocity, acceleration, yaw, yaw_rate, along)

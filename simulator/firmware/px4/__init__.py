@@ -10,6 +10,7 @@ import math
 from simulator.airframe import BatteryState
 from simulator.firmware.base import (
     Firmware,
+    Heads,
     Landing,
     PositionGains,
     ReadParameter,
@@ -50,6 +51,8 @@ def gains(parameter: ReadParameter) -> PositionGains:
         tilt_max_rad=math.radians(parameter("MPC_TILTMAX_AIR")),
         thrust_max=parameter("MPC_THR_MAX"),
         derivative_cutoff_hz=5.0,
+        turn_radps=math.radians(parameter("MPC_YAWRAUTO_MAX")),
+        facing_mps=parameter("MPC_XY_P") * parameter("NAV_ACC_RAD"),  # further away than that
     )
 
 
@@ -63,6 +66,11 @@ def return_height_m(distance_m: float, parameter: ReadParameter) -> float:
         cone_rad = math.radians(min(89.0, max(1.0, parameter("RTL_CONE_ANG"))))
         height_m = min(distance_m / math.tan(cone_rad), highest_m)
     return min(max(height_m, 2.0 * accepted_m), highest_m)
+
+
+def return_heads(distance_m: float, parameter: ReadParameter) -> Heads:
+    """Far away the way home, near it as it stood there."""
+    return Heads.AS_HOME if distance_m < parameter("RTL_MIN_DIST") else Heads.ALONG
 
 
 _BATTERY_THRESHOLDS = ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")
@@ -96,6 +104,7 @@ PX4 = Firmware(
     origin=(47.397742, 8.545594, 489.4),
     boot_mode="AUTO.LOITER",
     reposition_mode="AUTO.LOITER",
+    repositions_strictly=False,
     modes=MODES,
     rules=RULES,
     parameters=PARAMETERS,
@@ -129,6 +138,7 @@ PX4 = Firmware(
     healthy_without_position_after_s=4.0,
     unhealthy_where_unarmable=True,
     setpoint_mode_needs_stream=True,
+    setpoints_as_automatic=False,
     setpoints_outlive_modes=True,
     setpoint_decides_flight=False,
     setpoint_spool_s=0.0,
@@ -145,6 +155,7 @@ PX4 = Firmware(
     ),
     gains=gains,
     return_height_m=return_height_m,
+    return_heads=return_heads,
     heartbeat=heartbeat,
     command_mode=command_mode,
     set_mode=set_mode,

@@ -59,6 +59,8 @@ PARAMETERS = (
     _real("MPC_XY_VEL_I_ACC", 0.4, 0, 60, "1/s^2"),
     _real("MPC_XY_VEL_MAX", 12.0, 0, 20, "m/s"),
     _real("MPC_XY_VEL_P_ACC", 1.8, 1.2, 5, "1/s"),
+    _real("MPC_YAWRAUTO_MAX", 45.0, 5, 360, "deg/s of turns in automatic flight"),
+    _int("MPC_YAW_MODE", 0, 0, 4, "automatic flight faces: 0 the waypoint"),
     _real("MPC_Z_P", 1.0, 0.1, 1.5, "1/s"),
     _real("MPC_Z_VEL_D_ACC", 0.0, 0, 2, "-"),
     _real("MPC_Z_VEL_I_ACC", 2.0, 0.2, 3, "1/s^2"),

@@ -54,7 +54,7 @@ _LOCAL_NED, _BODY_NED = 1, 8  # MAV_FRAME
 _YAW_IGNORED, _YAW_RATE_IGNORED = 1024, 2048
 
 
-def in_local_frame(values: Mapping[str, Any], attitude: Quaternion) -> Mapping[str, Any]:
+def in_local_frame(values: Mapping[str, Any], _: Triple, attitude: Quaternion) -> Mapping[str, Any]:
     """BODY_NED: velocity turned by the course, acceleration by the attitude, no position.
 
     A vector is whole or ignored there.

@@ -1,0 +1,234 @@
+"""Where the vehicle heads and how fast: body frames, its way, turns and speeds that were asked for.
+
+Expected values are those of ArduCopter 4.6.3 and PX4 1.16.1 SITL, asked the same.
+"""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from sim_bench import LOITER, NAN, RTL, Bench
+
+from simulator.firmware.ardupilot import ARDUPILOT
+from simulator.geodesy import EARTH_RADIUS_M
+from simulator.sensors import EstimatorName
+
+ACCEPTED, UNSUPPORTED = 0, 3
+POSITION_ALONE, VELOCITY_ALONE, YAW_TOO = 0xDF8, 0xDC7, 0x9F8
+LOCAL, LOCAL_OFFSET, BODY, BODY_OFFSET = 1, 7, 8, 9  # MAV_FRAME
+RELATIVE, ABSOLUTE = 6, 5
+
+
+def copter() -> Bench:
+    """An ArduCopter that holds 5 m in GUIDED."""
+    bench = Bench(EstimatorName.PERFECT, firmware=ARDUPILOT, boot_scale=0.1)
+    bench.run(4.5)
+    bench.command(176, 1, 4)
+    bench.command(400, 1)
+    bench.command(22, *(0.0,) * 6, 5.0)
+    bench.run(9.0)
+    return bench
+
+
+def px4() -> Bench:
+    """A PX4 that holds 3 m."""
+    bench = Bench()
+    bench.fly_offboard()
+    bench.ask_mode(LOITER)
+    return bench
+
+
+def ask(
+    bench: Bench,
+    frame: int,
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    velocity: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    *,
+    mask: int = POSITION_ALONE,
+    yaw: float = 0.0,
+) -> None:
+    bench.send(
+        mavlink.MAVLink_set_position_target_local_ned_message(
+            0, 1, 1, frame, mask, *place, *velocity, 0, 0, 0, yaw, 0
+        )
+    )
+
+
+def reposition(
+    bench: Bench, north: float, east: float, up: float, frame: int, yaw: float = NAN
+) -> int:
+    """So many metres from the origin of the local frame."""
+    latitude, longitude, _ = bench.instance.autopilot.firmware.origin
+    shrink = math.cos(math.radians(latitude))
+    x = round((latitude + math.degrees(north / EARTH_RADIUS_M)) * 1e7)
+    y = round((longitude + math.degrees(east / EARTH_RADIUS_M / shrink)) * 1e7)
+    bench.send(mavlink.MAVLink_command_int_message(1, 1, frame, 192, 0, 0, -1, 1, 0, yaw, x, y, up))
+    bench.run(0.02)
+    return int(bench.of("COMMAND_ACK")[-1][1].result)
+
+
+def course_deg(bench: Bench) -> float:
+    return math.degrees(bench.instance.autopilot.look().yaw_rad)
+
+
+def off_deg(bench: Bench, wanted_deg: float) -> float:
+    return abs(math.remainder(course_deg(bench) - wanted_deg, 360.0))
+
+
+def place(bench: Bench) -> tuple[float, ...]:
+    return tuple(bench.instance.autopilot.truth.position_ned_m.tolist())
+
+
+def velocity(bench: Bench) -> tuple[float, ...]:
+    return tuple(bench.instance.autopilot.truth.velocity_ned_mps.tolist())
+
+
+def fastest_mps(bench: Bench, duration_s: float) -> float:
+    speeds = []
+    bench.run(duration_s, lambda: speeds.append(math.hypot(*velocity(bench)[:2])))
+    return max(speeds)
+
+
+@pytest.mark.parametrize(
+    ("frame", "moved"),
+    [
+        (LOCAL_OFFSET, (4.0, 0.0, -1.0)),
+        (BODY, (4.0 * math.cos(2.0), 4.0 * math.sin(2.0), -1.0)),
+        (BODY_OFFSET, (4.0 * math.cos(2.0), 4.0 * math.sin(2.0), -1.0)),
+    ],
+)
+def test_an_offset_is_from_where_it_is_and_ahead_is_its_course(
+    frame: int, moved: tuple[float, float, float]
+) -> None:
+    bench = copter()
+    ask(bench, LOCAL, (1.0, 2.0, -5.0), mask=YAW_TOO, yaw=2.0)
+    bench.run(10.0)
+    ask(bench, frame, (4.0, 0.0, -1.0))
+    bench.run(10.0)
+    wanted = [here + by for here, by in zip((1.0, 2.0, -5.0), moved, strict=True)]
+    assert place(bench) == pytest.approx(wanted, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("frame", "flown"), [(BODY, (0.0, 1.0)), (BODY_OFFSET, (0.0, 1.0)), (LOCAL_OFFSET, (1.0, 0.0))]
+)
+def test_a_velocity_ahead_is_along_its_course(frame: int, flown: tuple[float, float]) -> None:
+    bench = copter()
+    ask(bench, LOCAL, (0.0, 0.0, -5.0), mask=YAW_TOO, yaw=math.pi / 2)
+    bench.run(5.0)
+    bench.run(4.0, lambda: ask(bench, frame, velocity=(1.0, 0.0, 0.0), mask=VELOCITY_ALONE), 0.25)
+    assert velocity(bench)[:2] == pytest.approx(flown, abs=0.12)
+
+
+def test_a_yaw_in_a_body_frame_is_from_its_course() -> None:
+    bench = copter()
+    ask(bench, LOCAL, (0.0, 0.0, -5.0), mask=YAW_TOO, yaw=1.0)
+    bench.run(5.0)
+    ask(bench, BODY_OFFSET, mask=YAW_TOO, yaw=0.5)
+    bench.run(5.0)
+    assert off_deg(bench, math.degrees(1.5)) < 2.0
+
+
+@pytest.mark.parametrize(
+    ("frame", "mask"),
+    [
+        (20, VELOCITY_ALONE),  # no such frame
+        (LOCAL, 0xDFF),  # nothing demanded
+        (LOCAL, 0xC38),  # a position with an acceleration alone
+    ],
+)
+def test_what_an_arducopter_cannot_fly_stops_it(frame: int, mask: int) -> None:
+    bench = copter()
+    bench.run(3.0, lambda: ask(bench, LOCAL, velocity=(3.0, 0, 0), mask=VELOCITY_ALONE), 0.25)
+    assert velocity(bench)[0] == pytest.approx(3.0, abs=0.3)
+    ask(bench, frame, (50.0, 0.0, -5.0), (5.0, 0.0, 0.0), mask=mask)
+    bench.run(2.5)
+    assert velocity(bench)[0] == pytest.approx(0.0, abs=0.3)
+
+
+def test_a_force_is_dropped() -> None:
+    bench = copter()
+    bench.run(3.0, lambda: ask(bench, LOCAL, velocity=(2.0, 0, 0), mask=VELOCITY_ALONE), 0.25)
+    ask(bench, LOCAL, mask=0xC3F | 512)
+    bench.run(0.5)
+    assert velocity(bench)[0] == pytest.approx(2.0, abs=0.2)
+
+
+def test_an_arducopter_faces_its_way_unless_told_otherwise() -> None:
+    """At 1 m/s it did; at 0.3 m/s, a twentieth of its speed being 0.5, it did not."""
+    bench = copter()
+    ask(bench, LOCAL, (0.0, 30.0, -5.0))
+    bench.run(3.5)
+    assert off_deg(bench, 90.0) < 3.0
+    bench.run(8.0)
+    slow = {"velocity": (0.3, 0.0, 0.0), "mask": VELOCITY_ALONE}
+    bench.run(4.0, lambda: ask(bench, LOCAL, **slow), 0.25)
+    assert off_deg(bench, 90.0) < 3.0
+    bench.send(mavlink.MAVLink_param_set_message(1, 1, b"WP_YAW_BEHAVIOR", 0, 9))
+    ask(bench, LOCAL, (0.0, 0.0, -5.0))
+    bench.run(4.0)
+    assert off_deg(bench, 90.0) < 3.0
+
+
+@pytest.mark.parametrize(
+    ("params", "wanted_deg", "took_s"), [((90, 25, 1), 90.0, 4.0), ((45, 10, -1, 1), -45.0, 4.5)]
+)
+def test_a_turn_is_as_fast_as_asked(
+    params: tuple[float, ...], wanted_deg: float, took_s: float
+) -> None:
+    bench = copter()
+    begun_s, begun_deg = bench.time_s, course_deg(bench)
+    assert bench.command(115, *params) == [ACCEPTED]
+    from_deg = begun_deg if len(params) == 4 else 0.0
+    done_s = bench.run_until(lambda: off_deg(bench, from_deg + wanted_deg) < 3.0, 12.0)
+    assert done_s - begun_s == pytest.approx(took_s, abs=0.6)
+
+
+def test_a_speed_asked_for_holds_for_positions() -> None:
+    """3 m/s asked, 3.7 m/s flown by the real one in the same 10 m."""
+    bench = copter()
+    assert bench.command(178, 1, 3.0, -1) == [ACCEPTED]
+    ask(bench, LOCAL, (10.0, 0.0, -5.0))
+    assert fastest_mps(bench, 8.0) == pytest.approx(3.4, abs=0.4)
+    assert place(bench)[0] == pytest.approx(10.0, abs=0.2)
+
+
+def test_a_place_to_go_to_needs_a_frame() -> None:
+    """ArduCopter takes it as COMMAND_INT alone."""
+    bench = copter()
+    assert bench.command(192, -1, 1, 0, NAN, 0, 0, 10) == [UNSUPPORTED]
+    assert reposition(bench, 0.0, 20.0, 8.0, RELATIVE) == ACCEPTED
+    bench.run(10.0)
+    assert place(bench) == pytest.approx((0.0, 20.0, -8.0), abs=0.3)
+
+
+def test_a_px4_faces_the_place_it_goes_to_and_turns_as_asked() -> None:
+    bench = px4()
+    amsl_m = bench.instance.autopilot.firmware.origin[2] + 3.0
+    assert reposition(bench, 0.0, 30.0, amsl_m, ABSOLUTE) == ACCEPTED
+    bench.run(4.0)
+    assert off_deg(bench, 90.0) < 6.0
+    bench.run(10.0)
+    assert reposition(bench, 0.0, 30.0, amsl_m, ABSOLUTE, math.radians(-45)) == ACCEPTED
+    bench.run(0.5)  # 135 degrees at 45 a second
+    assert off_deg(bench, 90.0) < 30.0
+    bench.run(4.5)
+    assert off_deg(bench, -45.0) < 3.0
+    assert reposition(bench, 1.0, 30.0, amsl_m, ABSOLUTE) == ACCEPTED  # nearer than NAV_ACC_RAD
+    bench.run(4.0)
+    assert off_deg(bench, -45.0) < 3.0
+
+
+def test_a_px4_returns_head_first_and_lands_as_it_stood() -> None:
+    bench = px4()
+    home_deg = course_deg(bench)
+    amsl_m = bench.instance.autopilot.firmware.origin[2] + 3.0
+    reposition(bench, 0.0, 30.0, amsl_m, ABSOLUTE)
+    bench.run(14.0)
+    bench.ask_mode(RTL)
+    bench.run_until(lambda: place(bench)[1] < 15.0, 40.0)
+    assert off_deg(bench, -90.0) < 5.0
+    bench.run_until(lambda: bench.height_m < 20.0, 30.0)
+    assert off_deg(bench, home_deg) < 5.0
