@@ -1,91 +1,120 @@
-"""The observer's small Kalman filters, compiled: covariances and what a measurement corrects.
+"""The small Kalman filters of observer and fusion, compiled: covariances, and what a measurement
+corrects.
 
 Covariances are propagated for the actual interval between messages, so no sampling rate is
-assumed. Axes with the same model share one covariance (both lateral axes do): `places` (m, n)
-tells for each of m axes where its n filter states stand in the observer's state vector. Their
-order is position, velocity, ..., bias of the reported velocity, or b and b', or psi and psi'.
-Arrays are changed in place. Nothing here knows messages, settings or the motion itself. Loops over
+assumed. Axes with the same model share one filter (both lateral axes do): `places` tells for each
+of its axes where the filter's states stand in the state vector that it corrects. Their order is
+position, velocity, ..., bias of the reported velocity, or b and b', or psi and psi'. Records and
+states are changed in place. Nothing here knows messages, settings or the motion itself. Loops over
 single numbers throughout: array expressions of so few compile for seconds.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
+
+from offboard.model.kernel import entry, kernel
 
 Array = NDArray[np.float64]
-Places = NDArray[np.int64]
 
 GATE_SDS = 3.0
+SIZE_MAX, AXES_MAX = 6, 2
+NOTHING = -1  # no second state is part of what is measured
+
+FILTER = np.dtype(
+    [
+        ("size", "i8"),  # n; what follows is used up to there
+        ("axes", "i8"),  # m
+        ("places", "i8", (AXES_MAX, SIZE_MAX)),
+        ("covariance", "f8", (SIZE_MAX, SIZE_MAX)),
+        ("dynamics", "f8", (SIZE_MAX, SIZE_MAX)),
+        ("densities", "f8", SIZE_MAX),  # per root second
+        ("longest_s", "f8"),  # of a step
+        # scratch; the gain is that of the last measurement
+        ("gain", "f8", SIZE_MAX),
+        ("projected", "f8", SIZE_MAX),
+        ("innovation", "f8", AXES_MAX),
+        ("work", "f8", (4, SIZE_MAX, SIZE_MAX)),
+    ],
+    align=True,
+)
+"""One filter of n states for m axes: x' = F x, P' = F P + P F' + diag(densities^2)."""
 
 
-@numba.njit(cache=True)
-def _product(left: Array, right: Array) -> Array:
-    """left @ right, both (n, n): small matrices, and a tenth of the time to compile."""
-    size = len(left)
-    out = np.empty((size, size))
+def set_up(one: Any, dynamics: Array, densities: Array) -> None:
+    """Give a FILTER its model, (n, n) and (n,)."""
+    size = len(densities)
+    one["size"] = size
+    one["dynamics"][:size, :size] = dynamics
+    one["densities"][:size] = densities
+
+
+def start(one: Any, variances: ArrayLike) -> None:
+    """Uncorrelated errors of these variances (n,)."""
+    covariance = np.diag(variances)
+    one["covariance"][: len(covariance), : len(covariance)] = covariance
+
+
+@kernel
+def _multiply(left: Array, right: Array, size: int, out: Array) -> None:
+    """left @ right, as far as `size`: small matrices, and a tenth of the time to compile."""
     for i in range(size):
         for j in range(size):
             total = 0.0
             for k in range(size):
                 total += left[i, k] * right[k, j]
             out[i, j] = total
-    return out
 
 
-@numba.njit(cache=True)
-def _transition(dynamics: Array, interval_s: float) -> Array:
-    """exp(dynamics interval_s), (n, n), to fourth order."""
-    size = len(dynamics)
-    scaled = np.empty((size, size))
+@kernel
+def _half_transition(one: Any, interval_s: float) -> None:
+    """exp(dynamics interval_s / 2) to fourth order, into the first work matrix."""
+    size, work, scaled = one.size, one.work, one.work[0]
+    half_s = 0.5 * interval_s
     for i in range(size):
         for j in range(size):
-            scaled[i, j] = interval_s * dynamics[i, j]
-    square = _product(scaled, scaled)
-    cube = _product(square, scaled)
-    fourth = _product(square, square)
+            scaled[i, j] = half_s * one.dynamics[i, j]
+    for k in range(3):  # square, cube, fourth power
+        _multiply(work[min(k, 1)], work[k // 2], size, work[k + 1])
     for i in range(size):
         for j in range(size):
-            scaled[i, j] += square[i, j] / 2.0 + cube[i, j] / 6.0 + fourth[i, j] / 24.0
+            scaled[i, j] += work[1, i, j] / 2.0 + work[2, i, j] / 6.0 + work[3, i, j] / 24.0
         scaled[i, i] += 1.0
-    return scaled
 
 
-@numba.njit(cache=True)
-def spread(
-    covariance: Array, dynamics: Array, densities: Array, interval_s: float, longest_s: float
-) -> None:
-    """Covariance (n, n) over `interval_s`: P' = F P + P F' + diag(densities^2).
-
-    dynamics F (n, n); densities (n,) per root second; steps of at most `longest_s`.
-    """
-    steps = math.ceil(interval_s / longest_s - 1e-6)
+@entry(FILTER, float)
+def spread(one: Any, interval_s: float) -> int:
+    """The covariance `interval_s` later, in steps of at most `longest_s`."""
+    steps = math.ceil(interval_s / one.longest_s - 1e-6)
     if steps <= 0:
-        return
+        return 0
     h = interval_s / steps
-    half = _transition(dynamics, 0.5 * h)
-    transition = _product(half, half)
-    noise = _noise(half, transition, densities, h)
-    size = len(covariance)
+    _half_transition(one, h)
+    size, covariance = one.size, one.covariance[:]
+    half, transition, noise, moved = one.work[0], one.work[1], one.work[2], one.work[3]
+    _multiply(half, half, size, transition)
+    _fill_noise(half, transition, one.densities, size, h, noise)
     for _ in range(steps):
-        moved = _product(transition, covariance)
+        _multiply(transition, covariance, size, moved)
         for i in range(size):
             for j in range(size):
                 total = noise[i, j]
                 for k in range(size):
                     total += moved[i, k] * transition[j, k]
                 covariance[i, j] = total
+    return 0
 
 
-@numba.njit(cache=True)
-def _noise(half: Array, transition: Array, densities: Array, interval_s: float) -> Array:
+@kernel
+def _fill_noise(
+    half: Array, transition: Array, densities: Array, size: int, interval_s: float, noise: Array
+) -> None:
     """What the densities add to a covariance, by Simpson's rule: exact for a chain of two
     integrators."""
-    size = len(half)
-    noise = np.empty((size, size))
     for i in range(size):
         for j in range(size):
             total = densities[i] ** 2 if i == j else 0.0
@@ -93,111 +122,90 @@ def _noise(half: Array, transition: Array, densities: Array, interval_s: float) 
                 middle, end = half[i, k] * half[j, k], transition[i, k] * transition[j, k]
                 total += densities[k] ** 2 * (4.0 * middle + end)
             noise[i, j] = total * interval_s / 6.0
-    return noise
 
 
-@numba.njit(cache=True)
-def _projected(covariance: Array, row: Array) -> Array:
-    """covariance (n, n) @ row (n,)."""
-    size = len(row)
-    out = np.empty(size)
-    for i in range(size):
-        total = 0.0
-        for k in range(size):
-            total += covariance[i, k] * row[k]
-        out[i] = total
-    return out
+@kernel
+def _projected(one: Any, i: int, place: int, other: int) -> float:
+    """Covariance of state i with what is measured: the states `place` and `other` together."""
+    total: float = one.covariance[i, place]
+    return total if other == NOTHING else total + one.covariance[i, other]
 
 
-@numba.njit(cache=True)
-def absorb(covariance: Array, row: Array, variance: float) -> Array:
-    """Scalar measurement row @ x with the given variance: updates the covariance (n, n) and
-    returns the gain (n,)."""
-    projected = _projected(covariance, row)
-    size = len(row)
-    total = variance
-    for i in range(size):
-        total += row[i] * projected[i]
-    gain = np.empty(size)
-    for i in range(size):
+@kernel
+def _variance(one: Any, place: int, other: int, variance: float) -> float:
+    """Of what is measured, with `variance` of the measurement's own."""
+    total = variance + _projected(one, place, place, other)
+    return total if other == NOTHING else total + _projected(one, other, place, other)
+
+
+@entry(FILTER, int, int, float)
+def absorb(one: Any, place: int, other: int, variance: float) -> int:
+    """A scalar measurement, of the given variance, of the states `place` and `other` (or NOTHING)
+    together: changes the covariance and leaves the gain."""
+    covariance, gain, projected = one.covariance, one.gain, one.projected
+    total = _variance(one, place, other, variance)
+    for i in range(one.size):
+        projected[i] = _projected(one, i, place, other)
         gain[i] = projected[i] / total
-    for i in range(size):
+    for i in range(one.size):
         for j in range(i + 1):
             value = covariance[i, j] - 0.5 * (gain[i] * projected[j] + gain[j] * projected[i])
             covariance[i, j] = value
             covariance[j, i] = value
-    return gain
+    return 0
 
 
-@numba.njit(cache=True)
-def correct(
-    state: Array, places: Places, covariance: Array, row: Array, innovation: Array, sd: float
-) -> None:
-    """One scalar measurement row @ x per axis, innovation (m,), standard deviation `sd`."""
-    gain = absorb(covariance, row, sd * sd)
-    for k in range(len(places)):
-        for i in range(len(row)):
-            state[places[k, i]] += gain[i] * innovation[k]
+@kernel
+def correct(state: Array, one: Any, place: int, other: int, sd: float) -> None:
+    """The measurement of `absorb` for each axis, its innovations in the record."""
+    absorb(one, place, other, sd * sd)
+    for k in range(one.axes):
+        for i in range(one.size):
+            state[one.places[k, i]] += one.gain[i] * one.innovation[k]
 
 
-@numba.njit(cache=True)
-def _jumped(covariance: Array, row: Array, innovation: Array, sd: float, gate: float) -> bool:
-    projected = _projected(covariance, row)
-    variance = sd * sd
-    for i in range(len(row)):
-        variance += row[i] * projected[i]
-    largest = 0.0
-    for value in innovation:
-        largest = max(largest, abs(value))
-    return largest > gate + GATE_SDS * math.sqrt(variance)
+@kernel
+def correct_within(
+    state: Array, one: Any, place: int, other: int, measured: Array, sd: float, gate: float
+) -> bool:
+    """The same with `measured`, which has it where `state` has the state `place`. Changes nothing
+    where that is further off than `gate` beyond the expected spread: it is a jump of the estimate.
 
-
-@numba.njit(cache=True)
-def correct_position(
-    state: Array, places: Places, covariance: Array, measured: Array, sd: float, gate: float
-) -> int:
-    """Position (m,) of a group of axes. Further off than `gate` beyond the expected spread it is
-    a jump of the estimate: the position is re-anchored and nothing else moves.
-
-    Returns the number of jumps, 0 or 1.
+    Returns whether it was within.
     """
-    row = np.zeros(len(covariance))
-    row[0] = 1.0
-    innovation = np.empty(len(places))
-    for k in range(len(places)):
-        innovation[k] = measured[k] - state[places[k, 0]]
-    if not _jumped(covariance, row, innovation, sd, gate):
-        correct(state, places, covariance, row, innovation, sd)
-        return 0
-    for k in range(len(places)):
-        state[places[k, 0]] = measured[k]
-    for i in range(len(covariance)):
-        covariance[0, i] = covariance[i, 0] = 0.0
-    covariance[0, 0] = sd * sd
-    return 1
+    largest = 0.0
+    for k in range(one.axes):
+        seen = one.places[k, place]
+        innovation = measured[seen] - state[seen]
+        if other != NOTHING:
+            innovation -= state[one.places[k, other]]
+        one.innovation[k] = innovation
+        largest = max(largest, abs(innovation))
+    if largest > gate + GATE_SDS * math.sqrt(_variance(one, place, other, sd * sd)):
+        return False
+    correct(state, one, place, other, sd)
+    return True
 
 
-@numba.njit(cache=True)
-def correct_velocity(
-    state: Array, places: Places, covariance: Array, measured: Array, sd: float, gate: float
-) -> int:
-    """Reported velocity (m,) = velocity + bias. A jump (as in `correct_position`) goes into the
-    bias. Returns the number of jumps, 0 or 1."""
-    bias = len(covariance) - 1
-    row = np.zeros(len(covariance))
-    row[1] = 1.0
-    row[bias] = 1.0
-    innovation = np.empty(len(places))
-    for k in range(len(places)):
-        innovation[k] = measured[k] - state[places[k, 1]] - state[places[k, bias]]
-    if not _jumped(covariance, row, innovation, sd, gate):
-        correct(state, places, covariance, row, innovation, sd)
-        return 0
-    for k in range(len(places)):
-        state[places[k, bias]] += innovation[k]
-    for i in range(len(covariance)):
+@kernel
+def anchor_position(state: Array, one: Any, measured: Array, sd: float) -> None:
+    """The position jumped: it is taken as measured, and nothing else moves."""
+    for k in range(one.axes):
+        state[one.places[k, 0]] = measured[one.places[k, 0]]
+    for i in range(one.size):
+        one.covariance[0, i] = one.covariance[i, 0] = 0.0
+    one.covariance[0, 0] = sd * sd
+
+
+@kernel
+def anchor_bias(state: Array, one: Any, sd: float) -> None:
+    """The reported velocity jumped, by its innovations in the record: that goes into the bias."""
+    bias = one.size - 1
+    covariance = one.covariance
+    for k in range(one.axes):
+        state[one.places[k, bias]] += one.innovation[k]
+    for i in range(one.size):
         covariance[bias, i] = -covariance[1, i]
-    for i in range(len(covariance)):
+    for i in range(one.size):
         covariance[i, bias] = covariance[bias, i]
     covariance[bias, bias] = covariance[1, 1] + sd * sd
-    return 1

@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from offboard.control.filtering import absorb, spread
+from offboard.control.filtering import FILTER, NOTHING, absorb, set_up, spread, start
+from offboard.model.kernel import address
 from offboard.model.vehicle import Parameters, Vehicle
 
 Array = NDArray[np.float64]
@@ -22,8 +23,6 @@ Triple = tuple[float, float, float]
 
 P, V, D = 0, 1, 2
 LATERAL, VERTICAL = slice(0, 2), slice(2, 3)
-MEASURES_POSITION = np.array([1.0, 0.0, 0.0])
-MEASURES_VELOCITY = np.array([0.0, 1.0, 0.0])
 START_VELOCITY_SD_MPS, START_DISTURBANCE_SD_MPS2 = 0.3, 0.5
 GATE_SDS = 5.0
 LONGEST_SPREAD_S = 0.05
@@ -124,11 +123,57 @@ class Thrust:
         return self._commanded * step_s + lag_s * (missing - left)
 
 
+class Group:
+    """Axes that share a model: their covariance [p v d]. `sd_m` of a fix, `drift_mps2` of d."""
+
+    def __init__(self, axes: slice, sd_m: float, drift_mps2: float) -> None:
+        self.axes = axes
+        self._sd_m = sd_m
+        self._densities = np.array([0.0, 0.2 * drift_mps2, drift_mps2])
+        self._record = np.zeros(1, FILTER)
+        self._record["longest_s"] = LONGEST_SPREAD_S
+        self._address = address(self._record)
+        self._covariance, self._gain = self._record["covariance"][0], self._record["gain"][0]
+
+    def adopt(self, drag_per_mass_ps: float) -> None:
+        dynamics = np.zeros((3, 3))
+        dynamics[P, V] = dynamics[V, D] = 1.0
+        dynamics[V, V] = -drag_per_mass_ps
+        set_up(self._record[0], dynamics, self._densities)
+
+    def start(self, position_m2: float) -> None:
+        """From a position of this variance."""
+        start(
+            self._record[0], (position_m2, START_VELOCITY_SD_MPS**2, START_DISTURBANCE_SD_MPS2**2)
+        )
+
+    def spread(self, step_s: float) -> None:
+        spread.call(self._address, step_s)
+
+    def explains(self, off_m: Array) -> bool:
+        """Whether a fix may be off by so much by chance."""
+        sd_m = math.sqrt(self._covariance[P, P] + self._sd_m * self._sd_m)
+        return bool(np.abs(off_m[self.axes]).max() <= GATE_SDS * sd_m)
+
+    def absorb_position(self) -> Array:
+        """Take in a fix: its gain (3,)."""
+        return self.absorb(P, self._sd_m * self._sd_m)
+
+    def absorb(self, place: int, variance: float) -> Array:
+        """Take in a measurement of p, v or d: its gain (3,)."""
+        absorb.call(self._address, place, NOTHING, variance)
+        gain: Array = self._gain[: D + 1]
+        return gain
+
+
 class FusionFilter:
     """`start` it, then feed it every attitude, command and fix. state (3, 3): axes NED, [p v d]."""
 
     def __init__(self, vehicle: Vehicle, settings: FusionSettings) -> None:
         self._settings = settings
+        self._lateral = Group(LATERAL, settings.position_sd_m, settings.lateral_drift_mps2)
+        vertical = Group(VERTICAL, settings.height_sd_m, settings.vertical_drift_mps2)
+        self._groups = self._lateral, vertical
         self._thrust = Thrust()
         self.state = np.zeros((3, 3))
         self.time_s = -math.inf
@@ -152,8 +197,8 @@ class FusionFilter:
         """From here, NED; `variances_m2` of the position, lateral and vertical."""
         self.time_s = time_s
         self.state[:, P], self.state[:, V], self.state[:, D] = position, velocity, 0.0
-        rest = START_VELOCITY_SD_MPS**2, START_DISTURBANCE_SD_MPS2**2
-        self._lateral, self._vertical = (np.diag([each, *rest]) for each in variances_m2)
+        for group, variance_m2 in zip(self._groups, variances_m2, strict=True):
+            group.start(variance_m2)
         self._direction: Array | None = None
         self._past = Past()
         self._past.note(time_s, self.state[:, :D])
@@ -175,10 +220,8 @@ class FusionFilter:
         acceleration = pull + self.state[:, D] - self._vehicle.drag_per_mass_ps * self.state[:, V]
         self.state[:, P] += step_s * (self.state[:, V] + 0.5 * step_s * acceleration)
         self.state[:, V] += step_s * acceleration
-        for covariance, densities in zip(
-            (self._lateral, self._vertical), self._densities, strict=True
-        ):
-            spread(covariance, self._dynamics, densities, step_s, LONGEST_SPREAD_S)
+        for group in self._groups:
+            group.spread(step_s)
         self.time_s = time_s
         self._past.note(time_s, self.state[:, :D])
 
@@ -196,19 +239,15 @@ class FusionFilter:
         if then is None:
             return None
         off = position - then[:, P]
-        sds = self._settings.position_sd_m, self._settings.height_sd_m
-        groups = (LATERAL, self._lateral, sds[0]), (VERTICAL, self._vertical, sds[1])
-        for axes, covariance, sd in groups:
-            if np.abs(off[axes]).max() > GATE_SDS * math.sqrt(covariance[P, P] + sd * sd):
-                return None
+        if not all(group.explains(off) for group in self._groups):
+            return None
         before = self.state[:, :D].copy()
-        for axes, covariance, sd in groups:
-            gain = absorb(covariance, MEASURES_POSITION, sd * sd)
-            self.state[axes] += np.outer(off[axes], gain)
+        for group in self._groups:
+            self.state[group.axes] += np.outer(off[group.axes], group.absorb_position())
         if velocity_ne is not None:
             moved = self.state[LATERAL, V] - before[LATERAL, V]
             slower = np.array(velocity_ne) - then[LATERAL, V] - moved
-            gain = absorb(self._lateral, MEASURES_VELOCITY, self._settings.velocity_sd_mps**2)
+            gain = self._lateral.absorb(V, self._settings.velocity_sd_mps**2)
             self.state[LATERAL] += np.outer(slower, gain)
         change: Array = self.state[:, :D] - before
         self._past.shift(change)
@@ -216,9 +255,5 @@ class FusionFilter:
 
     def _adopt(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
-        self._dynamics = np.zeros((3, 3))
-        self._dynamics[P, V] = self._dynamics[V, D] = 1.0
-        self._dynamics[V, V] = -vehicle.drag_per_mass_ps
-        settings = self._settings
-        drifts = settings.lateral_drift_mps2, settings.vertical_drift_mps2
-        self._densities = [np.array([0.0, 0.2 * drift, drift]) for drift in drifts]
+        for group in self._groups:
+            group.adopt(vehicle.drag_per_mass_ps)

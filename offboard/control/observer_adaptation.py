@@ -10,10 +10,12 @@ bounded, and never below what is configured. Knows no message, no plant and no c
 from __future__ import annotations
 
 import math
+from typing import Any
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from offboard.model.kernel import entry, kernel
 
 Array = NDArray[np.float64]
 
@@ -27,7 +29,7 @@ LONGEST_SPAN_S = 0.3
 NORTH_EAST, DOWN = 0, 1
 
 # Rows of the memory, six numbers each: position and velocity, NED.
-RESIDUAL, CHANGE = 0, 1  # of the last message, see `weigh`
+RESIDUAL, CHANGE = 0, 1  # of the last message, see `_weigh`
 MEANS = 2  # of the innovations over the newest three spans, newest first; position only
 RELATION = 5  # mean product (lateral, vertical) and mean square (the same) of the means
 SUM = 6  # of the innovations in this span
@@ -35,33 +37,45 @@ COUNTS = 7  # messages in this span, neighbours heard, spans ended, begin of the
 MEMORY_SHAPE = (8, 6)
 IN_SPAN, NEIGHBOURS, SPANS, BEGAN_S, LAST_S = 0, 1, 2, 3, 4
 
+ADAPTATION = np.dtype(
+    [
+        ("memory", "f8", MEMORY_SHAPE),
+        ("least", "f8", 2),  # white variances of position and velocity: configured,
+        ("variance", "f8", 2),  # and measured
+        ("bounds", "f8", (2, 2)),  # least and greatest density, lateral and vertical
+        ("density", "f8", 2),
+        # of one message, before and after its correction: position (m) and velocity (m/s), NED
+        ("innovation", "f8", 6),
+        ("residual", "f8", 6),
+    ],
+    align=True,
+)
+"""What is learnt, and what it is learnt from."""
 
-@numba.njit(cache=True)
-def weigh(
-    innovation: Array, memory: Array, interval_s: float, least: Array, variance: Array
-) -> None:
-    """White variance (2,) of position and velocity from their innovations (6,).
+
+@kernel
+def _weigh(noted: Any, interval_s: float) -> None:
+    """White variances of position and velocity from their innovations.
 
     The measured change since the last message less the predicted one is innovation - residual;
     for white noise of variance s^2 neighbouring changes have the covariance -s^2, for a measured
     value that wanders none.
     """
+    memory, variance, innovation = noted.memory, noted.variance, noted.innovation
     share = min(interval_s / NOISE_TIME_S, 0.1)
     for kind in range(2):
         product = 0.0
         for i in range(3 * kind, 3 * kind + 3):
             product -= (innovation[i] - memory[RESIDUAL, i]) * memory[CHANGE, i] / 3.0
-        limit = NOISE_OUTLIER * max(variance[kind], least[kind])
+        limit = NOISE_OUTLIER * max(variance[kind], noted.least[kind])
         product = min(max(product, -limit), limit)
         variance[kind] += share * (product - variance[kind])
 
 
-@numba.njit(cache=True)
-def relate(memory: Array, span_s: float, bounds: Array, density: Array) -> None:
-    """Densities (2,) of the disturbance, lateral and vertical, from the means of three spans.
-
-    bounds (2, 2): least and greatest of each.
-    """
+@kernel
+def _relate(noted: Any, span_s: float) -> None:
+    """Densities of the disturbance, lateral and vertical, from the means of three spans."""
+    memory, bounds, density = noted.memory, noted.bounds, noted.density
     share = span_s / DRIFT_TIME_S
     relation = memory[RELATION]
     for group in range(2):
@@ -78,7 +92,7 @@ def relate(memory: Array, span_s: float, bounds: Array, density: Array) -> None:
         density[group] = min(max(grown, bounds[group, 0]), bounds[group, 1])
 
 
-@numba.njit(cache=True)
+@kernel
 def _end_span(memory: Array, time_s: float) -> None:
     counts = memory[COUNTS]
     for i in range(6):
@@ -91,39 +105,45 @@ def _end_span(memory: Array, time_s: float) -> None:
     counts[SPANS] += 1.0
 
 
-@numba.njit(cache=True)
-def note(
-    memory: Array,
-    time_s: float,
-    innovation: Array,
-    residual: Array,
-    least: Array,
-    variance: Array,
-    bounds: Array,
-    density: Array,
-) -> None:
-    """One message: innovation (6,) before and residual (6,) after its correction."""
+@entry(ADAPTATION, float)
+def note(noted: Any, time_s: float) -> int:
+    """Learn from one message."""
+    memory, innovation = noted.memory, noted.innovation
     counts = memory[COUNTS]
     if counts[NEIGHBOURS] == 0.0:
         counts[BEGAN_S] = time_s
     elif counts[NEIGHBOURS] > 1.0:
-        weigh(innovation, memory, time_s - counts[LAST_S], least, variance)
+        _weigh(noted, time_s - counts[LAST_S])
     for i in range(6):
         memory[CHANGE, i] = innovation[i] - memory[RESIDUAL, i]
-        memory[RESIDUAL, i] = residual[i]
+        memory[RESIDUAL, i] = noted.residual[i]
         memory[SUM, i] += innovation[i]
     counts[IN_SPAN] += 1.0
     counts[NEIGHBOURS] += 1.0
     counts[LAST_S] = time_s
     span_s = time_s - counts[BEGAN_S]
     if span_s >= SPAN_S - 1e-6:
-        _end_span(memory, time_s)
+        _end_span(memory[:], time_s)
         if counts[SPANS] > 2.0:
-            relate(memory, min(span_s, LONGEST_SPAN_S), bounds, density)
+            _relate(noted, min(span_s, LONGEST_SPAN_S))
+    return 0
+
+
+@kernel
+def interrupt(noted: Any) -> None:
+    """The next innovation is no neighbour of the last one: a jump, a gap, a new start."""
+    for i in range(MEMORY_SHAPE[1]):
+        noted.memory[SUM, i] = noted.memory[COUNTS, i] = 0.0
+
+
+@kernel
+def white_sd(noted: Any, kind: int) -> float:
+    """Standard deviation of the noise of position (0) or velocity (1)."""
+    return math.sqrt(max(noted.variance[kind], noted.least[kind]))
 
 
 class Adaptation:
-    """White standard deviations of position and velocity, densities of the disturbance.
+    """An ADAPTATION record as whoever configures it sees it.
 
     `position_sd_m`, `velocity_sd_mps` and `density_mps2`, `density_limit_mps2` are the least and
     (of the density) greatest values.
@@ -131,23 +151,27 @@ class Adaptation:
 
     def __init__(
         self,
+        record: np.ndarray[Any, Any],
         position_sd_m: float,
         velocity_sd_mps: float,
         density_mps2: float,
         density_limit_mps2: float,
     ) -> None:
-        self._least = np.array([position_sd_m, velocity_sd_mps]) ** 2
+        self._record = record
+        self._noted = record.view(np.recarray)[0]
+        record["least"] = np.square((position_sd_m, velocity_sd_mps))
         self._limit_mps2 = max(density_mps2, density_limit_mps2)
-        self._bounds = np.full((2, 2), density_mps2)
+        self._bounds = record["bounds"][0]
+        self._bounds[:] = density_mps2
         self.reset()
 
     def reset(self) -> None:
         """Believe what is configured."""
-        self._variance = np.zeros(2)
-        self._memory = np.zeros(MEMORY_SHAPE)
+        self._record["variance"] = 0.0
+        self._record["memory"] = 0.0
         self._bounds[NORTH_EAST, 1] = self._limit_mps2
         self._bounds[DOWN, 1] = self._bounds[DOWN, 0]
-        self.densities_mps2: Array = self._bounds[:, 0].copy()  # lateral, vertical
+        self._record["density"] = self._bounds[:, 0]
 
     def trust_thrust(self) -> None:
         """From now on the vertical density may grow too. A thrust that acts later than believed
@@ -155,27 +179,19 @@ class Adaptation:
         self._bounds[DOWN, 1] = self._limit_mps2
 
     def interrupt(self) -> None:
-        """The next innovation is no neighbour of the last one: a jump, a gap, a new start."""
-        self._memory[SUM:] = 0.0
+        """The next innovation is no neighbour of the last one: a gap, a new start."""
+        interrupt(self._noted)
 
     @property
     def position_sd_m(self) -> float:
-        return math.sqrt(max(self._variance[0], self._least[0]))
+        return white_sd(self._noted, 0)
 
     @property
     def velocity_sd_mps(self) -> float:
-        return math.sqrt(max(self._variance[1], self._least[1]))
+        return white_sd(self._noted, 1)
 
-    def note(self, time_s: float, innovation: Array, residual: Array) -> None:
-        """Innovation before and residual after the correction by one message, (6,) each: position
-        (m) and velocity (m/s), NED."""
-        note(
-            self._memory,
-            time_s,
-            innovation,
-            residual,
-            self._least,
-            self._variance,
-            self._bounds,
-            self.densities_mps2,
-        )
+    @property
+    def densities_mps2(self) -> Array:
+        """Of the disturbance, lateral and vertical."""
+        densities: Array = self._record["density"][0]
+        return densities

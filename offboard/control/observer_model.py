@@ -1,16 +1,27 @@
 """What the observer believes: its settings, the plant it replays and the filters it corrects with.
 
-Pure values made from a `Vehicle` and `ObserverSettings`; no state and no message passes here.
+Made from a `Vehicle` and `ObserverSettings` and written into the observer's record; no message
+passes here.
 """
 
 from __future__ import annotations
 
 from enum import StrEnum
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from offboard.control.filtering import set_up, start
+from offboard.control.observer_filter import (
+    BIASED,
+    IGNORED,
+    LATERAL,
+    LATERAL_DRIFT,
+    OBSERVER,
+    TRUSTED,
+)
 from offboard.control.propagation import (
     BIAS,
     BIAS_TIME_CONSTANT,
@@ -19,6 +30,7 @@ from offboard.control.propagation import (
     DISTURBANCE,
     DRAG,
     GRAVITY,
+    NOW,
     PLANT_SIZE,
     POSITION,
     THRUST_DELAY,
@@ -37,23 +49,23 @@ from offboard.control.response import lateral_model
 from offboard.model.vehicle import Parameters, Vehicle
 
 Array = NDArray[np.float64]
+Record = np.ndarray[Any, Any]
 
-# Places in the state vector: per lateral axis [p v b b' d beta], vertical [p v d beta].
-LATERAL = np.array(
+# Per filter the places of its states in the observer's, axis by axis, and what is believed of them
+# at the first message: the reported velocity, no disturbance, no bias.
+PLACES: tuple[list[tuple[int, ...]], ...] = (
     [
-        [POSITION + i, VELOCITY + i, TILT + i, TILT_RATE + i, DISTURBANCE + i, BIAS + i]
+        (POSITION + i, VELOCITY + i, TILT + i, TILT_RATE + i, DISTURBANCE + i, BIAS + i)
         for i in (0, 1)
-    ]
+    ],
+    [(POSITION + 2, VELOCITY + 2, DISTURBANCE + 2, BIAS + 2)],
+    [(COURSE, COURSE_RATE)],
 )
-VERTICAL = np.array([[POSITION + 2, VELOCITY + 2, DISTURBANCE + 2, BIAS + 2]])
-HEADING = np.array([[COURSE, COURSE_RATE]])
-LATERAL_DRIFT, VERTICAL_DRIFT = 4, 2  # of the disturbance among these
-# What is believed at the first message: the reported velocity, no disturbance, no bias.
-LATERAL_START_SD = np.array([0.1, 0.3, 0.02, 0.3, 1.0, 0.3])
-VERTICAL_START_SD = np.array([0.1, 0.3, 1.5, 0.3])
-HEADING_START_SD = np.array([0.05, 0.3])
-MEASURES_TILT = np.array([0.0, 0.0, 1.0, 0.0, 0.0, 0.0])
-MEASURES_COURSE = np.array([1.0, 0.0])
+START_SDS = (
+    (0.1, 0.3, 0.02, 0.3, 1.0, 0.3),
+    (0.1, 0.3, 1.5, 0.3),
+    (0.05, 0.3),
+)
 
 
 class VelocitySource(StrEnum):
@@ -84,6 +96,49 @@ class ObserverSettings(Parameters):
     # Noise and drift beyond what stands above are learnt from the innovations; the drift so far
     adaptive: bool = True
     disturbance_density_limit_mps2: float = Field(default=1.0, gt=0, le=10)
+
+
+_USES = {
+    VelocitySource.POSITION: IGNORED,
+    VelocitySource.BIAS: BIASED,
+    VelocitySource.REPORTED: TRUSTED,
+}
+
+
+def new_record(settings: ObserverSettings) -> Record:
+    """An OBSERVER that has no vehicle yet."""
+    record = np.zeros(1, OBSERVER)
+    record["velocity"] = _USES[settings.velocity]
+    record["adaptive"] = settings.adaptive
+    record["white_sds"] = settings.position_sd_m, settings.velocity_sd_mps
+    record["gates"] = settings.position_jump_m, settings.velocity_jump_mps
+    record["attitude_sd"] = settings.attitude_sd_rad
+    record["disturbance_limit"] = settings.disturbance_limit_mps2
+    for one, places in zip(record["filters"][0], PLACES, strict=True):
+        one["axes"] = len(places)
+        one["places"][: len(places), : len(places[0])] = places
+    return record
+
+
+def believe(record: Record, vehicle: Vehicle, settings: ObserverSettings) -> None:
+    """The vehicle's plant, and filters that follow it."""
+    record["motion"]["plant"] = plant_vector(vehicle, settings)
+    frequency = max(vehicle.tilt.natural_frequency_radps, vehicle.yaw.natural_frequency_radps)
+    damping = max(vehicle.tilt.damping, vehicle.yaw.damping, 0.5)
+    longest_s = min(0.02, 0.25 / (2.0 * damping * frequency))
+    for one, model in zip(record["filters"][0], filter_models(vehicle, settings), strict=True):
+        set_up(one, *model)
+        one["longest_s"] = longest_s
+
+
+def start_filters(record: Record, settings: ObserverSettings) -> None:
+    """As little is known as at the first message."""
+    for one, sds in zip(record["filters"][0], START_SDS, strict=True):
+        start(one, np.square(sds))
+    if settings.velocity is VelocitySource.REPORTED:
+        record["filters"]["covariance"][0, LATERAL, LATERAL_DRIFT, LATERAL_DRIFT] = 0.0
+    record["motion"]["states"][0, NOW, DISTURBANCE : DISTURBANCE + 3] = 0.0
+    record["motion"]["states"][0, NOW, BIAS : BIAS + 3] = 0.0
 
 
 def plant_vector(vehicle: Vehicle, settings: ObserverSettings) -> Array:

@@ -16,11 +16,15 @@ from offboard.control.observer import Observer, ObserverSettings, VelocitySource
 from offboard.control.observer_model import plant_vector
 from offboard.control.propagation import (
     COMMAND_SIZE,
+    LATER,
+    MOTION,
+    NOW,
     STATE_SIZE,
     THRUST,
-    advance,
+    replay,
 )
 from offboard.model.frames import quaternion_from_thrust_direction
+from offboard.model.kernel import address
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 G = 9.80665
@@ -153,9 +157,12 @@ def test_replay_agrees_with_scipy(damping: float) -> None:
     for a, b in itertools.pairwise(edges):
         u = held(0.5 * (a + b))
         x = solve_ivp(rate, (a, b), x, "DOP853", args=(u,), rtol=1e-11, atol=1e-12).y[:, -1]
-    replayed = start.copy()
-    advance(replayed, 0.0, 1.0, sent, 5, plant_vector(vehicle, ObserverSettings()))
-    assert replayed == pytest.approx(x, abs=3e-6)
+    motion = np.zeros(1, MOTION)
+    motion["states"][0, NOW] = start
+    motion["plant"] = plant_vector(vehicle, ObserverSettings())
+    motion["history"][0, :5], motion["sent"] = sent, 5
+    replay.call(address(motion), LATER, 0.0, 1.0)
+    assert motion["states"][0, LATER] == pytest.approx(x, abs=3e-6)
 
 
 @pytest.mark.parametrize("about_rad", [0.0, math.pi, -math.pi])
