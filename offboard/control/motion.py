@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
@@ -22,6 +21,7 @@ from offboard.control.trace import (
     Trace,
     thinned,
 )
+from offboard.model.kernel import array, entry
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
@@ -43,13 +43,12 @@ class Motion:
             [np.interp(self.times, stamps, trace.attitude[:, NORTH + axis]) for axis in (0, 1)]
         )
         self.upright = np.sqrt(np.maximum(1.0 - np.sum(self.direction_ne**2, axis=0), 0.01))
-        self._sent_at = np.ascontiguousarray(trace.commands[:, SENT_AT])
-        self._thrust = np.ascontiguousarray(trace.commands[:, SENT_THRUST])
+        self._sent = np.ascontiguousarray(trace.commands[:, [SENT_AT, SENT_THRUST]])
 
     def thrust(self, delay_s: float, lag_s: float) -> Array:
         """Thrust (N,) as a fraction of full throttle."""
         out = np.empty_like(self.times)
-        lagged_thrust(self.times, self._sent_at, self._thrust, delay_s, lag_s, out)
+        lagged_thrust.call(self.times, self._sent, delay_s, lag_s, out)
         return out
 
     @property
@@ -72,7 +71,7 @@ class Motion:
 
     @property
     def usable(self) -> bool:
-        return len(self.times) >= 50 and len(self._sent_at) >= 3
+        return len(self.times) >= 50 and len(self._sent) >= 3
 
 
 def specific_velocity(motion: Motion, vehicle: Vehicle) -> Array:
@@ -94,26 +93,26 @@ def specific_velocity(motion: Motion, vehicle: Vehicle) -> Array:
     return velocity
 
 
-@numba.njit(cache=True)
-def lagged_thrust(
-    times: Array, sent_at: Array, thrust: Array, delay_s: float, lag_s: float, out: Array
-) -> None:
-    """The thrust `out` (N,) at `times`: commands (M,) after delay and first-order lag, exact."""
+@entry(array(1), array(2), float, float, array(1))
+def lagged_thrust(times: Array, sent: Array, delay_s: float, lag_s: float, out: Array) -> int:
+    """The thrust `out` (N,) at `times`: commands `sent` (M, 2), when and how much, after delay and
+    first-order lag, exact."""
     row = 0
-    while row + 1 < sent_at.shape[0] and sent_at[row + 1] + delay_s <= times[0] - 10.0 * lag_s:
+    while row + 1 < sent.shape[0] and sent[row + 1, 0] + delay_s <= times[0] - 10.0 * lag_s:
         row += 1
-    value = thrust[row]
-    now = min(sent_at[row] + delay_s, times[0])
+    value = sent[row, 1]
+    now = min(sent[row, 0] + delay_s, times[0])
     for i in range(times.shape[0]):
         while now < times[i]:
             following = row + 1
             until = times[i]
-            acts = following < sent_at.shape[0] and sent_at[following] + delay_s <= until
+            acts = following < sent.shape[0] and sent[following, 0] + delay_s <= until
             if acts:
-                until = max(sent_at[following] + delay_s, now)
+                until = max(sent[following, 0] + delay_s, now)
             left = math.exp(-(until - now) / lag_s) if lag_s > 1e-6 else 0.0
-            value = thrust[row] + (value - thrust[row]) * left
+            value = sent[row, 1] + (value - sent[row, 1]) * left
             now = until
             if acts:
                 row = following
-        out[i] = value if lag_s > 1e-6 else thrust[row]
+        out[i] = value if lag_s > 1e-6 else sent[row, 1]
+    return 0

@@ -11,13 +11,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
 from offboard.control.motion import Motion
 from offboard.control.response_fit import Estimate
+from offboard.model.kernel import array, entry, kernel
 
 Array = NDArray[np.float64]
 
@@ -47,20 +47,24 @@ class VerticalFit:
     drag_ps: Estimate
 
 
-@numba.njit(cache=True)
+@entry(array(1), array(2), array(2), float, array(1), array(2))
 def innovations(
-    times: Array,
-    positions: Array,
-    accelerations: Array,
-    drag: float,
-    allowed: Array,
-    out: Array,
-) -> None:
-    """Normalised innovations `out` (N - 1,) of a filter [p, v, d] along one axis.
+    times: Array, positions: Array, accelerations: Array, drag: float, allowed: Array, out: Array
+) -> int:
+    """Normalised innovations `out` (axes, N - 1) of a filter [p, v, d] along each axis.
 
-    v' = a - c v + d with `accelerations` (N,) joined by straight lines; `allowed` (6,): densities
-    per root second of p, v and d, sd of the positions, and of v and d at the start.
+    v' = a - c v + d with `accelerations` (axes, N) joined by straight lines; `allowed` (6,):
+    densities per root second of p, v and d, sd of the positions, and of v and d at the start.
     """
+    for axis in range(out.shape[0]):
+        _filter(times, positions[axis], accelerations[axis], drag, allowed, out[axis])
+    return 0
+
+
+@kernel
+def _filter(
+    times: Array, positions: Array, accelerations: Array, drag: float, allowed: Array, out: Array
+) -> None:
     p_density, v_density, d_density = allowed[0], allowed[1], allowed[2]
     noise, start_v, start_d = allowed[3] ** 2, allowed[4] ** 2, allowed[5] ** 2
     p, v, d = positions[0], 0.0, 0.0
@@ -105,8 +109,7 @@ def fit_drag(motion: Motion, thrust_mps2: Array) -> Estimate:
 
     def surprises(drag: Array) -> Array:
         out = np.empty((2, len(motion.times) - 1))
-        for along, pull, white in zip(motion.positions, pulls, out, strict=False):
-            innovations(motion.times, along, pull, drag[0], LATERAL, white)
+        innovations.call(motion.times, motion.positions[:2], pulls, drag[0], LATERAL, out)
         return out.ravel()
 
     result = least_squares(
@@ -142,7 +145,8 @@ def fit_vertical(motion: Motion, gravity_mps2: float, prior: VerticalPrior) -> V
         thrust = motion.thrust(delay_s, lag_s)
         pull = gravity_mps2 * (1.0 - inverse * thrust * motion.upright)
         out = np.empty(len(motion.times) - 1)
-        innovations(motion.times, motion.positions[2], pull, drag_ps, VERTICAL, out)
+        down = motion.positions[2:], pull[None], drag_ps, VERTICAL, out[None]
+        innovations.call(motion.times, *down)
         return out
 
     upper = np.array((50.0, THRUST_DELAY_UPPER_S, LAG_UPPER_S, DRAG_UPPER))

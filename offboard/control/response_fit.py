@@ -20,6 +20,7 @@ from offboard.control.response_search import (
     UPPER,
     Data,
     residual,
+    residuals,
     respond,
     scale_of,
     search,
@@ -32,12 +33,14 @@ from offboard.model.vehicle import AxisResponse
 Array = NDArray[np.float64]
 
 # Where the search starts: of these the best two are followed to the end.
-STARTS = (
-    (0.01, 12.0, 1.0),
-    (0.06, 11.0, 0.6),
-    (0.15, 8.0, 0.7),
-    (0.3, 10.0, 0.7),
-    (0.15, 3.5, 0.5),
+STARTS = np.array(
+    [
+        [0.01, 12.0, 1.0],
+        [0.06, 11.0, 0.6],
+        [0.15, 8.0, 0.7],
+        [0.3, 10.0, 0.7],
+        [0.15, 3.5, 0.5],
+    ]
 )
 FOLLOWED = 2
 # Residuals of an estimator wander for this long: the uncertainty counts them as related.
@@ -75,7 +78,7 @@ class ResponseProblem:
 
     def __init__(self, times: Array, signals: Array, sent_at: Array, commands: Array) -> None:
         kept = thinned(times, SPACING_S)
-        arrays = (times[kept], signals[kept], sent_at, commands)
+        arrays = (times[kept], signals[kept], np.column_stack((sent_at, commands)))
         self._data = Data(*map(np.ascontiguousarray, arrays))
 
     def residual(self, parameters: Array, weights: Array | None = None) -> Array:
@@ -86,9 +89,9 @@ class ResponseProblem:
 
     def solve(self) -> tuple[Array, Array, float]:
         """The best parameters (3,), their covariance (3, 3) and the scale of what is left."""
-        misses = [float(np.sum(self.residual(np.array(start)) ** 2)) for start in STARTS]
-        nearest = np.argsort(misses)[:FOLLOWED]
-        found = [search(self._data, np.array(STARTS[index])) for index in nearest]
+        even = np.ones(len(self._data.times))
+        misses = np.sum(residuals(self._data, STARTS, even) ** 2, axis=(1, 2))
+        found = [search(self._data, start) for start in STARTS[np.argsort(misses)[:FOLLOWED]]]
         best = min(found, key=lambda each: each[1])[0]
         left = self.residual(best)
         scale = scale_of(left)
@@ -166,11 +169,12 @@ def predicted(
 ) -> Array:
     """The response (N, axes) to `commands` (M, axes), at rest at the start."""
     axes = commands.shape[1]
-    motion, out = np.empty((2, axes + 2)), np.empty((len(times), axes + 2))
+    motion, out = np.empty((2, axes + 2)), np.empty((1, len(times), axes + 2))
     if len(times) and len(sent_at):
-        signal, sent, held = (np.ascontiguousarray(each) for each in (times, sent_at, commands))
-        respond(signal, sent, held, delay_s, frequency_radps, damping, motion, out)
-    response: Array = out[:, :axes]
+        sent = np.column_stack((sent_at, commands))
+        parameters = np.array([[delay_s, frequency_radps, damping]])
+        respond.call(np.ascontiguousarray(times), sent, parameters, motion, out)
+    response: Array = out[0, :, :axes]
     return response
 
 

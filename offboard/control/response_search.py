@@ -11,10 +11,12 @@ are (K. Lange, R. Little and J. Taylor, 1989). Times in s, signals in any unit; 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
+
+from offboard.model.kernel import array, entry, kernel
 
 Array = NDArray[np.float64]
 
@@ -29,21 +31,17 @@ CONVERGED = 2e-4  # of STEP_SCALES
 DIFFERENCE = 1e-3  # of them too, for slopes
 
 
+@dataclass(frozen=True, slots=True)
 class Data:
-    """Signals (N, axes) at `times` (N,) under `commands` (M, axes) sent at `sent_at` (M,), each
-    contiguous and in the order of time; and room for one response."""
+    """Signals (N, axes) at `times` (N,) under commands: `sent` (M, 1 + axes), when and what; each
+    contiguous and in the order of time."""
 
-    def __init__(self, times: Array, signals: Array, sent_at: Array, commands: Array) -> None:
-        self.times, self.signals = times, signals
-        self.sent_at, self.commands = sent_at, commands
-        axes = signals.shape[1]
-        self.motion = np.empty((2, axes + 2))
-        self.response = np.empty((len(times), axes + 3))
-        """Of the axes, free of command from a unit offset and from a unit rate, and constant."""
-        self.response[:, -1] = 1.0
+    times: Array
+    signals: Array
+    sent: Array
 
 
-@numba.njit(cache=True)
+@kernel
 def _propagator(frequency: float, damping: float, step_s: float) -> tuple[float, float]:
     """f0, f1 with exp(A h) = f0 I + f1 A for A = [[0, 1], [-wn^2, -2 z wn]]."""
     decay = damping * frequency
@@ -62,29 +60,28 @@ def _propagator(frequency: float, damping: float, step_s: float) -> tuple[float,
     return shrink * math.cos(q * step_s) + decay * sine, sine
 
 
-@numba.njit(cache=True)
-def respond(
-    times: Array,
-    sent_at: Array,
-    commands: Array,
-    delay_s: float,
-    frequency: float,
-    damping: float,
-    motion: Array,
-    out: Array,
-) -> None:
-    """The response at `times` (N,) to piecewise constant `commands` (M, axes), at rest on the
-    command in force at the start; `out` (N, at least axes + 2): the axes, then the free responses
-    to a unit offset and to a unit rate. Rows in the order of time; exact. `motion` (2, axes + 2)
-    is scratch."""
-    axes = commands.shape[1]
+@entry(array(1), array(2), array(2), array(2), array(3))
+def respond(times: Array, sent: Array, parameters: Array, motion: Array, out: Array) -> int:
+    """The responses with each of the `parameters` (K, 3) at `times` (N,) to piecewise constant
+    commands, `sent` (M, 1 + axes), at rest on the command in force at the start. `out` (K, N, at
+    least axes + 2): the axes, then the free responses to a unit offset and to a unit rate. Rows in
+    the order of time; exact. `motion` (2, axes + 2) is scratch."""
+    for k in range(parameters.shape[0]):
+        _follow(times, sent, parameters[k], motion, out[k])
+    return 0
+
+
+@kernel
+def _follow(times: Array, sent: Array, parameters: Array, motion: Array, out: Array) -> None:
+    delay_s, frequency, damping = parameters[0], parameters[1], parameters[2]
+    axes = sent.shape[1] - 1
     value, rate = motion[0], motion[1]
     now = times[0]
     row = -1
-    while row + 1 < sent_at.shape[0] and sent_at[row + 1] + delay_s <= now:
+    while row + 1 < sent.shape[0] and sent[row + 1, 0] + delay_s <= now:
         row += 1
     for axis in range(axes):
-        value[axis], rate[axis] = commands[max(row, 0), axis], 0.0
+        value[axis], rate[axis] = sent[max(row, 0), 1 + axis], 0.0
     value[axes], rate[axes] = 1.0, 0.0
     value[axes + 1], rate[axes + 1] = 0.0, 1.0
     stiffness, friction = frequency * frequency, 2.0 * damping * frequency
@@ -92,12 +89,12 @@ def respond(
         while now < times[i]:
             until = times[i]
             following = row + 1
-            acts = following < sent_at.shape[0] and sent_at[following] + delay_s <= until
+            acts = following < sent.shape[0] and sent[following, 0] + delay_s <= until
             if acts:
-                until = max(sent_at[following] + delay_s, now)
+                until = max(sent[following, 0] + delay_s, now)
             f0, f1 = _propagator(frequency, damping, until - now)
             for axis in range(axes + 2):
-                held = commands[max(row, 0), axis] if axis < axes else 0.0
+                held = sent[max(row, 0), 1 + axis] if axis < axes else 0.0
                 away, speed = value[axis] - held, rate[axis]
                 value[axis] = held + f0 * away + f1 * speed
                 rate[axis] = f0 * speed + f1 * (-stiffness * away - friction * speed)
@@ -110,27 +107,26 @@ def respond(
             out[i, axis] = value[axis]
 
 
-def residual(data: Data, parameters: Array, weights: Array) -> Array:
-    """Signals less response (N, axes), free motion and a constant offset projected out under
-    `weights` (N,)."""
-    delay_s, frequency, damping = parameters.tolist()
-    respond(
-        data.times,
-        data.sent_at,
-        data.commands,
-        delay_s,
-        frequency,
-        damping,
-        data.motion,
-        data.response,
-    )
+def residuals(data: Data, parameters: Array, weights: Array) -> Array:
+    """Signals less the responses with each of the `parameters` (K, 3), free motion and a constant
+    offset projected out under `weights` (N,): (K, N, axes)."""
     axes = data.signals.shape[1]
-    left: Array = data.signals - data.response[:, :axes]
-    basis = data.response[:, axes:]
-    weighted = basis.T * weights
+    motion = np.empty((2, axes + 2))
+    out = np.ones((len(parameters), len(data.times), axes + 3))
+    respond.call(data.times, data.sent, parameters, motion, out)
+    left: Array = data.signals - out[:, :, :axes]
+    basis = out[:, :, axes:]
+    weighted = basis.swapaxes(1, 2) * weights
     gram = weighted @ basis
-    gram.flat[:: len(gram) + 1] += 1e-12 + 1e-9 * gram.diagonal()
+    diagonal = np.einsum("kii->ki", gram)
+    diagonal += 1e-12 + 1e-9 * diagonal
     left -= basis @ np.linalg.solve(gram, weighted @ left)
+    return left
+
+
+def residual(data: Data, parameters: Array, weights: Array) -> Array:
+    """`residuals` (N, axes) with one set of `parameters` (3,)."""
+    left: Array = residuals(data, parameters[None], weights)[0]
     return left
 
 
@@ -148,14 +144,10 @@ def weights_of(left: Array, scale: float) -> Array:
 
 def slopes(data: Data, parameters: Array, weights: Array, left: Array) -> Array:
     """Of the residual `left` (N, axes) by the parameters: (3, N, axes)."""
-    slope = np.empty((3, *left.shape))
-    for j in range(3):
-        step = DIFFERENCE * STEP_SCALES[j]
-        if parameters[j] + step > UPPER[j]:
-            step = -step
-        moved = parameters.copy()
-        moved[j] += step
-        slope[j] = (residual(data, moved, weights) - left) / step
+    steps = DIFFERENCE * STEP_SCALES
+    steps[parameters + steps > UPPER] *= -1.0
+    slope: Array = residuals(data, parameters + np.diag(steps), weights) - left
+    slope /= steps[:, None, None]
     return slope
 
 

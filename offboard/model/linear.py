@@ -1,7 +1,7 @@
 """The linear model at hover, torque interface: Eqs. 8-18, continuous and sampled.
 
 States as in Eq. 5, inputs as in Eq. 6 but in deviation from hover [m g, 0, 0, 0]; C = I, D = 0.
-The matrices are differentiated from the one compiled rigid body, not written down a second time.
+The matrices are differentiated from the one rigid body, not written down a second time.
 Knows no attitude loop: that is the other interface.
 """
 

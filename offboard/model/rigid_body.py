@@ -1,13 +1,11 @@
-"""The nonlinear rigid body of Eqs. 1-8: forces and torques in, motion out. Compiled.
+"""The nonlinear rigid body of Eqs. 1-8: forces and torques in, motion out.
 
 One function, `body_accelerations`, holds the physics (Newton-Euler with linear drag); two charts
 around it hold only kinematics: the paper's 12 states (Eq. 5, Euler angles, body velocity) and 13
 states with a quaternion and NED velocity, without singularity. The length of the state tells
-which. The simulator, the swarm's roll-outs and the linearisation all run this code.
-
-`derivative` and `rk4_step` broadcast over leading axes. `derivative_into` and `rk4_into` are the
-same for one state, allocate nothing and can be called from other compiled code. All accept
-complex numbers, for differentiation by complex step. Inputs are total: hover is [m g, 0, 0, 0].
+which. The simulator, the paper's plant and the linearisation all run this code: compiled, where
+compiled code calls it, and on numpy's arrays, also complex ones for differentiation by complex
+step, where Python does. Inputs are total: hover is [m g, 0, 0, 0].
 
 Knows no rotors, ground, sensors or randomness.
 """
@@ -56,27 +54,17 @@ def derivative(
 
     Leading axes broadcast against each other. Raises ValueError for other lengths.
     """
-    states, flat_inputs, flat_wind, shape = _flatten(state, inputs, wind_ned_mps)
-    result = np.empty_like(states)
-    _derivative_each(states, flat_inputs, flat_wind, parameters, result)
-    return result.reshape(shape)
-
-
-def rk4_step(
-    state: ArrayLike,
-    inputs: ArrayLike,
-    parameters: Array,
-    step_s: float,
-    wind_ned_mps: ArrayLike = _STILL_AIR,
-) -> Any:
-    """State after `step_s` seconds of held inputs and wind, by one classical Runge-Kutta step.
-
-    Shapes as for `derivative`. The quaternion of a 13-state leaves with unit length.
-    """
-    states, flat_inputs, flat_wind, shape = _flatten(state, inputs, wind_ned_mps)
-    result = np.empty_like(states)
-    _rk4_each(states, flat_inputs, flat_wind, parameters, step_s, result)
-    return result.reshape(shape)
+    given = [np.asarray(part) for part in (state, inputs, wind_ned_mps)]
+    sizes = tuple(part.shape[-1] if part.ndim else 0 for part in given)
+    if sizes[0] not in (EULER.size, QUATERNION.size) or sizes[1:] != (INPUT_SIZE, 3):
+        raise ValueError(
+            f"state, inputs and wind must end in 12 or 13, 4 and 3 elements, not {sizes}"
+        )
+    lead = np.broadcast_shapes(*(part.shape[:-1] for part in given))
+    result = np.empty((*lead, sizes[0]), np.result_type(np.float64, *given))
+    state, inputs, wind, out = (np.moveaxis(part, -1, 0) for part in (*given, result))
+    derivative_into(state, inputs, wind, parameters, out)
+    return result
 
 
 @kernel
@@ -182,7 +170,8 @@ def _quaternion_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, ou
 
 @kernel
 def derivative_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, out: Any) -> None:
-    """One state (12,) or (13,), inputs (4,), wind (3,) m/s, `pack`ed parameters -> `out`."""
+    """One state (12,) or (13,), inputs (4,), wind (3,) m/s, `pack`ed parameters -> `out`; in Python
+    also many, along further axes."""
     if state.shape[0] == 12:
         _euler_into(state, inputs, wind_ned, parameters, out)
     else:
@@ -211,39 +200,3 @@ def rk4_into(
         length = np.sqrt(out[0] * out[0] + out[1] * out[1] + out[2] * out[2] + out[3] * out[3])
         for i in range(4):
             out[i] /= length
-
-
-@kernel
-def _derivative_each(states: Any, inputs: Any, wind: Any, parameters: Any, out: Any) -> None:
-    for i in range(states.shape[0]):
-        derivative_into(states[i], inputs[i], wind[i], parameters, out[i])
-
-
-@kernel
-def _rk4_each(
-    states: Any, inputs: Any, wind: Any, parameters: Any, step_s: float, out: Any
-) -> None:
-    scratch = np.empty((RK4_SCRATCH_ROWS, states.shape[1]), states.dtype)
-    for i in range(states.shape[0]):
-        rk4_into(states[i], inputs[i], wind[i], parameters, step_s, scratch, out[i])
-
-
-def _flatten(
-    state: ArrayLike, inputs: ArrayLike, wind: ArrayLike
-) -> tuple[Any, Any, Any, tuple[int, ...]]:
-    """Contiguous (N, 12 or 13), (N, 4), (N, 3) of one dtype, and the shape of the result."""
-    arrays = [np.asarray(part) for part in (state, inputs, wind)]
-    sizes = tuple(part.shape[-1] if part.ndim else 0 for part in arrays)
-    if sizes[0] not in (EULER.size, QUATERNION.size) or sizes[1:] != (INPUT_SIZE, 3):
-        raise ValueError(
-            f"state, inputs and wind must end in 12 or 13, 4 and 3 elements, not {sizes}"
-        )
-    dtype = np.result_type(np.float64, *arrays)
-    lead = np.broadcast_shapes(*(part.shape[:-1] for part in arrays))
-    flat = []
-    for part, size in zip(arrays, sizes, strict=True):
-        # Always a fresh writable array: views would have the loops compiled once more per kind
-        rows = np.empty((*lead, size), dtype)
-        rows[...] = part
-        flat.append(rows.reshape(-1, size))
-    return flat[0], flat[1], flat[2], (*lead, sizes[0])

@@ -7,8 +7,9 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import expm
 
+from offboard.model.integration import follow
 from offboard.model.linear import hover_matrices, hover_system, sampled_matrices
-from offboard.model.rigid_body import derivative, hover_input, pack, rk4_step
+from offboard.model.rigid_body import RK4_SCRATCH_ROWS, derivative, hover_input, pack
 from offboard.model.state import (
     PHI,
     PSI,
@@ -61,7 +62,7 @@ def test_hover_matrices_are_the_physics_written_by_hand(paper_vehicle: Vehicle) 
 
 
 def test_hover_matrices_agree_with_finite_differences(paper_vehicle: Vehicle) -> None:
-    """Five-point differences of the real-valued compiled code, not of its complex twin."""
+    """Five-point differences of real numbers."""
     parameters, trim = pack(paper_vehicle), hover_input(paper_vehicle)
     h = 1e-3
 
@@ -92,8 +93,8 @@ def test_the_sampled_model_predicts_small_flights(paper_vehicle: Vehicle) -> Non
     state, deviation = 1e-5 * generator.normal(size=12), 1e-5 * generator.normal(size=4)
     sampled_a, sampled_b = sampled_matrices(paper_vehicle, 0.1)
     predicted = sampled_a @ state + sampled_b @ deviation
-    for _ in range(20):
-        state = rk4_step(state, hover_input(paper_vehicle) + deviation, pack(paper_vehicle), 0.005)
+    inputs, scratch = hover_input(paper_vehicle) + deviation, np.empty((RK4_SCRATCH_ROWS, 12))
+    follow.call(state, inputs, np.zeros(3), pack(paper_vehicle), 0.005, 20, scratch)
     assert_allclose(state, predicted, atol=2e-9)
 
 

@@ -16,8 +16,9 @@ from scipy.linalg import expm
 from offboard.config import shipped
 from offboard.control.paper_law import PAPER_STEP_S
 from offboard.model.document import parse
+from offboard.model.integration import follow
 from offboard.model.linear import hover_matrices, sampled_matrices
-from offboard.model.rigid_body import RK4_SCRATCH_ROWS, hover_input, pack, rk4_into
+from offboard.model.rigid_body import RK4_SCRATCH_ROWS, hover_input, pack
 from offboard.model.state import EULER, THRUST, U, W
 from offboard.model.vehicle import Vehicle
 
@@ -82,8 +83,8 @@ class NonlinearPlant:
         total[THRUST] = max(total[THRUST], 0.0)
         out = state.copy()
         step_s = PAPER_STEP_S / _SUBSTEPS
-        for _ in range(_SUBSTEPS):
-            rk4_into(out, total, self._wind, self._parameters, step_s, self._scratch, out)
+        constants = self._wind, self._parameters, step_s, _SUBSTEPS
+        follow.call(out, total, *constants, self._scratch)
         return out
 
 
