@@ -11,7 +11,6 @@ from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numba.core.event import install_recorder
 
 from offboard.control import identification
 from offboard.control.base import Command, Controller, Situation
@@ -30,8 +29,8 @@ from offboard.flight.sitl import Hangar
 from offboard.flight.stop import StopRequests
 from offboard.mavlink.dialect import POSITIONING_TELEMETRY
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
-from offboard.model.compilation import without_garbage_collection
 from offboard.model.document import DocumentError
+from offboard.model.kernel import Entry
 from offboard.model.vehicle import Vehicle
 from offboard.reference.track import Track
 from offboard.reference.transfer import Hold
@@ -83,7 +82,6 @@ class Crew:
     learning: IdentifySettings | None = None
 
 
-@without_garbage_collection()
 def rehearse(crew: Crew, *, keeps_deadline: bool) -> float:
     """Call every code path of observer and controller, compiled ones included, and forget it.
 
@@ -157,9 +155,9 @@ def fly(
             bundled.hangar.launch(bundled.options(link.port))
             stack.callback(bundled.hangar.recall)
         tell("preparing the controller (its first run on a machine compiles for seconds)")
-        with install_recorder("numba:compile") as compiled:
-            took_s = rehearse(crew, keeps_deadline=bundled is None)
-        if compiled.buffer and took_s > COMPILED_S:
+        compiled = Entry.compilations
+        took_s = rehearse(crew, keeps_deadline=bundled is None)
+        if Entry.compilations > compiled and took_s > COMPILED_S:
             tell(f"compiled in {took_s:.1f} s; the next start finds it cached")
         stops.heed()
         stack.enter_context(log)

@@ -7,12 +7,11 @@ one that is there.
 from __future__ import annotations
 
 import functools
+import gc
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, cast
-
-from offboard.model.compilation import without_garbage_collection
 
 # Numba's and Python's runtime: left over from errors that cannot happen here
 _RUNTIME = ("NRT_", "Py", "_Py", "numba_")
@@ -44,7 +43,6 @@ def external_type(symbol: str, parameters: tuple[Any, ...], returns: type) -> An
     return types.ExternalFunction(symbol, numbers[returns](*kinds))
 
 
-@without_garbage_collection()
 def compiled(
     function: Callable[..., Any], parameters: tuple[Any, ...], returns: type, symbol: str
 ) -> bytes:
@@ -61,7 +59,7 @@ def compiled(
     for each in parameters:
         kinds.append(numbers.get(each, types.voidptr))
         kinds += [types.int64] * getattr(each, "dimensions", 0)
-    with _hardly_optimised():
+    with _without_garbage_collection(), _hardly_optimised():
         made = cfunc(numbers[returns](*kinds), error_model="numpy")(_flat(function, parameters))
         assembly = made.inspect_llvm()
     module = llvm.parse_assembly(_self_contained(assembly))
@@ -71,6 +69,18 @@ def compiled(
         elif not each.is_declaration:
             each.linkage = "internal"
     return cast(bytes, module.as_bitcode())
+
+
+@contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """numba makes so many objects that a tenth of its time goes there."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
 
 
 @contextmanager

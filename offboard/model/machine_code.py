@@ -14,7 +14,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any, cast
 
-from offboard.model.compilation import prepare_cache, sources_digest
+from offboard.model import cache, sources
 
 _NOWHERE = 1  # an address
 
@@ -33,7 +33,7 @@ def emitted(bitcode: bytes) -> bytes:
 
 
 def _file(symbol: str) -> Path:
-    return prepare_cache() / f"{symbol}-{_identity()}.o"
+    return cache.directory() / f"{symbol}-{_identity()}.o"
 
 
 @functools.cache
@@ -42,7 +42,7 @@ def _identity() -> str:
     import llvmlite.binding as llvm
 
     identity = (
-        sources_digest(),
+        sources.digest(),
         metadata.version("numba"),
         metadata.version("llvmlite"),
         llvm.get_process_triple(),

@@ -14,7 +14,7 @@ import sys
 from collections.abc import Mapping
 from pathlib import Path
 
-from offboard.model.compilation import entry_modules, sources_digest
+from offboard.model import sources
 
 DIRECTORY = Path(__file__).resolve().parents[1] / "_bitcode"
 
@@ -44,11 +44,11 @@ def _kind() -> str:
     """Of bitcode: for these sources, this kind of processor and system, and LLVM."""
     import llvmlite.binding as llvm
 
-    return f"{sources_digest()}-{llvm.get_process_triple()}-llvm{llvm.llvm_version_info[0]}"
+    return f"{sources.digest()}-{llvm.get_process_triple()}-llvm{llvm.llvm_version_info[0]}"
 
 
 if __name__ == "__main__":
-    for name in entry_modules():
+    for name in sources.entry_modules():
         importlib.import_module(name)
     from offboard.model.kernel import Entry
 

@@ -7,14 +7,13 @@ from pathlib import Path
 
 import pytest
 
-from offboard.model.compilation import prepare_cache
-
-CACHE = prepare_cache()  # pytester moves the home directory, where it would be compiled anew
+# pytester moves the home directory, where it would be compiled anew
+CACHE = os.environ.get("XDG_CACHE_HOME") or str(Path.home() / ".cache")
 
 
 @pytest.fixture(autouse=True)
 def compiled(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(CACHE))
+    monkeypatch.setenv("XDG_CACHE_HOME", CACHE)
 
 
 TAKES_OFF = """

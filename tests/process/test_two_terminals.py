@@ -13,7 +13,7 @@ SHORT = ("--reference", "hover", "--set", "reference.duration_s=2", "--set", "re
 def test_real_time_after_the_compilation_cache_was_deleted(
     spawn: Spawn, port: int, tmp_path: Path
 ) -> None:
-    cache = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")}
+    cache = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
     simulator = spawn(
         "simulator", "--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", **cache
     )

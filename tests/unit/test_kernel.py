@@ -86,12 +86,11 @@ COMPUTED = "[20, 20, 64.5] [ 3 10] 14.0 3"
 def _python(program: str, cache: Path, bitcode: Path | str = "", **settings: str) -> str:
     """What a program says that compiles for itself alone."""
     (cache / "entries.py").write_text(ENTRIES)
-    clean = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA")}
     ours = {"XDG_CACHE_HOME": str(cache), "TMPDIR": str(cache)}
     done = subprocess.run(
         [sys.executable, "-c", program, str(bitcode)],
         cwd=ROOT,
-        env=clean | ours | settings | {"PYTHONPATH": f"{ROOT}{os.pathsep}{cache}"},
+        env={**os.environ, **ours, **settings} | {"PYTHONPATH": f"{ROOT}{os.pathsep}{cache}"},
         capture_output=True,
         text=True,
         check=True,

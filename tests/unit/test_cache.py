@@ -1,4 +1,4 @@
-"""The compilation cache: private, writable, and never older than the sources."""
+"""Where machine code is kept: private, writable, and never older than the sources."""
 
 from __future__ import annotations
 
@@ -10,8 +10,6 @@ from pathlib import Path
 
 import pytest
 
-from offboard.model import compilation
-
 ROOT = Path(__file__).parents[2]
 
 
@@ -22,28 +20,26 @@ def copy_of_the_package(where: Path) -> Path:
     return where
 
 
-def answer(
-    code: str, package_root: Path = ROOT, umask: int = 0o022, **environment: str
-) -> tuple[str, str]:
-    """What a fresh interpreter that has this package says, and on standard error."""
-    clean = {key: value for key, value in os.environ.items() if not key.startswith("NUMBA")}
+def answer(code: str, package_root: Path = ROOT, umask: int = 0o022, **environment: str) -> str:
+    """What a fresh interpreter that has this package says."""
     done = subprocess.run(
         [sys.executable, "-B", "-c", code],
         cwd=package_root,
-        env=clean | {"PYTHONPATH": str(package_root)} | environment,
+        env={**os.environ, "PYTHONPATH": str(package_root), **environment},
         capture_output=True,
         text=True,
         check=True,
         timeout=60,
         umask=umask,
     )
-    return done.stdout.strip(), done.stderr.strip()
+    assert not done.stderr
+    return done.stdout.strip()
 
 
 def cache_directory(package_root: Path, **environment: str) -> Path:
-    """Where a fresh interpreter importing the copy has numba put its cache."""
-    code = "import offboard, numba; print(numba.config.CACHE_DIR)"
-    return Path(answer(code, package_root, **environment)[0])
+    """Where a fresh interpreter that imports the copy keeps machine code."""
+    code = "from offboard.model import cache; print(cache.directory())"
+    return Path(answer(code, package_root, **environment))
 
 
 @pytest.mark.parametrize("changed", ["rigid_body.py", "state.py"])  # its sizes are compiled in
@@ -75,17 +71,6 @@ def test_without_a_writable_home_the_cache_is_temporary(tmp_path: Path) -> None:
     assert tmp_path in directory.parents
 
 
-def test_the_users_choice_has_precedence(tmp_path: Path) -> None:
-    assert cache_directory(ROOT, NUMBA_CACHE_DIR=str(tmp_path)) == tmp_path
-
-
-def test_numba_imported_first_is_told_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
-    import numba
-
-    monkeypatch.setattr(numba.config, "CACHE_DIR", "")
-    assert str(compilation.prepare_cache()) == numba.config.CACHE_DIR
-
-
 def test_a_directory_others_can_write_to_is_not_used(tmp_path: Path) -> None:
     shared = tmp_path / "pso-offboard"
     shared.mkdir()
@@ -96,45 +81,22 @@ def test_a_directory_others_can_write_to_is_not_used(tmp_path: Path) -> None:
 
 KEPT = """
 from offboard.model.machine_code import keep, kept
-from offboard.model.compilation import prepare_cache
+from offboard.model import cache
 keep("f", b"code")
-print(kept("f"), prepare_cache())
+print(kept("f"), cache.directory())
 """
 
 
-@pytest.mark.parametrize("variable", ["XDG_CACHE_HOME", "NUMBA_CACHE_DIR"])
-def test_in_a_group_that_shares_its_files_machine_code_is_kept(
-    tmp_path: Path, variable: str
-) -> None:
-    said, complaint = answer(KEPT, umask=0o002, **{variable: str(tmp_path / "new" / "cache")})
-    directory = Path(said.removeprefix("b'code' "))
-    assert not complaint
-    assert tmp_path / "new" / "cache" in (directory, directory.parent.parent)
+def test_in_a_group_that_shares_its_files_machine_code_is_kept(tmp_path: Path) -> None:
+    home = tmp_path / "new" / "cache"
+    directory = Path(answer(KEPT, umask=0o002, XDG_CACHE_HOME=str(home)).removeprefix("b'code' "))
+    assert directory.parent == home / "pso-offboard"
     made = [path for path in (directory, *directory.parents) if tmp_path in path.parents]
     assert {path.stat().st_mode & 0o777 for path in made} == {0o700}
 
 
 def test_a_digest_directory_others_can_write_to_is_not_used(tmp_path: Path) -> None:
-    directory = Path(answer(KEPT, XDG_CACHE_HOME=str(tmp_path))[0].removeprefix("b'code' "))
+    directory = Path(answer(KEPT, XDG_CACHE_HOME=str(tmp_path)).removeprefix("b'code' "))
     directory.chmod(0o775)
-    said, _ = answer(KEPT, XDG_CACHE_HOME=str(tmp_path), TMPDIR=str(tmp_path))
+    said = answer(KEPT, XDG_CACHE_HOME=str(tmp_path), TMPDIR=str(tmp_path))
     assert said == f"b'code' {tmp_path / f'pso-offboard-{os.getuid()}' / directory.name}"
-
-
-@pytest.mark.parametrize(
-    ("mode", "trouble"), [(0o777, "others can write to it"), (None, "it cannot be written")]
-)
-def test_an_unusable_choice_is_said_once_and_replaced(
-    tmp_path: Path, mode: int | None, trouble: str
-) -> None:
-    chosen = tmp_path / "chosen"
-    if mode is None:
-        chosen.write_text("not a directory")
-    else:
-        chosen.mkdir()
-        chosen.chmod(mode)
-    home = str(tmp_path / "home")
-    said, complaint = answer(KEPT, NUMBA_CACHE_DIR=str(chosen), XDG_CACHE_HOME=home)
-    assert said.startswith(f"b'code' {home}")
-    assert len(complaint.splitlines()) == 1
-    assert complaint.startswith(f"NUMBA_CACHE_DIR={chosen} is not used: {trouble}")
