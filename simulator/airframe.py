@@ -54,6 +54,7 @@ class BatteryState:
     voltage_v: float
     current_a: float
     remaining: float
+    used_mah: float  # since boot
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +74,7 @@ class Airframe:
         left = battery.remaining - drawn_as / (3600.0 * battery.capacity_ah)
         current = battery.hover_current_a * (thrust / self.hover_thrust) ** 1.5
         voltage = battery.cells * (3.5 + 0.7 * left) - battery.resistance_ohm * current
-        return BatteryState(max(voltage, 0.0), current, max(left, 0.0))
+        return BatteryState(max(voltage, 0.0), current, max(left, 0.0), drawn_as / 3.6)
 
 
 def build_airframe(

@@ -12,8 +12,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from simulator.codec import id_of, name_of
-from simulator.firmware.base import ModeRequest, Result, Say, Severity
-from simulator.geodesy import to_metres
+from simulator.commander import Wish
+from simulator.firmware.base import ModeRequest, Result, Say, Severity, Triple
+from simulator.geodesy import down_m, to_metres
 from simulator.telemetry import View
 
 _CHANGE_MODE = 1.0  # MAV_DO_REPOSITION_FLAGS
@@ -86,15 +87,15 @@ class Commands:
         autopilot = self.link.view.autopilot
         if request.mode is None:
             if request.say is not None:
-                autopilot.texts.append(request.say)
+                autopilot.commander.texts.append(request.say)
             return request.refusal
-        return autopilot.happen("mode", mode=request.mode, by_planner=by_planner)
+        return autopilot.happen("mode", Wish(request.mode, by_planner=by_planner))
 
     def _arm_disarm(self, command: Command) -> Result | None:
         autopilot = self.link.view.autopilot
         wish = autopilot.firmware.arm_wish(command.params[0])
         if not wish.event:
-            autopilot.texts += () if wish.say is None else (wish.say,)
+            autopilot.commander.texts += () if wish.say is None else (wish.say,)
             return wish.refusal
         forced = command.params[1] == autopilot.firmware.force_codes[wish.event]
         return autopilot.happen(f"force {wish.event}" if forced else wish.event)
@@ -104,10 +105,10 @@ class Commands:
         autopilot = self.link.view.autopilot
         home_down_m = autopilot.pilot.home_ned_m[2]
         if autopilot.firmware.takeoff_above_home:
-            return autopilot.happen("takeoff", takeoff_z_m=home_down_m - asked_m)
+            return autopilot.happen("takeoff", Wish(takeoff_z_m=home_down_m - asked_m))
         above_m = asked_m - autopilot.firmware.origin[2]
         known = math.isfinite(above_m) and above_m > -home_down_m
-        return autopilot.happen("takeoff", takeoff_z_m=-above_m if known else math.nan)
+        return autopilot.happen("takeoff", Wish(takeoff_z_m=-above_m if known else math.nan))
 
     def _land(self, _: Command) -> Result:
         return self.link.view.autopilot.happen("land")
@@ -117,23 +118,24 @@ class Commands:
 
     def _loiter(self, _: Command) -> Result:
         autopilot = self.link.view.autopilot
-        return autopilot.happen("loiter") if autopilot.knows("loiter") else Result.UNSUPPORTED
+        known = autopilot.commander.knows("loiter")
+        return autopilot.happen("loiter") if known else Result.UNSUPPORTED
 
     def _set_home(self, command: Command) -> Result:
         """param1 = 1: here; else a place in degrees and metres above the sea."""
         latitude, longitude, height_m = command.params[4:7]
         autopilot = self.link.view.autopilot
         if command.params[0] == 1.0:
-            autopilot.set_home(autopilot.look().position_ned_m)
+            autopilot.pilot.home_ned_m = autopilot.senses.look().position_ned_m
         elif math.isfinite(latitude + longitude + height_m):
             north, east = to_metres(autopilot.firmware.origin, latitude, longitude)
-            autopilot.set_home((north, east, autopilot.firmware.origin[2] - height_m))
+            autopilot.pilot.home_ned_m = (north, east, autopilot.firmware.origin[2] - height_m)
         else:
             return Result.DENIED
         return Result.ACCEPTED
 
     def _reposition(self, command: Command) -> Result:
-        """Hold there from now on; what is not a number of the place stays as it is."""
+        """Hold there from now on; what is not finite stays as it is."""
         if command.params[1] != _CHANGE_MODE:
             return Result.UNSUPPORTED
         autopilot = self.link.view.autopilot
@@ -144,7 +146,24 @@ class Commands:
             if not (latitude or longitude):
                 return Result.DENIED
             yaw_rad = math.nan
-        return autopilot.reposition(latitude, longitude, height_m, command.frame or 0, yaw_rad)
+        result = autopilot.happen("mode", Wish(autopilot.firmware.reposition_mode))
+        if result is Result.ACCEPTED and autopilot.commander.armed:
+            yaw_rad = yaw_rad if math.isfinite(yaw_rad) else math.nan
+            place = self._place(latitude, longitude, height_m, command.frame or 0)
+            autopilot.pilot.go_to(place, yaw_rad)
+        return result
+
+    def _place(self, latitude: float, longitude: float, height_m: float, frame: int) -> Triple:
+        """NED, of a place in degrees and a height of this MAV_FRAME; where it is in what of it
+        is not finite."""
+        autopilot = self.link.view.autopilot
+        origin, home_down_m = autopilot.firmware.origin, autopilot.pilot.home_ned_m[2]
+        here = autopilot.senses.look().position_ned_m
+        north, east = to_metres(origin, latitude, longitude)
+        if not math.isfinite(north + east):
+            north, east = here[:2]
+        down = down_m(height_m, frame, origin, home_down_m)
+        return north, east, down if math.isfinite(down) else here[2]
 
     def _change_speed(self, command: Command) -> Result:
         """Of automatic flight across the ground, until another mode; none is its own again."""
@@ -160,10 +179,10 @@ class Commands:
         """To a course, or by so much: degrees."""
         asked_deg, speed_dps, sense, relative = command.params[:4]
         autopilot = self.link.view.autopilot
-        if not autopilot.knows("turn"):
+        if not autopilot.commander.knows("turn"):
             return Result.UNSUPPORTED
         if math.isfinite(asked_deg):
-            from_rad = autopilot.look().yaw_rad if relative else 0.0
+            from_rad = autopilot.senses.look().yaw_rad if relative else 0.0
             turn_rad = math.radians(asked_deg) * (-1.0 if relative and sense < 0 else 1.0)
             turn_radps = math.radians(speed_dps) if speed_dps > 0.0 else math.inf
             yaw_rad = math.remainder(from_rad + turn_rad, 2.0 * math.pi)
@@ -177,7 +196,7 @@ class Commands:
     def _start_mission(self, command: Command) -> Result:
         autopilot = self.link.view.autopilot
         first = command.params[0] if math.isfinite(command.params[0]) else 0.0
-        if not autopilot.knows("mission"):
+        if not autopilot.commander.knows("mission"):
             return Result.UNSUPPORTED
         if not -1 <= first < max(1, len(autopilot.mission.items)):
             return Result.DENIED
@@ -205,7 +224,7 @@ class Commands:
     def _refuse_interval(self, number: float, text: str) -> Result:
         autopilot = self.link.view.autopilot
         if text and math.isfinite(number):
-            autopilot.texts.append(Say(Severity.INFO, text.format(id=int(number))))
+            autopilot.commander.texts.append(Say(Severity.INFO, text.format(id=int(number))))
         return autopilot.firmware.streams.refusal
 
     def _get_interval(self, command: Command) -> Result:

@@ -1,4 +1,4 @@
-"""Latitude and longitude to metres round the origin, on a sphere. Knows no vehicle."""
+"""Latitude, longitude and height to metres round the origin, on a sphere. Knows no vehicle."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ import math
 
 EARTH_RADIUS_M = 6_371_000.0
 Origin = tuple[float, float, float]  # latitude, longitude deg, AMSL m
+# MAV_FRAME: height above sea level, above home, above the ground
+GLOBAL_FRAMES, RELATIVE_FRAMES, TERRAIN_FRAMES = map(frozenset, ((0, 5), (3, 6), (10, 11)))
 
 
 def to_metres(origin: Origin, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
@@ -14,3 +16,8 @@ def to_metres(origin: Origin, latitude_deg: float, longitude_deg: float) -> tupl
     north_m = math.radians(latitude_deg - latitude) * EARTH_RADIUS_M
     shrink = math.cos(math.radians(latitude))
     return north_m, math.radians(longitude_deg - longitude) * EARTH_RADIUS_M * shrink
+
+
+def down_m(height_m: float, frame: int, origin: Origin, home_down_m: float) -> float:
+    """NED, of a height in this MAV_FRAME: above home where it is relative, else above the sea."""
+    return (home_down_m if frame in RELATIVE_FRAMES else origin[2]) - height_m

@@ -13,6 +13,7 @@ from typing import Any, Protocol
 
 from simulator import faults
 from simulator.autopilot import Autopilot
+from simulator.commander import Wish
 from simulator.faults import Direction, Fault, Moment, Refusable
 from simulator.firmware.base import Behaviour, Say, Severity
 from simulator.impairment import Channel, Path
@@ -71,14 +72,14 @@ class Injection:
             self._waiting = [running for running in self._waiting if not running.over]
 
     def _note_moments(self, now_s: float, autopilot: Autopilot) -> None:
-        self._flown = self._flown or not autopilot.landed
-        by_setpoint = autopilot.mode.behaviour is Behaviour.SETPOINT
+        self._flown = self._flown or not autopilot.pilot.landed
+        by_setpoint = autopilot.commander.mode.behaviour is Behaviour.SETPOINT
         for moment, reached in (
             (Moment.BOOT, True),
-            (Moment.ARMED, autopilot.armed),
-            (Moment.TOOK_OFF, not autopilot.landed),
-            (Moment.ENGAGED, by_setpoint and autopilot.armed),
-            (Moment.LANDED, self._flown and autopilot.landed),
+            (Moment.ARMED, autopilot.commander.armed),
+            (Moment.TOOK_OFF, not autopilot.pilot.landed),
+            (Moment.ENGAGED, by_setpoint and autopilot.commander.armed),
+            (Moment.LANDED, self._flown and autopilot.pilot.landed),
         ):
             if reached:
                 self._moments.setdefault(moment, now_s)
@@ -142,7 +143,7 @@ def _jump(vehicle: Vehicle, running: Running) -> None:
 
 
 def _lose_fix(vehicle: Vehicle, running: Running) -> None:
-    vehicle.autopilot.gps_healthy = False
+    vehicle.autopilot.senses.gps_healthy = False
     running.memory = 0.0
 
 
@@ -153,7 +154,7 @@ def _drift(vehicle: Vehicle, running: Running) -> None:
 
 
 def _regain_fix(vehicle: Vehicle, running: Running) -> None:
-    vehicle.autopilot.gps_healthy = True
+    vehicle.autopilot.senses.gps_healthy = True
     if running.memory:
         vehicle.autopilot.plant.reset_estimate((-running.memory, -running.memory, 0.0))
 
@@ -216,18 +217,18 @@ def _refuse(vehicle: Vehicle, running: Running) -> None:
     of = running.fault.of
     said = Say(Severity.CRITICAL, f"{_REFUSED_TITLES[of]}: {running.fault.text}")
     for event in _REFUSED_EVENTS[of]:
-        vehicle.autopilot.refused[event] = said
+        vehicle.autopilot.commander.refused[event] = said
 
 
 def _allow(vehicle: Vehicle, running: Running) -> None:
     for event in _REFUSED_EVENTS[running.fault.of]:
-        vehicle.autopilot.refused.pop(event, None)
+        vehicle.autopilot.commander.refused.pop(event, None)
 
 
 def _take_over(vehicle: Vehicle, running: Running) -> None:
     modes = vehicle.autopilot.firmware.modes.values()
     hold = next(mode.name for mode in modes if mode.behaviour is Behaviour.HOLD)
-    vehicle.autopilot.happen("mode", mode=hold)
+    vehicle.autopilot.happen("mode", Wish(hold))
 
 
 Effect = Callable[[Vehicle, Running], None]

@@ -85,7 +85,7 @@ class Instance:
     @property
     def idle(self) -> bool:
         """Disarmed and on the ground: nothing can happen by itself."""
-        return not self.autopilot.armed and self.autopilot.landed
+        return not self.autopilot.commander.armed and self.autopilot.pilot.landed
 
     def advance(self) -> None:
         """One step of STEP_S; what it has to say waits in the links."""
@@ -96,10 +96,10 @@ class Instance:
             self.autopilot.plant.advance(STEP_S, _OFF)
             return
         self.autopilot.step()
-        if self.autopilot.restarts:
+        if self.autopilot.commander.restarts:
             self.reboot(RESTART_S)
             return
-        if self.autopilot.texts or self.autopilot.announcements:
+        if self.autopilot.commander.texts or self.autopilot.commander.announcements:
             self._spread_texts()
         self.companion.step()
         self.ground.step()
@@ -129,7 +129,7 @@ class Instance:
         if self._injection is not None or self.steps < self._back_at_step:
             return False
         autopilot = self.autopilot
-        if autopilot.steps >= autopilot.calm_until:
+        if autopilot.senses.steps >= autopilot.calm_until:
             autopilot.wake()
         if not self._stretch.possible:
             return False
@@ -137,7 +137,7 @@ class Instance:
             if not autopilot.rest():
                 return False
             self._stretch.prepare()
-        count = min(most, LONGEST, autopilot.calm_until - autopilot.steps)
+        count = min(most, LONGEST, autopilot.calm_until - autopilot.senses.steps)
         if count < 1:
             return False
         self.steps += self._stretch.fly(count)
@@ -202,9 +202,9 @@ class Instance:
         """The autopilot is gone for so long and starts anew; the vehicle goes on falling."""
         old = self.autopilot
         self.autopilot = Autopilot(
-            old.firmware, old.plant, old.parameters, old.mission, boot_scale=old.boot_scale
+            old.firmware, old.plant, old.parameters, old.mission, boot_scale=old.health.scale
         )
-        self.autopilot.pilot.fall(old.truth.on_ground)
+        self.autopilot.pilot.fall(old.plant.on_ground)
         self.view.restart(self.autopilot)
         self.companion.restart()
         self.ground.restart()
@@ -245,11 +245,12 @@ class Instance:
         return self.companion.barrier and is_timesync and any(frame[10:18])
 
     def _spread_texts(self) -> None:
-        for said in self.autopilot.texts:
+        commander = self.autopilot.commander
+        for said in commander.texts:
             self.companion.say(said)
             self.ground.say(said)
-        self.autopilot.texts.clear()
-        for name in self.autopilot.announcements:
+        commander.texts.clear()
+        for name in commander.announcements:
             self.companion.send_now(name)
             self.ground.send_now(name)
-        self.autopilot.announcements.clear()
+        commander.announcements.clear()

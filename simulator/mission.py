@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 from simulator.firmware.base import NAN3, MotionSetpoint, Triple
-from simulator.geodesy import Origin, to_metres
+from simulator.geodesy import GLOBAL_FRAMES, RELATIVE_FRAMES, Origin, down_m, to_metres
 
 ITEMS_MAX = 500
 _ACCEPTED_M, _ACCEPTED_HEIGHT_M = 2.0, 0.8  # NAV_ACC_RAD of multicopters, NAV_MC_ALT_RAD
@@ -34,9 +34,6 @@ _PLACES = frozenset(
     {Kind.WAYPOINT, Kind.LOITER_UNLIMITED, Kind.LOITER_TIME, Kind.LAND, Kind.TAKEOFF}
 )
 _WAITS = frozenset({Kind.WAYPOINT, Kind.LOITER_TIME, Kind.DELAY})
-GLOBAL_FRAMES = frozenset({0, 5})  # MAV_FRAME, altitude above sea level
-RELATIVE_FRAMES = frozenset({3, 6})  # above home
-TERRAIN_FRAMES = frozenset({10, 11})  # above the ground
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,9 +208,7 @@ class Mission:
 
     def _place(self, item: Item, home_ned_m: Triple) -> Triple:
         north, east = to_metres(self.origin, item.x * 1e-7, item.y * 1e-7)
-        if item.frame in RELATIVE_FRAMES:
-            return north, east, home_ned_m[2] - item.z
-        return north, east, self.origin[2] - item.z
+        return north, east, down_m(item.z, item.frame, self.origin, home_ned_m[2])
 
     def _target(self, item: Item, position_ned_m: Triple, home_ned_m: Triple) -> Triple:
         north, east, down = self._place(item, home_ned_m)

@@ -12,7 +12,8 @@ from enum import IntEnum
 from typing import Protocol
 
 from simulator.codec import Message
-from simulator.mission import GLOBAL_FRAMES, ITEMS_MAX, RELATIVE_FRAMES, Item, Mission
+from simulator.geodesy import GLOBAL_FRAMES, RELATIVE_FRAMES
+from simulator.mission import ITEMS_MAX, Item, Mission
 
 ASK_AGAIN_S, GIVE_UP_S = 0.25, 5.0
 _ANY_TYPE = 255

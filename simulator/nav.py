@@ -1,4 +1,7 @@
-"""What the flight stack flies by: the estimate, and what the feet and the range finder feel."""
+"""What the flight stack flies by: its clock, the estimate, and what feet and range finder feel.
+
+Knows the plant alone, and of that what it shows; knows no modes, no parameters and no messages.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import math
 from dataclasses import dataclass
 
 from simulator.firmware.base import Quaternion, Triple
+from simulator.plant import STEP_S, Plant, Truth
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,3 +28,53 @@ class Nav:
     def yaw_rad(self) -> float:
         w, x, y, z = self.attitude
         return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+
+
+class Senses:
+    """The present step of one plant, looked at when somebody asks and once only."""
+
+    def __init__(self, plant: Plant) -> None:
+        self._plant = plant
+        self.steps = 0  # of STEP_S since boot
+        self.gps_healthy = True  # no fault takes the fixes away
+        self._truth: Truth | None = None
+        self._nav: Nav | None = None
+
+    @property
+    def time_s(self) -> float:
+        """Vehicle time since boot."""
+        return self.steps * STEP_S
+
+    def moved(self, count: int) -> None:
+        """The plant is so many steps further."""
+        self.steps += count
+        self.forget()
+
+    def forget(self) -> None:
+        """What was seen is no more."""
+        self._truth = self._nav = None
+
+    @property
+    def truth(self) -> Truth:
+        """Where the vehicle really is now; the flight stack itself reads the battery alone."""
+        if self._truth is None:
+            self._truth = self._plant.truth
+        return self._truth
+
+    def look(self) -> Nav:
+        """The estimate now, and whether the feet touch the ground."""
+        if self._nav is None:
+            plant = self._plant
+            (north, east, down, v_north, v_east, v_down, w, x, y, z, p, q, r) = (
+                plant.report().tolist()
+            )
+            self._nav = Nav(
+                (north, east, down),
+                (v_north, v_east, v_down),
+                (w, x, y, z),
+                (p, q, r),
+                plant.on_ground,
+                plant.reset_counter,
+                plant.height_m,
+            )
+        return self._nav

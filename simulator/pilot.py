@@ -101,6 +101,12 @@ class Pilot:
         """The demand in force."""
         return self._demand
 
+    def tell(self) -> list[str]:
+        """The events since it was last asked."""
+        told = [*(("climbed",) if self.climbed else ()), *self.events]
+        self.events.clear()
+        return told
+
     def fall(self, on_ground: bool) -> None:
         """The vehicle as a reboot finds it."""
         self._detector.landed = on_ground

@@ -274,11 +274,6 @@ class Plant:
         """From now on the rotors give this much more."""
         self.record["rotor_constants"][0, _THRUST_MAX] *= factor
 
-    @property
-    def used_mah(self) -> float:
-        """Charge drawn since boot."""
-        return float(self._rotor[CHARGE]) / 3.6
-
     def set_battery(self, remaining: float) -> None:
         """From now on the battery has this share of its capacity, 0 .. 1."""
         battery = self._airframe.battery

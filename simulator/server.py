@@ -15,6 +15,7 @@ from simulator.commands import Command, Commands
 from simulator.firmware.base import Say, Severity
 from simulator.mission_transfer import HANDLERS as MISSION_HANDLERS
 from simulator.mission_transfer import Transfer
+from simulator.setpoints import ATTITUDE, GLOBAL, LOCAL
 from simulator.strict import Strict
 from simulator.telemetry import LEAST_INTERVAL_US, MAV_COMP_ID_AUTOPILOT, View
 
@@ -123,7 +124,7 @@ class Server:
     @property
     def _now_us(self) -> int:
         """Time by which streams are due; no clock that a fault can turn back."""
-        return self.view.autopilot.steps * STEP_US
+        return self.view.autopilot.senses.steps * STEP_US
 
     def send_barrier(self, stamp_ns: int) -> None:
         """Queue a TIMESYNC request."""
@@ -216,7 +217,7 @@ class Server:
         assert self.strict is not None
         said = self.strict.complaint(message, self._now_us * 1e-6)
         if said is not None:
-            self.view.autopilot.texts.append(said)
+            self.view.autopilot.commander.texts.append(said)
 
     def _is_for_us(self, message: Message) -> bool:
         """To our system or all, to the autopilot or all of it."""
@@ -233,7 +234,7 @@ class Server:
         read = autopilot.parameters.__getitem__
         if autopilot.firmware.is_ground_station(message.type, message.system, read):
             self._ground_station_us = self._now_us
-            autopilot.hear_ground_station()
+            autopilot.watch.hear_ground_station(autopilot.senses.time_s)
             self._say_what_was_kept()
 
     def _command_long(self, message: Message) -> None:
@@ -246,14 +247,8 @@ class Server:
         sender = (message.system, message.component)
         self._commands.run(Command(message.command, params, *sender, message.frame))
 
-    def _set_attitude_target(self, message: Message) -> None:
-        self.view.autopilot.obey_attitude(message.values)
-
-    def _set_position_target(self, message: Message) -> None:
-        self.view.autopilot.obey_motion(message.values)
-
-    def _set_global_position_target(self, message: Message) -> None:
-        self.view.autopilot.obey_global_motion(message.values)
+    def _setpoint(self, message: Message) -> None:
+        self.view.autopilot.obey(message.name, message.values)
 
     def _set_mode(self, message: Message) -> None:
         sender = (message.system, message.component)
@@ -309,9 +304,7 @@ HANDLERS: dict[str, Callable[[Server, Message], None]] = {
     "COMMAND_LONG": Server._command_long,
     "COMMAND_INT": Server._command_int,
     "SET_MODE": Server._set_mode,
-    "SET_ATTITUDE_TARGET": Server._set_attitude_target,
-    "SET_POSITION_TARGET_LOCAL_NED": Server._set_position_target,
-    "SET_POSITION_TARGET_GLOBAL_INT": Server._set_global_position_target,
+    **dict.fromkeys((ATTITUDE, LOCAL, GLOBAL), Server._setpoint),
     **dict.fromkeys(MISSION_HANDLERS, Server._mission),
     "TIMESYNC": Server._timesync,
     "PING": Server._ping,

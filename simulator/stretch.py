@@ -68,7 +68,7 @@ class Stretch:
         view = self._view
         if self._odd or view.silent or view.stuck or self._rescheduled:
             self._schedule()
-        if view.autopilot.steps >= self._next_step:
+        if view.autopilot.senses.steps >= self._next_step:
             view.note()
             self._fly(0)
 
@@ -81,8 +81,8 @@ class Stretch:
     def prepare(self) -> None:
         """Take over from the autopilot, which rests: what `fly` flies and tells until it wakes."""
         autopilot = self._view.autopilot
-        pilot = autopilot.pilot
-        self._record["loop_step"] = pilot.next_loop_step(autopilot.steps, autopilot.look, NO_LOOP)
+        pilot, senses = autopilot.pilot, autopilot.senses
+        self._record["loop_step"] = pilot.next_loop_step(senses.steps, senses.look, NO_LOOP)
         autopilot.plant.obey(pilot.demand)
         self._view.note()
 
@@ -102,14 +102,14 @@ class Stretch:
         self._tally[_SEQUENCES:_GAP_COUNT] = one.sequence, other.sequence
         done = _fly.call(
             count,
-            autopilot.steps,
+            autopilot.senses.steps,
             autopilot.plant.address,
             autopilot.pilot.loop.address,
             *self._fixed,
         )
         if done:
             autopilot.plant.flown(done)
-            autopilot.flown(done)
+            autopilot.senses.moved(done)
         self._deliver()
         return done
 

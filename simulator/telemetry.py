@@ -86,7 +86,7 @@ class View:
         """What the vehicle cannot say yet, whatever rate it granted."""
         autopilot = self.autopilot
         event = autopilot.firmware.withheld_until.get(name)
-        return event is not None and event not in autopilot.reached
+        return event is not None and event not in autopilot.health.reached
 
     def note(self) -> None:
         """Bring the record up to date."""
@@ -98,7 +98,7 @@ class View:
             pilot.home_ned_m[2],
             self.sensor_bits,
             self.has_fix,
-            autopilot.landed_state,
+            self.landed_state,
         )
         if state != self._noted:
             self._noted = state
@@ -117,8 +117,8 @@ class View:
 
     def payload(self, name: str) -> bytes:
         """Packed payload of message `name` now; built once per step for all links."""
-        if self._at_step != self.autopilot.steps:
-            self._at_step = self.autopilot.steps
+        if self._at_step != self.autopilot.senses.steps:
+            self._at_step = self.autopilot.senses.steps
             self.payloads.clear()
         packed = self.payloads.get(name)
         if packed is None:
@@ -130,7 +130,7 @@ class View:
 
     def restart(self, autopilot: Autopilot) -> None:
         """Another autopilot, after a reboot."""
-        autopilot.gps_healthy = self.autopilot.gps_healthy
+        autopilot.senses.gps_healthy = self.autopilot.senses.gps_healthy
         self.autopilot = autopilot
         self.clock_offset_us = self.ping_sequence = 0
         self._at_step = -1
@@ -138,7 +138,7 @@ class View:
     @property
     def has_fix(self) -> bool:
         """No fault takes it away."""
-        return self.autopilot.gps_healthy
+        return self.autopilot.senses.gps_healthy
 
     @property
     def sensor_bits(self) -> tuple[int, int, int]:
@@ -146,13 +146,23 @@ class View:
         autopilot = self.autopilot
         sensors = autopilot.firmware.sensors
         present, enabled, health = sensors.present, sensors.enabled, sensors.health
-        if not autopilot.has_fix:
+        if not autopilot.health.has_fix(autopilot.senses.time_s):
             present, enabled, health = present & ~_GPS, enabled & ~_GPS, health & ~_GPS
         elif not self.has_fix:
             health &= ~_GPS
-        if autopilot.healthy:
+        if autopilot.commander.healthy:
             health |= _PREARM
         return present, enabled, health
+
+    @property
+    def landed_state(self) -> int:
+        """MAV_LANDED_STATE: 1 on ground, 2 in air, 3 taking off, 4 landing."""
+        pilot = self.autopilot.pilot
+        if pilot.landed:
+            return 1
+        if pilot.landing:
+            return 4
+        return 3 if pilot.climbing else 2
 
     @property
     def time_ms(self) -> int:
@@ -161,7 +171,7 @@ class View:
     @property
     def time_us(self) -> int:
         """The vehicle's clock, as its stamps show it."""
-        return max(0, self.autopilot.steps * 4000 + self.clock_offset_us)
+        return max(0, self.autopilot.senses.steps * 4000 + self.clock_offset_us)
 
     def geodetic(self, north_m: float, east_m: float) -> tuple[int, int]:
         """Latitude and longitude in 1e-7 deg of a point near the origin (spherical Earth)."""
@@ -213,18 +223,19 @@ def _in_body(attitude: Quaternion, vector_ned: Triple) -> Triple:
 
 def heartbeat(view: View) -> Sequence[Any]:
     autopilot = view.autopilot
+    base_mode, status = autopilot.commander.heartbeat
     return (
         MAV_TYPE_QUADROTOR,
         autopilot.firmware.mav_autopilot,
-        autopilot.base_mode,
-        autopilot.mode.custom_mode,
-        autopilot.system_status,
+        base_mode,
+        autopilot.commander.mode.custom_mode,
+        status,
         3,
     )
 
 
 def attitude(view: View) -> Sequence[Any]:
-    nav = view.autopilot.look()
+    nav = view.autopilot.senses.look()
     w, x, y, z = nav.attitude
     roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
@@ -232,17 +243,17 @@ def attitude(view: View) -> Sequence[Any]:
 
 
 def attitude_quaternion(view: View) -> Sequence[Any]:
-    nav = view.autopilot.look()
+    nav = view.autopilot.senses.look()
     return (view.time_ms, *nav.attitude, *nav.rates_frd_radps, (0.0, 0.0, 0.0, 0.0))
 
 
 def local_position_ned(view: View) -> Sequence[Any]:
-    nav = view.autopilot.look()
+    nav = view.autopilot.senses.look()
     return (view.time_ms, *nav.position_ned_m, *nav.velocity_ned_mps)
 
 
 def odometry(view: View) -> Sequence[Any]:
-    nav = view.autopilot.look()
+    nav = view.autopilot.senses.look()
     frame = 1  # MAV_FRAME_LOCAL_NED, velocities too, as PX4 sends it
     return (
         view.time_us,
@@ -261,7 +272,7 @@ def odometry(view: View) -> Sequence[Any]:
 
 
 def global_position_int(view: View) -> Sequence[Any]:
-    nav = view.autopilot.look()
+    nav = view.autopilot.senses.look()
     north, east, down = nav.position_ned_m
     home_down = view.autopilot.pilot.home_ned_m[2]
     return (
@@ -275,7 +286,7 @@ def global_position_int(view: View) -> Sequence[Any]:
 
 
 def altitude(view: View) -> Sequence[Any]:
-    down = view.autopilot.look().position_ned_m[2]
+    down = view.autopilot.senses.look().position_ned_m[2]
     amsl = view.altitude_mm(down) / 1e3
     relative = view.autopilot.pilot.home_ned_m[2] - down
     return (view.time_us, amsl, amsl, -down, relative, math.nan, math.nan)
@@ -283,7 +294,7 @@ def altitude(view: View) -> Sequence[Any]:
 
 def highres_imu(view: View) -> Sequence[Any]:
     """Specific force of the truth in body axes, rates as estimated."""
-    nav = view.autopilot.look()
+    nav = view.autopilot.senses.look()
     w, x, y, z, *_, down, a_north, a_east, a_down = view.autopilot.plant.motion()
     force = _in_body((w, x, y, z), (a_north, a_east, a_down - GRAVITY_MPS2))
     height = view.autopilot.firmware.origin[2] - down
@@ -335,7 +346,7 @@ def timesync(view: View) -> Sequence[Any]:
 
 def vfr_hud(view: View) -> Sequence[Any]:
     autopilot = view.autopilot
-    nav = autopilot.look()
+    nav = autopilot.senses.look()
     north, east, down = nav.velocity_ned_mps
     return (
         0.0,
@@ -366,7 +377,7 @@ def gps_raw_int(view: View) -> Sequence[Any]:
 
 def sys_status(view: View) -> Sequence[Any]:
     autopilot = view.autopilot
-    battery = autopilot.truth.battery
+    battery = autopilot.senses.truth.battery
     present, enabled, health = view.sensor_bits
     return (
         present, enabled, health, 80,
@@ -378,11 +389,12 @@ def sys_status(view: View) -> Sequence[Any]:
 
 
 def extended_sys_state(view: View) -> Sequence[Any]:
-    return (0, view.autopilot.landed_state)
+    return (0, view.landed_state)
 
 
 def estimator_status(view: View) -> Sequence[Any]:
-    flags = 895 if view.autopilot.has_fix else 1024
+    autopilot = view.autopilot
+    flags = 895 if autopilot.health.has_fix(autopilot.senses.time_s) else 1024
     return (view.time_us, flags, 0.12, 0.03, 0.03, 0.14, 0.02, math.nan, 0.3, 0.31)
 
 
@@ -396,7 +408,7 @@ def ping(view: View) -> Sequence[Any]:
 
 
 def battery_status(view: View) -> Sequence[Any]:
-    battery = view.autopilot.truth.battery
+    battery = view.autopilot.senses.truth.battery
     voltage = _fit(battery.voltage_v * 1e3, 16, signed=False)
     return (
         0, 1, 1, 32767, (voltage, *(65535,) * 9), _fit(battery.current_a * 100, 16), 0, -1,
@@ -422,7 +434,7 @@ def home_position(view: View) -> Sequence[Any]:
 
 def hil_state_quaternion(view: View) -> Sequence[Any]:
     """The truth. Latitude and longitude are in steps of 1 cm; PX4 leaves time_usec 0."""
-    truth = view.autopilot.truth
+    truth = view.autopilot.senses.truth
     north, east, down = truth.position_ned_m.tolist()
     a, b, c = (_fit(value / GRAVITY_MPS2 * 1e3, 16) for value in truth.acceleration_ned_mps2)
     v_north, v_east, v_down = truth.velocity_ned_mps.tolist()

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from simulator import config
+from simulator.commander import Wish
 from simulator.conditions import Conditions
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
@@ -36,7 +37,7 @@ def _standing() -> Instance:
 
 def _holding() -> Instance:
     instance = _standing()
-    instance.autopilot.happen("mode", mode="AUTO.TAKEOFF")
+    instance.autopilot.happen("mode", Wish("AUTO.TAKEOFF"))
     instance.autopilot.happen("arm")
     _fly(instance, 12.0)
     return instance

@@ -76,4 +76,4 @@ def test_a_takeoff_that_is_refused_ends_on_the_ground_without_a_setpoint() -> No
     assert "no lift-off" in outcome.sentence
     assert len(pair.commands(TAKEOFF)) >= 8
     assert pair.setpoints == []
-    assert not pair.instance.autopilot.armed
+    assert not pair.instance.autopilot.commander.armed

@@ -37,7 +37,7 @@ def test_flies_a_short_lemniscate_and_lands(law: str, tmp_path: Path) -> None:
     score = pair.score(tmp_path)
     assert score.rmse_position_m < MOST_M[law]
     assert score.tracked_s == pytest.approx(6.0, abs=0.3)
-    assert not pair.instance.autopilot.armed
+    assert not pair.instance.autopilot.commander.armed
 
 
 def test_autopilot_gets_positions_while_tracking_and_attitudes_before(tmp_path: Path) -> None:
@@ -82,7 +82,7 @@ def flown(law: str, tmp_path: Path, *assignments: str) -> tuple[np.ndarray, np.n
         if companion.phase in (Phase.CLIMB, Phase.JOIN, Phase.TRACK, Phase.HOVER):
             mission = companion.mission
             times.append(mission.track_time_s(companion.view.time_s))
-            truth = np.array(pair.instance.autopilot.truth.position_ned_m)
+            truth = np.array(pair.instance.autopilot.senses.truth.position_ned_m)
             places.append(truth - mission.origin_ned_m)
 
     pair._step = watched  # type: ignore[method-assign]

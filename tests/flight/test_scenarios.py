@@ -64,7 +64,7 @@ def in_track(action: Callable[[Pair], None], flight: Callable[..., Pair] = lemni
 
 
 def never_armed(pair: Pair) -> Checks:
-    yield not pair.instance.autopilot.armed
+    yield not pair.instance.autopilot.commander.armed
     yield not pair.went_through(Phase.TAKEOFF)
 
 
@@ -81,8 +81,8 @@ def disarmed_by_us(pair: Pair) -> Checks:
 
 def landed(pair: Pair) -> Checks:
     autopilot = pair.instance.autopilot
-    yield not autopilot.armed
-    yield autopilot.landed
+    yield not autopilot.commander.armed
+    yield autopilot.pilot.landed
     yield len(pair.commands(LAND)) >= 1
 
 
@@ -102,16 +102,16 @@ def soft_landing(pair: Pair) -> Checks:
 
 def left_to_the_pilot(pair: Pair) -> Checks:
     autopilot = pair.instance.autopilot
-    yield autopilot.armed
-    yield autopilot.mode.name == "AUTO.LOITER"
+    yield autopilot.commander.armed
+    yield autopilot.commander.mode.name == "AUTO.LOITER"
     yield not pair.commands(LAND)
 
 
 def landing_left_to_the_pilot(pair: Pair) -> Checks:
     """Nothing is asked once the heartbeat, at 1 Hz, has shown the pilot's mode."""
     autopilot = pair.instance.autopilot
-    yield autopilot.armed
-    yield autopilot.mode.name == "AUTO.LOITER"
+    yield autopilot.commander.armed
+    yield autopilot.commander.mode.name == "AUTO.LOITER"
     (began_s,) = (at_s for at_s, phase in pair.phases if phase is Phase.LAND)
     frames = [(at_s, decode(frame)) for at_s, _, frame in pair.sent if at_s > began_s + 2.6]
     yield len(frames) > 10
@@ -129,7 +129,7 @@ def held_then_silent(pair: Pair) -> Checks:
 
 def told_to_land(pair: Pair) -> Checks:
     """Level setpoints while nothing is seen, at most 0.5 s of silence before the first of them."""
-    yield pair.instance.autopilot.mode.name == "AUTO.LAND"
+    yield pair.instance.autopilot.commander.mode.name == "AUTO.LAND"
     blind_s = pair.heard_s
     after = [(at_s, s) for at_s, _, s in pair.setpoints if at_s > blind_s + 0.2]
     yield len(after) >= 5 and after[0][0] < blind_s + 0.5
@@ -193,8 +193,8 @@ def already_flying() -> Pair:
     pair.ground(ARM_DISARM, 1)
     while instance.time_s < 17.0:
         instance.step()
-    assert instance.autopilot.mode.name == "AUTO.LOITER"
-    assert not instance.autopilot.landed
+    assert instance.autopilot.commander.mode.name == "AUTO.LOITER"
+    assert not instance.autopilot.pilot.landed
     return pair
 
 
@@ -214,7 +214,7 @@ def flown_by_another() -> Pair:
         if second == 150:
             pair.ground(SET_MODE, 1, 6)
         pair.instance.step()
-    assert pair.instance.autopilot.mode.name == "OFFBOARD"
+    assert pair.instance.autopilot.commander.mode.name == "OFFBOARD"
     return pair
 
 
@@ -270,7 +270,7 @@ ROWS = (
         4,
         "stop requested by the operator; still armed after 2 s",
         Phase.FAILED,
-        lambda pair: iter([pair.instance.autopilot.armed]),
+        lambda pair: iter([pair.instance.autopilot.commander.armed]),
     ),
     stopped(Phase.TAKEOFF, 0.3, Phase.DISARMED, stayed_down),
     stopped(Phase.TAKEOFF, 1.5, Phase.DISARMED, landed),
@@ -394,7 +394,7 @@ ROWS = (
         4,
         "the vehicle left OFFBOARD for AUTO.LOITER",
         Phase.YIELDED,
-        lambda pair: iter([pair.instance.autopilot.mode.name == "AUTO.LOITER"]),
+        lambda pair: iter([pair.instance.autopilot.commander.mode.name == "AUTO.LOITER"]),
     ),
     Row(
         "motors cut in flight",
@@ -402,7 +402,7 @@ ROWS = (
         4,
         "the vehicle disarmed in flight",
         Phase.FAILED,
-        lambda pair: iter([not pair.instance.autopilot.armed]),
+        lambda pair: iter([not pair.instance.autopilot.commander.armed]),
     ),
     # the link
     Row("20 Hz", lambda: lemniscate(firmware=slow(20.0)), 0, FLOWN, Phase.DISARMED, flown),
@@ -432,7 +432,7 @@ ROWS = (
         4,
         "the vehicle restarted in flight",
         Phase.FAILED,
-        lambda pair: iter([not pair.instance.autopilot.armed]),
+        lambda pair: iter([not pair.instance.autopilot.commander.armed]),
     ),
     Row(
         "position and attitude stop, heartbeats go on",

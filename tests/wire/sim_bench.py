@@ -70,7 +70,7 @@ class Bench:
 
     @property
     def height_m(self) -> float:
-        return -float(self.instance.autopilot.truth.position_ned_m[2])
+        return -float(self.instance.autopilot.senses.truth.position_ned_m[2])
 
     # -- sending -----------------------------------------------------------------------------
 
@@ -187,11 +187,16 @@ class Bench:
     @property
     def mode(self) -> int:
         """custom_mode as the next heartbeat will show it."""
-        return self.instance.autopilot.mode.custom_mode
+        return self.instance.autopilot.commander.mode.custom_mode
+
+    @property
+    def system_status(self) -> int:
+        """MAV_STATE as the next heartbeat will show it."""
+        return self.instance.autopilot.commander.heartbeat[1]
 
     @property
     def armed(self) -> bool:
-        return self.instance.autopilot.armed
+        return self.instance.autopilot.commander.armed
 
     # -- scripts -----------------------------------------------------------------------------
 

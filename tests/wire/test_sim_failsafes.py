@@ -37,9 +37,9 @@ def test_a_low_battery_holds_then_acts(remaining: float, action: int, mode: int)
     begun_s = bench.time_s
     drain(bench, remaining)
     bench.run(4.8)
-    assert (bench.mode, bench.instance.autopilot.system_status) == (LOITER, 5)
+    assert (bench.mode, bench.system_status) == (LOITER, 5)
     bench.run(0.5)
-    assert (bench.mode, bench.instance.autopilot.system_status) == (mode, 5)
+    assert (bench.mode, bench.system_status) == (mode, 5)
     level = "Critical battery" if remaining > 0.05 else "Emergency battery level"
     assert bench.texts(begun_s)[:3] == [
         level,
@@ -61,7 +61,7 @@ def test_by_default_a_battery_only_warns_of_each_level_once() -> None:
         "Critical battery",
         "Emergency battery level",
     ]
-    assert (bench.mode, bench.instance.autopilot.system_status) == (LOITER, 4)
+    assert (bench.mode, bench.system_status) == (LOITER, 4)
 
 
 def test_the_pilot_takes_over_before_the_failsafe_acts() -> None:
@@ -71,7 +71,7 @@ def test_the_pilot_takes_over_before_the_failsafe_acts() -> None:
     bench.run(0.6, bench.attitude)
     assert bench.ask_mode(OFFBOARD) == [0, 0]
     bench.run(5.0, bench.attitude)
-    assert (bench.mode, bench.instance.autopilot.system_status) == (OFFBOARD, 4)
+    assert (bench.mode, bench.system_status) == (OFFBOARD, 4)
 
 
 def test_a_stream_does_not_end_a_battery_failsafe() -> None:
@@ -85,19 +85,18 @@ def test_a_stream_does_not_end_a_battery_failsafe() -> None:
 def test_a_lost_ground_station(action: int, mode: int) -> None:
     """Lost COM_DL_LOSS_T after it counts as gone, 2.5 s; its return ends no failsafe."""
     bench = flying("NAV_DLL_ACT", action)
-    autopilot = bench.instance.autopilot
     begun_s, bench.heartbeat_type = bench.time_s, None
     bench.run(11.3)
-    assert (bench.mode, autopilot.system_status) == (LOITER, 4)
+    assert (bench.mode, bench.system_status) == (LOITER, 4)
     bench.run(1.5)
-    assert (bench.mode, autopilot.system_status) == (LOITER, 5 if action else 4)
+    assert (bench.mode, bench.system_status) == (LOITER, 5 if action else 4)
     bench.run(5.3)
     assert bench.mode == mode
     assert "Connection to ground station lost" not in bench.texts(begun_s)  # nobody was there
     bench.heartbeat_type = 6
     bench.run(1.5)
     assert bench.texts(begun_s)[-1] == "GCS connection regained"
-    assert (bench.mode, autopilot.system_status) == (mode, 5 if action else 4)
+    assert (bench.mode, bench.system_status) == (mode, 5 if action else 4)
 
 
 def test_texts_wait_for_a_ground_station_five_seconds() -> None:
@@ -135,16 +134,16 @@ def test_a_worse_battery_changes_what_is_awaited() -> None:
 def test_without_position_automatic_flight_lands_and_attitude_flies_on() -> None:
     bench = flying()
     autopilot = bench.instance.autopilot
-    autopilot.gps_healthy = False
+    autopilot.senses.gps_healthy = False
     bench.run(4.5)
     assert bench.mode == LOITER
     bench.run(1.0)
-    assert (bench.mode, autopilot.system_status) == (LAND, 5)
-    autopilot.gps_healthy = True
+    assert (bench.mode, bench.system_status) == (LAND, 5)
+    autopilot.senses.gps_healthy = True
     bench.run(0.5)
-    assert (bench.mode, autopilot.system_status) == (LOITER, 4)
+    assert (bench.mode, bench.system_status) == (LOITER, 4)
     bench.run(0.6, bench.attitude)
     bench.ask_mode(OFFBOARD)
-    autopilot.gps_healthy = False
+    autopilot.senses.gps_healthy = False
     bench.run(6.0, bench.attitude)
-    assert (bench.mode, autopilot.system_status) == (OFFBOARD, 4)
+    assert (bench.mode, bench.system_status) == (OFFBOARD, 4)

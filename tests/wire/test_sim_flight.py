@@ -8,9 +8,10 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from sim_bench import HOVER, LAND, LOITER, NAN, OFFBOARD, POSCTL, RTL, TAKEOFF, Bench, px4_vehicle
 
-from simulator.autopilot import ACTIONS, GUARDS, describe
+from simulator.commander import ACTIONS, GUARDS
 from simulator.firmware.px4 import PX4
 from simulator.sensors import EstimatorName
+from simulator.state_table import describe
 
 
 def set_parameter(bench: Bench, name: str, value: float) -> None:
@@ -36,7 +37,7 @@ def test_stream_loss_trips_a_little_after_one_second(period_s: float) -> None:
     last_s = bench.time_s
     bench.run(1.5)
     assert 1.03 <= bench.text_at("Failsafe activated") - last_s <= 1.06
-    assert (bench.mode, bench.instance.autopilot.system_status) == (POSCTL, 5)
+    assert (bench.mode, bench.system_status) == (POSCTL, 5)
 
 
 def test_until_then_the_last_attitude_and_thrust_go_on() -> None:
@@ -69,7 +70,7 @@ def test_resuming_the_stream_returns_to_offboard_by_itself() -> None:
     bench.run(2.0, lambda: bench.position(0, 0, -5))
     shown_s = next(t for t, m in bench.of("HEARTBEAT", begun_s) if m.custom_mode == OFFBOARD)
     assert shown_s - begun_s < 1.1
-    assert bench.instance.autopilot.system_status == 4
+    assert bench.system_status == 4
 
 
 @pytest.mark.parametrize(("period_s", "trips"), [(0.8, False), (1 / 1.5, False), (1 / 0.9, True)])
@@ -105,7 +106,7 @@ def test_a_mode_chosen_in_the_failsafe_stays() -> None:
     bench.run(2.0)
     assert bench.command(21) == [0]
     bench.run(1.0, bench.attitude)
-    assert (bench.mode, bench.instance.autopilot.system_status) == (LAND, 4)
+    assert (bench.mode, bench.system_status) == (LAND, 4)
 
 
 # -- automatic flight ------------------------------------------------------------------------
@@ -157,7 +158,7 @@ def test_a_least_thrust_that_lifts_never_lands() -> None:
     bench.fly_offboard(2.0)
     bench.command(21)
     bench.run(10.0)
-    assert -bench.instance.autopilot.truth.velocity_ned_mps[2] == pytest.approx(2.0, abs=0.3)
+    assert -bench.instance.autopilot.senses.truth.velocity_ned_mps[2] == pytest.approx(2.0, abs=0.3)
     set_parameter(bench, "MPC_THR_MIN", 0.05)
     bench.run_until(lambda: not bench.armed, 60.0)
 
@@ -178,7 +179,7 @@ def test_return_flies_home_and_lands() -> None:
     bench.run(10.0, lambda: bench.position(8, 4, -5))
     assert bench.command(20) == [0]
     bench.run_until(lambda: not bench.armed, 40.0)
-    x, y, z = bench.instance.autopilot.truth.position_ned_m
+    x, y, z = bench.instance.autopilot.senses.truth.position_ned_m
     assert math.hypot(x, y) < 1.0
     assert abs(z) < 0.05
 
@@ -225,7 +226,7 @@ def test_velocity_and_yaw_setpoints() -> None:
 
 def climb_rate_after(bench: Bench, duration_s: float, **setpoint: object) -> float:
     bench.run(duration_s, lambda: bench.attitude(**setpoint))
-    return -float(bench.instance.autopilot.truth.velocity_ned_mps[2])
+    return -float(bench.instance.autopilot.senses.truth.velocity_ned_mps[2])
 
 
 @pytest.mark.parametrize(
@@ -339,7 +340,7 @@ def test_reposition_holds_somewhere_else(frame: int, height_m: float) -> None:
     )
     bench.run(12.0)
     assert bench.mode == LOITER
-    place = bench.instance.autopilot.truth.position_ned_m
+    place = bench.instance.autopilot.senses.truth.position_ned_m
     assert place == pytest.approx([10.0, 0.0, -5.0], abs=0.2)
 
 
@@ -366,7 +367,7 @@ def test_position_gains_and_speeds_are_obeyed_while_flying() -> None:
     bench.fly_offboard()
     assert bench.instance.autopilot.parameters.set("MPC_XY_VEL_MAX", 1.0)
     bench.run(9.0, lambda: bench.position(20, 0, -3))
-    speed_mps = math.hypot(*bench.instance.autopilot.truth.velocity_ned_mps[:2])
+    speed_mps = math.hypot(*bench.instance.autopilot.senses.truth.velocity_ned_mps[:2])
     assert speed_mps == pytest.approx(1.0, abs=0.1)
 
 
@@ -377,5 +378,5 @@ def test_a_landing_is_felt_three_stages_after_the_touch() -> None:
     bench.command(21)
     plant = bench.instance.autopilot.plant
     touched_s = bench.run_until(lambda: plant.on_ground, 10.0)
-    bench.run_until(lambda: bench.instance.autopilot.landed, 5.0)
+    bench.run_until(lambda: bench.instance.autopilot.pilot.landed, 5.0)
     assert bench.time_s - touched_s == pytest.approx(3.1, abs=0.15)

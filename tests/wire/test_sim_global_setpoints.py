@@ -94,7 +94,7 @@ def test_other_frames_are_refused_aloud_and_are_no_stream(message: object, text:
     bench.send(message)
     bench.run(0.1)
     assert bench.texts() == [text]
-    assert not bench.instance.autopilot.stream_alive
+    assert not bench.instance.autopilot.stream.alive(bench.time_s)
 
 
 def test_what_is_no_number_moves_nothing_to_infinity() -> None:

@@ -265,7 +265,7 @@ def test_truth_is_sent_on_request() -> None:
     bench.run_until(lambda: bench.instance.companion.view.time_ms % 40 == 0, 0.1)
     bench.run(0.0)
     at_s, state = bench.of("HIL_STATE_QUATERNION")[-1]
-    truth = bench.instance.autopilot.truth
+    truth = bench.instance.autopilot.senses.truth
     assert state.time_usec == round(at_s * 1e6) == round(bench.time_s * 1e6)
     latitude, longitude, amsl = PX4.origin
     north = math.radians(state.lat * 1e-7 - latitude) * 6_371_000
@@ -349,7 +349,7 @@ def test_hostile_frames_and_then_a_normal_flight(seed: int) -> None:
         if count % 10 == 0:
             bench.run(0.02)
     bench.command(21)
-    bench.run_until(lambda: bench.instance.autopilot.landed, 300.0)
+    bench.run_until(lambda: bench.instance.autopilot.pilot.landed, 300.0)
     bench.command(400, 0, 21196)
     autopilot = bench.instance.autopilot
     for spec in PX4.parameters:

@@ -140,8 +140,8 @@ def test_an_arducopter_flies_in_stretches_without_a_setpoint_and_behind_the_last
             while instance.time_s < until_s:
                 step(instance)
                 said[-1] += instance.drain()
-        assert instance.autopilot.truth.position_ned_m[2] == pytest.approx(-5.0, abs=0.5)
-        assert instance.autopilot.truth.position_ned_m[0] > 2.0
+        assert instance.autopilot.senses.truth.position_ned_m[2] == pytest.approx(-5.0, abs=0.5)
+        assert instance.autopilot.senses.truth.position_ned_m[0] > 2.0
     assert said[0] == said[1]
 
 
@@ -158,10 +158,10 @@ def test_stretches_end_before_a_battery_is_found_empty() -> None:
 def test_the_script_flies_by_attitude_and_lands_after_its_end() -> None:
     instance = _instance()
     _flown(instance, Instance.advance_to_barrier, 17.0)
-    assert instance.autopilot.armed
-    assert instance.autopilot.mode.custom_mode == OFFBOARD
+    assert instance.autopilot.commander.armed
+    assert instance.autopilot.commander.mode.custom_mode == OFFBOARD
     _flown(instance, Instance.advance_to_barrier, 60.0)
-    assert instance.autopilot.landed
+    assert instance.autopilot.pilot.landed
 
 
 def test_most_steps_of_a_vehicle_left_alone_are_flown_in_stretches(
@@ -218,9 +218,9 @@ def _shake(instance: Instance, random: np.random.Generator, scale: float) -> Non
     body[:4] = attitude / np.linalg.norm(attitude)
     body[12] = -abs(body[12]) % 9e3
     rotor[:3] = random.random(), 0.0, 10.0 * abs(rotor[2])
-    autopilot._nav = autopilot._truth = None
-    autopilot.steps = 2 * int(random.integers(0, 2**30))
-    autopilot.gps_healthy = bool(random.random() < 0.5)
+    autopilot.senses.forget()
+    autopilot.senses.steps = 2 * int(random.integers(0, 2**30))
+    autopilot.senses.gps_healthy = bool(random.random() < 0.5)
     pilot = autopilot.pilot
     pilot.home_ned_m = (0.0, 0.0, scale)
     pilot.fall(on_ground=bool(random.random() < 0.5))

@@ -20,7 +20,7 @@ _PWM_LEAST, _PWM_SPAN = 1000, 1000
 
 def _specific_force(view: View) -> tuple[float, float, float]:
     """What an accelerometer would show, FRD, m/s^2."""
-    truth = view.autopilot.truth
+    truth = view.autopilot.senses.truth
     force_ned = truth.acceleration_ned_mps2.copy()
     force_ned[2] -= GRAVITY_MPS2
     x, y, z = (rotation_from_quaternion(truth.attitude).T @ force_ned).tolist()
@@ -29,7 +29,7 @@ def _specific_force(view: View) -> tuple[float, float, float]:
 
 def simstate(view: View) -> Sequence[Any]:
     """The truth, without height and velocity."""
-    truth = view.autopilot.truth
+    truth = view.autopilot.senses.truth
     north, east, _ = truth.position_ned_m.tolist()
     return (
         *euler_from_quaternion(truth.attitude).tolist(),
@@ -41,7 +41,7 @@ def simstate(view: View) -> Sequence[Any]:
 
 def sim_state(view: View) -> Sequence[Any]:
     """The truth. It carries no time stamp; latitude and longitude are in steps of 1 cm."""
-    truth = view.autopilot.truth
+    truth = view.autopilot.senses.truth
     north, east, down = truth.position_ned_m.tolist()
     latitude, longitude = view.geodetic(north, east)
     return (
@@ -62,8 +62,8 @@ def sim_state(view: View) -> Sequence[Any]:
 
 def ekf_status_report(view: View) -> Sequence[Any]:
     """EKF_STATUS_REPORT: flags grow as the estimate does; variances as of a good one."""
-    reached = view.autopilot.reached
-    if view.autopilot.position_lost:
+    reached = view.autopilot.health.reached
+    if view.autopilot.watch.position_lost:
         reached -= {"position"}
     flags = next((bits for event, bits in _EKF_FLAGS if event in reached), _EKF_UNINITIALISED)
     return (flags, 0.02, 0.02, 0.02, 0.01, 0.0, 0.0)
@@ -72,7 +72,7 @@ def ekf_status_report(view: View) -> Sequence[Any]:
 def raw_imu(view: View) -> Sequence[Any]:
     """Milli-g, millirad/s, milligauss; 25 degrees."""
     force = (_int16(value / GRAVITY_MPS2 * 1e3) for value in _specific_force(view))
-    rates = (_int16(value * 1e3) for value in view.autopilot.look().rates_frd_radps)
+    rates = (_int16(value * 1e3) for value in view.autopilot.senses.look().rates_frd_radps)
     return (view.time_us, *force, *rates, 224, 80, -528, 0, 2500)
 
 
