@@ -20,6 +20,7 @@ from offboard.control.observer_adaptation import Adaptation
 from offboard.control.observer_filter import (
     POSITION_JUMPED,
     VELOCITY_JUMPED,
+    bound_disturbance,
     hear_attitude,
     hear_position,
 )
@@ -118,10 +119,8 @@ class Observer:
         self._adopt(vehicle)
         self._adaptation.trust_thrust()
         self._state[DISTURBANCE + 2] = down
-        disturbance = self._state[DISTURBANCE : DISTURBANCE + 3]
-        disturbance += slowed * self._state[VELOCITY : VELOCITY + 3]
-        limit = self._settings.disturbance_limit_mps2
-        np.clip(disturbance, -limit, limit, out=disturbance)
+        self._state[DISTURBANCE : DISTURBANCE + 3] += slowed * self._state[VELOCITY : VELOCITY + 3]
+        bound_disturbance(self._state, self._settings.disturbance_limit_mps2)
 
     @property
     def ready(self) -> bool:

@@ -1,4 +1,4 @@
-"""What the observer computes, compiled: one record, and what a message or a look ahead does to it.
+"""What the observer computes, compiled: one record, and what a message does to it.
 
 The record holds the believed state, the commands sent, three filters (both lateral axes, vertical,
 course) and what is learnt of their noise. Which message counts, and what a silence or the ground
@@ -51,8 +51,8 @@ from offboard.model.kernel import entry, kernel
 
 Array = NDArray[np.float64]
 
-# Places in a filter: per lateral axis [p v b b' d beta], vertical [p v d beta], course [psi psi'].
-LATERAL, VERTICAL, HEADING = 0, 1, 2
+LATERAL, VERTICAL, HEADING = 0, 1, 2  # filters
+# Places in them: per lateral axis [p v b b' d beta], vertical [p v d beta], course [psi psi'].
 LATERAL_TILT, LATERAL_DRIFT, VERTICAL_DRIFT, HEADING_COURSE = 2, 4, 2, 0
 POSITION_JUMPED, VELOCITY_JUMPED = 1, 2  # bits of an answer
 IGNORED, BIASED, TRUSTED = 0, 1, 2  # the reported velocity
