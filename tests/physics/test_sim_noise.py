@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numba
 import numpy as np
 import pytest
 from scipy import stats
@@ -18,21 +19,30 @@ from simulator.wind import Gusts, dryden, wind_axes
 
 def _normals(seed: int, lane: int, steps: int, width: int) -> np.ndarray:
     out = np.empty((steps, width))
-    for step in range(steps):
-        fill_normals(seed_word(seed), np.uint64(lane), step, out[step])
+    _fill(seed_word(seed), np.uint64(lane), out)
     return out
+
+
+@numba.njit
+def _fill(seed, lane, out):
+    for step in range(len(out)):
+        fill_normals(seed, lane, step, out[step])
 
 
 def _simulate(process, steps: int, seed: int) -> np.ndarray:
     """(steps, n) path that starts in the stationary distribution."""
-    normals = _normals(seed, 0, steps, len(process.transition))
-    path = np.empty_like(normals)
-    x = process.stationary_scale @ normals[0]
-    work = np.empty_like(x)
-    for step in range(steps):
-        advance_block(process.transition, process.scale, 0, len(x), 1.0, normals[step], x, work)
-        path[step] = x
+    path = _normals(seed, 0, steps, len(process.transition))
+    x = process.stationary_scale @ path[0]
+    _advance(process.transition, process.scale, x, np.empty_like(x), path)
     return path
+
+
+@numba.njit
+def _advance(transition, scale, x, work, path):
+    """Normals into states."""
+    for step in range(len(path)):
+        advance_block(transition, scale, 0, len(x), 1.0, path[step], x, work)
+        path[step] = x
 
 
 @pytest.mark.parametrize("width", [1, 4, 9])
