@@ -1,7 +1,8 @@
 """A mission: its items, how far it has come, and where it wants the vehicle to be.
 
-Knows positions and time; knows no modes, no links and no protocol (`simulator.mission_transfer`).
-What it comes upon (an item reached, its end, a return asked for) it says as events.
+Fences and rally points are kept beside it, and not heeded. Knows positions and time; knows no
+modes, no links and no protocol (`simulator.mission_transfer`). What it comes upon (an item reached,
+its end, a return asked for) it says as events.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ import math
 from dataclasses import dataclass, field
 from enum import IntEnum
 
-from simulator.firmware.base import NAN3, MotionSetpoint, Triple
+from simulator.firmware.base import NAN3, MissionItem, MotionSetpoint, Triple
 from simulator.geodesy import GLOBAL_FRAMES, RELATIVE_FRAMES, Origin, down_m, to_metres
 
 ITEMS_MAX = 500
@@ -37,15 +38,8 @@ _WAITS = frozenset({Kind.WAYPOINT, Kind.LOITER_TIME, Kind.DELAY})
 
 
 @dataclass(frozen=True, slots=True)
-class Item:
-    """One item as it was uploaded: x and y in 1e-7 deg, z in m, of `frame`."""
-
-    frame: int
-    command: int
-    params: tuple[float, float, float, float]
-    x: int
-    y: int
-    z: float
+class Item(MissionItem):
+    """One item, and what it means to who flies it."""
 
     @property
     def is_place(self) -> bool:
@@ -70,6 +64,7 @@ class Mission:
     origin: Origin
     first: int = 0  # the item with which it begins
     items: tuple[Item, ...] = ()
+    beside: dict[int, tuple[Item, ...]] = field(default_factory=dict)  # by MAV_MISSION_TYPE
     current: int = 0
     reached: int = -1
     finished: bool = False
@@ -85,6 +80,17 @@ class Mission:
     def flyable(self) -> bool:
         to_do = self.items[self.first :]
         return any(item.is_place or item.command == Kind.RETURN for item in to_do)
+
+    def listed(self, kind: int) -> tuple[Item, ...]:
+        """Items of this MAV_MISSION_TYPE."""
+        return self.beside.get(kind, ()) if kind else self.items
+
+    def keep(self, kind: int, items: tuple[Item, ...]) -> None:
+        """Other items of this MAV_MISSION_TYPE, or none."""
+        if kind:
+            self.beside[kind] = items
+        else:
+            self.replace(items)
 
     def replace(self, items: tuple[Item, ...]) -> None:
         """Another mission, or none; from its beginning."""

@@ -1,7 +1,8 @@
 """The mission protocol of one link: upload item by item, download, clear, current item.
 
-Knows messages and the mission's items; how a mission is flown is `simulator.mission`'s affair.
-Only missions are kept: fences and rally points are empty lists that take nothing.
+Missions, fences and rally points come and go alike. Knows messages and items; how a mission is
+flown is `simulator.mission`'s affair, and what items a firmware takes, and how it shows them, the
+firmware's.
 """
 
 from __future__ import annotations
@@ -12,12 +13,12 @@ from enum import IntEnum
 from typing import Protocol
 
 from simulator.codec import Message
-from simulator.geodesy import GLOBAL_FRAMES, RELATIVE_FRAMES
+from simulator.firmware.base import MissionRules, Say
 from simulator.mission import ITEMS_MAX, Item, Mission
 
 ASK_AGAIN_S, GIVE_UP_S = 0.25, 5.0
 _ANY_TYPE = 255
-_COMMAND_FRAME = 2  # MAV_FRAME_MISSION: no place
+_KINDS = frozenset({0, 1, 2})  # MAV_MISSION_TYPE: mission, fence, rally points
 
 
 class Ack(IntEnum):
@@ -25,7 +26,6 @@ class Ack(IntEnum):
 
     ACCEPTED = 0
     ERROR = 1
-    UNSUPPORTED_FRAME = 2
     UNSUPPORTED = 3
     NO_SPACE = 4
     INVALID_SEQUENCE = 13
@@ -38,6 +38,7 @@ class Link(Protocol):
     def send(self, name: str, *values: object) -> None: ...
     def send_now(self, name: str) -> None: ...
     def complain(self, text: str) -> None: ...
+    def say(self, said: Say) -> None: ...
 
 
 @dataclass(slots=True)
@@ -45,6 +46,7 @@ class Upload:
     """Under way: from whom, what has come, when the next item was asked for."""
 
     peer: tuple[int, int]
+    kind: int
     count: int
     items: list[Item]
     begun_s: float
@@ -56,16 +58,17 @@ class Download:
     """Under way: to whom, which item comes next."""
 
     peer: tuple[int, int]
+    kind: int
     due: int = 0
 
 
 @dataclass(slots=True)
 class Transfer:
-    """`strictly`: items go down in order alone, and are asked for in the kind that came last."""
+    """What one link has under way."""
 
     link: Link
     mission: Mission
-    strictly: bool
+    rules: MissionRules
     _upload: Upload | None = None
     _download: Download | None = None
     _whole: bool = False  # places come in whole 1e-7 degrees
@@ -84,7 +87,7 @@ class Transfer:
         if upload is None:
             return
         if now_s - upload.begun_s > GIVE_UP_S:
-            self._acknowledge(upload.peer, Ack.CANCELLED)
+            self._acknowledge(upload.peer, Ack.CANCELLED, upload.kind)
             self._upload = None
         elif now_s - upload.asked_s > ASK_AGAIN_S:
             self._ask(upload, now_s)
@@ -93,23 +96,23 @@ class Transfer:
 
     def _count(self, message: Message, now_s: float) -> None:
         peer = (message.system, message.component)
-        if message.mission_type:
-            known = Ack.UNSUPPORTED if message.count else Ack.ACCEPTED
-            self._acknowledge(peer, known, message.mission_type)
+        kind = message.mission_type
+        if kind not in _KINDS:
+            self._acknowledge(peer, Ack.UNSUPPORTED, kind)
         elif message.count > ITEMS_MAX:
-            self._acknowledge(peer, Ack.NO_SPACE)
+            self._acknowledge(peer, Ack.NO_SPACE, kind)
         elif message.count == 0:
-            self.mission.replace(())
-            self._acknowledge(peer, Ack.ACCEPTED)
+            self.mission.keep(kind, ())
+            self._acknowledge(peer, Ack.ACCEPTED, kind)
         else:
-            self._upload = Upload(peer, message.count, [], now_s, now_s)
+            self._upload = Upload(peer, kind, message.count, [], now_s, now_s)
             self._ask(self._upload, now_s)
 
     def _ask(self, upload: Upload, now_s: float) -> None:
         upload.asked_s = now_s
-        whole = self._whole and self.strictly
-        kind = "MISSION_REQUEST_INT" if whole else "MISSION_REQUEST"
-        self.link.send(kind, *upload.peer, len(upload.items), 0)
+        whole = self._whole and self.rules.strict
+        name = "MISSION_REQUEST_INT" if whole else "MISSION_REQUEST"
+        self.link.send(name, *upload.peer, len(upload.items), upload.kind)
 
     def _item(self, message: Message, now_s: float) -> None:
         self._whole = message.name == "MISSION_ITEM_INT"
@@ -119,9 +122,12 @@ class Transfer:
         if message.seq != len(upload.items):  # one that came twice
             return
         item = _read(message)
-        known = GLOBAL_FRAMES | RELATIVE_FRAMES | {_COMMAND_FRAME}
-        if item.frame not in known or not item.flyable:
-            self._acknowledge(upload.peer, Ack.UNSUPPORTED_FRAME)
+        refused = self.rules.refusal(upload.kind, item)
+        if refused is not None:
+            result, said = refused
+            self._acknowledge(upload.peer, result, upload.kind)
+            if said is not None:
+                self.link.say(said)
             self._upload = None
             return
         upload.items.append(item)
@@ -129,9 +135,11 @@ class Transfer:
         if len(upload.items) < upload.count:
             self._ask(upload, now_s)
             return
-        self.mission.replace(tuple(upload.items))
+        self.mission.keep(upload.kind, tuple(upload.items))
         self._upload = None
-        self._acknowledge(upload.peer, Ack.ACCEPTED)
+        self._acknowledge(upload.peer, Ack.ACCEPTED, upload.kind)
+        if upload.kind in self.rules.texts:
+            self.link.say(self.rules.texts[upload.kind])
 
     def _heard_ack(self, message: Message, now_s: float) -> None:
         """The peer wants to be asked in the other kind, or no more."""
@@ -146,51 +154,52 @@ class Transfer:
         elif message.type == Ack.CANCELLED:
             self._upload = None
 
-    def _acknowledge(self, peer: tuple[int, int], ack: Ack, kind: int = 0) -> None:
+    def _acknowledge(self, peer: tuple[int, int], ack: int, kind: int) -> None:
         self.link.send("MISSION_ACK", *peer, int(ack), kind)
 
     # -- down, and the rest ------------------------------------------------------------------
 
     def _list(self, message: Message, _: float) -> None:
-        count = 0 if message.mission_type else len(self.mission.items)
-        peer = (message.system, message.component)
-        self._download = None if message.mission_type else Download(peer)
-        self.link.send("MISSION_COUNT", *peer, count, message.mission_type)
+        kind, peer = message.mission_type, (message.system, message.component)
+        self._download = Download(peer, kind)
+        self.link.send("MISSION_COUNT", *peer, len(self.mission.listed(kind)), kind)
 
     def _request(self, message: Message, _: float) -> None:
-        peer = (message.system, message.component)
+        peer, kind = (message.system, message.component), message.mission_type
         self._whole = whole = message.name == "MISSION_REQUEST_INT"
-        there = not message.mission_type and message.seq < len(self.mission.items)
-        if self.strictly and not self._is_due(peer, message.seq, there):
+        items = self.mission.listed(kind)
+        there = message.seq < len(items)
+        if self.rules.strict and not self._is_due(peer, kind, message.seq, there):
             return
         if not there:
-            self._acknowledge(peer, Ack.INVALID_SEQUENCE, message.mission_type)
+            self._acknowledge(peer, Ack.INVALID_SEQUENCE, kind)
             return
-        item = self.mission.items[message.seq]
+        item = items[message.seq]
         places = (item.x, item.y) if whole else (item.x * 1e-7, item.y * 1e-7)
-        current = int(message.seq == self.mission.current)
-        head = (*peer, message.seq, item.frame, item.command, current, 1)
+        current = int(not kind and message.seq == self.mission.current)
+        goes_on = int(kind not in self.rules.stopping)
+        head = (*peer, message.seq, self.rules.frame_shown(item, whole), item.command)
         name = "MISSION_ITEM_INT" if whole else "MISSION_ITEM"
-        self.link.send(name, *head, *item.params, *places, item.z, 0)
+        self.link.send(name, *head, current, goes_on, *item.params, *places, item.z, kind)
 
-    def _is_due(self, peer: tuple[int, int], number: int, there: bool) -> bool:
+    def _is_due(self, peer: tuple[int, int], kind: int, number: int, there: bool) -> bool:
         """The item that comes next, or the last one again; another ends the download."""
         download = self._download
-        if download is None or download.peer != peer:
+        if download is None or (download.peer, download.kind) != (peer, kind):
             return False
         if not there or number not in (download.due - 1, download.due):
             self._download = None
-            self._acknowledge(peer, Ack.ERROR)
+            self._acknowledge(peer, Ack.ERROR, kind)
             self.link.complain("WPM: REJ. CMD: Req. WP was unexpected")
             return False
         download.due = number + 1
         return True
 
     def _clear(self, message: Message, _: float) -> None:
-        if message.mission_type in (0, _ANY_TYPE):
-            self.mission.replace(())
-        peer = (message.system, message.component)
-        self._acknowledge(peer, Ack.ACCEPTED, message.mission_type)
+        asked = message.mission_type
+        for kind in _KINDS if asked == _ANY_TYPE else _KINDS & {asked}:
+            self.mission.keep(kind, ())
+        self._acknowledge((message.system, message.component), Ack.ACCEPTED, asked)
 
     def _set_current(self, message: Message, _: float) -> None:
         if self.mission.go_to(message.seq):

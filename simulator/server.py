@@ -70,7 +70,7 @@ class Server:
 
     def _new_transfer(self) -> Transfer:
         autopilot = self.view.autopilot
-        return Transfer(self, autopilot.mission, autopilot.firmware.missions_strictly)
+        return Transfer(self, autopilot.mission, autopilot.firmware.missions)
 
     def _start_streams(self) -> None:
         self.rescheduled = True
@@ -275,6 +275,10 @@ class Server:
         elif message.param_id in names:
             self.send_parameter(message.param_id)
 
+    def _log_request_list(self, _: Message) -> None:
+        """There are none."""
+        self.send("LOG_ENTRY", 0, 0, 0, 0, 0)
+
     def _request_data_stream(self, message: Message) -> None:
         """Not acknowledged; a rate of 0 is as good as a stop."""
         names = self.view.autopilot.firmware.streams.groups.get(message.req_stream_id, ())
@@ -311,6 +315,7 @@ HANDLERS: dict[str, Callable[[Server, Message], None]] = {
     "PARAM_REQUEST_READ": Server._param_request_read,
     "PARAM_REQUEST_LIST": Server._param_request_list,
     "PARAM_SET": Server._param_set,
+    "LOG_REQUEST_LIST": Server._log_request_list,
     "REQUEST_DATA_STREAM": Server._request_data_stream,
     "FILE_TRANSFER_PROTOCOL": Server._file_transfer,
 }

@@ -40,6 +40,7 @@ class Severity(IntEnum):
     CRITICAL = 2
     WARNING = 4
     INFO = 6
+    DEBUG = 7
 
 
 class Behaviour(Enum):
@@ -173,6 +174,35 @@ class ArmWish:
 
 
 @dataclass(frozen=True, slots=True)
+class MissionItem:
+    """One item as it was uploaded: x and y in 1e-7 deg, z in m, of `frame` (MAV_FRAME)."""
+
+    frame: int
+    command: int  # MAV_CMD
+    params: tuple[float, float, float, float]
+    x: int
+    y: int
+    z: float
+
+
+@dataclass(frozen=True, slots=True)
+class MissionRules:
+    """What a firmware takes of lists of items, by MAV_MISSION_TYPE, and how it shows them.
+
+    `strict`: they go down in order alone, and are asked for in the kind that came last. `refusal`:
+    MAV_MISSION_RESULT and text of an item that is not taken. `texts` follow an upload.
+    `frame_shown`: of an item in whole 1e-7 degrees, or in degrees. `stopping`: types whose items
+    are shown without autocontinue.
+    """
+
+    strict: bool
+    refusal: Callable[[int, MissionItem], tuple[int, Say | None] | None]
+    texts: Mapping[int, Say]
+    frame_shown: Callable[[MissionItem, bool], int]
+    stopping: frozenset[int]
+
+
+@dataclass(frozen=True, slots=True)
 class Condition:
     """What a heartbeat depends on."""
 
@@ -285,7 +315,7 @@ class Firmware:
     position_grid_steps: int  # the estimator's position is new at every such step
     boot: Mapping[str, float]  # events of the start, s of vehicle time
     mission_first: int  # item with which a mission begins: before it, home
-    missions_strictly: bool  # uploads ask as the client writes, downloads go item by item
+    missions: MissionRules
     mode_acked_twice: bool  # the receiver acks a mode command before the commander does
     text_to_ground_stations_only: bool
     is_ground_station: Callable[[int, int, ReadParameter], bool]  # MAV_TYPE, system of a heartbeat

@@ -8,6 +8,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import LOITER, NAN, RTL, Bench
 
+from simulator.firmware.ardupilot import ARDUPILOT
+from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 
 MISSION = 0x04040000
@@ -25,7 +27,7 @@ def act(command: int, *params: float) -> Row:
     return command, (*params, *(0.0,) * (4 - len(params))), NAN, NAN, NAN
 
 
-def item(seq: int, row: Row, frame: int | None = None) -> object:
+def item(seq: int, row: Row, frame: int | None = None, kind: int = 0) -> object:
     command, params, north, east, up = row
     latitude, longitude, _ = PX4.origin
     x = y = 0
@@ -37,19 +39,36 @@ def item(seq: int, row: Row, frame: int | None = None) -> object:
     used = known if frame is None else frame
     z = 0.0 if math.isnan(up) else up
     return mavlink.MAVLink_mission_item_int_message(
-        1, 1, seq, used, command, 0, 1, *params, x, y, z
+        1, 1, seq, used, command, 0, 1, *params, x, y, z, kind
     )
 
 
-def upload(bench: Bench, rows: list[Row]) -> int:
+def upload(bench: Bench, rows: list[Row], kind: int = 0, frame: int | None = None) -> int:
     """The answer to a whole upload, item by item as it is asked for."""
-    bench.send(mavlink.MAVLink_mission_count_message(1, 1, len(rows)))
+    bench.send(mavlink.MAVLink_mission_count_message(1, 1, len(rows), kind))
     for seq, row in enumerate(rows):
         bench.run(0.02)
         assert asked(bench)[-1] == seq
-        bench.send(item(seq, row))
+        bench.send(item(seq, row, frame, kind))
     bench.run(0.02)
-    return int(bench.of("MISSION_ACK")[-1][1].type)
+    _, ack = bench.of("MISSION_ACK")[-1]
+    assert ack.mission_type == kind
+    return int(ack.type)
+
+
+def download(bench: Bench, kind: int) -> list[tuple[int, ...]]:
+    """Frame, command, current, autocontinue and param1 of every item."""
+    bench.send(mavlink.MAVLink_mission_request_list_message(1, 1, kind))
+    bench.run(0.02)
+    begun_s = bench.time_s
+    for seq in range(bench.of("MISSION_COUNT")[-1][1].count):
+        bench.send(mavlink.MAVLink_mission_request_int_message(1, 1, seq, kind))
+    bench.run(0.02)
+    return [
+        (m.frame, m.command, m.current, m.autocontinue, m.param1)
+        for _, m in bench.of("MISSION_ITEM_INT", begun_s)
+        if m.mission_type == kind
+    ]
 
 
 def asked(bench: Bench) -> list[int]:
@@ -134,7 +153,7 @@ def test_items_that_do_not_come_are_asked_for_again_and_given_up() -> None:
     [
         (mavlink.MAVLink_mission_count_message(1, 1, 65535), 4),
         (mavlink.MAVLink_mission_count_message(1, 1, 0), 0),
-        (mavlink.MAVLink_mission_count_message(1, 1, 3, 1), 3),
+        (mavlink.MAVLink_mission_count_message(1, 1, 3, 3), 3),
         (mavlink.MAVLink_mission_clear_all_message(1, 1, 255), 0),
     ],
 )
@@ -155,6 +174,65 @@ def test_places_in_no_known_frame_end_the_upload(row: Row, frame: int) -> None:
     bench.run(0.02)
     assert [m.type for _, m in bench.of("MISSION_ACK")] == [2]
     assert bench.instance.autopilot.mission.items == ()
+
+
+FENCE = [place(5001, north, east, 0, 3.0) for north, east in ((-50, -50), (50, -50), (50, 50))] + [
+    place(5004, 90, 0, 0, 20.0)
+]
+RALLY = [place(5100, 5, 0, 10, 0, 0, 0, 0)]
+SHOWN = {  # by the real ones, of what came in frames 0 and 3
+    PX4.name: ([(5, 5001, 1, 0, 3.0), (6, 5100, 1, 1, 0.0)]),
+    ARDUPILOT.name: ([(0, 5001, 0, 0, 3.0), (3, 5100, 0, 0, 0.0)]),
+}
+
+
+@pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=lambda f: f.name)
+def test_fences_and_rally_points_are_kept_beside_the_mission(firmware: Firmware) -> None:
+    """The marks of the current item, 1 on PX4, are the mission's affair here."""
+    bench = Bench(firmware=firmware)
+    bench.boot()
+    assert upload(bench, FENCE, 1, frame=0) == 0
+    assert upload(bench, RALLY, 2, frame=3) == 0
+    fence, rally = download(bench, 1), download(bench, 2)
+    wanted = [(f, c, 0, a, p) for f, c, _, a, p in SHOWN[firmware.name]]
+    assert [fence[0], *rally] == wanted
+    assert [row[1] for row in fence] == [5001, 5001, 5001, 5004]
+    assert download(bench, 0) == []
+    bench.send(mavlink.MAVLink_mission_clear_all_message(1, 1, 2))
+    bench.run(0.02)
+    assert (len(download(bench, 1)), download(bench, 2)) == (4, [])
+    bench.send(mavlink.MAVLink_mission_clear_all_message(1, 1, 255))
+    bench.run(0.02)
+    assert download(bench, 1) == []
+    said = ["Fence Indexed OK"] if firmware is ARDUPILOT else []
+    assert [text for text in bench.texts() if "Fence" in text] == said
+
+
+def test_a_px4_shows_frames_in_the_kind_asked_for() -> None:
+    bench = Bench()
+    bench.boot()
+    assert upload(bench, ROUND[:1], frame=3) == 0
+    assert [row[0] for row in download(bench, 0)] == [RELATIVE_INT]
+
+
+@pytest.mark.parametrize(
+    ("row", "frame", "kind", "answer"),
+    [
+        (place(RETURN, 1, 1, 0), 3, 0, 3),
+        (act(WAYPOINT), 2, 0, 3),
+        (place(5100, 1, 1, 0), 3, 0, 1),
+        (place(5001, 1, 1, 0, 2.0), 0, 1, 1),
+    ],
+)
+def test_a_px4_refuses_items_that_have_no_business_there(
+    row: Row, frame: int, kind: int, answer: int
+) -> None:
+    """A return has no place, a waypoint has one; a polygon has three corners."""
+    bench = Bench()
+    assert upload(bench, [row], kind, frame) == answer
+    bench.run(0.1)
+    said = ["IGN MISSION_ITEM: Invalid item"] if answer == 3 else []
+    assert bench.texts() == said
 
 
 def test_a_mission_is_flown_and_returns_and_is_flown_again() -> None:

@@ -9,6 +9,7 @@ import math
 
 from simulator.airframe import BatteryState
 from simulator.firmware.ardupilot.messages import MESSAGES
+from simulator.firmware.ardupilot.missions import MISSIONS
 from simulator.firmware.ardupilot.modes import (
     COMMAND_ANSWERS,
     MODES,
@@ -122,7 +123,7 @@ ARDUPILOT = Firmware(
     position_grid_steps=1,
     boot=BOOT,
     mission_first=1,
-    missions_strictly=False,
+    missions=MISSIONS,
     mode_acked_twice=False,
     text_to_ground_stations_only=False,
     is_ground_station=is_ground_station,

@@ -17,6 +17,7 @@ from simulator.firmware.base import (
     Result,
     Sensors,
 )
+from simulator.firmware.px4.missions import MISSIONS
 from simulator.firmware.px4.modes import (
     COMMAND_ANSWERS,
     MODES,
@@ -123,7 +124,7 @@ PX4 = Firmware(
     position_grid_steps=2,
     boot={},
     mission_first=0,
-    missions_strictly=True,
+    missions=MISSIONS,
     mode_acked_twice=True,
     text_to_ground_stations_only=True,
     is_ground_station=is_ground_station,

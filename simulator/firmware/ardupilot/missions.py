@@ -1,0 +1,39 @@
+"""What ArduCopter takes as items of missions, fences and rally points, and how it shows them."""
+
+from __future__ import annotations
+
+import math
+
+from simulator.firmware.base import MissionItem, MissionRules, Say, Severity
+
+_UNSUPPORTED_FRAME, _UNSUPPORTED = 2, 3  # MAV_MISSION_RESULT
+_SHOWN = {5: 0, 6: 3, 11: 10}  # MAV_FRAME: without INT
+_PLACE_FRAMES = frozenset({0, 3, 5, 6, 10, 11})
+_PLACES = frozenset({16, 17, 18, 19, 21, 22, 31, 82, 201})  # MAV_CMD of missions that have a place
+_BESIDE = {1: frozenset({5000, 5001, 5002, 5003, 5004}), 2: frozenset({5100})}
+
+
+def _refusal(kind: int, item: MissionItem) -> tuple[int, Say | None] | None:
+    if kind and item.command not in _BESIDE[kind]:
+        return _UNSUPPORTED, None
+    by_place = kind or item.command in _PLACES
+    if by_place and not (item.frame in _PLACE_FRAMES and math.isfinite(item.z)):
+        return _UNSUPPORTED_FRAME, None
+    return None
+
+
+def _frame_shown(item: MissionItem, _: bool) -> int:
+    """The old names of frames; what has no place is in frame 0."""
+    return _SHOWN.get(item.frame, item.frame) if item.frame in _PLACE_FRAMES else 0
+
+
+MISSIONS = MissionRules(
+    strict=False,
+    refusal=_refusal,
+    texts={
+        0: Say(Severity.INFO, "Flight plan received"),
+        1: Say(Severity.DEBUG, "Fence Indexed OK"),
+    },
+    frame_shown=_frame_shown,
+    stopping=frozenset({1, 2}),
+)
