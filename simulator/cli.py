@@ -34,7 +34,7 @@ def _refuse(sentence: str) -> NoReturn:
 @app.command()
 def simulate(
     connect: Annotated[
-        str | None, typer.Option(help="Companion link: udpout:HOST:PORT or udpin:HOST:PORT.")
+        str | None, typer.Option(help="Companion link: udpout:, udpin: or tcpin:HOST:PORT.")
     ] = None,
     gcs: Annotated[
         str, typer.Option(help=f"Ground station link, or {NO_LINK}.")
@@ -115,8 +115,8 @@ def simulate(
     from offboard.flight.clock import unix_us
     from offboard.model.document import DocumentError
     from simulator import config
+    from simulator.links import LinkError, open_link, shifted
     from simulator.recorder import Recorder
-    from simulator.udp import LinkError, open_link, shifted
 
     # PX4's own local ports only in PX4's place: beside a real one they would starve it
     own_ports = connect is None

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 
 from offboard.flight.clock import monotonic_s, unix_us
 from simulator.instance import Instance
+from simulator.links import Link, wait
 from simulator.plant import STEP_S
 from simulator.recorder import Recorder
-from simulator.udp import UdpLink, wait
 
 RESEND_S = 0.05  # until the companion is first heard
 RESEND_SILENT_S = 1.0
@@ -43,12 +43,12 @@ class Berth:
     """One instance and its sockets."""
 
     instance: Instance
-    companion: UdpLink
-    ground: UdpLink | None = None
+    companion: Link
+    ground: Link | None = None
     recorder: Recorder | None = None  # of the companion link
 
     @property
-    def links(self) -> list[UdpLink]:
+    def links(self) -> list[Link]:
         return [self.companion] if self.ground is None else [self.companion, self.ground]
 
     def send(self) -> None:

@@ -1,22 +1,13 @@
-"""UDP ends of the simulator's links. Bytes only; no MAVLink and no waiting beyond `wait`.
-
-udpout:HOST:PORT sends to that address from the start, udpin:HOST:PORT waits to be spoken to.
-Whoever sends to the socket is a peer from then on.
-"""
+"""The UDP end of a link: whoever sends to the socket is a peer from then on."""
 
 from __future__ import annotations
 
-import select
 import socket
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 PEERS_MAX = 16
 DATAGRAM_MAX = 65535
 Address = tuple[str, int]
-
-
-class LinkError(Exception):
-    """An address that cannot be used: one sentence."""
 
 
 class UdpLink:
@@ -65,69 +56,3 @@ class UdpLink:
 
     def close(self) -> None:
         self._socket.close()
-
-
-def free_ports(count: int) -> list[int]:
-    """UDP ports that nobody used a moment ago."""
-    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
-    try:
-        for sock in sockets:
-            sock.bind(("127.0.0.1", 0))
-        return [int(sock.getsockname()[1]) for sock in sockets]
-    finally:
-        for sock in sockets:
-            sock.close()
-
-
-def wait(links: Sequence[UdpLink], timeout_s: float) -> list[UdpLink]:
-    """The links at which a datagram waits, as soon as there is one, at the latest `timeout_s`."""
-    return select.select(links, [], [], max(0.0, timeout_s))[0]
-
-
-def open_link(url: str, preferred_port: int) -> UdpLink:
-    """Open `udpout:HOST:PORT` (from `preferred_port` if it is free) or `udpin:HOST:PORT`.
-
-    Raises LinkError with a sentence.
-    """
-    kind, host, port = _split(url)
-    address = _resolve(url, host, port)
-    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    sock.setblocking(False)
-    try:
-        if kind == "udpin":
-            sock.bind(address)
-            return UdpLink(sock, None)
-        local = "127.0.0.1" if address[0].startswith("127.") else ""
-        try:
-            sock.bind((local, preferred_port))
-        except OSError:
-            sock.bind((local, 0))
-    except OSError as error:
-        sock.close()
-        raise LinkError(f"{url} cannot be opened: {error.strerror or error}") from None
-    return UdpLink(sock, address)
-
-
-def shifted(url: str, by: int) -> str:
-    """The same link `by` ports further on. Raises LinkError with a sentence."""
-    kind, host, port = _split(url)
-    return f"{kind}:{host}:{port + by}"
-
-
-def _split(url: str) -> tuple[str, str, int]:
-    parts = url.split(":")
-    usable = len(parts) == 3 and parts[0] in ("udpout", "udpin") and parts[1] != ""
-    if not (usable and parts[2].isascii() and parts[2].isdigit() and 0 < int(parts[2]) < 65536):
-        raise LinkError(
-            f"{url} is no link: give udpout:HOST:PORT or udpin:HOST:PORT, port 1 .. 65535"
-        )
-    return parts[0], parts[1], int(parts[2])
-
-
-def _resolve(url: str, host: str, port: int) -> Address:
-    try:
-        found = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)
-    except (OSError, UnicodeError):
-        raise LinkError(f"{url} cannot be opened: no address known for {host}") from None
-    address = found[0][4]
-    return (str(address[0]), int(address[1]))

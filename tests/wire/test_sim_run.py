@@ -13,8 +13,9 @@ from simulator import run
 from simulator.conditions import Conditions
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
+from simulator.links import LinkError, open_link
 from simulator.run import Berth, Outcome, Runner
-from simulator.udp import LinkError, UdpLink, open_link
+from simulator.udp import UdpLink
 
 
 @pytest.fixture
@@ -28,6 +29,7 @@ def companion() -> Iterator[socket.socket]:
 @pytest.fixture
 def link(companion: socket.socket) -> Iterator[UdpLink]:
     opened = open_link(f"udpout:127.0.0.1:{companion.getsockname()[1]}", 0)
+    assert isinstance(opened, UdpLink)
     yield opened
     opened.close()
 
