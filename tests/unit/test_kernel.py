@@ -66,7 +66,11 @@ record = np.zeros(1, RECORD)
 record["values"] = (1.0, 2.0, 4.0)
 answers = [each.call(times, address(record)) for each, times in ((add_twice, 1), (add, 2))]
 places = np.array([1, 10])
-answers.append(weigh.call(np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]]), places, 0.5))
+values = np.array([[1.0, 2.0], [3.0, 4.0], [5.0, 6.0]])
+answers.append(weigh.call(values, places, 0.5))
+weighed, added = weigh.bound(values[:2].copy(), places, 2.0), add.bound(3, record)
+places[:] = 10, 1
+answers += [weighed(), added()]
 print(ready, compiled_here, "numba" in sys.modules)
 print(answers, places, float(record["total"][0]), int(record["calls"][0]))
 """
@@ -80,7 +84,7 @@ shipped.write(Path(sys.argv[1]), {entry.symbol: entry.bitcode() for entry in Ent
 """
 COMPILED = "False ['entries.add', 'entries.weigh'] True"  # and the other one in another process
 LOADED = "True [] False"
-COMPUTED = "[20, 20, 64.5] [ 3 10] 14.0 3"
+COMPUTED = "[20, 20, 64.5, 92.0, 30] [2 1] 24.5 4"
 
 
 def _python(program: str, cache: Path, bitcode: Path | str = "", **settings: str) -> str:
