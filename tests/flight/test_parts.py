@@ -9,14 +9,17 @@ import numpy as np
 import pytest
 from pair import hover
 
-from offboard import config
-from offboard.control.base import Command
+from offboard import config, sortie
+from offboard.control.base import Command, PredictedState, Situation
 from offboard.flight import manifest
 from offboard.flight.readiness import Readiness
+from offboard.flight.run import rehearse
 from offboard.flight.setpoint import clamp, usable
 from offboard.mavlink.ardupilot import ARDUPILOT
 from offboard.mavlink.px4 import PX4
+from offboard.model.kernel import Entry
 from offboard.model.vehicle import Vehicle
+from offboard.reference.transfer import Hold
 
 NAN, INF = math.nan, math.inf
 
@@ -81,6 +84,33 @@ def test_arducopter_must_tell_what_would_make_thrust_a_climb_rate() -> None:
     (complaint,) = readiness.complaints(ARDUPILOT, {"GUID_OPTIONS": 0.0, "ATC_ANGLE_BOOST": 1.0})
     assert complaint.endswith("Mend: param set GUID_OPTIONS 8")
     assert readiness.settled(ARDUPILOT, {"GUID_OPTIONS": 8.0, "ATC_ANGLE_BOOST": 1.0}, 2.1)
+
+
+def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Or it might be compiled in flight, for seconds."""
+    volume = "{shape: sphere, north_m: 6, east_m: 0.5, height_m: 3, radius_m: 0.4}"
+    chosen = {"controller": "horizon", "reference": "line"}
+    crew = sortie.crew(
+        config.load("flight", choices=chosen, assignments=(f"controller.keep_out=[{volume}]",))
+    )
+    loaded: list[str] = []
+    load = Entry._load
+    for entry in Entry.defined():
+        for kept in ("call", "_machine_code"):
+            vars(entry).pop(kept, None)
+    monkeypatch.setattr(Entry, "_load", lambda entry: loaded.append(entry.symbol) or load(entry))
+    rehearse(crew, keeps_deadline=False)
+    rehearsed = set(loaded)
+    at_m = np.array([5.0, 0.3, -3.0])
+    state = PredictedState(
+        0.05, at_m, np.array([1.5, 0.0, 0.0]), np.array([0.0, 0.0, 1.0]), np.zeros(3), 0.0, 0.0,
+        9.8, np.zeros(3), np.zeros(3),
+    )  # fmt: skip
+    met = Situation(0.0, state, Hold((7.0, 0.3, -3.0), 0.0), Command(9.8, (0.0, 0.0, 1.0), 0.0))
+    assert crew.controller.decide(met).certificate.iterations > 0
+    assert set(loaded) == rehearsed
 
 
 @pytest.mark.parametrize("length", [0, 1, 123, 124, 125, 20_000])

@@ -7,8 +7,9 @@ import pytest
 
 from offboard.control.cost import BoxQuadratic
 from offboard.control.swarm import QuadraticSwarm, RandomLanes, Swarm, SwarmSettings
-from offboard.control.swarm.motion import move, remember, scatter, spread_about
-from offboard.control.swarm.quadratic import quadratic_costs, warm_up
+from offboard.control.swarm.motion import SEARCH, move, scatter
+from offboard.control.swarm.quadratic import quadratic_costs
+from offboard.model.kernel import address
 
 PARTICLES = 40
 
@@ -47,8 +48,11 @@ def test_one_move_is_eq_30_then_eq_20_then_the_box() -> None:
         x = positions[j] + v
         expected_velocities[j] = np.where((x < lower[j]) | (x > upper[j]), -0.25 * v, v)
         expected[j] = np.clip(x, lower[j], upper[j])
-    lanes = RandomLanes(1).states(PARTICLES)
-    move(lanes, lower, upper, 0.9298, 1.4986, 1.4, 0.65, 0.25, positions, velocities, bests, leader)
+    lanes, search = RandomLanes(1).states(PARTICLES), np.zeros(1, SEARCH)
+    search[["inertia", "personal", "social", "damping", "rebound"]] = (
+        0.9298, 1.4986, 1.4, 0.65, 0.25,
+    )  # fmt: skip
+    move.call(address(search), lanes, lower, upper, positions, velocities, bests, leader)
     assert np.any((expected == lower[:, None]) | (expected == upper[:, None]))
     assert positions == pytest.approx(expected, rel=0, abs=1e-15)
     assert velocities == pytest.approx(expected_velocities, rel=0, abs=1e-15)
@@ -57,7 +61,9 @@ def test_one_move_is_eq_30_then_eq_20_then_the_box() -> None:
 def test_particles_start_all_over_the_box_with_velocities_of_either_sign() -> None:
     lower, upper = np.array([-1.0, 10.0]), np.array([1.0, 14.0])
     positions, velocities = np.empty((2, 4000)), np.empty((2, 4000))
-    scatter(RandomLanes(2).states(4000), lower, upper, 0.1, positions, velocities)
+    search, lanes = np.zeros(1, SEARCH), RandomLanes(2).states(4000)
+    search["initial_velocity"] = 0.1
+    scatter.call(address(search), lanes, lower, upper, positions, velocities)
     place = (positions.T - lower) / (upper - lower)
     assert place.min() >= 0
     assert place.max() <= 1
@@ -99,23 +105,35 @@ def test_compiled_and_ask_tell_move_the_same_particles(dimensions: int) -> None:
     assert (told.cost, told.spread) == (compiled.cost, compiled.spread)
 
 
-def test_what_callers_hand_in_compiles_nothing_new() -> None:
-    """A read-only or strided array has another type to numba: seconds of compilation in flight."""
-    warm_up()
-    functions = (move, scatter, remember, spread_about, quadratic_costs)
-    compiled = [len(function.signatures) for function in functions]
-    frozen = np.asfortranarray(np.eye(4))
-    frozen.setflags(write=False)
-    strided = np.ones(8)[::2]
-    strided.setflags(write=False)
-    problem = BoxQuadratic(frozen, strided, np.float32(1), -strided, strided)  # type: ignore[arg-type]
-    QuadraticSwarm(SwarmSettings(), 4).minimise(problem, RandomLanes(4), remaining_s=lambda: 1.0)
-    swarm = Swarm(-strided, strided, SwarmSettings(inertia=1), RandomLanes(4), (strided,))
+def test_callers_may_hand_in_any_array() -> None:
+    """Machine code takes contiguous arrays of doubles only: what callers have is copied."""
+    frozen, strided, single = np.asfortranarray(np.eye(4)), np.ones(8)[::2], np.float32(1)
+    for array in (frozen, strided):
+        array.setflags(write=False)
+    plain = BoxQuadratic(np.eye(4), np.ones(4), 1.0, -np.ones(4), np.ones(4))
+    problem = BoxQuadratic(frozen, strided, single, -strided, strided)  # type: ignore[arg-type]
+    found = [
+        QuadraticSwarm(SwarmSettings(), 4).minimise(each, RandomLanes(4), remaining_s=lambda: 1.0)
+        for each in (plain, problem)
+    ]
+    assert found[0].best.tolist() == found[1].best.tolist()
+    swarms = [
+        Swarm(-each, each, SwarmSettings(inertia=1), RandomLanes(4), (each,))
+        for each in (np.ones(4), strided)
+    ]
+    rising = np.arange(80.0)[::2]
     for _ in range(3):
-        swarm.ask()
-        swarm.tell(np.zeros(80)[::2])
-    assert swarm.spread >= 0
-    assert [len(function.signatures) for function in functions] == compiled == [1] * 5
+        assert swarms[0].ask().tolist() == swarms[1].ask().tolist()
+        swarms[0].tell(rising.copy())
+        swarms[1].tell(rising)
+    assert 0 < swarms[0].spread == swarms[1].spread
+
+
+def test_a_strided_array_is_refused_in_a_sentence() -> None:
+    lanes, box, particles = RandomLanes(4).states(3), np.ones(2), np.empty((2, 6))
+    search = address(np.zeros(1, SEARCH))
+    with pytest.raises(TypeError, match=r"takes a contiguous array of 2 dimensions of float64"):
+        scatter.call(search, lanes, box, box, particles[:, ::2], particles[:, :3])
 
 
 def test_a_lane_does_not_depend_on_how_many_are_in_use() -> None:

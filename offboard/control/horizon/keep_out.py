@@ -10,11 +10,11 @@ import math
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from offboard.model.kernel import kernel
 from offboard.model.vehicle import Parameters
 from offboard.reference.base import Reference
 
@@ -108,12 +108,14 @@ def pack(volumes: Sequence[Sphere | Cylinder | Box]) -> Array:
     return rows
 
 
-@numba.njit(cache=True)
-def distance(volume: Array, north: float, east: float, down: float) -> float:
-    """Metres from the surface of a packed volume at rest, negative inside."""
-    off_n = abs(north - volume[CENTRE])
-    off_e = abs(east - volume[CENTRE + 1])
-    off_d = abs(down - volume[CENTRE + 2]) - volume[HALF + 2]
+@kernel
+def distance(  # type: ignore[no-untyped-def]
+    volume, centre_north, centre_east, centre_down, north, east, down
+) -> float:
+    """Metres from the surface of a packed volume whose centre is there, negative inside."""
+    off_n = abs(north - centre_north)
+    off_e = abs(east - centre_east)
+    off_d = abs(down - centre_down) - volume[HALF + 2]
     if volume[RADIUS] > 0.0:
         flat = math.sqrt(off_n * off_n + off_e * off_e) - volume[RADIUS]
         deepest = max(flat, off_d)
@@ -126,15 +128,12 @@ def distance(volume: Array, north: float, east: float, down: float) -> float:
     return float(min(deepest, 0.0) + math.sqrt(outside) - volume[ROUND])
 
 
-@numba.njit(cache=True)
 def placed_at(volumes: Array, origin_ned_m: Array, track_time_s: float) -> Array:
     """The packed volumes where they are at a time of the reference's own axis; NaN and what is
     before 0 count as 0."""
     there = volumes.copy()
     elapsed_s = max(track_time_s, 0.0) if track_time_s == track_time_s else 0.0
-    for row in there:
-        for axis in range(3):
-            row[CENTRE + axis] += origin_ned_m[axis] + elapsed_s * row[VELOCITY + axis]
+    there[:, CENTRE:VELOCITY] += origin_ned_m + elapsed_s * there[:, VELOCITY:HALF]
     return there
 
 
@@ -146,8 +145,8 @@ def clearances(
     packed, origin = pack(volumes), np.zeros(3)
     nearest = np.full(len(times_s), np.inf)
     for i, (time_s, position) in enumerate(zip(times_s, positions_ned_m, strict=True)):
-        for row in placed_at(packed, origin, float(time_s)):
-            nearest[i] = min(nearest[i], distance(row, *position))
+        for row in placed_at(packed, origin, float(time_s)).tolist():
+            nearest[i] = min(nearest[i], distance(row, *row[CENTRE:VELOCITY], *position))
     return nearest
 
 

@@ -26,6 +26,7 @@ from offboard.control.horizon.keep_out import KeepOut, pack, placed_at
 from offboard.control.horizon.outlook import bounds, look_ahead
 from offboard.control.horizon.plant import (
     INPUTS,
+    MOST_STEPS,
     STATE_SIZE,
     plant_of,
     scene_of,
@@ -72,7 +73,7 @@ class HorizonSettings(TrackingSettings):
     a seed; `polish_steps` bounds the steps from each answer of the swarm to its local minimum.
     """
 
-    steps: int | None = Field(default=None, ge=2, le=40)
+    steps: int | None = Field(default=None, ge=2, le=MOST_STEPS)
     dynamics: Dynamics = Dynamics.NONLINEAR
     keep_out: tuple[KeepOut, ...] = ()
     clearance_m: float = Field(default=0.3, ge=0, le=50)
@@ -105,7 +106,7 @@ class HorizonLaw(TrackingLaw):
         self._seed = seed
         self._method = method
         self._volumes = pack(self._plans.keep_out)
-        self._evaluate = Evaluator(self._plans.planned)
+        self._evaluate = Evaluator(self._plans.planned, len(self._volumes))
         self._planner = ExactMinimum(INPUTS * self._plans.planned)
         super().__init__(
             vehicle, self._plans, Search.SWARM, stopwatch, period_s=period_s, seed=seed

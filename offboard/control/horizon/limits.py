@@ -6,22 +6,9 @@ from __future__ import annotations
 
 import math
 
-import numba
-import numpy as np
-
 from offboard.control.horizon.keep_out import CENTRE, VELOCITY, distance
-from offboard.control.horizon.plant import (
-    CLEARANCE,
-    HOLD,
-    NONLINEAR,
-    SPEED_MOST,
-    TILT_MOST,
-    B,
-    P,
-    V,
-    W,
-    Z,
-)
+from offboard.control.horizon.plant import PLANT, SCENE, B, P, V, W, Z
+from offboard.model.kernel import array, entry, kernel
 
 # Limits of a hold; every volume is two, at the middle and at the end.
 SPEED, TILT, FLOOR, VOLUME = range(4)
@@ -30,85 +17,87 @@ SPEED, TILT, FLOOR, VOLUME = range(4)
 SLOPE, CURVATURE = 20.0, 200.0
 
 
-@numba.njit(cache=True)
-def penalise(plant, scene, k, before, after, costs) -> None:  # type: ignore[no-untyped-def]
-    """What hold k pays for the limits that it exceeds."""
-    over = np.empty(costs.shape[0])
-    for limit in range(limits_of(scene)):
-        if _applies(plant, scene, limit):
-            _exceed(plant, scene, k, limit, before, after, over)
-            share = share_of(plant, limit)
+@kernel
+def penalise(  # type: ignore[no-untyped-def]
+    plant, scene, volumes, k, before, after, over, costs
+) -> None:
+    """What hold k pays for the limits that it exceeds; `over` (particles,) is scratch."""
+    for limit in range(limits_of(volumes)):
+        if _applies(plant, volumes, limit):
+            _exceed(plant, scene, volumes, k, limit, before, after, over)
+            share = share_of(plant.hold_s, limit)
             for n in range(costs.shape[0]):
                 costs[n] += share * _excess(over[n])
 
 
-@numba.njit(cache=True)
-def excesses(plant, scene, states, over) -> None:  # type: ignore[no-untyped-def]
+@entry(PLANT, SCENE, array(2), array(3), array(2))
+def excesses(plant, scene, volumes, states, over) -> int:  # type: ignore[no-untyped-def]
     """By how much plans exceed each limit in each hold, negative within, -inf where there is none:
     over (N * limits, particles) of states (N + 1, STATE_SIZE, particles)."""
-    count = limits_of(scene)
+    count = limits_of(volumes)
     for k in range(states.shape[0] - 1):
         for limit in range(count):
             row = over[k * count + limit]
             row[:] = -math.inf
-            if _applies(plant, scene, limit):
-                _exceed(plant, scene, k, limit, states[k], states[k + 1], row)
+            if _applies(plant, volumes, limit):
+                _exceed(plant, scene, volumes, k, limit, states[k], states[k + 1], row)
+    return 0
 
 
-@numba.njit(cache=True)
-def limits_of(scene) -> int:  # type: ignore[no-untyped-def]
+@kernel
+def limits_of(volumes) -> int:  # type: ignore[no-untyped-def]
     """Limits of each hold: speed, tilt, floor, and every volume at its middle and its end."""
-    return int(VOLUME + 2 * scene.volumes.shape[0])
+    return int(VOLUME + 2 * volumes.shape[0])
 
 
-@numba.njit(cache=True)
-def share_of(plant, limit) -> float:  # type: ignore[no-untyped-def]
+@kernel
+def share_of(hold_s, limit) -> float:  # type: ignore[no-untyped-def]
     """For how many seconds of a hold an excess is paid."""
-    return float(plant.scalars[HOLD] * (0.5 if limit >= VOLUME else 1.0))
+    return float(hold_s * (0.5 if limit >= VOLUME else 1.0))
 
 
-@numba.njit(cache=True)
-def _applies(plant, scene, limit) -> bool:  # type: ignore[no-untyped-def]
-    c = plant.scalars
+@kernel
+def _applies(plant, volumes, limit) -> bool:  # type: ignore[no-untyped-def]
     if limit == SPEED:
-        return bool(c[SPEED_MOST] < math.inf)
+        return bool(plant.speed_most_mps < math.inf)
     if limit == TILT:
-        return bool(c[NONLINEAR] != 0.0)
-    return bool(scene.volumes.shape[0] > 0)
+        return bool(plant.nonlinear != 0)
+    return bool(volumes.shape[0] > 0)
 
 
-@numba.njit(cache=True)
-def _exceed(plant, scene, k, limit, before, after, over) -> None:  # type: ignore[no-untyped-def]
+@kernel
+def _exceed(  # type: ignore[no-untyped-def]
+    plant, scene, volumes, k, limit, before, after, over
+) -> None:
     """By how much (particles,) hold k exceeds a limit."""
-    c = plant.scalars
     end = 2 * k + 2
     if limit == SPEED:
         v = scene.velocities[end]
         for n in range(over.shape[0]):
             north, east = v[0] + after[V, n], v[1] + after[V + 1, n]
             climb = v[2] + after[W, n]
-            over[n] = math.sqrt(north * north + east * east + climb * climb) - c[SPEED_MOST]
+            over[n] = math.sqrt(north * north + east * east + climb * climb) - plant.speed_most_mps
     elif limit == TILT:
         b = scene.directions[end]
         for n in range(over.shape[0]):
             north, east = b[0] + after[B, n], b[1] + after[B + 1, n]
-            over[n] = math.sqrt(north * north + east * east) - c[TILT_MOST]
+            over[n] = math.sqrt(north * north + east * east) - plant.tilt_most
     elif limit == FLOOR:
         room = max(scene.floor_down_m - scene.positions[end, 2], 0.0)
         for n in range(over.shape[0]):
             over[n] = after[Z, n] - room
     else:
-        _intrude(plant, scene, (limit - VOLUME) // 2, end - limit % 2, before, after, over)
+        volume, node = volumes[(limit - VOLUME) // 2], end - limit % 2
+        _intrude(plant, scene, volume, node, before, after, over)
 
 
-@numba.njit(cache=True)
-def _intrude(plant, scene, i, node, before, after, over) -> None:  # type: ignore[no-untyped-def]
-    """How deep (particles,) within the clearance of volume i at the middle or end of a hold."""
-    c = plant.scalars
-    hold = c[HOLD]
-    volume = scene.volumes[i].copy()
-    for axis in range(3):
-        volume[CENTRE + axis] += 0.5 * hold * node * volume[VELOCITY + axis]
+@kernel
+def _intrude(plant, scene, volume, node, before, after, over) -> None:  # type: ignore[no-untyped-def]
+    """How deep (particles,) within the clearance of a volume at the middle or end of a hold."""
+    hold = plant.hold_s
+    centre_n = volume[CENTRE] + 0.5 * hold * node * volume[VELOCITY]
+    centre_e = volume[CENTRE + 1] + 0.5 * hold * node * volume[VELOCITY + 1]
+    centre_d = volume[CENTRE + 2] + 0.5 * hold * node * volume[VELOCITY + 2]
     at = scene.positions[node]
     bow = 0.125 * hold
     for n in range(over.shape[0]):
@@ -119,10 +108,11 @@ def _intrude(plant, scene, i, node, before, after, over) -> None:  # type: ignor
             y = 0.5 * (before[P + 1, n] + after[P + 1, n])
             y += bow * (before[V + 1, n] - after[V + 1, n])
             z = 0.5 * (before[Z, n] + after[Z, n]) + bow * (before[W, n] - after[W, n])
-        over[n] = c[CLEARANCE] - distance(volume, at[0] + x, at[1] + y, at[2] + z)
+        away = distance(volume, centre_n, centre_e, centre_d, at[0] + x, at[1] + y, at[2] + z)
+        over[n] = plant.clearance_m - away
 
 
-@numba.njit(cache=True)
+@kernel
 def _excess(value: float) -> float:
     over = max(value, 0.0)
     return over * (SLOPE + CURVATURE * over)

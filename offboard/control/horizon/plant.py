@@ -1,4 +1,4 @@
-"""What roll-outs fly, as arrays for compiled code: the plant of one vehicle, the scene of one
+"""What roll-outs fly, as records for compiled code: the plant of one vehicle, the scene of one
 decision, and where a state has what.
 
 States and inputs are deviations from the reference (`Outlook`). Knows no cost and no search.
@@ -9,12 +9,12 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numpy.typing import NDArray
 
 from offboard.control.horizon.outlook import Bounds, Outlook
 from offboard.control.response import SHORTEST_THRUST_LAG_S, CostToGo
+from offboard.model.kernel import kernel
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
@@ -23,29 +23,43 @@ Array = NDArray[np.float64]
 P, V, B, R, Z, W, F, T = 0, 2, 4, 6, 8, 9, 10, 11
 STATE_SIZE = 12
 INPUTS = 3
+MOST_STEPS = 40
 
 
-class Plant(NamedTuple):
-    """Constants of one vehicle and period, all (n,) or (n, n) float arrays."""
-
-    lateral: Array  # (4, 4) transition
-    lateral_input: Array  # (4,)
-    vertical: Array  # (3, 3)
-    vertical_input: Array  # (3,)
-    tilt_half: Array  # (2, 3) b and b' after half a hold, of [b, b', input]
-    lateral_stage: Array  # (5, 5)
-    vertical_stage: Array  # (4, 4)
-    lateral_terminal: Array  # (4, 4)
-    vertical_terminal: Array  # (3, 3)
-    lateral_gain: Array  # (4,)
-    vertical_gain: Array  # (3,)
-    scalars: Array  # below
-
-
-# Indices of `Plant.scalars`.
-GRAVITY, HOLD, LAG_HALF, LAG_FULL, THRUST_LEAST, THRUST_MOST, TILT_MOST, SPEED_MOST = range(8)
-PUSH_V0, PUSH_V1, PUSH_V2, PUSH_P0, PUSH_P1, NONLINEAR, CLEARANCE = range(8, 15)
-SCALARS = 15
+PLANT = np.dtype(
+    [
+        ("lateral_transition", "f8", (4, 4)),
+        ("lateral_input", "f8", 4),
+        ("lateral_stage", "f8", (5, 5)),
+        ("lateral_terminal", "f8", (4, 4)),
+        ("lateral_gain", "f8", 4),
+        ("vertical_transition", "f8", (3, 3)),
+        ("vertical_input", "f8", 3),
+        ("vertical_stage", "f8", (4, 4)),
+        ("vertical_terminal", "f8", (3, 3)),
+        ("vertical_gain", "f8", 3),
+        ("tilt_half", "f8", (2, 3)),  # b and b' after half a hold, of [b, b', input]
+        ("nonlinear", "i8"),
+        ("hold_s", "f8"),
+        ("gravity_mps2", "f8"),
+        # of the thrust's lag, what is left after half a hold and a whole one
+        ("lag_half", "f8"),
+        ("lag_full", "f8"),
+        ("thrust_least_mps2", "f8"),
+        ("thrust_most_mps2", "f8"),
+        ("tilt_most", "f8"),  # sine
+        ("speed_most_mps", "f8"),
+        ("clearance_m", "f8"),
+        # of an acceleration at start, middle and end of a hold, what becomes velocity and position
+        ("push_v0", "f8"),
+        ("push_v1", "f8"),
+        ("push_v2", "f8"),
+        ("push_p0", "f8"),
+        ("push_p1", "f8"),
+    ],
+    align=True,
+)
+"""Constants of one vehicle and period."""
 
 
 def plant_of(
@@ -59,38 +73,52 @@ def plant_of(
     thrust_mps2: tuple[float, float],
     speed_limit_mps: float,
     clearance_m: float,
-) -> Plant:
-    """`half` is the lateral model sampled at half the period."""
+) -> NDArray[np.void]:
+    """One `PLANT`; `half` is the lateral model sampled at half the period."""
     lag_s = max(vehicle.thrust_lag_s, SHORTEST_THRUST_LAG_S)
-    drag = vehicle.drag_per_mass_ps
+    constants = {
+        "tilt_half": np.column_stack((half.transition[2:, 2:], half.input_map[2:, 0])),
+        "nonlinear": nonlinear,
+        "hold_s": period_s,
+        "gravity_mps2": vehicle.gravity_mps2,
+        "lag_half": math.exp(-0.5 * period_s / lag_s),
+        "lag_full": math.exp(-period_s / lag_s),
+        "thrust_least_mps2": thrust_mps2[0],
+        "thrust_most_mps2": thrust_mps2[1],
+        "tilt_most": math.sin(vehicle.tilt_max_rad),
+        "speed_most_mps": speed_limit_mps,
+        "clearance_m": clearance_m,
+    }
+    constants |= _pushes(vehicle.drag_per_mass_ps, period_s)
+    constants |= _axis("lateral", lateral) | _axis("vertical", vertical)
+    plant = np.zeros(1, PLANT)
+    for name, value in constants.items():
+        plant[name] = value
+    return plant
 
+
+def _pushes(drag: float, period_s: float) -> dict[str, float]:
     def carried(after_s: float) -> float:
         """Of a push, what is left as position after a time in drag, per unit."""
         return -math.expm1(-drag * after_s) / drag if drag > 0 else after_s
 
-    scalars = np.empty(SCALARS)
-    scalars[GRAVITY], scalars[HOLD] = vehicle.gravity_mps2, period_s
-    scalars[LAG_HALF] = math.exp(-0.5 * period_s / lag_s)
-    scalars[LAG_FULL] = math.exp(-period_s / lag_s)
-    scalars[THRUST_LEAST], scalars[THRUST_MOST] = thrust_mps2
-    scalars[TILT_MOST] = math.sin(vehicle.tilt_max_rad)
-    scalars[SPEED_MOST] = speed_limit_mps
-    scalars[PUSH_V0] = period_s / 6.0 * math.exp(-drag * period_s)
-    scalars[PUSH_V1] = period_s / 1.5 * math.exp(-0.5 * drag * period_s)
-    scalars[PUSH_V2] = period_s / 6.0
-    scalars[PUSH_P0] = period_s / 6.0 * carried(period_s)
-    scalars[PUSH_P1] = period_s / 1.5 * carried(0.5 * period_s)
-    scalars[NONLINEAR] = float(nonlinear)
-    scalars[CLEARANCE] = clearance_m
-    return Plant(
-        *(np.ascontiguousarray(part) for part in (
-            lateral.transition, lateral.input_map[:, 0],
-            vertical.transition, vertical.input_map[:, 0],
-            np.column_stack((half.transition[2:, 2:], half.input_map[2:, 0])),
-            lateral.stage, vertical.stage, lateral.terminal, vertical.terminal,
-            lateral.gain, vertical.gain, scalars,
-        )),
-    )  # fmt: skip
+    return {
+        "push_v0": period_s / 6.0 * math.exp(-drag * period_s),
+        "push_v1": period_s / 1.5 * math.exp(-0.5 * drag * period_s),
+        "push_v2": period_s / 6.0,
+        "push_p0": period_s / 6.0 * carried(period_s),
+        "push_p1": period_s / 1.5 * carried(0.5 * period_s),
+    }
+
+
+def _axis(name: str, model: CostToGo) -> dict[str, Array]:
+    return {
+        f"{name}_transition": model.transition,
+        f"{name}_input": model.input_map[:, 0],
+        f"{name}_stage": model.stage,
+        f"{name}_terminal": model.terminal,
+        f"{name}_gain": model.gain,
+    }
 
 
 class Scene(NamedTuple):
@@ -108,6 +136,37 @@ class Scene(NamedTuple):
     volumes: Array  # (V, PACKED_SIZE), where they are at the first node
     thrust_share: float  # of the thrust believed, what is there, by the vertical disturbance
     floor_down_m: float  # no way round a volume leads below, where the reference does not
+
+    def fill(self, record: NDArray[np.void], volumes: Array) -> None:
+        """Into one `SCENE`, and the volumes into an array of their own."""
+        for name in ("thrust_share", "floor_down_m"):
+            record[name] = getattr(self, name)
+        for name in _PER_STEP:
+            values = getattr(self, name)
+            record[name][0, : len(values)] = values
+        volumes[:] = self.volumes
+
+
+_PER_STEP = Scene._fields[:9]
+_NODES = 2 * MOST_STEPS + 1
+SCENE = np.dtype(
+    [
+        ("positions", "f8", (_NODES, 3)),
+        ("velocities", "f8", (_NODES, 3)),
+        ("directions", "f8", (_NODES, 3)),
+        ("thrusts_tilt", "f8", _NODES),
+        ("thrusts_heave", "f8", _NODES),
+        ("uprights", "f8", _NODES),
+        ("feedforward", "f8", MOST_STEPS),
+        ("lower", "f8", (MOST_STEPS, 3)),
+        ("upper", "f8", (MOST_STEPS, 3)),
+        ("thrust_share", "f8"),
+        ("floor_down_m", "f8"),
+        ("start", "f8", STATE_SIZE),
+    ],
+    align=True,
+)
+"""A `Scene` of up to `MOST_STEPS` holds without its volumes, and the state to start from."""
 
 
 def scene_of(outlook: Outlook, within: Bounds, volumes: Array, floor_down_m: float) -> Scene:
@@ -141,7 +200,7 @@ def start_state(lateral: Array, vertical: Array, scene: Scene) -> Array:
     return start
 
 
-@numba.njit(cache=True)
+@kernel
 def upright(north: float, east: float) -> float:
     """Down component of a thrust direction, a unit vector, by the other two (NED)."""
     return math.sqrt(max(1.0 - north * north - east * east, 0.01))

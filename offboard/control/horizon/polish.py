@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.control.horizon.limits import CURVATURE, SLOPE
-from offboard.control.horizon.plant import INPUTS, B, F, P, Plant, R, V, W, Z
+from offboard.control.horizon.plant import INPUTS, B, F, P, R, V, W, Z
 from offboard.control.horizon.search import Evaluator, Plan, Remaining, sequences
 
 Array = NDArray[np.float64]
@@ -98,16 +98,17 @@ def _local(evaluate: Evaluator, here: Array, upper: Array) -> _Local:
     )
 
 
-def _curvature(plant: Plant, moved: Array) -> Array:
+def _curvature(plant: NDArray[np.void], moved: Array) -> Array:
     """(n, n) of the cost of states that move as (N + 1, STATE_SIZE, n) with the n inputs."""
     steps, size = len(moved) - 1, moved.shape[2]
     held = np.eye(size).reshape(INPUTS, steps, size)
     total = DAMPING * np.eye(size)
-    for axis, rows, stage, terminal in (
-        (0, (P, V, B, R), plant.lateral_stage, plant.lateral_terminal),
-        (1, (P + 1, V + 1, B + 1, R + 1), plant.lateral_stage, plant.lateral_terminal),
-        (2, (Z, W, F), plant.vertical_stage, plant.vertical_terminal),
+    for axis, rows, model in (
+        (0, (P, V, B, R), "lateral"),
+        (1, (P + 1, V + 1, B + 1, R + 1), "lateral"),
+        (2, (Z, W, F), "vertical"),
     ):
+        stage, terminal = plant[f"{model}_stage"][0], plant[f"{model}_terminal"][0]
         both = np.concatenate((moved[:-1, rows], held[axis][:, None]), axis=1)
         total += both.reshape(-1, size).T @ (stage @ both).reshape(-1, size)
         last = moved[-1, rows]

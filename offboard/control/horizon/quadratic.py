@@ -42,7 +42,7 @@ class HorizonQuadratic:
 
     def plan(self, stacked: Array) -> Array:
         """Inputs (N, 3) of the problem's (3 N,)."""
-        return np.ascontiguousarray(stacked.reshape(3, self.steps).T)
+        return stacked.reshape(3, self.steps).T
 
 
 def _condense(to_go: CostToGo, steps: int) -> tuple[Array, Array, Array]:

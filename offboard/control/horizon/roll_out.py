@@ -9,23 +9,12 @@ is remembered.
 
 from __future__ import annotations
 
-import numba
-
 from offboard.control.horizon.limits import penalise
 from offboard.control.horizon.plant import (
-    GRAVITY,
     INPUTS,
-    LAG_FULL,
-    LAG_HALF,
-    NONLINEAR,
-    PUSH_P0,
-    PUSH_P1,
-    PUSH_V0,
-    PUSH_V1,
-    PUSH_V2,
+    PLANT,
+    SCENE,
     STATE_SIZE,
-    THRUST_LEAST,
-    THRUST_MOST,
     B,
     F,
     P,
@@ -36,51 +25,60 @@ from offboard.control.horizon.plant import (
     Z,
     upright,
 )
+from offboard.model.kernel import array, entry, kernel
 
 
-@numba.njit(cache=True)
+@kernel
 def _clip(value: float, low: float, high: float) -> float:
     return min(max(value, low), high)
 
 
-@numba.njit(cache=True)
+@entry(
+    PLANT, SCENE, array(2), array(2), array(2), float, array(2), array(3),
+    array(3), array(3), array(1), array(1),
+)  # fmt: skip
 def roll_out(  # type: ignore[no-untyped-def]
-    plant, scene, start, base_inputs, base_states, feedback, weights, knots, states, inputs, costs
-) -> None:
+    plant, scene, volumes, base_inputs, base_states, feedback, weights, knots,
+    states, inputs, over, costs,
+) -> int:  # fmt: skip
     """Costs (particles,) of plans, and their states (N + 1, STATE_SIZE, particles) and inputs
-    (N, 3, particles).
+    (N, 3, particles); `over` (particles,) is scratch.
 
     Input of a step = base_inputs (N, 3) + `feedback` times the closed form's answer to how far the
     state is from base_states (N + 1, STATE_SIZE) + weights (N, M) @ knots (M, 3, particles),
     clipped to the bounds.
     """
-    steps = scene.lower.shape[0]
-    particles = costs.shape[0]
     for row in range(STATE_SIZE):
-        states[0, row, :] = start[row]
+        states[0, row, :] = scene.start[row]
     costs[:] = 0.0
-    for k in range(steps):
+    for k in range(inputs.shape[0]):
         _choose(
             plant, scene.lower[k], scene.upper[k], base_inputs[k], base_states[k], feedback,
             weights[k], knots, states[k], inputs[k],
         )  # fmt: skip
         _hold(plant, scene, k, states[k], inputs[k], states[k + 1], costs)
-        penalise(plant, scene, k, states[k], states[k + 1], costs)
+        penalise(plant, scene, volumes, k, states[k], states[k + 1], over, costs)
+    _conclude(plant, states[inputs.shape[0]], costs)
+    return 0
+
+
+@kernel
+def _conclude(plant, last, costs) -> None:  # type: ignore[no-untyped-def]
+    """Add what remains to be paid behind the last hold."""
     q, s = plant.lateral_terminal, plant.vertical_terminal
-    last = states[steps]
     for axis in range(2):
         for i in range(4):
             for j in range(4):
                 weight = q[i, j]
-                for n in range(particles):
+                for n in range(costs.shape[0]):
                     costs[n] += weight * last[2 * i + axis, n] * last[2 * j + axis, n]
     for i in range(3):
         for j in range(3):
-            for n in range(particles):
+            for n in range(costs.shape[0]):
                 costs[n] += s[i, j] * last[Z + i, n] * last[Z + j, n]
 
 
-@numba.njit(cache=True)
+@kernel
 def _choose(  # type: ignore[no-untyped-def]
     plant, lower, upper, base_input, base_state, feedback, weights, knots, state, chosen
 ) -> None:
@@ -112,11 +110,10 @@ def _choose(  # type: ignore[no-untyped-def]
             chosen[axis, n] = _clip(chosen[axis, n], lower[axis], upper[axis])
 
 
-@numba.njit(cache=True)
+@kernel
 def _hold(plant, scene, k, before, chosen, after, costs) -> None:  # type: ignore[no-untyped-def]
     """One hold of every particle: its cost, then where it leads."""
-    c = plant.scalars
-    a, b = plant.lateral, plant.lateral_input
+    a, b = plant.lateral_transition, plant.lateral_input
     q = plant.lateral_stage
     for axis in range(2):
         for n in range(chosen.shape[1]):
@@ -134,7 +131,7 @@ def _hold(plant, scene, k, before, chosen, after, costs) -> None:  # type: ignor
             after[V + axis, n] = a[1, 1] * v + a[1, 2] * d + a[1, 3] * r + b[1] * u
             after[B + axis, n] = a[2, 2] * d + a[2, 3] * r + b[2] * u
             after[R + axis, n] = a[3, 2] * d + a[3, 3] * r + b[3] * u
-    h, g, s = plant.vertical, plant.vertical_input, plant.vertical_stage
+    h, g, s = plant.vertical_transition, plant.vertical_input, plant.vertical_stage
     for n in range(chosen.shape[1]):
         z, w, f, u = before[Z, n], before[W, n], before[F, n], chosen[2, n]
         costs[n] += (
@@ -147,15 +144,15 @@ def _hold(plant, scene, k, before, chosen, after, costs) -> None:  # type: ignor
         after[W, n] = h[1, 1] * w + h[1, 2] * f + g[1] * u
         after[F, n] = h[2, 2] * f + g[2] * u
         after[T, n] = 0.0
-    if c[NONLINEAR] != 0.0:
+    if plant.nonlinear != 0:
         _bend(plant, scene, k, before, chosen, after)
 
 
-@numba.njit(cache=True)
+@kernel
 def _bend(plant, scene, k, before, chosen, after) -> None:  # type: ignore[no-untyped-def]
     """Add what T b does beyond the linear model: at start, middle and end of the hold."""
-    c, tilt = plant.scalars, plant.tilt_half
-    g, share = c[GRAVITY], scene.thrust_share
+    tilt = plant.tilt_half
+    g, share = plant.gravity_mps2, scene.thrust_share
     ref = scene.directions[2 * k : 2 * k + 3]
     thrusts = scene.thrusts_tilt[2 * k : 2 * k + 3]
     heaves = scene.thrusts_heave[2 * k : 2 * k + 3]
@@ -177,9 +174,9 @@ def _bend(plant, scene, k, before, chosen, after) -> None:  # type: ignore[no-un
         d1 = upright(ref[1, 0] + n1, ref[1, 1] + e1) - refs[1]
         d2 = upright(ref[2, 0] + n2, ref[2, 1] + e2) - refs[2]
         asked = (scene.feedforward[k] + w) / max(uprights[0] + d0, 0.1)
-        asked = _clip(asked, c[THRUST_LEAST], c[THRUST_MOST]) - led
-        t1 = asked + (t0 - asked) * c[LAG_HALF]
-        t2 = asked + (t0 - asked) * c[LAG_FULL]
+        asked = _clip(asked, plant.thrust_least_mps2, plant.thrust_most_mps2) - led
+        t1 = asked + (t0 - asked) * plant.lag_half
+        t2 = asked + (t0 - asked) * plant.lag_full
         # residual accelerations: -(T b - T_r b_r), less the linear model's
         x0 = g * n0 - share * ((thrusts[0] + t0) * n0 + t0 * ref[0, 0])
         x1 = g * n1 - share * ((thrusts[1] + t1) * n1 + t1 * ref[1, 0])
@@ -188,13 +185,13 @@ def _bend(plant, scene, k, before, chosen, after) -> None:  # type: ignore[no-un
         y1 = g * e1 - share * ((thrusts[1] + t1) * e1 + t1 * ref[1, 1])
         y2 = g * e2 - share * ((thrusts[2] + t2) * e2 + t2 * ref[2, 1])
         z0 = f - ((heaves[0] + t0) * d0 + t0 * uprights[0])
-        z1 = w + (f - w) * c[LAG_HALF] - ((heaves[1] + t1) * d1 + t1 * uprights[1])
-        z2 = w + (f - w) * c[LAG_FULL] - ((heaves[2] + t2) * d2 + t2 * uprights[2])
-        after[P, n] += c[PUSH_P0] * x0 + c[PUSH_P1] * x1
-        after[P + 1, n] += c[PUSH_P0] * y0 + c[PUSH_P1] * y1
-        after[V, n] += c[PUSH_V0] * x0 + c[PUSH_V1] * x1 + c[PUSH_V2] * x2
-        after[V + 1, n] += c[PUSH_V0] * y0 + c[PUSH_V1] * y1 + c[PUSH_V2] * y2
-        after[Z, n] += c[PUSH_P0] * z0 + c[PUSH_P1] * z1
-        after[W, n] += c[PUSH_V0] * z0 + c[PUSH_V1] * z1 + c[PUSH_V2] * z2
+        z1 = w + (f - w) * plant.lag_half - ((heaves[1] + t1) * d1 + t1 * uprights[1])
+        z2 = w + (f - w) * plant.lag_full - ((heaves[2] + t2) * d2 + t2 * uprights[2])
+        after[P, n] += plant.push_p0 * x0 + plant.push_p1 * x1
+        after[P + 1, n] += plant.push_p0 * y0 + plant.push_p1 * y1
+        after[V, n] += plant.push_v0 * x0 + plant.push_v1 * x1 + plant.push_v2 * x2
+        after[V + 1, n] += plant.push_v0 * y0 + plant.push_v1 * y1 + plant.push_v2 * y2
+        after[Z, n] += plant.push_p0 * z0 + plant.push_p1 * z1
+        after[W, n] += plant.push_v0 * z0 + plant.push_v1 * z1 + plant.push_v2 * z2
         after[T, n] = t2
         after[F, n] = (heaves[2] + t2) * d2 + t2 * uprights[2]

@@ -55,7 +55,7 @@ class _Draws:
 
     def conclude(self, mean: Array, sd: Array, iterations: int, cut_short: bool) -> Found:
         """The mean as a plan."""
-        self.evaluate.of_knots(self.base, np.ascontiguousarray(mean[:, :, None]))
+        self.evaluate.of_knots(self.base, mean[:, :, None])
         plan = self.evaluate.picked(1, 0)
         return Found(plan, float(np.linalg.norm(sd)), iterations, cut_short)
 

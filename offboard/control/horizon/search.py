@@ -14,10 +14,12 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.control.horizon.keep_out import PACKED_SIZE
 from offboard.control.horizon.limits import VOLUME, excesses, limits_of, share_of
-from offboard.control.horizon.plant import INPUTS, STATE_SIZE, Plant, Scene
+from offboard.control.horizon.plant import INPUTS, PLANT, SCENE, STATE_SIZE, Scene
 from offboard.control.horizon.roll_out import roll_out
 from offboard.control.swarm import RandomLanes, Swarm, SwarmSettings
+from offboard.model.kernel import address
 
 Array = NDArray[np.float64]
 Remaining = Callable[[], float] | None
@@ -58,94 +60,117 @@ def knot_weights(steps: int) -> Array:
 
 
 class Evaluator:
-    """Runs roll-outs of one situation; arrays are made once per number of particles."""
+    """Runs roll-outs of one situation, which may have so many volumes to keep out of. What compiled
+    code needs stays where it is in memory."""
 
-    def __init__(self, steps: int) -> None:
+    def __init__(self, steps: int, volumes: int) -> None:
         self.steps = steps
         self.knots = knot_weights(steps)
+        self.plant, self._record = np.zeros(1, PLANT), np.zeros(1, SCENE)
+        self._volumes = np.zeros((volumes, PACKED_SIZE))
+        self._base = np.zeros((steps, INPUTS)), np.zeros((steps + 1, STATE_SIZE))
+        self._nothing = np.zeros((steps, INPUTS)), np.zeros((steps + 1, STATE_SIZE))
         self._each_step = np.eye(steps)
-        self._arrays: dict[int, tuple[Array, Array, Array]] = {}
-        self._no_states = np.zeros((steps + 1, STATE_SIZE))
+        self._batches: dict[int, _Batch] = {}
 
-    def settle(self, plant: Plant, scene: Scene, start: Array) -> None:
-        """The situation of the roll-outs that follow."""
-        self._plant, self._scene, self._start = plant, scene, start
-
-    @property
-    def scene(self) -> Scene:
-        return self._scene
+    def settle(self, plant: NDArray[np.void], scene: Scene, start: Array) -> None:
+        """The situation of the roll-outs that follow: one `PLANT`, and a state (STATE_SIZE,)."""
+        self.scene = scene
+        self.plant[:] = plant
+        scene.fill(self._record, self._volumes)
+        self._record["start"] = start
 
     @property
     def lower(self) -> Array:
-        return self._scene.lower
+        return self.scene.lower
 
     @property
     def upper(self) -> Array:
-        return self._scene.upper
+        return self.scene.upper
 
     def of_knots(self, base: Plan, knots: Array) -> Array:
         """Costs (n,) of knots (M, 3, n) about `base`; a plan is read with `picked`."""
-        return self._run(base.inputs, base.states, 1.0, self.knots, knots)
+        return self._run(base.inputs, base.states, knots)
 
     def of_inputs(self, inputs: Array) -> Array:
         """Costs (n,) of input sequences (N, 3, n), clipped to the bounds."""
-        nothing = np.zeros((self.steps, INPUTS))
-        return self._run(nothing, self._no_states, 0.0, self._each_step, inputs)
+        return self._run(None, None, inputs)
 
     def held(self, inputs: Array, states: Array) -> Plan:
         """What becomes of inputs (N, 3) with the feedback that holds states (N + 1, .)."""
-        none = np.zeros((self.knots.shape[1], INPUTS, 1))
-        self._run(inputs, states, 1.0, self.knots, none)
+        self._run(inputs, states, np.zeros((self.knots.shape[1], INPUTS, 1)))
         return self.picked(1, 0)
 
     def flown(self, inputs: Array) -> Plan:
         """What becomes of inputs (N, 3) without feedback."""
-        self.of_inputs(np.ascontiguousarray(inputs[:, :, None]))
+        self.of_inputs(inputs[:, :, None])
         return self.picked(1, 0)
 
     def picked(self, count: int, index: int) -> Plan:
         """Plan `index` of the last roll-outs with `count` particles."""
-        states, inputs, costs = self._arrays[count]
-        return Plan(inputs[:, :, index].copy(), states[:, :, index].copy(), float(costs[index]))
-
-    @property
-    def plant(self) -> Plant:
-        return self._plant
+        batch = self._batches[count]
+        inputs, states = batch.inputs[:, :, index].copy(), batch.states[:, :, index].copy()
+        return Plan(inputs, states, float(batch.costs[index]))
 
     def rolled(self, count: int) -> tuple[Array, Array]:
         """States (N + 1, STATE_SIZE, count) of the last roll-outs with `count` particles, and by
         how much they exceed each limit: see `excesses`."""
-        states = self._arrays[count][0]
-        over = np.empty((self.steps * limits_of(self._scene), count))
-        excesses(self._plant, self._scene, states, over)
-        return states, over
+        states = self._batches[count].states
+        return states, self._excesses(states)
 
     def shares(self) -> Array:
         """(N * limits,): for how many seconds each of `excesses` is paid."""
-        limits = range(limits_of(self._scene))
-        return np.tile([share_of(self._plant, limit) for limit in limits], self.steps)
+        hold_s = float(self.plant["hold_s"][0])
+        limits = range(limits_of(self._volumes))
+        return np.tile([share_of(hold_s, limit) for limit in limits], self.steps)
 
     def meets(self, plan: Plan, margin_m: float) -> bool:
         """Whether a plan comes closer to the clearance of any volume than `margin_m`."""
-        over = np.empty((self.steps * limits_of(self._scene), 1))
-        excesses(self._plant, self._scene, plan.states[:, :, None], over)
+        over = self._excesses(plan.states[:, :, None])
         return bool((over.reshape(self.steps, -1)[:, VOLUME:] > -margin_m).any())
 
-    def _run(
-        self, inputs: Array, states: Array, feedback: float, weights: Array, knots: Array
-    ) -> Array:
+    def _excesses(self, states: Array) -> Array:
+        over = np.empty((self.steps * limits_of(self._volumes), states.shape[2]))
+        situation = address(self.plant), address(self._record), self._volumes
+        excesses.call(*situation, states, over)
+        return over
+
+    def _run(self, inputs: Array | None, states: Array | None, knots: Array) -> Array:
         count = knots.shape[2]
-        if count not in self._arrays:
-            self._arrays[count] = (
-                np.empty((self.steps + 1, STATE_SIZE, count)),
-                np.empty((self.steps, INPUTS, count)),
-                np.empty(count),
-            )
-        arrays = self._arrays[count]
-        roll_out(
-            self._plant, self._scene, self._start, inputs, states, feedback, weights, knots, *arrays
-        )
-        return arrays[2]
+        batch = self._batches.get(count)
+        if batch is None:
+            batch = self._batches[count] = self._batch(count)
+        if inputs is None:
+            batch.sequences[:] = knots
+            batch.fly_sequences()
+        else:
+            self._base[0][:], self._base[1][:] = inputs, states
+            batch.knots[:] = knots
+            batch.fly_knots()
+        return batch.costs
+
+    def _batch(self, count: int) -> _Batch:
+        knots = np.empty((self.knots.shape[1], INPUTS, count))
+        sequences, inputs = (np.empty((self.steps, INPUTS, count)) for _ in range(2))
+        states = np.empty((self.steps + 1, STATE_SIZE, count))
+        over, costs = (np.empty(count) for _ in range(2))
+        situation, flown = (self.plant, self._record, self._volumes), (states, inputs, over, costs)
+        about = roll_out.bound(*situation, *self._base, 1.0, self.knots, knots, *flown)
+        alone = roll_out.bound(*situation, *self._nothing, 0.0, self._each_step, sequences, *flown)
+        return _Batch(knots, sequences, about, alone, states, inputs, costs)
+
+
+@dataclass(frozen=True, slots=True)
+class _Batch:
+    """The arrays of the roll-outs of so many particles: what they are given, and what comes out."""
+
+    knots: Array
+    sequences: Array
+    fly_knots: Callable[[], int]
+    fly_sequences: Callable[[], int]
+    states: Array
+    inputs: Array
+    costs: Array
 
 
 def swarm(
@@ -163,7 +188,7 @@ def swarm(
     shape = (*reach.shape, settings.particles)
     best, cut_short = base, False
     for iteration in range(settings.iterations):
-        knots = np.ascontiguousarray(particles.ask().T).reshape(shape)
+        knots = particles.ask().T.reshape(shape)
         costs = evaluate.of_knots(base, knots)
         first = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
         if costs[first] < best.cost:
@@ -192,4 +217,4 @@ def _directions(count: int, size: int) -> Array:
 def sequences(stacked: Array) -> Array:
     """(3 N, n) of the quadratic's order to (N, 3, n)."""
     size, count = stacked.shape
-    return np.ascontiguousarray(stacked.reshape(INPUTS, size // INPUTS, count).transpose(1, 0, 2))
+    return stacked.reshape(INPUTS, size // INPUTS, count).transpose(1, 0, 2)

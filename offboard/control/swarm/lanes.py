@@ -34,15 +34,22 @@ class RandomLanes:
             raise ValueError(f"seed must be in 0 .. 2**64 - 1, got {seed}")
         self._seed = seed
         self._states: States = np.empty(0, np.uint64)
+        self._handed_out = self._states
 
     def states(self, count: int) -> States:
-        """The first `count` lanes, shape (count,), to be advanced in place."""
+        """The first `count` lanes, shape (count,), to be advanced in place: the same array as long
+        as the same count is asked for. Whoever holds fewer of them when there come to be more goes
+        on with those of its own."""
         held = len(self._states)
         if count > held:
             start = _splitmix64(self._seed)
             fresh = [_splitmix64((start + (i + 1) * _GOLDEN) & _MASK) for i in range(held, count)]
             self._states = np.concatenate([self._states, np.array(fresh, np.uint64)])
-        return self._states[:count]
+            self._handed_out = self._states
+        if count != len(self._handed_out):
+            self._handed_out = self._states[:count]
+        return self._handed_out
 
     def reset(self) -> None:
         self._states = np.empty(0, np.uint64)
+        self._handed_out = self._states

@@ -7,12 +7,31 @@ allocated. Knows no objective.
 
 from __future__ import annotations
 
-import numba
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-States = NDArray[np.uint64]
+from offboard.model.kernel import array, entry, kernel
+
+SEARCH = np.dtype(
+    [
+        ("inertia", "f8"),
+        ("personal", "f8"),
+        ("social", "f8"),
+        ("damping", "f8"),
+        ("rebound", "f8"),
+        ("initial_velocity", "f8"),
+        # the objective's constant, where it is a quadratic
+        ("constant", "f8"),
+        # done so far, and how far to go
+        ("iterations", "i8"),
+        ("limit", "i8"),
+        ("rejected", "i8"),
+        # the leader's cost and the spread, Eqs. 28-29
+        ("cost", "f8"),
+        ("spread", "f8"),
+    ],
+    align=True,
+)
+"""The numbers of one search: the settings, what it is told and what it found so far."""
 
 _SHIFT_A = np.uint64(13)
 _SHIFT_B = np.uint64(7)
@@ -22,11 +41,14 @@ _LOW_31 = np.uint64(0x7FFFFFFF)
 _UNIT_31 = 2.0**-31  # one draw gives two uniform numbers of 31 bits in [0, 1)
 
 
-@numba.njit(cache=True)
+@entry(SEARCH, array(1, "u8"), array(1), array(1), array(2), array(2))
 def scatter(  # type: ignore[no-untyped-def]
-    lanes, lower, upper, initial_velocity, positions, velocities
-) -> None:
-    """Uniform positions in the box and uniform velocities of either sign."""
+    search, lanes, lower, upper, positions, velocities
+) -> int:
+    """Begin a search: uniform positions in the box and uniform velocities of either sign."""
+    search.iterations = search.rejected = 0
+    search.cost = search.spread = np.inf
+    initial_velocity = search.initial_velocity
     for j in range(positions.shape[0]):
         low = lower[j]
         high = upper[j]
@@ -41,18 +63,20 @@ def scatter(  # type: ignore[no-untyped-def]
             r2 = np.int32(x & _LOW_31) * _UNIT_31
             positions[j, i] = min(max(low + r1 * width, low), high)
             velocities[j, i] = initial_velocity * (2.0 * r2 - 1.0) * width
+    return 0
 
 
-@numba.njit(cache=True)
+@entry(SEARCH, array(1, "u8"), array(1), array(1), array(2), array(2), array(2), array(1))
 def move(  # type: ignore[no-untyped-def]
-    lanes, lower, upper, inertia, personal, social, damping, rebound,
-    positions, velocities, bests, leader,
-) -> None:  # fmt: skip
+    search, lanes, lower, upper, positions, velocities, bests, leader
+) -> int:
     """Eqs. 30 and 20 with a random number per dimension; Eq. 22 by clamping.
 
     A clamped component turns its velocity round, times `rebound`: a particle that keeps it stays
     pressed on the wall, and where all lose it beside their leader, that dimension is dead.
     """
+    inertia, personal, social = search.inertia, search.personal, search.social
+    damping, rebound = search.damping, search.rebound
     for j in range(positions.shape[0]):
         low = lower[j]
         high = upper[j]
@@ -75,17 +99,17 @@ def move(  # type: ignore[no-untyped-def]
             inside = low <= there <= high
             velocities[j, i] = velocity if inside else -rebound * velocity
             positions[j, i] = min(max(there, low), high)  # Eq. 22
+    return 0
 
 
-@numba.njit(cache=True)
-def remember(  # type: ignore[no-untyped-def]
-    costs, positions, bests, best_costs, leader, leader_cost
-):
-    """Update personal bests and the leader in place; (leader's cost, number of rejected costs).
+@kernel
+def remember(search, costs, positions, bests, best_costs, leader) -> None:  # type: ignore[no-untyped-def]
+    """Update personal bests and the leader, count the iteration and what costs are rejected.
 
     Of equal costs the earlier one stands; a cost that is not finite never becomes a best.
     """
     dimensions, particles = positions.shape
+    leader_cost = search.cost
     rejected = 0
     winner = -1
     for i in range(particles):
@@ -102,10 +126,22 @@ def remember(  # type: ignore[no-untyped-def]
     if winner >= 0:
         for j in range(dimensions):
             leader[j] = positions[j, winner]
-    return leader_cost, rejected
+    search.cost = leader_cost
+    search.rejected += rejected
+    search.iterations += 1
 
 
-@numba.njit(cache=True)
+@entry(SEARCH, array(1), array(2), array(2), array(1), array(1))
+def learn(  # type: ignore[no-untyped-def]
+    search, costs, positions, bests, best_costs, leader
+) -> int:
+    """`remember`, and the spread."""
+    remember(search, costs, positions, bests, best_costs, leader)
+    search.spread = spread_about(positions, leader)
+    return 0
+
+
+@kernel
 def spread_about(positions, leader):  # type: ignore[no-untyped-def]
     """Mean distance of all particles from the leader, Eqs. 28-29."""
     dimensions, particles = positions.shape

@@ -8,22 +8,41 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-import numba
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from offboard.control.cost import BoxQuadratic
-from offboard.control.swarm.lanes import RandomLanes
-from offboard.control.swarm.motion import move, remember, scatter, spread_about
-from offboard.control.swarm.particles import Box, Swarm, box, place_seeds
+from offboard.control.swarm.lanes import RandomLanes, States
+from offboard.control.swarm.motion import SEARCH, move, remember, scatter, spread_about
+from offboard.control.swarm.particles import Swarm
+from offboard.control.swarm.population import Population, box
 from offboard.control.swarm.settings import SwarmHistory, SwarmResult, SwarmSettings
+from offboard.model.kernel import array, entry, kernel
 
 Array = NDArray[np.float64]
 
 CHUNK_ITERATIONS = 25  # between two looks at the time left: about 15 us
 
 
-@numba.njit(cache=True)
+@entry(
+    SEARCH, array(1, "u8"), array(1), array(1), array(2), array(2), array(2), array(1),
+    array(1), array(1), array(2), array(1),
+)  # fmt: skip
+def iterate(  # type: ignore[no-untyped-def]
+    search, lanes, lower, upper, positions, velocities, bests, leader,
+    best_costs, costs, hessian, gradient,
+) -> int:  # fmt: skip
+    """Iterations up to the limit; the first of them evaluates where the particles stand."""
+    while search.iterations < search.limit:
+        if search.iterations > 0:
+            move(search, lanes, lower, upper, positions, velocities, bests, leader)
+        quadratic_costs(hessian, gradient, search.constant, positions, costs)
+        remember(search, costs, positions, bests, best_costs, leader)
+    search.spread = spread_about(positions, leader)
+    return 0
+
+
+@kernel
 def quadratic_costs(  # type: ignore[no-untyped-def]
     hessian, gradient, constant, positions, costs
 ) -> None:
@@ -40,7 +59,7 @@ def quadratic_costs(  # type: ignore[no-untyped-def]
             costs[i] += positions[j, i] * slope
 
 
-@numba.njit(cache=True)
+@kernel
 def _costs_of_four(  # type: ignore[no-untyped-def]
     hessian, gradient, constant, positions, costs
 ) -> None:
@@ -61,42 +80,15 @@ def _costs_of_four(  # type: ignore[no-untyped-def]
         )
 
 
-@numba.njit(cache=True)
-def _iterate(  # type: ignore[no-untyped-def]
-    first, last, lanes, lower, upper, inertia, personal, social, damping, rebound,
-    positions, velocities, bests, best_costs, leader, leader_cost,
-    hessian, gradient, constant, costs,
-):  # fmt: skip
-    """Iterations first .. last - 1; iteration 0 evaluates where the particles stand."""
-    rejected = 0
-    for iteration in range(first, last):
-        if iteration > 0:
-            move(
-                lanes, lower, upper, inertia, personal, social, damping, rebound,
-                positions, velocities, bests, leader,
-            )  # fmt: skip
-        quadratic_costs(hessian, gradient, constant, positions, costs)
-        leader_cost, fresh = remember(costs, positions, bests, best_costs, leader, leader_cost)
-        rejected += fresh
-    return leader_cost, rejected, spread_about(positions, leader)
-
-
 class QuadraticSwarm:
     """Searches for minima of quadratics in `dimensions` inputs; its arrays are made once."""
 
     def __init__(self, settings: SwarmSettings, dimensions: int) -> None:
         self._settings = settings
-        shape = (dimensions, settings.particles)
-        self._positions = np.empty(shape)
-        self._velocities = np.empty(shape)
-        self._bests = np.empty(shape)
-        self._best_costs = np.empty(settings.particles)
-        self._costs = np.empty(settings.particles)
-        self._leader = np.empty(dimensions)
-        self._bounds = Box(np.empty(dimensions), np.empty(dimensions))
+        self._all = Population(settings, dimensions)
         self._hessian = np.empty((dimensions, dimensions))
         self._gradient = np.empty(dimensions)
-        self._constant = 0.0
+        self._drawn: States | None = None
 
     def minimise(
         self,
@@ -113,54 +105,43 @@ class QuadraticSwarm:
         are not finite and ordered, or of another dimension.
         """
         self._start(problem, lanes, seeds)
-        limit = self._settings.iterations
-        watched = remaining_s is not None or self._settings.tolerance > 0
+        p, limit, tolerance = self._all, self._settings.iterations, self._settings.tolerance
+        watched = remaining_s is not None or tolerance > 0
         chunk = 1 if keep_history else CHUNK_ITERATIONS if watched else limit
         kept: list[tuple[Array, float, float]] = []
-        done, cost, rejected, spread, cut_short = 0, np.inf, 0, np.inf, False
+        done, cut_short = 0, False
         while done < limit:
-            reach = min(done + chunk, limit)
-            cost, fresh, spread = self._advance(lanes, done, reach, cost)
-            done, rejected = reach, rejected + fresh
+            p.limit[0] = done = min(done + chunk, limit)
+            self._iterate()
             if keep_history:
-                kept.append((self._positions.T.copy(), cost, spread))
-            if spread <= self._settings.tolerance > 0:
+                kept.append((p.positions.T.copy(), float(p.cost[0]), float(p.spread[0])))
+            if tolerance > 0 and p.spread[0] <= tolerance:
                 break
             if done < limit and remaining_s is not None and remaining_s() <= 0:
                 cut_short = True
                 break
-        history = _history(kept) if keep_history else None
-        return SwarmResult(
-            self._leader.copy(), float(cost), float(spread), done, cut_short, rejected, history
-        )
+        return p.result(cut_short, _history(kept) if keep_history else None)
 
     def _start(self, problem: BoxQuadratic, lanes: RandomLanes, seeds: Sequence[ArrayLike]) -> None:
-        bounds = box(problem.lower, problem.upper)
-        if len(bounds.lower) != len(self._leader):
-            raise ValueError(f"{len(bounds.lower)} inputs for a swarm of {len(self._leader)}")
-        self._bounds = bounds
+        p = self._all
+        p.confine(box(problem.lower, problem.upper))
         self._hessian[:] = problem.hessian
         self._gradient[:] = problem.gradient
-        self._constant = float(problem.constant)
-        s = self._settings
-        states = lanes.states(s.particles)
-        scatter(states, *bounds, s.initial_velocity, self._positions, self._velocities)
-        place_seeds(self._positions, seeds, bounds)
-        self._bests[:] = self._positions
-        self._best_costs.fill(np.inf)
-        self._leader[:] = self._positions[:, 0]
+        p.search["constant"] = problem.constant
+        drawn = lanes.states(self._settings.particles)
+        if drawn is not self._drawn:
+            self._draw_from(drawn)
+        self._scatter()
+        p.begin(seeds)
 
-    def _advance(
-        self, lanes: RandomLanes, first: int, last: int, cost: float
-    ) -> tuple[float, int, float]:
-        s = self._settings
-        answer: tuple[float, int, float] = _iterate(
-            first, last, lanes.states(s.particles), *self._bounds,
-            s.inertia, s.personal, s.social, s.damping, s.rebound,
-            self._positions, self._velocities, self._bests, self._best_costs,
-            self._leader, cost, self._hessian, self._gradient, self._constant, self._costs,
-        )  # fmt: skip
-        return answer
+    def _draw_from(self, lanes: States) -> None:
+        p = self._all
+        where = (p.search, lanes, p.lower, p.upper, p.positions, p.velocities)
+        self._scatter = scatter.bound(*where)
+        self._iterate = iterate.bound(
+            *where, p.bests, p.leader, p.best_costs, p.costs, self._hessian, self._gradient
+        )
+        self._drawn = lanes
 
 
 def warm_up() -> None:
