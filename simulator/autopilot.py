@@ -1,7 +1,8 @@
 """One autopilot on one plant, step by step: it flies, and then looks at what happened.
 
-Its parts: the commander decides about modes, the pilot flies them, health and watch see to what
-changes by itself. Here is their order in time, and when compiled code may fly in their place.
+Its parts: the commander decides about modes, the navigator says where to be, the pilot flies there,
+health and watch see to what changes by itself. Here is their order in time, and when compiled code
+may fly in their place.
 Knows no MAVLink frames, sockets or clock: the vehicle's time is the plant's.
 """
 
@@ -15,10 +16,12 @@ from simulator.firmware.base import AttitudeSetpoint, Behaviour, Firmware, Motio
 from simulator.health import Health
 from simulator.mission import Mission
 from simulator.nav import Senses
+from simulator.navigator import Navigator
 from simulator.parameters import ParameterTable
 from simulator.pilot import Pilot
-from simulator.plant import STEP_S, Plant
+from simulator.plant import Plant
 from simulator.setpoints import ATTITUDE, SetpointStream
+from simulator.steps import STEP_S
 from simulator.watch import EVERY_STEPS, Watch
 
 _RESTS_STEPS = 250  # at most, so that what is changed behind its back is seen soon
@@ -46,8 +49,11 @@ class Autopilot:
         self.health = Health(
             firmware, self.parameters, self.mission, self.stream, self.watch, boot_scale
         )
-        self.pilot = Pilot(firmware, self.parameters, self.mission)
-        self.commander = Commander(firmware, self.parameters, self.pilot, self.senses, self.health)
+        self.navigator = Navigator(firmware, self.parameters, self.mission)
+        self.pilot = Pilot(firmware, self.parameters, self.navigator)
+        self.commander = Commander(
+            firmware, self.parameters, self.navigator, self.pilot, self.senses, self.health
+        )
         self.resting = False  # compiled code flies
         self.calm_until = self._rests_since = 0
 
@@ -67,7 +73,7 @@ class Autopilot:
         if message == ATTITUDE:
             self._fly(self.stream.attitude(values))
         elif outlives or mode.needs_position:
-            home_down_m = self.pilot.home_ned_m[2]
+            home_down_m = self.navigator.home_ned_m[2]
             setpoint, said = self.stream.motion(message, values, self.senses.look(), home_down_m)
             self.commander.texts += () if said is None else (said,)
             self._fly(setpoint)
@@ -76,8 +82,8 @@ class Autopilot:
         if setpoint is None:
             return
         self.stream.newest_s = self.senses.time_s
-        self.pilot.setpoint = setpoint
-        if self.pilot.behaviour is not self.commander.mode.behaviour:  # a takeoff in it ends
+        self.navigator.setpoint = setpoint
+        if self.navigator.behaviour is not self.commander.mode.behaviour:  # a takeoff in it ends
             self.pilot.enter(self.commander.mode.behaviour, self.senses.look())
         if isinstance(setpoint, AttitudeSetpoint) and setpoint.event:
             self.happen(setpoint.event)
@@ -113,7 +119,7 @@ class Autopilot:
         event = airtime.step(now_s, was_landed=was_landed, landed=pilot.landed)
         if event is not None:
             commander.happen(event)
-        for event in pilot.tell():
+        for event in self.navigator.tell():
             commander.happen(event)
         if not commander.armed:
             return

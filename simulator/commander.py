@@ -24,6 +24,7 @@ from simulator.firmware.base import (
 )
 from simulator.health import Health
 from simulator.nav import Senses
+from simulator.navigator import Navigator
 from simulator.parameters import ParameterTable
 from simulator.pilot import Pilot
 from simulator.state_table import StateTable
@@ -53,12 +54,14 @@ class Commander:
         self,
         firmware: Firmware,
         parameters: ParameterTable,
+        navigator: Navigator,
         pilot: Pilot,
         senses: Senses,
         health: Health,
     ) -> None:
         self._firmware, self._parameters = firmware, parameters
-        self._pilot, self._senses, self._health = pilot, senses, health
+        self._navigator, self._pilot = navigator, pilot
+        self._senses, self._health = senses, health
         self._table = StateTable(firmware.rules)
         self.mode: Mode = firmware.modes[firmware.boot_mode]
         self._intended = self._remembered = firmware.boot_mode
@@ -92,7 +95,7 @@ class Commander:
             healthy=self.healthy,
             failsafe=self.failsafe,
             faulty=bool(self._latched),
-            setpoint=self._pilot.setpoint,
+            setpoint=self._navigator.setpoint,
         )
         base_mode, state = self._firmware.heartbeat(condition)
         return base_mode | (128 if self.armed else 0), state
@@ -159,12 +162,12 @@ class Commander:
     @property
     def _figures(self) -> dict[str, float]:
         """What texts may name."""
-        above_home_m = self._pilot.target_height_m
-        amsl_m = self._firmware.origin[2] - self._pilot.home_ned_m[2] + above_home_m
+        above_home_m = self._navigator.target_height_m
+        amsl_m = self._firmware.origin[2] - self._navigator.home_ned_m[2] + above_home_m
         battery = self._senses.truth.battery
         return {
             "takeoff_m": self._parameters.role("takeoff_height_m"),
-            "climb_m": self._pilot.mission.climb_m,
+            "climb_m": self._navigator.mission.climb_m,
             "target_m": above_home_m,
             "target_amsl_m": amsl_m,
             "battery_v": battery.voltage_v,
@@ -181,7 +184,7 @@ class Commander:
             if mode.remembered:
                 self._remembered = name
         if mode is not self.mode and not self._firmware.setpoints_outlive_modes:
-            self._pilot.setpoint = None
+            self._navigator.setpoint = None
         if mode is not self.mode or mode.behaviour not in _GO_ON:
             self._pilot.enter(mode.behaviour, self._senses.look(), self._wish.takeoff_z_m)
         self.mode = mode
@@ -214,11 +217,11 @@ class Commander:
         self.failsafe = False
 
     def _take_off(self) -> None:
-        self._pilot.setpoint = None
+        self._navigator.setpoint = None
         self._pilot.enter(Behaviour.TAKEOFF, self._senses.look(), self._wish.takeoff_z_m)
 
     def _hold(self) -> None:
-        self._pilot.setpoint = None
+        self._navigator.setpoint = None
         self._pilot.enter(self.mode.behaviour, self._senses.look())
 
     def _level(self) -> None:
@@ -233,7 +236,7 @@ class Commander:
     # -- guards ------------------------------------------------------------------------------
 
     def _climb_asked(self) -> bool:
-        return self._wish.takeoff_z_m <= self._pilot.home_ned_m[2]
+        return self._wish.takeoff_z_m <= self._navigator.home_ned_m[2]
 
     def _mode_can_run(self) -> bool:
         return self._health.can_run(self._asked, self._senses.time_s)
@@ -249,12 +252,12 @@ GUARDS: dict[str, Callable[[Commander], bool]] = {
     "mode needs position": lambda own: own.mode.needs_position,
     "mode arms": lambda own: own.mode.arms,
     "position missing": lambda own: own._health.position_missing(own._asked),
-    "mission missing": lambda own: not own._pilot.mission.flyable,
+    "mission missing": lambda own: not own._navigator.mission.flyable,
     "climb asked": Commander._climb_asked,
-    "climbing": lambda own: own._pilot.behaviour is Behaviour.TAKEOFF,
-    "obeys attitude": lambda own: own._pilot.obeys_attitude,
-    "obeys motion": lambda own: own._pilot.obeys_motion,
-    "obeys velocity": lambda own: own._pilot.obeys_velocity,
+    "climbing": lambda own: own._navigator.behaviour is Behaviour.TAKEOFF,
+    "obeys attitude": lambda own: own._navigator.obeys_attitude,
+    "obeys motion": lambda own: own._navigator.obeys_motion,
+    "obeys velocity": lambda own: own._navigator.obeys_velocity,
 }
 
 ACTIONS: dict[str, Callable[[Commander], None]] = {

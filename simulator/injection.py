@@ -17,7 +17,7 @@ from simulator.commander import Wish
 from simulator.faults import Direction, Fault, Moment, Refusable
 from simulator.firmware.base import Behaviour, Say, Severity
 from simulator.impairment import Channel, Path
-from simulator.plant import STEP_S
+from simulator.steps import STEP_S
 from simulator.telemetry import Stuck, View
 
 _REFUSED_EVENTS = {

@@ -17,13 +17,14 @@ from simulator.faults import Fault
 from simulator.firmware.base import Firmware
 from simulator.impairment import frames
 from simulator.injection import prepare
-from simulator.plant import STEP_S, Plant
+from simulator.plant import Plant
 from simulator.server import Server
+from simulator.steps import STEP_S, STEP_US
 from simulator.stretch import LONGEST, Stretch
 from simulator.strict import Strict
 from simulator.telemetry import View
 
-STEP_MS = round(STEP_S * 1000)
+STEP_MS = STEP_US // 1000
 VIRTUAL_EPOCH_US = 1_767_225_600_000_000  # 2026-01-01, where virtual time begins
 BARRIER_INTERVAL_MS = 20
 RESTART_S = 1.0  # that a reboot on request takes

@@ -9,7 +9,8 @@ import math
 from dataclasses import dataclass
 
 from simulator.firmware.base import Quaternion, Triple
-from simulator.plant import STEP_S, Plant, Truth
+from simulator.plant import Plant, Truth
+from simulator.steps import STEP_S
 
 
 @dataclass(frozen=True, slots=True)

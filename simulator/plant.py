@@ -55,16 +55,12 @@ from simulator.sensors import (
     turn_estimate,
     white_sds,
 )
+from simulator.steps import STEP_S
 from simulator.wind import GUST_COUNT, dryden, wind_axes
-
-__all__ = ["STEP_S", "Conditions", "Demand", "Estimate", "Plant", "Truth"]
 
 Array = NDArray[np.float64]
 
 _MASS, _THRUST_MAX = 0, 0  # places in the constants of body and rotors
-
-STEP_S = 0.004
-"""Length of an integration step, s; `advance` moves in whole steps."""
 
 # As typed numbers: compiled code is made once more for each plain constant that is handed on
 _ERROR_LANE, _GUST_LANE, _WHITE_LANE, _RECEIVER_LANE = (np.uint64(lane) for lane in range(4))

@@ -7,6 +7,7 @@ velocity: with a wandering estimate it wanders, as the real ones do. Knows no mo
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from offboard.model.kernel import address, entry, kernel
 from simulator.firmware.base import NAN3, MotionSetpoint, PositionGains, Quaternion, Triple
+from simulator.steps import LOOP_S
 
 Array = NDArray[np.float64]
 
@@ -69,6 +71,17 @@ def _or_zero(value: float) -> float:
     return 0.0 if math.isnan(value) else value
 
 
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Within which a motion is flown; the speeds lower the limits of the gains."""
+
+    hover_thrust: float  # normalised, believed to hover
+    thrust_least: float = 0.0
+    across_mps: float = math.inf
+    up_mps: float = math.inf  # below 0 it is a descent
+    turn_radps: float = math.inf
+
+
 class PositionLoop:
     """Loop with its integrators."""
 
@@ -79,19 +92,13 @@ class PositionLoop:
         self._estimate = self.record["estimate"][0]
         self._state = self.record["state"][0]
         self._demand: MotionSetpoint | None = None
-        # compiles, which would be a stall of a second in flight
-        self.step(1.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), MotionSetpoint(), 0.5)
+        self.record["period_s"] = LOOP_S
         self.reset(0.0)
 
     @property
     def yaw_rad(self) -> float:
         """The course that it flies."""
         return float(self.record["course_rad"][0])
-
-    @property
-    def velocity_p_ps(self) -> float:
-        """Gain on the vertical velocity."""
-        return self.gains.velocity_z[0]
 
     def tune(self, gains: PositionGains) -> None:
         """Other gains from now on."""
@@ -109,58 +116,32 @@ class PositionLoop:
         self._state[:] = _AT_REST
         self.record["course_rad"] = yaw_rad
 
-    def step(
-        self,
-        duration_s: float,
-        position_ned_m: Triple,
-        velocity_ned_mps: Triple,
-        demand: MotionSetpoint,
-        hover_thrust: float,
-        *,
-        speed_xy_mps: float = math.inf,
-        speed_up_mps: float = math.inf,
-        thrust_least: float = 0.0,
-        turn_radps: float = math.inf,
-        integrate: bool = True,
-    ) -> tuple[Quaternion, float, Triple]:
-        """Attitude (wxyz), normalised thrust and the velocity (NED, m/s) that it tries to fly.
+    def demand(self, motion: MotionSetpoint, limits: Limits, *, integrate: bool = True) -> None:
+        """What to fly from now on; `integrate` False freezes the integrators."""
+        record, gains = self.record, self.gains
+        if motion is not self._demand:
+            self._demand = motion
+            record["position"] = motion.position_ned_m
+            record["velocity"] = motion.velocity_ned_mps
+            record["acceleration"] = motion.acceleration_ned_mps2
+            record["yaw_rad"] = motion.yaw_rad
+            record["yaw_rate_radps"] = motion.yaw_rate_radps
+            record["faces_way"] = motion.faces_way
+        record["speed_xy_mps"] = min(limits.across_mps, gains.speed_xy_mps)
+        record["speed_up_mps"] = min(limits.up_mps, gains.speed_up_mps)
+        record["hover_thrust"] = limits.hover_thrust
+        record["thrust_least"] = limits.thrust_least
+        record["turn_radps"] = limits.turn_radps
+        record["integrates"] = integrate
 
-        The speeds lower the limits of the gains; below 0, `speed_up_mps` is a descent.
-        `integrate` False freezes the integrators.
-        """
-        limits = (speed_xy_mps, speed_up_mps, thrust_least, turn_radps)
-        self.demand(duration_s, demand, hover_thrust, *limits)
-        self.record["integrates"] = integrate
+    def step(
+        self, position_ned_m: Triple, velocity_ned_mps: Triple
+    ) -> tuple[Quaternion, float, Triple]:
+        """One period of LOOP_S on this estimate. Attitude (wxyz), normalised thrust and the
+        velocity (NED, m/s) that it tries to fly."""
         self._estimate[:] = (*position_ned_m, *velocity_ned_mps)
         step_loop.call(self.address)
         return self.result
-
-    def demand(
-        self,
-        duration_s: float,
-        demand: MotionSetpoint,
-        hover_thrust: float,
-        speed_xy_mps: float = math.inf,
-        speed_up_mps: float = math.inf,
-        thrust_least: float = 0.0,
-        turn_radps: float = math.inf,
-    ) -> None:
-        """What `step_loop` is to fly from now on, as `step` is told."""
-        record, gains = self.record, self.gains
-        if demand is not self._demand:
-            self._demand = demand
-            record["position"] = demand.position_ned_m
-            record["velocity"] = demand.velocity_ned_mps
-            record["acceleration"] = demand.acceleration_ned_mps2
-            record["yaw_rad"] = demand.yaw_rad
-            record["yaw_rate_radps"] = demand.yaw_rate_radps
-            record["faces_way"] = demand.faces_way
-        record["period_s"] = duration_s
-        record["speed_xy_mps"] = min(speed_xy_mps, gains.speed_xy_mps)
-        record["speed_up_mps"] = min(speed_up_mps, gains.speed_up_mps)
-        record["hover_thrust"] = hover_thrust
-        record["thrust_least"] = thrust_least
-        record["turn_radps"] = turn_radps
 
     @property
     def result(self) -> tuple[Quaternion, float, Triple]:

@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from offboard.flight.clock import monotonic_s, unix_us
 from simulator.instance import Instance
 from simulator.links import Link, wait
-from simulator.plant import STEP_S
 from simulator.recorder import Recorder
+from simulator.steps import STEP_S
 
 RESEND_S = 0.05  # until the companion is first heard
 RESEND_SILENT_S = 1.0

@@ -16,12 +16,12 @@ from simulator.firmware.base import Say, Severity
 from simulator.mission_transfer import HANDLERS as MISSION_HANDLERS
 from simulator.mission_transfer import Transfer
 from simulator.setpoints import ATTITUDE, GLOBAL, LOCAL
+from simulator.steps import STEP_US
 from simulator.strict import Strict
 from simulator.telemetry import LEAST_INTERVAL_US, MAV_COMP_ID_AUTOPILOT, View
 
 TEXT_KEPT_US = 5_000_000
 TEXT_LENGTH = 50
-STEP_US = 4000
 DATAGRAM_MAX = 1400
 PARAMETERS_PER_STEP = 4
 PARAMETER_BY_NAME = 65535  # PARAM_VALUE.param_index of an answer that has none

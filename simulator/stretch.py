@@ -20,12 +20,11 @@ from simulator.frame_writer import FRAME_MAX, KINDS, write_frame
 from simulator.plant import advance_steps, report_state
 from simulator.position_loop import step_loop
 from simulator.server import Server, Stream
+from simulator.steps import LOOP_STEPS, STEP_US
 from simulator.telemetry import ON_POSITION_GRID, View
 
 LONGEST = 25  # steps of one stretch
 NO_LOOP = 1 << 62  # the step at which a position loop runs that does not
-_STEP_US = 4000
-_LOOP_STEPS = 2  # `simulator.pilot.LOOP_S`
 _ROWS_MAX = 128
 _OUT_BYTES = 65536
 _LINK, _KIND, _INTERVAL_US, _DUE_US, _GRID = range(5)
@@ -199,7 +198,7 @@ def _fly(
                     if not reported:
                         report_state(plant)
                     _hold(plant, loop, seen)
-                    links.loop_step = step + done + _LOOP_STEPS
+                    links.loop_step = step + done + LOOP_STEPS
                 done += advance_steps(min(goal, links.loop_step - step) - done, plant)
                 reported = False
         if step + done == speaks:
@@ -231,7 +230,7 @@ def _next_step(links: Any, now: int) -> int:
     """The first step behind `now` at which one of the streams speaks."""
     first = NO_LOOP
     for i in range(links.count):
-        step = max(now + 1, -(-links.rows[i, _DUE_US] // _STEP_US))
+        step = max(now + 1, -(-links.rows[i, _DUE_US] // STEP_US))
         grid = links.rows[i, _GRID]
         first = min(first, -(-step // grid) * grid)
     return first
@@ -241,12 +240,12 @@ def _next_step(links: Any, now: int) -> int:
 def _speak(now: int, plant: Any, seen: Any, links: Any, scratch: Any) -> None:
     """Write what is due now."""
     tally = links.tally
-    time_us = max(0, now * _STEP_US + seen.clock_offset_us)
+    time_us = max(0, now * STEP_US + seen.clock_offset_us)
     for i in range(links.count):
         row = links.rows[i]
-        if row[_DUE_US] > now * _STEP_US or now % row[_GRID]:
+        if row[_DUE_US] > now * STEP_US or now % row[_GRID]:
             continue
-        row[_DUE_US] = (now * _STEP_US // row[_INTERVAL_US] + 1) * row[_INTERVAL_US]
+        row[_DUE_US] = (now * STEP_US // row[_INTERVAL_US] + 1) * row[_INTERVAL_US]
         link, kind = row[_LINK], row[_KIND]
         sequence = tally[_SEQUENCES + link]
         if kind == _SILENT:

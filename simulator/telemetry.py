@@ -20,6 +20,7 @@ from simulator.firmware.base import MotionSetpoint, Quaternion, Triple
 from simulator.frame_writer import RECORD, STATE
 from simulator.geodesy import EARTH_RADIUS_M
 from simulator.position_loop import GRAVITY_MPS2
+from simulator.steps import STEP_US
 
 _DEGREES_PER_M = math.degrees(1.0 / EARTH_RADIUS_M)
 ON_POSITION_GRID = frozenset(
@@ -95,7 +96,7 @@ class View:
         state = (
             self.clock_offset_us,
             autopilot.plant.reset_counter,
-            pilot.home_ned_m[2],
+            autopilot.navigator.home_ned_m[2],
             self.sensor_bits,
             self.has_fix,
             self.landed_state,
@@ -157,12 +158,12 @@ class View:
     @property
     def landed_state(self) -> int:
         """MAV_LANDED_STATE: 1 on ground, 2 in air, 3 taking off, 4 landing."""
-        pilot = self.autopilot.pilot
-        if pilot.landed:
+        navigator = self.autopilot.navigator
+        if self.autopilot.pilot.landed:
             return 1
-        if pilot.landing:
+        if navigator.landing:
             return 4
-        return 3 if pilot.climbing else 2
+        return 3 if navigator.climbing else 2
 
     @property
     def time_ms(self) -> int:
@@ -171,7 +172,7 @@ class View:
     @property
     def time_us(self) -> int:
         """The vehicle's clock, as its stamps show it."""
-        return max(0, self.autopilot.senses.steps * 4000 + self.clock_offset_us)
+        return max(0, self.autopilot.senses.steps * STEP_US + self.clock_offset_us)
 
     def geodetic(self, north_m: float, east_m: float) -> tuple[int, int]:
         """Latitude and longitude in 1e-7 deg of a point near the origin (spherical Earth)."""
@@ -274,7 +275,7 @@ def odometry(view: View) -> Sequence[Any]:
 def global_position_int(view: View) -> Sequence[Any]:
     nav = view.autopilot.senses.look()
     north, east, down = nav.position_ned_m
-    home_down = view.autopilot.pilot.home_ned_m[2]
+    home_down = view.autopilot.navigator.home_ned_m[2]
     return (
         view.time_ms,
         *view.geodetic(north, east),
@@ -288,7 +289,7 @@ def global_position_int(view: View) -> Sequence[Any]:
 def altitude(view: View) -> Sequence[Any]:
     down = view.autopilot.senses.look().position_ned_m[2]
     amsl = view.altitude_mm(down) / 1e3
-    relative = view.autopilot.pilot.home_ned_m[2] - down
+    relative = view.autopilot.navigator.home_ned_m[2] - down
     return (view.time_us, amsl, amsl, -down, relative, math.nan, math.nan)
 
 
@@ -417,7 +418,7 @@ def battery_status(view: View) -> Sequence[Any]:
 
 
 def home_position(view: View) -> Sequence[Any]:
-    north, east, down = view.autopilot.pilot.home_ned_m
+    north, east, down = view.autopilot.navigator.home_ned_m
     return (
         *view.geodetic(north, east),
         view.altitude_mm(down),

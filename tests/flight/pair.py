@@ -33,7 +33,7 @@ from simulator import config as simulated
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
-from simulator.plant import STEP_S
+from simulator.steps import STEP_S
 
 HOST_EPOCH_S = 5000.0
 POLL_STEPS = 5

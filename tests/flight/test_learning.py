@@ -28,7 +28,7 @@ from offboard.model.document import parse
 from offboard.model.vehicle import AxisResponse, Vehicle
 from simulator import config as simulated
 from simulator.attitude import build_loop
-from simulator.plant import STEP_S
+from simulator.steps import STEP_S
 
 LEARNING = IdentifySettings()
 NEUTRAL = simulated.vehicle("neutral")

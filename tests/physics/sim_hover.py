@@ -10,7 +10,10 @@ import yaml
 
 from offboard.model.frames import euler_from_quaternion, quaternion_from_euler
 from offboard.model.vehicle import Vehicle
-from simulator.plant import STEP_S, Conditions, Demand, Plant
+from simulator.attitude import Demand
+from simulator.conditions import Conditions
+from simulator.plant import Plant
+from simulator.steps import STEP_S
 
 VEHICLES = Path(__file__).parents[2] / "config" / "vehicles"
 CALM = Conditions()

@@ -10,7 +10,10 @@ from sim_hover import attitude, hovering, load, response
 
 from offboard.model.frames import euler_from_quaternion, thrust_direction_from_quaternion
 from simulator.airframe import Battery
-from simulator.plant import STEP_S, Conditions, Demand, Plant
+from simulator.attitude import Demand
+from simulator.conditions import Conditions
+from simulator.plant import Plant
+from simulator.steps import STEP_S
 
 PX4 = load("px4_sih")
 G = PX4.gravity_mps2

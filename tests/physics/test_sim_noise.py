@@ -13,7 +13,7 @@ from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.signal import welch
 
 from simulator.noise import advance_block, block_diagonal, discretise, fill_normals, seed_word
-from simulator.plant import STEP_S
+from simulator.steps import STEP_S
 from simulator.wind import Gusts, dryden, wind_axes
 
 

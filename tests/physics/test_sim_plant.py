@@ -8,7 +8,10 @@ import numpy as np
 import pytest
 from sim_hover import attitude, hovering, load
 
-from simulator.plant import STEP_S, Conditions, Demand, Plant
+from simulator.attitude import Demand
+from simulator.conditions import Conditions
+from simulator.plant import Plant
+from simulator.steps import STEP_S
 
 PX4 = load("px4_sih")
 ROUGH = Conditions(

@@ -10,8 +10,11 @@ from scipy.spatial.transform import Rotation
 from sim_hover import attitude, hovering, load
 
 from offboard.model.frames import thrust_direction_from_quaternion
-from simulator.plant import STEP_S, Conditions, Demand, Plant
+from simulator.attitude import Demand
+from simulator.conditions import Conditions
+from simulator.plant import Plant
 from simulator.sensors import ARDUPILOT_LIKE, PX4_LIKE, YAW, error_process
+from simulator.steps import STEP_S
 
 FLIGHTS, SECONDS, RATE_HZ = 16, 60, 50
 

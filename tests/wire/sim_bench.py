@@ -14,8 +14,8 @@ from simulator.conditions import Conditions
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
-from simulator.plant import STEP_S
 from simulator.sensors import EstimatorName
+from simulator.steps import STEP_S
 
 OFFBOARD, LOITER, POSCTL = 0x00060000, 0x03040000, 0x00030000
 TAKEOFF, LAND, RTL = 0x02040000, 0x06040000, 0x05040000

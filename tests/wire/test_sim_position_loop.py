@@ -8,12 +8,22 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from simulator.firmware.base import NAN3, MotionSetpoint
+from simulator.firmware.base import NAN3, MotionSetpoint, Quaternion, Triple
 from simulator.firmware.px4 import PX4
 from simulator.parameters import ParameterTable
-from simulator.position_loop import GRAVITY_MPS2, PositionLoop
+from simulator.position_loop import GRAVITY_MPS2, Limits, PositionLoop
 
 GAINS = PX4.gains(ParameterTable(PX4).__getitem__)
+HOVER = Limits(hover_thrust=0.5)
+REST = (0.0, 0.0, 0.0)
+
+
+def _stepped(
+    loop: PositionLoop, motion: MotionSetpoint, limits: Limits = HOVER
+) -> tuple[Quaternion, float, Triple]:
+    """One period at the origin, at rest."""
+    loop.demand(motion, limits)
+    return loop.step(REST, REST)
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 0.7, math.pi / 2, 2.5, math.pi, -1.9])
@@ -26,7 +36,7 @@ def test_attitude_and_thrust_give_the_acceleration(
     """Thrust along the body axis, hover thrust per g: lateral as asked at constant height."""
     loop = PositionLoop(GAINS)
     motion = MotionSetpoint(NAN3, NAN3, acceleration, yaw_rad)
-    attitude, thrust, _ = loop.step(0.008, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), motion, 0.5)
+    attitude, thrust, _ = _stepped(loop, motion)
     w, x, y, z = attitude
     turned = Rotation.from_quat([x, y, z, w])
     down = turned.apply([0.0, 0.0, 1.0])
@@ -40,7 +50,7 @@ def test_attitude_and_thrust_give_the_acceleration(
 def test_tilt_and_thrust_are_limited() -> None:
     loop = PositionLoop(GAINS)
     motion = MotionSetpoint(NAN3, NAN3, (100.0, 0.0, 100.0))
-    attitude, thrust, _ = loop.step(0.008, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), motion, 0.5)
+    attitude, thrust, _ = _stepped(loop, motion)
     w, x, y, z = attitude
     down = Rotation.from_quat([x, y, z, w]).apply([0.0, 0.0, 1.0])
     assert math.acos(down[2]) == pytest.approx(GAINS.tilt_max_rad)
@@ -50,5 +60,5 @@ def test_tilt_and_thrust_are_limited() -> None:
 def test_speed_limits() -> None:
     loop = PositionLoop(GAINS)
     motion = MotionSetpoint((300.0, 400.0, -100.0))
-    *_, wanted = loop.step(0.008, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0), motion, 0.5, speed_xy_mps=5.0)
+    *_, wanted = _stepped(loop, motion, Limits(0.5, across_mps=5.0))
     assert wanted == pytest.approx((3.0, 4.0, -GAINS.speed_up_mps))

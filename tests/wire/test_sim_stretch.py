@@ -222,13 +222,13 @@ def _shake(instance: Instance, random: np.random.Generator, scale: float) -> Non
     autopilot.senses.steps = 2 * int(random.integers(0, 2**30))
     autopilot.senses.gps_healthy = bool(random.random() < 0.5)
     pilot = autopilot.pilot
-    pilot.home_ned_m = (0.0, 0.0, scale)
+    autopilot.navigator.home_ned_m = (0.0, 0.0, scale)
     pilot.fall(on_ground=bool(random.random() < 0.5))
     pilot.motion = MotionSetpoint(*(tuple(scale * random.standard_normal(3)) for _ in range(2)))
     pilot.thrust_demanded = float(random.random())
     given = tuple(random.standard_normal(4).tolist())
     by_attitude = random.random() < 0.5
-    pilot._demand = Demand(
+    pilot.demand = Demand(
         True, 2.0 * scale - 0.5, given if by_attitude else None, None if by_attitude else given[:3]
     )
 

@@ -1,0 +1,227 @@
+"""The navigator: where the vehicle is to be, by what it does or by whose setpoint it obeys.
+
+Behaviour and estimate in, motion demanded out. Knows position, time, home and parameters; knows no
+modes by name, no thrust and no attitude loop (`simulator.pilot` flies what it says).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from simulator.descent import Return, land_speed_mps, sink
+from simulator.firmware.base import (
+    AttitudeSetpoint,
+    Behaviour,
+    Firmware,
+    MotionSetpoint,
+    Quaternion,
+    Triple,
+)
+from simulator.mission import Mission
+from simulator.nav import Nav
+from simulator.parameters import ParameterTable
+
+_STANDING = frozenset({Behaviour.HOLD, Behaviour.SETPOINT})
+
+
+class Navigator:
+    """Goes about one behaviour at a time; `setpoint` is what somebody asked for last."""
+
+    def __init__(self, firmware: Firmware, parameters: ParameterTable, mission: Mission) -> None:
+        self._firmware = firmware
+        self._parameters = parameters
+        self.mission = mission
+        self._events = self.mission.events
+        self.behaviour = Behaviour.HOLD
+        self.setpoint: AttitudeSetpoint | MotionSetpoint | None = None
+        self.home_ned_m: Triple = (0.0, 0.0, 0.0)
+        self._home_yaw_rad = 0.0
+        self.cruise_mps = math.inf  # asked for, in automatic flight
+        self._return = Return(firmware, parameters, self._events)
+        self._hold: Triple = (0.0, 0.0, 0.0)
+        self._held = MotionSetpoint(self._hold)
+        self._takeoff_z_m = math.nan
+        self._climbed = False
+        self._levelling: AttitudeSetpoint | None = None  # the last one of our own
+
+    # -- what it does ------------------------------------------------------------------------
+
+    def enter(self, behaviour: Behaviour, nav: Nav, takeoff_z_m: float = math.nan) -> None:
+        """Begin a behaviour here; hold after a climb keeps the climb's target.
+
+        `takeoff_z_m`: NED height to climb to; NaN the default one.
+        """
+        if not (self._climbed and behaviour in _STANDING):
+            self._hold = _ahead(nav)
+        if behaviour is not self.behaviour:
+            self.cruise_mps = math.inf
+        self.behaviour = behaviour
+        self._takeoff_z_m = takeoff_z_m
+        self._return = Return(self._firmware, self._parameters, self._events)
+        self._climbed = False
+        self.mission.pause()
+
+    def arm(self, nav: Nav) -> None:
+        """The motors begin to turn: home is here."""
+        self.home_ned_m, self._home_yaw_rad = nav.position_ned_m, nav.yaw_rad
+        self.mission.pause()
+        self.stay(nav)
+
+    def stay(self, nav: Nav) -> None:
+        """Hold exactly here."""
+        self._hold = nav.position_ned_m
+
+    def go_to(self, place_ned_m: Triple, yaw_rad: float) -> None:
+        """Hold there, in a mode that holds or obeys; no number keeps the course."""
+        self._hold = place_ned_m
+        self._held = MotionSetpoint(place_ned_m, yaw_rad=yaw_rad, faces_way=True)
+        if self.behaviour is Behaviour.SETPOINT:
+            self.setpoint = self._held
+
+    def turn_to(self, yaw_rad: float, turn_radps: float) -> None:
+        """Keep this course while holding or obeying."""
+        self._held = MotionSetpoint(self._hold, yaw_rad=yaw_rad, turn_radps=turn_radps)
+        if isinstance(self.setpoint, MotionSetpoint):
+            self.setpoint = replace(self.setpoint, yaw_rad=yaw_rad, turn_radps=turn_radps)
+
+    def level(self, nav: Nav) -> None:
+        """Nobody says what to do: level, course and height as they are."""
+        self._levelling = AttitudeSetpoint(level(nav.yaw_rad), None, 0.0, climb_mps=0.0)
+        self.setpoint = self._levelling
+
+    def tell(self) -> list[str]:
+        """The events since it was last asked."""
+        told = [*(("climbed",) if self._climbed else ()), *self._events]
+        self._events.clear()
+        return told
+
+    # -- what others see ---------------------------------------------------------------------
+
+    @property
+    def calm(self) -> bool:
+        """There is nothing to tell."""
+        return not (self._climbed or self._events)
+
+    @property
+    def landing(self) -> bool:
+        """On the last way down."""
+        return self.behaviour is Behaviour.LAND or (
+            self._return.landing
+            if self.behaviour is Behaviour.RETURN
+            else self.behaviour is Behaviour.MISSION and self.mission.landing
+        )
+
+    @property
+    def climbing(self) -> bool:
+        """Taking off, by itself."""
+        by_mission = self.behaviour is Behaviour.MISSION and self.mission.climbing
+        return by_mission or self.behaviour is Behaviour.TAKEOFF
+
+    @property
+    def target_height_m(self) -> float:
+        """Of what it holds or climbs to, above home."""
+        place = self._return.place if self.behaviour is Behaviour.RETURN else self._hold
+        return self.home_ned_m[2] - place[2]
+
+    @property
+    def attitude_setpoint(self) -> AttitudeSetpoint | None:
+        """What is obeyed, if it is one of attitude: no place is wanted then."""
+        if self.behaviour is Behaviour.SETPOINT and isinstance(self.setpoint, AttitudeSetpoint):
+            return self.setpoint
+        return None
+
+    @property
+    def obeys_attitude(self) -> bool:
+        """Somebody else's attitude setpoint is flown."""
+        setpoint = self.attitude_setpoint
+        return setpoint is not None and setpoint is not self._levelling
+
+    @property
+    def obeys_motion(self) -> bool:
+        """Somebody else's position, velocity or acceleration is flown."""
+        return self.behaviour is Behaviour.SETPOINT and isinstance(self.setpoint, MotionSetpoint)
+
+    @property
+    def obeys_velocity(self) -> bool:
+        """The same, but somebody must go on saying so."""
+        if not (self.obeys_motion and isinstance(self.setpoint, MotionSetpoint)):
+            return False
+        rates = (*self.setpoint.velocity_ned_mps, *self.setpoint.acceleration_ned_mps2)
+        return not all(map(math.isnan, rates))
+
+    # -- where to be -------------------------------------------------------------------------
+
+    @property
+    def automatic(self) -> bool:
+        """Speeds and turns are those of automatic flight."""
+        return self.behaviour is not Behaviour.SETPOINT or self._firmware.setpoints_as_automatic
+
+    @property
+    def across_mps(self) -> float:
+        """Greatest speed across the ground."""
+        asked_mps = self._parameters.role("cruise_speed_mps") if self.automatic else math.inf
+        if self.automatic or self.setpoint is self._held:
+            asked_mps = min(asked_mps, self.cruise_mps)
+        if self.behaviour is Behaviour.MISSION:
+            asked_mps = min(asked_mps, self.mission.speed_mps)
+        return asked_mps
+
+    @property
+    def standing(self) -> MotionSetpoint | None:
+        """What is held or asked for, the same object as long as it is the same; None where the
+        behaviour goes on from place to place."""
+        if self.behaviour not in _STANDING:
+            return None
+        return self._standing
+
+    @property
+    def _standing(self) -> MotionSetpoint:
+        if self.behaviour is Behaviour.SETPOINT and isinstance(self.setpoint, MotionSetpoint):
+            return self.setpoint
+        if self._held.position_ned_m is not self._hold:
+            self._held = MotionSetpoint(self._hold)
+        return self._held
+
+    def motion(self, nav: Nav, time_s: float, *, landed: bool) -> MotionSetpoint:
+        """Where to be now, and how to get there; NED, SI, vehicle time."""
+        if self.behaviour is Behaviour.TAKEOFF:
+            return self._climb(nav, landed=landed)
+        if self.behaviour is Behaviour.RETURN:
+            return self._return.fly(time_s, nav, self.home_ned_m, self._home_yaw_rad)
+        if self.behaviour is Behaviour.MISSION:
+            return self._follow_mission(nav, time_s, landed=landed)
+        if self.behaviour is Behaviour.LAND:
+            return sink(self._hold, land_speed_mps(nav, self.home_ned_m[2], self._parameters))
+        if self.behaviour is Behaviour.DESCEND:
+            return sink(self._hold, self._firmware.descend_speed_mps)
+        return self._standing
+
+    def _climb(self, nav: Nav, *, landed: bool) -> MotionSetpoint:
+        target_z = self._takeoff_z_m
+        if math.isnan(target_z):
+            target_z = nav.position_ned_m[2] - self._parameters.role("takeoff_height_m")
+            self._takeoff_z_m = target_z
+            self._events.append("default height")
+        if nav.position_ned_m[2] < target_z + self._parameters.role("climbed_within_m"):
+            self._climbed = not landed
+        self._hold = (self._hold[0], self._hold[1], target_z)
+        return MotionSetpoint(self._hold)
+
+    def _follow_mission(self, nav: Nav, time_s: float, *, landed: bool) -> MotionSetpoint:
+        motion = self.mission.fly(time_s, nav.position_ned_m, self.home_ned_m, landed=landed)
+        if self.mission.landing:
+            speed_mps = land_speed_mps(nav, self.home_ned_m[2], self._parameters)
+            return sink(motion.position_ned_m, speed_mps)
+        return motion
+
+
+def level(yaw_rad: float) -> Quaternion:
+    """Attitude of this course without tilt."""
+    return (math.cos(0.5 * yaw_rad), 0.0, 0.0, math.sin(0.5 * yaw_rad))
+
+
+def _ahead(nav: Nav) -> Triple:
+    """Where a vehicle comes to rest that brakes gently from here."""
+    (x, y, z), (vx, vy, vz) = nav.position_ned_m, nav.velocity_ned_mps
+    return (x + 0.5 * vx, y + 0.5 * vy, z + 0.2 * vz)
