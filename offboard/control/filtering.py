@@ -73,16 +73,18 @@ def _multiply(left: Array, right: Array, size: int, out: Array) -> None:
 @kernel
 def _half_transition(one: Any, interval_s: float) -> None:
     """exp(dynamics interval_s / 2) to fourth order, into the first work matrix."""
-    size, work, scaled = one.size, one.work, one.work[0]
+    size, scaled, square, cube = one.size, one.work[0], one.work[1], one.work[2]
+    fourth = one.work[3]
     half_s = 0.5 * interval_s
     for i in range(size):
         for j in range(size):
             scaled[i, j] = half_s * one.dynamics[i, j]
-    for k in range(3):  # square, cube, fourth power
-        _multiply(work[min(k, 1)], work[k // 2], size, work[k + 1])
+    _multiply(scaled, scaled, size, square)
+    _multiply(square, scaled, size, cube)
+    _multiply(square, square, size, fourth)
     for i in range(size):
         for j in range(size):
-            scaled[i, j] += work[1, i, j] / 2.0 + work[2, i, j] / 6.0 + work[3, i, j] / 24.0
+            scaled[i, j] += square[i, j] / 2.0 + cube[i, j] / 6.0 + fourth[i, j] / 24.0
         scaled[i, i] += 1.0
 
 
