@@ -169,11 +169,12 @@ def predicted(
 ) -> Array:
     """The response (N, axes) to `commands` (M, axes), at rest at the start."""
     axes = commands.shape[1]
-    motion, out = np.empty((2, axes + 2)), np.empty((1, len(times), axes + 2))
+    out = np.empty((1, len(times), axes + 2))
     if len(times) and len(sent_at):
         sent = np.column_stack((sent_at, commands))
+        steps = np.empty((len(times) + len(sent) + 1, 4))
         parameters = np.array([[delay_s, frequency_radps, damping]])
-        respond.call(np.ascontiguousarray(times), sent, parameters, motion, out)
+        respond.call(np.ascontiguousarray(times), sent, parameters, steps, out)
     response: Array = out[0, :, :axes]
     return response
 

@@ -30,6 +30,9 @@ STEP_SCALES = np.array([0.03, 5.0, 0.3])
 CONVERGED = 2e-4  # of STEP_SCALES
 DIFFERENCE = 1e-3  # of them too, for slopes
 
+# Columns of a table of steps: the propagator, the row of the command held, the sample led to.
+F0, F1, HELD, SAMPLE = 0, 1, 2, 3
+
 
 @dataclass(frozen=True, slots=True)
 class Data:
@@ -60,60 +63,74 @@ def _propagator(frequency: float, damping: float, step_s: float) -> tuple[float,
     return shrink * math.cos(q * step_s) + decay * sine, sine
 
 
-@entry(array(1), array(2), array(2), array(2), array(3))
-def respond(times: Array, sent: Array, parameters: Array, motion: Array, out: Array) -> int:
-    """The responses with each of the `parameters` (K, 3) at `times` (N,) to piecewise constant
-    commands, `sent` (M, 1 + axes), at rest on the command in force at the start. `out` (K, N, at
-    least axes + 2): the axes, then the free responses to a unit offset and to a unit rate. Rows in
-    the order of time; exact. `motion` (2, axes + 2) is scratch."""
-    for k in range(parameters.shape[0]):
-        _follow(times, sent, parameters[k], motion, out[k])
-    return 0
-
-
 @kernel
-def _follow(times: Array, sent: Array, parameters: Array, motion: Array, out: Array) -> None:
-    delay_s, frequency, damping = parameters[0], parameters[1], parameters[2]
-    axes = sent.shape[1] - 1
-    value, rate = motion[0], motion[1]
+def _divide(k: int, times: Array, sent: Array, parameters: Array, steps: Array) -> None:
+    """The `steps` of constant command that lead from sample to sample, and a last one of no
+    sample."""
+    delay_s, frequency, damping = parameters[k, 0], parameters[k, 1], parameters[k, 2]
     now = times[0]
     row = -1
     while row + 1 < sent.shape[0] and sent[row + 1, 0] + delay_s <= now:
         row += 1
-    for axis in range(axes):
-        value[axis], rate[axis] = sent[max(row, 0), 1 + axis], 0.0
-    value[axes], rate[axes] = 1.0, 0.0
-    value[axes + 1], rate[axes + 1] = 0.0, 1.0
-    stiffness, friction = frequency * frequency, 2.0 * damping * frequency
+    step = 0
+    steps[0, HELD] = max(row, 0)
     for i in range(times.shape[0]):
         while now < times[i]:
             until = times[i]
-            following = row + 1
-            acts = following < sent.shape[0] and sent[following, 0] + delay_s <= until
+            acts = row + 1 < sent.shape[0] and sent[row + 1, 0] + delay_s <= until
             if acts:
-                until = max(sent[following, 0] + delay_s, now)
-            f0, f1 = _propagator(frequency, damping, until - now)
-            for axis in range(axes + 2):
-                held = sent[max(row, 0), 1 + axis] if axis < axes else 0.0
-                away, speed = value[axis] - held, rate[axis]
-                value[axis] = held + f0 * away + f1 * speed
-                rate[axis] = f0 * speed + f1 * (-stiffness * away - friction * speed)
+                until = max(sent[row + 1, 0] + delay_s, now)
+            steps[step, F0], steps[step, F1] = _propagator(frequency, damping, until - now)
+            steps[step, HELD], steps[step, SAMPLE] = max(row, 0), i
+            step += 1
             now = until
             if acts:
-                row = following
-            elif until >= times[i]:
-                break
-        for axis in range(axes + 2):
-            out[i, axis] = value[axis]
+                row += 1
+    steps[step, SAMPLE] = times.shape[0]
+
+
+@kernel
+def _follow(k: int, column: int, sent: Array, parameters: Array, steps: Array, out: Array) -> None:
+    """One column of `out`."""
+    frequency, damping = parameters[k, 1], parameters[k, 2]
+    stiffness, friction = frequency * frequency, 2.0 * damping * frequency
+    axes = sent.shape[1] - 1
+    commanded = column < axes
+    held = sent[int(steps[0, HELD]), 1 + column] if commanded else 0.0
+    value = 1.0 if column == axes else held
+    rate = 1.0 if column == axes + 1 else 0.0
+    step = 0
+    for i in range(out.shape[1]):
+        while steps[step, SAMPLE] == i:
+            if commanded:
+                held = sent[int(steps[step, HELD]), 1 + column]
+            f0, f1, away, speed = steps[step, F0], steps[step, F1], value - held, rate
+            value = held + f0 * away + f1 * speed
+            rate = f0 * speed + f1 * (-stiffness * away - friction * speed)
+            step += 1
+        out[k, i, column] = value
+
+
+@entry(array(1), array(2), array(2), array(2), array(3))
+def respond(times: Array, sent: Array, parameters: Array, steps: Array, out: Array) -> int:
+    """The responses with each of the `parameters` (K, 3) at `times` (N,) to piecewise constant
+    commands, `sent` (M, 1 + axes), at rest on the command in force at the start. `out` (K, N, at
+    least axes + 2): the axes, then the free responses to a unit offset and to a unit rate. Rows in
+    the order of time; exact. `steps` (N + M + 1, 4) is scratch."""
+    for k in range(parameters.shape[0]):
+        _divide(k, times, sent, parameters, steps)
+        for column in range(sent.shape[1] + 1):
+            _follow(k, column, sent, parameters, steps, out)
+    return 0
 
 
 def residuals(data: Data, parameters: Array, weights: Array) -> Array:
     """Signals less the responses with each of the `parameters` (K, 3), free motion and a constant
     offset projected out under `weights` (N,): (K, N, axes)."""
     axes = data.signals.shape[1]
-    motion = np.empty((2, axes + 2))
+    steps = np.empty((len(data.times) + len(data.sent) + 1, 4))
     out = np.ones((len(parameters), len(data.times), axes + 3))
-    respond.call(data.times, data.sent, parameters, motion, out)
+    respond.call(data.times, data.sent, parameters, steps, out)
     left: Array = data.signals - out[:, :, :axes]
     basis = out[:, :, axes:]
     weighted = basis.swapaxes(1, 2) * weights
