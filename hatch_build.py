@@ -14,7 +14,7 @@ COMPILES = ("numba", "numpy", "scipy", "pydantic", "pymavlink", "fastcrc", "pyya
 
 
 class BitcodeHook(BuildHookInterface[Any]):
-    """Runs `offboard.model.shipped` for a wheel; an editable installation compiles when it flies,
+    """Runs `offboard.model.wheel` for a wheel; an editable installation compiles when it flies,
     and needs no compiler for that (pip says what it wants a build for)."""
 
     def dependencies(self) -> list[str]:
@@ -28,7 +28,7 @@ class BitcodeHook(BuildHookInterface[Any]):
         directory = Path(self.directory).resolve() / "bitcode"
         found = os.pathsep.join([self.root, *sys.path])  # pip builds with a path of its own
         subprocess.run(
-            [sys.executable, "-m", "offboard.model.shipped", str(directory)],
+            [sys.executable, "-m", "offboard.model.wheel", str(directory)],
             cwd=self.root,
             env={**os.environ, "PYTHONPATH": found, "NUMBA_CPU_NAME": "generic"},
             check=True,

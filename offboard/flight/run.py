@@ -154,7 +154,7 @@ def fly(
             assert isinstance(link, UdpLink)
             bundled.hangar.launch(bundled.options(link.port))
             stack.callback(bundled.hangar.recall)
-        tell("preparing the controller (its first run on a machine compiles for seconds)")
+        tell("preparing the controller (a source tree's first flight compiles, for some seconds)")
         compiled = Entry.compilations
         took_s = rehearse(crew, keeps_deadline=bundled is None)
         if Entry.compilations > compiled and took_s > COMPILED_S:

@@ -2,15 +2,11 @@
 
 A wheel carries it (`hatch_build.py`). A source tree, a changed source, and another kind of
 processor or system than the wheel was built on have none: numba compiles there.
-
-    python -m offboard.model.shipped DIRECTORY     write what a wheel carries
 """
 
 from __future__ import annotations
 
 import functools
-import importlib
-import sys
 from collections.abc import Mapping
 from pathlib import Path
 
@@ -45,13 +41,3 @@ def _kind() -> str:
     import llvmlite.binding as llvm
 
     return f"{sources.digest()}-{llvm.get_process_triple()}-llvm{llvm.llvm_version_info[0]}"
-
-
-if __name__ == "__main__":
-    for name in sources.entry_modules():
-        importlib.import_module(name)
-    from offboard.model.kernel import Entry
-
-    made = {entry.symbol: entry.bitcode() for entry in Entry.defined()}
-    write(Path(sys.argv[1]), made)
-    print(f"{len(made)} compiled functions in {sys.argv[1]}")
