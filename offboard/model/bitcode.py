@@ -13,6 +13,8 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any, cast
 
+import numpy as np
+
 # Numba's and Python's runtime: left over from errors that cannot happen here
 _RUNTIME = ("NRT_", "Py", "_Py", "numba_")
 _DECLARATION = re.compile(r"^declare (?P<head>[^@\n]*)@(?P<name>[\w.]+)\((?P<rest>.*)$", re.M)
@@ -47,18 +49,21 @@ def compiled(
     """The function as `symbol`, and nothing else to be seen, compiled by numba.
 
     parameters: per argument `int`, `float`, the dtype of a record that comes by address, or what
-    has `dimensions` and a `dtype`, an array that comes as its address and its lengths.
+    has `dimensions` and a `dtype`, an array. Where there are arrays, all arguments come in one
+    block of 8 bytes each, given twice: a number, an address, and of arrays the lengths as well.
     """
     import llvmlite.binding as llvm
     from numba import cfunc, types
 
     numbers = {int: types.int64, float: types.float64}
-    kinds = []
-    for each in parameters:
-        kinds.append(numbers.get(each, types.voidptr))
-        kinds += [types.int64] * getattr(each, "dimensions", 0)
+    if any(hasattr(each, "dimensions") for each in parameters):
+        kinds = [types.voidptr, vars(types)["CPointer"](types.voidptr)]
+        taking = _taking_block(function, parameters)
+    else:
+        kinds = [numbers.get(each, types.voidptr) for each in parameters]
+        taking = _taking_addresses(function, parameters)
     with _without_garbage_collection(), _not_optimised():
-        made = cfunc(numbers[returns](*kinds), error_model="numpy")(_flat(function, parameters))
+        made = cfunc(numbers[returns](*kinds), error_model="numpy")(taking)
         assembly = made.inspect_llvm()
     module = llvm.parse_assembly(_self_contained(assembly))
     for each in module.functions:
@@ -112,27 +117,50 @@ def _tidy(module: Any) -> None:
             passes.run(function, builder)
 
 
-def _flat(function: Callable[..., Any], parameters: tuple[Any, ...]) -> Callable[..., Any]:
-    """The function with addresses and lengths for records and arrays, written out, as numba wants
-    its arguments."""
+def _taking_addresses(
+    function: Callable[..., Any], parameters: tuple[Any, ...]
+) -> Callable[..., Any]:
+    """The function with addresses for records, written out, as numba wants its arguments."""
+    names = [f"a{i}" for i in range(len(parameters))]
+    given = [
+        name if isinstance(each, type) else f"carray({name}, 1, {name}_dtype)[0]"
+        for name, each in zip(names, parameters, strict=True)
+    ]
+    return _written(function, parameters, ", ".join(names), given)
+
+
+def _taking_block(function: Callable[..., Any], parameters: tuple[Any, ...]) -> Callable[..., Any]:
+    """The function with one block for its arguments."""
+    given: list[str] = []
+    place = 0
+    for i, each in enumerate(parameters):
+        count = getattr(each, "dimensions", 0)
+        if isinstance(each, type):
+            given.append(f"{each.__name__}s[{place}]")
+        elif count:
+            lengths = "".join(f"ints[{place + axis}], " for axis in range(1, count + 1))
+            given.append(f"carray(places[{place}], ({lengths}), a{i}_dtype)")
+        else:
+            given.append(f"carray(places[{place}], 1, a{i}_dtype)[0]")
+        place += 1 + count
+    numbers = [f"{name}s = carray(block, {place}, {name}_dtype)" for name in ("int", "float")]
+    return _written(function, parameters, "block, places", given, *numbers)
+
+
+def _written(
+    function: Callable[..., Any],
+    parameters: tuple[Any, ...],
+    taken: str,
+    given: list[str],
+    *before: str,
+) -> Callable[..., Any]:
     import numba
 
-    names: list[str] = []
-    given: list[str] = []
     scope: dict[str, Any] = {"function": _callee(function), "carray": vars(numba)["carray"]}
-    for i, parameter in enumerate(parameters):
-        names.append(name := f"a{i}")
-        if isinstance(parameter, type):
-            given.append(name)
-            continue
-        lengths = [f"{name}_{axis}" for axis in range(getattr(parameter, "dimensions", 0))]
-        names += lengths
-        scope[f"{name}_dtype"] = getattr(parameter, "dtype", parameter)
-        if lengths:
-            given.append(f"carray({name}, ({', '.join(lengths)},), {name}_dtype)")
-        else:
-            given.append(f"carray({name}, 1, {name}_dtype)[0]")
-    exec(f"def entry({', '.join(names)}):\n    return function({', '.join(given)})", scope)
+    scope |= {"int_dtype": np.dtype("i8"), "float_dtype": np.dtype("f8")}
+    scope |= {f"a{i}_dtype": getattr(each, "dtype", each) for i, each in enumerate(parameters)}
+    lines = (*before, f"return function({', '.join(given)})")
+    exec(f"def entry({taken}):\n    " + "\n    ".join(lines), scope)
     return cast(Callable[..., Any], scope["entry"])
 
 
