@@ -66,16 +66,16 @@ def roll_out(  # type: ignore[no-untyped-def]
 def _conclude(plant, last, costs) -> None:  # type: ignore[no-untyped-def]
     """Add what remains to be paid behind the last hold."""
     q, s = plant.lateral_terminal, plant.vertical_terminal
-    for axis in range(2):
-        for i in range(4):
-            for j in range(4):
-                weight = q[i, j]
-                for n in range(costs.shape[0]):
-                    costs[n] += weight * last[2 * i + axis, n] * last[2 * j + axis, n]
-    for i in range(3):
-        for j in range(3):
-            for n in range(costs.shape[0]):
-                costs[n] += s[i, j] * last[Z + i, n] * last[Z + j, n]
+    for n in range(costs.shape[0]):
+        cost = costs[n]
+        for axis in range(2):
+            for i in range(4):
+                for j in range(4):
+                    cost += q[i, j] * last[2 * i + axis, n] * last[2 * j + axis, n]
+        for i in range(3):
+            for j in range(3):
+                cost += s[i, j] * last[Z + i, n] * last[Z + j, n]
+        costs[n] = cost
 
 
 @kernel
@@ -94,19 +94,15 @@ def _choose(  # type: ignore[no-untyped-def]
                 for n in range(particles):
                     chosen[axis, n] += weight * knots[m, axis, n]
     if feedback != 0.0:
-        for axis in range(2):
-            for i in range(4):
-                factor = feedback * gain[i]
-                at = base_state[2 * i + axis]
-                for n in range(particles):
-                    chosen[axis, n] -= factor * (state[2 * i + axis, n] - at)
-        for i in range(3):
-            factor = feedback * heave[i]
-            at = base_state[Z + i]
-            for n in range(particles):
-                chosen[2, n] -= factor * (state[Z + i, n] - at)
-    for axis in range(INPUTS):
         for n in range(particles):
+            for axis in range(2):
+                for i in range(4):
+                    off = state[2 * i + axis, n] - base_state[2 * i + axis]
+                    chosen[axis, n] -= feedback * gain[i] * off
+            for i in range(3):
+                chosen[2, n] -= feedback * heave[i] * (state[Z + i, n] - base_state[Z + i])
+    for n in range(particles):
+        for axis in range(INPUTS):
             chosen[axis, n] = _clip(chosen[axis, n], lower[axis], upper[axis])
 
 
