@@ -43,12 +43,12 @@ class Motion:
             [np.interp(self.times, stamps, trace.attitude[:, NORTH + axis]) for axis in (0, 1)]
         )
         self.upright = np.sqrt(np.maximum(1.0 - np.sum(self.direction_ne**2, axis=0), 0.01))
-        self._sent = np.ascontiguousarray(trace.commands[:, [SENT_AT, SENT_THRUST]])
+        self.sent = np.ascontiguousarray(trace.commands[:, [SENT_AT, SENT_THRUST]])
 
     def thrust(self, delay_s: float, lag_s: float) -> Array:
         """Thrust (N,) as a fraction of full throttle."""
         out = np.empty_like(self.times)
-        lagged_thrust.call(self.times, self._sent, delay_s, lag_s, out)
+        lagged_thrust.call(self.times, self.sent, np.array((delay_s, lag_s)), out)
         return out
 
     @property
@@ -71,7 +71,7 @@ class Motion:
 
     @property
     def usable(self) -> bool:
-        return len(self.times) >= 50 and len(self._sent) >= 3
+        return len(self.times) >= 50 and len(self.sent) >= 3
 
 
 def specific_velocity(motion: Motion, vehicle: Vehicle) -> Array:
@@ -93,10 +93,11 @@ def specific_velocity(motion: Motion, vehicle: Vehicle) -> Array:
     return velocity
 
 
-@entry(array(1), array(2), float, float, array(1))
-def lagged_thrust(times: Array, sent: Array, delay_s: float, lag_s: float, out: Array) -> int:
+@entry(array(1), array(2), array(1), array(1))
+def lagged_thrust(times: Array, sent: Array, delay_and_lag_s: Array, out: Array) -> int:
     """The thrust `out` (N,) at `times`: commands `sent` (M, 2), when and how much, after delay and
     first-order lag, exact."""
+    delay_s, lag_s = delay_and_lag_s[0], delay_and_lag_s[1]
     row = 0
     while row + 1 < sent.shape[0] and sent[row + 1, 0] + delay_s <= times[0] - 10.0 * lag_s:
         row += 1

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from offboard.control.motion import Motion
+from offboard.control.motion import Motion, lagged_thrust
 from offboard.control.response_fit import Estimate
 from offboard.model.kernel import array, entry, kernel
 
@@ -47,17 +47,18 @@ class VerticalFit:
     drag_ps: Estimate
 
 
-@entry(array(1), array(2), array(2), float, array(1), array(2))
+@entry(array(1), array(2), array(2), array(1), array(1), array(2))
 def innovations(
-    times: Array, positions: Array, accelerations: Array, drag: float, allowed: Array, out: Array
+    times: Array, positions: Array, accelerations: Array, drag: Array, allowed: Array, out: Array
 ) -> int:
     """Normalised innovations `out` (axes, N - 1) of a filter [p, v, d] along each axis.
 
-    v' = a - c v + d with `accelerations` (axes, N) joined by straight lines; `allowed` (6,):
-    densities per root second of p, v and d, sd of the positions, and of v and d at the start.
+    v' = a - c v + d with `accelerations` (axes, N) joined by straight lines and `drag` (1,);
+    `allowed` (6,): densities per root second of p, v and d, sd of the positions, and of v and d at
+    the start.
     """
     for axis in range(out.shape[0]):
-        _filter(times, positions[axis], accelerations[axis], drag, allowed, out[axis])
+        _filter(times, positions[axis], accelerations[axis], drag[0], allowed, out[axis])
     return 0
 
 
@@ -109,7 +110,7 @@ def fit_drag(motion: Motion, thrust_mps2: Array) -> Estimate:
 
     def surprises(drag: Array) -> Array:
         out = np.empty((2, len(motion.times) - 1))
-        innovations.call(motion.times, motion.positions[:2], pulls, drag[0], LATERAL, out)
+        innovations.call(motion.times, motion.positions[:2], pulls, drag, LATERAL, out)
         return out.ravel()
 
     result = least_squares(
@@ -136,19 +137,34 @@ class VerticalPrior:
     drag_ps: Estimate
 
 
+class _VerticalSurprises:
+    """Innovations (N - 1,) along the vertical with inverse hover thrust, delay and lag of the
+    thrust, and drag (4,); the next call writes over them."""
+
+    def __init__(self, motion: Motion, gravity_mps2: float) -> None:
+        self._gravity_mps2, self._upright = gravity_mps2, motion.upright
+        times, height = motion.times, motion.positions[2:]
+        self._parameters, self._thrust = np.empty(4), np.empty(len(times))
+        self._pull, self._out = np.empty_like(height), np.empty((1, len(times) - 1))
+        delay_and_lag_s, drag = self._parameters[1:3], self._parameters[3:]
+        self._lag = lagged_thrust.bound(times, motion.sent, delay_and_lag_s, self._thrust)
+        self._filter = innovations.bound(times, height, self._pull, drag, VERTICAL, self._out)
+
+    def __call__(self, parameters: Array) -> Array:
+        self._parameters[:] = parameters
+        self._lag()
+        inverse = self._parameters[0]
+        self._pull[0] = self._gravity_mps2 * (1.0 - inverse * self._thrust * self._upright)
+        self._filter()
+        surprises: Array = self._out[0]
+        return surprises
+
+
 def fit_vertical(motion: Motion, gravity_mps2: float, prior: VerticalPrior) -> VerticalFit:
     """Hover thrust, lag and delay of the thrust."""
     known = (prior.delay_s, prior.lag_s, prior.drag_ps)
 
-    def surprises(parameters: Array) -> Array:
-        inverse, delay_s, lag_s, drag_ps = parameters
-        thrust = motion.thrust(delay_s, lag_s)
-        pull = gravity_mps2 * (1.0 - inverse * thrust * motion.upright)
-        out = np.empty(len(motion.times) - 1)
-        down = motion.positions[2:], pull[None], drag_ps, VERTICAL, out[None]
-        innovations.call(motion.times, *down)
-        return out
-
+    surprises = _VerticalSurprises(motion, gravity_mps2)
     upper = np.array((50.0, THRUST_DELAY_UPPER_S, LAG_UPPER_S, DRAG_UPPER))
     start = np.clip(
         [1.0 / prior.hover_thrust, *(each.value for each in known)],
@@ -194,8 +210,9 @@ def _covariance(jacobian: Array, residual: Array, spacing_s: float, known: int) 
 
 def _long_run(score: Array, lags: int) -> Array:
     """Covariance (k, k) of the sum of a related series (N, k) (W. Newey and K. West, 1987)."""
-    total: Array = score.T @ score
-    for lag in range(1, lags + 1):
-        related = score[lag:].T @ score[:-lag]
-        total += (1.0 - lag / (lags + 1.0)) * (related + related.T)
+    lag = np.arange(1, lags + 1)
+    related = np.array([score[each:].T @ score[:-each] for each in lag.tolist()])
+    shares = (1.0 - lag / (lags + 1.0))[:, None, None]
+    terms = shares * (related + related.swapaxes(1, 2))
+    total: Array = np.cumsum(np.concatenate(((score.T @ score)[None], terms)), axis=0)[-1]
     return total

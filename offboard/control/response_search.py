@@ -11,6 +11,7 @@ are (K. Lange, R. Little and J. Taylor, 1989). Times in s, signals in any unit; 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -32,16 +33,6 @@ DIFFERENCE = 1e-3  # of them too, for slopes
 
 # Columns of a table of steps: the propagator, the row of the command held, the sample led to.
 F0, F1, HELD, SAMPLE = 0, 1, 2, 3
-
-
-@dataclass(frozen=True, slots=True)
-class Data:
-    """Signals (N, axes) at `times` (N,) under commands: `sent` (M, 1 + axes), when and what; each
-    contiguous and in the order of time."""
-
-    times: Array
-    signals: Array
-    sent: Array
 
 
 @kernel
@@ -124,13 +115,47 @@ def respond(times: Array, sent: Array, parameters: Array, steps: Array, out: Arr
     return 0
 
 
+class Data:
+    """Signals (N, axes) at `times` (N,) under commands: `sent` (M, 1 + axes), when and what; each
+    contiguous and in the order of time."""
+
+    def __init__(self, times: Array, signals: Array, sent: Array) -> None:
+        self.times, self.signals, self._sent = times, signals, sent
+        self._steps = np.empty((len(times) + len(sent) + 1, 4))
+        self._sought: dict[int, _Sought] = {}
+
+    def responses(self, parameters: Array) -> Array:
+        """`respond` with `parameters` (K, 3), and a constant: (K, N, axes + 3), which the next call
+        for as many writes over."""
+        count = len(parameters)
+        sought = self._sought.get(count)
+        if sought is None:
+            sought = self._sought[count] = self._bound(count)
+        sought.parameters[:] = parameters
+        sought.respond()
+        return sought.out
+
+    def _bound(self, count: int) -> _Sought:
+        parameters = np.empty((count, 3))
+        out = np.ones((count, len(self.times), self.signals.shape[1] + 3))
+        bound = respond.bound(self.times, self._sent, parameters, self._steps, out)
+        return _Sought(parameters, bound, out)
+
+
+@dataclass(frozen=True, slots=True)
+class _Sought:
+    """So many responses at once: what is written, called and read."""
+
+    parameters: Array
+    respond: Callable[[], int]
+    out: Array
+
+
 def residuals(data: Data, parameters: Array, weights: Array) -> Array:
     """Signals less the responses with each of the `parameters` (K, 3), free motion and a constant
     offset projected out under `weights` (N,): (K, N, axes)."""
     axes = data.signals.shape[1]
-    steps = np.empty((len(data.times) + len(data.sent) + 1, 4))
-    out = np.ones((len(parameters), len(data.times), axes + 3))
-    respond.call(data.times, data.sent, parameters, steps, out)
+    out = data.responses(parameters)
     left: Array = data.signals - out[:, :, :axes]
     basis = out[:, :, axes:]
     weighted = basis.swapaxes(1, 2) * weights
@@ -154,7 +179,7 @@ def scale_of(left: Array) -> float:
 
 def weights_of(left: Array, scale: float) -> Array:
     """Weights (N,) of Student's t, one for all axes of a sample."""
-    far = np.sum(left**2, axis=1)
+    far = (left**2).sum(axis=1)
     weights: Array = (FREEDOM + left.shape[1]) / (FREEDOM + far / scale**2)
     return weights
 
@@ -169,7 +194,7 @@ def slopes(data: Data, parameters: Array, weights: Array, left: Array) -> Array:
 
 
 def _cost(left: Array, weights: Array) -> float:
-    return float(weights @ np.sum(left**2, axis=1))
+    return float(weights @ (left**2).sum(axis=1))
 
 
 def search(data: Data, start: Array) -> tuple[Array, float]:
@@ -188,7 +213,7 @@ def search(data: Data, start: Array) -> tuple[Array, float]:
         if moved < CONVERGED and step >= PLAIN_STEPS:
             break
     scale = scale_of(left)
-    far = np.sum(left**2, axis=1)
+    far = (left**2).sum(axis=1)
     unlikely = left.size * math.log(scale)
     unlikely += 0.5 * (FREEDOM + left.shape[1]) * np.sum(np.log1p(far / (FREEDOM * scale**2)))
     return best, float(unlikely)
@@ -205,7 +230,8 @@ def _descend(
     normal, gradient = weighted @ slope.T, weighted @ left.ravel()
     for _ in range(DESCENTS):
         damped = normal + np.diag(damping * np.diag(normal) + 1e-12)
-        tried = np.clip(best - np.linalg.solve(damped, gradient) * STEP_SCALES, LOWER, UPPER)
+        tried = best - np.linalg.solve(damped, gradient) * STEP_SCALES
+        tried = np.minimum(np.maximum(tried, LOWER), UPPER)
         tried_left = residual(data, tried, weights)
         if _cost(tried_left, weights) < cost:
             return tried, tried_left, max(0.1 * damping, 1e-7)
