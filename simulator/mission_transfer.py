@@ -69,6 +69,7 @@ class Transfer:
     link: Link
     mission: Mission
     rules: MissionRules
+    home: Callable[[], Item]
     _upload: Upload | None = None
     _download: Download | None = None
     _whole: bool = False  # places come in whole 1e-7 degrees
@@ -168,13 +169,14 @@ class Transfer:
         peer, kind = (message.system, message.component), message.mission_type
         self._whole = whole = message.name == "MISSION_REQUEST_INT"
         items = self.mission.listed(kind)
-        there = message.seq < len(items)
+        shows_home = self.rules.home_first and kind == 0 and message.seq == 0
+        there = shows_home or message.seq < len(items)
         if self.rules.strict and not self._is_due(peer, kind, message.seq, there):
             return
         if not there:
             self._acknowledge(peer, Ack.INVALID_SEQUENCE, kind)
             return
-        item = items[message.seq]
+        item = self.home() if shows_home else items[message.seq]
         places = (item.x, item.y) if whole else (item.x * 1e-7, item.y * 1e-7)
         current = int(not kind and message.seq == self.mission.current)
         goes_on = int(kind not in self.rules.stopping)

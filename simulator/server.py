@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 from simulator.codec import Decoder, Message, frame, layout
 from simulator.commands import Command, Commands
 from simulator.firmware.base import Say, Severity
+from simulator.mission import Item
 from simulator.mission_transfer import HANDLERS as MISSION_HANDLERS
 from simulator.mission_transfer import Transfer
 from simulator.setpoints import ATTITUDE, GLOBAL, LOCAL
@@ -70,7 +71,13 @@ class Server:
 
     def _new_transfer(self) -> Transfer:
         autopilot = self.view.autopilot
-        return Transfer(self, autopilot.mission, autopilot.firmware.missions)
+        return Transfer(self, autopilot.mission, autopilot.firmware.missions, self._home)
+
+    def _home(self) -> Item:
+        """Home as a mission's item."""
+        north_m, east_m, down_m = self.view.autopilot.pilot.home_ned_m
+        place = self.view.geodetic(north_m, east_m)
+        return Item(0, 16, (0.0,) * 4, *place, self.view.altitude_mm(down_m) * 1e-3)
 
     def _start_streams(self) -> None:
         self.rescheduled = True

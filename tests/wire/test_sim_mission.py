@@ -208,6 +208,22 @@ def test_fences_and_rally_points_are_kept_beside_the_mission(firmware: Firmware)
     assert [text for text in bench.texts() if "Fence" in text] == said
 
 
+def test_an_arducopters_first_item_is_home_there_or_not() -> None:
+    """Scripts that download an empty mission wait for it."""
+    bench = Bench(firmware=ARDUPILOT)
+    bench.boot()
+    for _ in range(2):
+        bench.send(mavlink.MAVLink_mission_request_message(1, 1, 0))
+        bench.run(0.02)
+        home = bench.of("MISSION_ITEM")[-1][1]
+        assert (home.seq, home.frame, home.command) == (0, 0, WAYPOINT)
+        assert (home.x, home.y, home.z) == pytest.approx(ARDUPILOT.origin, abs=1e-2)
+        assert upload(bench, [place(WAYPOINT, 50, 50, 0), place(WAYPOINT, 9, 0, 5)]) == 0
+    bench.send(mavlink.MAVLink_mission_request_message(1, 1, 2))
+    bench.run(0.02)
+    assert bench.of("MISSION_ACK")[-1][1].type == 13
+
+
 def test_a_px4_shows_frames_in_the_kind_asked_for() -> None:
     bench = Bench()
     bench.boot()

@@ -43,5 +43,10 @@ def _frame_shown(item: MissionItem, whole: bool) -> int:
 
 
 MISSIONS = MissionRules(
-    strict=True, refusal=_refusal, texts={}, frame_shown=_frame_shown, stopping=frozenset({1})
+    strict=True,
+    home_first=False,
+    refusal=_refusal,
+    texts={},
+    frame_shown=_frame_shown,
+    stopping=frozenset({1}),
 )
