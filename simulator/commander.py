@@ -7,13 +7,13 @@ depends on which firmware it is. Knows no MAVLink frames, sockets or clock.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
 from simulator.airtime import Airtime
 from simulator.firmware.base import (
     AT_LAST,
+    NAN3,
     Behaviour,
     Condition,
     Firmware,
@@ -21,6 +21,7 @@ from simulator.firmware.base import (
     Result,
     Rule,
     Say,
+    Triple,
 )
 from simulator.health import Health
 from simulator.nav import Senses
@@ -34,10 +35,10 @@ _GO_ON = frozenset({Behaviour.SETPOINT, Behaviour.MISSION})  # when asked for ag
 
 @dataclass(frozen=True, slots=True)
 class Wish:
-    """What an event asks for: a mode by name, a height (NED, m) to climb to; and who asks."""
+    """What an event asks for: a mode by name, a place (NED, m) to climb to; and who asks."""
 
     mode: str = ""
-    takeoff_z_m: float = math.nan
+    takeoff_ned_m: Triple = NAN3
     by_planner: bool = False  # the component of a ground station
 
 
@@ -186,7 +187,7 @@ class Commander:
         if mode is not self.mode and not self._firmware.setpoints_outlive_modes:
             self._navigator.setpoint = None
         if mode is not self.mode or mode.behaviour not in _GO_ON:
-            self._pilot.enter(mode.behaviour, self._senses.look(), self._wish.takeoff_z_m)
+            self._pilot.enter(mode.behaviour, self._senses.look(), self._wish.takeoff_ned_m)
         self.mode = mode
 
     # -- actions -----------------------------------------------------------------------------
@@ -218,7 +219,7 @@ class Commander:
 
     def _take_off(self) -> None:
         self._navigator.setpoint = None
-        self._pilot.enter(Behaviour.TAKEOFF, self._senses.look(), self._wish.takeoff_z_m)
+        self._pilot.enter(Behaviour.TAKEOFF, self._senses.look(), self._wish.takeoff_ned_m)
 
     def _hold(self) -> None:
         self._navigator.setpoint = None
@@ -236,7 +237,7 @@ class Commander:
     # -- guards ------------------------------------------------------------------------------
 
     def _climb_asked(self) -> bool:
-        return self._wish.takeoff_z_m <= self._navigator.home_ned_m[2]
+        return self._wish.takeoff_ned_m[2] <= self._navigator.home_ned_m[2]
 
     def _mode_can_run(self) -> bool:
         return self._health.can_run(self._asked, self._senses.time_s)

@@ -13,7 +13,7 @@ from typing import Protocol
 
 from simulator.codec import id_of, name_of
 from simulator.commander import Wish
-from simulator.firmware.base import ModeRequest, Result, Say, Severity, Triple
+from simulator.firmware.base import Behaviour, ModeRequest, Result, Say, Severity, Triple
 from simulator.geodesy import down_m, to_metres
 from simulator.telemetry import View
 
@@ -105,10 +105,13 @@ class Commands:
         autopilot = self.link.view.autopilot
         home_down_m = autopilot.navigator.home_ned_m[2]
         if autopilot.firmware.takeoff_above_home:
-            return autopilot.happen("takeoff", Wish(takeoff_z_m=home_down_m - asked_m))
-        above_m = asked_m - autopilot.firmware.origin[2]
-        known = math.isfinite(above_m) and above_m > -home_down_m
-        return autopilot.happen("takeoff", Wish(takeoff_z_m=-above_m if known else math.nan))
+            down_m = home_down_m - asked_m
+            return autopilot.happen("takeoff", Wish(takeoff_ned_m=(math.nan, math.nan, down_m)))
+        place = to_metres(autopilot.firmware.origin, *command.params[4:6])
+        down_m = autopilot.firmware.origin[2] - asked_m
+        finite = (value if math.isfinite(value) else math.nan for value in (*place, down_m))
+        north, east, down = finite
+        return autopilot.happen("takeoff", Wish(takeoff_ned_m=(north, east, down)))
 
     def _land(self, _: Command) -> Result:
         return self.link.view.autopilot.happen("land")
@@ -135,12 +138,15 @@ class Commands:
         return Result.ACCEPTED
 
     def _reposition(self, command: Command) -> Result:
-        """Hold there from now on; what is not finite stays as it is."""
+        """Hold there from now on, flying there at the speed given; what is not finite stays as it
+        is."""
         if command.params[1] != _CHANGE_MODE:
             return Result.UNSUPPORTED
         autopilot = self.link.view.autopilot
         yaw_rad, latitude, longitude, height_m = command.params[3:7]
-        if autopilot.firmware.repositions_strictly:
+        strictly = autopilot.firmware.repositions_strictly
+        speed_mps = math.inf if strictly or not command.params[0] > 0.0 else command.params[0]
+        if strictly:
             if command.frame is None:
                 return Result.UNSUPPORTED
             if not (latitude or longitude):
@@ -151,7 +157,17 @@ class Commands:
             yaw_rad = yaw_rad if math.isfinite(yaw_rad) else math.nan
             place = self._place(latitude, longitude, height_m, command.frame or 0)
             autopilot.navigator.go_to(place, yaw_rad)
+            if math.isfinite(speed_mps):
+                autopilot.navigator.cruise_mps = speed_mps
         return result
+
+    def go_to(self, place: tuple[float, float, float], frame: int) -> bool:
+        """A place in degrees and metres of this MAV_FRAME, for a vehicle that obeys setpoints."""
+        autopilot = self.link.view.autopilot
+        obeys = autopilot.commander.mode.behaviour is Behaviour.SETPOINT
+        if obeys and autopilot.commander.armed:
+            autopilot.navigator.go_to(self._place(*place, frame), math.nan)
+        return obeys
 
     def _place(self, latitude: float, longitude: float, height_m: float, frame: int) -> Triple:
         """NED, of a place in degrees and a height of this MAV_FRAME; where it is in what of it

@@ -71,7 +71,7 @@ class Mission:
     speed_mps: float = math.inf
     climb_m: float = math.nan  # above home, of the climb it begins with
     events: list[str] = field(default_factory=list)
-    _under_way: bool = False
+    under_way: bool = False
     _climb_to_z_m: float = math.nan  # first, from the ground, straight up to here
     _since_s: float = math.nan  # when the current item's place was reached
     _held: Triple = NAN3
@@ -107,11 +107,11 @@ class Mission:
 
     def pause(self) -> None:
         """It is not flown for now; the next `fly` begins it."""
-        self._under_way = False
+        self.under_way = False
 
     def _begin(self, position_ned_m: Triple, landed: bool, home_ned_m: Triple) -> None:
         """Start, or continue where it was left; anew if it had come to its end."""
-        self._under_way = True
+        self.under_way = True
         self.events.append("mission begun")
         if self.finished:
             self.go_to(self.first)
@@ -127,7 +127,7 @@ class Mission:
     @property
     def climbing(self) -> bool:
         """Straight up from the ground."""
-        return self._under_way and not math.isnan(self._climb_to_z_m)
+        return self.under_way and not math.isnan(self._climb_to_z_m)
 
     @property
     def landing(self) -> bool:
@@ -138,7 +138,7 @@ class Mission:
         self, now_s: float, position_ned_m: Triple, home_ned_m: Triple, *, landed: bool
     ) -> MotionSetpoint:
         """Where to be now. `landing` tells that the height is the pilot's affair."""
-        if not self._under_way:
+        if not self.under_way:
             self._begin(position_ned_m, landed, home_ned_m)
         if not math.isnan(self._climb_to_z_m):
             self._held = (self._held[0], self._held[1], self._climb_to_z_m)

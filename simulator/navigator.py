@@ -11,6 +11,7 @@ from dataclasses import replace
 
 from simulator.descent import Return, land_speed_mps, sink
 from simulator.firmware.base import (
+    NAN3,
     AttitudeSetpoint,
     Behaviour,
     Firmware,
@@ -22,6 +23,7 @@ from simulator.mission import Mission
 from simulator.nav import Nav
 from simulator.parameters import ParameterTable
 
+_FLATTEST = 1000.0  # metres across per metre of climb
 _STANDING = frozenset({Behaviour.HOLD, Behaviour.SETPOINT})
 
 
@@ -36,35 +38,36 @@ class Navigator:
         self.behaviour = Behaviour.HOLD
         self.setpoint: AttitudeSetpoint | MotionSetpoint | None = None
         self.home_ned_m: Triple = (0.0, 0.0, 0.0)
-        self._home_yaw_rad = 0.0
+        self.home_yaw_rad = 0.0
         self.cruise_mps = math.inf  # asked for, in automatic flight
         self._return = Return(firmware, parameters, self._events)
         self._hold: Triple = (0.0, 0.0, 0.0)
         self._held = MotionSetpoint(self._hold)
-        self._takeoff_z_m = math.nan
+        self._takeoff_ned_m, self._climb_begun = NAN3, False
+        self.earthbound = False  # the takeoff leads nowhere up
         self._climbed = False
         self._levelling: AttitudeSetpoint | None = None  # the last one of our own
 
     # -- what it does ------------------------------------------------------------------------
 
-    def enter(self, behaviour: Behaviour, nav: Nav, takeoff_z_m: float = math.nan) -> None:
+    def enter(self, behaviour: Behaviour, nav: Nav, takeoff_ned_m: Triple = NAN3) -> None:
         """Begin a behaviour here; hold after a climb keeps the climb's target.
 
-        `takeoff_z_m`: NED height to climb to; NaN the default one.
+        `takeoff_ned_m`: where to climb to; NaN here, and the default height.
         """
         if not (self._climbed and behaviour in _STANDING):
             self._hold = _ahead(nav)
         if behaviour is not self.behaviour:
             self.cruise_mps = math.inf
         self.behaviour = behaviour
-        self._takeoff_z_m = takeoff_z_m
+        self._takeoff_ned_m, self._climb_begun, self.earthbound = takeoff_ned_m, False, False
         self._return = Return(self._firmware, self._parameters, self._events)
         self._climbed = False
         self.mission.pause()
 
     def arm(self, nav: Nav) -> None:
         """The motors begin to turn: home is here."""
-        self.home_ned_m, self._home_yaw_rad = nav.position_ned_m, nav.yaw_rad
+        self.home_ned_m, self.home_yaw_rad = nav.position_ned_m, nav.yaw_rad
         self.mission.pause()
         self.stay(nav)
 
@@ -188,7 +191,7 @@ class Navigator:
         if self.behaviour is Behaviour.TAKEOFF:
             return self._climb(nav, landed=landed)
         if self.behaviour is Behaviour.RETURN:
-            return self._return.fly(time_s, nav, self.home_ned_m, self._home_yaw_rad)
+            return self._return.fly(time_s, nav, self.home_ned_m, self.home_yaw_rad)
         if self.behaviour is Behaviour.MISSION:
             return self._follow_mission(nav, time_s, landed=landed)
         if self.behaviour is Behaviour.LAND:
@@ -198,15 +201,29 @@ class Navigator:
         return self._standing
 
     def _climb(self, nav: Nav, *, landed: bool) -> MotionSetpoint:
-        target_z = self._takeoff_z_m
-        if math.isnan(target_z):
-            target_z = nav.position_ned_m[2] - self._parameters.role("takeoff_height_m")
-            self._takeoff_z_m = target_z
-            self._events.append("default height")
+        if not self._climb_begun:
+            self._climb_begun = True
+            self._begin_climb(nav.position_ned_m, landed=landed)
+        north, east, target_z = self._takeoff_ned_m
+        if math.isnan(north + east):
+            north, east = self._hold[:2]
         if nav.position_ned_m[2] < target_z + self._parameters.role("climbed_within_m"):
             self._climbed = not landed
-        self._hold = (self._hold[0], self._hold[1], target_z)
+        self._hold = (north, east, target_z)
         return MotionSetpoint(self._hold)
+
+    def _begin_climb(self, here_ned_m: Triple, *, landed: bool) -> None:
+        """No way down, and from the ground none that is flat, is flown."""
+        (x, y, z), (north, east, target_z) = here_ned_m, self._takeoff_ned_m
+        if math.isnan(target_z):
+            target_z = z - self._parameters.role("takeoff_height_m")
+            self._events.append("default height")
+        elif target_z > z:
+            target_z, self.earthbound = z, landed
+            self._events.append("already higher")
+        if landed and math.hypot(north - x, east - y) > _FLATTEST * (z - target_z):
+            self.earthbound = True
+        self._takeoff_ned_m = (north, east, target_z)
 
     def _follow_mission(self, nav: Nav, time_s: float, *, landed: bool) -> MotionSetpoint:
         motion = self.mission.fly(time_s, nav.position_ned_m, self.home_ned_m, landed=landed)

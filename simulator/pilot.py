@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 from simulator.attitude import Demand
 from simulator.firmware.base import (
+    NAN3,
     AttitudeSetpoint,
     Behaviour,
     Firmware,
@@ -64,9 +65,9 @@ class Pilot:
         """The vehicle as a reboot finds it."""
         self._detector.landed = on_ground
 
-    def enter(self, behaviour: Behaviour, nav: Nav, takeoff_z_m: float = math.nan) -> None:
+    def enter(self, behaviour: Behaviour, nav: Nav, takeoff_ned_m: Triple = NAN3) -> None:
         """Begin a behaviour here, as the navigator does."""
-        self._navigator.enter(behaviour, nav, takeoff_z_m)
+        self._navigator.enter(behaviour, nav, takeoff_ned_m)
         self._next_loop_s = 0.0
         self._obeyed = None
         self.loop.reset(nav.yaw_rad)
@@ -256,7 +257,7 @@ class Pilot:
     def _asks_up(self, nav: Nav) -> bool:
         """Something above is demanded: a height, a climb or an acceleration."""
         motion = self.motion
-        return (
+        return not self._navigator.earthbound and (
             motion.position_ned_m[2] < nav.position_ned_m[2]
             or motion.velocity_ned_mps[2] < 0.0
             or motion.acceleration_ned_mps2[2] < 0.0

@@ -27,6 +27,7 @@ DATAGRAM_MAX = 1400
 PARAMETERS_PER_STEP = 4
 PARAMETER_BY_NAME = 65535  # PARAM_VALUE.param_index of an answer that has none
 INTERVAL_MAX_US = 2.0**31 - 1  # MESSAGE_INTERVAL.interval_us is an int32
+_ITEMS, _GUIDED = ("MISSION_ITEM", "MISSION_ITEM_INT"), 2  # `current` of an item
 _FTP_NAK, _FTP_ERROR_NOT_FOUND = 128 + 1, 10
 
 
@@ -75,7 +76,7 @@ class Server:
 
     def _home(self) -> Item:
         """Home as a mission's item."""
-        north_m, east_m, down_m = self.view.autopilot.pilot.home_ned_m
+        north_m, east_m, down_m = self.view.autopilot.navigator.home_ned_m
         place = self.view.geodetic(north_m, east_m)
         return Item(0, 16, (0.0,) * 4, *place, self.view.altitude_mm(down_m) * 1e-3)
 
@@ -262,7 +263,18 @@ class Server:
         self._commands.set_mode(message.base_mode, message.custom_mode, sender)
 
     def _mission(self, message: Message) -> None:
+        rules = self.view.autopilot.firmware.missions
+        if rules.guides and message.name in _ITEMS and message.current == _GUIDED:
+            self._guide(message)
+            return
         self._transfer.handle(message, self._now_us * 1e-6)
+
+    def _guide(self, message: Message) -> None:
+        """An item that is no mission's, but where to go now."""
+        scale = 1e-7 if message.name.endswith("INT") else 1.0
+        place = (message.x * scale, message.y * scale, message.z)
+        goes = self._commands.go_to(place, message.frame)
+        self.send("MISSION_ACK", message.system, message.component, 0 if goes else 1, 0)
 
     def _timesync(self, message: Message) -> None:
         if message.tc1 == 0:

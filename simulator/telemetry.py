@@ -293,19 +293,35 @@ def altitude(view: View) -> Sequence[Any]:
     return (view.time_us, amsl, amsl, -down, relative, math.nan, math.nan)
 
 
+def pressure_hpa(height_m: float) -> float:
+    """Of the air at this height above the sea, in a standard atmosphere."""
+    return 1013.25 * math.pow(1.0 - 2.25577e-5 * height_m, 5.25588)
+
+
+def scaled_pressure(view: View) -> Sequence[Any]:
+    """hPa; 25 degrees."""
+    down_m = view.autopilot.senses.look().position_ned_m[2]
+    height_m = view.autopilot.firmware.origin[2] - down_m
+    return (view.time_ms, pressure_hpa(height_m), 0.0, 2500, 0)
+
+
+def vibration(view: View) -> Sequence[Any]:
+    """None."""
+    return (view.time_us, 0.0, 0.0, 0.0, 0, 0, 0)
+
+
 def highres_imu(view: View) -> Sequence[Any]:
     """Specific force of the truth in body axes, rates as estimated."""
     nav = view.autopilot.senses.look()
     w, x, y, z, *_, down, a_north, a_east, a_down = view.autopilot.plant.motion()
     force = _in_body((w, x, y, z), (a_north, a_east, a_down - GRAVITY_MPS2))
     height = view.autopilot.firmware.origin[2] - down
-    pressure_hpa = 1013.25 * (1.0 - 2.25577e-5 * height) ** 5.25588
     return (
         view.time_us,
         *force,
         *nav.rates_frd_radps,
         *(0.21, 0.0, 0.43),
-        pressure_hpa,
+        pressure_hpa(height),
         0.0,
         height,
         15.0,
@@ -419,13 +435,14 @@ def battery_status(view: View) -> Sequence[Any]:
 
 def home_position(view: View) -> Sequence[Any]:
     north, east, down = view.autopilot.navigator.home_ned_m
+    yaw_rad = view.autopilot.navigator.home_yaw_rad
     return (
         *view.geodetic(north, east),
         view.altitude_mm(down),
         north,
         east,
         down,
-        (1.0, 0.0, 0.0, 0.0),
+        (math.cos(0.5 * yaw_rad), 0.0, 0.0, math.sin(0.5 * yaw_rad)),
         0.0,
         0.0,
         0.0,
@@ -505,5 +522,7 @@ BUILDERS: dict[str, Callable[[View], Sequence[Any]]] = {
         mission_current,
         mission_item_reached,
         autopilot_version,
+        scaled_pressure,
+        vibration,
     )
 }

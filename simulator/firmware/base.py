@@ -190,7 +190,7 @@ class MissionRules:
     """What a firmware takes of lists of items, by MAV_MISSION_TYPE, and how it shows them.
 
     `strict`: they go down in order alone, and are asked for in the kind that came last.
-    `home_first`: the first item of a mission, there or not, is home. `refusal`:
+    `home_first`: the first item of a mission, there or not, is home. `guides`: an item marked current = 2 is where to go now. `refusal`:
     MAV_MISSION_RESULT and text of an item that is not taken. `texts` follow an upload.
     `frame_shown`: of an item in whole 1e-7 degrees, or in degrees. `stopping`: types whose items
     are shown without autocontinue.
@@ -198,6 +198,7 @@ class MissionRules:
 
     strict: bool
     home_first: bool
+    guides: bool
     refusal: Callable[[int, MissionItem], tuple[int, Say | None] | None]
     texts: Mapping[int, Say]
     frame_shown: Callable[[MissionItem, bool], int]

@@ -25,7 +25,7 @@ def flying(firmware: Firmware) -> Bench:
     bench.command(176, 1, *((GUIDED,) if firmware is ARDUPILOT else (4, 3)))
     assert bench.command(400, 1) == [ACCEPTED]
     height_m = 5.0 if firmware is ARDUPILOT else PX4.origin[2] + 5.0
-    assert bench.command(22, 0, 0, 0, 0, 0, 0, height_m) == [ACCEPTED]
+    assert bench.command(22, 0, 0, 0, 0, NAN, NAN, height_m) == [ACCEPTED]
     bench.run(13.0)
     assert bench.height_m == pytest.approx(5.0, abs=0.3)
     return bench
@@ -116,7 +116,7 @@ def test_px4_says_why_no_mode_to_the_component_of_a_ground_station_alone() -> No
 
 @pytest.mark.parametrize(
     ("firmware", "idle", "refused"),
-    [(PX4, (132, 375, 65), (42, 46)), (ARDUPILOT, (87, 241), (111,))],
+    [(PX4, (132, 375, 65), (42, 46)), (ARDUPILOT, (22, 26), (111,))],
 )
 def test_intervals_of_what_is_never_said_and_requests_of_what_says_itself(
     firmware: Firmware, idle: tuple[int, ...], refused: tuple[int, ...]

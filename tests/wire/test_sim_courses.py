@@ -56,15 +56,26 @@ def ask(
     )
 
 
-def reposition(
-    bench: Bench, north: float, east: float, up: float, frame: int, yaw: float = NAN
-) -> int:
-    """So many metres from the origin of the local frame."""
+def degrees(bench: Bench, north: float, east: float) -> tuple[float, float]:
+    """Latitude and longitude, so many metres from the origin of the local frame."""
     latitude, longitude, _ = bench.instance.autopilot.firmware.origin
     shrink = math.cos(math.radians(latitude))
-    x = round((latitude + math.degrees(north / EARTH_RADIUS_M)) * 1e7)
-    y = round((longitude + math.degrees(east / EARTH_RADIUS_M / shrink)) * 1e7)
-    bench.send(mavlink.MAVLink_command_int_message(1, 1, frame, 192, 0, 0, -1, 1, 0, yaw, x, y, up))
+    north_deg, east_deg = (math.degrees(way / EARTH_RADIUS_M) for way in (north, east))
+    return latitude + north_deg, longitude + east_deg / shrink
+
+
+def reposition(
+    bench: Bench,
+    north: float,
+    east: float,
+    up: float,
+    frame: int,
+    yaw: float = NAN,
+    speed: float = -1.0,
+) -> int:
+    x, y = (round(value * 1e7) for value in degrees(bench, north, east))
+    asked = (frame, 192, 0, 0, speed, 1, 0, yaw, x, y, up)
+    bench.send(mavlink.MAVLink_command_int_message(1, 1, *asked))
     bench.run(0.02)
     return int(bench.of("COMMAND_ACK")[-1][1].result)
 
@@ -204,6 +215,24 @@ def test_a_place_to_go_to_needs_a_frame() -> None:
     assert place(bench) == pytest.approx((0.0, 20.0, -8.0), abs=0.3)
 
 
+@pytest.mark.parametrize("kind", ["", "_int"])
+def test_an_item_marked_as_guided_is_where_an_arducopter_goes_now(kind: str) -> None:
+    """As DroneKit's simple_goto asks."""
+    bench = copter()
+    x, y = degrees(bench, 0.0, 20.0)
+    where = (round(x * 1e7), round(y * 1e7)) if kind else (x, y)
+    pack = getattr(mavlink, f"MAVLink_mission_item{kind}_message")
+    asked = pack(0, 0, 0, 3, 16, 2, 0, 0, 0, 0, 0, *where, 8.0)
+    bench.send(asked)
+    bench.run(10.0)
+    assert [m.type for _, m in bench.of("MISSION_ACK")] == [0]
+    assert place(bench) == pytest.approx((0.0, 20.0, -8.0), abs=0.7)  # degrees as floats: 0.4 m
+    bench.command(176, 1, 9)  # LAND
+    bench.send(asked)
+    bench.run(0.02)
+    assert bench.of("MISSION_ACK")[-1][1].type == 1
+
+
 def test_a_px4_faces_the_place_it_goes_to_and_turns_as_asked() -> None:
     bench = px4()
     amsl_m = bench.instance.autopilot.firmware.origin[2] + 3.0
@@ -232,3 +261,47 @@ def test_a_px4_returns_head_first_and_lands_as_it_stood() -> None:
     assert off_deg(bench, -90.0) < 5.0
     bench.run_until(lambda: bench.height_m < 20.0, 30.0)
     assert off_deg(bench, home_deg) < 5.0
+
+
+def test_a_px4_goes_to_a_place_at_the_speed_given() -> None:
+    """1.9 m/s of 2 asked."""
+    bench = px4()
+    amsl_m = bench.instance.autopilot.firmware.origin[2] + 3.0
+    assert reposition(bench, 20.0, 0.0, amsl_m, ABSOLUTE, speed=2.0) == ACCEPTED
+    assert fastest_mps(bench, 9.0) == pytest.approx(1.9, abs=0.15)
+
+
+@pytest.mark.parametrize(
+    ("place_m", "up", "said"),
+    [
+        (None, 4.0, []),  # latitude and longitude 0: so far away that the way there is flat
+        ((0.0, 0.0), -400.0, ["Already higher than takeoff altitude"]),  # above the ground, it says
+    ],
+)
+def test_a_px4_stays_on_the_ground_when_its_takeoff_leads_nowhere_up(
+    place_m: tuple[float, float] | None, up: float, said: list[str]
+) -> None:
+    """As scripts that leave the place 0, or give a height above the ground, find out."""
+    bench = Bench()
+    bench.boot()
+    where = (0.0, 0.0) if place_m is None else degrees(bench, *place_m)
+    amsl_m = bench.instance.autopilot.firmware.origin[2] + up
+    assert bench.command(22, -1, 0, 0, NAN, *where, amsl_m) == [ACCEPTED]
+    assert bench.command(400, 1) == [ACCEPTED]
+    bench.run(8.0)
+    assert bench.height_m < 0.05
+    bench.run(3.0)
+    assert not bench.armed
+    wanted = ["Armed by external command", *said, "Disarmed by auto preflight disarming"]
+    assert bench.texts() == wanted
+
+
+def test_a_px4_takes_off_to_the_place_given() -> None:
+    bench = Bench()
+    bench.boot()
+    amsl_m = bench.instance.autopilot.firmware.origin[2] + 6.0
+    assert bench.command(22, -1, 0, 0, NAN, *degrees(bench, 10.0, 0.0), amsl_m) == [ACCEPTED]
+    assert bench.command(400, 1) == [ACCEPTED]
+    bench.run(15.0)
+    assert bench.mode == LOITER
+    assert place(bench) == pytest.approx((10.0, 0.0, -6.0), abs=0.8)

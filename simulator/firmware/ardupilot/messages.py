@@ -6,6 +6,8 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
+
 from offboard.model.frames import euler_from_quaternion, rotation_from_quaternion
 from simulator.position_loop import GRAVITY_MPS2
 from simulator.telemetry import View
@@ -91,7 +93,95 @@ def rc_channels(view: View) -> Sequence[Any]:
     return (view.time_ms, len(_STICKS), *_STICKS, *(0,) * (18 - len(_STICKS)), 255)
 
 
+def scaled_imu2(view: View) -> Sequence[Any]:
+    """SCALED_IMU2: as RAW_IMU."""
+    _, *values, _, temperature = raw_imu(view)
+    return (view.time_ms, *values, temperature)
+
+
+def ahrs(_: View) -> Sequence[Any]:
+    """AHRS: no drift, errors as of a good estimate."""
+    return (0.0, 0.0, 0.0, 0.0, 0.0, 0.003, 0.005)
+
+
+def ahrs2(view: View) -> Sequence[Any]:
+    """AHRS2: the estimate once more, in radians and metres above the sea."""
+    nav = view.autopilot.senses.look()
+    north, east, down = nav.position_ned_m
+    euler = euler_from_quaternion(np.array(nav.attitude)).tolist()
+    return (*euler, view.altitude_mm(down) * 1e-3, *view.geodetic(north, east))
+
+
+def meminfo(_: View) -> Sequence[Any]:
+    """MEMINFO: as SITL has it."""
+    return (0, 65535, 524288)
+
+
+def power_status(_: View) -> Sequence[Any]:
+    """POWER_STATUS: mV."""
+    return (5000, 0, 0)
+
+
+def wind(_: View) -> Sequence[Any]:
+    """WIND: what is not estimated without an airspeed is none."""
+    return (-180.0, 0.0, 0.0)
+
+
+def nav_controller_output(view: View) -> Sequence[Any]:
+    """NAV_CONTROLLER_OUTPUT: attitude wanted (deg), and the way left to where it is told to be."""
+    nav, pilot = view.autopilot.senses.look(), view.autopilot.pilot
+    wanted = pilot.demand.attitude or (1.0, 0.0, 0.0, 0.0)
+    roll, pitch, yaw = np.degrees(euler_from_quaternion(np.array(wanted))).tolist()
+    place = pilot.motion.position_ned_m
+    left = [there - here for there, here in zip(place, nav.position_ned_m, strict=True)]
+    north, east, down = (value if math.isfinite(value) else 0.0 for value in left)
+    distance_m = round(min(65535.0, math.hypot(north, east)))
+    bearing_deg = round(math.degrees(math.atan2(east, north))) if distance_m else 0
+    return (roll, pitch, round(yaw), bearing_deg, distance_m, -down, 0.0, 0.0)
+
+
+def position_target_global_int(view: View) -> Sequence[Any]:
+    """POSITION_TARGET_GLOBAL_INT: where it is told to be, above the sea; none is where it is."""
+    pilot, here = view.autopilot.pilot, view.autopilot.senses.look().position_ned_m
+    place = pilot.motion.position_ned_m
+    north, east, down = (p if math.isfinite(p) else h for p, h in zip(place, here, strict=True))
+    amsl_m = view.altitude_mm(down) * 1e-3
+    return (view.time_ms, 0, 65016, *view.geodetic(north, east), amsl_m, *(0.0,) * 8)
+
+
+_NO_MISSION, _NOT_STARTED, _ACTIVE, _PAUSED, _COMPLETE = range(1, 6)  # MISSION_STATE
+
+
+def mission_current(view: View) -> Sequence[Any]:
+    """MISSION_CURRENT: home is no item of the count; before the start it is the current one."""
+    mission = view.autopilot.mission
+    begun = mission.under_way or mission.reached >= 0 or mission.current > mission.first
+    state = _NO_MISSION
+    if mission.flyable:
+        state = _PAUSED if begun else _NOT_STARTED
+        state = _ACTIVE if mission.under_way else state
+        state = _COMPLETE if mission.finished else state
+    number = mission.current if begun else 0
+    return (number, max(0, len(mission.items) - 1), state, 0)
+
+
 MESSAGES: Mapping[str, Callable[[View], Sequence[Any]]] = {
     builder.__name__.upper(): builder
-    for builder in (simstate, sim_state, ekf_status_report, raw_imu, servo_output_raw, rc_channels)
+    for builder in (
+        simstate,
+        sim_state,
+        ekf_status_report,
+        raw_imu,
+        scaled_imu2,
+        servo_output_raw,
+        rc_channels,
+        ahrs,
+        ahrs2,
+        meminfo,
+        power_status,
+        wind,
+        nav_controller_output,
+        position_target_global_int,
+        mission_current,
+    )
 }

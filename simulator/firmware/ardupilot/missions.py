@@ -30,6 +30,7 @@ def _frame_shown(item: MissionItem, _: bool) -> int:
 MISSIONS = MissionRules(
     strict=False,
     home_first=True,
+    guides=True,
     refusal=_refusal,
     texts={
         0: Say(Severity.INFO, "Flight plan received"),

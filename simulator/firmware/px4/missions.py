@@ -45,6 +45,7 @@ def _frame_shown(item: MissionItem, whole: bool) -> int:
 MISSIONS = MissionRules(
     strict=True,
     home_first=False,
+    guides=False,
     refusal=_refusal,
     texts={},
     frame_shown=_frame_shown,

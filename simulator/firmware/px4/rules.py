@@ -122,6 +122,7 @@ RULES = (
     Rule("position found", when=("since position lost",), to="remembered", do=("recover",)),
     Rule("climbed", "AUTO.TAKEOFF", to="AUTO.LOITER"),
     Rule("default height", say=_info("Using default takeoff altitude: {takeoff_m:.1f} m")),
+    Rule("already higher", say=_critical("Already higher than takeoff altitude")),
     Rule(
         "return begun",
         say=_info(
