@@ -190,10 +190,10 @@ class MissionRules:
     """What a firmware takes of lists of items, by MAV_MISSION_TYPE, and how it shows them.
 
     `strict`: they go down in order alone, and are asked for in the kind that came last.
-    `home_first`: the first item of a mission, there or not, is home. `guides`: an item marked current = 2 is where to go now. `refusal`:
-    MAV_MISSION_RESULT and text of an item that is not taken. `texts` follow an upload.
-    `frame_shown`: of an item in whole 1e-7 degrees, or in degrees. `stopping`: types whose items
-    are shown without autocontinue.
+    `home_first`: the first item of a mission, there or not, is home. `guides`: an item marked
+    current = 2 is where to go now. `refusal`: MAV_MISSION_RESULT and text of an item that is not
+    taken. `texts` follow an upload. `frame_shown`: of an item in whole 1e-7 degrees, or in
+    degrees. `stopping`: types whose items are shown without autocontinue.
     """
 
     strict: bool
