@@ -121,11 +121,10 @@ def test_callers_may_hand_in_any_array() -> None:
         Swarm(-each, each, SwarmSettings(inertia=1), RandomLanes(4), (each,))
         for each in (np.ones(4), strided)
     ]
-    rising = np.arange(80.0)[::2]
-    for _ in range(3):
+    for costs in np.random.default_rng(4).normal(size=(3, 80)):
         assert swarms[0].ask().tolist() == swarms[1].ask().tolist()
-        swarms[0].tell(rising.copy())
-        swarms[1].tell(rising)
+        swarms[0].tell(costs[::2].copy())
+        swarms[1].tell(costs[::2])
     assert 0 < swarms[0].spread == swarms[1].spread
 
 
