@@ -1,8 +1,8 @@
-"""The vehicle in the air and on the ground: rotors, battery, contact, round the rigid body.
+"""The vehicle in the air and on the ground: rotors, contact, round the rigid body.
 
 The rigid body itself (mass, drag relative to the air) is `offboard.model.rigid_body`; here is
 what the controller's model does not have: rotor lag, loss of authority without thrust, ground,
-ground effect, a battery. Compiled; knows no autopilot, no estimate and no randomness.
+ground effect, the charge drawn. Compiled; knows no autopilot, no estimate and no randomness.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from offboard.model.kernel import kernel
 from offboard.model.rigid_body import pack, rk4_into
-from offboard.model.vehicle import Parameters, Vehicle
+from offboard.model.vehicle import Vehicle
+from simulator.battery import Battery, Pack
 
 Array = NDArray[np.float64]
 
@@ -36,27 +36,6 @@ _ROTOR_HEIGHT_M = 0.10
 _STIFFNESS_LIMIT = 0.5
 
 
-class Battery(Parameters):
-    """A lithium pack: open-circuit voltage linear in what remains, and on when nothing does;
-    sagging with the current."""
-
-    cells: int = Field(default=4, ge=1, le=16)
-    capacity_ah: float = Field(default=5.0, gt=0.01, le=200)
-    hover_current_a: float = Field(default=12.0, ge=0, le=500)
-    resistance_ohm: float = Field(default=0.02, ge=0, le=1)
-    remaining: float = Field(default=1.0, ge=0, le=1)  # at boot
-
-
-@dataclass(frozen=True, slots=True)
-class BatteryState:
-    """What a battery monitor would show; remaining 0..1."""
-
-    voltage_v: float
-    current_a: float
-    remaining: float
-    used_mah: float  # since boot
-
-
 @dataclass(frozen=True, slots=True)
 class Airframe:
     """Packed constants of the compiled step."""
@@ -65,16 +44,7 @@ class Airframe:
     rotor: Array  # thrust at full throttle N, share left after a step of lag, thrust of full
     #               authority, ground effect 0/1, hover thrust, hover current A
     substeps: int
-    battery: Battery
-    hover_thrust: float
-
-    def battery_state(self, drawn_as: float, thrust: float) -> BatteryState:
-        """Battery after the charge drawn so far, at this normalised thrust."""
-        battery = self.battery
-        left = battery.remaining - drawn_as / (3600.0 * battery.capacity_ah)
-        current = battery.hover_current_a * (thrust / self.hover_thrust) ** 1.5
-        voltage = battery.cells * (3.5 + 0.7 * left) - battery.resistance_ohm * current
-        return BatteryState(max(voltage, 0.0), current, max(left, 0.0), drawn_as / 3.6)
+    pack: Pack
 
 
 def build_airframe(
@@ -103,7 +73,7 @@ def build_airframe(
     body[0] *= mass_scale
     stiffness = max(body[6:9].max() / body[0], (body[9:12] / body[2:5]).max())
     substeps = max(1, math.ceil(step_s * stiffness / _STIFFNESS_LIMIT))
-    return Airframe(body, rotor, substeps, battery, vehicle.hover_thrust)
+    return Airframe(body, rotor, substeps, Pack(battery, vehicle.hover_thrust))
 
 
 @kernel

@@ -15,7 +15,7 @@ from simulator.codec import id_of, name_of
 from simulator.commander import Wish
 from simulator.firmware.base import Behaviour, ModeRequest, Result, Say, Severity, Triple
 from simulator.geodesy import down_m, to_metres
-from simulator.telemetry import View
+from simulator.view import View
 
 _CHANGE_MODE = 1.0  # MAV_DO_REPOSITION_FLAGS
 _MISSION_PLANNER = 190  # MAV_COMPONENT, as ground stations call themselves

@@ -8,7 +8,7 @@ from __future__ import annotations
 from pydantic import Field
 
 from offboard.model.vehicle import Parameters, Triple
-from simulator.airframe import Battery
+from simulator.battery import Battery
 from simulator.sensors import EstimatorName, WhiteNoise
 from simulator.wind import Gusts
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 EARTH_RADIUS_M = 6_371_000.0
+DEGREES_PER_M = math.degrees(1.0 / EARTH_RADIUS_M)  # northwards
 Origin = tuple[float, float, float]  # latitude, longitude deg, AMSL m
 # MAV_FRAME: height above sea level, above home, above the ground
 GLOBAL_FRAMES, RELATIVE_FRAMES, TERRAIN_FRAMES = map(frozenset, ((0, 5), (3, 6), (10, 11)))
@@ -16,6 +17,11 @@ def to_metres(origin: Origin, latitude_deg: float, longitude_deg: float) -> tupl
     north_m = math.radians(latitude_deg - latitude) * EARTH_RADIUS_M
     shrink = math.cos(math.radians(latitude))
     return north_m, math.radians(longitude_deg - longitude) * EARTH_RADIUS_M * shrink
+
+
+def east_degrees_per_m(origin: Origin) -> float:
+    """Of longitude, near the origin."""
+    return DEGREES_PER_M / math.cos(math.radians(origin[0]))
 
 
 def down_m(height_m: float, frame: int, origin: Origin, home_down_m: float) -> float:

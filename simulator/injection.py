@@ -18,7 +18,7 @@ from simulator.faults import Direction, Fault, Moment, Refusable
 from simulator.firmware.base import Behaviour, Say, Severity
 from simulator.impairment import Channel, Path
 from simulator.steps import STEP_S
-from simulator.telemetry import Stuck, View
+from simulator.view import Stuck, View
 
 _REFUSED_EVENTS = {
     Refusable.ARM: ("arm", "force arm"),

@@ -22,7 +22,8 @@ from simulator.server import Server
 from simulator.steps import STEP_S, STEP_US
 from simulator.stretch import LONGEST, Stretch
 from simulator.strict import Strict
-from simulator.telemetry import View
+from simulator.telemetry import builders
+from simulator.view import View
 
 STEP_MS = STEP_US // 1000
 VIRTUAL_EPOCH_US = 1_767_225_600_000_000  # 2026-01-01, where virtual time begins
@@ -57,7 +58,7 @@ class Instance:
             firmware, Plant(vehicle, conditions, seed), boot_scale=conditions.boot_scale
         )
         self.autopilot.parameters.set(firmware.system_parameter, system)
-        self.view = View(self.autopilot, system, epoch_us)
+        self.view = View(self.autopilot, system, epoch_us, builders(firmware))
         self._strict = Strict(system, self.autopilot.parameters) if strict else None
         self.companion = Server(
             self.view, firmware.companion_rates_hz, barrier=lockstep, strict=self._strict

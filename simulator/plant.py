@@ -12,114 +12,30 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.model.kernel import address, entry, kernel
-from offboard.model.rigid_body import RK4_SCRATCH_ROWS
+from offboard.model.kernel import address
 from offboard.model.state import QUATERNION
 from offboard.model.vehicle import Triple, Vehicle
-from simulator.airframe import (
-    ACCELERATION,
-    CHARGE,
-    CONTACT,
-    ROTOR_SIZE,
-    THRUST,
-    BatteryState,
-    advance_airframe,
-    build_airframe,
-)
-from simulator.attitude import (
-    ROW_WIDTH,
-    Demand,
-    angular_acceleration,
-    build_loop,
-    delayed_thrust,
-    encode,
-)
+from simulator.airframe import ACCELERATION, CHARGE, CONTACT, THRUST, Airframe, build_airframe
+from simulator.attitude import Demand, build_loop, encode
+from simulator.battery import BatteryState
 from simulator.conditions import Conditions
-from simulator.noise import LinearProcess, advance_block, fill_normals, seed_word
+from simulator.dynamics import RECORD, advance_steps, draw_gusts, receive_fix, report_state
+from simulator.noise import LinearProcess, seed_word
 from simulator.sensors import (
     ATTITUDE,
-    EAST,
-    ERROR_BLOCKS,
-    ERROR_COUNT,
-    NORTH,
     POSITION,
     RATES,
-    REPORT_WIDTH,
-    STANDING_NOISE,
     VELOCITY,
-    WHITE_COUNT,
-    YAW,
     error_model,
     error_process,
-    report,
-    turn_estimate,
     white_sds,
 )
 from simulator.steps import STEP_S
-from simulator.wind import GUST_COUNT, dryden, wind_axes
+from simulator.wind import dryden, wind_axes
 
 Array = NDArray[np.float64]
 
 _MASS, _THRUST_MAX = 0, 0  # places in the constants of body and rotors
-
-# As typed numbers: compiled code is made once more for each plain constant that is handed on
-_ERROR_LANE, _GUST_LANE, _WHITE_LANE, _RECEIVER_LANE = (np.uint64(lane) for lane in range(4))
-_GUST_BLOCKS = ((0, GUST_COUNT),)
-
-# Rows of the demand history, a power of two: more steps than any vehicle's longest delay
-_HISTORY_ROWS = 128
-
-RECORD = np.dtype(
-    [
-        ("step", "i8"),
-        ("seed", "u8"),
-        ("motors_on", "i8"),
-        ("substeps", "i8"),
-        ("gusty", "i8"),
-        ("noisy", "i8"),
-        # the truth
-        ("body", "f8", QUATERNION.size),
-        ("rotor", "f8", ROTOR_SIZE),
-        ("wind", "f8", 3),
-        ("gust", "f8", GUST_COUNT),
-        # the estimator
-        ("error", "f8", ERROR_COUNT),
-        ("offset", "f8", 3),
-        ("lag_s", "f8"),
-        ("white_sds", "f8", WHITE_COUNT),
-        # the satellite receiver: position NED and velocity NE
-        ("fix_sds", "f8", 5),
-        ("fix_offset", "f8", 3),
-        # the attitude loop
-        ("row", "f8", ROW_WIDTH),
-        ("history", "f8", (_HISTORY_ROWS, ROW_WIDTH)),
-        ("delays", "i8", 5),
-        ("gains", "f8", (3, 3)),
-        # constants
-        ("body_constants", "f8", 12),
-        ("rotor_constants", "f8", 6),
-        ("air", "f8", 7),
-        ("error_transition", "f8", (ERROR_COUNT, ERROR_COUNT)),
-        ("error_scale", "f8", (ERROR_COUNT, ERROR_COUNT)),
-        ("gust_transition", "f8", (GUST_COUNT, GUST_COUNT)),
-        ("gust_scale", "f8", (GUST_COUNT, GUST_COUNT)),
-        # scratch
-        ("normals", "f8", WHITE_COUNT),
-        ("gust_normals", "f8", GUST_COUNT),
-        ("work", "f8", ERROR_COUNT),
-        ("estimated", "f8", 4),
-        ("turn", "f8", 3),
-        ("turn_error", "f8", 3),
-        ("inputs", "f8", 4),
-        ("slopes", "f8", (RK4_SCRATCH_ROWS, QUATERNION.size)),
-        # what `report_state` says
-        ("report", "f8", REPORT_WIDTH),
-        # what `receive_fix` says
-        ("fix", "f8", 5),
-    ],
-    align=True,
-)
-"""All that compiled code knows of one vehicle below its autopilot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,7 +85,7 @@ class Plant:
         self.address = address(self.record)
         self._step = 0
         self._due_s = 0.0
-        self._airframe = build_airframe(
+        airframe = build_airframe(
             vehicle,
             STEP_S,
             thrust_scale=conditions.thrust_scale,
@@ -177,38 +93,16 @@ class Plant:
             ground_effect=conditions.ground_effect,
             battery=conditions.battery,
         )
-        model = error_model(conditions.estimator, conditions.white_noise)
-        errors = error_process(model, STEP_S)
+        self.pack = airframe.pack
         gusts = dryden(conditions.gusts, STEP_S)
-        loop = build_loop(vehicle, STEP_S)
-        weakening = conditions.weakening
-        air = (
-            *conditions.wind_ned_mps,
-            *wind_axes(conditions.wind_ned_mps),
-            weakening.at_s if weakening else np.inf,
-            weakening.thrust_scale if weakening else 1.0,
-        )
         constants = {
             "seed": seed_word(seed),
-            "substeps": self._airframe.substeps,
-            "noisy": np.any(errors.scale != 0.0),
-            "lag_s": model.lag_s,
-            "white_sds": white_sds(model),
-            "fix_sds": (*model.receiver.position_m, *model.receiver.velocity_mps),
-            "delays": loop.delays,
-            "gains": loop.gains,
-            "body_constants": self._airframe.body,
-            "rotor_constants": self._airframe.rotor,
-            "air": air,
-            "error_transition": errors.transition,
-            "error_scale": errors.scale,
-            "gust_transition": gusts.transition,
-            "gust_scale": gusts.scale,
+            **_of_vehicle(vehicle, airframe),
+            **_of_estimator(conditions),
+            **_of_air(conditions, gusts),
         }
         for name, value in constants.items():
             self.record[name] = value
-        *_, current_a, hover_thrust = self.battery_constants
-        self._drain_max_a = current_a * hover_thrust**-1.5
         self._start(conditions.wind_ned_mps, gusts)
 
     def _start(self, wind_ned_mps: Triple, gusts: LinearProcess) -> None:
@@ -223,7 +117,7 @@ class Plant:
         self._body[0] = 1.0
         self._rotor[CONTACT] = 1.0
         self._wind[:] = wind_ned_mps
-        _draw_gusts.call(self.address)
+        draw_gusts.call(self.address)
         record["gust"][0] = gusts.stationary_scale @ record["gust_normals"][0]
         record["gusty"] = np.any(record["gust"] != 0.0)
 
@@ -272,9 +166,7 @@ class Plant:
 
     def set_battery(self, remaining: float) -> None:
         """From now on the battery has this share of its capacity, 0 .. 1."""
-        battery = self._airframe.battery
-        drawn = battery.remaining - remaining
-        self._rotor[CHARGE] = 3600.0 * battery.capacity_ah * drawn
+        self._rotor[CHARGE] = self.pack.drawn_as(remaining)
 
     @property
     def truth(self) -> Truth:
@@ -289,28 +181,13 @@ class Plant:
             on_ground=bool(self._rotor[CONTACT]),
             thrust=float(self._rotor[THRUST]),
             wind_ned_mps=self._wind.copy(),
-            battery=self._battery(0.0, float(self._rotor[THRUST])),
-        )
-
-    @property
-    def battery_constants(self) -> tuple[float, ...]:
-        """Cells, capacity A s, share at boot, resistance ohm; current A and thrust in hover."""
-        battery = self._airframe.battery
-        return (
-            battery.cells,
-            3600.0 * battery.capacity_ah,
-            battery.remaining,
-            battery.resistance_ohm,
-            battery.hover_current_a,
-            self._airframe.hover_thrust,
+            battery=self.pack.state(float(self._rotor[CHARGE]), float(self._rotor[THRUST])),
         )
 
     def battery_at_worst(self, after_s: float) -> BatteryState:
         """What the battery may be by then: at full thrust from now on."""
-        return self._battery(self._drain_max_a * after_s, 1.0)
-
-    def _battery(self, more_as: float, thrust: float) -> BatteryState:
-        return self._airframe.battery_state(float(self._rotor[CHARGE]) + more_as, thrust)
+        more_as = self.pack.drain_max_a * after_s
+        return self.pack.state(float(self._rotor[CHARGE]) + more_as, 1.0)
 
     @property
     def fix(self) -> Fix:
@@ -359,123 +236,40 @@ class Plant:
         return seen
 
 
-@entry(RECORD)
-def _draw_gusts(plant: Any) -> int:
-    fill_normals(plant.seed, _GUST_LANE, np.int64(-1), plant.gust_normals[:])
-    return 0
+def _of_vehicle(vehicle: Vehicle, airframe: Airframe) -> dict[str, Any]:
+    """Constants of airframe and attitude loop, by their names in the record."""
+    loop = build_loop(vehicle, STEP_S)
+    return {
+        "substeps": airframe.substeps,
+        "body_constants": airframe.body,
+        "rotor_constants": airframe.rotor,
+        "delays": loop.delays,
+        "gains": loop.gains,
+    }
 
 
-@entry(RECORD)
-def report_state(plant: Any) -> int:
-    """Fill in the report of this state."""
-    report(
-        plant.body,
-        plant.rotor,
-        plant.error,
-        plant.offset,
-        plant.lag_s,
-        plant.white_sds,
-        1.0 if plant.motors_on else STANDING_NOISE,
-        plant.seed,
-        _WHITE_LANE,
-        plant.step,
-        plant.normals,
-        plant.report,
-    )
-    return 0
+def _of_estimator(conditions: Conditions) -> dict[str, Any]:
+    model = error_model(conditions.estimator, conditions.white_noise)
+    errors = error_process(model, STEP_S)
+    return {
+        "noisy": np.any(errors.scale != 0.0),
+        "lag_s": model.lag_s,
+        "white_sds": white_sds(model),
+        "fix_sds": (*model.receiver.position_m, *model.receiver.velocity_mps),
+        "error_transition": errors.transition,
+        "error_scale": errors.scale,
+    }
 
 
-@entry(RECORD)
-def receive_fix(plant: Any) -> int:
-    """Fill in the satellite fix of this state."""
-    fill_normals(plant.seed, _RECEIVER_LANE, plant.step, plant.fix[:])
-    for i in range(5):
-        plant.fix[i] *= plant.fix_sds[i]
-    for i in range(3):
-        plant.fix[i] += plant.body[10 + i] + plant.fix_offset[i]
-    for i in range(2):
-        plant.fix[3 + i] += plant.body[7 + i]
-    return 0
-
-
-@entry(int, RECORD)
-def advance_steps(count: int, plant: Any) -> int:
-    """`count` steps in place; the steps done, which are fewer if the ground is touched or left.
-
-    Per step: demand into history, air, loop on the estimate, airframe, estimator errors.
-    """
-    contact = plant.rotor[CONTACT]
-    noise_gain = 1.0 if plant.motors_on else STANDING_NOISE
-    error, turn_error = plant.error, plant.turn_error
-    first = plant.step
-    for step in range(first, first + count):
-        for i in range(ROW_WIDTH):
-            plant.history[step % _HISTORY_ROWS, i] = plant.row[i]
-        _move_air(plant, step)
-        turn_error[0], turn_error[1] = -error[EAST + 2], error[NORTH + 2]
-        turn_error[2] = error[YAW]
-        turn_estimate(plant.body, turn_error[:], plant.estimated[:])
-        angular_acceleration(
-            plant.estimated,
-            plant.body,
-            plant.history,
-            step,
-            plant.delays,
-            plant.gains,
-            turn_error,
-            plant.turn,
-        )
-        advance_airframe(
-            plant.body,
-            plant.rotor,
-            delayed_thrust(plant.history, step, plant.delays) if plant.motors_on else 0.0,
-            plant.turn,
-            plant.wind,
-            plant.body_constants,
-            plant.rotor_constants,
-            plant.air[6] if step * STEP_S >= plant.air[5] else 1.0,
-            STEP_S,
-            plant.substeps,
-            plant.inputs,
-            plant.slopes,
-        )
-        if plant.noisy:
-            fill_normals(plant.seed, _ERROR_LANE, step, plant.normals[:])
-            for start, end in ERROR_BLOCKS:
-                advance_block(
-                    plant.error_transition[:],
-                    plant.error_scale[:],
-                    start,
-                    end,
-                    noise_gain,
-                    plant.normals[:],
-                    error[:],
-                    plant.work[:],
-                )
-        plant.step = step + 1
-        if plant.rotor[CONTACT] != contact:
-            done: int = step + 1 - first
-            return done
-    return count
-
-
-@kernel
-def _move_air(plant: Any, step: int) -> None:
-    """Steady wind and gusts, along and across it."""
-    gust, air, wind = plant.gust, plant.air, plant.wind
-    if plant.gusty:
-        fill_normals(plant.seed, _GUST_LANE, step, plant.gust_normals[:])
-        for start, end in _GUST_BLOCKS:
-            advance_block(
-                plant.gust_transition[:],
-                plant.gust_scale[:],
-                start,
-                end,
-                1.0,
-                plant.gust_normals[:],
-                gust[:],
-                plant.work[:],
-            )
-    wind[0] = air[0] + air[3] * gust[0] - air[4] * gust[1]
-    wind[1] = air[1] + air[4] * gust[0] + air[3] * gust[1]
-    wind[2] = air[2] + gust[3]
+def _of_air(conditions: Conditions, gusts: LinearProcess) -> dict[str, Any]:
+    weakening = conditions.weakening
+    return {
+        "air": (
+            *conditions.wind_ned_mps,
+            *wind_axes(conditions.wind_ned_mps),
+            weakening.at_s if weakening else np.inf,
+            weakening.thrust_scale if weakening else 1.0,
+        ),
+        "gust_transition": gusts.transition,
+        "gust_scale": gusts.scale,
+    }

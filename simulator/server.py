@@ -19,8 +19,10 @@ from simulator.mission_transfer import Transfer
 from simulator.setpoints import ATTITUDE, GLOBAL, LOCAL
 from simulator.steps import STEP_US
 from simulator.strict import Strict
-from simulator.telemetry import LEAST_INTERVAL_US, MAV_COMP_ID_AUTOPILOT, View
+from simulator.telemetry import LEAST_INTERVAL_US
+from simulator.view import View
 
+MAV_COMP_ID_AUTOPILOT = 1
 TEXT_KEPT_US = 5_000_000
 TEXT_LENGTH = 50
 DATAGRAM_MAX = 1400

@@ -13,15 +13,17 @@ from typing import Any
 import numpy as np
 
 from offboard.model.kernel import address, entry, kernel
-from simulator import frame_writer, plant, position_loop
+from simulator import dynamics, payloads, position_loop, seen
 from simulator.airframe import CONTACT
 from simulator.attitude import encode_attitude
+from simulator.dynamics import advance_steps, report_state
 from simulator.frame_writer import FRAME_MAX, KINDS, write_frame
-from simulator.plant import advance_steps, report_state
 from simulator.position_loop import step_loop
+from simulator.seen import Seen
 from simulator.server import Server, Stream
 from simulator.steps import LOOP_STEPS, STEP_US
-from simulator.telemetry import ON_POSITION_GRID, View
+from simulator.telemetry import BUILDERS, ON_POSITION_GRID
+from simulator.view import View
 
 LONGEST = 25  # steps of one stretch
 NO_LOOP = 1 << 62  # the step at which a position loop runs that does not
@@ -51,14 +53,14 @@ class Stretch:
     """The streams of a vehicle's two links, kept for compiled code."""
 
     def __init__(self, view: View, links: tuple[Server, Server]) -> None:
-        self._view = view
+        self._view, self._seen = view, Seen(view)
         self._links = links
         self._streams: list[tuple[str, Stream]] = []
         self._record = np.zeros(1, LINKS)
         self._rows, self._gaps = self._record["rows"][0], self._record["gaps"][0]
         self._tally, self._out = self._record["tally"][0], self._record["out"][0]
-        self._payload = np.zeros(1, frame_writer.PAYLOAD)
-        self._fixed = (address(view.record), address(self._record), address(self._payload))
+        self._payload = np.zeros(1, payloads.PAYLOAD)
+        self._fixed = (self._seen.address, address(self._record), address(self._payload))
         self._next_step = 0
         self._odd = False  # something is silent, stuck or withheld now
 
@@ -68,7 +70,7 @@ class Stretch:
         if self._odd or view.silent or view.stuck or self._rescheduled:
             self._schedule()
         if view.autopilot.senses.steps >= self._next_step:
-            view.note()
+            self._seen.note()
             self._fly(0)
 
     @property
@@ -83,7 +85,7 @@ class Stretch:
         pilot, senses = autopilot.pilot, autopilot.senses
         self._record["loop_step"] = pilot.next_loop_step(senses.steps, senses.look, NO_LOOP)
         autopilot.plant.obey(pilot.demand)
-        self._view.note()
+        self._seen.note()
 
     def fly(self, count: int) -> int:
         """Take the vehicle at most `count` steps on (no more than LONGEST) and queue what is due.
@@ -148,7 +150,7 @@ class Stretch:
                 kind = _SLOW
                 if name in view.silent or name in withheld:
                     kind = _SILENT
-                elif name not in view.stuck and view.is_common(name) and name in KINDS:
+                elif name not in view.stuck and _is_common(view, name):
                     kind = KINDS.index(name)
                 grid = firmware.position_grid_steps if name in ON_POSITION_GRID else 1
                 rows.append((number, kind, stream.interval_us, stream.due_us, grid))
@@ -166,21 +168,26 @@ class Stretch:
         self._streams.clear()
 
 
+def _is_common(view: View, name: str) -> bool:
+    """Compiled code can write it, and it is not one that the firmware has in a way of its own."""
+    return name in KINDS and view.builders[name] is BUILDERS[name]
+
+
 @entry(
     int,
     int,
-    plant.RECORD,
+    dynamics.RECORD,
     position_loop.RECORD,
-    frame_writer.RECORD,
+    seen.RECORD,
     LINKS,
-    frame_writer.PAYLOAD,
+    payloads.PAYLOAD,
 )
 def _fly(
     count: int,
     step: int,
     plant: Any,
     loop: Any,
-    seen: Any,
+    shown: Any,
     links: Any,
     scratch: Any,
 ) -> int:
@@ -197,7 +204,7 @@ def _fly(
                 if step + done >= links.loop_step:
                     if not reported:
                         report_state(plant)
-                    _hold(plant, loop, seen)
+                    _hold(plant, loop, shown)
                     links.loop_step = step + done + LOOP_STEPS
                 done += advance_steps(min(goal, links.loop_step - step) - done, plant)
                 reported = False
@@ -205,7 +212,7 @@ def _fly(
             if not reported:
                 report_state(plant)
             reported = True
-            _speak(step + done, plant, seen, links, scratch)
+            _speak(step + done, plant, shown, links, scratch)
         full = max(tally[0], tally[1]) > _OUT_BYTES - _ROWS_MAX * FRAME_MAX
         if done >= count or full or tally[_GAP_COUNT] or plant.rotor[CONTACT] != contact:
             tally[_NEXT_STEP] = _next_step(links, step + done)
@@ -214,15 +221,15 @@ def _fly(
 
 
 @kernel
-def _hold(plant: Any, loop: Any, seen: Any) -> None:
+def _hold(plant: Any, loop: Any, shown: Any) -> None:
     """Run the position loop on the estimate and demand what it gives."""
     for i in range(6):
         loop.estimate[i] = plant.report[i]
     step_loop(loop)
     encode_attitude(loop.attitude, loop.thrust, plant.row)
     for i in range(4):
-        seen.attitude[i] = loop.attitude[i]
-    seen.thrust = seen.throttle = loop.thrust
+        shown.attitude[i] = loop.attitude[i]
+    shown.thrust = shown.throttle = loop.thrust
 
 
 @kernel
@@ -237,10 +244,10 @@ def _next_step(links: Any, now: int) -> int:
 
 
 @kernel
-def _speak(now: int, plant: Any, seen: Any, links: Any, scratch: Any) -> None:
+def _speak(now: int, plant: Any, shown: Any, links: Any, scratch: Any) -> None:
     """Write what is due now."""
     tally = links.tally
-    time_us = max(0, now * STEP_US + seen.clock_offset_us)
+    time_us = max(0, now * STEP_US + shown.clock_offset_us)
     for i in range(links.count):
         row = links.rows[i]
         if row[_DUE_US] > now * STEP_US or now % row[_GRID]:
@@ -256,6 +263,6 @@ def _speak(now: int, plant: Any, seen: Any, links: Any, scratch: Any) -> None:
             tally[_GAP_COUNT] += 1
         else:
             tally[link] = write_frame(
-                kind, plant, seen, time_us, sequence, scratch, links.out[link], tally[link]
+                kind, plant, shown, time_us, sequence, scratch, links.out[link], tally[link]
             )
         tally[_SEQUENCES + link] = (sequence + 1) & 0xFF

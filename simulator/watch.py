@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from simulator.airframe import BatteryState
+from simulator.battery import BatteryState
 from simulator.firmware.base import Firmware
 from simulator.parameters import ParameterTable
 

@@ -9,8 +9,8 @@ import pytest
 from sim_hover import attitude, hovering, load, response
 
 from offboard.model.frames import euler_from_quaternion, thrust_direction_from_quaternion
-from simulator.airframe import Battery
 from simulator.attitude import Demand
+from simulator.battery import Battery
 from simulator.conditions import Conditions
 from simulator.plant import Plant
 from simulator.steps import STEP_S

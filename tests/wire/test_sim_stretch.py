@@ -12,8 +12,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import OFFBOARD, TAKEOFF
 
 from simulator import config
-from simulator.airframe import Battery
 from simulator.attitude import Demand
+from simulator.battery import Battery
 from simulator.codec import Decoder, frame, layout
 from simulator.conditions import Conditions
 from simulator.firmware.ardupilot import ARDUPILOT

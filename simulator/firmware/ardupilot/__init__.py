@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from simulator.airframe import BatteryState
+from simulator.battery import BatteryState
 from simulator.firmware.ardupilot.messages import MESSAGES
 from simulator.firmware.ardupilot.missions import MISSIONS
 from simulator.firmware.ardupilot.modes import (

@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from offboard.model.frames import euler_from_quaternion, rotation_from_quaternion
+from simulator.fields import fit
 from simulator.position_loop import GRAVITY_MPS2
-from simulator.telemetry import View
+from simulator.view import View
 
 # EKF_STATUS_FLAGS from a boot event on
 _EKF_FLAGS = (("position", 831), ("attitude", 167), ("aligning", 0))
@@ -73,13 +74,9 @@ def ekf_status_report(view: View) -> Sequence[Any]:
 
 def raw_imu(view: View) -> Sequence[Any]:
     """Milli-g, millirad/s, milligauss; 25 degrees."""
-    force = (_int16(value / GRAVITY_MPS2 * 1e3) for value in _specific_force(view))
-    rates = (_int16(value * 1e3) for value in view.autopilot.senses.look().rates_frd_radps)
+    force = (fit(value / GRAVITY_MPS2 * 1e3, 16) for value in _specific_force(view))
+    rates = (fit(value * 1e3, 16) for value in view.autopilot.senses.look().rates_frd_radps)
     return (view.time_us, *force, *rates, 224, 80, -528, 0, 2500)
-
-
-def _int16(value: float) -> int:
-    return round(min(32767.0, max(-32768.0, value))) if math.isfinite(value) else 0
 
 
 def servo_output_raw(view: View) -> Sequence[Any]:

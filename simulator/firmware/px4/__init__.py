@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from simulator.airframe import BatteryState
+from simulator.battery import BatteryState
 from simulator.firmware.base import (
     Firmware,
     Heads,
