@@ -1,7 +1,7 @@
 """MAVLink commands (MAV_CMD): what each does, and how it is acknowledged.
 
 A command's unused parameters may be NaN or 0. Every command to us is answered, unknown ones with
-UNSUPPORTED. Knows one link (`Link`) and the autopilot behind it.
+UNSUPPORTED. Knows one link's outbox and schedule, and the autopilot behind it.
 """
 
 from __future__ import annotations
@@ -9,13 +9,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
+from simulator.autopilot import Autopilot
 from simulator.codec import id_of, name_of
 from simulator.commander import Wish
 from simulator.firmware.base import Behaviour, ModeRequest, Result, Say, Severity, Triple
 from simulator.geodesy import down_m, to_metres
-from simulator.view import View
+from simulator.outbox import Outbox
+from simulator.schedule import Schedule
 
 _CHANGE_MODE = 1.0  # MAV_DO_REPOSITION_FLAGS
 _MISSION_PLANNER = 190  # MAV_COMPONENT, as ground stations call themselves
@@ -33,26 +34,20 @@ class Command:
     frame: int | None = None  # MAV_FRAME of the place, if it tells
 
 
-class Link(Protocol):
-    """What a command needs of the link it came by."""
-
-    view: View
-
-    def send(self, name: str, *values: object) -> None: ...
-    def send_now(self, name: str) -> None: ...
-    def set_interval(self, name: str, interval_us: float) -> bool: ...
-    def interval_us(self, name: str) -> int: ...
-
-
 @dataclass(slots=True)
 class Commands:
     """What a client commands on one link, carried out and answered."""
 
-    link: Link
+    outbox: Outbox
+    schedule: Schedule
+
+    @property
+    def _autopilot(self) -> Autopilot:
+        return self.outbox.view.autopilot
 
     def run(self, command: Command) -> None:
         """Carry out and acknowledge, on the same link."""
-        answers = self.link.view.autopilot.firmware.command_answers
+        answers = self._autopilot.firmware.command_answers
         result: Result | None
         if command.number in answers:
             result = answers[command.number]
@@ -65,26 +60,26 @@ class Commands:
 
     def set_mode(self, base_mode: int, custom_mode: int, sender: tuple[int, int]) -> None:
         """SET_MODE, the message that came before the command."""
-        firmware = self.link.view.autopilot.firmware
+        firmware = self._autopilot.firmware
         request = firmware.set_mode(base_mode, custom_mode)
         result = self._request(request, sender[1] == _MISSION_PLANNER)
         if firmware.set_mode_acked_as is not None:
             self._acknowledge(Command(firmware.set_mode_acked_as, (), *sender), result)
 
     def _acknowledge(self, command: Command, result: Result) -> None:
-        self.link.send(
+        self.outbox.send(
             "COMMAND_ACK", command.number, int(result), 0, 0, command.system, command.component
         )
 
     def _set_mode(self, command: Command) -> Result:
-        autopilot = self.link.view.autopilot
+        autopilot = self._autopilot
         if autopilot.firmware.mode_acked_twice:
             self._acknowledge(command, Result.ACCEPTED)
         by_planner = command.component == _MISSION_PLANNER
         return self._request(autopilot.firmware.command_mode(command.params), by_planner)
 
     def _request(self, request: ModeRequest, by_planner: bool) -> Result:
-        autopilot = self.link.view.autopilot
+        autopilot = self._autopilot
         if request.mode is None:
             if request.say is not None:
                 autopilot.commander.texts.append(request.say)
@@ -92,7 +87,7 @@ class Commands:
         return autopilot.happen("mode", Wish(request.mode, by_planner=by_planner))
 
     def _arm_disarm(self, command: Command) -> Result | None:
-        autopilot = self.link.view.autopilot
+        autopilot = self._autopilot
         wish = autopilot.firmware.arm_wish(command.params[0])
         if not wish.event:
             autopilot.commander.texts += () if wish.say is None else (wish.say,)
@@ -102,7 +97,7 @@ class Commands:
 
     def _takeoff(self, command: Command) -> Result:
         asked_m = command.params[6]
-        autopilot = self.link.view.autopilot
+        autopilot = self._autopilot
         home_down_m = autopilot.navigator.home_ned_m[2]
         if autopilot.firmware.takeoff_above_home:
             down_m = home_down_m - asked_m
@@ -114,20 +109,20 @@ class Commands:
         return autopilot.happen("takeoff", Wish(takeoff_ned_m=(north, east, down)))
 
     def _land(self, _: Command) -> Result:
-        return self.link.view.autopilot.happen("land")
+        return self._autopilot.happen("land")
 
     def _return(self, _: Command) -> Result:
-        return self.link.view.autopilot.happen("return")
+        return self._autopilot.happen("return")
 
     def _loiter(self, _: Command) -> Result:
-        autopilot = self.link.view.autopilot
+        autopilot = self._autopilot
         known = autopilot.commander.knows("loiter")
         return autopilot.happen("loiter") if known else Result.UNSUPPORTED
 
     def _set_home(self, command: Command) -> Result:
         """param1 = 1: here; else a place in degrees and metres above the sea."""
         latitude, longitude, height_m = command.params[4:7]
-        autopilot = self.link.view.autopilot
+        autopilot = self._autopilot
         if command.params[0] == 1.0:
             autopilot.navigator.home_ned_m = autopilot.senses.look().position_ned_m
         elif math.isfinite(latitude + longitude + height_m):
@@ -142,7 +137,7 @@ class Commands:
         is."""
         if command.params[1] != _CHANGE_MODE:
             return Result.UNSUPPORTED
-        autopilot = self.link.view.autopilot
+        autopilot = self._autopilot
         yaw_rad, latitude, longitude, height_m = command.params[3:7]
         strictly = autopilot.firmware.repositions_strictly
         speed_mps = math.inf if strictly or not command.params[0] > 0.0 else command.params[0]
@@ -163,7 +158,7 @@ class Commands:
 
     def go_to(self, place: tuple[float, float, float], frame: int) -> bool:
         """A place in degrees and metres of this MAV_FRAME, for a vehicle that obeys setpoints."""
-        autopilot = self.link.view.autopilot
+        autopilot = self._autopilot
         obeys = autopilot.commander.mode.behaviour is Behaviour.SETPOINT
         if obeys and autopilot.commander.armed:
             autopilot.navigator.go_to(self._place(*place, frame), math.nan)
@@ -172,7 +167,7 @@ class Commands:
     def _place(self, latitude: float, longitude: float, height_m: float, frame: int) -> Triple:
         """NED, of a place in degrees and a height of this MAV_FRAME; where it is in what of it
         is not finite."""
-        autopilot = self.link.view.autopilot
+        autopilot = self._autopilot
         origin, home_down_m = autopilot.firmware.origin, autopilot.navigator.home_ned_m[2]
         here = autopilot.senses.look().position_ned_m
         north, east = to_metres(origin, latitude, longitude)
@@ -184,7 +179,7 @@ class Commands:
     def _change_speed(self, command: Command) -> Result:
         """Of automatic flight across the ground, until another mode; none is its own again."""
         kind, speed_mps = command.params[:2]
-        autopilot = self.link.view.autopilot
+        autopilot = self._autopilot
         if speed_mps > 0.0 and kind in _VERTICAL_SPEEDS:
             return Result.ACCEPTED
         known = 0.0 < speed_mps < math.inf
@@ -194,7 +189,7 @@ class Commands:
     def _turn(self, command: Command) -> Result:
         """To a course, or by so much: degrees."""
         asked_deg, speed_dps, sense, relative = command.params[:4]
-        autopilot = self.link.view.autopilot
+        autopilot = self._autopilot
         if not autopilot.commander.knows("turn"):
             return Result.UNSUPPORTED
         if math.isfinite(asked_deg):
@@ -207,10 +202,10 @@ class Commands:
 
     def _reboot(self, command: Command) -> Result:
         wish = command.params[0]
-        return self.link.view.autopilot.happen("reboot") if wish >= 1.0 else Result.UNSUPPORTED
+        return self._autopilot.happen("reboot") if wish >= 1.0 else Result.UNSUPPORTED
 
     def _start_mission(self, command: Command) -> Result:
-        autopilot = self.link.view.autopilot
+        autopilot = self._autopilot
         first = command.params[0] if math.isfinite(command.params[0]) else 0.0
         if not autopilot.commander.knows("mission"):
             return Result.UNSUPPORTED
@@ -220,12 +215,12 @@ class Commands:
 
     def _set_current_item(self, command: Command) -> Result:
         number = command.params[0]
-        known = math.isfinite(number) and self.link.view.autopilot.mission.go_to(int(number))
+        known = math.isfinite(number) and self._autopilot.mission.go_to(int(number))
         return Result.ACCEPTED if known else Result.DENIED
 
     def _set_interval(self, command: Command) -> Result:
         number, interval_us = command.params[:2]
-        streams = self.link.view.autopilot.firmware.streams
+        streams = self._autopilot.firmware.streams
         name = message_name(number)
         if 0 < interval_us < 1e6 / streams.rate_max_hz:
             return self._refuse_interval(number, streams.too_fast_text)
@@ -233,39 +228,39 @@ class Commands:
             return Result.ACCEPTED
         if name is None or not math.isfinite(interval_us):
             return self._refuse_interval(number, streams.refusal_text)
-        if not self.link.set_interval(name, interval_us):
+        if not self.schedule.set_interval(name, interval_us):
             return self._refuse_interval(number, streams.refusal_text)
         return Result.ACCEPTED
 
     def _refuse_interval(self, number: float, text: str) -> Result:
-        autopilot = self.link.view.autopilot
+        autopilot = self._autopilot
         if text and math.isfinite(number):
             autopilot.commander.texts.append(Say(Severity.INFO, text.format(id=int(number))))
         return autopilot.firmware.streams.refusal
 
     def _get_interval(self, command: Command) -> Result:
         name = message_name(command.params[0])
-        if name is None or name not in self.link.view.builders:
+        if name is None or name not in self.outbox.view.builders:
             return Result.DENIED
-        self.link.send("MESSAGE_INTERVAL", id_of(name), self.link.interval_us(name))
+        self.outbox.send("MESSAGE_INTERVAL", id_of(name), self.schedule.interval_us(name))
         return Result.ACCEPTED
 
     def _request_message(self, command: Command) -> Result:
         name = message_name(command.params[0])
-        streams = self.link.view.autopilot.firmware.streams
-        if name not in self.link.view.builders or self.link.view.withheld(name):
+        streams = self._autopilot.firmware.streams
+        if name not in self.outbox.view.builders or self.outbox.view.withheld(name):
             return streams.request_refusal
         if name in streams.by_itself:
             return streams.request_refusal
-        self.link.send_now(name)
+        self.outbox.send_now(name)
         return Result.ACCEPTED
 
     def _request_version(self, _: Command) -> Result:
-        self.link.send_now("AUTOPILOT_VERSION")
+        self.outbox.send_now("AUTOPILOT_VERSION")
         return Result.ACCEPTED
 
     def _request_home(self, _: Command) -> Result:
-        self.link.send_now("HOME_POSITION")
+        self.outbox.send_now("HOME_POSITION")
         return Result.ACCEPTED
 
 

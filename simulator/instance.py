@@ -107,7 +107,7 @@ class Instance:
         self.ground.step()
         self._stretch.say()
         if self._injection is not None:
-            self._arrived += self._injection.down.carry(self.companion.drain(), self._now_us)
+            self._arrived += self._injection.down.carry(self.companion.outbox.drain(), self._now_us)
 
     def tick(self) -> None:
         """`advance`, the same bytes, in compiled code when nothing happens."""
@@ -148,14 +148,14 @@ class Instance:
     def step(self) -> list[bytes]:
         """`advance`, and the companion link's datagrams; the ground link's are dropped."""
         self.advance()
-        self.ground.drain()
+        self.ground.outbox.drain()
         return self.drain()
 
     def drain(self) -> list[bytes]:
         """The companion link's datagrams that have arrived at its other end."""
         if self._injection is None:
-            return self.companion.drain()
-        said = self._injection.down.carry(self.companion.drain(), self._now_us)
+            return self.companion.outbox.drain()
+        said = self._injection.down.carry(self.companion.outbox.drain(), self._now_us)
         arrived, self._arrived = self._arrived + said, []
         return arrived
 
@@ -195,10 +195,10 @@ class Instance:
         stamp_ns = self.steps * STEP_MS * 1_000_000
         if self._injection is None:
             self.companion.send_barrier(stamp_ns)
-            return stamp_ns, self.companion.drain()
+            return stamp_ns, self.companion.outbox.drain()
         datagrams = self.drain()
         self.companion.send_barrier(stamp_ns)
-        return stamp_ns, datagrams + self.companion.drain()
+        return stamp_ns, datagrams + self.companion.outbox.drain()
 
     def reboot(self, silent_s: float) -> None:
         """The autopilot is gone for so long and starts anew; the vehicle goes on falling."""
@@ -249,10 +249,10 @@ class Instance:
     def _spread_texts(self) -> None:
         commander = self.autopilot.commander
         for said in commander.texts:
-            self.companion.say(said)
-            self.ground.say(said)
+            self.companion.texts.say(said)
+            self.ground.texts.say(said)
         commander.texts.clear()
         for name in commander.announcements:
-            self.companion.send_now(name)
-            self.ground.send_now(name)
+            self.companion.outbox.send_now(name)
+            self.ground.outbox.send_now(name)
         commander.announcements.clear()

@@ -10,15 +10,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Protocol
 
 from simulator.codec import Message
-from simulator.firmware.base import MissionRules, Say
-from simulator.mission import ITEMS_MAX, Item, Mission
+from simulator.firmware.base import MissionRules, Say, Severity
+from simulator.mission import ITEMS_MAX, Item, Kind, Mission
+from simulator.outbox import Outbox
+from simulator.texts import Texts
 
 ASK_AGAIN_S, GIVE_UP_S = 0.25, 5.0
 _ANY_TYPE = 255
 _KINDS = frozenset({0, 1, 2})  # MAV_MISSION_TYPE: mission, fence, rally points
+
+
+_UNEXPECTED = Say(Severity.CRITICAL, "WPM: REJ. CMD: Req. WP was unexpected")
 
 
 class Ack(IntEnum):
@@ -30,15 +34,6 @@ class Ack(IntEnum):
     NO_SPACE = 4
     INVALID_SEQUENCE = 13
     CANCELLED = 15
-
-
-class Link(Protocol):
-    """What a transfer needs of the link it came by."""
-
-    def send(self, name: str, *values: object) -> None: ...
-    def send_now(self, name: str) -> None: ...
-    def complain(self, text: str) -> None: ...
-    def say(self, said: Say) -> None: ...
 
 
 @dataclass(slots=True)
@@ -63,13 +58,13 @@ class Download:
 
 
 @dataclass(slots=True)
-class Transfer:
+class MissionTransfer:
     """What one link has under way."""
 
-    link: Link
+    outbox: Outbox
+    texts: Texts  # of the link alone
     mission: Mission
     rules: MissionRules
-    home: Callable[[], Item]
     _upload: Upload | None = None
     _download: Download | None = None
     _whole: bool = False  # places come in whole 1e-7 degrees
@@ -113,7 +108,7 @@ class Transfer:
         upload.asked_s = now_s
         whole = self._whole and self.rules.strict
         name = "MISSION_REQUEST_INT" if whole else "MISSION_REQUEST"
-        self.link.send(name, *upload.peer, len(upload.items), upload.kind)
+        self.outbox.send(name, *upload.peer, len(upload.items), upload.kind)
 
     def _item(self, message: Message, now_s: float) -> None:
         self._whole = message.name == "MISSION_ITEM_INT"
@@ -128,7 +123,7 @@ class Transfer:
             result, said = refused
             self._acknowledge(upload.peer, result, upload.kind)
             if said is not None:
-                self.link.say(said)
+                self.texts.say(said)
             self._upload = None
             return
         upload.items.append(item)
@@ -140,7 +135,7 @@ class Transfer:
         self._upload = None
         self._acknowledge(upload.peer, Ack.ACCEPTED, upload.kind)
         if upload.kind in self.rules.texts:
-            self.link.say(self.rules.texts[upload.kind])
+            self.texts.say(self.rules.texts[upload.kind])
 
     def _heard_ack(self, message: Message, now_s: float) -> None:
         """The peer wants to be asked in the other kind, or no more."""
@@ -156,14 +151,14 @@ class Transfer:
             self._upload = None
 
     def _acknowledge(self, peer: tuple[int, int], ack: int, kind: int) -> None:
-        self.link.send("MISSION_ACK", *peer, int(ack), kind)
+        self.outbox.send("MISSION_ACK", *peer, int(ack), kind)
 
     # -- down, and the rest ------------------------------------------------------------------
 
     def _list(self, message: Message, _: float) -> None:
         kind, peer = message.mission_type, (message.system, message.component)
         self._download = Download(peer, kind)
-        self.link.send("MISSION_COUNT", *peer, len(self.mission.listed(kind)), kind)
+        self.outbox.send("MISSION_COUNT", *peer, len(self.mission.listed(kind)), kind)
 
     def _request(self, message: Message, _: float) -> None:
         peer, kind = (message.system, message.component), message.mission_type
@@ -176,13 +171,20 @@ class Transfer:
         if not there:
             self._acknowledge(peer, Ack.INVALID_SEQUENCE, kind)
             return
-        item = self.home() if shows_home else items[message.seq]
+        item = self._home() if shows_home else items[message.seq]
         places = (item.x, item.y) if whole else (item.x * 1e-7, item.y * 1e-7)
         current = int(not kind and message.seq == self.mission.current)
         goes_on = int(kind not in self.rules.stopping)
         head = (*peer, message.seq, self.rules.frame_shown(item, whole), item.command)
         name = "MISSION_ITEM_INT" if whole else "MISSION_ITEM"
-        self.link.send(name, *head, current, goes_on, *item.params, *places, item.z, kind)
+        self.outbox.send(name, *head, current, goes_on, *item.params, *places, item.z, kind)
+
+    def _home(self) -> Item:
+        """As an item of a mission."""
+        view = self.outbox.view
+        north_m, east_m, down_m = view.autopilot.navigator.home_ned_m
+        place = view.geodetic(north_m, east_m)
+        return Item(0, Kind.WAYPOINT, (0.0,) * 4, *place, view.altitude_mm(down_m) * 1e-3)
 
     def _is_due(self, peer: tuple[int, int], kind: int, number: int, there: bool) -> bool:
         """The item that comes next, or the last one again; another ends the download."""
@@ -192,7 +194,7 @@ class Transfer:
         if not there or number not in (download.due - 1, download.due):
             self._download = None
             self._acknowledge(peer, Ack.ERROR, kind)
-            self.link.complain("WPM: REJ. CMD: Req. WP was unexpected")
+            self.texts.say(_UNEXPECTED)
             return False
         download.due = number + 1
         return True
@@ -205,7 +207,7 @@ class Transfer:
 
     def _set_current(self, message: Message, _: float) -> None:
         if self.mission.go_to(message.seq):
-            self.link.send_now("MISSION_CURRENT")
+            self.outbox.send_now("MISSION_CURRENT")
 
 
 def _read(message: Message) -> Item:
@@ -221,14 +223,14 @@ def _whole(value: float) -> int:
     return int(min(2e9, max(-2e9, value))) if value == value else 0
 
 
-HANDLERS: dict[str, Callable[[Transfer, Message, float], None]] = {
-    "MISSION_ACK": Transfer._heard_ack,
-    "MISSION_COUNT": Transfer._count,
-    "MISSION_ITEM": Transfer._item,
-    "MISSION_ITEM_INT": Transfer._item,
-    "MISSION_REQUEST_LIST": Transfer._list,
-    "MISSION_REQUEST": Transfer._request,
-    "MISSION_REQUEST_INT": Transfer._request,
-    "MISSION_CLEAR_ALL": Transfer._clear,
-    "MISSION_SET_CURRENT": Transfer._set_current,
+HANDLERS: dict[str, Callable[[MissionTransfer, Message, float], None]] = {
+    "MISSION_ACK": MissionTransfer._heard_ack,
+    "MISSION_COUNT": MissionTransfer._count,
+    "MISSION_ITEM": MissionTransfer._item,
+    "MISSION_ITEM_INT": MissionTransfer._item,
+    "MISSION_REQUEST_LIST": MissionTransfer._list,
+    "MISSION_REQUEST": MissionTransfer._request,
+    "MISSION_REQUEST_INT": MissionTransfer._request,
+    "MISSION_CLEAR_ALL": MissionTransfer._clear,
+    "MISSION_SET_CURRENT": MissionTransfer._set_current,
 }

@@ -188,7 +188,6 @@ MESSAGES = (
     odometry,
     global_position_int,
     altitude,
-    pressure_hpa,
     scaled_pressure,
     vibration,
     highres_imu,

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from simulator.firmware.base import Quaternion, Triple
 from simulator.plant import Plant, Truth
-from simulator.steps import STEP_S
+from simulator.steps import STEP_S, STEP_US
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,6 +45,11 @@ class Senses:
     def time_s(self) -> float:
         """Vehicle time since boot."""
         return self.steps * STEP_S
+
+    @property
+    def time_us(self) -> int:
+        """The same in whole microseconds; no fault turns it back."""
+        return self.steps * STEP_US
 
     def moved(self, count: int) -> None:
         """The plant is so many steps further."""

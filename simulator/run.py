@@ -59,7 +59,7 @@ class Berth:
         self.send_ground()
 
     def send_ground(self) -> None:
-        datagrams = self.instance.ground.drain()
+        datagrams = self.instance.ground.outbox.drain()
         if self.ground is not None:
             self.ground.send(datagrams)
 
@@ -202,7 +202,7 @@ class Runner:
                 continue
             stamp_ns, datagrams = self._berth.send_barrier()
             self._berth.read_ground()
-            first = not self._instance.companion.heard
+            first = not self._instance.companion.texts.heard
             waits_s = patience_s or (FIRST_CONTACT_S if first else PATIENCE_S)
             if self._answered(stamp_ns, datagrams, waits_s) or self._stopping():
                 continue
@@ -231,7 +231,7 @@ class Runner:
             now_s = monotonic_s()
             if now_s - begun_s > patience_s:
                 return False
-            if now_s - sent_s >= (RESEND_SILENT_S if server.heard else RESEND_S):
+            if now_s - sent_s >= (RESEND_SILENT_S if server.texts.heard else RESEND_S):
                 self._companion.send(datagrams)
                 sent_s = now_s
             wait([self._companion], POLL_S if now_s - begun_s > SPIN_S else 0.0)

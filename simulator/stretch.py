@@ -19,8 +19,9 @@ from simulator.attitude import encode_attitude
 from simulator.dynamics import advance_steps, report_state
 from simulator.frame_writer import FRAME_MAX, KINDS, write_frame
 from simulator.position_loop import step_loop
+from simulator.schedule import Stream
 from simulator.seen import Seen
-from simulator.server import Server, Stream
+from simulator.server import Server
 from simulator.steps import LOOP_STEPS, STEP_US
 from simulator.telemetry import BUILDERS, ON_POSITION_GRID
 from simulator.view import View
@@ -100,7 +101,7 @@ class Stretch:
     def _fly(self, count: int) -> int:
         autopilot = self._view.autopilot
         one, other = self._links
-        self._tally[_SEQUENCES:_GAP_COUNT] = one.sequence, other.sequence
+        self._tally[_SEQUENCES:_GAP_COUNT] = one.outbox.sequence, other.outbox.sequence
         done = _fly.call(
             count,
             autopilot.senses.steps,
@@ -122,20 +123,20 @@ class Stretch:
             self._view.autopilot.wake()
         if gap_count:
             for row, number, place, sequence in self._gaps[:gap_count].tolist():
-                link = self._links[number]
-                link.take(self._out[number, begun[number] : place].tobytes(), sequence)
-                link.send_now(self._streams[row][0])
+                outbox = self._links[number].outbox
+                outbox.take(self._out[number, begun[number] : place].tobytes(), sequence)
+                outbox.send_now(self._streams[row][0])
                 begun[number] = place
         for number, link in enumerate(self._links):
             if tally[number] > begun[number]:
                 said = self._out[number, begun[number] : tally[number]].tobytes()
-                link.take(said, tally[_SEQUENCES + number])
+                link.outbox.take(said, tally[_SEQUENCES + number])
 
     # -- the streams -------------------------------------------------------------------------
 
     @property
     def _rescheduled(self) -> bool:
-        return self._links[0].rescheduled or self._links[1].rescheduled
+        return self._links[0].schedule.changed or self._links[1].schedule.changed
 
     def _schedule(self) -> None:
         """Take the links' streams, as far as compiled code can write them."""
@@ -145,8 +146,8 @@ class Stretch:
         withheld = {name for name in firmware.withheld_until if view.withheld(name)}
         rows = []
         for number, link in enumerate(self._links):
-            link.rescheduled = False
-            for name, stream in link.streams.items():
+            link.schedule.changed = False
+            for name, stream in link.schedule.streams.items():
                 kind = _SLOW
                 if name in view.silent or name in withheld:
                     kind = _SILENT

@@ -13,7 +13,6 @@ from simulator.autopilot import Autopilot
 from simulator.codec import layout
 from simulator.fields import fit
 from simulator.geodesy import DEGREES_PER_M, east_degrees_per_m
-from simulator.steps import STEP_US
 
 _GPS, _PREARM = 0x20, 0x10000000  # MAV_SYS_STATUS_SENSOR
 
@@ -113,7 +112,7 @@ class View:
     @property
     def time_us(self) -> int:
         """The vehicle's clock, as its stamps show it."""
-        return max(0, self.autopilot.senses.steps * STEP_US + self.clock_offset_us)
+        return max(0, self.autopilot.senses.time_us + self.clock_offset_us)
 
     def geodetic(self, north_m: float, east_m: float) -> tuple[int, int]:
         """Latitude and longitude in 1e-7 deg of a point near the origin (spherical Earth)."""

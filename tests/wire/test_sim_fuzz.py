@@ -33,7 +33,7 @@ def assault(instance: Instance, seed: int, count: int) -> Decoder:
         (instance.feed if number % 4 else instance.feed_ground)(datagram)
         if number % PER_STEP == 0:
             instance.tick()
-            for said in (*instance.drain(), *instance.ground.drain()):
+            for said in (*instance.drain(), *instance.ground.outbox.drain()):
                 messages = reader.read(said)
                 positions = [m for m in messages if m.name == "LOCAL_POSITION_NED"]
                 assert all(math.isfinite(m.x + m.y + m.z) for m in positions)

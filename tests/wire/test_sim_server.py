@@ -15,8 +15,8 @@ from sim_bench import LOITER, NAN, OFFBOARD, Bench
 
 from simulator.firmware.px4 import PX4
 from simulator.firmware.px4.streams import COMPANION_RATES_HZ, GROUND_RATES_HZ
+from simulator.outbox import DATAGRAM_MAX
 from simulator.sensors import EstimatorName
-from simulator.server import DATAGRAM_MAX
 
 LOCAL_POSITION, ATTITUDE, HIL_STATE, GPS_RAW = 32, 30, 115, 24
 
@@ -43,8 +43,8 @@ def test_the_ground_link_has_rates_and_a_sequence_of_its_own() -> None:
     companion, ground = [], []
     for _ in range(2500):
         bench.instance.advance()
-        companion += bench.instance.companion.drain()
-        ground += bench.instance.ground.drain()
+        companion += bench.instance.companion.outbox.drain()
+        ground += bench.instance.ground.outbox.drain()
     heard = read(ground)
     counts = Counter(m.get_type() for m in heard)
     assert {name: counts[name] / 10.0 for name in GROUND_RATES_HZ} == {

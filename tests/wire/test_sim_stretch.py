@@ -21,8 +21,8 @@ from simulator.firmware.base import Firmware, MotionSetpoint
 from simulator.firmware.px4 import PX4
 from simulator.frame_writer import KINDS
 from simulator.instance import Instance
+from simulator.schedule import Stream
 from simulator.sensors import EstimatorName
-from simulator.server import Stream
 
 SEED = 7
 
@@ -95,7 +95,7 @@ def _flown(
         said.append(instance.barrier()[1])
         while script and script[0][0] <= instance.time_s:
             instance.feed(script.pop(0)[1].pack(codec))  # type: ignore[attr-defined]
-        said.append(instance.ground.drain())
+        said.append(instance.ground.outbox.drain())
     return [*said, instance.drain()]
 
 
@@ -238,27 +238,27 @@ def test_compiled_frames_are_the_readable_ones(name: str) -> None:
     """Random states, huge ones and zeros: every byte, the cut of trailing zeros, the checksum."""
     instance = _instance()
     random = np.random.default_rng(SEED)
-    instance.companion.streams.clear()
-    instance.companion.streams[name] = stream = Stream(1 << 40, 0)
+    instance.companion.schedule.streams.clear()
+    instance.companion.schedule.streams[name] = stream = Stream(1 << 40, 0)
     for case in range(200):
         _shake(instance, random, (1.0, 30.0, 1e5, 0.0)[case % 4])
-        instance.companion.sequence = int(random.integers(0, 256))
+        instance.companion.outbox.sequence = int(random.integers(0, 256))
         payload = instance.view.payload(name)
-        expected = frame(instance.companion.sequence, 1, 1, layout(name), payload)
+        expected = frame(instance.companion.outbox.sequence, 1, 1, layout(name), payload)
         stream.due_us = 0
-        instance.companion.rescheduled = True
+        instance.companion.schedule.changed = True
         instance._stretch.say()
         stream.due_us = 0
         instance._stretch._streams.clear()
-        assert instance.companion.drain() == [expected]
+        assert instance.companion.outbox.drain() == [expected]
 
 
 def test_states_that_are_no_numbers_are_written_all_the_same() -> None:
     instance = _instance()
     instance.autopilot.plant.record["body"][0, 10:] = np.nan, np.inf, -np.inf
     for name in KINDS:
-        instance.companion.set_interval(name, 4_000)
-        instance.companion.streams[name].due_us = 0
+        instance.companion.schedule.set_interval(name, 4_000)
+        instance.companion.schedule.streams[name].due_us = 0
     instance.advance_to_barrier()
     told = {message.name for message in Decoder().read(b"".join(instance.drain()))}
     assert told >= set(KINDS)

@@ -1,0 +1,69 @@
+"""The parameter protocol of one link: read, list, set.
+
+Knows messages; what a parameter is and takes is `simulator.parameters`' affair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from simulator.codec import Message
+from simulator.outbox import Outbox
+
+PER_STEP = 4  # of a list
+BY_NAME = 65535  # PARAM_VALUE.param_index of an answer that has none
+
+
+@dataclass(slots=True)
+class ParameterTransfer:
+    """What one link has under way."""
+
+    outbox: Outbox
+    _due: list[str] = field(default_factory=list)
+
+    @property
+    def listing(self) -> bool:
+        return bool(self._due)
+
+    def handle(self, message: Message) -> None:
+        """One message of the parameter protocol, addressed to us."""
+        HANDLERS[message.name](self, message)
+
+    def step(self) -> None:
+        """The list goes out bit by bit."""
+        for name in self._due[:PER_STEP]:
+            self._answer(name, listed=True)
+        del self._due[:PER_STEP]
+
+    def _answer(self, name: str, *, listed: bool = False) -> None:
+        """Queue PARAM_VALUE; `listed`: its number was asked for."""
+        autopilot = self.outbox.view.autopilot
+        value, kind = autopilot.parameters.to_wire(name)
+        names = autopilot.parameters.names
+        numbered = listed or autopilot.firmware.answers_carry_index
+        index = names.index(name) if numbered else BY_NAME
+        self.outbox.send("PARAM_VALUE", name.encode(), value, kind, len(names), index)
+
+    def _read(self, message: Message) -> None:
+        names = self.outbox.view.autopilot.parameters.names
+        if message.param_index >= 0:
+            if message.param_index < len(names):
+                self._answer(names[message.param_index], listed=True)
+        elif message.param_id in names:
+            self._answer(message.param_id)
+
+    def _list(self, _: Message) -> None:
+        self._due = list(self.outbox.view.autopilot.parameters.names)
+
+    def _set(self, message: Message) -> None:
+        table = self.outbox.view.autopilot.parameters
+        if table.set_from_wire(message.param_id, message.param_value, message.param_type):
+            self._answer(message.param_id)
+
+
+HANDLERS: dict[str, Callable[[ParameterTransfer, Message], None]] = {
+    "PARAM_REQUEST_READ": ParameterTransfer._read,
+    "PARAM_REQUEST_LIST": ParameterTransfer._list,
+    "PARAM_SET": ParameterTransfer._set,
+}
