@@ -163,7 +163,6 @@ class _VerticalSurprises:
 def fit_vertical(motion: Motion, gravity_mps2: float, prior: VerticalPrior) -> VerticalFit:
     """Hover thrust, lag and delay of the thrust."""
     known = (prior.delay_s, prior.lag_s, prior.drag_ps)
-
     surprises = _VerticalSurprises(motion, gravity_mps2)
     upper = np.array((50.0, THRUST_DELAY_UPPER_S, LAG_UPPER_S, DRAG_UPPER))
     start = np.clip(
