@@ -122,7 +122,7 @@ def fit_drag(motion: Motion, thrust_mps2: Array) -> Estimate:
     count = len(motion.times) - 1
     lags = min(round(RELATED_S / motion.spacing_s), count // 4)
     score = (result.jac[:, 0] * result.fun).reshape(2, count, 1)
-    variance = sum(float(_long_run(rows, lags)[0, 0]) for rows in score)
+    variance = sum(float(long_run(rows, lags)[0, 0]) for rows in score)
     return Estimate(float(result.x[0]), math.sqrt(max(variance, 0.0)) / slope)
 
 
@@ -201,17 +201,17 @@ def _covariance(jacobian: Array, residual: Array, spacing_s: float, known: int) 
     rows = len(residual) - known
     score = jacobian[:rows] * residual[:rows, None]
     lags = min(round(RELATED_S / spacing_s), rows // 4)
-    meat = _long_run(score, lags) + jacobian[rows:].T @ jacobian[rows:]
+    meat = long_run(score, lags) + jacobian[rows:].T @ jacobian[rows:]
     bread = np.linalg.pinv(jacobian.T @ jacobian)
     covariance: Array = bread @ meat @ bread
     return covariance
 
 
-def _long_run(score: Array, lags: int) -> Array:
+def long_run(score: Array, lags: int) -> Array:
     """Covariance (k, k) of the sum of a related series (N, k) (W. Newey and K. West, 1987)."""
-    lag = np.arange(1, lags + 1)
-    related = np.array([score[each:].T @ score[:-each] for each in lag.tolist()])
-    shares = (1.0 - lag / (lags + 1.0))[:, None, None]
-    terms = shares * (related + related.swapaxes(1, 2))
-    total: Array = np.cumsum(np.concatenate(((score.T @ score)[None], terms)), axis=0)[-1]
+    apart = np.arange(lags + 1)
+    related = np.array([score[lag:].T @ score[: len(score) - lag] for lag in apart.tolist()])
+    terms = (1.0 - apart / (lags + 1.0))[:, None, None] * (related + related.swapaxes(1, 2))
+    terms[0] = related[0]
+    total: Array = np.cumsum(terms, axis=0)[-1]
     return total

@@ -12,7 +12,7 @@ from scipy.linalg import expm
 
 from offboard.control.identification import Identified, identify
 from offboard.control.motion import lagged_thrust
-from offboard.control.motion_fit import innovations
+from offboard.control.motion_fit import innovations, long_run
 from offboard.control.response_fit import Estimate, fit_response, predicted
 from offboard.control.trace import Recorder, Trace, clean
 from offboard.model.vehicle import AxisResponse, Vehicle
@@ -91,6 +91,15 @@ def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():
     white = white[0, 200:]
     assert np.mean(white**2) == pytest.approx(1.0, abs=0.03)
     assert abs(np.mean(white[1:] * white[:-1])) < 0.02
+
+
+def test_related_scores_are_weighed_by_bartletts_triangle():
+    """As a quadratic form with every pair's weight written out."""
+    score = np.cumsum(np.random.default_rng(2).normal(size=(60, 3)), axis=0)
+    apart = np.abs(np.subtract.outer(np.arange(60), np.arange(60)))
+    expected = score.T @ np.maximum(1.0 - apart / 8.0, 0.0) @ score
+    assert long_run(score, 7) == pytest.approx(expected, rel=1e-12)
+    assert long_run(score, 0) == pytest.approx(score.T @ score, rel=1e-12)
 
 
 def test_response_fits_what_scipy_made_to_four_digits():
