@@ -23,6 +23,9 @@ _KINDS = frozenset({0, 1, 2})  # MAV_MISSION_TYPE: mission, fence, rally points
 
 
 _UNEXPECTED = Say(Severity.CRITICAL, "WPM: REJ. CMD: Req. WP was unexpected")
+_BUSY = Say(Severity.CRITICAL, "WPM: IGN MISSION_COUNT: Busy")
+_TIMEOUT = Say(Severity.CRITICAL, "Operation timeout")
+_UNASKED = Say(Severity.CRITICAL, "IGN MISSION_ITEM: No transfer")
 
 
 class Ack(IntEnum):
@@ -54,6 +57,7 @@ class Download:
 
     peer: tuple[int, int]
     kind: int
+    heard_s: float
     due: int = 0
 
 
@@ -67,11 +71,13 @@ class MissionTransfer:
     rules: MissionRules
     _upload: Upload | None = None
     _download: Download | None = None
+    _taken: tuple[int, int] = (0, 0)  # how many items of which kind were uploaded last
     _whole: bool = False  # places come in whole 1e-7 degrees
 
     @property
-    def uploading(self) -> bool:
-        return self._upload is not None
+    def under_way(self) -> bool:
+        """Time alone may end it, or have it go on."""
+        return self._upload is not None or self._download is not None
 
     def handle(self, message: Message, now_s: float) -> None:
         """One message of the mission protocol, addressed to us."""
@@ -79,6 +85,11 @@ class MissionTransfer:
 
     def step(self, now_s: float) -> None:
         """Ask again for an item that does not come; after a while no more."""
+        download = self._download
+        if download is not None and now_s - download.heard_s > GIVE_UP_S:
+            self._download = None
+            if self.rules.strict:
+                self.texts.say(_TIMEOUT)
         upload = self._upload
         if upload is None:
             return
@@ -93,8 +104,11 @@ class MissionTransfer:
     def _count(self, message: Message, now_s: float) -> None:
         peer = (message.system, message.component)
         kind = message.mission_type
-        if kind not in _KINDS:
-            self._acknowledge(peer, Ack.UNSUPPORTED, kind)
+        if self.rules.strict and self._download is not None:
+            self._acknowledge(peer, Ack.ERROR, self._download.kind)
+            self.texts.say(_BUSY)
+        elif kind not in _KINDS:
+            self._acknowledge(peer, self.rules.unknown_kind, kind)
         elif message.count > ITEMS_MAX:
             self._acknowledge(peer, Ack.NO_SPACE, kind)
         elif message.count == 0:
@@ -112,8 +126,10 @@ class MissionTransfer:
 
     def _item(self, message: Message, now_s: float) -> None:
         self._whole = message.name == "MISSION_ITEM_INT"
-        upload = self._upload
-        if upload is None or upload.peer != (message.system, message.component):
+        upload, peer = self._upload, (message.system, message.component)
+        if self.rules.strict and upload is None and self._download is None:
+            self._take_late(message, peer)
+        if upload is None or upload.peer != peer:
             return
         if message.seq != len(upload.items):  # one that came twice
             return
@@ -132,10 +148,18 @@ class MissionTransfer:
             self._ask(upload, now_s)
             return
         self.mission.keep(upload.kind, tuple(upload.items))
-        self._upload = None
+        self._upload, self._taken = None, (upload.count, upload.kind)
         self._acknowledge(upload.peer, Ack.ACCEPTED, upload.kind)
         if upload.kind in self.rules.texts:
             self.texts.say(self.rules.texts[upload.kind])
+
+    def _take_late(self, message: Message, peer: tuple[int, int]) -> None:
+        """The last item again, from one that did not hear it was taken; or one unasked for."""
+        if (message.seq + 1, message.mission_type) == self._taken:
+            self._acknowledge(peer, Ack.ACCEPTED, message.mission_type)
+            return
+        self._acknowledge(peer, Ack.ERROR, message.mission_type)
+        self.texts.say(_UNASKED)
 
     def _heard_ack(self, message: Message, now_s: float) -> None:
         """The peer wants to be asked in the other kind, or no more."""
@@ -155,12 +179,12 @@ class MissionTransfer:
 
     # -- down, and the rest ------------------------------------------------------------------
 
-    def _list(self, message: Message, _: float) -> None:
+    def _list(self, message: Message, now_s: float) -> None:
         kind, peer = message.mission_type, (message.system, message.component)
-        self._download = Download(peer, kind)
+        self._download = Download(peer, kind, now_s)
         self.outbox.send("MISSION_COUNT", *peer, len(self.mission.listed(kind)), kind)
 
-    def _request(self, message: Message, _: float) -> None:
+    def _request(self, message: Message, now_s: float) -> None:
         peer, kind = (message.system, message.component), message.mission_type
         self._whole = whole = message.name == "MISSION_REQUEST_INT"
         items = self.mission.listed(kind)
@@ -168,6 +192,8 @@ class MissionTransfer:
         there = shows_home or message.seq < len(items)
         if self.rules.strict and not self._is_due(peer, kind, message.seq, there):
             return
+        if self._download is not None:
+            self._download.heard_s = now_s
         if not there:
             self._acknowledge(peer, Ack.INVALID_SEQUENCE, kind)
             return

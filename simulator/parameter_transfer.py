@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 
 from simulator.codec import Message
 from simulator.outbox import Outbox
+from simulator.parameters import HASH, MAV_PARAM_TYPE_UINT32
 
 PER_STEP = 4  # of a list
 BY_NAME = 65535  # PARAM_VALUE.param_index of an answer that has none
@@ -39,6 +40,10 @@ class ParameterTransfer:
     def _answer(self, name: str, *, listed: bool = False) -> None:
         """Queue PARAM_VALUE; `listed`: its number was asked for."""
         autopilot = self.outbox.view.autopilot
+        if name == HASH:
+            head = (HASH.encode(), autopilot.parameters.hash_on_wire, MAV_PARAM_TYPE_UINT32)
+            self.outbox.send("PARAM_VALUE", *head, len(autopilot.parameters.names), BY_NAME)
+            return
         value, kind = autopilot.parameters.to_wire(name)
         names = autopilot.parameters.names
         numbered = listed or autopilot.firmware.answers_carry_index
@@ -50,14 +55,20 @@ class ParameterTransfer:
         if message.param_index >= 0:
             if message.param_index < len(names):
                 self._answer(names[message.param_index], listed=True)
-        elif message.param_id in names:
+        elif message.param_id in names or self._is_hash(message.param_id):
             self._answer(message.param_id)
 
+    def _is_hash(self, name: str) -> bool:
+        return name == HASH and self.outbox.view.autopilot.firmware.parameters_hashed
+
     def _list(self, _: Message) -> None:
-        self._due = list(self.outbox.view.autopilot.parameters.names)
+        hashed = (HASH,) if self._is_hash(HASH) and not self._due else ()
+        self._due = [*hashed, *self.outbox.view.autopilot.parameters.names]
 
     def _set(self, message: Message) -> None:
         table = self.outbox.view.autopilot.parameters
+        if self._is_hash(message.param_id):  # the client has them all
+            self._due = []
         if table.set_from_wire(message.param_id, message.param_value, message.param_type):
             self._answer(message.param_id)
 

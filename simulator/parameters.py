@@ -7,10 +7,13 @@ from __future__ import annotations
 
 import math
 import struct
+import zlib
 from collections.abc import Mapping
 
 from simulator.firmware.base import Firmware, ParameterSpec, Role
 
+HASH = "_HASH_CHECK"  # a parameter that is none: what all values come to
+MAV_PARAM_TYPE_UINT32 = 5
 MAV_PARAM_TYPE = {"int8": 2, "int16": 4, "int32": 6, "real32": 9}
 WHOLE = {"int8": (-128, 127), "int16": (-32768, 32767), "int32": (-(2**31), 2**31 - 1)}
 _FLOAT, _INT = struct.Struct("<f"), struct.Struct("<i")
@@ -95,6 +98,17 @@ class ParameterTable:
         if self._is_bytewise(spec):
             value = _FLOAT.unpack(_INT.pack(int(value)))[0]
         return value, MAV_PARAM_TYPE[spec.kind]
+
+    @property
+    def hash_on_wire(self) -> float:
+        """CRC-32 (no inversion) of names and values, by which clients know a table again."""
+        crc = 0
+        for name, spec in self._specs.items():
+            value = self._values[name]
+            data = _FLOAT.pack(value) if spec.kind == "real32" else _INT.pack(int(value))
+            crc = zlib.crc32(name.encode() + data, crc ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
+        number: float = _FLOAT.unpack(struct.pack("<I", crc))[0]
+        return number
 
     def _is_bytewise(self, spec: ParameterSpec) -> bool:
         return self._bytewise and spec.kind != "real32"

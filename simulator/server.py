@@ -71,7 +71,7 @@ class Server:
 
     def step(self) -> None:
         """Queue what is asked for and goes out bit by bit: missions, lists of parameters."""
-        if self._missions.uploading:
+        if self._missions.under_way:
             self._missions.step(self.view.autopilot.senses.time_us * 1e-6)
         if self._parameters.listing:
             self._parameters.step()
@@ -79,7 +79,7 @@ class Server:
     @property
     def only_streams(self) -> bool:
         """Nothing but streams has this link to say by itself."""
-        return not (self._missions.uploading or self._parameters.listing)
+        return not (self._missions.under_way or self._parameters.listing)
 
     def send_barrier(self, stamp_ns: int) -> None:
         """Queue a TIMESYNC request."""

@@ -200,6 +200,7 @@ class MissionRules:
     home_first: bool
     guides: bool
     refusal: Callable[[int, MissionItem], tuple[int, Say | None] | None]
+    unknown_kind: int  # MAV_MISSION_RESULT of a MAV_MISSION_TYPE that it has not
     texts: Mapping[int, Say]
     frame_shown: Callable[[MissionItem, bool], int]
     stopping: frozenset[int]
@@ -307,6 +308,7 @@ class Firmware:
     parameters: tuple[ParameterSpec, ...]
     parameter_roles: Mapping[str, Role]
     system_parameter: str  # that has the system id
+    parameters_hashed: bool  # a list begins with what all values come to
     parameters_bytewise: bool  # INT32 lies in the float's bytes, not as its value
     companion_rates_hz: Mapping[str, float]
     ground_rates_hz: Mapping[str, float]

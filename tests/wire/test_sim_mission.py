@@ -145,7 +145,32 @@ def test_items_that_do_not_come_are_asked_for_again_and_given_up() -> None:
     assert [m.type for _, m in bench.of("MISSION_ACK")] == [15]
     bench.send(item(0, ROUND[0]))
     bench.run(0.1)
-    assert len(bench.of("MISSION_ACK")) == 1
+    assert [m.type for _, m in bench.of("MISSION_ACK")] == [15, 1]
+    assert bench.texts() == ["IGN MISSION_ITEM: No transfer"]
+
+
+def test_a_last_item_that_comes_again_was_taken() -> None:
+    bench = Bench()
+    assert upload(bench, ROUND[:1]) == 0
+    bench.send(item(0, ROUND[0]))
+    bench.run(0.02)
+    assert [m.type for _, m in bench.of("MISSION_ACK")] == [0, 0]
+
+
+def test_a_px4_takes_nothing_while_a_download_is_left_open() -> None:
+    """One that nobody acknowledges, be it of nothing, is open for five seconds."""
+    bench = Bench()
+    bench.boot()
+    bench.send(mavlink.MAVLink_mission_request_list_message(1, 1))
+    bench.send(mavlink.MAVLink_mission_count_message(1, 1, 1))
+    bench.run(0.02)
+    assert [m.type for _, m in bench.of("MISSION_ACK")] == [1]
+    bench.run(5.1)
+    assert bench.texts() == ["WPM: IGN MISSION_COUNT: Busy", "Operation timeout"]
+    assert upload(bench, ROUND[:1]) == 0
+    assert len(download(bench, 0)) == 1
+    bench.send(mavlink.MAVLink_mission_ack_message(1, 1, 0))
+    assert upload(bench, ROUND[:1]) == 0
 
 
 @pytest.mark.parametrize(
@@ -153,7 +178,7 @@ def test_items_that_do_not_come_are_asked_for_again_and_given_up() -> None:
     [
         (mavlink.MAVLink_mission_count_message(1, 1, 65535), 4),
         (mavlink.MAVLink_mission_count_message(1, 1, 0), 0),
-        (mavlink.MAVLink_mission_count_message(1, 1, 3, 3), 3),
+        (mavlink.MAVLink_mission_count_message(1, 1, 3, 3), 4),
         (mavlink.MAVLink_mission_clear_all_message(1, 1, 255), 0),
     ],
 )

@@ -218,7 +218,33 @@ def test_parameters_are_listed_once_each() -> None:
     bench.run(0.5)
     listed = [(m.param_index, m.param_id, m.param_count) for _, m in bench.of("PARAM_VALUE")]
     names = [spec.name for spec in PX4.parameters]
-    assert listed == [(i, name, len(names)) for i, name in enumerate(names)]
+    hashed = (65535, "_HASH_CHECK", len(names))
+    assert listed == [hashed, *((i, name, len(names)) for i, name in enumerate(names))]
+
+
+def test_parameters_are_known_again_by_their_hash() -> None:
+    """As QGroundControl asks; who knows it needs no list."""
+    bench = Bench()
+
+    def known_as() -> tuple[float, int]:
+        bench.send(mavlink.MAVLink_param_request_read_message(1, 1, b"_HASH_CHECK", -1))
+        bench.run(0.02)
+        _, answer = bench.of("PARAM_VALUE")[-1]
+        assert answer.param_id == "_HASH_CHECK"
+        return answer.param_value, answer.param_type
+
+    first = known_as()
+    assert first[1] == 5
+    bench.send(mavlink.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", 2.0, 9))
+    assert known_as() != first
+    bench.send(mavlink.MAVLink_param_set_message(1, 1, b"COM_OF_LOSS_T", 1.0, 9))
+    assert known_as() == first
+    bench.send(mavlink.MAVLink_param_request_list_message(1, 1))
+    bench.run(0.008)
+    bench.send(mavlink.MAVLink_param_set_message(1, 1, b"_HASH_CHECK", 0.0, 5))
+    before = len(bench.of("PARAM_VALUE"))
+    bench.run(0.5)
+    assert len(bench.of("PARAM_VALUE")) == before
 
 
 def test_parameters_take_any_value_and_are_obeyed_within_their_range() -> None:

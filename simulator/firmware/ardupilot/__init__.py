@@ -106,6 +106,7 @@ ARDUPILOT = Firmware(
     parameters=PARAMETERS,
     parameter_roles=ROLES,
     system_parameter="SYSID_THISMAV",
+    parameters_hashed=False,
     parameters_bytewise=False,
     companion_rates_hz=DEFAULT_RATES_HZ,
     ground_rates_hz=DEFAULT_RATES_HZ,

@@ -32,6 +32,7 @@ MISSIONS = MissionRules(
     home_first=True,
     guides=True,
     refusal=_refusal,
+    unknown_kind=3,
     texts={
         0: Say(Severity.INFO, "Flight plan received"),
         1: Say(Severity.DEBUG, "Fence Indexed OK"),

@@ -111,6 +111,7 @@ PX4 = Firmware(
     parameters=PARAMETERS,
     parameter_roles=ROLES,
     system_parameter="MAV_SYS_ID",
+    parameters_hashed=True,
     parameters_bytewise=True,
     companion_rates_hz=COMPANION_RATES_HZ,
     ground_rates_hz=GROUND_RATES_HZ,

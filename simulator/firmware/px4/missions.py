@@ -47,6 +47,7 @@ MISSIONS = MissionRules(
     home_first=False,
     guides=False,
     refusal=_refusal,
+    unknown_kind=4,
     texts={},
     frame_shown=_frame_shown,
     stopping=frozenset({1}),
