@@ -12,7 +12,14 @@ from collections.abc import Mapping
 from typing import Any
 
 from simulator.commander import NOTHING, Commander, Wish
-from simulator.firmware.base import AttitudeSetpoint, Behaviour, Firmware, MotionSetpoint, Result
+from simulator.firmware.base import (
+    AttitudeSetpoint,
+    Behaviour,
+    Firmware,
+    MotionSetpoint,
+    Result,
+    Triple,
+)
 from simulator.health import Health
 from simulator.mission import Mission
 from simulator.nav import Senses
@@ -22,6 +29,7 @@ from simulator.pilot import Pilot
 from simulator.plant import Plant
 from simulator.setpoints import ATTITUDE, SetpointStream
 from simulator.steps import STEP_S
+from simulator.sticks import Sticks
 from simulator.watch import EVERY_STEPS, Watch
 
 _RESTS_STEPS = 250  # at most, so that what is changed behind its back is seen soon
@@ -49,7 +57,8 @@ class Autopilot:
         self.health = Health(
             firmware, self.parameters, self.mission, self.stream, self.watch, boot_scale
         )
-        self.navigator = Navigator(firmware, self.parameters, self.mission)
+        self.sticks = None if firmware.handling is None else Sticks(firmware.handling)
+        self.navigator = Navigator(firmware, self.parameters, self.mission, self.sticks)
         self.pilot = Pilot(firmware, self.parameters, self.navigator)
         self.commander = Commander(
             firmware, self.parameters, self.navigator, self.pilot, self.senses, self.health
@@ -78,13 +87,23 @@ class Autopilot:
             self.commander.texts += () if said is None else (said,)
             self._fly(setpoint)
 
+    def go_to(self, place_ned_m: Triple, yaw_rad: float) -> None:
+        """Hold there, in a mode that holds or obeys; no number faces the way there."""
+        self._end_takeoff()
+        self.navigator.go_to(place_ned_m, yaw_rad)
+
+    def _end_takeoff(self) -> None:
+        """Of a mode that climbs before it obeys."""
+        behaviour = self.commander.mode.behaviour
+        if self.navigator.behaviour is not behaviour:
+            self.pilot.enter(behaviour, self.senses.look())
+
     def _fly(self, setpoint: AttitudeSetpoint | MotionSetpoint | None) -> None:
         if setpoint is None:
             return
         self.stream.newest_s = self.senses.time_s
         self.navigator.setpoint = setpoint
-        if self.navigator.behaviour is not self.commander.mode.behaviour:  # a takeoff in it ends
-            self.pilot.enter(self.commander.mode.behaviour, self.senses.look())
+        self._end_takeoff()
         if isinstance(setpoint, AttitudeSetpoint) and setpoint.event:
             self.happen(setpoint.event)
 

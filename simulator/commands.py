@@ -151,7 +151,7 @@ class Commands:
         if result is Result.ACCEPTED and autopilot.commander.armed:
             yaw_rad = yaw_rad if math.isfinite(yaw_rad) else math.nan
             place = self._place(latitude, longitude, height_m, command.frame or 0)
-            autopilot.navigator.go_to(place, yaw_rad)
+            autopilot.go_to(place, yaw_rad)
             if math.isfinite(speed_mps):
                 autopilot.navigator.cruise_mps = speed_mps
         return result
@@ -161,7 +161,7 @@ class Commands:
         autopilot = self._autopilot
         obeys = autopilot.commander.mode.behaviour is Behaviour.SETPOINT
         if obeys and autopilot.commander.armed:
-            autopilot.navigator.go_to(self._place(*place, frame), math.nan)
+            autopilot.go_to(self._place(*place, frame), math.nan)
         return obeys
 
     def _place(self, latitude: float, longitude: float, height_m: float, frame: int) -> Triple:

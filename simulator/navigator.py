@@ -22,7 +22,9 @@ from simulator.firmware.base import (
 from simulator.mission import Mission
 from simulator.nav import Nav
 from simulator.parameters import ParameterTable
+from simulator.sticks import Sticks
 
+_STILL_MPS = 0.05  # slower than that it holds its place
 _FLATTEST = 1000.0  # metres across per metre of climb
 _STANDING = frozenset({Behaviour.HOLD, Behaviour.SETPOINT})
 
@@ -30,10 +32,17 @@ _STANDING = frozenset({Behaviour.HOLD, Behaviour.SETPOINT})
 class Navigator:
     """Goes about one behaviour at a time; `setpoint` is what somebody asked for last."""
 
-    def __init__(self, firmware: Firmware, parameters: ParameterTable, mission: Mission) -> None:
+    def __init__(
+        self,
+        firmware: Firmware,
+        parameters: ParameterTable,
+        mission: Mission,
+        sticks: Sticks | None = None,
+    ) -> None:
         self._firmware = firmware
         self._parameters = parameters
         self.mission = mission
+        self._sticks = sticks
         self._events = self.mission.events
         self.behaviour = Behaviour.HOLD
         self.setpoint: AttitudeSetpoint | MotionSetpoint | None = None
@@ -57,13 +66,16 @@ class Navigator:
         """
         if not (self._climbed and behaviour in _STANDING):
             self._hold = _ahead(nav)
-        if behaviour is not self.behaviour:
+        within = self.behaviour is Behaviour.TAKEOFF and behaviour is Behaviour.SETPOINT
+        if behaviour is not self.behaviour and not within:
             self.cruise_mps = math.inf
         self.behaviour = behaviour
         self._takeoff_ned_m, self._climb_begun, self.earthbound = takeoff_ned_m, False, False
         self._return = Return(self._firmware, self._parameters, self._events)
         self._climbed = False
         self.mission.pause()
+        if self._sticks is not None:
+            self._sticks.begin()
 
     def arm(self, nav: Nav) -> None:
         """The motors begin to turn: home is here."""
@@ -197,8 +209,27 @@ class Navigator:
         if self.behaviour is Behaviour.LAND:
             return sink(self._hold, land_speed_mps(nav, self.home_ned_m[2], self._parameters))
         if self.behaviour is Behaviour.DESCEND:
-            return sink(self._hold, self._firmware.descend_speed_mps)
+            return self._by_sticks(nav, time_s, landed=landed)
         return self._standing
+
+    def _by_sticks(self, nav: Nav, time_s: float, *, landed: bool) -> MotionSetpoint:
+        """What they ask for; what none of them asks for stays as it is."""
+        if self._sticks is None:
+            return sink(self._hold, self._firmware.descend_speed_mps)
+        across, change, climb_mps, turn_radps = self._sticks.ask(time_s, nav.yaw_rad)
+        if landed and climb_mps <= 0.0:
+            return sink(self._hold, self._firmware.descend_speed_mps)
+        (x, y, z), ahead = self._hold, _ahead(nav)
+        moves = math.hypot(*across) > _STILL_MPS
+        x, y = ahead[:2] if moves else (x, y)
+        self._hold = (x, y, ahead[2] if climb_mps else z)
+        nothing = (math.nan, math.nan)
+        return MotionSetpoint(
+            (*(nothing if moves else (x, y)), math.nan if climb_mps else z),
+            (*(across if moves else nothing), -climb_mps or math.nan),
+            (*(change if moves else nothing), math.nan),
+            yaw_rate_radps=turn_radps or math.nan,
+        )
 
     def _climb(self, nav: Nav, *, landed: bool) -> MotionSetpoint:
         if not self._climb_begun:

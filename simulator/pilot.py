@@ -29,7 +29,7 @@ from simulator.steps import LOOP_S, LOOP_STEPS, STEP_S
 from simulator.takeoff import Takeoff
 
 _TILT_BOOST_MAX = 10.0
-_LIFTING = frozenset({Behaviour.TAKEOFF, Behaviour.SETPOINT, Behaviour.MISSION})
+_LIFTING = frozenset({Behaviour.TAKEOFF, Behaviour.SETPOINT, Behaviour.MISSION, Behaviour.DESCEND})
 OFF = Demand()
 
 

@@ -6,7 +6,7 @@ the `outbox`. Knows no socket and no clock: time is the autopilot's.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 
 from simulator.codec import Decoder, Message
@@ -167,6 +167,24 @@ class Server:
             sender = (message.system, message.component)
             self.outbox.send("PING", message.time_usec, message.seq, *sender)
 
+    def _rc_channels_override(self, message: Message) -> None:
+        self._steer(message, [message.values[f"chan{i}_raw"] for i in range(1, 9)])
+
+    def _manual_control(self, message: Message) -> None:
+        """A joystick: -1000 .. 1000 each, the throttle 0 .. 1000."""
+        ahead, aside, throttle, turn = message.x, message.y, message.z, message.r
+        widths = (1500 + aside // 2, 1500 - ahead // 2, 1000 + throttle, 1500 + turn // 2)
+        self._steer(message, [min(2000, max(1000, width)) for width in widths])
+
+    def _steer(self, message: Message, widths_us: Sequence[int]) -> None:
+        """By the ground station alone."""
+        autopilot = self.view.autopilot
+        read = autopilot.parameters.__getitem__
+        if autopilot.sticks is None:
+            return
+        if autopilot.firmware.is_ground_station(0, message.system, read):
+            autopilot.sticks.override(widths_us, autopilot.senses.time_s)
+
     def _log_request_list(self, _: Message) -> None:
         """There are none."""
         self.outbox.send("LOG_ENTRY", 0, 0, 0, 0, 0)
@@ -194,6 +212,8 @@ HANDLERS: dict[str, Callable[[Server, Message], None]] = {
     "TIMESYNC": Server._timesync,
     "PING": Server._ping,
     **dict.fromkeys(PARAMETER_HANDLERS, Server._parameter),
+    "RC_CHANNELS_OVERRIDE": Server._rc_channels_override,
+    "MANUAL_CONTROL": Server._manual_control,
     "LOG_REQUEST_LIST": Server._log_request_list,
     "REQUEST_DATA_STREAM": Server._request_data_stream,
     "FILE_TRANSFER_PROTOCOL": Server._file_transfer,

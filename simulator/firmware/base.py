@@ -14,6 +14,7 @@ from enum import Enum, IntEnum
 from typing import Any, Literal
 
 from simulator.battery import BatteryState
+from simulator.sticks import Handling
 
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
@@ -340,7 +341,8 @@ class Firmware:
     setpoint_decides_flight: bool  # any thrust is flight; the land detector rests meanwhile
     setpoint_spool_s: float  # from arming until a setpoint's thrust acts
     stream_reaction_s: float  # from the stream's time-out until it counts as lost
-    descend_speed_mps: float
+    descend_speed_mps: float  # where sticks are missed
+    handling: Handling | None  # by sticks; None: it has none
     landing: Landing
     gains: Callable[[ReadParameter], PositionGains]
     return_height_m: Callable[[float, ReadParameter], float]  # above home, by the distance to it

@@ -35,6 +35,7 @@ from simulator.firmware.base import (
     Result,
     Sensors,
 )
+from simulator.sticks import Handling
 
 RETURN_LEAST_M = 2.0  # RTL_ALT_MIN
 
@@ -90,6 +91,17 @@ def obeys_system(sender: int, own: int, parameter: ReadParameter) -> bool:
     return not parameter("SYSID_ENFORCE") or sender in (own, parameter("SYSID_MYGCS"))
 
 
+HANDLING = Handling(
+    # throttle down, mode switch and others as SITL has them
+    feigned=(1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800),
+    climb_mps=2.5,  # PILOT_SPEED_UP
+    turn_radps=math.radians(202.5),  # PILOT_Y_RATE
+    speed_mps=12.5,  # LOIT_SPEED
+    acceleration_mps2=3.57,  # of two thirds of ANGLE_MAX
+    braking_mps2=2.5,  # LOIT_BRK_ACCEL
+    braking_after_s=1.0,  # LOIT_BRK_DELAY
+)
+
 ARDUPILOT = Firmware(
     name="ardupilot",
     vehicle="arducopter",
@@ -144,7 +156,8 @@ ARDUPILOT = Firmware(
     setpoint_decides_flight=True,
     setpoint_spool_s=2.8,
     stream_reaction_s=0.0,
-    descend_speed_mps=2.4,  # LOITER with the throttle stick down
+    descend_speed_mps=2.4,
+    handling=HANDLING,
     landing=Landing(
         low_thrust_share=1.0,
         idle_thrust_share=math.inf,

@@ -16,8 +16,6 @@ from simulator.view import View
 # EKF_STATUS_FLAGS from a boot event on
 _EKF_FLAGS = (("position", 831), ("attitude", 167), ("aligning", 0))
 _EKF_UNINITIALISED = 1024
-# The sticks that SITL feigns: throttle down, mode switch
-_STICKS = (1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800)
 _PWM_LEAST, _PWM_SPAN = 1000, 1000
 
 
@@ -86,8 +84,10 @@ def servo_output_raw(view: View) -> Sequence[Any]:
 
 
 def rc_channels(view: View) -> Sequence[Any]:
-    """RC_CHANNELS: sticks that nobody touches."""
-    return (view.time_ms, len(_STICKS), *_STICKS, *(0,) * (18 - len(_STICKS)), 255)
+    """RC_CHANNELS: what SITL feigns, and who overrides it."""
+    sticks, now_s = view.autopilot.sticks, view.autopilot.senses.time_s
+    widths_us = () if sticks is None else sticks.widths_us(now_s)
+    return (view.time_ms, len(widths_us), *widths_us, *(0,) * (18 - len(widths_us)), 255)
 
 
 def scaled_imu2(view: View) -> Sequence[Any]:

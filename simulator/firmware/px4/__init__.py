@@ -146,6 +146,7 @@ PX4 = Firmware(
     setpoint_spool_s=0.0,
     stream_reaction_s=0.036,
     descend_speed_mps=0.6,
+    handling=None,
     landing=Landing(
         low_thrust_share=0.95,  # of estimates that wander on the ground, too
         idle_thrust_share=0.1,
