@@ -12,14 +12,10 @@ from collections.abc import Mapping
 from typing import Any
 
 from simulator.commander import NOTHING, Commander, Wish
-from simulator.firmware.base import (
-    AttitudeSetpoint,
-    Behaviour,
-    Firmware,
-    MotionSetpoint,
-    Result,
-    Triple,
-)
+from simulator.firmware.base import Firmware
+from simulator.firmware.modes import Behaviour
+from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint
+from simulator.firmware.vocabulary import Result, Triple
 from simulator.health import Health
 from simulator.mission import Mission
 from simulator.nav import Senses
@@ -50,14 +46,14 @@ class Autopilot:
         self.firmware = firmware
         self.plant = plant
         self.parameters = parameters or ParameterTable(firmware)
-        self.mission = mission or Mission(firmware.origin, firmware.mission_first)
+        self.mission = mission or Mission(firmware.origin, int(firmware.missions.home_first))
         self.senses = Senses(plant)
         self.watch = Watch(firmware, self.parameters)
         self.stream = SetpointStream(firmware, self.parameters)
         self.health = Health(
             firmware, self.parameters, self.mission, self.stream, self.watch, boot_scale
         )
-        self.sticks = None if firmware.handling is None else Sticks(firmware.handling)
+        self.sticks = None if firmware.flight.handling is None else Sticks(firmware.flight.handling)
         self.navigator = Navigator(firmware, self.parameters, self.mission, self.sticks)
         self.pilot = Pilot(firmware, self.parameters, self.navigator)
         self.commander = Commander(
@@ -76,7 +72,7 @@ class Autopilot:
     def obey(self, message: str, values: Mapping[str, Any]) -> None:
         """A setpoint message, by its name in `simulator.setpoints`, and its fields."""
         mode = self.commander.mode
-        outlives = self.firmware.setpoints_outlive_modes
+        outlives = self.firmware.setpoints.outlive_modes
         if not (outlives or mode.behaviour is Behaviour.SETPOINT):
             return
         if message == ATTITUDE:

@@ -11,18 +11,10 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from simulator.airtime import Airtime
-from simulator.firmware.base import (
-    AT_LAST,
-    NAN3,
-    Behaviour,
-    Condition,
-    Firmware,
-    Mode,
-    Result,
-    Rule,
-    Say,
-    Triple,
-)
+from simulator.firmware.base import Firmware
+from simulator.firmware.modes import Behaviour, Condition, Mode
+from simulator.firmware.rules import AT_LAST, Rule
+from simulator.firmware.vocabulary import NAN3, Result, Say, Triple
 from simulator.health import Health
 from simulator.nav import Senses
 from simulator.navigator import Navigator
@@ -184,7 +176,7 @@ class Commander:
             self._intended = name
             if mode.remembered:
                 self._remembered = name
-        if mode is not self.mode and not self._firmware.setpoints_outlive_modes:
+        if mode is not self.mode and not self._firmware.setpoints.outlive_modes:
             self._navigator.setpoint = None
         if mode is not self.mode or mode.behaviour not in _GO_ON:
             self._pilot.enter(mode.behaviour, self._senses.look(), self._wish.takeoff_ned_m)

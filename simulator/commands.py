@@ -13,7 +13,9 @@ from dataclasses import dataclass
 from simulator.autopilot import Autopilot
 from simulator.codec import id_of, name_of
 from simulator.commander import Wish
-from simulator.firmware.base import Behaviour, ModeRequest, Result, Say, Severity, Triple
+from simulator.firmware.commands import ModeRequest
+from simulator.firmware.modes import Behaviour
+from simulator.firmware.vocabulary import Result, Say, Severity, Triple
 from simulator.geodesy import down_m, to_metres
 from simulator.outbox import Outbox
 from simulator.schedule import Schedule
@@ -47,7 +49,7 @@ class Commands:
 
     def run(self, command: Command) -> None:
         """Carry out and acknowledge, on the same link."""
-        answers = self._autopilot.firmware.command_answers
+        answers = self._autopilot.firmware.commands.answers
         result: Result | None
         if command.number in answers:
             result = answers[command.number]
@@ -61,10 +63,10 @@ class Commands:
     def set_mode(self, base_mode: int, custom_mode: int, sender: tuple[int, int]) -> None:
         """SET_MODE, the message that came before the command."""
         firmware = self._autopilot.firmware
-        request = firmware.set_mode(base_mode, custom_mode)
+        request = firmware.commands.set_mode(base_mode, custom_mode)
         result = self._request(request, sender[1] == _MISSION_PLANNER)
-        if firmware.set_mode_acked_as is not None:
-            self._acknowledge(Command(firmware.set_mode_acked_as, (), *sender), result)
+        if firmware.commands.set_mode_acked_as is not None:
+            self._acknowledge(Command(firmware.commands.set_mode_acked_as, (), *sender), result)
 
     def _acknowledge(self, command: Command, result: Result) -> None:
         self.outbox.send(
@@ -73,10 +75,10 @@ class Commands:
 
     def _set_mode(self, command: Command) -> Result:
         autopilot = self._autopilot
-        if autopilot.firmware.mode_acked_twice:
+        if autopilot.firmware.commands.mode_acked_twice:
             self._acknowledge(command, Result.ACCEPTED)
         by_planner = command.component == _MISSION_PLANNER
-        return self._request(autopilot.firmware.command_mode(command.params), by_planner)
+        return self._request(autopilot.firmware.commands.mode(command.params), by_planner)
 
     def _request(self, request: ModeRequest, by_planner: bool) -> Result:
         autopilot = self._autopilot
@@ -88,18 +90,18 @@ class Commands:
 
     def _arm_disarm(self, command: Command) -> Result | None:
         autopilot = self._autopilot
-        wish = autopilot.firmware.arm_wish(command.params[0])
+        wish = autopilot.firmware.commands.arm_wish(command.params[0])
         if not wish.event:
             autopilot.commander.texts += () if wish.say is None else (wish.say,)
             return wish.refusal
-        forced = command.params[1] == autopilot.firmware.force_codes[wish.event]
+        forced = command.params[1] == autopilot.firmware.commands.force_codes[wish.event]
         return autopilot.happen(f"force {wish.event}" if forced else wish.event)
 
     def _takeoff(self, command: Command) -> Result:
         asked_m = command.params[6]
         autopilot = self._autopilot
         home_down_m = autopilot.navigator.home_ned_m[2]
-        if autopilot.firmware.takeoff_above_home:
+        if autopilot.firmware.commands.takeoff_above_home:
             down_m = home_down_m - asked_m
             return autopilot.happen("takeoff", Wish(takeoff_ned_m=(math.nan, math.nan, down_m)))
         place = to_metres(autopilot.firmware.origin, *command.params[4:6])
@@ -139,7 +141,7 @@ class Commands:
             return Result.UNSUPPORTED
         autopilot = self._autopilot
         yaw_rad, latitude, longitude, height_m = command.params[3:7]
-        strictly = autopilot.firmware.repositions_strictly
+        strictly = autopilot.firmware.commands.repositions_strictly
         speed_mps = math.inf if strictly or not command.params[0] > 0.0 else command.params[0]
         if strictly:
             if command.frame is None:
@@ -147,7 +149,7 @@ class Commands:
             if not (latitude or longitude):
                 return Result.DENIED
             yaw_rad = math.nan
-        result = autopilot.happen("mode", Wish(autopilot.firmware.reposition_mode))
+        result = autopilot.happen("mode", Wish(autopilot.firmware.commands.reposition_mode))
         if result is Result.ACCEPTED and autopilot.commander.armed:
             yaw_rad = yaw_rad if math.isfinite(yaw_rad) else math.nan
             place = self._place(latitude, longitude, height_m, command.frame or 0)
@@ -184,7 +186,7 @@ class Commands:
             return Result.ACCEPTED
         known = 0.0 < speed_mps < math.inf
         autopilot.navigator.cruise_mps = speed_mps if known else math.inf
-        return Result.ACCEPTED if known else autopilot.firmware.speed_refusal
+        return Result.ACCEPTED if known else autopilot.firmware.commands.speed_refusal
 
     def _turn(self, command: Command) -> Result:
         """To a course, or by so much: degrees."""

@@ -9,7 +9,10 @@ import math
 from dataclasses import dataclass, field
 from enum import Enum
 
-from simulator.firmware.base import Firmware, Heads, MotionSetpoint, Triple
+from simulator.firmware.base import Firmware
+from simulator.firmware.flight import Heads
+from simulator.firmware.setpoints import MotionSetpoint
+from simulator.firmware.vocabulary import Triple
 from simulator.nav import Nav
 from simulator.parameters import ParameterTable
 
@@ -66,8 +69,8 @@ class Return:
         distance_m = math.hypot(x - home_x, y - home_y)
         if self.stage is Stage.BEGIN:
             read = self.parameters.__getitem__
-            height_m = self.firmware.return_height_m(distance_m, read)
-            self._heads = self.firmware.return_heads(distance_m, read)
+            height_m = self.firmware.flight.return_height_m(distance_m, read)
+            self._heads = self.firmware.flight.return_heads(distance_m, read)
             self.place = (x, y, min(z, home_z - height_m))
             self._go(Stage.CLIMB, "return begun")
         if self.stage is Stage.CLIMB and z < self.place[2] + _ARRIVED_M:

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.base import MotionSetpoint, Quaternion, Triple
+from simulator.firmware.setpoints import MotionSetpoint
+from simulator.firmware.vocabulary import Quaternion, Triple
 
 _RANGES = {
     (bits, signed): (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)

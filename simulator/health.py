@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.base import Behaviour, Firmware, Mode
+from simulator.firmware.base import Firmware
+from simulator.firmware.modes import Behaviour, Mode
 from simulator.mission import Mission
 from simulator.parameters import ParameterTable
 from simulator.setpoints import SetpointStream
@@ -30,9 +31,9 @@ class Health:
         self._stream, self._watch = stream, watch
         self.scale = scale
         self.reached: frozenset[str] = frozenset()  # events of the start
-        self._ahead = sorted((at_s * scale, event) for event, at_s in firmware.boot.items())
-        checks_s = (firmware.healthy_after_s, firmware.healthy_without_position_after_s)
-        grows_s = (*firmware.boot.values(), *checks_s, firmware.sensors.first_fix_s)
+        self._ahead = sorted((at_s * scale, event) for event, at_s in firmware.health.boot.items())
+        checks_s = (firmware.health.passes_after_s, firmware.health.passes_without_position_after_s)
+        grows_s = (*firmware.health.boot.values(), *checks_s, firmware.health.sensors.first_fix_s)
         self._growth_s = [at_s * scale for at_s in grows_s]
         self._grown_up_s = max(self._growth_s)
 
@@ -52,18 +53,18 @@ class Health:
 
     def has_fix(self, now_s: float) -> bool:
         """GPS reports a position, unless a fault takes it away."""
-        return now_s >= self._firmware.sensors.first_fix_s * self.scale
+        return now_s >= self._firmware.health.sensors.first_fix_s * self.scale
 
     def passes(self, mode: Mode, now_s: float, *, latched: bool) -> bool:
         """The pre-arm checks pass, for the mode that was chosen; `latched`: something is wrong
         until a reboot."""
         firmware = self._firmware
-        after_s = firmware.healthy_without_position_after_s
+        after_s = firmware.health.passes_without_position_after_s
         if mode.needs_position:
-            after_s = firmware.healthy_after_s
-        waits = firmware.setpoint_mode_needs_stream and mode.behaviour is Behaviour.SETPOINT
+            after_s = firmware.health.passes_after_s
+        waits = firmware.setpoints.mode_needs_stream and mode.behaviour is Behaviour.SETPOINT
         booted = now_s >= after_s * self.scale and not latched
-        if firmware.unhealthy_where_unarmable and not mode.arms:
+        if firmware.health.fails_where_unarmable and not mode.arms:
             return False
         if self._watch.ground_station_lost and self._parameters.role("ground_station_needed") > 0:
             return False

@@ -15,7 +15,8 @@ from simulator import faults
 from simulator.autopilot import Autopilot
 from simulator.commander import Wish
 from simulator.faults import Direction, Fault, Moment, Refusable
-from simulator.firmware.base import Behaviour, Say, Severity
+from simulator.firmware.modes import Behaviour
+from simulator.firmware.vocabulary import Say, Severity
 from simulator.impairment import Channel, Path
 from simulator.steps import STEP_S
 from simulator.view import Stuck, View

@@ -61,17 +61,17 @@ class Instance:
         self.view = View(self.autopilot, system, epoch_us, builders(firmware))
         self._strict = Strict(system, self.autopilot.parameters) if strict else None
         self.companion = Server(
-            self.view, firmware.companion_rates_hz, barrier=lockstep, strict=self._strict
+            self.view, firmware.streams.companion_rates_hz, barrier=lockstep, strict=self._strict
         )
         self.ground = Server(
-            self.view, firmware.ground_rates_hz if ground_link else {}, strict=self._strict
+            self.view, firmware.streams.ground_rates_hz if ground_link else {}, strict=self._strict
         )
         self._stretch = Stretch(self.view, (self.companion, self.ground))
         self.steps = 0
         self._injection = prepare(faults, seed)
         self._arrived: list[bytes] = []
         self._barrier_ms = 0
-        self._position_interval_ms = firmware.position_grid_steps * STEP_MS
+        self._position_interval_ms = firmware.streams.position_grid_steps * STEP_MS
         self._back_at_step = 0
 
     @property

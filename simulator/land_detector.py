@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from simulator.firmware.base import Landing
+from simulator.firmware.flight import Landing
 from simulator.nav import Nav
 from simulator.parameters import ParameterTable
 

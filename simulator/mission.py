@@ -11,7 +11,9 @@ import math
 from dataclasses import dataclass, field
 from enum import IntEnum
 
-from simulator.firmware.base import NAN3, MissionItem, MotionSetpoint, Triple
+from simulator.firmware.missions import MissionItem
+from simulator.firmware.setpoints import MotionSetpoint
+from simulator.firmware.vocabulary import NAN3, Triple
 from simulator.geodesy import GLOBAL_FRAMES, RELATIVE_FRAMES, Origin, down_m, to_metres
 
 ITEMS_MAX = 500

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from simulator.codec import Message
-from simulator.firmware.base import MissionRules, Say, Severity
+from simulator.firmware.missions import MissionRules
+from simulator.firmware.vocabulary import Say, Severity
 from simulator.mission import ITEMS_MAX, Item, Kind, Mission
 from simulator.outbox import Outbox
 from simulator.texts import Texts

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from simulator.firmware.base import Quaternion, Triple
+from simulator.firmware.vocabulary import Quaternion, Triple
 from simulator.plant import Plant, Truth
 from simulator.steps import STEP_S, STEP_US
 

@@ -10,15 +10,10 @@ import math
 from dataclasses import replace
 
 from simulator.descent import Return, land_speed_mps, sink
-from simulator.firmware.base import (
-    NAN3,
-    AttitudeSetpoint,
-    Behaviour,
-    Firmware,
-    MotionSetpoint,
-    Quaternion,
-    Triple,
-)
+from simulator.firmware.base import Firmware
+from simulator.firmware.modes import Behaviour
+from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint
+from simulator.firmware.vocabulary import NAN3, Quaternion, Triple
 from simulator.mission import Mission
 from simulator.nav import Nav
 from simulator.parameters import ParameterTable
@@ -170,7 +165,7 @@ class Navigator:
     @property
     def automatic(self) -> bool:
         """Speeds and turns are those of automatic flight."""
-        return self.behaviour is not Behaviour.SETPOINT or self._firmware.setpoints_as_automatic
+        return self.behaviour is not Behaviour.SETPOINT or self._firmware.setpoints.as_automatic
 
     @property
     def across_mps(self) -> float:
@@ -215,10 +210,10 @@ class Navigator:
     def _by_sticks(self, nav: Nav, time_s: float, *, landed: bool) -> MotionSetpoint:
         """What they ask for; what none of them asks for stays as it is."""
         if self._sticks is None:
-            return sink(self._hold, self._firmware.descend_speed_mps)
+            return sink(self._hold, self._firmware.flight.descend_speed_mps)
         across, change, climb_mps, turn_radps = self._sticks.ask(time_s, nav.yaw_rad)
         if landed and climb_mps <= 0.0:
-            return sink(self._hold, self._firmware.descend_speed_mps)
+            return sink(self._hold, self._firmware.flight.descend_speed_mps)
         (x, y, z), ahead = self._hold, _ahead(nav)
         moves = math.hypot(*across) > _STILL_MPS
         x, y = ahead[:2] if moves else (x, y)

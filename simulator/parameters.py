@@ -10,7 +10,8 @@ import struct
 import zlib
 from collections.abc import Mapping
 
-from simulator.firmware.base import Firmware, ParameterSpec, Role
+from simulator.firmware.base import Firmware
+from simulator.firmware.parameters import ParameterSpec, Role
 
 HASH = "_HASH_CHECK"  # a parameter that is none: what all values come to
 MAV_PARAM_TYPE_UINT32 = 5
@@ -26,7 +27,7 @@ class ParameterTable:
         self._specs = {spec.name: spec for spec in firmware.parameters}
         self._values = {spec.name: spec.default for spec in firmware.parameters}
         self._roles: Mapping[str, Role] = firmware.parameter_roles
-        self._bytewise = firmware.parameters_bytewise
+        self._bytewise = firmware.link.parameters_bytewise
         self.names = tuple(self._specs)
         self.changes = 0
 

@@ -11,15 +11,10 @@ import math
 from collections.abc import Callable
 
 from simulator.attitude import Demand
-from simulator.firmware.base import (
-    NAN3,
-    AttitudeSetpoint,
-    Behaviour,
-    Firmware,
-    MotionSetpoint,
-    Quaternion,
-    Triple,
-)
+from simulator.firmware.base import Firmware
+from simulator.firmware.modes import Behaviour
+from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint
+from simulator.firmware.vocabulary import NAN3, Quaternion, Triple
 from simulator.land_detector import LandDetector
 from simulator.nav import Nav
 from simulator.navigator import Navigator, level
@@ -43,8 +38,8 @@ class Pilot:
         self._parameters = parameters
         self._navigator = navigator
         self._tuned = parameters.changes
-        self.loop = PositionLoop(firmware.gains(parameters.__getitem__))
-        self._detector = LandDetector(firmware.landing, parameters)
+        self.loop = PositionLoop(firmware.flight.gains(parameters.__getitem__))
+        self._detector = LandDetector(firmware.flight.landing, parameters)
         self._takeoff = Takeoff(parameters)
         self.demand = OFF  # in force
         self.thrust_demanded = 0.0  # before it is raised for the tilt
@@ -119,7 +114,7 @@ class Pilot:
     def _tune(self) -> None:
         if self._tuned != self._parameters.changes:
             self._tuned = self._parameters.changes
-            self.loop.tune(self._firmware.gains(self._parameters.__getitem__))
+            self.loop.tune(self._firmware.flight.gains(self._parameters.__getitem__))
 
     def flies_itself(self, step: int, armed: bool, on_ground: bool) -> bool:
         """Whether `fly` will from this step on do no more than demand the attitude asked for, or
@@ -187,7 +182,7 @@ class Pilot:
     def _command(self, setpoint: AttitudeSetpoint, look: Callable[[], Nav]) -> None:
         """Its attitude or rates, and its thrust as this firmware takes it."""
         thrust = setpoint.thrust if setpoint.climb_mps is None else self._climb_thrust
-        if self._armed_for_s < self._firmware.setpoint_spool_s:
+        if self._armed_for_s < self._firmware.setpoints.spool_s:
             thrust = 0.0
         self.thrust_demanded = thrust
         if self._boosts_thrust:
@@ -267,7 +262,7 @@ class Pilot:
 
     def _detect(self, setpoint: AttitudeSetpoint | None, nav: Nav) -> None:
         was_landed = self.landed
-        if setpoint is not None and self._firmware.setpoint_decides_flight:
+        if setpoint is not None and self._firmware.setpoints.decide_flight:
             self._detector.rest()
             if self.thrust_demanded > 0.0:
                 self._detector.lift_off()
@@ -283,7 +278,7 @@ class Pilot:
     @property
     def _sinks(self) -> bool:
         """It was told to go down; where a place below is as good as a speed, by that too."""
-        landing = self._firmware.landing
+        landing = self._firmware.flight.landing
         told = self.motion.velocity_ned_mps[2] >= landing.sinking_mps
         return told or (landing.place_below_is_descent and self._wanted_z_mps > landing.sinking_mps)
 

@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.model.kernel import address, entry, kernel
-from simulator.firmware.base import NAN3, MotionSetpoint, PositionGains, Quaternion, Triple
+from simulator.firmware.flight import PositionGains
+from simulator.firmware.setpoints import MotionSetpoint
+from simulator.firmware.vocabulary import NAN3, Quaternion, Triple
 from simulator.steps import LOOP_S
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ import numpy as np
 from offboard.model.kernel import address
 from simulator.attitude import Demand
 from simulator.fields import motion_fields
-from simulator.firmware.base import MotionSetpoint
+from simulator.firmware.setpoints import MotionSetpoint
 from simulator.view import View
 
 # What changes now and then; `sensors`: MAV_SYS_STATUS_SENSOR bits, present, enabled, healthy

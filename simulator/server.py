@@ -109,16 +109,18 @@ class Server:
         """To our system or all, to the autopilot or all of it."""
         system = message.values.get("target_system", 0)
         component = message.values.get("target_component", 0)
-        checked = self.view.autopilot.firmware.target_component_checked
+        checked = self.view.autopilot.firmware.link.target_component_checked
         for_autopilot = component in (0, MAV_COMP_ID_AUTOPILOT) or not checked
         read = self.view.autopilot.parameters.__getitem__
-        obeyed = self.view.autopilot.firmware.obeys_system(message.system, self.view.system, read)
+        obeyed = self.view.autopilot.firmware.link.obeys_system(
+            message.system, self.view.system, read
+        )
         return system in (0, self.view.system) and for_autopilot and obeyed
 
     def _heartbeat(self, message: Message) -> None:
         autopilot = self.view.autopilot
         read = autopilot.parameters.__getitem__
-        if autopilot.firmware.is_ground_station(message.type, message.system, read):
+        if autopilot.firmware.link.is_ground_station(message.type, message.system, read):
             autopilot.watch.hear_ground_station(autopilot.senses.time_s)
             self.texts.hear_ground_station()
 
@@ -182,7 +184,7 @@ class Server:
         read = autopilot.parameters.__getitem__
         if autopilot.sticks is None:
             return
-        if autopilot.firmware.is_ground_station(0, message.system, read):
+        if autopilot.firmware.link.is_ground_station(0, message.system, read):
             autopilot.sticks.override(widths_us, autopilot.senses.time_s)
 
     def _log_request_list(self, _: Message) -> None:

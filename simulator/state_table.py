@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from simulator.firmware.base import Firmware, Result, Rule
+from simulator.firmware.base import Firmware
+from simulator.firmware.rules import Rule
+from simulator.firmware.vocabulary import Result
 
 
 class StateTable:

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+
+from simulator.firmware.flight import Handling
 
 KEEP, GIVE_BACK = 65535, 0  # RC_CHANNELS_OVERRIDE: this channel is left alone, or given back
 OVERRIDE_S = 3.0  # RC_OVERRIDE_TIME
@@ -15,20 +16,6 @@ _MIDDLE_US, _HALF_WAY_US = 1500, 500
 _LEAST_S, _LONGEST_S = 1e-3, 0.1  # between two looks at them
 Pair = tuple[float, float]
 _DEAD_US, _DEAD_THROTTLE = 20, 0.2  # about the middle: RCx_DZ; THR_DZ
-
-
-@dataclass(frozen=True, slots=True)
-class Handling:
-    """How a firmware flies by sticks; `feigned`: pulse widths, us, of roll, pitch, throttle, yaw
-    and further channels."""
-
-    feigned: tuple[int, ...]
-    climb_mps: float  # at the ends of the throttle's way, up and down
-    turn_radps: float
-    speed_mps: float  # that no stick exceeds
-    acceleration_mps2: float  # of a stick at its end
-    braking_mps2: float  # once no stick asks for anything
-    braking_after_s: float
 
 
 class Sticks:

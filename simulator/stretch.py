@@ -143,7 +143,7 @@ class Stretch:
         view = self._view
         self._hand_back()
         firmware = view.autopilot.firmware
-        withheld = {name for name in firmware.withheld_until if view.withheld(name)}
+        withheld = {name for name in firmware.streams.withheld_until if view.withheld(name)}
         rows = []
         for number, link in enumerate(self._links):
             link.schedule.changed = False
@@ -153,7 +153,7 @@ class Stretch:
                     kind = _SILENT
                 elif name not in view.stuck and _is_common(view, name):
                     kind = KINDS.index(name)
-                grid = firmware.position_grid_steps if name in ON_POSITION_GRID else 1
+                grid = firmware.streams.position_grid_steps if name in ON_POSITION_GRID else 1
                 rows.append((number, kind, stream.interval_us, stream.due_us, grid))
                 self._streams.append((name, stream))
         self._rows[: len(rows)] = np.array(rows, np.int64).reshape(-1, 5)

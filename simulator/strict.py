@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from simulator.codec import Message
-from simulator.firmware.base import Say, Severity
+from simulator.firmware.vocabulary import Say, Severity
 from simulator.parameters import ParameterTable
 
 AUTOPILOT = 1  # MAV_COMP_ID

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from simulator.firmware.base import Say
+from simulator.firmware.vocabulary import Say
 from simulator.outbox import Outbox
 
 KEPT_US = 5_000_000
@@ -32,12 +32,12 @@ class Texts:
     def say(self, said: Say) -> None:
         """Queue a text, if this link gets any."""
         firmware = self.outbox.view.autopilot.firmware
-        if firmware.text_to_ground_stations_only and not self._ground_station_is_there:
+        if firmware.link.text_to_ground_stations_only and not self._ground_station_is_there:
             self._kept.append((self._now_us, said))
             return
         if not self.heard:
             return
-        text = (said.text + firmware.text_suffix).encode("ascii", "replace")
+        text = (said.text + firmware.link.text_suffix).encode("ascii", "replace")
         for chunk, at in enumerate(range(0, len(text), LENGTH)):
             piece = text[at : at + LENGTH]
             self.outbox.send("STATUSTEXT", int(said.severity), piece, self._number, chunk)
@@ -53,7 +53,7 @@ class Texts:
 
     @property
     def _ground_station_is_there(self) -> bool:
-        stays_us = self.outbox.view.autopilot.firmware.ground_station_stays_s * 1e6
+        stays_us = self.outbox.view.autopilot.firmware.link.ground_station_stays_s * 1e6
         return self._now_us - self._ground_station_us <= stays_us
 
     @property

@@ -53,7 +53,7 @@ class View:
     def withheld(self, name: str) -> bool:
         """What the vehicle cannot say yet, whatever rate it granted."""
         autopilot = self.autopilot
-        event = autopilot.firmware.withheld_until.get(name)
+        event = autopilot.firmware.streams.withheld_until.get(name)
         return event is not None and event not in autopilot.health.reached
 
     def payload(self, name: str) -> bytes:
@@ -85,7 +85,7 @@ class View:
     def sensor_bits(self) -> tuple[int, int, int]:
         """MAV_SYS_STATUS_SENSOR: present, enabled, healthy."""
         autopilot = self.autopilot
-        sensors = autopilot.firmware.sensors
+        sensors = autopilot.firmware.health.sensors
         present, enabled, health = sensors.present, sensors.enabled, sensors.health
         if not autopilot.health.has_fix(autopilot.senses.time_s):
             present, enabled, health = present & ~_GPS, enabled & ~_GPS, health & ~_GPS

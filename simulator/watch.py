@@ -23,7 +23,7 @@ class Watch:
     parameters: ParameterTable
     _ground_station_s: float = math.nan  # last heard
     _ground_station_lost: bool = False
-    _battery_level: int = 0  # of `firmware.battery_events`, already told
+    _battery_level: int = 0  # of `firmware.health.battery_events`, already told
     _worse_s: float = math.nan  # since when it is worse than that
     _fix_s: float = 0.0
     _position_lost: bool = False
@@ -55,7 +55,7 @@ class Watch:
         if not (self._ground_station_lost or math.isnan(self._ground_station_s)):
             until_s = self._ground_station_s + self._patience_s
         if not has_fix and not self._position_lost:
-            until_s = min(until_s, self._fix_s + self.firmware.position_without_fix_s)
+            until_s = min(until_s, self._fix_s + self.firmware.health.position_without_fix_s)
         return now_s if has_fix and self._position_lost else until_s
 
     def calm_with(self, battery: BatteryState) -> bool:
@@ -66,14 +66,14 @@ class Watch:
     def _patience_s(self) -> float:
         """From a ground station's last heartbeat until it is lost."""
         timeout_s = self.parameters.role("ground_station_timeout_s")
-        return timeout_s + self.firmware.ground_station_stays_s
+        return timeout_s + self.firmware.link.ground_station_stays_s
 
     def _silent(self, now_s: float) -> bool:
         """The ground station has been for too long; never heard is not lost."""
         return now_s - self._ground_station_s > self._patience_s
 
     def _level(self, battery: BatteryState) -> int:
-        return self.firmware.battery_level(battery, self.parameters.__getitem__)
+        return self.firmware.health.battery_level(battery, self.parameters.__getitem__)
 
     def passed(self, now_s: float, has_fix: bool) -> None:
         """A step in which there was nothing to tell."""
@@ -101,12 +101,12 @@ class Watch:
         if now_s - self._worse_s < self.parameters.role("battery_patience_s"):
             return []
         self._battery_level, self._worse_s = level, math.nan
-        return [self.firmware.battery_events[level - 1]]
+        return [self.firmware.health.battery_events[level - 1]]
 
     def _position(self, now_s: float, has_fix: bool) -> list[str]:
         if has_fix:
             self._fix_s = now_s
-        lost = now_s - self._fix_s > self.firmware.position_without_fix_s
+        lost = now_s - self._fix_s > self.firmware.health.position_without_fix_s
         if lost == self._position_lost:
             return []
         self._position_lost = lost

@@ -12,7 +12,9 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.control.base import Command, Controller, Decision, Situation
 from simulator import config
-from simulator.firmware.base import Firmware, Result, Rule, Say, Severity
+from simulator.firmware.base import Firmware
+from simulator.firmware.rules import Rule
+from simulator.firmware.vocabulary import Result, Say, Severity
 from simulator.instance import Instance
 
 HEARTBEAT, ATTITUDE, POSITION, PARAM_VALUE = 0, 31, 32, 22
@@ -39,9 +41,12 @@ def with_default(name: str, value: float) -> Firmware:
 def slow(rate_hz: float) -> Firmware:
     """A vehicle that sends its state at `rate_hz` whatever it is asked for."""
     state = ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
-    rates = {name: rate_hz if name in state else hz for name, hz in LEAN.companion_rates_hz.items()}
-    streams = replace(LEAN.streams, fixed=LEAN.streams.fixed | frozenset(state))
-    return replace(LEAN, companion_rates_hz=rates, streams=streams)
+    asked = LEAN.streams.companion_rates_hz
+    rates = {name: rate_hz if name in state else hz for name, hz in asked.items()}
+    streams = replace(
+        LEAN.streams, companion_rates_hz=rates, fixed=LEAN.streams.fixed | frozenset(state)
+    )
+    return replace(LEAN, streams=streams)
 
 
 # --- links ----------------------------------------------------------------------------------------

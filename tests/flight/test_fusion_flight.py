@@ -17,11 +17,9 @@ from simulator.firmware.px4 import PX4
 LQR = "controller={law: lqr}"
 FUSED = ("estimate=fused", LQR)
 SEEDS = (1, 2, 3, 4, 5)
-WITH_RECEIVER = replace(
-    LEAN,
-    companion_rates_hz=LEAN.companion_rates_hz
-    | {"GPS_RAW_INT": PX4.companion_rates_hz["GPS_RAW_INT"]},
-)
+FIXES_HZ = {"GPS_RAW_INT": PX4.streams.companion_rates_hz["GPS_RAW_INT"]}
+RATES_HZ = {**LEAN.streams.companion_rates_hz, **FIXES_HZ}
+WITH_RECEIVER = replace(LEAN, streams=replace(LEAN.streams, companion_rates_hz=RATES_HZ))
 
 
 def flight(*assignments: str, **more: object) -> Pair:

@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from simulator.firmware.base import NAN3, MotionSetpoint, Quaternion, Triple
 from simulator.firmware.px4 import PX4
+from simulator.firmware.setpoints import MotionSetpoint
+from simulator.firmware.vocabulary import NAN3, Quaternion, Triple
 from simulator.parameters import ParameterTable
 from simulator.position_loop import GRAVITY_MPS2, Limits, PositionLoop
 
-GAINS = PX4.gains(ParameterTable(PX4).__getitem__)
+GAINS = PX4.flight.gains(ParameterTable(PX4).__getitem__)
 HOVER = Limits(hover_thrust=0.5)
 REST = (0.0, 0.0, 0.0)
 

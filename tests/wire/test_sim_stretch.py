@@ -17,8 +17,9 @@ from simulator.battery import Battery
 from simulator.codec import Decoder, frame, layout
 from simulator.conditions import Conditions
 from simulator.firmware.ardupilot import ARDUPILOT
-from simulator.firmware.base import Firmware, MotionSetpoint
+from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
+from simulator.firmware.setpoints import MotionSetpoint
 from simulator.frame_writer import KINDS
 from simulator.instance import Instance
 from simulator.schedule import Stream

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.base import MissionItem, MissionRules, Say, Severity
+from simulator.firmware.missions import MissionItem, MissionRules
+from simulator.firmware.vocabulary import Say, Severity
 
 _UNSUPPORTED_FRAME, _UNSUPPORTED = 2, 3  # MAV_MISSION_RESULT
 _SHOWN = {5: 0, 6: 3, 11: 10}  # MAV_FRAME: without INT

@@ -1,20 +1,9 @@
-"""ArduCopter's flight modes, the command that asks for them, and what a heartbeat shows."""
+"""ArduCopter's flight modes, and what a heartbeat shows."""
 
 from __future__ import annotations
 
-import math
-
-from simulator.firmware.base import (
-    ArmWish,
-    AttitudeSetpoint,
-    Behaviour,
-    Condition,
-    Mode,
-    ModeRequest,
-    Result,
-    Say,
-    Severity,
-)
+from simulator.firmware.modes import Behaviour, Condition, Mode
+from simulator.firmware.setpoints import AttitudeSetpoint
 
 # MAV_MODE_FLAG: 1 custom mode, 8 guided, 16 stabilise, 64 manual input. "Guided" shows whether
 # the position controller runs, not the mode.
@@ -68,56 +57,3 @@ def heartbeat(now: Condition) -> tuple[int, int]:
     if now.faulty or now.failsafe:
         return base_mode, 5
     return base_mode, 4 if now.armed and not now.landed else 3
-
-
-_CUSTOM_MODE_ENABLED = 1
-# Modes that it has and does not enter here, as it enters some only under conditions
-_NOT_ENTERED = {
-    **{
-        number: f"{title} failed: init failed"
-        for number, title in (
-            (14, "FLIP"),
-            (15, "AUTOTUNE"),
-            (22, "FLOWHOLD"),
-            (23, "FOLLOW"),
-            (25, "SYSTEMID"),
-            (28, "TURTLE"),
-        )
-    },
-    27: "AUTO RTL failed: No return path or landing sequence found",
-}
-_BY_NUMBER = {mode.custom_mode: mode.name for mode in MODES.values()}
-
-
-def command_mode(params: tuple[float, ...]) -> ModeRequest:
-    """MAV_CMD_DO_SET_MODE (176): param1 base mode, param2 the mode's number."""
-    base, number = (int(p) if math.isfinite(p) else 0 for p in params[:2])
-    if not base & _CUSTOM_MODE_ENABLED:
-        return ModeRequest(None, Result.DENIED)
-    known = _BY_NUMBER.get(number)
-    said = f"No such mode {number}"
-    if number in _NOT_ENTERED:
-        said = f"Mode change to {_NOT_ENTERED[number]}"
-    return ModeRequest(known, Result.FAILED, None if known else Say(Severity.WARNING, said))
-
-
-def set_mode(base_mode: int, custom_mode: int) -> ModeRequest:
-    """SET_MODE: the mode's number is custom_mode."""
-    return command_mode((base_mode, custom_mode))
-
-
-def arm_wish(param: float) -> ArmWish:
-    """1 arms, 0 disarms, anything else is not supported."""
-    if param in (0.0, 1.0):
-        return ArmWish("arm" if param else "disarm")
-    return ArmWish(refusal=Result.UNSUPPORTED)
-
-
-# Taken by their receivers, which change nothing that shows here, or failed without their devices
-_TAKEN = (181, 195, 197, 203, 206, 207, 208, 401, 2001, 5300, 42001, 42003, 42424)
-_FAILED = (84, 183, 184, 189, 193, 205, 211, 218, 500, 2000, 2500)
-COMMAND_ANSWERS: dict[int, Result | None] = {
-    **dict.fromkeys(_TAKEN, Result.ACCEPTED),
-    **dict.fromkeys(_FAILED, Result.FAILED),
-    532: Result.DENIED,
-}

@@ -1,26 +1,11 @@
-"""ArduCopter's state table: its start, what happens to it, and what it does and says then."""
+"""ArduCopter's state table: what happens to it, and what it does and says then."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 
-from simulator.firmware.base import Result, Rule, Say, Severity
-
-# Seconds after boot at which an event of this name happens
-BOOT = {
-    "barometer": 1.94,
-    "initialised": 2.47,
-    "estimator": 4.45,
-    "aligning": 5.40,
-    "tilt": 5.80,
-    "attitude": 5.90,
-    "gps": 9.83,
-    "origin": 20.02,
-    "other origin": 20.21,
-    "gyros": 24.0,
-    "reminder": 30.45,
-    "position": 41.61,
-}
+from simulator.firmware.rules import Rule
+from simulator.firmware.vocabulary import Result, Say, Severity
 
 
 def _info(text: str) -> Say:

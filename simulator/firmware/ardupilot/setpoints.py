@@ -6,13 +6,8 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from simulator.firmware.base import (
-    AttitudeSetpoint,
-    MotionSetpoint,
-    Quaternion,
-    ReadParameter,
-    Triple,
-)
+from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint, SetpointRules
+from simulator.firmware.vocabulary import Quaternion, ReadParameter, Triple
 
 _CENTI = 0.01
 _RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b111, 64, 128
@@ -132,3 +127,22 @@ def motion_setpoint(values: Mapping[str, Any]) -> MotionSetpoint | None:
         return None
     along = bool(mask & _YAW and mask & _YAW_RATE)
     return MotionSetpoint(position, velocity, acceleration, yaw, yaw_rate, along)
+
+
+def motion_complaint(message: str, frame: int | None) -> None:
+    """Nothing is said of a setpoint's frame."""
+
+
+SETPOINTS = SetpointRules(
+    attitude=attitude_setpoint,
+    motion=motion_setpoint,
+    in_local_frame=in_local_frame,
+    global_frames=frozenset({0, 3, 5, 6, 10, 11}),
+    complaint=motion_complaint,
+    mode_needs_stream=False,
+    as_automatic=True,
+    outlive_modes=False,
+    decide_flight=True,
+    spool_s=2.8,
+    reaction_s=0.0,
+)

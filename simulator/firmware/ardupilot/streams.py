@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from simulator.firmware.base import Result, Streams
+from simulator.firmware.ardupilot.messages import MESSAGES
+from simulator.firmware.streams import Streams
+from simulator.firmware.vocabulary import Result
 
-DEFAULT_RATES_HZ = {"HEARTBEAT": 1.0, "TIMESYNC": 0.1}
+COMPANION_RATES_HZ = GROUND_RATES_HZ = {"HEARTBEAT": 1.0, "TIMESYNC": 0.1}
 
 # MAV_DATA_STREAM
 _GROUPS = {
@@ -30,6 +32,18 @@ _IDLE = frozenset({
     259, 260, 262, 269, 271, 277, 280, 281, 285, 286, 295, 301, 373, 376, 9005,
 })  # fmt: skip
 STREAMS = Streams(
+    companion_rates_hz=COMPANION_RATES_HZ,
+    ground_rates_hz=GROUND_RATES_HZ,
+    own=MESSAGES,
+    unknown=frozenset(
+        {"ODOMETRY", "ESTIMATOR_STATUS", "HIL_STATE_QUATERNION", "ALTITUDE", "HIGHRES_IMU", "PING"}
+    ),
+    withheld_until={
+        "LOCAL_POSITION_NED": "position",
+        "GPS_GLOBAL_ORIGIN": "origin",
+        "HOME_POSITION": "origin",
+    },
+    position_grid_steps=1,
     fixed=frozenset({"TIMESYNC"}),
     by_itself=frozenset({"TIMESYNC"}),
     idle=_IDLE,

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.base import MissionItem, MissionRules, Say, Severity
+from simulator.firmware.missions import MissionItem, MissionRules
+from simulator.firmware.vocabulary import Say, Severity
 
 _ERROR, _UNSUPPORTED_FRAME, _UNSUPPORTED = 1, 2, 3  # MAV_MISSION_RESULT
 _COMMAND_FRAME = 2  # MAV_FRAME_MISSION: no place

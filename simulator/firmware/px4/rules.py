@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from simulator.firmware.base import AT_LAST, Result, Rule, Say, Severity
+from simulator.firmware.rules import AT_LAST, Rule
+from simulator.firmware.vocabulary import Result, Say, Severity
 
 
 def _info(text: str) -> Say:

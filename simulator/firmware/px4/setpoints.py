@@ -9,15 +9,8 @@ from typing import Any
 import numpy as np
 
 from offboard.model.frames import rotation_from_quaternion
-from simulator.firmware.base import (
-    AttitudeSetpoint,
-    MotionSetpoint,
-    Quaternion,
-    ReadParameter,
-    Say,
-    Severity,
-    Triple,
-)
+from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint, SetpointRules
+from simulator.firmware.vocabulary import Quaternion, ReadParameter, Say, Severity, Triple
 
 _RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b011, 64, 128
 
@@ -117,3 +110,18 @@ def motion_setpoint(values: Mapping[str, Any]) -> MotionSetpoint | None:
         math.nan if mask & _YAW_IGNORED or math.isinf(yaw) else yaw,
         math.nan if mask & _YAW_RATE_IGNORED or math.isinf(yaw_rate) else yaw_rate,
     )
+
+
+SETPOINTS = SetpointRules(
+    attitude=attitude_setpoint,
+    motion=motion_setpoint,
+    in_local_frame=in_local_frame,
+    global_frames=frozenset({5, 6, 11}),
+    complaint=motion_complaint,
+    mode_needs_stream=True,
+    as_automatic=False,
+    outlive_modes=True,
+    decide_flight=False,
+    spool_s=0.0,
+    reaction_s=0.036,
+)

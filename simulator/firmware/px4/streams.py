@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.base import Result, Streams
+from simulator.firmware.streams import Streams
+from simulator.firmware.vocabulary import Result
 
 COMPANION_RATES_HZ = {
     "HEARTBEAT": 1.0,
@@ -61,6 +62,12 @@ _IDLE = frozenset({
     12900, 12901, 12904, 12918, 12920,
 })  # fmt: skip
 STREAMS = Streams(
+    companion_rates_hz=COMPANION_RATES_HZ,
+    ground_rates_hz=GROUND_RATES_HZ,
+    own={},
+    unknown=frozenset(),
+    withheld_until={},
+    position_grid_steps=2,
     fixed=_BY_ITSELF | {"HEARTBEAT"},
     by_itself=_BY_ITSELF,
     idle=_IDLE,

@@ -1,0 +1,46 @@
+"""How ArduCopter starts, what its checks ask for, and when its battery is low."""
+
+from __future__ import annotations
+
+from simulator.battery import BatteryState
+from simulator.firmware.health import HealthRules, Sensors
+from simulator.firmware.vocabulary import ReadParameter
+
+# Seconds after boot at which an event of this name happens
+_BOOT = {
+    "barometer": 1.94,
+    "initialised": 2.47,
+    "estimator": 4.45,
+    "aligning": 5.40,
+    "tilt": 5.80,
+    "attitude": 5.90,
+    "gps": 9.83,
+    "origin": 20.02,
+    "other origin": 20.21,
+    "gyros": 24.0,
+    "reminder": 30.45,
+    "position": 41.61,
+}
+
+
+def battery_level(battery: BatteryState, parameter: ReadParameter) -> int:
+    """By voltage, or by the charge that remains of BATT_CAPACITY; 0 asks for neither."""
+
+    def below(kind: str) -> bool:
+        left_mah = battery.remaining * parameter("BATT_CAPACITY")
+        by_voltage = battery.voltage_v < parameter(f"BATT_{kind}_VOLT")
+        return by_voltage or left_mah < parameter(f"BATT_{kind}_MAH")
+
+    return 2 if below("CRT") else int(below("LOW"))
+
+
+HEALTH = HealthRules(
+    boot=_BOOT,
+    sensors=Sensors(0x5371FC2F, 0x5361FC2F, 0x4771FC2F, first_fix_s=10.2),
+    passes_after_s=42.5,
+    passes_without_position_after_s=24.0,
+    fails_where_unarmable=False,
+    position_without_fix_s=8.0,
+    battery_level=battery_level,
+    battery_events=("battery low", "battery critical"),
+)

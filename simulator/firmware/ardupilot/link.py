@@ -1,0 +1,29 @@
+"""Whom ArduCopter hears on a link, and how it speaks."""
+
+from __future__ import annotations
+
+from simulator.firmware.link import LinkRules
+from simulator.firmware.vocabulary import ReadParameter
+
+
+def is_ground_station(_: int, system: int, parameter: ReadParameter) -> bool:
+    """By its system id, whatever it is."""
+    return system == parameter("SYSID_MYGCS")
+
+
+def obeys_system(sender: int, own: int, parameter: ReadParameter) -> bool:
+    """All, or its ground station and its own components alone."""
+    return not parameter("SYSID_ENFORCE") or sender in (own, parameter("SYSID_MYGCS"))
+
+
+LINK = LinkRules(
+    is_ground_station=is_ground_station,
+    ground_station_stays_s=0.0,
+    obeys_system=obeys_system,
+    target_component_checked=False,
+    text_suffix="",
+    text_to_ground_stations_only=False,
+    parameters_bytewise=False,
+    parameters_hashed=False,
+    parameters_numbered=False,
+)

@@ -1,0 +1,63 @@
+"""How PX4 flies by itself, as its parameters have it."""
+
+from __future__ import annotations
+
+import math
+
+from simulator.firmware.flight import FlightRules, Heads, Landing, PositionGains
+from simulator.firmware.vocabulary import ReadParameter
+
+
+def gains(parameter: ReadParameter) -> PositionGains:
+    """The position loop as its parameters have it."""
+    across = tuple(parameter(f"MPC_XY_VEL_{term}_ACC") for term in "PID")
+    up = tuple(parameter(f"MPC_Z_VEL_{term}_ACC") for term in "PID")
+    return PositionGains(
+        position_xy_ps=parameter("MPC_XY_P"),
+        position_z_ps=parameter("MPC_Z_P"),
+        velocity_xy=(across[0], across[1], across[2]),
+        velocity_z=(up[0], up[1], up[2]),
+        speed_xy_mps=parameter("MPC_XY_VEL_MAX"),
+        speed_up_mps=parameter("MPC_Z_VEL_MAX_UP"),
+        speed_down_mps=parameter("MPC_Z_VEL_MAX_DN"),
+        tilt_max_rad=math.radians(parameter("MPC_TILTMAX_AIR")),
+        thrust_max=parameter("MPC_THR_MAX"),
+        derivative_cutoff_hz=5.0,
+        turn_radps=math.radians(parameter("MPC_YAWRAUTO_MAX")),
+        facing_mps=parameter("MPC_XY_P") * parameter("NAV_ACC_RAD"),  # further away than that
+    )
+
+
+def return_height_m(distance_m: float, parameter: ReadParameter) -> float:
+    """Under a cone near home, so that it comes down there and not beside it."""
+    highest_m, accepted_m = parameter("RTL_RETURN_ALT"), parameter("NAV_ACC_RAD")
+    if distance_m <= accepted_m:
+        return min(2.0 * distance_m, highest_m)
+    height_m = highest_m
+    if distance_m <= parameter("RTL_MIN_DIST"):
+        cone_rad = math.radians(min(89.0, max(1.0, parameter("RTL_CONE_ANG"))))
+        height_m = min(distance_m / math.tan(cone_rad), highest_m)
+    return min(max(height_m, 2.0 * accepted_m), highest_m)
+
+
+def return_heads(distance_m: float, parameter: ReadParameter) -> Heads:
+    """Far away the way home, near it as it stood there."""
+    return Heads.AS_HOME if distance_m < parameter("RTL_MIN_DIST") else Heads.ALONG
+
+
+FLIGHT = FlightRules(
+    gains=gains,
+    landing=Landing(
+        low_thrust_share=0.95,  # of estimates that wander on the ground, too
+        idle_thrust_share=0.1,
+        sinking_mps=0.09,
+        speed_down_mps=0.2,
+        speed_across_mps=1.5,  # LNDMC_XY_VEL_MAX
+        rate_radps=math.radians(20.0),  # LNDMC_ROT_MAX
+        place_below_is_descent=False,
+    ),
+    descend_speed_mps=0.6,
+    handling=None,
+    return_height_m=return_height_m,
+    return_heads=return_heads,
+)

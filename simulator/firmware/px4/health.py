@@ -1,0 +1,28 @@
+"""How PX4 starts, what its checks ask for, and when its battery is low."""
+
+from __future__ import annotations
+
+from simulator.battery import BatteryState
+from simulator.firmware.health import HealthRules, Sensors
+from simulator.firmware.vocabulary import ReadParameter
+
+_BATTERY_THRESHOLDS = ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")
+
+
+def battery_level(battery: BatteryState, parameter: ReadParameter) -> int:
+    """By the share that remains."""
+    return sum(battery.remaining < parameter(name) for name in _BATTERY_THRESHOLDS)
+
+
+HEALTH = HealthRules(
+    boot={},
+    # gyro, accelerometer, magnetometer, absolute pressure, GPS; battery, AHRS; health with
+    # geofence, or MAVProxy reports a breach
+    sensors=Sensors(0x0300402F, 0x0301402F, 0x0330C83F, first_fix_s=3.0),
+    passes_after_s=4.0,
+    passes_without_position_after_s=4.0,
+    fails_where_unarmable=True,
+    position_without_fix_s=5.0,  # EKF2_NOAID_TOUT
+    battery_level=battery_level,
+    battery_events=("battery low", "battery critical", "battery emergency"),
+)

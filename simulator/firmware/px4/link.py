@@ -1,0 +1,31 @@
+"""Whom PX4 hears on a link, and how it speaks."""
+
+from __future__ import annotations
+
+from simulator.firmware.link import LinkRules
+from simulator.firmware.vocabulary import ReadParameter
+
+_MAV_TYPE_GCS = 6
+
+
+def is_ground_station(kind: int, _: int, __: ReadParameter) -> bool:
+    """By its type, whoever it is."""
+    return kind == _MAV_TYPE_GCS
+
+
+def obeys_system(_: int, __: int, ___: ReadParameter) -> bool:
+    """Everybody."""
+    return True
+
+
+LINK = LinkRules(
+    is_ground_station=is_ground_station,
+    ground_station_stays_s=2.5,
+    obeys_system=obeys_system,
+    target_component_checked=True,
+    text_suffix="\t",
+    text_to_ground_stations_only=True,
+    parameters_bytewise=True,
+    parameters_hashed=True,
+    parameters_numbered=True,
+)
