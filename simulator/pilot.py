@@ -247,6 +247,7 @@ class Pilot:
             across_mps=navigator.across_mps,
             up_mps=up_mps,
             turn_radps=turn_radps,
+            gently=navigator.automatic,
         )
 
     def _asks_up(self, nav: Nav) -> bool:

@@ -52,9 +52,13 @@ RECORD = np.dtype(
         ("thrust_max", "f8"),
         ("turn_radps", "f8"),
         ("facing_mps", "f8"),
+        ("gently", "i8"),
+        ("speeding_mps2", "f8"),
+        ("braking_mps2", "f8"),
         ("integrates", "i8"),
         # the estimate: position and velocity NED
         ("estimate", "f8", 6),
+        ("across_mps", "f8"),  # wanted in the last period, or not a number
         ("way", "f8", 2),  # velocity wanted across the ground before it is limited
         # what comes out
         ("course_rad", "f8"),
@@ -82,6 +86,7 @@ class Limits:
     across_mps: float = math.inf
     up_mps: float = math.inf  # below 0 it is a descent
     turn_radps: float = math.inf
+    gently: bool = False  # as automatic flight speeds up and brakes
 
 
 class PositionLoop:
@@ -112,11 +117,14 @@ class PositionLoop:
         self.record["tilt_max_rad"] = gains.tilt_max_rad
         self.record["thrust_max"] = gains.thrust_max
         self.record["facing_mps"] = gains.facing_mps
+        self.record["speeding_mps2"] = gains.speeding_mps2
+        self.record["braking_mps2"] = gains.braking_mps2
 
     def reset(self, yaw_rad: float) -> None:
         """Forget integrators and derivative; hold the present course."""
         self._state[:] = _AT_REST
         self.record["course_rad"] = yaw_rad
+        self.record["across_mps"] = math.nan
 
     def demand(self, motion: MotionSetpoint, limits: Limits, *, integrate: bool = True) -> None:
         """What to fly from now on; `integrate` False freezes the integrators."""
@@ -134,6 +142,7 @@ class PositionLoop:
         record["hover_thrust"] = limits.hover_thrust
         record["thrust_least"] = limits.thrust_least
         record["turn_radps"] = limits.turn_radps
+        record["gently"] = limits.gently
         record["integrates"] = integrate
 
     def step(
@@ -270,12 +279,29 @@ def _integrate(loop: Any, estimate: Array) -> None:
 
 
 @kernel
+def _gentle_mps(loop: Any, speed_mps: float) -> float:
+    """The speed it may have now: little more than before, and no more than it can brake from
+    where it has a place to stop at, `speed_mps` being the position error times its gain."""
+    before_mps = loop.across_mps
+    if math.isnan(before_mps):
+        before_mps = math.hypot(loop.estimate[3], loop.estimate[4])
+    most = before_mps + loop.speeding_mps2 * LOOP_S
+    if math.isnan(loop.velocity[0]):
+        most = min(most, math.sqrt(2.0 * loop.braking_mps2 * speed_mps / loop.gains[0]))
+    return float(most)
+
+
+@kernel
 def _limit_speed(loop: Any) -> None:
     wanted = loop.wanted_velocity
     speed = math.hypot(_or_zero(wanted[0]), _or_zero(wanted[1]))
-    if speed > loop.speed_xy_mps:
-        wanted[0] *= loop.speed_xy_mps / speed
-        wanted[1] *= loop.speed_xy_mps / speed
+    most = loop.speed_xy_mps
+    if loop.gently:
+        most = min(most, _gentle_mps(loop, speed))
+        loop.across_mps = min(speed, most)
+    if speed > most:
+        wanted[0] *= most / speed
+        wanted[1] *= most / speed
     if not math.isnan(wanted[2]):
         wanted[2] = max(-loop.speed_up_mps, min(loop.gains[_SPEED_DOWN], wanted[2]))
 

@@ -34,6 +34,8 @@ class PositionGains:
     thrust_max: float
     derivative_cutoff_hz: float
     turn_radps: float  # of automatic flight, no faster
+    speeding_mps2: float  # the same, across the ground
+    braking_mps2: float  # the same, on the way to a place
     facing_mps: float  # wanted across the ground, from which on it faces its way
 
 

@@ -6,6 +6,7 @@ Expected values are those of ArduCopter 4.6.3 and PX4 1.16.1 SITL, asked the sam
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
@@ -224,7 +225,7 @@ def test_an_item_marked_as_guided_is_where_an_arducopter_goes_now(kind: str) -> 
     pack = getattr(mavlink, f"MAVLink_mission_item{kind}_message")
     asked = pack(0, 0, 0, 3, 16, 2, 0, 0, 0, 0, 0, *where, 8.0)
     bench.send(asked)
-    bench.run(10.0)
+    bench.run(12.0)
     assert [m.type for _, m in bench.of("MISSION_ACK")] == [0]
     assert place(bench) == pytest.approx((0.0, 20.0, -8.0), abs=0.7)  # degrees as floats: 0.4 m
     bench.command(176, 1, 9)  # LAND
@@ -305,3 +306,29 @@ def test_a_px4_takes_off_to_the_place_given() -> None:
     bench.run(15.0)
     assert bench.mode == LOITER
     assert place(bench) == pytest.approx((10.0, 0.0, -6.0), abs=0.8)
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "frame", "places_m", "fastest"),
+    [
+        # metres from the start, second by second, as the real ones went 40 m
+        (copter, RELATIVE, (1.0, 4.4, 11.0, 19.3, 27.1, 33.5, 38.0, 40.4), 7.7),
+        (px4, ABSOLUTE, (0.3, 1.0, 3.9, 7.6, 11.6, 15.8, 20.0, 24.2, 28.5, 32.4, 35.5, 37.8), 4.5),
+    ],
+    ids=["ardupilot", "px4"],
+)
+def test_the_way_to_a_place_is_sped_up_and_braked_gently(
+    vehicle: Callable[[], Bench], frame: int, places_m: tuple[float, ...], fastest: float
+) -> None:
+    bench = vehicle()
+    height_m = bench.height_m
+    up = height_m if frame == RELATIVE else bench.instance.autopilot.firmware.origin[2] + height_m
+    assert reposition(bench, 40.0, 0.0, up, frame) == ACCEPTED
+    flown, speeds = [], []
+    for _ in places_m:
+        speeds.append(fastest_mps(bench, 1.0))
+        flown.append(place(bench)[0])
+    assert flown == pytest.approx(places_m, abs=3.5)
+    assert max(speeds) == pytest.approx(fastest, abs=1.0)
+    bench.run(6.0)
+    assert place(bench)[0] == pytest.approx(40.0, abs=0.9)

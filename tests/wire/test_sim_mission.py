@@ -330,7 +330,7 @@ def test_a_mission_is_paused_by_hold_and_goes_on() -> None:
     upload(bench, [place(WAYPOINT, 0, 0, 3), place(LOITER_UNLIMITED, 40, 0, 3)])
     bench.command(300)
     bench.run_until(lambda: bench.instance.autopilot.mission.current == 1, 20.0)
-    bench.run(2.0)
+    bench.run(4.0)  # to 8 m, as PX4 gathers speed
     bench.ask_mode(LOITER)
     bench.run(5.0)
     _, here = bench.of("LOCAL_POSITION_NED")[-1]

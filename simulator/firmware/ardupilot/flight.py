@@ -25,6 +25,8 @@ def gains(parameter: ReadParameter) -> PositionGains:
         thrust_max=1.0,
         derivative_cutoff_hz=5.0,
         turn_radps=math.radians(parameter("ATC_SLEW_YAW") * 0.01),
+        speeding_mps2=parameter("WPNAV_ACCEL") * 0.01,
+        braking_mps2=0.5 * parameter("WPNAV_ACCEL") * 0.01,  # as the jerk is limited
         facing_mps=0.05 * speed_mps if parameter("WP_YAW_BEHAVIOR") else math.inf,
     )
 

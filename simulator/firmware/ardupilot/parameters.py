@@ -76,6 +76,7 @@ PARAMETERS = (
     _int8("SYSID_ENFORCE", 0, "obey SYSID_MYGCS alone"),
     _int16("SYSID_MYGCS", 255, "system id of the ground station"),
     _int16("SYSID_THISMAV", 1, "system id"),
+    _real("WPNAV_ACCEL", 250.0, "cm/s^2 across the ground"),
     _real("WPNAV_SPEED", 1000.0, "cm/s of automatic flight"),
     _real("WPNAV_SPEED_DN", 150.0, "cm/s of descent"),
     _real("WPNAV_SPEED_UP", 250.0, "cm/s of climb"),

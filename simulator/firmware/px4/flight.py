@@ -24,6 +24,8 @@ def gains(parameter: ReadParameter) -> PositionGains:
         thrust_max=parameter("MPC_THR_MAX"),
         derivative_cutoff_hz=5.0,
         turn_radps=math.radians(parameter("MPC_YAWRAUTO_MAX")),
+        speeding_mps2=2.0,  # less than MPC_ACC_HOR, as the jerk is limited
+        braking_mps2=0.7,
         facing_mps=parameter("MPC_XY_P") * parameter("NAV_ACC_RAD"),  # further away than that
     )
 
