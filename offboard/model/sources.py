@@ -8,28 +8,36 @@ import re
 from pathlib import Path
 
 _ENTRY = re.compile(rb"^@entry", re.M)
-_COMPILES = re.compile(rb"njit|llvmlite|^@(?:kernel|entry)", re.M)
+_COMPILES = re.compile(rb"llvmlite|^@(?:kernel|entry)", re.M)
 _IMPORT = re.compile(rb"^from ((?:offboard|simulator)[.\w]*) import (\([^)]*\)|.*)", re.M)
-_CONSTANT = re.compile(rb"\b[A-Z][A-Z0-9_]+\b")
+_NAME = re.compile(rb"\w+")
+_CONSTANT = re.compile(rb"[A-Z][A-Z0-9_]*")
 
 
 @functools.cache
 def digest() -> str:
-    """Hash of every module that compiles something, and of those whose constants it takes: their
-    machine code stands or falls as one."""
+    """Hash of every module that compiles something, and of those whose constants it takes, by name
+    or with the whole module: their machine code stands or falls as one."""
     sources = _contents()
     pending = [name for name, content in sources.items() if _COMPILES.search(content)]
     taken: set[str] = set()
     while pending:
         taken.add(name := pending.pop())
-        for module, names in _IMPORT.findall(sources[name]):
-            source = module.decode().replace(".", "/") + ".py"
-            if _CONSTANT.search(names) and source in sources and source not in taken:
-                pending.append(source)
+        pending += (_taken_from(sources[name]) & sources.keys()) - taken
     hashed = hashlib.sha256()
     for name in sorted(taken):
         hashed.update(name.encode() + b"\0" + sources[name])
     return hashed.hexdigest()[:16]
+
+
+def _taken_from(content: bytes) -> set[str]:
+    """The sources, some of which there are, of what a module takes constants from."""
+    found: set[str] = set()
+    for package, imported in _IMPORT.findall(content):
+        place = package.decode().replace(".", "/")
+        for name in _NAME.findall(imported):
+            found.add(f"{place}.py" if _CONSTANT.fullmatch(name) else f"{place}/{name.decode()}.py")
+    return found
 
 
 def entry_modules() -> list[str]:

@@ -14,9 +14,10 @@ ROOT = Path(__file__).parents[2]
 
 
 def copy_of_the_package(where: Path) -> Path:
-    shutil.copytree(
-        ROOT / "offboard", where / "offboard", ignore=shutil.ignore_patterns("__pycache__")
-    )
+    for package in ("offboard", "simulator"):
+        shutil.copytree(
+            ROOT / package, where / package, ignore=shutil.ignore_patterns("__pycache__")
+        )
     return where
 
 
@@ -42,14 +43,21 @@ def cache_directory(package_root: Path, **environment: str) -> Path:
     return Path(answer(code, package_root, **environment))
 
 
-@pytest.mark.parametrize("changed", ["rigid_body.py", "state.py"])  # its sizes are compiled in
+@pytest.mark.parametrize(
+    "changed",
+    [
+        "offboard/model/rigid_body.py",
+        "offboard/model/state.py",  # its sizes are compiled in
+        "simulator/seen.py",  # and this one's record, by the module's name
+    ],
+)
 def test_a_changed_compiled_source_gets_a_new_cache(tmp_path: Path, changed: str) -> None:
     root = copy_of_the_package(tmp_path)
     home = str(tmp_path / "cache")
     first = cache_directory(root, XDG_CACHE_HOME=home)
     assert first.parent == tmp_path / "cache" / "pso-offboard"
     assert first == cache_directory(root, XDG_CACHE_HOME=home)
-    with (root / "offboard" / "model" / changed).open("a") as source:
+    with (root / changed).open("a") as source:
         source.write("\n# changed\n")
     assert cache_directory(root, XDG_CACHE_HOME=home) != first
 
