@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from pathlib import Path
+import tempfile
 from typing import Any
 
 from hatchling.builders.hooks.plugin.interface import BuildHookInterface
@@ -25,12 +25,16 @@ class BitcodeHook(BuildHookInterface[Any]):
     def initialize(self, version: str, build_data: dict[str, Any]) -> None:
         if version == "editable":
             return
-        directory = Path(self.directory).resolve() / "bitcode"
+        self._made = tempfile.TemporaryDirectory()
         found = os.pathsep.join([self.root, *sys.path])  # pip builds with a path of its own
         subprocess.run(
-            [sys.executable, "-m", "offboard.model.wheel", str(directory)],
+            [sys.executable, "-m", "offboard.model.wheel", self._made.name],
             cwd=self.root,
             env={**os.environ, "PYTHONPATH": found, "NUMBA_CPU_NAME": "generic"},
             check=True,
         )
-        build_data["force_include"][str(directory)] = "offboard/_bitcode"
+        build_data["force_include"][self._made.name] = "offboard/_bitcode"
+
+    def finalize(self, version: str, build_data: dict[str, Any], artifact_path: str) -> None:
+        if version != "editable":
+            self._made.cleanup()

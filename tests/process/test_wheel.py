@@ -1,4 +1,4 @@
-"""The wheel: what a user gets who has no source tree, built as pip builds it."""
+"""The wheel: what a user gets who has no source tree."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import zipfile
 from pathlib import Path
 
 ROOT = Path(__file__).parents[2]
-BUILD = (sys.executable, "-m", "pip", "wheel", "--no-deps", "--no-build-isolation")
+BUILD = (sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory")
 FLIGHT = (
     "offboard", "fly", "--sitl", "--reference", "hover", "--set", "reference.duration_s=2",
     "--out", "x",
@@ -18,8 +18,10 @@ FLIGHT = (
 
 
 def test_wheel_flies_at_once_with_no_compiler(tmp_path: Path) -> None:
-    subprocess.run((*BUILD, "-w", tmp_path, ROOT), check=True, capture_output=True, timeout=300)
-    (wheel,) = tmp_path.glob("*.whl")
+    built = tmp_path / "dist"
+    subprocess.run((*BUILD, built), cwd=ROOT, check=True, capture_output=True, timeout=300)
+    (wheel,) = built.iterdir()
+    assert wheel.suffix == ".whl"
     site, no_compiler, empty = (tmp_path / name for name in ("site", "no_compiler", "empty"))
     zipfile.ZipFile(wheel).extractall(site)
     no_compiler.mkdir()
