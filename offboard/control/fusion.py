@@ -23,7 +23,7 @@ from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
-SILENT_S = 1.0  # without a usable fix: then the vehicle's estimate counts again
+SILENT_S = 1.0  # without a usable fix, or attitude: then the vehicle's estimate counts again
 AHEAD_S = 0.5  # of telemetry: no fix is, and those after it would all be old
 LEARNT_FIXES = 16  # two seconds of them, before fusion begins
 SMOOTH_S = 0.25  # in which what a fix corrects is passed on
@@ -125,7 +125,11 @@ class Fusion:
         self._filter.on_command(time_s, command.thrust_mps2)
 
     def on_attitude(self, time_s: float, q: Quaternion) -> None:
-        if self.fused:
+        if not self.fused:
+            return
+        if time_s - self._filter.time_s > SILENT_S:  # nobody knows what happened meanwhile
+            self._give_back(f"no attitude for {SILENT_S:.0f} s")
+        else:
             self._filter.on_attitude(time_s, np.array(thrust_direction_from_quaternion(q)))
 
     def on_origin(self, place: Geodetic, said: bool) -> None:

@@ -252,6 +252,15 @@ def test_a_stamp_far_ahead_spoils_no_later_fix() -> None:
     assert spoilt.fusion.news == plain.fusion.news
 
 
+@pytest.mark.parametrize("silence_s", [1.1, 4e6])  # the model would be followed through all of it
+def test_after_a_silence_of_the_attitude_it_is_the_vehicle_s_estimate(silence_s: float) -> None:
+    flown = trial().fly(20.0)
+    assert flown.fusion.fused
+    flown.fusion.on_attitude(flown.time_s + silence_s, (1.0, 0.0, 0.0, 0.0))
+    assert not flown.fusion.fused
+    assert flown.fusion.news[-1] == "no attitude for 1 s: following the vehicle's estimate"
+
+
 def test_nothing_but_finite_numbers() -> None:
     flown = trial().fly(5.0)
     flown.fusion.on_command(flown.time_s, Command(math.inf, (0.0, 0.0, 1.0), 0.0))
