@@ -64,8 +64,8 @@ def kept(symbol: str) -> bytes | None:
 
 def keep(symbol: str, code: bytes) -> None:
     """Whole or not at all; without it the next start compiles again."""
-    path = _file(symbol)
     try:
+        path = _file(symbol)
         handle, name = tempfile.mkstemp(dir=path.parent)
         with os.fdopen(handle, "wb") as file:
             file.write(hashlib.sha256(code).digest() + code)

@@ -79,6 +79,20 @@ def test_without_a_writable_home_the_cache_is_temporary(tmp_path: Path) -> None:
     assert tmp_path in directory.parents
 
 
+def test_with_nothing_writable_at_all_nothing_is_kept() -> None:
+    nowhere = """
+import tempfile
+from pathlib import Path
+from offboard.model import cache
+from offboard.model.machine_code import keep, kept
+cache._bases = lambda: iter((Path("/proc/none"),))
+tempfile.tempdir = "/proc/none"
+keep("f", b"code")
+print(kept("f"))
+"""
+    assert answer(nowhere) == "None"
+
+
 def test_a_directory_others_can_write_to_is_not_used(tmp_path: Path) -> None:
     shared = tmp_path / "pso-offboard"
     shared.mkdir()
