@@ -46,7 +46,8 @@ class Autopilot:
         self.firmware = firmware
         self.plant = plant
         self.parameters = parameters or ParameterTable(firmware)
-        self.mission = mission or Mission(firmware.origin, int(firmware.missions.home_first))
+        rules = firmware.missions
+        self.mission = mission or Mission(firmware.origin, int(rules.home_first), rules.turning)
         self.senses = Senses(plant)
         self.watch = Watch(firmware, self.parameters)
         self.stream = SetpointStream(firmware, self.parameters)

@@ -22,7 +22,10 @@ from simulator.parameters import ParameterTable
 from simulator.pilot import Pilot
 from simulator.state_table import StateTable
 
-_GO_ON = frozenset({Behaviour.SETPOINT, Behaviour.MISSION})  # when asked for again
+# When asked for again
+_GO_ON = frozenset(
+    {Behaviour.SETPOINT, Behaviour.MISSION, Behaviour.HOLD, Behaviour.RETURN, Behaviour.LAND}
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,6 +216,9 @@ class Commander:
         self._navigator.setpoint = None
         self._pilot.enter(Behaviour.TAKEOFF, self._senses.look(), self._wish.takeoff_ned_m)
 
+    def _return(self) -> None:
+        self._pilot.enter(Behaviour.RETURN, self._senses.look())
+
     def _hold(self) -> None:
         self._navigator.setpoint = None
         self._pilot.enter(self.mode.behaviour, self._senses.look())
@@ -260,6 +266,7 @@ ACTIONS: dict[str, Callable[[Commander], None]] = {
     "await": Commander._await,
     "recover": Commander._recover,
     "take off": Commander._take_off,
+    "return": Commander._return,
     "hold": Commander._hold,
     "level": Commander._level,
     "latch": Commander._latch,

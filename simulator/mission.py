@@ -65,6 +65,7 @@ class Mission:
 
     origin: Origin
     first: int = 0  # the item with which it begins
+    turning: frozenset[int] = frozenset()  # MAV_CMD of items that ask for a course
     items: tuple[Item, ...] = ()
     beside: dict[int, tuple[Item, ...]] = field(default_factory=dict)  # by MAV_MISSION_TYPE
     current: int = 0
@@ -246,6 +247,6 @@ class Mission:
     def _yaw(self, item: Item) -> float:
         """Asked for; NaN keeps the course."""
         asked_deg = item.params[3]
-        if item.command == Kind.WAYPOINT and math.isfinite(asked_deg):
+        if item.command in self.turning and math.isfinite(asked_deg):
             return math.remainder(math.radians(asked_deg), 2.0 * math.pi)
         return math.nan

@@ -31,7 +31,8 @@ class MissionRules:
     `home_first`: the first item of a mission, there or not, is home. `guides`: an item marked
     current = 2 is where to go now. `refusal`: MAV_MISSION_RESULT and text of an item that is not
     taken. `texts` follow an upload. `frame_shown`: of an item in whole 1e-7 degrees, or in
-    degrees. `stopping`: types whose items are shown without autocontinue.
+    degrees. `stopping`: types whose items are shown without autocontinue. `turning`: commands
+    (MAV_CMD) whose fourth parameter is a course.
     """
 
     strict: bool
@@ -42,3 +43,4 @@ class MissionRules:
     texts: Mapping[int, Say]
     frame_shown: Callable[[MissionItem, bool], int]
     stopping: frozenset[int]
+    turning: frozenset[int]

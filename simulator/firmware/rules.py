@@ -20,8 +20,8 @@ class Rule:
     when: names of guards that must all hold; "NAME=2" compares a parameter, "not X" negates,
         "since X" is a failsafe because of event X.
     to: next mode, "*" none, "requested" the mode asked for, "remembered" the last one chosen.
-    do: actions ("arm", "disarm", "failsafe", "await", "recover", "take off", "hold", "level",
-        "latch", "restart").
+    do: actions ("arm", "disarm", "failsafe", "await", "recover", "take off", "return", "hold",
+        "level", "latch", "restart").
     result: what a command is answered with. say, also: texts. send: messages to every link.
     """
 

@@ -332,3 +332,14 @@ def test_the_way_to_a_place_is_sped_up_and_braked_gently(
     assert max(speeds) == pytest.approx(fastest, abs=1.0)
     bench.run(6.0)
     assert place(bench)[0] == pytest.approx(40.0, abs=0.9)
+
+
+def test_hold_asked_for_on_the_way_to_a_place_stops_nothing() -> None:
+    """It is the mode in which a PX4 goes there."""
+    bench = px4()
+    amsl_m = bench.instance.autopilot.firmware.origin[2] + 3.0
+    reposition(bench, 20.0, 0.0, amsl_m, ABSOLUTE)
+    bench.run(3.0)
+    assert bench.ask_mode(LOITER) == [ACCEPTED, ACCEPTED]
+    bench.run(10.0)
+    assert place(bench)[0] == pytest.approx(20.0, abs=0.9)

@@ -353,3 +353,50 @@ def test_without_a_mission_none_starts() -> None:
     bench.ask_mode(LOITER)
     bench.fly_offboard()
     assert bench.ask_mode(MISSION) == [0, 1]
+
+
+def test_an_arducopter_faces_its_way_and_returns_within_its_mission() -> None:
+    """The fourth parameter is no course there; the mode is AUTO until it has landed, and after."""
+    bench = Bench(firmware=ARDUPILOT, boot_scale=0.1)
+    bench.run(4.5)
+    rows = [
+        place(WAYPOINT, 0, 0, 0, 0, 0, 0, 0),
+        place(TAKEOFF, 0, 0, 5, 0, 0, 0, 0),
+        place(WAYPOINT, 0, 20, 5, 0, 0, 0, 0),
+        (RETURN, (0.0,) * 4, NAN, NAN, NAN),
+    ]
+    latitude, longitude, _ = ARDUPILOT.origin
+    bench.send(mavlink.MAVLink_mission_count_message(1, 1, len(rows)))
+    for seq, (command, params, _, east, up) in enumerate(rows):
+        bench.run(0.02)
+        x, y = round(latitude * 1e7), round(longitude * 1e7)
+        if not math.isnan(east):
+            y += round(math.degrees(east / 6_371_000 / math.cos(math.radians(latitude))) * 1e7)
+        where = (x, y, 0.0 if math.isnan(up) else up)
+        bench.send(
+            mavlink.MAVLink_mission_item_int_message(1, 1, seq, 3, command, 0, 1, *params, *where)
+        )
+    bench.run(0.02)
+    assert bench.of("MISSION_ACK")[-1][1].type == 0
+    assert [row[0] for row in download(bench, 0)] == [0, 3, 3, 0]
+    bench.command(176, 1, 4)
+    assert bench.command(400, 1) == [0]
+    assert bench.command(300) == [0]
+    bench.run_until(lambda: bench.instance.autopilot.mission.finished, 30.0)
+    course_deg = math.degrees(bench.instance.autopilot.senses.look().yaw_rad)
+    assert course_deg == pytest.approx(90.0, abs=6.0)
+    bench.run_until(lambda: not bench.armed, 70.0)
+    assert bench.mode == 3
+    x, y, _ = bench.instance.autopilot.senses.truth.position_ned_m.tolist()
+    assert math.hypot(x, y) < 0.5
+
+
+def test_a_px4_turns_as_an_item_asks() -> None:
+    bench = Bench()
+    bench.boot()
+    upload(bench, [place(WAYPOINT, 0, 0, 3), place(LOITER_TIME, 0, 12, 3, 5.0, 0, 0, -90.0)])
+    bench.command(300)
+    bench.run_until(lambda: bench.instance.autopilot.mission.reached == 1, 30.0)
+    bench.run(2.0)
+    course_deg = math.degrees(bench.instance.autopilot.senses.look().yaw_rad)
+    assert course_deg == pytest.approx(-90.0, abs=5.0)

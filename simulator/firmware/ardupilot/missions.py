@@ -25,7 +25,8 @@ def _refusal(kind: int, item: MissionItem) -> tuple[int, Say | None] | None:
 
 def _frame_shown(item: MissionItem, _: bool) -> int:
     """The old names of frames; what has no place is in frame 0."""
-    return _SHOWN.get(item.frame, item.frame) if item.frame in _PLACE_FRAMES else 0
+    has_place = any(item.command in known for known in (_PLACES, *_BESIDE.values()))
+    return _SHOWN.get(item.frame, item.frame) if has_place else 0
 
 
 MISSIONS = MissionRules(
@@ -40,4 +41,5 @@ MISSIONS = MissionRules(
     },
     frame_shown=_frame_shown,
     stopping=frozenset({1, 2}),
+    turning=frozenset(),  # MAV_CMD_CONDITION_YAW would be
 )

@@ -134,7 +134,7 @@ RULES = (
     Rule("mission", result=_FAILED),
     Rule("mission progress", send=("MISSION_CURRENT",)),
     Rule("item reached", send=("MISSION_ITEM_REACHED",)),
-    Rule("mission return", "AUTO", to="RTL", send=_HEARTBEAT),
+    Rule("mission return", "AUTO", do=("return",)),  # within the mode
     Rule("mission finished", when=("landed",), do=("disarm",), say=_DISARMING),
     Rule("takeoff", "GUIDED", when=("armed", "landed", "climb asked"), do=("take off",)),
     Rule("takeoff", "GUIDED", when=("armed", "climbing", "climb asked"), do=("take off",)),

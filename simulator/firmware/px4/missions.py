@@ -52,4 +52,5 @@ MISSIONS = MissionRules(
     texts={},
     frame_shown=_frame_shown,
     stopping=frozenset({1}),
+    turning=frozenset({16, 17, 19, 21}),
 )
