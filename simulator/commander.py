@@ -22,10 +22,7 @@ from simulator.parameters import ParameterTable
 from simulator.pilot import Pilot
 from simulator.state_table import StateTable
 
-# When asked for again
-_GO_ON = frozenset(
-    {Behaviour.SETPOINT, Behaviour.MISSION, Behaviour.HOLD, Behaviour.RETURN, Behaviour.LAND}
-)
+_GO_ON = frozenset({Behaviour.SETPOINT, Behaviour.MISSION})  # when asked for again
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,11 +55,13 @@ class Navigator:
     # -- what it does ------------------------------------------------------------------------
 
     def enter(self, behaviour: Behaviour, nav: Nav, takeoff_ned_m: Triple = NAN3) -> None:
-        """Begin a behaviour here; hold after a climb keeps the climb's target.
+        """Begin a behaviour here; hold after a climb keeps the climb's target, and hold asked
+        for again the place it goes to.
 
         `takeoff_ned_m`: where to climb to; NaN here, and the default height.
         """
-        if not (self._climbed and behaviour in _STANDING):
+        goes_on = behaviour is self.behaviour is Behaviour.HOLD and self._is_going
+        if not (goes_on or (self._climbed and behaviour in _STANDING)):
             self._hold = _ahead(nav)
         within = self.behaviour is Behaviour.TAKEOFF and behaviour is Behaviour.SETPOINT
         if behaviour is not self.behaviour and not within:
@@ -88,6 +90,11 @@ class Navigator:
         self._held = MotionSetpoint(place_ned_m, yaw_rad=yaw_rad, faces_way=True)
         if self.behaviour is Behaviour.SETPOINT:
             self.setpoint = self._held
+
+    @property
+    def _is_going(self) -> bool:
+        """To a place that somebody named, or stands there."""
+        return self._held.faces_way and self._held.position_ned_m is self._hold
 
     def turn_to(self, yaw_rad: float, turn_radps: float) -> None:
         """Keep this course while holding or obeying."""
