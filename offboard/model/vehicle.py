@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 Triple = tuple[float, float, float]
 PositiveTriple = tuple[
@@ -17,6 +17,8 @@ PositiveTriple = tuple[
 NonNegativeTriple = tuple[
     Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]
 ]
+
+DRAG_PER_MASS_MOST_PS = 100.0  # falling, it has 0.1 m/s: no motion to control is left
 
 
 class Parameters(BaseModel):
@@ -68,6 +70,14 @@ class Vehicle(Parameters):
         return (
             0.5 * (self.drag_translation_npmps[0] + self.drag_translation_npmps[1]) / self.mass_kg
         )
+
+    @model_validator(mode="after")
+    def _moves(self) -> Vehicle:
+        if max(self.drag_translation_npmps) > DRAG_PER_MASS_MOST_PS * self.mass_kg:
+            raise ValueError(
+                f"drag_translation_npmps must be at most {DRAG_PER_MASS_MOST_PS:g} per kg of mass"
+            )
+        return self
 
     @property
     def thrust_max_mps2(self) -> float:
