@@ -7,6 +7,7 @@ firmware's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
@@ -19,6 +20,7 @@ from simulator.outbox import Outbox
 from simulator.texts import Texts
 
 ASK_AGAIN_S, GIVE_UP_S = 0.25, 5.0
+CHECKED_S = 0.03  # after it was taken a mission may be flown, where it is checked first
 _ANY_TYPE = 255
 _KINDS = frozenset({0, 1, 2})  # MAV_MISSION_TYPE: mission, fence, rally points
 
@@ -73,19 +75,28 @@ class MissionTransfer:
     _upload: Upload | None = None
     _download: Download | None = None
     _taken: tuple[int, int] = (0, 0)  # how many items of which kind were uploaded last
+    _unchecked: tuple[tuple[Item, ...], float] | None = None  # a mission, and when it was taken
     _whole: bool = False  # places come in whole 1e-7 degrees
 
     @property
     def under_way(self) -> bool:
         """Time alone may end it, or have it go on."""
-        return self._upload is not None or self._download is not None
+        return any(x is not None for x in (self._upload, self._download, self._unchecked))
 
     def handle(self, message: Message, now_s: float) -> None:
         """One message of the mission protocol, addressed to us."""
+        self._check(math.inf)
         HANDLERS[message.name](self, message, now_s)
+
+    def _check(self, now_s: float) -> None:
+        """An uploaded mission becomes the vehicle's, if it is time."""
+        if self._unchecked is not None and now_s - self._unchecked[1] >= CHECKED_S:
+            self.mission.keep(0, self._unchecked[0])
+            self._unchecked = None
 
     def step(self, now_s: float) -> None:
         """Ask again for an item that does not come; after a while no more."""
+        self._check(now_s)
         download = self._download
         if download is not None and now_s - download.heard_s > GIVE_UP_S:
             self._download = None
@@ -148,7 +159,10 @@ class MissionTransfer:
         if len(upload.items) < upload.count:
             self._ask(upload, now_s)
             return
-        self.mission.keep(upload.kind, tuple(upload.items))
+        if self.rules.strict and upload.kind == 0:
+            self._unchecked = (tuple(upload.items), now_s)
+        else:
+            self.mission.keep(upload.kind, tuple(upload.items))
         self._upload, self._taken = None, (upload.count, upload.kind)
         self._acknowledge(upload.peer, Ack.ACCEPTED, upload.kind)
         if upload.kind in self.rules.texts:

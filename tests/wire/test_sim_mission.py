@@ -50,7 +50,7 @@ def upload(bench: Bench, rows: list[Row], kind: int = 0, frame: int | None = Non
         bench.run(0.02)
         assert asked(bench)[-1] == seq
         bench.send(item(seq, row, frame, kind))
-    bench.run(0.02)
+    bench.run(0.05)
     _, ack = bench.of("MISSION_ACK")[-1]
     assert ack.mission_type == kind
     return int(ack.type)
@@ -400,3 +400,16 @@ def test_a_px4_turns_as_an_item_asks() -> None:
     bench.run(2.0)
     course_deg = math.degrees(bench.instance.autopilot.senses.look().yaw_rad)
     assert course_deg == pytest.approx(-90.0, abs=5.0)
+
+
+def test_a_px4_takes_a_moment_to_check_a_mission() -> None:
+    """Started at once the real one said so; 50 ms later it flew."""
+    bench = Bench()
+    bench.boot()
+    bench.send(mavlink.MAVLink_mission_count_message(1, 1, 1))
+    bench.run(0.02)
+    bench.send(item(0, ROUND[0]))
+    assert bench.command(300) == [2]
+    assert bench.texts() == ["Mission start denied! No valid mission"]
+    bench.run(0.03)
+    assert bench.command(300) == [0]
