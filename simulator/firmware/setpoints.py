@@ -49,6 +49,7 @@ class SetpointRules:
     motion: Callable[[Mapping[str, Any]], MotionSetpoint | None]
     # a SET_POSITION_TARGET in another local frame, by position and attitude, in MAV_FRAME 1
     in_local_frame: Callable[[Mapping[str, Any], Triple, Quaternion], Mapping[str, Any]]
+    home_mirrored: bool  # heights above home take home as high as it is low, about the origin
     global_frames: frozenset[int]  # MAV_FRAME that SET_POSITION_TARGET_GLOBAL_INT may come in
     # what is said about the named setpoint message in an unknown MAV_FRAME, or demanding nothing
     complaint: Callable[[str, int | None], Say | None]

@@ -101,3 +101,13 @@ def test_what_is_no_number_moves_nothing_to_infinity() -> None:
     bench = flown(lambda b: b.send(global_target(RELATIVE, NAN)), 3.0)
     _, here = bench.of("LOCAL_POSITION_NED")[-1]
     assert all(map(math.isfinite, (here.x, here.y, here.z)))
+
+
+def test_px4_mistakes_a_home_above_the_origin_for_one_below_it() -> None:
+    """Home set 8 m up, 4 m above it asked for: the real one went to the ground."""
+    bench = Bench()
+    bench.fly_offboard()
+    bench.run(9.0, lambda: bench.position(0.0, 0.0, -8.0))
+    assert bench.command(179, 1) == [0]
+    bench.run(7.0, lambda: bench.send(global_target(RELATIVE, UP)))
+    assert bench.height_m < 0.5

@@ -137,6 +137,7 @@ SETPOINTS = SetpointRules(
     attitude=attitude_setpoint,
     motion=motion_setpoint,
     in_local_frame=in_local_frame,
+    home_mirrored=False,
     global_frames=frozenset({0, 3, 5, 6, 10, 11}),
     complaint=motion_complaint,
     mode_needs_stream=False,

@@ -116,6 +116,7 @@ SETPOINTS = SetpointRules(
     attitude=attitude_setpoint,
     motion=motion_setpoint,
     in_local_frame=in_local_frame,
+    home_mirrored=True,
     global_frames=frozenset({5, 6, 11}),
     complaint=motion_complaint,
     mode_needs_stream=True,
