@@ -47,7 +47,13 @@ class Autopilot:
         self.plant = plant
         self.parameters = parameters or ParameterTable(firmware)
         rules = firmware.missions
-        self.mission = mission or Mission(firmware.origin, int(rules.home_first), rules.turning)
+        self.mission = mission or Mission(
+            firmware.origin,
+            int(rules.home_first),
+            rules.turning,
+            rules.tells_above,
+            rules.keeps_speed,
+        )
         self.senses = Senses(plant)
         self.watch = Watch(firmware, self.parameters)
         self.stream = SetpointStream(firmware, self.parameters)

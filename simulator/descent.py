@@ -16,8 +16,6 @@ from simulator.firmware.vocabulary import Triple
 from simulator.nav import Nav
 from simulator.parameters import ParameterTable
 
-_ARRIVED_M = 1.0
-
 
 def sink(place: Triple, speed_mps: float, yaw_rad: float = math.nan) -> MotionSetpoint:
     """Straight down at this speed."""
@@ -73,17 +71,19 @@ class Return:
             self._heads = self.firmware.flight.return_heads(distance_m, read)
             self.place = (x, y, min(z, home_z - height_m))
             self._go(Stage.CLIMB, "return begun")
-        if self.stage is Stage.CLIMB and z < self.place[2] + _ARRIVED_M:
+        role = self.parameters.role
+        within_m, height_within_m = role("return_within_m"), role("return_height_within_m")
+        if self.stage is Stage.CLIMB and z < self.place[2] + height_within_m:
             self.place = (home_x, home_y, self.place[2])
             self._go(Stage.FLY)
-        if self.stage is Stage.FLY and distance_m < _ARRIVED_M:
-            waits = self.parameters.role("return_waits_s") != 0.0
+        if self.stage is Stage.FLY and distance_m < within_m:
+            waits = role("return_waits_s") != 0.0
             self._go(Stage.DESCEND) if waits else self._go(Stage.LAND, "return lands")
-            lower_m = self.parameters.role("return_descends_to_m")
+            lower_m = role("return_descends_to_m")
             self.place = (home_x, home_y, max(self.place[2], home_z - lower_m))
-        if self.stage is Stage.DESCEND and z > self.place[2] - _ARRIVED_M:
-            waits_s = self.parameters.role("return_waits_s")
-            settles_s = self.parameters.role("return_settles_s")
+        if self.stage is Stage.DESCEND and z > self.place[2] - height_within_m:
+            waits_s = role("return_waits_s")
+            settles_s = role("return_settles_s")
             self._until_s = now_s + waits_s + settles_s if waits_s >= 0.0 else math.inf
             self._go(Stage.WAIT)
         if self.stage is Stage.WAIT and now_s >= self._until_s:

@@ -66,6 +66,8 @@ class Mission:
     origin: Origin
     first: int = 0  # the item with which it begins
     turning: frozenset[int] = frozenset()  # MAV_CMD of items that ask for a course
+    tells_above: bool = False  # a landing is reached above its place too, if it is not near
+    keeps_speed: bool = False  # asked for before a pause
     items: tuple[Item, ...] = ()
     beside: dict[int, tuple[Item, ...]] = field(default_factory=dict)  # by MAV_MISSION_TYPE
     current: int = 0
@@ -78,6 +80,9 @@ class Mission:
     _climb_to_z_m: float = math.nan  # first, from the ground, straight up to here
     _since_s: float = math.nan  # when the current item's place was reached
     _held: Triple = NAN3
+    _goes: bool = False  # to a place that was not near
+    before_ned_m: Triple = NAN3  # the place before the one flown to; no numbers: none
+    behind_ned_m: Triple = NAN3  # the one to go on to without a stop
 
     @property
     def flyable(self) -> bool:
@@ -106,6 +111,7 @@ class Mission:
         if not 0 <= number < len(self.items):
             return False
         self.current, self.finished, self._since_s = number, False, math.nan
+        self.before_ned_m = NAN3
         return True
 
     def pause(self) -> None:
@@ -118,14 +124,20 @@ class Mission:
         self.events.append("mission begun")
         if self.finished:
             self.go_to(self.first)
-        self.speed_mps = math.inf
-        self._held = position_ned_m
+        self.speed_mps = self._speed_so_far if self.keeps_speed else math.inf
+        self._held, self.before_ned_m = position_ned_m, NAN3
         self._since_s = self._climb_to_z_m = math.nan
         first = next((item for item in self.items[self.current :] if item.is_place), None)
         if landed and first is not None and first.command != Kind.LAND:
             self._climb_to_z_m = self._place(first, home_ned_m)[2]
             self.climb_m = home_ned_m[2] - self._climb_to_z_m
             self.events.append("mission climbs")
+
+    @property
+    def _speed_so_far(self) -> float:
+        done = self.items[: self.current]
+        asked = [i.params[1] for i in done if i.command == Kind.CHANGE_SPEED and i.params[1] > 0]
+        return asked[-1] if asked else math.inf
 
     @property
     def climbing(self) -> bool:
@@ -146,7 +158,7 @@ class Mission:
         if not math.isnan(self._climb_to_z_m):
             self._held = (self._held[0], self._held[1], self._climb_to_z_m)
             if position_ned_m[2] < self._climb_to_z_m + _ACCEPTED_HEIGHT_M:
-                self._climb_to_z_m = math.nan
+                self._climb_to_z_m, self.before_ned_m = math.nan, self._held
             return MotionSetpoint(self._held)
         self._pass_over()
         if not self._to_do:
@@ -154,6 +166,7 @@ class Mission:
         item = self.items[self.current]
         if item.is_place:
             self._held = self._target(item, position_ned_m, home_ned_m)
+            self.behind_ned_m = self._next_place(item, home_ned_m)
         self._progress(item, now_s, position_ned_m, landed)
         self._pass_over()
         return MotionSetpoint(self._held, yaw_rad=self._yaw(item), faces_way=True)
@@ -164,14 +177,14 @@ class Mission:
         """See whether its place is reached, and whether it is done there."""
         if math.isnan(self._since_s) and self._arrived(item, position_ned_m):
             self._since_s = now_s
-            if item.command != Kind.LAND:
+            if item.command == Kind.LAND and self.tells_above and self._goes:
                 self._note_reached()
-        if math.isnan(self._since_s):
+        self._goes = math.isnan(self._since_s)
+        if self._goes:
             return
-        if item.command == Kind.LAND and landed:
+        stayed = now_s - self._since_s >= self._stay_s(item)
+        if landed if item.command == Kind.LAND else stayed:
             self._note_reached()
-            self._advance()
-        elif now_s - self._since_s >= self._stay_s(item):
             self._advance()
 
     @property
@@ -196,6 +209,8 @@ class Mission:
 
     def _advance(self) -> None:
         """To the next item, or to the end."""
+        if self.items[self.current].is_place:
+            self.before_ned_m = self._held
         self._since_s = math.nan
         if self.current + 1 < len(self.items):
             self.current += 1
@@ -228,11 +243,28 @@ class Mission:
             down = position_ned_m[2] if self.landing else self._held[2]
         return north, east, down
 
+    def _next_place(self, item: Item, home_ned_m: Triple) -> Triple:
+        """Behind an item at which it does not stop; no numbers where there is none."""
+        rest = self.items[self.current + 1 :]
+        following = next((other for other in rest if other.is_place), None)
+        if following is None or self._stay_s(item) > 0.0:
+            return NAN3
+        north, east, down = self._place(following, home_ned_m)
+        if following.x == 0 and following.y == 0:
+            north, east = self._held[:2]
+        return north, east, down
+
+    @property
+    def accepted_m(self) -> float:
+        """From the current place across; no number where the item does not say."""
+        item = self.items[self.current] if self.current < len(self.items) else None
+        asked = item is not None and item.command == Kind.WAYPOINT and item.params[1] > 0
+        return item.params[1] if item is not None and asked else math.nan
+
     def _arrived(self, item: Item, position_ned_m: Triple) -> bool:
         if not item.is_place:
             return True
-        asked_m = item.params[1]
-        radius_m = asked_m if item.command == Kind.WAYPOINT and asked_m > 0 else _ACCEPTED_M
+        radius_m = _ACCEPTED_M if math.isnan(self.accepted_m) else self.accepted_m
         north, east, down = self._held
         x, y, z = position_ned_m
         near = math.hypot(x - north, y - east) < radius_m

@@ -18,10 +18,14 @@ from simulator.mission import Mission
 from simulator.nav import Nav
 from simulator.parameters import ParameterTable
 from simulator.sticks import Sticks
+from simulator.trajectory import Leg, Trajectory
 
 _STILL_MPS = 0.05  # slower than that it holds its place
 _FLATTEST = 1000.0  # metres across per metre of climb
 _STANDING = frozenset({Behaviour.HOLD, Behaviour.SETPOINT})
+_BY_ITSELF = frozenset(
+    {Behaviour.HOLD, Behaviour.TAKEOFF, Behaviour.LAND, Behaviour.RETURN, Behaviour.MISSION}
+)
 
 
 class Navigator:
@@ -51,6 +55,8 @@ class Navigator:
         self.earthbound = False  # the takeoff leads nowhere up
         self._climbed = False
         self._levelling: AttitudeSetpoint | None = None  # the last one of our own
+        limits = firmware.flight.path_limits
+        self._way = Trajectory(limits, parameters) if limits else None
 
     # -- what it does ------------------------------------------------------------------------
 
@@ -62,10 +68,12 @@ class Navigator:
         """
         goes_on = behaviour is self.behaviour is Behaviour.HOLD and self._is_going
         if not (goes_on or (self._climbed and behaviour in _STANDING)):
-            self._hold = _ahead(nav)
+            self._hold = self._ahead(nav)
         within = self.behaviour is Behaviour.TAKEOFF and behaviour is Behaviour.SETPOINT
         if behaviour is not self.behaviour and not within:
             self.cruise_mps = math.inf
+        if self._way is not None and behaviour not in _BY_ITSELF:
+            self._way.leave()
         self.behaviour = behaviour
         self._takeoff_ned_m, self._climb_begun, self.earthbound = takeoff_ned_m, False, False
         self._return = Return(self._firmware, self._parameters, self._events)
@@ -78,6 +86,8 @@ class Navigator:
         """The motors begin to turn: home is here."""
         self.home_ned_m, self.home_yaw_rad = nav.position_ned_m, nav.yaw_rad
         self.mission.pause()
+        if self._way is not None:
+            self._way.leave()
         self.stay(nav)
 
     def stay(self, nav: Nav) -> None:
@@ -185,11 +195,23 @@ class Navigator:
         return asked_mps
 
     @property
+    def smooth(self) -> bool:
+        """The motion asked for keeps all limits by itself."""
+        return self._way is not None and self._way.under_way
+
+    @property
+    def rises(self) -> bool:
+        """It is to go up, smoothly."""
+        return self._way is not None and self._way.under_way and self._way.wants_up
+
+    @property
     def standing(self) -> MotionSetpoint | None:
         """What is held or asked for, the same object as long as it is the same; None where the
         behaviour goes on from place to place."""
         if self.behaviour not in _STANDING:
             return None
+        if self._way is not None and self.behaviour in _BY_ITSELF:
+            return self._way.resting(self._standing)
         return self._standing
 
     @property
@@ -200,8 +222,24 @@ class Navigator:
             self._held = MotionSetpoint(self._hold)
         return self._held
 
-    def motion(self, nav: Nav, time_s: float, *, landed: bool) -> MotionSetpoint:
-        """Where to be now, and how to get there; NED, SI, vehicle time."""
+    def motion(self, nav: Nav, time_s: float, *, landed: bool, waits: bool) -> MotionSetpoint:
+        """Where to be now, and how to get there; NED, SI, vehicle time. `waits`: on the ground,
+        not to lift off yet."""
+        goal = self._goal(nav, time_s, landed=landed)
+        if self._way is None or self.behaviour not in _BY_ITSELF:
+            return goal
+        return self._way.follow(goal, self._leg(nav), nav, waits=waits)
+
+    def _leg(self, nav: Nav) -> Leg:
+        height_m = self.home_ned_m[2] - nav.position_ned_m[2]
+        if self.behaviour is not Behaviour.MISSION:
+            return Leg(self.across_mps, takeoff=self.climbing, height_m=height_m)
+        before, behind = self.mission.before_ned_m, self.mission.behind_ned_m
+        return Leg(
+            self.across_mps, before, behind, self.mission.accepted_m, self.climbing, height_m
+        )
+
+    def _goal(self, nav: Nav, time_s: float, *, landed: bool) -> MotionSetpoint:
         if self.behaviour is Behaviour.TAKEOFF:
             return self._climb(nav, landed=landed)
         if self.behaviour is Behaviour.RETURN:
@@ -221,7 +259,7 @@ class Navigator:
         across, change, climb_mps, turn_radps = self._sticks.ask(time_s, nav.yaw_rad)
         if landed and climb_mps <= 0.0:
             return sink(self._hold, self._firmware.flight.descend_speed_mps)
-        (x, y, z), ahead = self._hold, _ahead(nav)
+        (x, y, z), ahead = self._hold, self._ahead(nav)
         moves = math.hypot(*across) > _STILL_MPS
         x, y = ahead[:2] if moves else (x, y)
         self._hold = (x, y, ahead[2] if climb_mps else z)
@@ -244,6 +282,13 @@ class Navigator:
             self._climbed = not landed
         self._hold = (north, east, target_z)
         return MotionSetpoint(self._hold)
+
+    def _ahead(self, nav: Nav) -> Triple:
+        """Where a vehicle comes to rest that brakes gently from here."""
+        if self._way is not None:
+            return self._way.stop_ned_m(nav)
+        (x, y, z), (vx, vy, vz) = nav.position_ned_m, nav.velocity_ned_mps
+        return (x + 0.5 * vx, y + 0.5 * vy, z + 0.2 * vz)
 
     def _begin_climb(self, here_ned_m: Triple, *, landed: bool) -> None:
         """No way down, and from the ground none that is flat, is flown."""
@@ -269,9 +314,3 @@ class Navigator:
 def level(yaw_rad: float) -> Quaternion:
     """Attitude of this course without tilt."""
     return (math.cos(0.5 * yaw_rad), 0.0, 0.0, math.sin(0.5 * yaw_rad))
-
-
-def _ahead(nav: Nav) -> Triple:
-    """Where a vehicle comes to rest that brakes gently from here."""
-    (x, y, z), (vx, vy, vz) = nav.position_ned_m, nav.velocity_ned_mps
-    return (x + 0.5 * vx, y + 0.5 * vy, z + 0.2 * vz)

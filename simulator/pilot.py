@@ -212,12 +212,14 @@ class Pilot:
         lifts = self._navigator.behaviour in _LIFTING
         if self.landed and self._takeoff.spooling and lifts:
             self._navigator.stay(nav)
-        self.motion = self._navigator.motion(nav, time_s, landed=self.landed)
+        waits = not (self._takeoff.flying or self._takeoff.lifting)
+        self.motion = self._navigator.motion(nav, time_s, landed=self.landed, waits=waits)
         wants_up = lifts and self._asks_up(nav)
         self._takeoff.step(LOOP_S, wants_up)
         rises = self._takeoff.lifting
-        stands = nav.on_ground and (rises or self.landed)
-        self.loop.demand(self.motion, self._limits, integrate=not stands)
+        still = nav.on_ground and (rises or self.landed)
+        integrates = not still or (rises and self._firmware.flight.integrates_on_ramp)
+        self.loop.demand(self.motion, self._limits, integrate=integrates)
         attitude, thrust, wanted = self.loop.step(nav.position_ned_m, nav.velocity_ned_mps)
         self._wanted_z_mps = wanted[2]
         if rises:
@@ -234,26 +236,29 @@ class Pilot:
     @property
     def _limits(self) -> Limits:
         """As the behaviour allows, and the takeoff."""
-        role, navigator = self._parameters.role, self._navigator
-        up_mps = self._takeoff.speed_up_mps(self.loop.gains.velocity_z[0])
-        if navigator.climbing:
+        role, navigator, gains = self._parameters.role, self._navigator, self.loop.gains
+        up_mps = self._takeoff.speed_up_mps(gains.velocity_z[0])
+        if navigator.climbing and not navigator.smooth:
             up_mps = min(up_mps, role("takeoff_speed_mps"))
         turn_radps = self.motion.turn_radps
         if navigator.automatic:
-            turn_radps = min(turn_radps, self.loop.gains.turn_radps)
+            turn_radps = min(turn_radps, gains.turn_radps)
         return Limits(
             hover_thrust=role("hover_thrust"),
             thrust_least=0.0 if self._takeoff.lifting else role("thrust_least"),
-            across_mps=navigator.across_mps,
+            across_mps=math.inf if navigator.smooth else navigator.across_mps,
             up_mps=up_mps,
+            down_mps=gains.follows_down_mps if navigator.smooth else gains.speed_down_mps,
             turn_radps=turn_radps,
-            gently=navigator.automatic,
+            gently=navigator.automatic and not navigator.smooth,
         )
 
     def _asks_up(self, nav: Nav) -> bool:
         """Something above is demanded: a height, a climb or an acceleration."""
-        motion = self.motion
-        return not self._navigator.earthbound and (
+        motion, navigator = self.motion, self._navigator
+        if navigator.smooth:
+            return navigator.rises and not navigator.earthbound
+        return not navigator.earthbound and (
             motion.position_ned_m[2] < nav.position_ned_m[2]
             or motion.velocity_ned_mps[2] < 0.0
             or motion.acceleration_ned_mps2[2] < 0.0

@@ -28,13 +28,12 @@ _INTEGRAL_ACROSS_MAX_MPS2 = 4.0  # of the vertical it is gravity, so that any ve
 # State: integrals m/s^2, filtered derivative of the velocity, velocity of the last period.
 _DERIVATIVE, _VELOCITY = 3, 6
 _AT_REST = (0.0,) * 6 + NAN3
-# Gains: position P, velocity P, I and D of north, east and down, and then these.
-_SPEED_DOWN, _CUTOFF = 12, 13
+_CUTOFF = 12  # behind the gains: position P, velocity P, I and D of north, east and down
 
 RECORD = np.dtype(
     [
         ("state", "f8", 9),
-        ("gains", "f8", 14),
+        ("gains", "f8", 13),
         ("tilt_max_rad", "f8"),
         # what is demanded, NED; not a number where nothing is
         ("position", "f8", 3),
@@ -47,6 +46,7 @@ RECORD = np.dtype(
         ("period_s", "f8"),
         ("speed_xy_mps", "f8"),
         ("speed_up_mps", "f8"),
+        ("speed_down_mps", "f8"),
         ("hover_thrust", "f8"),
         ("thrust_least", "f8"),
         ("thrust_max", "f8"),
@@ -85,6 +85,7 @@ class Limits:
     thrust_least: float = 0.0
     across_mps: float = math.inf
     up_mps: float = math.inf  # below 0 it is a descent
+    down_mps: float = math.nan  # in place of the gains', whatever theirs
     turn_radps: float = math.inf
     gently: bool = False  # as automatic flight speeds up and brakes
 
@@ -112,8 +113,7 @@ class PositionLoop:
         self.gains = gains
         across = (gains.position_xy_ps, *gains.velocity_xy)
         up = (gains.position_z_ps, *gains.velocity_z)
-        limits = (gains.speed_down_mps, gains.derivative_cutoff_hz)
-        self.record["gains"] = (*across, *across, *up, *limits)
+        self.record["gains"] = (*across, *across, *up, gains.derivative_cutoff_hz)
         self.record["tilt_max_rad"] = gains.tilt_max_rad
         self.record["thrust_max"] = gains.thrust_max
         self.record["facing_mps"] = gains.facing_mps
@@ -139,6 +139,8 @@ class PositionLoop:
             record["faces_way"] = motion.faces_way
         record["speed_xy_mps"] = min(limits.across_mps, gains.speed_xy_mps)
         record["speed_up_mps"] = min(limits.up_mps, gains.speed_up_mps)
+        own = math.isnan(limits.down_mps)
+        record["speed_down_mps"] = gains.speed_down_mps if own else limits.down_mps
         record["hover_thrust"] = limits.hover_thrust
         record["thrust_least"] = limits.thrust_least
         record["turn_radps"] = limits.turn_radps
@@ -303,7 +305,7 @@ def _limit_speed(loop: Any) -> None:
         wanted[0] *= most / speed
         wanted[1] *= most / speed
     if not math.isnan(wanted[2]):
-        wanted[2] = max(-loop.speed_up_mps, min(loop.gains[_SPEED_DOWN], wanted[2]))
+        wanted[2] = max(-loop.speed_up_mps, min(loop.speed_down_mps, wanted[2]))
 
 
 @kernel

@@ -63,4 +63,4 @@ class Takeoff:
             return math.inf
         none_mps = -GRAVITY_MPS2 / velocity_p_ps
         share = min(1.0, self._ramp_s / max(self.parameters.role("takeoff_ramp_s"), 1e-3))
-        return none_mps + share * (self.parameters.role("takeoff_speed_mps") - none_mps)
+        return none_mps + share * (self.parameters.role("ramp_ends_mps") - none_mps)

@@ -30,6 +30,7 @@ class PositionGains:
     speed_xy_mps: float
     speed_up_mps: float
     speed_down_mps: float
+    follows_down_mps: float  # after a point that keeps its own limits
     tilt_max_rad: float
     thrust_max: float
     derivative_cutoff_hz: float
@@ -37,6 +38,30 @@ class PositionGains:
     speeding_mps2: float  # the same, across the ground
     braking_mps2: float  # the same, on the way to a place
     facing_mps: float  # wanted across the ground, from which on it faces its way
+
+
+@dataclass(frozen=True, slots=True)
+class PathLimits:
+    """Within which a way to a goal is drawn, where a firmware draws one (`simulator.trajectory`).
+
+    A takeoff goes at `lift` as long as it is lower than that above home. A corner is flown with a
+    share of the acceleration across; a point that runs further ahead than `behind_max_m` waits.
+    """
+
+    jerk_mps3: float
+    across_mps2: float
+    up_mps2: float
+    down_mps2: float
+    speed_across_mps: float
+    speed_up_mps: float
+    speed_down_mps: float
+    lift_mps: float
+    lift_mps2: float
+    lift_below_m: float
+    corner_share: float
+    accepted_m: float  # from a goal, across and in height
+    accepted_height_m: float
+    behind_max_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +96,8 @@ class FlightRules:
     """How a firmware flies by itself."""
 
     gains: Callable[[ReadParameter], PositionGains]
+    path_limits: Callable[[ReadParameter], PathLimits] | None  # None: it draws no ways
+    integrates_on_ramp: bool  # of a takeoff, as long as the ground still carries it
     landing: Landing
     descend_speed_mps: float  # where sticks are missed
     handling: Handling | None  # by sticks; None: it has none

@@ -33,6 +33,7 @@ class MissionRules:
     taken. `texts` follow an upload. `frame_shown`: of an item in whole 1e-7 degrees, or in
     degrees. `stopping`: types whose items are shown without autocontinue. `turning`: commands
     (MAV_CMD) whose fourth parameter is a course.
+    `tells_above`, `keeps_speed`: as in `simulator.mission`.
     """
 
     strict: bool
@@ -44,3 +45,5 @@ class MissionRules:
     frame_shown: Callable[[MissionItem, bool], int]
     stopping: frozenset[int]
     turning: frozenset[int]
+    tells_above: bool
+    keeps_speed: bool

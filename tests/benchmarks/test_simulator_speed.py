@@ -39,7 +39,7 @@ def _holding() -> Instance:
     instance = _standing()
     instance.autopilot.happen("mode", Wish("AUTO.TAKEOFF"))
     instance.autopilot.happen("arm")
-    _fly(instance, 12.0)
+    _fly(instance, 20.0)  # and at rest
     return instance
 
 

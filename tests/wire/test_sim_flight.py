@@ -338,7 +338,7 @@ def test_reposition_holds_somewhere_else(frame: int, height_m: float) -> None:
             1, 1, frame, 192, 0, 0, -1, 1, 0, NAN, latitude, longitude, height_m
         )
     )
-    bench.run(14.0)
+    bench.run(18.0)
     assert bench.mode == LOITER
     place = bench.instance.autopilot.senses.truth.position_ned_m
     assert place == pytest.approx([10.0, 0.0, -5.0], abs=0.2)

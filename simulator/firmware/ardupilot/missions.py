@@ -42,4 +42,6 @@ MISSIONS = MissionRules(
     frame_shown=_frame_shown,
     stopping=frozenset({1, 2}),
     turning=frozenset(),  # MAV_CMD_CONDITION_YAW would be
+    tells_above=False,
+    keeps_speed=False,
 )

@@ -101,6 +101,7 @@ ROLES: dict[str, Role] = {
     "failsafe_delay_s": 0.0,
     "spool_up_s": 2.5,
     "takeoff_ramp_s": 1.5,
+    "ramp_ends_mps": ("WPNAV_SPEED_UP", 0.76 * _CENTI),
     "climbed_within_m": 0.1,
     "thrust_least": 0.0,
     "stick_thrust_least": 0.08,
@@ -111,6 +112,8 @@ ROLES: dict[str, Role] = {
     "crawl_below_m": -1.0,  # it does not
     "crawl_speed_mps": 0.0,
     "return_descends_to_m": math.inf,
+    "return_within_m": 1.0,
+    "return_height_within_m": 1.0,
     "return_waits_s": ("RTL_LOIT_TIME", 1e-3),
     "return_settles_s": 1.8,  # stops and turns first
 }

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.flight import FlightRules, Heads, Landing, PositionGains
+from simulator.firmware.flight import FlightRules, Heads, Landing, PathLimits, PositionGains
 from simulator.firmware.vocabulary import ReadParameter
 
 
@@ -20,13 +20,35 @@ def gains(parameter: ReadParameter) -> PositionGains:
         speed_xy_mps=parameter("MPC_XY_VEL_MAX"),
         speed_up_mps=parameter("MPC_Z_VEL_MAX_UP"),
         speed_down_mps=parameter("MPC_Z_VEL_MAX_DN"),
+        follows_down_mps=max(parameter("MPC_Z_VEL_MAX_DN"), 1.2 * parameter("MPC_Z_V_AUTO_DN")),
         tilt_max_rad=math.radians(parameter("MPC_TILTMAX_AIR")),
         thrust_max=parameter("MPC_THR_MAX"),
         derivative_cutoff_hz=5.0,
         turn_radps=math.radians(parameter("MPC_YAWRAUTO_MAX")),
-        speeding_mps2=2.0,  # less than MPC_ACC_HOR, as the jerk is limited
-        braking_mps2=0.7,
+        speeding_mps2=parameter("MPC_ACC_HOR"),  # its ways keep limits of their own
+        braking_mps2=parameter("MPC_ACC_HOR"),
         facing_mps=parameter("MPC_XY_P") * parameter("NAV_ACC_RAD"),  # further away than that
+    )
+
+
+def path_limits(parameter: ReadParameter) -> PathLimits:
+    """Of the smooth ways of automatic flight."""
+    lift_mps, ramp_s = parameter("MPC_TKO_SPEED"), parameter("MPC_TKO_RAMP_T")
+    return PathLimits(
+        jerk_mps3=parameter("MPC_JERK_AUTO"),
+        across_mps2=parameter("MPC_ACC_HOR"),
+        up_mps2=parameter("MPC_ACC_UP_MAX"),
+        down_mps2=parameter("MPC_ACC_DOWN_MAX"),
+        speed_across_mps=parameter("MPC_XY_VEL_MAX"),
+        speed_up_mps=parameter("MPC_Z_V_AUTO_UP"),
+        speed_down_mps=parameter("MPC_Z_V_AUTO_DN"),
+        lift_mps=lift_mps,
+        lift_mps2=lift_mps / max(ramp_s, 1e-3),
+        lift_below_m=parameter("MPC_LAND_ALT1"),
+        corner_share=parameter("MPC_XY_TRAJ_P"),
+        accepted_m=parameter("NAV_ACC_RAD"),
+        accepted_height_m=parameter("NAV_MC_ALT_RAD"),
+        behind_max_m=parameter("MPC_XY_ERR_MAX"),
     )
 
 
@@ -49,6 +71,8 @@ def return_heads(distance_m: float, parameter: ReadParameter) -> Heads:
 
 FLIGHT = FlightRules(
     gains=gains,
+    path_limits=path_limits,
+    integrates_on_ramp=True,
     landing=Landing(
         low_thrust_share=0.95,  # of estimates that wander on the ground, too
         idle_thrust_share=0.1,

@@ -53,4 +53,6 @@ MISSIONS = MissionRules(
     frame_shown=_frame_shown,
     stopping=frozenset({1}),
     turning=frozenset({16, 17, 19, 21}),
+    tells_above=True,
+    keeps_speed=True,
 )
