@@ -137,9 +137,13 @@ class Entry(Generic[N]):
     def bound(self, *args: Any) -> Callable[[], N]:
         """`call` with the same arguments every time, in a fraction of its time; records are given
         as they are. What arrays and records hold may change from call to call; they live as long as
-        this does."""
-        pairs = zip(self._parameters, args, strict=True)
-        given = [address(arg) if isinstance(each, np.dtype) else arg for each, arg in pairs]
+        this does. Raises TypeError for a record or an array of another kind."""
+        given = list(args)
+        for i, (each, arg) in enumerate(zip(self._parameters, args, strict=True)):
+            if isinstance(each, np.dtype):
+                if arg.dtype != each:
+                    raise TypeError(f"argument {i} of {self.symbol} is a record of another kind")
+                given[i] = address(arg)
         block = self._block_of(given)
         call = functools.partial(
             self._machine_code, *((block, block) if self._takes_arrays else given)

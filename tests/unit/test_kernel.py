@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from offboard.control.filtering import FILTER
+from offboard.control.observer_adaptation import note
 from offboard.model.kernel import array
 
 ROOT = Path(__file__).parents[2]
@@ -137,13 +139,15 @@ def test_bitcode_that_came_with_the_package_needs_no_compiler(tmp_path: Path) ->
     assert _run(tmp_path / "user") == LOADED
 
 
-def test_an_array_that_would_be_misread_is_refused() -> None:
+def test_what_would_be_misread_is_refused() -> None:
     values = array(2).flat
     assert values(np.zeros((2, 3)))[1:] == (2, 3)
     fixed = np.ones((2, 3))
     fixed.flags.writeable = False
     assert values(fixed) == (fixed.ctypes.data, 2, 3)
     assert values(np.zeros((0, 3)))[1:] == (0, 3)
+    with pytest.raises(TypeError, match="argument 0 of .*note is a record of another kind"):
+        note.bound(np.zeros(1, FILTER), 0.0)
     for wrong in (np.zeros((2, 3))[:, ::2], np.zeros(3), np.zeros((2, 3), "f4")):
         with pytest.raises(TypeError, match="contiguous array of 2 dimensions of float64"):
             values(wrong)
