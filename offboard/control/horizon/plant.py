@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.control.horizon.outlook import Bounds, Outlook
+from offboard.control.propagation import upright
 from offboard.control.response import SHORTEST_THRUST_LAG_S, CostToGo
-from offboard.model.kernel import kernel
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
@@ -198,9 +198,3 @@ def start_state(lateral: Array, vertical: Array, scene: Scene) -> Array:
     force = scene.thrusts_heave[0] * scene.uprights[0] + start[F]
     start[T] = force / (scene.uprights[0] + leant) - scene.thrusts_heave[0]
     return start
-
-
-@kernel
-def upright(north: float, east: float) -> float:
-    """Down component of a thrust direction, a unit vector, by the other two (NED)."""
-    return math.sqrt(max(1.0 - north * north - east * east, 0.01))

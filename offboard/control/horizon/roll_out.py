@@ -23,8 +23,8 @@ from offboard.control.horizon.plant import (
     V,
     W,
     Z,
-    upright,
 )
+from offboard.control.propagation import upright
 from offboard.model.kernel import array, entry, kernel
 
 

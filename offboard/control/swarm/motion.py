@@ -41,6 +41,16 @@ _LOW_31 = np.uint64(0x7FFFFFFF)
 _UNIT_31 = 2.0**-31  # one draw gives two uniform numbers of 31 bits in [0, 1)
 
 
+@kernel
+def _next(x):  # type: ignore[no-untyped-def]
+    """Of a lane, by xorshift. What is drawn from it is not made here: the loops over kernels that
+    return two numbers are not vectorised."""
+    x ^= x << _SHIFT_A
+    x ^= x >> _SHIFT_B
+    x ^= x << _SHIFT_C
+    return x
+
+
 @entry(SEARCH, array(1, "u8"), array(1), array(1), array(2), array(2))
 def scatter(  # type: ignore[no-untyped-def]
     search, lanes, lower, upper, positions, velocities
@@ -54,11 +64,7 @@ def scatter(  # type: ignore[no-untyped-def]
         high = upper[j]
         width = high - low
         for i in range(positions.shape[1]):
-            x = lanes[i]
-            x ^= x << _SHIFT_A
-            x ^= x >> _SHIFT_B
-            x ^= x << _SHIFT_C
-            lanes[i] = x
+            x = lanes[i] = _next(lanes[i])
             r1 = np.int32(x >> _HIGH) * _UNIT_31
             r2 = np.int32(x & _LOW_31) * _UNIT_31
             positions[j, i] = min(max(low + r1 * width, low), high)
@@ -82,11 +88,7 @@ def move(  # type: ignore[no-untyped-def]
         high = upper[j]
         target = leader[j]
         for i in range(positions.shape[1]):
-            x = lanes[i]
-            x ^= x << _SHIFT_A
-            x ^= x >> _SHIFT_B
-            x ^= x << _SHIFT_C
-            lanes[i] = x
+            x = lanes[i] = _next(lanes[i])
             r1 = np.int32(x >> _HIGH) * _UNIT_31
             r2 = np.int32(x & _LOW_31) * _UNIT_31
             here = positions[j, i]
