@@ -146,7 +146,7 @@ def test_what_would_be_misread_is_refused() -> None:
     fixed.flags.writeable = False
     assert values(fixed) == (fixed.ctypes.data, 2, 3)
     assert values(np.zeros((0, 3)))[1:] == (0, 3)
-    with pytest.raises(TypeError, match="argument 0 of .*note is a record of another kind"):
+    with pytest.raises(TypeError, match="note is a record of another kind"):
         note.bound(np.zeros(1, FILTER), 0.0)
     for wrong in (np.zeros((2, 3))[:, ::2], np.zeros(3), np.zeros((2, 3), "f4")):
         with pytest.raises(TypeError, match="contiguous array of 2 dimensions of float64"):
