@@ -105,7 +105,7 @@ class Autopilot:
         if setpoint is None:
             return
         self.stream.newest_s = self.senses.time_s
-        self.navigator.setpoint = setpoint
+        self.navigator.obey(setpoint)
         self._end_takeoff()
         if isinstance(setpoint, AttitudeSetpoint) and setpoint.event:
             self.happen(setpoint.event)

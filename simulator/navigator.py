@@ -69,8 +69,7 @@ class Navigator:
         goes_on = behaviour is self.behaviour is Behaviour.HOLD and self._is_going
         if not (goes_on or (self._climbed and behaviour in _STANDING)):
             self._hold = self._ahead(nav)
-        within = self.behaviour is Behaviour.TAKEOFF and behaviour is Behaviour.SETPOINT
-        if behaviour is not self.behaviour and not within:
+        if behaviour is not self.behaviour:
             self.cruise_mps = math.inf
         if self._way is not None and behaviour not in _BY_ITSELF:
             self._way.leave()
@@ -94,12 +93,20 @@ class Navigator:
         """Hold exactly here."""
         self._hold = nav.position_ned_m
 
+    def obey(self, setpoint: AttitudeSetpoint | MotionSetpoint) -> None:
+        """From now on; one of another kind than before, flown as automatic flight is, forgets the
+        speed that was asked for."""
+        anew = _kind(setpoint) != _kind(self.setpoint)
+        if anew and self._firmware.setpoints.as_automatic:
+            self.cruise_mps = math.inf
+        self.setpoint = setpoint
+
     def go_to(self, place_ned_m: Triple, yaw_rad: float) -> None:
         """Hold there, in a mode that holds or obeys; no number keeps the course."""
         self._hold = place_ned_m
         self._held = MotionSetpoint(place_ned_m, yaw_rad=yaw_rad, faces_way=True)
         if self.behaviour is Behaviour.SETPOINT:
-            self.setpoint = self._held
+            self.obey(self._held)
 
     @property
     def _is_going(self) -> bool:
@@ -314,3 +321,11 @@ class Navigator:
 def level(yaw_rad: float) -> Quaternion:
     """Attitude of this course without tilt."""
     return (math.cos(0.5 * yaw_rad), 0.0, 0.0, math.sin(0.5 * yaw_rad))
+
+
+def _kind(setpoint: AttitudeSetpoint | MotionSetpoint | None) -> tuple[bool, ...]:
+    """Whether it gives an attitude, a place and a velocity."""
+    if not isinstance(setpoint, MotionSetpoint):
+        return (setpoint is not None,)
+    given = (setpoint.position_ned_m, setpoint.velocity_ned_mps)
+    return tuple(not math.isnan(vector[0]) for vector in given)
