@@ -39,7 +39,7 @@ def _holding() -> Instance:
     instance = _standing()
     instance.autopilot.happen("mode", Wish("AUTO.TAKEOFF"))
     instance.autopilot.happen("arm")
-    _fly(instance, 20.0)  # and at rest
+    _fly(instance, 25.0)  # until it rests there
     return instance
 
 
