@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from simulator.fields import centi, fit, heading_cdeg, in_body, motion_fields
-from simulator.position_loop import GRAVITY_MPS2
+from simulator.position_law import GRAVITY_MPS2
 from simulator.view import View
 
 _NAN21 = (math.nan,) * 21

@@ -18,7 +18,7 @@ from offboard.model.kernel import kernel
 from simulator.airframe import CHARGE, THRUST
 from simulator.dynamics import receive_fix
 from simulator.geodesy import DEGREES_PER_M
-from simulator.position_loop import GRAVITY_MPS2
+from simulator.position_law import GRAVITY_MPS2
 
 Array = NDArray[np.float64]
 

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from offboard.model.kernel import address, entry, kernel
-from simulator import dynamics, payloads, position_loop, seen
+from simulator import dynamics, payloads, position_law, seen
 from simulator.airframe import CONTACT
 from simulator.attitude import encode_attitude
 from simulator.dynamics import advance_steps, report_state
 from simulator.frame_writer import FRAME_MAX, KINDS, write_frame
-from simulator.position_loop import step_loop
+from simulator.position_law import step_loop
 from simulator.schedule import Stream
 from simulator.seen import Seen
 from simulator.server import Server
@@ -178,7 +178,7 @@ def _is_common(view: View, name: str) -> bool:
     int,
     int,
     dynamics.RECORD,
-    position_loop.RECORD,
+    position_law.RECORD,
     seen.RECORD,
     LINKS,
     payloads.PAYLOAD,

@@ -10,7 +10,7 @@ import math
 from dataclasses import dataclass
 
 from simulator.parameters import ParameterTable
-from simulator.position_loop import GRAVITY_MPS2
+from simulator.position_law import GRAVITY_MPS2
 
 
 @dataclass(slots=True)

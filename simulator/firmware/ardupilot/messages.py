@@ -10,7 +10,7 @@ import numpy as np
 
 from offboard.model.frames import euler_from_quaternion, rotation_from_quaternion
 from simulator.fields import fit
-from simulator.position_loop import GRAVITY_MPS2
+from simulator.position_law import GRAVITY_MPS2
 from simulator.view import View
 
 # EKF_STATUS_FLAGS from a boot event on
