@@ -21,7 +21,7 @@ from simulator.parameters import ParameterTable
 from simulator.smoothing import RECORD, follow
 from simulator.steps import LOOP_S
 
-_RESTS_M, _RESTS_MPS = 0.005, 0.01  # nearer and slower than that it has arrived
+_RESTS_M, _RESTS_MPS = 0.02, 0.02  # nearer and slower than that it has arrived
 _STARTS_DOWN_MPS = 0.7  # on the ground: a takeoff begins by pressing on it
 _WANTS_UP_MPS = 0.3
 _DECIDES_S = 0.6  # lost to the jerk when braking
