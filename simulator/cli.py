@@ -115,8 +115,8 @@ def simulate(
     from offboard.flight.clock import unix_us
     from offboard.model.document import DocumentError
     from simulator import config
-    from simulator.links import LinkError, open_link, shifted
-    from simulator.recorder import Recorder
+    from simulator.link.links import LinkError, open_link, shifted
+    from simulator.link.recorder import Recorder
 
     # PX4's own local ports only in PX4's place: beside a real one they would starve it
     own_ports = connect is None

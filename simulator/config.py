@@ -12,8 +12,8 @@ from pydantic import Field
 
 from offboard.model.document import DocumentError, M, parse
 from offboard.model.vehicle import Parameters, Vehicle
-from simulator.conditions import Conditions
 from simulator.faults import Fault
+from simulator.vehicle.conditions import Conditions
 
 
 class Scenario(Parameters):

@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from offboard.model.vehicle import Parameters, Triple
-from simulator.codec import id_of
-from simulator.impairment import Impairment
+from simulator.link.impairment import Impairment
+from simulator.mavlink.codec import id_of
 
 
 def _known(name: str) -> str:

@@ -64,9 +64,9 @@ def _load() -> None:
     """Import what a flight takes and have its compiled functions loaded."""
     from offboard.model.kernel import Entry
     from simulator import config, run
-    from simulator.conditions import Conditions
     from simulator.firmware.catalogue import FIRMWARES
     from simulator.instance import Instance
+    from simulator.vehicle.conditions import Conditions
 
     assert run
     Entry.compile_all()

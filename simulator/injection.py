@@ -1,7 +1,7 @@
 """Faults at work: begins and ends each one of a scenario at its time, on one vehicle.
 
-What a fault *is* lies in `simulator.faults`; what a bad link does, in `simulator.impairment`. This
-module knows the whole vehicle, and nothing of the vehicle knows it.
+What a fault *is* lies in `simulator.faults`; what a bad link does, in `simulator.link.impairment`.
+This module knows the whole vehicle, and nothing of the vehicle knows it.
 """
 
 from __future__ import annotations
@@ -12,14 +12,14 @@ from random import Random
 from typing import Any, Protocol
 
 from simulator import faults
-from simulator.autopilot import Autopilot
-from simulator.commander import Wish
+from simulator.autopilot.autopilot import Autopilot
+from simulator.autopilot.commander import Wish
 from simulator.faults import Direction, Fault, Moment, Refusable
 from simulator.firmware.modes import Behaviour
 from simulator.firmware.vocabulary import Say, Severity
-from simulator.impairment import Channel, Path
+from simulator.link.impairment import Channel, Path
+from simulator.mavlink.view import Stuck, View
 from simulator.steps import STEP_S
-from simulator.view import Stuck, View
 
 _REFUSED_EVENTS = {
     Refusable.ARM: ("arm", "force arm"),

@@ -10,20 +10,20 @@ import math
 from collections.abc import Mapping, Sequence
 
 from offboard.model.vehicle import Vehicle
-from simulator.attitude import Demand
-from simulator.autopilot import Autopilot
-from simulator.conditions import Conditions
+from simulator.autopilot.autopilot import Autopilot
 from simulator.faults import Fault
 from simulator.firmware.base import Firmware
-from simulator.impairment import frames
 from simulator.injection import prepare
-from simulator.plant import Plant
-from simulator.server import Server
+from simulator.link.impairment import frames
+from simulator.mavlink.server import Server
+from simulator.mavlink.stretch import LONGEST, Stretch
+from simulator.mavlink.strict import Strict
+from simulator.mavlink.telemetry import builders
+from simulator.mavlink.view import View
 from simulator.steps import STEP_S, STEP_US
-from simulator.stretch import LONGEST, Stretch
-from simulator.strict import Strict
-from simulator.telemetry import builders
-from simulator.view import View
+from simulator.vehicle.attitude import Demand
+from simulator.vehicle.conditions import Conditions
+from simulator.vehicle.plant import Plant
 
 STEP_MS = STEP_US // 1000
 VIRTUAL_EPOCH_US = 1_767_225_600_000_000  # 2026-01-01, where virtual time begins

@@ -28,7 +28,7 @@ class Sitl:
     """A running vehicle. `connection` and `ground_connection`: where a client listens for it."""
 
     def __init__(self, directory: Path, options: dict[str, Any]) -> None:
-        from simulator.links import free_ports
+        from simulator.link.links import free_ports
 
         self.scenario = options.get("scenario")
         self.port, self.ground_port = free_ports(2)

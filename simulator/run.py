@@ -15,8 +15,8 @@ from dataclasses import dataclass
 
 from offboard.flight.clock import monotonic_s, unix_us
 from simulator.instance import Instance
-from simulator.links import Link, wait
-from simulator.recorder import Recorder
+from simulator.link.links import Link, wait
+from simulator.link.recorder import Recorder
 from simulator.steps import STEP_S
 
 RESEND_S = 0.05  # until the companion is first heard

@@ -44,7 +44,7 @@ def test_only_the_clock_reads_the_time() -> None:
 
 
 def test_only_the_edges_open_sockets() -> None:
-    links = {f"simulator/{name}.py" for name in ("links", "tcp", "udp")}
+    links = {f"simulator/link/{name}.py" for name in ("links", "tcp", "udp")}
     edges = {"offboard/flight/link.py", *links}
     pipes = {"offboard/flight/sitl.py", "simulator/hangar.py"}  # between the two processes
     assert _importers("socket", "serial") <= edges

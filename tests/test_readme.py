@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
+from simulator.autopilot.state_table import describe
 from simulator.firmware.px4 import PX4
-from simulator.state_table import describe
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()

@@ -1,8 +1,9 @@
 """What a firmware personality consists of: data the core of the simulator runs on.
 
-The core (`simulator.autopilot`, `simulator.server`) never asks which firmware it is: it reads one
-`Firmware` value. What each of its parts is lies in the module of this folder that is called like
-it; `px4` and `ardupilot` are folders of the same names. A further personality is one more folder.
+The core (`simulator.autopilot.autopilot`, `simulator.mavlink.server`) never asks which firmware it
+is: it reads one `Firmware` value. What each of its parts is lies in the module of this folder that
+is called like it; `px4` and `ardupilot` are folders of the same names. A further personality is one
+more folder.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Commands: what they ask for, and how a firmware answers them.
 
-What they do is `simulator.commands`'.
+What they do is `simulator.mavlink.commands`'.
 """
 
 from __future__ import annotations

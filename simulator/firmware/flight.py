@@ -1,6 +1,6 @@
 """Automatic flight: gains and limits of the position loop, landing, the way home.
 
-Who flies so is `simulator.pilot` and `simulator.navigator`.
+Who flies so is `simulator.autopilot.pilot` and `simulator.autopilot.navigator`.
 """
 
 from __future__ import annotations
@@ -42,7 +42,8 @@ class PositionGains:
 
 @dataclass(frozen=True, slots=True)
 class PathLimits:
-    """Within which a way to a goal is drawn, where a firmware draws one (`simulator.trajectory`).
+    """Within which a way to a goal is drawn, where a firmware draws one
+    (`simulator.autopilot.trajectory`).
 
     A takeoff goes at `lift` as long as it is lower than that above home. A corner is flown with a
     share of the acceleration across; a point that runs further ahead than `behind_max_m` waits.

@@ -1,6 +1,6 @@
 """The start of a firmware, its sensors and its checks.
 
-Whether a vehicle is fit is `simulator.health`'s.
+Whether a vehicle is fit is `simulator.autopilot.health`'s.
 """
 
 from __future__ import annotations
@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-from simulator.battery import BatteryState
 from simulator.firmware.vocabulary import ReadParameter
+from simulator.vehicle.battery import BatteryState
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,6 +1,6 @@
 """Items of missions, fences and rally points, and what a firmware takes of them.
 
-How they are flown is `simulator.mission`'s.
+How they are flown is `simulator.autopilot.mission`'s.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class MissionRules:
     taken. `texts` follow an upload. `frame_shown`: of an item in whole 1e-7 degrees, or in
     degrees. `stopping`: types whose items are shown without autocontinue. `turning`: commands
     (MAV_CMD) whose fourth parameter is a course.
-    `tells_above`, `keeps_speed`: as in `simulator.mission`.
+    `tells_above`, `keeps_speed`: as in `simulator.autopilot.mission`.
     """
 
     strict: bool

@@ -1,6 +1,6 @@
 """Flight modes, what the vehicle does in them, and what a heartbeat shows of it.
 
-Which there are is the firmware's; what a behaviour flies, `simulator.navigator`'s.
+Which there are is the firmware's; what a behaviour flies, `simulator.autopilot.navigator`'s.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Parameters, and what the core needs them for.
 
-Their values are `simulator.parameters`'.
+Their values are `simulator.autopilot.parameters`'.
 """
 
 from __future__ import annotations

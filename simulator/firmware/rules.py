@@ -1,6 +1,6 @@
 """The rows of a state table.
 
-What a row does is `simulator.commander`'s; which there are, the firmware's.
+What a row does is `simulator.autopilot.commander`'s; which there are, the firmware's.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """What a firmware sends without being asked, and what it sends on request.
 
-What a message says is `simulator.telemetry`'s.
+What a message says is `simulator.mavlink.telemetry`'s.
 """
 
 from __future__ import annotations

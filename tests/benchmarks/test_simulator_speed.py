@@ -12,11 +12,11 @@ from typing import Any
 import pytest
 
 from simulator import config
-from simulator.commander import Wish
-from simulator.conditions import Conditions
+from simulator.autopilot.commander import Wish
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
-from simulator.sensors import EstimatorName
+from simulator.vehicle.conditions import Conditions
+from simulator.vehicle.sensors import EstimatorName
 
 
 def _fly(instance: Instance, duration_s: float) -> int:

@@ -27,8 +27,8 @@ from offboard.flight.takeover import with_link
 from offboard.model.document import parse
 from offboard.model.vehicle import AxisResponse, Vehicle
 from simulator import config as simulated
-from simulator.attitude import build_loop
 from simulator.steps import STEP_S
+from simulator.vehicle.attitude import build_loop
 
 LEARNING = IdentifySettings()
 NEUTRAL = simulated.vehicle("neutral")

@@ -10,10 +10,10 @@ import yaml
 
 from offboard.model.frames import euler_from_quaternion, quaternion_from_euler
 from offboard.model.vehicle import Vehicle
-from simulator.attitude import Demand
-from simulator.conditions import Conditions
-from simulator.plant import Plant
 from simulator.steps import STEP_S
+from simulator.vehicle.attitude import Demand
+from simulator.vehicle.conditions import Conditions
+from simulator.vehicle.plant import Plant
 
 VEHICLES = Path(__file__).parents[2] / "config" / "vehicles"
 CALM = Conditions()

@@ -9,11 +9,11 @@ import pytest
 from sim_hover import attitude, hovering, load, response
 
 from offboard.model.frames import euler_from_quaternion, thrust_direction_from_quaternion
-from simulator.attitude import Demand
-from simulator.battery import Battery
-from simulator.conditions import Conditions
-from simulator.plant import Plant
 from simulator.steps import STEP_S
+from simulator.vehicle.attitude import Demand
+from simulator.vehicle.battery import Battery
+from simulator.vehicle.conditions import Conditions
+from simulator.vehicle.plant import Plant
 
 PX4 = load("px4_sih")
 G = PX4.gravity_mps2

@@ -17,9 +17,9 @@ from offboard.model.frames import (
     rotation_from_quaternion,
     thrust_direction_from_quaternion,
 )
-from simulator.attitude import Demand
-from simulator.conditions import Conditions
 from simulator.steps import STEP_S
+from simulator.vehicle.attitude import Demand
+from simulator.vehicle.conditions import Conditions
 
 AXES = {"roll": 0, "pitch": 1, "yaw": 2}
 

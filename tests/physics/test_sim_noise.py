@@ -12,9 +12,15 @@ from scipy.integrate import quad_vec
 from scipy.linalg import expm, solve_continuous_lyapunov
 from scipy.signal import welch
 
-from simulator.noise import advance_block, block_diagonal, discretise, fill_normals, seed_word
 from simulator.steps import STEP_S
-from simulator.wind import Gusts, dryden, wind_axes
+from simulator.vehicle.noise import (
+    advance_block,
+    block_diagonal,
+    discretise,
+    fill_normals,
+    seed_word,
+)
+from simulator.vehicle.wind import Gusts, dryden, wind_axes
 
 
 def _normals(seed: int, lane: int, steps: int, width: int) -> np.ndarray:

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from sim_hover import attitude, hovering, load
 
-from simulator.attitude import Demand
-from simulator.conditions import Conditions
-from simulator.plant import Plant
 from simulator.steps import STEP_S
+from simulator.vehicle.attitude import Demand
+from simulator.vehicle.conditions import Conditions
+from simulator.vehicle.plant import Plant
 
 PX4 = load("px4_sih")
 ROUGH = Conditions(

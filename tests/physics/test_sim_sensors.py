@@ -10,11 +10,11 @@ from scipy.spatial.transform import Rotation
 from sim_hover import attitude, hovering, load
 
 from offboard.model.frames import thrust_direction_from_quaternion
-from simulator.attitude import Demand
-from simulator.conditions import Conditions
-from simulator.plant import Plant
-from simulator.sensors import ARDUPILOT_LIKE, PX4_LIKE, YAW, error_process
 from simulator.steps import STEP_S
+from simulator.vehicle.attitude import Demand
+from simulator.vehicle.conditions import Conditions
+from simulator.vehicle.plant import Plant
+from simulator.vehicle.sensors import ARDUPILOT_LIKE, PX4_LIKE, YAW, error_process
 
 FLIGHTS, SECONDS, RATE_HZ = 16, 60, 50
 

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from simulator.impairment import Channel, Impairment, Path, frames
+from simulator.link.impairment import Channel, Impairment, Path, frames
 
 STEP_US = 4000
 

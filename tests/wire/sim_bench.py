@@ -10,12 +10,12 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.model.vehicle import Vehicle
 from simulator import config
-from simulator.conditions import Conditions
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
-from simulator.sensors import EstimatorName
 from simulator.steps import STEP_S
+from simulator.vehicle.conditions import Conditions
+from simulator.vehicle.sensors import EstimatorName
 
 OFFBOARD, LOITER, POSCTL = 0x00060000, 0x03040000, 0x00030000
 TAKEOFF, LAND, RTL = 0x02040000, 0x06040000, 0x05040000

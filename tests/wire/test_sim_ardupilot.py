@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import NAN, Bench
 
 from simulator.firmware.ardupilot import ARDUPILOT
-from simulator.sensors import EstimatorName
+from simulator.vehicle.sensors import EstimatorName
 
 STABILIZE, ALT_HOLD, GUIDED, LOITER, RTL, LAND, BRAKE, GUIDED_NOGPS = 0, 2, 4, 5, 6, 9, 17, 20
 ACCEPTED, DENIED, FAILED = 0, 2, 4

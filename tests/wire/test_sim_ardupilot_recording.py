@@ -13,7 +13,7 @@ from sim_bench import Bench
 from sim_talk import Talk, ask_again
 
 from simulator.firmware.ardupilot import ARDUPILOT
-from simulator.sensors import EstimatorName
+from simulator.vehicle.sensors import EstimatorName
 
 RECORDING = Path(__file__).parent / "recordings" / "arducopter-4.6.3-guided.tlog"
 NOT_OURS = (

@@ -11,8 +11,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
-from simulator import codec
-from simulator.telemetry import BUILDERS
+from simulator.mavlink import codec
+from simulator.mavlink.telemetry import BUILDERS
 
 ANSWERS = (
     "COMMAND_ACK",

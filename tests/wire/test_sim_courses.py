@@ -14,7 +14,7 @@ from sim_bench import LOITER, NAN, RTL, Bench
 
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.geodesy import EARTH_RADIUS_M
-from simulator.sensors import EstimatorName
+from simulator.vehicle.sensors import EstimatorName
 
 ACCEPTED, UNSUPPORTED = 0, 3
 POSITION_ALONE, VELOCITY_ALONE, YAW_TOO = 0xDF8, 0xDC7, 0x9F8

@@ -13,10 +13,10 @@ from sim_bench import HOVER, OFFBOARD, Bench, px4_vehicle
 
 from offboard.model.document import DocumentError
 from simulator import config
-from simulator.conditions import Conditions
 from simulator.config import Scenario
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
+from simulator.vehicle.conditions import Conditions
 
 
 def faulty(*faults: dict[str, Any], seed: int = 1) -> Bench:

@@ -8,10 +8,10 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from sim_bench import HOVER, LAND, LOITER, NAN, OFFBOARD, POSCTL, RTL, TAKEOFF, Bench, px4_vehicle
 
-from simulator.commander import ACTIONS, GUARDS
+from simulator.autopilot.commander import ACTIONS, GUARDS
+from simulator.autopilot.state_table import describe
 from simulator.firmware.px4 import PX4
-from simulator.sensors import EstimatorName
-from simulator.state_table import describe
+from simulator.vehicle.sensors import EstimatorName
 
 
 def set_parameter(bench: Bench, name: str, value: float) -> None:

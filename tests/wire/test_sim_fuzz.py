@@ -15,12 +15,12 @@ from sim_bench import LOITER, NAN, Bench
 from sim_fuzz import datagrams
 
 from simulator import config
-from simulator.codec import Decoder
-from simulator.conditions import Conditions
 from simulator.firmware.base import Firmware
 from simulator.firmware.catalogue import FIRMWARES
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
+from simulator.mavlink.codec import Decoder
+from simulator.vehicle.conditions import Conditions
 
 COUNT = int(os.environ.get("FUZZ_DATAGRAMS", "20000"))
 PER_STEP = 20

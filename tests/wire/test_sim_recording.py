@@ -11,7 +11,7 @@ import pytest
 from sim_bench import Bench
 from sim_talk import Talk, ask_again
 
-from simulator.sensors import EstimatorName
+from simulator.vehicle.sensors import EstimatorName
 
 RECORDING = Path(__file__).parent / "recordings" / "px4-1.16.1-offboard.tlog"
 # PX4 announces its log file, the simulator writes none; the simulator hears that the recording ends

@@ -10,12 +10,12 @@ from pymavlink.dialects.v20 import common as mavlink
 from sim_bench import px4_vehicle
 
 from simulator import run
-from simulator.conditions import Conditions
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
-from simulator.links import LinkError, open_link
+from simulator.link.links import LinkError, open_link
+from simulator.link.udp import UdpLink
 from simulator.run import Berth, Outcome, Runner
-from simulator.udp import UdpLink
+from simulator.vehicle.conditions import Conditions
 
 
 @pytest.fixture

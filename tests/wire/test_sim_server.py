@@ -15,8 +15,8 @@ from sim_bench import LOITER, NAN, OFFBOARD, Bench
 
 from simulator.firmware.px4 import PX4
 from simulator.firmware.px4.streams import COMPANION_RATES_HZ, GROUND_RATES_HZ
-from simulator.outbox import DATAGRAM_MAX
-from simulator.sensors import EstimatorName
+from simulator.mavlink.outbox import DATAGRAM_MAX
+from simulator.vehicle.sensors import EstimatorName
 
 LOCAL_POSITION, ATTITUDE, HIL_STATE, GPS_RAW = 32, 30, 115, 24
 

@@ -19,7 +19,7 @@ from sim_rows import Comparison, Rows, compare
 from sim_talk import ask_again, recorded_frames
 
 from simulator.firmware.catalogue import FIRMWARES
-from simulator.sensors import EstimatorName
+from simulator.vehicle.sensors import EstimatorName
 
 RECORDINGS = Path(__file__).parent / "recordings"
 NOT_OURS = (

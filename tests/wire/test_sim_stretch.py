@@ -12,18 +12,18 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import OFFBOARD, TAKEOFF
 
 from simulator import config
-from simulator.attitude import Demand
-from simulator.battery import Battery
-from simulator.codec import Decoder, frame, layout
-from simulator.conditions import Conditions
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.firmware.setpoints import MotionSetpoint
-from simulator.frame_writer import KINDS
 from simulator.instance import Instance
-from simulator.schedule import Stream
-from simulator.sensors import EstimatorName
+from simulator.mavlink.codec import Decoder, frame, layout
+from simulator.mavlink.frame_writer import KINDS
+from simulator.mavlink.schedule import Stream
+from simulator.vehicle.attitude import Demand
+from simulator.vehicle.battery import Battery
+from simulator.vehicle.conditions import Conditions
+from simulator.vehicle.sensors import EstimatorName
 
 SEED = 7
 

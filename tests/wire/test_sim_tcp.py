@@ -8,8 +8,8 @@ from collections.abc import Iterator
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from simulator.links import LinkError, open_link, shifted, wait
-from simulator.tcp import UNSENT_MAX, TcpLink, whole_frames
+from simulator.link.links import LinkError, open_link, shifted, wait
+from simulator.link.tcp import UNSENT_MAX, TcpLink, whole_frames
 
 CODEC = mavlink.MAVLink(None, srcSystem=255)
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(CODEC)

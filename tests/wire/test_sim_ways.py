@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from sim_bench import Bench
 from sim_talk import ask_again
 
-from simulator.sensors import EstimatorName
+from simulator.vehicle.sensors import EstimatorName
 
 RECORDINGS = Path(__file__).parent / "recordings"
 HOPS, LEGS = (RECORDINGS / f"px4-1.16.1-{name}.tlog.xz" for name in ("hops", "legs"))

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from offboard.model.frames import euler_from_quaternion, rotation_from_quaternion
-from simulator.fields import fit
-from simulator.position_law import GRAVITY_MPS2
-from simulator.view import View
+from simulator.autopilot.position_law import GRAVITY_MPS2
+from simulator.mavlink.fields import fit
+from simulator.mavlink.view import View
 
 # EKF_STATUS_FLAGS from a boot event on
 _EKF_FLAGS = (("position", 831), ("attitude", 167), ("aligning", 0))

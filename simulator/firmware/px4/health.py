@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from simulator.battery import BatteryState
 from simulator.firmware.health import HealthRules, Sensors
 from simulator.firmware.vocabulary import ReadParameter
+from simulator.vehicle.battery import BatteryState
 
 _BATTERY_THRESHOLDS = ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")
 

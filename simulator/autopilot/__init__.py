@@ -1,0 +1,1 @@
+"""What the autopilot does with the vehicle: modes, guards, setpoints, loops. Knows no bytes."""

@@ -1,0 +1,199 @@
+"""One autopilot on one plant, step by step: it flies, and then looks at what happened.
+
+Its parts: the commander decides about modes, the navigator says where to be, the pilot flies there,
+health and watch see to what changes by itself. Here is their order in time, and when compiled code
+may fly in their place.
+Knows no MAVLink frames, sockets or clock: the vehicle's time is the plant's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from simulator.autopilot.commander import NOTHING, Commander, Wish
+from simulator.autopilot.health import Health
+from simulator.autopilot.mission import Mission
+from simulator.autopilot.nav import Senses
+from simulator.autopilot.navigator import Navigator
+from simulator.autopilot.parameters import ParameterTable
+from simulator.autopilot.pilot import Pilot
+from simulator.autopilot.setpoints import ATTITUDE, SetpointStream
+from simulator.autopilot.sticks import Sticks
+from simulator.autopilot.watch import EVERY_STEPS, Watch
+from simulator.firmware.base import Firmware
+from simulator.firmware.modes import Behaviour
+from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint
+from simulator.firmware.vocabulary import Result, Triple
+from simulator.steps import STEP_S
+from simulator.vehicle.plant import Plant
+
+_RESTS_STEPS = 250  # at most, so that what is changed behind its back is seen soon
+
+
+class Autopilot:
+    """`step` moves it and its plant by STEP_S."""
+
+    def __init__(
+        self,
+        firmware: Firmware,
+        plant: Plant,
+        parameters: ParameterTable | None = None,
+        mission: Mission | None = None,
+        *,
+        boot_scale: float = 1.0,
+    ) -> None:
+        self.firmware = firmware
+        self.plant = plant
+        self.parameters = parameters or ParameterTable(firmware)
+        rules = firmware.missions
+        self.mission = mission or Mission(
+            firmware.origin,
+            int(rules.home_first),
+            rules.turning,
+            rules.tells_above,
+            rules.keeps_speed,
+        )
+        self.senses = Senses(plant)
+        self.watch = Watch(firmware, self.parameters)
+        self.stream = SetpointStream(firmware, self.parameters)
+        self.health = Health(
+            firmware, self.parameters, self.mission, self.stream, self.watch, boot_scale
+        )
+        self.sticks = None if firmware.flight.handling is None else Sticks(firmware.flight.handling)
+        self.navigator = Navigator(firmware, self.parameters, self.mission, self.sticks)
+        self.pilot = Pilot(firmware, self.parameters, self.navigator)
+        self.commander = Commander(
+            firmware, self.parameters, self.navigator, self.pilot, self.senses, self.health
+        )
+        self.resting = False  # compiled code flies
+        self.calm_until = self._rests_since = 0
+
+    # -- what comes in -----------------------------------------------------------------------
+
+    def happen(self, event: str, wish: Wish = NOTHING) -> Result:
+        """An event from outside."""
+        self.wake()
+        return self.commander.happen(event, wish)
+
+    def obey(self, message: str, values: Mapping[str, Any]) -> None:
+        """A setpoint message, by its name in `simulator.autopilot.setpoints`, and its fields."""
+        mode = self.commander.mode
+        outlives = self.firmware.setpoints.outlive_modes
+        if not (outlives or mode.behaviour is Behaviour.SETPOINT):
+            return
+        if message == ATTITUDE:
+            self._fly(self.stream.attitude(values))
+        elif outlives or mode.needs_position:
+            home_down_m = self.navigator.home_ned_m[2]
+            setpoint, said = self.stream.motion(message, values, self.senses.look(), home_down_m)
+            self.commander.texts += () if said is None else (said,)
+            self._fly(setpoint)
+
+    def go_to(self, place_ned_m: Triple, yaw_rad: float) -> None:
+        """Hold there, in a mode that holds or obeys; no number faces the way there."""
+        self._end_takeoff()
+        self.navigator.go_to(place_ned_m, yaw_rad)
+
+    def _end_takeoff(self) -> None:
+        """Of a mode that climbs before it obeys."""
+        behaviour = self.commander.mode.behaviour
+        if self.navigator.behaviour is not behaviour:
+            self.pilot.enter(behaviour, self.senses.look())
+
+    def _fly(self, setpoint: AttitudeSetpoint | MotionSetpoint | None) -> None:
+        if setpoint is None:
+            return
+        self.stream.newest_s = self.senses.time_s
+        self.navigator.obey(setpoint)
+        self._end_takeoff()
+        if isinstance(setpoint, AttitudeSetpoint) and setpoint.event:
+            self.happen(setpoint.event)
+
+    # -- time --------------------------------------------------------------------------------
+
+    def step(self) -> None:
+        """Fly STEP_S, then see what happened."""
+        self.wake()
+        commander, pilot, senses = self.commander, self.pilot, self.senses
+        was_landed = pilot.landed
+        self.plant.advance(STEP_S, pilot.fly(senses.time_s, commander.armed, senses.look))
+        senses.moved(1)
+        while (event := self.health.reach(senses.time_s)) is not None:
+            commander.happen(event)
+        if commander.failsafe or commander.mode.behaviour is Behaviour.SETPOINT:
+            self._watch_stream()
+        if commander.armed:
+            self._watch_flight(was_landed)
+        if senses.steps % EVERY_STEPS == 0:
+            self._watch_surroundings()
+
+    def _watch_stream(self) -> None:
+        commander, alive = self.commander, self.stream.alive(self.senses.time_s)
+        if commander.failsafe and alive:
+            commander.happen("stream found")
+        elif commander.armed and commander.mode.behaviour is Behaviour.SETPOINT and not alive:
+            commander.happen("stream lost")
+
+    def _watch_flight(self, was_landed: bool) -> None:
+        commander, pilot, now_s = self.commander, self.pilot, self.senses.time_s
+        airtime = commander.airtime
+        event = airtime.step(now_s, was_landed=was_landed, landed=pilot.landed)
+        if event is not None:
+            commander.happen(event)
+        for event in self.navigator.tell():
+            commander.happen(event)
+        if not commander.armed:
+            return
+        event = airtime.over(now_s, landed=pilot.landed)
+        if event is not None:
+            commander.happen(event)
+
+    def _watch_surroundings(self) -> None:
+        senses = self.senses
+        battery, armed = senses.truth.battery, self.commander.armed
+        for event in self.watch.step(senses.time_s, armed, battery, senses.gps_healthy):
+            self.commander.happen(event)
+        self.commander.carry_out()
+
+    # -- compiled code in its place ----------------------------------------------------------
+
+    def rest(self) -> bool:
+        """Leave the flight to compiled code until `wake` or `calm_until`, the step before which
+        nothing can happen unless somebody speaks or the ground is touched or left.
+
+        A step too early rather than one too late; False when that is now.
+        """
+        commander, senses = self.commander, self.senses
+        if commander.failsafe or commander.restarts:
+            return False
+        if not self.pilot.flies_itself(senses.steps, commander.armed, self.plant.on_ground):
+            return False
+        watched_s = self.watch.calm_until_s(senses.time_s, senses.gps_healthy)
+        until_s = min(self._steady_until_s, watched_s)
+        if commander.armed:
+            if not self.watch.calm_with(self.plant.battery_at_worst(_RESTS_STEPS * STEP_S)):
+                return False
+            until_s = min(until_s, commander.airtime.calm_until_s)
+        self.calm_until = int(min(until_s / STEP_S, senses.steps + _RESTS_STEPS)) - 1
+        self.resting = self.calm_until > senses.steps
+        self._rests_since = senses.steps
+        return self.resting
+
+    @property
+    def _steady_until_s(self) -> float:
+        """When boot, the health of the sensors or the stream of setpoints changes by itself."""
+        now_s, lost_s = self.senses.time_s, self.stream.lost_s
+        until_s = self.health.steady_until_s(now_s)
+        watched = self.commander.armed and self.commander.mode.behaviour is Behaviour.SETPOINT
+        return max(now_s, min(until_s, lost_s)) if watched or lost_s >= now_s else until_s
+
+    def wake(self) -> None:
+        """Something is to happen: catch up with what compiled code flew."""
+        if self.resting:
+            self.resting = False
+            steps = self.senses.steps
+            self.pilot.flown(self._rests_since, steps - self._rests_since)
+            watched = steps // EVERY_STEPS * EVERY_STEPS
+            if watched > self._rests_since:
+                self.watch.passed(watched * STEP_S, self.senses.gps_healthy)

@@ -1,0 +1,1 @@
+"""Sockets, and the faults of the way between them."""

@@ -1,0 +1,295 @@
+"""MAVLink commands (MAV_CMD): what each does, and how it is acknowledged.
+
+A command's unused parameters may be NaN or 0. Every command to us is answered, unknown ones with
+UNSUPPORTED. Knows one link's outbox and schedule, and the autopilot behind it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from simulator.autopilot.autopilot import Autopilot
+from simulator.autopilot.commander import Wish
+from simulator.firmware.commands import ModeRequest
+from simulator.firmware.modes import Behaviour
+from simulator.firmware.vocabulary import Result, Say, Severity, Triple
+from simulator.geodesy import down_m, to_metres
+from simulator.mavlink.codec import id_of, name_of
+from simulator.mavlink.outbox import Outbox
+from simulator.mavlink.schedule import Schedule
+
+_CHANGE_MODE = 1.0  # MAV_DO_REPOSITION_FLAGS
+_MISSION_PLANNER = 190  # MAV_COMPONENT, as ground stations call themselves
+_VERTICAL_SPEEDS = (2.0, 3.0)  # SPEED_TYPE: climb, descent
+
+
+@dataclass(frozen=True, slots=True)
+class Command:
+    """COMMAND_LONG or COMMAND_INT, as one."""
+
+    number: int
+    params: tuple[float, ...]  # param1 .. param7, places in degrees
+    system: int  # of the sender
+    component: int
+    frame: int | None = None  # MAV_FRAME of the place, if it tells
+
+
+@dataclass(slots=True)
+class Commands:
+    """What a client commands on one link, carried out and answered."""
+
+    outbox: Outbox
+    schedule: Schedule
+
+    @property
+    def _autopilot(self) -> Autopilot:
+        return self.outbox.view.autopilot
+
+    def run(self, command: Command) -> None:
+        """Carry out and acknowledge, on the same link."""
+        answers = self._autopilot.firmware.commands.answers
+        result: Result | None
+        if command.number in answers:
+            result = answers[command.number]
+        elif (handler := HANDLERS.get(command.number)) is not None:
+            result = handler(self, command)
+        else:
+            result = Result.UNSUPPORTED
+        if result is not None:
+            self._acknowledge(command, result)
+
+    def set_mode(self, base_mode: int, custom_mode: int, sender: tuple[int, int]) -> None:
+        """SET_MODE, the message that came before the command."""
+        firmware = self._autopilot.firmware
+        request = firmware.commands.set_mode(base_mode, custom_mode)
+        result = self._request(request, sender[1] == _MISSION_PLANNER)
+        if firmware.commands.set_mode_acked_as is not None:
+            self._acknowledge(Command(firmware.commands.set_mode_acked_as, (), *sender), result)
+
+    def _acknowledge(self, command: Command, result: Result) -> None:
+        self.outbox.send(
+            "COMMAND_ACK", command.number, int(result), 0, 0, command.system, command.component
+        )
+
+    def _set_mode(self, command: Command) -> Result:
+        autopilot = self._autopilot
+        if autopilot.firmware.commands.mode_acked_twice:
+            self._acknowledge(command, Result.ACCEPTED)
+        by_planner = command.component == _MISSION_PLANNER
+        return self._request(autopilot.firmware.commands.mode(command.params), by_planner)
+
+    def _request(self, request: ModeRequest, by_planner: bool) -> Result:
+        autopilot = self._autopilot
+        if request.mode is None:
+            if request.say is not None:
+                autopilot.commander.texts.append(request.say)
+            return request.refusal
+        return autopilot.happen("mode", Wish(request.mode, by_planner=by_planner))
+
+    def _arm_disarm(self, command: Command) -> Result | None:
+        autopilot = self._autopilot
+        wish = autopilot.firmware.commands.arm_wish(command.params[0])
+        if not wish.event:
+            autopilot.commander.texts += () if wish.say is None else (wish.say,)
+            return wish.refusal
+        forced = command.params[1] == autopilot.firmware.commands.force_codes[wish.event]
+        return autopilot.happen(f"force {wish.event}" if forced else wish.event)
+
+    def _takeoff(self, command: Command) -> Result:
+        asked_m = command.params[6]
+        autopilot = self._autopilot
+        home_down_m = autopilot.navigator.home_ned_m[2]
+        if autopilot.firmware.commands.takeoff_above_home:
+            down_m = home_down_m - asked_m
+            return autopilot.happen("takeoff", Wish(takeoff_ned_m=(math.nan, math.nan, down_m)))
+        place = to_metres(autopilot.firmware.origin, *command.params[4:6])
+        down_m = autopilot.firmware.origin[2] - asked_m
+        finite = (value if math.isfinite(value) else math.nan for value in (*place, down_m))
+        north, east, down = finite
+        return autopilot.happen("takeoff", Wish(takeoff_ned_m=(north, east, down)))
+
+    def _land(self, _: Command) -> Result:
+        return self._autopilot.happen("land")
+
+    def _return(self, _: Command) -> Result:
+        return self._autopilot.happen("return")
+
+    def _loiter(self, _: Command) -> Result:
+        autopilot = self._autopilot
+        known = autopilot.commander.knows("loiter")
+        return autopilot.happen("loiter") if known else Result.UNSUPPORTED
+
+    def _set_home(self, command: Command) -> Result:
+        """param1 = 1: here; else a place in degrees and metres above the sea."""
+        latitude, longitude, height_m = command.params[4:7]
+        autopilot = self._autopilot
+        if command.params[0] == 1.0:
+            autopilot.navigator.home_ned_m = autopilot.senses.look().position_ned_m
+        elif math.isfinite(latitude + longitude + height_m):
+            north, east = to_metres(autopilot.firmware.origin, latitude, longitude)
+            autopilot.navigator.home_ned_m = (north, east, autopilot.firmware.origin[2] - height_m)
+        else:
+            return Result.DENIED
+        return Result.ACCEPTED
+
+    def _reposition(self, command: Command) -> Result:
+        """Hold there from now on, flying there at the speed given; what is not finite stays as it
+        is."""
+        if command.params[1] != _CHANGE_MODE:
+            return Result.UNSUPPORTED
+        autopilot = self._autopilot
+        yaw_rad, latitude, longitude, height_m = command.params[3:7]
+        strictly = autopilot.firmware.commands.repositions_strictly
+        speed_mps = math.inf if strictly or not command.params[0] > 0.0 else command.params[0]
+        if strictly:
+            if command.frame is None:
+                return Result.UNSUPPORTED
+            if not (latitude or longitude):
+                return Result.DENIED
+            yaw_rad = math.nan
+        result = autopilot.happen("mode", Wish(autopilot.firmware.commands.reposition_mode))
+        if result is Result.ACCEPTED and autopilot.commander.armed:
+            yaw_rad = yaw_rad if math.isfinite(yaw_rad) else math.nan
+            place = self._place(latitude, longitude, height_m, command.frame or 0)
+            autopilot.go_to(place, yaw_rad)
+            if math.isfinite(speed_mps):
+                autopilot.navigator.cruise_mps = speed_mps
+        return result
+
+    def go_to(self, place: tuple[float, float, float], frame: int) -> bool:
+        """A place in degrees and metres of this MAV_FRAME, for a vehicle that obeys setpoints."""
+        autopilot = self._autopilot
+        obeys = autopilot.commander.mode.behaviour is Behaviour.SETPOINT
+        if obeys and autopilot.commander.armed:
+            autopilot.go_to(self._place(*place, frame), math.nan)
+        return obeys
+
+    def _place(self, latitude: float, longitude: float, height_m: float, frame: int) -> Triple:
+        """NED, of a place in degrees and a height of this MAV_FRAME; where it is in what of it
+        is not finite."""
+        autopilot = self._autopilot
+        origin, home_down_m = autopilot.firmware.origin, autopilot.navigator.home_ned_m[2]
+        here = autopilot.senses.look().position_ned_m
+        north, east = to_metres(origin, latitude, longitude)
+        if not math.isfinite(north + east):
+            north, east = here[:2]
+        down = down_m(height_m, frame, origin, home_down_m)
+        return north, east, down if math.isfinite(down) else here[2]
+
+    def _change_speed(self, command: Command) -> Result:
+        """Of automatic flight across the ground, until another mode; none is its own again."""
+        kind, speed_mps = command.params[:2]
+        autopilot = self._autopilot
+        if speed_mps > 0.0 and kind in _VERTICAL_SPEEDS:
+            return Result.ACCEPTED
+        known = 0.0 < speed_mps < math.inf
+        autopilot.navigator.cruise_mps = speed_mps if known else math.inf
+        return Result.ACCEPTED if known else autopilot.firmware.commands.speed_refusal
+
+    def _turn(self, command: Command) -> Result:
+        """To a course, or by so much: degrees."""
+        asked_deg, speed_dps, sense, relative = command.params[:4]
+        autopilot = self._autopilot
+        if not autopilot.commander.knows("turn"):
+            return Result.UNSUPPORTED
+        if math.isfinite(asked_deg):
+            from_rad = autopilot.senses.look().yaw_rad if relative else 0.0
+            turn_rad = math.radians(asked_deg) * (-1.0 if relative and sense < 0 else 1.0)
+            turn_radps = math.radians(speed_dps) if speed_dps > 0.0 else math.inf
+            yaw_rad = math.remainder(from_rad + turn_rad, 2.0 * math.pi)
+            autopilot.navigator.turn_to(yaw_rad, turn_radps)
+        return autopilot.happen("turn")
+
+    def _reboot(self, command: Command) -> Result:
+        wish = command.params[0]
+        return self._autopilot.happen("reboot") if wish >= 1.0 else Result.UNSUPPORTED
+
+    def _start_mission(self, command: Command) -> Result:
+        autopilot = self._autopilot
+        first = command.params[0] if math.isfinite(command.params[0]) else 0.0
+        if not autopilot.commander.knows("mission"):
+            return Result.UNSUPPORTED
+        if not -1 <= first < max(1, len(autopilot.mission.items)):
+            return Result.DENIED
+        return autopilot.happen("mission")
+
+    def _set_current_item(self, command: Command) -> Result:
+        number = command.params[0]
+        known = math.isfinite(number) and self._autopilot.mission.go_to(int(number))
+        return Result.ACCEPTED if known else Result.DENIED
+
+    def _set_interval(self, command: Command) -> Result:
+        number, interval_us = command.params[:2]
+        streams = self._autopilot.firmware.streams
+        name = message_name(number)
+        if 0 < interval_us < 1e6 / streams.rate_max_hz:
+            return self._refuse_interval(number, streams.too_fast_text)
+        if number in streams.idle and math.isfinite(interval_us):
+            return Result.ACCEPTED
+        if name is None or not math.isfinite(interval_us):
+            return self._refuse_interval(number, streams.refusal_text)
+        if not self.schedule.set_interval(name, interval_us):
+            return self._refuse_interval(number, streams.refusal_text)
+        return Result.ACCEPTED
+
+    def _refuse_interval(self, number: float, text: str) -> Result:
+        autopilot = self._autopilot
+        if text and math.isfinite(number):
+            autopilot.commander.texts.append(Say(Severity.INFO, text.format(id=int(number))))
+        return autopilot.firmware.streams.refusal
+
+    def _get_interval(self, command: Command) -> Result:
+        name = message_name(command.params[0])
+        if name is None or name not in self.outbox.view.builders:
+            return Result.DENIED
+        self.outbox.send("MESSAGE_INTERVAL", id_of(name), self.schedule.interval_us(name))
+        return Result.ACCEPTED
+
+    def _request_message(self, command: Command) -> Result:
+        name = message_name(command.params[0])
+        streams = self._autopilot.firmware.streams
+        if name not in self.outbox.view.builders or self.outbox.view.withheld(name):
+            return streams.request_refusal
+        if name in streams.by_itself:
+            return streams.request_refusal
+        self.outbox.send_now(name)
+        return Result.ACCEPTED
+
+    def _request_version(self, _: Command) -> Result:
+        self.outbox.send_now("AUTOPILOT_VERSION")
+        return Result.ACCEPTED
+
+    def _request_home(self, _: Command) -> Result:
+        self.outbox.send_now("HOME_POSITION")
+        return Result.ACCEPTED
+
+
+HANDLERS: dict[int, Callable[[Commands, Command], Result | None]] = {
+    17: Commands._loiter,
+    20: Commands._return,
+    21: Commands._land,
+    22: Commands._takeoff,
+    115: Commands._turn,
+    176: Commands._set_mode,
+    178: Commands._change_speed,
+    179: Commands._set_home,
+    192: Commands._reposition,
+    224: Commands._set_current_item,
+    246: Commands._reboot,
+    300: Commands._start_mission,
+    400: Commands._arm_disarm,
+    410: Commands._request_home,
+    510: Commands._get_interval,
+    511: Commands._set_interval,
+    512: Commands._request_message,
+    520: Commands._request_version,
+}
+
+
+def message_name(number: float) -> str | None:
+    """Name of the message with this id, as a command's float parameter carries it; NaN is 0."""
+    if number != number:
+        return name_of(0)
+    return name_of(int(number)) if math.isfinite(number) and number >= 0 else None

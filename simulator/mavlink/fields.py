@@ -1,0 +1,60 @@
+"""SI values as the fields of MAVLink messages hold them: scaled, rounded and within their range.
+
+The one place of the simulator's side that converts units and frames for messages, beside its
+compiled twin (`simulator.mavlink.payloads`). Knows no vehicle and no message.
+"""
+
+from __future__ import annotations
+
+import math
+
+from simulator.firmware.setpoints import MotionSetpoint
+from simulator.firmware.vocabulary import Quaternion, Triple
+
+_RANGES = {
+    (bits, signed): (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)
+    for bits in (8, 16, 32)
+    for signed in (False, True)
+}
+
+
+def fit(value: float, bits: int, *, signed: bool = True) -> int:
+    """Nearest integer that a field of `bits` holds; what is not finite becomes 0."""
+    if value - value != 0.0:  # infinite or not a number
+        return 0
+    low, high = _RANGES[bits, signed]
+    return min(high, max(low, round(value)))
+
+
+def centi(velocity: Triple) -> tuple[int, int, int]:
+    """m/s as cm/s in two bytes each."""
+    return fit(velocity[0] * 100, 16), fit(velocity[1] * 100, 16), fit(velocity[2] * 100, 16)
+
+
+def heading_cdeg(yaw_rad: float) -> int:
+    """0 .. 35999."""
+    return round(math.degrees(yaw_rad) * 100) % 36000
+
+
+def in_body(attitude: Quaternion, vector_ned: Triple) -> Triple:
+    """An NED vector in body axes: v + 2 r x (r x v - w v) with the quaternion (w, r)."""
+    w, x, y, z = attitude
+    north, east, down = vector_ned
+    a, b, c = y * down - z * east, z * north - x * down, x * east - y * north
+    a, b, c = a - w * north, b - w * east, c - w * down
+    return (
+        north + 2.0 * (y * c - z * b),
+        east + 2.0 * (z * a - x * c),
+        down + 2.0 * (x * b - y * a),
+    )
+
+
+def motion_fields(motion: MotionSetpoint) -> tuple[float, ...]:
+    """A motion as POSITION_TARGET_LOCAL_NED and its like have it: NED, SI, NaN where nothing is."""
+    return (
+        *motion.position_ned_m,
+        *motion.velocity_ned_mps,
+        *motion.acceleration_ned_mps2,
+        motion.yaw_rad,
+        motion.yaw_rate_radps,
+    )

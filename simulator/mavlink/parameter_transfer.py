@@ -1,0 +1,80 @@
+"""The parameter protocol of one link: read, list, set.
+
+Knows messages; what a parameter is and takes is `simulator.autopilot.parameters`' affair.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+from simulator.autopilot.parameters import HASH, MAV_PARAM_TYPE_UINT32
+from simulator.mavlink.codec import Message
+from simulator.mavlink.outbox import Outbox
+
+PER_STEP = 4  # of a list
+BY_NAME = 65535  # PARAM_VALUE.param_index of an answer that has none
+
+
+@dataclass(slots=True)
+class ParameterTransfer:
+    """What one link has under way."""
+
+    outbox: Outbox
+    _due: list[str] = field(default_factory=list)
+
+    @property
+    def listing(self) -> bool:
+        return bool(self._due)
+
+    def handle(self, message: Message) -> None:
+        """One message of the parameter protocol, addressed to us."""
+        HANDLERS[message.name](self, message)
+
+    def step(self) -> None:
+        """The list goes out bit by bit."""
+        for name in self._due[:PER_STEP]:
+            self._answer(name, listed=True)
+        del self._due[:PER_STEP]
+
+    def _answer(self, name: str, *, listed: bool = False) -> None:
+        """Queue PARAM_VALUE; `listed`: its number was asked for."""
+        autopilot = self.outbox.view.autopilot
+        if name == HASH:
+            head = (HASH.encode(), autopilot.parameters.hash_on_wire, MAV_PARAM_TYPE_UINT32)
+            self.outbox.send("PARAM_VALUE", *head, len(autopilot.parameters.names), BY_NAME)
+            return
+        value, kind = autopilot.parameters.to_wire(name)
+        names = autopilot.parameters.names
+        numbered = listed or autopilot.firmware.link.parameters_numbered
+        index = names.index(name) if numbered else BY_NAME
+        self.outbox.send("PARAM_VALUE", name.encode(), value, kind, len(names), index)
+
+    def _read(self, message: Message) -> None:
+        names = self.outbox.view.autopilot.parameters.names
+        if message.param_index >= 0:
+            if message.param_index < len(names):
+                self._answer(names[message.param_index], listed=True)
+        elif message.param_id in names or self._is_hash(message.param_id):
+            self._answer(message.param_id)
+
+    def _is_hash(self, name: str) -> bool:
+        return name == HASH and self.outbox.view.autopilot.firmware.link.parameters_hashed
+
+    def _list(self, _: Message) -> None:
+        hashed = (HASH,) if self._is_hash(HASH) and not self._due else ()
+        self._due = [*hashed, *self.outbox.view.autopilot.parameters.names]
+
+    def _set(self, message: Message) -> None:
+        table = self.outbox.view.autopilot.parameters
+        if self._is_hash(message.param_id):  # the client has them all
+            self._due = []
+        if table.set_from_wire(message.param_id, message.param_value, message.param_type):
+            self._answer(message.param_id)
+
+
+HANDLERS: dict[str, Callable[[ParameterTransfer, Message], None]] = {
+    "PARAM_REQUEST_READ": ParameterTransfer._read,
+    "PARAM_REQUEST_LIST": ParameterTransfer._list,
+    "PARAM_SET": ParameterTransfer._set,
+}

@@ -1,0 +1,222 @@
+"""The MAVLink side of one link, without I/O: who speaks, and who of us answers.
+
+Each link has its own sequence numbers, rates and clients. Answers and telemetry wait in order in
+the `outbox`. Knows no socket and no clock: time is the autopilot's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+from simulator.autopilot.setpoints import ATTITUDE, GLOBAL, LOCAL
+from simulator.mavlink.codec import Decoder, Message
+from simulator.mavlink.commands import Command, Commands
+from simulator.mavlink.mission_transfer import HANDLERS as MISSION_HANDLERS
+from simulator.mavlink.mission_transfer import MissionTransfer
+from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT, Outbox
+from simulator.mavlink.parameter_transfer import HANDLERS as PARAMETER_HANDLERS
+from simulator.mavlink.parameter_transfer import ParameterTransfer
+from simulator.mavlink.schedule import Schedule
+from simulator.mavlink.strict import Strict
+from simulator.mavlink.texts import Texts
+from simulator.mavlink.view import View
+
+_ITEMS, _GUIDED = ("MISSION_ITEM", "MISSION_ITEM_INT"), 2  # `current` of an item
+_FTP_NAK, _FTP_ERROR_NOT_FOUND = 128 + 1, 10
+
+
+@dataclass(slots=True)
+class Server:
+    """One link of one vehicle. `rates_hz`: what it sends without being asked.
+
+    `barrier` leaves TIMESYNC requests to `send_barrier`: in lockstep they are the clock.
+    """
+
+    view: View
+    rates_hz: Mapping[str, float]
+    barrier: bool = False
+    strict: Strict | None = None
+    decoder: Decoder = field(default_factory=Decoder)
+    answered_ns: int = -1  # ts1 of the newest TIMESYNC answer
+    outbox: Outbox = field(init=False)
+    schedule: Schedule = field(init=False)
+    texts: Texts = field(init=False)
+    _commands: Commands = field(init=False)
+    _parameters: ParameterTransfer = field(init=False)
+    _missions: MissionTransfer = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.outbox = Outbox(self.view)
+        clock = ("TIMESYNC",) if self.barrier else ()
+        rates_hz = {name: hz for name, hz in self.rates_hz.items() if name not in clock}
+        self.schedule = Schedule(self.view, rates_hz)
+        self.texts = Texts(self.outbox)
+        self._commands = Commands(self.outbox, self.schedule)
+        self._begin_transfers()
+
+    def _begin_transfers(self) -> None:
+        autopilot = self.view.autopilot
+        self._parameters = ParameterTransfer(self.outbox)
+        self._missions = MissionTransfer(
+            self.outbox, self.texts, autopilot.mission, autopilot.firmware.missions
+        )
+
+    def restart(self) -> None:
+        """As after boot: default rates, nobody known."""
+        self.outbox.sequence = 0
+        self.schedule.restart()
+        self.texts.restart()
+        self._begin_transfers()
+
+    def step(self) -> None:
+        """Queue what is asked for and goes out bit by bit: missions, lists of parameters."""
+        if self._missions.under_way:
+            self._missions.step(self.view.autopilot.senses.time_us * 1e-6)
+        if self._parameters.listing:
+            self._parameters.step()
+
+    @property
+    def only_streams(self) -> bool:
+        """Nothing but streams has this link to say by itself."""
+        return not (self._missions.under_way or self._parameters.listing)
+
+    def send_barrier(self, stamp_ns: int) -> None:
+        """Queue a TIMESYNC request."""
+        self.outbox.send("TIMESYNC", 0, stamp_ns)
+
+    # -- in ----------------------------------------------------------------------------------
+
+    def receive(self, datagram: bytes) -> None:
+        """Handle everything in one datagram; no bytes make this raise."""
+        for message in self.decoder.read(datagram):
+            self.texts.heard = True
+            if message.name != "TIMESYNC":
+                self.view.autopilot.wake()
+            if self.strict is not None:
+                self._judge(message)
+            handler = HANDLERS.get(message.name)
+            if handler is not None and self._is_for_us(message):
+                handler(self, message)
+
+    def _judge(self, message: Message) -> None:
+        assert self.strict is not None
+        said = self.strict.complaint(message, self.view.autopilot.senses.time_us * 1e-6)
+        if said is not None:
+            self.view.autopilot.commander.texts.append(said)
+
+    def _is_for_us(self, message: Message) -> bool:
+        """To our system or all, to the autopilot or all of it."""
+        system = message.values.get("target_system", 0)
+        component = message.values.get("target_component", 0)
+        checked = self.view.autopilot.firmware.link.target_component_checked
+        for_autopilot = component in (0, MAV_COMP_ID_AUTOPILOT) or not checked
+        read = self.view.autopilot.parameters.__getitem__
+        obeyed = self.view.autopilot.firmware.link.obeys_system(
+            message.system, self.view.system, read
+        )
+        return system in (0, self.view.system) and for_autopilot and obeyed
+
+    def _heartbeat(self, message: Message) -> None:
+        autopilot = self.view.autopilot
+        read = autopilot.parameters.__getitem__
+        if autopilot.firmware.link.is_ground_station(message.type, message.system, read):
+            autopilot.watch.hear_ground_station(autopilot.senses.time_s)
+            self.texts.hear_ground_station()
+
+    def _command_long(self, message: Message) -> None:
+        params = tuple(message.values[f"param{i}"] for i in range(1, 8))
+        self._commands.run(Command(message.command, params, message.system, message.component))
+
+    def _command_int(self, message: Message) -> None:
+        params = tuple(message.values[f"param{i}"] for i in range(1, 5))
+        params += (message.x * 1e-7, message.y * 1e-7, message.z)
+        sender = (message.system, message.component)
+        self._commands.run(Command(message.command, params, *sender, message.frame))
+
+    def _setpoint(self, message: Message) -> None:
+        self.view.autopilot.obey(message.name, message.values)
+
+    def _set_mode(self, message: Message) -> None:
+        sender = (message.system, message.component)
+        self._commands.set_mode(message.base_mode, message.custom_mode, sender)
+
+    def _parameter(self, message: Message) -> None:
+        self._parameters.handle(message)
+
+    def _mission(self, message: Message) -> None:
+        rules = self.view.autopilot.firmware.missions
+        if rules.guides and message.name in _ITEMS and message.current == _GUIDED:
+            self._guide(message)
+            return
+        self._missions.handle(message, self.view.autopilot.senses.time_us * 1e-6)
+
+    def _guide(self, message: Message) -> None:
+        """An item that is no mission's, but where to go now."""
+        scale = 1e-7 if message.name.endswith("INT") else 1.0
+        place = (message.x * scale, message.y * scale, message.z)
+        goes = self._commands.go_to(place, message.frame)
+        self.outbox.send("MISSION_ACK", message.system, message.component, 0 if goes else 1, 0)
+
+    def _timesync(self, message: Message) -> None:
+        if message.tc1 == 0:
+            self.outbox.send("TIMESYNC", self.view.time_us * 1000, message.ts1)
+        else:
+            self.answered_ns = message.ts1
+
+    def _ping(self, message: Message) -> None:
+        if message.target_system == 0 and "PING" in self.view.builders:
+            sender = (message.system, message.component)
+            self.outbox.send("PING", message.time_usec, message.seq, *sender)
+
+    def _rc_channels_override(self, message: Message) -> None:
+        self._steer(message, [message.values[f"chan{i}_raw"] for i in range(1, 9)])
+
+    def _manual_control(self, message: Message) -> None:
+        """A joystick: -1000 .. 1000 each, the throttle 0 .. 1000."""
+        ahead, aside, throttle, turn = message.x, message.y, message.z, message.r
+        widths = (1500 + aside // 2, 1500 - ahead // 2, 1000 + throttle, 1500 + turn // 2)
+        self._steer(message, [min(2000, max(1000, width)) for width in widths])
+
+    def _steer(self, message: Message, widths_us: Sequence[int]) -> None:
+        """By the ground station alone."""
+        autopilot = self.view.autopilot
+        read = autopilot.parameters.__getitem__
+        if autopilot.sticks is None:
+            return
+        if autopilot.firmware.link.is_ground_station(0, message.system, read):
+            autopilot.sticks.override(widths_us, autopilot.senses.time_s)
+
+    def _log_request_list(self, _: Message) -> None:
+        """There are none."""
+        self.outbox.send("LOG_ENTRY", 0, 0, 0, 0, 0)
+
+    def _request_data_stream(self, message: Message) -> None:
+        rate_hz = message.req_message_rate if message.start_stop else 0
+        self.schedule.set_group(message.req_stream_id, rate_hz)
+
+    def _file_transfer(self, message: Message) -> None:
+        asked = message.payload
+        number = (asked[0] | asked[1] << 8) + 1 & 0xFFFF
+        head = (number & 0xFF, number >> 8, asked[2], _FTP_NAK, 1, asked[3])
+        answer = head + (0,) * 6 + (_FTP_ERROR_NOT_FOUND,)
+        padded = answer + (0,) * (len(asked) - len(answer))
+        self.outbox.send("FILE_TRANSFER_PROTOCOL", 0, message.system, message.component, padded)
+
+
+HANDLERS: dict[str, Callable[[Server, Message], None]] = {
+    "HEARTBEAT": Server._heartbeat,
+    "COMMAND_LONG": Server._command_long,
+    "COMMAND_INT": Server._command_int,
+    "SET_MODE": Server._set_mode,
+    **dict.fromkeys((ATTITUDE, LOCAL, GLOBAL), Server._setpoint),
+    **dict.fromkeys(MISSION_HANDLERS, Server._mission),
+    "TIMESYNC": Server._timesync,
+    "PING": Server._ping,
+    **dict.fromkeys(PARAMETER_HANDLERS, Server._parameter),
+    "RC_CHANNELS_OVERRIDE": Server._rc_channels_override,
+    "MANUAL_CONTROL": Server._manual_control,
+    "LOG_REQUEST_LIST": Server._log_request_list,
+    "REQUEST_DATA_STREAM": Server._request_data_stream,
+    "FILE_TRANSFER_PROTOCOL": Server._file_transfer,
+}

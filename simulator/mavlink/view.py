@@ -1,0 +1,126 @@
+"""What the messages of one vehicle show: its autopilot, as faults let it be seen.
+
+Packs each message once per step for all links. Knows no links, rates or sequence numbers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from simulator.autopilot.autopilot import Autopilot
+from simulator.geodesy import DEGREES_PER_M, east_degrees_per_m
+from simulator.mavlink.codec import layout
+from simulator.mavlink.fields import fit
+
+_GPS, _PREARM = 0x20, 0x10000000  # MAV_SYS_STATUS_SENSOR
+
+
+@dataclass(slots=True)
+class Stuck:
+    """A message that repeats its content; its first field, the time stamp, may run on."""
+
+    stamp_runs: bool
+    values: Sequence[Any] | None = None
+
+    def instead_of(self, values: Sequence[Any]) -> Sequence[Any]:
+        if self.values is None:
+            self.values = values
+        return (values[0], *self.values[1:]) if self.stamp_runs else self.values
+
+
+@dataclass(slots=True)
+class View:
+    """What builders read: the autopilot, and what one step's messages share."""
+
+    autopilot: Autopilot
+    system: int
+    epoch_us: int  # Unix time of boot
+    builders: dict[str, Callable[[View], Sequence[Any]]]  # fields by message
+    ping_sequence: int = 0
+    # What faults do to it
+    clock_offset_us: int = 0
+    silent: set[str] = field(default_factory=set)
+    stuck: dict[str, Stuck] = field(default_factory=dict)
+    east_degrees_per_m: float = field(init=False)
+    _payloads: dict[str, bytes] = field(default_factory=dict)
+    _at_step: int = -1
+
+    def __post_init__(self) -> None:
+        self.east_degrees_per_m = east_degrees_per_m(self.autopilot.firmware.origin)
+
+    def withheld(self, name: str) -> bool:
+        """What the vehicle cannot say yet, whatever rate it granted."""
+        autopilot = self.autopilot
+        event = autopilot.firmware.streams.withheld_until.get(name)
+        return event is not None and event not in autopilot.health.reached
+
+    def payload(self, name: str) -> bytes:
+        """Packed payload of message `name` now; built once per step for all links."""
+        if self._at_step != self.autopilot.senses.steps:
+            self._at_step = self.autopilot.senses.steps
+            self._payloads.clear()
+        packed = self._payloads.get(name)
+        if packed is None:
+            values = self.builders[name](self)
+            if name in self.stuck:
+                values = self.stuck[name].instead_of(values)
+            packed = self._payloads[name] = layout(name).pack(values)
+        return packed
+
+    def restart(self, autopilot: Autopilot) -> None:
+        """Another autopilot, after a reboot."""
+        autopilot.senses.gps_healthy = self.autopilot.senses.gps_healthy
+        self.autopilot = autopilot
+        self.clock_offset_us = self.ping_sequence = 0
+        self._at_step = -1
+
+    @property
+    def has_fix(self) -> bool:
+        """No fault takes it away."""
+        return self.autopilot.senses.gps_healthy
+
+    @property
+    def sensor_bits(self) -> tuple[int, int, int]:
+        """MAV_SYS_STATUS_SENSOR: present, enabled, healthy."""
+        autopilot = self.autopilot
+        sensors = autopilot.firmware.health.sensors
+        present, enabled, health = sensors.present, sensors.enabled, sensors.health
+        if not autopilot.health.has_fix(autopilot.senses.time_s):
+            present, enabled, health = present & ~_GPS, enabled & ~_GPS, health & ~_GPS
+        elif not self.has_fix:
+            health &= ~_GPS
+        if autopilot.commander.healthy:
+            health |= _PREARM
+        return present, enabled, health
+
+    @property
+    def landed_state(self) -> int:
+        """MAV_LANDED_STATE: 1 on ground, 2 in air, 3 taking off, 4 landing."""
+        navigator = self.autopilot.navigator
+        if self.autopilot.pilot.landed:
+            return 1
+        if navigator.landing:
+            return 4
+        return 3 if navigator.climbing else 2
+
+    @property
+    def time_ms(self) -> int:
+        return self.time_us // 1000 & 0xFFFFFFFF
+
+    @property
+    def time_us(self) -> int:
+        """The vehicle's clock, as its stamps show it."""
+        return max(0, self.autopilot.senses.time_us + self.clock_offset_us)
+
+    def geodetic(self, north_m: float, east_m: float) -> tuple[int, int]:
+        """Latitude and longitude in 1e-7 deg of a point near the origin (spherical Earth)."""
+        latitude, longitude, _ = self.autopilot.firmware.origin
+        north_deg = north_m * DEGREES_PER_M
+        east_deg = east_m * self.east_degrees_per_m
+        return fit((latitude + north_deg) * 1e7, 32), fit((longitude + east_deg) * 1e7, 32)
+
+    def altitude_mm(self, down_m: float) -> int:
+        """AMSL, mm."""
+        return fit((self.autopilot.firmware.origin[2] - down_m) * 1e3, 32)

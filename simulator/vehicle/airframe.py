@@ -1,0 +1,174 @@
+"""The vehicle in the air and on the ground: rotors, contact, round the rigid body.
+
+The rigid body itself (mass, drag relative to the air) is `offboard.model.rigid_body`; here is
+what the controller's model does not have: rotor lag, loss of authority without thrust, ground,
+ground effect, the charge drawn. Compiled; knows no autopilot, no estimate and no randomness.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.model.kernel import kernel
+from offboard.model.rigid_body import pack, rk4_into
+from offboard.model.vehicle import Vehicle
+from simulator.vehicle.battery import Battery, Pack
+
+Array = NDArray[np.float64]
+
+# The rotor state beside the rigid body's 13 numbers: actual normalised collective thrust, 1 while
+# the ground carries the vehicle, charge drawn (A s), acceleration in NED of the last step.
+THRUST, CONTACT, CHARGE, ACCELERATION, ROTOR_SIZE = 0, 1, 2, slice(3, 6), 6
+
+# Below this share of hover thrust the rotors' differences, hence the torques, fade to nothing.
+_AUTHORITY_SHARE = 0.2
+# Landing gear: it grips, so that wind does not blow a standing vehicle away, and sets it level.
+_FRICTION = 1.5
+_LEVELLING_TIME_S = 0.1
+# Cheeseman and Bennett (1955), rotors of this radius this far above the ground when landed.
+_ROTOR_RADIUS_M = 0.12
+_ROTOR_HEIGHT_M = 0.10
+# Explicit Runge-Kutta is stable to 2.78; stay well inside for any vehicle file.
+_STIFFNESS_LIMIT = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Airframe:
+    """Packed constants of the compiled step."""
+
+    body: Array  # offboard.model.rigid_body.pack of the real vehicle
+    rotor: Array  # thrust at full throttle N, share left after a step of lag, thrust of full
+    #               authority, ground effect 0/1, hover thrust, hover current A
+    substeps: int
+    pack: Pack
+
+
+def build_airframe(
+    vehicle: Vehicle,
+    step_s: float,
+    *,
+    thrust_scale: float = 1.0,
+    mass_scale: float = 1.0,
+    ground_effect: bool = False,
+    battery: Battery | None = None,
+) -> Airframe:
+    """The real vehicle: `thrust_scale` and `mass_scale` are what the controller is not told."""
+    battery = battery or Battery()
+    body = pack(vehicle)
+    lag_s = vehicle.thrust_lag_s
+    rotor = np.array(
+        [
+            thrust_scale * vehicle.mass_kg * vehicle.thrust_max_mps2,
+            math.exp(-step_s / lag_s) if lag_s > 0.0 else 0.0,
+            _AUTHORITY_SHARE * vehicle.hover_thrust,
+            float(ground_effect),
+            vehicle.hover_thrust,
+            battery.hover_current_a,
+        ]
+    )
+    body[0] *= mass_scale
+    stiffness = max(body[6:9].max() / body[0], (body[9:12] / body[2:5]).max())
+    substeps = max(1, math.ceil(step_s * stiffness / _STIFFNESS_LIMIT))
+    return Airframe(body, rotor, substeps, Pack(battery, vehicle.hover_thrust))
+
+
+@kernel
+def advance_airframe(
+    body: Array,
+    rotor: Array,
+    thrust_demand: float,
+    turn_demand: Array,
+    wind_ned: Array,
+    body_constants: Array,
+    rotor_constants: Array,
+    strength: float,
+    step_s: float,
+    substeps: int,
+    inputs: Array,
+    scratch: Array,
+) -> None:
+    """One step in place: `body` (13,) and `rotor` (ROTOR_SIZE,).
+
+    thrust_demand 0..1; turn_demand (3,) angular acceleration FRD rad/s^2; `strength` multiplies
+    the thrust (a weakening motor). `inputs` (4,) and `scratch` (3, 13) are work space.
+    """
+    before = rotor[THRUST]
+    rotor[THRUST] = thrust_demand + (before - thrust_demand) * rotor_constants[1]
+    mean = 0.5 * (before + rotor[THRUST])
+    north, east, down = body[7], body[8], body[9]
+    inputs[0] = strength * rotor_constants[0] * mean * _ground_gain(body[12], rotor_constants[3])
+    # Standing on its legs it cannot be turned
+    authority = 0.0 if rotor[CONTACT] > 0.5 else min(mean / rotor_constants[2], 1.0)
+    _torques(body, turn_demand, authority, body_constants, inputs)
+    part_s = step_s / substeps
+    for _ in range(substeps):
+        stands, stand_north, stand_east = rotor[CONTACT] > 0.5, body[10], body[11]
+        rk4_into(body[:], inputs, wind_ned, body_constants, part_s, scratch, body[:])
+        rotor[CONTACT] = _touch_ground(body, part_s)
+        if stands and rotor[CONTACT] > 0.5 and body[7] == 0.0 and body[8] == 0.0:
+            body[10], body[11] = stand_north, stand_east  # gripped: it did not creep either
+    rotor[3] = (body[7] - north) / step_s
+    rotor[4] = (body[8] - east) / step_s
+    rotor[5] = (body[9] - down) / step_s
+    rotor[CHARGE] += rotor_constants[5] * (mean / rotor_constants[4]) ** 1.5 * step_s
+
+
+@kernel
+def _ground_gain(down_m: float, enabled: float) -> float:
+    height = _ROTOR_HEIGHT_M + max(-down_m, 0.0)
+    gain: float = 1.0 / (1.0 - enabled * (_ROTOR_RADIUS_M / (4.0 * height)) ** 2)
+    return gain
+
+
+@kernel
+def _torques(body: Array, turn: Array, authority: float, constants: Array, inputs: Array) -> None:
+    """Inputs 1..3 that realise the angular acceleration: perfect mixing, faded by authority.
+
+    The gyroscopic torque and the rotational drag are what the rigid body will subtract.
+    """
+    p, q, r = body[4], body[5], body[6]
+    i_x, i_y, i_z, arm = constants[2], constants[3], constants[4], constants[5]
+    roll = i_x * turn[0] + (i_z - i_y) * q * r + constants[9] * p
+    pitch = i_y * turn[1] + (i_x - i_z) * r * p + constants[10] * q
+    yaw = i_z * turn[2] + (i_y - i_x) * p * q + constants[11] * r
+    inputs[1] = authority * roll / arm
+    inputs[2] = authority * pitch / arm
+    inputs[3] = authority * yaw
+
+
+@kernel
+def _touch_ground(body: Array, step_s: float) -> float:
+    """Ground at down = 0, inelastic, with friction; returns 1 while it carries the vehicle."""
+    if body[12] < 0.0:
+        return 0.0
+    body[12] = 0.0
+    if body[9] < 0.0:
+        return 0.0
+    # Coulomb: the horizontal impulse is at most the friction times the vertical one just taken
+    speed = math.hypot(body[7], body[8])
+    grip = _FRICTION * body[9]
+    left = (speed - grip) / speed if speed > grip else 0.0
+    body[7] *= left
+    body[8] *= left
+    body[9] = 0.0
+    body[4] = body[5] = body[6] = 0.0
+    _set_level(body, 1.0 - math.exp(-step_s / _LEVELLING_TIME_S))
+    return 1.0
+
+
+@kernel
+def _set_level(body: Array, share: float) -> None:
+    """Turn the attitude by this share of the way to level, keeping the twist about down."""
+    norm = math.hypot(body[0], body[3])
+    w, z = (body[0] / norm, body[3] / norm) if norm > 1e-9 else (1.0, 0.0)
+    body[0] += share * (w - body[0])
+    body[1] -= share * body[1]
+    body[2] -= share * body[2]
+    body[3] += share * (z - body[3])
+    length = math.sqrt(body[0] ** 2 + body[1] ** 2 + body[2] ** 2 + body[3] ** 2)
+    for i in range(4):
+        body[i] /= length

@@ -1,0 +1,73 @@
+"""The battery: what a monitor shows of it, by the charge that was drawn and the thrust.
+
+Knows the vehicle's hover alone; what draws the charge is the airframe's
+(`simulator.vehicle.airframe`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pydantic import Field
+
+from offboard.model.vehicle import Parameters
+
+
+class Battery(Parameters):
+    """A lithium pack: open-circuit voltage linear in what remains, and on when nothing does;
+    sagging with the current."""
+
+    cells: int = Field(default=4, ge=1, le=16)
+    capacity_ah: float = Field(default=5.0, gt=0.01, le=200)
+    hover_current_a: float = Field(default=12.0, ge=0, le=500)
+    resistance_ohm: float = Field(default=0.02, ge=0, le=1)
+    remaining: float = Field(default=1.0, ge=0, le=1)  # at boot
+
+
+@dataclass(frozen=True, slots=True)
+class BatteryState:
+    """What a battery monitor would show; remaining 0..1."""
+
+    voltage_v: float
+    current_a: float
+    remaining: float
+    used_mah: float  # since boot
+
+
+@dataclass(frozen=True, slots=True)
+class Pack:
+    """A battery in a vehicle that hovers at this normalised thrust."""
+
+    battery: Battery
+    hover_thrust: float
+
+    @property
+    def constants(self) -> tuple[float, ...]:
+        """Cells, capacity A s, share at boot, resistance ohm; current A and thrust in hover."""
+        battery = self.battery
+        return (
+            battery.cells,
+            3600.0 * battery.capacity_ah,
+            battery.remaining,
+            battery.resistance_ohm,
+            battery.hover_current_a,
+            self.hover_thrust,
+        )
+
+    @property
+    def drain_max_a(self) -> float:
+        """Current at full thrust."""
+        share: float = self.hover_thrust**-1.5
+        return self.battery.hover_current_a * share
+
+    def state(self, drawn_as: float, thrust: float) -> BatteryState:
+        """After the charge drawn so far (A s), at this normalised thrust."""
+        battery = self.battery
+        left = battery.remaining - drawn_as / (3600.0 * battery.capacity_ah)
+        current = battery.hover_current_a * (thrust / self.hover_thrust) ** 1.5
+        voltage = battery.cells * (3.5 + 0.7 * left) - battery.resistance_ohm * current
+        return BatteryState(max(voltage, 0.0), current, max(left, 0.0), drawn_as / 3.6)
+
+    def drawn_as(self, remaining: float) -> float:
+        """Charge (A s) behind which this share remains."""
+        return 3600.0 * self.battery.capacity_ah * (self.battery.remaining - remaining)

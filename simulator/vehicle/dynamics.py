@@ -1,0 +1,215 @@
+"""The equations of the vehicle below the autopilot, compiled: one step of everything, in place.
+
+Rows of a record in, the same rows a step later; what the estimator and the satellite receiver say
+of them. Knows constants and scratch only as `RECORD` lays them out (`simulator.vehicle.plant` fills
+it).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from offboard.model.kernel import entry, kernel
+from offboard.model.rigid_body import RK4_SCRATCH_ROWS
+from offboard.model.state import QUATERNION
+from simulator.steps import STEP_S
+from simulator.vehicle.airframe import CONTACT, ROTOR_SIZE, advance_airframe
+from simulator.vehicle.attitude import ROW_WIDTH, angular_acceleration, delayed_thrust
+from simulator.vehicle.noise import advance_block, fill_normals
+from simulator.vehicle.sensors import (
+    EAST,
+    ERROR_BLOCKS,
+    ERROR_COUNT,
+    NORTH,
+    REPORT_WIDTH,
+    STANDING_NOISE,
+    WHITE_COUNT,
+    YAW,
+    report,
+    turn_estimate,
+)
+from simulator.vehicle.wind import GUST_COUNT
+
+# As typed numbers: compiled code is made once more for each plain constant that is handed on
+_ERROR_LANE, _GUST_LANE, _WHITE_LANE, _RECEIVER_LANE = (np.uint64(lane) for lane in range(4))
+_GUST_BLOCKS = ((0, GUST_COUNT),)
+
+# Rows of the demand history, a power of two: more steps than any vehicle's longest delay
+_HISTORY_ROWS = 128
+
+RECORD = np.dtype(
+    [
+        ("step", "i8"),
+        ("seed", "u8"),
+        ("motors_on", "i8"),
+        ("substeps", "i8"),
+        ("gusty", "i8"),
+        ("noisy", "i8"),
+        # the truth
+        ("body", "f8", QUATERNION.size),
+        ("rotor", "f8", ROTOR_SIZE),
+        ("wind", "f8", 3),
+        ("gust", "f8", GUST_COUNT),
+        # the estimator
+        ("error", "f8", ERROR_COUNT),
+        ("offset", "f8", 3),
+        ("lag_s", "f8"),
+        ("white_sds", "f8", WHITE_COUNT),
+        # the satellite receiver: position NED and velocity NE
+        ("fix_sds", "f8", 5),
+        ("fix_offset", "f8", 3),
+        # the attitude loop
+        ("row", "f8", ROW_WIDTH),
+        ("history", "f8", (_HISTORY_ROWS, ROW_WIDTH)),
+        ("delays", "i8", 5),
+        ("gains", "f8", (3, 3)),
+        # constants
+        ("body_constants", "f8", 12),
+        ("rotor_constants", "f8", 6),
+        ("air", "f8", 7),
+        ("error_transition", "f8", (ERROR_COUNT, ERROR_COUNT)),
+        ("error_scale", "f8", (ERROR_COUNT, ERROR_COUNT)),
+        ("gust_transition", "f8", (GUST_COUNT, GUST_COUNT)),
+        ("gust_scale", "f8", (GUST_COUNT, GUST_COUNT)),
+        # scratch
+        ("normals", "f8", WHITE_COUNT),
+        ("gust_normals", "f8", GUST_COUNT),
+        ("work", "f8", ERROR_COUNT),
+        ("estimated", "f8", 4),
+        ("turn", "f8", 3),
+        ("turn_error", "f8", 3),
+        ("inputs", "f8", 4),
+        ("slopes", "f8", (RK4_SCRATCH_ROWS, QUATERNION.size)),
+        # what `report_state` says
+        ("report", "f8", REPORT_WIDTH),
+        # what `receive_fix` says
+        ("fix", "f8", 5),
+    ],
+    align=True,
+)
+"""All that compiled code knows of one vehicle below its autopilot; SI, NED and FRD."""
+
+
+@entry(RECORD)
+def draw_gusts(plant: Any) -> int:
+    """Fill in the normal numbers that the gusts of a flight begin with."""
+    fill_normals(plant.seed, _GUST_LANE, np.int64(-1), plant.gust_normals[:])
+    return 0
+
+
+@entry(RECORD)
+def report_state(plant: Any) -> int:
+    """Fill in the report of this state."""
+    report(
+        plant.body,
+        plant.rotor,
+        plant.error,
+        plant.offset,
+        plant.lag_s,
+        plant.white_sds,
+        1.0 if plant.motors_on else STANDING_NOISE,
+        plant.seed,
+        _WHITE_LANE,
+        plant.step,
+        plant.normals,
+        plant.report,
+    )
+    return 0
+
+
+@entry(RECORD)
+def receive_fix(plant: Any) -> int:
+    """Fill in the satellite fix of this state."""
+    fill_normals(plant.seed, _RECEIVER_LANE, plant.step, plant.fix[:])
+    for i in range(5):
+        plant.fix[i] *= plant.fix_sds[i]
+    for i in range(3):
+        plant.fix[i] += plant.body[10 + i] + plant.fix_offset[i]
+    for i in range(2):
+        plant.fix[3 + i] += plant.body[7 + i]
+    return 0
+
+
+@entry(int, RECORD)
+def advance_steps(count: int, plant: Any) -> int:
+    """`count` steps in place; the steps done, which are fewer if the ground is touched or left.
+
+    Per step: demand into history, air, loop on the estimate, airframe, estimator errors.
+    """
+    contact = plant.rotor[CONTACT]
+    noise_gain = 1.0 if plant.motors_on else STANDING_NOISE
+    error, turn_error = plant.error, plant.turn_error
+    first = plant.step
+    for step in range(first, first + count):
+        for i in range(ROW_WIDTH):
+            plant.history[step % _HISTORY_ROWS, i] = plant.row[i]
+        _move_air(plant, step)
+        turn_error[0], turn_error[1] = -error[EAST + 2], error[NORTH + 2]
+        turn_error[2] = error[YAW]
+        turn_estimate(plant.body, turn_error[:], plant.estimated[:])
+        angular_acceleration(
+            plant.estimated,
+            plant.body,
+            plant.history,
+            step,
+            plant.delays,
+            plant.gains,
+            turn_error,
+            plant.turn,
+        )
+        advance_airframe(
+            plant.body,
+            plant.rotor,
+            delayed_thrust(plant.history, step, plant.delays) if plant.motors_on else 0.0,
+            plant.turn,
+            plant.wind,
+            plant.body_constants,
+            plant.rotor_constants,
+            plant.air[6] if step * STEP_S >= plant.air[5] else 1.0,
+            STEP_S,
+            plant.substeps,
+            plant.inputs,
+            plant.slopes,
+        )
+        if plant.noisy:
+            fill_normals(plant.seed, _ERROR_LANE, step, plant.normals[:])
+            for start, end in ERROR_BLOCKS:
+                advance_block(
+                    plant.error_transition[:],
+                    plant.error_scale[:],
+                    start,
+                    end,
+                    noise_gain,
+                    plant.normals[:],
+                    error[:],
+                    plant.work[:],
+                )
+        plant.step = step + 1
+        if plant.rotor[CONTACT] != contact:
+            done: int = step + 1 - first
+            return done
+    return count
+
+
+@kernel
+def _move_air(plant: Any, step: int) -> None:
+    """Steady wind and gusts, along and across it."""
+    gust, air, wind = plant.gust, plant.air, plant.wind
+    if plant.gusty:
+        fill_normals(plant.seed, _GUST_LANE, step, plant.gust_normals[:])
+        for start, end in _GUST_BLOCKS:
+            advance_block(
+                plant.gust_transition[:],
+                plant.gust_scale[:],
+                start,
+                end,
+                1.0,
+                plant.gust_normals[:],
+                gust[:],
+                plant.work[:],
+            )
+    wind[0] = air[0] + air[3] * gust[0] - air[4] * gust[1]
+    wind[1] = air[1] + air[4] * gust[0] + air[3] * gust[1]
+    wind[2] = air[2] + gust[3]
