@@ -32,7 +32,7 @@ from offboard.reference.feasibility import check
 from offboard.reference.track import Track
 
 Raw = dict[str, Any]
-RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
+RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "llvmlite")
 UNKNOWN_VEHICLE = "neutral"
 FOLDERS = {"vehicle": "vehicles", "controller": "controllers", "reference": "references"}
 
