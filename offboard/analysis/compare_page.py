@@ -13,9 +13,9 @@ from offboard.analysis.compare_table import digits
 from offboard.analysis.figure import GREY, GRID, PALETTE, Figure, Trace, axis, numbers
 
 PANELS = {  # figure of the score: title, and the share of the width it is drawn in
-    "rmse_position_m": ("position error, RMSE [m]", (0.0, 0.5)),
-    "tilt_agitation_deg": ("tilt not asked for, RMS [deg]", (0.53, 0.75)),
-    "rate_agitation_radps": ("rates not asked for, RMS [rad/s]", (0.78, 1.0)),
+    "rmse_position_m": ("position error<br>RMSE [m]", (0.0, 0.47)),
+    "tilt_agitation_deg": ("tilt not asked for<br>RMS [deg]", (0.53, 0.74)),
+    "rate_agitation_radps": ("rates not asked for<br>RMS [rad/s]", (0.8, 1.0)),
 }
 EQUALS = (
     "the lowest median error of its scenario, and its equals, which are all whose median lies "
@@ -27,7 +27,8 @@ CAPTION = (
 )
 FAILED = "#ba2525"
 FEW_DECADES = 2
-_ROW_PX, _FRAME_PX = 18, 100  # the toolbar and the axes above
+_AIR = 0.05  # of a decade, beside the outermost ticks
+_ROW_PX, _FRAME_PX = 18, 120  # the toolbar and the axes above
 
 
 def page(rows: Sequence[Row], missing: Sequence[str] = ()) -> str:
@@ -58,7 +59,7 @@ def _figure(rows: Sequence[Row]) -> Figure:
     ]
     layout = {
         "height": _FRAME_PX + _ROW_PX * len(lines),
-        "margin": {"l": 120, "r": 20, "t": 90, "b": 10},
+        "margin": {"l": 120, "r": 20, "t": 110, "b": 10},
         "showlegend": False,
         "yaxis": {
             "tickvals": list(range(len(lines))),
@@ -99,14 +100,18 @@ def _label(line: Row | str) -> str:
 
 
 def _logarithmic(rows: Sequence[Row], name: str) -> dict[str, object]:
-    """An axis above its panel, at 1 or at 1, 2 and 5 of every decade."""
+    """An axis above its panel from tick to tick, at 1 or at 1, 2 and 5 of every decade."""
     ends = [end for row in rows for end in (row.lowest[name], row.highest[name]) if end > 0.0]
     low = math.floor(math.log10(min(ends, default=1.0)))
     high = math.ceil(math.log10(max(ends, default=1.0)))
     steps = (1, 2, 5) if high - low <= FEW_DECADES else (1,)
     ticks = [float(f"{step}e{power}") for power in range(low, high + 1) for step in steps]
+    first = max((at for at in ticks if at <= min(ends, default=1.0)), default=ticks[0])
+    last = min((at for at in ticks if at >= max(ends, default=1.0)), default=ticks[-1])
     return {
-        "type": "log", "side": "top", "tickvals": ticks, "ticktext": [f"{at:g}" for at in ticks],
+        "type": "log", "side": "top",
+        "range": [math.log10(first) - _AIR, math.log10(last) + _AIR],
+        "tickvals": ticks, "ticktext": [f"{at:g}" for at in ticks],
         "gridcolor": GRID, "linecolor": GREY, "showline": True, "minor": {"showgrid": False},
     }  # fmt: skip
 

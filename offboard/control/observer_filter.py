@@ -195,5 +195,6 @@ def _note_missed(state: Array, measured: Array, missed: Array) -> None:
 
 @kernel
 def bound_disturbance(state: Array, limit: float) -> None:
+    """Hold each axis of the disturbance, m/s^2 NED, within `limit`, in place."""
     for i in range(DISTURBANCE, DISTURBANCE + 3):
         state[i] = min(max(state[i], -limit), limit)

@@ -154,7 +154,8 @@ def fly(
             assert isinstance(link, UdpLink)
             bundled.hangar.launch(bundled.options(link.port))
             stack.callback(bundled.hangar.recall)
-        tell("preparing the controller (a source tree's first flight compiles, for some seconds)")
+        some = "" if Entry.all_compiled() else " (compiles what never flew here, for some seconds)"
+        tell(f"preparing the controller{some}")
         compiled = Entry.compilations
         took_s = rehearse(crew, keeps_deadline=bundled is None)
         if Entry.compilations > compiled and took_s > COMPILED_S:

@@ -18,6 +18,7 @@ from offboard.model.kernel import Entry
 
 
 def main(directory: Path) -> None:
+    """Write the bitcode of all entries where `offboard.model.shipped` looks for it."""
     symbols = list(_entries())
     with ProcessPoolExecutor() as pool:
         shipped.write(directory, dict(zip(symbols, pool.map(_compiled, symbols), strict=True)))

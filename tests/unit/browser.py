@@ -46,13 +46,13 @@ class Opened:
 
 
 @contextmanager
-def opening(file: Path) -> Iterator[Opened]:
+def opening(file: Path, width: int = 1280) -> Iterator[Opened]:
     """The page while the browser runs; fails the test where there is no browser."""
     found = next(filter(None, map(shutil.which, BROWSERS)), None)
     if found is None:
         pytest.fail(f"the page must be opened in a browser; install one of {', '.join(BROWSERS)}")
     with sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=found, args=list(FLAGS))
-        context = chromium.new_context(offline=True, viewport={"width": 1280, "height": 900})
+        context = chromium.new_context(offline=True, viewport={"width": width, "height": 900})
         yield Opened(context.new_page(), file)
         chromium.close()

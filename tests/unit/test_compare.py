@@ -12,7 +12,7 @@ import signal
 from pathlib import Path
 
 import pytest
-from browser import opening
+from browser import Opened, opening
 from rich.console import Console
 
 from offboard.analysis.compare import (
@@ -116,6 +116,28 @@ def test_the_page_opens_without_an_error_and_shows_every_row(
         told = opened.page.inner_text("main")
     for words in (*LAWS, *SCENARIOS, WHY, "3 of 3 failed", "<i>calm</i>"):
         assert words in told, words
+
+
+def test_titles_and_numbers_of_the_axes_keep_clear_of_each_other(
+    rows: list[Row], tmp_path: Path
+) -> None:
+    """In a window of 1100 pixels; every panel shows two numbers or more."""
+    file = tmp_path / "compare.html"
+    file.write_text(page(rows), encoding="utf-8")
+    axes = ("x", "x2", "x3")
+    with opening(file, width=1100) as opened:
+        titles = [_boxes(opened, f".g-{axis}title") for axis in axes]
+        numbers = [_boxes(opened, f".{axis}tick text") for axis in axes]
+    assert min(map(len, numbers)) >= 2
+    for panels in (titles, numbers):
+        for (_, right), (left, _) in itertools.pairwise(itertools.chain.from_iterable(panels)):
+            assert right < left
+
+
+def _boxes(opened: Opened, selector: str) -> list[tuple[float, float]]:
+    """Left and right edges in pixels, from left to right."""
+    found = [each.bounding_box() for each in opened.page.locator(selector).all()]
+    return sorted((box["x"], box["x"] + box["width"]) for box in found if box)
 
 
 def dies_with_seed_2(trial: Trial) -> Result:
