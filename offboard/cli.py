@@ -109,7 +109,7 @@ def fly(
     assignments: Assignments = None,
 ) -> None:
     """Connect, arm, take off, track the reference, land; log everything and score it."""
-    from offboard.flight.sitl import Hangar
+    from offboard.flight.sitl import SimulatorProcess
     from offboard.flight.stop import StopRequests
 
     if sitl and connect:
@@ -120,16 +120,16 @@ def fly(
     try:
         with (
             StopRequests(_leave) as stops,
-            Hangar() if sitl else nullcontext() as hangar,  # it loads while we do
+            SimulatorProcess() if sitl else nullcontext() as simulator,  # it loads while we do
         ):
             from offboard.analysis.requirement import Requirement
             from offboard.analysis.score import FIGURES
             from offboard.flight import clock
-            from offboard.sortie import Order, fly_order
+            from offboard.flight.request import FlightRequest, fly_request
 
             requirements = [Requirement.parse(text, FIGURES) for text in require or ()]
             directory = out_directory or Path("flights") / clock.local_stamp()
-            order = Order(
+            request = FlightRequest(
                 directory=directory,
                 config=config,
                 choices={part: name for part, name in named.items() if name is not None},
@@ -141,7 +141,7 @@ def fly(
                 scenario=scenario,
                 sim_vehicle=sim_vehicle,
             )
-            outcome = fly_order(order, _announcer(), out.print, hangar, stops)
+            outcome = fly_request(request, _announcer(), out.print, simulator, stops)
     except KeyboardInterrupt:  # in flight it lands instead
         raise Refusal(INTERRUPTED) from None
     if outcome.exit_code == 2:
@@ -196,9 +196,9 @@ def check(
 ) -> None:
     """Validate what a flight may be given, without flying: configurations, vehicles, controllers,
     references (.yaml or .csv; they must be flyable too) and the simulator's scenarios."""
-    from offboard.config import check_file
+    from offboard.documents.reading import DocumentError
+    from offboard.flight.configuration import check_file
     from offboard.flight.sitl import check_scenario
-    from offboard.model.document import DocumentError
 
     problems = []
     for path in files:
@@ -238,8 +238,8 @@ def identify(
     from offboard.analysis import history, tlog
     from offboard.analysis.identify import identify_flight, vehicle_file
     from offboard.analysis.identify_page import page as fits
-    from offboard.config import flown, load
     from offboard.flight import clock
+    from offboard.flight.configuration import flown, load
 
     if (flight is None) == (connect is None and not sitl):
         raise Refusal("name a FLIGHT, or fly one first with --connect or --sitl; not both")
@@ -306,30 +306,32 @@ def compare(
     if not 1 <= seeds <= 1000:
         raise Refusal(f"--seeds {seeds}: give 1 .. 1000")
     from offboard.analysis.comparison import compare_all
-    from offboard.config import locate, shipped
+    from offboard.analysis.trial import check_flyable, fly_trial
+    from offboard.documents import shipped
+    from offboard.documents.shipped import locate
     from offboard.flight import clock
+    from offboard.flight.request import FlightRequest
     from offboard.flight.sitl import check_scenario
-    from offboard.sortie import Order, check_flyable, fly_trial
 
-    known = sorted(path.stem for path in (shipped() / "controllers").glob("*.yaml"))
+    known = shipped.names("controllers")
     laws, references = _list(controllers, known), _list(reference)
     scenarios = _list(scenario) if connect is None else ["connected"]
     if connect is None:
         files = [locate(name, "scenarios", "scenario") for name in scenarios]
         for path in files:
-            if shipped() not in path.parents:
+            if shipped.directory() not in path.parents:
                 check_scenario(path)
     directory = out_directory or Path("flights") / f"compare-{clock.local_stamp()}"
-    order = Order(
+    request = FlightRequest(
         directory=directory,
         choices={"vehicle": vehicle} if vehicle else {},
         assignments=tuple(assignments or ()),
         connection=connect or DEFAULT_CONNECTION,
         sitl=connect is None,
     )
-    check_flyable(order, laws, references)
+    check_flyable(request, laws, references)
     problem = compare_all(
-        partial(fly_trial, order),
+        partial(fly_trial, request),
         controllers=laws,
         references=references,
         scenarios=scenarios,
@@ -361,9 +363,9 @@ def paper(
     ] = None,
 ) -> None:
     """Tables 2-4 and figures 4-17 of the paper, ours beside theirs, certified, on one page."""
-    from offboard.analysis.paper.options import PaperError, PaperOptions
-    from offboard.analysis.paper.run import reproduce
     from offboard.flight import clock
+    from offboard.paper.study.options import PaperError, PaperOptions
+    from offboard.paper.study.run import reproduce
 
     try:
         weights = None if initial_q is None else tuple(float(w) for w in initial_q.split(","))
@@ -400,8 +402,8 @@ def _score(flight: Path, requirements: list, as_json: bool) -> list[str]:  # typ
     """Score, write score.json beside a flight's log, print; return the missed requirements."""
     from offboard.analysis.document import as_text
     from offboard.analysis.table import show
+    from offboard.analysis.trial import keep_score, score_flight
     from offboard.flight.log import LogError
-    from offboard.sortie import keep_score, score_flight
 
     result, flown = score_flight(flight)
     if flight.is_dir():
@@ -421,9 +423,9 @@ def main() -> None:
     """Console entry: no traceback for anything that a user can mend."""
     from offboard.analysis.requirement import RequirementError
     from offboard.analysis.tlog import TlogError
+    from offboard.documents.reading import DocumentError
     from offboard.flight.link import LinkError
     from offboard.flight.log import LogError
-    from offboard.model.document import DocumentError
 
     try:
         app()

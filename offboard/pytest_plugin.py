@@ -19,7 +19,7 @@ import pytest
 
 if TYPE_CHECKING:
     from offboard.analysis.score import Score
-    from offboard.flight.sitl import Hangar
+    from offboard.flight.sitl import SimulatorProcess
 
 FLIGHTS = pytest.StashKey[list[Path]]()
 
@@ -39,16 +39,18 @@ class Flight:
 
 
 @pytest.fixture(scope="session")
-def _hangar() -> Iterator[Hangar]:
+def _simulator() -> Iterator[SimulatorProcess]:
     """What the flights of all tests start from."""
-    from offboard.flight.sitl import Hangar
+    from offboard.flight.sitl import SimulatorProcess
 
-    with Hangar() as hangar:
-        yield hangar
+    with SimulatorProcess() as simulator:
+        yield simulator
 
 
 @pytest.fixture
-def fly(request: pytest.FixtureRequest, tmp_path: Path, _hangar: Hangar) -> Callable[..., Flight]:
+def fly(
+    request: pytest.FixtureRequest, tmp_path: Path, _simulator: SimulatorProcess
+) -> Callable[..., Flight]:
     """Fly on the bundled simulator, in lockstep: a flight is a function of its arguments.
 
     The function takes reference, controller and vehicle (a shipped name or a file), scenario,
@@ -69,15 +71,16 @@ def fly(request: pytest.FixtureRequest, tmp_path: Path, _hangar: Hangar) -> Call
         settings: Sequence[str] = (),
         must_succeed: bool = True,
     ) -> Flight:
+        from offboard.analysis.trial import score_flight
+        from offboard.documents.reading import DocumentError
         from offboard.flight.link import LinkError
         from offboard.flight.log import LogError
-        from offboard.model.document import DocumentError
-        from offboard.sortie import Order, fly_order, score_flight
+        from offboard.flight.request import FlightRequest, fly_request
 
         named = {"reference": reference, "controller": controller, "vehicle": vehicle}
         directory = tmp_path / f"flight-{len(flown) + 1}"
         flown.append(directory / "flight.tlog")
-        order = Order(
+        request = FlightRequest(
             directory=directory,
             config=config,
             choices={part: name for part, name in named.items() if name is not None},
@@ -89,7 +92,7 @@ def fly(request: pytest.FixtureRequest, tmp_path: Path, _hangar: Hangar) -> Call
         )
         problem, outcome = "", None
         try:
-            outcome = fly_order(order, hangar=_hangar)
+            outcome = fly_request(request, simulator=_simulator)
         except (DocumentError, LinkError, LogError) as error:
             problem = str(error)
         finally:

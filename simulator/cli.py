@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated, NoReturn
 
 import typer
 
+from offboard.documents import shipped
 from simulator.firmware.base import Firmware
 from simulator.firmware.catalogue import FIRMWARES
 
@@ -112,8 +113,8 @@ def simulate(
     stopping = Stop()
 
     # late, so that a wrong option is answered at once
+    from offboard.documents.reading import DocumentError
     from offboard.flight.clock import unix_us
-    from offboard.model.document import DocumentError
     from simulator import config
     from simulator.link.links import LinkError, open_link, shifted
     from simulator.link.recorder import Recorder
@@ -203,7 +204,7 @@ def simulate(
 
 
 def _check(path: Path) -> NoReturn:
-    from offboard.model.document import DocumentError
+    from offboard.documents.reading import DocumentError
     from simulator import config
 
     try:
@@ -217,7 +218,7 @@ def _check(path: Path) -> NoReturn:
 def _list_scenarios() -> NoReturn:
     from simulator import config
 
-    for name in config.shipped_names("scenarios"):
+    for name in shipped.names("scenarios"):
         print(f"{name:18s} {config.scenario(name).description}")
     raise typer.Exit(0)
 

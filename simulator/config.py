@@ -1,17 +1,13 @@
-"""Scenarios and vehicles by name or file. Only this module of the simulator reads files.
-
-Shipped files lie inside an installed package, or in a checkout's `config/`.
-"""
+"""Scenarios and vehicles by name or file."""
 
 from __future__ import annotations
 
-from importlib import resources
-from pathlib import Path
-
 from pydantic import Field
 
-from offboard.model.document import DocumentError, M, parse
-from offboard.model.vehicle import Parameters, Vehicle
+from offboard.documents.parameters import Parameters
+from offboard.documents.reading import M, parse
+from offboard.documents.shipped import locate, read_text
+from offboard.model.vehicle import Vehicle
 from simulator.faults import Fault
 from simulator.vehicle.conditions import Conditions
 
@@ -35,26 +31,6 @@ def vehicle(name: str) -> Vehicle:
     return _load(name, "vehicles", "vehicle", Vehicle)
 
 
-def shipped_names(folder: str) -> list[str]:
-    """Names of the files of one folder of the shipped configuration."""
-    return sorted(path.stem for path in (_shipped() / folder).glob("*.yaml"))
-
-
-def _shipped() -> Path:
-    package = Path(str(resources.files("offboard")))
-    inside = package / "_config"
-    return inside if inside.is_dir() else package.parent / "config"
-
-
-def _load(name: str, folder: str, what: str, model: type[M]) -> M:
-    is_file = name.endswith((".yaml", ".yml")) or "/" in name
-    path = Path(name) if is_file else _shipped() / folder / f"{name}.yaml"
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        shipped = ", ".join(shipped_names(folder))
-        raise DocumentError(f"{what} {name} not found: give a file or one of {shipped}") from None
-    except (OSError, UnicodeDecodeError) as error:
-        reason = error.strerror if isinstance(error, OSError) else "not UTF-8 text"
-        raise DocumentError(f"{what} {path} cannot be read: {reason}") from None
-    return parse(text, model, str(path))
+def _load(name: str, folder: str, kind: str, model: type[M]) -> M:
+    path = locate(name, folder, kind)
+    return parse(read_text(path), model, str(path))

@@ -11,7 +11,8 @@ from typing import Annotated, Literal
 
 from pydantic import AfterValidator, Field
 
-from offboard.model.vehicle import Parameters, Triple
+from offboard.documents.parameters import Parameters
+from offboard.model.vehicle import Triple
 from simulator.link.impairment import Impairment
 from simulator.mavlink.codec import id_of
 

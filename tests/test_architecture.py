@@ -46,7 +46,7 @@ def test_only_the_clock_reads_the_time() -> None:
 def test_only_the_edges_open_sockets() -> None:
     links = {f"simulator/link/{name}.py" for name in ("links", "tcp", "udp")}
     edges = {"offboard/flight/link.py", *links}
-    pipes = {"offboard/flight/sitl.py", "simulator/hangar.py"}  # between the two processes
+    pipes = {"offboard/flight/sitl.py", "simulator/pool.py"}  # between the two processes
     assert _importers("socket", "serial") <= edges
     assert _importers("select") <= edges | pipes
 
@@ -59,7 +59,7 @@ def _importers(*modules: str) -> set[str]:
     }
 
 
-def test_the_simulator_shares_only_model_and_clock() -> None:
+def test_the_simulator_shares_only_documents_model_and_clock() -> None:
     shared = {
         name
         for path in (ROOT / "simulator").rglob("*.py")
@@ -69,7 +69,7 @@ def test_the_simulator_shares_only_model_and_clock() -> None:
     foreign = {
         name
         for name in shared
-        if not name.startswith(("offboard.model", "offboard.flight.clock"))
+        if not name.startswith(("offboard.model", "offboard.documents", "offboard.flight.clock"))
         and name not in ("offboard", "offboard.flight")
     }
     assert foreign == set()
@@ -84,7 +84,7 @@ def test_one_place_makes_a_setpoint() -> None:
         and isinstance(node.func, ast.Name)
         and node.func.id in ("AttitudeTarget", "PositionTarget")
     }
-    assert makers == {"offboard/flight/emission.py"}
+    assert makers == {"offboard/flight/outbox.py"}
 
 
 def test_top_level_holds_only_what_the_layout_names() -> None:

@@ -19,7 +19,7 @@ from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
-from offboard.model.document import DocumentError
+from offboard.documents.reading import DocumentError
 
 EQUAL_SHARE = 0.01  # of the best median: nearer is no difference, whatever the spread
 POLL_S = 0.2

@@ -6,7 +6,7 @@ import json
 import math
 from typing import Any
 
-from offboard.analysis.history import Happening, History
+from offboard.analysis.history import Event, History
 from offboard.analysis.score import Score
 
 
@@ -31,5 +31,5 @@ def _plain(value: float) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _story(happenings: tuple[Happening, ...]) -> list[dict[str, Any]]:
+def _story(happenings: tuple[Event, ...]) -> list[dict[str, Any]]:
     return [{"time_s": _plain(one.time_s), "what": one.what} for one in happenings]

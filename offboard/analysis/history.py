@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 
 from offboard.analysis.tlog import LoggedMessage, Tlog, columns, name_of
 from offboard.flight import manifest
-from offboard.flight.learning import RECORD_ID as IDENTIFIED_ID
-from offboard.flight.learning import RECORD_NAME as IDENTIFIED_NAME
+from offboard.flight.online_identification import RECORD_ID as IDENTIFIED_ID
+from offboard.flight.online_identification import RECORD_NAME as IDENTIFIED_NAME
 from offboard.flight.record import (
     COMPONENT_ID,
     RECORD_COMPONENT_ID,
@@ -26,8 +26,8 @@ from offboard.flight.record import (
     RECORD_NAME,
     TickRecord,
 )
-from offboard.mavlink.dialect import Dialect
-from offboard.mavlink.inbound import decode_text_chunk
+from offboard.mavlink.decode import decode_text_chunk
+from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.session import DIALECTS
 from offboard.mavlink.texts import TextAssembler
 from offboard.model.geodesy import Geodetic, origin_of, position_ned_m
@@ -45,7 +45,7 @@ _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: ground stations and companions
 
 
 @dataclass(frozen=True, slots=True)
-class Happening:
+class Event:
     """Something said or done: vehicle time (NaN before telemetry), who, and the words."""
 
     time_s: float
@@ -76,9 +76,9 @@ class History:
     records: tuple[TickRecord, ...]
     identified: Array
     link_delay: Array
-    phases: tuple[Happening, ...]
-    modes: tuple[Happening, ...]
-    said: tuple[Happening, ...]
+    phases: tuple[Event, ...]
+    modes: tuple[Event, ...]
+    said: tuple[Event, ...]
     messages: Counter[str]
     wall_s: float
 
@@ -190,12 +190,12 @@ class _Clock:
         times: Array = self._times[np.searchsorted(self._places, places)]
         return times
 
-    def story(self, who: str, told: Iterable[tuple[int, str]]) -> tuple[Happening, ...]:
+    def story(self, who: str, told: Iterable[tuple[int, str]]) -> tuple[Event, ...]:
         """What was told at places in the log, in their order."""
         ordered = sorted(told)
         times = self.at(np.array([place for place, _ in ordered], dtype=np.intp))
         return tuple(
-            Happening(float(time_s), who, what)
+            Event(float(time_s), who, what)
             for time_s, (_, what) in zip(times, ordered, strict=True)
         )
 
@@ -246,7 +246,7 @@ def _truth(theirs: _Party, clock: _Clock) -> Array:
     return np.array(told, dtype=np.float64).reshape(-1, 4)
 
 
-def _phases(ours: _Party, clock: _Clock) -> tuple[Happening, ...]:
+def _phases(ours: _Party, clock: _Clock) -> tuple[Event, ...]:
     told = [
         (place, text.removeprefix(OUR_WORDS))
         for place, text in _texts(ours)
@@ -264,7 +264,7 @@ def _texts(party: _Party) -> list[tuple[int, str]]:
     return said
 
 
-def _modes(theirs: _Party, clock: _Clock, dialect: Dialect | None) -> tuple[Happening, ...]:
+def _modes(theirs: _Party, clock: _Clock, dialect: Dialect | None) -> tuple[Event, ...]:
     told: list[tuple[int, str]] = []
     if dialect is None:
         return ()
@@ -275,7 +275,7 @@ def _modes(theirs: _Party, clock: _Clock, dialect: Dialect | None) -> tuple[Happ
     return clock.story("vehicle", told)
 
 
-def _said(theirs: _Party, clock: _Clock) -> tuple[Happening, ...]:
+def _said(theirs: _Party, clock: _Clock) -> tuple[Event, ...]:
     words = _texts(theirs)
     acks = [(place, entry.message) for place, entry in theirs.of("COMMAND_ACK")]
     refused = [

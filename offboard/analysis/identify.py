@@ -13,10 +13,10 @@ from numpy.typing import NDArray
 
 from offboard.analysis.history import History
 from offboard.analysis.tlog import Tlog
-from offboard.control.identification import Estimate, Identified, ResponseFit, identify
-from offboard.control.trace import Trace, clean
 from offboard.flight.phases import PHASE_CODES, Phase
-from offboard.mavlink.dialect import ThrustRule
+from offboard.identification.stages import Estimate, Identified, ResponseFit, identify
+from offboard.identification.trace import Trace, clean
+from offboard.mavlink.dialects.base import ThrustRule
 from offboard.mavlink.session import DIALECTS
 from offboard.model.frames import course_from_quaternion, thrust_direction_from_quaternion
 from offboard.model.vehicle import Vehicle

@@ -11,10 +11,18 @@ from numpy.typing import NDArray
 from offboard.analysis import page as shell
 from offboard.analysis.figure import BLUE, GREY, RED, Figure, line, panels
 from offboard.analysis.identify import rows
-from offboard.control.identification import EstimatorNoise, Identified
-from offboard.control.motion import Motion, specific_velocity
-from offboard.control.response_fit import predicted
-from offboard.control.trace import COURSE, NORTH, SENT_AT, SENT_COURSE, SENT_NORTH, STAMP, Trace
+from offboard.identification.motion import Motion, specific_velocity
+from offboard.identification.response_fit import predicted
+from offboard.identification.stages import EstimatorNoise, Identified
+from offboard.identification.trace import (
+    COURSE,
+    NORTH,
+    SENT_AT,
+    SENT_COURSE,
+    SENT_NORTH,
+    STAMP,
+    Trace,
+)
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 Array = NDArray[np.float64]

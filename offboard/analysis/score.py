@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BPoly
 
 from offboard.analysis import link
-from offboard.analysis.history import Happening, History
+from offboard.analysis.history import Event, History
 from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.model.frames import (
     course_from_quaternion,
@@ -94,7 +94,7 @@ class Score:
 FIGURES = {figure.name: figure.metadata for figure in fields(Score)}
 
 
-def phases(history: History) -> tuple[Happening, ...]:
+def phases(history: History) -> tuple[Event, ...]:
     """What the flight went through: vehicle time and 'phase: reason'."""
     return history.phases
 

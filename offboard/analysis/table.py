@@ -7,7 +7,7 @@ import math
 from rich.console import Console
 from rich.table import Table
 
-from offboard.analysis.history import Happening, History
+from offboard.analysis.history import Event, History
 from offboard.analysis.score import FIGURES, Score
 
 SECTIONS = {
@@ -42,7 +42,7 @@ def show(console: Console, score: Score, history: History) -> None:
     console.print(table)
 
 
-def _story(title: str, happenings: tuple[Happening, ...]) -> Table:
+def _story(title: str, happenings: tuple[Event, ...]) -> Table:
     table = Table(box=None, pad_edge=False)
     table.add_column("t [s]", justify="right")
     table.add_column(title)

@@ -1,1 +1,1 @@
-"""What to command: observer, swarm, objectives, controllers. Knows no MAVLink and no clock."""
+"""From a predicted state and a reference to a command: laws, swarm, horizon. No MAVLink, no clock."""

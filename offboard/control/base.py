@@ -8,72 +8,12 @@ from typing import Protocol, runtime_checkable
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.model.command import Command, PositionCommand
+from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import Reference
 
 Array = NDArray[np.float64]
-
-
-@dataclass(frozen=True, slots=True)
-class Command:
-    """One setpoint. `thrust_mps2` is the collective thrust per unit of mass (0 .. thrust_max);
-    `thrust_direction_ned` the commanded third body axis (unit, (0, 0, 1) when level);
-    `course_rad` the commanded heading of the nose.
-
-    Thrust is per unit of mass because only its ratio to the hover thrust crosses the wire, and
-    the mass of a real vehicle is not observable from telemetry.
-    """
-
-    thrust_mps2: float
-    thrust_direction_ned: tuple[float, float, float]
-    course_rad: float
-
-
-@dataclass(frozen=True, slots=True)
-class PositionCommand:
-    """A setpoint for the autopilot's own position loop, NED, SI; `course_rad` of the nose."""
-
-    position_ned_m: tuple[float, float, float]
-    velocity_ned_mps: tuple[float, float, float]
-    acceleration_ned_mps2: tuple[float, float, float]
-    course_rad: float
-    course_rate_radps: float
-
-
-@dataclass(frozen=True, slots=True)
-class PredictedHeave:
-    """The vertical motion at `time_s`, vehicle time, when the *thrust* of a command sent now takes
-    effect: down is positive; `thrust_down_mps2` is T b_z."""
-
-    time_s: float
-    position_down_m: float
-    velocity_down_mps: float
-    thrust_down_mps2: float
-
-
-@dataclass(frozen=True, slots=True)
-class PredictedState:
-    """The observer's state at `time_s`, vehicle time, when a command sent now takes effect.
-
-    Shapes (3,), NED, SI. `thrust_direction_ned` is the third body axis b and
-    `thrust_direction_rate_ned_ps` its derivative; acceleration = g e3 - T b - c v + d with
-    `disturbance_ned_mps2` d and `thrust_mps2` T (after the thrust's lag).
-
-    Thrust acts sooner than tilt. A vertical loop closed on `time_s` would wait for the tilt and,
-    from a difference of about 0.1 s on, cycle; `heave` is the vertical motion at its own time.
-    """
-
-    time_s: float
-    position_ned_m: Array
-    velocity_ned_mps: Array
-    thrust_direction_ned: Array
-    thrust_direction_rate_ned_ps: Array
-    course_rad: float
-    course_rate_radps: float
-    thrust_mps2: float
-    disturbance_ned_mps2: Array
-    rates_frd_radps: Array
-    heave: PredictedHeave | None = None
 
 
 @dataclass(frozen=True, slots=True)

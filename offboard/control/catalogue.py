@@ -11,15 +11,16 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from offboard.control.autopilot import AutopilotLaw, AutopilotSettings
 from offboard.control.base import Controller
 from offboard.control.horizon.law import HorizonLaw, HorizonSettings, Method
-from offboard.control.mpc import MpcLaw, MpcSettings
-from offboard.control.paper import PaperController
-from offboard.control.paper_law import PaperSettings
-from offboard.control.pid import PidLaw, PidSettings
-from offboard.control.tracking import OneDecisionSettings, Search, TrackingLaw
-from offboard.model.vehicle import Parameters, Vehicle
+from offboard.control.laws.autopilot import AutopilotLaw, AutopilotSettings
+from offboard.control.laws.mpc import MpcLaw, MpcSettings
+from offboard.control.laws.pid import PidLaw, PidSettings
+from offboard.control.laws.tracking import OneDecisionSettings, Search, TrackingLaw
+from offboard.documents.parameters import Parameters
+from offboard.model.vehicle import Vehicle
+from offboard.paper.controller import PaperController
+from offboard.paper.law import PaperSettings
 
 
 class Pso(OneDecisionSettings):

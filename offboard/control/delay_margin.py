@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm, solve_discrete_are
 
-from offboard.control.response import lateral_cost_to_go, lateral_model
+from offboard.control.riccati import lateral_cost_to_go
+from offboard.model.axes import lateral_model
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]

@@ -1,1 +1,1 @@
-"""The flight itself: phases, link, log and daemon. The only room with sockets, files and time."""
+"""One flight: phases, actions, link, log and loop. The only package with sockets, files and time."""

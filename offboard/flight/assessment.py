@@ -1,6 +1,6 @@
 """From all that is known to the facts of one moment, and to the words that explain an end.
 
-Reads view, session, mission and observer; changes none of them and decides nothing.
+Reads view, session, plan and observer; changes none of them and decides nothing.
 """
 
 from __future__ import annotations
@@ -10,13 +10,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from offboard.control.observer import Observer
-from offboard.flight.guards import Picture
-from offboard.flight.mission import Mission
+from offboard.estimation.observer import Observer
+from offboard.flight.flight_plan import FlightPlan
+from offboard.flight.guards import Facts
 from offboard.flight.phases import Limits, Phase
 from offboard.flight.readiness import Readiness
 from offboard.flight.view import VehicleView
-from offboard.mavlink.dialect import Takeoff
+from offboard.mavlink.dialects.base import Takeoff
 from offboard.mavlink.session import Session
 from offboard.model.frames import thrust_direction_from_quaternion
 
@@ -28,7 +28,7 @@ FAILSAFE_STATUS = 5  # MAV_STATE_CRITICAL; 6 is an emergency
 
 
 @dataclass(frozen=True, slots=True)
-class Course:
+class Progress:
     """What the companion itself knows of the moment: where it is in the flight."""
 
     phase: Phase
@@ -50,72 +50,72 @@ class Assessment:
         self,
         view: VehicleView,
         session: Session,
-        mission: Mission,
+        plan: FlightPlan,
         observer: Observer,
         readiness: Readiness,
         limits: Limits,
     ) -> None:
         self._view = view
         self._session = session
-        self._mission = mission
+        self._plan = plan
         self._observer = observer
         self._readiness = readiness
         self._limits = limits
 
-    def picture(self, course: Course) -> Picture:
+    def facts(self, progress: Progress) -> Facts:
         """The facts for the guards."""
-        view, mission, dialect = self._view, self._mission, self._session.dialect
-        track, time_s = mission.track, view.time_s
+        view, plan, dialect = self._view, self._plan, self._session.dialect
+        track, time_s = plan.track, view.time_s
         heartbeat = view.heartbeat
-        return Picture(
+        return Facts(
             limits=self._limits,
-            in_phase_s=course.in_phase_s,
-            silence_s=course.silence_s,
+            in_phase_s=progress.in_phase_s,
+            silence_s=progress.silence_s,
             blind_s=max(view.position_age_s, view.attitude_age_s),
             found=view.found is not None,
             ready=not self.unready(),
             misconfigured=bool(self._complaints()),
-            rebooted=course.rebooted,
+            rebooted=progress.rebooted,
             engaged=dialect is not None and view.mode == dialect.engage_mode,
             landing=dialect is not None and view.mode == dialect.land_mode,
             failsafe=heartbeat is not None and heartbeat.system_status >= FAILSAFE_STATUS,
             armed=view.armed,
             in_the_air=view.in_the_air,
-            lifted_off=course.phase is Phase.TAKEOFF and self._lifted_off(),
-            at_start=course.phase is Phase.CLIMB and self._at_start(time_s),
-            late_s=mission.late_s(time_s),
+            lifted_off=progress.phase is Phase.TAKEOFF and self._lifted_off(),
+            at_start=progress.phase is Phase.CLIMB and self._at_start(time_s),
+            late_s=plan.late_s(time_s),
             lifted_by_command=self.lifted_by_command,
-            excites=course.excites,
-            learnt=course.learnt,
-            track_time_s=mission.track_time_s(time_s),
+            excites=progress.excites,
+            learnt=progress.learnt,
+            track_time_s=plan.track_time_s(time_s),
             track_start_s=track.track_start_s,
             track_end_s=track.track_end_s,
             rest_time_s=track.duration_s + 0.5,
             position_error_m=self.position_error_m(),
             tilt_rad=self._tilt_rad(),
-            stop_requested=bool(course.stop_reason),
-            missed_decisions=course.missed_decisions,
-            contradicted=bool(course.contradiction),
+            stop_requested=bool(progress.stop_reason),
+            missed_decisions=progress.missed_decisions,
+            contradicted=bool(progress.contradiction),
         )
 
-    def words(self, picture: Picture, course: Course) -> dict[str, object]:
+    def words(self, facts: Facts, progress: Progress) -> dict[str, object]:
         """The figures that a row's reason may quote."""
         dialect, view = self._session.dialect, self._view
         older = view.position_age_s >= view.attitude_age_s
         return {
             "mode": view.mode,
             "mode_wanted": dialect.engage_mode if dialect else "offboard mode",
-            "silence_s": picture.silence_s,
-            "blind_s": picture.blind_s,
+            "silence_s": facts.silence_s,
+            "blind_s": facts.blind_s,
             "blind_to": "LOCAL_POSITION_NED" if older else "ATTITUDE_QUATERNION",
-            "in_phase_s": picture.in_phase_s,
-            "late_s": picture.late_s,
-            "position_error_m": picture.position_error_m,
-            "tilt_deg": math.degrees(picture.tilt_rad),
+            "in_phase_s": facts.in_phase_s,
+            "late_s": facts.late_s,
+            "position_error_m": facts.position_error_m,
+            "tilt_deg": math.degrees(facts.tilt_rad),
             "position_error_limit_m": self._limits.position_error_m,
-            "stop": course.stop_reason,
-            "failure": course.failure,
-            "contradiction": course.contradiction,
+            "stop": progress.stop_reason,
+            "failure": progress.failure,
+            "contradiction": progress.contradiction,
             "complaint": "; ".join(self._complaints()),
             "unready": self.unready(),
         }
@@ -164,7 +164,7 @@ class Assessment:
         position = self._view.position
         if position is None:
             return False
-        height_m = self._mission.origin_ned_m[2] - position.position_ned_m[2]
+        height_m = self._plan.origin_ned_m[2] - position.position_ned_m[2]
         if self.lifted_by_command:
             return height_m > TAKE_OVER_HEIGHT_M
         return height_m > LIFT_OFF_HEIGHT_M or -position.velocity_ned_mps[2] > LIFT_OFF_CLIMB_MPS
@@ -172,7 +172,7 @@ class Assessment:
     def position_error_m(self) -> float:
         """Distance of the reported position from the reference in force."""
         position = self._view.position
-        sample = self._mission.sample(position.time_s) if position else None
+        sample = self._plan.sample(position.time_s) if position else None
         if position is None or sample is None:
             return 0.0
         return float(np.linalg.norm(np.array(position.position_ned_m) - sample.position_ned_m))
@@ -182,4 +182,4 @@ class Assessment:
             return False
         state = self._observer.predict(time_s)
         position = np.array(self._view.position.position_ned_m)
-        return self._mission.at_start(time_s, position, state.velocity_ned_mps)
+        return self._plan.at_start(time_s, position, state.velocity_ned_mps)

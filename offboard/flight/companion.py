@@ -1,9 +1,8 @@
 """The companion computer, sans-I/O: datagrams and times in, frames out. It owns no socket or file.
 
-One instance flies one flight, and this is its front desk: telemetry goes to the view, the observer
-and the learner; when vehicle time crosses a multiple of the control period `progress` says which
-phase it is, `duties` does what that phase does, by a `decision` while tracking, and what leaves
-leaves through `emission`.
+One instance flies one flight. Telemetry goes to the view, the observer and the identification.
+When vehicle time crosses a multiple of the control period, `phase_machine` advances the phase and
+`actions` carries it out (`decide` while tracking). Every frame leaves through `outbox`.
 """
 
 from __future__ import annotations
@@ -12,17 +11,17 @@ import math
 from collections.abc import Callable, Hashable
 
 from offboard.control.base import Adopting, Controller
-from offboard.control.fusion import FusedObserver
-from offboard.control.observer import Observer
+from offboard.estimation.fusion import FusedObserver
+from offboard.estimation.observer import Observer
+from offboard.flight.actions import PhaseActions
 from offboard.flight.assessment import Assessment
-from offboard.flight.decision import Decider, Tick
-from offboard.flight.duties import Duties
-from offboard.flight.emission import Emission, Output
-from offboard.flight.learning import IdentifySettings, Learner
+from offboard.flight.decide import Decider, Tick
+from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.link_delay import LinkDelay
-from offboard.flight.mission import Mission
+from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
+from offboard.flight.outbox import Outbox, Output
+from offboard.flight.phase_machine import Outcome, PhaseMachine
 from offboard.flight.phases import Limits, Phase
-from offboard.flight.progress import Outcome, Progress
 from offboard.flight.readiness import Readiness
 from offboard.flight.view import VehicleView
 from offboard.mavlink.events import (
@@ -48,7 +47,7 @@ BRIDGED_SHARE = 0.3  # of the longest silence, after which level setpoints bridg
 
 
 class Companion:
-    """Flies `mission` with `controller`. `stopwatch` reads seconds, for solve times only."""
+    """Flies `plan` with `controller`. `stopwatch` reads seconds, for solve times only."""
 
     def __init__(
         self,
@@ -57,7 +56,7 @@ class Companion:
         session: Session,
         observer: Observer,
         controller: Controller,
-        mission: Mission,
+        plan: FlightPlan,
         limits: Limits,
         period_s: float,
         deadline_s: float | None,
@@ -69,70 +68,70 @@ class Companion:
         self._limits = limits
         self._period_s = period_s
         self._stopwatch = stopwatch
-        self.mission = mission
+        self.plan = plan
         self.view = VehicleView()
         self.peer: Hashable | None = None  # where the vehicle's datagrams come from
         self._tick = -1
         self._bridged_s = 0.0
-        self._learner = _learner(vehicle, controller, period_s, learning)
-        self._emission = Emission(session, observer, vehicle, self._learner)
+        self._identification = _identification(vehicle, controller, period_s, learning)
+        self._outbox = Outbox(session, observer, vehicle, self._identification)
         self._link_delay = LinkDelay()
         readiness = Readiness()
-        assessment = Assessment(self.view, session, mission, observer, readiness, limits)
+        assessment = Assessment(self.view, session, plan, observer, readiness, limits)
         decider = Decider(
             controller=controller,
             observer=observer,
-            mission=mission,
+            plan=plan,
             assessment=assessment,
-            learner=self._learner,
-            emission=self._emission,
+            identification=self._identification,
+            outbox=self._outbox,
             deadline_s=deadline_s,
             stopwatch=stopwatch,
         )
-        self._progress = Progress(
+        self._machine = PhaseMachine(
             view=self.view,
             session=session,
-            mission=mission,
+            plan=plan,
             observer=observer,
             assessment=assessment,
             decider=decider,
-            learner=self._learner,
-            emission=self._emission,
+            identification=self._identification,
+            outbox=self._outbox,
             link_delay=self._link_delay,
         )
-        self._duties = Duties(
+        self._actions = PhaseActions(
             view=self.view,
             session=session,
-            mission=mission,
+            plan=plan,
             observer=observer,
             readiness=readiness,
             assessment=assessment,
             decider=decider,
-            emission=self._emission,
+            outbox=self._outbox,
         )
 
     # ------------------------------------------------------------------ the outside calls these
 
     @property
     def phase(self) -> Phase:
-        return self._progress.phase
+        return self._machine.phase
 
     @property
     def outcome(self) -> Outcome | None:
         """None while it flies."""
-        return self._progress.outcome
+        return self._machine.outcome
 
     @property
     def announced(self) -> list[str]:
         """What the user is told, oldest first."""
-        return self._emission.announced
+        return self._outbox.announced
 
     def has_ended(self) -> bool:
-        return self._progress.has_ended()
+        return self._machine.has_ended()
 
     def request_stop(self, why: str = STOPPED) -> None:
         """The vehicle shall be on the ground: obeyed at the next tick or poll."""
-        self._progress.stop_reason = self._progress.stop_reason or why
+        self._machine.stop_reason = self._machine.stop_reason or why
 
     def receive(self, datagram: bytes, peer: Hashable, now_s: float) -> Output:
         """Take one datagram in, decide if it completes a tick, answer in order."""
@@ -144,25 +143,25 @@ class Companion:
             self._note(self._followed(event))
         alive = any(self._is_sign_of_life(event) for event in reception.events)
         if alive:
-            self._progress.silence_s = self._bridged_s = 0.0
+            self._machine.silence_s = self._bridged_s = 0.0
         if self.view.has_state and not self.has_ended():
             self._tick_if_due(arrived_s)
-        self._emission.pass_on(self._session.poll(now_s))
+        self._outbox.pass_on(self._session.poll(now_s))
         for reply in reception.replies:
-            self._emission.send(reply)
-        return self._emission.take(reception.frames, alive)
+            self._outbox.send(reply)
+        return self._outbox.take(reception.frames, alive)
 
     def poll(self, now_s: float, silence_s: float) -> Output:
         """Call when nothing arrives. `silence_s`: wall time since `Output.alive`."""
-        progress = self._progress
-        progress.silence_s = silence_s
+        machine = self._machine
+        machine.silence_s = silence_s
         patience_s = min(self._limits.silence_s, self._limits.connect_s)
-        if not self.view.has_state or progress.stop_reason or silence_s > patience_s:
-            progress.advance()
+        if not self.view.has_state or machine.stop_reason or silence_s > patience_s:
+            machine.advance()
         if not self.has_ended() and silence_s > BRIDGED_SHARE * self._limits.silence_s:
             self._bridge(silence_s)
-        self._emission.pass_on(self._session.poll(now_s))
-        return self._emission.take((), False)
+        self._outbox.pass_on(self._session.poll(now_s))
+        return self._outbox.take((), False)
 
     # ------------------------------------------------------------------ telemetry in
 
@@ -184,7 +183,7 @@ class Companion:
             case LocalPosition(time_s, position, speed):
                 event = LocalPosition(time_s, *fusion.follow(time_s, position, speed))
         while fusion.news:
-            self._emission.announce(fusion.news.pop(0))
+            self._outbox.announce(fusion.news.pop(0))
         return event
 
     def _note(self, event: Event) -> None:
@@ -192,22 +191,22 @@ class Companion:
         match event:
             case Attitude(time_s, attitude, rates):
                 self._observer.on_attitude(time_s, attitude, rates)
-                if self._learner:
-                    self._learner.on_attitude(time_s, attitude)
+                if self._identification:
+                    self._identification.on_attitude(time_s, attitude)
             case LocalPosition(time_s, position, velocity):
                 self._observer.on_position(time_s, position, velocity)
-                if self._learner:
-                    self._learner.on_position(time_s, position, velocity)
+                if self._identification:
+                    self._identification.on_position(time_s, position, velocity)
             case TimeAnswer():
                 self._link_delay.note(event)
             case Moved(peer):
-                self._emission.announce(f"the vehicle is heard from another port now: {peer}")
+                self._outbox.announce(f"the vehicle is heard from another port now: {peer}")
             case Reset():
                 self._observer.reset()
                 self._link_delay.forget()
                 self._tick = -1
-                self._emission.forget_asking()
-                self._progress.note_reboot()
+                self._outbox.forget_asking()
+                self._machine.note_reboot()
 
     # ------------------------------------------------------------------ ticks
 
@@ -218,12 +217,12 @@ class Companion:
             return
         missed = number - self._tick - 1 if self._tick >= 0 else 0
         self._tick = number
-        self._progress.advance()
+        self._machine.advance()
         if not self.has_ended():
-            tick = Tick(time_s, self.phase, self._progress.in_phase_s, arrived_s, missed)
-            self._duties.act(tick)
+            tick = Tick(time_s, self.phase, self._machine.in_phase_s, arrived_s, missed)
+            self._actions.act(tick)
             if tick.phase in TIMED or number % TIMED_EVERY == 0:
-                self._emission.send(self._link_delay.question(time_s))
+                self._outbox.send(self._link_delay.question(time_s))
 
     def _bridge(self, silence_s: float) -> None:
         """Telemetry stopped: go on without, each period of wall time, until the table ends it."""
@@ -231,14 +230,14 @@ class Companion:
             return
         self._bridged_s = silence_s
         time_s = self.view.time_s + silence_s
-        self._duties.hold(Tick(time_s, self.phase, self._progress.in_phase_s, math.nan))
+        self._actions.hold(Tick(time_s, self.phase, self._machine.in_phase_s, math.nan))
 
 
-def _learner(
+def _identification(
     vehicle: Vehicle, controller: Controller, period_s: float, settings: IdentifySettings | None
-) -> Learner | None:
+) -> OnlineIdentification | None:
     """Nothing is learnt for a controller that could not take it over."""
     if settings is None or not isinstance(controller, Adopting):
         return None
     bandwidth = controller.bandwidth_radps
-    return Learner(vehicle, settings, period_s=period_s, bandwidth_radps=bandwidth)
+    return OnlineIdentification(vehicle, settings, period_s=period_s, bandwidth_radps=bandwidth)

@@ -9,7 +9,7 @@ from offboard.flight.phases import Limits
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class Facts:
     """All facts that a guard may look at, at one moment. SI; times in seconds, NaN where there
     is none yet."""
 
@@ -43,149 +43,149 @@ class Picture:
     learnt: bool = False  # what they showed is taken over
 
 
-Guard = Callable[[Picture], bool]
+Guard = Callable[[Facts], bool]
 
 
-def vehicle_found(now: Picture) -> bool:
+def vehicle_found(now: Facts) -> bool:
     return now.found
 
 
-def ready(now: Picture) -> bool:
+def ready(now: Facts) -> bool:
     return now.ready
 
 
-def misconfigured(now: Picture) -> bool:
+def misconfigured(now: Facts) -> bool:
     return now.misconfigured
 
 
-def armed_by_another(now: Picture) -> bool:
+def armed_by_another(now: Facts) -> bool:
     return now.armed and not now.limits.begin_armed
 
 
-def rebooted(now: Picture) -> bool:
+def rebooted(now: Facts) -> bool:
     return now.rebooted
 
 
-def flown_by_another(now: Picture) -> bool:
+def flown_by_another(now: Facts) -> bool:
     """In the mode that only a stream of setpoints holds, before we sent one."""
     return now.engaged and now.armed and not now.lifted_by_command
 
 
-def streamed(now: Picture) -> bool:
+def streamed(now: Facts) -> bool:
     return now.in_phase_s >= now.limits.stream_s
 
 
-def needs_no_stream(now: Picture) -> bool:
+def needs_no_stream(now: Facts) -> bool:
     return now.lifted_by_command
 
 
-def engaged(now: Picture) -> bool:
+def engaged(now: Facts) -> bool:
     return now.engaged
 
 
-def engaged_in_the_air(now: Picture) -> bool:
+def engaged_in_the_air(now: Facts) -> bool:
     return now.engaged and now.armed and now.in_the_air
 
 
-def armed(now: Picture) -> bool:
+def armed(now: Facts) -> bool:
     return now.armed and now.engaged
 
 
-def lifted_off(now: Picture) -> bool:
+def lifted_off(now: Facts) -> bool:
     return now.lifted_off
 
 
-def at_start(now: Picture) -> bool:
+def at_start(now: Facts) -> bool:
     return now.at_start
 
 
-def too_late_at_start(now: Picture) -> bool:
+def too_late_at_start(now: Facts) -> bool:
     return now.late_s > now.limits.late_s
 
 
-def at_start_to_excite(now: Picture) -> bool:
+def at_start_to_excite(now: Facts) -> bool:
     return now.at_start and now.excites
 
 
-def learnt(now: Picture) -> bool:
+def learnt(now: Facts) -> bool:
     return now.learnt
 
 
-def at_full_speed(now: Picture) -> bool:
+def at_full_speed(now: Facts) -> bool:
     return now.track_time_s >= now.track_start_s
 
 
-def track_over(now: Picture) -> bool:
+def track_over(now: Facts) -> bool:
     return now.track_time_s >= now.track_end_s
 
 
-def at_rest(now: Picture) -> bool:
+def at_rest(now: Facts) -> bool:
     return now.track_time_s >= now.rest_time_s
 
 
-def disarmed(now: Picture) -> bool:
+def disarmed(now: Facts) -> bool:
     return not now.armed
 
 
-def disarmed_for_good(now: Picture) -> bool:
+def disarmed_for_good(now: Facts) -> bool:
     """Long enough for a heartbeat, 1 Hz, to contradict: an arming may have been under way."""
     return not now.armed and now.in_phase_s > 1.5
 
 
-def mode_taken(now: Picture) -> bool:
+def mode_taken(now: Facts) -> bool:
     return not now.engaged
 
 
-def taken_armed(now: Picture) -> bool:
+def taken_armed(now: Facts) -> bool:
     """A pilot took over just as it armed: whether it stays so is the pilot's to say."""
     return now.armed and not now.engaged
 
 
-def landing_taken(now: Picture) -> bool:
+def landing_taken(now: Facts) -> bool:
     """A pilot took over; a failsafe that lands is left to finish."""
     return not (now.engaged or now.landing or now.failsafe)
 
 
-def silent(now: Picture) -> bool:
+def silent(now: Facts) -> bool:
     return now.silence_s > now.limits.silence_s
 
 
-def lost(now: Picture) -> bool:
+def lost(now: Facts) -> bool:
     return now.silence_s > 2.0 * now.limits.silence_s
 
 
-def silent_on_ground(now: Picture) -> bool:
+def silent_on_ground(now: Facts) -> bool:
     return now.silence_s > now.limits.connect_s
 
 
-def blind(now: Picture) -> bool:
+def blind(now: Facts) -> bool:
     return now.blind_s > now.limits.blind_s
 
 
-def stop_requested(now: Picture) -> bool:
+def stop_requested(now: Facts) -> bool:
     return now.stop_requested
 
 
-def diverged(now: Picture) -> bool:
+def diverged(now: Facts) -> bool:
     return now.position_error_m > now.limits.position_error_m
 
 
-def toppled(now: Picture) -> bool:
+def toppled(now: Facts) -> bool:
     return now.tilt_rad > now.limits.tilt_rad
 
 
-def controller_failed(now: Picture) -> bool:
+def controller_failed(now: Facts) -> bool:
     return now.missed_decisions >= now.limits.missed_decisions
 
 
-def contradicted(now: Picture) -> bool:
+def contradicted(now: Facts) -> bool:
     return now.contradicted
 
 
 def longer_than(limit: str) -> Guard:
     """A guard that holds when the phase has lasted longer than the named limit."""
 
-    def too_long(now: Picture) -> bool:
+    def too_long(now: Facts) -> bool:
         return now.in_phase_s > float(getattr(now.limits, limit))
 
     too_long.__name__ = f"longer_than_{limit}"

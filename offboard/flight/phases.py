@@ -7,7 +7,7 @@ from enum import Enum
 
 from pydantic import Field
 
-from offboard.model.vehicle import Parameters
+from offboard.documents.parameters import Parameters
 
 
 class Phase(Enum):

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 
-from offboard.mavlink.dialect import Dialect
+from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.outgoing import ParamRead
 
 ASK_AGAIN_S = 0.5

@@ -11,8 +11,10 @@ from dataclasses import astuple, dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.base import Command, Decision, PredictedState
+from offboard.control.base import Decision
 from offboard.mavlink.outgoing import ReferenceRecord
+from offboard.model.command import Command
+from offboard.model.predicted_state import PredictedState
 from offboard.reference.base import FlatSample
 
 COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: what is sent

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from offboard.control.base import Command, PositionCommand
+from offboard.model.command import Command, PositionCommand
 from offboard.model.vehicle import Vehicle
 
 LEVEL = (0.0, 0.0, 1.0)

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 
-from offboard.model.document import DocumentError
+from offboard.documents.reading import DocumentError
 
 OWN_VEHICLES = {"px4": "px4_sih", "ardupilot": "arducopter"}  # flown by default, so known
 STOP_S = 2.0
@@ -42,21 +42,21 @@ def check_scenario(path: Path) -> None:
         raise DocumentError(*answer.stderr.strip().splitlines())
 
 
-class Hangar:
-    """`python -m simulator.hangar`: loads from when it is entered, then flies vehicles one after
+class SimulatorProcess:
+    """`python -m simulator.pool`: loads from when it is entered, then flies vehicles one after
     the other, each a process of its own. A context manager; leaving it ends everything."""
 
     def __init__(self) -> None:
         self._ending: Ending | None = None
 
-    def __enter__(self) -> Hangar:
+    def __enter__(self) -> SimulatorProcess:
         self._open()
         return self
 
     def _open(self) -> None:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "simulator.hangar"],
+            [sys.executable, "-m", "simulator.pool"],
             bufsize=0,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

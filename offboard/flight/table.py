@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from offboard.flight import guards
-from offboard.flight.guards import Guard, Picture, longer_than
+from offboard.flight.guards import Facts, Guard, longer_than
 from offboard.flight.phases import ExitCode, Phase
 
 REFUSED, ABORTED = ExitCode.REFUSED, ExitCode.ABORTED
@@ -166,6 +166,6 @@ TABLE: tuple[Row, ...] = (
 )
 
 
-def next_row(phase: Phase, now: Picture) -> Row | None:
+def next_row(phase: Phase, now: Facts) -> Row | None:
     """The first row of `phase` whose guard holds, or None to stay."""
     return next((row for row in TABLE if row.source is phase and row.guard(now)), None)

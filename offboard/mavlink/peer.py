@@ -10,8 +10,8 @@ from __future__ import annotations
 from collections.abc import Hashable
 
 from offboard.mavlink.counters import Counters
+from offboard.mavlink.decode import Address
 from offboard.mavlink.framing import FrameSplitter
-from offboard.mavlink.inbound import Address
 
 PEER_SILENT_S = 0.5  # half of what ends a flight (`Limits.silence_s`), so that it can go on
 

@@ -15,10 +15,14 @@ from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from offboard.mavlink import framing, inbound, outbound
-from offboard.mavlink.ardupilot import ARDUPILOT
+from offboard.mavlink import decode as inbound
+from offboard.mavlink import encode as outbound
+from offboard.mavlink import framing
 from offboard.mavlink.counters import Counters, DropReason, SequenceTracker
-from offboard.mavlink.dialect import TYPE_GCS, TYPE_ONBOARD_CONTROLLER, Dialect, WantedMessage
+from offboard.mavlink.decode import Address
+from offboard.mavlink.dialects.ardupilot import ARDUPILOT
+from offboard.mavlink.dialects.base import TYPE_GCS, TYPE_ONBOARD_CONTROLLER, Dialect, WantedMessage
+from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.events import (
     Attitude,
     Event,
@@ -28,7 +32,6 @@ from offboard.mavlink.events import (
     TimeAnswer,
     VehicleFound,
 )
-from offboard.mavlink.inbound import Address
 from offboard.mavlink.outgoing import (
     CommandLong,
     Heartbeat,
@@ -37,7 +40,6 @@ from offboard.mavlink.outgoing import (
     Timesync,
 )
 from offboard.mavlink.peer import Peer
-from offboard.mavlink.px4 import PX4
 from offboard.mavlink.telemetry_rates import LinkTime, Shortfall, TelemetryRates
 from offboard.mavlink.texts import TextAssembler
 from offboard.mavlink.vehicle_time import Age, VehicleTime

@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
-from offboard.mavlink.dialect import WantedMessage
+from offboard.mavlink.dialects.base import WantedMessage
 
 _WINDOW_S = 2.0
 _ENOUGH = 0.7  # of the rate wanted; a window holds few samples of a slow message

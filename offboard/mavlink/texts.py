@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from offboard.mavlink.decode import TextChunk, printable
 from offboard.mavlink.events import StatusText
-from offboard.mavlink.inbound import TextChunk, printable
 from offboard.mavlink.outgoing import StatusTextOut
 
 _ROOM = 50  # bytes; a chunk that is shorter is the last one

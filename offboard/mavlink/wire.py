@@ -4,8 +4,8 @@
 (outbound.py) turns a value of outgoing.py into a message id and payload. Import from here.
 """
 
-from offboard.mavlink.inbound import Address, decode
-from offboard.mavlink.outbound import Packed, encode, normalised_thrust
+from offboard.mavlink.decode import Address, decode
+from offboard.mavlink.encode import Packed, encode, normalised_thrust
 from offboard.mavlink.outgoing import (
     AttitudeTarget,
     CommandLong,

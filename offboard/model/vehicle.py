@@ -8,7 +8,9 @@ from __future__ import annotations
 
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic import Field, model_validator
+
+from offboard.documents.parameters import Parameters
 
 Triple = tuple[float, float, float]
 PositiveTriple = tuple[
@@ -19,14 +21,6 @@ NonNegativeTriple = tuple[
 ]
 
 DRAG_PER_MASS_MOST_PS = 100.0  # falling, it has 0.1 m/s: no motion to control is left
-
-
-class Parameters(BaseModel):
-    """Base of every configuration value: frozen, strict, unknown keys and non-finite refused."""
-
-    model_config = ConfigDict(
-        frozen=True, extra="forbid", allow_inf_nan=False, validate_default=True
-    )
 
 
 class AxisResponse(Parameters):

@@ -15,7 +15,7 @@ from typing import Annotated, Literal, Self
 import numpy as np
 from pydantic import Field, TypeAdapter, model_validator
 
-from offboard.model.vehicle import Parameters
+from offboard.documents.parameters import Parameters
 from offboard.reference import shapes, table, waypoints
 from offboard.reference.course import Course, Fixed, Tabulated, along_velocity
 from offboard.reference.path import Path

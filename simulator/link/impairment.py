@@ -12,7 +12,7 @@ from random import Random
 
 from pydantic import Field
 
-from offboard.model.vehicle import Parameters
+from offboard.documents.parameters import Parameters
 
 # Answers and announcements, which a rate limit per message does not thin: PARAM_VALUE, MISSION_*,
 # COMMAND_ACK, FILE_TRANSFER_PROTOCOL, TIMESYNC, AUTOPILOT_VERSION, MESSAGE_INTERVAL, STATUSTEXT

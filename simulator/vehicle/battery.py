@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from pydantic import Field
 
-from offboard.model.vehicle import Parameters
+from offboard.documents.parameters import Parameters
 
 
 class Battery(Parameters):

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 from pydantic import Field
 
-from offboard.model.vehicle import Parameters, Triple
+from offboard.documents.parameters import Parameters
+from offboard.model.vehicle import Triple
 from simulator.vehicle.battery import Battery
 from simulator.vehicle.sensors import EstimatorName, WhiteNoise
 from simulator.vehicle.wind import Gusts

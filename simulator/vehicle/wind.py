@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from offboard.model.vehicle import Parameters
+from offboard.documents.parameters import Parameters
 from simulator.vehicle.noise import LinearProcess, block_diagonal, discretise
 
 Array = NDArray[np.float64]

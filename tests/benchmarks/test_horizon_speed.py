@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from offboard.config import load
-from offboard.control.base import Command, PredictedState, Situation
+from offboard.control.base import Situation
 from offboard.control.catalogue import LAWS, build
+from offboard.flight.configuration import load
+from offboard.model.command import Command
+from offboard.model.predicted_state import PredictedState
 from offboard.reference.transfer import transfer
 
 SPHERES = [

@@ -10,7 +10,8 @@ from dataclasses import replace
 from pair import LEAN, Bytes, Filter, Pair, frames_of
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from offboard.control.base import Command, Controller, Decision, Situation
+from offboard.control.base import Controller, Decision, Situation
+from offboard.model.command import Command
 from simulator import config
 from simulator.firmware.base import Firmware
 from simulator.firmware.rules import Rule

@@ -14,19 +14,19 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from offboard import config
 from offboard.analysis import history, tlog
 from offboard.analysis.score import Score, score
 from offboard.control.base import Controller
 from offboard.control.catalogue import build
-from offboard.control.fusion import FusedObserver, observer_of
+from offboard.estimation.fusion import FusedObserver, observer_of
+from offboard.flight import configuration as config
 from offboard.flight.companion import Companion, Outcome
-from offboard.flight.learning import IdentifySettings
+from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.log import FlightLog
-from offboard.flight.mission import Mission
+from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Phase
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
-from offboard.mavlink.dialect import POSITIONING_TELEMETRY
+from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.model.vehicle import Vehicle
 from simulator import config as simulated
@@ -224,7 +224,7 @@ def make(
         ),
         observer=observer,
         controller=wrap(controller),
-        mission=Mission(config.build_track(resolved)),
+        plan=FlightPlan(config.build_track(resolved)),
         limits=resolved.limits.model_copy(update=limits or {}),
         period_s=resolved.period_s,
         deadline_s=None,

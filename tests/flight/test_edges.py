@@ -16,9 +16,9 @@ from typing import Any, cast
 import pytest
 
 from offboard.flight.companion import Companion, Outcome, Output
-from offboard.flight.daemon import Loop
 from offboard.flight.link import Link, SerialLink, open_link
 from offboard.flight.log import FlightLog
+from offboard.flight.loop import Loop
 from offboard.flight.stop import StopRequests
 from offboard.mavlink.counters import Counters
 from offboard.mavlink.framing import FrameSplitter, pack

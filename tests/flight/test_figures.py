@@ -12,7 +12,7 @@ from pair import SHORT, make
 
 from offboard.analysis import history
 from offboard.analysis.score import score
-from offboard.flight.learning import IdentifySettings
+from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Phase
 from simulator import config as simulated
 

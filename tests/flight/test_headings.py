@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pair import Pair, make
 
-from offboard.mavlink import outbound
+from offboard.mavlink import encode as outbound
 from offboard.mavlink.outgoing import AttitudeTarget
 
 Triple = tuple[int, int, int]

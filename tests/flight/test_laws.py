@@ -80,10 +80,10 @@ def flown(law: str, tmp_path: Path, *assignments: str) -> tuple[np.ndarray, np.n
         step()
         companion = pair.companion
         if companion.phase in (Phase.CLIMB, Phase.JOIN, Phase.TRACK, Phase.HOVER):
-            mission = companion.mission
-            times.append(mission.track_time_s(companion.view.time_s))
+            plan = companion.plan
+            times.append(plan.track_time_s(companion.view.time_s))
             truth = np.array(pair.instance.autopilot.senses.truth.position_ned_m)
-            places.append(truth - mission.origin_ned_m)
+            places.append(truth - plan.origin_ned_m)
 
     pair._step = watched  # type: ignore[method-assign]
     assert pair.fly().exit_code == 0

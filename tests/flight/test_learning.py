@@ -16,15 +16,15 @@ from test_ardupilot import on_arducopter
 
 from offboard.analysis import history
 from offboard.analysis.identify import identify_flight, vehicle_file
-from offboard.control.base import Command
-from offboard.control.identification import Estimate, Identified, ResponseFit
-from offboard.control.observer import Observer, ObserverSettings
-from offboard.flight.belief import Belief
-from offboard.flight.excitation import LENGTH_S, excited
-from offboard.flight.learning import RECORD_ID, IdentifySettings
+from offboard.documents.reading import parse
+from offboard.estimation.observer import Observer, ObserverSettings
+from offboard.flight.online_identification import RECORD_ID, IdentifySettings
 from offboard.flight.phases import Phase
-from offboard.flight.takeover import with_link
-from offboard.model.document import parse
+from offboard.identification.adoption import with_link
+from offboard.identification.excitation import LENGTH_S, excited
+from offboard.identification.stages import Estimate, Identified, ResponseFit
+from offboard.identification.vehicle_estimate import VehicleEstimate
+from offboard.model.command import Command
 from offboard.model.vehicle import AxisResponse, Vehicle
 from simulator import config as simulated
 from simulator.steps import STEP_S
@@ -236,7 +236,7 @@ def test_bandwidth_that_the_delay_does_not_bear_is_lowered():
 
 
 def test_what_was_found_is_blended_in_over_a_second():
-    belief = Belief(
+    belief = VehicleEstimate(
         NEUTRAL, factor=4.0, blend_s=1.0, unknown_delay_s=0.28, period_s=0.1, bandwidth_radps=7.0
     )
     fit = ResponseFit(Estimate(0.09, 0.002), Estimate(14.0, 0.1), Estimate(1.1, 0.01), 0.0, 0.1)

@@ -12,7 +12,7 @@ from faults import late, losing, repeating, stuttering, without
 from pair import Filter, Pair, make, through
 
 from offboard.analysis.score import Score
-from offboard.flight.learning import IdentifySettings
+from offboard.flight.online_identification import IdentifySettings
 
 LAP = ("controller={law: lqr}", "reference.laps=1", "reference.height_m=1.0")
 PLAIN_DELAY_MS = 57.0  # of the vehicle itself

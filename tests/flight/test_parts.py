@@ -9,15 +9,17 @@ import numpy as np
 import pytest
 from pair import hover
 
-from offboard import config, sortie
-from offboard.control.base import Command, PredictedState, Situation
-from offboard.flight import manifest
+from offboard.control.base import Situation
+from offboard.flight import configuration as config
+from offboard.flight import manifest, request
+from offboard.flight.one_flight import rehearse
 from offboard.flight.readiness import Readiness
-from offboard.flight.run import rehearse
 from offboard.flight.setpoint import clamp, usable
-from offboard.mavlink.ardupilot import ARDUPILOT
-from offboard.mavlink.px4 import PX4
+from offboard.mavlink.dialects.ardupilot import ARDUPILOT
+from offboard.mavlink.dialects.px4 import PX4
+from offboard.model.command import Command
 from offboard.model.kernel import Entry
+from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import Vehicle
 from offboard.reference.transfer import Hold
 
@@ -92,7 +94,7 @@ def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(
     """Or it might be compiled in flight, for seconds."""
     volume = "{shape: sphere, north_m: 6, east_m: 0.5, height_m: 3, radius_m: 0.4}"
     chosen = {"controller": "horizon", "reference": "line"}
-    crew = sortie.crew(
+    parts = request.build_parts(
         config.load("flight", choices=chosen, assignments=(f"controller.keep_out=[{volume}]",))
     )
     loaded: list[str] = []
@@ -101,7 +103,7 @@ def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(
         for kept in ("call", "_machine_code"):
             vars(entry).pop(kept, None)
     monkeypatch.setattr(Entry, "_load", lambda entry: loaded.append(entry.symbol) or load(entry))
-    rehearse(crew, keeps_deadline=False)
+    rehearse(parts, keeps_deadline=False)
     rehearsed = set(loaded)
     at_m = np.array([5.0, 0.3, -3.0])
     state = PredictedState(
@@ -109,7 +111,7 @@ def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(
         9.8, np.zeros(3), np.zeros(3),
     )  # fmt: skip
     met = Situation(0.0, state, Hold((7.0, 0.3, -3.0), 0.0), Command(9.8, (0.0, 0.0, 1.0), 0.0))
-    assert crew.controller.decide(met).certificate.iterations > 0
+    assert parts.controller.decide(met).certificate.iterations > 0
     assert set(loaded) == rehearsed
 
 

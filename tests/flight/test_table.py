@@ -8,13 +8,13 @@ from dataclasses import replace
 import pytest
 from pair import hover
 
-from offboard.flight.assessment import Course
-from offboard.flight.guards import Picture
+from offboard.flight.assessment import Progress
+from offboard.flight.guards import Facts
 from offboard.flight.phases import ENDS, ExitCode, Limits, Phase
 from offboard.flight.table import TABLE, Row, next_row
 
 ON_TRACK = (Phase.JOIN, Phase.TRACK, Phase.HOVER)
-UNEVENTFUL = Picture(
+UNEVENTFUL = Facts(
     limits=Limits(),
     in_phase_s=0.0,
     silence_s=0.0,
@@ -86,7 +86,7 @@ EVENTS: dict[str, dict[str, object]] = {  # the least that makes each guard hold
 }
 
 
-def quiet(phase: Phase) -> Picture:
+def quiet(phase: Phase) -> Facts:
     """Nothing happens in `phase`, which has just begun."""
     return replace(UNEVENTFUL, **QUIET.get(phase, {}))
 
@@ -140,8 +140,8 @@ def test_in_the_air_nothing_is_called_refused() -> None:
 
 
 def test_every_reason_has_its_words() -> None:
-    assessment = hover().companion._progress._assessment
-    course = Course(Phase.CONNECT, 0.0, 0.0, False, "", 0, "")
-    words = assessment.words(assessment.picture(course), course)
+    assessment = hover().companion._machine._assessment
+    course = Progress(Phase.CONNECT, 0.0, 0.0, False, "", 0, "")
+    words = assessment.words(assessment.facts(course), course)
     for row in TABLE:
         assert "{" not in row.reason.format(**words)

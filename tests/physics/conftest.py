@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from offboard.model.document import parse
+from offboard.documents.reading import parse
 from offboard.model.vehicle import Vehicle
 
 PAPER_YAML = Path(__file__).parents[2] / "config" / "vehicles" / "paper.yaml"

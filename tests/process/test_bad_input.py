@@ -20,12 +20,14 @@ from pathlib import Path
 import pytest
 from processes import Spawn, children
 
-from offboard import cli, sortie
+from offboard import cli
 from offboard.analysis import history, tlog
-from offboard.flight import run
+from offboard.analysis.trial import keep_score, score_flight
+from offboard.flight import one_flight as run
+from offboard.flight import request
 from offboard.flight.log import LogError
+from offboard.flight.request import FlightRequest, fly_request
 from offboard.model.kernel import Entry
-from offboard.sortie import Order, fly_order, keep_score, score_flight
 
 Capture = pytest.CaptureFixture[str]
 CONFIG = Path(__file__).parents[2] / "config"
@@ -65,7 +67,7 @@ def kept_out(north_m: float, east_m: float, height_m: float, radius_m: float) ->
 def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
     arguments: tuple[str, ...], says: str, offboard: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(sortie, "crew", pytest.fail)
+    monkeypatch.setattr(request, "build_parts", pytest.fail)
     code, said = offboard("fly", "--sitl", *arguments)
     assert (code, len(said.splitlines())) == (2, 1)
     assert says in said
@@ -325,10 +327,10 @@ def test_only_what_was_compiled_is_called_so(
 
     monkeypatch.setattr(run, "rehearse", rehearses)
     heard: list[str] = []
-    order = Order(
+    order = FlightRequest(
         tmp_path / "x", connection="udpin:127.0.0.1:0", assignments=("limits.connect_s=0.1",)
     )
-    fly_order(order, tell=heard.append)
+    fly_request(order, tell=heard.append)
     assert ("compiled in 2.3 s; the next start finds it cached" in heard) is compiles
 
 

@@ -12,8 +12,8 @@ from pathlib import Path
 import pytest
 from processes import Spawn
 
-from offboard import config
 from offboard.analysis import history, tlog
+from offboard.flight import configuration as config
 
 SHORT = ("--reference", "hover", "--set", "reference.duration_s=3")
 SCRIPTS = Path(sys.executable).parent

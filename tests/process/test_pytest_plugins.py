@@ -90,7 +90,7 @@ def test_a_failed_test_keeps_its_log_and_stops_its_vehicle(pytester: pytest.Pyte
 
 
 WRONG = {
-    'scenario="storm"': "*scenario storm not found: give a file or one of*",
+    'scenario="storm"': "*there is no scenario named 'storm'; known are*",
     "weather=3": "*pytest.mark.sitl: weather is unknown; there is scenario, firmware*",
 }
 

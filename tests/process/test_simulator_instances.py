@@ -9,6 +9,7 @@ from contextlib import ExitStack
 import pytest
 from sim_peer import simulator
 
+from offboard.documents import shipped
 from simulator import config
 
 
@@ -71,5 +72,5 @@ def test_scenarios_are_listed_with_what_they_are() -> None:
         output, errors = process.popen.communicate(timeout=20.0)
     assert (process.popen.returncode, errors) == (0, "")
     listed = dict(re.split(r"\s+", line, maxsplit=1) for line in output.splitlines())
-    names = config.shipped_names("scenarios")
+    names = shipped.names("scenarios")
     assert listed == {name: config.scenario(name).description for name in names}

@@ -154,7 +154,7 @@ def test_it_can_wait_to_be_spoken_to_and_shifts_its_system() -> None:
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (("--scenario", "storm"), "scenario storm not found: give a file or one of all_together, "),
+        (("--scenario", "storm"), "there is no scenario named 'storm'; known are all_together, "),
         (("--vehicle", "no/such.yaml"), "vehicle no/such.yaml not found"),
         (("--firmware", "betaflight"), "--firmware betaflight: unknown; there is px4"),
         (("--connect", "tcp:127.0.0.1:1"), "tcp:127.0.0.1:1 is no link"),

@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 import numba
 import numpy as np
 
-from offboard.control.base import Command, Controller, Situation
-from offboard.control.observer import Observer, ObserverSettings
+from offboard.control.base import Controller, Situation
+from offboard.estimation.observer import Observer, ObserverSettings
+from offboard.model.command import Command
 from offboard.model.frames import quaternion_from_thrust_direction
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import FlatSample

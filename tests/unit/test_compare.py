@@ -30,7 +30,7 @@ from offboard.analysis.compare_page import page
 from offboard.analysis.compare_table import lines
 from offboard.analysis.comparison import compare_all
 from offboard.analysis.processors import processors
-from offboard.model.document import DocumentError
+from offboard.documents.reading import DocumentError
 
 LAWS = ("pso", "lqr", "an/uncommonly/long/name.yaml", "lost")
 SCENARIOS = ("calm", "all_together")

@@ -7,8 +7,8 @@ import pytest
 from attitude_plant import Flight, Lemniscate, Truth, fly
 
 from offboard.control.delay_margin import delay_margin, needed_margin, supported_bandwidth
-from offboard.control.observer import ObserverSettings
-from offboard.control.tracking import Search, TrackingLaw, TrackingSettings
+from offboard.control.laws.tracking import Search, TrackingLaw, TrackingSettings
+from offboard.estimation.observer import ObserverSettings
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 PX4 = Vehicle(

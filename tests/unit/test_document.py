@@ -12,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import Field, model_validator
 
-from offboard.model.document import DocumentError, override, parse, read, validate
-from offboard.model.vehicle import Parameters, Vehicle
+from offboard.documents.parameters import Parameters
+from offboard.documents.reading import DocumentError, override, parse, read, validate
+from offboard.model.vehicle import Vehicle
 
 VEHICLES = sorted((Path(__file__).parents[2] / "config" / "vehicles").glob("*.yaml"))
 

@@ -15,9 +15,9 @@ import pytest
 from scipy.linalg import solve_continuous_are
 from scipy.spatial.transform import Rotation
 
-from offboard.control.base import Command
-from offboard.control.fusion import Fusion
-from offboard.control.fusion_filter import FusionSettings
+from offboard.estimation.fusion import Fusion
+from offboard.estimation.fusion_filter import FusionSettings
+from offboard.model.command import Command
 from offboard.model.geodesy import Geodetic
 from offboard.model.vehicle import AxisResponse, Vehicle
 

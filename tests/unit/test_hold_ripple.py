@@ -11,8 +11,8 @@ from scipy.integrate import solve_ivp
 from test_law_signs import at
 from test_tracking_law import PX4, G, law_of
 
-from offboard.control.response import thrust_ripple, tilt_ripple
-from offboard.control.tracking import TrackingLaw
+from offboard.control.laws.tracking import TrackingLaw
+from offboard.control.riccati import thrust_ripple, tilt_ripple
 from offboard.reference.base import FlatSample
 
 PERIOD_S = 0.1

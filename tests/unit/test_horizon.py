@@ -11,7 +11,7 @@ from attitude_plant import Lemniscate, Truth, fly
 from scipy.integrate import solve_ivp
 from test_tracking_law import LEVEL, PX4, G, law_of, state_of
 
-from offboard.control.base import Command, Decision, PredictedState, Situation
+from offboard.control.base import Decision, Situation
 from offboard.control.horizon.law import (
     STEPS_AROUND,
     Dynamics,
@@ -22,9 +22,11 @@ from offboard.control.horizon.law import (
 from offboard.control.horizon.plant import STATE_SIZE, B, P, T, V, W, Z
 from offboard.control.horizon.sampling import SamplingSettings, cem, mppi
 from offboard.control.horizon.search import swarm
-from offboard.control.mpc import MpcLaw, MpcSettings
+from offboard.control.laws.mpc import MpcLaw, MpcSettings
+from offboard.control.laws.tracking import errors
 from offboard.control.swarm import RandomLanes, SwarmSettings
-from offboard.control.tracking import errors
+from offboard.model.command import Command
+from offboard.model.predicted_state import PredictedState
 from offboard.reference.transfer import Hold
 
 STEPS, PERIOD_S = 10, 0.1

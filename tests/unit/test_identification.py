@@ -10,11 +10,11 @@ from scipy import signal
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from offboard.control.identification import Identified, identify
-from offboard.control.motion import lagged_thrust
-from offboard.control.motion_fit import innovations, long_run
-from offboard.control.response_fit import Estimate, fit_response, predicted
-from offboard.control.trace import Recorder, Trace, clean
+from offboard.identification.motion import lagged_thrust
+from offboard.identification.motion_fit import innovations, long_run
+from offboard.identification.response_fit import Estimate, fit_response, predicted
+from offboard.identification.stages import Identified, identify
+from offboard.identification.trace import Recorder, Trace, clean
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 G = 9.80665

@@ -10,8 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from offboard.control.filtering import FILTER
-from offboard.control.observer_adaptation import note
+from offboard.estimation.filtering import FILTER
+from offboard.estimation.observer_adaptation import note
 from offboard.model.kernel import array
 
 ROOT = Path(__file__).parents[2]

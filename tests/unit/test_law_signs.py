@@ -12,16 +12,11 @@ import pytest
 from attitude_plant import Lemniscate, Truth, fly
 from test_tracking_law import LEVEL, PX4, G
 
-from offboard.control.base import (
-    Command,
-    Controller,
-    Decision,
-    PositionCommand,
-    PredictedState,
-    Situation,
-)
+from offboard.control.base import Controller, Decision, Situation
 from offboard.control.catalogue import LAWS, build
+from offboard.model.command import Command, PositionCommand
 from offboard.model.frames import wrap_pi
+from offboard.model.predicted_state import PredictedState
 from offboard.reference.base import FlatSample
 from offboard.reference.transfer import Hold
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from offboard.control.response_fit import Estimate
-from offboard.flight.belief import Belief
 from offboard.flight.link_delay import LONGEST_S, LinkDelay
+from offboard.identification.response_fit import Estimate
+from offboard.identification.vehicle_estimate import VehicleEstimate
 from offboard.mavlink.events import TimeAnswer
 from offboard.model.vehicle import AxisResponse, Vehicle
 
@@ -54,8 +54,8 @@ def test_what_is_no_answer_to_us_counts_for_nothing() -> None:
     assert link.estimate == Estimate(pytest.approx(0.05), 0.0)
 
 
-def believing() -> Belief:
-    return Belief(
+def believing() -> VehicleEstimate:
+    return VehicleEstimate(
         PX4, factor=4.0, blend_s=1.0, unknown_delay_s=0.28, period_s=0.1, bandwidth_radps=7.0
     )
 

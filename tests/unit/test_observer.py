@@ -11,10 +11,9 @@ import pytest
 from attitude_plant import Plant, Truth
 from scipy.integrate import solve_ivp
 
-from offboard.control.base import Command, PredictedState
-from offboard.control.observer import Observer, ObserverSettings, VelocitySource
-from offboard.control.observer_model import plant_vector
-from offboard.control.propagation import (
+from offboard.estimation.observer import Observer, ObserverSettings, VelocitySource
+from offboard.estimation.observer_model import plant_vector
+from offboard.estimation.propagation import (
     COMMAND_SIZE,
     LATER,
     MOTION,
@@ -23,8 +22,10 @@ from offboard.control.propagation import (
     THRUST,
     replay,
 )
+from offboard.model.command import Command
 from offboard.model.frames import quaternion_from_thrust_direction
 from offboard.model.kernel import address
+from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 G = 9.80665

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from offboard.control.base import Command
-from offboard.control.observer import Observer, ObserverSettings
-from offboard.control.observer_adaptation import DOWN, NORTH_EAST, Adaptation
+from offboard.estimation.observer import Observer, ObserverSettings
+from offboard.estimation.observer_adaptation import DOWN, NORTH_EAST, Adaptation
+from offboard.model.command import Command
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 Array = NDArray[np.float64]

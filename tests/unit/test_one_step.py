@@ -8,7 +8,8 @@ import pytest
 from numpy.typing import NDArray
 
 from offboard.control.cost import BoxQuadratic
-from offboard.control.one_step import OneStep, cost_to_go
+from offboard.control.riccati import cost_to_go
+from offboard.paper.one_step import OneStep
 
 Array = NDArray[np.float64]
 

@@ -9,16 +9,18 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from offboard.analysis.paper import extensions
-from offboard.analysis.paper.closed_loop import FlightTask, fly
-from offboard.analysis.paper.plant import PlantKind, paper_model
-from offboard.config import load
-from offboard.control.base import Command, PredictedState, Situation
+from offboard.control.base import Situation
 from offboard.control.catalogue import build
 from offboard.control.certificate import certify
-from offboard.control.integral import ErrorIntegral, IntegralSettings
-from offboard.control.paper_law import PaperLaw, PaperSettings
-from offboard.control.state_limits import LimitedBox, StateLimits
+from offboard.flight.configuration import load
+from offboard.model.command import Command
+from offboard.model.predicted_state import PredictedState
+from offboard.paper.integral import ErrorIntegral, IntegralSettings
+from offboard.paper.law import PaperLaw, PaperSettings
+from offboard.paper.plant import PlantKind, paper_model
+from offboard.paper.state_limits import LimitedBox, StateLimits
+from offboard.paper.study import extensions
+from offboard.paper.study.closed_loop import FlightTask, fly
 from offboard.reference.base import FlatSample
 
 Array = NDArray[np.float64]

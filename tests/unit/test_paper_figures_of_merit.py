@@ -7,11 +7,11 @@ from functools import cache
 import numpy as np
 import pytest
 
-from offboard.analysis.paper import errata, printed, tables
-from offboard.analysis.paper.closed_loop import FlightTask, LawName, Summary, fly, summarised
-from offboard.analysis.paper.plant import LinearPlant, NonlinearPlant, PlantKind, paper_vehicle
-from offboard.analysis.paper.trajectory import PathName
-from offboard.control.paper_law import PaperSettings
+from offboard.paper.law import PaperSettings
+from offboard.paper.plant import LinearPlant, NonlinearPlant, PlantKind, paper_vehicle
+from offboard.paper.study import errata, printed, tables
+from offboard.paper.study.closed_loop import FlightTask, LawName, Summary, fly, summarised
+from offboard.paper.trajectory import PathName
 
 SEEDS = 3
 STILL = np.zeros(3)

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from offboard.analysis.paper.horizon import endless, receding, study, weights_table
-from offboard.analysis.paper.plant import paper_model
-from offboard.control.one_step import cost_to_go
-from offboard.control.paper_law import PaperSettings
+from offboard.control.riccati import cost_to_go
+from offboard.paper.law import PaperSettings
+from offboard.paper.plant import paper_model
+from offboard.paper.study.horizon import endless, receding, study, weights_table
 
 FINAL = PaperSettings()
 Q, R, RATE = (np.diag(part) for part in (FINAL.fitness, FINAL.energy, FINAL.rate))

@@ -12,10 +12,13 @@ import yaml
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from offboard.control.base import Command, DecisionError, PredictedState, Situation
-from offboard.control.integral import IntegralSettings
-from offboard.control.one_step import OneStep
-from offboard.control.paper import (
+from offboard.control.base import DecisionError, Situation
+from offboard.control.swarm import SwarmSettings
+from offboard.model.command import Command
+from offboard.model.linear import hover_matrices, sampled_matrices
+from offboard.model.predicted_state import PredictedState
+from offboard.model.vehicle import Vehicle
+from offboard.paper.controller import (
     PaperController,
     PaperLaw,
     PaperSettings,
@@ -23,9 +26,8 @@ from offboard.control.paper import (
     heading_frame,
     input_scale,
 )
-from offboard.control.swarm import SwarmSettings
-from offboard.model.linear import hover_matrices, sampled_matrices
-from offboard.model.vehicle import Vehicle
+from offboard.paper.integral import IntegralSettings
+from offboard.paper.one_step import OneStep
 from offboard.reference.base import FlatSample
 
 Array = NDArray[np.float64]

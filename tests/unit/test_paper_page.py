@@ -11,9 +11,9 @@ import pytest
 from browser import Opened, opening
 from rich.console import Console
 
-from offboard.analysis.paper import peers
-from offboard.analysis.paper.options import FIGURES, TABLES, PaperOptions
-from offboard.analysis.paper.run import Outcome, reproduce
+from offboard.paper.study import peers
+from offboard.paper.study.options import FIGURES, TABLES, PaperOptions
+from offboard.paper.study.run import Outcome, reproduce
 
 PNG = b"\x89PNG\r\n\x1a\n"
 

@@ -16,9 +16,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
-from offboard.analysis.paper import horizon
-from offboard.analysis.paper.options import FIGURES, TABLES, PaperError, PaperOptions, check
-from offboard.analysis.paper.run import Outcome, reproduce
+from offboard.paper.study import horizon
+from offboard.paper.study.options import FIGURES, TABLES, PaperError, PaperOptions, check
+from offboard.paper.study.run import Outcome, reproduce
 
 ROOT = Path(__file__).parents[2]
 
@@ -123,8 +123,8 @@ def test_a_piece_that_fails_fails_alone(tmp_path: Path, monkeypatch: pytest.Monk
 SCRIPT = """
 import sys
 from pathlib import Path
-from offboard.analysis.paper.options import PaperOptions
-from offboard.analysis.paper.run import reproduce
+from offboard.paper.study.options import PaperOptions
+from offboard.paper.study.run import reproduce
 if __name__ == "__main__":
     outcome = reproduce(PaperOptions(Path(sys.argv[1]), seeds=200, workers=2))
     sys.exit(7 if outcome.interrupted and outcome.missing else 0)

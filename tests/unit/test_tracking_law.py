@@ -14,11 +14,13 @@ import pytest
 from attitude_plant import Flight, Lemniscate, Truth, fly
 from scipy.linalg import expm
 
-from offboard.control.base import Command, DecisionError, PredictedState, Situation
-from offboard.control.observer import ObserverSettings, VelocitySource
-from offboard.control.response import lateral_model, lead, vertical_model
+from offboard.control.base import DecisionError, Situation
+from offboard.control.laws.tracking import Search, TrackingLaw, TrackingSettings, closed_form
 from offboard.control.swarm import SwarmSettings
-from offboard.control.tracking import Search, TrackingLaw, TrackingSettings, closed_form
+from offboard.estimation.observer import ObserverSettings, VelocitySource
+from offboard.model.axes import lateral_model, lead, vertical_model
+from offboard.model.command import Command
+from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import AxisResponse, Vehicle
 from offboard.reference.base import FlatSample
 

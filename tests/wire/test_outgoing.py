@@ -9,10 +9,10 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_frames import ARDUPILOT, PX4, Sender, pinned, understood
 
-from offboard.mavlink.ardupilot import ARDUPILOT as ARDUPILOT_DIALECT
-from offboard.mavlink.dialect import Dialect
-from offboard.mavlink.inbound import decode_text_chunk
-from offboard.mavlink.px4 import PX4 as PX4_DIALECT
+from offboard.mavlink.decode import decode_text_chunk
+from offboard.mavlink.dialects.ardupilot import ARDUPILOT as ARDUPILOT_DIALECT
+from offboard.mavlink.dialects.base import Dialect
+from offboard.mavlink.dialects.px4 import PX4 as PX4_DIALECT
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.texts import TextAssembler, chunks
 from offboard.mavlink.wire import (

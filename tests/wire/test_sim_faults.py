@@ -11,7 +11,8 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from sim_bench import HOVER, OFFBOARD, Bench, px4_vehicle
 
-from offboard.model.document import DocumentError
+from offboard.documents import shipped
+from offboard.documents.reading import DocumentError
 from simulator import config
 from simulator.config import Scenario
 from simulator.firmware.px4 import PX4
@@ -272,7 +273,7 @@ def test_a_wrong_fault_is_one_sentence(text: str, tmp_path: Path) -> None:
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("name", config.shipped_names("scenarios"))
+@pytest.mark.parametrize("name", shipped.names("scenarios"))
 def test_every_shipped_scenario_is_valid_and_described(name: str) -> None:
     scenario = config.scenario(name)
     assert scenario.name == name

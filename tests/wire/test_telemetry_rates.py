@@ -7,7 +7,7 @@ from collections import Counter
 import pytest
 from vehicle_frames import PEER, Sender, pinned, understood
 
-from offboard.mavlink.dialect import WantedMessage
+from offboard.mavlink.dialects.base import WantedMessage
 from offboard.mavlink.session import Session
 from offboard.mavlink.telemetry_rates import LinkTime, TelemetryRates
 

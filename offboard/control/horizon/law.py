@@ -36,10 +36,10 @@ from offboard.control.horizon.polish import Ended, polish
 from offboard.control.horizon.quadratic import HorizonQuadratic
 from offboard.control.horizon.sampling import SamplingSettings, cem, mppi
 from offboard.control.horizon.search import Evaluator, Found, Plan, swarm
-from offboard.control.mpc import one_decision
-from offboard.control.response import lateral_cost_to_go
+from offboard.control.laws.mpc import one_decision
+from offboard.control.laws.tracking import Search, Target, TrackingLaw, TrackingSettings, errors
+from offboard.control.riccati import lateral_cost_to_go
 from offboard.control.swarm import RandomLanes, SwarmResult, SwarmSettings
-from offboard.control.tracking import Search, Target, TrackingLaw, TrackingSettings, errors
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.base import PredictedState
-from offboard.control.response import held_lead
-from offboard.control.tracking import heave_of
+from offboard.control.laws.tracking import heave_of
+from offboard.control.riccati import held_lead
+from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import Reference
 from offboard.reference.flatness import flat_state

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.control.horizon.outlook import Bounds, Outlook
-from offboard.control.propagation import upright
-from offboard.control.response import SHORTEST_THRUST_LAG_S, CostToGo
+from offboard.control.riccati import CostToGo
+from offboard.model.axes import SHORTEST_THRUST_LAG_S, upright
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]

@@ -12,7 +12,7 @@ from scipy.linalg import block_diag
 
 from offboard.control.cost import BoxQuadratic
 from offboard.control.horizon.outlook import Bounds
-from offboard.control.response import CostToGo
+from offboard.control.riccati import CostToGo
 
 Array = NDArray[np.float64]
 

@@ -24,7 +24,7 @@ from offboard.control.horizon.plant import (
     W,
     Z,
 )
-from offboard.control.propagation import upright
+from offboard.model.axes import upright
 from offboard.model.kernel import array, entry, kernel
 
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from offboard.control.horizon.search import Evaluator, Found, Plan, Remaining
-from offboard.model.vehicle import Parameters
+from offboard.documents.parameters import Parameters
 
 Array = NDArray[np.float64]
 

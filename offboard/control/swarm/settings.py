@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from offboard.model.vehicle import Parameters
+from offboard.documents.parameters import Parameters
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,86 @@
+"""One flight of a comparison: fly it, score it from its log, keep the score."""
+
+from __future__ import annotations
+
+import atexit
+import itertools
+from collections.abc import Sequence
+from contextlib import suppress
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+from offboard.analysis import history, tlog
+from offboard.analysis import score as scoring
+from offboard.analysis.compare import Result, Trial
+from offboard.analysis.document import as_text
+from offboard.analysis.history import History
+from offboard.analysis.score import Score
+from offboard.analysis.tlog import TlogError
+from offboard.documents.reading import DocumentError
+from offboard.flight.companion import STOPPED
+from offboard.flight.configuration import build_track
+from offboard.flight.link import LinkError
+from offboard.flight.log import LogError
+from offboard.flight.request import FlightRequest, fly_request
+from offboard.flight.sitl import SimulatorProcess
+
+
+def score_flight(flight: Path) -> tuple[Score, History]:
+    """Score FLIGHT, a directory or a .tlog, from its log alone. Raises TlogError."""
+    flown = history.gather(tlog.read(tlog.find(flight)))
+    return scoring.score(flown), flown
+
+
+def keep_score(directory: Path, score: Score, flown: History) -> None:
+    """Write score.json into a flight directory. Raises LogError."""
+    path = directory / "score.json"
+    try:
+        path.write_text(as_text(score, flown), encoding="utf-8")
+    except OSError as error:
+        with suppress(OSError):
+            path.unlink()  # half a score is none
+        raise LogError(f"{path} cannot be written ({error.strerror})") from None
+
+
+def check_flyable(
+    request: FlightRequest, controllers: Sequence[str], references: Sequence[str]
+) -> None:
+    """Every controller with every reference, before the first flight. Raises DocumentError."""
+    for controller, reference in itertools.product(controllers, references):
+        build_track(_of_trial(request, controller, reference).resolve())
+
+
+def _of_trial(request: FlightRequest, controller: str, reference: str) -> FlightRequest:
+    named = {"controller": controller, "reference": reference}
+    return replace(request, choices={**request.choices, **named})
+
+
+@cache
+def _simulator() -> SimulatorProcess:
+    """Of this process, for all flights of a comparison that it flies."""
+    process = SimulatorProcess().__enter__()
+    atexit.register(process.close)
+    return process
+
+
+def fly_trial(request: FlightRequest, trial: Trial) -> Result:
+    """Fly one row of a comparison like `request`; a flight that cannot be flown is a result too.
+
+    It begins disarmed, unless `request` says otherwise: in the air, somebody else has the vehicle.
+    """
+    requested = replace(
+        _of_trial(request, trial.controller, trial.reference),
+        assignments=("limits.begin_armed=false", *request.assignments),
+        directory=trial.directory,
+        scenario=trial.scenario,
+        seed=trial.seed,
+    )
+    try:
+        outcome = fly_request(requested, simulator=_simulator() if request.sitl else None)
+        score, flown = score_flight(trial.directory)
+        keep_score(trial.directory, score, flown)
+    except (DocumentError, LinkError, LogError, TlogError) as error:
+        return Result(trial, 2, str(error), {})
+    stopped = outcome.sentence.startswith(STOPPED)
+    return Result(trial, outcome.exit_code, outcome.sentence, score.figures(), stopped)

@@ -1,0 +1,1 @@
+"""The tracking laws: one decision per tick from the predicted state and the reference."""

@@ -1,0 +1,1 @@
+"""Strict YAML documents: the shipped files, reading, validation, and errors as sentences."""

@@ -1,0 +1,173 @@
+"""YAML text -> validated value, or sentences that say exactly what is wrong with it.
+
+Every configuration file goes through `parse`: text in, frozen pydantic value out. Scalars follow
+YAML 1.2 (`1e-3` is a number, `no` and `12:30` are text), values are checked strictly (no text for
+numbers, no true for 1), duplicate keys, aliases and tags are refused. Each problem is one sentence
+with source, dotted key path, offending value and what is allowed. Reads no file.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Mapping
+from types import MappingProxyType
+from typing import Any, TypeVar
+
+import yaml
+from pydantic import BaseModel, ValidationError
+
+from offboard.documents.errors import place, sentence, shown
+
+M = TypeVar("M", bound=BaseModel)
+Json = dict[str, Any]
+
+_INTEGER = re.compile(r"[-+]?[0-9]{1,400}")
+_HEXADECIMAL = re.compile(r"0x[0-9a-fA-F]{1,300}")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
+_WORDS: dict[str, Any] = {
+    "": None, "~": None, "null": None, "Null": None, "NULL": None,
+    "true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False,
+    ".inf": math.inf, "+.inf": math.inf, "-.inf": -math.inf, ".nan": math.nan,
+}  # fmt: skip
+
+
+class DocumentError(Exception):
+    """`problems` holds one sentence each for a human; `str()` joins them with line breaks."""
+
+    def __init__(self, *problems: str) -> None:
+        super().__init__("\n".join(problems))
+        self.problems = problems
+
+
+def parse(text: str, model: type[M], source: str) -> M:
+    """YAML `text` -> an instance of `model`. `source` names the text in errors (a file's name).
+
+    Raises DocumentError with every problem found.
+    """
+    return validate(read(text, source), model, source)
+
+
+def read(text: str, source: str) -> Json:
+    """YAML `text` -> the raw mapping, not yet validated. An empty document is an empty mapping."""
+    value = _loaded(text, source)
+    if value is None:
+        return {}
+    if not isinstance(value, dict):
+        raise DocumentError(f"{source}: expected a mapping of keys to values, not {shown(value)}")
+    return value
+
+
+def override(mapping: Mapping[str, Any], assignment: str) -> Json:
+    """A copy of the raw `mapping` with one `key.path=value` of the command line applied.
+
+    The value is YAML; a number in the path indexes a list. Keys are not checked here: `validate`
+    refuses an unknown one like any other. Raises DocumentError when there is no `key.path=` or the
+    value is no YAML.
+    """
+    path, separator, text = assignment.partition("=")
+    keys = [key.strip() for key in path.split(".")]
+    if not separator or not all(keys):
+        raise DocumentError(f"--set {assignment}: expected key.path=value")
+    changed: Json = _with(mapping, keys, _loaded(text, f"--set {assignment}"))
+    return changed
+
+
+def validate(
+    mapping: Mapping[str, Any],
+    model: type[M],
+    source: str,
+    options: Mapping[str, str] = MappingProxyType({}),
+) -> M:
+    """Raw mapping -> an instance of `model`. Raises DocumentError with every problem found.
+
+    `source` names where the mapping is from, but for what the command line has put in: `options`,
+    key path -> option as it was given.
+    """
+    try:
+        # As JSON: strict about scalars, yet lists may become tuples and text an enum
+        return model.model_validate_json(json.dumps(mapping), strict=True)
+    except ValidationError as error:
+        schema = model.model_json_schema()
+        details = error.errors(include_url=False)
+        problems = [
+            (_origin(place(detail, mapping), options, source), detail) for detail in details
+        ]
+        raise DocumentError(
+            *(f"{origin}: {sentence(detail, mapping, schema)}" for origin, detail in problems)
+        ) from None
+
+
+def _origin(path: str, options: Mapping[str, str], source: str) -> str:
+    """The last option that touched the value at `path`, else `source`."""
+    problem = path.split(".")
+    for assigned, option in reversed(list(options.items())):
+        keys = [key.strip() for key in assigned.split(".")]
+        if all(mine == theirs for mine, theirs in zip(keys, problem, strict=False)):
+            return option
+    return source
+
+
+def _loaded(text: str, source: str) -> Any:
+    try:
+        root = yaml.compose(text, Loader=yaml.BaseLoader)
+        return None if root is None else _value(root, set())
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        place = f"{source}, line {mark.line + 1}, column {mark.column + 1}" if mark else source
+        problem = getattr(error, "problem", None) or " ".join(str(error).split())
+        raise DocumentError(f"{place}: {problem}") from None
+    except RecursionError:
+        raise DocumentError(f"{source}: nested too deeply") from None
+
+
+def _value(node: yaml.Node, seen: set[int]) -> Any:
+    """A node of the document -> plain Python, with the scalars of YAML 1.2."""
+    if id(node) in seen:
+        raise _refusal("a value is used twice: aliases are not allowed", node)
+    seen.add(id(node))
+    if node.tag not in _PLAIN_TAGS:
+        raise _refusal("tags are not allowed", node)
+    if isinstance(node, yaml.MappingNode):
+        mapping: Json = {}
+        for key, value in node.value:
+            if not isinstance(key, yaml.ScalarNode):
+                raise _refusal("a key must be a single word", key)
+            if key.value in mapping:
+                raise _refusal(f"the key {key.value!r} is given twice", key)
+            mapping[key.value] = _value(value, seen)
+        return mapping
+    if isinstance(node, yaml.SequenceNode):
+        return [_value(item, seen) for item in node.value]
+    plain = getattr(node, "style", None) is None
+    return _scalar(node.value) if plain else node.value
+
+
+_PLAIN_TAGS = {f"tag:yaml.org,2002:{kind}" for kind in ("str", "seq", "map")}
+
+
+def _scalar(text: str) -> Any:
+    if text in _WORDS:
+        return _WORDS[text]
+    if _INTEGER.fullmatch(text):
+        return int(text)
+    if _HEXADECIMAL.fullmatch(text):
+        return int(text, 16)
+    return float(text) if _FLOAT.fullmatch(text) else text
+
+
+def _refusal(problem: str, node: yaml.Node) -> yaml.YAMLError:
+    return yaml.MarkedYAMLError(problem=problem, problem_mark=node.start_mark)
+
+
+def _with(value: Any, keys: list[str], new: Any) -> Any:
+    """A copy of `value` in which the entry at `keys` is `new`; sections on the way are made."""
+    if not keys:
+        return new
+    key, rest = keys[0], keys[1:]
+    if isinstance(value, list) and key.isdecimal() and int(key) < len(value):
+        index = int(key)
+        return [*value[:index], _with(value[index], rest, new), *value[index + 1 :]]
+    section = dict(value) if isinstance(value, Mapping) else {}
+    return {**section, key: _with(section.get(key), rest, new)}

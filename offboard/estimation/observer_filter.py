@@ -1,0 +1,200 @@
+"""What the observer computes, compiled: one record, and what a message does to it.
+
+The record holds the believed state, the commands sent, three filters (both lateral axes, vertical,
+course) and what is learnt of their noise. Which message counts, and what a silence or the ground
+mean, is for the observer to say. Knows no settings and no quaternion.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.estimation.filtering import (
+    FILTER,
+    NOTHING,
+    anchor_bias,
+    anchor_position,
+    correct,
+    correct_within,
+    spread,
+)
+from offboard.estimation.observer_adaptation import (
+    ADAPTATION,
+    DOWN,
+    NORTH_EAST,
+    interrupt,
+    note,
+    white_sd,
+)
+from offboard.estimation.propagation import (
+    BIAS,
+    COURSE,
+    COURSE_RATE,
+    DISTURBANCE,
+    DRAG,
+    GRAVITY,
+    MOTION,
+    NOW,
+    POSITION,
+    THRUST,
+    TILT,
+    TILT_RATE,
+    VELOCITY,
+    replay,
+    wrapped,
+)
+from offboard.model.axes import upright
+from offboard.model.kernel import entry, kernel
+
+Array = NDArray[np.float64]
+
+LATERAL, VERTICAL, HEADING = 0, 1, 2  # filters
+# Places in them: per lateral axis [p v b b' d beta], vertical [p v d beta], course [psi psi'].
+LATERAL_TILT, LATERAL_DRIFT, VERTICAL_DRIFT, HEADING_COURSE = 2, 4, 2, 0
+POSITION_JUMPED, VELOCITY_JUMPED = 1, 2  # bits of an answer
+IGNORED, BIASED, TRUSTED = 0, 1, 2  # the reported velocity
+
+OBSERVER = np.dtype(
+    [
+        ("time_s", "f8"),  # vehicle time of the state
+        ("motion", MOTION),
+        ("filters", FILTER, 3),
+        ("adaptation", ADAPTATION),
+        # settings
+        ("velocity", "i8"),  # IGNORED, BIASED or TRUSTED
+        ("adaptive", "i8"),
+        ("white_sds", "f8", 2),  # of position and velocity, where they are not adaptive
+        ("gates", "f8", 2),  # beyond which they have jumped
+        ("attitude_sd", "f8"),
+        ("disturbance_limit", "f8"),
+        # scratch
+        ("measured", "f8", VELOCITY + 3),  # placed as in the state
+    ],
+    align=True,
+)
+"""One vehicle's observer."""
+
+
+@entry(OBSERVER, int, float, float, float, float)
+def hear_attitude(
+    seen: Any, complete: int, time_s: float, north: float, east: float, course: float
+) -> int:
+    """Thrust direction, north and east, and course reported for `time_s`. `complete`: position was
+    heard too, so that the motion can be replayed."""
+    _go_to(seen, complete, time_s)
+    state, late_s = seen.motion.states[NOW], seen.time_s - time_s
+    lateral, heading = seen.filters[LATERAL], seen.filters[HEADING]
+    lateral.innovation[0] = north - state[TILT] + late_s * state[TILT_RATE]
+    lateral.innovation[1] = east - state[TILT + 1] + late_s * state[TILT_RATE + 1]
+    heading.innovation[0] = wrapped(course - state[COURSE] + late_s * state[COURSE_RATE])
+    correct(state, lateral, LATERAL_TILT, NOTHING, seen.attitude_sd)
+    correct(state, heading, HEADING_COURSE, NOTHING, seen.attitude_sd)
+    bound_disturbance(state, seen.disturbance_limit)
+    return 0
+
+
+@entry(OBSERVER, int, float, float, float, float, float, float, float)
+def hear_position(
+    seen: Any,
+    complete: int,
+    time_s: float,
+    north: float,
+    east: float,
+    down: float,
+    velocity_n: float,
+    velocity_e: float,
+    velocity_d: float,
+) -> int:
+    """Position and velocity reported for `time_s`; `complete`: attitude was heard too. Returns what
+    jumped."""
+    _go_to(seen, complete, time_s)
+    state, measured = seen.motion.states[NOW], seen.measured
+    measured[POSITION], measured[POSITION + 1], measured[POSITION + 2] = north, east, down
+    measured[VELOCITY], measured[VELOCITY + 1] = velocity_n, velocity_e
+    measured[VELOCITY + 2] = velocity_d
+    if seen.velocity == TRUSTED:
+        for i in range(6):
+            state[i] = measured[i]
+        return 0
+    late_s = seen.time_s - time_s
+    if late_s > 0.0:
+        _bring_forward(measured, state, seen.motion.plant, late_s)
+    jumped = _correct(seen, state)
+    bound_disturbance(state, seen.disturbance_limit)
+    return jumped
+
+
+@kernel
+def _go_to(seen: Any, complete: int, time_s: float) -> None:
+    """Replay to `time_s`, or stay if newer telemetry came first."""
+    if time_s <= seen.time_s:
+        return
+    if complete:
+        interval_s = time_s - seen.time_s
+        replay(seen.motion, NOW, seen.time_s, time_s)
+        for i in range(3):
+            spread(seen.filters[i], interval_s)
+    seen.time_s = time_s
+
+
+@kernel
+def _bring_forward(measured: Array, state: Array, plant: Array, late_s: float) -> None:
+    """To where the vehicle has gone since, as far as is believed."""
+    north, east = state[TILT], state[TILT + 1]
+    direction = (north, east, upright(north, east))
+    for i in range(3):
+        speed = state[VELOCITY + i]
+        acceleration = direction[i] * -state[THRUST] + state[DISTURBANCE + i] - plant[DRAG] * speed
+        if i == 2:
+            acceleration += plant[GRAVITY]
+        measured[POSITION + i] += late_s * speed
+        measured[VELOCITY + i] += late_s * acceleration
+
+
+@kernel
+def _correct(seen: Any, state: Array) -> int:
+    """By what is measured, and learn from how far that was off. Returns what jumped."""
+    learnt = seen.adaptation
+    _note_missed(state, seen.measured, learnt.innovation)
+    jumped = 0
+    for kind in range(2):
+        if kind == 1 and seen.velocity == IGNORED:
+            continue
+        sd = white_sd(learnt, kind) if seen.adaptive else seen.white_sds[kind]
+        for i in range(2):
+            one, gate = seen.filters[i], seen.gates[kind]
+            other = NOTHING if kind == 0 else one.size - 1
+            if correct_within(state, one, kind, other, seen.measured, sd, gate):
+                continue
+            jumped |= 1 << kind
+            if kind == 0:
+                anchor_position(state, one, seen.measured, sd)
+            else:
+                anchor_bias(state, one, sd)
+    if seen.adaptive and jumped:
+        interrupt(learnt)
+    elif seen.adaptive:
+        _note_missed(state, seen.measured, learnt.residual)
+        note(learnt, seen.time_s)
+        seen.filters[LATERAL].densities[LATERAL_DRIFT] = learnt.density[NORTH_EAST]
+        seen.filters[VERTICAL].densities[VERTICAL_DRIFT] = learnt.density[DOWN]
+    return jumped
+
+
+@kernel
+def _note_missed(state: Array, measured: Array, missed: Array) -> None:
+    """Measured less believed position and reported velocity."""
+    for i in range(3):
+        missed[i] = measured[POSITION + i] - state[POSITION + i]
+        believed = state[VELOCITY + i]
+        missed[3 + i] = measured[VELOCITY + i] - believed - state[BIAS + i]
+
+
+@kernel
+def bound_disturbance(state: Array, limit: float) -> None:
+    """Hold each axis of the disturbance, m/s^2 NED, within `limit`, in place."""
+    for i in range(DISTURBANCE, DISTURBANCE + 3):
+        state[i] = min(max(state[i], -limit), limit)

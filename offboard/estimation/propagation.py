@@ -1,0 +1,196 @@
+"""Motion under the commands sent, compiled: what the observer replays and predicts with.
+
+A state has `STATE_SIZE` numbers at the indices below (NED, SI): position, velocity, the lateral
+part of the thrust direction b and its rate, disturbance, bias of the reported velocity, collective
+thrust after its lag, course and its rate. Motion is integrated with Runge-Kutta steps that end
+where a command takes effect. States are changed in place. Nothing here knows messages, settings or
+uncertainty.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.model.axes import upright
+from offboard.model.kernel import entry, kernel
+
+Array = NDArray[np.float64]
+
+POSITION = 0
+VELOCITY = 3
+TILT = 6
+TILT_RATE = 8
+DISTURBANCE = 10
+BIAS = 13
+THRUST = 16
+COURSE = 17
+COURSE_RATE = 18
+STATE_SIZE = 19
+
+# Indices of the plant vector.
+GRAVITY = 0
+DRAG = 1
+TILT_FREQUENCY = 2
+TILT_DAMPING = 3
+TILT_DELAY = 4
+THRUST_LAG = 5
+THRUST_DELAY = 6
+YAW_FREQUENCY = 7
+YAW_DAMPING = 8
+YAW_DELAY = 9
+BIAS_TIME_CONSTANT = 10
+PLANT_SIZE = 11
+
+# Columns of the command history, oldest row first.
+SENT_AT = 0
+SENT_TILT = 1
+SENT_THRUST = 3
+SENT_COURSE = 4
+COMMAND_SIZE = 5
+
+COMMANDS_KEPT = 128
+NOW, LATER = 0, 1  # rows of the states
+MOTION = np.dtype(
+    [
+        ("states", "f8", (2, STATE_SIZE)),
+        ("plant", "f8", PLANT_SIZE),
+        ("history", "f8", (COMMANDS_KEPT, COMMAND_SIZE)),
+        ("sent", "i8"),  # rows of the history that are in use
+        ("slopes", "f8", (5, STATE_SIZE)),  # scratch
+    ],
+    align=True,
+)
+"""States, the plant that moves them and the commands sent."""
+
+LONGEST_STEP_S = 0.01
+SAME_TIME_S = 1e-9
+
+
+@kernel
+def _in_force(motion: Any, time_s: float, delay_s: float) -> tuple[int, float]:
+    """Row of the command acting at `time_s` (-1: none yet) and the time when the next one acts."""
+    row = motion.sent - 1
+    while row >= 0 and motion.history[row, SENT_AT] + delay_s > time_s + SAME_TIME_S:
+        row -= 1
+    following = math.inf
+    if row + 1 < motion.sent:
+        following = motion.history[row + 1, SENT_AT] + delay_s
+    return row, following
+
+
+@kernel
+def _differentiate(
+    state: Array,
+    thrust: float,
+    tilt_n: float,
+    tilt_e: float,
+    course: float,
+    plant: Array,
+    rate: Array,
+) -> None:
+    """Right-hand side at collective thrust `thrust` and the commands now in force."""
+    b_n, b_e = state[TILT], state[TILT + 1]
+    pull = (-thrust * b_n, -thrust * b_e, plant[GRAVITY] - thrust * upright(b_n, b_e))
+    for axis in range(3):
+        rate[POSITION + axis] = state[VELOCITY + axis]
+        rate[VELOCITY + axis] = (
+            pull[axis] - plant[DRAG] * state[VELOCITY + axis] + state[DISTURBANCE + axis]
+        )
+        rate[DISTURBANCE + axis] = 0.0
+        rate[BIAS + axis] = -state[BIAS + axis] / plant[BIAS_TIME_CONSTANT]
+    stiffness = plant[TILT_FREQUENCY] ** 2
+    damping = 2.0 * plant[TILT_DAMPING] * plant[TILT_FREQUENCY]
+    rate[TILT] = state[TILT_RATE]
+    rate[TILT + 1] = state[TILT_RATE + 1]
+    rate[TILT_RATE] = stiffness * (tilt_n - b_n) - damping * state[TILT_RATE]
+    rate[TILT_RATE + 1] = stiffness * (tilt_e - b_e) - damping * state[TILT_RATE + 1]
+    rate[THRUST] = 0.0
+    rate[COURSE] = state[COURSE_RATE]
+    rate[COURSE_RATE] = (
+        plant[YAW_FREQUENCY] ** 2 * (course - state[COURSE])
+        - 2.0 * plant[YAW_DAMPING] * plant[YAW_FREQUENCY] * state[COURSE_RATE]
+    )
+
+
+@kernel
+def _lagged(thrust: float, commanded: float, lag_s: float, step_s: float) -> float:
+    if lag_s <= 0.0:
+        return commanded
+    return commanded + (thrust - commanded) * math.exp(-step_s / lag_s)
+
+
+@kernel
+def _move(state: Array, h: float, rate: Array, moved: Array) -> None:
+    for i in range(STATE_SIZE):
+        moved[i] = state[i] + h * rate[i]
+
+
+@kernel
+def _step(
+    state: Array,
+    h: float,
+    tilt_n: float,
+    tilt_e: float,
+    thrust: float,
+    course: float,
+    plant: Array,
+    slopes: Array,
+) -> None:
+    """One Runge-Kutta step of fourth order; the thrust's lag is followed exactly."""
+    lag = plant[THRUST_LAG]
+    middle = _lagged(state[THRUST], thrust, lag, 0.5 * h)
+    end = _lagged(state[THRUST], thrust, lag, h)
+    start = state[THRUST] if lag > 0.0 else thrust
+    k1, k2, k3, k4, moved = slopes[0], slopes[1], slopes[2], slopes[3], slopes[4]
+    _differentiate(state, start, tilt_n, tilt_e, course, plant, k1)
+    _move(state, 0.5 * h, k1, moved)
+    _differentiate(moved, middle, tilt_n, tilt_e, course, plant, k2)
+    _move(state, 0.5 * h, k2, moved)
+    _differentiate(moved, middle, tilt_n, tilt_e, course, plant, k3)
+    _move(state, h, k3, moved)
+    _differentiate(moved, end, tilt_n, tilt_e, course, plant, k4)
+    for i in range(STATE_SIZE):
+        state[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
+    state[THRUST] = end
+
+
+@entry(MOTION, int, float, float)
+def replay(motion: Any, row: int, start_s: float, end_s: float) -> int:
+    """Fill `row`, NOW or LATER, with the state that what is NOW at `start_s` becomes by `end_s`
+    under the commands sent; each axis has its own delay.
+
+    Before the first command has taken effect tilt, thrust and course hold what they have.
+    """
+    state, history, plant = motion.states[row], motion.history, motion.plant[:]
+    for i in range(STATE_SIZE):
+        state[i] = motion.states[NOW, i]
+    longest = min(LONGEST_STEP_S, 0.2 / plant[TILT_FREQUENCY], 0.2 / plant[YAW_FREQUENCY])
+    time = start_s
+    while end_s - time > SAME_TIME_S:
+        tilt_row, tilt_next = _in_force(motion, time, plant[TILT_DELAY])
+        thrust_row, thrust_next = _in_force(motion, time, plant[THRUST_DELAY])
+        course_row, course_next = _in_force(motion, time, plant[YAW_DELAY])
+        until = min(end_s, min(tilt_next, min(thrust_next, course_next)))
+        steps = max(1, math.ceil((until - time) / longest - 1e-6))
+        h = (until - time) / steps
+        tilt_n, tilt_e, thrust, course = state[TILT], state[TILT + 1], state[THRUST], state[COURSE]
+        if tilt_row >= 0:
+            tilt_n, tilt_e = history[tilt_row, SENT_TILT], history[tilt_row, SENT_TILT + 1]
+        if thrust_row >= 0:
+            thrust = history[thrust_row, SENT_THRUST]
+        if course_row >= 0:
+            course += wrapped(history[course_row, SENT_COURSE] - state[COURSE])
+        for _ in range(steps):
+            _step(state, h, tilt_n, tilt_e, thrust, course, plant, motion.slopes[:])
+        time = until
+    return 0
+
+
+@kernel
+def wrapped(angle_rad: float) -> float:
+    """The same angle in -pi .. pi."""
+    return angle_rad - 2.0 * math.pi * math.floor(angle_rad / (2.0 * math.pi) + 0.5)

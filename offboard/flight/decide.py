@@ -1,0 +1,159 @@
+"""One tick's decision: the state predicted, the law asked, its command checked and clamped.
+
+What follows a decision is here too: its record in the log, and what the flight has taught of the
+vehicle until then. A law that fails is counted, never raised: the vehicle is in the air.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from offboard.control.base import Adopting, Controller, Decision, DecisionError, Situation
+from offboard.estimation.observer import Observer
+from offboard.flight.assessment import Assessment
+from offboard.flight.flight_plan import FlightPlan
+from offboard.flight.online_identification import RECORD_ID as IDENTIFIED_ID
+from offboard.flight.online_identification import RECORD_NAME as IDENTIFIED_NAME
+from offboard.flight.online_identification import Adoption, OnlineIdentification
+from offboard.flight.outbox import Outbox
+from offboard.flight.phases import PHASE_CODES, Phase
+from offboard.flight.record import RECORD_ID, RECORD_NAME, TickRecord, reference_record
+from offboard.flight.setpoint import clamp, usable
+from offboard.mavlink.outgoing import SolverRecord
+from offboard.model.command import Command, PositionCommand
+from offboard.model.predicted_state import PredictedState
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """One control tick: when, in which phase and for how long, and what it cost to get here."""
+
+    time_s: float  # vehicle time
+    phase: Phase
+    in_phase_s: float
+    arrived_s: float  # stopwatch, when the telemetry came that made the tick
+    missed: int = 0  # ticks skipped since the previous one
+
+
+@dataclass(frozen=True, slots=True)
+class Decided:
+    """A decision and the state it was made for; `command` is what may leave."""
+
+    state: PredictedState
+    decision: Decision
+    command: Command | PositionCommand
+
+
+class Decider:
+    """Asks `controller`. `stopwatch` reads seconds, for solve times only."""
+
+    def __init__(
+        self,
+        *,
+        controller: Controller,
+        observer: Observer,
+        plan: FlightPlan,
+        assessment: Assessment,
+        identification: OnlineIdentification | None,
+        outbox: Outbox,
+        deadline_s: float | None,
+        stopwatch: Callable[[], float],
+    ) -> None:
+        self._controller = controller
+        self._observer = observer
+        self._plan = plan
+        self._assessment = assessment
+        self._identification = identification
+        self._outbox = outbox
+        self._deadline_s = deadline_s
+        self._stopwatch = stopwatch
+        self.missed = 0  # decisions, one after the other
+        self.failure = ""  # of the last one missed
+
+    def begin(self) -> None:
+        """Before the first decision: cautious, while what is to be learnt is not known."""
+        if self._identification and isinstance(self._controller, Adopting):
+            limit_radps = self._identification.cautious_bandwidth_radps
+            self._controller.adopt(self._outbox.vehicle, limit_radps)
+
+    def decide(self, tick: Tick) -> Decided | None:
+        """None, and `missed` one more, where there is no decision that may leave."""
+        try:
+            decided = self._decided(tick)
+        except Exception as error:  # whatever it is, the vehicle is in the air
+            self.missed += 1
+            self.failure = f"{type(error).__name__}: {error}"
+            self._outbox.warn(f"decision missed: {self.failure}")
+            return None
+        self.missed = 0
+        return decided
+
+    def follow_up(self, tick: Tick, decided: Decided) -> None:
+        """After the setpoint has left, so that it waits for nothing: record and learn."""
+        self._record(tick, decided)
+        if self._identification is None:
+            return
+        try:
+            adoption = self._identification.learn(tick.phase, tick.time_s)
+            if adoption is not None:
+                self._adopt(tick.time_s, adoption)
+        except Exception as error:  # flying on with what is believed is always possible
+            self._identification.give_up()
+            self._outbox.warn(f"identification ended: {error}")
+
+    def _decided(self, tick: Tick) -> Decided:
+        reference = self._plan.reference
+        assert reference is not None
+        state = self._observer.predict(tick.time_s)
+        situation = Situation(
+            tick.time_s,
+            state,
+            reference,
+            previous=self._outbox.command,
+            deadline_s=self._deadline_s,
+            origin_ned_m=self._plan.origin_ned_m,
+            track_time_s=self._plan.track_time_s(tick.time_s),
+        )
+        decision = self._controller.decide(situation)
+        command = decision.command
+        if isinstance(command, Command):
+            command = clamp(self._excited(command, tick), self._outbox.vehicle)
+        if not usable(command):
+            raise DecisionError(f"unusable {command}")
+        return Decided(state, decision, command)
+
+    def _excited(self, command: Command, tick: Tick) -> Command:
+        if self._identification is None or tick.phase is not Phase.EXCITE:
+            return command
+        return self._identification.excited(
+            command, tick.time_s, self._assessment.position_error_m()
+        )
+
+    def _adopt(self, time_s: float, adoption: Adoption) -> None:
+        assert isinstance(self._controller, Adopting)
+        limit = adoption.bandwidth_limit_radps
+        self._controller.adopt(adoption.vehicle, limit, gains=adoption.gains)
+        self._observer.adopt(adoption.vehicle)
+        self._outbox.vehicle = adoption.vehicle
+        if adoption.record:
+            record = SolverRecord(time_s, adoption.record, IDENTIFIED_ID, IDENTIFIED_NAME)
+            self._outbox.note_down(record)
+        for sentence in adoption.sentences:
+            self._outbox.announce(sentence)
+
+    def _record(self, tick: Tick, decided: Decided) -> None:
+        sample = self._plan.sample(tick.time_s)
+        assert sample is not None
+        self._outbox.note_down(reference_record(tick.time_s, sample))
+        record = TickRecord.of(
+            phase=PHASE_CODES[tick.phase],
+            decision=decided.decision,
+            state=decided.state,
+            lateness_s=self._stopwatch() - tick.arrived_s,
+            missed_ticks=tick.missed,
+            hover_thrust=self._observer.hover_thrust_estimate,
+            track_time_s=self._plan.track_time_s(tick.time_s),
+        )
+        data = SolverRecord(tick.time_s, record.data(), RECORD_ID, RECORD_NAME)
+        self._outbox.note_down(data)

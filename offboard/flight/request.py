@@ -1,0 +1,112 @@
+"""One configured flight, from names to a scored directory: what fly, compare and identify share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from offboard.control.catalogue import build
+from offboard.documents.reading import DocumentError
+from offboard.documents.shipped import locate, read_text
+from offboard.estimation.fusion import observer_of
+from offboard.flight import clock
+from offboard.flight.companion import Companion, Outcome
+from offboard.flight.configuration import FlightConfig, build_track, dump, load, read_part
+from offboard.flight.log import FlightLog
+from offboard.flight.one_flight import Bundled, FlightParts, fly
+from offboard.flight.sitl import OWN_VEHICLES, SimulatorProcess
+from offboard.flight.stop import StopRequests
+
+
+@dataclass(frozen=True, slots=True)
+class FlightRequest:
+    """What to fly and where: `choices` replaces vehicle, controller or reference by name or file,
+    `bundled` None flies whatever is at `connection`."""
+
+    directory: Path
+    config: str = "flight"
+    choices: Mapping[str, str] = field(default_factory=dict)
+    assignments: tuple[str, ...] = ()
+    seed: int | None = None
+    connection: str = "udpin:127.0.0.1:14540"
+    sitl: bool = False  # on a bundled simulator: the next three are its own, None its default
+    firmware: str = "px4"
+    scenario: str | None = None
+    sim_vehicle: str | None = None
+
+    def resolve(self) -> FlightConfig:
+        """The validated configuration. Raises DocumentError."""
+        if self.sitl:
+            self._check_bundled()
+        return load(
+            self.config,
+            choices=self.choices,
+            assignments=self.assignments,
+            seed=self.seed,
+            known_vehicle=OWN_VEHICLES[self.firmware] if self.sitl else None,
+        )
+
+    def _check_bundled(self) -> None:
+        """Before anything is built, which may compile. Raises DocumentError."""
+        if self.firmware not in OWN_VEHICLES:
+            known = ", ".join(OWN_VEHICLES)
+            raise DocumentError(f"--firmware {self.firmware}: unknown; there is {known}")
+        if self.scenario is not None:
+            read_text(locate(self.scenario, "scenarios", "scenario"))
+        if self.sim_vehicle is not None:
+            read_part("vehicle", self.sim_vehicle)
+
+
+def build_parts(config: FlightConfig) -> FlightParts:
+    """Everything that flies, built. Raises DocumentError where the reference cannot be flown."""
+    return FlightParts(
+        vehicle=config.vehicle,
+        controller=build(
+            config.controller, config.vehicle, config.period_s, config.seed, clock.monotonic_s
+        ),
+        make_observer=lambda: observer_of(
+            config.estimate, config.vehicle, config.observer, config.fusion
+        ),
+        track=build_track(config),
+        limits=config.limits,
+        period_s=config.period_s,
+        deadline_s=config.deadline_s,
+        learning=config.identify,
+    )
+
+
+def fly_request(
+    request: FlightRequest,
+    progress: Callable[[Companion], None] = lambda companion: None,
+    tell: Callable[[str], None] = lambda sentence: None,
+    simulator: SimulatorProcess | None = None,
+    stops: StopRequests | None = None,
+) -> Outcome:
+    """Fly and log. `simulator` runs the bundled vehicle, `stops` holds the requests to
+    stop; without them each is made for this flight alone.
+
+    Raises DocumentError, LinkError, LogError or KeyboardInterrupt before anything is sent.
+    """
+    with ExitStack() as stack:
+        stops = stops or stack.enter_context(StopRequests())
+        config = request.resolve()
+        bundled = None
+        if request.sitl:
+            bundled = Bundled(
+                simulator or stack.enter_context(SimulatorProcess()),
+                request.scenario,
+                config.seed,
+                request.sim_vehicle,
+                request.firmware,
+            )
+        return fly(
+            build_parts(config),
+            FlightLog(request.directory, dump(config)),
+            connection=request.connection,
+            bundled=bundled,
+            stops=stops,
+            progress=progress,
+            tell=tell,
+        )

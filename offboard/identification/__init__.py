@@ -1,0 +1,1 @@
+"""From a log or a flight to the vehicle: delay, attitude response, thrust and drag."""

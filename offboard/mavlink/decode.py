@@ -1,0 +1,231 @@
+"""Payloads of verified frames turned into events in NED, FRD and SI, or refused with a reason.
+
+Every field is checked for finite and plausible here. Knows no sequence numbers, no peers and no
+time but the one in the message. pymavlink's dialect classes supply ids and layouts.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple
+
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from offboard.mavlink import events
+from offboard.mavlink.counters import DropReason
+from offboard.mavlink.dialects.base import Dialect, ParameterEncoding
+from offboard.model.geodesy import Geodetic, origin_of
+
+POSITION_LIMIT_M = 1e5
+VELOCITY_LIMIT_MPS = 200.0
+RATE_LIMIT_RADPS = 100.0
+_PREARM_CHECK = 0x10000000  # MAV_SYS_STATUS_PREARM_CHECK
+_ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
+_FIX_3D = 3  # GPS_FIX_TYPE
+_UNKNOWN16 = 0xFFFF
+_LONGEST_UPTIME_US = 10**15  # a larger stamp is Unix time
+_REAL32 = 9  # MAV_PARAM_TYPE
+_UNSIGNED_TYPES, _SIGNED_TYPES = (1, 3, 5), (2, 4, 6)
+_LANDED = ("unknown", "on_ground", "in_air", "takeoff", "landing")  # MAV_LANDED_STATE
+_RESULTS = (  # MAV_RESULT
+    "ACCEPTED",
+    "TEMPORARILY_REJECTED",
+    "DENIED",
+    "UNSUPPORTED",
+    "FAILED",
+    "IN_PROGRESS",
+    "CANCELLED",
+    "COMMAND_LONG_ONLY",
+    "COMMAND_INT_ONLY",
+    "COMMAND_UNSUPPORTED_MAV_FRAME",
+    "NOT_IN_CONTROL",
+)
+
+
+class Address(NamedTuple):
+    """The sender of a message, or whom it is for."""
+
+    system_id: int
+    component_id: int
+
+
+class Identity(NamedTuple):
+    """What a HEARTBEAT says about its sender: MAV_TYPE and MAV_AUTOPILOT."""
+
+    vehicle_type: int
+    autopilot: int
+
+
+class TextChunk(NamedTuple):
+    """STATUSTEXT as it arrives: `last` when its end was marked. `text_id` 0: complete in itself."""
+
+    severity: int
+    data: bytes
+    text_id: int
+    chunk: int
+    last: bool
+
+
+def _unpack(message: Any, payload: bytes) -> tuple[Any, ...]:
+    """Fields in wire order; the zeros that MAVLink 2 cuts from the end are put back."""
+    layout: struct.Struct = message.unpacker
+    return layout.unpack_from(payload.ljust(layout.size, b"\0"))
+
+
+def decode(message_id: int, payload: bytes, dialect: Dialect) -> events.Event | DropReason | None:
+    """The event in a payload, IMPLAUSIBLE, or None for a message that nobody asked for."""
+    decoder = _DECODERS.get(message_id)
+    return None if decoder is None else decoder(payload, dialect)
+
+
+def decode_identity(payload: bytes) -> Identity:
+    """MAV_TYPE and MAV_AUTOPILOT of a HEARTBEAT."""
+    _, vehicle_type, autopilot, *_ = _unpack(mavlink.MAVLink_heartbeat_message, payload)
+    return Identity(vehicle_type, autopilot)
+
+
+def decode_ack_address(payload: bytes) -> Address:
+    """Whom a COMMAND_ACK answers; zeros mean everybody."""
+    *_, system_id, component_id = _unpack(mavlink.MAVLink_command_ack_message, payload)
+    return Address(system_id, component_id)
+
+
+def decode_timesync(payload: bytes) -> tuple[int, int]:
+    """(tc1, ts1) in nanoseconds; tc1 is 0 in a request."""
+    tc1, ts1 = _unpack(mavlink.MAVLink_timesync_message, payload)
+    return tc1, ts1
+
+
+def decode_text_chunk(payload: bytes) -> TextChunk:
+    """One STATUSTEXT; the last chunk of a text has its terminator."""
+    severity, text, text_id, chunk = _unpack(mavlink.MAVLink_statustext_message, payload)
+    data, terminator, _ = text.partition(b"\0")
+    return TextChunk(severity, data, text_id, chunk, bool(terminator))
+
+
+def _heartbeat(payload: bytes, dialect: Dialect) -> events.Event:
+    custom_mode, _, _, base_mode, status, _ = _unpack(mavlink.MAVLink_heartbeat_message, payload)
+    return events.Heartbeat(dialect.mode_name(custom_mode), bool(base_mode & _ARMED), status)
+
+
+def _local_position(payload: bytes, _: Dialect) -> events.Event | DropReason:
+    boot_ms, x, y, z, vx, vy, vz = _unpack(mavlink.MAVLink_local_position_ned_message, payload)
+    far, fast = POSITION_LIMIT_M, VELOCITY_LIMIT_MPS
+    # comparisons with NaN are false: these refuse what is not finite, too
+    if not (-far < x < far and -far < y < far and -far < z < far):
+        return DropReason.IMPLAUSIBLE
+    if not (-fast < vx < fast and -fast < vy < fast and -fast < vz < fast):
+        return DropReason.IMPLAUSIBLE
+    return events.LocalPosition(boot_ms / 1000.0, (x, y, z), (vx, vy, vz))
+
+
+def _attitude(payload: bytes, _: Dialect) -> events.Event | DropReason:
+    boot_ms, w, x, y, z, p, q, r, *_offset = _unpack(
+        mavlink.MAVLink_attitude_quaternion_message, payload
+    )
+    norm = math.sqrt(w * w + x * x + y * y + z * z)
+    if not 0.9 < norm < 1.1:
+        return DropReason.IMPLAUSIBLE
+    limit = RATE_LIMIT_RADPS
+    if not (-limit < p < limit and -limit < q < limit and -limit < r < limit):
+        return DropReason.IMPLAUSIBLE
+    return events.Attitude(boot_ms / 1000.0, (w / norm, x / norm, y / norm, z / norm), (p, q, r))
+
+
+def _gps_fix(payload: bytes, _: Dialect) -> events.Event | DropReason | None:
+    stamp_us, latitude, longitude, altitude, _, _, speed, course, fix, _, _, accuracy, *_more = (
+        _unpack(mavlink.MAVLink_gps_raw_int_message, payload)
+    )
+    if fix < _FIX_3D:
+        return None
+    place = _place(latitude, longitude, altitude)
+    if place is None:
+        return DropReason.IMPLAUSIBLE
+    velocity = None
+    if speed < _UNKNOWN16 and course < _UNKNOWN16:
+        ahead = math.radians(course * 1e-2)
+        velocity = (speed * 1e-2 * math.cos(ahead), speed * 1e-2 * math.sin(ahead))
+    time_s = stamp_us * 1e-6 if 0 < stamp_us < _LONGEST_UPTIME_US else None
+    return events.GpsFix(time_s, place, velocity, accuracy * 1e-3 if accuracy else None)
+
+
+def _place(latitude: int, longitude: int, altitude_mm: int) -> Geodetic | None:
+    """From degrees * 1e7 and mm above mean sea level; None where no such place is."""
+    if abs(latitude) > 900_000_000 or abs(longitude) > 1_800_000_000:
+        return None
+    return Geodetic(latitude * 1e-7, longitude * 1e-7, altitude_mm * 1e-3)
+
+
+def _global_origin(payload: bytes, _: Dialect) -> events.Event | DropReason:
+    latitude, longitude, altitude, *_time = _unpack(
+        mavlink.MAVLink_gps_global_origin_message, payload
+    )
+    place = _place(latitude, longitude, altitude)
+    return DropReason.IMPLAUSIBLE if place is None else events.Origin(place, said=True)
+
+
+def _home(payload: bytes, _: Dialect) -> events.Event | DropReason:
+    latitude, longitude, altitude, x, y, z, *_more = _unpack(
+        mavlink.MAVLink_home_position_message, payload
+    )
+    place, far = _place(latitude, longitude, altitude), POSITION_LIMIT_M
+    if place is None or not (-far < x < far and -far < y < far and -far < z < far):
+        return DropReason.IMPLAUSIBLE
+    return events.Origin(origin_of(place, (x, y, z)), said=False)
+
+
+def _system_health(payload: bytes, _: Dialect) -> events.Event:
+    fields = _unpack(mavlink.MAVLink_sys_status_message, payload)
+    health, millivolts, percent = fields[2], fields[4], fields[12]
+    return events.SystemHealth(
+        prearm_ok=bool(health & _PREARM_CHECK),
+        battery_voltage_v=millivolts * 1e-3 if millivolts != 0xFFFF else None,
+        battery_remaining=percent * 1e-2 if 0 <= percent <= 100 else None,
+    )
+
+
+def _landed(payload: bytes, _: Dialect) -> events.Event:
+    _, state = _unpack(mavlink.MAVLink_extended_sys_state_message, payload)
+    return events.Landed(_LANDED[state] if state < len(_LANDED) else _LANDED[0])
+
+
+def _command_ack(payload: bytes, _: Dialect) -> events.Event:
+    command, result, *_address = _unpack(mavlink.MAVLink_command_ack_message, payload)
+    return events.CommandAck(
+        command, _RESULTS[result] if result < len(_RESULTS) else f"UNKNOWN({result})"
+    )
+
+
+def _parameter(payload: bytes, dialect: Dialect) -> events.Event | DropReason:
+    value, _, _, name, kind = _unpack(mavlink.MAVLink_param_value_message, payload)
+    if dialect.parameter_encoding is ParameterEncoding.BYTEWISE and kind != _REAL32:
+        # from the bytes: as a float they may be a signalling NaN, which Python does not preserve
+        if kind not in _UNSIGNED_TYPES + _SIGNED_TYPES:
+            return DropReason.IMPLAUSIBLE
+        value = int.from_bytes(payload[:4].ljust(4, b"\0"), "little", signed=kind in _SIGNED_TYPES)
+    if not math.isfinite(value):
+        return DropReason.IMPLAUSIBLE
+    text = printable(name.partition(b"\0")[0])
+    return events.Parameter(text, float(value)) if text else DropReason.IMPLAUSIBLE
+
+
+def printable(data: bytes) -> str:
+    """Text for a terminal: no control characters, whatever the wire brought."""
+    text = data.decode("utf-8", errors="replace")
+    return "".join(c if c.isprintable() else " " for c in text).strip()
+
+
+_DECODERS: Mapping[int, Callable[[bytes, Dialect], events.Event | DropReason | None]] = {
+    0: _heartbeat,
+    1: _system_health,
+    22: _parameter,
+    31: _attitude,
+    24: _gps_fix,
+    32: _local_position,
+    49: _global_origin,
+    77: _command_ack,
+    242: _home,
+    245: _landed,
+}

@@ -1,0 +1,96 @@
+"""ArduCopter (4.3 and later) at the MAVLink boundary, as data."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+from offboard.mavlink.dialects.base import (
+    CUSTOM_MODE_ENABLED,
+    TRACKING_TELEMETRY,
+    TYPE_ONBOARD_CONTROLLER,
+    Dialect,
+    ParameterEncoding,
+    Takeoff,
+    ThrustRule,
+    WantedMessage,
+    WatchedParameter,
+)
+
+
+def _mode_parameters(custom_mode: int) -> tuple[float, float, float]:
+    return CUSTOM_MODE_ENABLED, float(custom_mode), 0.0
+
+
+_MODES = {
+    0: "STABILIZE",
+    1: "ACRO",
+    2: "ALT_HOLD",
+    3: "AUTO",
+    4: "GUIDED",
+    5: "LOITER",
+    6: "RTL",
+    7: "CIRCLE",
+    9: "LAND",
+    11: "DRIFT",
+    13: "SPORT",
+    14: "FLIP",
+    15: "AUTOTUNE",
+    16: "POSHOLD",
+    17: "BRAKE",
+    18: "THROW",
+    19: "AVOID_ADSB",
+    20: "GUIDED_NOGPS",
+    21: "SMART_RTL",
+    22: "FLOWHOLD",
+    23: "FOLLOW",
+    24: "ZIGZAG",
+    25: "SYSTEMID",
+    26: "AUTOROTATE",
+    27: "AUTO_RTL",
+    28: "TURTLE",
+}
+
+ARDUPILOT = Dialect(
+    name="ardupilot",
+    mav_autopilot=3,
+    heartbeat_type=TYPE_ONBOARD_CONTROLLER,
+    modes=MappingProxyType(_MODES),
+    mode_parameters=_mode_parameters,
+    engage_mode="GUIDED",
+    # LOITER obeys the throttle stick, and without one it descends or falls
+    hold_mode="BRAKE",
+    land_mode="LAND",
+    takeoff=Takeoff.COMMAND,
+    unused_parameter=0.0,  # NaN stops its SITL with a floating point exception
+    thrust_rule=ThrustRule.TILT_COMPENSATED,  # ATC_ANGLE_BOOST 1
+    # masks 1 to 6 throw the vehicle into position hold, 71 and 199 drop the message
+    attitude_type_mask=7,
+    parameter_encoding=ParameterEncoding.CAST,
+    watched_parameters=(
+        WatchedParameter(
+            "GUID_OPTIONS",
+            "without bit 8 the thrust field is a climb rate",
+            required_bits=8,
+            must_answer=True,
+        ),
+        WatchedParameter(
+            "GUID_TIMEOUT",
+            "seconds without setpoints before the vehicle levels",
+            allowed=(0.3, 5.0),
+        ),
+        WatchedParameter("MOT_THST_HOVER", "normalised thrust that holds the weight"),
+        WatchedParameter(
+            "ATC_ANGLE_BOOST",
+            "the autopilot must divide thrust by the tilt, since we do not",
+            allowed=(1.0, 1.0),
+            must_answer=True,
+        ),
+        WatchedParameter("FS_GCS_ENABLE", "what the vehicle does when the ground station is lost"),
+        WatchedParameter("FS_THR_ENABLE", "what the vehicle does when the radio is lost"),
+        WatchedParameter("SYSID_ENFORCE", "whether only SYSID_MYGCS is obeyed"),
+    ),
+    wanted=(
+        *TRACKING_TELEMETRY,
+        WantedMessage(108, "SIM_STATE", 50.0, optional=True),  # simulated truth
+    ),
+)

@@ -1,0 +1,80 @@
+"""PX4 (1.14 and later) at the MAVLink boundary, as data."""
+
+from __future__ import annotations
+
+from types import MappingProxyType
+
+from offboard.mavlink.dialects.base import (
+    CUSTOM_MODE_ENABLED,
+    TRACKING_TELEMETRY,
+    TYPE_GCS,
+    Dialect,
+    ParameterEncoding,
+    Takeoff,
+    ThrustRule,
+    WantedMessage,
+    WatchedParameter,
+)
+
+
+def _custom_mode(main: int, sub: int = 0) -> int:
+    return main << 16 | sub << 24
+
+
+def _mode_parameters(custom_mode: int) -> tuple[float, float, float]:
+    return CUSTOM_MODE_ENABLED, float(custom_mode >> 16 & 0xFF), float(custom_mode >> 24)
+
+
+_MODES = {
+    _custom_mode(1): "MANUAL",
+    _custom_mode(2): "ALTCTL",
+    _custom_mode(3): "POSCTL",
+    _custom_mode(3, 1): "POSCTL.ORBIT",
+    _custom_mode(4, 1): "AUTO.READY",
+    _custom_mode(4, 2): "AUTO.TAKEOFF",
+    _custom_mode(4, 3): "AUTO.LOITER",
+    _custom_mode(4, 4): "AUTO.MISSION",
+    _custom_mode(4, 5): "AUTO.RTL",
+    _custom_mode(4, 6): "AUTO.LAND",
+    _custom_mode(4, 8): "AUTO.FOLLOW_TARGET",
+    _custom_mode(4, 9): "AUTO.PRECLAND",
+    _custom_mode(4, 10): "AUTO.VTOL_TAKEOFF",
+    _custom_mode(5): "ACRO",
+    _custom_mode(6): "OFFBOARD",
+    _custom_mode(7): "STABILIZED",
+    _custom_mode(10): "TERMINATION",
+}
+
+PX4 = Dialect(
+    name="px4",
+    mav_autopilot=12,
+    # STATUSTEXT reaches only links whose heartbeat says ground station
+    heartbeat_type=TYPE_GCS,
+    modes=MappingProxyType(_MODES),
+    mode_parameters=_mode_parameters,
+    engage_mode="OFFBOARD",
+    hold_mode="AUTO.LOITER",
+    land_mode="AUTO.LAND",
+    # ACCEPTED by the receiver comes first, the commander's verdict up to 12 ms later
+    takeoff=Takeoff.SETPOINT,
+    unused_parameter=float("nan"),  # 0 would be a latitude
+    thrust_rule=ThrustRule.COLLECTIVE,
+    attitude_type_mask=7,
+    parameter_encoding=ParameterEncoding.BYTEWISE,
+    watched_parameters=(
+        WatchedParameter("MPC_THR_HOVER", "normalised thrust that holds the weight"),
+        WatchedParameter(
+            "COM_OF_LOSS_T",
+            "seconds without setpoints before the failsafe",
+            allowed=(0.3, 5.0),
+        ),
+        WatchedParameter("COM_OBL_RC_ACT", "what the vehicle does when setpoints stop"),
+        WatchedParameter("COM_RC_IN_MODE", "whether a radio is needed to arm"),
+        WatchedParameter("COM_RCL_EXCEPT", "modes in which a lost radio is no failsafe"),
+        WatchedParameter("NAV_DLL_ACT", "what the vehicle does when the ground station is lost"),
+    ),
+    wanted=(
+        *TRACKING_TELEMETRY,
+        WantedMessage(115, "HIL_STATE_QUATERNION", 50.0, optional=True),  # simulated truth
+    ),
+)

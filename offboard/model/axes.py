@@ -1,0 +1,69 @@
+"""The plant as an attitude setpoint sees it: the autopilot's attitude loop is part of the model.
+
+Written in the thrust direction b, acceleration = g e3 - T b - c v + d: the two lateral axes, the
+vertical and the course decouple, and no heading frame is needed. Delay is not part of these linear
+models: the observer predicts through it.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.model.kernel import kernel
+from offboard.model.vehicle import AxisResponse, Vehicle
+
+Array = NDArray[np.float64]
+
+
+# A thrust without lag would be a feed-through; this lag is far below every sampling period.
+SHORTEST_THRUST_LAG_S = 1e-3
+
+
+@dataclass(frozen=True, slots=True)
+class LinearModel:
+    """x' = A x + B u with one input: dynamics (n, n), input_map (n, 1)."""
+
+    dynamics: Array
+    input_map: Array
+
+
+def lateral_model(vehicle: Vehicle) -> LinearModel:
+    """One lateral axis, deviations [p, v, b, b'], input b_c: v' = -g b - c v, b'' = wn^2 (b_c - b)
+    - 2 z wn b' (the tilt response of `AxisResponse`)."""
+    stiffness = vehicle.tilt.natural_frequency_radps**2
+    dynamics = np.zeros((4, 4))
+    dynamics[0, 1] = 1.0
+    dynamics[1, 1:3] = -vehicle.drag_per_mass_ps, -vehicle.gravity_mps2
+    dynamics[2, 3] = 1.0
+    dynamics[3, 2] = -stiffness
+    dynamics[3, 3] = -2.0 * vehicle.tilt.damping * vehicle.tilt.natural_frequency_radps
+    return LinearModel(dynamics, np.array([[0.0], [0.0], [0.0], [stiffness]]))
+
+
+def vertical_model(vehicle: Vehicle) -> LinearModel:
+    """The vertical axis, deviations [z, v_z, f_z], input f_c: v_z' = -f_z - c v_z,
+    f_z' = (f_c - f_z) / lag, f_z = T b_z being the vertical part of the thrust, m/s^2."""
+    rate = 1.0 / max(vehicle.thrust_lag_s, SHORTEST_THRUST_LAG_S)
+    drag = vehicle.drag_per_mass_ps
+    dynamics = np.array([[0.0, 1.0, 0.0], [0.0, -drag, -1.0], [0.0, 0.0, -rate]])
+    return LinearModel(dynamics, np.array([[0.0], [0.0], [rate]]))
+
+
+def lead(value: Array, rate: Array, acceleration: Array, response: AxisResponse) -> Array:
+    """The command whose second-order response (delay aside) is the given motion:
+    s + 2 z / wn s' + s'' / wn^2. Any common shape."""
+    frequency = response.natural_frequency_radps
+    command: Array = (
+        value + (2.0 * response.damping / frequency) * rate + acceleration / frequency**2
+    )
+    return command
+
+
+@kernel
+def upright(north: float, east: float) -> float:
+    """Third component of a unit vector, kept positive whatever the other two are."""
+    return math.sqrt(max(1.0 - north * north - east * east, 0.01))

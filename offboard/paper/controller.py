@@ -1,0 +1,213 @@
+"""The controller named `paper`: the paper's law, one step ahead on [f_t, tau], over MAVLink.
+
+The swarm searches the inputs of Eq. 6 on the hover model (Eqs. 14, 21, 26); the attitude that the
+model predicts for k+1 is sent, and the autopilot's attitude loop realises it in the place of the
+torques. Knows no autopilot and reads no clock.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.control.base import Decision, DecisionError, Situation
+from offboard.control.certificate import ExactMinimum, certify
+from offboard.model.command import Command
+from offboard.model.frames import wrap_pi
+from offboard.model.linear import sampled_matrices
+from offboard.model.predicted_state import PredictedState
+from offboard.model.state import PHI, PSI, THETA, THRUST, P, R, U, W, X, Z
+from offboard.model.vehicle import Vehicle
+from offboard.paper.integral import ErrorIntegral
+from offboard.paper.law import (
+    PAPER_ARM_M,
+    PAPER_INERTIA_KGM2,
+    PAPER_MASS_KG,
+    PAPER_STEP_S,
+    Move,
+    PaperLaw,
+    PaperSettings,
+)
+from offboard.reference.base import FlatSample
+
+Array = NDArray[np.float64]
+
+
+class PaperController:
+    """`PaperLaw` between a predicted state and a command; `stopwatch` () -> s lets it keep a
+    deadline and report its time. Without one it takes the iterations it is allowed."""
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        settings: PaperSettings | None = None,
+        step_s: float = PAPER_STEP_S,
+        stopwatch: Callable[[], float] | None = None,
+        seed: int = 0,
+    ) -> None:
+        settings = settings or PaperSettings()
+        dynamics, inputs = sampled_matrices(vehicle, step_s)
+        lower, upper = flyable_box(vehicle, settings)
+        self._vehicle = vehicle
+        self._settings = settings
+        self._step_s = step_s
+        self._stopwatch = stopwatch
+        self._law = PaperLaw(
+            dynamics,
+            inputs * input_scale(vehicle),
+            settings,
+            lower,
+            upper,
+            step_s=step_s,
+            seed=seed,
+        )
+        self._integral = ErrorIntegral(settings.integral, step_s) if settings.integral else None
+        self._held = False  # the input was at its bound: the integral waits
+        self._exact = ExactMinimum(len(lower))
+
+    def decide(self, situation: Situation) -> Decision:
+        """The command for one tick. Raises DecisionError where the state has no finite cost."""
+        started = self._stopwatch() if self._stopwatch else math.nan
+        target = situation.reference.sample(situation.state.time_s + self._step_s)
+        if not _usable(situation.state):
+            raise DecisionError("the predicted state is not finite")
+        state, reference = heading_frame(situation.state, target)
+        move = self._law.move(
+            state,
+            reference,
+            self._remaining(situation.deadline_s, started),
+            integral=self._summed(situation),
+        )
+        if not math.isfinite(move.result.cost):
+            raise DecisionError("the cost of this decision is not finite")
+        certificate = certify(move.problem, move.result, self._exact)
+        self._held = certificate.at_bound
+        if self._stopwatch:
+            certificate = replace(certificate, solve_time_s=self._stopwatch() - started)
+        return Decision(self._command(move, state, float(target.course_rad)), certificate)
+
+    def reset(self) -> None:
+        """Forget everything of the previous flight, the random stream included."""
+        self._law.reset()
+        self._held = False
+        if self._integral:
+            self._integral.reset()
+
+    def warm_up(self) -> None:
+        """Call every code path once, compiled and daqp's, and forget it again."""
+        move = self._law.move(np.zeros(12), np.zeros(12), lambda: math.inf)
+        certify(move.problem, move.result, self._exact)
+        self.reset()
+
+    def _summed(self, situation: Situation) -> Array | None:
+        """The integral (4,) turned to the heading; summed in NED, where the wind stands still."""
+        if not self._integral:
+            return None
+        state, now = situation.state, situation.reference.sample(situation.state.time_s)
+        course = wrap_pi(state.course_rad - float(now.course_rad))
+        error = np.append(state.position_ned_m - now.position_ned_m, course)
+        summed = self._integral.add(error, self._held).copy()
+        summed[:3] = _turn(-state.course_rad) @ summed[:3]
+        return summed
+
+    def _remaining(self, deadline_s: float | None, started: float) -> Callable[[], float] | None:
+        stopwatch = self._stopwatch
+        if stopwatch is None or deadline_s is None:
+            return None
+        return lambda: deadline_s - (stopwatch() - started)
+
+    def _command(self, move: Move, state: Array, target_course_rad: float) -> Command:
+        gravity, limit = self._vehicle.gravity_mps2, self._vehicle.thrust_max_mps2
+        thrust = gravity + float(move.inputs[THRUST]) / PAPER_MASS_KG
+        phi, theta, psi = (float(angle) for angle in self._attitude(state, move.following))
+        course = target_course_rad + psi
+        return Command(
+            min(max(thrust, 0.0), limit), _thrust_direction(phi, theta, course), wrap_pi(course)
+        )
+
+    def _attitude(self, state: Array, following: Array) -> Array:
+        """[phi, theta, psi] to send, from x(k) and x(k+1) (12,)."""
+        predicted = following[PHI : PSI + 1]
+        if not self._settings.attitude_lead:
+            return predicted
+        rates = following[P : R + 1]
+        accelerations = (rates - state[P : R + 1]) / self._step_s
+        loops = (self._vehicle.tilt, self._vehicle.tilt, self._vehicle.yaw)
+        frequency = np.array([loop.natural_frequency_radps for loop in loops])
+        damping = np.array([loop.damping for loop in loops])
+        # s_c from s'' = wn^2 (s_c - s) - 2 z wn s'; its delay is in the state predicted already
+        lead: Array = 2.0 * damping / frequency * rates + accelerations / frequency**2
+        asked: Array = predicted + lead
+        return asked
+
+
+def input_scale(vehicle: Vehicle) -> Array:
+    """Newtons (metres) of the vehicle per newton (metre) of the paper's, (4,), Eq. 6.
+
+    The same input accelerates both alike, in translation and in rotation.
+    """
+    arms = np.array([vehicle.arm_m / PAPER_ARM_M, vehicle.arm_m / PAPER_ARM_M, 1.0])
+    inertia = np.array(vehicle.inertia_kgm2) / np.array(PAPER_INERTIA_KGM2)
+    return np.concatenate([[vehicle.mass_kg / PAPER_MASS_KG], inertia / arms])
+
+
+def flyable_box(vehicle: Vehicle, settings: PaperSettings) -> tuple[Array, Array]:
+    """The settings' box (4,), (4,) with f_t cut to a total thrust of 0 .. maximum (cf. Eq. 26)."""
+    lower, upper = np.array(settings.lower), np.array(settings.upper)
+    hover = vehicle.gravity_mps2
+    lower[THRUST] = max(lower[THRUST], -PAPER_MASS_KG * hover)
+    upper[THRUST] = min(upper[THRUST], PAPER_MASS_KG * (vehicle.thrust_max_mps2 - hover))
+    return lower, upper
+
+
+def heading_frame(state: PredictedState, target: FlatSample) -> tuple[Array, Array]:
+    """State and reference (12,) of Eqs. 5 and 27, turned by -psi and shifted to the target.
+
+    The hover model holds at course north only; in axes along and across the nose it holds at any.
+    Positions and course count from the target, velocities stay absolute because drag acts on them.
+    """
+    to_heading = _turn(-state.course_rad)
+    direction = to_heading @ state.thrust_direction_ned
+    vector = np.zeros(12)
+    vector[PHI] = math.asin(min(max(-direction[1], -1.0), 1.0))
+    vector[THETA] = math.atan2(direction[0], direction[2])
+    vector[PSI] = wrap_pi(state.course_rad - float(target.course_rad))
+    vector[P : R + 1] = state.rates_frd_radps
+    vector[U : W + 1] = to_heading @ state.velocity_ned_mps
+    vector[X : Z + 1] = to_heading @ (state.position_ned_m - target.position_ned_m)
+    reference = np.zeros(12)
+    reference[U : W + 1] = to_heading @ target.velocity_ned_mps
+    return vector, reference
+
+
+def _usable(state: PredictedState) -> bool:
+    return math.isfinite(state.course_rad) and all(
+        np.isfinite(part).all()
+        for part in (
+            state.position_ned_m,
+            state.velocity_ned_mps,
+            state.thrust_direction_ned,
+            state.rates_frd_radps,
+        )
+    )
+
+
+def _turn(angle_rad: float) -> Array:
+    """Rotation (3, 3) about the vertical."""
+    cosine, sine = math.cos(angle_rad), math.sin(angle_rad)
+    return np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _thrust_direction(phi: float, theta: float, psi: float) -> tuple[float, float, float]:
+    """Third body axis in NED of the Z-Y-X angles in rad."""
+    along, across = math.sin(theta) * math.cos(phi), -math.sin(phi)
+    cosine, sine = math.cos(psi), math.sin(psi)
+    return (
+        cosine * along - sine * across,
+        sine * along + cosine * across,
+        math.cos(theta) * math.cos(phi),
+    )

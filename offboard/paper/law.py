@@ -1,0 +1,171 @@
+"""The paper's law on any plant of Eq. 14: settings, and one input u(k) per state and reference.
+
+Beyond the paper, and absent by default: an integral term in the cost and limits on the state, both
+of which its conclusions ask for. Knows no vehicle, no autopilot, no clock.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field
+from scipy.linalg import block_diag
+
+from offboard.control.cost import BoxQuadratic
+from offboard.control.swarm import QuadraticSwarm, RandomLanes, SwarmResult, SwarmSettings
+from offboard.documents.parameters import Parameters
+from offboard.paper.integral import (
+    INTEGRATED,
+    IntegralSettings,
+    augmented,
+    augmented_reference,
+)
+from offboard.paper.one_step import OneStep
+from offboard.paper.state_limits import LimitedBox, StateLimits
+
+Array = NDArray[np.float64]
+
+PAPER_STEP_S = 0.1  # what Eq. 16 is sampled with, though it says 0.05
+PAPER_MASS_KG = 0.4  # Table 1
+PAPER_INERTIA_KGM2 = (0.0196, 0.0196, 0.0264)  # Table 1
+PAPER_ARM_M = 0.225  # not in Table 1, but Eq. 16 is only reproduced with it
+
+Weight = Annotated[float, Field(ge=0)]
+Four = tuple[float, float, float, float]
+FourWeights = tuple[Weight, Weight, Weight, Weight]
+TwelveWeights = tuple[
+    Weight, Weight, Weight, Weight, Weight, Weight, Weight, Weight, Weight, Weight, Weight, Weight
+]
+
+
+class PaperSettings(Parameters):
+    """Weights, box and swarm of the paper, by default the final ones (section 4.3).
+
+    States in the order of Eq. 5 in SI (psi in radians). Inputs are those of the paper's vehicle:
+    another vehicle's are scaled so that the same numbers accelerate it alike, and box and weights
+    keep their meaning. They are relative to hover; f_t is cut further where the total thrust
+    would be negative or above the vehicle's maximum.
+
+    The attitude sent is the one predicted for k+1. `attitude_lead` sends instead what the
+    autopilot's loop must be asked for so that it follows that prediction: without it a slow or
+    well damped loop realises a fraction of the torques only.
+
+    `integral` adds the summed position and course error to the cost, `limits` keeps tilt, rates
+    and speeds within bounds; without them the law is the paper's.
+    """
+
+    fitness: TwelveWeights = (1, 1, 25, 1, 1, 1, 20, 20, 5, 20, 20, 5)  # diag Q, Eq. 33
+    energy: FourWeights = (0.00057, 0.125, 0.125, 0.5)  # diag R, Eq. 34
+    rate: FourWeights = (1, 1, 1, 1)  # diag R_du, Eqs. 25 and 35
+    lower: Four = (-4.0, -0.2, -0.2, -0.1)  # N, N, N, N m, Eq. 26
+    upper: Four = (3.942, 0.2, 0.2, 0.1)  # Eq. 26
+    attitude_lead: bool = False
+    keep_constant: bool = True  # of J; epsilon of Eq. 29 rests on its rounding
+    integral: IntegralSettings | None = None
+    limits: StateLimits | None = None
+    swarm: SwarmSettings = SwarmSettings()
+
+    @classmethod
+    def first_configuration(cls) -> PaperSettings:
+        """Section 4.1: Q = I (Eq. 23 is lost; I gives the paper's magnitudes), R of Eq. 24, no
+        damping, and no rebound, which gives the paper's epsilon."""
+        return cls(
+            fitness=(1,) * 12,
+            energy=(0.0057, 1.25, 1.25, 5.0),
+            swarm=SwarmSettings(damping=1.0, rebound=0.0),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """What the law chose: inputs u(k) (4,), the state (12,) they lead to, and how it was found."""
+
+    inputs: Array
+    following: Array
+    problem: BoxQuadratic
+    result: SwarmResult
+
+
+class PaperLaw:
+    """The law on any plant of Eq. 14: dynamics (12, 12), inputs (12, 4), box (4,), (4,).
+
+    Remembers the last input (for R_du) and the random stream; `reset` forgets both. `terminal`
+    (12, 12) takes the place of diag(Q), for instance `cost_to_go` of the same weights. The
+    integral is summed by the caller, who knows the frame (`ErrorIntegral`). Raises ValueError
+    where the settings' limits cannot be kept on this plant.
+    """
+
+    def __init__(
+        self,
+        dynamics: Array,
+        inputs: Array,
+        settings: PaperSettings,
+        lower: Array | None = None,
+        upper: Array | None = None,
+        terminal: Array | None = None,
+        step_s: float = PAPER_STEP_S,
+        seed: int = 0,
+    ) -> None:
+        weight = np.diag(settings.fitness) if terminal is None else terminal
+        self._step_s = step_s
+        self._lower = np.array(settings.lower if lower is None else lower, np.float64)
+        self._upper = np.array(settings.upper if upper is None else upper, np.float64)
+        self._limits = (
+            LimitedBox(dynamics, inputs, settings.limits, self._lower, self._upper)
+            if settings.limits
+            else None
+        )
+        self._integral = settings.integral
+        if settings.integral:
+            dynamics, inputs = augmented(dynamics, inputs, step_s)
+            weight = block_diag(weight, np.diag(settings.integral.weights))
+        self._step = OneStep(
+            dynamics, inputs, weight, np.diag(settings.energy), np.diag(settings.rate)
+        )
+        self._keep_constant = settings.keep_constant
+        self._swarm = QuadraticSwarm(settings.swarm, len(self._lower))
+        self._lanes = RandomLanes(seed)
+        self._hover = np.zeros(len(self._lower))
+        self._previous = self._hover
+
+    def move(
+        self,
+        state: Array,
+        reference_next: Array,
+        remaining_s: Callable[[], float] | None = None,
+        *,
+        integral: Array | None = None,
+        nominal: Array | None = None,
+        keep_history: bool = False,
+    ) -> Move:
+        """u(k) for the state x(k) (12,) towards x_ref(k+1) (12,), Eq. 27.
+
+        `integral` (4,) is the summed error xi(k), heeded where the settings weigh it; `nominal`
+        (4,) is u_nom where it is not hover.
+        """
+        lower, upper = self._lower, self._upper
+        if self._limits:
+            lower, upper = self._limits.narrow(state)
+        whole = state
+        if self._integral:
+            summed = np.zeros(len(INTEGRATED)) if integral is None else integral
+            whole = np.concatenate([state, summed])
+            reference_next = augmented_reference(reference_next, self._step_s)
+        problem = self._step.problem(
+            whole, reference_next, self._hover if nominal is None else nominal, self._previous,
+            lower, upper, keep_constant=self._keep_constant,
+        )  # fmt: skip
+        result = self._swarm.minimise(
+            problem, self._lanes, remaining_s=remaining_s, keep_history=keep_history
+        )
+        self._previous = result.best
+        following = self._step.predict(whole, result.best)[: len(state)]
+        return Move(result.best, following, problem, result)
+
+    def reset(self) -> None:
+        self._previous = self._hover
+        self._lanes.reset()

@@ -1,0 +1,81 @@
+"""Eq. 21 as a quadratic in the input: one step ahead, weighed by any matrix.
+
+With Q as the weight of x(k+1) this is the paper's objective; with the Riccati solution of the
+same weights in its place (`cost_to_go`) the same search becomes infinite-horizon optimal. Knows
+no vehicle and no units: whoever brings the model brings them.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from offboard.control.cost import BoxQuadratic
+
+Array = NDArray[np.float64]
+
+
+class OneStep:
+    """J(u) of Eq. 21 for one model and one set of weights; `problem` fills in the situation.
+
+    dynamics A (n, n), inputs B (n, m), terminal W (n, n) on x_ref(k+1) - x(k+1), energy R (m, m)
+    on u_nom - u, rate R_du (m, m) on u - u(k-1), cross S (n, m) on twice the product of
+    x(k) - x_ref(k) and u - u_nom. All weights symmetric but S.
+    """
+
+    def __init__(
+        self,
+        dynamics: ArrayLike,
+        inputs: ArrayLike,
+        terminal: ArrayLike,
+        energy: ArrayLike,
+        rate: ArrayLike | None = None,
+        cross: ArrayLike | None = None,
+    ) -> None:
+        self._dynamics = np.array(dynamics, np.float64)
+        self._inputs = np.array(inputs, np.float64)
+        self._terminal = np.array(terminal, np.float64)
+        self._energy = np.array(energy, np.float64)
+        self._rate = np.zeros_like(self._energy) if rate is None else np.array(rate, np.float64)
+        self._cross = np.zeros_like(self._inputs) if cross is None else np.array(cross, np.float64)
+        curvature = self._inputs.T @ self._terminal @ self._inputs + self._energy + self._rate
+        self._hessian = curvature + curvature.T
+
+    def predict(self, state: Array, inputs: Array) -> Array:
+        """x(k+1) (..., n) of states (..., n) and inputs (..., m), Eq. 14."""
+        following: Array = state @ self._dynamics.T + inputs @ self._inputs.T
+        return following
+
+    def problem(
+        self,
+        state: Array,
+        reference_next: Array,
+        nominal: Array,
+        previous: Array,
+        lower: Array,
+        upper: Array,
+        *,
+        reference: Array | None = None,
+        keep_constant: bool = True,
+    ) -> BoxQuadratic:
+        """The quadratic in u(k) from state x(k) (n,) towards reference_next x_ref(k+1) (n,).
+
+        nominal u_nom, previous u(k-1), lower and upper (Eq. 22): (m,). `reference` x_ref(k) (n,)
+        matters to the cross weight only and is 0 if not given. The constant term does not move
+        the minimum, but the swarm's floor (epsilon of Eq. 29) is the rounding of J: without it
+        the paper's epsilon does not come out.
+        """
+        error = self._dynamics @ state - reference_next
+        off = state if reference is None else state - reference
+        weighed = self._terminal @ error
+        gradient = self._inputs.T @ weighed - self._energy @ nominal - self._rate @ previous
+        gradient = 2.0 * (gradient + self._cross.T @ off)
+        constant = 0.0
+        if keep_constant:
+            constant = float(
+                error @ weighed
+                + nominal @ self._energy @ nominal
+                + previous @ self._rate @ previous
+                - 2.0 * off @ self._cross @ nominal
+            )
+        return BoxQuadratic(self._hessian, gradient, constant, lower, upper)
