@@ -1,1 +1,1 @@
-"""From a predicted state and a reference to a command: laws, swarm, horizon. No MAVLink, no clock."""
+"""From a predicted state and a reference to a command: laws, swarm and horizon."""

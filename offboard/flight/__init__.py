@@ -1,1 +1,1 @@
-"""One flight: phases, actions, link, log and loop. The only package with sockets, files and time."""
+"""One flight: phases, actions, link, log and loop. Only this package has sockets and time."""

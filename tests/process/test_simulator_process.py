@@ -155,7 +155,7 @@ def test_it_can_wait_to_be_spoken_to_and_shifts_its_system() -> None:
     ("options", "says"),
     [
         (("--scenario", "storm"), "there is no scenario named 'storm'; known are all_together, "),
-        (("--vehicle", "no/such.yaml"), "vehicle no/such.yaml not found"),
+        (("--vehicle", "no/such.yaml"), "no/such.yaml cannot be read: No such file"),
         (("--firmware", "betaflight"), "--firmware betaflight: unknown; there is px4"),
         (("--connect", "tcp:127.0.0.1:1"), "tcp:127.0.0.1:1 is no link"),
         (("--connect", "udpout:127.0.0.1:99999"), "is no link"),
