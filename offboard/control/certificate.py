@@ -52,8 +52,7 @@ class ExactMinimum:
         minimiser, _, status, _ = self._model.solve()
         if status < 1:
             return unsolved
-        inside: Array = np.clip(minimiser, problem.lower, problem.upper)
-        return inside
+        return problem.clip(minimiser)
 
 
 def certify(

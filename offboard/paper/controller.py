@@ -8,13 +8,12 @@ torques. Knows no autopilot and reads no clock.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.base import Decision, DecisionError, Situation
+from offboard.control.base import ControllerSettings, Decision, DecisionError, Situation
 from offboard.control.certificate import ExactMinimum, certify
 from offboard.model.command import Command
 from offboard.model.frames import wrap_pi
@@ -37,16 +36,26 @@ from offboard.reference.base import FlatSample
 Array = NDArray[np.float64]
 
 
+class PaperControllerSettings(PaperSettings, ControllerSettings):
+    """Settings of the law `paper`; registered as an entry point like that of any other package."""
+
+    law: Literal["paper"] = "paper"
+
+    def build(self, vehicle: Vehicle, *, period_s: float, seed: int) -> PaperController:
+        return PaperController(vehicle, self, period_s, seed)
+
+
 class PaperController:
-    """`PaperLaw` between a predicted state and a command; `stopwatch` () -> s lets it keep a
-    deadline and report its time. Without one it takes the iterations it is allowed."""
+    """`PaperLaw` between a predicted state and a command.
+
+    Raises ValueError where the settings' state limits cannot be kept by this vehicle.
+    """
 
     def __init__(
         self,
         vehicle: Vehicle,
         settings: PaperSettings | None = None,
         step_s: float = PAPER_STEP_S,
-        stopwatch: Callable[[], float] | None = None,
         seed: int = 0,
     ) -> None:
         settings = settings or PaperSettings()
@@ -55,7 +64,6 @@ class PaperController:
         self._vehicle = vehicle
         self._settings = settings
         self._step_s = step_s
-        self._stopwatch = stopwatch
         self._law = PaperLaw(
             dynamics,
             inputs * input_scale(vehicle),
@@ -70,38 +78,24 @@ class PaperController:
         self._exact = ExactMinimum(len(lower))
 
     def decide(self, situation: Situation) -> Decision:
-        """The command for one tick. Raises DecisionError where the state has no finite cost."""
-        started = self._stopwatch() if self._stopwatch else math.nan
         target = situation.reference.sample(situation.state.time_s + self._step_s)
         if not _usable(situation.state):
             raise DecisionError("the predicted state is not finite")
         state, reference = heading_frame(situation.state, target)
         move = self._law.move(
-            state,
-            reference,
-            self._remaining(situation.deadline_s, started),
-            integral=self._summed(situation),
+            state, reference, situation.remaining_s, integral=self._summed(situation)
         )
         if not math.isfinite(move.result.cost):
             raise DecisionError("the cost of this decision is not finite")
         certificate = certify(move.problem, move.result, self._exact)
         self._held = certificate.at_bound
-        if self._stopwatch:
-            certificate = replace(certificate, solve_time_s=self._stopwatch() - started)
         return Decision(self._command(move, state, float(target.course_rad)), certificate)
 
     def reset(self) -> None:
-        """Forget everything of the previous flight, the random stream included."""
         self._law.reset()
         self._held = False
         if self._integral:
             self._integral.reset()
-
-    def warm_up(self) -> None:
-        """Call every code path once, compiled and daqp's, and forget it again."""
-        move = self._law.move(np.zeros(12), np.zeros(12), lambda: math.inf)
-        certify(move.problem, move.result, self._exact)
-        self.reset()
 
     def _summed(self, situation: Situation) -> Array | None:
         """The integral (4,) turned to the heading; summed in NED, where the wind stands still."""
@@ -113,12 +107,6 @@ class PaperController:
         summed = self._integral.add(error, self._held).copy()
         summed[:3] = _turn(-state.course_rad) @ summed[:3]
         return summed
-
-    def _remaining(self, deadline_s: float | None, started: float) -> Callable[[], float] | None:
-        stopwatch = self._stopwatch
-        if stopwatch is None or deadline_s is None:
-            return None
-        return lambda: deadline_s - (stopwatch() - started)
 
     def _command(self, move: Move, state: Array, target_course_rad: float) -> Command:
         gravity, limit = self._vehicle.gravity_mps2, self._vehicle.thrust_max_mps2
