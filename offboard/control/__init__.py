@@ -27,8 +27,8 @@ both into a package and register the settings class as an entry point:
 
     class PdSettings(ControllerSettings):
         law: Literal["pd"] = "pd"
-        stiffness_ps2: float = Field(default=3.0, gt=0, le=20)  # m/s^2 per m
-        damping_ps: float = Field(default=3.0, gt=0, le=20)  # m/s^2 per m/s
+        stiffness_ps2: float = Field(default=6.0, gt=0, le=20)  # m/s^2 per m
+        damping_ps: float = Field(default=4.0, gt=0, le=20)  # m/s^2 per m/s
 
         def build(self, vehicle, *, period_s, seed):
             return Pd(self, vehicle.gravity_mps2)
@@ -58,7 +58,7 @@ both into a package and register the settings class as an entry point:
 After `pip install` of this package:
 
     offboard fly --sitl --controller pd
-    offboard fly --sitl --controller pd --set controller.damping_ps=4
+    offboard fly --sitl --controller pd --set controller.damping_ps=5
     offboard compare --controllers pd,pso,pid
 
 A YAML file with `law: pd` and other values is given as `--controller my.yaml`. `Situation`,
