@@ -31,8 +31,8 @@ from offboard.estimation.observer import ObserverSettings
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Limits
 from offboard.model.vehicle import Vehicle
-from offboard.reference.catalogue import SHAPES, FromTable, ReferenceConfig, build
 from offboard.reference.feasibility import check
+from offboard.reference.shapes import SHAPES, FromTable, Shape
 from offboard.reference.track import Track
 
 Raw = dict[str, Any]
@@ -45,8 +45,8 @@ class FlightConfig(Parameters):
     """Everything that decides a flight, resolved. `flight.yaml` of a flight directory is one."""
 
     vehicle: Vehicle
-    controller: SerializeAsAny[ControllerSettings]  # of the law that it names
-    reference: ReferenceConfig
+    controller: SerializeAsAny[ControllerSettings]  # the settings class of its `law`
+    reference: SerializeAsAny[Shape]  # the class of its `shape`
     estimate: FollowedEstimate = FollowedEstimate.VEHICLE
     fusion: FusionSettings = FusionSettings()
     observer: ObserverSettings = ObserverSettings()
@@ -101,12 +101,10 @@ def build_track(config: FlightConfig) -> Track:
     Raises DocumentError naming time, value and limit where it cannot be flown.
     """
     try:
-        track = build(config.reference)
+        track = config.reference.track()
         check(track, config.vehicle)
     except ValueError as error:
-        given = config.reference
-        name = given.file if isinstance(given, FromTable) else given.shape
-        raise DocumentError(f"reference {name}: {error}") from None
+        raise DocumentError(f"reference {config.reference.title}: {error}") from None
     refused = config.controller.refusal(track)
     if refused:
         raise DocumentError(f"controller: {refused}")
@@ -145,7 +143,7 @@ def check_file(path: Path, check_scenario: Callable[[Path], None]) -> str:
         return "scenario"
     kind = _kind(raw)
     if kind in FOLDERS:
-        validate(raw, _model(kind, raw, str(path)), str(path))
+        validate(raw, _model(kind, raw), str(path))
         if kind == "reference":
             build_track(load("flight", choices={kind: name}))
     else:
@@ -187,15 +185,9 @@ def flown(text: str) -> FlightConfig:
 
 
 def _validated(raw: Raw, source: str, options: Mapping[str, str]) -> FlightConfig:
-    """`raw` as a FlightConfig whose controller has the settings class of its law."""
-    controller = raw.get("controller")
-    law = controller.get("law") if isinstance(controller, dict) else None
-    known = catalogue.names()
-    if law in known:
-        settings: type[BaseModel] = catalogue.settings_of(law)
-    else:  # refused, with the names
-        settings = create_model("Law", law=(StrEnum("Law", known), ...))  # type: ignore[arg-type]
-    model = create_model("FlightConfig", __base__=FlightConfig, controller=(settings, ...))
+    """`raw` as a FlightConfig whose parts have the classes that they name."""
+    parts: dict[str, Any] = {part: (_model(part, raw.get(part)), ...) for part in FOLDERS}
+    model = create_model("FlightConfig", __base__=FlightConfig, **parts)
     return FlightConfig(**dict(validate(raw, model, source, options)))
 
 
@@ -225,17 +217,17 @@ def read_part(part: str, name: str) -> Raw:
         return {"law": name}
     path = locate(name, FOLDERS[part], part, laws)
     raw = read(read_text(path), str(path))
-    validate(raw, _model(part, raw, str(path)), str(path))
+    validate(raw, _model(part, raw), str(path))
     return raw
 
 
-def _model(part: str, raw: Raw, source: str) -> type[BaseModel]:
+def _model(part: str, raw: object) -> type[BaseModel]:
+    """The class of a vehicle, or of the controller or reference that `raw` names. Where it names
+    none, a class that refuses it and knows the names."""
     if part == "vehicle":
         return Vehicle
     key, known = ("law", catalogue.names()) if part == "controller" else ("shape", list(SHAPES))
-    chosen = raw.get(key)
-    if key not in raw:
-        raise DocumentError(f"{source}: {key} is missing; known are {', '.join(known)}")
-    if chosen not in known:
-        raise DocumentError(f"{source}: {key} is {chosen!r}; known are {', '.join(known)}")
-    return catalogue.settings_of(chosen) if part == "controller" else SHAPES[chosen]
+    named = raw.get(key) if isinstance(raw, dict) else None
+    if named not in known:
+        return create_model("Unknown", **{key: (StrEnum("Names", known), ...)})  # type: ignore
+    return catalogue.settings_of(named) if part == "controller" else SHAPES[named]
