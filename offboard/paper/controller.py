@@ -1,8 +1,7 @@
-"""The controller named `paper`: the paper's law, one step ahead on [f_t, tau], over MAVLink.
+"""The law `paper`: the paper's law, one step ahead on [f_t, tau], with attitude setpoints.
 
-The swarm searches the inputs of Eq. 6 on the hover model (Eqs. 14, 21, 26); the attitude that the
-model predicts for k+1 is sent, and the autopilot's attitude loop realises it in the place of the
-torques. Knows no autopilot and reads no clock.
+The swarm searches the inputs of Eq. 6 on the hover model (Eqs. 14, 21, 26). Instead of the torques
+the attitude that the model predicts for k+1 is sent; the autopilot's attitude loop realises it.
 """
 
 from __future__ import annotations
@@ -74,7 +73,7 @@ class PaperController:
             seed=seed,
         )
         self._integral = ErrorIntegral(settings.integral, step_s) if settings.integral else None
-        self._held = False  # the input was at its bound: the integral waits
+        self._held = False  # whether the last input was at its bound: the integral waits
         self._exact = ExactMinimum(len(lower))
 
     def decide(self, situation: Situation) -> Decision:
@@ -98,7 +97,7 @@ class PaperController:
             self._integral.reset()
 
     def _summed(self, situation: Situation) -> Array | None:
-        """The integral (4,) turned to the heading; summed in NED, where the wind stands still."""
+        """The integral (4,) in the heading frame; summed in NED, where a wind is constant."""
         if not self._integral:
             return None
         state, now = situation.state, situation.reference.sample(situation.state.time_s)
@@ -127,24 +126,23 @@ class PaperController:
         loops = (self._vehicle.tilt, self._vehicle.tilt, self._vehicle.yaw)
         frequency = np.array([loop.natural_frequency_radps for loop in loops])
         damping = np.array([loop.damping for loop in loops])
-        # s_c from s'' = wn^2 (s_c - s) - 2 z wn s'; its delay is in the state predicted already
+        # s_c from s'' = wn^2 (s_c - s) - 2 z wn s'; the state is already predicted over the delay
         lead: Array = 2.0 * damping / frequency * rates + accelerations / frequency**2
         asked: Array = predicted + lead
         return asked
 
 
 def input_scale(vehicle: Vehicle) -> Array:
-    """Newtons (metres) of the vehicle per newton (metre) of the paper's, (4,), Eq. 6.
-
-    The same input accelerates both alike, in translation and in rotation.
-    """
+    """Factor (4,) from inputs of the paper's vehicle (Eq. 6) to those of `vehicle` that cause the
+    same accelerations, in translation and in rotation."""
     arms = np.array([vehicle.arm_m / PAPER_ARM_M, vehicle.arm_m / PAPER_ARM_M, 1.0])
     inertia = np.array(vehicle.inertia_kgm2) / np.array(PAPER_INERTIA_KGM2)
     return np.concatenate([[vehicle.mass_kg / PAPER_MASS_KG], inertia / arms])
 
 
 def flyable_box(vehicle: Vehicle, settings: PaperSettings) -> tuple[Array, Array]:
-    """The settings' box (4,), (4,) with f_t cut to a total thrust of 0 .. maximum (cf. Eq. 26)."""
+    """Lower and upper (4,) of the settings, with f_t limited to a total thrust between 0 and the
+    vehicle's maximum (cf. Eq. 26)."""
     lower, upper = np.array(settings.lower), np.array(settings.upper)
     hover = vehicle.gravity_mps2
     lower[THRUST] = max(lower[THRUST], -PAPER_MASS_KG * hover)
@@ -153,10 +151,11 @@ def flyable_box(vehicle: Vehicle, settings: PaperSettings) -> tuple[Array, Array
 
 
 def heading_frame(state: PredictedState, target: FlatSample) -> tuple[Array, Array]:
-    """State and reference (12,) of Eqs. 5 and 27, turned by -psi and shifted to the target.
+    """State and reference (12,) of Eqs. 5 and 27, rotated by -psi and relative to the target.
 
-    The hover model holds at course north only; in axes along and across the nose it holds at any.
-    Positions and course count from the target, velocities stay absolute because drag acts on them.
+    The hover model is valid for a course of north only; in axes along and across the nose it is
+    valid for every course. Positions and course are relative to the target; velocities stay
+    absolute because drag acts on them.
     """
     to_heading = _turn(-state.course_rad)
     direction = to_heading @ state.thrust_direction_ned
