@@ -116,8 +116,7 @@ class Punctuality:
 
 def warm_up(instance: Instance) -> None:
     """Run all compiled code once with an instance that is not used later."""
-    instance.advance_to_barrier(WARM_UP_S)
-    while instance.time_s < 2.0 * WARM_UP_S:
+    while instance.time_s < WARM_UP_S:
         instance.advance()
 
 
