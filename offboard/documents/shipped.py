@@ -5,6 +5,7 @@ An installed package has `config/` inside it; a checkout has it beside the packa
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
@@ -23,15 +24,16 @@ def names(folder: str) -> list[str]:
     return sorted(path.stem for path in (directory() / folder).glob("*.yaml"))
 
 
-def locate(name: str, folder: str, kind: str) -> Path:
+def locate(name: str, folder: str, kind: str, others: Sequence[str] = ()) -> Path:
     """The file with a shipped name, or the file named: a name with a `/` or that ends in .yaml or
-    .yml. Raises DocumentError with the known names."""
+    .yml. Raises DocumentError with the known names, `others` among them."""
     if name.endswith((".yaml", ".yml")) or "/" in name:
         return Path(name)
     candidate = directory() / folder / f"{name}.yaml"
     if candidate.is_file():
         return candidate
-    raise DocumentError(f"there is no {kind} named {name!r}; known are {', '.join(names(folder))}")
+    known = sorted((*names(folder), *others))
+    raise DocumentError(f"there is no {kind} named {name!r}; known are {', '.join(known)}")
 
 
 def read_text(path: Path) -> str:

@@ -102,13 +102,13 @@ def rehearse(parts: FlightParts, *, keeps_deadline: bool) -> float:
         observer.on_position(time_s, (0.0, 0.0, -2.0), (0.0, 0.0, 0.0))
         if step >= 20 and step % 10 == 0:
             state = observer.predict(time_s)
-            situation = Situation(time_s, state, reference, previous, parts.deadline_s)
+            situation = Situation(time_s, state, reference, previous, lambda: parts.deadline_s)
             command = parts.controller.decide(situation).command
             if isinstance(command, Command):
                 previous = command
                 observer.on_command(time_s, command)
     if keeps_deadline:
-        _check_deadline(parts, replace(situation, deadline_s=0.0))
+        _check_deadline(parts, replace(situation, remaining_s=lambda: 0.0))
     parts.track.sample(np.array([0.0, 1.0]))
     if parts.learning and parts.learning.online:
         identification.warm_up(parts.vehicle)
