@@ -27,7 +27,6 @@ from offboard.flight.phases import Limits
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.flight.sitl import SimulatorProcess
 from offboard.flight.stop import StopRequests
-from offboard.identification import stages as identification
 from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
 from offboard.model.command import Command
@@ -110,8 +109,6 @@ def rehearse(parts: FlightParts, *, keeps_deadline: bool) -> float:
     if keeps_deadline:
         _check_deadline(parts, replace(situation, remaining_s=lambda: 0.0))
     parts.track.sample(np.array([0.0, 1.0]))
-    if parts.learning and parts.learning.online:
-        identification.warm_up(parts.vehicle)
     parts.controller.reset()
     return clock.monotonic_s() - began_s
 
