@@ -147,6 +147,8 @@ class Companion:
         if self.view.has_state and not self.has_ended():
             self._tick_if_due(arrived_s)
         self._outbox.pass_on(self._session.poll(now_s))
+        if not self.view.has_state:
+            self._machine.advance()
         for reply in reception.replies:
             self._outbox.send(reply)
         return self._outbox.take(reception.frames, alive)
@@ -156,7 +158,7 @@ class Companion:
         machine = self._machine
         machine.silence_s = silence_s
         patience_s = min(self._limits.silence_s, self._limits.connect_s)
-        if not self.view.has_state or machine.stop_reason or silence_s > patience_s:
+        if machine.stop_reason or silence_s > patience_s:
             machine.advance()
         if not self.has_ended() and silence_s > BRIDGED_SHARE * self._limits.silence_s:
             self._bridge(silence_s)

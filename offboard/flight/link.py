@@ -15,10 +15,13 @@ from collections.abc import Callable, Hashable
 from contextlib import suppress
 from typing import Protocol
 
+from offboard.mavlink.framing import frame_size
+
 Chunk = tuple[bytes, Hashable]
 DATAGRAM_SIZE = 65535
 WAITING_MAX = 50  # frames
 SETPOINTS = frozenset({82, 84, 86})  # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_*
+TIMESYNC = 111
 TCP_NOTSENT_LOWAT = 25  # Linux's option, which the socket module names since Python 3.12
 
 
@@ -102,8 +105,13 @@ class Backlog:
                 self._begun = self._begun[send(self._begun) :]
 
 
+def _message_id(frame: bytes) -> int:
+    """Of a MAVLink 2 frame."""
+    return int.from_bytes(frame[7:10], "little")
+
+
 def _is_setpoint(frame: bytes) -> bool:
-    return int.from_bytes(frame[7:10], "little") in SETPOINTS
+    return _message_id(frame) in SETPOINTS
 
 
 class TcpLink:
@@ -189,6 +197,46 @@ class SerialLink:
 
     def close(self) -> None:
         self._port.close()
+
+
+class LockstepLink:
+    """A link to a simulator in lockstep: all datagrams up to a barrier at once, and only once.
+
+    A barrier is a TIMESYNC request at the end of a datagram. The simulator waits there for the
+    answer; until it comes, all datagrams since the previous barrier are sent again.
+    """
+
+    is_stream = False
+
+    def __init__(self, link: Link) -> None:
+        self._link = link
+        self._block: list[Chunk] = []  # since the newest barrier
+        self._barrier = b""
+
+    def receive(self, timeout_s: float) -> list[Chunk]:
+        complete: list[Chunk] = []
+        for chunk in self._link.receive(timeout_s):
+            self._block.append(chunk)
+            if not _is_barrier(chunk[0]):
+                continue
+            if chunk[0] != self._barrier:
+                complete += self._block
+            self._barrier, self._block = chunk[0], []
+        return complete
+
+    def send(self, data: bytes, peer: Hashable | None) -> None:
+        self._link.send(data, peer)
+
+    def close(self) -> None:
+        self._link.close()
+
+
+def _is_barrier(datagram: bytes) -> bool:
+    """Whether the last frame is a TIMESYNC request, which has tc1 = 0."""
+    at = last = 0
+    while at < len(datagram):
+        last, at = at, at + (frame_size(datagram, at) or len(datagram))
+    return _message_id(datagram[last:]) == TIMESYNC and not any(datagram[last + 10 : last + 18])
 
 
 def open_link(address: str) -> Link:

@@ -17,11 +17,7 @@ POLL_S = 0.02
 
 
 class Loop:
-    """Moves bytes between one link, one companion and one log until the flight ends.
-
-    `lockstep` makes the vehicle's time the link's time: then nothing that is sent depends on the
-    wall clock, and two flights with one seed send the same bytes.
-    """
+    """Moves bytes between one link, one companion and one log until the flight ends."""
 
     def __init__(
         self,
@@ -30,7 +26,6 @@ class Loop:
         log: FlightLog,
         *,
         stops: StopRequests,
-        lockstep: bool,
         progress: Callable[[Companion], None],
         vehicle_process_ended: Callable[[], Ending | None] = lambda: None,
     ) -> None:
@@ -38,7 +33,6 @@ class Loop:
         self._link = link
         self._log = log
         self._stops = stops
-        self._lockstep = lockstep
         self._machine = progress
         self._vehicle_process_ended = vehicle_process_ended
         self._log_error: str | None = None
@@ -65,7 +59,6 @@ class Loop:
 
     def _fly(self) -> None:
         companion, link = self._companion, self._link
-        link.receive(0.0)  # what waited while we prepared is old
         heard_s = polled_s = clock.monotonic_s()
         while not (companion.has_ended() or self._stops.insisted or self._ended_early):
             if self._stops.asked:
@@ -73,7 +66,7 @@ class Loop:
             chunks = link.receive(POLL_S)
             now_s = clock.monotonic_s()
             for data, peer in chunks:
-                output = companion.receive(data, peer, self._time_s(now_s))
+                output = companion.receive(data, peer, now_s)
                 if output.alive:
                     heard_s = now_s
                 self._deliver(output, peer)
@@ -81,12 +74,9 @@ class Loop:
                     break
             if not chunks or now_s - polled_s > POLL_S:
                 polled_s = now_s
-                self._deliver(companion.poll(self._time_s(now_s), now_s - heard_s), companion.peer)
+                self._deliver(companion.poll(now_s, now_s - heard_s), companion.peer)
                 self._show()
                 self._check_process()
-
-    def _time_s(self, now_s: float) -> float:
-        return self._companion.view.time_s if self._lockstep else now_s
 
     def _deliver(self, output: Output, peer: Hashable | None) -> None:
         target = self._companion.peer or peer

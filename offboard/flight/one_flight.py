@@ -19,7 +19,7 @@ from offboard.estimation.observer import Observer
 from offboard.flight import clock, manifest
 from offboard.flight.companion import Companion, Outcome
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.link import UdpLink, open_link
+from offboard.flight.link import LockstepLink, UdpLink, open_link
 from offboard.flight.log import FlightLog
 from offboard.flight.loop import Loop
 from offboard.flight.online_identification import IdentifySettings
@@ -56,6 +56,7 @@ class Bundled:
         """Of the `simulator` command: this vehicle, sending to a port of ours."""
         return [
             *("--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", "--lockstep"),
+            *("--patience", f"{SITL_PATIENCE_S:g}"),
             *("--seed", str(self.seed), "--firmware", self.firmware),
             *(("--scenario", self.scenario) if self.scenario else ()),
             *(("--vehicle", self.vehicle) if self.vehicle else ()),
@@ -170,6 +171,7 @@ def fly(
                 component_id=COMPONENT_ID,
                 record_component_id=RECORD_COMPONENT_ID,
                 stream=link.is_stream,
+                lockstep=bundled is not None,
                 speaks_first=not (bundled or connection.startswith("udpin")),
                 wanted_too=POSITIONING_TELEMETRY if fuses else (),
             )
@@ -178,13 +180,14 @@ def fly(
             log.begin(clock.unix_us(), session.encode(piece))
         loop = Loop(
             _companion(parts, session, observer, lockstep=bundled is not None),
-            link,
+            LockstepLink(link) if bundled else link,
             log,
             stops=stops,
-            lockstep=bundled is not None,
             progress=progress,
             vehicle_process_ended=bundled.simulator.ended if bundled else lambda: None,
         )
+        if not bundled:
+            link.receive(0.0)  # telemetry that arrived while we prepared is too old to use
         return loop.run()
 
 

@@ -58,7 +58,8 @@ class SessionSettings:
     in any portions. `speaks_first`: heartbeat before anybody was heard (somebody listens at the
     other end). `requests_intervals` False leaves the vehicle's rates alone. `wanted` replaces the
     dialect's telemetry, `wanted_too` adds to it. `record_component_id` stamps the records that only
-    our log sees; each component id has its own sequence numbers.
+    our log sees; each component id has its own sequence numbers. `lockstep`: the vehicle waits for
+    our answers, and only its time counts: the host times given to `receive` and `poll` are ignored.
     """
 
     system_id: int | None = None
@@ -69,6 +70,7 @@ class SessionSettings:
     wanted: tuple[WantedMessage, ...] | None = None
     wanted_too: tuple[WantedMessage, ...] = ()
     record_component_id: int = 191
+    lockstep: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,6 +102,7 @@ class Session:
         self._sequence_out: dict[int, int] = {}
         self._texts = TextAssembler()
         self._time = VehicleTime()
+        self._vehicle_s = 0.0  # newest stamp before the newest datagram
         self._link_time = LinkTime()
         self._rates = TelemetryRates((), 0.0)
         self._heartbeat_sent: tuple[float, float] | None = None  # host time, link time
@@ -108,6 +111,8 @@ class Session:
 
     def receive(self, datagram: bytes, peer: Hashable, now_s: float) -> Reception:
         """Take a datagram (or any portion of a stream) that came from `peer`. Never raises."""
+        self._vehicle_s = self._time.newest_s
+        now_s = self._clock_s(now_s)
         frames: list[bytes] = []
         events: list[Event] = []
         if self._peer.is_foreign(peer):
@@ -249,6 +254,7 @@ class Session:
     def poll(self, now_s: float) -> tuple[bytes, ...]:
         """Frames that are due: our heartbeat (1 Hz of host or vehicle time, whichever is faster)
         and requests for telemetry that is missing or too slow. Call it every cycle."""
+        now_s = self._clock_s(now_s)
         self._link_time.host(now_s)
         if self.dialect is None and not self.settings.speaks_first:
             return ()  # PX4 remembers the type of every heartbeat and misses the one that changed
@@ -281,6 +287,9 @@ class Session:
         sequence = self._sequence_out.get(component_id, 0)
         self._sequence_out[component_id] = (sequence + 1) % 256
         return framing.pack(*packed, sequence, self._own.system_id, component_id)
+
+    def _clock_s(self, host_s: float) -> float:
+        return self._vehicle_s if self.settings.lockstep else host_s
 
     # --- what is known of the link ---
 

@@ -19,18 +19,18 @@ class VehicleTime:
     """Judges time stamps: each message's must rise, and none may lie far behind the newest."""
 
     def __init__(self) -> None:
-        self._newest_s = 0.0
+        self.newest_s = 0.0
         self._last_s: dict[int, float] = {}
 
     def judge(self, message_id: int, time_s: float) -> Age:
-        if time_s < self._newest_s - _REORDERING_S:
-            self._newest_s = time_s
+        if time_s < self.newest_s - _REORDERING_S:
+            self.newest_s = time_s
             self._last_s = {message_id: time_s}
             return Age.REBOOTED
         last_s = self._last_s.get(message_id)
         if last_s is not None and time_s <= last_s:
             return Age.STALE
         self._last_s[message_id] = time_s
-        if time_s > self._newest_s:
-            self._newest_s = time_s
+        if time_s > self.newest_s:
+            self.newest_s = time_s
         return Age.FRESH
