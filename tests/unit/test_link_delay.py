@@ -1,14 +1,14 @@
-"""The delay of the link from TIMESYNC answers, and the vehicle estimate behind it."""
+"""The delay of the link from TIMESYNC replies, and the estimate of a vehicle behind this link."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from offboard.flight.link_delay import LONGEST_S, LinkDelay
+from offboard.flight.link_delay import DELAY_MAX_S, LinkDelay
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import VehicleEstimate
-from offboard.mavlink.events import TimeAnswer
+from offboard.mavlink.events import TimesyncReply
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 PX4 = Vehicle(
@@ -24,37 +24,37 @@ PX4 = Vehicle(
 )
 
 
-def answered(link: LinkDelay, telemetry_s: float, delay_s: float) -> TimeAnswer:
-    asked_ns = link.question(telemetry_s).ts1_ns
-    return TimeAnswer(asked_ns, asked_ns + round(delay_s * 1e9))
+def reply(link: LinkDelay, telemetry_s: float, delay_s: float) -> TimesyncReply:
+    request_ns = link.request(telemetry_s).ts1_ns
+    return TimesyncReply(request_ns, request_ns + round(delay_s * 1e9))
 
 
-def test_median_and_scatter_of_the_answers() -> None:
+def test_median_and_spread_of_the_replies() -> None:
     link, rng = LinkDelay(), np.random.default_rng(3)
     for number, delay_s in enumerate(rng.normal(0.12, 0.01, 40)):
-        link.note(answered(link, 5.0 + 0.1 * number, delay_s))
+        link.on_reply(reply(link, 5.0 + 0.1 * number, delay_s))
     assert link.estimate is not None
     assert link.estimate.value == pytest.approx(0.12, abs=0.005)
     assert link.estimate.sd == pytest.approx(0.01, rel=0.4)
-    link.forget()
+    link.reset()
     assert link.estimate is None
 
 
-def test_what_is_no_answer_to_us_counts_for_nothing() -> None:
+def test_replies_to_others_late_and_duplicate_ones_are_ignored() -> None:
     link = LinkDelay()
     for number in range(5):
         at_s = float(number)
-        answer = answered(link, at_s, 0.05)
-        link.note(TimeAnswer(answer.asked_ns + 1, answer.vehicle_ns))  # somebody else's question
-        link.note(answered(link, at_s + 0.2, -0.01))  # other clocks
-        link.note(answered(link, at_s + 0.4, LONGEST_S + 0.01))
+        own = reply(link, at_s, 0.05)
+        link.on_reply(TimesyncReply(own.request_ns + 1, own.vehicle_ns))  # another sender's request
+        link.on_reply(reply(link, at_s + 0.2, -0.01))  # other clocks
+        link.on_reply(reply(link, at_s + 0.4, DELAY_MAX_S + 0.01))
         assert link.estimate is None
-        link.note(answer)
-        link.note(TimeAnswer(answer.asked_ns, answer.vehicle_ns + 10**9))  # a repetition
+        link.on_reply(own)
+        link.on_reply(TimesyncReply(own.request_ns, own.vehicle_ns + 10**9))  # a duplicate
     assert link.estimate == Estimate(pytest.approx(0.05), 0.0)
 
 
-def new_estimate() -> VehicleEstimate:
+def believing() -> VehicleEstimate:
     return VehicleEstimate(
         PX4, factor=4.0, blend_s=1.0, unknown_delay_s=0.28, period_s=0.1, bandwidth_radps=7.0
     )
@@ -62,23 +62,23 @@ def new_estimate() -> VehicleEstimate:
 
 @pytest.mark.parametrize("late_s", [0.1, 0.2, 0.3])
 def test_every_delay_of_the_vehicle_is_later_by_the_link(late_s: float) -> None:
-    estimate, direct = new_estimate(), new_estimate()
-    (sentence,) = estimate.apply_link_delay(Estimate(late_s + 0.004, 0.003))
-    assert f"link delay {1e3 * late_s + 4:.0f} +- 3 ms" in sentence
-    assert estimate.settled
-    now = estimate.now
+    belief, direct = believing(), believing()
+    (sentence,) = belief.expect_link(Estimate(late_s + 0.004, 0.003))
+    assert f"{1e3 * late_s + 4:.0f} +- 3 ms late" in sentence
+    assert belief.settled
+    now = belief.now
     assert now.tilt.delay_s == pytest.approx(0.057 + late_s)
     assert now.yaw.delay_s == pytest.approx(0.148 + late_s, abs=0.001)
     assert now.thrust_delay_s == pytest.approx(0.015 + late_s)
     assert now.tilt.natural_frequency_radps == 11.4
-    assert direct.apply_link_delay(Estimate(0.004, 0.001)) == []
+    assert direct.expect_link(Estimate(0.004, 0.001)) == []
     assert direct.now == PX4
-    assert new_estimate().cautious_radps == pytest.approx(direct.cautious_radps, abs=0.1)
-    assert estimate.cautious_radps <= direct.cautious_radps
+    assert believing().cautious_radps == pytest.approx(direct.cautious_radps, abs=0.1)
+    assert belief.cautious_radps <= direct.cautious_radps
 
 
 def test_a_link_that_scatters_bears_less() -> None:
-    steady, scattering = new_estimate(), new_estimate()
-    steady.apply_link_delay(Estimate(0.2, 0.001))
-    scattering.apply_link_delay(Estimate(0.2, 0.03))
+    steady, scattering = believing(), believing()
+    steady.expect_link(Estimate(0.2, 0.001))
+    scattering.expect_link(Estimate(0.2, 0.03))
     assert scattering.cautious_radps < 0.9 * steady.cautious_radps
