@@ -168,7 +168,7 @@ def _announcer() -> Callable[[Companion], None]:
     def announce(companion: Companion) -> None:
         nonlocal shown
         for line in companion.announced[shown:]:
-            out.print(f"{companion.view.time_s:8.2f} s  {line}", markup=False, soft_wrap=True)
+            out.print(f"{companion.state.time_s:8.2f} s  {line}", markup=False, soft_wrap=True)
         shown = len(companion.announced)
 
     return announce

@@ -1,7 +1,7 @@
-"""One tick's decision: the state predicted, the law asked, its command checked and clamped.
+"""Decision of one tick: predict the state, call the control law, check and limit its command.
 
-What follows a decision is here too: its record in the log, and what the flight has taught of the
-vehicle until then. A law that fails is counted, never raised: the vehicle is in the air.
+After it: the record for the log, and the online identification. Failures of the law are counted,
+never raised: the vehicle is in the air.
 """
 
 from __future__ import annotations
@@ -13,13 +13,13 @@ from offboard.control.base import Adopting, Controller, Decision, DecisionError,
 from offboard.estimation.observer import Observer
 from offboard.flight.assessment import Assessment
 from offboard.flight.flight_plan import FlightPlan
+from offboard.flight.gate import clamp, usable
 from offboard.flight.online_identification import RECORD_ID as IDENTIFIED_ID
 from offboard.flight.online_identification import RECORD_NAME as IDENTIFIED_NAME
 from offboard.flight.online_identification import Adoption, OnlineIdentification
 from offboard.flight.outbox import Outbox
 from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.flight.record import RECORD_ID, RECORD_NAME, TickRecord, reference_record
-from offboard.flight.setpoint import clamp, usable
 from offboard.mavlink.outgoing import SolverRecord
 from offboard.model.command import Command, PositionCommand
 from offboard.model.predicted_state import PredictedState
@@ -27,18 +27,18 @@ from offboard.model.predicted_state import PredictedState
 
 @dataclass(frozen=True, slots=True)
 class Tick:
-    """One control tick: when, in which phase and for how long, and what it cost to get here."""
+    """One control tick."""
 
     time_s: float  # vehicle time
     phase: Phase
     in_phase_s: float
-    arrived_s: float  # stopwatch, when the telemetry came that made the tick
+    arrived_s: float  # stopwatch, on arrival of the telemetry that caused the tick
     missed: int = 0  # ticks skipped since the previous one
 
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """A decision and the state it was made for; `command` is what may leave."""
+    """A decision and the state it was made for; `command` is checked and limited."""
 
     state: PredictedState
     decision: Decision
@@ -47,7 +47,10 @@ class Decided:
 
 
 class Decider:
-    """Asks `controller`. `stopwatch` reads seconds, for solve times only."""
+    """Calls `controller`. `stopwatch` reads seconds, for solve times only.
+
+    `missed` counts failed decisions in a row, `failure` describes the newest.
+    """
 
     def __init__(
         self,
@@ -69,20 +72,20 @@ class Decider:
         self._outbox = outbox
         self._deadline_s = deadline_s
         self._stopwatch = stopwatch
-        self.missed = 0  # decisions, one after the other
-        self.failure = ""  # of the last one missed
+        self.missed = 0
+        self.failure = ""
 
     def begin(self) -> None:
-        """Before the first decision: cautious, while what is to be learnt is not known."""
+        """Before the first decision: limit the bandwidth until the vehicle is identified."""
         if self._identification and isinstance(self._controller, Adopting):
             limit_radps = self._identification.cautious_bandwidth_radps
             self._controller.adopt(self._outbox.vehicle, limit_radps)
 
     def decide(self, tick: Tick) -> Decided | None:
-        """None, and `missed` one more, where there is no decision that may leave."""
+        """The decision, or None if it failed, which increases `missed`."""
         try:
             decided = self._decided(tick)
-        except Exception as error:  # whatever it is, the vehicle is in the air
+        except Exception as error:  # any error: the vehicle is in the air
             self.missed += 1
             self.failure = f"{type(error).__name__}: {error}"
             self._outbox.warn(f"decision missed: {self.failure}")
@@ -91,7 +94,7 @@ class Decider:
         return decided
 
     def follow_up(self, tick: Tick, decided: Decided) -> None:
-        """After the setpoint has left, so that it waits for nothing: record and learn."""
+        """After the setpoint was queued: log the decision, identify, adopt the result."""
         self._record(tick, decided)
         if self._identification is None:
             return
@@ -99,9 +102,9 @@ class Decider:
             adoption = self._identification.learn(tick.phase, tick.time_s)
             if adoption is not None:
                 self._adopt(tick.time_s, adoption)
-        except Exception as error:  # flying on with what is believed is always possible
+        except Exception as error:  # the flight continues with the present vehicle model
             self._identification.give_up()
-            self._outbox.warn(f"identification ended: {error}")
+            self._outbox.warn(f"identification stopped: {error}")
 
     def _decided(self, tick: Tick) -> Decided:
         reference = self._plan.reference
@@ -147,14 +150,14 @@ class Decider:
         self._outbox.vehicle = adoption.vehicle
         if adoption.record:
             record = SolverRecord(time_s, adoption.record, IDENTIFIED_ID, IDENTIFIED_NAME)
-            self._outbox.note_down(record)
+            self._outbox.log(record)
         for sentence in adoption.sentences:
             self._outbox.announce(sentence)
 
     def _record(self, tick: Tick, decided: Decided) -> None:
         sample = self._plan.sample(tick.time_s)
         assert sample is not None
-        self._outbox.note_down(reference_record(tick.time_s, sample))
+        self._outbox.log(reference_record(tick.time_s, sample))
         record = TickRecord.of(
             phase=PHASE_CODES[tick.phase],
             decision=decided.decision,
@@ -165,5 +168,4 @@ class Decider:
             hover_thrust=self._observer.hover_thrust_estimate,
             track_time_s=self._plan.track_time_s(tick.time_s),
         )
-        data = SolverRecord(tick.time_s, record.data(), RECORD_ID, RECORD_NAME)
-        self._outbox.note_down(data)
+        self._outbox.log(SolverRecord(tick.time_s, record.data(), RECORD_ID, RECORD_NAME))

@@ -218,7 +218,7 @@ def make(
             SessionSettings(
                 component_id=COMPONENT_ID,
                 record_component_id=RECORD_COMPONENT_ID,
-                wanted_too=POSITIONING_TELEMETRY if isinstance(observer, FusedObserver) else (),
+                extra_wanted=POSITIONING_TELEMETRY if isinstance(observer, FusedObserver) else (),
             )
         ),
         observer=observer,
