@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from offboard.documents.errors import UserError
 from offboard.mavlink.counters import DropReason
 from offboard.mavlink.framing import Frame, frame_size, parse
 
@@ -27,7 +28,7 @@ _MAGIC = (0xFD, 0xFE)
 _codec = dialect.MAVLink(None)
 
 
-class TlogError(Exception):
+class TlogError(UserError):
     """A file that cannot be read as a .tlog: one sentence for the user."""
 
 

@@ -15,6 +15,8 @@ from collections.abc import Callable, Hashable
 from contextlib import suppress
 from typing import Protocol
 
+from offboard.documents.errors import UserError
+
 Chunk = tuple[bytes, Hashable]
 DATAGRAM_SIZE = 65535
 WAITING_MAX = 50  # frames
@@ -22,7 +24,7 @@ SETPOINTS = frozenset({82, 84, 86})  # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_
 TCP_NOTSENT_LOWAT = 25  # Linux's option, which the socket module names since Python 3.12
 
 
-class LinkError(Exception):
+class LinkError(UserError):
     """A link that cannot be opened or was lost: one sentence for the user."""
 
 

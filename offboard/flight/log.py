@@ -12,10 +12,12 @@ from errno import EACCES, ENOTDIR
 from pathlib import Path
 from types import TracebackType
 
+from offboard.documents.errors import UserError
+
 _STAMP = struct.Struct(">Q")
 
 
-class LogError(Exception):
+class LogError(UserError):
     """The flight directory cannot be written: one sentence for the user."""
 
 

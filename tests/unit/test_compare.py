@@ -27,9 +27,9 @@ from offboard.analysis.compare import (
     trials,
 )
 from offboard.analysis.compare_page import page
-from offboard.analysis.compare_table import lines
+from offboard.analysis.compare_table import show
 from offboard.analysis.comparison import compare_all
-from offboard.analysis.processors import processors
+from offboard.analysis.workers import processors
 from offboard.documents.reading import DocumentError
 
 LAWS = ("pso", "lqr", "an/uncommonly/long/name.yaml", "lost")
@@ -94,7 +94,9 @@ def test_files_hold_every_figure(rows: list[Row]) -> None:
 
 @pytest.mark.parametrize("width", [60, 80, 120, 200])
 def test_no_line_of_the_table_is_wider_than_the_window(rows: list[Row], width: int) -> None:
-    told = [line.plain for line in lines(rows, width)]
+    text = io.StringIO()
+    show(Console(file=text, width=width), rows)
+    told = text.getvalue().splitlines()
     assert max(map(len, told)) <= width
     whole = "\n".join(told)
     for words in (*LAWS[:2], *SCENARIOS, "[0.0109\N{EN DASH}0.0121]", "0.0119", "lost (2 of 3)"):

@@ -9,7 +9,7 @@ import sys
 import threading
 import time
 
-from offboard.analysis.interrupts import deaf_to_interrupts
+from offboard.analysis.workers import interrupts_deferred
 
 MASK = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()))"
 
@@ -18,7 +18,7 @@ def interrupted_meanwhile() -> list[str]:
     """What a process says of its own mask that was started after the interrupt."""
     said = []
     try:
-        with deaf_to_interrupts():
+        with interrupts_deferred():
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(0.05)
             command = (sys.executable, "-c", MASK)
