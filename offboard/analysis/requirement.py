@@ -28,7 +28,7 @@ class RequirementError(UserError):
 class Requirement:
     """One figure of the score compared with a number.
 
-    >>> Requirement.parse("rmse_position_m<0.05", FIGURES).met(score.figures())
+    Example: `Requirement.parse("rmse_position_m<0.05", FIGURES).met(score.figures())`.
     """
 
     figure: str

@@ -1,7 +1,7 @@
-"""The figures of one flight, from its History: how well it tracked, and what that took.
+"""The figures of one flight, computed from its History.
 
-Only the phase TRACK is scored; setpoint gaps count from take-off to landing. A figure that the
-log does not hold is NaN.
+Tracking, activity and telemetry are scored during the phase TRACK, setpoints from the first one to
+the landing, decisions over the whole flight. A figure that the log does not hold is NaN.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BPoly
 
-from offboard.analysis import link
-from offboard.analysis.history import Event, History
+from offboard.analysis import link_figures
+from offboard.analysis.history import History
 from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.model.frames import (
     course_from_quaternion,
@@ -40,7 +40,9 @@ class Score:
     estimates it (LOCAL_POSITION_NED), `truth` as it is in the simulator (HIL_STATE_QUATERNION or
     SIM_STATE). Times are vehicle time. A figure that the log does not hold is NaN.
 
-    >>> flight.score.rmse_position_m < 0.05
+    Example, with the pytest fixture `fly`:
+
+        assert fly(reference="hover").score.rmse_position_m < 0.05
     """
 
     rmse_position_m: float = _figure("position error, RMSE", "m")
@@ -101,13 +103,8 @@ class Score:
 FIGURES = {figure.name: figure.metadata for figure in fields(Score)}
 
 
-def phases(history: History) -> tuple[Event, ...]:
-    """What the flight went through: vehicle time and 'phase: reason'."""
-    return history.phases
-
-
 def score(history: History) -> Score:
-    """Compute every figure that the history supports."""
+    """Compute all figures of a flight from its arrays."""
     values: dict[str, float] = {}
     window = _window(history)
     if window is not None:
@@ -117,15 +114,15 @@ def score(history: History) -> Score:
         values |= _activity(history, reference, *window)
         values |= _truth(history, reference, *window)
         values["tracked_s"] = window[1] - window[0]
-        values |= link.telemetry(history, *window)
-    values |= link.setpoints(history)
-    values |= link.delay(history)
+        values |= link_figures.telemetry(history, *window)
+    values |= link_figures.setpoints(history)
+    values |= link_figures.delay(history)
     values |= _decisions(history)
     return Score(**values)
 
 
 def _window(history: History) -> tuple[float, float] | None:
-    """First and last vehicle time of the phase TRACK; None where the log holds too little of it."""
+    """First and last vehicle time of the phase TRACK; None with fewer than two samples."""
     track = float(PHASE_CODES[Phase.TRACK])
     times = [
         time_s
@@ -145,8 +142,8 @@ def _between(rows: Array, begin_s: float, end_s: float) -> Array:
 
 
 class _Reference:
-    """What was to be flown, as functions of vehicle time (N,): the records are joined by the
-    quintic that their position, velocity and acceleration determine."""
+    """The reference as a function of vehicle time (N,): between two records the quintic through
+    their positions, velocities and accelerations."""
 
     def __init__(self, rows: Array) -> None:
         newest = np.maximum.accumulate(rows[:, 0])
@@ -156,7 +153,7 @@ class _Reference:
         self._curve = BPoly.from_derivatives(self._times, knots)
 
     def position(self, times: Array, derivative: int = 0) -> Array:
-        """(N, 3) NED, or one of its derivatives."""
+        """(N, 3) position NED in m, or a derivative of it."""
         values: Array = self._curve.derivative(derivative)(times)
         return values
 
@@ -167,7 +164,7 @@ class _Reference:
 def _tracking(
     history: History, reference: _Reference, begin_s: float, end_s: float
 ) -> dict[str, float]:
-    position = link.each_once(_between(history.position, begin_s, end_s))
+    position = link_figures.each_once(_between(history.position, begin_s, end_s))
     times = position[:, 0]
     error_m = np.linalg.norm(position[:, 1:4] - reference.position(times), axis=1)
     slip_mps = np.linalg.norm(position[:, 4:7] - reference.position(times, 1), axis=1)
@@ -234,8 +231,8 @@ def _activity(
 
 
 def _agitation(reference: _Reference, attitude: Array) -> dict[str, float]:
-    """Motion that the reference does not explain: thrust direction and rates less their best
-    linear fit by the reference's velocity, acceleration and jerk (drag and lag need no model)."""
+    """Motion beside that of the reference: thrust direction and rates minus their linear fit by the
+    reference's velocity, acceleration and jerk. The fit needs no model of drag and lag."""
     times = attitude[:, 0]
     explained = [reference.position(times, order)[:, :2] for order in (1, 2, 3)]
     regressors = np.hstack((*explained, np.ones((len(times), 1))))

@@ -27,8 +27,8 @@ SECTIONS = {
 
 
 def summary(score: Score, history: History, directory: Path) -> list[tuple[str, str]]:
-    """(label, text) of what a person wants to know after a flight; figures that the log does not
-    hold are left out."""
+    """(label, text) of what a person wants to know after a flight. Figures that the log does not
+    hold are left out; without any there is no row."""
     rows = []
     if math.isfinite(score.rmse_position_m):
         rows.append(
@@ -52,11 +52,10 @@ def summary(score: Score, history: History, directory: Path) -> list[tuple[str, 
     identified = _identified(history)
     if identified:
         rows.append(("identified", identified))
-    return [
-        *rows,
-        ("log", str(directory / "flight.tlog")),
-        ("all figures", f"offboard score {directory}"),
-    ]
+    if rows:
+        rows.append(("log", str(directory / "flight.tlog")))
+        rows.append(("all figures", f"offboard score {directory}"))
+    return rows
 
 
 def _identified(history: History) -> str:
@@ -93,7 +92,7 @@ def show(console: Console, score: Score, history: History) -> None:
         console.print("nothing was flown that could be scored")
         return
     figures = Table(box=None, pad_edge=False, show_header=False)
-    figures.add_column()
+    figures.add_column(no_wrap=True)
     figures.add_column(justify="right")
     figures.add_column()
     figures.add_column(style="dim")

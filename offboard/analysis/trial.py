@@ -30,8 +30,10 @@ def score_flight(flight: Path) -> tuple[Score, History]:
     `flight` is a flight directory or a .tlog file. Returns the figures and the events and arrays
     that they were computed from. Raises TlogError.
 
-    >>> score, history = score_flight(Path("flights/20261121-093000"))
-    >>> score.rmse_position_m
+    Example:
+
+        score, history = score_flight(Path("flights/20261121-093000"))
+        print(score.rmse_position_m, history.position.shape)
     """
     flown = history.gather(tlog.read(tlog.find(flight)))
     return scoring.score(flown), flown

@@ -9,7 +9,16 @@ from typing import Annotated
 
 import typer
 
-from offboard.cli.shared import DEFAULT_CONNECTION, FLIGHTS, Assignments, CommandError, Vehicle, out
+from offboard.cli.shared import (
+    DEFAULT_CONNECTION,
+    FLIGHTS,
+    Assignments,
+    CommandError,
+    Vehicle,
+    out,
+    say,
+)
+from offboard.documents import shipped
 
 
 def compare(
@@ -53,30 +62,30 @@ def compare(
         raise CommandError(f"--workers {workers}: give 1 .. 256")
     if not 1 <= seeds <= 1000:
         raise CommandError(f"--seeds {seeds}: give 1 .. 1000")
-    from offboard.analysis.comparison import compare_all
-    from offboard.analysis.trial import check_flyable, fly_trial
-    from offboard.documents import shipped
-    from offboard.flight import clock
-    from offboard.flight.request import FlightRequest
-    from offboard.flight.sitl import check_scenario
-
     laws = _names(controllers, shipped.names("controllers"))
     references = _names(reference)
     scenarios = _names(scenario) if connect is None else ["connected"]
-    if connect is None:
-        files = [shipped.locate(name, "scenarios", "scenario") for name in scenarios]
-        for path in files:
-            if shipped.directory() not in path.parents:
-                check_scenario(path)
-    directory = out_directory or FLIGHTS / f"compare-{clock.local_stamp()}"
-    request = FlightRequest(
-        directory=directory,
-        choices={"vehicle": vehicle} if vehicle else {},
-        assignments=tuple(assignments or ()),
-        connection=connect or DEFAULT_CONNECTION,
-        sitl=connect is None,
+    say(
+        f"controllers: {len(laws)}, references: {len(references)}, scenarios: {len(scenarios)}, "
+        f"seeds: {seeds}"
     )
-    check_flyable(request, laws, references)
+    with out.status("checking that all of them can be flown"):
+        from offboard.analysis.comparison import compare_all
+        from offboard.analysis.trial import check_flyable, fly_trial
+        from offboard.flight import clock
+        from offboard.flight.request import FlightRequest
+
+        if connect is None:
+            _check_scenarios(scenarios)
+        directory = out_directory or FLIGHTS / f"compare-{clock.local_stamp()}"
+        request = FlightRequest(
+            directory=directory,
+            choices={"vehicle": vehicle} if vehicle else {},
+            assignments=tuple(assignments or ()),
+            connection=connect or DEFAULT_CONNECTION,
+            sitl=connect is None,
+        )
+        check_flyable(request, laws, references)
     problem = compare_all(
         partial(fly_trial, request),
         controllers=laws,
@@ -89,6 +98,15 @@ def compare(
     )
     if problem:
         raise CommandError(problem, 4)
+
+
+def _check_scenarios(names: Sequence[str]) -> None:
+    """Check the scenario files that are not shipped. Raises DocumentError."""
+    from offboard.flight.sitl import check_scenario
+
+    for path in [shipped.locate(name, "scenarios", "scenario") for name in names]:
+        if shipped.directory() not in path.parents:
+            check_scenario(path)
 
 
 def _names(text: str, known: Sequence[str] = ()) -> list[str]:

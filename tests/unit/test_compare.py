@@ -227,6 +227,37 @@ def test_flights_that_would_share_a_directory_are_refused_before_the_first(
     assert not (tmp_path / "all").exists()
 
 
+@pytest.mark.parametrize("terminal", [False, True], ids=["piped", "terminal"])
+def test_progress_is_shown_before_the_first_flight_ends(
+    tmp_path: Path, terminal: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Piped, a line for each flight; on a terminal, a bar that is gone at the end."""
+    monkeypatch.setenv("TERM", "xterm")
+    text = io.StringIO()
+    shown: list[str] = []
+
+    def fly(trial: Trial) -> Result:
+        shown.append(text.getvalue())
+        return lands(trial)
+
+    compare_all(
+        fly,
+        controllers=["pso", "lqr"],
+        references=["hover"],
+        scenarios=["calm"],
+        seeds=[1],
+        directory=tmp_path / "all",
+        workers=0,
+        console=Console(file=text, width=80, force_terminal=terminal),
+    )
+    assert "2 flights, 1 at a time" in shown[0]
+    assert ("0/2" in shown[0]) is terminal
+    lines = ["   1  pso-hover-calm-1: 1.00 m", "   2  lqr-hover-calm-1: 1.00 m"]
+    assert [line for line in text.getvalue().splitlines() if line in lines] == (
+        [] if terminal else lines
+    )
+
+
 def lands(trial: Trial) -> Result:
     return Result(trial, 0, "flown and landed", dict.fromkeys(FIGURES, 1.0))
 
