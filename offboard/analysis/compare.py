@@ -129,7 +129,7 @@ def trials(
         if other is not trial:
             raise DocumentError(
                 f"{_named(other)} and {_named(trial)} would both be recorded in "
-                f"{trial.directory}; name each once, and no two files alike"
+                f"{trial.directory}; give each name once and files different names"
             )
     return planned
 

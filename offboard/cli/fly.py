@@ -93,7 +93,7 @@ def fly(
     from offboard.flight.stop import StopRequests
 
     if sitl and connect:
-        raise CommandError("--sitl flies a simulator of its own: leave --connect out, or --sitl")
+        raise CommandError("--sitl starts its own simulator: use --sitl or --connect, not both")
     if not sitl and (scenario or sim_vehicle or firmware != "px4"):
         raise CommandError("--scenario, --sim-vehicle and --firmware are options of --sitl: add it")
     named = {"controller": controller, "reference": reference, "vehicle": vehicle}

@@ -106,7 +106,7 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         (("--connect", "serial:/dev/nonexistent:57600"), "cannot be opened"),
         (("--out", "/dev/null/x"), "recorded in /dev/null/x: Not a directory; choose a directory"),
         (("--out", "/proc/nowhere"), "choose a directory that can be written with --out"),
-        (("--sitl",), "--sitl flies a simulator of its own: leave --connect out, or --sitl"),
+        (("--sitl",), "--sitl starts its own simulator: use --sitl or --connect, not both"),
         (kept_out(0, 0, 3, 0.5), "keep_out[0] (sphere) contains the start of the reference"),
         (kept_out(0, 0, 0, 0.5), "keep_out[0] (sphere) contains the take-off point with its"),
         (kept_out(0, 0, 6, 5), "keep_out[0] (sphere) contains the whole path with its clearance"),
@@ -367,7 +367,9 @@ def test_a_pipe_that_closes_ends_no_flight(spawn: Spawn, tmp_path: Path) -> None
     assert flown.phases[-1].what.startswith("disarmed")
 
 
-def test_a_score_that_cannot_be_kept_is_told(spawn: Spawn, offboard: Call, tmp_path: Path) -> None:
+def test_a_score_that_cannot_be_written_is_reported(
+    spawn: Spawn, offboard: Call, tmp_path: Path
+) -> None:
     process = spawn("offboard", "fly", "--sitl", "--out", "x", "--reference", "hover")
     assert process.wait(timeout=60) == 0
     (tmp_path / "x" / "score.json").unlink()
@@ -375,7 +377,7 @@ def test_a_score_that_cannot_be_kept_is_told(spawn: Spawn, offboard: Call, tmp_p
     assert offboard("score", "x") == (0, "x/score.json cannot be written (Is a directory)\n")
 
 
-def test_half_a_score_is_not_kept(tmp_path: Path) -> None:
+def test_an_incomplete_score_is_not_kept(tmp_path: Path) -> None:
     score, flown = score_flight(RECORDING)
     limit = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (100, limit[1]))

@@ -1,8 +1,9 @@
-"""What the commands print: it fits the terminal, and `fly` prints once, live, verdict last."""
+"""Output of the commands: width, shipped files in --help, phases and result of `fly`."""
 
 from __future__ import annotations
 
 import io
+import json
 import os
 import pty
 import subprocess
@@ -79,7 +80,7 @@ def test_a_score_fits(columns: int) -> None:
 def test_a_piped_flight_prints_its_phases_once_as_they_happen(spawn: Spawn, tmp_path: Path) -> None:
     process = spawn(
         "offboard", "fly", "--sitl", "--scenario", "calm", "--out", "x", "--reference", "hover",
-        "--set", "reference.duration_s=100", "--require", "rmse_position_m<0.5",
+        "--set", "reference.duration_s=10", "--require", "rmse_position_m<0.5",
         COLUMNS="80", PYTHONUNBUFFERED="",
     )  # fmt: skip
     assert process.stdout is not None
@@ -92,8 +93,11 @@ def test_a_piped_flight_prints_its_phases_once_as_they_happen(spawn: Spawn, tmp_
     assert (process.wait(), process.communicate()[1]) == (0, "")
     assert max(map(len, lines)) <= 81  # with the line break
     begin = lines.index("\n")
-    phases = [line.split()[2] for line in lines[1:begin] if line.split()[2].endswith(":")]
-    assert len(phases) == len(set(phases)) >= 10
+    words = [line.split() for line in lines[1:begin]]
+    phases = {what: float(time_s) for time_s, _, what, *_ in words if what.endswith(":")}
+    assert len(phases) == sum(what.endswith(":") for _, _, what, *_ in words) >= 10
+    logged = json.loads((tmp_path / "x" / "score.json").read_text())["phases"]
+    assert phases == pytest.approx({e["what"].split()[0]: e["time_s"] for e in logged}, abs=0.01)
     verdict, *rows = lines[begin + 1 :]
     assert verdict.startswith("flown and landed; requirement met: rmse_position_m is ")
     labels = [row[2:17].strip() for row in rows]

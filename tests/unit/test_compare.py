@@ -1,4 +1,4 @@
-"""Many flights, one table: what is best, what failed and why, and that it can be read."""
+"""Comparisons: best controllers, failures with their reasons, table, page, files, progress."""
 
 from __future__ import annotations
 
@@ -148,7 +148,7 @@ def dies_with_seed_2(trial: Trial) -> Result:
     return Result(trial, 0, "flown and landed", dict.fromkeys(FIGURES, 1.0))
 
 
-def test_a_worker_that_dies_costs_its_own_flight(tmp_path: Path) -> None:
+def test_a_worker_that_dies_fails_its_own_flight_only(tmp_path: Path) -> None:
     problem = compare_all(
         dies_with_seed_2,
         controllers=["pso"],
@@ -169,7 +169,7 @@ def test_a_worker_that_dies_costs_its_own_flight(tmp_path: Path) -> None:
     ("exit_code", "flown"),
     [(2, "pso lqr pid mpc"), (3, "pso lqr"), (4, "pso lqr")],  # a file; refused; aborted
 )
-def test_on_one_vehicle_a_flight_that_it_did_not_let_us_end_is_the_last(
+def test_on_one_vehicle_nothing_is_flown_after_a_refused_or_aborted_flight(
     tmp_path: Path, exit_code: int, flown: str
 ) -> None:
     begun: list[str] = []
@@ -262,7 +262,7 @@ def lands(trial: Trial) -> Result:
     return Result(trial, 0, "flown and landed", dict.fromkeys(FIGURES, 1.0))
 
 
-def test_where_the_system_tells_no_affinity_all_processors_count(
+def test_without_cpu_affinity_all_processors_are_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert processors() == len(os.sched_getaffinity(0))

@@ -1,4 +1,4 @@
-"""Documents: what is accepted, and the exact sentence for what is not."""
+"""Configuration files: accepted values, and the exact sentence for each error."""
 
 from __future__ import annotations
 
@@ -207,7 +207,7 @@ def test_a_description_is_read_and_is_no_part_of_the_value() -> None:
         ("[" * 5000, "d.yaml: nested too deeply"),
     ],
 )
-def test_what_is_no_document_is_refused_with_its_place(text: str, sentence: str) -> None:
+def test_invalid_yaml_is_refused_with_line_and_column(text: str, sentence: str) -> None:
     assert problems(text) == (sentence,)
 
 
@@ -254,7 +254,7 @@ def test_a_bad_override_is_refused_with_the_same_sentences(assignment: str, sent
 
 
 @given(st.text(st.sampled_from("ab:-[]{}&*!?|>'\"%@#,.0123 \n\t\\\x00\ud800é~"), max_size=40))
-def test_no_text_whatever_raises_anything_else(text: str) -> None:
+def test_every_text_is_read_or_raises_document_error(text: str) -> None:
     refused: tuple[str, ...] = ()
     title: object = None
     try:
