@@ -1,7 +1,6 @@
-"""What the link was like: rates, gaps and repetitions of telemetry, gaps of setpoints, the delay.
+"""Figures of the link: rates, gaps and repetitions of telemetry, gaps of setpoints, delays.
 
-All by the vehicle's time stamps, as the flight itself takes them; arrays of a History in, figures
-of a Score out.
+From the arrays of a History to figures of a Score, all in vehicle time as in the flight itself.
 """
 
 from __future__ import annotations
@@ -17,14 +16,14 @@ Array = NDArray[np.float64]
 
 
 def each_once(rows: Array) -> Array:
-    """Rows (N, columns) by their times, the first column, in order; of equal times the first."""
+    """Rows (N, columns) sorted by time (the first column), the first one of equal times."""
     _, first = np.unique(rows[:, 0], return_index=True)
     once: Array = rows[first]
     return once
 
 
 def telemetry(history: History, begin_s: float, end_s: float) -> dict[str, float]:
-    """Between two vehicle times, both included."""
+    """Figures of the telemetry between two vehicle times, both included."""
     position, attitude = (
         rows[(rows[:, 0] >= begin_s) & (rows[:, 0] <= end_s)]
         for rows in (history.position, history.attitude)
@@ -39,8 +38,8 @@ def telemetry(history: History, begin_s: float, end_s: float) -> dict[str, float
 
 
 def setpoints(history: History) -> dict[str, float]:
-    """Setpoints from the first one to the landing."""
-    begun = {what.what.partition(":")[0]: what.time_s for what in history.phases}
+    """Figures of the setpoints from the first one to the landing."""
+    begun = {event.what.partition(":")[0]: event.time_s for event in history.phases}
     end_s = begun.get("land", math.inf)
     armed_s = begun.get("takeoff", math.nan)
     last_s = history.position[-1, 0] if len(history.position) else math.nan
@@ -54,7 +53,7 @@ def setpoints(history: History) -> dict[str, float]:
 
 
 def delay(history: History) -> dict[str, float]:
-    """The link's own, and the last one that the flight identified, vehicle included."""
+    """Delay of the link (TIMESYNC), and the last one identified: from telemetry to effect."""
     values = {}
     if len(history.link_delay):
         late_ms = 1e3 * history.link_delay[:, 1]

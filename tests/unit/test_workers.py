@@ -1,4 +1,4 @@
-"""Ctrl-C while other processes are started: it comes when they are."""
+"""SIGINT while worker processes start: deferred until they have started."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import sys
 import threading
 import time
 
-from offboard.analysis.interrupts import deaf_to_interrupts
+from offboard.analysis.workers import interrupts_deferred
 
 MASK = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()))"
 
 
 def interrupted_meanwhile() -> list[str]:
-    """What a process says of its own mask that was started after the interrupt."""
+    """Whether SIGINT is masked in a process that is started after an interrupt, and that one."""
     said = []
     try:
-        with deaf_to_interrupts():
+        with interrupts_deferred():
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(0.05)
             command = (sys.executable, "-c", MASK)
@@ -28,8 +28,8 @@ def interrupted_meanwhile() -> list[str]:
     return said
 
 
-def test_an_interrupt_of_meanwhile_comes_afterwards() -> None:
-    """Though another thread of ours, with no mask, takes the signal."""
+def test_an_interrupt_is_deferred_to_the_end_of_the_block() -> None:
+    """Also when another thread, without the mask, receives the signal."""
     over = threading.Event()
     threading.Thread(target=over.wait).start()
     try:
