@@ -90,11 +90,11 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         (("--set", "controller.seed=3"), "controller.seed is not a known key"),
         (
             ("--set", "controller.law=frog"),
-            "--set controller.law=frog: controller.law: 'frog' is not one of pso, lqr,",
+            "--set controller.law=frog: controller.law: 'frog' should be 'pso', 'lqr',",
         ),
         (
             ("--set", "reference.shape=spiral"),
-            "--set reference.shape=spiral: reference.shape: 'spiral' is not one of hover, line,",
+            "--set reference.shape=spiral: reference.shape: 'spiral' should be 'hover', 'line',",
         ),
         (("--set", "controller=pid2"), "no controller named 'pid2'; known are"),
         (
