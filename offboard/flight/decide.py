@@ -43,6 +43,7 @@ class Decided:
     state: PredictedState
     decision: Decision
     command: Command | PositionCommand
+    solve_time_s: float
 
 
 class Decider:
@@ -116,22 +117,30 @@ class Decider:
         reference = self._plan.reference
         assert reference is not None
         state = self._observer.predict(tick.time_s)
+        began_s = self._stopwatch()
         situation = Situation(
             tick.time_s,
             state,
             reference,
             previous=self._outbox.command,
-            deadline_s=self._deadline_s,
+            remaining_s=self._remaining(began_s),
             origin_ned_m=self._plan.origin_ned_m,
             track_time_s=self._plan.track_time_s(tick.time_s),
         )
         decision = self._controller.decide(situation)
+        solve_time_s = self._stopwatch() - began_s
         command = decision.command
         if isinstance(command, Command):
             command = clamp(self._excited(command, tick), self._outbox.vehicle)
         if not usable(command):
             raise DecisionError(f"unusable {command}")
-        return Decided(state, decision, command)
+        return Decided(state, decision, command, solve_time_s)
+
+    def _remaining(self, began_s: float) -> Callable[[], float] | None:
+        deadline_s = self._deadline_s
+        if deadline_s is None:
+            return None
+        return lambda: deadline_s - (self._stopwatch() - began_s)
 
     def _excited(self, command: Command, tick: Tick) -> Command:
         if self._identification is None or tick.phase is not Phase.EXCITE:
@@ -160,6 +169,7 @@ class Decider:
             phase=PHASE_CODES[tick.phase],
             decision=decided.decision,
             state=decided.state,
+            solve_time_s=decided.solve_time_s,
             lateness_s=self._stopwatch() - tick.arrived_s,
             missed_ticks=tick.missed,
             hover_thrust=self._observer.hover_thrust_estimate,

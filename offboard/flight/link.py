@@ -15,6 +15,7 @@ from collections.abc import Hashable
 from contextlib import suppress
 from typing import Protocol
 
+from offboard.documents.errors import UserError
 from offboard.mavlink.framing import frame_size
 
 Chunk = tuple[bytes, Hashable]
@@ -25,8 +26,8 @@ TIMESYNC = 111
 TCP_NOTSENT_LOWAT = 25  # Linux's option, which the socket module names since Python 3.12
 
 
-class LinkError(Exception):
-    """A link cannot be opened; the message is one sentence for the user."""
+class LinkError(UserError):
+    """A link that cannot be opened or was lost: one sentence for the user."""
 
 
 class Link(Protocol):

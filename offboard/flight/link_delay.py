@@ -11,7 +11,7 @@ from __future__ import annotations
 import statistics
 from collections import deque
 
-from offboard.identification.response_fit import Estimate
+from offboard.identification.uncertainty import Estimate
 from offboard.mavlink.events import TimesyncReply
 from offboard.mavlink.outgoing import Timesync
 

@@ -12,11 +12,13 @@ from errno import EACCES, ENOTDIR
 from pathlib import Path
 from types import TracebackType
 
+from offboard.documents.errors import UserError
+
 _STAMP = struct.Struct(">Q")
 
 
-class LogError(Exception):
-    """The flight directory cannot be written; the message is one sentence for the user."""
+class LogError(UserError):
+    """The flight directory cannot be written: one sentence for the user."""
 
 
 class FlightLog:

@@ -74,6 +74,7 @@ class Loop:
                 if output.alive:
                     telemetry_s = now_s
                 self._deliver(output, peer)
+                self._show()
                 if companion.has_ended():
                     break
             if not chunks or now_s - polled_s > POLL_S:

@@ -27,7 +27,6 @@ from offboard.flight.phases import Limits
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.flight.sitl import SimulatorProcess
 from offboard.flight.stop import StopRequests
-from offboard.identification import stages as identification
 from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
 from offboard.model.command import Command
@@ -103,16 +102,14 @@ def rehearse(parts: FlightParts, *, keeps_deadline: bool) -> float:
         observer.on_position(time_s, (0.0, 0.0, -2.0), (0.0, 0.0, 0.0))
         if step >= 20 and step % 10 == 0:
             state = observer.predict(time_s)
-            situation = Situation(time_s, state, reference, previous, parts.deadline_s)
+            situation = Situation(time_s, state, reference, previous, lambda: parts.deadline_s)
             command = parts.controller.decide(situation).command
             if isinstance(command, Command):
                 previous = command
                 observer.on_command(time_s, command)
     if keeps_deadline:
-        _check_deadline(parts, replace(situation, deadline_s=0.0))
+        _check_deadline(parts, replace(situation, remaining_s=lambda: 0.0))
     parts.track.sample(np.array([0.0, 1.0]))
-    if parts.identify and parts.identify.online:
-        identification.warm_up(parts.vehicle)
     parts.controller.reset()
     return clock.monotonic_s() - began_s
 

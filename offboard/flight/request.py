@@ -7,13 +7,18 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from offboard.control.catalogue import build
 from offboard.documents.reading import DocumentError
 from offboard.documents.shipped import locate, read_text
 from offboard.estimation.fusion import observer_of
-from offboard.flight import clock
 from offboard.flight.companion import Companion, Outcome
-from offboard.flight.configuration import FlightConfig, build_track, dump, load, read_part
+from offboard.flight.configuration import (
+    FlightConfig,
+    build_controller,
+    build_track,
+    dump,
+    load,
+    read_part,
+)
 from offboard.flight.log import FlightLog
 from offboard.flight.one_flight import Bundled, FlightParts, fly
 from offboard.flight.sitl import OWN_VEHICLES, SimulatorProcess
@@ -67,9 +72,7 @@ def build_parts(config: FlightConfig) -> FlightParts:
     """Build the parts of a flight. Raises DocumentError if the reference cannot be flown."""
     return FlightParts(
         vehicle=config.vehicle,
-        controller=build(
-            config.controller, config.vehicle, config.period_s, config.seed, clock.monotonic_s
-        ),
+        controller=build_controller(config),
         make_observer=lambda: observer_of(
             config.estimate, config.vehicle, config.observer, config.fusion
         ),

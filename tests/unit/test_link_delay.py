@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from offboard.flight.link_delay import DELAY_MAX_S, LinkDelay
-from offboard.identification.response_fit import Estimate
+from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import VehicleEstimate
 from offboard.mavlink.events import TimesyncReply
 from offboard.model.vehicle import AxisResponse, Vehicle
