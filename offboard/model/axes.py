@@ -40,8 +40,8 @@ class LinearModel:
 
 
 def lateral_model(vehicle: Vehicle) -> LinearModel:
-    """One lateral axis, deviations [p, v, b, b'], input b_c: v' = -g b - c v, b'' = wn^2 (b_c - b)
-    - 2 z wn b' (the tilt response of `AxisResponse`)."""
+    """One lateral axis: state [p, v, b, b'], input b_c, as deviations. v' = -g b - c v and
+    b'' = wn^2 (b_c - b) - 2 z wn b', the tilt response of `AxisResponse`."""
     stiffness = vehicle.tilt.natural_frequency_radps**2
     dynamics = np.zeros((4, 4))
     dynamics[0, 1] = 1.0
@@ -53,8 +53,8 @@ def lateral_model(vehicle: Vehicle) -> LinearModel:
 
 
 def vertical_model(vehicle: Vehicle) -> LinearModel:
-    """The vertical axis, deviations [z, v_z, f_z], input f_c: v_z' = -f_z - c v_z,
-    f_z' = (f_c - f_z) / lag, f_z = T b_z being the vertical part of the thrust, m/s^2."""
+    """The vertical axis: state [z, v_z, f_z], input f_c, as deviations. v_z' = -f_z - c v_z and
+    f_z' = (f_c - f_z) / lag; f_z = T b_z is the vertical part of the thrust, m/s^2."""
     rate = 1.0 / max(vehicle.thrust_lag_s, SHORTEST_THRUST_LAG_S)
     drag = vehicle.drag_per_mass_ps
     dynamics = np.array([[0.0, 1.0, 0.0], [0.0, -drag, -1.0], [0.0, 0.0, -rate]])
@@ -62,8 +62,8 @@ def vertical_model(vehicle: Vehicle) -> LinearModel:
 
 
 def lead(value: Array, rate: Array, acceleration: Array, response: AxisResponse) -> Array:
-    """The command whose second-order response (delay aside) is the given motion:
-    s + 2 z / wn s' + s'' / wn^2. Any common shape."""
+    """The command to which a second-order response without delay follows the given motion:
+    s + 2 z / wn s' + s'' / wn^2. Arguments and result have one common shape."""
     frequency = response.natural_frequency_radps
     command: Array = (
         value + (2.0 * response.damping / frequency) * rate + acceleration / frequency**2
