@@ -15,8 +15,10 @@ from numpy.typing import NDArray
 from offboard.analysis.history import History
 from offboard.analysis.tlog import Tlog
 from offboard.flight.phases import PHASE_CODES, Phase
-from offboard.identification.stages import Estimate, Identified, ResponseFit, identify
+from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.trace import Trace, clean
+from offboard.identification.uncertainty import Estimate
+from offboard.identification.vehicle_fit import Identified, identify
 from offboard.mavlink.dialects.base import ThrustRule
 from offboard.mavlink.session import DIALECTS
 from offboard.model.frames import course_from_quaternion, thrust_direction_from_quaternion

@@ -114,7 +114,7 @@ def _announcer() -> Callable[[Companion], None]:
     def announce(companion: Companion) -> None:
         nonlocal shown
         for line in companion.announced[shown:]:
-            say(f"{companion.view.time_s:8.2f} s  {line}", indent=12)
+            say(f"{companion.state.time_s:8.2f} s  {line}", indent=12)
         shown = len(companion.announced)
 
     return announce

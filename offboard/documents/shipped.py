@@ -5,6 +5,7 @@ In an installed package `config/` lies inside the package, in a checkout beside 
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
@@ -45,15 +46,16 @@ def overview(*kinds: str) -> str:
     return "\n\n".join(f"Shipped {kind}s: {', '.join(names(FOLDERS[kind]))}." for kind in kinds)
 
 
-def locate(name: str, folder: str, kind: str) -> Path:
+def locate(name: str, folder: str, kind: str, others: Sequence[str] = ()) -> Path:
     """The file with a shipped name, or the file itself where `name` contains a `/` or ends in .yaml
-    or .yml. Raises DocumentError with the known names."""
+    or .yml. Raises DocumentError with the known names, `others` among them."""
     if name.endswith((".yaml", ".yml")) or "/" in name:
         return Path(name)
     candidate = directory() / folder / f"{name}.yaml"
     if candidate.is_file():
         return candidate
-    raise DocumentError(f"there is no {kind} named {name!r}; known are {', '.join(names(folder))}")
+    known = sorted((*names(folder), *others))
+    raise DocumentError(f"there is no {kind} named {name!r}; known are {', '.join(known)}")
 
 
 def read_text(path: Path) -> str:

@@ -1,4 +1,4 @@
-"""The phase table: complete, bounded, acyclic, every row reachable, every reason sayable."""
+"""The phase table: complete, bounded, without cycles, every row and reason usable."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pair import hover
 from offboard.flight.assessment import Progress
 from offboard.flight.guards import Facts
 from offboard.flight.phases import ENDS, ExitCode, Limits, Phase
-from offboard.flight.table import TABLE, Row, next_row
+from offboard.flight.transitions import TRANSITIONS, Row, next_row
 
 ON_TRACK = (Phase.JOIN, Phase.TRACK, Phase.HOVER)
 UNEVENTFUL = Facts(
@@ -41,7 +41,7 @@ UNEVENTFUL = Facts(
     missed_decisions=0,
     contradicted=False,
 )
-QUIET = {  # what else a phase shows while it waits
+QUIET = {  # facts of a phase while nothing happens
     Phase.HEALTH: {"engaged": False, "armed": False},
     Phase.ENGAGE: {"engaged": False, "armed": False},
     Phase.ARM: {"armed": False},
@@ -49,7 +49,7 @@ QUIET = {  # what else a phase shows while it waits
     Phase.TRACK: {"track_time_s": 4.0},
     Phase.HOVER: {"track_time_s": 20.0},
 }
-EVENTS: dict[str, dict[str, object]] = {  # the least that makes each guard hold
+EVENTS: dict[str, dict[str, object]] = {  # the facts that make each guard hold
     "vehicle_found": {"found": True},
     "ready": {"ready": True},
     "misconfigured": {"misconfigured": True},
@@ -65,15 +65,15 @@ EVENTS: dict[str, dict[str, object]] = {  # the least that makes each guard hold
     "lifted_off": {"lifted_off": True},
     "at_start": {"at_start": True},
     "at_start_to_excite": {"at_start": True, "excites": True},
-    "learnt": {"learnt": True},
+    "identified": {"identified": True},
     "at_full_speed": {"track_time_s": 4.0},
     "track_over": {"track_time_s": 20.0},
     "at_rest": {"track_time_s": 23.5},
     "disarmed": {"armed": False},
     "disarmed_for_good": {"armed": False, "in_phase_s": 1.6},
-    "mode_taken": {"engaged": False},
-    "taken_armed": {"engaged": False, "armed": True},
-    "landing_taken": {"engaged": False},
+    "mode_left": {"engaged": False},
+    "mode_left_armed": {"engaged": False, "armed": True},
+    "landing_left": {"engaged": False},
     "silent": {"silence_s": 1.01},
     "lost": {"silence_s": 2.01},
     "silent_on_ground": {"silence_s": 20.1},
@@ -99,7 +99,7 @@ def event_of(row: Row) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("phase", [phase for phase in Phase if phase not in ENDS])
-def test_nothing_happens_by_itself_but_time_ends_every_wait(phase: Phase) -> None:
+def test_no_event_no_transition_and_every_wait_is_limited(phase: Phase) -> None:
     assert next_row(phase, quiet(phase)) is None
     later = {"track_time_s": 1e4} if phase in ON_TRACK else {"in_phase_s": 1e4}
     if phase is Phase.CLIMB:
@@ -109,39 +109,39 @@ def test_nothing_happens_by_itself_but_time_ends_every_wait(phase: Phase) -> Non
     assert next_row(phase, replace(quiet(phase), **later)) is not None
 
 
-@pytest.mark.parametrize("row", TABLE, ids=lambda r: f"{r.source.value}: {r.guard.__name__}")
+@pytest.mark.parametrize("row", TRANSITIONS, ids=lambda r: f"{r.source.value}: {r.guard.__name__}")
 def test_every_row_is_reachable(row: Row) -> None:
     assert next_row(row.source, replace(quiet(row.source), **event_of(row))) is row
 
 
-def test_ends_have_no_rows_and_every_other_phase_has() -> None:
-    assert {row.source for row in TABLE} == {phase for phase in Phase if phase not in ENDS}
+def test_every_phase_but_the_ends_has_rows() -> None:
+    assert {row.source for row in TRANSITIONS} == {phase for phase in Phase if phase not in ENDS}
 
 
-def test_no_way_back() -> None:
+def test_every_row_leads_to_a_later_phase() -> None:
     order = {phase: index for index, phase in enumerate(Phase)}
-    assert all(order[row.target] > order[row.source] for row in TABLE)
+    assert all(order[row.target] > order[row.source] for row in TRANSITIONS)
 
 
 def test_every_abnormal_end_has_an_exit_code() -> None:
     """Its own, or that of each way into its phase."""
-    for row in TABLE:
+    for row in TRANSITIONS:
         if row.target in (Phase.FAILED, Phase.YIELDED) and row.exit_code is None:
-            ways_in = [way.exit_code for way in TABLE if way.target is row.source]
+            ways_in = [way.exit_code for way in TRANSITIONS if way.target is row.source]
             assert ways_in
             assert None not in ways_in
-    assert {row.exit_code for row in TABLE} == {None, ExitCode.REFUSED, ExitCode.ABORTED}
+    assert {row.exit_code for row in TRANSITIONS} == {None, ExitCode.REFUSED, ExitCode.ABORTED}
 
 
-def test_in_the_air_nothing_is_called_refused() -> None:
-    for row in TABLE:
+def test_no_flight_in_the_air_ends_as_refused() -> None:
+    for row in TRANSITIONS:
         if row.exit_code == ExitCode.REFUSED:
             assert row.source not in (Phase.TAKEOFF, Phase.CLIMB, *ON_TRACK, Phase.LAND)
 
 
-def test_every_reason_has_its_words() -> None:
+def test_every_reason_has_its_figures() -> None:
     assessment = hover().companion._machine._assessment
-    course = Progress(Phase.CONNECT, 0.0, 0.0, False, "", 0, "")
-    words = assessment.words(assessment.facts(course), course)
-    for row in TABLE:
-        assert "{" not in row.reason.format(**words)
+    progress = Progress(Phase.CONNECT, 0.0, 0.0, False, "", 0, "")
+    figures = assessment.figures(assessment.facts(progress), progress)
+    for row in TRANSITIONS:
+        assert "{" not in row.reason.format(**figures)

@@ -1,7 +1,7 @@
-"""The state machine of a flight: `TABLE`, and the first row of a phase whose guard holds.
+"""The phase table: transitions between the phases of a flight. The first row that holds is taken.
 
-A flight only ever goes down the table. What is done in a phase is the companion's business; the
-names in braces are the words of `assessment.Assessment.words`.
+Every row leads to a later phase. `actions` has what is done in a phase. The names in braces are
+keys of `assessment.Assessment.figures`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,10 @@ REFUSED, ABORTED = ExitCode.REFUSED, ExitCode.ABORTED
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """From `source`, when `guard` holds, to `target`; `exit_code` where the flight's result is
-    decided by this row (what follows may only make it graver)."""
+    """A transition from `source`, when `guard` holds, to `target`.
+
+    `exit_code` is set if this row decides the result; a later row can only make it more severe.
+    """
 
     source: Phase
     guard: Guard
@@ -31,7 +33,7 @@ _LEFT = "the vehicle left {mode_wanted} for {mode}"
 _SILENT = "no telemetry for {silence_s:.1f} s"
 _BLIND = "no {blind_to} for {blind_s:.1f} s"
 _REBOOTED = "the vehicle restarted"
-_ARMED_ALREADY = "the vehicle is armed already, and not by us"
+_ARMED_ALREADY = "the vehicle is armed already, by another controller or a pilot"
 _DISARMED = "disarmed on the ground"
 _STOP = "{stop}"
 _DIVERGED = "{position_error_m:.1f} m from the reference (limit {position_error_limit_m:.1f} m)"
@@ -61,7 +63,7 @@ def _flying_rows(source: Phase, when: str = "in flight") -> tuple[Row, ...]:
     return (
         Row(source, guards.rebooted, Phase.FAILED, f"{_REBOOTED} {when}", ABORTED),
         Row(source, guards.disarmed, Phase.FAILED, f"the vehicle disarmed {when}", ABORTED),
-        Row(source, guards.mode_taken, Phase.YIELDED, _LEFT, ABORTED),
+        Row(source, guards.mode_left, Phase.YIELDED, _LEFT, ABORTED),
         Row(source, guards.silent, Phase.LAND, _SILENT, ABORTED),
         Row(source, guards.blind, Phase.LAND, _BLIND, ABORTED),
         Row(source, guards.stop_requested, Phase.LAND, _STOP, ABORTED),
@@ -83,15 +85,15 @@ def _too_long(source: Phase, limit: str, target: Phase, reason: str, exit_code: 
     return Row(source, longer_than(limit), target, reason, exit_code)
 
 
-TABLE: tuple[Row, ...] = (
+TRANSITIONS: tuple[Row, ...] = (
     Row(Phase.CONNECT, guards.stop_requested, Phase.FAILED, _STOP, REFUSED),
     Row(Phase.CONNECT, guards.vehicle_found, Phase.HEALTH, "vehicle found"),
     Row(Phase.CONNECT, guards.silent_on_ground, Phase.FAILED, _NOT_FOUND, REFUSED),
     *_ground_rows(Phase.HEALTH),
     Row(Phase.HEALTH, guards.flown_by_another, Phase.FAILED, _NOT_OURS, REFUSED),
-    Row(Phase.HEALTH, guards.misconfigured, Phase.FAILED, "{complaint}", REFUSED),
+    Row(Phase.HEALTH, guards.misconfigured, Phase.FAILED, "{problems}", REFUSED),
     Row(Phase.HEALTH, guards.ready, Phase.STREAM, "telemetry flows and the vehicle can arm"),
-    _too_long(Phase.HEALTH, "health_s", Phase.FAILED, "not ready: {unready}", REFUSED),
+    _too_long(Phase.HEALTH, "health_s", Phase.FAILED, "not ready: {not_ready}", REFUSED),
     *_streaming_rows(Phase.STREAM),
     Row(Phase.STREAM, guards.needs_no_stream, Phase.ENGAGE, "the autopilot takes off by itself"),
     Row(Phase.STREAM, guards.streamed, Phase.ENGAGE, "setpoints stream"),
@@ -103,8 +105,8 @@ TABLE: tuple[Row, ...] = (
     Row(Phase.ARM, guards.silent, Phase.STAND_DOWN, _SILENT, REFUSED),
     Row(Phase.ARM, guards.blind, Phase.STAND_DOWN, _BLIND, REFUSED),
     Row(Phase.ARM, guards.stop_requested, Phase.STAND_DOWN, _STOP, REFUSED),
-    Row(Phase.ARM, guards.taken_armed, Phase.YIELDED, f"{_LEFT} as it armed", ABORTED),
-    Row(Phase.ARM, guards.mode_taken, Phase.FAILED, _LEFT, REFUSED),
+    Row(Phase.ARM, guards.mode_left_armed, Phase.YIELDED, f"{_LEFT} as it armed", ABORTED),
+    Row(Phase.ARM, guards.mode_left, Phase.FAILED, _LEFT, REFUSED),
     Row(Phase.ARM, guards.armed, Phase.TAKEOFF, "armed"),
     _too_long(
         Phase.ARM,
@@ -117,23 +119,23 @@ TABLE: tuple[Row, ...] = (
     Row(Phase.TAKEOFF, guards.lifted_off, Phase.CLIMB, "lifted off"),
     _too_long(Phase.TAKEOFF, "lift_off_s", Phase.LAND, _NO_LIFT_OFF, ABORTED),
     *_tracking_rows(Phase.CLIMB),
-    Row(Phase.CLIMB, guards.at_start_to_excite, Phase.EXCITE, "small steps, to see the answer"),
+    Row(Phase.CLIMB, guards.at_start_to_excite, Phase.EXCITE, "identification steps"),
     Row(Phase.CLIMB, guards.at_start, Phase.JOIN, "hovers at the start of the reference"),
     Row(
         Phase.CLIMB,
         guards.too_late_at_start,
         Phase.LAND,
-        "the start of the reference was not reached, {position_error_m:.1f} m off "
-        "{late_s:.0f} s after it should have been",
+        "the start of the reference was not reached: {position_error_m:.1f} m away, "
+        "{late_s:.0f} s late",
         ABORTED,
     ),
     *_tracking_rows(Phase.EXCITE),
-    Row(Phase.EXCITE, guards.learnt, Phase.JOIN, "hovers at the start of the reference"),
+    Row(Phase.EXCITE, guards.identified, Phase.JOIN, "hovers at the start of the reference"),
     _too_long(
         Phase.EXCITE,
         "excite_s",
         Phase.LAND,
-        "nothing was concluded from the steps in {in_phase_s:.0f} s",
+        "identification did not converge in {in_phase_s:.0f} s",
         ABORTED,
     ),
     *_tracking_rows(Phase.JOIN),
@@ -145,7 +147,7 @@ TABLE: tuple[Row, ...] = (
     Row(Phase.LAND, guards.rebooted, Phase.FAILED, f"{_REBOOTED} while landing", ABORTED),
     Row(Phase.LAND, guards.disarmed, Phase.DISARMED, _DISARMED),
     Row(Phase.LAND, guards.lost, Phase.FAILED, f"{_SILENT} while landing", ABORTED),
-    Row(Phase.LAND, guards.landing_taken, Phase.YIELDED, _LEFT, ABORTED),
+    Row(Phase.LAND, guards.landing_left, Phase.YIELDED, _LEFT, ABORTED),
     _too_long(
         Phase.LAND,
         "land_s",
@@ -168,4 +170,4 @@ TABLE: tuple[Row, ...] = (
 
 def next_row(phase: Phase, now: Facts) -> Row | None:
     """The first row of `phase` whose guard holds, or None to stay."""
-    return next((row for row in TABLE if row.source is phase and row.guard(now)), None)
+    return next((row for row in TRANSITIONS if row.source is phase and row.guard(now)), None)

@@ -1,6 +1,6 @@
-"""The last look at a command before it leaves: PX4 flies whatever it is sent, so we are the guard.
+"""The gate: the last check of a setpoint before it is sent. PX4 flies any setpoint it receives.
 
-Independent of the control laws and of their own limits.
+Independent of the control laws and of their limits.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ _LENGTH_TOLERANCE = 0.01
 
 
 def usable(command: Command | PositionCommand) -> bool:
-    """Finite, and its thrust direction a unit vector."""
+    """Whether all values are finite and the thrust direction is a unit vector."""
     if isinstance(command, PositionCommand):
         vectors = (
             command.position_ned_m,
@@ -31,9 +31,10 @@ def usable(command: Command | PositionCommand) -> bool:
 
 
 def clamp(command: Command, vehicle: Vehicle) -> Command:
-    """The usable command nearest to `command` within the vehicle's thrust and tilt.
+    """`command` limited to the vehicle's thrust and tilt.
 
-    A direction beyond `tilt_max_rad` is turned back to it in its own vertical plane.
+    A direction tilted by more than `tilt_max_rad` is turned back to that tilt in its own vertical
+    plane.
     """
     thrust = min(max(command.thrust_mps2, 0.0), vehicle.thrust_max_mps2)
     north, east, down = command.thrust_direction_ned
