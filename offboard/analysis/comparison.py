@@ -112,10 +112,10 @@ def _with_progress(
 
         def ending() -> bool:
             nonlocal announced
-            if stops.asked and not announced:
+            if stops.requested and not announced:
                 announced = True
                 progress.console.print(LANDING)
-            return stops.asked
+            return stops.requested
 
         with suppress(KeyboardInterrupt), StopRequests() as stops:
             for result in _flown(planned, fly, 0 if workers == 0 else width, ending):
