@@ -2,19 +2,20 @@
 
 from __future__ import annotations
 
+import os
 import shutil
+import signal
 import sys
 import textwrap
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn, TextIO
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TextIO
 
 import typer
 
 from offboard.documents import shipped
 from simulator.firmware.base import Firmware
 from simulator.firmware.catalogue import FIRMWARES
-from simulator.stop import Stop
 
 if TYPE_CHECKING:
     from simulator.instance import Instance
@@ -24,14 +25,27 @@ LOCAL_COMPANION_PORT, LOCAL_GROUND_PORT = 14580, 18570  # as PX4 SITL
 ANY_PORT = 0
 NO_LINK = "none"
 SYSTEM_MAX = 250
-NAME = "NAME|FILE"  # shipped, or a file
+FILE = "NAME|FILE"  # the name of a shipped file, or a path
 
+GROUND_LINK = f"udpout:127.0.0.1:{GROUND_PORT}"
+LINKS = (
+    "Companion link: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT.  "
+    f"[default: udpout:127.0.0.1:{COMPANION_PORT}]"
+)
+PATIENCE = (
+    "With --lockstep: longest wait for the companion.  [default: 180 for its first message, then 5]"
+)
 EXIT_CODES = (
     "Exit codes: 0 stopped; 2 usage or configuration error; 3 no companion, or it fell silent "
     "(--lockstep)."
 )
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
+
+
+def _option(metavar: str, text: str, **limits: Any) -> Any:
+    """A command-line option with a value, named as its parameter."""
+    return typer.Option(metavar=metavar, help=text, **limits)
 
 
 def _refuse(sentence: str) -> NoReturn:
@@ -41,67 +55,38 @@ def _refuse(sentence: str) -> NoReturn:
 
 @app.command(epilog=f"{shipped.overview('vehicle', 'scenario')}\n\n{EXIT_CODES}")
 def simulate(
-    connect: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LINK",
-            help="Companion link: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT.  "
-            f"[default: udpout:127.0.0.1:{COMPANION_PORT}]",
-        ),
-    ] = None,
-    gcs: Annotated[
-        str, typer.Option(metavar="LINK", help=f"Ground station link, or {NO_LINK}.")
-    ] = f"udpout:127.0.0.1:{GROUND_PORT}",
-    firmware: Annotated[str, typer.Option(metavar="NAME", help="px4 or ardupilot.")] = "px4",
+    connect: Annotated[str | None, _option("LINK", LINKS)] = None,
+    gcs: Annotated[str, _option("LINK", f"Ground station link, or {NO_LINK}.")] = GROUND_LINK,
+    firmware: Annotated[str, _option("NAME", "px4 or ardupilot.")] = "px4",
     speed: Annotated[
-        float | None,
-        typer.Option(metavar="FACTOR", help="Multiple of real time, 0.1 .. 1000.  [default: 1]"),
+        float | None, _option("FACTOR", "Multiple of real time, 0.1 .. 1000.  [default: 1]")
     ] = None,
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Virtual time that waits for the companion.")
     ] = False,
-    seed: Annotated[int, typer.Option(metavar="N", min=0, max=2**32 - 1, help="Random seed.")] = 7,
+    seed: Annotated[int, _option("N", "Random seed.", min=0, max=2**32 - 1)] = 7,
     scenario: Annotated[
-        str | None,
-        typer.Option(metavar=NAME, help="Scenario.  [default: estimator errors of the firmware]"),
+        str | None, _option(FILE, "Scenario.  [default: estimator errors of the firmware]")
     ] = None,
     vehicle: Annotated[
-        str | None,
-        typer.Option(metavar=NAME, help="Vehicle.  [default: SITL vehicle of the firmware]"),
+        str | None, _option(FILE, "Vehicle.  [default: SITL vehicle of the firmware]")
     ] = None,
     param: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="Set a parameter of the autopilot; repeatable."),
+        list[str] | None, _option("NAME=VALUE", "Set a parameter of the autopilot; repeatable.")
     ] = None,
     duration: Annotated[
-        float | None, typer.Option(metavar="SECONDS", min=0.0, help="Stop after this vehicle time.")
+        float | None, _option("SECONDS", "Stop after this vehicle time.", min=0.0)
     ] = None,
-    instance: Annotated[
-        int, typer.Option(metavar="N", min=0, max=249, help="Added to ports and system id.")
-    ] = 0,
-    instances: Annotated[
-        int, typer.Option(metavar="N", min=1, max=100, help="Number of vehicles.")
-    ] = 1,
-    patience: Annotated[
-        float | None,
-        typer.Option(
-            metavar="SECONDS",
-            min=0.1,
-            max=600.0,
-            help="With --lockstep: longest wait for the companion.  "
-            "[default: 180 for its first message, then 5]",
-        ),
-    ] = None,
+    instance: Annotated[int, _option("N", "Added to ports and system id.", min=0, max=249)] = 0,
+    instances: Annotated[int, _option("N", "Number of vehicles.", min=1, max=100)] = 1,
+    patience: Annotated[float | None, _option("SECONDS", PATIENCE, min=0.1, max=600.0)] = None,
     strict: Annotated[
         bool, typer.Option("--strict", help="Report messages that the autopilot ignores silently.")
     ] = False,
     log: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Record the companion link as a .tlog; a new file."),
+        Path | None, _option("FILE", "Record the companion link as a .tlog; a new file.")
     ] = None,
-    check: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Check a scenario file and exit.")
-    ] = None,
+    check: Annotated[Path | None, _option("FILE", "Check a scenario file and exit.")] = None,
     show_version: Annotated[
         bool, typer.Option("--version", help="Print the version and exit.")
     ] = False,
@@ -284,6 +269,24 @@ def _print(text: str, file: TextIO | None = None) -> None:
             for line in text.splitlines()
         )
     print(text, file=file, flush=True)
+
+
+class Stop:
+    """Whether SIGTERM or SIGINT was received. While the simulator starts, they end the process."""
+
+    def __init__(self) -> None:
+        self.running = False
+        self._noted = False
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, self._note)
+
+    def _note(self, number: int, frame: object) -> None:
+        self._noted = True
+        if not self.running:
+            os._exit(0)  # no file or flight has begun
+
+    def __call__(self) -> bool:
+        return self._noted
 
 
 def main() -> None:

@@ -5,11 +5,9 @@ An interrupted comparison keeps the flights that have ended and names those that
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import suppress
 from pathlib import Path
-from types import FrameType
 
 from rich.console import Console
 from rich.progress import (
@@ -27,6 +25,7 @@ from offboard.analysis.compare_table import digits, numbered_seeds, show
 from offboard.analysis.workers import open_worker, processors
 from offboard.flight.log import LogError
 from offboard.flight.phases import ExitCode
+from offboard.flight.stop import StopRequests
 
 LANDING = "interrupted: flights in the air are landed; interrupt again to exit at once"
 
@@ -109,16 +108,22 @@ def _with_progress(
     results: list[Result] = []
     with Progress(*columns, console=console, transient=True, disable=not live) as progress:
         task = progress.add_task(plan, total=len(planned))
-        try:
-            with _interruptible(lambda: progress.console.print(LANDING)) as ending:
-                for result in _flown(planned, fly, 0 if workers == 0 else width, ending):
-                    if not result.stopped:
-                        results.append(result)
-                    progress.advance(task)
+        announced = False
+
+        def ending() -> bool:
+            nonlocal announced
+            if stops.requested and not announced:
+                announced = True
+                progress.console.print(LANDING)
+            return stops.requested
+
+        with suppress(KeyboardInterrupt), StopRequests() as stops:
+            for result in _flown(planned, fly, 0 if workers == 0 else width, ending):
+                progress.advance(task)
+                if not result.stopped:
+                    results.append(result)
                     if not live:
                         console.print(_line(result, len(results)), markup=False, soft_wrap=True)
-        except KeyboardInterrupt:
-            pass  # the second one
     return results
 
 
@@ -153,29 +158,6 @@ def _ended(results: Sequence[Result]) -> str:
         return ""
     trial, sentence = results[-1].trial, results[-1].sentence
     return f"ended with {trial.controller} on {trial.reference}, seed {trial.seed} ({sentence})"
-
-
-@contextmanager
-def _interruptible(told: Callable[[], None]) -> Iterator[Callable[[], bool]]:
-    """Whether an interrupt was received, of which `told` is called. The second one raises
-    KeyboardInterrupt."""
-    asked = 0
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        nonlocal asked
-        asked += 1
-        if asked > 1:
-            raise KeyboardInterrupt
-        told()
-
-    kinds = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
-    heard = [kind for kind in kinds if signal.getsignal(kind) is not signal.SIG_IGN]
-    before = {kind: signal.signal(kind, on_signal) for kind in heard}
-    try:
-        yield lambda: asked > 0
-    finally:
-        for kind, handler in before.items():
-            signal.signal(kind, handler)
 
 
 def _missing(planned: Sequence[Trial], results: Sequence[Result]) -> list[str]:

@@ -22,7 +22,7 @@ from offboard.identification.vehicle_fit import Identified, identify
 from offboard.mavlink.dialects.base import ThrustRule
 from offboard.mavlink.session import DIALECTS
 from offboard.model.frames import course_from_quaternion, thrust_direction_from_quaternion
-from offboard.model.vehicle import Vehicle
+from offboard.model.vehicle import AxisResponse, Vehicle
 
 Array = NDArray[np.float64]
 
@@ -102,41 +102,42 @@ def vehicle_file(found: Identified, believed: Vehicle, flight: str) -> str:
     Identified constants have their standard deviation as comment. The other constants are those of
     `believed`, with the reason why they were not identified. `flight` names the log.
     """
-    vehicle = found.applied_to(believed)
+    vehicle, whys = found.applied_to(believed), found.refusals
     kept = "not identifiable from telemetry"
-    lag = _comment(found, found.thrust_lag_s, "thrust_lag_s", "s")
-    hover = _comment(found, found.hover_thrust, "hover_thrust", "")
-    drag = _comment(found, found.drag_ps, "drag_ps", "1/s times the mass")
-    lines = [
-        f"# Identified from {found.seconds:.0f} s of {flight}; +- is one standard deviation.",
-        f"name: {vehicle.name}",
-        _line(f"mass_kg: {vehicle.mass_kg:g}", kept),
-        f"gravity_mps2: {vehicle.gravity_mps2:g}",
-        _line(f"inertia_kgm2: {_list(vehicle.inertia_kgm2)}", kept),
-        _line(f"arm_m: {vehicle.arm_m:g}", kept),
-        _line(f"drag_translation_npmps: {_list(vehicle.drag_translation_npmps)}", drag),
-        _line(f"drag_rotation_nmpradps: {_list(vehicle.drag_rotation_nmpradps)}", kept),
-        _line(f"hover_thrust: {vehicle.hover_thrust:.4f}", hover),
-        _line(f"thrust_delay_s: {vehicle.thrust_delay_s:.4f}", lag),
-        _line(f"thrust_lag_s: {vehicle.thrust_lag_s:.4f}", lag),
-    ]
-    for name, fit in (("tilt", found.tilt), ("yaw", found.yaw)):
-        axis = getattr(vehicle, name)
-        lines += [
-            _line(f"{name}:", _fit_comment(fit, found.refusals.get(name, ""))),
-            f"  delay_s: {axis.delay_s:.4f}",
-            f"  natural_frequency_radps: {axis.natural_frequency_radps:.3f}",
-            f"  damping: {axis.damping:.3f}",
-        ]
+    lag = _comment(found.thrust_lag_s, "s", whys.get("thrust_lag_s", ""))
+    hover = _comment(found.hover_thrust, "", whys.get("hover_thrust", ""))
+    drag = _comment(found.drag_ps, "1/s times the mass", whys.get("drag_ps", ""))
     limits = _list(vehicle.angular_acceleration_limit_radps2)
-    lines += [
-        _line(f"angular_acceleration_limit_radps2: {limits}", kept),
-        f"tilt_max_rad: {vehicle.tilt_max_rad:g}",
+    entries = [
+        (f"name: {vehicle.name}", ""),
+        (f"mass_kg: {vehicle.mass_kg:g}", kept),
+        (f"gravity_mps2: {vehicle.gravity_mps2:g}", ""),
+        (f"inertia_kgm2: {_list(vehicle.inertia_kgm2)}", kept),
+        (f"arm_m: {vehicle.arm_m:g}", kept),
+        (f"drag_translation_npmps: {_list(vehicle.drag_translation_npmps)}", drag),
+        (f"drag_rotation_nmpradps: {_list(vehicle.drag_rotation_nmpradps)}", kept),
+        (f"hover_thrust: {vehicle.hover_thrust:.4f}", hover),
+        (f"thrust_delay_s: {vehicle.thrust_delay_s:.4f}", lag),
+        (f"thrust_lag_s: {vehicle.thrust_lag_s:.4f}", lag),
+        *_axis("tilt", vehicle.tilt, _fit_comment(found.tilt, whys.get("tilt", ""))),
+        *_axis("yaw", vehicle.yaw, _fit_comment(found.yaw, whys.get("yaw", ""))),
+        (f"angular_acceleration_limit_radps2: {limits}", kept),
+        (f"tilt_max_rad: {vehicle.tilt_max_rad:g}", ""),
     ]
-    return "\n".join(lines) + "\n"
+    heading = f"# Identified from {found.seconds:.0f} s of {flight}; +- is one standard deviation."
+    return "\n".join([heading, *(_line(*entry) for entry in entries)]) + "\n"
 
 
-def _line(entry: str, comment: str = "") -> str:
+def _axis(name: str, axis: AxisResponse, comment: str) -> list[tuple[str, str]]:
+    return [
+        (f"{name}:", comment),
+        (f"  delay_s: {axis.delay_s:.4f}", ""),
+        (f"  natural_frequency_radps: {axis.natural_frequency_radps:.3f}", ""),
+        (f"  damping: {axis.damping:.3f}", ""),
+    ]
+
+
+def _line(entry: str, comment: str) -> str:
     """An entry with its comment, which stands above where it does not fit beside."""
     line = f"{entry}  # {comment}" if comment else entry
     if len(line) <= LINE_WIDTH:
@@ -147,9 +148,9 @@ def _line(entry: str, comment: str = "") -> str:
     return "\n".join([*above, entry])
 
 
-def _comment(found: Identified, estimate: Estimate | None, name: str, unit: str) -> str:
+def _comment(estimate: Estimate | None, unit: str, why: str) -> str:
     if estimate is None:
-        return NOT_IDENTIFIED.format(sentence=found.refusals.get(name, ""))
+        return NOT_IDENTIFIED.format(sentence=why)
     return f"+- {estimate.sd:.2g} {unit}".rstrip()
 
 

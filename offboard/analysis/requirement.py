@@ -17,7 +17,8 @@ _OPERATORS: dict[str, Callable[[float, float], bool]] = {
     "<": operator.lt,
     ">": operator.gt,
 }
-_PATTERN = re.compile(r"^\s*(\w+)\s*(<=|>=|==|<|>)\s*(\S+)\s*$")
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_PATTERN = re.compile(rf"\s*(\w+)\s*(<=|>=|==|<|>)\s*({_NUMBER})\s*")
 
 
 class RequirementError(UserError):
@@ -38,7 +39,7 @@ class Requirement:
     @classmethod
     def parse(cls, text: str, known: Mapping[str, object]) -> Requirement:
         """Read 'FIGURE<NUMBER'. `known` has the names of all figures. Raises RequirementError."""
-        match = _PATTERN.match(text)
+        match = _PATTERN.fullmatch(text)
         if match is None:
             raise RequirementError(
                 f"--require {text!r} is not understood; write FIGURE<NUMBER, "
@@ -49,13 +50,7 @@ class Requirement:
             raise RequirementError(
                 f"--require: there is no figure {figure!r}; there are {', '.join(known)}"
             )
-        try:
-            limit = float(number)
-        except ValueError:
-            limit = math.nan
-        if math.isnan(limit):
-            raise RequirementError(f"--require {text!r}: {number!r} is not a number")
-        return cls(figure, comparison, limit)
+        return cls(figure, comparison, float(number))
 
     def met(self, figures: Mapping[str, float]) -> bool:
         """Whether the figure is as required. One that the log does not hold (NaN) is not."""

@@ -4,53 +4,36 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from pathlib import Path
 from typing import Annotated
-
-import typer
 
 from offboard.cli.shared import (
     DEFAULT_CONNECTION,
     FLIGHTS,
     Assignments,
     CommandError,
+    Directory,
     Vehicle,
+    Workers,
+    option,
     out,
     say,
 )
 from offboard.documents import shipped
 
+NAMES = "Names or files, separated by commas"
+
 
 def compare(
-    controllers: Annotated[
-        str, typer.Option(metavar="LIST", help="Comma-separated names or files, or 'all'.")
-    ] = "pso,lqr,paper",
-    reference: Annotated[
-        str, typer.Option(metavar="LIST", help="Comma-separated names or files.")
-    ] = "lemniscate",
-    scenario: Annotated[
-        str, typer.Option(metavar="LIST", help="Comma-separated names or files.")
-    ] = "calm,px4_like",
-    seeds: Annotated[
-        int, typer.Option(metavar="N", help="Flights of each combination, with seeds 1 .. N.")
-    ] = 3,
+    controllers: Annotated[str, option("LIST", f"{NAMES}, or 'all'.")] = "pso,lqr,paper",
+    reference: Annotated[str, option("LIST", f"{NAMES}.")] = "lemniscate",
+    scenario: Annotated[str, option("LIST", f"{NAMES}.")] = "calm,px4_like",
+    seeds: Annotated[int, option("N", "Flights of each combination, with seeds 1 .. N.")] = 3,
     vehicle: Vehicle = None,
     connect: Annotated[
-        str | None,
-        typer.Option(metavar="LINK", help="Fly the vehicle at this link instead of the simulator."),
+        str | None, option("LINK", "Fly the vehicle at this link instead of the simulator.")
     ] = None,
-    workers: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Processes, 1 .. 256.  [default: one per processor]"),
-    ] = None,
-    out_directory: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            metavar="DIR",
-            help="Directory of all flights.  [default: a new one]",
-        ),
-    ] = None,
+    workers: Workers = None,
+    out_directory: Directory = None,
     assignments: Assignments = None,
 ) -> None:
     """Fly several controllers and compare them in one table.

@@ -13,12 +13,15 @@ import typer
 from offboard.cli.score import requirements_of, scored
 from offboard.cli.shared import (
     DEFAULT_CONNECTION,
+    FILE,
     FLIGHTS,
     Assignments,
     CommandError,
+    Directory,
     Requirements,
     Vehicle,
     complain,
+    option,
     out,
     say,
 )
@@ -29,58 +32,28 @@ if TYPE_CHECKING:
 
 INTERRUPTED = "interrupted before anything was sent"
 LABEL_WIDTH = 15
+LINKS = (
+    "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD.  "
+    f"[default: {DEFAULT_CONNECTION}]"
+)
 
 
 def fly(
-    sitl: Annotated[
-        bool, typer.Option("--sitl", help="Start the bundled simulator and fly it.")
-    ] = False,
-    connect: Annotated[
-        str | None,
-        typer.Option(
-            metavar="LINK",
-            help="udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD.  "
-            f"[default: {DEFAULT_CONNECTION}]",
-        ),
-    ] = None,
-    config: Annotated[
-        str, typer.Option(metavar="NAME|FILE", help="Configuration: a shipped name or a file.")
-    ] = "flight",
-    controller: Annotated[
-        str | None,
-        typer.Option(metavar="NAME|FILE", help="Controller: a shipped name or a file."),
-    ] = None,
-    reference: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|FILE", help="Reference: a shipped name, or a .yaml or .csv file."
-        ),
-    ] = None,
+    sitl: Annotated[bool, typer.Option("--sitl", help="Fly the bundled simulator.")] = False,
+    connect: Annotated[str | None, option("LINK", LINKS)] = None,
+    config: Annotated[str, option(FILE, "Configuration.")] = "flight",
+    controller: Annotated[str | None, option(FILE, "Controller.")] = None,
+    reference: Annotated[str | None, option(FILE, "Reference; a file may also be .csv.")] = None,
     vehicle: Vehicle = None,
-    firmware: Annotated[
-        str, typer.Option(metavar="NAME", help="With --sitl: px4 or ardupilot.")
-    ] = "px4",
+    firmware: Annotated[str, option("NAME", "With --sitl: px4 or ardupilot.")] = "px4",
     scenario: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|FILE",
-            help="With --sitl: scenario.  [default: estimator errors of the firmware]",
-        ),
+        str | None, option(FILE, "With --sitl: scenario.  [default: errors of the firmware]")
     ] = None,
     sim_vehicle: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME|FILE", help="With --sitl: simulated vehicle; may differ from --vehicle."
-        ),
+        str | None, option(FILE, "With --sitl: simulated vehicle; may differ from --vehicle.")
     ] = None,
-    seed: Annotated[
-        int | None,
-        typer.Option(metavar="N", help="Random seed of the swarm and, with --sitl, the simulator."),
-    ] = None,
-    out_directory: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="Flight directory.  [default: a new one]"),
-    ] = None,
+    seed: Annotated[int | None, option("N", "Random seed, also of the simulator.")] = None,
+    out_directory: Directory = None,
     require: Requirements = None,
     assignments: Assignments = None,
 ) -> None:
@@ -88,6 +61,7 @@ def fly(
 
     Prints the phases of the flight as they happen and ends with the result. The flight directory
     holds flight.tlog (all messages), flight.yaml (the resolved configuration) and score.json.
+    NAME is the name of a shipped file, see below and `offboard list`.
     """
     from offboard.flight.sitl import SimulatorProcess
     from offboard.flight.stop import StopRequests

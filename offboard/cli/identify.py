@@ -8,39 +8,28 @@ from typing import Annotated
 import typer
 
 from offboard.cli.fly import fly
-from offboard.cli.shared import FLIGHTS, CommandError, out, say
+from offboard.cli.shared import FILE, FLIGHT, FLIGHTS, CommandError, Directory, option, out, say
 
 
 def identify(
-    flight: Annotated[
-        Path | None, typer.Argument(metavar="FLIGHT", help="Flight directory or .tlog file.")
-    ] = None,
+    flight: Annotated[Path | None, FLIGHT] = None,
     output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="FILE", help="Vehicle file to write."),
+        Path | None, option("FILE", "Vehicle file to write.", "-o", "--output")
     ] = None,
     page: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="Page with the fits.  [default: beside the log]"),
+        Path | None, option("FILE", "Page with the fits.  [default: beside the log]")
     ] = None,
     connect: Annotated[
-        str | None,
-        typer.Option(metavar="LINK", help="Fly the reference `identify` there and use its log."),
+        str | None, option("LINK", "Fly the reference `identify` there and use its log.")
     ] = None,
     sitl: Annotated[
-        bool, typer.Option("--sitl", help="Fly it on the bundled simulator and use its log.")
+        bool, typer.Option("--sitl", help="The same on the bundled simulator.")
     ] = False,
     vehicle: Annotated[
         str | None,
-        typer.Option(
-            metavar="NAME|FILE",
-            help="Vehicle with the constants that are not identified.  [default: of the flight]",
-        ),
+        option(FILE, "Source of constants that are not identified.  [default: the flight]"),
     ] = None,
-    out_directory: Annotated[
-        Path | None,
-        typer.Option("--out", metavar="DIR", help="Flight directory of --connect or --sitl."),
-    ] = None,
+    out_directory: Directory = None,
 ) -> None:
     """Identify a vehicle from a flight: vehicle file and page.
 
@@ -59,13 +48,7 @@ def identify(
         raise CommandError(f"{output} exists already; choose another file with -o")
     if flight is None:
         flight = out_directory or FLIGHTS / f"identify-{clock.local_stamp()}"
-        fly(
-            sitl=sitl,
-            connect=connect,
-            reference="identify",
-            vehicle=vehicle,
-            out_directory=flight,
-        )
+        fly(sitl, connect, reference="identify", vehicle=vehicle, out_directory=flight)
     path = tlog.find(flight)
     log = tlog.read(path)
     configuration = history.configuration(log)

@@ -2,42 +2,23 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from offboard.cli.shared import FLIGHTS, CommandError, err, say
+from offboard.cli.shared import FLIGHTS, CommandError, Directory, Workers, err, option, say
 
 
 def paper(
-    out_directory: Annotated[
-        Path | None,
-        typer.Option(
-            "--out",
-            metavar="DIR",
-            help="Directory of page, tables and figures.  [default: a new one]",
-        ),
-    ] = None,
-    quick: Annotated[
-        bool, typer.Option("--quick", help="Fewer seeds: seconds instead of minutes.")
-    ] = False,
-    seeds: Annotated[
-        int | None, typer.Option(metavar="N", help="Flights per row.  [default: 20]")
-    ] = None,
+    out_directory: Directory = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer seeds; takes seconds.")] = False,
+    seeds: Annotated[int | None, option("N", "Flights per row.  [default: 20]")] = None,
     initial_q: Annotated[
-        str | None,
-        typer.Option(metavar="LIST", help="diag(Q) of Eq. 23: 1 or 12 comma-separated weights."),
+        str | None, option("LIST", "diag(Q) of Eq. 23: 1 or 12 weights, separated by commas.")
     ] = None,
-    figure: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Only this figure; repeatable.")
-    ] = None,
-    table: Annotated[
-        list[str] | None, typer.Option(metavar="NAME", help="Only this table; repeatable.")
-    ] = None,
-    workers: Annotated[
-        int | None, typer.Option(metavar="N", help="Processes.  [default: one per processor]")
-    ] = None,
+    figure: Annotated[list[str] | None, option("NAME", "Only this figure; repeatable.")] = None,
+    table: Annotated[list[str] | None, option("NAME", "Only this table; repeatable.")] = None,
+    workers: Workers = None,
 ) -> None:
     """Reproduce tables 2-4 and figures 4-17 of the paper on one page."""
     from offboard.flight import clock

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from offboard.cli.shared import CommandError, FlightArgument, Requirements, complain, out
+from offboard.cli.shared import FLIGHT, CommandError, Requirements, complain, out
 
 if TYPE_CHECKING:
     from offboard.analysis.history import History
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def score(
-    flight: FlightArgument,
+    flight: Annotated[Path, FLIGHT],
     as_json: Annotated[bool, typer.Option("--json", help="Print the score as JSON.")] = False,
     require: Requirements = None,
 ) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import textwrap
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Console
@@ -26,25 +26,27 @@ EXIT_CODES = (
     "ground; 4 aborted in flight, or left armed."
 )
 
+
+def option(metavar: str, text: str, *names: str) -> Any:
+    """A command-line option with a value, by default named as its parameter."""
+    return typer.Option(*names, metavar=metavar, help=text)
+
+
+NEW_DIRECTORY = "Directory of the results.  [default: a new one in flights]"
+FILE = "NAME|FILE"  # the name of a shipped file, or a path
+FLIGHT = typer.Argument(metavar="FLIGHT", help="Flight directory or .tlog file.")
+Directory = Annotated[Path | None, option("DIR", NEW_DIRECTORY, "--out")]
+Vehicle = Annotated[str | None, option(FILE, "Vehicle.")]
+Workers = Annotated[int | None, option("N", "Processes.  [default: one per processor]")]
 Requirements = Annotated[
     list[str] | None,
-    typer.Option(
-        "--require",
-        metavar="FIGURE<NUMBER",
-        help="Exit with code 1 if the score does not meet this; repeatable.",
+    option(
+        "FIGURE<NUMBER", "Exit with 1 if the score does not meet this; repeatable.", "--require"
     ),
 ]
 Assignments = Annotated[
     list[str] | None,
-    typer.Option(
-        "--set", metavar="KEY.PATH=VALUE", help="Change one configuration value; repeatable."
-    ),
-]
-FlightArgument = Annotated[
-    Path, typer.Argument(metavar="FLIGHT", help="Flight directory or .tlog file.")
-]
-Vehicle = Annotated[
-    str | None, typer.Option(metavar="NAME|FILE", help="Vehicle: a shipped name or a file.")
+    option("KEY.PATH=VALUE", "Change one configuration value; repeatable.", "--set"),
 ]
 
 

@@ -14,7 +14,7 @@ from offboard.flight.state import VehicleState
 from offboard.mavlink.dialects.base import TAKEOFF, Dialect
 from offboard.mavlink.outgoing import CommandLong
 from offboard.mavlink.session import Session
-from offboard.model.command import Command, PositionCommand
+from offboard.model.command import Command
 
 SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
 SPOOL_MAX = 2.0
@@ -53,28 +53,28 @@ class PhaseActions:
             self._prepare(tick)
         elif tick.phase is Phase.TAKEOFF:
             self._take_off(tick)
-        elif tick.phase in TRACKING:
-            self._track(tick)
-        else:
+        elif tick.phase not in TRACKING:
             self.hold(tick)
+        elif not self._decider.decide(tick):
+            self._outbox.send_command(tick.time_s, self._level())
 
     def hold(self, tick: Tick) -> None:
         """Send what needs no telemetry: level setpoints, and the request that ends the flight."""
         phase, time_s = tick.phase, tick.time_s
         # Until setpoints have replaced an autopilot's own take-off, none must be sent
-        ours = not self._assessment.lifted_by_command or self._plan.reference is not None
+        steers = not self._assessment.lifted_by_command or self._plan.reference is not None
         if phase is Phase.TAKEOFF or phase in TRACKING:
-            if ours:
+            if steers:
                 self._outbox.send_command(time_s, self._level())
         elif phase is Phase.LAND:
             if not self._engaged:
                 return
             self._outbox.request(self._dialect.land(), time_s)
-            if ours and tick.in_phase_s < LAND_STREAM_S:
+            if steers and tick.in_phase_s < LAND_STREAM_S:
                 self._outbox.send_command(time_s, self._level())
         elif phase is Phase.STAND_DOWN:
             self._outbox.request(CommandLong.disarm(), time_s)
-            if ours:
+            if steers:
                 course_rad = self._outbox.command.course_rad
                 self._outbox.send_command(time_s, Command(0.0, LEVEL, course_rad))
 
@@ -119,18 +119,6 @@ class PhaseActions:
             self._outbox.request(self._dialect.take_off(TAKEOFF_HEIGHT_M), time_s)
         gravity_mps2 = self._outbox.vehicle.gravity_mps2
         self._outbox.set_command(time_s, Command(gravity_mps2, LEVEL, self._state.course_rad))
-
-    def _track(self, tick: Tick) -> None:
-        decided = self._decider.decide(tick)
-        if decided is None:
-            self._outbox.send_command(tick.time_s, self._level())
-            return
-        if isinstance(decided.command, PositionCommand):
-            self._outbox.send_position(tick.time_s, decided.command)
-        else:
-            body_z_down = float(decided.state.thrust_direction_ned[2])
-            self._outbox.send_command(tick.time_s, decided.command, body_z_down)
-        self._decider.follow_up(tick, decided)
 
     def _level(self) -> Command:
         """Level, with the thrust that hovers; before lift-off with the thrust reached."""

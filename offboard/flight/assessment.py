@@ -125,11 +125,11 @@ class Assessment:
         state, session = self._state, self._session
         if not state.has_state or session.dialect is None:
             return "no LOCAL_POSITION_NED or no ATTITUDE_QUATERNION arrives"
+        rates_hz = session.rates_hz
         for name in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED"):
-            rate_hz = session.rates_hz[name]
-            if rate_hz < MINIMUM_TELEMETRY_HZ:
+            if rates_hz[name] < MINIMUM_TELEMETRY_HZ:
                 return (
-                    f"{name} arrives at {rate_hz:.1f} Hz, "
+                    f"{name} arrives at {rates_hz[name]:.1f} Hz, "
                     f"at least {MINIMUM_TELEMETRY_HZ:.0f} Hz are needed"
                 )
         if state.armed and state.landed == "unknown":

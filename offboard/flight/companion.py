@@ -64,7 +64,7 @@ class Companion:
         period_s: float,
         deadline_s: float | None,
         stopwatch: Callable[[], float],
-        learning: IdentifySettings | None = None,
+        identify: IdentifySettings | None = None,
     ) -> None:
         self._session = session
         self._observer = observer
@@ -76,7 +76,7 @@ class Companion:
         self.peer: Hashable | None = None
         self._tick = -1
         self._bridged_s = 0.0
-        self._identification = _identification(vehicle, controller, period_s, learning)
+        self._identification = _identification(vehicle, controller, period_s, identify)
         self._outbox = Outbox(session, observer, vehicle, self._identification)
         self._link_delay = LinkDelay()
         readiness = Readiness()

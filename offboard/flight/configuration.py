@@ -119,11 +119,6 @@ def build_controller(config: FlightConfig) -> Controller:
         raise DocumentError(f"controller {settings.law}: {error}") from None
 
 
-def controllers() -> list[str]:
-    """The names of all controllers: shipped files, and laws of installed packages."""
-    return list(dict.fromkeys((*shipped.names(FOLDERS["controller"]), *catalogue.names())))
-
-
 def check_file(path: Path, check_scenario: Callable[[Path], None]) -> str:
     """Validate one file of any kind that a flight may be given; return what it is.
 

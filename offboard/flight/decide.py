@@ -1,7 +1,7 @@
-"""Decision of one tick: predict the state, call the control law, check and limit its command.
+"""Decision of one tick: predict the state, call the control law, check, limit and send its command.
 
-After it: the record for the log, and the online identification. Failures of the law are counted,
-never raised: the vehicle is in the air.
+Then log the decision and identify the vehicle. Failures of the law are counted, never raised: the
+vehicle is in the air.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Tick:
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """A decision and the state it was made for; `command` is checked and limited."""
+    """A decision and the predicted state it was made for; `command` is checked and limited."""
 
     state: PredictedState
     decision: Decision
@@ -81,29 +81,36 @@ class Decider:
             limit_radps = self._identification.cautious_bandwidth_radps
             self._controller.adopt(self._outbox.vehicle, limit_radps)
 
-    def decide(self, tick: Tick) -> Decided | None:
-        """The decision, or None if it failed, which increases `missed`."""
+    def decide(self, tick: Tick) -> bool:
+        """Decide, send the setpoint, log the decision, then identify.
+
+        Returns False, and increases `missed`, if the decision failed; then nothing is sent.
+        """
         try:
             decided = self._decided(tick)
         except Exception as error:  # any error: the vehicle is in the air
             self.missed += 1
             self.failure = f"{type(error).__name__}: {error}"
             self._outbox.warn(f"decision missed: {self.failure}")
-            return None
+            return False
         self.missed = 0
-        return decided
-
-    def follow_up(self, tick: Tick, decided: Decided) -> None:
-        """After the setpoint was queued: log the decision, identify, adopt the result."""
+        if isinstance(decided.command, PositionCommand):
+            self._outbox.send_position(tick.time_s, decided.command)
+        else:
+            body_z_down = float(decided.state.thrust_direction_ned[2])
+            self._outbox.send_command(tick.time_s, decided.command, body_z_down)
         self._record(tick, decided)
-        if self._identification is None:
-            return
+        if self._identification:
+            self._identify(tick, self._identification)
+        return True
+
+    def _identify(self, tick: Tick, identification: OnlineIdentification) -> None:
         try:
-            adoption = self._identification.learn(tick.phase, tick.time_s)
+            adoption = identification.learn(tick.phase, tick.time_s)
             if adoption is not None:
                 self._adopt(tick.time_s, adoption)
         except Exception as error:  # the flight continues with the present vehicle model
-            self._identification.give_up()
+            identification.give_up()
             self._outbox.warn(f"identification stopped: {error}")
 
     def _decided(self, tick: Tick) -> Decided:
@@ -150,14 +157,14 @@ class Decider:
         self._outbox.vehicle = adoption.vehicle
         if adoption.record:
             record = SolverRecord(time_s, adoption.record, IDENTIFIED_ID, IDENTIFIED_NAME)
-            self._outbox.log(record)
+            self._outbox.send(record)
         for sentence in adoption.sentences:
             self._outbox.announce(sentence)
 
     def _record(self, tick: Tick, decided: Decided) -> None:
         sample = self._plan.sample(tick.time_s)
         assert sample is not None
-        self._outbox.log(reference_record(tick.time_s, sample))
+        self._outbox.send(reference_record(tick.time_s, sample))
         record = TickRecord.of(
             phase=PHASE_CODES[tick.phase],
             decision=decided.decision,
@@ -168,4 +175,4 @@ class Decider:
             hover_thrust=self._observer.hover_thrust_estimate,
             track_time_s=self._plan.track_time_s(tick.time_s),
         )
-        self._outbox.log(SolverRecord(tick.time_s, record.data(), RECORD_ID, RECORD_NAME))
+        self._outbox.send(SolverRecord(tick.time_s, record.data(), RECORD_ID, RECORD_NAME))

@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 import select
 import socket
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from contextlib import suppress
 from typing import Protocol
 
@@ -84,31 +84,31 @@ class UdpLink:
         return int(self._socket.getsockname()[1])
 
 
-class Backlog:
-    """Frames queued for a stream whose buffer is full. A new setpoint replaces a queued one; of
-    too many frames the oldest are dropped."""
+class LockstepLink(UdpLink):
+    """UDP to a simulator in lockstep: returns all datagrams up to a barrier at once, and only once.
 
-    def __init__(self) -> None:
-        self._begun = b""
-        self._queued: list[bytes] = []
+    A barrier is a TIMESYNC request at the end of a datagram. The simulator waits for the reply and
+    meanwhile repeats all datagrams since the previous barrier.
+    """
 
-    def add(self, frame: bytes) -> None:
-        if _is_setpoint(frame):
-            self._queued = [other for other in self._queued if not _is_setpoint(other)]
-        self._queued = [*self._queued, frame][-QUEUED_MAX:]
+    def __init__(self, sock: socket.socket, peer: tuple[str, int] | None) -> None:
+        super().__init__(sock, peer)
+        self._block: list[Chunk] = []  # since the newest barrier
+        self._barrier = b""
 
-    def flush(self, send: Callable[[bytes], int]) -> None:
-        """Send as much as possible. `send` returns the number of bytes sent, or raises
-        BlockingIOError as sockets do."""
-        with suppress(BlockingIOError):
-            while self._begun or self._queued:
-                if not self._begun:
-                    self._begun = self._queued.pop(0)
-                self._begun = self._begun[send(self._begun) :]
+    def receive(self, timeout_s: float) -> list[Chunk]:
+        complete: list[Chunk] = []
+        for chunk in super().receive(timeout_s):
+            self._block.append(chunk)
+            if _is_barrier(chunk[0]):
+                if chunk[0] != self._barrier:
+                    complete += self._block
+                self._barrier, self._block = chunk[0], []
+        return complete
 
 
 def _message_id(frame: bytes) -> int:
-    """Of a MAVLink 2 frame."""
+    """Message id of a MAVLink 2 frame."""
     return int.from_bytes(frame[7:10], "little")
 
 
@@ -116,18 +116,53 @@ def _is_setpoint(frame: bytes) -> bool:
     return _message_id(frame) in SETPOINTS
 
 
-class TcpLink:
-    """A TCP connection to a listening autopilot."""
+def _is_barrier(datagram: bytes) -> bool:
+    """Whether the last frame is a TIMESYNC request, which has tc1 = 0."""
+    at = last = 0
+    while at < len(datagram):
+        last, at = at, at + (frame_size(datagram, at) or len(datagram))
+    return _message_id(datagram[last:]) == TIMESYNC and not any(datagram[last + 10 : last + 18])
+
+
+class StreamLink:
+    """Base of TCP and serial links. Frames are queued while the buffer of the stream is full: a new
+    setpoint replaces a queued one, and of too many frames the oldest are dropped."""
 
     is_stream = True
 
+    def __init__(self) -> None:
+        self._begun = b""
+        self._queued: list[bytes] = []
+
+    def send(self, data: bytes, peer: Hashable | None) -> None:
+        if _is_setpoint(data):
+            self._queued = [other for other in self._queued if not _is_setpoint(other)]
+        self._queued = [*self._queued, data][-QUEUED_MAX:]
+        self._flush()
+
+    def _flush(self) -> None:
+        """Send as much as possible. A dead link shows as silence."""
+        with suppress(OSError):
+            while self._begun or self._queued:
+                if not self._begun:
+                    self._begun = self._queued.pop(0)
+                self._begun = self._begun[self._write(self._begun) :]
+
+    def _write(self, data: bytes) -> int:
+        """Number of bytes sent; raises BlockingIOError if the buffer is full."""
+        raise NotImplementedError
+
+
+class TcpLink(StreamLink):
+    """A TCP connection to a listening autopilot."""
+
     def __init__(self, sock: socket.socket) -> None:
+        super().__init__()
         sock.setblocking(False)
-        with suppress(OSError):  # queue in `Backlog`, where a setpoint can be replaced
+        with suppress(OSError):  # queue here, where a setpoint can be replaced
             sock.setsockopt(socket.IPPROTO_TCP, TCP_NOTSENT_LOWAT, 1)
         self._socket = sock
         self._open = True
-        self._backlog = Backlog()
 
     def receive(self, timeout_s: float) -> list[Chunk]:
         if not self._open:
@@ -146,33 +181,26 @@ class TcpLink:
         self._open = bool(data)
         return [(data, "tcp")] if data else []
 
-    def send(self, data: bytes, peer: Hashable | None) -> None:
-        self._backlog.add(data)
-        self._flush()
-
-    def _flush(self) -> None:
-        with suppress(OSError):  # a dead link shows as silence
-            self._backlog.flush(self._socket.send)
+    def _write(self, data: bytes) -> int:
+        return self._socket.send(data)
 
     def close(self) -> None:
         self._socket.close()
 
 
-class SerialLink:
+class SerialLink(StreamLink):
     """A serial port through pyserial."""
-
-    is_stream = True
 
     def __init__(self, device: str, baud: int) -> None:
         import serial
 
+        super().__init__()
         try:
             self._port = serial.Serial(device, baud, timeout=0)
         except (serial.SerialException, ValueError) as error:
             raise LinkError(
                 f"serial port {device} at {baud} baud cannot be opened: {error}"
             ) from None
-        self._backlog = Backlog()
 
     def receive(self, timeout_s: float) -> list[Chunk]:
         self._flush()
@@ -185,14 +213,6 @@ class SerialLink:
             return []
         return [(data, "serial")] if data else []
 
-    def send(self, data: bytes, peer: Hashable | None) -> None:
-        self._backlog.add(data)
-        self._flush()
-
-    def _flush(self) -> None:
-        with suppress(OSError):  # a dead link shows as silence
-            self._backlog.flush(self._write)
-
     def _write(self, data: bytes) -> int:
         # pyserial's write waits in a busy loop while the port's buffer is full
         return os.write(self._port.fileno(), data)
@@ -201,44 +221,18 @@ class SerialLink:
         self._port.close()
 
 
-class LockstepLink:
-    """A link to a simulator in lockstep: returns all datagrams up to a barrier at once, only once.
-
-    A barrier is a TIMESYNC request at the end of a datagram. The simulator waits for the reply and
-    meanwhile repeats all datagrams since the previous barrier.
-    """
-
-    is_stream = False
-
-    def __init__(self, link: Link) -> None:
-        self._link = link
-        self._block: list[Chunk] = []  # since the newest barrier
-        self._barrier = b""
-
-    def receive(self, timeout_s: float) -> list[Chunk]:
-        complete: list[Chunk] = []
-        for chunk in self._link.receive(timeout_s):
-            self._block.append(chunk)
-            if not _is_barrier(chunk[0]):
-                continue
-            if chunk[0] != self._barrier:
-                complete += self._block
-            self._barrier, self._block = chunk[0], []
-        return complete
-
-    def send(self, data: bytes, peer: Hashable | None) -> None:
-        self._link.send(data, peer)
-
-    def close(self) -> None:
-        self._link.close()
+def open_lockstep_link() -> LockstepLink:
+    """Open a link on a free port of this computer, for a simulator in lockstep."""
+    sock = _udp_socket()
+    sock.bind(("127.0.0.1", 0))
+    return LockstepLink(sock, None)
 
 
-def _is_barrier(datagram: bytes) -> bool:
-    """Whether the last frame is a TIMESYNC request, which has tc1 = 0."""
-    at = last = 0
-    while at < len(datagram):
-        last, at = at, at + (frame_size(datagram, at) or len(datagram))
-    return _message_id(datagram[last:]) == TIMESYNC and not any(datagram[last + 10 : last + 18])
+def _udp_socket() -> socket.socket:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+    sock.setblocking(False)
+    return sock
 
 
 def open_link(address: str) -> Link:
@@ -268,9 +262,7 @@ def _open_socket(kind: str, host: str, port: int, address: str) -> Link:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             return TcpLink(connection)
         peer = (socket.gethostbyname(host), port)
-        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
-        sock.setblocking(False)
+        sock = _udp_socket()
         if kind == "udpout":
             return UdpLink(sock, peer)
         sock.bind(peer)

@@ -63,7 +63,7 @@ class Loop:
 
     def _fly(self) -> None:
         companion, link = self._companion, self._link
-        heard_s = polled_s = clock.monotonic_s()
+        telemetry_s = polled_s = clock.monotonic_s()
         while not (companion.has_ended() or self._stops.repeated or self._ended_early):
             if self._stops.requested:
                 companion.request_stop()
@@ -72,14 +72,14 @@ class Loop:
             for data, peer in chunks:
                 output = companion.receive(data, peer, now_s)
                 if output.alive:
-                    heard_s = now_s
+                    telemetry_s = now_s
                 self._deliver(output, peer)
                 self._show()
                 if companion.has_ended():
                     break
             if not chunks or now_s - polled_s > POLL_S:
                 polled_s = now_s
-                self._deliver(companion.poll(now_s, now_s - heard_s), companion.peer)
+                self._deliver(companion.poll(now_s, now_s - telemetry_s), companion.peer)
                 self._show()
                 self._check_simulator()
 

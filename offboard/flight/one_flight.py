@@ -19,7 +19,7 @@ from offboard.estimation.observer import Observer
 from offboard.flight import clock, manifest
 from offboard.flight.companion import Companion, Outcome
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.link import LockstepLink, UdpLink, open_link
+from offboard.flight.link import LockstepLink, open_link, open_lockstep_link
 from offboard.flight.log import FlightLog
 from offboard.flight.loop import Loop
 from offboard.flight.online_identification import IdentifySettings
@@ -80,7 +80,7 @@ class FlightParts:
     limits: Limits
     period_s: float
     deadline_s: float
-    learning: IdentifySettings | None = None
+    identify: IdentifySettings | None = None
 
 
 def rehearse(parts: FlightParts, *, keeps_deadline: bool) -> float:
@@ -146,10 +146,10 @@ def fly(
     """
     with ExitStack() as stack:
         log.check()
-        link = open_link("udpin:127.0.0.1:0" if bundled else connection)
+        link = open_lockstep_link() if bundled else open_link(connection)
         stack.callback(link.close)
         if bundled:
-            assert isinstance(link, UdpLink)
+            assert isinstance(link, LockstepLink)
             bundled.simulator.launch(bundled.options(link.port))
             stack.callback(bundled.simulator.recall)
         some = "" if Entry.all_compiled() else " (compiles what never flew here, for some seconds)"
@@ -176,7 +176,7 @@ def fly(
             log.begin(clock.unix_us(), session.encode(piece))
         loop = Loop(
             _companion(parts, session, observer, lockstep=bundled is not None),
-            LockstepLink(link) if bundled else link,
+            link,
             log,
             stops=stops,
             progress=progress,
@@ -204,5 +204,5 @@ def _companion(
         period_s=parts.period_s,
         deadline_s=None if lockstep else parts.deadline_s,
         stopwatch=clock.monotonic_s,
-        learning=parts.learning,
+        identify=parts.identify,
     )

@@ -1,7 +1,7 @@
-"""Outbox: the only place that creates setpoints, and the queue of all frames to send and to log.
+"""Outbox: the only place that creates setpoints, and the queue of all messages and records.
 
 A setpoint is also given to the observer and the identification, which predict with the commands
-that were sent. Frames are queued until `flush`. Decides nothing; owns no socket or file.
+that were sent. `flush` encodes what is queued. Decides nothing; owns no socket or file.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class Output:
 
 
 class Outbox:
-    """Creates and queues frames. `vehicle` is the vehicle model in use: it scales the thrust.
+    """Creates and queues messages. `vehicle` is the vehicle model in use: it scales the thrust.
 
     `command` is the command in force, `announced` are the sentences for the user, oldest first.
     """
@@ -53,8 +53,7 @@ class Outbox:
         self.announced: list[str] = []
         self._requested_s = -math.inf
         self._text_id = 0
-        self._to_send: list[bytes] = []
-        self._to_log: list[bytes] = []
+        self._queue: list[Outgoing] = []
 
     # ------------------------------------------------------------------ setpoints
 
@@ -130,18 +129,12 @@ class Outbox:
             self.send(chunk)
 
     def send(self, *messages: Outgoing) -> None:
-        """Queue messages, to send and to log."""
-        for message in messages:
-            frame = self._session.encode(message)
-            self._to_send.append(frame)
-            self._to_log.append(frame)
-
-    def log(self, record: Record) -> None:
-        """Queue a record, for the log only."""
-        self._to_log.append(self._session.encode(record))
+        """Queue messages to send and to log; records are only logged."""
+        self._queue.extend(messages)
 
     def flush(self, received: tuple[bytes, ...], alive: bool) -> Output:
-        """All frames queued since the last call; in the log, `received` comes before them."""
-        send, log = tuple(self._to_send), (*received, *self._to_log)
-        self._to_send, self._to_log = [], []
-        return Output(send, log, alive)
+        """Encode the queue. In the log, the frames `received` come first."""
+        frames = [(message, self._session.encode(message)) for message in self._queue]
+        self._queue.clear()
+        send = tuple(frame for message, frame in frames if not isinstance(message, Record))
+        return Output(send, (*received, *(frame for _, frame in frames)), alive)

@@ -80,7 +80,7 @@ def build_parts(config: FlightConfig) -> FlightParts:
         limits=config.limits,
         period_s=config.period_s,
         deadline_s=config.deadline_s,
-        learning=config.identify,
+        identify=config.identify,
     )
 
 

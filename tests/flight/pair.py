@@ -228,7 +228,7 @@ def make(
         period_s=resolved.period_s,
         deadline_s=None,
         stopwatch=lambda: 0.0,
-        learning=learning,
+        identify=learning,
     )
     conditions = simulated.scenario(scenario).conditions
     instance = Instance(firmware, flies or simulated.vehicle("px4_sih"), conditions, seed)

@@ -29,7 +29,7 @@ def hovering() -> VehicleState:
     return state
 
 
-def test_an_outage_of_the_whole_link_ages_nothing() -> None:
+def test_an_outage_of_the_whole_link_does_not_count_as_age() -> None:
     state = hovering()
     state.update(position(10.9))
     assert state.attitude_age_s == pytest.approx(0.0)
@@ -41,7 +41,7 @@ def test_an_outage_of_the_whole_link_ages_nothing() -> None:
 
 
 @pytest.mark.parametrize("interval_s", [0.05, 0.2, 0.31, 0.4, 0.9])
-def test_one_stream_that_stops_is_seen_however_slow_the_other_is(interval_s: float) -> None:
+def test_a_stopped_stream_is_detected_at_any_rate_of_the_other(interval_s: float) -> None:
     for stopped in ("position", "attitude"):
         state = hovering()
         going = attitude if stopped == "position" else position
