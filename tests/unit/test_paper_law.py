@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from offboard.control.base import DecisionError, Situation
 from offboard.control.swarm import SwarmSettings
+from offboard.documents.reading import parse
 from offboard.model.command import Command
 from offboard.model.linear import hover_matrices, sampled_matrices
 from offboard.model.predicted_state import PredictedState
@@ -32,7 +32,7 @@ from offboard.reference.base import FlatSample
 Array = NDArray[np.float64]
 
 FILES = sorted((Path(__file__).parents[2] / "config" / "vehicles").glob("*.yaml"))
-VEHICLES = {path.stem: Vehicle(**yaml.safe_load(path.read_text())) for path in FILES}
+VEHICLES = {path.stem: parse(path.read_text(), Vehicle, path.stem) for path in FILES}
 PAPER = VEHICLES["paper"]
 
 
