@@ -16,7 +16,6 @@ from simulator.firmware.base import Firmware
 from simulator.injection import prepare
 from simulator.link.impairment import frames
 from simulator.mavlink.server import Server
-from simulator.mavlink.stretch import LONGEST, Stretch
 from simulator.mavlink.strict import Strict
 from simulator.mavlink.telemetry import builders
 from simulator.mavlink.view import View
@@ -66,7 +65,6 @@ class Instance:
         self.ground = Server(
             self.view, firmware.streams.ground_rates_hz if ground_link else {}, strict=self._strict
         )
-        self._stretch = Stretch(self.view, (self.companion, self.ground))
         self.steps = 0
         self._injection = prepare(faults, seed)
         self._arrived: list[bytes] = []
@@ -105,45 +103,16 @@ class Instance:
             self._spread_texts()
         self.companion.step()
         self.ground.step()
-        self._stretch.say()
         if self._injection is not None:
             self._arrived += self._injection.down.carry(self.companion.outbox.drain(), self._now_us)
 
-    def tick(self) -> None:
-        """`advance`, the same bytes, in compiled code when nothing happens."""
-        if not self._leap(1):
-            self.advance()
-
     def advance_to_barrier(self, end_s: float = math.inf) -> bool:
-        """`advance` until `barrier_due` (True) or `end_s`: the same bytes, in fewer calls."""
-        interval_ms = self._position_interval_ms
-        first = -(-self._barrier_ms // interval_ms) * interval_ms // STEP_MS
+        """`advance` until `barrier_due` (True) or `end_s` (False)."""
         while self.time_s < end_s:
-            left = min(first - self.steps, (end_s - self.time_s) / STEP_S)
-            if not self._leap(int(left)):
-                self.advance()
+            self.advance()
             if self.barrier_due():
                 return True
         return False
-
-    def _leap(self, most: int) -> bool:
-        """Fly up to so many steps in one go, if nothing but flight and telemetry is in them."""
-        if self._injection is not None or self.steps < self._back_at_step:
-            return False
-        autopilot = self.autopilot
-        if autopilot.senses.steps >= autopilot.calm_until:
-            autopilot.wake()
-        if not self._stretch.possible:
-            return False
-        if not autopilot.resting:
-            if not autopilot.rest():
-                return False
-            self._stretch.prepare()
-        count = min(most, LONGEST, autopilot.calm_until - autopilot.senses.steps)
-        if count < 1:
-            return False
-        self.steps += self._stretch.fly(count)
-        return True
 
     def step(self) -> list[bytes]:
         """`advance`, and the companion link's datagrams; the ground link's are dropped."""
@@ -219,6 +188,7 @@ class Instance:
     def _inject(self) -> None:
         assert self._injection is not None
         self._injection.step(self.time_s, self)
+        self.autopilot.senses.forget()
         for datagram in self._injection.up.carry([], self._now_us):
             self._handle(datagram)
 

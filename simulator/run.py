@@ -159,7 +159,7 @@ class Runner:
             deadline_s = epoch_s + (instance.time_s + STEP_S) / speed
             self._serve_until(deadline_s)
             for berth in self._berths:
-                berth.instance.tick()
+                berth.instance.advance()
                 berth.send()
             behind_s = monotonic_s() - deadline_s
             self.punctuality.note(behind_s, STEP_S / speed)
@@ -174,7 +174,7 @@ class Runner:
         """Start each vehicle a step after the next, so that their streams do not fall together."""
         for ahead, berth in enumerate(self._berths):
             for _ in range(ahead):
-                berth.instance.tick()
+                berth.instance.advance()
                 berth.send()
 
     def _serve_until(self, deadline_s: float) -> None:

@@ -51,13 +51,13 @@ class Senses:
         """The same in whole microseconds; no fault turns it back."""
         return self.steps * STEP_US
 
-    def moved(self, count: int) -> None:
-        """The plant is so many steps further."""
-        self.steps += count
+    def step(self) -> None:
+        """The plant has moved by one step."""
+        self.steps += 1
         self.forget()
 
     def forget(self) -> None:
-        """What was seen is no more."""
+        """Look again when asked next: the plant or its estimate has changed."""
         self._truth = self._nav = None
 
     @property

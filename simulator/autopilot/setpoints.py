@@ -36,12 +36,6 @@ class SetpointStream:
         age_s = now_s - self.newest_s - self.firmware.setpoints.reaction_s
         return age_s <= self.parameters.role("stream_timeout_s")
 
-    @property
-    def lost_s(self) -> float:
-        """Vehicle time from which on it counts as lost, unless it goes on."""
-        noticed_s = self.newest_s + self.firmware.setpoints.reaction_s
-        return noticed_s + self.parameters.role("stream_timeout_s")
-
     def attitude(self, values: Mapping[str, Any]) -> AttitudeSetpoint | MotionSetpoint | None:
         """By the fields of ATTITUDE; None: nothing to be flown."""
         return self.firmware.setpoints.attitude(values, self.parameters.__getitem__)

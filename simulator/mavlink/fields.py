@@ -1,7 +1,7 @@
 """SI values as the fields of MAVLink messages hold them: scaled, rounded and within their range.
 
-The one place of the simulator's side that converts units and frames for messages, beside its
-compiled twin (`simulator.mavlink.payloads`). Knows no vehicle and no message.
+The one place of the simulator's side that converts units and frames for messages. Knows no vehicle
+and no message.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ def centi(velocity: Triple) -> tuple[int, int, int]:
 
 
 def heading_cdeg(yaw_rad: float) -> int:
-    """0 .. 35999."""
-    return round(math.degrees(yaw_rad) * 100) % 36000
+    """0 .. 35999; what is not finite becomes 0."""
+    return fit(math.degrees(yaw_rad) * 100, 32) % 36000
 
 
 def in_body(attitude: Quaternion, vector_ned: Triple) -> Triple:

@@ -76,8 +76,8 @@ def altitude(view: View) -> Sequence[Any]:
 
 
 def pressure_hpa(height_m: float) -> float:
-    """Of the air at this height above the sea, in a standard atmosphere."""
-    return 1013.25 * math.pow(1.0 - 2.25577e-5 * height_m, 5.25588)
+    """Pressure of the standard atmosphere at this height above the sea; 0 above 44 km."""
+    return 1013.25 * math.pow(max(0.0, 1.0 - 2.25577e-5 * height_m), 5.25588)
 
 
 def scaled_pressure(view: View) -> Sequence[Any]:

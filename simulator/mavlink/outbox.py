@@ -30,12 +30,6 @@ class Outbox:
         """Queue a message that the view can fill, as it is now."""
         self._frame(name, self.view.payload(name))
 
-    def take(self, frames: bytes, next_sequence: int) -> None:
-        """Queue whole frames written elsewhere, numbered from `sequence` to below this."""
-        if frames:
-            self._frames.append(frames)
-        self.sequence = next_sequence
-
     def _frame(self, name: str, payload: bytes) -> None:
         numbers = (self.sequence, self.view.system, MAV_COMP_ID_AUTOPILOT)
         self._frames.append(frame(*numbers, layout(name), payload))

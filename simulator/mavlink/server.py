@@ -70,16 +70,13 @@ class Server:
         self._begin_transfers()
 
     def step(self) -> None:
-        """Queue what is asked for and goes out bit by bit: missions, lists of parameters."""
+        """Queue what is due at this step: missions, lists of parameters, telemetry."""
         if self._missions.under_way:
             self._missions.step(self.view.autopilot.senses.time_us * 1e-6)
         if self._parameters.listing:
             self._parameters.step()
-
-    @property
-    def only_streams(self) -> bool:
-        """Nothing but streams has this link to say by itself."""
-        return not (self._missions.under_way or self._parameters.listing)
+        for name in self.schedule.take_due():
+            self.outbox.send_now(name)
 
     def send_barrier(self, stamp_ns: int) -> None:
         """Queue a TIMESYNC request."""
@@ -91,8 +88,6 @@ class Server:
         """Handle everything in one datagram; no bytes make this raise."""
         for message in self.decoder.read(datagram):
             self.texts.heard = True
-            if message.name != "TIMESYNC":
-                self.view.autopilot.wake()
             if self.strict is not None:
                 self._judge(message)
             handler = HANDLERS.get(message.name)

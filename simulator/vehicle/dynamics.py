@@ -15,7 +15,7 @@ from offboard.model.kernel import entry, kernel
 from offboard.model.rigid_body import RK4_SCRATCH_ROWS
 from offboard.model.state import QUATERNION
 from simulator.steps import STEP_S
-from simulator.vehicle.airframe import CONTACT, ROTOR_SIZE, advance_airframe
+from simulator.vehicle.airframe import ROTOR_SIZE, advance_airframe
 from simulator.vehicle.attitude import ROW_WIDTH, angular_acceleration, delayed_thrust
 from simulator.vehicle.noise import advance_block, fill_normals
 from simulator.vehicle.sensors import (
@@ -134,11 +134,10 @@ def receive_fix(plant: Any) -> int:
 
 @entry(int, RECORD)
 def advance_steps(count: int, plant: Any) -> int:
-    """`count` steps in place; the steps done, which are fewer if the ground is touched or left.
+    """`count` steps in place.
 
     Per step: demand into history, air, loop on the estimate, airframe, estimator errors.
     """
-    contact = plant.rotor[CONTACT]
     noise_gain = 1.0 if plant.motors_on else STANDING_NOISE
     error, turn_error = plant.error, plant.turn_error
     first = plant.step
@@ -187,10 +186,7 @@ def advance_steps(count: int, plant: Any) -> int:
                     plant.work[:],
                 )
         plant.step = step + 1
-        if plant.rotor[CONTACT] != contact:
-            done: int = step + 1 - first
-            return done
-    return count
+    return 0
 
 
 @kernel

@@ -135,24 +135,15 @@ class Plant:
 
     def advance(self, duration_s: float, demand: Demand) -> None:
         """Hold the demand for `duration_s`; what is left of a step is owed to the next call."""
-        self.obey(demand)
-        self._due_s += duration_s
-        count = int(self._due_s / STEP_S + 1e-6)
-        self._due_s -= count * STEP_S
-        self._step += count
-        while count > 0:
-            count -= advance_steps.call(count, self.address)
-
-    def obey(self, demand: Demand) -> None:
-        """From the next step on this is the demand."""
         if demand is not self._demand:
             encode(demand, self._row)
             self.record["motors_on"] = demand.motors_on
             self._demand = demand
-
-    def flown(self, count: int) -> None:
-        """Compiled code took the record so many steps further."""
+        self._due_s += duration_s
+        count = int(self._due_s / STEP_S + 1e-6)
+        self._due_s -= count * STEP_S
         self._step += count
+        advance_steps.call(count, self.address)
 
     def reset_estimate(self, offset_ned_m: Triple) -> None:
         """The estimator jumps by this much from now on, and says so by its reset counter."""
@@ -190,11 +181,6 @@ class Plant:
             wind_ned_mps=self._wind.copy(),
             battery=self.pack.state(float(self._rotor[CHARGE]), float(self._rotor[THRUST])),
         )
-
-    def battery_at_worst(self, after_s: float) -> BatteryState:
-        """What the battery may be by then: at full thrust from now on."""
-        more_as = self.pack.drain_max_a * after_s
-        return self.pack.state(float(self._rotor[CHARGE]) + more_as, 1.0)
 
     @property
     def fix(self) -> Fix:

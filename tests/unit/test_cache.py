@@ -48,7 +48,7 @@ def cache_directory(package_root: Path, **environment: str) -> Path:
     [
         "offboard/model/rigid_body.py",
         "offboard/model/state.py",  # its sizes are compiled in
-        "simulator/mavlink/seen.py",  # and this one's record, by the module's name
+        "simulator/vehicle/dynamics.py",  # and this one's record, by the module's name
     ],
 )
 def test_a_changed_compiled_source_gets_a_new_cache(tmp_path: Path, changed: str) -> None:

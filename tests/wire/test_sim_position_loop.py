@@ -24,8 +24,7 @@ def _stepped(
     loop: PositionLoop, motion: MotionSetpoint, limits: Limits = HOVER
 ) -> tuple[Quaternion, float, Triple]:
     """One period at the origin, at rest."""
-    loop.demand(motion, limits)
-    return loop.step(REST, REST)
+    return loop.step(motion, limits, REST, REST)
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 0.7, math.pi / 2, 2.5, math.pi, -1.9])

@@ -1,0 +1,79 @@
+"""Telemetry of a link: rates, time of the first message, values that are not numbers."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from simulator import config
+from simulator.firmware.px4 import PX4
+from simulator.instance import Instance
+from simulator.mavlink.codec import Decoder
+from simulator.vehicle.conditions import Conditions
+from simulator.vehicle.sensors import EstimatorName
+
+
+def _instance() -> Instance:
+    return Instance(
+        PX4,
+        config.vehicle(PX4.vehicle),
+        Conditions(estimator=EstimatorName.PX4_LIKE),
+        7,
+        lockstep=True,
+        ground_link=False,
+    )
+
+
+def test_another_rate_of_one_message_leaves_the_others_their_times() -> None:
+    instance = _instance()
+    while instance.time_s < 3.1:
+        instance.advance()
+    instance.drain()
+    slower = mavlink.MAVLink_command_long_message(1, 1, 511, 0, 31, 40_000, 0, 0, 0, 0, 0)
+    instance.feed(slower.pack(mavlink.MAVLink(None, 255, 190)))
+    sent = Counter[str]()
+    while instance.time_s < 3.9:
+        for datagram in instance.step():
+            sent.update(message.name for message in Decoder().read(datagram))
+    assert "HEARTBEAT" not in sent
+    assert sent["ATTITUDE_QUATERNION"] == 20
+    assert sent["ATTITUDE"] == 80
+
+
+def test_positions_are_sent_on_the_grid_of_the_estimator_whatever_their_rate() -> None:
+    instance = _instance()
+    faster = mavlink.MAVLink_command_long_message(1, 1, 511, 0, 32, 4_000, 0, 0, 0, 0, 0)
+    instance.feed(faster.pack(mavlink.MAVLink(None, 255, 190)))
+    stamps = []
+    while instance.time_s < 1.0:
+        for datagram in instance.step():
+            messages = Decoder().read(datagram)
+            stamps += [m.time_boot_ms for m in messages if m.name == "LOCAL_POSITION_NED"]
+    grid_ms = 4 * PX4.streams.position_grid_steps
+    assert stamps == list(range(grid_ms, 1001, grid_ms))
+
+
+def test_a_duration_ends_between_barriers() -> None:
+    instance = _instance()
+    while instance.advance_to_barrier(1.012):
+        instance.barrier()
+    assert instance.steps == 253
+
+
+@pytest.mark.parametrize(
+    "body",
+    [(np.nan,) * 13, (1.0, *(0.0,) * 9, np.nan, np.inf, -np.inf), (1.0, *(0.0,) * 11, -1e5)],
+    ids=["all NaN", "no position", "above the atmosphere"],
+)
+def test_states_without_meaning_are_sent_all_the_same(body: tuple[float, ...]) -> None:
+    instance = _instance()
+    instance.autopilot.plant.record["body"][0] = body
+    streams = instance.companion.schedule.streams
+    for name in streams:
+        streams[name].due_us = 0
+    instance.advance_to_barrier()
+    sent = {message.name for message in Decoder().read(b"".join(instance.drain()))}
+    assert sent >= {"LOCAL_POSITION_NED", "ODOMETRY", "ATTITUDE", "HIGHRES_IMU", "GPS_RAW_INT"}
