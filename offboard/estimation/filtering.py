@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from offboard.model.kernel import entry, kernel
+from offboard.compiled import array, entry, kernel
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ NOTHING = -1  # no second state is part of what is measured
 
 FILTER = np.dtype(
     [
-        ("size", "i8"),  # n; what follows is used up to there
+        ("order", "i8"),  # n; what follows is used up to there
         ("axes", "i8"),  # m
         ("places", "i8", (AXES_MAX, SIZE_MAX)),
         ("covariance", "f8", (SIZE_MAX, SIZE_MAX)),
@@ -47,10 +47,10 @@ FILTER = np.dtype(
 
 def set_up(one: Any, dynamics: Array, densities: Array) -> None:
     """Give a FILTER its model, (n, n) and (n,)."""
-    size = len(densities)
-    one["size"] = size
-    one["dynamics"][:size, :size] = dynamics
-    one["densities"][:size] = densities
+    order = len(densities)
+    one["order"] = order
+    one["dynamics"][:order, :order] = dynamics
+    one["densities"][:order] = densities
 
 
 def start(one: Any, variances: ArrayLike) -> None:
@@ -73,7 +73,7 @@ def _multiply(left: Array, right: Array, size: int, out: Array) -> None:
 @kernel
 def _half_transition(one: Any, interval_s: float) -> None:
     """exp(dynamics interval_s / 2) to fourth order, into the first work matrix."""
-    size, scaled, square, cube = one.size, one.work[0], one.work[1], one.work[2]
+    size, scaled, square, cube = one.order, one.work[0], one.work[1], one.work[2]
     fourth = one.work[3]
     half_s = 0.5 * interval_s
     for i in range(size):
@@ -88,27 +88,32 @@ def _half_transition(one: Any, interval_s: float) -> None:
         scaled[i, i] += 1.0
 
 
-@entry(FILTER, float)
-def spread(one: Any, interval_s: float) -> int:
-    """The covariance `interval_s` later, in steps of at most `longest_s`."""
-    steps = math.ceil(interval_s / one.longest_s - 1e-6)
-    if steps <= 0:
-        return 0
-    h = interval_s / steps
-    _half_transition(one, h)
-    size, covariance = one.size, one.covariance[:]
+@entry(array(1, FILTER), float)
+def spread(filters: Any, interval_s: float) -> None:
+    """The covariances of `filters` (any number of FILTER) `interval_s` later, in steps of at most
+    `longest_s`."""
+    for n in range(filters.shape[0]):
+        one = filters[n]
+        steps = math.ceil(interval_s / one.longest_s - 1e-6)
+        if steps > 0:
+            _spread(one, interval_s / steps, steps)
+
+
+@kernel
+def _spread(one: Any, step_s: float, steps: int) -> None:
+    _half_transition(one, step_s)
+    order, covariance = one.order, one.covariance[:]
     half, transition, noise, moved = one.work[0], one.work[1], one.work[2], one.work[3]
-    _multiply(half, half, size, transition)
-    _fill_noise(half, transition, one.densities, size, h, noise)
+    _multiply(half, half, order, transition)
+    _fill_noise(half, transition, one.densities, order, step_s, noise)
     for _ in range(steps):
-        _multiply(transition, covariance, size, moved)
-        for i in range(size):
-            for j in range(size):
+        _multiply(transition, covariance, order, moved)
+        for i in range(order):
+            for j in range(order):
                 total = noise[i, j]
-                for k in range(size):
+                for k in range(order):
                     total += moved[i, k] * transition[j, k]
                 covariance[i, j] = total
-    return 0
 
 
 @kernel
@@ -140,21 +145,20 @@ def _variance(one: Any, place: int, other: int, variance: float) -> float:
     return total if other == NOTHING else total + _projected(one, other, place, other)
 
 
-@entry(FILTER, int, int, float)
-def absorb(one: Any, place: int, other: int, variance: float) -> int:
+@kernel
+def absorb(one: Any, place: int, other: int, variance: float) -> None:
     """A scalar measurement, of the given variance, of the states `place` and `other` (or NOTHING)
     together: changes the covariance and leaves the gain."""
     covariance, gain, projected = one.covariance, one.gain, one.projected
     total = _variance(one, place, other, variance)
-    for i in range(one.size):
+    for i in range(one.order):
         projected[i] = _projected(one, i, place, other)
         gain[i] = projected[i] / total
-    for i in range(one.size):
+    for i in range(one.order):
         for j in range(i + 1):
             value = covariance[i, j] - 0.5 * (gain[i] * projected[j] + gain[j] * projected[i])
             covariance[i, j] = value
             covariance[j, i] = value
-    return 0
 
 
 @kernel
@@ -162,7 +166,7 @@ def correct(state: Array, one: Any, place: int, other: int, sd: float) -> None:
     """The measurement of `absorb` for each axis, its innovations in the record."""
     absorb(one, place, other, sd * sd)
     for k in range(one.axes):
-        for i in range(one.size):
+        for i in range(one.order):
             state[one.places[k, i]] += one.gain[i] * one.innovation[k]
 
 
@@ -194,7 +198,7 @@ def anchor_position(state: Array, one: Any, measured: Array, sd: float) -> None:
     """The position jumped: it is taken as measured, and nothing else moves."""
     for k in range(one.axes):
         state[one.places[k, 0]] = measured[one.places[k, 0]]
-    for i in range(one.size):
+    for i in range(one.order):
         one.covariance[0, i] = one.covariance[i, 0] = 0.0
     one.covariance[0, 0] = sd * sd
 
@@ -202,12 +206,12 @@ def anchor_position(state: Array, one: Any, measured: Array, sd: float) -> None:
 @kernel
 def anchor_bias(state: Array, one: Any, sd: float) -> None:
     """The reported velocity jumped, by its innovations in the record: that goes into the bias."""
-    bias = one.size - 1
+    bias = one.order - 1
     covariance = one.covariance
     for k in range(one.axes):
         state[one.places[k, bias]] += one.innovation[k]
-    for i in range(one.size):
+    for i in range(one.order):
         covariance[bias, i] = -covariance[1, i]
-    for i in range(one.size):
+    for i in range(one.order):
         covariance[i, bias] = covariance[bias, i]
     covariance[bias, bias] = covariance[1, 1] + sd * sd

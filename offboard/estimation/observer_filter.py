@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.compiled import entry, kernel
 from offboard.estimation.filtering import (
     FILTER,
     NOTHING,
@@ -19,7 +20,6 @@ from offboard.estimation.filtering import (
     anchor_position,
     correct,
     correct_within,
-    spread,
 )
 from offboard.estimation.observer_adaptation import (
     ADAPTATION,
@@ -43,11 +43,9 @@ from offboard.estimation.propagation import (
     TILT,
     TILT_RATE,
     VELOCITY,
-    replay,
     wrapped,
 )
 from offboard.model.axes import upright
-from offboard.model.kernel import entry, kernel
 
 Array = NDArray[np.float64]
 
@@ -78,66 +76,40 @@ OBSERVER = np.dtype(
 """One vehicle's observer."""
 
 
-@entry(OBSERVER, int, float, float, float, float)
-def hear_attitude(
-    seen: Any, complete: int, time_s: float, north: float, east: float, course: float
-) -> int:
-    """Thrust direction, north and east, and course reported for `time_s`. `complete`: position was
-    heard too, so that the motion can be replayed."""
-    _go_to(seen, complete, time_s)
-    state, late_s = seen.motion.states[NOW], seen.time_s - time_s
-    lateral, heading = seen.filters[LATERAL], seen.filters[HEADING]
+@entry(OBSERVER, float, float, float, float)
+def correct_by_attitude(
+    observers: Any, time_s: float, north: float, east: float, course: float
+) -> None:
+    """Correct the state by an attitude measured at `time_s`, not later than the state: thrust
+    direction (north and east components) and course (rad). `observers` is one OBSERVER (1,)."""
+    observer = observers[0]
+    state, late_s = observer.motion.states[NOW], observer.time_s - time_s
+    lateral, heading = observer.filters[LATERAL], observer.filters[HEADING]
     lateral.innovation[0] = north - state[TILT] + late_s * state[TILT_RATE]
     lateral.innovation[1] = east - state[TILT + 1] + late_s * state[TILT_RATE + 1]
     heading.innovation[0] = wrapped(course - state[COURSE] + late_s * state[COURSE_RATE])
-    correct(state, lateral, LATERAL_TILT, NOTHING, seen.attitude_sd)
-    correct(state, heading, HEADING_COURSE, NOTHING, seen.attitude_sd)
-    bound_disturbance(state, seen.disturbance_limit)
-    return 0
+    correct(state, lateral, LATERAL_TILT, NOTHING, observer.attitude_sd)
+    correct(state, heading, HEADING_COURSE, NOTHING, observer.attitude_sd)
+    bound_disturbance(state, observer.disturbance_limit)
 
 
-@entry(OBSERVER, int, float, float, float, float, float, float, float)
-def hear_position(
-    seen: Any,
-    complete: int,
-    time_s: float,
-    north: float,
-    east: float,
-    down: float,
-    velocity_n: float,
-    velocity_e: float,
-    velocity_d: float,
-) -> int:
-    """Position and velocity reported for `time_s`; `complete`: attitude was heard too. Returns what
-    jumped."""
-    _go_to(seen, complete, time_s)
-    state, measured = seen.motion.states[NOW], seen.measured
-    measured[POSITION], measured[POSITION + 1], measured[POSITION + 2] = north, east, down
-    measured[VELOCITY], measured[VELOCITY + 1] = velocity_n, velocity_e
-    measured[VELOCITY + 2] = velocity_d
-    if seen.velocity == TRUSTED:
+@entry(OBSERVER, float)
+def correct_by_position(observers: Any, time_s: float) -> int:
+    """Correct the state by the position and velocity in `measured`, of `time_s`, not later than
+    the state. Returns what jumped: POSITION_JUMPED, VELOCITY_JUMPED, both or 0."""
+    observer = observers[0]
+    state, measured = observer.motion.states[NOW], observer.measured
+    jumped = 0
+    if observer.velocity == TRUSTED:
         for i in range(6):
             state[i] = measured[i]
-        return 0
-    late_s = seen.time_s - time_s
-    if late_s > 0.0:
-        _bring_forward(measured, state, seen.motion.plant, late_s)
-    jumped = _correct(seen, state)
-    bound_disturbance(state, seen.disturbance_limit)
+    else:
+        late_s = observer.time_s - time_s
+        if late_s > 0.0:
+            _bring_forward(measured, state, observer.motion.plant, late_s)
+        jumped = _correct(observer, state)
+        bound_disturbance(state, observer.disturbance_limit)
     return jumped
-
-
-@kernel
-def _go_to(seen: Any, complete: int, time_s: float) -> None:
-    """Replay to `time_s`, or stay if newer telemetry came first."""
-    if time_s <= seen.time_s:
-        return
-    if complete:
-        interval_s = time_s - seen.time_s
-        replay(seen.motion, NOW, seen.time_s, time_s)
-        for i in range(3):
-            spread(seen.filters[i], interval_s)
-    seen.time_s = time_s
 
 
 @kernel
@@ -166,7 +138,7 @@ def _correct(seen: Any, state: Array) -> int:
         sd = white_sd(learnt, kind) if seen.adaptive else seen.white_sds[kind]
         for i in range(2):
             one, gate = seen.filters[i], seen.gates[kind]
-            other = NOTHING if kind == 0 else one.size - 1
+            other = NOTHING if kind == 0 else one.order - 1
             if correct_within(state, one, kind, other, seen.measured, sd, gate):
                 continue
             jumped |= 1 << kind

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from offboard.compiled import prepare
 from offboard.control.base import Controller, Situation
 from offboard.documents.reading import DocumentError
 from offboard.estimation.fusion import FusedObserver
@@ -31,12 +32,10 @@ from offboard.identification import stages as identification
 from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
 from offboard.model.command import Command
-from offboard.model.kernel import Entry
 from offboard.model.vehicle import Vehicle
 from offboard.reference.track import Track
 from offboard.reference.transfer import Hold
 
-COMPILED_S = 2.0  # worth a word
 REHEARSED_DECISIONS = 5  # of which the fastest counts: the machine may do something else too
 SITL_PATIENCE_S = 180.0  # a bundled simulator may compile first, on a machine that does much else
 
@@ -155,12 +154,9 @@ def fly(
             assert isinstance(link, UdpLink)
             bundled.simulator.launch(bundled.options(link.port))
             stack.callback(bundled.simulator.recall)
-        some = "" if Entry.all_compiled() else " (compiles what never flew here, for some seconds)"
-        tell(f"preparing the controller{some}")
-        compiled = Entry.compilations
-        took_s = rehearse(parts, keeps_deadline=bundled is None)
-        if Entry.compilations > compiled and took_s > COMPILED_S:
-            tell(f"compiled in {took_s:.1f} s; the next start finds it cached")
+        tell("preparing the controller")
+        prepare(tell)
+        rehearse(parts, keeps_deadline=bundled is None)
         stops.heed()
         stack.enter_context(log)
         observer = parts.make_observer()

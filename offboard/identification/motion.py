@@ -11,6 +11,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.compiled import array, entry
 from offboard.identification.estimator_noise import SLOWNESS_S
 from offboard.identification.trace import (
     NORTH,
@@ -21,7 +22,6 @@ from offboard.identification.trace import (
     Trace,
     thinned,
 )
-from offboard.model.kernel import array, entry
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
@@ -48,7 +48,7 @@ class Motion:
     def thrust(self, delay_s: float, lag_s: float) -> Array:
         """Thrust (N,) as a fraction of full throttle."""
         out = np.empty_like(self.times)
-        lagged_thrust.call(self.times, self.sent, np.array((delay_s, lag_s)), out)
+        lagged_thrust(self.times, self.sent, np.array((delay_s, lag_s)), out)
         return out
 
     @property

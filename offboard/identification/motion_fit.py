@@ -10,14 +10,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
+from offboard.compiled import array, entry, kernel
 from offboard.identification.motion import Motion, lagged_thrust
 from offboard.identification.response_fit import Estimate
-from offboard.model.kernel import array, entry, kernel
 
 Array = NDArray[np.float64]
 
@@ -110,7 +111,7 @@ def fit_drag(motion: Motion, thrust_mps2: Array) -> Estimate:
 
     def surprises(drag: Array) -> Array:
         out = np.empty((2, len(motion.times) - 1))
-        innovations.call(motion.times, motion.positions[:2], pulls, drag, LATERAL, out)
+        innovations(motion.times, motion.positions[:2], pulls, drag, LATERAL, out)
         return out.ravel()
 
     result = least_squares(
@@ -147,8 +148,8 @@ class _VerticalSurprises:
         self._parameters, self._thrust = np.empty(4), np.empty(len(times))
         self._pull, self._out = np.empty_like(height), np.empty((1, len(times) - 1))
         delay_and_lag_s, drag = self._parameters[1:3], self._parameters[3:]
-        self._lag = lagged_thrust.bound(times, motion.sent, delay_and_lag_s, self._thrust)
-        self._filter = innovations.bound(times, height, self._pull, drag, VERTICAL, self._out)
+        self._lag = partial(lagged_thrust, times, motion.sent, delay_and_lag_s, self._thrust)
+        self._filter = partial(innovations, times, height, self._pull, drag, VERTICAL, self._out)
 
     def __call__(self, parameters: Array) -> Array:
         self._parameters[:] = parameters

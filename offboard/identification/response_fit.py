@@ -174,7 +174,7 @@ def predicted(
         sent = np.column_stack((sent_at, commands))
         steps = np.empty((len(times) + len(sent) + 1, 4))
         parameters = np.array([[delay_s, frequency_radps, damping]])
-        respond.call(np.ascontiguousarray(times), sent, parameters, steps, out)
+        respond(np.ascontiguousarray(times), sent, parameters, steps, out)
     response: Array = out[0, :, :axes]
     return response
 

@@ -13,11 +13,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.model.kernel import array, entry, kernel
+from offboard.compiled import array, entry, kernel
 
 Array = NDArray[np.float64]
 
@@ -138,7 +139,7 @@ class Data:
     def _bound(self, count: int) -> _Sought:
         parameters = np.empty((count, 3))
         out = np.ones((count, len(self.times), self.signals.shape[1] + 3))
-        bound = respond.bound(self.times, self._sent, parameters, self._steps, out)
+        bound = partial(respond, self.times, self._sent, parameters, self._steps, out)
         return _Sought(parameters, bound, out)
 
 

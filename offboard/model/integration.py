@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from offboard.model.kernel import array, entry
+from offboard.compiled import array, entry
 from offboard.model.rigid_body import rk4_into
 
 

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from offboard.model.kernel import kernel
+from offboard.compiled import kernel
 from offboard.model.state import EULER, INPUT_SIZE, QUATERNION
 from offboard.model.vehicle import Vehicle
 

@@ -84,7 +84,7 @@ class NonlinearPlant:
         out = state.copy()
         step_s = PAPER_STEP_S / _SUBSTEPS
         constants = self._wind, self._parameters, step_s, _SUBSTEPS
-        follow.call(out, total, *constants, self._scratch)
+        follow(out, total, *constants, self._scratch)
         return out
 
 

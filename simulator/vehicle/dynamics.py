@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from offboard.model.kernel import entry, kernel
+from offboard.compiled import entry, kernel
 from offboard.model.rigid_body import RK4_SCRATCH_ROWS
 from offboard.model.state import QUATERNION
 from simulator.steps import STEP_S
@@ -93,15 +93,16 @@ RECORD = np.dtype(
 
 
 @entry(RECORD)
-def draw_gusts(plant: Any) -> int:
+def draw_gusts(plants: Any) -> None:
     """Fill in the normal numbers that the gusts of a flight begin with."""
+    plant = plants[0]
     fill_normals(plant.seed, _GUST_LANE, np.int64(-1), plant.gust_normals[:])
-    return 0
 
 
 @entry(RECORD)
-def report_state(plant: Any) -> int:
+def report_state(plants: Any) -> None:
     """Fill in the report of this state."""
+    plant = plants[0]
     report(
         plant.body,
         plant.rotor,
@@ -116,12 +117,12 @@ def report_state(plant: Any) -> int:
         plant.normals,
         plant.report,
     )
-    return 0
 
 
 @entry(RECORD)
-def receive_fix(plant: Any) -> int:
+def receive_fix(plants: Any) -> None:
     """Fill in the satellite fix of this state."""
+    plant = plants[0]
     fill_normals(plant.seed, _RECEIVER_LANE, plant.step, plant.fix[:])
     for i in range(5):
         plant.fix[i] *= plant.fix_sds[i]
@@ -129,15 +130,15 @@ def receive_fix(plant: Any) -> int:
         plant.fix[i] += plant.body[10 + i] + plant.fix_offset[i]
     for i in range(2):
         plant.fix[3 + i] += plant.body[7 + i]
-    return 0
 
 
 @entry(int, RECORD)
-def advance_steps(count: int, plant: Any) -> int:
+def advance_steps(count: int, plants: Any) -> None:
     """`count` steps in place.
 
     Per step: demand into history, air, loop on the estimate, airframe, estimator errors.
     """
+    plant = plants[0]
     noise_gain = 1.0 if plant.motors_on else STANDING_NOISE
     error, turn_error = plant.error, plant.turn_error
     first = plant.step
@@ -186,7 +187,6 @@ def advance_steps(count: int, plant: Any) -> int:
                     plant.work[:],
                 )
         plant.step = step + 1
-    return 0
 
 
 @kernel

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from offboard.compiled import kernel
 from offboard.documents.parameters import Parameters
-from offboard.model.kernel import kernel
 from offboard.reference.base import Reference
 
 Array = NDArray[np.float64]

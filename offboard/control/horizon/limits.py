@@ -6,9 +6,9 @@ from __future__ import annotations
 
 import math
 
+from offboard.compiled import array, entry, kernel
 from offboard.control.horizon.keep_out import CENTRE, VELOCITY, distance
 from offboard.control.horizon.plant import PLANT, SCENE, B, P, V, W, Z
-from offboard.model.kernel import array, entry, kernel
 
 # Limits of a hold; every volume is two, at the middle and at the end.
 SPEED, TILT, FLOOR, VOLUME = range(4)
@@ -31,9 +31,10 @@ def penalise(  # type: ignore[no-untyped-def]
 
 
 @entry(PLANT, SCENE, array(2), array(3), array(2))
-def excesses(plant, scene, volumes, states, over) -> int:  # type: ignore[no-untyped-def]
+def excesses(plants, scenes, volumes, states, over) -> None:  # type: ignore[no-untyped-def]
     """By how much plans exceed each limit in each hold, negative within, -inf where there is none:
     over (N * limits, particles) of states (N + 1, STATE_SIZE, particles)."""
+    plant, scene = plants[0], scenes[0]
     count = limits_of(volumes)
     for k in range(states.shape[0] - 1):
         for limit in range(count):
@@ -41,7 +42,6 @@ def excesses(plant, scene, volumes, states, over) -> int:  # type: ignore[no-unt
             row[:] = -math.inf
             if _applies(plant, volumes, limit):
                 _exceed(plant, scene, volumes, k, limit, states[k], states[k + 1], row)
-    return 0
 
 
 @kernel

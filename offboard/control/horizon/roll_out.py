@@ -9,6 +9,7 @@ is remembered.
 
 from __future__ import annotations
 
+from offboard.compiled import array, entry, kernel
 from offboard.control.horizon.limits import penalise
 from offboard.control.horizon.plant import (
     INPUTS,
@@ -25,7 +26,6 @@ from offboard.control.horizon.plant import (
     Z,
 )
 from offboard.model.axes import upright
-from offboard.model.kernel import array, entry, kernel
 
 
 @kernel
@@ -38,9 +38,9 @@ def _clip(value: float, low: float, high: float) -> float:
     array(3), array(3), array(1), array(1),
 )  # fmt: skip
 def roll_out(  # type: ignore[no-untyped-def]
-    plant, scene, volumes, base_inputs, base_states, feedback, weights, knots,
+    plants, scenes, volumes, base_inputs, base_states, feedback, weights, knots,
     states, inputs, over, costs,
-) -> int:  # fmt: skip
+) -> None:  # fmt: skip
     """Costs (particles,) of plans, and their states (N + 1, STATE_SIZE, particles) and inputs
     (N, 3, particles); `over` (particles,) is scratch.
 
@@ -48,6 +48,7 @@ def roll_out(  # type: ignore[no-untyped-def]
     state is from base_states (N + 1, STATE_SIZE) + weights (N, M) @ knots (M, 3, particles),
     clipped to the bounds.
     """
+    plant, scene = plants[0], scenes[0]
     for row in range(STATE_SIZE):
         states[0, row, :] = scene.start[row]
     costs[:] = 0.0
@@ -59,7 +60,6 @@ def roll_out(  # type: ignore[no-untyped-def]
         _hold(plant, scene, k, states[k], inputs[k], states[k + 1], costs)
         penalise(plant, scene, volumes, k, states[k], states[k + 1], over, costs)
     _conclude(plant, states[inputs.shape[0]], costs)
-    return 0
 
 
 @kernel

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from offboard.model.kernel import array, entry, kernel
+from offboard.compiled import array, entry, kernel
 
 SEARCH = np.dtype(
     [
@@ -53,9 +53,10 @@ def _next(x):  # type: ignore[no-untyped-def]
 
 @entry(SEARCH, array(1, "u8"), array(1), array(1), array(2), array(2))
 def scatter(  # type: ignore[no-untyped-def]
-    search, lanes, lower, upper, positions, velocities
-) -> int:
+    searches, lanes, lower, upper, positions, velocities
+) -> None:
     """Begin a search: uniform positions in the box and uniform velocities of either sign."""
+    search = searches[0]
     search.iterations = search.rejected = 0
     search.cost = search.spread = np.inf
     initial_velocity = search.initial_velocity
@@ -69,13 +70,12 @@ def scatter(  # type: ignore[no-untyped-def]
             r2 = np.int32(x & _LOW_31) * _UNIT_31
             positions[j, i] = min(max(low + r1 * width, low), high)
             velocities[j, i] = initial_velocity * (2.0 * r2 - 1.0) * width
-    return 0
 
 
-@entry(SEARCH, array(1, "u8"), array(1), array(1), array(2), array(2), array(2), array(1))
+@kernel
 def move(  # type: ignore[no-untyped-def]
     search, lanes, lower, upper, positions, velocities, bests, leader
-) -> int:
+) -> None:
     """Eqs. 30 and 20 with a random number per dimension; Eq. 22 by clamping.
 
     A clamped component turns its velocity round, times `rebound`: a particle that keeps it stays
@@ -101,7 +101,14 @@ def move(  # type: ignore[no-untyped-def]
             inside = low <= there <= high
             velocities[j, i] = velocity if inside else -rebound * velocity
             positions[j, i] = min(max(there, low), high)  # Eq. 22
-    return 0
+
+
+@entry(SEARCH, array(1, "u8"), array(1), array(1), array(2), array(2), array(2), array(1))
+def move_particles(  # type: ignore[no-untyped-def]
+    searches, lanes, lower, upper, positions, velocities, bests, leader
+) -> None:
+    """`move` of one SEARCH (1,)."""
+    move(searches[0], lanes, lower, upper, positions, velocities, bests, leader)
 
 
 @kernel
@@ -135,12 +142,12 @@ def remember(search, costs, positions, bests, best_costs, leader) -> None:  # ty
 
 @entry(SEARCH, array(1), array(2), array(2), array(1), array(1))
 def learn(  # type: ignore[no-untyped-def]
-    search, costs, positions, bests, best_costs, leader
-) -> int:
+    searches, costs, positions, bests, best_costs, leader
+) -> None:
     """`remember`, and the spread."""
+    search = searches[0]
     remember(search, costs, positions, bests, best_costs, leader)
     search.spread = spread_about(positions, leader)
-    return 0
 
 
 @kernel
