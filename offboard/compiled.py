@@ -1,4 +1,4 @@
-"""Compilation by numba: two decorators, where the machine code is kept, and when it is made.
+"""Compilation by numba: two decorators, when functions are compiled, where machine code is kept.
 
     PAIR = np.dtype([("total", "f8"), ("count", "i8")], align=True)
 
@@ -16,11 +16,13 @@
 
     add(np.zeros(1, PAIR), np.ones(3))
 
-A kernel is called by compiled code; called from Python it runs as Python. An entry is called from
-Python. Its first call loads its machine code from disk, or compiles it with the kernels in it, for
-seconds: `prepare` before anything that must not wait. Importing compiles nothing and does not
-import numba. numba notices when the source file of an entry changed, not when that of a kernel did:
-so the directory of the machine code is named after all sources that are compiled.
+A kernel is called by compiled functions; called from Python it runs as Python. An entry is called
+from Python: the first call loads it from disk, or compiles it and its kernels, for seconds. Before
+anything that must not wait, `prepare` compiles the entries of all modules that are imported.
+Importing a module neither compiles nor imports numba.
+
+numba recompiles an entry when its source file has changed, but not when that of a kernel has. So
+machine code is kept in a directory that is named after all compiled sources.
 """
 
 from __future__ import annotations
@@ -41,7 +43,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Generic, ParamSpec, TypeVar
+from typing import Any, Generic, ParamSpec, TypeVar, cast
 
 import numpy as np
 
@@ -50,64 +52,61 @@ R = TypeVar("R")
 F = TypeVar("F", bound=Callable[..., Any])
 
 Parameter = type[int] | type[float] | np.dtype[Any] | tuple[int, np.dtype[Any]]
-"""Of an entry: a number, an array of one record, or an array: its dimensions and dtype."""
+"""Of an entry: a number, an array of one record, or the dimensions and dtype of an array."""
 
-ENTRIES_PER_PROCESS = 3  # a process takes a second to start
-VERSIONS_KEPT = 5
+ENTRIES_PER_PROCESS = 3  # starting a process costs as much as compiling one of them
+VERSIONS_KEPT = 5  # directories of machine code, most recently used
 
 _entries: list[Entry[Any, Any]] = []
-_kernels: list[Callable[..., Any]] = []  # that numba does not know yet
+_kernels: list[Callable[..., Any]] = []  # not yet registered with numba
 
 
 def kernel(function: F) -> F:
-    """Decorator: a function for entries and other kernels to call."""
+    """Decorator of a function that entries and other kernels call."""
     _kernels.append(function)
     return function
 
 
-def array(dimensions: int, dtype: str = "f8") -> Parameter:
+def array(dimensions: int, dtype: str | np.dtype[Any] = "f8") -> Parameter:
     """Parameter of an entry: a C-contiguous array."""
     return dimensions, np.dtype(dtype)
 
 
 def entry(*parameters: Parameter) -> Callable[[Callable[P, R]], Entry[P, R]]:
-    """Decorator: a function for Python to call, with one parameter per argument: `int`, `float`,
-    `array(dimensions)`, or a dtype, which stands for an array of one such record."""
+    """Decorator of a function that Python calls. There is one parameter per argument: `int`,
+    `float`, `array(dimensions)`, or a dtype for an array of one record."""
     return lambda function: Entry(function, parameters)
 
 
 class Entry(Generic[P, R]):
-    """A function in machine code. Arguments of other types raise TypeError."""
+    """A compiled function. Calling it with arguments of other types raises TypeError."""
 
     def __init__(self, function: Callable[P, R], parameters: tuple[Parameter, ...]) -> None:
+        self.name = f"{function.__module__}.{function.__name__}"
+        self.machine_code: Callable[P, R] | None = None  # once it is loaded
         self._function, self._parameters = function, parameters
-        self._code: Callable[P, R] | None = None
         functools.update_wrapper(self, function)
         _entries.append(self)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
-        code = self._code or self.load()
+        code = self.machine_code or self.load()
         return code(*args, **kwargs)
 
     @property
-    def _mark(self) -> Path:
-        """A file that is locked while the machine code is made, and not empty afterwards."""
-        return directory() / f"{self.__module__}.{self.__name__}"
-
-    @property
-    def on_disk(self) -> bool:
-        """Whether the machine code was made before."""
-        return self._mark.exists() and self._mark.stat().st_size > 0
+    def is_compiled(self) -> bool:
+        """Whether its machine code is on disk."""
+        mark = directory() / self.name
+        return mark.exists() and mark.stat().st_size > 0
 
     def load(self, wait: bool = True) -> Callable[P, R]:
-        """The machine code, from disk or newly compiled. Raises BlockingIOError where another
-        process is compiling it, unless it is to `wait` for that."""
-        with self._mark.open("a") as mark:
+        """The machine code, from disk or compiled now. Raises BlockingIOError while another process
+        compiles it, unless it may `wait` for that."""
+        with (directory() / self.name).open("a") as mark:  # not empty once it is compiled
             fcntl.flock(mark, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
             with _without_garbage_collection():
-                self._code = code = self._compile()
+                code = self.machine_code = self._compile()
             if mark.tell() == 0:
-                mark.write("compiled")
+                mark.write("compiled\n")
         return code
 
     def _compile(self) -> Callable[P, R]:
@@ -117,11 +116,13 @@ class Entry(Generic[P, R]):
         while _kernels:
             register_jitable(error_model="numpy")(_kernels.pop())
         signature = tuple(map(_numba_type, self._parameters))
-        others, numba.config.CACHE_DIR = numba.config.CACHE_DIR, str(directory())
+        config: Any = numba.config
+        others, config.CACHE_DIR = config.CACHE_DIR, str(directory())
         try:
-            return numba.njit(signature, cache=True, error_model="numpy")(self._function)
+            jitted = numba.njit(signature, cache=True, error_model="numpy")(self._function)
         finally:
-            numba.config.CACHE_DIR = others
+            config.CACHE_DIR = others
+        return cast(Callable[P, R], jitted)
 
 
 def _numba_type(parameter: Parameter) -> Any:
@@ -135,7 +136,7 @@ def _numba_type(parameter: Parameter) -> Any:
 
 @contextmanager
 def _without_garbage_collection() -> Iterator[None]:
-    """numba makes so many objects that a third of the time of loading goes there."""
+    """numba creates so many objects that collection takes a third of the time of loading."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -146,61 +147,63 @@ def _without_garbage_collection() -> Iterator[None]:
 
 
 def prepare(tell: Callable[[str], None] = lambda sentence: None) -> None:
-    """Compile the entries of all modules imported so far that are not on disk, in several
-    processes. `tell` is given a sentence for the user before that."""
-    missing = [each for each in _entries if not each.on_disk]
+    """Compile the entries of all imported modules, if they are not on disk, with one process per
+    processor. `tell` is called with a sentence for the user before it takes long."""
+    missing = [each for each in _entries if not each.is_compiled]
     if not missing:
         return
     tell("first run on this machine: compiling, about 15 s")
     modules = sorted({each.__module__ for each in missing})
     command = (sys.executable, "-P", "-m", "offboard.compiled", *modules)
-    found = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
     silent = subprocess.DEVNULL
-    helpers = [
-        subprocess.Popen(command, env=found, stdin=silent, stdout=silent, stderr=silent)
+    others = [
+        subprocess.Popen(command, env=environment, stdin=silent, stdout=silent, stderr=silent)
         for _ in range(1, min(os.cpu_count() or 1, len(missing) // ENTRIES_PER_PROCESS))
     ]
     _compile_free(missing)
-    for helper in helpers:
-        helper.wait()
+    for process in others:
+        process.wait()
+
+
+def _compile_free(entries: Iterable[Entry[Any, Any]]) -> None:
+    """Compile the entries that are not on disk and that no other process is compiling."""
+    for each in entries:
+        if not each.is_compiled:
+            with suppress(BlockingIOError):
+                each.load(wait=False)
 
 
 def main(modules: Sequence[str]) -> None:
-    """`python -m offboard.compiled MODULE...`: compile the entries that these modules take."""
+    """`python -m offboard.compiled MODULE...`: compile the entries that these modules import."""
     for name in modules:
         importlib.import_module(name)
     _compile_free(_entries)
 
 
-def _compile_free(entries: Iterable[Entry[Any, Any]]) -> None:
-    """Compile those that are not on disk and that no other process is compiling."""
-    for each in entries:
-        if not each.on_disk:
-            with suppress(BlockingIOError):
-                each.load(wait=False)
-
-
 @functools.cache
 def directory() -> Path:
-    """Of the machine code: private, in NUMBA_CACHE_DIR, XDG_CACHE_HOME or ~/.cache, where these
-    are absolute and writable; else one for this process."""
-    bases = (os.environ.get("NUMBA_CACHE_DIR"), os.environ.get("XDG_CACHE_HOME"), "~/.cache")
-    for base in (Path(each).expanduser() / "pso-offboard" for each in bases if each):
+    """Where machine code of these sources is kept, below the first of NUMBA_CACHE_DIR,
+    XDG_CACHE_HOME, ~/.cache and the directory for temporary files that is absolute and in which
+    only this user can write. Raises OSError if there is none."""
+    candidates = [os.environ.get(name, "") for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")]
+    candidates += [os.path.expanduser("~/.cache"), f"{tempfile.gettempdir()}/cache-{os.getuid()}"]
+    for base in (Path(each) / "pso-offboard" for each in candidates if os.path.isabs(each)):
         place = base / _digest()
-        if base.is_absolute() and _is_private(base) and _is_private(place):
+        if _is_private(base) and _is_private(place):
             os.utime(place)
             versions = sorted(base.iterdir(), key=lambda each: each.stat().st_mtime)
             for old in versions[:-VERSIONS_KEPT]:
                 shutil.rmtree(old, ignore_errors=True)
             return place
-    return Path(tempfile.mkdtemp(prefix="pso-offboard-"))
+    raise OSError(f"no private directory for machine code: tried {', '.join(candidates)}")
 
 
 def _is_private(place: Path) -> bool:
-    """Make the directory; whether nobody else may write there: what is read is executed."""
+    """Make the directory; whether only this user can write in it: machine code is executed."""
     try:
         for part in (*reversed(place.parents), place):
-            part.mkdir(mode=0o700, exist_ok=True)  # whatever the umask
+            part.mkdir(mode=0o700, exist_ok=True)  # parents=True would take the umask's mode
         tempfile.TemporaryFile(dir=place).close()
         status = place.lstat()
     except OSError:
@@ -209,9 +212,15 @@ def _is_private(place: Path) -> bool:
     return ours and not status.st_mode & 0o022
 
 
+_COMPILED = re.compile(rb"^@(?:entry|kernel)\b", re.M)
+_IMPORT = re.compile(rb"^from ((?:offboard|simulator)[.\w]*) import (\([^)]*\)|.*)", re.M)
+_CONSTANT = re.compile(rb"\b[A-Z][A-Z0-9_]*\b")
+
+
+@functools.cache
 def _digest() -> str:
-    """Of the versions of Python and numba, and of all modules with entries or kernels and those
-    whose constants they take, which are compiled in."""
+    """Of the versions of Python and numba, of the modules with entries or kernels, and of those
+    that they import constants from, because these are compiled in."""
     root = Path(__file__).parents[1]
     sources = {
         path.relative_to(root).as_posix(): path.read_bytes()
@@ -226,18 +235,13 @@ def _digest() -> str:
             path = module.decode().replace(".", "/") + ".py"
             if _CONSTANT.search(names) and path in sources.keys() - taken:
                 pending.append(path)
-    digest = hashlib.sha256(f"{sys.implementation.cache_tag} {version('numba')}".encode())
+    digest = hashlib.sha256(f"{root} {sys.implementation.cache_tag} {version('numba')}".encode())
     for name in sorted(taken):
         digest.update(name.encode() + b"\0" + sources[name])
     return digest.hexdigest()[:16]
 
 
-_COMPILED = re.compile(rb"^@(?:entry|kernel)\b", re.M)
-_IMPORT = re.compile(rb"^from ((?:offboard|simulator)[.\w]*) import (\([^)]*\)|.*)", re.M)
-_CONSTANT = re.compile(rb"\b[A-Z][A-Z0-9_]*\b")
-
 if __name__ == "__main__":
-    # As imported, not as run: the entries are there
-    from offboard.compiled import main as compile_modules
+    from offboard.compiled import main as compile_modules  # where the entries register themselves
 
     compile_modules(sys.argv[1:])

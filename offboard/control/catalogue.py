@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from offboard.control.base import Controller
-from offboard.control.horizon.law import HorizonLaw, HorizonSettings, Method
+from offboard.control.horizon.settings import HorizonSettings, Method
 from offboard.control.laws.autopilot import AutopilotLaw, AutopilotSettings
 from offboard.control.laws.mpc import MpcLaw, MpcSettings
 from offboard.control.laws.pid import PidLaw, PidSettings
@@ -117,6 +117,9 @@ def build(
         case Mpc():
             return MpcLaw(vehicle, config, stopwatch, period_s=period_s)
         case Horizon() | Mppi() | Cem():
+            # Imported where it flies: what is imported is compiled before the first flight
+            from offboard.control.horizon.law import HorizonLaw
+
             method = Method(config.law)
             return HorizonLaw(vehicle, config, method, stopwatch, period_s=period_s, seed=seed)
         case Pid():

@@ -21,8 +21,10 @@ from offboard.estimation.observer_filter import (
     POSITION_JUMPED,
     VELOCITY_JUMPED,
     bound_disturbance,
+    bring_forward,
     correct_by_attitude,
     correct_by_position,
+    learn,
 )
 from offboard.estimation.observer_model import (
     ObserverSettings,
@@ -80,6 +82,7 @@ class Observer:
         self._motion = self._record["motion"]
         self._filters = self._record["filters"][0]
         self._measured: Array = self._record["measured"][0]
+        self._plant: Array = self._motion["plant"][0]
         self._states: Array = self._motion["states"][0]
         self._state: Array = self._states[NOW]
         self._history: Array = self._motion["history"][0]
@@ -190,9 +193,7 @@ class Observer:
         else:
             self._go_to(time_s, complete=self._attitude_at is not None)
             self._measured[:] = *position_ned_m, *velocity_ned_mps
-            jumped = correct_by_position(self._record, time_s)
-            self.position_jumps += bool(jumped & POSITION_JUMPED)
-            self.velocity_jumps += bool(jumped & VELOCITY_JUMPED)
+            self._correct_by_position(time_s)
         self._position_at = time_s
 
     def predict(self, time_s: float) -> PredictedState:
@@ -240,6 +241,21 @@ class Observer:
             replay(self._motion, NOW, start_s, time_s)
             spread(self._filters, time_s - start_s)
         self._time_s = time_s
+
+    def _correct_by_position(self, time_s: float) -> None:
+        """By what is measured, of `time_s`."""
+        if self._settings.velocity is VelocitySource.REPORTED:
+            self._state[: VELOCITY + 3] = self._measured
+            return
+        if time_s < self._time_s:
+            bring_forward(self._measured, self._state, self._plant, self._time_s - time_s)
+        jumped = correct_by_position(self._record)
+        self.position_jumps += bool(jumped & POSITION_JUMPED)
+        self.velocity_jumps += bool(jumped & VELOCITY_JUMPED)
+        if jumped:
+            self._adaptation.interrupt()
+        elif self._settings.adaptive:
+            learn(self._record)
 
     def _heave(self, time_s: float) -> PredictedHeave:
         state = self._foreseen(time_s).tolist()

@@ -25,7 +25,6 @@ from offboard.estimation.observer_adaptation import (
     ADAPTATION,
     DOWN,
     NORTH_EAST,
-    interrupt,
     note,
     white_sd,
 )
@@ -53,7 +52,6 @@ LATERAL, VERTICAL, HEADING = 0, 1, 2  # filters
 # Places in them: per lateral axis [p v b b' d beta], vertical [p v d beta], course [psi psi'].
 LATERAL_TILT, LATERAL_DRIFT, VERTICAL_DRIFT, HEADING_COURSE = 2, 4, 2, 0
 POSITION_JUMPED, VELOCITY_JUMPED = 1, 2  # bits of an answer
-IGNORED, BIASED, TRUSTED = 0, 1, 2  # the reported velocity
 
 OBSERVER = np.dtype(
     [
@@ -62,7 +60,7 @@ OBSERVER = np.dtype(
         ("filters", FILTER, 3),
         ("adaptation", ADAPTATION),
         # settings
-        ("velocity", "i8"),  # IGNORED, BIASED or TRUSTED
+        ("uses_velocity", "i8"),  # with a bias of its own
         ("adaptive", "i8"),
         ("white_sds", "f8", 2),  # of position and velocity, where they are not adaptive
         ("gates", "f8", 2),  # beyond which they have jumped
@@ -93,67 +91,40 @@ def correct_by_attitude(
     bound_disturbance(state, observer.disturbance_limit)
 
 
-@entry(OBSERVER, float)
-def correct_by_position(observers: Any, time_s: float) -> int:
-    """Correct the state by the position and velocity in `measured`, of `time_s`, not later than
-    the state. Returns what jumped: POSITION_JUMPED, VELOCITY_JUMPED, both or 0."""
+@entry(OBSERVER)
+def correct_by_position(observers: Any) -> int:
+    """Correct the state by the position and velocity in `measured`. Returns what jumped:
+    POSITION_JUMPED, VELOCITY_JUMPED, both or 0."""
     observer = observers[0]
-    state, measured = observer.motion.states[NOW], observer.measured
-    jumped = 0
-    if observer.velocity == TRUSTED:
-        for i in range(6):
-            state[i] = measured[i]
-    else:
-        late_s = observer.time_s - time_s
-        if late_s > 0.0:
-            _bring_forward(measured, state, observer.motion.plant, late_s)
-        jumped = _correct(observer, state)
-        bound_disturbance(state, observer.disturbance_limit)
-    return jumped
-
-
-@kernel
-def _bring_forward(measured: Array, state: Array, plant: Array, late_s: float) -> None:
-    """To where the vehicle has gone since, as far as is believed."""
-    north, east = state[TILT], state[TILT + 1]
-    direction = (north, east, upright(north, east))
-    for i in range(3):
-        speed = state[VELOCITY + i]
-        acceleration = direction[i] * -state[THRUST] + state[DISTURBANCE + i] - plant[DRAG] * speed
-        if i == 2:
-            acceleration += plant[GRAVITY]
-        measured[POSITION + i] += late_s * speed
-        measured[VELOCITY + i] += late_s * acceleration
-
-
-@kernel
-def _correct(seen: Any, state: Array) -> int:
-    """By what is measured, and learn from how far that was off. Returns what jumped."""
-    learnt = seen.adaptation
-    _note_missed(state, seen.measured, learnt.innovation)
+    state, measured, learnt = observer.motion.states[NOW], observer.measured, observer.adaptation
+    _note_missed(state, measured, learnt.innovation)
     jumped = 0
     for kind in range(2):
-        if kind == 1 and seen.velocity == IGNORED:
+        if kind == 1 and not observer.uses_velocity:
             continue
-        sd = white_sd(learnt, kind) if seen.adaptive else seen.white_sds[kind]
+        sd = white_sd(learnt, kind) if observer.adaptive else observer.white_sds[kind]
         for i in range(2):
-            one, gate = seen.filters[i], seen.gates[kind]
+            one = observer.filters[i]
             other = NOTHING if kind == 0 else one.order - 1
-            if correct_within(state, one, kind, other, seen.measured, sd, gate):
-                continue
-            jumped |= 1 << kind
-            if kind == 0:
-                anchor_position(state, one, seen.measured, sd)
-            else:
-                anchor_bias(state, one, sd)
-    if seen.adaptive and jumped:
-        interrupt(learnt)
-    elif seen.adaptive:
-        _note_missed(state, seen.measured, learnt.residual)
-        note(learnt, seen.time_s)
-        seen.filters[LATERAL].densities[LATERAL_DRIFT] = learnt.density[NORTH_EAST]
-        seen.filters[VERTICAL].densities[VERTICAL_DRIFT] = learnt.density[DOWN]
+            if not correct_within(state, one, kind, other, measured, sd, observer.gates[kind]):
+                jumped |= 1 << kind
+                if kind == 0:
+                    anchor_position(state, one, measured, sd)
+                else:
+                    anchor_bias(state, one, sd)
+    bound_disturbance(state, observer.disturbance_limit)
     return jumped
+
+
+@entry(OBSERVER)
+def learn(observers: Any) -> None:
+    """Learn noise and drift from the position that the state was last corrected by."""
+    observer = observers[0]
+    learnt = observer.adaptation
+    _note_missed(observer.motion.states[NOW], observer.measured, learnt.residual)
+    note(learnt, observer.time_s)
+    observer.filters[LATERAL].densities[LATERAL_DRIFT] = learnt.density[NORTH_EAST]
+    observer.filters[VERTICAL].densities[VERTICAL_DRIFT] = learnt.density[DOWN]
 
 
 @kernel
@@ -163,6 +134,19 @@ def _note_missed(state: Array, measured: Array, missed: Array) -> None:
         missed[i] = measured[POSITION + i] - state[POSITION + i]
         believed = state[VELOCITY + i]
         missed[3 + i] = measured[VELOCITY + i] - believed - state[BIAS + i]
+
+
+def bring_forward(measured: Array, state: Array, plant: Array, late_s: float) -> None:
+    """Move a position and velocity `measured` (6,) `late_s` before the state to its time."""
+    north, east = state[TILT], state[TILT + 1]
+    direction = (north, east, upright(north, east))
+    for i in range(3):
+        speed = state[VELOCITY + i]
+        acceleration = direction[i] * -state[THRUST] + state[DISTURBANCE + i] - plant[DRAG] * speed
+        if i == 2:
+            acceleration += plant[GRAVITY]
+        measured[POSITION + i] += late_s * speed
+        measured[VELOCITY + i] += late_s * acceleration
 
 
 @kernel

@@ -18,7 +18,7 @@ from pydantic import BaseModel, Field
 
 from offboard.control.catalogue import LAWS, ControllerConfig
 from offboard.control.horizon.keep_out import refusal
-from offboard.control.horizon.law import HorizonSettings
+from offboard.control.horizon.settings import HorizonSettings
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import DocumentError, override, read, validate
 from offboard.documents.shipped import locate, read_text

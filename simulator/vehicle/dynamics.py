@@ -139,26 +139,12 @@ def advance_steps(count: int, plants: Any) -> None:
     Per step: demand into history, air, loop on the estimate, airframe, estimator errors.
     """
     plant = plants[0]
-    noise_gain = 1.0 if plant.motors_on else STANDING_NOISE
-    error, turn_error = plant.error, plant.turn_error
     first = plant.step
     for step in range(first, first + count):
         for i in range(ROW_WIDTH):
             plant.history[step % _HISTORY_ROWS, i] = plant.row[i]
         _move_air(plant, step)
-        turn_error[0], turn_error[1] = -error[EAST + 2], error[NORTH + 2]
-        turn_error[2] = error[YAW]
-        turn_estimate(plant.body, turn_error[:], plant.estimated[:])
-        angular_acceleration(
-            plant.estimated,
-            plant.body,
-            plant.history,
-            step,
-            plant.delays,
-            plant.gains,
-            turn_error,
-            plant.turn,
-        )
+        _control_attitude(plant, step)
         advance_airframe(
             plant.body,
             plant.rotor,
@@ -174,18 +160,7 @@ def advance_steps(count: int, plants: Any) -> None:
             plant.slopes,
         )
         if plant.noisy:
-            fill_normals(plant.seed, _ERROR_LANE, step, plant.normals[:])
-            for start, end in ERROR_BLOCKS:
-                advance_block(
-                    plant.error_transition[:],
-                    plant.error_scale[:],
-                    start,
-                    end,
-                    noise_gain,
-                    plant.normals[:],
-                    error[:],
-                    plant.work[:],
-                )
+            _move_errors(plant, step)
         plant.step = step + 1
 
 
@@ -209,3 +184,40 @@ def _move_air(plant: Any, step: int) -> None:
     wind[0] = air[0] + air[3] * gust[0] - air[4] * gust[1]
     wind[1] = air[1] + air[4] * gust[0] + air[3] * gust[1]
     wind[2] = air[2] + gust[3]
+
+
+@kernel
+def _control_attitude(plant: Any, step: int) -> None:
+    """The angular acceleration that the attitude loop demands, on the estimated attitude."""
+    error, turn_error = plant.error, plant.turn_error
+    turn_error[0], turn_error[1] = -error[EAST + 2], error[NORTH + 2]
+    turn_error[2] = error[YAW]
+    turn_estimate(plant.body, turn_error[:], plant.estimated[:])
+    angular_acceleration(
+        plant.estimated,
+        plant.body,
+        plant.history,
+        step,
+        plant.delays,
+        plant.gains,
+        turn_error,
+        plant.turn,
+    )
+
+
+@kernel
+def _move_errors(plant: Any, step: int) -> None:
+    """The errors of the estimator."""
+    fill_normals(plant.seed, _ERROR_LANE, step, plant.normals[:])
+    gain = 1.0 if plant.motors_on else STANDING_NOISE
+    for start, end in ERROR_BLOCKS:
+        advance_block(
+            plant.error_transition[:],
+            plant.error_scale[:],
+            start,
+            end,
+            gain,
+            plant.normals[:],
+            plant.error[:],
+            plant.work[:],
+        )

@@ -7,6 +7,7 @@ import random
 
 import numpy as np
 import pytest
+from offboard.model.kernel import Entry
 from pair import hover
 
 from offboard.control.base import Situation
@@ -18,7 +19,6 @@ from offboard.flight.setpoint import clamp, usable
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.px4 import PX4
 from offboard.model.command import Command
-from offboard.model.kernel import Entry
 from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import Vehicle
 from offboard.reference.transfer import Hold

@@ -18,6 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from offboard.model.kernel import Entry
 from processes import Spawn, children
 
 from offboard import cli
@@ -27,7 +28,6 @@ from offboard.flight import one_flight as run
 from offboard.flight import request
 from offboard.flight.log import LogError
 from offboard.flight.request import FlightRequest, fly_request
-from offboard.model.kernel import Entry
 
 Capture = pytest.CaptureFixture[str]
 CONFIG = Path(__file__).parents[2] / "config"

@@ -12,16 +12,17 @@ from scipy.integrate import solve_ivp
 from test_tracking_law import LEVEL, PX4, G, law_of, state_of
 
 from offboard.control.base import Decision, Situation
-from offboard.control.horizon.law import (
+from offboard.control.horizon.law import HorizonLaw
+from offboard.control.horizon.plant import STATE_SIZE, B, P, T, V, W, Z
+from offboard.control.horizon.sampling import cem, mppi
+from offboard.control.horizon.search import swarm
+from offboard.control.horizon.settings import (
     STEPS_AROUND,
     Dynamics,
-    HorizonLaw,
     HorizonSettings,
     Method,
+    SamplingSettings,
 )
-from offboard.control.horizon.plant import STATE_SIZE, B, P, T, V, W, Z
-from offboard.control.horizon.sampling import SamplingSettings, cem, mppi
-from offboard.control.horizon.search import swarm
 from offboard.control.laws.mpc import MpcLaw, MpcSettings
 from offboard.control.laws.tracking import errors
 from offboard.control.swarm import RandomLanes, SwarmSettings

@@ -87,7 +87,7 @@ def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():
         state = drift @ state + kicks[i]
     times = step_s * np.arange(count)
     allowed, white = np.array([*densities, 0.01, 1.0, 1.0]), np.empty((1, count - 1))
-    innovations.call(times, positions[None], np.zeros((1, count)), np.array([drag]), allowed, white)
+    innovations(times, positions[None], np.zeros((1, count)), np.array([drag]), allowed, white)
     white = white[0, 200:]
     assert np.mean(white**2) == pytest.approx(1.0, abs=0.03)
     assert abs(np.mean(white[1:] * white[:-1])) < 0.02
@@ -179,7 +179,7 @@ def test_lagged_thrust_is_that_of_scipy():
 
     solved = solve_ivp(rate, (0.0, 2.0), [0.4], t_eval=times, max_step=1e-3, rtol=1e-8)
     ours = np.empty_like(times)
-    lagged_thrust.call(times, np.column_stack((sent_at, thrust)), np.array((0.02, 0.08)), ours)
+    lagged_thrust(times, np.column_stack((sent_at, thrust)), np.array((0.02, 0.08)), ours)
     assert np.abs(ours - solved.y[0]).max() < 5e-4
 
 

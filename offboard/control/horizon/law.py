@@ -12,21 +12,18 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import replace
-from enum import StrEnum
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from offboard.control.base import Certificate, DecisionError, Situation
 from offboard.control.certificate import ExactMinimum, certify
 from offboard.control.cost import BoxQuadratic
 from offboard.control.horizon.detour import detours
-from offboard.control.horizon.keep_out import KeepOut, pack, placed_at
+from offboard.control.horizon.keep_out import pack, placed_at
 from offboard.control.horizon.outlook import bounds, look_ahead
 from offboard.control.horizon.plant import (
     INPUTS,
-    MOST_STEPS,
     STATE_SIZE,
     plant_of,
     scene_of,
@@ -34,59 +31,21 @@ from offboard.control.horizon.plant import (
 )
 from offboard.control.horizon.polish import Ended, polish
 from offboard.control.horizon.quadratic import HorizonQuadratic
-from offboard.control.horizon.sampling import SamplingSettings, cem, mppi
+from offboard.control.horizon.sampling import cem, mppi
 from offboard.control.horizon.search import Evaluator, Found, Plan, swarm
+from offboard.control.horizon.settings import Dynamics, HorizonSettings, Method
 from offboard.control.laws.mpc import one_decision
-from offboard.control.laws.tracking import Search, Target, TrackingLaw, TrackingSettings, errors
+from offboard.control.laws.tracking import Search, Target, TrackingLaw, errors
 from offboard.control.riccati import lateral_cost_to_go
-from offboard.control.swarm import RandomLanes, SwarmResult, SwarmSettings
+from offboard.control.swarm import RandomLanes, SwarmResult
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
 HEAVE_REACH_MPS2 = 3.0  # of the knots of the vertical thrust
-STEPS, STEPS_AROUND = 10, 20
 RIVALS = 2  # of the best plan of our own, that are searched about as well
 MET_M = 0.3  # from the clearance of a volume: further outside, a plan does not meet it
 PLANNED_MARGIN_M = 0.05  # beyond the clearance: for tracking, and for a limit that is bought softly
-
-
-class Method(StrEnum):
-    """Who searches the knots."""
-
-    SWARM = "horizon"
-    MPPI = "mppi"
-    CEM = "cem"
-
-
-class Dynamics(StrEnum):
-    """What the roll-outs fly: thrust times direction, or its linear model about hover."""
-
-    NONLINEAR = "nonlinear"
-    LINEAR = "linear"
-
-
-class HorizonSettings(TrackingSettings):
-    """The tracking law's settings, `steps` decisions ahead (none: 10, and 20 around volumes: the
-    way past one must fit in), around `keep_out` with `clearance_m` to spare and at most
-    `speed_limit_mps` (none: unlimited). `seed_with_qp`: whether the linear problem's exact plan is
-    a seed; `polish_steps` bounds the steps from each answer of the swarm to its local minimum.
-    """
-
-    steps: int | None = Field(default=None, ge=2, le=MOST_STEPS)
-    dynamics: Dynamics = Dynamics.NONLINEAR
-    keep_out: tuple[KeepOut, ...] = ()
-    clearance_m: float = Field(default=0.3, ge=0, le=50)
-    speed_limit_mps: float | None = Field(default=None, gt=0, le=50)
-    seed_with_qp: bool = True
-    polish_steps: int = Field(default=8, ge=0, le=50)
-    swarm: SwarmSettings = SwarmSettings(particles=20, iterations=40, damping=0.8)
-    sampling: SamplingSettings = SamplingSettings()
-
-    @property
-    def planned(self) -> int:
-        """The decisions ahead, as chosen or by default."""
-        return self.steps or (STEPS_AROUND if self.keep_out else STEPS)
 
 
 class HorizonLaw(TrackingLaw):

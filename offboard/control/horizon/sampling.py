@@ -11,27 +11,13 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
 from offboard.control.horizon.search import Evaluator, Found, Plan, Remaining
-from offboard.documents.parameters import Parameters
+from offboard.control.horizon.settings import SamplingSettings
 
 Array = NDArray[np.float64]
 
 LEAST_SD = 1e-3  # of the reach: what the cross-entropy method never falls below
-
-
-class SamplingSettings(Parameters):
-    """`samples` x `iterations` roll-outs; `deviation` is the first standard deviation as a share
-    of the knots' reach, multiplied by `shrink` after each iteration (MPPI). `temperature` is a
-    share of the samples' cost spread, `elite` the share that the cross-entropy method keeps."""
-
-    samples: int = Field(default=40, ge=4, le=10_000)
-    iterations: int = Field(default=70, ge=1, le=10_000)
-    deviation: float = Field(default=0.3, gt=0, le=2)
-    shrink: float = Field(default=0.93, gt=0, le=1)
-    temperature: float = Field(default=0.1, gt=0, le=10)
-    elite: float = Field(default=0.2, gt=0, le=1)
 
 
 @dataclass

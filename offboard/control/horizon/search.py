@@ -139,9 +139,10 @@ class Evaluator:
         batch = self._batches.get(count)
         if batch is None:
             batch = self._batches[count] = _Batch(self.steps, count)
+        base_inputs, base_states, knots = map(np.ascontiguousarray, (*base, knots))
         roll_out(
             self.plant, self._record, self._volumes,
-            *map(np.ascontiguousarray, base), feedback, weights, np.ascontiguousarray(knots),
+            base_inputs, base_states, feedback, weights, knots,
             batch.states, batch.inputs, batch.over, batch.costs,
         )  # fmt: skip
         return batch.costs

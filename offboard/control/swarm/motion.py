@@ -7,9 +7,15 @@ allocated. Knows no objective.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
+from numpy.typing import NDArray
 
 from offboard.compiled import array, entry, kernel
+from offboard.control.swarm.lanes import States
+
+Array = NDArray[np.float64]
 
 SEARCH = np.dtype(
     [
@@ -42,7 +48,7 @@ _UNIT_31 = 2.0**-31  # one draw gives two uniform numbers of 31 bits in [0, 1)
 
 
 @kernel
-def _next(x):  # type: ignore[no-untyped-def]
+def _next(x: np.uint64) -> np.uint64:
     """Of a lane, by xorshift. What is drawn from it is not made here: the loops over kernels that
     return two numbers are not vectorised."""
     x ^= x << _SHIFT_A
@@ -52,8 +58,8 @@ def _next(x):  # type: ignore[no-untyped-def]
 
 
 @entry(SEARCH, array(1, "u8"), array(1), array(1), array(2), array(2))
-def scatter(  # type: ignore[no-untyped-def]
-    searches, lanes, lower, upper, positions, velocities
+def scatter(
+    searches: Any, lanes: States, lower: Array, upper: Array, positions: Array, velocities: Array
 ) -> None:
     """Begin a search: uniform positions in the box and uniform velocities of either sign."""
     search = searches[0]
@@ -73,8 +79,15 @@ def scatter(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def move(  # type: ignore[no-untyped-def]
-    search, lanes, lower, upper, positions, velocities, bests, leader
+def move(
+    search: Any,
+    lanes: States,
+    lower: Array,
+    upper: Array,
+    positions: Array,
+    velocities: Array,
+    bests: Array,
+    leader: Array,
 ) -> None:
     """Eqs. 30 and 20 with a random number per dimension; Eq. 22 by clamping.
 
@@ -104,15 +117,24 @@ def move(  # type: ignore[no-untyped-def]
 
 
 @entry(SEARCH, array(1, "u8"), array(1), array(1), array(2), array(2), array(2), array(1))
-def move_particles(  # type: ignore[no-untyped-def]
-    searches, lanes, lower, upper, positions, velocities, bests, leader
+def move_particles(
+    searches: Any,
+    lanes: States,
+    lower: Array,
+    upper: Array,
+    positions: Array,
+    velocities: Array,
+    bests: Array,
+    leader: Array,
 ) -> None:
     """`move` of one SEARCH (1,)."""
     move(searches[0], lanes, lower, upper, positions, velocities, bests, leader)
 
 
 @kernel
-def remember(search, costs, positions, bests, best_costs, leader) -> None:  # type: ignore[no-untyped-def]
+def remember(
+    search: Any, costs: Array, positions: Array, bests: Array, best_costs: Array, leader: Array
+) -> None:
     """Update personal bests and the leader, count the iteration and what costs are rejected.
 
     Of equal costs the earlier one stands; a cost that is not finite never becomes a best.
@@ -141,8 +163,8 @@ def remember(search, costs, positions, bests, best_costs, leader) -> None:  # ty
 
 
 @entry(SEARCH, array(1), array(2), array(2), array(1), array(1))
-def learn(  # type: ignore[no-untyped-def]
-    searches, costs, positions, bests, best_costs, leader
+def learn(
+    searches: Any, costs: Array, positions: Array, bests: Array, best_costs: Array, leader: Array
 ) -> None:
     """`remember`, and the spread."""
     search = searches[0]
@@ -151,7 +173,7 @@ def learn(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def spread_about(positions, leader):  # type: ignore[no-untyped-def]
+def spread_about(positions: Array, leader: Array) -> float:
     """Mean distance of all particles from the leader, Eqs. 28-29."""
     dimensions, particles = positions.shape
     total = 0.0
@@ -160,4 +182,4 @@ def spread_about(positions, leader):  # type: ignore[no-untyped-def]
         for j in range(dimensions):
             squared += (leader[j] - positions[j, i]) ** 2
         total += np.sqrt(squared)
-    return total / particles
+    return float(total / particles)

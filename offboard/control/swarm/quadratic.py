@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from offboard.compiled import array, entry, kernel
 from offboard.control.cost import BoxQuadratic
-from offboard.control.swarm.lanes import RandomLanes
+from offboard.control.swarm.lanes import RandomLanes, States
 from offboard.control.swarm.motion import SEARCH, move, remember, scatter, spread_about
 from offboard.control.swarm.particles import Swarm
 from offboard.control.swarm.population import Population, box
@@ -29,10 +29,20 @@ CHUNK_ITERATIONS = 25  # between two looks at the time left: about 15 us
     SEARCH, array(1, "u8"), array(1), array(1), array(2), array(2), array(2), array(1),
     array(1), array(1), array(2), array(1),
 )  # fmt: skip
-def iterate(  # type: ignore[no-untyped-def]
-    searches, lanes, lower, upper, positions, velocities, bests, leader,
-    best_costs, costs, hessian, gradient,
-) -> None:  # fmt: skip
+def iterate(
+    searches: Any,
+    lanes: States,
+    lower: Array,
+    upper: Array,
+    positions: Array,
+    velocities: Array,
+    bests: Array,
+    leader: Array,
+    best_costs: Array,
+    costs: Array,
+    hessian: Array,
+    gradient: Array,
+) -> None:
     """Iterations up to the limit; the first of them evaluates where the particles stand."""
     search = searches[0]
     while search.iterations < search.limit:
@@ -44,8 +54,8 @@ def iterate(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def quadratic_costs(  # type: ignore[no-untyped-def]
-    hessian, gradient, constant, positions, costs
+def quadratic_costs(
+    hessian: Array, gradient: Array, constant: float, positions: Array, costs: Array
 ) -> None:
     """J of positions (n, particles) into costs (particles,)."""
     if positions.shape[0] == 4:
@@ -61,8 +71,8 @@ def quadratic_costs(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _costs_of_four(  # type: ignore[no-untyped-def]
-    hessian, gradient, constant, positions, costs
+def _costs_of_four(
+    hessian: Array, gradient: Array, constant: float, positions: Array, costs: Array
 ) -> None:
     """The same for the four inputs of Eq. 6, unrolled: a third of the time of a search."""
     h00, h11 = 0.5 * hessian[0, 0], 0.5 * hessian[1, 1]
