@@ -57,7 +57,7 @@ Parameter = type[int] | type[float] | np.dtype[Any] | tuple[int, np.dtype[Any]]
 ENTRIES_PER_PROCESS = 3  # starting a process costs as much as compiling one of them
 VERSIONS_KEPT = 5  # directories of machine code, most recently used
 
-_entries: list[Entry[Any, Any]] = []
+defined: list[Entry[Any, Any]] = []  # the entries of the modules imported so far
 _kernels: list[Callable[..., Any]] = []  # not yet registered with numba
 
 
@@ -86,7 +86,7 @@ class Entry(Generic[P, R]):
         self.machine_code: Callable[P, R] | None = None  # once it is loaded
         self._function, self._parameters = function, parameters
         functools.update_wrapper(self, function)
-        _entries.append(self)
+        defined.append(self)
 
     def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
         code = self.machine_code or self.load()
@@ -149,7 +149,7 @@ def _without_garbage_collection() -> Iterator[None]:
 def prepare(tell: Callable[[str], None] = lambda sentence: None) -> None:
     """Compile the entries of all imported modules, if they are not on disk, with one process per
     processor. `tell` is called with a sentence for the user before it takes long."""
-    missing = [each for each in _entries if not each.is_compiled]
+    missing = [each for each in defined if not each.is_compiled]
     if not missing:
         return
     tell("first run on this machine: compiling, about 15 s")
@@ -178,7 +178,7 @@ def main(modules: Sequence[str]) -> None:
     """`python -m offboard.compiled MODULE...`: compile the entries that these modules import."""
     for name in modules:
         importlib.import_module(name)
-    _compile_free(_entries)
+    _compile_free(defined)
 
 
 @functools.cache

@@ -1,7 +1,7 @@
-"""The plant as an attitude setpoint sees it: the autopilot's attitude loop is part of the model.
+"""The linear axes of a vehicle that is sent attitude setpoints: its attitude loop is in the model.
 
 Written in the thrust direction b, acceleration = g e3 - T b - c v + d: the two lateral axes, the
-vertical and the course decouple, and no heading frame is needed. Delay is not part of these linear
+vertical and the course decouple, and no heading frame is needed. The delay is not part of these
 models: the observer predicts through it.
 """
 
@@ -12,23 +12,31 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import expm
 
 from offboard.compiled import kernel
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 Array = NDArray[np.float64]
 
-
-# A thrust without lag would be a feed-through; this lag is far below every sampling period.
+# Stands in for a lag of zero, which would make the input a state; far below every period.
 SHORTEST_THRUST_LAG_S = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class LinearModel:
-    """x' = A x + B u with one input: dynamics (n, n), input_map (n, 1)."""
+    """x' = A x + B u: dynamics A (n, n), input_map B (n, m)."""
 
     dynamics: Array
     input_map: Array
+
+    def sampled(self, period_s: float) -> LinearModel:
+        """x(k+1) = A_d x(k) + B_d u(k) with u held for `period_s` (zero-order hold, Eq. 14)."""
+        size, count = self.input_map.shape
+        flow = np.zeros((size + count, size + count))
+        flow[:size, :size], flow[:size, size:] = self.dynamics, self.input_map
+        step = expm(period_s * flow)
+        return LinearModel(step[:size, :size], step[:size, size:])
 
 
 def lateral_model(vehicle: Vehicle) -> LinearModel:

@@ -16,9 +16,14 @@ from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.sticks import Sticks
 from simulator.autopilot.trajectory import Leg, Trajectory
 from simulator.firmware.base import Firmware
-from simulator.firmware.modes import Behaviour
-from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint
-from simulator.firmware.vocabulary import NAN3, Quaternion, Triple
+from simulator.firmware.values import (
+    NAN3,
+    AttitudeSetpoint,
+    Behaviour,
+    MotionSetpoint,
+    Quaternion,
+    Triple,
+)
 
 _STILL_MPS = 0.05  # slower than that it holds its place
 _FLATTEST = 1000.0  # metres across per metre of climb

@@ -64,7 +64,7 @@ class Flight:
 def fly(flight: Flight, directory: Path, progress: Callable[[Any], None]) -> Outcome:
     with FlightLog(directory / "flight", "") as log, StopRequests() as stops:
         companion = cast(Companion, flight)
-        return Loop(companion, Wire(), log, stops=stops, lockstep=False, progress=progress).run()
+        return Loop(companion, Wire(), log, stops=stops, progress=progress).run()
 
 
 @pytest.mark.parametrize("failure", [SystemExit(1), BrokenPipeError(), OSError(5, "lost")])

@@ -90,8 +90,8 @@ def test_sixty_ms_each_way_are_a_limit_cycle_until_they_are_known(tmp_path: Path
         known = sixty_ms_each_way(10, seed, IdentifySettings())
         score = known.score(tmp_path / str(seed))
         (said,) = [line for line in known.companion.announced if line.startswith("bandwidth")]
-        used_radps = float(said.removeprefix("bandwidth ").split()[0])
+        used_radps = float(said.removeprefix("bandwidth limited to ").split()[0])
         assert 6.0 < used_radps < 10.0
-        assert f"of 10.0 rad/s: what a delay of {score.delay_ms:.0f} " in said
+        assert f"(configured 10.0) by the identified delay, {score.delay_ms:.0f} " in said
         assert score.rmse_position_m < 0.06
         assert score.delay_ms == pytest.approx(PLAIN_DELAY_MS + 120.0, abs=10.0)
