@@ -8,30 +8,26 @@ the law, its object the law's `ControllerSettings`. The paper's law is added tha
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
 
 from offboard.control.base import ControllerSettings
-from offboard.control.laws.autopilot import AutopilotSettings
-from offboard.control.laws.horizon import HorizonSettings
-from offboard.control.laws.lqr import LqrSettings
-from offboard.control.laws.mpc import MpcSettings
-from offboard.control.laws.pid import PidSettings
-from offboard.control.laws.pso import PsoSettings
-from offboard.control.laws.sampling import CemSettings, MppiSettings
 from offboard.documents.reading import DocumentError
 
 GROUP = "pso_offboard.controllers"
 
-BUILT_IN: Mapping[str, type[ControllerSettings]] = {
-    "pso": PsoSettings,
-    "lqr": LqrSettings,
-    "mpc": MpcSettings,
-    "horizon": HorizonSettings,
-    "mppi": MppiSettings,
-    "cem": CemSettings,
-    "pid": PidSettings,
-    "autopilot": AutopilotSettings,
+BUILT_IN: Mapping[str, str] = {
+    "pso": "pso:PsoSettings",
+    "lqr": "lqr:LqrSettings",
+    "mpc": "mpc:MpcSettings",
+    "horizon": "horizon:HorizonSettings",
+    "mppi": "sampling:MppiSettings",
+    "cem": "sampling:CemSettings",
+    "pid": "pid:PidSettings",
+    "autopilot": "autopilot:AutopilotSettings",
 }
+"""Module in `offboard.control.laws` and settings class of each law. A law is imported when it is
+chosen, because whatever is imported is compiled before the first flight."""
 
 
 def names() -> list[str]:
@@ -45,7 +41,10 @@ def settings_of(law: str) -> type[ControllerSettings]:
     Raises DocumentError where an entry point cannot be used, with one sentence that names it.
     """
     if law in BUILT_IN:
-        return BUILT_IN[law]
+        module, _, name = BUILT_IN[law].partition(":")
+        built_in: type[ControllerSettings]
+        built_in = getattr(import_module(f"offboard.control.laws.{module}"), name)
+        return built_in
     found = entry_points(group=GROUP, name=law)
     if not found:
         raise DocumentError(f"there is no law named {law!r}; known are {', '.join(names())}")

@@ -36,7 +36,7 @@ from offboard.reference.shapes import SHAPES, FromTable, Shape
 from offboard.reference.track import Track
 
 Raw = dict[str, Any]
-RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "llvmlite")
+RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
 UNKNOWN_VEHICLE = "neutral"
 FOLDERS = {"vehicle": "vehicles", "controller": "controllers", "reference": "references"}
 
@@ -159,7 +159,9 @@ def _kind(raw: Raw) -> str:
     keys = {
         "flight configuration": set(FlightConfig.model_fields),
         "vehicle": set(Vehicle.model_fields),
-        "controller": {key for law in catalogue.BUILT_IN.values() for key in law.model_fields},
+        "controller": {
+            key for law in catalogue.BUILT_IN for key in catalogue.settings_of(law).model_fields
+        },
         "reference": {key for shape in SHAPES.values() for key in shape.model_fields},
     }
 
