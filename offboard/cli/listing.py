@@ -8,8 +8,12 @@ from offboard.documents import shipped
 
 def list_files() -> None:
     """List the shipped files by name, with one line each."""
+    from offboard.control import catalogue
+
     for number, (kind, folder) in enumerate(shipped.FOLDERS.items()):
         described = shipped.descriptions(folder)
+        if kind == "controller":
+            described = dict.fromkeys(catalogue.names(), "of an installed package") | described
         width = max(map(len, described))
         out.print("\n" * (number > 0) + f"{kind}s", style="bold")
         for name, text in described.items():

@@ -2,37 +2,38 @@
 
 A controller file (`config/controllers/*.yaml`) holds the settings of one law, named by `law`. A
 package adds a law with an entry point in the group `pso_offboard.controllers`: its name is that of
-the law, its object the law's `ControllerSettings`. The paper's law is added that way too.
+the law, its object the law's `ControllerSettings`. The paper's law is added that way too. A law is
+imported when it is asked for, so that a flight loads and compiles only what it needs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 
 from offboard.control.base import ControllerSettings
 from offboard.documents.reading import DocumentError
 
 GROUP = "pso_offboard.controllers"
 
-BUILT_IN: Mapping[str, str] = {
-    "pso": "pso:PsoSettings",
-    "lqr": "lqr:LqrSettings",
-    "mpc": "mpc:MpcSettings",
-    "horizon": "horizon:HorizonSettings",
-    "mppi": "sampling:MppiSettings",
-    "cem": "sampling:CemSettings",
-    "pid": "pid:PidSettings",
-    "autopilot": "autopilot:AutopilotSettings",
-}
-"""Module in `offboard.control.laws` and settings class of each law. A law is imported when it is
-chosen, because whatever is imported is compiled before the first flight."""
+BUILT_IN = EntryPoints(
+    EntryPoint(law, f"offboard.control.laws.{settings}", GROUP)
+    for law, settings in (
+        ("pso", "pso:PsoSettings"),
+        ("lqr", "lqr:LqrSettings"),
+        ("mpc", "mpc:MpcSettings"),
+        ("horizon", "horizon:HorizonSettings"),
+        ("mppi", "sampling:MppiSettings"),
+        ("cem", "sampling:CemSettings"),
+        ("pid", "pid:PidSettings"),
+        ("autopilot", "autopilot:AutopilotSettings"),
+    )
+)
 
 
 def names() -> list[str]:
-    """All law names: built in, then those of entry points. Loads none of these."""
-    return list(dict.fromkeys((*BUILT_IN, *sorted(entry_points(group=GROUP).names))))
+    """All law names: built in, then those of installed packages. Imports none of them."""
+    installed = sorted(entry_points(group=GROUP).names)
+    return list(dict.fromkeys((*(entry.name for entry in BUILT_IN), *installed)))
 
 
 def settings_of(law: str) -> type[ControllerSettings]:
@@ -40,12 +41,7 @@ def settings_of(law: str) -> type[ControllerSettings]:
 
     Raises DocumentError where an entry point cannot be used, with one sentence that names it.
     """
-    if law in BUILT_IN:
-        module, _, name = BUILT_IN[law].partition(":")
-        built_in: type[ControllerSettings]
-        built_in = getattr(import_module(f"offboard.control.laws.{module}"), name)
-        return built_in
-    found = entry_points(group=GROUP, name=law)
+    found = BUILT_IN.select(name=law) or entry_points(group=GROUP, name=law)
     if not found:
         raise DocumentError(f"there is no law named {law!r}; known are {', '.join(names())}")
     if len(found) > 1:

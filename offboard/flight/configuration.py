@@ -11,13 +11,12 @@ from __future__ import annotations
 import platform
 from collections.abc import Callable, Iterable, Mapping
 from difflib import get_close_matches
-from enum import StrEnum
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import BaseModel, Field, SerializeAsAny, create_model
+from pydantic import BaseModel, Field, SerializeAsAny, create_model, model_validator
 
 from offboard.control import catalogue
 from offboard.control.base import Controller, ControllerSettings
@@ -38,7 +37,7 @@ from offboard.reference.track import Track
 Raw = dict[str, Any]
 RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
 UNKNOWN_VEHICLE = "neutral"
-FOLDERS = {"vehicle": "vehicles", "controller": "controllers", "reference": "references"}
+FOLDERS = {part: shipped.FOLDERS[part] for part in ("vehicle", "controller", "reference")}
 
 
 class FlightConfig(Parameters):
@@ -120,11 +119,6 @@ def build_controller(config: FlightConfig) -> Controller:
         raise DocumentError(f"controller {settings.law}: {error}") from None
 
 
-def controllers() -> list[str]:
-    """The names of all controllers: shipped files, and laws of installed packages."""
-    return list(dict.fromkeys((*shipped.names(FOLDERS["controller"]), *catalogue.names())))
-
-
 def check_file(path: Path, check_scenario: Callable[[Path], None]) -> str:
     """Validate one file of any kind that a flight may be given; return what it is.
 
@@ -160,7 +154,9 @@ def _kind(raw: Raw) -> str:
         "flight configuration": set(FlightConfig.model_fields),
         "vehicle": set(Vehicle.model_fields),
         "controller": {
-            key for law in catalogue.BUILT_IN for key in catalogue.settings_of(law).model_fields
+            key
+            for law in catalogue.BUILT_IN.names
+            for key in catalogue.settings_of(law).model_fields
         },
         "reference": {key for shape in SHAPES.values() for key in shape.model_fields},
     }
@@ -224,12 +220,24 @@ def read_part(part: str, name: str) -> Raw:
 
 
 def _model(part: str, raw: object) -> type[BaseModel]:
-    """The class of a vehicle, or of the controller or reference that `raw` names. Where it names
-    none, a class that refuses it and knows the names."""
+    """The class of a vehicle, or of the controller or reference that `raw` names."""
     if part == "vehicle":
         return Vehicle
     key, known = ("law", catalogue.names()) if part == "controller" else ("shape", list(SHAPES))
     named = raw.get(key) if isinstance(raw, dict) else None
     if named not in known:
-        return create_model("Unknown", **{key: (StrEnum("Names", known), ...)})  # type: ignore
+        problem = f"{key}: {named!r} is not one of" if named else f"{key} is missing; known are"
+        return _refusing(f"{problem} {', '.join(known)}")
     return catalogue.settings_of(named) if part == "controller" else SHAPES[named]
+
+
+def _refusing(problem: str) -> type[BaseModel]:
+    """A class that refuses every value."""
+
+    class Unknown(BaseModel):
+        @model_validator(mode="before")
+        @classmethod
+        def _refuse(cls, given: object) -> object:
+            raise ValueError(problem)
+
+    return Unknown

@@ -88,11 +88,11 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         (("--set", "controller.seed=3"), "controller.seed is not a known key"),
         (
             ("--set", "controller.law=frog"),
-            "--set controller.law=frog: controller.law: 'frog' should be 'pso', 'lqr',",
+            "--set controller.law=frog: controller: law: 'frog' is not one of pso, lqr,",
         ),
         (
             ("--set", "reference.shape=spiral"),
-            "--set reference.shape=spiral: reference.shape: 'spiral' should be 'hover', 'line',",
+            "--set reference.shape=spiral: reference: shape: 'spiral' is not one of hover, line,",
         ),
         (("--set", "controller=pid2"), "no controller named 'pid2'; known are"),
         (
@@ -158,8 +158,8 @@ CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3
         ("mine.yaml", "mas_kg: 1", "mas_kg is not a known key, did you mean mass_kg?"),
         ("mine.yaml", "hover_thrust: 0.5", "mine.yaml: mass_kg is missing"),
         ("mine.yaml", "hover_thrust: 0.5", "mine.yaml: inertia_kgm2 is missing"),
-        ("law.yaml", "bandwidth_radps: 5", "law.yaml: law is missing"),
-        ("line.yaml", "laps: 5", "line.yaml: shape is missing"),
+        ("law.yaml", "bandwidth_radps: 5", "law.yaml: law is missing; known are pso, lqr,"),
+        ("line.yaml", "laps: 5", "line.yaml: shape is missing; known are hover, line,"),
         ("path.csv", CSV.format(east="two"), "path.csv, row 4, column east_m: 'two' is not a"),
         ("path.csv", CSV.format(east=90), "reference path.csv: the reference asks for"),
         (
