@@ -67,7 +67,7 @@ class Figure:
 
         Without its style for a page, which contains `STYLE` once.
         """
-        drawing = self.drawing.to_plotly_json()
+        drawing = json.loads(self.drawing.to_json())
         if not styled:
             del drawing["layout"]["template"]
         document = {"title": self.title, "caption": self.caption, **drawing}

@@ -11,6 +11,7 @@ function coloured(text) {
 }
 
 function draw(element) {
+  delete element.dataset.drawn;
   const { data, layout } = coloured(document.getElementById(element.id + "_data").textContent);
   layout.template = coloured(JSON.stringify(style));
   if (narrow.matches && layout.showlegend !== false) {
