@@ -10,9 +10,8 @@ from numpy.typing import NDArray
 from offboard.analysis.figure import BLUE, GREY, RED, Figure, curve, panels
 from offboard.analysis.identify import rows
 from offboard.analysis.page import render
-from offboard.identification.motion import Motion, specific_velocity
-from offboard.identification.response_fit import predicted
-from offboard.identification.stages import Identified
+from offboard.identification.motion_fit import Motion, predicted_velocity
+from offboard.identification.response import second_order
 from offboard.identification.trace import (
     COURSE,
     NORTH,
@@ -22,6 +21,7 @@ from offboard.identification.trace import (
     STAMP,
     Trace,
 )
+from offboard.identification.vehicle_fit import Identified
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 Array = NDArray[np.float64]
@@ -40,7 +40,8 @@ def page(flight: str, found: Identified, trace: Trace, believed: Vehicle) -> str
     """
     vehicle = found.applied_to(believed)
     last = trace.between(max(trace.begin_s, trace.end_s - SHOWN_S), trace.end_s)
-    figures = [] if math.isnan(trace.begin_s) else [_tilt(last, vehicle), _yaw(last, vehicle)]
+    flown = not math.isnan(trace.begin_s) and len(trace.commands) > 0
+    figures = [_tilt(last, vehicle), _yaw(last, vehicle)] if flown else []
     if len(trace.commands) and len(last.position) > 2:
         figures.append(_motion(last, vehicle))
     return render(
@@ -77,7 +78,7 @@ def _response(
     """Commanded, measured and modelled signals (N, axes), one panel per axis, times `scale`."""
     times, sent_at = trace.attitude[:, STAMP], trace.commands[:, SENT_AT]
     constants = response.delay_s, response.natural_frequency_radps, response.damping
-    modelled = predicted(times, sent_at, sent, *constants)
+    modelled = second_order(times, sent_at, sent, *constants)
     shown = sent_at >= times[0]
     figure = panels(titles, "vehicle time, s")
     for axis in range(len(titles)):
@@ -91,7 +92,7 @@ def _response(
 
 def _motion(trace: Trace, vehicle: Vehicle) -> Figure:
     motion = Motion(trace)
-    modelled = specific_velocity(motion, vehicle)
+    modelled = predicted_velocity(motion, vehicle)
     measured = np.gradient(motion.positions, motion.times, axis=1)
     figure = panels(("north, m/s", "east, m/s", "down, m/s"), "vehicle time, s")
     for axis in range(3):

@@ -10,13 +10,19 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.signal import cont2discrete
 
+from offboard.compiled import array, entry
 from offboard.documents import shipped
 from offboard.documents.reading import parse
-from offboard.model.integration import follow
+from offboard.model.axes import LinearModel
 from offboard.model.linear import hover_matrices, sampled_matrices
-from offboard.model.rigid_body import RK4_SCRATCH_ROWS, hover_input, pack
+from offboard.model.rigid_body import (
+    RK4_SCRATCH_ROWS,
+    derivative_into,
+    hover_input,
+    pack,
+    rk4_into,
+)
 from offboard.model.state import EULER, THRUST, U, W
 from offboard.model.vehicle import Vehicle
 from offboard.paper.law import PAPER_STEP_S
@@ -91,8 +97,23 @@ class NonlinearPlant:
         total[THRUST] = max(total[THRUST], 0.0)
         following = state.copy()
         constants = self._wind, self._parameters, PAPER_STEP_S / _SUBSTEPS, _SUBSTEPS
-        follow.call(following, total, *constants, self._scratch)
+        follow(following, total, *constants, self._scratch)
         return following
+
+
+@entry(array(1), array(1), array(1), array(1), float, int, array(2))
+def follow(
+    state: Array,
+    inputs: Array,
+    wind_ned: Array,
+    parameters: Array,
+    step_s: float,
+    steps: int,
+    scratch: Array,
+) -> None:
+    """`steps` RK4 steps of held inputs and wind, in place; shapes as in `rk4_into`."""
+    for _ in range(steps):
+        rk4_into(derivative_into, state, inputs, wind_ned, parameters, step_s, scratch, state)
 
 
 PLANTS: dict[PlantKind, type[LinearPlant | NonlinearPlant]] = {
@@ -112,10 +133,7 @@ def _sampled_wind(wind_ned_mps: Array) -> Array:
     """The term that a constant wind adds to x(k+1) (12,)."""
     vehicle = paper_vehicle()
     dynamics, _ = hover_matrices(vehicle)
-    size = len(dynamics)
-    force = np.zeros((size, 1))
+    force = np.zeros((len(dynamics), 1))
     drag = np.array(vehicle.drag_translation_npmps) / vehicle.mass_kg
     force[U : W + 1, 0] = drag * wind_ned_mps
-    system = dynamics, force, np.eye(size), np.zeros((size, 1))
-    effect: Array = cont2discrete(system, PAPER_STEP_S)[1][:, 0]
-    return effect
+    return LinearModel(dynamics, force).sampled(PAPER_STEP_S).input_map[:, 0]

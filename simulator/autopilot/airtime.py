@@ -49,11 +49,3 @@ class Airtime:
     def _expired(self, now_s: float, since_s: float, role: str) -> bool:
         limit_s = self.parameters.role(role)
         return limit_s > 0 and now_s - since_s >= limit_s - 1e-6
-
-    @property
-    def calm_until_s(self) -> float:
-        """When `over` may have something to say of a vehicle that stays where it is, in the air
-        or on the ground before its flight."""
-        if self._flown:
-            return math.inf
-        return self._armed_s + self.parameters.role("disarm_idle_s")

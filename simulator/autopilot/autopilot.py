@@ -1,8 +1,7 @@
 """One autopilot on one plant, step by step: it flies, and then looks at what happened.
 
 Its parts: the commander decides about modes, the navigator says where to be, the pilot flies there,
-health and watch see to what changes by itself. Here is their order in time, and when compiled code
-may fly in their place.
+health and watch see to what changes by itself. Here is their order in time.
 Knows no MAVLink frames, sockets or clock: the vehicle's time is the plant's.
 """
 
@@ -22,13 +21,9 @@ from simulator.autopilot.setpoints import ATTITUDE, SetpointStream
 from simulator.autopilot.sticks import Sticks
 from simulator.autopilot.watch import EVERY_STEPS, Watch
 from simulator.firmware.base import Firmware
-from simulator.firmware.modes import Behaviour
-from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint
-from simulator.firmware.vocabulary import Result, Triple
+from simulator.firmware.values import AttitudeSetpoint, Behaviour, MotionSetpoint, Result, Triple
 from simulator.steps import STEP_S
 from simulator.vehicle.plant import Plant
-
-_RESTS_STEPS = 250  # at most, so that what is changed behind its back is seen soon
 
 
 class Autopilot:
@@ -51,7 +46,7 @@ class Autopilot:
             firmware.origin,
             int(rules.home_first),
             rules.turning,
-            rules.tells_above,
+            rules.reached_above_landing,
             rules.keeps_speed,
         )
         self.senses = Senses(plant)
@@ -60,20 +55,17 @@ class Autopilot:
         self.health = Health(
             firmware, self.parameters, self.mission, self.stream, self.watch, boot_scale
         )
-        self.sticks = None if firmware.flight.handling is None else Sticks(firmware.flight.handling)
+        self.sticks = None if firmware.flight.sticks is None else Sticks(firmware.flight.sticks)
         self.navigator = Navigator(firmware, self.parameters, self.mission, self.sticks)
         self.pilot = Pilot(firmware, self.parameters, self.navigator)
         self.commander = Commander(
             firmware, self.parameters, self.navigator, self.pilot, self.senses, self.health
         )
-        self.resting = False  # compiled code flies
-        self.calm_until = self._rests_since = 0
 
     # -- what comes in -----------------------------------------------------------------------
 
     def happen(self, event: str, wish: Wish = NOTHING) -> Result:
         """An event from outside."""
-        self.wake()
         return self.commander.happen(event, wish)
 
     def obey(self, message: str, values: Mapping[str, Any]) -> None:
@@ -114,11 +106,10 @@ class Autopilot:
 
     def step(self) -> None:
         """Fly STEP_S, then see what happened."""
-        self.wake()
         commander, pilot, senses = self.commander, self.pilot, self.senses
         was_landed = pilot.landed
         self.plant.advance(STEP_S, pilot.fly(senses.time_s, commander.armed, senses.look))
-        senses.moved(1)
+        senses.step()
         while (event := self.health.reach(senses.time_s)) is not None:
             commander.happen(event)
         if commander.failsafe or commander.mode.behaviour is Behaviour.SETPOINT:
@@ -155,45 +146,3 @@ class Autopilot:
         for event in self.watch.step(senses.time_s, armed, battery, senses.gps_healthy):
             self.commander.happen(event)
         self.commander.carry_out()
-
-    # -- compiled code in its place ----------------------------------------------------------
-
-    def rest(self) -> bool:
-        """Leave the flight to compiled code until `wake` or `calm_until`, the step before which
-        nothing can happen unless somebody speaks or the ground is touched or left.
-
-        A step too early rather than one too late; False when that is now.
-        """
-        commander, senses = self.commander, self.senses
-        if commander.failsafe or commander.restarts:
-            return False
-        if not self.pilot.flies_itself(senses.steps, commander.armed, self.plant.on_ground):
-            return False
-        watched_s = self.watch.calm_until_s(senses.time_s, senses.gps_healthy)
-        until_s = min(self._steady_until_s, watched_s)
-        if commander.armed:
-            if not self.watch.calm_with(self.plant.battery_at_worst(_RESTS_STEPS * STEP_S)):
-                return False
-            until_s = min(until_s, commander.airtime.calm_until_s)
-        self.calm_until = int(min(until_s / STEP_S, senses.steps + _RESTS_STEPS)) - 1
-        self.resting = self.calm_until > senses.steps
-        self._rests_since = senses.steps
-        return self.resting
-
-    @property
-    def _steady_until_s(self) -> float:
-        """When boot, the health of the sensors or the stream of setpoints changes by itself."""
-        now_s, lost_s = self.senses.time_s, self.stream.lost_s
-        until_s = self.health.steady_until_s(now_s)
-        watched = self.commander.armed and self.commander.mode.behaviour is Behaviour.SETPOINT
-        return max(now_s, min(until_s, lost_s)) if watched or lost_s >= now_s else until_s
-
-    def wake(self) -> None:
-        """Something is to happen: catch up with what compiled code flew."""
-        if self.resting:
-            self.resting = False
-            steps = self.senses.steps
-            self.pilot.flown(self._rests_since, steps - self._rests_since)
-            watched = steps // EVERY_STEPS * EVERY_STEPS
-            if watched > self._rests_since:
-                self.watch.passed(watched * STEP_S, self.senses.gps_healthy)

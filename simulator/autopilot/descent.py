@@ -12,9 +12,7 @@ from enum import Enum
 from simulator.autopilot.nav import Nav
 from simulator.autopilot.parameters import ParameterTable
 from simulator.firmware.base import Firmware
-from simulator.firmware.flight import Heads
-from simulator.firmware.setpoints import MotionSetpoint
-from simulator.firmware.vocabulary import Triple
+from simulator.firmware.values import MotionSetpoint, ReturnYaw, Triple
 
 
 def sink(place: Triple, speed_mps: float, yaw_rad: float = math.nan) -> MotionSetpoint:
@@ -52,7 +50,7 @@ class Return:
     stage: Stage = Stage.BEGIN
     place: Triple = field(default=(0.0, 0.0, 0.0))
     _until_s: float = math.inf
-    _heads: Heads | None = None
+    _heads: ReturnYaw | None = None
 
     @property
     def landing(self) -> bool:
@@ -68,7 +66,7 @@ class Return:
         if self.stage is Stage.BEGIN:
             read = self.parameters.__getitem__
             height_m = self.firmware.flight.return_height_m(distance_m, read)
-            self._heads = self.firmware.flight.return_heads(distance_m, read)
+            self._heads = self.firmware.flight.return_yaw(distance_m, read)
             self.place = (x, y, min(z, home_z - height_m))
             self._go(Stage.CLIMB, "return begun")
         role = self.parameters.role
@@ -89,13 +87,13 @@ class Return:
         if self.stage is Stage.WAIT and now_s >= self._until_s:
             self._go(Stage.LAND, "return lands")
         if self._heads is not None and self.stage.value > Stage.FLY.value:
-            self._heads = Heads.AS_HOME
+            self._heads = ReturnYaw.AS_AT_HOME
         yaw_rad = math.nan
-        if self._heads is Heads.AS_HOME and self.stage is not Stage.CLIMB:
+        if self._heads is ReturnYaw.AS_AT_HOME and self.stage is not Stage.CLIMB:
             yaw_rad = home_yaw_rad
         if self.stage is Stage.LAND:
             return sink(self.place, land_speed_mps(nav, home_z, self.parameters), yaw_rad)
-        along = self._heads is Heads.ALONG
+        along = self._heads is ReturnYaw.ALONG_PATH
         return MotionSetpoint(self.place, yaw_rad=yaw_rad, faces_way=along)
 
     def _go(self, stage: Stage, event: str = "") -> None:

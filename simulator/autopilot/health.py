@@ -5,14 +5,12 @@ Knows firmware, parameters and what is watched; what is refused for it is for th
 
 from __future__ import annotations
 
-import math
-
 from simulator.autopilot.mission import Mission
 from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.setpoints import SetpointStream
 from simulator.autopilot.watch import Watch
 from simulator.firmware.base import Firmware
-from simulator.firmware.modes import Behaviour, Mode
+from simulator.firmware.values import Behaviour, Mode
 
 
 class Health:
@@ -32,10 +30,6 @@ class Health:
         self.scale = scale
         self.reached: frozenset[str] = frozenset()  # events of the start
         self._ahead = sorted((at_s * scale, event) for event, at_s in firmware.health.boot.items())
-        checks_s = (firmware.health.passes_after_s, firmware.health.passes_without_position_after_s)
-        grows_s = (*firmware.health.boot.values(), *checks_s, firmware.health.sensors.first_fix_s)
-        self._growth_s = [at_s * scale for at_s in grows_s]
-        self._grown_up_s = max(self._growth_s)
 
     def reach(self, now_s: float) -> str | None:
         """The next event of the start that has come, if one has."""
@@ -44,12 +38,6 @@ class Health:
         _, event = self._ahead.pop(0)
         self.reached |= {event}
         return event
-
-    def steady_until_s(self, now_s: float) -> float:
-        """When the start next changes something by itself."""
-        if now_s > self._grown_up_s:
-            return math.inf
-        return min(at_s for at_s in self._growth_s if at_s >= now_s)
 
     def has_fix(self, now_s: float) -> bool:
         """GPS reports a position, unless a fault takes it away."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from simulator.firmware.vocabulary import Quaternion, Triple
+from simulator.firmware.values import Quaternion, Triple
 from simulator.steps import STEP_S, STEP_US
 from simulator.vehicle.plant import Plant, Truth
 
@@ -51,13 +51,13 @@ class Senses:
         """The same in whole microseconds; no fault turns it back."""
         return self.steps * STEP_US
 
-    def moved(self, count: int) -> None:
-        """The plant is so many steps further."""
-        self.steps += count
+    def step(self) -> None:
+        """The plant has moved by one step."""
+        self.steps += 1
         self.forget()
 
     def forget(self) -> None:
-        """What was seen is no more."""
+        """Look again when asked next: the plant or its estimate has changed."""
         self._truth = self._nav = None
 
     @property

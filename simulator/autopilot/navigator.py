@@ -16,9 +16,14 @@ from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.sticks import Sticks
 from simulator.autopilot.trajectory import Leg, Trajectory
 from simulator.firmware.base import Firmware
-from simulator.firmware.modes import Behaviour
-from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint
-from simulator.firmware.vocabulary import NAN3, Quaternion, Triple
+from simulator.firmware.values import (
+    NAN3,
+    AttitudeSetpoint,
+    Behaviour,
+    MotionSetpoint,
+    Quaternion,
+    Triple,
+)
 
 _STILL_MPS = 0.05  # slower than that it holds its place
 _FLATTEST = 1000.0  # metres across per metre of climb
@@ -133,11 +138,6 @@ class Navigator:
     # -- what others see ---------------------------------------------------------------------
 
     @property
-    def calm(self) -> bool:
-        """There is nothing to tell."""
-        return not (self._climbed or self._events)
-
-    @property
     def landing(self) -> bool:
         """On the last way down."""
         return self.behaviour is Behaviour.LAND or (
@@ -210,16 +210,6 @@ class Navigator:
     def rises(self) -> bool:
         """It is to go up, smoothly."""
         return self._way is not None and self._way.under_way and self._way.wants_up
-
-    @property
-    def standing(self) -> MotionSetpoint | None:
-        """What is held or asked for, the same object as long as it is the same; None where the
-        behaviour goes on from place to place."""
-        if self.behaviour not in _STANDING:
-            return None
-        if self._way is not None and self.behaviour in _BY_ITSELF:
-            return self._way.resting(self._standing)
-        return self._standing
 
     @property
     def _standing(self) -> MotionSetpoint:

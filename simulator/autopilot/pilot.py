@@ -17,10 +17,15 @@ from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.position_loop import Limits, PositionLoop
 from simulator.autopilot.takeoff import Takeoff
 from simulator.firmware.base import Firmware
-from simulator.firmware.modes import Behaviour
-from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint
-from simulator.firmware.vocabulary import NAN3, Quaternion, Triple
-from simulator.steps import LOOP_S, LOOP_STEPS, STEP_S
+from simulator.firmware.values import (
+    NAN3,
+    AttitudeSetpoint,
+    Behaviour,
+    MotionSetpoint,
+    Quaternion,
+    Triple,
+)
+from simulator.steps import LOOP_S
 from simulator.vehicle.attitude import Demand
 
 _TILT_BOOST_MAX = 10.0
@@ -116,55 +121,6 @@ class Pilot:
             self._tuned = self._parameters.changes
             self.loop.tune(self._firmware.flight.gains(self._parameters.__getitem__))
 
-    def flies_itself(self, step: int, armed: bool, on_ground: bool) -> bool:
-        """Whether `fly` will from this step on do no more than demand the attitude asked for, or
-        run the position loop on one setpoint, until somebody speaks or the ground is touched."""
-        if not armed:
-            return self.landed and self.demand is OFF
-        if self.landed or on_ground or not (self._takeoff.flying and self._navigator.calm):
-            return False
-        setpoint = self._navigator.attitude_setpoint
-        if setpoint is None:
-            standing = self._navigator.standing
-            known = self.motion is standing or self._loop_step(step) == step
-            return standing is not None and known
-        return setpoint.climb_mps is None and not self._boosts_thrust
-
-    def next_loop_step(self, step: int, look: Callable[[], Nav], never: int) -> int:
-        """When the position loop, told all it needs, is to be run in place of `fly`."""
-        if self.demand is OFF:
-            return never
-        setpoint, standing = self._navigator.attitude_setpoint, self._navigator.standing
-        if setpoint is not None:
-            self._obey(setpoint, look)
-        if setpoint is not None or standing is None:
-            return never
-        self._tune()
-        self.motion = standing
-        self.loop.demand(standing, self._limits, integrate=True)
-        return self._loop_step(step)
-
-    def _loop_step(self, step: int) -> int:
-        """The first step from this one on at which `fly` does more than repeat its demand."""
-        return max(step, math.ceil((self._next_loop_s - 1e-6) / STEP_S))
-
-    def flown(self, first_step: int, count: int) -> None:
-        """Keep up with steps in which `fly` was not asked, as `flies_itself` allows."""
-        loop_step = self._loop_step(first_step)
-        if self.demand is OFF or loop_step >= first_step + count:
-            return
-        loops = (first_step + count - 1 - loop_step) // LOOP_STEPS + 1
-        self._next_loop_s = (loop_step + LOOP_STEPS * (loops - 1)) * STEP_S + LOOP_S
-        for _ in range(loops):
-            self._armed_for_s += LOOP_S
-        self._detector.rest()
-        if self._navigator.attitude_setpoint is None:
-            attitude, thrust, wanted = self.loop.result
-            self._attitude = attitude
-            self._wanted_z_mps = wanted[2]
-            self.thrust_demanded = thrust
-            self._set(attitude, None, thrust)
-
     @property
     def _boosts_thrust(self) -> bool:
         return self._parameters.role("tilt_boost") != 0.0
@@ -195,8 +151,10 @@ class Pilot:
         if setpoint.climb_mps is not None:
             climb = MotionSetpoint(velocity_ned_mps=(math.nan, math.nan, -setpoint.climb_mps))
             limits = Limits(self._parameters.role("hover_thrust"))
-            self.loop.demand(climb, limits, integrate=not nav.on_ground)
-            _, self._climb_thrust, _ = self.loop.step(nav.position_ned_m, nav.velocity_ned_mps)
+            estimate = (nav.position_ned_m, nav.velocity_ned_mps)
+            _, self._climb_thrust, _ = self.loop.step(
+                climb, limits, *estimate, integrate=not nav.on_ground
+            )
             if self.landed and setpoint.climb_mps <= 0.0:
                 self._climb_thrust = 0.0
         self._command(setpoint, lambda: nav)
@@ -219,8 +177,10 @@ class Pilot:
         rises = self._takeoff.lifting
         still = nav.on_ground and (rises or self.landed)
         integrates = not still or (rises and self._firmware.flight.integrates_on_ramp)
-        self.loop.demand(self.motion, self._limits, integrate=integrates)
-        attitude, thrust, wanted = self.loop.step(nav.position_ned_m, nav.velocity_ned_mps)
+        estimate = (nav.position_ned_m, nav.velocity_ned_mps)
+        attitude, thrust, wanted = self.loop.step(
+            self.motion, self._limits, *estimate, integrate=integrates
+        )
         self._wanted_z_mps = wanted[2]
         if rises:
             attitude = level(self.loop.yaw_rad) if nav.on_ground else attitude
@@ -268,7 +228,7 @@ class Pilot:
 
     def _detect(self, setpoint: AttitudeSetpoint | None, nav: Nav) -> None:
         was_landed = self.landed
-        if setpoint is not None and self._firmware.setpoints.decide_flight:
+        if setpoint is not None and self._firmware.setpoints.imply_flight:
             self._detector.rest()
             if self.thrust_demanded > 0.0:
                 self._detector.lift_off()

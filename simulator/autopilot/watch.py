@@ -47,21 +47,6 @@ class Watch:
             *self._position(now_s, has_fix),
         ]
 
-    def calm_until_s(self, now_s: float, has_fix: bool) -> float:
-        """Until when `step` will have nothing to tell but of the battery, if nobody speaks."""
-        if self._ground_station_lost != self._silent(now_s):
-            return now_s
-        until_s = math.inf
-        if not (self._ground_station_lost or math.isnan(self._ground_station_s)):
-            until_s = self._ground_station_s + self._patience_s
-        if not has_fix and not self._position_lost:
-            until_s = min(until_s, self._fix_s + self.firmware.health.position_without_fix_s)
-        return now_s if has_fix and self._position_lost else until_s
-
-    def calm_with(self, battery: BatteryState) -> bool:
-        """`step` has nothing to tell of the battery until it is worse than this one."""
-        return math.isnan(self._worse_s) and self._level(battery) <= self._battery_level
-
     @property
     def _patience_s(self) -> float:
         """From a ground station's last heartbeat until it is lost."""
@@ -74,11 +59,6 @@ class Watch:
 
     def _level(self, battery: BatteryState) -> int:
         return self.firmware.health.battery_level(battery, self.parameters.__getitem__)
-
-    def passed(self, now_s: float, has_fix: bool) -> None:
-        """A step in which there was nothing to tell."""
-        if has_fix:
-            self._fix_s = now_s
 
     def _ground_station(self, now_s: float) -> list[str]:
         lost = self._silent(now_s)

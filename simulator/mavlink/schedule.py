@@ -1,47 +1,83 @@
-"""What one link says by itself: the streams and their intervals, as clients ask for them.
+"""Telemetry of one link: the streams, their intervals and when each is due.
 
-What is due is found and written elsewhere (`simulator.mavlink.stretch`). Knows no client and no
-frame.
+Knows no client and no frame; `simulator.mavlink.outbox` fills and frames what is due.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from simulator.mavlink.telemetry import LEAST_INTERVAL_US
+from simulator.mavlink.telemetry import LEAST_INTERVAL_US, ON_POSITION_GRID
 from simulator.mavlink.view import View
+from simulator.steps import STEP_US
 
 INTERVAL_MAX_US = 2.0**31 - 1  # MESSAGE_INTERVAL.interval_us is an int32
 
 
 @dataclass(slots=True)
 class Stream:
-    """One message sent by itself: interval and next time, microseconds of vehicle time."""
+    """One message sent periodically: interval and next time, microseconds of vehicle time.
+
+    It is sent at multiples of `grid_us` only.
+    """
 
     interval_us: int
     due_us: int
+    grid_us: int
+
+    def next_after(self, now_us: int) -> None:
+        """Due at the next multiple of the interval, so that the mean rate is exact."""
+        self.due_at((now_us // self.interval_us + 1) * self.interval_us)
+
+    def due_at(self, time_us: int) -> None:
+        """Due at this time, or at the next grid point."""
+        self.due_us = -(-time_us // self.grid_us) * self.grid_us
 
 
 @dataclass(slots=True)
 class Schedule:
-    """`rates_hz`: what is sent without being asked. `changed`: the streams are others than they
-    were, until somebody takes note."""
+    """Streams of one link. `rates_hz`: what is sent without being requested."""
 
     view: View
     rates_hz: Mapping[str, float]
     streams: dict[str, Stream] = field(default_factory=dict)
-    changed: bool = True
+    _next_us: float = 0.0  # no stream is due before
 
     def __post_init__(self) -> None:
         self.restart()
 
     def restart(self) -> None:
         """As after boot."""
-        self.changed = True
-        self.streams = {
-            name: Stream(round(1e6 / rate_hz), 0) for name, rate_hz in self.rates_hz.items()
-        }
+        self.streams.clear()
+        for name, rate_hz in self.rates_hz.items():
+            self._start(name, round(1e6 / rate_hz)).due_at(STEP_US)
+
+    def _start(self, name: str, interval_us: int) -> Stream:
+        """A stream of message `name`; in its old place if there was one."""
+        steps = self.view.autopilot.firmware.streams.position_grid_steps
+        grid_us = STEP_US * (steps if name in ON_POSITION_GRID else 1)
+        self.streams[name] = stream = Stream(interval_us, 0, grid_us)
+        self._next_us = 0.0
+        return stream
+
+    def take_due(self) -> list[str]:
+        """Names of the messages due now, in the order of the streams; each is due again later."""
+        view, now_us = self.view, self.view.autopilot.senses.time_us
+        if now_us < self._next_us:
+            return []
+        due: list[str] = []
+        next_us = math.inf
+        for name, stream in self.streams.items():
+            if now_us >= stream.due_us:
+                stream.next_after(now_us)
+                if name not in view.silent and not view.withheld(name):
+                    due.append(name)
+            if stream.due_us < next_us:
+                next_us = stream.due_us
+        self._next_us = next_us
+        return due
 
     def set_interval(self, name: str, interval_us: float) -> bool:
         """0 restores the default, < 0 stops; False when the message has no settable rate."""
@@ -50,19 +86,16 @@ class Schedule:
         if interval_us == 0:
             rate_hz = self.rates_hz.get(name)
             interval_us = -1.0 if rate_hz is None else 1e6 / rate_hz
-        self.changed = True
         if interval_us < 0:
             self.streams.pop(name, None)
             return True
         least_us = LEAST_INTERVAL_US.get(name, 1.0)
         interval_us = round(min(INTERVAL_MAX_US, max(least_us, interval_us)))
-        # multiples of the interval, so that the mean rate is exact
-        next_us = (self.view.autopilot.senses.time_us // interval_us + 1) * interval_us
-        self.streams[name] = Stream(interval_us, next_us)
+        self._start(name, interval_us).next_after(self.view.autopilot.senses.time_us)
         return True
 
     def interval_us(self, name: str) -> int:
-        """Interval of a message; -1 when it is not sent by itself."""
+        """Interval of a message; -1 when it is not sent periodically."""
         stream = self.streams.get(name)
         return -1 if stream is None else stream.interval_us
 

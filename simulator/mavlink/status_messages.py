@@ -1,7 +1,7 @@
-"""Messages of the vehicle's state, its clock, its home and its mission.
+"""Builders of messages about state, clock, home and mission.
 
-One function per message, its fields in the order of the XML. Knows no links, rates or sequence
-numbers.
+One function per message, named like it, returns its fields in the order of the XML. Knows no links,
+rates or sequence numbers.
 """
 
 from __future__ import annotations
@@ -55,23 +55,12 @@ def extended_sys_state(view: View) -> Sequence[Any]:
     return (0, view.landed_state)
 
 
-def estimator_status(view: View) -> Sequence[Any]:
-    autopilot = view.autopilot
-    flags = 895 if autopilot.health.has_fix(autopilot.senses.time_s) else 1024
-    return (view.time_us, flags, 0.12, 0.03, 0.03, 0.14, 0.02, math.nan, 0.3, 0.31)
-
-
 def system_time(view: View) -> Sequence[Any]:
     return (view.epoch_us + view.time_us, view.time_ms)
 
 
 def timesync(view: View) -> Sequence[Any]:
     return (0, view.time_us * 1000)
-
-
-def ping(view: View) -> Sequence[Any]:
-    view.ping_sequence += 1
-    return (view.time_us, view.ping_sequence & 0xFFFFFFFF, 0, 0)
 
 
 def home_position(view: View) -> Sequence[Any]:
@@ -96,7 +85,7 @@ def gps_global_origin(view: View) -> Sequence[Any]:
 
 
 def mission_current(view: View) -> Sequence[Any]:
-    """Number and count of items; PX4 has 65535 items when it has none, and leaves the rest 0."""
+    """Current item and number of items; PX4 sends 65535 for no items, and 0 for the rest."""
     mission = view.autopilot.mission
     return (mission.current, len(mission.items) or 65535, 0, 0)
 
@@ -111,20 +100,3 @@ def autopilot_version(view: View) -> Sequence[Any]:
         firmware.capabilities, firmware.version, 0, 0, 0,
         (0,) * 8, (0,) * 8, (0,) * 8, 0, 0, view.system, (0,) * 18,
     )  # fmt: skip
-
-
-MESSAGES = (
-    heartbeat,
-    sys_status,
-    battery_status,
-    extended_sys_state,
-    estimator_status,
-    system_time,
-    timesync,
-    ping,
-    home_position,
-    gps_global_origin,
-    mission_current,
-    mission_item_reached,
-    autopilot_version,
-)

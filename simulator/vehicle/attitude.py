@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.model.kernel import kernel
+from offboard.compiled import kernel
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
@@ -29,8 +28,6 @@ RATE_LIMIT_RADPS: Triple = (3.84, 3.84, 3.49)
 # A rate demand skips the attitude half of the cascade: with half the identified delay PX4's
 # measured rate steps come out (roll t63 .10-.11 s, yaw .45 s).
 _RATE_DELAY_SHARE = 0.5
-
-_NO_ATTITUDE = (0.0, 0.0, 0.0, 0.0)
 
 # One row per step of the demand history.
 _IS_ATTITUDE, _RATES, _THRUST, ROW_WIDTH = 0, 5, 8, 9
@@ -84,27 +81,25 @@ def build_loop(vehicle: Vehicle, step_s: float) -> Loop:
 
 def encode(demand: Demand, row: Array) -> None:
     """Write the sanitised demand into a history row (ROW_WIDTH,); every number finite."""
+    row[:] = 0.0
     thrust = demand.thrust if demand.motors_on else 0.0
-    encode_attitude.function(demand.attitude or _NO_ATTITUDE, thrust, row)
-    if demand.attitude is None and demand.rates_frd_radps is not None:
+    if not math.isnan(thrust):
+        row[_THRUST] = min(max(thrust, 0.0), 1.0)
+    if demand.attitude is not None:
+        _encode_attitude(demand.attitude, row)
+    elif demand.rates_frd_radps is not None:
         row[_RATES:_THRUST] = [*map(_within, demand.rates_frd_radps, RATE_LIMIT_RADPS)]
 
 
-@kernel
-def encode_attitude(attitude: Any, thrust: float, row: Array) -> None:
-    """The same of an attitude (wxyz, any length) alone; without direction or not finite: none."""
-    for i in range(ROW_WIDTH):
-        row[i] = 0.0
-    if not math.isnan(thrust):
-        row[_THRUST] = min(max(thrust, 0.0), 1.0)
-    w, x, y, z = attitude[0], attitude[1], attitude[2], attitude[3]
+def _encode_attitude(attitude: Quaternion, row: Array) -> None:
+    """Scale to unit length, largest part first; nothing where that gives no direction."""
+    w, x, y, z = attitude
     largest = max(abs(w), abs(x), abs(y), abs(z))
     if not math.isfinite(w + x + y + z) or largest == 0.0:
         return
     w, x, y, z = w / largest, x / largest, y / largest, z / largest
     norm = math.sqrt(w * w + x * x + y * y + z * z)
-    row[_IS_ATTITUDE] = 1.0
-    row[1], row[2], row[3], row[4] = w / norm, x / norm, y / norm, z / norm
+    row[_IS_ATTITUDE:_RATES] = (1.0, w / norm, x / norm, y / norm, z / norm)
 
 
 def _within(rate: float, limit: float) -> float:

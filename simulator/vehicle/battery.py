@@ -41,25 +41,6 @@ class Pack:
     battery: Battery
     hover_thrust: float
 
-    @property
-    def constants(self) -> tuple[float, ...]:
-        """Cells, capacity A s, share at boot, resistance ohm; current A and thrust in hover."""
-        battery = self.battery
-        return (
-            battery.cells,
-            3600.0 * battery.capacity_ah,
-            battery.remaining,
-            battery.resistance_ohm,
-            battery.hover_current_a,
-            self.hover_thrust,
-        )
-
-    @property
-    def drain_max_a(self) -> float:
-        """Current at full thrust."""
-        share: float = self.hover_thrust**-1.5
-        return self.battery.hover_current_a * share
-
     def state(self, drawn_as: float, thrust: float) -> BatteryState:
         """After the charge drawn so far (A s), at this normalised thrust."""
         battery = self.battery

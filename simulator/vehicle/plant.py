@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.model.kernel import address
 from offboard.model.state import QUATERNION
 from offboard.model.vehicle import Triple, Vehicle
 from simulator.steps import STEP_S
@@ -89,7 +88,6 @@ class Plant:
 
     def __init__(self, vehicle: Vehicle, conditions: Conditions, seed: int) -> None:
         self.record = np.zeros(1, RECORD)
-        self.address = address(self.record)
         self._step = 0
         self._due_s = 0.0
         airframe = build_airframe(
@@ -124,7 +122,7 @@ class Plant:
         self._body[0] = 1.0
         self._rotor[CONTACT] = 1.0
         self._wind[:] = wind_ned_mps
-        draw_gusts.call(self.address)
+        draw_gusts(self.record)
         record["gust"][0] = gusts.stationary_scale @ record["gust_normals"][0]
         record["gusty"] = np.any(record["gust"] != 0.0)
 
@@ -135,24 +133,15 @@ class Plant:
 
     def advance(self, duration_s: float, demand: Demand) -> None:
         """Hold the demand for `duration_s`; what is left of a step is owed to the next call."""
-        self.obey(demand)
-        self._due_s += duration_s
-        count = int(self._due_s / STEP_S + 1e-6)
-        self._due_s -= count * STEP_S
-        self._step += count
-        while count > 0:
-            count -= advance_steps.call(count, self.address)
-
-    def obey(self, demand: Demand) -> None:
-        """From the next step on this is the demand."""
         if demand is not self._demand:
             encode(demand, self._row)
             self.record["motors_on"] = demand.motors_on
             self._demand = demand
-
-    def flown(self, count: int) -> None:
-        """Compiled code took the record so many steps further."""
+        self._due_s += duration_s
+        count = int(self._due_s / STEP_S + 1e-6)
+        self._due_s -= count * STEP_S
         self._step += count
+        advance_steps(count, self.record)
 
     def reset_estimate(self, offset_ned_m: Triple) -> None:
         """The estimator jumps by this much from now on, and says so by its reset counter."""
@@ -191,15 +180,10 @@ class Plant:
             battery=self.pack.state(float(self._rotor[CHARGE]), float(self._rotor[THRUST])),
         )
 
-    def battery_at_worst(self, after_s: float) -> BatteryState:
-        """What the battery may be by then: at full thrust from now on."""
-        more_as = self.pack.drain_max_a * after_s
-        return self.pack.state(float(self._rotor[CHARGE]) + more_as, 1.0)
-
     @property
     def fix(self) -> Fix:
         """A satellite fix of now; the same however often it is asked within a step."""
-        receive_fix.call(self.address)
+        receive_fix(self.record)
         fix = self.record["fix"][0].copy()
         return Fix(fix[:3], fix[3:])
 
@@ -238,7 +222,7 @@ class Plant:
     def report(self) -> Array:
         """The estimate in one array (REPORT_WIDTH,), laid out as `simulator.vehicle.sensors` says;
         it changes with the next call."""
-        report_state.call(self.address)
+        report_state(self.record)
         seen: Array = self._report
         return seen
 

@@ -1,4 +1,4 @@
-"""A companion in memory for tests of the simulator: pymavlink here, an Instance there."""
+"""A companion in memory for tests of the simulator: pymavlink on one side, an Instance behind."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ class Bench:
                 each()
             if self.instance.steps % STEPS_PER_HEARTBEAT == 0:
                 self._heartbeat()
-            self.instance.tick()
+            self.instance.advance()
             for datagram in self.instance.drain():
                 self.raw += datagram
                 self._unread.append((self.time_s, datagram))

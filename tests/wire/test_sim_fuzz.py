@@ -1,4 +1,4 @@
-"""Whatever arrives, the vehicle goes on, says only well-formed things, and flies afterwards.
+"""Arbitrary input: the vehicle keeps running, sends well-formed frames only, and flies afterwards.
 
 `FUZZ_DATAGRAMS=1000000 pytest tests/wire/test_sim_fuzz.py` sends half a million to each firmware
 and half a million more in flight, before a normal one.
@@ -32,7 +32,7 @@ def assault(instance: Instance, seed: int, count: int) -> Decoder:
     for number, datagram in enumerate(itertools.islice(datagrams(seed), count)):
         (instance.feed if number % 4 else instance.feed_ground)(datagram)
         if number % PER_STEP == 0:
-            instance.tick()
+            instance.advance()
             for said in (*instance.drain(), *instance.ground.outbox.drain()):
                 messages = reader.read(said)
                 positions = [m for m in messages if m.name == "LOCAL_POSITION_NED"]

@@ -12,8 +12,7 @@ from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.position_law import GRAVITY_MPS2
 from simulator.autopilot.position_loop import Limits, PositionLoop
 from simulator.firmware.px4 import PX4
-from simulator.firmware.setpoints import MotionSetpoint
-from simulator.firmware.vocabulary import NAN3, Quaternion, Triple
+from simulator.firmware.values import NAN3, MotionSetpoint, Quaternion, Triple
 
 GAINS = PX4.flight.gains(ParameterTable(PX4).__getitem__)
 HOVER = Limits(hover_thrust=0.5)
@@ -24,8 +23,7 @@ def _stepped(
     loop: PositionLoop, motion: MotionSetpoint, limits: Limits = HOVER
 ) -> tuple[Quaternion, float, Triple]:
     """One period at the origin, at rest."""
-    loop.demand(motion, limits)
-    return loop.step(REST, REST)
+    return loop.step(motion, limits, REST, REST)
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 0.7, math.pi / 2, 2.5, math.pi, -1.9])

@@ -7,6 +7,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from offboard.documents.errors import UserError
 from offboard.paper.law import PaperSettings
 
 # Section of the page -> tables and figures, in reading order
@@ -30,7 +31,7 @@ TABLES, FIGURES = (
 SEEDS, QUICK_SEEDS, MOST_SEEDS = 20, 2, 10_000
 
 
-class PaperError(Exception):
+class PaperError(UserError):
     """The run is not possible; the message is one sentence for the user."""
 
 

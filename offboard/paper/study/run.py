@@ -21,8 +21,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from offboard.analysis.figure import Figure
-from offboard.analysis.interrupts import deaf_to_interrupts
-from offboard.analysis.processors import processors
+from offboard.analysis.workers import interrupts_deferred, processors
 from offboard.control.swarm import warm_up
 from offboard.paper.study.options import PaperError, PaperOptions, check
 from offboard.paper.study.page import Table, page
@@ -126,7 +125,7 @@ def _results(jobs: Sequence[Job], workers: int | None) -> Generator[tuple[Job, A
     context = multiprocessing.get_context("spawn")
     pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
     try:
-        with deaf_to_interrupts():  # the processes start here and inherit it
+        with interrupts_deferred():  # the processes start here and inherit it
             futures = {pool.submit(_guarded, job): job for job in jobs}
         for future in as_completed(futures):
             try:

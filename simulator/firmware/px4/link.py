@@ -1,20 +1,20 @@
-"""Whom PX4 hears on a link, and how it speaks."""
+"""Link behaviour of PX4."""
 
 from __future__ import annotations
 
-from simulator.firmware.link import LinkRules
-from simulator.firmware.vocabulary import ReadParameter
+from simulator.firmware.base import LinkRules
+from simulator.firmware.values import ReadParameter
 
 _MAV_TYPE_GCS = 6
 
 
 def is_ground_station(kind: int, _: int, __: ReadParameter) -> bool:
-    """By its type, whoever it is."""
+    """By MAV_TYPE, whatever the system id."""
     return kind == _MAV_TYPE_GCS
 
 
 def obeys_system(_: int, __: int, ___: ReadParameter) -> bool:
-    """Everybody."""
+    """All systems."""
     return True
 
 

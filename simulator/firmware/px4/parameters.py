@@ -1,8 +1,8 @@
-"""PX4's parameters: those that clients read and those that the vehicle obeys."""
+"""Parameters of PX4: those that clients read and those that the vehicle obeys."""
 
 from __future__ import annotations
 
-from simulator.firmware.parameters import ParameterSpec, Role
+from simulator.firmware.base import ParameterSpec, Role
 
 
 def _real(name: str, default: float, low: float, high: float, meaning: str) -> ParameterSpec:

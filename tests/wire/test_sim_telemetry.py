@@ -1,0 +1,111 @@
+"""Telemetry of a link: builders, rates, the grid of positions, values that are not finite."""
+
+from __future__ import annotations
+
+from collections import Counter
+from dataclasses import replace
+from types import ModuleType
+
+import numpy as np
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from sim_bench import Bench
+
+from simulator import config
+from simulator.firmware.base import Firmware
+from simulator.firmware.catalogue import FIRMWARES
+from simulator.firmware.px4 import PX4
+from simulator.instance import Instance
+from simulator.mavlink.codec import Decoder
+from simulator.mavlink.telemetry import builders, builders_in
+from simulator.vehicle.conditions import Conditions
+from simulator.vehicle.sensors import EstimatorName
+
+
+def _instance() -> Instance:
+    return Instance(
+        PX4,
+        config.vehicle(PX4.vehicle),
+        Conditions(estimator=EstimatorName.PX4_LIKE),
+        7,
+        lockstep=True,
+        ground_link=False,
+    )
+
+
+def test_another_rate_of_one_message_does_not_shift_the_others() -> None:
+    instance = _instance()
+    while instance.time_s < 3.1:
+        instance.advance()
+    instance.drain()
+    slower = mavlink.MAVLink_command_long_message(1, 1, 511, 0, 31, 40_000, 0, 0, 0, 0, 0)
+    instance.feed(slower.pack(mavlink.MAVLink(None, 255, 190)))
+    sent = Counter[str]()
+    while instance.time_s < 3.9:
+        for datagram in instance.step():
+            sent.update(message.name for message in Decoder().read(datagram))
+    assert "HEARTBEAT" not in sent
+    assert sent["ATTITUDE_QUATERNION"] == 20
+    assert sent["ATTITUDE"] == 80
+
+
+def test_positions_are_sent_on_the_grid_of_the_estimator_whatever_their_rate() -> None:
+    instance = _instance()
+    faster = mavlink.MAVLink_command_long_message(1, 1, 511, 0, 32, 4_000, 0, 0, 0, 0, 0)
+    instance.feed(faster.pack(mavlink.MAVLink(None, 255, 190)))
+    stamps = []
+    while instance.time_s < 1.0:
+        for datagram in instance.step():
+            messages = Decoder().read(datagram)
+            stamps += [m.time_boot_ms for m in messages if m.name == "LOCAL_POSITION_NED"]
+    grid_ms = 4 * PX4.streams.position_grid_steps
+    assert stamps == list(range(grid_ms, 1001, grid_ms))
+
+
+def test_a_duration_ends_between_barriers() -> None:
+    instance = _instance()
+    while instance.advance_to_barrier(1.012):
+        instance.barrier()
+    assert instance.steps == 253
+
+
+@pytest.mark.parametrize(
+    "body",
+    [(np.nan,) * 13, (1.0, *(0.0,) * 9, np.nan, np.inf, -np.inf), (1.0, *(0.0,) * 11, -1e5)],
+    ids=["all NaN", "no position", "above the atmosphere"],
+)
+def test_states_that_are_not_finite_or_out_of_range_are_sent(body: tuple[float, ...]) -> None:
+    instance = _instance()
+    instance.autopilot.plant.record["body"][0] = body
+    streams = instance.companion.schedule.streams
+    for name in streams:
+        streams[name].due_us = 0
+    instance.advance_to_barrier()
+    sent = {message.name for message in Decoder().read(b"".join(instance.drain()))}
+    assert sent >= {"LOCAL_POSITION_NED", "ODOMETRY", "ATTITUDE", "HIGHRES_IMU", "GPS_RAW_INT"}
+
+
+@pytest.mark.parametrize("firmware", FIRMWARES.values(), ids=FIRMWARES)
+def test_every_message_is_read_by_pymavlink(firmware: Firmware) -> None:
+    """Right number, order and types of fields: each message is framed here and decoded there."""
+    bench = Bench(firmware=firmware, boot_scale=0.02)
+    bench.run(1.0)
+    names = builders(firmware)
+    for name in names:
+        bench.instance.companion.outbox.send_now(name)
+    bench.run(0.1)
+    assert {message.get_type() for _, message in bench.received} >= set(names)
+
+
+def test_a_stream_without_a_builder_is_refused() -> None:
+    streams = replace(PX4.streams, companion_rates_hz={"HEARTBEAT": 1.0, "ATITUDE": 10.0})
+    with pytest.raises(ValueError, match=r"^px4 streams: no builder for ATITUDE$"):
+        builders(replace(PX4, streams=streams))
+
+
+def test_a_builder_that_is_not_called_like_a_message_is_refused() -> None:
+    module = ModuleType("messages")
+    exec("def atitude(view): return ()", vars(module))
+    vars(module)["atitude"].__module__ = "messages"
+    with pytest.raises(ValueError, match=r"^messages: not a MAVLink message: ATITUDE$"):
+        builders_in(module)
