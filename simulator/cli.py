@@ -154,13 +154,11 @@ def simulate(
         except OSError as error:
             _refuse(f"--log {log} cannot be written: {error.strerror}")
 
-    from offboard.model.kernel import Entry
+    from offboard.compiled import prepare
     from simulator.instance import VIRTUAL_EPOCH_US, Instance
     from simulator.run import Endpoint, Runner, warm_up
 
-    if not Entry.all_compiled():
-        _tell("compiling the flight dynamics, once (some seconds)")
-    Entry.compile_all()
+    prepare(_tell)
     warm_up(Instance(personality, flyer, flown.conditions, seed, lockstep=True))
 
     epoch_us = VIRTUAL_EPOCH_US if lockstep else unix_us()

@@ -61,14 +61,14 @@ def _fly(options: list[str]) -> NoReturn:
 
 def _load() -> None:
     """Import all modules of a flight and load its compiled functions."""
-    from offboard.model.kernel import Entry
+    from offboard.compiled import prepare
     from simulator import config, run
     from simulator.firmware.catalogue import FIRMWARES
     from simulator.instance import Instance
     from simulator.vehicle.conditions import Conditions
 
     assert run
-    Entry.compile_all()
+    prepare()
     for firmware in FIRMWARES.values():
         vehicle = config.vehicle(firmware.vehicle)
         Instance(firmware, vehicle, Conditions(), 1, lockstep=True).advance_to_barrier()

@@ -35,7 +35,7 @@ from offboard.reference.shapes import SHAPES, FromTable, Shape
 from offboard.reference.track import Track
 
 Raw = dict[str, Any]
-RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "llvmlite")
+RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
 UNKNOWN_VEHICLE = "neutral"
 FOLDERS = {part: shipped.FOLDERS[part] for part in ("vehicle", "controller", "reference")}
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from offboard.compiled import prepare
 from offboard.control.base import Controller, Situation
 from offboard.documents.reading import DocumentError
 from offboard.estimation.fusion import FusedObserver
@@ -30,12 +31,10 @@ from offboard.flight.stop import StopRequests
 from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
 from offboard.model.command import Command
-from offboard.model.kernel import Entry
 from offboard.model.vehicle import Vehicle
 from offboard.reference.track import Track
 from offboard.reference.transfer import Hold
 
-COMPILED_S = 2.0  # worth a word
 REHEARSED_DECISIONS = 5  # the fastest counts: the machine may be busy
 SITL_TIMEOUT_S = 180.0  # for simulator and companion in lockstep: either may compile, or be slow
 
@@ -83,13 +82,12 @@ class FlightParts:
     identify: IdentifySettings | None = None
 
 
-def rehearse(parts: FlightParts, *, keeps_deadline: bool) -> float:
+def rehearse(parts: FlightParts, *, keeps_deadline: bool) -> None:
     """Call every code path of observer and controller, so that nothing is compiled in flight.
 
-    A pause of seconds at the first decision in flight is a crash. Returns the wall time (s) it
-    took. With `keeps_deadline`, raises DocumentError if a decision cannot meet the deadline.
+    A pause of seconds at the first decision in flight is a crash. With `keeps_deadline`, raises
+    DocumentError if a decision cannot meet the deadline.
     """
-    began_s = clock.monotonic_s()
     observer = parts.make_observer()
     reference = Hold((0.0, 0.0, -2.0), 0.1)
     previous = Command(parts.vehicle.gravity_mps2, (0.0, 0.0, 1.0), 0.0)
@@ -111,7 +109,6 @@ def rehearse(parts: FlightParts, *, keeps_deadline: bool) -> float:
         _check_deadline(parts, replace(situation, remaining_s=lambda: 0.0))
     parts.track.sample(np.array([0.0, 1.0]))
     parts.controller.reset()
-    return clock.monotonic_s() - began_s
 
 
 def _check_deadline(parts: FlightParts, cut_short: Situation) -> None:
@@ -152,12 +149,9 @@ def fly(
             assert isinstance(link, LockstepLink)
             bundled.simulator.launch(bundled.options(link.port))
             stack.callback(bundled.simulator.recall)
-        some = "" if Entry.all_compiled() else " (compiles what never flew here, for some seconds)"
-        tell(f"preparing the controller{some}")
-        compiled = Entry.compilations
-        took_s = rehearse(parts, keeps_deadline=bundled is None)
-        if Entry.compilations > compiled and took_s > COMPILED_S:
-            tell(f"compiled in {took_s:.1f} s; the next start finds it cached")
+        tell("preparing the controller")
+        prepare(tell)
+        rehearse(parts, keeps_deadline=bundled is None)
         stops.check()
         stack.enter_context(log)
         observer = parts.make_observer()

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
-from offboard.model.kernel import kernel
+from offboard.compiled import kernel
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 Array = NDArray[np.float64]

@@ -202,8 +202,8 @@ def make(
     believed: Vehicle | None = None,
     **options: Any,
 ) -> Pair:
-    """A pair as `offboard fly --sitl` would make it, and what a test changes about it: what
-    `flies` whatever is `believed`, and `learning` what it is."""
+    """A pair as `offboard fly --sitl` makes it. `flies` is the simulated vehicle, `believed` the
+    controller's model of it, `learning` the settings of the identification."""
     named = {"reference": reference, "vehicle": vehicle}
     choices = {part: chosen for part, chosen in named.items() if chosen}
     resolved = config.load(

@@ -9,6 +9,8 @@ import numpy as np
 import pytest
 from pair import hover
 
+from offboard import compiled
+from offboard.compiled import Entry
 from offboard.control.base import Situation
 from offboard.flight import configuration as config
 from offboard.flight import manifest, request
@@ -18,7 +20,6 @@ from offboard.flight.readiness import Readiness
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.px4 import PX4
 from offboard.model.command import Command
-from offboard.model.kernel import Entry
 from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import Vehicle
 from offboard.reference.transfer import Hold
@@ -98,11 +99,10 @@ def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(
         config.load("flight", choices=chosen, assignments=(f"controller.keep_out=[{volume}]",))
     )
     loaded: list[str] = []
-    load = Entry._load
-    for entry in Entry.defined():
-        for kept in ("call", "_machine_code"):
-            vars(entry).pop(kept, None)
-    monkeypatch.setattr(Entry, "_load", lambda entry: loaded.append(entry.symbol) or load(entry))
+    load = Entry.load
+    for entry in compiled.defined:
+        monkeypatch.setattr(entry, "machine_code", None)
+    monkeypatch.setattr(Entry, "load", lambda entry: loaded.append(entry.name) or load(entry))
     rehearse(parts, keeps_deadline=False)
     rehearsed = set(loaded)
     at_m = np.array([5.0, 0.3, -3.0])

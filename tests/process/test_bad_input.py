@@ -26,8 +26,6 @@ from offboard.analysis.trial import keep_score, score_flight
 from offboard.flight import one_flight as run
 from offboard.flight import request
 from offboard.flight.log import LogError
-from offboard.flight.request import FlightRequest, fly_request
-from offboard.model.kernel import Entry
 
 Capture = pytest.CaptureFixture[str]
 CONFIG = Path(__file__).parents[2] / "config"
@@ -326,24 +324,6 @@ def test_a_comparison_interrupted_while_it_compiles_does_not_fly(
     )  # fmt: skip
     assert (code, said) == (4, "interrupted: 2 of 2 flights missing\n")
     assert not list(tmp_path.rglob("*.tlog"))
-
-
-@pytest.mark.parametrize("compiles", [True, False])
-def test_only_what_was_compiled_is_called_so(
-    compiles: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def rehearses(*_: object, **__: object) -> float:
-        if compiles:
-            monkeypatch.setattr(Entry, "compilations", Entry.compilations + 1)
-        return 2.3
-
-    monkeypatch.setattr(run, "rehearse", rehearses)
-    heard: list[str] = []
-    order = FlightRequest(
-        tmp_path / "x", connection="udpin:127.0.0.1:0", assignments=("limits.connect_s=0.1",)
-    )
-    fly_request(order, tell=heard.append)
-    assert ("compiled in 2.3 s; the next start finds it cached" in heard) is compiles
 
 
 @pytest.mark.parametrize("signals", [[signal.SIGTERM], [signal.SIGINT, signal.SIGINT]])
