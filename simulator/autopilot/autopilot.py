@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from simulator.autopilot.commander import NOTHING, Commander, Wish
+from simulator.autopilot.guidance import Guidance
 from simulator.autopilot.health import Health
 from simulator.autopilot.mission import Mission
 from simulator.autopilot.nav import Senses
@@ -58,7 +59,8 @@ class Autopilot:
             firmware, self.parameters, self.mission, self.stream, self.watch, boot_scale
         )
         self.sticks = None if firmware.flight.handling is None else Sticks(firmware.flight.handling)
-        self.navigator = Navigator(firmware, self.parameters, self.mission, self.sticks)
+        self.guidance = Guidance(firmware, self.parameters, self.mission, self.sticks)
+        self.navigator = Navigator(self.guidance)
         self.pilot = Pilot(firmware, self.parameters, self.navigator)
         self.commander = Commander(
             firmware, self.parameters, self.navigator, self.pilot, self.senses, self.health
@@ -79,7 +81,7 @@ class Autopilot:
         if message == ATTITUDE:
             self._fly(self.stream.attitude(values))
         elif outlives or mode.needs_position:
-            home_down_m = self.navigator.home_ned_m[2]
+            home_down_m = self.guidance.home_ned_m[2]
             setpoint, said = self.stream.motion(message, values, self.senses.look(), home_down_m)
             self.commander.texts += () if said is None else (said,)
             self._fly(setpoint)
@@ -99,7 +101,7 @@ class Autopilot:
         if setpoint is None:
             return
         self.stream.newest_s = self.senses.time_s
-        self.navigator.obey(setpoint)
+        self.navigator.follow(setpoint)
         self._end_takeoff()
         if isinstance(setpoint, AttitudeSetpoint) and setpoint.event:
             self.happen(setpoint.event)
@@ -134,7 +136,7 @@ class Autopilot:
         event = airtime.step(now_s, was_landed=was_landed, landed=pilot.landed)
         if event is not None:
             commander.happen(event)
-        for event in self.navigator.tell():
+        for event in self.navigator.take_events():
             commander.happen(event)
         if not commander.armed:
             return

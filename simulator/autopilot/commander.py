@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from simulator.autopilot.airtime import Airtime
+from simulator.autopilot.behaviours import BEHAVIOURS
 from simulator.autopilot.health import Health
 from simulator.autopilot.nav import Senses
 from simulator.autopilot.navigator import Navigator
@@ -21,8 +22,6 @@ from simulator.firmware.base import Firmware
 from simulator.firmware.modes import Behaviour, Condition, Mode
 from simulator.firmware.rules import AT_LAST, Rule
 from simulator.firmware.vocabulary import NAN3, Result, Say, Triple
-
-_GO_ON = frozenset({Behaviour.SETPOINT, Behaviour.MISSION})  # when asked for again
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +53,7 @@ class Commander:
     ) -> None:
         self._firmware, self._parameters = firmware, parameters
         self._navigator, self._pilot = navigator, pilot
+        self._guidance = navigator.guidance
         self._senses, self._health = senses, health
         self._table = StateTable(firmware.rules)
         self.mode: Mode = firmware.modes[firmware.boot_mode]
@@ -88,7 +88,7 @@ class Commander:
             healthy=self.healthy,
             failsafe=self.failsafe,
             faulty=bool(self._latched),
-            setpoint=self._navigator.setpoint,
+            setpoint=self._guidance.setpoint,
         )
         base_mode, state = self._firmware.heartbeat(condition)
         return base_mode | (128 if self.armed else 0), state
@@ -156,11 +156,11 @@ class Commander:
     def _figures(self) -> dict[str, float]:
         """What texts may name."""
         above_home_m = self._navigator.target_height_m
-        amsl_m = self._firmware.origin[2] - self._navigator.home_ned_m[2] + above_home_m
+        amsl_m = self._firmware.origin[2] - self._guidance.home_ned_m[2] + above_home_m
         battery = self._senses.truth.battery
         return {
             "takeoff_m": self._parameters.role("takeoff_height_m"),
-            "climb_m": self._navigator.mission.climb_m,
+            "climb_m": self._guidance.mission.climb_m,
             "target_m": above_home_m,
             "target_amsl_m": amsl_m,
             "battery_v": battery.voltage_v,
@@ -177,8 +177,8 @@ class Commander:
             if mode.remembered:
                 self._remembered = name
         if mode is not self.mode and not self._firmware.setpoints.outlive_modes:
-            self._navigator.setpoint = None
-        if mode is not self.mode or mode.behaviour not in _GO_ON:
+            self._guidance.setpoint = None
+        if mode is not self.mode or not BEHAVIOURS[mode.behaviour].goes_on:
             self._pilot.enter(mode.behaviour, self._senses.look(), self._wish.takeoff_ned_m)
         self.mode = mode
 
@@ -210,18 +210,18 @@ class Commander:
         self.failsafe = False
 
     def _take_off(self) -> None:
-        self._navigator.setpoint = None
+        self._guidance.setpoint = None
         self._pilot.enter(Behaviour.TAKEOFF, self._senses.look(), self._wish.takeoff_ned_m)
 
     def _return(self) -> None:
         self._pilot.enter(Behaviour.RETURN, self._senses.look())
 
     def _hold(self) -> None:
-        self._navigator.setpoint = None
+        self._guidance.setpoint = None
         self._pilot.enter(self.mode.behaviour, self._senses.look())
 
     def _level(self) -> None:
-        self._pilot.level(self._senses.look())
+        self._pilot.level_off(self._senses.look())
 
     def _latch(self) -> None:
         self._latched |= {self._event}
@@ -232,7 +232,7 @@ class Commander:
     # -- guards ------------------------------------------------------------------------------
 
     def _climb_asked(self) -> bool:
-        return self._wish.takeoff_ned_m[2] <= self._navigator.home_ned_m[2]
+        return self._wish.takeoff_ned_m[2] <= self._guidance.home_ned_m[2]
 
     def _mode_can_run(self) -> bool:
         return self._health.can_run(self._asked, self._senses.time_s)
@@ -248,12 +248,12 @@ GUARDS: dict[str, Callable[[Commander], bool]] = {
     "mode needs position": lambda own: own.mode.needs_position,
     "mode arms": lambda own: own.mode.arms,
     "position missing": lambda own: own._health.position_missing(own._asked),
-    "mission missing": lambda own: not own._navigator.mission.flyable,
+    "mission missing": lambda own: not own._guidance.mission.flyable,
     "climb asked": Commander._climb_asked,
     "climbing": lambda own: own._navigator.behaviour is Behaviour.TAKEOFF,
-    "obeys attitude": lambda own: own._navigator.obeys_attitude,
-    "obeys motion": lambda own: own._navigator.obeys_motion,
-    "obeys velocity": lambda own: own._navigator.obeys_velocity,
+    "obeys attitude": lambda own: own._navigator.follows_attitude,
+    "obeys motion": lambda own: own._navigator.follows_motion,
+    "obeys velocity": lambda own: own._navigator.follows_velocity,
 }
 
 ACTIONS: dict[str, Callable[[Commander], None]] = {

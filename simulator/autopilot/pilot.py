@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from simulator.autopilot.behaviours import Control
 from simulator.autopilot.land_detector import LandDetector
 from simulator.autopilot.nav import Nav
 from simulator.autopilot.navigator import Navigator, level
@@ -24,7 +25,6 @@ from simulator.steps import LOOP_S
 from simulator.vehicle.attitude import Demand
 
 _TILT_BOOST_MAX = 10.0
-_LIFTING = frozenset({Behaviour.TAKEOFF, Behaviour.SETPOINT, Behaviour.MISSION, Behaviour.DESCEND})
 OFF = Demand()
 
 
@@ -77,9 +77,9 @@ class Pilot:
         self._attitude = level(nav.yaw_rad)
         self.loop.reset(nav.yaw_rad)
 
-    def level(self, nav: Nav) -> None:
-        """Nobody says what to do: level, course and height as they are."""
-        self._navigator.level(nav)
+    def level_off(self, nav: Nav) -> None:
+        """No setpoint arrives: level attitude, present yaw and height."""
+        self._navigator.level_off(nav)
         self.loop.reset(nav.yaw_rad)
 
     def fly(self, time_s: float, armed: bool, look: Callable[[], Nav]) -> Demand:
@@ -101,13 +101,14 @@ class Pilot:
     def _loop_once(self, setpoint: AttitudeSetpoint | None, nav: Nav, time_s: float) -> None:
         """One period of the position loop's."""
         self._tune()
-        if self._navigator.behaviour is Behaviour.LEVEL:
+        control = self._navigator.active.control
+        if control is Control.LEVEL:
             thrust = self._parameters.role("stick_thrust_least")
             self._set(level(self.loop.yaw_rad), None, thrust)
         elif setpoint is not None:
             if setpoint.climb_mps is not None or self._boosts_thrust:
                 self._fly_vertical(setpoint, nav)
-        elif self._navigator.behaviour is not Behaviour.COAST:
+        elif control is Control.MOTION:
             self._fly_motion(nav, time_s)
         self._detect(setpoint, nav)
 
@@ -162,9 +163,9 @@ class Pilot:
     # -- motion ------------------------------------------------------------------------------
 
     def _fly_motion(self, nav: Nav, time_s: float) -> None:
-        lifts = self._navigator.behaviour in _LIFTING
+        lifts = self._navigator.active.lifts_off
         if self.landed and self._takeoff.spooling and lifts:
-            self._navigator.stay(nav)
+            self._navigator.guidance.hold_ned_m = nav.position_ned_m
         waits = not (self._takeoff.flying or self._takeoff.lifting)
         self.motion = self._navigator.motion(nav, time_s, landed=self.landed, waits=waits)
         wants_up = lifts and self._asks_up(nav)
@@ -193,27 +194,29 @@ class Pilot:
         """As the behaviour allows, and the takeoff."""
         role, navigator, gains = self._parameters.role, self._navigator, self.loop.gains
         up_mps = self._takeoff.speed_up_mps(gains.velocity_z[0])
-        if navigator.climbing and not navigator.smooth:
+        if navigator.active.climbing and not navigator.planned:
             up_mps = min(up_mps, role("takeoff_speed_mps"))
         turn_radps = self.motion.turn_radps
-        if navigator.automatic:
+        if navigator.active.automatic:
             turn_radps = min(turn_radps, gains.turn_radps)
         return Limits(
             hover_thrust=role("hover_thrust"),
             thrust_least=0.0 if self._takeoff.lifting else role("thrust_least"),
-            across_mps=math.inf if navigator.smooth else navigator.across_mps,
+            across_mps=math.inf if navigator.planned else navigator.cruise_mps,
             up_mps=up_mps,
-            down_mps=gains.follows_down_mps if navigator.smooth else gains.speed_down_mps,
+            down_mps=gains.follows_down_mps if navigator.planned else gains.speed_down_mps,
             turn_radps=turn_radps,
-            gently=navigator.automatic and not navigator.smooth,
+            gently=navigator.active.automatic and not navigator.planned,
         )
 
     def _asks_up(self, nav: Nav) -> bool:
         """Something above is demanded: a height, a climb or an acceleration."""
         motion, navigator = self.motion, self._navigator
-        if navigator.smooth:
-            return navigator.rises and not navigator.earthbound
-        return not navigator.earthbound and (
+        if navigator.active.cannot_climb:
+            return False
+        if navigator.planned:
+            return navigator.plans_up
+        return (
             motion.position_ned_m[2] < nav.position_ned_m[2]
             or motion.velocity_ned_mps[2] < 0.0
             or motion.acceleration_ned_mps2[2] < 0.0

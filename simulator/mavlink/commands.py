@@ -100,7 +100,7 @@ class Commands:
     def _takeoff(self, command: Command) -> Result:
         asked_m = command.params[6]
         autopilot = self._autopilot
-        home_down_m = autopilot.navigator.home_ned_m[2]
+        home_down_m = autopilot.guidance.home_ned_m[2]
         if autopilot.firmware.commands.takeoff_above_home:
             down_m = home_down_m - asked_m
             return autopilot.happen("takeoff", Wish(takeoff_ned_m=(math.nan, math.nan, down_m)))
@@ -126,10 +126,10 @@ class Commands:
         latitude, longitude, height_m = command.params[4:7]
         autopilot = self._autopilot
         if command.params[0] == 1.0:
-            autopilot.navigator.home_ned_m = autopilot.senses.look().position_ned_m
+            autopilot.guidance.home_ned_m = autopilot.senses.look().position_ned_m
         elif math.isfinite(latitude + longitude + height_m):
             north, east = to_metres(autopilot.firmware.origin, latitude, longitude)
-            autopilot.navigator.home_ned_m = (north, east, autopilot.firmware.origin[2] - height_m)
+            autopilot.guidance.home_ned_m = (north, east, autopilot.firmware.origin[2] - height_m)
         else:
             return Result.DENIED
         return Result.ACCEPTED
@@ -155,7 +155,7 @@ class Commands:
             place = self._place(latitude, longitude, height_m, command.frame or 0)
             autopilot.go_to(place, yaw_rad)
             if math.isfinite(speed_mps):
-                autopilot.navigator.cruise_mps = speed_mps
+                autopilot.guidance.cruise_mps = speed_mps
         return result
 
     def go_to(self, place: tuple[float, float, float], frame: int) -> bool:
@@ -170,7 +170,7 @@ class Commands:
         """NED, of a place in degrees and a height of this MAV_FRAME; where it is in what of it
         is not finite."""
         autopilot = self._autopilot
-        origin, home_down_m = autopilot.firmware.origin, autopilot.navigator.home_ned_m[2]
+        origin, home_down_m = autopilot.firmware.origin, autopilot.guidance.home_ned_m[2]
         here = autopilot.senses.look().position_ned_m
         north, east = to_metres(origin, latitude, longitude)
         if not math.isfinite(north + east):
@@ -185,7 +185,7 @@ class Commands:
         if speed_mps > 0.0 and kind in _VERTICAL_SPEEDS:
             return Result.ACCEPTED
         known = 0.0 < speed_mps < math.inf
-        autopilot.navigator.cruise_mps = speed_mps if known else math.inf
+        autopilot.guidance.cruise_mps = speed_mps if known else math.inf
         return Result.ACCEPTED if known else autopilot.firmware.commands.speed_refusal
 
     def _turn(self, command: Command) -> Result:
@@ -199,7 +199,7 @@ class Commands:
             turn_rad = math.radians(asked_deg) * (-1.0 if relative and sense < 0 else 1.0)
             turn_radps = math.radians(speed_dps) if speed_dps > 0.0 else math.inf
             yaw_rad = math.remainder(from_rad + turn_rad, 2.0 * math.pi)
-            autopilot.navigator.turn_to(yaw_rad, turn_radps)
+            autopilot.guidance.turn_to(yaw_rad, turn_radps)
         return autopilot.happen("turn")
 
     def _reboot(self, command: Command) -> Result:

@@ -223,7 +223,7 @@ class MissionTransfer:
     def _home(self) -> Item:
         """As an item of a mission."""
         view = self.outbox.view
-        north_m, east_m, down_m = view.autopilot.navigator.home_ned_m
+        north_m, east_m, down_m = view.autopilot.guidance.home_ned_m
         place = view.geodetic(north_m, east_m)
         return Item(0, Kind.WAYPOINT, (0.0,) * 4, *place, view.altitude_mm(down_m) * 1e-3)
 

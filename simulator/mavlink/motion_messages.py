@@ -57,7 +57,7 @@ def odometry(view: View) -> Sequence[Any]:
 def global_position_int(view: View) -> Sequence[Any]:
     nav = view.autopilot.senses.look()
     north, east, down = nav.position_ned_m
-    home_down = view.autopilot.navigator.home_ned_m[2]
+    home_down = view.autopilot.guidance.home_ned_m[2]
     return (
         view.time_ms,
         *view.geodetic(north, east),
@@ -71,7 +71,7 @@ def global_position_int(view: View) -> Sequence[Any]:
 def altitude(view: View) -> Sequence[Any]:
     down = view.autopilot.senses.look().position_ned_m[2]
     amsl = view.altitude_mm(down) / 1e3
-    relative = view.autopilot.navigator.home_ned_m[2] - down
+    relative = view.autopilot.guidance.home_ned_m[2] - down
     return (view.time_us, amsl, amsl, -down, relative, math.nan, math.nan)
 
 

@@ -75,8 +75,8 @@ def ping(view: View) -> Sequence[Any]:
 
 
 def home_position(view: View) -> Sequence[Any]:
-    north, east, down = view.autopilot.navigator.home_ned_m
-    yaw_rad = view.autopilot.navigator.home_yaw_rad
+    north, east, down = view.autopilot.guidance.home_ned_m
+    yaw_rad = view.autopilot.guidance.home_yaw_rad
     return (
         *view.geodetic(north, east),
         view.altitude_mm(down),

@@ -98,12 +98,12 @@ class View:
     @property
     def landed_state(self) -> int:
         """MAV_LANDED_STATE: 1 on ground, 2 in air, 3 taking off, 4 landing."""
-        navigator = self.autopilot.navigator
+        behaviour = self.autopilot.navigator.active
         if self.autopilot.pilot.landed:
             return 1
-        if navigator.landing:
+        if behaviour.landing:
             return 4
-        return 3 if navigator.climbing else 2
+        return 3 if behaviour.climbing else 2
 
     @property
     def time_ms(self) -> int:

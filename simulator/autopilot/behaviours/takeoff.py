@@ -1,0 +1,60 @@
+"""Takeoff: climb to a place, or straight up to the default height."""
+
+from __future__ import annotations
+
+import math
+
+from simulator.autopilot.behaviours.base import ActiveBehaviour
+from simulator.autopilot.nav import Nav
+from simulator.firmware.modes import Behaviour
+from simulator.firmware.setpoints import MotionSetpoint
+from simulator.firmware.vocabulary import NAN3, Triple
+
+_FLATTEST = 1000.0  # metres across per metre of climb
+
+
+class Takeoff(ActiveBehaviour):
+    """PX4 AUTO.TAKEOFF; ArduCopter GUIDED after MAV_CMD_NAV_TAKEOFF. Ends with `climbed`."""
+
+    lifts_off = True
+
+    def enter(self, nav: Nav, place_ned_m: Triple = NAN3) -> None:
+        self._place_ned_m = place_ned_m
+        self._begun = self._climbed = False
+
+    @property
+    def climbing(self) -> bool:
+        return True
+
+    @property
+    def events(self) -> tuple[str, ...]:
+        return ("climbed",) if self._climbed else ()
+
+    def keeps_place(self, following: Behaviour) -> bool:
+        return self._climbed and following in (Behaviour.HOLD, Behaviour.SETPOINT)
+
+    def motion(self, nav: Nav, time_s: float, *, landed: bool) -> MotionSetpoint:
+        guidance = self.guidance
+        if not self._begun:
+            self._begun = True
+            self._begin(nav.position_ned_m, landed=landed)
+        north, east, target_z = self._place_ned_m
+        if math.isnan(north + east):
+            north, east = guidance.hold_ned_m[:2]
+        if nav.position_ned_m[2] < target_z + guidance.parameters.role("climbed_within_m"):
+            self._climbed = not landed
+        guidance.hold_ned_m = (north, east, target_z)
+        return MotionSetpoint(guidance.hold_ned_m)
+
+    def _begin(self, here_ned_m: Triple, *, landed: bool) -> None:
+        """Neither a descent nor, from the ground, a nearly flat leg is flown."""
+        (x, y, z), (north, east, target_z) = here_ned_m, self._place_ned_m
+        if math.isnan(target_z):
+            target_z = z - self.guidance.parameters.role("takeoff_height_m")
+            self.guidance.events.append("default height")
+        elif target_z > z:
+            target_z, self.cannot_climb = z, landed
+            self.guidance.events.append("already higher")
+        if landed and math.hypot(north - x, east - y) > _FLATTEST * (z - target_z):
+            self.cannot_climb = True
+        self._place_ned_m = (north, east, target_z)
