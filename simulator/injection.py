@@ -15,8 +15,7 @@ from simulator import faults
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.commander import Wish
 from simulator.faults import Direction, Fault, Moment, Refusable
-from simulator.firmware.modes import Behaviour
-from simulator.firmware.vocabulary import Say, Severity
+from simulator.firmware.values import Behaviour, Severity, StatusText
 from simulator.link.impairment import Channel, Path
 from simulator.mavlink.view import Stuck, View
 from simulator.steps import STEP_S
@@ -216,7 +215,7 @@ def _jump_clock_back(vehicle: Vehicle, running: Running) -> None:
 
 def _refuse(vehicle: Vehicle, running: Running) -> None:
     of = running.fault.of
-    said = Say(Severity.CRITICAL, f"{_REFUSED_TITLES[of]}: {running.fault.text}")
+    said = StatusText(Severity.CRITICAL, f"{_REFUSED_TITLES[of]}: {running.fault.text}")
     for event in _REFUSED_EVENTS[of]:
         vehicle.autopilot.commander.refused[event] = said
 

@@ -9,9 +9,6 @@ from pathlib import Path
 
 import pytest
 
-from simulator.autopilot.state_table import describe
-from simulator.firmware.px4 import PX4
-
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 SCRIPTS = Path(sys.executable).parent
@@ -68,14 +65,3 @@ def _subcommands() -> list[str]:
 @pytest.mark.parametrize("command", _subcommands())
 def test_every_command_is_described(command: str) -> None:
     assert f"offboard {command}" in README
-
-
-def state_table() -> str:
-    """The simulated autopilot's rules as the README shows them."""
-    rows = [("when", "in mode", "if", "then", "answer and text"), ("---",) * 5, *describe(PX4)]
-    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
-
-
-def test_the_state_table_is_the_one_in_the_code() -> None:
-    shown = README.partition("<!-- states:begin -->\n")[2].partition("\n<!-- states:end -->")[0]
-    assert shown == state_table(), f"put this between the marks:\n{state_table()}"

@@ -22,9 +22,7 @@ from simulator.autopilot.setpoints import ATTITUDE, SetpointStream
 from simulator.autopilot.sticks import Sticks
 from simulator.autopilot.watch import EVERY_STEPS, Watch
 from simulator.firmware.base import Firmware
-from simulator.firmware.modes import Behaviour
-from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint
-from simulator.firmware.vocabulary import Result, Triple
+from simulator.firmware.values import AttitudeSetpoint, Behaviour, MotionSetpoint, Result, Triple
 from simulator.steps import STEP_S
 from simulator.vehicle.plant import Plant
 
@@ -49,7 +47,7 @@ class Autopilot:
             firmware.origin,
             int(rules.home_first),
             rules.turning,
-            rules.tells_above,
+            rules.reached_above_landing,
             rules.keeps_speed,
         )
         self.senses = Senses(plant)
@@ -58,7 +56,7 @@ class Autopilot:
         self.health = Health(
             firmware, self.parameters, self.mission, self.stream, self.watch, boot_scale
         )
-        self.sticks = None if firmware.flight.handling is None else Sticks(firmware.flight.handling)
+        self.sticks = None if firmware.flight.sticks is None else Sticks(firmware.flight.sticks)
         self.guidance = Guidance(firmware, self.parameters, self.mission, self.sticks)
         self.navigator = Navigator(self.guidance)
         self.pilot = Pilot(firmware, self.parameters, self.navigator)

@@ -17,11 +17,9 @@ from simulator.autopilot.nav import Senses
 from simulator.autopilot.navigator import Navigator
 from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.pilot import Pilot
-from simulator.autopilot.state_table import StateTable
-from simulator.firmware.base import Firmware
-from simulator.firmware.modes import Behaviour, Condition, Mode
-from simulator.firmware.rules import AT_LAST, Rule
-from simulator.firmware.vocabulary import NAN3, Result, Say, Triple
+from simulator.autopilot.state_table import StateTable, fields_of
+from simulator.firmware.base import AFTER_DELAY, Firmware, Rule
+from simulator.firmware.values import NAN3, Behaviour, Condition, Mode, Result, StatusText, Triple
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,15 +53,15 @@ class Commander:
         self._navigator, self._pilot = navigator, pilot
         self._guidance = navigator.guidance
         self._senses, self._health = senses, health
-        self._table = StateTable(firmware.rules)
+        self._table = StateTable(firmware, CONDITIONS, ACTIONS, TEXT_VALUES)
         self.mode: Mode = firmware.modes[firmware.boot_mode]
         self._intended = self._remembered = firmware.boot_mode
         self.armed = self.failsafe = False
         self.airtime = Airtime(parameters)
         self._latched: frozenset[str] = frozenset()  # events that a reboot alone undoes
-        self.refused: dict[str, Say] = {}  # events, and "offboard", that are refused by a fault
+        self.refused: dict[str, StatusText] = {}  # by a fault: events, and "offboard"
         self.restarts = False  # a reboot was asked for and granted
-        self.texts: list[Say] = []
+        self.texts: list[StatusText] = []
         self.announcements: list[str] = []
         self._event, self._wish = "", NOTHING  # what happens now
         self._cause = ""  # of the failsafe
@@ -139,7 +137,7 @@ class Commander:
         name, compares, value = guard.partition("=")
         if compares:
             return self._parameters[name] == float(value)
-        return GUARDS[guard](self)
+        return CONDITIONS[guard](self)
 
     def _apply(self, rule: Rule) -> None:
         for action in rule.do:
@@ -147,26 +145,10 @@ class Commander:
         target = {"requested": self._wish.mode, "remembered": self._remembered}
         if rule.to != "*":
             self._enter(target.get(rule.to, rule.to), by_failsafe="failsafe" in rule.do)
-        title = self._asked.title
-        for say in (*((rule.say,) if rule.say else ()), *rule.also):
-            self.texts.append(Say(say.severity, say.text.format(mode=title, **self._figures)))
+        for text in rule.texts:
+            values = {name: TEXT_VALUES[name](self) for name in fields_of(text.text)}
+            self.texts.append(StatusText(text.severity, text.text.format(**values)))
         self.announcements += rule.send
-
-    @property
-    def _figures(self) -> dict[str, float]:
-        """What texts may name."""
-        above_home_m = self._navigator.target_height_m
-        amsl_m = self._firmware.origin[2] - self._guidance.home_ned_m[2] + above_home_m
-        battery = self._senses.truth.battery
-        return {
-            "takeoff_m": self._parameters.role("takeoff_height_m"),
-            "climb_m": self._guidance.mission.climb_m,
-            "target_m": above_home_m,
-            "target_amsl_m": amsl_m,
-            "battery_v": battery.voltage_v,
-            "used_mah": battery.used_mah,
-            "delay_s": self._parameters.role("failsafe_delay_s"),
-        }
 
     def _enter(self, name: str, *, by_failsafe: bool) -> None:
         mode = self._firmware.modes[name]
@@ -196,7 +178,7 @@ class Commander:
 
     def _fail(self) -> None:
         self.failsafe = True
-        self._cause = self._event.removesuffix(AT_LAST)
+        self._cause = self._event.removesuffix(AFTER_DELAY)
 
     def _await(self) -> None:
         """Carry the failsafe out later, so that a pilot can take over before; no later than one
@@ -204,7 +186,7 @@ class Commander:
         at_s = self._senses.time_s + self._parameters.role("failsafe_delay_s")
         if self._awaited is not None:
             at_s = self._awaited[0]
-        self._awaited = (at_s, self._event + AT_LAST)
+        self._awaited = (at_s, self._event + AFTER_DELAY)
 
     def _recover(self) -> None:
         self.failsafe = False
@@ -229,7 +211,11 @@ class Commander:
     def _restart(self) -> None:
         self.restarts = True
 
-    # -- guards ------------------------------------------------------------------------------
+    # -- conditions and values of texts --------------------------------------------------------
+
+    def _target_amsl_m(self) -> float:
+        home_amsl_m = self._firmware.origin[2] - self._guidance.home_ned_m[2]
+        return home_amsl_m + self._navigator.target_height_m
 
     def _climb_asked(self) -> bool:
         return self._wish.takeoff_ned_m[2] <= self._guidance.home_ned_m[2]
@@ -238,7 +224,7 @@ class Commander:
         return self._health.can_run(self._asked, self._senses.time_s)
 
 
-GUARDS: dict[str, Callable[[Commander], bool]] = {
+CONDITIONS: dict[str, Callable[[Commander], bool]] = {
     "armed": lambda own: own.armed,
     "landed": lambda own: own._pilot.landed,
     "waiting": lambda own: own._awaited is not None,
@@ -268,4 +254,15 @@ ACTIONS: dict[str, Callable[[Commander], None]] = {
     "level": Commander._level,
     "latch": Commander._latch,
     "restart": Commander._restart,
+}
+
+TEXT_VALUES: dict[str, Callable[[Commander], float | str]] = {
+    "mode": lambda own: own._asked.title,
+    "takeoff_m": lambda own: own._parameters.role("takeoff_height_m"),
+    "climb_m": lambda own: own._guidance.mission.climb_m,
+    "target_m": lambda own: own._navigator.target_height_m,
+    "target_amsl_m": Commander._target_amsl_m,
+    "battery_v": lambda own: own._senses.truth.battery.voltage_v,
+    "used_mah": lambda own: own._senses.truth.battery.used_mah,
+    "delay_s": lambda own: own._parameters.role("failsafe_delay_s"),
 }

@@ -14,8 +14,7 @@ from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.sticks import Sticks
 from simulator.autopilot.trajectory import Trajectory
 from simulator.firmware.base import Firmware
-from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint
-from simulator.firmware.vocabulary import Triple
+from simulator.firmware.values import AttitudeSetpoint, MotionSetpoint, Triple
 
 ORIGIN: Triple = (0.0, 0.0, 0.0)
 

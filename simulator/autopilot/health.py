@@ -10,7 +10,7 @@ from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.setpoints import SetpointStream
 from simulator.autopilot.watch import Watch
 from simulator.firmware.base import Firmware
-from simulator.firmware.modes import Behaviour, Mode
+from simulator.firmware.values import Behaviour, Mode
 
 
 class Health:

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 from simulator.autopilot.nav import Nav
 from simulator.autopilot.parameters import ParameterTable
-from simulator.firmware.flight import Landing
+from simulator.firmware.base import Landing
 
 AIRBORNE_S = 0.1
 _SMOOTHING_S = 0.2

@@ -11,9 +11,7 @@ import math
 from dataclasses import dataclass, field
 from enum import IntEnum
 
-from simulator.firmware.missions import MissionItem
-from simulator.firmware.setpoints import MotionSetpoint
-from simulator.firmware.vocabulary import NAN3, Triple
+from simulator.firmware.values import NAN3, MissionItem, MotionSetpoint, Triple
 from simulator.geodesy import GLOBAL_FRAMES, RELATIVE_FRAMES, Origin, down_m, to_metres
 
 ITEMS_MAX = 500

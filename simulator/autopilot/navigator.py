@@ -12,9 +12,14 @@ import math
 from simulator.autopilot.behaviours import BEHAVIOURS, ActiveBehaviour
 from simulator.autopilot.guidance import Guidance
 from simulator.autopilot.nav import Nav
-from simulator.firmware.modes import Behaviour
-from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint
-from simulator.firmware.vocabulary import NAN3, Quaternion, Triple
+from simulator.firmware.values import (
+    NAN3,
+    AttitudeSetpoint,
+    Behaviour,
+    MotionSetpoint,
+    Quaternion,
+    Triple,
+)
 
 
 class Navigator:

@@ -10,8 +10,7 @@ import struct
 import zlib
 from collections.abc import Mapping
 
-from simulator.firmware.base import Firmware
-from simulator.firmware.parameters import ParameterSpec, Role
+from simulator.firmware.base import Firmware, ParameterSpec, Role
 
 HASH = "_HASH_CHECK"  # a parameter that is none: what all values come to
 MAV_PARAM_TYPE_UINT32 = 5

@@ -18,9 +18,14 @@ from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.position_loop import Limits, PositionLoop
 from simulator.autopilot.takeoff import Takeoff
 from simulator.firmware.base import Firmware
-from simulator.firmware.modes import Behaviour
-from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint
-from simulator.firmware.vocabulary import NAN3, Quaternion, Triple
+from simulator.firmware.values import (
+    NAN3,
+    AttitudeSetpoint,
+    Behaviour,
+    MotionSetpoint,
+    Quaternion,
+    Triple,
+)
 from simulator.steps import LOOP_S
 from simulator.vehicle.attitude import Demand
 
@@ -226,7 +231,7 @@ class Pilot:
 
     def _detect(self, setpoint: AttitudeSetpoint | None, nav: Nav) -> None:
         was_landed = self.landed
-        if setpoint is not None and self._firmware.setpoints.decide_flight:
+        if setpoint is not None and self._firmware.setpoints.imply_flight:
             self._detector.rest()
             if self.thrust_demanded > 0.0:
                 self._detector.lift_off()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.vocabulary import Quaternion, Triple
+from simulator.firmware.values import Quaternion, Triple
 
 GRAVITY_MPS2 = 9.80665
 _LEAST_DIRECTION_Z = 0.1  # thrust is divided by the cosine of the tilt, and by no less than this

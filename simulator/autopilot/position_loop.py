@@ -19,9 +19,8 @@ from simulator.autopilot.position_law import (
     velocity_wanted,
     wrapped,
 )
-from simulator.firmware.flight import PositionGains
-from simulator.firmware.setpoints import MotionSetpoint
-from simulator.firmware.vocabulary import NAN3, Quaternion, Triple
+from simulator.firmware.base import PositionGains
+from simulator.firmware.values import NAN3, MotionSetpoint, Quaternion, Triple
 from simulator.steps import LOOP_S
 
 # The vertical integral may hold up any vehicle; m/s^2 of north, east and down

@@ -14,8 +14,7 @@ from typing import Any
 from simulator.autopilot.nav import Nav
 from simulator.autopilot.parameters import ParameterTable
 from simulator.firmware.base import Firmware
-from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint
-from simulator.firmware.vocabulary import Say
+from simulator.firmware.values import AttitudeSetpoint, MotionSetpoint, StatusText
 from simulator.geodesy import TERRAIN_FRAMES, down_m, to_metres
 
 ATTITUDE = "SET_ATTITUDE_TARGET"
@@ -42,14 +41,14 @@ class SetpointStream:
 
     def motion(
         self, message: str, values: Mapping[str, Any], nav: Nav, home_down_m: float
-    ) -> tuple[MotionSetpoint | None, Say | None]:
+    ) -> tuple[MotionSetpoint | None, StatusText | None]:
         """By the fields of LOCAL or GLOBAL, and what is said about them. They may be relative to
         the vehicle, and heights to home (NED, m)."""
         rules, frame = self.firmware.setpoints, values["coordinate_frame"]
         if message == LOCAL:
             local = rules.in_local_frame(values, nav.position_ned_m, nav.attitude)
         elif _is_place(values) and frame not in rules.global_frames:
-            return None, rules.complaint(message, frame)
+            return None, rules.rejection(message, frame)
         else:
             local = self._in_metres(values, home_down_m)
         setpoint = rules.motion(local)
@@ -57,7 +56,7 @@ class SetpointStream:
             return setpoint, None
         frame = local["coordinate_frame"]
         known = None if frame == _LOCAL_NED else frame
-        return None, rules.complaint(message, known)
+        return None, rules.rejection(message, known)
 
     def _in_metres(self, values: Mapping[str, Any], home_down_m: float) -> Mapping[str, Any]:
         """Fields of GLOBAL as those of LOCAL in MAV_FRAME 1; a position is whole or ignored."""

@@ -12,8 +12,8 @@ import math
 from dataclasses import dataclass, field
 
 from simulator.autopilot.position_law import horizontal, or_zero
-from simulator.firmware.flight import PathLimits
-from simulator.firmware.vocabulary import Triple
+from simulator.firmware.base import PathLimits
+from simulator.firmware.values import Triple
 from simulator.steps import LOOP_S
 
 _TURNING_MPS, _TURNING_COS = 0.2, 0.98  # a turn: faster than this, off the way to the target

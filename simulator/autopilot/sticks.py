@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from simulator.firmware.flight import Handling
+from simulator.firmware.base import StickFlight
 
 KEEP, GIVE_BACK = 65535, 0  # RC_CHANNELS_OVERRIDE: this channel is left alone, or given back
 OVERRIDE_S = 3.0  # RC_OVERRIDE_TIME
@@ -21,7 +21,7 @@ _DEAD_US, _DEAD_THROTTLE = 20, 0.2  # about the middle: RCx_DZ; THR_DZ
 class Sticks:
     """Channels as they are now; time is an argument, vehicle seconds."""
 
-    def __init__(self, handling: Handling) -> None:
+    def __init__(self, handling: StickFlight) -> None:
         self.handling = handling
         self._overridden: dict[int, tuple[int, float]] = {}  # channel -> pulse width, until
         self._velocity = (0.0, 0.0)  # ahead and aside, m/s, as a course of 0 has them
@@ -29,7 +29,7 @@ class Sticks:
 
     def override(self, widths_us: Sequence[int], now_s: float) -> None:
         """RC_CHANNELS_OVERRIDE, from the first channel on."""
-        for channel, width_us in enumerate(widths_us[: len(self.handling.feigned)]):
+        for channel, width_us in enumerate(widths_us[: len(self.handling.default_pulses_us)]):
             if width_us == GIVE_BACK:
                 self._overridden.pop(channel, None)
             elif width_us != KEEP:
@@ -41,7 +41,7 @@ class Sticks:
             self._overridden[channel][0]
             if now_s < self._overridden.get(channel, (0, -math.inf))[1]
             else feigned
-            for channel, feigned in enumerate(self.handling.feigned)
+            for channel, feigned in enumerate(self.handling.default_pulses_us)
         )
 
     def begin(self) -> None:

@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from simulator.autopilot.nav import Nav
 from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.smoothing import Point, Target
-from simulator.firmware.flight import PathLimits
-from simulator.firmware.setpoints import MotionSetpoint
-from simulator.firmware.vocabulary import NAN3, ReadParameter, Triple
+from simulator.firmware.base import PathLimits
+from simulator.firmware.values import NAN3, MotionSetpoint, ReadParameter, Triple
 
 _RESTS_M, _RESTS_MPS = 0.02, 0.02  # nearer and slower than that it has arrived
 _STARTS_DOWN_MPS = 0.7  # on the ground: a takeoff begins by pressing on it

@@ -12,9 +12,7 @@ from dataclasses import dataclass
 
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.commander import Wish
-from simulator.firmware.commands import ModeRequest
-from simulator.firmware.modes import Behaviour
-from simulator.firmware.vocabulary import Result, Say, Severity, Triple
+from simulator.firmware.values import Behaviour, ModeRequest, Result, Severity, StatusText, Triple
 from simulator.geodesy import down_m, to_metres
 from simulator.mavlink.codec import id_of, name_of
 from simulator.mavlink.outbox import Outbox
@@ -83,19 +81,19 @@ class Commands:
     def _request(self, request: ModeRequest, by_planner: bool) -> Result:
         autopilot = self._autopilot
         if request.mode is None:
-            if request.say is not None:
-                autopilot.commander.texts.append(request.say)
+            if request.text is not None:
+                autopilot.commander.texts.append(request.text)
             return request.refusal
         return autopilot.happen("mode", Wish(request.mode, by_planner=by_planner))
 
     def _arm_disarm(self, command: Command) -> Result | None:
         autopilot = self._autopilot
-        wish = autopilot.firmware.commands.arm_wish(command.params[0])
-        if not wish.event:
-            autopilot.commander.texts += () if wish.say is None else (wish.say,)
-            return wish.refusal
-        forced = command.params[1] == autopilot.firmware.commands.force_codes[wish.event]
-        return autopilot.happen(f"force {wish.event}" if forced else wish.event)
+        request = autopilot.firmware.commands.arm(command.params[0])
+        if not request.event:
+            autopilot.commander.texts += () if request.text is None else (request.text,)
+            return request.refusal
+        forced = command.params[1] == autopilot.firmware.commands.force_codes[request.event]
+        return autopilot.happen(f"force {request.event}" if forced else request.event)
 
     def _takeoff(self, command: Command) -> Result:
         asked_m = command.params[6]
@@ -226,7 +224,7 @@ class Commands:
         name = message_name(number)
         if 0 < interval_us < 1e6 / streams.rate_max_hz:
             return self._refuse_interval(number, streams.too_fast_text)
-        if number in streams.idle and math.isfinite(interval_us):
+        if number in streams.never_sent and math.isfinite(interval_us):
             return Result.ACCEPTED
         if name is None or not math.isfinite(interval_us):
             return self._refuse_interval(number, streams.refusal_text)
@@ -237,7 +235,7 @@ class Commands:
     def _refuse_interval(self, number: float, text: str) -> Result:
         autopilot = self._autopilot
         if text and math.isfinite(number):
-            autopilot.commander.texts.append(Say(Severity.INFO, text.format(id=int(number))))
+            autopilot.commander.texts.append(StatusText(Severity.INFO, text.format(id=int(number))))
         return autopilot.firmware.streams.refusal
 
     def _get_interval(self, command: Command) -> Result:
@@ -252,7 +250,7 @@ class Commands:
         streams = self._autopilot.firmware.streams
         if name not in self.outbox.view.builders or self.outbox.view.withheld(name):
             return streams.request_refusal
-        if name in streams.by_itself:
+        if name in streams.not_on_request:
             return streams.request_refusal
         self.outbox.send_now(name)
         return Result.ACCEPTED

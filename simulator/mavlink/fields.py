@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.setpoints import MotionSetpoint
-from simulator.firmware.vocabulary import Quaternion, Triple
+from simulator.firmware.values import MotionSetpoint, Quaternion, Triple
 
 _RANGES = {
     (bits, signed): (-(1 << bits - 1), (1 << bits - 1) - 1) if signed else (0, (1 << bits) - 1)

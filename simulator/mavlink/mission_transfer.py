@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from enum import IntEnum
 
 from simulator.autopilot.mission import ITEMS_MAX, Item, Kind, Mission
-from simulator.firmware.missions import MissionRules
-from simulator.firmware.vocabulary import Say, Severity
+from simulator.firmware.base import MissionRules
+from simulator.firmware.values import Severity, StatusText
 from simulator.mavlink.codec import Message
 from simulator.mavlink.outbox import Outbox
 from simulator.mavlink.texts import Texts
@@ -25,10 +25,10 @@ _ANY_TYPE = 255
 _KINDS = frozenset({0, 1, 2})  # MAV_MISSION_TYPE: mission, fence, rally points
 
 
-_UNEXPECTED = Say(Severity.CRITICAL, "WPM: REJ. CMD: Req. WP was unexpected")
-_BUSY = Say(Severity.CRITICAL, "WPM: IGN MISSION_COUNT: Busy")
-_TIMEOUT = Say(Severity.CRITICAL, "Operation timeout")
-_UNASKED = Say(Severity.CRITICAL, "IGN MISSION_ITEM: No transfer")
+_UNEXPECTED = StatusText(Severity.CRITICAL, "WPM: REJ. CMD: Req. WP was unexpected")
+_BUSY = StatusText(Severity.CRITICAL, "WPM: IGN MISSION_COUNT: Busy")
+_TIMEOUT = StatusText(Severity.CRITICAL, "Operation timeout")
+_UNASKED = StatusText(Severity.CRITICAL, "IGN MISSION_ITEM: No transfer")
 
 
 class Ack(IntEnum):
@@ -80,8 +80,8 @@ class MissionTransfer:
 
     @property
     def under_way(self) -> bool:
-        """Time alone may end it, or have it go on."""
-        return any(x is not None for x in (self._upload, self._download, self._unchecked))
+        """A transfer waits for its next message or its time-out."""
+        return not (self._upload is None and self._download is None and self._unchecked is None)
 
     def handle(self, message: Message, now_s: float) -> None:
         """One message of the mission protocol, addressed to us."""
@@ -215,7 +215,7 @@ class MissionTransfer:
         item = self._home() if shows_home else items[message.seq]
         places = (item.x, item.y) if whole else (item.x * 1e-7, item.y * 1e-7)
         current = int(not kind and message.seq == self.mission.current)
-        goes_on = int(kind not in self.rules.stopping)
+        goes_on = int(kind not in self.rules.without_autocontinue)
         head = (*peer, message.seq, self.rules.frame_shown(item, whole), item.command)
         name = "MISSION_ITEM_INT" if whole else "MISSION_ITEM"
         self.outbox.send(name, *head, current, goes_on, *item.params, *places, item.z, kind)

@@ -10,11 +10,8 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from simulator.autopilot.position_law import GRAVITY_MPS2
-from simulator.mavlink.fields import centi, fit, heading_cdeg, in_body, motion_fields
+from simulator.mavlink.fields import centi, fit, heading_cdeg, motion_fields
 from simulator.mavlink.view import View
-
-_NAN21 = (math.nan,) * 21
 
 
 def attitude(view: View) -> Sequence[Any]:
@@ -35,25 +32,6 @@ def local_position_ned(view: View) -> Sequence[Any]:
     return (view.time_ms, *nav.position_ned_m, *nav.velocity_ned_mps)
 
 
-def odometry(view: View) -> Sequence[Any]:
-    nav = view.autopilot.senses.look()
-    frame = 1  # MAV_FRAME_LOCAL_NED, velocities too, as PX4 sends it
-    return (
-        view.time_us,
-        frame,
-        frame,
-        *nav.position_ned_m,
-        nav.attitude,
-        *nav.velocity_ned_mps,
-        *nav.rates_frd_radps,
-        _NAN21,
-        _NAN21,
-        nav.reset_counter,
-        8,  # MAV_ESTIMATOR_TYPE_AUTOPILOT
-        0,
-    )
-
-
 def global_position_int(view: View) -> Sequence[Any]:
     nav = view.autopilot.senses.look()
     north, east, down = nav.position_ned_m
@@ -66,13 +44,6 @@ def global_position_int(view: View) -> Sequence[Any]:
         *centi(nav.velocity_ned_mps),
         heading_cdeg(nav.yaw_rad),
     )
-
-
-def altitude(view: View) -> Sequence[Any]:
-    down = view.autopilot.senses.look().position_ned_m[2]
-    amsl = view.altitude_mm(down) / 1e3
-    relative = view.autopilot.guidance.home_ned_m[2] - down
-    return (view.time_us, amsl, amsl, -down, relative, math.nan, math.nan)
 
 
 def pressure_hpa(height_m: float) -> float:
@@ -90,26 +61,6 @@ def scaled_pressure(view: View) -> Sequence[Any]:
 def vibration(view: View) -> Sequence[Any]:
     """None."""
     return (view.time_us, 0.0, 0.0, 0.0, 0, 0, 0)
-
-
-def highres_imu(view: View) -> Sequence[Any]:
-    """Specific force of the truth in body axes, rates as estimated."""
-    nav = view.autopilot.senses.look()
-    w, x, y, z, *_, down, a_north, a_east, a_down = view.autopilot.plant.motion()
-    force = in_body((w, x, y, z), (a_north, a_east, a_down - GRAVITY_MPS2))
-    height = view.autopilot.firmware.origin[2] - down
-    return (
-        view.time_us,
-        *force,
-        *nav.rates_frd_radps,
-        *(0.21, 0.0, 0.43),
-        pressure_hpa(height),
-        0.0,
-        height,
-        15.0,
-        0x1BFF,
-        0,
-    )
 
 
 def vfr_hud(view: View) -> Sequence[Any]:
@@ -159,41 +110,15 @@ def position_target_local_ned(view: View) -> Sequence[Any]:
     return (view.time_ms, 1, 0, *motion_fields(view.autopilot.pilot.motion))
 
 
-def hil_state_quaternion(view: View) -> Sequence[Any]:
-    """The truth. Latitude and longitude are in steps of 1 cm; PX4 leaves time_usec 0."""
-    truth = view.autopilot.senses.truth
-    north, east, down = truth.position_ned_m.tolist()
-    a, b, c = (fit(value / GRAVITY_MPS2 * 1e3, 16) for value in truth.acceleration_ned_mps2)
-    v_north, v_east, v_down = truth.velocity_ned_mps.tolist()
-    airspeed = fit(math.hypot(v_north, v_east) * 100, 16, signed=False)
-    return (
-        view.time_us,
-        truth.attitude.tolist(),
-        *truth.rates_frd_radps.tolist(),
-        *view.geodetic(north, east),
-        view.altitude_mm(down),
-        *centi((v_north, v_east, v_down)),
-        airspeed,
-        airspeed,
-        a,
-        b,
-        c,
-    )
-
-
 MESSAGES = (
     attitude,
     attitude_quaternion,
     local_position_ned,
-    odometry,
     global_position_int,
-    altitude,
     scaled_pressure,
     vibration,
-    highres_imu,
     vfr_hud,
     gps_raw_int,
     attitude_target,
     position_target_local_ned,
-    hil_state_quaternion,
 )

@@ -68,12 +68,15 @@ class Schedule:
         if now_us < self._next_us:
             return []
         due: list[str] = []
+        next_us = math.inf
         for name, stream in self.streams.items():
             if now_us >= stream.due_us:
                 stream.next_after(now_us)
                 if name not in view.silent and not view.withheld(name):
                     due.append(name)
-        self._next_us = min((stream.due_us for stream in self.streams.values()), default=math.inf)
+            if stream.due_us < next_us:
+                next_us = stream.due_us
+        self._next_us = next_us
         return due
 
     def set_interval(self, name: str, interval_us: float) -> bool:

@@ -141,7 +141,7 @@ class Server:
 
     def _mission(self, message: Message) -> None:
         rules = self.view.autopilot.firmware.missions
-        if rules.guides and message.name in _ITEMS and message.current == _GUIDED:
+        if rules.guided_items and message.name in _ITEMS and message.current == _GUIDED:
             self._guide(message)
             return
         self._missions.handle(message, self.view.autopilot.senses.time_us * 1e-6)

@@ -55,23 +55,12 @@ def extended_sys_state(view: View) -> Sequence[Any]:
     return (0, view.landed_state)
 
 
-def estimator_status(view: View) -> Sequence[Any]:
-    autopilot = view.autopilot
-    flags = 895 if autopilot.health.has_fix(autopilot.senses.time_s) else 1024
-    return (view.time_us, flags, 0.12, 0.03, 0.03, 0.14, 0.02, math.nan, 0.3, 0.31)
-
-
 def system_time(view: View) -> Sequence[Any]:
     return (view.epoch_us + view.time_us, view.time_ms)
 
 
 def timesync(view: View) -> Sequence[Any]:
     return (0, view.time_us * 1000)
-
-
-def ping(view: View) -> Sequence[Any]:
-    view.ping_sequence += 1
-    return (view.time_us, view.ping_sequence & 0xFFFFFFFF, 0, 0)
 
 
 def home_position(view: View) -> Sequence[Any]:
@@ -118,10 +107,8 @@ MESSAGES = (
     sys_status,
     battery_status,
     extended_sys_state,
-    estimator_status,
     system_time,
     timesync,
-    ping,
     home_position,
     gps_global_origin,
     mission_current,

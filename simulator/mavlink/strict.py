@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from simulator.autopilot.parameters import ParameterTable
-from simulator.firmware.vocabulary import Say, Severity
+from simulator.firmware.values import Severity, StatusText
 from simulator.mavlink.codec import Message
 
 AUTOPILOT = 1  # MAV_COMP_ID
@@ -31,7 +31,7 @@ class Strict:
     swallowed: Counter[str] = field(default_factory=Counter)
     _said_s: dict[str, float] = field(default_factory=dict)
 
-    def complaint(self, message: Message, now_s: float) -> Say | None:
+    def complaint(self, message: Message, now_s: float) -> StatusText | None:
         """What to say about a message, if anything."""
         judge = JUDGES.get(message.name)
         if judge is None or message.values.get("target_system", 0) not in (0, self.system):
@@ -47,7 +47,7 @@ class Strict:
         if now_s - self._said_s.get(sentence, -math.inf) < SAY_AGAIN_S:
             return None
         self._said_s[sentence] = now_s
-        return Say(Severity.WARNING, sentence)
+        return StatusText(Severity.WARNING, sentence)
 
     def _attitude(self, values: dict[str, Any]) -> str:
         mask, thrust = values["type_mask"], values["thrust"]

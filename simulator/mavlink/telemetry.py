@@ -27,5 +27,4 @@ LEAST_INTERVAL_US = {"GPS_RAW_INT": 125_000.0}  # a receiver gives eight fixes a
 
 def builders(firmware: Firmware) -> dict[str, Builder]:
     """What this firmware sends, by message."""
-    known = {name: b for name, b in BUILDERS.items() if name not in firmware.streams.unknown}
-    return {**known, **firmware.streams.own}
+    return {**BUILDERS, **firmware.streams.messages}

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field
 
-from simulator.firmware.vocabulary import Say
+from simulator.firmware.values import StatusText
 from simulator.mavlink.outbox import Outbox
 
 KEPT_US = 5_000_000
@@ -22,14 +22,14 @@ class Texts:
     outbox: Outbox
     heard: bool = False
     _ground_station_us: float = -math.inf  # last heard
-    _kept: list[tuple[int, Say]] = field(default_factory=list)
+    _kept: list[tuple[int, StatusText]] = field(default_factory=list)
     _number: int = 0
 
     def restart(self) -> None:
         """As after boot: what was said is said."""
         self._ground_station_us, self._kept, self._number = -math.inf, [], 0
 
-    def say(self, said: Say) -> None:
+    def say(self, said: StatusText) -> None:
         """Queue a text, if this link gets any."""
         firmware = self.outbox.view.autopilot.firmware
         if firmware.link.text_to_ground_stations_only and not self._ground_station_is_there:

@@ -13,9 +13,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from offboard.control.base import Controller, Decision, Situation
 from offboard.model.command import Command
 from simulator import config
-from simulator.firmware.base import Firmware
-from simulator.firmware.rules import Rule
-from simulator.firmware.vocabulary import Result, Say, Severity
+from simulator.firmware.base import Firmware, Rule
+from simulator.firmware.values import Result, Severity, StatusText
 from simulator.instance import Instance
 
 HEARTBEAT, ATTITUDE, POSITION, PARAM_VALUE = 0, 31, 32, 22
@@ -27,7 +26,8 @@ Action = Callable[[Pair], None]
 
 def refusing(event: str, text: str) -> Firmware:
     """A vehicle that refuses one thing, with its reason."""
-    rule = Rule(event, result=Result.TEMPORARILY_REJECTED, say=Say(Severity.CRITICAL, text))
+    said = (StatusText(Severity.CRITICAL, text),)
+    rule = Rule(event, result=Result.TEMPORARILY_REJECTED, texts=said)
     return replace(LEAN, rules=(rule, *LEAN.rules))
 
 

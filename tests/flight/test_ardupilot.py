@@ -12,9 +12,8 @@ from pair import Pair, make
 from offboard.flight.phases import TRACKING, ExitCode, Phase
 from simulator import config as simulated
 from simulator.firmware.ardupilot import ARDUPILOT
-from simulator.firmware.base import Firmware
-from simulator.firmware.rules import Rule
-from simulator.firmware.vocabulary import Result
+from simulator.firmware.base import Firmware, Rule
+from simulator.firmware.values import Result
 from simulator.instance import Instance
 
 SET_MODE, ARM, TAKEOFF, LAND = 176, 400, 22, 21

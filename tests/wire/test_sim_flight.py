@@ -8,8 +8,6 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from sim_bench import HOVER, LAND, LOITER, NAN, OFFBOARD, POSCTL, RTL, TAKEOFF, Bench, px4_vehicle
 
-from simulator.autopilot.commander import ACTIONS, GUARDS
-from simulator.autopilot.state_table import describe
 from simulator.firmware.px4 import PX4
 from simulator.vehicle.sensors import EstimatorName
 
@@ -307,20 +305,6 @@ def test_the_same_seed_gives_the_same_bytes() -> None:
     assert len(first) > 200_000
     assert first == second
     assert first != other
-
-
-def test_every_rule_names_modes_guards_and_actions_that_exist() -> None:
-    special = {"*", "requested", "remembered"}
-    for rule in PX4.rules:
-        assert {rule.to, rule.mode} <= set(PX4.modes) | special
-        assert set(rule.do) <= set(ACTIONS)
-        for guard in rule.when:
-            if guard.startswith("since "):
-                assert guard[6:] in {rule.event for rule in PX4.rules}
-                continue
-            name, compares, _ = guard.removeprefix("not ").partition("=")
-            assert (name in {p.name for p in PX4.parameters}) if compares else (name in GUARDS)
-    assert len(describe(PX4)) == len(PX4.rules)
 
 
 # -- going where it is told --------------------------------------------------------------------

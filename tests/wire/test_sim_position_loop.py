@@ -12,8 +12,7 @@ from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.position_law import GRAVITY_MPS2
 from simulator.autopilot.position_loop import Limits, PositionLoop
 from simulator.firmware.px4 import PX4
-from simulator.firmware.setpoints import MotionSetpoint
-from simulator.firmware.vocabulary import NAN3, Quaternion, Triple
+from simulator.firmware.values import NAN3, MotionSetpoint, Quaternion, Triple
 
 GAINS = PX4.flight.gains(ParameterTable(PX4).__getitem__)
 HOVER = Limits(hover_thrust=0.5)

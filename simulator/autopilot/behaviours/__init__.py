@@ -17,7 +17,7 @@ from simulator.autopilot.behaviours.return_ import Return
 from simulator.autopilot.behaviours.setpoint import FollowSetpoint
 from simulator.autopilot.behaviours.sticks import FlyBySticks
 from simulator.autopilot.behaviours.takeoff import Takeoff
-from simulator.firmware.modes import Behaviour
+from simulator.firmware.values import Behaviour
 
 __all__ = ["BEHAVIOURS", "ActiveBehaviour", "Control"]
 

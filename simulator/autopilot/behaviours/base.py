@@ -13,9 +13,7 @@ from typing import ClassVar
 from simulator.autopilot.guidance import Guidance
 from simulator.autopilot.nav import Nav
 from simulator.autopilot.trajectory import Leg
-from simulator.firmware.modes import Behaviour
-from simulator.firmware.setpoints import MotionSetpoint
-from simulator.firmware.vocabulary import NAN3, Triple
+from simulator.firmware.values import NAN3, Behaviour, MotionSetpoint, Triple
 
 
 class Control(Enum):

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from simulator.autopilot.behaviours.base import ActiveBehaviour
-from simulator.firmware.modes import Behaviour
+from simulator.firmware.values import Behaviour
 
 
 class Hold(ActiveBehaviour):

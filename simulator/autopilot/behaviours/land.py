@@ -7,8 +7,7 @@ import math
 from simulator.autopilot.behaviours.base import ActiveBehaviour
 from simulator.autopilot.nav import Nav
 from simulator.autopilot.parameters import ParameterTable
-from simulator.firmware.setpoints import MotionSetpoint
-from simulator.firmware.vocabulary import Triple
+from simulator.firmware.values import MotionSetpoint, Triple
 
 
 class Land(ActiveBehaviour):

@@ -6,8 +6,7 @@ from simulator.autopilot.behaviours.base import ActiveBehaviour
 from simulator.autopilot.behaviours.land import land_speed_mps, sink
 from simulator.autopilot.nav import Nav
 from simulator.autopilot.trajectory import Leg
-from simulator.firmware.setpoints import MotionSetpoint
-from simulator.firmware.vocabulary import NAN3, Triple
+from simulator.firmware.values import NAN3, MotionSetpoint, Triple
 
 
 class FlyMission(ActiveBehaviour):

@@ -8,9 +8,7 @@ from enum import Enum
 from simulator.autopilot.behaviours.base import ActiveBehaviour
 from simulator.autopilot.behaviours.land import land_speed_mps, sink
 from simulator.autopilot.nav import Nav
-from simulator.firmware.flight import Heads
-from simulator.firmware.setpoints import MotionSetpoint
-from simulator.firmware.vocabulary import NAN3, Triple
+from simulator.firmware.values import NAN3, MotionSetpoint, ReturnYaw, Triple
 
 
 class Stage(Enum):
@@ -26,7 +24,7 @@ class Return(ActiveBehaviour):
         self._stage = Stage.BEGIN
         self._place_ned_m: Triple = (0.0, 0.0, 0.0)
         self._until_s = math.inf
-        self._heads: Heads | None = None
+        self._heads: ReturnYaw | None = None
 
     @property
     def landing(self) -> bool:
@@ -42,12 +40,12 @@ class Return(ActiveBehaviour):
         self._advance(nav, time_s)
         guidance = self.guidance
         yaw_rad = math.nan
-        if self._heads is Heads.AS_HOME and self._stage is not Stage.CLIMB:
+        if self._heads is ReturnYaw.AS_AT_HOME and self._stage is not Stage.CLIMB:
             yaw_rad = guidance.home_yaw_rad
         if self._stage is Stage.LAND:
             speed_mps = land_speed_mps(nav, guidance.home_ned_m[2], guidance.parameters)
             return sink(self._place_ned_m, speed_mps, yaw_rad)
-        along = self._heads is Heads.ALONG
+        along = self._heads is ReturnYaw.ALONG_PATH
         return MotionSetpoint(self._place_ned_m, yaw_rad=yaw_rad, faces_way=along)
 
     def _begin(self, nav: Nav) -> None:
@@ -56,7 +54,7 @@ class Return(ActiveBehaviour):
         read, flight = guidance.parameters.__getitem__, guidance.firmware.flight
         distance_m = self._distance_home_m(nav)
         height_m = flight.return_height_m(distance_m, read)
-        self._heads = flight.return_heads(distance_m, read)
+        self._heads = flight.return_yaw(distance_m, read)
         self._place_ned_m = (x, y, min(z, guidance.home_ned_m[2] - height_m))
         self._go_to(Stage.CLIMB, "return begun")
 
@@ -81,7 +79,7 @@ class Return(ActiveBehaviour):
         if self._stage is Stage.WAIT and time_s >= self._until_s:
             self._go_to(Stage.LAND, "return lands")
         if self._heads is not None and self._stage.value > Stage.FLY.value:
-            self._heads = Heads.AS_HOME
+            self._heads = ReturnYaw.AS_AT_HOME
 
     def _distance_home_m(self, nav: Nav) -> float:
         home = self.guidance.home_ned_m

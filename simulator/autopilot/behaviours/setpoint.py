@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from simulator.autopilot.behaviours.base import ActiveBehaviour
 from simulator.autopilot.nav import Nav
-from simulator.firmware.setpoints import MotionSetpoint
+from simulator.firmware.values import MotionSetpoint
 
 
 class FollowSetpoint(ActiveBehaviour):

@@ -7,8 +7,7 @@ import math
 from simulator.autopilot.behaviours.base import ActiveBehaviour
 from simulator.autopilot.behaviours.land import sink
 from simulator.autopilot.nav import Nav
-from simulator.firmware.setpoints import MotionSetpoint
-from simulator.firmware.vocabulary import NAN3, Triple
+from simulator.firmware.values import NAN3, MotionSetpoint, Triple
 
 _STILL_MPS = 0.05  # a slower demand holds the place
 

@@ -6,9 +6,7 @@ import math
 
 from simulator.autopilot.behaviours.base import ActiveBehaviour
 from simulator.autopilot.nav import Nav
-from simulator.firmware.modes import Behaviour
-from simulator.firmware.setpoints import MotionSetpoint
-from simulator.firmware.vocabulary import NAN3, Triple
+from simulator.firmware.values import NAN3, Behaviour, MotionSetpoint, Triple
 
 _FLATTEST = 1000.0  # metres across per metre of climb
 

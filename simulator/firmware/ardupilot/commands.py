@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from simulator.firmware.ardupilot.modes import MODES
-from simulator.firmware.commands import ArmWish, CommandRules, ModeRequest
-from simulator.firmware.vocabulary import Result, Say, Severity
+from simulator.firmware.base import CommandRules
+from simulator.firmware.values import ArmRequest, ModeRequest, Result, warning
 
 _CUSTOM_MODE_ENABLED = 1
 # Modes that it has and does not enter here, as it enters some only under conditions
@@ -36,7 +36,7 @@ def command_mode(params: tuple[float, ...]) -> ModeRequest:
     said = f"No such mode {number}"
     if number in _NOT_ENTERED:
         said = f"Mode change to {_NOT_ENTERED[number]}"
-    return ModeRequest(known, Result.FAILED, None if known else Say(Severity.WARNING, said))
+    return ModeRequest(known, Result.FAILED, None if known else warning(said))
 
 
 def set_mode(base_mode: int, custom_mode: int) -> ModeRequest:
@@ -44,11 +44,11 @@ def set_mode(base_mode: int, custom_mode: int) -> ModeRequest:
     return command_mode((base_mode, custom_mode))
 
 
-def arm_wish(param: float) -> ArmWish:
+def arm_request(param: float) -> ArmRequest:
     """1 arms, 0 disarms, anything else is not supported."""
     if param in (0.0, 1.0):
-        return ArmWish("arm" if param else "disarm")
-    return ArmWish(refusal=Result.UNSUPPORTED)
+        return ArmRequest("arm" if param else "disarm")
+    return ArmRequest(refusal=Result.UNSUPPORTED)
 
 
 # Taken by their receivers, which change nothing that shows here, or failed without their devices
@@ -65,7 +65,7 @@ COMMANDS = CommandRules(
     mode_acked_twice=False,
     set_mode=set_mode,
     set_mode_acked_as=None,
-    arm_wish=arm_wish,
+    arm=arm_request,
     force_codes={"arm": 2989.0, "disarm": 21196.0},
     takeoff_above_home=True,
     reposition_mode="GUIDED",

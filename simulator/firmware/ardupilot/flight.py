@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.flight import FlightRules, Handling, Heads, Landing, PositionGains
-from simulator.firmware.vocabulary import ReadParameter
+from simulator.firmware.base import FlightRules, Landing, PositionGains, StickFlight
+from simulator.firmware.values import ReadParameter, ReturnYaw
 
 _RETURN_LEAST_M = 2.0  # RTL_ALT_MIN
 
@@ -38,14 +38,14 @@ def return_height_m(distance_m: float, parameter: ReadParameter) -> float:
     return min(highest_m, max(distance_m * slope, _RETURN_LEAST_M)) if slope > 0 else highest_m
 
 
-def return_heads(_: float, parameter: ReadParameter) -> Heads | None:
+def return_yaw(_: float, parameter: ReadParameter) -> ReturnYaw | None:
     """As it did, by default."""
-    return Heads.ALONG if parameter("WP_YAW_BEHAVIOR") in (1.0, 3.0) else None
+    return ReturnYaw.ALONG_PATH if parameter("WP_YAW_BEHAVIOR") in (1.0, 3.0) else None
 
 
-_HANDLING = Handling(
+_STICKS = StickFlight(
     # throttle down, mode switch and others as SITL has them
-    feigned=(1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800),
+    default_pulses_us=(1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800),
     climb_mps=2.5,  # PILOT_SPEED_UP
     turn_radps=math.radians(202.5),  # PILOT_Y_RATE
     speed_mps=12.5,  # LOIT_SPEED
@@ -69,7 +69,7 @@ FLIGHT = FlightRules(
         place_below_is_descent=True,
     ),
     descend_speed_mps=2.4,
-    handling=_HANDLING,
+    sticks=_STICKS,
     return_height_m=return_height_m,
-    return_heads=return_heads,
+    return_yaw=return_yaw,
 )

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from simulator.firmware.health import HealthRules, Sensors
-from simulator.firmware.vocabulary import ReadParameter
+from simulator.firmware.base import HealthRules, Sensors
+from simulator.firmware.values import ReadParameter
 from simulator.vehicle.battery import BatteryState
 
 # Seconds after boot at which an event of this name happens

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from simulator.firmware.link import LinkRules
-from simulator.firmware.vocabulary import ReadParameter
+from simulator.firmware.base import LinkRules
+from simulator.firmware.values import ReadParameter
 
 
 def is_ground_station(_: int, system: int, parameter: ReadParameter) -> bool:

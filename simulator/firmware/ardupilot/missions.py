@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.missions import MissionItem, MissionRules
-from simulator.firmware.vocabulary import Say, Severity
+from simulator.firmware.base import MissionRules
+from simulator.firmware.values import MissionItem, Severity, StatusText, info
 
 _UNSUPPORTED_FRAME, _UNSUPPORTED = 2, 3  # MAV_MISSION_RESULT
 _SHOWN = {5: 0, 6: 3, 11: 10}  # MAV_FRAME: without INT
@@ -14,7 +14,7 @@ _PLACES = frozenset({16, 17, 18, 19, 21, 22, 31, 82, 201})  # MAV_CMD of mission
 _BESIDE = {1: frozenset({5000, 5001, 5002, 5003, 5004}), 2: frozenset({5100})}
 
 
-def _refusal(kind: int, item: MissionItem) -> tuple[int, Say | None] | None:
+def _refusal(kind: int, item: MissionItem) -> tuple[int, StatusText | None] | None:
     if kind and item.command not in _BESIDE[kind]:
         return _UNSUPPORTED, None
     by_place = kind or item.command in _PLACES
@@ -32,16 +32,16 @@ def _frame_shown(item: MissionItem, _: bool) -> int:
 MISSIONS = MissionRules(
     strict=False,
     home_first=True,
-    guides=True,
+    guided_items=True,
     refusal=_refusal,
     unknown_kind=3,
     texts={
-        0: Say(Severity.INFO, "Flight plan received"),
-        1: Say(Severity.DEBUG, "Fence Indexed OK"),
+        0: info("Flight plan received"),
+        1: StatusText(Severity.DEBUG, "Fence Indexed OK"),
     },
     frame_shown=_frame_shown,
-    stopping=frozenset({1, 2}),
+    without_autocontinue=frozenset({1, 2}),
     turning=frozenset(),  # MAV_CMD_CONDITION_YAW would be
-    tells_above=False,
+    reached_above_landing=False,
     keeps_speed=False,
 )

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from simulator.firmware.modes import Behaviour, Condition, Mode
-from simulator.firmware.setpoints import AttitudeSetpoint
+from simulator.firmware.values import AttitudeSetpoint, Behaviour, Condition, Mode
 
 # MAV_MODE_FLAG: 1 custom mode, 8 guided, 16 stabilise, 64 manual input. "Guided" shows whether
 # the position controller runs, not the mode.

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.parameters import ParameterSpec, Role
+from simulator.firmware.base import ParameterSpec, Role
 
 
 def _real(name: str, default: float, meaning: str) -> ParameterSpec:

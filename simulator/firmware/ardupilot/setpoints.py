@@ -6,8 +6,14 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
-from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint, SetpointRules
-from simulator.firmware.vocabulary import Quaternion, ReadParameter, Triple
+from simulator.firmware.base import SetpointRules
+from simulator.firmware.values import (
+    AttitudeSetpoint,
+    MotionSetpoint,
+    Quaternion,
+    ReadParameter,
+    Triple,
+)
 
 _CENTI = 0.01
 _RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b111, 64, 128
@@ -129,7 +135,7 @@ def motion_setpoint(values: Mapping[str, Any]) -> MotionSetpoint | None:
     return MotionSetpoint(position, velocity, acceleration, yaw, yaw_rate, along)
 
 
-def motion_complaint(message: str, frame: int | None) -> None:
+def rejection_text(message: str, frame: int | None) -> None:
     """Nothing is said of a setpoint's frame."""
 
 
@@ -139,11 +145,11 @@ SETPOINTS = SetpointRules(
     in_local_frame=in_local_frame,
     home_mirrored=False,
     global_frames=frozenset({0, 3, 5, 6, 10, 11}),
-    complaint=motion_complaint,
+    rejection=rejection_text,
     mode_needs_stream=False,
     as_automatic=True,
     outlive_modes=False,
-    decide_flight=True,
+    imply_flight=True,
     spool_s=2.8,
     reaction_s=0.0,
 )

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from simulator.firmware.ardupilot.messages import MESSAGES
-from simulator.firmware.streams import Streams
-from simulator.firmware.vocabulary import Result
+from simulator.firmware.base import Streams
+from simulator.firmware.values import Result
 
 COMPANION_RATES_HZ = GROUND_RATES_HZ = {"HEARTBEAT": 1.0, "TIMESYNC": 0.1}
 
@@ -26,7 +26,7 @@ _GROUPS = {
     11: ("VFR_HUD",),
     12: ("AHRS", "SYSTEM_TIME", "WIND", "BATTERY_STATUS", "EKF_STATUS_REPORT", "VIBRATION"),
 }
-_IDLE = frozenset({
+_NEVER_SENT = frozenset({
     22, 26, 34, 35, 100, 105, 124, 127, 128, 129, 132, 133, 136, 137,
     143, 162, 165, 173, 180, 191, 192, 194, 195, 225, 226, 235, 246,
     259, 260, 262, 269, 271, 277, 280, 281, 285, 286, 295, 301, 373, 376, 9005,
@@ -34,10 +34,7 @@ _IDLE = frozenset({
 STREAMS = Streams(
     companion_rates_hz=COMPANION_RATES_HZ,
     ground_rates_hz=GROUND_RATES_HZ,
-    own=MESSAGES,
-    unknown=frozenset(
-        {"ODOMETRY", "ESTIMATOR_STATUS", "HIL_STATE_QUATERNION", "ALTITUDE", "HIGHRES_IMU", "PING"}
-    ),
+    messages=MESSAGES,
     withheld_until={
         "LOCAL_POSITION_NED": "position",
         "GPS_GLOBAL_ORIGIN": "origin",
@@ -45,8 +42,8 @@ STREAMS = Streams(
     },
     position_grid_steps=1,
     fixed=frozenset({"TIMESYNC"}),
-    by_itself=frozenset({"TIMESYNC"}),
-    idle=_IDLE,
+    not_on_request=frozenset({"TIMESYNC"}),
+    never_sent=_NEVER_SENT,
     groups={0: tuple(name for names in _GROUPS.values() for name in names), **_GROUPS},
     rate_max_hz=200.0,
     refusal=Result.DENIED,

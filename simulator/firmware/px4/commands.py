@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.commands import ArmWish, CommandRules, ModeRequest
-from simulator.firmware.vocabulary import Result, Say, Severity
+from simulator.firmware.base import CommandRules
+from simulator.firmware.values import ArmRequest, ModeRequest, Result, critical
 
 # PX4_CUSTOM_MAIN_MODE, PX4_CUSTOM_SUB_MODE_AUTO
 _MAIN = {1: "MANUAL", 2: "ALTCTL", 3: "POSCTL", 5: "ACRO", 6: "OFFBOARD", 7: "STABILIZED"}
@@ -19,7 +19,7 @@ _AUTO_SUB = {
     9: "AUTO.PRECLAND",
 }
 _CUSTOM_MODE_ENABLED = 1
-_NO_AUTO_MODE = Say(Severity.CRITICAL, "Unsupported auto mode")
+_NO_AUTO_MODE = critical("Unsupported auto mode")
 
 
 def command_mode(params: tuple[float, ...]) -> ModeRequest:
@@ -42,13 +42,13 @@ def set_mode(base_mode: int, custom_mode: int) -> ModeRequest:
     return command_mode((base_mode, custom_mode >> 16 & 0xFF, custom_mode >> 24))
 
 
-def arm_wish(param: float) -> ArmWish:
+def arm_request(param: float) -> ArmRequest:
     """Rounded; what is not a number disarms."""
     wish = math.floor(param + 0.5) if math.isfinite(param) else 0
     if wish in (0, 1):
-        return ArmWish("arm" if wish else "disarm")
+        return ArmRequest("arm" if wish else "disarm")
     text = f"Unsupported ARM_DISARM param: {param:.3f}"
-    return ArmWish(say=Say(Severity.CRITICAL, text))
+    return ArmRequest(text=critical(text))
 
 
 # Taken by its receivers, which change nothing that shows here, or do not answer
@@ -69,7 +69,7 @@ COMMANDS = CommandRules(
     mode_acked_twice=True,
     set_mode=set_mode,
     set_mode_acked_as=176,
-    arm_wish=arm_wish,
+    arm=arm_request,
     force_codes={"arm": 21196.0, "disarm": 21196.0},
     takeoff_above_home=False,
     reposition_mode="AUTO.LOITER",

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.flight import FlightRules, Heads, Landing, PathLimits, PositionGains
-from simulator.firmware.vocabulary import ReadParameter
+from simulator.firmware.base import FlightRules, Landing, PathLimits, PositionGains
+from simulator.firmware.values import ReadParameter, ReturnYaw
 
 
 def gains(parameter: ReadParameter) -> PositionGains:
@@ -64,9 +64,9 @@ def return_height_m(distance_m: float, parameter: ReadParameter) -> float:
     return min(max(height_m, 2.0 * accepted_m), highest_m)
 
 
-def return_heads(distance_m: float, parameter: ReadParameter) -> Heads:
+def return_yaw(distance_m: float, parameter: ReadParameter) -> ReturnYaw:
     """Far away the way home, near it as it stood there."""
-    return Heads.AS_HOME if distance_m < parameter("RTL_MIN_DIST") else Heads.ALONG
+    return ReturnYaw.AS_AT_HOME if distance_m < parameter("RTL_MIN_DIST") else ReturnYaw.ALONG_PATH
 
 
 FLIGHT = FlightRules(
@@ -83,7 +83,7 @@ FLIGHT = FlightRules(
         place_below_is_descent=False,
     ),
     descend_speed_mps=0.6,
-    handling=None,
+    sticks=None,
     return_height_m=return_height_m,
-    return_heads=return_heads,
+    return_yaw=return_yaw,
 )

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.missions import MissionItem, MissionRules
-from simulator.firmware.vocabulary import Say, Severity
+from simulator.firmware.base import MissionRules
+from simulator.firmware.values import MissionItem, StatusText, critical
 
 _ERROR, _UNSUPPORTED_FRAME, _UNSUPPORTED = 1, 2, 3  # MAV_MISSION_RESULT
 _COMMAND_FRAME = 2  # MAV_FRAME_MISSION: no place
 _IN_WHOLE_DEGREES = {0: 5, 3: 6}  # MAV_FRAME: GLOBAL and GLOBAL_RELATIVE_ALT and their twins
 _IN_DEGREES = {whole: frame for frame, whole in _IN_WHOLE_DEGREES.items()}
-_INVALID = Say(Severity.CRITICAL, "IGN MISSION_ITEM: Invalid item")
+_INVALID = critical("IGN MISSION_ITEM: Invalid item")
 
 _FENCE, _RALLY = frozenset({5000, 5001, 5002, 5003, 5004}), frozenset({5100})
 _POLYGONS = frozenset({5001, 5002})
@@ -23,7 +23,7 @@ _ACTS = frozenset({
 })  # fmt: skip
 
 
-def _refusal(kind: int, item: MissionItem) -> tuple[int, Say | None] | None:
+def _refusal(kind: int, item: MissionItem) -> tuple[int, StatusText | None] | None:
     by_place = item.frame in _IN_WHOLE_DEGREES or item.frame in _IN_DEGREES
     if not by_place and item.frame != _COMMAND_FRAME:
         return _UNSUPPORTED_FRAME, _INVALID
@@ -46,13 +46,13 @@ def _frame_shown(item: MissionItem, whole: bool) -> int:
 MISSIONS = MissionRules(
     strict=True,
     home_first=False,
-    guides=False,
+    guided_items=False,
     refusal=_refusal,
     unknown_kind=4,
     texts={},
     frame_shown=_frame_shown,
-    stopping=frozenset({1}),
+    without_autocontinue=frozenset({1}),
     turning=frozenset({16, 17, 19, 21}),
-    tells_above=True,
+    reached_above_landing=True,
     keeps_speed=True,
 )

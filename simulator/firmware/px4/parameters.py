@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from simulator.firmware.parameters import ParameterSpec, Role
+from simulator.firmware.base import ParameterSpec, Role
 
 
 def _real(name: str, default: float, low: float, high: float, meaning: str) -> ParameterSpec:

@@ -9,8 +9,16 @@ from typing import Any
 import numpy as np
 
 from offboard.model.frames import rotation_from_quaternion
-from simulator.firmware.setpoints import AttitudeSetpoint, MotionSetpoint, SetpointRules
-from simulator.firmware.vocabulary import Quaternion, ReadParameter, Say, Severity, Triple
+from simulator.firmware.base import SetpointRules
+from simulator.firmware.values import (
+    AttitudeSetpoint,
+    MotionSetpoint,
+    Quaternion,
+    ReadParameter,
+    StatusText,
+    Triple,
+    critical,
+)
 
 _RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b011, 64, 128
 
@@ -75,13 +83,13 @@ def in_local_frame(values: Mapping[str, Any], _: Triple, attitude: Quaternion) -
     }
 
 
-def motion_complaint(message: str, frame: int | None) -> Say:
+def rejection_text(message: str, frame: int | None) -> StatusText:
     """About a setpoint in an unknown frame; None: one that demands nothing."""
     if frame is None:
-        return Say(Severity.CRITICAL, f"{message} invalid")
+        return critical(f"{message} invalid")
     if message.endswith("GLOBAL_INT"):
-        return Say(Severity.CRITICAL, f"{message} invalid coordinate frame {frame}")
-    return Say(Severity.CRITICAL, f"{message} coordinate frame {frame} unsupported")
+        return critical(f"{message} invalid coordinate frame {frame}")
+    return critical(f"{message} coordinate frame {frame} unsupported")
 
 
 def motion_setpoint(values: Mapping[str, Any]) -> MotionSetpoint | None:
@@ -118,11 +126,11 @@ SETPOINTS = SetpointRules(
     in_local_frame=in_local_frame,
     home_mirrored=True,
     global_frames=frozenset({5, 6, 11}),
-    complaint=motion_complaint,
+    rejection=rejection_text,
     mode_needs_stream=True,
     as_automatic=False,
     outlive_modes=True,
-    decide_flight=False,
+    imply_flight=False,
     spool_s=0.0,
     reaction_s=0.036,
 )

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.streams import Streams
-from simulator.firmware.vocabulary import Result
+from simulator.firmware.base import Streams
+from simulator.firmware.px4.messages import MESSAGES
+from simulator.firmware.values import Result
 
 COMPANION_RATES_HZ = {
     "HEARTBEAT": 1.0,
@@ -55,7 +56,7 @@ GROUND_RATES_HZ = {
 }
 
 _BY_ITSELF = frozenset({"MISSION_CURRENT", "MISSION_ITEM_REACHED"})
-_IDLE = frozenset({
+_NEVER_SENT = frozenset({
     8, 25, 26, 36, 62, 65, 69, 76, 87, 93, 106, 112, 116, 124, 129, 132, 137, 143, 149,
     192, 225, 231, 233, 235, 246, 250, 251, 253, 254, 261, 263, 264, 265, 280, 281, 283,
     284, 285, 286, 290, 291, 300, 330, 339, 350, 360, 361, 371, 372, 375, 380, 395, 397, 435,
@@ -64,13 +65,12 @@ _IDLE = frozenset({
 STREAMS = Streams(
     companion_rates_hz=COMPANION_RATES_HZ,
     ground_rates_hz=GROUND_RATES_HZ,
-    own={},
-    unknown=frozenset(),
+    messages=MESSAGES,
     withheld_until={},
     position_grid_steps=2,
     fixed=_BY_ITSELF | {"HEARTBEAT"},
-    by_itself=_BY_ITSELF,
-    idle=_IDLE,
+    not_on_request=_BY_ITSELF,
+    never_sent=_NEVER_SENT,
     groups={},
     rate_max_hz=math.inf,
     refusal=Result.FAILED,

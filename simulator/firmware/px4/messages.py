@@ -1,0 +1,99 @@
+"""Messages that PX4 sends and ArduPilot does not, as field values in the order of the XML."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from simulator.autopilot.position_law import GRAVITY_MPS2
+from simulator.mavlink.fields import centi, fit, in_body
+from simulator.mavlink.motion_messages import pressure_hpa
+from simulator.mavlink.view import View
+
+_NAN21 = (math.nan,) * 21
+
+
+def odometry(view: View) -> Sequence[Any]:
+    nav = view.autopilot.senses.look()
+    frame = 1  # MAV_FRAME_LOCAL_NED, velocities too, as PX4 sends it
+    return (
+        view.time_us,
+        frame,
+        frame,
+        *nav.position_ned_m,
+        nav.attitude,
+        *nav.velocity_ned_mps,
+        *nav.rates_frd_radps,
+        _NAN21,
+        _NAN21,
+        nav.reset_counter,
+        8,  # MAV_ESTIMATOR_TYPE_AUTOPILOT
+        0,
+    )
+
+
+def altitude(view: View) -> Sequence[Any]:
+    down = view.autopilot.senses.look().position_ned_m[2]
+    amsl = view.altitude_mm(down) / 1e3
+    relative = view.autopilot.guidance.home_ned_m[2] - down
+    return (view.time_us, amsl, amsl, -down, relative, math.nan, math.nan)
+
+
+def highres_imu(view: View) -> Sequence[Any]:
+    """Specific force of the truth in body axes, rates as estimated."""
+    nav = view.autopilot.senses.look()
+    w, x, y, z, *_, down, a_north, a_east, a_down = view.autopilot.plant.motion()
+    force = in_body((w, x, y, z), (a_north, a_east, a_down - GRAVITY_MPS2))
+    height = view.autopilot.firmware.origin[2] - down
+    return (
+        view.time_us,
+        *force,
+        *nav.rates_frd_radps,
+        *(0.21, 0.0, 0.43),
+        pressure_hpa(height),
+        0.0,
+        height,
+        15.0,
+        0x1BFF,
+        0,
+    )
+
+
+def hil_state_quaternion(view: View) -> Sequence[Any]:
+    """The truth. Latitude and longitude are in steps of 1 cm; PX4 leaves time_usec 0."""
+    truth = view.autopilot.senses.truth
+    north, east, down = truth.position_ned_m.tolist()
+    a, b, c = (fit(value / GRAVITY_MPS2 * 1e3, 16) for value in truth.acceleration_ned_mps2)
+    v_north, v_east, v_down = truth.velocity_ned_mps.tolist()
+    airspeed = fit(math.hypot(v_north, v_east) * 100, 16, signed=False)
+    return (
+        view.time_us,
+        truth.attitude.tolist(),
+        *truth.rates_frd_radps.tolist(),
+        *view.geodetic(north, east),
+        view.altitude_mm(down),
+        *centi((v_north, v_east, v_down)),
+        airspeed,
+        airspeed,
+        a,
+        b,
+        c,
+    )
+
+
+def estimator_status(view: View) -> Sequence[Any]:
+    autopilot = view.autopilot
+    flags = 895 if autopilot.health.has_fix(autopilot.senses.time_s) else 1024
+    return (view.time_us, flags, 0.12, 0.03, 0.03, 0.14, 0.02, math.nan, 0.3, 0.31)
+
+
+def ping(view: View) -> Sequence[Any]:
+    view.ping_sequence += 1
+    return (view.time_us, view.ping_sequence & 0xFFFFFFFF, 0, 0)
+
+
+MESSAGES: Mapping[str, Callable[[View], Sequence[Any]]] = {
+    builder.__name__.upper(): builder
+    for builder in (odometry, altitude, highres_imu, hil_state_quaternion, estimator_status, ping)
+}

@@ -1,0 +1,161 @@
+"""Values that firmware, autopilot and link exchange: results, texts, setpoints, modes, items.
+
+Knows no firmware and no message builder.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum, IntEnum
+
+Triple = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
+ReadParameter = Callable[[str], float]
+NAN3: Triple = (math.nan, math.nan, math.nan)
+
+
+class Result(IntEnum):
+    """MAV_RESULT."""
+
+    ACCEPTED = 0
+    TEMPORARILY_REJECTED = 1
+    DENIED = 2
+    UNSUPPORTED = 3
+    FAILED = 4
+    CANCELLED = 6
+
+
+class Severity(IntEnum):
+    """MAV_SEVERITY, those in use."""
+
+    EMERGENCY = 0
+    CRITICAL = 2
+    WARNING = 4
+    INFO = 6
+    DEBUG = 7
+
+
+@dataclass(frozen=True, slots=True)
+class StatusText:
+    """A STATUSTEXT."""
+
+    severity: Severity
+    text: str
+
+
+def info(text: str) -> StatusText:
+    return StatusText(Severity.INFO, text)
+
+
+def warning(text: str) -> StatusText:
+    return StatusText(Severity.WARNING, text)
+
+
+def critical(text: str) -> StatusText:
+    return StatusText(Severity.CRITICAL, text)
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeSetpoint:
+    """SET_ATTITUDE_TARGET as the firmware reads it; None: keep what was demanded before."""
+
+    attitude: Quaternion | None
+    rates_frd_radps: Triple | None
+    thrust: float  # 0 .. 1
+    climb_mps: float | None = None  # not None: the autopilot's vertical loop makes the thrust
+    event: str = ""  # reported when the setpoint is taken: a value that should have been refused
+
+
+@dataclass(frozen=True, slots=True)
+class MotionSetpoint:
+    """Position, velocity, acceleration (NED, SI), yaw (rad), yaw rate; NaN where not demanded."""
+
+    position_ned_m: Triple = NAN3
+    velocity_ned_mps: Triple = NAN3
+    acceleration_ned_mps2: Triple = NAN3
+    yaw_rad: float = math.nan
+    yaw_rate_radps: float = math.nan
+    faces_way: bool = False  # without yaw and yaw rate: face the direction of flight
+    turn_radps: float = math.inf  # yaw rate limit
+
+
+class Behaviour(Enum):
+    """What the vehicle does in a mode; `simulator.autopilot` flies it."""
+
+    HOLD = "holds position"
+    TAKEOFF = "climbs to the takeoff height"
+    LAND = "descends where it is and lands"
+    RETURN = "flies home and lands"
+    MISSION = "flies the mission"
+    DESCEND = "descends slowly: a manual mode without stick input"
+    LEVEL = "level attitude, least throttle: a manual mode with sticks down"
+    COAST = "keeps the last demand: a manual mode without stick input"
+    SETPOINT = "obeys setpoints"
+
+
+@dataclass(frozen=True, slots=True)
+class Mode:
+    """One flight mode."""
+
+    name: str
+    title: str  # in texts
+    custom_mode: int
+    base_mode: int  # MAV_MODE_FLAG without the armed bit
+    behaviour: Behaviour
+    arms: bool = True  # the vehicle may be armed in it
+    remembered: bool = True  # comes back after an automatic disarm
+    needs_sticks: bool = False
+    needs_position: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Condition:
+    """State that HEARTBEAT shows."""
+
+    mode: Mode
+    reached: frozenset[str]  # boot events so far
+    armed: bool
+    landed: bool
+    healthy: bool
+    failsafe: bool
+    faulty: bool
+    setpoint: AttitudeSetpoint | MotionSetpoint | None  # in force
+
+
+@dataclass(frozen=True, slots=True)
+class ModeRequest:
+    """Mode that a command asks for by name, or the result to refuse it with."""
+
+    mode: str | None
+    refusal: Result = Result.DENIED
+    text: StatusText | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class ArmRequest:
+    """Event that an arm or disarm command asks for, or the result to refuse it with."""
+
+    event: str = ""
+    refusal: Result | None = None  # None: no acknowledgement
+    text: StatusText | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class MissionItem:
+    """One item as it was uploaded: x and y in 1e-7 deg, z in m, of `frame` (MAV_FRAME)."""
+
+    frame: int
+    command: int  # MAV_CMD
+    params: tuple[float, float, float, float]
+    x: int
+    y: int
+    z: float
+
+
+class ReturnYaw(Enum):
+    """Yaw on the way home."""
+
+    ALONG_PATH = "in the direction of flight"
+    AS_AT_HOME = "as at home when it was set"

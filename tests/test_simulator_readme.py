@@ -1,0 +1,50 @@
+"""The state tables in simulator/README.md are those of the code, and its paths exist.
+
+`python tests/test_simulator_readme.py` writes the tables.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import pytest
+
+from simulator.autopilot.state_table import describe
+from simulator.firmware.base import Firmware
+from simulator.firmware.catalogue import FIRMWARES
+
+ROOT = Path(__file__).parents[1]
+README = ROOT / "simulator" / "README.md"
+HEAD = ("event", "in mode", "if", "next mode", "answer and texts")
+
+
+def table(firmware: Firmware) -> str:
+    """The state table of one firmware in Markdown."""
+    rows = (HEAD, ("---",) * len(HEAD), *describe(firmware))
+    return "\n".join("| " + " | ".join(row) + " |" for row in rows)
+
+
+def with_tables(text: str) -> str:
+    """The same page with the tables of the code between its markers."""
+    for name, firmware in FIRMWARES.items():
+        begin, end = f"<!-- {name}:begin -->\n", f"<!-- {name}:end -->"
+        before, _, rest = text.partition(begin)
+        _, _, after = rest.partition(end)
+        text = f"{before}{begin}{table(firmware)}\n{end}{after}"
+    return text
+
+
+@pytest.mark.parametrize("firmware", FIRMWARES.values(), ids=FIRMWARES)
+def test_the_state_table_is_the_one_in_the_code(firmware: Firmware) -> None:
+    assert table(firmware) in README.read_text(), "run: python tests/test_simulator_readme.py"
+
+
+def test_every_file_that_is_named_exists() -> None:
+    named = re.findall(r"`((?:simulator|tests|config)/[\w./-]*)`", README.read_text())
+    assert named
+    assert [path for path in named if not (ROOT / path).exists()] == []
+
+
+if __name__ == "__main__":
+    README.write_text(with_tables(README.read_text()))
