@@ -96,5 +96,6 @@ def test_top_level_holds_only_what_the_layout_names() -> None:
     assert {name for name in top - allowed if not name.startswith(".")} <= {
         "LICENSE",
         "CHANGELOG.md",
+        "CONTRIBUTING.md",
         "hatch_build.py",
     }

@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
+import json
 import re
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 SCRIPTS = Path(sys.executable).parent
+LINES_MAX = 180
+
+
+def _examples() -> dict[str, list[str]]:
+    """The Python blocks of every README that has some."""
+    rooms = (ROOT / "offboard", ROOT / "simulator", ROOT / "config")
+    paths = [path for room in rooms for path in room.rglob("README.md")]
+    found = {
+        str(path.relative_to(ROOT)): re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)
+        for path in (ROOT / "README.md", *sorted(paths))
+    }
+    return {name: blocks for name, blocks in found.items() if blocks}
 
 
 def _commands() -> list[str]:
@@ -20,10 +34,23 @@ def _commands() -> list[str]:
     return [line for block in blocks for line in block.strip().splitlines()]
 
 
+def test_the_readme_is_short() -> None:
+    assert len(README.splitlines()) <= LINES_MAX
+
+
 def test_ci_runs_exactly_the_test_command() -> None:
     command = _commands()[1]
     assert command.endswith("pytest -n auto")
     assert (ROOT / ".ci" / "run").read_text().splitlines()[-1] == command
+
+
+def test_the_workflow_leaves_out_only_tests_that_exist() -> None:
+    workflow = (ROOT / ".github" / "workflows" / "ci.yml").read_text()
+    left_out = re.findall(r"--(?:ignore|deselect)=([\w/.]+)(?:::(\w+))?", workflow)
+    assert left_out
+    for file, test in left_out:
+        wanted = f"def {test}(" if test else "def test_"
+        assert wanted in (ROOT / file).read_text(), f"{file}::{test}"
 
 
 def test_first_command_flies_and_scores(tmp_path: Path) -> None:
@@ -41,11 +68,33 @@ def test_first_command_flies_and_scores(tmp_path: Path) -> None:
     assert "rmse_position_m" in done.stdout
     (flight,) = (tmp_path / "flights").iterdir()
     assert {path.name for path in flight.iterdir()} >= {"flight.tlog", "flight.yaml", "score.json"}
+    assert json.loads((flight / "score.json").read_text())["rmse_position_m"] < 0.05
+    _compare_with_picture(flight)
 
 
-def test_its_own_tests_pass(tmp_path: Path) -> None:
-    for number, block in enumerate(re.findall(r"```python\n(.*?)```", README, re.DOTALL)):
+def _compare_with_picture(flight: Path) -> None:
+    """The README's picture shows the path of this flight, to within a pixel (1 cm)."""
+    script = ROOT / ".github" / "flight_picture.py"
+    drawn = subprocess.run(
+        (sys.executable, script, flight), capture_output=True, text=True, check=True, timeout=60
+    ).stdout
+    shown = (ROOT / ".github" / "flight.svg").read_text()
+    assert _path(drawn).shape[0] > 200
+    np.testing.assert_allclose(_path(drawn), _path(shown), atol=1.0)
+
+
+def _path(picture: str) -> np.ndarray:
+    """Pixels of the first flight's path, (N, 2)."""
+    (points,) = re.findall(r'id="flight-1" points="([^"]+)"', picture)
+    return np.array([pair.split(",") for pair in points.split()], dtype=float)
+
+
+@pytest.mark.parametrize("readme", _examples())
+def test_python_examples_run(readme: str, tmp_path: Path) -> None:
+    blocks = _examples()[readme]
+    for number, block in enumerate(blocks):
         (tmp_path / f"test_{number}.py").write_text(block)
+    tests = sum(len(re.findall(r"^def test_", block, re.MULTILINE)) for block in blocks)
     done = subprocess.run(
         (sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", "--rootdir", "."),
         cwd=tmp_path,
@@ -53,7 +102,8 @@ def test_its_own_tests_pass(tmp_path: Path) -> None:
         text=True,
         timeout=170,
     )
-    assert "3 passed" in done.stdout, done.stdout + done.stderr
+    expected = f"{tests} passed" if tests else "no tests ran"
+    assert expected in done.stdout, f"{readme}: {done.stdout}{done.stderr}"
 
 
 def _subcommands() -> list[str]:
