@@ -150,16 +150,16 @@ def simulate(
 
     from offboard.model.kernel import Entry
     from simulator.instance import VIRTUAL_EPOCH_US, Instance
-    from simulator.run import Berth, Runner, rehearse
+    from simulator.run import Endpoint, Runner, warm_up
 
     if not Entry.all_compiled():
         _tell("compiling the flight dynamics, once (some seconds)")
     Entry.compile_all()
-    rehearse(Instance(personality, flyer, flown.conditions, seed, lockstep=True))
+    warm_up(Instance(personality, flyer, flown.conditions, seed, lockstep=True))
 
     epoch_us = VIRTUAL_EPOCH_US if lockstep else unix_us()
-    berths = [
-        Berth(
+    endpoints = [
+        Endpoint(
             Instance(
                 personality,
                 flyer,
@@ -178,10 +178,10 @@ def simulate(
         )
         for number, companion, ground in zip(numbers, companions, grounds, strict=True)
     ]
-    for berth in berths:
+    for endpoint in endpoints:
         for name, value in parameters.items():
-            berth.instance.autopilot.parameters.set(name, value)
-    _tell_if_lifted(berths[0].instance, flyer.hover_thrust)
+            endpoint.instance.autopilot.parameters.set(name, value)
+    _tell_if_lifted(endpoints[0].instance, flyer.hover_thrust)
     purpose = "waiting at" if connect.startswith("udpin:") else "sending to"
     for number in numbers:
         place = shifted(connect, number - instance).partition(":")[2]
@@ -191,14 +191,14 @@ def simulate(
             flush=True,
         )
     stopping.running = True
-    runner = Runner(berths, stopping=stopping, tell=_tell, duration_s=duration)
+    runner = Runner(endpoints, stopping=stopping, report=_tell, duration_s=duration)
     outcome = runner.lockstep(patience) if lockstep else runner.real_time(speed or 1.0)
     if outcome.sentence:
         _tell(outcome.sentence)
     if instances > 1:
         print(f"{instances} vehicles: {runner.punctuality}", flush=True)
-    for berth in berths:
-        for sentence, count in berth.instance.swallowed.items():
+    for endpoint in endpoints:
+        for sentence, count in endpoint.instance.complaints.items():
             print(f"{count} x {sentence}", flush=True)
     raise typer.Exit(outcome.code)
 

@@ -19,7 +19,7 @@ from simulator.mavlink.codec import id_of
 
 def _known(name: str) -> str:
     if id_of(name) is None:
-        raise ValueError(f"{name[:40]!r} is no MAVLink message")
+        raise ValueError(f"{name[:40]!r} is not a MAVLink message")
     return name
 
 
@@ -27,7 +27,7 @@ MessageName = Annotated[str, AfterValidator(_known)]
 
 
 class Moment(StrEnum):
-    """What a fault's time counts from; each counts from its first occurrence."""
+    """Event from which the time of a fault counts: its first occurrence."""
 
     BOOT = "boot"
     ARMED = "armed"
@@ -37,7 +37,7 @@ class Moment(StrEnum):
 
 
 class Direction(StrEnum):
-    """Of a link, seen from the vehicle: telemetry goes down, commands go up."""
+    """Direction of a link seen from the vehicle: telemetry is down, commands are up."""
 
     DOWN = "down"
     UP = "up"
@@ -45,7 +45,7 @@ class Direction(StrEnum):
 
 
 class Refusable(StrEnum):
-    """What an autopilot may be made to refuse."""
+    """Requests that a fault can make the autopilot refuse."""
 
     ARM = "arm"
     OFFBOARD = "offboard"
@@ -61,9 +61,9 @@ class Timed(Parameters):
 
 
 class LinkFault(Timed, Impairment):
-    """A bad companion link; each direction by itself, so `both` has twice the delay there and back.
+    """A bad companion link; each direction by itself, so `both` doubles the round trip.
 
-    In lockstep the question for the time, which is the simulation's clock, is exempt.
+    It does not apply to the TIMESYNC exchange of lockstep, which is the simulation's clock.
     """
 
     fault: Literal["link"]
@@ -71,28 +71,28 @@ class LinkFault(Timed, Impairment):
 
 
 class EstimatorJump(Timed):
-    """The estimate of position jumps; the reset counter says so."""
+    """The position estimate jumps, and its reset counter increases."""
 
     fault: Literal["estimator_jump"]
     offset_ned_m: Triple
 
 
 class GpsLoss(Timed):
-    """No fix; the estimate drifts to the north-east until the fix is back, then jumps back."""
+    """No GPS fix: the position estimate drifts to the north-east, and jumps back with the fix."""
 
     fault: Literal["gps_loss"]
     drift_mps: float = Field(default=0.0, ge=0, le=10)
 
 
 class SilentMessage(Timed):
-    """A message that is no longer sent by itself, on any link."""
+    """A message that is no longer sent periodically, on any link."""
 
     fault: Literal["silent_message"]
     message: MessageName
 
 
 class StuckMessage(Timed):
-    """A message that repeats its content; with `stamp_runs` its time stamp goes on."""
+    """A message that repeats its content; with `stamp_runs` its time stamp increases."""
 
     fault: Literal["stuck_message"]
     message: MessageName
@@ -100,49 +100,49 @@ class StuckMessage(Timed):
 
 
 class WeakMotor(Timed):
-    """One of four motors gives `motor_scale` of its thrust; the mixer keeps the torques."""
+    """One of four motors has `motor_scale` of its thrust; the mixer keeps the torques."""
 
     fault: Literal["weak_motor"]
     motor_scale: float = Field(ge=0, le=1)
 
 
 class ThrustChange(Timed):
-    """All thrust multiplied."""
+    """Thrust of all motors multiplied by `thrust_scale`."""
 
     fault: Literal["thrust_change"]
     thrust_scale: float = Field(ge=0.1, le=3)
 
 
 class MassChange(Timed):
-    """A load picked up or dropped: the mass multiplied."""
+    """A load picked up or dropped: mass multiplied by `mass_scale`."""
 
     fault: Literal["mass_change"]
     mass_scale: float = Field(ge=0.2, le=5)
 
 
 class BatteryDrop(Timed):
-    """The battery has only this share left, for good."""
+    """The charge of the battery drops to `remaining` of its capacity, permanently."""
 
     fault: Literal["battery_drop"]
     remaining: float = Field(ge=0, le=1)
 
 
 class Reboot(Timed):
-    """The autopilot restarts: motors off, silence for `for_s`, time from zero, disarmed."""
+    """The autopilot restarts, disarmed, with its time from zero, after `for_s` of silence."""
 
     fault: Literal["reboot"]
     for_s: float = Field(default=2.0, gt=0, le=60)
 
 
 class ClockJump(Timed):
-    """Every time stamp jumps by this much."""
+    """All time stamps of the vehicle jump by `jump_s`."""
 
     fault: Literal["clock_jump"]
     jump_s: float = Field(ge=-1e4, le=1e4)
 
 
 class Refusal(Timed):
-    """The autopilot refuses, with a text."""
+    """The autopilot refuses a request, with a text."""
 
     fault: Literal["refusal"]
     of: Refusable

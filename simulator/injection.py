@@ -1,7 +1,7 @@
-"""Faults at work: begins and ends each one of a scenario at its time, on one vehicle.
+"""Fault injection: begins and ends each fault of a scenario at its time, on one vehicle.
 
-What a fault *is* lies in `simulator.faults`; what a bad link does, in `simulator.link.impairment`.
-This module knows the whole vehicle, and nothing of the vehicle knows it.
+What a fault is, is in `simulator.faults`; link faults are in `simulator.link.impairment`. This
+module knows the whole vehicle; no other module but `simulator.instance` knows it.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from simulator import faults
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.commander import Wish
 from simulator.faults import Direction, Fault, Moment, Refusable
-from simulator.firmware.values import Behaviour, Severity, StatusText
+from simulator.firmware.values import Behaviour, critical
 from simulator.link.impairment import Channel, Path
 from simulator.mavlink.view import Stuck, View
 from simulator.steps import STEP_S
@@ -33,7 +33,7 @@ _REFUSED_TITLES = {
 
 
 class Vehicle(Protocol):
-    """What faults take hold of."""
+    """What faults act on."""
 
     autopilot: Autopilot
     view: View
@@ -43,19 +43,19 @@ class Vehicle(Protocol):
 
 @dataclass(slots=True)
 class Running:
-    """One fault of the scenario, and where it stands."""
+    """One fault of the scenario and its progress."""
 
     fault: Any
     channels: list[Channel]
-    begins_s: float | None = None  # None: its moment has not come
+    begins_s: float | None = None  # None: the moment it counts from has not come
     begun: bool = False
     over: bool = False
-    memory: Any = None  # what its end needs to know
+    memory: Any = None  # what its end has to undo
 
 
 @dataclass(slots=True)
 class Injection:
-    """All faults of one flight. `down` and `up` are the companion link's directions."""
+    """All faults of one flight. `down` and `up`: directions of the companion link."""
 
     down: Path
     up: Path
@@ -64,7 +64,7 @@ class Injection:
     _flown: bool = False
 
     def step(self, now_s: float, vehicle: Vehicle) -> None:
-        """Begin and end what is due at `now_s`, seconds since the start (no reboot resets it)."""
+        """Begin and end the faults due at `now_s`, seconds since the start."""
         self._note_moments(now_s, vehicle.autopilot)
         for running in self._waiting:
             self._advance(running, now_s + 1e-6, vehicle)
@@ -107,20 +107,20 @@ class Injection:
 
 
 def prepare(scenario: Sequence[Fault], seed: int) -> Injection | None:
-    """Faults that have not begun; None when the scenario has none."""
+    """Faults of one flight, none begun; None when the scenario has none."""
     if not scenario:
         return None
-    ways: dict[Direction, list[Channel]] = {Direction.DOWN: [], Direction.UP: []}
+    paths: dict[Direction, list[Channel]] = {Direction.DOWN: [], Direction.UP: []}
     waiting: list[Running] = []
     for number, fault in enumerate(scenario):
         channels = []
-        for direction, way in ways.items():
+        for direction, path in paths.items():
             if isinstance(fault, faults.LinkFault) and fault.direction in (direction, "both"):
                 channels.append(Channel(fault, Random(f"{seed} {number} {direction}")))
                 channels[-1].on = False
-                way.append(channels[-1])
+                path.append(channels[-1])
         waiting.append(Running(fault, channels))
-    down, up = (Path(tuple(way)) for way in ways.values())
+    down, up = (Path(tuple(path)) for path in paths.values())
     return Injection(down, up, waiting)
 
 
@@ -128,12 +128,12 @@ def _nothing(vehicle: Vehicle, running: Running) -> None:
     pass
 
 
-def _link_down(vehicle: Vehicle, running: Running) -> None:
+def _impair_link(vehicle: Vehicle, running: Running) -> None:
     for channel in running.channels:
         channel.on = True
 
 
-def _link_up(vehicle: Vehicle, running: Running) -> None:
+def _restore_link(vehicle: Vehicle, running: Running) -> None:
     for channel in running.channels:
         channel.on = False
 
@@ -153,25 +153,25 @@ def _drift(vehicle: Vehicle, running: Running) -> None:
     vehicle.autopilot.plant.drift_estimate((step_m, step_m, 0.0))
 
 
-def _regain_fix(vehicle: Vehicle, running: Running) -> None:
+def _restore_fix(vehicle: Vehicle, running: Running) -> None:
     vehicle.autopilot.senses.gps_healthy = True
     if running.memory:
         vehicle.autopilot.plant.reset_estimate((-running.memory, -running.memory, 0.0))
 
 
-def _silence(vehicle: Vehicle, running: Running) -> None:
+def _stop_message(vehicle: Vehicle, running: Running) -> None:
     vehicle.view.silent.add(running.fault.message)
 
 
-def _speak(vehicle: Vehicle, running: Running) -> None:
+def _resume_message(vehicle: Vehicle, running: Running) -> None:
     vehicle.view.silent.discard(running.fault.message)
 
 
-def _stick(vehicle: Vehicle, running: Running) -> None:
+def _freeze_message(vehicle: Vehicle, running: Running) -> None:
     vehicle.view.stuck[running.fault.message] = Stuck(running.fault.stamp_runs)
 
 
-def _unstick(vehicle: Vehicle, running: Running) -> None:
+def _unfreeze_message(vehicle: Vehicle, running: Running) -> None:
     vehicle.view.stuck.pop(running.fault.message, None)
 
 
@@ -215,9 +215,9 @@ def _jump_clock_back(vehicle: Vehicle, running: Running) -> None:
 
 def _refuse(vehicle: Vehicle, running: Running) -> None:
     of = running.fault.of
-    said = StatusText(Severity.CRITICAL, f"{_REFUSED_TITLES[of]}: {running.fault.text}")
+    text = critical(f"{_REFUSED_TITLES[of]}: {running.fault.text}")
     for event in _REFUSED_EVENTS[of]:
-        vehicle.autopilot.commander.refused[event] = said
+        vehicle.autopilot.commander.refused[event] = text
 
 
 def _allow(vehicle: Vehicle, running: Running) -> None:
@@ -225,7 +225,7 @@ def _allow(vehicle: Vehicle, running: Running) -> None:
         vehicle.autopilot.commander.refused.pop(event, None)
 
 
-def _take_over(vehicle: Vehicle, running: Running) -> None:
+def _switch_to_hold(vehicle: Vehicle, running: Running) -> None:
     modes = vehicle.autopilot.firmware.modes.values()
     hold = next(mode.name for mode in modes if mode.behaviour is Behaviour.HOLD)
     vehicle.autopilot.happen("mode", Wish(hold))
@@ -233,13 +233,13 @@ def _take_over(vehicle: Vehicle, running: Running) -> None:
 
 Effect = Callable[[Vehicle, Running], None]
 
-# Per fault: how it begins, what it does at every step, how it ends.
+# By fault: what it does when it begins, at every step, and when it ends.
 EFFECTS: dict[type, tuple[Effect, Effect, Effect]] = {
-    faults.LinkFault: (_link_down, _nothing, _link_up),
+    faults.LinkFault: (_impair_link, _nothing, _restore_link),
     faults.EstimatorJump: (_jump, _nothing, _nothing),
-    faults.GpsLoss: (_lose_fix, _drift, _regain_fix),
-    faults.SilentMessage: (_silence, _nothing, _speak),
-    faults.StuckMessage: (_stick, _nothing, _unstick),
+    faults.GpsLoss: (_lose_fix, _drift, _restore_fix),
+    faults.SilentMessage: (_stop_message, _nothing, _resume_message),
+    faults.StuckMessage: (_freeze_message, _nothing, _unfreeze_message),
     faults.WeakMotor: (_weaken_motor, _nothing, _restore_thrust),
     faults.ThrustChange: (_change_thrust, _nothing, _restore_thrust),
     faults.MassChange: (_change_mass, _nothing, _restore_mass),
@@ -247,5 +247,5 @@ EFFECTS: dict[type, tuple[Effect, Effect, Effect]] = {
     faults.Reboot: (_reboot, _nothing, _nothing),
     faults.ClockJump: (_jump_clock, _nothing, _jump_clock_back),
     faults.Refusal: (_refuse, _nothing, _allow),
-    faults.PilotTakesOver: (_take_over, _nothing, _nothing),
+    faults.PilotTakesOver: (_switch_to_hold, _nothing, _nothing),
 }

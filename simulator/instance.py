@@ -1,7 +1,7 @@
-"""One simulated vehicle with its two links, without sockets: bytes in, steps, bytes out.
+"""One simulated vehicle with its two links, in memory: datagrams in, steps, datagrams out.
 
-Tests and campaigns drive it byte by byte; `simulator.run` puts sockets and a clock round it. The
-same seed and the same bytes in at the same steps give the same bytes out.
+Tests and campaigns drive it directly; `simulator.run` adds sockets and a clock. The same seed and
+the same datagrams at the same steps give the same datagrams out.
 """
 
 from __future__ import annotations
@@ -27,16 +27,31 @@ from simulator.vehicle.plant import Plant
 STEP_MS = STEP_US // 1000
 VIRTUAL_EPOCH_US = 1_767_225_600_000_000  # 2026-01-01, where virtual time begins
 BARRIER_INTERVAL_MS = 20
-RESTART_S = 1.0  # that a reboot on request takes
+RESTART_S = 1.0  # duration of a reboot by command
 _TIMESYNC = 111
 _OFF = Demand()
 
 
 class Instance:
-    """A vehicle in the air or on the ground, its autopilot and its companion and ground links.
+    """A vehicle with its autopilot, its companion link and its ground station link.
 
-    `lockstep` replaces the companion link's TIMESYNC stream by barriers (see `barrier_due`);
-    without `ground_link` nothing is built for a ground station.
+    Args:
+        firmware: `PX4` or `ARDUPILOT`.
+        vehicle: physical parameters, as `simulator.config.vehicle` reads them.
+        conditions: wind, estimator errors, battery and other surroundings.
+        seed: of all noise.
+        system: MAVLink system id.
+        lockstep: replace the TIMESYNC stream of the companion link by barriers (`barrier_due`).
+        ground_link: send telemetry to a ground station too.
+        epoch_us: Unix time of boot in SYSTEM_TIME, microseconds.
+        faults: what goes wrong, and when (`simulator.faults`).
+        strict: report messages that the autopilot ignores or misreads (`complaints`).
+
+    Example:
+        >>> instance = Instance(PX4, config.vehicle("px4_sih"), Conditions(), seed=1)
+        >>> while instance.time_s < 1.0:
+        ...     telemetry = instance.step()
+        >>> instance.feed(b"...")  # a datagram of the companion
     """
 
     def __init__(
@@ -74,21 +89,21 @@ class Instance:
 
     @property
     def time_s(self) -> float:
-        """Time since the start; the vehicle's own until it reboots."""
+        """Seconds since the start; a reboot does not reset it."""
         return self.steps * STEP_S
 
     @property
-    def swallowed(self) -> Mapping[str, int]:
-        """How often each thing was complained of (`strict`)."""
-        return {} if self._strict is None else self._strict.swallowed
+    def complaints(self) -> Mapping[str, int]:
+        """Number of messages by complaint; empty unless `strict`."""
+        return {} if self._strict is None else self._strict.counts
 
     @property
     def idle(self) -> bool:
-        """Disarmed and on the ground: nothing can happen by itself."""
+        """Disarmed and on the ground."""
         return not self.autopilot.commander.armed and self.autopilot.pilot.landed
 
     def advance(self) -> None:
-        """One step of STEP_S; what it has to say waits in the links."""
+        """Simulate one step of STEP_S; telemetry waits in the links until `drain`."""
         self.steps += 1
         if self._injection is not None:
             self._inject()
@@ -100,7 +115,7 @@ class Instance:
             self.reboot(RESTART_S)
             return
         if self.autopilot.commander.texts or self.autopilot.commander.announcements:
-            self._spread_texts()
+            self._send_texts()
         self.companion.step()
         self.ground.step()
         if self._injection is not None:
@@ -115,21 +130,22 @@ class Instance:
         return False
 
     def step(self) -> list[bytes]:
-        """`advance`, and the companion link's datagrams; the ground link's are dropped."""
+        """`advance`, then the datagrams of the companion link; those of the ground link are
+        dropped."""
         self.advance()
         self.ground.outbox.drain()
         return self.drain()
 
     def drain(self) -> list[bytes]:
-        """The companion link's datagrams that have arrived at its other end."""
+        """Datagrams that have arrived at the companion since the last call."""
         if self._injection is None:
             return self.companion.outbox.drain()
-        said = self._injection.down.carry(self.companion.outbox.drain(), self._now_us)
-        arrived, self._arrived = self._arrived + said, []
+        sent = self._injection.down.carry(self.companion.outbox.drain(), self._now_us)
+        arrived, self._arrived = self._arrived + sent, []
         return arrived
 
     def feed(self, datagram: bytes) -> None:
-        """One datagram from the companion, handled at the present vehicle time."""
+        """Receive one datagram of the companion at the present vehicle time."""
         if self._injection is None:
             self._handle(datagram)
             return
@@ -138,11 +154,11 @@ class Instance:
                 self._handle(arrived)
 
     def feed_ground(self, datagram: bytes) -> None:
-        """One datagram from the ground station."""
+        """Receive one datagram of the ground station."""
         if self.steps < self._back_at_step:
             return
         self.ground.receive(datagram)
-        self._spread_texts()
+        self._send_texts()
 
     def barrier_due(self) -> bool:
         """Whether lockstep waits here for the companion.
@@ -157,9 +173,12 @@ class Instance:
         return True
 
     def barrier(self) -> tuple[int, list[bytes]]:
-        """Lockstep's question for the time, behind all telemetry: its stamp, and all datagrams.
+        """Send the TIMESYNC request of lockstep after all telemetry.
 
-        It is the clock of the simulation and no part of the flight: no fault touches it.
+        It is the clock of the simulation, so that link faults do not apply to it.
+
+        Returns:
+            Its time stamp in nanoseconds, and all datagrams for the companion.
         """
         stamp_ns = self.steps * STEP_MS * 1_000_000
         if self._injection is None:
@@ -170,7 +189,7 @@ class Instance:
         return stamp_ns, datagrams + self.companion.outbox.drain()
 
     def reboot(self, silent_s: float) -> None:
-        """The autopilot is gone for so long and starts anew; the vehicle goes on falling."""
+        """Restart the autopilot after `silent_s` without motors and messages; the vehicle falls."""
         old = self.autopilot
         self.autopilot = Autopilot(
             old.firmware, old.plant, old.parameters, old.mission, boot_scale=old.health.scale
@@ -196,10 +215,10 @@ class Instance:
         if self.steps < self._back_at_step and not self._is_clock(datagram):
             return
         self.companion.receive(datagram)
-        self._spread_texts()
+        self._send_texts()
 
     def _without_clock(self, datagram: bytes) -> list[bytes]:
-        """Answer lockstep's question at once; what is left takes the way up."""
+        """Handle lockstep's TIMESYNC answer at once; the rest is subject to link faults."""
         pieces = [frame for _, frame in frames(datagram)]
         if not (self.companion.barrier and any(map(self._is_clock, pieces))):
             return [datagram]
@@ -212,15 +231,16 @@ class Instance:
         return rest
 
     def _is_clock(self, frame: bytes) -> bool:
-        """A TIMESYNC answer (tc1 is not 0) in lockstep."""
+        """Whether it is a TIMESYNC answer (tc1 is not 0) in lockstep."""
         is_timesync = frames(frame)[0][0] == _TIMESYNC if frame else False
         return self.companion.barrier and is_timesync and any(frame[10:18])
 
-    def _spread_texts(self) -> None:
+    def _send_texts(self) -> None:
+        """Queue new texts and announced messages on both links."""
         commander = self.autopilot.commander
-        for said in commander.texts:
-            self.companion.texts.say(said)
-            self.ground.texts.say(said)
+        for text in commander.texts:
+            self.companion.texts.send(text)
+            self.ground.texts.send(text)
         commander.texts.clear()
         for name in commander.announcements:
             self.companion.outbox.send_now(name)

@@ -1,9 +1,9 @@
-"""Instances in time and on sockets: real time, any speed, or lockstep with a companion.
+"""Instances with sockets and a clock: real time, faster or slower, or lockstep with a companion.
 
-Lockstep is MAVLink's own: at each barrier the simulator sends a TIMESYNC request after the
-telemetry and waits for the answer. The companion answers in the order in which it reads, so by
-then it has handled that telemetry, and all it sent before the answer is applied at that instant.
-Input is read at barriers only, hence a flight is a function of its seed.
+Lockstep uses MAVLink only: at each barrier the simulator sends a TIMESYNC request after the
+telemetry and waits for the answer. The companion answers in the order in which it reads: when the
+answer arrives, it has handled that telemetry, and everything it sent before the answer takes effect
+at that instant. Input is read at barriers only, so that a flight depends on nothing but its seed.
 """
 
 from __future__ import annotations
@@ -19,28 +19,28 @@ from simulator.link.links import Link, wait
 from simulator.link.recorder import Recorder
 from simulator.steps import STEP_S
 
-RESEND_S = 0.05  # until the companion is first heard
+RESEND_S = 0.05  # of a barrier, until the companion first sends something
 RESEND_SILENT_S = 1.0
-PATIENCE_S = 5.0
-FIRST_CONTACT_S = 180.0  # a companion may compile first, on a machine that does much else
-FREE_RUN_S = 60.0  # vehicle time after the companion fell silent
-REHEARSAL_S = 0.2  # every fast message is due in it
-SPIN_S = 50e-6  # an answer comes sooner than a sleeping core wakes up
-POLL_S = 0.05  # so that a stop is noticed in time
+ANSWER_TIMEOUT_S = 5.0
+FIRST_ANSWER_TIMEOUT_S = 180.0  # a companion may compile first, on a busy machine
+FREE_RUN_S = 60.0  # vehicle time without the companion
+WARM_UP_S = 0.2  # every fast message is due in it
+SPIN_S = 50e-6  # poll without sleeping: most answers arrive sooner than a core wakes up
+POLL_S = 0.05  # longest wait, so that a stop is noticed
 BEHIND_S = 0.5
 
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """Exit code and, unless all is well, a sentence."""
+    """Exit code and, unless it is 0, a sentence."""
 
     code: int
     sentence: str = ""
 
 
 @dataclass(frozen=True, slots=True)
-class Berth:
-    """One instance and its sockets."""
+class Endpoint:
+    """One instance with its sockets."""
 
     instance: Instance
     companion: Link
@@ -64,7 +64,7 @@ class Berth:
             self.ground.send(datagrams)
 
     def send_barrier(self) -> tuple[int, list[bytes]]:
-        """Send everything and the question for the time; return its stamp and the datagrams."""
+        """Send everything queued and the barrier; return its time stamp and its datagrams."""
         stamp_ns, datagrams = self.instance.barrier()
         self._record(datagrams)
         self.companion.send(datagrams)
@@ -72,15 +72,15 @@ class Berth:
         return stamp_ns, datagrams
 
     def read(self) -> bool:
-        """Handle what has arrived; whether the companion sent anything."""
-        spoken = False
+        """Handle all datagrams that have arrived; whether the companion sent any."""
+        received = False
         while (datagram := self.companion.receive()) is not None:
-            self.hear(datagram)
-            spoken = True
+            self.handle(datagram)
+            received = True
         self.read_ground()
-        return spoken
+        return received
 
-    def hear(self, datagram: bytes) -> None:
+    def handle(self, datagram: bytes) -> None:
         """Handle one datagram of the companion."""
         self._record([datagram])
         self.instance.feed(datagram)
@@ -96,7 +96,7 @@ class Berth:
 
 @dataclass(slots=True)
 class Punctuality:
-    """Of a run in real time: steps, and how late they ended. Missed: later than the next one."""
+    """Deadlines of a run in real time. Missed: a step ended after the next one was due."""
 
     steps: int = 0
     missed: int = 0
@@ -114,32 +114,38 @@ class Punctuality:
         )
 
 
-def rehearse(instance: Instance) -> None:
-    """Have a throw-away instance call all compiled code, so that none compiles in flight."""
-    instance.advance_to_barrier(REHEARSAL_S)
-    while instance.time_s < 2.0 * REHEARSAL_S:
+def warm_up(instance: Instance) -> None:
+    """Run all compiled code once with an instance that is not used later."""
+    while instance.time_s < WARM_UP_S:
         instance.advance()
 
 
 class Runner:
-    """Instances and their sockets in one time; lockstep is for one. `stopping` is asked often."""
+    """Runs instances with their sockets.
+
+    Args:
+        endpoints: the instances; lockstep takes one.
+        stopping: called often; True ends the run.
+        report: takes sentences for the user.
+        duration_s: vehicle time at which the run ends.
+    """
 
     def __init__(
         self,
-        berths: Sequence[Berth],
+        endpoints: Sequence[Endpoint],
         *,
         stopping: Callable[[], bool],
-        tell: Callable[[str], None],
+        report: Callable[[str], None],
         duration_s: float | None = None,
     ) -> None:
-        self._berths = berths
-        self._berth = berths[0]
-        self._instance = self._berth.instance
-        self._companion = self._berth.companion
-        self._owner = {link: berth for berth in berths for link in berth.links}
+        self._endpoints = endpoints
+        self._endpoint = endpoints[0]
+        self._instance = self._endpoint.instance
+        self._companion = self._endpoint.companion
+        self._owner = {link: endpoint for endpoint in endpoints for link in endpoint.links}
         self._links = list(self._owner)
         self._stopping = stopping
-        self._tell = tell
+        self._report = report
         self._end_s = math.inf if duration_s is None else duration_s
         self.punctuality = Punctuality()
 
@@ -149,7 +155,7 @@ class Runner:
     # -- real time ---------------------------------------------------------------------------
 
     def real_time(self, speed: float) -> Outcome:
-        """`speed` x real time, by absolute deadlines; answers go out as soon as they are due."""
+        """Run at `speed` x real time by absolute deadlines; answers are sent at once."""
         instance = self._instance
         self._stagger()
         gc.collect()
@@ -158,100 +164,105 @@ class Runner:
         while not self._over():
             deadline_s = epoch_s + (instance.time_s + STEP_S) / speed
             self._serve_until(deadline_s)
-            for berth in self._berths:
-                berth.instance.advance()
-                berth.send()
+            for endpoint in self._endpoints:
+                endpoint.instance.advance()
+                endpoint.send()
             behind_s = monotonic_s() - deadline_s
             self.punctuality.note(behind_s, STEP_S / speed)
-            if behind_s > BEHIND_S:  # suspended or overloaded: go on from here, do not race
-                self._tell(
-                    f"{behind_s:.1f} s behind at {instance.time_s:.1f} s: going on from here"
-                )
+            if behind_s > BEHIND_S:  # suspended or overloaded: do not catch up
+                self._report(f"{behind_s:.1f} s behind at {instance.time_s:.1f} s: not catching up")
                 epoch_s += behind_s
         return Outcome(0)
 
     def _stagger(self) -> None:
-        """Start each vehicle a step after the next, so that their streams do not fall together."""
-        for ahead, berth in enumerate(self._berths):
+        """Start each vehicle one step later, so that they do not all send in the same step."""
+        for ahead, endpoint in enumerate(self._endpoints):
             for _ in range(ahead):
-                berth.instance.advance()
-                berth.send()
+                endpoint.instance.advance()
+                endpoint.send()
 
     def _serve_until(self, deadline_s: float) -> None:
-        """Handle what arrives before the deadline; once in any case."""
+        """Handle what arrives before the deadline; at least once."""
         while True:
             remaining_s = deadline_s - monotonic_s()
             ready = wait(self._links, min(remaining_s, POLL_S))
-            for berth in dict.fromkeys(self._owner[link] for link in ready):
-                if berth.read():
-                    berth.send()
+            for endpoint in dict.fromkeys(self._owner[link] for link in ready):
+                if endpoint.read():
+                    endpoint.send()
                 else:
-                    berth.send_ground()
+                    endpoint.send_ground()
             if remaining_s <= 0 or self._stopping():
                 return
 
     # -- lockstep ----------------------------------------------------------------------------
 
-    def lockstep(self, patience_s: float | None = None) -> Outcome:
-        """Virtual time that waits for the companion at every barrier, so long; not given, longer
-        for its first word."""
+    def lockstep(self, timeout_s: float | None = None) -> Outcome:
+        """Run in virtual time that waits for the companion at every barrier.
+
+        Args:
+            timeout_s: longest wait for an answer; default ANSWER_TIMEOUT_S, and
+                FIRST_ANSWER_TIMEOUT_S for the first one.
+
+        Returns:
+            Code 3 if no companion answered, else 0.
+        """
         gc.collect()
         gc.freeze()
         while not self._over():
             if not self._instance.advance_to_barrier(self._end_s):
                 continue
-            stamp_ns, datagrams = self._berth.send_barrier()
-            self._berth.read_ground()
-            first = not self._instance.companion.texts.heard
-            waits_s = patience_s or (FIRST_CONTACT_S if first else PATIENCE_S)
+            stamp_ns, datagrams = self._endpoint.send_barrier()
+            self._endpoint.read_ground()
+            first = not self._instance.companion.texts.connected
+            waits_s = timeout_s or (FIRST_ANSWER_TIMEOUT_S if first else ANSWER_TIMEOUT_S)
             if self._answered(stamp_ns, datagrams, waits_s) or self._stopping():
                 continue
             if self._instance.companion.answered_ns < 0:
                 return Outcome(
                     3,
                     f"no companion answered TIMESYNC within {waits_s:g} s:"
-                    " start one, or leave --lockstep away",
+                    " start one, or run without --lockstep",
                 )
-            self._tell(f"the companion fell silent at {self._instance.time_s:.2f} s")
+            self._report(f"the companion stopped answering at {self._instance.time_s:.2f} s")
             if not self._free_run():
-                return Outcome(3, "the companion did not come back")
+                return Outcome(3, "the companion did not answer again")
         return Outcome(0)
 
-    def _answered(self, stamp_ns: int, datagrams: list[bytes], patience_s: float) -> bool:
+    def _answered(self, stamp_ns: int, datagrams: list[bytes], timeout_s: float) -> bool:
         """Wait for the answer to this barrier, applying all that comes before it."""
         server = self._instance.companion
         begun_s = sent_s = monotonic_s()
         while server.answered_ns != stamp_ns:
             datagram = self._companion.receive()
             if datagram is not None:
-                self._berth.hear(datagram)
+                self._endpoint.handle(datagram)
                 continue
             if self._stopping():
                 return False
             now_s = monotonic_s()
-            if now_s - begun_s > patience_s:
+            if now_s - begun_s > timeout_s:
                 return False
-            if now_s - sent_s >= (RESEND_SILENT_S if server.texts.heard else RESEND_S):
+            if now_s - sent_s >= (RESEND_SILENT_S if server.texts.connected else RESEND_S):
                 self._companion.send(datagrams)
                 sent_s = now_s
             wait([self._companion], POLL_S if now_s - begun_s > SPIN_S else 0.0)
         return True
 
     def _free_run(self) -> bool:
-        """Let the failsafe play out at full speed; True as soon as the companion answers again."""
+        """Continue at full speed without the companion; True as soon as it answers again."""
         instance = self._instance
         end_s = instance.time_s + FREE_RUN_S
         known_ns = instance.companion.answered_ns
         while instance.time_s < end_s and not (instance.idle or self._over()):
             if not instance.advance_to_barrier(end_s):
                 continue
-            self._berth.send_barrier()
+            self._endpoint.send_barrier()
             while (datagram := self._companion.receive()) is not None:
-                self._berth.hear(datagram)
-            self._berth.read_ground()
+                self._endpoint.handle(datagram)
+            self._endpoint.read_ground()
             if instance.companion.answered_ns != known_ns:
-                self._tell(f"the companion is back at {instance.time_s:.2f} s")
+                self._report(f"the companion answers again at {instance.time_s:.2f} s")
                 return True
         state = "landed and disarmed" if instance.idle else "still flying"
-        self._tell(f"without it the vehicle is {state} at {instance.time_s:.1f} s")
+        self._report(f"without it the vehicle is {state} at {instance.time_s:.1f} s")
         return False

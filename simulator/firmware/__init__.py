@@ -1,1 +1,1 @@
-"""Autopilot personalities: modes, numbers, texts and timeouts as data, one module each."""
+"""PX4 and ArduPilot as data: modes, state table, parameters, texts and timing."""

@@ -1,4 +1,4 @@
-"""The personalities by name: the one place that lists them."""
+"""The firmwares by name."""
 
 from __future__ import annotations
 

@@ -1,1 +1,1 @@
-"""Sockets, and the faults of the way between them."""
+"""Sockets of a link, and faults between its two ends."""

@@ -1,8 +1,7 @@
-"""What a link does to datagrams on their way: delay, loss, repetition, disorder, damage.
+"""Link faults: delay, loss, duplication, reordering, corruption and limited rate of datagrams.
 
-Wrapped round the byte channel, so that neither the autopilot nor its MAVLink side knows of it.
-Time is an argument, in microseconds; randomness is the generator handed in, so that a flight with
-bad links is as reproducible as one with good ones.
+They act on bytes, outside the MAVLink server. Time is an argument, in microseconds, and the random
+generator is passed in, so that the same seed gives the same faults.
 """
 
 from __future__ import annotations
@@ -14,41 +13,41 @@ from pydantic import Field
 
 from offboard.documents.parameters import Parameters
 
-# Answers and announcements, which a rate limit per message does not thin: PARAM_VALUE, MISSION_*,
+# Answers and events, which a rate limit per message does not drop: PARAM_VALUE, MISSION_*,
 # COMMAND_ACK, FILE_TRANSFER_PROTOCOL, TIMESYNC, AUTOPILOT_VERSION, MESSAGE_INTERVAL, STATUSTEXT
 _NOT_STREAMED = frozenset((22, *range(37, 48), 51, 73, 77, 110, 111, 148, 244, 253))
 _MAGIC_V2, _SIGNED, _SIGNATURE_BYTES = 0xFD, 0x01, 13
 
 
 class Impairment(Parameters):
-    """One direction of a link. Shares are probabilities per datagram, 0 .. 1."""
+    """Faults of one direction of a link; probabilities are per datagram."""
 
     latency_s: float = Field(default=0.0, ge=0, le=10)
     jitter_s: float = Field(default=0.0, ge=0, le=5)  # further delay, uniform; order is kept
     loss: float = Field(default=0.0, ge=0, le=1)
     duplication: float = Field(default=0.0, ge=0, le=1)
-    reorder: float = Field(default=0.0, ge=0, le=1)  # share held back by `reorder_s`
+    reorder: float = Field(default=0.0, ge=0, le=1)  # probability of a delay by `reorder_s`
     reorder_s: float = Field(default=0.02, ge=0, le=5)
-    corruption: float = Field(default=0.0, ge=0, le=1)  # share in which one bit is flipped
+    corruption: float = Field(default=0.0, ge=0, le=1)  # probability of one flipped bit
     rate_bytes_ps: float | None = Field(default=None, ge=100, le=1e9)
-    queue_bytes: int = Field(default=4096, ge=280, le=10_000_000)  # what finds it full is lost
+    queue_bytes: int = Field(default=4096, ge=280, le=10_000_000)  # in front of `rate_bytes_ps`
     message_rate_hz: float | None = Field(default=None, ge=0.1, le=1000)  # of each message id
 
 
 class Channel:
-    """One direction: `put` datagrams in, `take` those that have arrived."""
+    """One direction of a link: `put` datagrams in, `take` those that have arrived."""
 
     def __init__(self, settings: Impairment, random: Random) -> None:
         self._settings = settings
         self._random = random
-        self.on = True  # what is under way arrives in any case
+        self.on = True  # datagrams already under way arrive in any case
         self._under_way: list[tuple[int, int, bytes]] = []
         self._count = 0
         self._newest_us = self._idle_us = 0
         self._slots: dict[int, int] = {}
 
     def put(self, datagram: bytes, now_us: int) -> None:
-        """Send one datagram off at `now_us`."""
+        """Send one datagram at `now_us`."""
         if not self.on:
             self._deliver(now_us, datagram)
             return
@@ -73,7 +72,7 @@ class Channel:
             self._deliver(due_us, datagram)
 
     def take(self, now_us: int) -> list[bytes]:
-        """What has arrived by `now_us`, in the order of arrival."""
+        """Datagrams that have arrived by `now_us`, in order."""
         arrived: list[bytes] = []
         while self._under_way and self._under_way[0][0] <= now_us:
             arrived.append(heapq.heappop(self._under_way)[2])
@@ -84,7 +83,7 @@ class Channel:
         self._count += 1
 
     def _transmitted(self, size: int, now_us: int) -> int | None:
-        """When the last byte is through a narrow link; None when its queue is full."""
+        """Time at which the last byte is sent at the limited rate; None when the queue is full."""
         rate = self._settings.rate_bytes_ps
         if rate is None:
             return now_us
@@ -101,7 +100,7 @@ class Channel:
         return bytes(damaged)
 
     def _thinned(self, datagram: bytes, now_us: int, rate_hz: float) -> bytes:
-        """The datagram without the messages that came in the same 1/rate already."""
+        """The datagram without messages whose id was already sent in this 1/rate."""
         slot = int(now_us * 1e-6 * rate_hz + 1e-9)
         kept: list[bytes] = []
         for message_id, frame in frames(datagram):
@@ -114,13 +113,13 @@ class Channel:
 
 
 class Path:
-    """One direction through any number of channels, one behind the other."""
+    """One direction through any number of channels in series."""
 
     def __init__(self, channels: tuple[Channel, ...] = ()) -> None:
         self.channels = channels
 
     def carry(self, datagrams: list[bytes], now_us: int) -> list[bytes]:
-        """Send these off and return what arrives now."""
+        """Send these datagrams and return those that arrive now."""
         for channel in self.channels:
             for datagram in datagrams:
                 channel.put(datagram, now_us)
@@ -129,7 +128,7 @@ class Path:
 
 
 def frames(datagram: bytes) -> list[tuple[int, bytes]]:
-    """(message id, frame) of each MAVLink 2 frame; what is none is one piece with id -1."""
+    """(message id, frame) of each MAVLink 2 frame; anything else is one piece with id -1."""
     found: list[tuple[int, bytes]] = []
     at = 0
     while at < len(datagram):

@@ -1,7 +1,7 @@
-"""Opening the simulator's links, and waiting for them. Bytes only; no MAVLink.
+"""Opening the simulator's links, and waiting for datagrams. Bytes only; no MAVLink.
 
-udpout:HOST:PORT sends to that address from the start, udpin:HOST:PORT waits to be spoken to, and
-tcpin:HOST:PORT to be connected to, as ArduPilot's SITL does.
+udpout:HOST:PORT sends to that address from the start, udpin:HOST:PORT answers whoever sends to it,
+and tcpin:HOST:PORT accepts connections, as ArduPilot's SITL does.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from typing import Protocol
 from simulator.link.tcp import TcpLink
 from simulator.link.udp import Address, UdpLink
 
-# Of instances, as those of PX4 and ArduPilot are
+# Distance between the ports of two instances, as PX4 and ArduPilot have it
 _PORTS_APART = {"udpout": 1, "udpin": 1, "tcpin": 10}
 
 
 class LinkError(Exception):
-    """An address that cannot be used: one sentence."""
+    """An address that cannot be used; the message is one sentence."""
 
 
 class Link(Protocol):
-    """One end of a link, with any number of peers. Nothing here waits."""
+    """One end of a link with any number of peers. No method blocks."""
 
     @property
     def port(self) -> int: ...
@@ -34,7 +34,7 @@ class Link(Protocol):
 
 
 def free_ports(count: int) -> list[int]:
-    """UDP ports that nobody used a moment ago."""
+    """UDP ports on 127.0.0.1 that are free now."""
     sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
     try:
         for sock in sockets:
@@ -46,14 +46,19 @@ def free_ports(count: int) -> list[int]:
 
 
 def wait(links: Sequence[Link], timeout_s: float) -> list[Link]:
-    """The links at which a datagram waits, as soon as there is one, at the latest `timeout_s`."""
+    """Links with a datagram to receive; returns with the first one, or after `timeout_s`."""
     return select.select(links, [], [], max(0.0, timeout_s))[0]
 
 
 def open_link(url: str, preferred_port: int) -> Link:
-    """Open `udpout:HOST:PORT` (from `preferred_port` if it is free), `udpin:` or `tcpin:` alike.
+    """Open a link.
 
-    Raises LinkError with a sentence.
+    Args:
+        url: `udpout:HOST:PORT`, `udpin:HOST:PORT` or `tcpin:HOST:PORT`.
+        preferred_port: local port of `udpout`; any other if it is in use.
+
+    Raises:
+        LinkError: the address is malformed, unknown or in use.
     """
     kind, host, port = _split(url)
     address = _resolve(url, host, port)
@@ -81,7 +86,7 @@ def open_link(url: str, preferred_port: int) -> Link:
 
 
 def shifted(url: str, by: int) -> str:
-    """The same link of the instance `by` further on. Raises LinkError with a sentence."""
+    """URL of the same link for the instance `by` numbers later. Raises LinkError."""
     kind, host, port = _split(url)
     return f"{kind}:{host}:{port + by * _PORTS_APART[kind]}"
 
@@ -91,7 +96,7 @@ def _split(url: str) -> tuple[str, str, int]:
     usable = len(parts) == 3 and parts[0] in _PORTS_APART and parts[1] != ""
     if not (usable and parts[2].isascii() and parts[2].isdigit() and 0 < int(parts[2]) < 65536):
         raise LinkError(
-            f"{url} is no link: give udpout:, udpin: or tcpin:HOST:PORT, port 1 .. 65535"
+            f"{url} is not a link: give udpout:, udpin: or tcpin:HOST:PORT, port 1 .. 65535"
         )
     return parts[0], parts[1], int(parts[2])
 

@@ -1,4 +1,4 @@
-"""A .tlog of a link: every frame with the time it crossed. Knows framing and no message.
+"""Telemetry log (.tlog) of a link: every frame with its time. Knows framing and no message.
 
 A record is a big-endian uint64 of Unix microseconds, low two bits zero, then the frame unchanged.
 """
@@ -14,13 +14,13 @@ _STAMP = struct.Struct(">Q")
 
 
 class Recorder:
-    """Appends to a new file, each record at once, so that a killed process loses nothing."""
+    """Writes a new file without buffering, so that a killed process loses nothing."""
 
     def __init__(self, path: Path) -> None:
         self._file = path.open("xb", buffering=0)
 
     def write(self, unix_us: int, datagrams: list[bytes]) -> None:
-        """Both directions alike. What is no MAVLink 2 frame is left out; a full disk is borne."""
+        """Append the MAVLink 2 frames of datagrams, sent or received. A full disk is ignored."""
         stamp = _STAMP.pack(unix_us & ~3)
         records = [
             stamp + frame

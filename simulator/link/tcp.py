@@ -1,7 +1,6 @@
-"""The TCP end of a link: a server to which any number of clients connect, and leave.
+"""TCP server of a link for any number of clients.
 
-What comes in pieces is put together again: what `receive` gives are whole MAVLink frames, as a
-datagram holds them.
+A TCP stream may cut a frame anywhere; `receive` returns whole MAVLink frames, as a datagram does.
 """
 
 from __future__ import annotations
@@ -14,13 +13,13 @@ from dataclasses import dataclass, field
 
 CLIENTS_MAX = 16
 READ_BYTES = 65536
-UNSENT_MAX = 1 << 20  # bytes that wait for a client; one that does not read loses the link
+UNSENT_MAX = 1 << 20  # bytes; a client that does not read more is disconnected
 _MAGIC_V1, _MAGIC_V2, _SIGNED, _SIGNATURE_BYTES = 0xFE, 0xFD, 0x01, 13
 
 
 @dataclass(slots=True)
 class Client:
-    """One connection: what of a frame has come, what has still to go."""
+    """One connection: bytes received of an incomplete frame, and bytes not sent yet."""
 
     socket: socket.socket
     arrived: bytearray = field(default_factory=bytearray)
@@ -28,17 +27,17 @@ class Client:
 
 
 class TcpLink:
-    """A listening socket and its clients. One that is gone or does not read is forgotten."""
+    """A listening socket and its clients. A client that disconnects or does not read is dropped."""
 
     def __init__(self, listener: socket.socket) -> None:
         self._listener = listener
         self._clients: list[Client] = []
         self._selector = selectors.DefaultSelector()
         self._selector.register(listener, selectors.EVENT_READ)
-        self._read: deque[bytes] = deque()
+        self._frames: deque[bytes] = deque()
 
     def fileno(self) -> int:
-        """Of all its sockets together."""
+        """File descriptor for select; it covers the listener and all clients."""
         fileno = getattr(self._selector, "fileno", self._listener.fileno)
         return int(fileno())
 
@@ -48,7 +47,7 @@ class TcpLink:
         return int(self._listener.getsockname()[1])
 
     def send(self, datagrams: Iterable[bytes]) -> None:
-        """Everything to every client."""
+        """Send all datagrams to every client."""
         together = b"".join(datagrams)
         for client in tuple(self._clients):
             client.unsent += together
@@ -61,19 +60,19 @@ class TcpLink:
         except BlockingIOError:
             pass
         except OSError:
-            self._forget(client)
+            self._disconnect(client)
         if len(client.unsent) > UNSENT_MAX:
-            self._forget(client)
+            self._disconnect(client)
 
     def receive(self) -> bytes | None:
-        """The whole frames of one reading of one client, or None when none wait."""
-        if not self._read:
+        """Whole frames of one read from one client, or None."""
+        if not self._frames:
             for key, _ in self._selector.select(0):
                 if key.fileobj is self._listener:
                     self._accept()
                 else:
-                    self._hear(key.data)
-        return self._read.popleft() if self._read else None
+                    self._read_client(key.data)
+        return self._frames.popleft() if self._frames else None
 
     def _accept(self) -> None:
         try:
@@ -81,14 +80,14 @@ class TcpLink:
         except OSError:
             return
         if len(self._clients) >= CLIENTS_MAX:
-            self._forget(self._clients[0])
+            self._disconnect(self._clients[0])
         sock.setblocking(False)
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         client = Client(sock)
         self._clients.append(client)
         self._selector.register(sock, selectors.EVENT_READ, client)
 
-    def _hear(self, client: Client) -> None:
+    def _read_client(self, client: Client) -> None:
         try:
             piece = client.socket.recv(READ_BYTES)
         except BlockingIOError:
@@ -96,15 +95,15 @@ class TcpLink:
         except OSError:
             piece = b""
         if not piece:
-            self._forget(client)
+            self._disconnect(client)
             return
         client.arrived += piece
         whole = whole_frames(client.arrived)
         if whole:
-            self._read.append(bytes(client.arrived[:whole]))
+            self._frames.append(bytes(client.arrived[:whole]))
             del client.arrived[:whole]
 
-    def _forget(self, client: Client) -> None:
+    def _disconnect(self, client: Client) -> None:
         if client in self._clients:
             self._clients.remove(client)
             self._selector.unregister(client.socket)
@@ -112,13 +111,13 @@ class TcpLink:
 
     def close(self) -> None:
         for client in tuple(self._clients):
-            self._forget(client)
+            self._disconnect(client)
         self._selector.close()
         self._listener.close()
 
 
 def whole_frames(data: bytes | bytearray) -> int:
-    """Bytes of `data` before a frame that is not there yet; garbage counts as there."""
+    """Number of bytes before the first incomplete frame; bytes outside frames count too."""
     at = 0
     while at < len(data):
         length = 1

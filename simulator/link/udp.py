@@ -1,4 +1,4 @@
-"""The UDP end of a link: whoever sends to the socket is a peer from then on."""
+"""UDP socket of a link: whoever sends to it becomes a peer."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ Address = tuple[str, int]
 
 
 class UdpLink:
-    """One socket and its peers. A peer that refuses or a full buffer loses datagrams, no more."""
+    """One socket and its peers. Send errors lose datagrams and are otherwise ignored."""
 
     def __init__(self, sock: socket.socket, target: Address | None) -> None:
         self._socket = sock
@@ -27,7 +27,7 @@ class UdpLink:
         return int(self._socket.getsockname()[1])
 
     def send(self, datagrams: Iterable[bytes]) -> None:
-        """Each datagram to every peer."""
+        """Send each datagram to every peer."""
         for datagram in datagrams:
             for peer in self._peers:
                 try:
@@ -36,19 +36,19 @@ class UdpLink:
                     continue
 
     def receive(self) -> bytes | None:
-        """One datagram, or None when none waits."""
+        """One datagram, or None."""
         while True:
             try:
                 datagram, sender = self._socket.recvfrom(DATAGRAM_MAX)
             except ConnectionError:
-                continue  # an ICMP answer to something sent earlier
+                continue  # ICMP error for a datagram sent earlier
             except OSError:
                 return None
             if sender not in self._peers:
-                self._learn(sender)
+                self._add_peer(sender)
             return datagram
 
-    def _learn(self, sender: Address) -> None:
+    def _add_peer(self, sender: Address) -> None:
         if len(self._peers) >= PEERS_MAX:
             oldest = next(peer for peer in self._peers if peer != self._target)
             del self._peers[oldest]

@@ -1,1 +1,1 @@
-"""Bytes of MAVLink in, bytes out: what is asked of the autopilot and what it reports."""
+"""MAVLink of a vehicle without sockets: telemetry, commands, parameters, missions and texts."""

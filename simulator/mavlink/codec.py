@@ -1,8 +1,8 @@
-"""MAVLink 2 frames to and from plain values: the simulator's own reading of the protocol.
+"""MAVLink 2 frames to and from plain values, implemented for the simulator.
 
 Only the message tables (ids, field order, CRC extra) come from the dialect; packing, checksums and
-framing are written here, apart from the companion's codec, so that a mistake in one of them shows
-on the wire. Knows no vehicle, no socket and no clock. Nothing a peer sends makes it raise.
+framing are independent of the companion's codec, so that an error in one of them shows between
+them. Knows no vehicle, no socket and no clock. Nothing a peer sends makes it raise.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Message:
 
 
 class Layout:
-    """How one message lies in its payload. `pack` takes the values in the order of the XML."""
+    """Payload layout of one message. `pack` takes the values in the field order of the XML."""
 
     def __init__(self, message: Any) -> None:
         self.id: int = message.id
@@ -84,9 +84,9 @@ class Layout:
 def _packer(
     layout: struct.Struct, order: Sequence[int], spans: Sequence[int]
 ) -> Callable[[Sequence[Any]], bytes]:
-    """Values in the order of the XML, arrays as sequences -> payload.
+    """Function from values in the order of the XML, arrays as sequences, to the payload.
 
-    Written out as one expression, as `namedtuple` does it: a loop takes five times as long.
+    Generated as one expression, as `namedtuple` does: a loop takes five times as long.
     """
     terms = [
         f"v[{index}]" if span == 1 else f"*v[{index}]"
@@ -101,7 +101,7 @@ def _packer(
 def _namer(
     names: Sequence[str], spans: Sequence[int], is_text: Sequence[bool]
 ) -> Callable[[tuple[Any, ...]], dict[str, Any]]:
-    """What a struct unpacks, in the order of the wire -> values by name; written out likewise."""
+    """Function from unpacked values in payload order to values by name; generated likewise."""
     terms = []
     at = 0
     for name, span, text in zip(names, spans, is_text, strict=True):
@@ -157,7 +157,7 @@ def name_of(message_id: int) -> str | None:
 
 
 def frame(sequence: int, system: int, component: int, message: Layout, payload: bytes) -> bytes:
-    """One unsigned MAVLink 2 frame round a packed payload."""
+    """One unsigned MAVLink 2 frame with a packed payload."""
     low, high = message.id & 0xFFFF, message.id >> 16
     head = _HEADER_V2.pack(len(payload), 0, 0, sequence, system, component, low, high)
     body = head + payload
@@ -167,16 +167,16 @@ def frame(sequence: int, system: int, component: int, message: Layout, payload: 
 
 @dataclass
 class Decoder:
-    """Datagrams -> messages. What cannot be read is dropped and counted by reason.
+    """Datagrams -> messages. Unreadable bytes are dropped and counted by reason.
 
-    A datagram holds whole frames: nothing is carried over, so that garbage in one cannot delay or
-    swallow a command in the next.
+    A datagram holds whole frames: nothing is kept for the next one, so that garbage cannot delay
+    or hide a later command.
     """
 
     dropped: Counter[str] = field(default_factory=Counter)
 
     def read(self, datagram: bytes) -> list[Message]:
-        """All intact messages of `datagram`, in order; frames are found behind garbage too."""
+        """All intact messages of `datagram`, in order, also those after garbage."""
         messages: list[Message] = []
         at = 0
         while at < len(datagram):
@@ -187,7 +187,7 @@ class Decoder:
         return messages
 
     def _at(self, data: bytes, at: int) -> tuple[int, Message | None]:
-        """Bytes to move on, and the message that begins at `at`, if one does."""
+        """Number of bytes to skip, and the message that begins at `at`, if one does."""
         left = len(data) - at
         if data[at] == MAGIC_V2 and left >= 12:
             head, message_id = 10, data[at + 7] | data[at + 8] << 8 | data[at + 9] << 16
@@ -205,7 +205,7 @@ class Decoder:
         if length > left:
             return self._skip("truncated")
         if known is None:
-            # no CRC extra to verify with: believed only when a frame, or nothing, follows
+            # no CRC extra to verify with: taken as a frame if another, or nothing, follows
             self.dropped["unknown message"] += 1
             follows = length == left or data[at + length] in (MAGIC_V1, MAGIC_V2)
             return (length if follows else 1), None

@@ -1,7 +1,8 @@
 """MAVLink commands (MAV_CMD): what each does, and how it is acknowledged.
 
-A command's unused parameters may be NaN or 0. Every command to us is answered, unknown ones with
-UNSUPPORTED. Knows one link's outbox and schedule, and the autopilot behind it.
+Unused parameters of a command may be NaN or 0. Every command addressed to the vehicle is
+acknowledged, unknown ones with UNSUPPORTED. Knows one link's outbox and schedule, and the
+autopilot.
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ from dataclasses import dataclass
 
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.commander import Wish
-from simulator.firmware.values import Behaviour, ModeRequest, Result, Severity, StatusText, Triple
+from simulator.firmware.values import Behaviour, ModeRequest, Result, Triple, info
 from simulator.geodesy import down_m, to_metres
 from simulator.mavlink.codec import id_of, name_of
 from simulator.mavlink.outbox import Outbox
@@ -25,18 +26,18 @@ _VERTICAL_SPEEDS = (2.0, 3.0)  # SPEED_TYPE: climb, descent
 
 @dataclass(frozen=True, slots=True)
 class Command:
-    """COMMAND_LONG or COMMAND_INT, as one."""
+    """COMMAND_LONG or COMMAND_INT."""
 
     number: int
     params: tuple[float, ...]  # param1 .. param7, places in degrees
     system: int  # of the sender
     component: int
-    frame: int | None = None  # MAV_FRAME of the place, if it tells
+    frame: int | None = None  # MAV_FRAME of the place; None: COMMAND_LONG has none
 
 
 @dataclass(slots=True)
 class Commands:
-    """What a client commands on one link, carried out and answered."""
+    """Commands of one link: carried out and acknowledged."""
 
     outbox: Outbox
     schedule: Schedule
@@ -46,7 +47,7 @@ class Commands:
         return self.outbox.view.autopilot
 
     def run(self, command: Command) -> None:
-        """Carry out and acknowledge, on the same link."""
+        """Carry out a command and acknowledge it on the same link."""
         answers = self._autopilot.firmware.commands.answers
         result: Result | None
         if command.number in answers:
@@ -59,7 +60,7 @@ class Commands:
             self._acknowledge(command, result)
 
     def set_mode(self, base_mode: int, custom_mode: int, sender: tuple[int, int]) -> None:
-        """SET_MODE, the message that came before the command."""
+        """SET_MODE, the deprecated message."""
         firmware = self._autopilot.firmware
         request = firmware.commands.set_mode(base_mode, custom_mode)
         result = self._request(request, sender[1] == _MISSION_PLANNER)
@@ -96,14 +97,14 @@ class Commands:
         return autopilot.happen(f"force {request.event}" if forced else request.event)
 
     def _takeoff(self, command: Command) -> Result:
-        asked_m = command.params[6]
+        height_m = command.params[6]
         autopilot = self._autopilot
         home_down_m = autopilot.guidance.home_ned_m[2]
         if autopilot.firmware.commands.takeoff_above_home:
-            down_m = home_down_m - asked_m
+            down_m = home_down_m - height_m
             return autopilot.happen("takeoff", Wish(takeoff_ned_m=(math.nan, math.nan, down_m)))
         place = to_metres(autopilot.firmware.origin, *command.params[4:6])
-        down_m = autopilot.firmware.origin[2] - asked_m
+        down_m = autopilot.firmware.origin[2] - height_m
         finite = (value if math.isfinite(value) else math.nan for value in (*place, down_m))
         north, east, down = finite
         return autopilot.happen("takeoff", Wish(takeoff_ned_m=(north, east, down)))
@@ -120,7 +121,7 @@ class Commands:
         return autopilot.happen("loiter") if known else Result.UNSUPPORTED
 
     def _set_home(self, command: Command) -> Result:
-        """param1 = 1: here; else a place in degrees and metres above the sea."""
+        """MAV_CMD_DO_SET_HOME. param1 = 1: here; else a place in degrees and AMSL metres."""
         latitude, longitude, height_m = command.params[4:7]
         autopilot = self._autopilot
         if command.params[0] == 1.0:
@@ -133,15 +134,15 @@ class Commands:
         return Result.ACCEPTED
 
     def _reposition(self, command: Command) -> Result:
-        """Hold there from now on, flying there at the speed given; what is not finite stays as it
-        is."""
+        """MAV_CMD_DO_REPOSITION: fly to a place and hold there. Coordinates that are not finite
+        keep their present value."""
         if command.params[1] != _CHANGE_MODE:
             return Result.UNSUPPORTED
         autopilot = self._autopilot
         yaw_rad, latitude, longitude, height_m = command.params[3:7]
-        strictly = autopilot.firmware.commands.repositions_strictly
-        speed_mps = math.inf if strictly or not command.params[0] > 0.0 else command.params[0]
-        if strictly:
+        strict = autopilot.firmware.commands.repositions_strictly
+        speed_mps = math.inf if strict or not command.params[0] > 0.0 else command.params[0]
+        if strict:
             if command.frame is None:
                 return Result.UNSUPPORTED
             if not (latitude or longitude):
@@ -157,7 +158,7 @@ class Commands:
         return result
 
     def go_to(self, place: tuple[float, float, float], frame: int) -> bool:
-        """A place in degrees and metres of this MAV_FRAME, for a vehicle that obeys setpoints."""
+        """Fly to a place in degrees and metres; False in a mode that does not obey setpoints."""
         autopilot = self._autopilot
         obeys = autopilot.commander.mode.behaviour is Behaviour.SETPOINT
         if obeys and autopilot.commander.armed:
@@ -165,8 +166,8 @@ class Commands:
         return obeys
 
     def _place(self, latitude: float, longitude: float, height_m: float, frame: int) -> Triple:
-        """NED, of a place in degrees and a height of this MAV_FRAME; where it is in what of it
-        is not finite."""
+        """NED position of a place in degrees and a height of this MAV_FRAME; the present position
+        replaces coordinates that are not finite."""
         autopilot = self._autopilot
         origin, home_down_m = autopilot.firmware.origin, autopilot.guidance.home_ned_m[2]
         here = autopilot.senses.look().position_ned_m
@@ -177,7 +178,10 @@ class Commands:
         return north, east, down if math.isfinite(down) else here[2]
 
     def _change_speed(self, command: Command) -> Result:
-        """Of automatic flight across the ground, until another mode; none is its own again."""
+        """MAV_CMD_DO_CHANGE_SPEED across the ground, in automatic flight until the next mode.
+
+        A speed that is not positive restores the default.
+        """
         kind, speed_mps = command.params[:2]
         autopilot = self._autopilot
         if speed_mps > 0.0 and kind in _VERTICAL_SPEEDS:
@@ -187,22 +191,22 @@ class Commands:
         return Result.ACCEPTED if known else autopilot.firmware.commands.speed_refusal
 
     def _turn(self, command: Command) -> Result:
-        """To a course, or by so much: degrees."""
-        asked_deg, speed_dps, sense, relative = command.params[:4]
+        """MAV_CMD_CONDITION_YAW: to a yaw, or relative to the present one; degrees."""
+        yaw_deg, speed_dps, sense, relative = command.params[:4]
         autopilot = self._autopilot
         if not autopilot.commander.knows("turn"):
             return Result.UNSUPPORTED
-        if math.isfinite(asked_deg):
+        if math.isfinite(yaw_deg):
             from_rad = autopilot.senses.look().yaw_rad if relative else 0.0
-            turn_rad = math.radians(asked_deg) * (-1.0 if relative and sense < 0 else 1.0)
+            turn_rad = math.radians(yaw_deg) * (-1.0 if relative and sense < 0 else 1.0)
             turn_radps = math.radians(speed_dps) if speed_dps > 0.0 else math.inf
             yaw_rad = math.remainder(from_rad + turn_rad, 2.0 * math.pi)
             autopilot.guidance.turn_to(yaw_rad, turn_radps)
         return autopilot.happen("turn")
 
     def _reboot(self, command: Command) -> Result:
-        wish = command.params[0]
-        return self._autopilot.happen("reboot") if wish >= 1.0 else Result.UNSUPPORTED
+        restart = command.params[0] >= 1.0
+        return self._autopilot.happen("reboot") if restart else Result.UNSUPPORTED
 
     def _start_mission(self, command: Command) -> Result:
         autopilot = self._autopilot
@@ -235,7 +239,7 @@ class Commands:
     def _refuse_interval(self, number: float, text: str) -> Result:
         autopilot = self._autopilot
         if text and math.isfinite(number):
-            autopilot.commander.texts.append(StatusText(Severity.INFO, text.format(id=int(number))))
+            autopilot.commander.texts.append(info(text.format(id=int(number))))
         return autopilot.firmware.streams.refusal
 
     def _get_interval(self, command: Command) -> Result:
@@ -264,30 +268,31 @@ class Commands:
         return Result.ACCEPTED
 
 
+# By MAV_CMD
 HANDLERS: dict[int, Callable[[Commands, Command], Result | None]] = {
-    17: Commands._loiter,
-    20: Commands._return,
-    21: Commands._land,
-    22: Commands._takeoff,
-    115: Commands._turn,
-    176: Commands._set_mode,
-    178: Commands._change_speed,
-    179: Commands._set_home,
-    192: Commands._reposition,
-    224: Commands._set_current_item,
-    246: Commands._reboot,
-    300: Commands._start_mission,
-    400: Commands._arm_disarm,
-    410: Commands._request_home,
-    510: Commands._get_interval,
-    511: Commands._set_interval,
-    512: Commands._request_message,
-    520: Commands._request_version,
+    17: Commands._loiter,  # NAV_LOITER_UNLIM
+    20: Commands._return,  # NAV_RETURN_TO_LAUNCH
+    21: Commands._land,  # NAV_LAND
+    22: Commands._takeoff,  # NAV_TAKEOFF
+    115: Commands._turn,  # CONDITION_YAW
+    176: Commands._set_mode,  # DO_SET_MODE
+    178: Commands._change_speed,  # DO_CHANGE_SPEED
+    179: Commands._set_home,  # DO_SET_HOME
+    192: Commands._reposition,  # DO_REPOSITION
+    224: Commands._set_current_item,  # DO_SET_MISSION_CURRENT
+    246: Commands._reboot,  # PREFLIGHT_REBOOT_SHUTDOWN
+    300: Commands._start_mission,  # MISSION_START
+    400: Commands._arm_disarm,  # COMPONENT_ARM_DISARM
+    410: Commands._request_home,  # GET_HOME_POSITION
+    510: Commands._get_interval,  # GET_MESSAGE_INTERVAL
+    511: Commands._set_interval,  # SET_MESSAGE_INTERVAL
+    512: Commands._request_message,  # REQUEST_MESSAGE
+    520: Commands._request_version,  # REQUEST_AUTOPILOT_CAPABILITIES
 }
 
 
 def message_name(number: float) -> str | None:
-    """Name of the message with this id, as a command's float parameter carries it; NaN is 0."""
+    """Name of the message with this id in a float parameter; NaN is 0."""
     if number != number:
         return name_of(0)
     return name_of(int(number)) if math.isfinite(number) and number >= 0 else None

@@ -1,7 +1,6 @@
-"""SI values as the fields of MAVLink messages hold them: scaled, rounded and within their range.
+"""Conversion of SI values to fields of MAVLink messages: scaled, rounded, limited to their range.
 
-The one place of the simulator's side that converts units and frames for messages. Knows no vehicle
-and no message.
+All unit conversions of telemetry are here. Knows no vehicle and no message.
 """
 
 from __future__ import annotations
@@ -18,7 +17,7 @@ _RANGES = {
 
 
 def fit(value: float, bits: int, *, signed: bool = True) -> int:
-    """Nearest integer that a field of `bits` holds; what is not finite becomes 0."""
+    """Nearest integer within a field of `bits`; 0 for what is not finite."""
     if value - value != 0.0:  # infinite or not a number
         return 0
     low, high = _RANGES[bits, signed]
@@ -26,13 +25,18 @@ def fit(value: float, bits: int, *, signed: bool = True) -> int:
 
 
 def centi(velocity: Triple) -> tuple[int, int, int]:
-    """m/s as cm/s in two bytes each."""
+    """m/s -> cm/s, int16."""
     return fit(velocity[0] * 100, 16), fit(velocity[1] * 100, 16), fit(velocity[2] * 100, 16)
 
 
 def heading_cdeg(yaw_rad: float) -> int:
-    """0 .. 35999; what is not finite becomes 0."""
+    """Yaw -> centidegrees 0 .. 35999; 0 for what is not finite."""
     return fit(math.degrees(yaw_rad) * 100, 32) % 36000
+
+
+def pressure_hpa(height_m: float) -> float:
+    """Pressure of the standard atmosphere at this height above the sea; 0 above 44 km."""
+    return 1013.25 * math.pow(max(0.0, 1.0 - 2.25577e-5 * height_m), 5.25588)
 
 
 def in_body(attitude: Quaternion, vector_ned: Triple) -> Triple:
@@ -49,7 +53,7 @@ def in_body(attitude: Quaternion, vector_ned: Triple) -> Triple:
 
 
 def motion_fields(motion: MotionSetpoint) -> tuple[float, ...]:
-    """A motion as POSITION_TARGET_LOCAL_NED and its like have it: NED, SI, NaN where nothing is."""
+    """A setpoint as the fields of POSITION_TARGET_LOCAL_NED: NED, SI, NaN where not demanded."""
     return (
         *motion.position_ned_m,
         *motion.velocity_ned_mps,

@@ -1,8 +1,7 @@
-"""The mission protocol of one link: upload item by item, download, clear, current item.
+"""Mission protocol of one link: upload, download, clear and current item.
 
-Missions, fences and rally points come and go alike. Knows messages and items; how a mission is
-flown is `simulator.autopilot.mission`'s affair, and what items a firmware takes, and how it shows
-them, the firmware's.
+Missions, fences and rally points are transferred alike. Knows messages and items; the flight of a
+mission is in `simulator.autopilot.mission`, and which items a firmware takes in its `MissionRules`.
 """
 
 from __future__ import annotations
@@ -19,8 +18,8 @@ from simulator.mavlink.codec import Message
 from simulator.mavlink.outbox import Outbox
 from simulator.mavlink.texts import Texts
 
-ASK_AGAIN_S, GIVE_UP_S = 0.25, 5.0
-CHECKED_S = 0.03  # after it was taken a mission may be flown, where it is checked first
+REPEAT_S, GIVE_UP_S = 0.25, 5.0
+CHECK_S = 0.03  # from the last item until a strict firmware has checked the mission
 _ANY_TYPE = 255
 _KINDS = frozenset({0, 1, 2})  # MAV_MISSION_TYPE: mission, fence, rally points
 
@@ -28,7 +27,7 @@ _KINDS = frozenset({0, 1, 2})  # MAV_MISSION_TYPE: mission, fence, rally points
 _UNEXPECTED = StatusText(Severity.CRITICAL, "WPM: REJ. CMD: Req. WP was unexpected")
 _BUSY = StatusText(Severity.CRITICAL, "WPM: IGN MISSION_COUNT: Busy")
 _TIMEOUT = StatusText(Severity.CRITICAL, "Operation timeout")
-_UNASKED = StatusText(Severity.CRITICAL, "IGN MISSION_ITEM: No transfer")
+_NOT_REQUESTED = StatusText(Severity.CRITICAL, "IGN MISSION_ITEM: No transfer")
 
 
 class Ack(IntEnum):
@@ -44,39 +43,39 @@ class Ack(IntEnum):
 
 @dataclass(slots=True)
 class Upload:
-    """Under way: from whom, what has come, when the next item was asked for."""
+    """An upload in progress: sender, items received, time of the last request."""
 
     peer: tuple[int, int]
     kind: int
     count: int
     items: list[Item]
     begun_s: float
-    asked_s: float
+    requested_s: float
 
 
 @dataclass(slots=True)
 class Download:
-    """Under way: to whom, which item comes next."""
+    """A download in progress: receiver and next item."""
 
     peer: tuple[int, int]
     kind: int
-    heard_s: float
+    active_s: float
     due: int = 0
 
 
 @dataclass(slots=True)
 class MissionTransfer:
-    """What one link has under way."""
+    """Mission transfers of one link."""
 
     outbox: Outbox
-    texts: Texts  # of the link alone
+    texts: Texts  # of this link
     mission: Mission
     rules: MissionRules
     _upload: Upload | None = None
     _download: Download | None = None
-    _taken: tuple[int, int] = (0, 0)  # how many items of which kind were uploaded last
-    _unchecked: tuple[tuple[Item, ...], float] | None = None  # a mission, and when it was taken
-    _whole: bool = False  # places come in whole 1e-7 degrees
+    _taken: tuple[int, int] = (0, 0)  # count and kind of the last upload
+    _unchecked: tuple[tuple[Item, ...], float] | None = None  # a mission and its arrival time
+    _whole: bool = False  # the peer uses the _INT messages, in 1e-7 degrees
 
     @property
     def under_way(self) -> bool:
@@ -84,32 +83,32 @@ class MissionTransfer:
         return not (self._upload is None and self._download is None and self._unchecked is None)
 
     def handle(self, message: Message, now_s: float) -> None:
-        """One message of the mission protocol, addressed to us."""
+        """Handle one message of the mission protocol addressed to this vehicle."""
         self._check(math.inf)
         HANDLERS[message.name](self, message, now_s)
 
     def _check(self, now_s: float) -> None:
-        """An uploaded mission becomes the vehicle's, if it is time."""
-        if self._unchecked is not None and now_s - self._unchecked[1] >= CHECKED_S:
+        """Replace the vehicle's mission by the uploaded one once it has been checked."""
+        if self._unchecked is not None and now_s - self._unchecked[1] >= CHECK_S:
             self.mission.keep(0, self._unchecked[0])
             self._unchecked = None
 
     def step(self, now_s: float) -> None:
-        """Ask again for an item that does not come; after a while no more."""
+        """Request a missing item again, and give up after a while."""
         self._check(now_s)
         download = self._download
-        if download is not None and now_s - download.heard_s > GIVE_UP_S:
+        if download is not None and now_s - download.active_s > GIVE_UP_S:
             self._download = None
             if self.rules.strict:
-                self.texts.say(_TIMEOUT)
+                self.texts.send(_TIMEOUT)
         upload = self._upload
         if upload is None:
             return
         if now_s - upload.begun_s > GIVE_UP_S:
             self._acknowledge(upload.peer, Ack.CANCELLED, upload.kind)
             self._upload = None
-        elif now_s - upload.asked_s > ASK_AGAIN_S:
-            self._ask(upload, now_s)
+        elif now_s - upload.requested_s > REPEAT_S:
+            self._request_item(upload, now_s)
 
     # -- up ----------------------------------------------------------------------------------
 
@@ -118,7 +117,7 @@ class MissionTransfer:
         kind = message.mission_type
         if self.rules.strict and self._download is not None:
             self._acknowledge(peer, Ack.ERROR, self._download.kind)
-            self.texts.say(_BUSY)
+            self.texts.send(_BUSY)
         elif kind not in _KINDS:
             self._acknowledge(peer, self.rules.unknown_kind, kind)
         elif message.count > ITEMS_MAX:
@@ -128,10 +127,10 @@ class MissionTransfer:
             self._acknowledge(peer, Ack.ACCEPTED, kind)
         else:
             self._upload = Upload(peer, kind, message.count, [], now_s, now_s)
-            self._ask(self._upload, now_s)
+            self._request_item(self._upload, now_s)
 
-    def _ask(self, upload: Upload, now_s: float) -> None:
-        upload.asked_s = now_s
+    def _request_item(self, upload: Upload, now_s: float) -> None:
+        upload.requested_s = now_s
         whole = self._whole and self.rules.strict
         name = "MISSION_REQUEST_INT" if whole else "MISSION_REQUEST"
         self.outbox.send(name, *upload.peer, len(upload.items), upload.kind)
@@ -143,21 +142,21 @@ class MissionTransfer:
             self._take_late(message, peer)
         if upload is None or upload.peer != peer:
             return
-        if message.seq != len(upload.items):  # one that came twice
+        if message.seq != len(upload.items):  # a duplicate
             return
         item = _read(message)
         refused = self.rules.refusal(upload.kind, item)
         if refused is not None:
-            result, said = refused
+            result, text = refused
             self._acknowledge(upload.peer, result, upload.kind)
-            if said is not None:
-                self.texts.say(said)
+            if text is not None:
+                self.texts.send(text)
             self._upload = None
             return
         upload.items.append(item)
         upload.begun_s = now_s
         if len(upload.items) < upload.count:
-            self._ask(upload, now_s)
+            self._request_item(upload, now_s)
             return
         if self.rules.strict and upload.kind == 0:
             self._unchecked = (tuple(upload.items), now_s)
@@ -166,18 +165,18 @@ class MissionTransfer:
         self._upload, self._taken = None, (upload.count, upload.kind)
         self._acknowledge(upload.peer, Ack.ACCEPTED, upload.kind)
         if upload.kind in self.rules.texts:
-            self.texts.say(self.rules.texts[upload.kind])
+            self.texts.send(self.rules.texts[upload.kind])
 
     def _take_late(self, message: Message, peer: tuple[int, int]) -> None:
-        """The last item again, from one that did not hear it was taken; or one unasked for."""
+        """An item without an upload: the last one repeated, or one that was not requested."""
         if (message.seq + 1, message.mission_type) == self._taken:
             self._acknowledge(peer, Ack.ACCEPTED, message.mission_type)
             return
         self._acknowledge(peer, Ack.ERROR, message.mission_type)
-        self.texts.say(_UNASKED)
+        self.texts.send(_NOT_REQUESTED)
 
-    def _heard_ack(self, message: Message, now_s: float) -> None:
-        """The peer wants to be asked in the other kind, or no more."""
+    def _ack(self, message: Message, now_s: float) -> None:
+        """MISSION_ACK of the peer: it wants the other kind of request, or cancels."""
         peer, upload = (message.system, message.component), self._upload
         if self._download is not None and self._download.peer == peer:
             self._download = None
@@ -185,7 +184,7 @@ class MissionTransfer:
             return
         if message.type == Ack.UNSUPPORTED:
             self._whole = not self._whole
-            self._ask(upload, now_s)
+            self._request_item(upload, now_s)
         elif message.type == Ack.CANCELLED:
             self._upload = None
 
@@ -203,39 +202,39 @@ class MissionTransfer:
         peer, kind = (message.system, message.component), message.mission_type
         self._whole = whole = message.name == "MISSION_REQUEST_INT"
         items = self.mission.listed(kind)
-        shows_home = self.rules.home_first and kind == 0 and message.seq == 0
-        there = shows_home or message.seq < len(items)
-        if self.rules.strict and not self._is_due(peer, kind, message.seq, there):
+        is_home = self.rules.home_first and kind == 0 and message.seq == 0
+        exists = is_home or message.seq < len(items)
+        if self.rules.strict and not self._is_due(peer, kind, message.seq, exists):
             return
         if self._download is not None:
-            self._download.heard_s = now_s
-        if not there:
+            self._download.active_s = now_s
+        if not exists:
             self._acknowledge(peer, Ack.INVALID_SEQUENCE, kind)
             return
-        item = self._home() if shows_home else items[message.seq]
+        item = self._home() if is_home else items[message.seq]
         places = (item.x, item.y) if whole else (item.x * 1e-7, item.y * 1e-7)
         current = int(not kind and message.seq == self.mission.current)
-        goes_on = int(kind not in self.rules.without_autocontinue)
+        autocontinue = int(kind not in self.rules.without_autocontinue)
         head = (*peer, message.seq, self.rules.frame_shown(item, whole), item.command)
         name = "MISSION_ITEM_INT" if whole else "MISSION_ITEM"
-        self.outbox.send(name, *head, current, goes_on, *item.params, *places, item.z, kind)
+        self.outbox.send(name, *head, current, autocontinue, *item.params, *places, item.z, kind)
 
     def _home(self) -> Item:
-        """As an item of a mission."""
+        """Home as an item of a mission."""
         view = self.outbox.view
         north_m, east_m, down_m = view.autopilot.guidance.home_ned_m
         place = view.geodetic(north_m, east_m)
         return Item(0, Kind.WAYPOINT, (0.0,) * 4, *place, view.altitude_mm(down_m) * 1e-3)
 
-    def _is_due(self, peer: tuple[int, int], kind: int, number: int, there: bool) -> bool:
-        """The item that comes next, or the last one again; another ends the download."""
+    def _is_due(self, peer: tuple[int, int], kind: int, number: int, exists: bool) -> bool:
+        """Whether it is the next item or the last one again; any other ends the download."""
         download = self._download
         if download is None or (download.peer, download.kind) != (peer, kind):
             return False
-        if not there or number not in (download.due - 1, download.due):
+        if not exists or number not in (download.due - 1, download.due):
             self._download = None
             self._acknowledge(peer, Ack.ERROR, kind)
-            self.texts.say(_UNEXPECTED)
+            self.texts.send(_UNEXPECTED)
             return False
         download.due = number + 1
         return True
@@ -255,17 +254,17 @@ def _read(message: Message) -> Item:
     """MISSION_ITEM_INT, or MISSION_ITEM with its places in degrees."""
     x, y = message.x, message.y
     if message.name == "MISSION_ITEM":
-        x, y = (_whole(value * 1e7) for value in (x, y))
+        x, y = (_integer(value * 1e7) for value in (x, y))
     params = (message.param1, message.param2, message.param3, message.param4)
     return Item(message.frame, message.command, params, x, y, message.z)
 
 
-def _whole(value: float) -> int:
+def _integer(value: float) -> int:
     return int(min(2e9, max(-2e9, value))) if value == value else 0
 
 
 HANDLERS: dict[str, Callable[[MissionTransfer, Message, float], None]] = {
-    "MISSION_ACK": MissionTransfer._heard_ack,
+    "MISSION_ACK": MissionTransfer._ack,
     "MISSION_COUNT": MissionTransfer._count,
     "MISSION_ITEM": MissionTransfer._item,
     "MISSION_ITEM_INT": MissionTransfer._item,

@@ -1,7 +1,7 @@
-"""Messages of where the vehicle is, how it moves and where it is told to be.
+"""Builders of messages about position, motion and setpoints.
 
-One function per message, its fields in the order of the XML. Knows no links, rates or sequence
-numbers.
+One function per message, named like it, returns its fields in the order of the XML. Knows no links,
+rates or sequence numbers.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from simulator.mavlink.fields import centi, fit, heading_cdeg, motion_fields
+from simulator.mavlink.fields import centi, fit, heading_cdeg, motion_fields, pressure_hpa
 from simulator.mavlink.view import View
 
 
@@ -46,20 +46,15 @@ def global_position_int(view: View) -> Sequence[Any]:
     )
 
 
-def pressure_hpa(height_m: float) -> float:
-    """Pressure of the standard atmosphere at this height above the sea; 0 above 44 km."""
-    return 1013.25 * math.pow(max(0.0, 1.0 - 2.25577e-5 * height_m), 5.25588)
-
-
 def scaled_pressure(view: View) -> Sequence[Any]:
-    """hPa; 25 degrees."""
+    """Static pressure in hPa; 25 degC."""
     down_m = view.autopilot.senses.look().position_ned_m[2]
     height_m = view.autopilot.firmware.origin[2] - down_m
     return (view.time_ms, pressure_hpa(height_m), 0.0, 2500, 0)
 
 
 def vibration(view: View) -> Sequence[Any]:
-    """None."""
+    """No vibration."""
     return (view.time_us, 0.0, 0.0, 0.0, 0, 0, 0)
 
 
@@ -78,7 +73,7 @@ def vfr_hud(view: View) -> Sequence[Any]:
 
 
 def gps_raw_int(view: View) -> Sequence[Any]:
-    """Its accuracies are PX4's SIH's: larger than the errors."""
+    """Accuracies as PX4's SIH reports them: larger than the errors."""
     if not view.has_fix:
         return (view.time_us, 1, 0, 0, 0, 65535, 65535, 65535, 65535, 0, *(0,) * 6)
     fix = view.autopilot.plant.fix
@@ -108,17 +103,3 @@ def attitude_target(view: View) -> Sequence[Any]:
 
 def position_target_local_ned(view: View) -> Sequence[Any]:
     return (view.time_ms, 1, 0, *motion_fields(view.autopilot.pilot.motion))
-
-
-MESSAGES = (
-    attitude,
-    attitude_quaternion,
-    local_position_ned,
-    global_position_int,
-    scaled_pressure,
-    vibration,
-    vfr_hud,
-    gps_raw_int,
-    attitude_target,
-    position_target_local_ned,
-)

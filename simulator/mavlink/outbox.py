@@ -1,4 +1,4 @@
-"""What one link has to say: messages framed, numbered and queued until datagrams take them.
+"""Send queue of one link: messages framed, numbered and joined to datagrams.
 
 Knows the view that fills messages and the link's sequence numbers; knows no client and no rate.
 """
@@ -16,18 +16,18 @@ DATAGRAM_MAX = 1400
 
 @dataclass(slots=True)
 class Outbox:
-    """`sequence`: of the next frame, 0 .. 255."""
+    """Send queue. `sequence`: number of the next frame, 0 .. 255."""
 
     view: View
     sequence: int = 0
     _frames: list[bytes] = field(default_factory=list)
 
     def send(self, name: str, *values: object) -> None:
-        """Queue one message; `values` in the order of the XML."""
+        """Queue one message; `values` in the field order of the XML."""
         self._frame(name, layout(name).pack(values))
 
     def send_now(self, name: str) -> None:
-        """Queue a message that the view can fill, as it is now."""
+        """Queue a message with its contents of now, filled by the view."""
         self._frame(name, self.view.payload(name))
 
     def _frame(self, name: str, payload: bytes) -> None:
@@ -36,7 +36,7 @@ class Outbox:
         self.sequence = (self.sequence + 1) & 0xFF
 
     def drain(self) -> list[bytes]:
-        """Everything queued, as datagrams of whole frames."""
+        """Remove everything queued, as datagrams of whole frames."""
         if not self._frames:
             return []
         together = self._frames[0] if len(self._frames) == 1 else b"".join(self._frames)
@@ -45,7 +45,7 @@ class Outbox:
 
 
 def _datagrams(frames: bytes) -> list[bytes]:
-    """Many unsigned frames, cut between frames into pieces that a datagram holds."""
+    """Unsigned frames, cut between frames into datagrams of at most DATAGRAM_MAX bytes."""
     datagrams: list[bytes] = []
     begin = at = 0
     while at < len(frames):

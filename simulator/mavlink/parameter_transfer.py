@@ -1,6 +1,6 @@
-"""The parameter protocol of one link: read, list, set.
+"""Parameter protocol of one link: read, list, set.
 
-Knows messages; what a parameter is and takes is `simulator.autopilot.parameters`' affair.
+Knows messages; values and their ranges are in `simulator.autopilot.parameters`.
 """
 
 from __future__ import annotations
@@ -12,13 +12,13 @@ from simulator.autopilot.parameters import HASH, MAV_PARAM_TYPE_UINT32
 from simulator.mavlink.codec import Message
 from simulator.mavlink.outbox import Outbox
 
-PER_STEP = 4  # of a list
-BY_NAME = 65535  # PARAM_VALUE.param_index of an answer that has none
+PER_STEP = 4  # parameters of a list
+NO_INDEX = 65535  # PARAM_VALUE.param_index of an answer without one
 
 
 @dataclass(slots=True)
 class ParameterTransfer:
-    """What one link has under way."""
+    """Parameter transfers of one link."""
 
     outbox: Outbox
     _due: list[str] = field(default_factory=list)
@@ -28,26 +28,26 @@ class ParameterTransfer:
         return bool(self._due)
 
     def handle(self, message: Message) -> None:
-        """One message of the parameter protocol, addressed to us."""
+        """Handle one message of the parameter protocol addressed to this vehicle."""
         HANDLERS[message.name](self, message)
 
     def step(self) -> None:
-        """The list goes out bit by bit."""
+        """Queue the next parameters of a requested list."""
         for name in self._due[:PER_STEP]:
             self._answer(name, listed=True)
         del self._due[:PER_STEP]
 
     def _answer(self, name: str, *, listed: bool = False) -> None:
-        """Queue PARAM_VALUE; `listed`: its number was asked for."""
+        """Queue PARAM_VALUE; `listed`: as part of a list or requested by index."""
         autopilot = self.outbox.view.autopilot
         if name == HASH:
             head = (HASH.encode(), autopilot.parameters.hash_on_wire, MAV_PARAM_TYPE_UINT32)
-            self.outbox.send("PARAM_VALUE", *head, len(autopilot.parameters.names), BY_NAME)
+            self.outbox.send("PARAM_VALUE", *head, len(autopilot.parameters.names), NO_INDEX)
             return
         value, kind = autopilot.parameters.to_wire(name)
         names = autopilot.parameters.names
         numbered = listed or autopilot.firmware.link.parameters_numbered
-        index = names.index(name) if numbered else BY_NAME
+        index = names.index(name) if numbered else NO_INDEX
         self.outbox.send("PARAM_VALUE", name.encode(), value, kind, len(names), index)
 
     def _read(self, message: Message) -> None:
@@ -67,7 +67,7 @@ class ParameterTransfer:
 
     def _set(self, message: Message) -> None:
         table = self.outbox.view.autopilot.parameters
-        if self._is_hash(message.param_id):  # the client has them all
+        if self._is_hash(message.param_id):  # the client has the whole list already
             self._due = []
         if table.set_from_wire(message.param_id, message.param_value, message.param_type):
             self._answer(message.param_id)

@@ -1,6 +1,6 @@
 """Telemetry of one link: the streams, their intervals and when each is due.
 
-Knows no client and no frame; the outbox fills and frames what is due.
+Knows no client and no frame; `simulator.mavlink.outbox` fills and frames what is due.
 """
 
 from __future__ import annotations

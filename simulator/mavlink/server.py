@@ -1,4 +1,4 @@
-"""The MAVLink side of one link, without I/O: who speaks, and who of us answers.
+"""MAVLink server of one link, without I/O: received messages and the part that handles each.
 
 Each link has its own sequence numbers, rates and clients. Answers and telemetry wait in order in
 the `outbox`. Knows no socket and no clock: time is the autopilot's.
@@ -28,9 +28,13 @@ _FTP_NAK, _FTP_ERROR_NOT_FOUND = 128 + 1, 10
 
 @dataclass(slots=True)
 class Server:
-    """One link of one vehicle. `rates_hz`: what it sends without being asked.
+    """One link of one vehicle.
 
-    `barrier` leaves TIMESYNC requests to `send_barrier`: in lockstep they are the clock.
+    Args:
+        view: contents of the messages.
+        rates_hz: messages sent without a request.
+        barrier: leave TIMESYNC requests to `send_barrier`: in lockstep they are the clock.
+        strict: reports messages that the autopilot ignores.
     """
 
     view: View
@@ -63,7 +67,7 @@ class Server:
         )
 
     def restart(self) -> None:
-        """As after boot: default rates, nobody known."""
+        """Reset as after boot: default rates, no known client."""
         self.outbox.sequence = 0
         self.schedule.restart()
         self.texts.restart()
@@ -82,26 +86,26 @@ class Server:
         """Queue a TIMESYNC request."""
         self.outbox.send("TIMESYNC", 0, stamp_ns)
 
-    # -- in ----------------------------------------------------------------------------------
+    # -- received messages -------------------------------------------------------------------
 
     def receive(self, datagram: bytes) -> None:
-        """Handle everything in one datagram; no bytes make this raise."""
+        """Handle all messages of one datagram; no bytes make this raise."""
         for message in self.decoder.read(datagram):
-            self.texts.heard = True
+            self.texts.connected = True
             if self.strict is not None:
-                self._judge(message)
+                self._check(message)
             handler = HANDLERS.get(message.name)
             if handler is not None and self._is_for_us(message):
                 handler(self, message)
 
-    def _judge(self, message: Message) -> None:
+    def _check(self, message: Message) -> None:
         assert self.strict is not None
-        said = self.strict.complaint(message, self.view.autopilot.senses.time_us * 1e-6)
-        if said is not None:
-            self.view.autopilot.commander.texts.append(said)
+        text = self.strict.complaint(message, self.view.autopilot.senses.time_us * 1e-6)
+        if text is not None:
+            self.view.autopilot.commander.texts.append(text)
 
     def _is_for_us(self, message: Message) -> bool:
-        """To our system or all, to the autopilot or all of it."""
+        """Whether its target is this system and its autopilot, or all."""
         system = message.values.get("target_system", 0)
         component = message.values.get("target_component", 0)
         checked = self.view.autopilot.firmware.link.target_component_checked
@@ -117,7 +121,7 @@ class Server:
         read = autopilot.parameters.__getitem__
         if autopilot.firmware.link.is_ground_station(message.type, message.system, read):
             autopilot.watch.hear_ground_station(autopilot.senses.time_s)
-            self.texts.hear_ground_station()
+            self.texts.note_ground_station()
 
     def _command_long(self, message: Message) -> None:
         params = tuple(message.values[f"param{i}"] for i in range(1, 8))
@@ -142,16 +146,17 @@ class Server:
     def _mission(self, message: Message) -> None:
         rules = self.view.autopilot.firmware.missions
         if rules.guided_items and message.name in _ITEMS and message.current == _GUIDED:
-            self._guide(message)
+            self._guided_item(message)
             return
         self._missions.handle(message, self.view.autopilot.senses.time_us * 1e-6)
 
-    def _guide(self, message: Message) -> None:
-        """An item that is no mission's, but where to go now."""
+    def _guided_item(self, message: Message) -> None:
+        """A mission item that is a place to fly to now (ArduPilot, `current` = 2)."""
         scale = 1e-7 if message.name.endswith("INT") else 1.0
         place = (message.x * scale, message.y * scale, message.z)
-        goes = self._commands.go_to(place, message.frame)
-        self.outbox.send("MISSION_ACK", message.system, message.component, 0 if goes else 1, 0)
+        accepted = self._commands.go_to(place, message.frame)
+        result = 0 if accepted else 1  # MAV_MISSION_RESULT
+        self.outbox.send("MISSION_ACK", message.system, message.component, result, 0)
 
     def _timesync(self, message: Message) -> None:
         if message.tc1 == 0:
@@ -165,16 +170,16 @@ class Server:
             self.outbox.send("PING", message.time_usec, message.seq, *sender)
 
     def _rc_channels_override(self, message: Message) -> None:
-        self._steer(message, [message.values[f"chan{i}_raw"] for i in range(1, 9)])
+        self._sticks(message, [message.values[f"chan{i}_raw"] for i in range(1, 9)])
 
     def _manual_control(self, message: Message) -> None:
-        """A joystick: -1000 .. 1000 each, the throttle 0 .. 1000."""
-        ahead, aside, throttle, turn = message.x, message.y, message.z, message.r
-        widths = (1500 + aside // 2, 1500 - ahead // 2, 1000 + throttle, 1500 + turn // 2)
-        self._steer(message, [min(2000, max(1000, width)) for width in widths])
+        """Joystick axes -1000 .. 1000, throttle 0 .. 1000, as pulse widths."""
+        pitch, roll, throttle, yaw = message.x, message.y, message.z, message.r
+        widths = (1500 + roll // 2, 1500 - pitch // 2, 1000 + throttle, 1500 + yaw // 2)
+        self._sticks(message, [min(2000, max(1000, width)) for width in widths])
 
-    def _steer(self, message: Message, widths_us: Sequence[int]) -> None:
-        """By the ground station alone."""
+    def _sticks(self, message: Message, widths_us: Sequence[int]) -> None:
+        """Stick positions; only the ground station may send them."""
         autopilot = self.view.autopilot
         read = autopilot.parameters.__getitem__
         if autopilot.sticks is None:
@@ -183,7 +188,7 @@ class Server:
             autopilot.sticks.override(widths_us, autopilot.senses.time_s)
 
     def _log_request_list(self, _: Message) -> None:
-        """There are none."""
+        """There are no logs."""
         self.outbox.send("LOG_ENTRY", 0, 0, 0, 0, 0)
 
     def _request_data_stream(self, message: Message) -> None:
@@ -191,11 +196,11 @@ class Server:
         self.schedule.set_group(message.req_stream_id, rate_hz)
 
     def _file_transfer(self, message: Message) -> None:
-        asked = message.payload
-        number = (asked[0] | asked[1] << 8) + 1 & 0xFFFF
-        head = (number & 0xFF, number >> 8, asked[2], _FTP_NAK, 1, asked[3])
+        request = message.payload
+        number = (request[0] | request[1] << 8) + 1 & 0xFFFF
+        head = (number & 0xFF, number >> 8, request[2], _FTP_NAK, 1, request[3])
         answer = head + (0,) * 6 + (_FTP_ERROR_NOT_FOUND,)
-        padded = answer + (0,) * (len(asked) - len(answer))
+        padded = answer + (0,) * (len(request) - len(answer))
         self.outbox.send("FILE_TRANSFER_PROTOCOL", 0, message.system, message.component, padded)
 
 

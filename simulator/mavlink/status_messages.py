@@ -1,7 +1,7 @@
-"""Messages of the vehicle's state, its clock, its home and its mission.
+"""Builders of messages about state, clock, home and mission.
 
-One function per message, its fields in the order of the XML. Knows no links, rates or sequence
-numbers.
+One function per message, named like it, returns its fields in the order of the XML. Knows no links,
+rates or sequence numbers.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def gps_global_origin(view: View) -> Sequence[Any]:
 
 
 def mission_current(view: View) -> Sequence[Any]:
-    """Number and count of items; PX4 has 65535 items when it has none, and leaves the rest 0."""
+    """Current item and number of items; PX4 sends 65535 for no items, and 0 for the rest."""
     mission = view.autopilot.mission
     return (mission.current, len(mission.items) or 65535, 0, 0)
 
@@ -100,18 +100,3 @@ def autopilot_version(view: View) -> Sequence[Any]:
         firmware.capabilities, firmware.version, 0, 0, 0,
         (0,) * 8, (0,) * 8, (0,) * 8, 0, 0, view.system, (0,) * 18,
     )  # fmt: skip
-
-
-MESSAGES = (
-    heartbeat,
-    sys_status,
-    battery_status,
-    extended_sys_state,
-    system_time,
-    timesync,
-    home_position,
-    gps_global_origin,
-    mission_current,
-    mission_item_reached,
-    autopilot_version,
-)

@@ -1,6 +1,6 @@
-"""What an autopilot swallows in silence, told aloud and counted (`--strict`).
+"""Reports of messages that an autopilot ignores or misreads without an answer (`--strict`).
 
-Judges messages only; the vehicle goes on as the real one would. Knows no link and no mode.
+Looks at messages only; the vehicle behaves as without it. Knows no link and no mode.
 """
 
 from __future__ import annotations
@@ -12,11 +12,11 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from simulator.autopilot.parameters import ParameterTable
-from simulator.firmware.values import Severity, StatusText
+from simulator.firmware.values import StatusText, warning
 from simulator.mavlink.codec import Message
 
 AUTOPILOT = 1  # MAV_COMP_ID
-SAY_AGAIN_S = 1.0
+REPEAT_S = 1.0
 _RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b11, 64, 128  # type_mask
 _NORM_TOLERANCE = 0.01
 _MOTION = (("x", "y", "z"), ("vx", "vy", "vz"), ("afx", "afy", "afz"))
@@ -24,30 +24,30 @@ _MOTION = (("x", "y", "z"), ("vx", "vy", "vz"), ("afx", "afy", "afz"))
 
 @dataclass(slots=True)
 class Strict:
-    """`swallowed` counts sentences; `complaint` also says each, at most once a second."""
+    """Checks of received messages. `counts`: number of messages by complaint."""
 
     system: int
     parameters: ParameterTable
-    swallowed: Counter[str] = field(default_factory=Counter)
-    _said_s: dict[str, float] = field(default_factory=dict)
+    counts: Counter[str] = field(default_factory=Counter)
+    _reported_s: dict[str, float] = field(default_factory=dict)
 
     def complaint(self, message: Message, now_s: float) -> StatusText | None:
-        """What to say about a message, if anything."""
-        judge = JUDGES.get(message.name)
-        if judge is None or message.values.get("target_system", 0) not in (0, self.system):
+        """Text about a message; None if it is fine, or was reported less than REPEAT_S ago."""
+        check = CHECKS.get(message.name)
+        if check is None or message.values.get("target_system", 0) not in (0, self.system):
             return None
         component = message.values.get("target_component", 0)
-        fault = judge(self, message.values)
+        fault = check(self, message.values)
         if component not in (0, AUTOPILOT):
             fault = f"to component {component} is ignored"
         if not fault:
             return None
         sentence = f"Strict: {message.name} {fault}"
-        self.swallowed[sentence] += 1
-        if now_s - self._said_s.get(sentence, -math.inf) < SAY_AGAIN_S:
+        self.counts[sentence] += 1
+        if now_s - self._reported_s.get(sentence, -math.inf) < REPEAT_S:
             return None
-        self._said_s[sentence] = now_s
-        return StatusText(Severity.WARNING, sentence)
+        self._reported_s[sentence] = now_s
+        return warning(sentence)
 
     def _attitude(self, values: dict[str, Any]) -> str:
         mask, thrust = values["type_mask"], values["thrust"]
@@ -94,7 +94,7 @@ def _printable(name: str) -> str:
     return "".join(letter for letter in name if letter.isprintable()) or "name"
 
 
-JUDGES: dict[str, Callable[[Strict, dict[str, Any]], str]] = {
+CHECKS: dict[str, Callable[[Strict, dict[str, Any]], str]] = {
     "SET_ATTITUDE_TARGET": Strict._attitude,
     "SET_POSITION_TARGET_LOCAL_NED": Strict._motion,
     "SET_POSITION_TARGET_GLOBAL_INT": Strict._motion,

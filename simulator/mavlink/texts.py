@@ -1,6 +1,6 @@
-"""The texts of one link: STATUSTEXT in chunks, and those that wait for a ground station.
+"""STATUSTEXTs of one link: cut into chunks, and held back until a ground station is there.
 
-Knows when a ground station was last heard here; what is said is for others to decide.
+Knows when a ground station was last heard on this link; the texts come from the autopilot.
 """
 
 from __future__ import annotations
@@ -11,48 +11,48 @@ from dataclasses import dataclass, field
 from simulator.firmware.values import StatusText
 from simulator.mavlink.outbox import Outbox
 
-KEPT_US = 5_000_000
+HELD_US = 5_000_000
 LENGTH = 50  # STATUSTEXT.text
 
 
 @dataclass(slots=True)
 class Texts:
-    """`heard`: there is somebody on the link at all."""
+    """Texts of one link. `connected`: anything was received on it."""
 
     outbox: Outbox
-    heard: bool = False
-    _ground_station_us: float = -math.inf  # last heard
-    _kept: list[tuple[int, StatusText]] = field(default_factory=list)
+    connected: bool = False
+    _ground_station_us: float = -math.inf  # its last heartbeat
+    _held: list[tuple[int, StatusText]] = field(default_factory=list)
     _number: int = 0
 
     def restart(self) -> None:
-        """As after boot: what was said is said."""
-        self._ground_station_us, self._kept, self._number = -math.inf, [], 0
+        """Reset as after boot; texts already sent are not repeated."""
+        self._ground_station_us, self._held, self._number = -math.inf, [], 0
 
-    def say(self, said: StatusText) -> None:
-        """Queue a text, if this link gets any."""
-        firmware = self.outbox.view.autopilot.firmware
-        if firmware.link.text_to_ground_stations_only and not self._ground_station_is_there:
-            self._kept.append((self._now_us, said))
+    def send(self, text: StatusText) -> None:
+        """Queue a text, or hold it back until a ground station is there (PX4)."""
+        link = self.outbox.view.autopilot.firmware.link
+        if link.text_to_ground_stations_only and not self._has_ground_station:
+            self._held.append((self._now_us, text))
             return
-        if not self.heard:
+        if not self.connected:
             return
-        text = (said.text + firmware.link.text_suffix).encode("ascii", "replace")
-        for chunk, at in enumerate(range(0, len(text), LENGTH)):
-            piece = text[at : at + LENGTH]
-            self.outbox.send("STATUSTEXT", int(said.severity), piece, self._number, chunk)
+        encoded = (text.text + link.text_suffix).encode("ascii", "replace")
+        for chunk, at in enumerate(range(0, len(encoded), LENGTH)):
+            piece = encoded[at : at + LENGTH]
+            self.outbox.send("STATUSTEXT", int(text.severity), piece, self._number, chunk)
         self._number = (self._number + 1) & 0xFFFF
 
-    def hear_ground_station(self) -> None:
-        """Texts wait for one, but not for long."""
+    def note_ground_station(self) -> None:
+        """A ground station sent a heartbeat: send the texts held back for at most HELD_US."""
         self._ground_station_us = self._now_us
-        kept, self._kept = self._kept, []
-        for at_us, said in kept:
-            if self._now_us - at_us < KEPT_US:
-                self.say(said)
+        held, self._held = self._held, []
+        for at_us, text in held:
+            if self._now_us - at_us < HELD_US:
+                self.send(text)
 
     @property
-    def _ground_station_is_there(self) -> bool:
+    def _has_ground_station(self) -> bool:
         stays_us = self.outbox.view.autopilot.firmware.link.ground_station_stays_s * 1e6
         return self._now_us - self._ground_station_us <= stays_us
 

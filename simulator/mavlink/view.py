@@ -1,4 +1,4 @@
-"""What the messages of one vehicle show: its autopilot, as faults let it be seen.
+"""Contents of all messages of one vehicle: its autopilot, with the faults that change telemetry.
 
 Packs each message once per step for all links. Knows no links, rates or sequence numbers.
 """
@@ -19,7 +19,7 @@ _GPS, _PREARM = 0x20, 0x10000000  # MAV_SYS_STATUS_SENSOR
 
 @dataclass(slots=True)
 class Stuck:
-    """A message that repeats its content; its first field, the time stamp, may run on."""
+    """A message that repeats its content; its first field, the time stamp, may increase."""
 
     stamp_runs: bool
     values: Sequence[Any] | None = None
@@ -32,14 +32,17 @@ class Stuck:
 
 @dataclass(slots=True)
 class View:
-    """What builders read: the autopilot, and what one step's messages share."""
+    """Input of the message builders: the autopilot, and values that several messages need.
+
+    `silent` and `stuck`: messages that a fault stops or freezes.
+    """
 
     autopilot: Autopilot
     system: int
     epoch_us: int  # Unix time of boot
     builders: dict[str, Callable[[View], Sequence[Any]]]  # fields by message
     ping_sequence: int = 0
-    # What faults do to it
+    # changed by faults
     clock_offset_us: int = 0
     silent: set[str] = field(default_factory=set)
     stuck: dict[str, Stuck] = field(default_factory=dict)
@@ -51,7 +54,7 @@ class View:
         self.east_degrees_per_m = east_degrees_per_m(self.autopilot.firmware.origin)
 
     def withheld(self, name: str) -> bool:
-        """What the vehicle cannot say yet, whatever rate it granted."""
+        """Whether the vehicle cannot send this message yet, whatever its rate."""
         autopilot = self.autopilot
         event = autopilot.firmware.streams.withheld_until.get(name)
         return event is not None and event not in autopilot.health.reached
@@ -70,7 +73,7 @@ class View:
         return packed
 
     def restart(self, autopilot: Autopilot) -> None:
-        """Another autopilot, after a reboot."""
+        """Show another autopilot, after a reboot."""
         autopilot.senses.gps_healthy = self.autopilot.senses.gps_healthy
         self.autopilot = autopilot
         self.clock_offset_us = self.ping_sequence = 0
@@ -78,7 +81,7 @@ class View:
 
     @property
     def has_fix(self) -> bool:
-        """No fault takes it away."""
+        """No fault suppresses the GPS fix."""
         return self.autopilot.senses.gps_healthy
 
     @property
@@ -111,7 +114,7 @@ class View:
 
     @property
     def time_us(self) -> int:
-        """The vehicle's clock, as its stamps show it."""
+        """Vehicle time of the time stamps, microseconds."""
         return max(0, self.autopilot.senses.time_us + self.clock_offset_us)
 
     def geodetic(self, north_m: float, east_m: float) -> tuple[int, int]:

@@ -105,7 +105,7 @@ def test_a_companion_that_falls_silent_in_flight_is_noticed() -> None:
         peer.answers_timesync = False
         code, errors = process.finish(20.0)
     assert code == 3
-    assert "fell silent at 12." in errors
+    assert "stopped answering at 12." in errors
     assert "landed and disarmed" in errors
     assert "Traceback" not in errors
 
@@ -157,8 +157,8 @@ def test_it_can_wait_to_be_spoken_to_and_shifts_its_system() -> None:
         (("--scenario", "storm"), "there is no scenario named 'storm'; known are all_together, "),
         (("--vehicle", "no/such.yaml"), "no/such.yaml cannot be read: No such file"),
         (("--firmware", "betaflight"), "--firmware betaflight: unknown; there is px4"),
-        (("--connect", "tcp:127.0.0.1:1"), "tcp:127.0.0.1:1 is no link"),
-        (("--connect", "udpout:127.0.0.1:99999"), "is no link"),
+        (("--connect", "tcp:127.0.0.1:1"), "tcp:127.0.0.1:1 is not a link"),
+        (("--connect", "udpout:127.0.0.1:99999"), "is not a link"),
         (("--speed", "0"), "--speed 0: must be 0.1 .. 1000"),
         (("--speed", "nan"), "--speed nan: must be 0.1 .. 1000"),
         (("--speed", "2", "--lockstep"), "exclude each other"),

@@ -1,4 +1,4 @@
-"""A companion in memory for tests of the simulator: pymavlink here, an Instance there."""
+"""A companion in memory for tests of the simulator: pymavlink on one side, an Instance behind."""
 
 from __future__ import annotations
 

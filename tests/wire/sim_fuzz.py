@@ -1,4 +1,4 @@
-"""Datagrams that nobody should send, without end: the same seed gives the same ones."""
+"""An endless sequence of hostile datagrams; the same seed gives the same ones."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Two talks side by side, row by row: what is equal, what differs, what comes late."""
+"""Comparison of two sessions, row by row: equal, different and late rows."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What an autopilot said, in rows that can be compared, and recordings to ask it again from."""
+"""Messages of an autopilot in comparable rows, and recordings to repeat."""
 
 from __future__ import annotations
 

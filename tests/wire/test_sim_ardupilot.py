@@ -1,4 +1,4 @@
-"""The simulated ArduCopter: what it says unasked, its arming rules, setpoints and their limits.
+"""The simulated ArduCopter: its default messages, arming rules, setpoints and their limits.
 
 Expected values are those of ArduCopter 4.6.3 SITL. The start is ten times as fast as its 42 s.
 """
@@ -78,7 +78,7 @@ def flying(height_m: float = 5.0) -> Bench:
 # -- telemetry -------------------------------------------------------------------------------
 
 
-def test_unasked_it_sends_heartbeats_time_questions_and_where_home_is() -> None:
+def test_without_requests_it_sends_heartbeat_timesync_and_home() -> None:
     """And texts, once somebody spoke; origin and home when the filter has found them."""
     vehicle = bench()
     vehicle.run(20.0)
@@ -92,7 +92,7 @@ def test_unasked_it_sends_heartbeats_time_questions_and_where_home_is() -> None:
     }
 
 
-def test_texts_reach_whoever_has_spoken_whatever_it_says_to_be() -> None:
+def test_texts_are_sent_to_any_client_once_it_has_sent_something() -> None:
     silent, spoken = bench(heartbeat_type=None), bench(heartbeat_type=None)
     spoken.send(mavlink.MAVLink_timesync_message(0, 1))
     for vehicle in (silent, spoken):
@@ -125,7 +125,7 @@ def test_granted_rates_are_exact(message: int, rate_hz: float) -> None:
         (9999, 1, "No ap_message for mavlink id (9999)"),
     ],
 )
-def test_refused_rates_say_why(message: int, rate_hz: float, text: str) -> None:
+def test_refused_rates_are_explained_by_a_text(message: int, rate_hz: float, text: str) -> None:
     vehicle = bench()
     assert vehicle.command(511, message, 1e6 / rate_hz) == [DENIED]
     assert text in vehicle.texts()
@@ -154,7 +154,7 @@ def test_all_streams_at_once() -> None:
     assert first_s == pytest.approx(41.6 * BOOT_SCALE, abs=0.26)
 
 
-def test_version_is_told_on_request() -> None:
+def test_version_on_request() -> None:
     vehicle = bench()
     assert vehicle.command(512, 148) == [ACCEPTED]
     ((_, version),) = vehicle.of("AUTOPILOT_VERSION")
@@ -162,7 +162,7 @@ def test_version_is_told_on_request() -> None:
     assert vehicle.command(512, 331) == [FAILED]
 
 
-def test_truth_is_told_on_request() -> None:
+def test_true_state_on_request() -> None:
     vehicle = flying()
     assert vehicle.command(512, 108) == [ACCEPTED]
     _, truth = vehicle.of("SIM_STATE")[-1]
@@ -178,7 +178,7 @@ def test_truth_is_told_on_request() -> None:
     ("to", "heard"),
     [((1, 1), True), ((0, 0), True), ((1, 191), True), ((1, 5), True), ((7, 1), False)],
 )
-def test_the_component_is_not_checked(to: tuple[int, int], heard: bool) -> None:
+def test_the_target_component_is_not_checked(to: tuple[int, int], heard: bool) -> None:
     vehicle = ready()
     acks = vehicle.command(400, 1, to=to)
     assert acks == ([ACCEPTED] if heard else [])
@@ -188,7 +188,7 @@ def test_the_component_is_not_checked(to: tuple[int, int], heard: bool) -> None:
 # -- modes and arming ------------------------------------------------------------------------
 
 
-def test_a_mode_asked_for_too_early_is_acknowledged_and_lost() -> None:
+def test_a_mode_requested_before_initialisation_is_acknowledged_and_lost() -> None:
     vehicle = bench()
     assert ask_mode(vehicle, GUIDED) == [ACCEPTED]
     assert vehicle.mode == GUIDED
@@ -245,7 +245,7 @@ def test_arming_is_refused_with_a_text(at_s: float, mode: int, text: str) -> Non
     assert not vehicle.armed
 
 
-def test_what_needs_no_position_arms_before_there_is_one() -> None:
+def test_modes_without_position_arm_before_there_is_a_position() -> None:
     vehicle = bench()
     vehicle.run(3.0)
     ask_mode(vehicle, GUIDED_NOGPS)
@@ -254,7 +254,7 @@ def test_what_needs_no_position_arms_before_there_is_one() -> None:
     assert "Mode change to GUIDED failed: requires position" in vehicle.texts()
 
 
-def test_the_prearm_bit_is_judged_for_the_present_mode() -> None:
+def test_the_prearm_bit_is_that_of_the_present_mode() -> None:
     vehicle = bench()
     vehicle.run(3.0)
     bits = []
@@ -275,7 +275,7 @@ def test_arming_twice_forced_and_disarming() -> None:
     assert vehicle.command(400, 1, 2989) == [ACCEPTED]
 
 
-def test_armed_and_not_flown_it_disarms_after_ten_seconds() -> None:
+def test_armed_on_the_ground_it_disarms_after_ten_seconds() -> None:
     vehicle = ready()
     vehicle.command(400, 1)
     armed_s = vehicle.text_at("Arming motors")
@@ -318,7 +318,7 @@ def test_a_stream_without_thrust_cancels_the_takeoff() -> None:
     assert vehicle.instance.autopilot.pilot.landed
 
 
-def test_setpoints_alone_lift_off() -> None:
+def test_takeoff_by_setpoints_alone() -> None:
     """.3 m after 3.3-3.9 s; any thrust is flight, even if it cannot lift."""
     vehicle = ready()
     vehicle.command(400, 1)
@@ -341,7 +341,7 @@ def test_setpoints_alone_lift_off() -> None:
     assert weak.armed
 
 
-def test_set_down_by_setpoints_it_stays_in_the_air_until_land() -> None:
+def test_landed_by_setpoints_it_counts_as_flying_until_land_mode() -> None:
     vehicle = flying(2.0)
     vehicle.run(12.0, lambda: vehicle.attitude(thrust=0.3))
     assert vehicle.height_m < 0.02
@@ -374,7 +374,7 @@ def test_a_forced_disarm_in_the_air_falls() -> None:
 # -- setpoints -------------------------------------------------------------------------------
 
 
-def test_base_mode_says_who_controls_the_position() -> None:
+def test_base_mode_shows_whether_the_position_controller_runs() -> None:
     """The guided bit, 8, is 0 while attitude setpoints fly: it says nothing about the mode."""
     vehicle = flying()
     seen = []
@@ -405,7 +405,7 @@ def test_base_mode_says_who_controls_the_position() -> None:
         (199, 1.0, False),
     ],
 )
-def test_which_attitudes_fly(mask: int, length: float, rolls: bool) -> None:
+def test_which_attitude_setpoints_are_flown(mask: int, length: float, rolls: bool) -> None:
     vehicle = flying()
     vehicle.run(0.6, lambda: vehicle.attitude(roll(8.0, length), HOVER, mask))
     assert (abs(roll_deg(vehicle) - 8.0) < 1.0) == rolls
@@ -448,7 +448,7 @@ def test_without_guid_options_thrust_is_a_climb_rate(thrust: float, climb: float
     assert climb_mps(vehicle) == pytest.approx(climb, abs=0.1)
 
 
-def test_a_thrust_that_is_no_number_is_none_and_is_remembered() -> None:
+def test_a_nan_thrust_is_zero_and_prevents_arming_until_reboot() -> None:
     vehicle = flying()
     vehicle.run(0.5, lambda: vehicle.attitude(LEVEL, NAN))
     assert climb_mps(vehicle) < -2.0
@@ -469,7 +469,7 @@ def test_other_modes_ignore_setpoints(mode: int) -> None:
     assert vehicle.mode == mode
 
 
-def test_a_pilot_keeps_the_vehicle_until_guided_is_asked_for_again() -> None:
+def test_after_a_pilot_took_over_setpoints_need_guided_mode_again() -> None:
     vehicle = flying()
     stream = lambda: vehicle.attitude(roll(5.0), HOVER)  # noqa: E731
     vehicle.run(0.5, stream)
@@ -483,7 +483,7 @@ def test_a_pilot_keeps_the_vehicle_until_guided_is_asked_for_again() -> None:
 
 
 @pytest.mark.parametrize("timeout_s", [3.0, 1.0, 0.5])
-def test_a_lost_stream_levels_after_guid_timeout_and_nothing_is_said(timeout_s: float) -> None:
+def test_a_lost_stream_levels_after_guid_timeout_without_a_text(timeout_s: float) -> None:
     vehicle = flying()
     set_parameter(vehicle, "GUID_TIMEOUT", timeout_s)
     vehicle.run(1.0, lambda: vehicle.attitude(roll(5.0), HOVER))
@@ -537,7 +537,7 @@ def test_a_step_of_ten_degrees_as_measured() -> None:
     assert peak_deg == pytest.approx(10.1, abs=0.15)
 
 
-def test_the_echo_is_the_demand_before_the_boost() -> None:
+def test_attitude_target_has_the_thrust_before_angle_boost() -> None:
     vehicle = flying()
     vehicle.command(511, 83, 20_000)
     vehicle.run(1.0, lambda: vehicle.attitude(roll(30.0), HOVER))
@@ -558,7 +558,7 @@ def test_the_echo_is_the_demand_before_the_boost() -> None:
         (2, ALT_HOLD, ["EKF variance", "EKF Failsafe: changed to ALT_HOLD Mode"]),
     ],
 )
-def test_without_satellites_the_estimate_is_given_up_after_eight_seconds(
+def test_without_gps_the_position_is_lost_after_eight_seconds(
     action: int, mode: int, said: list[str]
 ) -> None:
     vehicle = flying()
@@ -578,7 +578,7 @@ def test_without_satellites_the_estimate_is_given_up_after_eight_seconds(
     assert vehicle.texts(begun_s) == ([*said, "EKF Failsafe Cleared"] if said else [])
 
 
-def test_a_mission_of_home_alone_is_none() -> None:
+def test_a_mission_of_home_alone_cannot_start() -> None:
     vehicle = ready()
     vehicle.send(mavlink.MAVLink_mission_count_message(1, 1, 1))
     vehicle.send(mavlink.MAVLink_mission_item_int_message(1, 1, 0, 6, 16, 0, 1, *(0,) * 7))
@@ -590,7 +590,7 @@ def test_a_mission_of_home_alone_is_none() -> None:
     assert vehicle.texts()[-1] == "Disarming motors"
 
 
-def test_a_mission_begins_behind_its_item_for_home() -> None:
+def test_a_mission_begins_with_the_item_after_home() -> None:
     vehicle = ready()
     latitude, longitude = (round(degrees * 1e7) for degrees in ARDUPILOT.origin[:2])
     ahead = latitude + round(math.degrees(6.0 / 6_371_000) * 1e7)
@@ -639,7 +639,7 @@ def test_the_list_is_numbered() -> None:
     assert {m.param_type for m in told} == {2, 4, 6, 9}
 
 
-def test_two_vehicles_of_one_seed_say_the_same_bytes() -> None:
+def test_the_same_seed_gives_the_same_bytes() -> None:
     said = []
     for _ in range(2):
         vehicle = Bench(

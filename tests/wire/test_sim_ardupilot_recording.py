@@ -1,4 +1,4 @@
-"""A real ArduCopter's recording asked again: the same bytes at the same vehicle times.
+"""A recorded session with a real ArduCopter, repeated: the same bytes at the same vehicle times.
 
 Every answer is compared row by row; what may differ is listed here with its reason.
 """
@@ -61,7 +61,7 @@ def test_every_text_is_the_same_in_order(talks: tuple[Talk, Talk]) -> None:
         assert abs(our_s - real_s) < limit_s, text
 
 
-def test_every_parameter_asked_for_is_the_same(talks: tuple[Talk, Talk]) -> None:
+def test_every_requested_parameter_is_the_same(talks: tuple[Talk, Talk]) -> None:
     """Values, types and the number that says "by name"; unasked ones are not sent here."""
     real, ours = talks
     asked = [row for row in real.parameters if row[0] in ASKED]
@@ -94,14 +94,14 @@ def test_landed_states_are_the_same(talks: tuple[Talk, Talk]) -> None:
     assert late[-1] < LANDING_S
 
 
-def test_the_filter_reports_the_same_progress(talks: tuple[Talk, Talk]) -> None:
+def test_the_ekf_flags_progress_alike(talks: tuple[Talk, Talk]) -> None:
     real, ours = talks
     assert ours.filter_flags == real.filter_flags == [1024, 0, 167, 831]
     late = [a - b for a, b in zip(ours.filter_times_s, real.filter_times_s, strict=True)]
     assert np.abs(late) == pytest.approx(0.0, abs=0.6)  # 2 Hz
 
 
-def test_position_begins_when_it_begins_there(talks: tuple[Talk, Talk]) -> None:
+def test_local_position_begins_at_the_same_time(talks: tuple[Talk, Talk]) -> None:
     real, ours = talks
     assert real.positions_ned_m[0][0] == pytest.approx(41.66, abs=0.05)
     assert ours.positions_ned_m[0][0] == pytest.approx(real.positions_ned_m[0][0], abs=0.06)

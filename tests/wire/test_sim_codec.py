@@ -65,7 +65,7 @@ def _number(field_type: str, rng: random.Random) -> float | int:
 
 
 @pytest.mark.parametrize("name", [*BUILDERS, *ANSWERS, *ASKED])
-def test_frames_are_pymavlinks_byte_for_byte(name: str) -> None:
+def test_frames_equal_those_of_pymavlink(name: str) -> None:
     rng = random.Random(name)
     layout = codec.layout(name)
     for sequence in range(40):
@@ -77,7 +77,7 @@ def test_frames_are_pymavlinks_byte_for_byte(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ASKED)
-def test_reads_what_pymavlink_packed(name: str) -> None:
+def test_decodes_frames_of_pymavlink(name: str) -> None:
     rng = random.Random(name)
     decoder = codec.Decoder()
     for _ in range(40):
@@ -91,7 +91,7 @@ def test_reads_what_pymavlink_packed(name: str) -> None:
     assert not decoder.dropped
 
 
-def test_reads_mavlink_1() -> None:
+def test_decodes_mavlink_1() -> None:
     theirs = mavlink.MAVLink(None, srcSystem=3, srcComponent=7)
     packed = mavlink.MAVLink_param_request_read_message(1, 1, b"COM_OF_LOSS_T", -1).pack(
         theirs, force_mavlink1=True
@@ -109,7 +109,7 @@ def packed_command(number: int) -> bytes:
 
 @settings(max_examples=300, deadline=None)
 @given(st.binary(max_size=300), st.integers(0, 65535))
-def test_a_frame_behind_garbage_is_read_at_once(garbage: bytes, number: int) -> None:
+def test_a_frame_after_garbage_is_decoded_at_once(garbage: bytes, number: int) -> None:
     decoder = codec.Decoder()
     decoder.read(garbage)
     assert [m.command for m in decoder.read(packed_command(number))] == [number]
@@ -117,7 +117,7 @@ def test_a_frame_behind_garbage_is_read_at_once(garbage: bytes, number: int) -> 
 
 @settings(max_examples=300, deadline=None)
 @given(st.binary(max_size=60).filter(lambda b: not set(b) & {0xFD, 0xFE}))
-def test_garbage_in_the_same_datagram_costs_only_itself(garbage: bytes) -> None:
+def test_garbage_in_a_datagram_hides_no_frame(garbage: bytes) -> None:
     decoder = codec.Decoder()
     messages = decoder.read(garbage + packed_command(400) + garbage + packed_command(176))
     assert [m.command for m in messages] == [400, 176]
@@ -134,7 +134,7 @@ def test_garbage_in_the_same_datagram_costs_only_itself(garbage: bytes) -> None:
         (lambda raw: b"", None),
     ],
 )
-def test_what_cannot_be_read_is_counted(spoil: object, reason: str | None) -> None:
+def test_undecodable_bytes_are_counted_by_reason(spoil: object, reason: str | None) -> None:
     decoder = codec.Decoder()
     assert decoder.read(spoil(packed_command(400))) == []
     assert (reason is None and not decoder.dropped) or decoder.dropped[reason] == 1

@@ -1,4 +1,4 @@
-"""Commands in flight, as PX4 1.16.1 and ArduCopter 4.6.3 were seen to carry them out."""
+"""Commands in flight, as measured on PX4 1.16.1 and ArduCopter 4.6.3."""
 
 from __future__ import annotations
 
@@ -64,14 +64,14 @@ def test_a_changed_speed_is_flown_until_another_mode(firmware: Firmware) -> None
 
 
 @pytest.mark.parametrize(("firmware", "answer"), [(PX4, ACCEPTED), (ARDUPILOT, FAILED)])
-def test_no_speed_is_the_mode_s_own(firmware: Firmware, answer: int) -> None:
+def test_a_speed_that_is_not_positive_restores_the_default(firmware: Firmware, answer: int) -> None:
     bench = Bench(firmware=firmware)
     asked = ((1, -1.0), (1, NAN), (0, 3.0), (2, 3.0))
     answers = [bench.command(CHANGE_SPEED, *params)[0] for params in asked]
     assert answers == [answer, answer, ACCEPTED, ACCEPTED]
 
 
-def test_px4_turns_to_the_course_of_a_place_and_stays_where_none_is_told() -> None:
+def test_px4_takes_the_yaw_of_a_reposition_and_keeps_coordinates_that_are_nan() -> None:
     bench = flying(PX4)
     go_north(bench, 3.0, math.pi / 2)
     bench.run(6.0)
@@ -83,7 +83,7 @@ def test_px4_turns_to_the_course_of_a_place_and_stays_where_none_is_told() -> No
         assert truth.position_ned_m[[0, 2]] == pytest.approx([3.0, -5.0], abs=0.3)
 
 
-def test_arducopter_lifts_off_to_a_place_with_a_course_that_is_none() -> None:
+def test_arducopter_lifts_off_to_a_reposition_without_a_finite_yaw() -> None:
     bench = Bench(firmware=ARDUPILOT, boot_scale=0.1)
     bench.boot()
     bench.command(176, 1, GUIDED)
@@ -93,7 +93,7 @@ def test_arducopter_lifts_off_to_a_place_with_a_course_that_is_none() -> None:
     assert bench.height_m > 2.0
 
 
-def test_arducopter_turns_to_a_course_and_by_an_angle() -> None:
+def test_arducopter_turns_to_a_yaw_and_by_an_angle() -> None:
     bench = flying(ARDUPILOT)
     bench.command(INTERVAL, 30, 100_000)
     assert bench.command(TURN, 90, 0, 1, 0) == [ACCEPTED]
@@ -104,7 +104,7 @@ def test_arducopter_turns_to_a_course_and_by_an_angle() -> None:
     assert yaw_rad(bench) == pytest.approx(math.pi / 3, abs=0.03)
 
 
-def test_px4_says_why_no_mode_to_the_component_of_a_ground_station_alone() -> None:
+def test_px4_explains_a_refused_mode_to_ground_station_components_only() -> None:
     bench = flying(PX4)
     said = len(bench.texts())
     assert bench.ask_mode(OFFBOARD) == [ACCEPTED, LATER]
@@ -120,7 +120,7 @@ def test_px4_says_why_no_mode_to_the_component_of_a_ground_station_alone() -> No
     ("firmware", "idle", "refused"),
     [(PX4, (132, 375, 65), (42, 46)), (ARDUPILOT, (22, 26), (111,))],
 )
-def test_intervals_of_what_is_never_said_and_requests_of_what_says_itself(
+def test_intervals_of_messages_never_sent_and_requests_of_event_messages(
     firmware: Firmware, idle: tuple[int, ...], refused: tuple[int, ...]
 ) -> None:
     bench = Bench(firmware=firmware)
@@ -130,7 +130,7 @@ def test_intervals_of_what_is_never_said_and_requests_of_what_says_itself(
 
 
 @pytest.mark.parametrize(("firmware", "answers"), [(PX4, 1), (ARDUPILOT, 0)])
-def test_who_answers_a_ping(firmware: Firmware, answers: int) -> None:
+def test_answers_to_ping(firmware: Firmware, answers: int) -> None:
     bench = Bench(firmware=firmware)
     for target in ((0, 0), (1, 1)):
         bench.send(mavlink.MAVLink_ping_message(123, 7, *target))

@@ -1,4 +1,4 @@
-"""Where the vehicle heads and how fast: body frames, its way, turns and speeds that were asked for.
+"""Yaw and speed in automatic flight: body frames, direction of flight, requested turns and speeds.
 
 Expected values are those of ArduCopter 4.6.3 and PX4 1.16.1 SITL, asked the same.
 """
@@ -111,7 +111,7 @@ def fastest_mps(bench: Bench, duration_s: float) -> float:
         (BODY_OFFSET, (4.0 * math.cos(2.0), 4.0 * math.sin(2.0), -1.0)),
     ],
 )
-def test_an_offset_is_from_where_it_is_and_ahead_is_its_course(
+def test_offset_frames_are_relative_to_position_and_yaw(
     frame: int, moved: tuple[float, float, float]
 ) -> None:
     bench = copter()
@@ -126,7 +126,7 @@ def test_an_offset_is_from_where_it_is_and_ahead_is_its_course(
 @pytest.mark.parametrize(
     ("frame", "flown"), [(BODY, (0.0, 1.0)), (BODY_OFFSET, (0.0, 1.0)), (LOCAL_OFFSET, (1.0, 0.0))]
 )
-def test_a_velocity_ahead_is_along_its_course(frame: int, flown: tuple[float, float]) -> None:
+def test_body_velocities_are_rotated_by_yaw(frame: int, flown: tuple[float, float]) -> None:
     bench = copter()
     ask(bench, LOCAL, (0.0, 0.0, -5.0), mask=YAW_TOO, yaw=math.pi / 2)
     bench.run(5.0)
@@ -134,7 +134,7 @@ def test_a_velocity_ahead_is_along_its_course(frame: int, flown: tuple[float, fl
     assert velocity(bench)[:2] == pytest.approx(flown, abs=0.12)
 
 
-def test_a_yaw_in_a_body_frame_is_from_its_course() -> None:
+def test_a_yaw_in_a_body_frame_is_relative() -> None:
     bench = copter()
     ask(bench, LOCAL, (0.0, 0.0, -5.0), mask=YAW_TOO, yaw=1.0)
     bench.run(5.0)
@@ -151,7 +151,7 @@ def test_a_yaw_in_a_body_frame_is_from_its_course() -> None:
         (LOCAL, 0xC38),  # a position with an acceleration alone
     ],
 )
-def test_what_an_arducopter_cannot_fly_stops_it(frame: int, mask: int) -> None:
+def test_arducopter_stops_at_setpoints_that_it_cannot_fly(frame: int, mask: int) -> None:
     bench = copter()
     bench.run(3.0, lambda: ask(bench, LOCAL, velocity=(3.0, 0, 0), mask=VELOCITY_ALONE), 0.25)
     assert velocity(bench)[0] == pytest.approx(3.0, abs=0.3)
@@ -160,7 +160,7 @@ def test_what_an_arducopter_cannot_fly_stops_it(frame: int, mask: int) -> None:
     assert velocity(bench)[0] == pytest.approx(0.0, abs=0.3)
 
 
-def test_a_force_is_dropped() -> None:
+def test_a_force_setpoint_is_ignored() -> None:
     bench = copter()
     bench.run(3.0, lambda: ask(bench, LOCAL, velocity=(2.0, 0, 0), mask=VELOCITY_ALONE), 0.25)
     ask(bench, LOCAL, mask=0xC3F | 512)
@@ -168,7 +168,7 @@ def test_a_force_is_dropped() -> None:
     assert velocity(bench)[0] == pytest.approx(2.0, abs=0.2)
 
 
-def test_an_arducopter_faces_its_way_unless_told_otherwise() -> None:
+def test_arducopter_faces_its_direction_of_flight_without_a_yaw() -> None:
     """At 1 m/s it did; at 0.3 m/s, a twentieth of its speed being 0.5, it did not."""
     bench = copter()
     ask(bench, LOCAL, (0.0, 30.0, -5.0))
@@ -187,7 +187,7 @@ def test_an_arducopter_faces_its_way_unless_told_otherwise() -> None:
 @pytest.mark.parametrize(
     ("params", "wanted_deg", "took_s"), [((90, 25, 1), 90.0, 4.0), ((45, 10, -1, 1), -45.0, 4.5)]
 )
-def test_a_turn_is_as_fast_as_asked(
+def test_a_turn_has_the_requested_rate(
     params: tuple[float, ...], wanted_deg: float, took_s: float
 ) -> None:
     bench = copter()
@@ -198,7 +198,7 @@ def test_a_turn_is_as_fast_as_asked(
     assert done_s - begun_s == pytest.approx(took_s, abs=0.6)
 
 
-def test_a_speed_asked_for_holds_until_a_setpoint_of_another_kind() -> None:
+def test_a_requested_speed_holds_until_a_setpoint_of_another_kind() -> None:
     """4 m/s asked on the way, 4.1 flown; asked before, it is forgotten: the takeoff was another."""
     bench = copter()
     ask(bench, LOCAL, (30.0, 0.0, -5.0))
@@ -213,14 +213,14 @@ def test_a_speed_asked_for_holds_until_a_setpoint_of_another_kind() -> None:
     assert fastest_mps(bench, 6.0) > 7.0
 
 
-def test_a_speed_asked_for_before_the_first_setpoint_is_forgotten() -> None:
+def test_a_speed_requested_before_the_first_setpoint_is_discarded() -> None:
     bench = copter()
     assert bench.command(178, 1, 3.0, -1) == [ACCEPTED]
     ask(bench, LOCAL, (30.0, 0.0, -5.0))
     assert fastest_mps(bench, 8.0) > 6.0
 
 
-def test_a_place_to_go_to_needs_a_frame() -> None:
+def test_reposition_of_arducopter_needs_a_frame() -> None:
     """ArduCopter takes it as COMMAND_INT alone."""
     bench = copter()
     assert bench.command(192, -1, 1, 0, NAN, 0, 0, 10) == [UNSUPPORTED]
@@ -230,7 +230,7 @@ def test_a_place_to_go_to_needs_a_frame() -> None:
 
 
 @pytest.mark.parametrize("kind", ["", "_int"])
-def test_an_item_marked_as_guided_is_where_an_arducopter_goes_now(kind: str) -> None:
+def test_arducopter_flies_to_a_guided_mission_item_at_once(kind: str) -> None:
     """As DroneKit's simple_goto asks."""
     bench = copter()
     x, y = degrees(bench, 0.0, 20.0)
@@ -247,7 +247,7 @@ def test_an_item_marked_as_guided_is_where_an_arducopter_goes_now(kind: str) -> 
     assert bench.of("MISSION_ACK")[-1][1].type == 1
 
 
-def test_a_px4_faces_the_place_it_goes_to_and_turns_as_asked() -> None:
+def test_px4_faces_its_goal_and_then_takes_the_requested_yaw() -> None:
     bench = px4()
     amsl_m = bench.instance.autopilot.firmware.origin[2] + 3.0
     assert reposition(bench, 0.0, 30.0, amsl_m, ABSOLUTE) == ACCEPTED
@@ -264,7 +264,7 @@ def test_a_px4_faces_the_place_it_goes_to_and_turns_as_asked() -> None:
     assert off_deg(bench, -45.0) < 3.0
 
 
-def test_a_px4_returns_head_first_and_lands_as_it_stood() -> None:
+def test_px4_returns_facing_home_and_lands_with_the_yaw_of_home() -> None:
     bench = px4()
     home_deg = course_deg(bench)
     amsl_m = bench.instance.autopilot.firmware.origin[2] + 3.0
@@ -277,7 +277,7 @@ def test_a_px4_returns_head_first_and_lands_as_it_stood() -> None:
     assert off_deg(bench, home_deg) < 5.0
 
 
-def test_a_px4_goes_to_a_place_at_the_speed_given() -> None:
+def test_px4_repositions_with_the_given_speed() -> None:
     """1.9 m/s of 2 asked."""
     bench = px4()
     amsl_m = bench.instance.autopilot.firmware.origin[2] + 3.0
@@ -292,7 +292,7 @@ def test_a_px4_goes_to_a_place_at_the_speed_given() -> None:
         ((0.0, 0.0), -400.0, ["Already higher than takeoff altitude"]),  # above the ground, it says
     ],
 )
-def test_a_px4_stays_on_the_ground_when_its_takeoff_leads_nowhere_up(
+def test_px4_stays_on_the_ground_if_its_takeoff_does_not_climb(
     place_m: tuple[float, float] | None, up: float, said: list[str]
 ) -> None:
     """As scripts that leave the place 0, or give a height above the ground, find out."""
@@ -310,7 +310,7 @@ def test_a_px4_stays_on_the_ground_when_its_takeoff_leads_nowhere_up(
     assert bench.texts() == wanted
 
 
-def test_a_px4_takes_off_to_the_place_given() -> None:
+def test_px4_takes_off_to_the_given_place() -> None:
     bench = Bench()
     bench.boot()
     amsl_m = bench.instance.autopilot.firmware.origin[2] + 6.0
@@ -330,7 +330,7 @@ def test_a_px4_takes_off_to_the_place_given() -> None:
     ],
     ids=["ardupilot", "px4"],
 )
-def test_the_way_to_a_place_is_sped_up_and_braked_gently(
+def test_acceleration_and_braking_on_the_way_to_a_place(
     vehicle: Callable[[], Bench], frame: int, places_m: tuple[float, ...], fastest: float
 ) -> None:
     bench = vehicle()
@@ -347,7 +347,7 @@ def test_the_way_to_a_place_is_sped_up_and_braked_gently(
     assert place(bench)[0] == pytest.approx(40.0, abs=0.9)
 
 
-def test_hold_asked_for_on_the_way_to_a_place_stops_nothing() -> None:
+def test_hold_requested_on_the_way_to_a_place_does_not_stop_it() -> None:
     """It is the mode in which a PX4 goes there."""
     bench = px4()
     amsl_m = bench.instance.autopilot.firmware.origin[2] + 3.0

@@ -1,4 +1,4 @@
-"""Failsafes by ground station, battery and position, and the parameters that rule them."""
+"""Failsafes by ground station, battery and position, and their parameters."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def test_the_pilot_takes_over_before_the_failsafe_acts() -> None:
     assert (bench.mode, bench.system_status) == (OFFBOARD, 4)
 
 
-def test_a_stream_does_not_end_a_battery_failsafe() -> None:
+def test_setpoints_do_not_end_a_battery_failsafe() -> None:
     bench = flying("COM_LOW_BAT_ACT", 2)
     drain(bench, 0.06)
     bench.run(6.0, bench.attitude)
@@ -99,7 +99,7 @@ def test_a_lost_ground_station(action: int, mode: int) -> None:
     assert (bench.mode, bench.system_status) == (mode, 5 if action else 4)
 
 
-def test_texts_wait_for_a_ground_station_five_seconds() -> None:
+def test_texts_are_held_for_a_ground_station_for_five_seconds() -> None:
     bench = flying("COM_LOW_BAT_ACT", 0)
     begun_s, bench.heartbeat_type = bench.time_s, None
     bench.run(4.0)
@@ -113,7 +113,7 @@ def test_texts_wait_for_a_ground_station_five_seconds() -> None:
     assert bench.texts(begun_s) == ["Critical battery"]  # the other was too old
 
 
-def test_a_worse_battery_changes_what_is_awaited() -> None:
+def test_a_worse_battery_changes_the_delayed_failsafe() -> None:
     bench = flying("COM_LOW_BAT_ACT", 3)
     begun_s = bench.time_s
     drain(bench, 0.06)
@@ -131,7 +131,7 @@ def test_a_worse_battery_changes_what_is_awaited() -> None:
     ]
 
 
-def test_without_position_automatic_flight_lands_and_attitude_flies_on() -> None:
+def test_without_position_automatic_flight_lands_and_attitude_setpoints_continue() -> None:
     bench = flying()
     autopilot = bench.instance.autopilot
     autopilot.senses.gps_healthy = False

@@ -1,4 +1,4 @@
-"""Faults of a scenario, each seen on the wire or in the truth; one row per fault where it fits."""
+"""Faults of a scenario, each observed in telemetry or in the true state."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def test_a_link_fault_begins_and_ends() -> None:
     assert max(b - a for a, b in pairwise(heard_s)) == pytest.approx(1.0, abs=0.03)
 
 
-def test_a_damaged_link_flies_on_and_the_damage_is_dropped() -> None:
+def test_a_corrupting_link_is_survived_and_corrupt_frames_are_dropped() -> None:
     bench = hovering({"fault": "link", "corruption": 0.3, "loss": 0.1, "duplication": 0.1})
     hold(bench, 5.0)
     assert bench.height_m == pytest.approx(3.0, abs=0.2)
@@ -77,7 +77,7 @@ def test_a_damaged_link_flies_on_and_the_damage_is_dropped() -> None:
     assert bench.instance.companion.decoder.dropped["checksum"] > 5
 
 
-def test_estimator_jump_tells_by_its_counter() -> None:
+def test_estimator_jump_increases_the_reset_counter() -> None:
     bench = faulty({"fault": "estimator_jump", "at_s": 2.0, "offset_ned_m": (1.0, 0.0, -0.5)})
     bench.run(4.0)
     odometry = bench.of("ODOMETRY")
@@ -106,7 +106,7 @@ def test_gps_loss_drifts_and_jumps_back() -> None:
     assert found.reset_counter == 1
 
 
-def test_a_silent_message_leaves_the_others_alone() -> None:
+def test_a_silent_message_does_not_affect_the_others() -> None:
     bench = faulty(
         {"fault": "silent_message", "message": "LOCAL_POSITION_NED", "at_s": 2.0, "for_s": 2.0}
     )
@@ -121,7 +121,7 @@ def test_a_silent_message_leaves_the_others_alone() -> None:
 
 
 @pytest.mark.parametrize("runs", [True, False])
-def test_a_stuck_message_repeats_itself(runs: bool) -> None:
+def test_a_stuck_message_repeats_its_content(runs: bool) -> None:
     bench = hovering(
         {"fault": "stuck_message", "message": "ATTITUDE", "at_s": 1.0, "stamp_runs": runs}
     )
@@ -165,7 +165,7 @@ def test_battery_drop() -> None:
     assert {share for at_s, share in left if at_s > 1.01} == {10}
 
 
-def test_reboot_in_flight_falls_silent_disarmed_and_from_zero() -> None:
+def test_reboot_in_flight_disarms_and_restarts_time_after_silence() -> None:
     bench = hovering({"fault": "reboot", "at_s": 8.0, "for_s": 0.5})
     hold(bench, engaged_s(bench) + 8.0 - bench.time_s + 0.3)
     begun_s = bench.time_s
@@ -189,7 +189,7 @@ def test_reboot_keeps_the_parameters_and_the_vehicle_flies_again() -> None:
     bench.run_until(lambda: bench.height_m > 3.5, 15.0)
 
 
-def test_a_clock_jump_shows_in_stamps_and_nowhere_else() -> None:
+def test_a_clock_jump_changes_time_stamps_only() -> None:
     bench = faulty({"fault": "clock_jump", "jump_s": -1.5, "at_s": 2.0})
     bench.run(4.0)
     offsets = [(at_s, m.time_boot_ms / 1000 - at_s) for at_s, m in bench.of("ATTITUDE")]
@@ -258,13 +258,13 @@ BAD = {
     "faults: [{fault: link, loss: 1.5}]": "faults.0.loss: 1.5 is out of range",
     "faults: [{fault: link, speed: 1}]": "faults.0.speed is not a known key",
     "faults: [{fault: reboot, after: never}]": "'never' is not one of boot, armed, took_off",
-    "faults: [{fault: silent_message, message: NOPE}]": "'NOPE' is no MAVLink message",
+    "faults: [{fault: silent_message, message: NOPE}]": "'NOPE' is not a MAVLink message",
     "faults: [{fault: mass_change}]": "faults.0.mass_scale is missing",
 }
 
 
 @pytest.mark.parametrize("text", BAD)
-def test_a_wrong_fault_is_one_sentence(text: str, tmp_path: Path) -> None:
+def test_an_invalid_fault_is_refused_with_one_sentence(text: str, tmp_path: Path) -> None:
     path = tmp_path / "bad.yaml"
     path.write_text(f"name: bad\n{text}\n")
     with pytest.raises(DocumentError) as caught:

@@ -38,7 +38,7 @@ def test_stream_loss_trips_a_little_after_one_second(period_s: float) -> None:
     assert (bench.mode, bench.system_status) == (POSCTL, 5)
 
 
-def test_until_then_the_last_attitude_and_thrust_go_on() -> None:
+def test_until_the_loss_the_last_attitude_and_thrust_continue() -> None:
     bench = offboard_attitude()
     roll = math.radians(8.0)
     bench.run(0.8, lambda: bench.attitude((math.cos(roll / 2), math.sin(roll / 2), 0, 0)))
@@ -48,7 +48,7 @@ def test_until_then_the_last_attitude_and_thrust_go_on() -> None:
     assert bench.mode == OFFBOARD
 
 
-def test_without_sticks_it_sinks_lands_and_disarms_back_into_offboard() -> None:
+def test_without_sticks_it_descends_lands_disarms_and_returns_to_offboard() -> None:
     bench = offboard_attitude()
     bench.run(2.5)
     before_m = bench.height_m
@@ -60,7 +60,7 @@ def test_without_sticks_it_sinks_lands_and_disarms_back_into_offboard() -> None:
     assert bench.mode == OFFBOARD
 
 
-def test_resuming_the_stream_returns_to_offboard_by_itself() -> None:
+def test_resuming_the_stream_returns_to_offboard() -> None:
     bench = offboard_attitude()
     bench.run(3.0)
     assert bench.mode == POSCTL
@@ -81,7 +81,7 @@ def test_the_least_rate(period_s: float, trips: bool) -> None:
 @pytest.mark.parametrize(
     ("action", "mode"), [(0, POSCTL), (1, 0x00020000), (3, RTL), (4, LAND), (5, LOITER)]
 )
-def test_what_follows_is_a_parameter(action: int, mode: int) -> None:
+def test_the_failsafe_mode_is_a_parameter(action: int, mode: int) -> None:
     bench = offboard_attitude()
     set_parameter(bench, "COM_OBL_RC_ACT", action)
     bench.run(1.5)
@@ -240,19 +240,21 @@ def climb_rate_after(bench: Bench, duration_s: float, **setpoint: object) -> flo
         ({"quaternion": (NAN, 0, 0, 0)}, -0.1, 0.1),
     ],
 )
-def test_thrust_is_taken_as_it_comes(setpoint: dict, low: float, high: float) -> None:
+def test_thrust_outside_its_range_is_clipped_or_zero(
+    setpoint: dict, low: float, high: float
+) -> None:
     bench = offboard_attitude()
     assert low < climb_rate_after(bench, 0.6, **setpoint) < high
 
 
-def test_sixty_degrees_of_roll_pass() -> None:
+def test_sixty_degrees_of_roll_are_flown() -> None:
     bench = offboard_attitude()
     half = math.radians(30.0)
     bench.run(0.8, lambda: bench.attitude((math.cos(half), math.sin(half), 0, 0)))
     assert math.degrees(bench.of("ATTITUDE")[-1][1].roll) == pytest.approx(60.0, abs=7.0)
 
 
-def test_rates_fly_with_mask_128() -> None:
+def test_rates_are_flown_with_mask_128() -> None:
     bench = offboard_attitude()
     bench.run(0.6, lambda: bench.attitude(mask=128, rates=(0.0, 0.0, 0.6)))
     bench.run(0.6, lambda: bench.attitude(mask=128, rates=(0.0, 0.0, 0.6)))
@@ -264,7 +266,7 @@ def test_rates_fly_with_mask_128() -> None:
     [{"mask": 135}, {"to": (2, 1)}, {"to": (1, 2)}],
     ids=["all ignored", "to another system", "to another component"],
 )
-def test_what_is_no_stream_does_not_keep_offboard(setpoint: dict) -> None:
+def test_setpoints_without_demand_do_not_keep_offboard(setpoint: dict) -> None:
     bench = offboard_attitude()
     bench.run(1.5, lambda: bench.attitude(**setpoint))
     assert bench.mode == POSCTL
@@ -328,7 +330,7 @@ def test_reposition_holds_somewhere_else(frame: int, height_m: float) -> None:
     assert place == pytest.approx([10.0, 0.0, -5.0], abs=0.2)
 
 
-def test_the_older_message_sets_the_mode_and_is_acknowledged_once() -> None:
+def test_set_mode_sets_the_mode_and_is_acknowledged_once() -> None:
     bench = Bench()
     bench.boot()
     bench.send(mavlink.MAVLink_set_mode_message(1, 1, POSCTL))
@@ -337,7 +339,7 @@ def test_the_older_message_sets_the_mode_and_is_acknowledged_once() -> None:
     assert bench.mode == POSCTL
 
 
-def test_stabilized_without_sticks_goes_on_as_last_demanded() -> None:
+def test_stabilized_without_sticks_keeps_the_last_demand() -> None:
     bench = Bench()
     bench.instance.autopilot.parameters.set("COM_OBL_RC_ACT", 2)
     bench.fly_offboard()
@@ -355,7 +357,7 @@ def test_position_gains_and_speeds_are_obeyed_while_flying() -> None:
     assert speed_mps == pytest.approx(1.0, abs=0.1)
 
 
-def test_a_landing_is_felt_three_stages_after_the_touch() -> None:
+def test_a_landing_is_detected_three_stages_after_ground_contact() -> None:
     """A second of contact without thrust, and two of rest; LNDMC_TRIG_TIME each."""
     bench = Bench()
     bench.fly_offboard(2.0)

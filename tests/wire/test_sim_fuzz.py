@@ -1,4 +1,4 @@
-"""Whatever arrives, the vehicle goes on, says only well-formed things, and flies afterwards.
+"""Arbitrary input: the vehicle keeps running, sends well-formed frames only, and flies afterwards.
 
 `FUZZ_DATAGRAMS=1000000 pytest tests/wire/test_sim_fuzz.py` sends half a million to each firmware
 and half a million more in flight, before a normal one.

@@ -1,4 +1,4 @@
-"""Setpoints in global coordinates and in the body's frame, and what PX4 says about other frames."""
+"""Setpoints in global coordinates and in the body's frame, and PX4's texts about other frames."""
 
 from __future__ import annotations
 
@@ -50,14 +50,14 @@ def test_a_global_position_is_flown_to(frame: int, altitude_m: float) -> None:
     assert (here.x, here.y, here.z) == pytest.approx((NORTH, EAST, -UP), abs=0.1)
 
 
-def test_a_global_velocity_needs_no_place() -> None:
+def test_a_global_velocity_needs_no_position() -> None:
     mask = VELOCITY & ~0b111 | 0b001  # one coordinate ignored: PX4 ignores the place
     bench = flown(lambda b: b.send(global_target(99, UP, mask, 1.0)), 4.0)
     _, here = bench.of("LOCAL_POSITION_NED")[-1]
     assert here.vx == pytest.approx(0.9, abs=0.15)
 
 
-def test_a_body_velocity_goes_where_the_nose_points() -> None:
+def test_a_body_velocity_is_rotated_by_yaw() -> None:
     bench = Bench()
     bench.fly_offboard()
     turn = mavlink.MAVLink_set_position_target_local_ned_message(
@@ -88,7 +88,9 @@ def test_a_body_velocity_goes_where_the_nose_points() -> None:
         ),
     ],
 )
-def test_other_frames_are_refused_aloud_and_are_no_stream(message: object, text: str) -> None:
+def test_other_frames_are_refused_with_a_text_and_keep_no_stream(
+    message: object, text: str
+) -> None:
     bench = Bench()
     bench.boot()
     bench.send(message)
@@ -97,13 +99,13 @@ def test_other_frames_are_refused_aloud_and_are_no_stream(message: object, text:
     assert not bench.instance.autopilot.stream.alive(bench.time_s)
 
 
-def test_what_is_no_number_moves_nothing_to_infinity() -> None:
+def test_nan_coordinates_are_not_demanded() -> None:
     bench = flown(lambda b: b.send(global_target(RELATIVE, NAN)), 3.0)
     _, here = bench.of("LOCAL_POSITION_NED")[-1]
     assert all(map(math.isfinite, (here.x, here.y, here.z)))
 
 
-def test_px4_mistakes_a_home_above_the_origin_for_one_below_it() -> None:
+def test_px4_subtracts_the_height_of_home_with_the_wrong_sign() -> None:
     """Home set 8 m up, 4 m above it asked for: the real one went to the ground."""
     bench = Bench()
     bench.fly_offboard()

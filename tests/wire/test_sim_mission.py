@@ -1,4 +1,4 @@
-"""Missions: the protocol item by item, and what is flown of them."""
+"""Missions: protocol and flight."""
 
 from __future__ import annotations
 
@@ -91,7 +91,7 @@ ROUND = [
 ]
 
 
-def test_a_mission_is_kept_as_it_was_sent_and_cleared() -> None:
+def test_a_mission_is_downloaded_as_uploaded_and_cleared() -> None:
     bench = Bench()
     bench.boot()
     assert upload(bench, ROUND) == 0
@@ -110,7 +110,7 @@ def test_a_mission_is_kept_as_it_was_sent_and_cleared() -> None:
     assert bench.of("MISSION_COUNT")[-1][1].count == 0
 
 
-def test_items_go_down_in_order_or_the_download_ends() -> None:
+def test_items_are_downloaded_in_order_or_the_download_ends() -> None:
     bench = Bench()
     bench.boot()
     assert upload(bench, ROUND) == 0
@@ -124,7 +124,7 @@ def test_items_go_down_in_order_or_the_download_ends() -> None:
     assert bench.texts() == ["WPM: REJ. CMD: Req. WP was unexpected"]
 
 
-def test_who_knows_whole_coordinates_alone_says_so_and_may_stop() -> None:
+def test_a_client_may_ask_for_the_int_messages_and_may_cancel() -> None:
     bench = Bench()
     bench.send(mavlink.MAVLink_mission_count_message(1, 1, 2))
     bench.send(mavlink.MAVLink_mission_ack_message(1, 1, 3))  # unsupported
@@ -136,7 +136,7 @@ def test_who_knows_whole_coordinates_alone_says_so_and_may_stop() -> None:
     assert asked(bench) == [0, 0]
 
 
-def test_items_that_do_not_come_are_asked_for_again_and_given_up() -> None:
+def test_missing_items_are_requested_again_until_a_timeout() -> None:
     bench = Bench()
     bench.send(mavlink.MAVLink_mission_count_message(1, 1, 2))
     bench.run(1.0)
@@ -150,7 +150,7 @@ def test_items_that_do_not_come_are_asked_for_again_and_given_up() -> None:
     assert bench.texts() == ["IGN MISSION_ITEM: No transfer"]
 
 
-def test_a_last_item_that_comes_again_was_taken() -> None:
+def test_a_repeated_last_item_is_acknowledged_again() -> None:
     bench = Bench()
     assert upload(bench, ROUND[:1]) == 0
     bench.send(item(0, ROUND[0]))
@@ -158,7 +158,7 @@ def test_a_last_item_that_comes_again_was_taken() -> None:
     assert [m.type for _, m in bench.of("MISSION_ACK")] == [0, 0]
 
 
-def test_a_px4_takes_nothing_while_a_download_is_left_open() -> None:
+def test_px4_refuses_uploads_during_a_download() -> None:
     """One that nobody acknowledges, be it of nothing, is open for five seconds."""
     bench = Bench()
     bench.boot()
@@ -183,7 +183,7 @@ def test_a_px4_takes_nothing_while_a_download_is_left_open() -> None:
         (mavlink.MAVLink_mission_clear_all_message(1, 1, 255), 0),
     ],
 )
-def test_what_cannot_be_is_answered(message: object, answer: int) -> None:
+def test_impossible_requests_are_answered(message: object, answer: int) -> None:
     bench = Bench()
     bench.send(message)
     bench.run(0.02)
@@ -193,7 +193,7 @@ def test_what_cannot_be_is_answered(message: object, answer: int) -> None:
 @pytest.mark.parametrize(
     ("row", "frame"), [(ROUND[0], 1), (place(WAYPOINT, 1, 1, math.inf), RELATIVE_INT)]
 )
-def test_places_in_no_known_frame_end_the_upload(row: Row, frame: int) -> None:
+def test_an_unknown_frame_ends_the_upload(row: Row, frame: int) -> None:
     bench = Bench()
     bench.send(mavlink.MAVLink_mission_count_message(1, 1, 1))
     bench.send(item(0, row, frame))
@@ -234,7 +234,7 @@ def test_fences_and_rally_points_are_kept_beside_the_mission(firmware: Firmware)
     assert [text for text in bench.texts() if "Fence" in text] == said
 
 
-def test_an_arducopters_first_item_is_home_there_or_not() -> None:
+def test_the_first_item_of_arducopter_is_home() -> None:
     """Scripts that download an empty mission wait for it."""
     bench = Bench(firmware=ARDUPILOT)
     bench.boot()
@@ -250,7 +250,7 @@ def test_an_arducopters_first_item_is_home_there_or_not() -> None:
     assert bench.of("MISSION_ACK")[-1][1].type == 13
 
 
-def test_a_px4_shows_frames_in_the_kind_asked_for() -> None:
+def test_px4_sends_frames_of_the_requested_kind() -> None:
     bench = Bench()
     bench.boot()
     assert upload(bench, ROUND[:1], frame=3) == 0
@@ -266,9 +266,7 @@ def test_a_px4_shows_frames_in_the_kind_asked_for() -> None:
         (place(5001, 1, 1, 0, 2.0), 0, 1, 1),
     ],
 )
-def test_a_px4_refuses_items_that_have_no_business_there(
-    row: Row, frame: int, kind: int, answer: int
-) -> None:
+def test_px4_refuses_items_that_do_not_fit(row: Row, frame: int, kind: int, answer: int) -> None:
     """A return has no place, a waypoint has one; a polygon has three corners."""
     bench = Bench()
     assert upload(bench, [row], kind, frame) == answer
@@ -334,7 +332,7 @@ def test_a_mission_lands() -> None:
     ]
 
 
-def test_a_mission_is_paused_by_hold_and_goes_on() -> None:
+def test_a_mission_is_paused_by_hold_and_continues() -> None:
     bench = Bench()
     bench.boot()
     upload(bench, [place(WAYPOINT, 0, 0, 3), place(LOITER_UNLIMITED, 40, 0, 3)])
@@ -353,7 +351,7 @@ def test_a_mission_is_paused_by_hold_and_goes_on() -> None:
     assert reached(bench) == [0]  # and there it stays
 
 
-def test_without_a_mission_none_starts() -> None:
+def test_without_a_mission_the_start_is_refused() -> None:
     bench = Bench()
     bench.boot()
     assert bench.command(300) == [2]
@@ -365,7 +363,7 @@ def test_without_a_mission_none_starts() -> None:
     assert bench.ask_mode(MISSION) == [0, 1]
 
 
-def test_an_arducopter_faces_its_way_and_returns_within_its_mission() -> None:
+def test_arducopter_faces_its_direction_of_flight_and_returns_within_its_mission() -> None:
     """The fourth parameter is no course there; the mode is AUTO until it has landed, and after."""
     bench = Bench(firmware=ARDUPILOT, boot_scale=0.1)
     bench.run(4.5)
@@ -401,7 +399,7 @@ def test_an_arducopter_faces_its_way_and_returns_within_its_mission() -> None:
     assert math.hypot(x, y) < 0.5
 
 
-def test_a_px4_turns_as_an_item_asks() -> None:
+def test_px4_takes_the_yaw_of_an_item() -> None:
     bench = Bench()
     bench.boot()
     upload(bench, [place(WAYPOINT, 0, 0, 3), place(LOITER_TIME, 0, 12, 3, 5.0, 0, 0, -90.0)])
@@ -412,7 +410,7 @@ def test_a_px4_turns_as_an_item_asks() -> None:
     assert course_deg == pytest.approx(-90.0, abs=5.0)
 
 
-def test_a_px4_takes_a_moment_to_check_a_mission() -> None:
+def test_px4_checks_a_mission_before_it_can_start() -> None:
     """Started at once the real one said so; 50 ms later it flew."""
     bench = Bench()
     bench.boot()

@@ -1,4 +1,4 @@
-"""A real PX4's recording asked again: the same bytes at the same vehicle times to the simulator.
+"""A recorded session with a real PX4, repeated: the same bytes at the same vehicle times.
 
 Every answer is compared row by row; what may differ is listed here with its reason.
 """

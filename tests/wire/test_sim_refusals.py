@@ -132,7 +132,7 @@ def test_command(row: Row) -> None:
 
 
 @pytest.mark.parametrize("to", [(2, 1), (1, 2), (0, 191)])
-def test_a_command_to_somebody_else_is_ignored(to: tuple[int, int]) -> None:
+def test_a_command_to_another_target_is_ignored(to: tuple[int, int]) -> None:
     bench = Bench()
     bench.boot()
     assert bench.command(400, 1, to=to) == []
@@ -140,7 +140,7 @@ def test_a_command_to_somebody_else_is_ignored(to: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("to", [(1, 1), (1, 0), (0, 0)])
-def test_acks_carry_the_askers_ids(to: tuple[int, int]) -> None:
+def test_acknowledgements_carry_the_ids_of_the_sender(to: tuple[int, int]) -> None:
     bench = Bench()
     bench.boot()
     assert bench.command(400, 1, to=to) == [ACCEPTED]
@@ -148,7 +148,7 @@ def test_acks_carry_the_askers_ids(to: tuple[int, int]) -> None:
     assert (ack.target_system, ack.target_component) == (1, 191)
 
 
-def test_command_int_is_a_command_too() -> None:
+def test_command_int() -> None:
     bench = Bench()
     bench.boot()
     bench.send(
@@ -158,7 +158,7 @@ def test_command_int_is_a_command_too() -> None:
     assert bench.armed
 
 
-def test_heartbeat_tells_why_arming_is_refused() -> None:
+def test_heartbeat_and_prearm_bit_show_whether_it_can_arm() -> None:
     """system_status and the pre-arm bit: 3 about 4 s after boot, 0 in OFFBOARD without stream."""
     bench = Bench()
     bench.boot()

@@ -1,4 +1,4 @@
-"""Lockstep and its ends, on loopback sockets in one thread: what a process test would wait for."""
+"""Lockstep without, with and after a companion, on loopback sockets in one thread."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
 from simulator.link.links import LinkError, open_link
 from simulator.link.udp import UdpLink
-from simulator.run import Berth, Outcome, Runner
+from simulator.run import Endpoint, Outcome, Runner
 from simulator.vehicle.conditions import Conditions
 
 
@@ -34,38 +34,40 @@ def link(companion: socket.socket) -> Iterator[UdpLink]:
     opened.close()
 
 
-def runner(link: UdpLink, told: list[str]) -> Runner:
+def runner(link: UdpLink, reports: list[str]) -> Runner:
     instance = Instance(PX4, px4_vehicle(), Conditions(), 1, lockstep=True)
-    return Runner([Berth(instance, link)], stopping=lambda: False, tell=told.append)
+    return Runner([Endpoint(instance, link)], stopping=lambda: False, report=reports.append)
 
 
-def test_without_a_companion_it_gives_up(link: UdpLink, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(run, "FIRST_CONTACT_S", 0.1)
-    told: list[str] = []
-    outcome = runner(link, told).lockstep()
+def test_without_a_companion_the_run_ends_with_code_3(
+    link: UdpLink, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(run, "FIRST_ANSWER_TIMEOUT_S", 0.1)
+    reports: list[str] = []
+    outcome = runner(link, reports).lockstep()
     assert outcome == Outcome(
-        3, "no companion answered TIMESYNC within 0.1 s: start one, or leave --lockstep away"
+        3, "no companion answered TIMESYNC within 0.1 s: start one, or run without --lockstep"
     )
-    assert told == []
+    assert reports == []
 
 
-def test_a_patience_that_is_given_is_for_the_first_word_too(link: UdpLink) -> None:
+def test_a_given_timeout_applies_to_the_first_answer_too(link: UdpLink) -> None:
     outcome = runner(link, []).lockstep(0.2)
     assert outcome == Outcome(
-        3, "no companion answered TIMESYNC within 0.2 s: start one, or leave --lockstep away"
+        3, "no companion answered TIMESYNC within 0.2 s: start one, or run without --lockstep"
     )
 
 
-def test_one_that_answers_once_and_then_never_is_missed(
+def test_a_companion_that_answers_only_once_ends_the_run(
     link: UdpLink, companion: socket.socket
 ) -> None:
     answer = mavlink.MAVLink_timesync_message(1, 8_000_000).pack(mavlink.MAVLink(None))
     companion.sendto(answer, ("127.0.0.1", link.port))
-    told: list[str] = []
-    outcome = runner(link, told).lockstep(0.1)
-    assert outcome == Outcome(3, "the companion did not come back")
-    assert told == [
-        "the companion fell silent at 0.02 s",
+    reports: list[str] = []
+    outcome = runner(link, reports).lockstep(0.1)
+    assert outcome == Outcome(3, "the companion did not answer again")
+    assert reports == [
+        "the companion stopped answering at 0.02 s",
         "without it the vehicle is landed and disarmed at 0.0 s",
     ]
 
@@ -73,16 +75,16 @@ def test_one_that_answers_once_and_then_never_is_missed(
 def test_an_answer_to_another_barrier_does_not_count(
     link: UdpLink, companion: socket.socket, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(run, "FIRST_CONTACT_S", 0.1)
+    monkeypatch.setattr(run, "FIRST_ANSWER_TIMEOUT_S", 0.1)
     answer = mavlink.MAVLink_timesync_message(1, 123).pack(mavlink.MAVLink(None))
     companion.sendto(answer, ("127.0.0.1", link.port))
-    told: list[str] = []
-    outcome = runner(link, told).lockstep(0.1)
+    reports: list[str] = []
+    outcome = runner(link, reports).lockstep(0.1)
     assert outcome.code == 3
-    assert told[0] == "the companion fell silent at 0.01 s"
+    assert reports[0] == "the companion stopped answering at 0.01 s"
 
 
-def test_peers_are_learned_and_bounded(link: UdpLink, companion: socket.socket) -> None:
+def test_senders_become_peers_up_to_a_limit(link: UdpLink, companion: socket.socket) -> None:
     others = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(20)]
     for other in others:
         other.bind(("127.0.0.1", 0))
@@ -108,12 +110,12 @@ def _received(sock: socket.socket) -> bytes | None:
 @pytest.mark.parametrize(
     "url", ["", "udp:127.0.0.1:1", "udpout:127.0.0.1", "udpout::5", "udpin:127.0.0.1:x"]
 )
-def test_what_is_no_link_is_refused(url: str) -> None:
-    with pytest.raises(LinkError, match="is no link"):
+def test_malformed_urls_are_refused(url: str) -> None:
+    with pytest.raises(LinkError, match="is not a link"):
         open_link(url, 0)
 
 
-def test_a_taken_preferred_port_gives_way(link: UdpLink) -> None:
+def test_another_port_is_used_if_the_preferred_one_is_taken(link: UdpLink) -> None:
     second = open_link("udpout:127.0.0.1:9", link.port)
     try:
         assert second.port != link.port

@@ -29,7 +29,7 @@ def read(datagrams: list[bytes]) -> list[object]:
 # -- rates -----------------------------------------------------------------------------------
 
 
-def test_default_rates_are_px4s() -> None:
+def test_default_rates_are_those_of_px4() -> None:
     bench = Bench()
     bench.run(20.0)
     counts = Counter(m.get_type() for _, m in bench.received)
@@ -38,7 +38,7 @@ def test_default_rates_are_px4s() -> None:
     }
 
 
-def test_the_ground_link_has_rates_and_a_sequence_of_its_own() -> None:
+def test_the_ground_link_has_its_own_rates_and_sequence() -> None:
     bench = Bench(ground_link=True)
     companion, ground = [], []
     for _ in range(2500):
@@ -67,7 +67,7 @@ def test_a_hundred_hertz_come_in_gaps_of_8_and_16_ms() -> None:
     assert len(stamps) == pytest.approx(400, abs=2)
 
 
-def test_stamps_are_the_time_of_the_step() -> None:
+def test_time_stamps_are_the_time_of_the_step() -> None:
     bench = Bench()
     bench.run(3.0)
     for kind in ("ATTITUDE", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED"):
@@ -80,7 +80,7 @@ def test_intervals_that_cannot_be_set_fail(number: float) -> None:
     assert Bench().command(511, number, 20_000) == [4]
 
 
-def test_an_interval_can_be_stopped_restored_and_asked_for() -> None:
+def test_an_interval_can_be_stopped_restored_and_read() -> None:
     bench = Bench()
     for interval_us, shown_us, expected in (
         (20_000, 20_000, 50),
@@ -132,7 +132,7 @@ def test_datagrams_hold_whole_frames_and_fit() -> None:
 
 
 @pytest.mark.parametrize(("kind", "heard"), [(6, True), (18, False), (None, False)])
-def test_texts_reach_ground_stations_only(kind: int | None, heard: bool) -> None:
+def test_texts_are_sent_to_ground_stations_only(kind: int | None, heard: bool) -> None:
     bench = Bench(heartbeat_type=kind)
     bench.boot()
     bench.command(400, 1)
@@ -153,7 +153,7 @@ def test_long_texts_come_in_chunks_and_end_in_a_tab() -> None:
 # -- time, ping, files -----------------------------------------------------------------------
 
 
-def test_timesync_is_answered_with_the_vehicles_time() -> None:
+def test_timesync_is_answered_with_vehicle_time() -> None:
     bench = Bench()
     bench.run(2.0)
     bench.send(mavlink.MAVLink_timesync_message(0, 123456789))
@@ -207,7 +207,7 @@ def parameter(bench: Bench, name: str) -> tuple[float, int]:
         ("MIS_TAKEOFF_ALT", 2.5, 9),
     ],
 )
-def test_parameters_are_px4s(name: str, value: float, kind: int) -> None:
+def test_parameters_are_those_of_px4(name: str, value: float, kind: int) -> None:
     """Names, values and types as PX4 1.16.1 answers them."""
     assert parameter(Bench(), name) == (value, kind)
 
@@ -222,8 +222,8 @@ def test_parameters_are_listed_once_each() -> None:
     assert listed == [hashed, *((i, name, len(names)) for i, name in enumerate(names))]
 
 
-def test_parameters_are_known_again_by_their_hash() -> None:
-    """As QGroundControl asks; who knows it needs no list."""
+def test_the_parameter_hash_changes_with_the_values() -> None:
+    """As QGroundControl reads it; a client that knows the hash stops the list."""
     bench = Bench()
 
     def known_as() -> tuple[float, int]:
@@ -278,7 +278,7 @@ def test_an_unknown_parameter_is_not_answered() -> None:
 # -- truth -----------------------------------------------------------------------------------
 
 
-def test_truth_is_sent_on_request() -> None:
+def test_true_state_on_request() -> None:
     bench = Bench(EstimatorName.PX4_LIKE, seed=4)
     assert bench.command(511, HIL_STATE, 10_000) == [0]
     bench.boot()
@@ -303,7 +303,7 @@ def test_truth_is_sent_on_request() -> None:
     assert abs(east) > 1.0
 
 
-def test_satellite_fixes_are_as_wrong_as_sih_s() -> None:
+def test_gps_errors_are_as_large_as_those_of_sih() -> None:
     """Standing still: eight fixes a second however fast they are asked for, white about the truth
     with the deviations measured on PX4's SIH (N .19, E .13, D .52 m; .062 and .072 m/s)."""
     bench = Bench(EstimatorName.PX4_LIKE, seed=4)

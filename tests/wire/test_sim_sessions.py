@@ -1,4 +1,4 @@
-"""Sessions with a real PX4 and a real ArduCopter, asked again: row by row, what differs is listed
+"""Recorded sessions with a real PX4 and ArduCopter, repeated; every difference is listed
 here with its reason.
 
 Each recording is trimmed: setpoints to 5 Hz, telemetry to what tells the time and the rows.
@@ -274,14 +274,14 @@ def limit_s(session: Session, row: str) -> float:
 
 
 @ALL
-def test_rows_are_the_real_ones(session: Session) -> None:
+def test_rows_equal_those_of_the_real_autopilot(session: Session) -> None:
     compared = side_by_side(session)
     assert compared.differing == list(session.differing)
     assert compared.equal == session.equal
 
 
 @ALL
-def test_rows_come_when_the_real_ones_come(session: Session) -> None:
+def test_rows_come_at_the_time_of_the_real_ones(session: Session) -> None:
     compared = side_by_side(session)
     late = [(row, s) for row, s in compared.late if abs(s) > limit_s(session, row)]
     assert late == []
@@ -292,7 +292,7 @@ def test_rows_come_when_the_real_ones_come(session: Session) -> None:
     "until_s",
     [57.2, 63.1, 66.1, 69.1, 81.0, 84.0, 87.0, 98.9, 104.8, 119.6, 134.5],
 )
-def test_setpoints_lead_to_the_real_one_s_place(until_s: float) -> None:
+def test_setpoints_lead_to_the_place_of_the_real_vehicle(until_s: float) -> None:
     """At the ends of those that name one, metres; estimates of either wander half a metre."""
     session = next(session for session in SESSIONS if session.name == "setpoints")
     real, ours = (np.array(rows.positions_ned_m) for rows in heard(session))

@@ -36,7 +36,7 @@ def seen(bench: Bench) -> tuple[int, ...]:
     return tuple(getattr(channels, f"chan{i}_raw") for i in range(1, 9))
 
 
-def test_a_throttle_in_the_middle_holds_and_one_that_nobody_holds_sinks() -> None:
+def test_centred_throttle_holds_the_height_and_no_throttle_descends() -> None:
     bench = loitering()
     pushed(bench, 4.0, *MIDDLE)
     assert place(bench) == pytest.approx((0.0, 0.0, -5.0), abs=0.2)
@@ -47,7 +47,7 @@ def test_a_throttle_in_the_middle_holds_and_one_that_nobody_holds_sinks() -> Non
 
 
 @pytest.mark.parametrize(("width", "climb_mps"), [(1700, 0.63), (1300, -0.68), (1580, 0.0)])
-def test_the_throttle_asks_for_a_climb_rate(width: int, climb_mps: float) -> None:
+def test_the_throttle_is_a_climb_rate(width: int, climb_mps: float) -> None:
     bench = loitering()
     pushed(bench, 3.0, 1500, 1500, width, 1500)
     assert -velocity(bench)[2] == pytest.approx(climb_mps, abs=0.08)
@@ -56,7 +56,7 @@ def test_the_throttle_asks_for_a_climb_rate(width: int, climb_mps: float) -> Non
     assert bench.height_m == pytest.approx(height_m + 0.35 * climb_mps, abs=0.35)
 
 
-def test_a_stick_accelerates_and_released_the_vehicle_stops() -> None:
+def test_a_stick_accelerates_and_the_vehicle_stops_when_it_is_centred() -> None:
     """Pitch 1400: 0.43, 0.85, 1.15 and 1.36 m/s ahead second by second; released after five it
     went on at 1.1 m/s for a second and stood after two."""
     bench = loitering()
@@ -73,7 +73,7 @@ def test_a_stick_accelerates_and_released_the_vehicle_stops() -> None:
     assert abs(velocity(bench)[1]) < 0.1
 
 
-def test_roll_goes_aside_and_a_joystick_is_as_good() -> None:
+def test_roll_flies_sideways_also_by_manual_control() -> None:
     bench = loitering()
     pushed(bench, 3.0, 1700, 1500, 1500, 1500)
     assert velocity(bench)[1] == pytest.approx(2.65, abs=0.4)
@@ -84,7 +84,7 @@ def test_roll_goes_aside_and_a_joystick_is_as_good() -> None:
     assert -velocity(bench)[2] == pytest.approx(0.63, abs=0.1)
 
 
-def test_yaw_turns_and_stays_where_it_came_to() -> None:
+def test_yaw_turns_and_then_keeps_its_angle() -> None:
     bench = loitering()
     before = course_deg(bench)
     pushed(bench, 2.0, 1500, 1500, 1500, 1600)
@@ -95,7 +95,7 @@ def test_yaw_turns_and_stays_where_it_came_to() -> None:
     assert course_deg(bench) - before == pytest.approx(turned, abs=3.0)
 
 
-def test_nobody_but_the_ground_station_steers_and_zero_gives_back() -> None:
+def test_only_the_ground_station_may_send_sticks_and_zero_releases_them() -> None:
     bench = loitering()
     push(bench, 1700, 1700, 1700, 1700, system=42)
     assert seen(bench) == (*MIDDLE, *FEIGNED[4:])
@@ -103,7 +103,7 @@ def test_nobody_but_the_ground_station_steers_and_zero_gives_back() -> None:
     assert seen(bench) == (*FEIGNED[:1], 1500, 1000, *FEIGNED[3:])
 
 
-def test_a_px4_has_no_sticks() -> None:
+def test_px4_is_not_flown_by_sticks() -> None:
     bench = Bench()
     bench.fly_offboard()
     push(bench, 1700, 1700, 1700, 1700)
@@ -112,7 +112,7 @@ def test_a_px4_has_no_sticks() -> None:
     assert abs(velocity(bench)[0]) < 0.2
 
 
-def test_it_takes_off_by_stick() -> None:
+def test_takeoff_by_throttle() -> None:
     bench = Bench(firmware=copter().instance.autopilot.firmware, boot_scale=0.1)
     bench.run(4.5)
     bench.command(176, 1, LOITER)

@@ -1,4 +1,4 @@
-"""`--strict`: what PX4 swallows is said, at most once a second, and counted."""
+"""`--strict`: messages that PX4 ignores are reported, at most once a second, and counted."""
 
 from __future__ import annotations
 
@@ -59,25 +59,25 @@ RIGHT = [
 
 
 @pytest.mark.parametrize(("message", "sentence"), SWALLOWED, ids=[s for _, s in SWALLOWED])
-def test_what_is_swallowed_is_said_and_counted(message: object, sentence: str) -> None:
+def test_ignored_messages_are_reported_and_counted(message: object, sentence: str) -> None:
     bench = Bench(strict=True)
     bench.run(2.5, lambda: bench.send(message), period_s=0.1)
     assert bench.texts() == [f"Strict: {sentence}"] * 3
-    assert bench.instance.swallowed == {f"Strict: {sentence}": 25}
+    assert bench.instance.complaints == {f"Strict: {sentence}": 25}
 
 
 @pytest.mark.parametrize("message", RIGHT)
-def test_what_is_right_is_not_complained_of(message: object) -> None:
+def test_correct_messages_are_not_reported(message: object) -> None:
     bench = Bench(strict=True)
     bench.send(message)
     bench.run(0.1)
     assert bench.texts() == []
 
 
-def test_without_strict_it_is_swallowed() -> None:
+def test_without_strict_nothing_is_reported() -> None:
     bench = Bench()
     for message, _ in SWALLOWED:
         bench.send(message)
     bench.run(0.1)
     assert bench.texts() == []
-    assert bench.instance.swallowed == {}
+    assert bench.instance.complaints == {}

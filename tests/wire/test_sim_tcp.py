@@ -1,4 +1,4 @@
-"""The simulator as a TCP server, as ArduPilot's SITL is one."""
+"""The simulator as a TCP server, like ArduPilot's SITL."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ def heard(link: TcpLink) -> bytes | None:
     return link.receive()
 
 
-def test_frames_are_put_together_and_garbage_passes() -> None:
+def test_split_frames_are_joined_and_garbage_is_passed_on() -> None:
     stream = b"x" + HEARTBEAT + OLD + HEARTBEAT
     wholes = [0, 1, 1 + len(HEARTBEAT), 1 + len(HEARTBEAT + OLD), len(stream)]
     for length in range(len(stream) + 1):
         assert whole_frames(stream[:length]) == max(w for w in wholes if w <= length)
 
 
-def test_clients_come_and_go(link: TcpLink) -> None:
+def test_clients_connect_and_disconnect(link: TcpLink) -> None:
     one, other = client(link), client(link)
     one.sendall(HEARTBEAT[:5])
     assert heard(link) is None
@@ -64,18 +64,18 @@ def test_clients_come_and_go(link: TcpLink) -> None:
     other.close()
 
 
-def test_one_that_never_reads_holds_nobody_up(link: TcpLink) -> None:
-    deaf, other = client(link), client(link)
+def test_a_client_that_never_reads_is_disconnected(link: TcpLink) -> None:
+    idle, other = client(link), client(link)
     piece, count = bytes(65536), 0
     for _ in range(20 * UNSENT_MAX // len(piece)):
         link.send([piece])
         count += len(other.recv(1 << 20))
     assert count > 15 * UNSENT_MAX
     left = 0
-    while data := deaf.recv(1 << 20):
+    while data := idle.recv(1 << 20):
         left += len(data)
     assert left < 15 * UNSENT_MAX  # and then the end
-    deaf.close()
+    idle.close()
     other.close()
 
 

@@ -1,4 +1,4 @@
-"""The simulated PX4's automatic flight beside a real one's, place by place and second by second.
+"""Automatic flight of the simulated PX4 compared with a real one.
 
 Recorded from PX4 1.16.1 SITL (SIH) in real time and trimmed to 5 Hz: takeoffs to 2.5 and 10 m, a
 landing, 20 m across, 20 m up, a return; and a mission of legs from 20 to 40 m, one with a stop.
@@ -91,7 +91,7 @@ EACH = pytest.mark.parametrize("way", WAYS, ids=lambda way: way.title)
 
 
 @EACH
-def test_a_way_takes_the_real_one_s_time(way: Way) -> None:
+def test_a_leg_takes_as_long_as_on_the_real_vehicle(way: Way) -> None:
     real, ours = flown(HOPS)
     for share in (0.25, 0.5, 0.75):
         theirs_s = way.halfway_s(real, share)
@@ -99,13 +99,13 @@ def test_a_way_takes_the_real_one_s_time(way: Way) -> None:
 
 
 @EACH
-def test_a_way_has_the_real_one_s_speed(way: Way) -> None:
+def test_a_leg_has_the_speed_of_the_real_vehicle(way: Way) -> None:
     theirs_mps, ours_mps = (way.along(side)[2].max() for side in flown(HOPS))
     assert abs(ours_mps - theirs_mps) < 0.05 * theirs_mps + 0.05
 
 
 @EACH
-def test_a_way_has_the_real_one_s_shape(way: Way) -> None:
+def test_a_leg_has_the_shape_of_the_real_vehicle(way: Way) -> None:
     """Where it is second by second, both halfway at the same time."""
     real, ours = flown(HOPS)
     late_s = way.halfway_s(real) - way.halfway_s(ours)
@@ -114,7 +114,7 @@ def test_a_way_has_the_real_one_s_shape(way: Way) -> None:
     assert np.sqrt(np.mean(apart_m**2)) < 0.6 * way.apart_m
 
 
-def test_mission_items_are_reached_when_the_real_one_reaches_them() -> None:
+def test_mission_items_are_reached_at_the_time_of_the_real_vehicle() -> None:
     """From item to item; the first, a takeoff, from the start on."""
     real, ours = (np.diff([9.3, *side.reached_s.values()]) for side in flown(LEGS))
     assert list(flown(LEGS)[1].reached_s) == list(flown(LEGS)[0].reached_s)[: len(ours)]

@@ -1,6 +1,6 @@
-"""ArduCopter 4.6, as data: here its numbers, in the rooms beside what they are made of.
+"""ArduCopter 4.6 as data; each part is in the file of its name.
 
-Measured on ArduCopter 4.6.3 SITL where the wire shows it. Knows no simulator core and no socket.
+Measured on ArduCopter 4.6.3 SITL where MAVLink shows it. Knows no simulator core and no socket.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What ArduCopter takes commands for, and how it answers them."""
+"""How ArduCopter reads commands and acknowledges them."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from simulator.firmware.base import CommandRules
 from simulator.firmware.values import ArmRequest, ModeRequest, Result, warning
 
 _CUSTOM_MODE_ENABLED = 1
-# Modes that it has and does not enter here, as it enters some only under conditions
+# Modes that it has and does not enter in the simulator
 _NOT_ENTERED = {
     **{
         number: f"{title} failed: init failed"
@@ -33,10 +33,10 @@ def command_mode(params: tuple[float, ...]) -> ModeRequest:
     if not base & _CUSTOM_MODE_ENABLED:
         return ModeRequest(None, Result.DENIED)
     known = _BY_NUMBER.get(number)
-    said = f"No such mode {number}"
+    text = f"No such mode {number}"
     if number in _NOT_ENTERED:
-        said = f"Mode change to {_NOT_ENTERED[number]}"
-    return ModeRequest(known, Result.FAILED, None if known else warning(said))
+        text = f"Mode change to {_NOT_ENTERED[number]}"
+    return ModeRequest(known, Result.FAILED, None if known else warning(text))
 
 
 def set_mode(base_mode: int, custom_mode: int) -> ModeRequest:
@@ -51,7 +51,7 @@ def arm_request(param: float) -> ArmRequest:
     return ArmRequest(refusal=Result.UNSUPPORTED)
 
 
-# Taken by their receivers, which change nothing that shows here, or failed without their devices
+# Accepted without an effect that the simulator shows, and failed without their devices
 _TAKEN = (181, 195, 197, 203, 206, 207, 208, 401, 2001, 5300, 42001, 42003, 42424)
 _FAILED = (84, 183, 184, 189, 193, 205, 211, 218, 500, 2000, 2500)
 _ANSWERS: dict[int, Result | None] = {

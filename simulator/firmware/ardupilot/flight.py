@@ -1,4 +1,4 @@
-"""How ArduCopter flies by itself, as its parameters have it."""
+"""Automatic flight of ArduCopter, from its parameters."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ _RETURN_LEAST_M = 2.0  # RTL_ALT_MIN
 
 
 def gains(parameter: ReadParameter) -> PositionGains:
-    """The position loop as its parameters have it."""
+    """Gains and limits of the position loop."""
     speed_mps = parameter("WPNAV_SPEED") * 0.01
     return PositionGains(
         position_xy_ps=parameter("PSC_POSXY_P"),
@@ -33,18 +33,18 @@ def gains(parameter: ReadParameter) -> PositionGains:
 
 
 def return_height_m(distance_m: float, parameter: ReadParameter) -> float:
-    """Under a cone near home (RTL_CONE_SLOPE), so that a short way needs no high climb."""
+    """Height of a return above home: under a cone near home (RTL_CONE_SLOPE)."""
     highest_m, slope = parameter("RTL_ALT") * 0.01, parameter("RTL_CONE_SLOPE")
     return min(highest_m, max(distance_m * slope, _RETURN_LEAST_M)) if slope > 0 else highest_m
 
 
 def return_yaw(_: float, parameter: ReadParameter) -> ReturnYaw | None:
-    """As it did, by default."""
+    """Unchanged by default."""
     return ReturnYaw.ALONG_PATH if parameter("WP_YAW_BEHAVIOR") in (1.0, 3.0) else None
 
 
 _STICKS = StickFlight(
-    # throttle down, mode switch and others as SITL has them
+    # throttle down; mode switch and other channels as SITL has them
     default_pulses_us=(1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800),
     climb_mps=2.5,  # PILOT_SPEED_UP
     turn_radps=math.radians(202.5),  # PILOT_Y_RATE

@@ -1,4 +1,4 @@
-"""How ArduCopter starts, what its checks ask for, and when its battery is low."""
+"""Start, pre-arm checks and battery levels of ArduCopter."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from simulator.firmware.base import HealthRules, Sensors
 from simulator.firmware.values import ReadParameter
 from simulator.vehicle.battery import BatteryState
 
-# Seconds after boot at which an event of this name happens
+# Boot events, seconds after boot
 _BOOT = {
     "barometer": 1.94,
     "initialised": 2.47,
@@ -24,7 +24,7 @@ _BOOT = {
 
 
 def battery_level(battery: BatteryState, parameter: ReadParameter) -> int:
-    """By voltage, or by the charge that remains of BATT_CAPACITY; 0 asks for neither."""
+    """By voltage or by remaining charge of BATT_CAPACITY; a threshold of 0 disables the check."""
 
     def below(kind: str) -> bool:
         left_mah = battery.remaining * parameter("BATT_CAPACITY")

@@ -1,4 +1,4 @@
-"""Whom ArduCopter hears on a link, and how it speaks."""
+"""Link behaviour of ArduCopter."""
 
 from __future__ import annotations
 
@@ -7,12 +7,12 @@ from simulator.firmware.values import ReadParameter
 
 
 def is_ground_station(_: int, system: int, parameter: ReadParameter) -> bool:
-    """By its system id, whatever it is."""
+    """By system id, whatever the MAV_TYPE."""
     return system == parameter("SYSID_MYGCS")
 
 
 def obeys_system(sender: int, own: int, parameter: ReadParameter) -> bool:
-    """All, or its ground station and its own components alone."""
+    """All systems; with SYSID_ENFORCE the ground station and its own components only."""
     return not parameter("SYSID_ENFORCE") or sender in (own, parameter("SYSID_MYGCS"))
 
 

@@ -1,9 +1,9 @@
-"""Messages that ArduPilot sends and PX4 does not, as field values in the order of the XML."""
+"""Builders of messages that only ArduPilot sends; fields in the order of the XML."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ _PWM_LEAST, _PWM_SPAN = 1000, 1000
 
 
 def _specific_force(view: View) -> tuple[float, float, float]:
-    """What an accelerometer would show, FRD, m/s^2."""
+    """True specific force, FRD, m/s^2."""
     truth = view.autopilot.senses.truth
     force_ned = truth.acceleration_ned_mps2.copy()
     force_ned[2] -= GRAVITY_MPS2
@@ -29,7 +29,7 @@ def _specific_force(view: View) -> tuple[float, float, float]:
 
 
 def simstate(view: View) -> Sequence[Any]:
-    """The truth, without height and velocity."""
+    """True state without height and velocity."""
     truth = view.autopilot.senses.truth
     north, east, _ = truth.position_ned_m.tolist()
     return (
@@ -41,7 +41,7 @@ def simstate(view: View) -> Sequence[Any]:
 
 
 def sim_state(view: View) -> Sequence[Any]:
-    """The truth. It carries no time stamp; latitude and longitude are in steps of 1 cm."""
+    """True state without time stamp; latitude and longitude have a resolution of 1 cm."""
     truth = view.autopilot.senses.truth
     north, east, down = truth.position_ned_m.tolist()
     latitude, longitude = view.geodetic(north, east)
@@ -62,7 +62,7 @@ def sim_state(view: View) -> Sequence[Any]:
 
 
 def ekf_status_report(view: View) -> Sequence[Any]:
-    """EKF_STATUS_REPORT: flags grow as the estimate does; variances as of a good one."""
+    """Flags by the boot events so far; variances of a good estimate."""
     reached = view.autopilot.health.reached
     if view.autopilot.watch.position_lost:
         reached -= {"position"}
@@ -78,31 +78,31 @@ def raw_imu(view: View) -> Sequence[Any]:
 
 
 def servo_output_raw(view: View) -> Sequence[Any]:
-    """SERVO_OUTPUT_RAW: four motors, us, by the collective thrust."""
+    """Four motors, us, from the collective thrust."""
     pwm = _PWM_LEAST + round(_PWM_SPAN * view.autopilot.pilot.demand.thrust)
     return (view.time_us & 0xFFFFFFFF, 0, *(pwm,) * 4, *(0,) * 12)
 
 
 def rc_channels(view: View) -> Sequence[Any]:
-    """RC_CHANNELS: what SITL feigns, and who overrides it."""
+    """The channels of SITL without RC, or those of RC_CHANNELS_OVERRIDE."""
     sticks, now_s = view.autopilot.sticks, view.autopilot.senses.time_s
     widths_us = () if sticks is None else sticks.widths_us(now_s)
     return (view.time_ms, len(widths_us), *widths_us, *(0,) * (18 - len(widths_us)), 255)
 
 
 def scaled_imu2(view: View) -> Sequence[Any]:
-    """SCALED_IMU2: as RAW_IMU."""
+    """As RAW_IMU."""
     _, *values, _, temperature = raw_imu(view)
     return (view.time_ms, *values, temperature)
 
 
 def ahrs(_: View) -> Sequence[Any]:
-    """AHRS: no drift, errors as of a good estimate."""
+    """No drift; errors of a good estimate."""
     return (0.0, 0.0, 0.0, 0.0, 0.0, 0.003, 0.005)
 
 
 def ahrs2(view: View) -> Sequence[Any]:
-    """AHRS2: the estimate once more, in radians and metres above the sea."""
+    """The estimate in radians and AMSL metres."""
     nav = view.autopilot.senses.look()
     north, east, down = nav.position_ned_m
     euler = euler_from_quaternion(np.array(nav.attitude)).tolist()
@@ -110,22 +110,22 @@ def ahrs2(view: View) -> Sequence[Any]:
 
 
 def meminfo(_: View) -> Sequence[Any]:
-    """MEMINFO: as SITL has it."""
+    """Constants of SITL."""
     return (0, 65535, 524288)
 
 
 def power_status(_: View) -> Sequence[Any]:
-    """POWER_STATUS: mV."""
+    """Board voltage in mV."""
     return (5000, 0, 0)
 
 
 def wind(_: View) -> Sequence[Any]:
-    """WIND: what is not estimated without an airspeed is none."""
+    """No wind: it is not estimated without an airspeed sensor."""
     return (-180.0, 0.0, 0.0)
 
 
 def nav_controller_output(view: View) -> Sequence[Any]:
-    """NAV_CONTROLLER_OUTPUT: attitude wanted (deg), and the way left to where it is told to be."""
+    """Demanded attitude in degrees; distance and bearing to the position setpoint."""
     nav, pilot = view.autopilot.senses.look(), view.autopilot.pilot
     wanted = pilot.demand.attitude or (1.0, 0.0, 0.0, 0.0)
     roll, pitch, yaw = np.degrees(euler_from_quaternion(np.array(wanted))).tolist()
@@ -138,7 +138,7 @@ def nav_controller_output(view: View) -> Sequence[Any]:
 
 
 def position_target_global_int(view: View) -> Sequence[Any]:
-    """POSITION_TARGET_GLOBAL_INT: where it is told to be, above the sea; none is where it is."""
+    """Position setpoint with AMSL height; the present position where there is none."""
     pilot, here = view.autopilot.pilot, view.autopilot.senses.look().position_ned_m
     place = pilot.motion.position_ned_m
     north, east, down = (p if math.isfinite(p) else h for p, h in zip(place, here, strict=True))
@@ -150,7 +150,7 @@ _NO_MISSION, _NOT_STARTED, _ACTIVE, _PAUSED, _COMPLETE = range(1, 6)  # MISSION_
 
 
 def mission_current(view: View) -> Sequence[Any]:
-    """MISSION_CURRENT: home is no item of the count; before the start it is the current one."""
+    """Number of items without home; before the start the current item is home (0)."""
     mission = view.autopilot.mission
     begun = mission.under_way or mission.reached >= 0 or mission.current > mission.first
     state = _NO_MISSION
@@ -160,25 +160,3 @@ def mission_current(view: View) -> Sequence[Any]:
         state = _COMPLETE if mission.finished else state
     number = mission.current if begun else 0
     return (number, max(0, len(mission.items) - 1), state, 0)
-
-
-MESSAGES: Mapping[str, Callable[[View], Sequence[Any]]] = {
-    builder.__name__.upper(): builder
-    for builder in (
-        simstate,
-        sim_state,
-        ekf_status_report,
-        raw_imu,
-        scaled_imu2,
-        servo_output_raw,
-        rc_channels,
-        ahrs,
-        ahrs2,
-        meminfo,
-        power_status,
-        wind,
-        nav_controller_output,
-        position_target_global_int,
-        mission_current,
-    )
-}

@@ -1,4 +1,4 @@
-"""ArduCopter's flight modes, and what a heartbeat shows."""
+"""Flight modes of ArduCopter, and its heartbeat."""
 
 from __future__ import annotations
 

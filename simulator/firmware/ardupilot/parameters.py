@@ -1,6 +1,6 @@
-"""ArduCopter 4.6's parameters: those that clients read and those that the vehicle obeys.
+"""Parameters of ArduCopter 4.6: those that clients read and those that the vehicle obeys.
 
-ArduCopter takes values far out of the documented range, so the limits are those of the type.
+ArduCopter takes values outside the documented range, so the limits are those of the type.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ ROLES: dict[str, Role] = {
     "stream_timeout_s": "GUID_TIMEOUT",
     "disarm_landed_s": 0.45,
     "disarm_idle_s": "DISARM_DELAY",
-    "takeoff_height_m": 0.0,  # the command always tells
+    "takeoff_height_m": 0.0,  # the command always has one
     "takeoff_speed_mps": ("WPNAV_SPEED_UP", 0.76 * _CENTI),  # 5 m are too few to reach it
     "land_speed_mps": ("LAND_SPEED", _CENTI),
     "descent_speed_mps": ("WPNAV_SPEED_DN", _CENTI),
@@ -109,7 +109,7 @@ ROLES: dict[str, Role] = {
     "settled_s": 1.35,
     "slow_below_m": ("LAND_ALT_LOW", _CENTI),
     "fast_above_m": ("LAND_ALT_LOW", 1.1 * _CENTI),
-    "crawl_below_m": -1.0,  # it does not
+    "crawl_below_m": -1.0,  # never
     "crawl_speed_mps": 0.0,
     "return_descends_to_m": math.inf,
     "return_within_m": 1.0,

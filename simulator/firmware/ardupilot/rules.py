@@ -1,4 +1,4 @@
-"""ArduCopter's state table: what happens to it, and what it does and says then."""
+"""State table of ArduCopter: events, and what follows from them."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ _ORIGIN_AND_HOME = ("GPS_GLOBAL_ORIGIN", "HOME_POSITION")
 _ARMING = Rule("arm", do=("arm",), texts=(info("Arming motors"),), send=_ORIGIN_AND_HOME)
 _DISARMING = info("Disarming motors")
 
-_FOR_GOOD = ("failsafe", "latch")
+_UNTIL_REBOOT = ("failsafe", "latch")
 # FS_GCS_ENABLE 6 looks for a landing sequence in the mission first
-_INSTEAD = {
+_FURTHER_TEXTS = {
     ("ground station lost", 6): (
         warning("Unable to start landing sequence"),
         warning("Mode change to AUTO RTL failed: No return path or landing sequence found"),
@@ -41,14 +41,14 @@ _FAILSAFE = {
 def _failsafe(
     event: str, parameter: str, modes: Mapping[int, str], do: tuple[str, ...] = ("failsafe",)
 ) -> list[Rule]:
-    """At once to the mode that the parameter's value names, unless it stands disarmed."""
+    """Rows of a failsafe without delay: to the mode that the parameter selects, when armed."""
     return [
         Rule(
             event,
             when=("armed", f"{parameter}={value}"),
             to=mode,
             do=do,
-            texts=(*_FAILSAFE[event], *_INSTEAD.get((event, value), ())),
+            texts=(*_FAILSAFE[event], *_FURTHER_TEXTS.get((event, value), ())),
             send=_HEARTBEAT,
         )
         for value, mode in modes.items()
@@ -66,7 +66,7 @@ RULES = (
             info("Barometer 2 calibration complete"),
         ),
     ),
-    # A mode asked for before was acknowledged and is lost
+    # A mode requested before was acknowledged and is lost
     Rule(
         "initialised",
         to="STABILIZE",
@@ -125,7 +125,7 @@ RULES = (
             info("EKF3 IMU1 is using GPS"),
         ),
     ),
-    # A change of mode is shown by a heartbeat at once
+    # A heartbeat follows a mode change at once
     Rule("mode", when=("not armed",), to="requested", send=_HEARTBEAT),
     Rule("mode", when=("not position missing",), to="requested", send=_HEARTBEAT),
     Rule("mode", result=_FAILED, texts=(_NO_POSITION,)),
@@ -138,8 +138,8 @@ RULES = (
     Rule("item reached", send=("MISSION_ITEM_REACHED",)),
     Rule("mission return", "AUTO", do=("return",)),  # within the mode
     Rule("mission finished", when=("landed",), do=("disarm",), texts=(_DISARMING,)),
-    Rule("takeoff", "GUIDED", when=("armed", "landed", "climb asked"), do=("take off",)),
-    Rule("takeoff", "GUIDED", when=("armed", "climbing", "climb asked"), do=("take off",)),
+    Rule("takeoff", "GUIDED", when=("armed", "landed", "climb requested"), do=("take off",)),
+    Rule("takeoff", "GUIDED", when=("armed", "climbing", "climb requested"), do=("take off",)),
     Rule("takeoff", result=_FAILED),
     Rule("climbed", "GUIDED", do=("hold",)),
     Rule("land", to="LAND", send=_HEARTBEAT),
@@ -220,7 +220,7 @@ RULES = (
     Rule("disarm", result=_FAILED),
     Rule("force disarm", when=("not armed",)),
     Rule("force disarm", do=("disarm",), texts=(_DISARMING,)),
-    # No failsafe and no text: level, height held, or standing still, and still GUIDED
+    # No failsafe and no text: level with constant height, or standing still; the mode stays GUIDED
     Rule("stream lost", when=("obeys attitude",), do=("level",)),
     Rule("stream lost", when=("obeys velocity",), do=("hold",)),
     *_failsafe("ground station lost", "FS_GCS_ENABLE", _GROUND_MODES),
@@ -230,8 +230,8 @@ RULES = (
         do=("recover",),
         texts=(warning("GCS Failsafe Cleared"),),
     ),
-    *_failsafe("battery low", "BATT_FS_LOW_ACT", _BATTERY_MODES, _FOR_GOOD),
-    *_failsafe("battery critical", "BATT_FS_CRT_ACT", _BATTERY_MODES, _FOR_GOOD),
+    *_failsafe("battery low", "BATT_FS_LOW_ACT", _BATTERY_MODES, _UNTIL_REBOOT),
+    *_failsafe("battery critical", "BATT_FS_CRT_ACT", _BATTERY_MODES, _UNTIL_REBOOT),
     Rule("battery low", texts=(_FAILSAFE["battery low"][0],)),
     Rule("battery critical", texts=(_FAILSAFE["battery critical"][0],)),
     *(

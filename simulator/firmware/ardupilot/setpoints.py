@@ -1,4 +1,4 @@
-"""What ArduCopter makes of setpoint messages."""
+"""How ArduCopter reads setpoint messages."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ _RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b111, 64, 128
 _NORM_TOLERANCE = 0.0005
 _THRUST_IS_THRUST = 8  # GUID_OPTIONS
 _STOP = MotionSetpoint(velocity_ned_mps=(0.0, 0.0, 0.0))
-# Beside an attitude, rates of .3 rad/s move the equilibrium by 3 degrees
+# Rates beside an attitude: 0.3 rad/s move the equilibrium by 3 degrees
 _RATE_LEAD_S = 0.175
 
 
 def attitude_setpoint(
     values: Mapping[str, Any], parameter: ReadParameter
 ) -> AttitudeSetpoint | MotionSetpoint | None:
-    """SET_ATTITUDE_TARGET. None: dropped in silence, and what was demanded before goes on.
+    """SET_ATTITUDE_TARGET as ArduCopter reads it; None: ignored without an answer.
 
-    Dropped: thrust to be ignored, a quaternion off unit length. Rates of which some are to be
-    ignored make the vehicle hold its position. A thrust that is not a number is none, and latches
-    an internal error (the real SITL stops at a quaternion that is not a number; a board drops it).
+    Ignored: a message without thrust, a quaternion that is not of unit length. With some of the
+    rates ignored the vehicle holds its position. A thrust that is NaN counts as zero, and latches
+    an internal error (the real SITL stops at a NaN quaternion; a flight controller ignores it).
     """
     mask = values["type_mask"]
     ignored = mask & _RATES_IGNORED
@@ -61,7 +61,7 @@ def attitude_setpoint(
 
 
 def _vertical(thrust: float, parameter: ReadParameter) -> tuple[float, float | None, str]:
-    """Thrust, climb rate (None: the thrust is one) and the event of a value that is no number."""
+    """Thrust, climb rate (None: the field is a thrust) and the event of a NaN."""
     by_thrust = int(parameter("GUID_OPTIONS")) & _THRUST_IS_THRUST
     event = ""
     if math.isnan(thrust):
@@ -83,29 +83,29 @@ _NOTHING: Triple = (math.nan, math.nan, math.nan)
 def in_local_frame(
     values: Mapping[str, Any], position_ned_m: Triple, attitude: Quaternion
 ) -> Mapping[str, Any]:
-    """Offsets from where it is; in body frames turned by its course, and the yaw by so much."""
+    """Offset frames are relative to the present position; body frames also to the present yaw."""
     frame = values["coordinate_frame"]
     if frame not in _OFFSET:
         return values
     w, x, y, z = attitude
-    course_rad = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    turn_rad = course_rad if frame in _BODY else 0.0
-    ahead, aside = math.cos(turn_rad), math.sin(turn_rad)
+    yaw_rad = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+    turn_rad = yaw_rad if frame in _BODY else 0.0
+    cos_yaw, sin_yaw = math.cos(turn_rad), math.sin(turn_rad)
     local = {**values, "coordinate_frame": _LOCAL_NED, "yaw": turn_rad + values["yaw"]}
     for north, east in (("x", "y"), ("vx", "vy"), ("afx", "afy")):
-        local[north] = ahead * values[north] - aside * values[east]
-        local[east] = aside * values[north] + ahead * values[east]
+        local[north] = cos_yaw * values[north] - sin_yaw * values[east]
+        local[east] = sin_yaw * values[north] + cos_yaw * values[east]
     for name, here_m in zip("xyz", position_ned_m, strict=True):
         local[name] += here_m
     return local
 
 
 def motion_setpoint(values: Mapping[str, Any]) -> MotionSetpoint | None:
-    """SET_POSITION_TARGET_LOCAL_NED in frame 1: each vector wholly given or ignored.
+    """SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME 1; a vector with one ignored component is ignored.
 
-    What it cannot fly stops it: an unknown frame, nothing demanded, a position with an
-    acceleration alone, a velocity without a number. A force is dropped in silence, as is what has
-    no number elsewhere.
+    The vehicle stops at a setpoint that it cannot fly: an unknown frame, no demand, a position
+    with an acceleration and no velocity, a velocity that is not finite. None (ignored without an
+    answer): a force, and other values that are not finite.
     """
     mask = values["type_mask"]
 
@@ -136,7 +136,7 @@ def motion_setpoint(values: Mapping[str, Any]) -> MotionSetpoint | None:
 
 
 def rejection_text(message: str, frame: int | None) -> None:
-    """Nothing is said of a setpoint's frame."""
+    """No text."""
 
 
 SETPOINTS = SetpointRules(

@@ -1,10 +1,11 @@
-"""What ArduCopter sends without being asked, and what it sends on request."""
+"""Messages that ArduCopter sends periodically and on request."""
 
 from __future__ import annotations
 
-from simulator.firmware.ardupilot.messages import MESSAGES
+from simulator.firmware.ardupilot import messages
 from simulator.firmware.base import Streams
 from simulator.firmware.values import Result
+from simulator.mavlink.telemetry import builders_in
 
 COMPANION_RATES_HZ = GROUND_RATES_HZ = {"HEARTBEAT": 1.0, "TIMESYNC": 0.1}
 
@@ -34,7 +35,7 @@ _NEVER_SENT = frozenset({
 STREAMS = Streams(
     companion_rates_hz=COMPANION_RATES_HZ,
     ground_rates_hz=GROUND_RATES_HZ,
-    messages=MESSAGES,
+    messages=builders_in(messages),
     withheld_until={
         "LOCAL_POSITION_NED": "position",
         "GPS_GLOBAL_ORIGIN": "origin",

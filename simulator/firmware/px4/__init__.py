@@ -1,6 +1,6 @@
-"""PX4 1.16 multicopter, as data: here its numbers, in the rooms beside what they are made of.
+"""PX4 1.16 multicopter as data; each part is in the file of its name.
 
-Measured on PX4 1.16.1 SITL where the wire shows it. Knows no simulator core and no socket.
+Measured on PX4 1.16.1 SITL where MAVLink shows it. Knows no simulator core and no socket.
 """
 
 from __future__ import annotations

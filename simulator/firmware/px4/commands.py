@@ -1,4 +1,4 @@
-"""What PX4 takes commands for, and how it answers them."""
+"""How PX4 reads commands and acknowledges them."""
 
 from __future__ import annotations
 
@@ -32,8 +32,8 @@ def command_mode(params: tuple[float, ...]) -> ModeRequest:
         return ModeRequest(None, Result.ACCEPTED)
     if main == 4:
         known = _AUTO_SUB.get(sub)
-        said = None if known else _NO_AUTO_MODE
-        return ModeRequest(known, Result.TEMPORARILY_REJECTED, said)
+        text = None if known else _NO_AUTO_MODE
+        return ModeRequest(known, Result.TEMPORARILY_REJECTED, text)
     return ModeRequest(_MAIN.get(main), Result.ACCEPTED)
 
 
@@ -43,15 +43,15 @@ def set_mode(base_mode: int, custom_mode: int) -> ModeRequest:
 
 
 def arm_request(param: float) -> ArmRequest:
-    """Rounded; what is not a number disarms."""
-    wish = math.floor(param + 0.5) if math.isfinite(param) else 0
-    if wish in (0, 1):
-        return ArmRequest("arm" if wish else "disarm")
+    """param1 rounded; one that is not finite disarms."""
+    number = math.floor(param + 0.5) if math.isfinite(param) else 0
+    if number in (0, 1):
+        return ArmRequest("arm" if number else "disarm")
     text = f"Unsupported ARM_DISARM param: {param:.3f}"
     return ArmRequest(text=critical(text))
 
 
-# Taken by its receivers, which change nothing that shows here, or do not answer
+# Accepted without an effect that the simulator shows, and not acknowledged at all
 _TAKEN = (80, 187, 191, 195, 197, 201, 401, 519, 525, 528)
 _UNANSWERED = (
     1, 93, 203, 204, 205, 206, 214, 220, 242, 243, 260, 310, 420, 500, 521, 530, 531, 532, 3000

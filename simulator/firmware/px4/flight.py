@@ -1,4 +1,4 @@
-"""How PX4 flies by itself, as its parameters have it."""
+"""Automatic flight of PX4, from its parameters."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from simulator.firmware.values import ReadParameter, ReturnYaw
 
 
 def gains(parameter: ReadParameter) -> PositionGains:
-    """The position loop as its parameters have it."""
+    """Gains and limits of the position loop."""
     across = tuple(parameter(f"MPC_XY_VEL_{term}_ACC") for term in "PID")
     up = tuple(parameter(f"MPC_Z_VEL_{term}_ACC") for term in "PID")
     return PositionGains(
@@ -25,14 +25,14 @@ def gains(parameter: ReadParameter) -> PositionGains:
         thrust_max=parameter("MPC_THR_MAX"),
         derivative_cutoff_hz=5.0,
         turn_radps=math.radians(parameter("MPC_YAWRAUTO_MAX")),
-        speeding_mps2=parameter("MPC_ACC_HOR"),  # its ways keep limits of their own
+        speeding_mps2=parameter("MPC_ACC_HOR"),  # outside smoothed trajectories
         braking_mps2=parameter("MPC_ACC_HOR"),
-        facing_mps=parameter("MPC_XY_P") * parameter("NAV_ACC_RAD"),  # further away than that
+        facing_mps=parameter("MPC_XY_P") * parameter("NAV_ACC_RAD"),
     )
 
 
 def path_limits(parameter: ReadParameter) -> PathLimits:
-    """Of the smooth ways of automatic flight."""
+    """Limits of smoothed trajectories."""
     lift_mps, ramp_s = parameter("MPC_TKO_SPEED"), parameter("MPC_TKO_RAMP_T")
     return PathLimits(
         jerk_mps3=parameter("MPC_JERK_AUTO"),
@@ -53,7 +53,7 @@ def path_limits(parameter: ReadParameter) -> PathLimits:
 
 
 def return_height_m(distance_m: float, parameter: ReadParameter) -> float:
-    """Under a cone near home, so that it comes down there and not beside it."""
+    """Height of a return above home: under a cone near home (RTL_CONE_ANG)."""
     highest_m, accepted_m = parameter("RTL_RETURN_ALT"), parameter("NAV_ACC_RAD")
     if distance_m <= accepted_m:
         return min(2.0 * distance_m, highest_m)
@@ -65,7 +65,7 @@ def return_height_m(distance_m: float, parameter: ReadParameter) -> float:
 
 
 def return_yaw(distance_m: float, parameter: ReadParameter) -> ReturnYaw:
-    """Far away the way home, near it as it stood there."""
+    """Far away in the direction of flight, near home as at home."""
     return ReturnYaw.AS_AT_HOME if distance_m < parameter("RTL_MIN_DIST") else ReturnYaw.ALONG_PATH
 
 

@@ -1,4 +1,4 @@
-"""How PX4 starts, what its checks ask for, and when its battery is low."""
+"""Start, pre-arm checks and battery levels of PX4."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ _BATTERY_THRESHOLDS = ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")
 
 
 def battery_level(battery: BatteryState, parameter: ReadParameter) -> int:
-    """By the share that remains."""
+    """By the remaining share."""
     return sum(battery.remaining < parameter(name) for name in _BATTERY_THRESHOLDS)
 
 
 HEALTH = HealthRules(
     boot={},
-    # gyro, accelerometer, magnetometer, absolute pressure, GPS; battery, AHRS; health with
-    # geofence, or MAVProxy reports a breach
+    # gyro, accelerometer, magnetometer, absolute pressure, GPS; battery, AHRS; the health bits
+    # include the geofence, or MAVProxy reports a breach
     sensors=Sensors(0x0300402F, 0x0301402F, 0x0330C83F, first_fix_s=3.0),
     passes_after_s=4.0,
     passes_without_position_after_s=4.0,

@@ -1,4 +1,4 @@
-"""Whom PX4 hears on a link, and how it speaks."""
+"""Link behaviour of PX4."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ _MAV_TYPE_GCS = 6
 
 
 def is_ground_station(kind: int, _: int, __: ReadParameter) -> bool:
-    """By its type, whoever it is."""
+    """By MAV_TYPE, whatever the system id."""
     return kind == _MAV_TYPE_GCS
 
 
 def obeys_system(_: int, __: int, ___: ReadParameter) -> bool:
-    """Everybody."""
+    """All systems."""
     return True
 
 

@@ -1,14 +1,13 @@
-"""Messages that PX4 sends and ArduPilot does not, as field values in the order of the XML."""
+"""Builders of messages that only PX4 sends; fields in the order of the XML."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 from simulator.autopilot.position_law import GRAVITY_MPS2
-from simulator.mavlink.fields import centi, fit, in_body
-from simulator.mavlink.motion_messages import pressure_hpa
+from simulator.mavlink.fields import centi, fit, in_body, pressure_hpa
 from simulator.mavlink.view import View
 
 _NAN21 = (math.nan,) * 21
@@ -41,7 +40,7 @@ def altitude(view: View) -> Sequence[Any]:
 
 
 def highres_imu(view: View) -> Sequence[Any]:
-    """Specific force of the truth in body axes, rates as estimated."""
+    """True specific force in body axes, estimated rates."""
     nav = view.autopilot.senses.look()
     w, x, y, z, *_, down, a_north, a_east, a_down = view.autopilot.plant.motion()
     force = in_body((w, x, y, z), (a_north, a_east, a_down - GRAVITY_MPS2))
@@ -61,7 +60,7 @@ def highres_imu(view: View) -> Sequence[Any]:
 
 
 def hil_state_quaternion(view: View) -> Sequence[Any]:
-    """The truth. Latitude and longitude are in steps of 1 cm; PX4 leaves time_usec 0."""
+    """True state. Latitude and longitude have a resolution of 1 cm."""
     truth = view.autopilot.senses.truth
     north, east, down = truth.position_ned_m.tolist()
     a, b, c = (fit(value / GRAVITY_MPS2 * 1e3, 16) for value in truth.acceleration_ned_mps2)
@@ -91,9 +90,3 @@ def estimator_status(view: View) -> Sequence[Any]:
 def ping(view: View) -> Sequence[Any]:
     view.ping_sequence += 1
     return (view.time_us, view.ping_sequence & 0xFFFFFFFF, 0, 0)
-
-
-MESSAGES: Mapping[str, Callable[[View], Sequence[Any]]] = {
-    builder.__name__.upper(): builder
-    for builder in (odometry, altitude, highres_imu, hil_state_quaternion, estimator_status, ping)
-}

@@ -1,4 +1,4 @@
-"""What PX4 takes as items of missions, fences and rally points, and how it shows them again."""
+"""Which items of missions, fences and rally points PX4 takes, and how it sends them back."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from simulator.firmware.values import MissionItem, StatusText, critical
 
 _ERROR, _UNSUPPORTED_FRAME, _UNSUPPORTED = 1, 2, 3  # MAV_MISSION_RESULT
 _COMMAND_FRAME = 2  # MAV_FRAME_MISSION: no place
-_IN_WHOLE_DEGREES = {0: 5, 3: 6}  # MAV_FRAME: GLOBAL and GLOBAL_RELATIVE_ALT and their twins
+_IN_WHOLE_DEGREES = {0: 5, 3: 6}  # MAV_FRAME: GLOBAL, GLOBAL_RELATIVE_ALT -> the same _INT
 _IN_DEGREES = {whole: frame for frame, whole in _IN_WHOLE_DEGREES.items()}
 _INVALID = critical("IGN MISSION_ITEM: Invalid item")
 
@@ -39,7 +39,7 @@ def _refusal(kind: int, item: MissionItem) -> tuple[int, StatusText | None] | No
 
 
 def _frame_shown(item: MissionItem, whole: bool) -> int:
-    """Of the kind in which it is asked for, whatever it came in."""
+    """The frame of the kind of message that is requested, whatever the upload used."""
     return (_IN_WHOLE_DEGREES if whole else _IN_DEGREES).get(item.frame, item.frame)
 
 

@@ -1,4 +1,4 @@
-"""PX4's flight modes, and what a heartbeat shows."""
+"""Flight modes of PX4, and its heartbeat."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ MODES = {
 
 
 def heartbeat(now: Condition) -> tuple[int, int]:
-    """base_mode and MAV_STATE. Offboard shows which loops run: none before the first setpoint,
-    none but the rates' when these are flown."""
+    """base_mode and MAV_STATE. In Offboard base_mode shows which control loops run: none before
+    the first setpoint, the rate loop only for rate setpoints."""
     base_mode = now.mode.base_mode
     if now.mode.behaviour is Behaviour.SETPOINT:
         attitude = now.setpoint if isinstance(now.setpoint, AttitudeSetpoint) else None

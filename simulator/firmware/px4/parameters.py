@@ -1,4 +1,4 @@
-"""PX4's parameters: those that clients read and those that the vehicle obeys."""
+"""Parameters of PX4: those that clients read and those that the vehicle obeys."""
 
 from __future__ import annotations
 

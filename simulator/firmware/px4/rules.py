@@ -1,4 +1,4 @@
-"""PX4's state table: what happens to it, and what it does and says then."""
+"""State table of PX4: events, and what follows from them."""
 
 from __future__ import annotations
 
@@ -21,11 +21,9 @@ _WARNINGS = {
 }
 
 
-def _put_off(event: str, parameter: str, modes: Mapping[int, str]) -> list[Rule]:
-    """First hold, so that a pilot can take over; then the mode that the parameter's value names.
-
-    While another waits already, only what is done at last changes.
-    """
+def _delayed(event: str, parameter: str, modes: Mapping[int, str]) -> list[Rule]:
+    """Rows of a failsafe with delay: Hold first, so that a pilot can take over, then the mode that
+    the parameter selects. A second failsafe during the delay changes that mode only."""
     chosen = [(f"{parameter}={value}", mode) for value, mode in modes.items()]
     return [
         Rule(event, when=("waiting",), do=("failsafe", "await"), texts=(_WARNINGS[event],)),
@@ -58,7 +56,7 @@ def _put_off(event: str, parameter: str, modes: Mapping[int, str]) -> list[Rule]
 RULES = (
     Rule("mode", when=("not armed",), to="requested"),
     Rule("mode", when=("mode can run",), to="requested"),
-    Rule("mode", when=("planner asks",), result=_LATER, texts=(_NOT_AVAILABLE,)),
+    Rule("mode", when=("requested by ground station",), result=_LATER, texts=(_NOT_AVAILABLE,)),
     Rule("mode", result=_LATER),
     Rule("takeoff", to="AUTO.TAKEOFF"),
     Rule("land", to="AUTO.LAND", texts=(info("Landing at current position"),)),
@@ -102,9 +100,9 @@ RULES = (
         )
     ),
     Rule("stream found", when=("since stream lost",), to="remembered", do=("recover",)),
-    *_put_off("battery critical", "COM_LOW_BAT_ACT", {1: _RTL, 2: _LAND, 3: _RTL}),
-    *_put_off("battery emergency", "COM_LOW_BAT_ACT", {1: _RTL, 2: _LAND, 3: _LAND}),
-    *_put_off("ground station lost", "NAV_DLL_ACT", {2: _RTL, 3: _LAND}),
+    *_delayed("battery critical", "COM_LOW_BAT_ACT", {1: _RTL, 2: _LAND, 3: _RTL}),
+    *_delayed("battery emergency", "COM_LOW_BAT_ACT", {1: _RTL, 2: _LAND, 3: _LAND}),
+    *_delayed("ground station lost", "NAV_DLL_ACT", {2: _RTL, 3: _LAND}),
     Rule(
         "ground station lost",
         when=("armed", "not landed", "NAV_DLL_ACT=1"),

@@ -1,4 +1,4 @@
-"""What PX4 makes of setpoint messages, with its lack of checks."""
+"""How PX4 reads setpoint messages, including those that it should refuse."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ _RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b011, 64, 128
 
 
 def attitude_setpoint(values: Mapping[str, Any], _: ReadParameter) -> AttitudeSetpoint | None:
-    """SET_ATTITUDE_TARGET, with PX4's lack of checks; None when it is no stream (mask 135).
+    """SET_ATTITUDE_TARGET as PX4 reads it; None when it demands nothing (mask 135).
 
-    Only the roll and pitch rate bits count as "no rates". A thrust that is ignored or NaN is zero
-    thrust. A quaternion of any length flies; one without direction leaves the last attitude.
+    Only the roll and pitch bits of type_mask ignore the rates. A thrust that is ignored or NaN is
+    zero thrust. A quaternion may have any length; one without direction keeps the last attitude.
     """
     mask = values["type_mask"]
     attitude_given = not mask & _ATTITUDE_IGNORED
@@ -56,15 +56,15 @@ _YAW_IGNORED, _YAW_RATE_IGNORED = 1024, 2048
 
 
 def in_local_frame(values: Mapping[str, Any], _: Triple, attitude: Quaternion) -> Mapping[str, Any]:
-    """BODY_NED: velocity turned by the course, acceleration by the attitude, no position.
+    """BODY_NED: velocity rotated by yaw, acceleration by attitude, no position.
 
-    A vector is whole or ignored there.
+    A vector with one ignored component is ignored.
     """
     if values["coordinate_frame"] != _BODY_NED:
         return values
     w, x, y, z = attitude
     yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
-    ahead, aside = values["vx"], values["vy"]
+    forward, right = values["vx"], values["vy"]
     given = (values["afx"], values["afy"], values["afz"])
     finite = all(map(math.isfinite, given))
     turned = rotation_from_quaternion(np.array(attitude)) @ given if finite else given
@@ -75,8 +75,8 @@ def in_local_frame(values: Mapping[str, Any], _: Triple, attitude: Quaternion) -
         **values,
         "coordinate_frame": _LOCAL_NED,
         "type_mask": mask,
-        "vx": math.cos(yaw) * ahead - math.sin(yaw) * aside,
-        "vy": math.sin(yaw) * ahead + math.cos(yaw) * aside,
+        "vx": math.cos(yaw) * forward - math.sin(yaw) * right,
+        "vy": math.sin(yaw) * forward + math.cos(yaw) * right,
         "afx": float(turned[0]),
         "afy": float(turned[1]),
         "afz": float(turned[2]),
@@ -84,7 +84,7 @@ def in_local_frame(values: Mapping[str, Any], _: Triple, attitude: Quaternion) -
 
 
 def rejection_text(message: str, frame: int | None) -> StatusText:
-    """About a setpoint in an unknown frame; None: one that demands nothing."""
+    """Text about a setpoint in an unknown frame, or (None) one that demands nothing."""
     if frame is None:
         return critical(f"{message} invalid")
     if message.endswith("GLOBAL_INT"):
@@ -93,7 +93,7 @@ def rejection_text(message: str, frame: int | None) -> StatusText:
 
 
 def motion_setpoint(values: Mapping[str, Any]) -> MotionSetpoint | None:
-    """SET_POSITION_TARGET_LOCAL_NED in frame 1; None when nothing is demanded."""
+    """SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME 1; None when nothing is demanded."""
     if values["coordinate_frame"] != _LOCAL_NED:
         return None
     mask = values["type_mask"]

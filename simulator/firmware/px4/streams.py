@@ -1,12 +1,13 @@
-"""What PX4 sends without being asked, and what it sends on request."""
+"""Messages that PX4 sends periodically and on request."""
 
 from __future__ import annotations
 
 import math
 
 from simulator.firmware.base import Streams
-from simulator.firmware.px4.messages import MESSAGES
+from simulator.firmware.px4 import messages
 from simulator.firmware.values import Result
+from simulator.mavlink.telemetry import builders_in
 
 COMPANION_RATES_HZ = {
     "HEARTBEAT": 1.0,
@@ -55,7 +56,7 @@ GROUND_RATES_HZ = {
     "PING": 0.1,
 }
 
-_BY_ITSELF = frozenset({"MISSION_CURRENT", "MISSION_ITEM_REACHED"})
+_ON_EVENT = frozenset({"MISSION_CURRENT", "MISSION_ITEM_REACHED"})
 _NEVER_SENT = frozenset({
     8, 25, 26, 36, 62, 65, 69, 76, 87, 93, 106, 112, 116, 124, 129, 132, 137, 143, 149,
     192, 225, 231, 233, 235, 246, 250, 251, 253, 254, 261, 263, 264, 265, 280, 281, 283,
@@ -65,11 +66,11 @@ _NEVER_SENT = frozenset({
 STREAMS = Streams(
     companion_rates_hz=COMPANION_RATES_HZ,
     ground_rates_hz=GROUND_RATES_HZ,
-    messages=MESSAGES,
+    messages=builders_in(messages),
     withheld_until={},
     position_grid_steps=2,
-    fixed=_BY_ITSELF | {"HEARTBEAT"},
-    not_on_request=_BY_ITSELF,
+    fixed=_ON_EVENT | {"HEARTBEAT"},
+    not_on_request=_ON_EVENT,
     never_sent=_NEVER_SENT,
     groups={},
     rate_max_hz=math.inf,
