@@ -1,4 +1,4 @@
-"""What outlives a change of mode: home, the place to hold, the setpoint in force, the speed limit.
+"""Guidance state: what outlives a change of mode.
 
 Every behaviour (`simulator.autopilot.behaviours`) reads and changes this one value. NED, SI.
 """
@@ -6,11 +6,11 @@ Every behaviour (`simulator.autopilot.behaviours`) reads and changes this one va
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 
 from simulator.autopilot.mission import Mission
-from simulator.autopilot.nav import Nav
 from simulator.autopilot.parameters import ParameterTable
+from simulator.autopilot.state import StateEstimate
 from simulator.autopilot.sticks import Sticks
 from simulator.autopilot.trajectory import Trajectory
 from simulator.firmware.base import Firmware
@@ -19,67 +19,43 @@ from simulator.firmware.values import AttitudeSetpoint, MotionSetpoint, Triple
 ORIGIN: Triple = (0.0, 0.0, 0.0)
 
 
-@dataclass(slots=True)
 class Guidance:
-    """Guidance state of one autopilot.
+    """Home, the place to hold, the setpoint in force and the speed limit of one autopilot.
 
-    `setpoint` is the newest setpoint of a client; `cruise_mps` the horizontal speed that was asked
-    for in automatic flight, inf if none was; `events` are reported to the commander each step.
-    `trajectory` is None for a firmware that plans none (ArduCopter), `sticks` for one whose sticks
-    are not simulated (PX4).
+    `sticks` is None for a firmware whose sticks are not simulated (PX4), `trajectory` for one that
+    plans none (ArduCopter). `events` are reported to the commander at each step.
     """
 
-    firmware: Firmware
-    parameters: ParameterTable
-    mission: Mission
-    sticks: Sticks | None = None
-    trajectory: Trajectory | None = field(init=False, default=None)
-    setpoint: AttitudeSetpoint | MotionSetpoint | None = None
-    home_ned_m: Triple = ORIGIN
-    home_yaw_rad: float = 0.0
-    hold_ned_m: Triple = ORIGIN
-    cruise_mps: float = math.inf
-    events: list[str] = field(init=False)
-    _held: MotionSetpoint = field(default_factory=lambda: MotionSetpoint(ORIGIN))
-
-    def __post_init__(self) -> None:
-        limits = self.firmware.flight.path_limits
-        if limits is not None:
-            self.trajectory = Trajectory(limits, self.parameters)
-        self.events = self.mission.events
+    def __init__(self, firmware: Firmware, parameters: ParameterTable, mission: Mission) -> None:
+        self.firmware, self.parameters, self.mission = firmware, parameters, mission
+        self.events = mission.events
+        limits, sticks = firmware.flight.path_limits, firmware.flight.sticks
+        self.trajectory = None if limits is None else Trajectory(limits, parameters)
+        self.sticks = None if sticks is None else Sticks(sticks)
+        self.setpoint: AttitudeSetpoint | MotionSetpoint | None = None  # the newest of a client
+        self.hold = MotionSetpoint(ORIGIN)
+        self.home_ned_m = ORIGIN
+        self.home_yaw_rad = 0.0
+        self.cruise_mps = math.inf  # requested for automatic flight; inf: none
 
     @property
-    def held(self) -> MotionSetpoint:
-        """The setpoint that holds `hold_ned_m`; the same object while the place stays the same."""
-        if self._held.position_ned_m is not self.hold_ned_m:
-            self._held = MotionSetpoint(self.hold_ned_m)
-        return self._held
+    def hold_ned_m(self) -> Triple:
+        """The place to hold."""
+        return self.hold.position_ned_m
 
-    @property
-    def holds_named_place(self) -> bool:
-        """A client named the place to hold (`hold_at`)."""
-        return self._held.faces_way and self._held.position_ned_m is self.hold_ned_m
-
-    @property
-    def setpoint_is_held(self) -> bool:
-        """The setpoint in force is the one of `hold_at`."""
-        return self.setpoint is self._held
-
-    def hold_at(self, place_ned_m: Triple, yaw_rad: float) -> MotionSetpoint:
-        """Hold this place; a NaN yaw faces the way there. Returns the setpoint that does so."""
-        self.hold_ned_m = place_ned_m
-        self._held = MotionSetpoint(place_ned_m, yaw_rad=yaw_rad, faces_way=True)
-        return self._held
+    def hold_at(self, place_ned_m: Triple, yaw_rad: float) -> None:
+        """Hold a place that a client names; a NaN yaw faces the direction of flight."""
+        self.hold = MotionSetpoint(place_ned_m, yaw_rad=yaw_rad, faces_way=True)
 
     def turn_to(self, yaw_rad: float, turn_radps: float) -> None:
-        """Keep this yaw while holding a place or flying a setpoint."""
-        self._held = MotionSetpoint(self.hold_ned_m, yaw_rad=yaw_rad, turn_radps=turn_radps)
+        """Keep this yaw while holding a place or following a setpoint."""
+        self.hold = MotionSetpoint(self.hold_ned_m, yaw_rad=yaw_rad, turn_radps=turn_radps)
         if isinstance(self.setpoint, MotionSetpoint):
             self.setpoint = replace(self.setpoint, yaw_rad=yaw_rad, turn_radps=turn_radps)
 
-    def stopping_place_ned_m(self, nav: Nav) -> Triple:
-        """Where the vehicle comes to rest when it brakes gently from here."""
+    def stopping_place_ned_m(self, estimate: StateEstimate) -> Triple:
+        """Where the vehicle stops when it brakes now."""
         if self.trajectory is not None:
-            return self.trajectory.stop_ned_m(nav)
-        (x, y, z), (vx, vy, vz) = nav.position_ned_m, nav.velocity_ned_mps
+            return self.trajectory.stop_ned_m(estimate)
+        (x, y, z), (vx, vy, vz) = estimate.position_ned_m, estimate.velocity_ned_mps
         return (x + 0.5 * vx, y + 0.5 * vy, z + 0.2 * vz)

@@ -10,5 +10,5 @@ class Hold(ActiveBehaviour):
     """PX4 AUTO.LOITER; ArduCopter BRAKE and CIRCLE."""
 
     def keeps_place(self, following: Behaviour) -> bool:
-        """Hold asked for again does not stop a vehicle on its way to a named place."""
-        return following is Behaviour.HOLD and self.guidance.holds_named_place
+        """A repeated request does not stop a vehicle that flies to a named place."""
+        return following is Behaviour.HOLD and self.guidance.hold.faces_way

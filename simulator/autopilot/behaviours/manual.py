@@ -5,7 +5,7 @@ from __future__ import annotations
 from simulator.autopilot.behaviours.base import ActiveBehaviour, Control
 
 
-class LevelAtLeastThrust(ActiveBehaviour):
+class LevelAtLeastThrottle(ActiveBehaviour):
     """ArduCopter STABILIZE: level, with the throttle stick down."""
 
     control = Control.LEVEL

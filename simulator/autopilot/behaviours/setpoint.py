@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from simulator.autopilot.behaviours.base import ActiveBehaviour
-from simulator.autopilot.nav import Nav
+from simulator.autopilot.state import StateEstimate
 from simulator.firmware.values import MotionSetpoint
 
 
 class FollowSetpoint(ActiveBehaviour):
-    """The motion setpoint in force, or hold where there is none. The pilot flies an attitude
-    setpoint without asking for a motion."""
+    """Follow a motion setpoint; hold where there is none. The pilot flies an attitude setpoint
+    without asking for a motion."""
 
     lifts_off = True
     planned = False
-    goes_on = True
+    continues = True
 
-    def motion(self, nav: Nav, time_s: float, *, landed: bool) -> MotionSetpoint:
+    def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
         setpoint = self.guidance.setpoint
-        return setpoint if isinstance(setpoint, MotionSetpoint) else self.guidance.held
+        return setpoint if isinstance(setpoint, MotionSetpoint) else self.guidance.hold
 
     @property
     def automatic(self) -> bool:

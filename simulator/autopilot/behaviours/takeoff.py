@@ -1,51 +1,46 @@
-"""Takeoff: climb to a place, or straight up to the default height."""
+"""Takeoff: climb to a place, or vertically to the default height."""
 
 from __future__ import annotations
 
 import math
 
 from simulator.autopilot.behaviours.base import ActiveBehaviour
-from simulator.autopilot.nav import Nav
+from simulator.autopilot.state import StateEstimate
 from simulator.firmware.values import NAN3, Behaviour, MotionSetpoint, Triple
 
-_FLATTEST = 1000.0  # metres across per metre of climb
+_FLATTEST = 1000.0  # m across per m of climb
 
 
 class Takeoff(ActiveBehaviour):
-    """PX4 AUTO.TAKEOFF; ArduCopter GUIDED after MAV_CMD_NAV_TAKEOFF. Ends with `climbed`."""
+    """PX4 AUTO.TAKEOFF; ArduCopter GUIDED after MAV_CMD_NAV_TAKEOFF. Reports "climbed"."""
 
     lifts_off = True
+    climbing = True
 
-    def enter(self, nav: Nav, place_ned_m: Triple = NAN3) -> None:
+    def enter(self, place_ned_m: Triple = NAN3) -> None:
         self._place_ned_m = place_ned_m
         self._begun = self._climbed = False
-
-    @property
-    def climbing(self) -> bool:
-        return True
-
-    @property
-    def events(self) -> tuple[str, ...]:
-        return ("climbed",) if self._climbed else ()
 
     def keeps_place(self, following: Behaviour) -> bool:
         return self._climbed and following in (Behaviour.HOLD, Behaviour.SETPOINT)
 
-    def motion(self, nav: Nav, time_s: float, *, landed: bool) -> MotionSetpoint:
+    def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
         guidance = self.guidance
         if not self._begun:
             self._begun = True
-            self._begin(nav.position_ned_m, landed=landed)
+            self._begin(estimate.position_ned_m, landed=landed)
         north, east, target_z = self._place_ned_m
         if math.isnan(north + east):
             north, east = guidance.hold_ned_m[:2]
-        if nav.position_ned_m[2] < target_z + guidance.parameters.role("climbed_within_m"):
-            self._climbed = not landed
-        guidance.hold_ned_m = (north, east, target_z)
-        return MotionSetpoint(guidance.hold_ned_m)
+        within_m = guidance.parameters.role("climbed_within_m")
+        if not (self._climbed or landed) and estimate.position_ned_m[2] < target_z + within_m:
+            self._climbed = True
+            guidance.events.append("climbed")
+        guidance.hold = MotionSetpoint((north, east, target_z))
+        return guidance.hold
 
     def _begin(self, here_ned_m: Triple, *, landed: bool) -> None:
-        """Neither a descent nor, from the ground, a nearly flat leg is flown."""
+        """Choose the height. Neither a descent nor, on the ground, a nearly flat leg is flown."""
         (x, y, z), (north, east, target_z) = here_ned_m, self._place_ned_m
         if math.isnan(target_z):
             target_z = z - self.guidance.parameters.role("takeoff_height_m")

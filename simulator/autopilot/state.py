@@ -1,6 +1,6 @@
-"""What the flight stack flies by: its clock, the estimate, and what feet and range finder feel.
+"""State of the vehicle at the present step: time since boot, estimate and truth.
 
-Knows the plant alone, and of that what it shows; knows no modes, no parameters and no messages.
+Reads the plant. Knows no modes, no parameters and no messages.
 """
 
 from __future__ import annotations
@@ -14,16 +14,17 @@ from simulator.vehicle.plant import Plant, Truth
 
 
 @dataclass(frozen=True, slots=True)
-class Nav:
-    """The estimate as plain floats; whether the ground carries the vehicle, and how far it is."""
+class StateEstimate:
+    """The estimator's output as plain floats (NED, FRD, SI), ground contact and range finder."""
 
+    time_s: float  # vehicle time since boot
     position_ned_m: Triple
     velocity_ned_mps: Triple
     attitude: Quaternion
     rates_frd_radps: Triple
-    on_ground: bool
-    reset_counter: int = 0
-    ground_m: float = math.inf  # below the feet
+    on_ground: bool  # the ground carries the vehicle
+    reset_counter: int
+    ground_m: float  # distance to the ground
 
     @property
     def yaw_rad(self) -> float:
@@ -31,15 +32,15 @@ class Nav:
         return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
 
-class Senses:
-    """The present step of one plant, looked at when somebody asks and once only."""
+class VehicleState:
+    """Time, estimate and truth of the present step; both are read from the plant once a step."""
 
     def __init__(self, plant: Plant) -> None:
         self._plant = plant
         self.steps = 0  # of STEP_S since boot
-        self.gps_healthy = True  # no fault takes the fixes away
+        self.gps_healthy = True  # False while a fault takes the fix away
         self._truth: Truth | None = None
-        self._nav: Nav | None = None
+        self._estimate: StateEstimate | None = None
 
     @property
     def time_s(self) -> float:
@@ -48,33 +49,35 @@ class Senses:
 
     @property
     def time_us(self) -> int:
-        """The same in whole microseconds; no fault turns it back."""
+        """Vehicle time since boot in whole microseconds; no clock fault changes it."""
         return self.steps * STEP_US
 
     def step(self) -> None:
-        """The plant has moved by one step."""
+        """Begin the next step: the plant has moved."""
         self.steps += 1
-        self.forget()
+        self.invalidate()
 
-    def forget(self) -> None:
-        """Look again when asked next: the plant or its estimate has changed."""
-        self._truth = self._nav = None
+    def invalidate(self) -> None:
+        """Read the plant again: its state or its estimate was changed within a step."""
+        self._truth = self._estimate = None
 
     @property
     def truth(self) -> Truth:
-        """Where the vehicle really is now; the flight stack itself reads the battery alone."""
+        """True state. The autopilot itself uses only the battery's."""
         if self._truth is None:
             self._truth = self._plant.truth
         return self._truth
 
-    def look(self) -> Nav:
-        """The estimate now, and whether the feet touch the ground."""
-        if self._nav is None:
+    @property
+    def estimate(self) -> StateEstimate:
+        """State as the autopilot estimates it."""
+        if self._estimate is None:
             plant = self._plant
-            (north, east, down, v_north, v_east, v_down, w, x, y, z, p, q, r) = (
+            north, east, down, v_north, v_east, v_down, w, x, y, z, p, q, r = (
                 plant.report().tolist()
             )
-            self._nav = Nav(
+            self._estimate = StateEstimate(
+                self.time_s,
                 (north, east, down),
                 (v_north, v_east, v_down),
                 (w, x, y, z),
@@ -83,4 +86,4 @@ class Senses:
                 plant.reset_counter,
                 plant.height_m,
             )
-        return self._nav
+        return self._estimate
