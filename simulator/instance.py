@@ -194,7 +194,7 @@ class Instance:
         self.autopilot = Autopilot(
             old.firmware, old.plant, old.parameters, old.mission, boot_scale=old.health.boot_scale
         )
-        self.autopilot.pilot.set_landed(old.plant.on_ground)
+        self.autopilot.pilot.detector.set_landed(old.plant.on_ground)
         self.view.restart(self.autopilot)
         self.companion.restart()
         self.ground.restart()

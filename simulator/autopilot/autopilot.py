@@ -51,17 +51,11 @@ class Autopilot:
         self.state = VehicleState(plant)
         self.monitors = Monitors(firmware, self.parameters)
         self.stream = SetpointStream(firmware, self.parameters)
-        self.health = Health(
-            firmware, self.parameters, self.mission, self.stream, self.monitors, boot_scale
-        )
         self.guidance = Guidance(firmware, self.parameters, self.mission)
+        self.health = Health(self.guidance, self.stream, self.monitors, boot_scale)
         self.navigator = Navigator(self.guidance)
-        self.pilot = Pilot(firmware, self.parameters, self.navigator, self.state)
-        self.commander = Commander(
-            firmware, self.parameters, self.navigator, self.pilot, self.state, self.health
-        )
-
-    # -- input -------------------------------------------------------------------------------
+        self.pilot = Pilot(self.navigator, self.state)
+        self.commander = Commander(self.navigator, self.pilot, self.state, self.health)
 
     def handle(self, event: str, request: Request = NO_REQUEST) -> Result:
         """Handle an event from outside; returns the acknowledgement."""
@@ -100,8 +94,6 @@ class Autopilot:
         behaviour = self.commander.mode.behaviour
         if self.navigator.behaviour is not behaviour:
             self.pilot.enter(behaviour)
-
-    # -- time --------------------------------------------------------------------------------
 
     def step(self) -> None:
         """Fly STEP_S, then handle the events of the step."""

@@ -14,11 +14,10 @@ from simulator.autopilot.behaviours import BEHAVIOURS
 from simulator.autopilot.health import Health
 from simulator.autopilot.monitors import FlightTime
 from simulator.autopilot.navigator import Navigator
-from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.pilot import Pilot
 from simulator.autopilot.state import VehicleState
 from simulator.autopilot.state_table import StateTable, fields_of
-from simulator.firmware.base import AFTER_DELAY, Firmware, Rule
+from simulator.firmware.base import AFTER_DELAY, Rule
 from simulator.firmware.values import (
     NAN3,
     Behaviour,
@@ -37,7 +36,7 @@ class Request:
 
     mode: str = ""
     takeoff_ned_m: Triple = NAN3
-    by_planner: bool = False  # the component of a ground station
+    by_ground_station: bool = False  # the component of a ground station
 
 
 NO_REQUEST = Request()
@@ -50,20 +49,14 @@ class Commander:
     """
 
     def __init__(
-        self,
-        firmware: Firmware,
-        parameters: ParameterTable,
-        navigator: Navigator,
-        pilot: Pilot,
-        state: VehicleState,
-        health: Health,
+        self, navigator: Navigator, pilot: Pilot, state: VehicleState, health: Health
     ) -> None:
-        self._firmware, self._parameters = firmware, parameters
-        self._navigator, self._pilot = navigator, pilot
-        self._guidance = navigator.guidance
+        self._navigator, self._pilot, self._guidance = navigator, pilot, navigator.guidance
+        self._firmware, self._parameters = self._guidance.firmware, self._guidance.parameters
         self._state, self._health = state, health
+        firmware = self._firmware
         self._table = StateTable(firmware, CONDITIONS, ACTIONS, TEXT_VALUES)
-        self.flight_time = FlightTime(parameters)
+        self.flight_time = FlightTime(self._parameters)
         self.mode: Mode = firmware.modes[firmware.boot_mode]
         self._intended = self._remembered = firmware.boot_mode
         self.armed = self.failsafe = False
@@ -219,44 +212,46 @@ class Commander:
 
 
 CONDITIONS: dict[str, Callable[[Commander], bool]] = {
-    "armed": lambda own: own.armed,
-    "landed": lambda own: own._pilot.landed,
-    "waiting": lambda own: own._delayed is not None,
-    "ready": lambda own: own.healthy and own.mode.arms,
-    "mode can run": lambda own: own._health.can_run(own._requested, own._state.time_s),
-    "requested by ground station": lambda own: own._request.by_planner,
-    "mode needs position": lambda own: own.mode.needs_position,
-    "mode arms": lambda own: own.mode.arms,
-    "position missing": lambda own: own._health.position_missing(own._requested),
-    "mission missing": lambda own: not own._guidance.mission.flyable,
-    "climb requested": lambda own: own._request.takeoff_ned_m[2] <= own._guidance.home_ned_m[2],
-    "climbing": lambda own: own._navigator.behaviour is Behaviour.TAKEOFF,
-    "obeys attitude": lambda own: own._navigator.follows_attitude,
-    "obeys motion": lambda own: isinstance(own._navigator.setpoint, MotionSetpoint),
-    "obeys velocity": lambda own: own._navigator.follows_velocity,
+    "armed": lambda c: c.armed,
+    "landed": lambda c: c._pilot.landed,
+    "action delayed": lambda c: c._delayed is not None,
+    "ready": lambda c: c.healthy and c.mode.arms,
+    "mode can run": lambda c: c._health.can_run(c._requested, c._state.time_s),
+    "requested by ground station": lambda c: c._request.by_ground_station,
+    "mode needs position": lambda c: c.mode.needs_position,
+    "mode arms": lambda c: c.mode.arms,
+    "position missing": lambda c: (
+        c._requested.needs_position and "position" not in c._health.reached
+    ),
+    "mission missing": lambda c: not c._guidance.mission.flyable,
+    "climb requested": lambda c: c._request.takeoff_ned_m[2] <= c._guidance.home_ned_m[2],
+    "climbing": lambda c: c._navigator.behaviour is Behaviour.TAKEOFF,
+    "attitude setpoint": lambda c: c._navigator.follows_attitude,
+    "motion setpoint": lambda c: isinstance(c._navigator.setpoint, MotionSetpoint),
+    "velocity setpoint": lambda c: c._navigator.follows_velocity,
 }
 
 ACTIONS: dict[str, Callable[[Commander], None]] = {
     "arm": Commander._arm,
     "disarm": Commander._disarm,
     "failsafe": Commander._fail,
-    "await": Commander._delay,
+    "delay": Commander._delay,
     "recover": Commander._recover,
     "take off": Commander._take_off,
-    "return": lambda own: own._pilot.enter(Behaviour.RETURN),
+    "return": lambda c: c._pilot.enter(Behaviour.RETURN),
     "hold": Commander._hold,
-    "level": lambda own: own._pilot.level_off(),
+    "level": lambda c: c._pilot.level_off(),
     "latch": Commander._latch,
-    "restart": Commander._reboot,
+    "reboot": Commander._reboot,
 }
 
 TEXT_VALUES: dict[str, Callable[[Commander], float | str]] = {
-    "mode": lambda own: own._requested.title,
-    "takeoff_m": lambda own: own._parameters.role("takeoff_height_m"),
-    "climb_m": lambda own: own._guidance.mission.climb_m,
-    "target_m": lambda own: own._navigator.target_height_m,
+    "mode": lambda c: c._requested.title,
+    "takeoff_m": lambda c: c._parameters.role("takeoff_height_m"),
+    "climb_m": lambda c: c._guidance.mission.climb_m,
+    "target_m": lambda c: c._navigator.target_height_m,
     "target_amsl_m": Commander._target_amsl_m,
-    "battery_v": lambda own: own._state.truth.battery.voltage_v,
-    "used_mah": lambda own: own._state.truth.battery.used_mah,
-    "delay_s": lambda own: own._parameters.role("failsafe_delay_s"),
+    "battery_v": lambda c: c._state.truth.battery.voltage_v,
+    "used_mah": lambda c: c._state.truth.battery.used_mah,
+    "delay_s": lambda c: c._parameters.role("failsafe_delay_s"),
 }

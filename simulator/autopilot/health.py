@@ -7,11 +7,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from simulator.autopilot.mission import Mission
+from simulator.autopilot.guidance import Guidance
 from simulator.autopilot.monitors import Monitors
-from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.setpoints import SetpointStream
-from simulator.firmware.base import Firmware
 from simulator.firmware.values import Behaviour, Mode
 
 
@@ -19,19 +17,14 @@ class Health:
     """Health of one vehicle from boot on; `boot_scale` multiplies the times of its start."""
 
     def __init__(
-        self,
-        firmware: Firmware,
-        parameters: ParameterTable,
-        mission: Mission,
-        stream: SetpointStream,
-        monitors: Monitors,
-        boot_scale: float,
+        self, guidance: Guidance, stream: SetpointStream, monitors: Monitors, boot_scale: float
     ) -> None:
-        self._firmware, self._parameters, self._mission = firmware, parameters, mission
-        self._stream, self._monitors = stream, monitors
+        self._firmware, self._mission = guidance.firmware, guidance.mission
+        self._parameters, self._stream, self._monitors = guidance.parameters, stream, monitors
         self.boot_scale = boot_scale
         self.reached: frozenset[str] = frozenset()  # boot events so far
-        self._ahead = sorted((s * boot_scale, event) for event, s in firmware.health.boot.items())
+        times_s = self._firmware.health.boot.items()
+        self._ahead = sorted((at_s * boot_scale, event) for event, at_s in times_s)
 
     def boot_events(self, now_s: float) -> Iterator[str]:
         """Boot events since the last call."""
@@ -69,7 +62,3 @@ class Health:
         if mode.behaviour is Behaviour.MISSION:
             return self._mission.flyable
         return not mode.needs_sticks
-
-    def position_missing(self, mode: Mode) -> bool:
-        """The mode needs a position and there was none since boot."""
-        return mode.needs_position and "position" not in self.reached

@@ -11,16 +11,10 @@ import math
 
 from simulator.autopilot.behaviours import BEHAVIOURS, ActiveBehaviour
 from simulator.autopilot.guidance import Guidance
+from simulator.autopilot.position_loop import level
 from simulator.autopilot.state import StateEstimate
 from simulator.autopilot.trajectory import Trajectory
-from simulator.firmware.values import (
-    NAN3,
-    AttitudeSetpoint,
-    Behaviour,
-    MotionSetpoint,
-    Quaternion,
-    Triple,
-)
+from simulator.firmware.values import NAN3, AttitudeSetpoint, Behaviour, MotionSetpoint, Triple
 
 
 class Navigator:
@@ -70,8 +64,6 @@ class Navigator:
         self._level = AttitudeSetpoint(level(estimate.yaw_rad), None, 0.0, climb_mps=0.0)
         self.guidance.setpoint = self._level
 
-    # -- state -------------------------------------------------------------------------------
-
     @property
     def setpoint(self) -> AttitudeSetpoint | MotionSetpoint | None:
         """The setpoint that is followed; None in other behaviours."""
@@ -101,8 +93,6 @@ class Navigator:
         trajectory = self.guidance.trajectory
         return trajectory if trajectory is not None and trajectory.active else None
 
-    # -- motion ------------------------------------------------------------------------------
-
     @property
     def cruise_mps(self) -> float:
         """Horizontal speed limit."""
@@ -121,11 +111,6 @@ class Navigator:
         height_m = guidance.home_ned_m[2] - estimate.position_ned_m[2]
         leg = active.leg(self.cruise_mps, height_m)
         return guidance.trajectory.follow(goal, leg, estimate, on_ground=on_ground)
-
-
-def level(yaw_rad: float) -> Quaternion:
-    """Attitude with this yaw and no tilt (wxyz)."""
-    return (math.cos(0.5 * yaw_rad), 0.0, 0.0, math.sin(0.5 * yaw_rad))
 
 
 def _kind(setpoint: AttitudeSetpoint | MotionSetpoint | None) -> tuple[bool, ...]:

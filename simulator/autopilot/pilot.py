@@ -11,47 +11,33 @@ import math
 
 from simulator.autopilot.behaviours import Control
 from simulator.autopilot.ground import LandDetector, TakeoffRamp
-from simulator.autopilot.navigator import Navigator, level
-from simulator.autopilot.parameters import ParameterTable
-from simulator.autopilot.position_loop import Limits, PositionLoop
+from simulator.autopilot.navigator import Navigator
+from simulator.autopilot.position_loop import Limits, PositionLoop, level
 from simulator.autopilot.state import StateEstimate, VehicleState
-from simulator.firmware.base import Firmware
-from simulator.firmware.values import (
-    NAN3,
-    AttitudeSetpoint,
-    Behaviour,
-    MotionSetpoint,
-    Quaternion,
-    Triple,
-)
+from simulator.firmware.values import NAN3, AttitudeSetpoint, Behaviour, MotionSetpoint, Triple
 from simulator.steps import LOOP_S
 from simulator.vehicle.attitude import Demand
 
-_TILT_BOOST_MAX = 10.0
+_TILT_COSINE_MIN = 0.1  # the tilt raises the thrust to no more than ten times
 OFF = Demand()
 
 
 class Pilot:
     """Flies one vehicle from arming to disarming."""
 
-    def __init__(
-        self,
-        firmware: Firmware,
-        parameters: ParameterTable,
-        navigator: Navigator,
-        state: VehicleState,
-    ) -> None:
+    def __init__(self, navigator: Navigator, state: VehicleState) -> None:
+        firmware, parameters = navigator.guidance.firmware, navigator.guidance.parameters
         self._firmware, self._parameters = firmware, parameters
         self._navigator, self._state = navigator, state
         self._tuned = parameters.changes
         self.loop = PositionLoop(firmware.flight.gains(parameters.__getitem__))
-        self._detector = LandDetector(firmware.flight.landing, parameters)
+        self.detector = LandDetector(firmware.flight.landing, parameters)
         self._ramp = TakeoffRamp(parameters)
         self.demand = OFF  # in force
         self.thrust_demanded = 0.0  # before it is raised for the tilt
         self.motion = MotionSetpoint()  # last one flown
         self._setpoint: AttitudeSetpoint | None = None  # last one flown
-        self._attitude: Quaternion = (1.0, 0.0, 0.0, 0.0)
+        self._attitude = level(0.0)
         self._next_loop_s = 0.0
         self._armed_for_s = 0.0
         self._climb_thrust = 0.0  # of an attitude setpoint with a climb rate
@@ -60,11 +46,7 @@ class Pilot:
     @property
     def landed(self) -> bool:
         """The land detector's result."""
-        return self._detector.landed
-
-    def set_landed(self, landed: bool) -> None:
-        """Start, after a reboot, on the ground or in the air."""
-        self._detector.set_landed(landed)
+        return self.detector.landed
 
     def enter(self, behaviour: Behaviour, place_ned_m: Triple = NAN3) -> None:
         """Begin a behaviour. `place_ned_m`: where a takeoff climbs to."""
@@ -93,7 +75,7 @@ class Pilot:
         if not armed:
             self.demand, self._setpoint, self.thrust_demanded = OFF, None, 0.0
             if not self.landed and self._state.estimate.on_ground:
-                self._detector.set_landed(True)
+                self.detector.set_landed(True)
             return OFF
         setpoint = self._navigator.setpoint
         if not isinstance(setpoint, AttitudeSetpoint):
@@ -114,7 +96,7 @@ class Pilot:
         control = self._navigator.active.control
         if control is Control.LEVEL:
             thrust = self._parameters.role("stick_thrust_least")
-            self._set_demand(level(self.loop.yaw_rad), None, thrust)
+            self.demand = Demand(True, thrust, level(self.loop.yaw_rad))
         elif setpoint is not None:
             if setpoint.climb_mps is not None:
                 self._control_climb(setpoint.climb_mps, estimate)
@@ -123,11 +105,6 @@ class Pilot:
         elif control is Control.MOTION:
             self._fly_motion(estimate)
         self._detect_landing(setpoint, estimate)
-
-    def _set_demand(self, attitude: Quaternion | None, rates: Triple | None, thrust: float) -> None:
-        demand = Demand(True, thrust, attitude, rates)
-        if demand != self.demand:
-            self.demand = demand
 
     # -- attitude setpoints ------------------------------------------------------------------
 
@@ -151,9 +128,10 @@ class Pilot:
             thrust = 0.0
         self.thrust_demanded = thrust
         if self._boosts_thrust:
-            thrust = min(1.0, thrust * _tilt_boost(self._state.estimate.attitude))
+            tilt_cosine = max(self._state.estimate.tilt_cosine, _TILT_COSINE_MIN)
+            thrust = min(1.0, thrust * (1.0 / tilt_cosine))
         attitude = self._attitude if setpoint.rates_frd_radps is None else None
-        self._set_demand(attitude, setpoint.rates_frd_radps, thrust)
+        self.demand = Demand(True, thrust, attitude, setpoint.rates_frd_radps)
 
     def _control_climb(self, climb_mps: float, estimate: StateEstimate) -> None:
         """Thrust for a climb rate."""
@@ -185,11 +163,11 @@ class Pilot:
         elif self.landed:
             self.loop.reset(estimate.yaw_rad)
             attitude, thrust = level(estimate.yaw_rad), 0.0
-        elif self._detector.contact:
+        elif self.detector.contact:
             attitude, thrust = level(estimate.yaw_rad), self._parameters.role("thrust_least")
         self._attitude = attitude
         self.thrust_demanded = thrust
-        self._set_demand(attitude, None, thrust)
+        self.demand = Demand(True, thrust, attitude)
 
     @property
     def _limits(self) -> Limits:
@@ -228,14 +206,12 @@ class Pilot:
     def _detect_landing(self, setpoint: AttitudeSetpoint | None, estimate: StateEstimate) -> None:
         was_landed, by_motion = self.landed, setpoint is None
         if not by_motion and self._firmware.setpoints.imply_flight:
-            self._detector.reset()
+            self.detector.reset()
             if self.thrust_demanded > 0.0:
-                self._detector.set_landed(False)
+                self.detector.set_landed(False)
         else:
             descends = by_motion and self._descent_demanded
-            self._detector.step(
-                estimate, self.demand.thrust, by_motion=by_motion, descends=descends
-            )
+            self.detector.step(estimate, self.demand.thrust, by_motion=by_motion, descends=descends)
         if self.landed and not was_landed:
             self._ramp.land()
         elif was_landed and not self.landed and not self._ramp.lifting:
@@ -248,9 +224,3 @@ class Pilot:
         if self.motion.velocity_ned_mps[2] >= landing.sinking_mps:
             return True
         return landing.place_below_is_descent and self._velocity_down_mps > landing.sinking_mps
-
-
-def _tilt_boost(attitude: Quaternion) -> float:
-    """1 / cos(tilt)."""
-    _, x, y, _ = attitude
-    return 1.0 / max(1.0 - 2.0 * (x * x + y * y), 1.0 / _TILT_BOOST_MAX)

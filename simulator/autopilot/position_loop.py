@@ -216,6 +216,11 @@ def thrust_direction(acceleration_ned_mps2: Triple, tilt_max_rad: float) -> Trip
     return north / length, east / length, GRAVITY_MPS2 / length
 
 
+def level(yaw_rad: float) -> Quaternion:
+    """Attitude (wxyz) with this yaw and no tilt."""
+    return (math.cos(0.5 * yaw_rad), 0.0, 0.0, math.sin(0.5 * yaw_rad))
+
+
 def attitude(direction: Triple, yaw_rad: float) -> Quaternion:
     """Attitude (wxyz, FRD -> NED) with the third body axis along `direction` and this yaw."""
     cos_yaw, sin_yaw = math.cos(yaw_rad), math.sin(yaw_rad)

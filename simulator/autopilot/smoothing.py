@@ -26,8 +26,8 @@ class Target:
     """Target of one period and the speeds on the way there; places NED, m."""
 
     place: Triple  # NaN as height: descend with `descent_mps`
-    previous: Triple  # the target before it, or `place`
-    following: Triple  # the target after it, reached without a stop, or `place`
+    previous: Triple  # the target before it, or NaN
+    following: Triple  # the target after it, reached without a stop, or NaN
     descent_mps: float
     follows_height: bool  # the height of the point is that of the vehicle
     cruise_mps: float
@@ -205,7 +205,7 @@ def _direction(here: Triple, target: Target, turning: bool) -> Triple:
     start = target.previous
     x, y, z = _minus(target.place, start)
     length = math.sqrt(x * x + y * y + z * z)
-    if not turning or length <= _POINT_M or math.isnan(target.place[2]):
+    if not turning or not length > _POINT_M:  # NaN: no line, or no height
         return _minus(target.place, here)
     x, y, z = x / length, y / length, z / length
     a, b, c = _minus(here, start)

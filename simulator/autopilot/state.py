@@ -31,6 +31,11 @@ class StateEstimate:
         w, x, y, z = self.attitude
         return math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
 
+    @property
+    def tilt_cosine(self) -> float:
+        _, x, y, _ = self.attitude
+        return 1.0 - 2.0 * (x * x + y * y)
+
 
 class VehicleState:
     """Time, estimate and truth of the present step; both are read from the plant once a step."""

@@ -111,8 +111,8 @@ class Trajectory:
             speed_mps, rate_mps2 = limits.lift_mps, min(rate_mps2, limits.lift_mps2)
         return Target(
             place=place,
-            previous=place if math.isnan(leg.previous_ned_m[0]) else leg.previous_ned_m,
-            following=place if math.isnan(leg.following_ned_m[0]) else leg.following_ned_m,
+            previous=leg.previous_ned_m,
+            following=leg.following_ned_m,
             descent_mps=goal.velocity_ned_mps[2],
             follows_height=takes_off,
             cruise_mps=min(leg.cruise_mps, limits.speed_across_mps),

@@ -76,16 +76,16 @@ class Commands:
         autopilot = self._autopilot
         if autopilot.firmware.commands.mode_acked_twice:
             self._acknowledge(command, Result.ACCEPTED)
-        by_planner = command.component == _MISSION_PLANNER
-        return self._request(autopilot.firmware.commands.mode(command.params), by_planner)
+        by_ground_station = command.component == _MISSION_PLANNER
+        return self._request(autopilot.firmware.commands.mode(command.params), by_ground_station)
 
-    def _request(self, request: ModeRequest, by_planner: bool) -> Result:
+    def _request(self, request: ModeRequest, by_ground_station: bool) -> Result:
         autopilot = self._autopilot
         if request.mode is None:
             if request.text is not None:
                 autopilot.commander.texts.append(request.text)
             return request.refusal
-        return autopilot.handle("mode", Request(request.mode, by_planner=by_planner))
+        return autopilot.handle("mode", Request(request.mode, by_ground_station=by_ground_station))
 
     def _arm_disarm(self, command: Command) -> Result | None:
         autopilot = self._autopilot
