@@ -48,10 +48,14 @@ class Instance:
         strict: report messages that the autopilot ignores or misreads (`complaints`).
 
     Example:
+        >>> from simulator import config
+        >>> from simulator.firmware.px4 import PX4
+        >>> from simulator.vehicle.conditions import Conditions
         >>> instance = Instance(PX4, config.vehicle("px4_sih"), Conditions(), seed=1)
+        >>> telemetry = []
         >>> while instance.time_s < 1.0:
-        ...     telemetry = instance.step()
-        >>> instance.feed(b"...")  # a datagram of the companion
+        ...     telemetry += instance.step()
+        >>> instance.feed(b"")  # a datagram of the companion
     """
 
     def __init__(
