@@ -1,6 +1,7 @@
-"""pytest: the fixture `fly`, a whole flight on the bundled simulator as one call of a test.
+"""pytest plugin: the fixture `fly`, a flight on the bundled simulator as one call of a test.
 
-Installed with the package; imports the rest of it when the first test flies.
+Installed with the package. It imports the rest of the package when a test uses `fly`, so that other
+test suites are not slowed down.
 
     def test_tracks(fly):
         flight = fly(reference="lemniscate", controller="pso", scenario="gusts", seed=3)
@@ -26,7 +27,12 @@ FLIGHTS = pytest.StashKey[list[Path]]()
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """A flight that took place. `exit_code` 0: flown to its end; `sentence` says why it ended."""
+    """A flight that has ended.
+
+    `exit_code` is that of `offboard fly`: 0 flown and landed, 3 not flown, 4 aborted. `sentence`
+    says how it ended. `score` has the figures of the flight (see `offboard.analysis.score.Score`),
+    `directory` holds flight.tlog and flight.yaml.
+    """
 
     exit_code: int
     sentence: str
@@ -35,12 +41,13 @@ class Flight:
 
     @property
     def log(self) -> Path:
+        """The .tlog of the flight."""
         return self.directory / "flight.tlog"
 
 
 @pytest.fixture(scope="session")
 def _simulator() -> Iterator[SimulatorProcess]:
-    """What the flights of all tests start from."""
+    """The simulator process, shared by the flights of all tests."""
     from offboard.flight.sitl import SimulatorProcess
 
     with SimulatorProcess() as simulator:
@@ -51,11 +58,27 @@ def _simulator() -> Iterator[SimulatorProcess]:
 def fly(
     request: pytest.FixtureRequest, tmp_path: Path, _simulator: SimulatorProcess
 ) -> Callable[..., Flight]:
-    """Fly on the bundled simulator, in lockstep: a flight is a function of its arguments.
+    """A function that flies on the bundled simulator and returns a `Flight`.
 
-    The function takes reference, controller and vehicle (a shipped name or a file), scenario,
-    firmware, seed, config, and `settings`, each "key.path=value". Unless `must_succeed` is False,
-    a flight that does not come to its end fails the test with its sentence.
+    The flight is flown in lockstep: the same arguments give the same telemetry and setpoints. All
+    arguments are keywords and optional:
+
+    - `reference`, `controller`, `vehicle`: a shipped name (`offboard list`) or a file
+    - `scenario`: a shipped name or a file; default: the estimator errors of the firmware
+    - `firmware`: "px4" (default) or "ardupilot"
+    - `seed`: of the swarm and the simulator
+    - `config`: a shipped configuration or a file; default: "flight"
+    - `settings`: a sequence of "key.path=value", as --set of `offboard fly`
+    - `must_succeed`: False returns a flight that was aborted too; by default it fails the test
+
+    A configuration that cannot be flown fails the test with its error. The log of a failed test is
+    kept and its path printed.
+
+    Example:
+
+        def test_hovers_in_wind(fly):
+            flight = fly(reference="hover", scenario="wind_2mps", settings=["seed=5"])
+            assert flight.score.max_position_m < 0.3
     """
     flown = request.node.stash.setdefault(FLIGHTS, [])
 
@@ -72,9 +95,7 @@ def fly(
         must_succeed: bool = True,
     ) -> Flight:
         from offboard.analysis.trial import score_flight
-        from offboard.documents.reading import DocumentError
-        from offboard.flight.link import LinkError
-        from offboard.flight.log import LogError
+        from offboard.documents.errors import UserError
         from offboard.flight.request import FlightRequest, fly_request
 
         named = {"reference": reference, "controller": controller, "vehicle": vehicle}
@@ -93,10 +114,10 @@ def fly(
         problem, outcome = "", None
         try:
             outcome = fly_request(request, simulator=_simulator)
-        except (DocumentError, LinkError, LogError) as error:
+        except UserError as error:
             problem = str(error)
         finally:
-            gc.unfreeze()  # the flight's loop froze what the other tests need collected
+            gc.unfreeze()  # the loop of the flight froze the objects of all tests
         if outcome is None:
             pytest.fail(f"nothing was flown: {problem}", pytrace=False)
         if must_succeed and outcome.exit_code != 0:
@@ -111,7 +132,7 @@ def fly(
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Name the logs of a failed test."""
+    """Add the paths of the logs to the report of a failed test."""
     report = yield
     logs = [path for path in item.stash.get(FLIGHTS, []) if path.exists()]
     if report.failed and logs:

@@ -1,13 +1,15 @@
-"""The `simulator` command: options in, one vehicle running until it is told to stop."""
+"""The `simulator` command: simulated vehicles that run until they are stopped."""
 
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import sys
+import textwrap
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NoReturn
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TextIO
 
 import typer
 
@@ -19,79 +21,83 @@ if TYPE_CHECKING:
     from simulator.instance import Instance
 
 COMPANION_PORT, GROUND_PORT = 14540, 14550
-LOCAL_COMPANION_PORT, LOCAL_GROUND_PORT = 14580, 18570  # PX4's
+LOCAL_COMPANION_PORT, LOCAL_GROUND_PORT = 14580, 18570  # as PX4 SITL
 ANY_PORT = 0
 NO_LINK = "none"
 SYSTEM_MAX = 250
+FILE = "NAME|FILE"  # the name of a shipped file, or a path
+
+GROUND_LINK = f"udpout:127.0.0.1:{GROUND_PORT}"
+LINKS = (
+    "Companion link: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT.  "
+    f"[default: udpout:127.0.0.1:{COMPANION_PORT}]"
+)
+PATIENCE = (
+    "With --lockstep: longest wait for the companion.  [default: 180 for its first message, then 5]"
+)
+EXIT_CODES = (
+    "Exit codes: 0 stopped; 2 usage or configuration error; 3 no companion, or it fell silent "
+    "(--lockstep)."
+)
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False, rich_markup_mode=None)
 
 
+def _option(metavar: str, text: str, **limits: Any) -> Any:
+    """A command-line option with a value, named as its parameter."""
+    return typer.Option(metavar=metavar, help=text, **limits)
+
+
 def _refuse(sentence: str) -> NoReturn:
-    print(sentence, file=sys.stderr)
+    _print(sentence, sys.stderr)
     raise typer.Exit(2)
 
 
-@app.command()
+@app.command(epilog=f"{shipped.overview('vehicle', 'scenario')}\n\n{EXIT_CODES}")
 def simulate(
-    connect: Annotated[
-        str | None, typer.Option(help="Companion link: udpout:, udpin: or tcpin:HOST:PORT.")
+    connect: Annotated[str | None, _option("LINK", LINKS)] = None,
+    gcs: Annotated[str, _option("LINK", f"Ground station link, or {NO_LINK}.")] = GROUND_LINK,
+    firmware: Annotated[str, _option("NAME", "px4 or ardupilot.")] = "px4",
+    speed: Annotated[
+        float | None, _option("FACTOR", "Multiple of real time, 0.1 .. 1000.  [default: 1]")
     ] = None,
-    gcs: Annotated[
-        str, typer.Option(help=f"Ground station link, or {NO_LINK}.")
-    ] = f"udpout:127.0.0.1:{GROUND_PORT}",
-    firmware: Annotated[str, typer.Option(help="Whose behaviour: px4 or ardupilot.")] = "px4",
-    speed: Annotated[float | None, typer.Option(help="Times real time, 0.1 .. 1000.")] = None,
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Virtual time that waits for the companion.")
     ] = False,
-    seed: Annotated[int, typer.Option(min=0, max=2**32 - 1, help="Of all randomness.")] = 7,
+    seed: Annotated[int, _option("N", "Random seed.", min=0, max=2**32 - 1)] = 7,
     scenario: Annotated[
-        str | None, typer.Option(help="Name or file; the firmware's own estimator errors.")
+        str | None, _option(FILE, "Scenario.  [default: estimator errors of the firmware]")
     ] = None,
     vehicle: Annotated[
-        str | None, typer.Option(help="Name or file; the firmware's SITL vehicle.")
+        str | None, _option(FILE, "Vehicle.  [default: SITL vehicle of the firmware]")
     ] = None,
     param: Annotated[
-        list[str] | None, typer.Option(metavar="NAME=VALUE", help="Set a parameter of the vehicle.")
+        list[str] | None, _option("NAME=VALUE", "Set a parameter of the autopilot; repeatable.")
     ] = None,
     duration: Annotated[
-        float | None, typer.Option(min=0.0, help="Stop after so many vehicle seconds.")
+        float | None, _option("SECONDS", "Stop after this vehicle time.", min=0.0)
     ] = None,
-    instance: Annotated[
-        int, typer.Option(min=0, max=249, help="Shifts ports and the system id, as PX4's.")
-    ] = 0,
-    instances: Annotated[
-        int, typer.Option(min=1, max=100, help="So many vehicles, numbered from --instance on.")
-    ] = 1,
-    patience: Annotated[
-        float | None,
-        typer.Option(
-            min=0.1,
-            max=600.0,
-            help="With --lockstep: seconds to wait for a silent companion; 5, and 180 at first.",
-        ),
-    ] = None,
+    instance: Annotated[int, _option("N", "Added to ports and system id.", min=0, max=249)] = 0,
+    instances: Annotated[int, _option("N", "Number of vehicles.", min=1, max=100)] = 1,
+    patience: Annotated[float | None, _option("SECONDS", PATIENCE, min=0.1, max=600.0)] = None,
     strict: Annotated[
-        bool, typer.Option("--strict", help="Say and count what the autopilot would swallow.")
+        bool, typer.Option("--strict", help="Report messages that the autopilot ignores silently.")
     ] = False,
     log: Annotated[
-        Path | None,
-        typer.Option(
-            help="Record the companion link, all vehicles in one, as a .tlog; never overwrites."
-        ),
+        Path | None, _option("FILE", "Record the companion link as a .tlog; a new file.")
     ] = None,
-    check: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Validate a scenario file, and stop.")
-    ] = None,
+    check: Annotated[Path | None, _option("FILE", "Check a scenario file and exit.")] = None,
     show_version: Annotated[
-        bool, typer.Option("--version", help="Say which one it is, and stop.")
+        bool, typer.Option("--version", help="Print the version and exit.")
     ] = False,
     list_scenarios: Annotated[
-        bool, typer.Option("--list-scenarios", help="Name and describe the scenarios, and stop.")
+        bool, typer.Option("--list-scenarios", help="List the shipped scenarios and exit.")
     ] = False,
 ) -> None:
-    """Fly simulated vehicles that speak MAVLink like a real autopilot; each option for each."""
+    """Simulate vehicles that speak MAVLink as PX4 or ArduCopter does.
+
+    Every option applies to each of --instances vehicles; seed, ports and system id count up.
+    """
     if show_version:
         print(f"pso-offboard {version('pso-offboard')}")
         raise typer.Exit(0)
@@ -112,14 +118,14 @@ def simulate(
         _refuse(f"--instance {instance} --instances {instances}: system ids end at {SYSTEM_MAX}")
     stopping = Stop()
 
-    # late, so that a wrong option is answered at once
+    # imported late, so that a wrong option is answered at once
     from offboard.documents.reading import DocumentError
     from offboard.flight.clock import unix_us
     from simulator import config
     from simulator.link.links import LinkError, open_link, shifted
     from simulator.link.recorder import Recorder
 
-    # PX4's own local ports only in PX4's place: beside a real one they would starve it
+    # the local ports of PX4 SITL only by default: a real PX4 beside us may use them
     own_ports = connect is None
     connect = connect or f"udpout:127.0.0.1:{COMPANION_PORT + instance}"
     numbers = range(instance, instance + instances)
@@ -148,13 +154,11 @@ def simulate(
         except OSError as error:
             _refuse(f"--log {log} cannot be written: {error.strerror}")
 
-    from offboard.model.kernel import Entry
+    from offboard.compiled import prepare
     from simulator.instance import VIRTUAL_EPOCH_US, Instance
     from simulator.run import Endpoint, Runner, warm_up
 
-    if not Entry.all_compiled():
-        _tell("compiling the flight dynamics, once (some seconds)")
-    Entry.compile_all()
+    prepare(_tell)
     warm_up(Instance(personality, flyer, flown.conditions, seed, lockstep=True))
 
     epoch_us = VIRTUAL_EPOCH_US if lockstep else unix_us()
@@ -181,14 +185,13 @@ def simulate(
     for endpoint in endpoints:
         for name, value in parameters.items():
             endpoint.instance.autopilot.parameters.set(name, value)
-    _tell_if_lifted(endpoints[0].instance, flyer.hover_thrust)
+    _warn_if_it_cannot_land(endpoints[0].instance, flyer.hover_thrust)
     purpose = "waiting at" if connect.startswith("udpin:") else "sending to"
     for number in numbers:
         place = shifted(connect, number - instance).partition(":")[2]
-        print(
+        _print(
             f"{firmware} vehicle {flyer.name}, system {number + 1}, scenario {flown.name},"
-            f" seed {seed + number - instance}: {purpose} {place}",
-            flush=True,
+            f" seed {seed + number - instance}: {purpose} {place}"
         )
     stopping.running = True
     runner = Runner(endpoints, stopping=stopping, report=_tell, duration_s=duration)
@@ -196,10 +199,10 @@ def simulate(
     if outcome.sentence:
         _tell(outcome.sentence)
     if instances > 1:
-        print(f"{instances} vehicles: {runner.punctuality}", flush=True)
+        _print(f"{instances} vehicles: {runner.punctuality}")
     for endpoint in endpoints:
         for sentence, count in endpoint.instance.complaints.items():
-            print(f"{count} x {sentence}", flush=True)
+            _print(f"{count} x {sentence}")
     raise typer.Exit(outcome.code)
 
 
@@ -211,20 +214,18 @@ def _check(path: Path) -> NoReturn:
         config.scenario(str(path if path.suffix in (".yaml", ".yml") else path.absolute()))
     except DocumentError as error:
         _refuse(str(error))
-    print(f"{path}: scenario, valid")
+    _print(f"{path}: scenario, valid")
     raise typer.Exit(0)
 
 
 def _list_scenarios() -> NoReturn:
-    from simulator import config
-
-    for name in shipped.names("scenarios"):
-        print(f"{name:18s} {config.scenario(name).description}")
+    for name, text in shipped.descriptions("scenarios").items():
+        _print(f"{name:16}  {text}")
     raise typer.Exit(0)
 
 
 def _parameters(firmware: Firmware, assignments: list[str]) -> dict[str, float]:
-    """Values by name, each known and in range; else a sentence."""
+    """Values by parameter name. Exits where a name is unknown or a value out of range."""
     known = {spec.name: spec for spec in firmware.parameters}
     values: dict[str, float] = {}
     for text in assignments:
@@ -241,23 +242,35 @@ def _parameters(firmware: Firmware, assignments: list[str]) -> dict[str, float]:
     return values
 
 
-def _tell_if_lifted(instance: Instance, hover_thrust: float) -> None:
-    """Say that the least thrust is more than the vehicle weighs, as it may be on a real one."""
+def _warn_if_it_cannot_land(instance: Instance, hover_thrust: float) -> None:
+    """Warn where the lowest thrust of the autopilot exceeds the vehicle's weight."""
     firmware, parameters = instance.autopilot.firmware, instance.autopilot.parameters
     least, name = parameters.role("thrust_least"), firmware.parameter_roles["thrust_least"]
     if least >= hover_thrust:
         _tell(
-            f"{name} is {least:.3g}, which lifts a vehicle that hovers at {hover_thrust:g}: it will"
-            f" not come down; --param {name}=... sets another"
+            f"{name} is {least:.3g}, which lifts a vehicle that hovers at {hover_thrust:g}: it"
+            f" cannot land; change it with --param {name}=VALUE"
         )
 
 
 def _tell(sentence: str) -> None:
-    print(f"simulator: {sentence}", file=sys.stderr, flush=True)
+    _print(f"simulator: {sentence}", sys.stderr)
+
+
+def _print(text: str, file: TextIO | None = None) -> None:
+    """Print at once; on a terminal, wrapped at words to its width."""
+    file = file or sys.stdout
+    if file.isatty():
+        width = shutil.get_terminal_size().columns
+        text = "\n".join(
+            textwrap.fill(line, width, subsequent_indent="  ", break_long_words=False)
+            for line in text.splitlines()
+        )
+    print(text, file=file, flush=True)
 
 
 class Stop:
-    """Becomes true with the first SIGTERM or SIGINT; ends the process at once while starting."""
+    """Whether SIGTERM or SIGINT was received. While the simulator starts, they end the process."""
 
     def __init__(self) -> None:
         self.running = False
@@ -268,12 +281,12 @@ class Stop:
     def _note(self, number: int, frame: object) -> None:
         self._noted = True
         if not self.running:
-            os._exit(0)  # nothing is open yet that could be left half done
+            os._exit(0)  # no file or flight has begun
 
     def __call__(self) -> bool:
         return self._noted
 
 
 def main() -> None:
-    """Console entry point. Exit codes: 0 stopped, 2 usage or configuration, 3 no companion."""
+    """Console entry point."""
     app()

@@ -1,4 +1,4 @@
-"""Scenarios and vehicles by name or file."""
+"""Scenarios and vehicles of the simulator, by shipped name or by file."""
 
 from __future__ import annotations
 
@@ -13,21 +13,20 @@ from simulator.vehicle.conditions import Conditions
 
 
 class Scenario(Parameters):
-    """What a flight is flown in: one file of `config/scenarios`."""
+    """Conditions and faults of a simulated flight: one file of `config/scenarios`."""
 
     name: str = Field(min_length=1, max_length=40)
-    description: str = Field(default="", max_length=200)
     conditions: Conditions = Conditions()
     faults: tuple[Fault, ...] = Field(default=(), max_length=50)
 
 
 def scenario(name: str) -> Scenario:
-    """A shipped scenario or a file. Raises DocumentError with a sentence."""
+    """A shipped scenario or a file. Raises DocumentError."""
     return _load(name, "scenarios", "scenario", Scenario)
 
 
 def vehicle(name: str) -> Vehicle:
-    """A shipped vehicle or a file. Raises DocumentError with a sentence."""
+    """A shipped vehicle or a file. Raises DocumentError."""
     return _load(name, "vehicles", "vehicle", Vehicle)
 
 

@@ -1,9 +1,8 @@
-"""Vehicles one after the other, from a process that has loaded everything before it is asked.
+"""Flies vehicles one after the other, each in a fork of a process that has loaded everything.
 
-A line of standard input, the options of the `simulator` command as a JSON list, starts a vehicle in
-a fork of this process; an empty line, or the end of the input, ends it. Once it is gone its exit
-code is printed, negative for a signal. A start takes a second, a fork milliseconds; what flies is
-the same command with the same bytes.
+A line of standard input, the options of the `simulator` command as a JSON list, starts a vehicle.
+An empty line, or the end of the input, ends it. Its exit code is then printed, negative for a
+signal. A fork takes milliseconds where a start takes a second; the vehicle sends the same bytes.
 """
 
 from __future__ import annotations
@@ -21,22 +20,22 @@ from typing import NoReturn
 from simulator.cli import app
 
 
-def serve(orders: FileIO) -> None:
-    """Answer `orders` to their end. They must not be read ahead: select has to see what waits."""
+def serve(requests: FileIO) -> None:
+    """Fly a vehicle for each line of `requests`, which is unbuffered: `select` waits for it."""
     _load()
-    for line in orders:
+    for line in requests:
         if line.strip():
-            print(_flown(json.loads(line), orders), flush=True)
+            print(_exit_code(json.loads(line), requests), flush=True)
 
 
-def _flown(options: list[str], orders: FileIO) -> int:
-    """The exit code of a vehicle that flew until it ended, or the next order came."""
-    alive, lifeline = os.pipe()  # its end is seen when the last holder of `lifeline` is gone
+def _exit_code(options: list[str], requests: FileIO) -> int:
+    """Fly a vehicle until it ends or the next line arrives."""
+    alive, lifeline = os.pipe()  # `alive` becomes readable when the vehicle's process has ended
     vehicle = os.fork()
     if vehicle == 0:
         _fly(options)
     os.close(lifeline)
-    ready, _, _ = select.select([orders.fileno(), alive], [], [])
+    ready, _, _ = select.select([requests.fileno(), alive], [], [])
     if alive not in ready:
         os.kill(vehicle, signal.SIGKILL)
     os.close(alive)
@@ -45,10 +44,10 @@ def _flown(options: list[str], orders: FileIO) -> int:
 
 
 def _fly(options: list[str]) -> NoReturn:
-    """The `simulator` command, in this process."""
-    nowhere = os.open(os.devnull, os.O_RDWR)
-    os.dup2(nowhere, 0)
-    os.dup2(nowhere, 1)
+    """Run the `simulator` command in this process, without standard input and output."""
+    null = os.open(os.devnull, os.O_RDWR)
+    os.dup2(null, 0)
+    os.dup2(null, 1)
     code = 1
     try:
         app(options)
@@ -57,24 +56,24 @@ def _fly(options: list[str]) -> NoReturn:
     except BaseException:
         traceback.print_exc()
     sys.stderr.flush()
-    os._exit(code)  # nothing of the process that it was forked from is its to end
+    os._exit(code)  # without the exit handlers of the parent process
 
 
 def _load() -> None:
-    """Import what a flight takes and have its compiled functions loaded."""
-    from offboard.model.kernel import Entry
+    """Import all modules of a flight and load its compiled functions."""
+    from offboard.compiled import prepare
     from simulator import config, run
     from simulator.firmware.catalogue import FIRMWARES
     from simulator.instance import Instance
     from simulator.vehicle.conditions import Conditions
 
     assert run
-    Entry.compile_all()
+    prepare()
     for firmware in FIRMWARES.values():
         vehicle = config.vehicle(firmware.vehicle)
         Instance(firmware, vehicle, Conditions(), 1, lockstep=True).advance_to_barrier()
     gc.collect()
-    gc.freeze()  # what is never freed is not copied
+    gc.freeze()  # memory that is not collected stays shared with the forks
 
 
 if __name__ == "__main__":

@@ -1,12 +1,15 @@
-"""pytest: the fixture `sitl`, a running vehicle for the test of whoever writes MAVLink software.
+"""pytest plugin: the fixture `sitl`, a simulated vehicle for tests of MAVLink software.
 
-Installed with the package; imports the rest of it when the first test wants a vehicle, so that
-other tests pay nothing. The vehicle is a process of its own, stopped with its test whatever
-becomes of the test.
+Installed with the package. It imports the rest of the package when a test uses `sitl`, so that
+other test suites are not slowed down.
+
+    import pytest
+    from pymavlink import mavutil
 
     @pytest.mark.sitl(scenario="wind_2mps", firmware="px4", seed=7, speed=5.0)
     def test_mine(sitl):
         vehicle = mavutil.mavlink_connection(sitl.connection)
+        assert vehicle.wait_heartbeat(timeout=20)
 """
 
 from __future__ import annotations
@@ -20,12 +23,17 @@ from typing import Any
 import pytest
 
 STOP_S = 2.0
-OPTIONS = ("scenario", "firmware", "vehicle", "seed", "speed")  # of the marker and the command
+OPTIONS = ("scenario", "firmware", "vehicle", "seed", "speed")  # of marker and command
 LOGS = pytest.StashKey[list[Path]]()
 
 
 class Sitl:
-    """A running vehicle. `connection` and `ground_connection`: where a client listens for it."""
+    """A simulated vehicle that runs as a process of its own, on free ports of this machine.
+
+    The vehicle sends telemetry by UDP to two ports, as PX4 SITL does: to a companion computer
+    (`connection`) and to a ground station (`ground_connection`). `log` is the .tlog of the
+    companion's link; `output` has what the process printed to stderr.
+    """
 
     def __init__(self, directory: Path, options: dict[str, Any]) -> None:
         from simulator.link.links import free_ports
@@ -54,28 +62,29 @@ class Sitl:
 
     @property
     def connection(self) -> str:
-        """For pymavlink, MAVProxy and `offboard`."""
+        """Address of the companion's link for pymavlink, MAVProxy and `offboard`, for example
+        "udpin:127.0.0.1:14540"."""
         return f"udpin:127.0.0.1:{self.port}"
 
     @property
     def ground_connection(self) -> str:
-        """The same on the ground station's link."""
+        """Address of the ground station's link, in the same form."""
         return f"udpin:127.0.0.1:{self.ground_port}"
 
     @property
     def mavsdk_address(self) -> str:
-        """For MAVSDK."""
+        """Address of the companion's link for MAVSDK, for example "udpin://127.0.0.1:14540"."""
         return f"udpin://127.0.0.1:{self.port}"
 
     def wait_ready(self) -> None:
-        """Return when it is about to send; fail with its own sentence when it ended instead."""
+        """Wait until the vehicle sends. Fails the test with its error message if it ended."""
         assert self.process.stdout is not None
         if not self.process.stdout.readline():
             self.process.wait()
             pytest.fail(f"sitl: {self.output.read_text().strip()}", pytrace=False)
 
     def stop(self) -> None:
-        """Stop it and wait until it is gone."""
+        """Stop the process and wait for its end."""
         self.process.terminate()
         try:
             self.process.wait(STOP_S)
@@ -88,7 +97,20 @@ class Sitl:
 
 @pytest.fixture
 def sitl(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Sitl]:
-    """A running vehicle on free ports, as the marker `sitl` describes it."""
+    """A simulated vehicle on free ports, running until the end of the test.
+
+    The marker `sitl` sets its options: `scenario` and `vehicle` (a shipped name, see `offboard
+    list`, or a file), `firmware` ("px4" or "ardupilot"), `seed` and `speed` (multiple of real
+    time). Without the marker it is a PX4 vehicle in real time. When a test fails, the log is kept
+    and its path printed.
+
+    Example:
+
+        @pytest.mark.sitl(firmware="ardupilot", speed=10)
+        def test_has_telemetry(sitl):
+            vehicle = mavutil.mavlink_connection(sitl.connection)
+            assert vehicle.recv_match(type="ATTITUDE", blocking=True, timeout=20)
+    """
     marker = request.node.get_closest_marker("sitl")
     named = marker.kwargs if marker else {}
     if unknown := sorted(set(named) - set(OPTIONS)):
@@ -105,10 +127,10 @@ def sitl(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Sitl]:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Make the marker known."""
+    """Register the marker `sitl`."""
     config.addinivalue_line(
         "markers",
-        f"sitl({', '.join(OPTIONS)}): what the fixture `sitl` flies, and how",
+        f"sitl({', '.join(OPTIONS)}): options of the vehicle of the fixture `sitl`",
     )
 
 
@@ -116,7 +138,7 @@ def pytest_configure(config: pytest.Config) -> None:
 def pytest_runtest_makereport(
     item: pytest.Item, call: pytest.CallInfo[None]
 ) -> Generator[None, pytest.TestReport, pytest.TestReport]:
-    """Name the logs of a failed test."""
+    """Add the paths of the logs to the report of a failed test."""
     report = yield
     logs = [path for path in item.stash.get(LOGS, []) if path.exists()]
     if report.failed and logs:

@@ -1,18 +1,21 @@
-"""Before any test: compile once what the workers of a parallel run would each compile at once."""
+"""Before any test: everything is compiled, so that no test waits for it."""
 
 from __future__ import annotations
 
+import importlib
 import signal
-import subprocess
-import sys
-import tempfile
 
 import pytest
 
-FLIGHT = (
-    "offboard", "fly", "--sitl", "--reference", "hover", "--set", "reference.duration_s=1",
-)  # fmt: skip
+from offboard.compiled import prepare
 
+COMPILED = (
+    "offboard.control.laws.horizon",
+    "offboard.control.laws.pso",
+    "offboard.flight.request",
+    "offboard.paper.plant",
+    "simulator.vehicle.dynamics",
+)
 
 # Ignored signals are inherited: started in the background or under nohup, the processes of the
 # tests would not hear the Ctrl-C that they are sent
@@ -26,8 +29,7 @@ for _number, _handler in (
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
-    if hasattr(session.config, "workerinput") or session.config.option.collectonly:
-        return
-    with tempfile.TemporaryDirectory() as directory:
-        command = (sys.executable, "-m", *FLIGHT, "--out", f"{directory}/flight")
-        subprocess.run(command, capture_output=True, timeout=600, check=False)
+    if not hasattr(session.config, "workerinput") and not session.config.option.collectonly:
+        for name in COMPILED:
+            importlib.import_module(name)
+        prepare()

@@ -65,7 +65,7 @@ def test_first_command_flies_and_scores(tmp_path: Path) -> None:
         timeout=120,
     )
     assert done.returncode == 0, done.stderr
-    assert "rmse_position_m" in done.stdout
+    assert "tracked error" in done.stdout
     (flight,) = (tmp_path / "flights").iterdir()
     assert {path.name for path in flight.iterdir()} >= {"flight.tlog", "flight.yaml", "score.json"}
     assert json.loads((flight / "score.json").read_text())["rmse_position_m"] < 0.05

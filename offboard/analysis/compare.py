@@ -1,7 +1,7 @@
-"""Controllers side by side: every combination flown, scored, and put into one table.
+"""Many flights and their table: trials, results, medians and ranges, as CSV and JSON.
 
-A flight is one `Trial`; it fails as a row of the table, never as a crash. Each is flown by the
-function that it is handed, so that this module knows no simulator and no socket.
+A flight is one `Trial`. A flight that fails is a result too and never ends the comparison. The
+function that flies a trial is an argument: this module knows no simulator and no link.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pathlib import Path
 
 from offboard.documents.reading import DocumentError
 
-EQUAL_SHARE = 0.01  # of the best median: nearer is no difference, whatever the spread
+EQUAL_SHARE = 0.01  # medians that are closer than this share of the best are equal
 POLL_S = 0.2
 FIGURES = (
     "rmse_position_m",
@@ -36,7 +36,7 @@ FIGURES = (
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """One flight to be flown, and where it is recorded."""
+    """One flight of a comparison, and the directory that records it."""
 
     controller: str
     reference: str
@@ -47,14 +47,13 @@ class Trial:
 
 @dataclass(frozen=True, slots=True)
 class Result:
-    """What became of a trial: `figures` of its score (NaN where absent), or why there is none."""
+    """The end of a trial. `sentence` says how it ended; `figures` are those of its score."""
 
     trial: Trial
     exit_code: int
     sentence: str
     figures: dict[str, float]
-
-    stopped: bool = False  # by the operator, and so not flown
+    stopped: bool = False  # by the operator
 
     @property
     def flown(self) -> bool:
@@ -73,8 +72,8 @@ class Failure:
 class Row:
     """All seeds of one controller on one reference in one scenario: median and range.
 
-    `best`: none failed, and its median error is the lowest there, or equal to that: within the
-    range of the flights of the lowest, or within EQUAL_SHARE of its median.
+    `best`: no flight failed, and the median position error is the lowest of its reference and
+    scenario, or within the range of that one's flights, or within EQUAL_SHARE of its median.
     """
 
     controller: str
@@ -97,7 +96,7 @@ class Row:
 
     @property
     def why(self) -> str:
-        """Every different reason once."""
+        """The reasons of the failures, each once."""
         return "; ".join(dict.fromkeys(failure.sentence for failure in self.failures))
 
 
@@ -111,7 +110,7 @@ def trials(
     seeds: Iterable[int],
     directory: Path,
 ) -> list[Trial]:
-    """Every combination, a directory for each. Raises DocumentError where two would share one."""
+    """A trial for every combination. Raises DocumentError where two would share a directory."""
     planned = [
         Trial(
             controller,
@@ -130,7 +129,7 @@ def trials(
         if other is not trial:
             raise DocumentError(
                 f"{_named(other)} and {_named(trial)} would both be recorded in "
-                f"{trial.directory}; name each once, and no two files alike"
+                f"{trial.directory}; give each name once and files different names"
             )
     return planned
 
@@ -146,9 +145,11 @@ def run(
     width: int,
     ending: Callable[[], bool],
 ) -> Iterator[Result]:
-    """Fly all in `width` workers, yielding each result as it ends; once `ending`, no more take off.
+    """Fly all trials in `width` workers and yield each result when it ends.
 
-    Every worker is an executor of its own: one that dies is a failed row, and is replaced.
+    `fly` is called in a worker, so it must be picklable. When `ending` is true, no further flight
+    begins. Every worker is an executor of its own: if it dies, its flight has failed and a new one
+    replaces it.
     """
     waiting = deque(planned)
     with ExitStack() as stack:

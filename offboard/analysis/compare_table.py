@@ -1,150 +1,59 @@
-"""The table of a comparison for a terminal: a block per scenario, as wide as the window allows.
-
-Only presentation. Lines, no drawing: nothing is ever cut, and what does not fit goes below.
-"""
+"""The table of a comparison for a terminal: controllers below each other, a block per scenario."""
 
 from __future__ import annotations
 
 import itertools
 import math
-import textwrap
-from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
-from typing import TypeVar
+from collections.abc import Sequence
 
+from rich.console import Console
+from rich.table import Table
 from rich.text import Text
 
 from offboard.analysis.compare import EQUAL_SHARE, Row
 
-T = TypeVar("T", str, int)
-GAP = "  "
-LEGEND = (
-    f"* lowest median error of its block, and its equals: all whose median lies within the "
-    f"range of that one's flights, or within {EQUAL_SHARE:.0%} of its median",
-    "tilt, rates: motion that the reference does not ask for, RMS; decision: 99th percentile of "
-    "the time it takes",
-)
-
-
-@dataclass(frozen=True, slots=True)
-class Column:
-    """A figure of the score, and what stands above it."""
-
-    figure: str
-    title: str
-    unit: str
-
-
+# figure of the score, its title
 COLUMNS = (
-    Column("rmse_position_m", "RMSE", "m"),
-    Column("max_position_m", "largest", "m"),
-    Column("tilt_agitation_deg", "tilt", "deg"),
-    Column("rate_agitation_radps", "rates", "rad/s"),
-    Column("solve_time_p99_ms", "decision", "ms"),
+    ("rmse_position_m", "RMSE\n[m]"),
+    ("max_position_m", "maximum\n[m]"),
+    ("tilt_agitation_deg", "tilt\n[deg]"),
+    ("rate_agitation_radps", "rates\n[rad/s]"),
+    ("solve_time_p99_ms", "decision\n[ms]"),
+)
+DEFAULT_WIDTH = 80  # of a terminal
+NARROW = 3  # columns that are shown where it is narrower
+LEGEND = (
+    "RMSE, maximum: position error, medians of all flights [lowest\N{EN DASH}highest]. "
+    "tilt, rates: motion beside the reference's, RMS. decision: 99th percentile of its time.",
+    "* best: lowest median RMSE of the block; or a median within the range of the best, or within "
+    f"{EQUAL_SHARE:.0%} of its median.",
 )
 
 
-def lines(rows: Sequence[Row], width: int) -> Iterator[Text]:
-    """Title, blocks, legend, and whatever failed; no line but a long name is wider than `width`."""
-    constant = [_only(row.reference for row in rows), _only(row.scenario for row in rows)]
-    flights = _only(row.flights for row in rows)
-    many = "" if flights is None else f" of {flights} flight" + ("s" if flights > 1 else "")
-    what = "position error against the vehicle's estimate and what it took, median"
-    spread = " [lowest\N{EN DASH}highest]" if flights != 1 else ""
-    title = ", ".join([*filter(None, constant), what + spread + many])
-    yield from _wrapped(title, width, "bold")
-    layout = _fitting(rows, width)
-    yield from layout.heads()
-    blocks = itertools.groupby(rows, key=lambda row: (row.reference, row.scenario))
-    for names, block in blocks:
-        varying = [name for name, same in zip(names, constant, strict=True) if same is None]
-        if varying:
-            yield Text(", ".join(reversed(varying)), "bold")
-        for row in block:
-            yield from layout.row(row)
-    for words in LEGEND:
-        yield from _wrapped(words, width, "dim")
+def show(console: Console, rows: Sequence[Row]) -> None:
+    """Print the table, its legend and, for every failed flight, the reason."""
+    columns = COLUMNS if console.width >= DEFAULT_WIDTH else COLUMNS[:NARROW]
+    table = Table(box=None, pad_edge=False)
+    separator = " " if console.width > DEFAULT_WIDTH else "\n"
+    table.add_column("controller", overflow="fold")
+    for _, title in columns:
+        table.add_column(Text(title), justify="right", no_wrap=True)
+    for block, members in itertools.groupby(rows, lambda row: f"{row.reference}, {row.scenario}"):
+        table.add_row(Text(f"\n{block}", "bold"))
+        for row in members:
+            mark, style = ("*", "bold") if row.best else (" ", "" if row.flown else "red")
+            table.add_row(
+                Text(f"{mark} {_name(row)}"), *_cells(row, separator)[: len(columns)], style=style
+            )
+    console.print(table)
+    console.print()
+    for line in LEGEND:
+        console.print(Text(line, "dim"))
     for row in rows:
-        yield from _failures(row, width)
-
-
-@dataclass(frozen=True, slots=True)
-class Layout:
-    """Where things stand: the widest name, and of each column the median and the range.
-
-    `beside`: a range stands at the right of its median, else on a line below. A width of 0: the
-    ranges of that column are not shown.
-    """
-
-    name: int
-    medians: tuple[int, ...]
-    ranges: tuple[int, ...]
-    beside: bool
-
-    @property
-    def widths(self) -> list[int]:
-        pairs = zip(self.medians, self.ranges, strict=True)
-        if self.beside:
-            return [median + (1 + spread if spread else 0) for median, spread in pairs]
-        return [max(pair) for pair in pairs]
-
-    @property
-    def total(self) -> int:
-        return 2 + self.name + sum(len(GAP) + width for width in self.widths)
-
-    def heads(self) -> Iterator[Text]:
-        for texts in ([c.title for c in COLUMNS], [f"[{c.unit}]" for c in COLUMNS]):
-            yield Text(self._line("", "", [self._placed(i, t, "") for i, t in enumerate(texts)]))
-
-    def row(self, row: Row) -> Iterator[Text]:
-        """One line or two; a name that is too long has a line of its own."""
-        mark, style = ("*", "bold") if row.best else ("", "")
-        name = _name(row)
-        if not row.flown:
-            yield Text(f"  {name}", "red")
-            return
-        if len(name) > self.name:
-            yield Text(f"{mark:2}{name}", style)
-            mark = name = ""
-        spreads = [_range(row, column) if self.ranges[i] else "" for i, column in _numbered()]
-        medians = [digits(row.median[column.figure]) for column in COLUMNS]
-        beside = spreads if self.beside else [""] * len(COLUMNS)
-        cells = [self._placed(i, medians[i], beside[i]) for i, _ in _numbered()]
-        yield Text(self._line(mark, name, cells), style)
-        if not self.beside and any(spreads):
-            below = [self._placed(i, spread, "") for i, spread in enumerate(spreads)]
-            yield Text(self._line("", "", below), "dim")
-
-    def _placed(self, index: int, text: str, beside: str) -> str:
-        if not self.beside or not self.ranges[index]:
-            return f"{text:>{self.widths[index]}}"
-        return f"{text:>{self.medians[index]}} {beside:<{self.ranges[index]}}"
-
-    def _line(self, mark: str, name: str, cells: Sequence[str]) -> str:
-        return f"{mark:2}{name:<{self.name}}{GAP}{GAP.join(cells)}".rstrip()
-
-
-def _fitting(rows: Sequence[Row], width: int) -> Layout:
-    """The fullest layout that fits: ranges beside, below, below the error only, names apart."""
-    names = max((len(_name(row)) for row in rows if row.flown), default=0)
-    medians = tuple(
-        max([len(c.title), len(c.unit) + 2, *(len(digits(row.median[c.figure])) for row in rows)])
-        for c in COLUMNS
-    )
-    ranges = tuple(max(len(_range(row, c)) for row in rows) for c in COLUMNS)
-    error_only = (ranges[0], *(0 for _ in COLUMNS[1:]))
-    shortest = min((len(_name(row)) for row in rows if row.flown), default=0)
-    layouts = [
-        Layout(names, medians, ranges, beside=True),
-        Layout(names, medians, ranges, beside=False),
-        Layout(names, medians, error_only, beside=False),
-        Layout(shortest, medians, error_only, beside=False),
-    ]
-    return next((layout for layout in layouts if layout.total <= width), layouts[-1])
-
-
-def _numbered() -> Iterable[tuple[int, Column]]:
-    return enumerate(COLUMNS)
+        for reason in dict.fromkeys(failure.sentence for failure in row.failures):
+            seeds = [failure.seed for failure in row.failures if failure.sentence == reason]
+            where = f"{row.controller}, {row.reference}, {row.scenario}, {numbered_seeds(seeds)}"
+            console.print(Text(f"failed: {where}: {reason}", "red"))
 
 
 def _name(row: Row) -> str:
@@ -152,25 +61,23 @@ def _name(row: Row) -> str:
     return row.controller + part
 
 
+def _cells(row: Row, separator: str) -> list[Text]:
+    if not row.flown:
+        return []
+    cells = [digits(row.median[figure]) for figure, _ in COLUMNS]
+    low, high = (digits(ends["rmse_position_m"]) for ends in (row.lowest, row.highest))
+    if low != high:
+        cells[0] += f"{separator}[{low}\N{EN DASH}{high}]"
+    return [Text(cell) for cell in cells]
+
+
 def digits(value: float) -> str:
-    """Three significant digits."""
+    """Three significant digits, empty for what is not finite."""
     if not math.isfinite(value):
         return ""
     value = float(f"{value:.3g}")
     size = math.floor(math.log10(abs(value))) if value else 0
     return f"{value:.2e}" if size < -4 else f"{value:.{max(0, 2 - size)}f}"
-
-
-def _range(row: Row, column: Column) -> str:
-    low, high = (digits(ends[column.figure]) for ends in (row.lowest, row.highest))
-    return "" if low == high else f"[{low}\N{EN DASH}{high}]"
-
-
-def _failures(row: Row, width: int) -> Iterator[Text]:
-    for sentence in dict.fromkeys(failure.sentence for failure in row.failures):
-        seeds = [failure.seed for failure in row.failures if failure.sentence == sentence]
-        where = f"{row.controller}, {row.reference}, {row.scenario}, {numbered_seeds(seeds)}"
-        yield from _wrapped(f"failed: {where}: {sentence}", width, "red")
 
 
 def numbered_seeds(seeds: Sequence[int]) -> str:
@@ -181,15 +88,5 @@ def numbered_seeds(seeds: Sequence[int]) -> str:
             runs[-1].append(seed)
         else:
             runs.append([seed])
-    told = ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs)
-    return f"seed{'s' if len(seeds) > 1 else ''} {told}"
-
-
-def _wrapped(words: str, width: int, style: str) -> Iterator[Text]:
-    for line in textwrap.wrap(words, width, subsequent_indent=GAP, break_long_words=False):
-        yield Text(line, style)
-
-
-def _only(values: Iterable[T]) -> T | None:
-    different = set(values)
-    return different.pop() if len(different) == 1 else None
+    text = ", ".join(f"{run[0]}-{run[-1]}" if len(run) > 1 else str(run[0]) for run in runs)
+    return f"seed{'s' if len(seeds) > 1 else ''} {text}"

@@ -1,32 +1,33 @@
 """A whole comparison: flights in parallel with progress, then table, page, CSV and JSON.
 
-What is finished is kept when the run is interrupted, and what is missing is said.
+An interrupted comparison keeps the flights that have ended and names those that are missing.
 """
 
 from __future__ import annotations
 
-import multiprocessing
-import os
-import signal
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from contextlib import suppress
 from pathlib import Path
-from types import FrameType
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.progress import (
+    BarColumn,
+    MofNCompleteColumn,
+    Progress,
+    SpinnerColumn,
+    TextColumn,
+    TimeElapsedColumn,
+)
 
 from offboard.analysis.compare import Fly, Result, Trial, as_csv, as_json, run, table, trials
 from offboard.analysis.compare_page import page
-from offboard.analysis.compare_table import lines, numbered_seeds
-from offboard.analysis.interrupts import deaf_to_interrupts
-from offboard.analysis.processors import processors
+from offboard.analysis.compare_table import digits, numbered_seeds, show
+from offboard.analysis.workers import open_worker, processors
 from offboard.flight.log import LogError
 from offboard.flight.phases import ExitCode
+from offboard.flight.stop import StopRequests
 
-ORPHANED = 1
+LANDING = "interrupted: flights in the air are landed; interrupt again to exit at once"
 
 
 def compare_all(
@@ -40,13 +41,16 @@ def compare_all(
     workers: int | None,
     console: Console,
 ) -> str:
-    """Fly everything, print and write the table; a sentence on what failed or is missing, or "".
+    """Fly every combination, print and write the table.
 
-    `workers` None: one process per processor; 0: in this process, one flight after the other (a
-    vehicle that is there once; it ends when the vehicle or its pilot no longer lets us fly, for
-    the next flight would take it back). Writes compare.csv, compare.json and compare.html. Raises
-    LogError before the first flight where `directory` cannot be written or holds something, and
-    DocumentError where two flights would share one.
+    `fly` flies one trial. `workers` is the number of processes, None for one per processor. With 0
+    the flights follow each other in this process, for a single vehicle: after a flight that the
+    vehicle refused or its pilot ended, nothing more is flown. Writes compare.csv, compare.json and
+    compare.html to `directory`.
+
+    Returns a sentence on what failed or is missing, empty if nothing is. Raises, before the first
+    flight, LogError where `directory` cannot be written or is not empty, and DocumentError where
+    two flights would share a directory.
     """
     planned = trials(controllers, references, scenarios, seeds, directory)
     _claim(directory)
@@ -54,24 +58,23 @@ def compare_all(
     rows = table(sorted(results, key=lambda result: planned.index(result.trial)))
     if rows:
         console.print()
-        for line in lines(rows, console.width):
-            console.print(line, soft_wrap=True)
+        show(console, rows)
     missing = _missing(planned, results)
     ended = _ended(results) if missing and workers == 0 else ""
     if ended:
         missing.insert(0, f"{ended}; nothing more was flown")
     for words in missing:
-        console.print(words, style="yellow", markup=False, soft_wrap=True)
+        console.print(words, style="yellow", markup=False)
     (directory / "compare.csv").write_text(as_csv(rows), encoding="utf-8")
     (directory / "compare.json").write_text(as_json(rows), encoding="utf-8")
     (directory / "compare.html").write_text(page(rows, missing), encoding="utf-8")
     console.print(f"written: {directory / 'compare.html'}", markup=False, soft_wrap=True)
     failed = sum(not result.flown for result in results)
-    told = [f"{failed} of {len(results)} flights failed; the table says why"] if failed else []
+    problems = [f"{failed} of {len(results)} flights failed; the table says why"] if failed else []
     if missing:
         count = f"{len(planned) - len(results)} of {len(planned)} flights missing"
-        told.append(f"{ended or 'interrupted'}: {count}")
-    return "; ".join(told)
+        problems.append(f"{ended or 'interrupted'}: {count}")
+    return "; ".join(problems)
 
 
 def _claim(directory: Path) -> None:
@@ -91,42 +94,58 @@ def _claim(directory: Path) -> None:
 def _with_progress(
     planned: Sequence[Trial], fly: Fly, workers: int | None, console: Console
 ) -> list[Result]:
-    """What was flown until the end, or until the user asked for an end."""
-    columns = TextColumn("flying"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn()
+    """The flights that ended before an interrupt. On a terminal a bar moves, else a line is printed
+    for each flight."""
+    width = 1 if workers == 0 else min(workers or processors(), len(planned))
+    plan = f"{len(planned)} flights, {width} at a time"
+    columns = (
+        SpinnerColumn(), TextColumn("{task.description}"), BarColumn(bar_width=20),
+        MofNCompleteColumn(), TimeElapsedColumn(),
+    )  # fmt: skip
+    live = console.is_terminal
+    if not live:
+        console.print(plan)
     results: list[Result] = []
-    with Progress(*columns, console=console, transient=True) as progress:
-        task = progress.add_task("flying", total=len(planned))
+    with Progress(*columns, console=console, transient=True, disable=not live) as progress:
+        task = progress.add_task(plan, total=len(planned))
+        announced = False
 
-        def told() -> None:
-            progress.console.print(
-                "interrupted: what is in the air still lands; once more: it is left"
-            )
+        def ending() -> bool:
+            nonlocal announced
+            if stops.requested and not announced:
+                announced = True
+                progress.console.print(LANDING)
+            return stops.requested
 
-        try:
-            with _interruptible(told) as ending:
-                for result in _flown(planned, fly, workers, ending):
-                    if not result.stopped:
-                        results.append(result)
-                    progress.advance(task)
-        except KeyboardInterrupt:
-            pass  # the second one
+        with suppress(KeyboardInterrupt), StopRequests() as stops:
+            for result in _flown(planned, fly, 0 if workers == 0 else width, ending):
+                progress.advance(task)
+                if not result.stopped:
+                    results.append(result)
+                    if not live:
+                        console.print(_line(result, len(results)), markup=False, soft_wrap=True)
     return results
 
 
+def _line(result: Result, number: int) -> str:
+    trial = result.trial
+    end = f"{digits(result.figures['rmse_position_m'])} m" if result.flown else result.sentence
+    return f"{number:4}  {trial.directory.name}: {end}"
+
+
 def _flown(
-    planned: Sequence[Trial], fly: Fly, workers: int | None, ending: Callable[[], bool]
+    planned: Sequence[Trial], fly: Fly, workers: int, ending: Callable[[], bool]
 ) -> Iterator[Result]:
-    if workers == 0:
-        for trial in planned:
-            if ending():
-                return
-            result = fly(trial)
-            yield result
-            if result.stopped or _taken(result):  # the flight heard the interruption, not we
-                return
-    else:
-        width = workers or processors()
-        yield from run(planned, fly, _worker, width, ending)
+    if workers:
+        yield from run(planned, fly, open_worker, workers, ending)
+        return
+    for trial in planned:
+        if ending():
+            return
+        result = fly(trial)
+        yield result
+        if result.stopped or _taken(result):  # the flight received the interrupt, not this loop
+            return
 
 
 def _taken(result: Result) -> bool:
@@ -134,64 +153,11 @@ def _taken(result: Result) -> bool:
 
 
 def _ended(results: Sequence[Result]) -> str:
-    """Which flight on the one vehicle was the last, if it was the reason for that, or ""."""
+    """Why the last flight ended the comparison, empty if it did not."""
     if not results or not _taken(results[-1]):
         return ""
     trial, sentence = results[-1].trial, results[-1].sentence
     return f"ended with {trial.controller} on {trial.reference}, seed {trial.seed} ({sentence})"
-
-
-@contextmanager
-def _worker() -> Iterator[ProcessPoolExecutor]:
-    """One process. Left in a hurry, it is killed: asked to end it would land first."""
-    # spawn: a forked child would share compiled code and threads in unknown states
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(1, mp_context=context, initializer=_settle)
-    with deaf_to_interrupts():
-        pool.submit(os.getpid)  # starts it
-    try:
-        yield pool
-    except BaseException:
-        for child in multiprocessing.active_children():
-            child.kill()
-        raise
-    finally:
-        pool.shutdown(cancel_futures=True)
-
-
-def _settle() -> None:
-    """In a worker: a terminal that closes is not for us, and without our parent we are not."""
-    os.setpgrp()
-    parent = multiprocessing.parent_process()
-    assert parent is not None
-
-    def follow() -> None:
-        parent.join()
-        os._exit(ORPHANED)
-
-    threading.Thread(target=follow, daemon=True).start()
-
-
-@contextmanager
-def _interruptible(told: Callable[[], None]) -> Iterator[Callable[[], bool]]:
-    """Whether we were asked to end. The second time raises KeyboardInterrupt."""
-    asked = 0
-
-    def on_signal(number: int, frame: FrameType | None) -> None:
-        nonlocal asked
-        asked += 1
-        if asked > 1:
-            raise KeyboardInterrupt
-        told()
-
-    kinds = [signal.SIGINT, signal.SIGTERM, signal.SIGHUP]
-    heard = [kind for kind in kinds if signal.getsignal(kind) is not signal.SIG_IGN]
-    before = {kind: signal.signal(kind, on_signal) for kind in heard}
-    try:
-        yield lambda: asked > 0
-    finally:
-        for kind, handler in before.items():
-            signal.signal(kind, handler)
 
 
 def _missing(planned: Sequence[Trial], results: Sequence[Result]) -> list[str]:

@@ -1,4 +1,4 @@
-"""One flight as arrays, from its .tlog alone: vehicle, reference, decisions, setpoints, story.
+"""One flight as arrays and events, from its .tlog alone.
 
 Times are vehicle time in seconds, positions NED in metres relative to the estimator's origin.
 """
@@ -7,15 +7,15 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
-from operator import itemgetter
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.tlog import LoggedMessage, Tlog, columns, name_of
+from offboard.analysis.sender import Sender, VehicleClock, streams_of
+from offboard.analysis.tlog import LoggedMessage, Tlog, name_of
 from offboard.flight import manifest
 from offboard.flight.online_identification import RECORD_ID as IDENTIFIED_ID
 from offboard.flight.online_identification import RECORD_NAME as IDENTIFIED_NAME
@@ -38,15 +38,13 @@ OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
 POSITION_FIELDS = "x y z vx vy vz"
 ATTITUDE_FIELDS = "q1 q2 q3 q4 rollspeed pitchspeed yawspeed"
 REFERENCE_FIELDS = "x y z vx vy vz afx afy afz yaw"
-OUR_WORDS = "offboard: "  # before every phase that we announce
-# (system, component, message id) -> (place in the log, message), in order
-Streams = dict[tuple[int, int, int], list[tuple[int, LoggedMessage]]]
+OUR_PREFIX = "offboard: "  # of the texts that announce a phase
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: ground stations and companions
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """Something said or done: vehicle time (NaN before telemetry), who, and the words."""
+    """A phase, a mode or a text: vehicle time (NaN before telemetry), sender, and what."""
 
     time_s: float
     who: str
@@ -55,16 +53,18 @@ class Event:
 
 @dataclass(frozen=True, slots=True)
 class History:
-    """Rows (N, columns) in the order of arrival. Columns:
+    """Rows (N, columns) in the order of arrival, and events. Columns:
 
     position: t, north, east, down, v_north, v_east, v_down (LOCAL_POSITION_NED)
     attitude: t, w, x, y, z, p, q, r (ATTITUDE_QUATERNION)
     truth: t, north, east, down (HIL_STATE_QUATERNION or SIM_STATE; empty without)
     reference: t, position 3, velocity 3, acceleration 3, course (POSITION_TARGET_LOCAL_NED)
-    setpoint: t, wall time s, w, x, y, z, thrust (SET_ATTITUDE_TARGET); NaN from the third on where
-        the autopilot's own position loop was given one
-    identified: t, then what `flight.takeover.record_of` says
-    link_delay: t of the telemetry a question was stamped with, s until it arrived (TIMESYNC)
+    setpoint: t, wall time s, w, x, y, z, thrust (SET_ATTITUDE_TARGET); NaN from the third on for a
+        setpoint of the autopilot's own position loop (SET_POSITION_TARGET_LOCAL_NED)
+    identified: t, then value and sd of each constant as in `identification.adoption.record_of`
+    link_delay: t of the telemetry that a TIMESYNC request followed, its delay in s
+
+    `phases` are our own, `modes` and `said` (STATUSTEXT, refused commands) the vehicle's.
     """
 
     position: Array
@@ -85,14 +85,14 @@ class History:
 
 def gather(log: Tlog) -> History:
     """Sort a log's messages into a History. A log without a vehicle gives empty arrays."""
-    streams = _streams(log)
+    streams = streams_of(log)
     vehicle_id, dialect = _vehicle(log.messages)
-    ours = _Party(streams, lambda system, component: component in OUR_COMPONENTS)
-    theirs = _Party(
+    ours = Sender(streams, lambda system, component: component in OUR_COMPONENTS)
+    theirs = Sender(
         streams,
         lambda system, component: system == vehicle_id and component not in OUR_COMPONENTS,
     )
-    clock = _Clock(theirs)
+    clock = VehicleClock(theirs)
     arrays = [entry.message for _, entry in ours.of("DEBUG_FLOAT_ARRAY")]
     records = [
         (message.time_usec / 1e6, TickRecord.from_data(message.data))
@@ -118,16 +118,16 @@ def gather(log: Tlog) -> History:
         records=tuple(record for _, record in records),
         identified=np.array(identified, dtype=np.float64).reshape(-1, 1 + IDENTIFIED_SIZE),
         link_delay=_link_delay(ours, theirs),
-        phases=_phases(ours, clock),
-        modes=_modes(theirs, clock, dialect),
-        said=_said(theirs, clock),
+        phases=_events(clock, "offboard", _phases(ours)),
+        modes=_events(clock, "vehicle", _modes(theirs, dialect)),
+        said=_events(clock, "vehicle", _texts(theirs) + _refusals(theirs)),
         messages=counts,
         wall_s=(stamps[-1] - stamps[0]) / 1e6 if stamps else 0.0,
     )
 
 
 def configuration(log: Tlog) -> str | None:
-    """What the flight was flown with, as `config.flown` reads it; None where the log lacks it."""
+    """The configuration of the flight as YAML (see `flight.configuration.flown`), None without."""
     return manifest.join(
         bytes(entry.message.payload[: entry.message.payload_length])
         for entry in log.messages
@@ -137,71 +137,8 @@ def configuration(log: Tlog) -> str | None:
     )
 
 
-def _streams(log: Tlog) -> Streams:
-    streams: Streams = {}
-    for place, entry in enumerate(log.messages):
-        frame = entry.frame
-        key = frame.system_id, frame.component_id, frame.message_id
-        streams.setdefault(key, []).append((place, entry))
-    return streams
-
-
-class _Party:
-    """What one side of the link sent: messages by name, each with its place in the log."""
-
-    def __init__(self, streams: Streams, sent: Callable[[int, int], bool]) -> None:
-        self._kinds: dict[str, list[tuple[int, LoggedMessage]]] = {}
-        for (system, component, kind), stream in streams.items():
-            if sent(system, component):
-                self._kinds.setdefault(name_of(kind), []).extend(stream)
-        for stream in self._kinds.values():
-            stream.sort(key=itemgetter(0))
-
-    def of(self, name: str) -> list[tuple[int, LoggedMessage]]:
-        """(place, message) of all messages of that name."""
-        return self._kinds.get(name, [])
-
-    def places(self, name: str) -> NDArray[np.intp]:
-        return np.array([place for place, _ in self.of(name)], dtype=np.intp)
-
-    def columns(self, name: str, fields: str) -> Array:
-        """(N, columns): the fields of all messages of that name."""
-        return columns(name, [entry for _, entry in self.of(name)], fields)
-
-    def table(self, name: str, fields: str) -> Array:
-        """The same after their vehicle time in seconds."""
-        rows = self.columns(name, f"time_boot_ms {fields}")
-        rows[:, 0] /= 1e3
-        return rows
-
-
-class _Clock:
-    """Vehicle time at a place in the log: the newest that telemetry had told by then."""
-
-    def __init__(self, theirs: _Party) -> None:
-        names = ("LOCAL_POSITION_NED", "ATTITUDE_QUATERNION")
-        places = np.concatenate([theirs.places(name) for name in names])
-        times = np.concatenate([theirs.table(name, "")[:, 0] for name in names])
-        order = np.argsort(places)
-        self._places, self._times = places[order], np.append(math.nan, times[order])
-
-    def at(self, places: NDArray[np.intp]) -> Array:
-        """(N,) seconds, NaN before any telemetry."""
-        times: Array = self._times[np.searchsorted(self._places, places)]
-        return times
-
-    def story(self, who: str, told: Iterable[tuple[int, str]]) -> tuple[Event, ...]:
-        """What was told at places in the log, in their order."""
-        ordered = sorted(told)
-        times = self.at(np.array([place for place, _ in ordered], dtype=np.intp))
-        return tuple(
-            Event(float(time_s), who, what)
-            for time_s, (_, what) in zip(times, ordered, strict=True)
-        )
-
-
-def _setpoints(ours: _Party) -> Array:
-    """Of both kinds, in the order in which they were sent."""
+def _setpoints(ours: Sender) -> Array:
+    """Attitude and position setpoints in the order in which they were sent."""
     kinds = ("SET_ATTITUDE_TARGET", "SET_POSITION_TARGET_LOCAL_NED")
     attitude, position = (ours.table(kind, "") for kind in kinds)
     aims = ours.columns(kinds[0], "q thrust")
@@ -213,16 +150,16 @@ def _setpoints(ours: _Party) -> Array:
     return rows[np.argsort(np.concatenate([ours.places(kind) for kind in kinds]))]
 
 
-def _link_delay(ours: _Party, theirs: _Party) -> Array:
-    """By the answers to our own questions."""
-    questions, answers = (party.columns("TIMESYNC", "ts1 tc1") for party in (ours, theirs))
-    asked = questions[questions[:, 1] == 0.0, 0]
-    answered = answers[(answers[:, 1] != 0.0) & np.isin(answers[:, 0], asked)]
+def _link_delay(ours: Sender, theirs: Sender) -> Array:
+    """From the vehicle's answers to our TIMESYNC requests."""
+    requests, answers = (sender.columns("TIMESYNC", "ts1 tc1") for sender in (ours, theirs))
+    sent = requests[requests[:, 1] == 0.0, 0]
+    answered = answers[(answers[:, 1] != 0.0) & np.isin(answers[:, 0], sent)]
     return np.column_stack((answered[:, 0], answered[:, 1] - answered[:, 0])) * 1e-9
 
 
-def _truth(theirs: _Party, clock: _Clock) -> Array:
-    """Where the simulated vehicle is, once its log has said where the local frame's origin is."""
+def _truth(theirs: Sender, clock: VehicleClock) -> Array:
+    """True positions of a simulated vehicle, from the first origin of the local frame on."""
     homes = [(place, _origin_of_home(entry.message)) for place, entry in theirs.of("HOME_POSITION")]
     given = [
         (place, _origin_given(entry.message)) for place, entry in theirs.of("GPS_GLOBAL_ORIGIN")
@@ -236,54 +173,57 @@ def _truth(theirs: _Party, clock: _Clock) -> Array:
     newest = np.searchsorted([place for place, _ in origins], places)
     known = np.flatnonzero(newest)
     known = known[np.argsort(places[known])]
-    told = [
-        (
-            rows[row, 0],
-            *position_ned_m(Geodetic(*rows[row, 1:].tolist()), origins[newest[row] - 1][1]),
-        )
+    positions = [
+        position_ned_m(Geodetic(*rows[row, 1:].tolist()), origins[newest[row] - 1][1])
         for row in known
     ]
-    return np.array(told, dtype=np.float64).reshape(-1, 4)
+    return np.column_stack((rows[known, 0], np.reshape(positions, (-1, 3))))
 
 
-def _phases(ours: _Party, clock: _Clock) -> tuple[Event, ...]:
-    told = [
-        (place, text.removeprefix(OUR_WORDS))
+def _events(clock: VehicleClock, who: str, texts: Iterable[tuple[int, str]]) -> tuple[Event, ...]:
+    """Events from (place in the log, text), in their order."""
+    ordered = sorted(texts)
+    times = clock.at(np.array([place for place, _ in ordered], dtype=np.intp))
+    return tuple(
+        Event(float(time_s), who, what) for time_s, (_, what) in zip(times, ordered, strict=True)
+    )
+
+
+def _phases(ours: Sender) -> list[tuple[int, str]]:
+    return [
+        (place, text.removeprefix(OUR_PREFIX))
         for place, text in _texts(ours)
-        if text.startswith(OUR_WORDS)
+        if text.startswith(OUR_PREFIX)
     ]
-    return clock.story("offboard", told)
 
 
-def _texts(party: _Party) -> list[tuple[int, str]]:
-    """All that was said, joined from its chunks, each at the place of its last one."""
-    assembler, said = TextAssembler(), []
-    for place, entry in party.of("STATUSTEXT"):
+def _texts(sender: Sender) -> list[tuple[int, str]]:
+    """All STATUSTEXT, joined from their chunks, each at the place of its last one."""
+    assembler, texts = TextAssembler(), []
+    for place, entry in sender.of("STATUSTEXT"):
         whole = assembler.add(decode_text_chunk(entry.frame.payload), entry.unix_us / 1e6)
-        said += [(place, text.text) for text in whole]
-    return said
+        texts += [(place, text.text) for text in whole]
+    return texts
 
 
-def _modes(theirs: _Party, clock: _Clock, dialect: Dialect | None) -> tuple[Event, ...]:
-    told: list[tuple[int, str]] = []
+def _modes(theirs: Sender, dialect: Dialect | None) -> list[tuple[int, str]]:
+    modes: list[tuple[int, str]] = []
     if dialect is None:
-        return ()
+        return modes
     for place, entry in theirs.of("HEARTBEAT"):
         mode = dialect.mode_name(entry.message.custom_mode)
-        if entry.component_id == 1 and (not told or told[-1][1] != mode):
-            told.append((place, mode))
-    return clock.story("vehicle", told)
+        if entry.component_id == 1 and (not modes or modes[-1][1] != mode):
+            modes.append((place, mode))
+    return modes
 
 
-def _said(theirs: _Party, clock: _Clock) -> tuple[Event, ...]:
-    words = _texts(theirs)
+def _refusals(theirs: Sender) -> list[tuple[int, str]]:
     acks = [(place, entry.message) for place, entry in theirs.of("COMMAND_ACK")]
-    refused = [
+    return [
         (place, f"command {ack.command} refused, result {ack.result}")
         for place, ack in acks
-        if ack.result not in (0, 5)
+        if ack.result not in (0, 5)  # MAV_RESULT_ACCEPTED, MAV_RESULT_IN_PROGRESS
     ]
-    return clock.story("vehicle", words + refused)
 
 
 def _vehicle(messages: Iterable[LoggedMessage]) -> tuple[int | None, Dialect | None]:
@@ -299,7 +239,7 @@ def _origin_given(message: Any) -> Geodetic:
 
 
 def _origin_of_home(message: Any) -> Geodetic:
-    """Where the local frame's origin is: HOME_POSITION gives one point in both frames."""
+    """The origin of the local frame: HOME_POSITION gives one point in both frames."""
     place = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
     return origin_of(Geodetic(*place), (message.x, message.y, message.z))
 

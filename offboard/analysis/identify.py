@@ -6,6 +6,7 @@ What counts is the flight from lift-off to landing, whoever commanded it over SE
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Iterator
 
 import numpy as np
@@ -14,18 +15,21 @@ from numpy.typing import NDArray
 from offboard.analysis.history import History
 from offboard.analysis.tlog import Tlog
 from offboard.flight.phases import PHASE_CODES, Phase
-from offboard.identification.stages import Estimate, Identified, ResponseFit, identify
+from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.trace import Trace, clean
+from offboard.identification.uncertainty import Estimate
+from offboard.identification.vehicle_fit import Identified, identify
 from offboard.mavlink.dialects.base import ThrustRule
 from offboard.mavlink.session import DIALECTS
 from offboard.model.frames import course_from_quaternion, thrust_direction_from_quaternion
-from offboard.model.vehicle import Vehicle
+from offboard.model.vehicle import AxisResponse, Vehicle
 
 Array = NDArray[np.float64]
 
 FLOWN = (Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.HOVER)
 LIFTED_OFF_S = 0.5  # the ground's effect on the thrust ends
 NOT_IDENTIFIED = "not identified: {sentence}"
+LINE_WIDTH = 80
 
 
 def identify_flight(log: Tlog, history: History, vehicle: Vehicle) -> tuple[Identified, Trace]:
@@ -93,54 +97,70 @@ def rows(found: Identified) -> Iterator[tuple[str, Estimate | None, str, str]]:
 
 
 def vehicle_file(found: Identified, believed: Vehicle, flight: str) -> str:
-    """YAML of a vehicle file: what was identified, with its uncertainty, and for the rest what was
-    `believed`, with why it could not be identified."""
-    vehicle = found.applied_to(believed)
-    whys, lag = found.refusals, _comment(found, found.thrust_lag_s, "thrust_lag_s", "s")
-    drag = _comment(found, found.drag_ps, "drag_ps", "1/s times the mass believed")
-    lines = [
-        f"# Identified from {found.seconds:.0f} s of {flight}; the sd of each constant beside it.",
-        f"name: {vehicle.name}",
-        f"mass_kg: {vehicle.mass_kg:g}  # believed: telemetry does not show it",
-        f"gravity_mps2: {vehicle.gravity_mps2:g}",
-        f"inertia_kgm2: {_list(vehicle.inertia_kgm2)}  # believed",
-        f"arm_m: {vehicle.arm_m:g}  # believed",
-        f"drag_translation_npmps: {_list(vehicle.drag_translation_npmps)}  # {drag}",
-        f"drag_rotation_nmpradps: {_list(vehicle.drag_rotation_nmpradps)}  # believed",
-        f"hover_thrust: {vehicle.hover_thrust:.4f}"
-        f"  # {_comment(found, found.hover_thrust, 'hover_thrust', '')}",
-        f"thrust_delay_s: {vehicle.thrust_delay_s:.4f}  # {lag}",
-        f"thrust_lag_s: {vehicle.thrust_lag_s:.4f}  # {lag}",
-    ]
-    for name, fit in (("tilt", found.tilt), ("yaw", found.yaw)):
-        axis = getattr(vehicle, name)
-        lines += [
-            f"{name}:  # {_fit_comment(fit, whys.get(name, ''))}",
-            f"  delay_s: {axis.delay_s:.4f}",
-            f"  natural_frequency_radps: {axis.natural_frequency_radps:.3f}",
-            f"  damping: {axis.damping:.3f}",
-        ]
+    """YAML of a vehicle file from an identification.
+
+    Identified constants have their standard deviation as comment. The other constants are those of
+    `believed`, with the reason why they were not identified. `flight` names the log.
+    """
+    vehicle, whys = found.applied_to(believed), found.refusals
+    kept = "not identifiable from telemetry"
+    lag = _comment(found.thrust_lag_s, "s", whys.get("thrust_lag_s", ""))
+    hover = _comment(found.hover_thrust, "", whys.get("hover_thrust", ""))
+    drag = _comment(found.drag_ps, "1/s times the mass", whys.get("drag_ps", ""))
     limits = _list(vehicle.angular_acceleration_limit_radps2)
-    lines += [
-        f"angular_acceleration_limit_radps2: {limits}  # believed",
-        f"tilt_max_rad: {vehicle.tilt_max_rad:g}",
+    entries = [
+        (f"name: {vehicle.name}", ""),
+        (f"mass_kg: {vehicle.mass_kg:g}", kept),
+        (f"gravity_mps2: {vehicle.gravity_mps2:g}", ""),
+        (f"inertia_kgm2: {_list(vehicle.inertia_kgm2)}", kept),
+        (f"arm_m: {vehicle.arm_m:g}", kept),
+        (f"drag_translation_npmps: {_list(vehicle.drag_translation_npmps)}", drag),
+        (f"drag_rotation_nmpradps: {_list(vehicle.drag_rotation_nmpradps)}", kept),
+        (f"hover_thrust: {vehicle.hover_thrust:.4f}", hover),
+        (f"thrust_delay_s: {vehicle.thrust_delay_s:.4f}", lag),
+        (f"thrust_lag_s: {vehicle.thrust_lag_s:.4f}", lag),
+        *_axis("tilt", vehicle.tilt, _fit_comment(found.tilt, whys.get("tilt", ""))),
+        *_axis("yaw", vehicle.yaw, _fit_comment(found.yaw, whys.get("yaw", ""))),
+        (f"angular_acceleration_limit_radps2: {limits}", kept),
+        (f"tilt_max_rad: {vehicle.tilt_max_rad:g}", ""),
     ]
-    return "\n".join(lines) + "\n"
+    heading = f"# Identified from {found.seconds:.0f} s of {flight}; +- is one standard deviation."
+    return "\n".join([heading, *(_line(*entry) for entry in entries)]) + "\n"
 
 
-def _comment(found: Identified, estimate: Estimate | None, name: str, unit: str) -> str:
+def _axis(name: str, axis: AxisResponse, comment: str) -> list[tuple[str, str]]:
+    return [
+        (f"{name}:", comment),
+        (f"  delay_s: {axis.delay_s:.4f}", ""),
+        (f"  natural_frequency_radps: {axis.natural_frequency_radps:.3f}", ""),
+        (f"  damping: {axis.damping:.3f}", ""),
+    ]
+
+
+def _line(entry: str, comment: str) -> str:
+    """An entry with its comment, which stands above where it does not fit beside."""
+    line = f"{entry}  # {comment}" if comment else entry
+    if len(line) <= LINE_WIDTH:
+        return line
+    above = textwrap.wrap(
+        comment, LINE_WIDTH, initial_indent="# ", subsequent_indent="# ", break_long_words=False
+    )
+    return "\n".join([*above, entry])
+
+
+def _comment(estimate: Estimate | None, unit: str, why: str) -> str:
     if estimate is None:
-        return f"believed; {NOT_IDENTIFIED.format(sentence=found.refusals.get(name, ''))}"
+        return NOT_IDENTIFIED.format(sentence=why)
     return f"+- {estimate.sd:.2g} {unit}".rstrip()
 
 
 def _fit_comment(fit: ResponseFit | None, why: str) -> str:
     if fit is None:
-        return f"believed; {NOT_IDENTIFIED.format(sentence=why)}"
+        return NOT_IDENTIFIED.format(sentence=why)
     return (
         f"+- {fit.delay_s.sd:.2g} s, {fit.natural_frequency_radps.sd:.2g} rad/s, "
-        f"{fit.damping.sd:.2g}; {1e3 * fit.residual_rms:.1f} mrad rms left of "
-        f"{1e3 * fit.commanded_rms:.0f} commanded"
+        f"{fit.damping.sd:.2g}; residual {1e3 * fit.residual_rms:.1f} of "
+        f"{1e3 * fit.commanded_rms:.0f} mrad RMS"
     )
 
 

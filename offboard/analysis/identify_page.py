@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 from offboard.analysis import page as shell
 from offboard.analysis.figure import BLUE, GREY, RED, Figure, line, panels
 from offboard.analysis.identify import rows
-from offboard.identification.motion import Motion, specific_velocity
-from offboard.identification.response_fit import predicted
-from offboard.identification.stages import EstimatorNoise, Identified
+from offboard.identification.estimator_noise import EstimatorNoise
+from offboard.identification.motion_fit import Motion, predicted_velocity
+from offboard.identification.response import second_order
 from offboard.identification.trace import (
     COURSE,
     NORTH,
@@ -23,6 +23,7 @@ from offboard.identification.trace import (
     STAMP,
     Trace,
 )
+from offboard.identification.vehicle_fit import Identified
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 Array = NDArray[np.float64]
@@ -34,7 +35,8 @@ def page(flight: str, found: Identified, trace: Trace, believed: Vehicle) -> str
     """One self-contained HTML document; `flight` is the name of the log."""
     vehicle = found.applied_to(believed)
     last = trace.between(max(trace.begin_s, trace.end_s - SHOWN_S), trace.end_s)
-    figures = [] if math.isnan(trace.begin_s) else [_tilt(last, vehicle), _yaw(last, vehicle)]
+    flown = not math.isnan(trace.begin_s) and len(trace.commands) > 0
+    figures = [_tilt(last, vehicle), _yaw(last, vehicle)] if flown else []
     if len(trace.commands) and len(last.position) > 2:
         figures.append(_motion(last, vehicle))
     drawn = [shell.drawing(f"figure_{n}", figure) for n, figure in enumerate(figures)]
@@ -97,7 +99,7 @@ def _response(
     scale: float,
 ) -> Figure:
     times, sent_at = trace.attitude[:, STAMP], trace.commands[:, SENT_AT]
-    fitted = predicted(
+    fitted = second_order(
         times,
         sent_at,
         sent,
@@ -127,7 +129,7 @@ def _motion(trace: Trace, vehicle: Vehicle) -> Figure:
     motion = Motion(trace)
     names = ("north, m/s", "east, m/s", "down, m/s")
     traces = []
-    with_drag = specific_velocity(motion, vehicle)
+    with_drag = predicted_velocity(motion, vehicle)
     measured = np.gradient(motion.positions, motion.times, axis=1)
     for axis in range(3):
         legend = {"showlegend": axis == 0}

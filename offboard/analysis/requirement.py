@@ -1,4 +1,4 @@
-"""Requirements on a score: 'rmse_position_m<0.05' -> met or not. Pure text and numbers."""
+"""Requirements on a score, such as 'rmse_position_m<0.05'."""
 
 from __future__ import annotations
 
@@ -8,6 +8,8 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from offboard.documents.errors import UserError
+
 _OPERATORS: dict[str, Callable[[float, float], bool]] = {
     "<=": operator.le,
     ">=": operator.ge,
@@ -15,16 +17,20 @@ _OPERATORS: dict[str, Callable[[float, float], bool]] = {
     "<": operator.lt,
     ">": operator.gt,
 }
-_PATTERN = re.compile(r"^\s*(\w+)\s*(<=|>=|==|<|>)\s*(\S+)\s*$")
+_NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
+_PATTERN = re.compile(rf"\s*(\w+)\s*(<=|>=|==|<|>)\s*({_NUMBER})\s*")
 
 
-class RequirementError(Exception):
-    """A requirement that cannot be understood: one sentence with what would be right."""
+class RequirementError(UserError):
+    """A requirement that cannot be read; the sentence says what would be right."""
 
 
 @dataclass(frozen=True, slots=True)
 class Requirement:
-    """One figure of the score compared with a number."""
+    """One figure of the score compared with a number.
+
+    Example: `Requirement.parse("rmse_position_m<0.05", FIGURES).met(score.figures())`.
+    """
 
     figure: str
     comparison: str
@@ -32,8 +38,8 @@ class Requirement:
 
     @classmethod
     def parse(cls, text: str, known: Mapping[str, object]) -> Requirement:
-        """Read 'FIGURE<NUMBER'; raises RequirementError that lists the right names."""
-        match = _PATTERN.match(text)
+        """Read 'FIGURE<NUMBER'. `known` has the names of all figures. Raises RequirementError."""
+        match = _PATTERN.fullmatch(text)
         if match is None:
             raise RequirementError(
                 f"--require {text!r} is not understood; write FIGURE<NUMBER, "
@@ -44,19 +50,14 @@ class Requirement:
             raise RequirementError(
                 f"--require: there is no figure {figure!r}; there are {', '.join(known)}"
             )
-        try:
-            limit = float(number)
-        except ValueError:
-            limit = math.nan
-        if math.isnan(limit):
-            raise RequirementError(f"--require {text!r}: {number!r} is not a number")
-        return cls(figure, comparison, limit)
+        return cls(figure, comparison, float(number))
 
-    def verdict(self, figures: Mapping[str, float]) -> str | None:
-        """None when met, otherwise a sentence. A figure that the log lacks (NaN) is not met."""
+    def met(self, figures: Mapping[str, float]) -> bool:
+        """Whether the figure is as required. One that the log does not hold (NaN) is not."""
+        return _OPERATORS[self.comparison](figures[self.figure], self.limit)
+
+    def sentence(self, figures: Mapping[str, float]) -> str:
+        """The figure beside what is required: `rmse_position_m is 0.031 (required < 0.05)`."""
         value = figures[self.figure]
-        if _OPERATORS[self.comparison](value, self.limit):
-            return None
-        if math.isnan(value):
-            return f"{self.figure} is not in this log (required {self.comparison} {self.limit:g})"
-        return f"{self.figure} is {value:.4g} (required {self.comparison} {self.limit:g})"
+        found = "not in this log" if math.isnan(value) else f"{value:.4g}"
+        return f"{self.figure} is {found} (required {self.comparison} {self.limit:g})"

@@ -1,7 +1,7 @@
-"""The figures of one flight, from its History: how well it tracked, and what that took.
+"""The figures of one flight, computed from its History.
 
-Only the phase TRACK is scored; setpoint gaps count from take-off to landing. A figure that the
-log does not hold is NaN.
+Tracking, activity and telemetry are scored during the phase TRACK, setpoints from the first one to
+the landing, decisions over the whole flight. A figure that the log does not hold is NaN.
 """
 
 from __future__ import annotations
@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import BPoly
 
-from offboard.analysis import link
-from offboard.analysis.history import Event, History
+from offboard.analysis import link_figures
+from offboard.analysis.history import History
 from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.model.frames import (
     course_from_quaternion,
@@ -34,20 +34,29 @@ def _figure(meaning: str, unit: str = "") -> float:
 
 @dataclass(frozen=True, slots=True)
 class Score:
-    """All figures that --require may name."""
+    """All figures of a flight, by the names that --require takes.
 
-    rmse_position_m: float = _figure("position against the vehicle's estimate, RMSE", "m")
-    mean_position_m: float = _figure("the same, mean", "m")
-    p95_position_m: float = _figure("the same, 95th percentile", "m")
-    max_position_m: float = _figure("the same, largest", "m")
-    rmse_truth_m: float = _figure("position against the simulated truth, RMSE", "m")
-    max_truth_m: float = _figure("the same, largest", "m")
-    rmse_velocity_mps: float = _figure("velocity as the vehicle reports it, RMSE", "m/s")
-    p95_velocity_mps: float = _figure("the same, 95th percentile", "m/s")
-    max_velocity_mps: float = _figure("the same, largest", "m/s")
-    rmse_course_deg: float = _figure("course, RMSE", "deg")
-    max_course_deg: float = _figure("course, largest", "deg")
-    mu_e: float = _figure("the paper's fitness, Eq. 31 (course in degrees)")
+    Errors are relative to the reference, during the phase TRACK: `position` as the vehicle
+    estimates it (LOCAL_POSITION_NED), `truth` as it is in the simulator (HIL_STATE_QUATERNION or
+    SIM_STATE). Times are vehicle time. A figure that the log does not hold is NaN.
+
+    Example, with the pytest fixture `fly`:
+
+        assert fly(reference="hover").score.rmse_position_m < 0.05
+    """
+
+    rmse_position_m: float = _figure("position error, RMSE", "m")
+    mean_position_m: float = _figure("position error, mean", "m")
+    p95_position_m: float = _figure("position error, 95th percentile", "m")
+    max_position_m: float = _figure("position error, maximum", "m")
+    rmse_truth_m: float = _figure("true position error, RMSE", "m")
+    max_truth_m: float = _figure("true position error, maximum", "m")
+    rmse_velocity_mps: float = _figure("velocity error, RMSE", "m/s")
+    p95_velocity_mps: float = _figure("velocity error, 95th percentile", "m/s")
+    max_velocity_mps: float = _figure("velocity error, maximum", "m/s")
+    rmse_course_deg: float = _figure("course error, RMSE", "deg")
+    max_course_deg: float = _figure("course error, maximum", "deg")
+    mu_e: float = _figure("fitness of the paper, Eq. 31")
     e_u: float = _figure("Eq. 32, body velocity u", "m2/s2")
     e_v: float = _figure("Eq. 32, body velocity v", "m2/s2")
     e_w: float = _figure("Eq. 32, body velocity w", "m2/s2")
@@ -56,36 +65,36 @@ class Score:
     e_z: float = _figure("Eq. 32, down", "m2")
     e_psi: float = _figure("Eq. 32, course", "deg2")
     tracked_s: float = _figure("time scored", "s")
-    thrust_sd: float = _figure("normalised thrust commanded, standard deviation")
-    tilt_command_step_deg: float = _figure("commanded tilt, RMS change per setpoint", "deg")
-    tilt_max_deg: float = _figure("tilt flown, largest", "deg")
-    tilt_agitation_deg: float = _figure("tilt about what the reference asks, RMS", "deg")
-    rate_agitation_radps: float = _figure("roll and pitch rate about it, RMS", "rad/s")
-    roll_rate_sd_radps: float = _figure("roll rate, standard deviation", "rad/s")
-    pitch_rate_sd_radps: float = _figure("pitch rate, standard deviation", "rad/s")
-    setpoint_hz: float = _figure("setpoints per second of vehicle time", "Hz")
-    setpoint_gap_max_s: float = _figure("largest gap between setpoints, vehicle time", "s")
-    setpoint_gap_wall_max_s: float = _figure("the same, wall time", "s")
-    lateness_p99_ms: float = _figure("telemetry to setpoint, 99th percentile", "ms")
-    lateness_max_ms: float = _figure("the same, largest", "ms")
-    missed_ticks: float = _figure("control ticks that no telemetry came for")
-    solve_time_p50_ms: float = _figure("time to decide, median", "ms")
-    solve_time_p99_ms: float = _figure("the same, 99th percentile", "ms")
-    gap_median: float = _figure("cost above the exact optimum, relative, median")
-    gap_max: float = _figure("the same, largest")
+    thrust_sd: float = _figure("commanded thrust (0 .. 1), sd")
+    tilt_command_step_deg: float = _figure("commanded tilt, RMS of its steps", "deg")
+    tilt_max_deg: float = _figure("tilt, maximum", "deg")
+    tilt_agitation_deg: float = _figure("tilt beside the reference's, RMS", "deg")
+    rate_agitation_radps: float = _figure("rates beside the reference's, RMS", "rad/s")
+    roll_rate_sd_radps: float = _figure("roll rate, sd", "rad/s")
+    pitch_rate_sd_radps: float = _figure("pitch rate, sd", "rad/s")
+    setpoint_hz: float = _figure("setpoints sent", "Hz")
+    setpoint_gap_max_s: float = _figure("longest gap of setpoints", "s")
+    setpoint_gap_wall_max_s: float = _figure("longest gap of setpoints, wall time", "s")
+    lateness_p99_ms: float = _figure("telemetry to setpoint, 99th perc.", "ms")
+    lateness_max_ms: float = _figure("telemetry to setpoint, maximum", "ms")
+    missed_ticks: float = _figure("control periods without telemetry")
+    solve_time_p50_ms: float = _figure("time of a decision, median", "ms")
+    solve_time_p99_ms: float = _figure("time of a decision, 99th perc.", "ms")
+    gap_median: float = _figure("cost above the exact optimum, median")
+    gap_max: float = _figure("cost above the optimum, maximum")
     spread_median: float = _figure("epsilon of Eq. 29, median")
     at_bound_share: float = _figure("share of decisions at a bound")
-    cut_short_share: float = _figure("share of decisions cut short by their deadline")
+    cut_short_share: float = _figure("share of decisions cut by deadline")
     position_hz: float = _figure("LOCAL_POSITION_NED received", "Hz")
     attitude_hz: float = _figure("ATTITUDE_QUATERNION received", "Hz")
-    position_gap_max_s: float = _figure("largest gap between positions, vehicle time", "s")
-    stale_share: float = _figure("share of positions that came again or after newer ones")
-    link_delay_p50_ms: float = _figure("age of the telemetry when its setpoint arrived", "ms")
-    link_delay_p99_ms: float = _figure("the same, 99th percentile", "ms")
-    delay_ms: float = _figure("delay identified, newest telemetry to effect", "ms")
-    delay_sd_ms: float = _figure("its standard deviation", "ms")
-    hover_thrust: float = _figure("normalised hover thrust, estimated at the end")
-    flight_s: float = _figure("from arming to the end of the log, vehicle time", "s")
+    position_gap_max_s: float = _figure("longest gap of positions", "s")
+    stale_share: float = _figure("share of repeated or late positions")
+    link_delay_p50_ms: float = _figure("age of telemetry at its setpoint", "ms")
+    link_delay_p99_ms: float = _figure("age of telemetry, 99th perc.", "ms")
+    delay_ms: float = _figure("identified delay to the effect", "ms")
+    delay_sd_ms: float = _figure("identified delay, sd", "ms")
+    hover_thrust: float = _figure("hover thrust, estimated at the end")
+    flight_s: float = _figure("from arming to the end of the log", "s")
 
     def figures(self) -> dict[str, float]:
         return asdict(self)
@@ -94,13 +103,8 @@ class Score:
 FIGURES = {figure.name: figure.metadata for figure in fields(Score)}
 
 
-def phases(history: History) -> tuple[Event, ...]:
-    """What the flight went through: vehicle time and 'phase: reason'."""
-    return history.phases
-
-
 def score(history: History) -> Score:
-    """Compute every figure that the history supports."""
+    """Compute all figures of a flight from its arrays."""
     values: dict[str, float] = {}
     window = _window(history)
     if window is not None:
@@ -110,15 +114,15 @@ def score(history: History) -> Score:
         values |= _activity(history, reference, *window)
         values |= _truth(history, reference, *window)
         values["tracked_s"] = window[1] - window[0]
-        values |= link.telemetry(history, *window)
-    values |= link.setpoints(history)
-    values |= link.delay(history)
+        values |= link_figures.telemetry(history, *window)
+    values |= link_figures.setpoints(history)
+    values |= link_figures.delay(history)
     values |= _decisions(history)
     return Score(**values)
 
 
 def _window(history: History) -> tuple[float, float] | None:
-    """First and last vehicle time of the phase TRACK; None where the log holds too little of it."""
+    """First and last vehicle time of the phase TRACK; None with fewer than two samples."""
     track = float(PHASE_CODES[Phase.TRACK])
     times = [
         time_s
@@ -138,8 +142,8 @@ def _between(rows: Array, begin_s: float, end_s: float) -> Array:
 
 
 class _Reference:
-    """What was to be flown, as functions of vehicle time (N,): the records are joined by the
-    quintic that their position, velocity and acceleration determine."""
+    """The reference as a function of vehicle time (N,): between two records the quintic through
+    their positions, velocities and accelerations."""
 
     def __init__(self, rows: Array) -> None:
         newest = np.maximum.accumulate(rows[:, 0])
@@ -149,7 +153,7 @@ class _Reference:
         self._curve = BPoly.from_derivatives(self._times, knots)
 
     def position(self, times: Array, derivative: int = 0) -> Array:
-        """(N, 3) NED, or one of its derivatives."""
+        """(N, 3) position NED in m, or a derivative of it."""
         values: Array = self._curve.derivative(derivative)(times)
         return values
 
@@ -160,7 +164,7 @@ class _Reference:
 def _tracking(
     history: History, reference: _Reference, begin_s: float, end_s: float
 ) -> dict[str, float]:
-    position = link.each_once(_between(history.position, begin_s, end_s))
+    position = link_figures.each_once(_between(history.position, begin_s, end_s))
     times = position[:, 0]
     error_m = np.linalg.norm(position[:, 1:4] - reference.position(times), axis=1)
     slip_mps = np.linalg.norm(position[:, 4:7] - reference.position(times, 1), axis=1)
@@ -227,8 +231,8 @@ def _activity(
 
 
 def _agitation(reference: _Reference, attitude: Array) -> dict[str, float]:
-    """Motion that the reference does not explain: thrust direction and rates less their best
-    linear fit by the reference's velocity, acceleration and jerk (drag and lag need no model)."""
+    """Motion beside that of the reference: thrust direction and rates minus their linear fit by the
+    reference's velocity, acceleration and jerk. The fit needs no model of drag and lag."""
     times = attitude[:, 0]
     explained = [reference.position(times, order)[:, :2] for order in (1, 2, 3)]
     regressors = np.hstack((*explained, np.ones((len(times), 1))))

@@ -1,7 +1,7 @@
-"""A .tlog read back: stamped frames, decoded on demand. Knows MAVLink, judges nothing.
+"""Reads a .tlog: frames with their times, decoded on demand.
 
-A record is a big-endian uint64 of Unix microseconds, then one unchanged MAVLink frame. A log cut
-off in its last record (a crash) is read up to there; a file that is no .tlog is refused.
+A record is a big-endian uint64 of Unix microseconds, then one unchanged MAVLink frame. A log that
+ends inside a record (after a crash) is read up to it; a file that is no .tlog is refused.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
+from offboard.documents.errors import UserError
 from offboard.mavlink.counters import DropReason
 from offboard.mavlink.framing import Frame, frame_size, parse
 
@@ -27,12 +28,12 @@ _MAGIC = (0xFD, 0xFE)
 _codec = dialect.MAVLink(None)
 
 
-class TlogError(Exception):
-    """A file that cannot be read as a .tlog: one sentence for the user."""
+class TlogError(UserError):
+    """A file that cannot be read as a .tlog."""
 
 
 class LoggedMessage(NamedTuple):
-    """One frame and when it crossed the link."""
+    """One frame and the time at which it was sent or received."""
 
     unix_us: int
     frame: Frame
@@ -47,18 +48,18 @@ class LoggedMessage(NamedTuple):
 
     @property
     def name(self) -> str:
-        """As pymavlink calls it, UNKNOWN_<id> where it does not know it."""
+        """Name of the message in pymavlink, UNKNOWN_<id> without one."""
         return name_of(self.frame.message_id)
 
     @property
     def message(self) -> Any:
-        """Decoded by pymavlink, anew each time that it is asked for."""
+        """The message decoded by pymavlink, at each access."""
         return _codec.decode(bytearray(self.frame.raw))
 
 
 @dataclass(frozen=True, slots=True)
 class Tlog:
-    """All decodable messages in order; `truncated` bytes at the end belong to no whole record."""
+    """All decodable messages in order, and the bytes of an incomplete record at the end."""
 
     messages: tuple[LoggedMessage, ...]
     truncated: int
@@ -66,7 +67,7 @@ class Tlog:
 
 
 def find(flight: Path) -> Path:
-    """The .tlog of FLIGHT, which is a flight directory or the file itself."""
+    """The .tlog of a flight, given as flight directory or as file. Raises TlogError."""
     path = flight / "flight.tlog" if flight.is_dir() else flight
     if not path.is_file():
         raise TlogError(f"{path} does not exist; name a flight directory or a .tlog file")
@@ -108,14 +109,17 @@ def _records(data: bytes, path: Path) -> Iterator[tuple[int, int, int]]:
 
 @cache
 def name_of(message_id: int) -> str:
-    """The name of a message, UNKNOWN_<id> where pymavlink does not know it."""
+    """The name of a message id in pymavlink, UNKNOWN_<id> without one."""
     kind = dialect.mavlink_map.get(message_id)
     return kind.msgname if kind else f"UNKNOWN_{message_id}"
 
 
 def columns(name: str, messages: Sequence[LoggedMessage], fields: str) -> NDArray[np.float64]:
-    """Fields of messages that all are called `name`, (N, columns): `fields` with spaces between, an
-    array field filling as many columns as it has elements. What decoding one by one would give."""
+    """The fields of messages named `name` as rows (N, columns).
+
+    `fields` are separated by spaces; an array field fills as many columns as it has elements. Gives
+    the values of `message` for all messages at once.
+    """
     layout = _layout(name)
     size = layout.itemsize
     payloads = b"".join(entry.frame.payload[:size].ljust(size, b"\0") for entry in messages)
@@ -129,7 +133,7 @@ def columns(name: str, messages: Sequence[LoggedMessage], fields: str) -> NDArra
 
 @cache
 def _layout(name: str) -> np.dtype[np.void]:
-    """The payload as it lies on the wire, from pymavlink's own description of the message."""
+    """The layout of the payload on the wire, from pymavlink's definition of the message."""
     kind = getattr(dialect, f"MAVLink_{name.lower()}_message")
     formats = kind.native_format.decode().lstrip("<")
     return np.dtype(

@@ -13,21 +13,28 @@ from pathlib import Path
 from offboard.analysis import history, tlog
 from offboard.analysis import score as scoring
 from offboard.analysis.compare import Result, Trial
-from offboard.analysis.document import as_text
 from offboard.analysis.history import History
 from offboard.analysis.score import Score
-from offboard.analysis.tlog import TlogError
-from offboard.documents.reading import DocumentError
+from offboard.analysis.score_json import as_text
+from offboard.documents.errors import UserError
 from offboard.flight.companion import STOPPED
 from offboard.flight.configuration import build_track
-from offboard.flight.link import LinkError
 from offboard.flight.log import LogError
 from offboard.flight.request import FlightRequest, fly_request
 from offboard.flight.sitl import SimulatorProcess
 
 
 def score_flight(flight: Path) -> tuple[Score, History]:
-    """Score FLIGHT, a directory or a .tlog, from its log alone. Raises TlogError."""
+    """Score a flight from its log alone.
+
+    `flight` is a flight directory or a .tlog file. Returns the figures and the events and arrays
+    that they were computed from. Raises TlogError.
+
+    Example:
+
+        score, history = score_flight(Path("flights/20261121-093000"))
+        print(score.rmse_position_m, history.position.shape)
+    """
     flown = history.gather(tlog.read(tlog.find(flight)))
     return scoring.score(flown), flown
 
@@ -39,14 +46,14 @@ def keep_score(directory: Path, score: Score, flown: History) -> None:
         path.write_text(as_text(score, flown), encoding="utf-8")
     except OSError as error:
         with suppress(OSError):
-            path.unlink()  # half a score is none
+            path.unlink()  # an incomplete file
         raise LogError(f"{path} cannot be written ({error.strerror})") from None
 
 
 def check_flyable(
     request: FlightRequest, controllers: Sequence[str], references: Sequence[str]
 ) -> None:
-    """Every controller with every reference, before the first flight. Raises DocumentError."""
+    """Check every controller with every reference. Raises DocumentError."""
     for controller, reference in itertools.product(controllers, references):
         build_track(_of_trial(request, controller, reference).resolve())
 
@@ -58,16 +65,17 @@ def _of_trial(request: FlightRequest, controller: str, reference: str) -> Flight
 
 @cache
 def _simulator() -> SimulatorProcess:
-    """Of this process, for all flights of a comparison that it flies."""
+    """The simulator of this process, for all its flights of a comparison."""
     process = SimulatorProcess().__enter__()
     atexit.register(process.close)
     return process
 
 
 def fly_trial(request: FlightRequest, trial: Trial) -> Result:
-    """Fly one row of a comparison like `request`; a flight that cannot be flown is a result too.
+    """Fly one flight of a comparison, configured as `request`.
 
-    It begins disarmed, unless `request` says otherwise: in the air, somebody else has the vehicle.
+    A flight that fails is a result too. Unless `request` sets limits.begin_armed, an armed vehicle
+    is refused: somebody else is flying it.
     """
     requested = replace(
         _of_trial(request, trial.controller, trial.reference),
@@ -80,7 +88,7 @@ def fly_trial(request: FlightRequest, trial: Trial) -> Result:
         outcome = fly_request(requested, simulator=_simulator() if request.sitl else None)
         score, flown = score_flight(trial.directory)
         keep_score(trial.directory, score, flown)
-    except (DocumentError, LinkError, LogError, TlogError) as error:
+    except UserError as error:
         return Result(trial, 2, str(error), {})
     stopped = outcome.sentence.startswith(STOPPED)
     return Result(trial, outcome.exit_code, outcome.sentence, score.figures(), stopped)

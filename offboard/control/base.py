@@ -1,96 +1,158 @@
-"""The contract of every controller: a situation in, a decision out. Values only, all frozen."""
+"""The contract between a flight and its controller: `Situation` in, `Decision` out.
+
+Frames and units throughout: NED (north, east, down), metres, seconds, radians; the body is FRD
+(forward, right, down). `offboard.control` shows how to write a controller.
+"""
 
 from __future__ import annotations
 
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
-import numpy as np
-from numpy.typing import NDArray
-
+from offboard.documents.parameters import Parameters
 from offboard.model.command import Command, PositionCommand
 from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import Reference
 
-Array = NDArray[np.float64]
-
 
 @dataclass(frozen=True, slots=True)
 class Situation:
-    """All a controller may know. `time_s` is the vehicle time of the tick; the reference's time
-    axis is vehicle time too. `previous` is the command in force; `deadline_s` is the time budget
-    of this decision in seconds (None: unbounded, as in lockstep). `origin_ned_m` is the take-off
-    point, which references and keep-out volumes are given relative to; `track_time_s` the time on
-    the reference's own axis, NaN before it is joined."""
+    """Everything a controller knows at one control tick.
+
+    Attributes:
+        time_s: Vehicle time of the tick (`time_boot_ms` of the telemetry), s.
+        state: The state predicted for the time at which a command sent now takes effect; that time
+            is `state.time_s`.
+        reference: The trajectory to follow. Its time axis is vehicle time, its positions are in
+            the same local NED frame as `state`.
+        previous: The attitude command in force, that is the last one sent.
+        remaining_s: Returns how many seconds of the time budget of this decision are left,
+            negative once it is exceeded. None in lockstep, where the vehicle waits.
+        origin_ned_m: The take-off point. References and keep-out volumes are configured relative
+            to it.
+        track_time_s: Time since the start of the configured reference, s; NaN during the climb.
+    """
 
     time_s: float
     state: PredictedState
     reference: Reference
     previous: Command
-    deadline_s: float | None = None
+    remaining_s: Callable[[], float] | None = None
     origin_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    track_time_s: float = float("nan")
+    track_time_s: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """How good a decision is, and what it cost to find.
+    """How good a decision is. Logged with it; a figure that a controller does not have is NaN.
 
-    `cost` is J of the chosen input, `optimal_cost` J of the exact minimiser in the same box
-    (daqp), `gap` their relative difference (J - J*) / max(|J*|, tiny), `spread` epsilon of
-    Eq. 29, `seed_cost` J of the best plan that the search started from. NaN where a controller
-    has no such figure.
+    Attributes:
+        cost: Cost J of the chosen input or plan.
+        optimal_cost: Cost J* of the exact minimiser within the same bounds (by daqp).
+        gap: Relative difference (J - J*) / max(|J*|, floor); see `certificate.certify`.
+        spread: Mean distance of the particles from the best one, epsilon of Eq. 29.
+        iterations: Iterations of the search.
+        cut_short: Whether the search stopped because no time was left.
+        at_bound: Whether any input rests on its bound.
+        seed_cost: Cost J of the best plan that the search started from.
     """
 
-    cost: float = float("nan")
-    optimal_cost: float = float("nan")
-    gap: float = float("nan")
-    spread: float = float("nan")
+    cost: float = math.nan
+    optimal_cost: float = math.nan
+    gap: float = math.nan
+    spread: float = math.nan
     iterations: int = 0
     cut_short: bool = False
-    solve_time_s: float = float("nan")
     at_bound: bool = False
-    seed_cost: float = float("nan")
+    seed_cost: float = math.nan
 
 
 @dataclass(frozen=True, slots=True)
 class Decision:
-    """What is commanded, and how good that is."""
+    """What `Controller.decide` returns: the command, and optionally how good it is.
+
+    A `Command` is sent as SET_ATTITUDE_TARGET, after its thrust and tilt are limited to those of
+    the vehicle; a `PositionCommand` as SET_POSITION_TARGET_LOCAL_NED.
+    """
 
     command: Command | PositionCommand
     certificate: Certificate = field(default_factory=Certificate)
 
 
 class DecisionError(ArithmeticError):
-    """There is no decision: the situation, or what follows from it, is not finite. The flight
-    bridges it, and lands when it lasts; the command in force again would hide a dead law."""
+    """`Controller.decide` has no command to offer, for example because the state is not finite.
+
+    The flight sends level attitude instead and lands after `limits.missed_decisions` in a row.
+    """
 
 
 class Controller(Protocol):
-    """`decide` is called once per tick; `warm_up` calls every code path once before engaging."""
+    """A control law. The flight calls these two methods and no other.
+
+    Before take-off `decide` is called a few times on a vehicle at rest, so that everything is
+    compiled and loaded, then `reset` once. In flight `decide` is called at every control tick from
+    the climb to the landing.
+    """
 
     def decide(self, situation: Situation) -> Decision:
-        """The command for one tick. Raises DecisionError."""
+        """Return the command for this tick.
+
+        Raises DecisionError where there is none. Any other exception, and a command that is not
+        finite or whose thrust direction is not a unit vector, counts as no decision too.
+        """
         ...
 
     def reset(self) -> None:
-        """Forget everything of the previous flight, the random stream included."""
+        """Return to the state after construction: no memory, and the random stream at its seed."""
         ...
+
+
+class ControllerSettings(Parameters, ABC):
+    """Base class of a controller's settings: what a file in `config/controllers` or
+    `--set controller.KEY=VALUE` may say, and how the controller is made from it.
+
+    A subclass declares `law: Literal["name"] = "name"` and its fields with defaults and ranges.
+    Unknown keys and values out of range are refused with a sentence that names them.
+    """
+
+    law: str
+
+    @abstractmethod
+    def build(self, vehicle: Vehicle, *, period_s: float, seed: int) -> Controller:
+        """Make the controller.
+
+        Args:
+            vehicle: What is known of the vehicle before the flight.
+            period_s: Time between two decisions, s of vehicle time.
+            seed: Seed of whatever the controller draws at random; the same seed must give the
+                same decisions.
+        """
+
+    def refusal(self, reference: Reference) -> str | None:
+        """Why these settings cannot fly `reference`, given relative to the take-off point; None
+        if they can. Asked before anything is sent."""
+        return None
 
 
 @runtime_checkable
 class Adopting(Protocol):
-    """A controller that can go on with constants identified in flight."""
+    """A controller that can continue with the constants identified in flight. Optional."""
 
     @property
     def bandwidth_radps(self) -> float:
-        """The bandwidth that was asked for."""
+        """The configured bandwidth, rad/s."""
         ...
 
     def adopt(
         self, vehicle: Vehicle, bandwidth_limit_radps: float = ..., *, gains: bool = ...
     ) -> None:
-        """Plan with `vehicle` from the next decision on, at no more than this bandwidth. Without
-        `gains` only what costs nothing changes: one step of a blend that has not ended."""
+        """Use `vehicle` from the next decision on, at no more than `bandwidth_limit_radps`.
+
+        With `gains` False only the feed-forward changes: the vehicle is blended in over many
+        ticks, and solving for the gains anew would take too long at each of them.
+        """
         ...

@@ -1,127 +1,67 @@
-"""The controllers by name: one configuration value per law, and the controller built from it.
+"""Controllers by law name: the built-in ones, and those of installed packages.
 
-A controller file (`config/controllers/*.yaml`) is one of these values, told apart by `law`. The
-table is also the test matrix.
+A controller file (`config/controllers/*.yaml`) holds the settings of one law, named by `law`. A
+package adds a law with an entry point in the group `pso_offboard.controllers`: its name is that of
+the law, its object the law's `ControllerSettings`. The paper's law is added that way too. A law is
+imported when it is asked for, so that a flight loads and compiles only what it needs.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import Annotated, Literal
+from importlib.metadata import EntryPoint, EntryPoints, entry_points
 
-from pydantic import Field
+from offboard.control.base import ControllerSettings
+from offboard.documents.reading import DocumentError
 
-from offboard.control.base import Controller
-from offboard.control.horizon.law import HorizonLaw, HorizonSettings, Method
-from offboard.control.laws.autopilot import AutopilotLaw, AutopilotSettings
-from offboard.control.laws.mpc import MpcLaw, MpcSettings
-from offboard.control.laws.pid import PidLaw, PidSettings
-from offboard.control.laws.tracking import OneDecisionSettings, Search, TrackingLaw
-from offboard.documents.parameters import Parameters
-from offboard.model.vehicle import Vehicle
-from offboard.paper.controller import PaperController
-from offboard.paper.law import PaperSettings
+GROUP = "pso_offboard.controllers"
 
-
-class Pso(OneDecisionSettings):
-    """Cost-to-go over one held input, searched by the swarm."""
-
-    law: Literal["pso"]
-
-
-class Lqr(OneDecisionSettings):
-    """The exact minimiser of the same cost."""
-
-    law: Literal["lqr"]
+BUILT_IN = EntryPoints(
+    EntryPoint(law, f"offboard.control.laws.{settings}", GROUP)
+    for law, settings in (
+        ("pso", "pso:PsoSettings"),
+        ("lqr", "lqr:LqrSettings"),
+        ("mpc", "mpc:MpcSettings"),
+        ("horizon", "horizon:HorizonSettings"),
+        ("mppi", "sampling:MppiSettings"),
+        ("cem", "sampling:CemSettings"),
+        ("pid", "pid:PidSettings"),
+        ("autopilot", "autopilot:AutopilotSettings"),
+    )
+)
 
 
-class Mpc(MpcSettings):
-    """The same cost over N steps in their boxes, exactly."""
-
-    law: Literal["mpc"]
-
-
-class Horizon(HorizonSettings):
-    """N steps of nonlinear roll-outs, limits and keep-out volumes, searched by the swarm."""
-
-    law: Literal["horizon"]
+def names() -> list[str]:
+    """All law names: built in, then those of installed packages. Imports none of them."""
+    installed = sorted(entry_points(group=GROUP).names)
+    return list(dict.fromkeys((*(entry.name for entry in BUILT_IN), *installed)))
 
 
-class Mppi(HorizonSettings):
-    """The same roll-outs, searched by model predictive path integral control."""
+def settings_of(law: str) -> type[ControllerSettings]:
+    """The settings class of one of `names`. A built-in law cannot be replaced.
 
-    law: Literal["mppi"]
-
-
-class Cem(HorizonSettings):
-    """The same roll-outs, searched by the cross-entropy method."""
-
-    law: Literal["cem"]
-
-
-class Pid(PidSettings):
-    """Cascaded position and velocity loops with the same feed-forward and observer."""
-
-    law: Literal["pid"]
-
-
-class Autopilot(AutopilotSettings):
-    """The autopilot's own position loop."""
-
-    law: Literal["autopilot"]
-
-
-class Paper(PaperSettings):
-    """The paper's law, one step ahead."""
-
-    law: Literal["paper"]
-
-
-Law = Pso | Lqr | Mpc | Horizon | Mppi | Cem | Pid | Autopilot | Paper
-ControllerConfig = Annotated[Law, Field(discriminator="law")]
-LAWS: Mapping[str, type[Parameters]] = {
-    "pso": Pso,
-    "lqr": Lqr,
-    "mpc": Mpc,
-    "horizon": Horizon,
-    "mppi": Mppi,
-    "cem": Cem,
-    "pid": Pid,
-    "autopilot": Autopilot,
-    "paper": Paper,
-}
-
-
-def build(
-    config: Law,
-    vehicle: Vehicle,
-    period_s: float,
-    seed: int,
-    stopwatch: Callable[[], float] | None = None,
-) -> Controller:
-    """A controller for `vehicle`, deciding every `period_s`, its random stream from `seed`.
-
-    `stopwatch` () -> s keeps deadlines and measures solve times; without one there are neither.
+    Raises DocumentError where an entry point cannot be used, with one sentence that names it.
     """
-    match config:
-        case Pso() | Lqr():
-            return TrackingLaw(
-                vehicle,
-                config,
-                Search(config.law),
-                stopwatch,
-                config.feedforward,
-                period_s=period_s,
-                seed=seed,
-            )
-        case Mpc():
-            return MpcLaw(vehicle, config, stopwatch, period_s=period_s)
-        case Horizon() | Mppi() | Cem():
-            method = Method(config.law)
-            return HorizonLaw(vehicle, config, method, stopwatch, period_s=period_s, seed=seed)
-        case Pid():
-            return PidLaw(vehicle, config, stopwatch, period_s=period_s)
-        case Autopilot():
-            return AutopilotLaw(config, period_s=period_s)
-        case Paper():
-            return PaperController(vehicle, config, period_s, stopwatch, seed)
+    found = BUILT_IN.select(name=law) or entry_points(group=GROUP, name=law)
+    if not found:
+        raise DocumentError(f"there is no law named {law!r}; known are {', '.join(names())}")
+    if len(found) > 1:
+        which = " and ".join(sorted(_described(entry) for entry in found))
+        raise DocumentError(f"law {law} is defined twice, by {which}; uninstall one of them")
+    (entry,) = found
+    try:
+        loaded = entry.load()
+    except Exception as error:  # whatever another package raises while it is imported
+        raise _unusable(entry, f"{type(error).__name__}: {error}") from error
+    if not (isinstance(loaded, type) and issubclass(loaded, ControllerSettings)):
+        raise _unusable(entry, f"{loaded!r} is not a subclass of ControllerSettings")
+    return loaded
+
+
+def _unusable(entry: EntryPoint, reason: str) -> DocumentError:
+    sentence = " ".join(f"law {entry.name} of {_described(entry)} cannot be used: {reason}".split())
+    return DocumentError(sentence)
+
+
+def _described(entry: EntryPoint) -> str:
+    package = f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an unknown package"
+    return f"{package} ({entry.value})"

@@ -1,7 +1,7 @@
-"""How far a swarm's answer is from the exact minimum of the same quadratic in the same box.
+"""How far an answer of the swarm is from the exact minimum of the same quadratic within bounds.
 
-The minimum is daqp's (a dual active-set method), so swarm and certificate share no code. Knows
-neither what the inputs mean nor how they were found.
+The minimum is found by daqp, a dual active-set method, so that swarm and certificate share no
+code. Knows neither what the inputs mean nor how they were found.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from offboard.control.swarm.settings import SwarmResult
 
 Array = NDArray[np.float64]
 
-GAP_FLOOR = 1e-6  # of the cost's variation over the box
-BOUND_FRACTION = 1e-6  # of the box's width
+GAP_FLOOR = 1e-6  # times the variation of the cost within the bounds
+BOUND_FRACTION = 1e-6  # times the distance between the bounds
 
 
 class ExactMinimum:
-    """daqp's workspace for boxes in `dimensions` inputs, set up once and updated per problem."""
+    """Exact minimum of quadratics in `dimensions` inputs; daqp's workspace is made once."""
 
     def __init__(self, dimensions: int) -> None:
         self._dimensions = dimensions
-        self._free = np.zeros(dimensions, np.int32)  # every bound may or may not be active
+        self._free = np.zeros(dimensions, np.int32)  # no bound is active beforehand
         self._model = daqp.Model()
         no_rows, ones = np.empty((0, dimensions)), np.ones(dimensions)
         self._model.setup(
@@ -33,9 +33,9 @@ class ExactMinimum:
         )
 
     def minimise(self, problem: BoxQuadratic) -> Array:
-        """The minimiser (n,), inside the box; NaN if the problem is not finite or not solved.
+        """The minimiser (n,) within the bounds; NaN if the problem is not finite or not solved.
 
-        A singular Hessian has no single minimiser: daqp answers with one of them.
+        A singular Hessian has many minimisers: daqp returns one of them.
         """
         unsolved = np.full(self._dimensions, np.nan)
         if not (np.isfinite(problem.hessian).all() and np.isfinite(problem.gradient).all()):
@@ -52,20 +52,19 @@ class ExactMinimum:
         minimiser, _, status, _ = self._model.solve()
         if status < 1:
             return unsolved
-        inside: Array = np.clip(minimiser, problem.lower, problem.upper)
-        return inside
+        return problem.clip(minimiser)
 
 
 def certify(
     problem: BoxQuadratic, result: SwarmResult, exact: ExactMinimum | None = None
 ) -> Certificate:
-    """The certificate of `result`, the answer to `problem`; `exact` saves setting daqp up again.
+    """The certificate of `result`, the answer to `problem`. Pass `exact` to reuse its workspace.
 
-    The gap is (J - J*) / max(|J*|, floor). J - J* is not a difference of two costs, which near
-    the optimum would be rounding alone, but the exact rest of the expansion about the minimiser,
-    g*'d + 1/2 d'Hd with d = u - u* and g* = Hu* + f. What is negative (a swarm ahead of daqp's
-    tolerances) counts as 0. The floor, a millionth of what J can vary over the box, keeps a gap
-    meaningful where J* vanishes, that is exactly on the reference.
+    The gap is (J - J*) / max(|J*|, floor). J - J* is not computed as the difference of two costs,
+    which near the optimum would be rounding errors only, but from the expansion about the
+    minimiser: g*'d + 1/2 d'Hd with d = u - u* and g* = Hu* + f. A negative value (the swarm is
+    better than daqp's tolerance) counts as 0. The floor is a millionth of the variation of J within
+    the bounds; it keeps the gap meaningful exactly on the reference, where J* vanishes.
     """
     exact = exact or ExactMinimum(len(problem.gradient))
     best = exact.minimise(problem)
@@ -87,14 +86,14 @@ def certify(
 
 
 def at_bound(problem: BoxQuadratic, inputs: Array) -> bool:
-    """Whether any input (n,) that is free to move rests on its bound."""
+    """Whether any input (n,) rests on a bound; inputs fixed by equal bounds do not count."""
     width = problem.upper - problem.lower
-    room = np.minimum(inputs - problem.lower, problem.upper - inputs)
-    return bool(np.any((room <= BOUND_FRACTION * width) & (width > 0)))
+    distance = np.minimum(inputs - problem.lower, problem.upper - inputs)
+    return bool(np.any((distance <= BOUND_FRACTION * width) & (width > 0)))
 
 
 def _variation(problem: BoxQuadratic) -> float:
-    """An upper estimate of how much J varies over the box."""
+    """An upper estimate of the variation of J within the bounds."""
     width = problem.upper - problem.lower
     middle = 0.5 * (problem.lower + problem.upper)
     slope = problem.hessian @ middle + problem.gradient

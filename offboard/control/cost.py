@@ -1,4 +1,4 @@
-"""The one small quadratic form that every objective of the swarm over one step comes down to."""
+"""A quadratic cost within bounds: what the laws minimise."""
 
 from __future__ import annotations
 
@@ -28,3 +28,8 @@ class BoxQuadratic:
         """J of inputs (..., n), shape (...)."""
         quadratic: Array = np.einsum("...i,ij,...j->...", inputs, self.hessian, inputs)
         return 0.5 * quadratic + inputs @ self.gradient + self.constant
+
+    def clip(self, inputs: Array) -> Array:
+        """The nearest inputs (..., n) within the bounds."""
+        clipped: Array = np.clip(inputs, self.lower, self.upper)
+        return clipped

@@ -1,9 +1,10 @@
-"""How much delay that nobody knows of the tracking loop bears, and the bandwidth that bears enough.
+"""The delay margin of the tracking loop, and the highest bandwidth with a sufficient margin.
 
-A known delay is predicted through and costs little; what makes the loop unstable is a delay other
-than the one believed. One lateral axis is closed exactly as it is flown (law every period on the
-state predicted by replaying the commands sent, observer corrected by position and attitude) with
-the plant's delay longer than believed; the eigenvalues of the map over one period decide.
+A known delay is compensated by prediction and costs little; the loop becomes unstable where the
+delay differs from the one in the vehicle's parameters. The loop of one lateral axis is built as it
+is flown (a decision every period on the state predicted by replaying the commands sent; an observer
+corrected by position and attitude) with the plant's delay longer than the modelled one. It is
+stable if the eigenvalues of its map over one period are within the unit circle.
 """
 
 from __future__ import annotations
@@ -12,27 +13,27 @@ import math
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm, solve_discrete_are
+from scipy.linalg import solve_discrete_are
 
 from offboard.control.riccati import lateral_cost_to_go
-from offboard.model.axes import lateral_model
+from offboard.model.axes import LinearModel, lateral_model
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
-# The delay not known of that must be borne: a share of the delay, this much, and 3 sd.
-LEAST_MARGIN_S, SHARE_OF_DELAY, SDS = 0.03, 0.25, 3.0
+LEAST_MARGIN_S, SHARE_OF_DELAY, SDS = 0.03, 0.25, 3.0  # see `needed_margin`
 BANDWIDTH_STEP_RADPS, LEAST_BANDWIDTH_RADPS = 0.25, 1.0
 SUBSTEPS = 10
 LONGEST_S = 0.6
 STABLE = 1.0 - 1e-6
-# Of the observer, see ObserverSettings: densities of v', b'', d' and sds of position and attitude.
+# See ObserverSettings: noise densities of v', b'', d', standard deviations of position, attitude
 _DENSITIES = np.array([0.0, 0.2, 0.0, 0.6, 0.15])
 _SDS = np.array([0.002, 0.001])
 
 
 def delay_margin(vehicle: Vehicle, bandwidth_radps: float, period_s: float) -> float:
-    """The least delay beyond the believed one at which the loop is unstable, s; or LONGEST_S."""
+    """The least delay beyond the modelled one with which the loop is unstable, s; at most
+    LONGEST_S."""
     loop = _Loop(vehicle, bandwidth_radps, period_s)
     extra_s = 0.0
     while extra_s < LONGEST_S and loop.radius(extra_s) < STABLE:
@@ -41,29 +42,31 @@ def delay_margin(vehicle: Vehicle, bandwidth_radps: float, period_s: float) -> f
 
 
 def needed_margin(vehicle: Vehicle, delay_sd_s: float) -> float:
-    """What must be borne: 30 ms, a quarter of the delay (jitter grows with it), or three standard
-    deviations of it, whichever is longest."""
+    """The delay margin that a flight needs, s: 30 ms, a quarter of the delay (jitter grows with
+    it), or three standard deviations of the identified delay, whichever is longest."""
     return max(LEAST_MARGIN_S, SHARE_OF_DELAY * vehicle.tilt.delay_s, SDS * delay_sd_s)
 
 
 def supported_bandwidth(
     vehicle: Vehicle, bandwidth_radps: float, period_s: float, needed_s: float
 ) -> float:
-    """`bandwidth_radps`, or the greatest below it that bears a delay `needed_s` longer than
-    believed, found by halving in steps of BANDWIDTH_STEP_RADPS."""
+    """`bandwidth_radps`, or the highest below it whose delay margin is `needed_s`.
+
+    Found by bisection in steps of BANDWIDTH_STEP_RADPS; never below LEAST_BANDWIDTH_RADPS.
+    """
     fractions = np.linspace(0.0, needed_s, 4)
 
-    def bears(bandwidth: float) -> bool:
+    def stable(bandwidth: float) -> bool:
         loop = _Loop(vehicle, bandwidth, period_s)
         return all(loop.radius(float(extra_s)) < STABLE for extra_s in fractions)
 
-    if bandwidth_radps <= LEAST_BANDWIDTH_RADPS or bears(bandwidth_radps):
+    if bandwidth_radps <= LEAST_BANDWIDTH_RADPS or stable(bandwidth_radps):
         return bandwidth_radps
     steps = math.ceil((bandwidth_radps - LEAST_BANDWIDTH_RADPS) / BANDWIDTH_STEP_RADPS)
-    low, high = 0, steps  # LEAST_BANDWIDTH_RADPS is taken as borne
+    low, high = 0, steps  # LEAST_BANDWIDTH_RADPS counts as stable
     while high - low > 1:
         middle = (low + high) // 2
-        if bears(LEAST_BANDWIDTH_RADPS + middle * BANDWIDTH_STEP_RADPS):
+        if stable(LEAST_BANDWIDTH_RADPS + middle * BANDWIDTH_STEP_RADPS):
             low = middle
         else:
             high = middle
@@ -71,7 +74,7 @@ def supported_bandwidth(
 
 
 class _Loop:
-    """One lateral axis, SUBSTEPS samples a period: plant [p v b b'], observer [p v b b' d]."""
+    """One lateral axis, SUBSTEPS samples per period: plant [p v b b'], observer [p v b b' d]."""
 
     def __init__(self, vehicle: Vehicle, bandwidth_radps: float, period_s: float) -> None:
         model = lateral_model(vehicle)
@@ -79,11 +82,8 @@ class _Loop:
         self._delay_s = vehicle.tilt.delay_s
         dynamics = np.zeros((5, 5))
         dynamics[:4, :4], dynamics[1, 4] = model.dynamics, 1.0
-        inputs = np.append(model.input_map[:, 0], 0.0)
-        block = np.zeros((6, 6))
-        block[:5, :5], block[:5, 5] = dynamics, inputs
-        step = expm(block * self.step_s)
-        self._flow, self._push = step[:5, :5], step[:5, 5:]
+        step = LinearModel(dynamics, np.vstack((model.input_map, [0.0]))).sampled(self.step_s)
+        self._flow, self._push = step.dynamics, step.input_map
         measures = np.zeros((2, 5))
         measures[0, 0] = measures[1, 2] = 1.0
         noise = np.diag(_DENSITIES**2 * self.step_s)
@@ -94,11 +94,11 @@ class _Loop:
         self._correction = prior @ measures.T @ np.linalg.inv(measures @ prior @ measures.T + sds)
         self._measures = measures
         gain = lateral_cost_to_go(vehicle, bandwidth_radps, period_s).gain
-        # The reference leans into the disturbance: b_r = b_ff = d / g
+        # The target compensates the disturbance: b_r = b_ff = d / g
         self._gain = np.append(gain, -(1.0 + gain[2]) / vehicle.gravity_mps2)[None, :]
 
     def radius(self, extra_s: float) -> float:
-        """Spectral radius of the map over one period with the plant's delay `extra_s` longer."""
+        """Spectral radius of the map over one period, the plant's delay being `extra_s` longer."""
         ahead = round(self._delay_s / self.step_s)
         behind = round((self._delay_s + extra_s) / self.step_s)
         kept = max(ahead, behind) // SUBSTEPS + 3  # commands of this and earlier periods
@@ -118,6 +118,6 @@ class _Loop:
 
 
 def _in_force(sent: Array, substep: int) -> Array:
-    """The command of `substep` < 0, counted from the end of the period of sent[0]."""
+    """The command that acts in `substep` < 0, counted back from the end of the newest period."""
     row: Array = sent[-(substep // SUBSTEPS) - 1]
     return row

@@ -1,7 +1,7 @@
-"""One decision and the optimal cost of all that follow: sampled costs and Riccati solutions.
+"""The cost of one held input and of the optimal inputs after it: sampled costs, Riccati solutions.
 
-The linear error models of the axes (`offboard.model.axes`) are sampled with a zero-order hold; the
-stabilising Riccati solution turns one held input into an infinite horizon. Knows no reference, no
+The linear models of the axes (`offboard.model.axes`) are sampled with a zero-order hold. The
+stabilising Riccati solution adds the cost of an infinite horizon. Knows no reference, no
 measurement and no search.
 """
 
@@ -18,18 +18,19 @@ from offboard.model.vehicle import AxisResponse, Vehicle
 
 Array = NDArray[np.float64]
 
-# The block exponential holds exp(-A t) too, which overflows for loops much faster than the hold.
+# The block exponential contains exp(-A t), which overflows for loops much faster than the hold;
+# it is taken over period / 2**DOUBLINGS and doubled.
 DOUBLINGS = 10
 
 
 @dataclass(frozen=True, slots=True)
 class CostToGo:
-    """The sampled model of one axis with the optimal cost that follows one held input.
+    """The sampled model of one axis and the optimal cost that follows one held input.
 
     J(u; x) = integral over the hold of (x' Q x + R u^2) + x(k+1)' P x(k+1)
             = 1/2 curvature u^2 + (coupling x) u + 1/2 x' state_cost x, minimal at u = -gain x,
-    all in deviations from the reference. transition (n, n), input_map (n, 1), stage (n + 1, n + 1)
-    the cost of one hold as [x, u]' stage [x, u], terminal P (n, n), coupling and gain (n,).
+    in deviations from the reference. transition (n, n), input_map (n, 1); stage (n + 1, n + 1):
+    the cost of one hold is [x, u]' stage [x, u]; terminal P (n, n); coupling and gain (n,).
     """
 
     transition: Array
@@ -45,8 +46,8 @@ class CostToGo:
 def sampled_cost_to_go(
     model: LinearModel, state_weight: Array, input_weight: float, period_s: float
 ) -> CostToGo:
-    """Sample `model` with its stage cost integrated over the hold (C. F. Van Loan, 1978) and close
-    the horizon with the stabilising solution of the discrete Riccati equation.
+    """Sample `model` and its stage cost, integrated over the hold (C. F. Van Loan, 1978), and add
+    the stabilising solution of the discrete Riccati equation as the cost of all that follows.
 
     state_weight (n, n) and input_weight are the continuous weights of x' Q x + R u^2.
     """
@@ -91,7 +92,7 @@ def _sample_with_cost(
 
 
 def lateral_cost_to_go(vehicle: Vehicle, bandwidth_radps: float, period_s: float) -> CostToGo:
-    """Weights 1 on position and g^2 / wc^4 on b_c: one number, the bandwidth wc, sets the law."""
+    """Weights 1 on position and g^2 / wc^4 on b_c, for a bandwidth wc."""
     weight = np.diag([1.0, 0.0, 0.0, 0.0])
     effort = vehicle.gravity_mps2**2 / bandwidth_radps**4
     return sampled_cost_to_go(lateral_model(vehicle), weight, effort, period_s)
@@ -104,39 +105,39 @@ def vertical_cost_to_go(vehicle: Vehicle, bandwidth_radps: float, period_s: floa
 
 
 def tilt_ripple(vehicle: Vehicle, period_s: float) -> Array:
-    """`hold_ripple` (2,) of [b, b'], per unit of slope of b_c."""
+    """`hold_ripple` (2,) of [b, b'] for a slope of b_c of 1 per second."""
     whole = lateral_model(vehicle)
     return hold_ripple(LinearModel(whole.dynamics[2:, 2:], whole.input_map[2:]), period_s)
 
 
 def thrust_ripple(vehicle: Vehicle, period_s: float) -> float:
-    """`hold_ripple` of T b_z, per unit of slope of f_c."""
+    """`hold_ripple` of T b_z for a slope of f_c of 1 m/s^3."""
     whole = vertical_model(vehicle)
     return float(hold_ripple(LinearModel(whole.dynamics[2:, 2:], whole.input_map[2:]), period_s)[0])
 
 
 def hold_ripple(model: LinearModel, period_s: float) -> Array:
-    """How far a stable model (n,) is from its answer to the ramp u = t at the moments when a
-    staircase through the ramp's middles steps up. A sampled law looks exactly there: without this
-    part in its target it fights the ripple of its own hold, which no held input can avoid.
+    """How much the state (n,) of a stable model driven by held inputs differs from its response to
+    the ramp u = t, at the times when the input changes.
+
+    The held inputs equal the ramp in the middle of each hold. A sampled law decides exactly at
+    these times: without this difference in its target it would try to remove the ripple of its own
+    hold, which no held input can.
     """
-    size = len(model.dynamics)
-    flow = np.zeros((size + 1, size + 1))
-    flow[:size, :size], flow[:size, size:] = model.dynamics, model.input_map
-    step = expm(flow * period_s)
-    # The ramp's answer is slope t + smooth; the staircase's, where it steps up, slope t + stepped
+    held = model.sampled(period_s)
+    # Response to the ramp: slope t + smooth; to held inputs, when they change: slope t + stepped
     slope = -np.linalg.solve(model.dynamics, model.input_map[:, 0])
     smooth = np.linalg.solve(model.dynamics, slope)
-    pushed = (0.5 * step[:size, size] - slope) * period_s
-    stepped: Array = np.linalg.solve(np.eye(size) - step[:size, :size], pushed)
-    return stepped - smooth
+    pushed = (0.5 * held.input_map[:, 0] - slope) * period_s
+    stepped = np.linalg.solve(np.eye(len(pushed)) - held.dynamics, pushed)
+    return np.asarray(stepped - smooth, np.float64)
 
 
 def held_lead(
     value: Array, rate: Array, acceleration: Array, response: AxisResponse, period_s: float
 ) -> Array:
-    """`lead` in the middle of a hold, less what holding adds to a curved command (its mean over
-    the hold, to second order). Any common shape."""
+    """`axes.lead` in the middle of a hold, less the second-order difference between a curved
+    command and its mean over the hold. Arguments and result have one common shape."""
     led: Array = lead(value, rate, acceleration, response) - period_s**2 / 24.0 * acceleration
     return led
 
@@ -148,11 +149,12 @@ def cost_to_go(
     energy: ArrayLike,
     cross: ArrayLike | None = None,
 ) -> Array:
-    """The stabilising solution P (n, n) of the discrete Riccati equation.
+    """The stabilising solution P (n, n) of the discrete Riccati equation; x'Px is the optimal cost
+    from x on.
 
     x(k+1) = A x + B u with dynamics A (n, n) and inputs B (n, m); stage cost
-    x'Qx + u'Ru + 2 x'Su with fitness Q, energy R, cross S (n, m). x'Px is what remains to be paid
-    from x on. Raises numpy.linalg.LinAlgError where no stabilising solution exists.
+    x'Qx + u'Ru + 2 x'Su with fitness Q, energy R, cross S (n, m). Raises numpy.linalg.LinAlgError
+    where no stabilising solution exists.
     """
     s = None if cross is None else np.asarray(cross, np.float64)
     solution: Array = solve_discrete_are(

@@ -1,9 +1,8 @@
-"""YAML text -> validated value, or sentences that say exactly what is wrong with it.
+"""Reads configuration: YAML text -> validated value, or sentences that say what is wrong in it.
 
 Every configuration file goes through `parse`: text in, frozen pydantic value out. Scalars follow
-YAML 1.2 (`1e-3` is a number, `no` and `12:30` are text), values are checked strictly (no text for
-numbers, no true for 1), duplicate keys, aliases and tags are refused. Each problem is one sentence
-with source, dotted key path, offending value and what is allowed. Reads no file.
+YAML 1.2 (`1e-3` is a number, `no` and `12:30` are text) and are checked strictly (no text for
+numbers, no true for 1); duplicate keys, aliases and tags are refused. Opens no file.
 """
 
 from __future__ import annotations
@@ -18,10 +17,12 @@ from typing import Any, TypeVar
 import yaml
 from pydantic import BaseModel, ValidationError
 
-from offboard.documents.errors import place, sentence, shown
+from offboard.documents.errors import DocumentError as DocumentError
+from offboard.documents.errors import key_path, sentence, shown
 
 M = TypeVar("M", bound=BaseModel)
 Json = dict[str, Any]
+DESCRIPTION_SIZE = 200
 
 _INTEGER = re.compile(r"[-+]?[0-9]{1,400}")
 _HEXADECIMAL = re.compile(r"0x[0-9a-fA-F]{1,300}")
@@ -33,14 +34,6 @@ _WORDS: dict[str, Any] = {
 }  # fmt: skip
 
 
-class DocumentError(Exception):
-    """`problems` holds one sentence each for a human; `str()` joins them with line breaks."""
-
-    def __init__(self, *problems: str) -> None:
-        super().__init__("\n".join(problems))
-        self.problems = problems
-
-
 def parse(text: str, model: type[M], source: str) -> M:
     """YAML `text` -> an instance of `model`. `source` names the text in errors (a file's name).
 
@@ -50,21 +43,40 @@ def parse(text: str, model: type[M], source: str) -> M:
 
 
 def read(text: str, source: str) -> Json:
-    """YAML `text` -> the raw mapping, not yet validated. An empty document is an empty mapping."""
+    """YAML `text` -> the raw mapping, not yet validated. An empty document is an empty mapping.
+
+    Every file may have a `description`: one line for people, which `offboard list` prints. It
+    describes the file and is no part of the configuration: left out here, so that it is not
+    recorded with values that --set has changed since.
+    """
+    return _document(text, source)[0]
+
+
+def description(text: str, source: str) -> str:
+    """The `description` of a YAML file, empty without one. Raises DocumentError."""
+    return _document(text, source)[1]
+
+
+def _document(text: str, source: str) -> tuple[Json, str]:
     value = _loaded(text, source)
     if value is None:
-        return {}
+        return {}, ""
     if not isinstance(value, dict):
         raise DocumentError(f"{source}: expected a mapping of keys to values, not {shown(value)}")
-    return value
+    line = value.pop("description", "")
+    if not isinstance(line, str) or len(line) > DESCRIPTION_SIZE:
+        raise DocumentError(
+            f"{source}: description: {shown(line)} should be text of at most {DESCRIPTION_SIZE} "
+            "characters"
+        )
+    return value, line
 
 
 def override(mapping: Mapping[str, Any], assignment: str) -> Json:
     """A copy of the raw `mapping` with one `key.path=value` of the command line applied.
 
-    The value is YAML; a number in the path indexes a list. Keys are not checked here: `validate`
-    refuses an unknown one like any other. Raises DocumentError when there is no `key.path=` or the
-    value is no YAML.
+    The value is YAML; a number in the path indexes a list. Keys are not checked here but in
+    `validate`. Raises DocumentError where `key.path=` is missing or the value is no YAML.
     """
     path, separator, text = assignment.partition("=")
     keys = [key.strip() for key in path.split(".")]
@@ -82,25 +94,24 @@ def validate(
 ) -> M:
     """Raw mapping -> an instance of `model`. Raises DocumentError with every problem found.
 
-    `source` names where the mapping is from, but for what the command line has put in: `options`,
-    key path -> option as it was given.
+    `source` names the file in errors. `options` maps a key path to the command-line option that
+    set it; an error there names the option instead.
     """
     try:
-        # As JSON: strict about scalars, yet lists may become tuples and text an enum
+        # as JSON: strict about scalars, yet a list may become a tuple and text an enum
         return model.model_validate_json(json.dumps(mapping), strict=True)
     except ValidationError as error:
         schema = model.model_json_schema()
-        details = error.errors(include_url=False)
         problems = [
-            (_origin(place(detail, mapping), options, source), detail) for detail in details
+            f"{_origin(key_path(detail, mapping), options, source)}: "
+            f"{sentence(detail, mapping, schema)}"
+            for detail in error.errors(include_url=False)
         ]
-        raise DocumentError(
-            *(f"{origin}: {sentence(detail, mapping, schema)}" for origin, detail in problems)
-        ) from None
+        raise DocumentError(*problems) from None
 
 
 def _origin(path: str, options: Mapping[str, str], source: str) -> str:
-    """The last option that touched the value at `path`, else `source`."""
+    """The last option that set the value at `path`, else `source`."""
     problem = path.split(".")
     for assigned, option in reversed(list(options.items())):
         keys = [key.strip() for key in assigned.split(".")]
@@ -123,7 +134,7 @@ def _loaded(text: str, source: str) -> Any:
 
 
 def _value(node: yaml.Node, seen: set[int]) -> Any:
-    """A node of the document -> plain Python, with the scalars of YAML 1.2."""
+    """A YAML node -> plain Python, with the scalars of YAML 1.2."""
     if id(node) in seen:
         raise _refusal("a value is used twice: aliases are not allowed", node)
     seen.add(id(node))
@@ -162,7 +173,7 @@ def _refusal(problem: str, node: yaml.Node) -> yaml.YAMLError:
 
 
 def _with(value: Any, keys: list[str], new: Any) -> Any:
-    """A copy of `value` in which the entry at `keys` is `new`; sections on the way are made."""
+    """A copy of `value` in which the entry at `keys` is `new`; missing sections are created."""
     if not keys:
         return new
     key, rest = keys[0], keys[1:]

@@ -1,14 +1,24 @@
-"""The files of the shipped configuration, by name. This module and `reading` open no other file.
+"""Files of the shipped configuration: where they are, their names and descriptions.
 
-An installed package has `config/` inside it; a checkout has it beside the packages.
+In an installed package `config/` lies inside the package, in a checkout beside it.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
-from offboard.documents.reading import DocumentError
+from offboard.documents.errors import DocumentError
+
+# kind of file -> its folder
+FOLDERS = {
+    "reference": "references",
+    "controller": "controllers",
+    "vehicle": "vehicles",
+    "scenario": "scenarios",
+    "configuration": "",
+}
 
 
 def directory() -> Path:
@@ -19,19 +29,33 @@ def directory() -> Path:
 
 
 def names(folder: str) -> list[str]:
-    """The names in one folder, for example `scenarios`, sorted."""
+    """The names of the files in one folder, for example `scenarios`, sorted."""
     return sorted(path.stem for path in (directory() / folder).glob("*.yaml"))
 
 
-def locate(name: str, folder: str, kind: str) -> Path:
-    """The file with a shipped name, or the file named: a name with a `/` or that ends in .yaml or
-    .yml. Raises DocumentError with the known names."""
+def descriptions(folder: str) -> dict[str, str]:
+    """Name -> description of the files in one folder."""
+    from offboard.documents.reading import description  # late: --help needs no YAML
+
+    paths = {name: directory() / folder / f"{name}.yaml" for name in names(folder)}
+    return {name: description(read_text(path), str(path)) for name, path in paths.items()}
+
+
+def overview(*kinds: str) -> str:
+    """The names of the shipped files, a paragraph for each kind: for the end of `--help`."""
+    return "\n\n".join(f"Shipped {kind}s: {', '.join(names(FOLDERS[kind]))}." for kind in kinds)
+
+
+def locate(name: str, folder: str, kind: str, others: Sequence[str] = ()) -> Path:
+    """The file with a shipped name, or the file itself where `name` contains a `/` or ends in .yaml
+    or .yml. Raises DocumentError with the known names, `others` among them."""
     if name.endswith((".yaml", ".yml")) or "/" in name:
         return Path(name)
     candidate = directory() / folder / f"{name}.yaml"
     if candidate.is_file():
         return candidate
-    raise DocumentError(f"there is no {kind} named {name!r}; known are {', '.join(names(folder))}")
+    known = sorted((*names(folder), *others))
+    raise DocumentError(f"there is no {kind} named {name!r}; known are {', '.join(known)}")
 
 
 def read_text(path: Path) -> str:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from offboard.model.kernel import entry, kernel
+from offboard.compiled import array, entry, kernel
 
 Array = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ NOTHING = -1  # no second state is part of what is measured
 
 FILTER = np.dtype(
     [
-        ("size", "i8"),  # n; what follows is used up to there
+        ("order", "i8"),  # n; what follows is used up to there
         ("axes", "i8"),  # m
         ("places", "i8", (AXES_MAX, SIZE_MAX)),
         ("covariance", "f8", (SIZE_MAX, SIZE_MAX)),
@@ -47,10 +47,10 @@ FILTER = np.dtype(
 
 def set_up(one: Any, dynamics: Array, densities: Array) -> None:
     """Give a FILTER its model, (n, n) and (n,)."""
-    size = len(densities)
-    one["size"] = size
-    one["dynamics"][:size, :size] = dynamics
-    one["densities"][:size] = densities
+    order = len(densities)
+    one["order"] = order
+    one["dynamics"][:order, :order] = dynamics
+    one["densities"][:order] = densities
 
 
 def start(one: Any, variances: ArrayLike) -> None:
@@ -70,91 +70,78 @@ def _multiply(left: Array, right: Array, size: int, out: Array) -> None:
             out[i, j] = total
 
 
-@kernel
-def _half_transition(one: Any, interval_s: float) -> None:
-    """exp(dynamics interval_s / 2) to fourth order, into the first work matrix."""
-    size, scaled, square, cube = one.size, one.work[0], one.work[1], one.work[2]
-    fourth = one.work[3]
-    half_s = 0.5 * interval_s
-    for i in range(size):
-        for j in range(size):
-            scaled[i, j] = half_s * one.dynamics[i, j]
-    _multiply(scaled, scaled, size, square)
-    _multiply(square, scaled, size, cube)
-    _multiply(square, square, size, fourth)
-    for i in range(size):
-        for j in range(size):
-            scaled[i, j] += square[i, j] / 2.0 + cube[i, j] / 6.0 + fourth[i, j] / 24.0
-        scaled[i, i] += 1.0
+@entry(array(1, FILTER), float)
+def spread(filters: Any, interval_s: float) -> None:
+    """The covariances of `filters`, any number of FILTER, `interval_s` later, in steps of at most
+    `longest_s`.
 
-
-@entry(FILTER, float)
-def spread(one: Any, interval_s: float) -> int:
-    """The covariance `interval_s` later, in steps of at most `longest_s`."""
-    steps = math.ceil(interval_s / one.longest_s - 1e-6)
-    if steps <= 0:
-        return 0
-    h = interval_s / steps
-    _half_transition(one, h)
-    size, covariance = one.size, one.covariance[:]
-    half, transition, noise, moved = one.work[0], one.work[1], one.work[2], one.work[3]
-    _multiply(half, half, size, transition)
-    _fill_noise(half, transition, one.densities, size, h, noise)
-    for _ in range(steps):
-        _multiply(transition, covariance, size, moved)
-        for i in range(size):
-            for j in range(size):
-                total = noise[i, j]
-                for k in range(size):
-                    total += moved[i, k] * transition[j, k]
-                covariance[i, j] = total
-    return 0
-
-
-@kernel
-def _fill_noise(
-    half: Array, transition: Array, densities: Array, size: int, interval_s: float, noise: Array
-) -> None:
-    """What the densities add to a covariance, by Simpson's rule: exact for a chain of two
-    integrators."""
-    for i in range(size):
-        for j in range(size):
-            total = densities[i] ** 2 if i == j else 0.0
-            for k in range(size):
-                middle, end = half[i, k] * half[j, k], transition[i, k] * transition[j, k]
-                total += densities[k] ** 2 * (4.0 * middle + end)
-            noise[i, j] = total * interval_s / 6.0
+    One function, because each further one is a fifth of a second of compilation.
+    """
+    for n in range(filters.shape[0]):
+        one = filters[n]
+        steps = math.ceil(interval_s / one.longest_s - 1e-6)
+        if steps <= 0:
+            continue
+        step_s = interval_s / steps
+        order, covariance, densities = one.order, one.covariance[:], one.densities[:]
+        half, transition, noise, moved = one.work[0], one.work[1], one.work[2], one.work[3]
+        # exp(dynamics step_s / 2) to fourth order, and its square
+        for i in range(order):
+            for j in range(order):
+                half[i, j] = 0.5 * step_s * one.dynamics[i, j]
+        _multiply(half, half, order, transition)
+        _multiply(transition, half, order, noise)
+        _multiply(transition, transition, order, moved)
+        for i in range(order):
+            for j in range(order):
+                half[i, j] += transition[i, j] / 2.0 + noise[i, j] / 6.0 + moved[i, j] / 24.0
+            half[i, i] += 1.0
+        _multiply(half, half, order, transition)
+        # What the densities add, by Simpson's rule: exact for a chain of two integrators
+        for i in range(order):
+            for j in range(order):
+                total = densities[i] ** 2 if i == j else 0.0
+                for k in range(order):
+                    middle, end = half[i, k] * half[j, k], transition[i, k] * transition[j, k]
+                    total += densities[k] ** 2 * (4.0 * middle + end)
+                noise[i, j] = total * step_s / 6.0
+        for _ in range(steps):
+            _multiply(transition, covariance, order, moved)
+            for i in range(order):
+                for j in range(order):
+                    total = noise[i, j]
+                    for k in range(order):
+                        total += moved[i, k] * transition[j, k]
+                    covariance[i, j] = total
 
 
 @kernel
-def _projected(one: Any, i: int, place: int, other: int) -> float:
-    """Covariance of state i with what is measured: the states `place` and `other` together."""
-    total: float = one.covariance[i, place]
-    return total if other == NOTHING else total + one.covariance[i, other]
+def _expect(one: Any, place: int, other: int, variance: float) -> float:
+    """Fill `projected` with the covariance of each state with what is measured, the states `place`
+    and `other` (or NOTHING) together. Returns the variance of what is measured, with `variance` of
+    the measurement's own."""
+    projected = one.projected
+    for i in range(one.order):
+        projected[i] = one.covariance[i, place]
+        if other != NOTHING:
+            projected[i] += one.covariance[i, other]
+    total: float = variance + projected[place]
+    return total if other == NOTHING else total + projected[other]
 
 
 @kernel
-def _variance(one: Any, place: int, other: int, variance: float) -> float:
-    """Of what is measured, with `variance` of the measurement's own."""
-    total = variance + _projected(one, place, place, other)
-    return total if other == NOTHING else total + _projected(one, other, place, other)
-
-
-@entry(FILTER, int, int, float)
-def absorb(one: Any, place: int, other: int, variance: float) -> int:
+def absorb(one: Any, place: int, other: int, variance: float) -> None:
     """A scalar measurement, of the given variance, of the states `place` and `other` (or NOTHING)
     together: changes the covariance and leaves the gain."""
     covariance, gain, projected = one.covariance, one.gain, one.projected
-    total = _variance(one, place, other, variance)
-    for i in range(one.size):
-        projected[i] = _projected(one, i, place, other)
+    total = _expect(one, place, other, variance)
+    for i in range(one.order):
         gain[i] = projected[i] / total
-    for i in range(one.size):
+    for i in range(one.order):
         for j in range(i + 1):
             value = covariance[i, j] - 0.5 * (gain[i] * projected[j] + gain[j] * projected[i])
             covariance[i, j] = value
             covariance[j, i] = value
-    return 0
 
 
 @kernel
@@ -162,7 +149,7 @@ def correct(state: Array, one: Any, place: int, other: int, sd: float) -> None:
     """The measurement of `absorb` for each axis, its innovations in the record."""
     absorb(one, place, other, sd * sd)
     for k in range(one.axes):
-        for i in range(one.size):
+        for i in range(one.order):
             state[one.places[k, i]] += one.gain[i] * one.innovation[k]
 
 
@@ -183,7 +170,7 @@ def correct_within(
             innovation -= state[one.places[k, other]]
         one.innovation[k] = innovation
         largest = max(largest, abs(innovation))
-    if largest > gate + GATE_SDS * math.sqrt(_variance(one, place, other, sd * sd)):
+    if largest > gate + GATE_SDS * math.sqrt(_expect(one, place, other, sd * sd)):
         return False
     correct(state, one, place, other, sd)
     return True
@@ -194,7 +181,7 @@ def anchor_position(state: Array, one: Any, measured: Array, sd: float) -> None:
     """The position jumped: it is taken as measured, and nothing else moves."""
     for k in range(one.axes):
         state[one.places[k, 0]] = measured[one.places[k, 0]]
-    for i in range(one.size):
+    for i in range(one.order):
         one.covariance[0, i] = one.covariance[i, 0] = 0.0
     one.covariance[0, 0] = sd * sd
 
@@ -202,12 +189,12 @@ def anchor_position(state: Array, one: Any, measured: Array, sd: float) -> None:
 @kernel
 def anchor_bias(state: Array, one: Any, sd: float) -> None:
     """The reported velocity jumped, by its innovations in the record: that goes into the bias."""
-    bias = one.size - 1
+    bias = one.order - 1
     covariance = one.covariance
     for k in range(one.axes):
         state[one.places[k, bias]] += one.innovation[k]
-    for i in range(one.size):
+    for i in range(one.order):
         covariance[bias, i] = -covariance[1, i]
-    for i in range(one.size):
+    for i in range(one.order):
         covariance[i, bias] = covariance[bias, i]
     covariance[bias, bias] = covariance[1, 1] + sd * sd

@@ -16,7 +16,6 @@ from pydantic import Field
 
 from offboard.documents.parameters import Parameters
 from offboard.estimation.filtering import FILTER, NOTHING, absorb, set_up, spread, start
-from offboard.model.kernel import address
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
@@ -131,9 +130,8 @@ class Group:
         self.axes = axes
         self._sd_m = sd_m
         self._densities = np.array([0.0, 0.2 * drift_mps2, drift_mps2])
-        self._record = np.zeros(1, FILTER)
+        self._record = np.zeros(1, FILTER).view(np.recarray)
         self._record["longest_s"] = LONGEST_SPREAD_S
-        self._address = address(self._record)
         self._covariance, self._gain = self._record["covariance"][0], self._record["gain"][0]
 
     def adopt(self, drag_per_mass_ps: float) -> None:
@@ -149,7 +147,7 @@ class Group:
         )
 
     def spread(self, step_s: float) -> None:
-        spread.call(self._address, step_s)
+        spread(self._record, step_s)
 
     def explains(self, off_m: Array) -> bool:
         """Whether a fix may be off by so much by chance."""
@@ -162,7 +160,7 @@ class Group:
 
     def absorb(self, place: int, variance: float) -> Array:
         """Take in a measurement of p, v or d: its gain (3,)."""
-        absorb.call(self._address, place, NOTHING, variance)
+        absorb(self._record[0], place, NOTHING, variance)
         gain: Array = self._gain[: D + 1]
         return gain
 

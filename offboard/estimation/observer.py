@@ -15,13 +15,16 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.estimation.filtering import spread
 from offboard.estimation.observer_adaptation import Adaptation
 from offboard.estimation.observer_filter import (
     POSITION_JUMPED,
     VELOCITY_JUMPED,
     bound_disturbance,
-    hear_attitude,
-    hear_position,
+    bring_forward,
+    correct_by_attitude,
+    correct_by_position,
+    learn,
 )
 from offboard.estimation.observer_model import (
     ObserverSettings,
@@ -54,7 +57,6 @@ from offboard.model.frames import (
     thrust_direction_from_quaternion,
     wrap_pi,
 )
-from offboard.model.kernel import address
 from offboard.model.predicted_state import PredictedHeave, PredictedState
 from offboard.model.vehicle import Vehicle
 
@@ -76,10 +78,11 @@ class Observer:
     def __init__(self, vehicle: Vehicle, settings: ObserverSettings) -> None:
         self._settings = settings
         self._record = new_record(settings)
-        self._address = address(self._record)
         self._time = self._record["time_s"]
         self._motion = self._record["motion"]
-        self._motion_address = address(self._motion)
+        self._filters = self._record["filters"][0]
+        self._measured: Array = self._record["measured"][0]
+        self._plant: Array = self._motion["plant"][0]
         self._states: Array = self._motion["states"][0]
         self._state: Array = self._states[NOW]
         self._history: Array = self._motion["history"][0]
@@ -175,8 +178,8 @@ class Observer:
             state[THRUST] = self._gravity / upright(north, east)
             self._time_s = max(self._time_s, time_s)
         else:
-            heard = self._position_at is not None
-            hear_attitude.call(self._address, heard, time_s, north, east, course)
+            self._go_to(time_s, complete=self._position_at is not None)
+            correct_by_attitude(self._record, time_s, north, east, course)
         self._attitude_at = time_s
 
     def on_position(self, time_s: float, position_ned_m: Triple, velocity_ned_mps: Triple) -> None:
@@ -188,12 +191,9 @@ class Observer:
             self._state[VELOCITY : VELOCITY + 3] = velocity_ned_mps
             self._time_s = max(self._time_s, time_s)
         else:
-            heard = self._attitude_at is not None
-            jumped = hear_position.call(
-                self._address, heard, time_s, *position_ned_m, *velocity_ned_mps
-            )
-            self.position_jumps += bool(jumped & POSITION_JUMPED)
-            self.velocity_jumps += bool(jumped & VELOCITY_JUMPED)
+            self._go_to(time_s, complete=self._attitude_at is not None)
+            self._measured[:] = *position_ned_m, *velocity_ned_mps
+            self._correct_by_position(time_s)
         self._position_at = time_s
 
     def predict(self, time_s: float) -> PredictedState:
@@ -227,9 +227,35 @@ class Observer:
             state = self._state.copy()
             state[POSITION : POSITION + 3] += ahead_s * state[VELOCITY : VELOCITY + 3]
             return state
-        replay.call(self._motion_address, LATER, start_s, start_s + ahead_s)
+        replay(self._motion, LATER, start_s, start_s + ahead_s)
         later: Array = self._states[LATER].copy()
         return later
+
+    def _go_to(self, time_s: float, *, complete: bool) -> None:
+        """Advance the state to `time_s`, or leave it if it is newer. `complete`: both streams have
+        been heard, so that the commands can be replayed."""
+        start_s = self._time_s
+        if time_s <= start_s:
+            return
+        if complete:
+            replay(self._motion, NOW, start_s, time_s)
+            spread(self._filters, time_s - start_s)
+        self._time_s = time_s
+
+    def _correct_by_position(self, time_s: float) -> None:
+        """By what is measured, of `time_s`."""
+        if self._settings.velocity is VelocitySource.REPORTED:
+            self._state[: VELOCITY + 3] = self._measured
+            return
+        if time_s < self._time_s:
+            bring_forward(self._measured, self._state, self._plant, self._time_s - time_s)
+        jumped = correct_by_position(self._record)
+        self.position_jumps += bool(jumped & POSITION_JUMPED)
+        self.velocity_jumps += bool(jumped & VELOCITY_JUMPED)
+        if jumped:
+            self._adaptation.interrupt()
+        elif self._settings.adaptive:
+            learn(self._record)
 
     def _heave(self, time_s: float) -> PredictedHeave:
         state = self._foreseen(time_s).tolist()

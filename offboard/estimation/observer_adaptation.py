@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.model.kernel import entry, kernel
+from offboard.compiled import kernel
 
 Array = NDArray[np.float64]
 
@@ -105,8 +105,8 @@ def _end_span(memory: Array, time_s: float) -> None:
     counts[SPANS] += 1.0
 
 
-@entry(ADAPTATION, float)
-def note(noted: Any, time_s: float) -> int:
+@kernel
+def note(noted: Any, time_s: float) -> None:
     """Learn from one message."""
     memory, innovation = noted.memory, noted.innovation
     counts = memory[COUNTS]
@@ -126,7 +126,6 @@ def note(noted: Any, time_s: float) -> int:
         _end_span(memory[:], time_s)
         if counts[SPANS] > 2.0:
             _relate(noted, min(span_s, LONGEST_SPAN_S))
-    return 0
 
 
 @kernel

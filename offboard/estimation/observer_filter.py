@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.compiled import entry, kernel
 from offboard.estimation.filtering import (
     FILTER,
     NOTHING,
@@ -19,13 +20,11 @@ from offboard.estimation.filtering import (
     anchor_position,
     correct,
     correct_within,
-    spread,
 )
 from offboard.estimation.observer_adaptation import (
     ADAPTATION,
     DOWN,
     NORTH_EAST,
-    interrupt,
     note,
     white_sd,
 )
@@ -43,11 +42,9 @@ from offboard.estimation.propagation import (
     TILT,
     TILT_RATE,
     VELOCITY,
-    replay,
     wrapped,
 )
 from offboard.model.axes import upright
-from offboard.model.kernel import entry, kernel
 
 Array = NDArray[np.float64]
 
@@ -55,7 +52,6 @@ LATERAL, VERTICAL, HEADING = 0, 1, 2  # filters
 # Places in them: per lateral axis [p v b b' d beta], vertical [p v d beta], course [psi psi'].
 LATERAL_TILT, LATERAL_DRIFT, VERTICAL_DRIFT, HEADING_COURSE = 2, 4, 2, 0
 POSITION_JUMPED, VELOCITY_JUMPED = 1, 2  # bits of an answer
-IGNORED, BIASED, TRUSTED = 0, 1, 2  # the reported velocity
 
 OBSERVER = np.dtype(
     [
@@ -64,7 +60,7 @@ OBSERVER = np.dtype(
         ("filters", FILTER, 3),
         ("adaptation", ADAPTATION),
         # settings
-        ("velocity", "i8"),  # IGNORED, BIASED or TRUSTED
+        ("uses_velocity", "i8"),  # with a bias of its own
         ("adaptive", "i8"),
         ("white_sds", "f8", 2),  # of position and velocity, where they are not adaptive
         ("gates", "f8", 2),  # beyond which they have jumped
@@ -78,110 +74,57 @@ OBSERVER = np.dtype(
 """One vehicle's observer."""
 
 
-@entry(OBSERVER, int, float, float, float, float)
-def hear_attitude(
-    seen: Any, complete: int, time_s: float, north: float, east: float, course: float
-) -> int:
-    """Thrust direction, north and east, and course reported for `time_s`. `complete`: position was
-    heard too, so that the motion can be replayed."""
-    _go_to(seen, complete, time_s)
-    state, late_s = seen.motion.states[NOW], seen.time_s - time_s
-    lateral, heading = seen.filters[LATERAL], seen.filters[HEADING]
+@entry(OBSERVER, float, float, float, float)
+def correct_by_attitude(
+    observers: Any, time_s: float, north: float, east: float, course: float
+) -> None:
+    """Correct the state by an attitude measured at `time_s`, not later than the state: thrust
+    direction (north and east components) and course (rad). `observers` is one OBSERVER (1,)."""
+    observer = observers[0]
+    state, late_s = observer.motion.states[NOW], observer.time_s - time_s
+    lateral, heading = observer.filters[LATERAL], observer.filters[HEADING]
     lateral.innovation[0] = north - state[TILT] + late_s * state[TILT_RATE]
     lateral.innovation[1] = east - state[TILT + 1] + late_s * state[TILT_RATE + 1]
     heading.innovation[0] = wrapped(course - state[COURSE] + late_s * state[COURSE_RATE])
-    correct(state, lateral, LATERAL_TILT, NOTHING, seen.attitude_sd)
-    correct(state, heading, HEADING_COURSE, NOTHING, seen.attitude_sd)
-    bound_disturbance(state, seen.disturbance_limit)
-    return 0
+    correct(state, lateral, LATERAL_TILT, NOTHING, observer.attitude_sd)
+    correct(state, heading, HEADING_COURSE, NOTHING, observer.attitude_sd)
+    bound_disturbance(state, observer.disturbance_limit)
 
 
-@entry(OBSERVER, int, float, float, float, float, float, float, float)
-def hear_position(
-    seen: Any,
-    complete: int,
-    time_s: float,
-    north: float,
-    east: float,
-    down: float,
-    velocity_n: float,
-    velocity_e: float,
-    velocity_d: float,
-) -> int:
-    """Position and velocity reported for `time_s`; `complete`: attitude was heard too. Returns what
-    jumped."""
-    _go_to(seen, complete, time_s)
-    state, measured = seen.motion.states[NOW], seen.measured
-    measured[POSITION], measured[POSITION + 1], measured[POSITION + 2] = north, east, down
-    measured[VELOCITY], measured[VELOCITY + 1] = velocity_n, velocity_e
-    measured[VELOCITY + 2] = velocity_d
-    if seen.velocity == TRUSTED:
-        for i in range(6):
-            state[i] = measured[i]
-        return 0
-    late_s = seen.time_s - time_s
-    if late_s > 0.0:
-        _bring_forward(measured, state, seen.motion.plant, late_s)
-    jumped = _correct(seen, state)
-    bound_disturbance(state, seen.disturbance_limit)
-    return jumped
-
-
-@kernel
-def _go_to(seen: Any, complete: int, time_s: float) -> None:
-    """Replay to `time_s`, or stay if newer telemetry came first."""
-    if time_s <= seen.time_s:
-        return
-    if complete:
-        interval_s = time_s - seen.time_s
-        replay(seen.motion, NOW, seen.time_s, time_s)
-        for i in range(3):
-            spread(seen.filters[i], interval_s)
-    seen.time_s = time_s
-
-
-@kernel
-def _bring_forward(measured: Array, state: Array, plant: Array, late_s: float) -> None:
-    """To where the vehicle has gone since, as far as is believed."""
-    north, east = state[TILT], state[TILT + 1]
-    direction = (north, east, upright(north, east))
-    for i in range(3):
-        speed = state[VELOCITY + i]
-        acceleration = direction[i] * -state[THRUST] + state[DISTURBANCE + i] - plant[DRAG] * speed
-        if i == 2:
-            acceleration += plant[GRAVITY]
-        measured[POSITION + i] += late_s * speed
-        measured[VELOCITY + i] += late_s * acceleration
-
-
-@kernel
-def _correct(seen: Any, state: Array) -> int:
-    """By what is measured, and learn from how far that was off. Returns what jumped."""
-    learnt = seen.adaptation
-    _note_missed(state, seen.measured, learnt.innovation)
+@entry(OBSERVER)
+def correct_by_position(observers: Any) -> int:
+    """Correct the state by the position and velocity in `measured`. Returns what jumped:
+    POSITION_JUMPED, VELOCITY_JUMPED, both or 0."""
+    observer = observers[0]
+    state, measured, learnt = observer.motion.states[NOW], observer.measured, observer.adaptation
+    _note_missed(state, measured, learnt.innovation)
     jumped = 0
     for kind in range(2):
-        if kind == 1 and seen.velocity == IGNORED:
+        if kind == 1 and not observer.uses_velocity:
             continue
-        sd = white_sd(learnt, kind) if seen.adaptive else seen.white_sds[kind]
+        sd = white_sd(learnt, kind) if observer.adaptive else observer.white_sds[kind]
         for i in range(2):
-            one, gate = seen.filters[i], seen.gates[kind]
-            other = NOTHING if kind == 0 else one.size - 1
-            if correct_within(state, one, kind, other, seen.measured, sd, gate):
-                continue
-            jumped |= 1 << kind
-            if kind == 0:
-                anchor_position(state, one, seen.measured, sd)
-            else:
-                anchor_bias(state, one, sd)
-    if seen.adaptive and jumped:
-        interrupt(learnt)
-    elif seen.adaptive:
-        _note_missed(state, seen.measured, learnt.residual)
-        note(learnt, seen.time_s)
-        seen.filters[LATERAL].densities[LATERAL_DRIFT] = learnt.density[NORTH_EAST]
-        seen.filters[VERTICAL].densities[VERTICAL_DRIFT] = learnt.density[DOWN]
+            one = observer.filters[i]
+            other = NOTHING if kind == 0 else one.order - 1
+            if not correct_within(state, one, kind, other, measured, sd, observer.gates[kind]):
+                jumped |= 1 << kind
+                if kind == 0:
+                    anchor_position(state, one, measured, sd)
+                else:
+                    anchor_bias(state, one, sd)
+    bound_disturbance(state, observer.disturbance_limit)
     return jumped
+
+
+@entry(OBSERVER)
+def learn(observers: Any) -> None:
+    """Learn noise and drift from the position that the state was last corrected by."""
+    observer = observers[0]
+    learnt = observer.adaptation
+    _note_missed(observer.motion.states[NOW], observer.measured, learnt.residual)
+    note(learnt, observer.time_s)
+    observer.filters[LATERAL].densities[LATERAL_DRIFT] = learnt.density[NORTH_EAST]
+    observer.filters[VERTICAL].densities[VERTICAL_DRIFT] = learnt.density[DOWN]
 
 
 @kernel
@@ -191,6 +134,19 @@ def _note_missed(state: Array, measured: Array, missed: Array) -> None:
         missed[i] = measured[POSITION + i] - state[POSITION + i]
         believed = state[VELOCITY + i]
         missed[3 + i] = measured[VELOCITY + i] - believed - state[BIAS + i]
+
+
+def bring_forward(measured: Array, state: Array, plant: Array, late_s: float) -> None:
+    """Move a position and velocity `measured` (6,) `late_s` before the state to its time."""
+    north, east = state[TILT], state[TILT + 1]
+    direction = (north, east, upright(north, east))
+    for i in range(3):
+        speed = state[VELOCITY + i]
+        acceleration = direction[i] * -state[THRUST] + state[DISTURBANCE + i] - plant[DRAG] * speed
+        if i == 2:
+            acceleration += plant[GRAVITY]
+        measured[POSITION + i] += late_s * speed
+        measured[VELOCITY + i] += late_s * acceleration
 
 
 @kernel

@@ -16,12 +16,9 @@ from pydantic import Field
 from offboard.documents.parameters import Parameters
 from offboard.estimation.filtering import set_up, start
 from offboard.estimation.observer_filter import (
-    BIASED,
-    IGNORED,
     LATERAL,
     LATERAL_DRIFT,
     OBSERVER,
-    TRUSTED,
 )
 from offboard.estimation.propagation import (
     BIAS,
@@ -99,17 +96,10 @@ class ObserverSettings(Parameters):
     disturbance_density_limit_mps2: float = Field(default=1.0, gt=0, le=10)
 
 
-_USES = {
-    VelocitySource.POSITION: IGNORED,
-    VelocitySource.BIAS: BIASED,
-    VelocitySource.REPORTED: TRUSTED,
-}
-
-
 def new_record(settings: ObserverSettings) -> Record:
     """An OBSERVER that has no vehicle yet."""
     record = np.zeros(1, OBSERVER)
-    record["velocity"] = _USES[settings.velocity]
+    record["uses_velocity"] = settings.velocity is VelocitySource.BIAS
     record["adaptive"] = settings.adaptive
     record["white_sds"] = settings.position_sd_m, settings.velocity_sd_mps
     record["gates"] = settings.position_jump_m, settings.velocity_jump_mps

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.compiled import entry, kernel
 from offboard.model.axes import upright
-from offboard.model.kernel import entry, kernel
 
 Array = NDArray[np.float64]
 
@@ -159,12 +159,13 @@ def _step(
 
 
 @entry(MOTION, int, float, float)
-def replay(motion: Any, row: int, start_s: float, end_s: float) -> int:
+def replay(motions: Any, row: int, start_s: float, end_s: float) -> None:
     """Fill `row`, NOW or LATER, with the state that what is NOW at `start_s` becomes by `end_s`
-    under the commands sent; each axis has its own delay.
+    under the commands sent; each axis has its own delay. `motions` is one MOTION (1,).
 
     Before the first command has taken effect tilt, thrust and course hold what they have.
     """
+    motion = motions[0]
     state, history, plant = motion.states[row], motion.history, motion.plant[:]
     for i in range(STATE_SIZE):
         state[i] = motion.states[NOW, i]
@@ -187,7 +188,6 @@ def replay(motion: Any, row: int, start_s: float, end_s: float) -> int:
         for _ in range(steps):
             _step(state, h, tilt_n, tilt_e, thrust, course, plant, motion.slopes[:])
         time = until
-    return 0
 
 
 @kernel

@@ -1,6 +1,6 @@
-"""From all that is known to the facts of one moment, and to the words that explain an end.
+"""Assessment: the facts of one moment for the guards, and the figures that explain a transition.
 
-Reads view, session, plan and observer; changes none of them and decides nothing.
+Reads state, session, plan and observer; changes none of them and decides nothing.
 """
 
 from __future__ import annotations
@@ -15,21 +15,21 @@ from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.guards import Facts
 from offboard.flight.phases import Limits, Phase
 from offboard.flight.readiness import Readiness
-from offboard.flight.view import VehicleView
+from offboard.flight.state import VehicleState
 from offboard.mavlink.dialects.base import Takeoff
 from offboard.mavlink.session import Session
 from offboard.model.frames import thrust_direction_from_quaternion
 
 LIFT_OFF_HEIGHT_M = 0.15
 LIFT_OFF_CLIMB_MPS = 0.4
-TAKE_OVER_HEIGHT_M = 1.0  # of an autopilot's own takeoff
+TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
 MINIMUM_TELEMETRY_HZ = 10.0
 FAILSAFE_STATUS = 5  # MAV_STATE_CRITICAL; 6 is an emergency
 
 
 @dataclass(frozen=True, slots=True)
 class Progress:
-    """What the companion itself knows of the moment: where it is in the flight."""
+    """What the companion knows about its own flight at one moment."""
 
     phase: Phase
     in_phase_s: float
@@ -40,7 +40,7 @@ class Progress:
     failure: str
     contradiction: str = ""
     excites: bool = False
-    learnt: bool = False
+    identified: bool = False
 
 
 class Assessment:
@@ -48,14 +48,14 @@ class Assessment:
 
     def __init__(
         self,
-        view: VehicleView,
+        state: VehicleState,
         session: Session,
         plan: FlightPlan,
         observer: Observer,
         readiness: Readiness,
         limits: Limits,
     ) -> None:
-        self._view = view
+        self._state = state
         self._session = session
         self._plan = plan
         self._observer = observer
@@ -64,29 +64,29 @@ class Assessment:
 
     def facts(self, progress: Progress) -> Facts:
         """The facts for the guards."""
-        view, plan, dialect = self._view, self._plan, self._session.dialect
-        track, time_s = plan.track, view.time_s
-        heartbeat = view.heartbeat
+        state, plan, dialect = self._state, self._plan, self._session.dialect
+        track, time_s = plan.track, state.time_s
+        heartbeat = state.heartbeat
         return Facts(
             limits=self._limits,
             in_phase_s=progress.in_phase_s,
             silence_s=progress.silence_s,
-            blind_s=max(view.position_age_s, view.attitude_age_s),
-            found=view.found is not None,
-            ready=not self.unready(),
-            misconfigured=bool(self._complaints()),
+            blind_s=max(state.position_age_s, state.attitude_age_s),
+            found=state.found is not None,
+            ready=not self.not_ready(),
+            misconfigured=bool(self._problems()),
             rebooted=progress.rebooted,
-            engaged=dialect is not None and view.mode == dialect.engage_mode,
-            landing=dialect is not None and view.mode == dialect.land_mode,
+            engaged=dialect is not None and state.mode == dialect.engage_mode,
+            landing=dialect is not None and state.mode == dialect.land_mode,
             failsafe=heartbeat is not None and heartbeat.system_status >= FAILSAFE_STATUS,
-            armed=view.armed,
-            in_the_air=view.in_the_air,
+            armed=state.armed,
+            in_the_air=state.in_the_air,
             lifted_off=progress.phase is Phase.TAKEOFF and self._lifted_off(),
             at_start=progress.phase is Phase.CLIMB and self._at_start(time_s),
             late_s=plan.late_s(time_s),
             lifted_by_command=self.lifted_by_command,
             excites=progress.excites,
-            learnt=progress.learnt,
+            identified=progress.identified,
             track_time_s=plan.track_time_s(time_s),
             track_start_s=track.track_start_s,
             track_end_s=track.track_end_s,
@@ -98,12 +98,12 @@ class Assessment:
             contradicted=bool(progress.contradiction),
         )
 
-    def words(self, facts: Facts, progress: Progress) -> dict[str, object]:
-        """The figures that a row's reason may quote."""
-        dialect, view = self._session.dialect, self._view
-        older = view.position_age_s >= view.attitude_age_s
+    def figures(self, facts: Facts, progress: Progress) -> dict[str, object]:
+        """The values for the names in braces in the reasons of the phase table."""
+        dialect, state = self._session.dialect, self._state
+        older = state.position_age_s >= state.attitude_age_s
         return {
-            "mode": view.mode,
+            "mode": state.mode,
             "mode_wanted": dialect.engage_mode if dialect else "offboard mode",
             "silence_s": facts.silence_s,
             "blind_s": facts.blind_s,
@@ -116,52 +116,51 @@ class Assessment:
             "stop": progress.stop_reason,
             "failure": progress.failure,
             "contradiction": progress.contradiction,
-            "complaint": "; ".join(self._complaints()),
-            "unready": self.unready(),
+            "problems": "; ".join(self._problems()),
+            "not_ready": self.not_ready(),
         }
 
-    def unready(self) -> str:
-        """Why the vehicle cannot be engaged yet; empty when it can."""
-        view, session = self._view, self._session
-        if not view.has_state or session.dialect is None:
+    def not_ready(self) -> str:
+        """Why the vehicle cannot be engaged yet; empty if it can."""
+        state, session = self._state, self._session
+        if not state.has_state or session.dialect is None:
             return "no LOCAL_POSITION_NED or no ATTITUDE_QUATERNION arrives"
-        rates = session.rates_hz
-        slow = [s for s in session.shortfalls if rates[s.name] < MINIMUM_TELEMETRY_HZ]
-        for shortfall in slow:
-            if shortfall.name in ("LOCAL_POSITION_NED", "ATTITUDE_QUATERNION"):
+        rates_hz = session.rates_hz
+        for name in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED"):
+            if rates_hz[name] < MINIMUM_TELEMETRY_HZ:
                 return (
-                    f"{shortfall.name} arrives at {shortfall.measured_hz:.1f} Hz, "
+                    f"{name} arrives at {rates_hz[name]:.1f} Hz, "
                     f"at least {MINIMUM_TELEMETRY_HZ:.0f} Hz are needed"
                 )
-        if view.armed and view.landed == "unknown":
-            return "it is armed and does not say whether it flies (EXTENDED_SYS_STATE)"
-        unanswered = self._readiness.unanswered(session.dialect, view.parameters)
+        if state.armed and state.landed == "unknown":
+            return "it is armed and does not report whether it flies (EXTENDED_SYS_STATE)"
+        unanswered = self._readiness.unanswered(session.dialect, state.parameters)
         if unanswered:
-            return f"it does not tell its parameter {', '.join(unanswered)}"
-        if not self._readiness.settled(session.dialect, view.parameters, session.link_time_s):
+            return f"no reply for parameter {', '.join(unanswered)}"
+        if not self._readiness.complete(session.dialect, state.parameters, session.link_time_s):
             return "its parameters are still being read"
-        if not (view.prearm_ok or view.armed):
+        if not (state.prearm_ok or state.armed):
             return "its pre-arm checks do not pass"
         return ""
 
-    def _complaints(self) -> list[str]:
+    def _problems(self) -> list[str]:
         dialect = self._session.dialect
-        return [] if dialect is None else Readiness.complaints(dialect, self._view.parameters)
+        return [] if dialect is None else Readiness.problems(dialect, self._state.parameters)
 
     def _tilt_rad(self) -> float:
-        if self._view.attitude is None:
+        if self._state.attitude is None:
             return 0.0
-        down = thrust_direction_from_quaternion(np.array(self._view.attitude.attitude))[2]
+        down = thrust_direction_from_quaternion(np.array(self._state.attitude.attitude))[2]
         return math.acos(min(1.0, max(-1.0, float(down))))
 
     @property
     def lifted_by_command(self) -> bool:
-        """The autopilot takes off by itself, without setpoints."""
+        """The autopilot takes off on a command, without setpoints."""
         dialect = self._session.dialect
         return dialect is not None and dialect.takeoff is Takeoff.COMMAND
 
     def _lifted_off(self) -> bool:
-        position = self._view.position
+        position = self._state.position
         if position is None:
             return False
         height_m = self._plan.origin_ned_m[2] - position.position_ned_m[2]
@@ -170,16 +169,16 @@ class Assessment:
         return height_m > LIFT_OFF_HEIGHT_M or -position.velocity_ned_mps[2] > LIFT_OFF_CLIMB_MPS
 
     def position_error_m(self) -> float:
-        """Distance of the reported position from the reference in force."""
-        position = self._view.position
+        """Distance of the reported position from the reference; 0 without a reference."""
+        position = self._state.position
         sample = self._plan.sample(position.time_s) if position else None
         if position is None or sample is None:
             return 0.0
         return float(np.linalg.norm(np.array(position.position_ned_m) - sample.position_ned_m))
 
     def _at_start(self, time_s: float) -> bool:
-        if self._view.position is None:
+        if self._state.position is None:
             return False
-        state = self._observer.predict(time_s)
-        position = np.array(self._view.position.position_ned_m)
-        return self._plan.at_start(time_s, position, state.velocity_ned_mps)
+        velocity_ned_mps = self._observer.predict(time_s).velocity_ned_mps
+        position = np.array(self._state.position.position_ned_m)
+        return self._plan.at_start(time_s, position, velocity_ned_mps)

@@ -1,4 +1,4 @@
-"""The only module that reads the clock. Everything else is handed the time as an argument."""
+"""The only module that reads a clock. All other modules have the time as an argument."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import time
 
 
 def monotonic_s() -> float:
-    """Seconds on a clock that never jumps; its zero is arbitrary."""
+    """Seconds of a clock that never jumps, from an arbitrary zero."""
     return time.monotonic()
 
 
 def unix_us() -> int:
-    """Microseconds since 1970-01-01 UTC, for log stamps only."""
+    """Microseconds since 1970-01-01 UTC, for time stamps in logs only."""
     return time.time_ns() // 1000
 
 
 def local_stamp() -> str:
-    """Local date and time for the names of things, as 20261121-093000."""
+    """Local date and time for names of files, as 20261121-093000."""
     return time.strftime("%Y%m%d-%H%M%S")

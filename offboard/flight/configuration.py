@@ -1,7 +1,9 @@
-"""From names, files and --set to one validated `FlightConfig`. Only this module reads YAML files.
+"""From names, files and --set to one validated `FlightConfig`, and from that to what flies.
 
-A configuration refers to its vehicle, controller and reference by name (a file of `config/`), by
-file, or spells them out. Packaged, `config/` lies inside the package; in a checkout beside it.
+A configuration refers to its vehicle, controller and reference by name, by file, or holds their
+values. A name is that of a shipped file (`config/`); a controller's may also be the name of a law,
+which is flown with its defaults. Packaged, `config/` lies inside the package; in a checkout beside
+it.
 """
 
 from __future__ import annotations
@@ -14,11 +16,11 @@ from pathlib import Path
 from typing import Any
 
 import yaml
-from pydantic import BaseModel, Field
+from pydantic import BaseModel, Field, SerializeAsAny, create_model, model_validator
 
-from offboard.control.catalogue import LAWS, ControllerConfig
-from offboard.control.horizon.keep_out import refusal
-from offboard.control.horizon.law import HorizonSettings
+from offboard.control import catalogue
+from offboard.control.base import Controller, ControllerSettings
+from offboard.documents import shipped
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import DocumentError, override, read, validate
 from offboard.documents.shipped import locate, read_text
@@ -28,22 +30,22 @@ from offboard.estimation.observer import ObserverSettings
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Limits
 from offboard.model.vehicle import Vehicle
-from offboard.reference.catalogue import SHAPES, FromTable, ReferenceConfig, build
 from offboard.reference.feasibility import check
+from offboard.reference.shapes import SHAPES, FromTable, Shape
 from offboard.reference.track import Track
 
 Raw = dict[str, Any]
-RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "llvmlite")
+RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
 UNKNOWN_VEHICLE = "neutral"
-FOLDERS = {"vehicle": "vehicles", "controller": "controllers", "reference": "references"}
+FOLDERS = {part: shipped.FOLDERS[part] for part in ("vehicle", "controller", "reference")}
 
 
 class FlightConfig(Parameters):
     """Everything that decides a flight, resolved. `flight.yaml` of a flight directory is one."""
 
     vehicle: Vehicle
-    controller: ControllerConfig
-    reference: ReferenceConfig
+    controller: SerializeAsAny[ControllerSettings]  # the settings class of its `law`
+    reference: SerializeAsAny[Shape]  # the class of its `shape`
     estimate: FollowedEstimate = FollowedEstimate.VEHICLE
     fusion: FusionSettings = FusionSettings()
     observer: ObserverSettings = ObserverSettings()
@@ -88,7 +90,7 @@ def load(
         raise DocumentError(*(f"{path}: {sentence}" for sentence in missing))
     if seed is not None:
         raw["seed"], options["seed"] = seed, f"--seed {seed}"
-    return _with_table(validate(raw, FlightConfig, str(path), options))
+    return _with_table(_validated(raw, str(path), options))
 
 
 def build_track(config: FlightConfig) -> Track:
@@ -98,18 +100,23 @@ def build_track(config: FlightConfig) -> Track:
     Raises DocumentError naming time, value and limit where it cannot be flown.
     """
     try:
-        track = build(config.reference)
+        track = config.reference.track()
         check(track, config.vehicle)
     except ValueError as error:
-        given = config.reference
-        name = given.file if isinstance(given, FromTable) else given.shape
-        raise DocumentError(f"reference {name}: {error}") from None
-    controller = config.controller
-    if isinstance(controller, HorizonSettings):
-        refused = refusal(controller.keep_out, controller.clearance_m, track)
-        if refused:
-            raise DocumentError(f"controller: {refused}")
+        raise DocumentError(f"reference {config.reference.title}: {error}") from None
+    refused = config.controller.refusal(track)
+    if refused:
+        raise DocumentError(f"controller: {refused}")
     return track
+
+
+def build_controller(config: FlightConfig) -> Controller:
+    """The configured controller. Raises DocumentError where the vehicle cannot be flown so."""
+    settings = config.controller
+    try:
+        return settings.build(config.vehicle, period_s=config.period_s, seed=config.seed)
+    except ValueError as error:
+        raise DocumentError(f"controller {settings.law}: {error}") from None
 
 
 def check_file(path: Path, check_scenario: Callable[[Path], None]) -> str:
@@ -130,7 +137,7 @@ def check_file(path: Path, check_scenario: Callable[[Path], None]) -> str:
         return "scenario"
     kind = _kind(raw)
     if kind in FOLDERS:
-        validate(raw, _model(kind, raw, str(path)), str(path))
+        validate(raw, _model(kind, raw), str(path))
         if kind == "reference":
             build_track(load("flight", choices={kind: name}))
     else:
@@ -146,7 +153,11 @@ def _kind(raw: Raw) -> str:
     keys = {
         "flight configuration": set(FlightConfig.model_fields),
         "vehicle": set(Vehicle.model_fields),
-        "controller": {key for law in LAWS.values() for key in law.model_fields},
+        "controller": {
+            key
+            for law in catalogue.BUILT_IN.names
+            for key in catalogue.settings_of(law).model_fields
+        },
         "reference": {key for shape in SHAPES.values() for key in shape.model_fields},
     }
 
@@ -167,7 +178,15 @@ def dump(config: FlightConfig) -> str:
 
 def flown(text: str) -> FlightConfig:
     """The configuration in a log (`dump`ed then). Raises DocumentError."""
-    return validate(read(text, "the log's configuration"), FlightConfig, "the log's configuration")
+    source = "the log's configuration"
+    return _validated(read(text, source), source, {})
+
+
+def _validated(raw: Raw, source: str, options: Mapping[str, str]) -> FlightConfig:
+    """`raw` as a FlightConfig whose parts have the classes that they name."""
+    parts: dict[str, Any] = {part: (_model(part, raw.get(part)), ...) for part in FOLDERS}
+    model = create_model("FlightConfig", __base__=FlightConfig, **parts)
+    return FlightConfig(**dict(validate(raw, model, source, options)))
 
 
 def _with_table(config: FlightConfig) -> FlightConfig:
@@ -189,19 +208,36 @@ def read_part(part: str, name: str) -> Raw:
     """A vehicle, controller or reference by shipped name or file, valid. Raises DocumentError."""
     if part == "reference" and name.lower().endswith(".csv"):
         return {"shape": "table", "file": name}
-    path = locate(name, FOLDERS[part], part)
+    laws = []
+    if part == "controller":
+        laws = sorted(set(catalogue.names()) - set(shipped.names(FOLDERS[part])))
+    if name in laws:
+        return {"law": name}
+    path = locate(name, FOLDERS[part], part, laws)
     raw = read(read_text(path), str(path))
-    validate(raw, _model(part, raw, str(path)), str(path))
+    validate(raw, _model(part, raw), str(path))
     return raw
 
 
-def _model(part: str, raw: Raw, source: str) -> type[BaseModel]:
+def _model(part: str, raw: object) -> type[BaseModel]:
+    """The class of a vehicle, or of the controller or reference that `raw` names."""
     if part == "vehicle":
         return Vehicle
-    key, table = ("law", LAWS) if part == "controller" else ("shape", SHAPES)
-    chosen = raw.get(key)
-    if key not in raw:
-        raise DocumentError(f"{source}: {key} is missing; known are {', '.join(table)}")
-    if not isinstance(chosen, str) or chosen not in table:
-        raise DocumentError(f"{source}: {key} is {chosen!r}; known are {', '.join(table)}")
-    return table[chosen]
+    key, known = ("law", catalogue.names()) if part == "controller" else ("shape", list(SHAPES))
+    named = raw.get(key) if isinstance(raw, dict) else None
+    if named not in known:
+        problem = f"{key}: {named!r} is not one of" if named else f"{key} is missing; known are"
+        return _refusing(f"{problem} {', '.join(known)}")
+    return catalogue.settings_of(named) if part == "controller" else SHAPES[named]
+
+
+def _refusing(problem: str) -> type[BaseModel]:
+    """A class that refuses every value."""
+
+    class Unknown(BaseModel):
+        @model_validator(mode="before")
+        @classmethod
+        def _refuse(cls, given: object) -> object:
+            raise ValueError(problem)
+
+    return Unknown

@@ -1,4 +1,4 @@
-"""The references of one flight in vehicle time: climb to the start, the track, the rest."""
+"""Flight plan: the reference in force at each vehicle time: the climb, then the track."""
 
 from __future__ import annotations
 
@@ -17,25 +17,22 @@ SETTLED_SPEED_MPS = 0.3
 
 
 class FlightPlan:
-    """Which reference is in force. Starts on the ground; `lift_off` and `join` move it on."""
+    """The reference in force: none on the ground, then by `start_climb` and `start_track`.
+
+    `origin_ned_m` is the take-off point; the track's positions are relative to it.
+    """
 
     def __init__(self, track: Track) -> None:
-        self._track = track
+        self.track = track
         self.origin_ned_m = (0.0, 0.0, 0.0)
-        self._join_s = math.nan
+        self._track_began_s = math.nan
         self._arrival_s = math.nan
         self.reference: Reference | None = None
 
-    @property
-    def track(self) -> Track:
-        return self._track
-
-    def settle(self, position_ned_m: tuple[float, float, float]) -> None:
-        """Remember the take-off point: references are given relative to it."""
-        self.origin_ned_m = position_ned_m
-
-    def lift_off(self, time_s: float, position: Array, velocity: Array, course_rad: float) -> None:
-        """Plan from the present state to rest at the start of the track."""
+    def start_climb(
+        self, time_s: float, position: Array, velocity: Array, course_rad: float
+    ) -> None:
+        """Fly from this position and velocity (3,) to rest at the start of the track."""
         start = self._placed().sample(0.0)
         climb = transfer(
             position,
@@ -47,21 +44,21 @@ class FlightPlan:
         self._arrival_s = time_s + climb.duration_s
         self.reference = Shifted(climb, time_s)
 
-    def join(self, time_s: float) -> None:
-        """Start the track's own clock."""
-        self._join_s = time_s
+    def start_track(self, time_s: float) -> None:
+        """Fly the track, whose time 0 is `time_s`."""
+        self._track_began_s = time_s
         self.reference = Shifted(self._placed(), time_s)
 
     def track_time_s(self, time_s: float) -> float:
-        """Time on the track's own axis; NaN before it is joined."""
-        return time_s - self._join_s
+        """Time since the start of the track; NaN before it."""
+        return time_s - self._track_began_s
 
     def late_s(self, time_s: float) -> float:
-        """How long ago the start should have been reached; negative before, NaN without a plan."""
+        """Time since the planned end of the climb; negative before it, NaN without a climb."""
         return time_s - self._arrival_s
 
     def at_start(self, time_s: float, position: Array, velocity: Array) -> bool:
-        """The climb's plan is over and the vehicle rests at its end."""
+        """Whether the planned climb is over and the vehicle hovers at its end."""
         if not time_s >= self._arrival_s or self.reference is None:
             return False
         target = self.reference.sample(time_s)
@@ -71,8 +68,8 @@ class FlightPlan:
         )
 
     def sample(self, time_s: float) -> FlatSample | None:
-        """The reference in force at a vehicle time; None on the ground."""
+        """The reference at a vehicle time; None on the ground."""
         return None if self.reference is None else self.reference.sample(time_s)
 
     def _placed(self) -> Reference:
-        return Placed(self._track, self.origin_ned_m)
+        return Placed(self.track, self.origin_ned_m)

@@ -1,4 +1,4 @@
-"""The facts of one moment and the questions that the phase table asks of them. No I/O, no state."""
+"""Guards: the facts at one moment, and the conditions of the transitions. No I/O, no state."""
 
 from __future__ import annotations
 
@@ -10,25 +10,24 @@ from offboard.flight.phases import Limits
 
 @dataclass(frozen=True, slots=True)
 class Facts:
-    """All facts that a guard may look at, at one moment. SI; times in seconds, NaN where there
-    is none yet."""
+    """All that a guard may use. SI; NaN for what is not known yet."""
 
     limits: Limits
-    in_phase_s: float  # vehicle time since the phase began, ours while that does not flow
-    silence_s: float  # wall time since the vehicle was heard
+    in_phase_s: float  # since the phase began, on Session.link_time_s
+    silence_s: float  # wall time since the last telemetry
     blind_s: float  # age of the older of position and attitude, vehicle time
     found: bool
     ready: bool  # telemetry flows, parameters were read, pre-arm checks pass
     misconfigured: bool
-    rebooted: bool  # since it was first heard to flow
-    engaged: bool
+    rebooted: bool  # after its telemetry was complete
+    engaged: bool  # the vehicle shows the mode in which it follows our setpoints
     landing: bool  # the vehicle shows its landing mode
     failsafe: bool  # the vehicle shows a failsafe or an emergency
     armed: bool
-    in_the_air: bool  # by the vehicle's own account
+    in_the_air: bool  # as the vehicle reports
     lifted_off: bool
     at_start: bool
-    late_s: float  # since the start of the reference should have been reached
+    late_s: float  # since the planned end of the climb
     track_time_s: float
     track_start_s: float
     track_end_s: float
@@ -36,11 +35,11 @@ class Facts:
     position_error_m: float
     tilt_rad: float
     stop_requested: bool
-    missed_decisions: int  # one after the other
-    contradicted: bool  # the vehicle file, by telemetry
-    lifted_by_command: bool = False  # the autopilot takes off by itself, without setpoints
-    excites: bool = False  # steps are wanted before the reference is joined
-    learnt: bool = False  # what they showed is taken over
+    missed_decisions: int  # in a row
+    contradicted: bool  # telemetry contradicts the vehicle file
+    lifted_by_command: bool = False  # the autopilot takes off on a command, without setpoints
+    excites: bool = False  # identification steps are flown before the track
+    identified: bool = False  # and their result is in use
 
 
 Guard = Callable[[Facts], bool]
@@ -67,7 +66,7 @@ def rebooted(now: Facts) -> bool:
 
 
 def flown_by_another(now: Facts) -> bool:
-    """In the mode that only a stream of setpoints holds, before we sent one."""
+    """Armed and in the mode of setpoints, before we sent one."""
     return now.engaged and now.armed and not now.lifted_by_command
 
 
@@ -107,8 +106,8 @@ def at_start_to_excite(now: Facts) -> bool:
     return now.at_start and now.excites
 
 
-def learnt(now: Facts) -> bool:
-    return now.learnt
+def identified(now: Facts) -> bool:
+    return now.identified
 
 
 def at_full_speed(now: Facts) -> bool:
@@ -128,21 +127,21 @@ def disarmed(now: Facts) -> bool:
 
 
 def disarmed_for_good(now: Facts) -> bool:
-    """Long enough for a heartbeat, 1 Hz, to contradict: an arming may have been under way."""
+    """Disarmed for longer than a heartbeat period: arming may have been in progress."""
     return not now.armed and now.in_phase_s > 1.5
 
 
-def mode_taken(now: Facts) -> bool:
+def mode_left(now: Facts) -> bool:
     return not now.engaged
 
 
-def taken_armed(now: Facts) -> bool:
-    """A pilot took over just as it armed: whether it stays so is the pilot's to say."""
+def mode_left_armed(now: Facts) -> bool:
+    """A pilot changed the mode while the vehicle armed: it stays armed, as the pilot decides."""
     return now.armed and not now.engaged
 
 
-def landing_taken(now: Facts) -> bool:
-    """A pilot took over; a failsafe that lands is left to finish."""
+def landing_left(now: Facts) -> bool:
+    """A pilot changed the mode during the landing; the modes of a failsafe do not count."""
     return not (now.engaged or now.landing or now.failsafe)
 
 
@@ -183,7 +182,7 @@ def contradicted(now: Facts) -> bool:
 
 
 def longer_than(limit: str) -> Guard:
-    """A guard that holds when the phase has lasted longer than the named limit."""
+    """A guard that holds once the phase has lasted longer than the limit of this name."""
 
     def too_long(now: Facts) -> bool:
         return now.in_phase_s > float(getattr(now.limits, limit))

@@ -1,7 +1,7 @@
-"""Byte links: UDP, TCP and serial behind one small contract. Of MAVLink they know setpoints by id.
+"""Links: UDP, TCP and serial behind one protocol. Of MAVLink they know only message ids.
 
-udpin:HOST:PORT    wait on a port; the peer is whoever the session accepts
-udpout:HOST:PORT   send to a fixed peer
+udpin:HOST:PORT    listen on a port, send to the address of the vehicle that the session found
+udpout:HOST:PORT   send to this address
 tcp:HOST:PORT      connect to a listening autopilot (ArduPilot SITL)
 serial:DEVICE:BAUD
 """
@@ -11,40 +11,44 @@ from __future__ import annotations
 import os
 import select
 import socket
-from collections.abc import Callable, Hashable
+from collections.abc import Hashable
 from contextlib import suppress
 from typing import Protocol
 
+from offboard.documents.errors import UserError
+from offboard.mavlink.framing import frame_size
+
 Chunk = tuple[bytes, Hashable]
 DATAGRAM_SIZE = 65535
-WAITING_MAX = 50  # frames
+QUEUED_MAX = 50  # frames
 SETPOINTS = frozenset({82, 84, 86})  # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_*
+TIMESYNC = 111
 TCP_NOTSENT_LOWAT = 25  # Linux's option, which the socket module names since Python 3.12
 
 
-class LinkError(Exception):
+class LinkError(UserError):
     """A link that cannot be opened or was lost: one sentence for the user."""
 
 
 class Link(Protocol):
-    """Non-blocking byte channel; `is_stream` says that chunks do not end at frame borders."""
+    """Non-blocking byte channel. `is_stream`: received chunks may end within a frame."""
 
     is_stream: bool
 
     def receive(self, timeout_s: float) -> list[Chunk]:
-        """All chunks that wait, after waiting at most `timeout_s` for the first."""
+        """All received chunks, after waiting at most `timeout_s` for the first."""
         ...
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
-        """Send one frame to `peer` (UDP) or the only other end. Never waits: what does not fit is
-        dropped, or kept a while where a part of a frame would spoil the stream."""
+        """Send one frame to `peer` (UDP) or to the other end. Never waits: a frame that does not
+        fit into the buffer is dropped (UDP) or queued (streams)."""
         ...
 
     def close(self) -> None: ...
 
 
 class UdpLink:
-    """One UDP socket. `peer` is fixed for udpout, learned by the caller for udpin."""
+    """One UDP socket. `peer` is fixed for udpout and None for udpin."""
 
     is_stream = False
 
@@ -59,16 +63,16 @@ class UdpLink:
             try:
                 chunks.append(self._socket.recvfrom(DATAGRAM_SIZE))
             except ConnectionError:
-                continue  # the peer's port is closed: an ICMP answer to an earlier datagram
+                continue  # ICMP: the peer's port was closed when an earlier datagram arrived
             except OSError:
-                break  # nothing waits, or the interface went away
+                break  # nothing left, or the network interface is down
         return chunks
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
         target = self._peer or peer
         if not isinstance(target, tuple):
             return
-        with suppress(OSError):  # silence tells of a dead link
+        with suppress(OSError):  # a dead link shows as silence
             self._socket.sendto(data, target)
 
     def close(self) -> None:
@@ -76,48 +80,89 @@ class UdpLink:
 
     @property
     def port(self) -> int:
-        """The local port, for whoever asked for port 0."""
+        """The local port."""
         return int(self._socket.getsockname()[1])
 
 
-class Backlog:
-    """Whole frames that wait for room in a stream. A setpoint takes the place of the one that
-    waits, for an old one is worse than none; of too many frames the oldest are given up."""
+class LockstepLink(UdpLink):
+    """UDP to a simulator in lockstep: returns all datagrams up to a barrier at once, and only once.
 
-    def __init__(self) -> None:
-        self._begun = b""
-        self._waiting: list[bytes] = []
+    A barrier is a TIMESYNC request at the end of a datagram. The simulator waits for the reply and
+    meanwhile repeats all datagrams since the previous barrier.
+    """
 
-    def add(self, frame: bytes) -> None:
-        if _is_setpoint(frame):
-            self._waiting = [other for other in self._waiting if not _is_setpoint(other)]
-        self._waiting = [*self._waiting, frame][-WAITING_MAX:]
+    def __init__(self, sock: socket.socket, peer: tuple[str, int] | None) -> None:
+        super().__init__(sock, peer)
+        self._block: list[Chunk] = []  # since the newest barrier
+        self._barrier = b""
 
-    def flush(self, send: Callable[[bytes], int]) -> None:
-        """Send what goes; `send` returns how many bytes went, or raises as sockets do."""
-        with suppress(BlockingIOError):
-            while self._begun or self._waiting:
-                if not self._begun:
-                    self._begun = self._waiting.pop(0)
-                self._begun = self._begun[send(self._begun) :]
+    def receive(self, timeout_s: float) -> list[Chunk]:
+        complete: list[Chunk] = []
+        for chunk in super().receive(timeout_s):
+            self._block.append(chunk)
+            if _is_barrier(chunk[0]):
+                if chunk[0] != self._barrier:
+                    complete += self._block
+                self._barrier, self._block = chunk[0], []
+        return complete
+
+
+def _message_id(frame: bytes) -> int:
+    """Message id of a MAVLink 2 frame."""
+    return int.from_bytes(frame[7:10], "little")
 
 
 def _is_setpoint(frame: bytes) -> bool:
-    return int.from_bytes(frame[7:10], "little") in SETPOINTS
+    return _message_id(frame) in SETPOINTS
 
 
-class TcpLink:
-    """A TCP connection to an autopilot that listens."""
+def _is_barrier(datagram: bytes) -> bool:
+    """Whether the last frame is a TIMESYNC request, which has tc1 = 0."""
+    at = last = 0
+    while at < len(datagram):
+        last, at = at, at + (frame_size(datagram, at) or len(datagram))
+    return _message_id(datagram[last:]) == TIMESYNC and not any(datagram[last + 10 : last + 18])
+
+
+class StreamLink:
+    """Base of TCP and serial links. Frames are queued while the buffer of the stream is full: a new
+    setpoint replaces a queued one, and of too many frames the oldest are dropped."""
 
     is_stream = True
 
+    def __init__(self) -> None:
+        self._begun = b""
+        self._queued: list[bytes] = []
+
+    def send(self, data: bytes, peer: Hashable | None) -> None:
+        if _is_setpoint(data):
+            self._queued = [other for other in self._queued if not _is_setpoint(other)]
+        self._queued = [*self._queued, data][-QUEUED_MAX:]
+        self._flush()
+
+    def _flush(self) -> None:
+        """Send as much as possible. A dead link shows as silence."""
+        with suppress(OSError):
+            while self._begun or self._queued:
+                if not self._begun:
+                    self._begun = self._queued.pop(0)
+                self._begun = self._begun[self._write(self._begun) :]
+
+    def _write(self, data: bytes) -> int:
+        """Number of bytes sent; raises BlockingIOError if the buffer is full."""
+        raise NotImplementedError
+
+
+class TcpLink(StreamLink):
+    """A TCP connection to a listening autopilot."""
+
     def __init__(self, sock: socket.socket) -> None:
+        super().__init__()
         sock.setblocking(False)
-        with suppress(OSError):  # what waits shall wait here, where it can still be replaced
+        with suppress(OSError):  # queue here, where a setpoint can be replaced
             sock.setsockopt(socket.IPPROTO_TCP, TCP_NOTSENT_LOWAT, 1)
         self._socket = sock
         self._open = True
-        self._backlog = Backlog()
 
     def receive(self, timeout_s: float) -> list[Chunk]:
         if not self._open:
@@ -136,33 +181,26 @@ class TcpLink:
         self._open = bool(data)
         return [(data, "tcp")] if data else []
 
-    def send(self, data: bytes, peer: Hashable | None) -> None:
-        self._backlog.add(data)
-        self._flush()
-
-    def _flush(self) -> None:
-        with suppress(OSError):  # silence tells of a dead link
-            self._backlog.flush(self._socket.send)
+    def _write(self, data: bytes) -> int:
+        return self._socket.send(data)
 
     def close(self) -> None:
         self._socket.close()
 
 
-class SerialLink:
+class SerialLink(StreamLink):
     """A serial port through pyserial."""
-
-    is_stream = True
 
     def __init__(self, device: str, baud: int) -> None:
         import serial
 
+        super().__init__()
         try:
             self._port = serial.Serial(device, baud, timeout=0)
         except (serial.SerialException, ValueError) as error:
             raise LinkError(
                 f"serial port {device} at {baud} baud cannot be opened: {error}"
             ) from None
-        self._backlog = Backlog()
 
     def receive(self, timeout_s: float) -> list[Chunk]:
         self._flush()
@@ -170,29 +208,38 @@ class SerialLink:
             self._port.timeout = max(0.0, timeout_s)
             first = self._port.read(1)
             data = first + self._port.read(self._port.in_waiting) if first else b""
-        except OSError:  # unplugged, which pyserial tells in more than one way
+        except OSError:  # unplugged: pyserial raises different subclasses
             select.select([], [], [], max(0.0, timeout_s))
             return []
         return [(data, "serial")] if data else []
 
-    def send(self, data: bytes, peer: Hashable | None) -> None:
-        self._backlog.add(data)
-        self._flush()
-
-    def _flush(self) -> None:
-        with suppress(OSError):  # silence tells of a dead link
-            self._backlog.flush(self._write)
-
     def _write(self, data: bytes) -> int:
-        # pyserial's own write spins until a full port has room again
+        # pyserial's write waits in a busy loop while the port's buffer is full
         return os.write(self._port.fileno(), data)
 
     def close(self) -> None:
         self._port.close()
 
 
+def open_lockstep_link() -> LockstepLink:
+    """Open a link on a free port of this computer, for a simulator in lockstep."""
+    sock = _udp_socket()
+    sock.bind(("127.0.0.1", 0))
+    return LockstepLink(sock, None)
+
+
+def _udp_socket() -> socket.socket:
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
+    sock.setblocking(False)
+    return sock
+
+
 def open_link(address: str) -> Link:
-    """Open `address` (see the module's first lines); LinkError says what to change."""
+    """Open the link at `address`, for example "udpin:127.0.0.1:14540" (see the module).
+
+    Raises LinkError, which says what to change.
+    """
     kind, _, rest = address.partition(":")
     host, _, tail = rest.rpartition(":")
     if kind not in ("udpin", "udpout", "tcp", "serial") or not host or not tail.isdigit():
@@ -215,9 +262,7 @@ def _open_socket(kind: str, host: str, port: int, address: str) -> Link:
             connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
             return TcpLink(connection)
         peer = (socket.gethostbyname(host), port)
-        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-        sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
-        sock.setblocking(False)
+        sock = _udp_socket()
         if kind == "udpout":
             return UdpLink(sock, peer)
         sock.bind(peer)

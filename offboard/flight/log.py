@@ -1,7 +1,7 @@
-"""The flight directory and its .tlog: every frame that crossed the link, and our own records.
+"""The flight directory and its .tlog: every frame sent or received, and our own records.
 
-A .tlog record is a big-endian uint64 of Unix microseconds, low two bits zero, then the frame
-unchanged. Each record is one unbuffered write, so a crash loses at most the last one.
+An entry of a .tlog is a big-endian uint64 of Unix microseconds, low two bits zero, and the frame
+unchanged. Each entry is one unbuffered write: a crash loses at most the last one.
 """
 
 from __future__ import annotations
@@ -12,17 +12,19 @@ from errno import EACCES, ENOTDIR
 from pathlib import Path
 from types import TracebackType
 
+from offboard.documents.errors import UserError
+
 _STAMP = struct.Struct(">Q")
 
 
-class LogError(Exception):
+class LogError(UserError):
     """The flight directory cannot be written: one sentence for the user."""
 
 
 class FlightLog:
-    """Writes DIR/flight.tlog, and beside it flight.yaml with what the flight is flown with.
+    """Context manager that writes DIR/flight.tlog, and the configuration to DIR/flight.yaml.
 
-    Never overwrites: a directory that holds a flight is refused.
+    Never overwrites a flight. Entering raises LogError.
     """
 
     def __init__(self, directory: Path, configuration: str) -> None:
@@ -31,7 +33,7 @@ class FlightLog:
         self.configuration = configuration
 
     def check(self) -> None:
-        """Raise LogError for what can be told without making anything."""
+        """Raise LogError if the directory cannot be used, without creating anything."""
         if self.path.exists():
             raise self._taken()
         places = (self.directory, *self.directory.absolute().parents)
@@ -58,7 +60,7 @@ class FlightLog:
             (self.directory / "flight.yaml").write_text(text, encoding="utf-8")
         except OSError:
             self._file.close()
-            self.path.unlink()  # an empty log is no flight that must be kept
+            self.path.unlink()  # the empty log of a flight that does not begin
             raise
 
     def _taken(self) -> LogError:
@@ -79,14 +81,14 @@ class FlightLog:
         self._file.close()
 
     def begin(self, unix_us: int, frame: bytes) -> None:
-        """Append a frame before anything was sent: a disk that is full then refuses the flight."""
+        """Append a frame before the flight. Raises LogError on a full disk, which ends it."""
         try:
             self.write(unix_us, frame)
         except OSError as error:
             raise self._unwritable(error) from None
 
     def write(self, unix_us: int, frame: bytes) -> None:
-        """Append one frame with its time of crossing. A full disk raises OSError."""
+        """Append one frame and its Unix time. Raises OSError on a full disk."""
         rest = _STAMP.pack(unix_us & ~3) + frame
-        while rest:  # a disk that fills up takes a part; what came next would lie inside it
+        while rest:  # a nearly full disk accepts a part, which would hide the next entry
             rest = rest[self._file.write(rest) :]

@@ -1,4 +1,4 @@
-"""The loop on real sockets: link -> companion -> link and log, paced by the vehicle's telemetry."""
+"""The loop: link -> companion -> link and log, paced by the vehicle's telemetry."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ POLL_S = 0.02
 class Loop:
     """Moves bytes between one link, one companion and one log until the flight ends.
 
-    `lockstep` makes the vehicle's time the link's time: then nothing that is sent depends on the
-    wall clock, and two flights with one seed send the same bytes.
+    `progress` is called often, to show the companion's announcements to the user.
+    `simulator_ended` says how the bundled simulator ended, or None while it runs.
     """
 
     def __init__(
@@ -30,22 +30,20 @@ class Loop:
         log: FlightLog,
         *,
         stops: StopRequests,
-        lockstep: bool,
         progress: Callable[[Companion], None],
-        vehicle_process_ended: Callable[[], Ending | None] = lambda: None,
+        simulator_ended: Callable[[], Ending | None] = lambda: None,
     ) -> None:
         self._companion = companion
         self._link = link
         self._log = log
         self._stops = stops
-        self._lockstep = lockstep
-        self._machine = progress
-        self._vehicle_process_ended = vehicle_process_ended
+        self._progress = progress
+        self._simulator_ended = simulator_ended
         self._log_error: str | None = None
         self._ended_early: Outcome | None = None
 
     def run(self) -> Outcome:
-        """Fly to the end. A stop request lands; who insists leaves."""
+        """Fly to the end. The first stop request lands, a second one exits immediately."""
         self._stops.in_flight = True
         gc.collect()
         gc.freeze()
@@ -57,7 +55,7 @@ class Loop:
         if outcome is None:
             return Outcome(
                 ExitCode.ABORTED,
-                "interrupted twice: the stream stopped and the vehicle is left to its own failsafe",
+                "interrupted twice: setpoints stopped, the vehicle's own failsafe takes over",
             )
         if self._log_error:
             return Outcome(outcome.exit_code or ExitCode.ABORTED, self._log_error)
@@ -65,28 +63,25 @@ class Loop:
 
     def _fly(self) -> None:
         companion, link = self._companion, self._link
-        link.receive(0.0)  # what waited while we prepared is old
-        heard_s = polled_s = clock.monotonic_s()
-        while not (companion.has_ended() or self._stops.insisted or self._ended_early):
-            if self._stops.asked:
+        telemetry_s = polled_s = clock.monotonic_s()
+        while not (companion.has_ended() or self._stops.repeated or self._ended_early):
+            if self._stops.requested:
                 companion.request_stop()
             chunks = link.receive(POLL_S)
             now_s = clock.monotonic_s()
             for data, peer in chunks:
-                output = companion.receive(data, peer, self._time_s(now_s))
+                output = companion.receive(data, peer, now_s)
                 if output.alive:
-                    heard_s = now_s
+                    telemetry_s = now_s
                 self._deliver(output, peer)
+                self._show()
                 if companion.has_ended():
                     break
             if not chunks or now_s - polled_s > POLL_S:
                 polled_s = now_s
-                self._deliver(companion.poll(self._time_s(now_s), now_s - heard_s), companion.peer)
+                self._deliver(companion.poll(now_s, now_s - telemetry_s), companion.peer)
                 self._show()
-                self._check_process()
-
-    def _time_s(self, now_s: float) -> float:
-        return self._companion.view.time_s if self._lockstep else now_s
+                self._check_simulator()
 
     def _deliver(self, output: Output, peer: Hashable | None) -> None:
         target = self._companion.peer or peer
@@ -103,15 +98,15 @@ class Loop:
             self._companion.request_stop(self._log_error)
 
     def _show(self) -> None:
-        """Tell the user. A closed pipe or a lost terminal ends the showing, not the flight."""
+        """Show the progress. A closed pipe or a lost terminal does not end the flight."""
         try:
-            self._machine(self._companion)
+            self._progress(self._companion)
         except (Exception, SystemExit):
-            self._machine = lambda companion: None
+            self._progress = lambda companion: None
 
-    def _check_process(self) -> None:
-        """A simulator that ended will not be waited for."""
-        ended = None if self._companion.has_ended() else self._vehicle_process_ended()
+    def _check_simulator(self) -> None:
+        """End the flight if the bundled simulator has ended."""
+        ended = None if self._companion.has_ended() else self._simulator_ended()
         if ended is None:
             return
         code = ExitCode.ABORTED

@@ -1,7 +1,7 @@
-"""What a flight was flown with, inside its own log: one text in numbered, compressed pieces.
+"""The manifest: the configuration of a flight inside its log, compressed and in numbered pieces.
 
-The pieces are TUNNEL messages under our own component id, the first records of the .tlog. Twin
-functions: what `pieces` cuts, `join` puts together.
+The pieces are TUNNEL messages of our record component, the first entries of the .tlog. `pieces`
+splits a text, `join` restores it.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from collections.abc import Iterable
 
 from offboard.mavlink.outgoing import ConfigurationRecord
 
-PAYLOAD_TYPE = 0xC0F1  # TUNNEL.payload_type; above 32767 a number needs no registration
+PAYLOAD_TYPE = 0xC0F1  # TUNNEL.payload_type; numbers above 32767 need no registration
 _HEAD = struct.Struct("<HH")  # index of the piece, number of pieces
-_ROOM = 128 - _HEAD.size
+_PIECE_BYTES = 128 - _HEAD.size
 
 
 def pieces(text: str) -> list[ConfigurationRecord]:
     """Records that hold `text`, in order."""
     data = zlib.compress(text.encode("utf-8"), 9)
-    parts = [data[at : at + _ROOM] for at in range(0, len(data), _ROOM)]
+    parts = [data[at : at + _PIECE_BYTES] for at in range(0, len(data), _PIECE_BYTES)]
     return [
         ConfigurationRecord(_HEAD.pack(index, len(parts)) + part, PAYLOAD_TYPE)
         for index, part in enumerate(parts)
@@ -28,7 +28,7 @@ def pieces(text: str) -> list[ConfigurationRecord]:
 
 
 def join(payloads: Iterable[bytes]) -> str | None:
-    """The text in the payloads of TUNNEL messages in the order of the log; None if incomplete."""
+    """The text in the payloads of TUNNEL messages; None if a piece is missing or damaged."""
     parts: dict[int, bytes] = {}
     count = 0
     for payload in payloads:

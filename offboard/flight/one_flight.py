@@ -1,6 +1,6 @@
-"""One flight from a resolved configuration: build everything, rehearse, connect, fly, close.
+"""One flight with given parts: start the simulator, rehearse, connect, fly, close.
 
-Everything that may be slow (compiling, starting a simulator) happens before the vehicle is heard.
+Everything slow (compilation, start of a simulator) happens before telemetry is read.
 """
 
 from __future__ import annotations
@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from offboard.compiled import prepare
 from offboard.control.base import Controller, Situation
 from offboard.documents.reading import DocumentError
 from offboard.estimation.fusion import FusedObserver
@@ -19,7 +20,7 @@ from offboard.estimation.observer import Observer
 from offboard.flight import clock, manifest
 from offboard.flight.companion import Companion, Outcome
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.link import UdpLink, open_link
+from offboard.flight.link import LockstepLink, open_link, open_lockstep_link
 from offboard.flight.log import FlightLog
 from offboard.flight.loop import Loop
 from offboard.flight.online_identification import IdentifySettings
@@ -27,24 +28,21 @@ from offboard.flight.phases import Limits
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.flight.sitl import SimulatorProcess
 from offboard.flight.stop import StopRequests
-from offboard.identification import stages as identification
 from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
 from offboard.model.command import Command
-from offboard.model.kernel import Entry
 from offboard.model.vehicle import Vehicle
 from offboard.reference.track import Track
 from offboard.reference.transfer import Hold
 
-COMPILED_S = 2.0  # worth a word
-REHEARSED_DECISIONS = 5  # of which the fastest counts: the machine may do something else too
-SITL_PATIENCE_S = 180.0  # a bundled simulator may compile first, on a machine that does much else
+REHEARSED_DECISIONS = 5  # the fastest counts: the machine may be busy
+SITL_TIMEOUT_S = 180.0  # for simulator and companion in lockstep: either may compile, or be slow
 
 
 @dataclass(frozen=True, slots=True)
 class Bundled:
-    """A vehicle of the bundled simulator, in lockstep; `scenario` and `vehicle` None are the
-    firmware's own."""
+    """A vehicle of the bundled simulator, in lockstep. `scenario` and `vehicle` None: the defaults
+    of the firmware."""
 
     simulator: SimulatorProcess
     scenario: str | None
@@ -53,9 +51,10 @@ class Bundled:
     firmware: str = "px4"
 
     def options(self, port: int) -> list[str]:
-        """Of the `simulator` command: this vehicle, sending to a port of ours."""
+        """Options of the `simulator` command, for a vehicle that sends to our local `port`."""
         return [
             *("--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", "--lockstep"),
+            *("--patience", f"{SITL_TIMEOUT_S:g}"),
             *("--seed", str(self.seed), "--firmware", self.firmware),
             *(("--scenario", self.scenario) if self.scenario else ()),
             *(("--vehicle", self.vehicle) if self.vehicle else ()),
@@ -63,7 +62,7 @@ class Bundled:
         ]
 
     def _parameters(self) -> dict[str, float]:
-        """What a user would set once on this autopilot to fly with us."""
+        """Parameters that a user must set once on this autopilot."""
         dialect = DIALECTS.get(self.firmware)
         watched = dialect.watched_parameters if dialect else ()
         return {p.name: float(p.required_bits) for p in watched if p.required_bits}
@@ -71,7 +70,7 @@ class Bundled:
 
 @dataclass(frozen=True, slots=True)
 class FlightParts:
-    """What one flight is made of, built from the configuration by the caller."""
+    """Parts of one flight, see `request.build_parts`. `deadline_s`: wall time of one decision."""
 
     vehicle: Vehicle
     controller: Controller
@@ -80,16 +79,15 @@ class FlightParts:
     limits: Limits
     period_s: float
     deadline_s: float
-    learning: IdentifySettings | None = None
+    identify: IdentifySettings | None = None
 
 
-def rehearse(parts: FlightParts, *, keeps_deadline: bool) -> float:
-    """Call every code path of observer and controller, compiled ones included, and forget it.
+def rehearse(parts: FlightParts, *, keeps_deadline: bool) -> None:
+    """Call every code path of observer and controller, so that nothing is compiled in flight.
 
-    A stall of seconds at the first decision in flight is a crash. Returns the seconds it took.
-    `keeps_deadline`: raises DocumentError where no decision can be had within the deadline.
+    A pause of seconds at the first decision in flight is a crash. With `keeps_deadline`, raises
+    DocumentError if a decision cannot meet the deadline.
     """
-    began_s = clock.monotonic_s()
     observer = parts.make_observer()
     reference = Hold((0.0, 0.0, -2.0), 0.1)
     previous = Command(parts.vehicle.gravity_mps2, (0.0, 0.0, 1.0), 0.0)
@@ -102,22 +100,19 @@ def rehearse(parts: FlightParts, *, keeps_deadline: bool) -> float:
         observer.on_position(time_s, (0.0, 0.0, -2.0), (0.0, 0.0, 0.0))
         if step >= 20 and step % 10 == 0:
             state = observer.predict(time_s)
-            situation = Situation(time_s, state, reference, previous, parts.deadline_s)
+            situation = Situation(time_s, state, reference, previous, lambda: parts.deadline_s)
             command = parts.controller.decide(situation).command
             if isinstance(command, Command):
                 previous = command
                 observer.on_command(time_s, command)
     if keeps_deadline:
-        _check_deadline(parts, replace(situation, deadline_s=0.0))
+        _check_deadline(parts, replace(situation, remaining_s=lambda: 0.0))
     parts.track.sample(np.array([0.0, 1.0]))
-    if parts.learning and parts.learning.online:
-        identification.warm_up(parts.vehicle)
     parts.controller.reset()
-    return clock.monotonic_s() - began_s
 
 
 def _check_deadline(parts: FlightParts, cut_short: Situation) -> None:
-    """The least a decision takes, a search's first look included, must fit in its deadline."""
+    """The shortest possible decision must meet the deadline."""
     least_s = math.inf
     for _ in range(REHEARSED_DECISIONS):
         began_s = clock.monotonic_s()
@@ -140,28 +135,24 @@ def fly(
     progress: Callable[[Companion], None],
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> Outcome:
-    """Fly once over `connection`, or on a bundled simulator of our own.
+    """Fly once over `connection`, or on the `bundled` simulator.
 
-    Raises LinkError, DocumentError or LogError before anything is sent, what can be known at once
-    before anything slow; KeyboardInterrupt where `stops` was asked meanwhile. The log is opened
-    last, so that a flight which cannot begin leaves no directory behind. `tell` is given a sentence
-    about what takes so long.
+    Raises LinkError, DocumentError or LogError before anything is sent, and KeyboardInterrupt if a
+    stop was requested meanwhile. The log is created last: a flight that cannot begin leaves no
+    directory. `tell` is called with sentences about the preparation.
     """
     with ExitStack() as stack:
         log.check()
-        link = open_link("udpin:127.0.0.1:0" if bundled else connection)
+        link = open_lockstep_link() if bundled else open_link(connection)
         stack.callback(link.close)
         if bundled:
-            assert isinstance(link, UdpLink)
+            assert isinstance(link, LockstepLink)
             bundled.simulator.launch(bundled.options(link.port))
             stack.callback(bundled.simulator.recall)
-        some = "" if Entry.all_compiled() else " (compiles what never flew here, for some seconds)"
-        tell(f"preparing the controller{some}")
-        compiled = Entry.compilations
-        took_s = rehearse(parts, keeps_deadline=bundled is None)
-        if Entry.compilations > compiled and took_s > COMPILED_S:
-            tell(f"compiled in {took_s:.1f} s; the next start finds it cached")
-        stops.heed()
+        tell("preparing the controller")
+        prepare(tell)
+        rehearse(parts, keeps_deadline=bundled is None)
+        stops.check()
         stack.enter_context(log)
         observer = parts.make_observer()
         fuses = isinstance(observer, FusedObserver)
@@ -170,8 +161,9 @@ def fly(
                 component_id=COMPONENT_ID,
                 record_component_id=RECORD_COMPONENT_ID,
                 stream=link.is_stream,
-                speaks_first=not (bundled or connection.startswith("udpin")),
-                wanted_too=POSITIONING_TELEMETRY if fuses else (),
+                lockstep=bundled is not None,
+                sends_first=not (bundled or connection.startswith("udpin")),
+                extra_wanted=POSITIONING_TELEMETRY if fuses else (),
             )
         )
         for piece in manifest.pieces(log.configuration):
@@ -181,10 +173,11 @@ def fly(
             link,
             log,
             stops=stops,
-            lockstep=bundled is not None,
             progress=progress,
-            vehicle_process_ended=bundled.simulator.ended if bundled else lambda: None,
+            simulator_ended=bundled.simulator.ended if bundled else lambda: None,
         )
+        if not bundled:
+            link.receive(0.0)  # telemetry that arrived while we prepared is too old to use
         return loop.run()
 
 
@@ -192,9 +185,9 @@ def _companion(
     parts: FlightParts, session: Session, observer: Observer, *, lockstep: bool
 ) -> Companion:
     limits = parts.limits
-    if lockstep:  # the vehicle waits for us: silence only says that the machine is busy
-        patience = {"connect_s": SITL_PATIENCE_S, "silence_s": SITL_PATIENCE_S}
-        limits = limits.model_copy(update=patience)
+    if lockstep:  # the simulator waits for us: silence only means that the machine is busy
+        timeouts = {"connect_s": SITL_TIMEOUT_S, "silence_s": SITL_TIMEOUT_S}
+        limits = limits.model_copy(update=timeouts)
     return Companion(
         vehicle=parts.vehicle,
         session=session,
@@ -205,5 +198,5 @@ def _companion(
         period_s=parts.period_s,
         deadline_s=None if lockstep else parts.deadline_s,
         stopwatch=clock.monotonic_s,
-        learning=parts.learning,
+        identify=parts.identify,
     )

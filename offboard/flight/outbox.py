@@ -1,7 +1,7 @@
-"""What leaves the companion: the one place that makes a setpoint, and every other frame.
+"""Outbox: the only place that creates setpoints, and the queue of all messages and records.
 
-A setpoint that leaves is also given to the observer and the identification, so that they replay
-exactly what was sent. Frames are queued until `take`. Decides nothing; owns no socket or file.
+A setpoint is also given to the observer and the identification, which predict with the commands
+that were sent. `flush` encodes what is queued. Decides nothing; owns no socket or file.
 """
 
 from __future__ import annotations
@@ -10,35 +10,33 @@ import math
 from dataclasses import dataclass
 
 from offboard.estimation.observer import Observer
+from offboard.flight.gate import LEVEL
 from offboard.flight.online_identification import OnlineIdentification
-from offboard.flight.setpoint import LEVEL
-from offboard.mavlink.outgoing import (
-    AttitudeTarget,
-    Outgoing,
-    PositionTarget,
-    Record,
-)
+from offboard.mavlink.outgoing import AttitudeTarget, Outgoing, PositionTarget, Record
 from offboard.mavlink.session import Session
 from offboard.mavlink.texts import chunks
 from offboard.model.command import Command, PositionCommand
 from offboard.model.vehicle import Vehicle
 
 WARNING, INFO = 4, 6  # MAV_SEVERITY
-MOST_TEXTS = 65535  # STATUSTEXT.id; 0 is for those that are complete in themselves
-ASK_AGAIN_S = 1.0  # between repetitions of a command the vehicle has not obeyed
+TEXT_ID_MAX = 65535  # STATUSTEXT.id; 0 is for texts of one chunk
+REPEAT_S = 1.0  # period of a request that the vehicle has not followed
 
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """What one call produced: frames to send, and all frames for the log, records included."""
+    """Result of one call: frames to send, and all frames for the log, records included."""
 
     send: tuple[bytes, ...] = ()
     log: tuple[bytes, ...] = ()
-    alive: bool = False  # the vehicle was heard: its state, once that flows
+    alive: bool = False  # telemetry has arrived: position or attitude, once both are received
 
 
 class Outbox:
-    """One flight's way out. `vehicle` is the one now believed: it scales the thrust sent."""
+    """Creates and queues messages. `vehicle` is the vehicle model in use: it scales the thrust.
+
+    `command` is the command in force, `announced` are the sentences for the user, oldest first.
+    """
 
     def __init__(
         self,
@@ -51,18 +49,19 @@ class Outbox:
         self._observer = observer
         self._identification = identification
         self.vehicle = vehicle
-        self.command = Command(0.0, LEVEL, 0.0)  # in force
+        self.command = Command(0.0, LEVEL, 0.0)
         self.announced: list[str] = []
-        self._asked_s = -math.inf
-        self._texts = 0  # id of the last one
-        self._send_out: list[bytes] = []
-        self._log_out: list[bytes] = []
+        self._requested_s = -math.inf
+        self._text_id = 0
+        self._queue: list[Outgoing] = []
 
     # ------------------------------------------------------------------ setpoints
 
-    def emit(self, time_s: float, command: Command, body_z_down: float | None = None) -> None:
-        """The one place that emits a setpoint. `body_z_down`: of the body, when it acts."""
-        self.assume(time_s, command)
+    def send_command(
+        self, time_s: float, command: Command, body_z_down: float | None = None
+    ) -> None:
+        """Send an attitude setpoint. `body_z_down`: see `AttitudeTarget`."""
+        self.set_command(time_s, command)
         if self._identification:
             self._identification.on_command(time_s, command)
         self.send(
@@ -77,72 +76,65 @@ class Outbox:
             )
         )
 
-    def assume(self, time_s: float, command: Command) -> None:
-        """The command in force, whoever gave it; nothing leaves."""
+    def set_command(self, time_s: float, command: Command) -> None:
+        """Note the command in force without sending it, for example the autopilot's own."""
         self.command = command
         self._observer.on_command(time_s, command)
 
-    def hand_over(self, time_s: float, command: PositionCommand) -> None:
-        """Emit a setpoint for the autopilot's own position loop. What it commands its attitude
-        loop is not ours to know: the observer only listens."""
+    def send_position(self, time_s: float, command: PositionCommand) -> None:
+        """Send a setpoint for the autopilot's position loop. The attitude that this loop commands
+        is unknown, therefore the observer stops predicting with commands."""
         self._observer.freeze(True)
         self.command = Command(self.vehicle.gravity_mps2, LEVEL, command.course_rad)
         self.send(
             PositionTarget(
-                time_s=time_s,
-                position_ned_m=command.position_ned_m,
-                velocity_ned_mps=command.velocity_ned_mps,
-                acceleration_ned_mps2=command.acceleration_ned_mps2,
-                course_rad=command.course_rad,
-                course_rate_radps=command.course_rate_radps,
+                time_s,
+                command.position_ned_m,
+                command.velocity_ned_mps,
+                command.acceleration_ned_mps2,
+                command.course_rad,
+                command.course_rate_radps,
             )
         )
 
     def hover_mps2(self) -> float:
-        """Thrust that holds the weight, by the observer's account."""
+        """Thrust that holds the weight, by the observer's estimate of the hover thrust."""
         share = self._observer.hover_thrust_estimate / self.vehicle.hover_thrust
         return (share if math.isfinite(share) else 1.0) * self.vehicle.gravity_mps2
 
     # ------------------------------------------------------------------ everything else
 
-    def ask(self, request: Outgoing, time_s: float) -> None:
-        """Send a command, and again while it is not obeyed; the heartbeat is the verdict."""
-        if time_s - self._asked_s >= ASK_AGAIN_S - 1e-6:
-            self._asked_s = time_s
+    def request(self, request: Outgoing, time_s: float) -> None:
+        """Send a command, at most once a second: call it until the heartbeat shows the result."""
+        if time_s - self._requested_s >= REPEAT_S - 1e-6:
+            self._requested_s = time_s
             self.send(request)
 
-    def forget_asking(self) -> None:
-        """The next command is a new one, or the vehicle's time is."""
-        self._asked_s = -math.inf
+    def restart_requests(self) -> None:
+        """The next request is sent at once."""
+        self._requested_s = -math.inf
 
     def announce(self, sentence: str, title: str = "") -> None:
-        """Tell the user here and at the ground station, there under a title."""
+        """Report to the user, and to the ground station with `title` before the sentence."""
         self.announced.append(sentence)
-        self._say(INFO, title + sentence)
+        self._send_text(INFO, title + sentence)
 
     def warn(self, sentence: str) -> None:
-        """Tell the ground station and the log."""
-        self._say(WARNING, sentence)
+        """Report to the ground station and the log."""
+        self._send_text(WARNING, sentence)
 
-    def _say(self, severity: int, sentence: str) -> None:
-        self._texts = self._texts % MOST_TEXTS + 1
-        for chunk in chunks(severity, sentence, self._texts):
+    def _send_text(self, severity: int, sentence: str) -> None:
+        self._text_id = self._text_id % TEXT_ID_MAX + 1
+        for chunk in chunks(severity, sentence, self._text_id):
             self.send(chunk)
 
-    def send(self, outgoing: Outgoing) -> None:
-        self.pass_on((self._session.encode(outgoing),))
+    def send(self, *messages: Outgoing) -> None:
+        """Queue messages to send and to log; records are only logged."""
+        self._queue.extend(messages)
 
-    def pass_on(self, frames: tuple[bytes, ...]) -> None:
-        """Frames that somebody else has encoded."""
-        self._send_out.extend(frames)
-        self._log_out.extend(frames)
-
-    def note_down(self, record: Record) -> None:
-        """For the log alone."""
-        self._log_out.append(self._session.encode(record))
-
-    def take(self, heard: tuple[bytes, ...], alive: bool) -> Output:
-        """All that gathered since the last call, and for the log what was heard before it."""
-        send, log = tuple(self._send_out), (*heard, *self._log_out)
-        self._send_out, self._log_out = [], []
-        return Output(send, log, alive)
+    def flush(self, received: tuple[bytes, ...], alive: bool) -> Output:
+        """Encode the queue. In the log, the frames `received` come first."""
+        frames = [(message, self._session.encode(message)) for message in self._queue]
+        self._queue.clear()
+        send = tuple(frame for message, frame in frames if not isinstance(message, Record))
+        return Output(send, (*received, *(frame for _, frame in frames)), alive)

@@ -1,4 +1,4 @@
-"""The names of a flight: its phases, how it may end, and how long each wait may last."""
+"""Phases of a flight, exit codes, and the limits of time and state."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from offboard.documents.parameters import Parameters
 
 
 class Phase(Enum):
-    """In flight order; the last three end the flight."""
+    """In the order of a flight; the last three end it."""
 
     CONNECT = "connect"
     HEALTH = "health"
@@ -31,7 +31,7 @@ class Phase(Enum):
     FAILED = "failed"
 
 
-# What a log holds for a phase; numbers are never given anew, so that old logs stay readable
+# The number of a phase in logs. Never reuse a number: old logs must stay readable.
 PHASE_CODES: Mapping[Phase, int] = {
     Phase.CONNECT: 0,
     Phase.HEALTH: 1,
@@ -56,7 +56,7 @@ TRACKING = frozenset({Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.
 
 
 class ExitCode:
-    """The contract of every command."""
+    """Exit codes of every command."""
 
     FLOWN = 0
     REQUIREMENT_MISSED = 1
@@ -66,8 +66,8 @@ class ExitCode:
 
 
 class Limits(Parameters):
-    """How long each wait may last, and what is not flown, or no further. SI; seconds of vehicle
-    time, but `connect_s` and `silence_s` are wall time."""
+    """Limits of a flight. SI; seconds of vehicle time, but `connect_s` and `silence_s` are wall
+    time."""
 
     connect_s: float = Field(default=20.0, gt=0, le=600)
     health_s: float = Field(default=90.0, gt=0, le=600)
@@ -75,13 +75,13 @@ class Limits(Parameters):
     engage_s: float = Field(default=10.0, gt=0, le=60)
     arm_s: float = Field(default=15.0, gt=0, le=60)
     lift_off_s: float = Field(default=8.0, gt=0, le=30)
-    late_s: float = Field(default=90.0, gt=0, le=600)  # at the start of the reference
+    late_s: float = Field(default=90.0, gt=0, le=600)  # after the planned end of the climb
     excite_s: float = Field(default=30.0, gt=5, le=600)
     land_s: float = Field(default=90.0, gt=0, le=600)
     disarm_s: float = Field(default=5.0, ge=2, le=60)
-    silence_s: float = Field(default=1.0, ge=0.2, le=60)  # of everything: then a landing is asked
-    blind_s: float = Field(default=0.5, ge=0.15, le=10)  # of position or attitude alone
-    missed_decisions: int = Field(default=3, ge=1, le=100)  # one after the other
-    begin_armed: bool = True  # false: a vehicle that somebody has armed already is refused
+    silence_s: float = Field(default=1.0, ge=0.2, le=60)  # no telemetry: then land
+    blind_s: float = Field(default=0.5, ge=0.15, le=10)  # no position, or no attitude: then land
+    missed_decisions: int = Field(default=3, ge=1, le=100)  # in a row: then land
+    begin_armed: bool = True  # false: refuse a vehicle that is armed already
     position_error_m: float = Field(default=5.0, gt=0.1, le=100)
     tilt_rad: float = Field(default=1.3, gt=0.2, le=1.5)

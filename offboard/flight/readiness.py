@@ -1,6 +1,7 @@
-"""The vehicle's own parameters before the flight: asked for, waited for, judged by the dialect.
+"""Parameters of the vehicle before the flight: requested, awaited, checked by the dialect.
 
-Sans-I/O: answers and times in, requests out. What must hold of a parameter stands in the dialect.
+Sans-I/O: replies and times are arguments, requests are returned. The dialect holds what must be
+true of each parameter.
 """
 
 from __future__ import annotations
@@ -11,46 +12,41 @@ from collections.abc import Mapping
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.outgoing import ParamRead
 
-ASK_AGAIN_S = 0.5
-PATIENCE_S = 2.0  # an autopilot need not answer, unless the dialect insists
+REPEAT_S = 0.5
+REPLY_TIMEOUT_S = 2.0  # for parameters that need not be answered
 
 
 class Readiness:
-    """What is known of one vehicle's watched parameters. Times are seconds on any one clock."""
+    """Progress of reading one vehicle's watched parameters. Times are seconds of any one clock."""
 
     def __init__(self) -> None:
         self._began_s = math.nan
-        self._asked_s = -math.inf
+        self._requested_s = -math.inf
 
     def due(self, dialect: Dialect, known: Mapping[str, float], now_s: float) -> list[ParamRead]:
-        """Requests to send now: every watched parameter that has not been answered."""
+        """Requests to send now, for every watched parameter without a reply."""
         if math.isnan(self._began_s):
             self._began_s = now_s
-        if now_s - self._asked_s < ASK_AGAIN_S - 1e-6:
+        if now_s - self._requested_s < REPEAT_S - 1e-6:
             return []
-        self._asked_s = now_s
-        watched = dialect.watched_parameters
-        return [ParamRead(parameter.name) for parameter in watched if parameter.name not in known]
+        self._requested_s = now_s
+        return [ParamRead(p.name) for p in dialect.watched_parameters if p.name not in known]
 
-    def settled(self, dialect: Dialect, known: Mapping[str, float], now_s: float) -> bool:
-        """Every parameter has answered, or had its time to."""
+    def complete(self, dialect: Dialect, known: Mapping[str, float], now_s: float) -> bool:
+        """Every parameter has a reply; those that need none may also have timed out."""
         if self.unanswered(dialect, known):
             return False
-        everything = all(parameter.name in known for parameter in dialect.watched_parameters)
-        return everything or now_s - self._began_s >= PATIENCE_S
+        all_known = all(parameter.name in known for parameter in dialect.watched_parameters)
+        return all_known or now_s - self._began_s >= REPLY_TIMEOUT_S
 
     @staticmethod
     def unanswered(dialect: Dialect, known: Mapping[str, float]) -> list[str]:
-        """Names of the parameters without which this autopilot must not be flown."""
+        """Names of the parameters without reply that this autopilot must not be flown without."""
         watched = dialect.watched_parameters
         return [p.name for p in watched if p.must_answer and p.name not in known]
 
     @staticmethod
-    def complaints(dialect: Dialect, known: Mapping[str, float]) -> list[str]:
-        """A sentence for each parameter that is wrong, with the line that mends it."""
-        judged = (
-            parameter.complaint(known[parameter.name])
-            for parameter in dialect.watched_parameters
-            if parameter.name in known
-        )
-        return [complaint for complaint in judged if complaint is not None]
+    def problems(dialect: Dialect, known: Mapping[str, float]) -> list[str]:
+        """One sentence for each parameter with an invalid value."""
+        checked = (p.problem(known[p.name]) for p in dialect.watched_parameters if p.name in known)
+        return [problem for problem in checked if problem]

@@ -1,7 +1,7 @@
-"""One record per control tick: what the law saw, decided and cost, as floats for the log.
+"""The log's record of one control tick: state, command, cost and times, as floats.
 
-The names below are the layout of DEBUG_FLOAT_ARRAY.data (name "pso", array_id 1) in the .tlog;
-score, report and replay read the log through the same table.
+The fields of `TickRecord` are the layout of DEBUG_FLOAT_ARRAY.data (name "pso", array_id 1) in the
+.tlog; the analysis reads the log with the same class.
 """
 
 from __future__ import annotations
@@ -17,9 +17,9 @@ from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
 from offboard.reference.base import FlatSample
 
-COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: what is sent
-# MAV_COMP_ID_ONBOARD_COMPUTER2, for what only the log sees: with sequence numbers of its own it
-# leaves no gap in those that the vehicle counts
+COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: the sender of frames
+# MAV_COMP_ID_ONBOARD_COMPUTER2: the sender of records, which are only logged. Its own sequence
+# numbers leave no gap in those of the frames that the vehicle counts.
 RECORD_COMPONENT_ID = 192
 RECORD_NAME = "pso"
 NAN = float("nan")
@@ -28,7 +28,7 @@ RECORD_ID = 1
 
 @dataclass(frozen=True, slots=True)
 class TickRecord:
-    """All floats, SI, NED, vehicle time. NaN where a phase has no such figure."""
+    """All floats, SI, NED, vehicle time; NaN for what the control law does not have."""
 
     phase: float  # of flight.phases.PHASE_CODES
     thrust_mps2: float
@@ -44,7 +44,7 @@ class TickRecord:
     cut_short: float
     at_bound: float
     solve_time_s: float
-    lateness_s: float  # from the arrival of the telemetry that made the tick to the decision
+    lateness_s: float  # wall time from the arrival of the telemetry to this record
     missed_ticks: float  # ticks skipped since the previous record
     predicted_north_m: float
     predicted_east_m: float
@@ -56,8 +56,8 @@ class TickRecord:
     disturbance_east_mps2: float
     disturbance_down_mps2: float
     hover_thrust: float
-    track_time_s: float  # time on the reference's own axis; NaN before it starts
-    seed_cost: float = NAN  # of the best plan a search started from
+    track_time_s: float  # time since the start of the track; NaN before it
+    seed_cost: float = NAN  # cost of the best plan that the search started from
 
     def data(self) -> tuple[float, ...]:
         """The values in the order of DEBUG_FLOAT_ARRAY.data."""
@@ -70,14 +70,15 @@ class TickRecord:
         phase: int,
         decision: Decision,
         state: PredictedState,
+        solve_time_s: float,
         lateness_s: float,
         missed_ticks: int,
         hover_thrust: float,
         track_time_s: float,
     ) -> TickRecord:
-        """Gather one tick: the decision, the state it was made for, and the loop's own figures."""
+        """The record of `decision`, made for the predicted `state`."""
         command, certificate = decision.command, decision.certificate
-        # The autopilot's own loop chooses thrust and direction itself
+        # with a position setpoint, the autopilot chooses thrust and direction
         direction = command.thrust_direction_ned if isinstance(command, Command) else (NAN,) * 3
         return cls(
             float(phase),
@@ -91,18 +92,12 @@ class TickRecord:
             float(certificate.iterations),
             float(certificate.cut_short),
             float(certificate.at_bound),
-            certificate.solve_time_s,
+            solve_time_s,
             lateness_s,
             float(missed_ticks),
-            float(state.position_ned_m[0]),
-            float(state.position_ned_m[1]),
-            float(state.position_ned_m[2]),
-            float(state.velocity_ned_mps[0]),
-            float(state.velocity_ned_mps[1]),
-            float(state.velocity_ned_mps[2]),
-            float(state.disturbance_ned_mps2[0]),
-            float(state.disturbance_ned_mps2[1]),
-            float(state.disturbance_ned_mps2[2]),
+            *_triple(state.position_ned_m),
+            *_triple(state.velocity_ned_mps),
+            *_triple(state.disturbance_ned_mps2),
             hover_thrust,
             track_time_s,
             certificate.seed_cost,
@@ -110,7 +105,7 @@ class TickRecord:
 
     @classmethod
     def from_data(cls, data: tuple[float, ...]) -> TickRecord:
-        """Read back a record; longer arrays (zero padding) are cut, shorter ones refused."""
+        """The record in DEBUG_FLOAT_ARRAY.data. Raises ValueError if the array is too short."""
         names = fields(cls)
         if len(data) < len(names):
             raise ValueError(f"a tick record has {len(names)} floats, this one {len(data)}")
@@ -118,7 +113,7 @@ class TickRecord:
 
 
 def reference_record(time_s: float, sample: FlatSample) -> ReferenceRecord:
-    """What was to be flown at a tick."""
+    """The reference at a tick, for the log."""
     return ReferenceRecord(
         time_s=time_s,
         position_ned_m=_triple(sample.position_ned_m),

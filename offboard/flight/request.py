@@ -1,4 +1,4 @@
-"""One configured flight, from names to a scored directory: what fly, compare and identify share."""
+"""One configured flight, from names and files to a log. Used by `fly`, `compare`, `identify`."""
 
 from __future__ import annotations
 
@@ -7,13 +7,18 @@ from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from offboard.control.catalogue import build
 from offboard.documents.reading import DocumentError
 from offboard.documents.shipped import locate, read_text
 from offboard.estimation.fusion import observer_of
-from offboard.flight import clock
 from offboard.flight.companion import Companion, Outcome
-from offboard.flight.configuration import FlightConfig, build_track, dump, load, read_part
+from offboard.flight.configuration import (
+    FlightConfig,
+    build_controller,
+    build_track,
+    dump,
+    load,
+    read_part,
+)
 from offboard.flight.log import FlightLog
 from offboard.flight.one_flight import Bundled, FlightParts, fly
 from offboard.flight.sitl import OWN_VEHICLES, SimulatorProcess
@@ -22,8 +27,12 @@ from offboard.flight.stop import StopRequests
 
 @dataclass(frozen=True, slots=True)
 class FlightRequest:
-    """What to fly and where: `choices` replaces vehicle, controller or reference by name or file,
-    `bundled` None flies whatever is at `connection`."""
+    """What to fly, and where to record it.
+
+    `choices` replaces "vehicle", "controller" or "reference" of `config` by a name or a file;
+    `assignments` are `key.path=value`. `sitl` flies the bundled simulator with `firmware`,
+    `scenario` and `sim_vehicle` (None: its default) instead of the vehicle at `connection`.
+    """
 
     directory: Path
     config: str = "flight"
@@ -31,7 +40,7 @@ class FlightRequest:
     assignments: tuple[str, ...] = ()
     seed: int | None = None
     connection: str = "udpin:127.0.0.1:14540"
-    sitl: bool = False  # on a bundled simulator: the next three are its own, None its default
+    sitl: bool = False
     firmware: str = "px4"
     scenario: str | None = None
     sim_vehicle: str | None = None
@@ -49,7 +58,7 @@ class FlightRequest:
         )
 
     def _check_bundled(self) -> None:
-        """Before anything is built, which may compile. Raises DocumentError."""
+        """Check the simulator's options before anything is compiled. Raises DocumentError."""
         if self.firmware not in OWN_VEHICLES:
             known = ", ".join(OWN_VEHICLES)
             raise DocumentError(f"--firmware {self.firmware}: unknown; there is {known}")
@@ -60,12 +69,10 @@ class FlightRequest:
 
 
 def build_parts(config: FlightConfig) -> FlightParts:
-    """Everything that flies, built. Raises DocumentError where the reference cannot be flown."""
+    """Build the parts of a flight. Raises DocumentError if the reference cannot be flown."""
     return FlightParts(
         vehicle=config.vehicle,
-        controller=build(
-            config.controller, config.vehicle, config.period_s, config.seed, clock.monotonic_s
-        ),
+        controller=build_controller(config),
         make_observer=lambda: observer_of(
             config.estimate, config.vehicle, config.observer, config.fusion
         ),
@@ -73,7 +80,7 @@ def build_parts(config: FlightConfig) -> FlightParts:
         limits=config.limits,
         period_s=config.period_s,
         deadline_s=config.deadline_s,
-        learning=config.identify,
+        identify=config.identify,
     )
 
 
@@ -84,10 +91,15 @@ def fly_request(
     simulator: SimulatorProcess | None = None,
     stops: StopRequests | None = None,
 ) -> Outcome:
-    """Fly and log. `simulator` runs the bundled vehicle, `stops` holds the requests to
-    stop; without them each is made for this flight alone.
+    """Fly one flight and log it.
 
-    Raises DocumentError, LinkError, LogError or KeyboardInterrupt before anything is sent.
+    `progress` is called often in flight, `tell` with sentences about the preparation. `simulator`
+    and `stops` may be shared by several flights; without them this flight makes its own.
+
+    Example: `fly_request(FlightRequest(Path("flights/1"), sitl=True)).exit_code` is 0 if the flight
+    was flown and landed.
+
+    Raises DocumentError, LinkError, LogError or KeyboardInterrupt, all before anything is sent.
     """
     with ExitStack() as stack:
         stops = stops or stack.enter_context(StopRequests())

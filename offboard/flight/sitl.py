@@ -1,6 +1,6 @@
-"""The bundled simulator as processes of their own: started, watched and always stopped.
+"""The bundled simulator as a process: started, watched and always stopped.
 
-`offboard` never imports `simulator`; they meet on the wire, and on a pipe that says what to fly.
+`offboard` never imports `simulator`. They exchange MAVLink, and on a pipe the simulator's options.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from types import TracebackType
 
 from offboard.documents.reading import DocumentError
 
-OWN_VEHICLES = {"px4": "px4_sih", "ardupilot": "arducopter"}  # flown by default, so known
+OWN_VEHICLES = {"px4": "px4_sih", "ardupilot": "arducopter"}  # the simulator's default vehicles
 STOP_S = 2.0
 ERRORS_BYTES = 65536
 USAGE = 2  # the simulator's exit code for options and files that it cannot use
@@ -28,14 +28,14 @@ USAGE = 2  # the simulator's exit code for options and files that it cannot use
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """Why a simulator is gone: one sentence, and whether its options or files are to blame."""
+    """How a simulator ended: one sentence. `unusable`: its options or files were wrong."""
 
     sentence: str
     unusable: bool
 
 
 def check_scenario(path: Path) -> None:
-    """Have the simulator read a scenario file. Raises DocumentError with what is wrong in it."""
+    """Let the simulator validate a scenario file. Raises DocumentError with its errors."""
     command = [sys.executable, "-m", "simulator", "--check", str(path)]
     answer = subprocess.run(command, capture_output=True, text=True, check=False)
     if answer.returncode:
@@ -43,8 +43,8 @@ def check_scenario(path: Path) -> None:
 
 
 class SimulatorProcess:
-    """`python -m simulator.pool`: loads from when it is entered, then flies vehicles one after
-    the other, each a process of its own. A context manager; leaving it ends everything."""
+    """Context manager around `python -m simulator.pool`, which loads once and then starts vehicles,
+    one after the other, each as a child process. Leaving it ends all processes."""
 
     def __init__(self) -> None:
         self._ending: Ending | None = None
@@ -61,61 +61,61 @@ class SimulatorProcess:
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=self._errors,
-            # Ctrl-C in the terminal must land the vehicle, not kill it
+            # Ctrl-C must reach only our process, which lands the vehicle
             start_new_session=True,
         )
 
     def launch(self, options: Sequence[str]) -> None:
         """Start a vehicle with `options` of the `simulator` command."""
-        if self._process.poll() is not None:  # a flight that lost it shall not be the last one
+        if self._process.poll() is not None:  # it died in an earlier flight
             self.close()
             self._open()
-        self._said_before = os.fstat(self._errors.fileno()).st_size
+        self._errors_before = os.fstat(self._errors.fileno()).st_size
         self._ending = None
-        self._tell(json.dumps(options).encode() + b"\n")
+        self._write(json.dumps(options).encode() + b"\n")
 
     @property
     def pid(self) -> int:
-        """Of the process that loaded; a vehicle is its child."""
+        """Process id of the pool; a vehicle is its child."""
         return self._process.pid
 
-    def ended(self, patience_s: float = 0.0) -> Ending | None:
-        """How the vehicle's process ended, or None while it runs; waits for its end so long."""
+    def ended(self, timeout_s: float = 0.0) -> Ending | None:
+        """How the vehicle's process ended, or None if it still runs after `timeout_s`."""
         assert self._process.stdout is not None
-        if self._ending is None and select.select([self._process.stdout], [], [], patience_s)[0]:
-            answer = self._process.stdout.readline()
-            self._ending = self._explained(int(answer) if answer else self._process.wait())
-            if not answer:
-                self.close()  # what it flew lives on
+        if self._ending is None and select.select([self._process.stdout], [], [], timeout_s)[0]:
+            code = self._process.stdout.readline()
+            self._ending = self._explain(int(code) if code else self._process.wait())
+            if not code:
+                self.close()  # the pool died, its vehicle may still run
         return self._ending
 
     def recall(self) -> None:
         """End the vehicle's process."""
         if self.ended() is None:
-            self._tell(b"\n")
+            self._write(b"\n")
             if self.ended(STOP_S) is None:
                 self.close()
 
-    def _tell(self, order: bytes) -> None:
+    def _write(self, line: bytes) -> None:
         assert self._process.stdin is not None
-        with suppress(BrokenPipeError):  # it is gone, which `ended` will say
-            self._process.stdin.write(order)
+        with suppress(BrokenPipeError):  # the pool died; `ended` reports it
+            self._process.stdin.write(line)
 
-    def _explained(self, code: int) -> Ending:
-        errors = os.pread(self._errors.fileno(), ERRORS_BYTES, self._said_before)
-        words = errors.decode(errors="replace").strip().splitlines()
+    def _explain(self, code: int) -> Ending:
+        errors = os.pread(self._errors.fileno(), ERRORS_BYTES, self._errors_before)
+        lines = errors.decode(errors="replace").strip().splitlines()
         if code == USAGE:
-            return Ending(words[-1] if words else "the bundled simulator was refused", True)
+            return Ending(lines[-1] if lines else "the bundled simulator refused its options", True)
         how = f"signal {-code}" if code < 0 else f"exit code {code}"
-        said = f": {words[-1]}" if words else ""
-        return Ending(f"the bundled simulator ended ({how}){said}", False)
+        detail = f": {lines[-1]}" if lines else ""
+        return Ending(f"the bundled simulator ended ({how}){detail}", False)
 
     def close(self) -> None:
-        """End everything."""
+        """End all processes."""
         if self._errors.closed:
             return
-        with suppress(ProcessLookupError, PermissionError):  # nobody is left
-            os.killpg(self._process.pid, signal.SIGKILL)  # itself and what it flies
+        with suppress(ProcessLookupError, PermissionError):  # no process is left
+            os.killpg(self._process.pid, signal.SIGKILL)  # the pool and its vehicle
         self._process.wait()
         for pipe in (self._process.stdin, self._process.stdout, self._errors):
             assert pipe is not None

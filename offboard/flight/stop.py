@@ -1,7 +1,7 @@
-"""Who asks us to end: the signals of a terminal or a service manager, noted and never raised.
+"""Stop requests: signals of a terminal or a service manager are stored and never raised.
 
-A KeyboardInterrupt that comes while machine code is compiled may die in a callback of the compiler,
-and the flight would begin. Hence a note, and moments at which it is heeded. Knows no flight.
+A KeyboardInterrupt during a compilation can be lost in a callback of the compiler, and the flight
+would begin. Therefore a signal sets a flag, which is checked at known places.
 """
 
 from __future__ import annotations
@@ -17,27 +17,28 @@ def interrupt() -> None:
 
 
 class StopRequests:
-    """Notes SIGINT, SIGTERM and, unless it is ignored (nohup), SIGHUP while entered.
+    """Context manager that stores SIGINT, SIGTERM and, unless it is ignored (nohup), SIGHUP.
 
-    `at_once` is called by a second one before the flight; in flight that is the loop's matter.
+    A second request exits immediately: before the flight it calls `at_once`, in flight the loop
+    sees `repeated`. SIGHUP never counts as a second one: a closing terminal may send it twice.
     """
 
     def __init__(self, at_once: Callable[[], None] = interrupt) -> None:
         self._at_once = at_once
-        self.asked = False
-        self.insisted = False  # SIGHUP does not insist: a closing terminal may send it twice
+        self.requested = False
+        self.repeated = False
         self.in_flight = False
 
-    def heed(self) -> None:
-        """Raise KeyboardInterrupt, here where nothing swallows it, if asked to end."""
-        if self.asked:
+    def check(self) -> None:
+        """Raise KeyboardInterrupt if a stop was requested."""
+        if self.requested:
             raise KeyboardInterrupt
 
     def __enter__(self) -> StopRequests:
         kinds = [signal.SIGINT, signal.SIGTERM]
         if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:
             kinds.append(signal.SIGHUP)
-        self._before = {kind: signal.signal(kind, self._note) for kind in kinds}
+        self._before = {kind: signal.signal(kind, self._store) for kind in kinds}
         return self
 
     def __exit__(
@@ -49,8 +50,8 @@ class StopRequests:
         for number, handler in self._before.items():
             signal.signal(number, handler)
 
-    def _note(self, number: int, frame: FrameType | None) -> None:
-        self.insisted |= self.asked and number != signal.SIGHUP
-        self.asked = True
-        if self.insisted and not self.in_flight:
+    def _store(self, number: int, frame: FrameType | None) -> None:
+        self.repeated |= self.requested and number != signal.SIGHUP
+        self.requested = True
+        if self.repeated and not self.in_flight:
             self._at_once()

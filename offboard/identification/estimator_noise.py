@@ -1,5 +1,5 @@
-"""What an estimator reports beside the motion: noise from sample to sample, and a velocity that is
-not the derivative of its position. Knows a trace and no vehicle.
+"""Noise of the vehicle's own estimator: white noise from sample to sample, and the part of the
+reported velocity that is not the derivative of the reported position.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from offboard.identification.trace import NORTH, POSITION, STAMP, VELOCITY, Trac
 
 Array = NDArray[np.float64]
 
-SLOWNESS_S = 0.5  # over which a velocity is judged
+MEAN_OVER_S = 0.5  # time over which reported velocity and position are compared
 
 
 @dataclass(frozen=True, slots=True)
 class EstimatorNoise:
-    """Standard deviations: from sample to sample of position (m), reported velocity (m/s) and
-    thrust direction (rad); and the part of the reported velocity that is not the derivative of the
-    reported position, as means over half a second."""
+    """Standard deviations; NaN where the trace is too short. The first three are white noise of
+    position (m), reported velocity (m/s) and thrust direction (rad); the last one is reported
+    velocity less the derivative of reported position (m/s), as means over MEAN_OVER_S."""
 
     position_m: float
     velocity_mps: float
@@ -29,20 +29,22 @@ class EstimatorNoise:
     velocity_contradiction_mps: float
 
 
-def noise_of(trace: Trace) -> EstimatorNoise:
-    """Of a stretch of flight; NaN where it is too short."""
-    velocity = trace.position[:, VELOCITY]
+def estimator_noise(trace: Trace) -> EstimatorNoise:
+    """Noise of the attitudes, positions and velocities in a stretch of flight."""
+    stamps, velocity = trace.position[:, STAMP], trace.position[:, VELOCITY]
+    direction = trace.attitude[:, NORTH : NORTH + 2]
     return EstimatorNoise(
-        position_m=_white_sd(trace.position[:, STAMP], trace.position[:, POSITION]),
-        velocity_mps=_white_sd(trace.position[:, STAMP], velocity),
-        attitude_rad=_white_sd(trace.attitude[:, STAMP], trace.attitude[:, NORTH : NORTH + 2]),
-        velocity_contradiction_mps=_contradiction(trace),
+        position_m=_white_sd(stamps, trace.position[:, POSITION]),
+        velocity_mps=_white_sd(stamps, velocity),
+        attitude_rad=_white_sd(trace.attitude[:, STAMP], direction),
+        velocity_contradiction_mps=_velocity_contradiction(trace),
     )
 
 
 def _white_sd(stamps: Array, signals: Array) -> float:
-    """What differs from sample to sample, (N, axes): each against the cubic through its two
-    neighbours on either side, which any motion follows; median, so that jumps do not count."""
+    """Sd of white noise in `signals` (N, axes): each sample less the cubic through its two
+    neighbours on either side, which follows any motion; by the median, so that jumps do not
+    count."""
     if len(signals) < 10:
         return math.nan
     away = np.stack([stamps[i : len(stamps) - 4 + i] - stamps[2:-2] for i in (0, 1, 3, 4)])
@@ -52,15 +54,14 @@ def _white_sd(stamps: Array, signals: Array) -> float:
             if i != j:
                 weights[i] *= away[j] / (away[j] - away[i])
     around = np.stack([signals[i : len(signals) - 4 + i] for i in (0, 1, 3, 4)])
-    surprise = signals[2:-2] - np.einsum("kn,kna->na", weights, around)
-    white = surprise / np.sqrt(1.0 + np.sum(weights**2, axis=0))[:, None]
+    residual = signals[2:-2] - np.einsum("kn,kna->na", weights, around)
+    white = residual / np.sqrt(1.0 + np.sum(weights**2, axis=0))[:, None]
     return float(np.median(np.abs(white))) / 0.6745  # of a normal distribution
 
 
-def _contradiction(trace: Trace) -> float:
-    """Mean reported velocity less the mean velocity of the reported position, over SLOWNESS_S."""
+def _velocity_contradiction(trace: Trace) -> float:
     stamps = trace.position[:, STAMP]
-    starts = np.arange(stamps[0], stamps[-1] - SLOWNESS_S, SLOWNESS_S)
+    starts = np.arange(stamps[0], stamps[-1] - MEAN_OVER_S, MEAN_OVER_S)
     if len(starts) < 2:
         return math.nan
     differences = []
@@ -71,6 +72,6 @@ def _contradiction(trace: Trace) -> float:
         )
         gap = travelled - position
         differences.append(
-            np.interp(starts + SLOWNESS_S, stamps, gap) - np.interp(starts, stamps, gap)
+            np.interp(starts + MEAN_OVER_S, stamps, gap) - np.interp(starts, stamps, gap)
         )
-    return float(np.std(differences) / SLOWNESS_S)
+    return float(np.std(differences) / MEAN_OVER_S)

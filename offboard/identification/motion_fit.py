@@ -1,9 +1,10 @@
-"""Drag, hover thrust and thrust lag from positions, attitudes and the thrust commanded.
+"""Drag, hover thrust, thrust lag and thrust delay from positions, attitudes and commanded thrust.
 
-A Kalman filter per axis follows the position under the acceleration that attitude and thrust must
-have given, allowing for an estimator that wanders and for a disturbance that drifts; what it could
-not foresee, its innovations, is white for the right constants, and least squares on it finds them
-(maximum likelihood; L. Ljung, System Identification, 1999, 7.4). Knows arrays and no flight.
+A Kalman filter per axis follows the reported position under the acceleration that attitude and
+thrust give. It allows for an estimator that wanders and for a disturbance that drifts; its
+innovations are white for the right constants, and least squares on them finds these (maximum
+likelihood; Ljung, System Identification, 1999, 7.4). The reported velocity is not used: on PX4 it
+is not the derivative of the reported position. SI, NED.
 """
 
 from __future__ import annotations
@@ -15,30 +16,224 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 
-from offboard.identification.motion import Motion, lagged_thrust
-from offboard.identification.response_fit import Estimate
-from offboard.model.kernel import array, entry, kernel
+from offboard.identification.response import first_order, linear_recursion
+from offboard.identification.trace import (
+    NORTH,
+    POSITION,
+    SENT_AT,
+    SENT_THRUST,
+    STAMP,
+    Trace,
+    thinned,
+)
+from offboard.identification.uncertainty import (
+    Estimate,
+    lag_count,
+    long_run_covariance,
+    sandwich,
+)
+from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
-# What is allowed for. Per root second: a position that wanders (PX4: .013-.030 m), an acceleration
-# that is not modelled (m/s), a disturbance that drifts (m/s^2; PX4's tilt error times g is .1).
-# Then: noise of the positions (m), speed and disturbance at the start (m/s, m/s^2).
-LATERAL = np.array([0.05, 0.1, 0.08, 0.001, 3.0, 0.5])
-# The vertical has no disturbance beside the hover thrust sought.
-VERTICAL = np.array([0.05, 0.1, 0.03, 0.001, 3.0, 0.001])
-# Innovations of a wandering estimator stay related for this long.
-RELATED_S = 2.0
+SPACING_S = 0.018  # closer positions are left out: they show nothing more
+DRAG_SPACING_S = 0.036  # the same where only the drag is sought
+SPEED_OVER_S = 0.5  # time over which a speed is measured
+RELATED_S = 2.0  # time over which innovations of a wandering estimator are autocorrelated
 
-DRAG_START, DRAG_UPPER = 0.6, 5.0
-# Least values to search from: without a lag thrust jumps between samples and has no slope.
-SEARCHED_FROM = (0.005, 0.03, 0.01)
+DRAG_UPPER_PS = 5.0
+# Least start values of inverse hover thrust, delay (s), lag (s) and drag (1/s): without a lag the
+# thrust jumps between samples and has no slope.
+STARTED_FROM = (1.01, 0.005, 0.03, 0.01)
 LAG_UPPER_S, THRUST_DELAY_UPPER_S = 0.4, 0.5
+
+
+class Motion:
+    """Positions of a trace with the attitude at their times, at least `spacing_s` apart.
+
+    `times` (N,), `positions` (3, N) NED in m, `direction_ne` (2, N) thrust direction north and
+    east, `upright` (N,) its part down.
+    """
+
+    def __init__(self, trace: Trace, spacing_s: float = SPACING_S) -> None:
+        rows = trace.position[thinned(trace.position[:, STAMP], spacing_s)]
+        rows = rows[(rows[:, STAMP] >= trace.begin_s) & (rows[:, STAMP] <= trace.end_s)]
+        self.times = rows[:, STAMP]
+        self.positions = rows[:, POSITION].T
+        stamps = trace.attitude[:, STAMP]
+        self.direction_ne = np.array(
+            [np.interp(self.times, stamps, trace.attitude[:, NORTH + axis]) for axis in (0, 1)]
+        )
+        self.upright = np.sqrt(np.maximum(1.0 - np.sum(self.direction_ne**2, axis=0), 0.01))
+        self._sent_at = trace.commands[:, SENT_AT]
+        self._sent_thrust = trace.commands[:, SENT_THRUST, None]
+
+    def thrust(self, delay_s: float, lag_s: float) -> Array:
+        """Thrust (N,) as a fraction of full throttle, after delay and first-order lag."""
+        return first_order(self.times, self._sent_at, self._sent_thrust, delay_s, lag_s)[:, 0]
+
+    @property
+    def spacing_s(self) -> float:
+        """Mean time from one position to the next."""
+        return float(self.times[-1] - self.times[0]) / (len(self.times) - 1)
+
+    @property
+    def speed_mps(self) -> float:
+        """Horizontal speed, rms, from positions SPEED_OVER_S apart."""
+        ends = self.times + SPEED_OVER_S
+        within = ends <= self.times[-1]
+        if not within.any():
+            return 0.0
+        moved = [
+            np.interp(ends[within], self.times, along) - along[within]
+            for along in self.positions[:2]
+        ]
+        return float(np.sqrt(np.mean(np.sum(np.square(moved), axis=0)))) / SPEED_OVER_S
+
+    @property
+    def sufficient(self) -> bool:
+        """Whether there are enough positions and commands for a fit."""
+        return len(self.times) >= 50 and len(self._sent_at) >= 3
+
+    @property
+    def counts(self) -> str:
+        return f"{len(self.times)} positions and {len(self._sent_at)} commands"
+
+
+def predicted_velocity(motion: Motion, vehicle: Vehicle) -> Array:
+    """Velocity (3, N) from thrust, attitude and drag alone; its mean is that of the positions."""
+    thrust = vehicle.thrust_max_mps2 * motion.thrust(vehicle.thrust_delay_s, vehicle.thrust_lag_s)
+    down = vehicle.gravity_mps2 - thrust * motion.upright
+    push = np.vstack((-thrust * motion.direction_ne, down))
+    push -= push.mean(axis=1, keepdims=True)  # a constant disturbance
+    drag_ps, steps_s = vehicle.drag_per_mass_ps, np.diff(motion.times)
+    travelled = motion.positions[:, -1] - motion.positions[:, 0]
+    mean = travelled / max(motion.times[-1] - motion.times[0], 1e-3)
+    push += drag_ps * mean[:, None]
+    gained = np.zeros((len(motion.times), 1, 3))
+    gained[1:, 0] = (0.5 * (push[:, 1:] + push[:, :-1]) * steps_s).T
+    velocity = linear_recursion(np.exp(-drag_ps * steps_s)[:, None, None], gained)[:, 0].T
+    shifted: Array = velocity + (mean - velocity.mean(axis=1))[:, None]
+    return shifted
+
+
+# ---------------------------------------------------------------------- Kalman filter
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """What the filter allows for along an axis. Per root second: wander of the position (PX4:
+    0.013 to 0.030 m), acceleration that is not modelled (m/s) and drift of the disturbance (m/s^2;
+    PX4: tilt error times g, 0.1). Noise of positions (m), and sd of velocity (m/s) and disturbance
+    (m/s^2) at the start."""
+
+    position: float
+    velocity: float
+    disturbance: float
+    measured: float
+    start_velocity: float
+    start_disturbance: float
+
+
+LATERAL = Noise(0.05, 0.1, 0.08, 0.001, 3.0, 0.5)
+# The vertical disturbance is a part of the hover thrust that is sought.
+VERTICAL = Noise(0.05, 0.1, 0.03, 0.001, 3.0, 0.001)
+
+
+class PositionFilter:
+    """Kalman filter of position, velocity and disturbance [p, v, d], with v' = a - drag v + d.
+
+    Its gains are those for `drag_ps`, where a search begins; they hardly depend on it. With fixed
+    gains the variance of the innovations is fixed too, so their sum of squares is a likelihood.
+    """
+
+    def __init__(self, times: Array, drag_ps: float, noise: Noise) -> None:
+        self._steps_s = np.diff(times)
+        densities = np.array((noise.position, noise.velocity, noise.disturbance))
+        growth = np.diag(densities**2)
+        variance = noise.measured**2
+        covariance = np.diag((variance, noise.start_velocity**2, noise.start_disturbance**2))
+        self._gains = np.empty((len(self._steps_s), 3))
+        self._sds = np.empty(len(self._steps_s))
+        steps = zip(self._steps_s, motion_transitions(self._steps_s, drag_ps), strict=True)
+        for i, (step_s, transition) in enumerate(steps):
+            covariance = transition @ covariance @ transition.T + growth * step_s
+            spread = covariance[0, 0] + variance
+            gain = covariance[0] / spread
+            covariance = covariance - gain[:, None] * covariance[0]
+            self._gains[i], self._sds[i] = gain, math.sqrt(spread)
+
+    def innovations(self, positions: Array, accelerations: Array, drag_ps: float) -> Array:
+        """Normalised innovations (axes, N - 1) for `positions` (axes, N) under `accelerations`
+        (axes, N) without drag, joined by straight lines."""
+        transitions = motion_transitions(self._steps_s, drag_ps)
+        mean = 0.5 * (accelerations[:, 1:] + accelerations[:, :-1]).T[:, None]
+        # A mean acceleration over a step acts as a disturbance, but does not stay
+        driven = transitions[:, :, 2:] * mean
+        driven[:, 2] = 0.0
+        kept = np.eye(3) - self._gains[:, :, None] * np.array((1.0, 0.0, 0.0))
+        states = np.zeros((len(positions.T), 3, len(positions)))
+        states[0, 0] = positions[:, 0]
+        states[1:] = kept @ driven + self._gains[:, :, None] * positions.T[1:, None]
+        states = linear_recursion(kept @ transitions, states)
+        predicted = (transitions[:, :1] @ states[:-1] + driven[:, :1])[:, 0]
+        surprises: Array = ((positions.T[1:] - predicted) / self._sds[:, None]).T
+        return surprises
+
+
+def motion_transitions(steps_s: Array, drag_ps: float) -> Array:
+    """Transitions (N, 3, 3) of [p, v, d] with p' = v, v' = d - drag v, d' = 0 over `steps_s`."""
+    drag_ps = max(drag_ps, 1e-6)
+    transitions = np.zeros((len(steps_s), 3, 3))
+    transitions[:, 0, 0] = transitions[:, 2, 2] = 1.0
+    transitions[:, 1, 1] = np.exp(-drag_ps * steps_s)
+    transitions[:, 0, 1] = transitions[:, 1, 2] = -np.expm1(-drag_ps * steps_s) / drag_ps
+    transitions[:, 0, 2] = (steps_s - transitions[:, 0, 1]) / drag_ps
+    return transitions
+
+
+# ---------------------------------------------------------------------- fits
+
+
+def fit_drag(motion: Motion, thrust_mps2: Array, start_ps: float) -> Estimate:
+    """Lateral drag per unit of mass, 1/s, searched from `start_ps`; `thrust_mps2` (N,) at the
+    motion's times."""
+    start_ps = min(max(start_ps, STARTED_FROM[3]), 0.9 * DRAG_UPPER_PS)
+    accelerations = -thrust_mps2 * motion.direction_ne
+    lateral = PositionFilter(motion.times, start_ps, LATERAL)
+    found = least_squares(
+        lambda drag: lateral.innovations(motion.positions[:2], accelerations, drag[0]).ravel(),
+        [start_ps],
+        bounds=([0.0], [DRAG_UPPER_PS]),
+        xtol=1e-4,
+        ftol=1e-9,
+        max_nfev=12,
+    )
+    curvature = found.jac.T @ found.jac
+    if curvature[0, 0] <= 0.0:
+        return Estimate(float(found.x[0]), math.inf)
+    count = len(motion.times) - 1
+    lags = lag_count(RELATED_S, motion.spacing_s, count)
+    north, east = (found.jac[:, 0] * found.fun).reshape(2, count, 1)
+    scores_covariance = long_run_covariance(north, lags) + long_run_covariance(east, lags)
+    variance = float(sandwich(curvature, scores_covariance)[0, 0])
+    return Estimate(float(found.x[0]), math.sqrt(max(variance, 0.0)))
+
+
+@dataclass(frozen=True, slots=True)
+class VerticalPrior:
+    """What is known beforehand: where the search for the hover thrust begins, and thrust delay,
+    thrust lag and drag with their uncertainty."""
+
+    hover_thrust: float
+    delay_s: Estimate
+    lag_s: Estimate
+    drag_ps: Estimate
 
 
 @dataclass(frozen=True, slots=True)
 class VerticalFit:
-    """`thrust_delay_s` and `thrust_lag_s` are known better as `thrust_effect_s`, their sum."""
+    """`thrust_effect_s`, the sum of delay and lag, is better known than its parts."""
 
     hover_thrust: Estimate
     thrust_lag_s: Estimate
@@ -47,134 +242,28 @@ class VerticalFit:
     drag_ps: Estimate
 
 
-@entry(array(1), array(2), array(2), array(1), array(1), array(2))
-def innovations(
-    times: Array, positions: Array, accelerations: Array, drag: Array, allowed: Array, out: Array
-) -> int:
-    """Normalised innovations `out` (axes, N - 1) of a filter [p, v, d] along each axis.
+def fit_vertical(motion: Motion, gravity_mps2: float, prior: VerticalPrior) -> VerticalFit:
+    """Hover thrust, delay and lag of the thrust, and vertical drag."""
+    known = (prior.delay_s, prior.lag_s, prior.drag_ps)
+    means = np.array([each.value for each in known])
+    sds = np.array([each.sd for each in known])
+    upper = np.array((50.0, THRUST_DELAY_UPPER_S, LAG_UPPER_S, DRAG_UPPER_PS))
+    start = np.clip([1.0 / prior.hover_thrust, *means], STARTED_FROM, upper - 1e-3)
+    vertical = PositionFilter(motion.times, start[3], VERTICAL)
 
-    v' = a - c v + d with `accelerations` (axes, N) joined by straight lines and `drag` (1,);
-    `allowed` (6,): densities per root second of p, v and d, sd of the positions, and of v and d at
-    the start.
-    """
-    for axis in range(out.shape[0]):
-        _filter(times, positions[axis], accelerations[axis], drag[0], allowed, out[axis])
-    return 0
-
-
-@kernel
-def _filter(
-    times: Array, positions: Array, accelerations: Array, drag: float, allowed: Array, out: Array
-) -> None:
-    p_density, v_density, d_density = allowed[0], allowed[1], allowed[2]
-    noise, start_v, start_d = allowed[3] ** 2, allowed[4] ** 2, allowed[5] ** 2
-    p, v, d = positions[0], 0.0, 0.0
-    pp, pv, pd = noise, 0.0, 0.0
-    vv, vd, dd = start_v, 0.0, start_d
-    for i in range(1, times.shape[0]):
-        h = times[i] - times[i - 1]
-        keep = math.exp(-drag * h)
-        share = (1.0 - keep) / drag if drag > 1e-9 else h
-        reach = (h - share) / drag if drag > 1e-6 else 0.5 * h * h
-        push = 0.5 * (accelerations[i - 1] + accelerations[i]) + d
-        p = p + share * v + reach * push
-        v = keep * v + share * push
-        # F = [[1, share, reach], [0, keep, share], [0, 0, 1]]; P = F P F' + Q
-        a0, a1, a2 = pp + share * pv + reach * pd, pv + share * vv + reach * vd, 0.0
-        a2 = pd + share * vd + reach * dd
-        b1, b2 = keep * vv + share * vd, keep * vd + share * dd
-        pp = a0 + share * a1 + reach * a2 + p_density**2 * h
-        pv = keep * a1 + share * a2
-        pd = a2
-        vv = keep * b1 + share * b2 + v_density**2 * h
-        vd = b2
-        dd = dd + d_density**2 * h
-        spread = pp + noise
-        surprise = positions[i] - p
-        out[i - 1] = surprise / math.sqrt(spread)
-        gain_p, gain_v, gain_d = pp / spread, pv / spread, pd / spread
-        p += gain_p * surprise
-        v += gain_v * surprise
-        d += gain_d * surprise
-        dd -= gain_d * pd
-        vd -= gain_v * pd
-        vv -= gain_v * pv
-        pd -= gain_p * pd
-        pv -= gain_p * pv
-        pp -= gain_p * pp
-
-
-def fit_drag(motion: Motion, thrust_mps2: Array) -> Estimate:
-    """Lateral drag per unit of mass, 1/s; thrust_mps2 (N,) at the motion's times."""
-    pulls = -thrust_mps2 * motion.direction_ne
-
-    def surprises(drag: Array) -> Array:
-        out = np.empty((2, len(motion.times) - 1))
-        innovations.call(motion.times, motion.positions[:2], pulls, drag, LATERAL, out)
-        return out.ravel()
-
-    result = least_squares(
-        surprises, [DRAG_START], bounds=([0.0], [DRAG_UPPER]), xtol=1e-4, ftol=1e-9, max_nfev=12
-    )
-    slope = float(np.sum(result.jac**2))
-    if slope <= 0.0:
-        return Estimate(float(result.x[0]), math.inf)
-    count = len(motion.times) - 1
-    lags = min(round(RELATED_S / motion.spacing_s), count // 4)
-    score = (result.jac[:, 0] * result.fun).reshape(2, count, 1)
-    variance = sum(float(long_run(rows, lags)[0, 0]) for rows in score)
-    return Estimate(float(result.x[0]), math.sqrt(max(variance, 0.0)) / slope)
-
-
-@dataclass(frozen=True, slots=True)
-class VerticalPrior:
-    """What is known of the vertical beforehand: where the search for the hover thrust begins, and
-    the rest with its uncertainty."""
-
-    hover_thrust: float
-    delay_s: Estimate
-    lag_s: Estimate
-    drag_ps: Estimate
-
-
-class _VerticalSurprises:
-    """Innovations (N - 1,) along the vertical with inverse hover thrust, delay and lag of the
-    thrust, and drag (4,); the next call writes over them."""
-
-    def __init__(self, motion: Motion, gravity_mps2: float) -> None:
-        self._gravity_mps2, self._upright = gravity_mps2, motion.upright
-        times, height = motion.times, motion.positions[2:]
-        self._parameters, self._thrust = np.empty(4), np.empty(len(times))
-        self._pull, self._out = np.empty_like(height), np.empty((1, len(times) - 1))
-        delay_and_lag_s, drag = self._parameters[1:3], self._parameters[3:]
-        self._lag = lagged_thrust.bound(times, motion.sent, delay_and_lag_s, self._thrust)
-        self._filter = innovations.bound(times, height, self._pull, drag, VERTICAL, self._out)
-
-    def __call__(self, parameters: Array) -> Array:
-        self._parameters[:] = parameters
-        self._lag()
-        inverse = self._parameters[0]
-        self._pull[0] = self._gravity_mps2 * (1.0 - inverse * self._thrust * self._upright)
-        self._filter()
-        surprises: Array = self._out[0]
+    def innovations(parameters: Array) -> Array:
+        inverse, delay_s, lag_s, drag_ps = parameters
+        thrust = inverse * motion.thrust(delay_s, lag_s)
+        accelerations = gravity_mps2 * (1.0 - thrust * motion.upright)
+        surprises: Array = vertical.innovations(motion.positions[2:], accelerations[None], drag_ps)[
+            0
+        ]
         return surprises
 
-
-def fit_vertical(motion: Motion, gravity_mps2: float, prior: VerticalPrior) -> VerticalFit:
-    """Hover thrust, lag and delay of the thrust."""
-    known = (prior.delay_s, prior.lag_s, prior.drag_ps)
-    surprises = _VerticalSurprises(motion, gravity_mps2)
-    upper = np.array((50.0, THRUST_DELAY_UPPER_S, LAG_UPPER_S, DRAG_UPPER))
-    start = np.clip(
-        [1.0 / prior.hover_thrust, *(each.value for each in known)],
-        (1.01, *SEARCHED_FROM),
-        upper - 1e-3,
-    )
-    # What is known weighs as much as the innovations really are
-    scale = min(float(np.sqrt(np.mean(surprises(start) ** 2))), 1.0)
-    means, sds = (np.array([getattr(each, name) for each in known]) for name in ("value", "sd"))
-    result = least_squares(
-        lambda x: np.concatenate((surprises(x), scale * (x[1:] - means) / sds)),
+    # What is known counts as one innovation of the size that they have
+    scale = min(float(np.sqrt(np.mean(innovations(start) ** 2))), 1.0)
+    found = least_squares(
+        lambda x: np.concatenate((innovations(x), scale * (x[1:] - means) / sds)),
         start,
         bounds=((1.0, 0.0, 0.0, 0.0), upper),
         x_scale=(1.0, 0.03, 0.03, 0.3),
@@ -182,36 +271,18 @@ def fit_vertical(motion: Motion, gravity_mps2: float, prior: VerticalPrior) -> V
         ftol=1e-6,
         max_nfev=12,
     )
-    inverse, delay_s, lag_s, drag_ps = result.x
-    covariance = _covariance(result.jac, result.fun, motion.spacing_s, len(known))
+    inverse, delay_s, lag_s, drag_ps = found.x
+    rows = len(motion.times) - 1
+    lags = lag_count(RELATED_S, motion.spacing_s, rows)
+    scores_covariance = long_run_covariance(found.jac[:rows] * found.fun[:rows, None], lags)
+    scores_covariance += found.jac[rows:].T @ found.jac[rows:]
+    covariance = sandwich(found.jac.T @ found.jac, scores_covariance)
     spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
-    effect_sd = math.sqrt(max(float(np.sum(covariance[1:3, 1:3])), 0.0))
+    effect_sd_s = math.sqrt(max(float(np.sum(covariance[1:3, 1:3])), 0.0))
     return VerticalFit(
-        hover_thrust=Estimate(1.0 / inverse, float(spread[0] / inverse**2)),
-        thrust_lag_s=Estimate(lag_s, float(spread[2])),
-        thrust_delay_s=Estimate(delay_s, float(spread[1])),
-        thrust_effect_s=Estimate(delay_s + lag_s, effect_sd),
-        drag_ps=Estimate(drag_ps, float(spread[3])),
+        hover_thrust=Estimate(float(1.0 / inverse), float(spread[0] / inverse**2)),
+        thrust_lag_s=Estimate(float(lag_s), float(spread[2])),
+        thrust_delay_s=Estimate(float(delay_s), float(spread[1])),
+        thrust_effect_s=Estimate(float(delay_s + lag_s), effect_sd_s),
+        drag_ps=Estimate(float(drag_ps), float(spread[3])),
     )
-
-
-def _covariance(jacobian: Array, residual: Array, spacing_s: float, known: int) -> Array:
-    """Of least squares on innovations that stay related for RELATED_S, the last `known` rows being
-    what was known beforehand."""
-    rows = len(residual) - known
-    score = jacobian[:rows] * residual[:rows, None]
-    lags = min(round(RELATED_S / spacing_s), rows // 4)
-    meat = long_run(score, lags) + jacobian[rows:].T @ jacobian[rows:]
-    bread = np.linalg.pinv(jacobian.T @ jacobian)
-    covariance: Array = bread @ meat @ bread
-    return covariance
-
-
-def long_run(score: Array, lags: int) -> Array:
-    """Covariance (k, k) of the sum of a related series (N, k) (W. Newey and K. West, 1987)."""
-    apart = np.arange(lags + 1)
-    related = np.array([score[lag:].T @ score[: len(score) - lag] for lag in apart.tolist()])
-    terms = (1.0 - apart / (lags + 1.0))[:, None, None] * (related + related.swapaxes(1, 2))
-    terms[0] = related[0]
-    total: Array = np.cumsum(terms, axis=0)[-1]
-    return total

@@ -1,7 +1,7 @@
-"""A stretch of flight as arrays: what was commanded, what the estimator said. Values only.
+"""A stretch of flight as arrays: commands sent, attitudes and positions received.
 
-All times are vehicle time in seconds; a command bears the stamp of the newest telemetry when it
-was sent. Shapes: N samples or M commands in the order of their stamps. NED, SI.
+All times are vehicle time in s; the stamp of a command is that of the newest telemetry when it was
+sent. Shapes: N samples or M commands in the order of their stamps. NED, SI.
 """
 
 from __future__ import annotations
@@ -22,9 +22,11 @@ POSITION, VELOCITY, POSITION_WIDTH = slice(1, 4), slice(4, 7), 7
 
 @dataclass(frozen=True, slots=True)
 class Trace:
-    """commands (M, 5): stamp, thrust direction north and east, collective thrust along the body
-    axis as a fraction of full throttle, course (rad). attitude (N, 4): stamp, thrust direction
-    north and east, course. position (N, 7): stamp, position, reported velocity.
+    """Commands and telemetry of a stretch of flight.
+
+    `commands` (M, 5): stamp, thrust direction north and east, collective thrust along the body
+    axis as a fraction of full throttle, course (rad). `attitude` (N, 4): stamp, thrust direction
+    north and east, course (rad). `position` (N, 7): stamp, position (m), reported velocity (m/s).
     """
 
     commands: Array
@@ -33,20 +35,20 @@ class Trace:
 
     @property
     def begin_s(self) -> float:
-        """The first time with both attitude and position; NaN without."""
+        """First time with both attitude and position; NaN if there is none."""
         if not len(self.attitude) or not len(self.position):
             return math.nan
         return float(max(self.attitude[0, STAMP], self.position[0, STAMP]))
 
     @property
     def end_s(self) -> float:
-        """The last time with both; NaN without."""
+        """Last time with both attitude and position; NaN if there is none."""
         if not len(self.attitude) or not len(self.position):
             return math.nan
         return float(min(self.attitude[-1, STAMP], self.position[-1, STAMP]))
 
     def between(self, begin_s: float, end_s: float) -> Trace:
-        """Telemetry from `begin_s` to `end_s`, and every command sent up to then."""
+        """Telemetry from `begin_s` to `end_s`, and all commands sent until `end_s`."""
         return Trace(
             self.commands[self.commands[:, SENT_AT] <= end_s],
             *(
@@ -57,8 +59,8 @@ class Trace:
 
 
 def clean(commands: Array, attitude: Array, position: Array) -> Trace:
-    """A Trace from rows in the order of arrival: what is not finite, repeats or steps back in time
-    is left out, commands of one stamp but the last of them are."""
+    """A Trace from rows in the order of arrival. Rows that are not finite or not newer than the one
+    before are left out; of commands with one stamp the last is kept."""
     return Trace(
         _latest(_ordered(commands, strictly=False)),
         _ordered(attitude, strictly=True),
@@ -84,7 +86,7 @@ def _latest(rows: Array) -> Array:
 
 
 def thinned(stamps: Array, spacing_s: float) -> NDArray[np.intp]:
-    """Rows at least so far apart."""
+    """Indices of rows at least `spacing_s` apart."""
     kept: list[int] = []
     last = -math.inf
     for row, stamp in enumerate(stamps.tolist()):
@@ -95,7 +97,7 @@ def thinned(stamps: Array, spacing_s: float) -> NDArray[np.intp]:
 
 
 class Recorder:
-    """The last stretch of a flight, kept while it is flown. Memory is fixed."""
+    """The last `kept_s` seconds of a flight, at up to `rate_hz`, in a fixed amount of memory."""
 
     def __init__(self, *, kept_s: float = 30.0, rate_hz: float = 125.0) -> None:
         rows = math.ceil(kept_s * rate_hz)
@@ -110,7 +112,7 @@ class Recorder:
     def on_command(
         self, time_s: float, direction_ne: tuple[float, float], thrust: float, course_rad: float
     ) -> None:
-        """A command sent: thrust as a fraction of full throttle, along the body axis."""
+        """A command sent; `thrust` along the body axis, as a fraction of full throttle."""
         self._commands.add((time_s, *direction_ne, thrust, course_rad))
 
     def on_attitude(
@@ -127,7 +129,7 @@ class Recorder:
         self._position.add((time_s, *position_ned_m, *velocity_ned_mps))
 
     def trace(self, begin_s: float, end_s: float) -> Trace:
-        """A copy of what is kept of that time."""
+        """A copy of what was recorded from `begin_s` to `end_s`, with all commands until then."""
         telemetry = (
             rows[(rows[:, STAMP] >= begin_s) & (rows[:, STAMP] <= end_s)]
             for rows in (self._attitude.kept, self._position.kept)

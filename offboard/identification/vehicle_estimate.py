@@ -1,9 +1,8 @@
-"""What is believed of the vehicle in flight, and the bandwidth that this bears.
+"""The vehicle constants in use during a flight, and the bandwidth that their delay supports.
 
-It begins with the vehicle file, takes over what identification found within bounds, blended over
-a second, and doubts what contradicts it: a delay that jumps, a tilt that does not answer as
-predicted. Doubt lowers the bandwidth at once; only a look that explains the flight raises it again.
-Knows values and vehicle time, no flight and no trace.
+They begin as the vehicle file's. Identified constants within bounds replace them, blended in over
+a second. Telemetry may contradict them later: the delay has changed, or the tilt does not respond
+as predicted. Then the bandwidth is lowered at once, until a fit explains the flight again.
 """
 
 from __future__ import annotations
@@ -13,23 +12,43 @@ from dataclasses import replace
 from typing import Any
 
 from offboard.control.delay_margin import needed_margin, supported_bandwidth
-from offboard.identification.adoption import LINK_S, bounded, later, mixed, told, with_link
-from offboard.identification.response_fit import Estimate, Unexplained
-from offboard.identification.stages import Identified
+from offboard.identification.adoption import (
+    LINK_S,
+    interpolated,
+    summary,
+    with_added_delay,
+    with_link_delay,
+    within_bounds,
+)
+from offboard.identification.attitude_fit import Unexplained
+from offboard.identification.uncertainty import Estimate
+from offboard.identification.vehicle_fit import Identified
 from offboard.model.vehicle import Vehicle
 
-BETTER = 0.7  # another look at the tilt is taken if its delay is this much surer; in doubt, it or
-# what was believed before, if it leaves this much less unexplained
-DIRECT_LINK_S = 0.004  # of the vehicle file's delay: telemetry's age where nothing is in between
-LEAST_JUMP_S, JUMP_SDS = 0.015, 4.0  # delays further apart contradict each other
-DECISIVE = ("tilt", "hover_thrust")  # far from the vehicle file's, the flight ends
-MOST_DOUBTS = 2  # so often contradicted, doubt and low bandwidth stay for good
-LINKED = ("yaw", "thrust_delay_s")  # moved by the tilt's delay, where they were not identified
+# A new tilt fit replaces the old one if its delay's sd, or in doubt the tilt that it leaves
+# unexplained, is less than this share of the old one's.
+BETTER = 0.7
+DIRECT_LINK_S = 0.004  # link delay without a slow link: age of telemetry
+LEAST_JUMP_S, JUMP_SDS = 0.015, 4.0  # delays that differ by more contradict each other
+DECISIVE = ("tilt", "hover_thrust")  # out of bounds, these end the flight
+MOST_CONTRADICTIONS = 2  # after so many the bandwidth stays low for the rest of the flight
+LINKED = ("yaw", "thrust_delay_s")  # changed with the tilt's delay where not identified themselves
+OUT_OF_BOUNDS = "it is out of bounds"
 
 
 class VehicleEstimate:
-    """`vehicle` is the vehicle file's, `unknown_delay_s` what its delay may be wrong by until it
-    is identified; see `IdentifySettings` for `factor` and `blend_s`."""
+    """The current estimate of one vehicle, `now`, and the bandwidth limit that goes with it.
+
+    Args:
+        vehicle: constants of the vehicle file, used until others are identified.
+        factor: greatest ratio, either way, of an identified constant to the vehicle file's.
+        blend_s: time over which identified constants replace those in use; 0: at once.
+        unknown_delay_s: what the vehicle file's delay may be wrong by.
+        period_s: control period.
+        bandwidth_radps: bandwidth of the controller as configured.
+
+    Methods that adopt or reject something return sentences for the user.
+    """
 
     def __init__(
         self,
@@ -50,163 +69,185 @@ class VehicleEstimate:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything of the previous flight."""
+        """Back to the vehicle file."""
         self._from = self.target = self.now = self._file
-        self._before: dict[str, Any] = {}  # what the tilt taken over last has replaced
+        self._replaced: dict[str, Any] = {}  # tilt constants before the last adoption
         self._blend_began_s = -math.inf
-        self._refused_drag_ps = math.inf
-        self._doubt: Estimate | None = None
-        self._doubts = 0
+        self._rejected_drag_ps = math.inf
+        self._other_delay: Estimate | None = None  # seen once, contradicts the one in use
+        self._contradictions = 0
         self.delay: Estimate | None = None  # of the tilt, once identified
-        self.doubted = False
-        self.limit_radps = self.cautious_radps = self._borne(self._unknown_delay_s)
+        self.in_doubt = False
+        self.limit_radps = self.cautious_radps = self._supported(self._unknown_delay_s)
         self.contradiction = ""  # why this vehicle file must not be flown with
 
-    # ------------------------------------------------------------------ on the way
+    # ------------------------------------------------------------------ blending
 
     @property
     def settled(self) -> bool:
+        """Whether the constants in use are the last ones adopted."""
         return self.now == self.target
 
-    def taken_over(self, time_s: float) -> bool:
+    def blended(self, time_s: float) -> bool:
+        """Whether `time_s` is after the end of the last blend."""
         return time_s >= self._blend_began_s + self._blend_s
 
     def step(self, time_s: float) -> None:
-        """One period further on the way to the target."""
+        """Blend by one control period."""
         share = 1.0
         if self._blend_s > 0.0:
             passed_s = time_s - self._blend_began_s + self._period_s
             share = min(passed_s / self._blend_s, 1.0)
-        self.now = self.target if share > 1.0 - 1e-6 else mixed(self._from, self.target, share)
+        settled = share > 1.0 - 1e-6
+        self.now = self.target if settled else interpolated(self._from, self.target, share)
 
-    def is_news(self, drag: Estimate | None, least_ps: float) -> bool:
-        """Whether a drag differs from the one believed, and from the one refused last."""
-        if drag is None:
-            return False
-        known = (self.target.drag_per_mass_ps, self._refused_drag_ps)
-        return all(abs(drag.value - each) > max(least_ps, drag.sd) for each in known)
+    def _blend_to(self, target: Vehicle, time_s: float) -> None:
+        self._from, self.target, self._blend_began_s = self.now, target, time_s
 
-    # ------------------------------------------------------------------ what was found
+    @property
+    def previous(self) -> Vehicle:
+        """The estimate with the tilt constants before the last adoption."""
+        return self.target.model_copy(update=self._replaced)
 
-    def expect_link(self, late: Estimate) -> list[str]:
-        """The link's delay is known before the flight: what remains unknown is the vehicle's own,
-        and the link's scatter."""
-        added_s = late.value - DIRECT_LINK_S
+    # ------------------------------------------------------------------ identified constants
+
+    def apply_link_delay(self, link: Estimate) -> list[str]:
+        """Add the link's delay, measured before the flight, to every delay of the vehicle. What
+        remains unknown is the vehicle's own delay and the link's scatter."""
+        added_s = link.value - DIRECT_LINK_S
         sentences = []
         if added_s >= LINK_S:
-            self.target = self.now = self._from = later(self._file, added_s)
-            sentences = [f"the link is {_told(late)} late, telemetry and setpoint together"]
-        unknown_s = self._unknown_delay_s + JUMP_SDS * late.sd
-        self.limit_radps = self.cautious_radps = self._borne(unknown_s)
+            self.target = self.now = self._from = with_added_delay(self._file, added_s)
+            sentences = [f"link delay {_in_ms(link)}, telemetry and setpoint together"]
+        unknown_s = self._unknown_delay_s + JUMP_SDS * link.sd
+        self.limit_radps = self.cautious_radps = self._supported(unknown_s)
         return sentences
 
-    def take(self, found: Identified, time_s: float) -> list[str]:
-        """Set out for what was found; what was taken, refused or out of bounds, in sentences."""
-        within, sentences = bounded(found, self._file, self._factor)
+    def adopt(self, found: Identified, time_s: float) -> list[str]:
+        """Begin to blend in what is within bounds."""
+        within, sentences = within_bounds(found, self._file, self._factor)
         for name in DECISIVE:
             if getattr(found, name) is not None and getattr(within, name) is None:
                 self.contradiction = "; ".join(sentences)
         applied = within.applied_to(self.target)
-        target = with_link(within, applied, self._file)
+        target = with_link_delay(within, applied, self._file)
         if within.tilt is not None:
             moved = [name for name in LINKED if getattr(target, name) != getattr(applied, name)]
-            self._before = {name: getattr(self.target, name) for name in ("tilt", *moved)}
+            self._replaced = {name: getattr(self.target, name) for name in ("tilt", *moved)}
             self.delay = within.tilt.delay_s
-            self._doubt = None
+            self._other_delay = None
         if target != self.target:
-            self._set_out(target, time_s)
-            sentences.insert(0, told(within))
+            self._blend_to(target, time_s)
+            sentences.insert(0, summary(within))
         if within.drag_ps is None and found.drag_ps is not None:
-            self._refused_drag_ps = found.drag_ps.value
+            self._rejected_drag_ps = found.drag_ps.value
         return sentences
 
-    def unsure(self) -> list[str]:
-        """What flying the vehicle file as it is costs."""
-        if self.limit_radps >= self._bandwidth_radps:
-            return []
-        return [
-            f"bandwidth lowered from {self._bandwidth_radps:.1f} to {self.limit_radps:.1f} rad/s: "
-            "the delay is the vehicle file's, not identified"
-        ]
+    def is_new_drag(self, drag: Estimate | None, least_ps: float) -> bool:
+        """Whether `drag` differs by more than `least_ps` and its sd from the one in use and from
+        the one rejected last."""
+        if drag is None:
+            return False
+        known = (self.target.drag_per_mass_ps, self._rejected_drag_ps)
+        return all(abs(drag.value - each) > max(least_ps, drag.sd) for each in known)
 
-    def conclude(self, refusal: str = "it is out of bounds") -> list[str]:
-        """The bandwidth that the delay bears as it is known now; `refusal`: why it is not."""
-        if self.delay is None:
-            self.limit_radps = self.cautious_radps
-            return [f"tilt as believed, bandwidth {self.limit_radps:.1f} rad/s: {refusal}"]
-        before = min(self.limit_radps, self._bandwidth_radps)
-        borne = self._borne(needed_margin(self.target, self.delay.sd))
-        trusted = self._doubts < MOST_DOUBTS
-        self.limit_radps = borne if trusted else min(borne, self.limit_radps)
-        now = min(self.limit_radps, self._bandwidth_radps)
-        self.doubted = not trusted
-        if now == before:
-            return []
-        return [
-            f"bandwidth {now:.1f} of {self._bandwidth_radps:.1f} rad/s: what a delay of "
-            f"{_told(self.delay)} bears"
-        ]
-
-    def look_again(self, found: Identified, now: Unexplained, time_s: float) -> list[str]:
-        """A later look at the tilt: better, the same, or a contradiction. `now`: what the belief
-        leaves of the same stretch."""
+    def review_tilt(self, found: Identified, now: Unexplained, time_s: float) -> list[str]:
+        """Compare a later fit of the tilt with the estimate, and adopt it if it is better. `now`
+        is what the estimate leaves unexplained in the same stretch of flight."""
         tilt = found.tilt
-        if tilt is None or bounded(found, self._file, self._factor)[1]:
+        if tilt is None or within_bounds(found, self._file, self._factor)[1]:
             return []
         if self.delay is None:
             better = True
         elif _apart(tilt.delay_s, self.delay):
-            if self._doubt is None or _apart(tilt.delay_s, self._doubt):
-                return self._doubt_delay(self.delay, tilt.delay_s)
+            if self._other_delay is None or _apart(tilt.delay_s, self._other_delay):
+                return self._on_other_delay(self.delay, tilt.delay_s)
             better = True
         else:
-            clearer = self.doubted and tilt.residual_rms < BETTER * now.scale
+            clearer = self.in_doubt and tilt.residual_rms < BETTER * now.rms
             better = clearer or tilt.delay_s.sd < BETTER * self.delay.sd
-        sentences = self.take(found, time_s) if better else []
-        left = replace(now, scale=tilt.residual_rms) if better else now
-        certain = not left.contradicts if self.doubted else better
-        return sentences + (self.conclude() if certain else [])
+        sentences = self.adopt(found, time_s) if better else []
+        left = replace(now, rms=tilt.residual_rms) if better else now
+        certain = not left.contradicts if self.in_doubt else better
+        return sentences + (self.update_bandwidth() if certain else [])
 
-    def _doubt_delay(self, known: Estimate, seen: Estimate) -> list[str]:
-        self._doubt, self.doubted = seen, True
-        limit_radps = self._borne(abs(seen.value - known.value) + seen.sd)
-        said = f"tilt delay {_told(seen)} contradicts the {_told(known)} identified"
-        return [f"{said}: {self._lowered(limit_radps)}"]
+    # ------------------------------------------------------------------ contradictions
 
-    def contradict(self, now: Unexplained, before: Unexplained, time_s: float) -> list[str]:
-        """The tilt does not answer as predicted; `before`: what the belief before leaves."""
-        self.doubted = True
-        self._doubts += 1
-        identified = self.target != self._file
-        said = "the identified vehicle" if identified else "the vehicle file"
-        said += f" contradicts telemetry: {now.told}"
-        if before.scale < BETTER * now.scale:
+    def _on_other_delay(self, known: Estimate, seen: Estimate) -> list[str]:
+        self._other_delay, self.in_doubt = seen, True
+        self._limit(self._supported(abs(seen.value - known.value) + seen.sd))
+        return [
+            f"tilt delay {_in_ms(seen)} contradicts the identified {_in_ms(known)}; "
+            f"{self._bandwidth_text}"
+        ]
+
+    def on_contradiction(self, now: Unexplained, before: Unexplained, time_s: float) -> list[str]:
+        """Lower the bandwidth because the tilt does not respond as predicted. `now` and `before`
+        are what the estimate and the previous one leave unexplained; the previous one is used again
+        if it explains more."""
+        self.in_doubt = True
+        self._contradictions += 1
+        vehicle = "identified vehicle" if self.target != self._file else "vehicle file"
+        sentence = (
+            f"the {vehicle} contradicts telemetry: {1e3 * now.rms:.0f} mrad of tilt unexplained "
+            f"(limit {1e3 * now.limit:.0f}, commanded {1e3 * now.commanded_rms:.0f})"
+        )
+        if before.rms < BETTER * now.rms:
             self.delay = None
-            self._set_out(self.before, time_s)
-            said += f", {before.told} by the one before, which is flown again"
-        said += f"; {self._lowered(self.cautious_radps)}"
-        return [said + (" for good" if self._doubts >= MOST_DOUBTS else "")]
+            self._blend_to(self.previous, time_s)
+            sentence += f"; the previous estimate, with {1e3 * before.rms:.0f} mrad, is used again"
+        self._limit(self.cautious_radps)
+        sentence += f"; {self._bandwidth_text}"
+        lasting = self._contradictions >= MOST_CONTRADICTIONS
+        return [sentence + (" for the rest of the flight" if lasting else "")]
 
-    def _set_out(self, target: Vehicle, time_s: float) -> None:
-        self._from, self.target, self._blend_began_s = self.now, target, time_s
+    # ------------------------------------------------------------------ bandwidth
 
-    def _borne(self, needed_s: float) -> float:
+    def without_identification(self) -> list[str]:
+        """What the bandwidth is limited to with the vehicle file as it is."""
+        if self.limit_radps >= self._bandwidth_radps:
+            return []
+        return [
+            f"{self._bandwidth_text}: without identification the vehicle file's delay may be wrong "
+            f"by {1e3 * self._unknown_delay_s:.0f} ms"
+        ]
+
+    def update_bandwidth(self, refusal: str = OUT_OF_BOUNDS) -> list[str]:
+        """Set the limit that the delay supports as it is known now; `refusal` is the reason why
+        the tilt was not identified, if it was not."""
+        if self.delay is None:
+            self.limit_radps = self.cautious_radps
+            return [f"{self._bandwidth_text}: tilt response not identified, {refusal}"]
+        before = min(self.limit_radps, self._bandwidth_radps)
+        supported = self._supported(needed_margin(self.target, self.delay.sd))
+        self.in_doubt = self._contradictions >= MOST_CONTRADICTIONS
+        self.limit_radps = min(supported, self.limit_radps) if self.in_doubt else supported
+        if min(self.limit_radps, self._bandwidth_radps) == before:
+            return []
+        cause = " by the" if self.limit_radps < self._bandwidth_radps else ":"
+        return [f"{self._bandwidth_text}{cause} identified delay, {_in_ms(self.delay)}"]
+
+    def _supported(self, needed_s: float) -> float:
         return supported_bandwidth(self.target, self._bandwidth_radps, self._period_s, needed_s)
 
-    def _lowered(self, limit_radps: float) -> str:
+    def _limit(self, limit_radps: float) -> None:
         self.limit_radps = min(self.limit_radps, limit_radps)
-        return f"bandwidth lowered to {min(self.limit_radps, self._bandwidth_radps):.1f} rad/s"
 
     @property
-    def before(self) -> Vehicle:
-        """With the tilt that was believed before the last was taken over."""
-        return self.target.model_copy(update=self._before)
+    def _bandwidth_text(self) -> str:
+        if self.limit_radps >= self._bandwidth_radps:
+            return f"bandwidth {self._bandwidth_radps:.1f} rad/s as configured"
+        return (
+            f"bandwidth limited to {self.limit_radps:.1f} rad/s "
+            f"(configured {self._bandwidth_radps:.1f})"
+        )
 
 
 def _apart(one: Estimate, other: Estimate) -> bool:
+    """Whether two delays contradict each other."""
     allowed_s = max(LEAST_JUMP_S, JUMP_SDS * math.hypot(one.sd, other.sd))
     return abs(one.value - other.value) > allowed_s
 
 
-def _told(delay: Estimate) -> str:
+def _in_ms(delay: Estimate) -> str:
     return f"{1e3 * delay.value:.0f} +- {1e3 * delay.sd:.0f} ms"

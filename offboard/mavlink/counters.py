@@ -1,8 +1,7 @@
-"""What arrived and what was thrown away, counted by reason.
+"""Counters of received bytes and frames, and of what was dropped, by reason.
 
-Knows no message contents. Two sums hold at any time and are tested: every byte received is framed,
-skipped or still pending; every frame is decoded, ignored (nobody asked for that message) or
-dropped for one reason.
+Two sums always hold and are tested: each byte received is framed, skipped or pending; each frame is
+decoded, ignored (a message that no decoder exists for) or dropped for exactly one reason.
 """
 
 from __future__ import annotations
@@ -13,23 +12,23 @@ from enum import Enum
 
 
 class DropReason(Enum):
-    """Why something that arrived did not become an event; the value is for a human."""
+    """Why received data did not become an event; the value is a text for the user."""
 
     # bytes that did not become a frame
     TRUNCATED = "a frame cut short by the end of its datagram"
-    BAD_CRC = "checksum wrong, or no frame at all"
-    INCOMPATIBLE = "incompatibility flags of a later MAVLink"
-    FOREIGN_PEER = "a datagram from somebody other than the vehicle's address"
+    BAD_CRC = "wrong checksum, or no frame"
+    INCOMPATIBLE = "incompatibility flags of a later MAVLink version"
+    FOREIGN_PEER = "a datagram from another address than the vehicle's"
     # frames
-    UNKNOWN_ID = "a message id without known checksum seed"
-    ECHO = "our own frame come back"
+    UNKNOWN_ID = "a message id whose CRC_EXTRA is unknown"
+    ECHO = "a frame of our own, received back"
     NO_VEHICLE = "before the first heartbeat of an autopilot"
-    UNSUPPORTED_AUTOPILOT = "the heartbeat of an autopilot without dialect"
+    UNSUPPORTED_AUTOPILOT = "a heartbeat of an autopilot without dialect"
     FOREIGN_SYSTEM = "another system id than the vehicle's"
     FOREIGN_COMPONENT = "another component of the vehicle than its autopilot"
-    NOT_FOR_US = "an acknowledgement addressed to somebody else"
-    IMPLAUSIBLE = "not finite, or out of range"
-    STALE = "older than what was already received of this message"
+    NOT_FOR_US = "an acknowledgement addressed to another system"
+    IMPLAUSIBLE = "a value that is not finite or out of range"
+    STALE = "older than the newest message of the same id"
 
 
 NOT_A_FRAME = frozenset(
@@ -69,12 +68,13 @@ class Counters:
 
 
 class SequenceTracker:
-    """Counts gaps in one sender's 8-bit sequence numbers into `Counters`."""
+    """Counts gaps in the 8-bit sequence numbers of one sender."""
 
     def __init__(self) -> None:
         self._last: int | None = None
 
-    def note(self, sequence: int, counters: Counters) -> None:
+    def count(self, sequence: int, counters: Counters) -> None:
+        """Update `counters.sequenced` and `counters.lost` with one received frame."""
         counters.sequenced += 1
         if self._last is None:
             self._last = sequence

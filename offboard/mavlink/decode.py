@@ -1,7 +1,7 @@
-"""Payloads of verified frames turned into events in NED, FRD and SI, or refused with a reason.
+"""Decoding: payloads of verified frames become events in NED, FRD and SI, or are refused.
 
-Every field is checked for finite and plausible here. Knows no sequence numbers, no peers and no
-time but the one in the message. pymavlink's dialect classes supply ids and layouts.
+Every field is checked here to be finite and in range. Knows no sequence numbers, no addresses and
+no clock. pymavlink's dialect classes supply ids and layouts.
 """
 
 from __future__ import annotations
@@ -45,21 +45,21 @@ _RESULTS = (  # MAV_RESULT
 
 
 class Address(NamedTuple):
-    """The sender of a message, or whom it is for."""
+    """MAVLink ids of the sender or the receiver of a message."""
 
     system_id: int
     component_id: int
 
 
 class Identity(NamedTuple):
-    """What a HEARTBEAT says about its sender: MAV_TYPE and MAV_AUTOPILOT."""
+    """MAV_TYPE and MAV_AUTOPILOT in a HEARTBEAT."""
 
     vehicle_type: int
     autopilot: int
 
 
 class TextChunk(NamedTuple):
-    """STATUSTEXT as it arrives: `last` when its end was marked. `text_id` 0: complete in itself."""
+    """One STATUSTEXT. `last`: its text is terminated. `text_id` 0: a text of one chunk."""
 
     severity: int
     data: bytes
@@ -69,13 +69,13 @@ class TextChunk(NamedTuple):
 
 
 def _unpack(message: Any, payload: bytes) -> tuple[Any, ...]:
-    """Fields in wire order; the zeros that MAVLink 2 cuts from the end are put back."""
+    """Fields in wire order, after adding the trailing zeros that MAVLink 2 omits."""
     layout: struct.Struct = message.unpacker
     return layout.unpack_from(payload.ljust(layout.size, b"\0"))
 
 
 def decode(message_id: int, payload: bytes, dialect: Dialect) -> events.Event | DropReason | None:
-    """The event in a payload, IMPLAUSIBLE, or None for a message that nobody asked for."""
+    """The event in a payload, IMPLAUSIBLE, or None for a message without decoder."""
     decoder = _DECODERS.get(message_id)
     return None if decoder is None else decoder(payload, dialect)
 
@@ -87,19 +87,19 @@ def decode_identity(payload: bytes) -> Identity:
 
 
 def decode_ack_address(payload: bytes) -> Address:
-    """Whom a COMMAND_ACK answers; zeros mean everybody."""
+    """Receiver of a COMMAND_ACK; 0 means all."""
     *_, system_id, component_id = _unpack(mavlink.MAVLink_command_ack_message, payload)
     return Address(system_id, component_id)
 
 
 def decode_timesync(payload: bytes) -> tuple[int, int]:
-    """(tc1, ts1) in nanoseconds; tc1 is 0 in a request."""
+    """TIMESYNC (tc1, ts1) in nanoseconds; tc1 is 0 in a request."""
     tc1, ts1 = _unpack(mavlink.MAVLink_timesync_message, payload)
     return tc1, ts1
 
 
 def decode_text_chunk(payload: bytes) -> TextChunk:
-    """One STATUSTEXT; the last chunk of a text has its terminator."""
+    """One STATUSTEXT."""
     severity, text, text_id, chunk = _unpack(mavlink.MAVLink_statustext_message, payload)
     data, terminator, _ = text.partition(b"\0")
     return TextChunk(severity, data, text_id, chunk, bool(terminator))
@@ -152,7 +152,7 @@ def _gps_fix(payload: bytes, _: Dialect) -> events.Event | DropReason | None:
 
 
 def _place(latitude: int, longitude: int, altitude_mm: int) -> Geodetic | None:
-    """From degrees * 1e7 and mm above mean sea level; None where no such place is."""
+    """From degrees * 1e7 and mm above mean sea level; None if out of range."""
     if abs(latitude) > 900_000_000 or abs(longitude) > 1_800_000_000:
         return None
     return Geodetic(latitude * 1e-7, longitude * 1e-7, altitude_mm * 1e-3)
@@ -163,7 +163,7 @@ def _global_origin(payload: bytes, _: Dialect) -> events.Event | DropReason:
         mavlink.MAVLink_gps_global_origin_message, payload
     )
     place = _place(latitude, longitude, altitude)
-    return DropReason.IMPLAUSIBLE if place is None else events.Origin(place, said=True)
+    return DropReason.IMPLAUSIBLE if place is None else events.Origin(place, reported=True)
 
 
 def _home(payload: bytes, _: Dialect) -> events.Event | DropReason:
@@ -173,7 +173,7 @@ def _home(payload: bytes, _: Dialect) -> events.Event | DropReason:
     place, far = _place(latitude, longitude, altitude), POSITION_LIMIT_M
     if place is None or not (-far < x < far and -far < y < far and -far < z < far):
         return DropReason.IMPLAUSIBLE
-    return events.Origin(origin_of(place, (x, y, z)), said=False)
+    return events.Origin(origin_of(place, (x, y, z)), reported=False)
 
 
 def _system_health(payload: bytes, _: Dialect) -> events.Event:
@@ -201,7 +201,7 @@ def _command_ack(payload: bytes, _: Dialect) -> events.Event:
 def _parameter(payload: bytes, dialect: Dialect) -> events.Event | DropReason:
     value, _, _, name, kind = _unpack(mavlink.MAVLink_param_value_message, payload)
     if dialect.parameter_encoding is ParameterEncoding.BYTEWISE and kind != _REAL32:
-        # from the bytes: as a float they may be a signalling NaN, which Python does not preserve
+        # from the bytes: as a float they may be a signalling NaN, which Python changes
         if kind not in _UNSIGNED_TYPES + _SIGNED_TYPES:
             return DropReason.IMPLAUSIBLE
         value = int.from_bytes(payload[:4].ljust(4, b"\0"), "little", signed=kind in _SIGNED_TYPES)
@@ -212,7 +212,7 @@ def _parameter(payload: bytes, dialect: Dialect) -> events.Event | DropReason:
 
 
 def printable(data: bytes) -> str:
-    """Text for a terminal: no control characters, whatever the wire brought."""
+    """Received text without control characters, safe to print on a terminal."""
     text = data.decode("utf-8", errors="replace")
     return "".join(c if c.isprintable() else " " for c in text).strip()
 

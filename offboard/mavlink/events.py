@@ -1,7 +1,7 @@
-"""What the session tells the flight: one frozen value per thing that happened on the wire.
+"""What the session reports to the flight: one frozen value per received message or change.
 
-NED, FRD, SI and vehicle time (`time_boot_ms` in seconds) everywhere; all fields are finite and in
-range, or the message was dropped and counted.
+NED, FRD, SI and vehicle time (`time_boot_ms` in seconds) everywhere. All fields are finite and in
+range; a message with any other value is dropped and counted.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
 
 @dataclass(frozen=True, slots=True)
 class VehicleFound:
-    """The first HEARTBEAT of an autopilot: from here on the session is pinned to it."""
+    """The first HEARTBEAT of an autopilot. From now on the session accepts only this vehicle."""
 
     system_id: int
     component_id: int
-    autopilot: str  # a key of the dialect table: "px4", "ardupilot"
+    autopilot: str  # a key of session.DIALECTS: "px4", "ardupilot"
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,21 +53,21 @@ class Attitude:
 
 @dataclass(frozen=True, slots=True)
 class GpsFix:
-    """GPS_RAW_INT with a 3D fix; `time_s` None where its stamp is not vehicle time."""
+    """GPS_RAW_INT with a 3D fix; `time_s` is None if its stamp is not vehicle time."""
 
     time_s: float | None
     place: Geodetic
     velocity_ne_mps: tuple[float, float] | None
-    accuracy_m: float | None  # horizontal, by the receiver's own account
+    accuracy_m: float | None  # horizontal, as the receiver reports it
 
 
 @dataclass(frozen=True, slots=True)
 class Origin:
-    """Where the local frame's origin is: said by GPS_GLOBAL_ORIGIN, or by HOME_POSITION, which
-    gives one point in both frames."""
+    """Place of the local frame's origin. `reported` is true for GPS_GLOBAL_ORIGIN; otherwise it is
+    computed from HOME_POSITION, which gives one point in both frames."""
 
     place: Geodetic
-    said: bool
+    reported: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -96,10 +96,10 @@ class CommandAck:
 
 @dataclass(frozen=True, slots=True)
 class StatusText:
-    """STATUSTEXT, whole."""
+    """STATUSTEXT, all chunks joined, trailing tab and NUL removed."""
 
     severity: int  # MAV_SEVERITY, 0 emergency .. 7 debug
-    text: str  # chunks joined, trailing tab and NUL removed
+    text: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -111,24 +111,24 @@ class Parameter:
 
 
 @dataclass(frozen=True, slots=True)
-class Moved:
-    """The vehicle is heard from another port of its host, and no longer from the one before: a
-    router was started again. `peer` is what it sends from now."""
+class PeerChanged:
+    """The vehicle now sends from another port of its host, for example after a restart of
+    mavlink-router."""
 
     peer: Hashable
 
 
 @dataclass(frozen=True, slots=True)
-class TimeAnswer:
-    """TIMESYNC, answered: what we stamped our question with, and the vehicle's time then."""
+class TimesyncReply:
+    """TIMESYNC reply of the vehicle: the stamp of our request, and vehicle time on its arrival."""
 
-    asked_ns: int
+    request_ns: int
     vehicle_ns: int
 
 
 @dataclass(frozen=True, slots=True)
-class Reset:
-    """The vehicle's time went backwards by more than reordering explains: it was rebooted."""
+class Rebooted:
+    """Vehicle time decreased by more than reordering explains: the vehicle was rebooted."""
 
     time_s: float
 
@@ -145,7 +145,7 @@ Event = (
     | CommandAck
     | StatusText
     | Parameter
-    | Moved
-    | TimeAnswer
-    | Reset
+    | PeerChanged
+    | TimesyncReply
+    | Rebooted
 )

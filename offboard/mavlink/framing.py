@@ -1,7 +1,8 @@
-"""Frames cut out of bytes, and put together: header, length, checksum. Knows no field.
+"""Framing: frames are found in received bytes and packed for sending. Knows no message fields.
 
-A known message is believed only with a correct checksum. After garbage the search goes on one byte
-later, so that no damaged length can swallow a good frame. Nothing here raises on any input.
+A frame of a known message needs a correct checksum. After bytes that are no frame the search
+continues one byte later, so that a damaged length cannot hide a good frame. Nothing here raises,
+whatever the input.
 
 MAVLink 2 serialisation: 0xFD, length, incompatibility flags, compatibility flags, sequence, system,
 component, 24-bit id, payload without its trailing zeros, CRC-16/MCRF4XX seeded with the message's
@@ -37,7 +38,7 @@ _CRC_EXTRA: dict[int, bytes] = {
 
 
 class Frame(NamedTuple):
-    """`verified`: the checksum was right; False only for message ids without known CRC_EXTRA."""
+    """`verified`: the checksum is correct. False only if the CRC_EXTRA of the id is unknown."""
 
     raw: bytes
     message_id: int
@@ -49,8 +50,8 @@ class Frame(NamedTuple):
 
 
 class FrameSplitter:
-    """Bytes in, frames out. A datagram holds whole frames; a stream (serial, TCP) holds any part,
-    and the unfinished end, at most one frame, waits for the next call."""
+    """Finds frames. A datagram holds whole frames. A stream (serial, TCP) may end within a frame,
+    which is kept for the next call."""
 
     def __init__(self, stream: bool, counters: Counters) -> None:
         self._stream = stream
@@ -93,14 +94,14 @@ class FrameSplitter:
             self._aligned = False
 
     def _parse_at(self, data: bytes, at: int) -> Frame | DropReason | None:
-        """The frame that begins at `at`, why there is none, or None to wait for more bytes."""
+        """The frame at `at`, why there is none, or None if more bytes are needed."""
         size = frame_size(data, at)
         if size is None or at + size > len(data):
             return None if self._stream else DropReason.TRUNCATED
         frame = parse(data, at, at + size)
         if isinstance(frame, DropReason) or frame.verified:
             return frame
-        # without a checksum a frame is believed only if it fills the space between two others
+        # without a known checksum a frame must fill the space between two others
         if not self._aligned:
             return DropReason.BAD_CRC
         if at + size == len(data):
@@ -111,7 +112,7 @@ class FrameSplitter:
 def pack(
     message_id: int, payload: bytes, sequence: int, system_id: int, component_id: int
 ) -> bytes:
-    """An unsigned MAVLink 2 frame. Zeros at the payload's end are cut, but not its first byte."""
+    """An unsigned MAVLink 2 frame. Trailing zeros of the payload are cut, except its first byte."""
     payload = payload[:1] + payload[1:].rstrip(b"\0")
     body = _HEADER_V2.pack(
         _V2,
@@ -130,7 +131,7 @@ def pack(
 
 
 def _next_magic(data: bytes, at: int) -> int:
-    """Index of the next byte that may begin a frame, or the length of `data`."""
+    """Index of the next start byte of a frame, or the length of `data`."""
     if data[at] == _V2:
         return at
     candidates = [i for i in (data.find(_V2, at), data.find(_V1, at)) if i >= 0]
@@ -138,7 +139,7 @@ def _next_magic(data: bytes, at: int) -> int:
 
 
 def frame_size(data: bytes, at: int) -> int | None:
-    """Length announced by the header at `at`; None while the header itself is unfinished."""
+    """Frame length given by the header at `at`; None if the header is incomplete."""
     if at + 3 > len(data):
         return None
     if data[at] == _V1:
@@ -148,7 +149,7 @@ def frame_size(data: bytes, at: int) -> int | None:
 
 
 def parse(data: bytes, at: int, end: int) -> Frame | DropReason:
-    """The frame of `frame_size` bytes in data[at:end], or what is wrong with it."""
+    """The frame in data[at:end], which `frame_size` has measured, or why it is refused."""
     if data[at] == _V1:
         _, length, sequence, system, component, message_id = data[at : at + _HEADER_BYTES_V1]
         payload_at = at + _HEADER_BYTES_V1

@@ -1,7 +1,7 @@
-"""What the flight asks to be sent: one frozen value per message, the twin of events.py.
+"""What the flight sends or records: one frozen value per message, the counterpart of events.py.
 
-NED, FRD, SI and vehicle time; conversion to the wire's units and frames happens in wire.py. The
-last three values, the records, are for our own log and are never sent.
+NED, FRD, SI and vehicle time; encode.py converts to the units and frames of MAVLink. The last three
+values, the records, are written to the flight log and never sent.
 """
 
 from __future__ import annotations
@@ -9,8 +9,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from offboard.mavlink.events import Triple
-
-FORCE_DISARM = 21196.0  # param2 of MAV_CMD_COMPONENT_ARM_DISARM: also in the air
 
 
 @dataclass(frozen=True, slots=True)
@@ -20,7 +18,7 @@ class AttitudeTarget:
     `thrust_mps2` is thrust per unit of mass, `thrust_direction_ned` the commanded third body axis
     (unit), `course_rad` the commanded heading. `hover_thrust` is the normalised thrust that holds
     the weight. `body_z_down` is the third component of the body's own third axis when the command
-    acts, for autopilots which divide by it; None: the commanded one.
+    acts, for autopilots that divide by it; None: that of `thrust_direction_ned`.
     """
 
     time_s: float
@@ -34,19 +32,19 @@ class AttitudeTarget:
 
 @dataclass(frozen=True, slots=True)
 class PositionTarget:
-    """SET_POSITION_TARGET_LOCAL_NED; what is None is left to the autopilot."""
+    """SET_POSITION_TARGET_LOCAL_NED with all fields in use."""
 
     time_s: float
-    position_ned_m: Triple | None = None
-    velocity_ned_mps: Triple | None = None
-    acceleration_ned_mps2: Triple | None = None
-    course_rad: float | None = None
-    course_rate_radps: float | None = None
+    position_ned_m: Triple
+    velocity_ned_mps: Triple
+    acceleration_ned_mps2: Triple
+    course_rad: float
+    course_rate_radps: float
 
 
 @dataclass(frozen=True, slots=True)
 class CommandLong:
-    """COMMAND_LONG. NaN in `parameters` means "not given", as MAVLink has it."""
+    """COMMAND_LONG. NaN in `parameters` means "not given", as in MAVLink."""
 
     command: int
     parameters: tuple[float, ...] = ()  # up to seven; the rest is 0
@@ -57,26 +55,17 @@ class CommandLong:
         return cls(400, (1.0,))
 
     @classmethod
-    def disarm(cls, force: bool = False) -> CommandLong:
-        """`force` disarms in the air too: the vehicle falls."""
-        return cls(400, (0.0, FORCE_DISARM if force else 0.0))
+    def disarm(cls) -> CommandLong:
+        return cls(400, (0.0,))
 
     @classmethod
     def land(cls) -> CommandLong:
         return cls(21)
 
     @classmethod
-    def return_to_launch(cls) -> CommandLong:
-        return cls(20)
-
-    @classmethod
     def message_interval(cls, message_id: int, rate_hz: float) -> CommandLong:
-        """MAV_CMD_SET_MESSAGE_INTERVAL; the wire's interval is in whole microseconds."""
+        """MAV_CMD_SET_MESSAGE_INTERVAL; the interval is in whole microseconds."""
         return cls(511, (float(message_id), float(round(1e6 / rate_hz))))
-
-    @classmethod
-    def request_message(cls, message_id: int) -> CommandLong:
-        return cls(512, (float(message_id),))
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,23 +76,15 @@ class ParamRead:
 
 
 @dataclass(frozen=True, slots=True)
-class ParamSet:
-    """PARAM_SET. An int sets an INT32 parameter, a float a REAL32 one."""
-
-    name: str
-    value: int | float
-
-
-@dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """HEARTBEAT of ourselves; `vehicle_type` is a MAV_TYPE."""
+    """Our HEARTBEAT; `vehicle_type` is a MAV_TYPE."""
 
     vehicle_type: int
 
 
 @dataclass(frozen=True, slots=True)
 class Timesync:
-    """TIMESYNC. Answer: our time, and the asker's stamp unchanged; question: 0 and our stamp."""
+    """TIMESYNC. Request: tc1 = 0 and our stamp. Reply: our time and the stamp of the request."""
 
     tc1_ns: int
     ts1_ns: int
@@ -111,8 +92,8 @@ class Timesync:
 
 @dataclass(frozen=True, slots=True)
 class StatusTextOut:
-    """STATUSTEXT, one chunk of at most 50 bytes (`texts.chunks` cuts longer ones); `text_id` 0:
-    complete in itself."""
+    """STATUSTEXT, one chunk of at most 50 bytes (see `texts.chunks`); `text_id` 0: a text of one
+    chunk."""
 
     severity: int
     data: bytes
@@ -134,8 +115,8 @@ class ReferenceRecord:
 
 @dataclass(frozen=True, slots=True)
 class SolverRecord:
-    """What a decision cost and is worth, logged as DEBUG_FLOAT_ARRAY: at most 58 numbers, which
-    may be NaN where a controller has no such figure."""
+    """Numbers of one decision or identification, logged as DEBUG_FLOAT_ARRAY: at most 58, NaN
+    where there is none."""
 
     time_s: float
     data: tuple[float, ...]
@@ -145,7 +126,7 @@ class SolverRecord:
 
 @dataclass(frozen=True, slots=True)
 class ConfigurationRecord:
-    """One piece of what the flight was flown with, logged as TUNNEL: at most 128 bytes."""
+    """One piece of the flight's configuration, logged as TUNNEL: at most 128 bytes."""
 
     data: bytes
     payload_type: int
@@ -156,7 +137,6 @@ Outgoing = (
     | PositionTarget
     | CommandLong
     | ParamRead
-    | ParamSet
     | Heartbeat
     | Timesync
     | StatusTextOut

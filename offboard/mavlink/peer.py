@@ -1,8 +1,8 @@
-"""Where the vehicle's bytes come from, and when somebody else may be it. Knows no message.
+"""The network address of the vehicle, and when another address takes its place.
 
-A router (mavlink-router, MAVProxy) that is started again sends from another port. From the host of
-the vehicle's peer, with the vehicle's ids, and once that peer is silent, this is the vehicle;
-anything else is a stranger, and so is everybody while the peer speaks.
+mavlink-router and MAVProxy send from another port after a restart. A datagram comes from the
+vehicle when it is from the host of the known address, holds a frame with the vehicle's ids, and the
+known address has been silent. All other addresses are foreign.
 """
 
 from __future__ import annotations
@@ -13,11 +13,11 @@ from offboard.mavlink.counters import Counters
 from offboard.mavlink.decode import Address
 from offboard.mavlink.framing import FrameSplitter
 
-PEER_SILENT_S = 0.5  # half of what ends a flight (`Limits.silence_s`), so that it can go on
+PEER_SILENT_S = 0.5  # half of `Limits.silence_s`, so that the flight can continue
 
 
 class Peer:
-    """None until it is pinned. `heard_s`: host time at which it last sent for the vehicle."""
+    """The vehicle's address, unknown until `pin`. `heard_s`: host time of its newest frame."""
 
     def __init__(self) -> None:
         self._place: Hashable | None = None
@@ -25,15 +25,14 @@ class Peer:
         self.heard_s = 0.0
 
     def pin(self, place: Hashable, vehicle: Address) -> None:
-        """From now on the vehicle is there."""
+        """The vehicle with these ids sends from `place`."""
         self._place, self._vehicle = place, vehicle
 
     def is_foreign(self, place: Hashable) -> bool:
-        """Whether it is somewhere else."""
         return self._vehicle is not None and place != self._place
 
     def moves_to(self, place: Hashable, datagram: bytes, now_s: float) -> bool:
-        """Whether the vehicle speaks from there now, which pins it there."""
+        """Whether `datagram` shows that the vehicle sends from `place` now; if so, pin it there."""
         if now_s - self.heard_s <= PEER_SILENT_S or not _same_host(place, self._place):
             return False
         moved = any(
@@ -46,5 +45,5 @@ class Peer:
 
 
 def _same_host(place: Hashable, other: Hashable) -> bool:
-    """Of UDP, where a place is (host, port)."""
+    """Of two UDP addresses (host, port)."""
     return isinstance(place, tuple) and isinstance(other, tuple) and place[0] == other[0]

@@ -1,12 +1,11 @@
-"""One conversation with one autopilot: who it is, what it said, what we send. Sans-I/O.
+"""The session with one autopilot, without I/O: identity, telemetry, and what must be sent to it.
 
-Bytes and `now_s` (monotonic host seconds) come in as arguments; events, frames for the log and
-frames to send go out as values. No socket, no file, no clock. Nothing that arrives can raise.
+Bytes and `now_s` (monotonic host seconds) are arguments. Events, frames for the log and messages to
+send are returned. No socket, no file, no clock. Nothing that arrives can raise.
 
-The session pins itself to the first autopilot it hears, by system, component and peer, and from
-then on drops and counts everybody else. Only where that peer has fallen silent may another port of
-the same host go on as the vehicle (`Peer`). Our system id is the vehicle's, so that it takes us
-for a part of itself.
+The first autopilot heard is the vehicle, known by system id, component id and network address. From
+then on every other sender is dropped and counted; `Peer` says when the vehicle's address may
+change. Our system id is the vehicle's, which makes us one of its components.
 """
 
 from __future__ import annotations
@@ -15,74 +14,75 @@ from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from offboard.mavlink import decode as inbound
-from offboard.mavlink import encode as outbound
 from offboard.mavlink import framing
 from offboard.mavlink.counters import Counters, DropReason, SequenceTracker
-from offboard.mavlink.decode import Address
+from offboard.mavlink.decode import (
+    Address,
+    decode,
+    decode_ack_address,
+    decode_identity,
+    decode_text_chunk,
+    decode_timesync,
+)
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.base import TYPE_GCS, TYPE_ONBOARD_CONTROLLER, Dialect, WantedMessage
 from offboard.mavlink.dialects.px4 import PX4
+from offboard.mavlink.encode import encode
 from offboard.mavlink.events import (
     Attitude,
     Event,
     LocalPosition,
-    Moved,
-    Reset,
-    TimeAnswer,
+    PeerChanged,
+    Rebooted,
+    TimesyncReply,
     VehicleFound,
 )
-from offboard.mavlink.outgoing import (
-    CommandLong,
-    Heartbeat,
-    Outgoing,
-    Record,
-    Timesync,
-)
+from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Record, Timesync
 from offboard.mavlink.peer import Peer
-from offboard.mavlink.telemetry_rates import LinkTime, Shortfall, TelemetryRates
+from offboard.mavlink.telemetry_rates import TelemetryRates
 from offboard.mavlink.texts import TextAssembler
-from offboard.mavlink.vehicle_time import Age, VehicleTime
+from offboard.mavlink.vehicle_time import Age, LinkTime, VehicleTime
 
 DIALECTS: Mapping[str, Dialect] = MappingProxyType({d.name: d for d in (PX4, ARDUPILOT)})
 
 _HEARTBEAT, _COMMAND_ACK, _TIMESYNC, _STATUSTEXT = 0, 77, 111, 253
 _AUTOPILOT_COMPONENT = 1
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
-_HEARTBEAT_PERIOD_S = 0.999  # 1 Hz, and no cycle late for a rounding error
+_HEARTBEAT_PERIOD_S = 0.999  # 1 Hz; below 1 s, so that no rounding error delays it by a cycle
 
 
 @dataclass(frozen=True, slots=True)
 class SessionSettings:
-    """`system_id` None takes the first autopilot heard. `stream`: serial or TCP, where bytes come
-    in any portions. `speaks_first`: heartbeat before anybody was heard (somebody listens at the
-    other end). `requests_intervals` False leaves the vehicle's rates alone. `wanted` replaces the
-    dialect's telemetry, `wanted_too` adds to it. `record_component_id` stamps the records that only
-    our log sees; each component id has its own sequence numbers.
+    """How a session behaves.
+
+    `record_component_id` is the sender of records, which only our log holds; each component id has
+    its own sequence numbers. `stream`: serial or TCP, bytes arrive in any portions. `sends_first`:
+    send heartbeats before an autopilot was heard. `extra_wanted` is telemetry besides that of the
+    dialect. `lockstep`: the vehicle waits for our replies, and the host times given to `receive`
+    and `poll` are ignored, so that nothing that is sent depends on them.
     """
 
-    system_id: int | None = None
     component_id: int = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
-    stream: bool = False
-    speaks_first: bool = False
-    requests_intervals: bool = True
-    wanted: tuple[WantedMessage, ...] | None = None
-    wanted_too: tuple[WantedMessage, ...] = ()
     record_component_id: int = 191
+    stream: bool = False
+    sends_first: bool = False
+    extra_wanted: tuple[WantedMessage, ...] = ()
+    lockstep: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class Reception:
-    """What one portion of bytes brought, to be handled in this order: log `frames` (all with a
-    correct checksum, whatever became of their content, except our own echoes), process `events`,
-    then encode and send `replies` (sequence numbers are given in the order of sending)."""
+    """Result of one portion of bytes, to be handled in this order: log `frames`, process `events`,
+    encode and send `messages`.
+
+    `frames` are all with a correct checksum, used or not, except our own. `messages` are what is
+    due by time and, last, the replies to TIMESYNC requests: in lockstep, what is sent after the
+    reply is applied one barrier later.
+    """
 
     frames: tuple[bytes, ...] = ()
     events: tuple[Event, ...] = ()
-    replies: tuple[Outgoing, ...] = ()
-
-
-_NOTHING = Reception()
+    messages: tuple[Outgoing, ...] = ()
 
 
 class Session:
@@ -93,13 +93,14 @@ class Session:
         self.counters = Counters()
         self.vehicle: VehicleFound | None = None
         self.dialect: Dialect | None = None
-        self._own = Address(settings.system_id or 1, settings.component_id)
+        self._own = Address(1, settings.component_id)
         self._peer = Peer()
         self._splitter = framing.FrameSplitter(settings.stream, self.counters)
         self._sequence_in = SequenceTracker()
         self._sequence_out: dict[int, int] = {}
         self._texts = TextAssembler()
         self._time = VehicleTime()
+        self._arrival_s = 0.0  # vehicle time when the newest datagram arrived
         self._link_time = LinkTime()
         self._rates = TelemetryRates((), 0.0)
         self._heartbeat_sent: tuple[float, float] | None = None  # host time, link time
@@ -107,15 +108,17 @@ class Session:
     # --- in ---
 
     def receive(self, datagram: bytes, peer: Hashable, now_s: float) -> Reception:
-        """Take a datagram (or any portion of a stream) that came from `peer`. Never raises."""
+        """Process a datagram, or any portion of a stream, that came from `peer`. Never raises."""
+        self._arrival_s = self._time.newest_s
+        now_s = self._clock_s(now_s)
         frames: list[bytes] = []
         events: list[Event] = []
         if self._peer.is_foreign(peer):
             if not self._peer.moves_to(peer, datagram, now_s):
                 self.counters.dropped[DropReason.FOREIGN_PEER] += 1
-                return _NOTHING
-            self._heartbeat_sent = None  # a router learns from it where we are
-            events.append(Moved(peer))
+                return Reception()
+            self._heartbeat_sent = None  # a router learns our address from it
+            events.append(PeerChanged(peer))
         replies: list[Outgoing] = []
         events.extend(self._texts.expire(now_s))
         for frame in self._splitter.split(datagram):
@@ -129,7 +132,7 @@ class Session:
                 self.counters.ignored += 1
             if frame.verified and outcome is not DropReason.ECHO:
                 frames.append(frame.raw)
-        return Reception(tuple(frames), tuple(events), tuple(replies))
+        return Reception(tuple(frames), tuple(events), (*self._due(now_s), *replies))
 
     def _accept(
         self,
@@ -139,28 +142,28 @@ class Session:
         events: list[Event],
         replies: list[Outgoing],
     ) -> DropReason | bool:
-        """Why the frame was dropped, or whether anybody wanted it."""
+        """Why the frame was dropped, or whether it was decoded."""
         if (frame.system_id, frame.component_id) == self._own:
             return DropReason.ECHO
-        stranger = self._stranger(frame, peer, events)
-        if stranger is not None:
-            return stranger
+        foreign = self._check_sender(frame, peer, events)
+        if foreign is not None:
+            return foreign
         if self.vehicle is not None:
             self._peer.heard_s = now_s
-            self._sequence_in.note(frame.sequence, self.counters)
+            self._sequence_in.count(frame.sequence, self.counters)
         if not frame.verified:
             return DropReason.UNKNOWN_ID
         if frame.message_id == _TIMESYNC:
-            tc1_ns, ts1_ns = inbound.decode_timesync(frame.payload)
+            tc1_ns, ts1_ns = decode_timesync(frame.payload)
             if tc1_ns == 0:
-                # at time 0 the answer would be taken for a question
+                # a reply at time 0 would look like a request
                 replies.append(Timesync(max(1, int(now_s * 1e9)), ts1_ns))
             elif self.vehicle is not None:
-                events.append(TimeAnswer(ts1_ns, tc1_ns))
+                events.append(TimesyncReply(ts1_ns, tc1_ns))
             return True
         return self._interpret(frame, now_s, events)
 
-    def _stranger(
+    def _check_sender(
         self, frame: framing.Frame, peer: Hashable, events: list[Event]
     ) -> DropReason | None:
         """Why this frame is not from our vehicle; the first heartbeat of an autopilot pins it."""
@@ -170,18 +173,17 @@ class Session:
             if frame.component_id != self.vehicle.component_id:
                 return DropReason.FOREIGN_COMPONENT
             return None
-        if self.settings.system_id not in (None, frame.system_id):
-            return DropReason.FOREIGN_SYSTEM
         if frame.component_id != _AUTOPILOT_COMPONENT:
             return DropReason.FOREIGN_COMPONENT
         if frame.message_id == _TIMESYNC and frame.verified:
-            return None  # a simulator in lockstep may wait for the answer before its heartbeat
+            return None  # a simulator in lockstep may need the reply before its first heartbeat
         if frame.message_id != _HEARTBEAT or not frame.verified:
             return DropReason.NO_VEHICLE
         return self._pin(frame, peer, events)
 
     def _pin(self, frame: framing.Frame, peer: Hashable, events: list[Event]) -> DropReason | None:
-        identity = inbound.decode_identity(frame.payload)
+        """Take the sender of this heartbeat as the vehicle, if it is a supported autopilot."""
+        identity = decode_identity(frame.payload)
         if identity.vehicle_type == TYPE_GCS or identity.autopilot == _NO_AUTOPILOT:
             return DropReason.NO_VEHICLE
         dialect = next(
@@ -193,8 +195,8 @@ class Session:
         self.vehicle = VehicleFound(frame.system_id, frame.component_id, dialect.name)
         self._peer.pin(peer, Address(frame.system_id, frame.component_id))
         self._own = Address(frame.system_id, self.settings.component_id)
-        self._heartbeat_sent = None  # the dialect may want another type: say it at once
-        self._watch_rates()
+        self._heartbeat_sent = None  # the dialect may need another type: send it at once
+        self._restart_rates()
         events.append(self.vehicle)
         return None
 
@@ -204,54 +206,54 @@ class Session:
         """Turn a frame of the vehicle into events."""
         assert self.dialect is not None
         if frame.message_id == _STATUSTEXT:
-            events.extend(self._texts.add(inbound.decode_text_chunk(frame.payload), now_s))
+            events.extend(self._texts.add(decode_text_chunk(frame.payload), now_s))
             return True
         if frame.message_id == _COMMAND_ACK and not self._for_us(frame.payload):
             return DropReason.NOT_FOR_US
-        event = inbound.decode(frame.message_id, frame.payload, self.dialect)
+        event = decode(frame.message_id, frame.payload, self.dialect)
         if isinstance(event, DropReason):
             return event
         age = Age.FRESH
         if isinstance(event, (LocalPosition, Attitude)):
-            age = self._time.judge(frame.message_id, event.time_s)
+            age = self._time.check(frame.message_id, event.time_s)
             if age is Age.STALE:
                 return DropReason.STALE
-        # only now: a stream that repeats itself must not look fast enough to fly on
+        # after the check of the stamp: duplicates must not raise the measured rate
         self._rates.count(frame.message_id, self._link_time.seconds)
         if event is None:
             return False
         if isinstance(event, (LocalPosition, Attitude)):
             if age is Age.REBOOTED:
-                self._begin_anew()
-                events.append(Reset(event.time_s))
+                self._sequence_in = SequenceTracker()
+                self._restart_rates()  # a rebooted vehicle has its default rates
+                events.append(Rebooted(event.time_s))
             self._link_time.vehicle(event.time_s, now_s)
         events.append(event)
         return True
 
     def _for_us(self, ack_payload: bytes) -> bool:
-        to = inbound.decode_ack_address(ack_payload)
+        to = decode_ack_address(ack_payload)
         return to.system_id in (0, self._own.system_id) and (
             to.component_id in (0, self._own.component_id)
         )
 
-    def _begin_anew(self) -> None:
-        """A rebooted vehicle has forgotten the rates we asked for and counts from zero."""
-        self._sequence_in = SequenceTracker()
-        self._watch_rates()
-
-    def _watch_rates(self) -> None:
+    def _restart_rates(self) -> None:
         assert self.dialect is not None
-        wanted = self.dialect.wanted if self.settings.wanted is None else self.settings.wanted
-        self._rates = TelemetryRates((*wanted, *self.settings.wanted_too), self._link_time.seconds)
+        wanted = (*self.dialect.wanted, *self.settings.extra_wanted)
+        self._rates = TelemetryRates(wanted, self._link_time.seconds)
 
     # --- out ---
 
-    def poll(self, now_s: float) -> tuple[bytes, ...]:
-        """Frames that are due: our heartbeat (1 Hz of host or vehicle time, whichever is faster)
-        and requests for telemetry that is missing or too slow. Call it every cycle."""
+    def poll(self, now_s: float) -> tuple[Outgoing, ...]:
+        """Messages that are due at `now_s`. Call it whenever nothing has arrived for a while."""
+        return self._due(self._clock_s(now_s))
+
+    def _due(self, now_s: float) -> tuple[Outgoing, ...]:
+        """Our heartbeat, at 1 Hz of host or vehicle time, whichever is faster, and requests for
+        telemetry that is missing or too slow."""
         self._link_time.host(now_s)
-        if self.dialect is None and not self.settings.speaks_first:
-            return ()  # PX4 remembers the type of every heartbeat and misses the one that changed
+        if self.dialect is None and not self.settings.sends_first:
+            return ()  # PX4 does not notice a change of the type: the first must be right
         due: list[Outgoing] = []
         link_s = self._link_time.seconds
         if self._heartbeat_sent is None or (
@@ -261,20 +263,19 @@ class Session:
             self._heartbeat_sent = (now_s, link_s)
             kind = TYPE_ONBOARD_CONTROLLER if self.dialect is None else self.dialect.heartbeat_type
             due.append(Heartbeat(kind))
-        if self.settings.requests_intervals:
-            due.extend(
-                CommandLong.message_interval(w.message_id, w.rate_hz)
-                for w in self._rates.due(link_s)
-            )
-        return tuple(self.encode(value) for value in due)
+        requests = self._rates.due(link_s)
+        return (*due, *(CommandLong.message_interval(w.message_id, w.rate_hz) for w in requests))
 
     def encode(self, outgoing: Outgoing) -> bytes:
-        """The frame, with the next sequence number. ValueError: not finite, out of range, or
-        addressed to the vehicle before one was found."""
+        """The frame of a message, with the next sequence number of its component.
+
+        Raises ValueError if a value is not finite or out of range, or if the message is for the
+        vehicle and none was found.
+        """
         target = None
         if self.vehicle is not None:
             target = Address(self.vehicle.system_id, self.vehicle.component_id)
-        packed = outbound.encode(outgoing, target, self.dialect)
+        packed = encode(outgoing, target, self.dialect)
         component_id = self.settings.component_id
         if isinstance(outgoing, Record):
             component_id = self.settings.record_component_id
@@ -282,19 +283,17 @@ class Session:
         self._sequence_out[component_id] = (sequence + 1) % 256
         return framing.pack(*packed, sequence, self._own.system_id, component_id)
 
-    # --- what is known of the link ---
+    def _clock_s(self, host_s: float) -> float:
+        return self._arrival_s if self.settings.lockstep else host_s
+
+    # --- state of the link ---
 
     @property
     def link_time_s(self) -> float:
-        """Seconds that follow the vehicle's time while it flows, else the host's."""
+        """Monotonic seconds that follow vehicle time, or host time while telemetry is missing."""
         return self._link_time.seconds
 
     @property
     def rates_hz(self) -> dict[str, float]:
-        """Measured rate of each wanted message over the last two seconds of vehicle time."""
+        """Measured rate of each wanted message over the last two seconds of `link_time_s`."""
         return self._rates.measured_hz(self._link_time.seconds)
-
-    @property
-    def shortfalls(self) -> list[Shortfall]:
-        """Wanted messages that come too slowly to engage."""
-        return self._rates.shortfalls(self._link_time.seconds)

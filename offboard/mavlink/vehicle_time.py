@@ -1,14 +1,18 @@
-"""Time stamps of telemetry, judged one by one. Knows no message but by its id."""
+"""Vehicle time: which time stamps of telemetry are valid, and the seconds that the session counts.
+
+Vehicle time is `time_boot_ms` in seconds. Host time is any monotonic clock, given as an argument.
+"""
 
 from __future__ import annotations
 
 from enum import Enum, auto
 
-_REORDERING_S = 2.0  # older than this against the newest is a reboot, not a late packet
+_REBOOT_S = 2.0  # a stamp older than the newest by more than this means a reboot, not reordering
+_SILENCE_S = 1.0
 
 
 class Age(Enum):
-    """Of a message, by its time stamp."""
+    """What the time stamp of a message means."""
 
     FRESH = auto()
     STALE = auto()
@@ -16,21 +20,49 @@ class Age(Enum):
 
 
 class VehicleTime:
-    """Judges time stamps: each message's must rise, and none may lie far behind the newest."""
+    """Checks time stamps: those of one message id must increase, none may be far behind the newest.
+
+    `newest_s` is the newest stamp of any message.
+    """
 
     def __init__(self) -> None:
-        self._newest_s = 0.0
+        self.newest_s = 0.0
         self._last_s: dict[int, float] = {}
 
-    def judge(self, message_id: int, time_s: float) -> Age:
-        if time_s < self._newest_s - _REORDERING_S:
-            self._newest_s = time_s
+    def check(self, message_id: int, time_s: float) -> Age:
+        if time_s < self.newest_s - _REBOOT_S:
+            self.newest_s = time_s
             self._last_s = {message_id: time_s}
             return Age.REBOOTED
         last_s = self._last_s.get(message_id)
         if last_s is not None and time_s <= last_s:
             return Age.STALE
         self._last_s[message_id] = time_s
-        if time_s > self._newest_s:
-            self._newest_s = time_s
+        self.newest_s = max(self.newest_s, time_s)
         return Age.FRESH
+
+
+class LinkTime:
+    """Monotonic `seconds` that follow vehicle time, or host time while telemetry is missing."""
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+        self._vehicle_s: float | None = None
+        self._received_s: float | None = None
+        self._host_s: float | None = None
+
+    def vehicle(self, time_s: float, now_s: float) -> None:
+        """Telemetry with the stamp `time_s` arrived at host time `now_s`. A stamp older than the
+        newest changes nothing: streams overtake each other."""
+        self._received_s = now_s
+        step_s = 0.0 if self._vehicle_s is None else time_s - self._vehicle_s
+        if self._vehicle_s is None or step_s > 0.0 or step_s < -_REBOOT_S:
+            self.seconds += min(max(step_s, 0.0), _SILENCE_S)
+            self._vehicle_s = time_s
+
+    def host(self, now_s: float) -> None:
+        """Host time is `now_s`; it counts once no telemetry has arrived for a second."""
+        flowing = self._received_s is not None and now_s - self._received_s <= _SILENCE_S
+        if not flowing and self._host_s is not None:
+            self.seconds += max(now_s - self._host_s, 0.0)
+        self._host_s = now_s

@@ -1,1 +1,1 @@
-"""The vehicle as mathematics: frames, state, parameters, dynamics. No I/O, no clock, no MAVLink."""
+"""The vehicle as mathematics: frames, states, parameters and dynamics. Arrays only."""

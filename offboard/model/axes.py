@@ -1,7 +1,7 @@
-"""The plant as an attitude setpoint sees it: the autopilot's attitude loop is part of the model.
+"""The linear axes of a vehicle that is sent attitude setpoints: its attitude loop is in the model.
 
 Written in the thrust direction b, acceleration = g e3 - T b - c v + d: the two lateral axes, the
-vertical and the course decouple, and no heading frame is needed. Delay is not part of these linear
+vertical and the course decouple, and no heading frame is needed. The delay is not part of these
 models: the observer predicts through it.
 """
 
@@ -12,28 +12,36 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import expm
 
-from offboard.model.kernel import kernel
+from offboard.compiled import kernel
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 Array = NDArray[np.float64]
 
-
-# A thrust without lag would be a feed-through; this lag is far below every sampling period.
+# Stands in for a lag of zero, which would make the input a state; far below every period.
 SHORTEST_THRUST_LAG_S = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
 class LinearModel:
-    """x' = A x + B u with one input: dynamics (n, n), input_map (n, 1)."""
+    """x' = A x + B u: dynamics A (n, n), input_map B (n, m)."""
 
     dynamics: Array
     input_map: Array
 
+    def sampled(self, period_s: float) -> LinearModel:
+        """x(k+1) = A_d x(k) + B_d u(k) with u held for `period_s` (zero-order hold, Eq. 14)."""
+        size, count = self.input_map.shape
+        flow = np.zeros((size + count, size + count))
+        flow[:size, :size], flow[:size, size:] = self.dynamics, self.input_map
+        step = expm(period_s * flow)
+        return LinearModel(step[:size, :size], step[:size, size:])
+
 
 def lateral_model(vehicle: Vehicle) -> LinearModel:
-    """One lateral axis, deviations [p, v, b, b'], input b_c: v' = -g b - c v, b'' = wn^2 (b_c - b)
-    - 2 z wn b' (the tilt response of `AxisResponse`)."""
+    """One lateral axis: state [p, v, b, b'], input b_c, as deviations. v' = -g b - c v and
+    b'' = wn^2 (b_c - b) - 2 z wn b', the tilt response of `AxisResponse`."""
     stiffness = vehicle.tilt.natural_frequency_radps**2
     dynamics = np.zeros((4, 4))
     dynamics[0, 1] = 1.0
@@ -45,8 +53,8 @@ def lateral_model(vehicle: Vehicle) -> LinearModel:
 
 
 def vertical_model(vehicle: Vehicle) -> LinearModel:
-    """The vertical axis, deviations [z, v_z, f_z], input f_c: v_z' = -f_z - c v_z,
-    f_z' = (f_c - f_z) / lag, f_z = T b_z being the vertical part of the thrust, m/s^2."""
+    """The vertical axis: state [z, v_z, f_z], input f_c, as deviations. v_z' = -f_z - c v_z and
+    f_z' = (f_c - f_z) / lag; f_z = T b_z is the vertical part of the thrust, m/s^2."""
     rate = 1.0 / max(vehicle.thrust_lag_s, SHORTEST_THRUST_LAG_S)
     drag = vehicle.drag_per_mass_ps
     dynamics = np.array([[0.0, 1.0, 0.0], [0.0, -drag, -1.0], [0.0, 0.0, -rate]])
@@ -54,8 +62,8 @@ def vertical_model(vehicle: Vehicle) -> LinearModel:
 
 
 def lead(value: Array, rate: Array, acceleration: Array, response: AxisResponse) -> Array:
-    """The command whose second-order response (delay aside) is the given motion:
-    s + 2 z / wn s' + s'' / wn^2. Any common shape."""
+    """The command to which a second-order response without delay follows the given motion:
+    s + 2 z / wn s' + s'' / wn^2. Arguments and result have one common shape."""
     frequency = response.natural_frequency_radps
     command: Array = (
         value + (2.0 * response.damping / frequency) * rate + acceleration / frequency**2

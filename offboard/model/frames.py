@@ -4,8 +4,8 @@ A quaternion is [w, x, y, z], Hamilton, unit, and turns FRD components into NED 
 convention of ATTITUDE_QUATERNION and SET_ATTITUDE_TARGET). Euler angles are Z-Y-X (yaw psi, pitch
 theta, roll phi), rad. The thrust direction b is the third body axis in NED, (0, 0, 1) when level.
 
-All functions broadcast over leading axes and are pure. Single rotations take a path over Python
-floats, because the control loop asks for them hundreds of times a second. Knows no vehicle.
+All functions are pure and broadcast over leading axes. A single rotation is computed with Python
+floats, because the control loop needs hundreds of them per second.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def wrap_pi(angle_rad: float) -> float: ...
 @overload
 def wrap_pi(angle_rad: Array) -> Array: ...
 def wrap_pi(angle_rad: float | Array) -> float | Array:
-    """Angle (...) rad -> the same angle in [-pi, pi]; exact for angles already inside."""
+    """Angle (...) rad -> the same angle in [-pi, pi]; exact where it is already in this range."""
     if isinstance(angle_rad, (float, int)):
         return math.remainder(angle_rad, _TURN) if math.isfinite(angle_rad) else math.nan
     angles: Array = np.asarray(angle_rad, dtype=np.float64)
@@ -49,8 +49,8 @@ def quaternion_from_euler(phi_rad: ArrayLike, theta_rad: ArrayLike, psi_rad: Arr
 def euler_from_quaternion(quaternion: ArrayLike) -> Array:
     """Quaternion (..., 4) of any non-zero length -> [phi, theta, psi] (..., 3) rad.
 
-    theta in [-pi/2, pi/2], phi and psi in [-pi, pi]. Half sum and half difference of roll and yaw
-    are found apart, so that the angles still describe the rotation when theta is +-pi/2.
+    theta in [-pi/2, pi/2], phi and psi in [-pi, pi]. Half the sum and half the difference of roll
+    and yaw are computed separately, so that the angles describe the rotation at theta = +-pi/2 too.
     """
     w, x, y, z = _components(quaternion)
     half_sum = np.arctan2(x + z, w - y)
@@ -104,8 +104,8 @@ def quaternion_from_thrust_direction(direction_ned: ArrayLike, course_rad: Array
     """Third body axis b (..., 3) of any length and course psi (...) -> quaternion (..., 4).
 
     The body y axis is normal to the plane of b and the course, hence Euler psi is the course
-    (also upside down). Safe where that is not defined: b along the course's own y axis rolls
-    +-pi/2, b zero or not finite is taken as level, a course not finite as north.
+    (also upside down). Defined for every input: for b along the y axis of the course the roll is
+    +-pi/2, b zero or not finite counts as level, a course that is not finite as north.
     """
     north, east, down = _components(direction_ned)
     course: Any = np.where(np.isfinite(course_rad), course_rad, 0.0)[()]
@@ -129,7 +129,7 @@ def _half_sine_cosine(angle_rad: Any) -> tuple[Any, Any]:
 
 
 def _components(vectors: ArrayLike) -> Any:
-    """Last axis apart: Python floats for a single vector, views (...) for many."""
+    """The elements of the last axis: Python floats for a single vector, views (...) for many."""
     array = np.asarray(vectors, dtype=np.float64)
     return array.tolist() if array.ndim == 1 else np.moveaxis(array, -1, 0)
 

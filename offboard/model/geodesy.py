@@ -1,4 +1,4 @@
-"""Latitude, longitude and altitude, and metres in the plane round an origin. No messages, no time.
+"""Latitude, longitude and altitude <-> metres in the local NED frame of an origin.
 
 The azimuthal equidistant projection on a sphere (J. P. Snyder, Map Projections, 1987, section 25):
 distances from the origin are true, as in the local frames of PX4 and ArduPilot.
@@ -14,7 +14,7 @@ Triple = tuple[float, float, float]
 
 
 class Geodetic(NamedTuple):
-    """A place: degrees, and metres above mean sea level."""
+    """A point: degrees, and metres above mean sea level."""
 
     latitude_deg: float
     longitude_deg: float
@@ -22,7 +22,7 @@ class Geodetic(NamedTuple):
 
 
 def position_ned_m(place: Geodetic, origin: Geodetic) -> Triple:
-    """North, east and down of `place` from `origin`."""
+    """North, east and down of `place` relative to `origin`, m."""
     latitude, reference = math.radians(place.latitude_deg), math.radians(origin.latitude_deg)
     turn = math.radians(place.longitude_deg - origin.longitude_deg)
     sine, cosine = math.sin(latitude), math.cos(latitude)
@@ -34,7 +34,7 @@ def position_ned_m(place: Geodetic, origin: Geodetic) -> Triple:
 
 
 def origin_of(place: Geodetic, known_ned_m: Triple) -> Geodetic:
-    """The origin from which `place` lies at `known_ned_m`."""
+    """The origin relative to which `place` is at `known_ned_m`."""
     metres = math.radians(1.0) * EARTH_RADIUS_M
     shrink = max(math.cos(math.radians(place.latitude_deg)), 1e-6)
     latitude, longitude, altitude = place

@@ -1,4 +1,4 @@
-"""The state of the vehicle at the time when a command sent now takes effect. Values."""
+"""The state of the vehicle at the time when a command sent now takes effect."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class PredictedHeave:
-    """The vertical motion at `time_s`, vehicle time, when the *thrust* of a command sent now takes
-    effect: down is positive; `thrust_down_mps2` is T b_z."""
+    """The vertical motion at `time_s` (vehicle time), when the thrust of a command sent now takes
+    effect. Down is positive; `thrust_down_mps2` is the vertical part T b_z of the thrust."""
 
     time_s: float
     position_down_m: float
@@ -23,14 +23,24 @@ class PredictedHeave:
 
 @dataclass(frozen=True, slots=True)
 class PredictedState:
-    """The observer's state at `time_s`, vehicle time, when a command sent now takes effect.
+    """The state predicted by the observer for `time_s`, when a command sent now takes effect.
 
-    Shapes (3,), NED, SI. `thrust_direction_ned` is the third body axis b and
-    `thrust_direction_rate_ned_ps` its derivative; acceleration = g e3 - T b - c v + d with
-    `disturbance_ned_mps2` d and `thrust_mps2` T (after the thrust's lag).
+    Acceleration = g e3 - T b - c v + d, with thrust T, direction b, drag c and disturbance d.
 
-    Thrust acts sooner than tilt. A vertical loop closed on `time_s` would wait for the tilt and,
-    from a difference of about 0.1 s on, cycle; `heave` is the vertical motion at its own time.
+    Attributes:
+        time_s: Vehicle time, s: the tick plus the delay of the tilt.
+        position_ned_m: (3,), in the autopilot's local NED frame.
+        velocity_ned_mps: (3,).
+        thrust_direction_ned: (3,), unit vector b: the body's down axis in NED, (0, 0, 1) if level.
+        thrust_direction_rate_ned_ps: (3,), derivative of b, 1/s.
+        course_rad: Heading of the nose, 0 = north, clockwise, -pi .. pi.
+        course_rate_radps: Its derivative.
+        thrust_mps2: Thrust per unit of mass T that acts, after its lag.
+        disturbance_ned_mps2: (3,), estimated d: wind, wrong mass or hover thrust.
+        rates_frd_radps: (3,), body rates p, q, r.
+        heave: The vertical motion at its own time. Thrust acts sooner than tilt; a vertical loop
+            closed on `time_s` would wait for the tilt and, from a difference of about 0.1 s on,
+            oscillate. None: not predicted separately.
     """
 
     time_s: float

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from offboard.model.kernel import kernel
+from offboard.compiled import kernel
 from offboard.model.state import EULER, INPUT_SIZE, QUATERNION
 from offboard.model.vehicle import Vehicle
 
@@ -131,7 +131,7 @@ def _euler_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, out: An
 
 
 @kernel
-def _quaternion_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, out: Any) -> None:
+def quaternion_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, out: Any) -> None:
     qw, qx, qy, qz = state[0], state[1], state[2], state[3]
     p, q, r = state[4], state[5], state[6]
     # Body axes in NED, columns of the rotation FRD -> NED
@@ -175,22 +175,31 @@ def derivative_into(state: Any, inputs: Any, wind_ned: Any, parameters: Any, out
     if state.shape[0] == 12:
         _euler_into(state, inputs, wind_ned, parameters, out)
     else:
-        _quaternion_into(state, inputs, wind_ned, parameters, out)
+        quaternion_into(state, inputs, wind_ned, parameters, out)
 
 
 @kernel
 def rk4_into(
-    state: Any, inputs: Any, wind_ned: Any, parameters: Any, step_s: float, scratch: Any, out: Any
+    derivative: Any,
+    state: Any,
+    inputs: Any,
+    wind_ned: Any,
+    parameters: Any,
+    step_s: float,
+    scratch: Any,
+    out: Any,
 ) -> None:
-    """One RK4 step of one state into `out`, which may be `state`. `scratch` is (3, state size)."""
+    """One RK4 step of one state into `out`, which may be `state`. `derivative` is
+    `derivative_into`, or `quaternion_into` where only states of 13 numbers come; `scratch` is
+    (3, state size)."""
     slope, total, probe = scratch[0], scratch[1], scratch[2]
-    derivative_into(state, inputs, wind_ned, parameters, total)
+    derivative(state, inputs, wind_ned, parameters, total)
     for stage in range(1, 4):
         reach = step_s if stage == 3 else 0.5 * step_s
         previous = total if stage == 1 else slope
         for i in range(state.shape[0]):
             probe[i] = state[i] + reach * previous[i]
-        derivative_into(probe, inputs, wind_ned, parameters, slope)
+        derivative(probe, inputs, wind_ned, parameters, slope)
         weight = 1.0 if stage == 3 else 2.0
         for i in range(state.shape[0]):
             total[i] += weight * slope[i]

@@ -1,8 +1,7 @@
-"""Layout of states and inputs, and the way between the two charts of the rigid body.
+"""Layout of states and inputs, and the conversion between the two charts of the rigid body.
 
-A state is an array (..., 12) in the paper's order (Eq. 5) or (..., 13) with a quaternion, which
-has no singularity and is what the simulator integrates. Inputs (Eq. 6) are (..., 4). Names only:
-knows no dynamics and no vehicle.
+A state is an array (..., 12) in the paper's order (Eq. 5), or (..., 13) with a quaternion, which
+has no singularity and is what the simulator integrates. Inputs (Eq. 6) are (..., 4).
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ INPUT_SIZE: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class Chart:
-    """Where the parts of a state lie along its last axis."""
+    """The parts of a state along its last axis."""
 
     size: int
     attitude: slice
@@ -48,7 +47,7 @@ QUATERNION: Final = Chart(13, slice(0, 4), slice(4, 7), slice(7, 10), slice(10, 
 
 
 def quaternion_state(euler_state: Array) -> Array:
-    """Eq. 5 state (..., 12) -> quaternion state (..., 13); velocity turns from body to NED."""
+    """Eq. 5 state (..., 12) -> quaternion state (..., 13); velocity from body axes to NED."""
     phi, theta, psi = np.moveaxis(euler_state[..., EULER.attitude], -1, 0)
     quaternion = quaternion_from_euler(phi, theta, psi)
     velocity_ned = np.einsum(
@@ -61,7 +60,7 @@ def quaternion_state(euler_state: Array) -> Array:
 
 
 def euler_state(quaternion_state: Array) -> Array:
-    """Quaternion state (..., 13) -> Eq. 5 state (..., 12); velocity turns from NED to body."""
+    """Quaternion state (..., 13) -> Eq. 5 state (..., 12); velocity from NED to body axes."""
     quaternion = quaternion_state[..., QUATERNION.attitude]
     velocity_body = np.einsum(
         "...ji,...j->...i",

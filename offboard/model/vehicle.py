@@ -1,7 +1,7 @@
-"""What is believed of one vehicle: mass, drag, thrust scale and the response of its attitude loop.
+"""Parameters of one vehicle: mass, drag, thrust and the response of its attitude loop.
 
-A vehicle file (`config/vehicles/*.yaml`) is one `Vehicle`. The controller plans with it; the
-simulator builds its truth from one (its own, possibly another). Pure data: no file is read here.
+A vehicle file (`config/vehicles/*.yaml`) is one `Vehicle`. The controller uses it as its model; the
+simulated vehicle is made from one too, which may be another. No file is read here.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ NonNegativeTriple = tuple[
     Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]
 ]
 
-DRAG_PER_MASS_MOST_PS = 100.0  # falling, it has 0.1 m/s: no motion to control is left
+DRAG_PER_MASS_MOST_PS = 100.0  # falls at 0.1 m/s: nothing is left to control
 
 
 class AxisResponse(Parameters):
     """Closed attitude loop of one axis: s'' = wn^2 (s_c(t - D) - s) - 2 z wn s'.
 
-    The delay runs from the vehicle time of the newest telemetry when a command is sent to the
-    command's effect: age, transport and loop in one number.
+    The delay D is the time from the vehicle time of the newest telemetry at the decision to the
+    effect of the command: age of the telemetry, transport and attitude loop in one number.
     """
 
     delay_s: float = Field(ge=0, le=0.5)
@@ -36,11 +36,12 @@ class AxisResponse(Parameters):
 
 
 class Vehicle(Parameters):
-    """One multirotor. SI units, body axes FRD.
+    """Parameters of one multirotor. SI units, body axes FRD.
 
-    Inputs of the torque interface (Eq. 6) are [f_t, tau_x, tau_y, tau_z]; roll and pitch inputs
-    are multiplied by `arm_m` (Eq. 16 is only reproduced with 0.225 m: they are differential
-    forces in N). An `arm_m` of 1 makes them torques in N m.
+    A tracking law needs `hover_thrust`, `tilt`, `yaw`, the thrust's delay and lag, the drag and
+    the limits; identification in flight refines them. Inertia and `arm_m` serve the simulator and
+    the paper's law: its inputs (Eq. 6) are [f_t, tau_x, tau_y, tau_z], where roll and pitch are
+    differential forces in N at `arm_m`, or torques in N m with an `arm_m` of 1.
     """
 
     name: str = Field(min_length=1, max_length=40)
@@ -60,7 +61,7 @@ class Vehicle(Parameters):
 
     @property
     def drag_per_mass_ps(self) -> float:
-        """Lateral linear drag per unit of mass, 1/s (`c` of acceleration = ... - c v)."""
+        """Lateral linear drag per unit of mass, 1/s: c of acceleration = ... - c v."""
         return (
             0.5 * (self.drag_translation_npmps[0] + self.drag_translation_npmps[1]) / self.mass_kg
         )

@@ -1,1 +1,1 @@
-"""The paper: its laws as controllers, its plant, and the study of its tables and figures."""
+"""The paper: its law as a controller, its plant, and the study of its tables and figures."""

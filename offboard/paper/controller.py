@@ -1,20 +1,18 @@
-"""The controller named `paper`: the paper's law, one step ahead on [f_t, tau], over MAVLink.
+"""The law `paper`: the paper's law, one step ahead on [f_t, tau], with attitude setpoints.
 
-The swarm searches the inputs of Eq. 6 on the hover model (Eqs. 14, 21, 26); the attitude that the
-model predicts for k+1 is sent, and the autopilot's attitude loop realises it in the place of the
-torques. Knows no autopilot and reads no clock.
+The swarm searches the inputs of Eq. 6 on the hover model (Eqs. 14, 21, 26). Instead of the torques
+the attitude that the model predicts for k+1 is sent; the autopilot's attitude loop realises it.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from dataclasses import replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.base import Decision, DecisionError, Situation
+from offboard.control.base import ControllerSettings, Decision, DecisionError, Situation
 from offboard.control.certificate import ExactMinimum, certify
 from offboard.model.command import Command
 from offboard.model.frames import wrap_pi
@@ -37,16 +35,26 @@ from offboard.reference.base import FlatSample
 Array = NDArray[np.float64]
 
 
+class PaperControllerSettings(PaperSettings, ControllerSettings):
+    """Settings of the law `paper`; registered as an entry point like that of any other package."""
+
+    law: Literal["paper"] = "paper"
+
+    def build(self, vehicle: Vehicle, *, period_s: float, seed: int) -> PaperController:
+        return PaperController(vehicle, self, period_s, seed)
+
+
 class PaperController:
-    """`PaperLaw` between a predicted state and a command; `stopwatch` () -> s lets it keep a
-    deadline and report its time. Without one it takes the iterations it is allowed."""
+    """`PaperLaw` between a predicted state and a command.
+
+    Raises ValueError where the settings' state limits cannot be kept by this vehicle.
+    """
 
     def __init__(
         self,
         vehicle: Vehicle,
         settings: PaperSettings | None = None,
         step_s: float = PAPER_STEP_S,
-        stopwatch: Callable[[], float] | None = None,
         seed: int = 0,
     ) -> None:
         settings = settings or PaperSettings()
@@ -55,7 +63,6 @@ class PaperController:
         self._vehicle = vehicle
         self._settings = settings
         self._step_s = step_s
-        self._stopwatch = stopwatch
         self._law = PaperLaw(
             dynamics,
             inputs * input_scale(vehicle),
@@ -66,45 +73,31 @@ class PaperController:
             seed=seed,
         )
         self._integral = ErrorIntegral(settings.integral, step_s) if settings.integral else None
-        self._held = False  # the input was at its bound: the integral waits
+        self._held = False  # whether the last input was at its bound: the integral waits
         self._exact = ExactMinimum(len(lower))
 
     def decide(self, situation: Situation) -> Decision:
-        """The command for one tick. Raises DecisionError where the state has no finite cost."""
-        started = self._stopwatch() if self._stopwatch else math.nan
         target = situation.reference.sample(situation.state.time_s + self._step_s)
         if not _usable(situation.state):
             raise DecisionError("the predicted state is not finite")
         state, reference = heading_frame(situation.state, target)
         move = self._law.move(
-            state,
-            reference,
-            self._remaining(situation.deadline_s, started),
-            integral=self._summed(situation),
+            state, reference, situation.remaining_s, integral=self._summed(situation)
         )
         if not math.isfinite(move.result.cost):
             raise DecisionError("the cost of this decision is not finite")
         certificate = certify(move.problem, move.result, self._exact)
         self._held = certificate.at_bound
-        if self._stopwatch:
-            certificate = replace(certificate, solve_time_s=self._stopwatch() - started)
         return Decision(self._command(move, state, float(target.course_rad)), certificate)
 
     def reset(self) -> None:
-        """Forget everything of the previous flight, the random stream included."""
         self._law.reset()
         self._held = False
         if self._integral:
             self._integral.reset()
 
-    def warm_up(self) -> None:
-        """Call every code path once, compiled and daqp's, and forget it again."""
-        move = self._law.move(np.zeros(12), np.zeros(12), lambda: math.inf)
-        certify(move.problem, move.result, self._exact)
-        self.reset()
-
     def _summed(self, situation: Situation) -> Array | None:
-        """The integral (4,) turned to the heading; summed in NED, where the wind stands still."""
+        """The integral (4,) in the heading frame; summed in NED, where a wind is constant."""
         if not self._integral:
             return None
         state, now = situation.state, situation.reference.sample(situation.state.time_s)
@@ -113,12 +106,6 @@ class PaperController:
         summed = self._integral.add(error, self._held).copy()
         summed[:3] = _turn(-state.course_rad) @ summed[:3]
         return summed
-
-    def _remaining(self, deadline_s: float | None, started: float) -> Callable[[], float] | None:
-        stopwatch = self._stopwatch
-        if stopwatch is None or deadline_s is None:
-            return None
-        return lambda: deadline_s - (stopwatch() - started)
 
     def _command(self, move: Move, state: Array, target_course_rad: float) -> Command:
         gravity, limit = self._vehicle.gravity_mps2, self._vehicle.thrust_max_mps2
@@ -139,24 +126,23 @@ class PaperController:
         loops = (self._vehicle.tilt, self._vehicle.tilt, self._vehicle.yaw)
         frequency = np.array([loop.natural_frequency_radps for loop in loops])
         damping = np.array([loop.damping for loop in loops])
-        # s_c from s'' = wn^2 (s_c - s) - 2 z wn s'; its delay is in the state predicted already
+        # s_c from s'' = wn^2 (s_c - s) - 2 z wn s'; the state is already predicted over the delay
         lead: Array = 2.0 * damping / frequency * rates + accelerations / frequency**2
         asked: Array = predicted + lead
         return asked
 
 
 def input_scale(vehicle: Vehicle) -> Array:
-    """Newtons (metres) of the vehicle per newton (metre) of the paper's, (4,), Eq. 6.
-
-    The same input accelerates both alike, in translation and in rotation.
-    """
+    """Factor (4,) from inputs of the paper's vehicle (Eq. 6) to those of `vehicle` that cause the
+    same accelerations, in translation and in rotation."""
     arms = np.array([vehicle.arm_m / PAPER_ARM_M, vehicle.arm_m / PAPER_ARM_M, 1.0])
     inertia = np.array(vehicle.inertia_kgm2) / np.array(PAPER_INERTIA_KGM2)
     return np.concatenate([[vehicle.mass_kg / PAPER_MASS_KG], inertia / arms])
 
 
 def flyable_box(vehicle: Vehicle, settings: PaperSettings) -> tuple[Array, Array]:
-    """The settings' box (4,), (4,) with f_t cut to a total thrust of 0 .. maximum (cf. Eq. 26)."""
+    """Lower and upper (4,) of the settings, with f_t limited to a total thrust between 0 and the
+    vehicle's maximum (cf. Eq. 26)."""
     lower, upper = np.array(settings.lower), np.array(settings.upper)
     hover = vehicle.gravity_mps2
     lower[THRUST] = max(lower[THRUST], -PAPER_MASS_KG * hover)
@@ -165,10 +151,11 @@ def flyable_box(vehicle: Vehicle, settings: PaperSettings) -> tuple[Array, Array
 
 
 def heading_frame(state: PredictedState, target: FlatSample) -> tuple[Array, Array]:
-    """State and reference (12,) of Eqs. 5 and 27, turned by -psi and shifted to the target.
+    """State and reference (12,) of Eqs. 5 and 27, rotated by -psi and relative to the target.
 
-    The hover model holds at course north only; in axes along and across the nose it holds at any.
-    Positions and course count from the target, velocities stay absolute because drag acts on them.
+    The hover model is valid for a course of north only; in axes along and across the nose it is
+    valid for every course. Positions and course are relative to the target; velocities stay
+    absolute because drag acts on them.
     """
     to_heading = _turn(-state.course_rad)
     direction = to_heading @ state.thrust_direction_ned

@@ -1,7 +1,7 @@
 """The paper's law on any plant of Eq. 14: settings, and one input u(k) per state and reference.
 
-Beyond the paper, and absent by default: an integral term in the cost and limits on the state, both
-of which its conclusions ask for. Knows no vehicle, no autopilot, no clock.
+Beyond the paper, and off by default: an integral term in the cost and limits on the state, which
+its conclusions propose. Knows no vehicle and no autopilot.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from offboard.paper.state_limits import LimitedBox, StateLimits
 
 Array = NDArray[np.float64]
 
-PAPER_STEP_S = 0.1  # what Eq. 16 is sampled with, though it says 0.05
+PAPER_STEP_S = 0.1  # with which Eq. 16 is reproduced; the paper prints 0.05
 PAPER_MASS_KG = 0.4  # Table 1
 PAPER_INERTIA_KGM2 = (0.0196, 0.0196, 0.0264)  # Table 1
-PAPER_ARM_M = 0.225  # not in Table 1, but Eq. 16 is only reproduced with it
+PAPER_ARM_M = 0.225  # not in Table 1; Eq. 16 is reproduced only with it
 
 Weight = Annotated[float, Field(ge=0)]
 Four = tuple[float, float, float, float]
@@ -43,16 +43,16 @@ TwelveWeights = tuple[
 
 
 class PaperSettings(Parameters):
-    """Weights, box and swarm of the paper, by default the final ones (section 4.3).
+    """Weights, bounds and swarm of the paper, by default the final ones (section 4.3).
 
-    States in the order of Eq. 5 in SI (psi in radians). Inputs are those of the paper's vehicle:
-    another vehicle's are scaled so that the same numbers accelerate it alike, and box and weights
-    keep their meaning. They are relative to hover; f_t is cut further where the total thrust
-    would be negative or above the vehicle's maximum.
+    States are in the order of Eq. 5, SI (psi in radians). Inputs are those of the paper's vehicle,
+    relative to hover. For another vehicle they are scaled so that the same numbers cause the same
+    accelerations, and bounds and weights keep their meaning; f_t is limited further where the total
+    thrust would be negative or above the vehicle's maximum.
 
-    The attitude sent is the one predicted for k+1. `attitude_lead` sends instead what the
-    autopilot's loop must be asked for so that it follows that prediction: without it a slow or
-    well damped loop realises a fraction of the torques only.
+    The attitude sent is the one predicted for k+1. With `attitude_lead` it is the setpoint with
+    which the autopilot's attitude loop follows this prediction; without, a slow or well damped loop
+    realises only a fraction of the torques.
 
     `integral` adds the summed position and course error to the cost, `limits` keeps tilt, rates
     and speeds within bounds; without them the law is the paper's.
@@ -64,7 +64,7 @@ class PaperSettings(Parameters):
     lower: Four = (-4.0, -0.2, -0.2, -0.1)  # N, N, N, N m, Eq. 26
     upper: Four = (3.942, 0.2, 0.2, 0.1)  # Eq. 26
     attitude_lead: bool = False
-    keep_constant: bool = True  # of J; epsilon of Eq. 29 rests on its rounding
+    keep_constant: bool = True  # the constant of J: its rounding makes epsilon of Eq. 29
     integral: IntegralSettings | None = None
     limits: StateLimits | None = None
     swarm: SwarmSettings = SwarmSettings()
@@ -82,7 +82,7 @@ class PaperSettings(Parameters):
 
 @dataclass(frozen=True, slots=True)
 class Move:
-    """What the law chose: inputs u(k) (4,), the state (12,) they lead to, and how it was found."""
+    """The inputs u(k) (4,), the state (12,) they lead to, and how they were found."""
 
     inputs: Array
     following: Array
@@ -91,12 +91,12 @@ class Move:
 
 
 class PaperLaw:
-    """The law on any plant of Eq. 14: dynamics (12, 12), inputs (12, 4), box (4,), (4,).
+    """The law on any plant of Eq. 14: dynamics (12, 12), inputs (12, 4), lower and upper (4,).
 
     Remembers the last input (for R_du) and the random stream; `reset` forgets both. `terminal`
-    (12, 12) takes the place of diag(Q), for instance `cost_to_go` of the same weights. The
-    integral is summed by the caller, who knows the frame (`ErrorIntegral`). Raises ValueError
-    where the settings' limits cannot be kept on this plant.
+    (12, 12) replaces diag(Q), for instance by `cost_to_go` of the same weights. The integral is
+    summed by the caller, who knows the frame (`ErrorIntegral`). Raises ValueError where this plant
+    cannot keep the limits of the settings.
     """
 
     def __init__(
@@ -144,8 +144,8 @@ class PaperLaw:
     ) -> Move:
         """u(k) for the state x(k) (12,) towards x_ref(k+1) (12,), Eq. 27.
 
-        `integral` (4,) is the summed error xi(k), heeded where the settings weigh it; `nominal`
-        (4,) is u_nom where it is not hover.
+        `integral` (4,) is the summed error xi(k), used where the settings weigh it; `nominal` (4,)
+        is u_nom, by default hover. See `QuadraticSwarm.minimise` for the other arguments.
         """
         lower, upper = self._lower, self._upper
         if self._limits:
@@ -167,5 +167,6 @@ class PaperLaw:
         return Move(result.best, following, problem, result)
 
     def reset(self) -> None:
+        """Forget the last input and start the random stream anew."""
         self._previous = self._hover
         self._lanes.reset()

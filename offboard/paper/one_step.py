@@ -1,8 +1,8 @@
-"""Eq. 21 as a quadratic in the input: one step ahead, weighed by any matrix.
+"""Eq. 21 as a quadratic in the input: one step ahead, with any weight of the next state.
 
-With Q as the weight of x(k+1) this is the paper's objective; with the Riccati solution of the
-same weights in its place (`cost_to_go`) the same search becomes infinite-horizon optimal. Knows
-no vehicle and no units: whoever brings the model brings them.
+With Q as the weight of x(k+1) this is the paper's objective; with the Riccati solution of the same
+weights (`cost_to_go`) its minimum is optimal over an infinite horizon. Units are those of the
+model.
 """
 
 from __future__ import annotations
@@ -16,11 +16,11 @@ Array = NDArray[np.float64]
 
 
 class OneStep:
-    """J(u) of Eq. 21 for one model and one set of weights; `problem` fills in the situation.
+    """J(u) of Eq. 21 for one model and one set of weights; `problem` fills in the state.
 
-    dynamics A (n, n), inputs B (n, m), terminal W (n, n) on x_ref(k+1) - x(k+1), energy R (m, m)
-    on u_nom - u, rate R_du (m, m) on u - u(k-1), cross S (n, m) on twice the product of
-    x(k) - x_ref(k) and u - u_nom. All weights symmetric but S.
+    dynamics A (n, n), inputs B (n, m). Weights, all symmetric but S: terminal W (n, n) of
+    x_ref(k+1) - x(k+1), energy R (m, m) of u_nom - u, rate R_du (m, m) of u - u(k-1), cross S
+    (n, m) of twice the product of x(k) - x_ref(k) and u - u_nom.
     """
 
     def __init__(
@@ -60,10 +60,10 @@ class OneStep:
     ) -> BoxQuadratic:
         """The quadratic in u(k) from state x(k) (n,) towards reference_next x_ref(k+1) (n,).
 
-        nominal u_nom, previous u(k-1), lower and upper (Eq. 22): (m,). `reference` x_ref(k) (n,)
-        matters to the cross weight only and is 0 if not given. The constant term does not move
-        the minimum, but the swarm's floor (epsilon of Eq. 29) is the rounding of J: without it
-        the paper's epsilon does not come out.
+        nominal u_nom, previous u(k-1), lower and upper (Eq. 22): (m,). `reference` x_ref(k) (n,),
+        by default 0, is used by the cross weight only. The constant term does not move the
+        minimum, but its rounding limits epsilon of Eq. 29: the paper's epsilon is only reproduced
+        with it.
         """
         error = self._dynamics @ state - reference_next
         off = state if reference is None else state - reference

@@ -13,11 +13,17 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import expm
 
+from offboard.compiled import array, entry
 from offboard.documents import shipped
 from offboard.documents.reading import parse
-from offboard.model.integration import follow
 from offboard.model.linear import hover_matrices, sampled_matrices
-from offboard.model.rigid_body import RK4_SCRATCH_ROWS, hover_input, pack
+from offboard.model.rigid_body import (
+    RK4_SCRATCH_ROWS,
+    derivative_into,
+    hover_input,
+    pack,
+    rk4_into,
+)
 from offboard.model.state import EULER, THRUST, U, W
 from offboard.model.vehicle import Vehicle
 from offboard.paper.law import PAPER_STEP_S
@@ -84,8 +90,23 @@ class NonlinearPlant:
         out = state.copy()
         step_s = PAPER_STEP_S / _SUBSTEPS
         constants = self._wind, self._parameters, step_s, _SUBSTEPS
-        follow.call(out, total, *constants, self._scratch)
+        follow(out, total, *constants, self._scratch)
         return out
+
+
+@entry(array(1), array(1), array(1), array(1), float, int, array(2))
+def follow(
+    state: Array,
+    inputs: Array,
+    wind_ned: Array,
+    parameters: Array,
+    step_s: float,
+    steps: int,
+    scratch: Array,
+) -> None:
+    """`steps` RK4 steps of held inputs and wind, in place; shapes as in `rk4_into`."""
+    for _ in range(steps):
+        rk4_into(derivative_into, state, inputs, wind_ned, parameters, step_s, scratch, state)
 
 
 PLANTS: dict[PlantKind, type[LinearPlant | NonlinearPlant]] = {

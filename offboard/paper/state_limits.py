@@ -1,11 +1,11 @@
-"""Limits on state variables, which the paper's conclusions ask for, as bounds on the next input.
+"""Limits on state variables, which the paper's conclusions propose, as bounds on the next input.
 
-A limit checked at k+1 alone can be kept until it cannot: at the edge with a rate outwards no input
-helps. So an input is admitted only if from x(k+1) on a fixed linear regulator would stop the
-vehicle without any limit, or its own input, being exceeded (a maximal output admissible set,
-Gilbert and Tan 1991). The regulator's own input is then always admitted, whatever happened before:
-what is kept once is kept for ever, on the linear model exactly. In the hover model each of these
-conditions meets one input only, so they narrow the box of Eq. 22; swarm and certificate stay.
+Checking a limit at k+1 alone is not enough: at the limit with a rate outwards no input keeps it any
+more. Therefore an input is allowed only if a fixed linear regulator could stop the vehicle from
+x(k+1) on without exceeding any limit or the bounds of its own input (a maximal output admissible
+set, Gilbert and Tan 1991). The regulator's input is then always allowed, so on the linear model the
+limits are kept for ever once they are kept. In the hover model each of these conditions depends on
+one input only; they narrow the bounds of Eq. 22, and swarm and certificate are the same.
 """
 
 from __future__ import annotations
@@ -22,18 +22,18 @@ from offboard.model.state import PHI, THETA, P, Q, R, U, V, W
 
 Array = NDArray[np.float64]
 
-_STATES = (PHI, THETA, P, Q, R, U, V, W)  # closed in the hover model: neither position nor course
-_LOOK_AHEAD = 80  # steps of the regulator; what is left of any motion after them is nothing
-_SLIGHT = 1e-9  # of an input's greatest influence on any condition: none
-_REACH = 3.0  # the regulator brakes gently: a limit's full error asks for a third of the box
+_STATES = (PHI, THETA, P, Q, R, U, V, W)  # in the hover model independent of position and course
+_LOOK_AHEAD = 80  # steps of the regulator, after which all motion has ended
+_SLIGHT = 1e-9  # of an input's greatest influence on any condition: counts as none
+_REACH = 3.0  # the regulator uses a third of the input bounds at the limit of a state
 
 Bound = Annotated[float, Field(gt=0)]
 
 
 class StateLimits(Parameters):
-    """Largest magnitudes; what is absent is not limited. Speeds are in the heading frame, per axis.
+    """Largest magnitudes; None: not limited. Speeds are per axis of the heading frame.
 
-    `margin` keeps this fraction of every limit free for what the linear model leaves out.
+    `margin` is the fraction of every limit that is reserved for errors of the linear model.
     """
 
     tilt_rad: Bound | None = None  # phi and theta
@@ -44,7 +44,7 @@ class StateLimits(Parameters):
     margin: float = Field(default=0.0, ge=0, lt=1)
 
     def per_state(self) -> dict[int, float]:
-        """{index in Eq. 5: largest magnitude}, less the margin."""
+        """{index in Eq. 5: largest magnitude}, reduced by the margin."""
         groups = (
             (self.tilt_rad, (PHI, THETA)),
             (self.tilt_rate_radps, (P, Q)),
@@ -61,10 +61,10 @@ class StateLimits(Parameters):
 
 
 class LimitedBox:
-    """The box of Eq. 22, narrowed at each state to the inputs after which all limits can be held.
+    """The bounds of Eq. 22, narrowed at each state to inputs after which all limits can be kept.
 
     dynamics (12, 12), inputs (12, 4): Eq. 14; lower < 0 < upper (4,). Raises ValueError where a
-    limited state answers to several inputs or a limit can never be held.
+    condition depends on several inputs.
     """
 
     def __init__(
@@ -77,21 +77,19 @@ class LimitedBox:
         self._gain = _regulator(a, b, np.minimum(-lower, upper), magnitudes)
         rows, ceilings = _conditions(a, b, self._gain, lower, upper, magnitudes)
         influence = rows @ b
-        # An exact zero where axes do not couple; late steps of the look-ahead fade to nothing
-        meets = np.abs(influence) > _SLIGHT * np.abs(influence).max(axis=0)
-        if (meets.sum(axis=1) > 1).any():
+        # Exactly zero where axes do not couple, and nearly zero in late steps of the look-ahead
+        depends = np.abs(influence) > _SLIGHT * np.abs(influence).max(axis=0)
+        if (depends.sum(axis=1) > 1).any():
             raise ValueError("state limits need axes that do not couple")
-        kept = meets.any(axis=1)
-        self._channel = np.argmax(meets[kept], axis=1)
+        kept = depends.any(axis=1)
+        self._channel = np.argmax(depends[kept], axis=1)
         self._slope = influence[kept, self._channel]
         self._free = rows[kept] @ a
         self._ceiling = ceilings[kept]
 
     def narrow(self, state: Array) -> tuple[Array, Array]:
-        """Lower and upper (4,) at the state x(k) (12,), one of finite width or a single point.
-
-        Where no input keeps the limits any more (a gust, a start outside), the regulator's.
-        """
+        """Lower and upper (4,) at the state x(k) (12,). Where no input keeps the limits (after a
+        gust, or a start outside of them), both are the input of the regulator."""
         inside = state[list(_STATES)]
         edges = (self._ceiling - self._free @ inside) / self._slope
         lower, upper = self._lower.copy(), self._upper.copy()
@@ -105,7 +103,7 @@ class LimitedBox:
 
 
 def _regulator(a: Array, b: Array, box: Array, magnitudes: dict[int, float]) -> Array:
-    """K (4, 8) of u = -K x, which stops the vehicle: Riccati, scaled by limits and box."""
+    """K (4, 8) of u = -K x, which stops the vehicle: Riccati, scaled by the limits and bounds."""
     scale = [magnitudes.get(index, 1.0) for index in _STATES]
     weight = np.diag(1.0 / np.square(scale))
     energy = np.diag(np.square(_REACH / box))

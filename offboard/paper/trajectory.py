@@ -17,8 +17,8 @@ from offboard.model.state import PHI, PSI, THETA, THRUST, P, R, U, V, W, X, Z
 from offboard.model.vehicle import Vehicle
 from offboard.paper.law import PAPER_STEP_S
 from offboard.reference.base import FlatSample, Reference
-from offboard.reference.catalogue import CourseMode, Hover, Waypoints, build
 from offboard.reference.flatness import flat_state
+from offboard.reference.shapes import CourseMode, Hover, Waypoints
 from offboard.reference.waypoints import Smoothness
 
 Array = NDArray[np.float64]
@@ -42,16 +42,13 @@ class PathName(StrEnum):
 def reference(name: PathName) -> Reference:
     """Position NED, velocity and course over vehicle time from 0."""
     if name is PathName.HOVER:
-        return build(Hover(shape="hover", height_m=2.0, duration_s=60.0))
-    return build(
-        Waypoints(
-            shape="waypoints",
-            points_m=POINTS_M,
-            speed_mps=SPEED_MPS,
-            minimise=Smoothness.SNAP,
-            course=CourseMode.ALONG_VELOCITY,
-        )
-    )
+        return Hover(height_m=2.0, duration_s=60.0).track()
+    return Waypoints(
+        points_m=POINTS_M,
+        speed_mps=SPEED_MPS,
+        minimise=Smoothness.SNAP,
+        course=CourseMode.ALONG_VELOCITY,
+    ).track()
 
 
 @dataclass(frozen=True, slots=True)

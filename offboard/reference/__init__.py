@@ -1,1 +1,1 @@
-"""Where the vehicle should be: time -> position and its derivatives -> full state and input."""
+"""Trajectories to follow: time -> position, course and their derivatives -> state and input."""

@@ -1,4 +1,4 @@
-"""What every reference offers: the flat outputs (position and course) and their derivatives."""
+"""The contract of every reference: position and course with their derivatives (flat outputs)."""
 
 from __future__ import annotations
 
@@ -13,10 +13,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class FlatSample:
-    """Flat outputs at one or several times. NED, SI; leading shape (...) follows the time argument.
+    """A reference at one or several times. NED, SI. The leading shape (...) is that of the time.
 
-    Positions to snap have shape (..., 3); course (heading of the nose, 0 = north, positive
-    clockwise, unwrapped along a reference) and its derivatives have shape (...).
+    Attributes:
+        position_ned_m ... snap_ned_mps4: (..., 3), position and its first four derivatives.
+        course_rad: (...), heading of the nose: 0 = north, clockwise. Continuous along a reference,
+            so it may leave -pi .. pi.
+        course_rate_radps, course_acceleration_radps2: (...), its derivatives.
     """
 
     position_ned_m: Array
@@ -30,10 +33,17 @@ class FlatSample:
 
 
 class Reference(Protocol):
-    """A trajectory from time 0 to `duration_s`; before and after it rests at its ends."""
+    """A trajectory from time 0 to `duration_s`; before and after it rests at its ends.
+
+    Example:
+        sample = reference.sample(np.array([0.0, 0.1]))
+        sample.position_ned_m  # (2, 3)
+    """
 
     @property
-    def duration_s(self) -> float: ...
+    def duration_s(self) -> float:
+        """The time at which it comes to rest, s."""
+        ...
 
     def sample(self, time_s: float | Array) -> FlatSample:
         """Evaluate at `time_s`, a scalar or an array of any shape."""

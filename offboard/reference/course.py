@@ -1,8 +1,8 @@
 """Where the nose points along a path: fixed, given by a table, or along the horizontal velocity.
 
-A course is a function of the path's time s like the path itself. Velocity by s has the direction
-of velocity by t, so that starting from rest on a moving path needs no special case; only where
-the path itself stands still (`HOLD_SPEED_MPS`) has the direction to be made up.
+A course is a function of the path's time s, like the path itself. The derivative of position by s
+has the direction of the velocity, so that a start from rest needs no special case. Only where the
+path itself is slower than `HOLD_SPEED_MPS` the direction is interpolated.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Course(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Fixed:
-    """The same course everywhere."""
+    """A constant course."""
 
     course_rad: float
 
@@ -48,7 +48,7 @@ class Fixed:
 
 @dataclass(frozen=True, slots=True)
 class Tabulated:
-    """A course of its own, a polynomial of one column in radians (a column of a table)."""
+    """The course column of a table: a polynomial with one column, in radians."""
 
     polynomial: Polynomial
 
@@ -60,11 +60,11 @@ class Tabulated:
 class AlongVelocity:
     """The direction of the horizontal velocity, unwrapped from the start of the path.
 
-    nodes_rad (K,): the unwrapped course every `step_s` from s = 0, to find the turn a direction
-    belongs to. slow_s (M, 2): intervals in which the horizontal speed falls below
-    `HOLD_SPEED_MPS` and a quintic, slow_coefficients (M, 6) in powers of s - slow_s[:, 0],
-    replaces the direction: it meets course, rate and acceleration at both ends of the interval,
-    turns the short way, and comes to rest where the path begins or ends.
+    nodes_rad (K,): the unwrapped course every `step_s` from s = 0; it tells how many whole turns
+    are added to a direction. slow_s (M, 2): intervals in which the horizontal speed is below
+    `HOLD_SPEED_MPS`. There the direction is replaced by a quintic, slow_coefficients (M, 6) in
+    powers of s - slow_s[:, 0], which continues course, rate and acceleration at both ends of the
+    interval, turns the short way, and comes to rest where the path begins or ends.
     """
 
     step_s: float
@@ -78,12 +78,12 @@ class AlongVelocity:
         nearest_rad = self.nodes_rad[np.clip(node, 0, self.nodes_rad.size - 1)]
         jet[0] += 2.0 * np.pi * np.rint((nearest_rad - jet[0]) / (2.0 * np.pi))
         if len(self.slow_s):
-            # the first bridge that does not end before
-            bridge = np.searchsorted(self.slow_s[:-1, 1], path_time_s)
-            begin_s, end_s = self.slow_s[bridge].T
+            # the first interval that does not end before
+            interval = np.searchsorted(self.slow_s[:-1, 1], path_time_s)
+            begin_s, end_s = self.slow_s[interval].T
             slow = (begin_s <= path_time_s) & (path_time_s <= end_s)
             if slow.any():
-                coefficients = self.slow_coefficients[bridge[slow]].T
+                coefficients = self.slow_coefficients[interval[slow]].T
                 jet[:, slow] = _quintic((path_time_s - begin_s)[slow], coefficients)
         return jet
 
@@ -101,17 +101,19 @@ def along_velocity(path: Path, length_s: float, standstill_rad: float = 0.0) -> 
         return Fixed(standstill_rad)
     direction = direction_jet(path_jet)
     held = direction[0].copy()
-    # a slow node takes the course of the nearest fast one, which also unwraps across it
+    # a slow node takes the course of the next fast one, so that unwrapping works across it
     fast_index = np.flatnonzero(fast)
     nearest = fast_index[
         np.clip(np.searchsorted(fast_index, np.arange(count)), 0, fast_index.size - 1)
     ]
     direction[0] = np.unwrap(held[nearest])
-    slow_s, coefficients = _bridges(nodes_s, direction, fast)
+    slow_s, coefficients = _slow_intervals(nodes_s, direction, fast)
     return AlongVelocity(float(nodes_s[1]), direction[0], slow_s, coefficients)
 
 
-def _bridges(nodes_s: Array, direction: Array, fast: NDArray[np.bool_]) -> tuple[Array, Array]:
+def _slow_intervals(
+    nodes_s: Array, direction: Array, fast: NDArray[np.bool_]
+) -> tuple[Array, Array]:
     """Intervals (M, 2) and quintics (M, 6) over the runs of slow nodes; direction (3, K)."""
     edges = np.flatnonzero(np.diff(np.concatenate([[True], fast, [True]]).astype(np.int8)))
     last = fast.size - 1
@@ -121,9 +123,9 @@ def _bridges(nodes_s: Array, direction: Array, fast: NDArray[np.bool_]) -> tuple
         left, right = max(first_slow - 1, 0), min(first_fast, last)
         start = direction[:, left] if fast[left] else np.array([direction[0, right], 0.0, 0.0])
         end = direction[:, right] if fast[right] else np.array([direction[0, left], 0.0, 0.0])
-        interval = (float(nodes_s[left]), float(nodes_s[right]))
-        quintic = PPoly.from_bernstein_basis(BPoly.from_derivatives(interval, [start, end]))
-        intervals.append(interval)
+        ends = (float(nodes_s[left]), float(nodes_s[right]))
+        quintic = PPoly.from_bernstein_basis(BPoly.from_derivatives(ends, [start, end]))
+        intervals.append(ends)
         coefficients.append(quintic.c[::-1, 0])
     return np.reshape(intervals, (-1, 2)).astype(np.float64), np.reshape(coefficients, (-1, 6))
 
@@ -136,7 +138,7 @@ def direction_jet(path_jet: Array) -> Array:
     (vn, ve), (an, ae), (jn, je) = path_jet[1:4, :, :2].transpose(0, 2, 1)
     square = np.maximum(vn * vn + ve * ve, 1e-6)
     rate = (vn * ae - ve * an) / square
-    # numpy's own differs in the last digit from one processor to another
+    # numpy's arctan2 differs in the last digit from one processor to another
     direction = list(map(math.atan2, ve.tolist(), vn.tolist()))
     acceleration = (vn * je - ve * jn - 2.0 * rate * (vn * an + ve * ae)) / square
     return np.array((direction, rate, acceleration))

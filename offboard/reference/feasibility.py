@@ -1,4 +1,4 @@
-"""Can this vehicle fly that reference? Asked before anything is sent."""
+"""Whether a vehicle can fly a reference: checked before anything is sent."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ _CHUNK = 20_000
 
 
 class InfeasibleReference(ValueError):
-    """The reference asks for more than the vehicle has; one sentence with time, value, limit."""
+    """The reference exceeds a limit: one sentence with quantity, time, value and limit."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """What is demanded beyond the vehicle's own thrust and tilt limits.
+    """Limits of a reference, besides those of the vehicle.
 
-    Thrust and tilt must stay within fractions of the full ones: the rest is for the feedback.
-    Rates as PX4's defaults MC_ROLLRATE_MAX, MC_PITCHRATE_MAX (220 deg/s) and MC_YAWRATE_MAX
-    (200 deg/s).
+    Thrust and tilt must stay within fractions of the vehicle's limits; the rest is reserved for
+    feedback. Rates are PX4's defaults MC_ROLLRATE_MAX, MC_PITCHRATE_MAX (220 deg/s) and
+    MC_YAWRATE_MAX (200 deg/s).
     """
 
     height_min_m: float = 0.3
@@ -41,7 +41,7 @@ class Bounds:
 
 @dataclass(frozen=True, slots=True)
 class Envelope:
-    """The extremes that a reference asks for. SI; rates are magnitudes per body axis."""
+    """The extremes of a reference. SI; rates are magnitudes per body axis."""
 
     thrust_min_mps2: float
     thrust_max_mps2: float
@@ -53,18 +53,18 @@ class Envelope:
 
 @dataclass(frozen=True, slots=True)
 class _Demand:
-    """One quantity over time and what it may be; `sign` -1 marks a lower limit."""
+    """One quantity over time and its limit; `sign` is -1 for a lower limit."""
 
     what: str
     unit: str
     values: Array
     limit: float
     sign: float = 1.0
-    of_path: bool = False  # of the path itself, not of what it takes to fly it
+    of_path: bool = False  # depends on the path alone, not on the vehicle
 
     @property
     def worst(self) -> int:
-        """Index of the extreme, or of the first value that is not a number."""
+        """Index of the extreme, or of the first NaN."""
         return int(np.argmax(self.sign * self.values))
 
     @property
@@ -75,11 +75,11 @@ class _Demand:
 def check(
     reference: Reference, vehicle: Vehicle, ground_down_m: float = 0.0, bounds: Bounds = Bounds()
 ) -> Envelope:
-    """The extremes of a reference, sampled every 10 ms from 0 to its end, without wind.
+    """The extremes of a reference, sampled every 10 ms, without wind.
 
-    `ground_down_m` is the ground in the reference's own frame (NED, positive down): 0 when
-    positions are relative to the take-off point. Raises InfeasibleReference for a path that
-    leads below or far away, else for what is beyond its limit first.
+    `ground_down_m` is the height of the ground in the frame of the reference (NED, positive down):
+    0 when positions are relative to the take-off point. Raises InfeasibleReference for a path that
+    is too low or too far away, otherwise for the limit that is exceeded first.
     """
     count = int(np.ceil(reference.duration_s / _STEP_S)) + 1
     times = np.linspace(0.0, reference.duration_s, count)
@@ -104,7 +104,7 @@ def _envelope(
     demands = _demands(reference, vehicle, times, ground_down_m, bounds)
     broken: list[tuple[int, _Demand]] = []
     for demand in demands:
-        # written so that a value that is not a number counts as broken
+        # written so that NaN counts as broken
         within = demand.sign * demand.values <= demand.sign * demand.limit
         if not within.all():
             broken.append((int(np.argmin(within)), demand))

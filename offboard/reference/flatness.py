@@ -1,8 +1,8 @@
 """Differential flatness: from position and course to the full state and the input.
 
-The plant is acceleration = g e3 - T b - c v + d (NED; thrust T per unit of mass along b, the third
-body axis; linear drag c; constant disturbance d), so that T b = g e3 - a - c v + d =: f. Attitude,
-body rates and thrust follow from f and its derivatives in closed form. Pure arrays.
+The plant is a = g e3 - T b - c v + d (NED; thrust T per unit of mass, third body axis b, linear
+drag c, constant disturbance d), so that T b = g e3 - a - c v + d =: f. Attitude, body rates and
+thrust follow from f and its derivatives in closed form (Mellinger and Kumar, 2011, with drag).
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ class FlatState:
     """State and input that fly a `FlatSample`; leading shape (...) is the sample's.
 
     thrust_mps2, thrust_rate_mps3 (...): T and T'. thrust_direction_ned, _rate_ned_ps,
-    _acceleration_ned_ps2 (..., 3): b, b', b'', all zero-thrust safe (b is then (0, 0, 1)).
-    rates_frd_radps (..., 3): p, q, r, with the Euler yaw equal to the course. course_rad (...).
+    _acceleration_ned_ps2 (..., 3): b, b', b''; without thrust b is (0, 0, 1). rates_frd_radps
+    (..., 3): p, q, r, with the Euler yaw equal to the course. course_rad (...).
     """
 
     thrust_mps2: Array
@@ -42,7 +42,7 @@ class FlatState:
 
     @property
     def attitude(self) -> Array:
-        """Quaternion w, x, y, z, FRD to NED, shape (..., 4). Computed at each call."""
+        """Quaternion w, x, y, z, FRD to NED, shape (..., 4); computed at each call."""
         return quaternion_from_thrust_direction(self.thrust_direction_ned, self.course_rad)
 
 
@@ -54,7 +54,7 @@ def flat_state(
 ) -> FlatState:
     """The full state and input of a sample; the disturbance (3,) is constant in time.
 
-    Always finite: where f vanishes (free fall) the thrust direction points down."""
+    Always finite: where f vanishes (free fall) b is (0, 0, 1)."""
     drag = drag_per_mass_ps
     f = disturbance_ned_mps2 - sample.acceleration_ned_mps2 - drag * sample.velocity_ned_mps
     f[..., 2] += gravity_mps2
@@ -80,7 +80,7 @@ def flat_state(
 
 
 def _dot(left: Array, right: Array) -> Array:
-    """Over the last axis, which stays as (..., 1)."""
+    """Dot product over the last axis, (..., 1)."""
     product: Array = (left * right).sum(axis=-1, keepdims=True)
     return product
 

@@ -1,7 +1,7 @@
-"""What a geometric path is to the rest of the room, and the polynomial one.
+"""Geometric paths: what a shape has to provide, and the two kinds that there are.
 
 A path maps its own time s (seconds at full speed) to a position and its derivatives with respect
-to s. It knows nothing of the vehicle's time, of starting and stopping (`track`) or of course.
+to s. Starting and stopping is added by `track`, where the nose points by `course`.
 """
 
 from __future__ import annotations
@@ -15,15 +15,18 @@ from numpy.typing import NDArray
 from scipy.interpolate import BSpline
 
 Array = NDArray[np.float64]
+Triple = tuple[float, float, float]
 
 ORDERS = 5  # position, velocity, acceleration, jerk, snap
+_ORDER = np.arange(ORDERS, dtype=np.float64)[:, np.newaxis, np.newaxis]
+_ZERO: Triple = (0.0, 0.0, 0.0)
 
 
 class Path(Protocol):
     """Position along a path and its first four derivatives, analytic in s.
 
     `length_s` is the time that the path takes at full speed. A `bounded` path is defined on
-    [0, length_s] only; another continues smoothly beyond both ends (laps of a closed curve).
+    [0, length_s] only; any other continues smoothly beyond both ends (laps of a closed curve).
     """
 
     @property
@@ -80,4 +83,34 @@ class Polynomial:
         offset = path_time_s - self.breaks_s[piece]
         powers = offset[:, np.newaxis] ** np.arange(self.coefficients.shape[2])
         result: Array = np.einsum("dnkc,nk->dnc", self.coefficients[:, piece], powers)
+        return result
+
+
+@dataclass(frozen=True, slots=True)
+class Harmonic:
+    """p_i(s) = offset_i + slope_i s + amplitude_i sin(omega_i s + phase_i), i = north, east, down.
+
+    One sine per axis on top of a straight motion: enough for lines, circles, helices and figures
+    of eight, with all derivatives in closed form. SI.
+    """
+
+    length_s: float
+    bounded: bool = False
+    offset_ned_m: Triple = _ZERO
+    slope_ned_mps: Triple = _ZERO
+    amplitude_ned_m: Triple = _ZERO
+    omega_ned_radps: Triple = _ZERO
+    phase_ned_rad: Triple = _ZERO
+
+    def jet(self, path_time_s: Array) -> Array:
+        """Derivatives 0 to 4 with respect to s, shape (5, N, 3), for s of shape (N,)."""
+        time = path_time_s[:, np.newaxis]
+        omega = np.array(self.omega_ned_radps)
+        angle = omega * time + np.array(self.phase_ned_rad)
+        # d/ds of sin(omega s + phase) adds a quarter turn and a factor omega
+        scale = np.array(self.amplitude_ned_m) * omega**_ORDER
+        result: Array = scale * np.sin(angle + 0.5 * math.pi * _ORDER)
+        slope = np.array(self.slope_ned_mps)
+        result[0] += np.array(self.offset_ned_m) + slope * time
+        result[1] += slope
         return result

@@ -1,96 +1,245 @@
-"""The analytic shapes: hover, line, circle, lemniscate, helix.
+"""The references by name: one class per shape, with its settings and its path.
 
-All are one formula, a straight motion plus one sine per axis, so that every derivative is closed
-form. Positions are relative to the shape's origin; nothing here knows of heights above ground.
+A reference file (`config/references/*.yaml`) holds the settings of one shape, named by `shape`.
+Heights are metres above the take-off point, positive up; everything else is north and east of it.
+A new shape is a class here, a row in `SHAPES` and a file. Reads no file.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from abc import ABC, abstractmethod
+from collections.abc import Mapping
+from enum import StrEnum
+from typing import Annotated, Literal, Self
 
 import numpy as np
-from numpy.typing import NDArray
+from pydantic import Field, model_validator
 
-from offboard.reference.path import ORDERS
+from offboard.documents.parameters import Parameters
+from offboard.reference import table, waypoints
+from offboard.reference.course import Course, Fixed, Tabulated, along_velocity
+from offboard.reference.path import Harmonic, Path
+from offboard.reference.track import Track, path_end_s
 
-Array = NDArray[np.float64]
-Triple = tuple[float, float, float]
+Seconds = Annotated[float, Field(ge=0, le=60)]
+Period = Annotated[float, Field(ge=1, le=600)]
+Laps = Annotated[int, Field(ge=1, le=100)]
+Height = Annotated[float, Field(ge=0.5, le=500)]
+Coordinate = Annotated[float, Field(ge=-1000, le=1000)]
+Size = Annotated[float, Field(gt=0.05, le=500)]
+Speed = Annotated[float, Field(gt=0.05, le=30)]
+Climb = Annotated[float, Field(ge=-5, le=5)]
 
-_ZERO: Triple = (0.0, 0.0, 0.0)
-_ORDER = np.arange(ORDERS, dtype=np.float64)[:, np.newaxis, np.newaxis]
+
+class CourseMode(StrEnum):
+    """Where the nose points: a fixed course, along the horizontal velocity, as in the table."""
+
+    FIXED = "fixed"
+    ALONG_VELOCITY = "along_velocity"
+    TABLE = "table"
 
 
-@dataclass(frozen=True, slots=True)
-class Harmonic:
-    """p_i(s) = offset_i + slope_i s + amplitude_i sin(omega_i s + phase_i), i = north, east, down.
+class Shape(Parameters, ABC):
+    """What every shape has. Its origin is `height_m` above the ground, and north and east of the
+    take-off point; `course_deg` is the fixed course, clockwise from north.
 
-    Metres, metres per second, radians per second, radians. See `path.Path` for the rest.
+    Speed is gained within `run_in_s` and lost within `run_out_s`; see `Track`.
     """
 
-    length_s: float
-    bounded: bool = False
-    offset_ned_m: Triple = _ZERO
-    slope_ned_mps: Triple = _ZERO
-    amplitude_ned_m: Triple = _ZERO
-    omega_ned_radps: Triple = _ZERO
-    phase_ned_rad: Triple = _ZERO
+    shape: str
+    height_m: Height = 3.0
+    origin_north_m: Coordinate = 0.0
+    origin_east_m: Coordinate = 0.0
+    course: Literal[CourseMode.FIXED, CourseMode.ALONG_VELOCITY] = CourseMode.FIXED
+    course_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
+    run_in_s: Seconds = 4.0
+    run_out_s: Seconds = 3.0
 
-    def jet(self, path_time_s: Array) -> Array:
-        """Derivatives 0 to 4 with respect to s, shape (5, N, 3), for s of shape (N,)."""
-        time = path_time_s[:, np.newaxis]
-        omega = np.array(self.omega_ned_radps)
-        angle = omega * time + np.array(self.phase_ned_rad)
-        # d/ds of sin(omega s + phase) adds a quarter turn and a factor omega
-        scale = np.array(self.amplitude_ned_m) * omega**_ORDER
-        result: Array = scale * np.sin(angle + 0.5 * math.pi * _ORDER)
-        slope = np.array(self.slope_ned_mps)
-        result[0] += np.array(self.offset_ned_m) + slope * time
-        result[1] += slope
-        return result
+    @abstractmethod
+    def path(self) -> Path:
+        """The path at full speed, NED relative to the origin.
 
+        Raises ValueError with one sentence where these settings make none.
+        """
 
-def hover(duration_s: float) -> Harmonic:
-    """Rest at the origin for `duration_s`."""
-    return Harmonic(length_s=duration_s, bounded=True)
+    def track(self) -> Track:
+        """The reference, NED relative to the take-off point. Raises ValueError like `path`, and
+        where the runs do not fit (see `Track`)."""
+        path = self.path()
+        origin_ned_m = (self.origin_north_m, self.origin_east_m, -float(self.height_m))
+        return Track(path, self._course(path), self.run_in_s, self.run_out_s, origin_ned_m)
 
+    @property
+    def title(self) -> str:
+        """What errors call it."""
+        return self.shape
 
-def line(displacement_ned_m: Triple, speed_mps: float) -> Harmonic:
-    """Straight from the origin by the displacement at constant speed.
-
-    Raises ValueError for a displacement of zero length."""
-    distance_m = math.hypot(*displacement_ned_m)
-    if distance_m < 1e-6:
-        raise ValueError("a line needs a displacement longer than zero")
-    north, east, down = (speed_mps * component / distance_m for component in displacement_ned_m)
-    return Harmonic(
-        length_s=distance_m / speed_mps, bounded=True, slope_ned_mps=(north, east, down)
-    )
+    def _course(self, path: Path) -> Course:
+        fixed_rad = math.radians(self.course_deg)
+        if self.course is CourseMode.ALONG_VELOCITY:
+            return along_velocity(path, path_end_s(path, self.run_in_s, self.run_out_s), fixed_rad)
+        return Fixed(fixed_rad)
 
 
-def helix(radius_m: float, period_s: float, climb_mps: float, laps: int) -> Harmonic:
-    """Clockwise seen from above round the origin, from its north, climbing (positive up)."""
-    omega = 2.0 * math.pi / period_s
-    return Harmonic(
-        length_s=laps * period_s,
-        slope_ned_mps=(0.0, 0.0, -climb_mps),
-        amplitude_ned_m=(radius_m, radius_m, 0.0),
-        omega_ned_radps=(omega, omega, 0.0),
-        phase_ned_rad=(0.5 * math.pi, 0.0, 0.0),
-    )
+class Hover(Shape):
+    """Rest at the origin."""
+
+    shape: Literal["hover"] = "hover"
+    duration_s: Annotated[float, Field(gt=0.1, le=3600)] = 15.0
+    run_in_s: Literal[0] = 0
+    run_out_s: Literal[0] = 0
+
+    def path(self) -> Path:
+        return Harmonic(self.duration_s, bounded=True)
 
 
-def circle(radius_m: float, period_s: float, laps: int) -> Harmonic:
-    """Level, clockwise seen from above round the origin, from its north."""
-    return helix(radius_m, period_s, 0.0, laps)
+class Line(Shape):
+    """Straight from the origin to a point relative to it, at constant speed between the runs."""
+
+    shape: Literal["line"] = "line"
+    to_north_m: Coordinate = 10.0
+    to_east_m: Coordinate = 0.0
+    climb_m: Annotated[float, Field(ge=-500, le=500)] = 0.0
+    speed_mps: Speed = 1.5
+
+    def path(self) -> Path:
+        displacement = (self.to_north_m, self.to_east_m, -self.climb_m)
+        distance_m = math.hypot(*displacement)
+        if distance_m < 1e-6:
+            raise ValueError("a line needs a displacement longer than zero")
+        north, east, down = (self.speed_mps * part / distance_m for part in displacement)
+        return Harmonic(
+            distance_m / self.speed_mps, bounded=True, slope_ned_mps=(north, east, down)
+        )
 
 
-def lemniscate(half_length_m: float, half_width_m: float, period_s: float, laps: int) -> Harmonic:
-    """A level figure of eight from its centre, the origin: north = half_length sin(w s),
-    east = half_width sin(2 w s), w = 2 pi / period."""
-    omega = 2.0 * math.pi / period_s
-    return Harmonic(
-        length_s=laps * period_s,
-        amplitude_ned_m=(half_length_m, half_width_m, 0.0),
-        omega_ned_radps=(omega, 2.0 * omega, 0.0),
-    )
+class Helix(Shape):
+    """Round the origin, clockwise seen from above, from its north, climbing from `height_m`."""
+
+    shape: Literal["helix"] = "helix"
+    radius_m: Size = 1.5
+    period_s: Period = 10.0
+    climb_mps: Climb = 0.4
+    laps: Laps = 2
+
+    def path(self) -> Path:
+        omega = 2.0 * math.pi / self.period_s
+        return Harmonic(
+            self.laps * self.period_s,
+            slope_ned_mps=(0.0, 0.0, -self.climb_mps),
+            amplitude_ned_m=(self.radius_m, self.radius_m, 0.0),
+            omega_ned_radps=(omega, omega, 0.0),
+            phase_ned_rad=(0.5 * math.pi, 0.0, 0.0),
+        )
+
+
+class Circle(Shape):
+    """Level round the origin, clockwise seen from above, from its north."""
+
+    shape: Literal["circle"] = "circle"
+    radius_m: Size = 2.0
+    period_s: Period = 8.0
+    laps: Laps = 2
+
+    def path(self) -> Path:
+        return Helix(
+            radius_m=self.radius_m, period_s=self.period_s, climb_mps=0.0, laps=self.laps
+        ).path()
+
+
+class Lemniscate(Shape):
+    """A level figure of eight about the origin: north = half_length sin(w s), east = half_width
+    sin(2 w s), w = 2 pi / period."""
+
+    shape: Literal["lemniscate"] = "lemniscate"
+    half_length_m: Size = 2.0
+    half_width_m: Size = 1.0
+    period_s: Period = 8.0
+    laps: Laps = 2
+
+    def path(self) -> Path:
+        omega = 2.0 * math.pi / self.period_s
+        return Harmonic(
+            self.laps * self.period_s,
+            amplitude_ned_m=(self.half_length_m, self.half_width_m, 0.0),
+            omega_ned_radps=(omega, 2.0 * omega, 0.0),
+        )
+
+
+class Waypoints(Shape):
+    """A smooth path from rest to rest through points [north, east, up] m, relative to the origin;
+    at `times_s`, or at a mean speed."""
+
+    shape: Literal["waypoints"] = "waypoints"
+    points_m: Annotated[
+        tuple[tuple[Coordinate, Coordinate, Coordinate], ...], Field(min_length=2, max_length=500)
+    ]
+    speed_mps: Speed | None = None
+    times_s: tuple[Annotated[float, Field(ge=0, le=3600)], ...] | None = None
+    minimise: waypoints.Smoothness = waypoints.Smoothness.SNAP
+    run_in_s: Seconds = 1.0
+    run_out_s: Seconds = 1.0
+
+    @model_validator(mode="after")
+    def _makes_a_path(self) -> Self:
+        if (self.speed_mps is None) == (self.times_s is None):
+            raise ValueError("waypoints need one of speed_mps and times_s")
+        self.path()
+        return self
+
+    def path(self) -> Path:
+        points = np.array(self.points_m, dtype=np.float64) * (1.0, 1.0, -1.0)
+        if self.speed_mps is not None:
+            times = waypoints.times_from_speed(points, self.speed_mps)
+        else:
+            times = np.array(self.times_s or (), dtype=np.float64)
+        return waypoints.through(points, times, self.minimise)
+
+
+class FromTable(Shape):
+    """A CSV table (see `table`); positions relative to the take-off point, heights as written.
+
+    `course: table` takes the column course_deg, and the fixed `course_deg` where there is none.
+    `knot_spacing_s` > 0 smooths rounded or noisy rows. `text` is the content of `file`, filled in
+    by the reader of the file, so that a recorded configuration is complete.
+    """
+
+    shape: Literal["table"] = "table"
+    file: Annotated[str, Field(min_length=1, max_length=4096)]
+    text: str | None = None
+    height_m: Literal[0] = 0
+    knot_spacing_s: Annotated[float, Field(ge=0, le=60)] = 0.0
+    course: CourseMode = CourseMode.TABLE  # type: ignore[assignment]  # one more choice
+    run_in_s: Seconds = 2.0
+    run_out_s: Seconds = 2.0
+
+    @property
+    def title(self) -> str:
+        return self.file
+
+    def path(self) -> Path:
+        rows = self._rows()
+        return table.interpolate(rows.times_s, rows.points_ned_m, self.knot_spacing_s)
+
+    def _course(self, path: Path) -> Course:
+        if self.course is CourseMode.TABLE and (rows := self._rows()).course_rad is not None:
+            column = rows.course_rad[:, np.newaxis]
+            return Tabulated(table.interpolate(rows.times_s, column, self.knot_spacing_s))
+        return super()._course(path)
+
+    def _rows(self) -> table.Table:
+        if self.text is None:
+            raise ValueError(f"the table {self.file} has not been read")
+        return table.parse(self.text, self.file)
+
+
+SHAPES: Mapping[str, type[Shape]] = {
+    "hover": Hover,
+    "line": Line,
+    "circle": Circle,
+    "lemniscate": Lemniscate,
+    "helix": Helix,
+    "waypoints": Waypoints,
+    "table": FromTable,
+}

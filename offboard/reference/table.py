@@ -1,8 +1,8 @@
-"""A path given as a table: CSV text in, a smooth path (and course) out. Reads no file.
+"""Paths from points: a CSV table, and the smooth curve through points at given times.
 
-Columns, named in the first row and in any order: `time_s`; `north_m` or `x`, `x_m`; `east_m` or
-`y`, `y_m`; `down_m` or `z`, `z_m` (positive down), or `altitude_m` (positive up); optionally
-`course_deg` (heading of the nose, clockwise from north). Other columns are refused.
+Columns of a table, named in the first row, in any order: `time_s`; `north_m` or `x`, `x_m`;
+`east_m` or `y`, `y_m`; `down_m` or `z`, `z_m` (positive down), or `altitude_m` (positive up);
+optionally `course_deg` (heading of the nose, clockwise from north). Other columns are refused.
 """
 
 from __future__ import annotations
@@ -34,12 +34,12 @@ _NATURAL_END = [(3, 0.0), (4, 0.0)]
 
 
 class TableError(ValueError):
-    """The table cannot be flown; the sentence names the file, the row and the column."""
+    """The table cannot be used; the sentence names file, row and column."""
 
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """Rows: times_s (N,) from 0, points_ned_m (N, 3), course_rad (N,) unwrapped or None."""
+    """The rows: times_s (N,) from 0, points_ned_m (N, 3), course_rad (N,) unwrapped, or None."""
 
     times_s: Array
     points_ned_m: Array
@@ -47,9 +47,9 @@ class Table:
 
 
 def parse(text: str, name: str) -> Table:
-    """Parse CSV text; `name` stands for the file in errors. Rows count from 1, the header's.
+    """Parse CSV text. Times are shifted to begin at 0.
 
-    Times are shifted to begin at 0. Raises TableError."""
+    Raises TableError; it calls the table `name` and counts rows from 1, the header."""
     rows = [
         (number, row)
         for number, row in enumerate(_rows(text, name), start=1)
@@ -77,11 +77,11 @@ def parse(text: str, name: str) -> Table:
 
 
 def interpolate(times_s: Array, values: Array, knot_spacing_s: float = 0.0) -> Polynomial:
-    """A quintic spline, continuous to its 4th derivative, for values (N, C) at times (N,).
+    """A quintic spline, continuous to its fourth derivative, through values (N, C) at times (N,).
 
-    It passes through every row, which is the smoothest (least jerk) way to do so; third and
-    fourth derivative vanish at the ends. With a positive `knot_spacing_s` it is a least-squares
-    fit with knots no closer than that, which forgives rounded or noisy rows.
+    It has the least jerk of all curves through the values; third and fourth derivative vanish at
+    the ends. With a positive `knot_spacing_s` it is a least-squares fit with knots no closer than
+    that, for rounded or noisy values.
     """
     knots = _knots(times_s, knot_spacing_s)
     if knots is None:
@@ -110,7 +110,7 @@ def _header(cells: list[str], name: str, number: int) -> list[str]:
                 "time_s, north_m, east_m, down_m (or altitude_m), course_deg"
             )
         if column in columns:
-            raise TableError(f"{name}, row {number}: column {column} is there twice")
+            raise TableError(f"{name}, row {number}: column {column} is given twice")
         columns.append(column)
     for column in ("time_s", "north_m", "east_m"):
         if column not in columns:
@@ -142,11 +142,11 @@ def _ends(values: Array) -> list[tuple[int, Array]]:
 
 
 def _knots(times_s: Array, spacing_s: float) -> Array | None:
-    """Knots of a least-squares fit, or None where interpolation is as coarse already."""
+    """Knots of a least-squares fit, or None where interpolation has no more of them."""
     intervals = int(times_s[-1] / spacing_s) if spacing_s > 0.0 else times_s.size
     if intervals + _DEGREE >= times_s.size:
         return None
-    # knots on rows, evenly many rows apart: every span holds data (Schoenberg-Whitney)
+    # knots on rows, equally many rows apart: every span has data (Schoenberg-Whitney)
     on_rows = np.rint(np.linspace(0, times_s.size - 1, intervals + 1)).astype(np.int64)
     inner = times_s[on_rows[1:-1]]
     return np.concatenate(

@@ -1,9 +1,9 @@
 """A path flown from rest to rest: run-in, the scored part at full speed, run-out.
 
-A path that continues (circle, lemniscate, helix) is left where its laps begin: the run-in covers
-the first run_in_s / 2 of it, then come exactly the laps, and the run-out goes on along it for
-run_out_s / 2. A bounded path (line, waypoints, table) holds both runs within its ends: only what
-lies between is flown at full speed, and scored. A hover has no runs and is scored throughout.
+On an unbounded path (circle, lemniscate, helix) the run-in covers the first run_in_s / 2 of it,
+then come exactly the laps, and the run-out continues along it for run_out_s / 2. On a bounded path
+(line, waypoints, table) both runs lie within its ends: only the part between is flown at full speed
+and scored. A hover has no runs and is scored throughout.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ _REST_SPEED_MPS = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """A `Reference` continuous to snap in position and to acceleration in course, from rest to
-    rest; without runs, as continuous at its ends as the path at rest there is.
+    """A `Reference` from rest to rest, continuous to snap in position and to acceleration in course
+    (without a run, at that end, as continuous as the path is there).
 
     Time 0 is the start of the run-in; positions are NED relative to the take-off point. Raises
-    ValueError when the runs do not fit in a bounded path, or when a run is zero and the path
-    moves at that end.
+    ValueError where the runs do not fit in a bounded path, or a run is zero and the path moves at
+    that end.
     """
 
     path: Path

@@ -1,6 +1,5 @@
-"""Getting there: from a start, at rest or moving, to rest at a target; and references moved about.
-
-Used for the climb after take-off and for flying to the start of a track.
+"""Transfers from a start, at rest or moving, to rest at a target; and references shifted in time or
+space. Used for the climb after take-off and for flying to the start of a track.
 """
 
 from __future__ import annotations
@@ -22,23 +21,23 @@ Vector = Array | Iterable[float]
 
 _DURATION_MIN_S = 0.5
 _GROWTH = 1.08
-_CRUISE_FROM_S = 15.0  # a way that takes longer in one piece is flown in three
-_RAMPS_SHARE = 0.6  # most of such a way that gaining and losing speed may take
+_CRUISE_FROM_S = 15.0  # a transfer that takes longer in one piece is flown in three
+_RAMPS_SHARE = 0.6  # of the distance: most that gaining and losing speed may take
 _SMOOTH_PEAK = 35.0 / 16.0  # slope of the smoothstep of degree 7
 _BRAKE_MIN_S = 1.5
-_CREEP_MPS = 0.5  # a start so slow needs no braking of its own
-_AHEAD = 0.7  # least cosine between a start's velocity and its way
+_CREEP_MPS = 0.5  # a start that is no faster needs no braking
+_AHEAD = 0.7  # least cosine between a start's velocity and the direction of the target
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """How briskly a transfer may fly."""
+    """Limits of a transfer."""
 
     speed_mps: float = 1.5
     acceleration_mps2: float = 2.0
     course_rate_radps: float = 0.8
-    # Of a way so long that it is flown at constant speed in between (MPC_XY_CRUISE and
-    # MPC_Z_V_AUTO_DN of PX4 are 5 and 1.5 m/s)
+    # Of a long transfer, flown at constant speed between gaining and losing it (PX4: MPC_XY_CRUISE
+    # 5 m/s, MPC_Z_V_AUTO_DN 1.5 m/s)
     cruise_mps: float = 4.0
     cruise_vertical_mps: float = 1.5
 
@@ -76,13 +75,13 @@ def transfer(
     *,
     start_velocity_ned_mps: Vector = (0.0, 0.0, 0.0),
 ) -> Transfer:
-    """From a start (3,), NED, to rest at a target, as fast as the limits allow; turning the short
-    way. The course ends at `target_course_rad` plus whole turns, next to the start's.
+    """From a start (3,), NED, to rest at a target (3,), about as fast as the limits allow.
 
-    A start that moves too fast, or not towards the target, is first braked to rest, in the
-    direction that it moves in: nothing here knows where the ground is. A long way is flown
-    straight, at constant speed between gaining and losing it. Raises ValueError for anything not
-    finite.
+    The course turns the short way: it ends at `target_course_rad` plus the whole turns that are
+    nearest to the start. A start that is too fast, or does not move towards the target, is first
+    braked to rest in the direction of its motion (the ground is not considered). A long transfer is
+    flown straight, at constant speed between gaining and losing it. Raises ValueError for anything
+    that is not finite.
     """
     start, target, velocity = (
         np.asarray(list(vector), dtype=np.float64)
@@ -117,7 +116,7 @@ def transfer(
 
 
 def _moves_well(begin: Array, end: Array, limits: Limits) -> bool:
-    """Hardly, or towards the target at a speed that is no more than allowed."""
+    """Whether the start needs no braking: slow, or towards the target within the speed limit."""
     velocity, way = begin[1, :3], end[0, :3] - begin[0, :3]
     speed_mps = float(np.linalg.norm(velocity))
     ahead = float(velocity @ way) >= _AHEAD * speed_mps * float(np.linalg.norm(way))
@@ -131,7 +130,7 @@ def _at_rest(place: Array) -> Array:
 
 
 def _shortest(begin: Array, end: Array, limits: Limits) -> Polynomial:
-    """The shortest single polynomial within the limits, or the longest tried."""
+    """The shortest single polynomial within the limits; none is tried beyond _CRUISE_FROM_S."""
     distance_m = float(np.linalg.norm(end[0, :3] - begin[0, :3]))
     turn_rad = abs(float(end[0, 3] - begin[0, 3]))
     # no polynomial is faster than the mean speed or turn rate
@@ -146,14 +145,15 @@ def _shortest(begin: Array, end: Array, limits: Limits) -> Polynomial:
 
 
 def _cruise(start: Array, target: Array, limits: Limits) -> list[tuple[float, Array]]:
-    """From rest to rest, (4,) in position and course: gaining speed, keeping it, losing it."""
+    """Duration and end of three legs from rest to rest, (4,) in position and course: gaining speed,
+    keeping it, losing it."""
     way = target - start
     speed_mps = _cruise_mps(way, limits)
     ramp_s = _SMOOTH_PEAK * speed_mps / limits.acceleration_mps2
     straight_s = _length_m(way) / speed_mps
     fast, slow = _at_rest(start), _at_rest(target)
     fast[1] = slow[1] = way / straight_s
-    fast[0] += fast[1] * (ramp_s / 2.0)  # on average half as fast
+    fast[0] += fast[1] * (ramp_s / 2.0)  # the mean speed of a ramp is half the final one
     slow[0] -= slow[1] * (ramp_s / 2.0)
     return [(ramp_s, fast), (straight_s - ramp_s, slow), (ramp_s, _at_rest(target))]
 
@@ -163,7 +163,7 @@ def _length_m(way: Array) -> float:
 
 
 def _cruise_mps(way: Array, limits: Limits) -> float:
-    """Along a way (4,) in position and course; less where gaining speed would take most of it."""
+    """Speed along a way (4,) in position and course; a short one is mostly ramps."""
     distance_m = _length_m(way)
     return min(
         max(limits.cruise_mps, limits.speed_mps),
@@ -174,7 +174,7 @@ def _cruise_mps(way: Array, limits: Limits) -> float:
 
 
 def _through(times_s: Array | list[float], jets: list[Array]) -> Polynomial:
-    """Degree 9 from each (5, 4) jet, position to snap, to the next."""
+    """Polynomials of degree 9 from each (5, 4) jet, position to snap, to the next."""
     bernstein = BPoly.from_derivatives(times_s, jets)
     taylor = PPoly.from_bernstein_basis(bernstein).c[::-1].transpose(1, 0, 2)
     return Polynomial.from_taylor(bernstein.x, taylor)
@@ -193,7 +193,7 @@ def _excess(polynomial: Polynomial, limits: Limits) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """Rest at a point (NED, m) with a course (rad), for `duration_s` and for ever after."""
+    """Rest at a point (NED, m) with a course (rad)."""
 
     position_ned_m: tuple[float, float, float]
     course_rad: float
@@ -211,7 +211,7 @@ class Hold:
 
 @dataclass(frozen=True, slots=True)
 class Shifted:
-    """A reference that begins at `start_s` of another time axis (vehicle time, say)."""
+    """A reference that begins at `start_s` of another time axis, such as vehicle time."""
 
     reference: Reference
     start_s: float
@@ -228,7 +228,7 @@ class Shifted:
 
 @dataclass(frozen=True, slots=True)
 class Placed:
-    """A reference given relative to a point, placed there: NED, m (the take-off point, say)."""
+    """A reference relative to a point, such as the take-off point, moved there; NED, m."""
 
     reference: Reference
     origin_ned_m: tuple[float, float, float]

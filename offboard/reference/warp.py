@@ -1,6 +1,6 @@
-"""Starting and stopping smoothly on a path: a warp of time, and the chain rule through it.
+"""Smooth starts and stops on a path: the path's time s(t), and the chain rule for its derivatives.
 
-The path's time s(t) starts at rest, runs at rate 1 and comes to rest again.
+s(t) starts at rest, runs at rate 1 and comes to rest again.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def _ramp(x: Array, duration_s: float, direction: float) -> Array:
 
 
 def compose_position(s: Array, path: Array) -> Array:
-    """Derivatives by time (5, N, 3) of a path (5, N, 3) travelled as s (5, N) (Faa di Bruno)."""
+    """Derivatives by time (5, N, 3) of a path (5, N, 3) at s(t) (5, N) (Faa di Bruno)."""
     s1, s2, s3, s4 = s[1:, :, np.newaxis]
     p0, p1, p2, p3, p4 = path
     return np.stack(
@@ -68,6 +68,6 @@ def compose_position(s: Array, path: Array) -> Array:
 
 
 def compose_course(s: Array, course: Array) -> Array:
-    """Course, rate and acceleration by time (3, N) of a course (3, N) travelled as s (5, N)."""
+    """Course, rate and acceleration by time (3, N) of a course (3, N) at s(t) (5, N)."""
     c0, c1, c2 = course
     return np.stack([c0, c1 * s[1], c2 * s[1] ** 2 + c1 * s[2]])

@@ -16,14 +16,15 @@ from offboard.reference.path import Polynomial
 
 Array = NDArray[np.float64]
 
-_REST_LEG_STRETCH = 1.5  # the first and the last leg start or end at rest: give them more time
+_REST_LEG_STRETCH = 1.5  # the first and the last leg start or end at rest and need more time
 
 
 class Smoothness(StrEnum):
-    """What is minimised; inside, `jerk` is continuous to snap and `snap` two derivatives beyond.
+    """The derivative whose square is minimised. Inside, `jerk` gives a path continuous to snap,
+    `snap` one continuous to two derivatives more.
 
-    At the ends velocity and acceleration (snap: and jerk) vanish; `track`'s run-in and run-out
-    make what remains continuous too."""
+    At the ends velocity and acceleration vanish, with `snap` jerk too; the run-in and run-out of
+    `Track` make the higher derivatives continuous there."""
 
     JERK = "jerk"
     SNAP = "snap"

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.model.kernel import kernel
-from offboard.model.rigid_body import pack, rk4_into
+from offboard.compiled import kernel
+from offboard.model.rigid_body import pack, quaternion_into, rk4_into
 from offboard.model.vehicle import Vehicle
 from simulator.vehicle.battery import Battery, Pack
 
@@ -107,7 +107,9 @@ def advance_airframe(
     part_s = step_s / substeps
     for _ in range(substeps):
         stands, stand_north, stand_east = rotor[CONTACT] > 0.5, body[10], body[11]
-        rk4_into(body[:], inputs, wind_ned, body_constants, part_s, scratch, body[:])
+        rk4_into(
+            quaternion_into, body[:], inputs, wind_ned, body_constants, part_s, scratch, body[:]
+        )
         rotor[CONTACT] = _touch_ground(body, part_s)
         if stands and rotor[CONTACT] > 0.5 and body[7] == 0.0 and body[8] == 0.0:
             body[10], body[11] = stand_north, stand_east  # gripped: it did not creep either

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.model.kernel import kernel
+from offboard.compiled import kernel
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from offboard.model.kernel import entry, kernel
+from offboard.compiled import entry, kernel
 from offboard.model.rigid_body import RK4_SCRATCH_ROWS
 from offboard.model.state import QUATERNION
 from simulator.steps import STEP_S
@@ -93,15 +93,16 @@ RECORD = np.dtype(
 
 
 @entry(RECORD)
-def draw_gusts(plant: Any) -> int:
+def draw_gusts(plants: Any) -> None:
     """Fill in the normal numbers that the gusts of a flight begin with."""
+    plant = plants[0]
     fill_normals(plant.seed, _GUST_LANE, np.int64(-1), plant.gust_normals[:])
-    return 0
 
 
 @entry(RECORD)
-def report_state(plant: Any) -> int:
+def report_state(plants: Any) -> None:
     """Fill in the report of this state."""
+    plant = plants[0]
     report(
         plant.body,
         plant.rotor,
@@ -116,12 +117,12 @@ def report_state(plant: Any) -> int:
         plant.normals,
         plant.report,
     )
-    return 0
 
 
 @entry(RECORD)
-def receive_fix(plant: Any) -> int:
+def receive_fix(plants: Any) -> None:
     """Fill in the satellite fix of this state."""
+    plant = plants[0]
     fill_normals(plant.seed, _RECEIVER_LANE, plant.step, plant.fix[:])
     for i in range(5):
         plant.fix[i] *= plant.fix_sds[i]
@@ -129,35 +130,21 @@ def receive_fix(plant: Any) -> int:
         plant.fix[i] += plant.body[10 + i] + plant.fix_offset[i]
     for i in range(2):
         plant.fix[3 + i] += plant.body[7 + i]
-    return 0
 
 
 @entry(int, RECORD)
-def advance_steps(count: int, plant: Any) -> int:
+def advance_steps(count: int, plants: Any) -> None:
     """`count` steps in place.
 
     Per step: demand into history, air, loop on the estimate, airframe, estimator errors.
     """
-    noise_gain = 1.0 if plant.motors_on else STANDING_NOISE
-    error, turn_error = plant.error, plant.turn_error
+    plant = plants[0]
     first = plant.step
     for step in range(first, first + count):
         for i in range(ROW_WIDTH):
             plant.history[step % _HISTORY_ROWS, i] = plant.row[i]
         _move_air(plant, step)
-        turn_error[0], turn_error[1] = -error[EAST + 2], error[NORTH + 2]
-        turn_error[2] = error[YAW]
-        turn_estimate(plant.body, turn_error[:], plant.estimated[:])
-        angular_acceleration(
-            plant.estimated,
-            plant.body,
-            plant.history,
-            step,
-            plant.delays,
-            plant.gains,
-            turn_error,
-            plant.turn,
-        )
+        _control_attitude(plant, step)
         advance_airframe(
             plant.body,
             plant.rotor,
@@ -173,20 +160,8 @@ def advance_steps(count: int, plant: Any) -> int:
             plant.slopes,
         )
         if plant.noisy:
-            fill_normals(plant.seed, _ERROR_LANE, step, plant.normals[:])
-            for start, end in ERROR_BLOCKS:
-                advance_block(
-                    plant.error_transition[:],
-                    plant.error_scale[:],
-                    start,
-                    end,
-                    noise_gain,
-                    plant.normals[:],
-                    error[:],
-                    plant.work[:],
-                )
+            _move_errors(plant, step)
         plant.step = step + 1
-    return 0
 
 
 @kernel
@@ -209,3 +184,40 @@ def _move_air(plant: Any, step: int) -> None:
     wind[0] = air[0] + air[3] * gust[0] - air[4] * gust[1]
     wind[1] = air[1] + air[4] * gust[0] + air[3] * gust[1]
     wind[2] = air[2] + gust[3]
+
+
+@kernel
+def _control_attitude(plant: Any, step: int) -> None:
+    """The angular acceleration that the attitude loop demands, on the estimated attitude."""
+    error, turn_error = plant.error, plant.turn_error
+    turn_error[0], turn_error[1] = -error[EAST + 2], error[NORTH + 2]
+    turn_error[2] = error[YAW]
+    turn_estimate(plant.body, turn_error[:], plant.estimated[:])
+    angular_acceleration(
+        plant.estimated,
+        plant.body,
+        plant.history,
+        step,
+        plant.delays,
+        plant.gains,
+        turn_error,
+        plant.turn,
+    )
+
+
+@kernel
+def _move_errors(plant: Any, step: int) -> None:
+    """The errors of the estimator."""
+    fill_normals(plant.seed, _ERROR_LANE, step, plant.normals[:])
+    gain = 1.0 if plant.motors_on else STANDING_NOISE
+    for start, end in ERROR_BLOCKS:
+        advance_block(
+            plant.error_transition[:],
+            plant.error_scale[:],
+            start,
+            end,
+            gain,
+            plant.normals[:],
+            plant.error[:],
+            plant.work[:],
+        )

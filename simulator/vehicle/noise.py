@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from offboard.model.kernel import kernel
+from offboard.compiled import kernel
 
 Array = NDArray[np.float64]
 

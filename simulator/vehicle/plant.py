@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.model.kernel import address
 from offboard.model.state import QUATERNION
 from offboard.model.vehicle import Triple, Vehicle
 from simulator.steps import STEP_S
@@ -89,7 +88,6 @@ class Plant:
 
     def __init__(self, vehicle: Vehicle, conditions: Conditions, seed: int) -> None:
         self.record = np.zeros(1, RECORD)
-        self.address = address(self.record)
         self._step = 0
         self._due_s = 0.0
         airframe = build_airframe(
@@ -124,7 +122,7 @@ class Plant:
         self._body[0] = 1.0
         self._rotor[CONTACT] = 1.0
         self._wind[:] = wind_ned_mps
-        draw_gusts.call(self.address)
+        draw_gusts(self.record)
         record["gust"][0] = gusts.stationary_scale @ record["gust_normals"][0]
         record["gusty"] = np.any(record["gust"] != 0.0)
 
@@ -143,7 +141,7 @@ class Plant:
         count = int(self._due_s / STEP_S + 1e-6)
         self._due_s -= count * STEP_S
         self._step += count
-        advance_steps.call(count, self.address)
+        advance_steps(count, self.record)
 
     def reset_estimate(self, offset_ned_m: Triple) -> None:
         """The estimator jumps by this much from now on, and says so by its reset counter."""
@@ -185,7 +183,7 @@ class Plant:
     @property
     def fix(self) -> Fix:
         """A satellite fix of now; the same however often it is asked within a step."""
-        receive_fix.call(self.address)
+        receive_fix(self.record)
         fix = self.record["fix"][0].copy()
         return Fix(fix[:3], fix[3:])
 
@@ -224,7 +222,7 @@ class Plant:
     def report(self) -> Array:
         """The estimate in one array (REPORT_WIDTH,), laid out as `simulator.vehicle.sensors` says;
         it changes with the next call."""
-        report_state.call(self.address)
+        report_state(self.record)
         seen: Array = self._report
         return seen
 

@@ -18,8 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from offboard.compiled import kernel
 from offboard.documents.parameters import Parameters
-from offboard.model.kernel import kernel
 from offboard.model.vehicle import NonNegativeTriple
 from simulator.vehicle.noise import LinearProcess, block_diagonal, discretise, fill_normals
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from offboard.control.base import Situation
-from offboard.control.catalogue import LAWS, build
+from offboard.control.catalogue import settings_of
 from offboard.flight.configuration import load
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
@@ -60,7 +60,7 @@ def test_decision(law: str, steps: int | None, volumes: int, benchmark: Any) -> 
         settings["steps"] = steps
     if volumes:
         settings["keep_out"] = SPHERES[:volumes]
-    controller = build(LAWS[law].model_validate(settings), VEHICLE, 0.1, 7)  # type: ignore[arg-type]
+    controller = settings_of(law)(**settings).build(VEHICLE, period_s=0.1, seed=7)
     met = cycle(situations())
     decision = benchmark.pedantic(
         lambda: controller.decide(next(met)), rounds=1000, warmup_rounds=50

@@ -17,7 +17,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from offboard.analysis import history, tlog
 from offboard.analysis.score import Score, score
 from offboard.control.base import Controller
-from offboard.control.catalogue import build
 from offboard.estimation.fusion import FusedObserver, observer_of
 from offboard.flight import configuration as config
 from offboard.flight.companion import Companion, Outcome
@@ -211,7 +210,7 @@ def make(
         name, choices=choices, assignments=assignments, seed=seed, known_vehicle="px4_sih"
     )
     believed = believed or resolved.vehicle
-    controller = build(resolved.controller, believed, resolved.period_s, resolved.seed)
+    controller = resolved.controller.build(believed, period_s=resolved.period_s, seed=resolved.seed)
     observer = observer_of(resolved.estimate, believed, resolved.observer, resolved.fusion)
     companion = Companion(
         vehicle=believed,
@@ -219,7 +218,7 @@ def make(
             SessionSettings(
                 component_id=COMPONENT_ID,
                 record_component_id=RECORD_COMPONENT_ID,
-                wanted_too=POSITIONING_TELEMETRY if isinstance(observer, FusedObserver) else (),
+                extra_wanted=POSITIONING_TELEMETRY if isinstance(observer, FusedObserver) else (),
             )
         ),
         observer=observer,
@@ -229,7 +228,7 @@ def make(
         period_s=resolved.period_s,
         deadline_s=None,
         stopwatch=lambda: 0.0,
-        learning=learning,
+        identify=learning,
     )
     conditions = simulated.scenario(scenario).conditions
     instance = Instance(firmware, flies or simulated.vehicle("px4_sih"), conditions, seed)

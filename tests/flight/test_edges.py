@@ -1,4 +1,4 @@
-"""The loop and the links where the world outside fails: a terminal, a pipe, a cable."""
+"""Loop and links under failures of terminal, pipe and cable, and under signals."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from offboard.mavlink.framing import FrameSplitter, pack
 
 
 class Wire:
-    """A link on which nothing happens."""
+    """A link without traffic."""
 
     is_stream = False
 
@@ -38,7 +38,7 @@ class Wire:
 
 
 class Flight:
-    """A companion whose flight lasts `polls`, and which notes what it is asked."""
+    """A companion whose flight lasts `polls`, and which counts stop requests."""
 
     peer = None
 
@@ -64,11 +64,11 @@ class Flight:
 def fly(flight: Flight, directory: Path, progress: Callable[[Any], None]) -> Outcome:
     with FlightLog(directory / "flight", "") as log, StopRequests() as stops:
         companion = cast(Companion, flight)
-        return Loop(companion, Wire(), log, stops=stops, lockstep=False, progress=progress).run()
+        return Loop(companion, Wire(), log, stops=stops, progress=progress).run()
 
 
 @pytest.mark.parametrize("failure", [SystemExit(1), BrokenPipeError(), OSError(5, "lost")])
-def test_a_terminal_that_went_away_ends_no_flight(tmp_path: Path, failure: BaseException) -> None:
+def test_a_closed_terminal_does_not_end_the_flight(tmp_path: Path, failure: BaseException) -> None:
     shown = 0
 
     def progress(companion: Any) -> None:
@@ -85,7 +85,7 @@ def test_a_terminal_that_went_away_ends_no_flight(tmp_path: Path, failure: BaseE
     ("number", "polls_left"), [(signal.SIGHUP, 0), (signal.SIGINT, 3), (signal.SIGTERM, 3)]
 )
 def test_two_signals(tmp_path: Path, number: int, polls_left: int) -> None:
-    """Both ask for a landing; only a hang-up, which comes twice by itself, never leaves."""
+    """The first one lands, a second one exits immediately, except a second SIGHUP."""
     flight = Flight(5, lambda left: os.kill(os.getpid(), number) if left >= 3 else None)
     outcome = fly(flight, tmp_path, lambda companion: None)
     assert flight.polls == polls_left
@@ -93,7 +93,7 @@ def test_two_signals(tmp_path: Path, number: int, polls_left: int) -> None:
     assert (outcome.exit_code == 0) is (polls_left == 0)
 
 
-def test_an_ignored_hang_up_stays_ignored(tmp_path: Path) -> None:
+def test_an_ignored_sighup_stays_ignored(tmp_path: Path) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
         flight = Flight(5, lambda left: os.kill(os.getpid(), signal.SIGHUP))
@@ -136,8 +136,8 @@ def cable() -> Iterator[tuple[Link, Callable[[], bytes]]]:
 
 @pytest.mark.parametrize(
     ("ends", "count"), [(connection, 200_000), (cable, 5_000)]
-)  # some 10 MB and 250 kB, more than both ends hold
-def test_a_stream_that_is_full_delays_nothing_and_sends_the_newest_setpoint(
+)  # 10 MB and 250 kB, more than the buffers hold
+def test_a_full_stream_does_not_block_and_sends_the_newest_setpoint(
     ends: Callable[[], AbstractContextManager[tuple[Link, Callable[[], bytes]]]], count: int
 ) -> None:
     heartbeat = pack(0, b"\1" * 9, 7, 1, 191)
@@ -153,7 +153,7 @@ def test_a_stream_that_is_full_delays_nothing_and_sends_the_newest_setpoint(
     numbers = [int.from_bytes(f.payload[:4], "little") for f in frames if f.message_id == 82]
     assert all(frame.verified for frame in frames)
     assert numbers == sorted(numbers)
-    assert len(numbers) < count  # those that waited have been replaced
+    assert len(numbers) < count  # queued ones were replaced
     assert numbers[-2] < count - 1  # by the last one
     assert frames[-2].raw == heartbeat
 

@@ -1,4 +1,4 @@
-"""Off the path at bandwidth 7, on a vehicle whose attitude loop has a limit on its acceleration."""
+"""A position step at bandwidth 7 rad/s; the attitude loop limits its angular acceleration."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ HOVER = (f"reference.duration_s={END_S}", "controller.bandwidth_radps=7")
 
 
 def like_arducopter(personality: str, *assignments: str) -> Pair:
-    """ArduCopter's vehicle (1100 deg/s2) behind either firmware, hovering; after two seconds it
-    finds itself 2.4 m off."""
+    """ArduCopter's vehicle (1100 deg/s2) with either firmware, in hover; after two seconds the
+    estimated position jumps by 2.4 m."""
     if personality == "ardupilot":
         pair = on_arducopter(*HOVER, *assignments, reference="hover", seed=2)
     else:
@@ -37,7 +37,7 @@ def like_arducopter(personality: str, *assignments: str) -> Pair:
 
 
 def swing(pair: Pair, directory: Path) -> tuple[float, float]:
-    """Largest distance from the path (m) and rate (rad/s) once it should have settled."""
+    """Largest distance from the reference (m) and rate (rad/s) after the settling time."""
     assert pair.fly().exit_code == 0
     flown = history.gather(pair.log(directory))
     begin_s = next(at_s for at_s, phase in pair.phases if phase is Phase.TRACK)
@@ -53,15 +53,15 @@ def swing(pair: Pair, directory: Path) -> tuple[float, float]:
 
 
 @pytest.mark.parametrize("personality", ["px4", "ardupilot"])
-def test_engaged_off_the_path_it_settles(personality: str, tmp_path: Path) -> None:
+def test_settles_after_a_jump_of_the_position(personality: str, tmp_path: Path) -> None:
     away_m, rate_radps = swing(like_arducopter(personality), tmp_path)
     assert away_m < 0.005
     assert rate_radps < 0.02
 
 
 @pytest.mark.parametrize("personality", ["px4", "ardupilot"])
-def test_without_the_feedback_limit_it_cycles_for_good(personality: str, tmp_path: Path) -> None:
-    """Which shows that the limit is what keeps it from cycling."""
+def test_limit_cycle_without_the_feedback_limit(personality: str, tmp_path: Path) -> None:
+    """Shows that `feedback_limit` prevents the limit cycle."""
     lifted = like_arducopter(personality, "controller.feedback_limit=1.0")
     away_m, rate_radps = swing(lifted, tmp_path)
     assert away_m > 0.005

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from pair import Pair, make
 
-from offboard.mavlink import encode as outbound
+from offboard.mavlink import encode
 from offboard.mavlink.outgoing import AttitudeTarget
 
 Triple = tuple[int, int, int]
@@ -46,8 +46,8 @@ def test_facing_every_way(course_deg: float, tmp_path: Path) -> None:
 
 def swapped(monkeypatch: pytest.MonkeyPatch, sign: Callable[[AttitudeTarget], Any]) -> Pair:
     """The climbing flight, with what `sign` makes of each target on the wire."""
-    encode = outbound._attitude_quaternion
-    monkeypatch.setattr(outbound, "_attitude_quaternion", lambda target: encode(sign(target)))
+    unchanged = encode._attitude_quaternion
+    monkeypatch.setattr(encode, "_attitude_quaternion", lambda target: unchanged(sign(target)))
     return on_a_helix(0.4, 3.0)
 
 

@@ -11,13 +11,13 @@ import pytest
 from pair import Pair, decode, make
 from pydantic import TypeAdapter
 
-from offboard.control.catalogue import LAWS
+from offboard.control.catalogue import names
 from offboard.control.horizon.keep_out import KeepOut, clearances
 from offboard.flight.phases import Phase
 
 # RMSE in m that is to be undercut in calm; the paper's law has a time constant of 39 s, the
 # autopilot's own loop lags
-MOST_M = dict.fromkeys(LAWS, 0.01) | {"paper": 2.5, "autopilot": 1.0}
+MOST_M = dict.fromkeys(names(), 0.01) | {"paper": 2.5, "autopilot": 1.0}
 SHORT = ("reference.laps=1", "reference.period_s=6", "reference.half_length_m=1")
 
 
@@ -29,7 +29,7 @@ def flying(controller: str, tmp_path: Path, *assignments: str, **options: object
     return make(*assignments, name=str(chosen), **options)
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize("law", names())
 def test_flies_a_short_lemniscate_and_lands(law: str, tmp_path: Path) -> None:
     pair = flying(law, tmp_path, *SHORT)
     outcome = pair.fly()
@@ -81,7 +81,7 @@ def flown(law: str, tmp_path: Path, *assignments: str) -> tuple[np.ndarray, np.n
         companion = pair.companion
         if companion.phase in (Phase.CLIMB, Phase.JOIN, Phase.TRACK, Phase.HOVER):
             plan = companion.plan
-            times.append(plan.track_time_s(companion.view.time_s))
+            times.append(plan.track_time_s(companion.state.time_s))
             truth = np.array(pair.instance.autopilot.state.truth.position_ned_m)
             places.append(truth - plan.origin_ned_m)
 

@@ -1,4 +1,4 @@
-"""Identification in flight and from a flight's log, on vehicles that nobody told of."""
+"""Identification in flight and from a flight's log, of vehicles unlike the vehicle file."""
 
 from __future__ import annotations
 
@@ -20,17 +20,19 @@ from offboard.documents.reading import parse
 from offboard.estimation.observer import Observer, ObserverSettings
 from offboard.flight.online_identification import RECORD_ID, IdentifySettings
 from offboard.flight.phases import Phase
-from offboard.identification.adoption import with_link
+from offboard.identification.adoption import with_link_delay
+from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.excitation import LENGTH_S, excited
-from offboard.identification.stages import Estimate, Identified, ResponseFit
+from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import VehicleEstimate
+from offboard.identification.vehicle_fit import Identified
 from offboard.model.command import Command
 from offboard.model.vehicle import AxisResponse, Vehicle
 from simulator import config as simulated
 from simulator.steps import STEP_S
 from simulator.vehicle.attitude import build_loop
 
-LEARNING = IdentifySettings()
+IDENTIFY = IdentifySettings()
 NEUTRAL = simulated.vehicle("neutral")
 
 
@@ -51,7 +53,7 @@ def unseen(delay_s, frequency, damping, drag_ps, hover_thrust) -> Vehicle:
 
 
 def neutral(reference: str = "lemniscate", **options) -> Pair:
-    """A flight that believes in the neutral vehicle."""
+    """A flight with the vehicle file `neutral`."""
     return make(reference=reference, vehicle="neutral", **options)
 
 
@@ -73,7 +75,7 @@ UNSEEN = {
 )
 def test_unseen_vehicle_is_identified_from_its_log(name, scenario, tmp_path: Path):
     true = UNSEEN[name]
-    pair = neutral("identify", flies=true, scenario=scenario, learning=LEARNING)
+    pair = neutral("identify", flies=true, scenario=scenario, learning=IDENTIFY)
     assert pair.fly().exit_code == 0
     log = pair.log(tmp_path)
     found, _ = identify_flight(log, history.gather(log), NEUTRAL)
@@ -113,37 +115,39 @@ def like_arducopter(**options: Any) -> Pair:
 @pytest.mark.parametrize("like", [like_px4, like_arducopter])
 def test_second_lap_is_as_good_as_with_the_true_constants(like, tmp_path: Path):
     """Within 20 %, mean of two seeds; over ten seeds it is within 2 %."""
-    told, learnt, ignorant = [], [], []
+    true, identified, neutral_file = [], [], []
     for seed in (1, 2):
         flights = (
-            (told, like(seed=seed)),
-            (learnt, like(seed=seed, believed=NEUTRAL, learning=LEARNING)),
-            *([(ignorant, like(seed=seed, believed=NEUTRAL))] if seed == 1 else []),
+            (true, like(seed=seed)),
+            (identified, like(seed=seed, believed=NEUTRAL, learning=IDENTIFY)),
+            *([(neutral_file, like(seed=seed, believed=NEUTRAL))] if seed == 1 else []),
         )
         for index, (figures, pair) in enumerate(flights):
             assert pair.fly().exit_code == 0
             figures.append(second_lap_rmse_m(pair, tmp_path / f"{seed}-{index}"))
-    assert np.mean(learnt) < 1.2 * np.mean(told)
-    assert np.mean(ignorant) > 1.6 * np.mean(told)
+    assert np.mean(identified) < 1.2 * np.mean(true)
+    assert np.mean(neutral_file) > 1.6 * np.mean(true)
 
 
-def test_what_was_learnt_is_told_and_recorded():
-    pair = neutral(scenario="px4_like", learning=LEARNING)
+def test_identified_constants_are_announced_and_recorded():
+    pair = neutral(scenario="px4_like", learning=IDENTIFY)
     assert pair.fly().exit_code == 0
-    told = [line for line in pair.companion.announced if line.startswith("identified")]
-    assert "tilt" in told[0]
-    assert "hover thrust" in told[0]
-    assert any("drag" in line for line in told[1:])
+    announced = [line for line in pair.companion.announced if line.startswith("identified")]
+    assert "tilt" in announced[0]
+    assert "hover thrust" in announced[0]
+    assert any("drag" in line for line in announced[1:])
     begun = {phase: at_s for at_s, phase in pair.phases}
     assert begun[Phase.JOIN] - begun[Phase.EXCITE] == pytest.approx(LENGTH_S + 1.5, abs=0.25)
     records = [frame for frame in pair.logged if frame[7:10] == b"\x5e\x01\0"]  # 350
-    assert sum(frame[18:20] == RECORD_ID.to_bytes(2, "little") for frame in records) == len(told)
+    assert sum(frame[18:20] == RECORD_ID.to_bytes(2, "little") for frame in records) == len(
+        announced
+    )
 
 
-def test_learning_is_reproducible():
+def test_identification_is_reproducible():
     short = ("reference.laps=1", "reference.period_s=6", "reference.half_length_m=1")
     first, again = (
-        make(*short, vehicle="neutral", scenario="px4_like", learning=LEARNING) for _ in range(2)
+        make(*short, vehicle="neutral", scenario="px4_like", learning=IDENTIFY) for _ in range(2)
     )
     for pair in (first, again):
         assert pair.fly().exit_code == 0
@@ -151,24 +155,25 @@ def test_learning_is_reproducible():
     assert first.payloads == again.payloads
 
 
-def test_switched_off_nothing_is_excited_or_taken_over():
-    """And the bandwidth is one that bears a delay 0.13 s longer than the vehicle file's."""
+def test_switched_off_nothing_is_excited_or_adopted():
+    """The bandwidth is one that supports a delay 0.13 s longer than the vehicle file's."""
     pair = neutral("hover", learning=IdentifySettings(online=False))
     assert pair.fly().exit_code == 0
     assert not pair.went_through(Phase.EXCITE)
-    told = [line for line in pair.companion.announced if "identified" in line]
-    assert told == [
-        "bandwidth lowered from 7.0 to 5.0 rad/s: the delay is the vehicle file's, not identified"
+    announced = [line for line in pair.companion.announced if "identif" in line]
+    assert announced == [
+        "bandwidth limited to 5.0 rad/s (configured 7.0): without identification the vehicle "
+        "file's delay may be wrong by 130 ms"
     ]
 
 
 def test_steps_stay_in_the_box():
-    pair = neutral("hover", scenario="px4_like", learning=LEARNING)
+    pair = neutral("hover", scenario="px4_like", learning=IDENTIFY)
     away = []
 
     def look(now: Pair) -> bool:
         if now.companion.phase is Phase.EXCITE:
-            position = now.companion.view.position
+            position = now.companion.state.position
             assert position is not None
             away.append(np.linalg.norm(np.array(position.position_ned_m) - [0.0, 0.0, -3.0]))
         return False
@@ -176,26 +181,26 @@ def test_steps_stay_in_the_box():
     pair.at.append((look, lambda _: None))
     assert pair.fly().exit_code == 0
     assert len(away) > 500
-    assert max(away) < LEARNING.box_m
+    assert max(away) < IDENTIFY.box_m
 
 
-def believing(**wrong: object) -> Pair:
-    """PX4's vehicle, of which the vehicle file says something else."""
+def with_wrong_file(**wrong: object) -> Pair:
+    """PX4's vehicle, flown with a vehicle file that is wrong."""
     believed = simulated.vehicle("px4_sih").model_copy(update=wrong)
-    return make(scenario="px4_like", reference="hover", learning=LEARNING, believed=believed)
+    return make(scenario="px4_like", reference="hover", learning=IDENTIFY, believed=believed)
 
 
 @pytest.mark.parametrize(
     ("frequency", "sentence"),
     [
-        (2.5, " contradicts the vehicle file's 2.5 (2 .. 10 allowed)"),
-        (50.0, " contradicts the vehicle file's 50 (12.5 .. 45 allowed)"),
+        (2.5, " contradicts the vehicle file's 2.5 (2 to 10 allowed)"),
+        (50.0, " contradicts the vehicle file's 50 (12.5 to 45 allowed)"),
     ],
 )
 def test_vehicle_file_that_telemetry_contradicts_ends_the_flight(frequency, sentence):
-    """With both figures, and the vehicle lands."""
+    """The reason has both figures, and the vehicle lands."""
     tilt = simulated.vehicle("px4_sih").tilt
-    pair = believing(tilt=tilt.model_copy(update={"natural_frequency_radps": frequency}))
+    pair = with_wrong_file(tilt=tilt.model_copy(update={"natural_frequency_radps": frequency}))
     outcome = pair.fly()
     assert outcome.exit_code == 4
     found, _, allowed = outcome.sentence.removeprefix("tilt frequency ").partition(" ")
@@ -206,8 +211,8 @@ def test_vehicle_file_that_telemetry_contradicts_ends_the_flight(frequency, sent
 
 
 @pytest.mark.parametrize("hover_thrust", [0.33, 0.75])
-def test_hover_thrust_far_from_the_vehicle_file_is_found(hover_thrust, tmp_path: Path):
-    pair = believing(hover_thrust=hover_thrust)
+def test_hover_thrust_far_from_the_vehicle_file_is_identified(hover_thrust, tmp_path: Path):
+    pair = with_wrong_file(hover_thrust=hover_thrust)
     assert pair.fly().exit_code == 0
     assert "hover thrust 0.49" in " ".join(pair.companion.announced)
     assert pair.score(tmp_path).rmse_position_m < 0.05
@@ -218,10 +223,10 @@ def test_constants_out_of_bounds_end_the_flight():
     outcome = pair.fly()
     assert outcome.exit_code == 4
     assert "hover thrust 0.49" in outcome.sentence
-    assert "contradicts the vehicle file's 0.42 (0.4 .. 0.441 allowed)" in outcome.sentence
+    assert "contradicts the vehicle file's 0.42 (0.4 to 0.441 allowed)" in outcome.sentence
 
 
-def test_bandwidth_that_the_delay_does_not_bear_is_lowered():
+def test_bandwidth_that_the_delay_does_not_support_is_limited():
     slow = NEUTRAL.model_copy(
         update={"tilt": NEUTRAL.tilt.model_copy(update={"delay_s": 0.26, "damping": 0.6})}
     )
@@ -231,21 +236,23 @@ def test_bandwidth_that_the_delay_does_not_bear_is_lowered():
         learning=IdentifySettings(box_m=5.0),
     )  # fmt: skip
     assert pair.fly().exit_code == 0
-    (said,) = (line for line in pair.companion.announced if " of 10.0 rad/s" in line)
-    assert 4.0 < float(said.split()[1]) < 9.0
+    limited = "bandwidth limited to "
+    (line,) = (line for line in pair.companion.announced if line.startswith(limited))
+    assert "rad/s (configured 10.0) by the identified delay, 2" in line
+    assert 4.0 < float(line.removeprefix(limited).split()[0]) < 9.0
 
 
-def test_what_was_found_is_blended_in_over_a_second():
-    belief = VehicleEstimate(
+def test_identified_constants_are_blended_in_over_a_second():
+    estimate = VehicleEstimate(
         NEUTRAL, factor=4.0, blend_s=1.0, unknown_delay_s=0.28, period_s=0.1, bandwidth_radps=7.0
     )
     fit = ResponseFit(Estimate(0.09, 0.002), Estimate(14.0, 0.1), Estimate(1.1, 0.01), 0.0, 0.1)
     found = Identified(4.0, tilt=fit, hover_thrust=Estimate(0.5, 0.01), drag_ps=Estimate(1.2, 0.1))
-    belief.take(found, 10.0)
+    estimate.adopt(found, 10.0)
     way = [NEUTRAL]
     for tick in range(12):
-        belief.step(10.0 + 0.1 * tick)
-        way.append(belief.now)
+        estimate.step(10.0 + 0.1 * tick)
+        way.append(estimate.now)
     numbers = np.array(
         [[v.drag_per_mass_ps, v.hover_thrust, *v.tilt.model_dump().values()] for v in way]
     )
@@ -272,7 +279,7 @@ def test_steps_end_where_they_began():
 
 
 def test_slow_link_is_identified_and_flown(tmp_path: Path):
-    """100 ms more each way, which nobody told of; with what is believed it would diverge."""
+    """100 ms more each way than the vehicle file says; flown with the file it would diverge."""
     slow = simulated.vehicle("px4_sih")
     added_s = 0.2
     late = {
@@ -282,7 +289,7 @@ def test_slow_link_is_identified_and_flown(tmp_path: Path):
         for name in ("tilt", "yaw")
     }
     slow = slow.model_copy(update={**late, "thrust_delay_s": slow.thrust_delay_s + added_s})
-    pair = neutral(flies=slow, learning=LEARNING)
+    pair = neutral(flies=slow, learning=IDENTIFY)
     assert pair.fly().exit_code == 0
     assert second_lap_rmse_m(pair, tmp_path) < 0.03
 
@@ -302,7 +309,7 @@ def delayed(extra_s: Callable[[], float]) -> Filter:
 
 def on_a_link_that_changes(extra_s: Callable[[], float]) -> Pair:
     """Identified at its best, flown at bandwidth 7; two seconds on the path the uplink changes."""
-    pair = make(vehicle="px4_sih", scenario="px4_like", seed=1, learning=LEARNING)
+    pair = make(vehicle="px4_sih", scenario="px4_like", seed=1, learning=IDENTIFY)
     change = (in_phase(Phase.TRACK, 2.0), lambda flying: setattr(flying, "up", delayed(extra_s)))
     pair.at.append(change)
     return pair
@@ -312,11 +319,11 @@ def test_delay_that_jumps_is_noticed_and_flown(tmp_path: Path):
     """Unnoticed, 0.2 s more take the vehicle 3.8 m off at this bandwidth."""
     pair = on_a_link_that_changes(lambda: 0.2)
     assert pair.fly().exit_code == 0
-    said = " | ".join(pair.companion.announced)
-    doubt = said.index("the identified vehicle contradicts telemetry")
-    known = said.index("identified tilt", doubt)
-    assert "bandwidth lowered to 3.0 rad/s" in said[doubt:known]
-    found_s = 1e-3 * float(said[known:].split()[2])
+    text = " | ".join(pair.companion.announced)
+    doubt = text.index("the identified vehicle contradicts telemetry")
+    known = text.index("identified tilt delay", doubt)
+    assert "bandwidth limited to 3.0 rad/s" in text[doubt:known]
+    found_s = 1e-3 * float(text[known:].split()[3])
     assert found_s == pytest.approx(0.257, abs=0.010)
     assert pair.score(tmp_path / "whole").max_position_m < 1.5
     assert second_lap_rmse_m(pair, tmp_path) < 0.15
@@ -327,9 +334,9 @@ def test_delay_that_is_never_the_same_lowers_the_bandwidth(tmp_path: Path):
     chance = random.Random(3)
     pair = on_a_link_that_changes(lambda: chance.uniform(0.0, 0.2))
     assert pair.fly().exit_code == 0
-    said = [line for line in pair.companion.announced if "contradicts telemetry" in line]
-    assert "bandwidth lowered to 3.0 rad/s" in said[0]
-    assert "mrad of tilt unexplained (limit" in said[0]
+    doubts = [line for line in pair.companion.announced if "contradicts telemetry" in line]
+    assert "bandwidth limited to 3.0 rad/s" in doubts[0]
+    assert "mrad of tilt unexplained (limit" in doubts[0]
     assert pair.score(tmp_path / "whole").max_position_m < 2.0
     assert second_lap_rmse_m(pair, tmp_path) < 0.3
 
@@ -337,7 +344,7 @@ def test_delay_that_is_never_the_same_lowers_the_bandwidth(tmp_path: Path):
 @pytest.mark.parametrize(("scenario", "most_m"), [("calm", 0.2), ("px4_like", 0.65)])
 def test_attitude_loop_that_slows_is_noticed_and_flown(scenario, most_m, tmp_path: Path):
     """From 11.4 to 5 rad/s with the same delay. Unnoticed, it is 0.68 m off, and 0.98 m."""
-    pair = neutral(scenario=scenario, learning=LEARNING)
+    pair = neutral(scenario=scenario, learning=IDENTIFY)
     true = simulated.vehicle("px4_sih")
     slow = true.tilt.model_copy(update={"natural_frequency_radps": 5.0})
     loop = build_loop(true.model_copy(update={"tilt": slow}), STEP_S)
@@ -347,28 +354,28 @@ def test_attitude_loop_that_slows_is_noticed_and_flown(scenario, most_m, tmp_pat
 
     pair.at.append((in_phase(Phase.TRACK, 3.0), slows))
     assert pair.fly().exit_code == 0
-    said = " | ".join(pair.companion.announced)
-    doubt = said.index("the identified vehicle contradicts telemetry")
-    known = said.index("identified tilt", doubt)
-    assert "bandwidth lowered to 2.8 rad/s" in said[doubt:known]
-    assert float(said[known:].split()[4]) == pytest.approx(5.0, abs=0.2)
-    assert "bandwidth 7.0 of 7.0 rad/s" in said[known:]
-    assert "contradicts" not in said[known:]
+    text = " | ".join(pair.companion.announced)
+    doubt = text.index("the identified vehicle contradicts telemetry")
+    known = text.index("identified tilt delay", doubt)
+    assert "bandwidth limited to 2.8 rad/s" in text[doubt:known]
+    assert float(text[known:].split()[5]) == pytest.approx(5.0, abs=0.2)
+    assert "bandwidth 7.0 rad/s as configured" in text[known:]
+    assert "contradicts" not in text[known:]
     assert pair.score(tmp_path).max_position_m < most_m
 
 
 def test_steps_are_repeated_while_the_delay_is_uncertain():
     chance = random.Random(3)
-    pair = make(vehicle="px4_sih", reference="hover", scenario="px4_like", learning=LEARNING)
+    pair = make(vehicle="px4_sih", reference="hover", scenario="px4_like", learning=IDENTIFY)
     late = delayed(lambda: chance.uniform(0.0, 0.15))
     pair.at.append((in_phase(Phase.EXCITE), lambda flying: setattr(flying, "up", late)))
     assert pair.fly().exit_code == 0
-    said = pair.companion.announced
-    assert any("the steps again: its delay in s is uncertain by" in line for line in said)
+    sentence = "repeating the steps, tilt not identified: its delay (s) is uncertain: sd "
+    assert any(line.startswith(sentence) for line in pair.companion.announced)
 
 
 def test_observer_goes_on_smoothly_with_another_drag():
-    """The acceleration believed stays what it was: the disturbance takes up the difference."""
+    """The predicted acceleration stays the same: the disturbance changes with the drag."""
     before = NEUTRAL
     after = NEUTRAL.model_copy(update={"drag_translation_npmps": (1.4, 1.4, 1.4)})
     observer = Observer(before, ObserverSettings())
@@ -388,13 +395,13 @@ def test_observer_goes_on_smoothly_with_another_drag():
 @pytest.mark.parametrize(
     ("tilt_s", "thrust_s", "yaw_s"), [(0.24, 0.21, 0.4), (0.06, 0.01, 0.2), (0.02, 0.01, 0.2)]
 )
-def test_what_the_link_adds_to_tilt_it_adds_to_thrust_and_course(tilt_s, thrust_s, yaw_s):
-    """Believed are 0.04, 0.01 and 0.2 s; a little more or less is the vehicle's own."""
+def test_delay_that_the_link_adds_to_tilt_is_added_to_thrust_and_course(tilt_s, thrust_s, yaw_s):
+    """The vehicle file's are 0.04, 0.01 and 0.2 s; a small difference is the vehicle's own."""
     fit = ResponseFit(Estimate(tilt_s, 0.002), Estimate(11.0, 0.1), Estimate(0.8, 0.01), 0.0, 0.1)
     found = Identified(4.0, tilt=fit)
-    linked = with_link(found, found.applied_to(NEUTRAL), NEUTRAL)
+    linked = with_link_delay(found, found.applied_to(NEUTRAL), NEUTRAL)
     assert linked.tilt.delay_s == tilt_s
     assert linked.thrust_delay_s == pytest.approx(thrust_s)
     assert linked.yaw.delay_s == pytest.approx(yaw_s)
     known = Identified(4.0, tilt=fit, thrust_delay_s=Estimate(0.05, 0.01))
-    assert with_link(known, known.applied_to(NEUTRAL), NEUTRAL).thrust_delay_s == 0.05
+    assert with_link_delay(known, known.applied_to(NEUTRAL), NEUTRAL).thrust_delay_s == 0.05

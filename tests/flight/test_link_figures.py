@@ -1,6 +1,6 @@
-"""What the link was like, in the score, and that telemetry is taken at its vehicle time.
+"""Figures of the link in the score: delay, rates, gaps, duplicates.
 
-Each link is one fault laid over the same flight; the oracle is what the fault was told to do.
+Each test adds one link fault to the same flight; the oracle is the parameter of the fault.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ def flown_over(down: Filter, directory: Path) -> Score:
         (repeating(0.1), 2.0 / 3.0, 0.0, 0.05),
         (stuttering(0.08, 0.4), 0.0, 0.0, 0.10),
     ],
-    ids=["plain", "80 ms late", "everything three times", "stops for 80 ms in 400"],
+    ids=["plain", "80 ms late", "all messages three times", "stops for 80 ms in 400"],
 )
-def test_delay_and_repetitions_are_told(
+def test_delay_and_duplicates_are_measured(
     down: Filter, stale_share: float, later_ms: float, rmse_m: float, tmp_path: Path
 ) -> None:
     score = flown_over(down, tmp_path)
@@ -55,23 +55,23 @@ def test_delay_and_repetitions_are_told(
     assert score.position_gap_max_s == pytest.approx(1.0 / SENT_HZ, abs=0.007)
 
 
-def test_a_slow_link_is_known_before_it_is_flown_on(tmp_path: Path) -> None:
-    """0.3 s: the vehicle's answers to TIMESYNC are what keeps it in the air."""
+def test_the_delay_of_the_link_is_measured_before_lift_off(tmp_path: Path) -> None:
+    """With 0.3 s, the flight succeeds only if the vehicle replies to TIMESYNC."""
     assert flown_over(late(0.3), tmp_path).rmse_position_m < 0.15
     silent, slow = without(TIMESYNC), late(0.3)
-    unasked = over(lambda time_s, datagrams: slow(time_s, silent(time_s, datagrams)))
-    outcome = unasked.fly()
+    unanswered = over(lambda time_s, datagrams: slow(time_s, silent(time_s, datagrams)))
+    outcome = unanswered.fly()
     assert (outcome.exit_code, outcome.sentence[-13:]) == (4, "(limit 5.0 m)")
 
 
-def test_gaps_of_a_link_that_loses_are_told(tmp_path: Path) -> None:
+def test_gaps_of_a_lossy_link_are_measured(tmp_path: Path) -> None:
     score = flown_over(losing(0.3), tmp_path)
     assert 0.04 <= score.position_gap_max_s < 0.3
     assert score.position_hz == pytest.approx(0.7 * SENT_HZ, rel=0.1)
 
 
 def sixty_ms_each_way(bandwidth_radps: int, seed: int, learning: IdentifySettings | None) -> Pair:
-    """On PX4's vehicle file, which knows of none of it."""
+    """With PX4's vehicle file, which does not contain this delay."""
     law = f"controller={{law: lqr, feedback_limit: 0.6, bandwidth_radps: {bandwidth_radps}}}"
     pair = make(
         law, *LAP[1:], scenario="px4_like", vehicle="px4_sih", seed=seed,
@@ -81,8 +81,8 @@ def sixty_ms_each_way(bandwidth_radps: int, seed: int, learning: IdentifySetting
     return pair
 
 
-def test_sixty_ms_each_way_are_a_limit_cycle_until_they_are_known(tmp_path: Path) -> None:
-    """As on the real PX4: 0.5 to 0.9 m unknown, 0.05 m known, at the bandwidth that it bears."""
+def test_sixty_ms_each_way_cause_a_limit_cycle_unless_identified(tmp_path: Path) -> None:
+    """As on the real PX4: 0.5 to 0.9 m without identification, 0.05 m with it."""
     unknown = sixty_ms_each_way(5, 2, None).score(tmp_path / "unknown")
     assert unknown.rmse_position_m > 0.3
     assert unknown.tilt_agitation_deg > 12.0
@@ -90,8 +90,8 @@ def test_sixty_ms_each_way_are_a_limit_cycle_until_they_are_known(tmp_path: Path
         known = sixty_ms_each_way(10, seed, IdentifySettings())
         score = known.score(tmp_path / str(seed))
         (said,) = [line for line in known.companion.announced if line.startswith("bandwidth")]
-        used_radps = float(said.removeprefix("bandwidth ").split()[0])
+        used_radps = float(said.removeprefix("bandwidth limited to ").split()[0])
         assert 6.0 < used_radps < 10.0
-        assert f"of 10.0 rad/s: what a delay of {score.delay_ms:.0f} " in said
+        assert f"(configured 10.0) by the identified delay, {score.delay_ms:.0f} " in said
         assert score.rmse_position_m < 0.06
         assert score.delay_ms == pytest.approx(PLAIN_DELAY_MS + 120.0, abs=10.0)

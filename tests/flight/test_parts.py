@@ -1,4 +1,4 @@
-"""Small parts of the flight: the last look at a setpoint, parameters before it, its manifest."""
+"""The gate, the parameters before the flight, the manifest, and the records in the log."""
 
 from __future__ import annotations
 
@@ -9,16 +9,17 @@ import numpy as np
 import pytest
 from pair import hover
 
+from offboard import compiled
+from offboard.compiled import Entry
 from offboard.control.base import Situation
 from offboard.flight import configuration as config
 from offboard.flight import manifest, request
+from offboard.flight.gate import clamp, usable
 from offboard.flight.one_flight import rehearse
 from offboard.flight.readiness import Readiness
-from offboard.flight.setpoint import clamp, usable
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.px4 import PX4
 from offboard.model.command import Command
-from offboard.model.kernel import Entry
 from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import Vehicle
 from offboard.reference.transfer import Hold
@@ -48,7 +49,7 @@ def test_usable(command: Command, expected: bool) -> None:
     assert usable(command) is expected
 
 
-def test_clamp_leaves_what_is_within_and_turns_back_what_is_not(vehicle: Vehicle) -> None:
+def test_clamp_changes_only_what_exceeds_the_limits(vehicle: Vehicle) -> None:
     generator = np.random.default_rng(4)
     for drawn in generator.normal(size=(500, 3)):
         direction = drawn / np.linalg.norm(drawn)
@@ -66,26 +67,26 @@ def test_clamp_leaves_what_is_within_and_turns_back_what_is_not(vehicle: Vehicle
             assert clamped.thrust_direction_ned == command.thrust_direction_ned
 
 
-def test_parameters_are_asked_for_again_until_they_answer() -> None:
+def test_parameters_are_requested_until_they_are_answered() -> None:
     readiness, known = Readiness(), {"MPC_THR_HOVER": 0.5}
     first = [request.name for request in readiness.due(PX4, known, 10.0)]
     assert first == [p.name for p in PX4.watched_parameters if p.name not in known]
     assert readiness.due(PX4, known, 10.4) == []
     assert len(readiness.due(PX4, known, 10.5)) == len(first)
-    assert not readiness.settled(PX4, known, 11.9)
-    assert readiness.settled(PX4, known, 12.0)
+    assert not readiness.complete(PX4, known, 11.9)
+    assert readiness.complete(PX4, known, 12.0)
     everything = {parameter.name: 1.0 for parameter in PX4.watched_parameters}
-    assert readiness.settled(PX4, everything, 10.6)
+    assert readiness.complete(PX4, everything, 10.6)
 
 
-def test_arducopter_must_tell_what_would_make_thrust_a_climb_rate() -> None:
+def test_arducopter_is_not_flown_without_a_reply_for_guid_options() -> None:
     readiness = Readiness()
     readiness.due(ARDUPILOT, {}, 0.0)
     assert readiness.unanswered(ARDUPILOT, {}) == ["GUID_OPTIONS", "ATC_ANGLE_BOOST"]
-    assert not readiness.settled(ARDUPILOT, {}, 100.0)
-    (complaint,) = readiness.complaints(ARDUPILOT, {"GUID_OPTIONS": 0.0, "ATC_ANGLE_BOOST": 1.0})
-    assert complaint.endswith("Mend: param set GUID_OPTIONS 8")
-    assert readiness.settled(ARDUPILOT, {"GUID_OPTIONS": 8.0, "ATC_ANGLE_BOOST": 1.0}, 2.1)
+    assert not readiness.complete(ARDUPILOT, {}, 100.0)
+    (problem,) = readiness.problems(ARDUPILOT, {"GUID_OPTIONS": 0.0, "ATC_ANGLE_BOOST": 1.0})
+    assert problem.endswith("Fix: param set GUID_OPTIONS 8")
+    assert readiness.complete(ARDUPILOT, {"GUID_OPTIONS": 8.0, "ATC_ANGLE_BOOST": 1.0}, 2.1)
 
 
 def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(
@@ -98,11 +99,10 @@ def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(
         config.load("flight", choices=chosen, assignments=(f"controller.keep_out=[{volume}]",))
     )
     loaded: list[str] = []
-    load = Entry._load
-    for entry in Entry.defined():
-        for kept in ("call", "_machine_code"):
-            vars(entry).pop(kept, None)
-    monkeypatch.setattr(Entry, "_load", lambda entry: loaded.append(entry.symbol) or load(entry))
+    load = Entry.load
+    for entry in compiled.defined:
+        monkeypatch.setattr(entry, "machine_code", None)
+    monkeypatch.setattr(Entry, "load", lambda entry: loaded.append(entry.name) or load(entry))
     rehearse(parts, keeps_deadline=False)
     rehearsed = set(loaded)
     at_m = np.array([5.0, 0.3, -3.0])
@@ -138,8 +138,8 @@ def test_a_damaged_manifest_is_none() -> None:
     assert manifest.join([*payloads[:2], payloads[2][:-3] + b"???", *payloads[3:]]) is None
 
 
-def test_records_stay_at_home_and_no_sequence_has_a_gap() -> None:
-    """What the vehicle does not need goes to the log alone, under a component id of its own."""
+def test_records_are_not_sent_and_no_sequence_has_a_gap() -> None:
+    """Records have a component id of their own, with its own sequence numbers."""
     pair = hover()
     pair.fly()
     assert {frame[6] for _, _, frame in pair.sent} == {191}

@@ -304,7 +304,7 @@ ROWS = (
         lambda: hover(firmware=with_default("COM_OF_LOSS_T", 30.0)),
         3,
         "COM_OF_LOSS_T is 30: seconds without setpoints before the failsafe. "
-        "Mend: param set COM_OF_LOSS_T 5",
+        "Fix: param set COM_OF_LOSS_T 5",
         Phase.FAILED,
         nothing_asked,
     ),

@@ -7,8 +7,7 @@ import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 from scipy.linalg import expm
 
-from offboard.model.integration import follow
-from offboard.model.linear import hover_matrices, hover_system, sampled_matrices
+from offboard.model.linear import hover_matrices, sampled_matrices
 from offboard.model.rigid_body import RK4_SCRATCH_ROWS, derivative, hover_input, pack
 from offboard.model.state import (
     PHI,
@@ -28,6 +27,7 @@ from offboard.model.state import (
     Z,
 )
 from offboard.model.vehicle import Vehicle
+from offboard.paper.plant import follow
 
 # Every non-zero Eq. 16 prints. Its rows are interleaved [phi p psi r theta q x u (y lost) v z w];
 # its v row reads -0.0161, a slip: a roll to the right accelerates to the right.
@@ -94,7 +94,7 @@ def test_the_sampled_model_predicts_small_flights(paper_vehicle: Vehicle) -> Non
     sampled_a, sampled_b = sampled_matrices(paper_vehicle, 0.1)
     predicted = sampled_a @ state + sampled_b @ deviation
     inputs, scratch = hover_input(paper_vehicle) + deviation, np.empty((RK4_SCRATCH_ROWS, 12))
-    follow.call(state, inputs, np.zeros(3), pack(paper_vehicle), 0.005, 20, scratch)
+    follow(state, inputs, np.zeros(3), pack(paper_vehicle), 0.005, 20, scratch)
     assert_allclose(state, predicted, atol=2e-9)
 
 
@@ -124,12 +124,3 @@ def test_eq_16_is_not_reproduced_otherwise(
     _, sampled_b = sampled_matrices(vehicle, step_s)
     missed = {place for place, printed in EQ_16.items() if abs(sampled_b[place] - printed) > 0.5e-4}
     assert missed == wrong
-
-
-def test_the_system_observes_all_states_and_names_them(paper_vehicle: Vehicle) -> None:
-    system = hover_system(paper_vehicle)
-    assert_array_equal(system.C, np.eye(12))
-    assert_array_equal(system.D, np.zeros((12, 4)))
-    assert system.state_labels[PHI] == "phi"
-    assert system.state_labels[Z] == "z"
-    assert system.input_labels == ["thrust", "tau_x", "tau_y", "tau_z"]

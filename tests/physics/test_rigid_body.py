@@ -12,10 +12,17 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
-from offboard.model.integration import follow
-from offboard.model.rigid_body import RK4_SCRATCH_ROWS, derivative, hover_input, pack, rk4_into
+from offboard.model.rigid_body import (
+    RK4_SCRATCH_ROWS,
+    derivative,
+    derivative_into,
+    hover_input,
+    pack,
+    rk4_into,
+)
 from offboard.model.state import EULER, QUATERNION, Chart, euler_state, quaternion_state
 from offboard.model.vehicle import Vehicle
+from offboard.paper.plant import follow
 
 Array = NDArray[np.float64]
 
@@ -48,13 +55,13 @@ def step(
 ) -> Array:
     """One RK4 step by machine code."""
     after, scratch = state.copy(), np.empty((RK4_SCRATCH_ROWS, len(state)))
-    follow.call(after, inputs, wind_ned, parameters, step_s, 1, scratch)
+    follow(after, inputs, wind_ned, parameters, step_s, 1, scratch)
     return after
 
 
 def step_in_python(state: Array, inputs: Array, parameters: Array, step_s: float) -> Array:
     after, scratch = np.empty_like(state), np.empty((RK4_SCRATCH_ROWS, *state.shape), state.dtype)
-    rk4_into(state, inputs, STILL_AIR, parameters, step_s, scratch, after)
+    rk4_into(derivative_into, state, inputs, STILL_AIR, parameters, step_s, scratch, after)
     return after
 
 

@@ -1,4 +1,4 @@
-"""`offboard compare` interrupted: what flies lands, what landed is kept, the rest is named."""
+"""`offboard compare` interrupted: flights land, results are kept, missing flights are named."""
 
 from __future__ import annotations
 

@@ -127,7 +127,7 @@ def test_a_flight_in_one_call(pytester: pytest.Pytester) -> None:
     assert log.stat().st_size > 10_000
 
 
-def test_a_flight_of_nothing_known_is_one_sentence(pytester: pytest.Pytester) -> None:
+def test_an_unknown_reference_is_one_sentence(pytester: pytest.Pytester) -> None:
     pytester.makepyfile('def test_it(fly):\n    fly(reference="moon")\n')
     result = pytester.runpytest_subprocess("-q", timeout=60)
     result.assert_outcomes(failed=1)
@@ -135,7 +135,7 @@ def test_a_flight_of_nothing_known_is_one_sentence(pytester: pytest.Pytester) ->
     assert named_logs(result) == []
 
 
-def test_other_tests_pay_nothing(pytester: pytest.Pytester) -> None:
+def test_other_test_suites_import_nothing(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
         """
         import os, sys

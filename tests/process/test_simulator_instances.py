@@ -10,7 +10,6 @@ import pytest
 from sim_peer import simulator
 
 from offboard.documents import shipped
-from simulator import config
 
 
 def free_ports(count: int) -> int:
@@ -72,5 +71,4 @@ def test_scenarios_are_listed_with_what_they_are() -> None:
         output, errors = process.popen.communicate(timeout=20.0)
     assert (process.popen.returncode, errors) == (0, "")
     listed = dict(re.split(r"\s+", line, maxsplit=1) for line in output.splitlines())
-    names = shipped.names("scenarios")
-    assert listed == {name: config.scenario(name).description for name in names}
+    assert listed == shipped.descriptions("scenarios")

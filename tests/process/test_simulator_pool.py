@@ -1,4 +1,4 @@
-"""The bundled simulator's process: vehicle after vehicle, each gone when it is to be."""
+"""The bundled simulator's process: it flies one vehicle after another and ends each of them."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_a_pool_that_dies_takes_its_vehicle_along() -> None:
     assert gone(orphan)
 
 
-def test_one_after_the_other_and_the_same_seed_says_the_same(simulator: SimulatorProcess) -> None:
+def test_vehicles_with_the_same_seed_send_the_same_datagram(simulator: SimulatorProcess) -> None:
     said, pid = [], simulator.pid
     for seed in ("1", "1", "2"):
         with flying(simulator, "--scenario", "px4_like", "--seed", seed) as hello:
@@ -70,7 +70,9 @@ def test_one_after_the_other_and_the_same_seed_says_the_same(simulator: Simulato
     assert said[0] == said[1] != said[2]
 
 
-def test_a_vehicle_that_dies_says_how_and_the_next_one_flies(simulator: SimulatorProcess) -> None:
+def test_the_end_of_a_vehicle_is_reported_and_the_next_one_flies(
+    simulator: SimulatorProcess,
+) -> None:
     with flying(simulator):
         os.kill(vehicles(simulator)[0], signal.SIGKILL)
         ending = simulator.ended(10.0)
@@ -85,7 +87,7 @@ def test_a_vehicle_that_dies_says_how_and_the_next_one_flies(simulator: Simulato
     simulator.recall()
 
 
-def test_wrong_options_are_told_in_the_simulators_words(simulator: SimulatorProcess) -> None:
+def test_wrong_options_are_reported_as_the_simulator_does(simulator: SimulatorProcess) -> None:
     simulator.launch(["--scenario", "storm"])
     ending = simulator.ended(10.0)
     assert ending is not None

@@ -15,21 +15,21 @@ FLIGHT = (
     "offboard", "fly", "--sitl", "--reference", "hover", "--set", "reference.duration_s=2",
     "--out", "x",
 )  # fmt: skip
+TEXT = {".py", ".yaml", ".csv", ".md", ".txt", ".typed", ".html", ".css", ".js", ""}
 
 
-def test_wheel_flies_at_once_with_no_compiler(tmp_path: Path) -> None:
+def test_a_pure_wheel_flies_from_an_empty_directory_and_an_empty_cache(tmp_path: Path) -> None:
     built = tmp_path / "dist"
-    subprocess.run((*BUILD, built), cwd=ROOT, check=True, capture_output=True, timeout=300)
+    subprocess.run((*BUILD, built), cwd=ROOT, check=True, capture_output=True, timeout=60)
     (wheel,) = built.iterdir()
-    assert wheel.suffix == ".whl"
-    site, no_compiler, empty = (tmp_path / name for name in ("site", "no_compiler", "empty"))
-    zipfile.ZipFile(wheel).extractall(site)
-    no_compiler.mkdir()
-    (no_compiler / "numba.py").write_text("raise ImportError('no compiler')\n")
+    assert wheel.name.endswith("-py3-none-any.whl")
+    site, empty, cache = (tmp_path / name for name in ("site", "empty", "cache"))
+    with zipfile.ZipFile(wheel) as archive:
+        archive.extractall(site)
+        assert {Path(name).suffix for name in archive.namelist()} <= TEXT
     empty.mkdir()
 
-    found = os.pathsep.join(map(str, (no_compiler, site)))
-    environment = {**os.environ, "PYTHONPATH": found, "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    environment = {**os.environ, "PYTHONPATH": str(site), "XDG_CACHE_HOME": str(cache)}
     flight = subprocess.run(
         (sys.executable, "-m", *FLIGHT),
         cwd=empty,
@@ -37,11 +37,12 @@ def test_wheel_flies_at_once_with_no_compiler(tmp_path: Path) -> None:
         capture_output=True,
         text=True,
         check=False,
-        timeout=120,
+        timeout=150,
     )
     assert (flight.returncode, flight.stderr) == (0, "")
-    assert "compiled in" not in flight.stdout
+    assert "first run on this machine: compiling" in flight.stdout
     score = json.loads((empty / "x" / "score.json").read_text())
     assert score["rmse_position_m"] < 0.05
     assert not (empty / "offboard").exists()
-    assert len(list(tmp_path.glob("cache/**/*.o"))) > 10  # the next start finds them
+    assert list(cache.glob("pso-offboard/*/*/*.nbc"))  # the next start finds them
+    assert not list(site.rglob("*.nbc"))

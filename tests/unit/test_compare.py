@@ -1,4 +1,4 @@
-"""Many flights, one table: what is best, what failed and why, and that it can be read."""
+"""Comparisons: best controllers, failures with their reasons, table, page, files, progress."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ from offboard.analysis.compare import (
     trials,
 )
 from offboard.analysis.compare_page import page
-from offboard.analysis.compare_table import lines
+from offboard.analysis.compare_table import show
 from offboard.analysis.comparison import compare_all
-from offboard.analysis.processors import processors
+from offboard.analysis.workers import processors
 from offboard.documents.reading import DocumentError
 
 LAWS = ("pso", "lqr", "an/uncommonly/long/name.yaml", "lost")
@@ -94,7 +94,9 @@ def test_files_hold_every_figure(rows: list[Row]) -> None:
 
 @pytest.mark.parametrize("width", [60, 80, 120, 200])
 def test_no_line_of_the_table_is_wider_than_the_window(rows: list[Row], width: int) -> None:
-    told = [line.plain for line in lines(rows, width)]
+    text = io.StringIO()
+    show(Console(file=text, width=width), rows)
+    told = text.getvalue().splitlines()
     assert max(map(len, told)) <= width
     whole = "\n".join(told)
     for words in (*LAWS[:2], *SCENARIOS, "[0.0109\N{EN DASH}0.0121]", "0.0119", "lost (2 of 3)"):
@@ -146,7 +148,7 @@ def dies_with_seed_2(trial: Trial) -> Result:
     return Result(trial, 0, "flown and landed", dict.fromkeys(FIGURES, 1.0))
 
 
-def test_a_worker_that_dies_costs_its_own_flight(tmp_path: Path) -> None:
+def test_a_worker_that_dies_fails_its_own_flight_only(tmp_path: Path) -> None:
     problem = compare_all(
         dies_with_seed_2,
         controllers=["pso"],
@@ -167,7 +169,7 @@ def test_a_worker_that_dies_costs_its_own_flight(tmp_path: Path) -> None:
     ("exit_code", "flown"),
     [(2, "pso lqr pid mpc"), (3, "pso lqr"), (4, "pso lqr")],  # a file; refused; aborted
 )
-def test_on_one_vehicle_a_flight_that_it_did_not_let_us_end_is_the_last(
+def test_on_one_vehicle_nothing_is_flown_after_a_refused_or_aborted_flight(
     tmp_path: Path, exit_code: int, flown: str
 ) -> None:
     begun: list[str] = []
@@ -225,11 +227,42 @@ def test_flights_that_would_share_a_directory_are_refused_before_the_first(
     assert not (tmp_path / "all").exists()
 
 
+@pytest.mark.parametrize("terminal", [False, True], ids=["piped", "terminal"])
+def test_progress_is_shown_before_the_first_flight_ends(
+    tmp_path: Path, terminal: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Piped, a line for each flight; on a terminal, a bar that is gone at the end."""
+    monkeypatch.setenv("TERM", "xterm")
+    text = io.StringIO()
+    shown: list[str] = []
+
+    def fly(trial: Trial) -> Result:
+        shown.append(text.getvalue())
+        return lands(trial)
+
+    compare_all(
+        fly,
+        controllers=["pso", "lqr"],
+        references=["hover"],
+        scenarios=["calm"],
+        seeds=[1],
+        directory=tmp_path / "all",
+        workers=0,
+        console=Console(file=text, width=80, force_terminal=terminal),
+    )
+    assert "2 flights, 1 at a time" in shown[0]
+    assert ("0/2" in shown[0]) is terminal
+    lines = ["   1  pso-hover-calm-1: 1.00 m", "   2  lqr-hover-calm-1: 1.00 m"]
+    assert [line for line in text.getvalue().splitlines() if line in lines] == (
+        [] if terminal else lines
+    )
+
+
 def lands(trial: Trial) -> Result:
     return Result(trial, 0, "flown and landed", dict.fromkeys(FIGURES, 1.0))
 
 
-def test_where_the_system_tells_no_affinity_all_processors_count(
+def test_without_cpu_affinity_all_processors_are_used(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     assert processors() == len(os.sched_getaffinity(0))

@@ -7,7 +7,7 @@ import pytest
 from attitude_plant import Flight, Lemniscate, Truth, fly
 
 from offboard.control.delay_margin import delay_margin, needed_margin, supported_bandwidth
-from offboard.control.laws.tracking import Search, TrackingLaw, TrackingSettings
+from offboard.control.laws.lqr import LqrLaw, LqrSettings
 from offboard.estimation.observer import ObserverSettings
 from offboard.model.vehicle import AxisResponse, Vehicle
 
@@ -33,7 +33,7 @@ def delayed(delay_s: float) -> Vehicle:
 def flown(believed: Vehicle, bandwidth: float, extra_s: float) -> Flight:
     late = believed.tilt.model_copy(update={"delay_s": believed.tilt.delay_s + extra_s})
     truth = Truth(believed.model_copy(update={"tilt": late}), noisy=False)
-    law = TrackingLaw(believed, TrackingSettings(bandwidth_radps=bandwidth), Search.CLOSED_FORM)
+    law = LqrLaw(believed, LqrSettings(bandwidth_radps=bandwidth))
     return fly(
         truth, law, believed, Lemniscate(15.0), 1, ObserverSettings(velocity="position"),
         score_from_s=12.0, laps=1.0, offset_ned_m=(0.05, 0.05, 0.0),

@@ -9,9 +9,8 @@ import pytest
 from attitude_plant import Lemniscate, Truth, fly
 from scipy.integrate import solve_ivp
 from test_law_signs import at
-from test_tracking_law import PX4, G, law_of
+from test_tracking_law import PX4, G, lqr
 
-from offboard.control.laws.tracking import TrackingLaw
 from offboard.control.riccati import thrust_ripple, tilt_ripple
 from offboard.reference.base import FlatSample
 
@@ -59,7 +58,8 @@ class Jerking:
 
 def test_the_target_ripples_as_the_staircase_does() -> None:
     """Of a jerk of 1 m/s^3 b_c is a ramp of -1 / g per second, T one of -1 m/s^2 per second."""
-    law = TrackingLaw(PX4.model_copy(update={"drag_translation_npmps": (0.0,) * 3}))
+    without_drag = PX4.model_copy(update={"drag_translation_npmps": (0.0,) * 3})
+    law = lqr(vehicle=without_drag).tracking
     off = _after(held=True) - _after(held=False)
     level = at((0.0, 0.0, 0.0), 0.0)
     target = law.target(Jerking((1.0, -1.0, 0.0)), 0.0, level)
@@ -74,5 +74,5 @@ def test_the_target_ripples_as_the_staircase_does() -> None:
 def test_what_is_left_on_a_known_vehicle(heave_m: float, most_m: float) -> None:
     """Without noise, everything known: 0.8 and 1.5 mm by a law that fights its own ripple."""
     reference = Lemniscate(8.0, heave_m=heave_m)
-    flown = fly(Truth(PX4, noisy=False), law_of(), PX4, reference, 1, laps=1.0)
+    flown = fly(Truth(PX4, noisy=False), lqr(), PX4, reference, 1, laps=1.0)
     assert flown.rmse_m < most_m

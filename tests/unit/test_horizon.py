@@ -9,21 +9,16 @@ import numpy as np
 import pytest
 from attitude_plant import Lemniscate, Truth, fly
 from scipy.integrate import solve_ivp
-from test_tracking_law import LEVEL, PX4, G, law_of, state_of
+from test_tracking_law import LEVEL, PX4, G, lqr, state_of
 
 from offboard.control.base import Decision, Situation
-from offboard.control.horizon.law import (
-    STEPS_AROUND,
-    Dynamics,
-    HorizonLaw,
-    HorizonSettings,
-    Method,
-)
+from offboard.control.horizon.planner import STEPS_AROUND, Dynamics
 from offboard.control.horizon.plant import STATE_SIZE, B, P, T, V, W, Z
-from offboard.control.horizon.sampling import SamplingSettings, cem, mppi
+from offboard.control.horizon.sampling import CemSampling, MppiSampling, sample
 from offboard.control.horizon.search import swarm
+from offboard.control.laws.horizon import HorizonLaw, HorizonSettings
 from offboard.control.laws.mpc import MpcLaw, MpcSettings
-from offboard.control.laws.tracking import errors
+from offboard.control.laws.sampling import CemSettings, MppiSettings, SamplingLaw
 from offboard.control.swarm import RandomLanes, SwarmSettings
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
@@ -33,8 +28,18 @@ STEPS, PERIOD_S = 10, 0.1
 IN_THE_WAY = {"shape": "sphere", "north_m": 0.6, "east_m": -0.7, "height_m": 3.0, "radius_m": 0.3}
 
 
-def horizon(method: Method = Method.SWARM, **settings: object) -> HorizonLaw:
-    return HorizonLaw(PX4, HorizonSettings.model_validate(settings), method)
+def horizon(**settings: object) -> HorizonLaw:
+    return HorizonLaw(PX4, HorizonSettings.model_validate({"bandwidth_radps": 5.0} | settings))
+
+
+PEERS = {"mppi": MppiSettings, "cem": CemSettings}
+LAWS = ("horizon", *PEERS)
+
+
+def named(law: str, **settings: object) -> HorizonLaw | SamplingLaw:
+    if law == "horizon":
+        return horizon(**settings)
+    return SamplingLaw(PX4, PEERS[law].model_validate({"bandwidth_radps": 5.0} | settings))
 
 
 def situations(count: int, size: float, seed: int = 1) -> list[Situation]:
@@ -43,17 +48,15 @@ def situations(count: int, size: float, seed: int = 1) -> list[Situation]:
 
 
 def prepared(law: HorizonLaw, situation: Situation):  # type: ignore[no-untyped-def]
-    """The law with its roll-outs ready, and the linear problem."""
-    target = law.target(situation.reference, situation.time_s, situation.state)
-    box = law.problem(situation.state, target)
-    return law._settle(situation, target, box), law._evaluate
+    """The task, the linear problem, and the roll-outs of a situation."""
+    return *law.planner.prepare(situation), law.planner.evaluate
 
 
 @pytest.mark.parametrize("size", [0.1, 1.0])
 def test_linear_roll_outs_cost_what_the_quadratic_says(size: float) -> None:
     law, rng = horizon(dynamics=Dynamics.LINEAR), np.random.default_rng(2)
     for situation in situations(5, size):
-        problem, evaluate = prepared(law, situation)
+        _, problem, evaluate = prepared(law, situation)
         tried = rng.uniform(problem.lower, problem.upper, (7, 3 * STEPS))
         sequences = tried.reshape(7, 3, STEPS).transpose(2, 1, 0)
         costs = evaluate.of_inputs(np.ascontiguousarray(sequences))
@@ -63,16 +66,16 @@ def test_linear_roll_outs_cost_what_the_quadratic_says(size: float) -> None:
 def test_the_quadratic_without_bounds_leaves_the_cost_to_go() -> None:
     """N optimal inputs and P behind them cost x'Px, whatever N; the first is -K x."""
     law = horizon(dynamics=Dynamics.LINEAR)
+    tracking = law.planner.tracking
     for situation in situations(5, 0.3):
-        problem, _ = prepared(law, situation)
+        task, problem, _ = prepared(law, situation)
         best = np.linalg.solve(problem.hessian, -problem.gradient)
-        target = law.target(situation.reference, 5.0, situation.state)
-        lateral, vertical = errors(situation.state, target)
-        left = np.sum(lateral * (law.lateral.terminal @ lateral))
-        left += vertical @ law.vertical.terminal @ vertical
+        lateral, vertical = task.lateral, task.vertical
+        left = np.sum(lateral * (tracking.lateral.terminal @ lateral))
+        left += vertical @ tracking.vertical.terminal @ vertical
         assert float(problem(best)) == pytest.approx(left, rel=1e-8)
-        assert best[0] == pytest.approx(-law.lateral.gain @ lateral[:, 0], abs=1e-8)
-        assert best[2 * STEPS] == pytest.approx(-law.vertical.gain @ vertical, abs=1e-8)
+        assert best[0] == pytest.approx(-tracking.lateral.gain @ lateral[:, 0], abs=1e-8)
+        assert best[2 * STEPS] == pytest.approx(-tracking.vertical.gain @ vertical, abs=1e-8)
 
 
 PUSHED_MPS2 = np.array([2.0, -1.5, 0.0])  # a disturbance, which the reference leans into
@@ -120,7 +123,7 @@ def test_nonlinear_roll_outs_fly_as_scipy_does() -> None:
     off: dict[Dynamics, float] = {}
     for dynamics in Dynamics:
         law = horizon(dynamics=dynamics)
-        _, evaluate = prepared(law, situation)
+        _, _, evaluate = prepared(law, situation)
         rolled = evaluate.flown(plan).states[-1]
         place = np.array([rolled[P], rolled[P + 1], rolled[Z] - 3.0])
         speed = np.array([rolled[V], rolled[V + 1], rolled[W]])
@@ -136,12 +139,12 @@ def test_nonlinear_roll_outs_fly_as_scipy_does() -> None:
 
 def test_the_closed_form_flown_ahead_costs_the_cost_to_go() -> None:
     law = horizon(dynamics=Dynamics.LINEAR)
+    tracking = law.planner.tracking
     for situation in situations(5, 0.02):
-        _, evaluate = prepared(law, situation)
-        target = law.target(situation.reference, 5.0, situation.state)
-        lateral, vertical = errors(situation.state, target)
-        left = np.sum(lateral * (law.lateral.terminal @ lateral))
-        left += vertical @ law.vertical.terminal @ vertical
+        task, _, evaluate = prepared(law, situation)
+        lateral, vertical = task.lateral, task.vertical
+        left = np.sum(lateral * (tracking.lateral.terminal @ lateral))
+        left += vertical @ tracking.vertical.terminal @ vertical
         nothing = np.zeros((STEPS, 3)), np.zeros((STEPS + 1, STATE_SIZE))
         assert evaluate.held(*nothing).cost == pytest.approx(left, rel=1e-8)
 
@@ -149,10 +152,8 @@ def test_the_closed_form_flown_ahead_costs_the_cost_to_go() -> None:
 def test_first_bounds_are_those_of_one_decision() -> None:
     law = horizon()
     for situation in situations(5, 1.0):
-        _, evaluate = prepared(law, situation)
-        target = law.target(situation.reference, 5.0, situation.state)
-        box = law.problem(situation.state, target)
-        upright = situation.state.thrust_direction_ned[2]
+        task, _, evaluate = prepared(law, situation)
+        target, box, upright = task.target, task.problem, task.upright
         for ours, theirs in ((evaluate.lower[0], box.lower), (evaluate.upper[0], box.upper)):
             thrust = (target.thrust_down_feedforward_mps2 + ours[2]) / upright
             assert thrust == pytest.approx(theirs[0], rel=1e-9)
@@ -165,7 +166,7 @@ def test_a_plan_of_zeros_flies_the_reference(dynamics: Dynamics) -> None:
     law = horizon(dynamics=dynamics)
     sample = reference.sample(5.057)
     start = state_of(np.random.default_rng(0), reference, 0.0)
-    target = law.target(reference, 5.0, start)
+    target = law.planner.tracking.target(reference, 5.0, start)
     upright = math.sqrt(1.0 - target.direction_ne @ target.direction_ne)
     state = replace(
         start,
@@ -175,20 +176,20 @@ def test_a_plan_of_zeros_flies_the_reference(dynamics: Dynamics) -> None:
         thrust_direction_rate_ned_ps=np.array([*target.direction_rate_ne_ps, 0.0]),
         thrust_mps2=target.thrust_down_mps2 / upright,
     )
-    _, evaluate = prepared(law, Situation(5.0, state, reference, LEVEL))
+    _, _, evaluate = prepared(law, Situation(5.0, state, reference, LEVEL))
     plan = evaluate.flown(np.zeros((STEPS, 3)))
     assert np.abs(plan.states).max() < 1e-9
     assert plan.cost < 1e-12
 
 
 def test_mpc_is_lqr_where_no_bound_is_met_and_sees_one_coming_where_it_is() -> None:
-    mpc, lqr = MpcLaw(PX4, MpcSettings()), law_of()
+    mpc, closed = MpcLaw(PX4, MpcSettings(bandwidth_radps=5.0)), lqr()
     for situation in situations(20, 0.1):
-        ours, theirs = mpc.decide(situation).command, lqr.decide(situation).command
+        ours, theirs = mpc.decide(situation).command, closed.decide(situation).command
         assert ours.thrust_mps2 == pytest.approx(theirs.thrust_mps2, abs=1e-6)
         assert ours.thrust_direction_ned == pytest.approx(theirs.thrust_direction_ned, abs=1e-7)
-    tight = MpcLaw(PX4, MpcSettings(feedback_limit=0.02))
-    clipped = law_of(feedback_limit=0.02)
+    tight = MpcLaw(PX4, MpcSettings(bandwidth_radps=5.0, feedback_limit=0.02))
+    clipped = lqr(feedback_limit=0.02)
     apart = [
         abs(tight.decide(s).command.thrust_direction_ned[0]
             - clipped.decide(s).command.thrust_direction_ned[0])
@@ -208,7 +209,7 @@ def test_gap_to_the_exact_plan_without_it_as_a_seed(polish_steps: int) -> None:
     )
     gaps, met, begun = [], 0, []
     for situation in situations(60, 0.2):
-        law.previous = None
+        law.planner.previous = None
         certificate = law.decide(situation).certificate
         gaps.append(certificate.gap)
         met += certificate.at_bound
@@ -220,10 +221,10 @@ def test_gap_to_the_exact_plan_without_it_as_a_seed(polish_steps: int) -> None:
 
 
 def test_swarm_is_lqr_where_that_is_optimal() -> None:
-    law, lqr = horizon(dynamics=Dynamics.LINEAR), law_of()
+    law, closed = horizon(dynamics=Dynamics.LINEAR), lqr()
     for situation in situations(10, 0.1):
-        law.previous = None
-        decision, exact = law.decide(situation), lqr.decide(situation).command
+        law.planner.previous = None
+        decision, exact = law.decide(situation), closed.decide(situation).command
         assert decision.certificate.cost <= 1.01 * decision.certificate.optimal_cost
         assert decision.command.thrust_mps2 == pytest.approx(exact.thrust_mps2, abs=1e-3)
         assert decision.command.thrust_direction_ned == pytest.approx(
@@ -252,19 +253,19 @@ PASSING = IN_THE_WAY | {"east_m": -1.4, "velocity_east_mps": 1.4}
 def test_law_finds_cheaper_plans_than_its_peers(volume: dict[str, object]) -> None:
     """Each decision from the closed form, for no more roll-outs than theirs: every one cheaper,
     most cost less than half."""
-    paid: dict[Method, np.ndarray] = {}
-    for method in Method:
-        law = horizon(method, keep_out=[volume])
+    paid: dict[str, np.ndarray] = {}
+    for name in LAWS:
+        law = named(name, keep_out=[volume])
         flown = counted(law)
         costs = []
         for situation in situations(10, 0.3, seed=7):
-            law.previous = None
+            law.planner.previous = None
             costs.append(law.decide(situation).certificate.cost)
-        paid[method] = np.array(costs)
+        paid[name] = np.array(costs)
         assert sum(flown) <= 10 * 2850
-    for peer in (Method.MPPI, Method.CEM):
-        assert (paid[Method.SWARM] < paid[peer]).all()
-        assert np.median(paid[Method.SWARM] / paid[peer]) < 0.5
+    for peer in PEERS:
+        assert (paid["horizon"] < paid[peer]).all()
+        assert np.median(paid["horizon"] / paid[peer]) < 0.5
 
 
 def test_a_way_below_the_clearance_to_the_ground_costs() -> None:
@@ -277,7 +278,7 @@ def test_a_way_below_the_clearance_to_the_ground_costs() -> None:
         thrust_direction_ned=np.array([0.0, 0.0, 1.0]), thrust_mps2=G,
     )  # fmt: skip
     hold = Hold((5.0, 5.0, -0.8), 0.0)
-    _, evaluate = prepared(law, Situation(5.0, start, hold, LEVEL))
+    _, _, evaluate = prepared(law, Situation(5.0, start, hold, LEVEL))
     down, up = np.zeros((STEPS_AROUND, 3)), np.zeros((STEPS_AROUND, 3))
     down[:5, 2], up[:5, 2] = -3.0, 3.0
     low, high = evaluate.flown(down), evaluate.flown(up)
@@ -311,8 +312,8 @@ def test_plans_stay_cheaper_along_a_flight() -> None:
     fly(Truth(PX4, noisy=False), flown, PX4, reference, 1, laps=0.05, score_from_s=6.5)
     met = [situation for situation in flown.asked if situation.time_s > 4.0]
     paid = []
-    for method in (Method.SWARM, Method.MPPI, Method.CEM):
-        law = horizon(method, keep_out=[IN_THE_WAY])
+    for name in LAWS:
+        law = named(name, keep_out=[IN_THE_WAY])
         paid.append([law.decide(situation).certificate.cost for situation in met])
     ours, mppis, cems = np.array(paid)
     for theirs, share in ((mppis, 0.9), (cems, 0.75)):
@@ -329,12 +330,12 @@ def test_the_search_alone_beats_its_peers(volume: dict[str, object]) -> None:
     settings = SwarmSettings(particles=20, iterations=140, damping=0.8)
     paid = []
     for situation in situations(30, 0.3, seed=7):
-        _, evaluate = prepared(law, situation)
+        _, _, evaluate = prepared(law, situation)
         base = evaluate.held(np.zeros((STEPS_AROUND, 3)), np.zeros((STEPS_AROUND + 1, STATE_SIZE)))
         reach = np.tile([0.3, 0.3, 3.0], (evaluate.knots.shape[1], 1))
         found = [swarm(evaluate, base, reach, settings, lanes, None)]
-        for sample in (mppi, cem):
-            found.append(sample(evaluate, base, reach, SamplingSettings(), drawn, None))
+        for peer in (MppiSampling(), CemSampling()):
+            found.append(sample(evaluate, base, reach, peer, drawn, None))
         paid.append([each.plan.cost for each in found])
     ours, mppis, cems = np.array(paid).T
     for theirs in (mppis, cems):
@@ -342,16 +343,16 @@ def test_the_search_alone_beats_its_peers(volume: dict[str, object]) -> None:
         assert np.median(ours / theirs) < 1.0
 
 
-def counted(law: HorizonLaw) -> list[int]:
+def counted(law: HorizonLaw | SamplingLaw) -> list[int]:
     """The number of plans in each batch of roll-outs from now on."""
     batches: list[int] = []
-    fly = law._evaluate._run
+    fly = law.planner.evaluate._run
 
     def run(*args: np.ndarray) -> np.ndarray:
         batches.append(args[-1].shape[2])
         return fly(*args)
 
-    law._evaluate._run = run  # type: ignore[method-assign, assignment]
+    law.planner.evaluate._run = run  # type: ignore[method-assign, assignment]
     return batches
 
 
@@ -361,11 +362,11 @@ def test_answers_are_local_minima(volume: dict[str, object]) -> None:
     law, rng = horizon(keep_out=[volume], polish_steps=30), np.random.default_rng(5)
     better = []
     for situation in situations(12, 0.2):
-        law.previous = None
+        law.planner.previous = None
         cost = law.decide(situation).certificate.cost
-        assert law.previous is not None
-        _, evaluate = prepared(law, situation)
-        inputs = law.previous[1].inputs[:, :, None]
+        assert law.planner.previous is not None
+        _, _, evaluate = prepared(law, situation)
+        inputs = law.planner.previous[1].inputs[:, :, None]
         sizes = rng.choice([1e-3, 1e-2, 5e-2], 400)
         tried = inputs + sizes * rng.normal(size=(*inputs.shape[:2], 400))
         better.append(1.0 - evaluate.of_inputs(np.ascontiguousarray(tried)).min() / cost)
@@ -379,7 +380,7 @@ def test_searches_only_where_something_is_left_to_find() -> None:
         seed_with_qp=False, steps=20, swarm={"particles": 120, "iterations": 240, "damping": 0.9}
     )
     for situation in situations(6, 0.1):
-        law.previous = longest.previous = None
+        law.planner.previous = longest.planner.previous = None
         quick, searched = law.decide(situation), longest.decide(situation)
         assert quick.certificate.iterations == 0
         assert searched.certificate.iterations == 240
@@ -389,23 +390,22 @@ def test_searches_only_where_something_is_left_to_find() -> None:
     assert law.decide(situation).certificate.iterations > 0
 
 
-@pytest.mark.parametrize("method", Method)
-def test_deadline_is_kept_with_a_plan_no_worse_than_the_base(method: Method) -> None:
-    ticks = iter(range(10**9))
-    settings = HorizonSettings.model_validate({"keep_out": [IN_THE_WAY]})
-    law = HorizonLaw(PX4, settings, method, lambda: 1e-3 * next(ticks))
+@pytest.mark.parametrize("name", LAWS)
+def test_deadline_is_kept_with_a_plan_no_worse_than_the_base(name: str) -> None:
+    remaining_s = iter(range(4, -1000, -1))
     (situation,) = situations(1, 0.3)
-    decision = law.decide(replace(situation, deadline_s=0.005))
+    law = named(name, keep_out=[IN_THE_WAY])
+    decision = law.decide(replace(situation, remaining_s=lambda: next(remaining_s)))
     assert decision.certificate.cut_short
     assert 1 <= decision.certificate.iterations <= 5
-    if method is Method.SWARM:
+    if name == "horizon":
         assert decision.certificate.cost <= decision.certificate.seed_cost
     assert np.linalg.norm(decision.command.thrust_direction_ned) == pytest.approx(1.0)
 
 
-@pytest.mark.parametrize("method", Method)
-def test_the_same_after_a_reset(method: Method) -> None:
-    law = horizon(method, keep_out=[IN_THE_WAY])
+@pytest.mark.parametrize("name", LAWS)
+def test_the_same_after_a_reset(name: str) -> None:
+    law = named(name, keep_out=[IN_THE_WAY])
     flown: list[list[Command]] = []
     for _ in range(2):
         flown.append([law.decide(situation).command for situation in situations(4, 0.3)])
@@ -420,9 +420,9 @@ def test_speed_limit_slows_the_plan() -> None:
     for limit in (None, 1.0):
         law = horizon(speed_limit_mps=limit)
         law.decide(situation)
-        assert law.previous is not None
-        states = law.previous[1].states
-        nodes = law._evaluate.scene.velocities[::2]
+        assert law.planner.previous is not None
+        states = law.planner.previous[1].states
+        nodes = law.planner.evaluate.scene.velocities[::2]
         speed = nodes + np.column_stack((states[:, V : V + 2], states[:, W]))
         fastest[limit] = float(np.linalg.norm(speed[-1]))
     assert fastest[None] > 1.4

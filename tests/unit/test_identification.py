@@ -10,16 +10,18 @@ from scipy import signal
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
-from offboard.identification.motion import lagged_thrust
-from offboard.identification.motion_fit import innovations, long_run
-from offboard.identification.response_fit import Estimate, fit_response, predicted
-from offboard.identification.stages import Identified, identify
+from offboard.identification import attitude_fit
+from offboard.identification.attitude_fit import ResponseFit
+from offboard.identification.motion_fit import Motion, Noise, PositionFilter, predicted_velocity
+from offboard.identification.response import first_order, linear_recursion, second_order
 from offboard.identification.trace import Recorder, Trace, clean
+from offboard.identification.uncertainty import Estimate, long_run_covariance
+from offboard.identification.vehicle_fit import Identified, completed, identify
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 G = 9.80665
-BELIEVED = Vehicle(
-    name="believed",
+VEHICLE_FILE = Vehicle(
+    name="file",
     mass_kg=1.0,
     inertia_kgm2=(0.02, 0.02, 0.03),
     drag_translation_npmps=(0.6, 0.6, 0.6),
@@ -31,8 +33,8 @@ BELIEVED = Vehicle(
 FINE_S = 1e-3
 
 
-def answered(commands, sent_at, delay_s, frequency, damping, times):
-    """The second-order answer by SciPy's linear simulation on a grid of 1 ms."""
+def simulated(commands, sent_at, delay_s, frequency, damping, times):
+    """The second-order response by SciPy's linear simulation on a grid of 1 ms."""
     grid = np.arange(0.0, times[-1] + 0.01, FINE_S)
     rows = np.searchsorted(sent_at + delay_s, grid + 1e-9, side="right") - 1
     held = np.where(rows < 0, 0.0, commands[np.maximum(rows, 0)])
@@ -55,27 +57,41 @@ def steps(seed, count=60, period_s=0.1, size=0.035):
     return np.arange(count) * period_s, values
 
 
+def fit_response(*measured) -> ResponseFit:
+    return completed(attitude_fit.fit_response(*measured))
+
+
+def test_linear_recursion_equals_its_loop():
+    generator = np.random.default_rng(8)
+    transitions = 0.5 * generator.normal(size=(29, 3, 3))
+    inputs = generator.normal(size=(30, 3, 2))
+    states = [inputs[0]]
+    for transition, added in zip(transitions, inputs[1:], strict=True):
+        states.append(transition @ states[-1] + added)
+    assert linear_recursion(transitions, inputs) == pytest.approx(np.array(states), rel=1e-12)
+
+
 @pytest.mark.parametrize("damping", [0.3, 0.999, 1.0, 1.7])
-def test_response_is_that_of_scipy(damping):
+def test_second_order_response_equals_scipys_simulation(damping):
     sent_at, values = steps(3)
     times = 0.3 + np.cumsum(np.random.default_rng(4).choice([0.008, 0.016, 0.004], 500))
-    ours = predicted(times, sent_at, values[:, None], 0.057, 11.4, damping)[:, 0]
-    theirs = answered(values, sent_at, 0.057, 11.4, damping, times)
+    ours = second_order(times, sent_at, values[:, None], 0.057, 11.4, damping)[:, 0]
+    theirs = simulated(values, sent_at, 0.057, 11.4, damping, times)
     assert np.abs(ours - theirs).max() < 2e-5
     assert np.abs(theirs).max() > 0.02
 
 
-def test_command_under_way_acts_when_its_delay_is_over():
-    """Sent at 0.40 s, it acts at 0.457 s; the first sample is of 0.42 s."""
+def test_command_acts_when_its_delay_is_over():
+    """Sent at 0.40 s, it acts at 0.457 s; the first sample is at 0.42 s."""
     sent_at, values = np.array([0.0, 0.4]), np.array([0.0, 0.03])
     times = np.arange(0.42, 1.5, 0.01)
-    ours = predicted(times, sent_at, values[:, None], 0.057, 11.4, 0.6)[:, 0]
-    assert np.abs(ours - answered(values, sent_at, 0.057, 11.4, 0.6, times)).max() < 2e-5
+    ours = second_order(times, sent_at, values[:, None], 0.057, 11.4, 0.6)[:, 0]
+    assert np.abs(ours - simulated(values, sent_at, 0.057, 11.4, 0.6, times)).max() < 2e-5
     assert np.abs(ours[:4]).max() == 0.0
 
 
 def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():
-    """Position, speed and disturbance driven by the densities that the filter is told."""
+    """Position, speed and disturbance are driven by the densities that the filter assumes."""
     generator = np.random.default_rng(11)
     step_s, count, drag = 0.02, 20000, 0.7
     densities = np.array([0.02, 0.3, 0.5])
@@ -86,37 +102,37 @@ def test_innovations_of_a_matching_motion_are_white_and_of_unit_variance():
         positions[i] = state[0] + 0.01 * generator.normal()
         state = drift @ state + kicks[i]
     times = step_s * np.arange(count)
-    allowed, white = np.array([*densities, 0.01, 1.0, 1.0]), np.empty((1, count - 1))
-    innovations.call(times, positions[None], np.zeros((1, count)), np.array([drag]), allowed, white)
-    white = white[0, 200:]
+    position_filter = PositionFilter(times, drag, Noise(*densities, 0.01, 1.0, 1.0))
+    white = position_filter.innovations(positions[None], np.zeros((1, count)), drag)[0, 200:]
     assert np.mean(white**2) == pytest.approx(1.0, abs=0.03)
     assert abs(np.mean(white[1:] * white[:-1])) < 0.02
 
 
-def test_related_scores_are_weighed_by_bartletts_triangle():
-    """As a quadratic form with every pair's weight written out."""
+def test_long_run_covariance_has_bartletts_weights():
+    """Against the quadratic form with the weight of every pair written out."""
     score = np.cumsum(np.random.default_rng(2).normal(size=(60, 3)), axis=0)
     apart = np.abs(np.subtract.outer(np.arange(60), np.arange(60)))
     expected = score.T @ np.maximum(1.0 - apart / 8.0, 0.0) @ score
-    assert long_run(score, 7) == pytest.approx(expected, rel=1e-12)
-    assert long_run(score, 0) == pytest.approx(score.T @ score, rel=1e-12)
+    assert long_run_covariance(score, 7) == pytest.approx(expected, rel=1e-12)
+    assert long_run_covariance(score, 0) == pytest.approx(score.T @ score, rel=1e-12)
 
 
-def test_response_fits_what_scipy_made_to_four_digits():
+def test_response_of_scipys_simulation_is_identified():
     sent_at, values = steps(5)
     times = np.arange(0.3, 5.9, 0.01)
-    signals = answered(values, sent_at, 0.123, 7.0, 1.2, times)[:, None]
+    signals = simulated(values, sent_at, 0.123, 7.0, 1.2, times)[:, None]
     fit = fit_response(times, signals, sent_at, values[:, None])
     assert fit.delay_s.value == pytest.approx(0.123, abs=5e-4)
     assert fit.natural_frequency_radps.value == pytest.approx(7.0, rel=2e-3)
     assert fit.damping.value == pytest.approx(1.2, rel=2e-3)
 
 
-def test_uncertainty_is_what_repetition_shows():
-    """Noise related over 0.2 s, as an estimator's is: errors over their sd have an rms near 1."""
+def test_standard_deviations_agree_with_repeated_fits():
+    """Noise is autocorrelated over 0.2 s, as an estimator's: errors over their sd have an rms near
+    1."""
     sent_at, values = steps(6)
     times = np.arange(0.3, 5.9, 0.01)
-    clean_signal = answered(values, sent_at, 0.05, 11.0, 0.6, times)
+    clean_signal = simulated(values, sent_at, 0.05, 11.0, 0.6, times)
     truth = np.array([0.05, 11.0, 0.6])
     shares = []
     for seed in range(40):
@@ -131,8 +147,8 @@ def test_uncertainty_is_what_repetition_shows():
     assert np.all(rms < 1.8)
 
 
-def test_lost_commands_mislead_no_fit():
-    """One command in twelve never acts, which nobody tells: the fit is right by its own account."""
+def test_fit_is_right_within_its_uncertainty_though_commands_are_lost():
+    """One command in twelve never acts, which the fit does not know."""
     shares, errors_s = [], []
     times = np.arange(0.3, 7.9, 0.02)
     for seed in range(30):
@@ -140,7 +156,7 @@ def test_lost_commands_mislead_no_fit():
         generator = np.random.default_rng(seed)
         acts = generator.random(80) > 1 / 12
         acts[0] = True
-        signals = answered(values[acts], sent_at[acts], 0.15, 11.0, 0.6, times)
+        signals = simulated(values[acts], sent_at[acts], 0.15, 11.0, 0.6, times)
         signals += 0.001 * generator.normal(size=len(times))
         fit = fit_response(times, signals[:, None], sent_at, values[:, None])
         shares.append((fit.delay_s.value - 0.15) / fit.delay_s.sd)
@@ -151,24 +167,24 @@ def test_lost_commands_mislead_no_fit():
 
 
 def test_delay_known_beforehand_counts_by_its_uncertainty():
-    """A vague word changes nothing, a sure one decides and takes what depends on it along."""
+    """An uncertain one changes nothing; a certain one decides, also on the natural frequency."""
     sent_at, values = steps(5)
     times = np.arange(0.3, 5.9, 0.01)
     noise = 0.004 * np.random.default_rng(1).normal(size=len(times))
-    signals = (answered(values, sent_at, 0.123, 7.0, 1.2, times) + noise)[:, None]
-    alone, vague, sure = (
+    signals = (simulated(values, sent_at, 0.123, 7.0, 1.2, times) + noise)[:, None]
+    alone, uncertain, certain = (
         fit_response(times, signals, sent_at, values[:, None], delay)
         for delay in (None, Estimate(0.3, 10.0), Estimate(0.123, 1e-5))
     )
-    assert vague.delay_s.value == pytest.approx(alone.delay_s.value, abs=1e-6)
-    assert vague.delay_s.sd == pytest.approx(alone.delay_s.sd, rel=1e-3)
-    assert sure.delay_s.value == pytest.approx(0.123, abs=1e-4)
-    assert sure.delay_s.sd < 1e-4
-    wrong = [abs(each.natural_frequency_radps.value - 7.0) for each in (alone, sure)]
+    assert uncertain.delay_s.value == pytest.approx(alone.delay_s.value, abs=1e-6)
+    assert uncertain.delay_s.sd == pytest.approx(alone.delay_s.sd, rel=1e-3)
+    assert certain.delay_s.value == pytest.approx(0.123, abs=1e-4)
+    assert certain.delay_s.sd < 1e-4
+    wrong = [abs(each.natural_frequency_radps.value - 7.0) for each in (alone, certain)]
     assert wrong[1] < 0.7 * wrong[0]
 
 
-def test_lagged_thrust_is_that_of_scipy():
+def test_first_order_response_equals_scipys_integration():
     sent_at = np.array([0.0, 0.5, 0.9, 1.4])
     thrust = np.array([0.4, 0.5, 0.35, 0.45])
     times = np.arange(0.4, 2.0, 0.013)
@@ -178,16 +194,15 @@ def test_lagged_thrust_is_that_of_scipy():
         return (thrust[row] - u) / 0.08
 
     solved = solve_ivp(rate, (0.0, 2.0), [0.4], t_eval=times, max_step=1e-3, rtol=1e-8)
-    ours = np.empty_like(times)
-    lagged_thrust.call(times, np.column_stack((sent_at, thrust)), np.array((0.02, 0.08)), ours)
+    ours = first_order(times, sent_at, thrust[:, None], 0.02, 0.08)[:, 0]
     assert np.abs(ours - solved.y[0]).max() < 5e-4
 
 
 def flown(
     *, tilt=0.25, course=0.1, heave=0.06, hover=0.5, drag=0.8, noise=0.0, seconds=12.0, seed=1
 ) -> Trace:
-    """A vehicle that swings under open-loop commands, integrated by SciPy: tilt answers with
-    D .06, wn 12, z .7, course with D .1, wn 4, z .6, thrust with D .02, lag .05."""
+    """A vehicle that swings under open-loop commands, integrated by SciPy. Delay, natural frequency
+    and damping: tilt .06, 12, .7, course .1, 4, .6; thrust: delay .02, lag .05."""
     sent_at = np.arange(0.0, seconds, 0.1)
     generator = np.random.default_rng(seed)
     swing = tilt * np.sin(1.6 * sent_at), tilt * np.cos(2.3 * sent_at)
@@ -195,8 +210,8 @@ def flown(
     thrust = hover * (1.0 + heave * np.sign(np.sin(2.0 * sent_at)))
     courses = course * np.sign(np.sin(1.1 * sent_at))
     grid = np.arange(0.0, seconds, 0.01)
-    b = [answered(each, sent_at, 0.06, 12.0, 0.7, grid) for each in tilts]
-    turned = answered(courses, sent_at, 0.1, 4.0, 0.6, grid)
+    b = [simulated(each, sent_at, 0.06, 12.0, 0.7, grid) for each in tilts]
+    turned = simulated(courses, sent_at, 0.1, 4.0, 0.6, grid)
 
     def rate(t, x):
         row = max(int(np.searchsorted(sent_at + 0.02, t + 1e-12, side="right")) - 1, 0)
@@ -220,8 +235,8 @@ def flown(
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.001])
-def test_everything_comes_back(noise):
-    found = identify(flown(noise=noise), BELIEVED)
+def test_every_constant_is_identified(noise):
+    found = identify(flown(noise=noise), VEHICLE_FILE)
     assert not found.refusals
     assert found.tilt is not None
     assert found.yaw is not None
@@ -239,80 +254,103 @@ def test_everything_comes_back(noise):
     effect_s = found.thrust_lag_s.value + found.thrust_delay_s.value
     assert effect_s == pytest.approx(0.07, abs=0.015)
     assert found.drag_ps.value == pytest.approx(0.8, rel=0.05)
-    applied = found.applied_to(BELIEVED)
+    applied = found.applied_to(VEHICLE_FILE)
     assert applied.drag_per_mass_ps == pytest.approx(found.drag_ps.value)
     assert applied.tilt.damping == found.tilt.damping.value
 
 
-def test_reported_velocity_is_not_believed():
+def test_reported_velocity_is_not_used():
     """A velocity that is wrong by 0.4 m/s for seconds changes nothing but the noise figure."""
     true = flown()
     wrong = true.position.copy()
     wrong[:, 4:7] += 0.4 * np.sin(1.5 * wrong[:, :1])
-    honest, misled = (
-        identify(Trace(true.commands, true.attitude, each), BELIEVED)
+    right, misled = (
+        identify(Trace(true.commands, true.attitude, each), VEHICLE_FILE)
         for each in (true.position, wrong)
     )
-    assert misled.drag_ps == honest.drag_ps
-    assert misled.hover_thrust == honest.hover_thrust
-    assert honest.noise is not None
+    assert misled.drag_ps == right.drag_ps
+    assert misled.hover_thrust == right.hover_thrust
+    assert right.noise is not None
     assert misled.noise is not None
-    assert honest.noise.velocity_contradiction_mps < 0.002
+    assert right.noise.velocity_contradiction_mps < 0.002
     assert 0.2 < misled.noise.velocity_contradiction_mps < 0.4
 
 
-def test_noise_from_sample_to_sample_is_measured():
+def test_predicted_velocity_is_that_of_the_flight():
+    """With the true constants, after the unknown speed at the start has decayed for 7 s; a constant
+    velocity is not determined."""
+    trace = flown()
+    true = VEHICLE_FILE.model_copy(
+        update={
+            "hover_thrust": 0.5,
+            "thrust_lag_s": 0.05,
+            "thrust_delay_s": 0.02,
+            "drag_translation_npmps": (0.8, 0.8, 0.8),
+        }
+    )
+    motion = Motion(trace)
+    velocity = predicted_velocity(motion, true)
+    flight = np.array(
+        [np.interp(motion.times, trace.position[:, 0], trace.position[:, 4 + i]) for i in range(3)]
+    )
+    later = motion.times > motion.times[0] + 7.0
+    apart = np.std(velocity - flight, axis=1, where=later)
+    assert np.all(np.std(flight, axis=1, where=later) > [0.4, 0.3, 0.15])
+    assert np.all(apart < 0.01)
+
+
+def test_white_noise_of_the_estimator_is_measured():
     trace = flown(noise=0.004)
-    noise = identify(trace, BELIEVED).noise
+    noise = identify(trace, VEHICLE_FILE).noise
     assert noise is not None
     assert noise.position_m == pytest.approx(0.004, rel=0.1)
     assert noise.attitude_rad == pytest.approx(0.0008, rel=0.15)
     assert noise.velocity_mps < 1e-4
 
 
-def silent() -> Trace:
+def hover() -> Trace:
     return flown(tilt=0.0, course=0.0, heave=0.0)
 
 
 @pytest.mark.parametrize(
     ("trace", "name", "words"),
     [
-        (silent(), "tilt", "moved by 0.0 mrad rms"),
-        (silent(), "yaw", "moved by 0.0 mrad rms"),
-        (silent(), "thrust_lag_s", "the thrust moved by 0.0 %"),
-        (silent(), "drag_ps", "drag needs motion"),
+        (hover(), "tilt", "moved by 0.0 mrad rms"),
+        (hover(), "yaw", "moved by 0.0 mrad rms"),
+        (hover(), "thrust_lag_s", "the thrust changed by 0.0 %"),
+        (hover(), "drag_ps", "drag needs motion"),
         (flown(tilt=0.01), "drag_ps", "drag needs motion"),
         (flown(seconds=2.0), "tilt", "1.5 s of flight, 2 s are needed"),
     ],
 )
-def test_what_a_flight_does_not_show_is_refused(trace, name, words):
-    found = identify(trace, BELIEVED)
+def test_constant_that_the_flight_does_not_determine_is_refused(trace, name, words):
+    found = identify(trace, VEHICLE_FILE)
     assert words in found.refusals[name]
     assert getattr(found, name) is None
-    assert getattr(found.applied_to(BELIEVED), name, None) == getattr(BELIEVED, name, None)
+    assert getattr(found.applied_to(VEHICLE_FILE), name, None) == getattr(VEHICLE_FILE, name, None)
 
 
-def test_silent_hover_still_shows_its_thrust():
-    found = identify(silent(), BELIEVED)
+def test_hover_without_steps_determines_the_hover_thrust():
+    found = identify(hover(), VEHICLE_FILE)
     assert found.hover_thrust is not None
     assert found.hover_thrust.value == pytest.approx(0.5, rel=0.005)
 
 
-def test_attitude_that_follows_something_else_is_refused():
-    """Another's commands: the fit must not be taken for an answer."""
+def test_attitude_that_does_not_follow_its_commands_is_refused():
+    """The attitude of one flight with the commands of another."""
     ours, other = flown(seed=1), flown(seed=2)
     swapped = other.commands.copy()
     swapped[:, 1:3] = np.roll(swapped[:, 1:3], 17, axis=0)
-    found = identify(Trace(swapped, ours.attitude, ours.position), BELIEVED)
+    found = identify(Trace(swapped, ours.attitude, ours.position), VEHICLE_FILE)
     assert found.tilt is None
-    assert "does not follow" in found.refusals["tilt"] or "edge" in found.refusals["tilt"]
+    assert "does not follow" in found.refusals["tilt"] or "limit" in found.refusals["tilt"]
 
 
 @pytest.mark.parametrize("rows", [0, 1, 5])
-def test_next_to_nothing_is_refused(rows):
+def test_almost_empty_trace_is_refused(rows):
     trace = flown(seconds=3.0)
     cut = Trace(trace.commands[:rows], trace.attitude[:rows], trace.position[:rows])
-    found = identify(cut, BELIEVED)
+    found = identify(cut, VEHICLE_FILE)
     assert found == Identified(0.0, refusals=found.refusals)
     assert set(found.refusals) >= {"tilt", "yaw", "hover_thrust", "drag_ps"}
     assert not found.supported

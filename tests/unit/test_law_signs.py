@@ -13,7 +13,7 @@ from attitude_plant import Lemniscate, Truth, fly
 from test_tracking_law import LEVEL, PX4, G
 
 from offboard.control.base import Controller, Decision, Situation
-from offboard.control.catalogue import LAWS, build
+from offboard.control.catalogue import names, settings_of
 from offboard.model.command import Command, PositionCommand
 from offboard.model.frames import wrap_pi
 from offboard.model.predicted_state import PredictedState
@@ -21,12 +21,13 @@ from offboard.reference.base import FlatSample
 from offboard.reference.transfer import Hold
 
 # Those that track by themselves; the paper's law is slow, and the autopilot's own loop not ours
-TRACKING = [name for name in LAWS if name not in ("paper", "autopilot")]
+TRACKING = [name for name in names() if name not in ("paper", "autopilot")]
 HEADINGS_DEG = (0.0, 90.0, 179.9, -179.9, -90.0)
 
 
 def law_named(name: str) -> Controller:
-    return build(LAWS[name].model_validate({"law": name}), PX4, 0.1, 7)  # type: ignore[arg-type]
+    chosen = {"bandwidth_radps": 5.0} if name in TRACKING else {}
+    return settings_of(name)(law=name, **chosen).build(PX4, period_s=0.1, seed=7)
 
 
 def at(position: tuple[float, float, float], course_rad: float) -> PredictedState:

@@ -1,14 +1,14 @@
-"""The delay of the link from TIMESYNC answers, and what is believed of the vehicle behind it."""
+"""The delay of the link from TIMESYNC replies, and the estimate of a vehicle behind this link."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from offboard.flight.link_delay import LONGEST_S, LinkDelay
-from offboard.identification.response_fit import Estimate
+from offboard.flight.link_delay import DELAY_MAX_S, LinkDelay
+from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import VehicleEstimate
-from offboard.mavlink.events import TimeAnswer
+from offboard.mavlink.events import TimesyncReply
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 PX4 = Vehicle(
@@ -24,33 +24,33 @@ PX4 = Vehicle(
 )
 
 
-def answered(link: LinkDelay, telemetry_s: float, delay_s: float) -> TimeAnswer:
-    asked_ns = link.question(telemetry_s).ts1_ns
-    return TimeAnswer(asked_ns, asked_ns + round(delay_s * 1e9))
+def reply(link: LinkDelay, telemetry_s: float, delay_s: float) -> TimesyncReply:
+    request_ns = link.request(telemetry_s).ts1_ns
+    return TimesyncReply(request_ns, request_ns + round(delay_s * 1e9))
 
 
-def test_median_and_scatter_of_the_answers() -> None:
+def test_median_and_spread_of_the_replies() -> None:
     link, rng = LinkDelay(), np.random.default_rng(3)
     for number, delay_s in enumerate(rng.normal(0.12, 0.01, 40)):
-        link.note(answered(link, 5.0 + 0.1 * number, delay_s))
+        link.on_reply(reply(link, 5.0 + 0.1 * number, delay_s))
     assert link.estimate is not None
     assert link.estimate.value == pytest.approx(0.12, abs=0.005)
     assert link.estimate.sd == pytest.approx(0.01, rel=0.4)
-    link.forget()
+    link.reset()
     assert link.estimate is None
 
 
-def test_what_is_no_answer_to_us_counts_for_nothing() -> None:
+def test_replies_to_others_late_and_duplicate_ones_are_ignored() -> None:
     link = LinkDelay()
     for number in range(5):
         at_s = float(number)
-        answer = answered(link, at_s, 0.05)
-        link.note(TimeAnswer(answer.asked_ns + 1, answer.vehicle_ns))  # somebody else's question
-        link.note(answered(link, at_s + 0.2, -0.01))  # other clocks
-        link.note(answered(link, at_s + 0.4, LONGEST_S + 0.01))
+        own = reply(link, at_s, 0.05)
+        link.on_reply(TimesyncReply(own.request_ns + 1, own.vehicle_ns))  # another sender's request
+        link.on_reply(reply(link, at_s + 0.2, -0.01))  # other clocks
+        link.on_reply(reply(link, at_s + 0.4, DELAY_MAX_S + 0.01))
         assert link.estimate is None
-        link.note(answer)
-        link.note(TimeAnswer(answer.asked_ns, answer.vehicle_ns + 10**9))  # a repetition
+        link.on_reply(own)
+        link.on_reply(TimesyncReply(own.request_ns, own.vehicle_ns + 10**9))  # a duplicate
     assert link.estimate == Estimate(pytest.approx(0.05), 0.0)
 
 

@@ -24,7 +24,6 @@ from offboard.estimation.propagation import (
 )
 from offboard.model.command import Command
 from offboard.model.frames import quaternion_from_thrust_direction
-from offboard.model.kernel import address
 from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import AxisResponse, Vehicle
 
@@ -162,7 +161,7 @@ def test_replay_agrees_with_scipy(damping: float) -> None:
     motion["states"][0, NOW] = start
     motion["plant"] = plant_vector(vehicle, ObserverSettings())
     motion["history"][0, :5], motion["sent"] = sent, 5
-    replay.call(address(motion), LATER, 0.0, 1.0)
+    replay(motion, LATER, 0.0, 1.0)
     assert motion["states"][0, LATER] == pytest.approx(x, abs=3e-6)
 
 

@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from offboard.control.base import Situation
-from offboard.control.catalogue import build
 from offboard.control.certificate import certify
 from offboard.flight.configuration import load
 from offboard.model.command import Command
@@ -165,7 +164,7 @@ def flown_over_an_attitude_loop(
     """
     config = load("paper", choices={"controller": name})
     vehicle = config.vehicle
-    controller = build(config.controller, vehicle, 0.1, 1)
+    controller = config.controller.build(vehicle, period_s=0.1, seed=1)
     position, velocity, tilt, turning = (np.zeros(3) for _ in range(4))
     command = Command(vehicle.gravity_mps2, (0.0, 0.0, 1.0), 0.0)
     flown: list[tuple[Array, Array, Array]] = []

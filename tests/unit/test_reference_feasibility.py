@@ -10,8 +10,8 @@ import pytest
 
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import FlatSample
-from offboard.reference.catalogue import adapter, build
 from offboard.reference.feasibility import Bounds, InfeasibleReference, check
+from offboard.reference.shapes import SHAPES
 from offboard.reference.track import Track
 from offboard.reference.transfer import Hold
 
@@ -27,7 +27,7 @@ def vehicle(**changes: object) -> Vehicle:
 
 
 def track(**settings: object) -> Track:
-    return build(adapter.validate_python(settings))
+    return SHAPES[str(settings["shape"])](**settings).track()
 
 
 def test_envelope_of_a_circle_by_hand() -> None:

@@ -11,8 +11,8 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from offboard.reference.base import FlatSample
-from offboard.reference.catalogue import adapter, build
 from offboard.reference.flatness import FlatState, flat_state
+from offboard.reference.shapes import SHAPES, Circle, CourseMode, Hover
 from offboard.reference.track import Track
 
 Array = NDArray[np.float64]
@@ -33,7 +33,7 @@ every_course = pytest.mark.parametrize("course", ["fixed", "along_velocity"])
 
 
 def track_of(shape: str, course: str) -> Track:
-    return build(adapter.validate_python({"shape": shape, "course": course} | SETTINGS[shape]))
+    return SHAPES[shape](**{"course": course} | SETTINGS[shape]).track()
 
 
 def state_of(track: Track, time_s: float | Array) -> FlatState:
@@ -103,7 +103,7 @@ def test_a_level_circle_by_hand() -> None:
     """Steady circle without drag: T = hypot(g, v^2/r), tilt atan(v^2 / (r g)) inwards, and with
     the nose along the velocity p = 0, q and r the parts of the turn about the vertical."""
     radius, period = 2.0, 8.0
-    track = build(adapter.validate_python({"shape": "circle", "course": "along_velocity"}))
+    track = Circle(course=CourseMode.ALONG_VELOCITY).track()
     omega = 2 * math.pi / period
     inward = omega**2 * radius
     flat = flat_state(track.sample(9.3), GRAVITY, 0.0)
@@ -118,7 +118,7 @@ def test_a_level_circle_by_hand() -> None:
 
 
 def test_hover_in_a_disturbance_leans_against_it() -> None:
-    track = build(adapter.validate_python({"shape": "hover"}))
+    track = Hover().track()
     flat = flat_state(track.sample(1.0), GRAVITY, DRAG, WIND)
     force = np.array([0, 0, GRAVITY]) + WIND
     assert float(flat.thrust_mps2) == pytest.approx(np.linalg.norm(force))

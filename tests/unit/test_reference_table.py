@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from offboard.model.vehicle import Vehicle
-from offboard.reference.catalogue import adapter, build
 from offboard.reference.feasibility import InfeasibleReference, check
+from offboard.reference.shapes import FromTable
 from offboard.reference.table import TableError, interpolate, parse
 from offboard.reference.track import Track
 
@@ -17,8 +17,7 @@ GOOD = "time_s,north_m,east_m,down_m\n0,0,0,-2\n1,1,0,-2\n2,2,1,-2\n3,3,3,-2.5\n
 
 
 def table_track(text: str, **settings: object) -> Track:
-    config = adapter.validate_python({"shape": "table", "file": "flown.csv"} | settings)
-    return build(config, text)
+    return FromTable(**{"file": "flown.csv", "text": text} | settings).track()
 
 
 def test_columns_in_any_order_and_by_any_name() -> None:
@@ -98,7 +97,7 @@ def test_a_table_without_course_takes_the_configured_one() -> None:
 
 def test_an_unread_table_is_a_mistake_of_the_caller() -> None:
     with pytest.raises(ValueError, match=r"flown\.csv has not been read"):
-        build(adapter.validate_python({"shape": "table", "file": "flown.csv"}))
+        FromTable(file="flown.csv").track()
 
 
 HEAD = "time_s,north_m,east_m,down_m\n"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from offboard.reference.base import FlatSample
-from offboard.reference.catalogue import adapter, build
+from offboard.reference.shapes import Circle, CourseMode
 from offboard.reference.transfer import Hold, Limits, Placed, Shifted, Transfer, transfer
 
 
@@ -132,7 +132,7 @@ def test_derivatives_are_those_of_the_position() -> None:
 
 
 def test_shifted_placed_and_held() -> None:
-    track = build(adapter.validate_python({"shape": "circle", "course": "along_velocity"}))
+    track = Circle(course=CourseMode.ALONG_VELOCITY).track()
     moved = Placed(Shifted(track, 100.0), (10.0, -5.0, 2.0))
     assert moved.duration_s == track.duration_s + 100.0
     times = np.array([[90.0, 101.0], [110.0, 200.0]])

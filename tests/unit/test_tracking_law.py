@@ -7,6 +7,7 @@ those measured on PX4 itself.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,8 +15,9 @@ import pytest
 from attitude_plant import Flight, Lemniscate, Truth, fly
 from scipy.linalg import expm
 
-from offboard.control.base import DecisionError, Situation
-from offboard.control.laws.tracking import Search, TrackingLaw, TrackingSettings, closed_form
+from offboard.control.base import Controller, DecisionError, Situation
+from offboard.control.laws.lqr import LqrLaw, LqrSettings, closed_form
+from offboard.control.laws.pso import PsoLaw, PsoSettings
 from offboard.control.swarm import SwarmSettings
 from offboard.estimation.observer import ObserverSettings, VelocitySource
 from offboard.model.axes import lateral_model, lead, vertical_model
@@ -48,11 +50,13 @@ ARDUCOPTER = PX4.model_copy(
 LEVEL = Command(G, (0.0, 0.0, 1.0), 0.0)
 
 
-def law_of(
-    bandwidth: float = 5.0, search: Search = Search.CLOSED_FORM, seed: int = 0, **more: object
-) -> TrackingLaw:
-    settings = TrackingSettings.model_validate({"bandwidth_radps": bandwidth, **more})
-    return TrackingLaw(PX4, settings, search, seed=seed)
+def lqr(bandwidth: float = 5.0, vehicle: Vehicle = PX4, **more: object) -> LqrLaw:
+    return LqrLaw(vehicle, LqrSettings.model_validate({"bandwidth_radps": bandwidth, **more}))
+
+
+def pso(bandwidth: float = 5.0, vehicle: Vehicle = PX4, seed: int = 0, **more: object) -> PsoLaw:
+    settings = PsoSettings.model_validate({"bandwidth_radps": bandwidth, **more})
+    return PsoLaw(vehicle, settings, seed=seed)
 
 
 def state_of(rng: np.random.Generator, reference: Lemniscate, size: float) -> PredictedState:
@@ -86,7 +90,7 @@ def state_of(rng: np.random.Generator, reference: Lemniscate, size: float) -> Pr
 def test_gains_are_those_flown_on_px4(
     bandwidth: float, lateral: list[float], vertical: list[float]
 ) -> None:
-    law = law_of(bandwidth)
+    law = lqr(bandwidth).tracking
     digits = [2, 3, 3, 3]
     assert [round(k, d) for k, d in zip(law.lateral.gain, digits, strict=True)] == lateral
     digits = [1, 2, 2]
@@ -96,7 +100,7 @@ def test_gains_are_those_flown_on_px4(
 @pytest.mark.parametrize("vehicle", [PX4, ARDUCOPTER], ids=["px4", "arducopter"])
 def test_cost_is_the_integral_it_stands_for(vehicle: Vehicle) -> None:
     """J(u; x) against 30 s of flight in steps of 1 ms: u held for one period, then -K x."""
-    law = TrackingLaw(vehicle, TrackingSettings())
+    law = lqr(vehicle=vehicle).tracking
     rng = np.random.default_rng(4)
     pairs = [
         (lateral_model(vehicle), law.lateral, G**2 / 5.0**4),
@@ -145,8 +149,8 @@ def test_feed_forward_is_of_a_share_of_the_motion(share: float) -> None:
             moved = {name: share * getattr(whole, name) for name in FlatSample.__slots__[:5]}
             return replace(whole, **moved)
 
-    law = TrackingLaw(PX4, TrackingSettings(), Search.CLOSED_FORM, feedforward=share)
-    target, small = law.target(reference, 5.0, state), law_of().target(Smaller(), 5.0, state)
+    target = lqr(feedforward=share).tracking.target(reference, 5.0, state)
+    small = lqr().tracking.target(Smaller(), 5.0, state)
     for name in ("tilt_feedforward", "direction_ne", "direction_rate_ne_ps"):
         assert getattr(target, name) == pytest.approx(getattr(small, name), abs=1e-12)
     assert target.thrust_down_feedforward_mps2 == small.thrust_down_feedforward_mps2
@@ -157,11 +161,11 @@ def test_feed_forward_is_of_a_share_of_the_motion(share: float) -> None:
 
 def test_unconstrained_minimiser_is_the_lqr_law() -> None:
     """u* = -f / h: b_c = b_ff - K [p, v, b, b'], T b_z = f_ff - Kz [z, v_z, f_z]; course led."""
-    law, rng, reference = law_of(), np.random.default_rng(1), Lemniscate(15.0)
+    law, rng, reference = lqr().tracking, np.random.default_rng(1), Lemniscate(15.0)
     for _ in range(20):
         state = state_of(rng, reference, 0.3)
-        target = law.target(reference, 5.0, state)
-        problem = law.problem(state, target)
+        task = law.task(Situation(5.0, state, reference, LEVEL))
+        target, problem = task.target, task.problem
         minimiser = np.linalg.solve(problem.hessian, -problem.gradient)
         off = [
             state.position_ned_m[:2] - target.position_ne_m,
@@ -187,11 +191,11 @@ def test_unconstrained_minimiser_is_the_lqr_law() -> None:
 
 
 def test_cost_vanishes_on_the_reference_and_never_goes_below_zero() -> None:
-    law, rng, reference = law_of(), np.random.default_rng(2), Lemniscate(15.0)
+    law, rng, reference = lqr().tracking, np.random.default_rng(2), Lemniscate(15.0)
     for size in (0.0, 0.1, 1.0):
         state = state_of(rng, reference, size)
-        target = law.target(reference, 5.0, state)
-        problem = law.problem(state, target)
+        task = law.task(Situation(5.0, state, reference, LEVEL))
+        target, problem = task.target, task.problem
         assert problem(np.linalg.solve(problem.hessian, -problem.gradient)) > -1e-9
     upright = math.sqrt(1 - target.direction_ne @ target.direction_ne)
     on_it = replace(
@@ -204,17 +208,18 @@ def test_cost_vanishes_on_the_reference_and_never_goes_below_zero() -> None:
     )
     nominal = [target.thrust_down_feedforward_mps2 / upright,
                *target.tilt_feedforward, target.course_feedforward_rad]  # fmt: skip
-    cost = float(law.problem(on_it, target)(np.array(nominal)))
+    problem = law.task(Situation(5.0, on_it, reference, LEVEL)).problem
+    cost = float(problem(np.array(nominal)))
     assert cost == pytest.approx(0.0, abs=1e-9)
 
 
 @pytest.mark.parametrize(("size", "least", "most"), [(0.01, 0, 0), (1, 20, 50), (10, 50, 50)])
 def test_bounds_hold_and_the_feedback_is_limited(size: float, least: int, most: int) -> None:
-    law, rng, reference = law_of(), np.random.default_rng(3), Lemniscate(8.0)
+    law, rng, reference = lqr(), np.random.default_rng(3), Lemniscate(8.0)
     touched, limit = 0, math.sin(PX4.tilt_max_rad)
     for _ in range(50):
         state = state_of(rng, reference, size)
-        target = law.target(reference, 5.0, state)
+        target = law.tracking.target(reference, 5.0, state)
         decision = law.decide(Situation(5.0, state, reference, LEVEL))
         tilt = np.array(decision.command.thrust_direction_ned)
         fed_forward = np.clip(target.tilt_feedforward, -limit, limit)
@@ -228,12 +233,12 @@ def test_bounds_hold_and_the_feedback_is_limited(size: float, least: int, most: 
 
 def test_swarm_finds_the_closed_form() -> None:
     """The swarm of the paper on the cost-to-go: the exact optimum to a millionth of the box."""
-    pso, lqr = law_of(search=Search.SWARM), law_of(search=Search.CLOSED_FORM)
+    swarm, closed = pso(), lqr()
     rng, reference = np.random.default_rng(5), Lemniscate(8.0)
     for size in (0.05, 0.3, 3.0):
         state = state_of(rng, reference, size)
         situation = Situation(5.0, state, reference, LEVEL)
-        ours, exact = pso.decide(situation), lqr.decide(situation)
+        ours, exact = swarm.decide(situation), closed.decide(situation)
         assert ours.command.thrust_mps2 == pytest.approx(exact.command.thrust_mps2, abs=1e-5)
         assert ours.command.thrust_direction_ned == pytest.approx(
             exact.command.thrust_direction_ned, abs=1e-6
@@ -245,9 +250,9 @@ def test_swarm_finds_the_closed_form() -> None:
 
 
 def test_closed_form_is_no_worse_than_any_point_of_the_box() -> None:
-    law, rng, reference = law_of(), np.random.default_rng(6), Lemniscate(8.0)
+    rng, reference = np.random.default_rng(6), Lemniscate(8.0)
     state = state_of(rng, reference, 2.0)
-    problem = law.problem(state, law.target(reference, 5.0, state))
+    problem = lqr().tracking.task(Situation(5.0, state, reference, LEVEL)).problem
     anywhere = rng.uniform(problem.lower, problem.upper, (10_000, 4))
     assert problem(closed_form(problem)) <= problem(anywhere).min()
 
@@ -255,7 +260,7 @@ def test_closed_form_is_no_worse_than_any_point_of_the_box() -> None:
 def test_same_error_north_east_south_west_course_same_tilt() -> None:
     """The law lives in NED: the course turns the quaternion, never the thrust direction. An error
     to the north is answered by thrust to the south (b_n > 0), one to the east by b_e > 0."""
-    law = law_of()
+    law = lqr()
     tilts = []
     for course in np.radians([0.0, 90.0, 180.0, 270.0]):
         reference = Lemniscate(15.0, run_in_s=1e9, course_rad=float(course))
@@ -272,7 +277,7 @@ def test_same_error_north_east_south_west_course_same_tilt() -> None:
 
 
 def test_too_low_means_more_thrust_and_tilt_is_paid_for() -> None:
-    law, reference = law_of(), Lemniscate(15.0, run_in_s=1e9)
+    law, reference = lqr(), Lemniscate(15.0, run_in_s=1e9)
     rest = replace(state_of(np.random.default_rng(0), reference, 0.0), velocity_ned_mps=np.zeros(3))
     lower = replace(rest, position_ned_m=rest.position_ned_m + np.array([0, 0, 0.1]))
     command = law.decide(Situation(5.0, lower, reference, LEVEL)).command
@@ -287,21 +292,20 @@ def test_reset_gives_the_same_decisions_again_and_seeds_differ() -> None:
     rng, reference = np.random.default_rng(7), Lemniscate(8.0)
     situation = Situation(5.0, state_of(rng, reference, 0.3), reference, LEVEL)
 
-    def decisions(law: TrackingLaw) -> list[Command]:
+    def decisions(law: PsoLaw) -> list[Command]:
         return [law.decide(situation).command for _ in range(3)]
 
-    law = law_of(search=Search.SWARM, swarm=settings)
+    law = pso(swarm=settings)
     first = decisions(law)
     law.reset()
     assert decisions(law) == first
     assert decisions(law) != first
-    assert decisions(law_of(search=Search.SWARM, swarm=settings, seed=1)) != first
+    assert decisions(pso(swarm=settings, seed=1)) != first
 
 
 def test_what_is_not_finite_is_no_decision() -> None:
     reference = Lemniscate(8.0)
-    for search in Search:
-        law = law_of(search=search)
+    for law in (pso(), lqr()):
         state = state_of(np.random.default_rng(0), reference, 0.1)
         for broken in (math.nan, math.inf):
             wrong = replace(state, velocity_ned_mps=np.array([0.0, broken, 0.0]))
@@ -310,15 +314,13 @@ def test_what_is_not_finite_is_no_decision() -> None:
 
 
 def test_the_deadline_cuts_the_swarm_short() -> None:
-    ticks = iter(np.arange(0.0, 1000.0, 0.02))
-    law = TrackingLaw(PX4, TrackingSettings(), Search.SWARM, lambda: float(next(ticks)))
-    law.warm_up()
+    remaining_s = iter((0.02, 0.0))
     reference = Lemniscate(8.0)
     state = state_of(np.random.default_rng(0), reference, 0.1)
-    decision = law.decide(Situation(5.0, state, reference, LEVEL, deadline_s=0.05))
-    assert decision.certificate.cut_short
-    assert 0 < decision.certificate.iterations < 150
-    assert decision.certificate.solve_time_s > 0.05
+    situation = Situation(5.0, state, reference, LEVEL, lambda: next(remaining_s))
+    certificate = pso().decide(situation).certificate
+    assert certificate.cut_short
+    assert certificate.iterations == 50
 
 
 # ---------------------------------------------------------------- flights
@@ -328,15 +330,15 @@ def flight(
     bandwidth: float = 5.0,
     period_s: float = 15.0,
     seed: int = 1,
-    search: Search = Search.CLOSED_FORM,
     velocity: VelocitySource = VelocitySource.BIAS,
     truth: Truth | None = None,
     vehicle: Vehicle = PX4,
     laps: float = 1.0,
+    make: Callable[..., Controller] = lqr,
+    feedback_limit: float = 0.3,
     **more: object,
 ) -> Flight:
-    settings = TrackingSettings(bandwidth_radps=bandwidth, feedback_limit=more.pop("limit", 0.3))
-    law = TrackingLaw(vehicle, settings, search)
+    law = make(bandwidth, vehicle, feedback_limit=feedback_limit)
     observer = ObserverSettings(velocity=velocity)
     truth = truth or Truth(vehicle)
     reference = more.pop("reference", None) or Lemniscate(period_s)
@@ -363,7 +365,7 @@ def test_px4s_estimator_is_tracked_to_centimetres(
 
 
 def test_the_swarm_flies_like_the_closed_form() -> None:
-    ours, exact = flight(search=Search.SWARM, laps=0.3), flight(laps=0.3)
+    ours, exact = flight(make=pso, laps=0.3), flight(laps=0.3)
     assert ours.rmse_m == pytest.approx(exact.rmse_m, abs=1e-5)
 
 
@@ -443,7 +445,7 @@ def test_limited_feedback_cures_the_limit_cycle() -> None:
     """ArduCopter's acceleration limit, noise and wc 7 [.120 unlimited, .029 with .3]."""
     truth = Truth(ARDUCOPTER)
     limited = flight(7.0, vehicle=ARDUCOPTER, truth=truth)
-    free = flight(7.0, vehicle=ARDUCOPTER, truth=truth, limit=1.0)
+    free = flight(7.0, vehicle=ARDUCOPTER, truth=truth, feedback_limit=1.0)
     assert limited.rmse_m < 0.04
     assert free.rmse_m > 1.3 * limited.rmse_m
     assert free.rate_sd_radps > 1.3 * limited.rate_sd_radps

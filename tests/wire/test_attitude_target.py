@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from vehicle_frames import ARDUPILOT, PX4, Sender, pinned, understood
 
-from offboard.mavlink.wire import AttitudeTarget
+from offboard.mavlink.outgoing import AttitudeTarget
 
 COURSES_RAD = [0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi]
 HOVER, GRAVITY = 0.489, 9.81
@@ -42,7 +42,9 @@ def tilted(north: float, east: float) -> tuple[float, float, float]:
 
 @pytest.mark.parametrize("course_rad", COURSES_RAD)
 @pytest.mark.parametrize("lean", [(0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3), (0.2, -0.4)])
-def test_body_axes_point_where_they_were_told(course_rad: float, lean: tuple[float, float]) -> None:
+def test_body_axes_have_the_commanded_direction(
+    course_rad: float, lean: tuple[float, float]
+) -> None:
     direction = tilted(*lean)
     attitude = rotation(sent(target(thrust_direction_ned=direction, course_rad=course_rad)))
     np.testing.assert_allclose(attitude.apply([0.0, 0.0, 1.0]), direction, atol=1e-6)
@@ -61,7 +63,7 @@ def test_body_axes_point_where_they_were_told(course_rad: float, lean: tuple[flo
         (COURSES_RAD[3], 0.2, 0.0),  # nose west: roll right
     ],
 )
-def test_to_accelerate_north(course_rad: float, roll_rad: float, pitch_rad: float) -> None:
+def test_tilt_that_accelerates_north(course_rad: float, roll_rad: float, pitch_rad: float) -> None:
     direction = (-math.sin(0.2), 0.0, math.cos(0.2))
     message = sent(target(thrust_direction_ned=direction, course_rad=course_rad))
     yaw, pitch, roll = rotation(message).as_euler("ZYX")
@@ -81,7 +83,7 @@ def test_fields() -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_quaternion_is_unit_and_on_one_side(seed: int) -> None:
+def test_quaternion_has_unit_length_and_positive_w(seed: int) -> None:
     generator = np.random.default_rng(seed)
     direction = generator.normal(size=3) + np.array([0.0, 0.0, 3.0])
     direction *= generator.uniform(0.95, 1.05) / np.linalg.norm(direction)
@@ -146,7 +148,7 @@ def test_what_is_not_finite_is_refused(field: str, bad: float) -> None:
         ((0.0, 0.0, 2.0), "unit vector"),
     ],
 )
-def test_a_direction_that_is_none_is_refused(
+def test_a_direction_that_is_no_unit_vector_is_refused(
     direction: tuple[float, float, float], match: str
 ) -> None:
     with pytest.raises(ValueError, match=match):

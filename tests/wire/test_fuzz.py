@@ -1,4 +1,4 @@
-"""No bytes whatever may raise, fill the memory, or vanish uncounted."""
+"""No received bytes raise, exhaust the memory, or remain uncounted."""
 
 from __future__ import annotations
 
@@ -70,8 +70,8 @@ def test_any_bytes(portions: list[bytes], stream: bool, autopilot: int) -> None:
 
 @given(st.binary(max_size=255), st.sampled_from(sorted(mavlink.mavlink_map)), st.booleans())
 @settings(max_examples=500, deadline=None, derandomize=True)
-def test_any_payload_with_a_right_checksum(payload: bytes, message_id: int, px4: bool) -> None:
-    """Lengths that no sender would use, too: shorter is padded, longer is a later MAVLink."""
+def test_any_payload_with_a_correct_checksum(payload: bytes, message_id: int, px4: bool) -> None:
+    """Any length: a shorter payload is padded, a longer one belongs to a later MAVLink version."""
     session = pinned(Sender(), PX4 if px4 else ARDUPILOT)
     body = struct.pack(
         "<BBBBBBHB", len(payload), 0, 0, 7, 1, 1, message_id & 0xFFFF, message_id >> 16
@@ -89,7 +89,7 @@ WANTED = [0, 1, 22, 31, 32, 77, 111, 245, 253]
 
 
 @pytest.mark.parametrize("message_id", WANTED)
-def test_random_payloads_of_what_is_decoded(message_id: int) -> None:
+def test_random_payloads_of_decoded_messages(message_id: int) -> None:
     generator = np.random.default_rng(message_id)
     size = mavlink.mavlink_map[message_id].unpacker.size
     session = pinned(Sender(), PX4)
@@ -125,7 +125,7 @@ def test_damaged_frames(traffic: list[bytes], seed: int, stream: bool) -> None:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_good_frames_survive_garbage_between_them(traffic: list[bytes], seed: int) -> None:
-    """Even garbage that begins like a long frame swallows none of those behind it."""
+    """Also behind garbage that begins like a long frame."""
     generator = np.random.default_rng(seed)
     session = pinned(Sender(7), PX4, stream=True)
     data = b""
@@ -144,7 +144,7 @@ def test_good_frames_survive_garbage_between_them(traffic: list[bytes], seed: in
 @pytest.mark.parametrize(
     ("flags", "reason"), [(0x02, DropReason.INCOMPATIBLE), (0xFE, DropReason.INCOMPATIBLE)]
 )
-def test_later_incompatibilities_are_refused(flags: int, reason: DropReason) -> None:
+def test_unknown_incompatibility_flags_are_refused(flags: int, reason: DropReason) -> None:
     session = pinned(Sender())
     frame = bytearray(Sender().position(1000))
     frame[2] = flags
@@ -152,7 +152,7 @@ def test_later_incompatibilities_are_refused(flags: int, reason: DropReason) -> 
     assert session.counters.dropped[reason] == 1
 
 
-def test_signed_frames_are_framed_with_their_signature() -> None:
+def test_signed_frames_include_their_signature() -> None:
     link = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     link.signing.secret_key = bytes(32)
     link.signing.sign_outgoing = True
@@ -164,7 +164,7 @@ def test_signed_frames_are_framed_with_their_signature() -> None:
     assert len(reception.events) == 2
 
 
-def test_an_unknown_id_is_skipped_whole_only_before_another_frame() -> None:
+def test_a_frame_with_an_unknown_id_needs_another_frame_behind_it() -> None:
     good = Sender().position(1000)
     unknown = b"\xfd\x03\x00\x00\x00\x01\x01\xff\xff\xff" + b"abc" + b"\x00\x00"
     session = pinned(Sender())
@@ -173,7 +173,7 @@ def test_an_unknown_id_is_skipped_whole_only_before_another_frame() -> None:
     check(session)
 
 
-def test_garbage_like_an_unknown_frame_swallows_nothing() -> None:
+def test_garbage_like_an_unknown_frame_hides_no_frame() -> None:
     inner = Sender().position(1000)
     unknown = bytes([0xFD, len(inner), 0, 0, 0, 1, 1, 0xFF, 0xFF, 0xFF]) + inner + b"\0\0"
     outer = Sender().position(2000)
@@ -182,7 +182,7 @@ def test_garbage_like_an_unknown_frame_swallows_nothing() -> None:
     check(session)
 
 
-def test_a_flood_of_frame_beginnings_is_cheap_and_bounded() -> None:
+def test_many_start_bytes_use_bounded_time_and_memory() -> None:
     session = pinned(Sender(), stream=True)
     for _ in range(20):
         session.receive(b"\xfd" * 10_000, PEER, 0.0)
@@ -191,7 +191,7 @@ def test_a_flood_of_frame_beginnings_is_cheap_and_bounded() -> None:
     assert session.counters.bytes_skipped > 390_000
 
 
-def test_a_splitter_forgets_nothing_between_calls() -> None:
+def test_the_splitter_keeps_partial_frames_between_calls() -> None:
     counters = pinned(Sender()).counters
     splitter = FrameSplitter(True, counters)
     sender = Sender()

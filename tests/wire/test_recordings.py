@@ -1,4 +1,4 @@
-"""Real autopilots, recorded: what the session must find in them, in order and with numbers."""
+"""Recordings of real autopilots: the events that the session must find in them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ PEER = "recorded"
 
 
 class Replay:
-    """A recording gone through a session frame by frame."""
+    """A recording, received by a session frame by frame."""
 
     def __init__(self, path: Path) -> None:
         self.messages = list(recorded(path))
@@ -61,7 +61,7 @@ def replay(request: pytest.FixtureRequest) -> Replay:
     return found
 
 
-def test_every_byte_is_framed_and_no_frame_lost(replay: Replay) -> None:
+def test_every_byte_is_framed_and_no_frame_is_lost(replay: Replay) -> None:
     counters = replay.session.counters
     ours = [m for m in replay.messages if m.get_msgbuf()[6] == 191]
     assert counters.bytes_framed == sum(len(m.get_msgbuf()) for m in replay.messages)
@@ -123,7 +123,7 @@ def test_px4_modes(px4: Replay) -> None:
     ]
 
 
-def test_px4_acks_modes_twice(px4: Replay) -> None:
+def test_px4_acknowledges_modes_twice(px4: Replay) -> None:
     twice = [(176, "ACCEPTED")] * 2
     assert px4.acks() == [
         *twice,
@@ -139,7 +139,7 @@ def test_px4_acks_modes_twice(px4: Replay) -> None:
     ]
 
 
-def test_px4_texts_and_when_they_came(px4: Replay) -> None:
+def test_px4_texts_and_their_times(px4: Replay) -> None:
     texts = [(t, e.severity, e.text) for t, e in px4.events if isinstance(e, events.StatusText)]
     assert [(severity, text) for _, severity, text in texts] == [
         (6, "[logger] ./log/2026-11-20/22_33_27.ulg"),
@@ -198,7 +198,7 @@ def test_arducopter_modes(arducopter: Replay) -> None:
     ]
 
 
-def test_arducopter_acks_once_with_the_verdict(arducopter: Replay) -> None:
+def test_arducopter_acknowledges_once_with_the_result(arducopter: Replay) -> None:
     assert [ack for ack in arducopter.acks() if ack[0] not in (511, 512)] == [
         (400, "FAILED"),  # not initialised
         (176, "ACCEPTED"),
@@ -234,7 +234,7 @@ def test_arducopter_texts(arducopter: Replay) -> None:
     assert [text for text in texts if text in told] == told
 
 
-def test_arducopter_position_comes_late(arducopter: Replay) -> None:
+def test_arducopter_sends_no_position_for_40_s(arducopter: Replay) -> None:
     first_s = next(t for t, e in arducopter.events if isinstance(e, events.LocalPosition))
     assert first_s == pytest.approx(41.7, abs=0.2)
 

@@ -1,4 +1,4 @@
-"""Who is believed, what is dropped and why, and what is answered and asked unprompted."""
+"""The session: which sender is the vehicle, what is dropped and why, what is sent."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from vehicle_frames import ARDUPILOT, OFFBOARD, PEER, PX4, Sender, pinned, under
 
 from offboard.mavlink import events
 from offboard.mavlink.counters import DropReason
+from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Timesync
 from offboard.mavlink.session import Session, SessionSettings
-from offboard.mavlink.wire import Heartbeat, Timesync
 
 STRANGER = ("10.0.0.9", 4000)
 Triple = tuple[float, float, float]
@@ -60,16 +60,7 @@ def test_others_do_not_pin(
     assert dropped(session, reason) == 1
 
 
-def test_a_system_id_asked_for_is_waited_for() -> None:
-    session = Session(SessionSettings(system_id=7))
-    session.receive(Sender(1).heartbeat(), PEER, 0.0)
-    assert session.vehicle is None
-    assert dropped(session, DropReason.FOREIGN_SYSTEM) == 1
-    session.receive(Sender(7).heartbeat(), PEER, 0.0)
-    assert session.vehicle == events.VehicleFound(7, 1, "px4")
-
-
-def test_telemetry_before_the_first_heartbeat_waits() -> None:
+def test_telemetry_before_the_first_heartbeat_is_dropped() -> None:
     session = Session(SessionSettings())
     reception = session.receive(Sender().position(1000), PEER, 0.0)
     assert (reception.events, len(reception.frames)) == ((), 1)
@@ -91,16 +82,17 @@ def test_others_are_dropped_once_pinned() -> None:
 RESTARTED = (PEER[0], 50123)
 
 
-def test_a_router_that_restarts_goes_on_as_the_vehicle() -> None:
+def test_the_vehicle_may_move_to_another_port_after_a_silence() -> None:
     vehicle = Sender(1)
     session = pinned(vehicle)
     session.receive(vehicle.position(1000), PEER, 10.0)
     assert session.receive(vehicle.position(1020), RESTARTED, 10.5).events == ()
     assert dropped(session, DropReason.FOREIGN_PEER) == 1
-    moved, position = session.receive(vehicle.position(1040), RESTARTED, 10.51).events
-    assert moved == events.Moved(RESTARTED)
+    reception = session.receive(vehicle.position(1040), RESTARTED, 10.51)
+    moved, position = reception.events
+    assert moved == events.PeerChanged(RESTARTED)
     assert isinstance(position, events.LocalPosition)
-    assert b"\xfd" in b"".join(session.poll(10.52))[:1]  # a heartbeat at once
+    assert Heartbeat(6) in reception.messages  # at once, 0.51 s after the last one
     assert session.receive(vehicle.position(1060), PEER, 10.53).events == ()  # the old one is back
 
 
@@ -114,7 +106,7 @@ def test_a_router_that_restarts_goes_on_as_the_vehicle() -> None:
     ],
     ids=["beside the vehicle", "from another host", "another vehicle", "another component"],
 )
-def test_nobody_else_takes_the_vehicles_place(
+def test_no_other_sender_replaces_the_vehicle(
     sender: Sender, place: tuple[str, int], silence_s: float
 ) -> None:
     vehicle = Sender(1)
@@ -126,7 +118,7 @@ def test_nobody_else_takes_the_vehicles_place(
     assert len(session.receive(vehicle.position(1040), PEER, 99.0).events) == 1
 
 
-def test_our_own_frames_come_back_unheeded_and_unlogged() -> None:
+def test_our_own_frames_are_ignored_and_not_logged() -> None:
     session = pinned(Sender())
     reception = session.receive(session.encode(Heartbeat(18)), PEER, 0.0)
     assert (reception.frames, reception.events) == ((), ())
@@ -231,18 +223,18 @@ def test_a_satellite_fix() -> None:
     assert dropped(session, DropReason.IMPLAUSIBLE) == 1
 
 
-def test_where_the_local_frame_begins() -> None:
-    """GPS_GLOBAL_ORIGIN says it, HOME_POSITION by one point in both frames: 111.195 m a
-    thousandth of a degree of latitude on PX4's sphere."""
+def test_origin_of_the_local_frame() -> None:
+    """From GPS_GLOBAL_ORIGIN, or from HOME_POSITION, which gives one point in both frames: a
+    thousandth of a degree of latitude is 111.195 m on PX4's sphere."""
     vehicle = Sender()
     session = pinned(vehicle)
-    said = mavlink.MAVLink_gps_global_origin_message(473977435, 85455941, 489277)
-    (origin,) = session.receive(vehicle.frame(said), PEER, 0.0).events
-    assert origin == events.Origin(pytest.approx((47.3977435, 8.5455941, 489.277)), said=True)
+    message = mavlink.MAVLink_gps_global_origin_message(473977435, 85455941, 489277)
+    (origin,) = session.receive(vehicle.frame(message), PEER, 0.0).events
+    assert origin == events.Origin(pytest.approx((47.3977435, 8.5455941, 489.277)), reported=True)
     place = (473987435, 85455941, 491277)
     home = mavlink.MAVLink_home_position_message(*place, 111.195, 0.0, -2.0, LEVEL, 0.0, 0.0, 0.0)
     (origin,) = session.receive(vehicle.frame(home), PEER, 0.0).events
-    assert not origin.said
+    assert not origin.reported
     assert origin.place == pytest.approx((47.3977435, 8.5455941, 489.277), abs=1e-7)
     home = mavlink.MAVLink_home_position_message(*place, NAN, 0.0, -2.0, LEVEL, 0.0, 0.0, 0.0)
     assert session.receive(vehicle.frame(home), PEER, 0.0).events == ()
@@ -295,7 +287,7 @@ def test_landed(number: int, state: str) -> None:
     assert pinned(vehicle).receive(frame, PEER, 0.0).events == (events.Landed(state),)
 
 
-def test_an_unknown_mode_has_a_name_too() -> None:
+def test_name_of_an_unknown_mode() -> None:
     vehicle = Sender()
     session = pinned(vehicle)
     reception = session.receive(vehicle.heartbeat(custom_mode=0x12345678), PEER, 0.0)
@@ -314,7 +306,7 @@ def times(session: Session, *frames: bytes) -> list[float]:
     return found
 
 
-def test_late_and_double_messages_are_stale_each_kind_for_itself() -> None:
+def test_old_and_duplicate_messages_are_stale_per_message_id() -> None:
     vehicle = Sender()
     session = pinned(vehicle)
     frames = [
@@ -333,13 +325,13 @@ def test_a_jump_back_is_a_reboot() -> None:
     vehicle = Sender()
     session = pinned(vehicle)
     times(session, vehicle.position(60000), vehicle.attitude(60000))
-    assert len(session.poll(0.0)) > 4
     assert session.poll(0.0) == ()
     reception = session.receive(vehicle.position(500), PEER, 0.0)
-    assert reception.events[0] == events.Reset(0.5)
+    assert reception.events[0] == events.Rebooted(0.5)
     assert isinstance(reception.events[1], events.LocalPosition)
+    assert len(reception.messages) > 4  # the intervals are requested again
     assert times(session, vehicle.attitude(510), vehicle.position(510)) == [0.51, 0.51]
-    assert len(session.poll(0.0)) > 4  # the intervals are asked for again
+    assert session.poll(0.0) == ()
 
 
 def test_link_loss_is_counted_from_sequence_numbers() -> None:
@@ -394,7 +386,7 @@ def test_two_texts_interleaved() -> None:
     assert texts(session, *frames) == ["b" * 50 + "B", "a" * 50 + "A"]
 
 
-def test_a_lost_chunk_leaves_a_mark_after_a_second() -> None:
+def test_a_missing_chunk_is_marked_after_a_second() -> None:
     vehicle = Sender()
     session = pinned(vehicle)
     first, last = vehicle.text(CHUNKS[0], 3, 0), vehicle.text(CHUNKS[2], 3, 2)
@@ -405,7 +397,7 @@ def test_a_lost_chunk_leaves_a_mark_after_a_second() -> None:
     assert texts(session, vehicle.text(b"other"), now_s=1.1) == [mark, "other"]
 
 
-def test_unfinished_texts_do_not_pile_up() -> None:
+def test_the_number_of_incomplete_texts_is_limited() -> None:
     vehicle = Sender()
     session = pinned(vehicle)
     frames = [vehicle.text(b"x" * 50, text_id, 0) for text_id in range(1, 101)]
@@ -428,22 +420,23 @@ def test_texts_are_printable(data: bytes, text: str) -> None:
     assert texts(pinned(vehicle), vehicle.text(data)) == [text]
 
 
-# --- what is sent unprompted ---
+# --- what is sent ---
 
 
-def test_timesync_is_answered_after_the_events_of_its_datagram() -> None:
+def test_timesync_reply_is_the_last_message() -> None:
     vehicle = Sender()
     session = pinned(vehicle)
     request = vehicle.frame(mavlink.MAVLink_timesync_message(0, 123_456_789_012))
     reception = session.receive(vehicle.position(1000) + request, PEER, 2.5)
     assert len(reception.events) == 1
     assert len(reception.frames) == 2
-    (reply,) = (understood(session.encode(reply)) for reply in reception.replies)
+    assert isinstance(reception.messages[0], Heartbeat)
+    reply = understood(session.encode(reception.messages[-1]))
     assert (reply.tc1, reply.ts1) == (2_500_000_000, 123_456_789_012)
     answer = vehicle.frame(mavlink.MAVLink_timesync_message(1, 2))
     reception = session.receive(answer, PEER, 2.5)
-    assert reception.replies == ()
-    assert reception.events == (events.TimeAnswer(asked_ns=2, vehicle_ns=1),)
+    assert reception.messages == ()
+    assert reception.events == (events.TimesyncReply(request_ns=2, vehicle_ns=1),)
     question = understood(session.encode(Timesync(0, 77)))
     assert (question.tc1, question.ts1) == (0, 77)
 
@@ -451,63 +444,81 @@ def test_timesync_is_answered_after_the_events_of_its_datagram() -> None:
 def test_timesync_is_answered_before_the_first_heartbeat() -> None:
     session = Session(SessionSettings())
     request = Sender(7).frame(mavlink.MAVLink_timesync_message(0, 5))
-    (reply,) = session.receive(request, PEER, 0.0).replies
+    (reply,) = session.receive(request, PEER, 0.0).messages
     answer = understood(session.encode(reply))
     assert answer.ts1 == 5
     assert answer.tc1 != 0
     ground_station = Sender(255, 190).frame(mavlink.MAVLink_timesync_message(0, 5))
-    assert session.receive(ground_station, PEER, 1.0).replies == ()
+    assert session.receive(ground_station, PEER, 1.0).messages == ()
 
 
-def kinds(frames: tuple[bytes, ...]) -> list[str]:
-    return [understood(frame).get_type() for frame in frames]
-
-
-def test_nothing_is_said_into_the_void_unless_asked() -> None:
+def test_nothing_is_sent_before_a_vehicle_is_found_unless_set() -> None:
     assert Session(SessionSettings()).poll(0.0) == ()
-    assert kinds(Session(SessionSettings(speaks_first=True)).poll(0.0)) == ["HEARTBEAT"]
+    assert Session(SessionSettings(sends_first=True)).poll(0.0) == (Heartbeat(18),)
     session = Session(SessionSettings())
-    session.receive(Sender(255, 190).heartbeat(8, vehicle_type=6), PEER, 0.0)
+    frame = Sender(255, 190).heartbeat(8, vehicle_type=6)
+    assert session.receive(frame, PEER, 0.0).messages == ()
     assert session.poll(0.0) == ()
 
 
+def beats(messages: tuple[Outgoing, ...]) -> list[int]:
+    """Types of the heartbeats."""
+    return [message.vehicle_type for message in messages if isinstance(message, Heartbeat)]
+
+
 @pytest.mark.parametrize(("autopilot", "vehicle_type"), [(PX4, 6), (ARDUPILOT, 18)])
-def test_heartbeat_of_the_type_the_autopilot_wants(autopilot: int, vehicle_type: int) -> None:
-    session = pinned(Sender(), autopilot, requests_intervals=False)
-    beats = [(0.1 * i, frame) for i in range(100) for frame in session.poll(0.1 * i)]
-    assert [understood(frame).type for _, frame in beats] == [vehicle_type] * 10
-    assert [t for t, _ in beats] == pytest.approx(list(range(10)))
+def test_heartbeats_at_1_hz_of_the_type_the_autopilot_needs(
+    autopilot: int, vehicle_type: int
+) -> None:
+    session = Session(SessionSettings())
+    reception = session.receive(Sender().heartbeat(autopilot), PEER, 0.0)
+    sent = [(0.0, kind) for kind in beats(reception.messages)]
+    sent += [(0.1 * i, kind) for i in range(100) for kind in beats(session.poll(0.1 * i))]
+    assert [kind for _, kind in sent] == [vehicle_type] * 10
+    assert [t for t, _ in sent] == pytest.approx(list(range(10)))
+    assert understood(session.encode(Heartbeat(vehicle_type))).type == vehicle_type
 
 
 def test_heartbeat_of_the_right_type_at_once_when_found() -> None:
-    session = Session(SessionSettings(speaks_first=True, requests_intervals=False))
-    (before,) = session.poll(0.0)
-    session.receive(Sender().heartbeat(PX4), PEER, 0.1)
-    (after,) = session.poll(0.1)
-    assert (understood(before).type, understood(after).type) == (18, 6)
+    session = Session(SessionSettings(sends_first=True))
+    assert beats(session.poll(0.0)) == [18]
+    assert beats(session.receive(Sender().heartbeat(PX4), PEER, 0.1).messages) == [6]
 
 
 def test_heartbeat_follows_vehicle_time_when_that_is_faster() -> None:
     vehicle = Sender()
-    session = pinned(vehicle, requests_intervals=False)
-    beats = 0
-    for tick in range(1001):  # ten seconds of the vehicle in 0.2 of ours
-        session.receive(vehicle.position(10 * tick + 10), PEER, 0.0002 * tick)
-        beats += len(session.poll(0.0002 * tick))
-    assert beats == 11
+    session = pinned(vehicle)
+    sent = 1  # when the vehicle was found
+    for tick in range(1001):  # ten seconds of vehicle time in 0.2 s of host time
+        reception = session.receive(vehicle.position(10 * tick + 10), PEER, 0.0002 * tick)
+        sent += len(beats(reception.messages)) + len(beats(session.poll(0.0002 * tick)))
+    assert sent == 11
 
 
-def test_intervals_are_asked_for_at_once() -> None:
-    session = pinned(Sender())
-    first = [understood(frame) for frame in session.poll(0.0)]
-    assert [m.get_type() for m in first] == ["HEARTBEAT"] + ["COMMAND_LONG"] * 5
-    asked = {int(m.param1): m.param2 for m in first[1:]}
-    assert all(m.command == 511 for m in first[1:])
-    assert asked == {31: 10000.0, 32: 10000.0, 245: 200000.0, 1: 500000.0, 115: 20000.0}
+def test_in_lockstep_host_time_changes_nothing() -> None:
+    """Two sessions with the same datagrams at other host times, polled in between or not."""
+    vehicle = Sender()
+    datagrams = [vehicle.heartbeat(), *(vehicle.position(20 * tick) for tick in range(1, 300))]
+    plain, polled = (Session(SessionSettings(lockstep=True)) for _ in range(2))
+    for tick, datagram in enumerate(datagrams):
+        expected = plain.receive(datagram, PEER, 0.001 * tick)
+        assert polled.receive(datagram, PEER, 7.0 * tick) == expected
+        assert polled.poll(7.0 * tick + 6.0) == ()
+    assert polled.link_time_s == plain.link_time_s
+
+
+def test_intervals_are_requested_at_once() -> None:
+    session = Session(SessionSettings())
+    heartbeat, *requests = session.receive(Sender().heartbeat(), PEER, 0.0).messages
+    assert heartbeat == Heartbeat(6)
+    assert all(isinstance(m, CommandLong) and m.command == 511 for m in requests)
+    sent = [understood(session.encode(request)) for request in requests]
+    intervals_us = {int(m.param1): m.param2 for m in sent}
+    assert intervals_us == {31: 10000.0, 32: 10000.0, 245: 200000.0, 1: 500000.0, 115: 20000.0}
     assert session.poll(0.01) == ()
 
 
-def test_mavlink_1_frames_are_understood() -> None:
+def test_mavlink_1_frames_are_decoded() -> None:
     vehicle = Sender()
     session = pinned(vehicle)
     message = mavlink.MAVLink_attitude_quaternion_message(1000, *LEVEL, 0.1, 0.2, 0.3)

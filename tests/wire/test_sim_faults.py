@@ -255,9 +255,9 @@ def test_a_flight_with_every_kind_of_fault_is_reproducible() -> None:
 
 BAD = {
     "faults: [{fault: lnk}]": "faults.0.fault: 'lnk' is not one of battery_drop",
-    "faults: [{fault: link, loss: 1.5}]": "faults.0.loss: 1.5 is out of range",
+    "faults: [{fault: link, loss: 1.5}]": "faults.0.loss: 1.5 should be less than or equal to 1",
     "faults: [{fault: link, speed: 1}]": "faults.0.speed is not a known key",
-    "faults: [{fault: reboot, after: never}]": "'never' is not one of boot, armed, took_off",
+    "faults: [{fault: reboot, after: never}]": "'never' should be 'boot', 'armed', 'took_off'",
     "faults: [{fault: silent_message, message: NOPE}]": "'NOPE' is not a MAVLink message",
     "faults: [{fault: mass_change}]": "faults.0.mass_scale is missing",
 }
@@ -274,7 +274,5 @@ def test_an_invalid_fault_is_refused_with_one_sentence(text: str, tmp_path: Path
 
 
 @pytest.mark.parametrize("name", shipped.names("scenarios"))
-def test_every_shipped_scenario_is_valid_and_described(name: str) -> None:
-    scenario = config.scenario(name)
-    assert scenario.name == name
-    assert scenario.description
+def test_every_shipped_scenario_is_valid(name: str) -> None:
+    assert config.scenario(name).name == name

@@ -1,4 +1,4 @@
-"""Frames as an autopilot would send them, made by pymavlink: an encoder that is not ours."""
+"""Frames of an autopilot, encoded by pymavlink as an independent encoder."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Sender:
 
 
 def pinned(vehicle: Sender, autopilot: int = PX4, **settings: Any) -> Session:
-    """A session that has just heard `vehicle`."""
+    """A session that has received the first heartbeat of `vehicle`."""
     session = Session(SessionSettings(**settings))
     reception = session.receive(vehicle.heartbeat(autopilot), PEER, 0.0)
     assert len(reception.events) == 2
@@ -63,7 +63,7 @@ def pinned(vehicle: Sender, autopilot: int = PX4, **settings: Any) -> Session:
 
 
 def understood(frame: bytes) -> Any:
-    """What pymavlink, standing in for the autopilot, reads in one of our frames."""
+    """One of our frames, decoded by pymavlink as the autopilot would."""
     return mavlink.MAVLink(None).decode(bytearray(frame))
 
 

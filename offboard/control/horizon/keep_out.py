@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
+from offboard.compiled import kernel
 from offboard.documents.parameters import Parameters
-from offboard.model.kernel import kernel
 from offboard.reference.base import Reference
 
 Array = NDArray[np.float64]
@@ -109,8 +109,14 @@ def pack(volumes: Sequence[Sphere | Cylinder | Box]) -> Array:
 
 
 @kernel
-def distance(  # type: ignore[no-untyped-def]
-    volume, centre_north, centre_east, centre_down, north, east, down
+def distance(
+    volume: Any,
+    centre_north: float,
+    centre_east: float,
+    centre_down: float,
+    north: float,
+    east: float,
+    down: float,
 ) -> float:
     """Metres from the surface of a packed volume whose centre is there, negative inside."""
     off_n = abs(north - centre_north)

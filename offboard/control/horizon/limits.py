@@ -5,10 +5,16 @@ volumes to keep out of. Knows no motion: states are given.
 from __future__ import annotations
 
 import math
+from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.compiled import array, entry, kernel
 from offboard.control.horizon.keep_out import CENTRE, VELOCITY, distance
 from offboard.control.horizon.plant import PLANT, SCENE, B, P, V, W, Z
-from offboard.model.kernel import array, entry, kernel
+
+Array = NDArray[np.float64]
 
 # Limits of a hold; every volume is two, at the middle and at the end.
 SPEED, TILT, FLOOR, VOLUME = range(4)
@@ -18,46 +24,42 @@ SLOPE, CURVATURE = 20.0, 200.0
 
 
 @kernel
-def penalise(  # type: ignore[no-untyped-def]
-    plant, scene, volumes, k, before, after, over, costs
-) -> None:
-    """What hold k pays for the limits that it exceeds; `over` (particles,) is scratch."""
-    for limit in range(limits_of(volumes)):
-        if _applies(plant, volumes, limit):
-            _exceed(plant, scene, volumes, k, limit, before, after, over)
-            share = share_of(plant.hold_s, limit)
-            for n in range(costs.shape[0]):
-                costs[n] += share * _excess(over[n])
+def penalise(hold_s: float, limit: int, over: Array, costs: Array) -> None:
+    """Add what plans pay in a hold for exceeding a limit by `over` (particles,)."""
+    share = share_of(hold_s, limit)
+    for n in range(costs.shape[0]):
+        costs[n] += share * _excess(over[n])
 
 
 @entry(PLANT, SCENE, array(2), array(3), array(2))
-def excesses(plant, scene, volumes, states, over) -> int:  # type: ignore[no-untyped-def]
+def excesses(plants: Any, scenes: Any, volumes: Array, states: Array, over: Array) -> None:
     """By how much plans exceed each limit in each hold, negative within, -inf where there is none:
     over (N * limits, particles) of states (N + 1, STATE_SIZE, particles)."""
+    plant, scene = plants[0], scenes[0]
     count = limits_of(volumes)
     for k in range(states.shape[0] - 1):
         for limit in range(count):
             row = over[k * count + limit]
             row[:] = -math.inf
-            if _applies(plant, volumes, limit):
-                _exceed(plant, scene, volumes, k, limit, states[k], states[k + 1], row)
-    return 0
+            if applies(plant, volumes, limit):
+                exceed(plant, scene, volumes, k, limit, states[k], states[k + 1], row)
 
 
 @kernel
-def limits_of(volumes) -> int:  # type: ignore[no-untyped-def]
+def limits_of(volumes: Array) -> int:
     """Limits of each hold: speed, tilt, floor, and every volume at its middle and its end."""
     return int(VOLUME + 2 * volumes.shape[0])
 
 
 @kernel
-def share_of(hold_s, limit) -> float:  # type: ignore[no-untyped-def]
+def share_of(hold_s: float, limit: int) -> float:
     """For how many seconds of a hold an excess is paid."""
     return float(hold_s * (0.5 if limit >= VOLUME else 1.0))
 
 
 @kernel
-def _applies(plant, volumes, limit) -> bool:  # type: ignore[no-untyped-def]
+def applies(plant: Any, volumes: Array, limit: int) -> bool:
+    """Whether the plant and the situation have this limit."""
     if limit == SPEED:
         return bool(plant.speed_most_mps < math.inf)
     if limit == TILT:
@@ -66,8 +68,15 @@ def _applies(plant, volumes, limit) -> bool:  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _exceed(  # type: ignore[no-untyped-def]
-    plant, scene, volumes, k, limit, before, after, over
+def exceed(
+    plant: Any,
+    scene: Any,
+    volumes: Array,
+    k: int,
+    limit: int,
+    before: Array,
+    after: Array,
+    over: Array,
 ) -> None:
     """By how much (particles,) hold k exceeds a limit."""
     end = 2 * k + 2
@@ -92,7 +101,9 @@ def _exceed(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _intrude(plant, scene, volume, node, before, after, over) -> None:  # type: ignore[no-untyped-def]
+def _intrude(
+    plant: Any, scene: Any, volume: Array, node: int, before: Array, after: Array, over: Array
+) -> None:
     """How deep (particles,) within the clearance of a volume at the middle or end of a hold."""
     hold = plant.hold_s
     centre_n = volume[CENTRE] + 0.5 * hold * node * volume[VELOCITY]

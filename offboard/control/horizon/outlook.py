@@ -1,8 +1,8 @@
-"""What the reference asks over N decisions, and the deviations and bounds that follow from it.
+"""What the reference asks for over N decisions, and the bounds of the deviations from it.
 
-Everything beyond is in deviations from these values, with the attitude loop's own response taken
-out by the feed-forward: a plan of zeros flies the reference. Lateral axes live on the clock of the
-tilt, the vertical one on that of the thrust. Knows no search and no keep-out volume.
+Plans are deviations from these values, and the feed-forward compensates the response of the
+attitude loop: a plan of zeros flies the reference. The lateral axes are sampled at the times when
+the tilt acts, the vertical one when the thrust acts. Knows no search and no keep-out volume.
 """
 
 from __future__ import annotations
@@ -12,11 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.laws.tracking import heave_of
+from offboard.control.base import Situation
 from offboard.control.riccati import held_lead
-from offboard.model.predicted_state import PredictedState
-from offboard.model.vehicle import Vehicle
-from offboard.reference.base import Reference
+from offboard.control.tracking import Task, Tracking, heave_of
 from offboard.reference.flatness import flat_state
 
 Array = NDArray[np.float64]
@@ -26,12 +24,12 @@ Array = NDArray[np.float64]
 class Outlook:
     """The reference at the 2 N + 1 nodes (start, middle, ..., end) of N holds, NED, SI.
 
-    positions_ned_m, velocities_ned_mps, directions_ned (2 N + 1, 3), each axis at its own clock;
-    thrusts_tilt_mps2 and thrusts_heave_mps2 (2 N + 1,) T at the clocks of tilt and thrust,
-    uprights_heave (2 N + 1,) b_z at that of the thrust. feedforward (N, 3): b_c north and east and
-    the vertical thrust, led and half a hold late. A steady vertical disturbance is nearly always a
-    wrong thrust or mass, so the tilted thrust pushes sideways with `thrust_share` of what is
-    believed: g of it holds the weight.
+    positions_ned_m, velocities_ned_mps, directions_ned (2 N + 1, 3), each axis at its own times;
+    thrusts_tilt_mps2 and thrusts_heave_mps2 (2 N + 1,): T when tilt and when thrust act;
+    uprights_heave (2 N + 1,): b_z when the thrust acts. feedforward (N, 3): b_c north and east and
+    the vertical thrust in the middle of each hold, led. A steady vertical disturbance is nearly
+    always a wrong hover thrust or mass; therefore the lateral force of the tilted thrust is taken
+    as `thrust_share` of the modelled one.
     """
 
     positions_ned_m: Array
@@ -48,13 +46,12 @@ class Outlook:
         return len(self.feedforward)
 
 
-def look_ahead(
-    vehicle: Vehicle, reference: Reference, state: PredictedState, period_s: float, steps: int
-) -> Outlook:
-    """The outlook from the moments at which a command sent now takes effect."""
+def look_ahead(tracking: Tracking, situation: Situation, steps: int) -> Outlook:
+    """The outlook over `steps` holds, from the times at which a command sent now takes effect."""
+    vehicle, state, period_s = tracking.vehicle, situation.state, tracking.period_s
     nodes_s = 0.5 * period_s * np.arange(2 * steps + 1)
     times = np.concatenate((state.time_s + nodes_s, heave_of(state).time_s + nodes_s))
-    sample = reference.sample(times)
+    sample = situation.reference.sample(times)
     flat = flat_state(
         sample, vehicle.gravity_mps2, vehicle.drag_per_mass_ps, state.disturbance_ned_mps2
     )
@@ -89,29 +86,24 @@ def look_ahead(
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """Of the deviations [b_c north, b_c east, T b_z] of each step from the feed-forward, (N, 3)."""
+    """Bounds (N, 3) of the deviations [b_c north, b_c east, T b_z] of each step from the
+    feed-forward."""
 
     lower: Array
     upper: Array
 
 
-def bounds(
-    outlook: Outlook,
-    upright: float,
-    tilt_limit: float,
-    feedback_limit: float,
-    thrust_mps2: tuple[float, float],
-) -> Bounds:
-    """As the box of one decision has them, at every step: `thrust_mps2` is (least, most) and
-    `upright` b_z as predicted, which the first thrust is divided by."""
-    nominal = outlook.feedforward
+def bounds(outlook: Outlook, task: Task, tracking: Tracking) -> Bounds:
+    """The bounds of `task`, at every step."""
+    nominal, limit = outlook.feedforward, tracking.tilt_limit
+    reach = tracking.settings.feedback_limit
     lower, upper = np.empty_like(nominal), np.empty_like(nominal)
     tilt = nominal[:, :2]
-    centre = np.clip(tilt, -tilt_limit, tilt_limit)
-    lower[:, :2] = np.maximum(centre - feedback_limit, -tilt_limit) - tilt
-    upper[:, :2] = np.minimum(centre + feedback_limit, tilt_limit) - tilt
+    centre = np.clip(tilt, -limit, limit)
+    lower[:, :2] = np.maximum(centre - reach, -limit) - tilt
+    upper[:, :2] = np.minimum(centre + reach, limit) - tilt
     uprights = outlook.uprights_heave[0:-1:2].copy()
-    uprights[0] = upright
-    lower[:, 2] = thrust_mps2[0] * uprights - nominal[:, 2]
-    upper[:, 2] = thrust_mps2[1] * uprights - nominal[:, 2]
+    uprights[0] = task.upright
+    lower[:, 2] = task.problem.lower[0] * uprights - nominal[:, 2]
+    upper[:, 2] = task.problem.upper[0] * uprights - nominal[:, 2]
     return Bounds(lower, upper)

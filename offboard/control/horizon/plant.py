@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from offboard.control.horizon.outlook import Bounds, Outlook
 from offboard.control.riccati import CostToGo
+from offboard.control.tracking import Task, Tracking
 from offboard.model.axes import SHORTEST_THRUST_LAG_S, upright
-from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
@@ -63,18 +63,15 @@ PLANT = np.dtype(
 
 
 def plant_of(
-    vehicle: Vehicle,
-    lateral: CostToGo,
-    vertical: CostToGo,
-    period_s: float,
+    tracking: Tracking,
     *,
     half: CostToGo,
     nonlinear: bool,
-    thrust_mps2: tuple[float, float],
     speed_limit_mps: float,
     clearance_m: float,
 ) -> NDArray[np.void]:
     """One `PLANT`; `half` is the lateral model sampled at half the period."""
+    vehicle, period_s = tracking.vehicle, tracking.period_s
     lag_s = max(vehicle.thrust_lag_s, SHORTEST_THRUST_LAG_S)
     constants = {
         "tilt_half": np.column_stack((half.transition[2:, 2:], half.input_map[2:, 0])),
@@ -83,14 +80,15 @@ def plant_of(
         "gravity_mps2": vehicle.gravity_mps2,
         "lag_half": math.exp(-0.5 * period_s / lag_s),
         "lag_full": math.exp(-period_s / lag_s),
-        "thrust_least_mps2": thrust_mps2[0],
-        "thrust_most_mps2": thrust_mps2[1],
+        "thrust_least_mps2": tracking.settings.thrust_floor * vehicle.gravity_mps2,
+        "thrust_most_mps2": vehicle.thrust_max_mps2,
         "tilt_most": math.sin(vehicle.tilt_max_rad),
         "speed_most_mps": speed_limit_mps,
         "clearance_m": clearance_m,
     }
     constants |= _pushes(vehicle.drag_per_mass_ps, period_s)
-    constants |= _axis("lateral", lateral) | _axis("vertical", vertical)
+    constants |= _axis("lateral", tracking.lateral)
+    constants |= _axis("vertical", tracking.vertical)
     plant = np.zeros(1, PLANT)
     for name, value in constants.items():
         plant[name] = value
@@ -188,11 +186,11 @@ def scene_of(outlook: Outlook, within: Bounds, volumes: Array, floor_down_m: flo
     )
 
 
-def start_state(lateral: Array, vertical: Array, scene: Scene) -> Array:
-    """(STATE_SIZE,) of the deviations lateral (4, 2) and vertical (3,) of `tracking.errors`."""
+def start_state(task: Task, scene: Scene) -> Array:
+    """The state (STATE_SIZE,) of a task's deviations."""
     start = np.empty(STATE_SIZE)
-    start[P:Z] = lateral.reshape(-1)
-    start[Z:T] = vertical
+    start[P:Z] = task.lateral.reshape(-1)
+    start[Z:T] = task.vertical
     b_n, b_e = scene.directions[0, :2]
     leant = upright(b_n + start[B], b_e + start[B + 1]) - upright(b_n, b_e)
     force = scene.thrusts_heave[0] * scene.uprights[0] + start[F]

@@ -1,7 +1,7 @@
-"""The exact problem over N decisions where the plant is linear: one box quadratic, condensed.
+"""The problem over N decisions for the linear plant: one quadratic in all inputs (condensed).
 
-Inputs are the deviations of `Outlook`, in the order [north, east, down] x N. The axes do not
-couple. Knows no solver.
+Inputs are deviations from the `Outlook`: N of b_c north, N of b_c east, N of vertical thrust. The
+axes do not couple. Knows no solver.
 """
 
 from __future__ import annotations
@@ -13,35 +13,32 @@ from scipy.linalg import block_diag
 from offboard.control.cost import BoxQuadratic
 from offboard.control.horizon.outlook import Bounds
 from offboard.control.riccati import CostToGo
+from offboard.control.tracking import Task, Tracking
 
 Array = NDArray[np.float64]
 
 
 class HorizonQuadratic:
-    """J of N held inputs and the cost-to-go behind them, for given gains; `problem` fills in the
-    state."""
+    """J of N held inputs and the cost-to-go that follows them, for the gains of `tracking`;
+    `problem` fills in the state."""
 
-    def __init__(self, lateral: CostToGo, vertical: CostToGo, steps: int) -> None:
+    def __init__(self, tracking: Tracking, steps: int) -> None:
         self.steps = steps
-        self._lateral = _condense(lateral, steps)
-        self._vertical = _condense(vertical, steps)
-        self.hessian: Array = block_diag(self._lateral[0], self._lateral[0], self._vertical[0])
+        lateral = _condense(tracking.lateral, steps)
+        self._axes = (lateral, lateral, _condense(tracking.vertical, steps))
+        self._hessian: Array = block_diag(*(axis[0] for axis in self._axes))
 
-    def problem(self, lateral: Array, vertical: Array, within: Bounds) -> BoxQuadratic:
-        """From the deviations lateral (4, 2) and vertical (3,) of `tracking.errors`."""
-        starts = (lateral[:, 0], lateral[:, 1], vertical)
-        models = (self._lateral, self._lateral, self._vertical)
-        gradient = np.concatenate(
-            [start @ model[1] for start, model in zip(starts, models, strict=True)]
-        )
-        rest = sum(
-            float(start @ model[2] @ start) for start, model in zip(starts, models, strict=True)
-        )
+    def problem(self, task: Task, within: Bounds) -> BoxQuadratic:
+        """The quadratic in (3 N,) from the deviations of `task`."""
+        starts = (task.lateral[:, 0], task.lateral[:, 1], task.vertical)
+        axes = list(zip(starts, self._axes, strict=True))
+        gradient = np.concatenate([start @ axis[1] for start, axis in axes])
+        rest = sum(float(start @ axis[2] @ start) for start, axis in axes)
         lower, upper = within.lower.T.ravel(), within.upper.T.ravel()
-        return BoxQuadratic(self.hessian, gradient, rest, lower, upper)
+        return BoxQuadratic(self._hessian, gradient, rest, lower, upper)
 
     def plan(self, stacked: Array) -> Array:
-        """Inputs (N, 3) of the problem's (3 N,)."""
+        """Inputs (3 N,) of the problem as (N, 3), one row per step."""
         return stacked.reshape(3, self.steps).T
 
 

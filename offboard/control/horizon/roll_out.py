@@ -9,7 +9,13 @@ is remembered.
 
 from __future__ import annotations
 
-from offboard.control.horizon.limits import penalise
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.compiled import array, entry, kernel
+from offboard.control.horizon.limits import applies, exceed, limits_of, penalise
 from offboard.control.horizon.plant import (
     INPUTS,
     PLANT,
@@ -25,7 +31,8 @@ from offboard.control.horizon.plant import (
     Z,
 )
 from offboard.model.axes import upright
-from offboard.model.kernel import array, entry, kernel
+
+Array = NDArray[np.float64]
 
 
 @kernel
@@ -37,10 +44,20 @@ def _clip(value: float, low: float, high: float) -> float:
     PLANT, SCENE, array(2), array(2), array(2), float, array(2), array(3),
     array(3), array(3), array(1), array(1),
 )  # fmt: skip
-def roll_out(  # type: ignore[no-untyped-def]
-    plant, scene, volumes, base_inputs, base_states, feedback, weights, knots,
-    states, inputs, over, costs,
-) -> int:  # fmt: skip
+def roll_out(
+    plants: Any,
+    scenes: Any,
+    volumes: Array,
+    base_inputs: Array,
+    base_states: Array,
+    feedback: float,
+    weights: Array,
+    knots: Array,
+    states: Array,
+    inputs: Array,
+    over: Array,
+    costs: Array,
+) -> None:
     """Costs (particles,) of plans, and their states (N + 1, STATE_SIZE, particles) and inputs
     (N, 3, particles); `over` (particles,) is scratch.
 
@@ -48,6 +65,7 @@ def roll_out(  # type: ignore[no-untyped-def]
     state is from base_states (N + 1, STATE_SIZE) + weights (N, M) @ knots (M, 3, particles),
     clipped to the bounds.
     """
+    plant, scene = plants[0], scenes[0]
     for row in range(STATE_SIZE):
         states[0, row, :] = scene.start[row]
     costs[:] = 0.0
@@ -56,14 +74,18 @@ def roll_out(  # type: ignore[no-untyped-def]
             plant, scene.lower[k], scene.upper[k], base_inputs[k], base_states[k], feedback,
             weights[k], knots, states[k], inputs[k],
         )  # fmt: skip
-        _hold(plant, scene, k, states[k], inputs[k], states[k + 1], costs)
-        penalise(plant, scene, volumes, k, states[k], states[k + 1], over, costs)
+        _hold(plant, states[k], inputs[k], states[k + 1], costs)
+        if plant.nonlinear != 0:
+            _bend(plant, scene, k, states[k], inputs[k], states[k + 1])
+        for limit in range(limits_of(volumes)):
+            if applies(plant, volumes, limit):
+                exceed(plant, scene, volumes, k, limit, states[k], states[k + 1], over)
+                penalise(plant.hold_s, limit, over, costs)
     _conclude(plant, states[inputs.shape[0]], costs)
-    return 0
 
 
 @kernel
-def _conclude(plant, last, costs) -> None:  # type: ignore[no-untyped-def]
+def _conclude(plant: Any, last: Array, costs: Array) -> None:
     """Add what remains to be paid behind the last hold."""
     q, s = plant.lateral_terminal, plant.vertical_terminal
     for n in range(costs.shape[0]):
@@ -79,8 +101,17 @@ def _conclude(plant, last, costs) -> None:  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _choose(  # type: ignore[no-untyped-def]
-    plant, lower, upper, base_input, base_state, feedback, weights, knots, state, chosen
+def _choose(
+    plant: Any,
+    lower: Array,
+    upper: Array,
+    base_input: Array,
+    base_state: Array,
+    feedback: float,
+    weights: Array,
+    knots: Array,
+    state: Array,
+    chosen: Array,
 ) -> None:
     """The inputs of one step, (3, particles)."""
     particles = chosen.shape[1]
@@ -107,8 +138,8 @@ def _choose(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _hold(plant, scene, k, before, chosen, after, costs) -> None:  # type: ignore[no-untyped-def]
-    """One hold of every particle: its cost, then where it leads."""
+def _hold(plant: Any, before: Array, chosen: Array, after: Array, costs: Array) -> None:
+    """One hold of every particle: its cost, then where it leads by the linear model."""
     a, b = plant.lateral_transition, plant.lateral_input
     q = plant.lateral_stage
     for axis in range(2):
@@ -140,12 +171,10 @@ def _hold(plant, scene, k, before, chosen, after, costs) -> None:  # type: ignor
         after[W, n] = h[1, 1] * w + h[1, 2] * f + g[1] * u
         after[F, n] = h[2, 2] * f + g[2] * u
         after[T, n] = 0.0
-    if plant.nonlinear != 0:
-        _bend(plant, scene, k, before, chosen, after)
 
 
 @kernel
-def _bend(plant, scene, k, before, chosen, after) -> None:  # type: ignore[no-untyped-def]
+def _bend(plant: Any, scene: Any, k: int, before: Array, chosen: Array, after: Array) -> None:
     """Add what T b does beyond the linear model: at start, middle and end of the hold."""
     tilt = plant.tilt_half
     g, share = plant.gravity_mps2, scene.thrust_share

@@ -1,13 +1,11 @@
-"""MPPI and the cross-entropy method over the same knots and roll-outs as the swarm: its peers.
+"""MPPI and the cross-entropy method over the same knots and roll-outs as the swarm.
 
-Both draw knots from a normal distribution about a mean that starts on the base plan, and answer
-with the mean. MPPI weighs all samples by exp(-cost / temperature), the cross-entropy method fits
-mean and deviation to the best of them.
+They are peers for comparison: for the same number of roll-outs, what does the swarm find that they
+do not? Both draw knots from a normal distribution about a mean that starts at the base plan, and
+answer with the mean.
 """
 
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,93 +16,74 @@ from offboard.documents.parameters import Parameters
 
 Array = NDArray[np.float64]
 
-LEAST_SD = 1e-3  # of the reach: what the cross-entropy method never falls below
+LEAST_SD = 1e-3  # of the reach: least standard deviation of the cross-entropy method
 
 
-class SamplingSettings(Parameters):
-    """`samples` x `iterations` roll-outs; `deviation` is the first standard deviation as a share
-    of the knots' reach, multiplied by `shrink` after each iteration (MPPI). `temperature` is a
-    share of the samples' cost spread, `elite` the share that the cross-entropy method keeps."""
+class _Sampling(Parameters):
+    """`samples` roll-outs in each of `iterations`. `deviation` is the first standard deviation as
+    a fraction of the reach of the knots."""
 
     samples: int = Field(default=40, ge=4, le=10_000)
     iterations: int = Field(default=70, ge=1, le=10_000)
     deviation: float = Field(default=0.3, gt=0, le=2)
+
+
+class MppiSampling(_Sampling):
+    """Model predictive path integral control (Williams et al. 2017).
+
+    The mean moves to the average of all samples weighted by exp(-cost / temperature).
+    `temperature` is a fraction of the mean cost above the best; the standard deviation is
+    multiplied by `shrink` after each iteration.
+    """
+
     shrink: float = Field(default=0.93, gt=0, le=1)
     temperature: float = Field(default=0.1, gt=0, le=10)
-    elite: float = Field(default=0.2, gt=0, le=1)
 
-
-@dataclass
-class _Draws:
-    """Samples about a moving mean; the first of them is the mean itself."""
-
-    evaluate: Evaluator
-    base: Plan
-    reach: Array
-    generator: np.random.Generator
-    count: int
-
-    def costs(self, mean: Array, sd: Array) -> tuple[Array, Array]:
-        """Knots (M, 3, n) within the reach, and their costs (n,), infinite where not finite."""
-        noise = self.generator.standard_normal((*self.reach.shape, self.count))
-        noise[:, :, 0] = 0.0
-        wide = self.reach[:, :, None]
-        knots = np.clip(mean[:, :, None] + sd[:, :, None] * noise, -wide, wide)
-        costs = self.evaluate.of_knots(self.base, knots)
-        return knots, np.where(np.isfinite(costs), costs, np.inf)
-
-    def conclude(self, mean: Array, sd: Array, iterations: int, cut_short: bool) -> Found:
-        """The mean as a plan."""
-        self.evaluate.of_knots(self.base, mean[:, :, None])
-        plan = self.evaluate.picked(1, 0)
-        return Found(plan, float(np.linalg.norm(sd)), iterations, cut_short)
-
-
-def mppi(
-    evaluate: Evaluator,
-    base: Plan,
-    reach: Array,
-    settings: SamplingSettings,
-    generator: np.random.Generator,
-    remaining_s: Remaining,
-) -> Found:
-    """Model predictive path integral control (Williams et al. 2017) about `base`."""
-    draws = _Draws(evaluate, base, reach, generator, settings.samples)
-    mean, sd = np.zeros_like(reach), settings.deviation * reach
-    done = 0
-    while done < settings.iterations:
-        knots, costs = draws.costs(mean, sd)
+    def update(self, knots: Array, costs: Array, sd: Array, reach: Array) -> tuple[Array, Array]:
+        """Mean and standard deviation (M, 3) of the next samples."""
         above = costs - costs.min()
         usable = above[np.isfinite(above)]
-        scale = settings.temperature * float(usable.mean()) if len(usable) else 0.0
+        scale = self.temperature * float(usable.mean()) if len(usable) else 0.0
         weights = np.exp(-above / scale) if scale > 0 else (above == 0).astype(np.float64)
-        mean = knots @ (weights / weights.sum())
-        sd = settings.shrink * sd
-        done += 1
-        if remaining_s is not None and remaining_s() <= 0:
-            break
-    return draws.conclude(mean, sd, done, done < settings.iterations)
+        return knots @ (weights / weights.sum()), self.shrink * sd
 
 
-def cem(
+class CemSampling(_Sampling):
+    """The cross-entropy method (Rubinstein 1999).
+
+    Mean and standard deviation are those of the best `elite`, a fraction of the samples.
+    """
+
+    elite: float = Field(default=0.2, gt=0, le=1)
+
+    def update(self, knots: Array, costs: Array, sd: Array, reach: Array) -> tuple[Array, Array]:
+        """Mean and standard deviation (M, 3) of the next samples."""
+        kept = max(2, round(self.elite * self.samples))
+        elite = knots[:, :, np.argsort(costs, kind="stable")[:kept]]
+        return elite.mean(axis=2), np.maximum(elite.std(axis=2), LEAST_SD * reach)
+
+
+def sample(
     evaluate: Evaluator,
     base: Plan,
     reach: Array,
-    settings: SamplingSettings,
+    settings: MppiSampling | CemSampling,
     generator: np.random.Generator,
     remaining_s: Remaining,
 ) -> Found:
-    """The cross-entropy method (Rubinstein 1999) about `base`."""
-    draws = _Draws(evaluate, base, reach, generator, settings.samples)
+    """The plan at the last mean of the knots within +-reach (M, 3) about `base`."""
     mean, sd = np.zeros_like(reach), settings.deviation * reach
-    kept = max(2, round(settings.elite * settings.samples))
-    done = 0
+    wide, done = reach[:, :, None], 0
     while done < settings.iterations:
-        knots, costs = draws.costs(mean, sd)
-        elite = knots[:, :, np.argsort(costs, kind="stable")[:kept]]
-        mean = elite.mean(axis=2)
-        sd = np.maximum(elite.std(axis=2), LEAST_SD * reach)
+        noise = generator.standard_normal((*reach.shape, settings.samples))
+        noise[:, :, 0] = 0.0  # the mean itself is the first sample
+        knots = np.clip(mean[:, :, None] + sd[:, :, None] * noise, -wide, wide)
+        costs = evaluate.of_knots(base, knots)
+        costs = np.where(np.isfinite(costs), costs, np.inf)
+        mean, sd = settings.update(knots, costs, sd, reach)
         done += 1
         if remaining_s is not None and remaining_s() <= 0:
             break
-    return draws.conclude(mean, sd, done, done < settings.iterations)
+    evaluate.of_knots(base, mean[:, :, None])
+    plan = evaluate.picked(1, 0)
+    return Found(plan, float(np.linalg.norm(sd)), done, done < settings.iterations)

@@ -19,7 +19,6 @@ from offboard.control.horizon.limits import VOLUME, excesses, limits_of, share_o
 from offboard.control.horizon.plant import INPUTS, PLANT, SCENE, STATE_SIZE, Scene
 from offboard.control.horizon.roll_out import roll_out
 from offboard.control.swarm import RandomLanes, Swarm, SwarmSettings
-from offboard.model.kernel import address
 
 Array = NDArray[np.float64]
 Remaining = Callable[[], float] | None
@@ -60,15 +59,13 @@ def knot_weights(steps: int) -> Array:
 
 
 class Evaluator:
-    """Runs roll-outs of one situation, which may have so many volumes to keep out of. What compiled
-    code needs stays where it is in memory."""
+    """Runs roll-outs of `steps` holds in one situation, with `volumes` volumes to keep out of."""
 
     def __init__(self, steps: int, volumes: int) -> None:
         self.steps = steps
         self.knots = knot_weights(steps)
         self.plant, self._record = np.zeros(1, PLANT), np.zeros(1, SCENE)
         self._volumes = np.zeros((volumes, PACKED_SIZE))
-        self._base = np.zeros((steps, INPUTS)), np.zeros((steps + 1, STATE_SIZE))
         self._nothing = np.zeros((steps, INPUTS)), np.zeros((steps + 1, STATE_SIZE))
         self._each_step = np.eye(steps)
         self._batches: dict[int, _Batch] = {}
@@ -90,15 +87,16 @@ class Evaluator:
 
     def of_knots(self, base: Plan, knots: Array) -> Array:
         """Costs (n,) of knots (M, 3, n) about `base`; a plan is read with `picked`."""
-        return self._run(base.inputs, base.states, knots)
+        return self._run((base.inputs, base.states), 1.0, self.knots, knots)
 
     def of_inputs(self, inputs: Array) -> Array:
         """Costs (n,) of input sequences (N, 3, n), clipped to the bounds."""
-        return self._run(None, None, inputs)
+        return self._run(self._nothing, 0.0, self._each_step, inputs)
 
     def held(self, inputs: Array, states: Array) -> Plan:
         """What becomes of inputs (N, 3) with the feedback that holds states (N + 1, .)."""
-        self._run(inputs, states, np.zeros((self.knots.shape[1], INPUTS, 1)))
+        no_knots = np.zeros((self.knots.shape[1], INPUTS, 1))
+        self._run((inputs, states), 1.0, self.knots, no_knots)
         return self.picked(1, 0)
 
     def flown(self, inputs: Array) -> Plan:
@@ -131,46 +129,32 @@ class Evaluator:
 
     def _excesses(self, states: Array) -> Array:
         over = np.empty((self.steps * limits_of(self._volumes), states.shape[2]))
-        situation = address(self.plant), address(self._record), self._volumes
-        excesses.call(*situation, states, over)
+        excesses(self.plant, self._record, self._volumes, states, over)
         return over
 
-    def _run(self, inputs: Array | None, states: Array | None, knots: Array) -> Array:
+    def _run(
+        self, base: tuple[Array, Array], feedback: float, weights: Array, knots: Array
+    ) -> Array:
         count = knots.shape[2]
         batch = self._batches.get(count)
         if batch is None:
-            batch = self._batches[count] = self._batch(count)
-        if inputs is None:
-            batch.sequences[:] = knots
-            batch.fly_sequences()
-        else:
-            self._base[0][:], self._base[1][:] = inputs, states
-            batch.knots[:] = knots
-            batch.fly_knots()
+            batch = self._batches[count] = _Batch(self.steps, count)
+        base_inputs, base_states, knots = map(np.ascontiguousarray, (*base, knots))
+        roll_out(
+            self.plant, self._record, self._volumes,
+            base_inputs, base_states, feedback, weights, knots,
+            batch.states, batch.inputs, batch.over, batch.costs,
+        )  # fmt: skip
         return batch.costs
 
-    def _batch(self, count: int) -> _Batch:
-        knots = np.empty((self.knots.shape[1], INPUTS, count))
-        sequences, inputs = (np.empty((self.steps, INPUTS, count)) for _ in range(2))
-        states = np.empty((self.steps + 1, STATE_SIZE, count))
-        over, costs = (np.empty(count) for _ in range(2))
-        situation, flown = (self.plant, self._record, self._volumes), (states, inputs, over, costs)
-        about = roll_out.bound(*situation, *self._base, 1.0, self.knots, knots, *flown)
-        alone = roll_out.bound(*situation, *self._nothing, 0.0, self._each_step, sequences, *flown)
-        return _Batch(knots, sequences, about, alone, states, inputs, costs)
 
-
-@dataclass(frozen=True, slots=True)
 class _Batch:
-    """The arrays of the roll-outs of so many particles: what they are given, and what comes out."""
+    """What comes out of the roll-outs of `count` particles, made once: see `roll_out`."""
 
-    knots: Array
-    sequences: Array
-    fly_knots: Callable[[], int]
-    fly_sequences: Callable[[], int]
-    states: Array
-    inputs: Array
-    costs: Array
+    def __init__(self, steps: int, count: int) -> None:
+        self.states = np.empty((steps + 1, STATE_SIZE, count))
+        self.inputs = np.empty((steps, INPUTS, count))
+        self.over, self.costs = np.empty(count), np.empty(count)
 
 
 def swarm(

@@ -1,1 +1,2 @@
-"""The tracking laws: one decision per tick from the predicted state and the reference."""
+"""The control laws, one module each: settings and law. They are peers; what they share lies in
+`offboard.control.tracking` and `offboard.control.horizon`."""

@@ -1,36 +1,40 @@
-"""The autopilot's own position loop as a controller: it is given the reference and nothing else.
+"""The law `autopilot`: the autopilot's own position loop, which is sent the reference.
 
-What a user has without this package: position, velocity and acceleration, each decision anew.
+This is what a user has without this package: position, velocity and acceleration at each tick.
 """
 
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
-from offboard.control.base import Decision, DecisionError, Situation
-from offboard.documents.parameters import Parameters
+from offboard.control.base import ControllerSettings, Decision, DecisionError, Situation
 from offboard.model.command import PositionCommand
 from offboard.model.frames import wrap_pi
+from offboard.model.vehicle import Vehicle
 
 
-class AutopilotSettings(Parameters):
-    """`lead_s`: how far ahead of now the reference is taken, beyond half a period for the hold."""
+class AutopilotSettings(ControllerSettings):
+    """Settings of the law `autopilot`. The reference is sampled `lead_s` ahead of the tick, plus
+    half a period because the setpoint is held for one."""
 
+    law: Literal["autopilot"] = "autopilot"
     lead_s: float = Field(default=0.0, ge=0, le=1)
+
+    def build(self, vehicle: Vehicle, *, period_s: float, seed: int) -> AutopilotLaw:
+        return AutopilotLaw(self, period_s=period_s)
 
 
 class AutopilotLaw:
-    """The controller `autopilot`."""
+    """Sends the reference as position setpoints."""
 
-    def __init__(self, settings: AutopilotSettings | None = None, *, period_s: float = 0.1) -> None:
-        settings = settings or AutopilotSettings()
+    def __init__(self, settings: AutopilotSettings, *, period_s: float = 0.1) -> None:
         self._ahead_s = settings.lead_s + 0.5 * period_s
 
     def decide(self, situation: Situation) -> Decision:
-        """The reference as it will be. Raises DecisionError where it is not finite."""
         sample = situation.reference.sample(situation.time_s + self._ahead_s)
         vectors = (sample.position_ned_m, sample.velocity_ned_mps, sample.acceleration_ned_mps2)
         if not (np.isfinite(vectors).all() and math.isfinite(float(sample.course_rad))):
@@ -49,4 +53,4 @@ class AutopilotLaw:
         )
 
     def reset(self) -> None:
-        """There is nothing to forget."""
+        """It has no memory."""

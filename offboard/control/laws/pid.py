@@ -1,35 +1,36 @@
-"""The cascaded PID law: what most multirotors fly, with our observer and feed-forward.
+"""The law `pid`: cascaded loops as most multirotors fly them, with our observer and feed-forward.
 
-Position error asks for a velocity, velocity error for an acceleration, its integral takes what the
-observer's disturbance leaves. Same target, box and course as the tracking law; no model but the
-feed-forward's. Knows no autopilot and reads no clock.
+The position error asks for a velocity, the velocity error for an acceleration; an integral takes
+out what the estimated disturbance leaves.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from offboard.control.base import Certificate, Situation
+from offboard.control.base import Certificate, Decision, Situation
 from offboard.control.certificate import at_bound
-from offboard.control.cost import BoxQuadratic
-from offboard.control.laws.tracking import OneDecisionSettings, Search, Target, TrackingLaw, errors
+from offboard.control.tracking import OneDecisionSettings, Tracking, decision
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
 
 class PidSettings(OneDecisionSettings):
-    """Gains of the two cascades. `position_gain_ps` turns metres into m/s, `velocity_gain_ps` m/s
-    into m/s^2, `integral_gain_ps3` metre seconds into m/s^2; `integral_limit_mps2` bounds the
-    integral's part. The defaults are the best of a grid on the PX4-like vehicle. `bandwidth_radps`
-    is how fast the loop is with these gains: where the delay bears less, all are lowered with it.
+    """Settings of the law `pid`: the gains of the two cascades, the best of a grid on the PX4-like
+    vehicle.
+
+    `position_gain_ps` turns m into m/s, `velocity_gain_ps` m/s into m/s^2, `integral_gain_ps3` m s
+    into m/s^2; `integral_limit_mps2` bounds the part of the integral. `bandwidth_radps` is the
+    bandwidth of the loop with these gains: where the delay supports less, all are lowered with it.
     """
 
+    law: Literal["pid"] = "pid"
     bandwidth_radps: float = Field(default=5.0, ge=0.5, le=20)
     position_gain_ps: float = Field(default=1.8, ge=0, le=20)
     velocity_gain_ps: float = Field(default=4.6, ge=0, le=50)
@@ -39,70 +40,53 @@ class PidSettings(OneDecisionSettings):
     height_integral_gain_ps3: float = Field(default=1.0, ge=0, le=50)
     integral_limit_mps2: float = Field(default=2.0, ge=0, le=10)
 
+    def build(self, vehicle: Vehicle, *, period_s: float, seed: int) -> PidLaw:
+        return PidLaw(vehicle, self, period_s=period_s)
 
-class PidLaw(TrackingLaw):
-    """The controller `pid`."""
 
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        settings: PidSettings | None = None,
-        stopwatch: Callable[[], float] | None = None,
-        *,
-        period_s: float = 0.1,
-    ) -> None:
-        self._gains = settings or PidSettings()
+class PidLaw:
+    """Proportional, integral and derivative action on the position error."""
+
+    def __init__(self, vehicle: Vehicle, settings: PidSettings, *, period_s: float = 0.1) -> None:
+        self.bandwidth_radps = settings.bandwidth_radps
+        self.tracking = Tracking(vehicle, settings, period_s, settings.feedforward)
+        self._vehicle = vehicle
+        self._gains = settings
+        self._slower = 1.0  # factor on the gains, for the delay
+        self._integral = np.zeros(3)  # m/s^2, NED
+
+    def decide(self, situation: Situation) -> Decision:
+        task, gains, slower = self.tracking.task(situation), self._gains, self._slower
+        lateral, vertical = task.lateral, task.vertical
+        north_east_mps = lateral[1] + slower * gains.position_gain_ps * lateral[0]
+        climb_mps = vertical[1] + slower * gains.height_gain_ps * vertical[0]
+        asked = np.empty(3)  # acceleration against the error, m/s^2, NED
+        asked[:2] = slower * gains.velocity_gain_ps * north_east_mps
+        asked[2] = slower * gains.climb_gain_ps * climb_mps
+        asked += self._integral
+        asked[:2] /= self.tracking.vehicle.gravity_mps2  # as tilt
+        inputs = task.inputs(asked)
+        clipped = task.problem.clip(inputs)
+        self._integrate(np.append(lateral[0], vertical[0]), (clipped == inputs)[[1, 2, 0]])
+        cost, on_bound = float(task.problem(clipped)), at_bound(task.problem, clipped)
+        return decision(clipped, Certificate(cost, at_bound=on_bound))
+
+    def reset(self) -> None:
         self._integral = np.zeros(3)
-        feedforward = self._gains.feedforward
-        super().__init__(
-            vehicle, self._gains, Search.CLOSED_FORM, stopwatch, feedforward, period_s=period_s
-        )
+        self.adopt(self._vehicle)
 
     def adopt(
         self, vehicle: Vehicle, bandwidth_limit_radps: float = math.inf, *, gains: bool = True
     ) -> None:
-        super().adopt(vehicle, bandwidth_limit_radps, gains=gains)
+        self.tracking.adopt(vehicle, bandwidth_limit_radps, gains=gains)
         if gains:
-            self._slower = min(1.0, bandwidth_limit_radps / self._settings.bandwidth_radps)
-
-    def answer(
-        self,
-        situation: Situation,
-        target: Target,
-        problem: BoxQuadratic,
-        remaining_s: Callable[[], float] | None,
-    ) -> tuple[Array, Certificate]:
-        """Feed-forward and the three terms, clipped to the box."""
-        gains, state = self._gains, situation.state
-        lateral, vertical = errors(state, target)
-        upright = float(state.thrust_direction_ned[2])
-        asked = np.empty(3)  # acceleration against the error, m/s^2: north, east, down
-        slower = self._slower
-        lateral_mps = lateral[1] + slower * gains.position_gain_ps * lateral[0]
-        climb_mps = vertical[1] + slower * gains.height_gain_ps * vertical[0]
-        asked[:2] = slower * gains.velocity_gain_ps * lateral_mps
-        asked[2] = slower * gains.climb_gain_ps * climb_mps
-        asked += self._integral
-        inputs = np.empty(4)
-        inputs[0] = (target.thrust_down_feedforward_mps2 + asked[2]) / upright
-        inputs[1:3] = target.tilt_feedforward + asked[:2] / self._vehicle.gravity_mps2
-        inputs[3] = target.course_feedforward_rad
-        clipped: Array = np.clip(inputs, problem.lower, problem.upper)
-        free = clipped == inputs
-        self._integrate(np.append(lateral[0], vertical[0]), free[[1, 2, 0]])
-        certificate = Certificate(cost=float(problem(clipped)), at_bound=at_bound(problem, clipped))
-        return clipped, certificate
-
-    def reset(self) -> None:
-        """Forget everything of the previous flight, the integral included."""
-        super().reset()
-        self._integral = np.zeros(3)
+            self._slower = min(1.0, bandwidth_limit_radps / self.bandwidth_radps)
 
     def _integrate(self, off_ned_m: Array, free: NDArray[np.bool_]) -> None:
-        """Only axes whose command is not on its bound: what winds up there overshoots later."""
+        """Add the error of the axes whose command is not at its bound: no wind-up."""
         gains = self._gains
         rates = np.array([gains.integral_gain_ps3] * 2 + [gains.height_integral_gain_ps3])
-        step = self._slower**3 * self._period_s * rates * off_ned_m
+        step = self._slower**3 * self.tracking.period_s * rates * off_ned_m
         limit = gains.integral_limit_mps2
         self._integral = np.clip(
             np.where(free, self._integral + step, self._integral), -limit, limit

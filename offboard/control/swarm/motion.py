@@ -7,9 +7,15 @@ allocated. Knows no objective.
 
 from __future__ import annotations
 
-import numpy as np
+from typing import Any
 
-from offboard.model.kernel import array, entry, kernel
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.compiled import array, entry, kernel
+from offboard.control.swarm.lanes import States
+
+Array = NDArray[np.float64]
 
 SEARCH = np.dtype(
     [
@@ -42,7 +48,7 @@ _UNIT_31 = 2.0**-31  # one draw gives two uniform numbers of 31 bits in [0, 1)
 
 
 @kernel
-def _next(x):  # type: ignore[no-untyped-def]
+def _next(x: np.uint64) -> np.uint64:
     """Of a lane, by xorshift. What is drawn from it is not made here: the loops over kernels that
     return two numbers are not vectorised."""
     x ^= x << _SHIFT_A
@@ -52,10 +58,11 @@ def _next(x):  # type: ignore[no-untyped-def]
 
 
 @entry(SEARCH, array(1, "u8"), array(1), array(1), array(2), array(2))
-def scatter(  # type: ignore[no-untyped-def]
-    search, lanes, lower, upper, positions, velocities
-) -> int:
+def scatter(
+    searches: Any, lanes: States, lower: Array, upper: Array, positions: Array, velocities: Array
+) -> None:
     """Begin a search: uniform positions in the box and uniform velocities of either sign."""
+    search = searches[0]
     search.iterations = search.rejected = 0
     search.cost = search.spread = np.inf
     initial_velocity = search.initial_velocity
@@ -69,13 +76,19 @@ def scatter(  # type: ignore[no-untyped-def]
             r2 = np.int32(x & _LOW_31) * _UNIT_31
             positions[j, i] = min(max(low + r1 * width, low), high)
             velocities[j, i] = initial_velocity * (2.0 * r2 - 1.0) * width
-    return 0
 
 
-@entry(SEARCH, array(1, "u8"), array(1), array(1), array(2), array(2), array(2), array(1))
-def move(  # type: ignore[no-untyped-def]
-    search, lanes, lower, upper, positions, velocities, bests, leader
-) -> int:
+@kernel
+def move(
+    search: Any,
+    lanes: States,
+    lower: Array,
+    upper: Array,
+    positions: Array,
+    velocities: Array,
+    bests: Array,
+    leader: Array,
+) -> None:
     """Eqs. 30 and 20 with a random number per dimension; Eq. 22 by clamping.
 
     A clamped component turns its velocity round, times `rebound`: a particle that keeps it stays
@@ -101,11 +114,27 @@ def move(  # type: ignore[no-untyped-def]
             inside = low <= there <= high
             velocities[j, i] = velocity if inside else -rebound * velocity
             positions[j, i] = min(max(there, low), high)  # Eq. 22
-    return 0
+
+
+@entry(SEARCH, array(1, "u8"), array(1), array(1), array(2), array(2), array(2), array(1))
+def move_particles(
+    searches: Any,
+    lanes: States,
+    lower: Array,
+    upper: Array,
+    positions: Array,
+    velocities: Array,
+    bests: Array,
+    leader: Array,
+) -> None:
+    """`move` of one SEARCH (1,)."""
+    move(searches[0], lanes, lower, upper, positions, velocities, bests, leader)
 
 
 @kernel
-def remember(search, costs, positions, bests, best_costs, leader) -> None:  # type: ignore[no-untyped-def]
+def remember(
+    search: Any, costs: Array, positions: Array, bests: Array, best_costs: Array, leader: Array
+) -> None:
     """Update personal bests and the leader, count the iteration and what costs are rejected.
 
     Of equal costs the earlier one stands; a cost that is not finite never becomes a best.
@@ -134,17 +163,17 @@ def remember(search, costs, positions, bests, best_costs, leader) -> None:  # ty
 
 
 @entry(SEARCH, array(1), array(2), array(2), array(1), array(1))
-def learn(  # type: ignore[no-untyped-def]
-    search, costs, positions, bests, best_costs, leader
-) -> int:
+def learn(
+    searches: Any, costs: Array, positions: Array, bests: Array, best_costs: Array, leader: Array
+) -> None:
     """`remember`, and the spread."""
+    search = searches[0]
     remember(search, costs, positions, bests, best_costs, leader)
     search.spread = spread_about(positions, leader)
-    return 0
 
 
 @kernel
-def spread_about(positions, leader):  # type: ignore[no-untyped-def]
+def spread_about(positions: Array, leader: Array) -> float:
     """Mean distance of all particles from the leader, Eqs. 28-29."""
     dimensions, particles = positions.shape
     total = 0.0
@@ -153,4 +182,4 @@ def spread_about(positions, leader):  # type: ignore[no-untyped-def]
         for j in range(dimensions):
             squared += (leader[j] - positions[j, i]) ** 2
         total += np.sqrt(squared)
-    return total / particles
+    return float(total / particles)

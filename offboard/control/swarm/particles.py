@@ -16,10 +16,9 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from offboard.control.swarm.lanes import RandomLanes
-from offboard.control.swarm.motion import learn, move, scatter
+from offboard.control.swarm.motion import learn, move_particles, scatter
 from offboard.control.swarm.population import Population, box
 from offboard.control.swarm.settings import SwarmResult, SwarmSettings
-from offboard.model.kernel import address
 
 Array = NDArray[np.float64]
 
@@ -40,19 +39,17 @@ class Swarm:
         self._tolerance = settings.tolerance
         self._all = p = Population(settings, len(within.lower))
         p.confine(within)
-        drawn, bounds = lanes.states(settings.particles), (p.lower, p.upper)
-        scatter.call(address(p.search), drawn, *bounds, p.positions, p.velocities)
+        self._drawn = lanes.states(settings.particles)
+        scatter(p.search, self._drawn, p.lower, p.upper, p.positions, p.velocities)
         p.begin(seeds)
-        self._move = move.bound(
-            p.search, drawn, *bounds, p.positions, p.velocities, p.bests, p.leader
-        )
-        self._learn = learn.bound(p.search, p.costs, p.positions, p.bests, p.best_costs, p.leader)
         self._told = False
 
     def ask(self) -> Array:
         """Inputs to evaluate, (particles, n). Asking again without telling gives the same."""
         if self._told:
-            self._move()
+            p = self._all
+            where = p.search, self._drawn, p.lower, p.upper, p.positions, p.velocities
+            move_particles(*where, p.bests, p.leader)
             self._told = False
         return self._all.positions.T.copy()
 
@@ -61,13 +58,13 @@ class Swarm:
 
         Raises ValueError on another shape or if nothing was asked since the last call.
         """
-        values = np.asarray(costs, np.float64)
+        values, p = np.asarray(costs, np.float64), self._all
         if self._told:
             raise ValueError("tell without ask: these inputs already have their costs")
-        if values.shape != self._all.costs.shape:
-            raise ValueError(f"{values.shape} costs for {self._all.costs.shape} particles")
-        self._all.costs[:] = values
-        self._learn()
+        if values.shape != p.costs.shape:
+            raise ValueError(f"{values.shape} costs for {p.costs.shape} particles")
+        p.costs[:] = values
+        learn(p.search, p.costs, p.positions, p.bests, p.best_costs, p.leader)
         self._told = True
 
     @property

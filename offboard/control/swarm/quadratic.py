@@ -7,17 +7,18 @@ chunks of iterations and asks between them how much time the caller has left.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from offboard.compiled import array, entry, kernel
 from offboard.control.cost import BoxQuadratic
 from offboard.control.swarm.lanes import RandomLanes, States
 from offboard.control.swarm.motion import SEARCH, move, remember, scatter, spread_about
 from offboard.control.swarm.particles import Swarm
 from offboard.control.swarm.population import Population, box
 from offboard.control.swarm.settings import SwarmHistory, SwarmResult, SwarmSettings
-from offboard.model.kernel import array, entry, kernel
 
 Array = NDArray[np.float64]
 
@@ -28,23 +29,33 @@ CHUNK_ITERATIONS = 25  # between two looks at the time left: about 15 us
     SEARCH, array(1, "u8"), array(1), array(1), array(2), array(2), array(2), array(1),
     array(1), array(1), array(2), array(1),
 )  # fmt: skip
-def iterate(  # type: ignore[no-untyped-def]
-    search, lanes, lower, upper, positions, velocities, bests, leader,
-    best_costs, costs, hessian, gradient,
-) -> int:  # fmt: skip
+def iterate(
+    searches: Any,
+    lanes: States,
+    lower: Array,
+    upper: Array,
+    positions: Array,
+    velocities: Array,
+    bests: Array,
+    leader: Array,
+    best_costs: Array,
+    costs: Array,
+    hessian: Array,
+    gradient: Array,
+) -> None:
     """Iterations up to the limit; the first of them evaluates where the particles stand."""
+    search = searches[0]
     while search.iterations < search.limit:
         if search.iterations > 0:
             move(search, lanes, lower, upper, positions, velocities, bests, leader)
         quadratic_costs(hessian, gradient, search.constant, positions, costs)
         remember(search, costs, positions, bests, best_costs, leader)
     search.spread = spread_about(positions, leader)
-    return 0
 
 
 @kernel
-def quadratic_costs(  # type: ignore[no-untyped-def]
-    hessian, gradient, constant, positions, costs
+def quadratic_costs(
+    hessian: Array, gradient: Array, constant: float, positions: Array, costs: Array
 ) -> None:
     """J of positions (n, particles) into costs (particles,)."""
     if positions.shape[0] == 4:
@@ -60,8 +71,8 @@ def quadratic_costs(  # type: ignore[no-untyped-def]
 
 
 @kernel
-def _costs_of_four(  # type: ignore[no-untyped-def]
-    hessian, gradient, constant, positions, costs
+def _costs_of_four(
+    hessian: Array, gradient: Array, constant: float, positions: Array, costs: Array
 ) -> None:
     """The same for the four inputs of Eq. 6, unrolled: a third of the time of a search."""
     h00, h11 = 0.5 * hessian[0, 0], 0.5 * hessian[1, 1]
@@ -88,7 +99,6 @@ class QuadraticSwarm:
         self._all = Population(settings, dimensions)
         self._hessian = np.empty((dimensions, dimensions))
         self._gradient = np.empty(dimensions)
-        self._drawn: States | None = None
 
     def minimise(
         self,
@@ -104,7 +114,7 @@ class QuadraticSwarm:
         answer, after one chunk of iterations at the earliest. Raises ValueError on bounds that
         are not finite and ordered, or of another dimension.
         """
-        self._start(problem, lanes, seeds)
+        arguments = self._start(problem, lanes, seeds)
         p, limit, tolerance = self._all, self._settings.iterations, self._settings.tolerance
         watched = remaining_s is not None or tolerance > 0
         chunk = 1 if keep_history else CHUNK_ITERATIONS if watched else limit
@@ -112,7 +122,7 @@ class QuadraticSwarm:
         done, cut_short = 0, False
         while done < limit:
             p.limit[0] = done = min(done + chunk, limit)
-            self._iterate()
+            iterate(*arguments)
             if keep_history:
                 kept.append((p.positions.T.copy(), float(p.cost[0]), float(p.spread[0])))
             if tolerance > 0 and p.spread[0] <= tolerance:
@@ -122,26 +132,20 @@ class QuadraticSwarm:
                 break
         return p.result(cut_short, _history(kept) if keep_history else None)
 
-    def _start(self, problem: BoxQuadratic, lanes: RandomLanes, seeds: Sequence[ArrayLike]) -> None:
+    def _start(
+        self, problem: BoxQuadratic, lanes: RandomLanes, seeds: Sequence[ArrayLike]
+    ) -> tuple[Any, ...]:
+        """Scatter the particles; the arguments of `iterate`."""
         p = self._all
         p.confine(box(problem.lower, problem.upper))
         self._hessian[:] = problem.hessian
         self._gradient[:] = problem.gradient
         p.search["constant"] = problem.constant
         drawn = lanes.states(self._settings.particles)
-        if drawn is not self._drawn:
-            self._draw_from(drawn)
-        self._scatter()
+        where = p.search, drawn, p.lower, p.upper, p.positions, p.velocities
+        scatter(*where)
         p.begin(seeds)
-
-    def _draw_from(self, lanes: States) -> None:
-        p = self._all
-        where = (p.search, lanes, p.lower, p.upper, p.positions, p.velocities)
-        self._scatter = scatter.bound(*where)
-        self._iterate = iterate.bound(
-            *where, p.bests, p.leader, p.best_costs, p.costs, self._hessian, self._gradient
-        )
-        self._drawn = lanes
+        return (*where, p.bests, p.leader, p.best_costs, p.costs, self._hessian, self._gradient)
 
 
 def warm_up() -> None:

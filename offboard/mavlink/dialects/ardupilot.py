@@ -1,4 +1,4 @@
-"""ArduCopter (4.3 and later) at the MAVLink boundary, as data."""
+"""ArduCopter 4.3 and later."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ ARDUPILOT = Dialect(
     modes=MappingProxyType(_MODES),
     mode_parameters=_mode_parameters,
     engage_mode="GUIDED",
-    # LOITER obeys the throttle stick, and without one it descends or falls
+    # in LOITER the throttle stick sets the climb rate: without a radio the vehicle descends
     hold_mode="BRAKE",
     land_mode="LAND",
     takeoff=Takeoff.COMMAND,
     unused_parameter=0.0,  # NaN stops its SITL with a floating point exception
     thrust_rule=ThrustRule.TILT_COMPENSATED,  # ATC_ANGLE_BOOST 1
-    # masks 1 to 6 throw the vehicle into position hold, 71 and 199 drop the message
+    # masks 1 to 6 make it hold its position, 71 and 199 make it ignore the message
     attitude_type_mask=7,
     parameter_encoding=ParameterEncoding.CAST,
     watched_parameters=(
@@ -81,13 +81,13 @@ ARDUPILOT = Dialect(
         WatchedParameter("MOT_THST_HOVER", "normalised thrust that holds the weight"),
         WatchedParameter(
             "ATC_ANGLE_BOOST",
-            "the autopilot must divide thrust by the tilt, since we do not",
+            "the autopilot must divide thrust by the cosine of the tilt",
             allowed=(1.0, 1.0),
             must_answer=True,
         ),
         WatchedParameter("FS_GCS_ENABLE", "what the vehicle does when the ground station is lost"),
         WatchedParameter("FS_THR_ENABLE", "what the vehicle does when the radio is lost"),
-        WatchedParameter("SYSID_ENFORCE", "whether only SYSID_MYGCS is obeyed"),
+        WatchedParameter("SYSID_ENFORCE", "whether commands are accepted only from SYSID_MYGCS"),
     ),
     wanted=(
         *TRACKING_TELEMETRY,

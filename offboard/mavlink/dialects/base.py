@@ -1,5 +1,6 @@
-"""What differs between autopilots at the MAVLink boundary, as data. px4.py and ardupilot.py are
-the instances; nothing else in the product branches on the autopilot's name.
+"""Dialect: what differs between autopilots at the MAVLink boundary, as data.
+
+px4.py and ardupilot.py hold the instances. No other code branches on the name of the autopilot.
 """
 
 from __future__ import annotations
@@ -16,14 +17,14 @@ TYPE_ONBOARD_CONTROLLER, TYPE_GCS = 18, 6  # MAV_TYPE
 
 
 class ThrustRule(Enum):
-    """What the autopilot does with the normalised thrust."""
+    """What the autopilot does with the normalised thrust of a setpoint."""
 
-    COLLECTIVE = "applies it along the body axis as it is"
+    COLLECTIVE = "applies it unchanged along the body axis"
     TILT_COMPENSATED = "divides it by the cosine of the body's tilt"
 
 
 class ParameterEncoding(Enum):
-    """How integers travel in the float of PARAM_VALUE and PARAM_SET."""
+    """How PARAM_VALUE holds an integer in its float field."""
 
     BYTEWISE = "the integer's four bytes"
     CAST = "the integer's value"
@@ -38,7 +39,7 @@ class Takeoff(Enum):
 
 @dataclass(frozen=True, slots=True)
 class WantedMessage:
-    """A telemetry message and its rate. An optional one is asked for and not insisted on."""
+    """A telemetry message and the rate to request. An optional one is requested at most twice."""
 
     message_id: int
     name: str
@@ -48,8 +49,11 @@ class WantedMessage:
 
 @dataclass(frozen=True, slots=True)
 class WatchedParameter:
-    """A parameter read before flight. `required_bits` and `allowed` say what it must be;
-    without an answer to one that `must_answer` nothing flies."""
+    """A parameter of the autopilot that is read before flight.
+
+    `required_bits` must be set and the value must be within `allowed`. Without a reply to one that
+    `must_answer`, the flight is refused.
+    """
 
     name: str
     meaning: str
@@ -57,25 +61,25 @@ class WatchedParameter:
     allowed: tuple[float, float] | None = None
     must_answer: bool = False
 
-    def complaint(self, value: float) -> str | None:
-        """A sentence with the line that mends it, or None when `value` will do."""
+    def problem(self, value: float) -> str | None:
+        """What is wrong with `value` and the command that fixes it, or None if it is valid."""
         bits = int(value)
         if bits & self.required_bits != self.required_bits:
-            mended: float = bits | self.required_bits
+            valid: float = bits | self.required_bits
         elif self.allowed is not None and not self.allowed[0] <= value <= self.allowed[1]:
-            mended = min(max(value, self.allowed[0]), self.allowed[1])
+            valid = min(max(value, self.allowed[0]), self.allowed[1])
         else:
             return None
-        return f"{self.name} is {value:g}: {self.meaning}. Mend: param set {self.name} {mended:g}"
+        return f"{self.name} is {value:g}: {self.meaning}. Fix: param set {self.name} {valid:g}"
 
 
 @dataclass(frozen=True)
 class Dialect:
-    """One autopilot. Modes go by name; `modes` maps HEARTBEAT.custom_mode to it."""
+    """One autopilot. Modes are given by name; `modes` maps HEARTBEAT.custom_mode to the name."""
 
     name: str
     mav_autopilot: int
-    heartbeat_type: int  # what we say we are
+    heartbeat_type: int  # MAV_TYPE of our own heartbeat
     modes: Mapping[int, str]
     mode_parameters: Callable[[int], tuple[float, float, float]]  # custom_mode -> MAV_CMD 176
     engage_mode: str
@@ -93,7 +97,7 @@ class Dialect:
         return self.modes.get(custom_mode) or f"UNKNOWN(0x{custom_mode:08x})"
 
     def set_mode(self, name: str) -> CommandLong:
-        """MAV_CMD_DO_SET_MODE; ValueError names the modes there are."""
+        """MAV_CMD_DO_SET_MODE. Raises ValueError for an unknown mode."""
         for custom_mode, known in self.modes.items():
             if known == name:
                 return CommandLong(SET_MODE, self.mode_parameters(custom_mode))
@@ -111,12 +115,10 @@ class Dialect:
         return CommandLong.land()
 
     def take_off(self, altitude_m: float) -> CommandLong:
-        """MAV_CMD_NAV_TAKEOFF here; above home on ArduCopter, above mean sea level on PX4."""
+        """MAV_CMD_NAV_TAKEOFF at the present place. The altitude is above home on ArduCopter,
+        above mean sea level on PX4."""
         unused = self.unused_parameter
         return CommandLong(TAKEOFF, (0.0, 0.0, 0.0, unused, unused, unused, altitude_m))
-
-    def return_to_launch(self) -> CommandLong:
-        return CommandLong.return_to_launch()
 
 
 TRACKING_TELEMETRY = (
@@ -126,7 +128,7 @@ TRACKING_TELEMETRY = (
     WantedMessage(1, "SYS_STATUS", 2.0),
 )
 
-# For whom the vehicle's own position will not do
+# For our own position fusion (`estimate: fused`)
 POSITIONING_TELEMETRY = (
     WantedMessage(24, "GPS_RAW_INT", 10.0, optional=True),
     WantedMessage(49, "GPS_GLOBAL_ORIGIN", 1.0, optional=True),

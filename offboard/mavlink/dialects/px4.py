@@ -1,4 +1,4 @@
-"""PX4 (1.14 and later) at the MAVLink boundary, as data."""
+"""PX4 1.14 and later."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ def _custom_mode(main: int, sub: int = 0) -> int:
     return main << 16 | sub << 24
 
 
+# PX4 acknowledges it twice: on receipt, and up to 12 ms later with the commander's result
 def _mode_parameters(custom_mode: int) -> tuple[float, float, float]:
     return CUSTOM_MODE_ENABLED, float(custom_mode >> 16 & 0xFF), float(custom_mode >> 24)
 
@@ -48,14 +49,13 @@ _MODES = {
 PX4 = Dialect(
     name="px4",
     mav_autopilot=12,
-    # STATUSTEXT reaches only links whose heartbeat says ground station
+    # PX4 sends STATUSTEXT only on links with a heartbeat of a ground station
     heartbeat_type=TYPE_GCS,
     modes=MappingProxyType(_MODES),
     mode_parameters=_mode_parameters,
     engage_mode="OFFBOARD",
     hold_mode="AUTO.LOITER",
     land_mode="AUTO.LAND",
-    # ACCEPTED by the receiver comes first, the commander's verdict up to 12 ms later
     takeoff=Takeoff.SETPOINT,
     unused_parameter=float("nan"),  # 0 would be a latitude
     thrust_rule=ThrustRule.COLLECTIVE,

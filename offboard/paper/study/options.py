@@ -7,6 +7,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
+from offboard.documents.errors import UserError
 from offboard.paper.law import PaperSettings
 
 PAPER_FIGURES = tuple(str(number) for number in range(4, 18))
@@ -18,7 +19,7 @@ SEEDS, QUICK_SEEDS = 20, 2
 MOST_SEEDS = 10_000
 
 
-class PaperError(Exception):
+class PaperError(UserError):
     """A run that cannot be: one sentence for a human."""
 
 

@@ -22,8 +22,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from offboard.analysis.figure import Figure
-from offboard.analysis.interrupts import deaf_to_interrupts
-from offboard.analysis.processors import processors
+from offboard.analysis.workers import interrupts_deferred, processors
 from offboard.control.swarm import warm_up
 from offboard.paper.study.options import PaperError, PaperOptions, check
 from offboard.paper.study.page import facts_json, page
@@ -139,7 +138,7 @@ def _results(plan: Plan, workers: int | None) -> Generator[tuple[Key, Any]]:
 
 
 def _from_pool(pool: Executor, jobs: dict[Key, Job]) -> Iterator[tuple[Key, Any]]:
-    with deaf_to_interrupts():  # the processes start here, and stay so
+    with interrupts_deferred():  # the processes start here, and stay so
         futures: dict[Future[Any], Key] = {
             pool.submit(_guarded, function, *arguments): key
             for key, (function, arguments) in jobs.items()

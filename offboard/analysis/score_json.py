@@ -1,0 +1,32 @@
+"""A score as JSON: what `score --json` prints and score.json holds."""
+
+from __future__ import annotations
+
+import json
+import math
+from typing import Any
+
+from offboard.analysis.history import Event, History
+from offboard.analysis.score import Score
+
+
+def as_text(score: Score, history: History) -> str:
+    """All figures, the events and the number of messages as JSON text; a figure that the log does
+    not hold is null."""
+    document = {
+        **{name: _plain(value) for name, value in score.figures().items()},
+        "phases": _events(history.phases),
+        "modes": _events(history.modes),
+        "said": _events(history.said),
+        "messages": dict(sorted(history.messages.items())),
+        "wall_s": history.wall_s,
+    }
+    return json.dumps(document, indent=2, allow_nan=False) + "\n"
+
+
+def _plain(value: float) -> float | None:
+    return value if math.isfinite(value) else None
+
+
+def _events(events: tuple[Event, ...]) -> list[dict[str, Any]]:
+    return [{"time_s": _plain(event.time_s), "what": event.what} for event in events]

@@ -1,0 +1,104 @@
+"""A score as text for the terminal: the rows that end `fly`, and the tables of `score`."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+
+from offboard.analysis.history import History
+from offboard.analysis.score import FIGURES, Score
+
+# the figure that begins a section -> its title
+SECTIONS = {
+    "rmse_position_m": "tracking",
+    "mu_e": "fitness of the paper",
+    "tracked_s": "activity",
+    "setpoint_hz": "setpoints",
+    "solve_time_p50_ms": "decisions",
+    "position_hz": "telemetry",
+    "delay_ms": "vehicle",
+}
+
+
+def summary(score: Score, history: History, directory: Path) -> list[tuple[str, str]]:
+    """(label, text) of what a person wants to know after a flight. Figures that the log does not
+    hold are left out; without any there is no row."""
+    rows = []
+    if math.isfinite(score.rmse_position_m):
+        rows.append(
+            (
+                "tracked error",
+                f"{score.rmse_position_m:.3f} m RMSE, {score.max_position_m:.3f} m maximum, "
+                f"over {score.tracked_s:.1f} s",
+            )
+        )
+    if math.isfinite(score.rmse_truth_m):
+        error = f"{score.rmse_truth_m:.3f} m RMSE, {score.max_truth_m:.3f} m maximum"
+        rows.append(("true error", f"{error} (simulated vehicle)"))
+    if math.isfinite(score.solve_time_p99_ms):
+        rows.append(
+            (
+                "timing",
+                f"decision {score.solve_time_p99_ms:.2f} ms (99th percentile), "
+                f"{score.missed_ticks:.0f} of {len(history.records)} ticks missed",
+            )
+        )
+    identified = _identified(history)
+    if identified:
+        rows.append(("identified", identified))
+    if rows:
+        rows.append(("log", str(directory / "flight.tlog")))
+        rows.append(("all figures", f"offboard score {directory}"))
+    return rows
+
+
+def _identified(history: History) -> str:
+    """The last value of the main constants that the flight identified, empty without one."""
+    texts = []
+    for column, text in (
+        (1, "delay {:.0f} ms"),
+        (3, "tilt {:.1f} rad/s"),
+        (13, "hover thrust {:.3f}"),
+        (19, "drag {:.2f} 1/s"),
+    ):
+        values = history.identified[:, column]
+        values = values[np.isfinite(values)]
+        if len(values):
+            texts.append(text.format(values[-1] * (1e3 if "ms" in text else 1.0)))
+    return ", ".join(texts)
+
+
+def show(console: Console, score: Score, history: History) -> None:
+    """Print what happened in the order of time, then every figure that the log holds."""
+    story = Table(box=None, pad_edge=False)
+    story.add_column("t [s]", justify="right")
+    story.add_column("who")
+    story.add_column("what")
+    modes = (replace(event, what=f"mode {event.what}") for event in history.modes)
+    events = [*history.phases, *modes, *history.said]
+    for event in sorted(events, key=lambda event: np.nan_to_num(event.time_s)):
+        stamp = "" if math.isnan(event.time_s) else f"{event.time_s:.2f}"
+        story.add_row(stamp, event.who, Text(event.what))
+    if events:
+        console.print(story)
+    known = {name: value for name, value in score.figures().items() if not math.isnan(value)}
+    if not known:
+        console.print("nothing was flown that could be scored")
+        return
+    figures = Table(box=None, pad_edge=False, show_header=False)
+    figures.add_column(no_wrap=True)
+    figures.add_column(justify="right")
+    figures.add_column()
+    figures.add_column(style="dim")
+    for name, value in score.figures().items():
+        if name in SECTIONS:
+            figures.add_row(Text(f"\n{SECTIONS[name]}", "bold"))
+        if name in known:
+            figures.add_row(name, f"{value:.4g}", FIGURES[name]["unit"], FIGURES[name]["meaning"])
+    console.print(figures)

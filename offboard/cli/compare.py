@@ -1,0 +1,100 @@
+"""`offboard compare`: several controllers flown and scored, side by side in one table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import partial
+from typing import Annotated
+
+from offboard.cli.shared import (
+    DEFAULT_CONNECTION,
+    FLIGHTS,
+    Assignments,
+    CommandError,
+    Directory,
+    Vehicle,
+    Workers,
+    option,
+    out,
+    say,
+)
+from offboard.documents import shipped
+
+NAMES = "Names or files, separated by commas"
+
+
+def compare(
+    controllers: Annotated[str, option("LIST", f"{NAMES}, or 'all'.")] = "pso,lqr,paper",
+    reference: Annotated[str, option("LIST", f"{NAMES}.")] = "lemniscate",
+    scenario: Annotated[str, option("LIST", f"{NAMES}.")] = "calm,px4_like",
+    seeds: Annotated[int, option("N", "Flights of each combination, with seeds 1 .. N.")] = 3,
+    vehicle: Vehicle = None,
+    connect: Annotated[
+        str | None, option("LINK", "Fly the vehicle at this link instead of the simulator.")
+    ] = None,
+    workers: Workers = None,
+    out_directory: Directory = None,
+    assignments: Assignments = None,
+) -> None:
+    """Fly several controllers and compare them in one table.
+
+    Every controller flies every reference in every scenario with every seed. The table has medians
+    and ranges; the directory holds it as compare.csv, compare.json and compare.html.
+    """
+    if workers is not None and not 1 <= workers <= 256:
+        raise CommandError(f"--workers {workers}: give 1 .. 256")
+    if not 1 <= seeds <= 1000:
+        raise CommandError(f"--seeds {seeds}: give 1 .. 1000")
+    laws = _names(controllers, shipped.names("controllers"))
+    references = _names(reference)
+    scenarios = _names(scenario) if connect is None else ["connected"]
+    say(
+        f"controllers: {len(laws)}, references: {len(references)}, scenarios: {len(scenarios)}, "
+        f"seeds: {seeds}"
+    )
+    with out.status("checking that all of them can be flown"):
+        from offboard.analysis.comparison import compare_all
+        from offboard.analysis.trial import check_flyable, fly_trial
+        from offboard.flight import clock
+        from offboard.flight.request import FlightRequest
+
+        if connect is None:
+            _check_scenarios(scenarios)
+        directory = out_directory or FLIGHTS / f"compare-{clock.local_stamp()}"
+        request = FlightRequest(
+            directory=directory,
+            choices={"vehicle": vehicle} if vehicle else {},
+            assignments=tuple(assignments or ()),
+            connection=connect or DEFAULT_CONNECTION,
+            sitl=connect is None,
+        )
+        check_flyable(request, laws, references)
+    problem = compare_all(
+        partial(fly_trial, request),
+        controllers=laws,
+        references=references,
+        scenarios=scenarios,
+        seeds=range(1, seeds + 1),
+        directory=directory,
+        workers=workers if connect is None else 0,
+        console=out,
+    )
+    if problem:
+        raise CommandError(problem, 4)
+
+
+def _check_scenarios(names: Sequence[str]) -> None:
+    """Check the scenario files that are not shipped. Raises DocumentError."""
+    from offboard.flight.sitl import check_scenario
+
+    for path in [shipped.locate(name, "scenarios", "scenario") for name in names]:
+        if shipped.directory() not in path.parents:
+            check_scenario(path)
+
+
+def _names(text: str, known: Sequence[str] = ()) -> list[str]:
+    """Comma-separated names, each once; 'all' stands for every known one."""
+    parts = [part.strip() for part in text.split(",") if part.strip()]
+    if not parts:
+        raise CommandError("an empty list of names; give at least one")
+    return list(known) if parts == ["all"] and known else list(dict.fromkeys(parts))

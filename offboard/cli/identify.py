@@ -1,0 +1,72 @@
+"""`offboard identify`: the constants of a vehicle from a log, as a vehicle file and a page."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from offboard.cli.fly import fly
+from offboard.cli.shared import FILE, FLIGHT, FLIGHTS, CommandError, Directory, option, out, say
+
+
+def identify(
+    flight: Annotated[Path | None, FLIGHT] = None,
+    output: Annotated[
+        Path | None, option("FILE", "Vehicle file to write.", "-o", "--output")
+    ] = None,
+    page: Annotated[
+        Path | None, option("FILE", "Page with the fits.  [default: beside the log]")
+    ] = None,
+    connect: Annotated[
+        str | None, option("LINK", "Fly the reference `identify` there and use its log.")
+    ] = None,
+    sitl: Annotated[
+        bool, typer.Option("--sitl", help="The same on the bundled simulator.")
+    ] = False,
+    vehicle: Annotated[
+        str | None,
+        option(FILE, "Source of constants that are not identified.  [default: the flight]"),
+    ] = None,
+    out_directory: Directory = None,
+) -> None:
+    """Identify a vehicle from a flight: vehicle file and page.
+
+    Identifies delay, attitude response, hover thrust, thrust lag and drag, each with its standard
+    deviation. Prints the vehicle file; -o writes it.
+    """
+    from offboard.analysis import history, tlog
+    from offboard.analysis.identify import identify_flight, vehicle_file
+    from offboard.analysis.identify_page import page as fits
+    from offboard.flight import clock
+    from offboard.flight.configuration import flown, load
+
+    if (flight is None) == (connect is None and not sitl):
+        raise CommandError("name a FLIGHT, or fly one first with --connect or --sitl; not both")
+    if output is not None and output.exists():
+        raise CommandError(f"{output} exists already; choose another file with -o")
+    if flight is None:
+        flight = out_directory or FLIGHTS / f"identify-{clock.local_stamp()}"
+        fly(sitl, connect, reference="identify", vehicle=vehicle, out_directory=flight)
+    path = tlog.find(flight)
+    log = tlog.read(path)
+    configuration = history.configuration(log)
+    if vehicle is None and configuration is not None:
+        believed = flown(configuration).vehicle
+    else:
+        believed = load("flight", choices={"vehicle": vehicle} if vehicle else {}).vehicle
+    found, trace = identify_flight(log, history.gather(log), believed)
+    text = vehicle_file(found, believed, flight.name)
+    shown = page or path.with_name("identify.html")
+    try:
+        shown.write_text(fits(flight.name, found, trace, believed), encoding="utf-8")
+        if not found.supported:
+            raise CommandError(f"nothing could be identified from this flight; {shown} says why", 1)
+        if output is not None:
+            output.write_text(text, encoding="utf-8")
+    except OSError as error:
+        raise CommandError(f"{error.filename} cannot be written ({error.strerror})") from None
+    out.print(text, end="", markup=False, soft_wrap=True)
+    written = f"{output} and {shown}" if output else f"{shown}; -o FILE writes the vehicle file"
+    say(f"written: {written}", indent=2)

@@ -1,0 +1,47 @@
+"""`offboard paper`: the tables and figures of the paper, ours beside theirs."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import typer
+
+from offboard.cli.shared import FLIGHTS, CommandError, Directory, Workers, err, option, say
+
+
+def paper(
+    out_directory: Directory = None,
+    quick: Annotated[bool, typer.Option("--quick", help="Fewer seeds; takes seconds.")] = False,
+    seeds: Annotated[int | None, option("N", "Flights per row.  [default: 20]")] = None,
+    initial_q: Annotated[
+        str | None, option("LIST", "diag(Q) of Eq. 23: 1 or 12 weights, separated by commas.")
+    ] = None,
+    figure: Annotated[list[str] | None, option("NAME", "Only this figure; repeatable.")] = None,
+    table: Annotated[list[str] | None, option("NAME", "Only this table; repeatable.")] = None,
+    workers: Workers = None,
+) -> None:
+    """Reproduce tables 2-4 and figures 4-17 of the paper on one page."""
+    from offboard.flight import clock
+    from offboard.paper.study.options import PaperOptions
+    from offboard.paper.study.run import reproduce
+
+    try:
+        weights = None if initial_q is None else tuple(float(w) for w in initial_q.split(","))
+    except ValueError:
+        raise CommandError(
+            f"--initial-q {initial_q}: 1 or 12 numbers with commas between"
+        ) from None
+    options = PaperOptions(
+        out=out_directory or FLIGHTS / f"paper-{clock.local_stamp()}",
+        quick=quick,
+        seeds=seeds,
+        initial_q=weights,
+        figures=tuple(figure or ()),
+        tables=tuple(table or ()),
+        workers=workers,
+    )
+    outcome = reproduce(options, err)
+    say(f"written: {outcome.page}", indent=2)
+    if outcome.missing:
+        parts = "; ".join(f"{label}: {why}" for label, why in outcome.missing.items())
+        raise CommandError(f"missing: {parts}", 1)

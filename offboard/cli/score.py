@@ -1,0 +1,63 @@
+"""`offboard score`: every figure of a flight, from its log."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from offboard.cli.shared import FLIGHT, CommandError, Requirements, complain, out
+
+if TYPE_CHECKING:
+    from offboard.analysis.history import History
+    from offboard.analysis.requirement import Requirement
+    from offboard.analysis.score import Score
+
+
+def score(
+    flight: Annotated[Path, FLIGHT],
+    as_json: Annotated[bool, typer.Option("--json", help="Print the score as JSON.")] = False,
+    require: Requirements = None,
+) -> None:
+    """Score a flight from its .tlog alone.
+
+    Prints what happened in the order of time, then every figure. Writes score.json if FLIGHT is a
+    directory.
+    """
+    from offboard.analysis.score_json import as_text
+    from offboard.analysis.score_table import show
+
+    requirements = requirements_of(require)
+    result, history = scored(flight)
+    if as_json:
+        sys.stdout.write(as_text(result, history))
+    else:
+        show(out, result, history)
+    figures = result.figures()
+    missed = [each.sentence(figures) for each in requirements if not each.met(figures)]
+    if missed:
+        raise CommandError("; ".join(missed), 1)
+
+
+def requirements_of(texts: list[str] | None) -> list[Requirement]:
+    """The requirements of --require. Raises RequirementError."""
+    from offboard.analysis.requirement import Requirement
+    from offboard.analysis.score import FIGURES
+
+    return [Requirement.parse(text, FIGURES) for text in texts or ()]
+
+
+def scored(flight: Path) -> tuple[Score, History]:
+    """Score a flight and keep the score in its directory. Raises TlogError."""
+    from offboard.analysis.trial import keep_score, score_flight
+    from offboard.flight.log import LogError
+
+    result, history = score_flight(flight)
+    if flight.is_dir():
+        try:
+            keep_score(flight, result, history)
+        except LogError as error:  # the score can still be printed
+            complain(str(error))
+    return result, history

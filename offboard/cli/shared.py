@@ -1,0 +1,82 @@
+"""What the commands share: output that fits the terminal, option types, and CommandError.
+
+The module of a command imports the rest of the package when the command runs, so that `--help` and
+wrong options are answered at once.
+"""
+
+from __future__ import annotations
+
+import textwrap
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from offboard.documents.errors import UserError
+
+out = Console(highlight=False)
+err = Console(stderr=True, highlight=False)
+
+DEFAULT_CONNECTION = "udpin:127.0.0.1:14540"
+FLIGHTS = Path("flights")  # parent of the flight directories that have no --out
+EXIT_CODES = (
+    "Exit codes: 0 flown and all requirements met; 1 a requirement missed; 2 usage or "
+    "configuration error, nothing sent; 3 not flown: no vehicle, refused, or stopped on the "
+    "ground; 4 aborted in flight, or left armed."
+)
+
+
+def option(metavar: str, text: str, *names: str) -> Any:
+    """A command-line option with a value, by default named as its parameter."""
+    return typer.Option(*names, metavar=metavar, help=text)
+
+
+NEW_DIRECTORY = "Directory of the results.  [default: a new one in flights]"
+FILE = "NAME|FILE"  # the name of a shipped file, or a path
+FLIGHT = typer.Argument(metavar="FLIGHT", help="Flight directory or .tlog file.")
+Directory = Annotated[Path | None, option("DIR", NEW_DIRECTORY, "--out")]
+Vehicle = Annotated[str | None, option(FILE, "Vehicle.")]
+Workers = Annotated[int | None, option("N", "Processes.  [default: one per processor]")]
+Requirements = Annotated[
+    list[str] | None,
+    option(
+        "FIGURE<NUMBER", "Exit with 1 if the score does not meet this; repeatable.", "--require"
+    ),
+]
+Assignments = Annotated[
+    list[str] | None,
+    option("KEY.PATH=VALUE", "Change one configuration value; repeatable.", "--set"),
+]
+
+
+class CommandError(UserError):
+    """Ends the command with one sentence on stderr and an exit code."""
+
+    def __init__(self, sentence: str, code: int = 2) -> None:
+        super().__init__(sentence)
+        self.code = code
+
+
+def say(text: str, indent: int = 0) -> None:
+    """Print a line to stdout, wrapped at words to the width; further lines are indented."""
+    out.print(_wrapped(text, out.width, indent), markup=False, soft_wrap=True)
+
+
+def complain(text: str) -> None:
+    """Print to stderr: wrapped on a terminal, else a line for each problem."""
+    lines = text.splitlines()
+    if err.is_terminal:
+        lines = [_wrapped(line, err.width, 2) for line in lines]
+    err.print("\n".join(lines), markup=False, soft_wrap=True)
+
+
+def _wrapped(text: str, width: int, indent: int) -> str:
+    """Paths and other long words stay whole, so that they can be copied."""
+    return textwrap.fill(
+        text,
+        width,
+        subsequent_indent=indent * " ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )

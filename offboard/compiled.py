@@ -1,0 +1,247 @@
+"""Compilation by numba: two decorators, when functions are compiled, where machine code is kept.
+
+    PAIR = np.dtype([("total", "f8"), ("count", "i8")], align=True)
+
+    @kernel
+    def mean(pair):
+        return pair.total / pair.count
+
+    @entry(PAIR, array(1))
+    def add(pairs, values):
+        pair = pairs[0]
+        for i in range(values.shape[0]):
+            pair.total += values[i]
+        pair.count += values.shape[0]
+        return mean(pair)
+
+    add(np.zeros(1, PAIR), np.ones(3))
+
+A kernel is called by compiled functions; called from Python it runs as Python. An entry is called
+from Python: the first call loads it from disk, or compiles it and its kernels, for seconds. Before
+anything that must not wait, `prepare` compiles the entries of all modules that are imported.
+Importing a module neither compiles nor imports numba.
+
+numba recompiles an entry when its source file has changed, but not when that of a kernel has. So
+machine code is kept in a directory that is named after all compiled sources.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import functools
+import gc
+import hashlib
+import importlib
+import os
+import re
+import shutil
+import stat
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Generic, ParamSpec, TypeVar, cast
+
+import numpy as np
+
+P = ParamSpec("P")
+R = TypeVar("R")
+F = TypeVar("F", bound=Callable[..., Any])
+
+Parameter = type[int] | type[float] | np.dtype[Any] | tuple[int, np.dtype[Any]]
+"""Of an entry: a number, an array of one record, or the dimensions and dtype of an array."""
+
+ENTRIES_PER_PROCESS = 3  # starting a process costs as much as compiling one of them
+VERSIONS_KEPT = 5  # directories of machine code, most recently used
+
+defined: list[Entry[Any, Any]] = []  # the entries of the modules imported so far
+_kernels: list[Callable[..., Any]] = []  # not yet registered with numba
+
+
+def kernel(function: F) -> F:
+    """Decorator of a function that entries and other kernels call."""
+    _kernels.append(function)
+    return function
+
+
+def array(dimensions: int, dtype: str | np.dtype[Any] = "f8") -> Parameter:
+    """Parameter of an entry: a C-contiguous array."""
+    return dimensions, np.dtype(dtype)
+
+
+def entry(*parameters: Parameter) -> Callable[[Callable[P, R]], Entry[P, R]]:
+    """Decorator of a function that Python calls. There is one parameter per argument: `int`,
+    `float`, `array(dimensions)`, or a dtype for an array of one record."""
+    return lambda function: Entry(function, parameters)
+
+
+class Entry(Generic[P, R]):
+    """A compiled function. Calling it with arguments of other types raises TypeError."""
+
+    def __init__(self, function: Callable[P, R], parameters: tuple[Parameter, ...]) -> None:
+        self.name = f"{function.__module__}.{function.__name__}"
+        self.machine_code: Callable[P, R] | None = None  # once it is loaded
+        self._function, self._parameters = function, parameters
+        functools.update_wrapper(self, function)
+        defined.append(self)
+
+    def __call__(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        code = self.machine_code or self.load()
+        return code(*args, **kwargs)
+
+    @property
+    def is_compiled(self) -> bool:
+        """Whether its machine code is on disk."""
+        mark = directory() / self.name
+        return mark.exists() and mark.stat().st_size > 0
+
+    def load(self, wait: bool = True) -> Callable[P, R]:
+        """The machine code, from disk or compiled now. Raises BlockingIOError while another process
+        compiles it, unless it may `wait` for that."""
+        with (directory() / self.name).open("a") as mark:  # not empty once it is compiled
+            fcntl.flock(mark, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
+            with _without_garbage_collection():
+                code = self.machine_code = self._compile()
+            if mark.tell() == 0:
+                mark.write("compiled\n")
+        return code
+
+    def _compile(self) -> Callable[P, R]:
+        import numba
+        from numba.extending import register_jitable
+
+        while _kernels:
+            register_jitable(error_model="numpy")(_kernels.pop())
+        signature = tuple(map(_numba_type, self._parameters))
+        config: Any = numba.config
+        others, config.CACHE_DIR = config.CACHE_DIR, str(directory())
+        try:
+            jitted = numba.njit(signature, cache=True, error_model="numpy")(self._function)
+        finally:
+            config.CACHE_DIR = others
+        return cast(Callable[P, R], jitted)
+
+
+def _numba_type(parameter: Parameter) -> Any:
+    from numba import float64, from_dtype, int64, types
+
+    if isinstance(parameter, type):
+        return {int: int64, float: float64}[parameter]
+    dimensions, dtype = parameter if isinstance(parameter, tuple) else (1, parameter)
+    return types.Array(from_dtype(dtype), dimensions, "C")
+
+
+@contextmanager
+def _without_garbage_collection() -> Iterator[None]:
+    """numba creates so many objects that collection takes a third of the time of loading."""
+    enabled = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if enabled:
+            gc.enable()
+
+
+def prepare(tell: Callable[[str], None] = lambda sentence: None) -> None:
+    """Compile the entries of all imported modules, if they are not on disk, with one process per
+    processor. `tell` is called with a sentence for the user before it takes long."""
+    missing = [each for each in defined if not each.is_compiled]
+    if not missing:
+        return
+    tell("first run on this machine: compiling, about 15 s")
+    modules = sorted({each.__module__ for each in missing})
+    command = (sys.executable, "-P", "-m", "offboard.compiled", *modules)
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    silent = subprocess.DEVNULL
+    others = [
+        subprocess.Popen(command, env=environment, stdin=silent, stdout=silent, stderr=silent)
+        for _ in range(1, min(os.cpu_count() or 1, len(missing) // ENTRIES_PER_PROCESS))
+    ]
+    _compile_free(missing)
+    for process in others:
+        process.wait()
+
+
+def _compile_free(entries: Iterable[Entry[Any, Any]]) -> None:
+    """Compile the entries that are not on disk and that no other process is compiling."""
+    for each in entries:
+        if not each.is_compiled:
+            with suppress(BlockingIOError):
+                each.load(wait=False)
+
+
+def main(modules: Sequence[str]) -> None:
+    """`python -m offboard.compiled MODULE...`: compile the entries that these modules import."""
+    for name in modules:
+        importlib.import_module(name)
+    _compile_free(defined)
+
+
+@functools.cache
+def directory() -> Path:
+    """Where machine code of these sources is kept, below the first of NUMBA_CACHE_DIR,
+    XDG_CACHE_HOME, ~/.cache and the directory for temporary files that is absolute and in which
+    only this user can write. Raises OSError if there is none."""
+    candidates = [os.environ.get(name, "") for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")]
+    candidates += [os.path.expanduser("~/.cache"), f"{tempfile.gettempdir()}/cache-{os.getuid()}"]
+    for base in (Path(each) / "pso-offboard" for each in candidates if os.path.isabs(each)):
+        place = base / _digest()
+        if _is_private(base) and _is_private(place):
+            os.utime(place)
+            versions = sorted(base.iterdir(), key=lambda each: each.stat().st_mtime)
+            for old in versions[:-VERSIONS_KEPT]:
+                shutil.rmtree(old, ignore_errors=True)
+            return place
+    raise OSError(f"no private directory for machine code: tried {', '.join(candidates)}")
+
+
+def _is_private(place: Path) -> bool:
+    """Make the directory; whether only this user can write in it: machine code is executed."""
+    try:
+        for part in (*reversed(place.parents), place):
+            part.mkdir(mode=0o700, exist_ok=True)  # parents=True would take the umask's mode
+        tempfile.TemporaryFile(dir=place).close()
+        status = place.lstat()
+    except OSError:
+        return False
+    ours = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid()
+    return ours and not status.st_mode & 0o022
+
+
+_COMPILED = re.compile(rb"^@(?:entry|kernel)\b", re.M)
+_IMPORT = re.compile(rb"^from ((?:offboard|simulator)[.\w]*) import (\([^)]*\)|.*)", re.M)
+_CONSTANT = re.compile(rb"\b[A-Z][A-Z0-9_]*\b")
+
+
+@functools.cache
+def _digest() -> str:
+    """Of the versions of Python and numba, of the modules with entries or kernels, and of those
+    that they import constants from, because these are compiled in."""
+    root = Path(__file__).parents[1]
+    sources = {
+        path.relative_to(root).as_posix(): path.read_bytes()
+        for package in ("offboard", "simulator")
+        for path in (root / package).rglob("*.py")
+    }
+    pending = [name for name, source in sources.items() if _COMPILED.search(source)]
+    taken: set[str] = set()
+    while pending:
+        taken.add(name := pending.pop())
+        for module, names in _IMPORT.findall(sources[name]):
+            path = module.decode().replace(".", "/") + ".py"
+            if _CONSTANT.search(names) and path in sources.keys() - taken:
+                pending.append(path)
+    digest = hashlib.sha256(f"{root} {sys.implementation.cache_tag} {version('numba')}".encode())
+    for name in sorted(taken):
+        digest.update(name.encode() + b"\0" + sources[name])
+    return digest.hexdigest()[:16]
+
+
+if __name__ == "__main__":
+    from offboard.compiled import main as compile_modules  # where the entries register themselves
+
+    compile_modules(sys.argv[1:])

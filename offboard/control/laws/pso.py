@@ -1,0 +1,50 @@
+"""The law `pso`: the cost of one held input and all that follows, minimised by the swarm."""
+
+from __future__ import annotations
+
+import math
+from typing import Literal
+
+from offboard.control.base import Decision, Situation
+from offboard.control.certificate import ExactMinimum, certify
+from offboard.control.swarm import QuadraticSwarm, RandomLanes, SwarmSettings
+from offboard.control.tracking import OneDecisionSettings, Tracking, decision
+from offboard.model.vehicle import Vehicle
+
+
+class PsoSettings(OneDecisionSettings):
+    """Settings of the law `pso`."""
+
+    law: Literal["pso"] = "pso"
+    swarm: SwarmSettings = SwarmSettings()
+
+    def build(self, vehicle: Vehicle, *, period_s: float, seed: int) -> PsoLaw:
+        return PsoLaw(vehicle, self, period_s=period_s, seed=seed)
+
+
+class PsoLaw:
+    """Searches within the bounds of each decision; certified against the exact minimum."""
+
+    def __init__(
+        self, vehicle: Vehicle, settings: PsoSettings, *, period_s: float = 0.1, seed: int = 0
+    ) -> None:
+        self.bandwidth_radps = settings.bandwidth_radps
+        self.tracking = Tracking(vehicle, settings, period_s, settings.feedforward)
+        self._vehicle = vehicle
+        self._swarm = QuadraticSwarm(settings.swarm, 4)
+        self._lanes = RandomLanes(seed)
+        self._exact = ExactMinimum(4)
+
+    def decide(self, situation: Situation) -> Decision:
+        problem = self.tracking.task(situation).problem
+        result = self._swarm.minimise(problem, self._lanes, (), situation.remaining_s)
+        return decision(result.best, certify(problem, result, self._exact))
+
+    def reset(self) -> None:
+        self._lanes.reset()
+        self.adopt(self._vehicle)
+
+    def adopt(
+        self, vehicle: Vehicle, bandwidth_limit_radps: float = math.inf, *, gains: bool = True
+    ) -> None:
+        self.tracking.adopt(vehicle, bandwidth_limit_radps, gains=gains)

@@ -1,0 +1,307 @@
+"""What the tracking laws share: target, deviations, cost and bounds of one decision.
+
+A tracking law chooses u = [T, b_cx, b_cy, course]: thrust per unit of mass, north and east of the
+commanded thrust direction, commanded heading. The cost of one decision is a convex quadratic in u:
+the stage cost while u is held plus the Riccati solution of the state that it leads to, both in
+deviations from the reference. Each law (`offboard.control.laws`) composes a `Tracking` and differs
+in how it answers the `Task`. Knows no autopilot and no clock.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import Annotated
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BeforeValidator, Field
+
+from offboard.control.base import (
+    Certificate,
+    ControllerSettings,
+    Decision,
+    DecisionError,
+    Situation,
+)
+from offboard.control.cost import BoxQuadratic
+from offboard.control.riccati import (
+    held_lead,
+    lateral_cost_to_go,
+    thrust_ripple,
+    tilt_ripple,
+    vertical_cost_to_go,
+)
+from offboard.model.axes import lead
+from offboard.model.command import Command
+from offboard.model.frames import wrap_pi
+from offboard.model.predicted_state import PredictedHeave, PredictedState
+from offboard.model.vehicle import Vehicle
+from offboard.reference.base import FlatSample, Reference
+from offboard.reference.flatness import flat_state
+
+Array = NDArray[np.float64]
+
+COURSE_BOX_RAD = 0.5  # about the feed-forward: the autopilot closes the yaw loop
+COURSE_CURVATURE = 1.0
+
+
+class TrackingSettings(ControllerSettings):
+    """One number, the bandwidth wc, sets the law: weights 1 on position, g^2 / wc^4 on b_c and
+    1 / wc^4 on the vertical thrust.
+
+    On PX4 and ArduCopter the error falls quickly up to 5 rad/s and slowly beyond. More than 5 rad/s
+    needs a known delay: until it is identified in flight, `delay_margin` lowers the bandwidth.
+
+    `feedback_limit` bounds each lateral component of b_c about its feed-forward: a swing from one
+    tilt limit to the other would run into the acceleration limit of the attitude loop and end in a
+    limit cycle. `tilt_limit` bounds each lateral component of b_c itself. `thrust_floor` is the
+    least thrust as a fraction of g.
+    """
+
+    bandwidth_radps: float = Field(default=7.0, ge=0.5, le=20)
+    feedback_limit: float = Field(default=0.3, gt=0, le=1)
+    tilt_limit: float = Field(default=0.7, gt=0, le=0.7)
+    thrust_floor: float = Field(default=0.2, ge=0, lt=1)
+
+
+def _share(value: object) -> object:
+    return float(value) if isinstance(value, bool) else value
+
+
+class OneDecisionSettings(TrackingSettings):
+    """Settings of the laws that look at a single moment of the reference.
+
+    `feedforward`, a fraction or false and true, scales the velocity and the higher derivatives of
+    the reference from which attitude and thrust are fed forward. The disturbance is always
+    compensated in full.
+    """
+
+    feedforward: Annotated[float, BeforeValidator(_share), Field(ge=0, le=1)] = 1.0
+
+
+@dataclass(frozen=True, slots=True)
+class Target:
+    """State and input that the reference asks for when the command acts. NED, SI; the ripple of
+    held commands (`riccati.hold_ripple`) is included.
+
+    Lateral, each (2,), north and east, at the time of the predicted state: position_ne_m,
+    velocity_ne_mps, thrust direction direction_ne and its rate direction_rate_ne_ps. Vertical, at
+    the time when the thrust acts: position_down_m, velocity_down_mps and T b_z, thrust_down_mps2.
+    Feed-forward of tilt (2,), vertical thrust and course, each taken half a period after its own
+    delay and led through its own response.
+    """
+
+    position_ne_m: Array
+    velocity_ne_mps: Array
+    direction_ne: Array
+    direction_rate_ne_ps: Array
+    position_down_m: float
+    velocity_down_mps: float
+    thrust_down_mps2: float
+    tilt_feedforward: Array
+    thrust_down_feedforward_mps2: float
+    course_feedforward_rad: float
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """What one decision is about.
+
+    `lateral` (4, 2), [p, v, b, b'] x [north, east], and `vertical` (3,), [z, v_z, T b_z], are the
+    deviations of the predicted state from the target; `upright` is its b_z. `problem` is the cost
+    of u (4,) and its bounds.
+    """
+
+    target: Target
+    lateral: Array
+    vertical: Array
+    upright: float
+    problem: BoxQuadratic
+
+    def inputs(self, deviation: Array) -> Array:
+        """u (4,), not clipped, for a deviation (3,) from the feed-forward: b_c north, b_c east and
+        vertical thrust."""
+        inputs = np.empty(4)
+        inputs[0] = (self.target.thrust_down_feedforward_mps2 + deviation[2]) / self.upright
+        inputs[1:3] = self.target.tilt_feedforward + deviation[:2]
+        inputs[3] = self.target.course_feedforward_rad
+        return inputs
+
+
+class Tracking:
+    """Makes the `Task` of each decision, for one vehicle and one bandwidth; `adopt` sets both.
+
+    `vehicle` is the vehicle in use; `lateral` and `vertical` are the models of its axes with the
+    optimal cost that follows one held input.
+    """
+
+    def __init__(
+        self,
+        vehicle: Vehicle,
+        settings: TrackingSettings,
+        period_s: float,
+        feedforward: float = 1.0,
+    ) -> None:
+        self.settings = settings
+        self.period_s = period_s
+        self._feedforward = feedforward
+        self.adopt(vehicle)
+
+    def adopt(
+        self, vehicle: Vehicle, bandwidth_limit_radps: float = math.inf, *, gains: bool = True
+    ) -> None:
+        """See `base.Adopting.adopt`."""
+        self.vehicle = vehicle
+        self._tilt_ripple = tilt_ripple(vehicle, self.period_s)
+        self._thrust_ripple = thrust_ripple(vehicle, self.period_s)
+        if gains:
+            bandwidth = min(self.settings.bandwidth_radps, bandwidth_limit_radps)
+            self.lateral = lateral_cost_to_go(vehicle, bandwidth, self.period_s)
+            self.vertical = vertical_cost_to_go(vehicle, bandwidth, self.period_s)
+
+    @property
+    def tilt_limit(self) -> float:
+        """Bound of each lateral component of b_c."""
+        return min(self.settings.tilt_limit, math.sin(self.vehicle.tilt_max_rad))
+
+    def task(self, situation: Situation) -> Task:
+        """The task of this tick. Raises DecisionError where its cost is not finite."""
+        state = situation.state
+        target = self.target(situation.reference, situation.time_s, state)
+        lateral, vertical = deviations(state, target)
+        upright = float(state.thrust_direction_ned[2])
+        problem = self._problem(target, lateral, vertical, upright)
+        if not _finite(problem):
+            raise DecisionError("the cost of this decision is not finite")
+        return Task(target, lateral, vertical, upright, problem)
+
+    def target(self, reference: Reference, time_s: float, state: PredictedState) -> Target:
+        """The target of a decision at `time_s`, for the state predicted to the time when its tilt
+        begins to act. The estimated disturbance is compensated in it."""
+        vehicle, period_s = self.vehicle, self.period_s
+        half_s = 0.5 * period_s
+        heave_s = heave_of(state).time_s
+        course_s = time_s + vehicle.yaw.delay_s + half_s
+        times = [state.time_s, state.time_s + half_s, heave_s, heave_s + half_s, course_s]
+        sample = reference.sample(np.array(times))
+        flat = flat_state(
+            _scaled(sample, self._feedforward),
+            vehicle.gravity_mps2,
+            vehicle.drag_per_mass_ps,
+            state.disturbance_ned_mps2,
+        )
+        b, b1 = flat.thrust_direction_ned, flat.thrust_direction_rate_ned_ps
+        b2 = flat.thrust_direction_acceleration_ned_ps2
+        tilt_slope = lead(b1[0, :2], b2[0, :2], np.zeros(2), vehicle.tilt)
+        thrust_slope = flat.thrust_rate_mps3[2] * b[2, 2] + flat.thrust_mps2[2] * b1[2, 2]
+        thrust_down = flat.thrust_mps2[2] * b[2, 2] + self._thrust_ripple * thrust_slope
+        led_thrust = flat.thrust_mps2[3] + vehicle.thrust_lag_s * flat.thrust_rate_mps3[3]
+        course = lead(
+            sample.course_rad[4],
+            sample.course_rate_radps[4],
+            sample.course_acceleration_radps2[4],
+            vehicle.yaw,
+        )
+        return Target(
+            position_ne_m=sample.position_ned_m[0, :2],
+            velocity_ne_mps=sample.velocity_ned_mps[0, :2],
+            direction_ne=b[0, :2] + self._tilt_ripple[0] * tilt_slope,
+            direction_rate_ne_ps=b1[0, :2] + self._tilt_ripple[1] * tilt_slope,
+            position_down_m=float(sample.position_ned_m[2, 2]),
+            velocity_down_mps=float(sample.velocity_ned_mps[2, 2]),
+            thrust_down_mps2=float(thrust_down),
+            tilt_feedforward=held_lead(b[1, :2], b1[1, :2], b2[1, :2], vehicle.tilt, period_s),
+            thrust_down_feedforward_mps2=float(led_thrust * b[3, 2]),  # T lags, not T b_z
+            course_feedforward_rad=float(course),
+        )
+
+    def _problem(
+        self, target: Target, lateral: Array, vertical: Array, upright: float
+    ) -> BoxQuadratic:
+        nominal = np.empty(4)
+        nominal[0] = target.thrust_down_feedforward_mps2 / upright
+        nominal[1:3] = target.tilt_feedforward
+        nominal[3] = target.course_feedforward_rad
+        curvature = np.empty(4)
+        curvature[0] = self.vertical.curvature * upright**2
+        curvature[1:3] = self.lateral.curvature
+        curvature[3] = COURSE_CURVATURE
+        slope = np.zeros(4)  # of J at the nominal input
+        slope[0] = upright * (self.vertical.coupling @ vertical)
+        slope[1:3] = self.lateral.coupling @ lateral
+        rest = vertical @ self.vertical.state_cost @ vertical
+        rest += np.sum(lateral * (self.lateral.state_cost @ lateral))
+        gradient = slope - curvature * nominal
+        constant = 0.5 * rest + nominal @ (0.5 * curvature * nominal - slope)
+        lower, upper = self._box(nominal)
+        return BoxQuadratic(np.diag(curvature), gradient, float(constant), lower, upper)
+
+    def _box(self, nominal: Array) -> tuple[Array, Array]:
+        """Lower and upper (4,): thrust, |b_c| and |b_c - b_ff| per axis, course about its
+        feed-forward. A feed-forward beyond the tilt limit counts as being at the limit."""
+        settings, vehicle, limit = self.settings, self.vehicle, self.tilt_limit
+        centre = np.clip(nominal[1:3], -limit, limit)
+        lower, upper = np.empty(4), np.empty(4)
+        lower[0], upper[0] = settings.thrust_floor * vehicle.gravity_mps2, vehicle.thrust_max_mps2
+        lower[1:3] = np.maximum(centre - settings.feedback_limit, -limit)
+        upper[1:3] = np.minimum(centre + settings.feedback_limit, limit)
+        lower[3], upper[3] = nominal[3] - COURSE_BOX_RAD, nominal[3] + COURSE_BOX_RAD
+        return lower, upper
+
+
+def _scaled(sample: FlatSample, share: float) -> FlatSample:
+    """The sample with velocity and higher derivatives of position times `share`."""
+    if share == 1.0:
+        return sample
+    return replace(
+        sample,
+        velocity_ned_mps=share * sample.velocity_ned_mps,
+        acceleration_ned_mps2=share * sample.acceleration_ned_mps2,
+        jerk_ned_mps3=share * sample.jerk_ned_mps3,
+        snap_ned_mps4=share * sample.snap_ned_mps4,
+    )
+
+
+def deviations(state: PredictedState, target: Target) -> tuple[Array, Array]:
+    """`Task.lateral` (4, 2) and `Task.vertical` (3,) of a predicted state."""
+    lateral = np.empty((4, 2))
+    lateral[0] = state.position_ned_m[:2] - target.position_ne_m
+    lateral[1] = state.velocity_ned_mps[:2] - target.velocity_ne_mps
+    lateral[2] = state.thrust_direction_ned[:2] - target.direction_ne
+    lateral[3] = state.thrust_direction_rate_ned_ps[:2] - target.direction_rate_ne_ps
+    heave = heave_of(state)
+    vertical = np.array(
+        [
+            heave.position_down_m - target.position_down_m,
+            heave.velocity_down_mps - target.velocity_down_mps,
+            heave.thrust_down_mps2 - target.thrust_down_mps2,
+        ]
+    )
+    return lateral, vertical
+
+
+def heave_of(state: PredictedState) -> PredictedHeave:
+    """The vertical motion when the thrust acts; at `state.time_s` where it was not predicted."""
+    return state.heave or PredictedHeave(
+        time_s=state.time_s,
+        position_down_m=float(state.position_ned_m[2]),
+        velocity_down_mps=float(state.velocity_ned_mps[2]),
+        thrust_down_mps2=float(state.thrust_mps2 * state.thrust_direction_ned[2]),
+    )
+
+
+def decision(inputs: Array, certificate: Certificate) -> Decision:
+    """The decision for u (4,)."""
+    thrust, north, east, course = (float(value) for value in inputs)
+    down = math.sqrt(1.0 - north * north - east * east)
+    return Decision(Command(thrust, (north, east, down), wrap_pi(course)), certificate)
+
+
+def _finite(problem: BoxQuadratic) -> bool:
+    return bool(
+        math.isfinite(problem.constant)
+        and np.isfinite(problem.gradient).all()
+        and np.isfinite(problem.lower).all()
+        and np.isfinite(np.diag(problem.hessian)).all()
+    )

@@ -1,0 +1,299 @@
+"""Delay, natural frequency and damping of tilt and yaw from commanded and measured attitude.
+
+The model is s'' = wn^2 (c(t - delay) - s) - 2 z wn s' (`AxisResponse`). A bounded least-squares
+search finds its three parameters; the unknown state at the start and a constant offset are
+projected out. A link loses commands, which makes outliers, so residuals are taken for Student's t
+(Lange, Little and Taylor, 1989). Times in s, tilt in parts of a unit vector, yaw in rad.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Generator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import approx_fprime, least_squares
+
+from offboard.identification.response import free_motion, second_order
+from offboard.identification.trace import (
+    COURSE,
+    NORTH,
+    SENT_AT,
+    SENT_COURSE,
+    SENT_NORTH,
+    STAMP,
+    Trace,
+    thinned,
+)
+from offboard.identification.uncertainty import (
+    FREEDOM,
+    Estimate,
+    lag_count,
+    long_run_covariance,
+    sandwich,
+    scale_of,
+    student_t_loss,
+    student_t_weights,
+)
+from offboard.model.vehicle import AxisResponse
+
+Array = NDArray[np.float64]
+
+# Parameters in this order, with their bounds and the scale of a step of the search.
+DELAY, FREQUENCY, DAMPING = 0, 1, 2
+LOWER = np.array([0.0, 0.5, 0.1])
+UPPER = np.array([0.5, 60.0, 3.0])
+STEP_SCALES = np.array([0.03, 5.0, 0.3])
+# Start points: the search goes on from the one that explains most.
+STARTS = np.array(
+    [(delay_s, frequency, 0.7) for delay_s in (0.02, 0.08, 0.16, 0.3) for frequency in (4.0, 11.0)]
+)
+# Evaluations of one least-squares search, and how often residual weights are computed anew.
+STEPS, ROUNDS = 10, 2
+RELATED_S = 0.3  # time over which an attitude estimator's errors are autocorrelated
+SPACING_S = 0.018  # closer samples are left out: the responses are slower
+# Model error that no residual shows, as sd of delay (s), frequency (relative) and damping: PX4's
+# loop is not of second order and gives values this far apart for steps, swings and hover.
+MODEL_SDS = (0.002, 0.025, 0.025)
+# Limits on the motion that the current estimate leaves unexplained: rad, share of the commanded.
+UNEXPLAINED, UNEXPLAINED_SHARE = 0.008, 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class _Axis:
+    """Least commanded motion (rad rms), and the greatest accepted sd of delay (s), natural
+    frequency (relative) and damping."""
+
+    name: str
+    least_command_rad: float
+    sd_limits: tuple[float, float, float]
+
+
+TILT = _Axis("tilt", 0.004, (0.01, 0.15, 0.15))
+YAW = _Axis("yaw", 0.008, (0.04, 0.15, 0.2))
+EXPLAINED = 0.6  # least share of the commanded motion that the fitted response must explain
+
+
+@dataclass(frozen=True, slots=True)
+class ResponseFit:
+    """An identified axis. `residual_rms`: of the residuals without outliers; `commanded_rms`: of
+    the command about its mean; both in the unit of the signal."""
+
+    delay_s: Estimate
+    natural_frequency_radps: Estimate
+    damping: Estimate
+    residual_rms: float
+    commanded_rms: float
+
+
+@dataclass(frozen=True, slots=True)
+class Unexplained:
+    """Tilt that a response leaves unexplained: rms without outliers, and rms of the command; parts
+    of a unit vector."""
+
+    rms: float
+    commanded_rms: float
+
+    @property
+    def limit(self) -> float:
+        return max(UNEXPLAINED, UNEXPLAINED_SHARE * self.commanded_rms)
+
+    @property
+    def contradicts(self) -> bool:
+        """Whether telemetry contradicts the response."""
+        return self.rms > self.limit
+
+
+def tilt_signals(trace: Trace) -> tuple[Array, Array, Array, Array]:
+    """Times (N,), thrust directions (N, 2), and when (M,) which (M, 2) were commanded."""
+    signals = trace.attitude[:, NORTH : NORTH + 2]
+    commands = trace.commands[:, SENT_NORTH : SENT_NORTH + 2]
+    return trace.attitude[:, STAMP], signals, trace.commands[:, SENT_AT], commands
+
+
+def yaw_signals(trace: Trace) -> tuple[Array, Array, Array, Array]:
+    """Times (N,), courses (N, 1), and when (M,) which (M, 1) were commanded; rad, unwrapped."""
+    signals = np.unwrap(trace.attitude[:, COURSE])[:, None]
+    commands = np.unwrap(trace.commands[:, SENT_COURSE])[:, None]
+    return trace.attitude[:, STAMP], signals, trace.commands[:, SENT_AT], commands
+
+
+def fit_tilt(trace: Trace, refusals: dict[str, str]) -> Generator[None, None, ResponseFit | None]:
+    """Both components of the thrust direction, in pieces of some milliseconds. Returns None, and
+    the reason as `refusals["tilt"]`, if `trace` does not determine the response."""
+    return (yield from _fit_axis(TILT, tilt_signals(trace), refusals))
+
+
+def fit_yaw(
+    trace: Trace, refusals: dict[str, str], delay: Estimate
+) -> Generator[None, None, ResponseFit | None]:
+    """The course, as `fit_tilt`; `delay` is what is known of its delay beforehand."""
+    return (yield from _fit_axis(YAW, yaw_signals(trace), refusals, delay))
+
+
+def _fit_axis(
+    axis: _Axis,
+    measured: tuple[Array, Array, Array, Array],
+    refusals: dict[str, str],
+    delay: Estimate | None = None,
+) -> Generator[None, None, ResponseFit | None]:
+    times, _, sent_at, commands = measured
+    if len(times) < 50 or len(sent_at) < 3:
+        refusals[axis.name] = f"{len(times)} attitudes and {len(sent_at)} commands are too few"
+        return None
+    moved = commanded_rms(times, sent_at, commands)
+    if moved < axis.least_command_rad:
+        refusals[axis.name] = (
+            f"its command moved by {1e3 * moved:.1f} mrad rms, "
+            f"{1e3 * axis.least_command_rad:.0f} mrad are needed: fly steps"
+        )
+        return None
+    fit = yield from fit_response(*measured, delay)
+    refusal = _refusal(fit, axis.sd_limits)
+    if refusal is not None:
+        refusals[axis.name] = refusal
+        return None
+    return fit
+
+
+def _refusal(fit: ResponseFit, sd_limits: tuple[float, float, float]) -> str | None:
+    """Why a fit is rejected, or None."""
+    if fit.residual_rms > (1.0 - EXPLAINED) * fit.commanded_rms:
+        return (
+            f"it does not follow its command: {1e3 * fit.residual_rms:.1f} mrad rms of "
+            f"{1e3 * fit.commanded_rms:.1f} commanded are unexplained"
+        )
+    scales = (1.0, fit.natural_frequency_radps.value, 1.0)
+    names = ("delay (s)", "natural frequency (rad/s)", "damping")
+    estimates = (fit.delay_s, fit.natural_frequency_radps, fit.damping)
+    for index, (name, estimate) in enumerate(zip(names, estimates, strict=True)):
+        margin = 1e-3 * (UPPER[index] - LOWER[index])
+        at_lower = index != DELAY and estimate.value < LOWER[index] + margin
+        if at_lower or estimate.value > UPPER[index] - margin:
+            return f"its {name} is at the limit of the search, {estimate.value:.3g}"
+        limit = sd_limits[index] * scales[index]
+        if not estimate.sd <= limit:
+            return f"its {name} is uncertain: sd {estimate.sd:.2g}, limit {limit:.2g}; fly steps"
+    return None
+
+
+def unexplained(trace: Trace, response: AxisResponse) -> Unexplained:
+    """Tilt in `trace` that `response` does not explain."""
+    times, signals, sent_at, commands = tilt_signals(trace)
+    if len(times) < 20 or len(sent_at) < 3:
+        return Unexplained(0.0, 0.0)
+    parameters = (response.delay_s, response.natural_frequency_radps, response.damping)
+    problem = ResponseProblem(times, signals, sent_at, commands)
+    left = problem.residual(np.array(parameters), problem.even_weights)
+    return Unexplained(scale_of(left), commanded_rms(times, sent_at, commands))
+
+
+def commanded_rms(times: Array, sent_at: Array, commands: Array) -> float:
+    """Rms about their mean of the commands that acted within `times`."""
+    within = (sent_at >= times[0] - UPPER[DELAY]) & (sent_at <= times[-1])
+    if not within.any():
+        return 0.0
+    return float(np.sqrt(np.mean((commands[within] - commands[within].mean(axis=0)) ** 2)))
+
+
+def fit_response(
+    times: Array,
+    signals: Array,
+    sent_at: Array,
+    commands: Array,
+    delay: Estimate | None = None,
+) -> Generator[None, None, ResponseFit]:
+    """The response that explains `signals` (N, axes) at `times` (N,) under `commands` (M, axes)
+    sent at `sent_at` (M,), in two pieces; at least 50 samples and 3 commands. `delay` is what is
+    known of the delay beforehand."""
+    problem = ResponseProblem(times, signals, sent_at, commands)
+    start = problem.search()
+    yield
+    best, weights, scale = problem.refine(start)
+    covariance = problem.covariance(best, weights, scale)
+    covariance += np.diag((MODEL_SDS[0], MODEL_SDS[1] * best[FREQUENCY], MODEL_SDS[2])) ** 2
+    if delay is not None:  # Kalman update
+        gain = covariance[:, DELAY] / (covariance[DELAY, DELAY] + delay.sd**2)
+        best = np.clip(best + gain * (delay.value - best[DELAY]), LOWER, UPPER)
+        covariance = covariance - np.outer(gain, covariance[DELAY])
+    sds = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    found = (Estimate(float(value), float(sd)) for value, sd in zip(best, sds, strict=True))
+    delay_s, frequency, damping = found
+    moved = commanded_rms(times, sent_at, commands)
+    return ResponseFit(delay_s, frequency, damping, residual_rms=scale, commanded_rms=moved)
+
+
+class ResponseProblem:
+    """Least-squares problem of the measured `signals` (N, axes) under `commands` (M, axes)."""
+
+    def __init__(self, times: Array, signals: Array, sent_at: Array, commands: Array) -> None:
+        kept = thinned(times, SPACING_S)
+        self._times, self._signals = times[kept], signals[kept]
+        self._sent_at, self._commands = sent_at, commands
+        self.even_weights = np.ones(len(kept))
+
+    def residual(self, parameters: Array, weights: Array) -> Array:
+        """Signals less response (N, axes), with free motion and a constant offset projected out
+        under `weights` (N,)."""
+        delay_s, frequency, damping = parameters
+        left = self._signals - second_order(
+            self._times, self._sent_at, self._commands, delay_s, frequency, damping
+        )
+        basis = np.ones((len(left), 3))
+        basis[:, :2] = free_motion(self._times - self._times[0], frequency, damping)[:, 0]
+        weighted = basis.T * weights
+        gram = weighted @ basis
+        gram += np.diag(1e-12 + 1e-9 * np.diag(gram))
+        residual: Array = left - basis @ np.linalg.solve(gram, weighted @ left)
+        return residual
+
+    def search(self) -> Array:
+        """Parameters (3,) of least squares from the best of STARTS, all samples alike."""
+        costs = [np.sum(self.residual(start, self.even_weights) ** 2) for start in STARTS]
+        return self._least_squares(STARTS[np.argmin(costs)], self.even_weights, ftol=1e-3)
+
+    def refine(self, parameters: Array) -> tuple[Array, Array, float]:
+        """The best parameters (3,) for Student's t residuals, their weights (N,) and scale, which
+        are computed ROUNDS times from the residuals reached."""
+        weights, loss = self.even_weights, partial(student_t_loss, axes=self._signals.shape[1])
+        for _ in range(ROUNDS):
+            left = self.residual(parameters, weights)
+            scale = scale_of(left)
+            weights = student_t_weights(left, scale)
+            parameters = self._least_squares(
+                parameters, weights, ftol=1e-6, loss=loss, f_scale=scale
+            )
+        left = self.residual(parameters, weights)
+        scale = scale_of(left)
+        return parameters, student_t_weights(left, scale), scale
+
+    def _least_squares(self, start: Array, weights: Array, **options: Any) -> Array:
+        found: Array = least_squares(
+            lambda parameters: self.residual(parameters, weights).ravel(),
+            start,
+            bounds=(LOWER, UPPER),
+            x_scale=STEP_SCALES,
+            max_nfev=STEPS,
+            **options,
+        ).x
+        return found
+
+    def covariance(self, best: Array, weights: Array, scale: float) -> Array:
+        """Covariance (3, 3) of an M-estimate (Huber, 1967) with autocorrelated residuals."""
+        left = self.residual(best, weights)
+        count, axes = left.shape
+        slopes = approx_fprime(
+            best, lambda tried: self.residual(tried, weights).ravel(), 1e-3 * STEP_SCALES
+        ).reshape(count, axes, 3)
+        spacing_s = (self._times[-1] - self._times[0]) / max(count - 1, 1)
+        lags = lag_count(RELATED_S, spacing_s, count)
+        far = FREEDOM * scale**2 + np.sum(left**2, axis=1)
+        curvature, scores_covariance = np.zeros((3, 3)), np.zeros((3, 3))
+        for rows, axis in zip(slopes.swapaxes(0, 1), left.T, strict=True):
+            curvatures = weights * (1.0 - 2.0 * axis**2 / far)
+            curvature += rows.T @ (curvatures[:, None] * rows)
+            scores_covariance += long_run_covariance((weights * axis)[:, None] * rows, lags)
+        return sandwich(curvature, scores_covariance)

@@ -1,0 +1,72 @@
+"""An identified constant with its standard deviation, and the statistics of residuals behind it.
+
+Residuals are autocorrelated over the time in which an estimator's error wanders, so the covariance
+of a fit is the sandwich of Newey and West (1987): the curvature of the cost around the long-run
+covariance of its gradient. Where residuals have outliers, they are taken for Student's t (Lange,
+Little and Taylor, 1989), with one weight for all axes of a sample.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+
+FREEDOM = 3.0  # degrees of freedom of Student's t
+LEAST_SCALE = 2e-4  # of residuals: smaller ones all have the same weight
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """A value and its standard deviation, both in the unit that the field's name ends with."""
+
+    value: float
+    sd: float
+
+
+def lag_count(related_s: float, spacing_s: float, samples: int) -> int:
+    """Number of lags over which samples `spacing_s` apart count as autocorrelated."""
+    return min(max(round(related_s / max(spacing_s, 1e-4)), 1), samples // 4)
+
+
+def long_run_covariance(scores: Array, lags: int) -> Array:
+    """Covariance (k, k) of the sum of an autocorrelated series `scores` (N, k), with Bartlett
+    weights that fall to zero after `lags`."""
+    covariance = scores.T @ scores
+    for lag in range(1, lags + 1):
+        related = scores[lag:].T @ scores[:-lag]
+        covariance += (1.0 - lag / (lags + 1.0)) * (related + related.T)
+    return covariance
+
+
+def sandwich(curvature: Array, scores_covariance: Array) -> Array:
+    """Covariance (k, k) of estimates from the curvature J'J of their cost and the covariance of
+    its gradient."""
+    inverse = np.linalg.pinv(curvature)
+    covariance: Array = inverse @ scores_covariance @ inverse
+    return covariance
+
+
+def scale_of(residuals: Array) -> float:
+    """Standard deviation without outliers, from the median of the magnitudes."""
+    return max(float(np.median(np.abs(residuals))) / 0.6745, LEAST_SCALE)
+
+
+def student_t_weights(residuals: Array, scale: float) -> Array:
+    """Weights (N,) of `residuals` (N, axes)."""
+    axes = residuals.shape[1]
+    far = FREEDOM + np.sum(residuals**2, axis=1) / scale**2
+    weights: Array = (FREEDOM + axes) / far
+    return weights
+
+
+def student_t_loss(squares: Array, axes: int) -> Array:
+    """`loss` of scipy.optimize.least_squares: loss and its two derivatives (3, N axes) for squares
+    (N axes,) of scaled residuals."""
+    far = FREEDOM + squares.reshape(-1, axes).sum(axis=1)
+    slope = (FREEDOM + axes) / far
+    loss = (FREEDOM + axes) / axes * np.log(far / FREEDOM)
+    return np.repeat((loss, slope, -slope / far), axes, axis=1)

@@ -1,0 +1,248 @@
+"""All constants of one vehicle that a stretch of its flight determines, each with its uncertainty.
+
+What the flight does not determine stays None, and a sentence says why: a hover without steps shows
+no attitude response, drag needs motion, and the thrust's lag needs a thrust that varies. The fits
+run in pieces of some milliseconds, so that each can be done between two control ticks.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Generator, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, TypeVar
+
+import numpy as np
+
+from offboard.identification.attitude_fit import ResponseFit, fit_tilt, fit_yaw
+from offboard.identification.estimator_noise import EstimatorNoise, estimator_noise
+from offboard.identification.motion_fit import (
+    DRAG_SPACING_S,
+    DRAG_UPPER_PS,
+    Motion,
+    VerticalFit,
+    VerticalPrior,
+    fit_drag,
+    fit_vertical,
+)
+from offboard.identification.trace import Trace
+from offboard.identification.uncertainty import Array, Estimate
+from offboard.model.vehicle import AxisResponse, Vehicle
+
+Result = TypeVar("Result")
+Pieces = Generator[None, None, Result]
+
+LEAST_SECONDS = 2.0
+# Least motion: horizontal speed, rms; change of thrust, rms, as a fraction of the hover thrust.
+LEAST_SPEED_MPS, LEAST_THRUST_CHANGE = 0.4, 0.015
+# Greatest accepted standard deviations; of the hover thrust as a fraction of it.
+DRAG_SD_PS, HOVER_SD, EFFECT_SD_S = 0.2, 0.02, 0.03
+DRAG_PRIOR_PS = Estimate(0.6, 0.4)
+# A link adds the same to all delays. These are the sd of what remains of the delays of yaw and
+# thrust, of the thrust's lag, and of the link's delay while the tilt is not identified.
+YAW_DELAY_SD_S, THRUST_DELAY_SD_S, THRUST_LAG_SD_S, LINK_SD_S = 0.1, 0.03, 0.05, 0.15
+
+
+@dataclass(frozen=True, slots=True)
+class Identified:
+    """Constants identified from `seconds` of flight. What could not be identified is None, and
+    `refusals` has the reason under the field's name.
+
+    Delays run from the vehicle time of the newest telemetry when a command is sent to its effect.
+    """
+
+    seconds: float
+    tilt: ResponseFit | None = None
+    yaw: ResponseFit | None = None
+    hover_thrust: Estimate | None = None
+    thrust_lag_s: Estimate | None = None
+    thrust_delay_s: Estimate | None = None
+    drag_ps: Estimate | None = None
+    noise: EstimatorNoise | None = None
+    refusals: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def supported(self) -> bool:
+        """Whether anything at all was identified."""
+        found = (self.tilt, self.yaw, self.hover_thrust, self.thrust_lag_s, self.drag_ps)
+        return any(each is not None for each in found)
+
+    def applied_to(self, vehicle: Vehicle) -> Vehicle:
+        """`vehicle` with the identified constants; the others stay as they are."""
+        found: dict[str, object] = {}
+        for name, fit in (("tilt", self.tilt), ("yaw", self.yaw)):
+            if fit is not None:
+                found[name] = AxisResponse(
+                    delay_s=fit.delay_s.value,
+                    natural_frequency_radps=fit.natural_frequency_radps.value,
+                    damping=fit.damping.value,
+                )
+        for name, estimate in (
+            ("hover_thrust", self.hover_thrust),
+            ("thrust_lag_s", self.thrust_lag_s),
+            ("thrust_delay_s", self.thrust_delay_s),
+        ):
+            if estimate is not None:
+                found[name] = estimate.value
+        if self.drag_ps is not None:
+            found["drag_translation_npmps"] = (self.drag_ps.value * vehicle.mass_kg,) * 3
+        return vehicle.model_validate(vehicle.model_dump() | found)
+
+
+def identify(trace: Trace, vehicle: Vehicle) -> Identified:
+    """Identify every constant that a stretch of flight determines.
+
+    Args:
+        trace: commands sent, attitudes and positions received; see `Trace` for shapes and units.
+        vehicle: the vehicle file's constants: gravity, the start of each search, and how the
+            delays of tilt, yaw and thrust differ from each other.
+
+    Returns:
+        The constants with standard deviations, the reasons for those that are missing, and the
+        noise of the vehicle's estimator. Nothing is raised, whatever the flight contains.
+
+    Example:
+        found = identify(clean(commands, attitude, position), vehicle)
+        better = found.applied_to(vehicle)
+    """
+    found = completed(identify_in_pieces(trace, vehicle))
+    return replace(found, noise=estimator_noise(trace)) if found.seconds else found
+
+
+def completed(pieces: Pieces[Result]) -> Result:
+    """The result of work in pieces, done at once."""
+    while True:
+        try:
+            next(pieces)
+        except StopIteration as done:
+            result: Result = done.value
+            return result
+
+
+def identify_in_pieces(trace: Trace, vehicle: Vehicle) -> Pieces[Identified]:
+    """`identify` without the estimator's noise, some milliseconds of work at each step."""
+    refusals: dict[str, str] = {}
+    seconds = _seconds(trace)
+    if seconds < LEAST_SECONDS:
+        reason = f"{seconds:.1f} s of flight, {LEAST_SECONDS:.0f} s are needed"
+        names = ("tilt", "yaw", "hover_thrust", "thrust_lag_s", "drag_ps")
+        return Identified(0.0, refusals=dict.fromkeys(names, reason))
+    tilt = yield from fit_tilt(trace, refusals)
+    yield
+    link = _link_delay(tilt, vehicle)
+    yaw_delay = _with_link(vehicle.yaw.delay_s, YAW_DELAY_SD_S, link)
+    yaw = yield from fit_yaw(trace, refusals, yaw_delay)
+    yield
+    found = Identified(seconds, tilt, yaw, refusals=refusals)
+    motion = Motion(trace)
+    if not motion.sufficient:
+        reason = f"{motion.counts} are too few"
+        refusals |= dict.fromkeys(("hover_thrust", "thrust_lag_s", "drag_ps"), reason)
+        return found
+    thrust_delay = _with_link(vehicle.thrust_delay_s, THRUST_DELAY_SD_S, link)
+    thrust_lag = Estimate(vehicle.thrust_lag_s, THRUST_LAG_SD_S)
+    prior = VerticalPrior(vehicle.hover_thrust, thrust_delay, thrust_lag, DRAG_PRIOR_PS)
+    vertical = fit_vertical(motion, vehicle.gravity_mps2, prior)
+    drag: Estimate | None = None
+    if _fast_enough(motion, refusals):
+        yield
+        hover = vertical.hover_thrust.value
+        delay_and_lag_s = vertical.thrust_delay_s.value, vertical.thrust_lag_s.value
+        thrust_mps2 = vehicle.gravity_mps2 / hover * motion.thrust(*delay_and_lag_s)
+        drag = _accepted_drag(fit_drag(motion, thrust_mps2, DRAG_PRIOR_PS.value), refusals)
+        if drag is not None:
+            yield
+            drag_ps = Estimate(drag.value, max(drag.sd, 0.2 * drag.value, 0.05))
+            prior = replace(prior, hover_thrust=hover, drag_ps=drag_ps)
+            vertical = fit_vertical(motion, vehicle.gravity_mps2, prior)
+    return replace(found, drag_ps=drag, **_accepted_vertical(motion, vertical, refusals))
+
+
+def identify_tilt(trace: Trace) -> Pieces[Identified]:
+    """The tilt response alone, in two pieces."""
+    refusals: dict[str, str] = {}
+    tilt = yield from fit_tilt(trace, refusals)
+    return Identified(_seconds(trace), tilt=tilt, refusals=refusals)
+
+
+def identify_drag(trace: Trace, vehicle: Vehicle) -> Identified:
+    """The drag alone, given the other constants of `vehicle`; some milliseconds for 25 s of
+    flight."""
+    refusals: dict[str, str] = {}
+    seconds = _seconds(trace)
+    drag: Estimate | None = None
+    if seconds < LEAST_SECONDS or not (motion := Motion(trace, DRAG_SPACING_S)).sufficient:
+        refusals["drag_ps"] = "too few positions and commands"
+    elif _fast_enough(motion, refusals):
+        thrust = motion.thrust(vehicle.thrust_delay_s, vehicle.thrust_lag_s)
+        fit = fit_drag(motion, vehicle.thrust_max_mps2 * thrust, vehicle.drag_per_mass_ps)
+        drag = _accepted_drag(fit, refusals)
+    return Identified(seconds, drag_ps=drag, refusals=refusals)
+
+
+def _seconds(trace: Trace) -> float:
+    """Length of a trace; 0 without attitude or position."""
+    seconds = trace.end_s - trace.begin_s
+    return max(seconds, 0.0) if math.isfinite(seconds) else 0.0
+
+
+def _link_delay(tilt: ResponseFit | None, vehicle: Vehicle) -> Estimate:
+    """Delay that the link adds to those of the vehicle file, by the tilt's delay."""
+    if tilt is None:
+        return Estimate(0.0, LINK_SD_S)
+    return Estimate(tilt.delay_s.value - vehicle.tilt.delay_s, tilt.delay_s.sd)
+
+
+def _with_link(delay_s: float, own_sd_s: float, link: Estimate) -> Estimate:
+    return Estimate(max(delay_s + link.value, 0.0), math.hypot(own_sd_s, link.sd))
+
+
+def _fast_enough(motion: Motion, refusals: dict[str, str]) -> bool:
+    """Whether the vehicle moved fast enough to show its drag."""
+    speed_mps = motion.speed_mps
+    if speed_mps >= LEAST_SPEED_MPS:
+        return True
+    refusals["drag_ps"] = (
+        f"horizontal speed {speed_mps:.2f} m/s rms, {LEAST_SPEED_MPS} m/s are needed: "
+        "drag needs motion"
+    )
+    return False
+
+
+def _accepted_drag(drag: Estimate, refusals: dict[str, str]) -> Estimate | None:
+    if not 1e-3 < drag.value < 0.99 * DRAG_UPPER_PS:
+        refusals["drag_ps"] = f"the drag is at the limit of the search, {drag.value:.3g} 1/s"
+    elif not drag.sd <= DRAG_SD_PS:
+        refusals["drag_ps"] = f"the drag is uncertain: sd {drag.sd:.2g} 1/s, limit {DRAG_SD_PS}"
+    else:
+        return drag
+    return None
+
+
+def _accepted_vertical(
+    motion: Motion, fit: VerticalFit, refusals: dict[str, str]
+) -> dict[str, Any]:
+    """Those of hover thrust, thrust lag and thrust delay that are certain enough, by name."""
+    accepted: dict[str, Any] = {}
+    hover = fit.hover_thrust
+    if 0.02 < hover.value < 0.95 and hover.sd <= HOVER_SD * hover.value:
+        accepted["hover_thrust"] = hover
+    else:
+        refusals["hover_thrust"] = (
+            f"the hover thrust {hover.value:.3g} is uncertain: sd {hover.sd:.2g}"
+        )
+    thrust: Array = motion.thrust(fit.thrust_delay_s.value, fit.thrust_lag_s.value)
+    moved = float(np.std(thrust)) / hover.value
+    if moved < LEAST_THRUST_CHANGE:
+        refusals["thrust_lag_s"] = (
+            f"the thrust changed by {100.0 * moved:.1f} % rms, {100.0 * LEAST_THRUST_CHANGE:.1f} % "
+            "are needed: its lag shows in a climb"
+        )
+    elif not fit.thrust_effect_s.sd <= EFFECT_SD_S:
+        refusals["thrust_lag_s"] = (
+            f"delay and lag of the thrust are uncertain: sd {fit.thrust_effect_s.sd:.2g} s, "
+            f"limit {EFFECT_SD_S} s"
+        )
+    else:
+        accepted |= {"thrust_lag_s": fit.thrust_lag_s, "thrust_delay_s": fit.thrust_delay_s}
+    return accepted

@@ -1,0 +1,147 @@
+"""The phase table: complete, bounded, without cycles, every row and reason usable."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+from pair import hover
+
+from offboard.flight.assessment import Progress
+from offboard.flight.guards import Facts
+from offboard.flight.phases import ENDS, ExitCode, Limits, Phase
+from offboard.flight.transitions import TRANSITIONS, Row, next_row
+
+ON_TRACK = (Phase.JOIN, Phase.TRACK, Phase.HOVER)
+UNEVENTFUL = Facts(
+    limits=Limits(),
+    in_phase_s=0.0,
+    silence_s=0.0,
+    blind_s=0.0,
+    found=False,
+    ready=False,
+    misconfigured=False,
+    rebooted=False,
+    engaged=True,
+    landing=False,
+    failsafe=False,
+    armed=True,
+    in_the_air=False,
+    lifted_off=False,
+    at_start=False,
+    late_s=math.nan,
+    track_time_s=math.nan,
+    track_start_s=4.0,
+    track_end_s=20.0,
+    rest_time_s=23.5,
+    position_error_m=0.0,
+    tilt_rad=0.0,
+    stop_requested=False,
+    missed_decisions=0,
+    contradicted=False,
+)
+QUIET = {  # facts of a phase while nothing happens
+    Phase.HEALTH: {"engaged": False, "armed": False},
+    Phase.ENGAGE: {"engaged": False, "armed": False},
+    Phase.ARM: {"armed": False},
+    Phase.JOIN: {"track_time_s": 0.0},
+    Phase.TRACK: {"track_time_s": 4.0},
+    Phase.HOVER: {"track_time_s": 20.0},
+}
+EVENTS: dict[str, dict[str, object]] = {  # the facts that make each guard hold
+    "vehicle_found": {"found": True},
+    "ready": {"ready": True},
+    "misconfigured": {"misconfigured": True},
+    "armed_by_another": {"armed": True, "limits": Limits(begin_armed=False)},
+    "flown_by_another": {"engaged": True, "armed": True},
+    "rebooted": {"rebooted": True},
+    "needs_no_stream": {"lifted_by_command": True},
+    "streamed": {"in_phase_s": 1.0},
+    "engaged": {"engaged": True},
+    "engaged_in_the_air": {"engaged": True, "armed": True, "in_the_air": True},
+    "armed": {"armed": True},
+    "too_late_at_start": {"late_s": 91.0},
+    "lifted_off": {"lifted_off": True},
+    "at_start": {"at_start": True},
+    "at_start_to_excite": {"at_start": True, "excites": True},
+    "identified": {"identified": True},
+    "at_full_speed": {"track_time_s": 4.0},
+    "track_over": {"track_time_s": 20.0},
+    "at_rest": {"track_time_s": 23.5},
+    "disarmed": {"armed": False},
+    "disarmed_for_good": {"armed": False, "in_phase_s": 1.6},
+    "mode_left": {"engaged": False},
+    "mode_left_armed": {"engaged": False, "armed": True},
+    "landing_left": {"engaged": False},
+    "silent": {"silence_s": 1.01},
+    "lost": {"silence_s": 2.01},
+    "silent_on_ground": {"silence_s": 20.1},
+    "blind": {"blind_s": 0.51},
+    "stop_requested": {"stop_requested": True},
+    "diverged": {"position_error_m": 5.1},
+    "toppled": {"tilt_rad": 1.31},
+    "controller_failed": {"missed_decisions": 3},
+    "contradicted": {"contradicted": True},
+}
+
+
+def quiet(phase: Phase) -> Facts:
+    """Nothing happens in `phase`, which has just begun."""
+    return replace(UNEVENTFUL, **QUIET.get(phase, {}))
+
+
+def event_of(row: Row) -> dict[str, object]:
+    name = row.guard.__name__
+    if name.startswith("longer_than_"):
+        return {"in_phase_s": getattr(Limits(), name.removeprefix("longer_than_")) + 0.1}
+    return EVENTS[name]
+
+
+@pytest.mark.parametrize("phase", [phase for phase in Phase if phase not in ENDS])
+def test_no_event_no_transition_and_every_wait_is_limited(phase: Phase) -> None:
+    assert next_row(phase, quiet(phase)) is None
+    later = {"track_time_s": 1e4} if phase in ON_TRACK else {"in_phase_s": 1e4}
+    if phase is Phase.CLIMB:
+        later = {"late_s": 1e4}  # after the way that was planned
+    if phase is Phase.CONNECT:
+        later = {"silence_s": 1e4}  # only the wall clock runs before there is telemetry
+    assert next_row(phase, replace(quiet(phase), **later)) is not None
+
+
+@pytest.mark.parametrize("row", TRANSITIONS, ids=lambda r: f"{r.source.value}: {r.guard.__name__}")
+def test_every_row_is_reachable(row: Row) -> None:
+    assert next_row(row.source, replace(quiet(row.source), **event_of(row))) is row
+
+
+def test_every_phase_but_the_ends_has_rows() -> None:
+    assert {row.source for row in TRANSITIONS} == {phase for phase in Phase if phase not in ENDS}
+
+
+def test_every_row_leads_to_a_later_phase() -> None:
+    order = {phase: index for index, phase in enumerate(Phase)}
+    assert all(order[row.target] > order[row.source] for row in TRANSITIONS)
+
+
+def test_every_abnormal_end_has_an_exit_code() -> None:
+    """Its own, or that of each way into its phase."""
+    for row in TRANSITIONS:
+        if row.target in (Phase.FAILED, Phase.YIELDED) and row.exit_code is None:
+            ways_in = [way.exit_code for way in TRANSITIONS if way.target is row.source]
+            assert ways_in
+            assert None not in ways_in
+    assert {row.exit_code for row in TRANSITIONS} == {None, ExitCode.REFUSED, ExitCode.ABORTED}
+
+
+def test_no_flight_in_the_air_ends_as_refused() -> None:
+    for row in TRANSITIONS:
+        if row.exit_code == ExitCode.REFUSED:
+            assert row.source not in (Phase.TAKEOFF, Phase.CLIMB, *ON_TRACK, Phase.LAND)
+
+
+def test_every_reason_has_its_figures() -> None:
+    assessment = hover().companion._machine._assessment
+    progress = Progress(Phase.CONNECT, 0.0, 0.0, False, "", 0, "")
+    figures = assessment.figures(assessment.facts(progress), progress)
+    for row in TRANSITIONS:
+        assert "{" not in row.reason.format(**figures)

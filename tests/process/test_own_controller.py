@@ -1,0 +1,113 @@
+"""Controllers of other packages: the one that `offboard.control` documents, and broken ones."""
+
+from __future__ import annotations
+
+import inspect
+import json
+import os
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+import yaml
+from processes import Spawn
+
+import offboard.control
+from offboard.documents.reading import DocumentError
+from offboard.flight.configuration import load
+
+
+def documented_package(directory: Path) -> None:
+    """Write the files of the example in the docstring of `offboard.control`."""
+    text = inspect.getdoc(offboard.control) or ""
+    example = text[text.index("    # pyproject.toml") : text.index("After `pip install`")]
+    for file in textwrap.dedent(example).split("\n# "):
+        name, _, content = file.removeprefix("# ").partition("\n")
+        if name in ("pyproject.toml", "pd_controller.py"):
+            (directory / name).write_text(content)
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A directory of installed packages that has the documented one."""
+    source, site = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("site")
+    documented_package(source)
+    install = (sys.executable, "-m", "pip", "install", "--quiet", "--no-deps")
+    offline = ("--no-build-isolation", "--no-index", "--disable-pip-version-check")
+    subprocess.run((*install, *offline, "--target", site, source), check=True, timeout=120)
+    return site
+
+
+@pytest.mark.parametrize(
+    ("controller", "reference", "damping_ps", "most_m"),
+    [("pd", "hover", 4.0, 0.03), ("my.yaml", "lemniscate", 5.0, 0.2)],
+)
+def test_documented_controller_flies(
+    controller: str, reference: str, damping_ps: float, most_m: float,
+    site: Path, spawn: Spawn, tmp_path: Path,
+) -> None:  # fmt: skip
+    (tmp_path / "my.yaml").write_text("law: pd\ndamping_ps: 5\n")
+    path = os.pathsep.join(filter(None, (str(site), os.environ.get("PYTHONPATH"))))
+    flight = spawn(
+        "offboard", "fly", "--sitl", "--controller", controller, "--reference", reference,
+        "--scenario", "calm", "--seed", "7", "--out", "x", PYTHONPATH=path,
+    )  # fmt: skip
+    said, errors = flight.communicate(timeout=170)
+    assert (flight.returncode, errors) == (0, ""), said
+    score = json.loads((tmp_path / "x" / "score.json").read_text())
+    assert score["rmse_position_m"] < most_m
+    flown = yaml.safe_load((tmp_path / "x" / "flight.yaml").read_text())["controller"]
+    assert flown == {"law": "pd", "stiffness_ps2": 6.0, "damping_ps": damping_ps}
+
+
+def test_documented_settings_are_strict(
+    site: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.syspath_prepend(site)
+    with pytest.raises(DocumentError, match=r"controller.damping_ps: 0 should be greater than 0"):
+        load("flight", choices={"controller": "pd"}, assignments=["controller.damping_ps=0"])
+    (tmp_path / "my.yaml").write_text("law: pd\ndamping: 4\n")
+    with pytest.raises(DocumentError, match="damping is not a known key, did you mean damping_ps"):
+        load("flight", choices={"controller": str(tmp_path / "my.yaml")})
+
+
+def registered(site: Path, package: str, **laws: str) -> None:
+    """Metadata of an installed package whose entry points are `laws`."""
+    metadata = site / f"{package}-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {package}\nVersion: 1.0\n")
+    points = "".join(f"{law} = {where}\n" for law, where in laws.items())
+    (metadata / "entry_points.txt").write_text(f"[pso_offboard.controllers]\n{points}")
+
+
+@pytest.mark.parametrize(
+    ("law", "says"),
+    [
+        ("gone", "law gone of first 1.0 (no_such_module:Law) cannot be used: ModuleNotFoundError: "
+                 "No module named 'no_such_module'"),
+        ("raises", "law raises of first 1.0 (raising:Law) cannot be used: ZeroDivisionError: "
+                   "division by zero"),
+        ("function", "law function of first 1.0 (json:loads) cannot be used: <function loads at"),
+        ("twice", "law twice is defined twice, by first 1.0 (json:loads) and second 1.0"),
+        ("nowhere", "there is no controller named 'nowhere'; known are autopilot, cem, function,"),
+    ],
+)  # fmt: skip
+def test_broken_controller_is_refused_only_when_it_is_asked_for(
+    law: str, says: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    (tmp_path / "raising.py").write_text("1 / 0\n")
+    registered(
+        tmp_path, "first", gone="no_such_module:Law", raises="raising:Law", function="json:loads",
+        twice="json:loads", pso="no_such_module:Law",
+    )  # fmt: skip
+    registered(tmp_path, "second", twice="json:dumps")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(DocumentError) as refused:
+        load("flight", choices={"controller": law})
+    (sentence,) = refused.value.problems
+    assert sentence.startswith(says)
+    assert "\n" not in sentence
+    for name in ("pso", "paper"):  # built in, and the paper's
+        assert load("flight", choices={"controller": name}).controller.law == name

@@ -1,0 +1,158 @@
+"""Output of the commands: width, shipped files in --help, phases and result of `fly`."""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pty
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+from processes import Spawn
+from rich.console import Console
+from typer.testing import CliRunner
+
+from offboard.analysis.score_table import show
+from offboard.analysis.trial import score_flight
+from offboard.cli import app as offboard
+from simulator.cli import app as simulator
+
+CONFIG = Path(__file__).parents[2] / "config"
+RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
+FOLDERS = ("references", "controllers", "vehicles", "scenarios", "")
+COMMANDS = ("fly", "score", "check", "identify", "compare", "paper", "list")
+HELP = [(offboard, ()), *((offboard, (command,)) for command in COMMANDS), (simulator, ())]
+
+
+def shipped(folder: str) -> list[Path]:
+    return sorted((CONFIG / folder).glob("*.yaml"))
+
+
+@pytest.mark.parametrize("columns", [60, 80])
+def test_help_fits(columns: int) -> None:
+    for app, arguments in HELP:
+        answer = CliRunner().invoke(app, [*arguments, "--help"], terminal_width=columns)
+        assert answer.exit_code == 0
+        assert max(map(len, answer.output.splitlines())) <= columns
+        cut_off = [line for line in answer.output.splitlines()[1:] if line.endswith("...")]
+        assert columns < 80 or not cut_off
+
+
+@pytest.mark.parametrize(
+    ("app", "command", "folders"),
+    [
+        (offboard, "fly", FOLDERS[:4]),
+        (offboard, "compare", FOLDERS[:4]),
+        (simulator, "", FOLDERS[2:4]),
+    ],
+    ids=["fly", "compare", "simulator"],
+)
+def test_help_names_every_shipped_file(app: object, command: str, folders: tuple[str, ...]) -> None:
+    arguments = [*command.split(), "--help"]
+    words = CliRunner().invoke(app, arguments).output.replace(",", " ").replace(".", " ").split()  # type: ignore[arg-type]
+    for folder in folders:
+        assert {path.stem for path in shipped(folder)} <= set(words)
+
+
+def test_list_describes_every_shipped_file_in_one_line() -> None:
+    lines = CliRunner().invoke(offboard, ["list"]).output.splitlines()
+    assert max(map(len, lines)) <= 80
+    listed = [tuple(line.split(maxsplit=1)) for line in lines if line.startswith(" ")]
+    files = [path for folder in FOLDERS for path in shipped(folder)]
+    assert len(files) >= 44
+    assert listed == [(p.stem, yaml.safe_load(p.read_text())["description"]) for p in files]
+
+
+@pytest.mark.parametrize("columns", [60, 80])
+def test_a_score_fits(columns: int) -> None:
+    text = io.StringIO()
+    show(Console(file=text, width=columns), *score_flight(RECORDING))
+    lines = text.getvalue().splitlines()
+    assert max(map(len, lines)) <= columns
+    assert "…" not in text.getvalue()
+    assert columns < 80 or sum("setpoint_gap_wall_max_s" in line for line in lines) == 1
+
+
+def test_a_piped_flight_prints_its_phases_once_as_they_happen(spawn: Spawn, tmp_path: Path) -> None:
+    process = spawn(
+        "offboard", "fly", "--sitl", "--scenario", "calm", "--out", "x", "--reference", "hover",
+        "--set", "reference.duration_s=10", "--require", "rmse_position_m<0.5",
+        COLUMNS="80", PYTHONUNBUFFERED="",
+    )  # fmt: skip
+    assert process.stdout is not None
+    lines = []
+    for line in process.stdout:
+        lines.append(line)
+        if " track: " in line:
+            assert process.poll() is None
+            assert not (tmp_path / "x" / "score.json").exists()
+    assert (process.wait(), process.communicate()[1]) == (0, "")
+    assert max(map(len, lines)) <= 81  # with the line break
+    begin = lines.index("\n")
+    words = [line.split() for line in lines[1:begin]]
+    phases = {what: float(time_s) for time_s, _, what, *_ in words if what.endswith(":")}
+    assert len(phases) == sum(what.endswith(":") for _, _, what, *_ in words) >= 10
+    logged = json.loads((tmp_path / "x" / "score.json").read_text())["phases"]
+    assert phases == pytest.approx({e["what"].split()[0]: e["time_s"] for e in logged}, abs=0.01)
+    verdict, *rows = lines[begin + 1 :]
+    assert verdict.startswith("flown and landed; requirement met: rmse_position_m is ")
+    labels = [row[2:17].strip() for row in rows]
+    assert labels == ["tracked error", "true error", "timing", "identified", "log", "all figures"]
+    assert Path(tmp_path / rows[-2].split()[-1]).is_file()
+
+
+def test_a_missed_requirement_is_the_verdict(spawn: Spawn) -> None:
+    process = spawn(
+        "offboard", "fly", "--sitl", "--scenario", "calm", "--out", "x", "--reference", "hover",
+        "--set", "reference.duration_s=2", "--require", "tilt_max_deg<0", COLUMNS="80",
+    )  # fmt: skip
+    told, said = process.communicate(timeout=60)
+    assert process.returncode == 1
+    assert said.startswith("flown and landed; requirement missed: tilt_max_deg is ")
+    assert said.endswith(" (required < 0)\n")
+    assert "  all figures    offboard score x\n" in told
+
+
+def on_a_terminal(tmp_path: Path, *command: str) -> list[str]:
+    """The lines that a command prints on a terminal of 80 columns."""
+    terminal, theirs = pty.openpty()
+    environment = {**os.environ, "COLUMNS": "80", "TERM": "dumb"}
+    process = subprocess.Popen(
+        [sys.executable, "-m", *command],
+        cwd=tmp_path, env=environment, stdin=theirs, stdout=theirs, stderr=theirs,
+    )  # fmt: skip
+    os.close(theirs)
+    printed = b""
+    while True:
+        try:
+            printed += os.read(terminal, 65536)
+        except OSError:  # all that was printed has been read, and nobody is left to print
+            break
+    process.wait()
+    os.close(terminal)
+    return printed.decode().splitlines()
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ("offboard fly --reference spiral", "there is no reference named 'spiral'; known are"),
+        ("offboard fly --set no.such.key=1", "no is not a known key"),
+        ("simulator --scenario storm", "there is no scenario named 'storm'; known are"),
+        (
+            "simulator --duration 0.1 --connect udpout:127.0.0.1:59999 --gcs none",
+            "px4_sih, system 1",
+        ),
+    ],
+)
+def test_on_a_terminal_long_lines_are_wrapped_at_words(
+    command: str, says: str, tmp_path: Path
+) -> None:
+    lines = on_a_terminal(tmp_path, *command.split())
+    assert len(lines) > 1
+    assert max(map(len, lines)) <= 80
+    assert says in " ".join(line.strip() for line in lines)

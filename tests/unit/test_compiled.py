@@ -1,0 +1,238 @@
+"""Compiled functions: what they compute, when they are compiled, and where machine code is kept."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from offboard.control.swarm.motion import SEARCH, scatter
+from offboard.estimation.filtering import FILTER
+
+ROOT = Path(__file__).parents[2]
+OFFSET = "OFFSET = 1.0\n"
+KERNELS = """
+from offboard.compiled import kernel
+from offboard.constants import OFFSET
+
+
+@kernel
+def shifted(value):
+    return 2.0 * value + OFFSET
+"""
+ENTRIES = """
+import numpy as np
+from offboard.compiled import array, entry, kernel
+from offboard.kernels import shifted
+
+PAIR = np.dtype([("values", "f8", 2), ("calls", "i8")], align=True)
+
+
+@entry(PAIR, int)
+def add(pairs, times):
+    pair = pairs[0]
+    total = 0.0
+    for _ in range(times):
+        total += shifted(pair.values[0]) + shifted(pair.values[1])
+    pair.calls += 1
+    return total
+
+
+@entry(array(2), array(1, "i8"), float)
+def weigh(values, places, scale):
+    total = 0.0
+    for i in range(values.shape[0]):
+        for k in range(values.shape[1]):
+            total += scale * values[i, k] * places[k]
+    places[0] = values.shape[0]
+    return total
+"""
+CALL = """
+import sys
+import numpy as np
+from offboard import compiled
+from offboard.entries import PAIR, add, weigh
+
+assert "numba" not in sys.modules
+said = []
+compiled.prepare(said.append)
+pair, places = np.zeros(1, PAIR), np.array([1, 10])
+pair["values"] = 3.0, 5.0
+print(add(pair, 2), weigh(np.array([[1.0, 2.0], [3.0, 4.0]]), places, 0.5))
+print(int(pair["calls"][0]), places.tolist(), len(said))
+"""
+DIRECTORY = "from offboard import compiled; print(compiled.directory())"
+
+
+@pytest.fixture
+def package(tmp_path: Path) -> Path:
+    """A package `offboard` with two entries, a kernel in another file and a constant in a third."""
+    root = tmp_path / "package"
+    (root / "offboard").mkdir(parents=True)
+    shutil.copy(ROOT / "offboard" / "compiled.py", root / "offboard")
+    sources = {"__init__": "", "constants": OFFSET, "kernels": KERNELS, "entries": ENTRIES}
+    for name, source in (sources | {"other": ""}).items():
+        (root / "offboard" / f"{name}.py").write_text(source)
+    return root
+
+
+def start(root: Path, code: str, **environment: str) -> subprocess.Popen[str]:
+    clean = {key: value for key, value in os.environ.items() if "CACHE" not in key}
+    return subprocess.Popen(
+        [sys.executable, "-c", code],
+        cwd=root,
+        env={**clean, "PYTHONPATH": str(root), **environment},
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+
+
+def answer(root: Path, code: str, **environment: str) -> str:
+    """What a new interpreter prints that has the package in `root`."""
+    process = start(root, code, **environment)
+    printed, _ = process.communicate(timeout=120)
+    assert process.returncode == 0
+    return printed.strip()
+
+
+def machine_code(cache: Path) -> dict[Path, int]:
+    return {path: path.stat().st_mtime_ns for path in cache.rglob("*.nbc")}
+
+
+def test_entries_are_compiled_once_and_loaded_by_the_next_process(
+    package: Path, tmp_path: Path
+) -> None:
+    cache = str(tmp_path / "cache")
+    assert answer(package, CALL, XDG_CACHE_HOME=cache) == "36.0 32.0\n1 [2, 10] 1"
+    made = machine_code(tmp_path)
+    assert len(made) == 2
+    assert answer(package, CALL, XDG_CACHE_HOME=cache) == "36.0 32.0\n1 [2, 10] 0"
+    assert machine_code(tmp_path) == made
+
+
+@pytest.mark.parametrize(
+    ("changed", "source", "sum_of_both"),
+    [
+        ("kernels", KERNELS.replace("2.0", "3.0"), "52.0"),
+        ("constants", "OFFSET = 2.0\n", "40.0"),
+    ],
+)
+def test_a_change_in_another_file_is_compiled(
+    changed: str, source: str, sum_of_both: str, package: Path, tmp_path: Path
+) -> None:
+    cache = str(tmp_path / "cache")
+    assert answer(package, CALL, XDG_CACHE_HOME=cache).startswith("36.0 ")
+    (package / "offboard" / f"{changed}.py").write_text(source)
+    assert answer(package, CALL, XDG_CACHE_HOME=cache).startswith(f"{sum_of_both} ")
+
+
+def test_two_processes_do_not_compile_the_same_entry(package: Path, tmp_path: Path) -> None:
+    """One process holds the lock of both entries: the other one waits for it."""
+    cache = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    place = Path(answer(package, DIRECTORY, **cache))
+    marks = [(place / f"offboard.entries.{name}").open("w") for name in ("add", "weigh")]
+    for mark in marks:
+        fcntl.flock(mark, fcntl.LOCK_EX)
+    waiting = start(package, CALL, **cache)
+    with pytest.raises(subprocess.TimeoutExpired):
+        waiting.wait(3.0)
+    assert not machine_code(tmp_path)
+    for mark in marks:
+        mark.close()
+    assert waiting.communicate(timeout=60)[0].startswith("36.0 32.0\n")
+
+
+@pytest.mark.parametrize(
+    ("changed", "renames"),
+    [
+        ("offboard/model/rigid_body.py", True),
+        ("offboard/model/state.py", True),  # the sizes of states
+        ("simulator/steps.py", True),  # the length of a step
+        ("offboard/documents/reading.py", False),
+        ("offboard/flight/companion.py", False),
+    ],
+)
+def test_the_directory_is_named_after_compiled_sources(
+    changed: str, renames: bool, tmp_path: Path
+) -> None:
+    ignored = shutil.ignore_patterns("__pycache__")
+    for name in ("offboard", "simulator"):
+        shutil.copytree(ROOT / name, tmp_path / name, ignore=ignored)
+    cache = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    before = answer(tmp_path, DIRECTORY, **cache)
+    with (tmp_path / changed).open("a") as source:
+        source.write("\n# changed\n")
+    assert (answer(tmp_path, DIRECTORY, **cache) != before) is renames
+
+
+def test_the_directory_is_below_the_first_usable_of_four(package: Path, tmp_path: Path) -> None:
+    first, second, home = (tmp_path / name for name in ("numba", "xdg", "home"))
+    given = {"NUMBA_CACHE_DIR": str(first), "XDG_CACHE_HOME": str(second), "HOME": str(home)}
+    given["TMPDIR"] = str(tmp_path)
+    expected = [first, second, home / ".cache", tmp_path / f"cache-{os.getuid()}"]
+    for place in expected:
+        found = Path(answer(package, DIRECTORY, **given))
+        assert found.parent == place / "pso-offboard"
+        shutil.rmtree(place)
+        place.parent.mkdir(exist_ok=True)
+        place.write_text("not a directory")
+
+
+def test_a_relative_directory_is_not_used(package: Path, tmp_path: Path) -> None:
+    home = {"HOME": str(tmp_path / "home"), "XDG_CACHE_HOME": "here"}
+    assert Path(answer(package, DIRECTORY, **home)).parent == tmp_path / "home/.cache/pso-offboard"
+    assert not list(package.rglob("here"))
+
+
+@pytest.mark.parametrize("shared", ["pso-offboard", "pso-offboard/{digest}"])
+def test_a_directory_that_others_can_write_in_is_not_used(
+    shared: str, package: Path, tmp_path: Path
+) -> None:
+    given = {"XDG_CACHE_HOME": str(tmp_path / "xdg"), "HOME": str(tmp_path / "home")}
+    made = Path(answer(package, DIRECTORY, **given))
+    (tmp_path / "xdg" / shared.format(digest=made.name)).chmod(0o775)
+    found = Path(answer(package, DIRECTORY, **given))
+    assert found == tmp_path / "home/.cache/pso-offboard" / made.name
+
+
+def test_new_directories_are_private_whatever_the_umask(package: Path, tmp_path: Path) -> None:
+    code = f"import os; os.umask(0o002); {DIRECTORY}"
+    made = Path(answer(package, code, XDG_CACHE_HOME=str(tmp_path / "new" / "cache")))
+    modes = [path.stat().st_mode & 0o777 for path in (made, *made.parents[:3])]
+    assert modes == [0o700] * 4
+
+
+def test_the_most_recently_used_five_versions_are_kept(package: Path, tmp_path: Path) -> None:
+    cache = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
+    first = Path(answer(package, DIRECTORY, **cache))
+    for age_s in range(1, 8):
+        old = first.parent / f"{age_s}"
+        old.mkdir()
+        os.utime(old, (time.time() - age_s,) * 2)
+    answer(package, DIRECTORY, **cache)
+    assert {path.name for path in first.parent.iterdir()} == {first.name, "1", "2", "3", "4"}
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [np.zeros((2, 6))[:, ::2], np.zeros(3), np.zeros((2, 3), "f4"), np.zeros((2, 3)).T],
+    ids=["strided", "one dimension", "single precision", "transposed"],
+)
+def test_arguments_of_other_types_are_refused(wrong: np.ndarray) -> None:
+    lanes, box, right = np.ones(3, np.uint64), np.ones(2), np.zeros((2, 3))
+    with pytest.raises(TypeError, match="No matching definition"):
+        scatter(np.zeros(1, SEARCH), lanes, box, box, right, wrong)
+    with pytest.raises(TypeError, match="No matching definition"):
+        scatter(np.zeros(1, FILTER), lanes, box, box, right, right)
+
+
+def test_importing_a_flight_does_not_import_numba() -> None:
+    code = "import sys, offboard.flight.request, simulator.run; print('numba' in sys.modules)"
+    assert answer(ROOT, code) == "False"

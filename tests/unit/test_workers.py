@@ -1,0 +1,39 @@
+"""SIGINT while worker processes start: deferred until they have started."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+
+from offboard.analysis.workers import interrupts_deferred
+
+MASK = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()))"
+
+
+def interrupted_meanwhile() -> list[str]:
+    """Whether SIGINT is masked in a process that is started after an interrupt, and that one."""
+    said = []
+    try:
+        with interrupts_deferred():
+            os.kill(os.getpid(), signal.SIGINT)
+            time.sleep(0.05)
+            command = (sys.executable, "-c", MASK)
+            said.append(subprocess.run(command, capture_output=True, text=True).stdout)
+    except KeyboardInterrupt:
+        said.append("interrupted")
+    return said
+
+
+def test_an_interrupt_is_deferred_to_the_end_of_the_block() -> None:
+    """Also when another thread, without the mask, receives the signal."""
+    over = threading.Event()
+    threading.Thread(target=over.wait).start()
+    try:
+        assert interrupted_meanwhile() == ["True\n", "interrupted"]
+    finally:
+        over.set()
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
