@@ -53,7 +53,7 @@ R = TypeVar("R")
 F = TypeVar("F", bound=Callable[..., Any])
 
 Parameter = type[int] | type[float] | np.dtype[Any] | tuple[int, np.dtype[Any]]
-"""Of an entry: a number, an array of one record, or the dimensions and dtype of an array."""
+"""A number, the dtype of an array of one record, or the dimensions and dtype of an array."""
 
 ENTRIES_PER_PROCESS = 3  # starting a process costs as much as compiling one of them
 VERSIONS_KEPT = 5  # directories of machine code, most recently used
@@ -218,8 +218,8 @@ _CONSTANT = re.compile(rb"\b[A-Z][A-Z0-9_]*\b")
 
 @functools.cache
 def _digest() -> str:
-    """Of the versions of Python and numba, of the modules with entries or kernels, and of those
-    that they import constants from, because these are compiled in."""
+    """A hash of the versions of Python and numba, the modules with entries or kernels, and the
+    modules that they import constants from, because constants are compiled in."""
     root = Path(__file__).parents[1]
     sources = {
         path.relative_to(root).as_posix(): path.read_bytes()
