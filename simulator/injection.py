@@ -13,7 +13,7 @@ from typing import Any, Protocol
 
 from simulator import faults
 from simulator.autopilot.autopilot import Autopilot
-from simulator.autopilot.commander import Wish
+from simulator.autopilot.commander import Request
 from simulator.faults import Direction, Fault, Moment, Refusable
 from simulator.firmware.values import Behaviour, critical
 from simulator.link.impairment import Channel, Path
@@ -143,7 +143,7 @@ def _jump(vehicle: Vehicle, running: Running) -> None:
 
 
 def _lose_fix(vehicle: Vehicle, running: Running) -> None:
-    vehicle.autopilot.senses.gps_healthy = False
+    vehicle.autopilot.state.gps_healthy = False
     running.memory = 0.0
 
 
@@ -154,7 +154,7 @@ def _drift(vehicle: Vehicle, running: Running) -> None:
 
 
 def _restore_fix(vehicle: Vehicle, running: Running) -> None:
-    vehicle.autopilot.senses.gps_healthy = True
+    vehicle.autopilot.state.gps_healthy = True
     if running.memory:
         vehicle.autopilot.plant.reset_estimate((-running.memory, -running.memory, 0.0))
 
@@ -228,7 +228,7 @@ def _allow(vehicle: Vehicle, running: Running) -> None:
 def _switch_to_hold(vehicle: Vehicle, running: Running) -> None:
     modes = vehicle.autopilot.firmware.modes.values()
     hold = next(mode.name for mode in modes if mode.behaviour is Behaviour.HOLD)
-    vehicle.autopilot.happen("mode", Wish(hold))
+    vehicle.autopilot.handle("mode", Request(hold))
 
 
 Effect = Callable[[Vehicle, Running], None]

@@ -115,7 +115,7 @@ class Instance:
             self.autopilot.plant.advance(STEP_S, _OFF)
             return
         self.autopilot.step()
-        if self.autopilot.commander.restarts:
+        if self.autopilot.commander.reboot_requested:
             self.reboot(RESTART_S)
             return
         if self.autopilot.commander.texts or self.autopilot.commander.announcements:
@@ -196,9 +196,9 @@ class Instance:
         """Restart the autopilot after `silent_s` without motors and messages; the vehicle falls."""
         old = self.autopilot
         self.autopilot = Autopilot(
-            old.firmware, old.plant, old.parameters, old.mission, boot_scale=old.health.scale
+            old.firmware, old.plant, old.parameters, old.mission, boot_scale=old.health.boot_scale
         )
-        self.autopilot.pilot.fall(old.plant.on_ground)
+        self.autopilot.pilot.detector.set_landed(old.plant.on_ground)
         self.view.restart(self.autopilot)
         self.companion.restart()
         self.ground.restart()
@@ -211,7 +211,7 @@ class Instance:
     def _inject(self) -> None:
         assert self._injection is not None
         self._injection.step(self.time_s, self)
-        self.autopilot.senses.forget()
+        self.autopilot.state.invalidate()
         for datagram in self._injection.up.carry([], self._now_us):
             self._handle(datagram)
 

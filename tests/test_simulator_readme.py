@@ -10,9 +10,9 @@ from pathlib import Path
 
 import pytest
 
-from simulator.autopilot.state_table import describe
 from simulator.firmware.base import Firmware
 from simulator.firmware.catalogue import FIRMWARES
+from simulator.firmware.values import Result
 
 ROOT = Path(__file__).parents[1]
 README = ROOT / "simulator" / "README.md"
@@ -21,7 +21,12 @@ HEAD = ("event", "in mode", "if", "next mode", "answer and texts")
 
 def table(firmware: Firmware) -> str:
     """The state table of one firmware in Markdown."""
-    rows = (HEAD, ("---",) * len(HEAD), *describe(firmware))
+    rows = [HEAD, ("---",) * len(HEAD)]
+    for rule in firmware.rules:
+        mode, to = ("any" if rule.mode == "*" else rule.mode), rule.to.replace("*", "")
+        answer = () if rule.result is Result.ACCEPTED else (rule.result.name,)
+        texts = (f'"{text.text}"' for text in rule.texts)
+        rows.append((rule.event, mode, " and ".join(rule.when), to, " ".join((*answer, *texts))))
     return "\n".join("| " + " | ".join(row) + " |" for row in rows)
 
 

@@ -31,9 +31,9 @@ REMEMBERED_S = 0.6  # a fix older than this is not used
 
 
 class FusionSettings(Parameters):
-    """Of the receiver: standard deviations of a fix, and how much older than its stamp it is. Of
-    the model: densities per root second. Of the hand-over: how smoothly, and how far apart the
-    two estimates may be."""
+    """Receiver: standard deviations of a fix, and how much older than its stamp it is. Model: noise
+    densities per root second. Switching between the estimates: how fast, and how far apart they
+    may be."""
 
     position_sd_m: float = Field(default=0.2, gt=0, le=20)  # north and east
     height_sd_m: float = Field(default=0.5, gt=0, le=20)

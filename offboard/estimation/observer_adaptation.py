@@ -191,6 +191,6 @@ class Adaptation:
 
     @property
     def densities_mps2(self) -> Array:
-        """Of the disturbance, lateral and vertical."""
+        """Noise densities of the disturbance, lateral and vertical."""
         densities: Array = self._record["density"][0]
         return densities

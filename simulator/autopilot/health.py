@@ -1,73 +1,64 @@
-"""Whether the vehicle is fit to arm: how far its start has come, and what the checks ask for.
+"""Start of the autopilot and its pre-arm checks.
 
-Knows firmware, parameters and what is watched; what is refused for it is for the rules.
+Knows the firmware's times and what the monitors found; its state table decides what is refused.
 """
 
 from __future__ import annotations
 
-from simulator.autopilot.mission import Mission
-from simulator.autopilot.parameters import ParameterTable
+from collections.abc import Iterator
+
+from simulator.autopilot.guidance import Guidance
+from simulator.autopilot.monitors import Monitors
 from simulator.autopilot.setpoints import SetpointStream
-from simulator.autopilot.watch import Watch
-from simulator.firmware.base import Firmware
 from simulator.firmware.values import Behaviour, Mode
 
 
 class Health:
-    """Of one vehicle from boot on; `scale` stretches the times of its start."""
+    """Health of one vehicle from boot on; `boot_scale` multiplies the times of its start."""
 
     def __init__(
-        self,
-        firmware: Firmware,
-        parameters: ParameterTable,
-        mission: Mission,
-        stream: SetpointStream,
-        watch: Watch,
-        scale: float,
+        self, guidance: Guidance, stream: SetpointStream, monitors: Monitors, boot_scale: float
     ) -> None:
-        self._firmware, self._parameters, self._mission = firmware, parameters, mission
-        self._stream, self._watch = stream, watch
-        self.scale = scale
-        self.reached: frozenset[str] = frozenset()  # events of the start
-        self._ahead = sorted((at_s * scale, event) for event, at_s in firmware.health.boot.items())
+        self._firmware, self._mission = guidance.firmware, guidance.mission
+        self._parameters, self._stream, self._monitors = guidance.parameters, stream, monitors
+        self.boot_scale = boot_scale
+        self.reached: frozenset[str] = frozenset()  # boot events so far
+        times_s = self._firmware.health.boot.items()
+        self._ahead = sorted((at_s * boot_scale, event) for event, at_s in times_s)
 
-    def reach(self, now_s: float) -> str | None:
-        """The next event of the start that has come, if one has."""
-        if not (self._ahead and now_s >= self._ahead[0][0]):
-            return None
-        _, event = self._ahead.pop(0)
-        self.reached |= {event}
-        return event
+    def boot_events(self, now_s: float) -> Iterator[str]:
+        """Boot events since the last call."""
+        while self._ahead and now_s >= self._ahead[0][0]:
+            _, event = self._ahead.pop(0)
+            self.reached |= {event}
+            yield event
 
     def has_fix(self, now_s: float) -> bool:
-        """GPS reports a position, unless a fault takes it away."""
-        return now_s >= self._firmware.health.sensors.first_fix_s * self.scale
+        """GPS has its first fix; a fault may take it away."""
+        return now_s >= self._firmware.health.sensors.first_fix_s * self.boot_scale
 
     def passes(self, mode: Mode, now_s: float, *, latched: bool) -> bool:
-        """The pre-arm checks pass, for the mode that was chosen; `latched`: something is wrong
-        until a reboot."""
+        """The pre-arm checks pass for this mode. `latched`: a failure that only a reboot clears."""
         firmware = self._firmware
         after_s = firmware.health.passes_without_position_after_s
         if mode.needs_position:
             after_s = firmware.health.passes_after_s
-        waits = firmware.setpoints.mode_needs_stream and mode.behaviour is Behaviour.SETPOINT
-        booted = now_s >= after_s * self.scale and not latched
+        if latched or now_s < after_s * self.boot_scale:
+            return False
         if firmware.health.fails_where_unarmable and not mode.arms:
             return False
-        if self._watch.ground_station_lost and self._parameters.role("ground_station_needed") > 0:
+        needed = self._parameters.role("ground_station_needed") > 0
+        if needed and self._monitors.ground_station_lost:
             return False
         if mode.behaviour is Behaviour.MISSION:
-            return booted and self._mission.flyable
-        return booted and (self._stream.alive(now_s) or not waits)
+            return self._mission.flyable
+        needs_stream = mode.behaviour is Behaviour.SETPOINT and firmware.setpoints.mode_needs_stream
+        return not needs_stream or self._stream.alive(now_s)
 
     def can_run(self, mode: Mode, now_s: float) -> bool:
-        """Whether a vehicle in the air may be put into this mode."""
+        """A vehicle in the air may enter this mode."""
         if mode.behaviour is Behaviour.SETPOINT:
             return self._stream.alive(now_s)
         if mode.behaviour is Behaviour.MISSION:
             return self._mission.flyable
         return not mode.needs_sticks
-
-    def position_missing(self, mode: Mode) -> bool:
-        """The mode needs a position, and there was none yet."""
-        return mode.needs_position and "position" not in self.reached

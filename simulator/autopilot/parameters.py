@@ -1,6 +1,6 @@
-"""The vehicle's parameters: a typed table, its values, and their form on the wire.
+"""The vehicle's parameters: values, ranges, and their form on the wire.
 
-Knows names, kinds and ranges from the firmware's data; knows no socket.
+Names, types and ranges are the firmware's. Knows no socket.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from collections.abc import Mapping
 
 from simulator.firmware.base import Firmware, ParameterSpec, Role
 
-HASH = "_HASH_CHECK"  # a parameter that is none: what all values come to
+HASH = "_HASH_CHECK"  # name under which the checksum of all values is read
 MAV_PARAM_TYPE_UINT32 = 5
 MAV_PARAM_TYPE = {"int8": 2, "int16": 4, "int32": 6, "real32": 9}
-WHOLE = {"int8": (-128, 127), "int16": (-32768, 32767), "int32": (-(2**31), 2**31 - 1)}
-_FLOAT, _INT = struct.Struct("<f"), struct.Struct("<i")
+RANGES = {"int8": (-128, 127), "int16": (-32768, 32767), "int32": (-(2**31), 2**31 - 1)}
+_FLOAT, _INT, _UNSIGNED = struct.Struct("<f"), struct.Struct("<i"), struct.Struct("<I")
 
 
 class ParameterTable:
-    """Values by name, in the firmware's order. `role` reads one by what it is for."""
+    """Parameter values by name, in the firmware's order; `changes` counts them."""
 
     def __init__(self, firmware: Firmware) -> None:
         self._specs = {spec.name: spec for spec in firmware.parameters}
@@ -34,66 +34,50 @@ class ParameterTable:
         return name in self._specs
 
     def __getitem__(self, name: str) -> float:
-        """What the vehicle obeys: the value, brought into its range."""
+        """The value in effect: limited to its range, the default in place of NaN."""
         spec, value = self._specs[name], self._values[name]
-        if value != value:  # not a number
+        if math.isnan(value):
             return spec.default
         return min(spec.maximum, max(spec.minimum, value))
 
     def role(self, role: str) -> float:
-        """What this firmware has for `role`, in SI units."""
-        filler = self._roles[role]
-        if isinstance(filler, str):
-            return self[filler]
-        if isinstance(filler, tuple):
-            return self[filler[0]] * filler[1]
-        return filler
-
-    def _takes(self, spec: ParameterSpec | None, value: float) -> bool:
-        return spec is not None and spec.minimum <= value <= spec.maximum
+        """The value that this firmware has for `role`, in SI units."""
+        source = self._roles[role]
+        if isinstance(source, str):
+            return self[source]
+        if isinstance(source, tuple):
+            return self[source[0]] * source[1]
+        return source
 
     def set(self, name: str, value: float) -> bool:
-        """Set one; False (and unchanged) when unknown, not finite or out of range."""
+        """Set one; False (and unchanged) where it is unknown, not finite or out of range."""
         spec = self._specs.get(name)
-        if spec is None or not self._takes(spec, value):
+        if spec is None or not spec.minimum <= value <= spec.maximum:
             return False
-        self._keep(spec, value)
+        self._store(spec, value)
         return True
 
-    def _keep(self, spec: ParameterSpec, value: float) -> None:
-        self.changes += 1
-        if spec.kind == "real32":
-            self._values[spec.name] = value
-        elif math.isfinite(value):
-            low, high = WHOLE[spec.kind]
-            self._values[spec.name] = float(min(high, max(low, int(value))))
-
-    def takes(self, name: str, wire: float) -> bool:
-        """Whether `set_from_wire` would set it."""
-        return self._takes(self._specs.get(name), self._from_wire(name, wire))
+    def in_range(self, name: str, wire: float) -> bool:
+        """The parameter exists and this param_value is in its range."""
+        spec = self._specs.get(name)
+        return spec is not None and spec.minimum <= self._from_wire(spec, wire) <= spec.maximum
 
     def set_from_wire(self, name: str, wire: float, kind: int) -> bool:
-        """Set from PARAM_SET, out of range too; False when it is not taken, and not answered.
+        """Set from PARAM_SET, also out of range; False where it is not answered.
 
-        An integer comes as its bytes, and then its type must fit, or as its value, and then no
-        type matters but what is not a number is not taken.
+        An integer is sent as its bytes, and then its type must fit, or as its value, and then any
+        type is accepted and NaN is not.
         """
         spec = self._specs.get(name)
         if spec is None or (self._bytewise and kind != MAV_PARAM_TYPE[spec.kind]):
             return False
-        if not self._bytewise and wire != wire:
+        if not self._bytewise and math.isnan(wire):
             return False
-        self._keep(spec, self._from_wire(name, wire))
+        self._store(spec, self._from_wire(spec, wire))
         return True
 
-    def _from_wire(self, name: str, wire: float) -> float:
-        spec = self._specs.get(name)
-        if spec is not None and self._is_bytewise(spec):
-            return float(_INT.unpack(_FLOAT.pack(wire))[0])
-        return wire
-
     def to_wire(self, name: str) -> tuple[float, int]:
-        """(param_value, param_type) of PARAM_VALUE."""
+        """param_value and param_type of PARAM_VALUE."""
         spec, value = self._specs[name], self._values[name]
         if self._is_bytewise(spec):
             value = _FLOAT.unpack(_INT.pack(int(value)))[0]
@@ -101,14 +85,25 @@ class ParameterTable:
 
     @property
     def hash_on_wire(self) -> float:
-        """CRC-32 (no inversion) of names and values, by which clients know a table again."""
+        """CRC-32 (no inversion) of names and values, by which clients recognise a known table."""
         crc = 0
         for name, spec in self._specs.items():
             value = self._values[name]
             data = _FLOAT.pack(value) if spec.kind == "real32" else _INT.pack(int(value))
             crc = zlib.crc32(name.encode() + data, crc ^ 0xFFFFFFFF) ^ 0xFFFFFFFF
-        number: float = _FLOAT.unpack(struct.pack("<I", crc))[0]
+        number: float = _FLOAT.unpack(_UNSIGNED.pack(crc))[0]
         return number
+
+    def _store(self, spec: ParameterSpec, value: float) -> None:
+        self.changes += 1
+        if spec.kind == "real32":
+            self._values[spec.name] = value
+        elif math.isfinite(value):
+            low, high = RANGES[spec.kind]
+            self._values[spec.name] = float(min(high, max(low, int(value))))
+
+    def _from_wire(self, spec: ParameterSpec, wire: float) -> float:
+        return float(_INT.unpack(_FLOAT.pack(wire))[0]) if self._is_bytewise(spec) else wire
 
     def _is_bytewise(self, spec: ParameterSpec) -> bool:
         return self._bytewise and spec.kind != "real32"

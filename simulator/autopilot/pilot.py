@@ -1,255 +1,226 @@
-"""The pilot: flies what the navigator wants, or the attitude that is asked for.
+"""The pilot: flies the navigator's motion or an attitude setpoint.
 
-Motion and estimate in, demand on the attitude loop out; takeoff and landing as the thrust has them.
-Knows time and parameters; knows no modes by name, no rules and no MAVLink. Decisions about modes
-are the commander's (`simulator.autopilot.commander`).
+Motion and estimate in, demand on the attitude loop out; takeoff ramp and land detector. Knows time
+and parameters; knows no modes by name, no rules and no MAVLink. The commander
+(`simulator.autopilot.commander`) decides about modes.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 
-from simulator.autopilot.land_detector import LandDetector
-from simulator.autopilot.nav import Nav
-from simulator.autopilot.navigator import Navigator, level
-from simulator.autopilot.parameters import ParameterTable
-from simulator.autopilot.position_loop import Limits, PositionLoop
-from simulator.autopilot.takeoff import Takeoff
-from simulator.firmware.base import Firmware
-from simulator.firmware.values import (
-    NAN3,
-    AttitudeSetpoint,
-    Behaviour,
-    MotionSetpoint,
-    Quaternion,
-    Triple,
-)
+from simulator.autopilot.behaviours import Control
+from simulator.autopilot.ground import LandDetector, TakeoffRamp
+from simulator.autopilot.navigator import Navigator
+from simulator.autopilot.position_loop import Limits, PositionLoop, level
+from simulator.autopilot.state import StateEstimate, VehicleState
+from simulator.firmware.values import NAN3, AttitudeSetpoint, Behaviour, MotionSetpoint, Triple
 from simulator.steps import LOOP_S
 from simulator.vehicle.attitude import Demand
 
-_TILT_BOOST_MAX = 10.0
-_LIFTING = frozenset({Behaviour.TAKEOFF, Behaviour.SETPOINT, Behaviour.MISSION, Behaviour.DESCEND})
+_TILT_COSINE_MIN = 0.1  # the tilt raises the thrust to no more than ten times
 OFF = Demand()
 
 
 class Pilot:
-    """Flies one vehicle, from the motors' first turn to their last."""
+    """Flies one vehicle from arming to disarming."""
 
-    def __init__(
-        self, firmware: Firmware, parameters: ParameterTable, navigator: Navigator
-    ) -> None:
-        self._firmware = firmware
-        self._parameters = parameters
-        self._navigator = navigator
+    def __init__(self, navigator: Navigator, state: VehicleState) -> None:
+        firmware, parameters = navigator.guidance.firmware, navigator.guidance.parameters
+        self._firmware, self._parameters = firmware, parameters
+        self._navigator, self._state = navigator, state
         self._tuned = parameters.changes
         self.loop = PositionLoop(firmware.flight.gains(parameters.__getitem__))
-        self._detector = LandDetector(firmware.flight.landing, parameters)
-        self._takeoff = Takeoff(parameters)
+        self.detector = LandDetector(firmware.flight.landing, parameters)
+        self._ramp = TakeoffRamp(parameters)
         self.demand = OFF  # in force
         self.thrust_demanded = 0.0  # before it is raised for the tilt
-        self.motion = MotionSetpoint()  # what the position loop was last asked for
-        self._obeyed: AttitudeSetpoint | None = None
-        self._attitude: Quaternion = (1.0, 0.0, 0.0, 0.0)
+        self.motion = MotionSetpoint()  # last one flown
+        self._setpoint: AttitudeSetpoint | None = None  # last one flown
+        self._attitude = level(0.0)
         self._next_loop_s = 0.0
         self._armed_for_s = 0.0
-        self._climb_thrust = 0.0
-        self._wanted_z_mps = 0.0
+        self._climb_thrust = 0.0  # of an attitude setpoint with a climb rate
+        self._velocity_down_mps = 0.0  # setpoint of the velocity loop
 
     @property
     def landed(self) -> bool:
-        """The land detector's verdict."""
-        return self._detector.landed
+        """The land detector's result."""
+        return self.detector.landed
 
-    def fall(self, on_ground: bool) -> None:
-        """The vehicle as a reboot finds it."""
-        self._detector.landed = on_ground
-
-    def enter(self, behaviour: Behaviour, nav: Nav, takeoff_ned_m: Triple = NAN3) -> None:
-        """Begin a behaviour here, as the navigator does."""
-        self._navigator.enter(behaviour, nav, takeoff_ned_m)
+    def enter(self, behaviour: Behaviour, place_ned_m: Triple = NAN3) -> None:
+        """Begin a behaviour. `place_ned_m`: where a takeoff climbs to."""
+        self._navigator.enter(behaviour, self._state.estimate, place_ned_m)
         self._next_loop_s = 0.0
-        self._obeyed = None
-        self.loop.reset(nav.yaw_rad)
+        self._setpoint = None
+        self.loop.reset(self._state.estimate.yaw_rad)
 
-    def arm(self, nav: Nav) -> None:
-        """The motors begin to turn: home is here."""
-        self._navigator.arm(nav)
-        self._takeoff.arm()
+    def arm(self) -> None:
+        """Start the motors."""
+        self._navigator.arm(self._state.estimate)
+        self._ramp.arm()
         if not self.landed:
-            self._takeoff.fly()
+            self._ramp.skip()
         self._armed_for_s = 0.0
-        self._attitude = level(nav.yaw_rad)
-        self.loop.reset(nav.yaw_rad)
+        self._attitude = level(self._state.estimate.yaw_rad)
+        self.loop.reset(self._state.estimate.yaw_rad)
 
-    def level(self, nav: Nav) -> None:
-        """Nobody says what to do: level, course and height as they are."""
-        self._navigator.level(nav)
-        self.loop.reset(nav.yaw_rad)
+    def level_off(self) -> None:
+        """The stream of attitude setpoints is lost: level attitude, present yaw and height."""
+        self._navigator.level_off(self._state.estimate)
+        self.loop.reset(self._state.estimate.yaw_rad)
 
-    def fly(self, time_s: float, armed: bool, look: Callable[[], Nav]) -> Demand:
-        """The demand for the step that begins now. `look` gives the estimate when it is needed."""
+    def step(self, armed: bool) -> Demand:
+        """Demand for the step that begins now."""
         if not armed:
-            self.demand, self._obeyed, self.thrust_demanded = OFF, None, 0.0
-            if not self.landed and look().on_ground:
-                self._detector.stand()
+            self.demand, self._setpoint, self.thrust_demanded = OFF, None, 0.0
+            if not self.landed and self._state.estimate.on_ground:
+                self.detector.set_landed(True)
             return OFF
-        setpoint = self._navigator.attitude_setpoint
-        if setpoint is not None:
-            self._obey(setpoint, look)
-        if time_s >= self._next_loop_s - 1e-6:
-            self._next_loop_s = time_s + LOOP_S
+        setpoint = self._navigator.setpoint
+        if not isinstance(setpoint, AttitudeSetpoint):
+            setpoint = None
+        elif setpoint is not self._setpoint:
+            self._take(setpoint)
+        if self._state.time_s >= self._next_loop_s - 1e-6:
+            self._next_loop_s = self._state.time_s + LOOP_S
             self._armed_for_s += LOOP_S
-            self._loop_once(setpoint, look(), time_s)
+            self._run_loop(setpoint, self._state.estimate)
         return self.demand
 
-    def _loop_once(self, setpoint: AttitudeSetpoint | None, nav: Nav, time_s: float) -> None:
-        """One period of the position loop's."""
-        self._tune()
-        if self._navigator.behaviour is Behaviour.LEVEL:
-            thrust = self._parameters.role("stick_thrust_least")
-            self._set(level(self.loop.yaw_rad), None, thrust)
-        elif setpoint is not None:
-            if setpoint.climb_mps is not None or self._boosts_thrust:
-                self._fly_vertical(setpoint, nav)
-        elif self._navigator.behaviour is not Behaviour.COAST:
-            self._fly_motion(nav, time_s)
-        self._detect(setpoint, nav)
-
-    def _tune(self) -> None:
+    def _run_loop(self, setpoint: AttitudeSetpoint | None, estimate: StateEstimate) -> None:
+        """One period of the position loop."""
         if self._tuned != self._parameters.changes:
             self._tuned = self._parameters.changes
             self.loop.tune(self._firmware.flight.gains(self._parameters.__getitem__))
+        control = self._navigator.active.control
+        if control is Control.LEVEL:
+            thrust = self._parameters.role("stick_thrust_least")
+            self.demand = Demand(True, thrust, level(self.loop.yaw_rad))
+        elif setpoint is not None:
+            if setpoint.climb_mps is not None:
+                self._control_climb(setpoint.climb_mps, estimate)
+            if setpoint.climb_mps is not None or self._boosts_thrust:
+                self._fly_attitude(setpoint)
+        elif control is Control.MOTION:
+            self._fly_motion(estimate)
+        self._detect_landing(setpoint, estimate)
+
+    # -- attitude setpoints ------------------------------------------------------------------
 
     @property
     def _boosts_thrust(self) -> bool:
         return self._parameters.role("tilt_boost") != 0.0
 
-    def _obey(self, setpoint: AttitudeSetpoint, look: Callable[[], Nav]) -> None:
-        if setpoint is self._obeyed:
-            return
-        if self._obeyed is None:
+    def _take(self, setpoint: AttitudeSetpoint) -> None:
+        """A new setpoint is flown at once."""
+        if self._setpoint is None:
             self._climb_thrust = self.demand.thrust
-        self._obeyed = setpoint
+        self._setpoint = setpoint
         if setpoint.attitude is not None:
             self._attitude = setpoint.attitude
-        self._command(setpoint, look)
+        self._fly_attitude(setpoint)
 
-    def _command(self, setpoint: AttitudeSetpoint, look: Callable[[], Nav]) -> None:
-        """Its attitude or rates, and its thrust as this firmware takes it."""
+    def _fly_attitude(self, setpoint: AttitudeSetpoint) -> None:
+        """Its attitude or rates, and its thrust, raised for the tilt where the firmware does so."""
         thrust = setpoint.thrust if setpoint.climb_mps is None else self._climb_thrust
         if self._armed_for_s < self._firmware.setpoints.spool_s:
             thrust = 0.0
         self.thrust_demanded = thrust
         if self._boosts_thrust:
-            thrust = min(1.0, thrust * _tilt_boost(look()))
+            tilt_cosine = max(self._state.estimate.tilt_cosine, _TILT_COSINE_MIN)
+            thrust = min(1.0, thrust * (1.0 / tilt_cosine))
         attitude = self._attitude if setpoint.rates_frd_radps is None else None
-        self._set(attitude, setpoint.rates_frd_radps, thrust)
+        self.demand = Demand(True, thrust, attitude, setpoint.rates_frd_radps)
 
-    def _fly_vertical(self, setpoint: AttitudeSetpoint, nav: Nav) -> None:
-        """What of an attitude setpoint needs the estimate: the climb rate, the tilt."""
-        if setpoint.climb_mps is not None:
-            climb = MotionSetpoint(velocity_ned_mps=(math.nan, math.nan, -setpoint.climb_mps))
-            limits = Limits(self._parameters.role("hover_thrust"))
-            estimate = (nav.position_ned_m, nav.velocity_ned_mps)
-            _, self._climb_thrust, _ = self.loop.step(
-                climb, limits, *estimate, integrate=not nav.on_ground
-            )
-            if self.landed and setpoint.climb_mps <= 0.0:
-                self._climb_thrust = 0.0
-        self._command(setpoint, lambda: nav)
-
-    def _set(self, attitude: Quaternion | None, rates: Triple | None, thrust: float) -> None:
-        demand = Demand(True, thrust, attitude, rates)
-        if demand != self.demand:
-            self.demand = demand
+    def _control_climb(self, climb_mps: float, estimate: StateEstimate) -> None:
+        """Thrust for a climb rate."""
+        motion = MotionSetpoint(velocity_ned_mps=(math.nan, math.nan, -climb_mps))
+        limits = Limits(self._parameters.role("hover_thrust"))
+        integrate = not estimate.on_ground
+        _, self._climb_thrust, _ = self.loop.step(motion, limits, estimate, integrate=integrate)
+        if self.landed and climb_mps <= 0.0:
+            self._climb_thrust = 0.0
 
     # -- motion ------------------------------------------------------------------------------
 
-    def _fly_motion(self, nav: Nav, time_s: float) -> None:
-        lifts = self._navigator.behaviour in _LIFTING
-        if self.landed and self._takeoff.spooling and lifts:
-            self._navigator.stay(nav)
-        waits = not (self._takeoff.flying or self._takeoff.lifting)
-        self.motion = self._navigator.motion(nav, time_s, landed=self.landed, waits=waits)
-        wants_up = lifts and self._asks_up(nav)
-        self._takeoff.step(LOOP_S, wants_up)
-        rises = self._takeoff.lifting
-        still = nav.on_ground and (rises or self.landed)
-        integrates = not still or (rises and self._firmware.flight.integrates_on_ramp)
-        estimate = (nav.position_ned_m, nav.velocity_ned_mps)
-        attitude, thrust, wanted = self.loop.step(
-            self.motion, self._limits, *estimate, integrate=integrates
+    def _fly_motion(self, estimate: StateEstimate) -> None:
+        navigator, ramp = self._navigator, self._ramp
+        lifts_off = navigator.active.lifts_off
+        if self.landed and ramp.spooling and lifts_off:
+            navigator.guidance.hold = MotionSetpoint(estimate.position_ned_m)
+        on_ground = not (ramp.flying or ramp.lifting)
+        self.motion = navigator.motion(estimate, landed=self.landed, on_ground=on_ground)
+        ramp.step(climb_demanded=lifts_off and self._climb_demanded(estimate))
+        still = estimate.on_ground and (ramp.lifting or self.landed)
+        on_ramp = ramp.lifting and self._firmware.flight.integrates_on_ramp
+        attitude, thrust, velocity_ned_mps = self.loop.step(
+            self.motion, self._limits, estimate, integrate=not still or on_ramp
         )
-        self._wanted_z_mps = wanted[2]
-        if rises:
-            attitude = level(self.loop.yaw_rad) if nav.on_ground else attitude
+        self._velocity_down_mps = velocity_ned_mps[2]
+        if ramp.lifting:
+            attitude = level(self.loop.yaw_rad) if estimate.on_ground else attitude
         elif self.landed:
-            self.loop.reset(nav.yaw_rad)
-            attitude, thrust = level(nav.yaw_rad), 0.0
-        elif self._detector.contact:
-            attitude, thrust = level(nav.yaw_rad), self._parameters.role("thrust_least")
+            self.loop.reset(estimate.yaw_rad)
+            attitude, thrust = level(estimate.yaw_rad), 0.0
+        elif self.detector.contact:
+            attitude, thrust = level(estimate.yaw_rad), self._parameters.role("thrust_least")
         self._attitude = attitude
         self.thrust_demanded = thrust
-        self._set(attitude, None, thrust)
+        self.demand = Demand(True, thrust, attitude)
 
     @property
     def _limits(self) -> Limits:
-        """As the behaviour allows, and the takeoff."""
+        """Limits of the motion by behaviour and takeoff ramp."""
         role, navigator, gains = self._parameters.role, self._navigator, self.loop.gains
-        up_mps = self._takeoff.speed_up_mps(gains.velocity_z[0])
-        if navigator.climbing and not navigator.smooth:
+        planned, automatic = navigator.trajectory is not None, navigator.active.automatic
+        up_mps = self._ramp.climb_limit_mps(gains.velocity_z[0])
+        if navigator.active.climbing and not planned:
             up_mps = min(up_mps, role("takeoff_speed_mps"))
         turn_radps = self.motion.turn_radps
-        if navigator.automatic:
-            turn_radps = min(turn_radps, gains.turn_radps)
         return Limits(
             hover_thrust=role("hover_thrust"),
-            thrust_least=0.0 if self._takeoff.lifting else role("thrust_least"),
-            across_mps=math.inf if navigator.smooth else navigator.across_mps,
+            thrust_least=0.0 if self._ramp.lifting else role("thrust_least"),
+            across_mps=math.inf if planned else navigator.cruise_mps,
             up_mps=up_mps,
-            down_mps=gains.follows_down_mps if navigator.smooth else gains.speed_down_mps,
-            turn_radps=turn_radps,
-            gently=navigator.automatic and not navigator.smooth,
+            down_mps=gains.follows_down_mps if planned else gains.speed_down_mps,
+            turn_radps=min(turn_radps, gains.turn_radps) if automatic else turn_radps,
+            smooth=automatic and not planned,
         )
 
-    def _asks_up(self, nav: Nav) -> bool:
-        """Something above is demanded: a height, a climb or an acceleration."""
+    def _climb_demanded(self, estimate: StateEstimate) -> bool:
+        """A higher place, a climb or an upward acceleration is demanded."""
         motion, navigator = self.motion, self._navigator
-        if navigator.smooth:
-            return navigator.rises and not navigator.earthbound
-        return not navigator.earthbound and (
-            motion.position_ned_m[2] < nav.position_ned_m[2]
+        if navigator.active.cannot_climb:
+            return False
+        if navigator.trajectory is not None:
+            return navigator.trajectory.climbs
+        return (
+            motion.position_ned_m[2] < estimate.position_ned_m[2]
             or motion.velocity_ned_mps[2] < 0.0
             or motion.acceleration_ned_mps2[2] < 0.0
         )
 
     # -- land detector -----------------------------------------------------------------------
 
-    def _detect(self, setpoint: AttitudeSetpoint | None, nav: Nav) -> None:
-        was_landed = self.landed
-        if setpoint is not None and self._firmware.setpoints.imply_flight:
-            self._detector.rest()
+    def _detect_landing(self, setpoint: AttitudeSetpoint | None, estimate: StateEstimate) -> None:
+        was_landed, by_motion = self.landed, setpoint is None
+        if not by_motion and self._firmware.setpoints.imply_flight:
+            self.detector.reset()
             if self.thrust_demanded > 0.0:
-                self._detector.lift_off()
+                self.detector.set_landed(False)
         else:
-            by_motion = setpoint is None
-            sinks = by_motion and self._sinks
-            self._detector.step(LOOP_S, nav, self.demand.thrust, by_motion=by_motion, sinks=sinks)
+            descends = by_motion and self._descent_demanded
+            self.detector.step(estimate, self.demand.thrust, by_motion=by_motion, descends=descends)
         if self.landed and not was_landed:
-            self._takeoff.land()
-        elif was_landed and not self.landed and not self._takeoff.lifting:
-            self._takeoff.fly()
+            self._ramp.land()
+        elif was_landed and not self.landed and not self._ramp.lifting:
+            self._ramp.skip()
 
     @property
-    def _sinks(self) -> bool:
-        """It was told to go down; where a place below is as good as a speed, by that too."""
+    def _descent_demanded(self) -> bool:
+        """A descent is demanded, or a place below where that counts as one."""
         landing = self._firmware.flight.landing
-        told = self.motion.velocity_ned_mps[2] >= landing.sinking_mps
-        return told or (landing.place_below_is_descent and self._wanted_z_mps > landing.sinking_mps)
-
-
-def _tilt_boost(nav: Nav) -> float:
-    """1 / cos(tilt) of the body."""
-    _, x, y, _ = nav.attitude
-    return 1.0 / max(1.0 - 2.0 * (x * x + y * y), 1.0 / _TILT_BOOST_MAX)
+        if self.motion.velocity_ned_mps[2] >= landing.sinking_mps:
+            return True
+        return landing.place_below_is_descent and self._velocity_down_mps > landing.sinking_mps

@@ -1,7 +1,8 @@
-"""The autopilot's own position loop: a motion setpoint and the estimate -> attitude and thrust.
+"""The autopilot's position loop: a motion setpoint and the estimate -> attitude and thrust.
 
-Holds what is kept from one period to the next: integrators, filtered acceleration and yaw. The
-equations are in `simulator.autopilot.position_law`. Knows no modes.
+P on position, PID on velocity, as multicopter autopilots fly it: on the *estimate* and its raw
+velocity, so it wanders where the estimate does. NED, SI; NaN where nothing is demanded. Knows no
+modes.
 """
 
 from __future__ import annotations
@@ -9,35 +10,29 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from simulator.autopilot.position_law import (
-    GRAVITY_MPS2,
-    attitude_of,
-    collective_thrust,
-    horizontal,
-    or_zero,
-    thrust_direction,
-    velocity_wanted,
-    wrapped,
-)
+from simulator.autopilot.state import StateEstimate
 from simulator.firmware.base import PositionGains
 from simulator.firmware.values import NAN3, MotionSetpoint, Quaternion, Triple
 from simulator.steps import LOOP_S
 
-# The vertical integral may hold up any vehicle; m/s^2 of north, east and down
+GRAVITY_MPS2 = 9.80665
+# The vertical integral may carry any vehicle; m/s^2 of north, east and down
 _INTEGRAL_MAX_MPS2 = (4.0, 4.0, GRAVITY_MPS2)
+_TILT_COSINE_MIN = 0.1  # least divisor of the thrust
+_TURN_RAD = 2.0 * math.pi
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Limits within which a motion is flown; the speeds lower those of the gains."""
+    """Limits of a motion; the speeds can only lower those of the gains."""
 
-    hover_thrust: float  # normalised, as the autopilot believes it
+    hover_thrust: float  # normalised, as the autopilot assumes it
     thrust_least: float = 0.0
     across_mps: float = math.inf
     up_mps: float = math.inf  # below 0 it is a descent
     down_mps: float = math.nan  # replaces the limit of the gains; NaN: theirs
     turn_radps: float = math.inf
-    gently: bool = False  # accelerate and brake as in automatic flight
+    smooth: bool = False  # accelerate and brake as in automatic flight
 
 
 class PositionLoop:
@@ -61,40 +56,41 @@ class PositionLoop:
         self._integral_mps2 = [0.0, 0.0, 0.0]
         self._acceleration_mps2 = [0.0, 0.0, 0.0]  # of the estimate, filtered
         self._velocity_mps = NAN3  # of the estimate in the last period
-        self._across_mps = math.nan  # wanted in the last period by `gently`
+        self._across_mps = math.nan  # setpoint of the last period under `smooth`
 
     def step(
         self,
         motion: MotionSetpoint,
         limits: Limits,
-        position_ned_m: Triple,
-        velocity_ned_mps: Triple,
+        estimate: StateEstimate,
         *,
         integrate: bool = True,
     ) -> tuple[Quaternion, float, Triple]:
-        """Fly one period of LOOP_S.
+        """Control of one period of LOOP_S.
 
         Args:
             motion: setpoint, NaN where nothing is demanded.
             limits: of speed, thrust and turn rate in this period.
-            position_ned_m, velocity_ned_mps: the estimate.
+            estimate: of which position and velocity are used.
             integrate: False freezes the integrators.
 
         Returns:
-            Attitude (wxyz, FRD -> NED), normalised thrust, and the velocity (NED, m/s) that the
-            loop tries to fly.
+            Attitude (wxyz, FRD -> NED), normalised thrust, and the velocity setpoint (NED, m/s)
+            of the velocity loop.
         """
-        self._filter_acceleration(velocity_ned_mps)
-        asked = self._velocity_asked(motion, position_ned_m)
-        wanted = self._limit_speed(asked, motion, limits, velocity_ned_mps)
-        acceleration = self._acceleration_wanted(motion, wanted, velocity_ned_mps)
-        self._turn(motion, limits, asked)
+        velocity = estimate.velocity_ned_mps
+        self._filter_acceleration(velocity)
+        demanded = self._velocity_demanded(motion, estimate.position_ned_m)
+        setpoint = self._limit_speed(demanded, motion, limits, velocity)
+        acceleration = self._acceleration(motion, setpoint, velocity)
+        self._turn(motion, limits, demanded)
         direction = thrust_direction(acceleration, self.gains.tilt_max_rad)
-        thrust = collective_thrust(acceleration[2], direction[2], limits.hover_thrust)
+        thrust = limits.hover_thrust * (1.0 - acceleration[2] / GRAVITY_MPS2)
+        thrust = thrust / max(direction[2], _TILT_COSINE_MIN)
         thrust = min(self.gains.thrust_max, max(limits.thrust_least, thrust))
         if integrate:
-            self._integrate(wanted, velocity_ned_mps, thrust, limits.thrust_least)
-        return attitude_of(direction, self.yaw_rad), thrust, wanted
+            self._integrate(setpoint, velocity, thrust, limits.thrust_least)
+        return attitude(direction, self.yaw_rad), thrust, setpoint
 
     def _filter_acceleration(self, velocity: Triple) -> None:
         """Derivative of the estimated velocity through a first-order low-pass."""
@@ -106,37 +102,39 @@ class PositionLoop:
             slope = (velocity[i] - before[i]) / LOOP_S
             filtered[i] += share * (slope - filtered[i])
 
-    def _velocity_asked(self, motion: MotionSetpoint, position: Triple) -> Triple:
-        """Velocity that the setpoint asks for, before any limit."""
+    def _velocity_demanded(self, motion: MotionSetpoint, position: Triple) -> Triple:
+        """P on the position error plus the demanded velocity, before any limit."""
         goal, speed, gain = motion.position_ned_m, motion.velocity_ned_mps, self._position_p
-        return (
-            velocity_wanted(goal[0] - position[0], speed[0], gain[0]),
-            velocity_wanted(goal[1] - position[1], speed[1], gain[1]),
-            velocity_wanted(goal[2] - position[2], speed[2], gain[2]),
+        north, east, down = (
+            speed[i]
+            if math.isnan(goal[i] - position[i])
+            else gain[i] * (goal[i] - position[i]) + _or_zero(speed[i])
+            for i in range(3)
         )
+        return north, east, down
 
     def _limit_speed(
-        self, asked: Triple, motion: MotionSetpoint, limits: Limits, velocity: Triple
+        self, demanded: Triple, motion: MotionSetpoint, limits: Limits, velocity: Triple
     ) -> Triple:
         gains = self.gains
-        north, east, down = asked
-        speed = horizontal(or_zero(north), or_zero(east))
+        north, east, down = demanded
+        speed = horizontal(_or_zero(north), _or_zero(east))
         most = min(limits.across_mps, gains.speed_xy_mps)
-        if limits.gently:
-            most = min(most, self._gentle_mps(speed, motion, velocity))
+        if limits.smooth:
+            most = min(most, self._smooth_mps(speed, motion, velocity))
             self._across_mps = min(speed, most)
         if speed > most:
             north, east = north * (most / speed), east * (most / speed)
         if not math.isnan(down):
             up_mps = min(limits.up_mps, gains.speed_up_mps)
-            own = math.isnan(limits.down_mps)
-            down_mps = gains.speed_down_mps if own else limits.down_mps
+            default = math.isnan(limits.down_mps)
+            down_mps = gains.speed_down_mps if default else limits.down_mps
             down = max(-up_mps, min(down_mps, down))
         return north, east, down
 
-    def _gentle_mps(self, speed_mps: float, motion: MotionSetpoint, velocity: Triple) -> float:
-        """Greatest speed across the ground in this period: little more than in the last one and,
-        on the way to a place, no more than it can brake from: v^2 = 2 a d, d = speed / gain."""
+    def _smooth_mps(self, speed_mps: float, motion: MotionSetpoint, velocity: Triple) -> float:
+        """Greatest speed across the ground: limited acceleration since the last period and, on the
+        way to a place, the speed from which it can brake: v^2 = 2 a d, d = speed / gain."""
         before_mps = self._across_mps
         if math.isnan(before_mps):
             before_mps = horizontal(velocity[0], velocity[1])
@@ -147,25 +145,23 @@ class PositionLoop:
             most = min(most, math.sqrt(squared)) if squared >= 0.0 else most
         return most
 
-    def _acceleration_wanted(
-        self, motion: MotionSetpoint, wanted: Triple, velocity: Triple
-    ) -> Triple:
-        """PID on the velocity error plus the demanded acceleration; the D acts on the estimate."""
+    def _acceleration(self, motion: MotionSetpoint, setpoint: Triple, velocity: Triple) -> Triple:
+        """PID on the velocity error plus the demanded acceleration; D acts on the estimate."""
         total = [0.0, 0.0, 0.0]
         for i in range(3):
-            total[i] = or_zero(motion.acceleration_ned_mps2[i])
-            if not math.isnan(wanted[i]):
+            total[i] = _or_zero(motion.acceleration_ned_mps2[i])
+            if not math.isnan(setpoint[i]):
                 p, _, d = self._velocity_pid[i]
-                error = wanted[i] - velocity[i]
+                error = setpoint[i] - velocity[i]
                 total[i] += p * error + self._integral_mps2[i] - d * self._acceleration_mps2[i]
         return total[0], total[1], total[2]
 
     def _integrate(
-        self, wanted: Triple, velocity: Triple, thrust: float, thrust_least: float
+        self, setpoint: Triple, velocity: Triple, thrust: float, thrust_least: float
     ) -> None:
         """Integrate the velocity errors; the vertical one not into a saturated thrust."""
         for i in range(3):
-            error = wanted[i] - velocity[i]
+            error = setpoint[i] - velocity[i]
             saturated = i == 2 and (
                 (thrust <= thrust_least and error > 0.0)
                 or (thrust >= self.gains.thrust_max and error < 0.0)
@@ -173,27 +169,71 @@ class PositionLoop:
             if math.isnan(error) or saturated:
                 continue
             most = _INTEGRAL_MAX_MPS2[i]
-            moved = self._integral_mps2[i] + self._velocity_pid[i][1] * error * LOOP_S
-            self._integral_mps2[i] = min(most, max(-most, moved))
+            integral = self._integral_mps2[i] + self._velocity_pid[i][1] * error * LOOP_S
+            self._integral_mps2[i] = min(most, max(-most, integral))
 
-    # -- yaw ---------------------------------------------------------------------------------
-
-    def _turn(self, motion: MotionSetpoint, limits: Limits, asked: Triple) -> None:
-        """Towards the yaw demanded by the shorter way, else by the yaw rate demanded."""
-        goal_rad = self._yaw_asked(motion, asked)
-        if math.isfinite(goal_rad):
+    def _turn(self, motion: MotionSetpoint, limits: Limits, demanded: Triple) -> None:
+        """Turn to the demanded yaw the shorter way, else by the demanded yaw rate."""
+        yaw_rad = self._yaw_demanded(motion, demanded)
+        if math.isfinite(yaw_rad):
             most_rad = limits.turn_radps * LOOP_S
-            left_rad = wrapped(goal_rad - self.yaw_rad)
-            if abs(left_rad) > most_rad:
-                goal_rad = wrapped(self.yaw_rad + math.copysign(most_rad, left_rad))
-            self.yaw_rad = goal_rad
+            error_rad = math.remainder(yaw_rad - self.yaw_rad, _TURN_RAD)
+            if abs(error_rad) > most_rad:
+                yaw_rad = self.yaw_rad + math.copysign(most_rad, error_rad)
+                yaw_rad = math.remainder(yaw_rad, _TURN_RAD)
+            self.yaw_rad = yaw_rad
         elif math.isfinite(motion.yaw_rate_radps):
-            self.yaw_rad = wrapped(self.yaw_rad + motion.yaw_rate_radps * LOOP_S)
+            yaw_rad = self.yaw_rad + motion.yaw_rate_radps * LOOP_S
+            self.yaw_rad = math.remainder(yaw_rad, _TURN_RAD)
 
-    def _yaw_asked(self, motion: MotionSetpoint, asked: Triple) -> float:
-        """The yaw demanded, or along the velocity asked for; not finite: keep the present one."""
+    def _yaw_demanded(self, motion: MotionSetpoint, demanded: Triple) -> float:
+        """The demanded yaw or that of the demanded velocity; not finite: keep the present one."""
         if math.isfinite(motion.yaw_rad) or not motion.faces_way:
             return motion.yaw_rad
-        if not horizontal(asked[0], asked[1]) > self.gains.facing_mps:
+        if not horizontal(demanded[0], demanded[1]) > self.gains.facing_mps:
             return math.nan
-        return math.atan2(asked[1], asked[0])
+        return math.atan2(demanded[1], demanded[0])
+
+
+def _or_zero(value: float) -> float:
+    return 0.0 if math.isnan(value) else value
+
+
+def horizontal(north: float, east: float) -> float:
+    """Length of a horizontal vector."""
+    return abs(complex(north, east))
+
+
+def thrust_direction(acceleration_ned_mps2: Triple, tilt_max_rad: float) -> Triple:
+    """Third body axis (unit, NED) for this horizontal acceleration in hover, within the tilt
+    limit; the thrust makes the vertical acceleration."""
+    north, east, _ = acceleration_ned_mps2
+    lateral = horizontal(north, east)
+    lateral_max = GRAVITY_MPS2 * math.tan(tilt_max_rad)
+    scale = lateral_max / lateral if lateral > lateral_max else 1.0
+    north, east = -north * scale, -east * scale
+    length = math.sqrt(north * north + east * east + GRAVITY_MPS2 * GRAVITY_MPS2)
+    return north / length, east / length, GRAVITY_MPS2 / length
+
+
+def level(yaw_rad: float) -> Quaternion:
+    """Attitude (wxyz) with this yaw and no tilt."""
+    return (math.cos(0.5 * yaw_rad), 0.0, 0.0, math.sin(0.5 * yaw_rad))
+
+
+def attitude(direction: Triple, yaw_rad: float) -> Quaternion:
+    """Attitude (wxyz, FRD -> NED) with the third body axis along `direction` and this yaw."""
+    cos_yaw, sin_yaw = math.cos(yaw_rad), math.sin(yaw_rad)
+    forward = cos_yaw * direction[0] + sin_yaw * direction[1]
+    right = cos_yaw * direction[1] - sin_yaw * direction[0]
+    half_roll = 0.5 * math.asin(min(1.0, max(-1.0, -right)))
+    half_pitch = 0.5 * math.atan2(forward, direction[2])
+    sr, cr = math.sin(half_roll), math.cos(half_roll)
+    sp, cp = math.sin(half_pitch), math.cos(half_pitch)
+    sy, cy = math.sin(0.5 * yaw_rad), math.cos(0.5 * yaw_rad)
+    return (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )

@@ -1,7 +1,6 @@
-"""The stream of setpoints: what a message asks to be flown, and whether they still come.
+"""The stream of setpoint messages: conversion to local NED, refusals, and its age.
 
-What each firmware makes of one is its own; here places become local NED, complaints are found and
-the age is kept. Knows neither modes nor the pilot that flies them.
+The firmware reads the messages. Knows no modes and no flight.
 """
 
 from __future__ import annotations
@@ -11,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from simulator.autopilot.nav import Nav
 from simulator.autopilot.parameters import ParameterTable
+from simulator.autopilot.state import StateEstimate
 from simulator.firmware.base import Firmware
 from simulator.firmware.values import AttitudeSetpoint, MotionSetpoint, StatusText
 from simulator.geodesy import TERRAIN_FRAMES, down_m, to_metres
@@ -24,30 +23,35 @@ _POSITION_IGNORED, _LOCAL_NED = 0b111, 1  # type_mask; MAV_FRAME
 
 @dataclass(slots=True)
 class SetpointStream:
-    """The setpoints that somebody sends; `newest_s`: vehicle time of the last that was taken."""
+    """Setpoints of a client; `newest_s`: vehicle time of the last that was accepted."""
 
     firmware: Firmware
     parameters: ParameterTable
     newest_s: float = -math.inf
 
     def alive(self, now_s: float) -> bool:
-        """Not lost: the firmware notices a little later than its time-out."""
+        """The stream is not lost; the firmware notices a loss some time after its time-out."""
         age_s = now_s - self.newest_s - self.firmware.setpoints.reaction_s
         return age_s <= self.parameters.role("stream_timeout_s")
 
-    def attitude(self, values: Mapping[str, Any]) -> AttitudeSetpoint | MotionSetpoint | None:
-        """By the fields of ATTITUDE; None: nothing to be flown."""
-        return self.firmware.setpoints.attitude(values, self.parameters.__getitem__)
+    def read(
+        self, message: str, values: Mapping[str, Any], estimate: StateEstimate, home_down_m: float
+    ) -> tuple[AttitudeSetpoint | MotionSetpoint | None, StatusText | None]:
+        """Setpoint of a message, or a text about its refusal.
 
-    def motion(
-        self, message: str, values: Mapping[str, Any], nav: Nav, home_down_m: float
-    ) -> tuple[MotionSetpoint | None, StatusText | None]:
-        """By the fields of LOCAL or GLOBAL, and what is said about them. They may be relative to
-        the vehicle, and heights to home (NED, m)."""
-        rules, frame = self.firmware.setpoints, values["coordinate_frame"]
+        Args:
+            message: ATTITUDE, LOCAL or GLOBAL.
+            values: its fields, which may be relative to the vehicle.
+            estimate: of the vehicle's state.
+            home_down_m: down coordinate (NED) of home, to which heights may be relative.
+        """
+        rules = self.firmware.setpoints
+        if message == ATTITUDE:
+            return rules.attitude(values, self.parameters.__getitem__), None
+        frame = values["coordinate_frame"]
         if message == LOCAL:
-            local = rules.in_local_frame(values, nav.position_ned_m, nav.attitude)
-        elif _is_place(values) and frame not in rules.global_frames:
+            local = rules.in_local_frame(values, estimate.position_ned_m, estimate.attitude)
+        elif _has_position(values) and frame not in rules.global_frames:
             return None, rules.rejection(message, frame)
         else:
             local = self._in_metres(values, home_down_m)
@@ -55,8 +59,7 @@ class SetpointStream:
         if setpoint is not None:
             return setpoint, None
         frame = local["coordinate_frame"]
-        known = None if frame == _LOCAL_NED else frame
-        return None, rules.rejection(message, known)
+        return None, rules.rejection(message, None if frame == _LOCAL_NED else frame)
 
     def _in_metres(self, values: Mapping[str, Any], home_down_m: float) -> Mapping[str, Any]:
         """Fields of GLOBAL as those of LOCAL in MAV_FRAME 1; a position is whole or ignored."""
@@ -66,10 +69,10 @@ class SetpointStream:
         z = down_m(values["alt"], frame, origin, home_down_m)
         if frame in TERRAIN_FRAMES:
             z = -values["alt"]
-        mask |= 0 if _is_place(values) else _POSITION_IGNORED
+        mask |= 0 if _has_position(values) else _POSITION_IGNORED
         place = {"coordinate_frame": _LOCAL_NED, "x": x, "y": y, "z": z, "type_mask": mask}
         return {**values, **place}
 
 
-def _is_place(values: Mapping[str, Any]) -> bool:
+def _has_position(values: Mapping[str, Any]) -> bool:
     return not values["type_mask"] & _POSITION_IGNORED

@@ -12,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from simulator.autopilot.autopilot import Autopilot
-from simulator.autopilot.commander import Wish
+from simulator.autopilot.commander import Request
 from simulator.firmware.values import Behaviour, ModeRequest, Result, Triple, info
 from simulator.geodesy import down_m, to_metres
 from simulator.mavlink.codec import id_of, name_of
@@ -76,16 +76,16 @@ class Commands:
         autopilot = self._autopilot
         if autopilot.firmware.commands.mode_acked_twice:
             self._acknowledge(command, Result.ACCEPTED)
-        by_planner = command.component == _MISSION_PLANNER
-        return self._request(autopilot.firmware.commands.mode(command.params), by_planner)
+        by_ground_station = command.component == _MISSION_PLANNER
+        return self._request(autopilot.firmware.commands.mode(command.params), by_ground_station)
 
-    def _request(self, request: ModeRequest, by_planner: bool) -> Result:
+    def _request(self, request: ModeRequest, by_ground_station: bool) -> Result:
         autopilot = self._autopilot
         if request.mode is None:
             if request.text is not None:
                 autopilot.commander.texts.append(request.text)
             return request.refusal
-        return autopilot.happen("mode", Wish(request.mode, by_planner=by_planner))
+        return autopilot.handle("mode", Request(request.mode, by_ground_station=by_ground_station))
 
     def _arm_disarm(self, command: Command) -> Result | None:
         autopilot = self._autopilot
@@ -94,41 +94,41 @@ class Commands:
             autopilot.commander.texts += () if request.text is None else (request.text,)
             return request.refusal
         forced = command.params[1] == autopilot.firmware.commands.force_codes[request.event]
-        return autopilot.happen(f"force {request.event}" if forced else request.event)
+        return autopilot.handle(f"force {request.event}" if forced else request.event)
 
     def _takeoff(self, command: Command) -> Result:
         height_m = command.params[6]
         autopilot = self._autopilot
-        home_down_m = autopilot.navigator.home_ned_m[2]
+        home_down_m = autopilot.guidance.home_ned_m[2]
         if autopilot.firmware.commands.takeoff_above_home:
             down_m = home_down_m - height_m
-            return autopilot.happen("takeoff", Wish(takeoff_ned_m=(math.nan, math.nan, down_m)))
+            return autopilot.handle("takeoff", Request(takeoff_ned_m=(math.nan, math.nan, down_m)))
         place = to_metres(autopilot.firmware.origin, *command.params[4:6])
         down_m = autopilot.firmware.origin[2] - height_m
         finite = (value if math.isfinite(value) else math.nan for value in (*place, down_m))
         north, east, down = finite
-        return autopilot.happen("takeoff", Wish(takeoff_ned_m=(north, east, down)))
+        return autopilot.handle("takeoff", Request(takeoff_ned_m=(north, east, down)))
 
     def _land(self, _: Command) -> Result:
-        return self._autopilot.happen("land")
+        return self._autopilot.handle("land")
 
     def _return(self, _: Command) -> Result:
-        return self._autopilot.happen("return")
+        return self._autopilot.handle("return")
 
     def _loiter(self, _: Command) -> Result:
         autopilot = self._autopilot
         known = autopilot.commander.knows("loiter")
-        return autopilot.happen("loiter") if known else Result.UNSUPPORTED
+        return autopilot.handle("loiter") if known else Result.UNSUPPORTED
 
     def _set_home(self, command: Command) -> Result:
         """MAV_CMD_DO_SET_HOME. param1 = 1: here; else a place in degrees and AMSL metres."""
         latitude, longitude, height_m = command.params[4:7]
         autopilot = self._autopilot
         if command.params[0] == 1.0:
-            autopilot.navigator.home_ned_m = autopilot.senses.look().position_ned_m
+            autopilot.guidance.home_ned_m = autopilot.state.estimate.position_ned_m
         elif math.isfinite(latitude + longitude + height_m):
             north, east = to_metres(autopilot.firmware.origin, latitude, longitude)
-            autopilot.navigator.home_ned_m = (north, east, autopilot.firmware.origin[2] - height_m)
+            autopilot.guidance.home_ned_m = (north, east, autopilot.firmware.origin[2] - height_m)
         else:
             return Result.DENIED
         return Result.ACCEPTED
@@ -148,13 +148,13 @@ class Commands:
             if not (latitude or longitude):
                 return Result.DENIED
             yaw_rad = math.nan
-        result = autopilot.happen("mode", Wish(autopilot.firmware.commands.reposition_mode))
+        result = autopilot.handle("mode", Request(autopilot.firmware.commands.reposition_mode))
         if result is Result.ACCEPTED and autopilot.commander.armed:
             yaw_rad = yaw_rad if math.isfinite(yaw_rad) else math.nan
             place = self._place(latitude, longitude, height_m, command.frame or 0)
             autopilot.go_to(place, yaw_rad)
             if math.isfinite(speed_mps):
-                autopilot.navigator.cruise_mps = speed_mps
+                autopilot.guidance.cruise_mps = speed_mps
         return result
 
     def go_to(self, place: tuple[float, float, float], frame: int) -> bool:
@@ -169,8 +169,8 @@ class Commands:
         """NED position of a place in degrees and a height of this MAV_FRAME; the present position
         replaces coordinates that are not finite."""
         autopilot = self._autopilot
-        origin, home_down_m = autopilot.firmware.origin, autopilot.navigator.home_ned_m[2]
-        here = autopilot.senses.look().position_ned_m
+        origin, home_down_m = autopilot.firmware.origin, autopilot.guidance.home_ned_m[2]
+        here = autopilot.state.estimate.position_ned_m
         north, east = to_metres(origin, latitude, longitude)
         if not math.isfinite(north + east):
             north, east = here[:2]
@@ -187,7 +187,7 @@ class Commands:
         if speed_mps > 0.0 and kind in _VERTICAL_SPEEDS:
             return Result.ACCEPTED
         known = 0.0 < speed_mps < math.inf
-        autopilot.navigator.cruise_mps = speed_mps if known else math.inf
+        autopilot.guidance.cruise_mps = speed_mps if known else math.inf
         return Result.ACCEPTED if known else autopilot.firmware.commands.speed_refusal
 
     def _turn(self, command: Command) -> Result:
@@ -197,16 +197,16 @@ class Commands:
         if not autopilot.commander.knows("turn"):
             return Result.UNSUPPORTED
         if math.isfinite(yaw_deg):
-            from_rad = autopilot.senses.look().yaw_rad if relative else 0.0
+            from_rad = autopilot.state.estimate.yaw_rad if relative else 0.0
             turn_rad = math.radians(yaw_deg) * (-1.0 if relative and sense < 0 else 1.0)
             turn_radps = math.radians(speed_dps) if speed_dps > 0.0 else math.inf
             yaw_rad = math.remainder(from_rad + turn_rad, 2.0 * math.pi)
-            autopilot.navigator.turn_to(yaw_rad, turn_radps)
-        return autopilot.happen("turn")
+            autopilot.guidance.turn_to(yaw_rad, turn_radps)
+        return autopilot.handle("turn")
 
     def _reboot(self, command: Command) -> Result:
         restart = command.params[0] >= 1.0
-        return self._autopilot.happen("reboot") if restart else Result.UNSUPPORTED
+        return self._autopilot.handle("reboot") if restart else Result.UNSUPPORTED
 
     def _start_mission(self, command: Command) -> Result:
         autopilot = self._autopilot
@@ -215,7 +215,7 @@ class Commands:
             return Result.UNSUPPORTED
         if not -1 <= first < max(1, len(autopilot.mission.items)):
             return Result.DENIED
-        return autopilot.happen("mission")
+        return autopilot.handle("mission")
 
     def _set_current_item(self, command: Command) -> Result:
         number = command.params[0]

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
-from simulator.autopilot.mission import ITEMS_MAX, Item, Kind, Mission
+from simulator.autopilot.mission import ITEMS_MAX, Kind, Mission
 from simulator.firmware.base import MissionRules
-from simulator.firmware.values import Severity, StatusText
+from simulator.firmware.values import MissionItem, Severity, StatusText
 from simulator.mavlink.codec import Message
 from simulator.mavlink.outbox import Outbox
 from simulator.mavlink.texts import Texts
@@ -48,7 +48,7 @@ class Upload:
     peer: tuple[int, int]
     kind: int
     count: int
-    items: list[Item]
+    items: list[MissionItem]
     begun_s: float
     requested_s: float
 
@@ -74,7 +74,7 @@ class MissionTransfer:
     _upload: Upload | None = None
     _download: Download | None = None
     _taken: tuple[int, int] = (0, 0)  # count and kind of the last upload
-    _unchecked: tuple[tuple[Item, ...], float] | None = None  # a mission and its arrival time
+    _unchecked: tuple[tuple[MissionItem, ...], float] | None = None  # a mission; arrival time
     _whole: bool = False  # the peer uses the _INT messages, in 1e-7 degrees
 
     @property
@@ -90,7 +90,7 @@ class MissionTransfer:
     def _check(self, now_s: float) -> None:
         """Replace the vehicle's mission by the uploaded one once it has been checked."""
         if self._unchecked is not None and now_s - self._unchecked[1] >= CHECK_S:
-            self.mission.keep(0, self._unchecked[0])
+            self.mission.store(0, self._unchecked[0])
             self._unchecked = None
 
     def step(self, now_s: float) -> None:
@@ -123,7 +123,7 @@ class MissionTransfer:
         elif message.count > ITEMS_MAX:
             self._acknowledge(peer, Ack.NO_SPACE, kind)
         elif message.count == 0:
-            self.mission.keep(kind, ())
+            self.mission.store(kind, ())
             self._acknowledge(peer, Ack.ACCEPTED, kind)
         else:
             self._upload = Upload(peer, kind, message.count, [], now_s, now_s)
@@ -161,7 +161,7 @@ class MissionTransfer:
         if self.rules.strict and upload.kind == 0:
             self._unchecked = (tuple(upload.items), now_s)
         else:
-            self.mission.keep(upload.kind, tuple(upload.items))
+            self.mission.store(upload.kind, tuple(upload.items))
         self._upload, self._taken = None, (upload.count, upload.kind)
         self._acknowledge(upload.peer, Ack.ACCEPTED, upload.kind)
         if upload.kind in self.rules.texts:
@@ -196,12 +196,12 @@ class MissionTransfer:
     def _list(self, message: Message, now_s: float) -> None:
         kind, peer = message.mission_type, (message.system, message.component)
         self._download = Download(peer, kind, now_s)
-        self.outbox.send("MISSION_COUNT", *peer, len(self.mission.listed(kind)), kind)
+        self.outbox.send("MISSION_COUNT", *peer, len(self.mission.items_of(kind)), kind)
 
     def _request(self, message: Message, now_s: float) -> None:
         peer, kind = (message.system, message.component), message.mission_type
         self._whole = whole = message.name == "MISSION_REQUEST_INT"
-        items = self.mission.listed(kind)
+        items = self.mission.items_of(kind)
         is_home = self.rules.home_first and kind == 0 and message.seq == 0
         exists = is_home or message.seq < len(items)
         if self.rules.strict and not self._is_due(peer, kind, message.seq, exists):
@@ -219,12 +219,12 @@ class MissionTransfer:
         name = "MISSION_ITEM_INT" if whole else "MISSION_ITEM"
         self.outbox.send(name, *head, current, autocontinue, *item.params, *places, item.z, kind)
 
-    def _home(self) -> Item:
+    def _home(self) -> MissionItem:
         """Home as an item of a mission."""
         view = self.outbox.view
-        north_m, east_m, down_m = view.autopilot.navigator.home_ned_m
+        north_m, east_m, down_m = view.autopilot.guidance.home_ned_m
         place = view.geodetic(north_m, east_m)
-        return Item(0, Kind.WAYPOINT, (0.0,) * 4, *place, view.altitude_mm(down_m) * 1e-3)
+        return MissionItem(0, Kind.WAYPOINT, (0.0,) * 4, *place, view.altitude_mm(down_m) * 1e-3)
 
     def _is_due(self, peer: tuple[int, int], kind: int, number: int, exists: bool) -> bool:
         """Whether it is the next item or the last one again; any other ends the download."""
@@ -242,7 +242,7 @@ class MissionTransfer:
     def _clear(self, message: Message, _: float) -> None:
         asked = message.mission_type
         for kind in _KINDS if asked == _ANY_TYPE else _KINDS & {asked}:
-            self.mission.keep(kind, ())
+            self.mission.store(kind, ())
         self._acknowledge((message.system, message.component), Ack.ACCEPTED, asked)
 
     def _set_current(self, message: Message, _: float) -> None:
@@ -250,13 +250,13 @@ class MissionTransfer:
             self.outbox.send_now("MISSION_CURRENT")
 
 
-def _read(message: Message) -> Item:
+def _read(message: Message) -> MissionItem:
     """MISSION_ITEM_INT, or MISSION_ITEM with its places in degrees."""
     x, y = message.x, message.y
     if message.name == "MISSION_ITEM":
         x, y = (_integer(value * 1e7) for value in (x, y))
     params = (message.param1, message.param2, message.param3, message.param4)
-    return Item(message.frame, message.command, params, x, y, message.z)
+    return MissionItem(message.frame, message.command, params, x, y, message.z)
 
 
 def _integer(value: float) -> int:

@@ -15,7 +15,7 @@ from simulator.mavlink.view import View
 
 
 def attitude(view: View) -> Sequence[Any]:
-    nav = view.autopilot.senses.look()
+    nav = view.autopilot.state.estimate
     w, x, y, z = nav.attitude
     roll = math.atan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = math.asin(min(1.0, max(-1.0, 2.0 * (w * y - z * x))))
@@ -23,19 +23,19 @@ def attitude(view: View) -> Sequence[Any]:
 
 
 def attitude_quaternion(view: View) -> Sequence[Any]:
-    nav = view.autopilot.senses.look()
+    nav = view.autopilot.state.estimate
     return (view.time_ms, *nav.attitude, *nav.rates_frd_radps, (0.0, 0.0, 0.0, 0.0))
 
 
 def local_position_ned(view: View) -> Sequence[Any]:
-    nav = view.autopilot.senses.look()
+    nav = view.autopilot.state.estimate
     return (view.time_ms, *nav.position_ned_m, *nav.velocity_ned_mps)
 
 
 def global_position_int(view: View) -> Sequence[Any]:
-    nav = view.autopilot.senses.look()
+    nav = view.autopilot.state.estimate
     north, east, down = nav.position_ned_m
-    home_down = view.autopilot.navigator.home_ned_m[2]
+    home_down = view.autopilot.guidance.home_ned_m[2]
     return (
         view.time_ms,
         *view.geodetic(north, east),
@@ -48,7 +48,7 @@ def global_position_int(view: View) -> Sequence[Any]:
 
 def scaled_pressure(view: View) -> Sequence[Any]:
     """Static pressure in hPa; 25 degC."""
-    down_m = view.autopilot.senses.look().position_ned_m[2]
+    down_m = view.autopilot.state.estimate.position_ned_m[2]
     height_m = view.autopilot.firmware.origin[2] - down_m
     return (view.time_ms, pressure_hpa(height_m), 0.0, 2500, 0)
 
@@ -60,7 +60,7 @@ def vibration(view: View) -> Sequence[Any]:
 
 def vfr_hud(view: View) -> Sequence[Any]:
     autopilot = view.autopilot
-    nav = autopilot.senses.look()
+    nav = autopilot.state.estimate
     north, east, down = nav.velocity_ned_mps
     return (
         0.0,

@@ -64,7 +64,7 @@ class Schedule:
 
     def take_due(self) -> list[str]:
         """Names of the messages due now, in the order of the streams; each is due again later."""
-        view, now_us = self.view, self.view.autopilot.senses.time_us
+        view, now_us = self.view, self.view.autopilot.state.time_us
         if now_us < self._next_us:
             return []
         due: list[str] = []
@@ -91,7 +91,7 @@ class Schedule:
             return True
         least_us = LEAST_INTERVAL_US.get(name, 1.0)
         interval_us = round(min(INTERVAL_MAX_US, max(least_us, interval_us)))
-        self._start(name, interval_us).next_after(self.view.autopilot.senses.time_us)
+        self._start(name, interval_us).next_after(self.view.autopilot.state.time_us)
         return True
 
     def interval_us(self, name: str) -> int:

@@ -76,7 +76,7 @@ class Server:
     def step(self) -> None:
         """Queue what is due at this step: missions, lists of parameters, telemetry."""
         if self._missions.under_way:
-            self._missions.step(self.view.autopilot.senses.time_us * 1e-6)
+            self._missions.step(self.view.autopilot.state.time_us * 1e-6)
         if self._parameters.listing:
             self._parameters.step()
         for name in self.schedule.take_due():
@@ -100,7 +100,7 @@ class Server:
 
     def _check(self, message: Message) -> None:
         assert self.strict is not None
-        text = self.strict.complaint(message, self.view.autopilot.senses.time_us * 1e-6)
+        text = self.strict.complaint(message, self.view.autopilot.state.time_us * 1e-6)
         if text is not None:
             self.view.autopilot.commander.texts.append(text)
 
@@ -120,7 +120,7 @@ class Server:
         autopilot = self.view.autopilot
         read = autopilot.parameters.__getitem__
         if autopilot.firmware.link.is_ground_station(message.type, message.system, read):
-            autopilot.watch.hear_ground_station(autopilot.senses.time_s)
+            autopilot.monitors.ground_station_heard(autopilot.state.time_s)
             self.texts.note_ground_station()
 
     def _command_long(self, message: Message) -> None:
@@ -134,7 +134,7 @@ class Server:
         self._commands.run(Command(message.command, params, *sender, message.frame))
 
     def _setpoint(self, message: Message) -> None:
-        self.view.autopilot.obey(message.name, message.values)
+        self.view.autopilot.take_setpoint(message.name, message.values)
 
     def _set_mode(self, message: Message) -> None:
         sender = (message.system, message.component)
@@ -148,7 +148,7 @@ class Server:
         if rules.guided_items and message.name in _ITEMS and message.current == _GUIDED:
             self._guided_item(message)
             return
-        self._missions.handle(message, self.view.autopilot.senses.time_us * 1e-6)
+        self._missions.handle(message, self.view.autopilot.state.time_us * 1e-6)
 
     def _guided_item(self, message: Message) -> None:
         """A mission item that is a place to fly to now (ArduPilot, `current` = 2)."""
@@ -182,10 +182,10 @@ class Server:
         """Stick positions; only the ground station may send them."""
         autopilot = self.view.autopilot
         read = autopilot.parameters.__getitem__
-        if autopilot.sticks is None:
+        if autopilot.guidance.sticks is None:
             return
         if autopilot.firmware.link.is_ground_station(0, message.system, read):
-            autopilot.sticks.override(widths_us, autopilot.senses.time_s)
+            autopilot.guidance.sticks.override(widths_us, autopilot.state.time_s)
 
     def _log_request_list(self, _: Message) -> None:
         """There are no logs."""

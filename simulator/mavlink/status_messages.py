@@ -31,7 +31,7 @@ def heartbeat(view: View) -> Sequence[Any]:
 
 def sys_status(view: View) -> Sequence[Any]:
     autopilot = view.autopilot
-    battery = autopilot.senses.truth.battery
+    battery = autopilot.state.truth.battery
     present, enabled, health = view.sensor_bits
     return (
         present, enabled, health, 80,
@@ -43,7 +43,7 @@ def sys_status(view: View) -> Sequence[Any]:
 
 
 def battery_status(view: View) -> Sequence[Any]:
-    battery = view.autopilot.senses.truth.battery
+    battery = view.autopilot.state.truth.battery
     voltage = fit(battery.voltage_v * 1e3, 16, signed=False)
     return (
         0, 1, 1, 32767, (voltage, *(65535,) * 9), fit(battery.current_a * 100, 16), 0, -1,
@@ -64,8 +64,8 @@ def timesync(view: View) -> Sequence[Any]:
 
 
 def home_position(view: View) -> Sequence[Any]:
-    north, east, down = view.autopilot.navigator.home_ned_m
-    yaw_rad = view.autopilot.navigator.home_yaw_rad
+    north, east, down = view.autopilot.guidance.home_ned_m
+    yaw_rad = view.autopilot.guidance.home_yaw_rad
     return (
         *view.geodetic(north, east),
         view.altitude_mm(down),

@@ -85,7 +85,7 @@ class Strict:
         name = values["param_id"]
         if name not in self.parameters:
             return f"of unknown {_printable(name)}"
-        if not self.parameters.takes(name, values["param_value"]):
+        if not self.parameters.in_range(name, values["param_value"]):
             return f"of {name} is out of range"
         return ""
 

@@ -58,4 +58,4 @@ class Texts:
 
     @property
     def _now_us(self) -> int:
-        return self.outbox.view.autopilot.senses.time_us
+        return self.outbox.view.autopilot.state.time_us

@@ -61,8 +61,8 @@ class View:
 
     def payload(self, name: str) -> bytes:
         """Packed payload of message `name` now; built once per step for all links."""
-        if self._at_step != self.autopilot.senses.steps:
-            self._at_step = self.autopilot.senses.steps
+        if self._at_step != self.autopilot.state.steps:
+            self._at_step = self.autopilot.state.steps
             self._payloads.clear()
         packed = self._payloads.get(name)
         if packed is None:
@@ -74,7 +74,7 @@ class View:
 
     def restart(self, autopilot: Autopilot) -> None:
         """Show another autopilot, after a reboot."""
-        autopilot.senses.gps_healthy = self.autopilot.senses.gps_healthy
+        autopilot.state.gps_healthy = self.autopilot.state.gps_healthy
         self.autopilot = autopilot
         self.clock_offset_us = self.ping_sequence = 0
         self._at_step = -1
@@ -82,7 +82,7 @@ class View:
     @property
     def has_fix(self) -> bool:
         """No fault suppresses the GPS fix."""
-        return self.autopilot.senses.gps_healthy
+        return self.autopilot.state.gps_healthy
 
     @property
     def sensor_bits(self) -> tuple[int, int, int]:
@@ -90,7 +90,7 @@ class View:
         autopilot = self.autopilot
         sensors = autopilot.firmware.health.sensors
         present, enabled, health = sensors.present, sensors.enabled, sensors.health
-        if not autopilot.health.has_fix(autopilot.senses.time_s):
+        if not autopilot.health.has_fix(autopilot.state.time_s):
             present, enabled, health = present & ~_GPS, enabled & ~_GPS, health & ~_GPS
         elif not self.has_fix:
             health &= ~_GPS
@@ -101,12 +101,12 @@ class View:
     @property
     def landed_state(self) -> int:
         """MAV_LANDED_STATE: 1 on ground, 2 in air, 3 taking off, 4 landing."""
-        navigator = self.autopilot.navigator
+        behaviour = self.autopilot.navigator.active
         if self.autopilot.pilot.landed:
             return 1
-        if navigator.landing:
+        if behaviour.landing:
             return 4
-        return 3 if navigator.climbing else 2
+        return 3 if behaviour.climbing else 2
 
     @property
     def time_ms(self) -> int:
@@ -115,7 +115,7 @@ class View:
     @property
     def time_us(self) -> int:
         """Vehicle time of the time stamps, microseconds."""
-        return max(0, self.autopilot.senses.time_us + self.clock_offset_us)
+        return max(0, self.autopilot.state.time_us + self.clock_offset_us)
 
     def geodetic(self, north_m: float, east_m: float) -> tuple[int, int]:
         """Latitude and longitude in 1e-7 deg of a point near the origin (spherical Earth)."""

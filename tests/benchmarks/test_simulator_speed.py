@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 
 from simulator import config
-from simulator.autopilot.commander import Wish
+from simulator.autopilot.commander import Request
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
 from simulator.vehicle.conditions import Conditions
@@ -37,8 +37,8 @@ def _standing() -> Instance:
 
 def _holding() -> Instance:
     instance = _standing()
-    instance.autopilot.happen("mode", Wish("AUTO.TAKEOFF"))
-    instance.autopilot.happen("arm")
+    instance.autopilot.handle("mode", Request("AUTO.TAKEOFF"))
+    instance.autopilot.handle("arm")
     _fly(instance, 25.0)  # until it rests there
     return instance
 

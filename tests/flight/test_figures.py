@@ -41,7 +41,7 @@ def test_default_flight(scenario: str, most_m: float, tmp_path: Path) -> None:
     assert score.setpoint_gap_max_s <= 0.12
     assert score.missed_ticks == 0
     assert score.gap_median <= 1e-9
-    assert abs(pair.instance.autopilot.senses.truth.position_ned_m[2]) < 0.05
+    assert abs(pair.instance.autopilot.state.truth.position_ned_m[2]) < 0.05
     assert not pair.instance.autopilot.commander.armed
 
 

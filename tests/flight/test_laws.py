@@ -82,7 +82,7 @@ def flown(law: str, tmp_path: Path, *assignments: str) -> tuple[np.ndarray, np.n
         if companion.phase in (Phase.CLIMB, Phase.JOIN, Phase.TRACK, Phase.HOVER):
             plan = companion.plan
             times.append(plan.track_time_s(companion.state.time_s))
-            truth = np.array(pair.instance.autopilot.senses.truth.position_ned_m)
+            truth = np.array(pair.instance.autopilot.state.truth.position_ned_m)
             places.append(truth - plan.origin_ned_m)
 
     pair._step = watched  # type: ignore[method-assign]

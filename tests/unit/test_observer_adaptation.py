@@ -86,7 +86,7 @@ def learnt(observer: Observer) -> Adaptation:
 
 
 def rms(errors: Array, share: float = 0.5) -> float:
-    """Of the last `share` of the rows, per axis."""
+    """The RMS of the last `share` of the rows, per axis."""
     return float(np.sqrt(np.mean(errors[-round(share * len(errors)) :] ** 2)))
 
 
@@ -100,8 +100,8 @@ def test_white_noise_is_measured(gap_s: float) -> None:
 
 
 def test_white_noise_is_smoothed_away() -> None:
-    """Of 2 cm per sample less than 0.6 cm are left; with the constants configured, half as much
-    again and more."""
+    """Noise of 2 cm per sample leaves less than 0.6 cm; with the configured constants it leaves at
+    least half as much again."""
     flown = hover(20.0, 0.01, seed=2, drift=0.05)
     _, adapted, _ = watch(flown, white=(0.02, 0.02))
     _, fixed, _ = watch(flown, SETTINGS.model_copy(update={"adaptive": False}), (0.02, 0.02))

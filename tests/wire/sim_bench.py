@@ -70,7 +70,7 @@ class Bench:
 
     @property
     def height_m(self) -> float:
-        return -float(self.instance.autopilot.senses.truth.position_ned_m[2])
+        return -float(self.instance.autopilot.state.truth.position_ned_m[2])
 
     # -- sending -----------------------------------------------------------------------------
 

@@ -48,12 +48,12 @@ def set_parameter(vehicle: Bench, name: str, value: float) -> None:
 
 
 def roll_deg(vehicle: Bench) -> float:
-    w, x, y, z = vehicle.instance.autopilot.senses.truth.attitude
+    w, x, y, z = vehicle.instance.autopilot.state.truth.attitude
     return math.degrees(math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y)))
 
 
 def climb_mps(vehicle: Bench) -> float:
-    return -float(vehicle.instance.autopilot.senses.truth.velocity_ned_mps[2])
+    return -float(vehicle.instance.autopilot.state.truth.velocity_ned_mps[2])
 
 
 def ready(mode: int = GUIDED) -> Bench:
@@ -358,7 +358,7 @@ def test_land_descends_at_half_a_metre_per_second_and_disarms() -> None:
     assert vehicle.command(21) == [ACCEPTED]
     vehicle.run(4.0)
     assert climb_mps(vehicle) == pytest.approx(-0.5, abs=0.03)
-    down_s = vehicle.run_until(lambda: vehicle.instance.autopilot.senses.truth.on_ground, 12.0)
+    down_s = vehicle.run_until(lambda: vehicle.instance.autopilot.state.truth.on_ground, 12.0)
     vehicle.run(3.0)
     assert vehicle.text_at("Disarming motors") - down_s == pytest.approx(2.1, abs=0.3)
     assert vehicle.mode == LAND
@@ -495,7 +495,7 @@ def test_a_lost_stream_levels_after_guid_timeout_without_a_text(timeout_s: float
     height_m = vehicle.height_m
     vehicle.run(4.0)
     assert vehicle.height_m == pytest.approx(height_m, abs=0.15)
-    drift_mps = math.hypot(*vehicle.instance.autopilot.senses.truth.velocity_ned_mps[:2])
+    drift_mps = math.hypot(*vehicle.instance.autopilot.state.truth.velocity_ned_mps[:2])
     assert drift_mps > 0.1  # nobody holds the position
     assert vehicle.texts(lost_s) == []
     assert vehicle.mode == GUIDED
@@ -565,13 +565,13 @@ def test_without_gps_the_position_is_lost_after_eight_seconds(
     set_parameter(vehicle, "FS_EKF_ACTION", action)
     vehicle.command(511, 193, 100_000)
     autopilot, begun_s = vehicle.instance.autopilot, vehicle.time_s
-    autopilot.senses.gps_healthy = False
+    autopilot.state.gps_healthy = False
     vehicle.run(7.8)
     assert (vehicle.mode, vehicle.system_status) == (GUIDED, 4)
     vehicle.run(0.5)
     assert (vehicle.mode, vehicle.system_status) == (mode, 5 if said else 4)
     assert vehicle.of("EKF_STATUS_REPORT")[-1][1].flags == 167
-    autopilot.senses.gps_healthy = True
+    autopilot.state.gps_healthy = True
     vehicle.run(0.5)
     assert vehicle.of("EKF_STATUS_REPORT")[-1][1].flags == 831
     assert (vehicle.mode, vehicle.system_status) == (mode, 4)
@@ -609,7 +609,7 @@ def test_a_mission_begins_with_the_item_after_home() -> None:
     vehicle.run_until(lambda: not vehicle.armed, 60.0)
     assert vehicle.texts()[-1] == "Disarming motors"
     assert [m.seq for _, m in vehicle.of("MISSION_ITEM_REACHED")] == [1, 2, 3]
-    assert vehicle.instance.autopilot.senses.truth.position_ned_m[0] == pytest.approx(6.0, abs=0.3)
+    assert vehicle.instance.autopilot.state.truth.position_ned_m[0] == pytest.approx(6.0, abs=0.3)
 
 
 def test_parameters_carry_values_whatever_their_type() -> None:

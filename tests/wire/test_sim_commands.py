@@ -54,13 +54,13 @@ def test_a_changed_speed_is_flown_until_another_mode(firmware: Firmware) -> None
     assert bench.command(CHANGE_SPEED, 1, 2.0, -1) == [ACCEPTED]
     go_north(bench, 40.0, NAN)
     bench.run(8.0)
-    speed_mps = bench.instance.autopilot.senses.truth.velocity_ned_mps[0]
+    speed_mps = bench.instance.autopilot.state.truth.velocity_ned_mps[0]
     assert speed_mps == pytest.approx(1.9, abs=0.15)  # against drag
     bench.command(21)
     bench.command(176, 1, *((GUIDED,) if firmware is ARDUPILOT else (4, 3)))
     go_north(bench, 40.0, NAN)
     bench.run(3.0)
-    assert bench.instance.autopilot.senses.truth.velocity_ned_mps[0] > 3.0
+    assert bench.instance.autopilot.state.truth.velocity_ned_mps[0] > 3.0
 
 
 @pytest.mark.parametrize(("firmware", "answer"), [(PX4, ACCEPTED), (ARDUPILOT, FAILED)])
@@ -79,7 +79,7 @@ def test_px4_takes_the_yaw_of_a_reposition_and_keeps_coordinates_that_are_nan() 
     for nothing in (NAN, math.inf):
         assert bench.command(REPOSITION, -1, 1, 0, *(nothing,) * 4) == [ACCEPTED]
         bench.run(3.0)
-        truth = bench.instance.autopilot.senses.truth
+        truth = bench.instance.autopilot.state.truth
         assert truth.position_ned_m[[0, 2]] == pytest.approx([3.0, -5.0], abs=0.3)
 
 

@@ -82,7 +82,7 @@ def reposition(
 
 
 def course_deg(bench: Bench) -> float:
-    return math.degrees(bench.instance.autopilot.senses.look().yaw_rad)
+    return math.degrees(bench.instance.autopilot.state.estimate.yaw_rad)
 
 
 def off_deg(bench: Bench, wanted_deg: float) -> float:
@@ -90,11 +90,11 @@ def off_deg(bench: Bench, wanted_deg: float) -> float:
 
 
 def place(bench: Bench) -> tuple[float, ...]:
-    return tuple(bench.instance.autopilot.senses.truth.position_ned_m.tolist())
+    return tuple(bench.instance.autopilot.state.truth.position_ned_m.tolist())
 
 
 def velocity(bench: Bench) -> tuple[float, ...]:
-    return tuple(bench.instance.autopilot.senses.truth.velocity_ned_mps.tolist())
+    return tuple(bench.instance.autopilot.state.truth.velocity_ned_mps.tolist())
 
 
 def fastest_mps(bench: Bench, duration_s: float) -> float:

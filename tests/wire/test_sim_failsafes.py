@@ -134,16 +134,16 @@ def test_a_worse_battery_changes_the_delayed_failsafe() -> None:
 def test_without_position_automatic_flight_lands_and_attitude_setpoints_continue() -> None:
     bench = flying()
     autopilot = bench.instance.autopilot
-    autopilot.senses.gps_healthy = False
+    autopilot.state.gps_healthy = False
     bench.run(4.5)
     assert bench.mode == LOITER
     bench.run(1.0)
     assert (bench.mode, bench.system_status) == (LAND, 5)
-    autopilot.senses.gps_healthy = True
+    autopilot.state.gps_healthy = True
     bench.run(0.5)
     assert (bench.mode, bench.system_status) == (LOITER, 4)
     bench.run(0.6, bench.attitude)
     bench.ask_mode(OFFBOARD)
-    autopilot.senses.gps_healthy = False
+    autopilot.state.gps_healthy = False
     bench.run(6.0, bench.attitude)
     assert (bench.mode, bench.system_status) == (OFFBOARD, 4)

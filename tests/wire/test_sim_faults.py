@@ -146,7 +146,7 @@ def test_a_weaker_or_heavier_vehicle_accelerates_less(fault: dict[str, Any], rat
 
     def lift_at(flight_s: float) -> float:
         bench.run(since_s + flight_s - bench.time_s, lambda: bench.attitude(thrust=HOVER))
-        acceleration = bench.instance.autopilot.senses.truth.acceleration_ned_mps2[2]
+        acceleration = bench.instance.autopilot.state.truth.acceleration_ned_mps2[2]
         return float(1.0 - acceleration / 9.80665)
 
     hold(bench, since_s + 7.6 - bench.time_s)

@@ -156,7 +156,7 @@ def test_a_least_thrust_that_lifts_never_lands() -> None:
     bench.fly_offboard(2.0)
     bench.command(21)
     bench.run(10.0)
-    assert -bench.instance.autopilot.senses.truth.velocity_ned_mps[2] == pytest.approx(2.0, abs=0.3)
+    assert -bench.instance.autopilot.state.truth.velocity_ned_mps[2] == pytest.approx(2.0, abs=0.3)
     set_parameter(bench, "MPC_THR_MIN", 0.05)
     bench.run_until(lambda: not bench.armed, 60.0)
 
@@ -177,7 +177,7 @@ def test_return_flies_home_and_lands() -> None:
     bench.run(10.0, lambda: bench.position(8, 4, -5))
     assert bench.command(20) == [0]
     bench.run_until(lambda: not bench.armed, 40.0)
-    x, y, z = bench.instance.autopilot.senses.truth.position_ned_m
+    x, y, z = bench.instance.autopilot.state.truth.position_ned_m
     assert math.hypot(x, y) < 1.0
     assert abs(z) < 0.05
 
@@ -224,7 +224,7 @@ def test_velocity_and_yaw_setpoints() -> None:
 
 def climb_rate_after(bench: Bench, duration_s: float, **setpoint: object) -> float:
     bench.run(duration_s, lambda: bench.attitude(**setpoint))
-    return -float(bench.instance.autopilot.senses.truth.velocity_ned_mps[2])
+    return -float(bench.instance.autopilot.state.truth.velocity_ned_mps[2])
 
 
 @pytest.mark.parametrize(
@@ -326,7 +326,7 @@ def test_reposition_holds_somewhere_else(frame: int, height_m: float) -> None:
     )
     bench.run(18.0)
     assert bench.mode == LOITER
-    place = bench.instance.autopilot.senses.truth.position_ned_m
+    place = bench.instance.autopilot.state.truth.position_ned_m
     assert place == pytest.approx([10.0, 0.0, -5.0], abs=0.2)
 
 
@@ -353,7 +353,7 @@ def test_position_gains_and_speeds_are_obeyed_while_flying() -> None:
     bench.fly_offboard()
     assert bench.instance.autopilot.parameters.set("MPC_XY_VEL_MAX", 1.0)
     bench.run(9.0, lambda: bench.position(20, 0, -3))
-    speed_mps = math.hypot(*bench.instance.autopilot.senses.truth.velocity_ned_mps[:2])
+    speed_mps = math.hypot(*bench.instance.autopilot.state.truth.velocity_ned_mps[:2])
     assert speed_mps == pytest.approx(1.0, abs=0.1)
 
 

@@ -391,11 +391,11 @@ def test_arducopter_faces_its_direction_of_flight_and_returns_within_its_mission
     assert bench.command(400, 1) == [0]
     assert bench.command(300) == [0]
     bench.run_until(lambda: bench.instance.autopilot.mission.finished, 30.0)
-    course_deg = math.degrees(bench.instance.autopilot.senses.look().yaw_rad)
+    course_deg = math.degrees(bench.instance.autopilot.state.estimate.yaw_rad)
     assert course_deg == pytest.approx(90.0, abs=6.0)
     bench.run_until(lambda: not bench.armed, 70.0)
     assert bench.mode == 3
-    x, y, _ = bench.instance.autopilot.senses.truth.position_ned_m.tolist()
+    x, y, _ = bench.instance.autopilot.state.truth.position_ned_m.tolist()
     assert math.hypot(x, y) < 0.5
 
 
@@ -406,7 +406,7 @@ def test_px4_takes_the_yaw_of_an_item() -> None:
     bench.command(300)
     bench.run_until(lambda: bench.instance.autopilot.mission.reached == 1, 30.0)
     bench.run(2.0)
-    course_deg = math.degrees(bench.instance.autopilot.senses.look().yaw_rad)
+    course_deg = math.degrees(bench.instance.autopilot.state.estimate.yaw_rad)
     assert course_deg == pytest.approx(-90.0, abs=5.0)
 
 

@@ -9,21 +9,22 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from simulator.autopilot.parameters import ParameterTable
-from simulator.autopilot.position_law import GRAVITY_MPS2
-from simulator.autopilot.position_loop import Limits, PositionLoop
+from simulator.autopilot.position_loop import GRAVITY_MPS2, Limits, PositionLoop
+from simulator.autopilot.state import StateEstimate
 from simulator.firmware.px4 import PX4
 from simulator.firmware.values import NAN3, MotionSetpoint, Quaternion, Triple
 
 GAINS = PX4.flight.gains(ParameterTable(PX4).__getitem__)
 HOVER = Limits(hover_thrust=0.5)
-REST = (0.0, 0.0, 0.0)
+ZERO = (0.0, 0.0, 0.0)
+ESTIMATE = StateEstimate(0.0, ZERO, ZERO, (1.0, 0.0, 0.0, 0.0), ZERO, False, 0, 1.0)
 
 
 def _stepped(
     loop: PositionLoop, motion: MotionSetpoint, limits: Limits = HOVER
 ) -> tuple[Quaternion, float, Triple]:
     """One period at the origin, at rest."""
-    return loop.step(motion, limits, REST, REST)
+    return loop.step(motion, limits, ESTIMATE)
 
 
 @pytest.mark.parametrize("yaw_rad", [0.0, 0.7, math.pi / 2, 2.5, math.pi, -1.9])

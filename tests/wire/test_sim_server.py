@@ -291,7 +291,7 @@ def test_true_state_on_request() -> None:
     bench.run_until(lambda: bench.instance.companion.view.time_ms % 40 == 0, 0.1)
     bench.run(0.0)
     at_s, state = bench.of("HIL_STATE_QUATERNION")[-1]
-    truth = bench.instance.autopilot.senses.truth
+    truth = bench.instance.autopilot.state.truth
     assert state.time_usec == round(at_s * 1e6) == round(bench.time_s * 1e6)
     latitude, longitude, amsl = PX4.origin
     north = math.radians(state.lat * 1e-7 - latitude) * 6_371_000

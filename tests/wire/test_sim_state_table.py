@@ -9,7 +9,7 @@ import pytest
 from sim_bench import Bench
 
 from simulator.autopilot.commander import ACTIONS, CONDITIONS, TEXT_VALUES
-from simulator.autopilot.state_table import StateTable, describe
+from simulator.autopilot.state_table import StateTable
 from simulator.firmware.base import Firmware, Rule
 from simulator.firmware.catalogue import FIRMWARES
 from simulator.firmware.values import critical
@@ -47,9 +47,9 @@ def test_a_row_that_names_something_unknown_is_refused(
 
 
 @FIRMWARE
-def test_all_rows_of_the_firmware_are_taken_and_described(firmware: Firmware) -> None:
+def test_all_rows_of_the_firmware_are_accepted(firmware: Firmware) -> None:
     table(firmware, *firmware.rules)
-    assert len(describe(firmware)) == len(firmware.rules) > 50
+    assert len(firmware.rules) > 50
 
 
 @FIRMWARE
@@ -71,4 +71,4 @@ def test_the_first_row_that_fits_decides(firmware: Firmware) -> None:
 def test_an_event_that_no_firmware_knows_is_an_error(firmware: Firmware) -> None:
     bench = Bench(firmware=firmware)
     with pytest.raises(KeyError):
-        bench.instance.autopilot.happen("stream lst")
+        bench.instance.autopilot.handle("stream lst")

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from offboard.model.frames import euler_from_quaternion, rotation_from_quaternion
-from simulator.autopilot.position_law import GRAVITY_MPS2
+from simulator.autopilot.position_loop import GRAVITY_MPS2
 from simulator.mavlink.fields import fit
 from simulator.mavlink.view import View
 
@@ -21,7 +21,7 @@ _PWM_LEAST, _PWM_SPAN = 1000, 1000
 
 def _specific_force(view: View) -> tuple[float, float, float]:
     """True specific force, FRD, m/s^2."""
-    truth = view.autopilot.senses.truth
+    truth = view.autopilot.state.truth
     force_ned = truth.acceleration_ned_mps2.copy()
     force_ned[2] -= GRAVITY_MPS2
     x, y, z = (rotation_from_quaternion(truth.attitude).T @ force_ned).tolist()
@@ -30,7 +30,7 @@ def _specific_force(view: View) -> tuple[float, float, float]:
 
 def simstate(view: View) -> Sequence[Any]:
     """True state without height and velocity."""
-    truth = view.autopilot.senses.truth
+    truth = view.autopilot.state.truth
     north, east, _ = truth.position_ned_m.tolist()
     return (
         *euler_from_quaternion(truth.attitude).tolist(),
@@ -42,7 +42,7 @@ def simstate(view: View) -> Sequence[Any]:
 
 def sim_state(view: View) -> Sequence[Any]:
     """True state without time stamp; latitude and longitude have a resolution of 1 cm."""
-    truth = view.autopilot.senses.truth
+    truth = view.autopilot.state.truth
     north, east, down = truth.position_ned_m.tolist()
     latitude, longitude = view.geodetic(north, east)
     return (
@@ -64,7 +64,7 @@ def sim_state(view: View) -> Sequence[Any]:
 def ekf_status_report(view: View) -> Sequence[Any]:
     """Flags by the boot events so far; variances of a good estimate."""
     reached = view.autopilot.health.reached
-    if view.autopilot.watch.position_lost:
+    if view.autopilot.monitors.position_lost:
         reached -= {"position"}
     flags = next((bits for event, bits in _EKF_FLAGS if event in reached), _EKF_UNINITIALISED)
     return (flags, 0.02, 0.02, 0.02, 0.01, 0.0, 0.0)
@@ -73,7 +73,7 @@ def ekf_status_report(view: View) -> Sequence[Any]:
 def raw_imu(view: View) -> Sequence[Any]:
     """Milli-g, millirad/s, milligauss; 25 degrees."""
     force = (fit(value / GRAVITY_MPS2 * 1e3, 16) for value in _specific_force(view))
-    rates = (fit(value * 1e3, 16) for value in view.autopilot.senses.look().rates_frd_radps)
+    rates = (fit(value * 1e3, 16) for value in view.autopilot.state.estimate.rates_frd_radps)
     return (view.time_us, *force, *rates, 224, 80, -528, 0, 2500)
 
 
@@ -85,8 +85,8 @@ def servo_output_raw(view: View) -> Sequence[Any]:
 
 def rc_channels(view: View) -> Sequence[Any]:
     """The channels of SITL without RC, or those of RC_CHANNELS_OVERRIDE."""
-    sticks, now_s = view.autopilot.sticks, view.autopilot.senses.time_s
-    widths_us = () if sticks is None else sticks.widths_us(now_s)
+    sticks, now_s = view.autopilot.guidance.sticks, view.autopilot.state.time_s
+    widths_us = () if sticks is None else sticks.pulses_us(now_s)
     return (view.time_ms, len(widths_us), *widths_us, *(0,) * (18 - len(widths_us)), 255)
 
 
@@ -103,7 +103,7 @@ def ahrs(_: View) -> Sequence[Any]:
 
 def ahrs2(view: View) -> Sequence[Any]:
     """The estimate in radians and AMSL metres."""
-    nav = view.autopilot.senses.look()
+    nav = view.autopilot.state.estimate
     north, east, down = nav.position_ned_m
     euler = euler_from_quaternion(np.array(nav.attitude)).tolist()
     return (*euler, view.altitude_mm(down) * 1e-3, *view.geodetic(north, east))
@@ -126,7 +126,7 @@ def wind(_: View) -> Sequence[Any]:
 
 def nav_controller_output(view: View) -> Sequence[Any]:
     """Demanded attitude in degrees; distance and bearing to the position setpoint."""
-    nav, pilot = view.autopilot.senses.look(), view.autopilot.pilot
+    nav, pilot = view.autopilot.state.estimate, view.autopilot.pilot
     wanted = pilot.demand.attitude or (1.0, 0.0, 0.0, 0.0)
     roll, pitch, yaw = np.degrees(euler_from_quaternion(np.array(wanted))).tolist()
     place = pilot.motion.position_ned_m
@@ -139,7 +139,7 @@ def nav_controller_output(view: View) -> Sequence[Any]:
 
 def position_target_global_int(view: View) -> Sequence[Any]:
     """Position setpoint with AMSL height; the present position where there is none."""
-    pilot, here = view.autopilot.pilot, view.autopilot.senses.look().position_ned_m
+    pilot, here = view.autopilot.pilot, view.autopilot.state.estimate.position_ned_m
     place = pilot.motion.position_ned_m
     north, east, down = (p if math.isfinite(p) else h for p, h in zip(place, here, strict=True))
     amsl_m = view.altitude_mm(down) * 1e-3

@@ -221,8 +221,8 @@ RULES = (
     Rule("force disarm", when=("not armed",)),
     Rule("force disarm", do=("disarm",), texts=(_DISARMING,)),
     # No failsafe and no text: level with constant height, or standing still; the mode stays GUIDED
-    Rule("stream lost", when=("obeys attitude",), do=("level",)),
-    Rule("stream lost", when=("obeys velocity",), do=("hold",)),
+    Rule("stream lost", when=("attitude setpoint",), do=("level",)),
+    Rule("stream lost", when=("velocity setpoint",), do=("hold",)),
     *_failsafe("ground station lost", "FS_GCS_ENABLE", _GROUND_MODES),
     Rule(
         "ground station found",
@@ -255,7 +255,7 @@ RULES = (
         texts=(critical("EKF Failsafe Cleared"),),
     ),
     Rule("thrust not a number", do=("latch",)),
-    Rule("reboot", when=("not armed",), do=("restart",)),
+    Rule("reboot", when=("not armed",), do=("reboot",)),
     Rule("reboot", result=_FAILED),
     Rule("settled", do=("disarm",), texts=(_DISARMING,)),
     Rule("idle", do=("disarm",), texts=(_DISARMING,)),

@@ -6,7 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from simulator.autopilot.position_law import GRAVITY_MPS2
+from simulator.autopilot.position_loop import GRAVITY_MPS2
 from simulator.mavlink.fields import centi, fit, in_body, pressure_hpa
 from simulator.mavlink.view import View
 
@@ -14,7 +14,7 @@ _NAN21 = (math.nan,) * 21
 
 
 def odometry(view: View) -> Sequence[Any]:
-    nav = view.autopilot.senses.look()
+    nav = view.autopilot.state.estimate
     frame = 1  # MAV_FRAME_LOCAL_NED, velocities too, as PX4 sends it
     return (
         view.time_us,
@@ -33,15 +33,15 @@ def odometry(view: View) -> Sequence[Any]:
 
 
 def altitude(view: View) -> Sequence[Any]:
-    down = view.autopilot.senses.look().position_ned_m[2]
+    down = view.autopilot.state.estimate.position_ned_m[2]
     amsl = view.altitude_mm(down) / 1e3
-    relative = view.autopilot.navigator.home_ned_m[2] - down
+    relative = view.autopilot.guidance.home_ned_m[2] - down
     return (view.time_us, amsl, amsl, -down, relative, math.nan, math.nan)
 
 
 def highres_imu(view: View) -> Sequence[Any]:
     """True specific force in body axes, estimated rates."""
-    nav = view.autopilot.senses.look()
+    nav = view.autopilot.state.estimate
     w, x, y, z, *_, down, a_north, a_east, a_down = view.autopilot.plant.motion()
     force = in_body((w, x, y, z), (a_north, a_east, a_down - GRAVITY_MPS2))
     height = view.autopilot.firmware.origin[2] - down
@@ -61,7 +61,7 @@ def highres_imu(view: View) -> Sequence[Any]:
 
 def hil_state_quaternion(view: View) -> Sequence[Any]:
     """True state. Latitude and longitude have a resolution of 1 cm."""
-    truth = view.autopilot.senses.truth
+    truth = view.autopilot.state.truth
     north, east, down = truth.position_ned_m.tolist()
     a, b, c = (fit(value / GRAVITY_MPS2 * 1e3, 16) for value in truth.acceleration_ned_mps2)
     v_north, v_east, v_down = truth.velocity_ned_mps.tolist()
@@ -83,7 +83,7 @@ def hil_state_quaternion(view: View) -> Sequence[Any]:
 
 def estimator_status(view: View) -> Sequence[Any]:
     autopilot = view.autopilot
-    flags = 895 if autopilot.health.has_fix(autopilot.senses.time_s) else 1024
+    flags = 895 if autopilot.health.has_fix(autopilot.state.time_s) else 1024
     return (view.time_us, flags, 0.12, 0.03, 0.03, 0.14, 0.02, math.nan, 0.3, 0.31)
 
 

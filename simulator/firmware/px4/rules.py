@@ -26,13 +26,13 @@ def _delayed(event: str, parameter: str, modes: Mapping[int, str]) -> list[Rule]
     the parameter selects. A second failsafe during the delay changes that mode only."""
     chosen = [(f"{parameter}={value}", mode) for value, mode in modes.items()]
     return [
-        Rule(event, when=("waiting",), do=("failsafe", "await"), texts=(_WARNINGS[event],)),
+        Rule(event, when=("action delayed",), do=("failsafe", "delay"), texts=(_WARNINGS[event],)),
         *(
             Rule(
                 event,
                 when=("armed", "not landed", value),
                 to="AUTO.LOITER",
-                do=("failsafe", "await"),
+                do=("failsafe", "delay"),
                 texts=(
                     _WARNINGS[event],
                     critical("Failsafe activated: entering Hold for {delay_s:.0f} seconds"),
@@ -123,7 +123,7 @@ RULES = (
     ),
     *(Rule(event, texts=(said,)) for event, said in _WARNINGS.items()),
     Rule("ground station found", texts=(_REGAINED,)),
-    Rule("position lost", "OFFBOARD", when=("not obeys motion",)),
+    Rule("position lost", "OFFBOARD", when=("not motion setpoint",)),
     Rule("position lost", when=("armed", "not landed"), to=_LAND, do=("failsafe",), texts=(_LOST,)),
     Rule("position found", when=("since position lost",), to="remembered", do=("recover",)),
     Rule("climbed", "AUTO.TAKEOFF", to="AUTO.LOITER"),
