@@ -53,10 +53,10 @@ R = TypeVar("R")
 F = TypeVar("F", bound=Callable[..., Any])
 
 Parameter = type[int] | type[float] | np.dtype[Any] | tuple[int, np.dtype[Any]]
-"""Of an entry: a number, an array of one record, or the dimensions and dtype of an array."""
+"""A number, the dtype of an array of one record, or the dimensions and dtype of an array."""
 
 ENTRIES_PER_PROCESS = 3  # starting a process costs as much as compiling one of them
-VERSIONS_KEPT = 5  # directories of machine code, most recently used
+UNUSED_S = 30 * 86400.0  # machine code that was not used for so long is deleted
 
 defined: list[Entry[Any, Any]] = []  # the entries of the modules imported so far
 _kernels: list[Callable[..., Any]] = []  # not yet registered with numba
@@ -187,11 +187,12 @@ def directory() -> Path:
     for cache in filter(os.path.isabs, (*given, os.path.expanduser("~/.cache"))):
         versions = Path(cache) / "pso-offboard"
         if _is_private(versions) and _is_private(versions / _digest()):
-            os.utime(versions / _digest())
-            by_use = sorted(versions.iterdir(), key=lambda each: each.stat().st_mtime)
-            for old in by_use[:-VERSIONS_KEPT]:
-                shutil.rmtree(old, ignore_errors=True)
-            return versions / _digest()
+            place = versions / _digest()
+            os.utime(place)
+            for each in versions.iterdir():  # every start touches the one that it uses
+                if each.stat().st_mtime < place.stat().st_mtime - UNUSED_S:
+                    shutil.rmtree(each, ignore_errors=True)
+            return place
     temporary = tempfile.mkdtemp()
     atexit.register(shutil.rmtree, temporary, ignore_errors=True)
     place = Path(temporary) / "pso-offboard" / _digest()
@@ -218,8 +219,8 @@ _CONSTANT = re.compile(rb"\b[A-Z][A-Z0-9_]*\b")
 
 @functools.cache
 def _digest() -> str:
-    """Of the versions of Python and numba, of the modules with entries or kernels, and of those
-    that they import constants from, because these are compiled in."""
+    """A hash of the versions of Python and numba, the modules with entries or kernels, and the
+    modules that they import constants from, because constants are compiled in."""
     root = Path(__file__).parents[1]
     sources = {
         path.relative_to(root).as_posix(): path.read_bytes()
