@@ -96,7 +96,7 @@ class Pilot:
         control = self._navigator.active.control
         if control is Control.LEVEL:
             thrust = self._parameters.role("stick_thrust_least")
-            self.demand = Demand(True, thrust, level(self.loop.yaw_rad))
+            self._demand(Demand(True, thrust, level(self.loop.yaw_rad)))
         elif setpoint is not None:
             if setpoint.climb_mps is not None:
                 self._control_climb(setpoint.climb_mps, estimate)
@@ -105,6 +105,11 @@ class Pilot:
         elif control is Control.MOTION:
             self._fly_motion(estimate)
         self._detect_landing(setpoint, estimate)
+
+    def _demand(self, demand: Demand) -> None:
+        """An equal demand stays the same object, which the plant does not encode again."""
+        if demand != self.demand:
+            self.demand = demand
 
     # -- attitude setpoints ------------------------------------------------------------------
 
@@ -131,7 +136,7 @@ class Pilot:
             tilt_cosine = max(self._state.estimate.tilt_cosine, _TILT_COSINE_MIN)
             thrust = min(1.0, thrust * (1.0 / tilt_cosine))
         attitude = self._attitude if setpoint.rates_frd_radps is None else None
-        self.demand = Demand(True, thrust, attitude, setpoint.rates_frd_radps)
+        self._demand(Demand(True, thrust, attitude, setpoint.rates_frd_radps))
 
     def _control_climb(self, climb_mps: float, estimate: StateEstimate) -> None:
         """Thrust for a climb rate."""
@@ -167,7 +172,7 @@ class Pilot:
             attitude, thrust = level(estimate.yaw_rad), self._parameters.role("thrust_least")
         self._attitude = attitude
         self.thrust_demanded = thrust
-        self.demand = Demand(True, thrust, attitude)
+        self._demand(Demand(True, thrust, attitude))
 
     @property
     def _limits(self) -> Limits:

@@ -64,32 +64,24 @@ class Trajectory:
         time_s = _REACTION_S + 0.5 * math.hypot(vx, vy) / self.limits.across_mps2
         return (x + time_s * vx, y + time_s * vy, z)
 
-    def _start(self, estimate: StateEstimate, velocity_ned_mps: Triple) -> None:
-        self._point.start(estimate.position_ned_m, velocity_ned_mps)
-        self._resets = estimate.reset_counter
-
     def follow(
         self, goal: MotionSetpoint, leg: Leg, estimate: StateEstimate, *, on_ground: bool
     ) -> MotionSetpoint:
-        """Motion of one period.
+        """Motion of one period on the leg to this goal: a place, or one to descend at with a speed.
 
-        Args:
-            goal: a place, or one to descend at with a speed.
-            leg: of which the goal is the end.
-            estimate: where an inactive trajectory starts.
-            on_ground: the vehicle may not lift off yet; the trajectory starts again.
+        The trajectory starts at the estimate; again in each period `on_ground`, where the vehicle
+        may not lift off yet.
         """
         if self._tuned != self._parameters.changes:
             self._tune()
-        if on_ground:
-            self._start(estimate, (0.0, 0.0, _ON_GROUND_MPS))
-        elif not self.active:
-            self._start(estimate, estimate.velocity_ned_mps)
-        self.active = True
-        if estimate.reset_counter != self._resets:
-            self._resets = estimate.reset_counter
-            self._point.move_to(estimate.position_ned_m)
-        target, point = self._target(goal, leg), self._point
+        point = self._point
+        if on_ground or not self.active:
+            velocity = (0.0, 0.0, _ON_GROUND_MPS) if on_ground else estimate.velocity_ned_mps
+            point.start(estimate.position_ned_m, velocity)
+        elif estimate.reset_counter != self._resets:
+            point.move_to(estimate.position_ned_m)
+        self.active, self._resets = True, estimate.reset_counter
+        target = self._target(goal, leg)
         point.follow(target, self.limits, estimate.position_ned_m)
         yaw_rad = goal.yaw_rad
         if self._has_arrived(goal):

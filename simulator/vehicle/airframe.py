@@ -1,8 +1,8 @@
-"""The vehicle in the air and on the ground: rotors, contact, round the rigid body.
+"""Airframe: rotors, ground contact and battery charge around the rigid body.
 
-The rigid body itself (mass, drag relative to the air) is `offboard.model.rigid_body`; here is
-what the controller's model does not have: rotor lag, loss of authority without thrust, ground,
-ground effect, the charge drawn. Compiled; knows no autopilot, no estimate and no randomness.
+The rigid body (mass, drag relative to the air) is `offboard.model.rigid_body`. This module adds
+what the controller's model does not have: rotor lag, loss of torque at low thrust, ground, ground
+effect, charge consumed. Compiled. Knows no autopilot, no estimate and no randomness.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ from simulator.vehicle.battery import Battery, Pack
 
 Array = NDArray[np.float64]
 
-# The rotor state beside the rigid body's 13 numbers: actual normalised collective thrust, 1 while
-# the ground carries the vehicle, charge drawn (A s), acceleration in NED of the last step.
+# Rotor state, beside the rigid body's 13 numbers: actual normalised collective thrust, 1 while the
+# ground carries the vehicle, charge consumed (A s), NED acceleration of the last step.
 THRUST, CONTACT, CHARGE, ACCELERATION, ROTOR_SIZE = 0, 1, 2, slice(3, 6), 6
 
-# Below this share of hover thrust the rotors' differences, hence the torques, fade to nothing.
+# Below this share of hover thrust the torques fall to zero with the thrust.
 _AUTHORITY_SHARE = 0.2
-# Landing gear: it grips, so that wind does not blow a standing vehicle away, and sets it level.
+# Landing gear: friction, so that wind does not move a landed vehicle, and levelling.
 _FRICTION = 1.5
 _LEVELLING_TIME_S = 0.1
-# Cheeseman and Bennett (1955), rotors of this radius this far above the ground when landed.
+# Ground effect (Cheeseman and Bennett 1955): rotor radius, height of the rotors when landed.
 _ROTOR_RADIUS_M = 0.12
 _ROTOR_HEIGHT_M = 0.10
-# Explicit Runge-Kutta is stable to 2.78; stay well inside for any vehicle file.
+# Rate times substep: explicit Runge-Kutta is stable to 2.78, and every vehicle file stays below.
 _STIFFNESS_LIMIT = 0.5
 
 
@@ -40,9 +40,9 @@ _STIFFNESS_LIMIT = 0.5
 class Airframe:
     """Packed constants of the compiled step."""
 
-    body: Array  # offboard.model.rigid_body.pack of the real vehicle
-    rotor: Array  # thrust at full throttle N, share left after a step of lag, thrust of full
-    #               authority, ground effect 0/1, hover thrust, hover current A
+    body: Array  # offboard.model.rigid_body.pack of the simulated vehicle
+    rotor: Array  # thrust at full throttle N, factor of the lag in a step, thrust above which
+    #               torques are full, ground effect 0/1, hover thrust, hover current A
     substeps: int
     pack: Pack
 
@@ -56,7 +56,15 @@ def build_airframe(
     ground_effect: bool = False,
     battery: Battery | None = None,
 ) -> Airframe:
-    """The real vehicle: `thrust_scale` and `mass_scale` are what the controller is not told."""
+    """Constants of the simulated vehicle.
+
+    Args:
+        vehicle: the model that the controller has, too.
+        step_s: length of a step.
+        thrust_scale, mass_scale: factors on thrust and mass that the controller does not know.
+        ground_effect: more thrust near the ground.
+        battery: None: the default one.
+    """
     battery = battery or Battery()
     body = pack(vehicle)
     lag_s = vehicle.thrust_lag_s
@@ -94,14 +102,14 @@ def advance_airframe(
     """One step in place: `body` (13,) and `rotor` (ROTOR_SIZE,).
 
     thrust_demand 0..1; turn_demand (3,) angular acceleration FRD rad/s^2; `strength` multiplies
-    the thrust (a weakening motor). `inputs` (4,) and `scratch` (3, 13) are work space.
+    the thrust (a failing motor). `inputs` (4,) and `scratch` (3, 13) are work space.
     """
     before = rotor[THRUST]
     rotor[THRUST] = thrust_demand + (before - thrust_demand) * rotor_constants[1]
     mean = 0.5 * (before + rotor[THRUST])
     north, east, down = body[7], body[8], body[9]
     inputs[0] = strength * rotor_constants[0] * mean * _ground_gain(body[12], rotor_constants[3])
-    # Standing on its legs it cannot be turned
+    # On the ground it does not rotate
     authority = 0.0 if rotor[CONTACT] > 0.5 else min(mean / rotor_constants[2], 1.0)
     _torques(body, turn_demand, authority, body_constants, inputs)
     part_s = step_s / substeps
@@ -112,7 +120,7 @@ def advance_airframe(
         )
         rotor[CONTACT] = _touch_ground(body, part_s)
         if stands and rotor[CONTACT] > 0.5 and body[7] == 0.0 and body[8] == 0.0:
-            body[10], body[11] = stand_north, stand_east  # gripped: it did not creep either
+            body[10], body[11] = stand_north, stand_east  # held by friction
     rotor[3] = (body[7] - north) / step_s
     rotor[4] = (body[8] - east) / step_s
     rotor[5] = (body[9] - down) / step_s
@@ -128,9 +136,9 @@ def _ground_gain(down_m: float, enabled: float) -> float:
 
 @kernel
 def _torques(body: Array, turn: Array, authority: float, constants: Array, inputs: Array) -> None:
-    """Inputs 1..3 that realise the angular acceleration: perfect mixing, faded by authority.
+    """Torque inputs 1..3 for an angular acceleration, with perfect mixing, scaled by `authority`.
 
-    The gyroscopic torque and the rotational drag are what the rigid body will subtract.
+    They include the gyroscopic torque and the rotational drag, which the rigid body subtracts.
     """
     p, q, r = body[4], body[5], body[6]
     i_x, i_y, i_z, arm = constants[2], constants[3], constants[4], constants[5]
@@ -144,13 +152,13 @@ def _torques(body: Array, turn: Array, authority: float, constants: Array, input
 
 @kernel
 def _touch_ground(body: Array, step_s: float) -> float:
-    """Ground at down = 0, inelastic, with friction; returns 1 while it carries the vehicle."""
+    """Inelastic ground at down = 0 with friction; returns 1 while it carries the vehicle, or 0."""
     if body[12] < 0.0:
         return 0.0
     body[12] = 0.0
     if body[9] < 0.0:
         return 0.0
-    # Coulomb: the horizontal impulse is at most the friction times the vertical one just taken
+    # Coulomb: the horizontal impulse is at most the friction coefficient times the vertical one
     speed = math.hypot(body[7], body[8])
     grip = _FRICTION * body[9]
     left = (speed - grip) / speed if speed > grip else 0.0
@@ -164,7 +172,7 @@ def _touch_ground(body: Array, step_s: float) -> float:
 
 @kernel
 def _set_level(body: Array, share: float) -> None:
-    """Turn the attitude by this share of the way to level, keeping the twist about down."""
+    """Rotate the attitude by this share of its tilt towards level; the heading stays."""
     norm = math.hypot(body[0], body[3])
     w, z = (body[0] / norm, body[3] / norm) if norm > 1e-9 else (1.0, 0.0)
     body[0] += share * (w - body[0])

@@ -1,9 +1,9 @@
-"""The autopilot's attitude loop: demands, their delays, and the angular acceleration they produce.
+"""Attitude loop of the autopilot: demands, their delays, and the angular acceleration.
 
-A cascade as PX4 flies it: the attitude error, thrust axis first, gives a rate, the rate error an
-angular acceleration, which is limited per axis. Linearised it is the identified response
-s'' = wn^2 (s_c(t - D) - s) - 2 z wn s' of each axis. It knows the estimated attitude only, never
-the true one, and neither modes nor MAVLink.
+A cascade as in PX4: the attitude error, thrust axis first, gives a rate; the rate error gives an
+angular acceleration, which is limited per axis. Linearised, each axis has the identified response
+s'' = wn^2 (s_c(t - D) - s) - 2 z wn s'. It uses the estimated attitude, not the true one. Knows no
+modes and no MAVLink.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ Quaternion = tuple[float, float, float, float]
 # PX4's defaults of MC_ROLLRATE_MAX, MC_PITCHRATE_MAX (220 deg/s) and MC_YAWRATE_MAX (200 deg/s)
 RATE_LIMIT_RADPS: Triple = (3.84, 3.84, 3.49)
 
-# A rate demand skips the attitude half of the cascade: with half the identified delay PX4's
-# measured rate steps come out (roll t63 .10-.11 s, yaw .45 s).
+# A rate demand bypasses the attitude part of the cascade. Half the identified delay reproduces
+# PX4's measured rate steps (t63: roll 0.10-0.11 s, yaw 0.45 s).
 _RATE_DELAY_SHARE = 0.5
 
 # One row per step of the demand history.
@@ -35,11 +35,12 @@ _IS_ATTITUDE, _RATES, _THRUST, ROW_WIDTH = 0, 5, 8, 9
 
 @dataclass(frozen=True, slots=True)
 class Demand:
-    """What the flight stack asks of the attitude loop; attitude wins if both are given.
+    """Demand on the attitude loop.
 
-    attitude: quaternion wxyz FRD -> NED, any length; rates_frd_radps: body rates; thrust:
-    normalised collective 0..1. Without attitude and rates: zero rates. Values that are not finite
-    are taken as PX4 does: thrust as 0, the attitude as undefined (here: zero rates).
+    `attitude` is a quaternion (wxyz, FRD -> NED) of any length and takes precedence over
+    `rates_frd_radps`; without either the rates are zero. `thrust` is normalised collective thrust,
+    0..1. As in PX4, a thrust of NaN is 0, and an attitude that is not finite is undefined (here:
+    zero rates).
     """
 
     motors_on: bool = False
@@ -57,7 +58,8 @@ class Loop:
 
 
 def build_loop(vehicle: Vehicle, step_s: float) -> Loop:
-    """Gains K = 2 z wn and wn / 2z per axis, and the delays, half a step less for the hold."""
+    """Gains 2 z wn and wn / 2z per axis, and the delays, shortened by half a step, by which
+    holding a demand for a step delays it."""
     axes = (vehicle.tilt, vehicle.tilt, vehicle.yaw)
     gains = np.array(
         [
@@ -80,7 +82,7 @@ def build_loop(vehicle: Vehicle, step_s: float) -> Loop:
 
 
 def encode(demand: Demand, row: Array) -> None:
-    """Write the sanitised demand into a history row (ROW_WIDTH,); every number finite."""
+    """Write a demand into a history row (ROW_WIDTH,), limited and with finite numbers only."""
     row[:] = 0.0
     thrust = demand.thrust if demand.motors_on else 0.0
     if not math.isnan(thrust):
@@ -92,7 +94,7 @@ def encode(demand: Demand, row: Array) -> None:
 
 
 def _encode_attitude(attitude: Quaternion, row: Array) -> None:
-    """Scale to unit length, largest part first; nothing where that gives no direction."""
+    """Scale to unit length, without overflow; an undefined attitude is not written."""
     w, x, y, z = attitude
     largest = max(abs(w), abs(x), abs(y), abs(z))
     if not math.isfinite(w + x + y + z) or largest == 0.0:
@@ -108,24 +110,24 @@ def _within(rate: float, limit: float) -> float:
 
 @kernel
 def delayed_row(history: Array, step: int, delay: int) -> Array:
-    """The demand of `delay` steps ago."""
+    """Demand of `delay` steps ago."""
     row: Array = history[(step - delay) % history.shape[0]]
     return row
 
 
 @kernel
 def delayed_thrust(history: Array, step: int, delays: Integers) -> float:
-    """Normalised collective thrust demanded the thrust delay ago."""
+    """Normalised collective thrust, delayed."""
     thrust: float = delayed_row(history, step, delays[2])[_THRUST]
     return thrust
 
 
 @kernel
 def _attitude_error(quaternion: Array, row: Array, error: Array) -> None:
-    """Body-frame error (3,) rad of the demanded attitude: tilt (x, y) first, then the twist (z).
+    """Attitude error (3,) in the body frame, rad: 2 sin(half angle) along the axis.
 
-    2 sin(half angle) along the axis, as PX4's reduced attitude control has it: the shortest
-    rotation of the thrust axis gives x and y, what is left about the demanded axis gives z.
+    As in PX4's reduced attitude control, the shortest rotation of the thrust axis gives x and y
+    (swing), the remaining rotation about the demanded axis gives z (twist).
     """
     w, x, y, z = quaternion[0], quaternion[1], quaternion[2], quaternion[3]
     dw, dx, dy, dz = row[1], row[2], row[3], row[4]
@@ -136,7 +138,7 @@ def _attitude_error(quaternion: Array, row: Array, error: Array) -> None:
     ez = w * dz - x * dy + y * dx - z * dw
     # swing-twist: e = swing * twist, twist about z by atan2(ez, ew) * 2
     norm = math.sqrt(ew * ew + ez * ez)
-    if norm < 1e-9:  # upside down: any axis is as good; the twist is undefined
+    if norm < 1e-9:  # upside down: the twist is undefined
         error[0], error[1], error[2] = 2.0 * ex, 2.0 * ey, 0.0
         return
     cosine, sine = ew / norm, ez / norm
@@ -156,10 +158,10 @@ def angular_acceleration(
     error: Array,
     out: Array,
 ) -> None:
-    """Demanded angular acceleration (3,) FRD rad/s^2 from the *estimated* attitude and the rates,
-    which are those of `body`.
+    """Demanded angular acceleration (3,) FRD rad/s^2, into `out`.
 
-    `error` (3,) is scratch. Tilt and yaw read the history at their own delays.
+    `quaternion` is the *estimated* attitude; the rates are those of `body`. Tilt and yaw have their
+    own delays in the history. `error` (3,) is scratch.
     """
     for first, last, attitude_delay, rate_delay in (
         (0, 2, delays[0], delays[3]),

@@ -1,7 +1,6 @@
-"""The battery: what a monitor shows of it, by the charge that was drawn and the thrust.
+"""Battery: voltage, current and remaining charge, as a battery monitor measures them.
 
-Knows the vehicle's hover alone; what draws the charge is the airframe's
-(`simulator.vehicle.airframe`).
+The airframe (`simulator.vehicle.airframe`) integrates the charge consumed.
 """
 
 from __future__ import annotations
@@ -14,8 +13,8 @@ from offboard.documents.parameters import Parameters
 
 
 class Battery(Parameters):
-    """A lithium pack: open-circuit voltage linear in what remains, and on when nothing does;
-    sagging with the current."""
+    """Lithium battery: open-circuit voltage linear in the remaining charge, also below zero, minus
+    the drop at the internal resistance."""
 
     cells: int = Field(default=4, ge=1, le=16)
     capacity_ah: float = Field(default=5.0, gt=0.01, le=200)
@@ -26,7 +25,7 @@ class Battery(Parameters):
 
 @dataclass(frozen=True, slots=True)
 class BatteryState:
-    """What a battery monitor would show; remaining 0..1."""
+    """Values of a battery monitor; `remaining` 0..1."""
 
     voltage_v: float
     current_a: float
@@ -36,13 +35,13 @@ class BatteryState:
 
 @dataclass(frozen=True, slots=True)
 class Pack:
-    """A battery in a vehicle that hovers at this normalised thrust."""
+    """Battery of a vehicle that hovers at this normalised thrust."""
 
     battery: Battery
     hover_thrust: float
 
     def state(self, drawn_as: float, thrust: float) -> BatteryState:
-        """After the charge drawn so far (A s), at this normalised thrust."""
+        """State after consuming `drawn_as` (A s), at this normalised thrust."""
         battery = self.battery
         left = battery.remaining - drawn_as / (3600.0 * battery.capacity_ah)
         current = battery.hover_current_a * (thrust / self.hover_thrust) ** 1.5
@@ -50,5 +49,5 @@ class Pack:
         return BatteryState(max(voltage, 0.0), current, max(left, 0.0), drawn_as / 3.6)
 
     def drawn_as(self, remaining: float) -> float:
-        """Charge (A s) behind which this share remains."""
+        """Charge consumed (A s) when this share remains."""
         return 3600.0 * self.battery.capacity_ah * (self.battery.remaining - remaining)

@@ -1,6 +1,6 @@
-"""What one flight is flown in: estimator, air, and what the vehicle is other than believed.
+"""Conditions of a flight: estimator, air, and differences between vehicle and model.
 
-Pure data, part of a scenario file; the defaults are a calm day with the vehicle as believed.
+Part of a scenario file. By default there is no wind, and vehicle and model are equal.
 """
 
 from __future__ import annotations
@@ -15,22 +15,22 @@ from simulator.vehicle.wind import Gusts
 
 
 class Weakening(Parameters):
-    """From `at_s` of vehicle time on the thrust is multiplied by `thrust_scale`."""
+    """Thrust multiplied by `thrust_scale` from vehicle time `at_s` on."""
 
     at_s: float = Field(ge=0, le=1e5)
     thrust_scale: float = Field(ge=0, le=2)
 
 
 class Conditions(Parameters):
-    """Everything true of a flight that the controller is not told."""
+    """Conditions of a flight that the controller does not know."""
 
     estimator: EstimatorName = EstimatorName.PERFECT
     white_noise: WhiteNoise = WhiteNoise()  # of the estimator `white`
-    wind_ned_mps: Triple = (0.0, 0.0, 0.0)  # where the air goes to, not where it comes from
+    wind_ned_mps: Triple = (0.0, 0.0, 0.0)  # velocity of the air: towards, not from
     gusts: Gusts = Gusts()
-    thrust_scale: float = Field(default=1.0, ge=0.1, le=3)  # .85: 15 % weaker than believed
+    thrust_scale: float = Field(default=1.0, ge=0.1, le=3)  # 0.85: 15 % less than the model
     mass_scale: float = Field(default=1.0, ge=0.1, le=5)
     weakening: Weakening | None = None
     ground_effect: bool = False
     battery: Battery = Battery()
-    boot_scale: float = Field(default=1.0, ge=0.02, le=10)  # of the times of the vehicle's start
+    boot_scale: float = Field(default=1.0, ge=0.02, le=10)  # on the times of the autopilot's start

@@ -36,7 +36,7 @@ from simulator.vehicle.wind import GUST_COUNT
 _ERROR_LANE, _GUST_LANE, _WHITE_LANE, _RECEIVER_LANE = (np.uint64(lane) for lane in range(4))
 _GUST_BLOCKS = ((0, GUST_COUNT),)
 
-# Rows of the demand history, a power of two: more steps than any vehicle's longest delay
+# Rows of the demand history: a power of two, more than the steps of any vehicle's longest delay
 _HISTORY_ROWS = 128
 
 RECORD = np.dtype(
@@ -82,26 +82,26 @@ RECORD = np.dtype(
         ("turn_error", "f8", 3),
         ("inputs", "f8", 4),
         ("slopes", "f8", (RK4_SCRATCH_ROWS, QUATERNION.size)),
-        # what `report_state` says
+        # output of `report_state`
         ("report", "f8", REPORT_WIDTH),
-        # what `receive_fix` says
+        # output of `receive_fix`
         ("fix", "f8", 5),
     ],
     align=True,
 )
-"""All that compiled code knows of one vehicle below its autopilot; SI, NED and FRD."""
+"""Complete state, constants and scratch of one vehicle below its autopilot; SI, NED and FRD."""
 
 
 @entry(RECORD)
 def draw_gusts(plants: Any) -> None:
-    """Fill in the normal numbers that the gusts of a flight begin with."""
+    """Write the random numbers for the first gust of a flight to `gust_normals`."""
     plant = plants[0]
     fill_normals(plant.seed, _GUST_LANE, np.int64(-1), plant.gust_normals[:])
 
 
 @entry(RECORD)
 def report_state(plants: Any) -> None:
-    """Fill in the report of this state."""
+    """Write the estimate of the present state to `report`."""
     plant = plants[0]
     report(
         plant.body,
@@ -121,7 +121,7 @@ def report_state(plants: Any) -> None:
 
 @entry(RECORD)
 def receive_fix(plants: Any) -> None:
-    """Fill in the satellite fix of this state."""
+    """Write the GPS fix of the present state to `fix`."""
     plant = plants[0]
     fill_normals(plant.seed, _RECEIVER_LANE, plant.step, plant.fix[:])
     for i in range(5):
@@ -136,7 +136,8 @@ def receive_fix(plants: Any) -> None:
 def advance_steps(count: int, plants: Any) -> None:
     """`count` steps in place.
 
-    Per step: demand into history, air, loop on the estimate, airframe, estimator errors.
+    Each step: store the demand, move the air, control the attitude, move the airframe, move the
+    estimator's errors.
     """
     plant = plants[0]
     first = plant.step
@@ -166,7 +167,7 @@ def advance_steps(count: int, plants: Any) -> None:
 
 @kernel
 def _move_air(plant: Any, step: int) -> None:
-    """Steady wind and gusts, along and across it."""
+    """Next wind: the steady wind plus gusts along and across it."""
     gust, air, wind = plant.gust, plant.air, plant.wind
     if plant.gusty:
         fill_normals(plant.seed, _GUST_LANE, step, plant.gust_normals[:])
@@ -188,7 +189,7 @@ def _move_air(plant: Any, step: int) -> None:
 
 @kernel
 def _control_attitude(plant: Any, step: int) -> None:
-    """The angular acceleration that the attitude loop demands, on the estimated attitude."""
+    """Angular acceleration demanded by the attitude loop for the estimated attitude."""
     error, turn_error = plant.error, plant.turn_error
     turn_error[0], turn_error[1] = -error[EAST + 2], error[NORTH + 2]
     turn_error[2] = error[YAW]
@@ -207,7 +208,7 @@ def _control_attitude(plant: Any, step: int) -> None:
 
 @kernel
 def _move_errors(plant: Any, step: int) -> None:
-    """The errors of the estimator."""
+    """Next errors of the estimator."""
     fill_normals(plant.seed, _ERROR_LANE, step, plant.normals[:])
     gain = 1.0 if plant.motors_on else STANDING_NOISE
     for start, end in ERROR_BLOCKS:

@@ -1,7 +1,7 @@
-"""Seeded normal numbers and linear stochastic processes: where all randomness of the truth is.
+"""Random numbers and linear stochastic processes; all randomness of the vehicle is here.
 
-A normal number is a pure function of (seed, lane, step): nothing is carried along, so a run of
-n steps gives the same bytes whether it is advanced at once or step by step. Knows no vehicle.
+A normal number is a pure function of (seed, lane, step), without a state: n steps give the same
+bytes in one call or in several. Knows no vehicle.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from offboard.compiled import kernel
 
 Array = NDArray[np.float64]
 
-_SERIES_LENGTH = 20  # terms for a matrix of norm 1 or less, to the last digit
+_SERIES_LENGTH = 20  # terms for full precision with a norm of 1 or less
 _TWO_TO_MINUS_53 = 2.0**-53
 _STEP_STRIDE = np.uint64(0x9E3779B97F4A7C15)
 _LANE_STRIDE = np.uint64(0xD1342543DE82EF95)
@@ -33,16 +33,16 @@ class LinearProcess:
 
 
 def seed_word(seed: int) -> np.uint64:
-    """Any integer seed -> the 64-bit word that `fill_normals` wants."""
+    """64-bit seed of `fill_normals` for any integer seed."""
     entropy = seed if seed >= 0 else (-seed << 1) | (1 << 64)
     return np.uint64(np.random.SeedSequence(entropy).generate_state(1, np.uint64)[0])
 
 
 def discretise(drift: ArrayLike, densities: ArrayLike, step_s: float) -> LinearProcess:
-    """x' = A x + w sampled exactly (Van Loan 1978, matrix exponential of the doubled system).
+    """Exact discretisation of x' = A x + w (Van Loan 1978, matrix exponential of size 2n).
 
     `drift` (n, n) 1/s; `densities` (n,) or the noise input matrix (n, m), in units of x per root
-    second. A drift that is not stable has no stationary covariance: its stationary scale is zero.
+    second. An unstable drift has no stationary covariance; its stationary scale is zero.
     """
     a = np.asarray(drift, dtype=np.float64)
     b = np.asarray(densities, dtype=np.float64)
@@ -58,7 +58,7 @@ def discretise(drift: ArrayLike, densities: ArrayLike, step_s: float) -> LinearP
 
 
 def block_diagonal(*processes: LinearProcess) -> LinearProcess:
-    """Independent processes side by side in one state vector."""
+    """Independent processes as one, with their states one after the other."""
     sizes = [len(process.transition) for process in processes]
     ends = np.cumsum(sizes)
     joined = LinearProcess(*(np.zeros((ends[-1], ends[-1])) for _ in range(3)))
@@ -71,9 +71,9 @@ def block_diagonal(*processes: LinearProcess) -> LinearProcess:
 
 
 def _exponential(matrix: Array) -> Array:
-    """exp of a matrix: its series where it converges at once, then squared up again.
+    """Matrix exponential by scaling, power series and squaring.
 
-    SciPy's does the same for any matrix; importing it costs 27 MB and 0.1 s of every start.
+    SciPy has one, but importing it costs 27 MB and 0.1 s of every start.
     """
     halvings = max(0, math.frexp(float(np.abs(matrix).sum(axis=1).max()))[1])
     scaled = matrix / 2.0**halvings
@@ -94,7 +94,7 @@ def _stationary_covariance(transition: Array, covariance: Array) -> Array:
 
 
 def _square_root(covariance: Array) -> Array:
-    """Symmetric-definite factor R with R R' = covariance; tolerates zero and rounding."""
+    """Factor R with R R' = covariance, which may be singular."""
     values, vectors = np.linalg.eigh(0.5 * (covariance + covariance.T))
     return np.ascontiguousarray(vectors * np.sqrt(np.maximum(values, 0.0)))
 
@@ -109,7 +109,7 @@ def _scramble(word: np.uint64) -> np.uint64:
 
 @kernel
 def fill_normals(seed: np.uint64, lane: np.uint64, step: int | np.int64, out: Array) -> None:
-    """Fill `out` (n,) with the standard normals of this lane and step (Box-Muller)."""
+    """Write the standard normals of this lane and step to `out` (n,), by Box-Muller."""
     key = _scramble(seed + np.uint64(step) * _STEP_STRIDE + lane * _LANE_STRIDE)
     count = out.shape[0]
     for i in range(0, count, 2):
@@ -134,8 +134,10 @@ def advance_block(
     x: Array,
     work: Array,
 ) -> None:
-    """One step of a LinearProcess in place, of one diagonal block: the states `first` to `end` - 1;
-    the others stay. `gain` multiplies the noise, `work` is scratch (n,)."""
+    """One step in place of one diagonal block of a LinearProcess, states `first` to `end` - 1.
+
+    `gain` multiplies the noise; `work` (n,) is scratch.
+    """
     for i in range(first, end):
         total = 0.0
         for j in range(first, end):

@@ -1,7 +1,7 @@
-"""The simulated vehicle below the autopilot: airframe, air, attitude loop and estimator as one.
+"""Plant: the simulated vehicle below the autopilot, with air, attitude loop and estimator.
 
-`Plant` takes a `Demand` and a duration, and shows the `Truth` and the `Estimate`. Fixed steps,
-one compiled call per `advance`. It knows no modes, no arming and no MAVLink.
+`Plant` takes a `Demand` and a duration and gives the `Truth` and the `Estimate`. Fixed steps, one
+compiled call per `advance`. Knows no modes, no arming and no MAVLink.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ _MASS, _THRUST_MAX = 0, 0  # places in the constants of body and rotors
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """Where the vehicle really is. Arrays (3,) NED or FRD, SI; quaternion (4,) wxyz FRD -> NED."""
+    """True state. Arrays (3,) NED or FRD, SI; quaternion (4,) wxyz FRD -> NED."""
 
     position_ned_m: Array
     velocity_ned_mps: Array
@@ -54,14 +54,14 @@ class Truth:
     attitude: Array
     rates_frd_radps: Array
     on_ground: bool
-    thrust: float  # actual normalised collective thrust, behind the rotor lag
+    thrust: float  # normalised collective thrust after the rotor lag
     wind_ned_mps: Array  # steady wind and gust
     battery: BatteryState
 
 
 @dataclass(frozen=True, slots=True)
 class Estimate:
-    """Where the autopilot believes the vehicle is, as it would report it now. As in `Truth`."""
+    """Estimated state, as the autopilot reports it. Frames and units as in `Truth`."""
 
     position_ned_m: Array
     velocity_ned_mps: Array
@@ -72,18 +72,18 @@ class Estimate:
 
 @dataclass(frozen=True, slots=True)
 class Fix:
-    """What the satellite receiver says, NED: position (3,) and velocity (2,)."""
+    """GPS fix, NED: position (3,) and velocity (2,)."""
 
     position_ned_m: Array
     velocity_ne_mps: Array
 
 
 class Plant:
-    """One vehicle standing at the origin, level, nose north, motors off.
+    """One vehicle, at first on the ground at the origin, level, heading north, motors off.
 
-    The estimator's errors start at zero and are driven by a tenth of the noise until the motors
-    first run: as on real vehicles, they reach their full size in the first tens of seconds of a
-    flight. The same seed gives the same bytes, however the time is cut into calls.
+    The estimator's errors start at zero and have a tenth of their noise while the motors are off:
+    as on real vehicles, they reach their full size in the first tens of seconds of a flight. The
+    same seed gives the same bytes, whatever the durations of the calls.
     """
 
     def __init__(self, vehicle: Vehicle, conditions: Conditions, seed: int) -> None:
@@ -128,11 +128,11 @@ class Plant:
 
     @property
     def time_s(self) -> float:
-        """Virtual time since boot."""
+        """Simulated time since the plant was made."""
         return self._step * STEP_S
 
     def advance(self, duration_s: float, demand: Demand) -> None:
-        """Hold the demand for `duration_s`; what is left of a step is owed to the next call."""
+        """Hold the demand for `duration_s`; a remainder of a step is added to the next call."""
         if demand is not self._demand:
             encode(demand, self._row)
             self.record["motors_on"] = demand.motors_on
@@ -144,29 +144,29 @@ class Plant:
         advance_steps(count, self.record)
 
     def reset_estimate(self, offset_ned_m: Triple) -> None:
-        """The estimator jumps by this much from now on, and says so by its reset counter."""
+        """Offset the estimate, and count an estimator reset."""
         self._offset_ned_m += offset_ned_m
         self._reset_counter = (self._reset_counter + 1) % 256
 
     def drift_estimate(self, offset_ned_m: Triple) -> None:
-        """The estimate moves off by this much, and the estimator does not notice."""
+        """Offset the estimate without an estimator reset."""
         self._offset_ned_m += offset_ned_m
 
     def scale_mass(self, factor: float) -> None:
-        """From now on the vehicle is this much heavier."""
+        """Multiply the mass."""
         self.record["body_constants"][0, _MASS] *= factor
 
     def scale_thrust(self, factor: float) -> None:
-        """From now on the rotors give this much more."""
+        """Multiply the thrust."""
         self.record["rotor_constants"][0, _THRUST_MAX] *= factor
 
     def set_battery(self, remaining: float) -> None:
-        """From now on the battery has this share of its capacity, 0 .. 1."""
+        """Set the remaining share of the battery's capacity, 0 .. 1."""
         self._rotor[CHARGE] = self.pack.drawn_as(remaining)
 
     @property
     def truth(self) -> Truth:
-        """A copy of the true state now."""
+        """The true state; a copy."""
         body = self._body.copy()
         return Truth(
             position_ned_m=body[QUATERNION.position],
@@ -182,23 +182,23 @@ class Plant:
 
     @property
     def fix(self) -> Fix:
-        """A satellite fix of now; the same however often it is asked within a step."""
+        """GPS fix of the present step; repeated calls give the same one."""
         receive_fix(self.record)
         fix = self.record["fix"][0].copy()
         return Fix(fix[:3], fix[3:])
 
     def shift_fixes(self, offset_ned_m: Triple) -> None:
-        """Fixes are off by this much more from now on."""
+        """Offset the GPS fixes; offsets add up."""
         self.record["fix_offset"][0] += offset_ned_m
 
     def motion(self) -> list[float]:
-        """The truth as plain numbers: attitude wxyz, rates FRD, then NED velocity, position,
+        """The true motion as floats: attitude wxyz, rates FRD, then NED velocity, position and
         acceleration."""
         return [*self._body.tolist(), *self._rotor[ACCELERATION].tolist()]
 
     @property
     def height_m(self) -> float:
-        """True, above the ground."""
+        """True height above the ground."""
         return -float(self._body[12])
 
     @property
@@ -208,20 +208,20 @@ class Plant:
 
     @property
     def reset_counter(self) -> int:
-        """How often the estimate was reset, 0 .. 255."""
+        """Estimator resets, modulo 256."""
         return self._reset_counter
 
     @property
     def estimate(self) -> Estimate:
-        """What the autopilot reports now; the same however often it is asked within a step."""
+        """Estimate of the present step; repeated calls give the same one."""
         out = self.report().copy()
         return Estimate(
             out[POSITION], out[VELOCITY], out[ATTITUDE], out[RATES], self._reset_counter
         )
 
     def report(self) -> Array:
-        """The estimate in one array (REPORT_WIDTH,), laid out as `simulator.vehicle.sensors` says;
-        it changes with the next call."""
+        """Estimate as one array (REPORT_WIDTH,), with the layout of `simulator.vehicle.sensors`;
+        the next call overwrites it."""
         report_state(self.record)
         seen: Array = self._report
         return seen

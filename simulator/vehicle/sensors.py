@@ -1,11 +1,10 @@
-"""What the autopilot believes: estimator errors as data, and the estimate made of truth and error.
+"""Estimator: error models identified on autopilots, and the estimate made from truth and errors.
 
-An estimator is a linear error process per NED axis, e = [e_p, e_v, e_b, e_r] with e' = A e + w,
-plus a white part from sample to sample. e_p and e_v are estimated minus true position and velocity;
-e_b is estimated minus true thrust direction (so the true tilt is the estimated one less e_b); e_r
-is the rate of e_p where e_p is smooth. The processes were identified on real autopilots; PX4's
-reproduces that its velocity is *not* the derivative of its position, and that its position is
-smooth all the same, which white noise does not. Knows no vehicle and no MAVLink.
+The error of an estimator is a linear process per NED axis, e = [e_p, e_v, e_b, e_r] with
+e' = A e + w, plus white noise. e_p and e_v are estimated minus true position and velocity; e_b is
+estimated minus true thrust direction; e_r is the rate of e_p where e_p is smooth. PX4's process
+reproduces a velocity that is *not* the derivative of the position, and a smooth position, which
+white noise alone does not. Knows no vehicle and no MAVLink.
 """
 
 from __future__ import annotations
@@ -33,12 +32,12 @@ _AXIS_STRIDE = 4
 
 WHITE_COUNT = 12  # position, velocity, attitude, rates
 
-# Of the noise, with the motors standing: the IMU is far quieter then.
+# Factor on the noise while the motors are off: the IMU has less noise then.
 STANDING_NOISE = 0.1
 
 
 class EstimatorName(StrEnum):
-    """Which autopilot's estimator errors the vehicle has."""
+    """Estimators by the autopilot whose errors they have."""
 
     PERFECT = "perfect"
     WHITE = "white"
@@ -47,7 +46,7 @@ class EstimatorName(StrEnum):
 
 
 class WhiteNoise(Parameters):
-    """Standard deviations from sample to sample, each axis alike, of the `white` estimator."""
+    """Standard deviations of the `white` estimator, the same on each axis; new at each sample."""
 
     position_m: float = Field(default=0.02, ge=0, le=10)
     velocity_mps: float = Field(default=0.02, ge=0, le=10)
@@ -57,9 +56,9 @@ class WhiteNoise(Parameters):
 
 @dataclass(frozen=True, slots=True)
 class AxisError:
-    """e' = drift e + noise xi of one axis, xi white with unit density; p in m, v in m/s, b in rad.
+    """Error e' = drift e + noise xi of one axis, xi white with unit density; p m, v m/s, b rad.
 
-    As many states as it needs, in the order of the error state; the others stay zero.
+    It may have fewer states than the error state, in the same order; the others are zero.
     """
 
     drift: Rows = ()
@@ -68,7 +67,7 @@ class AxisError:
 
 @dataclass(frozen=True, slots=True)
 class ReceiverNoise:
-    """Standard deviations from fix to fix, NED, of what the satellite receiver says."""
+    """Standard deviations of a GPS fix, NED; new at each fix."""
 
     position_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
     velocity_mps: tuple[float, float] = (0.0, 0.0)
@@ -76,7 +75,7 @@ class ReceiverNoise:
 
 @dataclass(frozen=True, slots=True)
 class ErrorModel:
-    """One estimator, and the receiver that it is fed by."""
+    """Errors of one estimator and of its GPS receiver."""
 
     north: AxisError
     east: AxisError
@@ -84,7 +83,7 @@ class ErrorModel:
     yaw_sd_rad: float
     yaw_time_s: float
     white: WhiteNoise
-    lag_s: float  # position and velocity describe the motion this long before their stamp
+    lag_s: float  # of position and velocity behind their time stamp
     receiver: ReceiverNoise = ReceiverNoise()
 
 
@@ -94,15 +93,15 @@ _SILENT = WhiteNoise(
 _NONE = AxisError()
 PERFECT = ErrorModel(_NONE, _NONE, _NONE, 0.0, 15.0, _SILENT, 0.0)
 
-# As PX4's SIH makes them up, and as its GPS_RAW_INT differs from its truth: .13 m east at 47 deg
-# north, because the same angle is less there.
+# GPS noise of PX4's SIH, measured as GPS_RAW_INT minus truth at 47 deg north. SIH's noise is an
+# angle of longitude to the east, hence the smaller distance.
 SIH_RECEIVER = ReceiverNoise((0.19, 0.13, 0.52), (0.062, 0.072))
 
-# PX4 1.16 SITL with its SIH quadrotor: identified from estimate against simulated truth, flown in
-# hover and on lemniscates. e_v is what the accelerometer's noise drives. e_p does not follow it:
-# the filter's position corrections undo it within half a second or so. They arrive smoothed by
-# the output predictor, so e_p has a rate of its own, e_r, whose drive shares in e_v's. North and
-# east differ because SIH's IMU noise is per body axis.
+# PX4 1.16 SITL with its SIH quadrotor, identified from estimate minus truth in hover and on
+# lemniscates. Accelerometer noise drives e_v. e_p does not integrate it: the filter's position
+# corrections remove it within about half a second. The output predictor smooths them, so e_p has
+# its own rate, e_r, whose noise is correlated with that of e_v. North and east differ because
+# SIH's IMU noise is per body axis.
 PX4_LIKE = ErrorModel(
     north=AxisError(
         drift=(
@@ -149,10 +148,10 @@ PX4_LIKE = ErrorModel(
 )
 
 
-# ArduCopter 4.6 EKF3 on noisy sensors ("noisy", not the near-silent ones SITL ships with: there
-# the agitation of a flight is a real vehicle's), identified as PX4's, in hover and on lemniscates.
-# Standard deviations N and E .057 m and .027 m/s, D .023 and .006; correlated over 1-1.5 s. The
-# mean of the position's rate over 1 s differs from the velocity by .05 m/s, over 4 s by .02.
+# ArduCopter 4.6 EKF3, identified as PX4's. The sensors had more noise than SITL's default, as those
+# of a real vehicle have. Standard deviations N and E 0.057 m and 0.027 m/s, D 0.023 and 0.006;
+# correlated over 1-1.5 s. The mean rate of the position over 1 s differs from the velocity by
+# 0.05 m/s, over 4 s by 0.02.
 _ARDUPILOT_LATERAL = AxisError(
     drift=(
         (0.0, 0.0, 0.0, 1.0),
@@ -188,7 +187,7 @@ ARDUPILOT_LIKE = ErrorModel(
 
 
 def error_model(name: EstimatorName, white: WhiteNoise) -> ErrorModel:
-    """The estimator of this name; `white` only matters for WHITE."""
+    """Errors of the estimator of this name; only WHITE uses `white`."""
     return {
         EstimatorName.PERFECT: PERFECT,
         EstimatorName.WHITE: ErrorModel(_NONE, _NONE, _NONE, 0.0, 15.0, white, 0.0),
@@ -198,7 +197,7 @@ def error_model(name: EstimatorName, white: WhiteNoise) -> ErrorModel:
 
 
 def error_process(model: ErrorModel, step_s: float) -> LinearProcess:
-    """The error state (NORTH, EAST, DOWN, YAW) sampled exactly at `step_s`."""
+    """Process of the error state (NORTH, EAST, DOWN, YAW) with steps of `step_s`."""
     parts = [
         discretise(*_padded(axis, end - first), step_s)
         for axis, (first, end) in zip(
@@ -211,7 +210,7 @@ def error_process(model: ErrorModel, step_s: float) -> LinearProcess:
 
 
 def _padded(axis: AxisError, size: int) -> tuple[Array, Array]:
-    """Drift and noise (size, size); the states that the axis does not have decay undriven."""
+    """Drift and noise (size, size); states that the axis does not have decay without noise."""
     drift, noise = -np.eye(size), np.zeros((size, size))
     for i, (drift_row, noise_row) in enumerate(zip(axis.drift, axis.noise, strict=True)):
         drift[i, : len(drift_row)] = drift_row
@@ -220,7 +219,7 @@ def _padded(axis: AxisError, size: int) -> tuple[Array, Array]:
 
 
 def white_sds(model: ErrorModel) -> Array:
-    """Standard deviations (12,): position, velocity, attitude, rates, in the order of REPORT."""
+    """Standard deviations (12,) of position, velocity, attitude error and rates."""
     white = model.white
     lateral = np.repeat([white.position_m, white.velocity_mps, white.attitude_rad], 3)
     return np.concatenate([lateral, white.rates_radps])
@@ -228,10 +227,10 @@ def white_sds(model: ErrorModel) -> Array:
 
 @kernel
 def turn_estimate(body: Array, error: Array, out: Array) -> None:
-    """The quaternion that `body` begins with, turned by the small NED rotation `error` (3,) rad,
-    into `out` (4,), unit length.
+    """The attitude of `body`, rotated by the small NED rotation `error` (3,) rad; unit length, into
+    `out` (4,).
 
-    A rotation (-e_bE, e_bN, e_psi) moves the thrust direction of a level body by (e_bN, e_bE).
+    A rotation (-e_bE, e_bN, e_psi) changes the thrust direction of a level body by (e_bN, e_bE).
     """
     w, x, y, z = body[0], body[1], body[2], body[3]
     a, b, c = 0.5 * error[0], 0.5 * error[1], 0.5 * error[2]
@@ -244,7 +243,7 @@ def turn_estimate(body: Array, error: Array, out: Array) -> None:
         out[i] /= norm
 
 
-# Layout of a report, the raw form of an estimate.
+# Layout of a report: the estimate as one array.
 POSITION, VELOCITY, ATTITUDE, RATES = slice(0, 3), slice(3, 6), slice(6, 10), slice(10, 13)
 REPORT_WIDTH = 13
 
@@ -264,10 +263,11 @@ def report(
     white: Array,
     out: Array,
 ) -> None:
-    """Truth (13,) plus error, reset offset (3,) and `gain` times the white part of this step.
+    """Estimate: truth (13,) plus errors, offset (3,) and `gain` times white noise, into `out`
+    (REPORT_WIDTH,).
 
-    Into `out` (REPORT_WIDTH,). `body` is [attitude, rates, velocity, position] as the rigid body
-    has it; `acceleration` holds the NED one from place 3 on; `white` (WHITE_COUNT,) is scratch.
+    `body` is [attitude, rates, velocity, position], as the rigid body has it; the NED acceleration
+    is `acceleration[3:6]`; `white` (WHITE_COUNT,) is scratch.
     """
     fill_normals(seed, lane, step, white[:])
     for i in range(WHITE_COUNT):

@@ -1,6 +1,6 @@
-"""The air: a steady wind and Dryden gusts (MIL-F-8785C) carried past the vehicle at a fixed speed.
+"""Wind: steady wind and Dryden gusts (MIL-F-8785C) that pass the vehicle at a fixed speed.
 
-Pure data and matrices; advanced by the plant. Knows no vehicle.
+Data and matrices; the plant advances the process. Knows no vehicle.
 """
 
 from __future__ import annotations
@@ -23,8 +23,8 @@ GUST_COUNT = 5
 class Gusts(Parameters):
     """Dryden turbulence. Standard deviations in m/s, scale lengths in m; intensity 0 is still air.
 
-    The pattern is frozen and passes at `speed_mps`, so the correlation times are length / speed.
-    Below 300 m of height MIL-F-8785C has the vertical length equal to the height and the
+    The gust field passes at `speed_mps` without changing, so the correlation times are length /
+    speed. For heights below 300 m MIL-F-8785C has the vertical length equal to the height and the
     horizontal intensity up to 1.8 times the vertical one.
     """
 
@@ -36,7 +36,7 @@ class Gusts(Parameters):
 
 
 def dryden(gusts: Gusts, step_s: float) -> LinearProcess:
-    """The gust process: states [u, v, v~, w, w~]; along, across and down are states 0, 1 and 3."""
+    """Gust process with states [u, v, v~, w, w~]; along, across and down are states 0, 1 and 3."""
     time_s = gusts.length_m / gusts.speed_mps
     down_time_s = gusts.vertical_length_m / gusts.speed_mps
     along = discretise([[-1.0 / time_s]], [gusts.intensity_mps * math.sqrt(2.0 / time_s)], step_s)
@@ -46,9 +46,9 @@ def dryden(gusts: Gusts, step_s: float) -> LinearProcess:
 
 
 def _transverse(sd_mps: float, time_s: float, step_s: float) -> LinearProcess:
-    """sd sqrt(tau) (1 + sqrt(3) tau s) / (1 + tau s)^2, white noise of unit density (two-sided).
+    """Filter sd sqrt(tau) (1 + sqrt(3) tau s) / (1 + tau s)^2 of white noise with unit density.
 
-    As x' = (-x + k y)/tau + sqrt(3/tau) sd w, y' = -y/tau + w: the first state is the gust.
+    As x' = (-x + k y)/tau + sqrt(3/tau) sd w, y' = -y/tau + w; the first state is the gust.
     """
     root_three = math.sqrt(3.0)
     direct = sd_mps * root_three / math.sqrt(time_s)
@@ -58,7 +58,7 @@ def _transverse(sd_mps: float, time_s: float, step_s: float) -> LinearProcess:
 
 
 def wind_axes(wind_ned_mps: tuple[float, float, float]) -> tuple[float, float]:
-    """(cos, sin) of the direction the steady wind blows to; north when there is none."""
+    """(cos, sin) of the direction towards which the steady wind blows; north without wind."""
     north, east, _ = wind_ned_mps
     speed = math.hypot(north, east)
     return (north / speed, east / speed) if speed > 1e-9 else (1.0, 0.0)

@@ -101,7 +101,7 @@ class Opened:
         ]
 
     def width_px(self) -> int:
-        """Of the whole page: more than the window's where something overflows."""
+        """The width of the whole page; it exceeds the window's where something overflows."""
         return int(self.page.evaluate("document.documentElement.scrollWidth"))
 
     def colliding(self) -> list[str]:

@@ -211,15 +211,15 @@ def test_new_directories_are_private_whatever_the_umask(package: Path, tmp_path:
     assert modes == [0o700] * 2
 
 
-def test_the_most_recently_used_five_versions_are_kept(package: Path, tmp_path: Path) -> None:
+def test_machine_code_unused_for_thirty_days_is_deleted(package: Path, tmp_path: Path) -> None:
     cache = {"XDG_CACHE_HOME": str(tmp_path / "cache")}
     first = Path(answer(package, DIRECTORY, **cache))
-    for age_s in range(1, 8):
-        old = first.parent / f"{age_s}"
+    for days in (1, 29, 31, 400):
+        old = first.parent / f"{days}"
         old.mkdir()
-        os.utime(old, (time.time() - age_s,) * 2)
+        os.utime(old, (time.time() - 86400.0 * days,) * 2)
     answer(package, DIRECTORY, **cache)
-    assert {path.name for path in first.parent.iterdir()} == {first.name, "1", "2", "3", "4"}
+    assert {path.name for path in first.parent.iterdir()} == {first.name, "1", "29"}
 
 
 @pytest.mark.parametrize(

@@ -127,7 +127,14 @@ def test_every_printed_entry_of_eq_16_is_reproduced_at_a_tenth_of_a_second_only(
 
 def test_errata_name_their_numbers() -> None:
     table = errata.errata_table(
-        flown(0.65), flown(0.65, False), flown(0.3), flown(1.0), flown(1.0), reweighted()
+        {
+            "damped": flown(0.65),
+            "no constant": flown(0.65, False),
+            "least": flown(0.3),
+            "undamped": flown(1.0),
+            "rebounding": flown(1.0),
+            "final": reweighted(),
+        }
     )
     said = {str(row["where"]): str(row["shown_by"]) for row in table.rows}
     assert "-0.076 N" in said["Eq. 26"]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 
@@ -21,6 +21,7 @@ _VARIANTS = {  # key: heading, name, sampling time, arm
     "ts_50ms_no_arm": ("0.05 s, no arm", "0.05 s, no arm", 0.05, False),
 }
 Erratum = tuple[str, str, str, str]  # where, printed, correct, evidence
+Flown = Mapping[str, Sequence[Flight]]
 
 
 def computed_inputs(step_s: float, with_arm: bool) -> np.ndarray:
@@ -69,32 +70,18 @@ def _reproduced_by(value: float | None, computed: dict[str, float]) -> str:
     return "none"
 
 
-def errata_table(
-    kept: Sequence[Flight],
-    dropped: Sequence[Flight],
-    least: Sequence[Flight],
-    undamped: Sequence[Flight],
-    rebounding: Sequence[Flight],
-    final: Sequence[Flight],
-) -> Table:
+def errata_table(flown: Flown) -> Table:
     """The errata, from flights on the linear plant.
 
     Args:
-        kept: lambda 0.65.
-        dropped: lambda 0.65 without the constant term of J.
-        least: lambda 0.3.
-        undamped: lambda 1.
-        rebounding: lambda 1 with particles that rebound from the box.
-        final: weights of Eqs. 33-35.
+        flown: flights, one per seed, by name. "damped": lambda 0.65; "no constant": the same
+            without the constant term of J; "least": lambda 0.3; "undamped": lambda 1;
+            "rebounding": the same with particles that rebound from the box; "final": Eqs. 33-35.
     """
     columns = {
         "where": "where", "printed": "printed", "holds": "correct", "shown_by": "evidence",
     }  # fmt: skip
-    errata = (
-        *_model_errata(),
-        *_swarm_errata(kept, dropped, least, undamped, rebounding),
-        *_error_errata(kept, final),
-    )
+    errata = (*_model_errata(), *_swarm_errata(flown), *_error_errata(flown))
     rows: list[Row] = [dict(zip(columns, erratum, strict=True)) for erratum in errata]
     return Table("Errata", columns, rows)
 
@@ -142,37 +129,39 @@ def _model_errata() -> Iterator[Erratum]:
     )
 
 
-def _swarm_errata(
-    kept: Sequence[Flight],
-    dropped: Sequence[Flight],
-    least: Sequence[Flight],
-    undamped: Sequence[Flight],
-    rebounding: Sequence[Flight],
-) -> Iterator[Erratum]:
-    costs = [flight.costs.sum() for flight in undamped]
-    with_constant, without = _epsilon(kept), _epsilon(dropped)
+def _swarm_errata(flown: Flown) -> Iterator[Erratum]:
+    costs = [flight.costs.sum() for flight in flown["undamped"]]
+    epsilon = {
+        name: float(np.mean([flight.spreads.mean() for flight in flights]))
+        for name, flights in flown.items()
+    }
+    missed = {
+        name: 100.0 * float(np.mean([np.mean(flight.gaps > MISS) for flight in flights]))
+        for name, flights in flown.items()
+    }
+    kept, dropped = epsilon["damped"], epsilon["no constant"]
     yield (
         "ε at λ = 0.65",
         "2.7744e-08, a measure of precision",
         "the rounding error of J: within it the costs of all particles are equal",
-        f"ε = {shown(with_constant)} with the constant term of J, {shown(without)} without it: "
-        f"same inputs, same minimum, {with_constant / without:.0f} times less",
+        f"ε = {shown(kept)} with the constant term of J, {shown(dropped)} without it: same inputs, "
+        f"same minimum, {kept / dropped:.0f} times less",
     )
     yield (
         "Table 2, small ε",
         "ε = 1.6e-11 at λ = 0.3, the smallest",
         "small ε is not quality: the swarm stops before it reaches the optimum",
-        f"λ = 0.3: ε = {shown(_epsilon(least))}, yet {_missed(least):.0f} % of the solves miss the "
-        f"optimum by more than 1e-6; λ = 0.65: {_missed(kept):.0f} %; λ = 1: "
-        f"{_missed(undamped):.0f} %",
+        f"λ = 0.3: ε = {shown(epsilon['least'])}, yet {missed['least']:.0f} % of the solves miss "
+        f"the optimum by more than 1e-6; λ = 0.65: {missed['damped']:.0f} %; λ = 1: "
+        f"{missed['undamped']:.0f} %",
     )
     yield (
         "ε at λ = 1",
         "1.3944",
         "depends on what particles do at the box, which the paper does not define",
-        f"ε = {shown(_epsilon(undamped))} with particles that lose their velocity at the bound, as "
-        f"flown here; {shown(_epsilon(rebounding))} with particles that rebound at half their "
-        "speed",
+        f"ε = {shown(epsilon['undamped'])} with particles that lose their velocity at the bound, "
+        f"as flown here; {shown(epsilon['rebounding'])} with particles that rebound at half "
+        "their speed",
     )
     yield (
         "J_c1 - J_cλ",
@@ -182,8 +171,10 @@ def _swarm_errata(
     )
 
 
-def _error_errata(kept: Sequence[Flight], final: Sequence[Flight]) -> Iterator[Erratum]:
-    before, after = (np.mean([f.errors for f in side], axis=0) for side in (kept, final))
+def _error_errata(flown: Flown) -> Iterator[Erratum]:
+    before, after = (
+        np.mean([flight.errors for flight in flown[name]], axis=0) for name in ("damped", "final")
+    )
     entries = printed.ERRORS_REWEIGHTED[2] / printed.ERRORS_DAMPED[2]
     yield (
         "Table 4, ratio of e_w",
@@ -213,11 +204,3 @@ def _value(entry: printed.PrintedEntry, matrix: np.ndarray) -> float:
 
 def _distance(entry: printed.PrintedEntry, matrix: np.ndarray) -> float:
     return abs(abs(_value(entry, matrix)) - abs(entry.value or 0.0))
-
-
-def _epsilon(flights: Sequence[Flight]) -> float:
-    return float(np.mean([flight.spreads.mean() for flight in flights]))
-
-
-def _missed(flights: Sequence[Flight]) -> float:
-    return 100.0 * float(np.mean([np.mean(flight.gaps > MISS) for flight in flights]))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -29,6 +29,7 @@ from offboard.paper.law import PaperSettings
 from offboard.paper.plant import PlantKind
 from offboard.paper.study.closed_loop import Flight
 from offboard.paper.study.peers import problems
+from offboard.paper.study.printed import BEST_DAMPING, TABLE_2, UNDAMPED
 from offboard.paper.trajectory import PathName, sampled_path
 
 Array = NDArray[np.float64]
@@ -38,27 +39,36 @@ UNDAMPED_FLIGHT = "λ = 1, first weights"
 DAMPED_FLIGHT = "λ = 0.65, first weights"
 FINAL_FLIGHT = "λ = 0.65, Eqs. 33-35"
 
-_INPUTS = ("f_t, N", "τ_x, N", "τ_y, N", "τ_z, N m")
-_VELOCITIES = ("u, m/s", "v, m/s", "w, m/s")
-_POSITIONS = ("x, m", "y, m", "z, m", "ψ, °")
 DASHES = {PlantKind.LINEAR: "solid", PlantKind.NONLINEAR: "dot"}
 _COLOURS = {PlantKind.LINEAR: BLUE, PlantKind.NONLINEAR: RED}
-_CAPTIONS = {
-    7: "The distortion that the paper describes: the undamped swarm ends anywhere in a flat valley "
-    "of the cost.",
-    8: "The states follow nevertheless: the plant filters the noise.",
-    9: "Positions lag by tens of metres: with Q = I the cost of one step hardly depends on them.",
-    10: "ε at λ = 1; printed mean 1.3944, least 0.9380, greatest 2.0023.",
-    11: "ε at λ = 0.65; printed mean 2.7744e-08. Its floor is the rounding of J, not the swarm.",
-    12: "The same flight with λ = 0.65: smooth.",
-    13: "Hardly different from Fig. 8, as in the paper.",
-    14: "Hardly different from Fig. 9, as in the paper.",
-    15: "Weights of Eqs. 33-35.",
-    16: "Velocities now follow the reference closely.",
-    17: "The steady error that the conclusions mention: a time constant of 39 s. On the nonlinear "
-    "plant tilt reduces the lift, which adds a height error.",
+_CONTROLS, _VELOCITIES, _POSITIONS, _SPREADS = "controls", "u, v, w", "x, y, z, ψ", "ε"
+_PANELS = {
+    _CONTROLS: ("f_t, N", "τ_x, N", "τ_y, N", "τ_z, N m"),
+    _VELOCITIES: ("u, m/s", "v, m/s", "w, m/s"),
+    _POSITIONS: ("x, m", "y, m", "z, m", "ψ, °"),
+    _SPREADS: ("ε",),
 }
-Flown = Mapping[PlantKind, Flight]
+_UNDAMPED, _BEST = TABLE_2[UNDAMPED], TABLE_2[BEST_DAMPING]
+# Number -> flight (on both plants), what is shown of it, caption
+FLOWN = {
+    7: (UNDAMPED_FLIGHT, _CONTROLS, "The distortion that the paper describes: the undamped swarm "
+        "ends anywhere in a flat valley of the cost."),
+    8: (UNDAMPED_FLIGHT, _VELOCITIES, "The states follow nevertheless: the plant filters the "
+        "noise."),
+    9: (UNDAMPED_FLIGHT, _POSITIONS, "Positions lag by tens of metres: with Q = I the cost of one "
+        "step hardly depends on them."),
+    10: (UNDAMPED_FLIGHT, _SPREADS, f"ε at λ = 1; printed mean {_UNDAMPED.mean:.4f}, least "
+         f"{_UNDAMPED.least:.4f}, greatest {_UNDAMPED.greatest:.4f}."),
+    11: (DAMPED_FLIGHT, _SPREADS, f"ε at λ = 0.65; printed mean {_BEST.mean:.4e}. Its floor is "
+         "the rounding of J, not the swarm."),
+    12: (DAMPED_FLIGHT, _CONTROLS, "The same flight with λ = 0.65: smooth."),
+    13: (DAMPED_FLIGHT, _VELOCITIES, "Hardly different from Fig. 8, as in the paper."),
+    14: (DAMPED_FLIGHT, _POSITIONS, "Hardly different from Fig. 9, as in the paper."),
+    15: (FINAL_FLIGHT, _CONTROLS, "Weights of Eqs. 33-35."),
+    16: (FINAL_FLIGHT, _VELOCITIES, "Velocities now follow the reference closely."),
+    17: (FINAL_FLIGHT, _POSITIONS, "The steady error that the conclusions mention: a time constant "
+         "of 39 s. On the nonlinear plant tilt reduces the lift, which adds a height error."),
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,10 +129,10 @@ def _particles(found: Search, shown: int) -> list[go.Scatter]:
 def reference_states() -> Figure:
     """Fig. 5."""
     path = sampled_path(PathName.TOUR, 1000)
-    titles = _POSITIONS + _VELOCITIES
-    drawing = panels(titles, "t, s", panel_px=100)
-    for panel, (title, column) in enumerate(zip(titles, _shown(path.tracked), strict=True), 1):
-        curve(drawing, panel, path.times_s, column, title, INK)
+    drawing = panels(_PANELS[_POSITIONS] + _PANELS[_VELOCITIES], "t, s", panel_px=100)
+    columns = _columns(path.tracked)
+    for panel, column in enumerate((*columns[_POSITIONS], *columns[_VELOCITIES]), 1):
+        curve(drawing, panel, path.times_s, column, "reference", INK)
     drawing.update_layout(showlegend=False, margin={"b": 50})
     caption = "The paper draws its path without numbers; this one is similar."
     return Figure("Fig. 5: reference of the states", drawing, caption)
@@ -152,41 +162,26 @@ def reference_path(flown: Mapping[str, Flight]) -> Figure:
     return Figure("Fig. 6: the path", drawing, caption, width_px=560)
 
 
-def _controls(number: int, name: str, flown: Flown) -> Figure:
-    drawing = panels(_INPUTS, "t, s")
-    for plant, flight in flown.items():
-        for panel, column in enumerate(flight.inputs.T, 1):
-            curve(drawing, panel, flight.times_s[:-1], column, f"{plant} plant", _COLOURS[plant])
-    return Figure(f"Fig. {number}: controls, {name}", drawing, _CAPTIONS[number])
+def flown_figure(number: int, flown: Mapping[PlantKind, Flight]) -> Figure:
+    """Figs. 7 to 17, `FLOWN`: the flight on both plants, beside its reference if it has one."""
+    name, shown, caption = FLOWN[number]
+    drawing = panels(_PANELS[shown], "t, s", 300 if shown == _SPREADS else 150)
+    first = next(iter(flown.values()))
+    lines = [(f"{p} plant", f, f.states, _COLOURS[p], "solid") for p, f in flown.items()]
+    if shown in (_VELOCITIES, _POSITIONS):
+        lines.insert(0, ("reference", first, first.tracked, INK, "dash"))
+    for label, flight, states, colour, dash in lines:
+        columns = _columns(states) | {_CONTROLS: [*flight.inputs.T], _SPREADS: [flight.spreads]}
+        for panel, column in enumerate(columns[shown], 1):
+            curve(drawing, panel, flight.times_s[: len(column)], column, label, colour, dash)
+    if shown == _SPREADS:
+        drawing.update_yaxes(type="log")
+    return Figure(f"Fig. {number}: {shown}, {name}", drawing, caption)
 
 
-def _spreads(number: int, name: str, flown: Flown) -> Figure:
-    drawing = panels(("ε",), "t, s", panel_px=300)
-    for plant, flight in flown.items():
-        curve(drawing, 1, flight.times_s[:-1], flight.spreads, f"{plant} plant", _COLOURS[plant])
-    drawing.update_yaxes(type="log")
-    return Figure(f"Fig. {number}: ε, {name}", drawing, _CAPTIONS[number])
-
-
-def _positions(number: int, name: str, flown: Flown) -> Figure:
-    drawing = _tracking(flown, _POSITIONS, slice(0, 4))
-    return Figure(f"Fig. {number}: x, y, z, ψ, {name}", drawing, _CAPTIONS[number])
-
-
-def _velocities(number: int, name: str, flown: Flown) -> Figure:
-    drawing = _tracking(flown, _VELOCITIES, slice(4, 7))
-    return Figure(f"Fig. {number}: u, v, w, {name}", drawing, _CAPTIONS[number])
-
-
-# Number -> name of the flight on both plants, and the function that draws it
-FLOWN: dict[int, tuple[str, Callable[[int, str, Flown], Figure]]] = {
-    7: (UNDAMPED_FLIGHT, _controls), 8: (UNDAMPED_FLIGHT, _velocities),
-    9: (UNDAMPED_FLIGHT, _positions), 10: (UNDAMPED_FLIGHT, _spreads),
-    11: (DAMPED_FLIGHT, _spreads), 12: (DAMPED_FLIGHT, _controls),
-    13: (DAMPED_FLIGHT, _velocities), 14: (DAMPED_FLIGHT, _positions),
-    15: (FINAL_FLIGHT, _controls), 16: (FINAL_FLIGHT, _velocities),
-    17: (FINAL_FLIGHT, _positions),
-}  # fmt: skip
+def _columns(states: Array) -> dict[str, list[Array]]:
+    positions = [*states[:, X : X + 3].T, np.degrees(states[:, PSI])]
+    return {_POSITIONS: positions, _VELOCITIES: [*states[:, U : U + 3].T]}
 
 
 def position_error(
@@ -197,21 +192,3 @@ def position_error(
     errors = np.maximum(flight.position_errors_m[::every], 1e-9)
     name = f"{law}, {plant}"
     curve(drawing, panel, flight.times_s[::every], errors, name, colour, DASHES[plant])
-
-
-def _tracking(flown: Flown, titles: Sequence[str], part: slice) -> go.Figure:
-    """The reference and the flights, one panel per state."""
-    drawing = panels(titles, "t, s")
-    first = next(iter(flown.values()))
-    lines = [("reference", first.tracked, INK, "dash")]
-    lines += [(f"{p} plant", flight.states, _COLOURS[p], "solid") for p, flight in flown.items()]
-    for name, states, colour, dash in lines:
-        for panel, column in enumerate(_shown(states)[part], 1):
-            curve(drawing, panel, first.times_s, column, name, colour, dash)
-    return drawing
-
-
-def _shown(states: Array) -> list[Array]:
-    """x, y, z, psi in degrees, u, v, w: (K,) each."""
-    x, y, z = states[:, X : X + 3].T
-    return [x, y, z, np.degrees(states[:, PSI]), *states[:, U : U + 3].T]

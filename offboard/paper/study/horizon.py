@@ -50,7 +50,7 @@ class Modes:
 
     @property
     def time_constant_s(self) -> float:
-        """Of the slowest mode; infinite where it does not decay."""
+        """Time constant of the slowest mode; infinite where it does not decay."""
         return -PAPER_STEP_S / math.log(self.slowest) if self.slowest < 1 else math.inf
 
     def row(self) -> Row:
@@ -90,7 +90,7 @@ class _Problem:
         return cost_to_go(self.a, self.b, self.weight, self.control_weight, self.cross)
 
     def eigenvalues(self, to_go: Array) -> Complexes:
-        """Of the loop that `to_go` closes, largest magnitude first."""
+        """Eigenvalues of the closed loop with this cost-to-go, largest magnitude first."""
         gain, _ = self.step(to_go)
         found = np.asarray(np.linalg.eigvals(self.a - self.b @ gain), np.complex128)
         return found[np.argsort(-np.abs(found), kind="stable")]

@@ -60,27 +60,26 @@ def planned(options: PaperOptions) -> dict[str, Piece]:
 
 
 def _tables(options: PaperOptions) -> dict[str, Piece]:
-    first, final = options.first_settings, PaperSettings()
-    undamped, damped, least = (
-        _seeds(_with_damping(first, damping), options.seed_count)
-        for damping in (UNDAMPED, BEST_DAMPING, LEAST_DAMPING)
-    )
-    reweighted = _seeds(final, options.seed_count)
-    few = min(options.seed_count, 3)
+    first, final, count = options.first_settings, PaperSettings(), options.seed_count
+    few = min(count, 3)
     no_constant = _with_damping(first, BEST_DAMPING).model_copy(update={"keep_constant": False})
     rebounding = _with_damping(first, UNDAMPED, rebound=REBOUND)
-    evidence: dict[str, Job | list[Job]] = {
-        "kept": damped, "dropped": _seeds(no_constant, few), "least": least,
-        "undamped": undamped, "rebounding": _seeds(rebounding, few), "final": reweighted,
-    }  # fmt: skip
-    both = {"undamped": undamped, "damped": damped}
-    weights = {"first": damped, "final": reweighted}
+    flights = {
+        "undamped": _seeds(_with_damping(first, UNDAMPED), count),
+        "damped": _seeds(_with_damping(first, BEST_DAMPING), count),
+        "final": _seeds(final, count),
+    }
+    evidence = flights | {
+        "least": _seeds(_with_damping(first, LEAST_DAMPING), count),
+        "no constant": _seeds(no_constant, few),
+        "rebounding": _seeds(rebounding, few),
+    }
     return {
         "table 2": Piece(_by_damping(options), tables.table_2),
-        "table 3": Piece(both, lambda flown: tables.table_3(**flown)),
-        "table 4": Piece(weights, lambda flown: tables.table_4(**flown)),
+        "table 3": Piece({each: flights[each] for each in ("undamped", "damped")}, tables.table_3),
+        "table 4": Piece({each: flights[each] for each in ("damped", "final")}, tables.table_4),
         "table bd": Piece({}, lambda _: errata.bd_table()),
-        "table errata": Piece(evidence, lambda flown: errata.errata_table(**flown)),
+        "table errata": Piece(evidence, errata.errata_table),
         "table horizon": Piece(_modes(options), lambda found: horizon.horizon_table(**found)),
         "table weights": Piece({0: Job(horizon.weights_table, (final,))}, lambda made: made[0]),
         "table integral": Piece(_flights(extensions.steady_tasks()), extensions.integral_table),
@@ -115,9 +114,9 @@ def _figures(options: PaperOptions) -> dict[str, Piece]:
         "figure limits": Piece(_flights(extensions.limit_tasks()), extensions.limits_figure),
         "figure peers": Piece(_peers(options), peers.peers_figure),
     }
-    for number, (name, draw) in figures.FLOWN.items():
+    for number, (name, *_) in figures.FLOWN.items():
         flown = _flights({plant: FlightTask(settings[name], plant) for plant in PlantKind})
-        pieces[f"figure {number}"] = Piece(flown, partial(draw, number, name))
+        pieces[f"figure {number}"] = Piece(flown, partial(figures.flown_figure, number))
     return pieces
 
 

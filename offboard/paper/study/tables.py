@@ -108,24 +108,24 @@ def _gain_notes(flown: Flown) -> list[str]:
     ]
 
 
-def table_3(undamped: Sequence[Flight], damped: Sequence[Flight]) -> Table:
-    """The errors of Eq. 32 with and without damping, beside the printed ones."""
+def table_3(flown: Mapping[str, Sequence[Flight]]) -> Table:
+    """The errors of Eq. 32 beside the printed ones, from flights "undamped" and "damped"."""
     return _errors_table(
         "Table 3: λ = 1 and λ = 0.65, first weights",
-        ("λ = 1", printed.ERRORS_UNDAMPED, undamped),
-        ("λ = 0.65", printed.ERRORS_DAMPED, damped),
+        ("λ = 1", printed.ERRORS_UNDAMPED, flown["undamped"]),
+        ("λ = 0.65", printed.ERRORS_DAMPED, flown["damped"]),
         printed.RATIO_DAMPED,
         "The paper concludes 5.8 % from one run per row. The sign of the difference changes from "
         "seed to seed: damping does not change the tracking.",
     )
 
 
-def table_4(first: Sequence[Flight], final: Sequence[Flight]) -> Table:
-    """The same with the first weights and with those of Eqs. 33-35."""
+def table_4(flown: Mapping[str, Sequence[Flight]]) -> Table:
+    """The same, from flights "damped" with the first weights and "final" with Eqs. 33-35."""
     return _errors_table(
         "Table 4: first weights and those of Eqs. 33-35, λ = 0.65",
-        ("R_0", printed.ERRORS_DAMPED, first),
-        ("R_opt", printed.ERRORS_REWEIGHTED, final),
+        ("R_0", printed.ERRORS_DAMPED, flown["damped"]),
+        ("R_opt", printed.ERRORS_REWEIGHTED, flown["final"]),
         printed.RATIO_REWEIGHTED,
         f"The printed ratio of e_w, {printed.RATIO_REWEIGHTED[2]:.4f}, is copied from Table 3; "
         "the entries of Table 4 give "
