@@ -27,6 +27,7 @@ machine code is kept in a directory that is named after all compiled sources.
 
 from __future__ import annotations
 
+import atexit
 import fcntl
 import functools
 import gc
@@ -39,8 +40,8 @@ import stat
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar, cast
@@ -52,10 +53,10 @@ R = TypeVar("R")
 F = TypeVar("F", bound=Callable[..., Any])
 
 Parameter = type[int] | type[float] | np.dtype[Any] | tuple[int, np.dtype[Any]]
-"""Of an entry: a number, an array of one record, or the dimensions and dtype of an array."""
+"""A number, the dtype of an array of one record, or the dimensions and dtype of an array."""
 
 ENTRIES_PER_PROCESS = 3  # starting a process costs as much as compiling one of them
-VERSIONS_KEPT = 5  # directories of machine code, most recently used
+UNUSED_S = 30 * 86400.0  # machine code that was not used for so long is deleted
 
 defined: list[Entry[Any, Any]] = []  # the entries of the modules imported so far
 _kernels: list[Callable[..., Any]] = []  # not yet registered with numba
@@ -103,8 +104,13 @@ class Entry(Generic[P, R]):
         compiles it, unless it may `wait` for that."""
         with (directory() / self.name).open("a") as mark:  # not empty once it is compiled
             fcntl.flock(mark, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
-            with _without_garbage_collection():
+            collects = gc.isenabled()
+            gc.disable()  # numba creates many objects: a third of the time of loading
+            try:
                 code = self.machine_code = self._compile()
+            finally:
+                if collects:
+                    gc.enable()
             if mark.tell() == 0:
                 mark.write("compiled\n")
         return code
@@ -134,18 +140,6 @@ def _numba_type(parameter: Parameter) -> Any:
     return types.Array(from_dtype(dtype), dimensions, "C")
 
 
-@contextmanager
-def _without_garbage_collection() -> Iterator[None]:
-    """numba creates so many objects that collection takes a third of the time of loading."""
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()
-
-
 def prepare(tell: Callable[[str], None] = lambda sentence: None) -> None:
     """Compile the entries of all imported modules, if they are not on disk, with one process per
     processor. `tell` is called with a sentence for the user before it takes long."""
@@ -155,10 +149,13 @@ def prepare(tell: Callable[[str], None] = lambda sentence: None) -> None:
     tell("first run on this machine: compiling, about 15 s")
     modules = sorted({each.__module__ for each in missing})
     command = (sys.executable, "-P", "-m", "offboard.compiled", *modules)
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
+    ours = {
+        "NUMBA_CACHE_DIR": str(directory().parents[1]),
+        "PYTHONPATH": os.pathsep.join(sys.path),
+    }
     silent = subprocess.DEVNULL
     others = [
-        subprocess.Popen(command, env=environment, stdin=silent, stdout=silent, stderr=silent)
+        subprocess.Popen(command, env=os.environ | ours, stdin=silent, stdout=silent, stderr=silent)
         for _ in range(1, min(os.cpu_count() or 1, len(missing) // ENTRIES_PER_PROCESS))
     ]
     _compile_free(missing)
@@ -183,27 +180,30 @@ def main(modules: Sequence[str]) -> None:
 
 @functools.cache
 def directory() -> Path:
-    """Where machine code of these sources is kept, below the first of NUMBA_CACHE_DIR,
-    XDG_CACHE_HOME, ~/.cache and the directory for temporary files that is absolute and in which
-    only this user can write. Raises OSError if there is none."""
-    candidates = [os.environ.get(name, "") for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")]
-    candidates += [os.path.expanduser("~/.cache"), f"{tempfile.gettempdir()}/cache-{os.getuid()}"]
-    for base in (Path(each) / "pso-offboard" for each in candidates if os.path.isabs(each)):
-        place = base / _digest()
-        if _is_private(base) and _is_private(place):
+    """Where machine code of these sources is kept: below the first of NUMBA_CACHE_DIR,
+    XDG_CACHE_HOME and ~/.cache that is absolute and in which only this user can write, otherwise
+    in a temporary directory of this process."""
+    given = [os.environ.get(name, "") for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")]
+    for cache in filter(os.path.isabs, (*given, os.path.expanduser("~/.cache"))):
+        versions = Path(cache) / "pso-offboard"
+        if _is_private(versions) and _is_private(versions / _digest()):
+            place = versions / _digest()
             os.utime(place)
-            versions = sorted(base.iterdir(), key=lambda each: each.stat().st_mtime)
-            for old in versions[:-VERSIONS_KEPT]:
-                shutil.rmtree(old, ignore_errors=True)
+            for each in versions.iterdir():  # every start touches the one that it uses
+                if each.stat().st_mtime < place.stat().st_mtime - UNUSED_S:
+                    shutil.rmtree(each, ignore_errors=True)
             return place
-    raise OSError(f"no private directory for machine code: tried {', '.join(candidates)}")
+    temporary = tempfile.mkdtemp()
+    atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+    place = Path(temporary) / "pso-offboard" / _digest()
+    place.mkdir(mode=0o700, parents=True)
+    return place
 
 
 def _is_private(place: Path) -> bool:
     """Make the directory; whether only this user can write in it: machine code is executed."""
     try:
-        for part in (*reversed(place.parents), place):
-            part.mkdir(mode=0o700, exist_ok=True)  # parents=True would take the umask's mode
+        place.mkdir(mode=0o700, parents=True, exist_ok=True)
         tempfile.TemporaryFile(dir=place).close()
         status = place.lstat()
     except OSError:
@@ -219,8 +219,8 @@ _CONSTANT = re.compile(rb"\b[A-Z][A-Z0-9_]*\b")
 
 @functools.cache
 def _digest() -> str:
-    """Of the versions of Python and numba, of the modules with entries or kernels, and of those
-    that they import constants from, because these are compiled in."""
+    """A hash of the versions of Python and numba, the modules with entries or kernels, and the
+    modules that they import constants from, because constants are compiled in."""
     root = Path(__file__).parents[1]
     sources = {
         path.relative_to(root).as_posix(): path.read_bytes()

@@ -20,10 +20,11 @@ def to_metres(origin: Origin, latitude_deg: float, longitude_deg: float) -> tupl
 
 
 def east_degrees_per_m(origin: Origin) -> float:
-    """Of longitude, near the origin."""
+    """Degrees of longitude per metre to the east, near the origin."""
     return DEGREES_PER_M / math.cos(math.radians(origin[0]))
 
 
 def down_m(height_m: float, frame: int, origin: Origin, home_down_m: float) -> float:
-    """NED, of a height in this MAV_FRAME: above home where it is relative, else above the sea."""
+    """The NED position, down, of a height in this MAV_FRAME: above home in relative frames, else
+    above mean sea level."""
     return (home_down_m if frame in RELATIVE_FRAMES else origin[2]) - height_m

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -98,3 +99,22 @@ def test_top_level_holds_only_what_the_layout_names() -> None:
         "CHANGELOG.md",
         "CONTRIBUTING.md",
     }
+
+
+# Words that hide what is meant; a domain thing has its standard term (CONTRIBUTING.md, "Words")
+UNWANTED = re.compile(
+    r"\b(Hangar|Berth|Crew|sortie|Duties|Emission|Belief|Learner|Happening|earthbound|manners)\b"
+    r'|^\s*"""Of ',
+    re.I | re.M,
+)
+
+
+def test_names_and_docstrings_are_plain() -> None:
+    files = [*SOURCES, *(ROOT / "tests").rglob("*.py")]
+    found = {
+        f"{path.relative_to(ROOT)}: {match[0].strip()}"
+        for path in files
+        if path != Path(__file__)
+        for match in UNWANTED.finditer(path.read_text(encoding="utf-8"))
+    }
+    assert found == set()

@@ -1,1 +1,1 @@
-"""After the flight: everything here reads logs and nothing here flies."""
+"""Reads logs: score, identification, comparison, and their pages."""

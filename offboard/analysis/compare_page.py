@@ -1,4 +1,4 @@
-"""The page of a comparison: errors and agitation of every law per scenario, and all figures."""
+"""The HTML page of a comparison: error and excess motion of every law per scenario, and a table."""
 
 from __future__ import annotations
 
@@ -7,174 +7,140 @@ import itertools
 import math
 from collections.abc import Sequence
 
-from offboard.analysis import page as shell
+import plotly.graph_objects as go
+from plotly.subplots import make_subplots
+
 from offboard.analysis.compare import EQUAL_SHARE, FIGURES, Row
 from offboard.analysis.compare_table import digits
-from offboard.analysis.figure import GREY, GRID, PALETTE, Figure, Trace, axis, numbers
+from offboard.analysis.figure import GRID, PALETTE, RED, STYLE, Figure, coordinates
+from offboard.analysis.page import render
 
-PANELS = {  # figure of the score: title, and the share of the width it is drawn in
-    "rmse_position_m": ("position error<br>RMSE [m]", (0.0, 0.47)),
-    "tilt_agitation_deg": ("tilt not asked for<br>RMS [deg]", (0.53, 0.74)),
-    "rate_agitation_radps": ("rates not asked for<br>RMS [rad/s]", (0.8, 1.0)),
+PANELS = {  # figure of the score: title of its panel
+    "rmse_position_m": "position error<br>RMSE [m]",
+    "tilt_agitation_deg": "excess tilt<br>RMS [deg]",
+    "rate_agitation_radps": "excess rates<br>RMS [rad/s]",
 }
-EQUALS = (
-    "the lowest median error of its scenario, and its equals, which are all whose median lies "
-    f"within the range of that one's flights, or within {EQUAL_SHARE:.0%} of its median."
+WIDTHS = (0.5, 0.25, 0.25)  # of the panels
+BEST = (
+    "lowest median position error of the scenario, or no worse than it: the median lies within the "
+    f"range of the best law's flights, or within {EQUAL_SHARE:.0%} of its median."
 )
 CAPTION = (
-    "Dot: median; line: range over the seeds. Not asked for: about what the reference asks of an "
-    f"ideal vehicle. Filled and bold: {EQUALS}"
+    "Dot: median; line: range over the seeds. Excess: motion that the reference does not require "
+    f"of an ideal vehicle. Filled and bold: {BEST}"
 )
-FAILED = "#ba2525"
-FEW_DECADES = 2
-_AIR = 0.05  # of a decade, beside the outermost ticks
-_ROW_PX, _FRAME_PX = 18, 120  # the toolbar and the axes above
+NARROWEST_PX = 640
+_FEW_DECADES = 2
+_MARGIN_DECADES = 0.05  # beside the outermost ticks
+_ROW_PX, _TOP_PX = 18, 120  # _TOP_PX: tool bar, titles and numbers of the axes
 
 
 def page(rows: Sequence[Row], missing: Sequence[str] = ()) -> str:
-    """One self-contained HTML document; `missing` says what was not flown."""
-    references = ", ".join(dict.fromkeys(row.reference for row in rows))
-    flights = sum(row.flights for row in rows)
-    body = [
-        "<h1>Controllers side by side</h1>",
-        f"<p>{html.escape(references)}: {flights} flights, each law with the same seeds.</p>",
-    ]
-    if missing:
-        items = "".join(f"<li>{html.escape(line)}</li>" for line in missing)
-        body.append(f'<div class="missing">Interrupted:<ul>{items}</ul></div>')
-    body.append(shell.drawing("comparison", _figure(rows)))
-    body.append(f"<article><h3>All figures: median [lowest–highest]</h3>{_table(rows)}</article>")
-    return shell.document("Controllers side by side", "".join(body))
+    """The page as text.
+
+    Args:
+        rows: the comparison, sorted by reference and scenario.
+        missing: a line for each group of flights that was not flown.
+    """
+    return render(
+        "analysis/templates/comparison.html",
+        title="Controllers side by side",
+        references=list(dict.fromkeys(row.reference for row in rows)),
+        flights=sum(row.flights for row in rows),
+        not_flown=missing,
+        figure=_figure(rows),
+        figures=FIGURES,
+        rows=rows,
+        shown=_value,
+        best=BEST,
+    )
 
 
 def _figure(rows: Sequence[Row]) -> Figure:
-    """Panels side by side with one line for every law, under the name of its scenario."""
+    """Panels side by side; one line per law, grouped under a heading per scenario."""
     lines = _lines(rows)
-    placed = [(row, place) for place, row in enumerate(lines) if isinstance(row, Row)]
-    controllers = list(dict.fromkeys(row.controller for row in rows))
-    traces = [
-        _trace([pair for pair in placed if pair[0].controller == law], name, colour, panel)
-        for law, colour in zip(controllers, itertools.cycle(PALETTE), strict=False)
-        for panel, name in enumerate(PANELS, 1)
-    ]
-    layout = {
-        "height": _FRAME_PX + _ROW_PX * len(lines),
-        "margin": {"l": 120, "r": 20, "t": 110, "b": 10},
-        "showlegend": False,
-        "yaxis": {
-            "tickvals": list(range(len(lines))),
-            "ticktext": [_label(line) for line in lines],
-            "range": [len(lines) - 0.3, -0.7],
-            "showgrid": False,
-            "zeroline": False,
-            "fixedrange": True,
-        },
-        "shapes": [_border(at) for at, line in enumerate(lines) if at and isinstance(line, str)],
-        "annotations": [_failure(row, at) for row, at in placed if row.failed],
-    }
-    for panel, (name, (title, domain)) in enumerate(PANELS.items(), 1):
-        layout["xaxis" if panel == 1 else f"xaxis{panel}"] = {
-            **_logarithmic(rows, name), "title": {"text": title}, "domain": domain,
-        }  # fmt: skip
-    return Figure("Error, and the agitation that it took", traces, layout, CAPTION)
+    figure = make_subplots(
+        cols=len(PANELS), shared_yaxes=True, column_widths=WIDTHS, horizontal_spacing=0.06
+    )
+    placed = [(row, place) for place, row in enumerate(lines) if isinstance(row, Row) and row.flown]
+    laws = list(dict.fromkeys(row.controller for row in rows))
+    for law, colour in zip(laws, itertools.cycle(PALETTE), strict=False):
+        own = [(row, place) for row, place in placed if row.controller == law]
+        for column, name in enumerate(PANELS, 1):
+            figure.add_trace(_dots(own, name, colour), row=1, col=column)
+    for column, (name, title) in enumerate(PANELS.items(), 1):
+        figure.update_xaxes(_logarithmic(rows, name), title_text=title, col=column)
+    figure.update_yaxes(
+        tickvals=list(range(len(lines))), ticktext=[_label(line) for line in lines],
+        range=[len(lines) - 0.3, -0.7], showgrid=False, zeroline=False, fixedrange=True,
+        showline=False, ticks="", ticklabelstandoff=8,
+    )  # fmt: skip
+    for at, line in enumerate(lines):
+        if at and isinstance(line, str):
+            figure.add_hline(at - 0.5, line={"color": GRID, "width": 1}, col="all", row=1)
+    figure.update_layout(
+        template=STYLE, height=_TOP_PX + _ROW_PX * len(lines) + 10, showlegend=False,
+        margin={"t": _TOP_PX, "b": 10},
+    )  # fmt: skip
+    return Figure("Position error and excess motion", figure, CAPTION, NARROWEST_PX)
 
 
 def _lines(rows: Sequence[Row]) -> list[Row | str]:
-    """The rows, above each block the name of its scenario, and of the reference if it varies."""
+    """The rows, with a heading (scenario, and reference if there are several) above each block."""
     several = len({row.reference for row in rows}) > 1
     lines: list[Row | str] = []
-    for (reference, scenario), block in itertools.groupby(rows, _cell):
+    for (reference, scenario), block in itertools.groupby(
+        rows, lambda row: (row.reference, row.scenario)
+    ):
         lines += [f"{scenario}, {reference}" if several else scenario, *block]
     return lines
-
-
-def _cell(row: Row) -> tuple[str, str]:
-    return row.reference, row.scenario
 
 
 def _label(line: Row | str) -> str:
     if isinstance(line, str):
         return f"<b>{html.escape(line)}</b>"
     name = html.escape(line.controller)
+    if line.failed:
+        failed = f"{line.failed} of {line.flights} failed"
+        name += f'  <span style="color: {RED}">{failed}</span>'
     return f"<b>{name}</b>" if line.best else name
 
 
 def _logarithmic(rows: Sequence[Row], name: str) -> dict[str, object]:
-    """An axis above its panel from tick to tick, at 1 or at 1, 2 and 5 of every decade."""
+    """A logarithmic axis above its panel, from tick to tick: 1, or 1, 2 and 5 of every decade."""
     ends = [end for row in rows for end in (row.lowest[name], row.highest[name]) if end > 0.0]
-    low = math.floor(math.log10(min(ends, default=1.0)))
-    high = math.ceil(math.log10(max(ends, default=1.0)))
-    steps = (1, 2, 5) if high - low <= FEW_DECADES else (1,)
+    least, greatest = min(ends, default=1.0), max(ends, default=1.0)
+    low, high = math.floor(math.log10(least)), math.ceil(math.log10(greatest))
+    steps = (1, 2, 5) if high - low <= _FEW_DECADES else (1,)
     ticks = [float(f"{step}e{power}") for power in range(low, high + 1) for step in steps]
-    first = max((at for at in ticks if at <= min(ends, default=1.0)), default=ticks[0])
-    last = min((at for at in ticks if at >= max(ends, default=1.0)), default=ticks[-1])
+    first = max((at for at in ticks if at <= least), default=ticks[0])
+    last = min((at for at in ticks if at >= greatest), default=ticks[-1])
     return {
-        "type": "log", "side": "top",
-        "range": [math.log10(first) - _AIR, math.log10(last) + _AIR],
-        "tickvals": ticks, "ticktext": [f"{at:g}" for at in ticks],
-        "gridcolor": GRID, "linecolor": GREY, "showline": True, "minor": {"showgrid": False},
+        "type": "log", "side": "top", "tickvals": ticks, "ticktext": [f"{at:g}" for at in ticks],
+        "range": [math.log10(first) - _MARGIN_DECADES, math.log10(last) + _MARGIN_DECADES],
     }  # fmt: skip
 
 
-def _trace(own: Sequence[tuple[Row, int]], name: str, colour: str, panel: int) -> Trace:
-    shown = [(row, place) for row, place in own if row.flown]
-    return {
-        "type": "scatter", "mode": "markers", "xaxis": axis("x", panel), "yaxis": "y",
-        "x": numbers([row.median[name] for row, _ in shown]),
-        "y": [place for _, place in shown],
-        "text": [_hover(row, name) for row, _ in shown], "hoverinfo": "text",
-        "marker": {
+def _dots(own: Sequence[tuple[Row, int]], name: str, colour: str) -> go.Scatter:
+    """Median and range of one law in one panel."""
+    rows = [row for row, _ in own]
+    return go.Scatter(
+        mode="markers", x=coordinates([row.median[name] for row in rows]),
+        y=[place for _, place in own], hoverinfo="text",
+        text=[
+            html.escape(f"{row.controller}, {row.scenario}, {row.reference}: {_value(row, name)}")
+            for row in rows
+        ],
+        marker={
             "color": colour, "size": 9, "line": {"color": colour, "width": 2},
-            "symbol": ["circle" if row.best else "circle-open" for row, _ in shown],
+            "symbol": ["circle" if row.best else "circle-open" for row in rows],
         },
-        "error_x": {
+        error_x={
             "type": "data", "symmetric": False, "thickness": 1.5, "width": 3, "color": colour,
-            "array": numbers([row.highest[name] - row.median[name] for row, _ in shown]),
-            "arrayminus": numbers([row.median[name] - row.lowest[name] for row, _ in shown]),
+            "array": coordinates([row.highest[name] - row.median[name] for row in rows]),
+            "arrayminus": coordinates([row.median[name] - row.lowest[name] for row in rows]),
         },
-    }  # fmt: skip
-
-
-def _hover(row: Row, name: str) -> str:
-    return html.escape(f"{row.controller}, {row.scenario}, {row.reference}: {_value(row, name)}")
-
-
-def _border(heading: int) -> dict[str, object]:
-    place = heading - 0.5
-    return {
-        "type": "line", "xref": "paper", "x0": 0, "x1": 1, "y0": place, "y1": place,
-        "line": {"color": GRID, "width": 1},
-    }  # fmt: skip
-
-
-def _failure(row: Row, place: int) -> dict[str, object]:
-    return {
-        "xref": "paper", "x": 0, "xanchor": "left", "y": place, "showarrow": False,
-        "text": f"{row.failed} of {row.flights} failed",
-        "font": {"color": FAILED, "size": 11},
-    }  # fmt: skip
-
-
-def _table(rows: Sequence[Row]) -> str:
-    head = "".join(f'<th class="text">{name}</th>' for name in ("reference", "scenario", "law"))
-    head += "<th>flights</th>" + "".join(f"<th>{name}</th>" for name in FIGURES)
-    note = shell.notes([f"Bold, with a star: {EQUALS}"])
-    return shell.table(head, [_line(row) for row in rows]) + note
-
-
-def _line(row: Row) -> str:
-    law = row.controller + (" *" if row.best else "")
-    names = "".join(
-        f'<td class="text">{html.escape(name)}</td>' for name in (row.reference, row.scenario, law)
-    )
-    names += f"<td>{row.flown} of {row.flights}</td>"
-    cells = "".join(f"<td>{_value(row, name)}</td>" for name in FIGURES)
-    if not row.flown:
-        cells = f'<td class="text long" colspan="{len(FIGURES)}">{html.escape(row.why)}</td>'
-    elif row.failed:
-        cells += f'<td class="text long">{html.escape(row.why)}</td>'
-    kind = "failed" if not row.flown else "best" if row.best else ""
-    return f'<tr class="{kind}">{names}{cells}</tr>'
+    )  # fmt: skip
 
 
 def _value(row: Row, name: str) -> str:

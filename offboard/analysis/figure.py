@@ -1,128 +1,106 @@
-"""A figure of the page: plotly's traces and layout as plain data, and how ours look.
+"""Plotly figures of the HTML pages: one style, one set of colours for light and dark.
 
-Knows the drawing only, not what is drawn. Numbers are rounded to what a screen can show.
+Contains what the figures of several pages share, not what any of them shows.
 """
 
 from __future__ import annotations
 
 import json
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike
+import plotly.graph_objects as go
+from numpy.typing import ArrayLike, NDArray
+from plotly.subplots import make_subplots
 
-Trace = dict[str, Any]
-
-INK, GRID, PAPER = "#1f2933", "#e4e7eb", "#ffffff"
+INK, MUTED, GRID, SURFACE, BACKGROUND = "#1f2933", "#52606d", "#e4e7eb", "#ffffff", "#f5f7fa"
 BLUE, RED, GREEN, ORANGE, PURPLE, GREY = (
-    "#2b6cb0", "#c53030", "#2f855a", "#c05621", "#6b46c1", "#829ab1",
+    "#2b6cb0", "#c53030", "#2f855a", "#c05621", "#6b46c1", "#617488",
 )  # fmt: skip
-PALETTE = (
-    BLUE, RED, GREEN, ORANGE, PURPLE, "#0f766e", "#b83280", "#744210", "#4a5568", "#d69e2e",
-    "#3182ce",
+TEAL, PINK, BROWN, SLATE, YELLOW = "#0f766e", "#b83280", "#744210", "#4a5568", "#b7791f"
+PALETTE = (BLUE, RED, GREEN, ORANGE, PURPLE, TEAL, PINK, BROWN, SLATE, YELLOW)
+# Figures are written in light colours; the page replaces each in the dark scheme
+DARK = {
+    INK: "#e6e9ed", MUTED: "#a5b1bd", GRID: "#343c46", SURFACE: "#1b2027", BACKGROUND: "#12161b",
+    BLUE: "#6aaaf0", RED: "#f47c7c", GREEN: "#5cc48d", ORANGE: "#f2954f", PURPLE: "#b197fc",
+    GREY: "#8d9bab", TEAL: "#4fd1c5", PINK: "#f18dc0", BROWN: "#c89b5d", SLATE: "#b8c2d0",
+    YELLOW: "#e8c15c",
+}  # fmt: skip
+
+_TOP_PX, _BOTTOM_PX, _PANEL_PX, _GAP_PX = 48, 90, 150, 36
+_AXIS = {
+    "gridcolor": GRID, "zerolinecolor": GRID, "linecolor": GREY, "showline": True,
+    "ticks": "outside", "tickcolor": GREY, "automargin": True, "exponentformat": "power",
+    "title": {"font": {"size": 13}},
+}  # fmt: skip
+_SCENE_AXIS = {"backgroundcolor": SURFACE, "gridcolor": GRID, "linecolor": GREY}
+STYLE = go.layout.Template(
+    layout={
+        "font": {"family": "system-ui, sans-serif", "size": 13, "color": INK},
+        "paper_bgcolor": SURFACE, "plot_bgcolor": SURFACE, "hovermode": "closest",
+        "margin": {"l": 50, "r": 15, "t": _TOP_PX, "b": _BOTTOM_PX}, "xaxis": _AXIS, "yaxis": _AXIS,
+        "scene": {"xaxis": _SCENE_AXIS, "yaxis": _SCENE_AXIS, "zaxis": _SCENE_AXIS},
+        "legend": {
+            "orientation": "h", "x": 0, "y": 0, "yref": "container", "yanchor": "bottom",
+            "groupclick": "togglegroup",
+        },
+    }
 )  # fmt: skip
-_DIGITS = 6
-_PANEL_PX, _TOP_PX, _GAP = 190, 60, 0.09
 
 
 @dataclass(frozen=True, slots=True)
 class Figure:
-    """`caption` says what it shows and what to compare it with."""
+    """A figure with its heading and the caption below it.
+
+    A window narrower than `width_px` scrolls the figure instead of squeezing it.
+    """
 
     title: str
-    traces: Sequence[Trace]
-    layout: Mapping[str, Any]
+    drawing: go.Figure
     caption: str = ""
+    width_px: int = 0
 
-    def to_json(self) -> str:
-        document = {
-            "title": self.title,
-            "caption": self.caption,
-            "data": list(self.traces),
-            "layout": {**_BASE, **self.layout},
-        }
+    def to_json(self, *, styled: bool = True) -> str:
+        """Title, caption, and the figure as plotly's own JSON (`plotly.io.read_json` reads it).
+
+        Without its style for a page, which contains `STYLE` once.
+        """
+        drawing = json.loads(self.drawing.to_json())
+        if not styled:
+            del drawing["layout"]["template"]
+        document = {"title": self.title, "caption": self.caption, **drawing}
         return json.dumps(document, separators=(",", ":"), allow_nan=False)
 
 
-def line(
-    x: ArrayLike, y: ArrayLike, name: str, colour: str, *, panel: int = 1, **rest: Any
-) -> Trace:
-    """A curve in panel 1, 2, ... of `panels`."""
-    dash = rest.pop("dash", "solid")
-    return {
-        "type": "scatter", "mode": "lines", "name": name, "legendgroup": name,
-        "x": numbers(x), "y": numbers(y), "xaxis": axis("x", panel), "yaxis": axis("y", panel),
-        "line": {"color": colour, "width": 1.4, "dash": dash}, **rest,
-    }  # fmt: skip
+def panels(titles: Sequence[str], x_title: str, panel_px: int = _PANEL_PX) -> go.Figure:
+    """An empty figure with one panel per title, one above the other, that share their x axis."""
+    inner_px = panel_px * len(titles) + _GAP_PX * (len(titles) - 1)
+    figure = make_subplots(
+        rows=len(titles), shared_xaxes=True, subplot_titles=titles,
+        vertical_spacing=_GAP_PX / inner_px,
+    )  # fmt: skip
+    figure.update_layout(template=STYLE, height=_TOP_PX + inner_px + _BOTTOM_PX)
+    figure.update_annotations(x=0, xanchor="left", font_size=13)
+    figure.update_xaxes(title_text=x_title, row=len(titles))
+    return figure
 
 
-def legend_beside() -> dict[str, Any]:
-    """For many entries: a column at the right, clear of the toolbar."""
-    return {"orientation": "v", "x": 1.01, "y": 1.0, "yanchor": "top"}
+def curve(
+    figure: go.Figure, panel: int, x: ArrayLike, y: ArrayLike, name: str, colour: str,
+    dash: str = "solid", **scatter: Any,
+) -> None:  # fmt: skip
+    """Add a curve to panel 1, 2, ...; curves of the same name share one entry of the legend."""
+    line = {"color": colour, "width": 1.4, "dash": dash, **scatter.pop("line", {})}
+    trace = go.Scatter(
+        x=coordinates(x), y=coordinates(y), name=name, legendgroup=name, line=line,
+        showlegend=name not in {other.name for other in figure.data},
+        **{"mode": "lines", **scatter},
+    )  # fmt: skip
+    figure.add_trace(trace, row=panel, col=1)
 
 
-def axis(letter: str, panel: int) -> str:
-    """Plotly's name of the axis of a panel, counted from 1: x, x2, x3 ..."""
-    return letter if panel == 1 else f"{letter}{panel}"
-
-
-def panels(titles: Sequence[str], x_title: str, **y_extra: Any) -> dict[str, Any]:
-    """Layout of panels one above the other that share their x axis."""
-    count = len(titles)
-    gap = _GAP / max(count - 1, 1) if count > 3 else _GAP / 2
-    height = (1.0 - gap * (count - 1)) / count
-    layout: dict[str, Any] = {"height": _TOP_PX + _PANEL_PX * count + 50}
-    for i, title in enumerate(titles):
-        top = 1.0 - i * (height + gap)
-        number = "" if i == 0 else str(i + 1)
-        last = i == count - 1
-        layout[f"yaxis{number}"] = {
-            **_AXIS, "title": {"text": title}, "domain": [max(top - height, 0.0), top],
-            "anchor": axis("x", i + 1), **y_extra,
-        }  # fmt: skip
-        layout[f"xaxis{number}"] = {
-            **_AXIS, "anchor": axis("y", i + 1), "showticklabels": last,
-            **({} if i == 0 else {"matches": "x"}),
-            **({"title": {"text": x_title}} if last else {}),
-        }  # fmt: skip
-    return layout
-
-
-def numbers(values: ArrayLike) -> list[float | None]:
-    """Rounded to six significant digits, None for what is not finite."""
-    array = np.asarray(values, np.float64)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        magnitude = np.where(array == 0, 1.0, np.abs(array))
-    return [
-        round(v, _DIGITS - 1 - math.floor(math.log10(m))) if math.isfinite(v) else None
-        for v, m in zip(array.tolist(), magnitude.tolist(), strict=True)
-    ]
-
-
-_AXIS: dict[str, Any] = {
-    "gridcolor": GRID, "zerolinecolor": GRID, "linecolor": GREY, "showline": True,
-    "ticks": "outside", "tickcolor": GREY, "automargin": True,
-    "exponentformat": "power",
-}  # fmt: skip
-_BASE: dict[str, Any] = {
-    "font": {"family": "system-ui, sans-serif", "size": 13, "color": INK},
-    "paper_bgcolor": PAPER, "plot_bgcolor": PAPER,
-    "margin": {"l": 70, "r": 20, "t": 40, "b": 50},
-    "legend": {
-        "orientation": "h", "x": 0, "y": 1.0, "yanchor": "bottom", "groupclick": "togglegroup",
-    },
-    "hovermode": "closest", "autosize": True,
-}  # fmt: skip
-
-
-def single(x_title: str, y_title: str, **extra: Any) -> dict[str, Any]:
-    """Layout of one panel; `x` and `y` in extra are merged into the axes."""
-    return {
-        "height": extra.pop("height", 430),
-        "xaxis": {**_AXIS, "title": {"text": x_title}, **extra.pop("x", {})},
-        "yaxis": {**_AXIS, "title": {"text": y_title}, **extra.pop("y", {})},
-        **extra,
-    }
+def coordinates(values: ArrayLike) -> NDArray[np.float32]:
+    """Seven significant digits: more than a screen shows. Plotly writes arrays in base64."""
+    return np.asarray(values, np.float32)

@@ -1,6 +1,6 @@
-"""A flight's log to its vehicle's constants: the trace of the log, and the vehicle file it makes.
+"""Identifies the vehicle of a log, and writes the vehicle file.
 
-What counts is the flight from lift-off to landing, whoever commanded it over SET_ATTITUDE_TARGET.
+Uses the flight from lift-off to landing, commanded by SET_ATTITUDE_TARGET, also of another program.
 """
 
 from __future__ import annotations
@@ -33,14 +33,17 @@ LINE_WIDTH = 80
 
 
 def identify_flight(log: Tlog, history: History, vehicle: Vehicle) -> tuple[Identified, Trace]:
-    """Everything that the log says of its vehicle, and the stretch it was taken from; `vehicle`
-    is where the search begins."""
+    """Identify the vehicle of a log.
+
+    The search starts at the constants of `vehicle`. Returns the identified constants and the part
+    of the flight that they were identified from.
+    """
     trace = trace_of(log, history)
     return identify(trace, vehicle), trace
 
 
 def trace_of(log: Tlog, history: History) -> Trace:
-    """The flown part of a log. A log without our phases is taken whole."""
+    """The part of a log in the air; the whole log if it has no phases of `offboard`."""
     setpoint, attitude = history.setpoint, history.attitude
     commanded = thrust_direction_from_quaternion(setpoint[:, 2:6])
     direction = thrust_direction_from_quaternion(attitude[:, 1:5])
@@ -78,7 +81,7 @@ def _thrust_rule(log: Tlog) -> ThrustRule:
 
 
 def rows(found: Identified) -> Iterator[tuple[str, Estimate | None, str, str]]:
-    """(what, estimate, unit, why not) of everything that can be identified, in reading order."""
+    """(name, estimate, unit, reason without one) of every constant that can be identified."""
     for name, fit in (("tilt", found.tilt), ("yaw", found.yaw)):
         why = found.refusals.get(name, "")
         yield f"{name} delay", fit.delay_s if fit else None, "s", why

@@ -13,7 +13,8 @@ def list_files() -> None:
     for number, (kind, folder) in enumerate(shipped.FOLDERS.items()):
         described = shipped.descriptions(folder)
         if kind == "controller":
-            described = dict.fromkeys(catalogue.names(), "of an installed package") | described
+            for law in catalogue.names():
+                described.setdefault(law, "law of an installed package")
         width = max(map(len, described))
         out.print("\n" * (number > 0) + f"{kind}s", style="bold")
         for name, text in described.items():

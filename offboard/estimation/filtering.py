@@ -1,12 +1,11 @@
-"""The small Kalman filters of observer and fusion, compiled: covariances, and what a measurement
-corrects.
+"""Small Kalman filters of observer and fusion, compiled: covariances and corrections.
 
-Covariances are propagated for the actual interval between messages, so no sampling rate is
-assumed. Axes with the same model share one filter (both lateral axes do): `places` tells for each
-of its axes where the filter's states stand in the state vector that it corrects. Their order is
+Covariances are propagated over the actual interval between messages, so no sampling rate is
+assumed. Axes with the same model share one filter, as both lateral axes do: `places` has, for each
+axis, the indices of the filter's states in the state vector that it corrects. The states are
 position, velocity, ..., bias of the reported velocity, or b and b', or psi and psi'. Records and
-states are changed in place. Nothing here knows messages, settings or the motion itself. Loops over
-single numbers throughout: array expressions of so few compile for seconds.
+states are changed in place. Loops over single numbers, because array expressions compile for
+seconds.
 """
 
 from __future__ import annotations
@@ -23,18 +22,18 @@ Array = NDArray[np.float64]
 
 GATE_SDS = 3.0
 SIZE_MAX, AXES_MAX = 6, 2
-NOTHING = -1  # no second state is part of what is measured
+NOTHING = -1  # the measurement is of one state, not of the sum of two
 
 FILTER = np.dtype(
     [
-        ("order", "i8"),  # n; what follows is used up to there
-        ("axes", "i8"),  # m
+        ("order", "i8"),  # n, the number of states in use
+        ("axes", "i8"),  # m, the number of axes in use
         ("places", "i8", (AXES_MAX, SIZE_MAX)),
         ("covariance", "f8", (SIZE_MAX, SIZE_MAX)),
         ("dynamics", "f8", (SIZE_MAX, SIZE_MAX)),
         ("densities", "f8", SIZE_MAX),  # per root second
-        ("longest_s", "f8"),  # of a step
-        # scratch; the gain is that of the last measurement
+        ("longest_s", "f8"),  # longest step of propagation
+        # scratch; `gain` is that of the last measurement
         ("gain", "f8", SIZE_MAX),
         ("projected", "f8", SIZE_MAX),
         ("innovation", "f8", AXES_MAX),
@@ -46,7 +45,7 @@ FILTER = np.dtype(
 
 
 def set_up(one: Any, dynamics: Array, densities: Array) -> None:
-    """Give a FILTER its model, (n, n) and (n,)."""
+    """Set the model of a FILTER: `dynamics` (n, n), `densities` (n,) per root second."""
     order = len(densities)
     one["order"] = order
     one["dynamics"][:order, :order] = dynamics
@@ -54,14 +53,14 @@ def set_up(one: Any, dynamics: Array, densities: Array) -> None:
 
 
 def start(one: Any, variances: ArrayLike) -> None:
-    """Uncorrelated errors of these variances (n,)."""
+    """Start a FILTER with uncorrelated errors of `variances` (n,)."""
     covariance = np.diag(variances)
     one["covariance"][: len(covariance), : len(covariance)] = covariance
 
 
 @kernel
 def _multiply(left: Array, right: Array, size: int, out: Array) -> None:
-    """left @ right, as far as `size`: small matrices, and a tenth of the time to compile."""
+    """out = left @ right for matrices of `size`; compiles in a tenth of the time of `@`."""
     for i in range(size):
         for j in range(size):
             total = 0.0
@@ -72,10 +71,10 @@ def _multiply(left: Array, right: Array, size: int, out: Array) -> None:
 
 @entry(array(1, FILTER), float)
 def spread(filters: Any, interval_s: float) -> None:
-    """The covariances of `filters`, any number of FILTER, `interval_s` later, in steps of at most
-    `longest_s`.
+    """Propagate the covariances of `filters` (FILTER, any number) by `interval_s`, in steps of at
+    most `longest_s`.
 
-    One function, because each further one is a fifth of a second of compilation.
+    One function, because each further one takes a fifth of a second to compile.
     """
     for n in range(filters.shape[0]):
         one = filters[n]
@@ -97,7 +96,7 @@ def spread(filters: Any, interval_s: float) -> None:
                 half[i, j] += transition[i, j] / 2.0 + noise[i, j] / 6.0 + moved[i, j] / 24.0
             half[i, i] += 1.0
         _multiply(half, half, order, transition)
-        # What the densities add, by Simpson's rule: exact for a chain of two integrators
+        # Process noise by Simpson's rule, exact for a chain of two integrators
         for i in range(order):
             for j in range(order):
                 total = densities[i] ** 2 if i == j else 0.0
@@ -117,9 +116,9 @@ def spread(filters: Any, interval_s: float) -> None:
 
 @kernel
 def _expect(one: Any, place: int, other: int, variance: float) -> float:
-    """Fill `projected` with the covariance of each state with what is measured, the states `place`
-    and `other` (or NOTHING) together. Returns the variance of what is measured, with `variance` of
-    the measurement's own."""
+    """Fill `projected` with the covariance of each state with the measured sum of the states
+    `place` and `other` (or NOTHING). Returns the variance of the innovation, of which `variance` is
+    the measurement noise."""
     projected = one.projected
     for i in range(one.order):
         projected[i] = one.covariance[i, place]
@@ -131,8 +130,8 @@ def _expect(one: Any, place: int, other: int, variance: float) -> float:
 
 @kernel
 def absorb(one: Any, place: int, other: int, variance: float) -> None:
-    """A scalar measurement, of the given variance, of the states `place` and `other` (or NOTHING)
-    together: changes the covariance and leaves the gain."""
+    """Correct the covariance by a measurement of the sum of the states `place` and `other` (or
+    NOTHING), with noise of `variance`; the gain is left in `gain`."""
     covariance, gain, projected = one.covariance, one.gain, one.projected
     total = _expect(one, place, other, variance)
     for i in range(one.order):
@@ -146,7 +145,8 @@ def absorb(one: Any, place: int, other: int, variance: float) -> None:
 
 @kernel
 def correct(state: Array, one: Any, place: int, other: int, sd: float) -> None:
-    """The measurement of `absorb` for each axis, its innovations in the record."""
+    """Correct covariance and state by a measurement as in `absorb`, whose `innovation` per axis is
+    in the record."""
     absorb(one, place, other, sd * sd)
     for k in range(one.axes):
         for i in range(one.order):
@@ -157,10 +157,11 @@ def correct(state: Array, one: Any, place: int, other: int, sd: float) -> None:
 def correct_within(
     state: Array, one: Any, place: int, other: int, measured: Array, sd: float, gate: float
 ) -> bool:
-    """The same with `measured`, which has it where `state` has the state `place`. Changes nothing
-    where that is further off than `gate` beyond the expected spread: it is a jump of the estimate.
+    """Correct as in `correct` by `measured`, which has the same indices as `state`. A measurement
+    further off than GATE_SDS standard deviations and `gate` is a jump of the vehicle's estimate and
+    changes nothing.
 
-    Returns whether it was within.
+    Returns whether the measurement was used.
     """
     largest = 0.0
     for k in range(one.axes):
@@ -178,7 +179,7 @@ def correct_within(
 
 @kernel
 def anchor_position(state: Array, one: Any, measured: Array, sd: float) -> None:
-    """The position jumped: it is taken as measured, and nothing else moves."""
+    """After a jump of the position: take it as measured and leave the other states."""
     for k in range(one.axes):
         state[one.places[k, 0]] = measured[one.places[k, 0]]
     for i in range(one.order):
@@ -188,7 +189,7 @@ def anchor_position(state: Array, one: Any, measured: Array, sd: float) -> None:
 
 @kernel
 def anchor_bias(state: Array, one: Any, sd: float) -> None:
-    """The reported velocity jumped, by its innovations in the record: that goes into the bias."""
+    """After a jump of the reported velocity: add its `innovation` to the bias."""
     bias = one.order - 1
     covariance = one.covariance
     for k in range(one.axes):

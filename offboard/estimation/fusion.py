@@ -1,9 +1,9 @@
-"""Own position fusion (`estimate: fused`): satellite fixes and the model in place of the vehicle's
-own position, which on PX4 is wrong by half a metre for seconds.
+"""Own position fusion (`estimate: fused`): position from GPS fixes and the vehicle's motion instead
+of the one that the vehicle reports, which on PX4 is wrong by half a metre for seconds.
 
-Which of the two is followed, and how one passes into the other without a jump, lives here. On the
-ground, and whenever fixes end, jump or contradict the vehicle, it is the vehicle's estimate, and
-what that is off the fixes is learnt meanwhile. Never anything that is not finite. Knows no MAVLink.
+This module chooses between the two and changes over smoothly. The vehicle's estimate is used on the
+ground and whenever fixes end, jump or contradict it; meanwhile its offset from the fixes is
+estimated. The result is always finite.
 """
 
 from __future__ import annotations
@@ -23,24 +23,23 @@ from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
-SILENT_S = 1.0  # without a usable fix, or attitude: then the vehicle's estimate counts again
-AHEAD_S = 0.5  # of telemetry: no fix is, and those after it would all be old
-LEARNT_FIXES = 16  # two seconds of them, before fusion begins
-SMOOTH_S = 0.25  # in which what a fix corrects is passed on
-# The vehicle's estimate wanders off the truth by so much per root second
-WANDER_MPS = 0.1
-UNKNOWN_M2 = 25.0
+SILENT_S = 1.0  # after this time without a usable fix or attitude the vehicle's estimate is used
+AHEAD_S = 0.5  # a stamp further ahead of telemetry is of another clock
+LEAST_FIXES = 16  # before fusion begins: two seconds
+SMOOTH_S = 0.25  # time constant over which the correction by a fix is applied
+WANDER_MPS = 0.1  # drift of the vehicle's estimate, m per root second
+UNKNOWN_M2 = 25.0  # variance of the offset before the first fix
 
 
 class FollowedEstimate(StrEnum):
-    """Whose position counts."""
+    """Which position estimate the controller follows."""
 
     VEHICLE = "vehicle"
     FUSED = "fused"
 
 
-class Glide:
-    """A difference (n,) that is passed on over a time constant instead of at once."""
+class DecayingOffset:
+    """An offset (n,) that decays with a time constant, so that a change is applied smoothly."""
 
     def __init__(self, size: int, time_constant_s: float) -> None:
         self.time_constant_s = time_constant_s
@@ -54,14 +53,14 @@ class Glide:
         self.set(self.at(time_s) + more, time_s)
 
     def at(self, time_s: float) -> Array:
-        """What is still to be passed on."""
+        """The offset that is left at `time_s`."""
         past_s = max(time_s - self._from_s, 0.0)
         left: Array = self._left * math.exp(-past_s / self.time_constant_s)
         return left
 
 
 class Offset:
-    """What fixes say that the vehicle's own position is off by, NED, while it is followed."""
+    """Offset (NED) of the fixes from the vehicle's estimate, while that is followed."""
 
     def __init__(self, settings: FusionSettings) -> None:
         sds = settings.position_sd_m, settings.position_sd_m, settings.height_sd_m
@@ -75,7 +74,8 @@ class Offset:
         self._at_s = math.nan
 
     def learn(self, time_s: float, off_m: Array) -> None:
-        """From one fix; from anew where it is further from those before than chance explains."""
+        """Update by the offset of one fix; restart if it is further than GATE_SDS standard
+        deviations from the estimated offset."""
         if self.fixes:
             self.variance_m2 += WANDER_MPS**2 * max(time_s - self._at_s, 0.0)
             spread = np.sqrt(self.variance_m2 + self._noise_m2)
@@ -89,7 +89,8 @@ class Offset:
 
 
 class Fusion:
-    """One flight's. `news` gathers sentences for the user until somebody takes them."""
+    """Own position fusion of one flight. `news` collects sentences for the user; the reader empties
+    it."""
 
     def __init__(self, vehicle: Vehicle, settings: FusionSettings) -> None:
         self._settings = settings
@@ -99,16 +100,16 @@ class Fusion:
         self.reset()
 
     def reset(self) -> None:
-        """The vehicle restarted: nothing of before holds."""
+        """Forget everything, after a restart of the vehicle."""
         self.fused = False
         self._grounded = True
         self._origin: Geodetic | None = None
-        self._said = self._doubtful = False
+        self._said = self._announced = False
         self._stamp_s = self._fixed_s = -math.inf
         self._reported = Past()
         self._reported_s = -math.inf
-        self._handover = Glide(3, self._settings.handover_s)
-        self._smooth = Glide(6, SMOOTH_S)
+        self._handover = DecayingOffset(3, self._settings.handover_s)
+        self._smooth = DecayingOffset(6, SMOOTH_S)
         self._followed: tuple[Array, Array] | None = None
         self._offset.forget()
 
@@ -116,10 +117,10 @@ class Fusion:
         self._filter.adopt(vehicle)
 
     def freeze(self, grounded: bool) -> None:
-        """While the vehicle does not fly our commands the model says nothing."""
+        """Use the vehicle's estimate while it is on the ground or does not fly our commands."""
         self._grounded = grounded
         if grounded and self.fused:
-            self._give_back("the vehicle does not fly our commands")
+            self._use_vehicle("the vehicle does not fly our commands")
 
     def on_command(self, time_s: float, command: Command) -> None:
         self._filter.on_command(time_s, command.thrust_mps2)
@@ -127,13 +128,13 @@ class Fusion:
     def on_attitude(self, time_s: float, q: Quaternion) -> None:
         if not self.fused:
             return
-        if time_s - self._filter.time_s > SILENT_S:  # nobody knows what happened meanwhile
-            self._give_back(f"no attitude for {SILENT_S:.0f} s")
+        if time_s - self._filter.time_s > SILENT_S:
+            self._use_vehicle(f"no attitude for {SILENT_S:.0f} s")
         else:
             self._filter.on_attitude(time_s, np.array(thrust_direction_from_quaternion(q)))
 
     def on_origin(self, place: Geodetic, said: bool) -> None:
-        """Where the local frame's origin is: what the vehicle `said` of it counts most."""
+        """Origin of the local frame. One that the vehicle `said` replaces one that was computed."""
         if said or not self._said:
             self._origin, self._said = place, said
 
@@ -144,7 +145,8 @@ class Fusion:
         velocity_ne_mps: tuple[float, float] | None,
         accuracy_m: float | None,
     ) -> None:
-        """`time_s` of its stamp; None, or of another clock: now."""
+        """A GPS fix at `place`, with velocity (north, east) and accuracy if the receiver has them.
+        `time_s` is its stamp; without one, or with that of another clock, it is of now."""
         now_s = self._reported_s
         stamp_s = now_s if time_s is None or time_s > now_s + AHEAD_S else time_s
         if stamp_s <= self._stamp_s or not math.isfinite(stamp_s):
@@ -167,7 +169,7 @@ class Fusion:
             self._smooth.add(-change.T.ravel(), self._filter.time_s)
 
     def follow(self, time_s: float, position: Triple, velocity: Triple) -> tuple[Triple, Triple]:
-        """From the reported position and velocity, NED, those to follow."""
+        """Position and velocity (NED) to follow, given those that the vehicle reports."""
         reported, speed = np.array(position), np.array(velocity)
         if time_s > self._reported_s:
             self._reported_s = time_s
@@ -181,7 +183,7 @@ class Fusion:
         )
         if not (np.isfinite(followed[0]).all() and np.isfinite(followed[1]).all()):
             self.reset()
-            self.news.append("own fusion is not finite: following the vehicle's estimate")
+            self.news.append("own position fusion is not finite: using the vehicle's estimate")
             return position, velocity
         self._followed = followed
         return _triple(followed[0]), _triple(followed[1])
@@ -191,40 +193,40 @@ class Fusion:
         if self.fused:
             off_m = float(np.abs(self._filter.at(time_s)[0] - reported).max())
             if time_s - self._fixed_s > SILENT_S:
-                self._give_back(f"no usable GPS fix for {SILENT_S:.0f} s")
+                self._use_vehicle(f"no usable GPS fix for {SILENT_S:.0f} s")
             elif off_m > apart_m:
-                self._give_back(f"GPS and the vehicle's estimate are {off_m:.1f} m apart")
+                self._use_vehicle(f"GPS and the vehicle's estimate are {off_m:.1f} m apart")
             return
-        if self._grounded or self._offset.fixes < LEARNT_FIXES:
+        if self._grounded or self._offset.fixes < LEAST_FIXES:
             return
         if time_s - self._fixed_s > SILENT_S:
             self._offset.forget()
             return
         off_m = float(np.abs(self._offset.value_m).max())
         if off_m <= apart_m:
-            self._take_over(time_s, reported, speed)
-        elif not self._doubtful:
-            self._doubtful = True
-            self.news.append(f"GPS is {off_m:.1f} m off the vehicle's estimate: not fused")
+            self._use_fusion(time_s, reported, speed)
+        elif not self._announced:
+            self._announced = True
+            self.news.append(f"GPS is {off_m:.1f} m from the vehicle's estimate: not fused")
 
-    def _take_over(self, time_s: float, reported: Array, speed: Array) -> None:
+    def _use_fusion(self, time_s: float, reported: Array, speed: Array) -> None:
         offset = self._offset
         variances = float(offset.variance_m2[0]), float(offset.variance_m2[2])
         self._filter.start(time_s, reported + offset.value_m, speed, variances)
         self._handover.add(-offset.value_m, time_s)
-        self.fused, self._doubtful = True, False
+        self.fused, self._announced = True, False
         off_m = float(np.linalg.norm(offset.value_m))
-        self.news.append(f"own position fusion, {off_m:.2f} m off the vehicle's estimate")
+        self.news.append(f"own position fusion in use, {off_m:.2f} m from the vehicle's estimate")
 
-    def _give_back(self, reason: str) -> None:
-        """From where we are to the vehicle's estimate, over the hand-over's time."""
+    def _use_vehicle(self, reason: str) -> None:
+        """Change over to the vehicle's estimate."""
         self.fused = False
         self._offset.forget()
         at_s, reported = self._reported_s, self._reported.at(self._reported_s)
         if self._followed is not None and reported is not None:
             self._handover.set(self._followed[0] - reported, at_s)
             self._smooth.set(np.zeros(6), at_s)
-        self.news.append(f"{reason}: following the vehicle's estimate")
+        self.news.append(f"{reason}: using the vehicle's estimate")
 
 
 def _triple(values: Array) -> Triple:
@@ -233,7 +235,8 @@ def _triple(values: Array) -> Triple:
 
 
 class FusedObserver(Observer):
-    """An observer that is told by `Fusion` where the vehicle is."""
+    """An observer that follows the position of `fusion`, which the caller applies to each position
+    message."""
 
     def __init__(
         self, vehicle: Vehicle, settings: ObserverSettings, fusion: FusionSettings
@@ -265,7 +268,7 @@ class FusedObserver(Observer):
 def observer_of(
     estimate: FollowedEstimate, vehicle: Vehicle, settings: ObserverSettings, fusion: FusionSettings
 ) -> Observer:
-    """The observer for the position that is to be followed."""
+    """The observer that follows the position `estimate`."""
     if estimate is FollowedEstimate.FUSED:
         return FusedObserver(vehicle, settings, fusion)
     return Observer(vehicle, settings)

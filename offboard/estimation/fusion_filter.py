@@ -1,8 +1,8 @@
-"""Position and velocity by the model, corrected by fixes that come late: what fusion computes.
+"""Kalman filter of own position fusion: the vehicle's motion, corrected by delayed GPS fixes.
 
-Per axis [p, v, d]: v' = g e3 - T b - c v + d with the thrust commanded and the attitude reported,
-which PX4's loop closes on; d takes up wind, wrong thrust and the attitude's own error. A fix is
-compared with the state of its own time. Knows no messages, no origin and no other estimate.
+Per axis [p, v, d] with v' = g e3 - T b - c v + d, where T is the commanded thrust and b the
+reported attitude, which PX4's loop controls; d stands for wind and for errors of thrust and
+attitude. A fix is compared with the state at its own time.
 """
 
 from __future__ import annotations
@@ -31,40 +31,40 @@ REMEMBERED_S = 0.6  # a fix older than this is not used
 
 
 class FusionSettings(Parameters):
-    """Of the receiver: standard deviations of a fix, and how much older than its stamp it is. Of
-    the model: densities per root second. Of the hand-over: how smoothly, and how far apart the
-    two estimates may be."""
+    """Noise and delay of the GPS receiver, drift densities per root second of the disturbance, and
+    time constant and limit of the hand-over between the vehicle's estimate and our own."""
 
     position_sd_m: float = Field(default=0.2, gt=0, le=20)  # north and east
     height_sd_m: float = Field(default=0.5, gt=0, le=20)
     velocity_sd_mps: float = Field(default=0.08, gt=0, le=5)  # north and east
-    delay_s: float = Field(default=0.0, ge=0, le=0.5)  # receivers: 0.1 to 0.2; PX4's SIH: none
+    delay_s: float = Field(default=0.0, ge=0, le=0.5)  # a receiver has 0.1 to 0.2, PX4's SIH none
     lateral_drift_mps2: float = Field(default=0.1, gt=0, le=5)
     vertical_drift_mps2: float = Field(default=0.04, gt=0, le=5)
     handover_s: float = Field(default=2.0, ge=0.2, le=20)
-    disagreement_m: float = Field(default=5.0, ge=0.5, le=100)  # then the vehicle's estimate counts
-    accuracy_m: float = Field(default=5.0, gt=0, le=100)  # a fix that claims less is not used
+    disagreement_m: float = Field(default=5.0, ge=0.5, le=100)  # above: vehicle's estimate
+    accuracy_m: float = Field(default=5.0, gt=0, le=100)  # less accurate fixes are dropped
 
 
 class Past:
-    """Values (n,) of the last moments, and what they were in between."""
+    """Values (n,) of the last REMEMBERED_S, interpolated."""
 
     def __init__(self) -> None:
         self._rows: deque[tuple[float, Array]] = deque()
 
     def note(self, time_s: float, values: Array) -> None:
-        """Times rise; what is older than REMEMBERED_S is forgotten."""
+        """Add the values of `time_s`, which must be newer than the last."""
         self._rows.append((time_s, values.copy()))
         while self._rows[0][0] < time_s - REMEMBERED_S:
             self._rows.popleft()
 
     def shift(self, change: Array) -> None:
-        """All of it was so much different."""
+        """Add `change` to all values."""
         for _, values in self._rows:
             values += change
 
     def at(self, time_s: float) -> Array | None:
-        """Linear between two moments, held behind the newest; None before the oldest."""
+        """Values at `time_s`: linear in between, constant after the newest, None before the
+        oldest."""
         later: tuple[float, Array] | None = None
         for row in reversed(self._rows):
             if row[0] <= time_s:
@@ -78,7 +78,7 @@ class Past:
 
 
 class Thrust:
-    """The collective thrust, m/s^2, that the commands sent give: each after its delay and lag."""
+    """Collective thrust (m/s^2) that the commands sent give, after delay and lag."""
 
     def __init__(self) -> None:
         self._waiting: deque[tuple[float, float]] = deque(maxlen=COMMANDS_KEPT)
@@ -88,20 +88,20 @@ class Thrust:
         self._waiting.append((time_s, thrust_mps2))
 
     def rescale(self, ratio: float) -> None:
-        """The same commands on the scale of another hover thrust."""
+        """Rescale the commands sent to another hover thrust."""
         scaled = ((time_s, ratio * thrust) for time_s, thrust in self._waiting)
         self._waiting = deque(scaled, maxlen=COMMANDS_KEPT)
         self._commanded *= ratio
         self._now *= ratio
 
     def settle(self, time_s: float, vehicle: Vehicle) -> None:
-        """What acts at `time_s` has acted for long."""
+        """Set the thrust to the command in force at `time_s`, without lag."""
         while self._waiting and self._waiting[0][0] + vehicle.thrust_delay_s <= time_s:
             self._commanded = self._waiting.popleft()[1]
         self._now = self._commanded
 
     def advance(self, begin_s: float, end_s: float, vehicle: Vehicle) -> float:
-        """The mean over the interval, which is not empty."""
+        """Mean thrust from `begin_s` to `end_s`, which must be later."""
         time_s, area = begin_s, 0.0
         while time_s < end_s:
             until_s = end_s
@@ -116,7 +116,7 @@ class Thrust:
         return area / (end_s - begin_s)
 
     def _hold(self, step_s: float, lag_s: float) -> float:
-        """The integral while one command is in force."""
+        """Integral of the thrust over `step_s` under one command."""
         missing = self._now - self._commanded
         left = missing * math.exp(-step_s / lag_s) if lag_s > 0.0 else 0.0
         self._now = self._commanded + left
@@ -124,7 +124,7 @@ class Thrust:
 
 
 class Group:
-    """Axes that share a model: their covariance [p v d]. `sd_m` of a fix, `drift_mps2` of d."""
+    """Axes with the same covariance of [p v d]. `sd_m`: noise of a fix, `drift_mps2`: of d."""
 
     def __init__(self, axes: slice, sd_m: float, drift_mps2: float) -> None:
         self.axes = axes
@@ -141,7 +141,7 @@ class Group:
         set_up(self._record[0], dynamics, self._densities)
 
     def start(self, position_m2: float) -> None:
-        """From a position of this variance."""
+        """Start with a position of variance `position_m2`."""
         start(
             self._record[0], (position_m2, START_VELOCITY_SD_MPS**2, START_DISTURBANCE_SD_MPS2**2)
         )
@@ -150,23 +150,26 @@ class Group:
         spread(self._record, step_s)
 
     def explains(self, off_m: Array) -> bool:
-        """Whether a fix may be off by so much by chance."""
+        """Whether a difference (3,) of fix and state is within GATE_SDS standard deviations."""
         sd_m = math.sqrt(self._covariance[P, P] + self._sd_m * self._sd_m)
         return bool(np.abs(off_m[self.axes]).max() <= GATE_SDS * sd_m)
 
     def absorb_position(self) -> Array:
-        """Take in a fix: its gain (3,)."""
+        """Correct the covariance by a fix. Returns the gain (3,)."""
         return self.absorb(P, self._sd_m * self._sd_m)
 
     def absorb(self, place: int, variance: float) -> Array:
-        """Take in a measurement of p, v or d: its gain (3,)."""
+        """Correct the covariance by a measurement of p, v or d. Returns the gain (3,)."""
         absorb(self._record[0], place, NOTHING, variance)
         gain: Array = self._gain[: D + 1]
         return gain
 
 
 class FusionFilter:
-    """`start` it, then feed it every attitude, command and fix. state (3, 3): axes NED, [p v d]."""
+    """Filter of all three axes: `start` it, then give it every attitude, command and fix.
+
+    `state` (3, 3): rows north, east, down; columns [p v d].
+    """
 
     def __init__(self, vehicle: Vehicle, settings: FusionSettings) -> None:
         self._settings = settings
@@ -180,8 +183,8 @@ class FusionFilter:
         self._adopt(vehicle)
 
     def adopt(self, vehicle: Vehicle) -> None:
-        """Go on with a newly identified vehicle: the disturbance gives up what the new hover thrust
-        and the new drag explain."""
+        """Continue with newly identified constants: the disturbance loses what the new hover thrust
+        and drag explain."""
         ratio = self._vehicle.hover_thrust / vehicle.hover_thrust
         slowed = vehicle.drag_per_mass_ps - self._vehicle.drag_per_mass_ps
         gravity = self._vehicle.gravity_mps2
@@ -193,7 +196,8 @@ class FusionFilter:
     def start(
         self, time_s: float, position: Array, velocity: Array, variances_m2: tuple[float, float]
     ) -> None:
-        """From here, NED; `variances_m2` of the position, lateral and vertical."""
+        """Start from `position` and `velocity` (3,), NED; `variances_m2`: of the position, lateral
+        and vertical."""
         self.time_s = time_s
         self.state[:, P], self.state[:, V], self.state[:, D] = position, velocity, 0.0
         for group, variance_m2 in zip(self._groups, variances_m2, strict=True):
@@ -207,7 +211,7 @@ class FusionFilter:
         self._thrust.on_command(time_s, thrust_mps2)
 
     def on_attitude(self, time_s: float, direction_ned: Array) -> None:
-        """The reported thrust direction (3,): the state moves on to its time."""
+        """Propagate the state to `time_s` with the reported thrust direction (3,)."""
         step_s = time_s - self.time_s
         if step_s <= 0.0:
             return
@@ -225,15 +229,15 @@ class FusionFilter:
         self._past.note(time_s, self.state[:, :D])
 
     def at(self, time_s: float) -> tuple[Array, Array]:
-        """Position and velocity (3,), NED, at a time close to the newest attitude's."""
+        """Position and velocity (3,), NED, at a time close to that of the newest attitude."""
         position = self.state[:, P] + (time_s - self.time_s) * self.state[:, V]
         return position, self.state[:, V].copy()
 
     def correct(
         self, time_s: float, position: Array, velocity_ne: tuple[float, float] | None
     ) -> Array | None:
-        """Take in a fix of `time_s`: how position and velocity (3, 2) changed by it; None where it
-        is further off than chance explains, or older than what is remembered."""
+        """Correct by a fix of `time_s`. Returns the change of position and velocity (3, 2), or None
+        if the fix is an outlier or older than REMEMBERED_S."""
         then = self._past.at(time_s)
         if then is None:
             return None

@@ -1,11 +1,10 @@
-"""Where the vehicle is, what pushes it, and where it will be when a command sent now takes effect.
+"""Position, velocity and disturbance of the vehicle, now and when a command sent now takes effect.
 
-The autopilot's reported velocity need not be the derivative of the position it reports (PX4: wrong
-by 0.2-0.3 m/s for seconds, with the position not following), so velocity comes from position and
-from the commands *sent*, replayed through the attitude response; the reported velocity is used
-with a bias of its own or not at all. A disturbance acceleration absorbs wrong thrust, mass, wind.
-Which message counts and when to begin anew is settled here. Vehicle time everywhere; no clock, no
-MAVLink, no reference.
+The velocity that an autopilot reports need not be the derivative of the position that it reports
+(PX4: wrong by 0.2 to 0.3 m/s for seconds), so velocity is estimated from the position and from the
+commands *sent*, replayed through the attitude response; the reported velocity is used with a bias
+or not at all. A disturbance acceleration stands for wind and for errors of thrust and mass. All
+times are vehicle time.
 """
 
 from __future__ import annotations
@@ -29,8 +28,10 @@ from offboard.estimation.observer_filter import (
 from offboard.estimation.observer_model import (
     ObserverSettings,
     VelocitySource,
-    believe,
     new_record,
+    predicted_heave,
+    predicted_state,
+    set_vehicle,
     start_filters,
 )
 from offboard.estimation.propagation import (
@@ -52,12 +53,8 @@ from offboard.estimation.propagation import (
 )
 from offboard.model.axes import upright
 from offboard.model.command import Command
-from offboard.model.frames import (
-    course_from_quaternion,
-    thrust_direction_from_quaternion,
-    wrap_pi,
-)
-from offboard.model.predicted_state import PredictedHeave, PredictedState
+from offboard.model.frames import course_from_quaternion, thrust_direction_from_quaternion
+from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import Vehicle
 
 __all__ = ["Observer", "ObserverSettings", "VelocitySource"]
@@ -66,14 +63,22 @@ Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 
-# Telemetry that arrives later than this after newer telemetry says nothing worth having.
-LATEST_S = 0.1
-# A longer silence, or step back in time, is a new start (a silence keeps the disturbance).
-LONGEST_GAP_S = 1.0
+LATEST_S = 0.1  # telemetry that is older than this when newer has arrived is dropped
+LONGEST_GAP_S = 1.0  # a longer gap or a step back in time restarts; a gap keeps the disturbance
 
 
 class Observer:
-    """One vehicle's observer. Feed it every message and every command; ask it before deciding."""
+    """State estimate of one vehicle.
+
+    Give it every attitude and position that arrives (`on_attitude`, `on_position`) and every
+    command that is sent (`on_command`); `predict` gives the state that a decision needs.
+    `position_jumps`, `velocity_jumps` and `stale_messages` count telemetry that jumped or was
+    dropped.
+
+    Args:
+        vehicle: constants of the vehicle.
+        settings: noise of telemetry and disturbance.
+    """
 
     def __init__(self, vehicle: Vehicle, settings: ObserverSettings) -> None:
         self._settings = settings
@@ -100,7 +105,7 @@ class Observer:
         self.reset()
 
     def reset(self) -> None:
-        """Forget everything of the previous flight."""
+        """Forget the previous flight."""
         self.position_jumps = 0
         self.velocity_jumps = 0
         self.stale_messages = 0
@@ -112,9 +117,9 @@ class Observer:
         self._restart()
 
     def adopt(self, vehicle: Vehicle) -> None:
-        """Go on with a newly identified vehicle. The thrust that crosses the wire is a ratio to
-        the hover thrust, so what was commanded is read on the new scale and the disturbance gives
-        up what the new hover thrust and the new drag explain."""
+        """Continue with newly identified constants. Thrust is sent as a ratio to the hover thrust,
+        so commands sent are rescaled, and the disturbance loses what the new hover thrust and drag
+        explain."""
         ratio = self._vehicle.hover_thrust / vehicle.hover_thrust
         self._history[:, SENT_THRUST] *= ratio
         self._state[THRUST] *= ratio
@@ -128,24 +133,25 @@ class Observer:
 
     @property
     def ready(self) -> bool:
-        """Whether position and attitude have both been heard since the start or a long silence."""
+        """Whether position and attitude have both arrived since the start or a long gap."""
         return self._position_at is not None and self._attitude_at is not None
 
     @property
     def hover_thrust_estimate(self) -> float:
-        """Normalised thrust that hovers: u_h (1 + d_z / g); within 2-3 % five seconds after
+        """Normalised hover thrust, u_h (1 + d_z / g); right within 3 % five seconds after
         take-off."""
         down = float(self._state[DISTURBANCE + 2])
         return self._vehicle.hover_thrust * (1.0 + down / self._gravity)
 
     @property
     def velocity_bias_ned_mps(self) -> Array:
-        """Reported minus believed velocity (3,), zero unless the source is `bias`."""
+        """Reported less estimated velocity (3,); zero unless the source is `bias`."""
         return self._state[BIAS : BIAS + 3].copy()
 
     def freeze(self, grounded: bool) -> None:
-        """While the vehicle does not fly our commands nothing integrates: velocity as reported,
-        no disturbance, thrust direction as measured. Released, the filters start from there."""
+        """Stop estimating while the vehicle is on the ground or does not fly our commands: velocity
+        as reported, thrust direction as measured, no disturbance. After that the filters start
+        from there."""
         if grounded != self._frozen:
             self._start_filters()
         self._frozen = grounded
@@ -164,13 +170,13 @@ class Observer:
         self._motion["sent"] = self._sent
 
     def on_attitude(self, time_s: float, q: Quaternion, rates: Triple) -> None:
-        """Attitude quaternion (FRD -> NED) and body rates (rad/s, FRD) of vehicle time `time_s`."""
-        if not self._admit(time_s, self._attitude_at):
+        """Attitude quaternion (FRD to NED, w first) and body rates (rad/s, FRD) at `time_s`."""
+        if not self._is_new(time_s, self._attitude_at):
             return
         north, east, _ = thrust_direction_from_quaternion(q).tolist()
         course = float(course_from_quaternion(q))
         self._rates = np.array(rates, dtype=np.float64)
-        if self._attitude_at is None or self._frozen:  # taken as it is
+        if self._attitude_at is None or self._frozen:
             state = self._state
             state[TILT : TILT + 2] = north, east
             state[TILT_RATE : TILT_RATE + 2] = 0.0
@@ -183,10 +189,10 @@ class Observer:
         self._attitude_at = time_s
 
     def on_position(self, time_s: float, position_ned_m: Triple, velocity_ned_mps: Triple) -> None:
-        """Reported position and velocity of vehicle time `time_s`."""
-        if not self._admit(time_s, self._position_at):
+        """Reported position and velocity at `time_s`."""
+        if not self._is_new(time_s, self._position_at):
             return
-        if self._position_at is None or self._frozen:  # taken as it is
+        if self._position_at is None or self._frozen:
             self._state[POSITION : POSITION + 3] = position_ned_m
             self._state[VELOCITY : VELOCITY + 3] = velocity_ned_mps
             self._time_s = max(self._time_s, time_s)
@@ -197,29 +203,15 @@ class Observer:
         self._position_at = time_s
 
     def predict(self, time_s: float) -> PredictedState:
-        """The state at `time_s` + tilt delay, when the tilt of a command sent at `time_s` begins
-        to act, replaying the commands sent. Meaningful once `ready`."""
-        until_s = time_s + self._vehicle.tilt.delay_s
-        state = self._foreseen(until_s)
-        north, east, rate_n, rate_e = state[TILT : TILT_RATE + 2].tolist()
-        down = upright(north, east)
-        return PredictedState(
-            time_s=until_s,
-            position_ned_m=state[POSITION : POSITION + 3],
-            velocity_ned_mps=state[VELOCITY : VELOCITY + 3],
-            thrust_direction_ned=np.array([north, east, down]),
-            thrust_direction_rate_ned_ps=np.array(
-                [rate_n, rate_e, -(north * rate_n + east * rate_e) / down]
-            ),
-            course_rad=wrap_pi(float(state[COURSE])),
-            course_rate_radps=float(state[COURSE_RATE]),
-            thrust_mps2=float(state[THRUST]),
-            disturbance_ned_mps2=state[DISTURBANCE : DISTURBANCE + 3],
-            rates_frd_radps=self._rates.copy(),
-            heave=self._heave(time_s + self._vehicle.thrust_delay_s),
-        )
+        """The state when the tilt of a command sent at `time_s` begins to act, after the tilt's
+        delay, with the commands sent replayed; `heave` is the vertical after the thrust's delay.
+        Valid once `ready`."""
+        tilt_s = time_s + self._vehicle.tilt.delay_s
+        thrust_s = time_s + self._vehicle.thrust_delay_s
+        heave = predicted_heave(thrust_s, self._propagated(thrust_s))
+        return predicted_state(tilt_s, self._propagated(tilt_s), self._rates.copy(), heave)
 
-    def _foreseen(self, time_s: float) -> Array:
+    def _propagated(self, time_s: float) -> Array:
         """A copy of the state, replayed forward to `time_s`."""
         start_s = self._time_s
         ahead_s = min(max(time_s - start_s, 0.0), LONGEST_GAP_S)
@@ -232,8 +224,8 @@ class Observer:
         return later
 
     def _go_to(self, time_s: float, *, complete: bool) -> None:
-        """Advance the state to `time_s`, or leave it if it is newer. `complete`: both streams have
-        been heard, so that the commands can be replayed."""
+        """Propagate the state to `time_s`, or leave it if it is newer. `complete`: position and
+        attitude have arrived, so that the commands can be replayed."""
         start_s = self._time_s
         if time_s <= start_s:
             return
@@ -243,7 +235,7 @@ class Observer:
         self._time_s = time_s
 
     def _correct_by_position(self, time_s: float) -> None:
-        """By what is measured, of `time_s`."""
+        """Correct by the position and velocity in `_measured`, which are of `time_s`."""
         if self._settings.velocity is VelocitySource.REPORTED:
             self._state[: VELOCITY + 3] = self._measured
             return
@@ -257,26 +249,17 @@ class Observer:
         elif self._settings.adaptive:
             learn(self._record)
 
-    def _heave(self, time_s: float) -> PredictedHeave:
-        state = self._foreseen(time_s).tolist()
-        return PredictedHeave(
-            time_s=time_s,
-            position_down_m=state[POSITION + 2],
-            velocity_down_mps=state[VELOCITY + 2],
-            thrust_down_mps2=state[THRUST] * upright(state[TILT], state[TILT + 1]),
-        )
-
     def _adopt(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
         self._gravity = vehicle.gravity_mps2
-        believe(self._record, vehicle, self._settings)
+        set_vehicle(self._record, vehicle, self._settings)
 
     def _forget_commands(self) -> None:
         self._sent = 0
         self._motion["sent"] = 0
 
     def _restart(self) -> None:
-        """The next message of each stream is taken as it is."""
+        """Take the next attitude and position as they are."""
         self._time_s = -math.inf
         self._position_at = None
         self._attitude_at = None
@@ -287,8 +270,9 @@ class Observer:
         start_filters(self._record, self._settings)
         self._adaptation.interrupt()
 
-    def _admit(self, time_s: float, last_s: float | None) -> bool:
-        """Whether a message of a stream last heard at `last_s` says something new."""
+    def _is_new(self, time_s: float, last_s: float | None) -> bool:
+        """Whether to use a message of `time_s`, the last of its kind having been of `last_s`;
+        restarts after a long gap."""
         now_s = self._time_s
         if abs(time_s - now_s) > LONGEST_GAP_S:
             if time_s < now_s:

@@ -1,10 +1,10 @@
-"""What the observer's innovations say of its own constants, compiled: noise and drift, online.
+"""Measurement noise and disturbance drift, estimated from the observer's innovations, compiled.
 
-With the right constants innovations are white (R. Mehra, 1970). What differs between neighbouring
-messages and comes back at once is noise of the measurement itself, more of it than believed. What
-stays for a fifth of a second is a disturbance that drifts faster than believed (gusts); PX4's and
-ArduCopter's estimators wander, but their innovations are over by then. Both estimates are slow,
-bounded, and never below what is configured. Knows no message, no plant and no clock.
+With the right constants innovations are white (R. Mehra, 1970). Innovations that change sign from
+one message to the next show that the measurement is noisier than configured. Innovations that are
+correlated over a fifth of a second show a disturbance that drifts faster than configured (gusts);
+the estimators of PX4 and ArduCopter wander too, but their innovations are shorter. Both estimates
+are slow, bounded, and never below the configured values.
 """
 
 from __future__ import annotations
@@ -20,46 +20,46 @@ from offboard.compiled import kernel
 Array = NDArray[np.float64]
 
 NOISE_TIME_S = 3.0
-NOISE_OUTLIER = 25.0  # a single product counts for at most so many times the variance
-# Innovations are averaged over SPAN_S and compared with those two spans earlier.
+NOISE_OUTLIER = 25.0  # limit of a single product, in variances
+# Innovations are averaged over SPAN_S and correlated with those two spans earlier.
 SPAN_S, DRIFT_TIME_S = 0.1, 3.0
-RELATED = 0.25  # the correlation above which the density grows, by e in a second at 1 above
-VISIBLE_M = 5e-5  # innovations smaller than this say nothing
+RELATED = 0.25  # correlation above which the density grows, by e per second for each 1 above
+VISIBLE_M = 5e-5  # smaller innovations do not count
 LONGEST_SPAN_S = 0.3
 NORTH_EAST, DOWN = 0, 1
 
 # Rows of the memory, six numbers each: position and velocity, NED.
 RESIDUAL, CHANGE = 0, 1  # of the last message, see `_weigh`
-MEANS = 2  # of the innovations over the newest three spans, newest first; position only
+MEANS = 2  # of the innovations over the last three spans, newest first; position only
 RELATION = 5  # mean product (lateral, vertical) and mean square (the same) of the means
 SUM = 6  # of the innovations in this span
-COUNTS = 7  # messages in this span, neighbours heard, spans ended, begin of the span, last message
+COUNTS = 7  # messages in this span, messages in a row, spans ended, start of the span, last message
 MEMORY_SHAPE = (8, 6)
 IN_SPAN, NEIGHBOURS, SPANS, BEGAN_S, LAST_S = 0, 1, 2, 3, 4
 
 ADAPTATION = np.dtype(
     [
         ("memory", "f8", MEMORY_SHAPE),
-        ("least", "f8", 2),  # white variances of position and velocity: configured,
-        ("variance", "f8", 2),  # and measured
-        ("bounds", "f8", (2, 2)),  # least and greatest density, lateral and vertical
-        ("density", "f8", 2),
+        ("least", "f8", 2),  # noise variances of position and velocity, configured
+        ("variance", "f8", 2),  # the same, estimated
+        ("bounds", "f8", (2, 2)),  # least and greatest drift density, lateral and vertical
+        ("density", "f8", 2),  # estimated
         # of one message, before and after its correction: position (m) and velocity (m/s), NED
         ("innovation", "f8", 6),
         ("residual", "f8", 6),
     ],
     align=True,
 )
-"""What is learnt, and what it is learnt from."""
+"""Estimated noise and drift, and the sums that they are estimated from."""
 
 
 @kernel
 def _weigh(noted: Any, interval_s: float) -> None:
-    """White variances of position and velocity from their innovations.
+    """Update the noise variances of position and velocity.
 
-    The measured change since the last message less the predicted one is innovation - residual;
-    for white noise of variance s^2 neighbouring changes have the covariance -s^2, for a measured
-    value that wanders none.
+    The measured change since the last message less the predicted one is innovation - residual. For
+    white noise of variance s^2, successive changes have the covariance -s^2; for a measurement that
+    wanders, they have none.
     """
     memory, variance, innovation = noted.memory, noted.variance, noted.innovation
     share = min(interval_s / NOISE_TIME_S, 0.1)
@@ -74,7 +74,7 @@ def _weigh(noted: Any, interval_s: float) -> None:
 
 @kernel
 def _relate(noted: Any, span_s: float) -> None:
-    """Densities of the disturbance, lateral and vertical, from the means of three spans."""
+    """Update the drift densities, lateral and vertical, from the means of three spans."""
     memory, bounds, density = noted.memory, noted.bounds, noted.density
     share = span_s / DRIFT_TIME_S
     relation = memory[RELATION]
@@ -107,7 +107,7 @@ def _end_span(memory: Array, time_s: float) -> None:
 
 @kernel
 def note(noted: Any, time_s: float) -> None:
-    """Learn from one message."""
+    """Update noise and drift by one message."""
     memory, innovation = noted.memory, noted.innovation
     counts = memory[COUNTS]
     if counts[NEIGHBOURS] == 0.0:
@@ -130,22 +130,25 @@ def note(noted: Any, time_s: float) -> None:
 
 @kernel
 def interrupt(noted: Any) -> None:
-    """The next innovation is no neighbour of the last one: a jump, a gap, a new start."""
+    """Do not correlate the next innovation with the last one: after a jump, a gap or a restart."""
     for i in range(MEMORY_SHAPE[1]):
         noted.memory[SUM, i] = noted.memory[COUNTS, i] = 0.0
 
 
 @kernel
 def white_sd(noted: Any, kind: int) -> float:
-    """Standard deviation of the noise of position (0) or velocity (1)."""
+    """Standard deviation of the noise of position (`kind` 0, m) or velocity (1, m/s)."""
     return math.sqrt(max(noted.variance[kind], noted.least[kind]))
 
 
 class Adaptation:
-    """An ADAPTATION record as whoever configures it sees it.
+    """Estimated noise and drift of one observer.
 
-    `position_sd_m`, `velocity_sd_mps` and `density_mps2`, `density_limit_mps2` are the least and
-    (of the density) greatest values.
+    Args:
+        record: an ADAPTATION (1,), which is filled.
+        position_sd_m, velocity_sd_mps: least standard deviations of the measurement noise.
+        density_mps2, density_limit_mps2: least and greatest density of the disturbance, per root
+            second.
     """
 
     def __init__(
@@ -165,7 +168,7 @@ class Adaptation:
         self.reset()
 
     def reset(self) -> None:
-        """Believe what is configured."""
+        """Start from the configured values."""
         self._record["variance"] = 0.0
         self._record["memory"] = 0.0
         self._bounds[NORTH_EAST, 1] = self._limit_mps2
@@ -173,12 +176,12 @@ class Adaptation:
         self._record["density"] = self._bounds[:, 0]
 
     def trust_thrust(self) -> None:
-        """From now on the vertical density may grow too. A thrust that acts later than believed
-        looks like drift, and answering it faster makes it oscillate."""
+        """From now on the vertical density may grow too. Before the thrust is identified, an error
+        of its delay looks like drift, and a faster correction would make the vehicle oscillate."""
         self._bounds[DOWN, 1] = self._limit_mps2
 
     def interrupt(self) -> None:
-        """The next innovation is no neighbour of the last one: a gap, a new start."""
+        """Do not correlate the next innovation with the last one: after a gap or a restart."""
         interrupt(self._noted)
 
     @property
@@ -191,6 +194,6 @@ class Adaptation:
 
     @property
     def densities_mps2(self) -> Array:
-        """Of the disturbance, lateral and vertical."""
+        """Drift densities of the disturbance, lateral and vertical, per root second."""
         densities: Array = self._record["density"][0]
         return densities

@@ -1,8 +1,7 @@
-"""What the observer computes, compiled: one record, and what a message does to it.
+"""The observer's record and its corrections by attitude and position, compiled.
 
-The record holds the believed state, the commands sent, three filters (both lateral axes, vertical,
-course) and what is learnt of their noise. Which message counts, and what a silence or the ground
-mean, is for the observer to say. Knows no settings and no quaternion.
+The record holds the estimated state, the commands sent, three filters (both lateral axes, vertical,
+course) and what their noise is estimated from. Which messages are used is decided in `observer`.
 """
 
 from __future__ import annotations
@@ -49,9 +48,9 @@ from offboard.model.axes import upright
 Array = NDArray[np.float64]
 
 LATERAL, VERTICAL, HEADING = 0, 1, 2  # filters
-# Places in them: per lateral axis [p v b b' d beta], vertical [p v d beta], course [psi psi'].
+# Their states: lateral [p v b b' d beta] per axis, vertical [p v d beta], course [psi psi'].
 LATERAL_TILT, LATERAL_DRIFT, VERTICAL_DRIFT, HEADING_COURSE = 2, 4, 2, 0
-POSITION_JUMPED, VELOCITY_JUMPED = 1, 2  # bits of an answer
+POSITION_JUMPED, VELOCITY_JUMPED = 1, 2  # bits of a result
 
 OBSERVER = np.dtype(
     [
@@ -60,18 +59,18 @@ OBSERVER = np.dtype(
         ("filters", FILTER, 3),
         ("adaptation", ADAPTATION),
         # settings
-        ("uses_velocity", "i8"),  # with a bias of its own
+        ("uses_velocity", "i8"),  # whether the reported velocity is used, with a bias
         ("adaptive", "i8"),
-        ("white_sds", "f8", 2),  # of position and velocity, where they are not adaptive
-        ("gates", "f8", 2),  # beyond which they have jumped
+        ("white_sds", "f8", 2),  # noise of position and velocity, if not adaptive
+        ("gates", "f8", 2),  # jumps of position and velocity are larger
         ("attitude_sd", "f8"),
         ("disturbance_limit", "f8"),
         # scratch
-        ("measured", "f8", VELOCITY + 3),  # placed as in the state
+        ("measured", "f8", VELOCITY + 3),  # indices as in the state
     ],
     align=True,
 )
-"""One vehicle's observer."""
+"""Record of one vehicle's observer."""
 
 
 @entry(OBSERVER, float, float, float, float)
@@ -96,13 +95,17 @@ def correct_by_position(observers: Any) -> int:
     """Correct the state by the position and velocity in `measured`. Returns what jumped:
     POSITION_JUMPED, VELOCITY_JUMPED, both or 0."""
     observer = observers[0]
-    state, measured, learnt = observer.motion.states[NOW], observer.measured, observer.adaptation
-    _note_missed(state, measured, learnt.innovation)
+    state, measured, adaptation = (
+        observer.motion.states[NOW],
+        observer.measured,
+        observer.adaptation,
+    )
+    _note_missed(state, measured, adaptation.innovation)
     jumped = 0
     for kind in range(2):
         if kind == 1 and not observer.uses_velocity:
             continue
-        sd = white_sd(learnt, kind) if observer.adaptive else observer.white_sds[kind]
+        sd = white_sd(adaptation, kind) if observer.adaptive else observer.white_sds[kind]
         for i in range(2):
             one = observer.filters[i]
             other = NOTHING if kind == 0 else one.order - 1
@@ -118,26 +121,26 @@ def correct_by_position(observers: Any) -> int:
 
 @entry(OBSERVER)
 def learn(observers: Any) -> None:
-    """Learn noise and drift from the position that the state was last corrected by."""
+    """Estimate noise and drift from the last correction by position."""
     observer = observers[0]
-    learnt = observer.adaptation
-    _note_missed(observer.motion.states[NOW], observer.measured, learnt.residual)
-    note(learnt, observer.time_s)
-    observer.filters[LATERAL].densities[LATERAL_DRIFT] = learnt.density[NORTH_EAST]
-    observer.filters[VERTICAL].densities[VERTICAL_DRIFT] = learnt.density[DOWN]
+    adaptation = observer.adaptation
+    _note_missed(observer.motion.states[NOW], observer.measured, adaptation.residual)
+    note(adaptation, observer.time_s)
+    observer.filters[LATERAL].densities[LATERAL_DRIFT] = adaptation.density[NORTH_EAST]
+    observer.filters[VERTICAL].densities[VERTICAL_DRIFT] = adaptation.density[DOWN]
 
 
 @kernel
 def _note_missed(state: Array, measured: Array, missed: Array) -> None:
-    """Measured less believed position and reported velocity."""
+    """Fill `missed` (6,) with measured less estimated position and reported velocity."""
     for i in range(3):
         missed[i] = measured[POSITION + i] - state[POSITION + i]
-        believed = state[VELOCITY + i]
-        missed[3 + i] = measured[VELOCITY + i] - believed - state[BIAS + i]
+        estimated = state[VELOCITY + i]
+        missed[3 + i] = measured[VELOCITY + i] - estimated - state[BIAS + i]
 
 
 def bring_forward(measured: Array, state: Array, plant: Array, late_s: float) -> None:
-    """Move a position and velocity `measured` (6,) `late_s` before the state to its time."""
+    """Propagate position and velocity `measured` (6,) by `late_s`, to the time of the state."""
     north, east = state[TILT], state[TILT + 1]
     direction = (north, east, upright(north, east))
     for i in range(3):
@@ -151,6 +154,6 @@ def bring_forward(measured: Array, state: Array, plant: Array, late_s: float) ->
 
 @kernel
 def bound_disturbance(state: Array, limit: float) -> None:
-    """Hold each axis of the disturbance, m/s^2 NED, within `limit`, in place."""
+    """Limit each axis of the disturbance (m/s^2, NED) to `limit`, in place."""
     for i in range(DISTURBANCE, DISTURBANCE + 3):
         state[i] = min(max(state[i], -limit), limit)

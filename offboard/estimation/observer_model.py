@@ -1,8 +1,4 @@
-"""What the observer believes: its settings, the plant it replays and the filters it corrects with.
-
-Made from a `Vehicle` and `ObserverSettings` and written into the observer's record; no message
-passes here.
-"""
+"""Settings of the observer, the plant and filter models of a vehicle, and predicted states."""
 
 from __future__ import annotations
 
@@ -31,6 +27,7 @@ from offboard.estimation.propagation import (
     NOW,
     PLANT_SIZE,
     POSITION,
+    THRUST,
     THRUST_DELAY,
     THRUST_LAG,
     TILT,
@@ -43,14 +40,16 @@ from offboard.estimation.propagation import (
     YAW_DELAY,
     YAW_FREQUENCY,
 )
-from offboard.model.axes import lateral_model
+from offboard.model.axes import lateral_model, upright
+from offboard.model.frames import wrap_pi
+from offboard.model.predicted_state import PredictedHeave, PredictedState
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 Record = np.ndarray[Any, Any]
 
-# Per filter the places of its states in the observer's, axis by axis, and what is believed of them
-# at the first message: the reported velocity, no disturbance, no bias.
+# Per filter: indices of its states in the observer's state, axis by axis, and their sd at the first
+# message, which gives position, velocity and attitude; disturbance and bias begin at zero.
 PLACES: tuple[list[tuple[int, ...]], ...] = (
     [
         (POSITION + i, VELOCITY + i, TILT + i, TILT_RATE + i, DISTURBANCE + i, BIAS + i)
@@ -67,16 +66,16 @@ START_SDS = (
 
 
 class VelocitySource(StrEnum):
-    """What the reported velocity is used for."""
+    """How the reported velocity is used."""
 
-    POSITION = "position"  # nothing: velocity from position and commands
-    BIAS = "bias"  # measured with a slowly varying bias
-    REPORTED = "reported"  # fed back raw, no disturbance: here only to be shown as worse
+    POSITION = "position"  # not at all: velocity from position and commands
+    BIAS = "bias"  # as a measurement with a slowly varying bias
+    REPORTED = "reported"  # as it is, without disturbance; for comparison only
 
 
 class ObserverSettings(Parameters):
-    """Densities per root second and standard deviations of the filters. The defaults flew PX4 and
-    ArduCopter; twice or half of them made no visible difference."""
+    """Noise densities per root second and standard deviations of the filters. The defaults were
+    flown on PX4 and ArduCopter; half or twice the values made no visible difference."""
 
     velocity: VelocitySource = VelocitySource.BIAS
     acceleration_density_mps: float = Field(default=0.2, gt=0, le=10)
@@ -91,13 +90,13 @@ class ObserverSettings(Parameters):
     position_jump_m: float = Field(default=0.3, gt=0, le=100)
     velocity_jump_mps: float = Field(default=0.5, gt=0, le=100)
     disturbance_limit_mps2: float = Field(default=8.0, gt=0, le=20)
-    # Noise and drift beyond what stands above are learnt from the innovations; the drift so far
+    # Estimate noise and drift above the configured ones from innovations, the drift up to the limit
     adaptive: bool = True
     disturbance_density_limit_mps2: float = Field(default=1.0, gt=0, le=10)
 
 
 def new_record(settings: ObserverSettings) -> Record:
-    """An OBSERVER that has no vehicle yet."""
+    """An OBSERVER (1,) without a vehicle."""
     record = np.zeros(1, OBSERVER)
     record["uses_velocity"] = settings.velocity is VelocitySource.BIAS
     record["adaptive"] = settings.adaptive
@@ -111,8 +110,8 @@ def new_record(settings: ObserverSettings) -> Record:
     return record
 
 
-def believe(record: Record, vehicle: Vehicle, settings: ObserverSettings) -> None:
-    """The vehicle's plant, and filters that follow it."""
+def set_vehicle(record: Record, vehicle: Vehicle, settings: ObserverSettings) -> None:
+    """Set the plant and the filter models of `record` to those of `vehicle`."""
     record["motion"]["plant"] = plant_vector(vehicle, settings)
     frequency = max(vehicle.tilt.natural_frequency_radps, vehicle.yaw.natural_frequency_radps)
     damping = max(vehicle.tilt.damping, vehicle.yaw.damping, 0.5)
@@ -123,7 +122,7 @@ def believe(record: Record, vehicle: Vehicle, settings: ObserverSettings) -> Non
 
 
 def start_filters(record: Record, settings: ObserverSettings) -> None:
-    """As little is known as at the first message."""
+    """Set covariances, disturbance and bias to those at the first message."""
     for one, sds in zip(record["filters"][0], START_SDS, strict=True):
         start(one, np.square(sds))
     if settings.velocity is VelocitySource.REPORTED:
@@ -133,7 +132,7 @@ def start_filters(record: Record, settings: ObserverSettings) -> None:
 
 
 def plant_vector(vehicle: Vehicle, settings: ObserverSettings) -> Array:
-    """The plant vector of `propagation`."""
+    """The plant vector (PLANT_SIZE,) of `propagation`."""
     plant = np.empty(PLANT_SIZE)
     plant[GRAVITY] = vehicle.gravity_mps2
     plant[DRAG] = vehicle.drag_per_mass_ps
@@ -152,7 +151,7 @@ def plant_vector(vehicle: Vehicle, settings: ObserverSettings) -> Array:
 def filter_models(vehicle: Vehicle, settings: ObserverSettings) -> tuple[tuple[Array, Array], ...]:
     """Dynamics (n, n) and densities (n,) of the lateral, vertical and course filters.
 
-    Linear about hover: an error of b accelerates by g whatever the thrust is at the moment.
+    Linear about hover: an error of b accelerates by g, whatever the thrust.
     """
     trusted = settings.velocity is VelocitySource.REPORTED
     drift = 0.0 if trusted else settings.disturbance_density_mps2
@@ -172,4 +171,38 @@ def filter_models(vehicle: Vehicle, settings: ObserverSettings) -> tuple[tuple[A
         (lateral, np.array([0.0, motion, 0.0, settings.tilt_density_radps, drift, bias])),
         (vertical, np.array([0.0, motion, drift, bias])),
         (heading, np.array([0.0, settings.course_density_radps])),
+    )
+
+
+def predicted_state(
+    time_s: float, state: Array, rates_frd_radps: Array, heave: PredictedHeave
+) -> PredictedState:
+    """A state (STATE_SIZE,) of `propagation` at `time_s` as the controller sees it."""
+    north, east, rate_n, rate_e = state[TILT : TILT_RATE + 2].tolist()
+    down = upright(north, east)
+    return PredictedState(
+        time_s=time_s,
+        position_ned_m=state[POSITION : POSITION + 3],
+        velocity_ned_mps=state[VELOCITY : VELOCITY + 3],
+        thrust_direction_ned=np.array([north, east, down]),
+        thrust_direction_rate_ned_ps=np.array(
+            [rate_n, rate_e, -(north * rate_n + east * rate_e) / down]
+        ),
+        course_rad=wrap_pi(float(state[COURSE])),
+        course_rate_radps=float(state[COURSE_RATE]),
+        thrust_mps2=float(state[THRUST]),
+        disturbance_ned_mps2=state[DISTURBANCE : DISTURBANCE + 3],
+        rates_frd_radps=rates_frd_radps,
+        heave=heave,
+    )
+
+
+def predicted_heave(time_s: float, state: Array) -> PredictedHeave:
+    """The vertical part of a state (STATE_SIZE,) at `time_s`."""
+    numbers = state.tolist()
+    return PredictedHeave(
+        time_s=time_s,
+        position_down_m=numbers[POSITION + 2],
+        velocity_down_mps=numbers[VELOCITY + 2],
+        thrust_down_mps2=numbers[THRUST] * upright(numbers[TILT], numbers[TILT + 1]),
     )

@@ -1,10 +1,9 @@
-"""Motion under the commands sent, compiled: what the observer replays and predicts with.
+"""Motion of the vehicle under the commands sent, compiled, for the observer's predictions.
 
-A state has `STATE_SIZE` numbers at the indices below (NED, SI): position, velocity, the lateral
-part of the thrust direction b and its rate, disturbance, bias of the reported velocity, collective
-thrust after its lag, course and its rate. Motion is integrated with Runge-Kutta steps that end
-where a command takes effect. States are changed in place. Nothing here knows messages, settings or
-uncertainty.
+A state has `STATE_SIZE` numbers at the indices below (NED, SI): position, velocity, thrust
+direction b (north and east) and its rate, disturbance, bias of the reported velocity, collective
+thrust after its lag, course and its rate. Motion is integrated with Runge-Kutta steps that end when
+a command takes effect. States are changed in place.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ MOTION = np.dtype(
     ],
     align=True,
 )
-"""States, the plant that moves them and the commands sent."""
+"""States, the constants of the plant and the commands sent."""
 
 LONGEST_STEP_S = 0.01
 SAME_TIME_S = 1e-9
@@ -140,7 +139,7 @@ def _step(
     plant: Array,
     slopes: Array,
 ) -> None:
-    """One Runge-Kutta step of fourth order; the thrust's lag is followed exactly."""
+    """One Runge-Kutta step of fourth order; the thrust's lag is integrated exactly."""
     lag = plant[THRUST_LAG]
     middle = _lagged(state[THRUST], thrust, lag, 0.5 * h)
     end = _lagged(state[THRUST], thrust, lag, h)
@@ -160,10 +159,10 @@ def _step(
 
 @entry(MOTION, int, float, float)
 def replay(motions: Any, row: int, start_s: float, end_s: float) -> None:
-    """Fill `row`, NOW or LATER, with the state that what is NOW at `start_s` becomes by `end_s`
-    under the commands sent; each axis has its own delay. `motions` is one MOTION (1,).
+    """Propagate the state NOW from `start_s` to `end_s` under the commands sent, each axis with its
+    own delay, and write it to `row`, NOW or LATER. `motions` is one MOTION (1,).
 
-    Before the first command has taken effect tilt, thrust and course hold what they have.
+    Until the first command takes effect, tilt, thrust and course keep their values.
     """
     motion = motions[0]
     state, history, plant = motion.states[row], motion.history, motion.plant[:]
@@ -192,5 +191,5 @@ def replay(motions: Any, row: int, start_s: float, end_s: float) -> None:
 
 @kernel
 def wrapped(angle_rad: float) -> float:
-    """The same angle in -pi .. pi."""
+    """The angle wrapped to -pi .. pi."""
     return angle_rad - 2.0 * math.pi * math.floor(angle_rad / (2.0 * math.pi) + 0.5)

@@ -45,5 +45,5 @@ class Peer:
 
 
 def _same_host(place: Hashable, other: Hashable) -> bool:
-    """Of two UDP addresses (host, port)."""
+    """Whether two UDP addresses (host, port) have the same host."""
     return isinstance(place, tuple) and isinstance(other, tuple) and place[0] == other[0]

@@ -1,7 +1,6 @@
-"""What the paper's law is flown on: its own linear model (Eq. 14) and the nonlinear one (Eq. 7).
+"""The plants of the paper: its linear model (Eq. 14) and the nonlinear one (Eq. 7).
 
-Both take inputs in deviation from hover, hold them over one step, and know wind and a thrust that
-is weaker than believed. Neither knows a law or a reference.
+Inputs are deviations from hover, held for one step of 0.1 s.
 """
 
 from __future__ import annotations
@@ -11,11 +10,11 @@ from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from offboard.compiled import array, entry
 from offboard.documents import shipped
 from offboard.documents.reading import parse
+from offboard.model.axes import LinearModel
 from offboard.model.linear import hover_matrices, sampled_matrices
 from offboard.model.rigid_body import (
     RK4_SCRATCH_ROWS,
@@ -42,7 +41,7 @@ class PlantKind(StrEnum):
 
 @cache
 def paper_vehicle() -> Vehicle:
-    """Table 1, with the arm that Eq. 16 needs: the shipped vehicle file `paper`."""
+    """Table 1 and the arm that Eq. 16 requires: the shipped vehicle file `paper`."""
     file = shipped.directory() / "vehicles" / "paper.yaml"
     return parse(file.read_text(encoding="utf-8"), Vehicle, str(file))
 
@@ -51,7 +50,7 @@ def paper_vehicle() -> Vehicle:
 def paper_model() -> tuple[Array, Array]:
     """A_d (12, 12) and B_d (12, 4) of Eq. 14, sampled with the 0.1 s that Eq. 16 is sampled with.
 
-    Shared between callers: not to be written to.
+    All callers share the arrays, which are read-only.
     """
     dynamics, inputs = sampled_matrices(paper_vehicle(), PAPER_STEP_S)
     dynamics.flags.writeable = inputs.flags.writeable = False
@@ -59,39 +58,47 @@ def paper_model() -> tuple[Array, Array]:
 
 
 class LinearPlant:
-    """Eq. 14 with C = I. Wind is a force through the drag, held constant (exactly sampled)."""
+    """Eq. 14 with C = I. A constant wind acts as a force through the drag, sampled exactly.
+
+    Args:
+        wind_ned_mps: wind velocity (3,).
+        thrust_loss: missing fraction of the total thrust, 0 to 1.
+    """
 
     def __init__(self, wind_ned_mps: Array, thrust_loss: float = 0.0) -> None:
         self._dynamics, self._inputs = paper_model()
-        self._thrust = _Thrust(thrust_loss)
-        self._drift = _sampled_wind(wind_ned_mps)
+        self._thrust_loss = thrust_loss
+        self._wind_effect = _sampled_wind(wind_ned_mps)
 
-    def following(self, state: Array, inputs: Array) -> Array:
-        """x(k+1) (12,) from x(k) and u(k) (4,)."""
-        held = self._thrust.actual(inputs)
-        following: Array = self._dynamics @ state + self._inputs @ held + self._drift
+    def next_state(self, state: Array, inputs: Array) -> Array:
+        """x(k+1) (12,) from x(k) (12,) and u(k) (4,)."""
+        delivered = _delivered(inputs, self._thrust_loss)
+        following: Array = self._dynamics @ state + self._inputs @ delivered + self._wind_effect
         return following
 
 
 class NonlinearPlant:
-    """Eq. 7 integrated by RK4 in ten substeps; the total thrust never pushes down."""
+    """Eq. 7, integrated by RK4 in ten substeps; the total thrust is never negative.
+
+    Arguments and `next_state` as for `LinearPlant`; velocities u, v, w are in body axes.
+    """
 
     def __init__(self, wind_ned_mps: Array, thrust_loss: float = 0.0) -> None:
         vehicle = paper_vehicle()
         self._hover = hover_input(vehicle)
         self._parameters = pack(vehicle)
         self._wind = np.array(wind_ned_mps, np.float64)
-        self._thrust = _Thrust(thrust_loss)
+        self._thrust_loss = thrust_loss
         self._scratch = np.empty((RK4_SCRATCH_ROWS, EULER.size))
 
-    def following(self, state: Array, inputs: Array) -> Array:
-        total = self._hover + self._thrust.actual(inputs)
+    def next_state(self, state: Array, inputs: Array) -> Array:
+        """x(k+1) (12,) from x(k) (12,) and u(k) (4,)."""
+        total = self._hover + _delivered(inputs, self._thrust_loss)
         total[THRUST] = max(total[THRUST], 0.0)
-        out = state.copy()
-        step_s = PAPER_STEP_S / _SUBSTEPS
-        constants = self._wind, self._parameters, step_s, _SUBSTEPS
-        follow(out, total, *constants, self._scratch)
-        return out
+        following = state.copy()
+        constants = self._wind, self._parameters, PAPER_STEP_S / _SUBSTEPS, _SUBSTEPS
+        follow(following, total, *constants, self._scratch)
+        return following
 
 
 @entry(array(1), array(1), array(1), array(1), float, int, array(2))
@@ -115,28 +122,18 @@ PLANTS: dict[PlantKind, type[LinearPlant | NonlinearPlant]] = {
 }
 
 
-class _Thrust:
-    """Rotors that give a fraction less than asked, of the total and not of the deviation."""
-
-    def __init__(self, loss: float) -> None:
-        self._loss = loss
-        self._weight_n = float(hover_input(paper_vehicle())[THRUST])
-
-    def actual(self, inputs: Array) -> Array:
-        held = inputs.copy()
-        held[THRUST] -= self._loss * (self._weight_n + held[THRUST])
-        return held
+def _delivered(inputs: Array, thrust_loss: float) -> Array:
+    """Inputs (4,) that the rotors deliver: a fraction of the total thrust is missing."""
+    delivered = inputs.copy()
+    delivered[THRUST] -= thrust_loss * (hover_input(paper_vehicle())[THRUST] + inputs[THRUST])
+    return delivered
 
 
 def _sampled_wind(wind_ned_mps: Array) -> Array:
-    """What a constant wind adds to x(k+1), (12,)."""
+    """The term that a constant wind adds to x(k+1) (12,)."""
     vehicle = paper_vehicle()
     dynamics, _ = hover_matrices(vehicle)
-    size = len(dynamics)
-    force = np.zeros(size)
+    force = np.zeros((len(dynamics), 1))
     drag = np.array(vehicle.drag_translation_npmps) / vehicle.mass_kg
-    force[U : W + 1] = drag * wind_ned_mps
-    whole = np.zeros((size + 1, size + 1))
-    whole[:size, :size], whole[:size, size] = dynamics, force
-    drift: Array = expm(PAPER_STEP_S * whole)[:size, size]
-    return drift
+    force[U : W + 1, 0] = drag * wind_ned_mps
+    return LinearModel(dynamics, force).sampled(PAPER_STEP_S).input_map[:, 0]

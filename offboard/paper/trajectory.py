@@ -1,7 +1,7 @@
-"""The reference of Figs. 5 and 6, which the paper only draws: ours, of the same kind, published.
+"""The reference of Figs. 5 and 6. The paper draws its path without numbers; this one is similar.
 
-About 100 s at some 3 m/s through turns and a change of height, minimum jerk from rest to rest,
-the nose along the path. Knows no plant and no law.
+About 100 s at some 3 m/s through turns and changes of height, minimum snap from rest to rest, the
+nose along the path.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SPEED_MPS = 2.8  # mean of an inner leg
 
 
 class PathName(StrEnum):
-    """What the paper flies."""
+    """The references of the study."""
 
     TOUR = "tour"  # Figs. 5 and 6
     HOVER = "hover"
@@ -52,11 +52,11 @@ def reference(name: PathName) -> Reference:
 
 
 @dataclass(frozen=True, slots=True)
-class Reach:
-    """The reference at every step k = 0 ... K.
+class SampledPath:
+    """A reference at the steps k = 0 ... K of 0.1 s.
 
-    `times_s` (K + 1,); `tracked` (K + 1, 12) is Eq. 27: zero but for psi, u, v, w, x, y, z, with
-    velocities in NED as on the linear plant; `samples` all flat outputs.
+    `times_s` (K + 1,); `tracked` (K + 1, 12) is Eq. 27: zero except psi, u, v, w, x, y, z, with
+    velocities in NED as on the linear plant; `samples` are the flat outputs.
     """
 
     times_s: Array
@@ -65,19 +65,19 @@ class Reach:
 
 
 @cache
-def reach(name: PathName, steps: int) -> Reach:
-    """A path sampled at the paper's 0.1 s: `steps` + 1 times, its states (steps + 1, 12)."""
+def sampled_path(name: PathName, steps: int) -> SampledPath:
+    """The reference `name` at `steps` + 1 times."""
     times_s: Array = PAPER_STEP_S * np.arange(steps + 1, dtype=np.float64)
     samples = reference(name).sample(times_s)
     tracked = np.zeros((steps + 1, 12))
     tracked[:, PSI] = samples.course_rad
     tracked[:, U : W + 1] = samples.velocity_ned_mps
     tracked[:, X : Z + 1] = samples.position_ned_m
-    return Reach(times_s, tracked, samples)
+    return SampledPath(times_s, tracked, samples)
 
 
 def linear_states(samples: FlatSample, vehicle: Vehicle) -> Array:
-    """The states (..., 12) that the linear model passes through on the reference, all of them."""
+    """All states (..., 12) of the linear model when it follows the reference exactly."""
     gravity, drag = vehicle.gravity_mps2, vehicle.drag_per_mass_ps
     v, a, j = samples.velocity_ned_mps, samples.acceleration_ned_mps2, samples.jerk_ned_mps3
     states = np.zeros((*samples.course_rad.shape, 12))
@@ -91,9 +91,9 @@ def linear_states(samples: FlatSample, vehicle: Vehicle) -> Array:
     return states
 
 
-def turned_states(samples: FlatSample, vehicle: Vehicle) -> Array:
-    """The same for the nonlinear plant (flatness), in the frame of each sample's own heading;
-    course and position count from the sample."""
+def heading_states(samples: FlatSample, vehicle: Vehicle) -> Array:
+    """The same (..., 12) for the nonlinear plant (flatness), in the heading frame of each sample;
+    course and position are relative to the sample, hence 0."""
     flat = flat_state(samples, vehicle.gravity_mps2, vehicle.drag_per_mass_ps)
     cosine, sine = np.cos(samples.course_rad), np.sin(samples.course_rad)
     b, v = flat.thrust_direction_ned, samples.velocity_ned_mps
@@ -109,9 +109,10 @@ def turned_states(samples: FlatSample, vehicle: Vehicle) -> Array:
 
 
 def nominal_inputs(states: Array, samples: FlatSample, vehicle: Vehicle, tilted: bool) -> Array:
-    """Inputs (K, 4), held, between states (K + 1, 12): torques from the rates at both ends.
+    """Inputs (K, 4) held between states (K + 1, 12); torques follow from the rates at both ends.
 
-    `tilted`: part of the lift of a tilted vehicle goes sideways, which the linear model leaves out.
+    `tilted`: increase the thrust by the part that tilt turns sideways, which the linear model
+    neglects.
     """
     inertia, drag = np.array(vehicle.inertia_kgm2), np.array(vehicle.drag_rotation_nmpradps)
     rates = states[:, P : R + 1]

@@ -1,4 +1,4 @@
-"""What tests do to a flight: links that lose and shuffle, vehicles that refuse, laws that fail."""
+"""Faults for tests of whole flights: of the link, the vehicle, and the control law."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def refusing(event: str, text: str) -> Firmware:
 
 
 def with_default(name: str, value: float) -> Firmware:
-    """A vehicle with one parameter set otherwise."""
+    """A vehicle with another value of one parameter."""
     parameters = (
         replace(spec, default=value) if spec.name == name else spec for spec in LEAN.parameters
     )
@@ -40,7 +40,7 @@ def with_default(name: str, value: float) -> Firmware:
 
 
 def slow(rate_hz: float) -> Firmware:
-    """A vehicle that sends its state at `rate_hz` whatever it is asked for."""
+    """A vehicle that sends position and attitude at `rate_hz`, whatever rate is requested."""
     state = ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
     asked = LEAN.streams.companion_rates_hz
     rates = {name: rate_hz if name in state else hz for name, hz in asked.items()}
@@ -60,7 +60,7 @@ def losing(share: float, seed: int = 3) -> Filter:
 
 
 def stuttering(hold_s: float, every_s: float) -> Filter:
-    """A link that stops for `hold_s` in every `every_s` and then hands over all at once."""
+    """A link that stops for `hold_s` in every `every_s`, then delivers all datagrams at once."""
     held: Bytes = []
 
     def arriving(time_s: float, datagrams: Bytes) -> Bytes:
@@ -74,7 +74,7 @@ def stuttering(hold_s: float, every_s: float) -> Filter:
 
 
 def interrupted(for_s: float) -> Filter:
-    """A link on which nothing arrives for so long, and attitude 50 ms later than the rest."""
+    """A link without any arrivals for a time, after which attitude arrives 50 ms after the rest."""
     began: list[float] = []
     rest = without(ATTITUDE)
 
@@ -89,7 +89,7 @@ def interrupted(for_s: float) -> Filter:
 
 
 def late(delay_s: float) -> Filter:
-    """A link on which everything takes so long."""
+    """A link with a constant delay."""
     under_way: list[tuple[float, bytes]] = []
 
     def arriving(time_s: float, datagrams: Bytes) -> Bytes:
@@ -102,7 +102,7 @@ def late(delay_s: float) -> Filter:
 
 
 def repeating(again_s: float) -> Filter:
-    """A link that brings everything twice at once, and once more later."""
+    """A link that delivers each datagram twice at once, and once more later."""
     again = late(again_s)
     return lambda time_s, datagrams: [*datagrams, *datagrams, *again(time_s, datagrams)]
 
@@ -159,7 +159,7 @@ def upside_down() -> Filter:
 
 
 def critical() -> Filter:
-    """A link on which the vehicle shows a failsafe whatever it does, as with a battery low."""
+    """A link on which every heartbeat shows MAV_STATE_CRITICAL, as with a low battery."""
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
 
     def change(frame: bytes) -> bytes:
@@ -201,7 +201,7 @@ def restart(pair: Pair) -> None:
 
 
 def jump(metres: float) -> Action:
-    """The estimator finds that it was `metres` further south."""
+    """The vehicle's estimated position jumps by `metres`."""
     return lambda pair: pair.instance.autopilot.plant.reset_estimate((metres, 0.0, 0.0))
 
 

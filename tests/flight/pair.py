@@ -136,7 +136,7 @@ class Pair:
 
     @property
     def payloads(self) -> Bytes:
-        """Of every SET_ATTITUDE_TARGET, as on the wire."""
+        """The payload of every SET_ATTITUDE_TARGET, as on the wire."""
         return [frame[10:-2] for _, _, frame in self.sent if frame[7:10] == b"\x52\0\0"]
 
     def commands(self, number: int) -> list[Any]:
@@ -156,7 +156,7 @@ class Pair:
         return tlog.read(log.path)
 
     def score(self, directory: Path) -> Score:
-        """Of that log."""
+        """The score of `log`."""
         return score(history.gather(self.log(directory)))
 
 
@@ -202,8 +202,8 @@ def make(
     believed: Vehicle | None = None,
     **options: Any,
 ) -> Pair:
-    """A pair as `offboard fly --sitl` would make it, and what a test changes about it: what
-    `flies` whatever is `believed`, and `learning` what it is."""
+    """A pair as `offboard fly --sitl` makes it. `flies` is the simulated vehicle, `believed` the
+    controller's model of it, `learning` the settings of the identification."""
     named = {"reference": reference, "vehicle": vehicle}
     choices = {part: chosen for part, chosen in named.items() if chosen}
     resolved = config.load(

@@ -1,6 +1,6 @@
-"""What can go wrong in a flight, one row each: title, what happens, how it must end, and checks.
+"""Faults of a flight, one row each: title, fault, exit code, sentence, last phase, and checks.
 
-Whatever the row: every setpoint is finite and legal, and none follows the end.
+In every row all setpoints are finite and valid, and none is sent after the end.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ def in_track(action: Callable[[Pair], None], flight: Callable[..., Pair] = lemni
     return lambda: flight(at=[(in_phase(Phase.TRACK, 1.0), action)])
 
 
-# --- checks: what must be true when all is over ---------------------------------------------------
+# --- checks after the flight ---
 
 
 def never_armed(pair: Pair) -> Checks:
@@ -68,7 +68,7 @@ def never_armed(pair: Pair) -> Checks:
     yield not pair.went_through(Phase.TAKEOFF)
 
 
-def nothing_asked(pair: Pair) -> Checks:
+def nothing_sent(pair: Pair) -> Checks:
     yield not pair.setpoints
     yield not pair.commands(SET_MODE)
     yield not pair.commands(ARM_DISARM)
@@ -100,15 +100,15 @@ def soft_landing(pair: Pair) -> Checks:
     yield all(abs(setpoint.q[1]) + abs(setpoint.q[2]) < 1e-6 for setpoint in level)
 
 
-def left_to_the_pilot(pair: Pair) -> Checks:
+def taken_over_by_the_pilot(pair: Pair) -> Checks:
     autopilot = pair.instance.autopilot
     yield autopilot.commander.armed
     yield autopilot.commander.mode.name == "AUTO.LOITER"
     yield not pair.commands(LAND)
 
 
-def landing_left_to_the_pilot(pair: Pair) -> Checks:
-    """Nothing is asked once the heartbeat, at 1 Hz, has shown the pilot's mode."""
+def landing_taken_over_by_the_pilot(pair: Pair) -> Checks:
+    """No request or setpoint once the heartbeat, at 1 Hz, has shown the pilot's mode."""
     autopilot = pair.instance.autopilot
     yield autopilot.commander.armed
     yield autopilot.commander.mode.name == "AUTO.LOITER"
@@ -127,8 +127,8 @@ def held_then_silent(pair: Pair) -> Checks:
     yield len(pair.commands(LAND)) >= 1
 
 
-def told_to_land(pair: Pair) -> Checks:
-    """Level setpoints while nothing is seen, at most 0.5 s of silence before the first of them."""
+def landing_requested(pair: Pair) -> Checks:
+    """Level setpoints without telemetry; the first follows within 0.5 s."""
     yield pair.instance.autopilot.commander.mode.name == "AUTO.LAND"
     blind_s = pair.heard_s
     after = [(at_s, s) for at_s, _, s in pair.setpoints if at_s > blind_s + 0.2]
@@ -137,12 +137,12 @@ def told_to_land(pair: Pair) -> Checks:
 
 
 def smooth(pair: Pair) -> Checks:
-    """The jump is taken with the tilt that the law allows itself, not with more."""
+    """After the jump the tilt stays within the law's own limit."""
     yield from flown(pair)
     yield max(math.hypot(s.q[1], s.q[2]) for _, _, s in pair.setpoints) < math.sin(0.5 * 0.7)
 
 
-def no_take_off_of_ours(pair: Pair) -> Checks:
+def continued_in_the_air(pair: Pair) -> Checks:
     yield from flown(pair)
     yield not pair.commands(ARM_DISARM)
     yield not pair.went_through(Phase.TAKEOFF)
@@ -150,8 +150,8 @@ def no_take_off_of_ours(pair: Pair) -> Checks:
     yield min(setpoint.thrust for _, _, setpoint in pair.setpoints) > 0.3
 
 
-def unhurt(pair: Pair) -> Checks:
-    """Two missed decisions are bridged, and forgotten with the next good one."""
+def bridged(pair: Pair) -> Checks:
+    """Two missed decisions are bridged; the next good one resets their count."""
     yield from flown(pair)
     texts = [frame for _, _, frame in pair.sent if b"decision missed" in frame]
     yield len(texts) == 4
@@ -166,7 +166,7 @@ def stayed_down(pair: Pair) -> Checks:
 
 
 def landed_by_failsafe(pair: Pair) -> Checks:
-    """A landing that is refused ends in silence, so that the vehicle comes down by itself."""
+    """After a refused landing the setpoints stop, so that the vehicle's failsafe lands."""
     yield from flown(pair)
     yield 25 <= sum(phase is Phase.LAND for _, phase, _ in pair.setpoints) <= 32
     yield len(pair.commands(LAND)) > 3
@@ -183,7 +183,7 @@ class Row:
 
 
 def already_flying() -> Pair:
-    """A vehicle that holds at 2.5 m when we come."""
+    """A vehicle that hovers at 2.5 m before the flight begins."""
     pair = hover("reference.height_m=2.5")
     instance = pair.instance
     nan = math.nan
@@ -245,7 +245,7 @@ ROWS = (
         Phase.FAILED,
         lambda pair: iter([not pair.setpoints]),
     ),
-    Row("found in the air", already_flying, 0, FLOWN, Phase.DISARMED, no_take_off_of_ours),
+    Row("found in the air", already_flying, 0, FLOWN, Phase.DISARMED, continued_in_the_air),
     # the operator
     Row(
         "stop before a vehicle is heard",
@@ -253,9 +253,9 @@ ROWS = (
         3,
         "stop requested by the operator",
         Phase.FAILED,
-        nothing_asked,
+        nothing_sent,
     ),
-    stopped(Phase.HEALTH, 1.0, Phase.FAILED, nothing_asked),
+    stopped(Phase.HEALTH, 1.0, Phase.FAILED, nothing_sent),
     stopped(Phase.STREAM, 0.5, Phase.FAILED, never_armed),
     stopped(Phase.ENGAGE, 0.1, Phase.FAILED, never_armed),
     stopped(Phase.ARM, 0.0, Phase.FAILED, disarmed_by_us),
@@ -278,7 +278,7 @@ ROWS = (
     stopped(Phase.TRACK, 1.0, Phase.DISARMED, landed),
     stopped(Phase.HOVER, 0.2, Phase.DISARMED, landed),
     # the vehicle refuses or is not there
-    Row("no vehicle", silent_vehicle, 3, "no vehicle heard in 3 s", Phase.FAILED, nothing_asked),
+    Row("no vehicle", silent_vehicle, 3, "no vehicle heard in 3 s", Phase.FAILED, nothing_sent),
     Row(
         "arming refused",
         lambda: hover(firmware=refusing("arm", "Arming denied: no joystick"), limits={"arm_s": 3}),
@@ -306,7 +306,7 @@ ROWS = (
         "COM_OF_LOSS_T is 30: seconds without setpoints before the failsafe. "
         "Fix: param set COM_OF_LOSS_T 5",
         Phase.FAILED,
-        nothing_asked,
+        nothing_sent,
     ),
     Row(
         "parameters not answered",
@@ -322,7 +322,7 @@ ROWS = (
         3,
         "not ready: no LOCAL_POSITION_NED or no ATTITUDE_QUATERNION arrives",
         Phase.FAILED,
-        nothing_asked,
+        nothing_sent,
     ),
     Row(
         "telemetry too slow",
@@ -330,7 +330,7 @@ ROWS = (
         3,
         "not ready: ATTITUDE_QUATERNION arrives at 4.0 Hz, at least 10 Hz are needed",
         Phase.FAILED,
-        nothing_asked,
+        nothing_sent,
     ),
     Row(
         "restart on the ground",
@@ -370,7 +370,7 @@ ROWS = (
         4,
         "not landed and disarmed after 20 s",
         Phase.FAILED,
-        landing_left_to_the_pilot,
+        landing_taken_over_by_the_pilot,
     ),
     Row(
         "pilot takes over as it arms",
@@ -378,7 +378,7 @@ ROWS = (
         4,
         "the vehicle left OFFBOARD for AUTO.LOITER as it armed",
         Phase.YIELDED,
-        left_to_the_pilot,
+        taken_over_by_the_pilot,
     ),
     Row(
         "pilot takes over",
@@ -386,7 +386,7 @@ ROWS = (
         4,
         "the vehicle left OFFBOARD for AUTO.LOITER",
         Phase.YIELDED,
-        left_to_the_pilot,
+        taken_over_by_the_pilot,
     ),
     Row(
         "pilot takes over while landing",
@@ -440,7 +440,7 @@ ROWS = (
         4,
         "no telemetry for 1.0 s; no telemetry for 2.0 s while landing",
         Phase.FAILED,
-        told_to_land,
+        landing_requested,
     ),
     Row(
         "position stops",
@@ -506,7 +506,7 @@ ROWS = (
         0,
         FLOWN,
         Phase.DISARMED,
-        unhurt,
+        bridged,
     ),
     Row(
         "a law that overturns for a moment",

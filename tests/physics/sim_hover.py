@@ -6,8 +6,8 @@ import math
 from pathlib import Path
 
 import numpy as np
-import yaml
 
+from offboard.documents.reading import parse
 from offboard.model.frames import euler_from_quaternion, quaternion_from_euler
 from offboard.model.vehicle import Vehicle
 from simulator.steps import STEP_S
@@ -20,7 +20,7 @@ CALM = Conditions()
 
 
 def load(name: str) -> Vehicle:
-    return Vehicle(**yaml.safe_load((VEHICLES / f"{name}.yaml").read_text()))
+    return parse((VEHICLES / f"{name}.yaml").read_text(), Vehicle, name)
 
 
 def attitude(roll_deg: float = 0.0, pitch_deg: float = 0.0, yaw_deg: float = 0.0):

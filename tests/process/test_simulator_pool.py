@@ -42,7 +42,7 @@ def vehicles(simulator: SimulatorProcess) -> list[int]:
 
 
 def gone(pid: int) -> bool:
-    """Within ten seconds, for whoever is not ours to wait for."""
+    """Whether a process that is no child of ours ends within ten seconds."""
     for _ in range(1000):
         if not Path(f"/proc/{pid}/exe").exists():
             return True

@@ -1,4 +1,4 @@
-"""A page of ours in Chromium, without a network."""
+"""A page of `offboard` in Chromium, without a network; measures what a reader sees."""
 
 from __future__ import annotations
 
@@ -6,43 +6,116 @@ import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import pytest
 from playwright.sync_api import Page, sync_playwright
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
-# WebGL (Fig. 6) in software: a machine that tests has no graphics card
+# WebGL (Fig. 6) in software: a machine that runs tests has no graphics card
 FLAGS = (
     "--no-sandbox", "--disable-gpu", "--disable-background-networking", "--use-gl=angle",
     "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
 )  # fmt: skip
+DRAWN = """scheme => [...document.querySelectorAll(".figure")].every((figure) =>
+  figure.dataset.drawn === scheme &&
+  Math.abs(figure.querySelector(".svg-container").clientWidth - figure.clientWidth) <= 1)"""
+# Of every text of the page and its figures: contrast by WCAG 2.1, brightness of its background
+CONTRASTS = """() => {
+  const linear = (v) => v <= 10.31475 ? v / 3294.6 : ((v / 255 + 0.055) / 1.055) ** 2.4;
+  const rgb = (colour) => colour.match(/[0-9.]+/g).map(Number);
+  const luminance = ([r, g, b]) => 0.2126 * linear(r) + 0.7152 * linear(g) + 0.0722 * linear(b);
+  const background = (element) => {
+    const colour = rgb(getComputedStyle(element).backgroundColor);
+    return colour.length < 4 || colour[3] > 0 ? colour : background(element.parentElement);
+  };
+  const texts = document.createTreeWalker(document.querySelector("main"), NodeFilter.SHOW_TEXT);
+  const found = [];
+  while (texts.nextNode()) {
+    const element = texts.currentNode.parentElement;
+    if (!texts.currentNode.textContent.trim() || element.closest("script, .modebar")) continue;
+    const style = getComputedStyle(element);
+    const ink = luminance(rgb(element.closest("svg") ? style.fill : style.color));
+    const paper = luminance(background(element));
+    const contrast = (Math.max(ink, paper) + 0.05) / (Math.min(ink, paper) + 0.05);
+    found.push([contrast, paper < 0.2 ? "dark" : "light", texts.currentNode.textContent]);
+  }
+  return found;
+}"""
+# [figure, width, height, [[text, left, top, right, bottom], ...]] in pixels of the figure
+TEXT_BOXES = """() => [...document.querySelectorAll(".figure")].map((figure) => {
+  const frame = figure.getBoundingClientRect();
+  const boxes = [...figure.querySelectorAll("svg text, .modebar")]
+    .filter((text) => text.textContent.trim() || text.matches(".modebar"))
+    .map((text) => [text.textContent.trim() || "tool bar", text.getBoundingClientRect()])
+    .map(([text, box]) => [text, box.left - frame.left, box.top - frame.top,
+                           box.right - frame.left, box.bottom - frame.top]);
+  return [figure.id, frame.width, frame.height, boxes];
+})"""
+TOUCHING_PX = 3  # boxes of neighbouring lines of text overlap by this much at most
 
 
 class Opened:
-    """The page, its figures drawn, and what it complained about or asked the network for."""
+    """A page with its figures drawn, the errors it reported and what it asked the network for."""
 
     def __init__(self, page: Page, file: Path) -> None:
         self.page = page
         self.problems: list[str] = []
         self._requests: list[str] = []
-        page.on("console", self._heard)
+        page.on("console", self._on_console)
         page.on("pageerror", lambda error: self.problems.append(str(error)))
         page.on("request", lambda request: self._requests.append(request.url))
-        page.goto(file.as_uri())
-        page.wait_for_function(
-            "[...document.querySelectorAll('.figure')].every(f => f.dataset.drawn === 'yes')",
-            timeout=60_000,
-        )
+        page.goto(file.as_uri(), timeout=60_000)
+        self.switch("light")
 
-    def _heard(self, message: object) -> None:
+    def _on_console(self, message: object) -> None:
         if getattr(message, "type", "") == "error":
             self.problems.append(str(getattr(message, "text", "")))
 
     @property
     def fetched(self) -> list[str]:
-        """What did not come out of the page itself."""
+        """Requests for anything outside the page itself."""
         own = ("file:", "data:", "blob:")
         return [url for url in self._requests if not url.startswith(own)]
+
+    def switch(self, scheme: Any) -> None:
+        """Change the colour scheme of the system, without a reload."""
+        self._scheme = scheme
+        self.page.emulate_media(color_scheme=scheme)
+        self.page.wait_for_function(DRAWN, arg=scheme, timeout=60_000)
+
+    def resize(self, width: int) -> None:
+        """Change the width of the window, without a reload."""
+        self.page.set_viewport_size({"width": width, "height": 900})
+        self.page.wait_for_function(DRAWN, arg=self._scheme, timeout=60_000)
+
+    def unreadable(self) -> list[str]:
+        """Texts on a background of the other colour scheme, or with a contrast below 4.5, the
+        least that WCAG 2.1 allows (level AA)."""
+        found = self.page.evaluate(CONTRASTS)
+        assert found
+        return [
+            f"{text}: contrast {contrast:.1f} on a {background} background"
+            for contrast, background, text in found
+            if contrast < 4.5 or background != self._scheme
+        ]
+
+    def width_px(self) -> int:
+        """The width of the whole page; it exceeds the window's where something overflows."""
+        return int(self.page.evaluate("document.documentElement.scrollWidth"))
+
+    def colliding(self) -> list[str]:
+        """Texts of figures that are cut off, or that overlap each other or the tool bar."""
+        found = []
+        for figure, width, height, boxes in self.page.evaluate(TEXT_BOXES):
+            for i, (text, left, top, right, bottom) in enumerate(boxes):
+                if left < -1 or top < -1 or right > width + 1 or bottom > height + 1:
+                    found.append(f"{figure}: {text} is cut off")
+                for other, left_, top_, right_, bottom_ in boxes[:i]:
+                    wide = min(right, right_) - max(left, left_)
+                    if wide > 1 and min(bottom, bottom_) - max(top, top_) > TOUCHING_PX:
+                        found.append(f"{figure}: {text} overlaps {other}")
+        return found
 
 
 @contextmanager

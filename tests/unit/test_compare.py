@@ -136,6 +136,20 @@ def test_titles_and_numbers_of_the_axes_keep_clear_of_each_other(
             assert right < left
 
 
+def test_the_page_follows_the_colour_scheme_and_fits_a_narrow_window(
+    rows: list[Row], tmp_path: Path
+) -> None:
+    file = tmp_path / "compare.html"
+    file.write_text(page(rows, ["not flown: <i>calm</i>"]), encoding="utf-8")
+    with opening(file, width=400) as opened:
+        assert opened.width_px() == 400
+        assert opened.colliding() == []
+        assert opened.unreadable() == []
+        opened.switch("dark")
+        assert opened.unreadable() == []
+        assert opened.problems == []
+
+
 def _boxes(opened: Opened, selector: str) -> list[tuple[float, float]]:
     """Left and right edges in pixels, from left to right."""
     found = [each.bounding_box() for each in opened.page.locator(selector).all()]

@@ -1,7 +1,7 @@
-"""Own position fusion: as good as theory allows, smooth at every change of mind, never fooled.
+"""Own position fusion: accuracy against theory, smooth changes of the estimate, wrong fixes.
 
 The vehicle here is exact: its thrust and attitude are those of an analytic motion, its estimate
-is off by a slow wave, its receiver by white noise. Nothing of the product makes any of it.
+is off by a slow wave, its receiver by white noise. None of it is made by the code under test.
 """
 
 from __future__ import annotations
@@ -118,7 +118,7 @@ class Trial:
 
 
 def trial(seed: int = 1, settings: FusionSettings = SETTINGS, **more: object) -> Trial:
-    """Two seconds on the ground, as far as the fusion knows, then flying."""
+    """Three seconds frozen as on the ground, then flying."""
     fusion = Fusion(VEHICLE, settings)
     fusion.on_origin(ORIGIN, said=True)
     made = Trial(fusion, settings, np.random.default_rng(seed), **more)  # type: ignore[arg-type]
@@ -128,7 +128,7 @@ def trial(seed: int = 1, settings: FusionSettings = SETTINGS, **more: object) ->
 
 
 def steady_sd_m(sd_m: float, drift: float, speed_sd: float | None) -> float:
-    """What theory allows: the continuous Riccati equation, a fix every 0.12 s."""
+    """Least possible sd: the continuous Riccati equation with a fix every 0.12 s."""
     dynamics = np.array([[0.0, 1.0, 0.0], [0.0, -DRAG, 1.0], [0.0, 0.0, 0.0]])
     seen = np.eye(3)[: 1 if speed_sd is None else 2]
     sds = [sd_m] if speed_sd is None else [sd_m, speed_sd]
@@ -137,7 +137,7 @@ def steady_sd_m(sd_m: float, drift: float, speed_sd: float | None) -> float:
     return math.sqrt(solve_continuous_are(dynamics.T, seen.T, drive, noise)[0, 0])
 
 
-def test_as_good_as_theory_allows() -> None:
+def test_error_is_the_least_possible() -> None:
     squares = np.array([np.mean(trial(s).fly(40.0).off_m(30.0) ** 2, axis=0) for s in (1, 2, 3)])
     rms = np.sqrt(squares.mean(axis=0))
     lateral = steady_sd_m(0.2, SETTINGS.lateral_drift_mps2, SETTINGS.velocity_sd_mps)
@@ -149,39 +149,43 @@ def test_as_good_as_theory_allows() -> None:
     assert rms[2] == pytest.approx(vertical, rel=0.2)
 
 
-def test_a_push_is_learnt() -> None:
+def test_constant_disturbance_is_estimated() -> None:
     flown = trial()
     flown.push_mps2 = np.array([0.8, -0.5, 0.6])
     flown.fly(40.0)
     assert np.abs(flown.off_m(20.0).mean(axis=0)).max() < 0.06
 
 
-@pytest.mark.parametrize(("told_s", "most_m", "least_m"), [(0.15, 0.01, 0.0), (0.0, 0.4, 0.1)])
-def test_late_fixes_belong_to_their_time(told_s: float, most_m: float, least_m: float) -> None:
-    settings = SETTINGS.model_copy(update={"delay_s": told_s})
+@pytest.mark.parametrize(
+    ("configured_s", "most_m", "least_m"), [(0.15, 0.01, 0.0), (0.0, 0.4, 0.1)]
+)
+def test_fixes_are_compared_with_the_state_at_their_time(
+    configured_s: float, most_m: float, least_m: float
+) -> None:
+    settings = SETTINGS.model_copy(update={"delay_s": configured_s})
     flown = trial(settings=settings, delay_s=0.15, quiet=True).fly(40.0)
     off_m = math.sqrt(np.mean(flown.off_m(16.0)[:, :2] ** 2))
     assert least_m <= off_m < most_m
 
 
 def test_smooth_from_start_to_end() -> None:
-    """Taken over, corrected, given back and taken over again: never a step, never far."""
+    """Fusion begins, is corrected, ends and begins again: the position never steps."""
     flown = trial(fixes=lambda time_s: None if 120 < time_s < 125 else np.zeros(3)).fly(40.0)
     table = flown.table
     steps = np.diff(table[:, 7:10] - table[:, 1:4], axis=0)
-    assert np.abs(steps).max() < 0.015  # a metre passed on over two seconds
-    said = flown.fusion.news
-    assert ["own position fusion" in s for s in said] == [True, False, True]
-    assert said[1] == "no usable GPS fix for 1 s: following the vehicle's estimate"
+    assert np.abs(steps).max() < 0.015  # one metre over two seconds
+    news = flown.fusion.news
+    assert ["own position fusion in use" in s for s in news] == [True, False, True]
+    assert news[1] == "no usable GPS fix for 1 s: using the vehicle's estimate"
     at = table[:, 0]
-    given_back = table[(at > 124.0) & (at < 125.0)]
+    after_fusion = table[(at > 124.0) & (at < 125.0)]
     # Followed for three seconds, with a hand-over of two
-    assert np.abs(given_back[:, 7:10] - given_back[:, 4:7]).max() < 0.35
+    assert np.abs(after_fusion[:, 7:10] - after_fusion[:, 4:7]).max() < 0.35
     assert np.abs(flown.off_m(8.0)).max() < 0.45
 
 
 @pytest.mark.parametrize("size_m", [3.0, 60.0])
-def test_fixes_that_jump_are_not_believed(size_m: float) -> None:
+def test_fixes_that_jump_are_not_used(size_m: float) -> None:
     jump = np.array([size_m, 0.0, 0.0])
     flown = trial(fixes=lambda time_s: jump * (time_s > 120.0)).fly(16.9)
     assert flown.fusion.fused
@@ -189,11 +193,11 @@ def test_fixes_that_jump_are_not_believed(size_m: float) -> None:
     table = flown.table
     around = (table[:, 0] > 110.0) & (table[:, 0] < 121.0)
     assert np.abs(table[:, 7] - table[:, 1])[around].max() < 0.15
-    assert "no usable GPS fix for 1 s: following the vehicle's estimate" in flown.fusion.news
-    if size_m > SETTINGS.disagreement_m:  # else it might as well be the vehicle that is wrong
+    assert "no usable GPS fix for 1 s: using the vehicle's estimate" in flown.fusion.news
+    if size_m > SETTINGS.disagreement_m:  # else the vehicle may be the one that is wrong
         assert not flown.fusion.fused
         assert np.abs(table[-1, 7] - table[-1, 4]) < 0.01
-        assert "m off the vehicle's estimate: not fused" in flown.fusion.news[-1]
+        assert "m from the vehicle's estimate: not fused" in flown.fusion.news[-1]
         assert len(flown.fusion.news) == 3
 
 
@@ -204,7 +208,7 @@ def test_a_single_wild_fix_changes_nothing() -> None:
     assert np.abs(wild - plain)[-500:, 7:10].max() < 0.01
 
 
-def test_on_the_ground_and_without_fixes_it_is_the_vehicle_s_estimate() -> None:
+def test_vehicles_estimate_is_used_on_the_ground_and_without_fixes() -> None:
     fusion = Fusion(VEHICLE, SETTINGS)
     grounded = Trial(fusion, SETTINGS, np.random.default_rng(1)).fly(5.0)
     assert np.array_equal(grounded.table[:, 4:7], grounded.table[:, 7:10])
@@ -231,7 +235,7 @@ def test_without_an_origin_the_first_fix_is_matched_to_the_estimate() -> None:
     assert np.abs(made.off_m(8.0)).max() < 0.05
 
 
-def test_what_is_not_usable_is_not_used() -> None:
+def test_inaccurate_and_old_fixes_are_not_used() -> None:
     flown = trial().fly(10.0)
     before = flown.fusion._fixed_s
     here = place_of(motion(flown.time_s)[0])
@@ -241,7 +245,7 @@ def test_what_is_not_usable_is_not_used() -> None:
     assert flown.fusion._fixed_s == before
 
 
-def test_a_stamp_far_ahead_spoils_no_later_fix() -> None:
+def test_fix_with_a_stamp_far_ahead_does_not_affect_later_fixes() -> None:
     plain, spoilt = trial().fly(20.0), trial().fly(20.0)
     here = place_of(motion(spoilt.time_s - spoilt.delay_s)[0])
     spoilt.fusion.on_fix(spoilt.time_s + 3600.0, here, None, 0.9)
@@ -252,16 +256,18 @@ def test_a_stamp_far_ahead_spoils_no_later_fix() -> None:
     assert spoilt.fusion.news == plain.fusion.news
 
 
-@pytest.mark.parametrize("silence_s", [1.1, 4e6])  # the model would be followed through all of it
-def test_after_a_silence_of_the_attitude_it_is_the_vehicle_s_estimate(silence_s: float) -> None:
+@pytest.mark.parametrize(
+    "silence_s", [1.1, 4e6]
+)  # without new attitudes the prediction is worthless
+def test_vehicles_estimate_is_used_after_a_gap_of_the_attitude(silence_s: float) -> None:
     flown = trial().fly(20.0)
     assert flown.fusion.fused
     flown.fusion.on_attitude(flown.time_s + silence_s, (1.0, 0.0, 0.0, 0.0))
     assert not flown.fusion.fused
-    assert flown.fusion.news[-1] == "no attitude for 1 s: following the vehicle's estimate"
+    assert flown.fusion.news[-1] == "no attitude for 1 s: using the vehicle's estimate"
 
 
-def test_nothing_but_finite_numbers() -> None:
+def test_result_is_always_finite() -> None:
     flown = trial().fly(5.0)
     flown.fusion.on_command(flown.time_s, Command(math.inf, (0.0, 0.0, 1.0), 0.0))
     flown.fly(1.0)

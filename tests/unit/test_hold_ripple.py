@@ -57,7 +57,7 @@ class Jerking:
 
 
 def test_the_target_ripples_as_the_staircase_does() -> None:
-    """Of a jerk of 1 m/s^3 b_c is a ramp of -1 / g per second, T one of -1 m/s^2 per second."""
+    """At a jerk of 1 m/s^3 b_c is a ramp of -1 / g per second, T one of -1 m/s^2 per second."""
     without_drag = PX4.model_copy(update={"drag_translation_npmps": (0.0,) * 3})
     law = lqr(vehicle=without_drag).tracking
     off = _after(held=True) - _after(held=False)

@@ -54,7 +54,7 @@ def test_replies_to_others_late_and_duplicate_ones_are_ignored() -> None:
     assert link.estimate == Estimate(pytest.approx(0.05), 0.0)
 
 
-def believing() -> VehicleEstimate:
+def new_estimate() -> VehicleEstimate:
     return VehicleEstimate(
         PX4, factor=4.0, blend_s=1.0, unknown_delay_s=0.28, period_s=0.1, bandwidth_radps=7.0
     )
@@ -62,23 +62,23 @@ def believing() -> VehicleEstimate:
 
 @pytest.mark.parametrize("late_s", [0.1, 0.2, 0.3])
 def test_every_delay_of_the_vehicle_is_later_by_the_link(late_s: float) -> None:
-    belief, direct = believing(), believing()
-    (sentence,) = belief.expect_link(Estimate(late_s + 0.004, 0.003))
+    estimate, direct = new_estimate(), new_estimate()
+    (sentence,) = estimate.expect_link(Estimate(late_s + 0.004, 0.003))
     assert f"{1e3 * late_s + 4:.0f} +- 3 ms late" in sentence
-    assert belief.settled
-    now = belief.now
+    assert estimate.settled
+    now = estimate.now
     assert now.tilt.delay_s == pytest.approx(0.057 + late_s)
     assert now.yaw.delay_s == pytest.approx(0.148 + late_s, abs=0.001)
     assert now.thrust_delay_s == pytest.approx(0.015 + late_s)
     assert now.tilt.natural_frequency_radps == 11.4
     assert direct.expect_link(Estimate(0.004, 0.001)) == []
     assert direct.now == PX4
-    assert believing().cautious_radps == pytest.approx(direct.cautious_radps, abs=0.1)
-    assert belief.cautious_radps <= direct.cautious_radps
+    assert new_estimate().cautious_radps == pytest.approx(direct.cautious_radps, abs=0.1)
+    assert estimate.cautious_radps <= direct.cautious_radps
 
 
 def test_a_link_that_scatters_bears_less() -> None:
-    steady, scattering = believing(), believing()
+    steady, scattering = new_estimate(), new_estimate()
     steady.expect_link(Estimate(0.2, 0.001))
     scattering.expect_link(Estimate(0.2, 0.03))
     assert scattering.cautious_radps < 0.9 * steady.cautious_radps

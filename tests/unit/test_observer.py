@@ -53,7 +53,7 @@ def command(north: float, east: float, thrust: float = G, course: float = 0.0) -
 def hovering(
     settings: ObserverSettings | None = None, until_s: float = 5.0, vehicle: Vehicle = NO_DELAY
 ) -> Observer:
-    """An observer that has heard a perfect hover every 10 ms."""
+    """An observer after a perfect hover with telemetry every 10 ms."""
     observer = Observer(vehicle, settings or ObserverSettings())
     observer.on_command(0.0, LEVEL)
     for i in range(round(until_s / 0.01) + 1):
@@ -98,7 +98,7 @@ def follow(
 # ---------------------------------------------------------------- gains and motion
 
 
-def test_steady_gains_are_those_flown_on_px4() -> None:
+def test_steady_gains_equal_those_flown_on_px4() -> None:
     """Per 10 ms with the velocity ignored (its sd 1 m/s): p .36, v 7.87, d 5.97 from position;
     b .62, b' 28.2 from b. Found by disturbing one message by a little."""
     settings = ObserverSettings(velocity_sd_mps=1.0)
@@ -186,7 +186,7 @@ def test_prediction_is_exact_on_a_matching_plant(about_rad: float) -> None:
         assert apart == pytest.approx(0.0, abs=1e-3)
 
 
-def test_a_command_shows_in_the_prediction_only_after_its_delay() -> None:
+def test_command_changes_the_prediction_only_after_its_delay() -> None:
     observer = hovering(until_s=1.0, vehicle=PX4)
     before = observer.predict(1.0)
     observer.on_command(1.0, command(0.3, 0.0))
@@ -197,7 +197,7 @@ def test_a_command_shows_in_the_prediction_only_after_its_delay() -> None:
     assert later.thrust_direction_ned[0] == pytest.approx(expected, rel=0.3)
 
 
-def test_the_vertical_is_predicted_to_when_the_thrust_acts() -> None:
+def test_vertical_is_predicted_to_the_time_when_the_thrust_acts() -> None:
     """Falling at 2 m/s with thrust delay 15 ms, tilt delay 57 ms: two times, two heights."""
     observer = Observer(PX4, ObserverSettings())
     thrust = G - 1.02 * 2.0
@@ -215,7 +215,7 @@ def test_the_vertical_is_predicted_to_when_the_thrust_acts() -> None:
     assert state.heave.thrust_down_mps2 == pytest.approx(thrust, abs=1e-6)
 
 
-# ---------------------------------------------------------------- what is learned
+# ---------------------------------------------------------------- disturbance and bias
 
 
 @pytest.mark.parametrize("gap_s", [0.01, 0.033, 0.05])
@@ -245,7 +245,7 @@ def test_disturbance_and_velocity_converge_at_any_rate(
         assert observer.velocity_bias_ned_mps == pytest.approx([0.3, -0.2, 0.25], abs=0.02)
 
 
-def test_reported_velocity_is_taken_raw_only_when_asked() -> None:
+def test_reported_velocity_is_used_as_it_is_only_if_configured() -> None:
     wrong = (0.3, 0.0, -0.2)
     raw = hovering(ObserverSettings(velocity=VelocitySource.REPORTED))
     raw.on_position(5.01, STILL, wrong)
@@ -256,8 +256,8 @@ def test_reported_velocity_is_taken_raw_only_when_asked() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.85, 1.15])
-def test_hover_thrust_is_found_from_the_disturbance(scale: float) -> None:
-    """A believed hover thrust of u_h, a true one of u_h / scale: u_h (1 + d_z / g)."""
+def test_hover_thrust_is_estimated_from_the_disturbance(scale: float) -> None:
+    """The vehicle file has a hover thrust of u_h, the plant u_h / scale: u_h (1 + d_z / g)."""
     plant = Plant(Truth(PX4, thrust_scale=scale, noisy=False), np.random.default_rng(0))
     observer = Observer(PX4, ObserverSettings())
     sent = command(0.0, 0.0, G / scale)
@@ -292,7 +292,7 @@ def test_disturbance_is_bounded() -> None:
 # ---------------------------------------------------------------- ground, gaps, jumps
 
 
-def test_frozen_nothing_integrates() -> None:
+def test_frozen_observer_integrates_nothing() -> None:
     observer = hovering(vehicle=PX4)
     observer.freeze(True)
     observer.on_command(5.0, command(0.3, 0.0, 1.5 * G))
@@ -311,7 +311,7 @@ def test_frozen_nothing_integrates() -> None:
     for message in (1, 2, 3):
         observer.on_attitude(7.05 + 0.01 * message, tuple(tilted), STILL)
         observer.on_position(7.05 + 0.01 * message, (1.0, 2.0, -0.1), (0.2, 0.0, -0.1))
-    assert observer.predict(7.08).thrust_direction_ned[0] > 0.13  # now it follows the command
+    assert observer.predict(7.08).thrust_direction_ned[0] > 0.13  # now it responds to the command
 
 
 def test_old_and_repeated_messages_are_dropped_and_counted() -> None:
@@ -325,7 +325,7 @@ def test_old_and_repeated_messages_are_dropped_and_counted() -> None:
     assert np.array_equal(before.position_ned_m, after.position_ned_m)
 
 
-def test_a_slightly_older_stream_is_used_at_its_own_time() -> None:
+def test_position_older_than_the_attitude_is_used_at_its_own_time() -> None:
     """Position stamped 8 ms before the newest attitude, at 3 m/s: no error of 24 mm."""
     observer = Observer(NO_DELAY, ObserverSettings())
     observer.on_command(0.0, command(-1.02 * 3.0 / G, 0.0))
@@ -348,7 +348,7 @@ def test_a_position_jump_is_followed_without_a_velocity_kick() -> None:
     assert observer.position_jumps == 1
     assert state.position_ned_m == pytest.approx([2.0, -1.0, 0.0], abs=1e-6)
     assert state.velocity_ned_mps == pytest.approx([0, 0, 0], abs=1e-6)
-    # the next message counts for little: where it is now says nothing of how fast it is
+    # the next message has little effect: the jump says nothing of the velocity
     observer.on_position(5.02, (2.01, -1.0, 0.0), STILL)
     undisturbed = hovering()
     undisturbed.on_position(5.01, STILL, STILL)
@@ -357,7 +357,7 @@ def test_a_position_jump_is_followed_without_a_velocity_kick() -> None:
     assert 0 < kick < 0.6 * undisturbed.predict(5.02).velocity_ned_mps[0]
 
 
-def test_a_velocity_jump_is_put_into_the_bias() -> None:
+def test_velocity_jump_is_added_to_the_bias() -> None:
     observer = hovering()
     observer.on_position(5.01, STILL, (0.0, 2.0, 0.0))
     assert observer.velocity_jumps == 1
@@ -366,7 +366,7 @@ def test_a_velocity_jump_is_put_into_the_bias() -> None:
 
 
 def test_a_gap_of_half_a_second_is_replayed() -> None:
-    """Nothing heard while a tilt command acts: the position is where the plant went."""
+    """No telemetry while a tilt command acts: the predicted position is that of the plant."""
     plant = Plant(Truth(PX4, noisy=False), np.random.default_rng(0))
     observer = Observer(PX4, ObserverSettings())
     plant.command(LEVEL)
@@ -388,7 +388,7 @@ def test_a_gap_of_half_a_second_is_replayed() -> None:
     assert corrected.velocity_ned_mps == pytest.approx(plant.x[3:6], abs=0.01)
 
 
-def test_a_long_silence_is_a_new_start_that_keeps_the_disturbance() -> None:
+def test_restart_after_a_long_gap_keeps_the_disturbance() -> None:
     observer = Observer(NO_DELAY, ObserverSettings())
     observer.on_command(0.0, LEVEL)
     assert not observer.ready
@@ -397,7 +397,7 @@ def test_a_long_silence_is_a_new_start_that_keeps_the_disturbance() -> None:
         lateral = 0.5 * 0.01 * i / 1.02  # a push of .5 at its terminal speed
         observer.on_position(0.01 * i, (lateral, 0.0, 0.0), (0.5 / 1.02, 0.0, 0.0))
     assert observer.ready
-    observer.on_position(9.0, (7, 7, -7), (1, 0, 0))  # whole numbers are numbers too
+    observer.on_position(9.0, (7, 7, -7), (1, 0, 0))  # integers
     assert not observer.ready
     observer.on_attitude(9.0, UPRIGHT, STILL)
     state = observer.predict(9.0)
@@ -407,7 +407,7 @@ def test_a_long_silence_is_a_new_start_that_keeps_the_disturbance() -> None:
     assert state.disturbance_ned_mps2[0] == pytest.approx(0.5, abs=0.05)
 
 
-def test_a_rebooted_vehicle_is_a_new_start() -> None:
+def test_restart_after_a_reboot_of_the_vehicle() -> None:
     observer = hovering()
     observer.on_attitude(0.5, UPRIGHT, STILL)
     observer.on_position(0.5, (4.0, 0.0, 0.0), STILL)
@@ -417,8 +417,8 @@ def test_a_rebooted_vehicle_is_a_new_start() -> None:
     assert state.position_ned_m[0] == 4.0
 
 
-def test_everything_stays_finite_under_any_telemetry() -> None:
-    """Stutter, repeats, steps back, wild values: a minute of nonsense leaves numbers."""
+def test_state_is_finite_under_any_telemetry() -> None:
+    """Irregular, repeated and decreasing stamps, random values."""
     rng = np.random.default_rng(11)
     observer = Observer(PX4, ObserverSettings())
     time_s = 0.0

@@ -1,4 +1,4 @@
-"""What the observer learns of its own constants, against motions and noises made with NumPy."""
+"""Noise and drift that the observer estimates, against motions and noises made with NumPy."""
 
 from __future__ import annotations
 
@@ -56,13 +56,13 @@ def hover(seconds: float, gap_s: float, seed: int, drift: float = 0.0, kicks: fl
     return Hover(times, positions[rows], velocities[rows], disturbances[rows])
 
 
-def watch(
+def observe(
     flown: Hover,
     settings: ObserverSettings = SETTINGS,
     white: tuple[float, float] = (0.0, 0.0),
     adopted: bool = True,
 ) -> tuple[Observer, Array, Array]:
-    """An observer that has heard it all with white noise on position and velocity; believed
+    """An observer after telemetry of `flown` with white noise on position and velocity; estimated
     positions and disturbances (N, 3)."""
     rng = np.random.default_rng(99)
     observer = Observer(VEHICLE, settings)
@@ -75,105 +75,105 @@ def watch(
         velocity = flown.velocities[i] + white[1] * rng.standard_normal(3)
         observer.on_attitude(time_s, UPRIGHT, STILL)
         observer.on_position(time_s, tuple(position), tuple(velocity))
-        believed = observer.predict(time_s)
-        positions[i] = believed.position_ned_m
-        disturbances[i] = believed.disturbance_ned_mps2
+        state = observer.predict(time_s)
+        positions[i] = state.position_ned_m
+        disturbances[i] = state.disturbance_ned_mps2
     return observer, positions, disturbances
 
 
-def learnt(observer: Observer) -> Adaptation:
+def adaptation(observer: Observer) -> Adaptation:
     return observer._adaptation
 
 
 def rms(errors: Array, share: float = 0.5) -> float:
-    """Of the last `share` of the rows, per axis."""
+    """The RMS of the last `share` of the rows, per axis."""
     return float(np.sqrt(np.mean(errors[-round(share * len(errors)) :] ** 2)))
 
 
 @pytest.mark.parametrize("gap_s", [0.008, 0.02, 0.05])
 def test_white_noise_is_measured(gap_s: float) -> None:
-    """2 cm and 5 cm/s on a drifting hover, at 125, 50 and 20 Hz: found within a quarter."""
+    """2 cm and 5 cm/s on a drifting hover, at 125, 50 and 20 Hz: estimated within a quarter."""
     flown = hover(25.0, gap_s, seed=1, drift=0.1)
-    observer, _, _ = watch(flown, white=(0.02, 0.05))
-    assert learnt(observer).position_sd_m == pytest.approx(0.02, rel=0.25)
-    assert learnt(observer).velocity_sd_mps == pytest.approx(0.05, rel=0.25)
+    observer, _, _ = observe(flown, white=(0.02, 0.05))
+    assert adaptation(observer).position_sd_m == pytest.approx(0.02, rel=0.25)
+    assert adaptation(observer).velocity_sd_mps == pytest.approx(0.05, rel=0.25)
 
 
-def test_white_noise_is_smoothed_away() -> None:
-    """Of 2 cm per sample less than 0.6 cm are left; with the constants configured, half as much
-    again and more."""
+def test_white_noise_is_filtered() -> None:
+    """Noise of 2 cm per sample leaves less than 0.6 cm; with the configured constants it leaves at
+    least half as much again."""
     flown = hover(20.0, 0.01, seed=2, drift=0.05)
-    _, adapted, _ = watch(flown, white=(0.02, 0.02))
-    _, fixed, _ = watch(flown, SETTINGS.model_copy(update={"adaptive": False}), (0.02, 0.02))
+    _, adapted, _ = observe(flown, white=(0.02, 0.02))
+    _, fixed, _ = observe(flown, SETTINGS.model_copy(update={"adaptive": False}), (0.02, 0.02))
     assert rms(adapted - flown.positions) < 0.006
     assert rms(fixed - flown.positions) > 1.5 * rms(adapted - flown.positions)
 
 
-def test_an_estimate_that_wanders_is_not_noise_nor_gusts() -> None:
+def test_estimate_that_wanders_is_neither_noise_nor_gusts() -> None:
     """A velocity kicked as PX4's frame of reference is (0.2 m/s per root second), smooth from
     sample to sample: nothing is changed, on three seeds."""
     for seed in (3, 4, 5):
-        observer, _, _ = watch(hover(20.0, 0.008, seed=seed, kicks=0.2))
-        assert learnt(observer).position_sd_m < 1.1 * SETTINGS.position_sd_m
-        assert learnt(observer).velocity_sd_mps < 1.5 * SETTINGS.velocity_sd_mps
+        observer, _, _ = observe(hover(20.0, 0.008, seed=seed, kicks=0.2))
+        assert adaptation(observer).position_sd_m < 1.1 * SETTINGS.position_sd_m
+        assert adaptation(observer).velocity_sd_mps < 1.5 * SETTINGS.velocity_sd_mps
         floor = SETTINGS.disturbance_density_mps2
-        assert learnt(observer).densities_mps2 == pytest.approx([floor, floor], rel=0.3)
+        assert adaptation(observer).densities_mps2 == pytest.approx([floor, floor], rel=0.3)
 
 
 def test_gusts_are_followed_faster() -> None:
-    """A disturbance drifting by 0.7 m/s^2 per root second: both densities grow, and the believed
-    disturbance is off by less than 0.7 of what it is with the density configured."""
+    """A disturbance drifting by 0.7 m/s^2 per root second: both densities grow, and the estimated
+    disturbance has less than 0.7 of the error that the configured density gives."""
     flown = hover(20.0, 0.01, seed=6, drift=0.7)
-    observer, _, adapted = watch(flown)
-    _, _, fixed = watch(flown, SETTINGS.model_copy(update={"adaptive": False}))
-    assert min(learnt(observer).densities_mps2) > 0.5
+    observer, _, adapted = observe(flown)
+    _, _, fixed = observe(flown, SETTINGS.model_copy(update={"adaptive": False}))
+    assert min(adaptation(observer).densities_mps2) > 0.5
     assert rms(adapted - flown.disturbances) < 0.7 * rms(fixed - flown.disturbances)
 
 
-def test_the_density_falls_again_when_the_gusts_are_over() -> None:
+def test_density_falls_after_the_gusts() -> None:
     gusts = hover(15.0, 0.01, seed=7, drift=0.7)
-    observer, _, _ = watch(gusts)
-    grown = learnt(observer).densities_mps2.copy()
+    observer, _, _ = observe(gusts)
+    grown = adaptation(observer).densities_mps2.copy()
     for i in range(2000):
         time_s = 15.0 + 0.01 * i
         observer.on_attitude(time_s, UPRIGHT, STILL)
         observer.on_position(time_s, tuple(gusts.positions[-1]), STILL)
     assert grown[NORTH_EAST] > 0.5
-    assert learnt(observer).densities_mps2 == pytest.approx([0.15, 0.15])
+    assert adaptation(observer).densities_mps2 == pytest.approx([0.15, 0.15])
 
 
-def test_the_vertical_waits_until_the_thrust_is_known() -> None:
-    """A thrust that acts later than believed looks like drift."""
+def test_vertical_density_is_fixed_until_the_thrust_is_identified() -> None:
+    """Until then an error of the thrust's delay looks like drift."""
     flown = hover(15.0, 0.01, seed=8, drift=0.7)
-    observer, _, _ = watch(flown, adopted=False)
-    assert learnt(observer).densities_mps2[DOWN] == SETTINGS.disturbance_density_mps2
-    assert learnt(observer).densities_mps2[NORTH_EAST] > 0.5
+    observer, _, _ = observe(flown, adopted=False)
+    assert adaptation(observer).densities_mps2[DOWN] == SETTINGS.disturbance_density_mps2
+    assert adaptation(observer).densities_mps2[NORTH_EAST] > 0.5
 
 
-def test_a_jump_is_not_noise_and_hides_no_gusts() -> None:
+def test_jumps_are_not_noise_and_do_not_hide_gusts() -> None:
     """Fifteen resets of the estimator's position by 2 m in 15 s of gusts."""
     flown = hover(15.0, 0.01, seed=9, drift=0.7)
     jumps = 2.0 * np.cumsum(np.arange(len(flown.times)) % 100 == 50)[:, None]
-    observer, _, _ = watch(Hover(flown.times, flown.positions + jumps, *[flown.velocities] * 2))
+    observer, _, _ = observe(Hover(flown.times, flown.positions + jumps, *[flown.velocities] * 2))
     assert observer.position_jumps == 15
-    assert learnt(observer).position_sd_m == SETTINGS.position_sd_m
-    assert learnt(observer).densities_mps2[NORTH_EAST] > 0.5
+    assert adaptation(observer).position_sd_m == SETTINGS.position_sd_m
+    assert adaptation(observer).densities_mps2[NORTH_EAST] > 0.5
 
 
-def test_one_wrong_position_counts_for_little() -> None:
+def test_one_wrong_position_has_little_effect() -> None:
     """20 cm off, too little for a jump, in one message of a perfect hover."""
     flown = hover(5.0, 0.01, seed=11, drift=0.05)
     flown.positions[-3] += 0.2
-    observer, _, _ = watch(flown)
+    observer, _, _ = observe(flown)
     assert observer.position_jumps == 0
-    assert learnt(observer).position_sd_m < 1.5 * SETTINGS.position_sd_m
+    assert adaptation(observer).position_sd_m < 1.5 * SETTINGS.position_sd_m
 
 
-def test_learnt_constants_are_bounded_and_forgotten_by_a_reset() -> None:
+def test_estimates_are_bounded_and_cleared_by_a_reset() -> None:
     settings = SETTINGS.model_copy(update={"disturbance_density_limit_mps2": 0.4})
-    observer, _, _ = watch(hover(15.0, 0.01, seed=10, drift=2.0), settings, (0.05, 0.0))
-    assert learnt(observer).position_sd_m > 0.03
-    assert max(learnt(observer).densities_mps2) <= 0.4
+    observer, _, _ = observe(hover(15.0, 0.01, seed=10, drift=2.0), settings, (0.05, 0.0))
+    assert adaptation(observer).position_sd_m > 0.03
+    assert max(adaptation(observer).densities_mps2) <= 0.4
     observer.reset()
-    assert learnt(observer).position_sd_m == SETTINGS.position_sd_m
-    assert learnt(observer).densities_mps2 == pytest.approx([0.15, 0.15])
+    assert adaptation(observer).position_sd_m == SETTINGS.position_sd_m
+    assert adaptation(observer).densities_mps2 == pytest.approx([0.15, 0.15])

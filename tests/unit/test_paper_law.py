@@ -7,12 +7,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from offboard.control.base import DecisionError, Situation
 from offboard.control.swarm import SwarmSettings
+from offboard.documents.reading import parse
 from offboard.model.command import Command
 from offboard.model.linear import hover_matrices, sampled_matrices
 from offboard.model.predicted_state import PredictedState
@@ -32,7 +32,7 @@ from offboard.reference.base import FlatSample
 Array = NDArray[np.float64]
 
 FILES = sorted((Path(__file__).parents[2] / "config" / "vehicles").glob("*.yaml"))
-VEHICLES = {path.stem: Vehicle(**yaml.safe_load(path.read_text())) for path in FILES}
+VEHICLES = {path.stem: parse(path.read_text(), Vehicle, path.stem) for path in FILES}
 PAPER = VEHICLES["paper"]
 
 
@@ -90,7 +90,7 @@ def tilted(course: float) -> tuple[PredictedState, Straight]:
 
 
 def closed_loop_eigenvalues(settings: PaperSettings, dear_inputs: bool = True) -> Array:
-    """Of [x, u(k-1)] under the unconstrained minimiser of Eq. 21."""
+    """Eigenvalues of [x, u(k-1)] under the unconstrained minimiser of Eq. 21."""
     dynamics, inputs = sampled_matrices(PAPER, 0.1)
     energy, rate = np.diag(settings.energy), np.diag(settings.rate)
     step = OneStep(
@@ -348,11 +348,11 @@ def test_flights_with_the_same_seed_decide_the_same() -> None:
     state, reference = tilted(1.0)
     situation = Situation(0.0, state, reference, HOVER)
     few = SwarmSettings(iterations=10)
-    controller, twin, other = (
+    controller, same_seed, other = (
         PaperController(PAPER, PaperSettings(swarm=few), seed=seed) for seed in (1, 1, 2)
     )
     first, second = (controller.decide(situation).command for _ in range(2))
-    assert [twin.decide(situation).command for _ in range(2)] == [first, second]
+    assert [same_seed.decide(situation).command for _ in range(2)] == [first, second]
     assert first != second
     assert other.decide(situation).command != first
     controller.reset()

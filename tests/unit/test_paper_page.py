@@ -41,6 +41,26 @@ def test_the_page_opens_without_an_error_and_without_the_network(opened: Opened)
     assert opened.fetched == []
 
 
+@pytest.mark.parametrize("scheme", ["dark", "light"])
+def test_every_text_is_readable_after_a_switch_of_the_colour_scheme(
+    opened: Opened, scheme: str
+) -> None:
+    opened.switch(scheme)
+    assert opened.unreadable() == []
+    assert opened.problems == []
+
+
+def test_the_page_fits_a_narrow_window(opened: Opened) -> None:
+    opened.resize(400)
+    try:
+        assert opened.width_px() == 400
+        assert opened.colliding() == []
+    finally:
+        opened.resize(1280)
+    assert opened.colliding() == []
+    assert opened.problems == []
+
+
 def test_every_figure_is_drawn(opened: Opened) -> None:
     drawn = opened.page.evaluate(
         "[...document.querySelectorAll('.figure')].map(f => [f.id.replace('figure_', ''), "
@@ -85,14 +105,14 @@ def test_absent_peers_are_listed_as_absent(run: Outcome) -> None:
 
 
 def test_the_swarm_reaches_the_optimum_within_the_papers_budget() -> None:
-    heats = peers.race("this swarm, λ = 0.65", PaperOptions(Path()).first_settings, 3)
-    assert heats[-1].budget == 6000
-    assert heats[-1].gap_p90 <= 1e-9
-    assert heats[0].gap_median > 1e-6
+    measured = peers.measure("this swarm, λ = 0.65", PaperOptions(Path()).first_settings, 3)
+    assert measured[-1].budget == 6000
+    assert measured[-1].gap_p90 <= 1e-9
+    assert measured[0].gap_median > 1e-6
 
 
 def test_a_peer_whose_package_is_missing_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(peers, "_PACKAGES", {"CMA-ES": "no_such_package_anywhere"})
     assert peers.absent() == ["CMA-ES"]
     assert "CMA-ES" not in peers.present()
-    assert "CMA-ES: absent" in str(peers.peers_table([]).rows[0]["solver"])
+    assert "CMA-ES: absent" in str(peers.peers_table({}).rows[0]["solver"])

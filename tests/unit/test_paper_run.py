@@ -30,8 +30,8 @@ def quietly(options: PaperOptions) -> Outcome:
 @pytest.mark.parametrize(
     ("changes", "sentence"),
     [
-        ({"figures": ("3",)}, "there is no figure '3'; known are 4, 5"),
-        ({"tables": ("1",)}, "there is no table '1'; known are 2, 3, 4, bd"),
+        ({"figures": ("3",)}, "there is no figure '3'; known are gap, 4, 5"),
+        ({"tables": ("1",)}, "there is no table '1'; known are 2, 3, 4, errata"),
         ({"seeds": 0}, "seeds must be 1 .. 10000, not 0"),
         ({"workers": 0}, "workers must be 1 or more, not 0"),
         ({"initial_q": (1.0, 2.0)}, "the initial Q takes 1 or 12 weights, not 2"),
@@ -65,7 +65,8 @@ def test_initial_q_reaches_the_first_configuration(tmp_path: Path) -> None:
 
 def test_names_pick_pieces_and_nothing_else(tmp_path: Path) -> None:
     everything = PaperOptions(tmp_path)
-    assert (everything.wanted_figures, everything.wanted_tables) == (FIGURES, TABLES)
+    wanted = [f"table {name}" for name in TABLES] + [f"figure {name}" for name in FIGURES]
+    assert list(everything.labels) == wanted
     outcome = quietly(PaperOptions(tmp_path, figures=("5",), tables=("bd",), workers=1))
     assert outcome.finished == ["table bd", "figure 5"]
     assert not outcome.missing

@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import yaml
 from numpy.polynomial import Chebyshev
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
+from offboard.documents.reading import parse, read
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import FlatSample
 from offboard.reference.course import HOLD_SPEED_MPS, AlongVelocity, Fixed, along_velocity
@@ -46,7 +46,7 @@ def track_of(shape: str, course: str, **settings: object) -> Track:
 
 def shipped(name: str) -> Track:
     text = (CONFIG / "references" / f"{name}.yaml").read_text()
-    settings = yaml.safe_load(text)
+    settings = read(text, name)
     return SHAPES[settings["shape"]](**settings).track()
 
 
@@ -199,7 +199,7 @@ def test_shipped_peak_speeds(name: str, peak_mps: float) -> None:
 @pytest.mark.parametrize("vehicle", sorted(p.stem for p in (CONFIG / "vehicles").glob("*.yaml")))
 def test_shipped_references_are_feasible(name: str, vehicle: str) -> None:
     text = (CONFIG / "vehicles" / f"{vehicle}.yaml").read_text()
-    envelope = check(shipped(name), Vehicle.model_validate(yaml.safe_load(text)))
+    envelope = check(shipped(name), parse(text, Vehicle, vehicle))
     assert envelope.tilt_max_rad < 0.62
     assert envelope.height_min_m == pytest.approx(5.0 if name == "lemniscate_4mps" else 3.0)
 

@@ -177,7 +177,7 @@ class Planner:
 
 
 def lowest_cost(plans: Sequence[Plan]) -> float:
-    """Of the plans that a search starts from. Raises DecisionError where it is not finite."""
+    """The lowest cost of these plans. Raises DecisionError where it is not finite."""
     lowest = min(plan.cost for plan in plans)
     if not math.isfinite(lowest):
         raise DecisionError("no plan over the horizon has a finite cost")

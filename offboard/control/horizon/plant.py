@@ -97,7 +97,7 @@ def plant_of(
 
 def _pushes(drag: float, period_s: float) -> dict[str, float]:
     def carried(after_s: float) -> float:
-        """Of a push, what is left as position after a time in drag, per unit."""
+        """The distance that a unit of velocity leads to in this time, against the drag."""
         return -math.expm1(-drag * after_s) / drag if drag > 0 else after_s
 
     return {

@@ -49,8 +49,8 @@ _UNIT_31 = 2.0**-31  # one draw gives two uniform numbers of 31 bits in [0, 1)
 
 @kernel
 def _next(x: np.uint64) -> np.uint64:
-    """Of a lane, by xorshift. What is drawn from it is not made here: the loops over kernels that
-    return two numbers are not vectorised."""
+    """The next state of a random lane (xorshift). The callers turn it into numbers, because loops
+    over kernels that return two values are not vectorised."""
     x ^= x << _SHIFT_A
     x ^= x >> _SHIFT_B
     x ^= x << _SHIFT_C

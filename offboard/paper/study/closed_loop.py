@@ -1,12 +1,12 @@
-"""One flight of the paper's loop: law, plant and reference, step by step, every step certified.
+"""One flight of the paper's loop: law, plant and reference, with a certificate for every step.
 
-A `FlightTask` is everything that decides a flight, and small enough to be sent to another process;
-`fly` is a function of it alone. Knows neither which flights a table needs nor how they are shown.
+A `FlightTask` contains everything that determines a flight and is small enough to send to another
+process; `fly` depends on nothing else.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from enum import StrEnum
 
 import numpy as np
@@ -24,32 +24,30 @@ from offboard.paper.law import PAPER_STEP_S, PaperLaw, PaperSettings
 from offboard.paper.plant import PLANTS, PlantKind, paper_model, paper_vehicle
 from offboard.paper.trajectory import (
     PathName,
-    Reach,
+    SampledPath,
+    heading_states,
     linear_states,
     nominal_inputs,
-    reach,
-    turned_states,
+    sampled_path,
 )
 from offboard.reference.base import FlatSample
 
 Array = NDArray[np.float64]
 
-# Eq. 31, in the order of Tables 3 and 4: u v w x y z psi
-TRACKED = (6, 7, 8, 9, 10, 11, PSI)
-_STILL = np.zeros(3)
+TRACKED = (*range(U, Z + 1), PSI)  # Eq. 31, in the order of Tables 3 and 4: u v w x y z psi
 
 
 class LawName(StrEnum):
     """The laws compared."""
 
     ONE_STEP = "one step"  # Eq. 21
-    COST_TO_GO = "cost-to-go"  # the Riccati solution in the place of Q, a consistent reference
+    COST_TO_GO = "cost-to-go"  # the Riccati solution replaces Q; the reference is consistent
 
 
 @dataclass(frozen=True, slots=True)
 class FlightTask:
-    """`start_offset_m` is where the flight starts from the reference's start, NED; `thrust_loss`
-    the fraction of thrust that rotors fall short of."""
+    """`start_offset_m` is the start relative to the reference's start, NED; `thrust_loss` the
+    missing fraction of the total thrust."""
 
     settings: PaperSettings
     plant: PlantKind = PlantKind.LINEAR
@@ -64,18 +62,25 @@ class FlightTask:
 
 @dataclass(frozen=True, slots=True)
 class Flight:
-    """K steps. `states` (K + 1, 12) with velocities u, v, w in NED (on the nonlinear plant turned
-    from the body), `tracked` (K + 1, 12) the reference likewise, `inputs` (K, 4) from hover.
-    (K,): `costs` J, `spreads` epsilon, `gaps` (certificate), `solve_s`.
+    """K steps. `states` and the reference `tracked` (K + 1, 12) with velocities u, v, w in NED;
+    `inputs` (K, 4) relative to hover. Per step (K,): `costs` J and their part weighed by R and
+    R_du, `spreads` epsilon, `gaps` to the exact optimum, `solve_s`.
     """
 
     states: Array
     tracked: Array
     inputs: Array
     costs: Array
+    signal_costs: Array
     spreads: Array
     gaps: Array
     solve_s: Array
+
+    @property
+    def times_s(self) -> Array:
+        """(K + 1,) from 0."""
+        times: Array = PAPER_STEP_S * np.arange(len(self.states), dtype=np.float64)
+        return times
 
     @property
     def errors(self) -> Array:
@@ -92,116 +97,87 @@ class Flight:
         return distances
 
 
-@dataclass(frozen=True, slots=True)
-class Summary:
-    """What a table needs of a flight: `errors` (8,), `cost` J summed over the path, `signal_cost`
-    the part of it that R and R_du weigh; `spreads`, `gaps`, `solve_s` (K,)."""
-
-    errors: Array
-    cost: float
-    signal_cost: float
-    spreads: Array
-    gaps: Array
-    solve_s: Array
-
-
-def summarised(task: FlightTask) -> Summary:
-    """Fly `task` and keep only what a table needs."""
-    flight = fly(task)
-    steps = np.diff(np.vstack([np.zeros(4), flight.inputs]), axis=0)
-    signal = np.sum(flight.inputs**2 @ task.settings.energy) + np.sum(steps**2 @ task.settings.rate)
-    return Summary(
-        flight.errors, float(flight.costs.sum()), float(signal),
-        flight.spreads, flight.gaps, flight.solve_s,
-    )  # fmt: skip
-
-
 def fly(task: FlightTask) -> Flight:
-    """Fly `task`; the same task gives the same flight, solve times apart."""
+    """Fly `task`; the same task gives the same flight, except for the solve times."""
     plant = PLANTS[task.plant](np.array(task.wind_ned_mps), task.thrust_loss)
-    way = reach(task.path, task.steps)
-    pilot = _Pilot(task, way)
-    state = way.tracked[0].copy()
+    path = sampled_path(task.path, task.steps)
+    controller = _Controller(task, path)
+    state = path.tracked[0].copy()
     state[X : Z + 1] += task.start_offset_m
     if task.law is LawName.COST_TO_GO:
-        state[:PSI] = pilot.consistent[0][:PSI]
+        state[:PSI] = controller.consistent[0][:PSI]
     states, inputs = [state], []
     for k in range(task.steps):
-        inputs.append(pilot.inputs(k, state))
-        state = plant.following(state, inputs[-1])
+        inputs.append(controller.inputs(k, state))
+        state = plant.next_state(state, inputs[-1])
         states.append(state)
-    shown = np.array(states)
+    flown = np.array(states)
     if task.plant is PlantKind.NONLINEAR:
-        shown[:, U : W + 1] = _velocity_ned(shown)
-    return Flight(shown, way.tracked, np.array(inputs), *np.array(pilot.figures).T)
+        flown[:, U : W + 1] = _velocity_ned(flown)
+    applied = np.array(inputs)
+    changes = np.diff(applied, axis=0, prepend=0.0)
+    signal_costs = applied**2 @ task.settings.energy + changes**2 @ task.settings.rate
+    costs, *figures = np.array(controller.figures).T
+    return Flight(flown, path.tracked, applied, costs, signal_costs, *figures)
 
 
-class _Pilot:
-    """The law, what it is shown of the state, and the figures of every decision."""
+class _Controller:
+    """The law of a task. `consistent` (K + 1, 12) are the states that the plant's model has when
+    it follows the reference; `figures` cost, spread, gap and solve time of every step."""
 
-    def __init__(self, task: FlightTask, way: Reach) -> None:
-        vehicle = paper_vehicle()
+    def __init__(self, task: FlightTask, path: SampledPath) -> None:
+        vehicle, settings = paper_vehicle(), task.settings
         self._dynamics, self._inputs = paper_model()
-        self._way = way
+        self._path = path
         self._nonlinear = task.plant is PlantKind.NONLINEAR
-        lower, upper = flyable_box(vehicle, task.settings) if self._nonlinear else (None, None)
-        terminal = None
+        lower, upper = flyable_box(vehicle, settings) if self._nonlinear else (None, None)
+        self._terminal = None
         if task.law is LawName.COST_TO_GO:
-            terminal = cost_to_go(
-                self._dynamics,
-                self._inputs,
-                np.diag(task.settings.fitness),
-                np.diag(task.settings.energy),
-            )
-        self._terminal = terminal
+            weights = np.diag(settings.fitness), np.diag(settings.energy)
+            self._terminal = cost_to_go(self._dynamics, self._inputs, *weights)
         self._law = PaperLaw(
-            self._dynamics, self._inputs, task.settings, lower, upper, terminal, seed=task.seed
+            self._dynamics, self._inputs, settings, lower, upper, self._terminal, seed=task.seed
         )
-        self._integral = (
-            ErrorIntegral(task.settings.integral, PAPER_STEP_S) if task.settings.integral else None
-        )
-        self._held = False
+        integral = settings.integral
+        self._integral = ErrorIntegral(integral, PAPER_STEP_S) if integral else None
+        self._at_bound = False
         self._exact = ExactMinimum(4)
-        complete = turned_states if self._nonlinear else linear_states
-        self.consistent = complete(way.samples, vehicle)
-        self._nominal = nominal_inputs(self.consistent, way.samples, vehicle, self._nonlinear)
+        complete = heading_states if self._nonlinear else linear_states
+        self.consistent = complete(path.samples, vehicle)
+        self._nominal = nominal_inputs(self.consistent, path.samples, vehicle, self._nonlinear)
         self.figures: list[tuple[float, float, float, float]] = []
 
     def inputs(self, k: int, state: Array) -> Array:
         """u(k) (4,) for the plant's state x(k) (12,)."""
-        reference_next, nominal = self._target(k, state)
-        seen = self._seen(state, k if self._terminal is not None else k + 1)[0]
-        summed = self._summed(k, state)
+        integral = self._summed_error(k, state)
+        nominal = None
+        seen, target = self._in_axes_of_the_law(state, k + 1)
+        if self._terminal is not None:  # needs a reference that the model itself can follow
+            seen, _ = self._in_axes_of_the_law(state, k)
+            nominal = self._nominal[k]
+            target = self._dynamics @ self.consistent[k] + self._inputs @ nominal
         started = monotonic_s()
-        move = self._law.move(seen, reference_next, integral=summed, nominal=nominal)
+        move = self._law.move(seen, target, integral=integral, nominal=nominal)
         elapsed_s = monotonic_s() - started
         certificate = certify(move.problem, move.result, self._exact)
-        self._held = certificate.at_bound
+        self._at_bound = certificate.at_bound
         self.figures.append((certificate.cost, certificate.spread, certificate.gap, elapsed_s))
         return move.inputs
 
-    def _target(self, k: int, state: Array) -> tuple[Array, Array | None]:
-        """x_ref(k+1) (12,), and u_nom (4,) where it is not hover.
-
-        The cost-to-go wants a reference that the model itself follows: x_ref(k) one step on.
-        """
-        if self._terminal is None:
-            return self._seen(state, k + 1)[1], None
-        ahead = self._dynamics @ self.consistent[k] + self._inputs @ self._nominal[k]
-        return ahead, self._nominal[k]
-
-    def _seen(self, state: Array, k: int) -> tuple[Array, Array]:
-        """State and reference (12,) as the law is shown them: as they are on the linear plant,
-        in the heading frame and counted from sample k on the nonlinear one."""
+    def _in_axes_of_the_law(self, state: Array, k: int) -> tuple[Array, Array]:
+        """State and reference k (12,): unchanged on the linear plant; in the heading frame and
+        relative to sample k on the nonlinear one."""
         if not self._nonlinear:
-            return state, self._way.tracked[k]
-        return heading_frame(_predicted(state), _at(self._way.samples, k))
+            return state, self._path.tracked[k]
+        samples = self._path.samples
+        sample = FlatSample(*(getattr(samples, field.name)[k] for field in fields(samples)))
+        return heading_frame(_predicted(state), sample)
 
-    def _summed(self, k: int, state: Array) -> Array | None:
+    def _summed_error(self, k: int, state: Array) -> Array | None:
         if not self._integral:
             return None
-        off = (state - self._way.tracked[k])[list(INTEGRATED)]
-        summed = self._integral.add(off, self._held).copy()
+        off = (state - self._path.tracked[k])[list(INTEGRATED)]
+        summed = self._integral.add(off, self._at_bound).copy()
         if self._nonlinear:
             cosine, sine = np.cos(state[PSI]), np.sin(state[PSI])
             north, east = summed[0], summed[1]
@@ -210,11 +186,12 @@ class _Pilot:
 
 
 def _predicted(state: Array) -> PredictedState:
-    """The plant's state (12,) as a controller is shown it."""
+    """The plant's state (12,) in the form that a controller gets."""
     rotation = rotation_from_quaternion(quaternion_from_euler(*state[PHI : PSI + 1]))
+    still = np.zeros(3)
     return PredictedState(
-        0.0, state[X : Z + 1], rotation @ state[U : W + 1], rotation[:, 2], _STILL,
-        float(state[PSI]), 0.0, 0.0, _STILL, state[P : R + 1],
+        0.0, state[X : Z + 1], rotation @ state[U : W + 1], rotation[:, 2], still,
+        float(state[PSI]), 0.0, 0.0, still, state[P : R + 1],
     )  # fmt: skip
 
 
@@ -224,11 +201,3 @@ def _velocity_ned(states: Array) -> Array:
     rotation = rotation_from_quaternion(quaternion_from_euler(*angles))
     velocity: Array = np.einsum("...ij,...j->...i", rotation, states[..., EULER.velocity])
     return velocity
-
-
-def _at(samples: FlatSample, k: int) -> FlatSample:
-    return FlatSample(
-        samples.position_ned_m[k], samples.velocity_ned_mps[k], samples.acceleration_ned_mps2[k],
-        samples.jerk_ned_mps3[k], samples.snap_ned_mps4[k], samples.course_rad[k],
-        samples.course_rate_radps[k], samples.course_acceleration_radps2[k],
-    )  # fmt: skip

@@ -1,11 +1,14 @@
-"""Counterparts of the paper's Figs. 4-17, from flights and searches. Knows no page."""
+"""Figures 4 to 17 of the paper, from flights and searches computed here."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
+import plotly.graph_objects as go
 from numpy.typing import NDArray
+from plotly.subplots import make_subplots
 
 from offboard.analysis.figure import (
     BLUE,
@@ -13,187 +16,179 @@ from offboard.analysis.figure import (
     GREY,
     INK,
     RED,
+    STYLE,
     Figure,
-    Trace,
-    axis,
-    line,
+    coordinates,
+    curve,
     panels,
-    single,
 )
+from offboard.control.certificate import ExactMinimum
+from offboard.control.swarm import QuadraticSwarm, RandomLanes
 from offboard.model.state import PSI, U, X
-from offboard.paper.law import PAPER_STEP_S
+from offboard.paper.law import PaperSettings
 from offboard.paper.plant import PlantKind
 from offboard.paper.study.closed_loop import Flight
-from offboard.paper.study.search import SHOWN_ITERATIONS, Search
-from offboard.paper.trajectory import Reach
+from offboard.paper.study.peers import problems
+from offboard.paper.study.printed import BEST_DAMPING, TABLE_2, UNDAMPED
+from offboard.paper.trajectory import PathName, sampled_path
 
 Array = NDArray[np.float64]
 
-_INPUT_TITLES = ("f_t, N", "τ_x, N", "τ_y, N", "τ_z, N m")
-_VELOCITY_TITLES = ("u, m/s", "v, m/s", "w, m/s")
-_POSITION_TITLES = ("x, m", "y, m", "z, m", "ψ, °")
+SHOWN_ITERATIONS = (1, 5, 20, 150)  # Fig. 4 a-d
+UNDAMPED_FLIGHT = "λ = 1, first weights"
+DAMPED_FLIGHT = "λ = 0.65, first weights"
+FINAL_FLIGHT = "λ = 0.65, Eqs. 33-35"
+
+DASHES = {PlantKind.LINEAR: "solid", PlantKind.NONLINEAR: "dot"}
 _COLOURS = {PlantKind.LINEAR: BLUE, PlantKind.NONLINEAR: RED}
-Flown = Mapping[PlantKind, Flight]
+_CONTROLS, _VELOCITIES, _POSITIONS, _SPREADS = "controls", "u, v, w", "x, y, z, ψ", "ε"
+_PANELS = {
+    _CONTROLS: ("f_t, N", "τ_x, N", "τ_y, N", "τ_z, N m"),
+    _VELOCITIES: ("u, m/s", "v, m/s", "w, m/s"),
+    _POSITIONS: ("x, m", "y, m", "z, m", "ψ, °"),
+    _SPREADS: ("ε",),
+}
+_UNDAMPED, _BEST = TABLE_2[UNDAMPED], TABLE_2[BEST_DAMPING]
+# Number -> flight (on both plants), what is shown of it, caption
+FLOWN = {
+    7: (UNDAMPED_FLIGHT, _CONTROLS, "The distortion that the paper describes: the undamped swarm "
+        "ends anywhere in a flat valley of the cost."),
+    8: (UNDAMPED_FLIGHT, _VELOCITIES, "The states follow nevertheless: the plant filters the "
+        "noise."),
+    9: (UNDAMPED_FLIGHT, _POSITIONS, "Positions lag by tens of metres: with Q = I the cost of one "
+        "step hardly depends on them."),
+    10: (UNDAMPED_FLIGHT, _SPREADS, f"ε at λ = 1; printed mean {_UNDAMPED.mean:.4f}, least "
+         f"{_UNDAMPED.least:.4f}, greatest {_UNDAMPED.greatest:.4f}."),
+    11: (DAMPED_FLIGHT, _SPREADS, f"ε at λ = 0.65; printed mean {_BEST.mean:.4e}. Its floor is "
+         "the rounding of J, not the swarm."),
+    12: (DAMPED_FLIGHT, _CONTROLS, "The same flight with λ = 0.65: smooth."),
+    13: (DAMPED_FLIGHT, _VELOCITIES, "Hardly different from Fig. 8, as in the paper."),
+    14: (DAMPED_FLIGHT, _POSITIONS, "Hardly different from Fig. 9, as in the paper."),
+    15: (FINAL_FLIGHT, _CONTROLS, "Weights of Eqs. 33-35."),
+    16: (FINAL_FLIGHT, _VELOCITIES, "Velocities now follow the reference closely."),
+    17: (FINAL_FLIGHT, _POSITIONS, "The steady error that the conclusions mention: a time constant "
+         "of 39 s. On the nonlinear plant tilt reduces the lift, which adds a height error."),
+}  # fmt: skip
 
 
-def search_motion(searches: Sequence[Search]) -> Figure:
+@dataclass(frozen=True, slots=True)
+class Search:
+    """Positions (4 shown iterations, particles, 4), box lower, upper (4,), optimum u* (4,)."""
+
+    positions: Array
+    lower: Array
+    upper: Array
+    optimum: Array
+
+
+def search(settings: PaperSettings) -> Search:
+    """A search of the swarm of `settings` midway along the path of Figs. 5-6."""
+    problem = problems(3, settings)[1]
+    swarm = QuadraticSwarm(settings.swarm, 4)
+    history = swarm.minimise(problem, RandomLanes(0), keep_history=True).history
+    assert history is not None
+    picked = np.minimum(SHOWN_ITERATIONS, len(history.positions)) - 1
+    optimum = ExactMinimum(4).minimise(problem)
+    return Search(history.positions[picked], problem.lower, problem.upper, optimum)
+
+
+def search_motion(searches: Mapping[float, Search]) -> Figure:
     """Fig. 4: the particles in [f_t, tau_x], one row per lambda, four iterations each."""
-    traces: list[Trace] = []
-    layout: dict[str, object] = {"height": 90 + 250 * len(searches), "showlegend": False}
-    notes = []
-    wide, tall = 1.0 / len(SHOWN_ITERATIONS), 1.0 / len(searches)
-    for row, found in enumerate(searches):
-        for column, iteration in enumerate(SHOWN_ITERATIONS):
-            panel = row * len(SHOWN_ITERATIONS) + column + 1
-            traces += _cloud(found, column, panel)
-            left, bottom = column * wide, 1.0 - (row + 1) * tall
-            number = "" if panel == 1 else str(panel)
-            below = {"text": "f_t, N" if found is searches[-1] else "", "standoff": 4}
-            layout[f"xaxis{number}"] = {
-                "domain": [left + 0.035, left + wide - 0.01], "anchor": axis("y", panel),
-                "range": _padded(found.lower[0], found.upper[0]), "title": below,
-                "gridcolor": "#e4e7eb", "zeroline": False,
-            }  # fmt: skip
-            layout[f"yaxis{number}"] = {
-                "domain": [bottom + 0.04, bottom + tall - 0.06], "anchor": axis("x", panel),
-                "range": _padded(found.lower[1], found.upper[1]), "gridcolor": "#e4e7eb",
-                "zeroline": False, **({"title": {"text": "τ_x, N"}} if column == 0 else {}),
-            }  # fmt: skip
-            notes.append(
-                {
-                    "text": f"{'abcd'[column]})  λ = {found.damping:g}, iteration {iteration}",
-                    "x": left + 0.035, "y": bottom + tall - 0.05, "xref": "paper",
-                    "yref": "paper", "showarrow": False, "xanchor": "left", "yanchor": "bottom",
-                }
-            )  # fmt: skip
-    layout["annotations"] = notes
-    caption = "Dots: particles; cross: the exact optimum; the box is Eq. 26. Two of four inputs."
-    return Figure("Fig. 4: the swarm searching", traces, layout, caption)
-
-
-def _cloud(found: Search, shown: int, panel: int) -> list[Trace]:
-    at = {"xaxis": axis("x", panel), "yaxis": axis("y", panel), "type": "scatter"}
-    corners = ([0, 1, 1, 0, 0], [0, 0, 1, 1, 0])
-    edges = (found.lower, found.upper)
-    return [
-        {**at, "mode": "lines", "line": {"color": GREY, "width": 1}, "hoverinfo": "skip",
-         "x": [float(edges[i][0]) for i in corners[0]],
-         "y": [float(edges[i][1]) for i in corners[1]]},
-        {**at, "mode": "markers", "name": "particle", "marker": {"color": BLUE, "size": 5,
-         "opacity": 0.7}, "x": found.positions[shown, :, 0].round(9).tolist(),
-         "y": found.positions[shown, :, 1].round(9).tolist()},
-        {**at, "mode": "markers", "name": "optimum", "marker": {"color": RED, "size": 10,
-         "symbol": "cross-thin", "line": {"width": 2, "color": RED}},
-         "x": [float(found.optimum[0])], "y": [float(found.optimum[1])]},
-    ]  # fmt: skip
-
-
-def reference_states(way: Reach) -> Figure:
-    """Fig. 5."""
-    traces = [
-        line(way.times_s, column, title, INK, panel=i + 1, showlegend=False)
-        for i, (title, column) in enumerate(
-            zip(_POSITION_TITLES + _VELOCITY_TITLES, _shown_states(way.tracked), strict=True)
-        )
-    ]
-    layout = panels(_POSITION_TITLES + _VELOCITY_TITLES, "t, s")
-    layout["height"] = 900
-    return Figure(
-        "Fig. 5: reference of the states", traces, layout,
-        "The paper draws its path without numbers; this one is of the same kind.",
+    titles = [f"λ = {damping:g}, iteration {n}" for damping in searches for n in SHOWN_ITERATIONS]
+    drawing = make_subplots(
+        rows=len(searches), cols=len(SHOWN_ITERATIONS), shared_xaxes="all", shared_yaxes="all",
+        subplot_titles=titles, horizontal_spacing=0.015, vertical_spacing=0.07,
     )  # fmt: skip
+    for row, found in enumerate(searches.values(), 1):
+        for column in range(1, len(SHOWN_ITERATIONS) + 1):
+            drawing.add_traces(_particles(found, column - 1), rows=row, cols=column)
+    drawing.update_layout(
+        template=STYLE, height=110 + 240 * len(searches), showlegend=False,
+        margin={"t": 60, "b": 50},
+    )  # fmt: skip
+    drawing.update_annotations(font_size=12)
+    drawing.update_xaxes(title_text="f_t, N", row=len(searches))
+    drawing.update_yaxes(title_text="τ_x, N", col=1)
+    caption = "Dots: particles; cross: the exact optimum; the box is Eq. 26. Two of four inputs."
+    return Figure("Fig. 4: the search of the swarm", drawing, caption, width_px=760)
 
 
-def reference_path(way: Reach, flights: Mapping[str, Flight]) -> Figure:
-    """Fig. 6: the path in space, and what was flown."""
+def _particles(found: Search, shown: int) -> list[go.Scatter]:
+    (left, low), (right, high) = found.lower[:2], found.upper[:2]
+    corners = [left, right, right, left, left], [low, low, high, high, low]
+    cross = {"color": RED, "size": 10, "symbol": "cross-thin", "line": {"width": 2, "color": RED}}
+    dot = {"color": BLUE, "size": 5, "opacity": 0.7}
+    drawn = (
+        (corners, {"mode": "lines", "line": {"color": GREY, "width": 1}, "hoverinfo": "skip"}),
+        (found.positions[shown].T, {"mode": "markers", "name": "particle", "marker": dot}),
+        (found.optimum[:, None], {"mode": "markers", "name": "optimum", "marker": cross}),
+    )
+    return [go.Scatter(x=coordinates(x[0]), y=coordinates(x[1]), **style) for x, style in drawn]
 
-    def trace(states: Array, name: str, colour: str, width: int) -> Trace:
-        x, y, z = states[::4, X : X + 3].T
-        return {
-            "type": "scatter3d", "mode": "lines", "name": name,
-            "x": x.round(3).tolist(), "y": y.round(3).tolist(), "z": (-z).round(3).tolist(),
-            "line": {"color": colour, "width": width},
-        }  # fmt: skip
 
-    traces = [trace(way.tracked, "reference", INK, 4)]
-    colours = (BLUE, RED, GREEN)
-    for (name, flight), colour in zip(flights.items(), colours, strict=False):
-        traces.append(trace(flight.states, name, colour, 3))
-    ends = way.tracked[[0, -1], X : X + 3]
-    traces.append(
-        {
-            "type": "scatter3d", "mode": "markers+text", "text": ["S", "D"], "showlegend": False,
-            "x": ends[:, 0].tolist(), "y": ends[:, 1].tolist(), "z": (-ends[:, 2]).tolist(),
-            "marker": {"size": 4, "color": INK}, "textposition": "top center",
-        }
+def reference_states() -> Figure:
+    """Fig. 5."""
+    path = sampled_path(PathName.TOUR, 1000)
+    drawing = panels(_PANELS[_POSITIONS] + _PANELS[_VELOCITIES], "t, s", panel_px=100)
+    columns = _columns(path.tracked)
+    for panel, column in enumerate((*columns[_POSITIONS], *columns[_VELOCITIES]), 1):
+        curve(drawing, panel, path.times_s, column, "reference", INK)
+    drawing.update_layout(showlegend=False, margin={"b": 50})
+    caption = "The paper draws its path without numbers; this one is similar."
+    return Figure("Fig. 5: reference of the states", drawing, caption)
+
+
+def reference_path(flown: Mapping[str, Flight]) -> Figure:
+    """Fig. 6: the path in space, with the flights by their names."""
+    tracked = sampled_path(PathName.TOUR, 1000).tracked
+    drawing = go.Figure()
+    paths = {"reference": tracked} | {name: flight.states for name, flight in flown.items()}
+    for (name, states), colour in zip(paths.items(), (INK, BLUE, RED, GREEN), strict=False):
+        x, y, z = (coordinates(column) for column in (states[::4, X : X + 3] * (1, 1, -1)).T)
+        line = {"color": colour, "width": 4 if name == "reference" else 3}
+        drawing.add_scatter3d(x=x, y=y, z=z, mode="lines", name=name, line=line)
+    x, y, z = (coordinates(column) for column in (tracked[[0, -1], X : X + 3] * (1, 1, -1)).T)
+    drawing.add_scatter3d(
+        x=x, y=y, z=z, mode="markers+text", text=["S", "D"], textposition="top center",
+        showlegend=False, marker={"size": 4, "color": INK},
     )  # fmt: skip
     scene = {
-        "xaxis": {"title": {"text": "north, m"}}, "yaxis": {"title": {"text": "east, m"}},
-        "zaxis": {"title": {"text": "height, m"}}, "aspectmode": "manual",
-        "aspectratio": {"x": 1.5, "y": 1.5, "z": 0.6},
-        "camera": {"eye": {"x": 1.2, "y": 1.3, "z": 0.8}, "center": {"x": 0, "y": 0, "z": -0.2}},
+        "xaxis_title": "north, m", "yaxis_title": "east, m", "zaxis_title": "height, m",
+        "aspectmode": "manual", "aspectratio": {"x": 1.5, "y": 1.5, "z": 0.6},
+        "camera": {"eye": {"x": 1.2, "y": 1.3, "z": 0.8}, "center": {"z": -0.2}},
     }  # fmt: skip
-    return Figure(
-        "Fig. 6: the path", traces, {"height": 560, "scene": scene},
-        "S start, D destination. Flown on the linear plant.",
-    )  # fmt: skip
+    drawing.update_layout(template=STYLE, height=560, scene=scene, margin={"l": 0, "b": 40})
+    caption = "S start, D destination. Flown on the linear plant."
+    return Figure("Fig. 6: the path", drawing, caption, width_px=560)
 
 
-def controls(title: str, flown: Flown, caption: str) -> Figure:
-    """Figs. 7, 12, 15."""
-    traces = [
-        line(_times(flight)[:-1], flight.inputs[:, i], f"{plant} plant", _COLOURS[plant],
-             panel=i + 1, showlegend=i == 0)
-        for plant, flight in flown.items()
-        for i in range(4)
-    ]  # fmt: skip
-    return Figure(title, traces, panels(_INPUT_TITLES, "t, s"), caption)
-
-
-def velocities(title: str, flown: Flown, caption: str) -> Figure:
-    """Figs. 8, 13, 16."""
-    return _tracking(title, flown, _VELOCITY_TITLES, slice(4, 7), caption)
-
-
-def positions(title: str, flown: Flown, caption: str) -> Figure:
-    """Figs. 9, 14, 17."""
-    return _tracking(title, flown, _POSITION_TITLES, slice(0, 4), caption)
-
-
-def spreads(title: str, flown: Flown, caption: str) -> Figure:
-    """Figs. 10, 11: epsilon of every solve."""
-    traces = [
-        line(_times(flight)[:-1], flight.spreads, f"{plant} plant", _COLOURS[plant])
-        for plant, flight in flown.items()
-    ]
-    return Figure(title, traces, single("t, s", "ε", y={"type": "log"}), caption)
-
-
-def _tracking(title: str, flown: Flown, titles: Sequence[str], part: slice, caption: str) -> Figure:
+def flown_figure(number: int, flown: Mapping[PlantKind, Flight]) -> Figure:
+    """Figs. 7 to 17, `FLOWN`: the flight on both plants, beside its reference if it has one."""
+    name, shown, caption = FLOWN[number]
+    drawing = panels(_PANELS[shown], "t, s", 300 if shown == _SPREADS else 150)
     first = next(iter(flown.values()))
-    traces = [
-        line(_times(first), column, "reference", INK, panel=i + 1, showlegend=i == 0, dash="dash")
-        for i, column in enumerate(_shown_states(first.tracked)[part])
-    ]
-    for plant, flight in flown.items():
-        traces += [
-            line(_times(flight), column, f"{plant} plant", _COLOURS[plant], panel=i + 1,
-                 showlegend=i == 0)
-            for i, column in enumerate(_shown_states(flight.states)[part])
-        ]  # fmt: skip
-    return Figure(title, traces, panels(titles, "t, s"), caption)
+    lines = [(f"{p} plant", f, f.states, _COLOURS[p], "solid") for p, f in flown.items()]
+    if shown in (_VELOCITIES, _POSITIONS):
+        lines.insert(0, ("reference", first, first.tracked, INK, "dash"))
+    for label, flight, states, colour, dash in lines:
+        columns = _columns(states) | {_CONTROLS: [*flight.inputs.T], _SPREADS: [flight.spreads]}
+        for panel, column in enumerate(columns[shown], 1):
+            curve(drawing, panel, flight.times_s[: len(column)], column, label, colour, dash)
+    if shown == _SPREADS:
+        drawing.update_yaxes(type="log")
+    return Figure(f"Fig. {number}: {shown}, {name}", drawing, caption)
 
 
-def _shown_states(states: Array) -> list[Array]:
-    """x, y, z, psi in degrees, u, v, w: (K,) each."""
-    x, y, z = states[:, X : X + 3].T
-    return [x, y, z, np.degrees(states[:, PSI]), *states[:, U : U + 3].T]
+def _columns(states: Array) -> dict[str, list[Array]]:
+    positions = [*states[:, X : X + 3].T, np.degrees(states[:, PSI])]
+    return {_POSITIONS: positions, _VELOCITIES: [*states[:, U : U + 3].T]}
 
 
-def _times(flight: Flight) -> Array:
-    return PAPER_STEP_S * np.arange(len(flight.states), dtype=np.float64)
-
-
-def _padded(low: float, high: float) -> list[float]:
-    margin = 0.06 * (high - low)
-    return [float(low - margin), float(high + margin)]
+def position_error(
+    drawing: go.Figure, panel: int, flight: Flight, law: str, plant: PlantKind, colour: str,
+    every: int = 1,
+) -> None:  # fmt: skip
+    """Add the position error of every n-th step; not below 1e-9 m, for a logarithmic axis."""
+    errors = np.maximum(flight.position_errors_m[::every], 1e-9)
+    name = f"{law}, {plant}"
+    curve(drawing, panel, flight.times_s[::every], errors, name, colour, DASHES[plant])

@@ -1,36 +1,45 @@
-"""Why one step is not enough: closed-loop eigenvalues from the model alone, nothing flown.
+"""One step compared with longer horizons: closed-loop eigenvalues from the model, and flights.
 
-The unconstrained law of each objective is linear; its slowest eigenvalue says how long an error
-lasts. Knows the model and the weights; no swarm, because the box does not matter near the end.
+The law of each objective is linear while no input is at its bound; the slowest eigenvalue of its
+closed loop gives the time an error lasts.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import solve_discrete_are
+from scipy.linalg import block_diag
 from scipy.optimize import differential_evolution
 
+from offboard.analysis.figure import BLUE, GREY, INK, RED, Figure, curve, panels
 from offboard.control.riccati import cost_to_go
 from offboard.model.state import PHI, TAU_X, P, V, Y
 from offboard.paper.law import PAPER_STEP_S, PaperSettings
-from offboard.paper.plant import paper_model
-from offboard.paper.study.table import Column, Row, Table
+from offboard.paper.plant import PlantKind, paper_model
+from offboard.paper.study.closed_loop import FlightTask, LawName
+from offboard.paper.study.figures import position_error
+from offboard.paper.study.page import Row, Table
+from offboard.paper.trajectory import PathName
 
 Array = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
 
 LONGEST = 20
-_LATERAL = (PHI, P, V, Y)  # y, v, phi, p answer to tau_x alone; x and the rest mirror it
+_LATERAL = [PHI, P, V, Y]  # y, v, phi, p depend on tau_x alone; x and the others mirror them
 _RATIOS = (1, 2, 5, 10, 20, 40, 80)
+_COLUMNS = {
+    "slowest": "slowest |eigenvalue|", "time_constant_s": "slowest time constant, s",
+}  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
 class Modes:
-    """Eigenvalues of the closed loop, largest magnitude first."""
+    """Eigenvalues of a closed loop, largest magnitude first."""
 
     name: str
     eigenvalues: Complexes
@@ -41,16 +50,50 @@ class Modes:
 
     @property
     def time_constant_s(self) -> float:
-        """Of the slowest mode; infinite where it does not decay."""
+        """Time constant of the slowest mode; infinite where it does not decay."""
         return -PAPER_STEP_S / math.log(self.slowest) if self.slowest < 1 else math.inf
 
+    def row(self) -> Row:
+        """The cells of `_COLUMNS`."""
+        finite = math.isfinite(self.time_constant_s)
+        return {
+            "slowest": self.slowest,
+            "time_constant_s": self.time_constant_s if finite else None,
+        }
 
-def extended(dynamics: Array, inputs: Array) -> tuple[Array, Array]:
-    """A (n + m, n + m) and B of [x, u(k-1)]: R_du needs the input applied last."""
-    states, count = inputs.shape
-    a = np.zeros((states + count, states + count))
-    a[:states, :states] = dynamics
-    return a, np.vstack([inputs, np.eye(count)])
+
+class _Problem:
+    """The stage cost of Eq. 21 on [x, u(k-1)] (n + m), because R_du weighs u(k) - u(k-1).
+
+    J = z'Qz + u'(R + R_du)u + 2 z'Su with z = [x, u(k-1)], Q = diag(fitness, R_du), S = [0, -R_du].
+    """
+
+    def __init__(
+        self, dynamics: Array, inputs: Array, fitness: Array, energy: Array, rate: Array
+    ) -> None:
+        count = inputs.shape[1]
+        self.a = block_diag(dynamics, np.zeros((count, count)))
+        self.b = np.vstack([inputs, np.eye(count)])
+        self.weight = block_diag(fitness, rate)
+        self.control_weight = energy + rate
+        self.cross = np.vstack([np.zeros_like(inputs), -rate])
+
+    def step(self, to_go: Array) -> tuple[Array, Array]:
+        """The feedback gain (m, n + m) for the cost to go after the step, and the one before it."""
+        curvature = self.control_weight + self.b.T @ to_go @ self.b
+        gain = np.linalg.solve(curvature, self.b.T @ to_go @ self.a + self.cross.T)
+        before = self.weight + self.a.T @ to_go @ self.a - gain.T @ curvature @ gain
+        return gain, 0.5 * (before + before.T)
+
+    def endless(self) -> Array:
+        """The cost to go of an infinite horizon."""
+        return cost_to_go(self.a, self.b, self.weight, self.control_weight, self.cross)
+
+    def eigenvalues(self, to_go: Array) -> Complexes:
+        """Eigenvalues of the closed loop with this cost-to-go, largest magnitude first."""
+        gain, _ = self.step(to_go)
+        found = np.asarray(np.linalg.eigvals(self.a - self.b @ gain), np.complex128)
+        return found[np.argsort(-np.abs(found), kind="stable")]
 
 
 def receding(
@@ -59,49 +102,21 @@ def receding(
     fitness: Array,
     energy: Array,
     rate: Array,
-    steps: int,
+    steps: int | None = None,
     terminal: Array | None = None,
 ) -> Complexes:
-    """Eigenvalues under the first input of the optimal `steps`, Eq. 21 at each of them.
+    """Eigenvalues of the loop closed by the first input of the optimum over `steps` steps.
 
-    fitness (n, n) on x(k+1) ... x(k+N), the last replaced by `terminal`; energy, rate (m, m).
+    Eq. 21 at each step: fitness (n, n) weighs x(k+1) ... x(k+N), `terminal` replaces it at the
+    last; energy, rate (m, m). Without `steps` the horizon is infinite (Riccati).
     """
-    states = len(dynamics)
-    a, b = extended(dynamics, inputs)
-    weight = np.zeros_like(a)
-    weight[:states, :states] = fitness
-    last = np.zeros_like(a)
-    last[:states, :states] = fitness if terminal is None else terminal
-    # u - u(k-1) couples input and state: u'(R + R_du)u - 2 u'R_du u(k-1) + u(k-1)'R_du u(k-1)
-    held = np.zeros_like(a)
-    held[states:, states:] = rate
-    cross = np.zeros_like(b)
-    cross[states:] = -rate
-    to_go = last
-    for step in range(steps):
-        if step:
-            to_go = to_go + weight
-        curvature = energy + rate + b.T @ to_go @ b
-        gain = np.linalg.solve(curvature, b.T @ to_go @ a + cross.T)
-        to_go = held + a.T @ to_go @ a - gain.T @ curvature @ gain
-        to_go = 0.5 * (to_go + to_go.T)
-    return _sorted(a - b @ gain)
-
-
-def endless(
-    dynamics: Array, inputs: Array, fitness: Array, energy: Array, rate: Array
-) -> Complexes:
-    """Eigenvalues for an infinite horizon of the same stage cost (Riccati)."""
-    states = len(dynamics)
-    a, b = extended(dynamics, inputs)
-    weight = np.zeros_like(a)
-    weight[:states, :states] = fitness
-    weight[states:, states:] = rate
-    cross = np.zeros_like(b)
-    cross[states:] = -rate
-    p = solve_discrete_are(a, b, weight, energy + rate, s=cross)
-    gain = np.linalg.solve(energy + rate + b.T @ p @ b, b.T @ p @ a + cross.T)
-    return _sorted(a - b @ gain)
+    problem = _Problem(dynamics, inputs, fitness, energy, rate)
+    if steps is None:
+        return problem.eigenvalues(problem.endless())
+    to_go = block_diag(fitness if terminal is None else terminal, np.zeros_like(rate))
+    for _ in range(steps - 1):
+        _, to_go = problem.step(to_go)
+    return problem.eigenvalues(to_go)
 
 
 def study(settings: PaperSettings, first: PaperSettings) -> list[Modes]:
@@ -116,38 +131,82 @@ def study(settings: PaperSettings, first: PaperSettings) -> list[Modes]:
         Modes("cost-to-go, Eqs. 33-35", receding(a, b, q, r, s, 1, cost_to_go(a, b, q, r))),
     ]
     modes += [Modes(f"N = {n}", receding(a, b, q, r, s, n)) for n in range(1, LONGEST + 1)]
-    return [*modes, Modes("N = ∞", endless(a, b, q, r, s))]
+    return [*modes, Modes("N = ∞", receding(a, b, q, r, s))]
 
 
-def horizon_table(modes: list[Modes]) -> Table:
-    """Slowest eigenvalues and time constants (s) of the closed loops."""
-    rows: list[Row] = [
+def horizon_table(modes: Sequence[Modes]) -> Table:
+    """Slowest eigenvalues and time constants of the closed loops."""
+    rows = [
         {
             "law": mode.name,
-            "slowest": mode.slowest,
-            "time_constant_s": mode.time_constant_s if mode.slowest < 1 else None,
-            "four_slowest": ", ".join(_text(value) for value in mode.eigenvalues[:4]),
+            **mode.row(),
+            "four_slowest": ", ".join(map(_text, mode.eigenvalues[:4])),
         }
         for mode in modes
     ]
-    columns = (
-        ("law", "law"), ("slowest", "slowest |eigenvalue|"),
-        ("time_constant_s", "slowest time constant, s"), ("four_slowest", "four slowest"),
-    )  # fmt: skip
     notes = (
-        "Position is four integrations from torque: one step of 0.1 s moves it by 0.4 mm per "
-        "newton, so one step's cost hardly sees it. The same 4-dimensional search with the "
-        "Riccati solution in the place of Q does, at the same price.",
+        "Position is four integrations from torque: in one step of 0.1 s a newton moves it by "
+        "0.4 mm, so the cost of one step hardly depends on it. The same search over four inputs, "
+        "with the Riccati solution instead of Q, takes the same time and is as fast as any.",
     )
-    return Table("Closed loop by objective and horizon", [Column(*p) for p in columns], rows, notes)
+    columns = {"law": "law", **_COLUMNS, "four_slowest": "four slowest"}
+    return Table("Closed loop by objective and horizon", columns, rows, notes)
+
+
+def horizon_figure(modes: Sequence[Modes]) -> Figure:
+    """Slowest time constant over the horizon."""
+    by_name = {mode.name: mode.time_constant_s for mode in modes}
+    steps = list(range(1, LONGEST + 1))
+    drawing = panels(("slowest time constant, s",), "horizon N, steps of 0.1 s", panel_px=300)
+    values = [by_name[f"N = {n}"] for n in steps]
+    curve(drawing, 1, steps, values, "N steps, Eqs. 33-35", BLUE, mode="lines+markers")
+    curve(drawing, 1, [1, LONGEST], [by_name["N = ∞"]] * 2, "N = ∞", INK, "dash")
+    diamond = {"size": 11, "color": RED, "symbol": "diamond"}
+    value = by_name["cost-to-go, Eqs. 33-35"]
+    curve(drawing, 1, [1], [value], "one step + cost-to-go", RED, mode="markers", marker=diamond)
+    drawing.update_yaxes(type="log", tickvals=[1, 2, 5, 10, 20, 50])
+    caption = "Computed from the model. One step with the cost-to-go is as fast as any horizon."
+    return Figure("Slowest time constant of the closed loop", drawing, caption)
+
+
+def law_tasks() -> dict[tuple[str, LawName, PlantKind], FlightTask]:
+    """(offset or tour, law, plant) -> hover from 1 m off, or the path of Figs. 5-6."""
+    tasks: dict[tuple[str, LawName, PlantKind], FlightTask] = {}
+    for law in LawName:
+        for plant in PlantKind:
+            tasks["tour", law, plant] = FlightTask(PaperSettings(), plant, law=law)
+            tasks["offset", law, plant] = FlightTask(
+                PaperSettings(), plant, PathName.HOVER, law, start_offset_m=(1.0, 0.0, 0.0)
+            )
+    return tasks
+
+
+def laws_figure(results: Mapping[Any, Any]) -> Figure:
+    """Both laws flown: position errors over time of `law_tasks`; "modes" is the `study`."""
+    titles = {"offset": "1 m off at hover: position error, m", "tour": "tour: position error, m"}
+    drawing = panels(list(titles.values()), "t, s", panel_px=240)
+    for panel, kind in enumerate(titles, 1):
+        for law, colour in ((LawName.ONE_STEP, RED), (LawName.COST_TO_GO, BLUE)):
+            for plant in PlantKind:
+                position_error(drawing, panel, results[kind, law, plant], law, plant, colour)
+    (slow_s,) = (m.time_constant_s for m in results["modes"] if m.name == "one step, Eqs. 33-35")
+    times = np.linspace(0.0, 100.0, 50)
+    curve(
+        drawing, 1, times, np.exp(-times / slow_s), f"model: e^(-t / {slow_s:.1f} s)", GREY, "dash"
+    )
+    drawing.update_yaxes(type="log", range=[-5, 0.7])
+    caption = (
+        "Same weights (Eqs. 33-35), swarm and box; the cost-to-go also gets a reference that the "
+        "model can follow."
+    )
+    return Figure("One step and cost-to-go, flown", drawing, caption)
 
 
 def weights_table(settings: PaperSettings, seed: int = 0) -> Table:
-    """What diagonal weights alone can do for one step: the lateral loop, y over v from 1 to 80."""
+    """What diagonal weights alone achieve in one step: the lateral loop with y over v 1 to 80."""
     a, b = paper_model()
-    lateral = list(_LATERAL)
-    a, b = a[np.ix_(lateral, lateral)], b[lateral, TAU_X : TAU_X + 1]
-    fitness = np.array(settings.fitness)[lateral]
+    a, b = a[np.ix_(_LATERAL, _LATERAL)], b[_LATERAL, TAU_X : TAU_X + 1]
+    fitness = np.array(settings.fitness)[_LATERAL]
     energy, rate = np.eye(1) * settings.energy[TAU_X], np.eye(1) * settings.rate[TAU_X]
 
     def modes(name: str, diagonal: Array) -> Modes:
@@ -159,36 +218,21 @@ def weights_table(settings: PaperSettings, seed: int = 0) -> Table:
     ]
     found = differential_evolution(
         lambda exponents: modes("", 10.0**exponents).slowest,
-        [(-3.0, 7.0)] * len(lateral), seed=seed, maxiter=150, tol=1e-8,
+        [(-3.0, 7.0)] * len(_LATERAL), seed=seed, maxiter=150, tol=1e-8,
     )  # fmt: skip
     best = 10.0**found.x
-    shown = ", ".join(f"{weight:.3g}" for weight in best)
-    tried.append(modes(f"searched: Q_φ, Q_p, Q_v, Q_y = {shown}", best))
-    rows: list[Row] = [
-        {
-            "weights": mode.name,
-            "slowest": mode.slowest,
-            "time_constant_s": mode.time_constant_s if mode.slowest < 1 else None,
-        }
-        for mode in tried
-    ]
-    columns = (
-        ("weights", "diagonal weights"), ("slowest", "slowest |eigenvalue|"),
-        ("time_constant_s", "slowest time constant, s"),
-    )  # fmt: skip
+    weights = ", ".join(f"{weight:.3g}" for weight in best)
+    tried.append(modes(f"searched: Q_φ, Q_p, Q_v, Q_y = {weights}", best))
+    rows = [{"weights": mode.name, **mode.row()} for mode in tried]
     notes = (
-        "With Eq. 33's equal weights on y and v even R = R_Δu = 0 does not help. Unequal ones do: "
-        "in one step four diagonal weights are four feedback gains in disguise, and any stable "
-        "pole placement is within reach of a search over them. Towards Q_y = 40 Q_v the loop gets "
-        "slower again, then unstable. Such weights no longer mean what they say, and what is found "
-        "holds inside the box only; the cost-to-go needs no search.",
+        "With the equal weights of Eq. 33 on y and v even R = R_Δu = 0 does not help. Unequal ones "
+        "do: in one step four diagonal weights determine four feedback gains, and a search over "
+        "them reaches any stable pole placement. Towards Q_y = 40 Q_v the loop gets slower again, "
+        "then unstable. Such weights no longer express what matters, and the result holds inside "
+        "the box only; the cost-to-go needs no search.",
     )
-    return Table("One step, other diagonal weights", [Column(*p) for p in columns], rows, notes)
-
-
-def _sorted(matrix: Array) -> Complexes:
-    eigenvalues = np.asarray(np.linalg.eigvals(matrix), np.complex128)
-    return eigenvalues[np.argsort(-np.abs(eigenvalues), kind="stable")]
+    columns = {"weights": "diagonal weights", **_COLUMNS}
+    return Table("One step, other diagonal weights", columns, rows, notes)
 
 
 def _text(value: complex) -> str:

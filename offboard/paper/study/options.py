@@ -1,4 +1,4 @@
-"""What one run of the paper is asked for, checked before anything is computed."""
+"""The options of one run of the study, the names of its tables and figures, and their check."""
 
 from __future__ import annotations
 
@@ -10,26 +10,43 @@ from pathlib import Path
 from offboard.documents.errors import UserError
 from offboard.paper.law import PaperSettings
 
-PAPER_FIGURES = tuple(str(number) for number in range(4, 18))
-FIGURES = (*PAPER_FIGURES, "gap", "horizon", "laws", "integral", "limits", "peers")
-TABLES = (
-    "2", "3", "4", "bd", "errata", "horizon", "weights", "integral", "limits", "peers",
-)  # fmt: skip
-SEEDS, QUICK_SEEDS = 20, 2
-MOST_SEEDS = 10_000
+# Section of the page -> tables and figures, in reading order
+SECTIONS: dict[str, tuple[str, ...]] = {
+    "Tables of the paper": ("table 2", "figure gap", "table 3", "table 4"),
+    "Figures of the paper": tuple(f"figure {number}" for number in range(4, 18)),
+    "Errata, with computed evidence": ("table errata", "table bd"),
+    "One step compared with longer horizons": (
+        "table horizon", "figure horizon", "figure laws", "table weights",
+    ),
+    "Extensions that the conclusions propose": (
+        "table integral", "figure integral", "table limits", "figure limits",
+    ),
+    "The swarm compared with other optimisers": ("figure peers", "table peers"),
+}  # fmt: skip
+LABELS = tuple(label for labels in SECTIONS.values() for label in labels)
+TABLES, FIGURES = (
+    tuple(label.split()[1] for label in LABELS if label.startswith(kind))
+    for kind in ("table", "figure")
+)
+SEEDS, QUICK_SEEDS, MOST_SEEDS = 20, 2, 10_000
 
 
 class PaperError(UserError):
-    """A run that cannot be: one sentence for a human."""
+    """The run is not possible; the message is one sentence for the user."""
 
 
 @dataclass(frozen=True, slots=True)
 class PaperOptions:
-    """`figures` and `tables` pick by name from FIGURES and TABLES; both empty is everything.
+    """Options of `offboard paper`.
 
-    `initial_q` is diag(Q) of the first configuration (Eq. 23, which is lost): twelve numbers, or
-    one for all; None is the identity. `seeds` flights per row (None: 20, quick: 2). `workers`
-    processes (None: one per processor; 1: in this process).
+    Args:
+        out: output directory; created if absent.
+        quick: fewer seeds, problems and budgets.
+        seeds: flights per row of a table; None: 20, or 2 if quick.
+        initial_q: diag(Q) of the first configuration (Eq. 23, whose values are not printed):
+            twelve weights, or one for all; None: the identity.
+        figures, tables: names from FIGURES and TABLES; both empty: everything.
+        workers: processes; None: one per processor; 1: no other process.
     """
 
     out: Path
@@ -45,10 +62,6 @@ class PaperOptions:
         return self.seeds if self.seeds is not None else QUICK_SEEDS if self.quick else SEEDS
 
     @property
-    def peer_problems(self) -> int:
-        return 3 if self.quick else 30
-
-    @property
     def first_settings(self) -> PaperSettings:
         """The first configuration (section 4.1), at lambda = 1."""
         first = PaperSettings.first_configuration()
@@ -58,21 +71,18 @@ class PaperOptions:
         return first.model_copy(update={"fitness": diagonal})
 
     @property
-    def wanted_figures(self) -> tuple[str, ...]:
-        return self.figures if self.figures or self.tables else FIGURES
-
-    @property
-    def wanted_tables(self) -> tuple[str, ...]:
-        return self.tables if self.figures or self.tables else TABLES
+    def labels(self) -> tuple[str, ...]:
+        """The tables and figures to make ("table 2", "figure gap"), tables first."""
+        chosen = [f"table {name}" for name in self.tables]
+        chosen += [f"figure {name}" for name in self.figures]
+        return tuple(dict.fromkeys(chosen)) or tuple(sorted(LABELS, key=_is_figure))
 
 
 def check(options: PaperOptions) -> None:
-    """Raises PaperError with one sentence on the first thing wrong; makes the output directory."""
-    for kind, chosen, known in (
-        ("figure", options.figures, FIGURES),
-        ("table", options.tables, TABLES),
-    ):
-        for name in chosen:
+    """Create the output directory. Raises PaperError for the first option that is not valid."""
+    chosen = (("figure", options.figures, FIGURES), ("table", options.tables, TABLES))
+    for kind, names, known in chosen:
+        for name in names:
             if name not in known:
                 raise PaperError(f"there is no {kind} {name!r}; known are {', '.join(known)}")
     if not 1 <= options.seed_count <= MOST_SEEDS:
@@ -82,6 +92,10 @@ def check(options: PaperOptions) -> None:
     if options.initial_q is not None:
         _check_weights(options.initial_q)
     _check_output(options.out)
+
+
+def _is_figure(label: str) -> bool:
+    return label.startswith("figure")
 
 
 def _check_weights(diagonal: tuple[float, ...]) -> None:

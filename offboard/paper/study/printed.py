@@ -1,6 +1,6 @@
 """What the paper prints (doi 10.1117/12.2565129): its tables and Eq. 16, as data.
 
-Figures as printed, slips included; what is wrong with them is said in `errata`.
+Numbers as printed, errors included; `errata` lists the errors.
 """
 
 from __future__ import annotations
@@ -56,12 +56,12 @@ RATIO_REWEIGHTED: Final[Eight] = (0.0450, 0.0538, 0.6615, 0.0442, 0.0486, 0.0911
 
 
 class PrintedEntry(NamedTuple):
-    """A non-zero of Eq. 16: printed row (from 1), the state it must be, input, value."""
+    """A non-zero of Eq. 16: printed row (from 1), the state it must be, input, printed value."""
 
     row: int
     state: str
     input: str
-    value: float
+    value: float | None
 
 
 INPUT_NAMES: Final = ("f_t", "tau_x", "tau_y", "tau_z")
@@ -79,5 +79,5 @@ EQ_16: Final = (
     PrintedEntry(10, "z", "f_t", -0.0120),
     PrintedEntry(11, "w", "f_t", -0.2350),
 )
-LOST_ENTRY: Final = ("y", "tau_x")  # the twelfth row is not printed
+LOST_ENTRY: Final = PrintedEntry(12, "y", "tau_x", None)  # the twelfth row is not printed
 EQ_26_LOWER_THRUST: Final = -4.0

@@ -1,0 +1,37 @@
+"""The page of an identification from a recorded flight, opened in Chromium without a network."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from browser import opening
+
+from offboard.analysis import history, tlog
+from offboard.analysis.identify import identify_flight, rows
+from offboard.analysis.identify_page import page
+from offboard.flight.configuration import load
+
+RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
+REFUSAL = "it <b>does not</b> follow its command"
+
+
+def test_the_page_shows_every_constant_and_reads_in_both_colour_schemes(
+    tmp_path: Path,
+) -> None:
+    believed = load("flight", choices={}).vehicle
+    log = tlog.read(RECORDING)
+    found, trace = identify_flight(log, history.gather(log), believed)
+    found = replace(found, yaw=None, refusals={**found.refusals, "yaw": REFUSAL})
+    file = tmp_path / "identify.html"
+    file.write_text(page("flight <1>", found, trace, believed), encoding="utf-8")
+    with opening(file, width=400) as opened:
+        assert opened.problems == opened.fetched == []
+        assert opened.page.inner_text("h1").endswith("of flight <1>")
+        assert opened.page.locator("tr").count() == 1 + len(list(rows(found)))
+        assert opened.page.inner_text("table").count(f"not identified: {REFUSAL}") == 3
+        assert opened.page.locator(".figure").count() == 3
+        assert opened.width_px() == 400
+        assert opened.colliding() == opened.unreadable() == []
+        opened.switch("dark")
+        assert opened.unreadable() == []
