@@ -115,3 +115,14 @@ def _subcommands() -> list[str]:
 @pytest.mark.parametrize("command", _subcommands())
 def test_every_command_is_described(command: str) -> None:
     assert f"offboard {command}" in README
+
+
+def test_links_lead_to_files() -> None:
+    for readme in (
+        ROOT / "README.md",
+        ROOT / "CONTRIBUTING.md",
+        *ROOT.glob("*/README.md"),
+        *ROOT.glob("offboard/*/README.md"),
+    ):
+        for target in re.findall(r"\]\(([^)#:]+)\)", readme.read_text()):
+            assert (readme.parent / target).exists(), f"{readme.relative_to(ROOT)}: {target}"

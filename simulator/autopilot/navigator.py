@@ -24,6 +24,8 @@ class Navigator:
         self.guidance = guidance
         self.behaviour = Behaviour.HOLD
         self.active: ActiveBehaviour = BEHAVIOURS[Behaviour.HOLD](guidance)
+        self._entered = True  # `active.enter` was called
+        self._place_ned_m = NAN3  # for `active.enter`
         self._level: AttitudeSetpoint | None = None  # the last of `level_off`
 
     def enter(
@@ -39,7 +41,7 @@ class Navigator:
         self.behaviour, self.active = behaviour, BEHAVIOURS[behaviour](guidance)
         if guidance.trajectory is not None and not self.active.planned:
             guidance.trajectory.active = False
-        self.active.enter(place_ned_m)
+        self._entered, self._place_ned_m = False, place_ned_m
 
     def arm(self, estimate: StateEstimate) -> None:
         """The motors start: set home."""
@@ -105,6 +107,9 @@ class Navigator:
     def motion(self, estimate: StateEstimate, *, landed: bool, on_ground: bool) -> MotionSetpoint:
         """Motion of this period. `on_ground`: the vehicle may not lift off yet."""
         guidance, active = self.guidance, self.active
+        if not self._entered:
+            self._entered = True
+            active.enter(estimate, self._place_ned_m, landed=landed)
         goal = active.motion(estimate, landed=landed)
         if guidance.trajectory is None or not active.planned:
             return goal

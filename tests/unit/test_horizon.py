@@ -124,7 +124,7 @@ def test_nonlinear_roll_outs_fly_as_scipy_does() -> None:
     for dynamics in Dynamics:
         law = horizon(dynamics=dynamics)
         _, _, evaluate = prepared(law, situation)
-        rolled = evaluate.flown(plan).states[-1]
+        rolled = evaluate.open_loop(plan).states[-1]
         place = np.array([rolled[P], rolled[P + 1], rolled[Z] - 3.0])
         speed = np.array([rolled[V], rolled[V + 1], rolled[W]])
         off[dynamics] = float(np.abs(place - true[:3]).max())
@@ -146,7 +146,7 @@ def test_the_closed_form_flown_ahead_costs_the_cost_to_go() -> None:
         left = np.sum(lateral * (tracking.lateral.terminal @ lateral))
         left += vertical @ tracking.vertical.terminal @ vertical
         nothing = np.zeros((STEPS, 3)), np.zeros((STEPS + 1, STATE_SIZE))
-        assert evaluate.held(*nothing).cost == pytest.approx(left, rel=1e-8)
+        assert evaluate.follow(*nothing).cost == pytest.approx(left, rel=1e-8)
 
 
 def test_first_bounds_are_those_of_one_decision() -> None:
@@ -177,7 +177,7 @@ def test_a_plan_of_zeros_flies_the_reference(dynamics: Dynamics) -> None:
         thrust_mps2=target.thrust_down_mps2 / upright,
     )
     _, _, evaluate = prepared(law, Situation(5.0, state, reference, LEVEL))
-    plan = evaluate.flown(np.zeros((STEPS, 3)))
+    plan = evaluate.open_loop(np.zeros((STEPS, 3)))
     assert np.abs(plan.states).max() < 1e-9
     assert plan.cost < 1e-12
 
@@ -281,7 +281,7 @@ def test_a_way_below_the_clearance_to_the_ground_costs() -> None:
     _, _, evaluate = prepared(law, Situation(5.0, start, hold, LEVEL))
     down, up = np.zeros((STEPS_AROUND, 3)), np.zeros((STEPS_AROUND, 3))
     down[:5, 2], up[:5, 2] = -3.0, 3.0
-    low, high = evaluate.flown(down), evaluate.flown(up)
+    low, high = evaluate.open_loop(down), evaluate.open_loop(up)
     assert low.states[:, Z] == pytest.approx(-high.states[:, Z], abs=1e-9)
     over = np.maximum(low.states[1:, Z] - 0.5, 0.0)
     assert over.max() > 0.1
@@ -331,7 +331,9 @@ def test_the_search_alone_beats_its_peers(volume: dict[str, object]) -> None:
     paid = []
     for situation in situations(30, 0.3, seed=7):
         _, _, evaluate = prepared(law, situation)
-        base = evaluate.held(np.zeros((STEPS_AROUND, 3)), np.zeros((STEPS_AROUND + 1, STATE_SIZE)))
+        base = evaluate.follow(
+            np.zeros((STEPS_AROUND, 3)), np.zeros((STEPS_AROUND + 1, STATE_SIZE))
+        )
         reach = np.tile([0.3, 0.3, 3.0], (evaluate.knots.shape[1], 1))
         found = [swarm(evaluate, base, reach, settings, lanes, None)]
         for peer in (MppiSampling(), CemSampling()):

@@ -63,15 +63,15 @@ def new_estimate() -> VehicleEstimate:
 @pytest.mark.parametrize("late_s", [0.1, 0.2, 0.3])
 def test_every_delay_of_the_vehicle_is_later_by_the_link(late_s: float) -> None:
     estimate, direct = new_estimate(), new_estimate()
-    (sentence,) = estimate.expect_link(Estimate(late_s + 0.004, 0.003))
-    assert f"{1e3 * late_s + 4:.0f} +- 3 ms late" in sentence
+    (sentence,) = estimate.apply_link_delay(Estimate(late_s + 0.004, 0.003))
+    assert f"link delay {1e3 * late_s + 4:.0f} +- 3 ms" in sentence
     assert estimate.settled
     now = estimate.now
     assert now.tilt.delay_s == pytest.approx(0.057 + late_s)
     assert now.yaw.delay_s == pytest.approx(0.148 + late_s, abs=0.001)
     assert now.thrust_delay_s == pytest.approx(0.015 + late_s)
     assert now.tilt.natural_frequency_radps == 11.4
-    assert direct.expect_link(Estimate(0.004, 0.001)) == []
+    assert direct.apply_link_delay(Estimate(0.004, 0.001)) == []
     assert direct.now == PX4
     assert new_estimate().cautious_radps == pytest.approx(direct.cautious_radps, abs=0.1)
     assert estimate.cautious_radps <= direct.cautious_radps
@@ -79,6 +79,6 @@ def test_every_delay_of_the_vehicle_is_later_by_the_link(late_s: float) -> None:
 
 def test_a_link_that_scatters_bears_less() -> None:
     steady, scattering = new_estimate(), new_estimate()
-    steady.expect_link(Estimate(0.2, 0.001))
-    scattering.expect_link(Estimate(0.2, 0.03))
+    steady.apply_link_delay(Estimate(0.2, 0.001))
+    scattering.apply_link_delay(Estimate(0.2, 0.03))
     assert scattering.cautious_radps < 0.9 * steady.cautious_radps

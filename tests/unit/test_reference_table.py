@@ -123,7 +123,7 @@ BODY = "0,0,0,-2\n1,1,0,-2\n2,2,1,-2\n"
         ("time_s,x,y\n" + BODY, r"row 1: one of down_m and altitude_m is needed"),
         ("time_s,x,y,z,altitude_m\n" + BODY, r"one of down_m and altitude_m is needed, not both"),
         ("time_s,x,z\n" + BODY, r"row 1: column east_m is missing"),
-        ("time_s,x,y,x_m\n" + BODY, r"row 1: column north_m is there twice"),
+        ("time_s,x,y,x_m\n" + BODY, r"row 1: column north_m is given twice"),
         ("\x00\x01\x02PK", r"a\.csv, row 1: unknown column|not a CSV"),
         ("0,0,0,-2\n" + BODY, r"row 1: unknown column '0'"),
     ],

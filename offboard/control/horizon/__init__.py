@@ -1,2 +1,2 @@
-"""Several decisions ahead: what the reference asks, the exact quadratic where the plant is linear,
-compiled roll-outs where it is not, volumes to keep out of, and the searches over them."""
+"""Planning N decisions ahead: the reference over the horizon, the quadratic for the linear plant,
+compiled roll-outs for the nonlinear one, keep-out volumes, and searches."""

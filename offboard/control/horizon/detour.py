@@ -1,7 +1,7 @@
-"""Ways past keep-out volumes, for a search to begin with: beside each side of each volume.
+"""Detours round keep-out volumes, as starts of a search: one past each side of each volume.
 
-A way is a sequence of states for the closed form to hold on to. None need be good: a search would
-find better ones, but not the other side of a volume that is wider than its horizon reaches.
+A detour is a sequence of states that the closed form follows. It need not be good: the search
+improves it. But the search alone would not find the other side of a wide volume.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ from offboard.control.horizon.plant import STATE_SIZE, P, Scene, V, W, Z
 
 Array = NDArray[np.float64]
 
-NEAR_M = 1.0  # beyond what must be kept free: what is further off is no reason to go round
-SIDES = ((0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0), (2, -1.0))  # axis NED and sign; never below
+NEAR_M = 1.0  # volumes whose clearance is further from the reference need no detour
+# Axis NED and sign: a detour never passes below a volume
+SIDES = ((0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0), (2, -1.0))
 ROWS = ((P, V), (P + 1, V + 1), (Z, W))  # position and velocity of each axis in a state
 
 
 def detours(scene: Scene, reach_m: float) -> list[Array]:
-    """States (N + 1, STATE_SIZE) of every way past a volume less than `reach_m` and a bit away from
-    the reference within the horizon."""
+    """States (N + 1, STATE_SIZE) of all detours round the volumes that are near the reference;
+    `reach_m` is the distance to keep from their surface."""
     ways = []
     places, speeds = scene.positions[::2], scene.velocities[::2]
     for volume in scene.volumes:

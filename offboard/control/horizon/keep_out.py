@@ -1,7 +1,6 @@
-"""Volumes to keep out of: spheres, upright cylinders and boxes, at rest or moving, and the compiled
-distance to them. Given like references: metres north and east of, and above, the take-off point.
+"""Keep-out volumes and the distance to them: spheres, upright cylinders, boxes, at rest or moving.
 
-Knows no plan. `refusal` says why a reference cannot be flown with them.
+They are given like references: metres north and east of the take-off point, and above it.
 """
 
 from __future__ import annotations
@@ -25,14 +24,14 @@ Speed = Annotated[float, Field(ge=-20, le=20)]
 
 CHECK_STEP_S = 0.02
 
-# Columns of a packed volume: centre NED, velocity NED, half sizes NED of its box, and how much is
-# added round it: everything; or, for a cylinder, the radius in the plane.
+# Columns of a packed volume: centre NED, velocity NED, half sizes NED of a box; radius added on all
+# sides (sphere), and horizontally (cylinder)
 CENTRE, VELOCITY, HALF, ROUND, RADIUS = 0, 3, 6, 9, 10
 PACKED_SIZE = 11
 
 
 class _KeepOut(Parameters):
-    """The centre at time 0 of the reference's own axis (before, it rests there), and velocity."""
+    """Centre when the reference starts, and velocity from then on; before, the volume rests."""
 
     north_m: Metres
     east_m: Metres
@@ -42,7 +41,7 @@ class _KeepOut(Parameters):
     velocity_up_mps: Speed = 0.0
 
     def packed(self) -> Array:
-        """(PACKED_SIZE,), NED, relative to the take-off point."""
+        """The volume as (PACKED_SIZE,), NED, relative to the take-off point."""
         row = np.zeros(PACKED_SIZE)
         row[CENTRE : CENTRE + 3] = self.north_m, self.east_m, -self.height_m
         row[VELOCITY : VELOCITY + 3] = (
@@ -54,7 +53,7 @@ class _KeepOut(Parameters):
 
 
 class Sphere(_KeepOut):
-    """A ball of `radius_m`."""
+    """A sphere of `radius_m`."""
 
     shape: Literal["sphere"]
     radius_m: Size
@@ -66,7 +65,7 @@ class Sphere(_KeepOut):
 
 
 class Cylinder(_KeepOut):
-    """Upright, `length_m` high, about its centre."""
+    """An upright cylinder, `length_m` high."""
 
     shape: Literal["cylinder"]
     radius_m: Size
@@ -80,7 +79,7 @@ class Cylinder(_KeepOut):
 
 
 class Box(_KeepOut):
-    """Sides along north, east and the vertical."""
+    """A box with sides along north, east and the vertical."""
 
     shape: Literal["box"]
     size_north_m: Size
@@ -101,7 +100,7 @@ KeepOut = Annotated[Sphere | Cylinder | Box, Field(discriminator="shape")]
 
 
 def pack(volumes: Sequence[Sphere | Cylinder | Box]) -> Array:
-    """All of them, (V, PACKED_SIZE)."""
+    """The volumes as (V, PACKED_SIZE)."""
     rows = np.zeros((len(volumes), PACKED_SIZE))
     for row, volume in zip(rows, volumes, strict=True):
         row[:] = volume.packed()
@@ -118,7 +117,7 @@ def distance(
     east: float,
     down: float,
 ) -> float:
-    """Metres from the surface of a packed volume whose centre is there, negative inside."""
+    """Distance of a point from the surface of a packed volume with this centre, negative inside."""
     off_n = abs(north - centre_north)
     off_e = abs(east - centre_east)
     off_d = abs(down - centre_down) - volume[HALF + 2]
@@ -135,8 +134,8 @@ def distance(
 
 
 def placed_at(volumes: Array, origin_ned_m: Array, track_time_s: float) -> Array:
-    """The packed volumes where they are at a time of the reference's own axis; NaN and what is
-    before 0 count as 0."""
+    """The packed volumes at a time since the start of the reference; NaN and negative times count
+    as 0."""
     there = volumes.copy()
     elapsed_s = max(track_time_s, 0.0) if track_time_s == track_time_s else 0.0
     there[:, CENTRE:VELOCITY] += origin_ned_m + elapsed_s * there[:, VELOCITY:HALF]
@@ -146,8 +145,8 @@ def placed_at(volumes: Array, origin_ned_m: Array, track_time_s: float) -> Array
 def clearances(
     volumes: Sequence[Sphere | Cylinder | Box], times_s: Array, positions_ned_m: Array
 ) -> Array:
-    """Distance to the nearest volume, (n,), at times (n,) of the reference's axis and positions
-    (n, 3) relative to the take-off point; infinite without volumes."""
+    """Distance to the nearest volume, (n,), at times (n,) since the start of the reference and
+    positions (n, 3) relative to the take-off point; infinite without volumes."""
     packed, origin = pack(volumes), np.zeros(3)
     nearest = np.full(len(times_s), np.inf)
     for i, (time_s, position) in enumerate(zip(times_s, positions_ned_m, strict=True)):
@@ -159,7 +158,7 @@ def clearances(
 def refusal(
     volumes: Sequence[Sphere | Cylinder | Box], clearance_m: float, reference: Reference
 ) -> str | None:
-    """Why `reference`, given relative to the take-off point, cannot be flown with them; or None."""
+    """Why `reference`, relative to the take-off point, conflicts with the volumes; or None."""
     for number, volume in enumerate(volumes):
         times = np.arange(0.0, reference.duration_s + CHECK_STEP_S, CHECK_STEP_S)
         path = reference.sample(times).position_ned_m

@@ -1,5 +1,5 @@
-"""What a plan may not exceed, and what it pays where it does, compiled: speed, tilt, the ground and
-volumes to keep out of. Knows no motion: states are given.
+"""Soft limits of a plan, compiled: speed, tilt, the ground and keep-out volumes. Exceeding them is
+penalised.
 """
 
 from __future__ import annotations
@@ -16,16 +16,16 @@ from offboard.control.horizon.plant import PLANT, SCENE, B, P, V, W, Z
 
 Array = NDArray[np.float64]
 
-# Limits of a hold; every volume is two, at the middle and at the end.
+# Limits of a hold; every volume counts twice, at the middle and at the end
 SPEED, TILT, FLOOR, VOLUME = range(4)
 
-# What a violated limit costs a second: per metre (or m/s, or unit of b), and per its square.
+# Penalty of an exceeded limit per second: per metre (or m/s, or unit of b), and per its square
 SLOPE, CURVATURE = 20.0, 200.0
 
 
 @kernel
 def penalise(hold_s: float, limit: int, over: Array, costs: Array) -> None:
-    """Add what plans pay in a hold for exceeding a limit by `over` (particles,)."""
+    """Add the penalties of one hold to costs (particles,), for exceeding a limit by `over`."""
     share = share_of(hold_s, limit)
     for n in range(costs.shape[0]):
         costs[n] += share * _excess(over[n])
@@ -33,8 +33,8 @@ def penalise(hold_s: float, limit: int, over: Array, costs: Array) -> None:
 
 @entry(PLANT, SCENE, array(2), array(3), array(2))
 def excesses(plants: Any, scenes: Any, volumes: Array, states: Array, over: Array) -> None:
-    """By how much plans exceed each limit in each hold, negative within, -inf where there is none:
-    over (N * limits, particles) of states (N + 1, STATE_SIZE, particles)."""
+    """Compute by how much plans exceed each limit in each hold: over (N * limits, particles) of
+    states (N + 1, STATE_SIZE, particles). Negative within a limit, -inf where it does not apply."""
     plant, scene = plants[0], scenes[0]
     count = limits_of(volumes)
     for k in range(states.shape[0] - 1):
@@ -47,19 +47,19 @@ def excesses(plants: Any, scenes: Any, volumes: Array, states: Array, over: Arra
 
 @kernel
 def limits_of(volumes: Array) -> int:
-    """Limits of each hold: speed, tilt, floor, and every volume at its middle and its end."""
+    """Number of limits in each hold: speed, tilt, floor, and two for every volume."""
     return int(VOLUME + 2 * volumes.shape[0])
 
 
 @kernel
 def share_of(hold_s: float, limit: int) -> float:
-    """For how many seconds of a hold an excess is paid."""
+    """The seconds of a hold for which an excess is penalised."""
     return float(hold_s * (0.5 if limit >= VOLUME else 1.0))
 
 
 @kernel
 def applies(plant: Any, volumes: Array, limit: int) -> bool:
-    """Whether the plant and the situation have this limit."""
+    """Whether this limit applies to the plant and the situation."""
     if limit == SPEED:
         return bool(plant.speed_most_mps < math.inf)
     if limit == TILT:
@@ -78,7 +78,7 @@ def exceed(
     after: Array,
     over: Array,
 ) -> None:
-    """By how much (particles,) hold k exceeds a limit."""
+    """Compute by how much hold k exceeds a limit, over (particles,)."""
     end = 2 * k + 2
     if limit == SPEED:
         v = scene.velocities[end]
@@ -104,7 +104,8 @@ def exceed(
 def _intrude(
     plant: Any, scene: Any, volume: Array, node: int, before: Array, after: Array, over: Array
 ) -> None:
-    """How deep (particles,) within the clearance of a volume at the middle or end of a hold."""
+    """Compute how deep particles are in the clearance of a volume, in the middle or at the end of
+    a hold."""
     hold = plant.hold_s
     centre_n = volume[CENTRE] + 0.5 * hold * node * volume[VELOCITY]
     centre_e = volume[CENTRE + 1] + 0.5 * hold * node * volume[VELOCITY + 1]
@@ -114,7 +115,7 @@ def _intrude(
     for n in range(over.shape[0]):
         if node % 2 == 0:
             x, y, z = after[P, n], after[P + 1, n], after[Z, n]
-        else:  # halfway, as position and velocity at both ends have it
+        else:  # the middle, from position and velocity at both ends
             x = 0.5 * (before[P, n] + after[P, n]) + bow * (before[V, n] - after[V, n])
             y = 0.5 * (before[P + 1, n] + after[P + 1, n])
             y += bow * (before[V + 1, n] - after[V + 1, n])

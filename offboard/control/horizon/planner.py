@@ -130,21 +130,21 @@ class Planner:
         )
         floor_down_m = situation.origin_ned_m[2] - self._settings.clearance_m
         scene = scene_of(ahead, within, volumes, floor_down_m)
-        self.evaluate.settle(self._plant, scene, start_state(task, scene))
+        self.evaluate.prepare(self._plant, scene, start_state(task, scene))
         return task, self.quadratic.problem(task, within)
 
     def own_plan(self, time_s: float) -> Plan:
         """The cheaper of the plan of the closed form and what remains of the previous plan."""
         steps = self._settings.planned
         inputs, states = np.zeros((steps, INPUTS)), np.zeros((steps + 1, STATE_SIZE))
-        plan = self.evaluate.held(inputs, states)
+        plan = self.evaluate.follow(inputs, states)
         if self.previous is not None:
             decided_s, before = self.previous
             gone = round((time_s - decided_s) / self.tracking.period_s)
             if 0 <= gone < steps:
                 inputs[: steps - gone] = before.inputs[gone:]
                 states[: steps - gone + 1] = before.states[gone:]
-                plan = min(plan, self.evaluate.held(inputs, states), key=cost_of)
+                plan = min(plan, self.evaluate.follow(inputs, states), key=cost_of)
         return plan
 
     def conclude(

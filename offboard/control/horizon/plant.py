@@ -1,7 +1,7 @@
-"""What roll-outs fly, as records for compiled code: the plant of one vehicle, the scene of one
-decision, and where a state has what.
+"""Data of the roll-outs as records for compiled code: the plant of one vehicle, the scene of one
+decision, and the layout of a state.
 
-States and inputs are deviations from the reference (`Outlook`). Knows no cost and no search.
+States and inputs are deviations from the reference (`Outlook`).
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from offboard.model.axes import SHORTEST_THRUST_LAG_S, upright
 
 Array = NDArray[np.float64]
 
-# Rows of a state: position, velocity, b, b' north and east in turn; height, climb, T b_z; T.
+# Rows of a state: position, velocity, b, b', each north and east; then z, v_z, T b_z; T
 P, V, B, R, Z, W, F, T = 0, 2, 4, 6, 8, 9, 10, 11
 STATE_SIZE = 12
 INPUTS = 3
@@ -42,7 +42,7 @@ PLANT = np.dtype(
         ("nonlinear", "i8"),
         ("hold_s", "f8"),
         ("gravity_mps2", "f8"),
-        # of the thrust's lag, what is left after half a hold and a whole one
+        # share of a thrust error that is left after half a hold and a whole one
         ("lag_half", "f8"),
         ("lag_full", "f8"),
         ("thrust_least_mps2", "f8"),
@@ -50,7 +50,7 @@ PLANT = np.dtype(
         ("tilt_most", "f8"),  # sine
         ("speed_most_mps", "f8"),
         ("clearance_m", "f8"),
-        # of an acceleration at start, middle and end of a hold, what becomes velocity and position
+        # velocity and position after a hold per acceleration at its start, middle and end
         ("push_v0", "f8"),
         ("push_v1", "f8"),
         ("push_v2", "f8"),
@@ -97,7 +97,7 @@ def plant_of(
 
 def _pushes(drag: float, period_s: float) -> dict[str, float]:
     def carried(after_s: float) -> float:
-        """The distance that a unit of velocity leads to in this time, against the drag."""
+        """The distance covered in this time with an initial velocity of 1, against the drag."""
         return -math.expm1(-drag * after_s) / drag if drag > 0 else after_s
 
     return {
@@ -120,7 +120,7 @@ def _axis(name: str, model: CostToGo) -> dict[str, Array]:
 
 
 class Scene(NamedTuple):
-    """What one decision is made in: the outlook, the bounds and the volumes, as arrays."""
+    """The outlook, the bounds and the volumes of one decision, as arrays."""
 
     positions: Array  # (2 N + 1, 3)
     velocities: Array
@@ -136,7 +136,7 @@ class Scene(NamedTuple):
     floor_down_m: float  # no way round a volume leads below, where the reference does not
 
     def fill(self, record: NDArray[np.void], volumes: Array) -> None:
-        """Into one `SCENE`, and the volumes into an array of their own."""
+        """Write all into one `SCENE` and the volumes into an array of their own."""
         for name in ("thrust_share", "floor_down_m"):
             record[name] = getattr(self, name)
         for name in _PER_STEP:

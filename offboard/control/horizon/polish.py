@@ -1,9 +1,9 @@
-"""The local end of a search: sequential quadratic steps on all inputs of a plan (Gauss and Newton).
+"""Local optimisation of a plan: sequential quadratic programming on all its inputs (Gauss-Newton).
 
-The roll-outs give the slope of the cost and how the states move with each input, which gives its
-curvature. Limits and volumes enter as what they are, half-spaces that may be entered at a price
-per unit and per square of it (a slack each), so that a step ends on their surface and not beside
-it. Each step is searched along on the roll-outs themselves: what is not better is not taken.
+The roll-outs give the gradient of the cost and the derivatives of the states by each input, from
+which the curvature follows. Each limit and volume is a half-space with a slack variable and the
+penalty of `limits`, so that a step ends on its surface. A line search on the roll-outs takes a step
+only where it lowers the cost.
 """
 
 from __future__ import annotations
@@ -21,29 +21,29 @@ from offboard.control.horizon.search import Evaluator, Plan, Remaining, sequence
 
 Array = NDArray[np.float64]
 
-DIFFERENCE = 1e-6  # for slopes, towards the middle of the bounds
+DIFFERENCE = 1e-6  # of the finite differences, towards the middle of the bounds
 STRIDES = 2.0 ** -np.arange(0.0, 12.0)
-TRUSTED, LEAST_TRUSTED = 0.5, 1e-2  # of the bounds: how far the first step may go, and the last
-NEAR = 0.3  # metres and the like: a limit further off is not met in one step
-ENOUGH = 1e-4  # of the cost: a step that promises less is not worth taking
-DAMPING = 1e-6  # of the curvature's trace: inputs that nothing depends on
-ENDLESS = 1e30  # daqp's infinity
+TRUSTED, LEAST_TRUSTED = 0.5, 1e-2  # trust region as a fraction of the bounds: first and least
+NEAR = 0.3  # m, m/s: a limit further away is not reached in one step
+ENOUGH = 1e-4  # of the cost: least predicted gain of a step
+DAMPING = 1e-6  # added to the curvature, for inputs that nothing depends on
+ENDLESS = 1e30  # infinity for daqp
 
 
 class Ended(Enum):
-    """Why a polish went no further."""
+    """Why `polish` ended."""
 
-    SETTLED = "what is left to gain is nothing"
-    STUCK = "no stride along the step is better"
+    CONVERGED = "the predicted gain is negligible"
+    STUCK = "no part of the step lowers the cost"
     SPENT = "all steps were taken"
-    LATE = "time ran out"
+    LATE = "no time is left"
 
 
 def polish(
     evaluate: Evaluator, plan: Plan, most: int, remaining_s: Remaining
 ) -> tuple[Plan, Ended]:
-    """At most `most` steps from `plan`, each within a share of the bounds: less of them where the
-    last step was no good, more where all of it was."""
+    """Take at most `most` steps from `plan`. The trust region shrinks where only a part of a step
+    lowers the cost, and grows where the whole step does."""
     lower, upper = evaluate.lower.T.ravel(), evaluate.upper.T.ravel()
     width, local = TRUSTED, None
     for _ in range(most):
@@ -54,12 +54,12 @@ def polish(
         room = width * (upper - lower)
         step, gain = _step(local, np.maximum(lower - here, -room), np.minimum(upper - here, room))
         if gain <= ENOUGH * abs(plan.cost):
-            return plan, Ended.SETTLED
+            return plan, Ended.CONVERGED
         tried = np.clip(here[:, None] + STRIDES * step[:, None], lower[:, None], upper[:, None])
         costs = evaluate.of_inputs(sequences(tried))
         first = int(np.argmin(costs))
         if costs[first] < plan.cost:
-            plan, local = evaluate.picked(len(STRIDES), first), None
+            plan, local = evaluate.plan(len(STRIDES), first), None
         elif width < LEAST_TRUSTED:
             return plan, Ended.STUCK
         width = min(1.0, 2.0 * width) if first == 0 else max(STRIDES[first], 0.1) * width
@@ -68,8 +68,9 @@ def polish(
 
 @dataclass(frozen=True, slots=True)
 class _Local:
-    """About a plan: curvature (n, n) and slope (n,) of the cost without its limits; of the m
-    limits that are near, the excess (m,), its slope (m, n), and for how long it is paid (m,)."""
+    """The problem about a plan: curvature (n, n) and slope (n,) of the cost without penalties; for
+    each of the m limits nearby the excess (m,), its slope (m, n) and the seconds for which it is
+    penalised (m,)."""
 
     curvature: Array
     slope: Array
@@ -84,7 +85,7 @@ def _local(evaluate: Evaluator, here: Array, upper: Array) -> _Local:
     probes = np.repeat(here[:, None], size + 1, axis=1)
     probes[np.arange(size), np.arange(size)] += inward
     costs = evaluate.of_inputs(sequences(probes))
-    states, over = evaluate.rolled(size + 1)
+    states, over = evaluate.last_states(size + 1)
     shares = evaluate.shares()
     paid = np.maximum(over, 0.0)
     smooth = costs - shares @ (paid * (SLOPE + CURVATURE * paid))
@@ -99,7 +100,8 @@ def _local(evaluate: Evaluator, here: Array, upper: Array) -> _Local:
 
 
 def _curvature(plant: NDArray[np.void], moved: Array) -> Array:
-    """(n, n) of the cost of states that move as (N + 1, STATE_SIZE, n) with the n inputs."""
+    """Curvature (n, n) of the cost; `moved` (N + 1, STATE_SIZE, n) is the derivative of the states
+    by the n inputs."""
     steps, size = len(moved) - 1, moved.shape[2]
     held = np.eye(size).reshape(INPUTS, steps, size)
     total = DAMPING * np.eye(size)
@@ -117,8 +119,8 @@ def _curvature(plant: NDArray[np.void], moved: Array) -> Array:
 
 
 def _step(local: _Local, lower: Array, upper: Array) -> tuple[Array, float]:
-    """The minimiser (n,) of the quadratic within its box, a slack for each limit; and by how much
-    it is lower there than here."""
+    """The step (n,) to the minimum of the quadratic with a slack variable for each limit, and the
+    predicted gain."""
     size, count = len(local.slope), len(local.over)
     curvature = np.zeros((size + count, size + count))
     curvature[:size, :size] = local.curvature

@@ -1,10 +1,9 @@
 """Roll-outs of the attitude interface over N holds, compiled: one plan per particle.
 
-The motion is the linear one of the tracking law's own model, sampled exactly, plus what thrust
-times direction adds beyond it, integrated over start, middle and end of each hold (Simpson). A plan
-of zeros flies the reference exactly, and for small deviations cost and motion are those of the
-closed form. Structure of arrays: the innermost loop runs over particles. Nothing is drawn, nothing
-is remembered.
+The motion is that of the tracking laws' linear model, sampled exactly, plus the nonlinear part of
+thrust times direction, integrated over start, middle and end of each hold (Simpson). A plan of
+zeros flies the reference exactly, and for small deviations cost and motion are those of the closed
+form. Structure of arrays: the innermost loop runs over particles.
 """
 
 from __future__ import annotations
@@ -58,12 +57,12 @@ def roll_out(
     over: Array,
     costs: Array,
 ) -> None:
-    """Costs (particles,) of plans, and their states (N + 1, STATE_SIZE, particles) and inputs
-    (N, 3, particles); `over` (particles,) is scratch.
+    """Compute costs (particles,), states (N + 1, STATE_SIZE, particles) and inputs
+    (N, 3, particles) of plans; `over` (particles,) is scratch.
 
-    Input of a step = base_inputs (N, 3) + `feedback` times the closed form's answer to how far the
-    state is from base_states (N + 1, STATE_SIZE) + weights (N, M) @ knots (M, 3, particles),
-    clipped to the bounds.
+    The input of a step is base_inputs (N, 3) + weights (N, M) @ knots (M, 3, particles) +
+    `feedback` times the closed form's answer to the deviation of the state from base_states
+    (N + 1, STATE_SIZE), clipped to the bounds.
     """
     plant, scene = plants[0], scenes[0]
     for row in range(STATE_SIZE):
@@ -76,17 +75,17 @@ def roll_out(
         )  # fmt: skip
         _hold(plant, states[k], inputs[k], states[k + 1], costs)
         if plant.nonlinear != 0:
-            _bend(plant, scene, k, states[k], inputs[k], states[k + 1])
+            _add_nonlinear_part(plant, scene, k, states[k], inputs[k], states[k + 1])
         for limit in range(limits_of(volumes)):
             if applies(plant, volumes, limit):
                 exceed(plant, scene, volumes, k, limit, states[k], states[k + 1], over)
                 penalise(plant.hold_s, limit, over, costs)
-    _conclude(plant, states[inputs.shape[0]], costs)
+    _add_terminal_cost(plant, states[inputs.shape[0]], costs)
 
 
 @kernel
-def _conclude(plant: Any, last: Array, costs: Array) -> None:
-    """Add what remains to be paid behind the last hold."""
+def _add_terminal_cost(plant: Any, last: Array, costs: Array) -> None:
+    """Add the cost-to-go of the last state."""
     q, s = plant.lateral_terminal, plant.vertical_terminal
     for n in range(costs.shape[0]):
         cost = costs[n]
@@ -139,7 +138,7 @@ def _choose(
 
 @kernel
 def _hold(plant: Any, before: Array, chosen: Array, after: Array, costs: Array) -> None:
-    """One hold of every particle: its cost, then where it leads by the linear model."""
+    """One hold of every particle: its cost and the state after it, by the linear model."""
     a, b = plant.lateral_transition, plant.lateral_input
     q = plant.lateral_stage
     for axis in range(2):
@@ -174,8 +173,10 @@ def _hold(plant: Any, before: Array, chosen: Array, after: Array, costs: Array) 
 
 
 @kernel
-def _bend(plant: Any, scene: Any, k: int, before: Array, chosen: Array, after: Array) -> None:
-    """Add what T b does beyond the linear model: at start, middle and end of the hold."""
+def _add_nonlinear_part(
+    plant: Any, scene: Any, k: int, before: Array, chosen: Array, after: Array
+) -> None:
+    """Add the difference between T b and its linear model, at start, middle and end of a hold."""
     tilt = plant.tilt_half
     g, share = plant.gravity_mps2, scene.thrust_share
     ref = scene.directions[2 * k : 2 * k + 3]
@@ -202,7 +203,7 @@ def _bend(plant: Any, scene: Any, k: int, before: Array, chosen: Array, after: A
         asked = _clip(asked, plant.thrust_least_mps2, plant.thrust_most_mps2) - led
         t1 = asked + (t0 - asked) * plant.lag_half
         t2 = asked + (t0 - asked) * plant.lag_full
-        # residual accelerations: -(T b - T_r b_r), less the linear model's
+        # residual accelerations: -(T b - T_r b_r) minus those of the linear model
         x0 = g * n0 - share * ((thrusts[0] + t0) * n0 + t0 * ref[0, 0])
         x1 = g * n1 - share * ((thrusts[1] + t1) * n1 + t1 * ref[1, 0])
         x2 = g * n2 - share * ((thrusts[2] + t2) * n2 + t2 * ref[2, 0])

@@ -85,5 +85,5 @@ def sample(
         if remaining_s is not None and remaining_s() <= 0:
             break
     evaluate.of_knots(base, mean[:, :, None])
-    plan = evaluate.picked(1, 0)
+    plan = evaluate.plan(1, 0)
     return Found(plan, float(np.linalg.norm(sd)), done, done < settings.iterations)

@@ -1,8 +1,8 @@
-"""Searches for the knots of a plan, and the polish of what they find.
+"""The swarm's search for the knots of a plan, and the roll-outs that every search uses.
 
-A plan is a base (inputs and the states they lead to), held by the closed form's feedback, plus a
-few knots interpolated over its steps. The searches know it only through `Evaluator`, which runs
-the roll-outs; `swarm`, `mppi` and `cem` spend the same number of them.
+A plan is a base (inputs and the states they lead to) that the feedback of the closed form follows,
+plus a few knots interpolated over its steps. `Evaluator` runs the roll-outs; by default `horizon`,
+`mppi` and `cem` use the same number of them.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from offboard.control.swarm import RandomLanes, Swarm, SwarmSettings
 Array = NDArray[np.float64]
 Remaining = Callable[[], float] | None
 
-# Steps of the knots: dense where the next command is, sparse where it will be decided again
+# Places of the knots as fractions of the plan: dense at its start, which is what is commanded
 KNOT_SHARES = (0.0, 0.15, 0.4, 0.8)
 
 
@@ -38,7 +38,7 @@ class Plan:
 
 @dataclass(frozen=True, slots=True)
 class Found:
-    """The plan a search ended with and how."""
+    """The plan that a search ended with; `spread` of its last knots."""
 
     plan: Plan
     spread: float
@@ -47,7 +47,7 @@ class Found:
 
 
 def knot_weights(steps: int) -> Array:
-    """(N, M): linear between knots, held after the last one."""
+    """Weights (N, M) of M knots in each step: linear between knots, constant after the last."""
     places = sorted({round(share * (steps - 1)) for share in KNOT_SHARES})
     weights = np.zeros((steps, len(places)))
     for step in range(steps):
@@ -59,7 +59,7 @@ def knot_weights(steps: int) -> Array:
 
 
 class Evaluator:
-    """Runs roll-outs of `steps` holds in one situation, with `volumes` volumes to keep out of."""
+    """Runs roll-outs of `steps` holds in one situation, with `volumes` keep-out volumes."""
 
     def __init__(self, steps: int, volumes: int) -> None:
         self.steps = steps
@@ -70,8 +70,9 @@ class Evaluator:
         self._each_step = np.eye(steps)
         self._batches: dict[int, _Batch] = {}
 
-    def settle(self, plant: NDArray[np.void], scene: Scene, start: Array) -> None:
-        """The situation of the roll-outs that follow: one `PLANT`, and a state (STATE_SIZE,)."""
+    def prepare(self, plant: NDArray[np.void], scene: Scene, start: Array) -> None:
+        """Set the situation of the next roll-outs: one `PLANT`, the scene, and the state
+        (STATE_SIZE,) that they start from."""
         self.scene = scene
         self.plant[:] = plant
         scene.fill(self._record, self._volumes)
@@ -79,51 +80,53 @@ class Evaluator:
 
     @property
     def lower(self) -> Array:
+        """Lower bounds of the inputs, (N, 3)."""
         return self.scene.lower
 
     @property
     def upper(self) -> Array:
+        """Upper bounds of the inputs, (N, 3)."""
         return self.scene.upper
 
     def of_knots(self, base: Plan, knots: Array) -> Array:
-        """Costs (n,) of knots (M, 3, n) about `base`; a plan is read with `picked`."""
+        """Costs (n,) of knots (M, 3, n) about `base`; `plan` returns one of these plans."""
         return self._run((base.inputs, base.states), 1.0, self.knots, knots)
 
     def of_inputs(self, inputs: Array) -> Array:
         """Costs (n,) of input sequences (N, 3, n), clipped to the bounds."""
         return self._run(self._nothing, 0.0, self._each_step, inputs)
 
-    def held(self, inputs: Array, states: Array) -> Plan:
-        """What becomes of inputs (N, 3) with the feedback that holds states (N + 1, .)."""
+    def follow(self, inputs: Array, states: Array) -> Plan:
+        """The plan of inputs (N, 3) plus feedback towards states (N + 1, STATE_SIZE)."""
         no_knots = np.zeros((self.knots.shape[1], INPUTS, 1))
         self._run((inputs, states), 1.0, self.knots, no_knots)
-        return self.picked(1, 0)
+        return self.plan(1, 0)
 
-    def flown(self, inputs: Array) -> Plan:
-        """What becomes of inputs (N, 3) without feedback."""
+    def open_loop(self, inputs: Array) -> Plan:
+        """The plan of inputs (N, 3) without feedback."""
         self.of_inputs(inputs[:, :, None])
-        return self.picked(1, 0)
+        return self.plan(1, 0)
 
-    def picked(self, count: int, index: int) -> Plan:
-        """Plan `index` of the last roll-outs with `count` particles."""
+    def plan(self, count: int, index: int) -> Plan:
+        """Plan number `index` of the last roll-outs with `count` particles."""
         batch = self._batches[count]
         inputs, states = batch.inputs[:, :, index].copy(), batch.states[:, :, index].copy()
         return Plan(inputs, states, float(batch.costs[index]))
 
-    def rolled(self, count: int) -> tuple[Array, Array]:
-        """States (N + 1, STATE_SIZE, count) of the last roll-outs with `count` particles, and by
-        how much they exceed each limit: see `excesses`."""
+    def last_states(self, count: int) -> tuple[Array, Array]:
+        """States (N + 1, STATE_SIZE, count) of the last roll-outs with `count` particles, and
+        their `excesses`."""
         states = self._batches[count].states
         return states, self._excesses(states)
 
     def shares(self) -> Array:
-        """(N * limits,): for how many seconds each of `excesses` is paid."""
+        """(N * limits,): the seconds for which each of `excesses` is penalised."""
         hold_s = float(self.plant["hold_s"][0])
         limits = range(limits_of(self._volumes))
         return np.tile([share_of(hold_s, limit) for limit in limits], self.steps)
 
-    def meets(self, plan: Plan, margin_m: float) -> bool:
-        """Whether a plan comes closer to the clearance of any volume than `margin_m`."""
+    def is_near(self, plan: Plan, margin_m: float) -> bool:
+        """Whether a plan comes within `margin_m` of the clearance of any volume, or into it."""
         over = self._excesses(plan.states[:, :, None])
         return bool((over.reshape(self.steps, -1)[:, VOLUME:] > -margin_m).any())
 
@@ -149,7 +152,7 @@ class Evaluator:
 
 
 class _Batch:
-    """What comes out of the roll-outs of `count` particles, made once: see `roll_out`."""
+    """Arrays for the results of `roll_out` with `count` particles, made once."""
 
     def __init__(self, steps: int, count: int) -> None:
         self.states = np.empty((steps + 1, STATE_SIZE, count))
@@ -165,8 +168,8 @@ def swarm(
     lanes: RandomLanes,
     remaining_s: Remaining,
 ) -> Found:
-    """Particles of knots within +-reach (M, 3) of `base`; the first one stands on it, and so
-    the answer is never worse."""
+    """The best plan whose knots are within +-reach (M, 3) about `base`. The first particle starts
+    at the base, so the answer is never worse."""
     limit = reach.ravel()
     particles = Swarm(-limit, limit, settings, lanes, _graded(limit, settings.particles))
     shape = (*reach.shape, settings.particles)
@@ -176,7 +179,7 @@ def swarm(
         costs = evaluate.of_knots(base, knots)
         first = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
         if costs[first] < best.cost:
-            best = evaluate.picked(settings.particles, first)
+            best = evaluate.plan(settings.particles, first)
         particles.tell(costs)
         if remaining_s is not None and remaining_s() <= 0 and iteration + 1 < settings.iterations:
             cut_short = True
@@ -186,8 +189,8 @@ def swarm(
 
 
 def _graded(limit: Array, count: int) -> list[Array]:
-    """Where the particles start, (n,) each: the first on the base, the others scattered about it,
-    ever wider. The same at each decision: what differs is their motion."""
+    """Where the particles start, (n,) each: the first at the base, the others scattered about it,
+    each wider than the one before. Equal in all decisions; their motion is random."""
     return list(_directions(count, len(limit)) * limit)
 
 
@@ -199,6 +202,6 @@ def _directions(count: int, size: int) -> Array:
 
 
 def sequences(stacked: Array) -> Array:
-    """(3 N, n) of the quadratic's order to (N, 3, n)."""
+    """Inputs (3 N, n) in the order of `HorizonQuadratic` as (N, 3, n)."""
     size, count = stacked.shape
     return stacked.reshape(INPUTS, size // INPUTS, count).transpose(1, 0, 2)

@@ -82,21 +82,21 @@ class HorizonLaw:
         if settings.seed_with_qp:
             exact = self.planner.exact.minimise(linear)
             if np.isfinite(exact).all():
-                plans.append(evaluate.flown(self.planner.quadratic.plan(exact)))
+                plans.append(evaluate.open_loop(self.planner.quadratic.plan(exact)))
         if settings.keep_out:
             inputs = np.zeros((settings.planned, INPUTS))
             ways = detours(evaluate.scene, settings.reach_m)
-            plans.extend(evaluate.held(inputs, way) for way in ways)
+            plans.extend(evaluate.follow(inputs, way) for way in ways)
         return plans
 
     def _polished(self, seeds: list[Plan], remaining_s: Remaining) -> Found | None:
         """The best seed, polished, if that leaves nothing to search for: no volume is near, and
         the convex problem that remains is solved."""
         settings, evaluate = self._settings, self.planner.evaluate
-        if not settings.seed_with_qp or any(evaluate.meets(plan, MET_M) for plan in seeds):
+        if not settings.seed_with_qp or any(evaluate.is_near(plan, MET_M) for plan in seeds):
             return None
         best, ended = polish(evaluate, min(seeds, key=cost_of), settings.polish_steps, remaining_s)
-        return Found(best, math.nan, 0, False) if ended is Ended.SETTLED else None
+        return Found(best, math.nan, 0, False) if ended is Ended.CONVERGED else None
 
     def _searched(self, bases: list[Plan], remaining_s: Remaining) -> Found:
         """The best plan about any of the bases, which share the iterations. Searching only about

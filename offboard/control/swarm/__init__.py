@@ -1,7 +1,7 @@
-"""The particle swarm of Eqs. 19-20 and 30: one law of motion, driven two ways.
+"""The particle swarm of Eqs. 19-20 and 30, with two interfaces.
 
-`Swarm` (ask/tell) serves any objective, `QuadraticSwarm` a `BoxQuadratic` without leaving compiled
-code. Knows objectives only as costs: no model, no reference, no clock.
+`Swarm` (ask/tell) serves any objective; `QuadraticSwarm` minimises a `BoxQuadratic` entirely in
+compiled code. Knows no model, no reference and no clock.
 """
 
 from offboard.control.swarm.lanes import RandomLanes

@@ -1,7 +1,7 @@
-"""The random stream of a swarm: one xorshift generator per particle, advanced in place.
+"""The random numbers of a swarm: one xorshift generator (lane) per particle, advanced in place.
 
-Each particle draws from its own lane, so that compiled code fills whole rows at once and the
-stream does not depend on who drives the swarm. Knows neither particles nor costs.
+Each particle draws from its own lane, so that compiled code fills whole rows at once, and both
+interfaces of the swarm draw the same numbers.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ _GOLDEN = 0x9E3779B97F4A7C15
 
 
 def _splitmix64(value: int) -> int:
-    """A well mixed 64-bit number, never 0 (where xorshift would stay for ever)."""
+    """The splitmix64 hash; never 0, which xorshift would repeat for ever."""
     value = (value ^ (value >> 30)) * 0xBF58476D1CE4E5B9 & _MASK
     value = (value ^ (value >> 27)) * 0x94D049BB133111EB & _MASK
     return (value ^ (value >> 31)) or _GOLDEN
 
 
 class RandomLanes:
-    """A reproducible stream that goes on from search to search; `reset` starts it anew.
+    """Reproducible random lanes that continue from search to search; `reset` starts them anew.
 
-    `states(count)` hands out the live lanes: whoever draws from them advances the stream. Lane i
-    depends on the seed and i alone, not on how many lanes are in use.
+    Lane i depends on the seed and i alone, not on the number of lanes in use. Raises ValueError for
+    a seed outside 0 .. 2**64 - 1.
     """
 
     def __init__(self, seed: int) -> None:
@@ -37,9 +37,11 @@ class RandomLanes:
         self._handed_out = self._states
 
     def states(self, count: int) -> States:
-        """The first `count` lanes, shape (count,), to be advanced in place: the same array as long
-        as the same count is asked for. Whoever holds fewer of them when there come to be more goes
-        on with those of its own."""
+        """The states of the first `count` lanes, shape (count,), to be advanced in place.
+
+        The same array is returned as long as `count` is the same. When `count` grows the lanes are
+        copied: an array returned before is no longer connected with them.
+        """
         held = len(self._states)
         if count > held:
             start = _splitmix64(self._seed)
@@ -51,5 +53,6 @@ class RandomLanes:
         return self._handed_out
 
     def reset(self) -> None:
+        """Return all lanes to their state at the seed."""
         self._states = np.empty(0, np.uint64)
         self._handed_out = self._states

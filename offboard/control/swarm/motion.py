@@ -1,8 +1,8 @@
-"""How particles move and what they remember, compiled: the one copy of the law of motion.
+"""Motion and memory of the particles, compiled; used by both interfaces of the swarm.
 
 Structure of arrays: positions, velocities and personal bests have shape (n, particles), so that
 the innermost loop runs over particles and vectorises. Arrays are changed in place; nothing is
-allocated. Knows no objective.
+allocated.
 """
 
 from __future__ import annotations
@@ -25,19 +25,19 @@ SEARCH = np.dtype(
         ("damping", "f8"),
         ("rebound", "f8"),
         ("initial_velocity", "f8"),
-        # the objective's constant, where it is a quadratic
+        # the constant of a quadratic objective
         ("constant", "f8"),
-        # done so far, and how far to go
+        # iterations done, their limit, and costs that were not finite
         ("iterations", "i8"),
         ("limit", "i8"),
         ("rejected", "i8"),
-        # the leader's cost and the spread, Eqs. 28-29
+        # cost of the best particle and spread, Eqs. 28-29
         ("cost", "f8"),
         ("spread", "f8"),
     ],
     align=True,
 )
-"""The numbers of one search: the settings, what it is told and what it found so far."""
+"""Settings and state of one search."""
 
 _SHIFT_A = np.uint64(13)
 _SHIFT_B = np.uint64(7)
@@ -61,7 +61,7 @@ def _next(x: np.uint64) -> np.uint64:
 def scatter(
     searches: Any, lanes: States, lower: Array, upper: Array, positions: Array, velocities: Array
 ) -> None:
-    """Begin a search: uniform positions in the box and uniform velocities of either sign."""
+    """Begin a search: uniform positions within the bounds, uniform velocities of either sign."""
     search = searches[0]
     search.iterations = search.rejected = 0
     search.cost = search.spread = np.inf
@@ -91,8 +91,9 @@ def move(
 ) -> None:
     """Eqs. 30 and 20 with a random number per dimension; Eq. 22 by clamping.
 
-    A clamped component turns its velocity round, times `rebound`: a particle that keeps it stays
-    pressed on the wall, and where all lose it beside their leader, that dimension is dead.
+    Where a particle is clamped its velocity is reversed and multiplied by `rebound`. If it were
+    kept, the particle would stay at the bound; if it were set to zero, all particles could come to
+    rest beside the best one in this dimension.
     """
     inertia, personal, social = search.inertia, search.personal, search.social
     damping, rebound = search.damping, search.rebound
@@ -135,9 +136,9 @@ def move_particles(
 def remember(
     search: Any, costs: Array, positions: Array, bests: Array, best_costs: Array, leader: Array
 ) -> None:
-    """Update personal bests and the leader, count the iteration and what costs are rejected.
+    """Update personal bests and the leader (best of all); count the iteration and rejected costs.
 
-    Of equal costs the earlier one stands; a cost that is not finite never becomes a best.
+    Of equal costs the first one found stays the best; a cost that is not finite is rejected.
     """
     dimensions, particles = positions.shape
     leader_cost = search.cost

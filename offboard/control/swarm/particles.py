@@ -1,11 +1,11 @@
-"""The swarm as ask/tell: the caller owns the loop, the evaluation and the deadline.
+"""The swarm for any objective, as ask/tell: the caller owns loop, evaluation and deadline.
 
     swarm = Swarm(lower, upper, settings, lanes)
     for _ in range(settings.iterations):
         swarm.tell(objective(swarm.ask()))
     answer = swarm.result()
 
-Knows the objective only by the costs it is told. What callers hand in is copied.
+Arguments are copied.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ Array = NDArray[np.float64]
 
 
 class Swarm:
-    """One search in a box. `seeds` are inputs (n,) that the first particles start from: the answer
+    """One search within bounds (n,). The first particles start from `seeds`, (n,) each: the answer
     is never worse than the best of them."""
 
     def __init__(
@@ -45,7 +45,7 @@ class Swarm:
         self._told = False
 
     def ask(self) -> Array:
-        """Inputs to evaluate, (particles, n). Asking again without telling gives the same."""
+        """Inputs to evaluate, (particles, n); the same until `tell` is called."""
         if self._told:
             p = self._all
             where = p.search, self._drawn, p.lower, p.upper, p.positions, p.velocities
@@ -54,9 +54,9 @@ class Swarm:
         return self._all.positions.T.copy()
 
     def tell(self, costs: ArrayLike) -> None:
-        """The costs (particles,) of the inputs last asked for. What is not finite counts as +inf.
+        """Give the costs (particles,) of the inputs returned by `ask`; NaN and -inf count as +inf.
 
-        Raises ValueError on another shape or if nothing was asked since the last call.
+        Raises ValueError for another shape, or where `ask` was not called since the last `tell`.
         """
         values, p = np.asarray(costs, np.float64), self._all
         if self._told:
@@ -69,14 +69,14 @@ class Swarm:
 
     @property
     def spread(self) -> float:
-        """Epsilon of Eq. 29 of the inputs last told of."""
+        """Epsilon of Eq. 29 after the last `tell`."""
         return float(self._all.spread[0])
 
     @property
     def converged(self) -> bool:
-        """Whether the spread has fallen to the settings' tolerance (never, if that is 0)."""
+        """Whether the spread has fallen to the tolerance of the settings (never, if it is 0)."""
         return self._told and self.spread <= self._tolerance > 0
 
     def result(self, cut_short: bool = False) -> SwarmResult:
-        """Best so far."""
+        """The best input so far."""
         return self._all.result(cut_short)

@@ -1,7 +1,4 @@
-"""The particles of a swarm: the arrays that compiled code moves, made once.
-
-Knows the law of motion and the box, and neither objective nor who drives the search.
-"""
+"""The arrays of a swarm, made once and changed in place by compiled code."""
 
 from __future__ import annotations
 
@@ -25,7 +22,8 @@ class Box(NamedTuple):
 
 
 def box(lower: ArrayLike, upper: ArrayLike) -> Box:
-    """Checked copies. Raises ValueError on shapes that differ, disorder or anything not finite."""
+    """Copies of the bounds. Raises ValueError where their shapes differ, lower exceeds upper, or
+    anything is not finite."""
     low = np.array(lower, np.float64, order="C")
     high = np.array(upper, np.float64, order="C")
     if low.ndim != 1 or low.shape != high.shape or not low.size:
@@ -36,7 +34,7 @@ def box(lower: ArrayLike, upper: ArrayLike) -> Box:
 
 
 class Population:
-    """Particles in `dimensions` inputs, and where in memory they are for good.
+    """The particles of a swarm in `dimensions` inputs.
 
     positions, velocities, bests (n, particles); costs, best_costs (particles,); leader, lower,
     upper (n,); search, one `SEARCH`, of which limit, cost and spread are views (1,).
@@ -53,14 +51,14 @@ class Population:
         self.limit, self.cost, self.spread = (self.search[n] for n in ("limit", "cost", "spread"))
 
     def confine(self, within: Box) -> None:
-        """To this box. Raises ValueError on one of another dimension."""
+        """Set the bounds. Raises ValueError where they have another dimension."""
         if len(within.lower) != len(self.leader):
             raise ValueError(f"{len(within.lower)} inputs for a swarm of {len(self.leader)}")
         self.lower[:], self.upper[:] = within
 
     def begin(self, seeds: Sequence[ArrayLike]) -> None:
-        """Where they were scattered, but the first of them on the `seeds`, clamped to the box.
-        Seeds that are not finite or beyond the number of particles are left out."""
+        """Move the first particles to the `seeds`, clamped to the bounds, and clear the memory.
+        Seeds that are not finite, and more seeds than particles, are ignored."""
         usable = [
             seed for seed in (np.asarray(s, np.float64) for s in seeds) if np.isfinite(seed).all()
         ]
@@ -71,7 +69,7 @@ class Population:
         self.leader[:] = self.positions[:, 0]
 
     def result(self, cut_short: bool, history: SwarmHistory | None = None) -> SwarmResult:
-        """Best so far."""
+        """The best input so far."""
         found = self.search[0]
         return SwarmResult(
             self.leader.copy(),

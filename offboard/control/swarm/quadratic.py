@@ -1,7 +1,7 @@
-"""The swarm on a `BoxQuadratic`, compiled from the first particle to the answer.
+"""The swarm for a `BoxQuadratic`, entirely in compiled code.
 
-Moves the same particles as `Swarm` does on the same random stream. Knows no clock: it runs in
-chunks of iterations and asks between them how much time the caller has left.
+It moves the particles exactly as `Swarm` does with the same random numbers. It runs in chunks of
+iterations and asks between them how much time is left.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from offboard.control.swarm.settings import SwarmHistory, SwarmResult, SwarmSett
 
 Array = NDArray[np.float64]
 
-CHUNK_ITERATIONS = 25  # between two looks at the time left: about 15 us
+CHUNK_ITERATIONS = 25  # about 15 us
 
 
 @entry(
@@ -43,7 +43,7 @@ def iterate(
     hessian: Array,
     gradient: Array,
 ) -> None:
-    """Iterations up to the limit; the first of them evaluates where the particles stand."""
+    """Iterate up to the limit. The first iteration evaluates the particles where they start."""
     search = searches[0]
     while search.iterations < search.limit:
         if search.iterations > 0:
@@ -57,7 +57,7 @@ def iterate(
 def quadratic_costs(
     hessian: Array, gradient: Array, constant: float, positions: Array, costs: Array
 ) -> None:
-    """J of positions (n, particles) into costs (particles,)."""
+    """Compute J of positions (n, particles), costs (particles,)."""
     if positions.shape[0] == 4:
         _costs_of_four(hessian, gradient, constant, positions, costs)
         return
@@ -74,7 +74,7 @@ def quadratic_costs(
 def _costs_of_four(
     hessian: Array, gradient: Array, constant: float, positions: Array, costs: Array
 ) -> None:
-    """The same for the four inputs of Eq. 6, unrolled: a third of the time of a search."""
+    """The same for four inputs, unrolled: a search takes a third of the time."""
     h00, h11 = 0.5 * hessian[0, 0], 0.5 * hessian[1, 1]
     h22, h33 = 0.5 * hessian[2, 2], 0.5 * hessian[3, 3]
     h10, h20, h21 = hessian[1, 0], hessian[2, 0], hessian[2, 1]
@@ -92,7 +92,7 @@ def _costs_of_four(
 
 
 class QuadraticSwarm:
-    """Searches for minima of quadratics in `dimensions` inputs; its arrays are made once."""
+    """Minimises quadratics in `dimensions` inputs; its arrays are made once."""
 
     def __init__(self, settings: SwarmSettings, dimensions: int) -> None:
         self._settings = settings
@@ -108,11 +108,12 @@ class QuadraticSwarm:
         remaining_s: Callable[[], float] | None = None,
         keep_history: bool = False,
     ) -> SwarmResult:
-        """The best input found in the problem's box.
+        """The best input found within the bounds of the problem.
 
-        `remaining_s` says how many seconds are left; once it says none, the best so far is the
-        answer, after one chunk of iterations at the earliest. Raises ValueError on bounds that
-        are not finite and ordered, or of another dimension.
+        `remaining_s` returns how many seconds are left; when none are, the search ends with the
+        best so far, after one chunk of iterations at the earliest. `keep_history` keeps every
+        iteration. Raises ValueError for bounds that are not finite and ordered, or of another
+        dimension.
         """
         arguments = self._start(problem, lanes, seeds)
         p, limit, tolerance = self._all, self._settings.iterations, self._settings.tolerance
@@ -135,7 +136,7 @@ class QuadraticSwarm:
     def _start(
         self, problem: BoxQuadratic, lanes: RandomLanes, seeds: Sequence[ArrayLike]
     ) -> tuple[Any, ...]:
-        """Scatter the particles; the arguments of `iterate`."""
+        """Scatter the particles and return the arguments of `iterate`."""
         p = self._all
         p.confine(box(problem.lower, problem.upper))
         self._hessian[:] = problem.hessian
@@ -149,7 +150,7 @@ class QuadraticSwarm:
 
 
 def warm_up() -> None:
-    """Call every compiled path of the swarm once, so that none compiles in flight."""
+    """Load or compile every compiled function of the swarm, so that no measured search has to."""
     settings = SwarmSettings(particles=2, iterations=2)
     for dimensions in (2, 4):
         zeros, ones = np.zeros(dimensions), np.ones(dimensions)

@@ -1,4 +1,4 @@
-"""What a swarm is told and what it answers: values only."""
+"""Settings and results of a swarm."""
 
 from __future__ import annotations
 
@@ -16,19 +16,20 @@ Array = NDArray[np.float64]
 class SwarmSettings(Parameters):
     """The swarm of the paper's section 4.1 with the damping of Table 2.
 
-    `damping` is lambda of Eq. 30 (1 gives Eq. 19). `rebound` is the part of its velocity that a
-    particle keeps, turned round, where it is clamped to the box: at 0 one search in a hundred
-    ends beside a minimum on the bounds, at 0.5 one in ten thousand (40 x 150), but only at 0 does
-    epsilon at lambda = 1 come out as the paper's. `initial_velocity` bounds the first velocities,
-    as a fraction of the box's width. A swarm whose spread (Eq. 29) falls to `tolerance`, in the
-    unit of the inputs, stops early; at 0 it uses all its iterations.
+    `inertia`, `personal` and `social` are w, c1 and c2 of Eq. 19, `damping` is lambda of Eq. 30 (1
+    gives Eq. 19). `rebound` is the share of the velocity with which a particle is reflected at a
+    bound: with 0 one search in a hundred misses a minimum on the bounds, with 0.5 one in ten
+    thousand (40 x 150); but only with 0 epsilon at lambda = 1 equals the paper's.
+    `initial_velocity` bounds the first velocities, as a fraction of the distance between the
+    bounds. The search ends early when the spread (Eq. 29) falls to `tolerance`, in the unit of the
+    inputs; never, if that is 0.
     """
 
     particles: int = Field(default=40, ge=2, le=10_000)
     iterations: int = Field(default=150, ge=1, le=100_000)
     inertia: float = Field(default=0.9298, ge=0, le=2)
-    personal: float = Field(default=1.4986, ge=0, le=4)  # c1
-    social: float = Field(default=1.4986, ge=0, le=4)  # c2
+    personal: float = Field(default=1.4986, ge=0, le=4)
+    social: float = Field(default=1.4986, ge=0, le=4)
     damping: float = Field(default=0.65, gt=0, le=1)
     rebound: float = Field(default=0.5, ge=0, le=1)
     initial_velocity: float = Field(default=0.5, ge=0, le=1)
@@ -50,11 +51,11 @@ class SwarmHistory:
 
 @dataclass(frozen=True, slots=True)
 class SwarmResult:
-    """The answer of one search.
+    """The result of one search.
 
-    `best` (n,) is always finite and inside the box; `cost` is inf if no particle ever had a
-    finite cost. `spread` is epsilon of Eq. 29 in the last iteration. `cut_short` says that the
-    caller's time ran out, `rejected` how many costs were not finite.
+    `best` (n,) is always finite and within the bounds; `cost` is inf if no particle had a finite
+    cost. `spread` is epsilon of Eq. 29 in the last iteration, `cut_short` whether the time ran
+    out, `rejected` how many costs were not finite.
     """
 
     best: Array

@@ -13,7 +13,7 @@ from typing import ClassVar
 from simulator.autopilot.guidance import Guidance
 from simulator.autopilot.state import StateEstimate
 from simulator.autopilot.trajectory import Leg
-from simulator.firmware.values import NAN3, Behaviour, MotionSetpoint, Triple
+from simulator.firmware.values import Behaviour, MotionSetpoint, Triple
 
 
 class Control(Enum):
@@ -36,8 +36,9 @@ class ActiveBehaviour:
     def __init__(self, guidance: Guidance) -> None:
         self.guidance = guidance
 
-    def enter(self, place_ned_m: Triple = NAN3) -> None:
-        """Begin. `place_ned_m`: where a takeoff climbs to; NaN where it is not specified."""
+    def enter(self, estimate: StateEstimate, place_ned_m: Triple, *, landed: bool) -> None:
+        """Begin, before the first `motion`. `place_ned_m`: where a takeoff climbs to; NaN where it
+        is not specified."""
 
     def leave(self) -> None:
         """End: another behaviour begins."""

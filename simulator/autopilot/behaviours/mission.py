@@ -6,7 +6,7 @@ from simulator.autopilot.behaviours.base import ActiveBehaviour
 from simulator.autopilot.behaviours.land import descent, land_speed_mps
 from simulator.autopilot.state import StateEstimate
 from simulator.autopilot.trajectory import Leg
-from simulator.firmware.values import NAN3, MotionSetpoint, Triple
+from simulator.firmware.values import MotionSetpoint
 
 
 class FlyMission(ActiveBehaviour):
@@ -14,9 +14,6 @@ class FlyMission(ActiveBehaviour):
 
     lifts_off = True
     continues = True
-
-    def enter(self, place_ned_m: Triple = NAN3) -> None:
-        self.guidance.mission.pause()
 
     def leave(self) -> None:
         self.guidance.mission.pause()

@@ -7,7 +7,7 @@ import math
 from simulator.autopilot.behaviours.base import ActiveBehaviour
 from simulator.autopilot.behaviours.land import descent
 from simulator.autopilot.state import StateEstimate
-from simulator.firmware.values import NAN3, MotionSetpoint, Triple
+from simulator.firmware.values import MotionSetpoint, Triple
 
 _STILL_MPS = 0.05  # a slower demand holds the place
 
@@ -19,7 +19,7 @@ class FlyBySticks(ActiveBehaviour):
     lifts_off = True
     planned = False
 
-    def enter(self, place_ned_m: Triple = NAN3) -> None:
+    def enter(self, estimate: StateEstimate, place_ned_m: Triple, *, landed: bool) -> None:
         if self.guidance.sticks is not None:
             self.guidance.sticks.begin()
 
