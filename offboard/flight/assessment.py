@@ -1,184 +1,233 @@
-"""Assessment: the facts of one moment for the guards, and the figures that explain a transition.
+"""Assessment: the facts of one moment, and the figures that explain a transition.
 
-Reads state, session, plan and observer; changes none of them and decides nothing.
+Functions of the flight state; they change nothing and decide nothing.
 """
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import numpy as np
 
 from offboard.estimation.observer import Observer
-from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.guards import Facts
-from offboard.flight.phases import Limits, Phase
-from offboard.flight.readiness import Readiness
-from offboard.flight.state import VehicleState
-from offboard.mavlink.dialects.base import Takeoff
+from offboard.flight.authority import Standing
+from offboard.flight.facts import Facts
+from offboard.flight.online_identification import OnlineIdentification
+from offboard.flight.phases import Phase
+from offboard.flight.state import FlightState
+from offboard.mavlink.events import OtherSender
 from offboard.mavlink.session import Session
 from offboard.model.frames import thrust_direction_from_quaternion
 
-LIFT_OFF_HEIGHT_M = 0.15
-LIFT_OFF_CLIMB_MPS = 0.4
 TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
 MINIMUM_TELEMETRY_HZ = 10.0
 FAILSAFE_STATUS = 5  # MAV_STATE_CRITICAL; 6 is an emergency
+OTHER_SENDER_S = 5.0  # a second sender is there for so long after its newest frame
+ARMING_SHOWN_S = 2.5  # HEARTBEAT, at 1 Hz, shows an accepted arming within this time
+ARM = 400  # MAV_CMD_COMPONENT_ARM_DISARM
 
 
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """What the companion knows about its own flight at one moment."""
+def facts(
+    state: FlightState,
+    session: Session,
+    observer: Observer,
+    identification: OnlineIdentification | None,
+) -> Facts:
+    """The facts of this moment."""
+    vehicle, plan, authority = state.vehicle, state.plan, state.authority
+    track, time_s = plan.track, state.time_s
+    health, heartbeat = vehicle.health, vehicle.heartbeat
+    charge = health.battery_remaining if health else None
+    age_s = state.telemetry_age_s(state.host_s) if vehicle.has_state else 0.0
+    north_m, east_m, height_m = _from_take_off(state)
+    return Facts(
+        limits=state.limits,
+        in_phase_s=state.in_phase_s,
+        silence_s=state.silence_s,
+        blind_s=max(vehicle.position_age_s, vehicle.attitude_age_s),
+        found=vehicle.found is not None,
+        ready=not not_ready(state, session),
+        misconfigured=bool(_problems(state)),
+        rebooted=state.rebooted,
+        engaged=authority is not None and authority.mode == authority.engage_mode,
+        lost=authority is not None and authority.standing is Standing.LOST,
+        authority_known=authority is not None and authority.known(state.now_s),
+        failsafe=heartbeat is not None and heartbeat.system_status >= FAILSAFE_STATUS,
+        armed=vehicle.armed,
+        in_the_air=state.contact.in_the_air,
+        landed=state.phase is Phase.LAND and state.contact.landed,
+        lifted_off=state.phase is Phase.TAKEOFF and _lifted_off(state),
+        at_start=state.phase is Phase.CLIMB and _at_start(state, observer),
+        late_s=plan.late_s(time_s),
+        track_time_s=plan.track_time_s(time_s),
+        track_start_s=track.track_start_s,
+        track_end_s=track.track_end_s,
+        rest_time_s=track.duration_s + 0.5,
+        position_error_m=position_error_m(state),
+        prediction_error_m=_prediction_error_m(state),
+        tilt_rad=_tilt_rad(state),
+        tilt_error_rad=_tilt_error_rad(state),
+        height_m=height_m,
+        distance_m=math.hypot(north_m, east_m),
+        stop_requested=bool(state.stop_reason),
+        missed_decisions=state.missed,
+        contradicted=identification is not None and bool(identification.contradiction),
+        telemetry_age_s=age_s,
+        link_growth_s=max(state.link.growth_s, age_s),
+        clock_jump_s=state.clock.jumped_s,
+        battery=1.0 if charge is None else charge,
+        other_sender=vehicle.age_s(OtherSender) < OTHER_SENDER_S,
+        disarmed_again=_disarmed_again(state),
+        lifted_by_command=state.takes_off_by_command,
+        excites=identification is not None and identification.wants_excitation,
+        identified=identification is not None and identification.finished(time_s),
+    )
 
-    phase: Phase
-    in_phase_s: float
-    silence_s: float
-    rebooted: bool
-    stop_reason: str
-    missed_decisions: int
-    failure: str
-    contradiction: str = ""
-    excites: bool = False
-    identified: bool = False
+
+def figures(
+    state: FlightState,
+    session: Session,
+    now: Facts,
+    identification: OnlineIdentification | None,
+) -> dict[str, object]:
+    """The values for the names in braces in the reasons of phase table and ladder."""
+    vehicle, authority, other = state.vehicle, state.authority, state.vehicle.other_sender
+    older = vehicle.position_age_s >= vehicle.attitude_age_s
+    return {
+        "mode": vehicle.mode,
+        "mode_wanted": authority.engage_mode if authority else "offboard mode",
+        "lost": authority.lost_reason if authority else "",
+        "authority_age_s": state.now_s - authority.reported_s if authority else math.inf,
+        "silence_s": now.silence_s,
+        "blind_s": now.blind_s,
+        "blind_to": "LOCAL_POSITION_NED" if older else "ATTITUDE_QUATERNION",
+        "telemetry_age_s": now.telemetry_age_s,
+        "link_growth_s": now.link_growth_s,
+        "clock_jump_s": now.clock_jump_s,
+        "in_phase_s": now.in_phase_s,
+        "late_s": now.late_s,
+        "position_error_m": now.position_error_m,
+        "position_error_limit_m": state.limits.position_error_m,
+        "prediction_error_m": now.prediction_error_m,
+        "tilt_deg": math.degrees(now.tilt_rad),
+        "tilt_error_deg": math.degrees(now.tilt_error_rad),
+        "height_m": now.height_m,
+        "distance_m": now.distance_m,
+        "battery_percent": 100.0 * now.battery,
+        "other_sender": f"system {other.system_id} component {other.component_id}" if other else "",
+        "stop": state.stop_reason,
+        "failure": state.failure,
+        "contradiction": identification.contradiction if identification else "",
+        "problems": "; ".join(_problems(state)),
+        "not_ready": not_ready(state, session),
+    }
 
 
-class Assessment:
-    """Facts about one flight, on demand."""
-
-    def __init__(
-        self,
-        state: VehicleState,
-        session: Session,
-        plan: FlightPlan,
-        observer: Observer,
-        readiness: Readiness,
-        limits: Limits,
-    ) -> None:
-        self._state = state
-        self._session = session
-        self._plan = plan
-        self._observer = observer
-        self._readiness = readiness
-        self._limits = limits
-
-    def facts(self, progress: Progress) -> Facts:
-        """The facts for the guards."""
-        state, plan, dialect = self._state, self._plan, self._session.dialect
-        track, time_s = plan.track, state.time_s
-        heartbeat = state.heartbeat
-        return Facts(
-            limits=self._limits,
-            in_phase_s=progress.in_phase_s,
-            silence_s=progress.silence_s,
-            blind_s=max(state.position_age_s, state.attitude_age_s),
-            found=state.found is not None,
-            ready=not self.not_ready(),
-            misconfigured=bool(self._problems()),
-            rebooted=progress.rebooted,
-            engaged=dialect is not None and state.mode == dialect.engage_mode,
-            landing=dialect is not None and state.mode == dialect.land_mode,
-            failsafe=heartbeat is not None and heartbeat.system_status >= FAILSAFE_STATUS,
-            armed=state.armed,
-            in_the_air=state.in_the_air,
-            lifted_off=progress.phase is Phase.TAKEOFF and self._lifted_off(),
-            at_start=progress.phase is Phase.CLIMB and self._at_start(time_s),
-            late_s=plan.late_s(time_s),
-            lifted_by_command=self.lifted_by_command,
-            excites=progress.excites,
-            identified=progress.identified,
-            track_time_s=plan.track_time_s(time_s),
-            track_start_s=track.track_start_s,
-            track_end_s=track.track_end_s,
-            rest_time_s=track.duration_s + 0.5,
-            position_error_m=self.position_error_m(),
-            tilt_rad=self._tilt_rad(),
-            stop_requested=bool(progress.stop_reason),
-            missed_decisions=progress.missed_decisions,
-            contradicted=bool(progress.contradiction),
+def not_ready(state: FlightState, session: Session) -> str:
+    """Why the vehicle cannot be engaged yet; empty if it can."""
+    vehicle, dialect, limits = state.vehicle, state.dialect, state.limits
+    if not vehicle.has_state or dialect is None:
+        return "no LOCAL_POSITION_NED or no ATTITUDE_QUATERNION arrives"
+    rates_hz = session.rates_hz
+    for name in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED"):
+        if rates_hz[name] < MINIMUM_TELEMETRY_HZ:
+            return (
+                f"{name} arrives at {rates_hz[name]:.1f} Hz, "
+                f"at least {MINIMUM_TELEMETRY_HZ:.0f} Hz are needed"
+            )
+    if vehicle.armed and vehicle.landed == "unknown":
+        return "it is armed and does not report whether it flies (EXTENDED_SYS_STATE)"
+    unanswered = state.readiness.unanswered(dialect, vehicle.parameters)
+    if unanswered:
+        return f"no reply for parameter {', '.join(unanswered)}"
+    if not state.readiness.complete(dialect, vehicle.parameters, state.now_s):
+        return "its parameters are still being read"
+    if not (vehicle.prearm_ok or vehicle.armed):
+        return "its pre-arm checks do not pass"
+    link = state.link.estimate
+    if link and (link.value > limits.link_delay_s or link.sd > limits.link_jitter_s):
+        return (
+            f"the link delays by {1e3 * link.value:.0f} +- {1e3 * link.sd:.0f} ms, at most "
+            f"{1e3 * limits.link_delay_s:.0f} +- {1e3 * limits.link_jitter_s:.0f} ms can be flown "
+            "(limits.link_delay_s, limits.link_jitter_s)"
         )
+    return ""
 
-    def figures(self, facts: Facts, progress: Progress) -> dict[str, object]:
-        """The values for the names in braces in the reasons of the phase table."""
-        dialect, state = self._session.dialect, self._state
-        older = state.position_age_s >= state.attitude_age_s
-        return {
-            "mode": state.mode,
-            "mode_wanted": dialect.engage_mode if dialect else "offboard mode",
-            "silence_s": facts.silence_s,
-            "blind_s": facts.blind_s,
-            "blind_to": "LOCAL_POSITION_NED" if older else "ATTITUDE_QUATERNION",
-            "in_phase_s": facts.in_phase_s,
-            "late_s": facts.late_s,
-            "position_error_m": facts.position_error_m,
-            "tilt_deg": math.degrees(facts.tilt_rad),
-            "position_error_limit_m": self._limits.position_error_m,
-            "stop": progress.stop_reason,
-            "failure": progress.failure,
-            "contradiction": progress.contradiction,
-            "problems": "; ".join(self._problems()),
-            "not_ready": self.not_ready(),
-        }
 
-    def not_ready(self) -> str:
-        """Why the vehicle cannot be engaged yet; empty if it can."""
-        state, session = self._state, self._session
-        if not state.has_state or session.dialect is None:
-            return "no LOCAL_POSITION_NED or no ATTITUDE_QUATERNION arrives"
-        rates_hz = session.rates_hz
-        for name in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED"):
-            if rates_hz[name] < MINIMUM_TELEMETRY_HZ:
-                return (
-                    f"{name} arrives at {rates_hz[name]:.1f} Hz, "
-                    f"at least {MINIMUM_TELEMETRY_HZ:.0f} Hz are needed"
-                )
-        if state.armed and state.landed == "unknown":
-            return "it is armed and does not report whether it flies (EXTENDED_SYS_STATE)"
-        unanswered = self._readiness.unanswered(session.dialect, state.parameters)
-        if unanswered:
-            return f"no reply for parameter {', '.join(unanswered)}"
-        if not self._readiness.complete(session.dialect, state.parameters, session.link_time_s):
-            return "its parameters are still being read"
-        if not (state.prearm_ok or state.armed):
-            return "its pre-arm checks do not pass"
-        return ""
+def position_error_m(state: FlightState) -> float:
+    """Distance of the reported position from the reference; 0 without a reference."""
+    position = state.vehicle.position
+    sample = state.plan.sample(position.time_s) if position else None
+    if position is None or sample is None:
+        return 0.0
+    return float(np.linalg.norm(np.array(position.position_ned_m) - sample.position_ned_m))
 
-    def _problems(self) -> list[str]:
-        dialect = self._session.dialect
-        return [] if dialect is None else Readiness.problems(dialect, self._state.parameters)
 
-    def _tilt_rad(self) -> float:
-        if self._state.attitude is None:
-            return 0.0
-        down = thrust_direction_from_quaternion(np.array(self._state.attitude.attitude))[2]
-        return math.acos(min(1.0, max(-1.0, float(down))))
+def _problems(state: FlightState) -> list[str]:
+    if state.dialect is None:
+        return []
+    return state.readiness.problems(state.dialect, state.vehicle.parameters)
 
-    @property
-    def lifted_by_command(self) -> bool:
-        """The autopilot takes off on a command, without setpoints."""
-        dialect = self._session.dialect
-        return dialect is not None and dialect.takeoff is Takeoff.COMMAND
 
-    def _lifted_off(self) -> bool:
-        position = self._state.position
-        if position is None:
-            return False
-        height_m = self._plan.origin_ned_m[2] - position.position_ned_m[2]
-        if self.lifted_by_command:
-            return height_m > TAKE_OVER_HEIGHT_M
-        return height_m > LIFT_OFF_HEIGHT_M or -position.velocity_ned_mps[2] > LIFT_OFF_CLIMB_MPS
+def _disarmed_again(state: FlightState) -> bool:
+    vehicle = state.vehicle
+    accepted = vehicle.results.get(ARM) == "ACCEPTED"
+    return accepted and vehicle.disarmed and state.in_phase_s > ARMING_SHOWN_S
 
-    def position_error_m(self) -> float:
-        """Distance of the reported position from the reference; 0 without a reference."""
-        position = self._state.position
-        sample = self._plan.sample(position.time_s) if position else None
-        if position is None or sample is None:
-            return 0.0
-        return float(np.linalg.norm(np.array(position.position_ned_m) - sample.position_ned_m))
 
-    def _at_start(self, time_s: float) -> bool:
-        if self._state.position is None:
-            return False
-        velocity_ned_mps = self._observer.predict(time_s).velocity_ned_mps
-        position = np.array(self._state.position.position_ned_m)
-        return self._plan.at_start(time_s, position, velocity_ned_mps)
+def _from_take_off(state: FlightState) -> tuple[float, float, float]:
+    """North, east and height of the newest position relative to the take-off point."""
+    position = state.vehicle.position
+    if position is None or state.plan.reference is None:
+        return 0.0, 0.0, 0.0
+    north, east, down = (
+        each - origin
+        for each, origin in zip(position.position_ned_m, state.plan.origin_ned_m, strict=True)
+    )
+    return north, east, -down
+
+
+def _prediction_error_m(state: FlightState) -> float:
+    """Distance of the newest position from the newest prediction for an earlier moment."""
+    position = state.vehicle.position
+    if position is None:
+        return 0.0
+    for predicted in reversed(state.predictions):
+        passed_s = position.time_s - predicted.time_s
+        if passed_s >= 0.0:
+            then = predicted.position_ned_m + passed_s * predicted.velocity_ned_mps
+            return float(np.linalg.norm(np.array(position.position_ned_m) - then))
+    return 0.0
+
+
+def _tilt_rad(state: FlightState) -> float:
+    attitude = state.vehicle.attitude
+    if attitude is None:
+        return 0.0
+    down = thrust_direction_from_quaternion(np.array(attitude.attitude))[2]
+    return math.acos(min(1.0, max(-1.0, float(down))))
+
+
+def _tilt_error_rad(state: FlightState) -> float:
+    """Angle between the thrust direction and the nearest of the newest commands."""
+    attitude = state.vehicle.attitude
+    if attitude is None or len(state.commands) < (state.commands.maxlen or 0):
+        return 0.0
+    flown = thrust_direction_from_quaternion(np.array(attitude.attitude))
+    nearest = max(float(flown @ np.array(each.thrust_direction_ned)) for each in state.commands)
+    return math.acos(min(1.0, max(-1.0, nearest)))
+
+
+def _lifted_off(state: FlightState) -> bool:
+    if state.takes_off_by_command:
+        return state.contact.height_m > TAKE_OVER_HEIGHT_M
+    return state.contact.lifted_off
+
+
+def _at_start(state: FlightState, observer: Observer) -> bool:
+    if state.vehicle.position is None:
+        return False
+    time_s = state.time_s
+    velocity_ned_mps = observer.predict(time_s).velocity_ned_mps
+    position = np.array(state.vehicle.position.position_ned_m)
+    return state.plan.at_start(time_s, position, velocity_ned_mps)

@@ -1,17 +1,70 @@
 """The gate: the last check of a setpoint before it is sent. PX4 flies any setpoint it receives.
 
-Independent of the control laws and of their limits.
+Independent of the control laws and of their limits. Every setpoint passes `admit`, which is called
+in one place (`outbox`).
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import overload
 
 from offboard.model.command import Command, PositionCommand
 from offboard.model.vehicle import Vehicle
 
 LEVEL = (0.0, 0.0, 1.0)
+FALLING_SHARE = 1.0 / 3.0  # of the hover thrust: less is sent only to a vehicle on the ground
 _LENGTH_TOLERANCE = 0.01
+
+
+class Refused(Exception):
+    """A setpoint that must not leave; the message is the reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class Clearance:
+    """What `admit` must know of the moment.
+
+    Args:
+        ours: the vehicle is ours to command (`Authority.permits_setpoint`).
+        on_ground: it certainly stands on the ground (`GroundContact.certain`).
+        age_s: age of the telemetry that the setpoint was computed from, beyond the known delay of
+            the link; 0 for a setpoint that needs none.
+        age_limit_s: the greatest age that may leave.
+        late_s: time by which the decision missed its deadline; 0 if it did not.
+    """
+
+    ours: bool
+    on_ground: bool
+    age_s: float = 0.0
+    age_limit_s: float = math.inf
+    late_s: float = 0.0
+
+
+@overload
+def admit(command: Command, vehicle: Vehicle, clearance: Clearance) -> Command: ...
+@overload
+def admit(command: PositionCommand, vehicle: Vehicle, clearance: Clearance) -> PositionCommand: ...
+def admit(
+    command: Command | PositionCommand, vehicle: Vehicle, clearance: Clearance
+) -> Command | PositionCommand:
+    """The setpoint that may leave: `command` within the vehicle's limits.
+
+    Raises Refused if the vehicle is not ours, the telemetry was too old, the decision too late, or
+    a value is not finite.
+    """
+    if not clearance.ours:
+        raise Refused("the vehicle is not ours")
+    if not clearance.age_s <= clearance.age_limit_s:
+        raise Refused(f"decided on telemetry that is {clearance.age_s:.2f} s old")
+    if clearance.late_s > 0.0:
+        raise Refused(f"decided {clearance.late_s:.2f} s too late")
+    if not usable(command):
+        raise Refused(f"unusable {command}")
+    if isinstance(command, PositionCommand):
+        return command
+    return clamp(command, vehicle, on_ground=clearance.on_ground)
 
 
 def usable(command: Command | PositionCommand) -> bool:
@@ -30,16 +83,19 @@ def usable(command: Command | PositionCommand) -> bool:
     return abs(math.hypot(*command.thrust_direction_ned) - 1.0) <= _LENGTH_TOLERANCE
 
 
-def clamp(command: Command, vehicle: Vehicle) -> Command:
+def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool = False) -> Command:
     """`command` limited to the vehicle's thrust and tilt.
 
     A direction tilted by more than `tilt_max_rad` is turned back to that tilt in its own vertical
-    plane.
+    plane. Unless the vehicle certainly stands on the ground, thrust is at least a third of hover.
     """
-    thrust = min(max(command.thrust_mps2, 0.0), vehicle.thrust_max_mps2)
+    least_mps2 = 0.0 if on_ground else FALLING_SHARE * vehicle.gravity_mps2
+    thrust = min(max(command.thrust_mps2, least_mps2), vehicle.thrust_max_mps2)
     north, east, down = command.thrust_direction_ned
     lateral = math.hypot(north, east)
-    if math.atan2(lateral, down) > vehicle.tilt_max_rad and lateral > 0.0:
-        scale = math.sin(vehicle.tilt_max_rad) / lateral
+    if math.atan2(lateral, down) > vehicle.tilt_max_rad:
+        # straight down has no vertical plane of its own: any will do
+        north, east = (north / lateral, east / lateral) if lateral > 0.0 else (1.0, 0.0)
+        scale = math.sin(vehicle.tilt_max_rad)
         north, east, down = scale * north, scale * east, math.cos(vehicle.tilt_max_rad)
     return Command(thrust, (north, east, down), command.course_rad)

@@ -1,46 +1,11 @@
-"""Guards: the facts at one moment, and the conditions of the transitions. No I/O, no state."""
+"""Guards: the conditions of the phase table, functions of the facts. No I/O, no state."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
-from offboard.flight.phases import Limits
-
-
-@dataclass(frozen=True, slots=True)
-class Facts:
-    """All that a guard may use. SI; NaN for what is not known yet."""
-
-    limits: Limits
-    in_phase_s: float  # since the phase began, on Session.link_time_s
-    silence_s: float  # wall time since the last telemetry
-    blind_s: float  # age of the older of position and attitude, vehicle time
-    found: bool
-    ready: bool  # telemetry flows, parameters were read, pre-arm checks pass
-    misconfigured: bool
-    rebooted: bool  # after its telemetry was complete
-    engaged: bool  # the vehicle shows the mode in which it follows our setpoints
-    landing: bool  # the vehicle shows its landing mode
-    failsafe: bool  # the vehicle shows a failsafe or an emergency
-    armed: bool
-    in_the_air: bool  # as the vehicle reports
-    lifted_off: bool
-    at_start: bool
-    late_s: float  # since the planned end of the climb
-    track_time_s: float
-    track_start_s: float
-    track_end_s: float
-    rest_time_s: float
-    position_error_m: float
-    tilt_rad: float
-    stop_requested: bool
-    missed_decisions: int  # in a row
-    contradicted: bool  # telemetry contradicts the vehicle file
-    lifted_by_command: bool = False  # the autopilot takes off on a command, without setpoints
-    excites: bool = False  # identification steps are flown before the track
-    identified: bool = False  # and their result is in use
-
+from offboard.flight.facts import Facts
+from offboard.flight.phases import Rung
 
 Guard = Callable[[Facts], bool]
 
@@ -67,7 +32,17 @@ def rebooted(now: Facts) -> bool:
 
 def flown_by_another(now: Facts) -> bool:
     """Armed and in the mode of setpoints, before we sent one."""
-    return now.engaged and now.armed and not now.lifted_by_command
+    return now.engaged and now.armed and not now.limits.begin_engaged
+
+
+def in_failsafe(now: Facts) -> bool:
+    """A failsafe flies the vehicle."""
+    return now.failsafe and now.in_the_air and not now.limits.begin_in_failsafe
+
+
+def other_sender(now: Facts) -> bool:
+    """Another program sends setpoints on the link, or uses our ids."""
+    return now.other_sender and not now.limits.begin_with_other_sender
 
 
 def streamed(now: Facts) -> bool:
@@ -126,30 +101,38 @@ def disarmed(now: Facts) -> bool:
     return not now.armed
 
 
+def fell(now: Facts) -> bool:
+    """Disarmed, but not standing on the ground after a landing."""
+    return not now.armed and not now.landed
+
+
 def disarmed_for_good(now: Facts) -> bool:
     """Disarmed for longer than a heartbeat period: arming may have been in progress."""
     return not now.armed and now.in_phase_s > 1.5
 
 
-def mode_left(now: Facts) -> bool:
-    return not now.engaged
+def lost(now: Facts) -> bool:
+    return now.lost
 
 
-def mode_left_armed(now: Facts) -> bool:
+def lost_armed(now: Facts) -> bool:
     """A pilot changed the mode while the vehicle armed: it stays armed, as the pilot decides."""
-    return now.armed and not now.engaged
+    return now.armed and now.lost
 
 
-def landing_left(now: Facts) -> bool:
-    """A pilot changed the mode during the landing; the modes of a failsafe do not count."""
-    return not (now.engaged or now.landing or now.failsafe)
+def disarmed_again(now: Facts) -> bool:
+    return now.disarmed_again
+
+
+def authority_unknown(now: Facts) -> bool:
+    return not now.authority_known
 
 
 def silent(now: Facts) -> bool:
     return now.silence_s > now.limits.silence_s
 
 
-def lost(now: Facts) -> bool:
+def silent_for_long(now: Facts) -> bool:
     return now.silence_s > 2.0 * now.limits.silence_s
 
 
@@ -165,20 +148,14 @@ def stop_requested(now: Facts) -> bool:
     return now.stop_requested
 
 
-def diverged(now: Facts) -> bool:
-    return now.position_error_m > now.limits.position_error_m
+def at_rung(rung: Rung) -> Guard:
+    """A guard that holds when the ladder is at `rung`."""
 
+    def reached(now: Facts) -> bool:
+        return now.rung is rung
 
-def toppled(now: Facts) -> bool:
-    return now.tilt_rad > now.limits.tilt_rad
-
-
-def controller_failed(now: Facts) -> bool:
-    return now.missed_decisions >= now.limits.missed_decisions
-
-
-def contradicted(now: Facts) -> bool:
-    return now.contradicted
+    reached.__name__ = f"ladder_{rung.name.lower()}"
+    return reached
 
 
 def longer_than(limit: str) -> Guard:

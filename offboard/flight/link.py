@@ -13,12 +13,21 @@ import select
 import socket
 from collections.abc import Hashable
 from contextlib import suppress
-from typing import Protocol
+from typing import NamedTuple, Protocol
 
 from offboard.documents.errors import UserError
+from offboard.flight import clock
 from offboard.mavlink.framing import frame_size
 
-Chunk = tuple[bytes, Hashable]
+
+class Chunk(NamedTuple):
+    """Received bytes, their sender, and the host time of their arrival."""
+
+    data: bytes
+    peer: Hashable
+    arrived_s: float
+
+
 DATAGRAM_SIZE = 65535
 QUEUED_MAX = 50  # frames
 SETPOINTS = frozenset({82, 84, 86})  # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_*
@@ -61,7 +70,8 @@ class UdpLink:
         chunks: list[Chunk] = []
         while ready:
             try:
-                chunks.append(self._socket.recvfrom(DATAGRAM_SIZE))
+                data, peer = self._socket.recvfrom(DATAGRAM_SIZE)
+                chunks.append(Chunk(data, peer, clock.monotonic_s()))
             except ConnectionError:
                 continue  # ICMP: the peer's port was closed when an earlier datagram arrived
             except OSError:
@@ -100,10 +110,10 @@ class LockstepLink(UdpLink):
         complete: list[Chunk] = []
         for chunk in super().receive(timeout_s):
             self._block.append(chunk)
-            if _is_barrier(chunk[0]):
-                if chunk[0] != self._barrier:
+            if _is_barrier(chunk.data):
+                if chunk.data != self._barrier:
                     complete += self._block
-                self._barrier, self._block = chunk[0], []
+                self._barrier, self._block = chunk.data, []
         return complete
 
 
@@ -179,7 +189,7 @@ class TcpLink(StreamLink):
         except OSError:
             data = b""
         self._open = bool(data)
-        return [(data, "tcp")] if data else []
+        return [Chunk(data, "tcp", clock.monotonic_s())] if data else []
 
     def _write(self, data: bytes) -> int:
         return self._socket.send(data)
@@ -211,7 +221,7 @@ class SerialLink(StreamLink):
         except OSError:  # unplugged: pyserial raises different subclasses
             select.select([], [], [], max(0.0, timeout_s))
             return []
-        return [(data, "serial")] if data else []
+        return [Chunk(data, "serial", clock.monotonic_s())] if data else []
 
     def _write(self, data: bytes) -> int:
         # pyserial's write waits in a busy loop while the port's buffer is full

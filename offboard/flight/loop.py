@@ -63,24 +63,16 @@ class Loop:
 
     def _fly(self) -> None:
         companion, link = self._companion, self._link
-        telemetry_s = polled_s = clock.monotonic_s()
+        checked_s = clock.monotonic_s()
         while not (companion.has_ended() or self._stops.repeated or self._ended_early):
             if self._stops.requested:
                 companion.request_stop()
             chunks = link.receive(POLL_S)
             now_s = clock.monotonic_s()
-            for data, peer in chunks:
-                output = companion.receive(data, peer, now_s)
-                if output.alive:
-                    telemetry_s = now_s
-                self._deliver(output, peer)
-                self._show()
-                if companion.has_ended():
-                    break
-            if not chunks or now_s - polled_s > POLL_S:
-                polled_s = now_s
-                self._deliver(companion.poll(now_s, now_s - telemetry_s), companion.peer)
-                self._show()
+            self._deliver(companion.turn(chunks, now_s), companion.peer)
+            self._show()
+            if not chunks or now_s - checked_s > POLL_S:
+                checked_s = now_s
                 self._check_simulator()
 
     def _deliver(self, output: Output, peer: Hashable | None) -> None:

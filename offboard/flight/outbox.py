@@ -1,67 +1,90 @@
-"""Outbox: the only place that creates setpoints, and the queue of all messages and records.
+"""Outbox: the only place from which setpoints and commands leave, and the queue of all messages.
 
-A setpoint is also given to the observer and the identification, which predict with the commands
-that were sent. `flush` encodes what is queued. Decides nothing; owns no socket or file.
+A setpoint passes the gate first, and is then given to the observer and the identification, which
+predict with the commands that were sent. `flush` encodes what is queued. Decides nothing; owns no
+socket or file.
 """
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from dataclasses import dataclass
 
 from offboard.estimation.observer import Observer
-from offboard.flight.gate import LEVEL
+from offboard.flight.gate import LEVEL, Clearance, Refused, admit
 from offboard.flight.online_identification import OnlineIdentification
-from offboard.mavlink.outgoing import AttitudeTarget, Outgoing, PositionTarget, Record
+from offboard.flight.state import FlightState
+from offboard.flight.vehicle_state import GOOD_RESULTS
+from offboard.mavlink.outgoing import (
+    AttitudeTarget,
+    CommandLong,
+    Outgoing,
+    PositionTarget,
+    Record,
+)
 from offboard.mavlink.session import Session
 from offboard.mavlink.texts import chunks
 from offboard.model.command import Command, PositionCommand
-from offboard.model.vehicle import Vehicle
 
 WARNING, INFO = 4, 6  # MAV_SEVERITY
 TEXT_ID_MAX = 65535  # STATUSTEXT.id; 0 is for texts of one chunk
-REPEAT_S = 1.0  # period of a request that the vehicle has not followed
+REPEAT_S = 1.0  # after this a request that was refused, or not answered, is sent again
 
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """Result of one call: frames to send, and all frames for the log, records included."""
+    """Result of one turn: frames to send, and all frames for the log, records included."""
 
     send: tuple[bytes, ...] = ()
     log: tuple[bytes, ...] = ()
-    alive: bool = False  # telemetry has arrived: position or attitude, once both are received
 
 
 class Outbox:
-    """Creates and queues messages. `vehicle` is the vehicle model in use: it scales the thrust.
+    """Creates and queues messages.
 
-    `command` is the command in force, `announced` are the sentences for the user, oldest first.
+    `command` is the command in force, `announced` are the sentences for the user, oldest first,
+    `refused` counts the setpoints that the gate refused, by phase of the flight.
     """
 
     def __init__(
         self,
+        state: FlightState,
         session: Session,
         observer: Observer,
-        vehicle: Vehicle,
         identification: OnlineIdentification | None,
     ) -> None:
+        self._state = state
         self._session = session
         self._observer = observer
         self._identification = identification
-        self.vehicle = vehicle
         self.command = Command(0.0, LEVEL, 0.0)
         self.announced: list[str] = []
-        self._requested_s = -math.inf
+        self.refused: Counter[str] = Counter()
+        self._requested_s: dict[CommandLong, float] = {}
         self._text_id = 0
         self._queue: list[Outgoing] = []
 
     # ------------------------------------------------------------------ setpoints
 
     def send_command(
-        self, time_s: float, command: Command, body_z_down: float | None = None
-    ) -> None:
-        """Send an attitude setpoint. `body_z_down`: see `AttitudeTarget`."""
+        self,
+        time_s: float,
+        command: Command,
+        body_z_down: float | None = None,
+        *,
+        age_s: float = 0.0,
+        late_s: float = 0.0,
+    ) -> Command:
+        """Send an attitude setpoint and return it as it was sent.
+
+        `age_s` and `late_s` are those of the decision (see `gate.Clearance`), `body_z_down` is
+        described in `AttitudeTarget`. Raises gate.Refused; then nothing is sent.
+        """
+        model = self._state.model
+        command = admit(command, model, self._clearance(age_s, late_s))
         self.set_command(time_s, command)
+        self._state.commands.append(command)
         if self._identification:
             self._identification.on_command(time_s, command)
         self.send(
@@ -70,22 +93,36 @@ class Outbox:
                 thrust_mps2=command.thrust_mps2,
                 thrust_direction_ned=command.thrust_direction_ned,
                 course_rad=command.course_rad,
-                hover_thrust=self.vehicle.hover_thrust,
-                gravity_mps2=self.vehicle.gravity_mps2,
+                hover_thrust=model.hover_thrust,
+                gravity_mps2=model.gravity_mps2,
                 body_z_down=body_z_down,
             )
         )
+        return command
+
+    def send_level(self, time_s: float, command: Command) -> None:
+        """Send a setpoint that no decision was needed for, if the vehicle is ours."""
+        try:
+            self.send_command(time_s, command)
+        except Refused:
+            self.refused[self._state.phase.value] += 1
 
     def set_command(self, time_s: float, command: Command) -> None:
         """Note the command in force without sending it, for example the autopilot's own."""
         self.command = command
         self._observer.on_command(time_s, command)
 
-    def send_position(self, time_s: float, command: PositionCommand) -> None:
-        """Send a setpoint for the autopilot's position loop. The attitude that this loop commands
-        is unknown, therefore the observer stops predicting with commands."""
+    def send_position(
+        self, time_s: float, command: PositionCommand, *, age_s: float = 0.0, late_s: float = 0.0
+    ) -> None:
+        """Send a setpoint for the autopilot's position loop; see `send_command`.
+
+        The attitude that this loop commands is unknown, therefore the observer stops predicting
+        with commands.
+        """
+        command = admit(command, self._state.model, self._clearance(age_s, late_s))
         self._observer.freeze(True)
-        self.command = Command(self.vehicle.gravity_mps2, LEVEL, command.course_rad)
+        self.command = Command(self._state.model.gravity_mps2, LEVEL, command.course_rad)
         self.send(
             PositionTarget(
                 time_s,
@@ -99,20 +136,39 @@ class Outbox:
 
     def hover_mps2(self) -> float:
         """Thrust that holds the weight, by the observer's estimate of the hover thrust."""
-        share = self._observer.hover_thrust_estimate / self.vehicle.hover_thrust
-        return (share if math.isfinite(share) else 1.0) * self.vehicle.gravity_mps2
+        model = self._state.model
+        share = self._observer.hover_thrust_estimate / model.hover_thrust
+        return (share if math.isfinite(share) else 1.0) * model.gravity_mps2
+
+    def _clearance(self, age_s: float, late_s: float) -> Clearance:
+        state = self._state
+        return Clearance(
+            ours=state.ours,
+            on_ground=state.contact.certain,
+            age_s=age_s,
+            age_limit_s=state.limits.setpoint_age_s,
+            late_s=late_s,
+        )
 
     # ------------------------------------------------------------------ everything else
 
-    def request(self, request: Outgoing, time_s: float) -> None:
-        """Send a command, at most once a second: call it until the heartbeat shows the result."""
-        if time_s - self._requested_s >= REPEAT_S - 1e-6:
-            self._requested_s = time_s
-            self.send(request)
+    def request(self, request: CommandLong) -> bool:
+        """Send a command if the vehicle is ours; returns whether it was sent.
 
-    def restart_requests(self) -> None:
-        """The next request is sent at once."""
-        self._requested_s = -math.inf
+        It is sent once. Only one that was refused, or that nothing has answered, is sent again,
+        after a second.
+        """
+        state = self._state
+        result = state.vehicle.results.get(request.command)
+        requested_s = self._requested_s.get(request, -math.inf)
+        waits = state.now_s - requested_s < REPEAT_S - 1e-6
+        done = math.isfinite(requested_s) and result in GOOD_RESULTS
+        if waits or done or not state.may_command:
+            return False
+        self._requested_s[request] = state.now_s
+        state.vehicle.results.pop(request.command, None)
+        self.send(request)
+        return True
 
     def announce(self, sentence: str, title: str = "") -> None:
         """Report to the user, and to the ground station with `title` before the sentence."""
@@ -132,9 +188,9 @@ class Outbox:
         """Queue messages to send and to log; records are only logged."""
         self._queue.extend(messages)
 
-    def flush(self, received: tuple[bytes, ...], alive: bool) -> Output:
+    def flush(self, received: list[bytes]) -> Output:
         """Encode the queue. In the log, the frames `received` come first."""
         frames = [(message, self._session.encode(message)) for message in self._queue]
         self._queue.clear()
         send = tuple(frame for message, frame in frames if not isinstance(message, Record))
-        return Output(send, (*received, *(frame for _, frame in frames)), alive)
+        return Output(send, (*received, *(frame for _, frame in frames)))

@@ -1,147 +1,121 @@
-"""Phase machine: applies the phase table, and starts what begins with a phase.
-
-`Assessment` gives the facts, `transitions` the row. Holds the phase, its start, and the outcome.
-"""
+"""Phase machine: applies the ladder and the phase table, and starts what begins with a phase."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
 from offboard.estimation.observer import Observer
-from offboard.flight.assessment import Assessment, Progress
+from offboard.flight import assessment
 from offboard.flight.decide import Decider
-from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.link_delay import LinkDelay
+from offboard.flight.facts import Facts
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.outbox import Outbox
-from offboard.flight.phases import ENDS, ExitCode, Phase
-from offboard.flight.state import VehicleState
+from offboard.flight.phases import BEFORE_FLIGHT, FLYING, ExitCode, Phase
+from offboard.flight.state import FlightState, Outcome
 from offboard.flight.transitions import Row, next_row
 from offboard.mavlink.session import Session
 
 
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """How a flight ended: an exit code of `phases.ExitCode`, and one sentence."""
-
-    exit_code: int
-    sentence: str
-
-
 class PhaseMachine:
-    """The phase of one flight. `stop_reason`: why the flight shall end, or empty; `silence_s`:
-    wall time since the last telemetry."""
+    """Changes `phase`, `began_s` and `outcome` of the state."""
 
     def __init__(
         self,
         *,
-        state: VehicleState,
+        state: FlightState,
         session: Session,
-        plan: FlightPlan,
         observer: Observer,
-        assessment: Assessment,
         decider: Decider,
         identification: OnlineIdentification | None,
         outbox: Outbox,
-        link_delay: LinkDelay,
     ) -> None:
         self._state = state
         self._session = session
-        self._plan = plan
         self._observer = observer
-        self._assessment = assessment
         self._decider = decider
         self._identification = identification
         self._outbox = outbox
-        self._link_delay = link_delay
-        self.phase = Phase.CONNECT
-        self.outcome: Outcome | None = None
-        self.stop_reason = ""
-        self.silence_s = 0.0
-        self._rebooted = False
-        self._began_s = 0.0  # on the session's link time
-
-    def has_ended(self) -> bool:
-        return self.phase in ENDS
-
-    @property
-    def in_phase_s(self) -> float:
-        """Seconds since the phase began, on `Session.link_time_s`."""
-        return self._session.link_time_s - self._began_s
 
     def advance(self) -> None:
         """Make every transition whose guard holds."""
-        while not self.has_ended():
-            progress = self._progress()
-            facts = self._assessment.facts(progress)
-            row = next_row(self.phase, facts)
+        while not self._state.has_ended:
+            now = self._facts()
+            row = next_row(self._state.phase, now)
             if row is None:
                 return
-            self._enter(row, row.reason.format(**self._assessment.figures(facts, progress)))
+            self._enter(row, row.reason.format(**self._figures(now)))
 
     def on_reboot(self) -> None:
         """The vehicle was rebooted: this ends the flight, except while telemetry is awaited."""
-        self._rebooted = self.phase not in (Phase.CONNECT, Phase.HEALTH)
+        self._state.rebooted = self._state.phase not in (Phase.CONNECT, Phase.HEALTH)
         self.advance()
 
-    def _progress(self) -> Progress:
-        identification = self._identification
-        return Progress(
-            phase=self.phase,
-            in_phase_s=self.in_phase_s,
-            silence_s=self.silence_s,
-            rebooted=self._rebooted,
-            stop_reason=self.stop_reason,
-            missed_decisions=self._decider.missed,
-            failure=self._decider.failure,
-            contradiction=identification.contradiction if identification else "",
-            excites=identification is not None and identification.wants_excitation,
-            identified=identification is not None and identification.finished(self._state.time_s),
-        )
+    def _facts(self) -> Facts:
+        """The facts of this moment, with the rung of the ladder that they lead to."""
+        state = self._state
+        now = assessment.facts(state, self._session, self._observer, self._identification)
+        if state.phase not in FLYING:
+            return now
+        state.ladder.step(now, state.now_s)
+        return replace(now, rung=state.ladder.rung)
+
+    def _figures(self, now: Facts) -> dict[str, object]:
+        figures = assessment.figures(self._state, self._session, now, self._identification)
+        worst = self._state.ladder.worst
+        return figures | {"ladder": worst.reason.format(**figures) if worst else ""}
 
     def _enter(self, row: Row, reason: str) -> None:
+        state = self._state
         self._conclude(row, reason)
-        self._state.clear_messages()
-        self.phase = row.target
-        self._began_s = self._session.link_time_s
-        self._outbox.restart_requests()
+        state.vehicle.clear_messages()
+        state.phase = row.target
+        state.began_s = state.now_s
         self._outbox.announce(f"{row.target.value}: {reason}", title="offboard: ")
+        if row.source in BEFORE_FLIGHT and row.target in FLYING:
+            state.link.settle()
+            state.clock.settle()
         if self._identification:
             if row.target is Phase.CLIMB:
-                self._identification.on_link_delay(self._link_delay.estimate)
-            self._identification.on_phase(row.target, self._state.time_s)
+                self._identification.on_link_delay(state.link.estimate)
+            self._identification.on_phase(row.target, state.time_s)
         if row.target is Phase.TAKEOFF:
             self._begin_takeoff()
         elif row.target is Phase.CLIMB:
             self._begin_climb(in_the_air=row.source is Phase.ENGAGE)
         elif row.target is Phase.JOIN:
-            self._plan.start_track(self._state.time_s)
+            state.plan.start_track(state.time_s)
 
     def _conclude(self, row: Row, reason: str) -> None:
         """The most severe exit code counts; later reasons are added to the first sentence."""
+        state = self._state
         if row.exit_code is not None:
-            if self.outcome is None:
-                self.outcome = Outcome(row.exit_code, reason + self._state.explanation())
+            if state.outcome is None:
+                state.outcome = Outcome(row.exit_code, reason + state.vehicle.explanation())
             else:
-                sentence = f"{self.outcome.sentence}; {reason}"
-                self.outcome = Outcome(max(self.outcome.exit_code, row.exit_code), sentence)
-        elif row.target is Phase.DISARMED and self.outcome is None:
-            self.outcome = Outcome(ExitCode.FLOWN, "flown and landed")
+                sentence = f"{state.outcome.sentence}; {reason}"
+                state.outcome = Outcome(max(state.outcome.exit_code, row.exit_code), sentence)
+        elif row.target is Phase.DISARMED and state.outcome is None:
+            state.outcome = Outcome(ExitCode.FLOWN, "flown and landed")
 
     def _begin_takeoff(self) -> None:
-        assert self._state.position is not None
-        self._plan.origin_ned_m = self._state.position.position_ned_m
+        position = self._state.vehicle.position
+        assert position is not None
+        self._state.plan.origin_ned_m = position.position_ned_m
 
     def _begin_climb(self, *, in_the_air: bool) -> None:
-        assert self._state.position is not None
-        position_ned_m = self._state.position.position_ned_m
-        velocity = np.array(self._state.position.velocity_ned_mps)
-        if in_the_air:  # take-off point unknown: below the vehicle, at the local origin's height
-            self._plan.origin_ned_m = (*position_ned_m[:2], 0.0)
+        state = self._state
+        position = state.vehicle.position
+        assert position is not None
+        if in_the_air:  # take-off point unknown: below the vehicle, at the height of its last rest
+            down_m = state.contact.rest_down_m
+            state.plan.origin_ned_m = (*position.position_ned_m[:2], down_m)
         self._observer.freeze(False)
         self._decider.begin()
-        self._plan.start_climb(
-            self._state.time_s, np.array(position_ned_m), velocity, self._state.course_rad
+        state.plan.start_climb(
+            state.time_s,
+            np.array(position.position_ned_m),
+            np.array(position.velocity_ned_mps),
+            state.vehicle.course_rad,
         )

@@ -1,9 +1,9 @@
-"""Phases of a flight, exit codes, and the limits of time and state."""
+"""Phases of a flight, rungs of the ladder, exit codes, and the limits of time and state."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from enum import Enum
+from enum import Enum, IntEnum
 
 from pydantic import Field
 
@@ -24,11 +24,22 @@ class Phase(Enum):
     JOIN = "join"
     TRACK = "track"
     HOVER = "hover"
+    HOLD = "hold"
     LAND = "land"
     STAND_DOWN = "stand down"
     DISARMED = "disarmed"
     YIELDED = "yielded"
     FAILED = "failed"
+
+
+class Rung(IntEnum):
+    """What follows when a limit is exceeded in flight, from mild to severe (see `ladder`)."""
+
+    FLY = 0
+    LEVEL = 1  # this tick: level, with the estimated hover thrust, instead of the decision
+    HOLD = 2  # the autopilot is asked to hold, after `Limits.hold_s` to land
+    LAND = 3  # the autopilot is asked to land
+    SILENCE = 4  # nothing is sent any more
 
 
 # The number of a phase in logs. Never reuse a number: old logs must stay readable.
@@ -49,10 +60,12 @@ PHASE_CODES: Mapping[Phase, int] = {
     Phase.FAILED: 13,
     Phase.EXCITE: 14,
     Phase.STAND_DOWN: 15,
+    Phase.HOLD: 16,
 }
 ENDS = frozenset({Phase.DISARMED, Phase.YIELDED, Phase.FAILED})
 BEFORE_FLIGHT = frozenset({Phase.CONNECT, Phase.HEALTH, Phase.STREAM, Phase.ENGAGE, Phase.ARM})
 TRACKING = frozenset({Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.HOVER})
+FLYING = TRACKING | {Phase.TAKEOFF, Phase.HOLD}  # phases in which the ladder is stepped
 
 
 class ExitCode:
@@ -66,22 +79,37 @@ class ExitCode:
 
 
 class Limits(Parameters):
-    """Limits of a flight. SI; seconds of vehicle time, but `connect_s` and `silence_s` are wall
-    time."""
+    """Limits of a flight. SI; seconds of vehicle time, but `connect_s`, `silence_s` and `late_s`
+    of a decision are wall time. `ladder` has what follows when one is exceeded in flight."""
 
+    # on the ground
     connect_s: float = Field(default=20.0, gt=0, le=600)
     health_s: float = Field(default=90.0, gt=0, le=600)
     stream_s: float = Field(default=1.0, ge=0.6, le=10)
     engage_s: float = Field(default=10.0, gt=0, le=60)
     arm_s: float = Field(default=15.0, gt=0, le=60)
     lift_off_s: float = Field(default=8.0, gt=0, le=30)
+    disarm_s: float = Field(default=5.0, ge=2, le=60)
+    begin_armed: bool = True  # false: refuse a vehicle that is armed already
+    begin_engaged: bool = False  # true: fly one that another controller has in the mode already
+    begin_in_failsafe: bool = False  # true: take one over from its failsafe
+    begin_with_other_sender: bool = False  # true: fly although another program controls it, too
+    link_delay_s: float = Field(default=0.4, gt=0, le=2)  # telemetry and setpoint together
+    link_jitter_s: float = Field(default=0.15, gt=0, le=2)  # standard deviation of the delay
+    # in flight
     late_s: float = Field(default=90.0, gt=0, le=600)  # after the planned end of the climb
     excite_s: float = Field(default=30.0, gt=5, le=600)
+    hold_s: float = Field(default=2.0, ge=0.5, le=60)  # from hold to land
     land_s: float = Field(default=90.0, gt=0, le=600)
-    disarm_s: float = Field(default=5.0, ge=2, le=60)
-    silence_s: float = Field(default=1.0, ge=0.2, le=60)  # no telemetry: then land
-    blind_s: float = Field(default=0.5, ge=0.15, le=10)  # no position, or no attitude: then land
-    missed_decisions: int = Field(default=3, ge=1, le=100)  # in a row: then land
-    begin_armed: bool = True  # false: refuse a vehicle that is armed already
+    silence_s: float = Field(default=1.0, ge=0.2, le=60)  # no telemetry
+    blind_s: float = Field(default=0.5, ge=0.15, le=10)  # no position, or no attitude
+    setpoint_age_s: float = Field(default=0.25, ge=0.1, le=2)  # of telemetry beyond link delay
+    link_growth_s: float = Field(default=0.3, gt=0, le=2)  # of the link's delay since take-off
+    missed_decisions: int = Field(default=3, ge=1, le=100)  # in a row
     position_error_m: float = Field(default=5.0, gt=0.1, le=100)
+    prediction_error_m: float = Field(default=2.0, gt=0.1, le=100)  # of the decision before
     tilt_rad: float = Field(default=1.3, gt=0.2, le=1.5)
+    tilt_error_rad: float = Field(default=0.5, gt=0.1, le=3.2)  # from every recent command
+    ceiling_m: float = Field(default=120.0, gt=0, le=10000)  # above the take-off point
+    radius_m: float = Field(default=1000.0, gt=0, le=100000)  # from the take-off point
+    battery: float = Field(default=0.1, ge=0, le=1)  # remaining, of 1

@@ -1,150 +1,103 @@
-"""Vehicle state: the newest telemetry of each kind, and what follows from it. No decisions."""
+"""Flight state: all that one flight knows. `Companion` owns it; the other modules take it.
+
+Facts come in by `VehicleState`, `Authority`, `GroundContact`, `VehicleClock` and `LinkDelay`, each
+with the time when it was heard. What follows from them is in `facts`.
+"""
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass, field
 
-from offboard.mavlink.events import (
-    Attitude,
-    CommandAck,
-    Event,
-    Heartbeat,
-    Landed,
-    LocalPosition,
-    Parameter,
-    Rebooted,
-    StatusText,
-    SystemHealth,
-    VehicleFound,
-)
-from offboard.model.frames import course_from_quaternion
+from offboard.flight.authority import Authority
+from offboard.flight.flight_plan import FlightPlan
+from offboard.flight.ground_contact import GroundContact
+from offboard.flight.ladder import Ladder
+from offboard.flight.link_age import LinkDelay, VehicleClock
+from offboard.flight.phases import ENDS, Limits, Phase
+from offboard.flight.readiness import Readiness
+from offboard.flight.vehicle_state import VehicleState
+from offboard.mavlink.dialects.base import Dialect, Takeoff
+from offboard.model.command import Command
+from offboard.model.predicted_state import PredictedState
+from offboard.model.vehicle import Vehicle
 
-OUTAGE_S = 0.3  # a longer gap of all telemetry is an outage of the link
-MESSAGES_MAX = 12  # texts and refusals kept for the sentence that explains a failure
-WARNING = 4  # MAV_SEVERITY; more severe is a lower number
-SET_MESSAGE_INTERVAL = 511  # MAV_CMD: a refused rate explains no failure
+Triple = tuple[float, float, float]
+COMMANDS_KEPT = 7  # as long as an attitude may take to follow
+PREDICTIONS_KEPT = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """How a flight ended: an exit code of `phases.ExitCode`, and one sentence."""
+
+    exit_code: int
+    sentence: str
 
 
 @dataclass(slots=True)
-class VehicleState:
-    """The newest telemetry of the vehicle; None until the first message of that kind."""
+class FlightState:
+    """One flight. `model` is the vehicle model in use: it scales the thrust of setpoints."""
 
-    found: VehicleFound | None = None
-    heartbeat: Heartbeat | None = None
-    health: SystemHealth | None = None
-    landed: str = "unknown"
-    position: LocalPosition | None = None
-    attitude: Attitude | None = None
-    parameters: dict[str, float] = field(default_factory=dict)
-    texts: deque[str] = field(default_factory=lambda: deque(maxlen=MESSAGES_MAX))
-    refusals: deque[str] = field(default_factory=lambda: deque(maxlen=MESSAGES_MAX))
-    accepted: set[int] = field(default_factory=set)  # MAV_CMD numbers
-    resumed_s: float = -math.inf  # vehicle time of the first telemetry after an outage
+    limits: Limits
+    plan: FlightPlan
+    model: Vehicle
+    vehicle: VehicleState = field(default_factory=VehicleState)
+    clock: VehicleClock = field(default_factory=VehicleClock)
+    link: LinkDelay = field(default_factory=LinkDelay)
+    readiness: Readiness = field(default_factory=Readiness)
+    ladder: Ladder = field(default_factory=Ladder)
+    contact: GroundContact = field(init=False)
+    dialect: Dialect | None = None  # with the authority, once the vehicle was found
+    authority: Authority | None = None
+
+    phase: Phase = Phase.CONNECT
+    began_s: float = 0.0  # of the phase, on `Session.link_time_s`
+    now_s: float = 0.0  # `Session.link_time_s`
+    host_s: float = 0.0  # monotonic time of this computer at the present turn
+    silence_s: float = 0.0  # host time since the newest telemetry
+    rebooted: bool = False
+    stop_reason: str = ""  # why the flight shall end; empty while it shall not
+    outcome: Outcome | None = None
+
+    missed: int = 0  # decisions in a row that were not sent
+    failure: str = ""  # of the newest of them
+    commands: deque[Command] = field(default_factory=lambda: deque(maxlen=COMMANDS_KEPT))
+    predictions: deque[PredictedState] = field(
+        default_factory=lambda: deque(maxlen=PREDICTIONS_KEPT)
+    )
+
+    def __post_init__(self) -> None:
+        self.contact = GroundContact(self.vehicle)
+
+    @property
+    def in_phase_s(self) -> float:
+        """Seconds since the phase began."""
+        return self.now_s - self.began_s
+
+    @property
+    def has_ended(self) -> bool:
+        return self.phase in ENDS
 
     @property
     def time_s(self) -> float:
-        """Vehicle time of the newest position or attitude; 0 before the first."""
-        stamps = [event.time_s for event in (self.position, self.attitude) if event is not None]
-        return max(stamps, default=0.0)
+        """Vehicle time of the newest telemetry."""
+        return self.vehicle.time_s
 
     @property
-    def position_age_s(self) -> float:
-        """Vehicle time since the newest position, or since telemetry resumed after an outage of
-        the link; NaN before the first position."""
-        return self._age_s(self.position)
+    def takes_off_by_command(self) -> bool:
+        """The autopilot takes off on a command, without setpoints."""
+        return self.dialect is not None and self.dialect.takeoff is Takeoff.COMMAND
 
     @property
-    def attitude_age_s(self) -> float:
-        """As `position_age_s`, for the attitude."""
-        return self._age_s(self.attitude)
+    def ours(self) -> bool:
+        """A setpoint may leave."""
+        return self.authority is not None and self.authority.permits_setpoint(self.now_s)
 
     @property
-    def in_the_air(self) -> bool:
-        """The vehicle reports that it flies (EXTENDED_SYS_STATE)."""
-        return self.landed in ("in_air", "takeoff", "landing")
+    def may_command(self) -> bool:
+        return self.authority is not None and self.authority.permits_command(self.now_s)
 
-    @property
-    def armed(self) -> bool:
-        return self.heartbeat is not None and self.heartbeat.armed
-
-    @property
-    def mode(self) -> str:
-        return self.heartbeat.mode if self.heartbeat else "unknown"
-
-    @property
-    def has_state(self) -> bool:
-        """Position and attitude have been received."""
-        return self.position is not None and self.attitude is not None
-
-    @property
-    def course_rad(self) -> float:
-        """Heading of the nose in the newest attitude, which must have been received."""
-        assert self.attitude is not None
-        return float(course_from_quaternion(self.attitude.attitude))
-
-    @property
-    def prearm_ok(self) -> bool:
-        """SYS_STATUS reports that the vehicle's pre-arm checks pass."""
-        return self.health is not None and self.health.prearm_ok
-
-    def update(self, event: Event) -> None:
-        """Store what one event reports."""
-        if isinstance(event, (LocalPosition, Attitude)):
-            self._detect_outage(event.time_s)
-        match event:
-            case Heartbeat():
-                self.heartbeat = event
-            case LocalPosition():
-                self.position = event
-            case Attitude():
-                self.attitude = event
-            case SystemHealth():
-                self.health = event
-            case Landed(state):
-                self.landed = state
-            case VehicleFound():
-                self.found = event
-            case Parameter(name, value):
-                self.parameters[name] = value
-            case StatusText(severity, text) if severity <= WARNING:
-                self.texts.append(text)
-            case CommandAck(command, "ACCEPTED"):
-                self.accepted.add(command)
-            case CommandAck(command, result) if (
-                command != SET_MESSAGE_INTERVAL and result != "IN_PROGRESS"
-            ):
-                self.refusals.append(f"command {command} {result}")
-            case Rebooted():
-                self._reset()
-
-    def _detect_outage(self, time_s: float) -> None:
-        """After an outage, a new one is accepted only once both streams have resumed: a slow
-        stream must not hide that the other has stopped."""
-        stamps_s = [newest.time_s for newest in (self.position, self.attitude) if newest]
-        if time_s > self.time_s + OUTAGE_S and all(each >= self.resumed_s for each in stamps_s):
-            self.resumed_s = time_s
-
-    def _age_s(self, newest: LocalPosition | Attitude | None) -> float:
-        if newest is None:
-            return math.nan
-        return self.time_s - max(newest.time_s, self.resumed_s)
-
-    def _reset(self) -> None:
-        """After a reboot nothing is known of the vehicle."""
-        self.heartbeat = self.health = self.position = self.attitude = None
-        self.landed = "unknown"
-        self.resumed_s = -math.inf
-        self.parameters.clear()
-
-    def explanation(self) -> str:
-        """The newest texts or refusals of the vehicle, to end a sentence with; may be empty."""
-        messages = list(dict.fromkeys(self.texts or self.refusals))[-3:]
-        return "; the vehicle said: " + " | ".join(messages) if messages else ""
-
-    def clear_messages(self) -> None:
-        """Forget texts and acknowledgements: they do not explain what happens later."""
-        self.texts.clear()
-        self.refusals.clear()
-        self.accepted.clear()
+    def telemetry_age_s(self, host_s: float) -> float:
+        """Age of the newest telemetry at `host_s`, beyond the least delay of the link."""
+        return self.clock.age_s(self.time_s, host_s)

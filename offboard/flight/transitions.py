@@ -1,7 +1,7 @@
 """The phase table: transitions between the phases of a flight. The first row that holds is taken.
 
 Every row leads to a later phase. `actions` has what is done in a phase. The names in braces are
-keys of `assessment.Assessment.figures`.
+keys of `assessment.figures`.
 """
 
 from __future__ import annotations
@@ -9,8 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from offboard.flight import guards
-from offboard.flight.guards import Facts, Guard, longer_than
-from offboard.flight.phases import ExitCode, Phase
+from offboard.flight.facts import Facts
+from offboard.flight.guards import Guard, longer_than
+from offboard.flight.phases import ExitCode, Phase, Rung
 
 REFUSED, ABORTED = ExitCode.REFUSED, ExitCode.ABORTED
 
@@ -29,17 +30,23 @@ class Row:
     exit_code: int | None = None
 
 
-_LEFT = "the vehicle left {mode_wanted} for {mode}"
 _SILENT = "no telemetry for {silence_s:.1f} s"
 _BLIND = "no {blind_to} for {blind_s:.1f} s"
+_UNKNOWN = "no report of the mode for {authority_age_s:.1f} s: whose the vehicle is, is not known"
 _REBOOTED = "the vehicle restarted"
 _ARMED_ALREADY = "the vehicle is armed already, by another controller or a pilot"
 _DISARMED = "disarmed on the ground"
-_STOP = "{stop}"
-_DIVERGED = "{position_error_m:.1f} m from the reference (limit {position_error_limit_m:.1f} m)"
 _NOT_FOUND = "no vehicle heard in {silence_s:.0f} s; is it running, and sending to this port?"
 _NO_LIFT_OFF = "no lift-off in {in_phase_s:.0f} s; is hover_thrust in the vehicle file right?"
-_NOT_OURS = "the vehicle is armed and in {mode_wanted} already: another controller flies it"
+_NOT_OURS = (
+    "the vehicle is armed and in {mode_wanted} already: another controller flies it "
+    "(limits.begin_engaged=true takes it over)"
+)
+_FAILSAFE = "a failsafe flies the vehicle, in {mode} (limits.begin_in_failsafe=true takes it over)"
+_OTHER_SENDER = (
+    "another program controls the vehicle on this link, too: {other_sender} "
+    "(limits.begin_with_other_sender=true flies all the same)"
+)
 _NOT_ENGAGED = "the vehicle did not enter {mode_wanted} in {in_phase_s:.0f} s (it shows {mode})"
 
 
@@ -48,6 +55,7 @@ def _ground_rows(source: Phase) -> tuple[Row, ...]:
         Row(source, guards.armed_by_another, Phase.FAILED, _ARMED_ALREADY, REFUSED),
         Row(source, guards.silent_on_ground, Phase.FAILED, _SILENT, REFUSED),
         Row(source, guards.stop_requested, Phase.FAILED, "{stop} before take-off", REFUSED),
+        Row(source, guards.other_sender, Phase.FAILED, _OTHER_SENDER, REFUSED),
     )
 
 
@@ -56,6 +64,8 @@ def _streaming_rows(source: Phase) -> tuple[Row, ...]:
         Row(source, guards.rebooted, Phase.FAILED, _REBOOTED, REFUSED),
         *_ground_rows(source),
         Row(source, guards.blind, Phase.FAILED, _BLIND, REFUSED),
+        Row(source, guards.authority_unknown, Phase.FAILED, _UNKNOWN, REFUSED),
+        Row(source, guards.lost, Phase.FAILED, "{lost}", REFUSED),
     )
 
 
@@ -63,21 +73,11 @@ def _flying_rows(source: Phase, when: str = "in flight") -> tuple[Row, ...]:
     return (
         Row(source, guards.rebooted, Phase.FAILED, f"{_REBOOTED} {when}", ABORTED),
         Row(source, guards.disarmed, Phase.FAILED, f"the vehicle disarmed {when}", ABORTED),
-        Row(source, guards.mode_left, Phase.YIELDED, _LEFT, ABORTED),
-        Row(source, guards.silent, Phase.LAND, _SILENT, ABORTED),
-        Row(source, guards.blind, Phase.LAND, _BLIND, ABORTED),
-        Row(source, guards.stop_requested, Phase.LAND, _STOP, ABORTED),
-        Row(source, guards.toppled, Phase.LAND, "tilt {tilt_deg:.0f} deg", ABORTED),
-    )
-
-
-def _tracking_rows(source: Phase) -> tuple[Row, ...]:
-    failed = "the controller failed: {failure}"
-    return (
-        *_flying_rows(source),
-        Row(source, guards.controller_failed, Phase.LAND, failed, ABORTED),
-        Row(source, guards.contradicted, Phase.LAND, "{contradiction}", ABORTED),
-        Row(source, guards.diverged, Phase.LAND, _DIVERGED, ABORTED),
+        Row(source, guards.lost, Phase.YIELDED, "{lost}", ABORTED),
+        Row(source, guards.at_rung(Rung.SILENCE), Phase.YIELDED, "{ladder}", ABORTED),
+        Row(source, guards.at_rung(Rung.LAND), Phase.LAND, "{ladder}", ABORTED),
+        Row(source, guards.stop_requested, Phase.LAND, "{stop}", ABORTED),
+        Row(source, guards.at_rung(Rung.HOLD), Phase.HOLD, "{ladder}", ABORTED),
     )
 
 
@@ -86,11 +86,12 @@ def _too_long(source: Phase, limit: str, target: Phase, reason: str, exit_code: 
 
 
 TRANSITIONS: tuple[Row, ...] = (
-    Row(Phase.CONNECT, guards.stop_requested, Phase.FAILED, _STOP, REFUSED),
+    Row(Phase.CONNECT, guards.stop_requested, Phase.FAILED, "{stop}", REFUSED),
     Row(Phase.CONNECT, guards.vehicle_found, Phase.HEALTH, "vehicle found"),
     Row(Phase.CONNECT, guards.silent_on_ground, Phase.FAILED, _NOT_FOUND, REFUSED),
     *_ground_rows(Phase.HEALTH),
     Row(Phase.HEALTH, guards.flown_by_another, Phase.FAILED, _NOT_OURS, REFUSED),
+    Row(Phase.HEALTH, guards.in_failsafe, Phase.FAILED, _FAILSAFE, REFUSED),
     Row(Phase.HEALTH, guards.misconfigured, Phase.FAILED, "{problems}", REFUSED),
     Row(Phase.HEALTH, guards.ready, Phase.STREAM, "telemetry flows and the vehicle can arm"),
     _too_long(Phase.HEALTH, "health_s", Phase.FAILED, "not ready: {not_ready}", REFUSED),
@@ -102,12 +103,19 @@ TRANSITIONS: tuple[Row, ...] = (
     Row(Phase.ENGAGE, guards.engaged, Phase.ARM, "the vehicle shows {mode}"),
     _too_long(Phase.ENGAGE, "engage_s", Phase.FAILED, _NOT_ENGAGED, REFUSED),
     Row(Phase.ARM, guards.rebooted, Phase.FAILED, _REBOOTED, REFUSED),
+    Row(Phase.ARM, guards.lost_armed, Phase.YIELDED, "{lost} as it armed", ABORTED),
+    Row(Phase.ARM, guards.lost, Phase.FAILED, "{lost}", REFUSED),
     Row(Phase.ARM, guards.silent, Phase.STAND_DOWN, _SILENT, REFUSED),
     Row(Phase.ARM, guards.blind, Phase.STAND_DOWN, _BLIND, REFUSED),
-    Row(Phase.ARM, guards.stop_requested, Phase.STAND_DOWN, _STOP, REFUSED),
-    Row(Phase.ARM, guards.mode_left_armed, Phase.YIELDED, f"{_LEFT} as it armed", ABORTED),
-    Row(Phase.ARM, guards.mode_left, Phase.FAILED, _LEFT, REFUSED),
+    Row(Phase.ARM, guards.stop_requested, Phase.STAND_DOWN, "{stop}", REFUSED),
     Row(Phase.ARM, guards.armed, Phase.TAKEOFF, "armed"),
+    Row(
+        Phase.ARM,
+        guards.disarmed_again,
+        Phase.FAILED,
+        "the vehicle was disarmed just after it had armed",
+        REFUSED,
+    ),
     _too_long(
         Phase.ARM,
         "arm_s",
@@ -118,7 +126,7 @@ TRANSITIONS: tuple[Row, ...] = (
     *_flying_rows(Phase.TAKEOFF, "before lift-off"),
     Row(Phase.TAKEOFF, guards.lifted_off, Phase.CLIMB, "lifted off"),
     _too_long(Phase.TAKEOFF, "lift_off_s", Phase.LAND, _NO_LIFT_OFF, ABORTED),
-    *_tracking_rows(Phase.CLIMB),
+    *_flying_rows(Phase.CLIMB),
     Row(Phase.CLIMB, guards.at_start_to_excite, Phase.EXCITE, "identification steps"),
     Row(Phase.CLIMB, guards.at_start, Phase.JOIN, "hovers at the start of the reference"),
     Row(
@@ -129,7 +137,7 @@ TRANSITIONS: tuple[Row, ...] = (
         "{late_s:.0f} s late",
         ABORTED,
     ),
-    *_tracking_rows(Phase.EXCITE),
+    *_flying_rows(Phase.EXCITE),
     Row(Phase.EXCITE, guards.identified, Phase.JOIN, "hovers at the start of the reference"),
     _too_long(
         Phase.EXCITE,
@@ -138,16 +146,27 @@ TRANSITIONS: tuple[Row, ...] = (
         "identification did not converge in {in_phase_s:.0f} s",
         ABORTED,
     ),
-    *_tracking_rows(Phase.JOIN),
+    *_flying_rows(Phase.JOIN),
     Row(Phase.JOIN, guards.at_full_speed, Phase.TRACK, "on the reference at full speed"),
-    *_tracking_rows(Phase.TRACK),
+    *_flying_rows(Phase.TRACK),
     Row(Phase.TRACK, guards.track_over, Phase.HOVER, "the reference was flown"),
-    *_tracking_rows(Phase.HOVER),
+    *_flying_rows(Phase.HOVER),
     Row(Phase.HOVER, guards.at_rest, Phase.LAND, "at rest"),
+    *(row for row in _flying_rows(Phase.HOLD) if row.target is not Phase.HOLD),
+    _too_long(
+        Phase.HOLD, "hold_s", Phase.LAND, "the autopilot held for {in_phase_s:.0f} s", ABORTED
+    ),
     Row(Phase.LAND, guards.rebooted, Phase.FAILED, f"{_REBOOTED} while landing", ABORTED),
+    Row(
+        Phase.LAND,
+        guards.fell,
+        Phase.FAILED,
+        "disarmed {height_m:.1f} m above the take-off point or after a fall: not landed",
+        ABORTED,
+    ),
     Row(Phase.LAND, guards.disarmed, Phase.DISARMED, _DISARMED),
-    Row(Phase.LAND, guards.lost, Phase.FAILED, f"{_SILENT} while landing", ABORTED),
-    Row(Phase.LAND, guards.landing_left, Phase.YIELDED, _LEFT, ABORTED),
+    Row(Phase.LAND, guards.silent_for_long, Phase.FAILED, f"{_SILENT} while landing", ABORTED),
+    Row(Phase.LAND, guards.lost, Phase.YIELDED, "{lost}", ABORTED),
     _too_long(
         Phase.LAND,
         "land_s",
@@ -156,7 +175,7 @@ TRANSITIONS: tuple[Row, ...] = (
         ABORTED,
     ),
     Row(Phase.STAND_DOWN, guards.rebooted, Phase.FAILED, _REBOOTED, REFUSED),
-    Row(Phase.STAND_DOWN, guards.lost, Phase.FAILED, _SILENT, REFUSED),
+    Row(Phase.STAND_DOWN, guards.silent_for_long, Phase.FAILED, _SILENT, REFUSED),
     Row(Phase.STAND_DOWN, guards.disarmed_for_good, Phase.FAILED, _DISARMED),
     _too_long(
         Phase.STAND_DOWN,

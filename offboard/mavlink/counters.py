@@ -22,6 +22,7 @@ class DropReason(Enum):
     # frames
     UNKNOWN_ID = "a message id whose CRC_EXTRA is unknown"
     ECHO = "a frame of our own, received back"
+    SAME_IDS = "a frame with our own ids that another program sent"
     NO_VEHICLE = "before the first heartbeat of an autopilot"
     UNSUPPORTED_AUTOPILOT = "a heartbeat of an autopilot without dialect"
     FOREIGN_SYSTEM = "another system id than the vehicle's"

@@ -28,6 +28,7 @@ _UNKNOWN16 = 0xFFFF
 _LONGEST_UPTIME_US = 10**15  # a larger stamp is Unix time
 _REAL32 = 9  # MAV_PARAM_TYPE
 _UNSIGNED_TYPES, _SIGNED_TYPES = (1, 3, 5), (2, 4, 6)
+_CURRENT_MODE = struct.Struct("<IIx")  # custom_mode, intended_custom_mode; not in pymavlink 2.4.50
 _LANDED = ("unknown", "on_ground", "in_air", "takeoff", "landing")  # MAV_LANDED_STATE
 _RESULTS = (  # MAV_RESULT
     "ACCEPTED",
@@ -108,6 +109,11 @@ def decode_text_chunk(payload: bytes) -> TextChunk:
 def _heartbeat(payload: bytes, dialect: Dialect) -> events.Event:
     custom_mode, _, _, base_mode, status, _ = _unpack(mavlink.MAVLink_heartbeat_message, payload)
     return events.Heartbeat(dialect.mode_name(custom_mode), bool(base_mode & _ARMED), status)
+
+
+def _current_mode(payload: bytes, dialect: Dialect) -> events.Event:
+    custom_mode, _ = _CURRENT_MODE.unpack_from(payload.ljust(_CURRENT_MODE.size, b"\0"))
+    return events.ModeReport(dialect.mode_name(custom_mode))
 
 
 def _local_position(payload: bytes, _: Dialect) -> events.Event | DropReason:
@@ -228,4 +234,5 @@ _DECODERS: Mapping[int, Callable[[bytes, Dialect], events.Event | DropReason | N
     77: _command_ack,
     242: _home,
     245: _landed,
+    436: _current_mode,
 }

@@ -34,6 +34,23 @@ class Heartbeat:
 
 
 @dataclass(frozen=True, slots=True)
+class ModeReport:
+    """CURRENT_MODE of our vehicle."""
+
+    mode: str  # as in `Heartbeat`
+
+
+@dataclass(frozen=True, slots=True)
+class OtherSender:
+    """A frame that shows a second controller of our vehicle on this link: a setpoint that is not
+    ours, or a frame with our own ids that we did not send."""
+
+    system_id: int
+    component_id: int
+    message_id: int
+
+
+@dataclass(frozen=True, slots=True)
 class LocalPosition:
     """LOCAL_POSITION_NED."""
 
@@ -136,6 +153,8 @@ class Rebooted:
 Event = (
     VehicleFound
     | Heartbeat
+    | ModeReport
+    | OtherSender
     | LocalPosition
     | Attitude
     | GpsFix

@@ -10,6 +10,7 @@ change. Our system id is the vehicle's, which makes us one of its components.
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Hashable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -32,6 +33,7 @@ from offboard.mavlink.events import (
     Attitude,
     Event,
     LocalPosition,
+    OtherSender,
     PeerChanged,
     Rebooted,
     TimesyncReply,
@@ -46,6 +48,8 @@ from offboard.mavlink.vehicle_time import Age, LinkTime, VehicleTime
 DIALECTS: Mapping[str, Dialect] = MappingProxyType({d.name: d for d in (PX4, ARDUPILOT)})
 
 _HEARTBEAT, _COMMAND_ACK, _TIMESYNC, _STATUSTEXT = 0, 77, 111, 253
+_SETPOINTS = (82, 84, 86)  # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT
+_ECHOES = 256  # newest frames of ours that are recognised when they come back
 _AUTOPILOT_COMPONENT = 1
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 _HEARTBEAT_PERIOD_S = 0.999  # 1 Hz; below 1 s, so that no rounding error delays it by a cycle
@@ -72,17 +76,16 @@ class SessionSettings:
 
 @dataclass(frozen=True, slots=True)
 class Reception:
-    """Result of one portion of bytes, to be handled in this order: log `frames`, process `events`,
-    encode and send `messages`.
+    """Result of one portion of bytes.
 
-    `frames` are all with a correct checksum, used or not, except our own. `messages` are what is
-    due by time and, last, the replies to TIMESYNC requests: in lockstep, what is sent after the
+    `frames` are all with a correct checksum, used or not, except our own; they are for the log.
+    `replies` answer TIMESYNC requests. They must be sent last: in lockstep, what is sent after the
     reply is applied one barrier later.
     """
 
     frames: tuple[bytes, ...] = ()
     events: tuple[Event, ...] = ()
-    messages: tuple[Outgoing, ...] = ()
+    replies: tuple[Outgoing, ...] = ()
 
 
 class Session:
@@ -98,6 +101,7 @@ class Session:
         self._splitter = framing.FrameSplitter(settings.stream, self.counters)
         self._sequence_in = SequenceTracker()
         self._sequence_out: dict[int, int] = {}
+        self._sent: deque[bytes] = deque(maxlen=_ECHOES)
         self._texts = TextAssembler()
         self._time = VehicleTime()
         self._arrival_s = 0.0  # vehicle time when the newest datagram arrived
@@ -132,7 +136,7 @@ class Session:
                 self.counters.ignored += 1
             if frame.verified and outcome is not DropReason.ECHO:
                 frames.append(frame.raw)
-        return Reception(tuple(frames), tuple(events), (*self._due(now_s), *replies))
+        return Reception(tuple(frames), tuple(events), tuple(replies))
 
     def _accept(
         self,
@@ -143,8 +147,14 @@ class Session:
         replies: list[Outgoing],
     ) -> DropReason | bool:
         """Why the frame was dropped, or whether it was decoded."""
-        if (frame.system_id, frame.component_id) == self._own:
+        sender = Address(frame.system_id, frame.component_id)
+        ours = sender == self._own
+        if ours and frame.raw in self._sent:
             return DropReason.ECHO
+        if self.vehicle is not None and (ours or frame.message_id in _SETPOINTS):
+            events.append(OtherSender(*sender, frame.message_id))
+        if ours:
+            return DropReason.SAME_IDS
         foreign = self._check_sender(frame, peer, events)
         if foreign is not None:
             return foreign
@@ -245,12 +255,12 @@ class Session:
     # --- out ---
 
     def poll(self, now_s: float) -> tuple[Outgoing, ...]:
-        """Messages that are due at `now_s`. Call it whenever nothing has arrived for a while."""
-        return self._due(self._clock_s(now_s))
+        """Messages that are due at `now_s`; call it at least every 50 ms.
 
-    def _due(self, now_s: float) -> tuple[Outgoing, ...]:
-        """Our heartbeat, at 1 Hz of host or vehicle time, whichever is faster, and requests for
-        telemetry that is missing or too slow."""
+        They are our heartbeat, at 1 Hz of host or vehicle time, whichever is faster, and requests
+        for telemetry that is missing or too slow.
+        """
+        now_s = self._clock_s(now_s)
         self._link_time.host(now_s)
         if self.dialect is None and not self.settings.sends_first:
             return ()  # PX4 does not notice a change of the type: the first must be right
@@ -281,7 +291,9 @@ class Session:
             component_id = self.settings.record_component_id
         sequence = self._sequence_out.get(component_id, 0)
         self._sequence_out[component_id] = (sequence + 1) % 256
-        return framing.pack(*packed, sequence, self._own.system_id, component_id)
+        frame = framing.pack(*packed, sequence, self._own.system_id, component_id)
+        self._sent.append(frame)
+        return frame
 
     def _clock_s(self, host_s: float) -> float:
         return self._arrival_s if self.settings.lockstep else host_s

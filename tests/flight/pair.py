@@ -21,6 +21,7 @@ from offboard.estimation.fusion import FusedObserver, observer_of
 from offboard.flight import configuration as config
 from offboard.flight.companion import Companion, Outcome
 from offboard.flight.flight_plan import FlightPlan
+from offboard.flight.link import Chunk
 from offboard.flight.log import FlightLog
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Phase
@@ -75,7 +76,6 @@ class Pair:
     sent: list[tuple[float, Phase, bytes]] = field(default_factory=list)  # by the companion
     logged: Bytes = field(default_factory=list)
     phases: list[tuple[float, Phase]] = field(default_factory=list)
-    heard_s: float = 0.0
 
     def fly(self, longest_s: float = LONGEST_S) -> Outcome:
         """To the end of the flight, which must come within `longest_s`."""
@@ -87,7 +87,7 @@ class Pair:
             self._step()
             if step % POLL_STEPS == 0 and not self.companion.has_ended():
                 now_s = HOST_EPOCH_S + self.time_s
-                self._take(self.companion.poll(now_s, self.time_s - self.heard_s))
+                self._take(self.companion.turn([], now_s))
             for moment in [moment for moment in self.at if moment[0](self)]:
                 self.at.remove(moment)
                 moment[1](self)
@@ -102,10 +102,8 @@ class Pair:
         for datagram in self.down(self.time_s, self.instance.step()):
             if self.companion.has_ended():
                 return
-            output = self.companion.receive(datagram, "vehicle", HOST_EPOCH_S + self.time_s)
-            if output.alive:
-                self.heard_s = self.time_s
-            self._take(output)
+            now_s = HOST_EPOCH_S + self.time_s
+            self._take(self.companion.turn([Chunk(datagram, "vehicle", now_s)], now_s))
 
     def _take(self, output: Any) -> None:
         self.logged.extend(output.log)
@@ -125,6 +123,11 @@ class Pair:
 
     def pilot_takes_over(self) -> None:
         self.ground(176, 1, 4, LOITER)
+
+    @property
+    def heard_s(self) -> float:
+        """Time of the newest telemetry."""
+        return self.time_s - self.companion.state.silence_s
 
     # -- what a test may ask afterwards -----------------------------------------------------------
 

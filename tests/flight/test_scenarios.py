@@ -166,8 +166,8 @@ def stayed_down(pair: Pair) -> Checks:
 
 
 def landed_by_failsafe(pair: Pair) -> Checks:
-    """After a refused landing the setpoints stop, so that the vehicle's failsafe lands."""
-    yield from flown(pair)
+    """After a refused landing the setpoints stop, so that the vehicle's failsafe acts."""
+    yield pair.went_through(Phase.HOVER)
     yield 25 <= sum(phase is Phase.LAND for _, phase, _ in pair.setpoints) <= 32
     yield len(pair.commands(LAND)) > 3
 
@@ -351,9 +351,9 @@ ROWS = (
     Row(
         "landing refused",
         lambda: hover(firmware=refusing("land", "No.")),
-        0,
-        FLOWN,
-        Phase.DISARMED,
+        4,
+        "the vehicle left OFFBOARD for POSCTL; the vehicle said: No.",
+        Phase.YIELDED,
         landed_by_failsafe,
     ),
     # the pilot
@@ -392,7 +392,7 @@ ROWS = (
         "pilot takes over while landing",
         lambda: hover(at=[(in_phase(Phase.LAND, 1.2), take_over)]),
         4,
-        "the vehicle left OFFBOARD for AUTO.LOITER",
+        "the vehicle left AUTO.LAND for AUTO.LOITER",
         Phase.YIELDED,
         lambda pair: iter([pair.instance.autopilot.commander.mode.name == "AUTO.LOITER"]),
     ),
@@ -496,8 +496,8 @@ ROWS = (
         )
         for fail, says in (
             (raises, "ZeroDivisionError: nothing to divide by"),
-            (not_a_number, "DecisionError: unusable Command(thrust_mps2=nan"),
-            (no_direction, "DecisionError: unusable Command"),
+            (not_a_number, "unusable Command(thrust_mps2=nan"),
+            (no_direction, "unusable Command"),
         )
     ),
     Row(

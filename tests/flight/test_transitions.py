@@ -8,9 +8,9 @@ from dataclasses import replace
 import pytest
 from pair import hover
 
-from offboard.flight.assessment import Progress
-from offboard.flight.guards import Facts
-from offboard.flight.phases import ENDS, ExitCode, Limits, Phase
+from offboard.flight import ladder
+from offboard.flight.facts import Facts
+from offboard.flight.phases import ENDS, ExitCode, Limits, Phase, Rung
 from offboard.flight.transitions import TRANSITIONS, Row, next_row
 
 ON_TRACK = (Phase.JOIN, Phase.TRACK, Phase.HOVER)
@@ -24,10 +24,12 @@ UNEVENTFUL = Facts(
     misconfigured=False,
     rebooted=False,
     engaged=True,
-    landing=False,
+    lost=False,
+    authority_known=True,
     failsafe=False,
     armed=True,
     in_the_air=False,
+    landed=True,
     lifted_off=False,
     at_start=False,
     late_s=math.nan,
@@ -36,7 +38,11 @@ UNEVENTFUL = Facts(
     track_end_s=20.0,
     rest_time_s=23.5,
     position_error_m=0.0,
+    prediction_error_m=0.0,
     tilt_rad=0.0,
+    tilt_error_rad=0.0,
+    height_m=1.0,
+    distance_m=2.0,
     stop_requested=False,
     missed_decisions=0,
     contradicted=False,
@@ -69,20 +75,23 @@ EVENTS: dict[str, dict[str, object]] = {  # the facts that make each guard hold
     "at_full_speed": {"track_time_s": 4.0},
     "track_over": {"track_time_s": 20.0},
     "at_rest": {"track_time_s": 23.5},
+    "in_failsafe": {"failsafe": True, "in_the_air": True},
+    "other_sender": {"other_sender": True},
     "disarmed": {"armed": False},
+    "disarmed_again": {"disarmed_again": True},
     "disarmed_for_good": {"armed": False, "in_phase_s": 1.6},
-    "mode_left": {"engaged": False},
-    "mode_left_armed": {"engaged": False, "armed": True},
-    "landing_left": {"engaged": False},
+    "fell": {"armed": False, "landed": False},
+    "lost": {"lost": True},
+    "lost_armed": {"lost": True, "armed": True},
+    "authority_unknown": {"authority_known": False},
     "silent": {"silence_s": 1.01},
-    "lost": {"silence_s": 2.01},
+    "silent_for_long": {"silence_s": 2.01},
     "silent_on_ground": {"silence_s": 20.1},
     "blind": {"blind_s": 0.51},
     "stop_requested": {"stop_requested": True},
-    "diverged": {"position_error_m": 5.1},
-    "toppled": {"tilt_rad": 1.31},
-    "controller_failed": {"missed_decisions": 3},
-    "contradicted": {"contradicted": True},
+    "ladder_hold": {"rung": Rung.HOLD},
+    "ladder_land": {"rung": Rung.LAND},
+    "ladder_silence": {"rung": Rung.SILENCE},
 }
 
 
@@ -140,8 +149,7 @@ def test_no_flight_in_the_air_ends_as_refused() -> None:
 
 
 def test_every_reason_has_its_figures() -> None:
-    assessment = hover().companion._machine._assessment
-    progress = Progress(Phase.CONNECT, 0.0, 0.0, False, "", 0, "")
-    figures = assessment.figures(assessment.facts(progress), progress)
-    for row in TRANSITIONS:
+    machine = hover().companion._machine
+    figures = machine._figures(machine._facts())
+    for row in (*TRANSITIONS, *ladder.ROWS):
         assert "{" not in row.reason.format(**figures)

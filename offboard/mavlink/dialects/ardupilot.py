@@ -91,6 +91,7 @@ ARDUPILOT = Dialect(
     ),
     wanted=(
         *TRACKING_TELEMETRY,
+        WantedMessage(0, "HEARTBEAT", 10.0, optional=True),  # the only report of the mode
         WantedMessage(108, "SIM_STATE", 50.0, optional=True),  # simulated truth
     ),
 )

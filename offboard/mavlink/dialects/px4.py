@@ -75,6 +75,8 @@ PX4 = Dialect(
     ),
     wanted=(
         *TRACKING_TELEMETRY,
+        # shows a change of the mode within 0.1 s; the rate of HEARTBEAT, 1 Hz, cannot be changed
+        WantedMessage(436, "CURRENT_MODE", 10.0, optional=True),
         WantedMessage(115, "HIL_STATE_QUATERNION", 50.0, optional=True),  # simulated truth
     ),
 )

@@ -1,0 +1,54 @@
+"""Facts of one moment: all that a guard of the phase table or a row of the ladder may use."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from offboard.flight.phases import Limits, Rung
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """SI; NaN for what is not known yet. `assessment.facts` computes them."""
+
+    limits: Limits
+    in_phase_s: float  # since the phase began, on Session.link_time_s
+    silence_s: float  # host time since the last telemetry
+    blind_s: float  # age of the older of position and attitude, vehicle time
+    found: bool
+    ready: bool  # telemetry flows, parameters were read, pre-arm checks pass
+    misconfigured: bool
+    rebooted: bool  # after its telemetry was complete
+    engaged: bool  # the vehicle shows the mode in which it follows setpoints
+    lost: bool  # the vehicle is not ours any more
+    authority_known: bool
+    failsafe: bool  # the vehicle shows a failsafe or an emergency
+    armed: bool
+    in_the_air: bool
+    landed: bool  # after a descent: it did not fall
+    lifted_off: bool
+    at_start: bool
+    late_s: float  # since the planned end of the climb
+    track_time_s: float
+    track_start_s: float
+    track_end_s: float
+    rest_time_s: float
+    position_error_m: float
+    prediction_error_m: float
+    tilt_rad: float
+    tilt_error_rad: float
+    height_m: float  # above the take-off point
+    distance_m: float  # horizontal, from the take-off point
+    stop_requested: bool
+    missed_decisions: int  # in a row
+    contradicted: bool  # telemetry contradicts the vehicle file
+    telemetry_age_s: float = 0.0  # beyond the least delay of the link
+    link_growth_s: float = 0.0
+    clock_jump_s: float = 0.0
+    battery: float = 1.0
+    other_sender: bool = False
+    disarmed_again: bool = False  # after arming was accepted
+    lifted_by_command: bool = False  # the autopilot takes off on a command, without setpoints
+    rung: Rung = Rung.FLY  # of the ladder, which judges the other facts
+    excites: bool = False  # identification steps are flown before the track
+    identified: bool = False  # and their result is in use

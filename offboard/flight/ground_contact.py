@@ -1,0 +1,102 @@
+"""Whether the vehicle is on the ground, from several signs with ages. In doubt it is in the air.
+
+Signs: disarmed (HEARTBEAT), the land detector (EXTENDED_SYS_STATE), and height and vertical speed
+(LOCAL_POSITION_NED) since it was last known to rest.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+from offboard.flight.vehicle_state import VehicleState
+from offboard.mavlink.events import Landed, LocalPosition
+
+DETECTOR_KNOWN_S = 1.5  # EXTENDED_SYS_STATE is requested at 5 Hz
+RESTING_HEIGHT_M, RESTING_SPEED_MPS = 0.75, 0.3  # errors of an estimate on the ground
+LIFTED_HEIGHT_M, LIFTED_CLIMB_MPS, LIFTED_SAMPLES = 0.15, 0.4, 3
+FLYING = ("in_air", "takeoff", "landing")
+GROUND_SPEED_MPS = 0.5  # as an estimate on the ground may show
+STOOD_WITHIN_M, STOOD_HEIGHT_M = 0.1, 0.3
+KEPT_S, KEPT_EVERY_S = 20.0, 0.05
+DESCENT_OVER_S, AT_REST_S = 3.0, 0.5
+FALL_MPS = 2.5  # faster than any landing: WPNAV_SPEED_DN is 1.5, MPC_Z_V_AUTO_DN 1.5
+
+
+@dataclass(slots=True)
+class GroundContact:
+    """Updated with every position; `vehicle` holds the other signs."""
+
+    vehicle: VehicleState
+    rest_down_m: float = 0.0  # where it was last known to rest; at first the local origin
+    _lifted: int = 0  # samples in a row
+    _heights: deque[tuple[float, float, float]] = field(default_factory=deque)
+
+    def on_position(self, position: LocalPosition) -> None:
+        """The newest position."""
+        speed_mps = position.velocity_ned_mps[2]
+        if self.vehicle.disarmed and abs(speed_mps) < GROUND_SPEED_MPS:
+            self.rest_down_m = position.position_ned_m[2]
+        climbs = speed_mps < -LIFTED_CLIMB_MPS and self.height_m > 0.3 * LIFTED_HEIGHT_M
+        lifted = self.height_m > LIFTED_HEIGHT_M or climbs
+        self._lifted = self._lifted + 1 if lifted else 0
+        if not self._heights or position.time_s - self._heights[-1][0] >= KEPT_EVERY_S:
+            self._heights.append((position.time_s, self.height_m, speed_mps))
+        while self._heights[0][0] < position.time_s - KEPT_S:
+            self._heights.popleft()
+
+    @property
+    def height_m(self) -> float:
+        """Height above the place of the last rest; 0 before the first position."""
+        position = self.vehicle.position
+        return self.rest_down_m - position.position_ned_m[2] if position else 0.0
+
+    @property
+    def certain(self) -> bool:
+        """Every sign says that the vehicle stands on the ground."""
+        vehicle = self.vehicle
+        if vehicle.disarmed:
+            return True
+        if vehicle.landed != "on_ground" or vehicle.age_s(Landed) > DETECTOR_KNOWN_S:
+            return False
+        position = vehicle.position
+        return (
+            position is not None
+            and abs(self.height_m) < RESTING_HEIGHT_M
+            and abs(position.velocity_ned_mps[2]) < GROUND_SPEED_MPS
+        )
+
+    @property
+    def in_the_air(self) -> bool:
+        """The vehicle is armed and any sign says that it flies."""
+        return self.vehicle.armed and not self.certain
+
+    @property
+    def lifted_off(self) -> bool:
+        """Several positions in a row are above the ground."""
+        return self._lifted >= LIFTED_SAMPLES
+
+    def stood_for(self, for_s: float) -> bool:
+        """At the height of the last rest, and no higher or lower during `for_s`."""
+        heights = [height for height, _ in self._recent(for_s)]
+        still = max(heights, default=math.inf) - min(heights, default=0.0) < STOOD_WITHIN_M
+        return still and self._known_for(for_s) and abs(self.height_m) < STOOD_HEIGHT_M
+
+    @property
+    def landed(self) -> bool:
+        """Judged when it disarms after a descent: it did not fall, and it is at the height of the
+        last rest or was at rest already (on a slope)."""
+        fell = any(down > FALL_MPS for _, down in self._recent(DESCENT_OVER_S))
+        rested = all(abs(down) < RESTING_SPEED_MPS for _, down in self._recent(AT_REST_S))
+        at_rest = rested and self._known_for(AT_REST_S)
+        return not fell and (abs(self.height_m) < RESTING_HEIGHT_M or at_rest)
+
+    def _known_for(self, for_s: float) -> bool:
+        heard = self._heights
+        return bool(heard) and heard[-1][0] - heard[0][0] >= for_s
+
+    def _recent(self, over_s: float) -> list[tuple[float, float]]:
+        """Height and vertical speed, down positive, of the last `over_s`."""
+        newest_s = self._heights[-1][0] if self._heights else 0.0
+        return [(height, down) for at_s, height, down in self._heights if at_s > newest_s - over_s]

@@ -1,0 +1,165 @@
+"""Vehicle state: the newest telemetry of each kind, when it was heard, and what follows from it.
+
+No decisions. Ages are seconds of `Session.link_time_s`, which is given as `now_s`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass, field
+
+from offboard.mavlink.events import (
+    Attitude,
+    CommandAck,
+    Event,
+    Heartbeat,
+    Landed,
+    LocalPosition,
+    ModeReport,
+    OtherSender,
+    Parameter,
+    Rebooted,
+    StatusText,
+    SystemHealth,
+    VehicleFound,
+)
+from offboard.model.frames import course_from_quaternion
+
+ARMED_KNOWN_S = 3.0  # PX4 reports it in HEARTBEAT alone, at 1 Hz
+OUTAGE_S = 0.3  # a longer gap of all telemetry is an outage of the link
+MESSAGES_MAX = 12  # texts and refusals kept for the sentence that explains a failure
+WARNING = 4  # MAV_SEVERITY; more severe is a lower number
+GOOD_RESULTS = ("ACCEPTED", "IN_PROGRESS")  # MAV_RESULT
+SET_MESSAGE_INTERVAL = 511  # MAV_CMD: a refused rate explains no failure
+
+
+@dataclass(slots=True)
+class VehicleState:
+    """The newest telemetry of the vehicle; None until the first message of that kind."""
+
+    found: VehicleFound | None = None
+    heartbeat: Heartbeat | None = None
+    health: SystemHealth | None = None
+    landed: str = "unknown"
+    position: LocalPosition | None = None
+    attitude: Attitude | None = None
+    parameters: dict[str, float] = field(default_factory=dict)
+    texts: deque[str] = field(default_factory=lambda: deque(maxlen=MESSAGES_MAX))
+    refusals: deque[str] = field(default_factory=lambda: deque(maxlen=MESSAGES_MAX))
+    results: dict[int, str] = field(default_factory=dict)  # newest, by MAV_CMD number
+    mode: str = "unknown"
+    other_sender: OtherSender | None = None
+    resumed_s: float = -math.inf  # vehicle time of the first telemetry after an outage
+    now_s: float = 0.0
+    heard_s: dict[type, float] = field(default_factory=dict)  # by type of event
+
+    @property
+    def time_s(self) -> float:
+        """Vehicle time of the newest position or attitude; 0 before the first."""
+        stamps = [event.time_s for event in (self.position, self.attitude) if event is not None]
+        return max(stamps, default=0.0)
+
+    @property
+    def position_age_s(self) -> float:
+        """Vehicle time since the newest position, or since telemetry resumed after an outage of
+        the link; NaN before the first position."""
+        return self._age_s(self.position)
+
+    @property
+    def attitude_age_s(self) -> float:
+        """As `position_age_s`, for the attitude."""
+        return self._age_s(self.attitude)
+
+    def age_s(self, *kinds: type) -> float:
+        """Time since the newest event of one of these types; infinite if none was heard."""
+        return self.now_s - max(self.heard_s.get(kind, -math.inf) for kind in kinds)
+
+    @property
+    def armed(self) -> bool:
+        return self.heartbeat is not None and self.heartbeat.armed
+
+    @property
+    def disarmed(self) -> bool:
+        """A recent HEARTBEAT says that the vehicle is disarmed."""
+        return not self.armed and self.age_s(Heartbeat) < ARMED_KNOWN_S
+
+    @property
+    def has_state(self) -> bool:
+        """Position and attitude have been received."""
+        return self.position is not None and self.attitude is not None
+
+    @property
+    def course_rad(self) -> float:
+        """Heading of the nose in the newest attitude, which must have been received."""
+        assert self.attitude is not None
+        return float(course_from_quaternion(self.attitude.attitude))
+
+    @property
+    def prearm_ok(self) -> bool:
+        """SYS_STATUS reports that the vehicle's pre-arm checks pass."""
+        return self.health is not None and self.health.prearm_ok
+
+    def update(self, event: Event, now_s: float) -> None:
+        """Store what one event reports."""
+        self.now_s = now_s
+        self.heard_s[type(event)] = now_s
+        if isinstance(event, (LocalPosition, Attitude)):
+            self._detect_outage(event.time_s)
+        match event:
+            case Heartbeat(mode):
+                self.heartbeat, self.mode = event, mode
+            case ModeReport(mode):
+                self.mode = mode
+            case OtherSender():
+                self.other_sender = event
+            case LocalPosition():
+                self.position = event
+            case Attitude():
+                self.attitude = event
+            case SystemHealth():
+                self.health = event
+            case Landed(state):
+                self.landed = state
+            case VehicleFound():
+                self.found = event
+            case Parameter(name, value):
+                self.parameters[name] = value
+            case StatusText(severity, text) if severity <= WARNING:
+                self.texts.append(text)
+            case CommandAck(command, result) if command != SET_MESSAGE_INTERVAL:
+                self.results[command] = result
+                if result not in GOOD_RESULTS:
+                    self.refusals.append(f"command {command} {result}")
+            case Rebooted():
+                self._reset()
+
+    def _detect_outage(self, time_s: float) -> None:
+        """After an outage, a new one is accepted only once both streams have resumed: a slow
+        stream must not hide that the other has stopped."""
+        stamps_s = [newest.time_s for newest in (self.position, self.attitude) if newest]
+        if time_s > self.time_s + OUTAGE_S and all(each >= self.resumed_s for each in stamps_s):
+            self.resumed_s = time_s
+
+    def _age_s(self, newest: LocalPosition | Attitude | None) -> float:
+        if newest is None:
+            return math.nan
+        return self.time_s - max(newest.time_s, self.resumed_s)
+
+    def _reset(self) -> None:
+        """After a reboot nothing is known of the vehicle."""
+        self.heartbeat = self.health = self.position = self.attitude = None
+        self.landed = self.mode = "unknown"
+        self.heard_s.clear()
+        self.resumed_s = -math.inf
+        self.parameters.clear()
+
+    def explanation(self) -> str:
+        """The newest texts or refusals of the vehicle, to end a sentence with; may be empty."""
+        messages = list(dict.fromkeys(self.texts or self.refusals))[-3:]
+        return "; the vehicle said: " + " | ".join(messages) if messages else ""
+
+    def clear_messages(self) -> None:
+        """Forget texts and acknowledgements: they do not explain what happens later."""
+        self.texts.clear()
+        self.refusals.clear()
