@@ -78,7 +78,8 @@ class SessionSettings:
 class Reception:
     """Result of one portion of bytes.
 
-    `frames` are all with a correct checksum, used or not, except our own; they are for the log.
+    `frames` are all with a correct checksum, used or not, except those with our ids; they are for
+    the log, in which our ids mean that we sent a frame.
     `replies` answer TIMESYNC requests. They must be sent last: in lockstep, what is sent after the
     reply is applied one barrier later.
     """
@@ -134,7 +135,7 @@ class Session:
                 self.counters.decoded += 1
             else:
                 self.counters.ignored += 1
-            if frame.verified and outcome is not DropReason.ECHO:
+            if frame.verified and outcome not in (DropReason.ECHO, DropReason.SAME_IDS):
                 frames.append(frame.raw)
         return Reception(tuple(frames), tuple(events), tuple(replies))
 

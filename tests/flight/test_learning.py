@@ -173,7 +173,7 @@ def test_steps_stay_in_the_box():
 
     def look(now: Pair) -> bool:
         if now.companion.phase is Phase.EXCITE:
-            position = now.companion.state.position
+            position = now.companion.state.vehicle.position
             assert position is not None
             away.append(np.linalg.norm(np.array(position.position_ned_m) - [0.0, 0.0, -3.0]))
         return False

@@ -137,7 +137,7 @@ def test_good_frames_survive_garbage_between_them(traffic: list[bytes], seed: in
     found += session.receive(bytes(LONGEST_FRAME), PEER, 0.0).frames
     ours = [frame for frame in traffic if frame[6] == 191]
     assert found == [frame for frame in traffic if frame not in ours]
-    assert session.counters.dropped[DropReason.ECHO] == len(ours)
+    assert session.counters.dropped[DropReason.SAME_IDS] == len(ours)
     check(session)
 
 

@@ -9,7 +9,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from vehicle_frames import ARDUPILOT, OFFBOARD, PEER, PX4, Sender, pinned, understood
 
-from offboard.mavlink import events
+from offboard.mavlink import events, framing
 from offboard.mavlink.counters import DropReason
 from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Timesync
 from offboard.mavlink.session import Session, SessionSettings
@@ -92,7 +92,7 @@ def test_the_vehicle_may_move_to_another_port_after_a_silence() -> None:
     moved, position = reception.events
     assert moved == events.PeerChanged(RESTARTED)
     assert isinstance(position, events.LocalPosition)
-    assert Heartbeat(6) in reception.messages  # at once, 0.51 s after the last one
+    assert Heartbeat(6) in session.poll(10.51)  # at once, 0.51 s after the last one
     assert session.receive(vehicle.position(1060), PEER, 10.53).events == ()  # the old one is back
 
 
@@ -123,6 +123,28 @@ def test_our_own_frames_are_ignored_and_not_logged() -> None:
     reception = session.receive(session.encode(Heartbeat(18)), PEER, 0.0)
     assert (reception.frames, reception.events) == ((), ())
     assert dropped(session, DropReason.ECHO) == 1
+
+
+def test_another_program_with_our_ids_and_a_strange_setpoint_are_seen() -> None:
+    """Another companion that uses our ids, and one that sends setpoints as another component."""
+    session = pinned(Sender())
+    twin, other = Sender(1, 191), Sender(1, 195)
+    assert session.receive(twin.heartbeat(8, vehicle_type=18), PEER, 0.0).events == (
+        events.OtherSender(1, 191, 0),
+    )
+    assert dropped(session, DropReason.SAME_IDS) == 1
+    level = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, [1, 0, 0, 0], 0, 0, 0, 0.5)
+    assert session.receive(other.frame(level), PEER, 0.0).events == (
+        events.OtherSender(1, 195, 82),
+    )
+    assert session.receive(other.heartbeat(8, vehicle_type=18), PEER, 0.0).events == ()
+
+
+def test_current_mode_reports_the_mode() -> None:
+    session = pinned(Sender())
+    payload = (6 << 16).to_bytes(4, "little") + (3 << 16).to_bytes(4, "little") + b"\0"
+    frame = framing.pack(436, payload, 9, 1, 1)
+    assert session.receive(frame, PEER, 0.0).events == (events.ModeReport("OFFBOARD"),)
 
 
 def test_acks_for_others_are_not_ours() -> None:
@@ -329,7 +351,7 @@ def test_a_jump_back_is_a_reboot() -> None:
     reception = session.receive(vehicle.position(500), PEER, 0.0)
     assert reception.events[0] == events.Rebooted(0.5)
     assert isinstance(reception.events[1], events.LocalPosition)
-    assert len(reception.messages) > 4  # the intervals are requested again
+    assert len(session.poll(0.0)) > 4  # the intervals are requested again
     assert times(session, vehicle.attitude(510), vehicle.position(510)) == [0.51, 0.51]
     assert session.poll(0.0) == ()
 
@@ -423,19 +445,19 @@ def test_texts_are_printable(data: bytes, text: str) -> None:
 # --- what is sent ---
 
 
-def test_timesync_reply_is_the_last_message() -> None:
+def test_timesync_is_answered() -> None:
     vehicle = Sender()
     session = pinned(vehicle)
     request = vehicle.frame(mavlink.MAVLink_timesync_message(0, 123_456_789_012))
     reception = session.receive(vehicle.position(1000) + request, PEER, 2.5)
     assert len(reception.events) == 1
     assert len(reception.frames) == 2
-    assert isinstance(reception.messages[0], Heartbeat)
-    reply = understood(session.encode(reception.messages[-1]))
+    (answer,) = reception.replies
+    reply = understood(session.encode(answer))
     assert (reply.tc1, reply.ts1) == (2_500_000_000, 123_456_789_012)
-    answer = vehicle.frame(mavlink.MAVLink_timesync_message(1, 2))
-    reception = session.receive(answer, PEER, 2.5)
-    assert reception.messages == ()
+    theirs = vehicle.frame(mavlink.MAVLink_timesync_message(1, 2))
+    reception = session.receive(theirs, PEER, 2.5)
+    assert reception.replies == ()
     assert reception.events == (events.TimesyncReply(request_ns=2, vehicle_ns=1),)
     question = understood(session.encode(Timesync(0, 77)))
     assert (question.tc1, question.ts1) == (0, 77)
@@ -444,12 +466,12 @@ def test_timesync_reply_is_the_last_message() -> None:
 def test_timesync_is_answered_before_the_first_heartbeat() -> None:
     session = Session(SessionSettings())
     request = Sender(7).frame(mavlink.MAVLink_timesync_message(0, 5))
-    (reply,) = session.receive(request, PEER, 0.0).messages
+    (reply,) = session.receive(request, PEER, 0.0).replies
     answer = understood(session.encode(reply))
     assert answer.ts1 == 5
     assert answer.tc1 != 0
     ground_station = Sender(255, 190).frame(mavlink.MAVLink_timesync_message(0, 5))
-    assert session.receive(ground_station, PEER, 1.0).messages == ()
+    assert session.receive(ground_station, PEER, 1.0).replies == ()
 
 
 def test_nothing_is_sent_before_a_vehicle_is_found_unless_set() -> None:
@@ -457,7 +479,7 @@ def test_nothing_is_sent_before_a_vehicle_is_found_unless_set() -> None:
     assert Session(SessionSettings(sends_first=True)).poll(0.0) == (Heartbeat(18),)
     session = Session(SessionSettings())
     frame = Sender(255, 190).heartbeat(8, vehicle_type=6)
-    assert session.receive(frame, PEER, 0.0).messages == ()
+    session.receive(frame, PEER, 0.0)
     assert session.poll(0.0) == ()
 
 
@@ -471,9 +493,8 @@ def test_heartbeats_at_1_hz_of_the_type_the_autopilot_needs(
     autopilot: int, vehicle_type: int
 ) -> None:
     session = Session(SessionSettings())
-    reception = session.receive(Sender().heartbeat(autopilot), PEER, 0.0)
-    sent = [(0.0, kind) for kind in beats(reception.messages)]
-    sent += [(0.1 * i, kind) for i in range(100) for kind in beats(session.poll(0.1 * i))]
+    session.receive(Sender().heartbeat(autopilot), PEER, 0.0)
+    sent = [(0.1 * i, kind) for i in range(100) for kind in beats(session.poll(0.1 * i))]
     assert [kind for _, kind in sent] == [vehicle_type] * 10
     assert [t for t, _ in sent] == pytest.approx(list(range(10)))
     assert understood(session.encode(Heartbeat(vehicle_type))).type == vehicle_type
@@ -482,7 +503,8 @@ def test_heartbeats_at_1_hz_of_the_type_the_autopilot_needs(
 def test_heartbeat_of_the_right_type_at_once_when_found() -> None:
     session = Session(SessionSettings(sends_first=True))
     assert beats(session.poll(0.0)) == [18]
-    assert beats(session.receive(Sender().heartbeat(PX4), PEER, 0.1).messages) == [6]
+    session.receive(Sender().heartbeat(PX4), PEER, 0.1)
+    assert beats(session.poll(0.1)) == [6]
 
 
 def test_heartbeat_follows_vehicle_time_when_that_is_faster() -> None:
@@ -490,8 +512,8 @@ def test_heartbeat_follows_vehicle_time_when_that_is_faster() -> None:
     session = pinned(vehicle)
     sent = 1  # when the vehicle was found
     for tick in range(1001):  # ten seconds of vehicle time in 0.2 s of host time
-        reception = session.receive(vehicle.position(10 * tick + 10), PEER, 0.0002 * tick)
-        sent += len(beats(reception.messages)) + len(beats(session.poll(0.0002 * tick)))
+        session.receive(vehicle.position(10 * tick + 10), PEER, 0.0002 * tick)
+        sent += len(beats(session.poll(0.0002 * tick)))
     assert sent == 11
 
 
@@ -503,18 +525,26 @@ def test_in_lockstep_host_time_changes_nothing() -> None:
     for tick, datagram in enumerate(datagrams):
         expected = plain.receive(datagram, PEER, 0.001 * tick)
         assert polled.receive(datagram, PEER, 7.0 * tick) == expected
-        assert polled.poll(7.0 * tick + 6.0) == ()
+        assert polled.poll(7.0 * tick + 6.0) == plain.poll(0.001 * tick)
     assert polled.link_time_s == plain.link_time_s
 
 
 def test_intervals_are_requested_at_once() -> None:
     session = Session(SessionSettings())
-    heartbeat, *requests = session.receive(Sender().heartbeat(), PEER, 0.0).messages
+    session.receive(Sender().heartbeat(), PEER, 0.0)
+    heartbeat, *requests = session.poll(0.0)
     assert heartbeat == Heartbeat(6)
     assert all(isinstance(m, CommandLong) and m.command == 511 for m in requests)
     sent = [understood(session.encode(request)) for request in requests]
     intervals_us = {int(m.param1): m.param2 for m in sent}
-    assert intervals_us == {31: 10000.0, 32: 10000.0, 245: 200000.0, 1: 500000.0, 115: 20000.0}
+    assert intervals_us == {
+        31: 10000.0,
+        32: 10000.0,
+        245: 200000.0,
+        1: 500000.0,
+        436: 100000.0,
+        115: 20000.0,
+    }
     assert session.poll(0.01) == ()
 
 

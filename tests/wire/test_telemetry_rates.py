@@ -25,7 +25,8 @@ class Vehicle:
         self.speed = speed
         self.ticks = 0
         self.requested_s: list[float] = []
-        self._obey(self.session.receive(self.sender.heartbeat(), PEER, 0.0).messages)
+        self.session.receive(self.sender.heartbeat(), PEER, 0.0)
+        self._obey(self.session.poll(0.0))
 
     def _obey(self, messages: tuple[Outgoing, ...]) -> None:
         for message in messages:
@@ -39,7 +40,8 @@ class Vehicle:
             now_s = 0.01 * self.ticks / self.speed
             if every_ticks and self.ticks % every_ticks == 0:
                 frame = self.sender.position(10 * self.ticks)
-                self._obey(self.session.receive(frame, PEER, now_s).messages)
+                self.session.receive(frame, PEER, now_s)
+                self._obey(self.session.poll(now_s))
             self._obey(self.session.poll(now_s))
 
 

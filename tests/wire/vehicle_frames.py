@@ -59,6 +59,7 @@ def pinned(vehicle: Sender, autopilot: int = PX4, **settings: Any) -> Session:
     session = Session(SessionSettings(**settings))
     reception = session.receive(vehicle.heartbeat(autopilot), PEER, 0.0)
     assert len(reception.events) == 2
+    session.poll(0.0)
     return session
 
 
