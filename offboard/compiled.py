@@ -40,8 +40,8 @@ import stat
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Sequence
-from contextlib import suppress
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import contextmanager, suppress
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar, cast
@@ -104,13 +104,8 @@ class Entry(Generic[P, R]):
         compiles it, unless it may `wait` for that."""
         with (directory() / self.name).open("a") as mark:  # not empty once it is compiled
             fcntl.flock(mark, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
-            collects = gc.isenabled()
-            gc.disable()  # numba creates many objects: a third of the time of loading
-            try:
+            with loading():
                 code = self.machine_code = self._compile()
-            finally:
-                if collects:
-                    gc.enable()
             if mark.tell() == 0:
                 mark.write("compiled\n")
         return code
@@ -129,6 +124,20 @@ class Entry(Generic[P, R]):
         finally:
             config.CACHE_DIR = others
         return cast(Callable[P, R], jitted)
+
+
+@contextmanager
+def loading() -> Iterator[None]:
+    """Import modules or load machine code without garbage collection, which takes up to a third of
+    the time: many objects are created and nearly none is garbage. Later collections skip them."""
+    collects = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        gc.freeze()
+        if collects:
+            gc.enable()
 
 
 def _numba_type(parameter: Parameter) -> Any:

@@ -14,10 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn, TextIO
 import typer
 
 from offboard.documents import shipped
-from simulator.firmware.base import Firmware
-from simulator.firmware.catalogue import FIRMWARES
 
 if TYPE_CHECKING:
+    from simulator.firmware.base import Firmware
     from simulator.instance import Instance
 
 COMPANION_PORT, GROUND_PORT = 14540, 14550
@@ -105,9 +104,6 @@ def simulate(
         _list_scenarios()
     if check is not None:
         _check(check)
-    personality = FIRMWARES.get(firmware)
-    if personality is None:
-        _refuse(f"--firmware {firmware}: unknown; there is {', '.join(FIRMWARES)}")
     if lockstep and speed is not None:
         _refuse("--speed and --lockstep exclude each other: lockstep has no speed")
     if speed is not None and not 0.1 <= speed <= 1000.0:
@@ -119,11 +115,21 @@ def simulate(
     stopping = Stop()
 
     # imported late, so that a wrong option is answered at once
-    from offboard.documents.reading import DocumentError
-    from offboard.flight.clock import unix_us
-    from simulator import config
-    from simulator.link.links import LinkError, open_link, shifted
-    from simulator.link.recorder import Recorder
+    from offboard.compiled import loading, prepare
+
+    with loading():
+        from offboard.documents.reading import DocumentError
+        from offboard.flight.clock import unix_us
+        from simulator import config
+        from simulator.firmware.catalogue import FIRMWARES
+        from simulator.instance import VIRTUAL_EPOCH_US, Instance
+        from simulator.link.links import LinkError, open_link, shifted
+        from simulator.link.recorder import Recorder
+        from simulator.run import Endpoint, Runner, warm_up
+
+    personality = FIRMWARES.get(firmware)
+    if personality is None:
+        _refuse(f"--firmware {firmware}: unknown; there is {', '.join(FIRMWARES)}")
 
     # the local ports of PX4 SITL only by default: a real PX4 beside us may use them
     own_ports = connect is None
@@ -153,10 +159,6 @@ def simulate(
             recorder = Recorder(log)
         except OSError as error:
             _refuse(f"--log {log} cannot be written: {error.strerror}")
-
-    from offboard.compiled import prepare
-    from simulator.instance import VIRTUAL_EPOCH_US, Instance
-    from simulator.run import Endpoint, Runner, warm_up
 
     prepare(_tell)
     warm_up(Instance(personality, flyer, flown.conditions, seed, lockstep=True))

@@ -7,7 +7,6 @@ signal. A fork takes milliseconds where a start takes a second; the vehicle send
 
 from __future__ import annotations
 
-import gc
 import json
 import os
 import select
@@ -17,12 +16,14 @@ import traceback
 from io import FileIO
 from typing import NoReturn
 
+from offboard.compiled import loading, prepare
 from simulator.cli import app
 
 
 def serve(requests: FileIO) -> None:
     """Fly a vehicle for each line of `requests`, which is unbuffered: `select` waits for it."""
-    _load()
+    with loading():  # what is not collected stays shared with the forks
+        _load()
     for line in requests:
         if line.strip():
             print(_exit_code(json.loads(line), requests), flush=True)
@@ -61,7 +62,6 @@ def _fly(options: list[str]) -> NoReturn:
 
 def _load() -> None:
     """Import all modules of a flight and load its compiled functions."""
-    from offboard.compiled import prepare
     from simulator import config, run
     from simulator.firmware.catalogue import FIRMWARES
     from simulator.instance import Instance
@@ -72,8 +72,6 @@ def _load() -> None:
     for firmware in FIRMWARES.values():
         vehicle = config.vehicle(firmware.vehicle)
         Instance(firmware, vehicle, Conditions(), 1, lockstep=True).advance_to_barrier()
-    gc.collect()
-    gc.freeze()  # memory that is not collected stays shared with the forks
 
 
 if __name__ == "__main__":

@@ -76,8 +76,11 @@ def fly(
             StopRequests(_exit_at_once) as stops,
             SimulatorProcess() if sitl else nullcontext() as simulator,  # loads in the background
         ):
-            from offboard.flight import clock
-            from offboard.flight.request import FlightRequest, fly_request
+            from offboard.compiled import loading
+
+            with loading():
+                from offboard.flight import clock
+                from offboard.flight.request import FlightRequest, fly_request
 
             requirements = requirements_of(require)
             directory = out_directory or FLIGHTS / clock.local_stamp()

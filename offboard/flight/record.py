@@ -6,7 +6,7 @@ The fields of `TickRecord` are the layout of DEBUG_FLOAT_ARRAY.data (name "pso",
 
 from __future__ import annotations
 
-from dataclasses import astuple, dataclass, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
@@ -61,7 +61,7 @@ class TickRecord:
 
     def data(self) -> tuple[float, ...]:
         """The values in the order of DEBUG_FLOAT_ARRAY.data."""
-        return astuple(self)
+        return tuple(getattr(self, each.name) for each in fields(self))
 
     @classmethod
     def of(

@@ -28,8 +28,8 @@ class FlatState:
     """State and input that fly a `FlatSample`; leading shape (...) is the sample's.
 
     thrust_mps2, thrust_rate_mps3 (...): T and T'. thrust_direction_ned, _rate_ned_ps,
-    _acceleration_ned_ps2 (..., 3): b, b', b''; without thrust b is (0, 0, 1). rates_frd_radps
-    (..., 3): p, q, r, with the Euler yaw equal to the course. course_rad (...).
+    _acceleration_ned_ps2 (..., 3): b, b', b''; without thrust b is (0, 0, 1). course_rad,
+    course_rate_radps (...): equal to the Euler yaw and its rate.
     """
 
     thrust_mps2: Array
@@ -37,13 +37,19 @@ class FlatState:
     thrust_direction_ned: Array
     thrust_direction_rate_ned_ps: Array
     thrust_direction_acceleration_ned_ps2: Array
-    rates_frd_radps: Array
     course_rad: Array
+    course_rate_radps: Array
 
     @property
     def attitude(self) -> Array:
         """Quaternion w, x, y, z, FRD to NED, shape (..., 4); computed at each call."""
         return quaternion_from_thrust_direction(self.thrust_direction_ned, self.course_rad)
+
+    @property
+    def rates_frd_radps(self) -> Array:
+        """Body rates p, q, r, shape (..., 3); computed at each call."""
+        b, b1 = self.thrust_direction_ned, self.thrust_direction_rate_ned_ps
+        return _body_rates(b, b1, self.course_rad, self.course_rate_radps)
 
 
 def flat_state(
@@ -74,8 +80,8 @@ def flat_state(
         thrust_direction_ned=b,
         thrust_direction_rate_ned_ps=b1,
         thrust_direction_acceleration_ned_ps2=b2,
-        rates_frd_radps=_body_rates(b, b1, sample.course_rad, sample.course_rate_radps),
         course_rad=sample.course_rad,
+        course_rate_radps=sample.course_rate_radps,
     )
 
 

@@ -135,7 +135,7 @@ def test_array_equals_loop_and_shapes() -> None:
         single = state_of(track, float(times[index]))
         assert single.thrust_mps2.shape == ()
         assert single.rates_frd_radps.shape == (3,)
-        for name in FlatState.__slots__:
+        for name in (*FlatState.__slots__, "rates_frd_radps"):
             np.testing.assert_allclose(
                 getattr(batch, name)[index], getattr(single, name), rtol=1e-12, atol=1e-13
             )
@@ -149,6 +149,6 @@ def test_free_fall_and_knife_edge_stay_finite() -> None:
             np.array(0.0), np.array(1.0), np.array(0.0),
         )  # fmt: skip
         flat = flat_state(sample, GRAVITY, 0.0)
-        for name in FlatState.__slots__:
+        for name in (*FlatState.__slots__, "rates_frd_radps"):
             assert np.all(np.isfinite(getattr(flat, name))), (acceleration, name)
         assert np.linalg.norm(flat.thrust_direction_ned) == pytest.approx(1.0)

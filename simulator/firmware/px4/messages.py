@@ -63,7 +63,9 @@ def hil_state_quaternion(view: View) -> Sequence[Any]:
     """True state. Latitude and longitude have a resolution of 1 cm."""
     truth = view.autopilot.state.truth
     north, east, down = truth.position_ned_m.tolist()
-    a, b, c = (fit(value / GRAVITY_MPS2 * 1e3, 16) for value in truth.acceleration_ned_mps2)
+    a, b, c = (
+        fit(value / GRAVITY_MPS2 * 1e3, 16) for value in truth.acceleration_ned_mps2.tolist()
+    )
     v_north, v_east, v_down = truth.velocity_ned_mps.tolist()
     airspeed = fit(math.hypot(v_north, v_east) * 100, 16, signed=False)
     return (
