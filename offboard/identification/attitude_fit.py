@@ -51,8 +51,9 @@ STEP_SCALES = np.array([0.03, 5.0, 0.3])
 STARTS = np.array(
     [(delay_s, frequency, 0.7) for delay_s in (0.02, 0.08, 0.16, 0.3) for frequency in (4.0, 11.0)]
 )
-# Evaluations of one least-squares search, and how often residual weights are computed anew.
-STEPS, ROUNDS = 10, 2
+# Evaluations of one least-squares search, how often residual weights are computed anew, and the
+# relative change of the cost that ends a search: the weights change more than a finer search.
+STEPS, ROUNDS, TOLERANCE = 10, 4, 1e-3
 RELATED_S = 0.3  # time over which an attitude estimator's errors are autocorrelated
 SPACING_S = 0.018  # closer samples are left out: the responses are slower
 # Model error that no residual shows, as sd of delay (s), frequency (relative) and damping: PX4's
@@ -253,7 +254,7 @@ class ResponseProblem:
     def search(self) -> Array:
         """Parameters (3,) of least squares from the best of STARTS, all samples alike."""
         costs = [np.sum(self.residual(start, self.even_weights) ** 2) for start in STARTS]
-        return self._least_squares(STARTS[np.argmin(costs)], self.even_weights, ftol=1e-3)
+        return self._least_squares(STARTS[np.argmin(costs)], self.even_weights)
 
     def refine(self, parameters: Array) -> tuple[Array, Array, float]:
         """The best parameters (3,) for Student's t residuals, their weights (N,) and scale, which
@@ -263,9 +264,7 @@ class ResponseProblem:
             left = self.residual(parameters, weights)
             scale = scale_of(left)
             weights = student_t_weights(left, scale)
-            parameters = self._least_squares(
-                parameters, weights, ftol=1e-6, loss=loss, f_scale=scale
-            )
+            parameters = self._least_squares(parameters, weights, loss=loss, f_scale=scale)
         left = self.residual(parameters, weights)
         scale = scale_of(left)
         return parameters, student_t_weights(left, scale), scale
@@ -276,6 +275,7 @@ class ResponseProblem:
             start,
             bounds=(LOWER, UPPER),
             x_scale=STEP_SCALES,
+            ftol=TOLERANCE,
             max_nfev=STEPS,
             **options,
         ).x

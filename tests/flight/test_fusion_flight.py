@@ -15,7 +15,7 @@ from offboard.analysis import history
 from offboard.flight.phases import Phase
 from simulator.firmware.px4 import PX4
 
-LQR = "controller={law: lqr}"
+LQR = "controller={law: lqr, bandwidth_radps: 5.0}"
 FUSED = ("estimate=fused", LQR)
 SEEDS = (1, 2, 3, 4, 5)
 FIXES_HZ = {"GPS_RAW_INT": PX4.streams.companion_rates_hz["GPS_RAW_INT"]}

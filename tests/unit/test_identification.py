@@ -147,23 +147,36 @@ def test_standard_deviations_agree_with_repeated_fits():
     assert np.all(rms < 1.8)
 
 
+def with_lost_commands(seed, share, times, size):
+    """Random steps of which this share never acts, which the fit does not know, and the response
+    with a delay of 0.15 s and noise of 0.001."""
+    sent_at, values = steps(seed, count=80, size=size)
+    generator = np.random.default_rng(seed)
+    acts = generator.random(80) > share
+    acts[0] = True
+    signals = simulated(values[acts], sent_at[acts], 0.15, 11.0, 0.6, times)
+    signals += 0.001 * generator.normal(size=len(times))
+    return times, signals[:, None], sent_at, values[:, None]
+
+
 def test_fit_is_right_within_its_uncertainty_though_commands_are_lost():
-    """One command in twelve never acts, which the fit does not know."""
     shares, errors_s = [], []
     times = np.arange(0.3, 7.9, 0.02)
     for seed in range(30):
-        sent_at, values = steps(seed, count=80)
-        generator = np.random.default_rng(seed)
-        acts = generator.random(80) > 1 / 12
-        acts[0] = True
-        signals = simulated(values[acts], sent_at[acts], 0.15, 11.0, 0.6, times)
-        signals += 0.001 * generator.normal(size=len(times))
-        fit = fit_response(times, signals[:, None], sent_at, values[:, None])
-        shares.append((fit.delay_s.value - 0.15) / fit.delay_s.sd)
-        errors_s.append(fit.delay_s.value - 0.15)
+        delay = fit_response(*with_lost_commands(seed, 1 / 12, times, 0.035)).delay_s
+        shares.append((delay.value - 0.15) / delay.sd)
+        errors_s.append(delay.value - 0.15)
     assert np.max(np.abs(errors_s)) < 0.015
     assert np.max(np.abs(shares)) < 3.5
     assert 0.3 < np.sqrt(np.mean(np.square(shares))) < 1.5
+
+
+def test_weights_of_outliers_have_converged():
+    """Large steps, telemetry at 20 Hz: the delay's error is 1.5 ms rms, with weights
+    that are computed twice only 3.7 ms."""
+    times = np.arange(0.3, 7.9, 0.05)
+    fits = [fit_response(*with_lost_commands(seed, 1 / 8, times, 0.1)) for seed in range(15)]
+    assert np.sqrt(np.mean([(fit.delay_s.value - 0.15) ** 2 for fit in fits])) < 0.002
 
 
 def test_delay_known_beforehand_counts_by_its_uncertainty():
