@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 INTERRUPTED = "interrupted before anything was sent"
 LABEL_WIDTH = 15
+LINES_MAX = 1000  # that wait for the terminal
+TERMINAL_S = 2.0  # for them, after the flight
 LINKS = (
     "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD.  "
     f"[default: {DEFAULT_CONNECTION}]"
@@ -75,6 +77,7 @@ def fly(
         with (
             StopRequests(_exit_at_once) as stops,
             SimulatorProcess() if sitl else nullcontext() as simulator,  # loads in the background
+            _announcing() as announce,
         ):
             from offboard.flight import clock
             from offboard.flight.request import FlightRequest, fly_request
@@ -93,7 +96,7 @@ def fly(
                 scenario=scenario,
                 sim_vehicle=sim_vehicle,
             )
-            outcome = fly_request(request, _announcer(), say, simulator, stops)
+            outcome = fly_request(request, announce, say, simulator, stops)
     except KeyboardInterrupt:  # before the flight; in flight an interrupt lands the vehicle
         raise CommandError(INTERRUPTED) from None
     if outcome.exit_code == 2:
@@ -107,17 +110,30 @@ def _exit_at_once() -> None:
     os._exit(2)
 
 
-def _announcer() -> Callable[[Companion], None]:
-    """A function that prints what the companion has announced since the last call."""
+@contextmanager
+def _announcing() -> Iterator[Callable[[Companion], None]]:
+    """A function that prints what the companion has announced since the last call. It does not
+    wait for the terminal, which Ctrl-S stops; lines that are not shown are counted at the end."""
+    from offboard.flight.background import BackgroundWriter
+
+    writer = BackgroundWriter[str](_show, LINES_MAX)
     shown = 0
 
     def announce(companion: Companion) -> None:
         nonlocal shown
         for line in companion.announced[shown:]:
-            say(f"{companion.state.time_s:8.2f} s  {line}", indent=12)
+            writer.put(f"{companion.state.time_s:8.2f} s  {line}")
         shown = len(companion.announced)
 
-    return announce
+    yield announce
+    writer.close(TERMINAL_S)
+    if writer.dropped:
+        complain(f"{writer.dropped} lines were not shown, the terminal did not take them")
+
+
+def _show(lines: list[str]) -> None:
+    for line in lines:
+        say(line, indent=12)
 
 
 def _conclude(outcome: Outcome, directory: Path, requirements: list[Requirement]) -> None:

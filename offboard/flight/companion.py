@@ -8,7 +8,7 @@ does what the phase requires (`decide` while tracking). All frames are queued in
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 
 from offboard.control.base import Adopting, Controller
 from offboard.estimation.fusion import FusedObserver
@@ -17,13 +17,15 @@ from offboard.flight.actions import PhaseActions
 from offboard.flight.assessment import Assessment
 from offboard.flight.decide import Decider, Tick
 from offboard.flight.flight_plan import FlightPlan
+from offboard.flight.link import Chunk
 from offboard.flight.link_delay import LinkDelay
 from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
 from offboard.flight.outbox import Outbox, Output
 from offboard.flight.phase_machine import Outcome, PhaseMachine
-from offboard.flight.phases import Limits, Phase
+from offboard.flight.phases import BEFORE_FLIGHT, Limits, Phase
 from offboard.flight.readiness import Readiness
 from offboard.flight.state import VehicleState
+from offboard.flight.supervisor import Guard
 from offboard.mavlink.events import (
     Attitude,
     Event,
@@ -75,6 +77,7 @@ class Companion:
         self.state = VehicleState()
         self.peer: Hashable | None = None
         self._tick = -1
+        self._heard_s: float | None = None  # host time of the last telemetry
         self._bridged_s = 0.0
         self._identification = _identification(vehicle, controller, period_s, identify)
         self._outbox = Outbox(session, observer, vehicle, self._identification)
@@ -135,6 +138,34 @@ class Companion:
     def request_stop(self, why: str = STOPPED) -> None:
         """Land, or do not take off; takes effect at the next tick or poll."""
         self._machine.stop_reason = self._machine.stop_reason or why
+
+    def announce(self, sentence: str) -> None:
+        """Report to the user, to the ground station and to the log."""
+        self._outbox.announce(sentence)
+
+    def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
+        """One turn of the loop: what has arrived until `now_s`, which may be nothing."""
+        outputs: list[Output] = []
+        for chunk in chunks:
+            if not self.has_ended():
+                outputs.append(self.receive(chunk.data, chunk.peer, now_s))
+        if self._heard_s is None or any(output.alive for output in outputs):
+            self._heard_s = now_s
+        if not self.has_ended():
+            outputs.append(self.poll(now_s, now_s - self._heard_s))
+        return Output(
+            tuple(frame for output in outputs for frame in output.send),
+            tuple(frame for output in outputs for frame in output.log),
+            self._guard(),
+        )
+
+    def _guard(self) -> Guard | None:
+        vehicle, dialect = self._session.vehicle, self._session.dialect
+        if vehicle is None or dialect is None:
+            return None
+        ours = self.phase not in BEFORE_FLIGHT and not self.has_ended()
+        ours &= self.state.mode in (dialect.engage_mode, dialect.land_mode)
+        return Guard(vehicle, ours, self.state.armed)
 
     def receive(self, datagram: bytes, peer: Hashable, now_s: float) -> Output:
         """Process one datagram from `peer` at host time `now_s`; decide if it completes a tick."""

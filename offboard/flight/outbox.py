@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from offboard.estimation.observer import Observer
 from offboard.flight.gate import LEVEL
 from offboard.flight.online_identification import OnlineIdentification
+from offboard.flight.supervisor import Guard
 from offboard.mavlink.outgoing import AttitudeTarget, Outgoing, PositionTarget, Record
 from offboard.mavlink.session import Session
 from offboard.mavlink.texts import chunks
@@ -29,6 +30,7 @@ class Output:
 
     send: tuple[bytes, ...] = ()
     log: tuple[bytes, ...] = ()
+    guard: Guard | None = None  # for the supervisor; None before the vehicle is found
     alive: bool = False  # telemetry has arrived: position or attitude, once both are received
 
 
@@ -137,4 +139,4 @@ class Outbox:
         frames = [(message, self._session.encode(message)) for message in self._queue]
         self._queue.clear()
         send = tuple(frame for message, frame in frames if not isinstance(message, Record))
-        return Output(send, (*received, *(frame for _, frame in frames)), alive)
+        return Output(send, (*received, *(frame for _, frame in frames)), alive=alive)

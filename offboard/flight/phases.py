@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import Enum
+from typing import Literal
 
 from pydantic import Field
 
@@ -82,6 +83,7 @@ class Limits(Parameters):
     silence_s: float = Field(default=1.0, ge=0.2, le=60)  # no telemetry: then land
     blind_s: float = Field(default=0.5, ge=0.15, le=10)  # no position, or no attitude: then land
     missed_decisions: int = Field(default=3, ge=1, le=100)  # in a row: then land
+    log_lost: Literal["land", "go_on"] = "land"  # the log cannot be written
     begin_armed: bool = True  # false: refuse a vehicle that is armed already
     position_error_m: float = Field(default=5.0, gt=0.1, le=100)
     tilt_rad: float = Field(default=1.3, gt=0.2, le=1.5)
