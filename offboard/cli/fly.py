@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -77,7 +76,7 @@ def fly(
         with (
             StopRequests(_exit_at_once) as stops,
             SimulatorProcess() if sitl else nullcontext() as simulator,  # loads in the background
-            _announcing() as announce,
+            closing(_Announcer()) as announcer,
         ):
             from offboard.flight import clock
             from offboard.flight.request import FlightRequest, fly_request
@@ -96,12 +95,12 @@ def fly(
                 scenario=scenario,
                 sim_vehicle=sim_vehicle,
             )
-            outcome = fly_request(request, announce, say, simulator, stops)
+            outcome = fly_request(request, announcer.announce, say, simulator, stops)
     except KeyboardInterrupt:  # before the flight; in flight an interrupt lands the vehicle
         raise CommandError(INTERRUPTED) from None
     if outcome.exit_code == 2:
         raise CommandError(outcome.sentence)
-    _conclude(outcome, directory, requirements)
+    _conclude(outcome, directory, requirements, announcer.dropped)
 
 
 def _exit_at_once() -> None:
@@ -110,25 +109,27 @@ def _exit_at_once() -> None:
     os._exit(2)
 
 
-@contextmanager
-def _announcing() -> Iterator[Callable[[Companion], None]]:
-    """A function that prints what the companion has announced since the last call. It does not
-    wait for the terminal, which Ctrl-S stops; lines that are not shown are counted at the end."""
-    from offboard.flight.background import BackgroundWriter
+class _Announcer:
+    """Prints what the companion has announced. It does not wait for the terminal, which Ctrl-S
+    stops: `dropped` lines did not fit into the queue, or were not taken until `close`."""
 
-    writer = BackgroundWriter[str](_show, LINES_MAX)
-    shown = 0
+    def __init__(self) -> None:
+        from offboard.flight.background import BackgroundWriter
 
-    def announce(companion: Companion) -> None:
-        nonlocal shown
-        for line in companion.announced[shown:]:
-            writer.put(f"{companion.state.time_s:8.2f} s  {line}")
-        shown = len(companion.announced)
+        self._writer = BackgroundWriter[str](_show, LINES_MAX)
+        self._shown = 0
 
-    yield announce
-    writer.close(TERMINAL_S)
-    if writer.dropped:
-        complain(f"{writer.dropped} lines were not shown, the terminal did not take them")
+    def announce(self, companion: Companion) -> None:
+        for line in companion.announced[self._shown :]:
+            self._writer.put(f"{companion.state.time_s:8.2f} s  {line}")
+        self._shown = len(companion.announced)
+
+    def close(self) -> None:
+        self._writer.close(TERMINAL_S)
+
+    @property
+    def dropped(self) -> int:
+        return 0 if self._writer.error else self._writer.dropped  # nobody misses a closed pipe
 
 
 def _show(lines: list[str]) -> None:
@@ -136,8 +137,11 @@ def _show(lines: list[str]) -> None:
         say(line, indent=12)
 
 
-def _conclude(outcome: Outcome, directory: Path, requirements: list[Requirement]) -> None:
-    """Print verdict and result. Exits with the code of the verdict."""
+def _conclude(
+    outcome: Outcome, directory: Path, requirements: list[Requirement], not_shown: int
+) -> None:
+    """Print verdict and result. Exits with the code of the verdict. `not_shown`: lines of the
+    flight that the terminal did not take."""
     from offboard.analysis.score_table import summary
 
     score, history = scored(directory)
@@ -146,6 +150,8 @@ def _conclude(outcome: Outcome, directory: Path, requirements: list[Requirement]
     results = "; ".join(each.sentence(score.figures()) for each in missed or checked)
     code = outcome.exit_code or int(bool(missed))
     out.print()
+    if not_shown:
+        say(f"{not_shown} lines of the flight are missing above: the terminal was stopped")
     if outcome.exit_code:
         complain(f"{outcome.sentence} (log: {directory / 'flight.tlog'})")
     elif missed:

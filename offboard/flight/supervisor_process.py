@@ -104,9 +104,8 @@ class Rescue:
 
     def run(self, reason: str) -> None:
         """Take over for `reason`, until the vehicle is down or belongs to somebody else."""
-        self._receive(0.0)
-        self._ask()  # first: the sentence takes longer
-        self._text(f"taking over: {reason}")
+        self._receive(0.0)  # the mode may have been left since the last beat
+        self._ask(f"taking over: {reason}")
         while not self._recovery.ended:
             self._receive(POLL_S)
             self._ask()
@@ -123,10 +122,13 @@ class Rescue:
         due = self._session.poll(clock.monotonic_s())
         self._send(*(message for message in due if isinstance(message, Heartbeat)))
 
-    def _ask(self) -> None:
+    def _ask(self, text: str = "") -> None:
         request = self._recovery.due(clock.monotonic_s())
         if request:
-            self._send(request.command)
+            self._send(request.command)  # before all texts
+        if text:
+            self._text(text)
+        if request:
             self._say(f"{request.word} requested")
         if self._recovery.refusal:
             self._say(f"the vehicle answers {self._recovery.refusal}")

@@ -130,13 +130,14 @@ class UdpLink:
         ours = [chunk for chunk in found if chunk.peer == self._place]
         others = [chunk for chunk in found if chunk.peer != self._place]
         silent = now_s - self._heard_s > PEER_SILENT_S
+        if others:
+            self._look_s = now_s + LOOK_EVERY_S
         if heard or ours:
             self._heard_s = now_s
         elif silent:
             ours = [chunk for chunk in others if same_host(chunk.peer, self._place)]
             others = [chunk for chunk in others if not same_host(chunk.peer, self._place)]
         if others:
-            self._look_s = now_s + LOOK_EVERY_S
             self._count(others, listening.dropped)
         return ours
 

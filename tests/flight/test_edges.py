@@ -16,6 +16,7 @@ from typing import Any, cast
 import pytest
 
 from offboard.flight import clock
+from offboard.flight import log as log_module
 from offboard.flight.companion import Companion, Outcome, Output
 from offboard.flight.connection import open_link
 from offboard.flight.link import Chunk, Link, Strangers
@@ -52,8 +53,9 @@ class Flight:
 
     peer = None
 
-    def __init__(self, turns: int, during: Callable[[int], object]) -> None:
+    def __init__(self, turns: int, during: Callable[[int], object], log: bytes = b"") -> None:
         self.turns, self.during = turns, during
+        self.log = (log,) if log else ()
         self.stops = 0
         self.outcome: Outcome | None = None
         self.announced: list[str] = []
@@ -72,7 +74,7 @@ class Flight:
         self.during(self.turns)
         if self.turns == 0:
             self.outcome = Outcome(0, "flown and landed")
-        return Output()
+        return Output(log=self.log)
 
 
 def fly(flight: Flight, directory: Path, progress: Callable[[Any], None]) -> Outcome:
@@ -133,6 +135,70 @@ def test_an_ignored_sighup_stays_ignored(tmp_path: Path) -> None:
     finally:
         signal.signal(signal.SIGHUP, before)
     assert flight.stops == 0
+
+
+@pytest.mark.parametrize(
+    ("lands", "exit_code", "stops"), [(True, 4, True), (False, 0, False)], ids=["land", "go_on"]
+)
+def test_a_log_that_cannot_be_written_is_said_at_once(
+    lands: bool, exit_code: int, stops: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`limits.log_lost`: a full disk in flight."""
+
+    def full(descriptor: int, entries: list[bytes]) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(log_module, "append", full)
+    says = (
+        f"the log {tmp_path / 'flight' / 'flight.tlog'} cannot be written (No space left on device)"
+    )
+    flight = Flight(100_000, lambda left: setattr(flight, "turns", min(left, 3 * bool(left)))
+                    if flight.announced else None, log=b"frame")  # fmt: skip
+    with FlightLog(tmp_path / "flight", "", real_time=True) as log, StopRequests() as stops_:
+        outcome = Loop(
+            cast(Companion, flight), Wire(), log, stops=stops_,
+            progress=lambda companion: None, lands_without_log=lands,
+        ).run()  # fmt: skip
+    assert flight.announced == [says]
+    assert bool(flight.stops) is stops
+    assert outcome.exit_code == exit_code
+    assert outcome.sentence.startswith(f"{says}: ")
+    assert outcome.sentence.endswith(" entries lost; flown and landed")
+
+
+def failing(turns: range, error: BaseException) -> Callable[[int], None]:
+    def during(left: int) -> None:
+        if left in turns:
+            raise error
+
+    return during
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError("no"), SystemExit(3), MemoryError()])
+def test_an_exception_lands_and_ends_with_4(error: BaseException, tmp_path: Path) -> None:
+    flight = Flight(5, failing(range(3, 5), error))
+    outcome = fly(flight, tmp_path, lambda companion: None)
+    assert (flight.turns, flight.stops, outcome.exit_code) == (0, 2, 4)
+    says = f"internal error: {type(error).__name__}: {error} (test_edges.py:"
+    assert outcome.sentence.startswith(says)
+    assert outcome.sentence.endswith("; flown and landed")
+
+
+def test_an_exception_in_every_turn_ends_in_silence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 100.0
+    monkeypatch.setattr(clock, "monotonic_s", lambda: now_s)
+
+    def fails(left: int) -> None:
+        nonlocal now_s
+        now_s += 0.04
+        raise ValueError("again")
+
+    flight = Flight(1000, fails)
+    outcome = fly(flight, tmp_path, lambda companion: None)
+    assert (1000 - flight.turns, outcome.exit_code) == (8, 4)  # 0.3 s
+    assert outcome.sentence.endswith("; setpoints stopped")
 
 
 def setpoint(number: int) -> bytes:
