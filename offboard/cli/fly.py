@@ -64,15 +64,15 @@ def fly(
     holds flight.tlog (all messages), flight.yaml (the resolved configuration) and score.json.
     NAME is the name of a shipped file, see below and `offboard list`.
     """
-    from offboard.flight.sitl import SimulatorProcess
-    from offboard.flight.stop import StopRequests
-
     if sitl and connect:
         raise CommandError("--sitl starts its own simulator: use --sitl or --connect, not both")
     if not sitl and (scenario or sim_vehicle or firmware != "px4"):
         raise CommandError("--scenario, --sim-vehicle and --firmware are options of --sitl: add it")
     named = {"controller": controller, "reference": reference, "vehicle": vehicle}
     try:
+        from offboard.flight.sitl import SimulatorProcess
+        from offboard.flight.stop import StopRequests
+
         with (
             StopRequests(_exit_at_once) as stops,
             SimulatorProcess() if sitl else nullcontext() as simulator,  # loads in the background
