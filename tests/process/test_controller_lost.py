@@ -1,7 +1,7 @@
-"""The supervisor: a controller that is killed, stopped or hangs in flight, over each kind of link.
+"""A controller that is killed, stopped or hangs in flight: the supervisor lands the vehicle.
 
-Real processes in real time. The log says what the vehicle was asked; the simulated autopilot, which
-is another program, that it accepted it and landed.
+Real processes in real time, each over another kind of link. The log says what was asked of the
+vehicle; the simulated autopilot, which is another program, that it obeyed and landed.
 """
 
 from __future__ import annotations
@@ -140,11 +140,10 @@ def story(log: tlog.Tlog) -> list[str]:
     return [text for text, before in zip(kept, ["", *kept], strict=False) if text != before]
 
 
-@pytest.mark.parametrize("kind", ["udp", "tcp", "serial"])
 def test_a_killed_controller_is_survived(
-    kind: str, spawn: Spawn, cable: Callable[[int], str], tmp_path: Path
+    spawn: Spawn, cable: Callable[[int], str], tmp_path: Path
 ) -> None:
-    flight = tracking(spawn, connections(spawn, kind, cable))
+    flight = tracking(spawn, connections(spawn, "udp", cable))
     (supervisor,) = children(flight.pid)
     flight.kill()
     await_end(supervisor)
@@ -175,10 +174,10 @@ def test_a_stopped_controller_that_continues_sends_nothing(
     assert "Traceback" not in said
     log = tlog.read(path)
     assert story(log) == ["hold", "land", "Disarmed by landing"]
-    names = [entry.name for entry in log.messages]
-    texts = [i for i, entry in enumerate(log.messages)
-             if entry.name == "STATUSTEXT" and "hold requested" in entry.message.text]  # fmt: skip
-    assert "SET_ATTITUDE_TARGET" not in names[texts[0] :]
+    texts = [entry for entry in log.messages if entry.name == "STATUSTEXT"]
+    taken_us = next(e.unix_us for e in texts if "hold requested" in e.message.text)
+    setpoints_us = [e.unix_us for e in log.messages if e.name == "SET_ATTITUDE_TARGET"]
+    assert max(setpoints_us) < taken_us
 
 
 def test_an_endless_loop_in_a_law(
@@ -202,15 +201,3 @@ def test_an_endless_loop_in_a_law(
         "hold", "land", "Disarmed by landing",
     ]  # fmt: skip
     assert flight.poll() is None  # it hangs for ever
-
-
-def test_after_an_orderly_flight_nothing_is_left(
-    spawn: Spawn, cable: Callable[[int], str], tmp_path: Path
-) -> None:
-    flight = tracking(spawn, connections(spawn, "udp", cable))
-    (supervisor,) = children(flight.pid)
-    flight.send_signal(signal.SIGTERM)
-    flight.communicate(timeout=LONG_S)
-    assert flight.returncode == 4
-    assert ended(supervisor)
-    assert b"supervisor:" not in (tmp_path / "x" / "flight.tlog").read_bytes()
