@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from importlib.metadata import version
 from typing import Annotated
 
@@ -35,6 +36,7 @@ def offboard(
     ] = False,
 ) -> None:
     """Fly a trajectory over MAVLink with a particle-swarm receding-horizon law, and score it."""
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # until here: see __main__
 
 
 app.command(epilog=f"{NAMES}\n\n{EXIT_CODES}")(fly.fly)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from contextlib import nullcontext
+from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -32,6 +31,8 @@ if TYPE_CHECKING:
 
 INTERRUPTED = "interrupted before anything was sent"
 LABEL_WIDTH = 15
+LINES_MAX = 1000  # that wait for the terminal
+TERMINAL_S = 2.0  # for them, after the flight
 LINKS = (
     "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD.  "
     f"[default: {DEFAULT_CONNECTION}]"
@@ -63,18 +64,19 @@ def fly(
     holds flight.tlog (all messages), flight.yaml (the resolved configuration) and score.json.
     NAME is the name of a shipped file, see below and `offboard list`.
     """
-    from offboard.flight.sitl import SimulatorProcess
-    from offboard.flight.stop import StopRequests
-
     if sitl and connect:
         raise CommandError("--sitl starts its own simulator: use --sitl or --connect, not both")
     if not sitl and (scenario or sim_vehicle or firmware != "px4"):
         raise CommandError("--scenario, --sim-vehicle and --firmware are options of --sitl: add it")
     named = {"controller": controller, "reference": reference, "vehicle": vehicle}
     try:
+        from offboard.flight.sitl import SimulatorProcess
+        from offboard.flight.stop import StopRequests
+
         with (
             StopRequests(_exit_at_once) as stops,
             SimulatorProcess() if sitl else nullcontext() as simulator,  # loads in the background
+            closing(_Announcer()) as announcer,
         ):
             from offboard.compiled import loading
 
@@ -96,12 +98,12 @@ def fly(
                 scenario=scenario,
                 sim_vehicle=sim_vehicle,
             )
-            outcome = fly_request(request, _announcer(), say, simulator, stops)
+            outcome = fly_request(request, announcer.announce, say, simulator, stops)
     except KeyboardInterrupt:  # before the flight; in flight an interrupt lands the vehicle
         raise CommandError(INTERRUPTED) from None
     if outcome.exit_code == 2:
         raise CommandError(outcome.sentence)
-    _conclude(outcome, directory, requirements)
+    _conclude(outcome, directory, requirements, announcer.dropped)
 
 
 def _exit_at_once() -> None:
@@ -110,21 +112,39 @@ def _exit_at_once() -> None:
     os._exit(2)
 
 
-def _announcer() -> Callable[[Companion], None]:
-    """A function that prints what the companion has announced since the last call."""
-    shown = 0
+class _Announcer:
+    """Prints what the companion has announced. It does not wait for the terminal, which Ctrl-S
+    stops: `dropped` lines did not fit into the queue, or were not taken until `close`."""
 
-    def announce(companion: Companion) -> None:
-        nonlocal shown
-        for line in companion.announced[shown:]:
-            say(f"{companion.state.time_s:8.2f} s  {line}", indent=12)
-        shown = len(companion.announced)
+    def __init__(self) -> None:
+        from offboard.flight.background import BackgroundWriter
 
-    return announce
+        self._writer = BackgroundWriter[str](_show, LINES_MAX)
+        self._shown = 0
+
+    def announce(self, companion: Companion) -> None:
+        for line in companion.announced[self._shown :]:
+            self._writer.put(f"{companion.state.time_s:8.2f} s  {line}")
+        self._shown = len(companion.announced)
+
+    def close(self) -> None:
+        self._writer.close(TERMINAL_S)
+
+    @property
+    def dropped(self) -> int:
+        return 0 if self._writer.error else self._writer.dropped  # nobody misses a closed pipe
 
 
-def _conclude(outcome: Outcome, directory: Path, requirements: list[Requirement]) -> None:
-    """Print verdict and result. Exits with the code of the verdict."""
+def _show(lines: list[str]) -> None:
+    for line in lines:
+        say(line, indent=12)
+
+
+def _conclude(
+    outcome: Outcome, directory: Path, requirements: list[Requirement], not_shown: int
+) -> None:
+    """Print verdict and result. Exits with the code of the verdict. `not_shown`: lines of the
+    flight that the terminal did not take."""
     from offboard.analysis.score_table import summary
 
     score, history = scored(directory)
@@ -133,6 +153,8 @@ def _conclude(outcome: Outcome, directory: Path, requirements: list[Requirement]
     results = "; ".join(each.sentence(score.figures()) for each in missed or checked)
     code = outcome.exit_code or int(bool(missed))
     out.print()
+    if not_shown:
+        say(f"{not_shown} lines of the flight are missing above: the terminal was stopped")
     if outcome.exit_code:
         complain(f"{outcome.sentence} (log: {directory / 'flight.tlog'})")
     elif missed:

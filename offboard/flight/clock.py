@@ -10,6 +10,12 @@ def monotonic_s() -> float:
     return time.monotonic()
 
 
+def monotonic_less_unix_s() -> float:
+    """What converts Unix seconds to `monotonic_s`. A pause between the two readings makes it too
+    small: a stamp converted with it is then too old, never too new."""
+    return time.monotonic() - time.time()
+
+
 def unix_us() -> int:
     """Microseconds since 1970-01-01 UTC, for time stamps in logs only."""
     return time.time_ns() // 1000

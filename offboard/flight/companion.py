@@ -24,6 +24,7 @@ from offboard.flight.outbox import Outbox, Output
 from offboard.flight.phase_machine import PhaseMachine
 from offboard.flight.phases import BEFORE_FLIGHT, Limits, Phase
 from offboard.flight.state import FlightState, Outcome
+from offboard.flight.supervisor import Guard
 from offboard.mavlink.events import (
     Attitude,
     Event,
@@ -120,12 +121,6 @@ class Companion:
         """Sentences for the user, oldest first."""
         return self._outbox.announced
 
-    @property
-    def flies(self) -> bool:
-        """The vehicle is armed and ours: should we fail, somebody else has to land it."""
-        state = self.state
-        return state.phase not in BEFORE_FLIGHT and not state.has_ended and state.may_command
-
     def has_ended(self) -> bool:
         return self.state.has_ended
 
@@ -168,7 +163,15 @@ class Companion:
             self._heard_s, state.silence_s, self._bridged_s = now_s, 0.0, 0.0
         self._act()
         self._outbox.send(*due, *replies)
-        return self._outbox.flush(frames)
+        return self._outbox.flush(frames, self._guard())
+
+    def _guard(self) -> Guard | None:
+        """For the supervisor: whether it has to act, should this process fail."""
+        state, vehicle = self.state, self._session.vehicle
+        if vehicle is None:
+            return None
+        ours = state.phase not in BEFORE_FLIGHT and not state.has_ended and state.may_command
+        return Guard(vehicle, ours, state.vehicle.armed)
 
     # ------------------------------------------------------------------ one turn
 

@@ -1,51 +1,71 @@
-"""Links: UDP, TCP and serial behind one protocol. Of MAVLink they know only message ids.
-
-udpin:HOST:PORT    listen on a port, send to the address of the vehicle that the session found
-udpout:HOST:PORT   send to this address
-tcp:HOST:PORT      connect to a listening autopilot (ArduPilot SITL)
-serial:DEVICE:BAUD
-"""
+"""Link: the byte channel to the vehicle, as the loop sees it. `connection.open_link` opens one."""
 
 from __future__ import annotations
 
-import os
-import select
-import socket
+from collections import Counter
 from collections.abc import Hashable
-from contextlib import suppress
-from typing import NamedTuple, Protocol
+from dataclasses import dataclass
+from typing import Protocol
 
 from offboard.documents.errors import UserError
-from offboard.flight import clock
-from offboard.mavlink.framing import frame_size
 
-
-class Chunk(NamedTuple):
-    """Received bytes, their sender, and the host time of their arrival."""
-
-    data: bytes
-    peer: Hashable
-    arrived_s: float
-
-
-DATAGRAM_SIZE = 65535
-QUEUED_MAX = 50  # frames
-SETPOINTS = frozenset({82, 84, 86})  # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_*
-TIMESYNC = 111
-TCP_NOTSENT_LOWAT = 25  # Linux's option, which the socket module names since Python 3.12
+NAMED_MAX = 8  # addresses that are counted one by one
+OTHERS = "other addresses"
 
 
 class LinkError(UserError):
     """A link that cannot be opened or was lost: one sentence for the user."""
 
 
+@dataclass(frozen=True, slots=True)
+class Chunk:
+    """Received bytes: a datagram, or any portion of a stream.
+
+    `arrived_s` is on the clock of `clock.monotonic_s`: the kernel's stamp of a datagram; for a
+    stream the last time when nothing was waiting, since the bytes arrived after it.
+    """
+
+    data: bytes
+    peer: Hashable
+    arrived_s: float
+
+
+class Strangers:
+    """Counts datagrams from other addresses than the vehicle's."""
+
+    def __init__(self) -> None:
+        self._counts: Counter[str] = Counter()
+        self._news: list[str] = []
+
+    @property
+    def total(self) -> int:
+        return self._counts.total()
+
+    def count(self, sender: str, number: int) -> None:
+        """Add `number` ignored datagrams of `sender`."""
+        if sender not in self._counts and len(self._counts) >= NAMED_MAX:
+            sender = OTHERS
+        before = self._counts[sender]
+        self._counts[sender] += number
+        if len(str(before + number)) > len(str(before)) or not before:
+            count = f"{before + number:,} datagram{'s' if before + number > 1 else ''}"
+            verb = "were" if before + number > 1 else "was"
+            self._news.append(f"{count} from {sender}, which is not the vehicle, {verb} ignored")
+
+    def news(self) -> list[str]:
+        """Sentences since the last call, on the 1st, 10th, 100th ... datagram of a sender."""
+        news, self._news = self._news, []
+        return news
+
+
 class Link(Protocol):
     """Non-blocking byte channel. `is_stream`: received chunks may end within a frame."""
 
     is_stream: bool
+    strangers: Strangers
 
     def receive(self, timeout_s: float) -> list[Chunk]:
-        """All received chunks, after waiting at most `timeout_s` for the first."""
+        """What has arrived, oldest first and bounded, after waiting at most `timeout_s` for it."""
         ...
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
@@ -53,232 +73,12 @@ class Link(Protocol):
         fit into the buffer is dropped (UDP) or queued (streams)."""
         ...
 
+    def follow(self, peer: Hashable) -> None:
+        """The vehicle sends from `peer`: from now on other senders cannot displace it."""
+        ...
+
+    def descriptors(self) -> tuple[int, ...]:
+        """The open file descriptors, with which another process can continue the link."""
+        ...
+
     def close(self) -> None: ...
-
-
-class UdpLink:
-    """One UDP socket. `peer` is fixed for udpout and None for udpin."""
-
-    is_stream = False
-
-    def __init__(self, sock: socket.socket, peer: tuple[str, int] | None) -> None:
-        self._socket = sock
-        self._peer = peer
-
-    def receive(self, timeout_s: float) -> list[Chunk]:
-        ready, _, _ = select.select([self._socket], [], [], max(0.0, timeout_s))
-        chunks: list[Chunk] = []
-        while ready:
-            try:
-                data, peer = self._socket.recvfrom(DATAGRAM_SIZE)
-                chunks.append(Chunk(data, peer, clock.monotonic_s()))
-            except ConnectionError:
-                continue  # ICMP: the peer's port was closed when an earlier datagram arrived
-            except OSError:
-                break  # nothing left, or the network interface is down
-        return chunks
-
-    def send(self, data: bytes, peer: Hashable | None) -> None:
-        target = self._peer or peer
-        if not isinstance(target, tuple):
-            return
-        with suppress(OSError):  # a dead link shows as silence
-            self._socket.sendto(data, target)
-
-    def close(self) -> None:
-        self._socket.close()
-
-    @property
-    def port(self) -> int:
-        """The local port."""
-        return int(self._socket.getsockname()[1])
-
-
-class LockstepLink(UdpLink):
-    """UDP to a simulator in lockstep: returns all datagrams up to a barrier at once, and only once.
-
-    A barrier is a TIMESYNC request at the end of a datagram. The simulator waits for the reply and
-    meanwhile repeats all datagrams since the previous barrier.
-    """
-
-    def __init__(self, sock: socket.socket, peer: tuple[str, int] | None) -> None:
-        super().__init__(sock, peer)
-        self._block: list[Chunk] = []  # since the newest barrier
-        self._barrier = b""
-
-    def receive(self, timeout_s: float) -> list[Chunk]:
-        complete: list[Chunk] = []
-        for chunk in super().receive(timeout_s):
-            self._block.append(chunk)
-            if _is_barrier(chunk.data):
-                if chunk.data != self._barrier:
-                    complete += self._block
-                self._barrier, self._block = chunk.data, []
-        return complete
-
-
-def _message_id(frame: bytes) -> int:
-    """Message id of a MAVLink 2 frame."""
-    return int.from_bytes(frame[7:10], "little")
-
-
-def _is_setpoint(frame: bytes) -> bool:
-    return _message_id(frame) in SETPOINTS
-
-
-def _is_barrier(datagram: bytes) -> bool:
-    """Whether the last frame is a TIMESYNC request, which has tc1 = 0."""
-    at = last = 0
-    while at < len(datagram):
-        last, at = at, at + (frame_size(datagram, at) or len(datagram))
-    return _message_id(datagram[last:]) == TIMESYNC and not any(datagram[last + 10 : last + 18])
-
-
-class StreamLink:
-    """Base of TCP and serial links. Frames are queued while the buffer of the stream is full: a new
-    setpoint replaces a queued one, and of too many frames the oldest are dropped."""
-
-    is_stream = True
-
-    def __init__(self) -> None:
-        self._begun = b""
-        self._queued: list[bytes] = []
-
-    def send(self, data: bytes, peer: Hashable | None) -> None:
-        if _is_setpoint(data):
-            self._queued = [other for other in self._queued if not _is_setpoint(other)]
-        self._queued = [*self._queued, data][-QUEUED_MAX:]
-        self._flush()
-
-    def _flush(self) -> None:
-        """Send as much as possible. A dead link shows as silence."""
-        with suppress(OSError):
-            while self._begun or self._queued:
-                if not self._begun:
-                    self._begun = self._queued.pop(0)
-                self._begun = self._begun[self._write(self._begun) :]
-
-    def _write(self, data: bytes) -> int:
-        """Number of bytes sent; raises BlockingIOError if the buffer is full."""
-        raise NotImplementedError
-
-
-class TcpLink(StreamLink):
-    """A TCP connection to a listening autopilot."""
-
-    def __init__(self, sock: socket.socket) -> None:
-        super().__init__()
-        sock.setblocking(False)
-        with suppress(OSError):  # queue here, where a setpoint can be replaced
-            sock.setsockopt(socket.IPPROTO_TCP, TCP_NOTSENT_LOWAT, 1)
-        self._socket = sock
-        self._open = True
-
-    def receive(self, timeout_s: float) -> list[Chunk]:
-        if not self._open:
-            select.select([], [], [], max(0.0, timeout_s))
-            return []
-        self._flush()
-        ready, _, _ = select.select([self._socket], [], [], max(0.0, timeout_s))
-        if not ready:
-            return []
-        try:
-            data = self._socket.recv(DATAGRAM_SIZE)
-        except (BlockingIOError, InterruptedError):
-            return []
-        except OSError:
-            data = b""
-        self._open = bool(data)
-        return [Chunk(data, "tcp", clock.monotonic_s())] if data else []
-
-    def _write(self, data: bytes) -> int:
-        return self._socket.send(data)
-
-    def close(self) -> None:
-        self._socket.close()
-
-
-class SerialLink(StreamLink):
-    """A serial port through pyserial."""
-
-    def __init__(self, device: str, baud: int) -> None:
-        import serial
-
-        super().__init__()
-        try:
-            self._port = serial.Serial(device, baud, timeout=0)
-        except (serial.SerialException, ValueError) as error:
-            raise LinkError(
-                f"serial port {device} at {baud} baud cannot be opened: {error}"
-            ) from None
-
-    def receive(self, timeout_s: float) -> list[Chunk]:
-        self._flush()
-        try:
-            self._port.timeout = max(0.0, timeout_s)
-            first = self._port.read(1)
-            data = first + self._port.read(self._port.in_waiting) if first else b""
-        except OSError:  # unplugged: pyserial raises different subclasses
-            select.select([], [], [], max(0.0, timeout_s))
-            return []
-        return [Chunk(data, "serial", clock.monotonic_s())] if data else []
-
-    def _write(self, data: bytes) -> int:
-        # pyserial's write waits in a busy loop while the port's buffer is full
-        return os.write(self._port.fileno(), data)
-
-    def close(self) -> None:
-        self._port.close()
-
-
-def open_lockstep_link() -> LockstepLink:
-    """Open a link on a free port of this computer, for a simulator in lockstep."""
-    sock = _udp_socket()
-    sock.bind(("127.0.0.1", 0))
-    return LockstepLink(sock, None)
-
-
-def _udp_socket() -> socket.socket:
-    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1 << 20)
-    sock.setblocking(False)
-    return sock
-
-
-def open_link(address: str) -> Link:
-    """Open the link at `address`, for example "udpin:127.0.0.1:14540" (see the module).
-
-    Raises LinkError, which says what to change.
-    """
-    kind, _, rest = address.partition(":")
-    host, _, tail = rest.rpartition(":")
-    if kind not in ("udpin", "udpout", "tcp", "serial") or not host or not tail.isdigit():
-        raise LinkError(
-            f"connection {address!r} is not understood; use udpin:HOST:PORT, udpout:HOST:PORT, "
-            "tcp:HOST:PORT or serial:DEVICE:BAUD"
-        )
-    number = int(tail)
-    if kind == "serial":
-        return SerialLink(host, number)
-    if not 0 <= number <= 65535:
-        raise LinkError(f"connection {address!r}: port {number} is not within 0 .. 65535")
-    return _open_socket(kind, host, number, address)
-
-
-def _open_socket(kind: str, host: str, port: int, address: str) -> Link:
-    try:
-        if kind == "tcp":
-            connection = socket.create_connection((host, port), timeout=5.0)
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            return TcpLink(connection)
-        peer = (socket.gethostbyname(host), port)
-        sock = _udp_socket()
-        if kind == "udpout":
-            return UdpLink(sock, peer)
-        sock.bind(peer)
-    except OSError as error:
-        raise LinkError(
-            f"connection {address} cannot be opened: {error.strerror or error}"
-            + ("; another program uses the port" if getattr(error, "errno", 0) == 98 else "")
-        ) from None
-    return UdpLink(sock, None)

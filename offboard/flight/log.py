@@ -1,7 +1,8 @@
 """The flight directory and its .tlog: every frame sent or received, and our own records.
 
 An entry of a .tlog is a big-endian uint64 of Unix microseconds, low two bits zero, and the frame
-unchanged. Each entry is one unbuffered write: a crash loses at most the last one.
+unchanged. A thread writes them, so that a slow disk does not stop the flight: a crash loses the
+last hundredths of a second.
 """
 
 from __future__ import annotations
@@ -13,8 +14,11 @@ from pathlib import Path
 from types import TracebackType
 
 from offboard.documents.errors import UserError
+from offboard.flight.background import BackgroundWriter
 
 _STAMP = struct.Struct(">Q")
+QUEUED_MAX = 100_000  # entries, minutes of a flight
+CLOSE_S = 10.0  # for what is queued when the flight ends
 
 
 class LogError(UserError):
@@ -24,13 +28,16 @@ class LogError(UserError):
 class FlightLog:
     """Context manager that writes DIR/flight.tlog, and the configuration to DIR/flight.yaml.
 
-    Never overwrites a flight. Entering raises LogError.
+    Never overwrites a flight. Entering raises LogError. With `real_time` an entry that does not fit
+    into the queue is dropped; otherwise `write` waits for the disk.
     """
 
-    def __init__(self, directory: Path, configuration: str) -> None:
+    def __init__(self, directory: Path, configuration: str, *, real_time: bool = False) -> None:
         self.directory = directory
         self.path = directory / "flight.tlog"
         self.configuration = configuration
+        self._real_time = real_time
+        self._closed = False
 
     def check(self) -> None:
         """Raise LogError if the directory cannot be used, without creating anything."""
@@ -46,12 +53,15 @@ class FlightLog:
     def __enter__(self) -> FlightLog:
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
-            self._file = self.path.open("xb", buffering=0)
+            # appended to, since another process may continue the log
+            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND
+            self.descriptor = os.open(self.path, flags, 0o666)
             self._write_configuration()
         except FileExistsError:
             raise self._taken() from None
         except OSError as error:
             raise self._unwritable(error) from None
+        self._writer = BackgroundWriter[bytes](self._append, QUEUED_MAX, waits=not self._real_time)
         return self
 
     def _write_configuration(self) -> None:
@@ -59,7 +69,7 @@ class FlightLog:
             text = self.configuration
             (self.directory / "flight.yaml").write_text(text, encoding="utf-8")
         except OSError:
-            self._file.close()
+            os.close(self.descriptor)
             self.path.unlink()  # the empty log of a flight that does not begin
             raise
 
@@ -78,17 +88,53 @@ class FlightLog:
         value: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        self._file.close()
+        self.close()
+
+    def close(self) -> None:
+        """Write what is queued, for a bounded time. `problem` says what was lost."""
+        if self._closed:
+            return
+        self._closed = True
+        self._writer.close(CLOSE_S)
+        if self._writer.is_free():  # else the descriptor is still in use
+            os.close(self.descriptor)
+
+    @property
+    def problem(self) -> str:
+        """What of the log is lost, and why; empty if nothing is."""
+        error, dropped = self._writer.error, self._writer.dropped
+        if error is None and not dropped:
+            return ""
+        reason = (getattr(error, "strerror", None) or error) if error else "the disk is too slow"
+        return f"the log {self.path} cannot be written ({reason})"
+
+    @property
+    def lost(self) -> int:
+        """Number of entries that were not written."""
+        return self._writer.dropped
 
     def begin(self, unix_us: int, frame: bytes) -> None:
-        """Append a frame before the flight. Raises LogError on a full disk, which ends it."""
+        """Append a frame at once, before the flight. Raises LogError on a full disk."""
         try:
-            self.write(unix_us, frame)
+            self._append([entry(unix_us, frame)])
         except OSError as error:
             raise self._unwritable(error) from None
 
     def write(self, unix_us: int, frame: bytes) -> None:
-        """Append one frame and its Unix time. Raises OSError on a full disk."""
-        rest = _STAMP.pack(unix_us & ~3) + frame
-        while rest:  # a nearly full disk accepts a part, which would hide the next entry
-            rest = rest[self._file.write(rest) :]
+        """Queue one frame and its Unix time."""
+        self._writer.put(entry(unix_us, frame))
+
+    def _append(self, entries: list[bytes]) -> None:
+        append(self.descriptor, entries)
+
+
+def entry(unix_us: int, frame: bytes) -> bytes:
+    """One entry of a .tlog."""
+    return _STAMP.pack(unix_us & ~3) + frame
+
+
+def append(descriptor: int, entries: list[bytes]) -> None:
+    """Write whole entries: a nearly full disk accepts a part, which would hide the next one."""
+    rest = b"".join(entries)
+    while rest:
+        rest = rest[os.write(descriptor, rest) :]

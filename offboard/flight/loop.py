@@ -1,9 +1,15 @@
-"""The loop: link -> companion -> link and log, paced by the vehicle's telemetry."""
+"""The loop: link -> companion -> link and log, paced by the vehicle's telemetry.
+
+Nothing in it waits, except for telemetry: log and terminal are written by other threads. Whatever
+fails in it hands the vehicle back.
+"""
 
 from __future__ import annotations
 
 import gc
+import traceback
 from collections.abc import Callable, Hashable
+from contextlib import suppress
 
 from offboard.flight import clock
 from offboard.flight.companion import Companion, Outcome, Output
@@ -12,15 +18,24 @@ from offboard.flight.log import FlightLog
 from offboard.flight.phases import BEFORE_FLIGHT, ExitCode
 from offboard.flight.sitl import Ending
 from offboard.flight.stop import StopRequests
+from offboard.flight.supervisor import Supervisor
 
 POLL_S = 0.02
+FAILING_S = 0.3  # without a turn that succeeds: give up
+TWICE = "interrupted twice: setpoints stopped, "
+OWN_FAILSAFE, SUPERVISED = (
+    "the vehicle's own failsafe takes over",
+    "the supervisor lands the vehicle",
+)
+UNGUARDED = "the supervisor ended: nobody lands the vehicle if this process dies"
 
 
 class Loop:
     """Moves bytes between one link, one companion and one log until the flight ends.
 
-    `progress` is called often, to show the companion's announcements to the user.
-    `simulator_ended` says how the bundled simulator ended, or None while it runs.
+    `progress` is called often, to show the companion's announcements to the user; it must not wait.
+    `simulator_ended` says how the bundled simulator ended, or None while it runs. `supervisor`
+    outlives us; None with the bundled simulator. `lands_without_log`: `Limits.log_lost`.
     """
 
     def __init__(
@@ -32,6 +47,8 @@ class Loop:
         stops: StopRequests,
         progress: Callable[[Companion], None],
         simulator_ended: Callable[[], Ending | None] = lambda: None,
+        supervisor: Supervisor | None = None,
+        lands_without_log: bool = True,
     ) -> None:
         self._companion = companion
         self._link = link
@@ -39,7 +56,11 @@ class Loop:
         self._stops = stops
         self._progress = progress
         self._simulator_ended = simulator_ended
-        self._log_error: str | None = None
+        self._supervisor = supervisor
+        self._lands_without_log = lands_without_log
+        self._warned: set[str] = set()
+        self._error = ""  # the first exception
+        self._succeeded_s = clock.monotonic_s()
         self._ended_early: Outcome | None = None
 
     def run(self) -> Outcome:
@@ -47,50 +68,94 @@ class Loop:
         self._stops.in_flight = True
         gc.collect()
         gc.freeze()
-        self._fly()
+        self._succeeded_s = clock.monotonic_s()
+        while not (self._companion.has_ended() or self._stops.repeated or self._ended_early):
+            try:
+                self._turn()
+                self._succeeded_s = clock.monotonic_s()
+            except BaseException as error:  # a law may even end the program
+                self._hand_back(error)
         self._show()
-        if self._ended_early:
-            return self._ended_early
-        outcome = self._companion.outcome
-        if outcome is None:
-            return Outcome(
-                ExitCode.ABORTED,
-                "interrupted twice: setpoints stopped, the vehicle's own failsafe takes over",
-            )
-        if self._log_error:
-            return Outcome(outcome.exit_code or ExitCode.ABORTED, self._log_error)
-        return outcome
+        return self._outcome()
 
-    def _fly(self) -> None:
-        companion, link = self._companion, self._link
-        checked_s = clock.monotonic_s()
-        while not (companion.has_ended() or self._stops.repeated or self._ended_early):
-            if self._stops.requested:
-                companion.request_stop()
-            chunks = link.receive(POLL_S)
-            now_s = clock.monotonic_s()
-            self._deliver(companion.turn(chunks, now_s), companion.peer)
-            self._show()
-            if not chunks or now_s - checked_s > POLL_S:
-                checked_s = now_s
-                self._check_simulator()
-
-    def _deliver(self, output: Output, peer: Hashable | None) -> None:
-        target = self._companion.peer or peer
-        for frame in output.send:
-            self._link.send(frame, target)
-        if self._log_error:
+    def _turn(self) -> None:
+        if self._taken_over():
             return
-        try:
-            stamp = clock.unix_us()
-            for frame in output.log:
-                self._log.write(stamp, frame)
-        except OSError as error:
-            self._log_error = f"the log {self._log.path} cannot be written ({error.strerror})"
-            self._companion.request_stop(self._log_error)
+        if self._stops.requested:
+            self._companion.request_stop()
+        chunks = self._link.receive(POLL_S)
+        output = self._companion.turn(chunks, clock.monotonic_s())
+        self._deliver(output)
+        for sentence in self._link.strangers.news():
+            self._companion.announce(sentence)
+        self._check_log()
+        self._show()
+        self._check_simulator()
+
+    def _deliver(self, output: Output) -> None:
+        peer = self._companion.peer
+        if self._taken_over():  # we may have been stopped for seconds since the turn began
+            return
+        for frame in output.send:
+            self._link.send(frame, peer)
+        stamp = clock.unix_us()
+        for frame in output.log:
+            self._log.write(stamp, frame)
+        if peer is not None:
+            self._link.follow(peer)
+            self._beat(output, peer)
+
+    # --- the supervisor ---
+
+    def _beat(self, output: Output, peer: Hashable) -> None:
+        if self._supervisor is None or output.guard is None:
+            return
+        self._supervisor.beat(output.guard, peer, self._link, self._log.descriptor)
+        if self._supervisor.lost:
+            self._warn(UNGUARDED)
+
+    def _taken_over(self) -> bool:
+        """Whether the supervisor has the vehicle; then wait until it is done with it."""
+        supervisor = self._supervisor
+        if supervisor is None or not supervisor.has_taken_over():
+            return False
+        ended = False
+        while not (ended or self._stops.requested):
+            ended = supervisor.await_end(POLL_S)
+            for sentence in supervisor.said:
+                self._warn(f"supervisor: {sentence}")
+            self._show()
+        self._ended_early = Outcome(ExitCode.ABORTED, f"supervisor: {'; '.join(supervisor.said)}")
+        return True
+
+    # --- what may go wrong ---
+
+    def _hand_back(self, error: BaseException) -> None:
+        """Land, if the companion still can. Otherwise end: silence, and the supervisor."""
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        place = f"{where.filename.rpartition('/')[2]}:{where.lineno}"
+        sentence = f"internal error: {type(error).__name__}: {error} ({place})"
+        self._error = self._error or sentence
+        with suppress(BaseException):
+            self._companion.request_stop(self._error)
+        if clock.monotonic_s() - self._succeeded_s > FAILING_S:
+            self._ended_early = Outcome(ExitCode.ABORTED, f"{self._error}; setpoints stopped")
+
+    def _check_log(self) -> None:
+        problem = self._log.problem
+        if problem:
+            self._warn(problem)
+            if self._lands_without_log:
+                self._companion.request_stop(problem)
+
+    def _warn(self, sentence: str) -> None:
+        """Announce it once."""
+        if sentence not in self._warned:
+            self._warned.add(sentence)
+            self._companion.announce(sentence)
 
     def _show(self) -> None:
-        """Show the progress. A closed pipe or a lost terminal does not end the flight."""
+        """Show the progress. A failure does not end the flight."""
         try:
             self._progress(self._companion)
         except (Exception, SystemExit):
@@ -105,3 +170,23 @@ class Loop:
         if self._companion.phase in BEFORE_FLIGHT:
             code = ExitCode.USAGE if ended.unusable else ExitCode.REFUSED
         self._ended_early = Outcome(code, ended.sentence)
+
+    # --- the end ---
+
+    def _outcome(self) -> Outcome:
+        """The result; closes the log, so that all that it lost is known."""
+        if self._supervisor and self._companion.has_ended():
+            self._supervisor.dismiss()
+        self._log.close()
+        outcome = self._ended_early or self._companion.outcome or self._interrupted()
+        code, sentence = outcome.exit_code, outcome.sentence
+        if self._error:
+            code = ExitCode.ABORTED
+            sentence = sentence if self._error in sentence else f"{self._error}; {sentence}"
+        if self._log.problem:
+            code = code or (ExitCode.ABORTED if self._lands_without_log else ExitCode.FLOWN)
+            sentence = f"{self._log.problem}: {self._log.lost} entries lost; {sentence}"
+        return Outcome(code, sentence)
+
+    def _interrupted(self) -> Outcome:
+        return Outcome(ExitCode.ABORTED, TWICE + (SUPERVISED if self._supervisor else OWN_FAILSAFE))

@@ -19,8 +19,9 @@ from offboard.estimation.fusion import FusedObserver
 from offboard.estimation.observer import Observer
 from offboard.flight import clock, manifest
 from offboard.flight.companion import Companion, Outcome
+from offboard.flight.connection import open_link, open_lockstep_link
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.link import LockstepLink, open_link, open_lockstep_link
+from offboard.flight.link import Link
 from offboard.flight.log import FlightLog
 from offboard.flight.loop import Loop
 from offboard.flight.online_identification import IdentifySettings
@@ -28,6 +29,8 @@ from offboard.flight.phases import Limits
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.flight.sitl import SimulatorProcess
 from offboard.flight.stop import StopRequests
+from offboard.flight.supervisor import Supervisor
+from offboard.flight.udp_link import LockstepLink
 from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
 from offboard.model.command import Command
@@ -36,6 +39,7 @@ from offboard.reference.track import Track
 from offboard.reference.transfer import Hold
 
 REHEARSED_DECISIONS = 5  # the fastest counts: the machine may be busy
+DISCARDED_MAX = 20  # batches of a link
 SITL_TIMEOUT_S = 180.0  # for simulator and companion in lockstep: either may compile, or be slow
 
 
@@ -149,6 +153,7 @@ def fly(
             assert isinstance(link, LockstepLink)
             bundled.simulator.launch(bundled.options(link.port))
             stack.callback(bundled.simulator.recall)
+        supervisor = None if bundled else stack.enter_context(Supervisor())
         tell("preparing the controller")
         prepare(tell)
         rehearse(parts, keeps_deadline=bundled is None)
@@ -175,10 +180,20 @@ def fly(
             stops=stops,
             progress=progress,
             simulator_ended=bundled.simulator.ended if bundled else lambda: None,
+            supervisor=supervisor,
+            lands_without_log=parts.limits.log_lost == "land",
         )
-        if not bundled:
-            link.receive(0.0)  # telemetry that arrived while we prepared is too old to use
+        if supervisor:
+            supervisor.await_ready()
+            discard(link)
         return loop.run()
+
+
+def discard(link: Link) -> None:
+    """Drop the telemetry that arrived while we prepared: it is too old to use."""
+    for _ in range(DISCARDED_MAX):
+        if not link.receive(0.0):
+            return
 
 
 def _companion(

@@ -15,6 +15,7 @@ from offboard.estimation.observer import Observer
 from offboard.flight.gate import LEVEL, Clearance, Refused, admit
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.state import FlightState
+from offboard.flight.supervisor import Guard
 from offboard.flight.vehicle_state import GOOD_RESULTS
 from offboard.mavlink.outgoing import (
     AttitudeTarget,
@@ -38,6 +39,7 @@ class Output:
 
     send: tuple[bytes, ...] = ()
     log: tuple[bytes, ...] = ()
+    guard: Guard | None = None  # for the supervisor; None before the vehicle is found
 
 
 class Outbox:
@@ -188,9 +190,9 @@ class Outbox:
         """Queue messages to send and to log; records are only logged."""
         self._queue.extend(messages)
 
-    def flush(self, received: list[bytes]) -> Output:
+    def flush(self, received: list[bytes], guard: Guard | None = None) -> Output:
         """Encode the queue. In the log, the frames `received` come first."""
         frames = [(message, self._session.encode(message)) for message in self._queue]
         self._queue.clear()
         send = tuple(frame for message, frame in frames if not isinstance(message, Record))
-        return Output(send, (*received, *(frame for _, frame in frames)))
+        return Output(send, (*received, *(frame for _, frame in frames)), guard)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from enum import Enum, IntEnum
+from typing import Literal
 
 from pydantic import Field
 
@@ -113,3 +114,4 @@ class Limits(Parameters):
     ceiling_m: float = Field(default=120.0, gt=0, le=10000)  # above the take-off point
     radius_m: float = Field(default=1000.0, gt=0, le=100000)  # from the take-off point
     battery: float = Field(default=0.1, ge=0, le=1)  # remaining, of 1
+    log_lost: Literal["land", "go_on"] = "land"  # the log cannot be written

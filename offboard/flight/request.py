@@ -115,7 +115,7 @@ def fly_request(
             )
         return fly(
             build_parts(config),
-            FlightLog(request.directory, dump(config)),
+            FlightLog(request.directory, dump(config), real_time=not request.sitl),
             connection=request.connection,
             bundled=bundled,
             stops=stops,

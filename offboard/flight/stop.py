@@ -10,6 +10,10 @@ import signal
 from collections.abc import Callable
 from types import FrameType, TracebackType
 
+from offboard.flight import clock
+
+AGAIN_S = 1.0  # `timeout` signals its child and the group: within this time it is one request
+
 
 def interrupt() -> None:
     """End at once."""
@@ -19,15 +23,20 @@ def interrupt() -> None:
 class StopRequests:
     """Context manager that stores SIGINT, SIGTERM and, unless it is ignored (nohup), SIGHUP.
 
-    A second request exits immediately: before the flight it calls `at_once`, in flight the loop
-    sees `repeated`. SIGHUP never counts as a second one: a closing terminal may send it twice.
+    A second request, a second or more after the first, exits immediately: before the flight it
+    calls `at_once`, in flight the loop sees `repeated`. SIGHUP never counts as a second one: a
+    closing terminal may send it twice.
     """
 
     def __init__(self, at_once: Callable[[], None] = interrupt) -> None:
         self._at_once = at_once
-        self.requested = False
+        self._first_s: float | None = None
         self.repeated = False
         self.in_flight = False
+
+    @property
+    def requested(self) -> bool:
+        return self._first_s is not None
 
     def check(self) -> None:
         """Raise KeyboardInterrupt if a stop was requested."""
@@ -51,7 +60,10 @@ class StopRequests:
             signal.signal(number, handler)
 
     def _store(self, number: int, frame: FrameType | None) -> None:
-        self.repeated |= self.requested and number != signal.SIGHUP
-        self.requested = True
+        now_s = clock.monotonic_s()
+        if self._first_s is None:
+            self._first_s = now_s
+        elif number != signal.SIGHUP and now_s - self._first_s >= AGAIN_S:
+            self.repeated = True
         if self.repeated and not self.in_flight:
             self._at_once()

@@ -2,7 +2,8 @@
 
 mavlink-router and MAVProxy send from another port after a restart. A datagram comes from the
 vehicle when it is from the host of the known address, holds a frame with the vehicle's ids, and the
-known address has been silent. All other addresses are foreign.
+known address, host and port, has been silent. All other addresses are foreign. The link checks that
+the silence is no overflow and no pause of ours: before, it hands over no foreign datagram.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class Peer:
 
     def moves_to(self, place: Hashable, datagram: bytes, now_s: float) -> bool:
         """Whether `datagram` shows that the vehicle sends from `place` now; if so, pin it there."""
-        if now_s - self.heard_s <= PEER_SILENT_S or not _same_host(place, self._place):
+        if now_s - self.heard_s <= PEER_SILENT_S or not same_host(place, self._place):
             return False
         moved = any(
             frame.verified and Address(frame.system_id, frame.component_id) == self._vehicle
@@ -44,6 +45,6 @@ class Peer:
         return moved
 
 
-def _same_host(place: Hashable, other: Hashable) -> bool:
+def same_host(place: Hashable, other: Hashable) -> bool:
     """Whether two UDP addresses (host, port) have the same host."""
     return isinstance(place, tuple) and isinstance(other, tuple) and place[0] == other[0]

@@ -202,14 +202,19 @@ class Session:
         )
         if dialect is None:
             return DropReason.UNSUPPORTED_AUTOPILOT
-        self.dialect = dialect
-        self.vehicle = VehicleFound(frame.system_id, frame.component_id, dialect.name)
-        self._peer.pin(peer, Address(frame.system_id, frame.component_id))
-        self._own = Address(frame.system_id, self.settings.component_id)
+        vehicle = VehicleFound(frame.system_id, frame.component_id, dialect.name)
+        self.adopt(vehicle, peer)
+        events.append(vehicle)
+        return None
+
+    def adopt(self, vehicle: VehicleFound, peer: Hashable) -> None:
+        """Take this vehicle, which sends from `peer`, as ours."""
+        self.dialect = DIALECTS[vehicle.autopilot]
+        self.vehicle = vehicle
+        self._peer.pin(peer, Address(vehicle.system_id, vehicle.component_id))
+        self._own = Address(vehicle.system_id, self.settings.component_id)
         self._heartbeat_sent = None  # the dialect may need another type: send it at once
         self._restart_rates()
-        events.append(self.vehicle)
-        return None
 
     def _interpret(
         self, frame: framing.Frame, now_s: float, events: list[Event]

@@ -19,7 +19,7 @@ def chunks(severity: int, text: str, text_id: int) -> list[StatusTextOut]:
 
     `text_id`, 1 .. 65535, must differ between texts whose chunks may mix on the way.
     """
-    data = text.encode("utf-8")[: _CHUNKS_MAX * _CHUNK_BYTES - 1]
+    data = text.encode("utf-8", "replace")[: _CHUNKS_MAX * _CHUNK_BYTES - 1]
     if len(data) <= _CHUNK_BYTES:
         return [StatusTextOut(severity, data)]
     return [  # an empty one at the end if the last is full

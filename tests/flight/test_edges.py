@@ -8,15 +8,18 @@ import select
 import signal
 import socket
 import tty
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import Any, cast
 
 import pytest
 
+from offboard.flight import clock
+from offboard.flight import log as log_module
 from offboard.flight.companion import Companion, Outcome, Output
-from offboard.flight.link import Link, SerialLink, open_link
+from offboard.flight.connection import open_link
+from offboard.flight.link import Chunk, Link, Strangers
 from offboard.flight.log import FlightLog
 from offboard.flight.loop import Loop
 from offboard.flight.stop import StopRequests
@@ -29,23 +32,33 @@ class Wire:
 
     is_stream = False
 
-    def receive(self, timeout_s: float) -> list[Any]:
+    def __init__(self) -> None:
+        self.strangers = Strangers()
+
+    def receive(self, timeout_s: float) -> list[Chunk]:
         return []
 
     def send(self, data: bytes, peer: object) -> None: ...
+
+    def follow(self, peer: object) -> None: ...
+
+    def descriptors(self) -> tuple[int, ...]:
+        return ()
 
     def close(self) -> None: ...
 
 
 class Flight:
-    """A companion whose flight lasts `polls`, and which counts stop requests."""
+    """A companion whose flight lasts `turns`, and which counts stop requests."""
 
     peer = None
 
-    def __init__(self, polls: int, during: Callable[[int], object]) -> None:
-        self.polls, self.during = polls, during
+    def __init__(self, turns: int, during: Callable[[int], object], log: bytes = b"") -> None:
+        self.turns, self.during = turns, during
+        self.log = (log,) if log else ()
         self.stops = 0
         self.outcome: Outcome | None = None
+        self.announced: list[str] = []
 
     def has_ended(self) -> bool:
         return self.outcome is not None
@@ -53,12 +66,15 @@ class Flight:
     def request_stop(self, why: str = "") -> None:
         self.stops += 1
 
-    def poll(self, now_s: float, silence_s: float) -> Output:
-        self.polls -= 1
-        self.during(self.polls)
-        if self.polls == 0:
+    def announce(self, sentence: str) -> None:
+        self.announced.append(sentence)
+
+    def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
+        self.turns -= 1
+        self.during(self.turns)
+        if self.turns == 0:
             self.outcome = Outcome(0, "flown and landed")
-        return Output()
+        return Output(log=self.log)
 
 
 def fly(flight: Flight, directory: Path, progress: Callable[[Any], None]) -> Outcome:
@@ -78,19 +94,37 @@ def test_a_closed_terminal_does_not_end_the_flight(tmp_path: Path, failure: Base
 
     flight = Flight(5, lambda left: None)
     assert fly(flight, tmp_path, progress).sentence == "flown and landed"
-    assert (flight.polls, shown, flight.stops) == (0, 1, 0)
+    assert (flight.turns, shown, flight.stops) == (0, 1, 0)
 
 
 @pytest.mark.parametrize(
-    ("number", "polls_left"), [(signal.SIGHUP, 0), (signal.SIGINT, 3), (signal.SIGTERM, 3)]
+    ("number", "apart_s", "turns_left"),
+    [
+        (signal.SIGHUP, 1.1, 0),
+        (signal.SIGINT, 1.1, 3),
+        (signal.SIGTERM, 1.1, 3),
+        (signal.SIGTERM, 0.001, 0),  # GNU timeout signals its child and the group
+        (signal.SIGINT, 0.9, 0),
+    ],
 )
-def test_two_signals(tmp_path: Path, number: int, polls_left: int) -> None:
-    """The first one lands, a second one exits immediately, except a second SIGHUP."""
-    flight = Flight(5, lambda left: os.kill(os.getpid(), number) if left >= 3 else None)
+def test_two_signals(
+    number: int, apart_s: float, turns_left: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The first one lands, a second one after a second exits immediately, except SIGHUP."""
+    now_s = 100.0
+    monkeypatch.setattr(clock, "monotonic_s", lambda: now_s)
+
+    def signalled(left: int) -> None:
+        nonlocal now_s
+        if left >= 3:
+            os.kill(os.getpid(), number)
+            now_s += apart_s
+
+    flight = Flight(5, signalled)
     outcome = fly(flight, tmp_path, lambda companion: None)
-    assert flight.polls == polls_left
+    assert flight.turns == turns_left
     assert flight.stops
-    assert (outcome.exit_code == 0) is (polls_left == 0)
+    assert (outcome.exit_code == 0) is (turns_left == 0)
 
 
 def test_an_ignored_sighup_stays_ignored(tmp_path: Path) -> None:
@@ -101,6 +135,70 @@ def test_an_ignored_sighup_stays_ignored(tmp_path: Path) -> None:
     finally:
         signal.signal(signal.SIGHUP, before)
     assert flight.stops == 0
+
+
+@pytest.mark.parametrize(
+    ("lands", "exit_code", "stops"), [(True, 4, True), (False, 0, False)], ids=["land", "go_on"]
+)
+def test_a_log_that_cannot_be_written_is_said_at_once(
+    lands: bool, exit_code: int, stops: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """`limits.log_lost`: a full disk in flight."""
+
+    def full(descriptor: int, entries: list[bytes]) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(log_module, "append", full)
+    says = (
+        f"the log {tmp_path / 'flight' / 'flight.tlog'} cannot be written (No space left on device)"
+    )
+    flight = Flight(100_000, lambda left: setattr(flight, "turns", min(left, 3 * bool(left)))
+                    if flight.announced else None, log=b"frame")  # fmt: skip
+    with FlightLog(tmp_path / "flight", "", real_time=True) as log, StopRequests() as stops_:
+        outcome = Loop(
+            cast(Companion, flight), Wire(), log, stops=stops_,
+            progress=lambda companion: None, lands_without_log=lands,
+        ).run()  # fmt: skip
+    assert flight.announced == [says]
+    assert bool(flight.stops) is stops
+    assert outcome.exit_code == exit_code
+    assert outcome.sentence.startswith(f"{says}: ")
+    assert outcome.sentence.endswith(" entries lost; flown and landed")
+
+
+def failing(turns: range, error: BaseException) -> Callable[[int], None]:
+    def during(left: int) -> None:
+        if left in turns:
+            raise error
+
+    return during
+
+
+@pytest.mark.parametrize("error", [ZeroDivisionError("no"), SystemExit(3), MemoryError()])
+def test_an_exception_lands_and_ends_with_4(error: BaseException, tmp_path: Path) -> None:
+    flight = Flight(5, failing(range(3, 5), error))
+    outcome = fly(flight, tmp_path, lambda companion: None)
+    assert (flight.turns, flight.stops, outcome.exit_code) == (0, 2, 4)
+    says = f"internal error: {type(error).__name__}: {error} (test_edges.py:"
+    assert outcome.sentence.startswith(says)
+    assert outcome.sentence.endswith("; flown and landed")
+
+
+def test_an_exception_in_every_turn_ends_in_silence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 100.0
+    monkeypatch.setattr(clock, "monotonic_s", lambda: now_s)
+
+    def fails(left: int) -> None:
+        nonlocal now_s
+        now_s += 0.04
+        raise ValueError("again")
+
+    flight = Flight(1000, fails)
+    outcome = fly(flight, tmp_path, lambda companion: None)
+    assert (1000 - flight.turns, outcome.exit_code) == (8, 4)  # 0.3 s
+    assert outcome.sentence.endswith("; setpoints stopped")
 
 
 def setpoint(number: int) -> bytes:
@@ -160,9 +258,9 @@ def test_a_full_stream_does_not_block_and_sends_the_newest_setpoint(
 
 def test_an_unplugged_serial_link_is_silent() -> None:
     ours, theirs = pty.openpty()
-    link = SerialLink(os.ttyname(theirs), 57600)
+    link = open_link(f"serial:{os.ttyname(theirs)}:57600")
     os.write(ours, b"abc")
-    assert link.receive(0.5) == [(b"abc", "serial")]
+    assert [(chunk.data, chunk.peer) for chunk in link.receive(0.5)] == [(b"abc", "serial")]
     os.close(theirs)
     os.close(ours)
     assert link.receive(0.01) == []

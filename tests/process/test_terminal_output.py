@@ -8,6 +8,8 @@ import os
 import pty
 import subprocess
 import sys
+import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -156,3 +158,28 @@ def test_on_a_terminal_long_lines_are_wrapped_at_words(
     assert len(lines) > 1
     assert max(map(len, lines)) <= 80
     assert says in " ".join(line.strip() for line in lines)
+
+
+def test_a_terminal_stopped_by_ctrl_s_stops_no_flight(tmp_path: Path) -> None:
+    terminal, theirs = pty.openpty()
+    process = subprocess.Popen(
+        [sys.executable, "-m", "offboard", "fly", "--sitl", "--reference", "hover", "--out", "x"],
+        cwd=tmp_path, stdin=theirs, stdout=theirs, stderr=theirs,
+    )  # fmt: skip
+    os.close(theirs)
+    printed = b""
+    while b"health: " not in printed:
+        printed += os.read(terminal, 65536)
+    os.write(terminal, b"\x13")  # Ctrl-S
+    log = tmp_path / "x" / "flight.tlog"
+    deadline_s = time.monotonic() + 60.0
+    while b"disarmed: " not in log.read_bytes():
+        assert time.monotonic() < deadline_s, "the flight waits for the terminal"
+        time.sleep(0.05)
+    os.write(terminal, b"\x11")  # Ctrl-Q
+    with suppress(OSError):  # nobody is left to print
+        while True:
+            printed += os.read(terminal, 65536)
+    assert process.wait(timeout=30) == 0
+    os.close(terminal)
+    assert b"flown and landed" in printed

@@ -25,6 +25,7 @@ def test_real_time_after_the_compilation_cache_was_deleted(
     assert (flight.returncode, said) == (0, ""), shown
     assert "first run on this machine: compiling" in shown
     assert simulator.poll() is None
+    assert b"supervisor:" not in (tmp_path / "x" / "flight.tlog").read_bytes()
     score = json.loads((tmp_path / "x" / "score.json").read_text())
     # Half of PX4's COM_OF_LOSS_T: on an idle machine it is 0.11 s, a shared one may stall us both
     assert score["setpoint_gap_wall_max_s"] < 0.5

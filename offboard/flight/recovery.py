@@ -1,0 +1,94 @@
+"""Recovery: what the supervisor asks of a vehicle that has lost its controller. No I/O, no clock.
+
+Hold, and after some seconds land. Both are asked for only while the vehicle shows a mode that is
+ours or that we asked for, and at most once for each report of the mode. Any other mode is the
+decision of a pilot or of the vehicle's own failsafe, and final.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+from offboard.mavlink.dialects.base import Dialect
+from offboard.mavlink.events import CommandAck, Event, Heartbeat, ModeReport
+from offboard.mavlink.outgoing import CommandLong
+
+REPEAT_S = 0.3  # between two requests
+UNHEARD_MAX = 3  # requests to a vehicle of which nothing is heard
+HOLD_S = 5.0  # then land
+FRESH_S = 2.5  # an older report of the mode is no reason for a command
+LONGEST_S = 120.0
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """A command, and what it asks for in a word."""
+
+    command: CommandLong
+    word: str
+
+
+class Recovery:
+    """Begins at `began_s`. `ended` says how it ended; empty until then."""
+
+    def __init__(self, dialect: Dialect, began_s: float) -> None:
+        self._dialect = dialect
+        self._began_s = began_s
+        self._mode: str | None = None
+        self._reported_s = -math.inf
+        self._armed = True
+        self._asked_s = -math.inf
+        self._requests = 0
+        self._held_s = math.inf  # since when it holds
+        self.refusal = ""  # of the newest request
+        self.ended = ""
+
+    def see(self, event: Event, at_s: float) -> None:
+        """An event of the vehicle that arrived at `at_s`, which may be before `began_s`."""
+        match event:
+            case Heartbeat(mode, armed):
+                self._mode, self._armed, self._reported_s = mode, armed, at_s
+            case ModeReport(mode):
+                self._mode, self._reported_s = mode, at_s
+            case CommandAck(_, result) if result not in ("ACCEPTED", "IN_PROGRESS"):
+                self.refusal = result
+
+    def due(self, now_s: float) -> Request | None:
+        """What to ask for now."""
+        self._conclude(now_s)
+        if self.ended or now_s - self._asked_s < REPEAT_S:
+            return None
+        request = self._wanted(now_s)
+        if request:
+            self._asked_s = now_s
+            self._requests += 1
+        return request
+
+    def _conclude(self, now_s: float) -> None:
+        """Note when it holds, and when this is over."""
+        holds = self._mode == self._dialect.hold_mode
+        ours = self._mode in (None, self._dialect.engage_mode, self._dialect.land_mode)
+        if not self._armed:
+            self.ended = "the vehicle is disarmed"
+        elif not (ours or (holds and self._requests)):
+            self.ended = f"the vehicle shows {self._mode}: its pilot or its failsafe has it"
+        elif now_s - self._began_s > LONGEST_S:
+            self.ended = f"not landed after {LONGEST_S:.0f} s"
+        self._held_s = min(self._held_s, now_s) if holds else math.inf
+
+    def _wanted(self, now_s: float) -> Request | None:
+        if self._mode is None:
+            return self._hold() if self._requests < UNHEARD_MAX else None
+        answered = self._reported_s > self._asked_s and now_s - self._reported_s < FRESH_S
+        if not answered or self._mode == self._dialect.land_mode:
+            return None
+        if self._mode == self._dialect.engage_mode:
+            return self._hold() if now_s - self._began_s < HOLD_S else self._land()
+        return self._land() if now_s - self._held_s >= HOLD_S else None
+
+    def _hold(self) -> Request:
+        return Request(self._dialect.hold(), "hold")
+
+    def _land(self) -> Request:
+        return Request(self._dialect.land(), "land")

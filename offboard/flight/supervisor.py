@@ -1,0 +1,145 @@
+"""The supervisor, as the controller sees it: a process that outlives it.
+
+The loop tells it in every turn whether the vehicle is ours and in the air (`Guard`). When these
+beats stop for `supervisor_process.SILENT_S`, or the controller ends meanwhile, the process takes
+over the link and asks the vehicle to hold, then to land. From then on the controller must not send.
+
+Beats are JSON lines on a socket pair. The descriptors of link and log go along when they change.
+"""
+
+from __future__ import annotations
+
+import json
+import select
+import socket
+import subprocess
+import sys
+from collections.abc import Hashable
+from contextlib import suppress
+from dataclasses import asdict, dataclass
+from types import TracebackType
+
+from offboard.documents.errors import UserError
+from offboard.flight.link import Link
+from offboard.mavlink.events import VehicleFound
+
+START_S = 20.0  # on a busy machine
+DISMISS_S = 1.0
+READY, END = "ready", "end"
+
+
+class SupervisorError(UserError):
+    """The supervisor cannot be started: one sentence for the user."""
+
+
+@dataclass(frozen=True, slots=True)
+class Guard:
+    """What the supervisor must know before it may act: the vehicle, whether it is `ours`, in the
+    mode of our setpoints or on its way down for us, and whether it may be `flying`."""
+
+    vehicle: VehicleFound
+    ours: bool
+    flying: bool
+
+
+class Supervisor:
+    """Context manager around the process.
+
+    `lost`: it has ended although the flight goes on, and nobody will take over.
+    """
+
+    def __init__(self) -> None:
+        self.lost = False
+        self._received = b""
+        self._lines: list[str] = []  # first READY, then why it took over and what it did
+        self._beat: tuple[Guard, Hashable] | None = None
+        self._line = b""
+        self._passed: object = None  # the descriptors that it has
+
+    def __enter__(self) -> Supervisor:
+        self._channel, theirs = socket.socketpair()
+        self._channel.setblocking(False)
+        with theirs:
+            self._process = subprocess.Popen(
+                [sys.executable, "-m", "offboard.flight.supervisor_process"],
+                stdin=theirs.fileno(),
+                stdout=subprocess.DEVNULL,
+                start_new_session=True,  # signals of the terminal reach only the controller
+            )
+        return self
+
+    @property
+    def pid(self) -> int:
+        """Process id."""
+        return self._process.pid
+
+    @property
+    def said(self) -> list[str]:
+        """Its sentences: why it took over, and what it did."""
+        return self._lines[1:]
+
+    def await_ready(self) -> None:
+        """Wait until the process has loaded. Raises SupervisorError."""
+        while not self._lines:
+            select.select([self._channel], [], [], START_S)
+            if not self._receive():
+                raise SupervisorError(
+                    "the supervisor, which lands the vehicle if this process dies, does not start"
+                )
+
+    def beat(self, guard: Guard, peer: Hashable, link: Link, log_descriptor: int) -> None:
+        """Show that the controller lives. The vehicle sends from `peer`. Never waits."""
+        if self._beat != (guard, peer):
+            self._beat = (guard, peer)
+            message = {**asdict(guard), "peer": peer, "stream": link.is_stream}
+            self._line = json.dumps(message).encode() + b"\n"
+        descriptors = [*link.descriptors(), log_descriptor]
+        passed = (peer, descriptors)
+        try:
+            socket.send_fds(
+                self._channel, [self._line], [] if passed == self._passed else descriptors
+            )
+            self._passed = passed
+        except BlockingIOError:
+            pass  # it is stopped or very late; the next beat says the same
+        except OSError:
+            self.lost = not self.has_taken_over()
+
+    def has_taken_over(self) -> bool:
+        """Whether it sends in our place: then nothing may be sent or received, for good."""
+        self._receive()
+        return len(self._lines) > 1
+
+    def _receive(self) -> bool:
+        """Read what it says. False if there is nothing, or if it has ended."""
+        try:
+            data = self._channel.recv(65536)
+        except OSError:
+            return False
+        *lines, self._received = (self._received + data).split(b"\n")
+        self._lines += [json.loads(line) for line in lines]
+        self.lost = not data and len(self._lines) <= 1
+        return bool(data)
+
+    def await_end(self, timeout_s: float) -> bool:
+        """Wait at most `timeout_s` for its next sentence; whether it has ended."""
+        select.select([self._channel], [], [], timeout_s)
+        self._receive()
+        return self._process.poll() is not None
+
+    def dismiss(self) -> None:
+        """The flight has ended in order: the supervisor must not take over."""
+        with suppress(OSError):
+            self._channel.settimeout(DISMISS_S)
+            self._channel.sendall(json.dumps(END).encode() + b"\n")
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the channel. Without `dismiss` the process takes over now, if it must."""
+        self._channel.close()
+        with suppress(subprocess.TimeoutExpired):  # it holds the link's port
+            self._process.wait(DISMISS_S)

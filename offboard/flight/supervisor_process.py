@@ -1,0 +1,214 @@
+"""The process of the supervisor: watches the controller's beats, and takes its place if they stop.
+
+It imports only what it needs, so that it is ready at once and stays small. Its standard input is
+the controller's end of the channel, see `supervisor`.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import signal
+import socket
+import sys
+from collections.abc import Hashable
+from contextlib import suppress
+from typing import Any
+
+from offboard.flight import clock
+from offboard.flight.background import BackgroundWriter
+from offboard.flight.link import Link
+from offboard.flight.log import append, entry
+from offboard.flight.recovery import Recovery
+from offboard.flight.stream_link import StreamLink
+from offboard.flight.supervisor import END, READY
+from offboard.flight.udp_link import UdpLink
+from offboard.mavlink.events import VehicleFound
+from offboard.mavlink.outgoing import Heartbeat, Outgoing
+from offboard.mavlink.session import Session, SessionSettings
+from offboard.mavlink.texts import chunks
+
+SILENT_S = 0.95  # without a beat
+POLL_S = 0.02
+PAUSE_MAX_S = 0.1  # of a turn that counts as the controller's silence: the rest was a pause of ours
+CLOSE_S = 2.0
+WARNING = 4  # MAV_SEVERITY
+DIED = "the controller ended in flight"
+HANGS = f"the controller has not answered for {SILENT_S:g} s"
+
+
+class Watch:
+    """The controller's beats, and what is needed to take over."""
+
+    def __init__(self, channel: socket.socket) -> None:
+        self._channel = channel
+        self._channel.setblocking(False)
+        self._received = b""
+        self._silent_s = 0.0
+        self.newest: dict[str, Any] = {}
+        self.descriptors: list[int] = []  # of the link, then of the log
+        self.ended = False
+        self.dismissed = False
+
+    def turn(self, elapsed_s: float) -> str:
+        """Read what has arrived. Why to take over; empty if there is no reason."""
+        self._silent_s += min(elapsed_s, PAUSE_MAX_S)
+        with suppress(BlockingIOError, ConnectionResetError):
+            while not self.ended:
+                self._read()
+        if self.dismissed or not (self.newest.get("ours") and self.newest.get("flying")):
+            return ""
+        if self.ended:
+            return DIED
+        return HANGS if self._silent_s >= SILENT_S else ""
+
+    def _read(self) -> None:
+        data, descriptors, _, _ = socket.recv_fds(self._channel, 65536, 8)
+        self.ended = not data
+        if descriptors:
+            for descriptor in self.descriptors:
+                os.close(descriptor)
+            self.descriptors = descriptors
+        *lines, self._received = (self._received + data).split(b"\n")
+        for line in lines:
+            self._take(line)
+
+    def _take(self, line: bytes) -> None:
+        try:
+            message = json.loads(line)
+        except ValueError:  # only a part of it did fit into the buffer
+            return
+        self._silent_s = 0.0
+        self.dismissed |= message == END
+        if isinstance(message, dict):
+            self.newest = message
+
+
+class Rescue:
+    """The controller's place taken: its link, its log, and what is asked of the vehicle."""
+
+    def __init__(self, watch: Watch, tell: BackgroundWriter[str]) -> None:
+        beat = watch.newest
+        self._tell = tell
+        self._peer = _peer(beat["peer"])
+        self._link = _link(watch.descriptors[:-1], str(self._peer) if beat["stream"] else "")
+        self._log = BackgroundWriter[bytes](
+            lambda entries: append(watch.descriptors[-1], entries), 100_000
+        )
+        self._session = Session(SessionSettings(stream=beat["stream"]))
+        self._session.adopt(VehicleFound(**beat["vehicle"]), self._peer)
+        assert self._session.dialect is not None
+        self._recovery = Recovery(self._session.dialect, clock.monotonic_s())
+        self._text_id = 0
+
+    def run(self, reason: str) -> None:
+        """Take over for `reason`, until the vehicle is down or belongs to somebody else."""
+        self._receive(0.0)  # the mode may have been left since the last beat
+        self._ask(f"taking over: {reason}")
+        while not self._recovery.ended:
+            self._receive(POLL_S)
+            self._ask()
+        self._say(self._recovery.ended)
+        self._log.close(CLOSE_S)
+
+    def _receive(self, timeout_s: float) -> None:
+        for chunk in self._link.receive(timeout_s):
+            reception = self._session.receive(chunk.data, chunk.peer, chunk.arrived_s)
+            self._record(*reception.frames)
+            for event in reception.events:
+                self._recovery.see(event, chunk.arrived_s)
+            self._send(*reception.replies)
+        due = self._session.poll(clock.monotonic_s())
+        self._send(*(message for message in due if isinstance(message, Heartbeat)))
+
+    def _ask(self, text: str = "") -> None:
+        request = self._recovery.due(clock.monotonic_s())
+        if request:
+            self._send(request.command)  # before all texts
+        if text:
+            self._text(text)
+        if request:
+            self._say(f"{request.word} requested")
+        if self._recovery.refusal:
+            self._say(f"the vehicle answers {self._recovery.refusal}")
+            self._recovery.refusal = ""
+
+    def _say(self, sentence: str) -> None:
+        """To the controller or its terminal, to the ground station and to the log."""
+        self._tell.put(sentence)
+        self._text(sentence)
+
+    def _text(self, sentence: str) -> None:
+        self._text_id += 1
+        self._send(*chunks(WARNING, f"supervisor: {sentence}", self._text_id))
+
+    def _send(self, *messages: Outgoing) -> None:
+        for message in messages:
+            frame = self._session.encode(message)
+            self._link.send(frame, self._peer)
+            self._record(frame)
+
+    def _record(self, *frames: bytes) -> None:
+        for frame in frames:
+            self._log.put(entry(clock.unix_us(), frame))
+
+
+def _peer(place: Any) -> Hashable:
+    """An address as the link gives it: JSON has no tuples."""
+    return tuple(place) if isinstance(place, list) else str(place)
+
+
+def _link(descriptors: list[int], stream: str) -> Link:
+    """The link that has these descriptors; `stream` is the name of a stream, empty for UDP."""
+    if stream:
+        (descriptor,) = descriptors
+        return StreamLink(descriptor, stream, lambda: os.close(descriptor))
+    listening = vehicle = None
+    for sock in (socket.socket(fileno=descriptor) for descriptor in descriptors):
+        try:
+            sock.getpeername()
+            vehicle = sock
+        except OSError:  # not connected
+            listening = sock
+    return UdpLink(listening, vehicle)
+
+
+def main() -> None:
+    """Watch until the controller ends, in order or not."""
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
+        signal.signal(number, signal.SIG_IGN)  # whoever stops the controller means it, not us
+    channel = socket.socket(fileno=os.dup(sys.stdin.fileno()))
+    watch = Watch(channel)
+    channel.send(json.dumps(READY).encode() + b"\n")
+    reason, before_s = "", clock.monotonic_s()
+    while not (reason or watch.ended or watch.dismissed):
+        select.select([], [], [], POLL_S)
+        now_s = clock.monotonic_s()
+        reason, before_s = watch.turn(now_s - before_s), now_s
+    if reason:
+        tell = BackgroundWriter[str](lambda said: _tell(channel, said), 1000)
+        _announce(channel, tell, f"taking over: {reason}")
+        Rescue(watch, tell).run(reason)
+        tell.close(CLOSE_S)
+
+
+def _announce(channel: socket.socket, tell: BackgroundWriter[str], sentence: str) -> None:
+    """The controller, if it is alive, must know it before the vehicle does."""
+    try:
+        channel.send(json.dumps(sentence).encode() + b"\n")
+    except OSError:
+        tell.put(sentence)
+
+
+def _tell(channel: socket.socket, sentences: list[str]) -> None:
+    """To the controller; if it is gone, to the terminal, which may wait."""
+    for sentence in sentences:
+        try:
+            channel.send(json.dumps(sentence).encode() + b"\n")
+        except OSError:
+            os.write(2, f"offboard supervisor: {sentence}\n".encode())
+
+
+if __name__ == "__main__":
+    main()

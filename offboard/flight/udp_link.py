@@ -1,0 +1,262 @@
+"""UDP links. The vehicle, once known, has a connected socket of its own, which the kernel filters.
+
+Two sockets share the local port then: the kernel gives the vehicle's datagrams to the connected
+one, and those of all other senders to the listening one, of which little is read. So nobody can
+fill the vehicle's buffer or take our time. Linux lets two sockets share a port with SO_REUSEADDR,
+macOS with SO_REUSEPORT; afterwards the option is cleared, so that no other program can join.
+"""
+
+from __future__ import annotations
+
+import select
+import socket
+import struct
+import sys
+from collections.abc import Hashable
+from contextlib import suppress
+
+from offboard.flight import clock
+from offboard.flight.link import Chunk, Strangers
+from offboard.mavlink.framing import frame_size
+from offboard.mavlink.peer import PEER_SILENT_S, same_host
+
+DATAGRAM_SIZE = 65535
+BUFFER_BYTES = 1 << 20
+BATCH_MAX = 512  # datagrams of one call
+LOOK_MAX, LOOK_EVERY_S = 64, 0.02  # of other senders, while the vehicle is known
+TIMESYNC = 111
+_LINUX = sys.platform == "linux"
+_SHARE_PORT = socket.SO_REUSEADDR if _LINUX else socket.SO_REUSEPORT
+# Options that the socket module does not name: SO_TIMESTAMPNS on Linux, SO_TIMESTAMP on macOS
+_STAMP_OPTION = 35 if _LINUX else 0x0400
+_STAMP_KIND = 35 if _LINUX else 0x02
+_STAMP = struct.Struct("@ll" if _LINUX else "@li")
+_STAMP_UNIT_S = 1e-9 if _LINUX else 1e-6
+_DROPPED = 40 if _LINUX else None  # SO_RXQ_OVFL: how many datagrams did not fit into the buffer
+_ANCILLARY_BYTES = socket.CMSG_SPACE(_STAMP.size) + socket.CMSG_SPACE(4)
+
+
+def udp_socket() -> socket.socket:
+    """A non-blocking socket with arrival stamps."""
+    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
+    with suppress(OSError):  # without stamps the arrival is taken as early as it can have been
+        sock.setsockopt(socket.SOL_SOCKET, _STAMP_OPTION, 1)
+        if _DROPPED is not None:
+            sock.setsockopt(socket.SOL_SOCKET, _DROPPED, 1)
+    sock.setblocking(False)
+    return sock
+
+
+class _Inbox:
+    """Reads one socket. `dropped`: datagrams that did not fit into its buffer."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self.socket = sock
+        self.dropped = 0
+        self._buffer = bytearray(DATAGRAM_SIZE)
+        self._empty_s = clock.monotonic_s()  # all that is waiting arrived later
+
+    def drain(self, most: int) -> list[Chunk]:
+        """At most `most` datagrams that are waiting."""
+        chunks: list[Chunk] = []
+        offset_s = clock.monotonic_less_unix_s()
+        for _ in range(most):
+            now_s = clock.monotonic_s()
+            try:
+                size, ancillary, _, peer = self.socket.recvmsg_into(
+                    [self._buffer], _ANCILLARY_BYTES
+                )
+            except ConnectionError:
+                continue  # ICMP: the peer's port was closed when an earlier datagram arrived
+            except OSError:  # nothing left, or the network interface is down
+                self._empty_s = now_s
+                break
+            stamp_s = self._read(ancillary)
+            # a clock that was set meanwhile must not move the arrival
+            arrived_s = max(self._empty_s, min(stamp_s + offset_s, clock.monotonic_s()))
+            chunks.append(Chunk(bytes(self._buffer[:size]), peer, arrived_s))
+        return chunks
+
+    def _read(self, ancillary: list[tuple[int, int, bytes]]) -> float:
+        """Unix time of the arrival, 0 if there is no stamp; notes `dropped`."""
+        stamp_s = 0.0
+        for _, kind, data in ancillary:
+            if kind == _STAMP_KIND and len(data) >= _STAMP.size:
+                seconds, fraction = _STAMP.unpack_from(data)
+                stamp_s = seconds + fraction * _STAMP_UNIT_S
+            elif kind == _DROPPED:
+                self.dropped = int.from_bytes(data, sys.byteorder)
+        return stamp_s
+
+
+class UdpLink:
+    """`listening` hears every sender, `vehicle` is connected to the vehicle; one may be missing."""
+
+    is_stream = False
+
+    def __init__(self, listening: socket.socket | None, vehicle: socket.socket | None) -> None:
+        self.strangers = Strangers()
+        self._listening = _Inbox(listening) if listening else None
+        self._vehicle = _Inbox(vehicle) if vehicle else None
+        self._place: Hashable = vehicle.getpeername() if vehicle else None
+        self._heard_s = clock.monotonic_s()  # when we last found a datagram of the vehicle
+        self._look_s = 0.0  # when other senders are read next
+        self._dropped = 0
+
+    # --- in ---
+
+    def receive(self, timeout_s: float) -> list[Chunk]:
+        awaited = [inbox.socket for inbox in self._awaited()]
+        select.select(awaited, [], [], max(0.0, timeout_s))
+        chunks = self._vehicle.drain(BATCH_MAX) if self._vehicle else []
+        if self._listening:
+            if self._vehicle is None:
+                return self._listening.drain(BATCH_MAX)
+            chunks += self._look(self._listening, bool(chunks))
+        return sorted(chunks, key=lambda chunk: chunk.arrived_s)
+
+    def _awaited(self) -> list[_Inbox]:
+        """The sockets that end the waiting: a flood of other senders must not."""
+        looks = self._vehicle is None or clock.monotonic_s() >= self._look_s
+        return [i for i in (self._vehicle, self._listening if looks else None) if i]
+
+    def _look(self, listening: _Inbox, heard: bool) -> list[Chunk]:
+        """What other senders sent: nearly all is only counted. Returned is what the vehicle sent
+        before its socket was connected or to a broadcast address, and after a silence that we
+        observed ourselves (not one of our own pauses) what may come from its new port."""
+        now_s = clock.monotonic_s()
+        found = listening.drain(LOOK_MAX) if now_s >= self._look_s else []
+        ours = [chunk for chunk in found if chunk.peer == self._place]
+        others = [chunk for chunk in found if chunk.peer != self._place]
+        silent = now_s - self._heard_s > PEER_SILENT_S
+        if others:
+            self._look_s = now_s + LOOK_EVERY_S
+        if heard or ours:
+            self._heard_s = now_s
+        elif silent:
+            ours = [chunk for chunk in others if same_host(chunk.peer, self._place)]
+            others = [chunk for chunk in others if not same_host(chunk.peer, self._place)]
+        if others:
+            self._count(others, listening.dropped)
+        return ours
+
+    def _count(self, others: list[Chunk], dropped: int) -> None:
+        for sender, number in _by_sender(others).items():
+            self.strangers.count(sender, number)
+        if dropped > self._dropped:  # most of the others by far: the vehicle has its own buffer
+            self.strangers.count(_name(others[-1].peer), dropped - self._dropped)
+            self._dropped = dropped
+
+    # --- out ---
+
+    def send(self, data: bytes, peer: Hashable | None) -> None:
+        with suppress(OSError):  # a dead link shows as silence
+            if self._vehicle is None:
+                if self._listening and isinstance(peer, tuple):
+                    self._listening.socket.sendto(data, peer)
+                return
+            try:
+                self._vehicle.socket.send(data)
+            except ConnectionError:  # reports an earlier ICMP, and has not sent
+                self._vehicle.socket.send(data)
+
+    # --- the vehicle ---
+
+    def follow(self, peer: Hashable) -> None:
+        if self._listening is None or peer == self._place or not isinstance(peer, tuple):
+            return
+        listening = self._listening
+        before, self._vehicle = self._vehicle, None
+        if before:
+            before.socket.close()
+        try:
+            sock = _second_socket(listening.socket, peer)
+        except OSError:  # then hear the vehicle alone
+            with suppress(OSError):
+                listening.socket.connect(peer)
+            self._listening, sock = None, listening.socket
+        self._vehicle, self._place = _Inbox(sock), peer
+        self._heard_s, self._dropped = clock.monotonic_s(), listening.dropped
+
+    def descriptors(self) -> tuple[int, ...]:
+        return tuple(i.socket.fileno() for i in (self._listening, self._vehicle) if i)
+
+    def close(self) -> None:
+        for inbox in (self._listening, self._vehicle):
+            if inbox:
+                inbox.socket.close()
+
+    @property
+    def port(self) -> int:
+        """The local port."""
+        inbox = self._listening or self._vehicle
+        assert inbox is not None
+        return int(inbox.socket.getsockname()[1])
+
+
+def _second_socket(listening: socket.socket, peer: tuple[str, int]) -> socket.socket:
+    """A socket on the port of `listening`, connected to `peer`. Raises OSError."""
+    sock = udp_socket()
+    both = (listening, sock)
+    try:
+        for one in both:
+            one.setsockopt(socket.SOL_SOCKET, _SHARE_PORT, 1)
+        sock.bind(listening.getsockname())
+        sock.connect(peer)
+    except OSError:
+        sock.close()
+        raise
+    finally:
+        for one in both:
+            if one.fileno() >= 0:
+                one.setsockopt(socket.SOL_SOCKET, _SHARE_PORT, 0)
+    return sock
+
+
+def _by_sender(chunks: list[Chunk]) -> dict[str, int]:
+    numbers: dict[str, int] = {}
+    for chunk in chunks:
+        name = _name(chunk.peer)
+        numbers[name] = numbers.get(name, 0) + 1
+    return numbers
+
+
+def _name(place: Hashable) -> str:
+    """An address as the user writes it, 127.0.0.1:14540."""
+    return ":".join(map(str, place)) if isinstance(place, tuple) else str(place)
+
+
+class LockstepLink(UdpLink):
+    """UDP to a simulator in lockstep: returns all datagrams up to a barrier at once, and only once.
+
+    A barrier is a TIMESYNC request at the end of a datagram. The simulator waits for the reply and
+    meanwhile repeats all datagrams since the previous barrier.
+    """
+
+    def __init__(self, sock: socket.socket) -> None:
+        super().__init__(sock, None)
+        self._block: list[Chunk] = []  # since the newest barrier
+        self._barrier = b""
+
+    def follow(self, peer: Hashable) -> None:
+        """The simulator is ours, and a second socket would change the order of its datagrams."""
+
+    def receive(self, timeout_s: float) -> list[Chunk]:
+        complete: list[Chunk] = []
+        for chunk in super().receive(timeout_s):
+            self._block.append(chunk)
+            if _is_barrier(chunk.data):
+                if chunk.data != self._barrier:
+                    complete += self._block
+                self._barrier, self._block = chunk.data, []
+        return complete
+
+
+def _is_barrier(datagram: bytes) -> bool:
+    """Whether the last frame is a TIMESYNC request, which has tc1 = 0."""
+    at = last = 0
+    while at < len(datagram):
+        last, at = at, at + (frame_size(datagram, at) or len(datagram))
+    frame = datagram[last:]
+    return int.from_bytes(frame[7:10], "little") == TIMESYNC and not any(frame[10:18])

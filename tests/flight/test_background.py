@@ -1,0 +1,129 @@
+"""Background writer and log: slow and failing disks stop no caller, and what is lost is counted."""
+
+from __future__ import annotations
+
+import threading
+from pathlib import Path
+
+import pytest
+
+from offboard.analysis import tlog
+from offboard.flight import log as log_module
+from offboard.flight.background import BackgroundWriter
+from offboard.flight.log import FlightLog
+from offboard.mavlink.framing import pack
+
+UNIX_US = 1_767_225_600_000_000
+LONG_S = 20.0
+
+
+class Disk:
+    """Takes nothing until it is `free`."""
+
+    def __init__(self) -> None:
+        self.free, self.asked = threading.Event(), threading.Event()
+        self.items: list[int] = []
+
+    def write(self, items: list[int]) -> None:
+        self.asked.set()
+        assert self.free.wait(LONG_S)
+        self.items += items
+
+
+def test_a_slow_writer_stops_nobody_and_loses_nothing() -> None:
+    disk = Disk()
+    writer = BackgroundWriter(disk.write, 1000)
+    for number in range(500):
+        writer.put(number)
+    assert disk.items == []
+    disk.free.set()
+    writer.close(LONG_S)
+    assert (disk.items, writer.dropped) == (list(range(500)), 0)
+
+
+def test_what_does_not_fit_is_dropped_and_counted() -> None:
+    disk = Disk()
+    writer = BackgroundWriter(disk.write, 10)
+    writer.put(-1)
+    assert disk.asked.wait(LONG_S)  # holds the first
+    for number in range(50):
+        writer.put(number)
+    assert writer.dropped == 40
+    disk.free.set()
+    writer.close(LONG_S)
+    assert disk.items == [-1, *range(10)]
+
+
+def test_in_lockstep_nothing_is_dropped() -> None:
+    disk = Disk()
+    disk.free.set()
+    writer = BackgroundWriter(disk.write, 100, waits=True)
+    for number in range(2000):
+        writer.put(number)
+    writer.close(LONG_S)
+    assert (disk.items, writer.dropped) == (list(range(2000)), 0)
+
+
+def test_what_is_stuck_at_the_end_is_counted() -> None:
+    disk = Disk()
+    writer = BackgroundWriter(disk.write, 100)
+    writer.put(-1)
+    assert disk.asked.wait(LONG_S)
+    for number in range(7):
+        writer.put(number)
+    writer.close(0.05)
+    assert writer.dropped == 8
+    assert not writer.is_free()
+    disk.free.set()
+
+
+@pytest.mark.parametrize("failure", [OSError(28, "No space left"), SystemExit(1)])
+def test_a_failure_is_kept_and_ends_the_writing(failure: BaseException) -> None:
+    written: list[int] = []
+
+    def write(items: list[int]) -> None:
+        if written:
+            raise failure
+        written.extend(items)
+
+    writer = BackgroundWriter(write, 100)
+    writer.put(0)
+    while not written:
+        pass
+    for number in range(1, 6):
+        writer.put(number)
+    writer.close(LONG_S)
+    assert (writer.error, writer.dropped, written) == (failure, 5, [0])
+
+
+def test_a_log_on_a_slow_disk_is_complete(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    free, right = threading.Event(), log_module.append
+
+    def slow(descriptor: int, entries: list[bytes]) -> None:
+        assert free.wait(LONG_S)
+        right(descriptor, entries)
+
+    monkeypatch.setattr(log_module, "append", slow)
+    frames = [pack(0, bytes(9), number % 256, 1, 191) for number in range(3000)]
+    with FlightLog(tmp_path / "x", "", real_time=True) as log:
+        for number, frame in enumerate(frames):
+            log.write(UNIX_US + 100 * number, frame)
+        assert log.path.stat().st_size == 0
+        free.set()
+    assert [entry.frame.raw for entry in tlog.read(log.path).messages] == frames
+    assert (log.problem, log.lost) == ("", 0)
+
+
+def test_a_disk_that_never_answers_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    free = threading.Event()
+    monkeypatch.setattr(log_module, "append", lambda descriptor, entries: free.wait(LONG_S))
+    monkeypatch.setattr(log_module, "QUEUED_MAX", 100)
+    monkeypatch.setattr(log_module, "CLOSE_S", 0.05)
+    with FlightLog(tmp_path / "x", "", real_time=True) as log:
+        for number in range(300):
+            log.write(UNIX_US + number, b"x")
+        assert log.problem == f"the log {log.path} cannot be written (the disk is too slow)"
+    assert log.lost == 300
+    free.set()

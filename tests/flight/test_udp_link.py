@@ -1,0 +1,234 @@
+"""UDP links: arrival stamps, other senders, and the vehicle's change of port, on real sockets."""
+
+from __future__ import annotations
+
+import socket
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from offboard.flight import clock
+from offboard.flight.connection import open_link
+from offboard.flight.link import Chunk, Strangers
+from offboard.flight.udp_link import LOOK_EVERY_S, UdpLink
+from offboard.mavlink.peer import PEER_SILENT_S
+
+LOCAL = "127.0.0.1"
+
+
+class Sender:
+    """Sends datagrams to a link from a port of its own."""
+
+    def __init__(self, link: UdpLink) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind((LOCAL, 0))
+        self.socket.settimeout(5.0)
+        self.place = self.socket.getsockname()
+        self._to = (LOCAL, link.port)
+
+    def send(self, *datagrams: bytes) -> None:
+        for datagram in datagrams:
+            self.socket.sendto(datagram, self._to)
+
+
+@pytest.fixture
+def link() -> Iterator[UdpLink]:
+    opened = open_link(f"udpin:{LOCAL}:0")
+    assert isinstance(opened, UdpLink)
+    yield opened
+    opened.close()
+
+
+@pytest.fixture
+def vehicle(link: UdpLink) -> Iterator[Sender]:
+    sender = Sender(link)
+    yield sender
+    sender.socket.close()
+
+
+@pytest.fixture
+def stranger(link: UdpLink) -> Iterator[Sender]:
+    sender = Sender(link)
+    yield sender
+    sender.socket.close()
+
+
+class Time:
+    """The link's clock, set by the test."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.now_s = clock.monotonic_s()
+        monkeypatch.setattr(clock, "monotonic_s", lambda: self.now_s)
+
+
+def data(chunks: list[Chunk]) -> list[bytes]:
+    return [chunk.data for chunk in chunks]
+
+
+def test_a_datagram_has_the_time_of_its_arrival_not_of_its_reading(
+    link: UdpLink, vehicle: Sender
+) -> None:
+    before_s = time.monotonic()
+    vehicle.send(b"first")
+    between_s = time.monotonic()
+    time.sleep(0.1)
+    vehicle.send(b"second")
+    time.sleep(0.1)
+    first, second = link.receive(1.0)
+    assert before_s - 1e-4 <= first.arrived_s <= between_s + 1e-4
+    assert between_s + 0.1 <= second.arrived_s <= time.monotonic() - 0.1
+    assert (first.peer, second.peer) == (vehicle.place, vehicle.place)
+
+
+@pytest.mark.parametrize("jump_s", [-3600.0, 3600.0])
+def test_a_clock_that_is_set_does_not_move_arrivals(
+    jump_s: float, link: UdpLink, vehicle: Sender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Unix time jumps between the arrival and its reading."""
+    assert link.receive(0.0) == []
+    empty_s = time.monotonic()
+    right = clock.monotonic_less_unix_s
+    vehicle.send(b"x")
+    monkeypatch.setattr(clock, "monotonic_less_unix_s", lambda: right() - jump_s)
+    (chunk,) = link.receive(1.0)
+    assert empty_s - 0.01 <= chunk.arrived_s <= time.monotonic()
+
+
+def test_other_senders_are_counted_and_neither_delay_nor_displace_the_vehicle(
+    link: UdpLink, vehicle: Sender, stranger: Sender
+) -> None:
+    vehicle.send(b"v0")
+    assert data(link.receive(1.0)) == [b"v0"]
+    stranger.send(b"waits already")
+    vehicle.send(b"v1")
+    link.follow(vehicle.place)
+    vehicle.send(b"v2")
+    stranger.send(*[bytes(1000)] * 20_000)  # ten times the buffer
+    vehicle.send(b"v3")
+    time.sleep(LOOK_EVERY_S)
+    heard = link.receive(1.0)
+    while data(heard)[-1:] != [b"v3"]:
+        heard += link.receive(1.0)
+    assert data(heard) == [b"v1", b"v2", b"v3"]
+    assert [chunk.arrived_s for chunk in heard] == sorted(chunk.arrived_s for chunk in heard)
+    looks = 0
+    while link.strangers.total < 20_001:  # the last one tells how many did not fit
+        stranger.send(b"more")
+        vehicle.send(b"v")
+        time.sleep(LOOK_EVERY_S)
+        assert set(data(link.receive(1.0))) == {b"v"}
+        looks += 1
+    assert looks < 300
+    name = f"{LOCAL}:{stranger.place[1]}"
+    news = link.strangers.news()
+    assert f"1 datagram from {name}, which is not the vehicle, was ignored" in news or len(news) > 1
+    assert all(name in sentence for sentence in news)
+    assert link.strangers.news() == []
+
+
+def test_frames_reach_the_vehicle_before_and_after_it_is_followed(
+    link: UdpLink, vehicle: Sender
+) -> None:
+    link.send(b"nobody", None)
+    link.send(b"one", vehicle.place)
+    link.follow(vehicle.place)
+    link.send(b"two", vehicle.place)
+    heard = [vehicle.socket.recvfrom(100) for _ in range(2)]
+    assert heard == [(b"one", (LOCAL, link.port)), (b"two", (LOCAL, link.port))]
+
+
+@pytest.mark.parametrize("option", [socket.SO_REUSEADDR, socket.SO_REUSEPORT])
+@pytest.mark.parametrize("host", [LOCAL, "0.0.0.0"])
+@pytest.mark.parametrize("followed", [False, True])
+def test_no_other_program_gets_the_port(
+    option: int, host: str, followed: bool, link: UdpLink, vehicle: Sender
+) -> None:
+    """pymavlink's udpin sets SO_REUSEADDR: it would take the vehicle's datagrams."""
+    if followed:
+        link.follow(vehicle.place)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
+        other.setsockopt(socket.SOL_SOCKET, option, 1)
+        with pytest.raises(OSError, match="in use"):
+            other.bind((host, link.port))
+
+
+def test_another_port_is_heard_after_a_silence_that_was_observed(
+    link: UdpLink, vehicle: Sender, stranger: Sender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now = Time(monkeypatch)
+    link.follow(vehicle.place)
+    for _ in range(4):
+        now.now_s += 0.4 * PEER_SILENT_S
+        vehicle.send(b"v")
+        stranger.send(b"no")
+        assert data(link.receive(1.0)) == [b"v"]
+    for silent_s, heard in ((0.9, []), (0.2, [b"moved"])):
+        now.now_s += silent_s * PEER_SILENT_S
+        stranger.send(b"moved")
+        assert data(link.receive(0.0)) == heard
+    link.follow(stranger.place)
+    vehicle.send(b"a stranger now")
+    stranger.send(b"v")
+    assert data(link.receive(1.0)) == [b"v"]
+
+
+def test_our_own_pause_is_no_silence_of_the_vehicle(
+    link: UdpLink, vehicle: Sender, stranger: Sender, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Stopped for 3 s: the vehicle's datagrams wait, but a flood may have dropped the newest."""
+    now = Time(monkeypatch)
+    link.follow(vehicle.place)
+    vehicle.send(b"v")
+    now.now_s += 3.0
+    stranger.send(b"spoofed")
+    assert data(link.receive(1.0)) == [b"v"]
+    now.now_s += 0.9 * PEER_SILENT_S
+    stranger.send(b"spoofed")
+    assert link.receive(0.0) == []
+
+
+def test_udpout_hears_only_its_peer() -> None:
+    with (
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer,
+        socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other,
+    ):
+        peer.bind((LOCAL, 0))
+        link = open_link(f"udpout:{LOCAL}:{peer.getsockname()[1]}")
+        link.send(b"hello", None)
+        _, place = peer.recvfrom(100)
+        other.sendto(b"no", place)
+        peer.sendto(b"yes", place)
+        assert data(link.receive(1.0)) == [b"yes"]
+        assert link.receive(0.0) == []
+        link.close()
+
+
+def test_a_refused_datagram_does_not_cost_the_next_one() -> None:
+    """A connected socket reports the ICMP message of the one before instead of sending."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.bind((LOCAL, 0))
+        port = probe.getsockname()[1]
+    link = open_link(f"udpout:{LOCAL}:{port}")
+    link.send(b"too early", None)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as peer:
+        peer.bind((LOCAL, port))
+        peer.settimeout(5.0)
+        link.send(b"heard", None)
+        assert peer.recv(100) == b"heard"
+    link.close()
+
+
+def test_senders_are_named_at_powers_of_ten_and_bounded_in_number() -> None:
+    strangers = Strangers()
+    for _ in range(100):
+        strangers.count("a:1", 1)
+    assert [sentence.split(" from")[0] for sentence in strangers.news()] == [
+        "1 datagram", "10 datagrams", "100 datagrams",
+    ]  # fmt: skip
+    strangers.count("b:2", 78_000)
+    assert strangers.news() == ["78,000 datagrams from b:2, which is not the vehicle, were ignored"]
+    for port in range(1000):
+        strangers.count(f"c:{port}", 1)
+    assert len(strangers.news()) == 6 + 3  # six more names, then 1, 10 and 100 others
+    assert strangers.total == 100 + 78_000 + 1000

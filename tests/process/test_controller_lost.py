@@ -1,0 +1,203 @@
+"""A controller that is killed, stopped or hangs in flight: the supervisor lands the vehicle.
+
+Real processes in real time, each over another kind of link. The log says what was asked of the
+vehicle; the simulated autopilot, which is another program, that it obeyed and landed.
+"""
+
+from __future__ import annotations
+
+import os
+import pty
+import select
+import signal
+import socket
+import subprocess
+import threading
+import time
+import tty
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from processes import Spawn, children, free_port
+
+from offboard.analysis import tlog
+
+HOLD, LAND = 176, 21  # MAV_CMD
+LONG_S = 60.0
+HOVER = (
+    "--reference",
+    "hover",
+    "--set",
+    "reference.duration_s=600",
+    "--set",
+    "reference.height_m=1",
+)
+LAW_THAT_HANGS = """
+import os
+from typing import Literal
+from offboard.control.base import ControllerSettings
+from offboard.control.laws.lqr import LqrSettings
+
+class Settings(ControllerSettings):
+    law: Literal["hangs"] = "hangs"
+
+    def build(self, vehicle, *, period_s, seed):
+        return Hangs(LqrSettings().build(vehicle, period_s=period_s, seed=seed))
+
+class Hangs:
+    def __init__(self, law):
+        self.law = law
+        self.reset = law.reset
+
+    def decide(self, situation):
+        while os.path.exists("hang"):
+            pass
+        return self.law.decide(situation)
+"""
+
+
+@pytest.fixture
+def cable() -> Iterator[Callable[[int], str]]:
+    """A serial line to a TCP port: a pseudo-terminal and a thread."""
+    ends: list[Any] = []
+
+    def lay(port: int) -> str:
+        master, slave = pty.openpty()
+        tty.setraw(slave)
+        other = socket.create_connection(("127.0.0.1", port))
+        ends.extend((master, slave, other))
+        threading.Thread(target=carry, args=(master, other), daemon=True).start()
+        return f"serial:{os.ttyname(slave)}:921600"
+
+    yield lay
+    for end in ends[::-1]:
+        end.close() if isinstance(end, socket.socket) else os.close(end)
+
+
+def carry(master: int, other: socket.socket) -> None:
+    while True:
+        try:
+            ready = select.select([master, other], [], [])[0]
+            if master in ready:
+                other.sendall(os.read(master, 65536))
+            if other in ready:
+                os.write(master, other.recv(65536))
+        except (OSError, ValueError):  # closed at the end of the test
+            return
+
+
+def connections(spawn: Spawn, kind: str, cable: Callable[[int], str]) -> str:
+    """Start a simulator; the address at which it can be flown."""
+    port = free_port()
+    listens = kind != "udp"
+    link = f"tcpin:127.0.0.1:{port}" if listens else f"udpout:127.0.0.1:{port}"
+    simulator = spawn("simulator", "--connect", link, "--gcs", "none")
+    assert simulator.stdout is not None
+    assert simulator.stdout.readline()
+    if kind == "serial":
+        return cable(port)
+    return f"tcp:127.0.0.1:{port}" if listens else f"udpin:127.0.0.1:{port}"
+
+
+def tracking(spawn: Spawn, connection: str, *arguments: str, **more: str) -> subprocess.Popen[str]:
+    """A flight that has just begun to track."""
+    flight = spawn("offboard", "fly", "--connect", connection, "--out", "x", *HOVER, *arguments,
+                   **more)  # fmt: skip
+    assert flight.stdout is not None
+    for line in flight.stdout:
+        if "track: " in line:
+            return flight
+    raise AssertionError(flight.communicate()[1])
+
+
+def ended(pid: int) -> bool:
+    """Whether a process has ended; one that nobody waits for has too."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+def await_end(pid: int) -> None:
+    deadline_s = time.monotonic() + LONG_S
+    while not ended(pid):
+        assert time.monotonic() < deadline_s, f"process {pid} has not ended"
+        time.sleep(0.02)
+
+
+def story(log: tlog.Tlog) -> list[str]:
+    """Commands and texts about the take-over, in order, repeated ones once."""
+    told: list[str] = []
+    for entry in log.messages:
+        if entry.name == "COMMAND_LONG" and entry.message.command in (HOLD, LAND):
+            told.append("hold" if entry.message.command == HOLD else "land")
+        elif entry.name == "STATUSTEXT":
+            told.append(entry.message.text.strip())
+    begun = next(i for i, text in enumerate(told) if text.startswith("supervisor: taking over"))
+    kept = [text for text in told[begun - 1 :] if text in ("hold", "land", "Disarmed by landing")]
+    return [text for text, before in zip(kept, ["", *kept], strict=False) if text != before]
+
+
+def test_a_killed_controller_is_survived(
+    spawn: Spawn, cable: Callable[[int], str], tmp_path: Path
+) -> None:
+    flight = tracking(spawn, connections(spawn, "udp", cable))
+    (supervisor,) = children(flight.pid)
+    flight.kill()
+    await_end(supervisor)
+    _, said = flight.communicate()
+    assert said.splitlines()[0] == (
+        "offboard supervisor: taking over: the controller ended in flight"
+    )
+    assert said.splitlines()[-1] == "offboard supervisor: the vehicle is disarmed"
+    log = tlog.read(tmp_path / "x" / "flight.tlog")
+    assert story(log) == ["hold", "land", "Disarmed by landing"]
+
+
+def test_a_stopped_controller_that_continues_sends_nothing(
+    spawn: Spawn, cable: Callable[[int], str], tmp_path: Path
+) -> None:
+    flight = tracking(spawn, connections(spawn, "tcp", cable))
+    flight.send_signal(signal.SIGSTOP)
+    path = tmp_path / "x" / "flight.tlog"
+    deadline_s = time.monotonic() + LONG_S
+    while b"hold requested" not in path.read_bytes():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+    flight.send_signal(signal.SIGCONT)
+    _, said = flight.communicate(timeout=LONG_S)
+    assert flight.returncode == 4
+    assert said.startswith("supervisor: taking over: the controller has not answered for 0.95 s; ")
+    assert "; land requested; the vehicle is disarmed" in said
+    assert "Traceback" not in said
+    log = tlog.read(path)
+    assert story(log) == ["hold", "land", "Disarmed by landing"]
+    texts = [entry for entry in log.messages if entry.name == "STATUSTEXT"]
+    taken_us = next(e.unix_us for e in texts if "hold requested" in e.message.text)
+    setpoints_us = [e.unix_us for e in log.messages if e.name == "SET_ATTITUDE_TARGET"]
+    assert max(setpoints_us) < taken_us
+
+
+def test_an_endless_loop_in_a_law(
+    spawn: Spawn, cable: Callable[[int], str], tmp_path: Path
+) -> None:
+    """It begins when the file `hang` exists."""
+    metadata = tmp_path / "hangs-1.0.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: hangs\nVersion: 1.0\n")
+    (metadata / "entry_points.txt").write_text(
+        "[pso_offboard.controllers]\nhangs = law_that_hangs:Settings\n"
+    )
+    (tmp_path / "law_that_hangs.py").write_text(LAW_THAT_HANGS)
+    path = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH"))))
+    connection = connections(spawn, "serial", cable)
+    flight = tracking(spawn, connection, "--controller", "hangs", PYTHONPATH=path)
+    (supervisor,) = children(flight.pid)
+    (tmp_path / "hang").touch()
+    await_end(supervisor)
+    assert story(tlog.read(tmp_path / "x" / "flight.tlog")) == [
+        "hold", "land", "Disarmed by landing",
+    ]  # fmt: skip
+    assert flight.poll() is None  # it hangs for ever
