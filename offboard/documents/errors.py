@@ -80,6 +80,12 @@ def shown(value: Any) -> str:
     return text if len(text) <= 60 else f"{text[:57]}..."
 
 
+def abridged(name: object) -> str:
+    """The name of a file for a message: at most 100 characters, without what is no text."""
+    text = str(name).encode(errors="backslashreplace").decode()
+    return text if len(text) <= 100 else f"{text[:97]}..."
+
+
 def _unknown_key(path: str, sections: list[Schema]) -> str:
     known = sorted({key for section in sections for key in section.get("properties", ())})
     near = difflib.get_close_matches(path.rpartition(".")[2], known, n=1)

@@ -37,6 +37,7 @@ from offboard.reference.track import Track
 Raw = dict[str, Any]
 RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
 UNKNOWN_VEHICLE = "neutral"
+DESCENT_MPS = 0.5  # slowest default near the ground: ArduCopter LAND_SPEED; MPC_LAND_SPEED is 0.7
 FOLDERS = {part: shipped.FOLDERS[part] for part in ("vehicle", "controller", "reference")}
 
 
@@ -101,9 +102,16 @@ def build_track(config: FlightConfig) -> Track:
     """
     try:
         track = config.reference.track()
-        check(track, config.vehicle)
+        envelope = check(track, config.vehicle)
     except ValueError as error:
         raise DocumentError(f"reference {config.reference.title}: {error}") from None
+    landing_s = envelope.height_max_m / DESCENT_MPS
+    if landing_s > config.limits.land_s:
+        raise DocumentError(
+            f"reference {config.reference.title}: landing from {envelope.height_max_m:.4g} m takes "
+            f"{landing_s:.4g} s at {DESCENT_MPS} m/s, longer than limits.land_s "
+            f"({config.limits.land_s:g} s); fly lower or allow more time"
+        )
     refused = config.controller.refusal(track)
     if refused:
         raise DocumentError(f"controller: {refused}")

@@ -15,6 +15,7 @@ from types import TracebackType
 from offboard.documents.errors import UserError
 
 _STAMP = struct.Struct(">Q")
+FILES = ("flight.tlog", "flight.yaml", "score.json")  # of a flight directory
 
 
 class LogError(UserError):
@@ -34,8 +35,9 @@ class FlightLog:
 
     def check(self) -> None:
         """Raise LogError if the directory cannot be used, without creating anything."""
-        if self.path.exists():
-            raise self._taken()
+        for name in FILES:
+            if (self.directory / name).exists():
+                raise self._taken(name)
         places = (self.directory, *self.directory.absolute().parents)
         place = next(path for path in places if path.exists())
         if not place.is_dir():
@@ -48,8 +50,8 @@ class FlightLog:
             self.directory.mkdir(parents=True, exist_ok=True)
             self._file = self.path.open("xb", buffering=0)
             self._write_configuration()
-        except FileExistsError:
-            raise self._taken() from None
+        except FileExistsError as error:
+            raise self._taken(Path(error.filename).name) from None
         except OSError as error:
             raise self._unwritable(error) from None
         return self
@@ -57,14 +59,18 @@ class FlightLog:
     def _write_configuration(self) -> None:
         try:
             text = self.configuration
-            (self.directory / "flight.yaml").write_text(text, encoding="utf-8")
+            with (self.directory / "flight.yaml").open("x", encoding="utf-8") as file:
+                file.write(text)
         except OSError:
             self._file.close()
             self.path.unlink()  # the empty log of a flight that does not begin
             raise
 
-    def _taken(self) -> LogError:
-        return LogError(f"{self.path} already holds a flight; choose another directory with --out")
+    def _taken(self, name: str) -> LogError:
+        return LogError(
+            f"{self.directory / name} exists: the directory already holds a flight; choose another "
+            "directory with --out"
+        )
 
     def _unwritable(self, error: OSError) -> LogError:
         return LogError(
