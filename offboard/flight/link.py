@@ -15,7 +15,7 @@ from collections.abc import Hashable
 from contextlib import suppress
 from typing import Protocol
 
-from offboard.documents.errors import UserError
+from offboard.documents.errors import UserError, abridged, shown
 from offboard.mavlink.framing import frame_size
 
 Chunk = tuple[bytes, Hashable]
@@ -197,7 +197,7 @@ class SerialLink(StreamLink):
         super().__init__()
         try:
             self._port = serial.Serial(device, baud, timeout=0)
-        except (serial.SerialException, ValueError) as error:
+        except (serial.SerialException, ValueError, OverflowError) as error:
             raise LinkError(
                 f"serial port {device} at {baud} baud cannot be opened: {error}"
             ) from None
@@ -242,9 +242,9 @@ def open_link(address: str) -> Link:
     """
     kind, _, rest = address.partition(":")
     host, _, tail = rest.rpartition(":")
-    if kind not in ("udpin", "udpout", "tcp", "serial") or not host or not tail.isdigit():
+    if kind not in ("udpin", "udpout", "tcp", "serial") or not host or not _is_number(tail):
         raise LinkError(
-            f"connection {address!r} is not understood; use udpin:HOST:PORT, udpout:HOST:PORT, "
+            f"connection {shown(address)} is not understood; use udpin:HOST:PORT, udpout:HOST:PORT, "
             "tcp:HOST:PORT or serial:DEVICE:BAUD"
         )
     number = int(tail)
@@ -253,6 +253,11 @@ def open_link(address: str) -> Link:
     if not 0 <= number <= 65535:
         raise LinkError(f"connection {address!r}: port {number} is not within 0 .. 65535")
     return _open_socket(kind, host, number, address)
+
+
+def _is_number(text: str) -> bool:
+    """Whether it is a number of at most ten of the digits 0 .. 9: a port or a baud rate."""
+    return text.isascii() and text.isdigit() and len(text) <= 10
 
 
 def _open_socket(kind: str, host: str, port: int, address: str) -> Link:
@@ -266,9 +271,10 @@ def _open_socket(kind: str, host: str, port: int, address: str) -> Link:
         if kind == "udpout":
             return UdpLink(sock, peer)
         sock.bind(peer)
-    except OSError as error:
+    except (OSError, UnicodeError) as error:  # UnicodeError: a host like a..b
         raise LinkError(
-            f"connection {address} cannot be opened: {error.strerror or error}"
+            f"connection {abridged(address)} cannot be opened: "
+            f"{getattr(error, 'strerror', None) or error}"
             + ("; another program uses the port" if getattr(error, "errno", 0) == 98 else "")
         ) from None
     return UdpLink(sock, None)
