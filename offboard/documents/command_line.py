@@ -24,8 +24,9 @@ DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
 def run(load: Callable[[], Callable[[], object]]) -> NoReturn:
-    """Import a command with `load`, call it, and exit. The command calls `interrupts_raise` when its
-    arguments are parsed.
+    """Import a command with `load`, call it, and exit.
+
+    An interrupt exits at once until the command calls `interrupts_raise`, its arguments parsed.
 
     A UserError is printed without a traceback and exits with its `code`, 2 without one. So do an
     interrupt, a lack of memory, and an error of a file or of the output.
