@@ -244,8 +244,8 @@ def open_link(address: str) -> Link:
     host, _, tail = rest.rpartition(":")
     if kind not in ("udpin", "udpout", "tcp", "serial") or not host or not _is_number(tail):
         raise LinkError(
-            f"connection {shown(address)} is not understood; use udpin:HOST:PORT, udpout:HOST:PORT, "
-            "tcp:HOST:PORT or serial:DEVICE:BAUD"
+            f"connection {shown(address)} is not understood; use udpin:HOST:PORT, "
+            "udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
         )
     number = int(tail)
     if kind == "serial":
