@@ -98,7 +98,8 @@ def _split(url: str) -> tuple[str, str, int]:
     number = parts[-1].isascii() and parts[-1].isdigit() and len(parts[-1]) <= 5
     if not (usable and number and 0 < int(parts[2]) < 65536):
         raise LinkError(
-            f"{abridged(url)} is not a link: give udpout:, udpin: or tcpin:HOST:PORT, port 1 .. 65535"
+            f"{abridged(url)} is not a link: give udpout:, udpin: or tcpin:HOST:PORT, "
+            "port 1 .. 65535"
         )
     return parts[0], parts[1], int(parts[2])
 
