@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import signal
 import sys
@@ -112,6 +113,9 @@ def simulate(
         _refuse("--speed and --lockstep exclude each other: lockstep has no speed")
     if speed is not None and not 0.1 <= speed <= 1000.0:
         _refuse(f"--speed {speed:g}: must be 0.1 .. 1000")
+    for option, seconds in (("--duration", duration), ("--patience", patience)):
+        if seconds is not None and math.isnan(seconds):
+            _refuse(f"{option} nan: must be a number")
     if lockstep and instances > 1:
         _refuse("--lockstep and --instances exclude each other: time waits for one companion")
     if instance + instances > SYSTEM_MAX:

@@ -18,7 +18,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from offboard.documents.errors import DocumentError as DocumentError
-from offboard.documents.errors import key_path, sentence, shown
+from offboard.documents.errors import abridged, key_path, sentence, shown
 
 M = TypeVar("M", bound=BaseModel)
 Json = dict[str, Any]
@@ -80,10 +80,11 @@ def override(mapping: Mapping[str, Any], assignment: str) -> Json:
     `validate`. Raises DocumentError where `key.path=` is missing or the value is no YAML.
     """
     path, separator, text = assignment.partition("=")
+    source = f"--set {abridged(assignment)}"
     keys = [key.strip() for key in path.split(".")]
     if not separator or not all(keys):
-        raise DocumentError(f"--set {assignment}: expected key.path=value")
-    changed: Json = _with(mapping, keys, _loaded(text, f"--set {assignment}"))
+        raise DocumentError(f"{source}: expected key.path=value")
+    changed: Json = _with(mapping, keys, _loaded(text, source))
     return changed
 
 

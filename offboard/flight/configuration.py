@@ -21,6 +21,7 @@ from pydantic import BaseModel, Field, SerializeAsAny, create_model, model_valid
 from offboard.control import catalogue
 from offboard.control.base import Controller, ControllerSettings
 from offboard.documents import shipped
+from offboard.documents.errors import abridged
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import DocumentError, override, read, validate
 from offboard.documents.shipped import locate, read_text
@@ -83,7 +84,7 @@ def load(
     for assignment in assignments:
         raw = override(raw, assignment)
         key = assignment.partition("=")[0].strip()
-        options[key] = f"--set {assignment}"
+        options[key] = f"--set {abridged(assignment)}"
         if key in FOLDERS and isinstance(raw[key], str):
             raw[key] = read_part(key, raw[key])
     missing = [_missing(part, raw) for part in FOLDERS if part not in raw]
