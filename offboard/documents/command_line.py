@@ -154,6 +154,11 @@ def _flushed() -> OSError | None:
     try:
         sys.stdout.flush()
     except OSError as error:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        drop_output()
         return error
     return None
+
+
+def drop_output() -> None:
+    """Send stdout to /dev/null from now on, after an error of it."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

@@ -1,4 +1,4 @@
-"""Arguments, files and processes that no user means: one sentence, exit code 2, nothing overwritten.
+"""Arguments, files and processes that no user means: one sentence, exit code 2, no file changed.
 
 What ends before anything is sent is called in this process; the rest are real processes.
 """
@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import os
 import resource
-import signal
 import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
 from offboard import cli
 from offboard.analysis import tlog
 from offboard.analysis.compare import Result
@@ -63,7 +63,8 @@ VALUES = {
     "offboard check": ("FILE...",),
     "offboard paper": ("--out", "--figure", "--table", "--initial-q"),
     "simulator": (
-        "--connect", "--gcs", "--firmware", "--scenario", "--vehicle", "--param", "--log", "--check",
+        "--connect", "--gcs", "--firmware", "--scenario", "--vehicle", "--param", "--log",
+        "--check",
     ),
 }  # fmt: skip
 
@@ -377,7 +378,7 @@ builtins.__import__ = imported
 
 
 def test_an_interrupted_score_is_one_sentence(tmp_path: Path) -> None:
-    begin = f"""
+    begin = """
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)
 from offboard.analysis import trial
@@ -385,6 +386,18 @@ trial.score_flight = lambda flight: signal.raise_signal(signal.SIGINT)
 """
     ended = process(SCORE, tmp_path, begin)
     assert (ended.returncode, ended.stderr) == (2, "interrupted\n")
+
+
+def test_a_flight_whose_result_cannot_be_printed_keeps_its_exit_code(tmp_path: Path) -> None:
+    begin = f"""
+{FULL}
+from offboard.cli import fly
+fly.say = lambda text, indent=0: print(text) if "preparing" not in text else None
+"""
+    ended = process(f"offboard fly {' '.join(LINK)} --out x", tmp_path, begin)
+    assert ended.returncode == 3
+    assert ended.stderr.endswith("; the output cannot be written: No space left on device\n")
+    assert "Traceback" not in ended.stderr
 
 
 def test_closed_standard_files_are_no_log(tmp_path: Path) -> None:
