@@ -55,8 +55,11 @@ def run(load: Callable[[], Callable[[], object]]) -> NoReturn:
     unwritten = _flushed()
     if unwritten and not sentence:
         sentence, code = explained(unwritten), code or USAGE
-    if sentence:
-        complain(sentence)
+    try:
+        if sentence:
+            complain(sentence)
+    except OSError:  # stderr cannot be written either: the exit code is all that is left
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
     raise SystemExit(code)
 
 
@@ -82,7 +85,7 @@ def wrapped(text: str, width: int, indent: int) -> str:
 
     return textwrap.fill(
         text,
-        width,
+        max(width, 1),  # COLUMNS=0
         subsequent_indent=indent * " ",
         break_long_words=False,
         break_on_hyphens=False,

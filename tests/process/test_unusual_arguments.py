@@ -307,6 +307,7 @@ def process(
 FULL = "sys.stdout = open('/dev/full', 'w')"
 GONE = "import os; os.mkdir('gone'); os.chdir('gone'); os.rmdir('../gone')"
 LITTLE = "import resource; resource.setrlimit(resource.RLIMIT_AS, (400_000_000, 400_000_000))"
+NO_OUTPUT = f"{FULL}; sys.stderr = open('/dev/full', 'w')"
 SCORE = f"offboard score {RECORDING}"
 
 
@@ -329,6 +330,19 @@ def test_a_process_that_lacks_something_says_so(
 ) -> None:
     ended = process(command, tmp_path, begin)
     assert says in refused((ended.returncode, ended.stderr))
+
+
+@pytest.mark.parametrize("command", ["offboard check no.yaml", SCORE, "offboard paper --table 99"])
+def test_without_any_output_the_exit_code_is_left(command: str, tmp_path: Path) -> None:
+    ended = process(command, tmp_path, NO_OUTPUT)
+    assert (ended.returncode, ended.stdout) == (2, "")
+
+
+def test_a_page_on_a_full_disk_leaves_no_file(tmp_path: Path) -> None:
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))"
+    ended = process(f"offboard identify {RECORDING} --page x.html -o x.yaml", tmp_path, limit)
+    assert refused((ended.returncode, ended.stderr)).startswith("x.html cannot be written (File")
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become a user without rights")
