@@ -171,7 +171,7 @@ def _kind(raw: Raw) -> str:
     }
 
     def likeness(kind: str) -> tuple[int, int]:
-        close = sum(bool(get_close_matches(key, keys[kind], n=1)) for key in raw)
+        close = sum(bool(get_close_matches(key, keys[kind], n=1)) for key in list(raw)[:100])
         return len(raw.keys() & keys[kind]), close
 
     return max(keys, key=likeness)
