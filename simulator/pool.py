@@ -13,11 +13,13 @@ import select
 import signal
 import sys
 import traceback
+from functools import partial
 from io import FileIO
 from typing import NoReturn
 
 from offboard.compiled import loading, prepare
-from simulator.cli import app
+from offboard.documents.command_line import run
+from simulator.command import app
 
 
 def serve(requests: FileIO) -> None:
@@ -51,7 +53,7 @@ def _fly(options: list[str]) -> NoReturn:
     os.dup2(null, 1)
     code = 1
     try:
-        app(options)
+        run(lambda: partial(app, options))
     except SystemExit as ended:
         code = int(ended.code or 0)
     except BaseException:

@@ -107,7 +107,7 @@ def test_python_examples_run(readme: str, tmp_path: Path) -> None:
 
 
 def _subcommands() -> list[str]:
-    from offboard.cli import app
+    from offboard.cli.commands import app
 
     return sorted(info.name or info.callback.__name__ for info in app.registered_commands)
 

@@ -19,7 +19,7 @@ from rich.progress import (
     TimeElapsedColumn,
 )
 
-from offboard.analysis.compare import Fly, Result, Trial, as_csv, as_json, run, table, trials
+from offboard.analysis.compare import Fly, Result, Row, Trial, as_csv, as_json, run, table, trials
 from offboard.analysis.compare_page import page
 from offboard.analysis.compare_table import digits, numbered_seeds, show
 from offboard.analysis.workers import open_worker, processors
@@ -65,23 +65,35 @@ def compare_all(
         missing.insert(0, f"{ended}; nothing more was flown")
     for words in missing:
         console.print(words, style="yellow", markup=False)
-    (directory / "compare.csv").write_text(as_csv(rows), encoding="utf-8")
-    (directory / "compare.json").write_text(as_json(rows), encoding="utf-8")
-    (directory / "compare.html").write_text(page(rows, missing), encoding="utf-8")
-    console.print(f"written: {directory / 'compare.html'}", markup=False, soft_wrap=True)
+    unwritten = _written(directory, rows, missing)
+    if not unwritten:
+        console.print(f"written: {directory / 'compare.html'}", markup=False, soft_wrap=True)
     failed = sum(not result.flown for result in results)
     problems = [f"{failed} of {len(results)} flights failed; the table says why"] if failed else []
     if missing:
         count = f"{len(planned) - len(results)} of {len(planned)} flights missing"
         problems.append(f"{ended or 'interrupted'}: {count}")
-    return "; ".join(problems)
+    return "; ".join([*problems, *unwritten])
+
+
+def _written(directory: Path, rows: Sequence[Row], missing: Sequence[str]) -> list[str]:
+    """Write the table and the page; a sentence about the first file that cannot be written."""
+    documents = {"csv": as_csv(rows), "json": as_json(rows), "html": page(rows, missing)}
+    for suffix, text in documents.items():
+        path = directory / f"compare.{suffix}"
+        try:
+            path.write_text(text, encoding="utf-8")
+        except OSError as error:
+            return [f"{path} cannot be written ({error.strerror})"]
+    return []
 
 
 def _claim(directory: Path) -> None:
     try:
         directory.mkdir(parents=True, exist_ok=True)
         occupied = any(directory.iterdir())
-        (directory / "compare.csv").touch()
+        if not occupied:
+            (directory / "compare.csv").touch()
     except OSError as error:
         raise LogError(
             f"the comparison cannot be recorded in {directory}: {error.strerror}; "

@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pymavlink.dialects.v20 import ardupilotmega as dialect
 
-from offboard.documents.errors import UserError
+from offboard.documents.errors import UserError, abridged
 from offboard.mavlink.counters import DropReason
 from offboard.mavlink.framing import Frame, frame_size, parse
 
@@ -70,7 +70,8 @@ def find(flight: Path) -> Path:
     """The .tlog of a flight, given as flight directory or as file. Raises TlogError."""
     path = flight / "flight.tlog" if flight.is_dir() else flight
     if not path.is_file():
-        raise TlogError(f"{path} does not exist; name a flight directory or a .tlog file")
+        problem = "is not a regular file" if path.exists() else "does not exist"
+        raise TlogError(f"{abridged(path)} {problem}; name a flight directory or a .tlog file")
     return path
 
 

@@ -40,13 +40,15 @@ def score_flight(flight: Path) -> tuple[Score, History]:
 
 
 def keep_score(directory: Path, score: Score, flown: History) -> None:
-    """Write score.json into a flight directory. Raises LogError."""
-    path = directory / "score.json"
+    """Write score.json into a flight directory; a score that is there stays until the new one is
+    complete. Raises LogError."""
+    path, incomplete = directory / "score.json", directory / "score.json.part"
     try:
-        path.write_text(as_text(score, flown), encoding="utf-8")
+        incomplete.write_text(as_text(score, flown), encoding="utf-8")
+        incomplete.replace(path)
     except OSError as error:
         with suppress(OSError):
-            path.unlink()  # an incomplete file
+            incomplete.unlink()
         raise LogError(f"{path} cannot be written ({error.strerror})") from None
 
 

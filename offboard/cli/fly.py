@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import sys
 from contextlib import closing, nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -24,6 +25,7 @@ from offboard.cli.shared import (
     out,
     say,
 )
+from offboard.documents.command_line import drop_output, explained
 
 if TYPE_CHECKING:
     from offboard.analysis.requirement import Requirement
@@ -152,16 +154,21 @@ def _conclude(
     missed = [each for each in checked if not each.met(score.figures())]
     results = "; ".join(each.sentence(score.figures()) for each in missed or checked)
     code = outcome.exit_code or int(bool(missed))
-    out.print()
-    if not_shown:
-        say(f"{not_shown} lines of the flight are missing above: the terminal was stopped")
-    if outcome.exit_code:
-        complain(f"{outcome.sentence} (log: {directory / 'flight.tlog'})")
-    elif missed:
-        complain(f"{outcome.sentence}; requirement missed: {results}")
-    else:
-        say(f"{outcome.sentence}{'; requirement met: ' if results else ''}{results}")
-    for label, text in summary(score, history, directory):
-        say(f"  {label:<{LABEL_WIDTH}}{text}", indent=2 + LABEL_WIDTH)
+    try:
+        out.print()
+        if not_shown:
+            say(f"{not_shown} lines of the flight are missing above: the terminal was stopped")
+        if outcome.exit_code:
+            complain(f"{outcome.sentence} (log: {directory / 'flight.tlog'})")
+        elif missed:
+            complain(f"{outcome.sentence}; requirement missed: {results}")
+        else:
+            say(f"{outcome.sentence}{'; requirement met: ' if results else ''}{results}")
+        for label, text in summary(score, history, directory):
+            say(f"  {label:<{LABEL_WIDTH}}{text}", indent=2 + LABEL_WIDTH)
+        sys.stdout.flush()
+    except OSError as error:  # the exit code stays that of the flight
+        drop_output()
+        complain(f"{outcome.sentence}; {explained(error)}")
     if code:
         raise typer.Exit(code)

@@ -6,13 +6,14 @@ wrong options are answered at once.
 
 from __future__ import annotations
 
-import textwrap
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 from rich.console import Console
 
+from offboard.documents.command_line import complain as complain
+from offboard.documents.command_line import wrapped
 from offboard.documents.errors import UserError
 
 out = Console(highlight=False)
@@ -60,23 +61,4 @@ class CommandError(UserError):
 
 def say(text: str, indent: int = 0) -> None:
     """Print a line to stdout, wrapped at words to the width; further lines are indented."""
-    out.print(_wrapped(text, out.width, indent), markup=False, soft_wrap=True)
-
-
-def complain(text: str) -> None:
-    """Print to stderr: wrapped on a terminal, else a line for each problem."""
-    lines = text.splitlines()
-    if err.is_terminal:
-        lines = [_wrapped(line, err.width, 2) for line in lines]
-    err.print("\n".join(lines), markup=False, soft_wrap=True)
-
-
-def _wrapped(text: str, width: int, indent: int) -> str:
-    """Paths and other long words stay whole, so that they can be copied."""
-    return textwrap.fill(
-        text,
-        width,
-        subsequent_indent=indent * " ",
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
+    out.print(wrapped(text, out.width, indent), markup=False, soft_wrap=True)

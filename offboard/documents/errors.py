@@ -36,7 +36,8 @@ def sentence(detail: ErrorDetails, document: Any, schema: Schema) -> str:
     `detail` is from `ValidationError.errors()`, `document` the value that was validated, `schema`
     the JSON schema of the whole model.
     """
-    kind, path, value = detail["type"], key_path(detail, document), shown(detail["input"])
+    path = abridged(key_path(detail, document))
+    kind, value = detail["type"], shown(detail["input"])
     if kind == "extra_forbidden":
         return _unknown_key(path, _places(detail["loc"][:-1], schema))
     if kind == "missing":
@@ -78,6 +79,12 @@ def shown(value: Any) -> str:
         return "an empty value"
     text = str(value).lower() if isinstance(value, bool) else repr(value)
     return text if len(text) <= 60 else f"{text[:57]}..."
+
+
+def abridged(name: object) -> str:
+    """A name or path for a message: at most 100 characters, without what is no text."""
+    text = str(name).encode(errors="backslashreplace").decode()
+    return text if len(text) <= 100 else f"{text[:97]}..."
 
 
 def _unknown_key(path: str, sections: list[Schema]) -> str:

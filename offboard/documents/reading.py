@@ -18,11 +18,12 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from offboard.documents.errors import DocumentError as DocumentError
-from offboard.documents.errors import key_path, sentence, shown
+from offboard.documents.errors import abridged, key_path, sentence, shown
 
 M = TypeVar("M", bound=BaseModel)
 Json = dict[str, Any]
 DESCRIPTION_SIZE = 200
+PROBLEMS_MOST = 10
 
 _INTEGER = re.compile(r"[-+]?[0-9]{1,400}")
 _HEXADECIMAL = re.compile(r"0x[0-9a-fA-F]{1,300}")
@@ -37,7 +38,7 @@ _WORDS: dict[str, Any] = {
 def parse(text: str, model: type[M], source: str) -> M:
     """YAML `text` -> an instance of `model`. `source` names the text in errors (a file's name).
 
-    Raises DocumentError with every problem found.
+    Raises DocumentError with the problems found.
     """
     return validate(read(text, source), model, source)
 
@@ -79,10 +80,11 @@ def override(mapping: Mapping[str, Any], assignment: str) -> Json:
     `validate`. Raises DocumentError where `key.path=` is missing or the value is no YAML.
     """
     path, separator, text = assignment.partition("=")
+    source = f"--set {abridged(assignment)}"
     keys = [key.strip() for key in path.split(".")]
     if not separator or not all(keys):
-        raise DocumentError(f"--set {assignment}: expected key.path=value")
-    changed: Json = _with(mapping, keys, _loaded(text, f"--set {assignment}"))
+        raise DocumentError(f"{source}: expected key.path=value")
+    changed: Json = _with(mapping, keys, _loaded(text, source))
     return changed
 
 
@@ -92,7 +94,8 @@ def validate(
     source: str,
     options: Mapping[str, str] = MappingProxyType({}),
 ) -> M:
-    """Raw mapping -> an instance of `model`. Raises DocumentError with every problem found.
+    """Raw mapping -> an instance of `model`. Raises DocumentError with the problems
+    found, at most PROBLEMS_MOST of them.
 
     `source` names the file in errors. `options` maps a key path to the command-line option that
     set it; an error there names the option instead.
@@ -102,11 +105,14 @@ def validate(
         return model.model_validate_json(json.dumps(mapping), strict=True)
     except ValidationError as error:
         schema = model.model_json_schema()
+        details = error.errors(include_url=False)
         problems = [
             f"{_origin(key_path(detail, mapping), options, source)}: "
             f"{sentence(detail, mapping, schema)}"
-            for detail in error.errors(include_url=False)
+            for detail in details[:PROBLEMS_MOST]
         ]
+        if len(details) > PROBLEMS_MOST:
+            problems.append(f"{source}: and {len(details) - PROBLEMS_MOST} more problems")
         raise DocumentError(*problems) from None
 
 
@@ -177,7 +183,7 @@ def _with(value: Any, keys: list[str], new: Any) -> Any:
     if not keys:
         return new
     key, rest = keys[0], keys[1:]
-    if isinstance(value, list) and key.isdecimal() and int(key) < len(value):
+    if isinstance(value, list) and key in map(str, range(len(value))):
         index = int(key)
         return [*value[:index], _with(value[index], rest, new), *value[index + 1 :]]
     section = dict(value) if isinstance(value, Mapping) else {}

@@ -9,7 +9,9 @@ from collections.abc import Sequence
 from importlib import resources
 from pathlib import Path
 
-from offboard.documents.errors import DocumentError
+from offboard.documents.errors import DocumentError, abridged, shown
+
+SIZE_MOST = 500_000  # characters of a file: a table of 10,000 rows, or 5 s to parse as YAML
 
 # kind of file -> its folder
 FOLDERS = {
@@ -51,17 +53,24 @@ def locate(name: str, folder: str, kind: str, others: Sequence[str] = ()) -> Pat
     or .yml. Raises DocumentError with the known names, `others` among them."""
     if name.endswith((".yaml", ".yml")) or "/" in name:
         return Path(name)
-    candidate = directory() / folder / f"{name}.yaml"
-    if candidate.is_file():
-        return candidate
+    if name in names(folder):
+        return directory() / folder / f"{name}.yaml"
     known = sorted((*names(folder), *others))
-    raise DocumentError(f"there is no {kind} named {name!r}; known are {', '.join(known)}")
+    raise DocumentError(f"there is no {kind} named {shown(name)}; known are {', '.join(known)}")
 
 
 def read_text(path: Path) -> str:
-    """The content of a UTF-8 file. Raises DocumentError."""
+    """The content of a UTF-8 file of at most SIZE_MOST characters. Raises DocumentError."""
     try:
-        return path.read_text(encoding="utf-8")
-    except (OSError, UnicodeDecodeError) as error:
-        reason = getattr(error, "strerror", None) or "not UTF-8 text"
-        raise DocumentError(f"{path} cannot be read: {reason}") from None
+        if not path.is_file():
+            path.stat()  # says why there is none
+            raise DocumentError(f"{path} cannot be read: not a regular file")
+        with path.open(encoding="utf-8") as file:
+            text = file.read(SIZE_MOST + 1)
+        if len(text) > SIZE_MOST:
+            raise DocumentError(f"{path} cannot be read: larger than {SIZE_MOST // 1000} kB")
+        return text
+    except OSError as error:
+        raise DocumentError(f"{abridged(path)} cannot be read: {error.strerror}") from None
+    except ValueError:  # also a name that no file can have
+        raise DocumentError(f"{shown(str(path))} cannot be read: not UTF-8 text") from None

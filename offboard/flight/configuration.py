@@ -21,6 +21,7 @@ from pydantic import BaseModel, Field, SerializeAsAny, create_model, model_valid
 from offboard.control import catalogue
 from offboard.control.base import Controller, ControllerSettings
 from offboard.documents import shipped
+from offboard.documents.errors import abridged
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import DocumentError, override, read, validate
 from offboard.documents.shipped import locate, read_text
@@ -37,6 +38,7 @@ from offboard.reference.track import Track
 Raw = dict[str, Any]
 RECORDED_VERSIONS = ("pso-offboard", "pymavlink", "numpy", "scipy", "numba")
 UNKNOWN_VEHICLE = "neutral"
+DESCENT_MPS = 0.5  # slowest default near the ground: ArduCopter LAND_SPEED; MPC_LAND_SPEED is 0.7
 FOLDERS = {part: shipped.FOLDERS[part] for part in ("vehicle", "controller", "reference")}
 
 
@@ -82,7 +84,7 @@ def load(
     for assignment in assignments:
         raw = override(raw, assignment)
         key = assignment.partition("=")[0].strip()
-        options[key] = f"--set {assignment}"
+        options[key] = f"--set {abridged(assignment)}"
         if key in FOLDERS and isinstance(raw[key], str):
             raw[key] = read_part(key, raw[key])
     missing = [_missing(part, raw) for part in FOLDERS if part not in raw]
@@ -101,9 +103,16 @@ def build_track(config: FlightConfig) -> Track:
     """
     try:
         track = config.reference.track()
-        check(track, config.vehicle)
+        envelope = check(track, config.vehicle)
     except ValueError as error:
         raise DocumentError(f"reference {config.reference.title}: {error}") from None
+    landing_s = envelope.height_max_m / DESCENT_MPS
+    if landing_s > config.limits.land_s:
+        raise DocumentError(
+            f"reference {config.reference.title}: landing from {envelope.height_max_m:.4g} m takes "
+            f"{landing_s:.4g} s at {DESCENT_MPS} m/s, longer than limits.land_s "
+            f"({config.limits.land_s:g} s); fly lower or allow more time"
+        )
     refused = config.controller.refusal(track)
     if refused:
         raise DocumentError(f"controller: {refused}")
@@ -162,7 +171,7 @@ def _kind(raw: Raw) -> str:
     }
 
     def likeness(kind: str) -> tuple[int, int]:
-        close = sum(bool(get_close_matches(key, keys[kind], n=1)) for key in raw)
+        close = sum(bool(get_close_matches(key, keys[kind], n=1)) for key in list(raw)[:100])
         return len(raw.keys() & keys[kind]), close
 
     return max(keys, key=likeness)

@@ -12,12 +12,12 @@ import re
 import socket
 from errno import EADDRINUSE
 
+from offboard.documents.errors import shown
 from offboard.flight.link import Link, LinkError
 from offboard.flight.stream_link import serial_link, tcp_link
 from offboard.flight.udp_link import LockstepLink, UdpLink, udp_socket
 
 FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
-SHOWN_MAX = 80  # characters of an address in an error
 PORT_MAX, BAUD_MAX = 65535, 100_000_000
 _ADDRESS = re.compile(r"(udpin|udpout|tcp|serial):(.+):([0-9]{1,9})", re.ASCII)
 
@@ -36,16 +36,16 @@ def open_link(address: str) -> Link:
     """
     matched = _ADDRESS.fullmatch(address)
     if matched is None:
-        raise LinkError(f"connection {_shown(address)} is not understood; use {FORMS}")
+        raise LinkError(f"connection {shown(address)} is not understood; use {FORMS}")
     kind, host, number = matched[1], matched[2], int(matched[3])
     if kind == "serial":
         if not 0 < number <= BAUD_MAX:
-            raise LinkError(f"connection {_shown(address)}: {number} baud is no rate of a port")
+            raise LinkError(f"connection {shown(address)}: {number} baud is no rate of a port")
         return serial_link(host, number)
     least = 0 if kind == "udpin" else 1  # 0: any free port
     if not least <= number <= PORT_MAX:
         raise LinkError(
-            f"connection {_shown(address)}: port {number} is not within {least} .. {PORT_MAX}"
+            f"connection {shown(address)}: port {number} is not within {least} .. {PORT_MAX}"
         )
     try:
         return tcp_link(host, number) if kind == "tcp" else _udp_link(kind, host, number)
@@ -53,7 +53,7 @@ def open_link(address: str) -> Link:
         reason = getattr(error, "strerror", None) or error
         taken = getattr(error, "errno", None) == EADDRINUSE
         raise LinkError(
-            f"connection {_shown(address)} cannot be opened: {reason}"
+            f"connection {shown(address)} cannot be opened: {reason}"
             + ("; another program uses the port" if taken else "")
         ) from None
 
@@ -70,10 +70,3 @@ def _udp_link(kind: str, host: str, port: int) -> UdpLink:
         sock.close()
         raise
     return UdpLink(sock, None)
-
-
-def _shown(address: str) -> str:
-    """The address, quoted if it is empty or unprintable, and cut if it is long."""
-    if len(address) > SHOWN_MAX:
-        address = f"{address[:SHOWN_MAX]}..."
-    return address if address.isprintable() and address else repr(address)

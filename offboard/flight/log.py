@@ -19,6 +19,7 @@ from offboard.flight.background import BackgroundWriter
 _STAMP = struct.Struct(">Q")
 QUEUED_MAX = 100_000  # entries, minutes of a flight
 CLOSE_S = 10.0  # for what is queued when the flight ends
+FILES = ("flight.tlog", "flight.yaml", "score.json")  # of a flight directory
 
 
 class LogError(UserError):
@@ -41,8 +42,9 @@ class FlightLog:
 
     def check(self) -> None:
         """Raise LogError if the directory cannot be used, without creating anything."""
-        if self.path.exists():
-            raise self._taken()
+        for name in FILES:
+            if (self.directory / name).exists():
+                raise self._taken(name)
         places = (self.directory, *self.directory.absolute().parents)
         place = next(path for path in places if path.exists())
         if not place.is_dir():
@@ -57,8 +59,8 @@ class FlightLog:
             flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND
             self.descriptor = os.open(self.path, flags, 0o666)
             self._write_configuration()
-        except FileExistsError:
-            raise self._taken() from None
+        except FileExistsError as error:
+            raise self._taken(Path(error.filename).name) from None
         except OSError as error:
             raise self._unwritable(error) from None
         self._writer = BackgroundWriter[bytes](self._append, QUEUED_MAX, waits=not self._real_time)
@@ -67,14 +69,18 @@ class FlightLog:
     def _write_configuration(self) -> None:
         try:
             text = self.configuration
-            (self.directory / "flight.yaml").write_text(text, encoding="utf-8")
+            with (self.directory / "flight.yaml").open("x", encoding="utf-8") as file:
+                file.write(text)
         except OSError:
             os.close(self.descriptor)
             self.path.unlink()  # the empty log of a flight that does not begin
             raise
 
-    def _taken(self) -> LogError:
-        return LogError(f"{self.path} already holds a flight; choose another directory with --out")
+    def _taken(self, name: str) -> LogError:
+        return LogError(
+            f"{self.directory / name} exists: the directory already holds a flight; choose another "
+            "directory with --out"
+        )
 
     def _unwritable(self, error: OSError) -> LogError:
         return LogError(

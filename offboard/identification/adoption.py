@@ -8,14 +8,14 @@ from typing import Any
 
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import Identified
-from offboard.model.vehicle import AxisResponse, Vehicle
+from offboard.model.vehicle import HOVER_THRUST_LIMITS, AxisResponse, Vehicle
 
 # Least and greatest value of each constant, whatever the vehicle file says.
 BOUNDS = {
     "delay": (0.0, 0.5),
     "frequency": (2.0, 45.0),
     "damping": (0.2, 2.5),
-    "hover thrust": (0.1, 0.8),
+    "hover thrust": HOVER_THRUST_LIMITS,
     "thrust lag": (0.0, 0.25),
     "thrust delay": (0.0, 0.5),
     "drag": (0.02, 3.0),

@@ -20,6 +20,7 @@ NonNegativeTriple = tuple[
     Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]
 ]
 
+HOVER_THRUST_LIMITS = (0.02, 0.95)  # of a file, and of what identification adopts in flight
 DRAG_PER_MASS_MOST_PS = 100.0  # falls at 0.1 m/s: nothing is left to control
 
 
@@ -51,7 +52,9 @@ class Vehicle(Parameters):
     arm_m: float = Field(default=1.0, gt=0, le=10)
     drag_translation_npmps: NonNegativeTriple  # D_t, Eq. 3, N per m/s
     drag_rotation_nmpradps: NonNegativeTriple  # D_r, Eq. 4, N m per rad/s
-    hover_thrust: float = Field(gt=0.02, lt=0.95)  # normalised; PX4 MPC_THR_HOVER
+    hover_thrust: float = Field(
+        ge=HOVER_THRUST_LIMITS[0], le=HOVER_THRUST_LIMITS[1]
+    )  # normalised; PX4 MPC_THR_HOVER
     thrust_delay_s: float = Field(default=0.0, ge=0, le=0.5)
     thrust_lag_s: float = Field(default=0.0, ge=0, le=0.5)
     tilt: AxisResponse

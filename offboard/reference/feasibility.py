@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -49,6 +50,7 @@ class Envelope:
     rates_max_frd_radps: tuple[float, float, float]
     speed_max_mps: float
     height_min_m: float
+    height_max_m: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,6 +97,7 @@ def check(
         rates_max_frd_radps=(float(highest[3]), float(highest[4]), float(highest[5])),
         speed_max_mps=float(highest[6]),
         height_min_m=float(lowest[7]),
+        height_max_m=float(highest[9]),
     )
 
 
@@ -141,4 +144,5 @@ def _demands(
         _Demand("a speed of", "m/s", speed, bounds.speed_max_mps),
         _Demand("a height of", "m", height, bounds.height_min_m, -1.0, of_path=True),
         _Demand("a distance of", "m", distance, bounds.distance_max_m, of_path=True),
+        _Demand("a height of", "m", height, math.inf, of_path=True),
     )

@@ -11,6 +11,7 @@ import socket
 from collections.abc import Iterable, Sequence
 from typing import Protocol
 
+from offboard.documents.errors import abridged
 from simulator.link.tcp import TcpLink
 from simulator.link.udp import Address, UdpLink
 
@@ -94,9 +95,11 @@ def shifted(url: str, by: int) -> str:
 def _split(url: str) -> tuple[str, str, int]:
     parts = url.split(":")
     usable = len(parts) == 3 and parts[0] in _PORTS_APART and parts[1] != ""
-    if not (usable and parts[2].isascii() and parts[2].isdigit() and 0 < int(parts[2]) < 65536):
+    number = parts[-1].isascii() and parts[-1].isdigit() and len(parts[-1]) <= 5
+    if not (usable and number and 0 < int(parts[2]) < 65536):
         raise LinkError(
-            f"{url} is not a link: give udpout:, udpin: or tcpin:HOST:PORT, port 1 .. 65535"
+            f"{abridged(url)} is not a link: give udpout:, udpin: or tcpin:HOST:PORT, "
+            "port 1 .. 65535"
         )
     return parts[0], parts[1], int(parts[2])
 
@@ -105,6 +108,8 @@ def _resolve(url: str, host: str, port: int) -> Address:
     try:
         found = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)
     except (OSError, UnicodeError):
-        raise LinkError(f"{url} cannot be opened: no address known for {host}") from None
+        raise LinkError(
+            f"{abridged(url)} cannot be opened: no address known for {abridged(host)}"
+        ) from None
     address = found[0][4]
     return (str(address[0]), int(address[1]))

@@ -20,8 +20,8 @@ from typer.testing import CliRunner
 
 from offboard.analysis.score_table import show
 from offboard.analysis.trial import score_flight
-from offboard.cli import app as offboard
-from simulator.cli import app as simulator
+from offboard.cli.commands import app as offboard
+from simulator.command import app as simulator
 
 CONFIG = Path(__file__).parents[2] / "config"
 RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"

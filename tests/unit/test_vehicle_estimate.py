@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import pytest
+from pydantic import ValidationError
 
 from offboard.flight import online_identification as online
 from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
 from offboard.flight.phases import Phase
+from offboard.identification.adoption import within_bounds
 from offboard.identification.attitude_fit import ResponseFit, Unexplained
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import VehicleEstimate
@@ -42,6 +44,23 @@ def estimate_with(found: Identified) -> VehicleEstimate:
     estimate.update_bandwidth()
     estimate.step(7.0)
     return estimate
+
+
+@pytest.mark.parametrize("hover_thrust", [0.02, 0.06, 0.42, 0.85, 0.95])
+def test_a_hover_thrust_that_a_file_may_have_is_adopted_in_flight(hover_thrust: float) -> None:
+    file = Vehicle.model_validate(FILE.model_dump() | {"hover_thrust": hover_thrust})
+    found = Identified(10.0, hover_thrust=Estimate(hover_thrust, 0.001))
+    assert within_bounds(found, file, 4.0) == (found, [])
+
+
+@pytest.mark.parametrize("hover_thrust", [0.0199, 0.9501])
+def test_a_hover_thrust_that_no_file_may_have_is_not_adopted(hover_thrust: float) -> None:
+    with pytest.raises(ValidationError, match="hover_thrust"):
+        Vehicle.model_validate(FILE.model_dump() | {"hover_thrust": hover_thrust})
+    found = Identified(10.0, hover_thrust=Estimate(hover_thrust, 0.001))
+    kept, (sentence,) = within_bounds(found, FILE, 1000.0)
+    assert kept.hover_thrust is None
+    assert "contradicts the vehicle file's 0.42 (0.02 to 0.95 allowed)" in sentence
 
 
 def test_doubt_ends_with_a_fit_that_explains_the_flight() -> None:

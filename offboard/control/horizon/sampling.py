@@ -7,11 +7,14 @@ answer with the mean.
 
 from __future__ import annotations
 
+from typing import Self
+
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from offboard.control.horizon.search import Evaluator, Found, Plan, Remaining
+from offboard.control.swarm.settings import check_evaluations
 from offboard.documents.parameters import Parameters
 
 Array = NDArray[np.float64]
@@ -26,6 +29,11 @@ class _Sampling(Parameters):
     samples: int = Field(default=40, ge=4, le=10_000)
     iterations: int = Field(default=70, ge=1, le=10_000)
     deviation: float = Field(default=0.3, gt=0, le=2)
+
+    @model_validator(mode="after")
+    def _ends(self) -> Self:
+        check_evaluations("samples", self.samples, self.iterations)
+        return self
 
 
 class MppiSampling(_Sampling):

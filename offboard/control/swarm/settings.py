@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from offboard.documents.parameters import Parameters
 
 Array = NDArray[np.float64]
+
+EVALUATIONS_MOST = 500_000  # a search of 0.1 s with `pso`, of some seconds with `horizon`
 
 
 class SwarmSettings(Parameters):
@@ -34,6 +37,19 @@ class SwarmSettings(Parameters):
     rebound: float = Field(default=0.5, ge=0, le=1)
     initial_velocity: float = Field(default=0.5, ge=0, le=1)
     tolerance: float = Field(default=0.0, ge=0)
+
+    @model_validator(mode="after")
+    def _ends(self) -> Self:
+        check_evaluations("particles", self.particles, self.iterations)
+        return self
+
+
+def check_evaluations(what: str, count: int, iterations: int) -> None:
+    """Raise ValueError for a search that would take longer than any period of control."""
+    if count * iterations > EVALUATIONS_MOST:
+        raise ValueError(
+            f"{what} x iterations must be at most {EVALUATIONS_MOST}, not {count * iterations}"
+        )
 
 
 @dataclass(frozen=True, slots=True)

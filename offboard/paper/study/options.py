@@ -40,7 +40,7 @@ class PaperOptions:
     """Options of `offboard paper`.
 
     Args:
-        out: output directory; created if absent.
+        out: output directory; created if absent, else empty.
         quick: fewer seeds, problems and budgets.
         seeds: flights per row of a table; None: 20, or 2 if quick.
         initial_q: diag(Q) of the first configuration (Eq. 23, whose values are not printed):
@@ -109,6 +109,8 @@ def _check_weights(diagonal: tuple[float, ...]) -> None:
 def _check_output(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
+        if any(out.iterdir()):
+            raise PaperError(f"{out} is not empty; choose another directory with --out")
         with tempfile.TemporaryFile(dir=out):
             pass
     except OSError as error:

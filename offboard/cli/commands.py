@@ -1,0 +1,46 @@
+"""The application: the commands of `offboard` and the options before them."""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from typing import Annotated
+
+import typer
+
+from offboard.cli import check, compare, fly, identify, listing, paper, score
+from offboard.cli.shared import EXIT_CODES, out
+from offboard.documents import shipped
+from offboard.documents.arguments import Command
+
+app = typer.Typer(
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode=None,
+)
+NAMES = shipped.overview("reference", "controller", "vehicle", "scenario")
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        out.print(f"pso-offboard {version('pso-offboard')}")
+        raise typer.Exit
+
+
+@app.callback()
+def offboard(
+    show_version: Annotated[
+        bool,
+        typer.Option("--version", callback=_version, is_eager=True, help="Print the version."),
+    ] = False,
+) -> None:
+    """Fly a trajectory over MAVLink with a particle-swarm receding-horizon law, and score it."""
+
+
+app.command(cls=Command, epilog=f"{NAMES}\n\n{EXIT_CODES}")(fly.fly)
+app.command(cls=Command, epilog=EXIT_CODES)(score.score)
+app.command(cls=Command, epilog=EXIT_CODES)(check.check)
+app.command(cls=Command, epilog=EXIT_CODES)(identify.identify)
+app.command(cls=Command, epilog=f"{NAMES}\n\n{EXIT_CODES}")(compare.compare)
+app.command(cls=Command, epilog=EXIT_CODES)(paper.paper)
+app.command("list", cls=Command)(listing.list_files)

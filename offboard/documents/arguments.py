@@ -1,0 +1,54 @@
+"""The arguments of a command, checked before they are converted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from typer.core import TyperCommand
+
+from offboard.documents.command_line import INTERRUPTED, interrupts_raise
+from offboard.documents.errors import UserError, shown
+
+NAME_BYTES = 255  # the longest name of a file (NAME_MAX)
+
+
+class Command(TyperCommand):
+    """A command whose values are neither empty nor options nor bytes that are no text.
+
+    `--connect "$LINK"` of an unset variable is empty, `--out $DIR --sitl` of one takes the next
+    option as its value: neither may mean something else.
+    """
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        given, _, parameters = self.make_parser(ctx).parse_args(list(args))
+        for parameter in parameters:
+            values = given.get(parameter.name)
+            for value in values if isinstance(values, (list, tuple)) else [values]:
+                if isinstance(value, str):
+                    _check(_label(parameter), value)
+        return super().parse_args(ctx, args)
+
+    def invoke(self, ctx: Any) -> Any:
+        interrupts_raise()
+        try:
+            return super().invoke(ctx)
+        except KeyboardInterrupt:
+            raise UserError(INTERRUPTED) from None
+
+
+def _label(parameter: Any) -> str:
+    """`--connect`, `FLIGHT`."""
+    return str(parameter.opts[-1] if parameter.param_type_name == "option" else parameter.metavar)
+
+
+def _check(label: str, value: str) -> None:
+    if not value.strip():
+        raise UserError(f"{label}: the value is empty; is a variable unset?")
+    if value.startswith("--"):
+        raise UserError(f"{label}: {shown(value)} is an option, not a value; is a variable unset?")
+    try:
+        value.encode()
+    except UnicodeEncodeError:
+        raise UserError(f"{label}: {shown(value)} is not UTF-8") from None
+    if "\0" in value:
+        raise UserError(f"{label}: {shown(value)} holds a null character")

@@ -1,0 +1,167 @@
+"""Running a command, `offboard` or `simulator`: what ends it is one sentence and an exit code.
+
+The console scripts import this before anything else, so it imports little: an interrupt during the
+imports of the command is answered too.
+"""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import sys
+
+TYPE_CHECKING = False
+if TYPE_CHECKING:
+    from collections.abc import Callable
+    from types import FrameType
+    from typing import NoReturn, TextIO
+
+USAGE = 2  # exit code
+INTERRUPTED = "interrupted"
+MEMORY_LEAST_MB = 1000  # with less, numpy and the compiler end the process themselves
+DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
+
+
+def run(load: Callable[[], Callable[[], object]]) -> NoReturn:
+    """Import a command with `load`, call it, and exit.
+
+    An interrupt exits at once until the command calls `interrupts_raise`, its arguments parsed.
+
+    A UserError is printed without a traceback and exits with its `code`, 2 without one. So do an
+    interrupt, a lack of memory, and an error of a file or of the output.
+    """
+    interrupts_exit()
+    _open_standard_files()
+    try:
+        _check_process()
+        load()()
+        sentence, code = "", 0
+    except SystemExit as ended:
+        sentence, code = "", ended.code if isinstance(ended.code, int) else 0
+    except KeyboardInterrupt:
+        sentence, code = INTERRUPTED, USAGE
+    except MemoryError:
+        sentence, code = "not enough memory", USAGE
+    except OSError as error:
+        sentence, code = explained(error), USAGE
+    except Exception as error:
+        from offboard.documents.errors import UserError
+
+        if not isinstance(error, UserError):
+            raise
+        sentence, code = str(error), getattr(error, "code", USAGE)
+    interrupts_raise()
+    unwritten = _flushed()
+    if unwritten and not sentence:
+        sentence, code = explained(unwritten), code or USAGE
+    try:
+        if sentence:
+            complain(sentence)
+    except OSError:  # stderr cannot be written either: the exit code is all that is left
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+    raise SystemExit(code)
+
+
+def complain(text: str) -> None:
+    """Print to stderr at once; on a terminal each line is wrapped at words to its width."""
+    tell(text, sys.stderr)
+
+
+def tell(text: str, file: TextIO) -> None:
+    """Print to a file at once; on a terminal each line is wrapped at words to its width."""
+    if file.isatty():
+        import shutil
+
+        width = shutil.get_terminal_size().columns
+        text = "\n".join(wrapped(line, width, 2) for line in text.splitlines())
+    print(text, file=file, flush=True)
+
+
+def wrapped(text: str, width: int, indent: int) -> str:
+    """A line wrapped at words, further lines indented. Paths and other long words stay whole, so
+    that they can be copied."""
+    import textwrap
+
+    return textwrap.fill(
+        text,
+        max(width, 1),  # COLUMNS=0
+        subsequent_indent=indent * " ",
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+
+
+def explained(error: OSError) -> str:
+    """A sentence for an error of the operating system."""
+    reason = error.strerror or str(error)
+    if error.filename is not None:
+        from offboard.documents.errors import abridged
+
+        return f"{abridged(error.filename)}: {reason}"
+    if error.errno in DISK_ERRORS:
+        return f"the output cannot be written: {reason}"
+    return f"refused by the operating system: {reason}"
+
+
+def _open_standard_files() -> None:
+    """Open /dev/null for standard files that are closed, else a log would become one of them. Text
+    that the encoding of the output does not have is escaped."""
+    for descriptor, name in enumerate(("stdin", "stdout", "stderr")):
+        if getattr(sys, name) is None:
+            os.open(os.devnull, os.O_RDWR)  # the lowest free descriptor
+            setattr(sys, name, open(descriptor, "r" if descriptor == 0 else "w"))  # noqa: SIM115
+    reconfigure = getattr(sys.stdout, "reconfigure", None)
+    if reconfigure is not None:
+        reconfigure(errors="backslashreplace")
+
+
+def _check_process() -> None:
+    """Raise UserError where the working directory is gone or memory is limited too much."""
+    import resource
+
+    from offboard.documents.errors import UserError
+
+    try:
+        os.getcwd()
+    except FileNotFoundError:
+        raise UserError("the working directory does not exist any more; change to one") from None
+    limit_mb = resource.getrlimit(resource.RLIMIT_AS)[0] / 1e6
+    if 0 <= limit_mb < MEMORY_LEAST_MB:
+        raise UserError(
+            f"address space is limited to {limit_mb:.0f} MB; at least {MEMORY_LEAST_MB} MB are "
+            "needed (ulimit -v)"
+        )
+
+
+def interrupts_exit() -> None:
+    """From now on an interrupt exits at once: an import may catch KeyboardInterrupt. If interrupts
+    are ignored, as in a background job, they stay so."""
+    if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
+        signal.signal(signal.SIGINT, _exit_at_once)
+
+
+def interrupts_raise() -> None:
+    """From now on an interrupt raises KeyboardInterrupt again."""
+    if signal.getsignal(signal.SIGINT) is _exit_at_once:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+def _exit_at_once(number: int, frame: FrameType | None) -> None:
+    os.write(2, f"{INTERRUPTED}\n".encode())
+    os._exit(USAGE)
+
+
+def _flushed() -> OSError | None:
+    """Flush stdout. After an error, which is returned, the rest of the output is dropped."""
+    try:
+        sys.stdout.flush()
+    except OSError as error:
+        drop_output()
+        return error
+    return None
+
+
+def drop_output() -> None:
+    """Send stdout to /dev/null from now on, after an error of it."""
+    os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())

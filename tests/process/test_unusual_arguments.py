@@ -1,0 +1,425 @@
+"""Arguments, files and processes that no user means: one sentence, exit code 2, no file changed.
+
+What ends before anything is sent is called in this process; the rest are real processes.
+"""
+
+from __future__ import annotations
+
+import os
+import resource
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from offboard import cli
+from offboard.analysis import tlog
+from offboard.analysis.compare import Result
+from simulator import cli as simulator_cli
+
+RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
+SURROGATE = os.fsdecode(b"caf\xe9")
+LONG = 300 * "n"
+Call = Callable[..., tuple[int, str]]
+LINK = ("--connect", "udpin:127.0.0.1:0", "--set", "limits.connect_s=0.1")
+
+
+@pytest.fixture
+def call(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> Call:
+    """`call("offboard fly", ...)` -> (exit code, stderr)."""
+    monkeypatch.chdir(tmp_path)
+
+    def call(command: str, *arguments: object) -> tuple[int, str]:
+        main = simulator_cli.main if command.startswith("simulator") else cli.main
+        monkeypatch.setattr(sys, "argv", [*command.split(), *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return int(ended.value.code or 0), capsys.readouterr().err
+
+    return call
+
+
+def refused(answer: tuple[int, str]) -> str:
+    """The one sentence of a refusal."""
+    code, said = answer
+    assert (code, said.count("\n"), "Traceback" in said) == (2, 1, False), said
+    return said
+
+
+VALUES = {
+    "offboard fly": (
+        "--connect", "--config", "--controller", "--reference", "--vehicle", "--out", "--require",
+        "--set", "--scenario", "--sim-vehicle", "--firmware",
+    ),
+    "offboard compare": (
+        "--connect", "--controllers", "--reference", "--scenario", "--vehicle", "--out", "--set",
+    ),
+    "offboard identify": ("--connect", "-o", "--page", "--vehicle", "--out", "FLIGHT"),
+    "offboard score": ("FLIGHT", "--require"),
+    "offboard check": ("FILE...",),
+    "offboard paper": ("--out", "--figure", "--table", "--initial-q"),
+    "simulator": (
+        "--connect", "--gcs", "--firmware", "--scenario", "--vehicle", "--param", "--log",
+        "--check",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("value", "says"),
+    [
+        ("", "the value is empty; is a variable unset?"),
+        (" \t", "the value is empty; is a variable unset?"),
+        (SURROGATE, r"'caf\udce9' is not UTF-8"),
+        ("a\0b", r"'a\x00b' holds a null character"),
+    ],
+)
+@pytest.mark.parametrize("command", VALUES)
+def test_a_value_that_is_no_text_is_refused(
+    value: str, says: str, command: str, call: Call, tmp_path: Path
+) -> None:
+    for option in VALUES[command]:
+        given = (option, value) if option.startswith("-") else (value,)
+        label = "--output" if option == "-o" else option
+        assert refused(call(command, *given)) == f"{label}: {says}\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_option_is_no_value_of_the_one_before_it(call: Call, tmp_path: Path) -> None:
+    said = refused(call("offboard fly", "--out", "--sitl"))
+    assert said == "--out: '--sitl' is an option, not a value; is a variable unset?\n"
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [
+        ("offboard fly", (*LINK, "--config", LONG)),
+        ("offboard fly", (*LINK, "--vehicle", f"{LONG}.yaml")),
+        ("offboard fly", (*LINK, "--controller", LONG)),
+        ("offboard fly", (*LINK, "--reference", f"{LONG}.csv")),
+        ("offboard fly", (*LINK, "--set", f"vehicle={LONG}/x")),
+        ("offboard fly", (*LINK, "--out", LONG)),
+        ("offboard fly", (*LINK, "--set", 'vehicle="a\\0/b"')),
+        ("offboard fly", (*LINK, "--set", 'reference={shape: table, file: "a\\0b"}')),
+        ("offboard fly", (*LINK, "--set", 'vehicle.name="\\ud800"')),
+        ("offboard fly", (*LINK, "--set", f"controller.{5000 * '9'}=1")),
+        ("offboard fly", (*LINK, "--set", "a..b=1")),
+        ("offboard fly", (*LINK, "--seed", 5000 * "9")),
+        ("offboard fly", ("--connect", f"udpin:127.0.0.1:{5000 * '9'}")),
+        ("offboard fly", ("--connect", "udpin:127.0.0.1:²")),
+        ("offboard fly", ("--connect", "udpin:a..b:14540")),
+        ("offboard fly", ("--connect", f"udpin:{LONG}:14540")),
+        ("offboard fly", ("--connect", "serial:/dev/null:9999999999")),
+        ("offboard compare", ("--controllers", LONG)),
+        ("offboard compare", ("--controllers", "lqr", "--scenario", f"{LONG}.yaml")),
+        ("offboard compare", ("--controllers", "lqr", "--scenario", "calm", "--out", LONG)),
+        ("offboard score", (LONG,)),
+        ("offboard check", (f"{LONG}.yaml",)),
+        ("offboard check", (f"{LONG}.csv",)),
+        ("offboard identify", (LONG,)),
+        ("offboard identify", (RECORDING, "--page", LONG)),
+        ("offboard identify", (RECORDING, "-o", f"nowhere/{LONG}")),
+        ("offboard paper", ("--quick", "--table", "2", "--out", LONG)),
+        ("simulator", ("--scenario", f"{LONG}.yaml")),
+        ("simulator", ("--vehicle", f"{LONG}.yaml")),
+        ("simulator", ("--check", f"{LONG}.yaml")),
+        ("simulator", ("--connect", f"udpin:127.0.0.1:{5000 * '9'}")),
+        ("simulator", ("--connect", "udpin:a..b:14540")),
+        ("simulator", ("--duration", "nan")),
+        ("simulator", ("--patience", "nan", "--lockstep")),
+    ],
+)
+def test_a_name_or_number_beyond_every_limit_is_refused(
+    command: str, arguments: tuple[object, ...], call: Call, tmp_path: Path
+) -> None:
+    code, said = call(command, *arguments)
+    assert (code, "Traceback" in said) == (2, False), said
+    assert len(said) < 600 or "--seed" in said
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("name", ["flight.yaml", "flight.tlog", "score.json"])
+def test_a_directory_with_a_flight_is_left_as_it_is(name: str, call: Call, tmp_path: Path) -> None:
+    (tmp_path / "x").mkdir()
+    (tmp_path / "x" / name).write_text("precious")
+    said = refused(call("offboard fly", *LINK, "--out", "x"))
+    assert said.startswith(f"x/{name} exists: the directory already holds a flight; choose another")
+    assert [path.read_text() for path in (tmp_path / "x").iterdir()] == ["precious"]
+
+
+@pytest.mark.parametrize(
+    ("command", "says"),
+    [
+        ("offboard compare --controllers lqr --scenario calm --seeds 1 --out x", "is not empty"),
+        ("offboard paper --quick --table 2 --out x", "is not empty; choose another"),
+        (f"offboard identify {RECORDING} --page x/old", "x/old exists already; choose another"),
+        (f"offboard identify {RECORDING} -o x/old", "x/old exists already; choose another file"),
+        (f"offboard identify {RECORDING} -o new --page new", "-o and --page are both new"),
+        (f"offboard identify {RECORDING} -o y/new", "-o y/new: there is no directory y"),
+        ("simulator --log x/old --duration 0.1 --gcs none", "--log x/old cannot be written: File"),
+    ],
+)
+def test_no_command_overwrites_a_file(command: str, says: str, call: Call, tmp_path: Path) -> None:
+    (tmp_path / "x").mkdir()
+    old = tmp_path / "x" / "old"
+    old.write_text("precious")
+    before = old.stat().st_mtime_ns
+    assert says in refused(call(command.split()[0], *command.split()[1:]))
+    assert [path.name for path in tmp_path.rglob("*")] == ["x", "old"]
+    assert (old.read_text(), old.stat().st_mtime_ns) == ("precious", before)
+
+
+def test_the_page_of_a_second_identification_has_a_name_of_its_own(
+    call: Call, tmp_path: Path
+) -> None:
+    (tmp_path / "x.tlog").write_bytes(RECORDING.read_bytes())
+    (tmp_path / "identify.html").write_text("precious")
+    assert call("offboard identify", "x.tlog") == (0, "")
+    assert (tmp_path / "identify.html").read_text() == "precious"
+    assert "<html" in (tmp_path / "identify-2.html").read_text()
+
+
+FILES: dict[str, Callable[[Path], object]] = {
+    "a FIFO": os.mkfifo,
+    "/dev/zero": lambda path: path.symlink_to("/dev/zero"),
+    "a directory": Path.mkdir,
+    "larger than 500 kB": lambda path: path.write_text("# comment\n" * 60_000),
+}
+
+
+@pytest.mark.parametrize("kind", FILES)
+@pytest.mark.parametrize(
+    "command",
+    [
+        "offboard check x.yaml",
+        "offboard check x.csv",
+        "offboard fly --connect udpin:127.0.0.1:0 --config x.yaml",
+        "offboard fly --connect udpin:127.0.0.1:0 --reference x.csv",
+        "offboard fly --sitl --scenario x.yaml",
+        "offboard compare --controllers x.yaml",
+        "simulator --check x.yaml",
+        "simulator --vehicle x.yaml",
+    ],
+)
+def test_only_regular_files_of_a_bounded_size_are_read(
+    kind: str, command: str, call: Call, tmp_path: Path
+) -> None:
+    name = "x.csv" if "x.csv" in command else "x.yaml"
+    FILES[kind](tmp_path / name)
+    said = refused(call(command.split()[0], *command.split()[1:]))
+    reason = kind if kind.startswith("larger") else "not a regular file"
+    assert f"{name} cannot be read: {reason}" in said
+
+
+@pytest.mark.parametrize("make", [os.mkfifo, lambda path: path.symlink_to("/dev/zero")])
+@pytest.mark.parametrize("command", ["score", "identify"])
+def test_only_a_regular_file_is_a_log(
+    command: str, make: Callable[[Path], object], call: Call, tmp_path: Path
+) -> None:
+    make(tmp_path / "x.tlog")
+    assert "x.tlog is not a regular file; name a flight directory or a .tlog file" in refused(
+        call(f"offboard {command}", "x.tlog")
+    )
+
+
+def test_of_many_errors_the_first_ten_are_printed(call: Call, tmp_path: Path) -> None:
+    keys = "".join(f"key_{number}: 1\n" for number in range(5000))
+    (tmp_path / "x.yaml").write_text(f"law: pid\n{keys}")
+    code, said = call("offboard check", "x.yaml")
+    assert code == 2
+    lines = said.splitlines()
+    assert len(lines) == 11
+    assert lines[0].startswith("x.yaml: key_0 is not a known key")
+    assert lines[-1] == "x.yaml: and 4990 more problems"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (
+            ("--set", "reference.height_m=100"),
+            "reference lemniscate: landing from 100 m takes 200 s at 0.5 m/s, longer than "
+            "limits.land_s (90 s); fly lower or allow more time",
+        ),
+        (
+            ("--set", "controller.swarm={particles: 10000, iterations: 100000}"),
+            "controller.swarm: particles x iterations must be at most 500000, not 1000000000",
+        ),
+        (
+            ("--controller", "cem", "--set", "controller.sampling.samples=8000"),
+            "controller.sampling: samples x iterations must be at most 500000, not 560000",
+        ),
+    ],
+)
+def test_what_cannot_end_in_time_is_refused(
+    arguments: tuple[str, ...], says: str, call: Call, tmp_path: Path
+) -> None:
+    assert says in refused(call("offboard fly", *LINK, *arguments))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_height_with_the_time_to_land_is_flown(call: Call, tmp_path: Path) -> None:
+    high = ("--set", "reference.height_m=100", "--set", "limits.land_s=201")
+    code, said = call("offboard fly", *LINK, *high, "--out", "x")
+    assert (code, "no vehicle heard" in said) == (3, True)
+
+
+def test_a_comparison_on_a_full_disk_says_which_file_is_missing(
+    call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def flown(request: object, trial: object) -> Result:
+        limit = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
+        resource.setrlimit(resource.RLIMIT_FSIZE, (10, limit))
+        return Result(trial, 3, "no vehicle", {})  # type: ignore[arg-type]
+
+    monkeypatch.setattr("offboard.analysis.trial.fly_trial", flown)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        code, said = call(
+            "offboard compare", *LINK, "--controllers", "lqr", "--seeds", 1, "--out", "x"
+        )
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert (code, said.count("\n")) == (4, 1)
+    assert said.endswith("; x/compare.csv cannot be written (File too large)\n")
+
+
+def process(
+    command: str, directory: Path, begin: str = "pass", **more: str
+) -> subprocess.CompletedProcess[str]:
+    """A command as its console script runs it, after `begin`."""
+    module, *arguments = command.split()
+    script = (
+        f"import sys; sys.argv = {[module, *arguments]!r}\n{begin}\n"
+        f"from {module}.cli import main\nsys.exit(main())"
+    )
+    return subprocess.run(
+        [sys.executable, "-c", script], cwd=directory, capture_output=True, text=True, timeout=60,
+        env={**os.environ, **more},
+    )  # fmt: skip
+
+
+FULL = "sys.stdout = open('/dev/full', 'w')"
+GONE = "import os; os.mkdir('gone'); os.chdir('gone'); os.rmdir('../gone')"
+LITTLE = "import resource; resource.setrlimit(resource.RLIMIT_AS, (400_000_000, 400_000_000))"
+NO_OUTPUT = f"{FULL}; sys.stderr = open('/dev/full', 'w')"
+SCORE = f"offboard score {RECORDING}"
+
+
+@pytest.mark.parametrize(
+    ("begin", "command", "says"),
+    [
+        (FULL, "offboard list", "the output cannot be written: No space left on device"),
+        (FULL, "offboard --version", "the output cannot be written: No space left on device"),
+        (FULL, SCORE, "the output cannot be written: No space left on device"),
+        (FULL, f"{SCORE} --json", "the output cannot be written: No space left on device"),
+        (FULL, "simulator --list-scenarios", "the output cannot be written: No space left"),
+        (GONE, SCORE, "the working directory does not exist any more; change to one"),
+        (GONE, "simulator", "the working directory does not exist any more; change to one"),
+        (LITTLE, SCORE, "address space is limited to 400 MB; at least 1000 MB are needed"),
+        (LITTLE, "simulator", "address space is limited to 400 MB; at least 1000 MB are needed"),
+    ],
+)
+def test_a_process_that_lacks_something_says_so(
+    begin: str, command: str, says: str, tmp_path: Path
+) -> None:
+    ended = process(command, tmp_path, begin)
+    assert says in refused((ended.returncode, ended.stderr))
+
+
+@pytest.mark.parametrize("command", ["offboard check no.yaml", SCORE, "offboard paper --table 99"])
+def test_without_any_output_the_exit_code_is_left(command: str, tmp_path: Path) -> None:
+    ended = process(command, tmp_path, NO_OUTPUT)
+    assert (ended.returncode, ended.stdout) == (2, "")
+
+
+def test_a_page_on_a_full_disk_leaves_no_file(tmp_path: Path) -> None:
+    limit = "import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))"
+    ended = process(f"offboard identify {RECORDING} --page x.html -o x.yaml", tmp_path, limit)
+    assert refused((ended.returncode, ended.stderr)).startswith("x.html cannot be written (File")
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can become a user without rights")
+@pytest.mark.parametrize(
+    ("command", "place"),
+    [
+        ("offboard fly --connect udpin:127.0.0.1:0 --out locked/x", "locked/x"),
+        ("offboard fly --connect udpin:127.0.0.1:0 --vehicle locked/x.yaml", "locked/x.yaml"),
+        ("offboard score locked/x", "locked/x"),
+        ("offboard identify locked/x -o y", "locked/x"),
+        ("simulator --check locked/x.yaml", "locked/x.yaml"),
+    ],
+)
+def test_a_folder_that_cannot_be_searched(command: str, place: str, tmp_path: Path) -> None:
+    (tmp_path / "locked").mkdir(mode=0)
+    drop = "import ctypes; ctypes.CDLL(None).prctl(24, 1); ctypes.CDLL(None).prctl(24, 2)"
+    begin = (
+        f"{drop}\nimport os, struct\n"  # without CAP_DAC_OVERRIDE and CAP_DAC_READ_SEARCH
+        "header = struct.pack('Ii', 0x20080522, 0)\n"
+        "assert not ctypes.CDLL(None).capset(header, bytes(24))"
+    )
+    ended = process(command, tmp_path, begin)
+    said = refused((ended.returncode, ended.stderr))
+    assert place in said
+    assert "Permission denied" in said
+
+
+@pytest.mark.parametrize("module", ["offboard", "simulator"])
+def test_an_interrupt_during_the_imports_is_one_sentence(module: str, tmp_path: Path) -> None:
+    """The signal is raised by an import, the first once `main` has been called."""
+    begin = """
+import builtins, signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+import {module}.cli
+count, real = 0, builtins.__import__
+def imported(*arguments, **named):
+    global count
+    count += 1
+    if count == {at}:
+        signal.raise_signal(signal.SIGINT)
+    return real(*arguments, **named)
+builtins.__import__ = imported
+"""
+    for at in (5, 10, 100, 400, 1000):
+        ended = process(f"{module} --help", tmp_path, begin.format(module=module, at=at))
+        assert (ended.returncode, ended.stderr) == (2, "interrupted\n"), at
+
+
+def test_an_interrupted_score_is_one_sentence(tmp_path: Path) -> None:
+    begin = """
+import signal
+signal.signal(signal.SIGINT, signal.default_int_handler)
+from offboard.analysis import trial
+trial.score_flight = lambda flight: signal.raise_signal(signal.SIGINT)
+"""
+    ended = process(SCORE, tmp_path, begin)
+    assert (ended.returncode, ended.stderr) == (2, "interrupted\n")
+
+
+def test_a_flight_whose_result_cannot_be_printed_keeps_its_exit_code(tmp_path: Path) -> None:
+    begin = f"""
+{FULL}
+from offboard.cli import fly
+fly.say = lambda text, indent=0: print(text) if "preparing" not in text else None
+"""
+    ended = process(f"offboard fly {' '.join(LINK)} --out x", tmp_path, begin)
+    assert ended.returncode == 3
+    assert ended.stderr.endswith("; the output cannot be written: No space left on device\n")
+    assert "Traceback" not in ended.stderr
+
+
+def test_closed_standard_files_are_no_log(tmp_path: Path) -> None:
+    begin = (
+        "import os; [os.close(d) for d in (0, 1, 2)]; sys.stdout = sys.stderr = sys.stdin = None"
+    )
+    command = "offboard fly --connect udpin:127.0.0.1:0 --set limits.connect_s=0.1 --out x"
+    ended = process(command, tmp_path, begin)
+    assert ended.returncode == 3
+    log = tlog.read(tmp_path / "x" / "flight.tlog")
+    assert (log.truncated, log.undecodable) == (0, 0)  # nothing was printed into it
