@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from textwrap import dedent
 
 import numpy as np
 import pytest
@@ -126,3 +127,17 @@ def test_links_lead_to_files() -> None:
     ):
         for target in re.findall(r"\]\(([^)#:]+)\)", readme.read_text()):
             assert (readme.parent / target).exists(), f"{readme.relative_to(ROOT)}: {target}"
+
+
+def test_scenario_example_is_valid(tmp_path: Path) -> None:
+    text = (ROOT / "config" / "README.md").read_text()
+    (block,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "example.yaml").write_text(dedent(block))
+    done = subprocess.run(
+        (SCRIPTS / "offboard", "check", "example.yaml"),
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.stdout == "example.yaml: scenario, valid\n", done.stderr
