@@ -1,6 +1,6 @@
 """Identifies the vehicle of a log, and writes the vehicle file.
 
-Uses the flight from lift-off to landing, commanded by SET_ATTITUDE_TARGET, also of another program.
+The flight may be one of another program, if it sent SET_ATTITUDE_TARGET.
 """
 
 from __future__ import annotations
@@ -141,7 +141,7 @@ def _axis(name: str, axis: AxisResponse, comment: str) -> list[tuple[str, str]]:
 
 
 def _line(entry: str, comment: str) -> str:
-    """An entry with its comment, which stands above where it does not fit beside."""
+    """An entry with its comment, on lines above it if one line is too short for both."""
     line = f"{entry}  # {comment}" if comment else entry
     if len(line) <= LINE_WIDTH:
         return line
