@@ -20,8 +20,8 @@ LINES_MAX = 180
 
 def _examples() -> dict[str, list[str]]:
     """The Python blocks of every README that has some."""
-    rooms = (ROOT / "offboard", ROOT / "simulator", ROOT / "config")
-    paths = [path for room in rooms for path in room.rglob("README.md")]
+    folders = (ROOT / "offboard", ROOT / "simulator", ROOT / "config")
+    paths = [path for folder in folders for path in folder.rglob("README.md")]
     found = {
         str(path.relative_to(ROOT)): re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)
         for path in (ROOT / "README.md", *sorted(paths))

@@ -99,13 +99,13 @@ def rows(found: Identified) -> Iterator[tuple[str, Estimate | None, str, str]]:
     yield "drag", found.drag_ps, "1/s", found.refusals.get("drag_ps", "")
 
 
-def vehicle_file(found: Identified, believed: Vehicle, flight: str) -> str:
+def vehicle_file(found: Identified, prior: Vehicle, flight: str) -> str:
     """YAML of a vehicle file from an identification.
 
     Identified constants have their standard deviation as comment. The other constants are those of
-    `believed`, with the reason why they were not identified. `flight` names the log.
+    `prior`, with the reason why they were not identified. `flight` names the log.
     """
-    vehicle, whys = found.applied_to(believed), found.refusals
+    vehicle, whys = found.applied_to(prior), found.refusals
     kept = "not identifiable from telemetry"
     lag = _comment(found.thrust_lag_s, "s", whys.get("thrust_lag_s", ""))
     hover = _comment(found.hover_thrust, "", whys.get("hover_thrust", ""))

@@ -50,7 +50,7 @@ PARAMETERS = (
     _real("MPC_LAND_CRWL", 0.3, 0.1, 10, "m/s of crawling"),
     _real("MPC_LAND_SPEED", 0.7, 0.6, 10, "m/s near the ground"),
     _real("MPC_MANTHR_MIN", 0.08, 0, 1, "least thrust by stick"),
-    _real("MPC_THR_HOVER", 0.5, 0.1, 0.8, "normalised thrust believed to hover"),
+    _real("MPC_THR_HOVER", 0.5, 0.1, 0.8, "hover thrust, normalised"),
     _real("MPC_THR_MAX", 1.0, 0, 1, "most thrust of the position loop"),
     _real("MPC_THR_MIN", 0.12, 0.05, 0.5, "least thrust of the position loop"),
     _real("MPC_TILTMAX_AIR", 45.0, 20, 89, "deg"),
