@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.model.frames import quaternion_from_thrust_direction
 from offboard.reference.base import FlatSample
 
 Array = NDArray[np.float64]
@@ -29,7 +28,7 @@ class FlatState:
 
     thrust_mps2, thrust_rate_mps3 (...): T and T'. thrust_direction_ned, _rate_ned_ps,
     _acceleration_ned_ps2 (..., 3): b, b', b''; without thrust b is (0, 0, 1). rates_frd_radps
-    (..., 3): p, q, r, with the Euler yaw equal to the course. course_rad (...).
+    (..., 3): p, q, r, with the Euler yaw equal to the course.
     """
 
     thrust_mps2: Array
@@ -38,12 +37,6 @@ class FlatState:
     thrust_direction_rate_ned_ps: Array
     thrust_direction_acceleration_ned_ps2: Array
     rates_frd_radps: Array
-    course_rad: Array
-
-    @property
-    def attitude(self) -> Array:
-        """Quaternion w, x, y, z, FRD to NED, shape (..., 4); computed at each call."""
-        return quaternion_from_thrust_direction(self.thrust_direction_ned, self.course_rad)
 
 
 def flat_state(
@@ -75,7 +68,6 @@ def flat_state(
         thrust_direction_rate_ned_ps=b1,
         thrust_direction_acceleration_ned_ps2=b2,
         rates_frd_radps=_body_rates(b, b1, sample.course_rad, sample.course_rate_radps),
-        course_rad=sample.course_rad,
     )
 
 

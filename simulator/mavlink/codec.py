@@ -59,10 +59,6 @@ class Layout:
         self._pack = _packer(message, spans)
         self._named = _namer(message.ordered_fieldnames, spans, is_text)
 
-    @property
-    def size(self) -> int:
-        return self._struct.size
-
     def pack(self, values: Sequence[Any]) -> bytes:
         """Payload with its trailing zeros removed (at least one byte stays).
 
