@@ -1,4 +1,4 @@
-"""Flies vehicles one after the other, each in a fork of a process that has loaded everything.
+"""Runs vehicles one after the other, each in a fork of a process that has loaded all modules.
 
 A line of standard input, the options of the `simulator` command as a JSON list, starts a vehicle.
 An empty line, or the end of the input, ends it. Its exit code is then printed, negative for a
@@ -23,7 +23,7 @@ from simulator.command import app
 
 
 def serve(requests: FileIO) -> None:
-    """Fly a vehicle for each line of `requests`, which is unbuffered: `select` waits for it."""
+    """Run a vehicle for each line of `requests`, which is unbuffered: `select` waits for it."""
     with loading():  # what is not collected stays shared with the forks
         _load()
     for line in requests:
@@ -32,21 +32,21 @@ def serve(requests: FileIO) -> None:
 
 
 def _exit_code(options: list[str], requests: FileIO) -> int:
-    """Fly a vehicle until it ends or the next line arrives."""
-    alive, lifeline = os.pipe()  # `alive` becomes readable when the vehicle's process has ended
+    """Run a vehicle until it ends or the next line arrives; return its exit code."""
+    ended, open_end = os.pipe()  # `ended` is readable once the vehicle's process has ended
     vehicle = os.fork()
     if vehicle == 0:
-        _fly(options)
-    os.close(lifeline)
-    ready, _, _ = select.select([requests.fileno(), alive], [], [])
-    if alive not in ready:
+        _run(options)
+    os.close(open_end)
+    ready, _, _ = select.select([requests.fileno(), ended], [], [])
+    if ended not in ready:
         os.kill(vehicle, signal.SIGKILL)
-    os.close(alive)
+    os.close(ended)
     _, status = os.waitpid(vehicle, 0)
     return os.waitstatus_to_exitcode(status)
 
 
-def _fly(options: list[str]) -> NoReturn:
+def _run(options: list[str]) -> NoReturn:
     """Run the `simulator` command in this process, without standard input and output."""
     null = os.open(os.devnull, os.O_RDWR)
     os.dup2(null, 0)
@@ -63,7 +63,7 @@ def _fly(options: list[str]) -> NoReturn:
 
 
 def _load() -> None:
-    """Import all modules of a flight and load its compiled functions."""
+    """Import all modules of the simulator and load its compiled functions."""
     from simulator import config, run
     from simulator.firmware.catalogue import FIRMWARES
     from simulator.instance import Instance

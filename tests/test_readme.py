@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from pathlib import Path
+from textwrap import dedent
 
 import numpy as np
 import pytest
@@ -19,8 +20,8 @@ LINES_MAX = 180
 
 def _examples() -> dict[str, list[str]]:
     """The Python blocks of every README that has some."""
-    rooms = (ROOT / "offboard", ROOT / "simulator", ROOT / "config")
-    paths = [path for room in rooms for path in room.rglob("README.md")]
+    folders = (ROOT / "offboard", ROOT / "simulator", ROOT / "config")
+    paths = [path for folder in folders for path in folder.rglob("README.md")]
     found = {
         str(path.relative_to(ROOT)): re.findall(r"```python\n(.*?)```", path.read_text(), re.DOTALL)
         for path in (ROOT / "README.md", *sorted(paths))
@@ -126,3 +127,17 @@ def test_links_lead_to_files() -> None:
     ):
         for target in re.findall(r"\]\(([^)#:]+)\)", readme.read_text()):
             assert (readme.parent / target).exists(), f"{readme.relative_to(ROOT)}: {target}"
+
+
+def test_scenario_example_is_valid(tmp_path: Path) -> None:
+    text = (ROOT / "config" / "README.md").read_text()
+    (block,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
+    (tmp_path / "example.yaml").write_text(dedent(block))
+    done = subprocess.run(
+        (SCRIPTS / "offboard", "check", "example.yaml"),
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        timeout=60,
+    )
+    assert done.stdout == "example.yaml: scenario, valid\n", done.stderr

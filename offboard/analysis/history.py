@@ -64,7 +64,8 @@ class History:
     identified: t, then value and sd of each constant as in `identification.adoption.record_of`
     link_delay: t of the telemetry that a TIMESYNC request followed, its delay in s
 
-    `phases` are our own, `modes` and `said` (STATUSTEXT, refused commands) the vehicle's.
+    `phases` are our own; the vehicle's are `modes` and `vehicle_messages` (STATUSTEXT, refused
+    commands).
     """
 
     position: Array
@@ -78,7 +79,7 @@ class History:
     link_delay: Array
     phases: tuple[Event, ...]
     modes: tuple[Event, ...]
-    said: tuple[Event, ...]
+    vehicle_messages: tuple[Event, ...]
     messages: Counter[str]
     wall_s: float
 
@@ -120,7 +121,7 @@ def gather(log: Tlog) -> History:
         link_delay=_link_delay(ours, theirs),
         phases=_events(clock, "offboard", _phases(ours)),
         modes=_events(clock, "vehicle", _modes(theirs, dialect)),
-        said=_events(clock, "vehicle", _texts(theirs) + _refusals(theirs)),
+        vehicle_messages=_events(clock, "vehicle", _texts(theirs) + _refusals(theirs)),
         messages=counts,
         wall_s=(stamps[-1] - stamps[0]) / 1e6 if stamps else 0.0,
     )

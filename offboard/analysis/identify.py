@@ -1,6 +1,6 @@
 """Identifies the vehicle of a log, and writes the vehicle file.
 
-Uses the flight from lift-off to landing, commanded by SET_ATTITUDE_TARGET, also of another program.
+The flight may be one of another program, if it sent SET_ATTITUDE_TARGET.
 """
 
 from __future__ import annotations
@@ -99,13 +99,13 @@ def rows(found: Identified) -> Iterator[tuple[str, Estimate | None, str, str]]:
     yield "drag", found.drag_ps, "1/s", found.refusals.get("drag_ps", "")
 
 
-def vehicle_file(found: Identified, believed: Vehicle, flight: str) -> str:
+def vehicle_file(found: Identified, prior: Vehicle, flight: str) -> str:
     """YAML of a vehicle file from an identification.
 
     Identified constants have their standard deviation as comment. The other constants are those of
-    `believed`, with the reason why they were not identified. `flight` names the log.
+    `prior`, with the reason why they were not identified. `flight` names the log.
     """
-    vehicle, whys = found.applied_to(believed), found.refusals
+    vehicle, whys = found.applied_to(prior), found.refusals
     kept = "not identifiable from telemetry"
     lag = _comment(found.thrust_lag_s, "s", whys.get("thrust_lag_s", ""))
     hover = _comment(found.hover_thrust, "", whys.get("hover_thrust", ""))
@@ -141,7 +141,7 @@ def _axis(name: str, axis: AxisResponse, comment: str) -> list[tuple[str, str]]:
 
 
 def _line(entry: str, comment: str) -> str:
-    """An entry with its comment, which stands above where it does not fit beside."""
+    """An entry with its comment, on lines above it if one line is too short for both."""
     line = f"{entry}  # {comment}" if comment else entry
     if len(line) <= LINE_WIDTH:
         return line

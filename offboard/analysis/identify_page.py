@@ -29,16 +29,16 @@ Array = NDArray[np.float64]
 SHOWN_S = 20.0  # the figures show the end of the flight; a longer part is too dense to read
 
 
-def page(flight: str, found: Identified, trace: Trace, believed: Vehicle) -> str:
+def page(flight: str, found: Identified, trace: Trace, prior: Vehicle) -> str:
     """The page as text.
 
     Args:
         flight: name of the log.
         found: what was identified.
         trace: the part of the log that it was identified from.
-        believed: the vehicle before the identification; supplies what was not identified.
+        prior: the vehicle before the identification; supplies what was not identified.
     """
-    vehicle = found.applied_to(believed)
+    vehicle = found.applied_to(prior)
     last = trace.between(max(trace.begin_s, trace.end_s - SHOWN_S), trace.end_s)
     flown = not math.isnan(trace.begin_s) and len(trace.commands) > 0
     figures = [_tilt(last, vehicle), _yaw(last, vehicle)] if flown else []

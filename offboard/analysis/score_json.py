@@ -17,7 +17,7 @@ def as_text(score: Score, history: History) -> str:
         **{name: _plain(value) for name, value in score.figures().items()},
         "phases": _events(history.phases),
         "modes": _events(history.modes),
-        "said": _events(history.said),
+        "vehicle_messages": _events(history.vehicle_messages),
         "messages": dict(sorted(history.messages.items())),
         "wall_s": history.wall_s,
     }

@@ -81,7 +81,7 @@ def show(console: Console, score: Score, history: History) -> None:
     story.add_column("who")
     story.add_column("what")
     modes = (replace(event, what=f"mode {event.what}") for event in history.modes)
-    events = [*history.phases, *modes, *history.said]
+    events = [*history.phases, *modes, *history.vehicle_messages]
     for event in sorted(events, key=lambda event: np.nan_to_num(event.time_s)):
         stamp = "" if math.isnan(event.time_s) else f"{event.time_s:.2f}"
         story.add_row(stamp, event.who, Text(event.what))

@@ -27,8 +27,7 @@ def streams_of(log: Tlog) -> Streams:
 
 
 class Sender:
-    """The messages of one side of the link. `sent` tells by (system, component) whether it is the
-    sender."""
+    """The messages of one side of the link. `sent(system, component)` is True for that side."""
 
     def __init__(self, streams: Streams, sent: Callable[[int, int], bool]) -> None:
         self._kinds: dict[str, list[tuple[int, LoggedMessage]]] = {}

@@ -14,7 +14,7 @@ from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import contextmanager
 
-ORPHANED = 1  # exit code of a worker whose parent is gone
+ORPHANED = 1  # exit code of a worker whose parent has ended
 
 
 def processors() -> int:

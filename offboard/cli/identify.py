@@ -60,13 +60,13 @@ def identify(
     log = tlog.read(path)
     configuration = history.configuration(log)
     if vehicle is None and configuration is not None:
-        believed = flown(configuration).vehicle
+        prior = flown(configuration).vehicle
     else:
-        believed = load("flight", choices={"vehicle": vehicle} if vehicle else {}).vehicle
-    found, trace = identify_flight(log, history.gather(log), believed)
-    text = vehicle_file(found, believed, flight.name)
+        prior = load("flight", choices={"vehicle": vehicle} if vehicle else {}).vehicle
+    found, trace = identify_flight(log, history.gather(log), prior)
+    text = vehicle_file(found, prior, flight.name)
     shown = page or _free(path.with_name("identify.html"))
-    _write_new(shown, fits(flight.name, found, trace, believed))
+    _write_new(shown, fits(flight.name, found, trace, prior))
     if not found.supported:
         raise CommandError(f"nothing could be identified from this flight; {shown} says why", 1)
     if output is not None:

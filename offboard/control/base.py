@@ -48,7 +48,7 @@ class Situation:
 
 @dataclass(frozen=True, slots=True)
 class Certificate:
-    """How good a decision is. Logged with it; a figure that a controller does not have is NaN.
+    """Quality of a decision, logged with it; NaN for a figure that the controller does not have.
 
     Attributes:
         cost: Cost J of the chosen input or plan.
@@ -89,17 +89,18 @@ class Decision:
 
 
 class DecisionError(ArithmeticError):
-    """`Controller.decide` has no command to offer, for example because the state is not finite.
+    """`Controller.decide` found no command, for example because the state is not finite.
 
     The flight sends level attitude instead and lands after `limits.missed_decisions` in a row.
     """
 
 
 class Controller(Protocol):
-    """A control law. The flight calls these two methods and no other.
+    """A control law. The flight calls these two methods, and those of `Adopting` if it has them.
 
     Before take-off `decide` is called a few times on a vehicle at rest, so that everything is
-    compiled and loaded, then `reset` once. In flight `decide` is called at every control tick from
+    compiled and loaded, then `reset` once; an exception then ends the program before anything is
+    sent. In flight `decide` is called at every control tick from
     the climb to the landing.
     """
 
@@ -118,7 +119,7 @@ class Controller(Protocol):
 
 class ControllerSettings(Parameters, ABC):
     """Base class of a controller's settings: what a file in `config/controllers` or
-    `--set controller.KEY=VALUE` may say, and how the controller is made from it.
+    `--set controller.KEY=VALUE` may set, and how the controller is made from it.
 
     A subclass declares `law: Literal["name"] = "name"` and its fields with defaults and ranges.
     Unknown keys and values out of range are refused with a sentence that names them.
@@ -157,7 +158,7 @@ class Adopting(Protocol):
     ) -> None:
         """Use `vehicle` from the next decision on, at no more than `bandwidth_limit_radps`.
 
-        With `gains` False only the feed-forward changes: the vehicle is blended in over many
-        ticks, and solving for the gains anew would take too long at each of them.
+        With `gains` False only the feed-forward changes. The flight changes the vehicle in small
+        steps at successive ticks, and to compute the gains at each of them would take too long.
         """
         ...

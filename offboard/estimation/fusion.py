@@ -104,7 +104,7 @@ class Fusion:
         self.fused = False
         self._grounded = True
         self._origin: Geodetic | None = None
-        self._said = self._announced = False
+        self._origin_from_vehicle = self._announced = False
         self._stamp_s = self._fixed_s = -math.inf
         self._reported = Past()
         self._reported_s = -math.inf
@@ -133,10 +133,10 @@ class Fusion:
         else:
             self._filter.on_attitude(time_s, np.array(thrust_direction_from_quaternion(q)))
 
-    def on_origin(self, place: Geodetic, said: bool) -> None:
-        """Origin of the local frame. One that the vehicle `said` replaces one that was computed."""
-        if said or not self._said:
-            self._origin, self._said = place, said
+    def on_origin(self, place: Geodetic, from_vehicle: bool) -> None:
+        """Origin of the local frame. One `from_vehicle` replaces a computed one."""
+        if from_vehicle or not self._origin_from_vehicle:
+            self._origin, self._origin_from_vehicle = place, from_vehicle
 
     def on_fix(
         self,

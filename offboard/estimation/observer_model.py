@@ -48,8 +48,7 @@ from offboard.model.vehicle import Vehicle
 Array = NDArray[np.float64]
 Record = np.ndarray[Any, Any]
 
-# Per filter: indices of its states in the observer's state, axis by axis, and their sd at the first
-# message, which gives position, velocity and attitude; disturbance and bias begin at zero.
+# For each filter: indices of its states in the observer's state, for each axis
 PLACES: tuple[list[tuple[int, ...]], ...] = (
     [
         (POSITION + i, VELOCITY + i, TILT + i, TILT_RATE + i, DISTURBANCE + i, BIAS + i)
@@ -58,6 +57,8 @@ PLACES: tuple[list[tuple[int, ...]], ...] = (
     [(POSITION + 2, VELOCITY + 2, DISTURBANCE + 2, BIAS + 2)],
     [(COURSE, COURSE_RATE)],
 )
+# Standard deviations of these states at the first telemetry, which sets position, velocity and
+# attitude; disturbance and bias start at zero
 START_SDS = (
     (0.1, 0.3, 0.02, 0.3, 1.0, 0.3),
     (0.1, 0.3, 1.5, 0.3),
@@ -68,9 +69,9 @@ START_SDS = (
 class VelocitySource(StrEnum):
     """How the reported velocity is used."""
 
-    POSITION = "position"  # not at all: velocity from position and commands
+    POSITION = "position"  # not used: velocity comes from position and commands
     BIAS = "bias"  # as a measurement with a slowly varying bias
-    REPORTED = "reported"  # as it is, without disturbance; for comparison only
+    REPORTED = "reported"  # as the true velocity, without disturbance; for comparison
 
 
 class ObserverSettings(Parameters):
@@ -90,13 +91,13 @@ class ObserverSettings(Parameters):
     position_jump_m: float = Field(default=0.3, gt=0, le=100)
     velocity_jump_mps: float = Field(default=0.5, gt=0, le=100)
     disturbance_limit_mps2: float = Field(default=8.0, gt=0, le=20)
-    # Estimate noise and drift above the configured ones from innovations, the drift up to the limit
+    # Noise and drift from the innovations: at least the values above, the drift up to the limit
     adaptive: bool = True
     disturbance_density_limit_mps2: float = Field(default=1.0, gt=0, le=10)
 
 
 def new_record(settings: ObserverSettings) -> Record:
-    """An OBSERVER (1,) without a vehicle."""
+    """A record (1,) of dtype OBSERVER whose vehicle is not set yet."""
     record = np.zeros(1, OBSERVER)
     record["uses_velocity"] = settings.velocity is VelocitySource.BIAS
     record["adaptive"] = settings.adaptive
@@ -151,7 +152,7 @@ def plant_vector(vehicle: Vehicle, settings: ObserverSettings) -> Array:
 def filter_models(vehicle: Vehicle, settings: ObserverSettings) -> tuple[tuple[Array, Array], ...]:
     """Dynamics (n, n) and densities (n,) of the lateral, vertical and course filters.
 
-    Linear about hover: an error of b accelerates by g, whatever the thrust.
+    Linearised about hover: the acceleration per error of the thrust direction b is g.
     """
     trusted = settings.velocity is VelocitySource.REPORTED
     drift = 0.0 if trusted else settings.disturbance_density_mps2
@@ -177,7 +178,7 @@ def filter_models(vehicle: Vehicle, settings: ObserverSettings) -> tuple[tuple[A
 def predicted_state(
     time_s: float, state: Array, rates_frd_radps: Array, heave: PredictedHeave
 ) -> PredictedState:
-    """A state (STATE_SIZE,) of `propagation` at `time_s` as the controller sees it."""
+    """What the controller is given of a state (STATE_SIZE,) of `propagation` at `time_s`."""
     north, east, rate_n, rate_e = state[TILT : TILT_RATE + 2].tolist()
     down = upright(north, east)
     return PredictedState(

@@ -53,7 +53,7 @@ class LinkTime:
 
     def vehicle(self, time_s: float, now_s: float) -> None:
         """Telemetry with the stamp `time_s` arrived at host time `now_s`. A stamp older than the
-        newest changes nothing: streams overtake each other."""
+        newest changes nothing: messages of several streams may arrive out of order."""
         self._received_s = now_s
         step_s = 0.0 if self._vehicle_s is None else time_s - self._vehicle_s
         if self._vehicle_s is None or step_s > 0.0 or step_s < -_REBOOT_S:

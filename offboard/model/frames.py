@@ -76,24 +76,6 @@ def rotation_from_quaternion(quaternion: ArrayLike) -> Array:
     return entries.reshape(*entries.shape[:-1], 3, 3)
 
 
-def quaternion_multiply(left: ArrayLike, right: ArrayLike) -> Array:
-    """Hamilton product (..., 4): the rotation `right` followed by `left`."""
-    lw, lx, ly, lz = _components(left)
-    rw, rx, ry, rz = _components(right)
-    return _stack(
-        lw * rw - lx * rx - ly * ry - lz * rz,
-        lw * rx + lx * rw + ly * rz - lz * ry,
-        lw * ry - lx * rz + ly * rw + lz * rx,
-        lw * rz + lx * ry - ly * rx + lz * rw,
-    )
-
-
-def quaternion_conjugate(quaternion: ArrayLike) -> Array:
-    """Conjugate (..., 4): the inverse rotation of a unit quaternion."""
-    w, x, y, z = _components(quaternion)
-    return _stack(w, -x, -y, -z)
-
-
 def thrust_direction_from_quaternion(quaternion: ArrayLike) -> Array:
     """Unit quaternion (..., 4) -> third body axis b in NED (..., 3)."""
     w, x, y, z = _components(quaternion)

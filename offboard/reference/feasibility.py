@@ -77,11 +77,12 @@ class _Demand:
 def check(
     reference: Reference, vehicle: Vehicle, ground_down_m: float = 0.0, bounds: Bounds = Bounds()
 ) -> Envelope:
-    """The extremes of a reference, sampled every 10 ms, without wind.
+    """Check that a vehicle can fly a reference without wind; return the extremes.
 
-    `ground_down_m` is the height of the ground in the frame of the reference (NED, positive down):
-    0 when positions are relative to the take-off point. Raises InfeasibleReference for a path that
-    is too low or too far away, otherwise for the limit that is exceeded first.
+    The reference is sampled every 10 ms. `ground_down_m` is the position of the ground in its frame
+    (NED, positive down): 0 if positions are relative to the take-off point. Raises
+    InfeasibleReference for a path that is too low or too far away, otherwise for the limit that is
+    exceeded first.
     """
     count = int(np.ceil(reference.duration_s / _STEP_S)) + 1
     times = np.linspace(0.0, reference.duration_s, count)
@@ -107,7 +108,7 @@ def _envelope(
     demands = _demands(reference, vehicle, times, ground_down_m, bounds)
     broken: list[tuple[int, _Demand]] = []
     for demand in demands:
-        # written so that NaN counts as broken
+        # in this form NaN exceeds the limit
         within = demand.sign * demand.values <= demand.sign * demand.limit
         if not within.all():
             broken.append((int(np.argmin(within)), demand))

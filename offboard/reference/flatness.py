@@ -12,7 +12,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.model.frames import quaternion_from_thrust_direction
 from offboard.reference.base import FlatSample
 
 Array = NDArray[np.float64]
@@ -39,11 +38,6 @@ class FlatState:
     thrust_direction_acceleration_ned_ps2: Array
     course_rad: Array
     course_rate_radps: Array
-
-    @property
-    def attitude(self) -> Array:
-        """Quaternion w, x, y, z, FRD to NED, shape (..., 4); computed at each call."""
-        return quaternion_from_thrust_direction(self.thrust_direction_ned, self.course_rad)
 
     @property
     def rates_frd_radps(self) -> Array:

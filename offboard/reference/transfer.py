@@ -36,8 +36,8 @@ class Limits:
     speed_mps: float = 1.5
     acceleration_mps2: float = 2.0
     course_rate_radps: float = 0.8
-    # Of a long transfer, flown at constant speed between gaining and losing it (PX4: MPC_XY_CRUISE
-    # 5 m/s, MPC_Z_V_AUTO_DN 1.5 m/s)
+    # Constant speed of a long transfer between its run-in and run-out (PX4: MPC_XY_CRUISE 5 m/s,
+    # MPC_Z_V_AUTO_DN 1.5 m/s)
     cruise_mps: float = 4.0
     cruise_vertical_mps: float = 1.5
 

@@ -41,7 +41,7 @@ _TIMED = frozenset({Kind.WAYPOINT, Kind.LOITER_TIME, Kind.DELAY})  # param1: s t
 
 @dataclass(slots=True)
 class Mission:
-    """Items and progress of one vehicle's mission. Whoever flies it takes its `events`."""
+    """Items and progress of one vehicle's mission. The commander takes its `events`."""
 
     origin: Origin
     rules: MissionRules

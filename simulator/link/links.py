@@ -1,7 +1,7 @@
 """Opening the simulator's links, and waiting for datagrams. Bytes only; no MAVLink.
 
-udpout:HOST:PORT sends to that address from the start, udpin:HOST:PORT answers whoever sends to it,
-and tcpin:HOST:PORT accepts connections, as ArduPilot's SITL does.
+udpout:HOST:PORT sends to that address from the start, udpin:HOST:PORT answers every address that
+sends to it, and tcpin:HOST:PORT accepts connections, as ArduPilot's SITL does.
 """
 
 from __future__ import annotations

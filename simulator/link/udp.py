@@ -1,4 +1,4 @@
-"""UDP socket of a link: whoever sends to it becomes a peer."""
+"""UDP socket of a link: every address that sends to it becomes a peer."""
 
 from __future__ import annotations
 

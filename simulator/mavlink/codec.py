@@ -52,23 +52,19 @@ class Layout:
         self.crc_extra: int = message.crc_extra
         self.extra_byte = bytes((message.crc_extra,))
         self._struct: struct.Struct = message.unpacker
-        self._wire_names: Sequence[str] = message.ordered_fieldnames
-        self._names: Sequence[str] = message.fieldnames
         is_text = [fmt.endswith("s") for fmt in _formats(message)]
         spans = [
             1 if text else length for text, length in zip(is_text, message.lengths, strict=True)
         ]
-        order = tuple(self._names.index(name) for name in self._wire_names)
-        self._pack = _packer(self._struct, order, spans)
-        self._named = _namer(self._wire_names, spans, is_text)
-
-    @property
-    def size(self) -> int:
-        return self._struct.size
+        self._pack = _packer(message, spans)
+        self._named = _namer(message.ordered_fieldnames, spans, is_text)
 
     def pack(self, values: Sequence[Any]) -> bytes:
-        """Payload with its trailing zeros removed (at least one byte stays)."""
-        payload = self._pack(values)
+        """Payload with its trailing zeros removed (at least one byte stays).
+
+        Raises TypeError, which names message and field, for too few or too many values.
+        """
+        payload = self._pack(*values)
         if payload[-1]:
             return payload
         return payload.rstrip(b"\0") or b"\0"
@@ -81,20 +77,20 @@ class Layout:
         return self._named(self._struct.unpack(payload))
 
 
-def _packer(
-    layout: struct.Struct, order: Sequence[int], spans: Sequence[int]
-) -> Callable[[Sequence[Any]], bytes]:
+def _packer(message: Any, spans: Sequence[int]) -> Callable[..., bytes]:
     """Function from values in the order of the XML, arrays as sequences, to the payload.
 
     Generated as one expression, as `namedtuple` does: a loop takes five times as long.
     """
     terms = [
-        f"v[{index}]" if span == 1 else f"*v[{index}]"
-        for index, span in zip(order, spans, strict=True)
+        name if span == 1 else f"*{name}"
+        for name, span in zip(message.ordered_fieldnames, spans, strict=True)
     ]
-    packer: Callable[[Sequence[Any]], bytes] = eval(
-        f"lambda v: pack({', '.join(terms)})", {"pack": layout.pack}
+    packer: Callable[..., bytes] = eval(
+        f"lambda {', '.join(message.fieldnames)}: pack_({', '.join(terms)})",
+        {"pack_": message.unpacker.pack},
     )
+    packer.__qualname__ = message.msgname
     return packer
 
 

@@ -17,7 +17,7 @@ _RANGES = {
 
 
 def fit(value: float, bits: int, *, signed: bool = True) -> int:
-    """Nearest integer within a field of `bits`; 0 for what is not finite."""
+    """`value` rounded and limited to an integer of `bits`; 0 if it is not finite."""
     if value - value != 0.0:  # infinite or not a number
         return 0
     low, high = _RANGES[bits, signed]
@@ -30,7 +30,7 @@ def centi(velocity: Triple) -> tuple[int, int, int]:
 
 
 def heading_cdeg(yaw_rad: float) -> int:
-    """Yaw -> centidegrees 0 .. 35999; 0 for what is not finite."""
+    """Yaw -> centidegrees 0 .. 35999; 0 if it is not finite."""
     return fit(math.degrees(yaw_rad) * 100, 32) % 36000
 
 

@@ -85,7 +85,7 @@ def gps_global_origin(view: View) -> Sequence[Any]:
 
 
 def mission_current(view: View) -> Sequence[Any]:
-    """Current item and number of items; PX4 sends 65535 for no items, and 0 for the rest."""
+    """Current item and number of items, 65535 without a mission; the other fields are 0 in PX4."""
     mission = view.autopilot.mission
     return (mission.current, len(mission.items) or 65535, 0, 0)
 

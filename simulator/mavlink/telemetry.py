@@ -51,7 +51,7 @@ def builders(firmware: Firmware) -> dict[str, Builder]:
     """All messages of this firmware, with their builders.
 
     Raises:
-        ValueError: a stream of the firmware has no builder.
+        ValueError: a stream of the firmware has no builder, or a message that it never sends has.
     """
     streams = firmware.streams
     known = {**BUILDERS, **streams.messages}
@@ -59,4 +59,7 @@ def builders(firmware: Firmware) -> dict[str, Builder]:
     missing = sorted(named.union(streams.fixed, *streams.groups.values()).difference(known))
     if missing:
         raise ValueError(f"{firmware.name} streams: no builder for {', '.join(missing)}")
+    unsent = sorted(name for name in known if id_of(name) in streams.never_sent)
+    if unsent:
+        raise ValueError(f"{firmware.name} streams: remove from never_sent: {', '.join(unsent)}")
     return known

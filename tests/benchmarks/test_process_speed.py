@@ -118,6 +118,6 @@ def test_instances(benchmark: Any) -> None:
         output = subprocess.run(command, capture_output=True, text=True, check=True).stdout
         return output.splitlines()[-1]
 
-    said = benchmark.pedantic(run, rounds=1)
-    print(f"\n{said}")
-    assert "of 5000 deadlines missed" in said
+    output = benchmark.pedantic(run, rounds=1)
+    print(f"\n{output}")
+    assert "of 5000 deadlines missed" in output

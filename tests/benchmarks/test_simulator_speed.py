@@ -20,11 +20,11 @@ from simulator.vehicle.sensors import EstimatorName
 
 
 def _fly(instance: Instance, duration_s: float) -> int:
-    """Bytes said at the barriers of so much flight."""
-    end_s, said = instance.time_s + duration_s, 0
+    """Bytes sent at the barriers of so much flight."""
+    end_s, sent = instance.time_s + duration_s, 0
     while instance.advance_to_barrier(end_s):
-        said += sum(map(len, instance.barrier()[1]))
-    return said
+        sent += sum(map(len, instance.barrier()[1]))
+    return sent
 
 
 def _standing() -> Instance:
@@ -47,5 +47,5 @@ def _holding() -> Instance:
 @pytest.mark.parametrize("begin", [_standing, _holding], ids=["on the ground", "holding position"])
 def test_a_second_in_memory(benchmark: Any, begin: Callable[[], Instance]) -> None:
     instance = begin()
-    said = benchmark(_fly, instance, 1.0)
-    assert 20_000 < said < 60_000
+    sent = benchmark(_fly, instance, 1.0)
+    assert 20_000 < sent < 60_000

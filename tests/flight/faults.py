@@ -26,8 +26,8 @@ Action = Callable[[Pair], None]
 
 def refusing(event: str, text: str) -> Firmware:
     """A vehicle that refuses one thing, with its reason."""
-    said = (StatusText(Severity.CRITICAL, text),)
-    rule = Rule(event, result=Result.TEMPORARILY_REJECTED, texts=said)
+    texts = (StatusText(Severity.CRITICAL, text),)
+    rule = Rule(event, result=Result.TEMPORARILY_REJECTED, texts=texts)
     return replace(LEAN, rules=(rule, *LEAN.rules))
 
 

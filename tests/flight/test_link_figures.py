@@ -88,9 +88,9 @@ def test_sixty_ms_each_way_cause_a_limit_cycle_unless_identified(tmp_path: Path)
     for seed in (1, 2):
         known = sixty_ms_each_way(10, seed, IdentifySettings())
         score = known.score(tmp_path / str(seed))
-        (said,) = [line for line in known.companion.announced if line.startswith("bandwidth")]
-        used_radps = float(said.removeprefix("bandwidth limited to ").split()[0])
+        (sentence,) = [line for line in known.companion.announced if line.startswith("bandwidth")]
+        used_radps = float(sentence.removeprefix("bandwidth limited to ").split()[0])
         assert 6.0 < used_radps < 10.0
-        assert f"(configured 10.0) by the identified delay, {score.delay_ms:.0f} " in said
+        assert f"(configured 10.0) by the identified delay, {score.delay_ms:.0f} " in sentence
         assert score.rmse_position_m < 0.06
         assert score.delay_ms == pytest.approx(PLAIN_DELAY_MS + 120.0, abs=10.0)

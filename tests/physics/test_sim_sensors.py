@@ -23,17 +23,17 @@ def _errors(estimator: str) -> dict[str, np.ndarray]:
     """Estimate minus truth, (flight, sample, axis), 20 to 80 s after take-off, hover."""
     vehicle = load("px4_sih" if estimator == "px4_like" else "arducopter")
     level = Demand(True, vehicle.hover_thrust, attitude())
-    believed, true = [], []
+    estimated, true = [], []
     for seed in range(FLIGHTS):
         plant = Plant(vehicle, Conditions(estimator=estimator), seed)
         plant.advance(1.0, Demand(True, 1.4 * vehicle.hover_thrust, attitude()))
         plant.advance(19.0, level)
         for _ in range(SECONDS * RATE_HZ):
             plant.advance(1.0 / RATE_HZ, level)
-            for rows, source in ((believed, plant.estimate), (true, plant.truth)):
+            for rows, source in ((estimated, plant.estimate), (true, plant.truth)):
                 parts = (source.position_ned_m, source.velocity_ned_mps, source.attitude)
                 rows.append(np.concatenate(parts))
-    estimate, truth = np.array(believed), np.array(true)
+    estimate, truth = np.array(estimated), np.array(true)
     turn = Rotation.from_quat(estimate[:, 6:], scalar_first=True) * (
         Rotation.from_quat(truth[:, 6:], scalar_first=True).inv()
     )

@@ -19,7 +19,7 @@ STOP_S = 5.0
 
 
 class Process:
-    """`python -m simulator` with what it said, stopped when the block ends however it ends."""
+    """`python -m simulator` with its output, stopped at the end of the block."""
 
     def __init__(self, *options: str) -> None:
         self.popen = subprocess.Popen(

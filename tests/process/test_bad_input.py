@@ -1,4 +1,4 @@
-"""Bad input: one sentence that says what, where and what to do, the right exit code, no traceback.
+"""Bad input: one sentence (what, where, what to do), the right exit code, no traceback.
 
 What ends before anything is sent is called in this process; the rest are real processes.
 """
@@ -54,7 +54,7 @@ def kept_out(north_m: float, east_m: float, height_m: float, radius_m: float) ->
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "expected"),
     [
         (("--firmware", "frog"), "--firmware frog: unknown; there is px4, ardupilot"),
         (("--sim-vehicle", "tank"), "there is no vehicle named 'tank'; known are arducopter"),
@@ -63,16 +63,16 @@ def kept_out(north_m: float, east_m: float, height_m: float, radius_m: float) ->
     ],
 )
 def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
-    arguments: tuple[str, ...], says: str, offboard: Call, monkeypatch: pytest.MonkeyPatch
+    arguments: tuple[str, ...], expected: str, offboard: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(request, "build_parts", pytest.fail)
-    code, said = offboard("fly", "--sitl", *arguments)
-    assert (code, len(said.splitlines())) == (2, 1)
-    assert says in said
+    code, output = offboard("fly", "--sitl", *arguments)
+    assert (code, len(output.splitlines())) == (2, 1)
+    assert expected in output
 
 
 @pytest.mark.parametrize(
-    ("arguments", "says"),
+    ("arguments", "expected"),
     [
         (("--config", "nonsense"), "no configuration named 'nonsense'; known are flight, paper"),
         (("--config", "missing.yaml"), "missing.yaml cannot be read: No such file"),
@@ -133,13 +133,13 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
     ],
 )
 def test_usage_is_refused_before_anything_is_sent(
-    arguments: tuple[str, ...], says: str, offboard: Call, tmp_path: Path
+    arguments: tuple[str, ...], expected: str, offboard: Call, tmp_path: Path
 ) -> None:
-    code, said = offboard("fly", "--connect", "udpin:127.0.0.1:0", *arguments)
-    assert code == 2, said
-    assert says in said
-    assert "Traceback" not in said
-    assert len(said.strip().splitlines()) == 1
+    code, output = offboard("fly", "--connect", "udpin:127.0.0.1:0", *arguments)
+    assert code == 2, output
+    assert expected in output
+    assert "Traceback" not in output
+    assert len(output.strip().splitlines()) == 1
     assert not list(tmp_path.iterdir())
 
 
@@ -147,7 +147,7 @@ CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3
 
 
 @pytest.mark.parametrize(
-    ("name", "content", "says"),
+    ("name", "content", "expected"),
     [
         ("flight.yaml", "vehicle: px4_sih", "flight.yaml: controller is missing"),
         ("flight.yaml", "seed: 0.5", "flight.yaml: vehicle is missing"),
@@ -179,12 +179,12 @@ CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3
     ],
 )
 def test_every_kind_of_file_is_checked(
-    name: str, content: str, says: str, offboard: Call, tmp_path: Path
+    name: str, content: str, expected: str, offboard: Call, tmp_path: Path
 ) -> None:
     (tmp_path / name).write_text(content)
-    code, said = offboard("check", name)
-    assert (code, "Traceback" in said) == (2, False)
-    assert says in said
+    code, output = offboard("check", name)
+    assert (code, "Traceback" in output) == (2, False)
+    assert expected in output
 
 
 def test_all_shipped_files_are_valid(offboard: Call) -> None:
@@ -195,81 +195,81 @@ def test_all_shipped_files_are_valid(offboard: Call) -> None:
 
 
 def test_infeasible_reference_names_time_value_and_limit(offboard: Call) -> None:
-    code, said = offboard("fly", "--set", "reference.period_s=2.0")
+    code, output = offboard("fly", "--set", "reference.period_s=2.0")
     assert code == 2
-    assert "reference lemniscate" in said
-    assert " s" in said
-    assert "limit" in said
+    assert "reference lemniscate" in output
+    assert " s" in output
+    assert "limit" in output
 
 
 def test_port_in_use(offboard: Call) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         port = other.getsockname()[1]
-        code, said = offboard("fly", "--connect", f"udpin:127.0.0.1:{port}")
+        code, output = offboard("fly", "--connect", f"udpin:127.0.0.1:{port}")
     assert code == 2
-    assert f"udpin:127.0.0.1:{port} cannot be opened" in said
-    assert "another program uses the port" in said
+    assert f"udpin:127.0.0.1:{port} cannot be opened" in output
+    assert "another program uses the port" in output
 
 
 def test_a_flight_is_never_overwritten(offboard: Call, tmp_path: Path) -> None:
     (tmp_path / "old").mkdir()
     (tmp_path / "old" / "flight.tlog").write_bytes(b"precious")
-    code, said = offboard("fly", "--out", "old", "--connect", "udpin:127.0.0.1:0")
+    code, output = offboard("fly", "--out", "old", "--connect", "udpin:127.0.0.1:0")
     assert code == 2
-    assert "already holds a flight; choose another directory with --out" in said
+    assert "already holds a flight; choose another directory with --out" in output
     assert (tmp_path / "old" / "flight.tlog").read_bytes() == b"precious"
 
 
 @pytest.mark.parametrize(
-    ("content", "says"),
+    ("content", "expected"),
     [
         (b"", "is not a .tlog, or empty"),
         (b"PK\3\4" + bytes(500), "is not a .tlog"),
         (b"\x00" * 11, "is not a .tlog"),
     ],
 )
-def test_foreign_log(content: bytes, says: str, offboard: Call, tmp_path: Path) -> None:
+def test_foreign_log(content: bytes, expected: str, offboard: Call, tmp_path: Path) -> None:
     (tmp_path / "x.tlog").write_bytes(content)
-    code, said = offboard("score", "x.tlog")
-    assert (code, "Traceback" in said) == (2, False)
-    assert says in said
+    code, output = offboard("score", "x.tlog")
+    assert (code, "Traceback" in output) == (2, False)
+    assert expected in output
 
 
 def test_identification_overwrites_no_vehicle_file(offboard: Call, tmp_path: Path) -> None:
     (tmp_path / "mine.yaml").write_text("precious")
-    code, said = offboard("identify", RECORDING, "-o", "mine.yaml", "--page", "page.html")
-    assert (code, said) == (2, "mine.yaml exists already; choose another file with -o\n")
+    code, output = offboard("identify", RECORDING, "-o", "mine.yaml", "--page", "page.html")
+    assert (code, output) == (2, "mine.yaml exists already; choose another file with -o\n")
     assert [path.read_text() for path in tmp_path.iterdir()] == ["precious"]
 
 
 def test_nothing_identified_is_no_vehicle_file(offboard: Call, tmp_path: Path) -> None:
     still = RECORDING.with_name("arducopter-4.6.3-guided.tlog")
-    code, said = offboard("identify", still, "-o", "mine.yaml", "--page", "page.html")
+    code, output = offboard("identify", still, "-o", "mine.yaml", "--page", "page.html")
     assert code == 1
-    assert said == "nothing could be identified from this flight; page.html says why\n"
+    assert output == "nothing could be identified from this flight; page.html says why\n"
     assert [path.name for path in tmp_path.iterdir()] == ["page.html"]
 
 
 def test_missing_log(offboard: Call) -> None:
-    code, said = offboard("score", "nowhere")
+    code, output = offboard("score", "nowhere")
     assert code == 2
-    assert "nowhere does not exist; name a flight directory or a .tlog file" in said
+    assert "nowhere does not exist; name a flight directory or a .tlog file" in output
 
 
 def test_truncated_log_is_scored_up_to_there(offboard: Call, tmp_path: Path) -> None:
     (tmp_path / "cut.tlog").write_bytes(RECORDING.read_bytes()[:-7])
-    code, said = offboard("score", "cut.tlog")
-    assert (code, said) == (0, "")
+    code, output = offboard("score", "cut.tlog")
+    assert (code, output) == (0, "")
 
 
 def test_no_vehicle(offboard: Call, tmp_path: Path) -> None:
-    code, said = offboard(
+    code, output = offboard(
         "fly", "--connect", "udpin:127.0.0.1:0", "--set", "limits.connect_s=0.3", "--out", "x"
     )
     assert code == 3
-    assert said.startswith("no vehicle heard in 0 s; is it running, and sending to this port?")
-    assert len(said.strip().splitlines()) == 1
+    assert output.startswith("no vehicle heard in 0 s; is it running, and sending to this port?")
+    assert len(output.strip().splitlines()) == 1
     log = tlog.read(tmp_path / "x" / "flight.tlog")
     assert history.configuration(log) == (tmp_path / "x" / "flight.yaml").read_text()
 
@@ -290,10 +290,10 @@ def in_flight(spawn: Spawn, *arguments: str) -> subprocess.Popen[str]:
 def test_interrupt_lands(spawn: Spawn, tmp_path: Path) -> None:
     process = in_flight(spawn)
     process.send_signal(signal.SIGINT)
-    _, said = process.communicate(timeout=60)
+    _, output = process.communicate(timeout=60)
     assert process.returncode == 4
-    assert said.startswith("stop requested by the operator (log: x/flight.tlog)")
-    assert len(said.strip().splitlines()) == 1
+    assert output.startswith("stop requested by the operator (log: x/flight.tlog)")
+    assert len(output.strip().splitlines()) == 1
     flown = history.gather(tlog.read(tmp_path / "x" / "flight.tlog"))
     assert "AUTO.LAND" in [mode.what for mode in flown.modes]
     assert flown.phases[-1].what.startswith("disarmed")
@@ -309,8 +309,10 @@ def test_interrupted_while_it_compiles_it_does_not_fly(
     offboard: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run, "rehearse", interrupted_while_compiling)
-    code, said = offboard("fly", "--connect", "udpin:127.0.0.1:0", "--set", "limits.connect_s=0.3")
-    assert (code, said) == (2, "interrupted before anything was sent\n")
+    code, output = offboard(
+        "fly", "--connect", "udpin:127.0.0.1:0", "--set", "limits.connect_s=0.3"
+    )
+    assert (code, output) == (2, "interrupted before anything was sent\n")
     assert not list(tmp_path.iterdir())
 
 
@@ -318,11 +320,11 @@ def test_a_comparison_interrupted_while_it_compiles_does_not_fly(
     offboard: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(run, "rehearse", interrupted_while_compiling)
-    code, said = offboard(
+    code, output = offboard(
         "compare", "--connect", "udpin:127.0.0.1:0", "--controllers", "lqr", "--seeds", 2,
         "--set", "limits.connect_s=0.3", "--out", "x",
     )  # fmt: skip
-    assert (code, said) == (4, "interrupted: 2 of 2 flights missing\n")
+    assert (code, output) == (4, "interrupted: 2 of 2 flights missing\n")
     assert not list(tmp_path.rglob("*.tlog"))
 
 
@@ -337,8 +339,8 @@ def test_ended_before_flight_it_leaves_no_simulator(
     for number in signals:
         process.send_signal(number)
         time.sleep(0.05)
-    _, said = process.communicate(timeout=60)
-    assert (process.returncode, said) == (2, "interrupted before anything was sent\n")
+    _, output = process.communicate(timeout=60)
+    assert (process.returncode, output) == (2, "interrupted before anything was sent\n")
     deadline_s = time.monotonic() + 10.0  # hit while it started: it ends by itself, alone
     while Path(f"/proc/{simulator}").exists() and time.monotonic() < deadline_s:
         time.sleep(0.01)
@@ -381,10 +383,10 @@ def test_simulator_killed_in_flight(spawn: Spawn, tmp_path: Path) -> None:
     process = in_flight(spawn)
     (simulator,) = children(process.pid)
     os.kill(simulator, signal.SIGKILL)
-    _, said = process.communicate(timeout=30)
+    _, output = process.communicate(timeout=30)
     assert process.returncode == 4
-    assert said.startswith("the bundled simulator ended (signal 9) (log: x/flight.tlog)")
-    assert len(said.strip().splitlines()) == 1
+    assert output.startswith("the bundled simulator ended (signal 9) (log: x/flight.tlog)")
+    assert len(output.strip().splitlines()) == 1
     flown = history.gather(tlog.read(tmp_path / "x" / "flight.tlog"))
     assert len(flown.setpoint) > 50
 

@@ -20,23 +20,23 @@ COMPARE = (
 
 def as_a_terminal_interrupts(process: subprocess.Popen[str]) -> tuple[str, str]:
     os.killpg(process.pid, signal.SIGINT)
-    told, said = process.communicate(timeout=60)
+    output, errors = process.communicate(timeout=60)
     assert process.returncode == 4
-    assert "Traceback" not in said
-    return told, said
+    assert "Traceback" not in errors
+    return output, errors
 
 
 def test_interrupted_it_keeps_what_landed(spawn: Spawn, tmp_path: Path) -> None:
     process = spawn("offboard", *COMPARE)
     while process.poll() is None and not list(tmp_path.rglob("score.json")):
         time.sleep(0.01)
-    told, said = as_a_terminal_interrupts(process)
+    output, errors = as_a_terminal_interrupts(process)
     (row,) = csv.DictReader((tmp_path / "x" / "compare.csv").open(encoding="utf-8"))
     flights = int(row["flights"])
     assert (row["controller"], row["failed"]) == ("lqr", "0")
     assert 1 <= flights <= 4
-    assert f"interrupted: {SEEDS - flights} of {SEEDS} flights missing" in said
-    assert "not flown: hover, calm: lqr seed" in told
+    assert f"interrupted: {SEEDS - flights} of {SEEDS} flights missing" in errors
+    assert "not flown: hover, calm: lqr seed" in output
     assert "not flown" in (tmp_path / "x" / "compare.html").read_text(encoding="utf-8")
     assert len(list(tmp_path.rglob("score.json"))) == flights
 
@@ -45,6 +45,6 @@ def test_interrupted_while_its_processes_load_it_ends_in_order(spawn: Spawn) -> 
     process = spawn("offboard", *COMPARE)
     while process.poll() is None and len(children(process.pid)) < 3:  # a tracker, two of ours
         time.sleep(0.01)
-    told, said = as_a_terminal_interrupts(process)
-    assert "the process that flew it ended" not in told
-    assert "flights missing" in said
+    output, errors = as_a_terminal_interrupts(process)
+    assert "the process that flew it ended" not in output
+    assert "flights missing" in errors

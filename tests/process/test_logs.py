@@ -36,8 +36,8 @@ def test_same_seed_same_bytes_another_seed_others(spawn: Spawn, tmp_path: Path) 
         for name, seed in seeds.items()
     ]
     for flight in flights:
-        _, said = flight.communicate(timeout=60)
-        assert (flight.returncode, said) == (0, "")
+        _, errors = flight.communicate(timeout=60)
+        assert (flight.returncode, errors) == (0, "")
     one, two, three = (setpoints(tmp_path / name) for name in seeds)
     assert len(one) > 100
     assert one == two

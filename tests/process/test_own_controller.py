@@ -54,8 +54,8 @@ def test_documented_controller_flies(
         "offboard", "fly", "--sitl", "--controller", controller, "--reference", reference,
         "--scenario", "calm", "--seed", "7", "--out", "x", PYTHONPATH=path,
     )  # fmt: skip
-    said, errors = flight.communicate(timeout=170)
-    assert (flight.returncode, errors) == (0, ""), said
+    output, errors = flight.communicate(timeout=170)
+    assert (flight.returncode, errors) == (0, ""), output
     score = json.loads((tmp_path / "x" / "score.json").read_text())
     assert score["rmse_position_m"] < most_m
     flown = yaml.safe_load((tmp_path / "x" / "flight.yaml").read_text())["controller"]

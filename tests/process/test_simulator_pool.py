@@ -59,15 +59,15 @@ def test_a_pool_that_dies_takes_its_vehicle_along() -> None:
 
 
 def test_vehicles_with_the_same_seed_send_the_same_datagram(simulator: SimulatorProcess) -> None:
-    said, pid = [], simulator.pid
+    hellos, pid = [], simulator.pid
     for seed in ("1", "1", "2"):
         with flying(simulator, "--scenario", "px4_like", "--seed", seed) as hello:
-            said.append(hello)
+            hellos.append(hello)
             assert len(vehicles(simulator)) == 1
             assert simulator.ended() is None
         simulator.recall()
         assert (vehicles(simulator), simulator.pid) == ([], pid)
-    assert said[0] == said[1] != said[2]
+    assert hellos[0] == hellos[1] != hellos[2]
 
 
 def test_the_end_of_a_vehicle_is_reported_and_the_next_one_flies(

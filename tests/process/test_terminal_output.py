@@ -112,10 +112,10 @@ def test_a_missed_requirement_is_the_verdict(spawn: Spawn) -> None:
         "offboard", "fly", "--sitl", "--scenario", "calm", "--out", "x", "--reference", "hover",
         "--set", "reference.duration_s=2", "--require", "tilt_max_deg<0", COLUMNS="80",
     )  # fmt: skip
-    told, said = process.communicate(timeout=60)
+    told, errors = process.communicate(timeout=60)
     assert process.returncode == 1
-    assert said.startswith("flown and landed; requirement missed: tilt_max_deg is ")
-    assert said.endswith(" (required < 0)\n")
+    assert errors.startswith("flown and landed; requirement missed: tilt_max_deg is ")
+    assert errors.endswith(" (required < 0)\n")
     assert "  all figures    offboard score x\n" in told
 
 

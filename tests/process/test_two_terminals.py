@@ -21,8 +21,8 @@ def test_real_time_after_the_compilation_cache_was_deleted(
         "offboard", "fly", "--connect", f"udpin:127.0.0.1:{port}", "--out", "x", *SHORT,
         "--set", "limits.connect_s=120", **cache,
     )  # fmt: skip
-    shown, said = flight.communicate(timeout=150)
-    assert (flight.returncode, said) == (0, ""), shown
+    shown, errors = flight.communicate(timeout=150)
+    assert (flight.returncode, errors) == (0, ""), shown
     assert "first run on this machine: compiling" in shown
     assert simulator.poll() is None
     assert b"supervisor:" not in (tmp_path / "x" / "flight.tlog").read_bytes()

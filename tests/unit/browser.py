@@ -20,7 +20,7 @@ FLAGS = (
 DRAWN = """scheme => [...document.querySelectorAll(".figure")].every((figure) =>
   figure.dataset.drawn === scheme &&
   Math.abs(figure.querySelector(".svg-container").clientWidth - figure.clientWidth) <= 1)"""
-# Of every text of the page and its figures: contrast by WCAG 2.1, brightness of its background
+# For each text of the page and its figures: contrast by WCAG 2.1, brightness of its background
 CONTRASTS = """() => {
   const linear = (v) => v <= 10.31475 ? v / 3294.6 : ((v / 255 + 0.055) / 1.055) ** 2.4;
   const rgb = (colour) => colour.match(/[0-9.]+/g).map(Number);

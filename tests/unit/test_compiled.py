@@ -61,12 +61,12 @@ from offboard import compiled
 from offboard.entries import PAIR, add, weigh
 
 assert "numba" not in sys.modules
-said = []
-compiled.prepare(said.append)
+sentences = []
+compiled.prepare(sentences.append)
 pair, places = np.zeros(1, PAIR), np.array([1, 10])
 pair["values"] = 3.0, 5.0
 print(add(pair, 2), weigh(np.array([[1.0, 2.0], [3.0, 4.0]]), places, 0.5))
-print(int(pair["calls"][0]), places.tolist(), len(said))
+print(int(pair["calls"][0]), places.tolist(), len(sentences))
 """
 DIRECTORY = "from offboard import compiled; print(compiled.directory())"
 

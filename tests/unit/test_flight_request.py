@@ -1,4 +1,4 @@
-"""What is believed of the vehicle before a flight."""
+"""The vehicle parameters that a flight begins with."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from offboard.flight.request import FlightRequest
 
 
 @pytest.mark.parametrize(
-    ("asked", "believed"),
+    ("asked", "expected"),
     [
         ({}, "neutral"),
         ({"sitl": True}, "px4_sih"),
@@ -26,9 +26,9 @@ from offboard.flight.request import FlightRequest
     ],
 )
 def test_vehicle_is_neutral_unless_one_is_named_or_the_simulator_flies_its_own(
-    asked: dict[str, Any], believed: str
+    asked: dict[str, Any], expected: str
 ) -> None:
-    assert FlightRequest(Path("unused"), **asked).resolve().vehicle.name == believed
+    assert FlightRequest(Path("unused"), **asked).resolve().vehicle.name == expected
 
 
 @pytest.mark.parametrize(

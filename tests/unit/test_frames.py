@@ -15,10 +15,8 @@ from scipy.spatial.transform import Rotation
 from offboard.model.frames import (
     course_from_quaternion,
     euler_from_quaternion,
-    quaternion_conjugate,
     quaternion_from_euler,
     quaternion_from_thrust_direction,
-    quaternion_multiply,
     rotation_from_quaternion,
     thrust_direction_from_quaternion,
     wrap_pi,
@@ -74,14 +72,6 @@ def test_course_is_the_heading_of_the_nose() -> None:
 
 def test_rotation_matrix_is_scipys() -> None:
     assert_allclose(rotation_from_quaternion(QUATERNIONS), RANDOM.as_matrix(), atol=1e-15)
-
-
-def test_product_and_conjugate_are_scipys() -> None:
-    left, right = RANDOM[:250], RANDOM[250:]
-    product = quaternion_multiply(QUATERNIONS[:250], QUATERNIONS[250:])
-    assert angle_between(product, (left * right).as_quat(scalar_first=True)) < 1e-14
-    inverse = quaternion_conjugate(QUATERNIONS)
-    assert angle_between(inverse, RANDOM.inv().as_quat(scalar_first=True)) < 1e-14
 
 
 def test_thrust_direction_is_the_third_body_axis() -> None:
@@ -189,10 +179,6 @@ def test_leading_axes_broadcast_and_single_values_agree() -> None:
         "matrix": (
             rotation_from_quaternion(many),
             lambda i, j: rotation_from_quaternion(many[i, j]),
-        ),
-        "product": (
-            quaternion_multiply(many, other),
-            lambda i, j: quaternion_multiply(many[i, j], other[j]),
         ),
         "direction": (direction, lambda i, j: thrust_direction_from_quaternion(many[i, j])),
         "attitude": (

@@ -120,7 +120,7 @@ class Trial:
 def trial(seed: int = 1, settings: FusionSettings = SETTINGS, **more: object) -> Trial:
     """Three seconds frozen as on the ground, then flying."""
     fusion = Fusion(VEHICLE, settings)
-    fusion.on_origin(ORIGIN, said=True)
+    fusion.on_origin(ORIGIN, from_vehicle=True)
     made = Trial(fusion, settings, np.random.default_rng(seed), **more)  # type: ignore[arg-type]
     made.fly(3.0)
     fusion.freeze(False)
@@ -228,9 +228,9 @@ def test_without_an_origin_the_first_fix_is_matched_to_the_estimate() -> None:
     off = made.off_m(8.0).mean(axis=0)  # by what the estimate was off at the first fix
     errors = matched[:, 4:7] - matched[:, 1:4]
     assert np.abs(off - errors.mean(axis=0)).max() < 0.1
-    fusion.on_origin(Geodetic(1.0, 1.0, 1.0), said=False)
-    fusion.on_origin(ORIGIN, said=True)
-    fusion.on_origin(Geodetic(2.0, 2.0, 2.0), said=False)
+    fusion.on_origin(Geodetic(1.0, 1.0, 1.0), from_vehicle=False)
+    fusion.on_origin(ORIGIN, from_vehicle=True)
+    fusion.on_origin(Geodetic(2.0, 2.0, 2.0), from_vehicle=False)
     made.fly(20.0)
     assert np.abs(made.off_m(8.0)).max() < 0.05
 
@@ -274,7 +274,7 @@ def test_result_is_always_finite() -> None:
     assert np.isfinite(flown.table).all()
     assert "not finite" in flown.fusion.news[-1]
     flown.fusion.reset()
-    flown.fusion.on_origin(ORIGIN, said=True)
+    flown.fusion.on_origin(ORIGIN, from_vehicle=True)
     flown.fly(3.0)
     flown.fusion.freeze(False)
     flown.fly(20.0)

@@ -19,12 +19,12 @@ REFUSAL = "it <b>does not</b> follow its command"
 def test_the_page_shows_every_constant_and_reads_in_both_colour_schemes(
     tmp_path: Path,
 ) -> None:
-    believed = load("flight", choices={}).vehicle
+    prior = load("flight", choices={}).vehicle
     log = tlog.read(RECORDING)
-    found, trace = identify_flight(log, history.gather(log), believed)
+    found, trace = identify_flight(log, history.gather(log), prior)
     found = replace(found, yaw=None, refusals={**found.refusals, "yaw": REFUSAL})
     file = tmp_path / "identify.html"
-    file.write_text(page("flight <1>", found, trace, believed), encoding="utf-8")
+    file.write_text(page("flight <1>", found, trace, prior), encoding="utf-8")
     with opening(file, width=400) as opened:
         assert opened.problems == opened.fetched == []
         assert opened.page.inner_text("h1").endswith("of flight <1>")

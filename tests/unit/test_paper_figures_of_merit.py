@@ -136,10 +136,10 @@ def test_errata_name_their_numbers() -> None:
             "final": reweighted(),
         }
     )
-    said = {str(row["where"]): str(row["shown_by"]) for row in table.rows}
-    assert "-0.076 N" in said["Eq. 26"]
-    assert "0.8992 with the arm, 3.9963 without" in said["Eq. 16, arm"]
-    assert "λ = 0.65: 0 %" in said["Table 2, small ε"]
+    shown = {str(row["where"]): str(row["shown_by"]) for row in table.rows}
+    assert "-0.076 N" in shown["Eq. 26"]
+    assert "0.8992 with the arm, 3.9963 without" in shown["Eq. 16, arm"]
+    assert "λ = 0.65: 0 %" in shown["Table 2, small ε"]
 
 
 def test_a_flight_is_a_function_of_its_task() -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
+from offboard.model.frames import quaternion_from_thrust_direction
 from offboard.reference.base import FlatSample
 from offboard.reference.flatness import FlatState, flat_state
 from offboard.reference.shapes import SHAPES, Circle, CourseMode, Hover
@@ -68,17 +69,22 @@ def test_rates_turn_the_attitude(shape: str, course: str) -> None:
     times = np.linspace(0.1, track.duration_s - 0.1, 400)
     half = 1e-4
     middle, before, after = (state_of(track, times + shift) for shift in (0.0, -half, half))
-    attitude = Rotation.from_quat(middle.attitude, scalar_first=True)
+    courses = [track.sample(times + shift).course_rad for shift in (0.0, -half, half)]
+    attitude, earlier, later = (
+        Rotation.from_quat(
+            quaternion_from_thrust_direction(state.thrust_direction_ned, course_rad),
+            scalar_first=True,
+        )
+        for state, course_rad in zip((middle, before, after), courses, strict=True)
+    )
     np.testing.assert_allclose(
         attitude.apply([0.0, 0.0, 1.0]), middle.thrust_direction_ned, atol=1e-12
     )
     nose = attitude.apply([1.0, 0.0, 0.0])
-    off = np.arctan2(nose[:, 1], nose[:, 0]) - middle.course_rad
+    off = np.arctan2(nose[:, 1], nose[:, 0]) - courses[0]
     np.testing.assert_allclose(np.sin(off), 0.0, atol=1e-9)
     assert np.all(np.cos(off) > 0.0)
-    turn = Rotation.from_quat(before.attitude, scalar_first=True).inv() * Rotation.from_quat(
-        after.attitude, scalar_first=True
-    )
+    turn = earlier.inv() * later
     np.testing.assert_allclose(turn.as_rotvec() / (2 * half), middle.rates_frd_radps, atol=2e-6)
 
 
@@ -130,7 +136,7 @@ def test_array_equals_loop_and_shapes() -> None:
     track = track_of("helix", "along_velocity")
     times = np.linspace(0.0, track.duration_s, 12).reshape(3, 4)
     batch = state_of(track, times)
-    assert batch.attitude.shape == (3, 4, 4)
+    assert batch.thrust_direction_ned.shape == (3, 4, 3)
     for index in np.ndindex(3, 4):
         single = state_of(track, float(times[index]))
         assert single.thrust_mps2.shape == ()

@@ -71,4 +71,4 @@ def test_a_story_is_told_in_vehicle_time() -> None:
         elif kind == "COMMAND_ACK" and message.result not in (0, 5):
             expected.append((now_s, f"command {message.command} refused, result {message.result}"))
     assert len(expected) > 5
-    assert [(said.time_s, said.what) for said in flown.said] == expected
+    assert [(sent.time_s, sent.what) for sent in flown.vehicle_messages] == expected

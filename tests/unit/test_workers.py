@@ -16,16 +16,16 @@ MASK = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_
 
 def interrupted_meanwhile() -> list[str]:
     """Whether SIGINT is masked in a process that is started after an interrupt, and that one."""
-    said = []
+    outputs = []
     try:
         with interrupts_deferred():
             os.kill(os.getpid(), signal.SIGINT)
             time.sleep(0.05)
             command = (sys.executable, "-c", MASK)
-            said.append(subprocess.run(command, capture_output=True, text=True).stdout)
+            outputs.append(subprocess.run(command, capture_output=True, text=True).stdout)
     except KeyboardInterrupt:
-        said.append("interrupted")
-    return said
+        outputs.append("interrupted")
+    return outputs
 
 
 def test_an_interrupt_is_deferred_to_the_end_of_the_block() -> None:

@@ -29,7 +29,7 @@ def px4_vehicle() -> Vehicle:
 
 
 class Bench:
-    """One instance and what its companion link has said so far, as (vehicle time, message)."""
+    """One instance and what its companion link has sent so far, as (vehicle time, message)."""
 
     def __init__(
         self,

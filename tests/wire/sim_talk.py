@@ -87,7 +87,7 @@ def recorded_frames(recording: Path) -> list[tuple[float, bytes, Any]]:
 
 
 class Listener(Protocol):
-    """What takes in what an autopilot said."""
+    """Receives the messages of an autopilot."""
 
     def hear(self, time_s: float, message: Any) -> None: ...
 
@@ -102,8 +102,8 @@ def ask_again(
 ) -> None:
     """Send what the companion sent, at the same vehicle times; both talks are filled.
 
-    `run_on_s`: how long the simulator goes on after the last question. `each` sees what the real
-    one said, in time.
+    `run_on_s`: how long the simulator runs after the last request. `each` receives the messages
+    of the real autopilot, in order of time.
     """
     system = bench.system
     offset_s = 0.0  # vehicle time minus host time, from the newest stamp

@@ -551,7 +551,7 @@ def test_attitude_target_has_the_thrust_before_angle_boost() -> None:
 
 
 @pytest.mark.parametrize(
-    ("action", "mode", "said"),
+    ("action", "mode", "texts"),
     [
         (0, GUIDED, []),
         (1, LAND, ["EKF variance", "EKF Failsafe: changed to LAND Mode"]),
@@ -559,7 +559,7 @@ def test_attitude_target_has_the_thrust_before_angle_boost() -> None:
     ],
 )
 def test_without_gps_the_position_is_lost_after_eight_seconds(
-    action: int, mode: int, said: list[str]
+    action: int, mode: int, texts: list[str]
 ) -> None:
     vehicle = flying()
     set_parameter(vehicle, "FS_EKF_ACTION", action)
@@ -569,13 +569,13 @@ def test_without_gps_the_position_is_lost_after_eight_seconds(
     vehicle.run(7.8)
     assert (vehicle.mode, vehicle.system_status) == (GUIDED, 4)
     vehicle.run(0.5)
-    assert (vehicle.mode, vehicle.system_status) == (mode, 5 if said else 4)
+    assert (vehicle.mode, vehicle.system_status) == (mode, 5 if texts else 4)
     assert vehicle.of("EKF_STATUS_REPORT")[-1][1].flags == 167
     autopilot.state.gps_healthy = True
     vehicle.run(0.5)
     assert vehicle.of("EKF_STATUS_REPORT")[-1][1].flags == 831
     assert (vehicle.mode, vehicle.system_status) == (mode, 4)
-    assert vehicle.texts(begun_s) == ([*said, "EKF Failsafe Cleared"] if said else [])
+    assert vehicle.texts(begun_s) == ([*texts, "EKF Failsafe Cleared"] if texts else [])
 
 
 def test_a_mission_of_home_alone_cannot_start() -> None:
@@ -640,7 +640,7 @@ def test_the_list_is_numbered() -> None:
 
 
 def test_the_same_seed_gives_the_same_bytes() -> None:
-    said = []
+    received = []
     for _ in range(2):
         vehicle = Bench(
             EstimatorName.ARDUPILOT_LIKE, seed=5, firmware=ARDUPILOT, boot_scale=BOOT_SCALE
@@ -648,6 +648,6 @@ def test_the_same_seed_gives_the_same_bytes() -> None:
         for message, period_us in itertools.product((31, 32, 108), (20_000,)):
             vehicle.command(511, message, period_us)
         vehicle.run(6.0)
-        said.append(bytes(vehicle.raw))
-    assert len(said[0]) > 10_000
-    assert said[0] == said[1]
+        received.append(bytes(vehicle.raw))
+    assert len(received[0]) > 10_000
+    assert received[0] == received[1]

@@ -76,6 +76,14 @@ def test_frames_equal_those_of_pymavlink(name: str) -> None:
         assert codec.frame(sequence, 9, 4, layout, layout.pack(values)) == expected
 
 
+def test_too_few_and_too_many_values_are_refused_by_name() -> None:
+    layout = codec.layout("EXTENDED_SYS_STATE")
+    with pytest.raises(TypeError, match=r"^EXTENDED_SYS_STATE\(\) missing .* 'landed_state'$"):
+        layout.pack((0,))
+    with pytest.raises(TypeError, match=r"^EXTENDED_SYS_STATE\(\) takes 2 .* 3 were given$"):
+        layout.pack((0, 1, 2))
+
+
 @pytest.mark.parametrize("name", ASKED)
 def test_decodes_frames_of_pymavlink(name: str) -> None:
     rng = random.Random(name)

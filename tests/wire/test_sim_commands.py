@@ -106,13 +106,13 @@ def test_arducopter_turns_to_a_yaw_and_by_an_angle() -> None:
 
 def test_px4_explains_a_refused_mode_to_ground_station_components_only() -> None:
     bench = flying(PX4)
-    said = len(bench.texts())
+    count = len(bench.texts())
     assert bench.ask_mode(OFFBOARD) == [ACCEPTED, LATER]
-    assert len(bench.texts()) == said
+    assert len(bench.texts()) == count
     bench.codec.srcComponent = 190
     assert bench.ask_mode(OFFBOARD) == [ACCEPTED, LATER]
     bench.run(0.02)
-    assert bench.texts()[said:] == ["Switching to Offboard is currently not available"]
+    assert bench.texts()[count:] == ["Switching to Offboard is currently not available"]
     assert bench.mode == LOITER
 
 

@@ -286,14 +286,14 @@ def test_px4_repositions_with_the_given_speed() -> None:
 
 
 @pytest.mark.parametrize(
-    ("place_m", "up", "said"),
+    ("place_m", "up", "texts"),
     [
         (None, 4.0, []),  # latitude and longitude 0: so far away that the way there is flat
         ((0.0, 0.0), -400.0, ["Already higher than takeoff altitude"]),  # above the ground, it says
     ],
 )
 def test_px4_stays_on_the_ground_if_its_takeoff_does_not_climb(
-    place_m: tuple[float, float] | None, up: float, said: list[str]
+    place_m: tuple[float, float] | None, up: float, texts: list[str]
 ) -> None:
     """As scripts that leave the place 0, or give a height above the ground, find out."""
     bench = Bench()
@@ -306,7 +306,7 @@ def test_px4_stays_on_the_ground_if_its_takeoff_does_not_climb(
     assert bench.height_m < 0.05
     bench.run(3.0)
     assert not bench.armed
-    wanted = ["Armed by external command", *said, "Disarmed by auto preflight disarming"]
+    wanted = ["Armed by external command", *texts, "Disarmed by auto preflight disarming"]
     assert bench.texts() == wanted
 
 

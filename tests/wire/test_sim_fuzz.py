@@ -27,14 +27,14 @@ PER_STEP = 20
 
 
 def assault(instance: Instance, seed: int, count: int) -> Decoder:
-    """Feed both links, let time pass between; the reader of everything that was said."""
+    """Feed both links, let time pass between; returns the decoder of everything that was sent."""
     reader = Decoder()
     for number, datagram in enumerate(itertools.islice(datagrams(seed), count)):
         (instance.feed if number % 4 else instance.feed_ground)(datagram)
         if number % PER_STEP == 0:
             instance.advance()
-            for said in (*instance.drain(), *instance.ground.outbox.drain()):
-                messages = reader.read(said)
+            for datagram_out in (*instance.drain(), *instance.ground.outbox.drain()):
+                messages = reader.read(datagram_out)
                 positions = [m for m in messages if m.name == "LOCAL_POSITION_NED"]
                 assert all(math.isfinite(m.x + m.y + m.z) for m in positions)
     return reader

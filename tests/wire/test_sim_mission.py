@@ -230,8 +230,8 @@ def test_fences_and_rally_points_are_kept_beside_the_mission(firmware: Firmware)
     bench.send(mavlink.MAVLink_mission_clear_all_message(1, 1, 255))
     bench.run(0.02)
     assert download(bench, 1) == []
-    said = ["Fence Indexed OK"] if firmware is ARDUPILOT else []
-    assert [text for text in bench.texts() if "Fence" in text] == said
+    expected = ["Fence Indexed OK"] if firmware is ARDUPILOT else []
+    assert [text for text in bench.texts() if "Fence" in text] == expected
 
 
 def test_the_first_item_of_arducopter_is_home() -> None:
@@ -271,8 +271,8 @@ def test_px4_refuses_items_that_do_not_fit(row: Row, frame: int, kind: int, answ
     bench = Bench()
     assert upload(bench, [row], kind, frame) == answer
     bench.run(0.1)
-    said = ["IGN MISSION_ITEM: Invalid item"] if answer == 3 else []
-    assert bench.texts() == said
+    expected = ["IGN MISSION_ITEM: Invalid item"] if answer == 3 else []
+    assert bench.texts() == expected
 
 
 def _is_near(position: Any, place_ned_m: tuple[float, float, float]) -> bool:
@@ -411,7 +411,7 @@ def test_px4_takes_the_yaw_of_an_item() -> None:
 
 
 def test_px4_checks_a_mission_before_it_can_start() -> None:
-    """Started at once the real one said so; 50 ms later it flew."""
+    """The real one denied a start right after the upload; 50 ms later it flew the mission."""
     bench = Bench()
     bench.boot()
     bench.send(mavlink.MAVLink_mission_count_message(1, 1, 1))

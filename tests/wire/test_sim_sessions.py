@@ -25,7 +25,7 @@ RECORDINGS = Path(__file__).parent / "recordings"
 NOT_OURS = (
     "[logger]",  # its log file
     "GPS Vertical Pos Drift",  # while it stands, which the simulator has not
-    "Calibrating barometer",  # said before the link is heard
+    "Calibrating barometer",  # sent before the recording begins
     "RC7: SaveWaypoint LOW",  # a switch on the feigned remote control
     "in-flight yaw alignment",  # ours aligns on the ground for good
     "SIM Hit ground at",  # SITL's own remark
@@ -105,7 +105,7 @@ SESSIONS = [
         seed=2,
         equal=51,
         differing=(
-            # said 5 s before a ground station hears it: a tenth of a second less, and it is told
+            # at the end of the 5 s in which a silent ground station is still sent texts
             "ours text 6 Connection to ground station lost",
         ),
     ),

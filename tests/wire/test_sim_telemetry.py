@@ -103,6 +103,12 @@ def test_a_stream_without_a_builder_is_refused() -> None:
         builders(replace(PX4, streams=streams))
 
 
+def test_message_with_a_builder_that_is_never_sent_is_refused() -> None:
+    streams = replace(PX4.streams, never_sent=frozenset({74}))
+    with pytest.raises(ValueError, match=r"^px4 streams: remove from never_sent: VFR_HUD$"):
+        builders(replace(PX4, streams=streams))
+
+
 def test_a_builder_that_is_not_called_like_a_message_is_refused() -> None:
     module = ModuleType("messages")
     exec("def atitude(view): return ()", vars(module))

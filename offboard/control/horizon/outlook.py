@@ -41,10 +41,6 @@ class Outlook:
     feedforward: Array
     thrust_share: float
 
-    @property
-    def steps(self) -> int:
-        return len(self.feedforward)
-
 
 def look_ahead(tracking: Tracking, situation: Situation, steps: int) -> Outlook:
     """The outlook over `steps` holds, from the times at which a command sent now takes effect."""

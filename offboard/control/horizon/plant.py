@@ -132,7 +132,7 @@ class Scene(NamedTuple):
     lower: Array  # (N, 3)
     upper: Array
     volumes: Array  # (V, PACKED_SIZE), where they are at the first node
-    thrust_share: float  # of the thrust believed, what is there, by the vertical disturbance
+    thrust_share: float  # true over modelled thrust, from the vertical disturbance
     floor_down_m: float  # no way round a volume leads below, where the reference does not
 
     def fill(self, record: NDArray[np.void], volumes: Array) -> None:

@@ -1,8 +1,7 @@
 """MPPI and the cross-entropy method over the same knots and roll-outs as the swarm.
 
-They are peers for comparison: for the same number of roll-outs, what does the swarm find that they
-do not? Both draw knots from a normal distribution about a mean that starts at the base plan, and
-answer with the mean.
+They exist for comparison with the swarm at the same number of roll-outs. Both draw knots from a
+normal distribution about a mean that starts at the base plan, and return the mean.
 """
 
 from __future__ import annotations

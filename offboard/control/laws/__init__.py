@@ -1,2 +1,2 @@
-"""The control laws, one module each: settings and law. They are peers; what they share lies in
-`offboard.control.tracking` and `offboard.control.horizon`."""
+"""The control laws, one module each: settings and law. No law imports another; what they share is
+in `offboard.control.tracking` and `offboard.control.horizon`."""

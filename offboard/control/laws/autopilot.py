@@ -1,6 +1,6 @@
 """The law `autopilot`: the autopilot's own position loop, which is sent the reference.
 
-This is what a user has without this package: position, velocity and acceleration at each tick.
+For comparison: a user can send position, velocity and acceleration without this package.
 """
 
 from __future__ import annotations
@@ -53,4 +53,4 @@ class AutopilotLaw:
         )
 
     def reset(self) -> None:
-        """It has no memory."""
+        """Nothing to do: the law has no state."""

@@ -1,6 +1,6 @@
 """The law `lqr`: the minimiser of the same cost as `pso`, in closed form.
 
-The axes do not couple, so it is clip(-f / h) per input.
+The axes are not coupled, so that each input is clip(-f / h).
 """
 
 from __future__ import annotations

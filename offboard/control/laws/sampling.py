@@ -1,7 +1,6 @@
 """The laws `mppi` and `cem`: the roll-outs of `horizon`, searched by sampling.
 
-Peers for comparison with the swarm, at the same number of roll-outs; not meant to be flown for
-their own sake.
+They exist for comparison with the swarm at the same number of roll-outs.
 """
 
 from __future__ import annotations

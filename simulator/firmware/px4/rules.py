@@ -121,7 +121,7 @@ RULES = (
             _LOST,
         ),
     ),
-    *(Rule(event, texts=(said,)) for event, said in _WARNINGS.items()),
+    *(Rule(event, texts=(text,)) for event, text in _WARNINGS.items()),
     Rule("ground station found", texts=(_REGAINED,)),
     Rule("position lost", "OFFBOARD", when=("not motion setpoint",)),
     Rule("position lost", when=("armed", "not landed"), to=_LAND, do=("failsafe",), texts=(_LOST,)),
