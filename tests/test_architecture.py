@@ -47,10 +47,11 @@ def test_only_the_clock_reads_the_time() -> None:
 
 def test_only_the_edges_open_sockets() -> None:
     links = {f"simulator/link/{name}.py" for name in ("links", "tcp", "udp")}
-    edges = {"offboard/flight/link.py", *links}
-    pipes = {"offboard/flight/sitl.py", "simulator/pool.py"}  # between the two processes
-    assert _importers("socket", "serial") <= edges
-    assert _importers("select") <= edges | pipes
+    edges = {f"offboard/flight/{name}.py" for name in ("connection", "stream_link", "udp_link")}
+    supervisor = {f"offboard/flight/{name}.py" for name in ("supervisor", "supervisor_process")}
+    pipes = {"offboard/flight/sitl.py", "simulator/pool.py"}  # between two processes
+    assert _importers("socket", "serial") <= edges | links | supervisor
+    assert _importers("select") <= edges | links | supervisor | pipes
 
 
 def _importers(*modules: str) -> set[str]:

@@ -71,7 +71,7 @@ class Certificate:
     seed_cost: float = math.nan
 
     def void(self) -> Certificate:
-        """Of the search alone: the costs are not those of the command that was sent."""
+        """The certificate without its costs, which are not those of the command that was sent."""
         nan = math.nan
         return replace(self, cost=nan, optimal_cost=nan, gap=nan, seed_cost=nan)
 
