@@ -168,6 +168,7 @@ class Decider:
         record = TickRecord.of(
             phase=PHASE_CODES[tick.phase],
             decision=decided.decision,
+            sent=decided.command,
             state=decided.state,
             solve_time_s=decided.solve_time_s,
             lateness_s=self._stopwatch() - tick.arrived_s,

@@ -11,7 +11,7 @@ change. Our system id is the vehicle's, which makes us one of its components.
 from __future__ import annotations
 
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from offboard.mavlink import framing
@@ -31,6 +31,7 @@ from offboard.mavlink.encode import encode
 from offboard.mavlink.events import (
     Attitude,
     Event,
+    GpsFix,
     LocalPosition,
     PeerChanged,
     Rebooted,
@@ -159,7 +160,8 @@ class Session:
                 # a reply at time 0 would look like a request
                 replies.append(Timesync(max(1, int(now_s * 1e9)), ts1_ns))
             elif self.vehicle is not None:
-                events.append(TimesyncReply(ts1_ns, tc1_ns))
+                wrapped_ns = round(self._time.wrapped_s(tc1_ns / 1e9) * 1e9)
+                events.append(TimesyncReply(ts1_ns, tc1_ns + wrapped_ns))
             return True
         return self._interpret(frame, now_s, events)
 
@@ -214,6 +216,8 @@ class Session:
         if isinstance(event, DropReason):
             return event
         age = Age.FRESH
+        if isinstance(event, (LocalPosition, Attitude, GpsFix)) and event.time_s is not None:
+            event = replace(event, time_s=event.time_s + self._time.wrapped_s(event.time_s))
         if isinstance(event, (LocalPosition, Attitude)):
             age = self._time.check(frame.message_id, event.time_s)
             if age is Age.STALE:
