@@ -14,12 +14,14 @@ def as_text(score: Score, history: History) -> str:
     """All figures, the events and the number of messages as JSON text; a figure that the log does
     not hold is null."""
     document = {
+        "ended_by": score.ended_by,
         **{name: _plain(value) for name, value in score.figures().items()},
         "phases": _events(history.phases),
         "modes": _events(history.modes),
         "said": _events(history.said),
         "messages": dict(sorted(history.messages.items())),
         "wall_s": history.wall_s,
+        "damage": history.damage,
     }
     return json.dumps(document, indent=2, allow_nan=False) + "\n"
 

@@ -123,8 +123,10 @@ def _announcer() -> Callable[[Companion], None]:
 def _conclude(outcome: Outcome, directory: Path, requirements: list[Requirement]) -> None:
     """Print verdict and result. Exits with the code of the verdict."""
     from offboard.analysis.score_table import summary
+    from offboard.analysis.trial import judged
 
     score, history = scored(directory)
+    outcome = judged(outcome, score)
     checked = [] if outcome.exit_code else requirements
     missed = [each for each in checked if not each.met(score.figures())]
     results = "; ".join(each.sentence(score.figures()) for each in missed or checked)

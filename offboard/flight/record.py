@@ -25,6 +25,7 @@ COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: the sender of frames
 RECORD_COMPONENT_ID = 192
 RECORD_NAME = "pso"
 NAN = float("nan")
+Array = NDArray[np.float64]
 RECORD_ID = 3
 LAYOUTS = {1: 28, RECORD_ID: 31}  # array_id -> number of fields; 2 is another array
 
@@ -131,16 +132,21 @@ class TickRecord:
             float(strangers),
         )
 
-    @classmethod
-    def from_data(cls, data: tuple[float, ...], array_id: int = RECORD_ID) -> TickRecord:
-        """The record in DEBUG_FLOAT_ARRAY.data. Raises ValueError if the array is too short."""
-        count = LAYOUTS[array_id]
-        if len(data) < count:
-            raise ValueError(f"a tick record has {count} floats, this one {len(data)}")
-        return cls(*data[:count])
-
 
 FIELDS = tuple(field.name for field in fields(TickRecord))
+
+
+def records_of(data: Array, array_ids: Array) -> NDArray[np.void]:
+    """Records (N,) as a structured array with the fields of `TickRecord`, from DEBUG_FLOAT_ARRAY:
+    `data` (N, 58) and `array_ids` (N,), all in LAYOUTS. What an older log lacks has its default."""
+    values = data[:, : len(FIELDS)].copy()
+    for array_id, count in LAYOUTS.items():
+        older = array_ids == array_id
+        values[older, count:] = TickRecord(*(NAN,) * count).data()[count:]
+    records = np.empty(len(values), [(name, np.float64) for name in FIELDS])
+    for column, name in enumerate(FIELDS):
+        records[name] = values[:, column]
+    return records
 
 
 def reference_record(time_s: float, sample: FlatSample) -> ReferenceRecord:
@@ -155,5 +161,5 @@ def reference_record(time_s: float, sample: FlatSample) -> ReferenceRecord:
     )
 
 
-def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
+def _triple(values: Array) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])

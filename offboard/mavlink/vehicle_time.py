@@ -1,7 +1,7 @@
 """Vehicle time: which time stamps of telemetry are valid, and the seconds that the session counts.
 
-Vehicle time is `time_boot_ms` in seconds, continued where its 32 bits begin again at zero, after 49.7
-days. Host time is any monotonic clock, given as an argument.
+Vehicle time is `time_boot_ms` in seconds, continued where its 32 bits begin again at zero, after
+49.7 days. Host time is any monotonic clock, given as an argument.
 """
 
 from __future__ import annotations
