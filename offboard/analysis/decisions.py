@@ -37,7 +37,7 @@ class Decisions:
             return {}
 
         def known(name: str) -> Array:
-            values = columns[name][np.isfinite(columns[name])].astype(np.float64)
+            values: Array = columns[name][np.isfinite(columns[name])].astype(np.float64)
             return values
 
         def refusals(flag: int) -> float:

@@ -1,7 +1,7 @@
 """One flight as arrays and events, from its .tlog alone: whole, or in stretches of bounded memory.
 
-Times are vehicle time in seconds, continued where `time_boot_ms` begins again at zero. Positions are
-NED in metres relative to the estimator's origin.
+Times are vehicle time in seconds, continued where `time_boot_ms` begins again at zero. Positions
+are NED in metres relative to the estimator's origin.
 """
 
 from __future__ import annotations

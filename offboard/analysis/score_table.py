@@ -83,7 +83,7 @@ def _identified(history: History) -> str:
 
 
 def show(console: Console, score: Score, history: History) -> None:
-    """Print the verdict, what happened in the order of time, then every figure that the log holds."""
+    """Print the verdict, what happened in the order of time, and every figure of the log."""
     console.print(Text(verdict(score)))
     story = Table(box=None, pad_edge=False)
     story.add_column("t [s]", justify="right")

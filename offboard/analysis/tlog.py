@@ -93,7 +93,9 @@ class Tlog:
             raise TlogError(f"{self.path} cannot be read: {error.strerror}") from None
 
     def _messages(self, blocks: Iterator[bytes]) -> Iterator[LoggedMessage]:
-        data, before, at, found, lost = b"", 0, 0, False, False
+        data, before, at, found = b"", 0, 0, False
+        lost: int | None = None  # where the search for the next entry began
+        cut = False  # it began because the file ends within the entry there, if its length is right
         while True:
             if at + _LONGEST + 9 > len(data):  # an entry, and the head of the next one
                 block = next(blocks, b"")
@@ -101,26 +103,33 @@ class Tlog:
                 if block:
                     continue
                 if len(data) < 8 + 3:  # no entry can begin here
-                    self.truncated = 0 if lost else len(data)
                     break
-            entry = _entry(data, at, certain=lost)
+            entry = _entry(data, at, certain=lost is not None)
             if isinstance(entry, LoggedMessage):
+                if lost is not None and cut:
+                    self._count(lost)
                 at += 8 + len(entry.frame.raw)
-                found, lost = True, False
+                found, lost = True, None
                 yield entry
-                continue
-            if entry is None and not lost:  # the file ends within this entry
-                self.truncated = len(data) - at
-                break
-            if not lost:
-                self.damaged += 1
-                self.first_damage = self.first_damage if self.damaged > 1 else before + at
-            lost = not entry
-            at = at + entry if entry else _next_magic(data, at + 9) - 8
+            elif entry:
+                self._count(before + at)
+                at += entry
+            else:
+                if lost is None:
+                    lost, cut = before + at, entry is None
+                    if not cut:
+                        self._count(lost)
+                at = _next_magic(data, at + 9) - 8
+        if lost is None or cut:
+            self.truncated = before + len(data) - (before if lost is None else lost)
         if not found:
             raise TlogError(
                 f"{self.path} is not a .tlog, or empty: it holds no time stamp and MAVLink frame"
             )
+
+    def _count(self, place: int) -> None:
+        self.damaged += 1
+        self.first_damage = self.first_damage if self.damaged > 1 else place
 
 
 def _entry(data: bytes, at: int, *, certain: bool) -> LoggedMessage | int | None:

@@ -1,8 +1,8 @@
 """Figures of the phase TRACK, collected stretch by stretch: errors, fitness, activity, truth.
 
 Errors and motion are weighted by the time of the reference (see `weighted`): a figure depends
-neither on the rate of the telemetry nor on jumps of the vehicle's clock. Sums of the paper's fitness
-are over the control ticks, as in its Eq. 32.
+neither on the rate of the telemetry nor on jumps of the vehicle's clock. Sums of the paper's
+fitness are over the control ticks, as in its Eq. 32.
 """
 
 from __future__ import annotations

@@ -27,9 +27,9 @@ from offboard.flight.sitl import SimulatorProcess
 def score_flight(flight: Path) -> tuple[Score, History]:
     """Score a flight from its log alone.
 
-    `flight` is a flight directory or a .tlog file. Returns the figures and the events. The arrays of
-    the history are those of the last minutes of a long flight; `history.gather` gives all of them.
-    Raises TlogError.
+    `flight` is a flight directory or a .tlog file. Returns the figures and the events. The arrays
+    of the history are those of the last minutes of a long flight; `history.gather` gives all of
+    them. Raises TlogError.
 
     Example:
 

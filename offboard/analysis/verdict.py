@@ -101,7 +101,7 @@ def judge(flown: History, landing: Landing, skipped_s: float) -> Verdict:
 
 
 def _ended_early(flown: History) -> str:
-    """What ended the flight, by its phases; REFERENCE_OVER if it went on to the disarmed vehicle."""
+    """What ended the flight, by its phases; REFERENCE_OVER if they were all gone through."""
     names = [event.what.partition(":")[0] for event in flown.phases]
     for event, name, before in zip(flown.phases[1:], names[1:], names, strict=False):
         regular = (before, name) in (("hover", "land"), ("land", "disarmed"))

@@ -6,10 +6,9 @@ import math
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from offboard.control.base import Certificate, Decision
-from offboard.flight.record import LAYOUTS, RECORD_ID, Refusal, TickRecord
+from offboard.flight.record import LAYOUTS, Refusal, TickRecord, records_of
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
 
@@ -53,12 +52,12 @@ def test_the_certificate_is_of_what_was_sent() -> None:
     assert withheld.refused == 3.0
 
 
-@pytest.mark.parametrize(("array_id", "age_s"), [(1, math.nan), (RECORD_ID, 0.03)])
-def test_a_record_of_an_older_log_has_no_age(array_id: int, age_s: float) -> None:
-    written = record(COMMAND, age_s=0.03, strangers=4).data()
-    on_the_wire = (*written[: LAYOUTS[array_id]], *(0.0,) * (58 - LAYOUTS[array_id]))
-    read = TickRecord.from_data(on_the_wire, array_id)
-    assert read.age_s == pytest.approx(age_s, nan_ok=True)
-    assert (read.seed_cost, read.strangers) == (3.0, 4.0 if array_id == RECORD_ID else 0.0)
-    with pytest.raises(ValueError, match="a tick record has"):
-        TickRecord.from_data(on_the_wire[: LAYOUTS[array_id] - 1], array_id)
+def test_a_record_of_an_older_log_has_no_age() -> None:
+    """The wire fills what a record does not use with zeros."""
+    written = record(COMMAND, age_s=0.03, refused=Refusal.LATE, strangers=4).data()
+    rows = [(*written[:count], *(0.0,) * (58 - count)) for count in LAYOUTS.values()]
+    old, new = records_of(np.array(rows), np.array(list(LAYOUTS)))
+    assert (old["seed_cost"], new["seed_cost"], old["phase"]) == (3.0, 3.0, 8.0)
+    assert math.isnan(old["age_s"])
+    assert (old["refused"], old["strangers"]) == (0.0, 0.0)
+    assert (new["age_s"], new["refused"], new["strangers"]) == (0.03, 1.0, 4.0)
