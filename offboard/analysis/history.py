@@ -8,14 +8,16 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.analysis.events import Event, modes, phases, said
 from offboard.analysis.sender import Stream, continuous_s
 from offboard.analysis.tlog import LoggedMessage, Tlog, name_of
+from offboard.analysis.truth import true_positions
 from offboard.flight import manifest
 from offboard.flight.online_identification import RECORD_NAME as IDENTIFIED_NAME
 from offboard.flight.record import (
@@ -25,11 +27,8 @@ from offboard.flight.record import (
     RECORD_NAME,
     records_of,
 )
-from offboard.mavlink.decode import decode_text_chunk
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.session import DIALECTS
-from offboard.mavlink.texts import TextAssembler
-from offboard.model.geodesy import Geodetic, origin_of, position_ned_m
 
 Array = NDArray[np.float64]
 IDENTIFIED_SIZE = 20
@@ -37,11 +36,9 @@ OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
 POSITION_FIELDS = "x y z vx vy vz"
 ATTITUDE_FIELDS = "q1 q2 q3 q4 rollspeed pitchspeed yawspeed"
 REFERENCE_FIELDS = "x y z vx vy vz afx afy afz yaw"
-OUR_PREFIX = "offboard: "  # of the texts that announce a phase
 STRETCH = 100_000  # messages, about five minutes of all that PX4 sends
 LATE_S = 3.0  # telemetry that is older when it arrives is not scored
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: ground stations and companions
-_Text = tuple[int, float, str]  # place in the log, vehicle time in ms, text
 _ARRAYS = {RECORD_NAME, IDENTIFIED_NAME}
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 _HEARTBEAT, _TIMESYNC, _FLOAT_ARRAY = 0, 111, 350
@@ -69,15 +66,6 @@ _NEWS = {
     245: "EXTENDED_SYS_STATE",
     253: "STATUSTEXT",
 }
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """A phase, a mode or a text: vehicle time (NaN before telemetry), sender, and what."""
-
-    time_s: float
-    who: str
-    what: str
 
 
 @dataclass(frozen=True, slots=True)
@@ -201,7 +189,7 @@ class _Collector:
         samples = {
             "position": self._table(self._theirs[32], POSITION_FIELDS),
             "attitude": self._table(self._theirs[31], ATTITUDE_FIELDS),
-            "truth": self._truth(),
+            "truth": true_positions(self._theirs, self.time_s),
             "reference": self._table(self._ours[85], REFERENCE_FIELDS),
             "setpoint": self._setpoints(),
             "ticks": arrays[of_ticks],
@@ -219,7 +207,7 @@ class _Collector:
     def _history(self, damage: str) -> History:
         tables = dict(self._rows)
         ticks = tables.pop("ticks")
-        heartbeat = self._news(0, "base_mode system_status custom_mode")
+        heartbeat = self._news(0, "base_mode system_status")
         heartbeat[:, 1] = (heartbeat[:, 1].astype(np.int64) & _ARMED) > 0
         counts: Counter[str] = Counter()
         for kind, count in self._counts.items():
@@ -230,11 +218,11 @@ class _Collector:
             records=records_of(ticks[:, 2:], ticks[:, 1]),
             identified=np.reshape(self._identified, (-1, 1 + IDENTIFIED_SIZE)),
             link_delay=self._link_delay(),
-            heartbeat=heartbeat[:, :3],
+            heartbeat=heartbeat,
             landed=self._news(245, "landed_state"),
-            phases=self._events("offboard", self._phases()),
-            modes=self._events("vehicle", self._modes(heartbeat[:, 3])),
-            said=self._events("vehicle", _texts(self._theirs[253]) + self._refusals()),
+            phases=phases(self._ours[253], self.time_s),
+            modes=modes(self._theirs[0], self._dialect, self.time_s),
+            said=said(self._theirs[253], self._theirs[77], self.time_s),
             messages=counts,
             wall_s=(self._unix_us[1] - self._unix_us[0]) / 1e6,
             damage=damage,
@@ -255,11 +243,6 @@ class _Collector:
         stream = self._theirs[kind]
         return np.column_stack((self.time_s(np.array(stream.now_ms)), stream.columns(fields)))
 
-    def _events(self, who: str, texts: Iterable[_Text]) -> tuple[Event, ...]:
-        return tuple(
-            Event(float(self.time_s(now_ms)), who, what) for _, now_ms, what in sorted(texts)
-        )
-
     # ------------------------------------------------------------------ samples
 
     def _setpoints(self) -> Array:
@@ -272,48 +255,6 @@ class _Collector:
         rows[: len(attitude), 2:] = attitude.columns("q thrust")
         return rows[np.argsort(np.concatenate((attitude.places, position.places)))]
 
-    def _truth(self) -> Array:
-        """True positions of a simulated vehicle, from the first origin of the local frame on."""
-        hil, state = self._theirs[115], self._theirs[108]
-        rows = np.vstack(
-            (
-                hil.columns("time_usec lat lon alt") / (1e3, 1e7, 1e7, 1e3),
-                np.insert(state.columns("lat_int lon_int alt") / (1e7, 1e7, 1.0), 0, 0.0, axis=1),
-            )
-        )
-        places = np.concatenate((hil.places, state.places))
-        now_ms = np.concatenate((hil.now_ms, state.now_ms))
-        rows[:, 0] = self.time_s(np.where(rows[:, 0] > 0.0, rows[:, 0], now_ms))
-        origins = self._origins()
-        newest = np.searchsorted([place for place, _ in origins], places)
-        known = np.flatnonzero(newest)
-        known = known[np.argsort(places[known])]
-        positions = [
-            position_ned_m(Geodetic(*rows[row, 1:].tolist()), origins[newest[row] - 1][1])
-            for row in known
-        ]
-        return np.column_stack((rows[known, 0], np.reshape(positions, (-1, 3))))
-
-    def _origins(self) -> list[tuple[int, Geodetic]]:
-        """(place in the log, origin of the local frame). HOME_POSITION gives one point in both
-        frames."""
-        given, home = self._theirs[49], self._theirs[242]
-        scale = (1e7, 1e7, 1e3)
-        origins = [
-            (place, Geodetic(*row))
-            for place, row in zip(
-                given.places,
-                (given.columns("latitude longitude altitude") / scale).tolist(),
-                strict=True,
-            )
-        ]
-        homes = home.columns("latitude longitude altitude x y z") / (*scale, 1.0, 1.0, 1.0)
-        origins += [
-            (place, origin_of(Geodetic(*row[:3]), (row[3], row[4], row[5])))
-            for place, row in zip(home.places, homes.tolist(), strict=True)
-        ]
-        return sorted(origins)
-
     def _link_delay(self) -> Array:
         """From the vehicle's answers to our TIMESYNC requests."""
         requests, answers = (
@@ -321,34 +262,6 @@ class _Collector:
         )
         answered = answers[np.isin(answers[:, 0], requests[:, 0])]
         return np.column_stack((answered[:, 0], answered[:, 1] - answered[:, 0])) * 1e-9
-
-    # ------------------------------------------------------------------ events
-
-    def _phases(self) -> list[_Text]:
-        return [
-            (place, now_ms, text.removeprefix(OUR_PREFIX))
-            for place, now_ms, text in _texts(self._ours[253])
-            if text.startswith(OUR_PREFIX)
-        ]
-
-    def _modes(self, numbers: Array) -> list[_Text]:
-        if self._dialect is None:
-            return []
-        stream = self._theirs[_HEARTBEAT]
-        return [
-            (stream.places[row], stream.now_ms[row], self._dialect.mode_name(int(numbers[row])))
-            for row in np.flatnonzero(np.diff(numbers, prepend=-1.0))
-        ]
-
-    def _refusals(self) -> list[_Text]:
-        stream = self._theirs[77]
-        return [
-            (place, now_ms, f"command {command:.0f} refused, result {result:.0f}")
-            for place, now_ms, (command, result) in zip(
-                stream.places, stream.now_ms, stream.columns("command result"), strict=True
-            )
-            if result not in (0, 5)  # MAV_RESULT_ACCEPTED, MAV_RESULT_IN_PROGRESS
-        ]
 
 
 def _is_used(entry: LoggedMessage, ours: bool) -> bool:
@@ -359,16 +272,6 @@ def _is_used(entry: LoggedMessage, ours: bool) -> bool:
     if kind == _FLOAT_ARRAY:
         return payload[10:20].rstrip(b"\0").decode(errors="replace") in _ARRAYS
     return kind != _HEARTBEAT or entry.frame.component_id == 1
-
-
-def _texts(stream: Stream) -> list[_Text]:
-    """All STATUSTEXT, joined from their chunks, each at the place of its last one."""
-    assembler, texts = TextAssembler(), []
-    rows = zip(stream.places, stream.unix_us, stream.now_ms, stream.payloads(), strict=True)
-    for place, unix_us, now_ms, payload in rows:
-        whole = assembler.add(decode_text_chunk(payload), unix_us / 1e6)
-        texts += [(place, now_ms, text.text) for text in whole]
-    return texts
 
 
 def _vehicle(log: Tlog) -> tuple[int | None, Dialect | None]:

@@ -6,7 +6,8 @@ import json
 import math
 from typing import Any
 
-from offboard.analysis.history import Event, History
+from offboard.analysis.events import Event
+from offboard.analysis.history import History
 from offboard.analysis.score import Score
 
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.history import Event, History
+from offboard.analysis.events import Event
+from offboard.analysis.history import History
 from offboard.flight.companion import STOPPED
 from offboard.flight.touchdown import Touchdown
 
