@@ -75,7 +75,8 @@ class Landing:
         """Why it has not landed, empty if it has; and the downward speed at touch-down."""
         if self._touchdown is None:
             return "not landed", math.nan
-        on_ground = bool(len(flown.landed)) and flown.landed[-1, 1] == _ON_GROUND
+        since = flown.landed[flown.landed[:, 0] >= begin_times(flown.phases)["land"]]
+        on_ground = bool(len(since)) and bool(since[-1, 1] == _ON_GROUND)
         return self._touchdown.not_landed(on_ground=on_ground), self._touchdown.speed_mps
 
 
