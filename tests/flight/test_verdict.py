@@ -20,11 +20,15 @@ from typer.testing import CliRunner
 
 from offboard.analysis import history, tlog
 from offboard.analysis.history import History
-from offboard.analysis.score import Scoring, score
+from offboard.analysis.score import Score, Scoring, score
+from offboard.analysis.trial import judged
 from offboard.cli import app
+from offboard.flight.companion import Outcome
 from offboard.flight.log import FlightLog
+from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.flight.touchdown import Touchdown
+from offboard.model.frames import thrust_direction_from_quaternion
 
 WRAP_MS = 2**32
 TRACKED_S = 3.0
@@ -139,6 +143,34 @@ def test_landings_and_falls() -> None:
     for tick in range(100):
         hovering.on_position(0.02 * tick, (3.0, 4.0, -2.8), 0.0)
     assert hovering.not_landed(on_ground=True) == "2.8 m above the take-off point"
+
+
+def test_the_outcome_follows_the_log(flown: History) -> None:
+    """`fly`, `compare` and the fixture: an exit code of 0 needs a completed flight."""
+    landed, refused = Outcome(0, "flown and landed"), Outcome(3, "not ready")
+    completed, fallen = score(flown), Score(completed=0.0, ended_by="fell at up to 5.1 m/s")
+    assert judged(landed, completed) == landed
+    sentence = "flown and landed, but not completed: fell at up to 5.1 m/s"
+    assert judged(landed, fallen) == Outcome(4, sentence)
+    assert judged(refused, fallen) == refused
+
+
+def test_a_record_says_what_was_sent(tmp_path: Path) -> None:
+    """Identification steps change the command after the decision: no certificate then."""
+    pair = hover(scenario="px4_like", learning=IdentifySettings())
+    assert pair.fly().exit_code == 0
+    flown = history.gather(pair.log(tmp_path))
+    excited = flown.records["phase"] == PHASE_CODES[Phase.EXCITE]
+    certified = np.isfinite(flown.records["gap"])
+    assert excited.sum() > 20
+    assert certified[~excited].all()
+    assert 0.0 < certified[excited].mean() < 0.9
+    assert score(flown).certified_share == pytest.approx(certified.mean())
+    rows = np.searchsorted(flown.setpoint[:, 0], flown.record_time_s)
+    sent = thrust_direction_from_quaternion(flown.setpoint[rows, 2:6])
+    recorded = [flown.records[f"thrust_direction_{axis}"] for axis in ("north", "east", "down")]
+    assert np.array_equal(flown.setpoint[rows, 0], flown.record_time_s)
+    assert np.abs(sent - np.stack(recorded, axis=1)).max() < 1e-6
 
 
 # --- what the figures must not depend on ----------------------------------------------------------
