@@ -33,7 +33,7 @@ LABELS = ("offboard", "the autopilot's own position loop")
 def tracked(flight: Path) -> tuple[Array, Array, Array]:
     """Time since the start of TRACK (N,), reference and flown position (N, 3), NED in metres."""
     flown = history.gather(tlog.read(tlog.find(flight)))
-    track = [record.phase == PHASE_CODES[Phase.TRACK] for record in flown.records]
+    track = flown.records["phase"] == PHASE_CODES[Phase.TRACK]
     begin_s, end_s = flown.record_time_s[track][[0, -1]]
     times = np.arange(begin_s, end_s, SAMPLE_S)
     _, first = np.unique(flown.reference[:, 0], return_index=True)

@@ -94,7 +94,7 @@ def fly(
         settings: Sequence[str] = (),
         must_succeed: bool = True,
     ) -> Flight:
-        from offboard.analysis.trial import score_flight
+        from offboard.analysis.trial import judged, score_flight
         from offboard.documents.errors import UserError
         from offboard.flight.request import FlightRequest, fly_request
 
@@ -120,9 +120,10 @@ def fly(
             gc.unfreeze()  # the loop of the flight froze the objects of all tests
         if outcome is None:
             pytest.fail(f"nothing was flown: {problem}", pytrace=False)
+        score, _ = score_flight(directory)
+        outcome = judged(outcome, score)
         if must_succeed and outcome.exit_code != 0:
             pytest.fail(f"the flight did not succeed: {outcome.sentence}", pytrace=False)
-        score, _ = score_flight(directory)
         return Flight(int(outcome.exit_code), outcome.sentence, score, directory)
 
     return fly_once

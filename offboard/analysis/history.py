@@ -1,36 +1,34 @@
-"""One flight as arrays and events, from its .tlog alone.
+"""One flight as arrays and events, from its .tlog alone: whole, or in stretches of bounded memory.
 
-Times are vehicle time in seconds, positions NED in metres relative to the estimator's origin.
+Times are vehicle time in seconds, continued where `time_boot_ms` begins again at zero. Positions
+are NED in metres relative to the estimator's origin.
 """
 
 from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.sender import Sender, VehicleClock, streams_of
+from offboard.analysis.events import Event, modes, phases, vehicle_messages
+from offboard.analysis.sender import Stream, continuous_s
 from offboard.analysis.tlog import LoggedMessage, Tlog, name_of
+from offboard.analysis.truth import true_positions
 from offboard.flight import manifest
-from offboard.flight.online_identification import RECORD_ID as IDENTIFIED_ID
 from offboard.flight.online_identification import RECORD_NAME as IDENTIFIED_NAME
 from offboard.flight.record import (
     COMPONENT_ID,
+    LAYOUTS,
     RECORD_COMPONENT_ID,
-    RECORD_ID,
     RECORD_NAME,
-    TickRecord,
+    records_of,
 )
-from offboard.mavlink.decode import decode_text_chunk
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.session import DIALECTS
-from offboard.mavlink.texts import TextAssembler
-from offboard.model.geodesy import Geodetic, origin_of, position_ned_m
 
 Array = NDArray[np.float64]
 IDENTIFIED_SIZE = 20
@@ -38,17 +36,36 @@ OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
 POSITION_FIELDS = "x y z vx vy vz"
 ATTITUDE_FIELDS = "q1 q2 q3 q4 rollspeed pitchspeed yawspeed"
 REFERENCE_FIELDS = "x y z vx vy vz afx afy afz yaw"
-OUR_PREFIX = "offboard: "  # of the texts that announce a phase
+STRETCH = 100_000  # messages, about five minutes of all that PX4 sends
+LATE_S = 3.0  # telemetry that is older when it arrives is not scored
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: ground stations and companions
-
-
-@dataclass(frozen=True, slots=True)
-class Event:
-    """A phase, a mode or a text: vehicle time (NaN before telemetry), sender, and what."""
-
-    time_s: float
-    who: str
-    what: str
+_ARRAYS = {RECORD_NAME, IDENTIFIED_NAME}
+_ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
+_HEARTBEAT, _TIMESYNC, _FLOAT_ARRAY = 0, 111, 350
+_TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
+# kinds of messages of which every stretch has its own, and kinds that are kept from the beginning
+_OUR_SAMPLES = {
+    82: "SET_ATTITUDE_TARGET",
+    84: "SET_POSITION_TARGET_LOCAL_NED",
+    85: "POSITION_TARGET_LOCAL_NED",
+    350: "DEBUG_FLOAT_ARRAY",
+}
+_SAMPLES = {
+    31: "ATTITUDE_QUATERNION",
+    32: "LOCAL_POSITION_NED",
+    108: "SIM_STATE",
+    115: "HIL_STATE_QUATERNION",
+}
+_OUR_NEWS = {111: "TIMESYNC", 253: "STATUSTEXT"}
+_NEWS = {
+    0: "HEARTBEAT",
+    49: "GPS_GLOBAL_ORIGIN",
+    77: "COMMAND_ACK",
+    111: "TIMESYNC",
+    242: "HOME_POSITION",
+    245: "EXTENDED_SYS_STATE",
+    253: "STATUSTEXT",
+}
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,9 +80,12 @@ class History:
         setpoint of the autopilot's own position loop (SET_POSITION_TARGET_LOCAL_NED)
     identified: t, then value and sd of each constant as in `identification.adoption.record_of`
     link_delay: t of the telemetry that a TIMESYNC request followed, its delay in s
+    heartbeat: t, armed (1 or 0), MAV_STATE
+    landed: t, MAV_LANDED_STATE (EXTENDED_SYS_STATE)
 
-    `phases` are our own; the vehicle's are `modes` and `vehicle_messages` (STATUSTEXT, refused
-    commands).
+    `records` (N,) are structured, with the fields of `flight.record.TickRecord`. `phases` are our
+    own, `modes` and `vehicle_messages` (STATUSTEXT, refused commands) the vehicle's. `damage`
+    says what could not be read.
     """
 
     position: Array
@@ -74,176 +94,189 @@ class History:
     reference: Array
     setpoint: Array
     record_time_s: Array
-    records: tuple[TickRecord, ...]
+    records: NDArray[np.void]
     identified: Array
     link_delay: Array
+    heartbeat: Array
+    landed: Array
     phases: tuple[Event, ...]
     modes: tuple[Event, ...]
     vehicle_messages: tuple[Event, ...]
     messages: Counter[str]
     wall_s: float
+    damage: str = ""
 
 
 def gather(log: Tlog) -> History:
     """Sort a log's messages into a History. A log without a vehicle gives empty arrays."""
-    streams = streams_of(log)
-    vehicle_id, dialect = _vehicle(log.messages)
-    ours = Sender(streams, lambda system, component: component in OUR_COMPONENTS)
-    theirs = Sender(
-        streams,
-        lambda system, component: system == vehicle_id and component not in OUR_COMPONENTS,
-    )
-    clock = VehicleClock(theirs)
-    arrays = [entry.message for _, entry in ours.of("DEBUG_FLOAT_ARRAY")]
-    records = [
-        (message.time_usec / 1e6, TickRecord.from_data(message.data))
-        for message in arrays
-        if _is(message, RECORD_ID, RECORD_NAME)
-    ]
-    identified = [
-        (message.time_usec / 1e6, *message.data[:IDENTIFIED_SIZE])
-        for message in arrays
-        if _is(message, IDENTIFIED_ID, IDENTIFIED_NAME)
-    ]
-    stamps = [entry.unix_us for entry in log.messages]
-    counts: Counter[str] = Counter()
-    for (_, _, kind), stream in streams.items():
-        counts[name_of(kind)] += len(stream)
-    return History(
-        position=theirs.table("LOCAL_POSITION_NED", POSITION_FIELDS),
-        attitude=theirs.table("ATTITUDE_QUATERNION", ATTITUDE_FIELDS),
-        truth=_truth(theirs, clock),
-        reference=ours.table("POSITION_TARGET_LOCAL_NED", REFERENCE_FIELDS),
-        setpoint=_setpoints(ours),
-        record_time_s=np.array([time_s for time_s, _ in records]),
-        records=tuple(record for _, record in records),
-        identified=np.array(identified, dtype=np.float64).reshape(-1, 1 + IDENTIFIED_SIZE),
-        link_delay=_link_delay(ours, theirs),
-        phases=_events(clock, "offboard", _phases(ours)),
-        modes=_events(clock, "vehicle", _modes(theirs, dialect)),
-        vehicle_messages=_events(clock, "vehicle", _texts(theirs) + _refusals(theirs)),
-        messages=counts,
-        wall_s=(stamps[-1] - stamps[0]) / 1e6 if stamps else 0.0,
-    )
+    *_, (history, _) = stretches(log, messages=2**62)
+    return history
+
+
+def stretches(log: Tlog, messages: int = STRETCH) -> Iterator[tuple[History, float]]:
+    """The flight in stretches of so many messages, each with the time up to which it is complete.
+
+    The rows of a stretch begin with the last one before the time up to which the previous stretch
+    was complete. Events, `identified`, `link_delay`, `heartbeat` and `landed` are all since the
+    beginning. The last stretch is complete up to infinity.
+    """
+    collector = _Collector(*_vehicle(log))
+    for count, entry in enumerate(log, 1):
+        collector.add(entry)
+        if count % messages == 0:
+            until_s = float(collector.time_s(collector.now_ms)) - LATE_S
+            yield collector.history(), until_s
+            collector.drop(until_s)
+    yield collector.history(log.damage), math.inf
 
 
 def configuration(log: Tlog) -> str | None:
     """The configuration of the flight as YAML (see `flight.configuration.flown`), None without."""
     return manifest.join(
         bytes(entry.message.payload[: entry.message.payload_length])
-        for entry in log.messages
+        for entry in log
         if entry.name == "TUNNEL"
         and entry.component_id in OUR_COMPONENTS
         and entry.message.payload_type == manifest.PAYLOAD_TYPE
     )
 
 
-def _setpoints(ours: Sender) -> Array:
-    """Attitude and position setpoints in the order in which they were sent."""
-    kinds = ("SET_ATTITUDE_TARGET", "SET_POSITION_TARGET_LOCAL_NED")
-    attitude, position = (ours.table(kind, "") for kind in kinds)
-    aims = ours.columns(kinds[0], "q thrust")
-    stamps = np.array([entry.unix_us / 1e6 for kind in kinds for _, entry in ours.of(kind)])
-    rows = np.full((len(stamps), 7), math.nan)
-    rows[:, 0] = np.concatenate((attitude[:, 0], position[:, 0]))
-    rows[:, 1] = stamps
-    rows[: len(aims), 2:] = aims
-    return rows[np.argsort(np.concatenate([ours.places(kind) for kind in kinds]))]
+class _Collector:
+    """Collects the messages of the vehicle with this system id and of `offboard`."""
+
+    def __init__(self, vehicle_id: int | None, dialect: Dialect | None) -> None:
+        self._vehicle_id = vehicle_id
+        self._dialect = dialect
+        self._ours = {kind: Stream(name) for kind, name in (_OUR_SAMPLES | _OUR_NEWS).items()}
+        self._theirs = {kind: Stream(name) for kind, name in (_SAMPLES | _NEWS).items()}
+        self._counts: Counter[int] = Counter()
+        self._unix_us = (0, 0)
+        self._place = 0
+        self._anchor_ms = math.nan
+        self.now_ms = math.nan  # stamp of the newest telemetry
+        self._rows: dict[str, Array] = {}  # of the present stretch
+        self._identified: list[Array] = []
+
+    def add(self, entry: LoggedMessage) -> None:
+        kind, component = entry.frame.message_id, entry.frame.component_id
+        self._counts[kind] += 1
+        self._unix_us = (self._unix_us[0] or entry.unix_us, entry.unix_us)
+        self._place += 1
+        ours = component in OUR_COMPONENTS
+        if not ours and entry.frame.system_id != self._vehicle_id:
+            return
+        stream = (self._ours if ours else self._theirs).get(kind)
+        if stream is None or not _is_used(entry, ours):
+            return
+        stream.add(entry, self._place, self.now_ms)
+        if kind in _TELEMETRY:
+            self.now_ms = float(int.from_bytes(entry.frame.payload[:4], "little"))
+            if math.isnan(self._anchor_ms):
+                self._anchor_ms = self.now_ms
+
+    def drop(self, until_s: float) -> None:
+        """Forget the samples before the last one that is not newer than `until_s`."""
+        for name, rows in self._rows.items():
+            newest = np.maximum.accumulate(rows[:, 0])
+            first = np.searchsorted(newest, until_s, side="right") - 1
+            self._rows[name] = rows[max(first, 0) :].copy()
+
+    def history(self, damage: str = "") -> History:
+        """The present stretch."""
+        arrays = self._ours[_FLOAT_ARRAY].columns("time_usec array_id data")
+        arrays[:, 0] = self.time_s(arrays[:, 0] / 1e3)
+        of_ticks = np.isin(arrays[:, 1], list(LAYOUTS))
+        samples = {
+            "position": self._table(self._theirs[32], POSITION_FIELDS),
+            "attitude": self._table(self._theirs[31], ATTITUDE_FIELDS),
+            "truth": true_positions(self._theirs, self.time_s),
+            "reference": self._table(self._ours[85], REFERENCE_FIELDS),
+            "setpoint": self._setpoints(),
+            "ticks": arrays[of_ticks],
+        }
+        self._rows = {
+            name: np.vstack((self._rows[name], rows)) if name in self._rows else rows
+            for name, rows in samples.items()
+        }
+        self._identified.extend(np.delete(arrays[~of_ticks], 1, axis=1)[:, : 1 + IDENTIFIED_SIZE])
+        for stream in (*map(self._ours.get, _OUR_SAMPLES), *map(self._theirs.get, _SAMPLES)):
+            assert stream is not None
+            stream.clear()
+        return self._history(damage)
+
+    def _history(self, damage: str) -> History:
+        tables = dict(self._rows)
+        ticks = tables.pop("ticks")
+        heartbeat = self._news(0, "base_mode system_status")
+        heartbeat[:, 1] = (heartbeat[:, 1].astype(np.int64) & _ARMED) > 0
+        counts: Counter[str] = Counter()
+        for kind, count in self._counts.items():
+            counts[name_of(kind)] += count
+        return History(
+            **tables,
+            record_time_s=ticks[:, 0],
+            records=records_of(ticks[:, 2:], ticks[:, 1]),
+            identified=np.reshape(self._identified, (-1, 1 + IDENTIFIED_SIZE)),
+            link_delay=self._link_delay(),
+            heartbeat=heartbeat,
+            landed=self._news(245, "landed_state"),
+            phases=phases(self._ours[253], self.time_s),
+            modes=modes(self._theirs[0], self._dialect, self.time_s),
+            vehicle_messages=vehicle_messages(self._theirs[253], self._theirs[77], self.time_s),
+            messages=counts,
+            wall_s=(self._unix_us[1] - self._unix_us[0]) / 1e6,
+            damage=damage,
+        )
+
+    # ------------------------------------------------------------------ time
+
+    def time_s(self, stamps_ms: Array | float) -> Array:
+        return continuous_s(np.asarray(stamps_ms, dtype=np.float64), self._anchor_ms)
+
+    def _table(self, stream: Stream, fields: str) -> Array:
+        rows = stream.columns(f"time_boot_ms {fields}")
+        rows[:, 0] = self.time_s(rows[:, 0])
+        return rows
+
+    def _news(self, kind: int, fields: str) -> Array:
+        """Fields of the vehicle's messages, with the time of the telemetry before as first."""
+        stream = self._theirs[kind]
+        return np.column_stack((self.time_s(np.array(stream.now_ms)), stream.columns(fields)))
+
+    # ------------------------------------------------------------------ samples
+
+    def _setpoints(self) -> Array:
+        """Attitude and position setpoints in the order in which they were sent."""
+        attitude, position = self._ours[82], self._ours[84]
+        rows = np.full((len(attitude) + len(position), 7), math.nan)
+        stamps = (attitude.columns("time_boot_ms"), position.columns("time_boot_ms"))
+        rows[:, 0] = self.time_s(np.concatenate(stamps)[:, 0])
+        rows[:, 1] = np.concatenate((attitude.unix_us, position.unix_us)) / 1e6
+        rows[: len(attitude), 2:] = attitude.columns("q thrust")
+        return rows[np.argsort(np.concatenate((attitude.places, position.places)))]
+
+    def _link_delay(self) -> Array:
+        """From the vehicle's answers to our TIMESYNC requests."""
+        requests, answers = (
+            streams[_TIMESYNC].columns("ts1 tc1") for streams in (self._ours, self._theirs)
+        )
+        answered = answers[np.isin(answers[:, 0], requests[:, 0])]
+        return np.column_stack((answered[:, 0], answered[:, 1] - answered[:, 0])) * 1e-9
 
 
-def _link_delay(ours: Sender, theirs: Sender) -> Array:
-    """From the vehicle's answers to our TIMESYNC requests."""
-    requests, answers = (sender.columns("TIMESYNC", "ts1 tc1") for sender in (ours, theirs))
-    sent = requests[requests[:, 1] == 0.0, 0]
-    answered = answers[(answers[:, 1] != 0.0) & np.isin(answers[:, 0], sent)]
-    return np.column_stack((answered[:, 0], answered[:, 1] - answered[:, 0])) * 1e-9
+def _is_used(entry: LoggedMessage, ours: bool) -> bool:
+    """Whether a message of a kind that is collected is one of those that we need."""
+    kind, payload = entry.frame.message_id, entry.frame.payload
+    if kind == _TIMESYNC:  # our requests, and replies of the vehicle: tc1 is 0 in a request
+        return any(payload[:8]) != ours
+    if kind == _FLOAT_ARRAY:
+        return payload[10:20].rstrip(b"\0").decode(errors="replace") in _ARRAYS
+    return kind != _HEARTBEAT or entry.frame.component_id == 1
 
 
-def _truth(theirs: Sender, clock: VehicleClock) -> Array:
-    """True positions of a simulated vehicle, from the first origin of the local frame on."""
-    homes = [(place, _origin_of_home(entry.message)) for place, entry in theirs.of("HOME_POSITION")]
-    given = [
-        (place, _origin_given(entry.message)) for place, entry in theirs.of("GPS_GLOBAL_ORIGIN")
-    ]
-    hil = theirs.columns("HIL_STATE_QUATERNION", "time_usec lat lon alt") / (1e6, 1e7, 1e7, 1e3)
-    state = theirs.columns("SIM_STATE", "lat_int lon_int alt") / (1e7, 1e7, 1.0)
-    rows = np.vstack((hil, np.insert(state, 0, 0.0, axis=1)))
-    places = np.concatenate([theirs.places("HIL_STATE_QUATERNION"), theirs.places("SIM_STATE")])
-    rows[:, 0] = np.where(rows[:, 0] > 0.0, rows[:, 0], clock.at(places))
-    origins = sorted(homes + given)
-    newest = np.searchsorted([place for place, _ in origins], places)
-    known = np.flatnonzero(newest)
-    known = known[np.argsort(places[known])]
-    positions = [
-        position_ned_m(Geodetic(*rows[row, 1:].tolist()), origins[newest[row] - 1][1])
-        for row in known
-    ]
-    return np.column_stack((rows[known, 0], np.reshape(positions, (-1, 3))))
-
-
-def _events(clock: VehicleClock, who: str, texts: Iterable[tuple[int, str]]) -> tuple[Event, ...]:
-    """Events from (place in the log, text), in their order."""
-    ordered = sorted(texts)
-    times = clock.at(np.array([place for place, _ in ordered], dtype=np.intp))
-    return tuple(
-        Event(float(time_s), who, what) for time_s, (_, what) in zip(times, ordered, strict=True)
-    )
-
-
-def _phases(ours: Sender) -> list[tuple[int, str]]:
-    return [
-        (place, text.removeprefix(OUR_PREFIX))
-        for place, text in _texts(ours)
-        if text.startswith(OUR_PREFIX)
-    ]
-
-
-def _texts(sender: Sender) -> list[tuple[int, str]]:
-    """All STATUSTEXT, joined from their chunks, each at the place of its last one."""
-    assembler, texts = TextAssembler(), []
-    for place, entry in sender.of("STATUSTEXT"):
-        whole = assembler.add(decode_text_chunk(entry.frame.payload), entry.unix_us / 1e6)
-        texts += [(place, text.text) for text in whole]
-    return texts
-
-
-def _modes(theirs: Sender, dialect: Dialect | None) -> list[tuple[int, str]]:
-    modes: list[tuple[int, str]] = []
-    if dialect is None:
-        return modes
-    for place, entry in theirs.of("HEARTBEAT"):
-        mode = dialect.mode_name(entry.message.custom_mode)
-        if entry.component_id == 1 and (not modes or modes[-1][1] != mode):
-            modes.append((place, mode))
-    return modes
-
-
-def _refusals(theirs: Sender) -> list[tuple[int, str]]:
-    acks = [(place, entry.message) for place, entry in theirs.of("COMMAND_ACK")]
-    return [
-        (place, f"command {ack.command} refused, result {ack.result}")
-        for place, ack in acks
-        if ack.result not in (0, 5)  # MAV_RESULT_ACCEPTED, MAV_RESULT_IN_PROGRESS
-    ]
-
-
-def _vehicle(messages: Iterable[LoggedMessage]) -> tuple[int | None, Dialect | None]:
-    for entry in messages:
+def _vehicle(log: Tlog) -> tuple[int | None, Dialect | None]:
+    known = {dialect.mav_autopilot: dialect for dialect in DIALECTS.values()}
+    for entry in log:
         if entry.name == "HEARTBEAT" and entry.message.autopilot != _NO_AUTOPILOT:
-            known = {dialect.mav_autopilot: dialect for dialect in DIALECTS.values()}
             return entry.system_id, known.get(entry.message.autopilot)
     return None, None
-
-
-def _origin_given(message: Any) -> Geodetic:
-    return Geodetic(message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3)
-
-
-def _origin_of_home(message: Any) -> Geodetic:
-    """The origin of the local frame: HOME_POSITION gives one point in both frames."""
-    place = message.latitude / 1e7, message.longitude / 1e7, message.altitude / 1e3
-    return origin_of(Geodetic(*place), (message.x, message.y, message.z))
-
-
-def _is(message: Any, array_id: int, name: str) -> bool:
-    return (message.array_id, message.name.rstrip("\0")) == (array_id, name)

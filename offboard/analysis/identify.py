@@ -63,18 +63,14 @@ def trace_of(log: Tlog, history: History) -> Trace:
 
 
 def _flown(history: History) -> tuple[float, float]:
-    indices = {float(PHASE_CODES[phase]) for phase in FLOWN}
-    times = [
-        time_s
-        for time_s, record in zip(history.record_time_s, history.records, strict=True)
-        if record.phase in indices
-    ]
-    return (times[0] + LIFTED_OFF_S, times[-1]) if times else (-math.inf, math.inf)
+    indices = [PHASE_CODES[phase] for phase in FLOWN]
+    times = history.record_time_s[np.isin(history.records["phase"], indices)]
+    return (times[0] + LIFTED_OFF_S, times[-1]) if len(times) else (-math.inf, math.inf)
 
 
 def _thrust_rule(log: Tlog) -> ThrustRule:
     known = {dialect.mav_autopilot: dialect.thrust_rule for dialect in DIALECTS.values()}
-    for entry in log.messages:
+    for entry in log:
         if entry.name == "HEARTBEAT" and entry.message.autopilot in known:
             return known[entry.message.autopilot]
     return ThrustRule.COLLECTIVE

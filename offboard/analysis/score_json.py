@@ -6,7 +6,8 @@ import json
 import math
 from typing import Any
 
-from offboard.analysis.history import Event, History
+from offboard.analysis.events import Event
+from offboard.analysis.history import History
 from offboard.analysis.score import Score
 
 
@@ -14,12 +15,14 @@ def as_text(score: Score, history: History) -> str:
     """All figures, the events and the number of messages as JSON text; a figure that the log does
     not hold is null."""
     document = {
+        "ended_by": score.ended_by,
         **{name: _plain(value) for name, value in score.figures().items()},
         "phases": _events(history.phases),
         "modes": _events(history.modes),
         "vehicle_messages": _events(history.vehicle_messages),
         "messages": dict(sorted(history.messages.items())),
         "wall_s": history.wall_s,
+        "damage": history.damage,
     }
     return json.dumps(document, indent=2, allow_nan=False) + "\n"
 

@@ -16,11 +16,12 @@ from offboard.analysis.score import FIGURES, Score
 
 # the figure that begins a section -> its title
 SECTIONS = {
+    "completed": "verdict",
     "rmse_position_m": "tracking",
     "mu_e": "fitness of the paper",
     "tracked_s": "activity",
     "setpoint_hz": "setpoints",
-    "solve_time_p50_ms": "decisions",
+    "decisions": "decisions",
     "position_hz": "telemetry",
     "delay_ms": "vehicle",
 }
@@ -46,7 +47,7 @@ def summary(score: Score, history: History, directory: Path) -> list[tuple[str, 
             (
                 "timing",
                 f"decision {score.solve_time_p99_ms:.2f} ms (99th percentile), "
-                f"{score.missed_ticks:.0f} of {len(history.records)} ticks missed",
+                f"{score.missed_ticks:.0f} of {score.decisions:.0f} ticks missed",
             )
         )
     identified = _identified(history)
@@ -56,6 +57,13 @@ def summary(score: Score, history: History, directory: Path) -> list[tuple[str, 
         rows.append(("log", str(directory / "flight.tlog")))
         rows.append(("all figures", f"offboard score {directory}"))
     return rows
+
+
+def verdict(score: Score) -> str:
+    """Whether the flight was completed, and what ended it."""
+    if math.isnan(score.completed):
+        return score.ended_by
+    return "completed" if score.completed else f"not completed: {score.ended_by}"
 
 
 def _identified(history: History) -> str:
@@ -75,7 +83,8 @@ def _identified(history: History) -> str:
 
 
 def show(console: Console, score: Score, history: History) -> None:
-    """Print what happened in the order of time, then every figure that the log holds."""
+    """Print the verdict, what happened in the order of time, and every figure of the log."""
+    console.print(Text(verdict(score)))
     story = Table(box=None, pad_edge=False)
     story.add_column("t [s]", justify="right")
     story.add_column("who")

@@ -1,71 +1,62 @@
-"""The messages of a log sorted by who sent them: the vehicle, or `offboard`; and vehicle time."""
+"""Messages of a log by sender and kind, as columns: the vehicle's, and those of `offboard`."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
-from operator import itemgetter
+from array import array
+from collections.abc import Iterator
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.tlog import LoggedMessage, Tlog, columns, name_of
+from offboard.analysis.tlog import LoggedMessage, columns, layout
 
 Array = NDArray[np.float64]
-# (system, component, message id) -> (place in the log, message), in order
-Streams = dict[tuple[int, int, int], list[tuple[int, LoggedMessage]]]
+WRAP_MS = 2**32
 
 
-def streams_of(log: Tlog) -> Streams:
-    """The messages of a log, each with its place in it, by sender and kind."""
-    streams: Streams = {}
-    for place, entry in enumerate(log.messages):
-        frame = entry.frame
-        key = frame.system_id, frame.component_id, frame.message_id
-        streams.setdefault(key, []).append((place, entry))
-    return streams
+class Stream:
+    """The messages of one kind from one sender, in the order of arrival.
+
+    For each also its place in the log, its Unix time, and the vehicle time in ms of the newest
+    telemetry before it (NaN without).
+    """
+
+    def __init__(self, name: str) -> None:
+        self._name = name
+        self._size = layout(name).itemsize
+        self._payloads = bytearray()
+        self.places, self.unix_us, self.now_ms = array("q"), array("q"), array("d")
+
+    def __len__(self) -> int:
+        return len(self.places)
+
+    def add(self, entry: LoggedMessage, place: int, now_ms: float) -> None:
+        self._payloads += entry.frame.payload[: self._size].ljust(self._size, b"\0")
+        self.places.append(place)
+        self.unix_us.append(entry.unix_us)
+        self.now_ms.append(now_ms)
+
+    def columns(self, fields: str) -> Array:
+        """(N, columns): the fields of all messages, separated by spaces."""
+        return columns(self._name, self._payloads, fields)
+
+    def payloads(self) -> Iterator[bytes]:
+        for at in range(0, len(self._payloads), self._size):
+            yield bytes(self._payloads[at : at + self._size])
+
+    def clear(self) -> None:
+        self.__init__(self._name)  # type: ignore[misc]
 
 
-class Sender:
-    """The messages of one side of the link. `sent(system, component)` is True for that side."""
+def continuous_s(stamps_ms: Array, anchor_ms: float) -> Array:
+    """Vehicle time in s from `time_boot_ms`, which begins again at zero after 2^32 ms.
 
-    def __init__(self, streams: Streams, sent: Callable[[int, int], bool]) -> None:
-        self._kinds: dict[str, list[tuple[int, LoggedMessage]]] = {}
-        for (system, component, kind), stream in streams.items():
-            if sent(system, component):
-                self._kinds.setdefault(name_of(kind), []).extend(stream)
-        for stream in self._kinds.values():
-            stream.sort(key=itemgetter(0))
-
-    def of(self, name: str) -> list[tuple[int, LoggedMessage]]:
-        """(place, message) of all messages of that name."""
-        return self._kinds.get(name, [])
-
-    def places(self, name: str) -> NDArray[np.intp]:
-        return np.array([place for place, _ in self.of(name)], dtype=np.intp)
-
-    def columns(self, name: str, fields: str) -> Array:
-        """(N, columns): the fields of all messages of that name."""
-        return columns(name, [entry for _, entry in self.of(name)], fields)
-
-    def table(self, name: str, fields: str) -> Array:
-        """As `columns`, with the vehicle time in seconds as first column."""
-        rows = self.columns(name, f"time_boot_ms {fields}")
-        rows[:, 0] /= 1e3
-        return rows
-
-
-class VehicleClock:
-    """Vehicle time at a place in the log: that of the newest telemetry before it."""
-
-    def __init__(self, vehicle: Sender) -> None:
-        names = ("LOCAL_POSITION_NED", "ATTITUDE_QUATERNION")
-        places = np.concatenate([vehicle.places(name) for name in names])
-        times = np.concatenate([vehicle.table(name, "")[:, 0] for name in names])
-        order = np.argsort(places)
-        self._places, self._times = places[order], np.append(math.nan, times[order])
-
-    def at(self, places: NDArray[np.intp]) -> Array:
-        """(N,) seconds, NaN before any telemetry."""
-        times: Array = self._times[np.searchsorted(self._places, places)]
-        return times
+    The result is within 24 days of `anchor_ms`, any stamp of the same log. Stamps that do not wrap
+    are put on the same clock.
+    """
+    if math.isnan(anchor_ms):
+        return stamps_ms / 1e3
+    away_ms = (stamps_ms - anchor_ms + WRAP_MS / 2) % WRAP_MS - WRAP_MS / 2
+    time_s: Array = (anchor_ms + away_ms) / 1e3
+    return time_s

@@ -1,15 +1,16 @@
-"""Reads a .tlog: frames with their times, decoded on demand.
+"""Reads a .tlog: frames with their times, one after the other, in bounded memory.
 
-A record is a big-endian uint64 of Unix microseconds, then one unchanged MAVLink frame. A log that
-ends inside a record (after a crash) is read up to it; a file that is no .tlog is refused.
+An entry is a big-endian uint64 of Unix microseconds, then one unchanged MAVLink frame. A log that
+ends inside an entry (after a crash) is read up to it. Damaged entries are skipped and counted:
+reading goes on at the next time stamp that is followed by a frame with a correct checksum. A file
+without any entry is refused.
 """
 
 from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -25,6 +26,8 @@ from offboard.mavlink.framing import Frame, frame_size, parse
 _STAMP = struct.Struct(">Q")
 _YEAR_2000_US, _YEAR_2100_US = 946_684_800_000_000, 4_102_444_800_000_000
 _MAGIC = (0xFD, 0xFE)
+_LONGEST = 8 + 280  # bytes of an entry: a signed MAVLink 2 frame
+_BLOCK = 1 << 20
 _codec = dialect.MAVLink(None)
 
 
@@ -57,13 +60,109 @@ class LoggedMessage(NamedTuple):
         return _codec.decode(bytearray(self.frame.raw))
 
 
-@dataclass(frozen=True, slots=True)
 class Tlog:
-    """All decodable messages in order, and the bytes of an incomplete record at the end."""
+    """A log to iterate over, as often as needed: its messages in order.
 
-    messages: tuple[LoggedMessage, ...]
-    truncated: int
-    undecodable: int
+    After each iteration `damaged` is the number of damaged entries, `first_damage` the place of the
+    first one in bytes, `truncated` the bytes of an incomplete entry at the end.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.damaged = self.first_damage = self.truncated = 0
+
+    @property
+    def messages(self) -> tuple[LoggedMessage, ...]:
+        """All messages at once: about 400 bytes of memory for each."""
+        return tuple(self)
+
+    @property
+    def damage(self) -> str:
+        """One sentence on what could not be read; empty if all could."""
+        if not self.damaged:
+            return ""
+        entries = f"{self.damaged} damaged entr{'ies were' if self.damaged > 1 else 'y was'}"
+        return f"{self.path}: {entries} skipped, the first at byte {self.first_damage}"
+
+    def __iter__(self) -> Iterator[LoggedMessage]:
+        self.damaged = self.first_damage = self.truncated = 0
+        try:
+            with self.path.open("rb") as file:
+                yield from self._messages(iter(lambda: file.read(_BLOCK), b""))
+        except OSError as error:
+            raise TlogError(f"{self.path} cannot be read: {error.strerror}") from None
+
+    def _messages(self, blocks: Iterator[bytes]) -> Iterator[LoggedMessage]:
+        data, before, at, found = b"", 0, 0, False
+        lost: int | None = None  # where the search for the next entry began
+        cut = False  # it began because the file ends within the entry there, if its length is right
+        while True:
+            if at + _LONGEST + 9 > len(data):  # an entry, and the head of the next one
+                block = next(blocks, b"")
+                before, data, at = before + at, data[at:] + block, 0
+                if block:
+                    continue
+                if len(data) < 8 + 3:  # no entry can begin here
+                    break
+            entry = _entry(data, at, certain=lost is not None)
+            if isinstance(entry, LoggedMessage):
+                if lost is not None and cut:
+                    self._count(lost)
+                at += 8 + len(entry.frame.raw)
+                found, lost = True, None
+                yield entry
+            elif entry:
+                self._count(before + at)
+                at += entry
+            else:
+                if lost is None:
+                    lost, cut = before + at, entry is None
+                    if not cut:
+                        self._count(lost)
+                at = _next_magic(data, at + 9) - 8
+        if lost is None or cut:
+            self.truncated = before + len(data) - (before if lost is None else lost)
+        if not found:
+            raise TlogError(
+                f"{self.path} is not a .tlog, or empty: it holds no time stamp and MAVLink frame"
+            )
+
+    def _count(self, place: int) -> None:
+        self.damaged += 1
+        self.first_damage = self.first_damage if self.damaged > 1 else place
+
+
+def _entry(data: bytes, at: int, *, certain: bool) -> LoggedMessage | int | None:
+    """The entry that begins at `at`; else the size of a damaged one that the next one follows, 0
+    where none begins, None where the data end within it. `certain`: its checksum must be known."""
+    if not _begins(data, at):
+        return 0
+    size = frame_size(data, at + 8)
+    end = at + 8 + (size or 0)
+    if size is None or end > len(data):
+        return None
+    frame = parse(data, at + 8, end)
+    if isinstance(frame, Frame) and frame.verified:
+        return LoggedMessage(_STAMP.unpack_from(data, at)[0], frame)
+    if certain or not _begins(data, end):
+        return 0
+    if isinstance(frame, DropReason):
+        return end - at
+    return LoggedMessage(_STAMP.unpack_from(data, at)[0], frame)
+
+
+def _begins(data: bytes, at: int) -> bool:
+    """Whether a time stamp and the first byte of a frame are at `at`, as far as the data go."""
+    if at + 9 > len(data):
+        return True
+    (stamp,) = _STAMP.unpack_from(data, at)
+    return data[at + 8] in _MAGIC and _YEAR_2000_US < stamp < _YEAR_2100_US
+
+
+def _next_magic(data: bytes, at: int) -> int:
+    """Where the next first byte of a frame is; the end of the data without one."""
+    places = [place for magic in _MAGIC if (place := data.find(magic, at)) >= 0]
+    return min(places, default=len(data))
 
 
 def find(flight: Path) -> Path:
@@ -76,36 +175,10 @@ def find(flight: Path) -> Path:
 
 
 def read(path: Path) -> Tlog:
-    """Read a whole log. Raises TlogError where the file is no .tlog or cannot be read."""
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise TlogError(f"{path} cannot be read: {error.strerror}") from None
-    messages: list[LoggedMessage] = []
-    end = undecodable = 0
-    for begin, end, stamp in _records(data, path):
-        frame = parse(data, begin, end)
-        if isinstance(frame, DropReason):
-            undecodable += 1
-        else:
-            messages.append(LoggedMessage(stamp, frame))
-    return Tlog(tuple(messages), len(data) - end, undecodable)
-
-
-def _records(data: bytes, path: Path) -> Iterator[tuple[int, int, int]]:
-    """(begin, end, stamp) of each whole frame."""
-    at = 0
-    while at + 11 <= len(data):
-        (stamp,) = _STAMP.unpack_from(data, at)
-        if data[at + 8] not in _MAGIC or not _YEAR_2000_US < stamp < _YEAR_2100_US:
-            raise TlogError(f"{path} is not a .tlog: no time stamp and MAVLink frame at byte {at}")
-        size = frame_size(data, at + 8)
-        if size is None or at + 8 + size > len(data):
-            return
-        yield at + 8, at + 8 + size, stamp
-        at += 8 + size
-    if at == 0:
-        raise TlogError(f"{path} is not a .tlog, or empty: it holds no whole MAVLink frame")
+    """A log to iterate over. Raises TlogError where the file is no .tlog or cannot be read."""
+    log = Tlog(path)
+    next(iter(log))
+    return log
 
 
 @cache
@@ -115,25 +188,23 @@ def name_of(message_id: int) -> str:
     return kind.msgname if kind else f"UNKNOWN_{message_id}"
 
 
-def columns(name: str, messages: Sequence[LoggedMessage], fields: str) -> NDArray[np.float64]:
-    """The fields of messages named `name` as rows (N, columns).
+def columns(name: str, payloads: bytes | bytearray, fields: str) -> NDArray[np.float64]:
+    """Fields of messages named `name` as rows (N, columns).
 
-    `fields` are separated by spaces; an array field fills as many columns as it has elements. Gives
-    the values of `message` for all messages at once.
+    `payloads` are the N payloads one after the other, each with all the zeros that MAVLink 2 omits
+    (see `layout`). `fields` are separated by spaces; an array field fills as many columns as it has
+    elements.
     """
-    layout = _layout(name)
-    size = layout.itemsize
-    payloads = b"".join(entry.frame.payload[:size].ljust(size, b"\0") for entry in messages)
-    rows = np.frombuffer(payloads, layout)
+    rows = np.frombuffer(bytes(payloads), layout(name))
     parts = []
     for field in fields.split():
-        width = math.prod(layout[field].shape)
+        width = math.prod(rows.dtype[field].shape)
         parts.append(rows[field].reshape(len(rows), width).astype(np.float64))
     return np.hstack(parts)
 
 
 @cache
-def _layout(name: str) -> np.dtype[np.void]:
+def layout(name: str) -> np.dtype[np.void]:
     """The layout of the payload on the wire, from pymavlink's definition of the message."""
     kind = getattr(dialect, f"MAVLink_{name.lower()}_message")
     formats = kind.native_format.decode().lstrip("<")

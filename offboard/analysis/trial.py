@@ -11,15 +11,15 @@ from functools import cache
 from pathlib import Path
 
 from offboard.analysis import history, tlog
-from offboard.analysis import score as scoring
 from offboard.analysis.compare import Result, Trial
 from offboard.analysis.history import History
-from offboard.analysis.score import Score
+from offboard.analysis.score import Score, Scoring
 from offboard.analysis.score_json import as_text
 from offboard.documents.errors import UserError
-from offboard.flight.companion import STOPPED
+from offboard.flight.companion import STOPPED, Outcome
 from offboard.flight.configuration import build_track
 from offboard.flight.log import LogError
+from offboard.flight.phases import ExitCode
 from offboard.flight.request import FlightRequest, fly_request
 from offboard.flight.sitl import SimulatorProcess
 
@@ -27,16 +27,26 @@ from offboard.flight.sitl import SimulatorProcess
 def score_flight(flight: Path) -> tuple[Score, History]:
     """Score a flight from its log alone.
 
-    `flight` is a flight directory or a .tlog file. Returns the figures and the events and arrays
-    that they were computed from. Raises TlogError.
+    `flight` is a flight directory or a .tlog file. Returns the figures and the events. The arrays
+    of the history are those of the last minutes of a long flight; `history.gather` gives all of
+    them. Raises TlogError.
 
     Example:
 
         score, history = score_flight(Path("flights/20261121-093000"))
-        print(score.rmse_position_m, history.position.shape)
+        print(score.rmse_position_m, history.phases)
     """
-    flown = history.gather(tlog.read(tlog.find(flight)))
-    return scoring.score(flown), flown
+    scored = Scoring()
+    for flown, until_s in history.stretches(tlog.read(tlog.find(flight))):
+        scored.add(flown, until_s)
+    return scored.score(flown), flown
+
+
+def judged(outcome: Outcome, score: Score) -> Outcome:
+    """The outcome of a flight by what its log shows: one that is not completed was aborted."""
+    if outcome.exit_code != ExitCode.FLOWN or score.completed == 1.0:
+        return outcome
+    return Outcome(ExitCode.ABORTED, f"{outcome.sentence}, but not completed: {score.ended_by}")
 
 
 def keep_score(directory: Path, score: Score, flown: History) -> None:
@@ -90,6 +100,7 @@ def fly_trial(request: FlightRequest, trial: Trial) -> Result:
         outcome = fly_request(requested, simulator=_simulator() if request.sitl else None)
         score, flown = score_flight(trial.directory)
         keep_score(trial.directory, score, flown)
+        outcome = judged(outcome, score)
     except UserError as error:
         return Result(trial, 2, str(error), {})
     stopped = outcome.sentence.startswith(STOPPED)

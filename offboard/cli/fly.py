@@ -148,8 +148,10 @@ def _conclude(
     """Print verdict and result. Exits with the code of the verdict. `not_shown`: lines of the
     flight that the terminal did not take."""
     from offboard.analysis.score_table import summary
+    from offboard.analysis.trial import judged
 
     score, history = scored(directory)
+    outcome = judged(outcome, score)
     checked = [] if outcome.exit_code else requirements
     missed = [each for each in checked if not each.met(score.figures())]
     results = "; ".join(each.sentence(score.figures()) for each in missed or checked)

@@ -23,11 +23,12 @@ def score(
 ) -> None:
     """Score a flight from its .tlog alone.
 
-    Prints what happened in the order of time, then every figure. Writes score.json if FLIGHT is a
+    Prints whether the flight was completed, what happened in the order of time, then every figure.
+    Every requirement on a flight that was not completed is missed. Writes score.json if FLIGHT is a
     directory.
     """
     from offboard.analysis.score_json import as_text
-    from offboard.analysis.score_table import show
+    from offboard.analysis.score_table import show, verdict
 
     requirements = requirements_of(require)
     result, history = scored(flight)
@@ -35,8 +36,12 @@ def score(
         sys.stdout.write(as_text(result, history))
     else:
         show(out, result, history)
+    if history.damage:
+        complain(history.damage)
     figures = result.figures()
     missed = [each.sentence(figures) for each in requirements if not each.met(figures)]
+    if requirements and result.completed != 1.0:
+        missed.insert(0, verdict(result))
     if missed:
         raise CommandError("; ".join(missed), 1)
 

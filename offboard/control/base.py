@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from typing import Protocol, runtime_checkable
 
 from offboard.documents.parameters import Parameters
@@ -69,11 +69,6 @@ class Certificate:
     cut_short: bool = False
     at_bound: bool = False
     seed_cost: float = math.nan
-
-    def void(self) -> Certificate:
-        """The certificate without its costs, which are not those of the command that was sent."""
-        nan = math.nan
-        return replace(self, cost=nan, optimal_cost=nan, gap=nan, seed_cost=nan)
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,7 +55,8 @@ def facts(
         failsafe=heartbeat is not None and heartbeat.system_status >= FAILSAFE_STATUS,
         armed=vehicle.armed,
         in_the_air=state.contact.in_the_air,
-        landed=state.phase is Phase.LAND and state.contact.landed,
+        landed=state.phase is Phase.LAND and not state.not_landed(),
+        disarmed_s=vehicle.disarmed_s,
         lifted_off=state.phase is Phase.TAKEOFF and _lifted_off(state),
         at_start=state.phase is Phase.CLIMB and _at_start(state, observer),
         late_s=plan.late_s(time_s),
@@ -118,6 +119,7 @@ def figures(
         "stop": state.stop_reason,
         "failure": state.failure,
         "contradiction": identification.contradiction if identification else "",
+        "not_landed": state.not_landed(),
         "problems": "; ".join(_problems(state)),
         "not_ready": not_ready(state, session),
     }

@@ -54,7 +54,7 @@ class Companion:
 
     `deadline_s` is the wall time that one decision may take; None in lockstep, where the vehicle
     waits for each decision. `state` is the flight's state; `peer` the address that the vehicle
-    sends from, None before it is found.
+    sends from, None before it is found; `strangers` the datagrams of other senders, for the log.
     """
 
     def __init__(
@@ -81,6 +81,7 @@ class Companion:
         self._turned_s = self._heard_s = math.nan  # host time of the last turn, and telemetry
         self._arrived_s = 0.0  # host time of the arrival of the newest telemetry
         self._bridged_s = 0.0
+        self.strangers = self._recorded_strangers = 0
         self._identification = _identification(vehicle, controller, period_s, identify)
         self._outbox = Outbox(state, session, observer, self._identification)
         decider = Decider(
@@ -237,6 +238,8 @@ class Companion:
             case LocalPosition(time_s, position, velocity):
                 self._on_telemetry(time_s, arrived_s)
                 state.contact.on_position(event)
+                if state.touchdown:
+                    state.touchdown.on_position(time_s, position, velocity[2])
                 self._observer.on_position(time_s, position, velocity)
                 if self._identification:
                     self._identification.on_position(time_s, position, velocity)
@@ -290,7 +293,17 @@ class Companion:
         self._tick = number
         self._machine.advance()
         if not state.has_ended:
-            self._actions.act(Tick(time_s, state.phase, state.in_phase_s, self._arrived_s, missed))
+            self._actions.act(
+                Tick(
+                    time_s,
+                    state.phase,
+                    state.in_phase_s,
+                    self._arrived_s,
+                    missed,
+                    self.strangers - self._recorded_strangers,
+                )
+            )
+            self._recorded_strangers = self.strangers
             self._outbox.send(state.link.request(time_s))
 
     def _bridge(self, silence_s: float) -> None:

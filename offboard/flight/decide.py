@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from offboard.control.base import Adopting, Controller, Decision, Situation
 from offboard.estimation.observer import Observer
 from offboard.flight.assessment import position_error_m
-from offboard.flight.gate import Refused
+from offboard.flight.gate import Refusal, Refused
 from offboard.flight.online_identification import RECORD_ID as IDENTIFIED_ID
 from offboard.flight.online_identification import RECORD_NAME as IDENTIFIED_NAME
 from offboard.flight.online_identification import Adoption, OnlineIdentification
@@ -21,7 +21,7 @@ from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.flight.record import RECORD_ID, RECORD_NAME, TickRecord, reference_record
 from offboard.flight.state import FlightState
 from offboard.mavlink.outgoing import SolverRecord
-from offboard.model.command import Command
+from offboard.model.command import Command, PositionCommand
 from offboard.model.predicted_state import PredictedState
 
 
@@ -34,16 +34,20 @@ class Tick:
     in_phase_s: float
     arrived_s: float  # host time of the arrival of the telemetry that caused the tick
     missed: int = 0  # ticks skipped since the previous one
+    strangers: int = 0  # datagrams of other senders since the previous one
 
 
 @dataclass(frozen=True, slots=True)
 class Decided:
-    """A decision, the predicted state it was made for, and what it took."""
+    """A decision, the predicted state it was made for, and what became of it."""
 
     state: PredictedState
     decision: Decision
     solve_time_s: float
-    age_s: float = 0.0  # of its telemetry, when it was sent
+    sent: Command | PositionCommand | None = None
+    age_s: float = 0.0  # of its telemetry, at the gate
+    refused: Refusal | None = None
+    failure: str = ""  # why it was refused
 
 
 class Decider:
@@ -85,36 +89,40 @@ class Decider:
         """
         try:
             decided = self._send(tick, self._decided(tick))
+            failure = decided.failure
         except Exception as error:  # any error: the vehicle is in the air
+            failure = f"{type(error).__name__}: {error}"
+        else:
+            self._record(tick, decided)
+        if failure:
             self._state.missed += 1
-            named = "" if isinstance(error, Refused) else f"{type(error).__name__}: "
-            self._state.failure = f"{named}{error}"
-            self._outbox.refused[tick.phase.value] += 1
-            self._outbox.warn(f"decision missed: {self._state.failure}")
+            self._state.failure = failure
+            self._outbox.warn(f"decision missed: {failure}")
             return False
         self._state.missed = 0
         self._state.predictions.append(decided.state)
-        self._record(tick, decided)
         if self._identification:
             self._identify(tick, self._identification)
         return True
 
     def _send(self, tick: Tick, decided: Decided) -> Decided:
-        """Send the command; returns the decision with the command that was sent. What the decision
-        certifies holds only for its own command."""
-        command = decided.decision.command
+        """Send the command, if the gate admits it."""
         age_s, late_s = self._age_and_lateness(tick)
+        try:
+            sent = self._sent(tick, decided, age_s, late_s)
+        except Refused as refused:
+            return replace(decided, age_s=age_s, refused=refused.why, failure=str(refused))
+        return replace(decided, age_s=age_s, sent=sent)
+
+    def _sent(
+        self, tick: Tick, decided: Decided, age_s: float, late_s: float
+    ) -> Command | PositionCommand:
+        command, outbox = decided.decision.command, self._outbox
         if not isinstance(command, Command):
-            self._outbox.send_position(tick.time_s, command, age_s=age_s, late_s=late_s)
-            return replace(decided, age_s=age_s)
+            return outbox.send_position(tick.time_s, command, age_s=age_s, late_s=late_s)
+        excited = self._excited(command, tick)
         body_z_down = float(decided.state.thrust_direction_ned[2])
-        sent = self._outbox.send_command(
-            tick.time_s, self._excited(command, tick), body_z_down, age_s=age_s, late_s=late_s
-        )
-        decision = decided.decision
-        if sent != command:
-            decision = replace(decision, command=sent, certificate=decision.certificate.void())
-        return replace(decided, decision=decision, age_s=age_s)
+        return outbox.send_command(tick.time_s, excited, body_z_down, age_s=age_s, late_s=late_s)
 
     def _age_and_lateness(self, tick: Tick) -> tuple[float, float]:
         """Age of the telemetry, and time since the end of the tick; both now, in host time."""
@@ -179,11 +187,15 @@ class Decider:
         record = TickRecord.of(
             phase=PHASE_CODES[tick.phase],
             decision=decided.decision,
+            sent=decided.sent,
             state=decided.state,
             solve_time_s=decided.solve_time_s,
             lateness_s=self._stopwatch() - tick.arrived_s,
             missed_ticks=tick.missed,
             hover_thrust=self._observer.hover_thrust_estimate,
             track_time_s=self._state.plan.track_time_s(tick.time_s),
+            age_s=decided.age_s,
+            refused=decided.refused or 0,
+            strangers=tick.strangers,
         )
         self._outbox.send(SolverRecord(tick.time_s, record.data(), RECORD_ID, RECORD_NAME))

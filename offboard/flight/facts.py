@@ -25,7 +25,8 @@ class Facts:
     failsafe: bool  # the vehicle shows a failsafe or an emergency
     armed: bool
     in_the_air: bool
-    landed: bool  # after a descent: it did not fall
+    landed: bool  # by the land detector, the height and the speed of the descent
+    disarmed_s: float  # since it was reported disarmed; 0 while armed
     lifted_off: bool
     at_start: bool
     late_s: float  # since the planned end of the climb

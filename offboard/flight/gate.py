@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from enum import IntFlag
 from typing import overload
 
 from offboard.model.command import Command, PositionCommand
@@ -18,8 +19,21 @@ FALLING_SHARE = 1.0 / 3.0  # of the hover thrust: less is sent only to a vehicle
 _LENGTH_TOLERANCE = 0.01
 
 
+class Refusal(IntFlag):
+    """Why a setpoint was not sent, as the log has it."""
+
+    LATE = 1  # decided after its deadline
+    STALE = 2  # the telemetry that it was made for is too old
+    NOT_OURS = 4  # the vehicle does not, or may not, follow us
+    UNUSABLE = 8  # not finite
+
+
 class Refused(Exception):
-    """A setpoint that must not leave; the message is the reason."""
+    """A setpoint that must not leave; the message is the reason, `why` its number."""
+
+    def __init__(self, why: Refusal, reason: str) -> None:
+        super().__init__(reason)
+        self.why = why
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,13 +69,13 @@ def admit(
     a value is not finite.
     """
     if not clearance.ours:
-        raise Refused("the vehicle is not ours")
+        raise Refused(Refusal.NOT_OURS, "the vehicle is not ours")
     if not clearance.age_s <= clearance.age_limit_s:
-        raise Refused(f"decided on telemetry that is {clearance.age_s:.2f} s old")
+        raise Refused(Refusal.STALE, f"decided on telemetry that is {clearance.age_s:.2f} s old")
     if clearance.late_s > 0.0:
-        raise Refused(f"decided {clearance.late_s:.2f} s too late")
+        raise Refused(Refusal.LATE, f"decided {clearance.late_s:.2f} s too late")
     if not usable(command):
-        raise Refused(f"unusable {command}")
+        raise Refused(Refusal.UNUSABLE, f"unusable {command}")
     if isinstance(command, PositionCommand):
         return command
     return clamp(command, vehicle, on_ground=clearance.on_ground)

@@ -6,7 +6,6 @@ Signs: disarmed (HEARTBEAT), the land detector (EXTENDED_SYS_STATE), and height 
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from dataclasses import dataclass, field
 
@@ -14,14 +13,11 @@ from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.events import Landed, LocalPosition
 
 DETECTOR_KNOWN_S = 1.5  # EXTENDED_SYS_STATE is requested at 5 Hz
-RESTING_HEIGHT_M, RESTING_SPEED_MPS = 0.75, 0.3  # errors of an estimate on the ground
+RESTING_HEIGHT_M = 0.75  # errors of an estimate on the ground
 LIFTED_HEIGHT_M, LIFTED_CLIMB_MPS, LIFTED_SAMPLES = 0.15, 0.4, 3
-FLYING = ("in_air", "takeoff", "landing")
 GROUND_SPEED_MPS = 0.5  # as an estimate on the ground may show
 STOOD_WITHIN_M, STOOD_HEIGHT_M = 0.1, 0.3
 KEPT_S, KEPT_EVERY_S = 20.0, 0.05
-DESCENT_OVER_S, AT_REST_S = 3.0, 0.5
-FALL_MPS = 2.5  # faster than any landing: WPNAV_SPEED_DN is 1.5, MPC_Z_V_AUTO_DN 1.5
 
 
 @dataclass(slots=True)
@@ -31,7 +27,7 @@ class GroundContact:
     vehicle: VehicleState
     rest_down_m: float = 0.0  # where it was last known to rest; at first the local origin
     _lifted: int = 0  # samples in a row
-    _heights: deque[tuple[float, float, float]] = field(default_factory=deque)
+    _heights: deque[tuple[float, float]] = field(default_factory=deque)
 
     def on_position(self, position: LocalPosition) -> None:
         """The newest position."""
@@ -42,7 +38,7 @@ class GroundContact:
         lifted = self.height_m > LIFTED_HEIGHT_M or climbs
         self._lifted = self._lifted + 1 if lifted else 0
         if not self._heights or position.time_s - self._heights[-1][0] >= KEPT_EVERY_S:
-            self._heights.append((position.time_s, self.height_m, speed_mps))
+            self._heights.append((position.time_s, self.height_m))
         while self._heights[0][0] < position.time_s - KEPT_S:
             self._heights.popleft()
 
@@ -79,24 +75,8 @@ class GroundContact:
 
     def stood_for(self, for_s: float) -> bool:
         """At the height of the last rest, and no higher or lower during `for_s`."""
-        heights = [height for height, _ in self._recent(for_s)]
-        still = max(heights, default=math.inf) - min(heights, default=0.0) < STOOD_WITHIN_M
-        return still and self._known_for(for_s) and abs(self.height_m) < STOOD_HEIGHT_M
-
-    @property
-    def landed(self) -> bool:
-        """Judged when it disarms after a descent: it did not fall, and it is at the height of the
-        last rest or was at rest already (on a slope)."""
-        fell = any(down > FALL_MPS for _, down in self._recent(DESCENT_OVER_S))
-        rested = all(abs(down) < RESTING_SPEED_MPS for _, down in self._recent(AT_REST_S))
-        at_rest = rested and self._known_for(AT_REST_S)
-        return not fell and (abs(self.height_m) < RESTING_HEIGHT_M or at_rest)
-
-    def _known_for(self, for_s: float) -> bool:
-        heard = self._heights
-        return bool(heard) and heard[-1][0] - heard[0][0] >= for_s
-
-    def _recent(self, over_s: float) -> list[tuple[float, float]]:
-        """Height and vertical speed, down positive, of the last `over_s`."""
         newest_s = self._heights[-1][0] if self._heights else 0.0
-        return [(height, down) for at_s, height, down in self._heights if at_s > newest_s - over_s]
+        heights = [height for at_s, height in self._heights if at_s > newest_s - for_s]
+        still = bool(heights) and max(heights) - min(heights) < STOOD_WITHIN_M
+        known = still and newest_s - self._heights[0][0] >= for_s
+        return known and abs(self.height_m) < STOOD_HEIGHT_M

@@ -8,6 +8,7 @@ from offboard.flight.facts import Facts
 from offboard.flight.phases import Rung
 
 Guard = Callable[[Facts], bool]
+DETECTOR_S = 1.0  # EXTENDED_SYS_STATE is requested at 5 Hz
 
 
 def vehicle_found(now: Facts) -> bool:
@@ -101,9 +102,13 @@ def disarmed(now: Facts) -> bool:
     return not now.armed
 
 
-def fell(now: Facts) -> bool:
-    """Disarmed, but not standing on the ground after a landing."""
-    return not now.armed and not now.landed
+def landed(now: Facts) -> bool:
+    return now.landed and not now.armed
+
+
+def disarmed_elsewhere(now: Facts) -> bool:
+    """Disarmed, but not landed; the land detector has had time to report."""
+    return not now.armed and not now.landed and now.disarmed_s > DETECTOR_S
 
 
 def disarmed_for_good(now: Facts) -> bool:

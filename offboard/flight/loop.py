@@ -86,7 +86,9 @@ class Loop:
         chunks = self._link.receive(POLL_S)
         output = self._companion.turn(chunks, clock.monotonic_s())
         self._deliver(output)
-        for sentence in self._link.strangers.news():
+        strangers = self._link.strangers
+        self._companion.strangers = strangers.total
+        for sentence in strangers.news():
             self._companion.announce(sentence)
         self._check_log()
         self._show()

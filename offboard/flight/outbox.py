@@ -8,7 +8,7 @@ socket or file.
 from __future__ import annotations
 
 import math
-from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass
 
 from offboard.estimation.observer import Observer
@@ -45,8 +45,7 @@ class Output:
 class Outbox:
     """Creates and queues messages.
 
-    `command` is the command in force, `announced` are the sentences for the user, oldest first,
-    `refused` counts the setpoints that the gate refused, by phase of the flight.
+    `command` is the command in force, `announced` are the sentences for the user, oldest first.
     """
 
     def __init__(
@@ -62,7 +61,6 @@ class Outbox:
         self._identification = identification
         self.command = Command(0.0, LEVEL, 0.0)
         self.announced: list[str] = []
-        self.refused: Counter[str] = Counter()
         self._requested_s: dict[CommandLong, float] = {}
         self._text_id = 0
         self._queue: list[Outgoing] = []
@@ -104,10 +102,8 @@ class Outbox:
 
     def send_level(self, time_s: float, command: Command) -> None:
         """Send a setpoint that no decision was needed for, if the vehicle is ours."""
-        try:
+        with suppress(Refused):
             self.send_command(time_s, command)
-        except Refused:
-            self.refused[self._state.phase.value] += 1
 
     def set_command(self, time_s: float, command: Command) -> None:
         """Note the command in force without sending it, for example the autopilot's own."""
@@ -116,7 +112,7 @@ class Outbox:
 
     def send_position(
         self, time_s: float, command: PositionCommand, *, age_s: float = 0.0, late_s: float = 0.0
-    ) -> None:
+    ) -> PositionCommand:
         """Send a setpoint for the autopilot's position loop; see `send_command`.
 
         The attitude that this loop commands is unknown, therefore the observer stops predicting
@@ -135,6 +131,7 @@ class Outbox:
                 command.course_rate_radps,
             )
         )
+        return command
 
     def hover_mps2(self) -> float:
         """Thrust that holds the weight, by the observer's estimate of the hover thrust."""

@@ -14,6 +14,7 @@ from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.outbox import Outbox
 from offboard.flight.phases import BEFORE_FLIGHT, FLYING, ExitCode, Phase
 from offboard.flight.state import FlightState, Outcome
+from offboard.flight.touchdown import Touchdown
 from offboard.flight.transitions import Row, next_row
 from offboard.mavlink.session import Session
 
@@ -86,6 +87,8 @@ class PhaseMachine:
             self._begin_climb(in_the_air=row.source is Phase.ENGAGE)
         elif row.target is Phase.JOIN:
             state.plan.start_track(state.time_s)
+        elif row.target is Phase.LAND:
+            state.touchdown = Touchdown(state.takeoff_ned_m)
 
     def _conclude(self, row: Row, reason: str) -> None:
         """The most severe exit code counts; later reasons are added to the first sentence."""
@@ -102,7 +105,7 @@ class PhaseMachine:
     def _begin_takeoff(self) -> None:
         position = self._state.vehicle.position
         assert position is not None
-        self._state.plan.origin_ned_m = position.position_ned_m
+        self._state.takeoff_ned_m = self._state.plan.origin_ned_m = position.position_ned_m
 
     def _begin_climb(self, *, in_the_air: bool) -> None:
         state = self._state

@@ -1,7 +1,8 @@
 """The log's record of one control tick: state, command, cost and times, as floats.
 
-The fields of `TickRecord` are the layout of DEBUG_FLOAT_ARRAY.data (name "pso", array_id 1) in the
-.tlog; the analysis reads the log with the same class.
+The fields of `TickRecord` are the layout of DEBUG_FLOAT_ARRAY.data (name "pso") in the .tlog; the
+analysis reads the log with the same class. The array_id says how many of the fields are in use:
+`LAYOUTS` has those of older logs, which lack the last fields.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from numpy.typing import NDArray
 
 from offboard.control.base import Decision
 from offboard.mavlink.outgoing import ReferenceRecord
-from offboard.model.command import Command
+from offboard.model.command import Command, PositionCommand
 from offboard.model.predicted_state import PredictedState
 from offboard.reference.base import FlatSample
 
@@ -23,12 +24,19 @@ COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: the sender of frames
 RECORD_COMPONENT_ID = 192
 RECORD_NAME = "pso"
 NAN = float("nan")
-RECORD_ID = 1
+Array = NDArray[np.float64]
+RECORD_ID = 3
+LAYOUTS = {1: 28, RECORD_ID: 31}  # array_id -> number of fields; 2 is another array
 
 
 @dataclass(frozen=True, slots=True)
 class TickRecord:
-    """All floats, SI, NED, vehicle time; NaN for what the control law does not have."""
+    """All floats, SI, NED, vehicle time; NaN for what the control law does not have.
+
+    Thrust, direction and course are those of the setpoint that was sent. The certificate, from
+    `cost` to `at_bound` and `seed_cost`, is of this setpoint too: NaN where it is not the one that
+    the control law certified, because excitation or the limits changed it or it was not sent.
+    """
 
     phase: float  # of flight.phases.PHASE_CODES
     thrust_mps2: float
@@ -44,7 +52,7 @@ class TickRecord:
     cut_short: float
     at_bound: float
     solve_time_s: float
-    lateness_s: float  # wall time from the arrival of the telemetry to this record
+    lateness_s: float  # wall time from the arrival of the telemetry to the decision's end
     missed_ticks: float  # ticks skipped since the previous record
     predicted_north_m: float
     predicted_east_m: float
@@ -58,6 +66,9 @@ class TickRecord:
     hover_thrust: float
     track_time_s: float  # time since the start of the track; NaN before it
     seed_cost: float = NAN  # cost of the best plan that the search started from
+    age_s: float = NAN  # of the telemetry when the setpoint was sent, vehicle time
+    refused: float = 0.0  # flags of `gate.Refusal`; 0 for a setpoint that was sent
+    strangers: float = 0.0  # datagrams of other senders since the previous record
 
     def data(self) -> tuple[float, ...]:
         """The values in the order of DEBUG_FLOAT_ARRAY.data."""
@@ -69,29 +80,34 @@ class TickRecord:
         *,
         phase: int,
         decision: Decision,
+        sent: Command | PositionCommand | None,
         state: PredictedState,
         solve_time_s: float,
         lateness_s: float,
         missed_ticks: int,
         hover_thrust: float,
         track_time_s: float,
+        age_s: float = NAN,
+        refused: int = 0,
+        strangers: int = 0,
     ) -> TickRecord:
-        """The record of `decision`, made for the predicted `state`."""
-        command, certificate = decision.command, decision.certificate
+        """The record of `decision`, made for the predicted `state`, and of the setpoint `sent`
+        instead of it or because of it; None if none was."""
         # with a position setpoint, the autopilot chooses thrust and direction
-        direction = command.thrust_direction_ned if isinstance(command, Command) else (NAN,) * 3
+        attitude = sent if isinstance(sent, Command) else None
+        certificate = decision.certificate if sent == decision.command else None
         return cls(
             float(phase),
-            command.thrust_mps2 if isinstance(command, Command) else NAN,
-            *direction,
-            command.course_rad,
-            certificate.cost,
-            certificate.optimal_cost,
-            certificate.gap,
-            certificate.spread,
-            float(certificate.iterations),
-            float(certificate.cut_short),
-            float(certificate.at_bound),
+            attitude.thrust_mps2 if attitude else NAN,
+            *(attitude.thrust_direction_ned if attitude else (NAN, NAN, NAN)),
+            sent.course_rad if sent else NAN,
+            certificate.cost if certificate else NAN,
+            certificate.optimal_cost if certificate else NAN,
+            certificate.gap if certificate else NAN,
+            certificate.spread if certificate else NAN,
+            float(certificate.iterations) if certificate else NAN,
+            float(certificate.cut_short) if certificate else NAN,
+            float(certificate.at_bound) if certificate else NAN,
             solve_time_s,
             lateness_s,
             float(missed_ticks),
@@ -100,16 +116,27 @@ class TickRecord:
             *_triple(state.disturbance_ned_mps2),
             hover_thrust,
             track_time_s,
-            certificate.seed_cost,
+            certificate.seed_cost if certificate else NAN,
+            age_s,
+            float(refused),
+            float(strangers),
         )
 
-    @classmethod
-    def from_data(cls, data: tuple[float, ...]) -> TickRecord:
-        """The record in DEBUG_FLOAT_ARRAY.data. Raises ValueError if the array is too short."""
-        names = fields(cls)
-        if len(data) < len(names):
-            raise ValueError(f"a tick record has {len(names)} floats, this one {len(data)}")
-        return cls(*data[: len(names)])
+
+FIELDS = tuple(field.name for field in fields(TickRecord))
+
+
+def records_of(data: Array, array_ids: Array) -> NDArray[np.void]:
+    """Records (N,) as a structured array with the fields of `TickRecord`, from DEBUG_FLOAT_ARRAY:
+    `data` (N, 58) and `array_ids` (N,), all in LAYOUTS. What an older log lacks has its default."""
+    values = data[:, : len(FIELDS)].copy()
+    for array_id, count in LAYOUTS.items():
+        older = array_ids == array_id
+        values[older, count:] = TickRecord(*(NAN,) * count).data()[count:]
+    records = np.empty(len(values), [(name, np.float64) for name in FIELDS])
+    for column, name in enumerate(FIELDS):
+        records[name] = values[:, column]
+    return records
 
 
 def reference_record(time_s: float, sample: FlatSample) -> ReferenceRecord:
@@ -124,5 +151,5 @@ def reference_record(time_s: float, sample: FlatSample) -> ReferenceRecord:
     )
 
 
-def _triple(values: NDArray[np.float64]) -> tuple[float, float, float]:
+def _triple(values: Array) -> tuple[float, float, float]:
     return float(values[0]), float(values[1]), float(values[2])

@@ -11,13 +11,15 @@ from dataclasses import dataclass, field
 
 from offboard.flight.authority import Authority
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.ground_contact import GroundContact
+from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact
 from offboard.flight.ladder import Ladder
 from offboard.flight.link_age import LinkDelay, VehicleClock
 from offboard.flight.phases import ENDS, Limits, Phase
 from offboard.flight.readiness import Readiness
+from offboard.flight.touchdown import Touchdown
 from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.dialects.base import Dialect, Takeoff
+from offboard.mavlink.events import Landed
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import Vehicle
@@ -48,6 +50,8 @@ class FlightState:
     readiness: Readiness = field(default_factory=Readiness)
     ladder: Ladder = field(default_factory=Ladder)
     contact: GroundContact = field(init=False)
+    takeoff_ned_m: Triple | None = None  # None for a vehicle that was found in the air
+    touchdown: Touchdown | None = None  # of the landing
     dialect: Dialect | None = None  # with the authority, once the vehicle was found
     authority: Authority | None = None
 
@@ -97,6 +101,14 @@ class FlightState:
     @property
     def may_command(self) -> bool:
         return self.authority is not None and self.authority.permits_command(self.now_s)
+
+    def not_landed(self) -> str:
+        """Why the vehicle has not landed; empty if it has."""
+        vehicle = self.vehicle
+        if self.touchdown is None:
+            return "it was not told to land"
+        on_ground = vehicle.landed == "on_ground" and vehicle.age_s(Landed) < DETECTOR_KNOWN_S
+        return self.touchdown.not_landed(on_ground=on_ground)
 
     def telemetry_age_s(self, host_s: float) -> float:
         """Age of the newest telemetry at `host_s`, beyond the least delay of the link."""

@@ -157,14 +157,14 @@ TRANSITIONS: tuple[Row, ...] = (
         Phase.HOLD, "hold_s", Phase.LAND, "the autopilot held for {in_phase_s:.0f} s", ABORTED
     ),
     Row(Phase.LAND, guards.rebooted, Phase.FAILED, f"{_REBOOTED} while landing", ABORTED),
+    Row(Phase.LAND, guards.landed, Phase.DISARMED, _DISARMED),
     Row(
         Phase.LAND,
-        guards.fell,
+        guards.disarmed_elsewhere,
         Phase.FAILED,
-        "disarmed {height_m:.1f} m above the take-off point or after a fall: not landed",
+        "disarmed, but not landed: {not_landed}",
         ABORTED,
     ),
-    Row(Phase.LAND, guards.disarmed, Phase.DISARMED, _DISARMED),
     Row(Phase.LAND, guards.silent_for_long, Phase.FAILED, f"{_SILENT} while landing", ABORTED),
     Row(Phase.LAND, guards.lost, Phase.YIELDED, "{lost}", ABORTED),
     _too_long(

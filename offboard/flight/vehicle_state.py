@@ -50,6 +50,7 @@ class VehicleState:
     results: dict[int, str] = field(default_factory=dict)  # newest, by MAV_CMD number
     mode: str = "unknown"
     other_sender: OtherSender | None = None
+    armed_changed_s: float = 0.0
     resumed_s: float = -math.inf  # vehicle time of the first telemetry after an outage
     now_s: float = 0.0
     heard_s: dict[type, float] = field(default_factory=dict)  # by type of event
@@ -70,6 +71,11 @@ class VehicleState:
     def attitude_age_s(self) -> float:
         """As `position_age_s`, for the attitude."""
         return self._age_s(self.attitude)
+
+    @property
+    def disarmed_s(self) -> float:
+        """Time since it was reported disarmed; 0 while it is armed."""
+        return 0.0 if self.armed else self.now_s - self.armed_changed_s
 
     def age_s(self, *kinds: type) -> float:
         """Time since the newest event of one of these types; infinite if none was heard."""
@@ -107,7 +113,9 @@ class VehicleState:
         if isinstance(event, (LocalPosition, Attitude)):
             self._detect_outage(event.time_s)
         match event:
-            case Heartbeat(mode):
+            case Heartbeat(mode, armed):
+                if armed != self.armed:
+                    self.armed_changed_s = now_s
                 self.heartbeat, self.mode = event, mode
             case ModeReport(mode):
                 self.mode = mode

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Hashable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from offboard.mavlink import framing
@@ -32,6 +32,7 @@ from offboard.mavlink.encode import encode
 from offboard.mavlink.events import (
     Attitude,
     Event,
+    GpsFix,
     LocalPosition,
     OtherSender,
     PeerChanged,
@@ -170,7 +171,8 @@ class Session:
                 # a reply at time 0 would look like a request
                 replies.append(Timesync(max(1, int(now_s * 1e9)), ts1_ns))
             elif self.vehicle is not None:
-                events.append(TimesyncReply(ts1_ns, tc1_ns))
+                wrapped_ns = round(self._time.wrapped_s(tc1_ns / 1e9) * 1e9)
+                events.append(TimesyncReply(ts1_ns, tc1_ns + wrapped_ns))
             return True
         return self._interpret(frame, now_s, events)
 
@@ -230,6 +232,8 @@ class Session:
         if isinstance(event, DropReason):
             return event
         age = Age.FRESH
+        if isinstance(event, (LocalPosition, Attitude, GpsFix)) and event.time_s is not None:
+            event = replace(event, time_s=event.time_s + self._time.wrapped_s(event.time_s))
         if isinstance(event, (LocalPosition, Attitude)):
             age = self._time.check(frame.message_id, event.time_s)
             if age is Age.STALE:

@@ -1,6 +1,7 @@
 """Vehicle time: which time stamps of telemetry are valid, and the seconds that the session counts.
 
-Vehicle time is `time_boot_ms` in seconds. Host time is any monotonic clock, given as an argument.
+Vehicle time is `time_boot_ms` in seconds, continued where its 32 bits begin again at zero, after
+49.7 days. Host time is any monotonic clock, given as an argument.
 """
 
 from __future__ import annotations
@@ -9,6 +10,8 @@ from enum import Enum, auto
 
 _REBOOT_S = 2.0  # a stamp older than the newest by more than this means a reboot, not reordering
 _SILENCE_S = 1.0
+_WRAP_S = 2**32 / 1e3
+_NEAR_S = 600.0  # a stamp this close to the newest, but for the wrap, continues it
 
 
 class Age(Enum):
@@ -29,7 +32,20 @@ class VehicleTime:
         self.newest_s = 0.0
         self._last_s: dict[int, float] = {}
 
+    def wrapped_s(self, time_s: float) -> float:
+        """Seconds to add to a stamp to continue the newest one across the wrap of `time_boot_ms`;
+        0 where it is no continuation, as after a reboot.
+
+        Also for clocks of the vehicle that do not wrap, as in TIMESYNC: puts them on that of the
+        stamps.
+        """
+        if not self._last_s:
+            return 0.0
+        wrapped_s = _WRAP_S * round((self.newest_s - time_s) / _WRAP_S)
+        return wrapped_s if abs(time_s + wrapped_s - self.newest_s) < _NEAR_S else 0.0
+
     def check(self, message_id: int, time_s: float) -> Age:
+        """`time_s`: the stamp, continued by `wrapped_s`."""
         if time_s < self.newest_s - _REBOOT_S:
             self.newest_s = time_s
             self._last_s = {message_id: time_s}

@@ -105,7 +105,10 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
             ("--set", "vehicle.drag_translation_npmps=[0, 0, 1e9]"),
             "vehicle: drag_translation_npmps must be at most 100 per kg of mass",
         ),
-        (("--require", "rmse<1"), "there is no figure 'rmse'; there are rmse_position_m"),
+        (
+            ("--require", "rmse<1"),
+            "there is no figure 'rmse'; there are completed, touchdown_mps, rmse_position_m",
+        ),
         (("--connect", "udpin:127.0.0.1"), "is not understood; use udpin:HOST:PORT"),
         (("--connect", "udpin:127.0.0.1:99999"), "port 99999 is not within 0 .. 65535"),
         (("--connect", "tcp:127.0.0.1:1"), "cannot be opened: Connection refused"),

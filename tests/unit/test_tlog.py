@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from pathlib import Path
 from typing import Any
@@ -34,23 +35,70 @@ def test_columns_are_what_pymavlink_decodes(path: Path, names: str) -> None:
     for name, messages in decoded.items():
         ours = [entry for entry in log.messages if entry.name == name]
         assert len(ours) == len(messages) > 1
+        size = tlog.layout(name).itemsize
+        payloads = b"".join(entry.frame.payload[:size].ljust(size, b"\0") for entry in ours)
         for field in messages[0].get_fieldnames():
             expected = np.array([np.ravel(getattr(message, field)) for message in messages])
-            assert np.array_equal(tlog.columns(name, ours, field), expected, equal_nan=True), field
+            assert np.array_equal(tlog.columns(name, payloads, field), expected, equal_nan=True)
 
 
 def test_no_message_gives_no_row_of_the_right_width() -> None:
-    assert tlog.columns("SET_ATTITUDE_TARGET", [], "time_boot_ms q thrust").shape == (0, 6)
+    assert tlog.columns("SET_ATTITUDE_TARGET", b"", "time_boot_ms q thrust").shape == (0, 6)
 
 
-def test_a_damaged_frame_is_counted_and_left_out(tmp_path: Path) -> None:
-    data = bytearray(PX4.read_bytes())
-    whole = tlog.read(PX4)
-    data[8 + 12] ^= 0x40  # in the payload of the first record
-    (tmp_path / "damaged.tlog").write_bytes(data)
-    damaged = tlog.read(tmp_path / "damaged.tlog")
-    assert (damaged.undecodable, damaged.truncated) == (1, 0)
-    assert damaged.messages == whole.messages[1:]
+def damaged(path: Path, data: bytes) -> tlog.Tlog:
+    path.write_bytes(data)
+    return tlog.read(path)
+
+
+def places(log: tlog.Tlog) -> list[int]:
+    """Where each entry begins; the log ends where the last one does."""
+    return [0, *itertools.accumulate(8 + len(entry.frame.raw) for entry in log.messages)]
+
+
+@pytest.mark.parametrize(
+    ("offset", "byte", "lost"),
+    [
+        (8 + 12, 0x40, 1),  # payload
+        (0, 0x7F, 1),  # time stamp
+        (8, 0x55, 1),  # first byte of the frame
+        (9, 0xFF, 1),  # length: the frame seems to reach into the next entries
+        (9, 0x01, 1),
+    ],
+)
+def test_a_damaged_entry_is_skipped_and_counted(
+    offset: int, byte: int, lost: int, tmp_path: Path
+) -> None:
+    """The first entry, one in the middle, and the last but one."""
+    data, whole = PX4.read_bytes(), tlog.read(PX4)
+    messages, at = whole.messages, places(whole)
+    for number in (0, len(messages) // 2, len(messages) - 2):
+        changed = bytearray(data)
+        changed[at[number] + offset] ^= byte
+        log = damaged(tmp_path / "x.tlog", bytes(changed))
+        assert log.messages == (*messages[:number], *messages[number + lost :])
+        assert (log.damaged, log.first_damage, log.truncated) == (1, at[number], 0)
+        assert log.damage.endswith(f"1 damaged entry was skipped, the first at byte {at[number]}")
+
+
+def test_entries_after_garbage_and_holes_are_read(tmp_path: Path) -> None:
+    """Garbage between entries, a hole that cuts two, and one that cuts the last: 4000 random bytes
+    hold about 30 that could begin a frame."""
+    data, whole = PX4.read_bytes(), tlog.read(PX4)
+    messages, at = whole.messages, places(whole)
+    garbage = np.random.default_rng(3).bytes(4000)
+    parts = data[: at[100]], garbage, data[at[100] : at[200] + 7], data[at[203] + 5 : -7]
+    log = damaged(tmp_path / "x.tlog", b"".join(parts))
+    assert log.messages == (*messages[:200], *messages[204:-1])
+    assert (log.damaged, log.first_damage) == (2, at[100])
+    assert log.truncated == at[-1] - at[-2] - 7
+    assert "2 damaged entries were skipped" in log.damage
+
+
+def test_a_whole_log_is_read_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = tlog.read(PX4).messages
+    monkeypatch.setattr(tlog, "_BLOCK", 301)
+    assert tlog.read(PX4).messages == whole
 
 
 def test_a_story_is_told_in_vehicle_time() -> None:

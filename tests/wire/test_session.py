@@ -356,6 +356,42 @@ def test_a_jump_back_is_a_reboot() -> None:
     assert session.poll(0.0) == ()
 
 
+WRAP_MS = 2**32
+
+
+@pytest.mark.parametrize("turns", [0, 1])
+def test_time_goes_on_where_the_32_bits_of_its_stamp_begin_again(turns: int) -> None:
+    """First heard 30 ms before the wrap. The clock of TIMESYNC is 64 bits wide: it does not wrap,
+    and its replies stay comparable with the stamps, also on a vehicle that has run for 50 days."""
+    vehicle = Sender()
+    session = pinned(vehicle)
+    before = [vehicle.position(WRAP_MS - 30), vehicle.attitude(WRAP_MS - 20)]
+    after = [
+        vehicle.position(10),
+        vehicle.attitude(WRAP_MS - 10),  # late, from before the wrap
+        vehicle.attitude(15),
+        vehicle.position(5),  # older than the one before
+        vehicle.position(20),
+    ]
+    expected_ms = [-30, -20, 10, -10, 15, 20]
+    expected_s = [pytest.approx((WRAP_MS + each) / 1e3, abs=1e-6) for each in expected_ms]
+    assert times(session, *before, *after) == expected_s
+    assert dropped(session, DropReason.STALE) == 1
+    arrived_ms = turns * WRAP_MS + WRAP_MS + 45
+    reply = vehicle.frame(mavlink.MAVLink_timesync_message(arrived_ms * 10**6, 77))
+    (answer,) = session.receive(reply, PEER, 0.0).events
+    assert answer == events.TimesyncReply(77, (WRAP_MS + 45) * 10**6)
+
+
+def test_a_reboot_after_the_wrap_is_a_reboot() -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    times(session, vehicle.position(WRAP_MS - 10), vehicle.position(60_000))
+    reception = session.receive(vehicle.position(500), PEER, 0.0)
+    assert isinstance(reception.events[0], events.Rebooted)
+    assert len(session.receive(vehicle.position(510), PEER, 0.0).events) == 1
+
+
 def test_link_loss_is_counted_from_sequence_numbers() -> None:
     vehicle = Sender()
     session = pinned(vehicle)

@@ -1,0 +1,125 @@
+"""The verdict on a flight, from its log alone: was all of it flown, and what ended it.
+
+A flight is completed if the whole reference was tracked, the vehicle landed, and it was disarmed.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.analysis.events import Event
+from offboard.analysis.history import History
+from offboard.flight.companion import STOPPED
+from offboard.flight.touchdown import Touchdown
+
+Array = NDArray[np.float64]
+
+REFERENCE_OVER = "reference over"
+NO_FLIGHT = "no flight of offboard in this log"
+_ON_GROUND = 1  # MAV_LANDED_STATE
+_CRITICAL = 5  # MAV_STATE
+_LANDING_ENDS = {"disarmed", "failed", "yielded"}
+# what begins the reason of the phase that ended a flight early -> the word for it; any other reason
+# stands for itself
+_CAUSES = (
+    (STOPPED, "operator"),
+    ("no telemetry|no LOCAL_POSITION_NED|no ATTITUDE_QUATERNION", "link"),
+    ("the vehicle left", "pilot"),
+    ("the vehicle restarted", "restart"),
+    ("the vehicle disarmed", "disarmed in flight"),
+    ("the controller failed", "controller"),
+    ("tilt|[0-9.]+ m from the reference", "limit"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """`completed`: 1 or 0, NaN for a log without a flight of `offboard`. `ended_by`: a word or a
+    few. `touchdown_mps`: downward speed before the ground was reached, NaN if it was not."""
+
+    completed: float
+    ended_by: str
+    touchdown_mps: float = math.nan
+
+
+class Landing:
+    """Judges the landing from the samples of a flight, which may come in stretches."""
+
+    def __init__(self) -> None:
+        self._takeoff: Array | None = None
+        self._touchdown: Touchdown | None = None
+        self._done_s = -math.inf
+
+    def add(self, flown: History, until_s: float) -> None:
+        """Evaluate the positions up to `until_s`."""
+        begun = begin_times(flown.phases)
+        position = flown.position[np.argsort(flown.position[:, 0], kind="stable")]
+        if self._takeoff is None and "takeoff" in begun:
+            before = position[position[:, 0] <= begun["takeoff"]]
+            self._takeoff = before[-1, 1:4] if len(before) else None
+        if "land" not in begun:
+            return
+        if self._touchdown is None:
+            self._touchdown = Touchdown(tuple(self._takeoff) if self._takeoff is not None else None)
+        begin_s, self._done_s = max(self._done_s, begun["land"]), until_s
+        rows = position[(position[:, 0] > begin_s) & (position[:, 0] <= until_s)]
+        for row in rows.tolist():
+            self._touchdown.on_position(row[0], (row[1], row[2], row[3]), row[6])
+
+    def judge(self, flown: History) -> tuple[str, float]:
+        """Why it has not landed, empty if it has; and the downward speed at touch-down."""
+        if self._touchdown is None:
+            return "not landed", math.nan
+        since = flown.landed[flown.landed[:, 0] >= begin_times(flown.phases)["land"]]
+        on_ground = bool(len(since)) and bool(since[-1, 1] == _ON_GROUND)
+        return self._touchdown.not_landed(on_ground=on_ground), self._touchdown.speed_mps
+
+
+def begin_times(phases: tuple[Event, ...]) -> dict[str, float]:
+    """Vehicle time at which each phase began."""
+    return {event.what.partition(":")[0]: event.time_s for event in phases}
+
+
+def judge(flown: History, landing: Landing, skipped_s: float) -> Verdict:
+    """The verdict on a flight. `flown`: its last stretch. `skipped_s`: time of the reference for
+    which nothing was decided."""
+    if not flown.phases:
+        return Verdict(math.nan, NO_FLIGHT)
+    why = _ended_early(flown)
+    not_landed, touchdown_mps = landing.judge(flown)
+    if why == REFERENCE_OVER:
+        if skipped_s > 0.0:
+            why = f"{skipped_s:.1f} s of the reference were not tracked"
+        elif not_landed:
+            why = not_landed
+        elif not len(flown.heartbeat) or flown.heartbeat[-1, 1]:
+            why = "not disarmed"
+    return Verdict(float(why == REFERENCE_OVER), why, touchdown_mps)
+
+
+def _ended_early(flown: History) -> str:
+    """What ended the flight, by its phases; REFERENCE_OVER if they were all gone through."""
+    names = [event.what.partition(":")[0] for event in flown.phases]
+    for event, name, before in zip(flown.phases[1:], names[1:], names, strict=False):
+        regular = (before, name) in (("hover", "land"), ("land", "disarmed"))
+        if name in {"land", "stand down", *_LANDING_ENDS} and not regular:
+            cause = _cause(event.what.partition(": ")[2])
+            return "failsafe" if cause == "pilot" and _critical(flown, event.time_s) else cause
+    if names[-1] not in _LANDING_ENDS:
+        return f"the log ends in the phase {names[-1]}"
+    return REFERENCE_OVER if "track" in names else names[-1]
+
+
+def _critical(flown: History, time_s: float) -> bool:
+    """Whether the newest HEARTBEAT showed a failsafe or an emergency."""
+    before = flown.heartbeat[flown.heartbeat[:, 0] <= time_s]
+    return bool(len(before)) and bool(before[-1, 2] >= _CRITICAL)
+
+
+def _cause(reason: str) -> str:
+    return next((word for begin, word in _CAUSES if re.match(begin, reason)), reason)

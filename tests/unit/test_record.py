@@ -1,0 +1,63 @@
+"""The record of a tick: it says what was sent, and logs of older versions stay readable."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+
+from offboard.control.base import Certificate, Decision
+from offboard.flight.record import LAYOUTS, Refusal, TickRecord, records_of
+from offboard.model.command import Command
+from offboard.model.predicted_state import PredictedState
+
+COMMAND = Command(9.0, (0.6, 0.0, 0.8), 0.3)
+DECISION = Decision(COMMAND, Certificate(2.0, 1.5, 0.25, 0.1, 40, True, True, 3.0))
+CERTIFIED = ("cost", "optimal_cost", "gap", "spread", "iterations", "cut_short", "at_bound",
+             "seed_cost")  # fmt: skip
+STATE = PredictedState(
+    time_s=5.0,
+    position_ned_m=np.zeros(3),
+    velocity_ned_mps=np.zeros(3),
+    thrust_direction_ned=np.array([0.0, 0.0, 1.0]),
+    thrust_direction_rate_ned_ps=np.zeros(3),
+    course_rad=0.0,
+    course_rate_radps=0.0,
+    thrust_mps2=9.81,
+    disturbance_ned_mps2=np.zeros(3),
+    rates_frd_radps=np.zeros(3),
+)
+
+
+def record(sent: Command | None, **more: float) -> TickRecord:
+    return TickRecord.of(
+        phase=8, decision=DECISION, sent=sent, state=STATE, solve_time_s=0.001, lateness_s=0.002,
+        missed_ticks=0, hover_thrust=0.5, track_time_s=1.0, **more,
+    )  # fmt: skip
+
+
+def certificate(of: TickRecord) -> list[float]:
+    return [getattr(of, name) for name in CERTIFIED]
+
+
+def test_the_certificate_is_of_what_was_sent() -> None:
+    as_decided = record(COMMAND)
+    assert certificate(as_decided) == [2.0, 1.5, 0.25, 0.1, 40.0, 1.0, 1.0, 3.0]
+    limited = record(replace(COMMAND, thrust_mps2=8.0))
+    assert limited.thrust_mps2 == 8.0
+    assert np.isnan(certificate(limited)).all()
+    withheld = record(None, refused=Refusal.STALE | Refusal.LATE)
+    assert np.isnan([*certificate(withheld), withheld.thrust_mps2, withheld.course_rad]).all()
+    assert withheld.refused == 3.0
+
+
+def test_a_record_of_an_older_log_has_no_age() -> None:
+    """The wire fills what a record does not use with zeros."""
+    written = record(COMMAND, age_s=0.03, refused=Refusal.LATE, strangers=4).data()
+    rows = [(*written[:count], *(0.0,) * (58 - count)) for count in LAYOUTS.values()]
+    old, new = records_of(np.array(rows), np.array(list(LAYOUTS)))
+    assert (old["seed_cost"], new["seed_cost"], old["phase"]) == (3.0, 3.0, 8.0)
+    assert math.isnan(old["age_s"])
+    assert (old["refused"], old["strangers"]) == (0.0, 0.0)
+    assert (new["age_s"], new["refused"], new["strangers"]) == (0.03, 1.0, 4.0)
