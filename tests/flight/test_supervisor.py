@@ -132,13 +132,6 @@ def test_a_vehicle_that_is_not_ours_or_on_the_ground_is_left_alone(guard: Guard,
     assert rig.heard() == []
 
 
-def test_after_an_orderly_end_it_does_nothing(rig: Rig) -> None:
-    rig.beat(OURS)
-    rig.supervisor.dismiss()
-    rig.await_end()
-    assert rig.heard() == []
-
-
 def test_signals_do_not_end_it(rig: Rig) -> None:
     """A service manager signals all processes of a service."""
     for number in (signal.SIGTERM, signal.SIGINT, signal.SIGHUP):
