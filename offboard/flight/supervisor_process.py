@@ -29,7 +29,7 @@ from offboard.mavlink.outgoing import Heartbeat, Outgoing, Timesync
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.texts import chunks
 
-SILENT_S = 0.95  # without a beat
+SILENT_S = 0.9  # without a beat; with two polls and a busy machine less than 1 s
 POLL_S = 0.02
 PAUSE_MAX_S = 0.1  # of a turn that counts as the controller's silence: the rest was a pause of ours
 CLOSE_S = 2.0

@@ -115,7 +115,7 @@ def test_it_takes_over_when_the_beats_stop_and_says_so_first(rig: Rig) -> None:
     assert not rig.supervisor.has_taken_over()
     assert rig.next_command().command == 176
     assert rig.supervisor.has_taken_over()
-    assert rig.supervisor.said[0] == "taking over: the controller has not answered for 0.95 s"
+    assert rig.supervisor.said[0] == "taking over: the controller has not answered for 0.9 s"
     rig.disarm()
     while not rig.supervisor.await_end(0.05):
         pass
