@@ -177,8 +177,6 @@ class Loop:
 
     def _outcome(self) -> Outcome:
         """The result; closes the log, so that all that it lost is known."""
-        if self._supervisor and self._companion.has_ended():
-            self._supervisor.dismiss()
         self._log.close()
         outcome = self._ended_early or self._companion.outcome or self._interrupted()
         code, sentence = outcome.exit_code, outcome.sentence

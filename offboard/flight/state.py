@@ -27,6 +27,7 @@ from offboard.model.vehicle import Vehicle
 Triple = tuple[float, float, float]
 COMMANDS_KEPT = 7  # as long as an attitude may take to follow
 PREDICTIONS_KEPT = 8
+POSITION_KNOWN_S = 1.0  # for the verdict of a landing
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,6 +108,8 @@ class FlightState:
         vehicle = self.vehicle
         if self.touchdown is None:
             return "it was not told to land"
+        if not vehicle.position_age_s < POSITION_KNOWN_S:
+            return "no LOCAL_POSITION_NED shows it"
         on_ground = vehicle.landed == "on_ground" and vehicle.age_s(Landed) < DETECTOR_KNOWN_S
         return self.touchdown.not_landed(on_ground=on_ground)
 

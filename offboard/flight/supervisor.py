@@ -24,8 +24,8 @@ from offboard.flight.link import Link
 from offboard.mavlink.events import VehicleFound
 
 START_S = 20.0  # on a busy machine
-DISMISS_S = 1.0
-READY, END = "ready", "end"
+END_S = 1.0
+READY = "ready"
 
 
 class SupervisorError(UserError):
@@ -127,19 +127,13 @@ class Supervisor:
         self._receive()
         return self._process.poll() is not None
 
-    def dismiss(self) -> None:
-        """The flight has ended in order: the supervisor must not take over."""
-        with suppress(OSError):
-            self._channel.settimeout(DISMISS_S)
-            self._channel.sendall(json.dumps(END).encode() + b"\n")
-
     def __exit__(
         self,
         kind: type[BaseException] | None,
         value: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close the channel. Without `dismiss` the process takes over now, if it must."""
+        """Close the channel: the process ends, or takes over if the last guard says so."""
         self._channel.close()
         with suppress(subprocess.TimeoutExpired):  # it holds the link's port
-            self._process.wait(DISMISS_S)
+            self._process.wait(END_S)

@@ -22,14 +22,14 @@ from offboard.flight.link import Link
 from offboard.flight.log import append, entry
 from offboard.flight.recovery import Recovery
 from offboard.flight.stream_link import StreamLink
-from offboard.flight.supervisor import END, READY
+from offboard.flight.supervisor import READY
 from offboard.flight.udp_link import UdpLink
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat, Outgoing
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.texts import chunks
 
-SILENT_S = 0.95  # without a beat
+SILENT_S = 0.9  # without a beat; with two polls and a busy machine less than 1 s
 POLL_S = 0.02
 PAUSE_MAX_S = 0.1  # of a turn that counts as the controller's silence: the rest was a pause of ours
 CLOSE_S = 2.0
@@ -49,7 +49,6 @@ class Watch:
         self.newest: dict[str, Any] = {}
         self.descriptors: list[int] = []  # of the link, then of the log
         self.ended = False
-        self.dismissed = False
 
     def turn(self, elapsed_s: float) -> str:
         """Read what has arrived. Why to take over; empty if there is no reason."""
@@ -57,7 +56,7 @@ class Watch:
         with suppress(BlockingIOError, ConnectionResetError):
             while not self.ended:
                 self._read()
-        if self.dismissed or not (self.newest.get("ours") and self.newest.get("flying")):
+        if not (self.newest.get("ours") and self.newest.get("flying")):
             return ""
         if self.ended:
             return DIED
@@ -80,9 +79,7 @@ class Watch:
         except ValueError:  # only a part of it did fit into the buffer
             return
         self._silent_s = 0.0
-        self.dismissed |= message == END
-        if isinstance(message, dict):
-            self.newest = message
+        self.newest = message
 
 
 class Rescue:
@@ -175,14 +172,14 @@ def _link(descriptors: list[int], stream: str) -> Link:
 
 
 def main() -> None:
-    """Watch until the controller ends, in order or not."""
+    """Watch until the controller ends, and take its place if the vehicle flies for it."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # whoever stops the controller means it, not us
     channel = socket.socket(fileno=os.dup(sys.stdin.fileno()))
     watch = Watch(channel)
     channel.send(json.dumps(READY).encode() + b"\n")
     reason, before_s = "", clock.monotonic_s()
-    while not (reason or watch.ended or watch.dismissed):
+    while not (reason or watch.ended):
         select.select([], [], [], POLL_S)
         now_s = clock.monotonic_s()
         reason, before_s = watch.turn(now_s - before_s), now_s

@@ -59,7 +59,7 @@ def test_a_swapped_lean_is_stopped(signs: Triple, monkeypatch: pytest.MonkeyPatc
 
     outcome = swapped(monkeypatch, sign).fly()
     assert outcome.exit_code == 4
-    assert "m from the reference (limit 5.0 m)" in outcome.sentence
+    assert "deg away from every recent command" in outcome.sentence
 
 
 def test_a_swapped_course_is_scored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

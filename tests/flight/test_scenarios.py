@@ -446,8 +446,8 @@ ROWS = (
         "position stops",
         in_track(downlink(without(POSITION))),
         4,
-        "no LOCAL_POSITION_NED for 0.",
-        Phase.DISARMED,
+        "disarmed, but not landed: no LOCAL_POSITION_NED shows it",
+        Phase.FAILED,
         soft_landing,
     ),
     Row(

@@ -107,9 +107,7 @@ def test_other_senders_are_counted_and_neither_delay_nor_displace_the_vehicle(
     stranger.send(*[bytes(1000)] * 20_000)  # ten times the buffer
     vehicle.send(b"v3")
     time.sleep(LOOK_EVERY_S)
-    heard = link.receive(1.0)
-    while data(heard)[-1:] != [b"v3"]:
-        heard += link.receive(1.0)
+    heard = [*link.receive(1.0), *link.receive(0.1)]
     assert data(heard) == [b"v1", b"v2", b"v3"]
     assert [chunk.arrived_s for chunk in heard] == sorted(chunk.arrived_s for chunk in heard)
     looks = 0

@@ -22,7 +22,7 @@ from offboard.analysis import history, tlog
 from offboard.analysis.history import History
 from offboard.analysis.score import Score, Scoring, score
 from offboard.analysis.trial import judged
-from offboard.cli import app
+from offboard.cli.commands import app
 from offboard.flight.companion import Outcome
 from offboard.flight.log import FlightLog
 from offboard.flight.online_identification import IdentifySettings

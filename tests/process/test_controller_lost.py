@@ -169,7 +169,7 @@ def test_a_stopped_controller_that_continues_sends_nothing(
     flight.send_signal(signal.SIGCONT)
     _, said = flight.communicate(timeout=LONG_S)
     assert flight.returncode == 4
-    assert said.startswith("supervisor: taking over: the controller has not answered for 0.95 s; ")
+    assert said.startswith("supervisor: taking over: the controller has not answered for 0.9 s; ")
     assert "; land requested; the vehicle is disarmed" in said
     assert "Traceback" not in said
     log = tlog.read(path)
