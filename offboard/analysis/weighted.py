@@ -58,8 +58,14 @@ class Weighted:
         """The value that is not exceeded for `percent` of the time."""
         if not self._sums[0] > 0.0:
             return math.nan
-        values, weights = np.concatenate(self._values), np.concatenate(self._weights)
-        order = np.argsort(values)
-        until = np.cumsum(weights[order], dtype=np.float64)
-        place = np.searchsorted(until, percent / 100.0 * until[-1])
-        return float(values[order[min(place, len(order) - 1)]])
+        # one array instead of the portions, which may take 20 MB
+        self._values, self._weights = (
+            [np.concatenate(portions)] for portions in (self._values, self._weights)
+        )
+        values, weights = self._values[0], self._weights[0]
+        low, high = float(values.min()), float(values.max())
+        while high - low > 1e-6 * abs(high) + 1e-12:  # sorting would take four times the memory
+            middle = 0.5 * (low + high)
+            below = weights[values <= middle].sum(dtype=np.float64)
+            low, high = (low, middle) if below >= percent / 100 * self._sums[0] else (middle, high)
+        return high
