@@ -122,7 +122,7 @@ def simulate(
     from offboard.documents.reading import DocumentError
     from offboard.flight.clock import unix_us
     from simulator import config
-    from simulator.link.links import LinkError, open_link, shifted
+    from simulator.link.links import LinkError, open_beside, open_link, shifted
     from simulator.link.recorder import Recorder
 
     # the local ports of PX4 SITL only by default: a real PX4 beside us may use them
@@ -131,6 +131,7 @@ def simulate(
     numbers = range(instance, instance + instances)
     try:
         flown = config.scenario(scenario or personality.scenario)
+        config.check_for(flown, personality, lockstep=lockstep)
         flyer = config.vehicle(vehicle or personality.vehicle)
         companions = [
             open_link(
@@ -162,9 +163,10 @@ def simulate(
     warm_up(Instance(personality, flyer, flown.conditions, seed, lockstep=True))
 
     epoch_us = VIRTUAL_EPOCH_US if lockstep else unix_us()
-    endpoints = [
-        Endpoint(
-            Instance(
+    endpoints = []
+    try:
+        for number, companion, ground in zip(numbers, companions, grounds, strict=True):
+            vehicle_flown = Instance(
                 personality,
                 flyer,
                 flown.conditions,
@@ -173,18 +175,15 @@ def simulate(
                 lockstep=lockstep,
                 ground_link=ground is not None,
                 epoch_us=epoch_us,
+                parameters=parameters,
                 faults=flown.faults,
+                start=flown.start,
                 strict=strict,
-            ),
-            companion,
-            ground,
-            recorder,
-        )
-        for number, companion, ground in zip(numbers, companions, grounds, strict=True)
-    ]
-    for endpoint in endpoints:
-        for name, value in parameters.items():
-            endpoint.instance.autopilot.parameters.set(name, value)
+            )
+            strangers = [open_beside(companion) for _ in vehicle_flown.strangers]
+            endpoints.append(Endpoint(vehicle_flown, companion, ground, recorder, strangers))
+    except (DocumentError, LinkError) as error:
+        _refuse(str(error))
     _warn_if_it_cannot_land(endpoints[0].instance, flyer.hover_thrust)
     purpose = "waiting at" if connect.startswith("udpin:") else "sending to"
     for number in numbers:

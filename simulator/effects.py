@@ -1,0 +1,322 @@
+"""Effects of faults: what each does to the vehicle when it begins, at every step, and at its end.
+
+What a fault is, is in `simulator.faults`; when it begins and ends, in `simulator.injection`. This
+module knows the whole vehicle.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from random import Random
+from typing import Any, Protocol
+
+from simulator import faults
+from simulator.autopilot.autopilot import Autopilot
+from simulator.autopilot.commander import Request
+from simulator.faults import Datagrams, LandedState, Refusable
+from simulator.firmware.values import critical
+from simulator.link.impairment import Channel
+from simulator.mavlink.codec import frame, layout
+from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT
+from simulator.mavlink.server import Server
+from simulator.mavlink.view import Stuck, View
+from simulator.start import climb
+from simulator.steps import STEP_S
+
+_REFUSED_EVENTS = {
+    Refusable.ARM: ("arm", "force arm"),
+    Refusable.OFFBOARD: ("offboard",),
+    Refusable.TAKEOFF: ("takeoff",),
+}
+_NO_THRUST = 1e-9  # a factor that can be undone
+_DATAGRAMS_MAX = 2000  # of a stranger, that wait
+_HEARTBEAT_HZ = 1.0
+_QUADROTOR, _ONBOARD_CONTROLLER, _NO_AUTOPILOT = 2, 18, 8  # MAV_TYPE, MAV_AUTOPILOT
+_STANDBY, _ACTIVE, _MAVLINK = 3, 4, 3  # MAV_STATE; protocol version
+_ATTITUDE_AND_THRUST = 7  # type_mask
+_REFUSED_TITLES = {
+    Refusable.ARM: "Arming denied",
+    Refusable.OFFBOARD: "Switching to Offboard denied",
+    Refusable.TAKEOFF: "Takeoff denied",
+}
+
+
+class Vehicle(Protocol):
+    """What faults act on."""
+
+    autopilot: Autopilot
+    view: View
+    companion: Server
+
+    def reboot(self, silent_s: float) -> None: ...
+
+
+@dataclass(slots=True)
+class Running:
+    """One fault of the scenario and its progress."""
+
+    fault: Any
+    channels: list[Channel]
+    random: Random
+    datagrams: list[bytes] = field(default_factory=list)  # of a stranger, to be sent
+    begins_s: float | None = None  # None: the moment it counts from has not come
+    begun: bool = False
+    over: bool = False
+    memory: Any = None  # what a later step or its end needs
+
+
+def nothing(vehicle: Vehicle, running: Running) -> None:
+    pass
+
+
+def _impair_link(vehicle: Vehicle, running: Running) -> None:
+    for channel in running.channels:
+        channel.on = True
+
+
+def _restore_link(vehicle: Vehicle, running: Running) -> None:
+    for channel in running.channels:
+        channel.on = False
+
+
+def _jump(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.plant.reset_estimate(running.fault.offset_ned_m)
+
+
+def _lose_fix(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.state.gps_healthy = False
+    running.memory = 0.0
+
+
+def _drift(vehicle: Vehicle, running: Running) -> None:
+    step_m = running.fault.drift_mps * STEP_S * 0.5**0.5
+    running.memory += step_m
+    vehicle.autopilot.plant.drift_estimate((step_m, step_m, 0.0))
+
+
+def _restore_fix(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.state.gps_healthy = True
+    if running.memory:
+        vehicle.autopilot.plant.reset_estimate((-running.memory, -running.memory, 0.0))
+
+
+def _stop_message(vehicle: Vehicle, running: Running) -> None:
+    vehicle.view.silent[running.fault.message] = running.fault.every or 0
+
+
+def _resume_message(vehicle: Vehicle, running: Running) -> None:
+    vehicle.view.silent.pop(running.fault.message, None)
+
+
+def _freeze_message(vehicle: Vehicle, running: Running) -> None:
+    vehicle.view.stuck[running.fault.message] = Stuck(running.fault.stamp_runs)
+
+
+def _unfreeze_message(vehicle: Vehicle, running: Running) -> None:
+    vehicle.view.stuck.pop(running.fault.message, None)
+
+
+def _offset_velocity(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.state.velocity_error_ned_mps = running.fault.offset_ned_mps
+
+
+def _restore_velocity(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.state.velocity_error_ned_mps = (0.0, 0.0, 0.0)
+
+
+def _report_wrongly(vehicle: Vehicle, running: Running) -> None:
+    on_ground = running.fault.reports is LandedState.ON_GROUND
+    vehicle.view.wrong_landed_state = 1 if on_ground else 2
+
+
+def _report_rightly(vehicle: Vehicle, running: Running) -> None:
+    vehicle.view.wrong_landed_state = None
+
+
+def _detect_no_landing(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.pilot.detector.reset()
+
+
+def _cut_motors(vehicle: Vehicle, running: Running) -> None:
+    plant = vehicle.autopilot.plant
+    if running.memory is None and plant.height_m <= running.fault.below_m:
+        running.memory = _NO_THRUST
+        plant.scale_thrust(_NO_THRUST)
+
+
+def _restart_motors(vehicle: Vehicle, running: Running) -> None:
+    if running.memory is not None:
+        _restore_thrust(vehicle, running)
+
+
+def _weaken_motor(vehicle: Vehicle, running: Running) -> None:
+    running.memory = (3.0 + running.fault.motor_scale) / 4.0
+    vehicle.autopilot.plant.scale_thrust(running.memory)
+
+
+def _change_thrust(vehicle: Vehicle, running: Running) -> None:
+    running.memory = running.fault.thrust_scale
+    vehicle.autopilot.plant.scale_thrust(running.memory)
+
+
+def _restore_thrust(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.plant.scale_thrust(1.0 / running.memory)
+
+
+def _change_mass(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.plant.scale_mass(running.fault.mass_scale)
+
+
+def _restore_mass(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.plant.scale_mass(1.0 / running.fault.mass_scale)
+
+
+def _drop_battery(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.plant.set_battery(running.fault.remaining)
+
+
+def _reboot(vehicle: Vehicle, running: Running) -> None:
+    vehicle.reboot(running.fault.for_s)
+
+
+def _jump_clock(vehicle: Vehicle, running: Running) -> None:
+    vehicle.view.clock_offset_us += round(running.fault.jump_s * 1e6)
+
+
+def _jump_clock_back(vehicle: Vehicle, running: Running) -> None:
+    vehicle.view.clock_offset_us -= round(running.fault.jump_s * 1e6)
+
+
+def _refuse(vehicle: Vehicle, running: Running) -> None:
+    of = running.fault.of
+    text = critical(f"{_REFUSED_TITLES[of]}: {running.fault.text}")
+    for event in _REFUSED_EVENTS[of]:
+        vehicle.autopilot.commander.refused[event] = text
+
+
+def _allow(vehicle: Vehicle, running: Running) -> None:
+    for event in _REFUSED_EVENTS[running.fault.of]:
+        vehicle.autopilot.commander.refused.pop(event, None)
+
+
+def _take_over(vehicle: Vehicle, running: Running) -> None:
+    """Switch as by command, and where no command may, as to a mode that needs sticks."""
+    autopilot = vehicle.autopilot
+    mode = autopilot.firmware.mode_named(running.fault.mode or autopilot.firmware.hold_mode)
+    assert mode is not None, "simulator.config checks it"
+    running.memory = autopilot.commander.mode.name
+    autopilot.handle("mode", Request(mode.name))
+    if autopilot.commander.mode is not mode:
+        autopilot.commander.switch(mode.name)
+
+
+def _hand_back(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.handle("mode", Request(running.memory))
+
+
+def _disarm(vehicle: Vehicle, running: Running) -> None:
+    vehicle.autopilot.handle("force disarm")
+
+
+def _climb(vehicle: Vehicle, running: Running) -> None:
+    climb(vehicle.autopilot, running.fault.height_m)
+
+
+def _start_count(vehicle: Vehicle, running: Running) -> None:
+    running.memory = -1
+
+
+def _due(step: int, rate_hz: float) -> int:
+    """How many messages of this rate are due in a step, counted from 0; the first at once."""
+    per_step = rate_hz * STEP_S
+    return math.floor(step * per_step + 1e-9) - math.floor((step - 1) * per_step + 1e-9)
+
+
+def _frame(running: Running, name: str, *values: object, system: int) -> bytes:
+    """A message of another sender, numbered by the step."""
+    message = layout(name)
+    sender = (system, running.fault.component)
+    return frame(running.memory & 0xFF, *sender, message, message.pack(values))
+
+
+def _begin_sending(vehicle: Vehicle, running: Running) -> None:
+    running.memory = -1
+    fault = running.fault
+    if fault.command is not None:
+        params = (*fault.params, *(0.0,) * (7 - len(fault.params)))
+        values = (vehicle.view.system, MAV_COMP_ID_AUTOPILOT, fault.command, 0, *params)
+        vehicle.companion.receive(_frame(running, "COMMAND_LONG", *values, system=fault.system))
+
+
+def _send_setpoints(vehicle: Vehicle, running: Running) -> None:
+    running.memory += 1
+    fault = running.fault
+    target = (0, vehicle.view.system, MAV_COMP_ID_AUTOPILOT, _ATTITUDE_AND_THRUST)
+    values = (*target, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, fault.thrust, (0.0, 0.0, 0.0))
+    for _ in range(_due(running.memory, fault.setpoint_rate_hz)):
+        sent = _frame(running, "SET_ATTITUDE_TARGET", *values, system=fault.system)
+        vehicle.companion.receive(sent)
+    own = (_ONBOARD_CONTROLLER, _NO_AUTOPILOT, 0, 0, _ACTIVE, _MAVLINK)
+    for _ in range(_due(running.memory, _HEARTBEAT_HZ)):
+        heartbeat = _frame(running, "HEARTBEAT", *own, system=fault.system)
+        vehicle.companion.outbox.forward(heartbeat)
+
+
+def _autopilot_heartbeat(vehicle: Vehicle, running: Running, system: int) -> bytes:
+    """HEARTBEAT of an autopilot like the vehicle's, disarmed and in its first mode."""
+    firmware = vehicle.autopilot.firmware
+    mode = firmware.modes[firmware.boot_mode]
+    state = (mode.base_mode, mode.custom_mode, _STANDBY, _MAVLINK)
+    values = (_QUADROTOR, firmware.mav_autopilot, *state)
+    return _frame(running, "HEARTBEAT", *values, system=system)
+
+
+def _send_heartbeats(vehicle: Vehicle, running: Running) -> None:
+    running.memory += 1
+    for _ in range(_due(running.memory, running.fault.rate_hz)):
+        heartbeat = _autopilot_heartbeat(vehicle, running, running.fault.system)
+        vehicle.companion.outbox.forward(heartbeat)
+
+
+def _send_strange_datagrams(vehicle: Vehicle, running: Running) -> None:
+    """What nobody fetches is limited."""
+    running.memory += 1
+    fault = running.fault
+    for _ in range(_due(running.memory, fault.rate_hz)):
+        if fault.sends is Datagrams.NOISE:
+            running.datagrams.append(running.random.randbytes(fault.size_bytes))
+        else:
+            system = fault.system or vehicle.view.system
+            running.datagrams.append(_autopilot_heartbeat(vehicle, running, system))
+    del running.datagrams[:-_DATAGRAMS_MAX]
+
+
+Effect = Callable[[Vehicle, Running], None]
+
+# By fault: what it does when it begins, at every step, and when it ends.
+EFFECTS: dict[type, tuple[Effect, Effect, Effect]] = {
+    faults.LinkFault: (_impair_link, nothing, _restore_link),
+    faults.EstimatorJump: (_jump, nothing, nothing),
+    faults.GpsLoss: (_lose_fix, _drift, _restore_fix),
+    faults.SilentMessage: (_stop_message, nothing, _resume_message),
+    faults.StuckMessage: (_freeze_message, nothing, _unfreeze_message),
+    faults.VelocityError: (_offset_velocity, nothing, _restore_velocity),
+    faults.WrongLandedState: (_report_wrongly, nothing, _report_rightly),
+    faults.BlindLandDetector: (nothing, _detect_no_landing, nothing),
+    faults.MotorsCut: (nothing, _cut_motors, _restart_motors),
+    faults.WeakMotor: (_weaken_motor, nothing, _restore_thrust),
+    faults.ThrustChange: (_change_thrust, nothing, _restore_thrust),
+    faults.MassChange: (_change_mass, nothing, _restore_mass),
+    faults.BatteryDrop: (_drop_battery, nothing, nothing),
+    faults.Reboot: (_reboot, nothing, nothing),
+    faults.ClockJump: (_jump_clock, nothing, _jump_clock_back),
+    faults.Refusal: (_refuse, nothing, _allow),
+    faults.PilotTakesOver: (_take_over, nothing, _hand_back),
+    faults.PilotDisarms: (_disarm, nothing, nothing),
+    faults.PilotTakesOff: (_climb, nothing, nothing),
+    faults.SecondSender: (_begin_sending, _send_setpoints, nothing),
+    faults.SecondVehicle: (_start_count, _send_heartbeats, nothing),
+    faults.Stranger: (_start_count, _send_strange_datagrams, nothing),
+}
