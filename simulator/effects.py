@@ -6,7 +6,6 @@ module knows the whole vehicle.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from random import Random
@@ -18,10 +17,9 @@ from simulator.autopilot.commander import Request
 from simulator.faults import Datagrams, LandedState, Refusable
 from simulator.firmware.values import critical
 from simulator.link.impairment import Channel
-from simulator.mavlink.codec import frame, layout
-from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT
 from simulator.mavlink.server import Server
 from simulator.mavlink.view import Stuck, View
+from simulator.sender import Sender
 from simulator.start import climb
 from simulator.steps import STEP_S
 
@@ -33,9 +31,6 @@ _REFUSED_EVENTS = {
 _NO_THRUST = 1e-9  # a factor that can be undone
 _DATAGRAMS_MAX = 2000  # of a stranger, that wait
 _HEARTBEAT_HZ = 1.0
-_QUADROTOR, _ONBOARD_CONTROLLER, _NO_AUTOPILOT = 2, 18, 8  # MAV_TYPE, MAV_AUTOPILOT
-_STANDBY, _ACTIVE, _MAVLINK = 3, 4, 3  # MAV_STATE; protocol version
-_ATTITUDE_AND_THRUST = 7  # type_mask
 _REFUSED_TITLES = {
     Refusable.ARM: "Arming denied",
     Refusable.OFFBOARD: "Switching to Offboard denied",
@@ -224,72 +219,45 @@ def _climb(vehicle: Vehicle, running: Running) -> None:
     climb(vehicle.autopilot, running.fault.height_m)
 
 
-def _start_count(vehicle: Vehicle, running: Running) -> None:
-    running.memory = -1
-
-
-def _due(step: int, rate_hz: float) -> int:
-    """How many messages of this rate are due in a step, counted from 0; the first at once."""
-    per_step = rate_hz * STEP_S
-    return math.floor(step * per_step + 1e-9) - math.floor((step - 1) * per_step + 1e-9)
-
-
-def _frame(running: Running, name: str, *values: object, system: int) -> bytes:
-    """A message of another sender, numbered by the step."""
-    message = layout(name)
-    sender = (system, running.fault.component)
-    return frame(running.memory & 0xFF, *sender, message, message.pack(values))
-
-
-def _begin_sending(vehicle: Vehicle, running: Running) -> None:
-    running.memory = -1
+def _add_sender(vehicle: Vehicle, running: Running) -> None:
     fault = running.fault
+    running.memory = Sender(fault.system or vehicle.view.system, fault.component)
+
+
+def _add_companion(vehicle: Vehicle, running: Running) -> None:
+    _add_sender(vehicle, running)
+    fault, target = running.fault, vehicle.view.system
     if fault.command is not None:
-        params = (*fault.params, *(0.0,) * (7 - len(fault.params)))
-        values = (vehicle.view.system, MAV_COMP_ID_AUTOPILOT, fault.command, 0, *params)
-        vehicle.companion.receive(_frame(running, "COMMAND_LONG", *values, system=fault.system))
+        command = running.memory.command(target, fault.command, fault.params)
+        vehicle.companion.receive(command)
 
 
 def _send_setpoints(vehicle: Vehicle, running: Running) -> None:
-    running.memory += 1
-    fault = running.fault
-    target = (0, vehicle.view.system, MAV_COMP_ID_AUTOPILOT, _ATTITUDE_AND_THRUST)
-    values = (*target, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, fault.thrust, (0.0, 0.0, 0.0))
-    for _ in range(_due(running.memory, fault.setpoint_rate_hz)):
-        sent = _frame(running, "SET_ATTITUDE_TARGET", *values, system=fault.system)
-        vehicle.companion.receive(sent)
-    own = (_ONBOARD_CONTROLLER, _NO_AUTOPILOT, 0, 0, _ACTIVE, _MAVLINK)
-    for _ in range(_due(running.memory, _HEARTBEAT_HZ)):
-        heartbeat = _frame(running, "HEARTBEAT", *own, system=fault.system)
-        vehicle.companion.outbox.forward(heartbeat)
-
-
-def _autopilot_heartbeat(vehicle: Vehicle, running: Running, system: int) -> bytes:
-    """HEARTBEAT of an autopilot like the vehicle's, disarmed and in its first mode."""
-    firmware = vehicle.autopilot.firmware
-    mode = firmware.modes[firmware.boot_mode]
-    state = (mode.base_mode, mode.custom_mode, _STANDBY, _MAVLINK)
-    values = (_QUADROTOR, firmware.mav_autopilot, *state)
-    return _frame(running, "HEARTBEAT", *values, system=system)
+    fault, sender = running.fault, running.memory
+    sender.step += 1
+    for _ in sender.due(fault.setpoint_rate_hz):
+        vehicle.companion.receive(sender.level_setpoint(vehicle.view.system, fault.thrust))
+    for _ in sender.due(_HEARTBEAT_HZ):
+        vehicle.companion.outbox.forward(sender.companion_heartbeat())
 
 
 def _send_heartbeats(vehicle: Vehicle, running: Running) -> None:
-    running.memory += 1
-    for _ in range(_due(running.memory, running.fault.rate_hz)):
-        heartbeat = _autopilot_heartbeat(vehicle, running, running.fault.system)
+    sender = running.memory
+    sender.step += 1
+    for _ in sender.due(running.fault.rate_hz):
+        heartbeat = sender.autopilot_heartbeat(vehicle.autopilot.firmware)
         vehicle.companion.outbox.forward(heartbeat)
 
 
 def _send_strange_datagrams(vehicle: Vehicle, running: Running) -> None:
-    """What nobody fetches is limited."""
-    running.memory += 1
-    fault = running.fault
-    for _ in range(_due(running.memory, fault.rate_hz)):
+    """Datagrams that nobody fetches are limited in number."""
+    fault, sender = running.fault, running.memory
+    sender.step += 1
+    for _ in sender.due(fault.rate_hz):
         if fault.sends is Datagrams.NOISE:
             running.datagrams.append(running.random.randbytes(fault.size_bytes))
         else:
-            system = fault.system or vehicle.view.system
-            running.datagrams.append(_autopilot_heartbeat(vehicle, running, system))
+            running.datagrams.append(sender.autopilot_heartbeat(vehicle.autopilot.firmware))
     del running.datagrams[:-_DATAGRAMS_MAX]
 
 
@@ -316,7 +284,7 @@ EFFECTS: dict[type, tuple[Effect, Effect, Effect]] = {
     faults.PilotTakesOver: (_take_over, nothing, _hand_back),
     faults.PilotDisarms: (_disarm, nothing, nothing),
     faults.PilotTakesOff: (_climb, nothing, nothing),
-    faults.SecondSender: (_begin_sending, _send_setpoints, nothing),
-    faults.SecondVehicle: (_start_count, _send_heartbeats, nothing),
-    faults.Stranger: (_start_count, _send_strange_datagrams, nothing),
+    faults.SecondSender: (_add_companion, _send_setpoints, nothing),
+    faults.SecondVehicle: (_add_sender, _send_heartbeats, nothing),
+    faults.Stranger: (_add_sender, _send_strange_datagrams, nothing),
 }

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from pydantic import Field
 
 from offboard.documents.errors import DocumentError
@@ -9,7 +11,6 @@ from offboard.documents.parameters import Parameters
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.commander import Request
 from simulator.faults import ModeName
-from simulator.firmware.values import NAN3
 
 CLIMB_S = 60.0  # for the climb
 SETTLE_S = 2.0
@@ -32,8 +33,7 @@ def climb(autopilot: Autopilot, height_m: float) -> None:
 
     A firmware that does not take off in its mode is given the one in which it does.
     """
-    north, east, _ = NAN3
-    request = Request(takeoff_ned_m=(north, east, -height_m))
+    request = Request(takeoff_ned_m=(math.nan, math.nan, -height_m))
     autopilot.handle("mode", Request(autopilot.firmware.commands.reposition_mode))
     autopilot.handle("arm")
     autopilot.handle("takeoff", request)
