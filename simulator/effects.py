@@ -20,7 +20,6 @@ from simulator.link.impairment import Channel
 from simulator.mavlink.server import Server
 from simulator.mavlink.view import Stuck, View
 from simulator.sender import Sender
-from simulator.start import climb
 from simulator.steps import STEP_S
 
 _REFUSED_EVENTS = {
@@ -215,10 +214,6 @@ def _disarm(vehicle: Vehicle, running: Running) -> None:
     vehicle.autopilot.handle("force disarm")
 
 
-def _climb(vehicle: Vehicle, running: Running) -> None:
-    climb(vehicle.autopilot, running.fault.height_m)
-
-
 def _add_sender(vehicle: Vehicle, running: Running) -> None:
     fault = running.fault
     running.memory = Sender(fault.system or vehicle.view.system, fault.component)
@@ -283,7 +278,6 @@ EFFECTS: dict[type, tuple[Effect, Effect, Effect]] = {
     faults.Refusal: (_refuse, nothing, _allow),
     faults.PilotTakesOver: (_take_over, nothing, _hand_back),
     faults.PilotDisarms: (_disarm, nothing, nothing),
-    faults.PilotTakesOff: (_climb, nothing, nothing),
     faults.SecondSender: (_add_companion, _send_setpoints, nothing),
     faults.SecondVehicle: (_add_sender, _send_heartbeats, nothing),
     faults.Stranger: (_add_sender, _send_strange_datagrams, nothing),

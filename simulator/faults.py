@@ -222,13 +222,6 @@ class PilotDisarms(Timed):
     fault: Literal["pilot_disarms"]
 
 
-class PilotTakesOff(Timed):
-    """The pilot arms, climbs to `height_m` and hovers."""
-
-    fault: Literal["pilot_takes_off"]
-    height_m: float = Field(default=10.0, ge=1, le=100)
-
-
 class SecondSender(Timed):
     """Another companion or ground station sends to the vehicle, which obeys any source.
 
@@ -284,7 +277,6 @@ Fault = Annotated[
     | Refusal
     | PilotTakesOver
     | PilotDisarms
-    | PilotTakesOff
     | SecondSender
     | SecondVehicle
     | Stranger,

@@ -28,17 +28,6 @@ class Start(Parameters):
     by_failsafe: bool = False  # a failsafe chose the mode: system_status is 5
 
 
-def climb(autopilot: Autopilot, height_m: float) -> None:
-    """Arm and begin to climb to a height above the origin, as a pilot with a ground station does.
-
-    A firmware that does not take off in its mode is given the one in which it does.
-    """
-    request = Request(takeoff_ned_m=(math.nan, math.nan, -height_m))
-    autopilot.handle("mode", Request(autopilot.firmware.commands.reposition_mode))
-    autopilot.handle("arm")
-    autopilot.handle("takeoff", request)
-
-
 def take_off(autopilot: Autopilot, start: Start) -> None:
     """Boot, climb and enter the mode of `start`.
 
@@ -48,7 +37,7 @@ def take_off(autopilot: Autopilot, start: Start) -> None:
     ready_s = autopilot.firmware.health.passes_after_s * autopilot.health.boot_scale + SETTLE_S
     while autopilot.state.time_s < ready_s:
         autopilot.step()
-    climb(autopilot, start.height_m)
+    _climb(autopilot, start.height_m)
     end_s = ready_s + CLIMB_S
     while not (hovers := _hovers(autopilot, start.height_m)) and autopilot.state.time_s < end_s:
         autopilot.step()
@@ -59,6 +48,17 @@ def take_off(autopilot: Autopilot, start: Start) -> None:
     autopilot.commander.switch(named.name, by_failsafe=start.by_failsafe)
     autopilot.commander.texts.clear()
     autopilot.commander.announcements.clear()
+
+
+def _climb(autopilot: Autopilot, height_m: float) -> None:
+    """Arm and begin to climb to a height above the origin, as a pilot with a ground station does.
+
+    A firmware that does not take off in its mode is given the one in which it does.
+    """
+    request = Request(takeoff_ned_m=(math.nan, math.nan, -height_m))
+    autopilot.handle("mode", Request(autopilot.firmware.commands.reposition_mode))
+    autopilot.handle("arm")
+    autopilot.handle("takeoff", request)
 
 
 def _hovers(autopilot: Autopilot, height_m: float) -> bool:

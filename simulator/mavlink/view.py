@@ -5,13 +5,12 @@ Packs each message once per step for all links. Knows no links, rates or sequenc
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from simulator.autopilot.autopilot import Autopilot
-from simulator.geodesy import DEGREES_PER_M, east_degrees_per_m
+from simulator.geodesy import DEGREES_PER_M, east_degrees_per_m, wrapped_deg
 from simulator.mavlink.codec import layout
 from simulator.mavlink.fields import fit
 
@@ -126,7 +125,7 @@ class View:
         latitude, longitude, _ = self.autopilot.firmware.origin
         north_deg = north_m * DEGREES_PER_M
         east_deg = east_m * self.east_degrees_per_m
-        east_deg = math.remainder(longitude + east_deg, 360.0)
+        east_deg = wrapped_deg(longitude + east_deg)
         return fit((latitude + north_deg) * 1e7, 32), fit(east_deg * 1e7, 32)
 
     def altitude_mm(self, down_m: float) -> int:

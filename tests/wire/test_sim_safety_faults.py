@@ -138,14 +138,6 @@ def test_the_pilot_disarms_in_the_air() -> None:
 
 
 @pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=lambda firmware: firmware.name)
-def test_the_pilot_takes_off(firmware: Firmware) -> None:
-    fault = {"fault": "pilot_takes_off", "height_m": 5.0, "at_s": 12.0}
-    bench = flying(fault, firmware=firmware, conditions={"boot_scale": 0.2})
-    bench.run(30.0)
-    assert bench.height_m == pytest.approx(5.0, abs=0.4)
-
-
-@pytest.mark.parametrize("firmware", [PX4, ARDUPILOT], ids=lambda firmware: firmware.name)
 def test_a_vehicle_found_in_a_failsafe_hovers_until_a_mode_is_chosen(firmware: Firmware) -> None:
     bench = flying(firmware=firmware, start={**HIGH, "by_failsafe": True})
     bench.run(0.1)

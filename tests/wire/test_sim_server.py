@@ -10,7 +10,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
-from pymavlink.dialects.v20 import common as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 from sim_bench import LOITER, NAN, OFFBOARD, Bench
 
 from simulator.firmware.px4 import PX4
