@@ -180,7 +180,7 @@ def simulate(
                 start=flown.start,
                 strict=strict,
             )
-            strangers = [open_beside(companion) for _ in vehicle_flown.strangers]
+            strangers = tuple(open_beside(companion) for _ in vehicle_flown.strangers)
             endpoints.append(Endpoint(vehicle_flown, companion, ground, recorder, strangers))
     except (DocumentError, LinkError) as error:
         _refuse(str(error))

@@ -231,7 +231,7 @@ class SecondSender(Timed):
 
     fault: Literal["second_sender"]
     system: int = Field(default=1, ge=1, le=255)
-    component: int = Field(default=192, ge=1, le=255)
+    component: int = Field(default=194, ge=1, le=255)
     setpoint_rate_hz: float = Field(default=10.0, ge=0, le=250)
     thrust: float = Field(default=0.5, ge=0, le=1)
     command: int | None = Field(default=None, ge=0, le=65535)  # MAV_CMD

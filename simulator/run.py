@@ -46,7 +46,7 @@ class Endpoint:
     companion: Link
     ground: Link | None = None
     recorder: Recorder | None = None  # of the companion link
-    strangers: Sequence[Link] = ()  # for `Instance.strangers`, in its order
+    strangers: tuple[Link, ...] = ()  # for `Instance.strangers`, in its order
 
     @property
     def links(self) -> list[Link]:

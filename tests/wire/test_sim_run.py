@@ -132,7 +132,7 @@ def test_a_stranger_sends_from_another_port_of_the_same_host(
     """In lockstep before each barrier: the telemetry of these 20 ms follows."""
     fault = Stranger.model_validate({"fault": "stranger", "rate_hz": 250.0, "size_bytes": 33})
     instance = Instance(PX4, px4_vehicle(), Conditions(), 1, lockstep=True, faults=(fault,))
-    endpoint = Endpoint(instance, link, strangers=[open_beside(link)])
+    endpoint = Endpoint(instance, link, strangers=(open_beside(link),))
     instance.advance_to_barrier()
     endpoint.send_barrier()
     received = []
