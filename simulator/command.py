@@ -127,7 +127,7 @@ def simulate(
         from simulator import config
         from simulator.firmware.catalogue import FIRMWARES
         from simulator.instance import VIRTUAL_EPOCH_US, Instance
-        from simulator.link.links import LinkError, open_link, shifted
+        from simulator.link.links import LinkError, open_beside, open_link, shifted
         from simulator.link.recorder import Recorder
         from simulator.run import Endpoint, Runner, warm_up
 
@@ -141,6 +141,7 @@ def simulate(
     numbers = range(instance, instance + instances)
     try:
         flown = config.scenario(scenario or personality.scenario)
+        config.check_for(flown, personality, lockstep=lockstep)
         flyer = config.vehicle(vehicle or personality.vehicle)
         companions = [
             open_link(
@@ -168,9 +169,10 @@ def simulate(
     warm_up(Instance(personality, flyer, flown.conditions, seed, lockstep=True))
 
     epoch_us = VIRTUAL_EPOCH_US if lockstep else unix_us()
-    endpoints = [
-        Endpoint(
-            Instance(
+    endpoints = []
+    try:
+        for number, companion, ground in zip(numbers, companions, grounds, strict=True):
+            vehicle_flown = Instance(
                 personality,
                 flyer,
                 flown.conditions,
@@ -179,18 +181,15 @@ def simulate(
                 lockstep=lockstep,
                 ground_link=ground is not None,
                 epoch_us=epoch_us,
+                parameters=parameters,
                 faults=flown.faults,
+                start=flown.start,
                 strict=strict,
-            ),
-            companion,
-            ground,
-            recorder,
-        )
-        for number, companion, ground in zip(numbers, companions, grounds, strict=True)
-    ]
-    for endpoint in endpoints:
-        for name, value in parameters.items():
-            endpoint.instance.autopilot.parameters.set(name, value)
+            )
+            strangers = tuple(open_beside(companion) for _ in vehicle_flown.strangers)
+            endpoints.append(Endpoint(vehicle_flown, companion, ground, recorder, strangers))
+    except (DocumentError, LinkError) as error:
+        _refuse(str(error))
     _warn_if_it_cannot_land(endpoints[0].instance, flyer.hover_thrust)
     purpose = "waiting at" if connect.startswith("udpin:") else "sending to"
     for number in numbers:

@@ -4,12 +4,18 @@ from __future__ import annotations
 
 from pydantic import Field
 
+from offboard.documents.errors import DocumentError
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import M, parse
 from offboard.documents.shipped import locate, read_text
 from offboard.model.vehicle import Vehicle
-from simulator.faults import Fault
+from simulator.faults import Fault, PilotTakesOver, Stranger
+from simulator.firmware.base import Firmware
+from simulator.start import Start
 from simulator.vehicle.conditions import Conditions
+
+# Between two barriers (20 ms) more would fill a socket's buffer, so that barriers are lost
+LOCKSTEP_STRANGER_HZ = 5000.0
 
 
 class Scenario(Parameters):
@@ -17,12 +23,28 @@ class Scenario(Parameters):
 
     name: str = Field(min_length=1, max_length=40)
     conditions: Conditions = Conditions()
+    start: Start | None = None
     faults: tuple[Fault, ...] = Field(default=(), max_length=50)
 
 
 def scenario(name: str) -> Scenario:
     """A shipped scenario or a file. Raises DocumentError."""
     return _load(name, "scenarios", "scenario", Scenario)
+
+
+def check_for(flown: Scenario, firmware: Firmware, *, lockstep: bool) -> None:
+    """Check what a scenario needs of a run. Raises DocumentError."""
+    switches = [fault.mode for fault in flown.faults if isinstance(fault, PilotTakesOver)]
+    named = switches if flown.start is None else [*switches, flown.start.mode]
+    for mode in named:
+        if mode is not None and firmware.mode_named(mode) is None:
+            raise DocumentError(f"scenario {flown.name}: {firmware.name} has no mode {mode}")
+    for fault in flown.faults:
+        if lockstep and isinstance(fault, Stranger) and fault.rate_hz > LOCKSTEP_STRANGER_HZ:
+            raise DocumentError(
+                f"scenario {flown.name}: a stranger with more than {LOCKSTEP_STRANGER_HZ:g}"
+                " datagrams/s overflows the socket of a companion in lockstep: fly it in real time"
+            )
 
 
 def vehicle(name: str) -> Vehicle:

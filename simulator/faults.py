@@ -9,10 +9,11 @@ from __future__ import annotations
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import AfterValidator, Field
+from pydantic import AfterValidator, Field, model_validator
 
 from offboard.documents.parameters import Parameters
 from offboard.model.vehicle import Triple
+from simulator.firmware.catalogue import FIRMWARES
 from simulator.link.impairment import Impairment
 from simulator.mavlink.codec import id_of
 
@@ -23,7 +24,14 @@ def _known(name: str) -> str:
     return name
 
 
+def _flown(name: str) -> str:
+    if all(firmware.mode_named(name) is None for firmware in FIRMWARES.values()):
+        raise ValueError(f"{name[:40]!r} is not a mode of any firmware")
+    return name
+
+
 MessageName = Annotated[str, AfterValidator(_known)]
+ModeName = Annotated[str, AfterValidator(_flown)]  # "AUTO." may be left out
 
 
 class Moment(StrEnum):
@@ -33,6 +41,7 @@ class Moment(StrEnum):
     ARMED = "armed"
     TOOK_OFF = "took_off"
     ENGAGED = "engaged"  # the vehicle obeys setpoints
+    LANDING = "landing"  # in the air, in the final descent of a landing
     LANDED = "landed"  # after a flight
 
 
@@ -42,6 +51,20 @@ class Direction(StrEnum):
     DOWN = "down"
     UP = "up"
     BOTH = "both"
+
+
+class LandedState(StrEnum):
+    """What EXTENDED_SYS_STATE can report wrongly."""
+
+    ON_GROUND = "on_ground"
+    IN_AIR = "in_air"
+
+
+class Datagrams(StrEnum):
+    """Content of a stranger's datagrams."""
+
+    NOISE = "noise"  # random bytes
+    HEARTBEAT = "heartbeat"  # of an autopilot like the vehicle's, disarmed
 
 
 class Refusable(StrEnum):
@@ -69,6 +92,12 @@ class LinkFault(Timed, Impairment):
     fault: Literal["link"]
     direction: Direction = Direction.BOTH
 
+    @model_validator(mode="after")
+    def _ends(self) -> LinkFault:
+        if self.stalled and self.for_s is None:
+            raise ValueError("a stalled link needs for_s: what waits arrives when the fault ends")
+        return self
+
 
 class EstimatorJump(Timed):
     """The position estimate jumps, and its reset counter increases."""
@@ -85,10 +114,11 @@ class GpsLoss(Timed):
 
 
 class SilentMessage(Timed):
-    """A message that is no longer sent periodically, on any link."""
+    """A message that is no longer sent, on any link; with `every`, every so many are still sent."""
 
     fault: Literal["silent_message"]
     message: MessageName
+    every: int | None = Field(default=None, ge=2, le=1000)
 
 
 class StuckMessage(Timed):
@@ -99,11 +129,38 @@ class StuckMessage(Timed):
     stamp_runs: bool = True
 
 
+class VelocityError(Timed):
+    """The velocity estimate has an offset, without an estimator reset."""
+
+    fault: Literal["velocity_error"]
+    offset_ned_mps: Triple
+
+
+class WrongLandedState(Timed):
+    """EXTENDED_SYS_STATE reports this state; the autopilot itself knows the true one."""
+
+    fault: Literal["wrong_landed_state"]
+    reports: LandedState
+
+
+class BlindLandDetector(Timed):
+    """The land detector never detects a landing, so that the vehicle does not disarm."""
+
+    fault: Literal["blind_land_detector"]
+
+
 class WeakMotor(Timed):
     """One of four motors has `motor_scale` of its thrust; the mixer keeps the torques."""
 
     fault: Literal["weak_motor"]
     motor_scale: float = Field(ge=0, le=1)
+
+
+class MotorsCut(Timed):
+    """No motor has thrust any more, from the first time on that the vehicle is below `below_m`."""
+
+    fault: Literal["motors_cut"]
+    below_m: float = Field(default=1e4, ge=0, le=1e4)  # above the ground
 
 
 class ThrustChange(Timed):
@@ -138,7 +195,7 @@ class ClockJump(Timed):
     """All time stamps of the vehicle jump by `jump_s`."""
 
     fault: Literal["clock_jump"]
-    jump_s: float = Field(ge=-1e4, le=1e4)
+    jump_s: float = Field(ge=-1e7, le=1e7)
 
 
 class Refusal(Timed):
@@ -150,9 +207,55 @@ class Refusal(Timed):
 
 
 class PilotTakesOver(Timed):
-    """The pilot switches to the mode that holds position."""
+    """The pilot switches to a mode; after `for_s` back to the one before.
+
+    Sticks are centred or, where they are not simulated, missing: POSCTL then descends slowly.
+    """
 
     fault: Literal["pilot_takes_over"]
+    mode: ModeName | None = None  # None: the one that holds position
+
+
+class PilotDisarms(Timed):
+    """The pilot disarms, also in the air."""
+
+    fault: Literal["pilot_disarms"]
+
+
+class SecondSender(Timed):
+    """Another companion or ground station sends to the vehicle, which obeys any source.
+
+    Level attitude setpoints at `setpoint_rate_hz` with this thrust, heading north, and a command
+    when it begins. Its HEARTBEAT reaches the companion once a second, as an autopilot forwards it.
+    """
+
+    fault: Literal["second_sender"]
+    system: int = Field(default=1, ge=1, le=255)
+    component: int = Field(default=194, ge=1, le=255)
+    setpoint_rate_hz: float = Field(default=10.0, ge=0, le=250)
+    thrust: float = Field(default=0.5, ge=0, le=1)
+    command: int | None = Field(default=None, ge=0, le=65535)  # MAV_CMD
+    params: tuple[float, ...] = Field(default=(), max_length=7)  # param1 .. param7; the rest is 0
+
+
+class SecondVehicle(Timed):
+    """HEARTBEATs of another vehicle arrive on the companion link, as on a shared radio."""
+
+    fault: Literal["second_vehicle"]
+    system: int = Field(default=2, ge=1, le=255)
+    component: int = Field(default=1, ge=1, le=255)
+    rate_hz: float = Field(default=1.0, gt=0, le=250)
+
+
+class Stranger(Timed):
+    """Datagrams from another port of the vehicle's host reach the companion. UDP links only."""
+
+    fault: Literal["stranger"]
+    sends: Datagrams = Datagrams.NOISE
+    rate_hz: float = Field(default=100.0, gt=0, le=100_000)
+    size_bytes: int = Field(default=64, ge=1, le=1400)  # of noise
+    system: int | None = Field(default=None, ge=1, le=255)  # None: the vehicle's own id, a spoof
+    component: int = Field(default=1, ge=1, le=255)
 
 
 Fault = Annotated[
@@ -161,13 +264,21 @@ Fault = Annotated[
     | GpsLoss
     | SilentMessage
     | StuckMessage
+    | VelocityError
+    | WrongLandedState
+    | BlindLandDetector
     | WeakMotor
+    | MotorsCut
     | ThrustChange
     | MassChange
     | BatteryDrop
     | Reboot
     | ClockJump
     | Refusal
-    | PilotTakesOver,
+    | PilotTakesOver
+    | PilotDisarms
+    | SecondSender
+    | SecondVehicle
+    | Stranger,
     Field(discriminator="fault"),
 ]

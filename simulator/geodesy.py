@@ -12,11 +12,17 @@ GLOBAL_FRAMES, RELATIVE_FRAMES, TERRAIN_FRAMES = map(frozenset, ((0, 5), (3, 6),
 
 
 def to_metres(origin: Origin, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:
-    """North and east, m, of a point near the origin."""
+    """North and east, m, of a point near the origin; angles of any size, NaN for none."""
     latitude, longitude, _ = origin
-    north_m = math.radians(latitude_deg - latitude) * EARTH_RADIUS_M
+    north_m = math.radians(wrapped_deg(latitude_deg - latitude)) * EARTH_RADIUS_M
     shrink = math.cos(math.radians(latitude))
-    return north_m, math.radians(longitude_deg - longitude) * EARTH_RADIUS_M * shrink
+    east_m = math.radians(wrapped_deg(longitude_deg - longitude)) * EARTH_RADIUS_M * shrink
+    return north_m, east_m
+
+
+def wrapped_deg(angle_deg: float) -> float:
+    """The same angle between -180 and 180; NaN for what is not finite."""
+    return math.remainder(angle_deg, 360.0) if math.isfinite(angle_deg) else math.nan
 
 
 def east_degrees_per_m(origin: Origin) -> float:

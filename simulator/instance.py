@@ -19,6 +19,7 @@ from simulator.mavlink.server import Server
 from simulator.mavlink.strict import Strict
 from simulator.mavlink.telemetry import builders
 from simulator.mavlink.view import View
+from simulator.start import Start, take_off
 from simulator.steps import STEP_S, STEP_US
 from simulator.vehicle.attitude import Demand
 from simulator.vehicle.conditions import Conditions
@@ -44,7 +45,9 @@ class Instance:
         lockstep: replace the TIMESYNC stream of the companion link by barriers (`barrier_due`).
         ground_link: send telemetry to a ground station too.
         epoch_us: Unix time of boot in SYSTEM_TIME, microseconds.
+        parameters: of the autopilot, in place of its defaults.
         faults: what goes wrong, and when (`simulator.faults`).
+        start: the vehicle is in the air when its links open; None: it boots on the ground.
         strict: report messages that the autopilot ignores or misreads (`complaints`).
 
     Example:
@@ -69,14 +72,22 @@ class Instance:
         lockstep: bool = False,
         ground_link: bool = True,
         epoch_us: int = VIRTUAL_EPOCH_US,
+        parameters: Mapping[str, float] | None = None,
         faults: Sequence[Fault] = (),
+        start: Start | None = None,
         strict: bool = False,
     ) -> None:
         self.autopilot = Autopilot(
             firmware, Plant(vehicle, conditions, seed), boot_scale=conditions.boot_scale
         )
         self.autopilot.parameters.set(firmware.system_parameter, system)
-        self.view = View(self.autopilot, system, epoch_us, builders(firmware))
+        for name, value in (parameters or {}).items():
+            self.autopilot.parameters.set(name, value)
+        if start is not None:
+            take_off(self.autopilot, start)
+        clock_us = round(conditions.clock_start_s * 1e6)
+        self.view = View(self.autopilot, system, epoch_us - clock_us, builders(firmware))
+        self.view.clock_offset_us = clock_us
         self._strict = Strict(system, self.autopilot.parameters) if strict else None
         self.companion = Server(
             self.view, firmware.streams.companion_rates_hz, barrier=lockstep, strict=self._strict
@@ -100,6 +111,12 @@ class Instance:
     def complaints(self) -> Mapping[str, int]:
         """Number of messages by complaint; empty unless `strict`."""
         return {} if self._strict is None else self._strict.counts
+
+    @property
+    def strangers(self) -> list[list[bytes]]:
+        """Datagrams for the companion that others send, a list for each of their ports; the caller
+        sends and clears them."""
+        return [] if self._injection is None else self._injection.strangers
 
     @property
     def idle(self) -> bool:

@@ -46,6 +46,7 @@ class Endpoint:
     companion: Link
     ground: Link | None = None
     recorder: Recorder | None = None  # of the companion link
+    strangers: tuple[Link, ...] = ()  # for `Instance.strangers`, in its order
 
     @property
     def links(self) -> list[Link]:
@@ -55,8 +56,15 @@ class Endpoint:
         """Send what both links have queued."""
         datagrams = self.instance.drain()
         self._record(datagrams)
+        self._send_strange()
         self.companion.send(datagrams)
         self.send_ground()
+
+    def _send_strange(self) -> None:
+        """Send the datagrams of senders that are not the vehicle, each from its own port."""
+        for link, datagrams in zip(self.strangers, self.instance.strangers, strict=True):
+            link.send(datagrams)
+            datagrams.clear()
 
     def send_ground(self) -> None:
         datagrams = self.instance.ground.outbox.drain()
@@ -67,6 +75,7 @@ class Endpoint:
         """Send everything queued and the barrier; return its time stamp and its datagrams."""
         stamp_ns, datagrams = self.instance.barrier()
         self._record(datagrams)
+        self._send_strange()
         self.companion.send(datagrams)
         self.send_ground()
         return stamp_ns, datagrams

@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
+from simulator.faults import Fault
 from simulator.firmware.base import Firmware
 from simulator.firmware.catalogue import FIRMWARES
 from simulator.firmware.values import Result
@@ -49,6 +51,14 @@ def test_every_file_that_is_named_exists() -> None:
     named = re.findall(r"`((?:simulator|tests|config)/[\w./-]*)`", README.read_text())
     assert named
     assert [path for path in named if not (ROOT / path).exists()] == []
+
+
+def test_every_fault_is_in_the_table() -> None:
+    faults = get_args(get_args(Fault)[0])
+    named = {get_args(fault.model_fields["fault"].annotation)[0] for fault in faults}
+    rows = "\n".join(line for line in README.read_text().splitlines() if line.startswith("| `"))
+    assert {name for name in named if f"`{name}`" not in rows} == set()
+    assert len(named) == 21
 
 
 if __name__ == "__main__":

@@ -74,8 +74,7 @@ class Commander:
     @property
     def healthy(self) -> bool:
         """The pre-arm checks pass in the intended mode."""
-        mode = self._firmware.modes[self._intended]
-        return self._health.passes(mode, self._state.time_s, latched=bool(self._latched))
+        return self._health.passes(self.intended, self._state.time_s, latched=bool(self._latched))
 
     @property
     def heartbeat(self) -> tuple[int, int]:
@@ -92,6 +91,11 @@ class Commander:
         )
         base_mode, state = self._firmware.heartbeat(condition)
         return base_mode | (128 if self.armed else 0), state
+
+    @property
+    def intended(self) -> Mode:
+        """The mode that was chosen; in a failsafe the vehicle flies another one."""
+        return self._firmware.modes[self._intended]
 
     def knows(self, event: str) -> bool:
         """The firmware has rules for an event."""
@@ -110,6 +114,12 @@ class Commander:
             return Result.ACCEPTED
         self._apply(rule)
         return rule.result
+
+    def switch(self, mode: str, *, by_failsafe: bool = False) -> None:
+        """Enter a mode that no command may request: by a pilot's switch, or by a failsafe."""
+        self._event, self._request = "", NO_REQUEST
+        self._enter(mode, by_failsafe=by_failsafe)
+        self.failsafe = by_failsafe
 
     def due_events(self) -> Iterator[str]:
         """The event of a delayed failsafe, once its delay is over."""

@@ -44,6 +44,7 @@ class VehicleState:
         self._plant = plant
         self.steps = 0  # of STEP_S since boot
         self.gps_healthy = True  # False while a fault takes the fix away
+        self.velocity_error_ned_mps: Triple = (0.0, 0.0, 0.0)  # by a fault
         self._truth: Truth | None = None
         self._estimate: StateEstimate | None = None
 
@@ -77,14 +78,14 @@ class VehicleState:
     def estimate(self) -> StateEstimate:
         """State as the autopilot estimates it."""
         if self._estimate is None:
-            plant = self._plant
+            plant, error = self._plant, self.velocity_error_ned_mps
             north, east, down, v_north, v_east, v_down, w, x, y, z, p, q, r = (
                 plant.report().tolist()
             )
             self._estimate = StateEstimate(
                 self.time_s,
                 (north, east, down),
-                (v_north, v_east, v_down),
+                (v_north + error[0], v_east + error[1], v_down + error[2]),
                 (w, x, y, z),
                 (p, q, r),
                 plant.on_ground,

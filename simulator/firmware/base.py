@@ -7,7 +7,7 @@ firmware is one more folder. Knows no simulator core, no message builder and no 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -173,6 +173,8 @@ class Streams:
     # message -> builder, beside `simulator.mavlink.telemetry.BUILDERS` or in place of one
     messages: Mapping[str, Callable[[Any], Sequence[Any]]]
     withheld_until: Mapping[str, str]  # message -> boot event before which it is not sent
+    # message -> version of its content: a message that is due waits until it is a new one
+    versions: Mapping[str, Callable[[Any], Hashable]]
     position_grid_steps: int  # the estimator's position is new at every such step
     fixed: frozenset[str]  # messages whose interval cannot be changed
     not_on_request: frozenset[str]
@@ -328,6 +330,7 @@ class Firmware:
     origin: Triple  # of the local frame: latitude, longitude deg, AMSL m
     modes: Mapping[str, Mode]
     boot_mode: str
+    hold_mode: str  # in which the vehicle stops and holds its position
     heartbeat: Callable[[Condition], tuple[int, int]]  # base_mode but the armed bit, MAV_STATE
     rules: tuple[Rule, ...]
     parameters: tuple[ParameterSpec, ...]
@@ -340,3 +343,7 @@ class Firmware:
     link: LinkRules
     health: HealthRules
     flight: FlightRules
+
+    def mode_named(self, name: str) -> Mode | None:
+        """Mode by its name, of which "AUTO." may be left out; None where there is none."""
+        return self.modes.get(name) or self.modes.get(f"AUTO.{name}")

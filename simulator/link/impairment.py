@@ -23,6 +23,7 @@ class Impairment(Parameters):
     """Faults of one direction of a link; probabilities are per datagram."""
 
     latency_s: float = Field(default=0.0, ge=0, le=10)
+    ramp_s: float = Field(default=0.0, ge=0, le=1e5)  # the latency grows from zero in this time
     jitter_s: float = Field(default=0.0, ge=0, le=5)  # further delay, uniform; order is kept
     loss: float = Field(default=0.0, ge=0, le=1)
     duplication: float = Field(default=0.0, ge=0, le=1)
@@ -30,7 +31,8 @@ class Impairment(Parameters):
     reorder_s: float = Field(default=0.02, ge=0, le=5)
     corruption: float = Field(default=0.0, ge=0, le=1)  # probability of one flipped bit
     rate_bytes_ps: float | None = Field(default=None, ge=100, le=1e9)
-    queue_bytes: int = Field(default=4096, ge=280, le=10_000_000)  # in front of `rate_bytes_ps`
+    stalled: bool = False  # datagrams wait until the fault ends, and then arrive at once, in order
+    queue_bytes: int = Field(default=4096, ge=280, le=10_000_000)  # that wait for rate or end
     message_rate_hz: float | None = Field(default=None, ge=0.1, le=1000)  # of each message id
 
 
@@ -42,6 +44,8 @@ class Channel:
         self._random = random
         self.on = True  # datagrams already under way arrive in any case
         self._under_way: list[tuple[int, int, bytes]] = []
+        self._held: list[bytes] = []  # while stalled
+        self._begun_us: int | None = None
         self._count = 0
         self._newest_us = self._idle_us = 0
         self._slots: dict[int, int] = {}
@@ -49,12 +53,16 @@ class Channel:
     def put(self, datagram: bytes, now_us: int) -> None:
         """Send one datagram at `now_us`."""
         if not self.on:
-            self._deliver(now_us, datagram)
+            self._release(now_us)
+            self._deliver(max(now_us, self._newest_us), datagram)
             return
         settings, chance = self._settings, self._random.random
         if settings.message_rate_hz is not None:
             datagram = self._thinned(datagram, now_us, settings.message_rate_hz)
         if not datagram or (settings.loss and chance() < settings.loss):
+            return
+        if settings.stalled:
+            self._hold(datagram)
             return
         sent_us = self._transmitted(len(datagram), now_us)
         if sent_us is None:
@@ -62,7 +70,8 @@ class Channel:
         if settings.corruption and chance() < settings.corruption:
             datagram = self._damaged(datagram)
         twice = bool(settings.duplication) and chance() < settings.duplication
-        delay_s = settings.latency_s + (settings.jitter_s * chance() if settings.jitter_s else 0.0)
+        delay_s = self._latency_s(now_us)
+        delay_s += settings.jitter_s * chance() if settings.jitter_s else 0.0
         due_us = max(sent_us + round(delay_s * 1e6), self._newest_us)
         if settings.reorder and chance() < settings.reorder:
             due_us += round(settings.reorder_s * 1e6)
@@ -73,10 +82,30 @@ class Channel:
 
     def take(self, now_us: int) -> list[bytes]:
         """Datagrams that have arrived by `now_us`, in order."""
+        if not self.on:
+            self._release(now_us)
         arrived: list[bytes] = []
         while self._under_way and self._under_way[0][0] <= now_us:
             arrived.append(heapq.heappop(self._under_way)[2])
         return arrived
+
+    def _latency_s(self, now_us: int) -> float:
+        """Latency, growing from the first datagram on."""
+        settings = self._settings
+        if not settings.ramp_s:
+            return settings.latency_s
+        if self._begun_us is None:
+            self._begun_us = now_us
+        return settings.latency_s * min(1.0, (now_us - self._begun_us) * 1e-6 / settings.ramp_s)
+
+    def _hold(self, datagram: bytes) -> None:
+        if sum(map(len, self._held)) + len(datagram) <= self._settings.queue_bytes:
+            self._held.append(datagram)
+
+    def _release(self, now_us: int) -> None:
+        for datagram in self._held:
+            self._deliver(now_us, datagram)
+        self._held.clear()
 
     def _deliver(self, due_us: int, datagram: bytes) -> None:
         heapq.heappush(self._under_way, (due_us, self._count, datagram))

@@ -86,6 +86,17 @@ def open_link(url: str, preferred_port: int) -> Link:
     return UdpLink(sock, address)
 
 
+def open_beside(link: Link) -> Link:
+    """Open a link with a port of its own and the same peers, for a sender beside the vehicle.
+
+    Raises:
+        LinkError: the link is a connection, in which nobody else can send.
+    """
+    if not isinstance(link, UdpLink):
+        raise LinkError("fault stranger: it needs a UDP link, where another port can send")
+    return link.beside()
+
+
 def shifted(url: str, by: int) -> str:
     """URL of the same link for the instance `by` numbers later. Raises LinkError."""
     kind, host, port = _split(url)

@@ -18,6 +18,15 @@ class UdpLink:
         self._target = target
         self._peers: dict[Address, None] = {} if target is None else {target: None}
 
+    def beside(self) -> UdpLink:
+        """A link with another port of the same host, and the same peers."""
+        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        sock.setblocking(False)
+        sock.bind((self._socket.getsockname()[0], 0))
+        other = UdpLink(sock, None)
+        other._peers = self._peers
+        return other
+
     def fileno(self) -> int:
         return self._socket.fileno()
 

@@ -15,7 +15,7 @@ from functools import cache
 from typing import Any
 
 from fastcrc.crc16 import mcrf4xx
-from pymavlink.dialects.v20 import ardupilotmega as dialect  # common and ArduPilot's own
+from pymavlink.dialects.v20 import all as dialect  # also CURRENT_MODE, which common lacks
 
 MAGIC_V1 = 0xFE
 MAGIC_V2 = 0xFD

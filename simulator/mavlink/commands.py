@@ -19,6 +19,7 @@ from simulator.mavlink.codec import id_of, name_of
 from simulator.mavlink.outbox import Outbox
 from simulator.mavlink.schedule import Schedule
 
+_HEIGHT_MAX_M = 83_000.0  # of home: ArduPilot's LOCATION_ALT_MAX_M
 _CHANGE_MODE = 1.0  # MAV_DO_REPOSITION_FLAGS
 _MISSION_PLANNER = 190  # MAV_COMPONENT, as ground stations call themselves
 _VERTICAL_SPEEDS = (2.0, 3.0)  # SPEED_TYPE: climb, descent
@@ -126,7 +127,7 @@ class Commands:
         autopilot = self._autopilot
         if command.params[0] == 1.0:
             autopilot.guidance.home_ned_m = autopilot.state.estimate.position_ned_m
-        elif math.isfinite(latitude + longitude + height_m):
+        elif math.isfinite(latitude + longitude) and abs(height_m) <= _HEIGHT_MAX_M:
             north, east = to_metres(autopilot.firmware.origin, latitude, longitude)
             autopilot.guidance.home_ned_m = (north, east, autopilot.firmware.origin[2] - height_m)
         else:

@@ -5,6 +5,7 @@ Knows the view that fills messages and the link's sequence numbers; knows no cli
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, field
 
 from simulator.mavlink.codec import frame, layout
@@ -21,14 +22,26 @@ class Outbox:
     view: View
     sequence: int = 0
     _frames: list[bytes] = field(default_factory=list)
+    _suppressed: Counter[str] = field(default_factory=Counter)
 
     def send(self, name: str, *values: object) -> None:
         """Queue one message; `values` in the field order of the XML."""
         self._frame(name, layout(name).pack(values))
 
     def send_now(self, name: str) -> None:
-        """Queue a message with its contents of now, filled by the view."""
-        self._frame(name, self.view.payload(name))
+        """Queue a message with its contents of now, filled by the view, unless a fault stops it."""
+        if name not in self.view.silent or self._passes(name):
+            self._frame(name, self.view.payload(name))
+
+    def forward(self, frame: bytes) -> None:
+        """Queue a frame of another sender."""
+        self._frames.append(frame)
+
+    def _passes(self, name: str) -> bool:
+        """Whether a message that a fault stops is one of those that are still sent."""
+        every = self.view.silent[name]
+        self._suppressed[name] += 1
+        return every > 0 and self._suppressed[name] % every == 0
 
     def _frame(self, name: str, payload: bytes) -> None:
         numbers = (self.sequence, self.view.system, MAV_COMP_ID_AUTOPILOT)

@@ -6,7 +6,7 @@ Knows no client and no frame; `simulator.mavlink.outbox` fills and frames what i
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Hashable, Mapping
 from dataclasses import dataclass, field
 
 from simulator.mavlink.telemetry import LEAST_INTERVAL_US, ON_POSITION_GRID
@@ -26,6 +26,7 @@ class Stream:
     interval_us: int
     due_us: int
     grid_us: int
+    version: Hashable = None  # of the content sent last, for messages that wait for a new one
 
     def next_after(self, now_us: int) -> None:
         """Due at the next multiple of the interval, so that the mean rate is exact."""
@@ -58,7 +59,8 @@ class Schedule:
         """A stream of message `name`; in its old place if there was one."""
         steps = self.view.autopilot.firmware.streams.position_grid_steps
         grid_us = STEP_US * (steps if name in ON_POSITION_GRID else 1)
-        self.streams[name] = stream = Stream(interval_us, 0, grid_us)
+        version = self.streams[name].version if name in self.streams else None
+        self.streams[name] = stream = Stream(interval_us, 0, grid_us, version)
         self._next_us = 0.0
         return stream
 
@@ -70,14 +72,23 @@ class Schedule:
         due: list[str] = []
         next_us = math.inf
         for name, stream in self.streams.items():
-            if now_us >= stream.due_us:
+            if now_us >= stream.due_us and self._is_new(name, stream):
                 stream.next_after(now_us)
-                if name not in view.silent and not view.withheld(name):
+                if not view.withheld(name):
                     due.append(name)
             if stream.due_us < next_us:
                 next_us = stream.due_us
         self._next_us = next_us
         return due
+
+    def _is_new(self, name: str, stream: Stream) -> bool:
+        """Whether the message has a content that was not sent yet; most always have."""
+        version = self.view.autopilot.firmware.streams.versions.get(name)
+        if version is None:
+            return True
+        newest = version(self.view)
+        new, stream.version = newest != stream.version, newest
+        return new
 
     def set_interval(self, name: str, interval_us: float) -> bool:
         """0 restores the default, < 0 stops; False when the message has no settable rate."""

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from simulator.autopilot.autopilot import Autopilot
-from simulator.geodesy import DEGREES_PER_M, east_degrees_per_m
+from simulator.geodesy import DEGREES_PER_M, east_degrees_per_m, wrapped_deg
 from simulator.mavlink.codec import layout
 from simulator.mavlink.fields import fit
 
@@ -34,7 +34,7 @@ class Stuck:
 class View:
     """Input of the message builders: the autopilot, and values that several messages need.
 
-    `silent` and `stuck`: messages that a fault stops or freezes.
+    `silent` and `stuck`: messages that a fault stops, but for every so many (0: all), or freezes.
     """
 
     autopilot: Autopilot
@@ -44,7 +44,8 @@ class View:
     ping_sequence: int = 0
     # changed by faults
     clock_offset_us: int = 0
-    silent: set[str] = field(default_factory=set)
+    silent: dict[str, int] = field(default_factory=dict)
+    wrong_landed_state: int | None = None  # reported in place of the true one
     stuck: dict[str, Stuck] = field(default_factory=dict)
     east_degrees_per_m: float = field(init=False)
     _payloads: dict[str, bytes] = field(default_factory=dict)
@@ -101,6 +102,8 @@ class View:
     @property
     def landed_state(self) -> int:
         """MAV_LANDED_STATE: 1 on ground, 2 in air, 3 taking off, 4 landing."""
+        if self.wrong_landed_state is not None:
+            return self.wrong_landed_state
         behaviour = self.autopilot.navigator.active
         if self.autopilot.pilot.landed:
             return 1
@@ -122,7 +125,8 @@ class View:
         latitude, longitude, _ = self.autopilot.firmware.origin
         north_deg = north_m * DEGREES_PER_M
         east_deg = east_m * self.east_degrees_per_m
-        return fit((latitude + north_deg) * 1e7, 32), fit((longitude + east_deg) * 1e7, 32)
+        east_deg = wrapped_deg(longitude + east_deg)
+        return fit((latitude + north_deg) * 1e7, 32), fit(east_deg * 1e7, 32)
 
     def altitude_mm(self, down_m: float) -> int:
         """AMSL, mm."""

@@ -33,4 +33,6 @@ class Conditions(Parameters):
     weakening: Weakening | None = None
     ground_effect: bool = False
     battery: Battery = Battery()
+    # vehicle clock at the start; its 32-bit milliseconds wrap at 4294967.296 s
+    clock_start_s: float = Field(default=0.0, ge=0, le=1e8)
     boot_scale: float = Field(default=1.0, ge=0.02, le=10)  # on the times of the autopilot's start

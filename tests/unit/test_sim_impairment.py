@@ -122,13 +122,35 @@ def test_frames_are_found_and_garbage_is_one_piece() -> None:
     assert frames(b"") == []
 
 
-def test_what_is_under_way_arrives_after_the_fault_has_ended() -> None:
+def test_after_the_end_of_a_fault_nothing_overtakes_what_is_under_way() -> None:
     channel = Channel(Impairment(latency_s=0.02), Random(1))
     channel.put(b"late", 0)
     channel.on = False
-    channel.put(b"prompt", 4000)
-    assert channel.take(4000) == [b"prompt"]
-    assert channel.take(20_000) == [b"late"]
+    channel.put(b"next", 4000)
+    assert channel.take(4000) == []
+    assert channel.take(20_000) == [b"late", b"next"]
+    channel.put(b"prompt", 24_000)
+    assert channel.take(24_000) == [b"prompt"]
+
+
+def test_a_ramp_grows_to_the_latency_and_keeps_the_order() -> None:
+    arrived = carried(latency_s=0.8, ramp_s=4.0)
+    assert numbers(arrived) == list(range(2000))
+    late_us = delays_us(arrived)
+    assert late_us[0] == 0
+    assert late_us[500] == pytest.approx(400_000, abs=STEP_US)  # 2 s after the first
+    assert set(late_us[1000:]) == {800_000}
+
+
+def test_a_stalled_link_delivers_what_its_queue_holds_when_it_ends() -> None:
+    channel = Channel(Impairment(stalled=True, queue_bytes=320), Random(1))
+    sent = [bytes([number]) * 32 for number in range(12)]
+    for number, datagram in enumerate(sent):
+        channel.put(datagram, number * STEP_US)
+        assert channel.take(number * STEP_US) == []
+    channel.on = False
+    channel.put(b"next", 12 * STEP_US)
+    assert channel.take(12 * STEP_US) == [*sent[:10], b"next"]
 
 
 def test_two_channels_in_a_row_add_their_delays() -> None:

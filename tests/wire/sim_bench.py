@@ -6,10 +6,11 @@ import math
 from collections.abc import Callable, Iterator
 from typing import Any
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from offboard.model.vehicle import Vehicle
 from simulator import config
+from simulator.config import Scenario
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
@@ -43,8 +44,11 @@ class Bench:
         boot_scale: float = 1.0,
         strict: bool = False,
         vehicle: Vehicle | None = None,
+        scenario: Scenario | None = None,
     ) -> None:
         conditions = Conditions(estimator=estimator, boot_scale=boot_scale)
+        if scenario is not None:
+            conditions = scenario.conditions
         vehicle = vehicle or config.vehicle(firmware.vehicle)
         self.instance = Instance(
             firmware,
@@ -53,6 +57,8 @@ class Bench:
             seed,
             system=system,
             ground_link=ground_link,
+            faults=() if scenario is None else scenario.faults,
+            start=None if scenario is None else scenario.start,
             strict=strict,
         )
         self.system = system

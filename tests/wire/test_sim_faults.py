@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from pymavlink.dialects.v20 import common as mavlink
 from sim_bench import HOVER, OFFBOARD, Bench, px4_vehicle
 
 from offboard.documents import shipped
@@ -17,19 +16,13 @@ from simulator import config
 from simulator.config import Scenario
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
-from simulator.vehicle.conditions import Conditions
 
 
 def faulty(*faults: dict[str, Any], seed: int = 1) -> Bench:
     """A vehicle with these faults on a calm day."""
     scenario = Scenario.model_validate({"name": "test", "faults": faults})
-    bench = Bench(seed=seed, heartbeat_type=None)
+    bench = Bench(seed=seed, scenario=scenario)
     bench._parser.robust_parsing = True  # damage is part of the deal
-    bench.instance = Instance(
-        PX4, px4_vehicle(), Conditions(), seed, ground_link=False, faults=scenario.faults
-    )
-    bench.heartbeat_type = mavlink.MAV_TYPE_GCS
-    bench.send(mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_GCS, 8, 0, 0, 4, 3))
     return bench
 
 

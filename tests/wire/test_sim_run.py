@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import select
 import socket
 from collections.abc import Iterator
+from contextlib import closing
 
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 from sim_bench import px4_vehicle
 
 from simulator import run
+from simulator.faults import Stranger
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
-from simulator.link.links import LinkError, open_link
+from simulator.link.links import LinkError, free_ports, open_beside, open_link
 from simulator.link.udp import UdpLink
 from simulator.run import Endpoint, Outcome, Runner
 from simulator.vehicle.conditions import Conditions
@@ -121,3 +124,31 @@ def test_another_port_is_used_if_the_preferred_one_is_taken(link: UdpLink) -> No
         assert second.port != link.port
     finally:
         second.close()
+
+
+def test_a_stranger_sends_from_another_port_of_the_same_host(
+    link: UdpLink, companion: socket.socket
+) -> None:
+    """In lockstep before each barrier: the telemetry of these 20 ms follows."""
+    fault = Stranger.model_validate({"fault": "stranger", "rate_hz": 250.0, "size_bytes": 33})
+    instance = Instance(PX4, px4_vehicle(), Conditions(), 1, lockstep=True, faults=(fault,))
+    endpoint = Endpoint(instance, link, strangers=(open_beside(link),))
+    instance.advance_to_barrier()
+    endpoint.send_barrier()
+    received = []
+    while select.select([companion], [], [], 0.0)[0]:
+        received.append(companion.recvfrom(2048))
+    ports = [sender[1] for _, sender in received]
+    ours = ports.index(link.port)
+    assert ours == instance.steps
+    assert {sender[0] for _, sender in received} == {"127.0.0.1"}
+    assert len(set(ports[:ours])) == 1
+    assert set(ports[ours:]) == {link.port}
+    assert {len(datagram) for datagram, _ in received[:ours]} == {33}
+
+
+def test_a_stranger_needs_a_udp_link() -> None:
+    (port,) = free_ports(1)
+    refused = pytest.raises(LinkError, match="fault stranger: it needs a UDP link")
+    with closing(open_link(f"tcpin:127.0.0.1:{port}", 0)) as connected, refused:
+        open_beside(connected)

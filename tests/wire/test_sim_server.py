@@ -10,6 +10,7 @@ from collections import Counter
 
 import numpy as np
 import pytest
+from pymavlink.dialects.v20 import all as every
 from pymavlink.dialects.v20 import common as mavlink
 from sim_bench import LOITER, NAN, OFFBOARD, Bench
 
@@ -22,7 +23,7 @@ LOCAL_POSITION, ATTITUDE, HIL_STATE, GPS_RAW = 32, 30, 115, 24
 
 
 def read(datagrams: list[bytes]) -> list[object]:
-    parser = mavlink.MAVLink(None)
+    parser = every.MAVLink(None)
     return [m for datagram in datagrams for m in parser.parse_buffer(datagram) or []]
 
 

@@ -27,6 +27,7 @@ ARDUPILOT = Firmware(
     origin=(-35.3632621, 149.1652374, 584.09),
     modes=MODES,
     boot_mode="STABILIZE",
+    hold_mode="BRAKE",
     heartbeat=heartbeat,
     rules=RULES,
     parameters=PARAMETERS,

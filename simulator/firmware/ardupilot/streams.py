@@ -41,6 +41,7 @@ STREAMS = Streams(
         "GPS_GLOBAL_ORIGIN": "origin",
         "HOME_POSITION": "origin",
     },
+    versions={},
     position_grid_steps=1,
     fixed=frozenset({"TIMESYNC"}),
     not_on_request=frozenset({"TIMESYNC"}),

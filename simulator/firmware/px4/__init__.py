@@ -29,6 +29,7 @@ PX4 = Firmware(
     origin=(47.397742, 8.545594, 489.4),
     modes=MODES,
     boot_mode="AUTO.LOITER",
+    hold_mode="AUTO.LOITER",
     heartbeat=heartbeat,
     rules=RULES,
     parameters=PARAMETERS,

@@ -11,6 +11,22 @@ from simulator.mavlink.fields import centi, fit, in_body, pressure_hpa
 from simulator.mavlink.view import View
 
 _NAN21 = (math.nan,) * 21
+# MAV_STANDARD_MODE; 0 for other modes
+_STANDARD_MODES = {
+    "POSCTL": 1,
+    "ALTCTL": 4,
+    "AUTO.RTL": 5,
+    "AUTO.MISSION": 6,
+    "AUTO.LAND": 7,
+    "AUTO.TAKEOFF": 8,
+}
+
+
+def current_mode(view: View) -> Sequence[Any]:
+    """The mode in force, and the one that was chosen: they differ in a failsafe."""
+    commander = view.autopilot.commander
+    standard = _STANDARD_MODES.get(commander.mode.name, 0)
+    return (standard, commander.mode.custom_mode, commander.intended.custom_mode)
 
 
 def odometry(view: View) -> Sequence[Any]:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Hashable
 
 from simulator.firmware.base import Streams
 from simulator.firmware.px4 import messages
 from simulator.firmware.values import Result
 from simulator.mavlink.telemetry import builders_in
+from simulator.mavlink.view import View
 
 COMPANION_RATES_HZ = {
     "HEARTBEAT": 1.0,
@@ -31,6 +33,7 @@ COMPANION_RATES_HZ = {
     "PING": 1.0,
     "SCALED_PRESSURE": 1.0,
     "BATTERY_STATUS": 0.5,
+    "CURRENT_MODE": 0.5,
     "HOME_POSITION": 0.5,
     "VIBRATION": 0.5,
 }
@@ -52,9 +55,20 @@ GROUND_RATES_HZ = {
     "MISSION_CURRENT": 1.0,
     "ESTIMATOR_STATUS": 0.5,
     "BATTERY_STATUS": 0.5,
+    "CURRENT_MODE": 0.5,
     "HOME_POSITION": 0.5,
     "PING": 0.1,
 }
+
+_STATUS_STEPS = 125  # 0.5 s
+
+
+def _vehicle_status(view: View) -> Hashable:
+    """Version of the topic vehicle_status: new twice a second, and at once when it changes."""
+    commander, state = view.autopilot.commander, view.autopilot.state
+    modes = (commander.mode, commander.intended)
+    return (state.steps // _STATUS_STEPS, modes, commander.armed, commander.failsafe)
+
 
 _ON_EVENT = frozenset({"MISSION_CURRENT", "MISSION_ITEM_REACHED"})
 _NEVER_SENT = frozenset({
@@ -68,6 +82,7 @@ STREAMS = Streams(
     ground_rates_hz=GROUND_RATES_HZ,
     messages=builders_in(messages),
     withheld_until={},
+    versions={"CURRENT_MODE": _vehicle_status},
     position_grid_steps=2,
     fixed=_ON_EVENT | {"HEARTBEAT"},
     not_on_request=_ON_EVENT,
