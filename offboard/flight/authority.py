@@ -11,6 +11,7 @@ import math
 from dataclasses import dataclass, field
 from enum import Enum
 
+JUST_S = 0.6  # PX4 sends CURRENT_MODE twice a second, and at once when the mode changes
 KNOWN_S = 2.5  # longest age of a report; HEARTBEAT comes at 1 Hz
 
 
@@ -82,8 +83,9 @@ class Authority:
         self._requested.add(mode)
 
     def doubt(self, host_s: float) -> None:
-        """After a gap of our own: only reports that arrive after `host_s` count."""
-        self._counts_from_s = host_s
+        """After a gap of our own that ended at `host_s`: only reports that arrive later, or have
+        arrived just before, count."""
+        self._counts_from_s = host_s - JUST_S
         self.reported_s = -math.inf
 
     def lose(self, reason: str) -> None:
