@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pair import Filter, Pair, in_phase, make
+from pair import Filter, Pair, in_phase, make, on_arducopter
 from scipy.interpolate import CubicHermiteSpline
-from test_ardupilot import on_arducopter
 
 from offboard.analysis import history
 from offboard.analysis.identify import identify_flight, vehicle_file
