@@ -91,7 +91,7 @@ class TelemetryRates:
 
     @property
     def bytes_ps(self) -> float:
-        """Of all wanted messages at the rates requested."""
+        """Bytes per second of all wanted messages at the rates requested."""
         return _bytes_ps(stream.wanted for stream in self._streams.values())
 
     def count(self, message_id: int, now_s: float) -> None:
