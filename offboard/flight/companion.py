@@ -103,7 +103,11 @@ class Companion:
             outbox=self._outbox,
         )
         self._actions = PhaseActions(
-            state=state, observer=observer, decider=decider, outbox=self._outbox
+            state=state,
+            session=session,
+            observer=observer,
+            decider=decider,
+            outbox=self._outbox,
         )
 
     # ------------------------------------------------------------------ interface

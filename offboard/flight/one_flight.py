@@ -183,6 +183,7 @@ def fly(
                 component_id=COMPONENT_ID,
                 record_component_id=RECORD_COMPONENT_ID,
                 stream=link.is_stream,
+                capacity_bytes_ps=None if bundled else link.capacity_bytes_ps,
                 lockstep=bundled is not None,
                 sends_first=not (bundled or connection.startswith("udpin")),
                 extra_wanted=POSITIONING_TELEMETRY if fuses else (),
