@@ -129,6 +129,8 @@ class OnlineIdentification:
         self._identified = False
         self._gave_up = False
         self._left_box = False
+        self._limit_radps = self._estimate.limit_radps  # as adopted
+        self._link: tuple[float, float] | None = None  # not yet taken into account
         self._work: Work | None = None
         self._sentences: list[str] = []
         self._record: tuple[float, ...] = ()
@@ -162,6 +164,11 @@ class OnlineIdentification:
         """The link's delay, measured before lift-off; None if the vehicle did not answer."""
         if link is not None:
             self._sentences += self._estimate.apply_link_delay(link)
+
+    def on_link_growth(self, added_s: float, changed_s: float) -> None:
+        """The link has added `added_s` to its delay since take-off, and changed by `changed_s`
+        lately; see `LinkGrowth`. The times of commands contain the former."""
+        self._link = added_s, changed_s
 
     def on_phase(self, phase: Phase, time_s: float) -> None:
         """The flight has entered `phase`."""
@@ -223,15 +230,21 @@ class OnlineIdentification:
         sentences, self._sentences = tuple(self._sentences), []
         record, self._record = self._record, ()
         estimate = self._estimate
-        if estimate.settled and not sentences and not record:
+        limit_radps = estimate.limit_radps
+        limited = limit_radps != self._limit_radps
+        if estimate.settled and not (sentences or record or limited):
             return None
+        self._limit_radps = limit_radps
         estimate.step(time_s)
-        return Adoption(estimate.now, estimate.limit_radps, estimate.settled, sentences, record)
+        gains = estimate.settled or limited
+        return Adoption(estimate.now, limit_radps, gains, sentences, record)
 
     # ------------------------------------------------------------------ work, in pieces
 
     def _due(self, phase: Phase, time_s: float) -> Work | None:
         """The work to begin now."""
+        if self._link is not None:
+            return self._follow_link(*self._link)
         if not self._settings.online:
             return None
         if not self._identified:
@@ -256,6 +269,12 @@ class OnlineIdentification:
         if phase is Phase.EXCITE:
             return self._left_box or time_s >= self._excite_s + LENGTH_S
         return phase in MOVING and not self.wants_excitation
+
+    def _follow_link(self, added_s: float, changed_s: float) -> Work:
+        """Adapt the bandwidth to the link as it is now."""
+        self._link = None
+        self._sentences += self._estimate.on_link(added_s, changed_s)
+        yield
 
     def _identify_all(self, phase: Phase) -> Work:
         """Identify everything from climb and steps; repeat the steps if the tilt is uncertain."""
