@@ -57,9 +57,11 @@ def compare(
         from offboard.analysis.trial import check_flyable, fly_trial
         from offboard.flight import clock
         from offboard.flight.request import FlightRequest
+        from offboard.flight.sitl import check_scenario_named
 
         if connect is None:
-            _check_scenarios(scenarios)
+            for name in scenarios:
+                check_scenario_named(name)
         directory = out_directory or FLIGHTS / f"compare-{clock.local_stamp()}"
         request = FlightRequest(
             directory=directory,
@@ -81,15 +83,6 @@ def compare(
     )
     if problem:
         raise CommandError(problem, 4)
-
-
-def _check_scenarios(names: Sequence[str]) -> None:
-    """Check the scenario files that are not shipped. Raises DocumentError."""
-    from offboard.flight.sitl import check_scenario
-
-    for path in [shipped.locate(name, "scenarios", "scenario") for name in names]:
-        if shipped.directory() not in path.parents:
-            check_scenario(path)
 
 
 def _names(text: str, known: Sequence[str] = ()) -> list[str]:

@@ -10,8 +10,10 @@ from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, Phase
 from offboard.flight.state import FlightState
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.outgoing import CommandLong
+from offboard.mavlink.session import Session
 from offboard.model.command import Command
 
+FIT_EVERY_S = 4.0  # between two reductions of the telemetry: a backlog must drain first
 SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
 SPOOL_MAX = 2.0
 TAKEOFF_HEIGHT_M = 3.0  # of an autopilot's own take-off, which setpoints replace on the way
@@ -23,9 +25,17 @@ class PhaseActions:
     """The actions of one flight; they send through `outbox`."""
 
     def __init__(
-        self, *, state: FlightState, observer: Observer, decider: Decider, outbox: Outbox
+        self,
+        *,
+        state: FlightState,
+        session: Session,
+        observer: Observer,
+        decider: Decider,
+        outbox: Outbox,
     ) -> None:
         self._state = state
+        self._session = session
+        self._fitted_s = 0.0  # in the phase HEALTH
         self._observer = observer
         self._decider = decider
         self._outbox = outbox
@@ -87,6 +97,7 @@ class PhaseActions:
     def _prepare(self, tick: Tick) -> None:
         if tick.phase is Phase.HEALTH:
             self._request_parameters()
+            self._fit_telemetry(tick.in_phase_s)
             return
         if tick.phase is Phase.ENGAGE:
             self._engage()
@@ -112,6 +123,19 @@ class PhaseActions:
         stale = state.vehicle.mode == self._dialect.engage_mode and state.vehicle.disarmed
         if stale and not state.vehicle.prearm_ok:  # PX4 returns to OFFBOARD after a landing
             self._outbox.request(self._dialect.hold())
+
+    def _fit_telemetry(self, in_phase_s: float) -> None:
+        """Request less telemetry while the link delays by more than can be flown: it may be
+        saturated."""
+        link, limits = self._state.link.estimate, self._state.limits
+        if in_phase_s - self._fitted_s < FIT_EVERY_S or link is None:
+            return
+        if link.value > limits.link_delay_s or link.sd > limits.link_jitter_s:
+            self._fitted_s = in_phase_s
+            if self._session.thin_telemetry():
+                self._state.link.reset()
+                delay = f"{1e3 * link.value:.0f} +- {1e3 * link.sd:.0f} ms"
+                self._outbox.announce(f"the link delays by {delay}: less telemetry is requested")
 
     def _take_off(self, tick: Tick) -> None:
         if self._state.takes_off_by_command:

@@ -103,7 +103,11 @@ class Companion:
             outbox=self._outbox,
         )
         self._actions = PhaseActions(
-            state=state, observer=observer, decider=decider, outbox=self._outbox
+            state=state,
+            session=session,
+            observer=observer,
+            decider=decider,
+            outbox=self._outbox,
         )
 
     # ------------------------------------------------------------------ interface
@@ -128,11 +132,6 @@ class Companion:
     def request_stop(self, why: str = STOPPED) -> None:
         """Land, or do not take off; takes effect at the next turn."""
         self.state.stop_reason = self.state.stop_reason or why
-
-    def lose_authority(self, reason: str) -> None:
-        """The vehicle is not ours any more: nothing is sent to it from now on."""
-        if self.state.authority is not None:
-            self.state.authority.lose(reason)
 
     def announce(self, sentence: str) -> None:
         """Report a sentence to the user, the ground station and the log."""

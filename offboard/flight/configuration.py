@@ -124,8 +124,9 @@ def build_controller(config: FlightConfig) -> Controller:
     settings = config.controller
     try:
         return settings.build(config.vehicle, period_s=config.period_s, seed=config.seed)
-    except ValueError as error:
-        raise DocumentError(f"controller {settings.law}: {error}") from None
+    except Exception as error:  # of a controller from outside, anything
+        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
+        raise DocumentError(f"controller {settings.law}: {kind}{error}") from error
 
 
 def check_file(path: Path, check_scenario: Callable[[Path], None]) -> str:

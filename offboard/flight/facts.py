@@ -21,6 +21,7 @@ class Facts:
     rebooted: bool  # after its telemetry was complete
     engaged: bool  # the vehicle shows the mode in which it follows setpoints
     lost: bool  # the vehicle is not ours any more
+    shown_since: bool  # and a HEARTBEAT has come since then
     authority_known: bool
     failsafe: bool  # the vehicle shows a failsafe or an emergency
     armed: bool

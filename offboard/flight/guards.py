@@ -121,8 +121,12 @@ def lost(now: Facts) -> bool:
 
 
 def lost_armed(now: Facts) -> bool:
-    """A pilot changed the mode while the vehicle armed: it stays armed, as the pilot decides."""
-    return now.armed and now.lost
+    """A pilot has changed the mode of a vehicle that stays armed."""
+    return now.lost and now.shown_since and now.armed
+
+
+def lost_disarmed(now: Facts) -> bool:
+    return now.lost and now.shown_since and not now.armed
 
 
 def disarmed_again(now: Facts) -> bool:

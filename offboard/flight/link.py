@@ -59,9 +59,11 @@ class Strangers:
 
 
 class Link(Protocol):
-    """Non-blocking byte channel. `is_stream`: received chunks may end within a frame."""
+    """Non-blocking byte channel. `is_stream`: received chunks may end within a frame.
+    `capacity_bytes_ps` of each direction; None: unknown."""
 
     is_stream: bool
+    capacity_bytes_ps: float | None
     strangers: Strangers
 
     def receive(self, timeout_s: float) -> list[Chunk]:

@@ -6,6 +6,7 @@ Everything slow (compilation, start of a simulator) happens before telemetry is 
 from __future__ import annotations
 
 import math
+import traceback
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -21,6 +22,7 @@ from offboard.flight import clock, manifest
 from offboard.flight.companion import Companion, Outcome
 from offboard.flight.connection import open_link, open_lockstep_link
 from offboard.flight.flight_plan import FlightPlan
+from offboard.flight.gate import usable
 from offboard.flight.link import Link
 from offboard.flight.log import FlightLog
 from offboard.flight.loop import Loop
@@ -33,7 +35,7 @@ from offboard.flight.supervisor import Supervisor
 from offboard.flight.udp_link import LockstepLink
 from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
-from offboard.model.command import Command
+from offboard.model.command import Command, PositionCommand
 from offboard.model.vehicle import Vehicle
 from offboard.reference.track import Track
 from offboard.reference.transfer import Hold
@@ -89,8 +91,8 @@ class FlightParts:
 def rehearse(parts: FlightParts, *, keeps_deadline: bool) -> None:
     """Call every code path of observer and controller, so that nothing is compiled in flight.
 
-    A pause of seconds at the first decision in flight is a crash. With `keeps_deadline`, raises
-    DocumentError if a decision cannot meet the deadline.
+    A pause of seconds at the first decision in flight is a crash. Raises DocumentError if the
+    control law fails or, with `keeps_deadline`, if a decision cannot meet the deadline.
     """
     observer = parts.make_observer()
     reference = Hold((0.0, 0.0, -2.0), 0.1)
@@ -105,7 +107,7 @@ def rehearse(parts: FlightParts, *, keeps_deadline: bool) -> None:
         if step >= 20 and step % 10 == 0:
             state = observer.predict(time_s)
             situation = Situation(time_s, state, reference, previous, lambda: parts.deadline_s)
-            command = parts.controller.decide(situation).command
+            command = _decided(parts.controller, situation)
             if isinstance(command, Command):
                 previous = command
                 observer.on_command(time_s, command)
@@ -113,6 +115,21 @@ def rehearse(parts: FlightParts, *, keeps_deadline: bool) -> None:
         _check_deadline(parts, replace(situation, remaining_s=lambda: 0.0))
     parts.track.sample(np.array([0.0, 1.0]))
     parts.controller.reset()
+
+
+def _decided(controller: Controller, situation: Situation) -> Command | PositionCommand:
+    """The command of a decision. Raises DocumentError if the law fails: better here than in
+    flight."""
+    try:
+        command = controller.decide(situation).command
+    except Exception as error:
+        where = traceback.extract_tb(error.__traceback__)[-1]
+        raise DocumentError(
+            f"controller: {type(error).__name__}: {error} ({where.filename}:{where.lineno})"
+        ) from error
+    if not usable(command):
+        raise DocumentError(f"controller: it decides {command}, which cannot be sent")
+    return command
 
 
 def _check_deadline(parts: FlightParts, cut_short: Situation) -> None:
@@ -166,6 +183,7 @@ def fly(
                 component_id=COMPONENT_ID,
                 record_component_id=RECORD_COMPONENT_ID,
                 stream=link.is_stream,
+                capacity_bytes_ps=None if bundled else link.capacity_bytes_ps,
                 lockstep=bundled is not None,
                 sends_first=not (bundled or connection.startswith("udpin")),
                 extra_wanted=POSITIONING_TELEMETRY if fuses else (),

@@ -8,7 +8,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from offboard.documents.reading import DocumentError
-from offboard.documents.shipped import locate, read_text
 from offboard.estimation.fusion import observer_of
 from offboard.flight.companion import Companion, Outcome
 from offboard.flight.configuration import (
@@ -21,7 +20,7 @@ from offboard.flight.configuration import (
 )
 from offboard.flight.log import FlightLog
 from offboard.flight.one_flight import Bundled, FlightParts, fly
-from offboard.flight.sitl import OWN_VEHICLES, SimulatorProcess
+from offboard.flight.sitl import OWN_VEHICLES, SimulatorProcess, check_scenario_named
 from offboard.flight.stop import StopRequests
 
 
@@ -63,7 +62,7 @@ class FlightRequest:
             known = ", ".join(OWN_VEHICLES)
             raise DocumentError(f"--firmware {self.firmware}: unknown; there is {known}")
         if self.scenario is not None:
-            read_text(locate(self.scenario, "scenarios", "scenario"))
+            check_scenario_named(self.scenario)
         if self.sim_vehicle is not None:
             read_part("vehicle", self.sim_vehicle)
 

@@ -15,9 +15,11 @@ import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from types import TracebackType
 
+from offboard.documents import shipped
 from offboard.documents.reading import DocumentError
 
 OWN_VEHICLES = {"px4": "px4_sih", "ardupilot": "arducopter"}  # the simulator's default vehicles
@@ -32,6 +34,15 @@ class Ending:
 
     sentence: str
     unusable: bool
+
+
+@cache
+def check_scenario_named(name: str) -> None:
+    """Check the scenario of flights, by name or path; shipped ones are valid. Raises
+    DocumentError."""
+    path = shipped.locate(name, "scenarios", "scenario")
+    if shipped.directory() not in path.parents:
+        check_scenario(path)
 
 
 def check_scenario(path: Path) -> None:

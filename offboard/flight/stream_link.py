@@ -14,6 +14,7 @@ from offboard.flight.link import Chunk, LinkError, Strangers
 READ_BYTES = 65536
 BATCH_BYTES = 1 << 20  # of one call
 QUEUED_MAX = 50  # frames
+BITS_OF_A_BYTE = 10  # on a serial line: start, eight bits, stop
 SETPOINTS = frozenset({82, 84, 86})  # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_*
 TCP_NOTSENT_LOWAT = 25  # Linux's option, which the socket module names since Python 3.12
 
@@ -24,8 +25,15 @@ class StreamLink:
 
     is_stream = True
 
-    def __init__(self, descriptor: int, name: str, close: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        descriptor: int,
+        name: str,
+        close: Callable[[], None],
+        capacity_bytes_ps: float | None = None,
+    ) -> None:
         self.strangers = Strangers()
+        self.capacity_bytes_ps = capacity_bytes_ps
         self._descriptor = descriptor
         self._name = name
         self._close = close
@@ -119,4 +127,4 @@ def serial_link(device: str, baud: int) -> StreamLink:
         port = serial.Serial(device, baud, timeout=0)
     except (serial.SerialException, ValueError, OverflowError) as error:
         raise LinkError(f"serial port {device} at {baud} baud cannot be opened: {error}") from None
-    return StreamLink(port.fileno(), "serial", port.close)
+    return StreamLink(port.fileno(), "serial", port.close, baud / BITS_OF_A_BYTE)

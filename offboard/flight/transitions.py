@@ -104,7 +104,7 @@ TRANSITIONS: tuple[Row, ...] = (
     _too_long(Phase.ENGAGE, "engage_s", Phase.FAILED, _NOT_ENGAGED, REFUSED),
     Row(Phase.ARM, guards.rebooted, Phase.FAILED, _REBOOTED, REFUSED),
     Row(Phase.ARM, guards.lost_armed, Phase.YIELDED, "{lost} as it armed", ABORTED),
-    Row(Phase.ARM, guards.lost, Phase.FAILED, "{lost}", REFUSED),
+    Row(Phase.ARM, guards.lost_disarmed, Phase.FAILED, "{lost}", REFUSED),
     Row(Phase.ARM, guards.silent, Phase.STAND_DOWN, _SILENT, REFUSED),
     Row(Phase.ARM, guards.blind, Phase.STAND_DOWN, _BLIND, REFUSED),
     Row(Phase.ARM, guards.stop_requested, Phase.STAND_DOWN, "{stop}", REFUSED),

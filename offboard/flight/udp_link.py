@@ -94,6 +94,7 @@ class UdpLink:
     """`listening` hears every sender, `vehicle` is connected to the vehicle; one may be missing."""
 
     is_stream = False
+    capacity_bytes_ps: float | None = None
 
     def __init__(self, listening: socket.socket | None, vehicle: socket.socket | None) -> None:
         self.strangers = Strangers()

@@ -42,7 +42,7 @@ from offboard.mavlink.events import (
 )
 from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Record, Timesync
 from offboard.mavlink.peer import Peer
-from offboard.mavlink.telemetry_rates import TelemetryRates
+from offboard.mavlink.telemetry_rates import SHARE, TelemetryRates, fitted
 from offboard.mavlink.texts import TextAssembler
 from offboard.mavlink.vehicle_time import Age, LinkTime, VehicleTime
 
@@ -63,7 +63,8 @@ class SessionSettings:
     `record_component_id` is the sender of records, which only our log holds; each component id has
     its own sequence numbers. `stream`: serial or TCP, bytes arrive in any portions. `sends_first`:
     send heartbeats before an autopilot was heard. `extra_wanted` is telemetry besides that of the
-    dialect. `lockstep`: the vehicle waits for our replies, and the host times given to `receive`
+    dialect. `capacity_bytes_ps` of the link limits the rates of telemetry that are requested; None:
+    unknown. `lockstep`: the vehicle waits for our replies, and the host times given to `receive`
     and `poll` are ignored, so that nothing that is sent depends on them.
     """
 
@@ -72,6 +73,7 @@ class SessionSettings:
     stream: bool = False
     sends_first: bool = False
     extra_wanted: tuple[WantedMessage, ...] = ()
+    capacity_bytes_ps: float | None = None
     lockstep: bool = False
 
 
@@ -109,6 +111,7 @@ class Session:
         self._arrival_s = 0.0  # vehicle time when the newest datagram arrived
         self._link_time = LinkTime()
         self._rates = TelemetryRates((), 0.0)
+        self._capacity_bytes_ps = settings.capacity_bytes_ps
         self._heartbeat_sent: tuple[float, float] | None = None  # host time, link time
 
     # --- in ---
@@ -260,7 +263,17 @@ class Session:
     def _restart_rates(self) -> None:
         assert self.dialect is not None
         wanted = (*self.dialect.wanted, *self.settings.extra_wanted)
+        if self._capacity_bytes_ps is not None:
+            wanted = fitted(wanted, self._capacity_bytes_ps)
         self._rates = TelemetryRates(wanted, self._link_time.seconds)
+
+    def thin_telemetry(self) -> bool:
+        """Request half of the telemetry from now on: the link is saturated. False if the rates are
+        the lowest already."""
+        before = self._rates.bytes_ps
+        self._capacity_bytes_ps = 0.5 * before / SHARE
+        self._restart_rates()
+        return self._rates.bytes_ps < 0.99 * before
 
     # --- out ---
 

@@ -2,22 +2,53 @@
 
 Rates are per second of `vehicle_time.LinkTime`, so that they mean the same in real time, at higher
 speed and in lockstep. A ground station may change the rates that we requested: therefore they are
-measured, and requested again. Knows message ids and times, no bytes.
+measured, and requested again. Knows message ids, sizes and times, no bytes.
 """
 
 from __future__ import annotations
 
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+
+from pymavlink.dialects.v20.ardupilotmega import mavlink_map
 
 from offboard.mavlink.dialects.base import WantedMessage
 
+SLOW_HZ = 20.0
+SHARE = 0.7  # of a link's capacity; the rest is for what is not requested
+FRAME_BYTES = 12  # of a MAVLink 2 frame besides its payload
+UNKNOWN_BYTES = 10  # of a payload that pymavlink does not know: CURRENT_MODE has 9
 _WINDOW_S = 2.0
 _ENOUGH = 0.7  # of the rate wanted; a window holds few samples of a slow message
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 3.0, 30.0
 _OPTIONAL_TRIES = 2
 _ARRIVALS_MAX = 4096  # limits the memory used when a link is flooded
+
+
+def fitted(wanted: Iterable[WantedMessage], bytes_ps: float) -> tuple[WantedMessage, ...]:
+    """`wanted` at rates that a link with a capacity of `bytes_ps` carries.
+
+    Messages at more than SLOW_HZ are thinned, all by the same factor, but not below SLOW_HZ: what
+    needs more than that is refused later, by the rates that arrive.
+    """
+    slow = [each for each in wanted if each.rate_hz <= SLOW_HZ]
+    fast = [each for each in wanted if each.rate_hz > SLOW_HZ]
+    left = SHARE * bytes_ps - _bytes_ps(slow)
+    factor = min(max(left / _bytes_ps(fast), 0.0), 1.0) if fast else 1.0
+    return (
+        *(replace(each, rate_hz=max(factor * each.rate_hz, SLOW_HZ)) for each in fast),
+        *slow,
+    )
+
+
+def _bytes_ps(wanted: Iterable[WantedMessage]) -> float:
+    return sum(each.rate_hz * (FRAME_BYTES + _payload_bytes(each.message_id)) for each in wanted)
+
+
+def _payload_bytes(message_id: int) -> int:
+    message = mavlink_map.get(message_id)
+    return message.unpacker.size if message else UNKNOWN_BYTES
 
 
 @dataclass(slots=True)
@@ -57,6 +88,11 @@ class TelemetryRates:
 
     def __init__(self, wanted: Iterable[WantedMessage], began_s: float) -> None:
         self._streams = {w.message_id: _Stream(w, began_s) for w in wanted}
+
+    @property
+    def bytes_ps(self) -> float:
+        """Bytes per second of all wanted messages at the rates requested."""
+        return _bytes_ps(stream.wanted for stream in self._streams.values())
 
     def count(self, message_id: int, now_s: float) -> None:
         """A message has arrived."""

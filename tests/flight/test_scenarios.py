@@ -257,7 +257,7 @@ ROWS = (
     ),
     stopped(Phase.HEALTH, 1.0, Phase.FAILED, nothing_sent),
     stopped(Phase.STREAM, 0.5, Phase.FAILED, never_armed),
-    stopped(Phase.ENGAGE, 0.1, Phase.FAILED, never_armed),
+    stopped(Phase.ENGAGE, 0.0, Phase.FAILED, never_armed),
     stopped(Phase.ARM, 0.0, Phase.FAILED, disarmed_by_us),
     stopped(Phase.ARM, 0.3, Phase.FAILED, disarmed_by_us),
     Row(

@@ -102,7 +102,7 @@ def test_heartbeat_interval_is_fixed_on_px4_and_set_on_ardupilot() -> None:
     ("firmware", "mode", "shown"),
     [(PX4, None, LOITER), (PX4, "POSCTL", POSCTL), (PX4, "RTL", 0x05040000),
      (ARDUPILOT, None, BRAKE), (ARDUPILOT, "LOITER", 5), (ARDUPILOT, "LAND", 9)],
-    ids=str,
+    ids=lambda each: getattr(each, "name", str(each)),
 )  # fmt: skip
 def test_the_pilot_chooses_a_mode(firmware: Firmware, mode: str | None, shown: int) -> None:
     bench = engaged({"fault": "pilot_takes_over", "mode": mode, "at_s": 1.0}, firmware=firmware)

@@ -1,0 +1,38 @@
+"""What is found out before a flight: a law that fails, a scenario that is wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from faults import failing, no_direction, raises
+
+from offboard.control.base import Controller
+from offboard.documents.reading import DocumentError
+from offboard.flight.configuration import load
+from offboard.flight.one_flight import rehearse
+from offboard.flight.request import FlightRequest, build_parts
+
+
+@pytest.mark.parametrize(
+    ("fail", "says"),
+    [
+        (raises, r"controller: ZeroDivisionError: nothing to divide by \(.*faults\.py:\d+\)"),
+        (no_direction, "controller: it decides Command.*, which cannot be sent"),
+    ],
+)
+def test_a_law_that_fails_is_found_before_the_flight(fail: object, says: str) -> None:
+    parts = build_parts(load("flight", known_vehicle="px4_sih"))
+    law: Controller = failing(fail, after=0)(parts.controller)  # type: ignore[arg-type]
+    with pytest.raises(DocumentError, match=says):
+        rehearse(replace(parts, controller=law), keeps_deadline=False)
+
+
+def test_a_wrong_scenario_leaves_no_directory(tmp_path: Path) -> None:
+    scenario = tmp_path / "bad.yaml"
+    scenario.write_text("conditions: {wind_ned_mps: [1, 2]}\n")
+    request = FlightRequest(tmp_path / "flight", sitl=True, scenario=str(scenario))
+    with pytest.raises(DocumentError, match="wind_ned_mps"):
+        request.resolve()
+    assert not (tmp_path / "flight").exists()
