@@ -35,6 +35,7 @@ from offboard.mavlink.events import (
     Origin,
     PeerChanged,
     Rebooted,
+    ThrustReport,
     TimesyncReply,
 )
 from offboard.mavlink.outgoing import Outgoing
@@ -237,11 +238,14 @@ class Companion:
             case LocalPosition(time_s, position, velocity):
                 self._on_telemetry(time_s, arrived_s)
                 state.contact.on_position(event)
+                state.hover.on_speed(time_s, velocity[2])
                 if state.touchdown:
                     state.touchdown.on_position(time_s, position, velocity[2])
                 self._observer.on_position(time_s, position, velocity)
                 if self._identification:
                     self._identification.on_position(time_s, position, velocity)
+            case ThrustReport(thrust):
+                state.hover.on_thrust(state.time_s, thrust)
             case Heartbeat(mode, _, status):
                 self._on_mode(mode, arrived_s, failsafe=status >= FAILSAFE_STATUS)
             case ModeReport(mode):

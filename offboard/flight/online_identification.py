@@ -165,6 +165,10 @@ class OnlineIdentification:
         if link is not None:
             self._sentences += self._estimate.apply_link_delay(link)
 
+    def on_hover_thrust(self, hover_thrust: float) -> None:
+        """The hover thrust that the vehicle showed before the take-over."""
+        self._estimate.apply_hover_thrust(hover_thrust)
+
     def on_link_growth(self, added_s: float, changed_s: float) -> None:
         """The link has added `added_s` to its delay since take-off, and changed by `changed_s`
         lately; see `LinkGrowth`. The times of commands contain the former."""

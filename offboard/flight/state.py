@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 from offboard.flight.authority import Authority
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact
+from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.ladder import Ladder
 from offboard.flight.link_age import LinkDelay, LinkGrowth, VehicleClock
 from offboard.flight.phases import ENDS, Limits, Phase
@@ -49,6 +50,7 @@ class FlightState:
     clock: VehicleClock = field(default_factory=VehicleClock)
     link: LinkDelay = field(default_factory=LinkDelay)
     growth: LinkGrowth = field(default_factory=LinkGrowth)
+    hover: HoverEstimate = field(default_factory=HoverEstimate)
     readiness: Readiness = field(default_factory=Readiness)
     ladder: Ladder = field(default_factory=Ladder)
     contact: GroundContact = field(init=False)

@@ -120,11 +120,16 @@ class VehicleEstimate:
         added_s = link.value - DIRECT_LINK_S
         sentences = []
         if added_s >= LINK_S:
-            self.target = self.now = self._from = with_added_delay(self._file, added_s)
+            self.target = self.now = self._from = with_added_delay(self.target, added_s)
             sentences = [f"link delay {_in_ms(link)}, telemetry and setpoint together"]
         self._unknown_s = self._unknown_delay_s + JUMP_SDS * link.sd
         self._vehicle_radps = self.cautious_radps = self._supported(self._unknown_s)
         return sentences
+
+    def apply_hover_thrust(self, hover_thrust: float) -> None:
+        """Begin with another hover thrust than the vehicle file's."""
+        update = {"hover_thrust": hover_thrust}
+        self.target = self.now = self._from = self.target.model_copy(update=update)
 
     def adopt(self, found: Identified, time_s: float) -> list[str]:
         """Begin to blend in what is within bounds."""
