@@ -33,7 +33,7 @@ LEAST_JUMP_S, JUMP_SDS = 0.015, 4.0  # delays that differ by more contradict eac
 DECISIVE = ("tilt", "hover_thrust")  # out of bounds, these end the flight
 MOST_CONTRADICTIONS = 2  # after so many the bandwidth stays low for the rest of the flight
 LINKED = ("yaw", "thrust_delay_s")  # changed with the tilt's delay where not identified themselves
-NOTICEABLE_RADPS = 0.5  # a smaller change for a later link is not announced
+NOTICEABLE_RADPS = 1.0  # a smaller change for a later link is not announced
 OUT_OF_BOUNDS = "it is out of bounds"
 
 
@@ -81,6 +81,7 @@ class VehicleEstimate:
         self.in_doubt = False
         self._unknown_s = self._unknown_delay_s
         self._link_radps = math.inf  # limit because the link became later
+        self._lowered_radps = 0.0  # by which this was lower than the vehicle's, as announced
         self._vehicle_radps = self.cautious_radps = self._supported(self._unknown_s)
         self.contradiction = ""  # why this vehicle file must not be flown with
 
@@ -219,7 +220,6 @@ class VehicleEstimate:
     def on_link(self, added_s: float, changed_s: float) -> list[str]:
         """Limit the bandwidth to what a link supports that has added `added_s` to its delay since
         take-off, which prediction compensates, and that changed by `changed_s` lately."""
-        before = self._in_use_radps
         self._link_radps = math.inf
         if added_s or changed_s:
             vehicle = with_added_delay(self.target, added_s)
@@ -227,8 +227,11 @@ class VehicleEstimate:
             self._link_radps = supported_bandwidth(
                 vehicle, self._bandwidth_radps, self._period_s, max(needed_s, changed_s)
             )
-        if abs(self._in_use_radps - before) < NOTICEABLE_RADPS:
+        lowered_radps = max(min(self._vehicle_radps, self._bandwidth_radps) - self._link_radps, 0.0)
+        news = abs(lowered_radps - self._lowered_radps) >= NOTICEABLE_RADPS
+        if not (news or (self._lowered_radps and not lowered_radps)):
             return []
+        self._lowered_radps = lowered_radps
         return [f"the link's delay has grown by {1e3 * added_s:.0f} ms; {self._bandwidth_text}"]
 
     def without_identification(self) -> list[str]:
