@@ -235,7 +235,7 @@ class Companion:
                 self._observer.on_attitude(time_s, attitude, rates)
                 if self._identification:
                     self._identification.on_attitude(time_s, attitude)
-            case LocalPosition(time_s, position, velocity):
+            case LocalPosition(time_s, position, velocity) if event is state.vehicle.position:
                 self._on_telemetry(time_s, arrived_s)
                 state.contact.on_position(event)
                 state.hover.on_speed(time_s, velocity[2])
