@@ -89,7 +89,7 @@ class PhaseActions:
             self._request_parameters()
             return
         if tick.phase is Phase.ENGAGE:
-            self._engage()
+            self._outbox.request(self._dialect.engage())
         elif tick.phase is Phase.ARM:
             self._outbox.request(CommandLong.arm())
         # On the ground without thrust; in the air with the thrust that hovers
@@ -99,11 +99,6 @@ class PhaseActions:
         thrust_mps2 = self._outbox.hover_mps2() if flying else 0.0
         command = Command(thrust_mps2, LEVEL, self._state.vehicle.course_rad)
         self._outbox.send_level(tick.time_s, command)
-
-    def _engage(self) -> None:
-        assert self._state.authority is not None
-        self._state.authority.ask()
-        self._outbox.request(self._dialect.engage())
 
     def _request_parameters(self) -> None:
         state = self._state
