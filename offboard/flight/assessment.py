@@ -15,7 +15,7 @@ from offboard.flight.facts import Facts
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.phases import Phase
 from offboard.flight.state import FlightState
-from offboard.mavlink.events import OtherSender
+from offboard.mavlink.events import Heartbeat, OtherSender
 from offboard.mavlink.session import Session
 from offboard.model.frames import thrust_direction_from_quaternion
 
@@ -51,6 +51,7 @@ def facts(
         rebooted=state.rebooted,
         engaged=authority is not None and authority.mode == authority.engage_mode,
         lost=authority is not None and authority.standing is Standing.LOST,
+        armed_since_lost=_armed_since_lost(state),
         authority_known=authority is not None and authority.known(state.now_s),
         failsafe=heartbeat is not None and heartbeat.system_status >= FAILSAFE_STATUS,
         armed=vehicle.armed,
@@ -169,6 +170,13 @@ def _problems(state: FlightState) -> list[str]:
     if state.dialect is None:
         return []
     return state.readiness.problems(state.dialect, state.vehicle.parameters)
+
+
+def _armed_since_lost(state: FlightState) -> bool:
+    """PX4 leaves AUTO.LAND as it disarms, and CURRENT_MODE shows that before HEARTBEAT does."""
+    vehicle, authority = state.vehicle, state.authority
+    heard_s = vehicle.heard_s.get(Heartbeat, -math.inf)
+    return authority is not None and vehicle.armed and heard_s > authority.lost_s
 
 
 def _disarmed_again(state: FlightState) -> bool:

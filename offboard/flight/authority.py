@@ -47,6 +47,7 @@ class Authority:
     mode: str = "unknown"
     reported_s: float = -math.inf  # time of the newest report
     lost_reason: str = ""
+    lost_s: float = math.inf  # time of the loss
     _asked_in: str = ""  # the mode shown when we asked
     _requested: set[str] = field(default_factory=set)
     _counts_from_s: float = -math.inf  # host time: what arrived before it is not evidence
@@ -62,14 +63,14 @@ class Authority:
             if mode == self.engage_mode:
                 self.standing = Standing.OURS
             elif mode != self._asked_in:
-                self.lose(f"it showed {mode} after {self.engage_mode} was asked for")
+                self.lose(f"it showed {mode} after {self.engage_mode} was asked for", now_s)
         elif self.standing is Standing.OURS and mode != self.engage_mode:
             if mode in self._requested:
                 self.standing = Standing.HANDED
             else:
-                self.lose(f"the vehicle left {self.engage_mode} for {mode}")
+                self.lose(f"the vehicle left {self.engage_mode} for {mode}", now_s)
         elif self.standing is Standing.HANDED and mode not in self._requested and not failsafe:
-            self.lose(f"the vehicle left {before} for {mode}")
+            self.lose(f"the vehicle left {before} for {mode}", now_s)
 
     def ask(self) -> None:
         """We ask for the mode in which the vehicle follows our setpoints."""
@@ -88,10 +89,10 @@ class Authority:
         self._counts_from_s = host_s - JUST_S
         self.reported_s = -math.inf
 
-    def lose(self, reason: str) -> None:
+    def lose(self, reason: str, now_s: float) -> None:
         """The vehicle is not ours any more, for good."""
         if self.standing is not Standing.LOST:
-            self.standing, self.lost_reason = Standing.LOST, reason
+            self.standing, self.lost_reason, self.lost_s = Standing.LOST, reason, now_s
 
     def known(self, now_s: float) -> bool:
         """Whether the newest report is recent enough to act on."""

@@ -132,7 +132,7 @@ class Companion:
     def lose_authority(self, reason: str) -> None:
         """The vehicle is not ours any more: nothing is sent to it from now on."""
         if self.state.authority is not None:
-            self.state.authority.lose(reason)
+            self.state.authority.lose(reason, self.state.now_s)
 
     def announce(self, sentence: str) -> None:
         """Report a sentence to the user, the ground station and the log."""

@@ -21,6 +21,7 @@ class Facts:
     rebooted: bool  # after its telemetry was complete
     engaged: bool  # the vehicle shows the mode in which it follows setpoints
     lost: bool  # the vehicle is not ours any more
+    armed_since_lost: bool  # and a later HEARTBEAT shows it armed
     authority_known: bool
     failsafe: bool  # the vehicle shows a failsafe or an emergency
     armed: bool

@@ -125,6 +125,10 @@ def lost_armed(now: Facts) -> bool:
     return now.armed and now.lost
 
 
+def taken_in_the_air(now: Facts) -> bool:
+    return now.armed_since_lost
+
+
 def disarmed_again(now: Facts) -> bool:
     return now.disarmed_again
 

@@ -166,7 +166,7 @@ TRANSITIONS: tuple[Row, ...] = (
         ABORTED,
     ),
     Row(Phase.LAND, guards.silent_for_long, Phase.FAILED, f"{_SILENT} while landing", ABORTED),
-    Row(Phase.LAND, guards.lost_armed, Phase.YIELDED, "{lost}", ABORTED),
+    Row(Phase.LAND, guards.taken_in_the_air, Phase.YIELDED, "{lost}", ABORTED),
     _too_long(
         Phase.LAND,
         "land_s",
