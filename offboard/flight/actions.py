@@ -63,9 +63,10 @@ class PhaseActions:
         dialect, authority = self._dialect, self._state.authority
         assert authority is not None
         holds = tick.phase is Phase.HOLD
-        if authority.mode != (dialect.hold_mode if holds else dialect.land_mode):
-            authority.request(dialect.hold_mode if holds else dialect.land_mode)
-            self._outbox.request(dialect.hold() if holds else dialect.land())
+        mode = dialect.hold_mode if holds else dialect.land_mode
+        if authority.mode != mode:
+            if self._outbox.request(dialect.hold() if holds else dialect.land()):
+                authority.request(mode)
         elif not holds:
             self._disarm_if_standing(tick)
         if steers and authority.mode == authority.engage_mode and tick.in_phase_s < LAND_STREAM_S:
