@@ -89,8 +89,7 @@ class Authority:
 
     def request(self, mode: str) -> None:
         """We ask for `mode` as the end of the flight."""
-        if mode not in self._requested:
-            self._requested.append(mode)
+        self._requested.append(mode)
 
     def doubt(self, host_s: float) -> None:
         """After a gap of our own that ended at `host_s`: only reports that arrive later, or have
