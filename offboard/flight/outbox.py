@@ -189,7 +189,7 @@ class Outbox:
 
     def flush(self, received: list[bytes], guard: Guard | None = None) -> Output:
         """Encode the queue. In the log, the frames `received` come first."""
-        frames = [(message, self._session.encode(message)) for message in self._queue]
-        self._queue.clear()
+        queue, self._queue = self._queue, []  # empty, should one of them not be encodable
+        frames = [(message, self._session.encode(message)) for message in queue]
         send = tuple(frame for message, frame in frames if not isinstance(message, Record))
         return Output(send, (*received, *(frame for _, frame in frames)), guard)
