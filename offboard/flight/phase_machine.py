@@ -86,8 +86,6 @@ class PhaseMachine:
             self._begin_engaging()
         elif row.target is Phase.TAKEOFF:
             self._begin_takeoff()
-        elif row.target is Phase.ENGAGE:
-            self._adopt_hover_thrust()
         elif row.target is Phase.CLIMB:
             self._begin_climb(in_the_air=row.source is Phase.ENGAGE)
         elif row.target is Phase.JOIN:
@@ -111,6 +109,7 @@ class PhaseMachine:
         """Here, not with the request: a vehicle that shows the mode already passes without one."""
         assert self._state.authority is not None
         self._state.authority.ask()
+        self._adopt_hover_thrust()
 
     def _begin_takeoff(self) -> None:
         position = self._state.vehicle.position
