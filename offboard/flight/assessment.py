@@ -75,7 +75,7 @@ def facts(
         missed_decisions=state.missed,
         contradicted=identification is not None and bool(identification.contradiction),
         telemetry_age_s=age_s,
-        link_growth_s=max(state.link.growth_s, age_s),
+        link_growth_s=state.link_growth_s,
         clock_jump_s=state.clock.jumped_s,
         battery=1.0 if charge is None else charge,
         other_sender=vehicle.age_s(OtherSender) < OTHER_SENDER_S,
