@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from offboard.flight.link_delay import DELAY_MAX_S, LinkDelay
 
+from offboard.flight.link_age import DELAY_MAX_S, LinkDelay
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import VehicleEstimate
 from offboard.mavlink.events import TimesyncReply
