@@ -51,11 +51,12 @@ class Happening:
 
 
 SOON = st.sampled_from([0.0, 0.1, 0.5])
+WAITED = st.sampled_from([0.0, 0.0, 0.5, 0.7, 3.0])
 AFTER = st.one_of(SOON, st.floats(0.0, 4.0))
 
 
 def reports(modes: st.SearchStrategy[str], after: st.SearchStrategy[float] = AFTER):
-    return st.builds(Happening, st.just("report"), after, modes, st.booleans(), SOON)
+    return st.builds(Happening, st.just("report"), after, modes, st.booleans(), WAITED)
 
 
 def several(mode: str):
@@ -75,7 +76,7 @@ INSERTED = st.one_of(
     reports(SHOWN),
     reports(SHOWN),
     st.builds(Happening, st.just("request"), AFTER, st.sampled_from("HL")),
-    st.builds(Happening, st.sampled_from(["ask", "pause", "lose"]), AFTER),
+    st.builds(Happening, st.sampled_from(["ask", "pause", "pause", "lose"]), AFTER),
 )
 INSERTIONS = st.lists(st.tuples(st.integers(0, 14), INSERTED), max_size=4)
 
