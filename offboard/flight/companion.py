@@ -18,6 +18,7 @@ from offboard.flight.actions import PhaseActions
 from offboard.flight.authority import Authority
 from offboard.flight.decide import Decider, Tick
 from offboard.flight.flight_plan import FlightPlan
+from offboard.flight.ground_contact import GroundContact
 from offboard.flight.link import Chunk
 from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
 from offboard.flight.outbox import Outbox, Output
@@ -171,7 +172,7 @@ class Companion:
         if vehicle is None:
             return None
         ours = state.phase not in BEFORE_FLIGHT and not state.has_ended and state.may_command
-        return Guard(vehicle, ours, state.vehicle.armed)
+        return Guard(vehicle, ours, state.vehicle.armed, holding=state.phase is Phase.HOLD)
 
     # ------------------------------------------------------------------ one turn
 
@@ -257,7 +258,9 @@ class Companion:
 
     def _on_telemetry(self, stamp_s: float, arrived_s: float) -> None:
         self._arrived_s = arrived_s
-        self.state.clock.on_telemetry(stamp_s, self._clock_s(arrived_s))
+        # A stream says only how early it may have arrived: after a pause of ours it would be ahead
+        host_s = self._turned_s if self._session.settings.stream else arrived_s
+        self.state.clock.on_telemetry(stamp_s, self._clock_s(host_s))
 
     def _clock_s(self, host_s: float) -> float:
         """Host time; in lockstep, where host time must decide nothing, the link's own seconds."""
@@ -276,6 +279,7 @@ class Companion:
         self._observer.reset()
         state.link.reset()
         state.clock.reset()
+        state.contact = GroundContact(state.vehicle)
         state.authority = None
         self._tick = -1
         self._machine.on_reboot()
