@@ -185,6 +185,7 @@ class Ladder:
     def __init__(self, rows: tuple[Row, ...] = ROWS) -> None:
         self._rows = rows
         self._held_s: Mapping[str, float] = {}
+        self._exceeded: Mapping[str, bool] = {}
         self._stepped_s: float | None = None
         self.worst: Row | None = None
 
@@ -198,12 +199,16 @@ class Ladder:
         self._stepped_s = time_s
         exceeded = {row.name: row.exceeded(now) for row in self._rows}
         self._held_s = {name: self._held(name, holds, step_s) for name, holds in exceeded.items()}
+        self._exceeded = exceeded
         active = [r for r in self._rows if exceeded[r.name] and self._held_s[r.name] >= r.delay_s]
         self.worst = max(active, key=lambda row: row.rung, default=None)
 
     def _held(self, name: str, holds: bool, step_s: float) -> float:
         held_s = self._held_s.get(name, 0.0)
-        return held_s + step_s if holds else max(held_s - RECOVERY * step_s, 0.0)
+        if not holds:
+            return max(held_s - RECOVERY * step_s, 0.0)
+        # one sample after a gap of telemetry does not say that it has held during the gap
+        return held_s + step_s if self._exceeded.get(name) else held_s
 
 
 def markdown() -> str:
