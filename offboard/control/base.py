@@ -24,7 +24,8 @@ class Situation:
     """Everything a controller knows at one control tick.
 
     Attributes:
-        time_s: Vehicle time of the tick (`time_boot_ms` of the telemetry), s.
+        time_s: Vehicle time of the tick (`time_boot_ms` of the telemetry), s; later by what the
+            link has added to its delay since take-off.
         state: The state predicted for the time at which a command sent now takes effect; that time
             is `state.time_s`.
         reference: The trajectory to follow. Its time axis is vehicle time, its positions are in

@@ -23,7 +23,7 @@ from offboard.flight.link import Chunk
 from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
 from offboard.flight.outbox import Outbox, Output
 from offboard.flight.phase_machine import PhaseMachine
-from offboard.flight.phases import BEFORE_FLIGHT, Limits, Phase
+from offboard.flight.phases import BEFORE_FLIGHT, FLYING, Limits, Phase
 from offboard.flight.state import FlightState, Outcome
 from offboard.flight.supervisor import Guard
 from offboard.mavlink.events import (
@@ -36,6 +36,7 @@ from offboard.mavlink.events import (
     Origin,
     PeerChanged,
     Rebooted,
+    ThrustReport,
     TimesyncReply,
 )
 from offboard.mavlink.outgoing import Outgoing
@@ -235,14 +236,17 @@ class Companion:
                 self._observer.on_attitude(time_s, attitude, rates)
                 if self._identification:
                     self._identification.on_attitude(time_s, attitude)
-            case LocalPosition(time_s, position, velocity):
+            case LocalPosition(time_s, position, velocity) if event is state.vehicle.position:
                 self._on_telemetry(time_s, arrived_s)
                 state.contact.on_position(event)
+                state.hover.on_speed(time_s, velocity[2])
                 if state.touchdown:
                     state.touchdown.on_position(time_s, position, velocity[2])
                 self._observer.on_position(time_s, position, velocity)
                 if self._identification:
                     self._identification.on_position(time_s, position, velocity)
+            case ThrustReport(thrust):
+                state.hover.on_thrust(state.time_s, thrust)
             case Heartbeat(mode, _, status):
                 self._on_mode(mode, arrived_s, failsafe=status >= FAILSAFE_STATUS)
             case ModeReport(mode):
@@ -278,6 +282,7 @@ class Companion:
         state = self.state
         self._observer.reset()
         state.link.reset()
+        state.growth.reset()
         state.clock.reset()
         state.contact = GroundContact(state.vehicle)
         state.authority = None
@@ -295,6 +300,8 @@ class Companion:
         missed = number - self._tick - 1 if self._tick >= 0 else 0
         self._tick = number
         self._machine.advance()
+        if state.phase in FLYING:
+            self._follow_link(time_s)
         if not state.has_ended:
             self._actions.act(
                 Tick(
@@ -308,6 +315,11 @@ class Companion:
             )
             self._recorded_strangers = self.strangers
             self._outbox.send(state.link.request(time_s))
+
+    def _follow_link(self, time_s: float) -> None:
+        growth = self.state.growth
+        if growth.step(time_s, self.state.link_growth_s) and self._identification:
+            self._identification.on_link_growth(growth.added_s, growth.changed_s)
 
     def _bridge(self, silence_s: float) -> None:
         """Without telemetry: a level setpoint each period of host time, until a transition."""

@@ -143,16 +143,17 @@ class Decider:
     def _decided(self, tick: Tick) -> Decided:
         plan = self._state.plan
         assert plan.reference is not None
-        state = self._observer.predict(tick.time_s)
+        sent_s = self._state.sent_s(tick.time_s)
+        state = self._observer.predict(sent_s)
         began_s = self._stopwatch()
         situation = Situation(
-            tick.time_s,
+            sent_s,
             state,
             plan.reference,
             previous=self._outbox.command,
             remaining_s=self._remaining(began_s),
             origin_ned_m=plan.origin_ned_m,
-            track_time_s=plan.track_time_s(tick.time_s),
+            track_time_s=plan.track_time_s(sent_s),
         )
         decision = self._controller.decide(situation)
         return Decided(state, decision, self._stopwatch() - began_s)

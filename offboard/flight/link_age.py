@@ -9,6 +9,8 @@ Two measures, on the vehicle's clock:
 - `VehicleClock`, by the arrival of telemetry: the vehicle time now, as far as the least delayed
   telemetry of the last seconds shows. Newest telemetry that is older has been delayed more than
   usual, by a backlog or a stop of this process.
+
+`LinkGrowth` keeps what both show the link to have added since take-off.
 """
 
 from __future__ import annotations
@@ -27,6 +29,7 @@ NORMAL = 1.4826  # standard deviation of a normal distribution / median absolute
 WINDOW_S, BIN_S = 5.0, 0.1
 RATE_OVER_S = 1.0  # the least stretch from which the rate of the clock is taken
 REAL_TIME = 0.05  # a rate that differs from 1 by less is that of a vehicle in real time
+LEAST_GROWTH_S, STEADY_S = 0.01, 5.0  # see `LinkGrowth`
 JUMP_S = 0.5  # a stamp further ahead of the vehicle time now shows a jump of the clock
 
 
@@ -136,3 +139,31 @@ class LinkDelay:
         if math.isnan(self._settled_s) or len(newest) < REPLIES_NEWEST:
             return 0.0
         return statistics.median(newest) - self._settled_s
+
+
+class LinkGrowth:
+    """What the link has added to its delay since take-off, for prediction and bandwidth.
+
+    `added_s` follows changes of more than LEAST_GROWTH_S. `changed_s` is by how much it changed
+    within the last STEADY_S: a delay that changes is not known better than that.
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Nothing was added."""
+        self.added_s = self.changed_s = 0.0
+        self._history: deque[tuple[float, float]] = deque(((-math.inf, 0.0),))  # from when, added_s
+
+    def step(self, time_s: float, growth_s: float) -> bool:
+        """Take the growth at vehicle time `time_s`; returns whether anything changed."""
+        before = self.added_s, self.changed_s
+        if abs(growth_s - self.added_s) > LEAST_GROWTH_S:
+            self.added_s = growth_s
+            self._history.append((time_s, growth_s))
+        while len(self._history) > 1 and self._history[1][0] <= time_s - STEADY_S:
+            self._history.popleft()
+        values_s = [added_s for _, added_s in self._history]
+        self.changed_s = max(values_s) - min(values_s)
+        return before != (self.added_s, self.changed_s)

@@ -41,6 +41,7 @@ DRAG_NEWS_PS = 0.03  # a smaller change of drag is not adopted
 # Prediction: how often and over how much flight it is compared with the tilt, and after how many
 # contradictions in a row the estimate is in doubt.
 COMPARE_EVERY_S, COMPARE_OVER_S, COMPARE_TIMES = 0.5, 2.0, 2
+LINK_DIGITS = 2  # of seconds: a smaller change of the link changes no bandwidth
 MOVING = (Phase.JOIN, Phase.TRACK)
 
 Work = Generator[None, None, None]
@@ -78,7 +79,7 @@ class Adoption:
 
     vehicle: Vehicle
     bandwidth_limit_radps: float
-    gains: bool  # whether the controller should compute its gains anew: at the end of a blend
+    gains: bool  # whether to compute the gains anew: at the end of a blend, or at a lower limit
     sentences: tuple[str, ...] = ()
     record: tuple[float, ...] = ()
 
@@ -129,6 +130,9 @@ class OnlineIdentification:
         self._identified = False
         self._gave_up = False
         self._left_box = False
+        self._limit_radps = self._estimate.limit_radps  # as adopted
+        self._link = (0.0, 0.0)  # growth and change
+        self._link_is_new = False  # not yet taken into account
         self._work: Work | None = None
         self._sentences: list[str] = []
         self._record: tuple[float, ...] = ()
@@ -163,6 +167,17 @@ class OnlineIdentification:
         if link is not None:
             self._sentences += self._estimate.apply_link_delay(link)
 
+    def on_hover_thrust(self, hover_thrust: float) -> None:
+        """The hover thrust that the vehicle showed before the take-over."""
+        self._estimate.apply_hover_thrust(hover_thrust)
+
+    def on_link_growth(self, added_s: float, changed_s: float) -> None:
+        """The link has added `added_s` to its delay since take-off, and changed by `changed_s`
+        lately; see `LinkGrowth`. The times of commands contain the former."""
+        link = round(added_s, LINK_DIGITS), round(changed_s, LINK_DIGITS)
+        if link != self._link:
+            self._link, self._link_is_new = link, True
+
     def on_phase(self, phase: Phase, time_s: float) -> None:
         """The flight has entered `phase`."""
         if not self._settings.online:
@@ -186,6 +201,11 @@ class OnlineIdentification:
     def cautious_bandwidth_radps(self) -> float:
         """Bandwidth limit until the delay is identified."""
         return self._estimate.cautious_radps
+
+    @property
+    def bandwidth_limit_radps(self) -> float:
+        """The bandwidth limit that was adopted last."""
+        return self._limit_radps
 
     def excited(self, command: Command, time_s: float, error_m: float) -> Command:
         """In the phase EXCITE: `command` with its step, until the vehicle leaves the box."""
@@ -223,15 +243,22 @@ class OnlineIdentification:
         sentences, self._sentences = tuple(self._sentences), []
         record, self._record = self._record, ()
         estimate = self._estimate
-        if estimate.settled and not sentences and not record:
+        limit_radps = estimate.limit_radps
+        lowered = limit_radps < self._limit_radps
+        news = sentences or record or limit_radps != self._limit_radps
+        if estimate.settled and not news:
             return None
+        self._limit_radps = limit_radps
         estimate.step(time_s)
-        return Adoption(estimate.now, estimate.limit_radps, estimate.settled, sentences, record)
+        gains = estimate.settled or lowered
+        return Adoption(estimate.now, limit_radps, gains, sentences, record)
 
     # ------------------------------------------------------------------ work, in pieces
 
     def _due(self, phase: Phase, time_s: float) -> Work | None:
         """The work to begin now."""
+        if self._link_is_new:
+            return self._follow_link(*self._link)
         if not self._settings.online:
             return None
         if not self._identified:
@@ -256,6 +283,12 @@ class OnlineIdentification:
         if phase is Phase.EXCITE:
             return self._left_box or time_s >= self._excite_s + LENGTH_S
         return phase in MOVING and not self.wants_excitation
+
+    def _follow_link(self, added_s: float, changed_s: float) -> Work:
+        """Adapt the bandwidth to the link as it is now."""
+        self._link_is_new = False
+        self._sentences += self._estimate.on_link(added_s, changed_s)
+        yield
 
     def _identify_all(self, phase: Phase) -> Work:
         """Identify everything from climb and steps; repeat the steps if the tilt is uncertain."""

@@ -86,7 +86,7 @@ class Outbox:
         self.set_command(time_s, command)
         self._state.commands.append(command)
         if self._identification:
-            self._identification.on_command(time_s, command)
+            self._identification.on_command(self._state.sent_s(time_s), command)
         self.send(
             AttitudeTarget(
                 time_s=time_s,
@@ -108,7 +108,7 @@ class Outbox:
     def set_command(self, time_s: float, command: Command) -> None:
         """Note the command in force without sending it, for example the autopilot's own."""
         self.command = command
-        self._observer.on_command(time_s, command)
+        self._observer.on_command(self._state.sent_s(time_s), command)
 
     def send_position(
         self, time_s: float, command: PositionCommand, *, age_s: float = 0.0, late_s: float = 0.0
@@ -189,7 +189,7 @@ class Outbox:
 
     def flush(self, received: list[bytes], guard: Guard | None = None) -> Output:
         """Encode the queue. In the log, the frames `received` come first."""
-        frames = [(message, self._session.encode(message)) for message in self._queue]
-        self._queue.clear()
+        queue, self._queue = self._queue, []  # empty, should one of them not be encodable
+        frames = [(message, self._session.encode(message)) for message in queue]
         send = tuple(frame for message, frame in frames if not isinstance(message, Record))
         return Output(send, (*received, *(frame for _, frame in frames)), guard)

@@ -10,6 +10,7 @@ from offboard.estimation.observer import Observer
 from offboard.flight import assessment
 from offboard.flight.decide import Decider
 from offboard.flight.facts import Facts
+from offboard.flight.hover_estimate import differs
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.outbox import Outbox
 from offboard.flight.phases import BEFORE_FLIGHT, FLYING, ExitCode, Phase
@@ -81,7 +82,9 @@ class PhaseMachine:
             if row.target is Phase.CLIMB:
                 self._identification.on_link_delay(state.link.estimate)
             self._identification.on_phase(row.target, state.time_s)
-        if row.target is Phase.TAKEOFF:
+        if row.target is Phase.ENGAGE:
+            self._begin_engaging()
+        elif row.target is Phase.TAKEOFF:
             self._begin_takeoff()
         elif row.target is Phase.CLIMB:
             self._begin_climb(in_the_air=row.source is Phase.ENGAGE)
@@ -102,6 +105,12 @@ class PhaseMachine:
         elif row.target is Phase.DISARMED and state.outcome is None:
             state.outcome = Outcome(ExitCode.FLOWN, "flown and landed")
 
+    def _begin_engaging(self) -> None:
+        """Here, not with the request: a vehicle that shows the mode already passes without one."""
+        assert self._state.authority is not None
+        self._state.authority.ask()
+        self._adopt_hover_thrust()
+
     def _begin_takeoff(self) -> None:
         position = self._state.vehicle.position
         assert position is not None
@@ -114,6 +123,7 @@ class PhaseMachine:
         if in_the_air:  # take-off point unknown: below the vehicle, at the height of its last rest
             down_m = state.contact.rest_down_m
             state.plan.origin_ned_m = (*position.position_ned_m[:2], down_m)
+        self._adopt_hover_thrust()
         self._observer.freeze(False)
         self._decider.begin()
         state.plan.start_climb(
@@ -121,4 +131,19 @@ class PhaseMachine:
             np.array(position.position_ned_m),
             np.array(position.velocity_ned_mps),
             state.vehicle.course_rad,
+        )
+
+    def _adopt_hover_thrust(self) -> None:
+        """Fly with the hover thrust that the autopilot's own flight shows, if it is another."""
+        state, model = self._state, self._state.model
+        shown = state.hover.hover_thrust(model, state.time_s) if state.contact.in_the_air else None
+        if shown is None or not differs(shown, model):
+            return
+        state.model = model.model_copy(update={"hover_thrust": shown})
+        self._observer.adopt(state.model)
+        if self._identification:
+            self._identification.on_hover_thrust(shown)
+        self._outbox.announce(
+            f"hover thrust {shown:.3f} by thrust and acceleration before the take-over, "
+            f"not {model.hover_thrust:.3f}"
         )

@@ -12,8 +12,9 @@ from dataclasses import dataclass, field
 from offboard.flight.authority import Authority
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact
+from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.ladder import Ladder
-from offboard.flight.link_age import LinkDelay, VehicleClock
+from offboard.flight.link_age import LinkDelay, LinkGrowth, VehicleClock
 from offboard.flight.phases import ENDS, Limits, Phase
 from offboard.flight.readiness import Readiness
 from offboard.flight.touchdown import Touchdown
@@ -48,6 +49,8 @@ class FlightState:
     vehicle: VehicleState = field(default_factory=VehicleState)
     clock: VehicleClock = field(default_factory=VehicleClock)
     link: LinkDelay = field(default_factory=LinkDelay)
+    growth: LinkGrowth = field(default_factory=LinkGrowth)
+    hover: HoverEstimate = field(default_factory=HoverEstimate)
     readiness: Readiness = field(default_factory=Readiness)
     ladder: Ladder = field(default_factory=Ladder)
     contact: GroundContact = field(init=False)
@@ -112,6 +115,17 @@ class FlightState:
             return "no LOCAL_POSITION_NED shows it"
         on_ground = vehicle.landed == "on_ground" and vehicle.age_s(Landed) < DETECTOR_KNOWN_S
         return self.touchdown.not_landed(on_ground=on_ground)
+
+    @property
+    def link_growth_s(self) -> float:
+        """What the link's delay has grown by since take-off."""
+        age_s = self.telemetry_age_s(self.host_s) if self.vehicle.has_state else 0.0
+        return max(self.link.growth_s, age_s)
+
+    def sent_s(self, time_s: float) -> float:
+        """The vehicle time from which the vehicle model's delays run for a command of the tick
+        `time_s`: later by what the link has added to its delay since take-off."""
+        return time_s + self.growth.added_s
 
     def telemetry_age_s(self, host_s: float) -> float:
         """Age of the newest telemetry at `host_s`, beyond the least delay of the link."""

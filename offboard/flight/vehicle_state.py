@@ -121,7 +121,7 @@ class VehicleState:
                 self.mode = mode
             case OtherSender():
                 self.other_sender = event
-            case LocalPosition():
+            case LocalPosition() if not self._repeats(event):
                 self.position = event
             case Attitude():
                 self.attitude = event
@@ -141,6 +141,17 @@ class VehicleState:
                     self.refusals.append(f"command {command} {result}")
             case Rebooted():
                 self._reset()
+
+    def _repeats(self, event: LocalPosition) -> bool:
+        """Whether it reports a motion, and nothing has changed: it is not new, whatever its
+        stamp."""
+        newest = self.position
+        return (
+            newest is not None
+            and event.position_ned_m == newest.position_ned_m
+            and event.velocity_ned_mps == newest.velocity_ned_mps
+            and any(event.velocity_ned_mps)
+        )
 
     def _detect_outage(self, time_s: float) -> None:
         """After an outage, a new one is accepted only once both streams have resumed: a slow

@@ -33,6 +33,7 @@ LEAST_JUMP_S, JUMP_SDS = 0.015, 4.0  # delays that differ by more contradict eac
 DECISIVE = ("tilt", "hover_thrust")  # out of bounds, these end the flight
 MOST_CONTRADICTIONS = 2  # after so many the bandwidth stays low for the rest of the flight
 LINKED = ("yaw", "thrust_delay_s")  # changed with the tilt's delay where not identified themselves
+NOTICEABLE_RADPS = 1.0  # a smaller change for a later link is not announced
 OUT_OF_BOUNDS = "it is out of bounds"
 
 
@@ -78,7 +79,10 @@ class VehicleEstimate:
         self._contradictions = 0
         self.delay: Estimate | None = None  # of the tilt, once identified
         self.in_doubt = False
-        self.limit_radps = self.cautious_radps = self._supported(self._unknown_delay_s)
+        self._unknown_s = self._unknown_delay_s
+        self._link_radps = math.inf  # limit because the link became later
+        self._lowered_radps = 0.0  # by which this was lower than the vehicle's, as announced
+        self._vehicle_radps = self.cautious_radps = self._supported(self._unknown_s)
         self.contradiction = ""  # why this vehicle file must not be flown with
 
     # ------------------------------------------------------------------ blending
@@ -117,11 +121,16 @@ class VehicleEstimate:
         added_s = link.value - DIRECT_LINK_S
         sentences = []
         if added_s >= LINK_S:
-            self.target = self.now = self._from = with_added_delay(self._file, added_s)
+            self.target = self.now = self._from = with_added_delay(self.target, added_s)
             sentences = [f"link delay {_in_ms(link)}, telemetry and setpoint together"]
-        unknown_s = self._unknown_delay_s + JUMP_SDS * link.sd
-        self.limit_radps = self.cautious_radps = self._supported(unknown_s)
+        self._unknown_s = self._unknown_delay_s + JUMP_SDS * link.sd
+        self._vehicle_radps = self.cautious_radps = self._supported(self._unknown_s)
         return sentences
+
+    def apply_hover_thrust(self, hover_thrust: float) -> None:
+        """Begin with another hover thrust than the vehicle file's."""
+        update = {"hover_thrust": hover_thrust}
+        self.target = self.now = self._from = self.target.model_copy(update=update)
 
     def adopt(self, found: Identified, time_s: float) -> list[str]:
         """Begin to blend in what is within bounds."""
@@ -203,6 +212,28 @@ class VehicleEstimate:
 
     # ------------------------------------------------------------------ bandwidth
 
+    @property
+    def limit_radps(self) -> float:
+        """The bandwidth that vehicle and link support, as they are known now."""
+        return min(self._vehicle_radps, self._link_radps)
+
+    def on_link(self, added_s: float, changed_s: float) -> list[str]:
+        """Limit the bandwidth to what a link supports that has added `added_s` to its delay since
+        take-off, which prediction compensates, and that changed by `changed_s` lately."""
+        self._link_radps = math.inf
+        if added_s or changed_s:
+            vehicle = with_added_delay(self.target, added_s)
+            needed_s = needed_margin(vehicle, self.delay.sd) if self.delay else self._unknown_s
+            self._link_radps = supported_bandwidth(
+                vehicle, self._bandwidth_radps, self._period_s, max(needed_s, changed_s)
+            )
+        lowered_radps = max(min(self._vehicle_radps, self._bandwidth_radps) - self._link_radps, 0.0)
+        news = abs(lowered_radps - self._lowered_radps) >= NOTICEABLE_RADPS
+        if not (news or (self._lowered_radps and not lowered_radps)):
+            return []
+        self._lowered_radps = lowered_radps
+        return [f"the link's delay has grown by {1e3 * added_s:.0f} ms; {self._bandwidth_text}"]
+
     def without_identification(self) -> list[str]:
         """What the bandwidth is limited to with the vehicle file as it is."""
         if self.limit_radps >= self._bandwidth_radps:
@@ -216,13 +247,13 @@ class VehicleEstimate:
         """Set the limit that the delay supports as it is known now; `refusal` is the reason why
         the tilt was not identified, if it was not."""
         if self.delay is None:
-            self.limit_radps = self.cautious_radps
+            self._vehicle_radps = self.cautious_radps
             return [f"{self._bandwidth_text}: tilt response not identified, {refusal}"]
-        before = min(self.limit_radps, self._bandwidth_radps)
+        before = self._in_use_radps
         supported = self._supported(needed_margin(self.target, self.delay.sd))
         self.in_doubt = self._contradictions >= MOST_CONTRADICTIONS
-        self.limit_radps = min(supported, self.limit_radps) if self.in_doubt else supported
-        if min(self.limit_radps, self._bandwidth_radps) == before:
+        self._vehicle_radps = min(supported, self._vehicle_radps) if self.in_doubt else supported
+        if self._in_use_radps == before:
             return []
         cause = " by the" if self.limit_radps < self._bandwidth_radps else ":"
         return [f"{self._bandwidth_text}{cause} identified delay, {_in_ms(self.delay)}"]
@@ -231,7 +262,11 @@ class VehicleEstimate:
         return supported_bandwidth(self.target, self._bandwidth_radps, self._period_s, needed_s)
 
     def _limit(self, limit_radps: float) -> None:
-        self.limit_radps = min(self.limit_radps, limit_radps)
+        self._vehicle_radps = min(self._vehicle_radps, limit_radps)
+
+    @property
+    def _in_use_radps(self) -> float:
+        return min(self.limit_radps, self._bandwidth_radps)
 
     @property
     def _bandwidth_text(self) -> str:

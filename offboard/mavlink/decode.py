@@ -140,6 +140,11 @@ def _attitude(payload: bytes, _: Dialect) -> events.Event | DropReason:
     return events.Attitude(boot_ms / 1000.0, (w / norm, x / norm, y / norm, z / norm), (p, q, r))
 
 
+def _thrust_report(payload: bytes, _: Dialect) -> events.Event | DropReason:
+    *_state, thrust, _mask = _unpack(mavlink.MAVLink_attitude_target_message, payload)
+    return events.ThrustReport(thrust) if 0.0 <= thrust <= 1.0 else DropReason.IMPLAUSIBLE
+
+
 def _gps_fix(payload: bytes, _: Dialect) -> events.Event | DropReason | None:
     stamp_us, latitude, longitude, altitude, _, _, speed, course, fix, _, _, accuracy, *_more = (
         _unpack(mavlink.MAVLink_gps_raw_int_message, payload)
@@ -232,6 +237,7 @@ _DECODERS: Mapping[int, Callable[[bytes, Dialect], events.Event | DropReason | N
     32: _local_position,
     49: _global_origin,
     77: _command_ack,
+    83: _thrust_report,
     242: _home,
     245: _landed,
     436: _current_mode,

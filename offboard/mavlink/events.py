@@ -69,6 +69,14 @@ class Attitude:
 
 
 @dataclass(frozen=True, slots=True)
+class ThrustReport:
+    """ATTITUDE_TARGET: the collective thrust that the autopilot demands of its motors, whatever
+    flies it. On ArduCopter before it is raised for the tilt."""
+
+    thrust: float  # normalised, 0 .. 1
+
+
+@dataclass(frozen=True, slots=True)
 class GpsFix:
     """GPS_RAW_INT with a 3D fix; `time_s` is None if its stamp is not vehicle time."""
 
@@ -157,6 +165,7 @@ Event = (
     | OtherSender
     | LocalPosition
     | Attitude
+    | ThrustReport
     | GpsFix
     | Origin
     | SystemHealth

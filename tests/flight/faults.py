@@ -17,7 +17,7 @@ from simulator.firmware.base import Firmware, Rule
 from simulator.firmware.values import Result, Severity, StatusText
 from simulator.instance import Instance
 
-HEARTBEAT, ATTITUDE, POSITION, PARAM_VALUE = 0, 31, 32, 22
+HEARTBEAT, ATTITUDE, POSITION, PARAM_VALUE, TIMESYNC, TARGET = 0, 31, 32, 22, 111, 83
 Action = Callable[[Pair], None]
 
 

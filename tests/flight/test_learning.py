@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 import pytest
-from pair import Filter, Pair, in_phase, make
+from faults import TIMESYNC, without
+from pair import Filter, Pair, in_phase, make, on_arducopter
 from scipy.interpolate import CubicHermiteSpline
-from test_ardupilot import on_arducopter
 
 from offboard.analysis import history
 from offboard.analysis.identify import identify_flight, vehicle_file
@@ -308,10 +308,12 @@ def delayed(extra_s: Callable[[], float]) -> Filter:
 
 
 def on_a_link_that_changes(extra_s: Callable[[], float]) -> Pair:
-    """Identified at its best, flown at bandwidth 7; two seconds on the path the uplink changes."""
+    """Identified at its best, flown at bandwidth 7; two seconds on the path the uplink changes.
+    The vehicle does not answer TIMESYNC, so only its motion shows the change."""
     pair = make(vehicle="px4_sih", scenario="px4_like", seed=1, learning=IDENTIFY)
     change = (in_phase(Phase.TRACK, 2.0), lambda flying: setattr(flying, "up", delayed(extra_s)))
     pair.at.append(change)
+    pair.down = without(TIMESYNC)
     return pair
 
 
@@ -369,6 +371,7 @@ def test_steps_are_repeated_while_the_delay_is_uncertain():
     pair = make(vehicle="px4_sih", reference="hover", scenario="px4_like", learning=IDENTIFY)
     late = delayed(lambda: chance.uniform(0.0, 0.15))
     pair.at.append((in_phase(Phase.EXCITE), lambda flying: setattr(flying, "up", late)))
+    pair.down = without(TIMESYNC)
     assert pair.fly().exit_code == 0
     sentence = "repeating the steps, tilt not identified: its delay (s) is uncertain: sd "
     assert any(line.startswith(sentence) for line in pair.companion.announced)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from offboard.flight.link_age import DELAY_MAX_S, LinkDelay
+from offboard.flight.link_age import DELAY_MAX_S, LEAST_GROWTH_S, STEADY_S, LinkDelay, LinkGrowth
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import VehicleEstimate
 from offboard.mavlink.events import TimesyncReply
@@ -82,3 +82,25 @@ def test_a_link_that_scatters_bears_less() -> None:
     steady.apply_link_delay(Estimate(0.2, 0.001))
     scattering.apply_link_delay(Estimate(0.2, 0.03))
     assert scattering.cautious_radps < 0.9 * steady.cautious_radps
+
+
+def test_growth_is_followed_and_unsteady_until_it_has_lasted() -> None:
+    growth = LinkGrowth()
+    assert not growth.step(1.0, 0.9 * LEAST_GROWTH_S)
+    assert growth.step(2.0, 0.2)
+    assert (growth.added_s, growth.changed_s) == (0.2, 0.2)
+    assert not growth.step(2.1, 0.2 + 0.9 * LEAST_GROWTH_S)
+    assert not growth.step(1.9 + STEADY_S, 0.2)
+    assert growth.step(2.0 + STEADY_S, 0.2)
+    assert (growth.added_s, growth.changed_s) == (0.2, 0.0)
+    assert growth.step(10.0, 0.0)
+    assert (growth.added_s, growth.changed_s) == (0.0, 0.2)
+    assert growth.step(10.0 + STEADY_S, 0.0)
+    assert (growth.added_s, growth.changed_s) == (0.0, 0.0)
+
+
+def test_growth_that_comes_and_goes_stays_unsteady() -> None:
+    growth = LinkGrowth()
+    for tick in range(200):
+        growth.step(0.1 * tick, 0.15 if tick // 10 % 2 else 0.05)
+        assert tick < 10 or growth.changed_s >= 0.0999

@@ -1,0 +1,69 @@
+"""Hover thrust of a vehicle that flies by itself, from its own thrust and its vertical motion.
+
+Before setpoints replace an autopilot's own take-off, or its mode of a vehicle found in the air,
+the thrust that it reports (ATTITUDE_TARGET) and its acceleration show the thrust that hovers,
+whatever the vehicle file says and however fast it climbs.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from offboard.model.vehicle import HOVER_THRUST_LIMITS, Vehicle
+
+WINDOW_S, KEPT_S = 0.5, 1.5
+LEAST_THRUSTS, LEAST_SPEEDS = 4, 8  # in the window
+LEAST_LIFT = 0.3  # of the weight: less shows too little of the thrust
+DIFFERENT = 0.1  # of the hover thrust: a smaller difference is left to the observer
+
+
+class HoverEstimate:
+    """Thrust reported and vertical speed of the last KEPT_S, by vehicle time."""
+
+    def __init__(self) -> None:
+        self._thrusts: deque[tuple[float, float]] = deque()
+        self._speeds: deque[tuple[float, float]] = deque()
+
+    def on_thrust(self, time_s: float, thrust: float) -> None:
+        """The autopilot reports its collective thrust, 0 .. 1."""
+        _append(self._thrusts, time_s, thrust)
+
+    def on_speed(self, time_s: float, down_mps: float) -> None:
+        """A vertical velocity, positive down."""
+        _append(self._speeds, time_s, down_mps)
+
+    def hover_thrust(self, vehicle: Vehicle, time_s: float) -> float | None:
+        """The normalised thrust that holds the weight, from the WINDOW_S before `time_s`; None if
+        too little was reported in it, or the vehicle falls. Delay, lag and drag are `vehicle`'s:
+        a_down = g (1 - u / u_h) - c v_down."""
+        speeds = _within(self._speeds, time_s)
+        thrusts = _within(self._thrusts, time_s - vehicle.thrust_delay_s - vehicle.thrust_lag_s)
+        if len(speeds) < LEAST_SPEEDS or len(thrusts) < LEAST_THRUSTS:
+            return None
+        gravity_mps2 = vehicle.gravity_mps2
+        acceleration_mps2 = float(np.polyfit(speeds[:, 0] - time_s, speeds[:, 1], 1)[0])
+        drag_mps2 = vehicle.drag_per_mass_ps * float(np.mean(speeds[:, 1]))
+        lift_mps2 = gravity_mps2 - acceleration_mps2 - drag_mps2
+        if lift_mps2 < LEAST_LIFT * gravity_mps2:
+            return None
+        share = float(np.mean(thrusts[:, 1])) * gravity_mps2 / lift_mps2
+        return share if HOVER_THRUST_LIMITS[0] <= share <= HOVER_THRUST_LIMITS[1] else None
+
+
+def differs(hover_thrust: float, vehicle: Vehicle) -> bool:
+    """Whether `hover_thrust` is another than `vehicle`'s, by more than the observer should find
+    out by itself."""
+    return abs(hover_thrust / vehicle.hover_thrust - 1.0) > DIFFERENT
+
+
+def _append(samples: deque[tuple[float, float]], time_s: float, value: float) -> None:
+    samples.append((time_s, value))
+    while samples[0][0] < time_s - KEPT_S:
+        samples.popleft()
+
+
+def _within(samples: deque[tuple[float, float]], end_s: float) -> np.ndarray:
+    kept = [each for each in samples if end_s - WINDOW_S <= each[0] <= end_s]
+    return np.array(kept).reshape(-1, 2)

@@ -1,0 +1,74 @@
+"""A link that becomes later in flight: prediction and bandwidth follow within a second.
+
+TIMESYNC and the age of telemetry show it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from faults import late
+from pair import Pair, in_phase, make, through
+
+from offboard.flight.online_identification import IdentifySettings
+from offboard.flight.phases import ExitCode, Phase
+
+CHANGED_S, BACK_S = 2.0, 8.0  # in track
+CONFIGURED_RADPS = 7.0
+
+
+def on_a_link_that_becomes_late(direction: str, added_s: float) -> tuple[Pair, list]:
+    """A lemniscate on PX4 during which the link becomes late and prompt again; returns also times
+    since the change, and the bandwidth limits that began then."""
+    pair = make(vehicle="px4_sih", scenario="px4_like", seed=7, learning=IdentifySettings())
+    begun: list[float] = []
+    limits: list[tuple[float, float]] = []
+
+    def change(flying: Pair) -> None:
+        begun.append(flying.time_s)
+        setattr(flying, direction, late(added_s))
+
+    def note(flying: Pair) -> bool:
+        if begun:
+            identification = flying.companion._identification
+            assert identification is not None
+            limit = min(identification.bandwidth_limit_radps, CONFIGURED_RADPS)
+            if not limits or limits[-1][1] != limit:
+                limits.append((flying.time_s - begun[0], limit))
+        return False
+
+    back = (in_phase(Phase.TRACK, BACK_S), lambda flying: setattr(flying, direction, through))
+    pair.at += [(in_phase(Phase.TRACK, CHANGED_S), change), back, (note, lambda _: None)]
+    return pair, limits
+
+
+@pytest.mark.parametrize(
+    ("direction", "added_s", "least_radps", "most_m"),
+    [("down", 0.1, 5.0, 0.12), ("down", 0.2, 3.5, 0.15), ("up", 0.2, 3.5, 0.2)],
+)
+def test_late_link_is_noticed_and_flown(
+    direction: str, added_s: float, least_radps: float, most_m: float, tmp_path: Path
+) -> None:
+    """With its delay taken for that at take-off, 0.2 s more take the vehicle 2.1 m off."""
+    pair, limits = on_a_link_that_becomes_late(direction, added_s)
+    assert pair.fly().exit_code == ExitCode.FLOWN
+    assert limits[0][1] == CONFIGURED_RADPS
+    lowered_s, lowered = limits[1]
+    assert lowered_s <= 0.9
+    assert least_radps <= lowered < CONFIGURED_RADPS - 0.5
+    stayed = [limit for since_s, limit in limits if since_s < BACK_S - CHANGED_S]
+    assert stayed[-1] == CONFIGURED_RADPS  # a delay that stays is compensated
+    assert limits[-1][1] == CONFIGURED_RADPS  # also when the link is prompt again
+    assert pair.score(tmp_path).max_position_m < most_m
+    grown, *_ = (line for line in pair.companion.announced if "limited" in line and "grown" in line)
+    assert grown.startswith(f"the link's delay has grown by {1e3 * added_s:.0f} ms")
+    assert not any("contradicts" in line for line in pair.companion.announced)
+
+
+def test_prompt_link_changes_nothing() -> None:
+    """What is sent is the same as without any TIMESYNC reply."""
+    pair, _ = on_a_link_that_becomes_late("down", 0.0)
+    assert pair.fly().exit_code == ExitCode.FLOWN
+    assert pair.companion.state.growth.added_s == 0.0
+    assert not any("grown" in line for line in pair.companion.announced)
