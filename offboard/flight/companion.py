@@ -48,7 +48,6 @@ __all__ = ["Companion", "Outcome", "Output"]
 STOPPED = "stop requested by the operator"
 BRIDGED_SHARE = 0.3  # of `Limits.silence_s`; after it, level setpoints replace the control law
 PAUSE_S = 0.3  # a longer gap between two turns: what was known before it is not known any more
-FAILSAFE_STATUS = 5  # MAV_STATE_CRITICAL
 
 
 class Companion:
@@ -247,12 +246,8 @@ class Companion:
                     self._identification.on_position(time_s, position, velocity)
             case ThrustReport(thrust):
                 state.hover.on_thrust(state.time_s, thrust)
-            case Heartbeat(mode, _, status):
-                self._on_mode(mode, arrived_s, failsafe=status >= FAILSAFE_STATUS)
-            case ModeReport(mode):
-                heartbeat = state.vehicle.heartbeat
-                failsafe = heartbeat is not None and heartbeat.system_status >= FAILSAFE_STATUS
-                self._on_mode(mode, arrived_s, failsafe=failsafe)
+            case Heartbeat(mode) | ModeReport(mode):
+                self._on_mode(mode, arrived_s)
             case TimesyncReply():
                 state.link.on_reply(event)
             case PeerChanged(peer):
@@ -270,13 +265,15 @@ class Companion:
         """Host time; in lockstep, where host time must decide nothing, the link's own seconds."""
         return self._session.link_time_s if self._lockstep else host_s
 
-    def _on_mode(self, mode: str, arrived_s: float, *, failsafe: bool) -> None:
+    def _on_mode(self, mode: str, arrived_s: float) -> None:
         state = self.state
         if state.authority is None:
             state.dialect = self._session.dialect
             assert state.dialect is not None
             state.authority = Authority(state.dialect.engage_mode)
-        state.authority.on_mode(mode, state.now_s, arrived_s=arrived_s, failsafe=failsafe)
+        state.authority.on_mode(
+            mode, state.now_s, arrived_s=arrived_s, failsafe=state.vehicle.in_failsafe
+        )
 
     def _on_reboot(self) -> None:
         state = self.state

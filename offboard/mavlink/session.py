@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from offboard.mavlink import framing
-from offboard.mavlink.counters import Counters, DropReason, SequenceTracker
+from offboard.mavlink.counters import Counters, DropReason
 from offboard.mavlink.decode import (
     Address,
     decode,
@@ -104,7 +104,6 @@ class Session:
         self._own = Address(1, settings.component_id)
         self._peer = Peer()
         self._splitter = framing.FrameSplitter(settings.stream, self.counters)
-        self._sequence_in = SequenceTracker()
         self._sequence_out: dict[int, int] = {}
         self._sent: deque[bytes] = deque(maxlen=_ECHOES)
         self._texts = TextAssembler()
@@ -166,7 +165,6 @@ class Session:
             return foreign
         if self.vehicle is not None:
             self._peer.heard_s = now_s
-            self._sequence_in.count(frame.sequence, self.counters)
         if not frame.verified:
             return DropReason.UNKNOWN_ID
         if frame.message_id == _TIMESYNC:
@@ -256,7 +254,6 @@ class Session:
             return False
         if isinstance(event, (LocalPosition, Attitude)):
             if age is Age.REBOOTED:
-                self._sequence_in = SequenceTracker()
                 self._restart_rates()  # a rebooted vehicle has its default rates
                 events.append(Rebooted(event.time_s))
             self._link_time.vehicle(event.time_s, now_s)
