@@ -72,8 +72,11 @@ ROWS = (
     Row(
         "link",
         "growth of the link's delay since take-off (TIMESYNC), or the age of telemetry",
-        "limits.link_growth_s",
-        lambda now: now.link_growth_s > now.limits.link_growth_s,
+        "limits.link_growth_s, limits.setpoint_age_s",
+        lambda now: (
+            now.link_growth_s > now.limits.link_growth_s
+            or now.telemetry_age_s > now.limits.setpoint_age_s
+        ),
         0.5,
         Rung.HOLD,
         "the delay of the link has grown by {link_growth_s:.2f} s",

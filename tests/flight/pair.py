@@ -33,6 +33,7 @@ from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.model.vehicle import Vehicle
 from simulator import config as simulated
+from simulator.config import Scenario
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
@@ -243,7 +244,7 @@ def make(
     reference: str | None = None,
     vehicle: str | None = None,
     seed: int = 7,
-    scenario: str = "calm",
+    scenario: str | Scenario = "calm",
     firmware: Firmware = LEAN,
     wrap: Callable[[Controller], Controller] = lambda controller: controller,
     limits: dict[str, float] | None = None,
@@ -252,6 +253,7 @@ def make(
     believed: Vehicle | None = None,
     deadline_s: float | None = None,
     boot_scale: float = 1.0,
+    clock: HostClock | None = None,
     **options: Any,
 ) -> Pair:
     """A pair as `offboard fly --sitl` makes it. `flies` is the simulated vehicle, `believed` the
@@ -259,7 +261,7 @@ def make(
     companion does not wait for slow decisions."""
     named = {"reference": reference, "vehicle": vehicle}
     choices = {part: chosen for part, chosen in named.items() if chosen}
-    clock = HostClock()
+    clock = clock or HostClock()
     resolved = config.load(
         name, choices=choices, assignments=assignments, seed=seed, known_vehicle="px4_sih"
     )
@@ -284,7 +286,7 @@ def make(
         stopwatch=lambda: 0.0 if deadline_s is None else clock.now_s,
         identify=learning,
     )
-    flown = simulated.scenario(scenario)
+    flown = simulated.scenario(scenario) if isinstance(scenario, str) else scenario
     instance = Instance(
         firmware,
         flies or simulated.vehicle(firmware.vehicle),

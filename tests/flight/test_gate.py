@@ -165,13 +165,17 @@ def may_command(history: list[Happening]) -> bool:
 
 def is_fresh(history: list[Happening], late_s: float) -> bool:
     """The newest report that counts is at most 2.5 s old, `late_s` after the end."""
-    now_s, newest_s, counts_from_s = 100.0, -math.inf, -math.inf
+    now_s, newest_s, arrived_s, counts_from_s = 100.0, -math.inf, -math.inf, -math.inf
     for each in history:
         now_s += each.after_s
         if each.kind == "pause":
-            newest_s, counts_from_s = -math.inf, now_s - BEFORE_PAUSE_ENDS_S
-        elif each.kind == "report" and now_s - each.waited_s >= counts_from_s:
-            newest_s = now_s
+            counts_from_s = now_s - BEFORE_PAUSE_ENDS_S
+            if arrived_s < counts_from_s:
+                newest_s = -math.inf
+        elif each.kind == "report":
+            arrived_s = now_s - each.waited_s
+            if arrived_s >= counts_from_s:
+                newest_s = now_s
     return now_s + late_s - newest_s <= FRESH_S
 
 
