@@ -7,9 +7,10 @@ not hold, so that a condition that comes and goes does not start from zero each 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
+from offboard.flight import guards
 from offboard.flight.facts import Facts
 from offboard.flight.phases import Rung
 
@@ -24,7 +25,7 @@ class Row:
     name: str
     meaning: str
     limit: str
-    exceeded: Callable[[Facts], bool]
+    exceeded: guards.Guard
     delay_s: float
     rung: Rung
     reason: str
@@ -35,7 +36,7 @@ ROWS = (
         "authority",
         "age of the newest report of the mode",
         "2.5 s",
-        lambda now: not now.authority_known,
+        guards.authority_unknown,
         0.0,
         Rung.SILENCE,
         "no report of the mode for {authority_age_s:.1f} s: it is not known whether the vehicle "
@@ -45,7 +46,7 @@ ROWS = (
         "silence",
         "host time without position and attitude",
         "limits.silence_s",
-        lambda now: now.silence_s > now.limits.silence_s,
+        guards.silent,
         0.0,
         Rung.LAND,
         "no telemetry for {silence_s:.1f} s",
@@ -54,7 +55,7 @@ ROWS = (
         "blind",
         "age of the older of position and attitude",
         "limits.blind_s",
-        lambda now: now.blind_s > now.limits.blind_s,
+        guards.blind,
         0.0,
         Rung.LAND,
         "no {blind_to} for {blind_s:.1f} s",
@@ -156,7 +157,7 @@ ROWS = (
         "second sender",
         "another program sends setpoints or uses our ids on this link",
         "one frame",
-        lambda now: now.other_sender and not now.limits.begin_with_other_sender,
+        guards.other_sender,
         0.0,
         Rung.HOLD,
         "another program controls the vehicle on this link, too: {other_sender}",
@@ -188,6 +189,7 @@ class Ladder:
     def __init__(self, rows: tuple[Row, ...] = ROWS) -> None:
         self._rows = rows
         self._held_s: Mapping[str, float] = {}
+        self._exceeded: Mapping[str, bool] = {}
         self._stepped_s: float | None = None
         self.worst: Row | None = None
 
@@ -201,12 +203,16 @@ class Ladder:
         self._stepped_s = time_s
         exceeded = {row.name: row.exceeded(now) for row in self._rows}
         self._held_s = {name: self._held(name, holds, step_s) for name, holds in exceeded.items()}
+        self._exceeded = exceeded
         active = [r for r in self._rows if exceeded[r.name] and self._held_s[r.name] >= r.delay_s]
         self.worst = max(active, key=lambda row: row.rung, default=None)
 
     def _held(self, name: str, holds: bool, step_s: float) -> float:
         held_s = self._held_s.get(name, 0.0)
-        return held_s + step_s if holds else max(held_s - RECOVERY * step_s, 0.0)
+        if not holds:
+            return max(held_s - RECOVERY * step_s, 0.0)
+        # one sample after a gap of telemetry does not say that it has held during the gap
+        return held_s + step_s if self._exceeded.get(name) else held_s
 
 
 def markdown() -> str:

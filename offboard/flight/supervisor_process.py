@@ -96,7 +96,8 @@ class Rescue:
         self._session = Session(SessionSettings(stream=beat["stream"]))
         self._session.adopt(VehicleFound(**beat["vehicle"]), self._peer)
         assert self._session.dialect is not None
-        self._recovery = Recovery(self._session.dialect, clock.monotonic_s())
+        began_s = clock.monotonic_s()
+        self._recovery = Recovery(self._session.dialect, began_s, holding=beat["holding"])
         self._text_id = 0
 
     def run(self, reason: str) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from test_transitions import UNEVENTFUL
+from uneventful import UNEVENTFUL
 
 from offboard.flight.facts import Facts
 from offboard.flight.ladder import Ladder
