@@ -38,14 +38,18 @@ from offboard.identification.uncertainty import (
     student_t_loss,
     student_t_weights,
 )
-from offboard.model.vehicle import AxisResponse
+from offboard.model.vehicle import (
+    DAMPING_LIMITS,
+    DELAY_LIMITS_S,
+    FREQUENCY_LIMITS_RADPS,
+    AxisResponse,
+)
 
 Array = NDArray[np.float64]
 
 # Parameters in this order, with their bounds and the scale of a step of the search.
 DELAY, FREQUENCY, DAMPING = 0, 1, 2
-LOWER = np.array([0.0, 0.5, 0.1])
-UPPER = np.array([0.5, 60.0, 3.0])
+LOWER, UPPER = np.array((DELAY_LIMITS_S, FREQUENCY_LIMITS_RADPS, DAMPING_LIMITS)).T
 STEP_SCALES = np.array([0.03, 5.0, 0.3])
 # Start points: the search goes on from the one that explains most.
 STARTS = np.array(
