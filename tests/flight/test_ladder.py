@@ -103,10 +103,17 @@ def test_a_second_sender(allowed: bool, rung: Rung) -> None:
 
 def test_time_that_steps_back_counts_for_nothing() -> None:
     ladder = Ladder()
-    for time_s in (100.0, 100.375, 50.0, 50.125):
+    for time_s in (100.0, 100.1875, 100.375, 50.0, 50.125):
         ladder.step(LINK, time_s)
     assert ladder.rung is Rung.HOLD
     ladder = Ladder()
-    for time_s in (100.0, 100.375, 50.0, 50.0625):
+    for time_s in (100.0, 100.1875, 100.375, 50.0, 50.0625):
         ladder.step(LINK, time_s)
+    assert ladder.rung is Rung.FLY
+
+
+def test_one_sample_after_a_gap_of_telemetry_is_no_condition_that_has_held() -> None:
+    ladder = Ladder()
+    ladder.step(QUIET, 100.0)
+    ladder.step(TILT_ERROR, 100.8)
     assert ladder.rung is Rung.FLY
