@@ -186,8 +186,7 @@ ROWS = (
 class Ladder:
     """How long each condition has held, and the worst row that is active."""
 
-    def __init__(self, rows: tuple[Row, ...] = ROWS) -> None:
-        self._rows = rows
+    def __init__(self) -> None:
         self._held_s: Mapping[str, float] = {}
         self._exceeded: Mapping[str, bool] = {}
         self._stepped_s: float | None = None
@@ -201,10 +200,10 @@ class Ladder:
         """Judge the facts of `time_s`, any monotonic time."""
         step_s = 0.0 if self._stepped_s is None else max(time_s - self._stepped_s, 0.0)
         self._stepped_s = time_s
-        exceeded = {row.name: row.exceeded(now) for row in self._rows}
+        exceeded = {row.name: row.exceeded(now) for row in ROWS}
         self._held_s = {name: self._held(name, holds, step_s) for name, holds in exceeded.items()}
         self._exceeded = exceeded
-        active = [r for r in self._rows if exceeded[r.name] and self._held_s[r.name] >= r.delay_s]
+        active = [r for r in ROWS if exceeded[r.name] and self._held_s[r.name] >= r.delay_s]
         self.worst = max(active, key=lambda row: row.rung, default=None)
 
     def _held(self, name: str, holds: bool, step_s: float) -> float:
