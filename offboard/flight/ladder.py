@@ -187,8 +187,7 @@ ROWS = (
 class Ladder:
     """How long each condition has held, and the worst row that is active."""
 
-    def __init__(self, rows: tuple[Row, ...] = ROWS) -> None:
-        self._rows = rows
+    def __init__(self) -> None:
         self._held_s: Mapping[str, float] = {}
         self._stepped_s: float | None = None
         self.worst: Row | None = None
@@ -202,9 +201,9 @@ class Ladder:
         passed_s = 0.0 if self._stepped_s is None else time_s - self._stepped_s
         step_s = min(max(passed_s, 0.0), STEP_MAX_S)
         self._stepped_s = time_s
-        exceeded = {row.name: row.exceeded(now) for row in self._rows}
+        exceeded = {row.name: row.exceeded(now) for row in ROWS}
         self._held_s = {name: self._held(name, holds, step_s) for name, holds in exceeded.items()}
-        active = [r for r in self._rows if exceeded[r.name] and self._held_s[r.name] >= r.delay_s]
+        active = [r for r in ROWS if exceeded[r.name] and self._held_s[r.name] >= r.delay_s]
         self.worst = max(active, key=lambda row: row.rung, default=None)
 
     def _held(self, name: str, holds: bool, step_s: float) -> float:

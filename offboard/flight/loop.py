@@ -76,6 +76,7 @@ class Loop:
                 self._succeeded_s = clock.monotonic_s()
             except BaseException as error:  # a law may even end the program
                 self._hand_back(error)
+        gc.unfreeze()  # of many flights in one process, each would leave its garbage
         self._show()
         return self._outcome()
 
