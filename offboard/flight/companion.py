@@ -238,7 +238,7 @@ class Companion:
             case LocalPosition(time_s, position, velocity) if event is state.vehicle.position:
                 self._on_telemetry(time_s, arrived_s)
                 state.contact.on_position(event)
-                state.hover.on_speed(time_s, velocity[2])
+                state.hover.on_position(time_s, state.contact.height_m, velocity[2])
                 if state.touchdown:
                     state.touchdown.on_position(time_s, position, velocity[2])
                 self._observer.on_position(time_s, position, velocity)

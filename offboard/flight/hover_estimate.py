@@ -14,7 +14,8 @@ import numpy as np
 from offboard.model.vehicle import HOVER_THRUST_LIMITS, Vehicle
 
 WINDOW_S, KEPT_S = 0.5, 1.5
-LEAST_THRUSTS, LEAST_SPEEDS = 4, 8  # in the window
+GROUND_M = 0.2  # lower, the ground may carry it
+LEAST_THRUSTS, LEAST_SPEEDS, LEAST_S = 3, 8, 0.25  # in the window
 LEAST_LIFT = 0.3  # of the weight: less shows too little of the thrust
 DIFFERENT = 0.1  # of the hover thrust: a smaller difference is left to the observer
 
@@ -30,17 +31,23 @@ class HoverEstimate:
         """The autopilot reports its collective thrust, 0 .. 1."""
         _append(self._thrusts, time_s, thrust)
 
-    def on_speed(self, time_s: float, down_mps: float) -> None:
-        """A vertical velocity, positive down."""
+    def on_position(self, time_s: float, height_m: float, down_mps: float) -> None:
+        """Height above the ground, and vertical velocity, positive down."""
+        if height_m < GROUND_M:
+            self._speeds.clear()
+            return
         _append(self._speeds, time_s, down_mps)
 
     def hover_thrust(self, vehicle: Vehicle, time_s: float) -> float | None:
         """The normalised thrust that holds the weight, from the WINDOW_S before `time_s`; None if
         too little was reported in it, or the vehicle falls. Delay, lag and drag are `vehicle`'s:
         a_down = g (1 - u / u_h) - c v_down."""
-        speeds = _within(self._speeds, time_s)
-        thrusts = _within(self._thrusts, time_s - vehicle.thrust_delay_s - vehicle.thrust_lag_s)
-        if len(speeds) < LEAST_SPEEDS or len(thrusts) < LEAST_THRUSTS:
+        speeds = _within(self._speeds, time_s - WINDOW_S, time_s)
+        if len(speeds) < LEAST_SPEEDS or speeds[-1, 0] - speeds[0, 0] < LEAST_S:
+            return None
+        late_s = vehicle.thrust_delay_s + vehicle.thrust_lag_s
+        thrusts = _within(self._thrusts, speeds[0, 0] - late_s, time_s - late_s)
+        if len(thrusts) < LEAST_THRUSTS:
             return None
         gravity_mps2 = vehicle.gravity_mps2
         acceleration_mps2 = float(np.polyfit(speeds[:, 0] - time_s, speeds[:, 1], 1)[0])
@@ -64,6 +71,6 @@ def _append(samples: deque[tuple[float, float]], time_s: float, value: float) ->
         samples.popleft()
 
 
-def _within(samples: deque[tuple[float, float]], end_s: float) -> np.ndarray:
-    kept = [each for each in samples if end_s - WINDOW_S <= each[0] <= end_s]
+def _within(samples: deque[tuple[float, float]], begin_s: float, end_s: float) -> np.ndarray:
+    kept = [each for each in samples if begin_s <= each[0] <= end_s]
     return np.array(kept).reshape(-1, 2)

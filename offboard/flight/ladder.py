@@ -15,6 +15,7 @@ from offboard.flight.facts import Facts
 from offboard.flight.phases import Rung
 
 RECOVERY = 0.25  # speed at which a delay runs back
+STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,7 +189,6 @@ class Ladder:
 
     def __init__(self) -> None:
         self._held_s: Mapping[str, float] = {}
-        self._exceeded: Mapping[str, bool] = {}
         self._stepped_s: float | None = None
         self.worst: Row | None = None
 
@@ -198,20 +198,17 @@ class Ladder:
 
     def step(self, now: Facts, time_s: float) -> None:
         """Judge the facts of `time_s`, any monotonic time."""
-        step_s = 0.0 if self._stepped_s is None else max(time_s - self._stepped_s, 0.0)
+        passed_s = 0.0 if self._stepped_s is None else time_s - self._stepped_s
+        step_s = min(max(passed_s, 0.0), STEP_MAX_S)
         self._stepped_s = time_s
         exceeded = {row.name: row.exceeded(now) for row in ROWS}
         self._held_s = {name: self._held(name, holds, step_s) for name, holds in exceeded.items()}
-        self._exceeded = exceeded
         active = [r for r in ROWS if exceeded[r.name] and self._held_s[r.name] >= r.delay_s]
         self.worst = max(active, key=lambda row: row.rung, default=None)
 
     def _held(self, name: str, holds: bool, step_s: float) -> float:
         held_s = self._held_s.get(name, 0.0)
-        if not holds:
-            return max(held_s - RECOVERY * step_s, 0.0)
-        # one sample after a gap of telemetry does not say that it has held during the gap
-        return held_s + step_s if self._exceeded.get(name) else held_s
+        return held_s + step_s if holds else max(held_s - RECOVERY * step_s, 0.0)
 
 
 def markdown() -> str:

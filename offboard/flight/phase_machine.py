@@ -123,7 +123,8 @@ class PhaseMachine:
         if in_the_air:  # take-off point unknown: below the vehicle, at the height of its last rest
             down_m = state.contact.rest_down_m
             state.plan.origin_ned_m = (*position.position_ned_m[:2], down_m)
-        self._adopt_hover_thrust()
+        if in_the_air or state.takes_off_by_command:
+            self._adopt_hover_thrust()
         self._observer.freeze(False)
         self._decider.begin()
         state.plan.start_climb(
@@ -136,7 +137,7 @@ class PhaseMachine:
     def _adopt_hover_thrust(self) -> None:
         """Fly with the hover thrust that the autopilot's own flight shows, if it is another."""
         state, model = self._state, self._state.model
-        shown = state.hover.hover_thrust(model, state.time_s) if state.contact.in_the_air else None
+        shown = state.hover.hover_thrust(model, state.time_s)
         if shown is None or not differs(shown, model):
             return
         state.model = model.model_copy(update={"hover_thrust": shown})

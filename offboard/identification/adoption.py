@@ -8,13 +8,20 @@ from typing import Any
 
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import Identified
-from offboard.model.vehicle import HOVER_THRUST_LIMITS, AxisResponse, Vehicle
+from offboard.model.vehicle import (
+    DAMPING_LIMITS,
+    DELAY_LIMITS_S,
+    FREQUENCY_LIMITS_RADPS,
+    HOVER_THRUST_LIMITS,
+    AxisResponse,
+    Vehicle,
+)
 
 # Least and greatest value of each constant, whatever the vehicle file says.
 BOUNDS = {
-    "delay": (0.0, 0.5),
-    "frequency": (2.0, 45.0),
-    "damping": (0.2, 2.5),
+    "delay": DELAY_LIMITS_S,
+    "frequency": FREQUENCY_LIMITS_RADPS,
+    "damping": DAMPING_LIMITS,
     "hover thrust": HOVER_THRUST_LIMITS,
     "thrust lag": (0.0, 0.25),
     "thrust delay": (0.0, 0.5),
@@ -84,14 +91,14 @@ def with_link_delay(found: Identified, target: Vehicle, vehicle_file: Vehicle) -
         update["thrust_delay_s"] = thrust_delay_s
     yaw_delay_s = vehicle_file.yaw.delay_s + added_s
     if found.yaw is None and target.yaw.delay_s < yaw_delay_s - LINK_S:
-        delay_s = min(yaw_delay_s, BOUNDS["delay"][1])
+        delay_s = min(yaw_delay_s, DELAY_LIMITS_S[1])
         update["yaw"] = target.yaw.model_copy(update={"delay_s": delay_s})
     return target.model_copy(update=update)
 
 
 def with_added_delay(vehicle: Vehicle, added_s: float) -> Vehicle:
     """`vehicle` behind a link that adds `added_s` to each of its delays."""
-    most_s = BOUNDS["delay"][1]
+    most_s = DELAY_LIMITS_S[1]
 
     def axis(response: AxisResponse) -> AxisResponse:
         return response.model_copy(update={"delay_s": min(response.delay_s + added_s, most_s)})

@@ -38,14 +38,18 @@ from offboard.identification.uncertainty import (
     student_t_loss,
     student_t_weights,
 )
-from offboard.model.vehicle import AxisResponse
+from offboard.model.vehicle import (
+    DAMPING_LIMITS,
+    DELAY_LIMITS_S,
+    FREQUENCY_LIMITS_RADPS,
+    AxisResponse,
+)
 
 Array = NDArray[np.float64]
 
 # Parameters in this order, with their bounds and the scale of a step of the search.
 DELAY, FREQUENCY, DAMPING = 0, 1, 2
-LOWER = np.array([0.0, 0.5, 0.1])
-UPPER = np.array([0.5, 60.0, 3.0])
+LOWER, UPPER = np.array((DELAY_LIMITS_S, FREQUENCY_LIMITS_RADPS, DAMPING_LIMITS)).T
 STEP_SCALES = np.array([0.03, 5.0, 0.3])
 # Start points: the search goes on from the one that explains most.
 STARTS = np.array(
@@ -54,6 +58,7 @@ STARTS = np.array(
 # Evaluations of one least-squares search, how often residual weights are computed anew, and the
 # relative change of the cost that ends a search: the weights change more than a finer search.
 STEPS, ROUNDS, TOLERANCE = 10, 4, 1e-3
+FITTED = 5  # parameters and free motion, of each axis
 RELATED_S = 0.3  # time over which an attitude estimator's errors are autocorrelated
 SPACING_S = 0.018  # closer samples are left out: the responses are slower
 # Model error that no residual shows, as sd of delay (s), frequency (relative) and damping: PX4's
@@ -71,10 +76,11 @@ class _Axis:
     name: str
     least_command_rad: float
     sd_limits: tuple[float, float, float]
+    wanders: bool  # see `ResponseProblem`
 
 
-TILT = _Axis("tilt", 0.004, (0.01, 0.15, 0.15))
-YAW = _Axis("yaw", 0.008, (0.04, 0.15, 0.2))
+TILT = _Axis("tilt", 0.004, (0.01, 0.15, 0.15), wanders=False)
+YAW = _Axis("yaw", 0.008, (0.04, 0.15, 0.2), wanders=True)
 EXPLAINED = 0.6  # least share of the commanded motion that the fitted response must explain
 
 
@@ -152,7 +158,7 @@ def _fit_axis(
             f"{1e3 * axis.least_command_rad:.0f} mrad are needed: fly steps"
         )
         return None
-    fit = yield from fit_response(*measured, delay)
+    fit = yield from fit_response(*measured, delay, wanders=axis.wanders)
     refusal = _refusal(fit, axis.sd_limits)
     if refusal is not None:
         refusals[axis.name] = refusal
@@ -206,11 +212,13 @@ def fit_response(
     sent_at: Array,
     commands: Array,
     delay: Estimate | None = None,
+    *,
+    wanders: bool = False,
 ) -> Generator[None, None, ResponseFit]:
     """The response that explains `signals` (N, axes) at `times` (N,) under `commands` (M, axes)
     sent at `sent_at` (M,), in two pieces; at least 50 samples and 3 commands. `delay` is what is
-    known of the delay beforehand."""
-    problem = ResponseProblem(times, signals, sent_at, commands)
+    known of the delay beforehand; `wanders`: see `ResponseProblem`."""
+    problem = ResponseProblem(times, signals, sent_at, commands, wanders=wanders)
     start = problem.search()
     yield
     best, weights, scale = problem.refine(start)
@@ -224,32 +232,57 @@ def fit_response(
     found = (Estimate(float(value), float(sd)) for value, sd in zip(best, sds, strict=True))
     delay_s, frequency, damping = found
     moved = commanded_rms(times, sent_at, commands)
-    return ResponseFit(delay_s, frequency, damping, residual_rms=scale, commanded_rms=moved)
+    left = problem.unexplained(best) if wanders else scale
+    return ResponseFit(delay_s, frequency, damping, residual_rms=left, commanded_rms=moved)
 
 
 class ResponseProblem:
-    """Least-squares problem of the measured `signals` (N, axes) under `commands` (M, axes)."""
+    """Least-squares problem of the measured `signals` (N, axes) under `commands` (M, axes).
 
-    def __init__(self, times: Array, signals: Array, sent_at: Array, commands: Array) -> None:
+    With `wanders` the errors of the measurement are a random walk, as those of an estimated course
+    are: their steps are independent, and take the place of the residuals.
+    """
+
+    def __init__(
+        self,
+        times: Array,
+        signals: Array,
+        sent_at: Array,
+        commands: Array,
+        *,
+        wanders: bool = False,
+    ) -> None:
         kept = thinned(times, SPACING_S)
         self._times, self._signals = times[kept], signals[kept]
         self._sent_at, self._commands = sent_at, commands
-        self.even_weights = np.ones(len(kept))
+        self._wanders = wanders
+        steps_s = np.diff(self._times)
+        self._root_steps = np.sqrt(steps_s / steps_s.mean())[:, None]
+        self.even_weights = np.ones(len(kept) - wanders)
 
     def residual(self, parameters: Array, weights: Array) -> Array:
         """Signals less response (N, axes), with free motion and a constant offset projected out
-        under `weights` (N,)."""
+        under `weights` (N,); or their N - 1 steps."""
+        left, basis = self._left_and_basis(parameters)
+        if self._wanders:
+            left = np.diff(left, axis=0) / self._root_steps
+            basis = np.diff(basis[:, :2], axis=0) / self._root_steps
+        return _projected(left, basis, weights)
+
+    def unexplained(self, parameters: Array) -> float:
+        """Sd without outliers of what the response leaves of the signals."""
+        left, basis = self._left_and_basis(parameters)
+        return scale_of(_projected(left, basis, np.ones(len(left))))
+
+    def _left_and_basis(self, parameters: Array) -> tuple[Array, Array]:
+        """Signals less response (N, axes); free motion and a constant (N, 3)."""
         delay_s, frequency, damping = parameters
         left = self._signals - second_order(
             self._times, self._sent_at, self._commands, delay_s, frequency, damping
         )
         basis = np.ones((len(left), 3))
         basis[:, :2] = free_motion(self._times - self._times[0], frequency, damping)[:, 0]
-        weighted = basis.T * weights
-        gram = weighted @ basis
-        gram += np.diag(1e-12 + 1e-9 * np.diag(gram))
-        residual: Array = left - basis @ np.linalg.solve(gram, weighted @ left)
-        return residual
+        return left, basis
 
     def search(self) -> Array:
         """Parameters (3,) of least squares from the best of STARTS, all samples alike."""
@@ -282,12 +315,18 @@ class ResponseProblem:
         return found
 
     def covariance(self, best: Array, weights: Array, scale: float) -> Array:
-        """Covariance (3, 3) of an M-estimate (Huber, 1967) with autocorrelated residuals."""
+        """Covariance (3, 3) of an M-estimate (Huber, 1967) with autocorrelated residuals; of least
+        squares for the independent steps of a measurement that wanders."""
         left = self.residual(best, weights)
         count, axes = left.shape
         slopes = approx_fprime(
             best, lambda tried: self.residual(tried, weights).ravel(), 1e-3 * STEP_SCALES
-        ).reshape(count, axes, 3)
+        )
+        if self._wanders:
+            variance = np.sum(left**2) / (left.size - FITTED * axes)
+            least_squares_covariance: Array = variance * np.linalg.pinv(slopes.T @ slopes)
+            return least_squares_covariance
+        slopes = slopes.reshape(count, axes, 3)
         spacing_s = (self._times[-1] - self._times[0]) / max(count - 1, 1)
         lags = lag_count(RELATED_S, spacing_s, count)
         far = FREEDOM * scale**2 + np.sum(left**2, axis=1)
@@ -297,3 +336,12 @@ class ResponseProblem:
             curvature += rows.T @ (curvatures[:, None] * rows)
             scores_covariance += long_run_covariance((weights * axis)[:, None] * rows, lags)
         return sandwich(curvature, scores_covariance)
+
+
+def _projected(left: Array, basis: Array, weights: Array) -> Array:
+    """`left` (N, axes) without its parts along `basis` (N, k), under `weights` (N,)."""
+    weighted = basis.T * weights
+    gram = weighted @ basis
+    gram += np.diag(1e-12 + 1e-9 * np.diag(gram))
+    residual: Array = left - basis @ np.linalg.solve(gram, weighted @ left)
+    return residual

@@ -34,12 +34,20 @@ def lag_count(related_s: float, spacing_s: float, samples: int) -> int:
 
 def long_run_covariance(scores: Array, lags: int) -> Array:
     """Covariance (k, k) of the sum of an autocorrelated series `scores` (N, k), with Bartlett
-    weights that fall to zero after `lags`."""
-    covariance = scores.T @ scores
+    weights that fall to zero after `lags`.
+
+    A fit has made the sum of `scores` zero, which hides as large a share of the covariance as the
+    weights are on average; it is restored (Kiefer and Vogelsang, 2005).
+    """
+    count = len(scores)
+    covariance, weights = scores.T @ scores, float(count)
     for lag in range(1, lags + 1):
+        weight = 1.0 - lag / (lags + 1.0)
         related = scores[lag:].T @ scores[:-lag]
-        covariance += (1.0 - lag / (lags + 1.0)) * (related + related.T)
-    return covariance
+        covariance += weight * (related + related.T)
+        weights += 2.0 * weight * (count - lag)
+    restored: Array = covariance / (1.0 - weights / count**2)
+    return restored
 
 
 def sandwich(curvature: Array, scores_covariance: Array) -> Array:

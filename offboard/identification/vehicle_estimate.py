@@ -31,7 +31,9 @@ BETTER = 0.7
 DIRECT_LINK_S = 0.004  # link delay without a slow link: age of telemetry
 LEAST_JUMP_S, JUMP_SDS = 0.015, 4.0  # delays that differ by more contradict each other
 DECISIVE = ("tilt", "hover_thrust")  # out of bounds, these end the flight
-MOST_CONTRADICTIONS = 2  # after so many the bandwidth stays low for the rest of the flight
+# After so many contradictions the bandwidth stays low until the estimate in use has explained the
+# flight for CALM_S.
+MOST_CONTRADICTIONS, CALM_S = 2, 20.0
 LINKED = ("yaw", "thrust_delay_s")  # changed with the tilt's delay where not identified themselves
 NOTICEABLE_RADPS = 1.0  # a smaller change for a later link is not announced
 OUT_OF_BOUNDS = "it is out of bounds"
@@ -77,6 +79,7 @@ class VehicleEstimate:
         self._rejected_drag_ps = math.inf
         self._other_delay: Estimate | None = None  # seen once, contradicts the one in use
         self._contradictions = 0
+        self._calm_from_s = -math.inf  # since the last contradiction
         self.delay: Estimate | None = None  # of the tilt, once identified
         self.in_doubt = False
         self._unknown_s = self._unknown_delay_s
@@ -164,6 +167,7 @@ class VehicleEstimate:
         """Compare a later fit of the tilt with the estimate, and adopt it if it is better. `now`
         is what the estimate leaves unexplained in the same stretch of flight."""
         tilt = found.tilt
+        self._forget_contradictions(now, time_s)
         if tilt is None or within_bounds(found, self._file, self._factor)[1]:
             return []
         if self.delay is None:
@@ -196,6 +200,7 @@ class VehicleEstimate:
         if it explains more."""
         self.in_doubt = True
         self._contradictions += 1
+        self._calm_from_s = time_s
         vehicle = "identified vehicle" if self.target != self._file else "vehicle file"
         sentence = (
             f"the {vehicle} contradicts telemetry: {1e3 * now.rms:.0f} mrad of tilt unexplained "
@@ -207,8 +212,16 @@ class VehicleEstimate:
             sentence += f"; the previous estimate, with {1e3 * before.rms:.0f} mrad, is used again"
         self._limit(self.cautious_radps)
         sentence += f"; {self._bandwidth_text}"
-        lasting = self._contradictions >= MOST_CONTRADICTIONS
-        return [sentence + (" for the rest of the flight" if lasting else "")]
+        if self._contradictions >= MOST_CONTRADICTIONS:
+            sentence += f" until nothing contradicts for {CALM_S:.0f} s"
+        return [sentence]
+
+    def _forget_contradictions(self, now: Unexplained, time_s: float) -> None:
+        """After CALM_S in which the estimate in use explains the flight."""
+        if now.contradicts:
+            self._calm_from_s = time_s
+        elif time_s >= self._calm_from_s + CALM_S:
+            self._contradictions = 0
 
     # ------------------------------------------------------------------ bandwidth
 

@@ -20,7 +20,11 @@ NonNegativeTriple = tuple[
     Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)], Annotated[float, Field(ge=0)]
 ]
 
-HOVER_THRUST_LIMITS = (0.02, 0.95)  # of a file, and of what identification adopts in flight
+# Of a file, and of what identification searches and adopts in flight
+HOVER_THRUST_LIMITS = (0.02, 0.95)
+DELAY_LIMITS_S = (0.0, 0.5)
+FREQUENCY_LIMITS_RADPS = (0.5, 60.0)
+DAMPING_LIMITS = (0.1, 3.0)
 DRAG_PER_MASS_MOST_PS = 100.0  # falls at 0.1 m/s: nothing is left to control
 
 
@@ -31,9 +35,11 @@ class AxisResponse(Parameters):
     effect of the command: age of the telemetry, transport and attitude loop in one number.
     """
 
-    delay_s: float = Field(ge=0, le=0.5)
-    natural_frequency_radps: float = Field(gt=0.1, le=100)
-    damping: float = Field(gt=0.05, le=5)
+    delay_s: float = Field(ge=DELAY_LIMITS_S[0], le=DELAY_LIMITS_S[1])
+    natural_frequency_radps: float = Field(
+        ge=FREQUENCY_LIMITS_RADPS[0], le=FREQUENCY_LIMITS_RADPS[1]
+    )
+    damping: float = Field(ge=DAMPING_LIMITS[0], le=DAMPING_LIMITS[1])
 
 
 class Vehicle(Parameters):

@@ -40,7 +40,7 @@ SHOWN = st.sampled_from("EEEBBHLO")
 
 
 @dataclass(frozen=True)
-class Happening:
+class Occurrence:
     """One event of the history, `after_s` the one before it."""
 
     kind: str  # report, ask, request, pause, lose
@@ -51,11 +51,12 @@ class Happening:
 
 
 SOON = st.sampled_from([0.0, 0.1, 0.5])
+WAITED = st.sampled_from([0.0, 0.0, 0.5, 0.7, 3.0])
 AFTER = st.one_of(SOON, st.floats(0.0, 4.0))
 
 
 def reports(modes: st.SearchStrategy[str], after: st.SearchStrategy[float] = AFTER):
-    return st.builds(Happening, st.just("report"), after, modes, st.booleans(), SOON)
+    return st.builds(Occurrence, st.just("report"), after, modes, st.booleans(), WAITED)
 
 
 def several(mode: str):
@@ -63,7 +64,7 @@ def several(mode: str):
 
 
 def one(kind: str, mode: str = ""):
-    return st.just([Happening(kind, 0.1, mode)])
+    return st.just([Occurrence(kind, 0.1, mode)])
 
 
 # A flight as it should be, cut off anywhere, and anything at all inserted anywhere
@@ -74,16 +75,16 @@ FLIGHT = st.tuples(
 INSERTED = st.one_of(
     reports(SHOWN),
     reports(SHOWN),
-    st.builds(Happening, st.just("request"), AFTER, st.sampled_from("HL")),
-    st.builds(Happening, st.sampled_from(["ask", "pause", "lose"]), AFTER),
+    st.builds(Occurrence, st.just("request"), AFTER, st.sampled_from("HL")),
+    st.builds(Occurrence, st.sampled_from(["ask", "pause", "pause", "lose"]), AFTER),
 )
 INSERTIONS = st.lists(st.tuples(st.integers(0, 14), INSERTED), max_size=4)
 
 
-def flight_of(parts, cut: int, insertions) -> list[Happening]:
+def flight_of(parts, cut: int, insertions) -> list[Occurrence]:
     history = [each for part in parts for each in part][:cut]
-    for index, happening in insertions:
-        history.insert(index, happening)
+    for index, occurrence in insertions:
+        history.insert(index, occurrence)
     return history
 
 
@@ -91,7 +92,7 @@ HISTORY = st.builds(flight_of, FLIGHT, st.integers(0, 14), INSERTIONS)
 BEGINNING = st.builds(flight_of, FLIGHT, st.integers(1, 5), INSERTIONS)
 
 
-def replayed(history: list[Happening], *, failsafes: bool = True) -> tuple[Authority, float]:
+def replayed(history: list[Occurrence], *, failsafes: bool = True) -> tuple[Authority, float]:
     """The authority after the history, and the time of its end."""
     authority, now_s = Authority("E"), 100.0
     for each in history:
@@ -114,7 +115,7 @@ def replayed(history: list[Happening], *, failsafes: bool = True) -> tuple[Autho
     return authority, now_s
 
 
-def since_asked(history: list[Happening]) -> str | None:
+def since_asked(history: list[Occurrence]) -> str | None:
     """The modes shown since we asked first, after the one in which we did; None if we never did."""
     shown, asked = "?", False
     letters = ""
@@ -127,7 +128,7 @@ def since_asked(history: list[Happening]) -> str | None:
     return letters if asked else None
 
 
-def may_set(history: list[Happening]) -> bool:
+def may_set(history: list[Occurrence]) -> bool:
     """Nothing but the mode in which we asked, then nothing but ours."""
     letters = since_asked(history)
     if any(each.kind == "lose" for each in history):
@@ -135,7 +136,7 @@ def may_set(history: list[Happening]) -> bool:
     return letters is None or re.fullmatch(rf"{re.escape(letters[0])}*E*", letters) is not None
 
 
-def may_command(history: list[Happening]) -> bool:
+def may_command(history: list[Occurrence]) -> bool:
     """As for a setpoint, and in a mode that we asked for later than for the one before it."""
     if may_set(history):
         return True
@@ -163,7 +164,7 @@ def may_command(history: list[Happening]) -> bool:
     return True
 
 
-def is_fresh(history: list[Happening], late_s: float) -> bool:
+def is_fresh(history: list[Occurrence], late_s: float) -> bool:
     """The newest report that counts is at most 2.5 s old, `late_s` after the end."""
     now_s, newest_s, arrived_s, counts_from_s = 100.0, -math.inf, -math.inf, -math.inf
     for each in history:
@@ -263,7 +264,7 @@ def tilt_of(command: Command) -> float:
 )
 @example([], Command(9.8, (0.0, 0.0, 1.0), 0.0), 0.0, False, 0.0, 0.25, 0.0)
 def test_flights_of_one_tick(
-    history: list[Happening],
+    history: list[Occurrence],
     command: Command | PositionCommand,
     later_s: float,
     on_ground: bool,
@@ -303,7 +304,7 @@ def test_flights_of_one_tick(
 
 @MANY
 @given(HISTORY, LATER)
-def test_a_command_needs_authority(history: list[Happening], later_s: float) -> None:
+def test_a_command_needs_authority(history: list[Occurrence], later_s: float) -> None:
     authority, end_s = replayed(history, failsafes=False)
     expected = may_command(history) and is_fresh(history, later_s)
     assert authority.permits_command(end_s + later_s) is expected

@@ -123,7 +123,7 @@ def test_estimate_of_an_accelerated_climb(true: float, climb_mps: float) -> None
     for step in range(101):
         time_s = 0.01 * step
         speed = final + (-climb_mps - final) * math.exp(-drag * time_s)
-        hover.on_speed(time_s, speed + rng.normal(0.0, 0.01))
+        hover.on_position(time_s, 1.0, speed + rng.normal(0.0, 0.01))
         if step % 10 == 0:
             hover.on_thrust(time_s, thrust)
     assert hover.hover_thrust(VEHICLE, 1.0) == pytest.approx(true, rel=0.02)
@@ -133,7 +133,23 @@ def test_no_estimate_from_too_little_or_while_it_falls() -> None:
     hover = HoverEstimate()
     assert hover.hover_thrust(VEHICLE, 0.0) is None
     for step in range(60):
-        hover.on_speed(0.01 * step, 9.0 * 0.01 * step)
+        hover.on_position(0.01 * step, 1.0, 9.0 * 0.01 * step)
         hover.on_thrust(0.01 * step, 0.05)
     assert hover.hover_thrust(VEHICLE, 0.6) is None  # falls
     assert hover.hover_thrust(VEHICLE, 2.0) is None  # reported too long ago
+
+
+def test_what_the_ground_carries_does_not_count() -> None:
+    """Spooling up on the ground it does not move, whatever its thrust."""
+    hover = HoverEstimate()
+    for step in range(100):
+        hover.on_position(0.01 * step, 0.0, 0.0)
+        hover.on_thrust(0.01 * step, 0.1)
+    assert hover.hover_thrust(VEHICLE, 1.0) is None
+
+
+def test_a_vehicle_that_our_setpoints_lift_keeps_its_file() -> None:
+    """PX4 takes off with setpoints; the observer finds the difference out."""
+    pair = with_thrust(0.8, "px4_sih", LEAN)
+    assert pair.fly().exit_code == ExitCode.FLOWN
+    assert math.isnan(taken_over_with(pair))

@@ -193,8 +193,8 @@ def with_wrong_file(**wrong: object) -> Pair:
 @pytest.mark.parametrize(
     ("frequency", "sentence"),
     [
-        (2.5, " contradicts the vehicle file's 2.5 (2 to 10 allowed)"),
-        (50.0, " contradicts the vehicle file's 50 (12.5 to 45 allowed)"),
+        (2.5, " contradicts the vehicle file's 2.5 (0.625 to 10 allowed)"),
+        (50.0, " contradicts the vehicle file's 50 (12.5 to 60 allowed)"),
     ],
 )
 def test_vehicle_file_that_telemetry_contradicts_ends_the_flight(frequency, sentence):

@@ -17,8 +17,17 @@ from typing import Any
 
 import pytest
 from faults import losing
-from pair import HOST_EPOCH_S, STEP_S, Pair, decode, frames_of, hover, in_phase
-from test_ardupilot import SHORT, on_arducopter
+from pair import (
+    HOST_EPOCH_S,
+    SHORT,
+    STEP_S,
+    Pair,
+    decode,
+    frames_of,
+    hover,
+    in_phase,
+    on_arducopter,
+)
 
 from offboard.flight.authority import Standing
 from offboard.flight.companion import Output

@@ -53,6 +53,22 @@ def test_a_hover_thrust_that_a_file_may_have_is_adopted_in_flight(hover_thrust: 
     assert within_bounds(found, file, 4.0) == (found, [])
 
 
+@pytest.mark.parametrize(
+    ("frequency", "damping"), [(0.5, 3.0), (1.9, 0.19), (46.0, 2.6), (60.0, 0.1)]
+)
+def test_a_response_that_a_file_may_have_is_adopted_in_flight(frequency, damping) -> None:
+    tilt = AxisResponse(delay_s=0.5, natural_frequency_radps=frequency, damping=damping)
+    values = (Estimate(value, 1e-3) for value in (0.5, frequency, damping))
+    found = Identified(10.0, tilt=ResponseFit(*values, 0.004, 0.1))
+    assert within_bounds(found, FILE.model_copy(update={"tilt": tilt}), 4.0) == (found, [])
+
+
+@pytest.mark.parametrize("wrong", [{"natural_frequency_radps": 60.1}, {"damping": 0.09}])
+def test_a_response_that_is_never_adopted_is_refused_in_a_file(wrong) -> None:
+    with pytest.raises(ValidationError, match=next(iter(wrong))):
+        AxisResponse.model_validate(FILE.tilt.model_dump() | wrong)
+
+
 @pytest.mark.parametrize("hover_thrust", [0.0199, 0.9501])
 def test_a_hover_thrust_that_no_file_may_have_is_not_adopted(hover_thrust: float) -> None:
     with pytest.raises(ValidationError, match="hover_thrust"):
@@ -99,12 +115,32 @@ def test_after_two_contradictions_the_bandwidth_stays_low(delay_s: float) -> Non
     estimate.review_tilt(fit(0.05), AGREES, 12.0)
     assert estimate.limit_radps > 6.5
     (sentence,) = estimate.on_contradiction(CONTRADICTS, CONTRADICTS, 20.0)
-    assert sentence.endswith("rad/s (configured 7.0) for the rest of the flight")
+    assert sentence.endswith("rad/s (configured 7.0) until nothing contradicts for 20 s")
     low = estimate.limit_radps
     for time_s in (22.0, 24.0, 26.0):
         estimate.review_tilt(fit(delay_s), CONTRADICTS, time_s)
     assert estimate.target.tilt.delay_s == delay_s
     assert estimate.limit_radps <= low < 3.5
+
+
+def test_bandwidth_returns_after_20_s_without_a_contradiction() -> None:
+    """A fit that the estimate in use contradicts once more begins the time anew."""
+    estimate = estimate_with(fit(0.05))
+    for begun_s in (10.0, 20.0):
+        estimate.on_contradiction(CONTRADICTS, CONTRADICTS, begun_s)
+        estimate.review_tilt(fit(0.05), AGREES, begun_s + 2.0)
+    low = estimate.limit_radps
+    said = [estimate.review_tilt(fit(0.05), AGREES, 24.0 + time_s) for time_s in range(0, 14, 2)]
+    estimate.review_tilt(fit(0.05), CONTRADICTS, 38.0)
+    said += [estimate.review_tilt(fit(0.05), AGREES, 40.0 + time_s) for time_s in range(0, 18, 2)]
+    assert estimate.limit_radps == low < 3.5
+    assert said == [[]] * 16
+    (sentence,) = estimate.review_tilt(fit(0.05), AGREES, 58.0)
+    assert sentence == "bandwidth 7.0 rad/s as configured: identified delay, 50 +- 2 ms"
+    assert not estimate.in_doubt
+    estimate.on_contradiction(CONTRADICTS, CONTRADICTS, 70.0)
+    estimate.review_tilt(fit(0.05), AGREES, 72.0)
+    assert estimate.limit_radps > 6.5  # the first of a new count
 
 
 def test_doubt_about_the_tilt_leaves_the_other_constants() -> None:
@@ -152,5 +188,5 @@ def test_lasting_contradiction_is_announced_twice(monkeypatch: pytest.MonkeyPatc
     announced = [sentence for each in taken for sentence in each.sentences]
     contradictions = [sentence for sentence in announced if "contradicts telemetry" in sentence]
     assert len(contradictions) == 2
-    assert contradictions[1].endswith("for the rest of the flight")
+    assert contradictions[1].endswith("until nothing contradicts for 20 s")
     assert taken[-1].bandwidth_limit_radps < 3.5
