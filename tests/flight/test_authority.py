@@ -12,12 +12,13 @@ from offboard.flight.authority import Authority, Standing
 
 
 def shown(*modes: str, asked_after: int = 1) -> Authority:
-    """Reports 0.1 s apart from 0 s on; we ask after the first `asked_after` of them."""
+    """Reports 0.1 s apart from 0 s on, and from 40 s of host time; we ask after the first
+    `asked_after` of them."""
     authority = Authority("OFFBOARD")
     for index, mode in enumerate(modes):
         if index == asked_after:
             authority.ask()
-        authority.on_mode(mode, 0.1 * index)
+        authority.on_mode(mode, 0.1 * index, arrived_s=40.0 + 0.1 * index)
     if asked_after >= len(modes):
         authority.ask()
     return authority
@@ -117,6 +118,15 @@ def test_after_a_pause_a_report_that_arrived_long_before_its_end_proves_nothing(
     assert not authority.permits_setpoint(0.1)
     authority.on_mode("OFFBOARD", 7.0, arrived_s=arrived_s)
     assert authority.permits_setpoint(7.0) is counts
+
+
+@pytest.mark.parametrize(("ended_s", "counts"), [(40.69, True), (40.71, False)])
+def test_a_report_that_was_read_just_before_a_pause_counts(ended_s: float, counts: bool) -> None:
+    """Before a short pause: the newest report arrived at 40.1 s."""
+    authority = shown("POSCTL", "OFFBOARD")
+    authority.doubt(ended_s)
+    assert authority.permits_setpoint(0.1) is counts
+    assert authority.heard(0.1)
 
 
 def test_a_report_from_before_the_pause_still_shows_a_take_over() -> None:

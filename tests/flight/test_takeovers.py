@@ -28,6 +28,7 @@ from pair import (
     in_phase,
     on_arducopter,
 )
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.flight.authority import Standing
 from offboard.flight.companion import Output
@@ -245,3 +246,24 @@ def test_a_vehicle_found_in_our_mode_can_be_taken(firmware: str) -> None:
 def test_leaving_the_landing_mode_as_it_disarms_is_no_take_over(duration_s: float) -> None:
     """PX4 returns to OFFBOARD, which CURRENT_MODE shows before HEARTBEAT shows it disarmed."""
     assert hover(f"reference.duration_s={duration_s}").fly().exit_code == ExitCode.FLOWN
+
+
+def test_a_hold_that_was_asked_for_on_the_ground_is_asked_for_again_in_flight() -> None:
+    """PX4 in OFFBOARD since its last landing; in flight another program sends setpoints."""
+    pair = start("px4")
+    switch = pair.instance.autopilot.commander.switch
+    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=195)
+    setpoint = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, (1, 0, 0, 0), 0, 0, 0, 0.5)
+    tracking = in_phase(Phase.TRACK, 1.0)
+    pair.down = lambda _, datagrams: (
+        [*datagrams, setpoint.pack(codec)] if tracking(pair) else datagrams
+    )
+    pair.at.append((lambda pair: pair.time_s > 0.1, lambda _: switch("OFFBOARD")))
+    assert pair.fly().exit_code == ExitCode.ABORTED
+    asked = [(m.param2, m.param3) for m in pair.commands(SET_MODE)]
+    assert asked == [(4.0, 3.0), (6.0, 0.0), (4.0, 3.0)]
+    (held_s,) = (at_s for at_s, phase in pair.phases if phase is Phase.HOLD)
+    (landed_s,) = (at_s for at_s, phase in pair.phases if phase is Phase.LAND)
+    after = [at_s for at_s, _, _ in pair.setpoints if at_s > held_s + 0.1]
+    assert after == []
+    assert landed_s - held_s == pytest.approx(2.1)
