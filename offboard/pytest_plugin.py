@@ -10,7 +10,6 @@ test suites are not slowed down.
 
 from __future__ import annotations
 
-import gc
 from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -116,8 +115,6 @@ def fly(
             outcome = fly_request(request, simulator=_simulator)
         except UserError as error:
             problem = str(error)
-        finally:
-            gc.unfreeze()  # the loop of the flight froze the objects of all tests
         if outcome is None:
             pytest.fail(f"nothing was flown: {problem}", pytrace=False)
         score, _ = score_flight(directory)

@@ -1,7 +1,7 @@
 """Faults of a flight as data: what goes wrong, when, and for how long. Part of a scenario file.
 
 A fault begins `at_s` after a moment of the flight and lasts `for_s`, or for good. What each one
-does to the vehicle is in `simulator.injection`.
+does to the vehicle is in `simulator.effects`.
 """
 
 from __future__ import annotations

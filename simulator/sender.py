@@ -43,8 +43,11 @@ class Sender:
     def level_setpoint(self, target: int, thrust: float) -> bytes:
         """SET_ATTITUDE_TARGET of a level attitude that heads north."""
         head = (0, target, MAV_COMP_ID_AUTOPILOT, _ATTITUDE_AND_THRUST)
-        attitude, rates, body_thrust = (1.0, 0.0, 0.0, 0.0), (0.0,) * 3, (0.0,) * 3
-        return self._frame("SET_ATTITUDE_TARGET", *head, attitude, *rates, thrust, body_thrust)
+        values = (*head, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, thrust)
+        has_extension = (
+            "thrust_body" in layout("SET_ATTITUDE_TARGET").fields
+        )  # not in each pymavlink
+        return self._frame("SET_ATTITUDE_TARGET", *values, *[(0.0,) * 3] * has_extension)
 
     def command(self, target: int, number: int, params: tuple[float, ...]) -> bytes:
         """COMMAND_LONG; parameters that are not given are 0."""

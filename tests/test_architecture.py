@@ -119,3 +119,8 @@ def test_names_and_docstrings_are_plain() -> None:
         for match in UNWANTED.finditer(path.read_text(encoding="utf-8"))
     }
     assert found == set()
+
+
+def test_test_modules_import_no_test_modules() -> None:
+    tests = (ROOT / "tests").rglob("*.py")
+    assert not {str(path) for path in tests if any(n.startswith("test_") for n in _names(path))}

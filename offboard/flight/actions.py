@@ -73,9 +73,10 @@ class PhaseActions:
         dialect, authority = self._dialect, self._state.authority
         assert authority is not None
         holds = tick.phase is Phase.HOLD
-        if authority.mode != (dialect.hold_mode if holds else dialect.land_mode):
-            authority.request(dialect.hold_mode if holds else dialect.land_mode)
-            self._outbox.request(dialect.hold() if holds else dialect.land())
+        mode = dialect.hold_mode if holds else dialect.land_mode
+        if authority.mode != mode:
+            if self._outbox.request(dialect.hold() if holds else dialect.land()):
+                authority.request(mode)
         elif not holds:
             self._disarm_if_standing(tick)
         if steers and authority.mode == authority.engage_mode and tick.in_phase_s < LAND_STREAM_S:
@@ -100,7 +101,7 @@ class PhaseActions:
             self._fit_telemetry(tick.in_phase_s)
             return
         if tick.phase is Phase.ENGAGE:
-            self._engage()
+            self._outbox.request(self._dialect.engage())
         elif tick.phase is Phase.ARM:
             self._outbox.request(CommandLong.arm())
         # On the ground without thrust; in the air with the thrust that hovers
@@ -110,11 +111,6 @@ class PhaseActions:
         thrust_mps2 = self._outbox.hover_mps2() if flying else 0.0
         command = Command(thrust_mps2, LEVEL, self._state.vehicle.course_rad)
         self._outbox.send_level(tick.time_s, command)
-
-    def _engage(self) -> None:
-        assert self._state.authority is not None
-        self._state.authority.ask()
-        self._outbox.request(self._dialect.engage())
 
     def _request_parameters(self) -> None:
         state = self._state

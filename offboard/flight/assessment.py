@@ -6,6 +6,7 @@ Functions of the flight state; they change nothing and decide nothing.
 from __future__ import annotations
 
 import math
+from dataclasses import fields
 
 import numpy as np
 
@@ -21,7 +22,6 @@ from offboard.model.frames import thrust_direction_from_quaternion
 
 TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
 MINIMUM_TELEMETRY_HZ = 10.0
-FAILSAFE_STATUS = 5  # MAV_STATE_CRITICAL; 6 is an emergency
 OTHER_SENDER_S = 5.0  # a second sender is there for so long after its newest frame
 ARMING_SHOWN_S = 2.5  # HEARTBEAT, at 1 Hz, shows an accepted arming within this time
 ARM = 400  # MAV_CMD_COMPONENT_ARM_DISARM
@@ -36,8 +36,7 @@ def facts(
     """The facts of this moment."""
     vehicle, plan, authority = state.vehicle, state.plan, state.authority
     track, time_s = plan.track, state.time_s
-    health, heartbeat = vehicle.health, vehicle.heartbeat
-    charge = health.battery_remaining if health else None
+    charge = vehicle.health.battery_remaining if vehicle.health else None
     age_s = state.telemetry_age_s(state.host_s) if vehicle.has_state else 0.0
     north_m, east_m, height_m = _from_take_off(state)
     return Facts(
@@ -52,8 +51,8 @@ def facts(
         engaged=authority is not None and authority.mode == authority.engage_mode,
         lost=authority is not None and authority.standing is Standing.LOST,
         shown_since=_shown_since_lost(state),
-        authority_known=authority is not None and authority.known(state.now_s),
-        failsafe=heartbeat is not None and heartbeat.system_status >= FAILSAFE_STATUS,
+        authority_known=authority is not None and authority.heard(state.now_s),
+        failsafe=vehicle.in_failsafe,
         armed=vehicle.armed,
         in_the_air=state.contact.in_the_air,
         landed=state.phase is Phase.LAND and not state.not_landed(),
@@ -92,29 +91,19 @@ def figures(
     now: Facts,
     identification: OnlineIdentification | None,
 ) -> dict[str, object]:
-    """The values for the names in braces in the reasons of phase table and ladder."""
+    """The values for the names in braces in the reasons of phase table and ladder: the facts, and
+    what explains them."""
     vehicle, authority, other = state.vehicle, state.authority, state.vehicle.other_sender
     older = vehicle.position_age_s >= vehicle.attitude_age_s
-    return {
+    return {each.name: getattr(now, each.name) for each in fields(now)} | {
         "mode": vehicle.mode,
         "mode_wanted": authority.engage_mode if authority else "offboard mode",
         "lost": authority.lost_reason if authority else "",
-        "authority_age_s": state.now_s - authority.reported_s if authority else math.inf,
-        "silence_s": now.silence_s,
-        "blind_s": now.blind_s,
+        "authority_age_s": state.now_s - authority.heard_s if authority else math.inf,
         "blind_to": "LOCAL_POSITION_NED" if older else "ATTITUDE_QUATERNION",
-        "telemetry_age_s": now.telemetry_age_s,
-        "link_growth_s": now.link_growth_s,
-        "clock_jump_s": now.clock_jump_s,
-        "in_phase_s": now.in_phase_s,
-        "late_s": now.late_s,
-        "position_error_m": now.position_error_m,
         "position_error_limit_m": state.limits.position_error_m,
-        "prediction_error_m": now.prediction_error_m,
         "tilt_deg": math.degrees(now.tilt_rad),
         "tilt_error_deg": math.degrees(now.tilt_error_rad),
-        "height_m": now.height_m,
-        "distance_m": now.distance_m,
         "battery_percent": 100.0 * now.battery,
         "other_sender": f"system {other.system_id} component {other.component_id}" if other else "",
         "stop": state.stop_reason,

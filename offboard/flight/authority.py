@@ -45,11 +45,13 @@ class Authority:
     engage_mode: str
     standing: Standing = Standing.FREE
     mode: str = "unknown"
-    reported_s: float = -math.inf  # time of the newest report
+    heard_s: float = -math.inf  # time of the newest report
+    reported_s: float = -math.inf  # time of the newest report that counts
     lost_reason: str = ""
-    lost_s: float = math.inf
+    lost_s: float = math.inf  # time of the loss
     _asked_in: str = ""  # the mode shown when we asked
-    _requested: set[str] = field(default_factory=set)
+    _requested: list[str] = field(default_factory=list)  # as the end; without those left behind
+    _arrived_s: float = -math.inf  # host time of the arrival of the newest report
     _counts_from_s: float = -math.inf  # host time: what arrived before it is not evidence
 
     def on_mode(
@@ -57,6 +59,7 @@ class Authority:
     ) -> None:
         """The vehicle reports `mode`. A failsafe may interrupt a landing that we asked for."""
         before, self.mode = self.mode, mode
+        self.heard_s, self._arrived_s = now_s, arrived_s
         if arrived_s >= self._counts_from_s:
             self.reported_s = now_s
         if self.standing is Standing.ASKED:
@@ -66,11 +69,19 @@ class Authority:
                 self.lose(f"it showed {mode} after {self.engage_mode} was asked for", now_s)
         elif self.standing is Standing.OURS and mode != self.engage_mode:
             if mode in self._requested:
-                self.standing = Standing.HANDED
+                self._hand_over(mode)
             else:
                 self.lose(f"the vehicle left {self.engage_mode} for {mode}", now_s)
-        elif self.standing is Standing.HANDED and mode not in self._requested and not failsafe:
-            self.lose(f"the vehicle left {before} for {mode}", now_s)
+        elif self.standing is Standing.HANDED:
+            if mode in self._requested:
+                self._hand_over(mode)
+            elif not failsafe:
+                self.lose(f"the vehicle left {before} for {mode}", now_s)
+
+    def _hand_over(self, mode: str) -> None:
+        """It shows a mode that we asked for: one that we asked for before would be a step back."""
+        self.standing = Standing.HANDED
+        del self._requested[: self._requested.index(mode)]
 
     def ask(self) -> None:
         """We ask for the mode in which the vehicle follows our setpoints."""
@@ -81,13 +92,14 @@ class Authority:
 
     def request(self, mode: str) -> None:
         """We ask for `mode` as the end of the flight."""
-        self._requested.add(mode)
+        self._requested.append(mode)
 
     def doubt(self, host_s: float) -> None:
         """After a gap of our own that ended at `host_s`: only reports that arrive later, or have
         arrived just before, count."""
         self._counts_from_s = host_s - JUST_S
-        self.reported_s = -math.inf
+        if self._arrived_s < self._counts_from_s:
+            self.reported_s = -math.inf
 
     def lose(self, reason: str, now_s: float) -> None:
         """The vehicle is not ours any more, for good."""
@@ -95,8 +107,12 @@ class Authority:
             self.standing, self.lost_reason, self.lost_s = Standing.LOST, reason, now_s
 
     def known(self, now_s: float) -> bool:
-        """Whether the newest report is recent enough to act on."""
+        """Whether the newest report that counts is recent enough to act on."""
         return now_s - self.reported_s <= KNOWN_S
+
+    def heard(self, now_s: float) -> bool:
+        """Whether reports arrive, even if none counts yet."""
+        return now_s - self.heard_s <= KNOWN_S
 
     def permits_setpoint(self, now_s: float) -> bool:
         """Whether a setpoint may leave: to a vehicle that follows it, or as the stream that PX4

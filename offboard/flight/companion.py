@@ -18,6 +18,7 @@ from offboard.flight.actions import PhaseActions
 from offboard.flight.authority import Authority
 from offboard.flight.decide import Decider, Tick
 from offboard.flight.flight_plan import FlightPlan
+from offboard.flight.ground_contact import GroundContact
 from offboard.flight.link import Chunk
 from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
 from offboard.flight.outbox import Outbox, Output
@@ -47,7 +48,6 @@ __all__ = ["Companion", "Outcome", "Output"]
 STOPPED = "stop requested by the operator"
 BRIDGED_SHARE = 0.3  # of `Limits.silence_s`; after it, level setpoints replace the control law
 PAUSE_S = 0.3  # a longer gap between two turns: what was known before it is not known any more
-FAILSAFE_STATUS = 5  # MAV_STATE_CRITICAL
 
 
 class Companion:
@@ -172,7 +172,7 @@ class Companion:
         if vehicle is None:
             return None
         ours = state.phase not in BEFORE_FLIGHT and not state.has_ended and state.may_command
-        return Guard(vehicle, ours, state.vehicle.armed)
+        return Guard(vehicle, ours, state.vehicle.armed, holding=state.phase is Phase.HOLD)
 
     # ------------------------------------------------------------------ one turn
 
@@ -184,9 +184,8 @@ class Companion:
         self._turned_s = now_s
         state.host_s = self._clock_s(now_s)
         state.silence_s = now_s - self._heard_s
-        if paused_s > PAUSE_S and not self._lockstep:
-            if state.authority is not None:
-                state.authority.doubt(now_s)
+        if paused_s > PAUSE_S and state.authority is not None and not self._lockstep:
+            state.authority.doubt(now_s)
             self._outbox.announce(
                 f"this computer paused for {paused_s:.2f} s: waiting for the vehicle's mode"
             )
@@ -235,7 +234,7 @@ class Companion:
                 self._observer.on_attitude(time_s, attitude, rates)
                 if self._identification:
                     self._identification.on_attitude(time_s, attitude)
-            case LocalPosition(time_s, position, velocity):
+            case LocalPosition(time_s, position, velocity) if event is state.vehicle.position:
                 self._on_telemetry(time_s, arrived_s)
                 state.contact.on_position(event)
                 state.hover.on_position(time_s, state.contact.height_m, velocity[2])
@@ -246,12 +245,8 @@ class Companion:
                     self._identification.on_position(time_s, position, velocity)
             case ThrustReport(thrust):
                 state.hover.on_thrust(state.time_s, thrust)
-            case Heartbeat(mode, _, status):
-                self._on_mode(mode, arrived_s, failsafe=status >= FAILSAFE_STATUS)
-            case ModeReport(mode):
-                heartbeat = state.vehicle.heartbeat
-                failsafe = heartbeat is not None and heartbeat.system_status >= FAILSAFE_STATUS
-                self._on_mode(mode, arrived_s, failsafe=failsafe)
+            case Heartbeat(mode) | ModeReport(mode):
+                self._on_mode(mode, arrived_s)
             case TimesyncReply():
                 state.link.on_reply(event)
             case PeerChanged(peer):
@@ -261,19 +256,23 @@ class Companion:
 
     def _on_telemetry(self, stamp_s: float, arrived_s: float) -> None:
         self._arrived_s = arrived_s
-        self.state.clock.on_telemetry(stamp_s, self._clock_s(arrived_s))
+        # A stream says only how early it may have arrived: after a pause of ours it would be ahead
+        host_s = self._turned_s if self._session.settings.stream else arrived_s
+        self.state.clock.on_telemetry(stamp_s, self._clock_s(host_s))
 
     def _clock_s(self, host_s: float) -> float:
         """Host time; in lockstep, where host time must decide nothing, the link's own seconds."""
         return self._session.link_time_s if self._lockstep else host_s
 
-    def _on_mode(self, mode: str, arrived_s: float, *, failsafe: bool) -> None:
+    def _on_mode(self, mode: str, arrived_s: float) -> None:
         state = self.state
         if state.authority is None:
             state.dialect = self._session.dialect
             assert state.dialect is not None
             state.authority = Authority(state.dialect.engage_mode)
-        state.authority.on_mode(mode, state.now_s, arrived_s=arrived_s, failsafe=failsafe)
+        state.authority.on_mode(
+            mode, state.now_s, arrived_s=arrived_s, failsafe=state.vehicle.in_failsafe
+        )
 
     def _on_reboot(self) -> None:
         state = self.state
@@ -281,6 +280,7 @@ class Companion:
         state.link.reset()
         state.growth.reset()
         state.clock.reset()
+        state.contact = GroundContact(state.vehicle)
         state.authority = None
         self._tick = -1
         self._machine.on_reboot()

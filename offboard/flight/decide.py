@@ -85,8 +85,10 @@ class Decider:
         """Decide, send the setpoint, log the decision, then identify.
 
         Returns False, and increases `missed`, if the decision failed or the gate refused it; then
-        nothing is sent.
+        nothing is sent. Telemetry that was too old before the decision began does not count: the
+        ladder has a row for it.
         """
+        was_old = self._state.telemetry_is_old
         try:
             decided = self._send(tick, self._decided(tick))
             failure = decided.failure
@@ -94,6 +96,8 @@ class Decider:
             failure = f"{type(error).__name__}: {error}"
         else:
             self._record(tick, decided)
+        if failure and was_old:
+            return False
         if failure:
             self._state.missed += 1
             self._state.failure = failure

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from enum import IntFlag
 from typing import overload
 
+from offboard.mavlink.encode import FLOAT32_MAX
 from offboard.model.command import Command, PositionCommand
 from offboard.model.vehicle import Vehicle
 
@@ -25,7 +26,7 @@ class Refusal(IntFlag):
     LATE = 1  # decided after its deadline
     STALE = 2  # the telemetry that it was made for is too old
     NOT_OURS = 4  # the vehicle does not, or may not, follow us
-    UNUSABLE = 8  # not finite
+    UNUSABLE = 8  # not finite, or beyond the numbers of the wire
 
 
 class Refused(Exception):
@@ -66,13 +67,13 @@ def admit(
     """The setpoint that may leave: `command` within the vehicle's limits.
 
     Raises Refused if the vehicle is not ours, the telemetry was too old, the decision too late, or
-    a value is not finite.
+    a value cannot be sent.
     """
     if not clearance.ours:
         raise Refused(Refusal.NOT_OURS, "the vehicle is not ours")
     if not clearance.age_s <= clearance.age_limit_s:
         raise Refused(Refusal.STALE, f"decided on telemetry that is {clearance.age_s:.2f} s old")
-    if clearance.late_s > 0.0:
+    if not clearance.late_s <= 0.0:
         raise Refused(Refusal.LATE, f"decided {clearance.late_s:.2f} s too late")
     if not usable(command):
         raise Refused(Refusal.UNUSABLE, f"unusable {command}")
@@ -82,7 +83,7 @@ def admit(
 
 
 def usable(command: Command | PositionCommand) -> bool:
-    """Whether all values are finite and the thrust direction is a unit vector."""
+    """Whether all values can be sent, as float32, and the thrust direction is a unit vector."""
     if isinstance(command, PositionCommand):
         vectors = (
             command.position_ned_m,
@@ -90,9 +91,9 @@ def usable(command: Command | PositionCommand) -> bool:
             command.acceleration_ned_mps2,
             (command.course_rad, command.course_rate_radps),
         )
-        return all(math.isfinite(value) for vector in vectors for value in vector)
+        return all(abs(value) <= FLOAT32_MAX for vector in vectors for value in vector)
     values = (command.thrust_mps2, *command.thrust_direction_ned, command.course_rad)
-    if not all(math.isfinite(value) for value in values):
+    if not all(abs(value) <= FLOAT32_MAX for value in values):
         return False
     return abs(math.hypot(*command.thrust_direction_ned) - 1.0) <= _LENGTH_TOLERANCE
 
@@ -108,8 +109,8 @@ def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool = False) -> Com
     north, east, down = command.thrust_direction_ned
     lateral = math.hypot(north, east)
     if math.atan2(lateral, down) > vehicle.tilt_max_rad:
-        # straight down has no vertical plane of its own: any will do
-        north, east = (north / lateral, east / lateral) if lateral > 0.0 else (1.0, 0.0)
-        scale = math.sin(vehicle.tilt_max_rad)
-        north, east, down = scale * north, scale * east, math.cos(vehicle.tilt_max_rad)
+        # an upright vector has no vertical plane of its own: atan2 takes the north's
+        towards_rad, scale = math.atan2(east, north), math.sin(vehicle.tilt_max_rad)
+        north, east = scale * math.cos(towards_rad), scale * math.sin(towards_rad)
+        down = math.cos(vehicle.tilt_max_rad)
     return Command(thrust, (north, east, down), command.course_rad)

@@ -7,13 +7,15 @@ not hold, so that a condition that comes and goes does not start from zero each 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 
+from offboard.flight import guards
 from offboard.flight.facts import Facts
 from offboard.flight.phases import Rung
 
 RECOVERY = 0.25  # speed at which a delay runs back
+STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,7 +26,7 @@ class Row:
     name: str
     meaning: str
     limit: str
-    exceeded: Callable[[Facts], bool]
+    exceeded: guards.Guard
     delay_s: float
     rung: Rung
     reason: str
@@ -35,7 +37,7 @@ ROWS = (
         "authority",
         "age of the newest report of the mode",
         "2.5 s",
-        lambda now: not now.authority_known,
+        guards.authority_unknown,
         0.0,
         Rung.SILENCE,
         "no report of the mode for {authority_age_s:.1f} s: it is not known whether the vehicle "
@@ -45,7 +47,7 @@ ROWS = (
         "silence",
         "host time without position and attitude",
         "limits.silence_s",
-        lambda now: now.silence_s > now.limits.silence_s,
+        guards.silent,
         0.0,
         Rung.LAND,
         "no telemetry for {silence_s:.1f} s",
@@ -54,7 +56,7 @@ ROWS = (
         "blind",
         "age of the older of position and attitude",
         "limits.blind_s",
-        lambda now: now.blind_s > now.limits.blind_s,
+        guards.blind,
         0.0,
         Rung.LAND,
         "no {blind_to} for {blind_s:.1f} s",
@@ -71,8 +73,11 @@ ROWS = (
     Row(
         "link",
         "growth of the link's delay since take-off (TIMESYNC), or the age of telemetry",
-        "limits.link_growth_s",
-        lambda now: now.link_growth_s > now.limits.link_growth_s,
+        "limits.link_growth_s, limits.setpoint_age_s",
+        lambda now: (
+            now.link_growth_s > now.limits.link_growth_s
+            or now.telemetry_age_s > now.limits.setpoint_age_s
+        ),
         0.5,
         Rung.HOLD,
         "the delay of the link has grown by {link_growth_s:.2f} s",
@@ -153,7 +158,7 @@ ROWS = (
         "second sender",
         "another program sends setpoints or uses our ids on this link",
         "one frame",
-        lambda now: now.other_sender and not now.limits.begin_with_other_sender,
+        guards.other_sender,
         0.0,
         Rung.HOLD,
         "another program controls the vehicle on this link, too: {other_sender}",
@@ -182,8 +187,7 @@ ROWS = (
 class Ladder:
     """How long each condition has held, and the worst row that is active."""
 
-    def __init__(self, rows: tuple[Row, ...] = ROWS) -> None:
-        self._rows = rows
+    def __init__(self) -> None:
         self._held_s: Mapping[str, float] = {}
         self._stepped_s: float | None = None
         self.worst: Row | None = None
@@ -194,11 +198,12 @@ class Ladder:
 
     def step(self, now: Facts, time_s: float) -> None:
         """Judge the facts of `time_s`, any monotonic time."""
-        step_s = 0.0 if self._stepped_s is None else max(time_s - self._stepped_s, 0.0)
+        passed_s = 0.0 if self._stepped_s is None else time_s - self._stepped_s
+        step_s = min(max(passed_s, 0.0), STEP_MAX_S)
         self._stepped_s = time_s
-        exceeded = {row.name: row.exceeded(now) for row in self._rows}
+        exceeded = {row.name: row.exceeded(now) for row in ROWS}
         self._held_s = {name: self._held(name, holds, step_s) for name, holds in exceeded.items()}
-        active = [r for r in self._rows if exceeded[r.name] and self._held_s[r.name] >= r.delay_s]
+        active = [r for r in ROWS if exceeded[r.name] and self._held_s[r.name] >= r.delay_s]
         self.worst = max(active, key=lambda row: row.rung, default=None)
 
     def _held(self, name: str, holds: bool, step_s: float) -> float:

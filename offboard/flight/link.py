@@ -14,7 +14,7 @@ OTHERS = "other addresses"
 
 
 class LinkError(UserError):
-    """A link that cannot be opened or was lost: one sentence for the user."""
+    """A link that cannot be opened: one sentence for the user."""
 
 
 @dataclass(frozen=True, slots=True)

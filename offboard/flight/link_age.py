@@ -47,6 +47,7 @@ class VehicleClock:
     def reset(self) -> None:
         """The vehicle was rebooted."""
         self._seen: deque[tuple[float, float]] = deque()  # stamp, arrival: the freshest of a bin
+        self._bin_s = 0.0  # arrival of the first of the newest bin
         self._settled = False
         self._rate = 1.0
         self.jumped_s = 0.0
@@ -62,11 +63,12 @@ class VehicleClock:
         seen = self._seen
         if seen and ahead_s > JUMP_S:
             self.jumped_s += ahead_s
-        if seen and arrived_s - seen[-1][1] < BIN_S:
+        if seen and arrived_s - self._bin_s < BIN_S:
             if ahead_s > 0.0:
                 seen[-1] = stamp_s, arrived_s
         else:
             seen.append((stamp_s, arrived_s))
+            self._bin_s = arrived_s
         while seen[0][1] < arrived_s - WINDOW_S:
             seen.popleft()
         self._measure_rate()

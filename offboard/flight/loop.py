@@ -21,6 +21,7 @@ from offboard.flight.stop import StopRequests
 from offboard.flight.supervisor import Supervisor
 
 POLL_S = 0.02
+STOPPED_S = 0.2  # from the beginning of a turn: what it decided does not leave later
 FAILING_S = 0.3  # without a turn that succeeds: give up
 TWICE = "interrupted twice: setpoints stopped, "
 OWN_FAILSAFE, SUPERVISED = (
@@ -75,6 +76,7 @@ class Loop:
                 self._succeeded_s = clock.monotonic_s()
             except BaseException as error:  # a law may even end the program
                 self._hand_back(error)
+        gc.unfreeze()  # of many flights in one process, each would leave its garbage
         self._show()
         return self._outcome()
 
@@ -84,8 +86,8 @@ class Loop:
         if self._stops.requested:
             self._companion.request_stop()
         chunks = self._link.receive(POLL_S)
-        output = self._companion.turn(chunks, clock.monotonic_s())
-        self._deliver(output)
+        began_s = clock.monotonic_s()
+        self._deliver(self._companion.turn(chunks, began_s), began_s)
         strangers = self._link.strangers
         self._companion.strangers = strangers.total
         for sentence in strangers.news():
@@ -94,15 +96,24 @@ class Loop:
         self._show()
         self._check_simulator()
 
-    def _deliver(self, output: Output) -> None:
+    def _deliver(self, output: Output, began_s: float) -> None:
+        """Send and log. This process may have been stopped since the turn began: then what the turn
+        decided is dropped."""
         peer = self._companion.peer
-        if self._taken_over():  # we may have been stopped for seconds since the turn began
+        if self._taken_over():
             return
+        dropped: list[bytes] = []
         for frame in output.send:
-            self._link.send(frame, peer)
+            if self._supervisor and clock.monotonic_s() - began_s > STOPPED_S:
+                dropped.append(frame)
+            else:
+                self._link.send(frame, peer)
+        if dropped:
+            self._companion.announce(f"{len(dropped)} messages dropped: they became too old")
         stamp = clock.unix_us()
         for frame in output.log:
-            self._log.write(stamp, frame)
+            if frame not in dropped:
+                self._log.write(stamp, frame)
         if peer is not None:
             self._link.follow(peer)
             self._beat(output, peer)

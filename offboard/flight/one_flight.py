@@ -9,7 +9,7 @@ import math
 import traceback
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
@@ -121,7 +121,9 @@ def _decided(controller: Controller, situation: Situation) -> Command | Position
     """The command of a decision. Raises DocumentError if the law fails: better here than in
     flight."""
     try:
-        command = controller.decide(situation).command
+        decision = controller.decide(situation)
+        command = decision.command
+        [float(figure) for figure in astuple(decision.certificate)]  # as the log will have them
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         raise DocumentError(
@@ -158,9 +160,9 @@ def fly(
 ) -> Outcome:
     """Fly once over `connection`, or on the `bundled` simulator.
 
-    Raises LinkError, DocumentError or LogError before anything is sent, and KeyboardInterrupt if a
-    stop was requested meanwhile. The log is created last: a flight that cannot begin leaves no
-    directory. `tell` is called with sentences about the preparation.
+    Raises LinkError, DocumentError, SupervisorError or LogError before anything is sent, and
+    KeyboardInterrupt if a stop was requested meanwhile. The log is created last: a flight that
+    cannot begin leaves no directory. `tell` is called with sentences about the preparation.
     """
     with ExitStack() as stack:
         log.check()
@@ -174,6 +176,8 @@ def fly(
         tell("preparing the controller")
         prepare(tell)
         rehearse(parts, keeps_deadline=bundled is None)
+        if supervisor:
+            supervisor.await_ready()
         stops.check()
         stack.enter_context(log)
         observer = parts.make_observer()
@@ -202,13 +206,12 @@ def fly(
             lands_without_log=parts.limits.log_lost == "land",
         )
         if supervisor:
-            supervisor.await_ready()
             discard(link)
         return loop.run()
 
 
 def discard(link: Link) -> None:
-    """Drop the telemetry that arrived while we prepared: it is too old to use."""
+    """Drop the telemetry that arrived during the preparation: it is too old to use."""
     for _ in range(DISCARDED_MAX):
         if not link.receive(0.0):
             return

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from offboard.estimation.observer import Observer
 from offboard.flight.gate import LEVEL, Clearance, Refused, admit
 from offboard.flight.online_identification import OnlineIdentification
+from offboard.flight.phases import Phase
 from offboard.flight.state import FlightState
 from offboard.flight.supervisor import Guard
 from offboard.flight.vehicle_state import GOOD_RESULTS
@@ -61,7 +62,7 @@ class Outbox:
         self._identification = identification
         self.command = Command(0.0, LEVEL, 0.0)
         self.announced: list[str] = []
-        self._requested_s: dict[CommandLong, float] = {}
+        self._requested_s: dict[tuple[Phase, CommandLong], float] = {}
         self._text_id = 0
         self._queue: list[Outgoing] = []
 
@@ -154,17 +155,18 @@ class Outbox:
     def request(self, request: CommandLong) -> bool:
         """Send a command if the vehicle is ours; returns whether it was sent.
 
-        It is sent once. Only one that was refused, or that nothing has answered, is sent again,
-        after a second.
+        In one phase it is sent once. Only one that was refused, or that nothing has answered, is
+        sent again, after a second.
         """
         state = self._state
+        key = state.phase, request
         result = state.vehicle.results.get(request.command)
-        requested_s = self._requested_s.get(request, -math.inf)
+        requested_s = self._requested_s.get(key, -math.inf)
         waits = state.now_s - requested_s < REPEAT_S - 1e-6
         done = math.isfinite(requested_s) and result in GOOD_RESULTS
         if waits or done or not state.may_command:
             return False
-        self._requested_s[request] = state.now_s
+        self._requested_s[key] = state.now_s
         state.vehicle.results.pop(request.command, None)
         self.send(request)
         return True
@@ -189,7 +191,7 @@ class Outbox:
 
     def flush(self, received: list[bytes], guard: Guard | None = None) -> Output:
         """Encode the queue. In the log, the frames `received` come first."""
-        frames = [(message, self._session.encode(message)) for message in self._queue]
-        self._queue.clear()
+        queue, self._queue = self._queue, []  # empty, should one of them not be encodable
+        frames = [(message, self._session.encode(message)) for message in queue]
         send = tuple(frame for message, frame in frames if not isinstance(message, Record))
         return Output(send, (*received, *(frame for _, frame in frames)), guard)

@@ -82,10 +82,10 @@ class PhaseMachine:
             if row.target is Phase.CLIMB:
                 self._identification.on_link_delay(state.link.estimate)
             self._identification.on_phase(row.target, state.time_s)
-        if row.target is Phase.TAKEOFF:
+        if row.target is Phase.ENGAGE:
+            self._begin_engaging()
+        elif row.target is Phase.TAKEOFF:
             self._begin_takeoff()
-        elif row.target is Phase.ENGAGE:
-            self._adopt_hover_thrust()
         elif row.target is Phase.CLIMB:
             self._begin_climb(in_the_air=row.source is Phase.ENGAGE)
         elif row.target is Phase.JOIN:
@@ -104,6 +104,12 @@ class PhaseMachine:
                 state.outcome = Outcome(max(state.outcome.exit_code, row.exit_code), sentence)
         elif row.target is Phase.DISARMED and state.outcome is None:
             state.outcome = Outcome(ExitCode.FLOWN, "flown and landed")
+
+    def _begin_engaging(self) -> None:
+        """Here, not with the request: a vehicle that shows the mode already passes without one."""
+        assert self._state.authority is not None
+        self._state.authority.ask()
+        self._adopt_hover_thrust()
 
     def _begin_takeoff(self) -> None:
         position = self._state.vehicle.position

@@ -30,10 +30,12 @@ class Request:
 
 
 class Recovery:
-    """Begins at `began_s`. `ended` says how it ended; empty until then."""
+    """Begins at `began_s`; `holding`: the vehicle was asked to hold before. `ended` says how it
+    ended; empty until then."""
 
-    def __init__(self, dialect: Dialect, began_s: float) -> None:
+    def __init__(self, dialect: Dialect, began_s: float, *, holding: bool = False) -> None:
         self._dialect = dialect
+        self._holding = holding
         self._began_s = began_s
         self._mode: str | None = None
         self._reported_s = -math.inf
@@ -71,7 +73,7 @@ class Recovery:
         ours = self._mode in (None, self._dialect.engage_mode, self._dialect.land_mode)
         if not self._armed:
             self.ended = "the vehicle is disarmed"
-        elif not (ours or (holds and self._requests)):
+        elif not (ours or (holds and (self._holding or self._requests))):
             self.ended = f"the vehicle shows {self._mode}: its pilot or its failsafe has it"
         elif now_s - self._began_s > LONGEST_S:
             self.ended = f"not landed after {LONGEST_S:.0f} s"

@@ -130,3 +130,8 @@ class FlightState:
     def telemetry_age_s(self, host_s: float) -> float:
         """Age of the newest telemetry at `host_s`, beyond the least delay of the link."""
         return self.clock.age_s(self.time_s, host_s)
+
+    @property
+    def telemetry_is_old(self) -> bool:
+        """No decision on the newest telemetry may leave any more."""
+        return self.telemetry_age_s(self.host_s) > self.limits.setpoint_age_s

@@ -35,11 +35,13 @@ class SupervisorError(UserError):
 @dataclass(frozen=True, slots=True)
 class Guard:
     """What the supervisor must know before it may act: the vehicle, whether it is `ours`, in the
-    mode of our setpoints or on its way down for us, and whether it may be `flying`."""
+    mode of our setpoints or in one that we asked for, whether it may be `flying`, and whether it
+    was asked to hold (`holding`): then this mode is ours, too."""
 
     vehicle: VehicleFound
     ours: bool
     flying: bool
+    holding: bool = False
 
 
 class Supervisor:

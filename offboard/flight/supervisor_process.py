@@ -1,4 +1,4 @@
-"""The process of the supervisor: watches the controller's beats, and takes its place if they stop.
+"""The process of the supervisor: it takes the controller's place if its beats stop.
 
 It imports only what it needs, so that it is ready at once and stays small. Its standard input is
 the controller's end of the channel, see `supervisor`.
@@ -83,7 +83,7 @@ class Watch:
 
 
 class Rescue:
-    """The controller's place taken: its link, its log, and what is asked of the vehicle."""
+    """Takes the controller's place: sends on its link what `Recovery` asks for, and logs it."""
 
     def __init__(self, watch: Watch, tell: BackgroundWriter[str]) -> None:
         beat = watch.newest
@@ -96,7 +96,8 @@ class Rescue:
         self._session = Session(SessionSettings(stream=beat["stream"]))
         self._session.adopt(VehicleFound(**beat["vehicle"]), self._peer)
         assert self._session.dialect is not None
-        self._recovery = Recovery(self._session.dialect, clock.monotonic_s())
+        began_s = clock.monotonic_s()
+        self._recovery = Recovery(self._session.dialect, began_s, holding=beat["holding"])
         self._text_id = 0
 
     def run(self, reason: str) -> None:

@@ -31,6 +31,7 @@ OUTAGE_S = 0.3  # a longer gap of all telemetry is an outage of the link
 MESSAGES_MAX = 12  # texts and refusals kept for the sentence that explains a failure
 WARNING = 4  # MAV_SEVERITY; more severe is a lower number
 GOOD_RESULTS = ("ACCEPTED", "IN_PROGRESS")  # MAV_RESULT
+FAILSAFE_STATUS = 5  # MAV_STATE_CRITICAL; 6 is an emergency
 SET_MESSAGE_INTERVAL = 511  # MAV_CMD: a refused rate explains no failure
 
 
@@ -77,9 +78,9 @@ class VehicleState:
         """Time since it was reported disarmed; 0 while it is armed."""
         return 0.0 if self.armed else self.now_s - self.armed_changed_s
 
-    def age_s(self, *kinds: type) -> float:
-        """Time since the newest event of one of these types; infinite if none was heard."""
-        return self.now_s - max(self.heard_s.get(kind, -math.inf) for kind in kinds)
+    def age_s(self, kind: type) -> float:
+        """Time since the newest event of this type; infinite if none was heard."""
+        return self.now_s - self.heard_s.get(kind, -math.inf)
 
     @property
     def armed(self) -> bool:
@@ -89,6 +90,11 @@ class VehicleState:
     def disarmed(self) -> bool:
         """A recent HEARTBEAT says that the vehicle is disarmed."""
         return not self.armed and self.age_s(Heartbeat) < ARMED_KNOWN_S
+
+    @property
+    def in_failsafe(self) -> bool:
+        """HEARTBEAT shows a failsafe or an emergency."""
+        return self.heartbeat is not None and self.heartbeat.system_status >= FAILSAFE_STATUS
 
     @property
     def has_state(self) -> bool:
@@ -121,7 +127,7 @@ class VehicleState:
                 self.mode = mode
             case OtherSender():
                 self.other_sender = event
-            case LocalPosition():
+            case LocalPosition() if not self._repeats(event):
                 self.position = event
             case Attitude():
                 self.attitude = event
@@ -141,6 +147,17 @@ class VehicleState:
                     self.refusals.append(f"command {command} {result}")
             case Rebooted():
                 self._reset()
+
+    def _repeats(self, event: LocalPosition) -> bool:
+        """Whether it reports a motion, and nothing has changed: it is not new, whatever its
+        stamp."""
+        newest = self.position
+        return (
+            newest is not None
+            and event.position_ned_m == newest.position_ned_m
+            and event.velocity_ned_mps == newest.velocity_ned_mps
+            and any(event.velocity_ned_mps)
+        )
 
     def _detect_outage(self, time_s: float) -> None:
         """After an outage, a new one is accepted only once both streams have resumed: a slow

@@ -44,7 +44,7 @@ NOT_A_FRAME = frozenset(
 
 @dataclass(slots=True)
 class Counters:
-    """Totals since the session began. `lost` counts gaps in the vehicle's sequence numbers."""
+    """Totals since the session began."""
 
     bytes_received: int = 0
     bytes_framed: int = 0
@@ -53,36 +53,8 @@ class Counters:
     frames: int = 0
     decoded: int = 0
     ignored: int = 0
-    sequenced: int = 0
-    lost: int = 0
     dropped: Counter[DropReason] = field(default_factory=Counter)
 
     @property
     def dropped_frames(self) -> int:
         return sum(n for reason, n in self.dropped.items() if reason not in NOT_A_FRAME)
-
-    @property
-    def link_loss(self) -> float:
-        """Share of the vehicle's frames that never arrived, 0 .. 1."""
-        total = self.sequenced + self.lost
-        return self.lost / total if total else 0.0
-
-
-class SequenceTracker:
-    """Counts gaps in the 8-bit sequence numbers of one sender."""
-
-    def __init__(self) -> None:
-        self._last: int | None = None
-
-    def count(self, sequence: int, counters: Counters) -> None:
-        """Update `counters.sequenced` and `counters.lost` with one received frame."""
-        counters.sequenced += 1
-        if self._last is None:
-            self._last = sequence
-            return
-        ahead = (sequence - self._last - 1) % 256
-        if ahead < 128:
-            counters.lost += ahead
-            self._last = sequence
-        elif ahead != 255 and counters.lost:  # late, not lost; 255 is a duplicate
-            counters.lost -= 1

@@ -142,7 +142,9 @@ def _attitude(payload: bytes, _: Dialect) -> events.Event | DropReason:
 
 def _thrust_report(payload: bytes, _: Dialect) -> events.Event | DropReason:
     *_state, thrust, _mask = _unpack(mavlink.MAVLink_attitude_target_message, payload)
-    return events.ThrustReport(thrust) if 0.0 <= thrust <= 1.0 else DropReason.IMPLAUSIBLE
+    if not math.isfinite(thrust):
+        return DropReason.IMPLAUSIBLE
+    return events.ThrustReport(min(max(thrust, 0.0), 1.0))  # ArduCopter's falls to -0.2 on landing
 
 
 def _gps_fix(payload: bytes, _: Dialect) -> events.Event | DropReason | None:

@@ -31,7 +31,7 @@ from offboard.mavlink.outgoing import (
 from offboard.model import frames
 
 _LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
-_FLOAT32_MAX = 3.4028234663852886e38
+FLOAT32_MAX = 3.4028234663852886e38
 
 
 class Packed(NamedTuple):
@@ -121,7 +121,7 @@ def _boot_ms(time_s: float) -> int:
 
 def _finite(name: str, *values: float) -> None:
     for value in values:
-        if not (math.isfinite(value) and abs(value) <= _FLOAT32_MAX):
+        if not (math.isfinite(value) and abs(value) <= FLOAT32_MAX):
             raise ValueError(f"{name} must be finite, not {value!r}")
 
 
@@ -235,7 +235,7 @@ def _solver(value: SolverRecord) -> Packed:
 
 def _float32(value: float) -> float:
     """The value, or infinity beyond the range of a float32 (log only; never sent)."""
-    return value if not abs(value) > _FLOAT32_MAX else math.copysign(math.inf, value)
+    return value if not abs(value) > FLOAT32_MAX else math.copysign(math.inf, value)
 
 
 def _configuration(value: ConfigurationRecord) -> Packed:

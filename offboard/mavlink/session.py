@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from offboard.mavlink import framing
-from offboard.mavlink.counters import Counters, DropReason, SequenceTracker
+from offboard.mavlink.counters import Counters, DropReason
 from offboard.mavlink.decode import (
     Address,
     decode,
@@ -49,7 +49,8 @@ from offboard.mavlink.vehicle_time import Age, LinkTime, VehicleTime
 DIALECTS: Mapping[str, Dialect] = MappingProxyType({d.name: d for d in (PX4, ARDUPILOT)})
 
 _HEARTBEAT, _COMMAND_ACK, _TIMESYNC, _STATUSTEXT = 0, 77, 111, 253
-_SETPOINTS = (82, 84, 86)  # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT
+# SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: offset of target_system
+_SETPOINTS = MappingProxyType({82: 36, 84: 50, 86: 50})
 _ECHOES = 256  # newest frames of ours that are recognised when they come back
 _AUTOPILOT_COMPONENT = 1
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
@@ -103,7 +104,6 @@ class Session:
         self._own = Address(1, settings.component_id)
         self._peer = Peer()
         self._splitter = framing.FrameSplitter(settings.stream, self.counters)
-        self._sequence_in = SequenceTracker()
         self._sequence_out: dict[int, int] = {}
         self._sent: deque[bytes] = deque(maxlen=_ECHOES)
         self._texts = TextAssembler()
@@ -156,7 +156,7 @@ class Session:
         ours = sender == self._own
         if ours and frame.raw in self._sent:
             return DropReason.ECHO
-        if self.vehicle is not None and (ours or frame.message_id in _SETPOINTS):
+        if self.vehicle is not None and (ours or self._is_setpoint(frame)):
             events.append(OtherSender(*sender, frame.message_id))
         if ours:
             return DropReason.SAME_IDS
@@ -165,7 +165,6 @@ class Session:
             return foreign
         if self.vehicle is not None:
             self._peer.heard_s = now_s
-            self._sequence_in.count(frame.sequence, self.counters)
         if not frame.verified:
             return DropReason.UNKNOWN_ID
         if frame.message_id == _TIMESYNC:
@@ -178,6 +177,14 @@ class Session:
                 events.append(TimesyncReply(ts1_ns, tc1_ns + wrapped_ns))
             return True
         return self._interpret(frame, now_s, events)
+
+    def _is_setpoint(self, frame: framing.Frame) -> bool:
+        """Whether it is a setpoint for our vehicle, or for all: routers forward those of others."""
+        offset = _SETPOINTS.get(frame.message_id)
+        if offset is None:
+            return False
+        target = frame.payload[offset : offset + 1]  # MAVLink 2 omits trailing zeros
+        return not target or target[0] in (0, self._own.system_id)
 
     def _check_sender(
         self, frame: framing.Frame, peer: Hashable, events: list[Event]
@@ -247,7 +254,6 @@ class Session:
             return False
         if isinstance(event, (LocalPosition, Attitude)):
             if age is Age.REBOOTED:
-                self._sequence_in = SequenceTracker()
                 self._restart_rates()  # a rebooted vehicle has its default rates
                 events.append(Rebooted(event.time_s))
             self._link_time.vehicle(event.time_s, now_s)

@@ -14,30 +14,17 @@ from offboard.reference.flatness import flat_state
 
 Array = NDArray[np.float64]
 
+HEIGHT_MIN_M, DISTANCE_MAX_M, SPEED_MAX_MPS = 0.3, 2000.0, 12.0
+# shares of the vehicle's limits; the rest is reserved for feedback
+THRUST_SHARE_MIN, THRUST_SHARE_MAX, TILT_SHARE_MAX = 0.05, 0.95, 0.9
+# PX4's defaults MC_ROLLRATE_MAX and MC_PITCHRATE_MAX (220 deg/s), MC_YAWRATE_MAX (200 deg/s)
+RATES_MAX_FRD_RADPS = 3.84, 3.84, 3.49
 _STEP_S = 0.01
 _CHUNK = 20_000
 
 
 class InfeasibleReference(ValueError):
     """The reference exceeds a limit: one sentence with quantity, time, value and limit."""
-
-
-@dataclass(frozen=True, slots=True)
-class Bounds:
-    """Limits of a reference, besides those of the vehicle.
-
-    Thrust and tilt must stay within fractions of the vehicle's limits; the rest is reserved for
-    feedback. Rates are PX4's defaults MC_ROLLRATE_MAX, MC_PITCHRATE_MAX (220 deg/s) and
-    MC_YAWRATE_MAX (200 deg/s).
-    """
-
-    height_min_m: float = 0.3
-    distance_max_m: float = 2000.0
-    speed_max_mps: float = 12.0
-    thrust_fraction_min: float = 0.05
-    thrust_fraction_max: float = 0.95
-    tilt_fraction_max: float = 0.9
-    rates_max_frd_radps: tuple[float, float, float] = (3.84, 3.84, 3.49)
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,20 +61,17 @@ class _Demand:
         return float(self.values[self.worst])
 
 
-def check(
-    reference: Reference, vehicle: Vehicle, ground_down_m: float = 0.0, bounds: Bounds = Bounds()
-) -> Envelope:
+def check(reference: Reference, vehicle: Vehicle) -> Envelope:
     """Check that a vehicle can fly a reference without wind; return the extremes.
 
-    The reference is sampled every 10 ms. `ground_down_m` is the position of the ground in its frame
-    (NED, positive down): 0 if positions are relative to the take-off point. Raises
+    The reference, relative to the take-off point, is sampled every 10 ms. Raises
     InfeasibleReference for a path that is too low or too far away, otherwise for the limit that is
     exceeded first.
     """
     count = int(np.ceil(reference.duration_s / _STEP_S)) + 1
     times = np.linspace(0.0, reference.duration_s, count)
     parts = [
-        _envelope(reference, vehicle, times[first : first + _CHUNK], ground_down_m, bounds)
+        _envelope(reference, vehicle, times[first : first + _CHUNK])
         for first in range(0, count, _CHUNK)
     ]
     lowest, highest = np.min(parts, axis=0), np.max(parts, axis=0)
@@ -102,10 +86,8 @@ def check(
     )
 
 
-def _envelope(
-    reference: Reference, vehicle: Vehicle, times: Array, ground_down_m: float, bounds: Bounds
-) -> list[float]:
-    demands = _demands(reference, vehicle, times, ground_down_m, bounds)
+def _envelope(reference: Reference, vehicle: Vehicle, times: Array) -> list[float]:
+    demands = _demands(reference, vehicle, times)
     broken: list[tuple[int, _Demand]] = []
     for demand in demands:
         # in this form NaN exceeds the limit
@@ -122,28 +104,26 @@ def _envelope(
     return [demand.extreme for demand in demands]
 
 
-def _demands(
-    reference: Reference, vehicle: Vehicle, times: Array, ground_down_m: float, bounds: Bounds
-) -> tuple[_Demand, ...]:
+def _demands(reference: Reference, vehicle: Vehicle, times: Array) -> tuple[_Demand, ...]:
     sample = reference.sample(times)
     state = flat_state(sample, vehicle.gravity_mps2, vehicle.drag_per_mass_ps)
     thrust_max = vehicle.thrust_max_mps2
     tilt = np.arccos(np.clip(state.thrust_direction_ned[:, 2], -1.0, 1.0))
     rates = np.abs(state.rates_frd_radps)
-    rates_max = bounds.rates_max_frd_radps
+    rates_max = RATES_MAX_FRD_RADPS
     speed = np.linalg.norm(sample.velocity_ned_mps, axis=-1)
-    height = ground_down_m - sample.position_ned_m[:, 2]
+    height = -sample.position_ned_m[:, 2]
     distance = np.linalg.norm(sample.position_ned_m, axis=-1)
     thrust = state.thrust_mps2
     return (
-        _Demand("a thrust of", "m/s^2", thrust, bounds.thrust_fraction_min * thrust_max, -1.0),
-        _Demand("a thrust of", "m/s^2", thrust, bounds.thrust_fraction_max * thrust_max),
-        _Demand("a tilt of", "rad", tilt, bounds.tilt_fraction_max * vehicle.tilt_max_rad),
+        _Demand("a thrust of", "m/s^2", thrust, THRUST_SHARE_MIN * thrust_max, -1.0),
+        _Demand("a thrust of", "m/s^2", thrust, THRUST_SHARE_MAX * thrust_max),
+        _Demand("a tilt of", "rad", tilt, TILT_SHARE_MAX * vehicle.tilt_max_rad),
         _Demand("a roll rate of", "rad/s", rates[:, 0], rates_max[0]),
         _Demand("a pitch rate of", "rad/s", rates[:, 1], rates_max[1]),
         _Demand("a yaw rate of", "rad/s", rates[:, 2], rates_max[2]),
-        _Demand("a speed of", "m/s", speed, bounds.speed_max_mps),
-        _Demand("a height of", "m", height, bounds.height_min_m, -1.0, of_path=True),
-        _Demand("a distance of", "m", distance, bounds.distance_max_m, of_path=True),
+        _Demand("a speed of", "m/s", speed, SPEED_MAX_MPS),
+        _Demand("a height of", "m", height, HEIGHT_MIN_M, -1.0, of_path=True),
+        _Demand("a distance of", "m", distance, DISTANCE_MAX_M, of_path=True),
         _Demand("a height of", "m", height, math.inf, of_path=True),
     )

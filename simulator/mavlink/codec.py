@@ -50,6 +50,7 @@ class Layout:
         self.id: int = message.id
         self.name: str = message.msgname
         self.crc_extra: int = message.crc_extra
+        self.fields = tuple(message.fieldnames)
         self.extra_byte = bytes((message.crc_extra,))
         self._struct: struct.Struct = message.unpacker
         is_text = [fmt.endswith("s") for fmt in _formats(message)]

@@ -3,6 +3,9 @@
 `Pair.fly` steps the vehicle by 4 ms and hands every datagram over at once, through faults that a
 test puts on the two directions. Host time runs with vehicle time but from another zero, so that
 code which mixes them up fails.
+
+The companion may take time: a law that calls `HostClock.spend`, or `Pair.pause`. Meanwhile the
+vehicle goes on, and what it sends waits, with the times of its arrival, for the next turn.
 """
 
 from __future__ import annotations
@@ -24,12 +27,14 @@ from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.link import Chunk
 from offboard.flight.log import FlightLog
 from offboard.flight.online_identification import IdentifySettings
-from offboard.flight.phases import Phase
+from offboard.flight.phases import Phase, Rung
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.model.vehicle import Vehicle
 from simulator import config as simulated
+from simulator.config import Scenario
+from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
@@ -59,6 +64,20 @@ def through(_: float, datagrams: Bytes) -> Bytes:
 
 
 @dataclass
+class HostClock:
+    """Monotonic time of the companion computer."""
+
+    now_s: float = HOST_EPOCH_S
+
+    def __call__(self) -> float:
+        return self.now_s
+
+    def spend(self, seconds: float) -> None:
+        """Compute for so long."""
+        self.now_s += seconds
+
+
+@dataclass
 class Pair:
     """One flight. `at` maps moments to actions: each is done once, when its test first holds.
 
@@ -68,47 +87,72 @@ class Pair:
 
     companion: Companion
     instance: Instance
+    clock: HostClock = field(default_factory=HostClock)
     down: Filter = through
     up: Filter = through
     at: list[tuple[Callable[[Pair], bool], Callable[[Pair], object]]] = field(default_factory=list)
     dead: bool = False
     time_s: float = 0.0
+    steps: int = 0
     sent: list[tuple[float, Phase, bytes]] = field(default_factory=list)  # by the companion
     logged: Bytes = field(default_factory=list)
     phases: list[tuple[float, Phase]] = field(default_factory=list)
+    rungs: dict[str, Rung] = field(default_factory=dict)  # rows of the ladder that were active
+    waiting: list[Chunk] = field(default_factory=list)  # that the companion has not read yet
+    leaving: Bytes = field(default_factory=list)  # what the turn in progress sends at its end
 
     def fly(self, longest_s: float = LONGEST_S) -> Outcome:
         """To the end of the flight, which must come within `longest_s`."""
-        step = 0
         while not self.companion.has_ended():
             assert self.time_s < longest_s, f"no end after {longest_s} s: {self.companion.phase}"
-            step += 1
-            self.time_s = step * STEP_S
-            self._step()
-            if step % POLL_STEPS == 0 and not self.companion.has_ended():
-                now_s = HOST_EPOCH_S + self.time_s
-                self._take(self.companion.turn([], now_s))
-            for moment in [moment for moment in self.at if moment[0](self)]:
-                self.at.remove(moment)
-                moment[1](self)
-            if not self.phases or self.phases[-1][1] is not self.companion.phase:
-                self.phases.append((self.time_s, self.companion.phase))
+            self.advance()
         assert self.companion.outcome is not None
         return self.companion.outcome
 
-    def _step(self) -> None:
-        if self.dead:
-            return
-        for datagram in self.down(self.time_s, self.instance.step()):
-            if self.companion.has_ended():
-                return
-            now_s = HOST_EPOCH_S + self.time_s
-            self._take(self.companion.turn([Chunk(datagram, "vehicle", now_s)], now_s))
+    def advance(self) -> None:
+        """One step of the vehicle, and the turns of the companion that follow."""
+        self.steps += 1
+        self.time_s = self.steps * STEP_S
+        now_s = HOST_EPOCH_S + self.time_s
+        datagrams = [] if self.dead else self.down(self.time_s, self.instance.step())
+        self.waiting += [Chunk(datagram, "vehicle", now_s) for datagram in datagrams]
+        if now_s >= self.clock.now_s:
+            self.clock.now_s = now_s
+            self._feed()
+            self._turns()
+        for moment in [moment for moment in self.at if moment[0](self)]:
+            self.at.remove(moment)
+            moment[1](self)
+        if not self.phases or self.phases[-1][1] is not self.companion.phase:
+            self.phases.append((self.time_s, self.companion.phase))
+
+    def _turns(self) -> None:
+        """A turn for each datagram that has just arrived, or one for all that have waited."""
+        now_s, chunks = self.clock.now_s, self.waiting
+        waited = bool(chunks) and chunks[0].arrived_s < now_s
+        batches = [chunks] if waited else [[chunk] for chunk in chunks]
+        self.waiting = []
+        if self.steps % POLL_STEPS == 0:
+            batches.append([])
+        for batch in batches:
+            if self.clock.now_s > now_s:
+                self.waiting += batch
+            elif not self.companion.has_ended():
+                self._take(self.companion.turn(batch, now_s))
 
     def _take(self, output: Any) -> None:
         self.logged.extend(output.log)
         self.sent.extend((self.time_s, self.companion.phase, frame) for frame in output.send)
-        for frame in self.up(self.time_s, list(output.send)):
+        self.leaving += self.up(self.time_s, list(output.send))
+        worst = self.companion.state.ladder.worst
+        if worst is not None:
+            self.rungs[worst.name] = worst.rung
+        if self.clock.now_s <= HOST_EPOCH_S + self.time_s:
+            self._feed()
+
+    def _feed(self) -> None:
+        frames, self.leaving = self.leaving, []
+        for frame in frames:
             if not self.dead:
                 self.instance.feed(frame)
 
@@ -123,6 +167,10 @@ class Pair:
 
     def pilot_takes_over(self) -> None:
         self.ground(176, 1, 4, LOITER)
+
+    def pause(self, seconds: float) -> None:
+        """The process of the companion is stopped, as by SIGSTOP."""
+        self.clock.spend(seconds)
 
     @property
     def heard_s(self) -> float:
@@ -196,19 +244,24 @@ def make(
     reference: str | None = None,
     vehicle: str | None = None,
     seed: int = 7,
-    scenario: str = "calm",
+    scenario: str | Scenario = "calm",
     firmware: Firmware = LEAN,
     wrap: Callable[[Controller], Controller] = lambda controller: controller,
     limits: dict[str, float] | None = None,
     flies: Vehicle | None = None,
     learning: IdentifySettings | None = None,
     believed: Vehicle | None = None,
+    deadline_s: float | None = None,
+    boot_scale: float = 1.0,
+    clock: HostClock | None = None,
     **options: Any,
 ) -> Pair:
     """A pair as `offboard fly --sitl` makes it. `flies` is the simulated vehicle, `believed` the
-    controller's model of it, `learning` the settings of the identification."""
+    controller's model of it, `learning` the settings of the identification. With `deadline_s` the
+    companion does not wait for slow decisions."""
     named = {"reference": reference, "vehicle": vehicle}
     choices = {part: chosen for part, chosen in named.items() if chosen}
+    clock = clock or HostClock()
     resolved = config.load(
         name, choices=choices, assignments=assignments, seed=seed, known_vehicle="px4_sih"
     )
@@ -229,13 +282,30 @@ def make(
         plan=FlightPlan(config.build_track(resolved)),
         limits=resolved.limits.model_copy(update=limits or {}),
         period_s=resolved.period_s,
-        deadline_s=None,
-        stopwatch=lambda: 0.0,
+        deadline_s=deadline_s,
+        stopwatch=lambda: 0.0 if deadline_s is None else clock.now_s,
         identify=learning,
     )
-    conditions = simulated.scenario(scenario).conditions
-    instance = Instance(firmware, flies or simulated.vehicle("px4_sih"), conditions, seed)
-    return Pair(companion, instance, **options)
+    flown = simulated.scenario(scenario) if isinstance(scenario, str) else scenario
+    instance = Instance(
+        firmware,
+        flies or simulated.vehicle(firmware.vehicle),
+        flown.conditions.model_copy(update={"boot_scale": boot_scale}),
+        seed,
+        ground_link=firmware.name != ARDUPILOT.name,
+        faults=flown.faults,
+        start=flown.start,
+    )
+    return Pair(companion, instance, clock, **options)
+
+
+def on_arducopter(
+    *assignments: str, guid_options: float = 8.0, firmware: Firmware = ARDUPILOT, **options: Any
+) -> Pair:
+    """A flight on ArduCopter, whose start is ten times as fast as the real one's 42 s."""
+    pair = make(*assignments, vehicle="arducopter", firmware=firmware, boot_scale=0.1, **options)
+    pair.instance.autopilot.parameters.set("GUID_OPTIONS", guid_options)
+    return pair
 
 
 SHORT = ("reference.height_m=1.0", "reference.duration_s=3.0")

@@ -4,38 +4,18 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import pytest
-from pair import Pair, make
+from pair import on_arducopter
 
 from offboard.flight.phases import TRACKING, ExitCode, Phase
-from simulator import config as simulated
 from simulator.firmware.ardupilot import ARDUPILOT
-from simulator.firmware.base import Firmware, Rule
+from simulator.firmware.base import Rule
 from simulator.firmware.values import Result
-from simulator.instance import Instance
 
 SET_MODE, ARM, TAKEOFF, LAND = 176, 400, 22, 21
 GUIDED = 4
 SHORT = ("reference.height_m=1.5", "reference.duration_s=3.0")
-
-
-def on_arducopter(
-    *assignments: str,
-    scenario: str = "calm",
-    guid_options: float = 8.0,
-    firmware: Firmware = ARDUPILOT,
-    **options: Any,
-) -> Pair:
-    """A flight on ArduCopter, whose start is ten times as fast as the real one's 42 s."""
-    seed = options.get("seed", 7)
-    pair = make(*assignments, vehicle="arducopter", scenario=scenario, **options)
-    conditions = simulated.scenario(scenario).conditions.model_copy(update={"boot_scale": 0.1})
-    vehicle = simulated.vehicle("arducopter")
-    pair.instance = Instance(firmware, vehicle, conditions, seed, ground_link=False)
-    pair.instance.autopilot.parameters.set("GUID_OPTIONS", guid_options)
-    return pair
 
 
 def test_guided_armed_takeoff_and_then_setpoints() -> None:

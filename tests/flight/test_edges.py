@@ -7,6 +7,7 @@ import pty
 import select
 import signal
 import socket
+import time
 import tty
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -23,6 +24,7 @@ from offboard.flight.link import Chunk, Link, Strangers
 from offboard.flight.log import FlightLog
 from offboard.flight.loop import Loop
 from offboard.flight.stop import StopRequests
+from offboard.flight.supervisor import Supervisor
 from offboard.mavlink.counters import Counters
 from offboard.mavlink.framing import FrameSplitter, pack
 
@@ -125,6 +127,50 @@ def test_two_signals(
     assert flight.turns == turns_left
     assert flight.stops
     assert (outcome.exit_code == 0) is (turns_left == 0)
+
+
+class Watcher:
+    """A supervisor that never takes over."""
+
+    lost = False
+    said: tuple[str, ...] = ()
+
+    def has_taken_over(self) -> bool:
+        return False
+
+    def beat(self, *arguments: object) -> None: ...
+
+
+def test_what_a_turn_decided_is_dropped_when_it_became_too_old(tmp_path: Path) -> None:
+    """As when the process is stopped between the decision and its sending."""
+    sent: list[bytes] = []
+
+    class Recording(Wire):
+        def send(self, data: bytes, peer: object) -> None:
+            sent.append(data)
+
+    class Deciding(Flight):
+        def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
+            frame = setpoint(self.turns)
+            super().turn(chunks, now_s)
+            if self.turns == 1:
+                time.sleep(0.25)
+            return Output(send=(frame,), log=(frame,))
+
+    flight = Deciding(3, lambda left: None)
+    directory = tmp_path / "flight"
+    with FlightLog(directory, "") as log, StopRequests() as stops:
+        Loop(
+            cast(Companion, flight),
+            cast(Link, Recording()),
+            log,
+            stops=stops,
+            progress=lambda companion: None,
+            supervisor=cast(Supervisor, Watcher()),
+        ).run()
+    assert sent == [setpoint(3), setpoint(1)]
+    assert flight.announced == ["1 messages dropped: they became too old"]
+    assert (directory / "flight.tlog").read_bytes().count(setpoint(2)) == 0
 
 
 def test_an_ignored_sighup_stays_ignored(tmp_path: Path) -> None:

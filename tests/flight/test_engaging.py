@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from pair import Pair, in_phase, make
-from test_ardupilot import on_arducopter
+from pair import Pair, in_phase, make, on_arducopter
 
 from offboard.analysis import history
 from offboard.flight.phases import Phase

@@ -17,7 +17,7 @@ from simulator.firmware.px4 import PX4
 
 LQR = "controller={law: lqr, bandwidth_radps: 5.0}"
 FUSED = ("estimate=fused", LQR)
-SEEDS = (1, 2, 3, 4, 5)
+SEEDS = range(1, 8)
 FIXES_HZ = {"GPS_RAW_INT": PX4.streams.companion_rates_hz["GPS_RAW_INT"]}
 RATES_HZ = {**LEAN.streams.companion_rates_hz, **FIXES_HZ}
 WITH_RECEIVER = replace(LEAN, streams=replace(LEAN.streams, companion_rates_hz=RATES_HZ))
@@ -78,7 +78,7 @@ def test_flight_continues_when_the_receiver_jumps(tmp_path: Path) -> None:
     assert pair.went_through(Phase.TRACK)
     assert [line for line in pair.companion.announced if "GPS" in line] == [
         "no usable GPS fix for 1 s: using the vehicle's estimate",
-        "GPS is 30.0 m from the vehicle's estimate: not fused",
+        "GPS is 30.1 m from the vehicle's estimate: not fused",
     ]
     assert largest_tilt_rad(pair) < largest_tilt_rad(undisturbed) + 0.02
     assert pair.score(tmp_path).max_truth_m < 1.2

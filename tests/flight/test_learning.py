@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import pytest
 from faults import TARGET, TIMESYNC, without
-from pair import Filter, Pair, in_phase, make
+from pair import Filter, Pair, in_phase, make, on_arducopter
 from scipy.interpolate import CubicHermiteSpline
-from test_ardupilot import on_arducopter
 
 from offboard.analysis import history
 from offboard.analysis.identify import identify_flight, vehicle_file

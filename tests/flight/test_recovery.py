@@ -28,13 +28,13 @@ class Vehicle:
         self.asked: list[tuple[float, int]] = []
         self.pilot: tuple[float, str] | None = None
 
-    def survives(self, before: str | None = None, longest_s: float = 200.0) -> str:
+    def survives(self, before: str | None = None, *, holding: bool = False) -> str:
         """Run to the end of the recovery, which has heard the mode `before` it began."""
-        recovery = Recovery(self.dialect, 100.0)
+        recovery = Recovery(self.dialect, 100.0, holding=holding)
         if before:
             recovery.see(Heartbeat(before, True, 4), 99.6)
         landing_s = 0.0
-        for step in range(round(longest_s / STEP_S)):
+        for step in range(round(200.0 / STEP_S)):
             time_s = step * STEP_S
             if self.pilot and time_s >= self.pilot[0]:
                 self.mode = self.pilot[1]
@@ -95,6 +95,14 @@ def test_a_mode_left_before_is_left_alone(dialect: Dialect, mode: str) -> None:
     left = dialect.hold_mode if mode == "hold" else "ALTCTL"
     assert vehicle.survives(before=left).startswith(f"the vehicle shows {left}")
     assert vehicle.asked == []
+
+
+@FIRMWARES
+def test_a_vehicle_that_the_controller_asked_to_hold_is_landed(dialect: Dialect) -> None:
+    vehicle = Vehicle(dialect)
+    vehicle.mode = dialect.hold_mode
+    assert vehicle.survives(before=dialect.hold_mode, holding=True) == "the vehicle is disarmed"
+    assert [command for _, command in vehicle.asked] == [LAND]
 
 
 @FIRMWARES

@@ -211,7 +211,7 @@ def test_port_in_use(offboard: Call) -> None:
         port = other.getsockname()[1]
         code, output = offboard("fly", "--connect", f"udpin:127.0.0.1:{port}")
     assert code == 2
-    assert f"udpin:127.0.0.1:{port} cannot be opened" in output
+    assert f"'udpin:127.0.0.1:{port}' cannot be opened" in output
     assert "another program uses the port" in output
 
 

@@ -6,8 +6,8 @@ import json
 
 import numpy as np
 import pytest
-from test_law_signs import law_named
-from test_tracking_law import LEVEL, Lemniscate, state_of
+from attitude_plant import Lemniscate
+from laws import LEVEL, law_named, state_of
 
 from offboard.control.base import Controller, Situation
 from offboard.control.catalogue import names, settings_of

@@ -7,9 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import pytest
 from attitude_plant import Lemniscate, Truth, fly
+from laws import PX4, G, at, lqr
 from scipy.integrate import solve_ivp
-from test_law_signs import at
-from test_tracking_law import PX4, G, lqr
 
 from offboard.control.riccati import thrust_ripple, tilt_ripple
 from offboard.reference.base import FlatSample

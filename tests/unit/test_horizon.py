@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from attitude_plant import Lemniscate, Truth, fly
+from laws import LEVEL, PX4, G, lqr, state_of
 from scipy.integrate import solve_ivp
-from test_tracking_law import LEVEL, PX4, G, lqr, state_of
 
 from offboard.control.base import Decision, Situation
 from offboard.control.horizon.planner import STEPS_AROUND, Dynamics

@@ -10,32 +10,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from attitude_plant import Lemniscate, Truth, fly
-from test_tracking_law import LEVEL, PX4, G
+from laws import LEVEL, PX4, TRACKING, G, at, law_named
 
 from offboard.control.base import Controller, Decision, Situation
-from offboard.control.catalogue import names, settings_of
 from offboard.model.command import Command, PositionCommand
 from offboard.model.frames import wrap_pi
-from offboard.model.predicted_state import PredictedState
 from offboard.reference.base import FlatSample
 from offboard.reference.transfer import Hold
 
-# Those that track by themselves; the paper's law is slow, and the autopilot's own loop not ours
-TRACKING = [name for name in names() if name not in ("paper", "autopilot")]
 HEADINGS_DEG = (0.0, 90.0, 179.9, -179.9, -90.0)
-
-
-def law_named(name: str) -> Controller:
-    chosen = {"bandwidth_radps": 5.0} if name in TRACKING else {}
-    return settings_of(name)(law=name, **chosen).build(PX4, period_s=0.1, seed=7)
-
-
-def at(position: tuple[float, float, float], course_rad: float) -> PredictedState:
-    """At rest and level."""
-    return PredictedState(
-        0.057, np.array(position), np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros(3),
-        course_rad, 0.0, G, np.zeros(3), np.zeros(3),
-    )  # fmt: skip
 
 
 class Swapped:

@@ -10,7 +10,7 @@ import pytest
 
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import FlatSample
-from offboard.reference.feasibility import Bounds, InfeasibleReference, check
+from offboard.reference.feasibility import InfeasibleReference, check
 from offboard.reference.shapes import SHAPES
 from offboard.reference.track import Track
 from offboard.reference.transfer import Hold
@@ -91,11 +91,14 @@ def test_the_earliest_time_is_named() -> None:
 
         duration_s = 10.0
 
+        def __init__(self, start_down_m: float) -> None:
+            self.start_down_m = start_down_m
+
         def sample(self, time_s: object) -> FlatSample:
             time = np.asarray(time_s, dtype=np.float64)
             zero = np.zeros((*time.shape, 3))
             position, velocity = zero.copy(), zero.copy()
-            position[..., 2] = -5.0 + time
+            position[..., 2] = self.start_down_m + time
             velocity[..., 0] = 2.0 * time
             course = np.zeros(time.shape)
             return FlatSample(position, velocity, zero, zero, zero, course, course, course)
@@ -103,12 +106,11 @@ def test_the_earliest_time_is_named() -> None:
     with pytest.raises(
         InfeasibleReference, match=r"a height of -5 m at 10.00 s, .* 0.3 m \(first at 4.7[01] s"
     ):
-        check(Leap(), vehicle())
+        check(Leap(-5.0), vehicle())
     with pytest.raises(
         InfeasibleReference, match=r"a speed of 20 m/s at 10.00 s, .* \(first at 6.0[01] s"
     ):
-        check(Leap(), vehicle(), ground_down_m=10.0)
-    assert check(Leap(), vehicle(), 10.0, Bounds(speed_max_mps=21.0)).height_min_m == 5.0
+        check(Leap(-15.0), vehicle())
 
 
 def test_what_is_not_a_number_is_refused() -> None:

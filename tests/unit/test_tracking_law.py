@@ -13,69 +13,18 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pytest
 from attitude_plant import Flight, Lemniscate, Truth, fly
+from laws import ARDUCOPTER, LEVEL, PX4, G, lqr, pso, state_of
 from scipy.linalg import expm
 
 from offboard.control.base import Controller, DecisionError, Situation
-from offboard.control.laws.lqr import LqrLaw, LqrSettings, closed_form
-from offboard.control.laws.pso import PsoLaw, PsoSettings
+from offboard.control.laws.lqr import closed_form
+from offboard.control.laws.pso import PsoLaw
 from offboard.control.swarm import SwarmSettings
 from offboard.estimation.observer import ObserverSettings, VelocitySource
 from offboard.model.axes import lateral_model, lead, vertical_model
 from offboard.model.command import Command
-from offboard.model.predicted_state import PredictedState
-from offboard.model.vehicle import AxisResponse, Vehicle
+from offboard.model.vehicle import Vehicle
 from offboard.reference.base import FlatSample
-
-G = 9.80665
-PX4 = Vehicle(
-    name="px4",
-    mass_kg=1.0,
-    inertia_kgm2=(0.025, 0.025, 0.03),
-    drag_translation_npmps=(1.02, 1.02, 1.02),
-    drag_rotation_nmpradps=(0.02, 0.02, 0.02),
-    hover_thrust=0.4895,
-    thrust_delay_s=0.015,
-    thrust_lag_s=0.05,
-    tilt=AxisResponse(delay_s=0.057, natural_frequency_radps=11.4, damping=0.56),
-    yaw=AxisResponse(delay_s=0.148, natural_frequency_radps=3.1, damping=0.4),
-)
-ARDUCOPTER = PX4.model_copy(
-    update={
-        "drag_translation_npmps": (0.29, 0.29, 0.29),
-        "thrust_lag_s": 0.0,
-        "tilt": AxisResponse(delay_s=0.01, natural_frequency_radps=12.6, damping=1.115),
-        "angular_acceleration_limit_radps2": (19.2, 19.2, 4.7),
-    }
-)
-LEVEL = Command(G, (0.0, 0.0, 1.0), 0.0)
-
-
-def lqr(bandwidth: float = 5.0, vehicle: Vehicle = PX4, **more: object) -> LqrLaw:
-    return LqrLaw(vehicle, LqrSettings.model_validate({"bandwidth_radps": bandwidth, **more}))
-
-
-def pso(bandwidth: float = 5.0, vehicle: Vehicle = PX4, seed: int = 0, **more: object) -> PsoLaw:
-    settings = PsoSettings.model_validate({"bandwidth_radps": bandwidth, **more})
-    return PsoLaw(vehicle, settings, seed=seed)
-
-
-def state_of(rng: np.random.Generator, reference: Lemniscate, size: float) -> PredictedState:
-    """Somewhere near the reference at 5.057 s, off by about `size` in every unit."""
-    sample = reference.sample(5.057)
-    tilt = np.clip(0.05 * size * rng.normal(size=2), -0.6, 0.6)
-    return PredictedState(
-        time_s=5.057,
-        position_ned_m=sample.position_ned_m + size * rng.normal(size=3),
-        velocity_ned_mps=sample.velocity_ned_mps + size * rng.normal(size=3),
-        thrust_direction_ned=np.array([*tilt, math.sqrt(1 - tilt @ tilt)]),
-        thrust_direction_rate_ned_ps=np.array([*(0.2 * size * rng.normal(size=2)), 0.0]),
-        course_rad=0.0,
-        course_rate_radps=0.0,
-        thrust_mps2=G + 0.3 * size * rng.normal(),
-        disturbance_ned_mps2=0.3 * size * rng.normal(size=3),
-        rates_frd_radps=np.zeros(3),
-    )
-
 
 # ---------------------------------------------------------------- the law on paper
 

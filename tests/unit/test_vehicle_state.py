@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from offboard.flight.state import VehicleState
+from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.events import Attitude, LocalPosition
 
 STILL = (0.0, 0.0, 0.0)
@@ -24,19 +24,19 @@ def hovering() -> VehicleState:
     """Both streams at 10 Hz until 10 s."""
     state = VehicleState()
     for time_s in np.arange(1, 101) / 10.0:
-        state.update(position(time_s))
-        state.update(attitude(time_s))
+        state.update(position(time_s), time_s)
+        state.update(attitude(time_s), time_s)
     return state
 
 
 def test_an_outage_of_the_whole_link_does_not_count_as_age() -> None:
     state = hovering()
-    state.update(position(10.9))
+    state.update(position(10.9), 10.9)
     assert state.attitude_age_s == pytest.approx(0.0)
-    state.update(position(11.0))
+    state.update(position(11.0), 11.0)
     assert state.attitude_age_s == pytest.approx(0.1)  # since the link is back
-    state.update(attitude(11.0))
-    state.update(attitude(11.9))  # a second one
+    state.update(attitude(11.0), 11.0)
+    state.update(attitude(11.9), 11.9)  # a second one
     assert state.position_age_s == pytest.approx(0.0)
 
 
@@ -46,6 +46,6 @@ def test_a_stopped_stream_is_detected_at_any_rate_of_the_other(interval_s: float
         state = hovering()
         going = attitude if stopped == "position" else position
         for time_s in 10.0 + np.arange(1, 11) * interval_s:
-            state.update(going(time_s))
+            state.update(going(time_s), time_s)
         age_s = getattr(state, f"{stopped}_age_s")
         assert age_s >= 10 * interval_s - interval_s - 1e-9

@@ -11,26 +11,14 @@ from collections.abc import Callable
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import LOITER, NAN, RTL, Bench
+from sim_courses import copter, course_deg, place, velocity
 
-from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.geodesy import EARTH_RADIUS_M
-from simulator.vehicle.sensors import EstimatorName
 
 ACCEPTED, UNSUPPORTED = 0, 3
 POSITION_ALONE, VELOCITY_ALONE, YAW_TOO = 0xDF8, 0xDC7, 0x9F8
 LOCAL, LOCAL_OFFSET, BODY, BODY_OFFSET = 1, 7, 8, 9  # MAV_FRAME
 RELATIVE, ABSOLUTE = 6, 5
-
-
-def copter() -> Bench:
-    """An ArduCopter that holds 5 m in GUIDED."""
-    bench = Bench(EstimatorName.PERFECT, firmware=ARDUPILOT, boot_scale=0.1)
-    bench.run(4.5)
-    bench.command(176, 1, 4)
-    bench.command(400, 1)
-    bench.command(22, *(0.0,) * 6, 5.0)
-    bench.run(9.0)
-    return bench
 
 
 def px4() -> Bench:
@@ -81,20 +69,8 @@ def reposition(
     return int(bench.of("COMMAND_ACK")[-1][1].result)
 
 
-def course_deg(bench: Bench) -> float:
-    return math.degrees(bench.instance.autopilot.state.estimate.yaw_rad)
-
-
 def off_deg(bench: Bench, wanted_deg: float) -> float:
     return abs(math.remainder(course_deg(bench) - wanted_deg, 360.0))
-
-
-def place(bench: Bench) -> tuple[float, ...]:
-    return tuple(bench.instance.autopilot.state.truth.position_ned_m.tolist())
-
-
-def velocity(bench: Bench) -> tuple[float, ...]:
-    return tuple(bench.instance.autopilot.state.truth.velocity_ned_mps.tolist())
 
 
 def fastest_mps(bench: Bench, duration_s: float) -> float:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import Bench
-from test_sim_courses import copter, course_deg, place, velocity
+from sim_courses import copter, course_deg, place, velocity
 
 LOITER = 5
 KEEP = 65535

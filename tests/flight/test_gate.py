@@ -1,0 +1,339 @@
+"""The gate, with the authority before it: flights of one tick, drawn by Hypothesis.
+
+Each is a history of reports, requests and pauses, then one setpoint. The oracle restates the rules
+as a pattern over the modes that were shown, and as numbers; it calls neither module.
+
+OFFBOARD_GATE_TICKS=100000 draws that many instead of the default number.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+import re
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from offboard.flight.authority import Authority
+from offboard.flight.gate import Clearance, Refusal, Refused, admit
+from offboard.model.command import Command, PositionCommand
+from simulator import config
+
+TICKS = int(os.environ.get("OFFBOARD_GATE_TICKS", "1000"))
+MANY = settings(
+    max_examples=TICKS, derandomize=True, deadline=None, suppress_health_check=list(HealthCheck)
+)
+FRESH_S = 2.5  # the longest age of a report of the mode
+BEFORE_PAUSE_ENDS_S = 0.6  # a report may have arrived so long before the end of a pause
+VEHICLE = config.vehicle("px4_sih")
+LEAST_MPS2, MOST_MPS2 = VEHICLE.gravity_mps2 / 3.0, VEHICLE.gravity_mps2 / VEHICLE.hover_thrust
+FLOAT32_MAX = float(np.finfo(np.float32).max)
+
+# --- histories ------------------------------------------------------------------------------------
+
+# E: the mode that follows setpoints, H and L: hold and land, B and O: others
+SHOWN = st.sampled_from("EEEBBHLO")
+
+
+@dataclass(frozen=True)
+class Occurrence:
+    """One event of the history, `after_s` the one before it."""
+
+    kind: str  # report, ask, request, pause, lose
+    after_s: float
+    mode: str = ""
+    failsafe: bool = False
+    waited_s: float = 0.0  # of a report, between its arrival and its processing
+
+
+SOON = st.sampled_from([0.0, 0.1, 0.5])
+WAITED = st.sampled_from([0.0, 0.0, 0.5, 0.7, 3.0])
+AFTER = st.one_of(SOON, st.floats(0.0, 4.0))
+
+
+def reports(modes: st.SearchStrategy[str], after: st.SearchStrategy[float] = AFTER):
+    return st.builds(Occurrence, st.just("report"), after, modes, st.booleans(), WAITED)
+
+
+def several(mode: str):
+    return st.lists(reports(st.just(mode), SOON), min_size=1, max_size=2)
+
+
+def one(kind: str, mode: str = ""):
+    return st.just([Occurrence(kind, 0.1, mode)])
+
+
+# A flight as it should be, cut off anywhere, and anything at all inserted anywhere
+FLIGHT = st.tuples(
+    several("B"), one("ask"), several("E"), one("request", "H"), several("H"),
+    one("request", "L"), several("L"),
+)  # fmt: skip
+INSERTED = st.one_of(
+    reports(SHOWN),
+    reports(SHOWN),
+    st.builds(Occurrence, st.just("request"), AFTER, st.sampled_from("HL")),
+    st.builds(Occurrence, st.sampled_from(["ask", "pause", "pause", "lose"]), AFTER),
+)
+INSERTIONS = st.lists(st.tuples(st.integers(0, 14), INSERTED), max_size=4)
+
+
+def flight_of(parts, cut: int, insertions) -> list[Occurrence]:
+    history = [each for part in parts for each in part][:cut]
+    for index, occurrence in insertions:
+        history.insert(index, occurrence)
+    return history
+
+
+HISTORY = st.builds(flight_of, FLIGHT, st.integers(0, 14), INSERTIONS)
+BEGINNING = st.builds(flight_of, FLIGHT, st.integers(1, 5), INSERTIONS)
+
+
+def replayed(history: list[Occurrence], *, failsafes: bool = True) -> tuple[Authority, float]:
+    """The authority after the history, and the time of its end."""
+    authority, now_s = Authority("E"), 100.0
+    for each in history:
+        now_s += each.after_s
+        if each.kind == "report":
+            authority.on_mode(
+                each.mode,
+                now_s,
+                arrived_s=now_s - each.waited_s,
+                failsafe=each.failsafe and failsafes,
+            )
+        elif each.kind == "ask":
+            authority.ask()
+        elif each.kind == "request":
+            authority.request(each.mode)
+        elif each.kind == "pause":
+            authority.doubt(now_s)
+        else:
+            authority.lose("by a test", now_s)
+    return authority, now_s
+
+
+def since_asked(history: list[Occurrence]) -> str | None:
+    """The modes shown since we asked first, after the one in which we did; None if we never did."""
+    shown, asked = "?", False
+    letters = ""
+    for each in history:
+        if each.kind == "report":
+            shown = each.mode
+            letters += each.mode if asked else ""
+        elif each.kind == "ask" and not asked:
+            asked, letters = True, shown
+    return letters if asked else None
+
+
+def may_set(history: list[Occurrence]) -> bool:
+    """Nothing but the mode in which we asked, then nothing but ours."""
+    letters = since_asked(history)
+    if any(each.kind == "lose" for each in history):
+        return False
+    return letters is None or re.fullmatch(rf"{re.escape(letters[0])}*E*", letters) is not None
+
+
+def may_command(history: list[Occurrence]) -> bool:
+    """As for a setpoint, and in a mode that we asked for later than for the one before it."""
+    if may_set(history):
+        return True
+    letters = since_asked(history)
+    if any(each.kind == "lose" for each in history) or letters is None:
+        return False
+    began = re.match(rf"{re.escape(letters[0])}*E+", letters) or re.match(r"E+", letters)
+    if began is None:
+        return False
+    first = next(i for i, each in enumerate(history) if each.kind == "ask")
+    reports = [i for i in range(first, len(history)) if history[i].kind == "report"]
+    current, reason = "E", -1
+    for i in reports[began.end() - 1 :]:
+        mode = history[i].mode
+        if mode == current:
+            continue
+        reasons = [
+            j
+            for j in range(reason + 1, i)
+            if history[j].kind == "request" and history[j].mode == mode
+        ]
+        if not reasons:
+            return False
+        current, reason = mode, reasons[0]
+    return True
+
+
+def is_fresh(history: list[Occurrence], late_s: float) -> bool:
+    """The newest report that counts is at most 2.5 s old, `late_s` after the end."""
+    now_s, newest_s, arrived_s, counts_from_s = 100.0, -math.inf, -math.inf, -math.inf
+    for each in history:
+        now_s += each.after_s
+        if each.kind == "pause":
+            counts_from_s = now_s - BEFORE_PAUSE_ENDS_S
+            if arrived_s < counts_from_s:
+                newest_s = -math.inf
+        elif each.kind == "report":
+            arrived_s = now_s - each.waited_s
+            if arrived_s >= counts_from_s:
+                newest_s = now_s
+    return now_s + late_s - newest_s <= FRESH_S
+
+
+# --- setpoints ------------------------------------------------------------------------------------
+
+ANY = st.one_of(
+    st.floats(),
+    st.sampled_from([math.nan, math.inf, -math.inf, 0.0, -0.0, 5e-324, -5e-324, 1e38, 1e39, 1e308]),
+)
+THRUST = st.one_of(st.floats(-5.0, 50.0), ANY)
+ANGLE = st.floats(-math.pi, math.pi)
+
+
+def leaning(tilt_rad: float, course_rad: float, length: float) -> tuple[float, float, float]:
+    lateral = length * math.sin(tilt_rad)
+    down = length * math.cos(tilt_rad)
+    return lateral * math.cos(course_rad), lateral * math.sin(course_rad), down
+
+
+LENGTH = st.one_of(st.floats(0.98, 1.02), st.floats(0.0, 1e200))
+TINY = st.sampled_from([0.0, -0.0, 5e-324, -5e-324, 1e-300, 1e-160])
+DIRECTION = st.one_of(
+    st.builds(leaning, ANGLE, ANGLE, LENGTH),
+    st.builds(leaning, ANGLE, ANGLE, st.just(1.0)),
+    st.tuples(TINY, TINY, st.sampled_from([1.0, -1.0])),
+    st.tuples(ANY, ANY, ANY),
+)
+COMMAND = st.one_of(
+    st.builds(
+        Command, st.floats(-5.0, 50.0), st.builds(leaning, ANGLE, ANGLE, st.just(1.0)), ANGLE
+    ),
+    st.builds(Command, THRUST, DIRECTION, st.one_of(ANGLE, ANY)),
+)
+
+
+def positions(number: st.SearchStrategy[float]):
+    vector = st.tuples(number, number, number)
+    return st.builds(PositionCommand, vector, vector, vector, number, number)
+
+
+POSITION = st.one_of(
+    positions(st.sampled_from([0.0, -1e4, 1e4, 5e-324])),
+    positions(st.one_of(st.just(1.0), st.just(1.0), ANY)),
+)
+TIME = st.one_of(st.floats(-0.1, 0.1), st.just(0.0), st.floats(-0.1, 3.0), ANY)
+LATER = st.one_of(SOON, st.floats(0.0, 4.0))
+
+
+def numbers(command: Command | PositionCommand) -> np.ndarray:
+    if isinstance(command, Command):
+        fields = (command.thrust_mps2, *command.thrust_direction_ned, command.course_rad)
+    else:
+        vectors = command.position_ned_m, command.velocity_ned_mps, command.acceleration_ned_mps2
+        fields = (*np.ravel(vectors), command.course_rad, command.course_rate_radps)
+    return np.array(fields, dtype=np.float64)
+
+
+def is_usable(command: Command | PositionCommand) -> bool:
+    """Every number fits the wire, which is float32, and a direction has the length 1."""
+    if not (np.abs(numbers(command)) <= FLOAT32_MAX).all():
+        return False
+    if isinstance(command, PositionCommand):
+        return True
+    length = np.linalg.norm(np.array(command.thrust_direction_ned, dtype=np.longdouble))
+    return bool(0.99 <= length <= 1.01)
+
+
+def tilt_of(command: Command) -> float:
+    north, east, down = (np.longdouble(each) for each in command.thrust_direction_ned)
+    return float(np.arctan2(np.sqrt(north**2 + east**2), down))
+
+
+# --- the properties -------------------------------------------------------------------------------
+
+
+@MANY
+@given(
+    st.one_of(BEGINNING, BEGINNING, HISTORY),
+    st.one_of(COMMAND, COMMAND, POSITION),
+    LATER,
+    st.booleans(),
+    TIME,
+    st.floats(0.1, 2.0),
+    st.one_of(st.just(0.0), TIME),
+)
+@example([], Command(9.8, (0.0, 0.0, 1.0), 0.0), 0.0, False, 0.0, 0.25, 0.0)
+def test_flights_of_one_tick(
+    history: list[Occurrence],
+    command: Command | PositionCommand,
+    later_s: float,
+    on_ground: bool,
+    age_s: float,
+    age_limit_s: float,
+    late_s: float,
+) -> None:
+    authority, end_s = replayed(history)
+    ours = authority.permits_setpoint(end_s + later_s)
+    clearance = Clearance(ours, on_ground, age_s, age_limit_s, late_s)
+    reasons = {
+        Refusal.NOT_OURS: not (may_set(history) and is_fresh(history, later_s)),
+        Refusal.STALE: not age_s <= age_limit_s,
+        Refusal.LATE: not late_s <= 0.0,
+        Refusal.UNUSABLE: not is_usable(command),
+    }
+    if any(reasons.values()):
+        with pytest.raises(Refused) as refused:
+            admit(command, VEHICLE, clearance)
+        assert reasons[refused.value.why]
+        return
+    sent = admit(command, VEHICLE, clearance)
+    if isinstance(command, PositionCommand):
+        assert sent == command
+        return
+    assert isinstance(sent, Command)
+    least_mps2 = 0.0 if on_ground else LEAST_MPS2
+    assert sent.thrust_mps2 == pytest.approx(
+        float(np.clip(command.thrust_mps2, least_mps2, MOST_MPS2)), abs=1e-12
+    )
+    assert is_usable(sent)
+    assert sent.course_rad == command.course_rad
+    assert tilt_of(sent) <= VEHICLE.tilt_max_rad + 1e-9
+    if tilt_of(command) <= VEHICLE.tilt_max_rad - 1e-9:
+        assert sent.thrust_direction_ned == command.thrust_direction_ned
+
+
+@MANY
+@given(HISTORY, LATER)
+def test_a_command_needs_authority(history: list[Occurrence], later_s: float) -> None:
+    authority, end_s = replayed(history, failsafes=False)
+    expected = may_command(history) and is_fresh(history, later_s)
+    assert authority.permits_command(end_s + later_s) is expected
+
+
+@pytest.mark.parametrize("late_s", [math.nan, 1e-9, math.inf])
+def test_a_lateness_that_is_unknown_is_late(late_s: float) -> None:
+    clearance = Clearance(ours=True, on_ground=False, late_s=late_s)
+    with pytest.raises(Refused) as refused:
+        admit(Command(9.8, (0.0, 0.0, 1.0), 0.0), VEHICLE, clearance)
+    assert refused.value.why is Refusal.LATE
+
+
+def test_straight_up_with_the_smallest_lateral_part_is_turned_back_to_the_limit() -> None:
+    """The length of (5e-324, 5e-324) is rounded to 5e-324: two whole parts instead of one."""
+    command = Command(9.8, (5e-324, 5e-324, -1.0), 0.0)
+    sent = admit(command, VEHICLE, Clearance(ours=True, on_ground=False))
+    assert tilt_of(sent) == pytest.approx(VEHICLE.tilt_max_rad, abs=1e-12)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        Command(9.8, (0.0, 0.0, 1.0), 1e39),
+        PositionCommand((0.0, 1e39, 0.0), (0.0,) * 3, (0.0,) * 3, 0.0, 0.0),
+    ],
+)
+def test_a_number_too_large_for_the_wire_is_refused(command: Command | PositionCommand) -> None:
+    """Encoding it would raise, after the gate."""
+    with pytest.raises(Refused) as refused:
+        admit(command, VEHICLE, Clearance(ours=True, on_ground=False))
+    assert refused.value.why is Refusal.UNUSABLE

@@ -1,0 +1,258 @@
+"""Safety: whose the vehicle is, and what must not happen to it in the air.
+
+Rows of faults that were seen on real autopilots, each flown with the fault of a scenario; most on
+both firmwares.
+"""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from typing import Any
+
+import pytest
+from faults import stop, without
+from pair import in_phase, make, on_arducopter
+from watch import (
+    ARM,
+    BOTH,
+    LAND,
+    REACTION_S,
+    SET_MODE,
+    Fly,
+    engage_mode,
+    said,
+    scenario_of,
+    sent_after,
+    watched,
+)
+
+from offboard.flight.phases import ExitCode, Phase
+
+CURRENT_MODE, DISARM_BY_FORCE = 436, 21196
+
+
+# -- authority -------------------------------------------------------------------------------------
+
+
+@BOTH
+@pytest.mark.parametrize("scenario", ["pilot_refuses", "pilot_takes_over", "pilot_comes_back"])
+def test_a_pilot_is_not_overridden(scenario: str, fly: Fly) -> None:
+    """Nothing leaves after the report of the pilot's mode, and the mode is asked for once.
+
+    `pilot_comes_back` is back after 0.6 s, long after the flight has ended.
+    """
+    pair = fly(scenario=scenario)
+    watch = watched(pair)
+    outcome = pair.fly()
+    mode = engage_mode(pair)
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert f"the vehicle left {mode} for" in outcome.sentence
+    assert len(pair.commands(SET_MODE)) == 1
+    assert pair.commands(LAND) == []
+    assert sent_after(pair, watch.left_s(mode) + REACTION_S) == []
+    assert sent_after(pair, watch.left_s(mode) - 0.5) != []
+
+
+@BOTH
+def test_a_vehicle_that_was_disarmed_is_not_armed_again(fly: Fly) -> None:
+    pair = fly(scenario="pilot_disarms")
+    watch = watched(pair)
+    outcome = pair.fly()
+    assert outcome.exit_code in (ExitCode.REFUSED, ExitCode.ABORTED)
+    assert "disarmed" in outcome.sentence
+    assert watch.armings == len(pair.commands(ARM)) == 1
+    assert watch.top_m < 0.05
+
+
+@BOTH
+def test_without_reports_of_the_mode_nothing_is_sent(fly: Fly) -> None:
+    """HEARTBEAT, the only report of an older PX4, stops; half a second later a pilot takes over."""
+    pair = fly(scenario="lost_heartbeat", down=without(CURRENT_MODE))
+    watch = watched(pair)
+    outcome = pair.fly()
+    stopped_s = watch.left_s(engage_mode(pair)) - 0.5
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert outcome.sentence.startswith("no report of the mode for 2.")
+    assert list(pair.rungs) == ["authority"]
+    assert sent_after(pair, stopped_s + 2.6) == []
+    assert pair.commands(LAND) == []
+    assert len(pair.commands(SET_MODE)) == 1
+
+
+@BOTH
+def test_current_mode_shows_the_pilot_without_heartbeats(fly: Fly) -> None:
+    """PX4 reports it; ArduCopter, whose only report is HEARTBEAT, is left after 2.5 s."""
+    pair = fly(scenario="lost_heartbeat")
+    watch = watched(pair)
+    pair.fly()
+    left_s = watch.left_s(engage_mode(pair))
+    px4 = engage_mode(pair) == "OFFBOARD"
+    assert sent_after(pair, left_s + (REACTION_S if px4 else 2.2)) == []
+    assert pair.commands(LAND) == []
+
+
+@BOTH
+def test_a_failsafe_is_not_taken_over(fly: Fly) -> None:
+    pair = fly(scenario="in_failsafe")
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.REFUSED
+    assert "limits.begin_in_failsafe=true" in outcome.sentence
+    assert pair.setpoints == pair.commands(SET_MODE) == []
+    told = fly(scenario="in_failsafe", limits={"begin_in_failsafe": True},
+               at=[(in_phase(Phase.CLIMB, 1.0), stop)])  # fmt: skip
+    told.fly()
+    assert told.went_through(Phase.CLIMB)
+
+
+def another_companion(**fault: Any) -> Any:
+    """A second `offboard fly`: our own ids."""
+    return scenario_of({"fault": "second_sender", "system": 1, "component": 191, **fault})
+
+
+@BOTH
+def test_a_second_sender_is_refused_before_the_flight(fly: Fly) -> None:
+    pair = fly(scenario=another_companion(setpoint_rate_hz=0))
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.REFUSED
+    assert "system 1 component 191 (limits.begin_with_other_sender=true" in outcome.sentence
+    assert pair.setpoints == pair.commands(SET_MODE) == []
+
+
+@BOTH
+def test_a_second_sender_is_noticed_in_flight(fly: Fly) -> None:
+    """Hold within a second and what HEARTBEAT takes, then land."""
+    pair = fly(
+        scenario=another_companion(after="engaged", at_s=20.0, setpoint_rate_hz=10, thrust=0.5)
+    )
+    watch = watched(pair)
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert outcome.sentence.startswith("another program controls the vehicle on this link, too")
+    assert [phase for _, phase in pair.phases][-4:-1] == [Phase.TRACK, Phase.HOLD, Phase.LAND]
+    assert watch.error_m < 0.3
+    assert not pair.instance.autopilot.commander.armed
+
+
+@BOTH
+def test_a_second_companion_of_other_ids_shows_by_what_it_does(fly: Fly) -> None:
+    """Its setpoints are not on our link: the vehicle no longer follows ours, and is landed."""
+    pair = fly(scenario="second_sender")
+    watch = watched(pair)
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert "deg away from every recent command" in outcome.sentence
+    assert watch.error_m < 5.0
+
+
+def test_an_arducopter_that_another_flies_is_refused() -> None:
+    pair = on_arducopter(scenario=scenario_of(start={"height_m": 8.0, "mode": "GUIDED"}))
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.REFUSED
+    assert "in GUIDED already" in outcome.sentence
+    assert "limits.begin_engaged=true" in outcome.sentence
+    assert pair.setpoints == pair.commands(SET_MODE) == []
+
+
+# -- in the air ------------------------------------------------------------------------------------
+
+
+@BOTH
+@pytest.mark.parametrize("scenario", ["landed_wrong", "landed_lost"])
+def test_in_the_air_it_never_falls(scenario: str, fly: Fly) -> None:
+    """The land detector says ground: never less than a third of hover, never fast downwards."""
+    pair = fly(scenario=scenario)
+    watch = watched(pair)
+    pair.fly()
+    hover = pair.companion.state.model.hover_thrust
+    assert not pair.went_through(Phase.TAKEOFF)
+    assert pair.went_through(Phase.TRACK)
+    assert min(setpoint.thrust for _, _, setpoint in pair.setpoints) > hover / 3.0 - 1e-6
+    assert watch.fall_mps < 1.6
+    assert watch.error_m < 0.1
+
+
+@BOTH
+def test_one_sample_of_velocity_is_no_lift_off(fly: Fly) -> None:
+    pair = fly(scenario="velocity_spike")
+    watch = watched(pair)
+    assert pair.fly().exit_code == ExitCode.FLOWN
+    assert -watch.during(Phase.CLIMB)[0].position_ned_m[2] > 0.1
+    thrusts = [setpoint.thrust for _, phase, setpoint in pair.setpoints if phase is Phase.TAKEOFF]
+    assert all(after - before < 0.05 for before, after in pairwise(thrusts))
+
+
+@BOTH
+def test_twice_the_thrust_does_not_carry_it_away(fly: Fly) -> None:
+    pair = fly(scenario="thrust_doubled")
+    watch = watched(pair)
+    assert pair.fly().exit_code == ExitCode.FLOWN
+    assert watch.top_m < 3.0 + 1.0
+    assert watch.error_m < 1.0
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("limits", "says"),
+    [({"ceiling_m": 2.0}, "2 m above and 0 m from"), ({"radius_m": 1.0}, "1 m from")],
+    ids=["ceiling", "radius"],
+)
+def test_the_volume_is_kept(limits: dict[str, float], says: str, fly: Fly) -> None:
+    pair = fly(limits=limits)
+    watch = watched(pair)
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert says in outcome.sentence
+    assert "the take-off point" in outcome.sentence
+    assert list(pair.rungs) == ["volume"]
+    far_m = max(float((m.position_ned_m[:2] ** 2).sum() ** 0.5) for m in watch.moments)
+    assert watch.top_m < limits.get("ceiling_m", 3.0) + 1.0
+    assert far_m < limits.get("radius_m", 0.1) + 1.5
+    assert not pair.instance.autopilot.commander.armed
+
+
+@BOTH
+def test_an_empty_battery_ends_the_flight(fly: Fly) -> None:
+    """ArduCopter without a battery failsafe is landed; PX4's own failsafe is not overridden."""
+    pair = fly(scenario="empty_battery")
+    watch = watched(pair)
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    if fly is make:
+        assert "Emergency battery level" in outcome.sentence
+        assert sent_after(pair, watch.left_s("OFFBOARD") + REACTION_S) == []
+    else:
+        assert outcome.sentence.startswith("the battery holds 5 %")
+        assert not pair.instance.autopilot.commander.armed
+
+
+@BOTH
+def test_a_reset_of_the_estimate_is_flown(fly: Fly) -> None:
+    pair = fly(scenario="estimator_jump")
+    watch = watched(pair)
+    assert pair.fly().exit_code == ExitCode.FLOWN
+    assert watch.error_m < 0.7  # of which the jump is 0.5
+    assert pair.rungs == {}
+
+
+# -- the end ---------------------------------------------------------------------------------------
+
+
+@BOTH
+def test_a_fall_in_the_landing_is_not_flown(fly: Fly) -> None:
+    pair = fly(scenario="motors_cut")
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert "disarmed, but not landed: fell at up to" in outcome.sentence
+
+
+@BOTH
+def test_a_vehicle_that_does_not_detect_its_landing_is_disarmed_and_said(fly: Fly) -> None:
+    pair = fly(scenario="never_landed")
+    watch = watched(pair)
+    assert pair.fly().exit_code == ExitCode.FLOWN
+    assert not pair.instance.autopilot.commander.armed
+    disarmed = [m for m in pair.commands(ARM) if (m.param1, m.param2) == (0.0, DISARM_BY_FORCE)]
+    assert len(disarmed) == 1
+    assert said(pair, "15 s without motion on the ground, and the vehicle does not disarm")
+    on_ground = [m for m in watch.moments if m.phase is Phase.LAND and m.position_ned_m[2] > -0.05]
+    assert watch.moments[-1].time_s - on_ground[0].time_s > 15.0

@@ -1,0 +1,270 @@
+"""Safety: old telemetry, slow decisions, pauses of the computer, clocks; and no false alarms.
+
+A setpoint is never older than `limits.setpoint_age_s` beyond the delay of the link, and a control
+period, when it reaches the vehicle.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from faults import HEARTBEAT, frame_id, without
+from pair import Bytes, HostClock, Pair, frames_of, in_phase, make, on_arducopter
+from watch import BOTH, LAND, SET_MODE, Fly, Watch, said, sent_after, watched
+
+from offboard.control.base import Controller, Decision, Situation
+from offboard.flight.online_identification import IdentifySettings
+from offboard.flight.phases import ExitCode, Phase, Rung
+from simulator import config as simulated
+
+DEADLINE_S, PERIOD_S = 0.05, 0.1
+CURRENT_MODE = 436
+QUICK = ("reference.laps=1", "reference.height_m=1.0")
+IN_TRACK = in_phase(Phase.TRACK, 2.0)
+HARSH = ("px4_like", "all_together", "gusts", "lossy_20hz", "delay_100ms")
+
+
+def ages_s(pair: Pair, since_s: float = 0.0) -> list[float]:
+    """Age of each setpoint's telemetry when it reached the vehicle."""
+    offset_s = 1e-6 * pair.instance.view.clock_offset_us
+    return [
+        at_s + offset_s - 1e-3 * m.time_boot_ms for at_s, _, m in pair.setpoints if at_s > since_s
+    ]
+
+
+# -- the link --------------------------------------------------------------------------------------
+
+
+@BOTH
+@pytest.mark.parametrize("scenario", ["late_link", "later_and_later", "link_saturates"])
+def test_a_link_that_becomes_late_ends_in_hold_and_landing(scenario: str, fly: Fly) -> None:
+    pair = fly(scenario=scenario, deadline_s=DEADLINE_S)
+    watch = watched(pair)
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert outcome.sentence.startswith("the delay of the link has grown by 0.")
+    assert [phase for _, phase in pair.phases][-4:] == [
+        Phase.TRACK, Phase.HOLD, Phase.LAND, Phase.DISARMED,
+    ]  # fmt: skip
+    assert pair.rungs == {"age": Rung.LEVEL, "link": Rung.HOLD}
+    dialect = pair.companion.state.dialect
+    assert dialect is not None
+    hold = dialect.hold().parameters[1:3]
+    assert hold in [(m.param2, m.param3) for m in pair.commands(SET_MODE)]
+    assert pair.commands(LAND)
+    assert watch.error_m < 0.6
+    assert watch.top_m < 4.0
+    began = watch.during(Phase.HOLD)[0]
+    assert all(
+        sum((moment.position_ned_m[:2] - began.position_ned_m[:2]) ** 2) < 2.0**2
+        for moment in watch.during(Phase.HOLD, Phase.LAND)
+    )
+
+
+@BOTH
+def test_a_saturated_link_does_no_harm(fly: Fly) -> None:
+    pair = fly(scenario="saturated_link", deadline_s=DEADLINE_S)
+    watch = watched(pair)
+    pair.fly()
+    assert watch.fall_mps < 1.5
+    assert watch.top_m < 4.0
+    assert not pair.instance.autopilot.commander.armed
+
+
+@BOTH
+def test_a_position_that_stands_still_with_new_stamps_is_not_followed(fly: Fly) -> None:
+    pair = fly(scenario="frozen_position")
+    watch = watched(pair)
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert outcome.sentence.startswith("no LOCAL_POSITION_NED for 0.6 s")
+    assert watch.error_m < 0.1
+    assert not pair.instance.autopilot.commander.armed
+
+
+@BOTH
+def test_thin_telemetry_is_flown(fly: Fly) -> None:
+    """Every tenth position, on a vehicle that is heavier meanwhile."""
+    pair = fly(scenario="thin_telemetry")
+    watch = watched(pair)
+    assert pair.fly().exit_code == ExitCode.FLOWN
+    assert watch.error_m < 0.3
+    assert pair.rungs == {}
+
+
+# -- this computer ---------------------------------------------------------------------------------
+
+
+class Slow:
+    """A law that computes for `seconds` from its 60th decision on."""
+
+    def __init__(self, law: Controller, clock: HostClock, seconds: float) -> None:
+        self._law, self._clock, self._seconds = law, clock, seconds
+        self._count = 0
+        self.reset = law.reset
+
+    def decide(self, situation: Situation) -> Decision:
+        self._count += 1
+        if self._count > 60:
+            self._clock.spend(self._seconds)
+        return self._law.decide(situation)
+
+
+def with_slow_law(fly: Fly, seconds: float) -> tuple[Pair, Watch]:
+    clock = HostClock()
+    pair = fly(
+        *QUICK, wrap=lambda law: Slow(law, clock, seconds), deadline_s=DEADLINE_S, clock=clock
+    )
+    watch = watched(pair)
+    return pair, watch
+
+
+@BOTH
+@pytest.mark.parametrize(("seconds", "why"), [(0.15, "0.05 s too late"), (0.3, "0.30 s old")])
+def test_a_slow_law_is_late_and_then_landed(seconds: float, why: str, fly: Fly) -> None:
+    pair, watch = with_slow_law(fly, seconds)
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert outcome.sentence.startswith("the controller failed: decided ")
+    assert why in outcome.sentence
+    assert pair.rungs == {"decision": Rung.LEVEL, "decisions": Rung.LAND}
+    assert len([True for frame in pair.logged if b"decision missed: decided" in frame]) == 3
+    assert watch.error_m < 0.5
+    assert not pair.instance.autopilot.commander.armed
+
+
+@BOTH
+def test_a_law_that_needs_most_of_the_period_is_flown(fly: Fly) -> None:
+    pair, watch = with_slow_law(fly, 0.08)
+    assert pair.fly().exit_code == ExitCode.FLOWN
+    assert watch.error_m < 0.1
+    assert pair.rungs == {}
+    assert max(ages_s(pair)) < 0.1 + PERIOD_S
+
+
+def paused(
+    fly: Fly,
+    seconds: float,
+    when: Callable[[Pair], bool] = IN_TRACK,
+    **options: Any,
+) -> tuple[Pair, Watch, float]:
+    """The process is stopped, two seconds into the track; the end of the stop."""
+    pair = fly(*QUICK, deadline_s=DEADLINE_S, **options)
+    ends_s: list[float] = []
+
+    def stop(pair: Pair) -> None:
+        pair.pause(seconds)
+        ends_s.append(pair.time_s + seconds)
+
+    pair.at.append((when, stop))
+    watch = watched(pair)
+    pair.fly()
+    return pair, watch, ends_s[0]
+
+
+@BOTH
+@pytest.mark.parametrize("seconds", [0.5, 0.9])
+def test_after_a_pause_one_setpoint_leaves(seconds: float, fly: Fly, tmp_path: Path) -> None:
+    """From the newest telemetry; the pause is announced and counted."""
+    pair, watch, end_s = paused(fly, seconds)
+    assert pair.companion.outcome is not None
+    assert pair.companion.outcome.exit_code == ExitCode.FLOWN
+    within = [at_s for at_s, _, _ in pair.setpoints if end_s - seconds < at_s < end_s + 0.05]
+    assert len(within) <= 1
+    assert max(ages_s(pair)) < 0.03
+    assert said(pair, f"this computer paused for {seconds:.2f} s")
+    assert watch.error_m < 0.8  # the last attitude is kept meanwhile
+    assert pair.score(tmp_path).missed_ticks == round(seconds / PERIOD_S) - 1
+
+
+def test_after_three_seconds_nothing_leaves_to_a_px4_in_its_failsafe() -> None:
+    pair, watch, end_s = paused(make, 3.0)
+    outcome = pair.companion.outcome
+    assert outcome is not None
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert "the vehicle left OFFBOARD for POSCTL" in outcome.sentence
+    assert watch.moments[-1].mode == "POSCTL"
+    assert sent_after(pair, end_s - 3.0 + 0.01) == []
+
+
+def test_after_three_seconds_an_arducopter_is_landed() -> None:
+    """It keeps its last attitude that long. The supervisor acts before; this is without it."""
+    pair, _, end_s = paused(on_arducopter, 3.0)
+    assert pair.companion.outcome is not None
+    assert pair.companion.outcome.exit_code == ExitCode.ABORTED
+    assert max(ages_s(pair, end_s - 2.9)) < 0.03
+    assert pair.commands(LAND)
+    assert not pair.instance.autopilot.commander.armed
+
+
+def test_after_a_pause_a_report_of_the_mode_is_awaited() -> None:
+    """A PX4 with HEARTBEAT alone, at 1 Hz: one that arrived more than 0.6 s ago does not count."""
+    beats_s: list[float] = []
+    rest = without(CURRENT_MODE)
+
+    def noting(time_s: float, datagrams: Bytes) -> Bytes:
+        if any(frame_id(frame) == HEARTBEAT for d in datagrams for frame in frames_of(d)):
+            beats_s.append(time_s)
+        return rest(time_s, datagrams)
+
+    def just_after_a_beat(pair: Pair) -> bool:
+        return IN_TRACK(pair) and 0.28 < pair.time_s - beats_s[-1] < 0.3
+
+    pair, watch, end_s = paused(make, 0.35, down=noting, when=just_after_a_beat)
+    first_s = next(at_s for at_s, _, _ in pair.setpoints if at_s > end_s - 0.34)
+    beat_s = next(at_s for at_s in beats_s if at_s > end_s)
+    assert 0.3 < beat_s - end_s < 0.4
+    assert beat_s <= first_s <= beat_s + PERIOD_S
+    assert pair.companion.outcome is not None
+    assert pair.companion.outcome.exit_code == ExitCode.FLOWN
+    assert watch.error_m < 0.3
+
+
+# -- the vehicle's clock ---------------------------------------------------------------------------
+
+
+@BOTH
+@pytest.mark.parametrize(("scenario", "jump"), [("clock_jump", "3.0"), ("clock_jump_35s", "35.0")])
+def test_a_jump_of_the_clock_lands(scenario: str, jump: str, fly: Fly, tmp_path: Path) -> None:
+    pair = fly(scenario=scenario, deadline_s=DEADLINE_S)
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert outcome.sentence == f"the clock of the vehicle jumped by {jump} s"
+    assert pair.phases[-1][1] is Phase.DISARMED
+    assert pair.score(tmp_path).completed == 0.0
+    level = [m for _, phase, m in pair.setpoints if phase is Phase.LAND]
+    assert all(abs(m.q[1]) + abs(m.q[2]) < 1e-6 for m in level)
+
+
+@BOTH
+def test_a_clock_that_wraps_is_flown(fly: Fly) -> None:
+    pair = fly(scenario="clock_wrap", deadline_s=DEADLINE_S)
+    watch = watched(pair)
+    assert pair.fly().exit_code == ExitCode.FLOWN
+    assert watch.error_m < 0.05
+    assert pair.rungs == {}
+    stamps_ms = [m.time_boot_ms for _, _, m in pair.setpoints]
+    assert max(stamps_ms) > 2**32 - 1000
+    assert min(stamps_ms) < 1000
+
+
+# -- no false alarms -------------------------------------------------------------------------------
+
+
+@BOTH
+@pytest.mark.parametrize("scenario", HARSH)
+def test_a_normal_flight_stays_off_the_ladder(scenario: str, fly: Fly) -> None:
+    """As `offboard fly` does it: nothing known of the vehicle, identified in flight."""
+    pair = fly(
+        scenario=scenario,
+        believed=simulated.vehicle("neutral"),
+        learning=IdentifySettings(),
+        deadline_s=DEADLINE_S,
+        seed=1 + HARSH.index(scenario),
+    )
+    outcome = pair.fly()
+    assert (outcome.exit_code, outcome.sentence) == (ExitCode.FLOWN, "flown and landed")
+    assert max(pair.rungs.values(), default=Rung.FLY) <= Rung.LEVEL

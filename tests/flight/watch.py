@@ -1,0 +1,127 @@
+"""The true motion of a vehicle in flight, and what several tests of safety ask."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from pair import Bytes, Filter, Pair, decode, make, on_arducopter, through
+
+from offboard.flight.phases import TRACKING, Phase
+from simulator.config import Scenario
+
+SET_MODE, LAND, ARM = 176, 21, 400  # MAV_CMD
+BOTH = pytest.mark.parametrize("fly", [make, on_arducopter], ids=["px4", "ardupilot"])
+REACTION_S = 0.13  # a report of the mode at 10 Hz, and a turn
+WATCHED_STEPS = 5  # 20 ms
+
+
+@dataclass(frozen=True)
+class Moment:
+    """The truth. `error_m` is the distance from the reference, NaN without one."""
+
+    time_s: float
+    phase: Phase
+    mode: str
+    armed: bool
+    position_ned_m: NDArray[np.float64]
+    down_mps: float
+    error_m: float
+
+
+@dataclass
+class Watch:
+    """A downlink that notes the truth every 20 ms, and has the fault `link`."""
+
+    pair: Pair
+    link: Filter = through
+    moments: list[Moment] = field(default_factory=list)
+
+    def __call__(self, time_s: float, datagrams: Bytes) -> Bytes:
+        if self.pair.steps % WATCHED_STEPS == 0:
+            self.moments.append(self._now(time_s))
+        return self.link(time_s, datagrams)
+
+    def _now(self, time_s: float) -> Moment:
+        autopilot, companion = self.pair.instance.autopilot, self.pair.companion
+        truth, commander = autopilot.state.truth, autopilot.commander
+        position = np.array(truth.position_ned_m)
+        vehicle_s = autopilot.state.time_s + 1e-6 * self.pair.instance.view.clock_offset_us
+        wanted = companion.state.plan.sample(vehicle_s)
+        error = np.nan if wanted is None else np.linalg.norm(position - wanted.position_ned_m)
+        return Moment(
+            time_s,
+            companion.phase,
+            commander.mode.name,
+            commander.armed,
+            position,
+            float(truth.velocity_ned_mps[2]),
+            float(error),
+        )
+
+    def during(self, *phases: Phase) -> list[Moment]:
+        return [moment for moment in self.moments if moment.phase in phases]
+
+    @property
+    def error_m(self) -> float:
+        """Largest true distance from the reference while it was tracked."""
+        return max(moment.error_m for moment in self.during(*TRACKING))
+
+    @property
+    def top_m(self) -> float:
+        return max(-moment.position_ned_m[2] for moment in self.moments)
+
+    @property
+    def fall_mps(self) -> float:
+        """Largest downward speed."""
+        return max(moment.down_mps for moment in self.moments)
+
+    @property
+    def armings(self) -> int:
+        armed = [moment.armed for moment in self.moments]
+        return sum(now and not before for before, now in pairwise(armed))
+
+    def left_s(self, mode: str) -> float:
+        """When the vehicle first left `mode`."""
+        modes = [(moment.time_s, moment.mode) for moment in self.moments]
+        return next(at_s for (_, before), (at_s, now) in pairwise(modes) if before == mode != now)
+
+
+def watched(pair: Pair) -> Watch:
+    """Watch `pair`; its present downlink stays."""
+    watch = Watch(pair, pair.down)
+    pair.down = watch
+    return watch
+
+
+def engage_mode(pair: Pair) -> str:
+    dialect = pair.companion.state.dialect
+    assert dialect is not None
+    return dialect.engage_mode
+
+
+def sent_after(pair: Pair, time_s: float) -> list[str]:
+    """Setpoints and commands that left after `time_s`."""
+    frames = [(at_s, decode(frame)) for at_s, _, frame in pair.sent if at_s > time_s]
+    return [
+        f"{message.get_type()} at {at_s:.2f}"
+        for at_s, message in frames
+        if message.get_type() in ("COMMAND_LONG", "SET_ATTITUDE_TARGET")
+    ]
+
+
+def said(pair: Pair, words: str) -> bool:
+    return any(words in sentence for sentence in pair.companion.announced)
+
+
+def scenario_of(*faults: dict[str, Any], **more: Any) -> Scenario:
+    """A scenario with these faults."""
+    return Scenario.model_validate({"name": "test", "faults": faults, **more})
+
+
+Fly = Callable[..., Pair]

@@ -1,0 +1,81 @@
+"""Vehicles, laws and states of the tests of control laws."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from attitude_plant import Lemniscate
+
+from offboard.control.base import Controller
+from offboard.control.catalogue import names, settings_of
+from offboard.control.laws.lqr import LqrLaw, LqrSettings
+from offboard.control.laws.pso import PsoLaw, PsoSettings
+from offboard.model.command import Command
+from offboard.model.predicted_state import PredictedState
+from offboard.model.vehicle import AxisResponse, Vehicle
+
+G = 9.80665
+PX4 = Vehicle(
+    name="px4",
+    mass_kg=1.0,
+    inertia_kgm2=(0.025, 0.025, 0.03),
+    drag_translation_npmps=(1.02, 1.02, 1.02),
+    drag_rotation_nmpradps=(0.02, 0.02, 0.02),
+    hover_thrust=0.4895,
+    thrust_delay_s=0.015,
+    thrust_lag_s=0.05,
+    tilt=AxisResponse(delay_s=0.057, natural_frequency_radps=11.4, damping=0.56),
+    yaw=AxisResponse(delay_s=0.148, natural_frequency_radps=3.1, damping=0.4),
+)
+ARDUCOPTER = PX4.model_copy(
+    update={
+        "drag_translation_npmps": (0.29, 0.29, 0.29),
+        "thrust_lag_s": 0.0,
+        "tilt": AxisResponse(delay_s=0.01, natural_frequency_radps=12.6, damping=1.115),
+        "angular_acceleration_limit_radps2": (19.2, 19.2, 4.7),
+    }
+)
+LEVEL = Command(G, (0.0, 0.0, 1.0), 0.0)
+# Those that track by themselves; the paper's law is slow, and the autopilot's own loop not ours
+TRACKING = [name for name in names() if name not in ("paper", "autopilot")]
+
+
+def lqr(bandwidth: float = 5.0, vehicle: Vehicle = PX4, **more: object) -> LqrLaw:
+    return LqrLaw(vehicle, LqrSettings.model_validate({"bandwidth_radps": bandwidth, **more}))
+
+
+def pso(bandwidth: float = 5.0, vehicle: Vehicle = PX4, seed: int = 0, **more: object) -> PsoLaw:
+    settings = PsoSettings.model_validate({"bandwidth_radps": bandwidth, **more})
+    return PsoLaw(vehicle, settings, seed=seed)
+
+
+def state_of(rng: np.random.Generator, reference: Lemniscate, size: float) -> PredictedState:
+    """Somewhere near the reference at 5.057 s, off by about `size` in every unit."""
+    sample = reference.sample(5.057)
+    tilt = np.clip(0.05 * size * rng.normal(size=2), -0.6, 0.6)
+    return PredictedState(
+        time_s=5.057,
+        position_ned_m=sample.position_ned_m + size * rng.normal(size=3),
+        velocity_ned_mps=sample.velocity_ned_mps + size * rng.normal(size=3),
+        thrust_direction_ned=np.array([*tilt, math.sqrt(1 - tilt @ tilt)]),
+        thrust_direction_rate_ned_ps=np.array([*(0.2 * size * rng.normal(size=2)), 0.0]),
+        course_rad=0.0,
+        course_rate_radps=0.0,
+        thrust_mps2=G + 0.3 * size * rng.normal(),
+        disturbance_ned_mps2=0.3 * size * rng.normal(size=3),
+        rates_frd_radps=np.zeros(3),
+    )
+
+
+def law_named(name: str) -> Controller:
+    chosen = {"bandwidth_radps": 5.0} if name in TRACKING else {}
+    return settings_of(name)(law=name, **chosen).build(PX4, period_s=0.1, seed=7)
+
+
+def at(position: tuple[float, float, float], course_rad: float) -> PredictedState:
+    """At rest and level."""
+    return PredictedState(
+        0.057, np.array(position), np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros(3),
+        course_rad, 0.0, G, np.zeros(3), np.zeros(3),
+    )  # fmt: skip

@@ -1,0 +1,138 @@
+"""Whether the vehicle stands on the ground: every sign, its age and its limit."""
+
+from __future__ import annotations
+
+import pytest
+
+from offboard.flight.ground_contact import GroundContact
+from offboard.flight.vehicle_state import VehicleState
+from offboard.mavlink.events import Heartbeat, Landed, LocalPosition
+
+
+class Standing:
+    """A vehicle that rests 2 m below its local origin, disarmed; time goes on with `at`."""
+
+    def __init__(self) -> None:
+        self.vehicle = VehicleState()
+        self.contact = GroundContact(self.vehicle)
+        self.heartbeat(0.0, armed=False)
+        self.position(0.0)
+
+    def heartbeat(self, now_s: float, *, armed: bool) -> None:
+        self.vehicle.update(Heartbeat("POSCTL", armed, 4), now_s)
+
+    def detector(self, now_s: float, state: str) -> None:
+        self.vehicle.update(Landed(state), now_s)
+
+    def position(self, now_s: float, height_m: float = 0.0, climb_mps: float = 0.0) -> None:
+        event = LocalPosition(now_s, (5.0, -3.0, 2.0 - height_m), (0.0, 0.0, -climb_mps))
+        self.vehicle.update(event, now_s)
+        self.contact.on_position(event)
+
+    def at(self, now_s: float) -> GroundContact:
+        self.vehicle.now_s = now_s
+        return self.contact
+
+
+def armed(height_m: float = 0.0, climb_mps: float = 0.0, detector: str = "on_ground") -> Standing:
+    standing = Standing()
+    standing.heartbeat(1.0, armed=True)
+    standing.position(1.0, height_m, climb_mps)
+    standing.detector(1.0, detector)
+    return standing
+
+
+def test_a_heartbeat_that_shows_it_disarmed_counts_for_three_seconds() -> None:
+    standing = Standing()
+    assert standing.at(2.9).certain
+    assert not standing.at(3.1).certain
+    assert not standing.at(3.1).in_the_air  # nobody has said that it is armed
+
+
+@pytest.mark.parametrize(
+    ("vehicle", "certain"),
+    [
+        (armed(), True),
+        (armed(height_m=0.7), True),
+        (armed(height_m=0.8), False),
+        (armed(height_m=-0.8), False),
+        (armed(climb_mps=0.45), True),
+        (armed(climb_mps=0.55), False),
+        (armed(climb_mps=-0.55), False),
+        (armed(detector="unknown"), False),
+        (armed(detector="landing"), False),
+        (armed(detector="in_air"), False),
+    ],
+)
+def test_when_armed_every_sign_must_say_ground(vehicle: Standing, certain: bool) -> None:
+    assert vehicle.at(1.0).certain is certain
+    assert vehicle.at(1.0).in_the_air is not certain
+
+
+def test_a_land_detector_that_is_not_heard_any_more_proves_nothing() -> None:
+    assert armed().at(2.4).certain
+    assert armed().at(2.6).in_the_air
+
+
+def test_armed_without_a_position_it_is_in_the_air() -> None:
+    vehicle = VehicleState()
+    vehicle.update(Heartbeat("POSCTL", True, 4), 0.0)
+    vehicle.update(Landed("on_ground"), 0.0)
+    assert GroundContact(vehicle).in_the_air
+
+
+def test_height_counts_from_where_it_last_rested() -> None:
+    standing = armed()
+    standing.position(2.0, 10.7, 0.0)
+    assert standing.contact.height_m == pytest.approx(10.7)
+    assert standing.contact.rest_down_m == 2.0
+    standing.heartbeat(3.0, armed=False)
+    standing.position(3.0, 4.0, -2.0)  # falling, motors off
+    assert standing.contact.rest_down_m == 2.0
+    standing.position(3.1, 1.0, -0.4)  # on a roof
+    assert standing.contact.height_m == 0.0
+
+
+@pytest.mark.parametrize(
+    ("heights_m", "climb_mps", "lifted"),
+    [
+        ((0.16, 0.16), 0.0, False),
+        ((0.16, 0.16, 0.16), 0.0, True),
+        ((0.14, 0.14, 0.14), 0.0, False),
+        ((0.16, 0.16, 0.14, 0.16, 0.16), 0.0, False),
+        ((0.05, 0.05, 0.05), 0.41, True),
+        ((0.05, 0.05, 0.05), 0.39, False),
+        ((0.04, 0.04, 0.04), 3.0, False),  # an estimate that is in motion on the ground
+    ],
+)
+def test_lifted_off_after_three_positions_in_a_row(
+    heights_m: tuple[float, ...], climb_mps: float, lifted: bool
+) -> None:
+    standing = armed()
+    for number, height_m in enumerate(heights_m):
+        standing.position(2.0 + 0.1 * number, height_m, climb_mps)
+    assert standing.contact.lifted_off is lifted
+
+
+@pytest.mark.parametrize(
+    ("height_m", "wander_m", "for_s", "stood"),
+    [
+        (0.0, 0.0, 16.0, True),
+        (0.0, 0.08, 16.0, True),
+        (0.0, 0.12, 16.0, False),
+        (0.4, 0.0, 16.0, False),  # hovers low
+        (0.0, 0.0, 14.0, False),
+    ],
+)
+def test_stood_for_fifteen_seconds(
+    height_m: float, wander_m: float, for_s: float, stood: bool
+) -> None:
+    vehicle = VehicleState()
+    contact = GroundContact(vehicle)
+    vehicle.update(Heartbeat("LAND", True, 4), 0.0)
+    for number in range(round(10 * for_s) + 1):
+        height = height_m + wander_m * (number % 2)
+        event = LocalPosition(0.1 * number, (0.0, 0.0, -height), (0.0, 0.0, 0.0))
+        vehicle.update(event, 0.1 * number)
+        contact.on_position(event)
+    assert contact.stood_for(15.0) is stood

@@ -1,0 +1,171 @@
+"""The vehicle's clock as telemetry shows it: its rate, the age of telemetry, and jumps."""
+
+from __future__ import annotations
+
+import math
+import random
+from collections.abc import Callable, Iterable
+
+import pytest
+
+from offboard.flight.link_age import LinkDelay, VehicleClock
+from offboard.mavlink.events import TimesyncReply
+
+EPOCH_S = 7000.0  # of host time: not that of the vehicle
+WAY_S = 0.05
+
+
+def every(step_s: float, begin_s: float, end_s: float) -> Iterable[float]:
+    return (begin_s + step_s * n for n in range(round((end_s - begin_s) / step_s)))
+
+
+def hear(
+    clock: VehicleClock,
+    times_s: Iterable[float],
+    *,
+    stamp: Callable[[float], float] = lambda at_s: at_s,
+    way: Callable[[float], float] = lambda at_s: WAY_S,
+) -> tuple[float, float]:
+    """Telemetry of these true times; the newest stamp, and its arrival."""
+    for at_s in times_s:
+        newest = stamp(at_s), EPOCH_S + at_s + way(at_s)
+        clock.on_telemetry(*newest)
+    return newest
+
+
+@pytest.mark.parametrize("rate", [1.0, 0.25, 4.0])
+@pytest.mark.parametrize("settles", [False, True])
+def test_time_goes_on_at_the_rate_of_the_vehicle(rate: float, settles: bool) -> None:
+    clock = VehicleClock()
+    hear(clock, every(0.02, 0.0, 3.0), stamp=lambda at_s: rate * at_s)
+    if settles:
+        clock.settle()
+    stamp_s, arrived_s = hear(clock, every(0.02, 3.0, 9.0), stamp=lambda at_s: rate * at_s)
+    assert clock.age_s(stamp_s, arrived_s) == pytest.approx(0.0, abs=1e-6)
+    assert clock.age_s(stamp_s, arrived_s + 0.2) == pytest.approx(0.2 * rate, abs=1e-6)
+    assert clock.now_s(EPOCH_S + 20.0) == pytest.approx(rate * (20.0 - WAY_S), abs=1e-6)
+    assert clock.jumped_s == 0.0
+
+
+def test_before_any_telemetry_nothing_is_old() -> None:
+    assert VehicleClock().now_s(EPOCH_S) == -math.inf
+    assert VehicleClock().age_s(3.0, EPOCH_S) == 0.0
+
+
+@pytest.mark.parametrize(("until_s", "grown_s"), [(12.0, 0.2), (14.0, 0.4)])
+def test_a_delay_that_grows_in_flight_is_no_slower_clock(until_s: float, grown_s: float) -> None:
+    clock = VehicleClock()
+    hear(clock, every(0.02, 0.0, 10.0))
+    clock.settle()
+    newest = hear(
+        clock, every(0.02, 10.0, until_s + 0.01), way=lambda at_s: WAY_S + 0.1 * (at_s - 10.0)
+    )
+    assert clock.age_s(*newest) == pytest.approx(grown_s, abs=0.003)
+
+
+def test_after_a_pause_the_backlog_is_as_old_as_it_is() -> None:
+    """Nothing is read for three seconds, then everything at once."""
+    clock = VehicleClock()
+    hear(clock, every(0.02, 0.0, 10.0))
+    clock.settle()
+    read_s = EPOCH_S + 13.0
+    ages_s = []
+    for stamp_s in every(0.02, 10.0, 13.0):
+        clock.on_telemetry(stamp_s, read_s)
+        ages_s.append(clock.age_s(stamp_s, read_s))
+    assert ages_s[0] == pytest.approx(3.0 - WAY_S)
+    assert ages_s[-1] == pytest.approx(0.0, abs=0.02)
+    assert ages_s == sorted(ages_s, reverse=True)
+    assert clock.jumped_s == 0.0
+
+
+@pytest.mark.parametrize(("jump_s", "shown_s"), [(3.0, 3.0), (0.6, 0.6), (0.4, 0.0), (-1.0, 0.0)])
+def test_a_jump_forward_is_measured(jump_s: float, shown_s: float) -> None:
+    clock = VehicleClock()
+    hear(clock, every(0.02, 0.0, 10.0))
+    clock.settle()
+    hear(clock, every(0.02, 10.0, 11.0), stamp=lambda at_s: at_s + jump_s)
+    assert clock.jumped_s == pytest.approx(shown_s, abs=0.001)
+
+
+def test_after_a_reboot_everything_begins_anew() -> None:
+    clock = VehicleClock()
+    hear(clock, every(0.02, 0.0, 10.0), stamp=lambda at_s: 4.0 * at_s)
+    clock.settle()
+    clock.reset()
+    newest = hear(clock, every(0.02, 10.0, 12.0), stamp=lambda at_s: at_s - 10.0)
+    assert clock.age_s(*newest) == pytest.approx(0.0, abs=1e-6)
+    assert clock.now_s(EPOCH_S + 15.0) == pytest.approx(5.0 - WAY_S)
+
+
+def test_lost_and_scattered_telemetry() -> None:
+    """A third is lost; up to 20 ms are added to the way."""
+    chance = random.Random(4)
+    clock = VehicleClock()
+    for at_s in every(0.02, 0.0, 20.0):
+        added_s = chance.uniform(0.0, 0.02)
+        if chance.random() < 1.0 / 3.0:
+            continue
+        clock.on_telemetry(at_s, EPOCH_S + at_s + WAY_S + added_s)
+        if at_s > 1.0:
+            age_s = clock.age_s(at_s, EPOCH_S + at_s + WAY_S + added_s)
+            assert age_s == pytest.approx(added_s, abs=0.01)
+
+
+def test_the_freshest_of_several_messages_counts() -> None:
+    """The second has been 40 ms longer on its way than the first."""
+    clock = VehicleClock()
+    clock.on_telemetry(1.00, 7001.05)
+    clock.on_telemetry(1.01, 7001.10)
+    assert clock.age_s(1.01, 7001.10) == pytest.approx(0.04)
+
+
+@pytest.mark.parametrize("drift", [1e-4, -1e-4])
+def test_an_hour_of_drift(drift: float) -> None:
+    """100 ppm: 0.36 s in an hour, 0.5 ms within the window of five seconds."""
+    clock = VehicleClock()
+    hear(clock, every(0.1, 0.0, 5.0))
+    clock.settle()
+    newest = hear(clock, every(0.25, 5.0, 3600.0), stamp=lambda at_s: at_s * (1.0 + drift))
+    assert clock.age_s(*newest) < 0.0006
+    assert clock.age_s(newest[0], newest[1] + 0.3) == pytest.approx(0.3, abs=0.0006)
+    assert clock.jumped_s == 0.0
+
+
+# --- what the link has added since take-off -------------------------------------------------------
+
+
+def replies(link: LinkDelay, delay_s: float, count: int) -> None:
+    for _ in range(count):
+        sent_s = next(TIMES_S)
+        request_ns = link.request(sent_s).ts1_ns
+        link.on_reply(TimesyncReply(request_ns, request_ns + round(delay_s * 1e9)))
+
+
+TIMES_S = iter(0.1 * n for n in range(1, 10_000))
+
+
+def test_growth_is_that_of_the_median_of_five_replies() -> None:
+    link = LinkDelay()
+    replies(link, 0.05, 40)
+    assert link.growth_s == 0.0  # not settled
+    link.settle()
+    replies(link, 0.35, 2)
+    assert link.growth_s == pytest.approx(0.0)  # two late ones may be chance
+    replies(link, 0.35, 1)
+    assert link.growth_s == pytest.approx(0.30)
+    replies(link, 0.01, 5)
+    assert link.growth_s == pytest.approx(-0.04)
+
+
+def test_growth_is_unknown_without_replies_and_after_a_reboot() -> None:
+    link = LinkDelay()
+    replies(link, 0.05, 4)
+    link.settle()
+    replies(link, 0.95, 10)
+    assert link.growth_s == 0.0  # nothing to compare with
+    link.settle()
+    replies(link, 1.25, 5)
+    assert link.growth_s == pytest.approx(0.3)
+    link.reset()
+    assert link.growth_s == 0.0
