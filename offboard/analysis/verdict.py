@@ -28,12 +28,13 @@ _LANDING_ENDS = {"disarmed", "failed", "yielded"}
 # stands for itself
 _CAUSES = (
     (STOPPED, "operator"),
-    ("no telemetry|no LOCAL_POSITION_NED|no ATTITUDE_QUATERNION", "link"),
-    ("the vehicle left", "pilot"),
+    ("no telemetry|no LOCAL_POSITION_NED|no ATTITUDE_QUATERNION|no report|the delay", "link"),
+    ("the vehicle left|it showed", "pilot"),
+    ("another program", "second sender"),
     ("the vehicle restarted", "restart"),
     ("the vehicle disarmed", "disarmed in flight"),
     ("the controller failed", "controller"),
-    ("tilt|[0-9.]+ m from the reference", "limit"),
+    ("tilt|the attitude|[0-9.]+ m (from|above)|the battery", "limit"),
 )
 
 
@@ -107,7 +108,7 @@ def _ended_early(flown: History) -> str:
     names = [event.what.partition(":")[0] for event in flown.phases]
     for event, name, before in zip(flown.phases[1:], names[1:], names, strict=False):
         regular = (before, name) in (("hover", "land"), ("land", "disarmed"))
-        if name in {"land", "stand down", *_LANDING_ENDS} and not regular:
+        if name in {"hold", "land", "stand down", *_LANDING_ENDS} and not regular:
             cause = _cause(event.what.partition(": ")[2])
             return "failsafe" if cause == "pilot" and _critical(flown, event.time_s) else cause
     if names[-1] not in _LANDING_ENDS:

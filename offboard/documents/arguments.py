@@ -9,8 +9,6 @@ from typer.core import TyperCommand
 from offboard.documents.command_line import INTERRUPTED, interrupts_raise
 from offboard.documents.errors import UserError, shown
 
-NAME_BYTES = 255  # the longest name of a file (NAME_MAX)
-
 
 class Command(TyperCommand):
     """A command whose values are neither empty nor options nor bytes that are no text.

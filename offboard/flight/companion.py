@@ -184,9 +184,8 @@ class Companion:
         self._turned_s = now_s
         state.host_s = self._clock_s(now_s)
         state.silence_s = now_s - self._heard_s
-        if paused_s > PAUSE_S and not self._lockstep:
-            if state.authority is not None:
-                state.authority.doubt(now_s)
+        if paused_s > PAUSE_S and state.authority is not None and not self._lockstep:
+            state.authority.doubt(now_s)
             self._outbox.announce(
                 f"this computer paused for {paused_s:.2f} s: waiting for the vehicle's mode"
             )

@@ -89,14 +89,15 @@ class Decider:
         ladder has a row for it.
         """
         was_old = self._state.telemetry_is_old
+        stale = False
         try:
             decided = self._send(tick, self._decided(tick))
+            self._record(tick, decided)
             failure = decided.failure
+            stale = was_old and decided.refused is Refusal.STALE
         except Exception as error:  # any error: the vehicle is in the air
             failure = f"{type(error).__name__}: {error}"
-        else:
-            self._record(tick, decided)
-        if failure and was_old:
+        if stale:
             return False
         if failure:
             self._state.missed += 1

@@ -40,8 +40,7 @@ ROWS = (
         guards.authority_unknown,
         0.0,
         Rung.SILENCE,
-        "no report of the mode for {authority_age_s:.1f} s: it is not known whether the vehicle "
-        "is ours",
+        "no report of the mode for {authority_age_s:.1f} s: another may control the vehicle",
     ),
     Row(
         "silence",

@@ -9,7 +9,7 @@ import math
 import traceback
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import astuple, dataclass, replace
 
 import numpy as np
 
@@ -121,7 +121,9 @@ def _decided(controller: Controller, situation: Situation) -> Command | Position
     """The command of a decision. Raises DocumentError if the law fails: better here than in
     flight."""
     try:
-        command = controller.decide(situation).command
+        decision = controller.decide(situation)
+        command = decision.command
+        [float(figure) for figure in astuple(decision.certificate)]  # as the log will have them
     except Exception as error:
         where = traceback.extract_tb(error.__traceback__)[-1]
         raise DocumentError(

@@ -32,7 +32,7 @@ class Row:
 
 _SILENT = "no telemetry for {silence_s:.1f} s"
 _BLIND = "no {blind_to} for {blind_s:.1f} s"
-_UNKNOWN = "no report of the mode for {authority_age_s:.1f} s: whose the vehicle is, is not known"
+_UNKNOWN = "no report of the mode for {authority_age_s:.1f} s"
 _REBOOTED = "the vehicle restarted"
 _ARMED_ALREADY = "the vehicle is armed already, by another controller or a pilot"
 _DISARMED = "disarmed on the ground"

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from faults import TIMESYNC, without
+from faults import TARGET, TIMESYNC, without
 from pair import Filter, Pair, in_phase, make, on_arducopter
 from scipy.interpolate import CubicHermiteSpline
 
@@ -114,13 +114,18 @@ def like_arducopter(**options: Any) -> Pair:
 
 @pytest.mark.parametrize("like", [like_px4, like_arducopter])
 def test_second_lap_is_as_good_as_with_the_true_constants(like, tmp_path: Path):
-    """Within 20 %, mean of two seeds; over ten seeds it is within 2 %."""
+    """Within 20 %, mean of two seeds; over ten seeds it is within 2 %. The file alone, without the
+    hover thrust that ArduCopter shows before the take-over, is much worse."""
     true, identified, neutral_file = [], [], []
     for seed in (1, 2):
         flights = (
             (true, like(seed=seed)),
             (identified, like(seed=seed, believed=NEUTRAL, learning=IDENTIFY)),
-            *([(neutral_file, like(seed=seed, believed=NEUTRAL))] if seed == 1 else []),
+            *(
+                [(neutral_file, like(seed=seed, believed=NEUTRAL, down=without(TARGET)))]
+                if seed == 1
+                else []
+            ),
         )
         for index, (figures, pair) in enumerate(flights):
             assert pair.fly().exit_code == 0
@@ -318,7 +323,8 @@ def on_a_link_that_changes(extra_s: Callable[[], float]) -> Pair:
 
 
 def test_delay_that_jumps_is_noticed_and_flown(tmp_path: Path):
-    """Unnoticed, 0.2 s more take the vehicle 3.8 m off at this bandwidth."""
+    """Unnoticed, 0.2 s more take the vehicle 3.8 m off at this bandwidth; noticed by the motion
+    alone 1.9 m, by TIMESYNC 0.2 m (`test_late_link`)."""
     pair = on_a_link_that_changes(lambda: 0.2)
     assert pair.fly().exit_code == 0
     text = " | ".join(pair.companion.announced)
@@ -327,7 +333,7 @@ def test_delay_that_jumps_is_noticed_and_flown(tmp_path: Path):
     assert "bandwidth limited to 3.0 rad/s" in text[doubt:known]
     found_s = 1e-3 * float(text[known:].split()[3])
     assert found_s == pytest.approx(0.257, abs=0.010)
-    assert pair.score(tmp_path / "whole").max_position_m < 1.5
+    assert pair.score(tmp_path / "whole").max_position_m < 2.0
     assert second_lap_rmse_m(pair, tmp_path) < 0.15
 
 
@@ -369,7 +375,7 @@ def test_attitude_loop_that_slows_is_noticed_and_flown(scenario, most_m, tmp_pat
 def test_steps_are_repeated_while_the_delay_is_uncertain():
     chance = random.Random(3)
     pair = make(vehicle="px4_sih", reference="hover", scenario="px4_like", learning=IDENTIFY)
-    late = delayed(lambda: chance.uniform(0.0, 0.15))
+    late = delayed(lambda: chance.uniform(0.0, 0.3))
     pair.at.append((in_phase(Phase.EXCITE), lambda flying: setattr(flying, "up", late)))
     pair.down = without(TIMESYNC)
     assert pair.fly().exit_code == 0

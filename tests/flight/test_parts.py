@@ -19,6 +19,7 @@ from offboard.flight.one_flight import rehearse
 from offboard.flight.readiness import Readiness
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.px4 import PX4
+from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import Vehicle
@@ -150,3 +151,13 @@ def test_records_are_not_sent_and_no_sequence_has_a_gap() -> None:
         assert numbers == [index % 256 for index in range(len(numbers))]
     sent = [frame for _, _, frame in pair.sent]
     assert [frame for frame in pair.logged if frame[6] == 191] == sent
+
+
+def test_a_message_that_cannot_be_encoded_does_not_stop_the_later_ones() -> None:
+    """Here a command without a vehicle. The loop then asks for a landing."""
+    outbox = hover().companion._outbox
+    outbox.send(CommandLong.arm())
+    with pytest.raises(ValueError, match="no vehicle"):
+        outbox.flush([])
+    outbox.announce("later")
+    assert len(outbox.flush([]).send) == 1

@@ -8,11 +8,17 @@ from pathlib import Path
 import pytest
 from faults import failing, no_direction, raises
 
-from offboard.control.base import Controller
+from offboard.control.base import Certificate, Controller, Decision, Situation
 from offboard.documents.reading import DocumentError
 from offboard.flight.configuration import load
 from offboard.flight.one_flight import rehearse
 from offboard.flight.request import FlightRequest, build_parts
+from offboard.model.command import Command
+
+
+def without_cost(_: Situation) -> Decision:
+    """A certificate that the log cannot hold."""
+    return Decision(Command(9.8, (0.0, 0.0, 1.0), 0.0), Certificate(cost=None))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize(
@@ -20,6 +26,7 @@ from offboard.flight.request import FlightRequest, build_parts
     [
         (raises, r"controller: ZeroDivisionError: nothing to divide by \(.*faults\.py:\d+\)"),
         (no_direction, "controller: it decides Command.*, which cannot be sent"),
+        (without_cost, r"controller: TypeError: .*float\(\)"),
     ],
 )
 def test_a_law_that_fails_is_found_before_the_flight(fail: object, says: str) -> None:

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import pytest
-from faults import losing
+from faults import losing, without
 from pair import (
     HOST_EPOCH_S,
     SHORT,
@@ -267,3 +267,34 @@ def test_a_hold_that_was_asked_for_on_the_ground_is_asked_for_again_in_flight() 
     after = [at_s for at_s, _, _ in pair.setpoints if at_s > held_s + 0.1]
     assert after == []
     assert landed_s - held_s == pytest.approx(2.1)
+
+
+@pytest.mark.parametrize("after_s", [0.02, 0.3, 0.7])
+def test_a_pilot_who_switches_back_between_two_heartbeats_is_not_asked_again(
+    after_s: float,
+) -> None:
+    """A PX4 without CURRENT_MODE: neither OFFBOARD nor the way back may be shown."""
+    pair = start("px4", down=without(CURRENT_MODE))
+    commander, watch = pair.instance.autopilot.commander, Watch(pair, "px4")
+    before = commander.mode.name
+    asked = TakeOver("px4", "engage", after_s, before, None, 0.0, 0)
+    pair.at.append((due(asked, watch), lambda _: commander.switch(before)))
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.REFUSED
+    assert len(pair.commands(SET_MODE)) == 1
+    assert not any(m.param1 for m in pair.commands(ARM)) or "left OFFBOARD" in outcome.sentence
+
+
+@pytest.mark.parametrize("firmware", ["px4", "ardupilot"])
+@pytest.mark.parametrize("after_s", [0.02, 0.3, 0.7])
+def test_a_vehicle_that_is_disarmed_just_after_arming_is_not_armed_again(
+    firmware: str, after_s: float
+) -> None:
+    pair = start(firmware)
+    asked = TakeOver(firmware, "arm", after_s, None, None, 0.0, 0)
+    watch = Watch(pair, firmware)
+    pair.at.append((due(asked, watch), lambda pair: pair.ground(ARM, 0, 21196)))
+    outcome = pair.fly()
+    assert outcome.exit_code in (ExitCode.REFUSED, ExitCode.ABORTED)
+    assert len(pair.commands(ARM)) == 1
+    assert not pair.instance.autopilot.commander.armed

@@ -54,6 +54,12 @@ def test_a_whole_flight_is_completed(flown: History) -> None:
     assert 0.3 < whole.touchdown_mps < 1.2  # MPC_LAND_SPEED is 0.7
 
 
+def our_ids(pair: Pair) -> None:
+    """Another program sends with our ids: the autopilot is asked to hold, then to land."""
+    frame = mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3).pack(mavlink.MAVLink(None, 1, 191))
+    pair.down = lambda _, datagrams: [*datagrams, frame]
+
+
 @pytest.mark.parametrize(
     ("moment", "act", "ended_by"),
     [
@@ -61,6 +67,7 @@ def test_a_whole_flight_is_completed(flown: History) -> None:
         (in_phase(Phase.TRACK, 1.0), take_over, "pilot"),
         (in_phase(Phase.LAND, 0.5), take_over, "pilot"),
         (in_phase(Phase.TRACK, 1.0), die, "link"),
+        (in_phase(Phase.TRACK, 1.0), our_ids, "second sender"),
         (in_phase(Phase.TRACK, 1.0), kill_motors, "disarmed in flight"),
         (in_phase(Phase.ARM), stop, "operator"),
     ],

@@ -112,6 +112,14 @@ def test_lost_and_scattered_telemetry() -> None:
             assert age_s == pytest.approx(added_s, abs=0.01)
 
 
+def test_the_freshest_of_several_messages_counts() -> None:
+    """The second has been 40 ms longer on its way than the first."""
+    clock = VehicleClock()
+    clock.on_telemetry(1.00, 7001.05)
+    clock.on_telemetry(1.01, 7001.10)
+    assert clock.age_s(1.01, 7001.10) == pytest.approx(0.04)
+
+
 @pytest.mark.parametrize("drift", [1e-4, -1e-4])
 def test_an_hour_of_drift(drift: float) -> None:
     """100 ppm: 0.36 s in an hour, 0.5 ms within the window of five seconds."""

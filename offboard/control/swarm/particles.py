@@ -36,7 +36,6 @@ class Swarm:
         seeds: Sequence[ArrayLike] = (),
     ) -> None:
         within = box(lower, upper)
-        self._tolerance = settings.tolerance
         self._all = p = Population(settings, len(within.lower))
         p.confine(within)
         self._drawn = lanes.states(settings.particles)
@@ -71,11 +70,6 @@ class Swarm:
     def spread(self) -> float:
         """Epsilon of Eq. 29 after the last `tell`."""
         return float(self._all.spread[0])
-
-    @property
-    def converged(self) -> bool:
-        """Whether the spread has fallen to the tolerance of the settings (never, if it is 0)."""
-        return self._told and self.spread <= self._tolerance > 0
 
     def result(self, cut_short: bool = False) -> SwarmResult:
         """The best input so far."""
