@@ -123,7 +123,7 @@ def test_link_time_follows_the_vehicle_or_host_time() -> None:
 @pytest.mark.parametrize(
     ("baud", "attitude_hz"),
     # 0.7 of 5,760 bytes/s less 366 for slow messages, over 84 per pair; HIL_STATE_QUATERNION too
-    [(57_600, 22.8), (115_200, 52.0), (921_600, 100.0)],
+    [(57_600, 22.6), (115_200, 51.0), (921_600, 100.0)],
 )
 def test_rates_fit_a_serial_line(baud: int, attitude_hz: float) -> None:
     session = Session(SessionSettings(stream=True, capacity_bytes_ps=baud / 10))
