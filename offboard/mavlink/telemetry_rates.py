@@ -16,7 +16,7 @@ from pymavlink.dialects.v20.ardupilotmega import mavlink_map
 from offboard.mavlink.dialects.base import WantedMessage
 
 SLOW_HZ = 20.0
-SHARE = 0.7  # of a link's capacity; the rest is for what is not requested
+SHARE = 0.68  # of a link's capacity; the rest is for what is not requested
 FRAME_BYTES = 12  # of a MAVLink 2 frame besides its payload
 UNKNOWN_BYTES = 10  # of a payload that pymavlink does not know: CURRENT_MODE has 9
 _WINDOW_S = 2.0

@@ -123,7 +123,7 @@ def test_link_time_follows_the_vehicle_or_host_time() -> None:
 @pytest.mark.parametrize(
     ("baud", "attitude_hz"),
     # 0.7 of 5,760 bytes/s less 366 for slow messages, over 84 per pair; HIL_STATE_QUATERNION too
-    [(57_600, 26.0), (115_200, 54.6), (921_600, 100.0)],
+    [(57_600, 22.6), (115_200, 51.0), (921_600, 100.0)],
 )
 def test_rates_fit_a_serial_line(baud: int, attitude_hz: float) -> None:
     session = Session(SessionSettings(stream=True, capacity_bytes_ps=baud / 10))
@@ -132,7 +132,7 @@ def test_rates_fit_a_serial_line(baud: int, attitude_hz: float) -> None:
     rates_hz = {int(m.parameters[0]): 1e6 / m.parameters[1] for m in asked}
     assert rates_hz[31] == rates_hz[32] == pytest.approx(attitude_hz, rel=0.02)
     assert rates_hz[436] == pytest.approx(10.0)
-    sizes = {31: 44 + 16, 32: 40, 436: 21, 245: 14, 1: 43 + 12, 115: 76}  # with extensions
+    sizes = {31: 44 + 16, 32: 40, 83: 49, 436: 21, 245: 14, 1: 43 + 12, 115: 76}  # with extensions
     assert sum(rate * sizes[number] for number, rate in rates_hz.items()) < 0.8 * baud / 10
 
 
@@ -145,5 +145,5 @@ def test_telemetry_of_a_saturated_link_is_halved_until_it_is_slow() -> None:
         asked = [m for m in session.poll(0.0) if isinstance(m, CommandLong)]
         rates_hz.append(next(1e6 / m.parameters[1] for m in asked if m.parameters[0] == 31))
     assert rates_hz[0] == pytest.approx(47.0, abs=4.0)
-    assert rates_hz[-1] == pytest.approx(20.0)
+    assert rates_hz[-1] == pytest.approx(20.0, abs=0.5)
     assert len(rates_hz) <= 3

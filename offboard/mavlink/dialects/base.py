@@ -126,7 +126,7 @@ TRACKING_TELEMETRY = (
     WantedMessage(32, "LOCAL_POSITION_NED", 100.0),
     WantedMessage(245, "EXTENDED_SYS_STATE", 5.0),
     WantedMessage(1, "SYS_STATUS", 2.0),
-    WantedMessage(83, "ATTITUDE_TARGET", 10.0, optional=True),  # its own thrust, before ours
+    WantedMessage(83, "ATTITUDE_TARGET", 8.0, optional=True),  # its own thrust, before ours
 )
 
 # For our own position fusion (`estimate: fused`)
