@@ -74,10 +74,10 @@ def flown(law: str, tmp_path: Path, *assignments: str) -> tuple[np.ndarray, np.n
     the RMSE."""
     pair = flying(law, tmp_path, "reference.laps=1", *assignments)
     times, places = [], []
-    step = pair._step
+    advance = pair.advance
 
     def watched() -> None:
-        step()
+        advance()
         companion = pair.companion
         if companion.phase in (Phase.CLIMB, Phase.JOIN, Phase.TRACK, Phase.HOVER):
             plan = companion.state.plan
@@ -85,7 +85,7 @@ def flown(law: str, tmp_path: Path, *assignments: str) -> tuple[np.ndarray, np.n
             truth = np.array(pair.instance.autopilot.state.truth.position_ned_m)
             places.append(truth - plan.origin_ned_m)
 
-    pair._step = watched  # type: ignore[method-assign]
+    pair.advance = watched  # type: ignore[method-assign]
     assert pair.fly().exit_code == 0
     return np.array(times[::5]), np.array(places[::5]), pair.score(tmp_path).rmse_position_m
 

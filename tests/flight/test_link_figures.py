@@ -88,7 +88,8 @@ def test_sixty_ms_each_way_cause_a_limit_cycle_unless_identified(tmp_path: Path)
     for seed in (1, 2):
         known = sixty_ms_each_way(10, seed, IdentifySettings())
         score = known.score(tmp_path / str(seed))
-        (sentence,) = [line for line in known.companion.announced if line.startswith("bandwidth")]
+        lines = [line for line in known.companion.announced if line.startswith("bandwidth")]
+        sentence = next(line for line in lines if "by the identified delay" in line)
         used_radps = float(sentence.removeprefix("bandwidth limited to ").split()[0])
         assert 6.0 < used_radps < 10.0
         assert f"(configured 10.0) by the identified delay, {score.delay_ms:.0f} " in sentence
