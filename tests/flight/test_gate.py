@@ -15,7 +15,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
 from offboard.flight.authority import Authority
@@ -244,6 +244,13 @@ def is_usable(command: Command | PositionCommand) -> bool:
     return bool(0.99 <= length <= 1.01)
 
 
+def is_on_the_edge(command: Command | PositionCommand) -> bool:
+    """A length that rounding alone puts on either side of its tolerance."""
+    if isinstance(command, PositionCommand):
+        return False
+    return abs(abs(math.hypot(*command.thrust_direction_ned) - 1.0) - 0.01) < 1e-12
+
+
 def tilt_of(command: Command) -> float:
     north, east, down = (np.longdouble(each) for each in command.thrust_direction_ned)
     return float(np.arctan2(np.sqrt(north**2 + east**2), down))
@@ -272,6 +279,7 @@ def test_flights_of_one_tick(
     age_limit_s: float,
     late_s: float,
 ) -> None:
+    assume(not is_on_the_edge(command))
     authority, end_s = replayed(history)
     ours = authority.permits_setpoint(end_s + later_s)
     clearance = Clearance(ours, on_ground, age_s, age_limit_s, late_s)
