@@ -93,7 +93,9 @@ def connections(spawn: Spawn, kind: str, cable: Callable[[int], str]) -> str:
     port = free_port()
     listens = kind != "udp"
     link = f"tcpin:127.0.0.1:{port}" if listens else f"udpout:127.0.0.1:{port}"
-    simulator = spawn("simulator", "--connect", link, "--gcs", "none")
+    # with the longest timeout of its own: on a busy machine its failsafe would come first
+    own_failsafe = ("--param", "COM_OF_LOSS_T=5")
+    simulator = spawn("simulator", "--connect", link, "--gcs", "none", *own_failsafe)
     assert simulator.stdout is not None
     assert simulator.stdout.readline()
     if kind == "serial":

@@ -32,8 +32,11 @@ def test_an_interrupt_is_deferred_to_the_end_of_the_block() -> None:
     """Also when another thread, without the mask, receives the signal."""
     over = threading.Event()
     threading.Thread(target=over.wait).start()
+    # a command that was run in this process may have left its own handler
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         assert interrupted_meanwhile() == ["True\n", "interrupted"]
+        assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     finally:
         over.set()
-    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+        signal.signal(signal.SIGINT, before)

@@ -582,7 +582,7 @@ def test_intervals_are_requested_at_once() -> None:
         245: 200000.0,
         1: 500000.0,
         436: 100000.0,
-        83: 100000.0,
+        83: 125000.0,
         115: 20000.0,
     }
     assert session.poll(0.01) == ()
