@@ -80,6 +80,9 @@ def simulate(
     instance: Annotated[int, _option("N", "Added to ports and system id.", min=0, max=249)] = 0,
     instances: Annotated[int, _option("N", "Number of vehicles.", min=1, max=100)] = 1,
     patience: Annotated[float | None, _option("SECONDS", PATIENCE, min=0.1, max=600.0)] = None,
+    signing_key: Annotated[
+        Path | None, _option("FILE", "Sign and require signatures, see `offboard key`.")
+    ] = None,
     strict: Annotated[
         bool, typer.Option("--strict", help="Report messages that the autopilot ignores silently.")
     ] = False,
@@ -123,6 +126,7 @@ def simulate(
 
     with loading():
         from offboard.documents.reading import DocumentError
+        from offboard.documents.signing_key import read_key
         from offboard.flight.clock import unix_us
         from simulator import config
         from simulator.firmware.catalogue import FIRMWARES
@@ -134,6 +138,8 @@ def simulate(
     personality = FIRMWARES.get(firmware)
     if personality is None:
         _refuse(f"--firmware {firmware}: unknown; there is {', '.join(FIRMWARES)}")
+
+    key = read_key(signing_key) if signing_key else b""
 
     # the local ports of PX4 SITL only by default: a real PX4 beside us may use them
     own_ports = connect is None
@@ -185,6 +191,7 @@ def simulate(
                 faults=flown.faults,
                 start=flown.start,
                 strict=strict,
+                signing_key=key,
             )
             strangers = tuple(open_beside(companion) for _ in vehicle_flown.strangers)
             endpoints.append(Endpoint(vehicle_flown, companion, ground, recorder, strangers))

@@ -16,6 +16,7 @@ from simulator.firmware.base import Firmware
 from simulator.injection import prepare
 from simulator.link.impairment import frames
 from simulator.mavlink.server import Server
+from simulator.mavlink.signing import Keyring
 from simulator.mavlink.strict import Strict
 from simulator.mavlink.telemetry import builders
 from simulator.mavlink.view import View
@@ -49,6 +50,7 @@ class Instance:
         faults: what goes wrong, and when (`simulator.faults`).
         start: the vehicle is in the air when its links open; None: it boots on the ground.
         strict: report messages that the autopilot ignores or misreads (`complaints`).
+        signing_key: 32 bytes; the vehicle signs what it sends, and accepts only what is signed.
 
     Example:
         >>> from simulator import config
@@ -76,6 +78,7 @@ class Instance:
         faults: Sequence[Fault] = (),
         start: Start | None = None,
         strict: bool = False,
+        signing_key: bytes = b"",
     ) -> None:
         self.autopilot = Autopilot(
             firmware, Plant(vehicle, conditions, seed), boot_scale=conditions.boot_scale
@@ -89,12 +92,21 @@ class Instance:
         self.view = View(self.autopilot, system, epoch_us - clock_us, builders(firmware))
         self.view.clock_offset_us = clock_us
         self._strict = Strict(system, self.autopilot.parameters) if strict else None
+        self.keyring = Keyring(
+            firmware.link.accepted_unsigned,
+            self._unix_us if firmware.link.stamps_follow_clock else None,
+            signing_key,
+        )
+        rates_hz = firmware.streams.ground_rates_hz if ground_link else {}
         self.companion = Server(
-            self.view, firmware.streams.companion_rates_hz, barrier=lockstep, strict=self._strict
+            self.view,
+            firmware.streams.companion_rates_hz,
+            self.keyring,
+            number=0,
+            barrier=lockstep,
+            strict=self._strict,
         )
-        self.ground = Server(
-            self.view, firmware.streams.ground_rates_hz if ground_link else {}, strict=self._strict
-        )
+        self.ground = Server(self.view, rates_hz, self.keyring, number=1, strict=self._strict)
         self.steps = 0
         self._injection = prepare(faults, seed)
         self._arrived: list[bytes] = []
@@ -109,8 +121,13 @@ class Instance:
 
     @property
     def complaints(self) -> Mapping[str, int]:
-        """Number of messages by complaint; empty unless `strict`."""
-        return {} if self._strict is None else self._strict.counts
+        """Number of messages by complaint: those that signing refused, and with `strict` others."""
+        refused = self.companion.decoder.refused + self.ground.decoder.refused
+        return refused + self._strict.counts if self._strict else refused
+
+    def _unix_us(self) -> int:
+        """The vehicle's clock, as in SYSTEM_TIME."""
+        return self.view.epoch_us + self.view.time_us
 
     @property
     def strangers(self) -> list[list[bytes]]:
@@ -217,6 +234,7 @@ class Instance:
         )
         self.autopilot.pilot.detector.set_landed(old.plant.on_ground)
         self.view.restart(self.autopilot)
+        self.keyring.restart()
         self.companion.restart()
         self.ground.restart()
         self._back_at_step = self.steps + round(silent_s / STEP_S)

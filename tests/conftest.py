@@ -1,11 +1,13 @@
-"""Before any test: everything is compiled, so that no test waits for it."""
+"""Before any test: bytecode and machine code are compiled, so that no test waits for it."""
 
 from __future__ import annotations
 
+import compileall
 import importlib
 import os
 import signal
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -29,13 +31,19 @@ for _number, _handler in (
     if signal.getsignal(_number) is signal.SIG_IGN:
         signal.signal(_number, _handler)
 
-# Tests that limit the size of files would leave truncated bytecode, on which later imports fail
+PACKAGES = (Path(__file__).parent.parent / name for name in ("offboard", "simulator"))
+
+# Tests that limit the size of files would leave truncated bytecode, on which later imports fail:
+# all bytecode is written once, at the start of the session
 sys.dont_write_bytecode = True
 os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
+os.environ["OFFBOARD_REPORT"] = "0"  # flights of tests write no report
 
 
 def pytest_sessionstart(session: pytest.Session) -> None:
     if not hasattr(session.config, "workerinput") and not session.config.option.collectonly:
+        for package in PACKAGES:
+            compileall.compile_dir(package, quiet=2)
         for name in COMPILED:
             importlib.import_module(name)
         prepare()

@@ -47,7 +47,8 @@ def test_only_the_clock_reads_the_time() -> None:
 
 def test_only_the_edges_open_sockets() -> None:
     links = {f"simulator/link/{name}.py" for name in ("links", "tcp", "udp")}
-    edges = {f"offboard/flight/{name}.py" for name in ("connection", "stream_link", "udp_link")}
+    opening = ("connection", "stream_link", "stream_sources", "udp_link")
+    edges = {f"offboard/flight/{name}.py" for name in opening}
     supervisor = {f"offboard/flight/{name}.py" for name in ("supervisor", "supervisor_process")}
     pipes = {"offboard/flight/sitl.py", "simulator/pool.py"}  # between two processes
     assert _importers("socket", "serial") <= edges | links | supervisor

@@ -12,17 +12,16 @@ import itertools
 import json
 import math
 import statistics
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
-from contextlib import AbstractContextManager, ExitStack
+from concurrent.futures import BrokenExecutor, Executor
+from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
+from offboard.analysis.workers import run_all
 from offboard.documents.reading import DocumentError
 
 EQUAL_SHARE = 0.01  # medians that are closer than this share of the best are equal
-POLL_S = 0.2
 FIGURES = (
     "rmse_position_m",
     "max_position_m",
@@ -145,27 +144,12 @@ def run(
     width: int,
     ending: Callable[[], bool],
 ) -> Iterator[Result]:
-    """Fly all trials in `width` workers and yield each result when it ends.
-
-    `fly` is called in a worker, so it must be picklable. When `ending` is true, no further flight
-    begins. Every worker is an executor of its own: if it dies, its flight has failed and a new one
-    replaces it.
-    """
-    waiting = deque(planned)
-    with ExitStack() as stack:
-        idle = [stack.enter_context(open_worker()) for _ in range(min(width, len(planned)))]
-        flying: dict[Future[Result], tuple[Trial, Executor]] = {}
-        while flying or (waiting and not ending()):
-            while idle and waiting and not ending():
-                trial, worker = waiting.popleft(), idle.pop()
-                flying[worker.submit(fly, trial)] = trial, worker
-            for done in wait(flying, POLL_S, FIRST_COMPLETED).done:
-                trial, worker = flying.pop(done)
-                error = done.exception()
-                if isinstance(error, BrokenExecutor):
-                    worker = stack.enter_context(open_worker())
-                idle.append(worker)
-                yield done.result() if error is None else Result(trial, 4, _why(error), {})
+    """Fly all trials in `width` workers (`workers.run_all`) and yield each result when it ends. If
+    a worker dies, its flight has failed."""
+    for trial, result in run_all(planned, fly, open_worker, width, ending):
+        if isinstance(result, BaseException):
+            result = Result(trial, 4, _why(result), {})
+        yield result
 
 
 def _why(error: BaseException) -> str:

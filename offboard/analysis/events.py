@@ -39,6 +39,16 @@ def phases(texts: Stream, clock: Clock) -> tuple[Event, ...]:
     return _events(clock, "offboard", announced)
 
 
+def announcements(texts: Stream, clock: Clock) -> tuple[Event, ...]:
+    """Our other texts: what was identified or limited, and decisions that were missed."""
+    others = (
+        (place, now_ms, text)
+        for place, now_ms, text in _texts(texts)
+        if not text.startswith(OUR_PREFIX)
+    )
+    return _events(clock, "offboard", others)
+
+
 def modes(heartbeats: Stream, dialect: Dialect | None, clock: Clock) -> tuple[Event, ...]:
     """The mode of the first HEARTBEAT, and every change; none for an unknown autopilot."""
     numbers = heartbeats.columns("custom_mode")[:, 0]

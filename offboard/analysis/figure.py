@@ -19,6 +19,8 @@ INK, MUTED, GRID, SURFACE, BACKGROUND = "#1f2933", "#52606d", "#e4e7eb", "#fffff
 BLUE, RED, GREEN, ORANGE, PURPLE, GREY = (
     "#2b6cb0", "#c53030", "#2f855a", "#c05621", "#6b46c1", "#617488",
 )  # fmt: skip
+# backgrounds of bands with text on them
+BLUE_BAND, ORANGE_BAND, GREY_BAND = "#cfe0f3", "#f6d9bd", "#dfe3e8"
 TEAL, PINK, BROWN, SLATE, YELLOW = "#0f766e", "#b83280", "#744210", "#4a5568", "#b7791f"
 PALETTE = (BLUE, RED, GREEN, ORANGE, PURPLE, TEAL, PINK, BROWN, SLATE, YELLOW)
 # Figures are written in light colours; the page replaces each in the dark scheme
@@ -26,7 +28,7 @@ DARK = {
     INK: "#e6e9ed", MUTED: "#a5b1bd", GRID: "#343c46", SURFACE: "#1b2027", BACKGROUND: "#12161b",
     BLUE: "#6aaaf0", RED: "#f47c7c", GREEN: "#5cc48d", ORANGE: "#f2954f", PURPLE: "#b197fc",
     GREY: "#8d9bab", TEAL: "#4fd1c5", PINK: "#f18dc0", BROWN: "#c89b5d", SLATE: "#b8c2d0",
-    YELLOW: "#e8c15c",
+    YELLOW: "#e8c15c", BLUE_BAND: "#24405e", ORANGE_BAND: "#5e3c1c", GREY_BAND: "#2f3843",
 }  # fmt: skip
 
 _TOP_PX, _BOTTOM_PX, _PANEL_PX, _GAP_PX = 48, 90, 150, 36
@@ -93,10 +95,10 @@ def curve(
 ) -> None:  # fmt: skip
     """Add a curve to panel 1, 2, ...; curves of the same name share one entry of the legend."""
     line = {"color": colour, "width": 1.4, "dash": dash, **scatter.pop("line", {})}
+    shown = {other.name for other in figure.data if other.showlegend}
     trace = go.Scatter(
         x=coordinates(x), y=coordinates(y), name=name, legendgroup=name, line=line,
-        showlegend=name not in {other.name for other in figure.data},
-        **{"mode": "lines", **scatter},
+        **{"mode": "lines", "showlegend": name not in shown, **scatter},
     )  # fmt: skip
     figure.add_trace(trace, row=panel, col=1)
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.events import Event, modes, phases, vehicle_messages
+from offboard.analysis.events import Event, announcements, modes, phases, vehicle_messages
 from offboard.analysis.sender import Stream, continuous_s
 from offboard.analysis.tlog import LoggedMessage, Tlog, name_of
 from offboard.analysis.truth import true_positions
@@ -28,6 +28,7 @@ from offboard.flight.record import (
     records_of,
 )
 from offboard.mavlink.dialects.base import Dialect
+from offboard.mavlink.framing import HEARTBEAT, TIMESYNC
 from offboard.mavlink.session import DIALECTS
 
 Array = NDArray[np.float64]
@@ -41,8 +42,9 @@ LATE_S = 3.0  # telemetry that is older when it arrives is not scored
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: ground stations and companions
 _ARRAYS = {RECORD_NAME, IDENTIFIED_NAME}
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
-_HEARTBEAT, _TIMESYNC, _FLOAT_ARRAY = 0, 111, 350
+_FLOAT_ARRAY = 350
 _TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
+_SUBSTITUTES = (30, 33)  # ATTITUDE, GLOBAL_POSITION_INT: the clock of logs without these
 # kinds of messages of which every stretch has its own, and kinds that are kept from the beginning
 _OUR_SAMPLES = {
     82: "SET_ATTITUDE_TARGET",
@@ -83,9 +85,10 @@ class History:
     heartbeat: t, armed (1 or 0), MAV_STATE
     landed: t, MAV_LANDED_STATE (EXTENDED_SYS_STATE)
 
-    `records` (N,) are structured, with the fields of `flight.record.TickRecord`. `phases` are our
-    own, `modes` and `vehicle_messages` (STATUSTEXT, refused commands) the vehicle's. `damage`
-    says what could not be read.
+    `records` (N,) are structured, with the fields of `flight.record.TickRecord`. `phases` and
+    `announcements` are our own, `modes` and `vehicle_messages` (STATUSTEXT, refused commands) the
+    vehicle's. `damage` says what could not be read, `damage_s` is the time of the telemetry before
+    the first damage, NaN without.
     """
 
     position: Array
@@ -100,11 +103,13 @@ class History:
     heartbeat: Array
     landed: Array
     phases: tuple[Event, ...]
+    announcements: tuple[Event, ...]
     modes: tuple[Event, ...]
     vehicle_messages: tuple[Event, ...]
     messages: Counter[str]
     wall_s: float
     damage: str = ""
+    damage_s: float = math.nan
 
 
 def gather(log: Tlog) -> History:
@@ -120,8 +125,10 @@ def stretches(log: Tlog, messages: int = STRETCH) -> Iterator[tuple[History, flo
     was complete. Events, `identified`, `link_delay`, `heartbeat` and `landed` are all since the
     beginning. The last stretch is complete up to infinity.
     """
-    collector = _Collector(*_vehicle(log))
+    collector = _Collector(*vehicle(log))
     for count, entry in enumerate(log, 1):
+        if log.damaged and math.isnan(collector.damage_ms):
+            collector.damage_ms = collector.now_ms
         collector.add(entry)
         if count % messages == 0:
             until_s = float(collector.time_s(collector.now_ms)) - LATE_S
@@ -153,7 +160,9 @@ class _Collector:
         self._unix_us = (0, 0)
         self._place = 0
         self._anchor_ms = math.nan
+        self._clocks: tuple[int, ...] = _TELEMETRY + _SUBSTITUTES
         self.now_ms = math.nan  # stamp of the newest telemetry
+        self.damage_ms = math.nan  # of the newest one before the first damage
         self._rows: dict[str, Array] = {}  # of the present stretch
         self._identified: list[Array] = []
 
@@ -166,10 +175,11 @@ class _Collector:
         if not ours and entry.frame.system_id != self._vehicle_id:
             return
         stream = (self._ours if ours else self._theirs).get(kind)
-        if stream is None or not _is_used(entry, ours):
-            return
-        stream.add(entry, self._place, self.now_ms)
-        if kind in _TELEMETRY:
+        if stream is not None and _is_used(entry, ours):
+            stream.add(entry, self._place, self.now_ms)
+        if kind in self._clocks and not ours:
+            if kind in _TELEMETRY:
+                self._clocks = _TELEMETRY
             self.now_ms = float(int.from_bytes(entry.frame.payload[:4], "little"))
             if math.isnan(self._anchor_ms):
                 self._anchor_ms = self.now_ms
@@ -221,11 +231,13 @@ class _Collector:
             heartbeat=heartbeat,
             landed=self._news(245, "landed_state"),
             phases=phases(self._ours[253], self.time_s),
+            announcements=announcements(self._ours[253], self.time_s),
             modes=modes(self._theirs[0], self._dialect, self.time_s),
             vehicle_messages=vehicle_messages(self._theirs[253], self._theirs[77], self.time_s),
             messages=counts,
             wall_s=(self._unix_us[1] - self._unix_us[0]) / 1e6,
             damage=damage,
+            damage_s=float(self.time_s(self.damage_ms)),
         )
 
     # ------------------------------------------------------------------ time
@@ -258,7 +270,7 @@ class _Collector:
     def _link_delay(self) -> Array:
         """From the vehicle's answers to our TIMESYNC requests."""
         requests, answers = (
-            streams[_TIMESYNC].columns("ts1 tc1") for streams in (self._ours, self._theirs)
+            streams[TIMESYNC].columns("ts1 tc1") for streams in (self._ours, self._theirs)
         )
         answered = answers[np.isin(answers[:, 0], requests[:, 0])]
         return np.column_stack((answered[:, 0], answered[:, 1] - answered[:, 0])) * 1e-9
@@ -267,14 +279,15 @@ class _Collector:
 def _is_used(entry: LoggedMessage, ours: bool) -> bool:
     """Whether a message of a kind that is collected is one of those that we need."""
     kind, payload = entry.frame.message_id, entry.frame.payload
-    if kind == _TIMESYNC:  # our requests, and replies of the vehicle: tc1 is 0 in a request
+    if kind == TIMESYNC:  # our requests, and replies of the vehicle: tc1 is 0 in a request
         return any(payload[:8]) != ours
     if kind == _FLOAT_ARRAY:
         return payload[10:20].rstrip(b"\0").decode(errors="replace") in _ARRAYS
-    return kind != _HEARTBEAT or entry.frame.component_id == 1
+    return kind != HEARTBEAT or entry.frame.component_id == 1
 
 
-def _vehicle(log: Tlog) -> tuple[int | None, Dialect | None]:
+def vehicle(log: Tlog) -> tuple[int | None, Dialect | None]:
+    """System id of the first autopilot in the log, and its dialect; None without, or if unknown."""
     known = {dialect.mav_autopilot: dialect for dialect in DIALECTS.values()}
     for entry in log:
         if entry.name == "HEARTBEAT" and entry.message.autopilot != _NO_AUTOPILOT:

@@ -50,6 +50,10 @@ def summary(score: Score, history: History, directory: Path) -> list[tuple[str, 
                 f"{score.missed_ticks:.0f} of {score.decisions:.0f} ticks missed",
             )
         )
+    if score.strangers > 0:
+        rows.append(
+            ("ignored", f"{score.strangers:,.0f} datagrams of others or frames without signature")
+        )
     identified = _identified(history)
     if identified:
         rows.append(("identified", identified))

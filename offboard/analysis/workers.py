@@ -1,4 +1,4 @@
-"""Worker processes: how many, and an executor that leaves Ctrl-C to the main process.
+"""Worker processes: how many, an executor that leaves Ctrl-C to the main process, and its jobs.
 
 A terminal sends Ctrl-C to every process in it. Workers must not act on it: the main process decides
 what is still flown.
@@ -10,10 +10,23 @@ import multiprocessing
 import os
 import signal
 import threading
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import (
+    FIRST_COMPLETED,
+    BrokenExecutor,
+    CancelledError,
+    Executor,
+    Future,
+    ProcessPoolExecutor,
+    wait,
+)
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from typing import TypeVar
 
+Job = TypeVar("Job")
+Result = TypeVar("Result")
+POLL_S = 0.2
 ORPHANED = 1  # exit code of a worker whose parent has ended
 
 
@@ -64,6 +77,37 @@ def open_worker() -> Iterator[ProcessPoolExecutor]:
         raise
     finally:
         pool.shutdown(cancel_futures=True)
+
+
+def run_all(
+    jobs: Sequence[Job],
+    work: Callable[[Job], Result],
+    open_worker: Callable[[], AbstractContextManager[Executor]],
+    width: int,
+    ending: Callable[[], bool],
+) -> Iterator[tuple[Job, Result | BaseException]]:
+    """Do all jobs in `width` workers; yield each with its result, or its exception, when it ends.
+
+    `work` is called in a worker, so it must be picklable. When `ending` is true, no further job
+    begins. Every worker is an executor of its own: if it dies, its job yields BrokenExecutor and a
+    new worker replaces it.
+    """
+    waiting = deque(jobs)
+    with ExitStack() as stack:
+        idle = [stack.enter_context(open_worker()) for _ in range(min(width, len(jobs)))]
+        busy: dict[Future[Result], tuple[Job, Executor]] = {}
+        while busy or (waiting and not ending()):
+            while idle and waiting and not ending():
+                job, worker = waiting.popleft(), idle.pop()
+                busy[worker.submit(work, job)] = job, worker
+            for done in wait(busy, POLL_S, FIRST_COMPLETED).done:
+                job, worker = busy.pop(done)
+                error = CancelledError() if done.cancelled() else done.exception()
+                if not isinstance(error, BrokenExecutor):
+                    idle.append(worker)
+                elif waiting:
+                    idle.append(stack.enter_context(open_worker()))
+                yield job, done.result() if error is None else error
 
 
 def _start() -> None:

@@ -7,7 +7,23 @@ from typing import Annotated
 
 import typer
 
-from offboard.cli import check, compare, fly, identify, listing, paper, score
+from offboard.cli import (
+    campaign,
+    check,
+    compare,
+    daemon,
+    doctor,
+    export,
+    fly,
+    identify,
+    key,
+    listing,
+    paper,
+    replay,
+    report,
+    score,
+    tune,
+)
 from offboard.cli.shared import EXIT_CODES, out
 from offboard.documents import shipped
 from offboard.documents.arguments import Command
@@ -38,9 +54,19 @@ def offboard(
 
 
 app.command(cls=Command, epilog=f"{NAMES}\n\n{EXIT_CODES}")(fly.fly)
+app.command(cls=Command, epilog=f"{NAMES}\n\n{EXIT_CODES}")(daemon.daemon)
+app.command(cls=Command, epilog=doctor.DOCTOR_CODES)(doctor.doctor)
 app.command(cls=Command, epilog=EXIT_CODES)(score.score)
+app.command(cls=Command, epilog=EXIT_CODES)(report.report)
 app.command(cls=Command, epilog=EXIT_CODES)(check.check)
 app.command(cls=Command, epilog=EXIT_CODES)(identify.identify)
 app.command(cls=Command, epilog=f"{NAMES}\n\n{EXIT_CODES}")(compare.compare)
+app.command(cls=Command, epilog=f"{shipped.overview('campaign')}\n\n{EXIT_CODES}")(
+    campaign.campaign
+)
+app.command(cls=Command, epilog=EXIT_CODES)(tune.tune)
 app.command(cls=Command, epilog=EXIT_CODES)(paper.paper)
+app.command(cls=Command, epilog=replay.EXIT_CODES)(replay.replay)
+app.command(cls=Command, epilog=EXIT_CODES)(export.export)
+app.command(cls=Command, epilog=EXIT_CODES)(key.key)
 app.command("list", cls=Command)(listing.list_files)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from contextlib import closing, nullcontext
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -19,24 +20,28 @@ from offboard.cli.shared import (
     CommandError,
     Directory,
     Requirements,
+    SigningKey,
+    System,
     Vehicle,
     complain,
     option,
     out,
     say,
 )
+from offboard.documents.arguments import FOXGLOVE, LIVE_PAGE
 from offboard.documents.command_line import drop_output, explained
 
 if TYPE_CHECKING:
     from offboard.analysis.requirement import Requirement
-    from offboard.flight.companion import Companion, Outcome
+    from offboard.analysis.score import Score
+    from offboard.flight.companion import Outcome
+    from offboard.live.displays import Displays
 
 INTERRUPTED = "interrupted before anything was sent"
 LABEL_WIDTH = 15
-LINES_MAX = 1000  # that wait for the terminal
-TERMINAL_S = 2.0  # for them, after the flight
 LINKS = (
-    "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD.  "
+    "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD; "
+    "IPv6 in brackets.  "
     f"[default: {DEFAULT_CONNECTION}]"
 )
 
@@ -44,6 +49,8 @@ LINKS = (
 def fly(
     sitl: Annotated[bool, typer.Option("--sitl", help="Fly the bundled simulator.")] = False,
     connect: Annotated[str | None, option("LINK", LINKS)] = None,
+    system: System = None,
+    signing_key: SigningKey = None,
     config: Annotated[str, option(FILE, "Configuration.")] = "flight",
     controller: Annotated[str | None, option(FILE, "Controller.")] = None,
     reference: Annotated[str | None, option(FILE, "Reference; a file may also be .csv.")] = None,
@@ -59,15 +66,38 @@ def fly(
     out_directory: Directory = None,
     require: Requirements = None,
     assignments: Assignments = None,
+    report: Annotated[
+        bool,
+        typer.Option(envvar="OFFBOARD_REPORT", help="Write report.html after the flight."),
+    ] = True,
+    live: Annotated[
+        str | None,
+        option("[HOST:PORT]", f"Show the flight on a page.  [without a value: {LIVE_PAGE}]"),
+    ] = None,
+    foxglove: Annotated[
+        str | None,
+        option("[HOST:PORT]", f"Serve Foxglove and Lichtblick.  [without a value: {FOXGLOVE}]"),
+    ] = None,
+    json_lines: Annotated[
+        bool,
+        typer.Option("--json-lines", help="One JSON object a line on stdout, for machines."),
+    ] = False,
 ) -> None:
     """Fly a reference: connect, arm, take off, track, land, score.
 
     Prints the phases of the flight as they happen and ends with the result. The flight directory
-    holds flight.tlog (all messages), flight.yaml (the resolved configuration) and score.json.
+    holds flight.tlog (all messages), flight.yaml (the resolved configuration), score.json, and
+    some seconds later report.html.
     NAME is the name of a shipped file, see below and `offboard list`.
+
+    With --json-lines stdout has nothing else. `type` of each object is preparation, announcement (a
+    phase or another text), snapshot (once a second of vehicle time; SI, NED, null for what is not
+    known) or, as the last one, result.
     """
     if sitl and connect:
         raise CommandError("--sitl starts its own simulator: use --sitl or --connect, not both")
+    if sitl and system:
+        raise CommandError("--system is an option of --connect: --sitl has one vehicle")
     if not sitl and (scenario or sim_vehicle or firmware != "px4"):
         raise CommandError("--scenario, --sim-vehicle and --firmware are options of --sitl: add it")
     named = {"controller": controller, "reference": reference, "vehicle": vehicle}
@@ -78,7 +108,7 @@ def fly(
         with (
             StopRequests(_exit_at_once) as stops,
             SimulatorProcess() if sitl else nullcontext() as simulator,  # loads in the background
-            closing(_Announcer()) as announcer,
+            closing(_displays(live, foxglove, json_lines=json_lines)) as displays,
         ):
             from offboard.compiled import loading
 
@@ -99,13 +129,26 @@ def fly(
                 firmware=firmware,
                 scenario=scenario,
                 sim_vehicle=sim_vehicle,
+                system_id=system,
+                signing_key=signing_key,
             )
-            outcome = fly_request(request, announcer.announce, say, simulator, stops)
+            tell = displays.tell if json_lines else say
+            for url in displays.await_ready():
+                tell(f"live: {url}")
+            outcome = fly_request(request, displays.show, tell, simulator, stops)
     except KeyboardInterrupt:  # before the flight; in flight an interrupt lands the vehicle
         raise CommandError(INTERRUPTED) from None
     if outcome.exit_code == 2:
         raise CommandError(outcome.sentence)
-    _conclude(outcome, directory, requirements, announcer.dropped)
+    try:
+        _conclude(
+            outcome, directory, requirements, displays.lost, report=report, json_lines=json_lines
+        )
+    finally:
+        if report:
+            from offboard.report.background import begin_report
+
+            begin_report(directory)
 
 
 def _exit_at_once() -> None:
@@ -114,39 +157,37 @@ def _exit_at_once() -> None:
     os._exit(2)
 
 
-class _Announcer:
-    """Prints what the companion has announced. It does not wait for the terminal, which Ctrl-S
-    stops: `dropped` lines did not fit into the queue, or were not taken until `close`."""
+def _displays(live: str | None, foxglove: str | None, *, json_lines: bool) -> Displays:
+    """What shows the flight: lines, and servers at the addresses `live` and `foxglove`."""
+    from offboard.live.displays import Displays
+    from offboard.live.lines import JsonLines, Terminal
+    from offboard.live.process import LiveProcess
 
-    def __init__(self) -> None:
-        from offboard.flight.background import BackgroundWriter
-
-        self._writer = BackgroundWriter[str](_show, LINES_MAX)
-        self._shown = 0
-
-    def announce(self, companion: Companion) -> None:
-        for line in companion.announced[self._shown :]:
-            self._writer.put(f"{companion.state.time_s:8.2f} s  {line}")
-        self._shown = len(companion.announced)
-
-    def close(self) -> None:
-        self._writer.close(TERMINAL_S)
-
-    @property
-    def dropped(self) -> int:
-        return 0 if self._writer.error else self._writer.dropped  # nobody misses a closed pipe
+    lines = JsonLines(_write) if json_lines else Terminal(out, partial(say, indent=12))
+    servers = (
+        ("offboard.live.server", "--live", live),
+        ("offboard.live.foxglove_server", "--foxglove", foxglove),
+    )
+    pages = [LiveProcess(module, name, address) for module, name, address in servers if address]
+    return Displays(lines, pages)
 
 
-def _show(lines: list[str]) -> None:
-    for line in lines:
-        say(line, indent=12)
+def _write(text: str) -> None:
+    sys.stdout.write(text)
+    sys.stdout.flush()
 
 
 def _conclude(
-    outcome: Outcome, directory: Path, requirements: list[Requirement], not_shown: int
+    outcome: Outcome,
+    directory: Path,
+    requirements: list[Requirement],
+    lost: list[str],
+    *,
+    report: bool,
+    json_lines: bool,
 ) -> None:
-    """Print verdict and result. Exits with the code of the verdict. `not_shown`: lines of the
-    flight that the terminal did not take."""
+    """Print verdict and result. Exits with the code of the verdict. `lost`: sentences on what was
+    not shown of the flight."""
     from offboard.analysis.score_table import summary
     from offboard.analysis.trial import judged
 
@@ -157,16 +198,22 @@ def _conclude(
     results = "; ".join(each.sentence(score.figures()) for each in missed or checked)
     code = outcome.exit_code or int(bool(missed))
     try:
+        if json_lines:
+            _write(_result(code, outcome.sentence, results, score, directory, lost))
+            raise typer.Exit(code)
         out.print()
-        if not_shown:
-            say(f"{not_shown} lines of the flight are missing above: the terminal was stopped")
+        for sentence in lost:
+            say(sentence)
         if outcome.exit_code:
             complain(f"{outcome.sentence} (log: {directory / 'flight.tlog'})")
         elif missed:
             complain(f"{outcome.sentence}; requirement missed: {results}")
         else:
             say(f"{outcome.sentence}{'; requirement met: ' if results else ''}{results}")
-        for label, text in summary(score, history, directory):
+        rows = summary(score, history, directory)
+        if report:
+            rows.append(("report", f"{directory / 'report.html'}, in some seconds"))
+        for label, text in rows:
             say(f"  {label:<{LABEL_WIDTH}}{text}", indent=2 + LABEL_WIDTH)
         sys.stdout.flush()
     except OSError as error:  # the exit code stays that of the flight
@@ -174,3 +221,22 @@ def _conclude(
         complain(f"{outcome.sentence}; {explained(error)}")
     if code:
         raise typer.Exit(code)
+
+
+def _result(
+    code: int, sentence: str, requirements: str, score: Score, directory: Path, lost: list[str]
+) -> str:
+    """The last line of --json-lines."""
+    from offboard.live.values import line, plain
+
+    result = {
+        "exit_code": code,
+        "sentence": sentence,
+        "requirements": requirements,
+        "completed": score.completed == 1.0,
+        "ended_by": score.ended_by,
+        "directory": str(directory),
+        "lost": lost,
+        "figures": {name: plain(value) for name, value in score.figures().items()},
+    }
+    return line("result", **result) + "\n"

@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
-import itertools
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
 from offboard.cli.fly import fly
-from offboard.cli.shared import FILE, FLIGHT, FLIGHTS, CommandError, Directory, option, out, say
+from offboard.cli.shared import (
+    FILE,
+    FLIGHT,
+    FLIGHTS,
+    CommandError,
+    Directory,
+    check_new,
+    free_name,
+    option,
+    out,
+    say,
+    write_new,
+)
 
 
 def identify(
@@ -47,15 +57,15 @@ def identify(
     if (flight is None) == (connect is None and not sitl):
         raise CommandError("name a FLIGHT, or fly one first with --connect or --sitl; not both")
     for chosen, name in ((output, "-o"), (page, "--page")):
-        if chosen is not None and (chosen.exists() or chosen.is_symlink()):
-            raise CommandError(f"{chosen} exists already; choose another file with {name}")
-        if chosen is not None and not chosen.parent.is_dir():
-            raise CommandError(f"{name} {chosen}: there is no directory {chosen.parent}")
+        if chosen is not None:
+            check_new(chosen, name)
     if output is not None and page is not None and output.resolve() == page.resolve():
         raise CommandError(f"-o and --page are both {output}; choose two files")
     if flight is None:
         flight = out_directory or FLIGHTS / f"identify-{clock.local_stamp()}"
-        fly(sitl, connect, reference="identify", vehicle=vehicle, out_directory=flight)
+        fly(
+            sitl, connect, reference="identify", vehicle=vehicle, out_directory=flight, report=False
+        )
     path = tlog.find(flight)
     log = tlog.read(path)
     configuration = history.configuration(log)
@@ -65,29 +75,12 @@ def identify(
         prior = load("flight", choices={"vehicle": vehicle} if vehicle else {}).vehicle
     found, trace = identify_flight(log, history.gather(log), prior)
     text = vehicle_file(found, prior, flight.name)
-    shown = page or _free(path.with_name("identify.html"))
-    _write_new(shown, fits(flight.name, found, trace, prior))
+    shown = page or free_name(path.with_name("identify.html"))
+    write_new(shown, fits(flight.name, found, trace, prior))
     if not found.supported:
         raise CommandError(f"nothing could be identified from this flight; {shown} says why", 1)
     if output is not None:
-        _write_new(output, text)
+        write_new(output, text)
     out.print(text, end="", markup=False, soft_wrap=True)
     written = f"{output} and {shown}" if output else f"{shown}; -o FILE writes the vehicle file"
     say(f"written: {written}", indent=2)
-
-
-def _free(path: Path) -> Path:
-    """`path`, or the first of NAME-2, NAME-3 ... that does not exist."""
-    numbered = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
-    return next(each for each in itertools.chain([path], numbered) if not each.exists())
-
-
-def _write_new(path: Path, text: str) -> None:
-    try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
-    except OSError as error:
-        if not isinstance(error, FileExistsError):
-            with suppress(OSError):
-                path.unlink()  # an incomplete file
-        raise CommandError(f"{path} cannot be written ({error.strerror})") from None

@@ -6,6 +6,10 @@ wrong options are answered at once.
 
 from __future__ import annotations
 
+import itertools
+import os
+from contextlib import suppress
+from errno import EEXIST
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -38,6 +42,16 @@ FILE = "NAME|FILE"  # the name of a shipped file, or a path
 FLIGHT = typer.Argument(metavar="FLIGHT", help="Flight directory or .tlog file.")
 Directory = Annotated[Path | None, option("DIR", NEW_DIRECTORY, "--out")]
 Vehicle = Annotated[str | None, option(FILE, "Vehicle.")]
+System = Annotated[
+    int | None,
+    typer.Option(
+        metavar="N", min=1, max=255, help="System id of the vehicle, where several are heard."
+    ),
+]
+SigningKey = Annotated[
+    Path | None,
+    option("FILE", "Sign all messages with this key and accept no others, see `offboard key`."),
+]
 Workers = Annotated[int | None, option("N", "Processes.  [default: one per processor]")]
 Requirements = Annotated[
     list[str] | None,
@@ -62,3 +76,36 @@ class CommandError(UserError):
 def say(text: str, indent: int = 0) -> None:
     """Print a line to stdout, wrapped at words to the width; further lines are indented."""
     out.print(wrapped(text, out.width, indent), markup=False, soft_wrap=True)
+
+
+def check_new(path: Path, option_name: str) -> None:
+    """Raise CommandError if the file chosen by an option exists, or has no directory."""
+    if path.exists() or path.is_symlink():
+        raise CommandError(f"{path} exists already; choose another file with {option_name}")
+    if not path.parent.is_dir():
+        raise CommandError(f"{option_name} {path}: there is no directory {path.parent}")
+
+
+def free_name(path: Path) -> Path:
+    """`path`, or the first of NAME-2, NAME-3 ... that does not exist."""
+    numbered = (path.with_stem(f"{path.stem}-{number}") for number in itertools.count(2))
+    return next(each for each in itertools.chain([path], numbered) if not each.exists())
+
+
+def write_new(path: Path, text: str) -> None:
+    """Write a file that must not exist. It appears when it is complete. Raises CommandError."""
+    incomplete = path.with_name(f".{os.getpid()}.part")
+    try:
+        with incomplete.open("x", encoding="utf-8") as file:
+            file.write(text)
+        try:
+            os.link(incomplete, path)  # unlike a rename, refuses to replace a file
+        except PermissionError:  # a file system without links
+            if path.exists():
+                raise FileExistsError(EEXIST, os.strerror(EEXIST)) from None
+            incomplete.rename(path)
+    except OSError as error:
+        raise CommandError(f"{path} cannot be written ({error.strerror})") from None
+    finally:
+        with suppress(OSError):
+            incomplete.unlink()

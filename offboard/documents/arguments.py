@@ -9,6 +9,10 @@ from typer.core import TyperCommand
 from offboard.documents.command_line import INTERRUPTED, interrupts_raise
 from offboard.documents.errors import UserError, shown
 
+LIVE_PAGE, FOXGLOVE = "127.0.0.1:8014", "127.0.0.1:8765"
+# options whose value may be omitted, and what they then have
+OPTIONAL_VALUES = {"--live": LIVE_PAGE, "--foxglove": FOXGLOVE}
+
 
 class Command(TyperCommand):
     """A command whose values are neither empty nor options nor bytes that are no text.
@@ -18,6 +22,7 @@ class Command(TyperCommand):
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        args = _completed(args)
         given, _, parameters = self.make_parser(ctx).parse_args(list(args))
         for parameter in parameters:
             values = given.get(parameter.name)
@@ -32,6 +37,16 @@ class Command(TyperCommand):
             return super().invoke(ctx)
         except KeyboardInterrupt:
             raise UserError(INTERRUPTED) from None
+
+
+def _completed(args: list[str]) -> list[str]:
+    """The arguments with the values that were omitted."""
+    completed: list[str] = []
+    for arg, following in zip(args, [*args, "-"][1:], strict=True):
+        completed.append(arg)
+        if arg in OPTIONAL_VALUES and following.startswith("-"):
+            completed.append(OPTIONAL_VALUES[arg])
+    return completed
 
 
 def _label(parameter: Any) -> str:

@@ -19,6 +19,7 @@ FOLDERS = {
     "controller": "controllers",
     "vehicle": "vehicles",
     "scenario": "scenarios",
+    "campaign": "campaigns",
     "configuration": "",
 }
 

@@ -111,6 +111,7 @@ class Fusion:
         self._handover = DecayingOffset(3, self._settings.handover_s)
         self._smooth = DecayingOffset(6, SMOOTH_S)
         self._followed: tuple[Array, Array] | None = None
+        self._received: tuple[Triple, Triple] | None = None  # the newest that was followed
         self._offset.forget()
 
     def adopt(self, vehicle: Vehicle) -> None:
@@ -169,7 +170,11 @@ class Fusion:
             self._smooth.add(-change.T.ravel(), self._filter.time_s)
 
     def follow(self, time_s: float, position: Triple, velocity: Triple) -> tuple[Triple, Triple]:
-        """Position and velocity (NED) to follow, given those that the vehicle reports."""
+        """Position and velocity (NED) to follow, given those that the vehicle reports. While these
+        do not change although it moves, its estimate stands still, and so does the result."""
+        if self._followed and any(velocity) and (position, velocity) == self._received:
+            return _triple(self._followed[0]), _triple(self._followed[1])
+        self._received = position, velocity
         reported, speed = np.array(position), np.array(velocity)
         if time_s > self._reported_s:
             self._reported_s = time_s

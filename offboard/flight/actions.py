@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from offboard.estimation.observer import Observer
+from offboard.flight.assessment import has_other_sender
 from offboard.flight.decide import Decider, Tick
 from offboard.flight.gate import LEVEL
 from offboard.flight.outbox import Outbox
@@ -12,7 +15,9 @@ from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.outgoing import CommandLong
 from offboard.mavlink.session import Session
 from offboard.model.command import Command
+from offboard.model.frames import thrust_direction_from_quaternion
 
+AUTOPILOT_VERSION = 148  # message id
 FIT_EVERY_S = 4.0  # between two reductions of the telemetry: a backlog must drain first
 SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
 SPOOL_MAX = 2.0
@@ -62,6 +67,8 @@ class PhaseActions:
                 self._outbox.send_level(time_s, self._level())
         elif phase in (Phase.HOLD, Phase.LAND):
             self._end(tick, steers=steers)
+        elif phase is Phase.HAND_BACK:
+            self._end(tick, steers=bool(self._state.commands))
         elif phase is Phase.STAND_DOWN:
             self._outbox.request(CommandLong.disarm())
             if steers:
@@ -72,7 +79,7 @@ class PhaseActions:
         """Ask the autopilot to hold or to land, with level setpoints until it does."""
         dialect, authority = self._dialect, self._state.authority
         assert authority is not None
-        holds = tick.phase is Phase.HOLD
+        holds = tick.phase is not Phase.LAND
         mode = dialect.hold_mode if holds else dialect.land_mode
         if authority.mode != mode:
             if self._outbox.request(dialect.hold() if holds else dialect.land()):
@@ -100,6 +107,9 @@ class PhaseActions:
             self._request_parameters()
             self._fit_telemetry(tick.in_phase_s)
             return
+        if tick.phase is Phase.STANDBY:
+            self._stand_by(tick.time_s)
+            return
         if tick.phase is Phase.ENGAGE:
             self._outbox.request(self._dialect.engage())
         elif tick.phase is Phase.ARM:
@@ -112,10 +122,42 @@ class PhaseActions:
         command = Command(thrust_mps2, LEVEL, self._state.vehicle.course_rad)
         self._outbox.send_level(tick.time_s, command)
 
+    def _stand_by(self, time_s: float) -> None:
+        """PX4 accepts OFFBOARD only while setpoints arrive: stream what changes nothing. On the
+        ground no thrust; in the air what the vehicle flies, unless a failsafe flies it, after which
+        PX4 would return to OFFBOARD, or it flies setpoints of others."""
+        state = self._state
+        on_ground, vehicle = state.contact.certain, state.vehicle
+        command = Command(0.0, LEVEL, vehicle.course_rad) if on_ground else self._flown()
+        quiet = state.takes_off_by_command or state.telemetry_is_old or has_other_sender(state)
+        if on_ground:
+            quiet |= vehicle.armed and vehicle.in_failsafe
+        else:
+            quiet |= vehicle.in_failsafe or not state.pilot.elsewhere
+        if quiet:
+            self._outbox.set_command(time_s, command)
+        else:
+            self._outbox.send_level(time_s, command)
+
+    def _flown(self) -> Command:
+        """The attitude that the vehicle has, with the thrust that its autopilot reports."""
+        state = self._state
+        attitude, share = state.vehicle.attitude, state.hover.thrust(state.time_s)
+        assert attitude is not None
+        direction = thrust_direction_from_quaternion(np.array(attitude.attitude))
+        north, east, down = direction.tolist()
+        model = state.model
+        thrust_mps2 = (1.0 if share is None else share / model.hover_thrust) * model.gravity_mps2
+        return Command(thrust_mps2, (north, east, down), state.vehicle.course_rad)
+
     def _request_parameters(self) -> None:
         state = self._state
         due = state.readiness.due(self._dialect, state.vehicle.parameters, state.now_s)
         self._outbox.send(*due)
+        if state.programme.serves:
+            if state.vehicle.uid is None:
+                self._outbox.request(CommandLong.message(AUTOPILOT_VERSION))
+            return
         stale = state.vehicle.mode == self._dialect.engage_mode and state.vehicle.disarmed
         if stale and not state.vehicle.prearm_ok:  # PX4 returns to OFFBOARD after a landing
             self._outbox.request(self._dialect.hold())

@@ -16,7 +16,7 @@ from offboard.flight.facts import Facts
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.phases import Phase
 from offboard.flight.state import FlightState
-from offboard.mavlink.events import Heartbeat, OtherSender
+from offboard.mavlink.events import Heartbeat, OtherCompanion, OtherSender
 from offboard.mavlink.session import Session
 from offboard.model.frames import thrust_direction_from_quaternion
 
@@ -24,6 +24,7 @@ TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
 MINIMUM_TELEMETRY_HZ = 10.0
 OTHER_SENDER_S = 5.0  # a second sender is there for so long after its newest frame
 ARMING_SHOWN_S = 2.5  # HEARTBEAT, at 1 Hz, shows an accepted arming within this time
+READIED = (Phase.HEALTH, Phase.STANDBY)  # phases in which readiness is judged
 ARM = 400  # MAV_CMD_COMPONENT_ARM_DISARM
 
 
@@ -45,8 +46,8 @@ def facts(
         silence_s=state.silence_s,
         blind_s=max(vehicle.position_age_s, vehicle.attitude_age_s),
         found=vehicle.found is not None,
-        ready=state.phase is Phase.HEALTH and not not_ready(state, session),
-        misconfigured=state.phase is Phase.HEALTH and bool(_problems(state)),
+        ready=state.phase in READIED and not not_ready(state, session),
+        misconfigured=state.phase in READIED and bool(problems(state)),
         rebooted=state.rebooted,
         engaged=authority is not None and authority.mode == authority.engage_mode,
         lost=authority is not None and authority.standing is Standing.LOST,
@@ -76,13 +77,29 @@ def facts(
         telemetry_age_s=age_s,
         link_growth_s=state.link_growth_s,
         clock_jump_s=state.clock.jumped_s,
+        position_jump_m=state.jumps.recent_m(time_s),
         battery=1.0 if charge is None else charge,
-        other_sender=vehicle.age_s(OtherSender) < OTHER_SENDER_S,
+        other_sender=_hears_other_sender(state),
+        other_vehicle=session.autopilots.ambiguous,
         disarmed_again=_disarmed_again(state),
         lifted_by_command=state.takes_off_by_command,
+        request=state.request,
+        switched=state.pilot.engaged,
+        hasty=state.pilot.hasty,
+        unclaimed=state.pilot.unclaimed and vehicle.landed != "unknown",
+        handed=authority is not None and authority.standing is Standing.HANDED,
         excites=identification is not None and identification.wants_excitation,
         identified=identification is not None and identification.finished(time_s),
     )
+
+
+def has_other_sender(state: FlightState) -> bool:
+    """Whether another program controls the vehicle on this link, and that counts."""
+    return _hears_other_sender(state) and not state.limits.begin_with_other_sender
+
+
+def _hears_other_sender(state: FlightState) -> bool:
+    return state.vehicle.age_s(OtherSender) < OTHER_SENDER_S
 
 
 def figures(
@@ -106,11 +123,15 @@ def figures(
         "tilt_error_deg": math.degrees(now.tilt_error_rad),
         "battery_percent": 100.0 * now.battery,
         "other_sender": f"system {other.system_id} component {other.component_id}" if other else "",
+        "companion": _other_companion(vehicle.other_companion),
+        "systems": session.autopilots.named(),
+        "not_found": session.autopilots.why_none(session.counters)
+        or "is it running, and sending to this port?",
         "stop": state.stop_reason,
         "failure": state.failure,
         "contradiction": identification.contradiction if identification else "",
         "not_landed": state.not_landed(),
-        "problems": "; ".join(_problems(state)),
+        "problems": "; ".join(problems(state)),
         "not_ready": not_ready(state, session),
     }
 
@@ -134,8 +155,18 @@ def not_ready(state: FlightState, session: Session) -> str:
         return f"no reply for parameter {', '.join(unanswered)}"
     if not state.readiness.complete(dialect, vehicle.parameters, state.now_s):
         return "its parameters are still being read"
-    if not (vehicle.prearm_ok or vehicle.armed):
+    if state.programme.serves and session.autopilots.ambiguous:
+        systems = session.autopilots.named()
+        return f"several vehicles are heard, systems {systems}: choose one with --system"
+    if not (vehicle.prearm_ok or vehicle.armed or state.programme.serves):
         return "its pre-arm checks do not pass"
+    if vehicle.estimator and vehicle.estimator.problem:
+        return vehicle.estimator.problem
+    charge = vehicle.health.battery_remaining if vehicle.health else None
+    if charge is not None and charge < limits.battery:
+        return f"its battery has {charge:.0%} left, limits.battery is {limits.battery:.0%}"
+    if not state.link.is_measured(state.host_s):
+        return "the delay of the link is being measured"
     link = state.link.estimate
     if link and (link.value > limits.link_delay_s or link.sd > limits.link_jitter_s):
         return (
@@ -155,7 +186,18 @@ def position_error_m(state: FlightState) -> float:
     return float(np.linalg.norm(np.array(position.position_ned_m) - sample.position_ned_m))
 
 
-def _problems(state: FlightState) -> list[str]:
+def _other_companion(other: OtherCompanion | None) -> str:
+    """What it may have to do with a vehicle that does not follow; empty without one."""
+    if other is None:
+        return ""
+    return (
+        f"; another companion computer, system {other.system_id} component {other.component_id}, "
+        "may send setpoints, too"
+    )
+
+
+def problems(state: FlightState) -> list[str]:
+    """What is wrong with the vehicle's parameters: one sentence for each."""
     if state.dialect is None:
         return []
     return state.readiness.problems(state.dialect, state.vehicle.parameters)
@@ -182,7 +224,7 @@ def _from_take_off(state: FlightState) -> tuple[float, float, float]:
         return 0.0, 0.0, 0.0
     north, east, down = (
         each - origin
-        for each, origin in zip(position.position_ned_m, state.plan.origin_ned_m, strict=True)
+        for each, origin in zip(position.position_ned_m, state.home_ned_m, strict=True)
     )
     return north, east, -down
 

@@ -8,7 +8,7 @@ changed. A report has an age: without a recent one nothing is sent.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from enum import Enum
 
 JUST_S = 0.6  # PX4 sends CURRENT_MODE twice a second, and at once when the mode changes
@@ -82,6 +82,17 @@ class Authority:
         """It shows a mode that we asked for: one that we asked for before would be a step back."""
         self.standing = Standing.HANDED
         del self._requested[: self._requested.index(mode)]
+
+    def renewed(self) -> Authority:
+        """For another flight of this vehicle: its reports of the mode, and nothing asked for."""
+        return replace(
+            self,
+            standing=Standing.FREE,
+            lost_reason="",
+            lost_s=math.inf,
+            _asked_in="",
+            _requested=[],
+        )
 
     def ask(self) -> None:
         """We ask for the mode in which the vehicle follows our setpoints."""

@@ -21,6 +21,12 @@ def unix_us() -> int:
     return time.time_ns() // 1000
 
 
+def utc() -> str:
+    """Date and time, UTC, as 2026-11-21T09:30:00.123Z."""
+    seconds, rest_ms = divmod(time.time_ns() // 1_000_000, 1000)
+    return f"{time.strftime('%Y-%m-%dT%H:%M:%S', time.gmtime(seconds))}.{rest_ms:03d}Z"
+
+
 def local_stamp() -> str:
     """Local date and time for names of files, as 20261121-093000."""
     return time.strftime("%Y%m%d-%H%M%S")

@@ -10,41 +10,68 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable, Sequence
+from dataclasses import replace
+
+import numpy as np
 
 from offboard.control.base import Adopting, Controller
 from offboard.estimation.fusion import FusedObserver
 from offboard.estimation.observer import Observer
+from offboard.flight import assessment, guards
 from offboard.flight.actions import PhaseActions
 from offboard.flight.authority import Authority
 from offboard.flight.decide import Decider, Tick
+from offboard.flight.facts import Facts
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import GroundContact
+from offboard.flight.hover_estimate import HoverEstimate
+from offboard.flight.inputs import InputRecorder
 from offboard.flight.link import Chunk
 from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
 from offboard.flight.outbox import Outbox, Output
 from offboard.flight.phase_machine import PhaseMachine
-from offboard.flight.phases import BEFORE_FLIGHT, FLYING, Limits, Phase
+from offboard.flight.phases import (
+    BEFORE_FLIGHT,
+    ENDS,
+    FLYING,
+    PHASE_CODES,
+    TRACKING,
+    WAITING,
+    Limits,
+    Phase,
+    Rung,
+)
+from offboard.flight.position_jumps import PositionJumps
+from offboard.flight.programme import FLY, Programme
+from offboard.flight.readiness import Readiness
+from offboard.flight.requests import Circumstances, Request, Result, answer
+from offboard.flight.snapshot import Snapshot, snapshot_of
 from offboard.flight.state import FlightState, Outcome
-from offboard.flight.supervisor import Guard
+from offboard.flight.supervisor import Supervised
+from offboard.identification.learned import Learned
 from offboard.mavlink.events import (
     Attitude,
+    ClockBehind,
+    CommandRequest,
     Event,
     GpsFix,
     Heartbeat,
     LocalPosition,
     ModeReport,
     Origin,
+    OtherCompanion,
     PeerChanged,
     Rebooted,
     ThrustReport,
     TimesyncReply,
 )
-from offboard.mavlink.outgoing import Outgoing
-from offboard.mavlink.session import Session
+from offboard.mavlink.outgoing import CommandResult, Outgoing
+from offboard.mavlink.session import ACTIVE, Session
 from offboard.model.vehicle import Vehicle
 
 __all__ = ["Companion", "Outcome", "Output"]
 
+MAV_STATE_STANDBY, MAV_STATE_CRITICAL = 3, 5
 STOPPED = "stop requested by the operator"
 BRIDGED_SHARE = 0.3  # of `Limits.silence_s`; after it, level setpoints replace the control law
 PAUSE_S = 0.3  # a longer gap between two turns: what was known before it is not known any more
@@ -54,8 +81,12 @@ class Companion:
     """Flies `plan` with `controller`. `stopwatch` reads host time.
 
     `deadline_s` is the wall time that one decision may take; None in lockstep, where the vehicle
-    waits for each decision. `state` is the flight's state; `peer` the address that the vehicle
-    sends from, None before it is found; `strangers` the datagrams of other senders, for the log.
+    waits for each decision. `learned` is what an earlier flight has identified of the vehicle.
+    `before` has ended or waits, with the same session: what it knows of vehicle and link stays
+    known.
+
+    `state` is the flight's state; `peer` the address that the vehicle sends from, None before it is
+    found; `strangers` the datagrams of other senders, for the log.
     """
 
     def __init__(
@@ -71,19 +102,35 @@ class Companion:
         deadline_s: float | None,
         stopwatch: Callable[[], float],
         identify: IdentifySettings | None = None,
+        learned: Learned | None = None,
+        programme: Programme = FLY,
+        before: Companion | None = None,
     ) -> None:
         self._session = session
         self._observer = observer
         self._period_s = period_s
         self._lockstep = session.settings.lockstep
-        self.state = state = FlightState(limits, plan, vehicle)
-        self.peer: Hashable | None = None
-        self._tick = -1
-        self._turned_s = self._heard_s = math.nan  # host time of the last turn, and telemetry
+        model = learned.vehicle if learned else vehicle
+        if learned:
+            observer.adopt(model)
+        if before is None:
+            state = FlightState(limits, plan, model, programme)
+        else:
+            state = before.state.next_flight(limits, plan, model, programme)
+        self.state: FlightState = state
+        self.peer: Hashable | None = before.peer if before else None
+        same_period = before is not None and before._period_s == period_s
+        self._tick: int = before._tick if before and same_period else -1
+        # host time of the last turn, and telemetry
+        self._turned_s: float = before._turned_s if before else math.nan
+        self._heard_s: float = before._heard_s if before else math.nan
         self._arrived_s = 0.0  # host time of the arrival of the newest telemetry
         self._bridged_s = 0.0
-        self.strangers = self._recorded_strangers = 0
-        self._identification = _identification(vehicle, controller, period_s, identify)
+        self._received: list[bytes] = []  # frames that are not in an `Output` yet
+        self._inputs = InputRecorder(session.settings, kept=not programme.serves)
+        self.strangers: int = before.strangers if before else 0
+        self._recorded_strangers = self.strangers
+        self._identification = _identification(vehicle, controller, period_s, identify, learned)
         self._outbox = Outbox(state, session, observer, self._identification)
         decider = Decider(
             state=state,
@@ -93,7 +140,7 @@ class Companion:
             outbox=self._outbox,
             period_s=period_s,
             deadline_s=deadline_s,
-            stopwatch=stopwatch,
+            stopwatch=self._inputs.watch(stopwatch),
         )
         self._machine = PhaseMachine(
             state=state,
@@ -127,52 +174,115 @@ class Companion:
         """Sentences for the user, oldest first."""
         return self._outbox.announced
 
+    def snapshot(self) -> Snapshot:
+        """The flight at this moment, for displays."""
+        return snapshot_of(
+            self.state,
+            self._outbox.command,
+            self.announced,
+            self.strangers,
+            self._session.counters.forged,
+        )
+
+    def facts(self) -> Facts:
+        """The facts of this moment, with the rung of the ladder that is in force."""
+        now = assessment.facts(self.state, self._session, self._observer, self._identification)
+        return replace(now, rung=self.state.ladder.rung)
+
     def has_ended(self) -> bool:
         return self.state.has_ended
 
+    @property
+    def identification(self) -> OnlineIdentification | None:
+        """What is identified in flight; None with a controller that cannot use it."""
+        return self._identification
+
     def request_stop(self, why: str = STOPPED) -> None:
         """Land, or do not take off; takes effect at the next turn."""
-        self.state.stop_reason = self.state.stop_reason or why
+        if not self.state.stop_reason:
+            self._inputs.call("request_stop", why)
+            self.state.stop_reason = why
 
     def announce(self, sentence: str) -> None:
         """Report a sentence to the user, the ground station and the log."""
+        self._inputs.call("announce", sentence)
         self._outbox.announce(sentence)
+
+    def on_dropped(self, frames: int) -> None:
+        """The last frames of the newest `Output` were not sent; for the log."""
+        self._inputs.dropped(frames)
+
+    def overhear(self, datagrams: Sequence[bytes]) -> None:
+        """Datagrams from other addresses than the vehicle's: on the ground, they may show that
+        several vehicles send to us."""
+        if self.phase in BEFORE_FLIGHT:
+            for datagram in datagrams:
+                for system_id in self._session.overhear(datagram):
+                    self._inputs.call("note_autopilot", system_id)
+
+    def note_autopilot(self, system_id: int) -> None:
+        """Another address shows the autopilot of this system, for a replay."""
+        self._session.autopilots.systems.append(system_id)
 
     def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
         """Process all that has arrived, then act once if a tick is due.
 
         Call it at least every 50 ms. `now_s` is host time.
         """
+        before = self._tick
+        now_s = self._inputs.begin(now_s, self.strangers)
+        try:
+            self._take_and_act(chunks, now_s)
+        finally:
+            self._inputs.end()
+        output = self._outbox.flush(self._received, self._supervised())
+        self._received = []
+        pieces = self._inputs.pieces(all_of_it=self._tick != before or self.has_ended())
+        return replace(output, log=(*output.log, *map(self._session.encode, pieces)))
+
+    def _take_and_act(self, chunks: Sequence[Chunk], now_s: float) -> None:
         self._begin_turn(now_s)
-        frames: list[bytes] = []
         replies: list[Outgoing] = []
         heard = False
         for chunk in chunks:
-            reception = self._session.receive(chunk.data, chunk.peer, chunk.arrived_s)
+            arrived_s = self._inputs.arrived_s(chunk)
+            reception = self._session.receive(chunk.data, chunk.peer, arrived_s)
+            self._inputs.chunk(chunk, reception)
             if reception.events:
                 self.peer = chunk.peer
-            frames += reception.frames
+            self._received += reception.frames
             replies += reception.replies
             for event in reception.events:
                 heard |= self._is_telemetry(event)
-                self._process(self._with_own_position(event), chunk.arrived_s)
-        due = self._session.poll(now_s)
+                self._process(self._with_own_position(event), arrived_s)
+        news = self._session.counters.news()
+        if news:
+            self._outbox.announce(news)
         state = self.state
+        self._session.status = self._status()
+        due = self._session.poll(now_s)
         state.now_s = state.vehicle.now_s = self._session.link_time_s
         state.host_s = self._clock_s(now_s)
         if heard:
             self._heard_s, state.silence_s, self._bridged_s = now_s, 0.0, 0.0
         self._act()
         self._outbox.send(*due, *replies)
-        return self._outbox.flush(frames, self._guard())
 
-    def _guard(self) -> Guard | None:
+    def _supervised(self) -> Supervised | None:
         """For the supervisor: whether it has to act, should this process fail."""
         state, vehicle = self.state, self._session.vehicle
         if vehicle is None:
             return None
         ours = state.phase not in BEFORE_FLIGHT and not state.has_ended and state.may_command
-        return Guard(vehicle, ours, state.vehicle.armed, holding=state.phase is Phase.HOLD)
+        return Supervised(vehicle, ours, state.vehicle.armed, holding=state.phase is Phase.HOLD)
+
+    def _status(self) -> tuple[int, int]:
+        """MAV_STATE and custom_mode of our heartbeat."""
+        phase, ladder = self.state.phase, self.state.ladder
+        calm = phase in WAITING or phase in ENDS
+        critical = phase in FLYING and ladder.rung >= Rung.HOLD
+        status = MAV_STATE_CRITICAL if critical else MAV_STATE_STANDBY if calm else ACTIVE
+        return status, PHASE_CODES[phase]
 
     # ------------------------------------------------------------------ one turn
 
@@ -204,7 +314,9 @@ class Companion:
     def _is_telemetry(self, event: Event) -> bool:
         """Whether the event ends a silence. Once position and attitude are received only they do:
         without them vehicle time stands still and nothing is decided."""
-        return isinstance(event, (Attitude, LocalPosition)) or not self.state.vehicle.has_state
+        if not self.state.vehicle.has_state:
+            return not isinstance(event, ClockBehind)
+        return isinstance(event, (Attitude, LocalPosition))
 
     # ------------------------------------------------------------------ telemetry
 
@@ -240,19 +352,44 @@ class Companion:
                 state.hover.on_position(time_s, state.contact.height_m, velocity[2])
                 if state.touchdown:
                     state.touchdown.on_position(time_s, position, velocity[2])
+                self._follow_jump(event)
                 self._observer.on_position(time_s, position, velocity)
                 if self._identification:
-                    self._identification.on_position(time_s, position, velocity)
+                    north, east, down = np.subtract(position, state.jumps.total_ned_m).tolist()
+                    self._identification.on_position(time_s, (north, east, down), velocity)
             case ThrustReport(thrust):
                 state.hover.on_thrust(state.time_s, thrust)
             case Heartbeat(mode) | ModeReport(mode):
-                self._on_mode(mode, arrived_s)
-            case TimesyncReply():
-                state.link.on_reply(event)
+                self._on_mode(event, mode, arrived_s)
+            case TimesyncReply(vehicle_ns=vehicle_ns):
+                asked_s = state.link.on_reply(event)
+                if asked_s is not None:
+                    state.clock.on_reply(vehicle_ns * 1e-9, asked_s)
+            case CommandRequest():
+                self._answer(event)
             case PeerChanged(peer):
                 self._outbox.announce(f"the vehicle now sends from another port: {peer}")
+            case OtherCompanion(system, component):
+                self._outbox.announce_once(
+                    f"another companion computer is on the link: system {system} component "
+                    f"{component}; only one of them may send setpoints"
+                )
+            case ClockBehind(system_id):
+                self._greet(system_id)
             case Rebooted():
                 self._on_reboot()
+
+    def _follow_jump(self, event: LocalPosition) -> None:
+        """The vehicle does not step when its estimate does."""
+        state, jump_ned_m = self.state, self.state.jumps.on_position(event)
+        if state.phase not in TRACKING:
+            state.jumps.forget()
+        elif jump_ned_m is not None:
+            back_s = state.plan.follow_jump(event.time_s, jump_ned_m)
+            self._outbox.announce(
+                f"the estimated position jumped by {np.linalg.norm(jump_ned_m):.2f} m: the "
+                f"reference jumps with it, and returns within {back_s:.0f} s"
+            )
 
     def _on_telemetry(self, stamp_s: float, arrived_s: float) -> None:
         self._arrived_s = arrived_s
@@ -264,7 +401,29 @@ class Companion:
         """Host time; in lockstep, where host time must decide nothing, the link's own seconds."""
         return self._session.link_time_s if self._lockstep else host_s
 
-    def _on_mode(self, mode: str, arrived_s: float) -> None:
+    def _answer(self, asked: CommandRequest) -> None:
+        """Acknowledge a command to us; the next tick does what it asks for."""
+        state = self.state
+        if state.programme.serves:
+            now = self.facts()
+            fit = guards.usable(now)
+            circumstances = Circumstances(
+                state.phase,
+                state.vehicle.armed,
+                state.programme.may_arm,
+                fit,
+                fit and guards.can_take_over(now),
+            )
+            result, request = answer(asked.command, asked.parameters, circumstances)
+            if request is not Request.NONE:
+                state.request = request
+                sender = f"system {asked.system_id} component {asked.component_id}"
+                self._outbox.announce(f"{request.value} requested by {sender}")
+        else:
+            result = Result.UNSUPPORTED
+        self._outbox.send(CommandResult(asked.command, result, asked.system_id, asked.component_id))
+
+    def _on_mode(self, event: Heartbeat | ModeReport, mode: str, arrived_s: float) -> None:
         state = self.state
         if state.authority is None:
             state.dialect = self._session.dialect
@@ -273,6 +432,21 @@ class Companion:
         state.authority.on_mode(
             mode, state.now_s, arrived_s=arrived_s, failsafe=state.vehicle.in_failsafe
         )
+        ours = mode == state.authority.engage_mode
+        contact = state.contact
+        state.pilot.on_mode(
+            ours=ours, in_the_air=contact.in_the_air, certainly=contact.certainly_flies
+        )
+        if assessment.has_other_sender(state):
+            state.pilot.engaged = False  # it was not switched for us
+        if isinstance(event, Heartbeat):
+            state.pilot.on_heartbeat(ours=ours, failsafe=state.vehicle.in_failsafe)
+
+    def _greet(self, system_id: int) -> None:
+        """Its time stamps will follow ours, once it has heard us."""
+        sentence = f"the signing time of system {system_id} is behind: sending ours"
+        if sentence not in self.announced:
+            self._outbox.announce(sentence)
 
     def _on_reboot(self) -> None:
         state = self.state
@@ -281,6 +455,8 @@ class Companion:
         state.growth.reset()
         state.clock.reset()
         state.contact = GroundContact(state.vehicle)
+        state.hover, state.jumps = HoverEstimate(), PositionJumps()
+        state.readiness = Readiness()
         state.authority = None
         self._tick = -1
         self._machine.on_reboot()
@@ -299,6 +475,7 @@ class Companion:
         if state.phase in FLYING:
             self._follow_link(time_s)
         if not state.has_ended:
+            ignored = self.strangers + self._session.counters.forged
             self._actions.act(
                 Tick(
                     time_s,
@@ -306,11 +483,11 @@ class Companion:
                     state.in_phase_s,
                     self._arrived_s,
                     missed,
-                    self.strangers - self._recorded_strangers,
+                    ignored - self._recorded_strangers,
                 )
             )
-            self._recorded_strangers = self.strangers
-            self._outbox.send(state.link.request(time_s))
+            self._recorded_strangers = ignored
+            self._outbox.send(state.link.request(time_s, state.host_s))
 
     def _follow_link(self, time_s: float) -> None:
         growth = self.state.growth
@@ -328,10 +505,16 @@ class Companion:
 
 
 def _identification(
-    vehicle: Vehicle, controller: Controller, period_s: float, settings: IdentifySettings | None
+    vehicle: Vehicle,
+    controller: Controller,
+    period_s: float,
+    settings: IdentifySettings | None,
+    learned: Learned | None,
 ) -> OnlineIdentification | None:
     """None for a controller that cannot adopt another vehicle model."""
     if settings is None or not isinstance(controller, Adopting):
         return None
     bandwidth = controller.bandwidth_radps
-    return OnlineIdentification(vehicle, settings, period_s=period_s, bandwidth_radps=bandwidth)
+    return OnlineIdentification(
+        vehicle, settings, period_s=period_s, bandwidth_radps=bandwidth, learned=learned
+    )

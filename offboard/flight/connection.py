@@ -3,7 +3,11 @@
 udpin:HOST:PORT    listen on a port, send to the address of the vehicle that the session found
 udpout:HOST:PORT   send to this address, and hear no other
 tcp:HOST:PORT      connect to a listening autopilot (ArduPilot SITL)
+tcpin:HOST:PORT    listen for one client
 serial:DEVICE:BAUD
+
+An IPv6 address stands in brackets, as in udpin:[::1]:14540. A TCP connection or serial port that
+breaks is opened again, for as long as the link is used.
 """
 
 from __future__ import annotations
@@ -11,15 +15,19 @@ from __future__ import annotations
 import re
 import socket
 from errno import EADDRINUSE
+from typing import Any
 
 from offboard.documents.errors import shown
-from offboard.flight.link import Link, LinkError
-from offboard.flight.stream_link import serial_link, tcp_link
+from offboard.flight.link import Link, LinkError, LinkUnavailable
+from offboard.flight.stream_link import StreamLink
+from offboard.flight.stream_sources import Listener, Redial, connect, open_port
 from offboard.flight.udp_link import LockstepLink, UdpLink, udp_socket
 
-FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD"
+FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD"
 PORT_MAX, BAUD_MAX = 65535, 100_000_000
-_ADDRESS = re.compile(r"(udpin|udpout|tcp|serial):(.+):([0-9]{1,9})", re.ASCII)
+BITS_OF_A_BYTE = 10  # on a serial line: start, eight bits, stop
+LISTENS = ("udpin", "tcpin")
+_ADDRESS = re.compile(r"(udpin|udpout|tcp|tcpin|serial):(.+):([0-9]{1,9})", re.ASCII)
 
 
 def open_lockstep_link() -> LockstepLink:
@@ -29,10 +37,11 @@ def open_lockstep_link() -> LockstepLink:
     return LockstepLink(sock)
 
 
-def open_link(address: str) -> Link:
+def open_link(address: str, *, waits: bool = False) -> Link:
     """Open the link at `address`, for example "udpin:127.0.0.1:14540" (see the module).
 
-    Raises LinkError, which says what to change.
+    With `waits` an autopilot that does not listen, or a serial port that is missing, is no error:
+    the link opens it as soon as it is there. Raises LinkError, which says what to change.
     """
     matched = _ADDRESS.fullmatch(address)
     if matched is None:
@@ -41,32 +50,55 @@ def open_link(address: str) -> Link:
     if kind == "serial":
         if not 0 < number <= BAUD_MAX:
             raise LinkError(f"connection {shown(address)}: {number} baud is no rate of a port")
-        return serial_link(host, number)
-    least = 0 if kind == "udpin" else 1  # 0: any free port
+        redial = Redial(lambda: open_port(host, number))
+        port = None if waits else open_port(host, number)
+        return StreamLink(port, "serial", redial, number / BITS_OF_A_BYTE)
+    least = 0 if kind in LISTENS else 1  # 0: any free port
     if not least <= number <= PORT_MAX:
         raise LinkError(
             f"connection {shown(address)}: port {number} is not within {least} .. {PORT_MAX}"
         )
+    if ":" in host and not (host.startswith("[") and host.endswith("]")):
+        raise LinkError(
+            f"connection {shown(address)} is not understood; an IPv6 address stands in brackets, "
+            f"as in {kind}:[::1]:{number}"
+        )
     try:
-        return tcp_link(host, number) if kind == "tcp" else _udp_link(kind, host, number)
+        return _network_link(kind, host.strip("[]"), number, waits=waits)
     except (OSError, UnicodeError) as error:  # of a host name that is too long
         reason = getattr(error, "strerror", None) or error
         taken = getattr(error, "errno", None) == EADDRINUSE
-        raise LinkError(
+        raise LinkUnavailable(
             f"connection {shown(address)} cannot be opened: {reason}"
             + ("; another program uses the port" if taken else "")
         ) from None
 
 
-def _udp_link(kind: str, host: str, port: int) -> UdpLink:
-    place = (socket.gethostbyname(host), port)
-    sock = udp_socket()
+def _network_link(kind: str, host: str, port: int, *, waits: bool) -> Link:
+    """Raises OSError or UnicodeError."""
+    if kind == "tcp":
+        redial = Redial(lambda: connect(host, port))
+        return StreamLink(None if waits else connect(host, port), "tcp", redial)
+    family, place = _resolved(host, port)
+    sock = socket.socket(family, socket.SOCK_STREAM) if kind == "tcpin" else udp_socket(family)
     try:
         if kind == "udpout":
             sock.connect(place)
             return UdpLink(None, sock)
+        if kind == "udpin":
+            sock.bind(place)
+            return UdpLink(sock, None)
+        sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         sock.bind(place)
+        sock.listen()
+        return StreamLink(None, "tcp", Listener(sock))
     except OSError:
         sock.close()
         raise
-    return UdpLink(sock, None)
+
+
+def _resolved(host: str, port: int) -> tuple[int, tuple[Any, ...]]:
+    """Address family and socket address of a host, IPv4 if it has both. Raises OSError."""
+    found = socket.getaddrinfo(host, port, type=socket.SOCK_DGRAM)
+    family, _, _, _, place = min(found, key=lambda each: each[0] != socket.AF_INET)
+    return family, tuple(place)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from offboard.flight.phases import Limits, Rung
+from offboard.flight.requests import Request
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,10 +48,17 @@ class Facts:
     telemetry_age_s: float = 0.0  # beyond the least delay of the link
     link_growth_s: float = 0.0
     clock_jump_s: float = 0.0
+    position_jump_m: float = 0.0  # of the reported position, all of the last ten seconds
     battery: float = 1.0
     other_sender: bool = False
+    other_vehicle: bool = False  # several vehicles were heard, and none was chosen
     disarmed_again: bool = False  # after arming was accepted
     lifted_by_command: bool = False  # the autopilot takes off on a command, without setpoints
+    request: Request = Request.NONE  # of the ground station
+    switched: bool = False  # by the pilot, in the air, to the mode of setpoints
+    hasty: bool = False  # the same, before a HEARTBEAT has shown the mode that it left
+    unclaimed: bool = False  # found in the air in the mode of setpoints
+    handed: bool = False  # it shows a mode that we asked for at the end
     rung: Rung = Rung.FLY  # of the ladder, which judges the other facts
     excites: bool = False  # identification steps are flown before the track
     identified: bool = False  # and their result is in use

@@ -3,17 +3,48 @@
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from offboard.reference.base import FlatSample, Reference
+from offboard.reference.paused import Paused
 from offboard.reference.track import Track
-from offboard.reference.transfer import Placed, Shifted, transfer
+from offboard.reference.transfer import Limits, Placed, Shifted, transfer
 
 Array = NDArray[np.float64]
 SETTLED_DISTANCE_M = 0.3
 SETTLED_SPEED_MPS = 0.3
+RETURN = Limits(
+    speed_mps=0.5, acceleration_mps2=0.5, cruise_mps=0.5, cruise_vertical_mps=0.5
+)  # after a jump of the estimate
+CLEAR_M = 0.5  # above the ground, of a track that is placed in the air
+SAMPLED_S = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Offset:
+    """A reference with another one, the offset, added to its positions; same time axis."""
+
+    reference: Reference
+    offset: Reference
+
+    @property
+    def duration_s(self) -> float:
+        return self.reference.duration_s
+
+    def sample(self, time_s: float | Array) -> FlatSample:
+        """Flat outputs at `time_s`, a scalar or an array of any shape."""
+        sample, offset = self.reference.sample(time_s), self.offset.sample(time_s)
+        return replace(
+            sample,
+            position_ned_m=sample.position_ned_m + offset.position_ned_m,
+            velocity_ned_mps=sample.velocity_ned_mps + offset.velocity_ned_mps,
+            acceleration_ned_mps2=sample.acceleration_ned_mps2 + offset.acceleration_ned_mps2,
+            jerk_ned_mps3=sample.jerk_ned_mps3 + offset.jerk_ned_mps3,
+            snap_ned_mps4=sample.snap_ned_mps4 + offset.snap_ned_mps4,
+        )
 
 
 class FlightPlan:
@@ -27,7 +58,16 @@ class FlightPlan:
         self.origin_ned_m = (0.0, 0.0, 0.0)
         self._track_began_s = math.nan
         self._arrival_s = math.nan
-        self.reference: Reference | None = None
+        self._planned: Reference | None = None
+        self._paused: Paused | None = None
+        self._offset: Reference | None = None  # since a jump of the estimate
+
+    @property
+    def reference(self) -> Reference | None:
+        """The reference in force."""
+        if self._planned is None or self._offset is None:
+            return self._planned
+        return Offset(self._planned, self._offset)
 
     def start_climb(
         self, time_s: float, position: Array, velocity: Array, course_rad: float
@@ -41,17 +81,60 @@ class FlightPlan:
             float(start.course_rad),
             start_velocity_ned_mps=velocity,
         )
+        self._track_began_s, self._paused = math.nan, None
         self._arrival_s = time_s + climb.duration_s
-        self.reference = Shifted(climb, time_s)
+        self._planned = Shifted(climb, time_s)
+        self._offset = None
 
     def start_track(self, time_s: float) -> None:
         """Fly the track, whose time 0 is `time_s`."""
-        self._track_began_s = time_s
-        self.reference = Shifted(self._placed(), time_s)
+        self._track_began_s, self._paused = time_s, None
+        self._planned = Shifted(self._placed(), time_s)
+
+    def follow_jump(self, time_s: float, jump_ned_m: Array) -> float:
+        """The estimated position has jumped by `jump_ned_m` (3,), not the vehicle: move the
+        reference by as much, and from there back to its place at up to RETURN.speed_mps. Returns
+        the duration of the way back, s."""
+        velocity = np.zeros(3)
+        if self._offset is not None:
+            before = self._offset.sample(time_s)
+            jump_ned_m = jump_ned_m + before.position_ned_m
+            velocity = before.velocity_ned_mps
+        back = transfer(jump_ned_m, np.zeros(3), 0.0, 0.0, RETURN, start_velocity_ned_mps=velocity)
+        self._offset = Shifted(back, time_s)
+        return back.duration_s
+
+    def pause(self, time_s: float) -> None:
+        """Come to rest on the track, which has begun."""
+        assert self._planned is not None
+        if self._paused and self._paused.at_full_speed(time_s):
+            self.start_track(self._track_began_s + time_s - self._paused.passed_s(time_s))
+        self._paused = self._planned = Paused(self._planned, time_s)
+
+    def resume(self, time_s: float) -> None:
+        """Continue the track after `pause`."""
+        if self._paused is not None:
+            self._paused = self._planned = self._paused.resumed(time_s)
+
+    def place_start(
+        self, position_ned_m: tuple[float, float, float], ground_down_m: float
+    ) -> float:
+        """Place the track so that it starts at this point, or as far above it as its lowest point
+        needs to stay `CLEAR_M` above the ground; returns by how much."""
+        times_s = np.arange(0.0, self.track.duration_s + SAMPLED_S, SAMPLED_S)
+        places = self.track.sample(times_s).position_ned_m
+        origin = np.array(position_ned_m) - places[0]
+        lowest_m = float(origin[2]) + float(places[:, 2].max())
+        # a vehicle that is lower itself decides how low is safe
+        least_m = max(ground_down_m - CLEAR_M, position_ned_m[2])
+        above_m = max(lowest_m - least_m, 0.0)
+        self.origin_ned_m = (float(origin[0]), float(origin[1]), float(origin[2]) - above_m)
+        return above_m
 
     def track_time_s(self, time_s: float) -> float:
-        """Time since the start of the track; NaN before it."""
-        return time_s - self._track_began_s
+        """Time since the start of the track, without pauses; NaN before it."""
+        passed_s = self._paused.passed_s(time_s) if self._paused else time_s
+        return passed_s - self._track_began_s
 
     def late_s(self, time_s: float) -> float:
         """Time since the planned end of the climb; negative before it, NaN without a climb."""

@@ -10,7 +10,7 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from offboard.flight.vehicle_state import VehicleState
-from offboard.mavlink.events import Landed, LocalPosition
+from offboard.mavlink.events import Landed, LocalPosition, Triple
 
 DETECTOR_KNOWN_S = 1.5  # EXTENDED_SYS_STATE is requested at 5 Hz
 RESTING_HEIGHT_M = 0.75  # errors of an estimate on the ground
@@ -25,7 +25,7 @@ class GroundContact:
     """Updated with every position; `vehicle` holds the other signs."""
 
     vehicle: VehicleState
-    rest_down_m: float = 0.0  # where it was last known to rest; at first the local origin
+    rest_ned_m: Triple = (0.0, 0.0, 0.0)  # where it last rested; at first the local origin
     _lifted: int = 0  # samples in a row
     _heights: deque[tuple[float, float]] = field(default_factory=deque)
 
@@ -33,7 +33,7 @@ class GroundContact:
         """The newest position."""
         speed_mps = position.velocity_ned_mps[2]
         if self.vehicle.disarmed and abs(speed_mps) < GROUND_SPEED_MPS:
-            self.rest_down_m = position.position_ned_m[2]
+            self.rest_ned_m = position.position_ned_m
         climbs = speed_mps < -LIFTED_CLIMB_MPS and self.height_m > 0.3 * LIFTED_HEIGHT_M
         lifted = self.height_m > LIFTED_HEIGHT_M or climbs
         self._lifted = self._lifted + 1 if lifted else 0
@@ -43,10 +43,23 @@ class GroundContact:
             self._heights.popleft()
 
     @property
+    def rest_down_m(self) -> float:
+        """The height of the last rest, positive down, m."""
+        return self.rest_ned_m[2]
+
+    @property
     def height_m(self) -> float:
         """Height above the place of the last rest; 0 before the first position."""
         position = self.vehicle.position
         return self.rest_down_m - position.position_ned_m[2] if position else 0.0
+
+    @property
+    def certainly_flies(self) -> bool:
+        """Every sign says that the vehicle flies. In doubt a pilot's switch does not engage: the
+        vehicle may stand on the ground."""
+        vehicle = self.vehicle
+        known = vehicle.age_s(Landed) <= DETECTOR_KNOWN_S
+        return self.in_the_air and known and vehicle.landed not in ("on_ground", "unknown")
 
     @property
     def certain(self) -> bool:

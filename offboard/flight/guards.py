@@ -6,9 +6,11 @@ from collections.abc import Callable
 
 from offboard.flight.facts import Facts
 from offboard.flight.phases import Rung
+from offboard.flight.requests import Request
 
 Guard = Callable[[Facts], bool]
 DETECTOR_S = 1.0  # EXTENDED_SYS_STATE is requested at 5 Hz
+LISTENED_S = 0.5  # to hear another sender: PX4 leaves OFFBOARD below 2 Hz
 
 
 def vehicle_found(now: Facts) -> bool:
@@ -44,6 +46,70 @@ def in_failsafe(now: Facts) -> bool:
 def other_sender(now: Facts) -> bool:
     """Another program sends setpoints on the link, or uses our ids."""
     return now.other_sender and not now.limits.begin_with_other_sender
+
+
+def other_vehicle(now: Facts) -> bool:
+    """Several vehicles are heard: which one is meant?"""
+    return now.other_vehicle
+
+
+def usable(now: Facts) -> bool:
+    """Nothing speaks against flying it."""
+    return now.ready and not now.misconfigured
+
+
+def can_take_over(now: Facts) -> bool:
+    """It flies in the mode of setpoints, and nobody else has it."""
+    return (
+        now.engaged
+        and now.armed
+        and now.in_the_air
+        and not now.failsafe
+        and not other_sender(now)
+        and not silent(now)
+        and not blind(now)
+    )
+
+
+def engaged_by_pilot(now: Facts) -> bool:
+    return now.switched and can_take_over(now) and usable(now)
+
+
+def engaged_but_unfit(now: Facts) -> bool:
+    return now.switched and can_take_over(now) and not usable(now)
+
+
+def started_in_the_air(now: Facts) -> bool:
+    return now.request is Request.START and can_take_over(now) and usable(now)
+
+
+def started_on_the_ground(now: Facts) -> bool:
+    return now.request is Request.START and not now.armed and usable(now)
+
+
+def engaged_too_soon(now: Facts) -> bool:
+    """Switched away and back so fast that a failsafe may have done it."""
+    return now.hasty and can_take_over(now) and now.in_phase_s > LISTENED_S
+
+
+def abandoned(now: Facts) -> bool:
+    """Found in the air, in the mode of setpoints, without anybody who flies it."""
+    alone = not now.other_vehicle
+    return alone and now.unclaimed and can_take_over(now) and now.in_phase_s > LISTENED_S
+
+
+def handed(now: Facts) -> bool:
+    return now.handed
+
+
+def requested(request: Request) -> Guard:
+    """A guard that holds when the ground station has asked for this."""
+
+    def wanted(now: Facts) -> bool:
+        return now.request is request
+
+    wanted.__name__ = f"requested_{request.name.lower()}"
+    return wanted
 
 
 def streamed(now: Facts) -> bool:

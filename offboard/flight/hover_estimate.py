@@ -17,6 +17,7 @@ WINDOW_S, KEPT_S = 0.5, 1.5
 GROUND_M = 0.2  # lower, the ground may carry it
 LEAST_THRUSTS, LEAST_SPEEDS, LEAST_S = 3, 8, 0.25  # in the window
 LEAST_LIFT = 0.3  # of the weight: less shows too little of the thrust
+SETTLED = 0.02  # of a vehicle that has flown by itself for long
 DIFFERENT = 0.1  # of the hover thrust: a smaller difference is left to the observer
 
 
@@ -37,6 +38,11 @@ class HoverEstimate:
             self._speeds.clear()
             return
         _append(self._speeds, time_s, down_mps)
+
+    def thrust(self, time_s: float) -> float | None:
+        """Mean of the thrust that was reported in the WINDOW_S before `time_s`; None without."""
+        thrusts = _within(self._thrusts, time_s - WINDOW_S, time_s)
+        return float(np.mean(thrusts[:, 1])) if len(thrusts) else None
 
     def hover_thrust(self, vehicle: Vehicle, time_s: float) -> float | None:
         """The normalised thrust that holds the weight, from the WINDOW_S before `time_s`; None if
@@ -59,10 +65,10 @@ class HoverEstimate:
         return share if HOVER_THRUST_LIMITS[0] <= share <= HOVER_THRUST_LIMITS[1] else None
 
 
-def differs(hover_thrust: float, vehicle: Vehicle) -> bool:
+def differs(hover_thrust: float, vehicle: Vehicle, least: float = DIFFERENT) -> bool:
     """Whether `hover_thrust` is another than `vehicle`'s, by more than the observer should find
     out by itself."""
-    return abs(hover_thrust / vehicle.hover_thrust - 1.0) > DIFFERENT
+    return abs(hover_thrust / vehicle.hover_thrust - 1.0) > least
 
 
 def _append(samples: deque[tuple[float, float]], time_s: float, value: float) -> None:

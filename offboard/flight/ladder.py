@@ -19,7 +19,7 @@ STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
 
 
 @dataclass(frozen=True, slots=True)
-class Row:
+class LadderRow:
     """`rung` is taken when `exceeded` has held for `delay_s`. The names in braces in `reason` are
     keys of `facts.figures`. `meaning` and `limit` are for the documentation."""
 
@@ -33,7 +33,7 @@ class Row:
 
 
 ROWS = (
-    Row(
+    LadderRow(
         "authority",
         "age of the newest report of the mode",
         "2.5 s",
@@ -42,7 +42,7 @@ ROWS = (
         Rung.SILENCE,
         "no report of the mode for {authority_age_s:.1f} s: another may control the vehicle",
     ),
-    Row(
+    LadderRow(
         "silence",
         "host time without position and attitude",
         "limits.silence_s",
@@ -51,7 +51,7 @@ ROWS = (
         Rung.LAND,
         "no telemetry for {silence_s:.1f} s",
     ),
-    Row(
+    LadderRow(
         "blind",
         "age of the older of position and attitude",
         "limits.blind_s",
@@ -60,7 +60,7 @@ ROWS = (
         Rung.LAND,
         "no {blind_to} for {blind_s:.1f} s",
     ),
-    Row(
+    LadderRow(
         "age",
         "age of the newest telemetry beyond the known delay of the link",
         "limits.setpoint_age_s",
@@ -69,7 +69,7 @@ ROWS = (
         Rung.LEVEL,
         "telemetry is {telemetry_age_s:.2f} s old",
     ),
-    Row(
+    LadderRow(
         "link",
         "growth of the link's delay since take-off (TIMESYNC), or the age of telemetry",
         "limits.link_growth_s, limits.setpoint_age_s",
@@ -81,7 +81,7 @@ ROWS = (
         Rung.HOLD,
         "the delay of the link has grown by {link_growth_s:.2f} s",
     ),
-    Row(
+    LadderRow(
         "decision",
         "a decision failed, came too late, or was not fit to be sent",
         "one",
@@ -90,7 +90,7 @@ ROWS = (
         Rung.LEVEL,
         "decision missed: {failure}",
     ),
-    Row(
+    LadderRow(
         "decisions",
         "decisions missed in a row",
         "limits.missed_decisions",
@@ -99,7 +99,7 @@ ROWS = (
         Rung.LAND,
         "the controller failed: {failure}",
     ),
-    Row(
+    LadderRow(
         "tilt",
         "tilt of the vehicle",
         "limits.tilt_rad",
@@ -108,16 +108,16 @@ ROWS = (
         Rung.LAND,
         "tilt {tilt_deg:.0f} deg",
     ),
-    Row(
+    LadderRow(
         "tilt error",
         "angle between the thrust direction and the nearest of the newest commands",
         "limits.tilt_error_rad",
         lambda now: now.tilt_error_rad > now.limits.tilt_error_rad,
         0.5,
         Rung.LAND,
-        "the attitude is {tilt_error_deg:.0f} deg away from every recent command",
+        "the attitude is {tilt_error_deg:.0f} deg away from every recent command{companion}",
     ),
-    Row(
+    LadderRow(
         "position error",
         "distance from the reference",
         "limits.position_error_m",
@@ -126,7 +126,7 @@ ROWS = (
         Rung.LAND,
         "{position_error_m:.1f} m from the reference (limit {position_error_limit_m:.1f} m)",
     ),
-    Row(
+    LadderRow(
         "prediction",
         "distance from the position that the decision before predicted",
         "limits.prediction_error_m",
@@ -135,7 +135,16 @@ ROWS = (
         Rung.HOLD,
         "{prediction_error_m:.1f} m from the predicted position",
     ),
-    Row(
+    LadderRow(
+        "estimator",
+        "jumps of the reported position in the last 10 s",
+        "limits.position_jump_m",
+        lambda now: now.position_jump_m > now.limits.position_jump_m,
+        0.0,
+        Rung.HOLD,
+        "the estimated position jumped by {position_jump_m:.1f} m",
+    ),
+    LadderRow(
         "volume",
         "height and distance from the take-off point",
         "limits.ceiling_m, limits.radius_m",
@@ -144,7 +153,7 @@ ROWS = (
         Rung.LAND,
         "{height_m:.0f} m above and {distance_m:.0f} m from the take-off point",
     ),
-    Row(
+    LadderRow(
         "battery",
         "remaining charge",
         "limits.battery",
@@ -153,7 +162,7 @@ ROWS = (
         Rung.LAND,
         "the battery holds {battery_percent:.0f} %",
     ),
-    Row(
+    LadderRow(
         "second sender",
         "another program sends setpoints or uses our ids on this link",
         "one frame",
@@ -162,7 +171,7 @@ ROWS = (
         Rung.HOLD,
         "another program controls the vehicle on this link, too: {other_sender}",
     ),
-    Row(
+    LadderRow(
         "clock",
         "jump of the vehicle's clock",
         "0.5 s",
@@ -171,7 +180,7 @@ ROWS = (
         Rung.LAND,
         "the clock of the vehicle jumped by {clock_jump_s:.1f} s",
     ),
-    Row(
+    LadderRow(
         "contradiction",
         "identified constants out of bounds",
         "BOUNDS of identification",
@@ -189,7 +198,12 @@ class Ladder:
     def __init__(self) -> None:
         self._held_s: Mapping[str, float] = {}
         self._stepped_s: float | None = None
-        self.worst: Row | None = None
+        self.worst: LadderRow | None = None
+
+    @property
+    def held_s(self) -> Mapping[str, float]:
+        """For how long each condition has held, by the name of its row."""
+        return self._held_s
 
     @property
     def rung(self) -> Rung:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Hashable
+from collections.abc import Hashable, Iterable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,7 +14,16 @@ OTHERS = "other addresses"
 
 
 class LinkError(UserError):
-    """A link that cannot be opened: one sentence for the user."""
+    """A link that cannot be opened: one sentence for the user. `is_usage`: the address is wrong;
+    otherwise it may be opened another time."""
+
+    is_usage = True
+
+
+class LinkUnavailable(LinkError):
+    """A link whose address is right and that cannot be opened now."""
+
+    is_usage = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,38 +40,54 @@ class Chunk:
 
 
 class Strangers:
-    """Counts datagrams from other addresses than the vehicle's."""
+    """Counts what other addresses than the vehicle's send, and keeps what the link has to tell."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
         self._news: list[str] = []
+        self._overheard: list[bytes] = []
 
     @property
     def total(self) -> int:
         return self._counts.total()
 
-    def count(self, sender: str, number: int) -> None:
-        """Add `number` ignored datagrams of `sender`."""
+    def count(self, sender: str, number: int, noun: str = "datagram") -> None:
+        """Add `number` ignored datagrams, or connections, of `sender`."""
         if sender not in self._counts and len(self._counts) >= NAMED_MAX:
             sender = OTHERS
         before = self._counts[sender]
         self._counts[sender] += number
         if len(str(before + number)) > len(str(before)) or not before:
-            count = f"{before + number:,} datagram{'s' if before + number > 1 else ''}"
+            count = f"{before + number:,} {noun}{'s' if before + number > 1 else ''}"
             verb = "were" if before + number > 1 else "was"
             self._news.append(f"{count} from {sender}, which is not the vehicle, {verb} ignored")
+
+    def tell(self, sentence: str) -> None:
+        """Something else that the user should know of the link."""
+        self._news.append(sentence)
 
     def news(self) -> list[str]:
         """Sentences since the last call, on the 1st, 10th, 100th ... datagram of a sender."""
         news, self._news = self._news, []
         return news
 
+    def keep(self, datagrams: Iterable[bytes]) -> None:
+        """Some of the datagrams, until the next call."""
+        self._overheard = list(datagrams)
+
+    def overheard(self) -> list[bytes]:
+        """The datagrams that were kept since the last call."""
+        overheard, self._overheard = self._overheard, []
+        return overheard
+
 
 class Link(Protocol):
     """Non-blocking byte channel. `is_stream`: received chunks may end within a frame.
-    `capacity_bytes_ps` of each direction; None: unknown."""
+    `capacity_bytes_ps` of each direction; None: unknown. `opened` changes when the descriptors
+    do."""
 
     is_stream: bool
+    opened: int
     capacity_bytes_ps: float | None
     strangers: Strangers
 

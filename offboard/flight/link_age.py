@@ -8,7 +8,8 @@ Two measures, on the vehicle's clock:
   of both directions together. The clock of this computer and the way of the reply do not matter.
 - `VehicleClock`, by the arrival of telemetry: the vehicle time now, as far as the least delayed
   telemetry of the last seconds shows. Newest telemetry that is older has been delayed more than
-  usual, by a backlog or a stop of this process.
+  usual, by a backlog or a stop of this process. The replies to TIMESYNC bound it from above, so
+  that a simulator slower than real time is not taken for a late link.
 
 `LinkGrowth` keeps what both show the link to have added since take-off.
 """
@@ -24,11 +25,14 @@ from offboard.mavlink.events import TimesyncReply
 from offboard.mavlink.outgoing import Timesync
 
 REPLIES_MIN, REPLIES_MAX, REPLIES_NEWEST = 5, 40, 5
+REPLIES_MEASURED = 20  # two seconds: a link that saturates has shown it
 DELAY_MAX_S = 10.0  # a larger difference belongs to another clock
+REQUESTS_MAX = 100  # of DELAY_MAX_S
 NORMAL = 1.4826  # standard deviation of a normal distribution / median absolute deviation
 WINDOW_S, BIN_S = 5.0, 0.1
 RATE_OVER_S = 1.0  # the least stretch from which the rate of the clock is taken
 REAL_TIME = 0.05  # a rate that differs from 1 by less is that of a vehicle in real time
+BOUNDS_S = 1.0  # a reply to an older request bounds the vehicle time no more
 LEAST_GROWTH_S, STEADY_S = 0.01, 5.0  # see `LinkGrowth`
 JUMP_S = 0.5  # a stamp further ahead of the vehicle time now shows a jump of the clock
 
@@ -38,7 +42,8 @@ class VehicleClock:
 
     The rate is 1 for a real vehicle; that of a simulator in faster or slower time is measured until
     `settle`, and from then on followed only if it is not 1: a delay that grows must not look like a
-    slower clock.
+    slower clock. What a reply to TIMESYNC shows does not depend on the delay: when we asked, the
+    vehicle's clock was at most at the time in the reply.
     """
 
     def __init__(self) -> None:
@@ -47,6 +52,7 @@ class VehicleClock:
     def reset(self) -> None:
         """The vehicle was rebooted."""
         self._seen: deque[tuple[float, float]] = deque()  # stamp, arrival: the freshest of a bin
+        self._bounds: deque[tuple[float, float]] = deque(maxlen=REPLIES_MAX)  # vehicle, host time
         self._bin_s = 0.0  # arrival of the first of the newest bin
         self._settled = False
         self._rate = 1.0
@@ -63,6 +69,7 @@ class VehicleClock:
         seen = self._seen
         if seen and ahead_s > JUMP_S:
             self.jumped_s += ahead_s
+            self._bounds.clear()
         if seen and arrived_s - self._bin_s < BIN_S:
             if ahead_s > 0.0:
                 seen[-1] = stamp_s, arrived_s
@@ -72,6 +79,11 @@ class VehicleClock:
         while seen[0][1] < arrived_s - WINDOW_S:
             seen.popleft()
         self._measure_rate()
+
+    def on_reply(self, vehicle_s: float, asked_s: float) -> None:
+        """A request that we sent at host time `asked_s` or later arrived at vehicle time
+        `vehicle_s`."""
+        self._bounds.append((vehicle_s, asked_s))
 
     def _measure_rate(self) -> None:
         if self._settled and self._rate == 1.0:
@@ -84,7 +96,9 @@ class VehicleClock:
     def now_s(self, host_s: float) -> float:
         """Vehicle time at host time `host_s`; -inf before the first telemetry."""
         rate = self._rate
-        return max((s + rate * (host_s - a) for s, a in self._seen), default=-math.inf)
+        shown_s = max((s + rate * (host_s - a) for s, a in self._seen), default=-math.inf)
+        recent = ((v, host_s - a) for v, a in self._bounds if host_s - a <= BOUNDS_S)
+        return min(shown_s, min((v + rate * since_s for v, since_s in recent), default=math.inf))
 
     def age_s(self, stamp_s: float, host_s: float) -> float:
         """Age at `host_s` of telemetry stamped `stamp_s`, beyond the least delay of the window."""
@@ -95,30 +109,38 @@ class LinkDelay:
     """Median and spread of the newest delays, and what has been added since `settle`."""
 
     def __init__(self) -> None:
-        self._requests: deque[int] = deque(maxlen=REPLIES_MAX)
+        self._requests: deque[tuple[int, float]] = deque(maxlen=REQUESTS_MAX)  # ts1, host time
         self._delays_s: deque[float] = deque(maxlen=REPLIES_MAX)
+        self._began_s = math.inf  # host time of the first request
         self._settled_s = math.nan
 
     def reset(self) -> None:
         """Forget all replies: the vehicle's clock has restarted."""
         self._requests.clear()
         self._delays_s.clear()
+        self._began_s = math.inf
         self._settled_s = math.nan
 
-    def request(self, telemetry_s: float) -> Timesync:
-        """The request to send with a setpoint. `telemetry_s`: stamp of the newest telemetry."""
+    def request(self, telemetry_s: float, host_s: float) -> Timesync:
+        """The request to send with a setpoint at host time `host_s`. `telemetry_s`: stamp of the
+        newest telemetry."""
         stamp_ns = round(telemetry_s * 1e9)
-        self._requests.append(stamp_ns)
+        self._requests.append((stamp_ns, host_s))
+        self._began_s = min(self._began_s, host_s)
         return Timesync(0, stamp_ns)
 
-    def on_reply(self, reply: TimesyncReply) -> None:
-        """Evaluate a reply; those to requests of others are ignored."""
-        if reply.request_ns not in self._requests:
-            return
-        self._requests.remove(reply.request_ns)  # a duplicate must not count again
+    def on_reply(self, reply: TimesyncReply) -> float | None:
+        """Evaluate a reply; returns the host time of its request. None for replies to requests of
+        others, and of another clock."""
+        asked = next((each for each in self._requests if each[0] == reply.request_ns), None)
+        if asked is None:
+            return None
+        self._requests.remove(asked)  # a duplicate must not count again
         delay_s = (reply.vehicle_ns - reply.request_ns) * 1e-9
-        if 0.0 <= delay_s <= DELAY_MAX_S:
-            self._delays_s.append(delay_s)
+        if not 0.0 <= delay_s <= DELAY_MAX_S:
+            return None
+        self._delays_s.append(delay_s)
+        return asked[1]
 
     @property
     def estimate(self) -> Estimate | None:
@@ -128,6 +150,12 @@ class LinkDelay:
         median_s = statistics.median(self._delays_s)
         deviation_s = statistics.median(abs(each - median_s) for each in self._delays_s)
         return Estimate(median_s, NORMAL * deviation_s)
+
+    def is_measured(self, host_s: float) -> bool:
+        """Whether the estimate can be relied on at host time `host_s`, or the vehicle answers
+        nothing."""
+        unanswered = not self._delays_s and host_s - self._began_s > DELAY_MAX_S
+        return len(self._delays_s) >= REPLIES_MEASURED or unanswered
 
     def settle(self) -> None:
         """The present delay is what the control law takes into account."""

@@ -8,14 +8,14 @@ from __future__ import annotations
 
 import gc
 import traceback
-from collections.abc import Callable, Hashable
+from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
+from typing import Any, Protocol
 
 from offboard.flight import clock
-from offboard.flight.companion import Companion, Outcome, Output
-from offboard.flight.link import Link
-from offboard.flight.log import FlightLog
-from offboard.flight.phases import BEFORE_FLIGHT, ExitCode
+from offboard.flight.companion import Outcome, Output
+from offboard.flight.link import Chunk, Link
+from offboard.flight.phases import BEFORE_FLIGHT, ExitCode, Phase
 from offboard.flight.sitl import Ending
 from offboard.flight.stop import StopRequests
 from offboard.flight.supervisor import Supervisor
@@ -31,6 +31,37 @@ OWN_FAILSAFE, SUPERVISED = (
 UNGUARDED = "the supervisor ended: nobody lands the vehicle if this process dies"
 
 
+class Flown(Protocol):
+    """What the loop needs of a companion, or of the flights of a service."""
+
+    peer: Hashable | None
+    strangers: int
+
+    @property
+    def phase(self) -> Phase: ...
+    @property
+    def outcome(self) -> Outcome | None: ...
+    def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output: ...
+    def has_ended(self) -> bool: ...
+    def request_stop(self, why: str = ...) -> None: ...
+    def announce(self, sentence: str) -> None: ...
+    def overhear(self, datagrams: Sequence[bytes]) -> None: ...
+    def on_dropped(self, frames: int) -> None: ...
+
+
+class Log(Protocol):
+    """What the loop needs of a log; nothing of it waits but `close`."""
+
+    @property
+    def problem(self) -> str: ...
+    @property
+    def lost(self) -> int: ...
+    @property
+    def descriptor(self) -> int: ...
+    def write(self, unix_us: int, frame: bytes) -> None: ...
+    def close(self) -> None: ...
+
+
 class Loop:
     """Moves bytes between one link, one companion and one log until the flight ends.
 
@@ -41,12 +72,12 @@ class Loop:
 
     def __init__(
         self,
-        companion: Companion,
+        companion: Flown,
         link: Link,
-        log: FlightLog,
+        log: Log,
         *,
         stops: StopRequests,
-        progress: Callable[[Companion], None],
+        progress: Callable[[Any], None],
         simulator_ended: Callable[[], Ending | None] = lambda: None,
         supervisor: Supervisor | None = None,
         lands_without_log: bool = True,
@@ -90,6 +121,7 @@ class Loop:
         self._deliver(self._companion.turn(chunks, began_s), began_s)
         strangers = self._link.strangers
         self._companion.strangers = strangers.total
+        self._companion.overhear(strangers.overheard())
         for sentence in strangers.news():
             self._companion.announce(sentence)
         self._check_log()
@@ -109,6 +141,7 @@ class Loop:
             else:
                 self._link.send(frame, peer)
         if dropped:
+            self._companion.on_dropped(len(dropped))
             self._companion.announce(f"{len(dropped)} messages dropped: they became too old")
         stamp = clock.unix_us()
         for frame in output.log:
@@ -121,9 +154,9 @@ class Loop:
     # --- the supervisor ---
 
     def _beat(self, output: Output, peer: Hashable) -> None:
-        if self._supervisor is None or output.guard is None:
+        if self._supervisor is None or output.supervised is None:
             return
-        self._supervisor.beat(output.guard, peer, self._link, self._log.descriptor)
+        self._supervisor.beat(output.supervised, peer, self._link, self._log.descriptor)
         if self._supervisor.lost:
             self._warn(UNGUARDED)
 

@@ -10,6 +10,7 @@ import traceback
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import astuple, dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
@@ -23,18 +24,20 @@ from offboard.flight.companion import Companion, Outcome
 from offboard.flight.connection import open_link, open_lockstep_link
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.gate import usable
+from offboard.flight.in_memory import InMemorySimulator
 from offboard.flight.link import Link
 from offboard.flight.log import FlightLog
 from offboard.flight.loop import Loop
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Limits
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
+from offboard.flight.signing_time import SigningTime
 from offboard.flight.sitl import SimulatorProcess
 from offboard.flight.stop import StopRequests
 from offboard.flight.supervisor import Supervisor
-from offboard.flight.udp_link import LockstepLink
 from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
+from offboard.mavlink.signing import Signing
 from offboard.model.command import Command, PositionCommand
 from offboard.model.vehicle import Vehicle
 from offboard.reference.track import Track
@@ -50,11 +53,26 @@ class Bundled:
     """A vehicle of the bundled simulator, in lockstep. `scenario` and `vehicle` None: the defaults
     of the firmware."""
 
-    simulator: SimulatorProcess
+    simulator: SimulatorProcess | InMemorySimulator
     scenario: str | None
     seed: int
     vehicle: str | None = None
     firmware: str = "px4"
+    signing_key: Path | None = None
+
+    def open_link(self) -> Link:
+        """Start the vehicle and return the link to it."""
+        if isinstance(self.simulator, InMemorySimulator):
+            return self.simulator.open_link(
+                firmware=self.firmware,
+                scenario=self.scenario,
+                vehicle=self.vehicle,
+                seed=self.seed,
+                parameters=self._parameters(),
+            )
+        link = open_lockstep_link()
+        self.simulator.launch(self.options(link.port))
+        return link
 
     def options(self, port: int) -> list[str]:
         """Options of the `simulator` command, for a vehicle that sends to our local `port`."""
@@ -64,6 +82,7 @@ class Bundled:
             *("--seed", str(self.seed), "--firmware", self.firmware),
             *(("--scenario", self.scenario) if self.scenario else ()),
             *(("--vehicle", self.vehicle) if self.vehicle else ()),
+            *(("--signing-key", str(self.signing_key.absolute())) if self.signing_key else ()),
             *(f"--param={name}={value:g}" for name, value in self._parameters().items()),
         ]
 
@@ -88,11 +107,12 @@ class FlightParts:
     identify: IdentifySettings | None = None
 
 
-def rehearse(parts: FlightParts, *, keeps_deadline: bool) -> None:
+def rehearse(parts: FlightParts, *, keeps_deadline: bool) -> float:
     """Call every code path of observer and controller, so that nothing is compiled in flight.
 
-    A pause of seconds at the first decision in flight is a crash. Raises DocumentError if the
-    control law fails or, with `keeps_deadline`, if a decision cannot meet the deadline.
+    A pause of seconds at the first decision in flight is a crash. Returns the wall time of the
+    shortest possible decision, measured with `keeps_deadline`. Raises DocumentError if the control
+    law fails or, with `keeps_deadline`, if a decision cannot meet the deadline.
     """
     observer = parts.make_observer()
     reference = Hold((0.0, 0.0, -2.0), 0.1)
@@ -111,10 +131,12 @@ def rehearse(parts: FlightParts, *, keeps_deadline: bool) -> None:
             if isinstance(command, Command):
                 previous = command
                 observer.on_command(time_s, command)
+    least_s = math.nan
     if keeps_deadline:
-        _check_deadline(parts, replace(situation, remaining_s=lambda: 0.0))
+        least_s = _check_deadline(parts, replace(situation, remaining_s=lambda: 0.0))
     parts.track.sample(np.array([0.0, 1.0]))
     parts.controller.reset()
+    return least_s
 
 
 def _decided(controller: Controller, situation: Situation) -> Command | PositionCommand:
@@ -134,8 +156,8 @@ def _decided(controller: Controller, situation: Situation) -> Command | Position
     return command
 
 
-def _check_deadline(parts: FlightParts, cut_short: Situation) -> None:
-    """The shortest possible decision must meet the deadline."""
+def _check_deadline(parts: FlightParts, cut_short: Situation) -> float:
+    """The shortest possible decision must meet the deadline; returns its time."""
     least_s = math.inf
     for _ in range(REHEARSED_DECISIONS):
         began_s = clock.monotonic_s()
@@ -146,6 +168,7 @@ def _check_deadline(parts: FlightParts, cut_short: Situation) -> None:
             f"controller: a decision takes at least {1e3 * least_s:.1f} ms here, longer than "
             f"deadline_s ({1e3 * parts.deadline_s:.1f} ms); plan fewer steps or allow more time"
         )
+    return least_s
 
 
 def fly(
@@ -154,25 +177,31 @@ def fly(
     *,
     connection: str,
     bundled: Bundled | None,
+    system_id: int | None = None,
+    signing_key: bytes | None = None,
     stops: StopRequests,
     progress: Callable[[Companion], None],
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> Outcome:
-    """Fly once over `connection`, or on the `bundled` simulator.
+    """Fly once over `connection`, or on the `bundled` simulator. `system_id`: of the vehicle, where
+    several send; `signing_key`: of MAVLink 2 signing.
 
-    Raises LinkError, DocumentError, SupervisorError or LogError before anything is sent, and
-    KeyboardInterrupt if a stop was requested meanwhile. The log is created last: a flight that
-    cannot begin leaves no directory. `tell` is called with sentences about the preparation.
+    Raises LinkError, DocumentError, SupervisorError, SigningTimeError or LogError before anything
+    is sent, and KeyboardInterrupt if a stop was requested meanwhile. The log is created last: a
+    flight that cannot begin leaves no directory. `tell` is called with sentences about the
+    preparation.
     """
     with ExitStack() as stack:
         log.check()
-        link = open_lockstep_link() if bundled else open_link(connection)
+        link = bundled.open_link() if bundled else open_link(connection)
         stack.callback(link.close)
         if bundled:
-            assert isinstance(link, LockstepLink)
-            bundled.simulator.launch(bundled.options(link.port))
             stack.callback(bundled.simulator.recall)
-        supervisor = None if bundled else stack.enter_context(Supervisor())
+        signing = None
+        if signing_key:  # in lockstep no stamp depends on the clock
+            kept = SigningTime(signing_key)
+            signing = Signing(signing_key) if bundled else stack.enter_context(kept)
+        supervisor = None if bundled else stack.enter_context(Supervisor(signing))
         tell("preparing the controller")
         prepare(tell)
         rehearse(parts, keeps_deadline=bundled is None)
@@ -181,22 +210,19 @@ def fly(
         stops.check()
         stack.enter_context(log)
         observer = parts.make_observer()
-        fuses = isinstance(observer, FusedObserver)
-        session = Session(
-            SessionSettings(
-                component_id=COMPONENT_ID,
-                record_component_id=RECORD_COMPONENT_ID,
-                stream=link.is_stream,
-                capacity_bytes_ps=None if bundled else link.capacity_bytes_ps,
-                lockstep=bundled is not None,
-                sends_first=not (bundled or connection.startswith("udpin")),
-                extra_wanted=POSITIONING_TELEMETRY if fuses else (),
-            )
+        session = session_of(
+            observer,
+            signing,
+            system_id=system_id,
+            stream=link.is_stream,
+            capacity_bytes_ps=None if bundled else link.capacity_bytes_ps,
+            lockstep=bundled is not None,
+            sends_first=not (bundled or connection.startswith("udpin")),
         )
         for piece in manifest.pieces(log.configuration):
             log.begin(clock.unix_us(), session.encode(piece))
         loop = Loop(
-            _companion(parts, session, observer, lockstep=bundled is not None),
+            companion_of(parts, session, observer, clock.monotonic_s),
             link,
             log,
             stops=stops,
@@ -217,10 +243,38 @@ def discard(link: Link) -> None:
             return
 
 
-def _companion(
-    parts: FlightParts, session: Session, observer: Observer, *, lockstep: bool
+def session_of(
+    observer: Observer,
+    signing: Signing | None = None,
+    *,
+    system_id: int | None = None,
+    stream: bool,
+    capacity_bytes_ps: float | None,
+    lockstep: bool,
+    sends_first: bool,
+) -> Session:
+    """The session of a flight with this observer; see `SessionSettings`."""
+    fuses = isinstance(observer, FusedObserver)
+    return Session(
+        SessionSettings(
+            system_id=system_id,
+            component_id=COMPONENT_ID,
+            record_component_id=RECORD_COMPONENT_ID,
+            stream=stream,
+            capacity_bytes_ps=capacity_bytes_ps,
+            lockstep=lockstep,
+            sends_first=sends_first,
+            extra_wanted=POSITIONING_TELEMETRY if fuses else (),
+        ),
+        signing,
+    )
+
+
+def companion_of(
+    parts: FlightParts, session: Session, observer: Observer, stopwatch: Callable[[], float]
 ) -> Companion:
-    limits = parts.limits
+    """The companion of a flight with these parts. `stopwatch` reads host time."""
+    limits, lockstep = parts.limits, session.settings.lockstep
     if lockstep:  # the simulator waits for us: silence only means that the machine is busy
         timeouts = {"connect_s": SITL_TIMEOUT_S, "silence_s": SITL_TIMEOUT_S}
         limits = limits.model_copy(update=timeouts)
@@ -233,6 +287,6 @@ def _companion(
         limits=limits,
         period_s=parts.period_s,
         deadline_s=None if lockstep else parts.deadline_s,
-        stopwatch=clock.monotonic_s,
+        stopwatch=stopwatch,
         identify=parts.identify,
     )

@@ -18,6 +18,7 @@ from offboard.flight.phases import Phase
 from offboard.identification.adoption import log_record
 from offboard.identification.attitude_fit import unexplained
 from offboard.identification.excitation import LENGTH_S, excited
+from offboard.identification.learned import Learned
 from offboard.identification.trace import Recorder
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import OUT_OF_BOUNDS, VehicleEstimate
@@ -92,6 +93,7 @@ class OnlineIdentification:
         settings: see `IdentifySettings`.
         period_s: control period.
         bandwidth_radps: bandwidth of the controller as configured.
+        learned: what an earlier flight has identified; then no steps are flown.
 
     It is told what arrives and what is sent (`on_...`), and `learn` is called once per tick.
     """
@@ -103,9 +105,11 @@ class OnlineIdentification:
         *,
         period_s: float,
         bandwidth_radps: float,
+        learned: Learned | None = None,
     ) -> None:
         self._file = vehicle
         self._settings = settings
+        self._recalled = learned if settings.online else None
         self._recorder = Recorder()
         self._estimate = VehicleEstimate(
             vehicle,
@@ -121,13 +125,16 @@ class OnlineIdentification:
         """Forget the previous flight."""
         self._recorder.clear()
         self._estimate.reset()
+        if self._recalled:
+            self._estimate.recall(self._recalled)
+        self._link_s = 0.0  # the link's delay when the climb began
         self._time_s = 0.0
         self._climb_s = self._excite_s = self._moving_s = math.nan
         self._rounds = 1
         self._drag_at_s = self._tilt_at_s = self._compared_at_s = -math.inf
         self._in_doubt_from_s = -math.inf
         self._contradictions = 0  # in a row
-        self._identified = False
+        self._identified = self._recalled is not None
         self._gave_up = False
         self._left_box = False
         self._limit_radps = self._estimate.limit_radps  # as adopted
@@ -164,7 +171,12 @@ class OnlineIdentification:
 
     def on_link_delay(self, link: Estimate | None) -> None:
         """The link's delay, measured before lift-off; None if the vehicle did not answer."""
-        if link is not None:
+        if link is None:
+            return
+        self._link_s = link.value
+        if self._recalled:
+            self._sentences += self._estimate.apply_link_change(self._recalled, link)
+        else:
             self._sentences += self._estimate.apply_link_delay(link)
 
     def on_hover_thrust(self, hover_thrust: float) -> None:
@@ -195,7 +207,17 @@ class OnlineIdentification:
     @property
     def wants_excitation(self) -> bool:
         """Whether the flight should go through the phase EXCITE."""
-        return self._settings.online and self._settings.excite
+        return self._settings.online and self._settings.excite and not self._identified
+
+    @property
+    def learned(self) -> Learned | None:
+        """What the next flight of this vehicle may begin with; None if nothing is known."""
+        return self._estimate.learned(self._link_s) if self._identified else None
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether telemetry has contradicted the constants in use."""
+        return self._estimate.contradicted
 
     @property
     def cautious_bandwidth_radps(self) -> float:

@@ -16,7 +16,7 @@ from offboard.flight.gate import LEVEL, Clearance, Refused, admit
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.phases import Phase
 from offboard.flight.state import FlightState
-from offboard.flight.supervisor import Guard
+from offboard.flight.supervisor import Supervised
 from offboard.flight.vehicle_state import GOOD_RESULTS
 from offboard.mavlink.outgoing import (
     AttitudeTarget,
@@ -40,7 +40,7 @@ class Output:
 
     send: tuple[bytes, ...] = ()
     log: tuple[bytes, ...] = ()
-    guard: Guard | None = None  # for the supervisor; None before the vehicle is found
+    supervised: Supervised | None = None  # for the supervisor; None before the vehicle is found
 
 
 class Outbox:
@@ -176,6 +176,11 @@ class Outbox:
         self.announced.append(sentence)
         self._send_text(INFO, title + sentence)
 
+    def announce_once(self, sentence: str) -> None:
+        """`announce`, unless it has been."""
+        if sentence not in self.announced:
+            self.announce(sentence)
+
     def warn(self, sentence: str) -> None:
         """Report to the ground station and the log."""
         self._send_text(WARNING, sentence)
@@ -189,9 +194,9 @@ class Outbox:
         """Queue messages to send and to log; records are only logged."""
         self._queue.extend(messages)
 
-    def flush(self, received: list[bytes], guard: Guard | None = None) -> Output:
+    def flush(self, received: list[bytes], supervised: Supervised | None = None) -> Output:
         """Encode the queue. In the log, the frames `received` come first."""
         queue, self._queue = self._queue, []  # empty, should one of them not be encodable
         frames = [(message, self._session.encode(message)) for message in queue]
         send = tuple(frame for message, frame in frames if not isinstance(message, Record))
-        return Output(send, (*received, *(frame for _, frame in frames)), guard)
+        return Output(send, (*received, *(frame for _, frame in frames)), supervised)

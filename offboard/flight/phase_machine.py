@@ -10,13 +10,16 @@ from offboard.estimation.observer import Observer
 from offboard.flight import assessment
 from offboard.flight.decide import Decider
 from offboard.flight.facts import Facts
-from offboard.flight.hover_estimate import differs
+from offboard.flight.hover_estimate import DIFFERENT, SETTLED, differs
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.outbox import Outbox
-from offboard.flight.phases import BEFORE_FLIGHT, FLYING, ExitCode, Phase
+from offboard.flight.phases import BEFORE_FLIGHT, FLYING, WAITING, ExitCode, Phase
+from offboard.flight.pilot_switch import PilotSwitch
+from offboard.flight.requests import Request
 from offboard.flight.state import FlightState, Outcome
 from offboard.flight.touchdown import Touchdown
-from offboard.flight.transitions import Row, next_row
+from offboard.flight.transitions import Row
+from offboard.mavlink.events import LocalPosition
 from offboard.mavlink.session import Session
 
 
@@ -43,18 +46,20 @@ class PhaseMachine:
     def advance(self) -> None:
         """Make every transition whose guard holds."""
         while not self._state.has_ended:
-            now = self._facts()
-            row = next_row(self._state.phase, now)
+            now = self.facts()
+            row = self._state.programme.next_row(self._state.phase, now)
             if row is None:
-                return
+                break
             self._enter(row, row.reason.format(**self._figures(now)))
+        self._state.request = Request.NONE
 
     def on_reboot(self) -> None:
         """The vehicle was rebooted: this ends the flight, except while telemetry is awaited."""
         self._state.rebooted = self._state.phase not in (Phase.CONNECT, Phase.HEALTH)
+        self._state.pilot = PilotSwitch(unclaimed=self._state.programme.serves)
         self.advance()
 
-    def _facts(self) -> Facts:
+    def facts(self) -> Facts:
         """The facts of this moment, with the rung of the ladder that they lead to."""
         state = self._state
         now = assessment.facts(state, self._session, self._observer, self._identification)
@@ -72,6 +77,7 @@ class PhaseMachine:
         state = self._state
         self._conclude(row, reason)
         state.vehicle.clear_messages()
+        state.request = Request.NONE
         state.phase = row.target
         state.began_s = state.now_s
         self._outbox.announce(f"{row.target.value}: {reason}", title="offboard: ")
@@ -82,14 +88,22 @@ class PhaseMachine:
             if row.target is Phase.CLIMB:
                 self._identification.on_link_delay(state.link.estimate)
             self._identification.on_phase(row.target, state.time_s)
+        if row.source in WAITING and row.target in FLYING and state.authority:
+            state.authority.ask()  # it shows the mode already
         if row.target is Phase.ENGAGE:
             self._begin_engaging()
+        elif row.target is Phase.STANDBY:
+            state.pilot.engaged = False  # the pilot switched to one that was not ready
         elif row.target is Phase.TAKEOFF:
             self._begin_takeoff()
         elif row.target is Phase.CLIMB:
-            self._begin_climb(in_the_air=row.source is Phase.ENGAGE)
+            self._begin_climb(row.source)
         elif row.target is Phase.JOIN:
             state.plan.start_track(state.time_s)
+        elif row.target is Phase.PAUSE:
+            state.plan.pause(state.time_s)
+        elif row.source is Phase.PAUSE and row.target is Phase.TRACK:
+            state.plan.resume(state.time_s)
         elif row.target is Phase.LAND:
             state.touchdown = Touchdown(state.takeoff_ned_m)
 
@@ -114,17 +128,27 @@ class PhaseMachine:
     def _begin_takeoff(self) -> None:
         position = self._state.vehicle.position
         assert position is not None
-        self._state.takeoff_ned_m = self._state.plan.origin_ned_m = position.position_ned_m
+        state = self._state
+        state.takeoff_ned_m = state.plan.origin_ned_m = position.position_ned_m
+        state.home_ned_m = state.takeoff_ned_m
 
-    def _begin_climb(self, *, in_the_air: bool) -> None:
+    def _begin_climb(self, source: Phase) -> None:
+        """To the start of the reference, after the take-off, in the air, or once more."""
         state = self._state
         position = state.vehicle.position
         assert position is not None
-        if in_the_air:  # take-off point unknown: below the vehicle, at the height of its last rest
-            down_m = state.contact.rest_down_m
-            state.plan.origin_ned_m = (*position.position_ned_m[:2], down_m)
+        flown = state.plan.sample(state.time_s)
+        if flown is not None:  # from where the reference is: the vehicle follows it
+            course_rad = float(flown.course_rad)
+            state.plan.start_climb(
+                state.time_s, flown.position_ned_m, flown.velocity_ned_mps, course_rad
+            )
+            return
+        in_the_air = source is not Phase.TAKEOFF
+        if in_the_air:
+            self._place_reference(position)
         if in_the_air or state.takes_off_by_command:
-            self._adopt_hover_thrust()
+            self._adopt_hover_thrust(SETTLED if source is Phase.STANDBY else DIFFERENT)
         self._observer.freeze(False)
         self._decider.begin()
         state.plan.start_climb(
@@ -134,11 +158,28 @@ class PhaseMachine:
             state.vehicle.course_rad,
         )
 
-    def _adopt_hover_thrust(self) -> None:
+    def _place_reference(self, position: LocalPosition) -> None:
+        """Place the reference of a vehicle that was found in the air. A take-off point that was not
+        seen is below it, at the height of its last rest."""
+        state, down_m = self._state, self._state.contact.rest_down_m
+        state.home_ned_m = (*position.position_ned_m[:2], down_m)
+        if self._state.programme.anchor == "here":
+            above_m = state.plan.place_start(position.position_ned_m, down_m)
+            if above_m:
+                self._outbox.announce(
+                    f"the reference starts {above_m:.1f} m above the vehicle: from here it would "
+                    "touch the ground"
+                )
+        elif self._state.programme.serves:
+            state.plan.origin_ned_m = state.contact.rest_ned_m
+        else:
+            state.plan.origin_ned_m = state.home_ned_m
+
+    def _adopt_hover_thrust(self, least: float = DIFFERENT) -> None:
         """Fly with the hover thrust that the autopilot's own flight shows, if it is another."""
         state, model = self._state, self._state.model
         shown = state.hover.hover_thrust(model, state.time_s)
-        if shown is None or not differs(shown, model):
+        if shown is None or not differs(shown, model, least):
             return
         state.model = model.model_copy(update={"hover_thrust": shown})
         self._observer.adopt(state.model)

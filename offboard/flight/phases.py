@@ -12,10 +12,12 @@ from offboard.documents.parameters import Parameters
 
 
 class Phase(Enum):
-    """In the order of a flight; the last three end it."""
+    """In the order of a flight; the last three end it. STANDBY, PAUSE and HAND_BACK occur in
+    flights of the service alone (`programme`)."""
 
     CONNECT = "connect"
     HEALTH = "health"
+    STANDBY = "standby"
     STREAM = "stream"
     ENGAGE = "engage"
     ARM = "arm"
@@ -24,7 +26,9 @@ class Phase(Enum):
     EXCITE = "excite"
     JOIN = "join"
     TRACK = "track"
+    PAUSE = "pause"
     HOVER = "hover"
+    HAND_BACK = "hand back"
     HOLD = "hold"
     LAND = "land"
     STAND_DOWN = "stand down"
@@ -62,11 +66,16 @@ PHASE_CODES: Mapping[Phase, int] = {
     Phase.EXCITE: 14,
     Phase.STAND_DOWN: 15,
     Phase.HOLD: 16,
+    Phase.STANDBY: 17,
+    Phase.PAUSE: 18,
+    Phase.HAND_BACK: 19,
 }
 ENDS = frozenset({Phase.DISARMED, Phase.YIELDED, Phase.FAILED})
-BEFORE_FLIGHT = frozenset({Phase.CONNECT, Phase.HEALTH, Phase.STREAM, Phase.ENGAGE, Phase.ARM})
-TRACKING = frozenset({Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.HOVER})
-FLYING = TRACKING | {Phase.TAKEOFF, Phase.HOLD}  # phases in which the ladder is stepped
+WAITING = frozenset({Phase.CONNECT, Phase.HEALTH, Phase.STANDBY})
+BEFORE_FLIGHT = WAITING | {Phase.STREAM, Phase.ENGAGE, Phase.ARM}
+TRACKING = frozenset({Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.PAUSE, Phase.HOVER})
+# phases in which the ladder is stepped
+FLYING = TRACKING | {Phase.TAKEOFF, Phase.HAND_BACK, Phase.HOLD}
 
 
 class ExitCode:
@@ -101,6 +110,7 @@ class Limits(Parameters):
     late_s: float = Field(default=90.0, gt=0, le=600)  # after the planned end of the climb
     excite_s: float = Field(default=30.0, gt=5, le=600)
     hold_s: float = Field(default=2.0, ge=0.5, le=60)  # from hold to land
+    hand_back_s: float = Field(default=3.0, ge=1, le=60)  # from the request to hold, to land
     land_s: float = Field(default=90.0, gt=0, le=600)
     silence_s: float = Field(default=1.0, ge=0.2, le=60)  # no telemetry
     blind_s: float = Field(default=0.5, ge=0.15, le=10)  # no position, or no attitude
@@ -108,6 +118,7 @@ class Limits(Parameters):
     link_growth_s: float = Field(default=0.3, gt=0, le=2)  # of the link's delay since take-off
     missed_decisions: int = Field(default=3, ge=1, le=100)  # in a row
     position_error_m: float = Field(default=5.0, gt=0.1, le=100)
+    position_jump_m: float = Field(default=2.0, gt=0.3, le=100)  # resets of the estimator in 10 s
     prediction_error_m: float = Field(default=2.0, gt=0.1, le=100)  # of the decision before
     tilt_rad: float = Field(default=1.3, gt=0.2, le=1.5)
     tilt_error_rad: float = Field(default=0.5, gt=0.1, le=3.2)  # from every recent command

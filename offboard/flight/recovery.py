@@ -2,7 +2,8 @@
 
 Hold, and after some seconds land. Both are asked for only while the vehicle shows a mode that is
 ours or that we asked for, and at most once for each report of the mode. Any other mode is the
-decision of a pilot or of the vehicle's own failsafe, and final.
+decision of a pilot or of the vehicle's own failsafe, and final. One that is reported just after a
+request may have been left for it: the next report decides.
 """
 
 from __future__ import annotations
@@ -71,9 +72,11 @@ class Recovery:
         """Note when it holds, and when this is over."""
         holds = self._mode == self._dialect.hold_mode
         ours = self._mode in (None, self._dialect.engage_mode, self._dialect.land_mode)
+        ours = ours or (holds and (self._holding or self._requests > 0))
+        crossed = 0.0 <= self._reported_s - self._asked_s < REPEAT_S  # the request on its way
         if not self._armed:
             self.ended = "the vehicle is disarmed"
-        elif not (ours or (holds and (self._holding or self._requests))):
+        elif not (ours or crossed):
             self.ended = f"the vehicle shows {self._mode}: its pilot or its failsafe has it"
         elif now_s - self._began_s > LONGEST_S:
             self.ended = f"not landed after {LONGEST_S:.0f} s"

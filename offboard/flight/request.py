@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from offboard.documents.reading import DocumentError
+from offboard.documents.signing_key import read_key
 from offboard.estimation.fusion import observer_of
 from offboard.flight.companion import Companion, Outcome
 from offboard.flight.configuration import (
@@ -18,6 +19,7 @@ from offboard.flight.configuration import (
     load,
     read_part,
 )
+from offboard.flight.in_memory import InMemorySimulator
 from offboard.flight.log import FlightLog
 from offboard.flight.one_flight import Bundled, FlightParts, fly
 from offboard.flight.sitl import OWN_VEHICLES, SimulatorProcess, check_scenario_named
@@ -31,6 +33,7 @@ class FlightRequest:
     `choices` replaces "vehicle", "controller" or "reference" of `config` by a name or a file;
     `assignments` are `key.path=value`. `sitl` flies the bundled simulator with `firmware`,
     `scenario` and `sim_vehicle` (None: its default) instead of the vehicle at `connection`.
+    `system_id` is that of the vehicle, where several send; `signing_key` a key file.
     """
 
     directory: Path
@@ -43,6 +46,8 @@ class FlightRequest:
     firmware: str = "px4"
     scenario: str | None = None
     sim_vehicle: str | None = None
+    system_id: int | None = None
+    signing_key: Path | None = None
 
     def resolve(self) -> FlightConfig:
         """The validated configuration. Raises DocumentError."""
@@ -87,7 +92,7 @@ def fly_request(
     request: FlightRequest,
     progress: Callable[[Companion], None] = lambda companion: None,
     tell: Callable[[str], None] = lambda sentence: None,
-    simulator: SimulatorProcess | None = None,
+    simulator: SimulatorProcess | InMemorySimulator | None = None,
     stops: StopRequests | None = None,
 ) -> Outcome:
     """Fly one flight and log it.
@@ -98,11 +103,13 @@ def fly_request(
     Example: `fly_request(FlightRequest(Path("flights/1"), sitl=True)).exit_code` is 0 if the flight
     was flown and landed.
 
-    Raises DocumentError, LinkError, LogError or KeyboardInterrupt, all before anything is sent.
+    Raises DocumentError, KeyFileError, SigningTimeError, LinkError, LogError or KeyboardInterrupt,
+    all before anything is sent.
     """
     with ExitStack() as stack:
         stops = stops or stack.enter_context(StopRequests())
         config = request.resolve()
+        key = read_key(request.signing_key) if request.signing_key else None
         bundled = None
         if request.sitl:
             bundled = Bundled(
@@ -111,12 +118,15 @@ def fly_request(
                 config.seed,
                 request.sim_vehicle,
                 request.firmware,
+                request.signing_key,
             )
         return fly(
             build_parts(config),
             FlightLog(request.directory, dump(config), real_time=not request.sitl),
             connection=request.connection,
             bundled=bundled,
+            system_id=request.system_id,
+            signing_key=key,
             stops=stops,
             progress=progress,
             tell=tell,

@@ -16,7 +16,11 @@ from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.ladder import Ladder
 from offboard.flight.link_age import LinkDelay, LinkGrowth, VehicleClock
 from offboard.flight.phases import ENDS, Limits, Phase
+from offboard.flight.pilot_switch import PilotSwitch
+from offboard.flight.position_jumps import PositionJumps
+from offboard.flight.programme import FLY, Programme
 from offboard.flight.readiness import Readiness
+from offboard.flight.requests import Request
 from offboard.flight.touchdown import Touchdown
 from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.dialects.base import Dialect, Takeoff
@@ -46,15 +50,19 @@ class FlightState:
     limits: Limits
     plan: FlightPlan
     model: Vehicle
+    programme: Programme = FLY
     vehicle: VehicleState = field(default_factory=VehicleState)
     clock: VehicleClock = field(default_factory=VehicleClock)
     link: LinkDelay = field(default_factory=LinkDelay)
     growth: LinkGrowth = field(default_factory=LinkGrowth)
     hover: HoverEstimate = field(default_factory=HoverEstimate)
+    jumps: PositionJumps = field(default_factory=PositionJumps)
     readiness: Readiness = field(default_factory=Readiness)
     ladder: Ladder = field(default_factory=Ladder)
     contact: GroundContact = field(init=False)
+    pilot: PilotSwitch = field(default_factory=PilotSwitch)
     takeoff_ned_m: Triple | None = None  # None for a vehicle that was found in the air
+    home_ned_m: Triple = (0.0, 0.0, 0.0)  # the ground where the flight began
     touchdown: Touchdown | None = None  # of the landing
     dialect: Dialect | None = None  # with the authority, once the vehicle was found
     authority: Authority | None = None
@@ -65,6 +73,7 @@ class FlightState:
     host_s: float = 0.0  # monotonic time of this computer at the present turn
     silence_s: float = 0.0  # host time since the newest telemetry
     rebooted: bool = False
+    request: Request = Request.NONE  # of the ground station, until the next tick
     stop_reason: str = ""  # why the flight shall end; empty while it shall not
     outcome: Outcome | None = None
 
@@ -77,6 +86,38 @@ class FlightState:
 
     def __post_init__(self) -> None:
         self.contact = GroundContact(self.vehicle)
+        self.pilot.unclaimed = self.programme.serves
+
+    def next_flight(
+        self, limits: Limits, plan: FlightPlan, model: Vehicle, programme: Programme
+    ) -> FlightState:
+        """The state of another flight with the same vehicle: what is known of vehicle and link
+        stays. It begins in STANDBY, in HEALTH while the vehicle is not known well enough."""
+        known = self.authority is not None and self.phase not in (Phase.CONNECT, Phase.HEALTH)
+        following = FlightState(
+            limits,
+            plan,
+            model,
+            programme,
+            vehicle=self.vehicle,
+            clock=self.clock,
+            link=self.link,
+            hover=self.hover,
+            readiness=self.readiness,
+            dialect=self.dialect,
+            authority=self.authority.renewed() if self.authority else None,
+            phase=Phase.STANDBY if known else Phase.CONNECT,
+            began_s=self.now_s,
+            now_s=self.now_s,
+            host_s=self.host_s,
+            silence_s=self.silence_s,
+        )
+        following.contact = self.contact
+        following.pilot = PilotSwitch(showed_ours=self.pilot.showed_ours)
+        if not self.has_ended:  # nothing was flown: what the pilot did before counts
+            following.pilot, following.phase = self.pilot, self.phase
+            following.began_s = self.began_s
+        return following
 
     @property
     def in_phase_s(self) -> float:

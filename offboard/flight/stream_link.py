@@ -1,53 +1,151 @@
-"""TCP and serial links: streams of bytes through a file descriptor."""
+"""TCP and serial links: streams of bytes through a file descriptor, renewed when they break.
+
+A broken stream is replaced by the next one that its source gives: `Redial` opens the same address
+again in a thread, `Listener` accepts the next client. Nothing here waits for either.
+"""
 
 from __future__ import annotations
 
 import os
 import select
-import socket
 from collections.abc import Callable, Hashable
 from contextlib import suppress
+from dataclasses import dataclass
+from typing import Protocol
 
 from offboard.flight import clock
-from offboard.flight.link import Chunk, LinkError, Strangers
+from offboard.flight.link import Chunk, Strangers
 
 READ_BYTES = 65536
 BATCH_BYTES = 1 << 20  # of one call
 QUEUED_MAX = 50  # frames
-BITS_OF_A_BYTE = 10  # on a serial line: start, eight bits, stop
 SETPOINTS = frozenset({82, 84, 86})  # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_*
-TCP_NOTSENT_LOWAT = 25  # Linux's option, which the socket module names since Python 3.12
+BROKEN, RENEWED = "the connection broke: connecting again", "connected again"
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """An open connection or port, which does not block."""
+
+    descriptor: int
+    close: Callable[[], None]
+    host: str = ""  # of the other end
+
+
+class Source(Protocol):
+    """Where streams come from. Nothing waits but `wait`."""
+
+    strangers: Strangers
+
+    def seek(self) -> None:
+        """A new stream is needed."""
+        ...
+
+    def offer(self, silent_s: float) -> Stream | None:
+        """A new stream, if there is one. `silent_s`: how long the present one has been silent;
+        infinite without one."""
+        ...
+
+    def wait(self, timeout_s: float) -> None:
+        """Wait at most `timeout_s` for a new stream."""
+        ...
+
+    def keep_to(self, host: str) -> None:
+        """The vehicle is at `host`: take no stream from elsewhere."""
+        ...
+
+    def descriptors(self) -> tuple[int, ...]:
+        """Its own descriptors, with which another process can continue it."""
+        ...
+
+    def close(self) -> None: ...
+
+
+class Nowhere:
+    """No source: a stream that breaks is lost."""
+
+    def __init__(self) -> None:
+        self.strangers = Strangers()
+
+    def seek(self) -> None: ...
+
+    def offer(self, silent_s: float) -> Stream | None:
+        return None
+
+    def wait(self, timeout_s: float) -> None:
+        select.select([], [], [], max(0.0, timeout_s))
+
+    def keep_to(self, host: str) -> None: ...
+
+    def descriptors(self) -> tuple[int, ...]:
+        return ()
+
+    def close(self) -> None: ...
 
 
 class StreamLink:
-    """A stream through `descriptor`, which does not block. Frames are queued while its buffer is
-    full: a new setpoint replaces a queued one, and of too many frames the oldest are dropped."""
+    """`stream`, and after it those of `source`; without it, the first one of `source`. Frames are
+    queued while the buffer is full: a new setpoint replaces a queued one, and of too many frames
+    the oldest are dropped. What was queued for a broken stream is dropped."""
 
     is_stream = True
 
     def __init__(
         self,
-        descriptor: int,
+        stream: Stream | None,
         name: str,
-        close: Callable[[], None],
+        source: Source,
         capacity_bytes_ps: float | None = None,
     ) -> None:
-        self.strangers = Strangers()
         self.capacity_bytes_ps = capacity_bytes_ps
-        self._descriptor = descriptor
+        self.opened = 0  # how often a stream began or broke
+        self.strangers = source.strangers
+        self._stream = stream
         self._name = name
-        self._close = close
-        self._open = True
-        self._empty_s = clock.monotonic_s()  # all that is waiting arrived later
+        self._source = source
+        self._connected = stream is not None  # at any time before
+        self._empty_s = self._heard_s = clock.monotonic_s()  # all that is waiting arrived later
         self._begun = b""
         self._queued: list[bytes] = []
+        if stream is None:
+            source.seek()
+
+    # --- the stream ---
+
+    def _renew(self) -> None:
+        """Take a new stream, if there is one."""
+        silent_s = clock.monotonic_s() - self._heard_s if self._stream else float("inf")
+        stream = self._source.offer(silent_s)
+        if stream is None:
+            return
+        if self._stream:
+            self._drop()
+        if self._connected:
+            self.strangers.tell(RENEWED)
+        self._stream, self._connected = stream, True
+        self._empty_s = self._heard_s = clock.monotonic_s()
+        self.opened += 1
+
+    def _drop(self) -> None:
+        """The stream is broken."""
+        assert self._stream is not None
+        with suppress(OSError):
+            self._stream.close()
+        self._stream, self._begun, self._queued = None, b"", []
+        self.opened += 1
+
+    def _break(self) -> None:
+        self._drop()
+        self.strangers.tell(BROKEN)
+        self._source.seek()
 
     # --- in ---
 
     def receive(self, timeout_s: float) -> list[Chunk]:
+        self._renew()
         self._flush()
-        if not self._open:
-            select.select([], [], [], max(0.0, timeout_s))
+        if self._stream is None:
+            self._source.wait(timeout_s)
             return []
         if not self._readable(0.0) and not self._readable(timeout_s):
             return []
@@ -55,76 +153,72 @@ class StreamLink:
         with suppress(BlockingIOError):
             while len(data) < BATCH_BYTES and self._readable(0.0) and (more := self._read()):
                 data += more
+        if data:
+            self._heard_s = clock.monotonic_s()
         return [Chunk(data, self._name, arrived_s)] if data else []
 
     def _readable(self, timeout_s: float) -> bool:
+        if self._stream is None:
+            return False
         began_s = clock.monotonic_s()
-        readable = bool(select.select([self._descriptor], [], [], max(0.0, timeout_s))[0])
+        awaited = [self._stream.descriptor]
+        readable = bool(select.select(awaited, [], [], max(0.0, timeout_s))[0])
         if not readable:
             self._empty_s = began_s
         return readable
 
     def _read(self) -> bytes:
         """Bytes that are waiting. None although it is readable: closed or unplugged."""
+        assert self._stream is not None
         try:
-            data = os.read(self._descriptor, READ_BYTES)
+            data = os.read(self._stream.descriptor, READ_BYTES)
         except BlockingIOError:
             raise
         except OSError:
             data = b""
-        self._open = bool(data)
+        if not data:
+            self._break()
         return data
 
     # --- out ---
 
     def send(self, data: bytes, peer: Hashable | None) -> None:
+        if self._stream is None:
+            return  # a dead link shows as silence
         if _is_setpoint(data):
             self._queued = [other for other in self._queued if not _is_setpoint(other)]
         self._queued = [*self._queued, data][-QUEUED_MAX:]
         self._flush()
 
     def _flush(self) -> None:
-        """Send as much as possible. A dead link shows as silence."""
-        with suppress(OSError):
-            while self._begun or self._queued:
+        """Send as much as possible."""
+        try:
+            while self._stream and (self._begun or self._queued):
                 if not self._begun:
                     self._begun = self._queued.pop(0)
                 # not pyserial's write, which waits in a busy loop while the buffer is full
-                self._begun = self._begun[os.write(self._descriptor, self._begun) :]
+                self._begun = self._begun[os.write(self._stream.descriptor, self._begun) :]
+        except BlockingIOError:
+            return
+        except OSError:
+            self._break()
 
     # --- the vehicle ---
 
     def follow(self, peer: Hashable) -> None:
-        """A stream has one other end."""
+        if self._stream:
+            self._source.keep_to(self._stream.host)
 
     def descriptors(self) -> tuple[int, ...]:
-        return (self._descriptor,)
+        own = (self._stream.descriptor,) if self._stream else ()
+        return (*self._source.descriptors(), *own)
 
     def close(self) -> None:
-        self._close()
+        if self._stream:
+            self._drop()
+        self._source.close()
 
 
 def _is_setpoint(frame: bytes) -> bool:
     """Whether a MAVLink 2 frame is a setpoint."""
     return int.from_bytes(frame[7:10], "little") in SETPOINTS
-
-
-def tcp_link(host: str, port: int) -> StreamLink:
-    """A connection to a listening autopilot. Raises OSError."""
-    connection = socket.create_connection((host, port), timeout=5.0)
-    connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    connection.setblocking(False)
-    with suppress(OSError):  # queue here, where a setpoint can be replaced
-        connection.setsockopt(socket.IPPROTO_TCP, TCP_NOTSENT_LOWAT, 1)
-    return StreamLink(connection.fileno(), "tcp", connection.close)
-
-
-def serial_link(device: str, baud: int) -> StreamLink:
-    """A serial port, opened by pyserial. Raises LinkError."""
-    import serial
-
-    try:
-        port = serial.Serial(device, baud, timeout=0)
-    except (serial.SerialException, ValueError, OverflowError) as error:
-        raise LinkError(f"serial port {device} at {baud} baud cannot be opened: {error}") from None
-    return StreamLink(port.fileno(), "serial", port.close, baud / BITS_OF_A_BYTE)

@@ -1,8 +1,9 @@
 """The supervisor, as the controller sees it: a process that outlives it.
 
-The loop tells it in every turn whether the vehicle is ours and in the air (`Guard`). When these
-beats stop for `supervisor_process.SILENT_S`, or the controller ends meanwhile, the process takes
-over the link and asks the vehicle to hold, then to land. From then on the controller must not send.
+The loop tells it in every turn whether the vehicle is ours and in the air (`Supervised`). When
+these beats stop for `supervisor_process.SILENT_S`, or the controller ends meanwhile, the process
+takes over the link and asks the vehicle to hold, then to land. From then on the controller must not
+send.
 
 Beats are JSON lines on a socket pair. The descriptors of link and log go along when they change.
 """
@@ -22,10 +23,12 @@ from types import TracebackType
 from offboard.documents.errors import UserError
 from offboard.flight.link import Link
 from offboard.mavlink.events import VehicleFound
+from offboard.mavlink.signing import Signing
 
 START_S = 20.0  # on a busy machine
 END_S = 1.0
 READY = "ready"
+NOT_STARTED = "the supervisor, which lands the vehicle if this process dies, does not start"
 
 
 class SupervisorError(UserError):
@@ -33,7 +36,7 @@ class SupervisorError(UserError):
 
 
 @dataclass(frozen=True, slots=True)
-class Guard:
+class Supervised:
     """What the supervisor must know before it may act: the vehicle, whether it is `ours`, in the
     mode of our setpoints or in one that we asked for, whether it may be `flying`, and whether it
     was asked to hold (`holding`): then this mode is ours, too."""
@@ -45,16 +48,17 @@ class Guard:
 
 
 class Supervisor:
-    """Context manager around the process.
+    """Context manager around the process. With `signing` it continues our signatures.
 
     `lost`: it has ended although the flight goes on, and nobody will take over.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, signing: Signing | None = None) -> None:
         self.lost = False
+        self._signing = signing
         self._received = b""
         self._lines: list[str] = []  # first READY, then why it took over and what it did
-        self._beat: tuple[Guard, Hashable] | None = None
+        self._beat: object = None  # what the newest line says
         self._line = b""
         self._passed: object = None  # the descriptors that it has
 
@@ -62,12 +66,18 @@ class Supervisor:
         self._channel, theirs = socket.socketpair()
         self._channel.setblocking(False)
         with theirs:
-            self._process = subprocess.Popen(
-                [sys.executable, "-m", "offboard.flight.supervisor_process"],
-                stdin=theirs.fileno(),
-                stdout=subprocess.DEVNULL,
-                start_new_session=True,  # signals of the terminal reach only the controller
-            )
+            try:
+                self._process = subprocess.Popen(
+                    [sys.executable, "-m", "offboard.flight.supervisor_process"],
+                    stdin=theirs.fileno(),
+                    stdout=subprocess.DEVNULL,
+                    start_new_session=True,  # signals of the terminal reach only the controller
+                )
+            except OSError as error:  # for example no memory, or too many processes
+                self._channel.close()
+                raise SupervisorError(f"{NOT_STARTED}: {error.strerror}") from None
+        if self._signing:  # not in arguments or environment, which others can read
+            self._channel.send(json.dumps({"key": self._signing.key.hex()}).encode() + b"\n")
         return self
 
     @property
@@ -85,18 +95,22 @@ class Supervisor:
         while not self._lines:
             select.select([self._channel], [], [], START_S)
             if not self._receive():
-                raise SupervisorError(
-                    "the supervisor, which lands the vehicle if this process dies, does not start"
-                )
+                raise SupervisorError(NOT_STARTED)
 
-    def beat(self, guard: Guard, peer: Hashable, link: Link, log_descriptor: int) -> None:
+    def beat(self, vehicle: Supervised, peer: Hashable, link: Link, log_descriptor: int) -> None:
         """Show that the controller lives. The vehicle sends from `peer`. Never waits."""
-        if self._beat != (guard, peer):
-            self._beat = (guard, peer)
-            message = {**asdict(guard), "peer": peer, "stream": link.is_stream}
+        signing = self._signing.state() if self._signing else None
+        if self._beat != (vehicle, peer, signing):
+            self._beat = (vehicle, peer, signing)
+            message = {
+                **asdict(vehicle),
+                "peer": peer,
+                "stream": link.is_stream,
+                "signing": signing,
+            }
             self._line = json.dumps(message).encode() + b"\n"
         descriptors = [*link.descriptors(), log_descriptor]
-        passed = (peer, descriptors)
+        passed = (link.opened, descriptors)
         try:
             socket.send_fds(
                 self._channel, [self._line], [] if passed == self._passed else descriptors
@@ -135,7 +149,7 @@ class Supervisor:
         value: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close the channel: the process ends, or takes over if the last guard says so."""
+        """Close the channel: the process ends, or takes over if the last beat says so."""
         self._channel.close()
         with suppress(subprocess.TimeoutExpired):  # it holds the link's port
             self._process.wait(END_S)

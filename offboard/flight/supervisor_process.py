@@ -11,9 +11,11 @@ import os
 import select
 import signal
 import socket
+import stat
 import sys
 from collections.abc import Hashable
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 from offboard.flight import clock
@@ -21,17 +23,20 @@ from offboard.flight.background import BackgroundWriter
 from offboard.flight.link import Link
 from offboard.flight.log import append, entry
 from offboard.flight.recovery import Recovery
-from offboard.flight.stream_link import StreamLink
+from offboard.flight.stream_link import Nowhere, Source, Stream, StreamLink
+from offboard.flight.stream_sources import Listener
 from offboard.flight.supervisor import READY
 from offboard.flight.udp_link import UdpLink
+from offboard.mavlink import texts
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat, Outgoing
 from offboard.mavlink.session import Session, SessionSettings
-from offboard.mavlink.texts import chunks
+from offboard.mavlink.signing import Signing
 
 SILENT_S = 0.9  # without a beat; with two polls and a busy machine less than 1 s
 POLL_S = 0.02
 PAUSE_MAX_S = 0.1  # of a turn that counts as the controller's silence: the rest was a pause of ours
+BACKLOG_MAX = 20  # batches of the link that are read before the first request
 CLOSE_S = 2.0
 WARNING = 4  # MAV_SEVERITY
 DIED = "the controller ended in flight"
@@ -47,6 +52,7 @@ class Watch:
         self._received = b""
         self._silent_s = 0.0
         self.newest: dict[str, Any] = {}
+        self.key: bytes | None = None  # of signing
         self.descriptors: list[int] = []  # of the link, then of the log
         self.ended = False
 
@@ -79,7 +85,10 @@ class Watch:
         except ValueError:  # only a part of it did fit into the buffer
             return
         self._silent_s = 0.0
-        self.newest = message
+        if "key" in message:
+            self.key = bytes.fromhex(message["key"])
+        else:
+            self.newest = message
 
 
 class Rescue:
@@ -93,7 +102,8 @@ class Rescue:
         self._log = BackgroundWriter[bytes](
             lambda entries: append(watch.descriptors[-1], entries), 100_000
         )
-        self._session = Session(SessionSettings(stream=beat["stream"]))
+        signing = watch.key and Signing.resumed(watch.key, clock.monotonic_s, beat["signing"])
+        self._session = Session(SessionSettings(stream=beat["stream"]), signing or None)
         self._session.adopt(VehicleFound(**beat["vehicle"]), self._peer)
         assert self._session.dialect is not None
         began_s = clock.monotonic_s()
@@ -102,7 +112,9 @@ class Rescue:
 
     def run(self, reason: str) -> None:
         """Take over for `reason`, until the vehicle is down or belongs to somebody else."""
-        self._receive(0.0)  # the mode may have been left since the last beat
+        for _ in range(BACKLOG_MAX):  # the mode may have been left since the last beat
+            if not self._receive(0.0):
+                break
         self._ask(f"taking over: {reason}")
         while not self._recovery.ended:
             self._receive(POLL_S)
@@ -110,8 +122,10 @@ class Rescue:
         self._say(self._recovery.ended)
         self._log.close(CLOSE_S)
 
-    def _receive(self, timeout_s: float) -> None:
-        for chunk in self._link.receive(timeout_s):
+    def _receive(self, timeout_s: float) -> bool:
+        """Process one batch; whether there was any."""
+        chunks = self._link.receive(timeout_s)
+        for chunk in chunks:
             reception = self._session.receive(chunk.data, chunk.peer, chunk.arrived_s)
             self._record(*reception.frames)
             for event in reception.events:
@@ -119,6 +133,7 @@ class Rescue:
             self._send(*reception.replies)
         due = self._session.poll(clock.monotonic_s())
         self._send(*(message for message in due if isinstance(message, Heartbeat)))
+        return bool(chunks)
 
     def _ask(self, text: str = "") -> None:
         request = self._recovery.due(clock.monotonic_s())
@@ -139,7 +154,7 @@ class Rescue:
 
     def _text(self, sentence: str) -> None:
         self._text_id += 1
-        self._send(*chunks(WARNING, f"supervisor: {sentence}", self._text_id))
+        self._send(*texts.chunks(WARNING, f"supervisor: {sentence}", self._text_id))
 
     def _send(self, *messages: Outgoing) -> None:
         for message in messages:
@@ -160,8 +175,7 @@ def _peer(place: Any) -> Hashable:
 def _link(descriptors: list[int], stream: str) -> Link:
     """The link that has these descriptors; `stream` is the name of a stream, empty for UDP."""
     if stream:
-        (descriptor,) = descriptors
-        return StreamLink(descriptor, stream, lambda: os.close(descriptor))
+        return _stream_link(descriptors, stream)
     listening = vehicle = None
     for sock in (socket.socket(fileno=descriptor) for descriptor in descriptors):
         try:
@@ -170,6 +184,27 @@ def _link(descriptors: list[int], stream: str) -> Link:
         except OSError:  # not connected
             listening = sock
     return UdpLink(listening, vehicle)
+
+
+def _stream_link(descriptors: list[int], name: str) -> StreamLink:
+    """A link with at most one stream, and at most one socket that listens for the next one. Without
+    a stream nothing can be asked of the vehicle until it connects again."""
+    source: Source = Nowhere()
+    stream = None
+    for descriptor in descriptors:
+        if _listens(descriptor):
+            source = Listener(socket.socket(fileno=descriptor))
+        else:
+            stream = Stream(descriptor, partial(os.close, descriptor))
+    return StreamLink(stream, name, source)
+
+
+def _listens(descriptor: int) -> bool:
+    if not stat.S_ISSOCK(os.fstat(descriptor).st_mode):
+        return False
+    sock = socket.socket(fileno=os.dup(descriptor))
+    with sock:
+        return bool(sock.getsockopt(socket.SOL_SOCKET, socket.SO_ACCEPTCONN))
 
 
 def main() -> None:

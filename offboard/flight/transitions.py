@@ -1,4 +1,5 @@
-"""The phase table: transitions between the phases of a flight. The first row that holds is taken.
+"""The phase table of `fly`: transitions between the phases of a flight. The first row that holds is
+taken. `programme` has the table of the service, which shares most of these rows.
 
 Every row leads to a later phase. `actions` has what is done in a phase. The names in braces are
 keys of `assessment.figures`.
@@ -9,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from offboard.flight import guards
-from offboard.flight.facts import Facts
 from offboard.flight.guards import Guard, longer_than
 from offboard.flight.phases import ExitCode, Phase, Rung
 
@@ -33,10 +33,11 @@ class Row:
 _SILENT = "no telemetry for {silence_s:.1f} s"
 _BLIND = "no {blind_to} for {blind_s:.1f} s"
 _UNKNOWN = "no report of the mode for {authority_age_s:.1f} s"
-_REBOOTED = "the vehicle restarted"
+REBOOTED = "the vehicle restarted"
 _ARMED_ALREADY = "the vehicle is armed already, by another controller or a pilot"
 _DISARMED = "disarmed on the ground"
-_NOT_FOUND = "no vehicle heard in {silence_s:.0f} s; is it running, and sending to this port?"
+_NOT_FOUND = "no vehicle heard in {silence_s:.0f} s; {not_found}"
+_SEVERAL = "several vehicles are heard, systems {systems}: choose one with --system"
 _NO_LIFT_OFF = "no lift-off in {in_phase_s:.0f} s; is hover_thrust in the vehicle file right?"
 _NOT_OURS = (
     "the vehicle is armed and in {mode_wanted} already: another controller flies it "
@@ -56,12 +57,13 @@ def _ground_rows(source: Phase) -> tuple[Row, ...]:
         Row(source, guards.silent_on_ground, Phase.FAILED, _SILENT, REFUSED),
         Row(source, guards.stop_requested, Phase.FAILED, "{stop} before take-off", REFUSED),
         Row(source, guards.other_sender, Phase.FAILED, _OTHER_SENDER, REFUSED),
+        Row(source, guards.other_vehicle, Phase.FAILED, _SEVERAL, REFUSED),
     )
 
 
 def _streaming_rows(source: Phase) -> tuple[Row, ...]:
     return (
-        Row(source, guards.rebooted, Phase.FAILED, _REBOOTED, REFUSED),
+        Row(source, guards.rebooted, Phase.FAILED, REBOOTED, REFUSED),
         *_ground_rows(source),
         Row(source, guards.blind, Phase.FAILED, _BLIND, REFUSED),
         Row(source, guards.authority_unknown, Phase.FAILED, _UNKNOWN, REFUSED),
@@ -69,9 +71,10 @@ def _streaming_rows(source: Phase) -> tuple[Row, ...]:
     )
 
 
-def _flying_rows(source: Phase, when: str = "in flight") -> tuple[Row, ...]:
+def flying_rows(source: Phase, when: str = "in flight") -> tuple[Row, ...]:
+    """What ends a phase in the air early."""
     return (
-        Row(source, guards.rebooted, Phase.FAILED, f"{_REBOOTED} {when}", ABORTED),
+        Row(source, guards.rebooted, Phase.FAILED, f"{REBOOTED} {when}", ABORTED),
         Row(source, guards.disarmed, Phase.FAILED, f"the vehicle disarmed {when}", ABORTED),
         Row(source, guards.lost, Phase.YIELDED, "{lost}", ABORTED),
         Row(source, guards.at_rung(Rung.SILENCE), Phase.YIELDED, "{ladder}", ABORTED),
@@ -102,7 +105,7 @@ TRANSITIONS: tuple[Row, ...] = (
     Row(Phase.ENGAGE, guards.engaged_in_the_air, Phase.CLIMB, "{mode} in the air"),
     Row(Phase.ENGAGE, guards.engaged, Phase.ARM, "the vehicle shows {mode}"),
     _too_long(Phase.ENGAGE, "engage_s", Phase.FAILED, _NOT_ENGAGED, REFUSED),
-    Row(Phase.ARM, guards.rebooted, Phase.FAILED, _REBOOTED, REFUSED),
+    Row(Phase.ARM, guards.rebooted, Phase.FAILED, REBOOTED, REFUSED),
     Row(Phase.ARM, guards.lost_armed, Phase.YIELDED, "{lost} as it armed", ABORTED),
     Row(Phase.ARM, guards.lost_disarmed, Phase.FAILED, "{lost}", REFUSED),
     Row(Phase.ARM, guards.silent, Phase.STAND_DOWN, _SILENT, REFUSED),
@@ -123,10 +126,10 @@ TRANSITIONS: tuple[Row, ...] = (
         "the vehicle did not arm in {in_phase_s:.0f} s",
         REFUSED,
     ),
-    *_flying_rows(Phase.TAKEOFF, "before lift-off"),
+    *flying_rows(Phase.TAKEOFF, "before lift-off"),
     Row(Phase.TAKEOFF, guards.lifted_off, Phase.CLIMB, "lifted off"),
     _too_long(Phase.TAKEOFF, "lift_off_s", Phase.LAND, _NO_LIFT_OFF, ABORTED),
-    *_flying_rows(Phase.CLIMB),
+    *flying_rows(Phase.CLIMB),
     Row(Phase.CLIMB, guards.at_start_to_excite, Phase.EXCITE, "identification steps"),
     Row(Phase.CLIMB, guards.at_start, Phase.JOIN, "hovers at the start of the reference"),
     Row(
@@ -137,7 +140,7 @@ TRANSITIONS: tuple[Row, ...] = (
         "{late_s:.0f} s late",
         ABORTED,
     ),
-    *_flying_rows(Phase.EXCITE),
+    *flying_rows(Phase.EXCITE),
     Row(Phase.EXCITE, guards.identified, Phase.JOIN, "hovers at the start of the reference"),
     _too_long(
         Phase.EXCITE,
@@ -146,17 +149,17 @@ TRANSITIONS: tuple[Row, ...] = (
         "identification did not converge in {in_phase_s:.0f} s",
         ABORTED,
     ),
-    *_flying_rows(Phase.JOIN),
+    *flying_rows(Phase.JOIN),
     Row(Phase.JOIN, guards.at_full_speed, Phase.TRACK, "on the reference at full speed"),
-    *_flying_rows(Phase.TRACK),
+    *flying_rows(Phase.TRACK),
     Row(Phase.TRACK, guards.track_over, Phase.HOVER, "the reference was flown"),
-    *_flying_rows(Phase.HOVER),
+    *flying_rows(Phase.HOVER),
     Row(Phase.HOVER, guards.at_rest, Phase.LAND, "at rest"),
-    *(row for row in _flying_rows(Phase.HOLD) if row.target is not Phase.HOLD),
+    *(row for row in flying_rows(Phase.HOLD) if row.target is not Phase.HOLD),
     _too_long(
         Phase.HOLD, "hold_s", Phase.LAND, "the autopilot held for {in_phase_s:.0f} s", ABORTED
     ),
-    Row(Phase.LAND, guards.rebooted, Phase.FAILED, f"{_REBOOTED} while landing", ABORTED),
+    Row(Phase.LAND, guards.rebooted, Phase.FAILED, f"{REBOOTED} while landing", ABORTED),
     Row(Phase.LAND, guards.landed, Phase.DISARMED, _DISARMED),
     Row(
         Phase.LAND,
@@ -174,7 +177,7 @@ TRANSITIONS: tuple[Row, ...] = (
         "not landed and disarmed after {in_phase_s:.0f} s",
         ABORTED,
     ),
-    Row(Phase.STAND_DOWN, guards.rebooted, Phase.FAILED, _REBOOTED, REFUSED),
+    Row(Phase.STAND_DOWN, guards.rebooted, Phase.FAILED, REBOOTED, REFUSED),
     Row(Phase.STAND_DOWN, guards.silent_for_long, Phase.FAILED, _SILENT, REFUSED),
     Row(Phase.STAND_DOWN, guards.disarmed_for_good, Phase.FAILED, _DISARMED),
     _too_long(
@@ -185,8 +188,3 @@ TRANSITIONS: tuple[Row, ...] = (
         ABORTED,
     ),
 )
-
-
-def next_row(phase: Phase, now: Facts) -> Row | None:
-    """The first row of `phase` whose guard holds, or None to stay."""
-    return next((row for row in TRANSITIONS if row.source is phase and row.guard(now)), None)

@@ -17,14 +17,13 @@ from contextlib import suppress
 
 from offboard.flight import clock
 from offboard.flight.link import Chunk, Strangers
-from offboard.mavlink.framing import frame_size
+from offboard.mavlink.framing import TIMESYNC, frame_size
 from offboard.mavlink.peer import PEER_SILENT_S, same_host
 
 DATAGRAM_SIZE = 65535
 BUFFER_BYTES = 1 << 20
 BATCH_MAX = 512  # datagrams of one call
 LOOK_MAX, LOOK_EVERY_S = 64, 0.02  # of other senders, while the vehicle is known
-TIMESYNC = 111
 _LINUX = sys.platform == "linux"
 _SHARE_PORT = socket.SO_REUSEADDR if _LINUX else socket.SO_REUSEPORT
 # Options that the socket module does not name: SO_TIMESTAMPNS on Linux, SO_TIMESTAMP on macOS
@@ -36,9 +35,9 @@ _DROPPED = 40 if _LINUX else None  # SO_RXQ_OVFL: how many datagrams did not fit
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_STAMP.size) + socket.CMSG_SPACE(4)
 
 
-def udp_socket() -> socket.socket:
+def udp_socket(family: int = socket.AF_INET) -> socket.socket:
     """A non-blocking socket with arrival stamps."""
-    sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    sock = socket.socket(family, socket.SOCK_DGRAM)
     sock.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, BUFFER_BYTES)
     with suppress(OSError):  # without stamps the arrival is taken as early as it can have been
         sock.setsockopt(socket.SOL_SOCKET, _STAMP_OPTION, 1)
@@ -97,6 +96,7 @@ class UdpLink:
     capacity_bytes_ps: float | None = None
 
     def __init__(self, listening: socket.socket | None, vehicle: socket.socket | None) -> None:
+        self.opened = 0
         self.strangers = Strangers()
         self._listening = _Inbox(listening) if listening else None
         self._vehicle = _Inbox(vehicle) if vehicle else None
@@ -140,6 +140,7 @@ class UdpLink:
             others = [chunk for chunk in others if not same_host(chunk.peer, self._place)]
         if others:
             self._count(others, listening.dropped)
+            self.strangers.keep(chunk.data for chunk in others)
         return ours
 
     def _count(self, others: list[Chunk], dropped: int) -> None:
@@ -178,6 +179,7 @@ class UdpLink:
                 listening.socket.connect(peer)
             self._listening, sock = None, listening.socket
         self._vehicle, self._place = _Inbox(sock), peer
+        self.opened += 1
         self._heard_s, self._dropped = clock.monotonic_s(), listening.dropped
 
     def descriptors(self) -> tuple[int, ...]:
@@ -196,9 +198,9 @@ class UdpLink:
         return int(inbox.socket.getsockname()[1])
 
 
-def _second_socket(listening: socket.socket, peer: tuple[str, int]) -> socket.socket:
+def _second_socket(listening: socket.socket, peer: tuple[str | int, ...]) -> socket.socket:
     """A socket on the port of `listening`, connected to `peer`. Raises OSError."""
-    sock = udp_socket()
+    sock = udp_socket(listening.family)
     both = (listening, sock)
     try:
         for one in both:
@@ -224,8 +226,11 @@ def _by_sender(chunks: list[Chunk]) -> dict[str, int]:
 
 
 def _name(place: Hashable) -> str:
-    """An address as the user writes it, 127.0.0.1:14540."""
-    return ":".join(map(str, place)) if isinstance(place, tuple) else str(place)
+    """An address as the user writes it, 127.0.0.1:14540 or [::1]:14540."""
+    if not isinstance(place, tuple):
+        return str(place)
+    host, port = place[:2]
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 class LockstepLink(UdpLink):
@@ -239,6 +244,7 @@ class LockstepLink(UdpLink):
         super().__init__(sock, None)
         self._block: list[Chunk] = []  # since the newest barrier
         self._barrier = b""
+        self._simulator: Hashable | None = None  # the sender of the barriers
 
     def follow(self, peer: Hashable) -> None:
         """The simulator is ours, and a second socket would change the order of its datagrams."""
@@ -251,7 +257,13 @@ class LockstepLink(UdpLink):
                 if chunk.data != self._barrier:
                     complete += self._block
                 self._barrier, self._block = chunk.data, []
+                self._simulator = chunk.peer
         return complete
+
+    def send(self, data: bytes, peer: Hashable | None) -> None:
+        """Send to the simulator, also before it is known as the vehicle: with a late link its first
+        heartbeat comes only after answered barriers."""
+        super().send(data, self._simulator if peer is None else peer)
 
 
 def _is_barrier(datagram: bytes) -> bool:

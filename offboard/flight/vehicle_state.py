@@ -12,17 +12,21 @@ from dataclasses import dataclass, field
 from offboard.mavlink.events import (
     Attitude,
     CommandAck,
+    EstimatorReport,
     Event,
+    FirmwareVersion,
     Heartbeat,
     Landed,
     LocalPosition,
     ModeReport,
+    OtherCompanion,
     OtherSender,
     Parameter,
     Rebooted,
     StatusText,
     SystemHealth,
     VehicleFound,
+    VehicleIdentity,
 )
 from offboard.model.frames import course_from_quaternion
 
@@ -42,15 +46,19 @@ class VehicleState:
     found: VehicleFound | None = None
     heartbeat: Heartbeat | None = None
     health: SystemHealth | None = None
+    estimator: EstimatorReport | None = None
+    version: FirmwareVersion | None = None
     landed: str = "unknown"
     position: LocalPosition | None = None
     attitude: Attitude | None = None
+    uid: int | None = None  # of the hardware; 0: it has none
     parameters: dict[str, float] = field(default_factory=dict)
     texts: deque[str] = field(default_factory=lambda: deque(maxlen=MESSAGES_MAX))
     refusals: deque[str] = field(default_factory=lambda: deque(maxlen=MESSAGES_MAX))
     results: dict[int, str] = field(default_factory=dict)  # newest, by MAV_CMD number
     mode: str = "unknown"
     other_sender: OtherSender | None = None
+    other_companion: OtherCompanion | None = None
     armed_changed_s: float = 0.0
     resumed_s: float = -math.inf  # vehicle time of the first telemetry after an outage
     now_s: float = 0.0
@@ -127,16 +135,22 @@ class VehicleState:
                 self.mode = mode
             case OtherSender():
                 self.other_sender = event
+            case OtherCompanion():
+                self.other_companion = event
             case LocalPosition() if not self._repeats(event):
                 self.position = event
             case Attitude():
                 self.attitude = event
             case SystemHealth():
                 self.health = event
+            case EstimatorReport():
+                self.estimator = event
             case Landed(state):
                 self.landed = state
             case VehicleFound():
                 self.found = event
+            case VehicleIdentity(uid, version):
+                self.uid, self.version = uid, version
             case Parameter(name, value):
                 self.parameters[name] = value
             case StatusText(severity, text) if severity <= WARNING:
@@ -173,7 +187,7 @@ class VehicleState:
 
     def _reset(self) -> None:
         """After a reboot nothing is known of the vehicle."""
-        self.heartbeat = self.health = self.position = self.attitude = None
+        self.heartbeat = self.health = self.estimator = self.position = self.attitude = None
         self.landed = self.mode = "unknown"
         self.heard_s.clear()
         self.resumed_s = -math.inf

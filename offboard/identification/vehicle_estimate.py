@@ -11,7 +11,12 @@ import math
 from dataclasses import replace
 from typing import Any
 
-from offboard.control.delay_margin import needed_margin, supported_bandwidth
+from offboard.control.delay_margin import (
+    LEAST_MARGIN_S,
+    SDS,
+    needed_margin,
+    supported_bandwidth,
+)
 from offboard.identification.adoption import (
     LINK_S,
     interpolated,
@@ -20,7 +25,8 @@ from offboard.identification.adoption import (
     with_link_delay,
     within_bounds,
 )
-from offboard.identification.attitude_fit import Unexplained
+from offboard.identification.attitude_fit import ResponseFit, Unexplained
+from offboard.identification.learned import Learned
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import Identified
 from offboard.model.vehicle import Vehicle
@@ -34,6 +40,8 @@ DECISIVE = ("tilt", "hover_thrust")  # out of bounds, these end the flight
 # After so many contradictions the bandwidth stays low until the estimate in use has explained the
 # flight for CALM_S.
 MOST_CONTRADICTIONS, CALM_S = 2, 20.0
+# Delay and lag of the thrust that are less certain than this would cost too much bandwidth
+THRUST_SD_S = 0.02
 LINKED = ("yaw", "thrust_delay_s")  # changed with the tilt's delay where not identified themselves
 NOTICEABLE_RADPS = 1.0  # a smaller change for a later link is not announced
 OUT_OF_BOUNDS = "it is out of bounds"
@@ -81,6 +89,7 @@ class VehicleEstimate:
         self._contradictions = 0
         self._calm_from_s = -math.inf  # since the last contradiction
         self.delay: Estimate | None = None  # of the tilt, once identified
+        self._thrust: Estimate | None = None  # delay and lag of the thrust, once identified
         self.in_doubt = False
         self._unknown_s = self._unknown_delay_s
         self._link_radps = math.inf  # limit because the link became later
@@ -130,6 +139,38 @@ class VehicleEstimate:
         self._vehicle_radps = self.cautious_radps = self._supported(self._unknown_s)
         return sentences
 
+    def recall(self, learned: Learned) -> None:
+        """Begin with what an earlier flight has identified."""
+        self.target = self.now = self._from = learned.vehicle
+        self.delay = learned.delay
+        margin_s = needed_margin(self.target, self.delay.sd)
+        self._vehicle_radps = self.cautious_radps = self._supported(margin_s)
+
+    def apply_link_change(self, learned: Learned, link: Estimate) -> list[str]:
+        """Adapt what was recalled to the link's delay of now."""
+        changed_s = link.value - max(learned.link_s, DIRECT_LINK_S)
+        changed_s = max(changed_s, -self.target.tilt.delay_s, -self.target.yaw.delay_s)
+        if abs(changed_s) < LINK_S:
+            return []
+        self.target = self.now = self._from = with_added_delay(self.target, changed_s)
+        self.delay = Estimate(
+            learned.delay.value + changed_s, math.hypot(learned.delay.sd, link.sd)
+        )
+        margin_s = needed_margin(self.target, self.delay.sd)
+        self._vehicle_radps = self.cautious_radps = self._supported(margin_s)
+        return [f"the link delays by {1e3 * changed_s:+.0f} ms since the vehicle was identified"]
+
+    def learned(self, link_s: float) -> Learned | None:
+        """What the next flight may begin with; None if nothing was identified, or in doubt."""
+        if self.delay is None or self.contradicted:
+            return None
+        return Learned(self.target, self.delay, link_s)
+
+    @property
+    def contradicted(self) -> bool:
+        """Whether this flight has contradicted the constants in use."""
+        return self.in_doubt or self._contradictions > 0 or bool(self.contradiction)
+
     def apply_hover_thrust(self, hover_thrust: float) -> None:
         """Begin with another hover thrust than the vehicle file's."""
         update = {"hover_thrust": hover_thrust}
@@ -141,6 +182,8 @@ class VehicleEstimate:
         for name in DECISIVE:
             if getattr(found, name) is not None and getattr(within, name) is None:
                 self.contradiction = "; ".join(sentences)
+        if within.thrust_effect_s is not None and within.thrust_effect_s.sd > THRUST_SD_S:
+            within = replace(within, thrust_lag_s=None, thrust_delay_s=None, thrust_effect_s=None)
         applied = within.applied_to(self.target)
         target = with_link_delay(within, applied, self._file)
         if within.tilt is not None:
@@ -148,6 +191,8 @@ class VehicleEstimate:
             self._replaced = {name: getattr(self.target, name) for name in ("tilt", *moved)}
             self.delay = within.tilt.delay_s
             self._other_delay = None
+        if within.thrust_delay_s is not None:
+            self._thrust = within.thrust_effect_s
         if target != self.target:
             self._blend_to(target, time_s)
             sentences.insert(0, summary(within))
@@ -173,18 +218,27 @@ class VehicleEstimate:
         if self.delay is None:
             better = True
         elif _apart(tilt.delay_s, self.delay):
-            if self._other_delay is None or _apart(tilt.delay_s, self._other_delay):
+            if not self._confirmed(tilt, now):
                 return self._on_other_delay(self.delay, tilt.delay_s)
             better = True
         else:
             clearer = self.in_doubt and tilt.residual_rms < BETTER * now.rms
             better = clearer or tilt.delay_s.sd < BETTER * self.delay.sd
         sentences = self.adopt(found, time_s) if better else []
-        left = replace(now, rms=tilt.residual_rms) if better else now
+        left = _left(tilt, now) if better else now
         certain = not left.contradicts if self.in_doubt else better
         return sentences + (self.update_bandwidth() if certain else [])
 
     # ------------------------------------------------------------------ contradictions
+
+    def _confirmed(self, tilt: ResponseFit, now: Unexplained) -> bool:
+        """Whether something besides this fit shows that the delay is another: a fit before it, or
+        a contradiction that it explains."""
+        if self._other_delay is not None:
+            return not _apart(tilt.delay_s, self._other_delay)
+        once = 0 < self._contradictions < MOST_CONTRADICTIONS
+        explains = tilt.residual_rms < BETTER * now.rms
+        return self.in_doubt and once and explains and not _left(tilt, now).contradicts
 
     def _on_other_delay(self, known: Estimate, seen: Estimate) -> list[str]:
         self._other_delay, self.in_doubt = seen, True
@@ -237,9 +291,7 @@ class VehicleEstimate:
         if added_s or changed_s:
             vehicle = with_added_delay(self.target, added_s)
             needed_s = needed_margin(vehicle, self.delay.sd) if self.delay else self._unknown_s
-            self._link_radps = supported_bandwidth(
-                vehicle, self._bandwidth_radps, self._period_s, max(needed_s, changed_s)
-            )
+            self._link_radps = self._supported(max(needed_s, changed_s), vehicle)
         lowered_radps = max(min(self._vehicle_radps, self._bandwidth_radps) - self._link_radps, 0.0)
         news = abs(lowered_radps - self._lowered_radps) >= NOTICEABLE_RADPS
         if not (news or (self._lowered_radps and not lowered_radps)):
@@ -269,10 +321,19 @@ class VehicleEstimate:
         if self._in_use_radps == before:
             return []
         cause = " by the" if self.limit_radps < self._bandwidth_radps else ":"
-        return [f"{self._bandwidth_text}{cause} identified delay, {_in_ms(self.delay)}"]
+        thrust = f", of the thrust with its lag {_in_ms(self._thrust)}" if self._thrust else ""
+        return [f"{self._bandwidth_text}{cause} identified delay, {_in_ms(self.delay)}{thrust}"]
 
-    def _supported(self, needed_s: float) -> float:
-        return supported_bandwidth(self.target, self._bandwidth_radps, self._period_s, needed_s)
+    def _supported(self, tilt_margin_s: float, vehicle: Vehicle | None = None) -> float:
+        vehicle = vehicle or self.target
+        thrust_sd_s = self._thrust.sd if self._thrust else 0.0
+        return supported_bandwidth(
+            vehicle,
+            self._bandwidth_radps,
+            self._period_s,
+            tilt_margin_s=tilt_margin_s,
+            thrust_margin_s=max(LEAST_MARGIN_S, SDS * thrust_sd_s),
+        )
 
     def _limit(self, limit_radps: float) -> None:
         self._vehicle_radps = min(self._vehicle_radps, limit_radps)
@@ -289,6 +350,11 @@ class VehicleEstimate:
             f"bandwidth limited to {self.limit_radps:.1f} rad/s "
             f"(configured {self._bandwidth_radps:.1f})"
         )
+
+
+def _left(tilt: ResponseFit, now: Unexplained) -> Unexplained:
+    """What this fit leaves unexplained of the same stretch of flight."""
+    return replace(now, rms=tilt.residual_rms)
 
 
 def _apart(one: Estimate, other: Estimate) -> bool:

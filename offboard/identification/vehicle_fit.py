@@ -49,6 +49,7 @@ class Identified:
     `refusals` has the reason under the field's name.
 
     Delays run from the vehicle time of the newest telemetry when a command is sent to its effect.
+    `thrust_effect_s`, the sum of the thrust's delay and lag, is better known than its parts.
     """
 
     seconds: float
@@ -57,6 +58,7 @@ class Identified:
     hover_thrust: Estimate | None = None
     thrust_lag_s: Estimate | None = None
     thrust_delay_s: Estimate | None = None
+    thrust_effect_s: Estimate | None = None
     drag_ps: Estimate | None = None
     noise: EstimatorNoise | None = None
     refusals: Mapping[str, str] = field(default_factory=dict)
@@ -244,5 +246,6 @@ def _accepted_vertical(
             f"limit {EFFECT_SD_S} s"
         )
     else:
-        accepted |= {"thrust_lag_s": fit.thrust_lag_s, "thrust_delay_s": fit.thrust_delay_s}
+        names = ("thrust_lag_s", "thrust_delay_s", "thrust_effect_s")
+        accepted |= {name: getattr(fit, name) for name in names}
     return accepted

@@ -21,13 +21,18 @@ class DropReason(Enum):
     FOREIGN_PEER = "a datagram from another address than the vehicle's"
     # frames
     UNKNOWN_ID = "a message id whose CRC_EXTRA is unknown"
+    UNSIGNED = "no signature"
+    BAD_SIGNATURE = "a signature of another key"
+    REPLAYED = "a signature whose time stamp is not newer than the last one of its sender"
+    OLD_STAMP = "a signature whose time stamp is more than a minute behind"
+    NO_KEY = "the heartbeat of an autopilot that signs, without our key"
     ECHO = "a frame of our own, received back"
     SAME_IDS = "a frame with our own ids that another program sent"
     NO_VEHICLE = "before the first heartbeat of an autopilot"
     UNSUPPORTED_AUTOPILOT = "a heartbeat of an autopilot without dialect"
     FOREIGN_SYSTEM = "another system id than the vehicle's"
     FOREIGN_COMPONENT = "another component of the vehicle than its autopilot"
-    NOT_FOR_US = "an acknowledgement addressed to another system"
+    NOT_FOR_US = "a command or acknowledgement for another system"
     IMPLAUSIBLE = "a value that is not finite or out of range"
     STALE = "older than the newest message of the same id"
 
@@ -39,6 +44,12 @@ NOT_A_FRAME = frozenset(
         DropReason.INCOMPATIBLE,
         DropReason.FOREIGN_PEER,
     }
+)
+FORGED = (
+    DropReason.UNSIGNED,
+    DropReason.BAD_SIGNATURE,
+    DropReason.REPLAYED,
+    DropReason.OLD_STAMP,
 )
 
 
@@ -54,7 +65,17 @@ class Counters:
     decoded: int = 0
     ignored: int = 0
     dropped: Counter[DropReason] = field(default_factory=Counter)
+    forged: int = 0  # frames that signing refused
+    _reported_next: int = 1  # number of them in the next of `news`
 
     @property
     def dropped_frames(self) -> int:
         return sum(n for reason, n in self.dropped.items() if reason not in NOT_A_FRAME)
+
+    def news(self) -> str:
+        """What signing refused, on the 1st, 10th, 100th ... frame; else empty."""
+        if self.forged < self._reported_next:
+            return ""
+        self._reported_next = 10 ** len(str(self.forged))
+        named = (f"{self.dropped[each]:,} x {each.value}" for each in FORGED if self.dropped[each])
+        return f"frames refused by signing: {', '.join(named)}"

@@ -22,6 +22,9 @@ POSITION_LIMIT_M = 1e5
 VELOCITY_LIMIT_MPS = 200.0
 RATE_LIMIT_RADPS = 100.0
 _PREARM_CHECK = 0x10000000  # MAV_SYS_STATUS_PREARM_CHECK
+_RADIO = 0x10000  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+# ESTIMATOR_STATUS_FLAGS and EKF_STATUS_FLAGS have the same bits
+_EKF_ATTITUDE, _EKF_VELOCITY, _EKF_POSITION, _EKF_HEIGHT = 1, 2, 8, 32
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 _FIX_3D = 3  # GPS_FIX_TYPE
 _UNKNOWN16 = 0xFFFF
@@ -79,6 +82,20 @@ def decode(message_id: int, payload: bytes, dialect: Dialect) -> events.Event | 
     """The event in a payload, IMPLAUSIBLE, or None for a message without decoder."""
     decoder = _DECODERS.get(message_id)
     return None if decoder is None else decoder(payload, dialect)
+
+
+def decode_command(message_id: int, payload: bytes) -> tuple[int, tuple[float, ...], Address]:
+    """Command, parameters and receiver of a COMMAND_LONG (76) or a COMMAND_INT (75), whose
+    parameters 5 to 7, a place, are left out."""
+    if message_id == mavlink.MAVLINK_MSG_ID_COMMAND_LONG:
+        *parameters, command, system_id, component_id, _ = _unpack(
+            mavlink.MAVLink_command_long_message, payload
+        )
+    else:
+        *parameters, _, _, _, command, system_id, component_id, _, _, _ = _unpack(
+            mavlink.MAVLink_command_int_message, payload
+        )
+    return command, tuple(parameters), Address(system_id, component_id)
 
 
 def decode_identity(payload: bytes) -> Identity:
@@ -147,12 +164,12 @@ def _thrust_report(payload: bytes, _: Dialect) -> events.Event | DropReason:
     return events.ThrustReport(min(max(thrust, 0.0), 1.0))  # ArduCopter's falls to -0.2 on landing
 
 
-def _gps_fix(payload: bytes, _: Dialect) -> events.Event | DropReason | None:
+def _gps_fix(payload: bytes, _: Dialect) -> events.Event | DropReason:
     stamp_us, latitude, longitude, altitude, _, _, speed, course, fix, _, _, accuracy, *_more = (
         _unpack(mavlink.MAVLink_gps_raw_int_message, payload)
     )
     if fix < _FIX_3D:
-        return None
+        return events.NoFix(fix)
     place = _place(latitude, longitude, altitude)
     if place is None:
         return DropReason.IMPLAUSIBLE
@@ -191,12 +208,50 @@ def _home(payload: bytes, _: Dialect) -> events.Event | DropReason:
 
 def _system_health(payload: bytes, _: Dialect) -> events.Event:
     fields = _unpack(mavlink.MAVLink_sys_status_message, payload)
-    health, millivolts, percent = fields[2], fields[4], fields[12]
+    present, health, millivolts, percent = fields[0], fields[2], fields[4], fields[12]
     return events.SystemHealth(
         prearm_ok=bool(health & _PREARM_CHECK),
         battery_voltage_v=millivolts * 1e-3 if millivolts != 0xFFFF else None,
         battery_remaining=percent * 1e-2 if 0 <= percent <= 100 else None,
+        radio_ok=bool(present & health & _RADIO),
     )
+
+
+def _px4_estimator(payload: bytes, _: Dialect) -> events.Event:
+    _, velocity, position, height, mag, hagl, airspeed, _, _, flags = _unpack(
+        mavlink.MAVLink_estimator_status_message, payload
+    )
+    ratios = {"GPS velocity": velocity, "GPS position": position, "height": height, "heading": mag}
+    return _estimator(flags, ratios | {"height above ground": hagl, "airspeed": airspeed})
+
+
+def _ardupilot_estimator(payload: bytes, _: Dialect) -> events.Event:
+    velocity, position, height, compass, terrain, flags, airspeed = _unpack(
+        mavlink.MAVLink_ekf_status_report_message, payload
+    )
+    ratios = {"GPS velocity": velocity, "GPS position": position, "height": height}
+    return _estimator(flags, ratios | {"compass": compass, "terrain": terrain, "air": airspeed})
+
+
+def _estimator(flags: int, ratios: dict[str, float]) -> events.EstimatorReport:
+    return events.EstimatorReport(
+        attitude_ok=bool(flags & _EKF_ATTITUDE),
+        velocity_ok=bool(flags & _EKF_VELOCITY),
+        position_ok=bool(flags & _EKF_POSITION),
+        height_ok=bool(flags & _EKF_HEIGHT),
+        ratios=tuple((name, ratio) for name, ratio in ratios.items() if math.isfinite(ratio)),
+    )
+
+
+def _version(payload: bytes, _: Dialect) -> events.Event:
+    _, uid, number, *more = _unpack(mavlink.MAVLink_autopilot_version_message, payload)
+    uid = uid or int.from_bytes(bytes(more[-18:]), "little")  # uid2, the only one of ArduPilot
+    return events.VehicleIdentity(uid, events.FirmwareVersion(*number.to_bytes(4, "big")))
+
+
+def _system_time(payload: bytes, _: Dialect) -> events.Event:
+    unix_us, _ = _unpack(mavlink.MAVLink_system_time_message, payload)
+    return events.SystemTime(unix_us * 1e-6)
 
 
 def _landed(payload: bytes, _: Dialect) -> events.Event:
@@ -233,6 +288,7 @@ def printable(data: bytes) -> str:
 _DECODERS: Mapping[int, Callable[[bytes, Dialect], events.Event | DropReason | None]] = {
     0: _heartbeat,
     1: _system_health,
+    2: _system_time,
     22: _parameter,
     31: _attitude,
     24: _gps_fix,
@@ -240,6 +296,9 @@ _DECODERS: Mapping[int, Callable[[bytes, Dialect], events.Event | DropReason | N
     49: _global_origin,
     77: _command_ack,
     83: _thrust_report,
+    148: _version,
+    193: _ardupilot_estimator,
+    230: _px4_estimator,
     242: _home,
     245: _landed,
     436: _current_mode,

@@ -18,6 +18,7 @@ from offboard.mavlink.dialects.base import Dialect, ThrustRule
 from offboard.mavlink.outgoing import (
     AttitudeTarget,
     CommandLong,
+    CommandResult,
     ConfigurationRecord,
     Heartbeat,
     Outgoing,
@@ -67,14 +68,24 @@ def encode(outgoing: Outgoing, target: Address | None, dialect: Dialect | None) 
             return _solver(outgoing)
         case ConfigurationRecord():
             return _configuration(outgoing)
-        case Heartbeat(vehicle_type):
+        case CommandResult(command, result, system_id, component_id):
+            return _pack(
+                mavlink.MAVLink_command_ack_message,
+                command=command,
+                result=result,
+                progress=0,
+                result_param2=0,
+                target_system=system_id,
+                target_component=component_id,
+            )
+        case Heartbeat(vehicle_type, system_status, custom_mode):
             return _pack(
                 mavlink.MAVLink_heartbeat_message,
                 type=vehicle_type,
                 autopilot=mavlink.MAV_AUTOPILOT_INVALID,
                 base_mode=0,
-                custom_mode=0,
-                system_status=mavlink.MAV_STATE_ACTIVE,
+                custom_mode=custom_mode,
+                system_status=system_status,
                 mavlink_version=3,
             )
         case Timesync(tc1_ns, ts1_ns):

@@ -51,6 +51,25 @@ class OtherSender:
 
 
 @dataclass(frozen=True, slots=True)
+class OtherCompanion:
+    """HEARTBEAT of another companion computer of our vehicle."""
+
+    system_id: int
+    component_id: int
+
+
+@dataclass(frozen=True, slots=True)
+class CommandRequest:
+    """COMMAND_LONG or COMMAND_INT to our own component, forwarded by the vehicle or a router.
+    Parameters may be NaN; those of a COMMAND_INT are its first four."""
+
+    command: int
+    parameters: tuple[float, ...]
+    system_id: int  # of the sender, as is the component
+    component_id: int
+
+
+@dataclass(frozen=True, slots=True)
 class LocalPosition:
     """LOCAL_POSITION_NED."""
 
@@ -87,6 +106,75 @@ class GpsFix:
 
 
 @dataclass(frozen=True, slots=True)
+class NoFix:
+    """GPS_RAW_INT without a 3D fix."""
+
+    fix_type: int  # GPS_FIX_TYPE: 0 no GPS, 1 no fix, 2 2D fix
+
+
+@dataclass(frozen=True, slots=True)
+class EstimatorReport:
+    """ESTIMATOR_STATUS (PX4) or EKF_STATUS_REPORT (ArduPilot).
+
+    `ratios`: innovation over its test limit, by measurement; above 1 the estimator rejects the
+    measurement. Measurements that are not in use are missing. PX4's are squared.
+    """
+
+    attitude_ok: bool
+    velocity_ok: bool  # horizontal
+    position_ok: bool  # horizontal, relative to the origin
+    height_ok: bool
+    ratios: tuple[tuple[str, float], ...]
+
+    @property
+    def worst(self) -> tuple[str, float]:
+        """The measurement with the largest ratio."""
+        return max(self.ratios, key=lambda each: each[1], default=("", 0.0))
+
+    @property
+    def problem(self) -> str:
+        """Why nobody can fly by this estimate; empty if somebody can."""
+        parts = {
+            "attitude": self.attitude_ok,
+            "horizontal velocity": self.velocity_ok,
+            "horizontal position": self.position_ok,
+            "height": self.height_ok,
+        }
+        missing = [name for name, valid in parts.items() if not valid]
+        if missing:
+            return f"its estimator has no valid {', '.join(missing)}"
+        name, ratio = self.worst
+        if ratio > 1.0:
+            return f"its estimator rejects {name} (innovation ratio {ratio:.2f}, limit 1)"
+        return ""
+
+
+@dataclass(frozen=True, slots=True)
+class FirmwareVersion:
+    """AUTOPILOT_VERSION.flight_sw_version."""
+
+    major: int
+    minor: int
+    patch: int
+    kind: int  # FIRMWARE_VERSION_TYPE: 0 development to 255 release
+
+
+@dataclass(frozen=True, slots=True)
+class VehicleIdentity:
+    """AUTOPILOT_VERSION: the hardware's unique number, 0 where there is none, and the firmware."""
+
+    uid: int
+    version: FirmwareVersion
+
+
+@dataclass(frozen=True, slots=True)
+class SystemTime:
+    """SYSTEM_TIME; `unix_s` is 0 while the vehicle does not know it."""
+
+    unix_s: float
+
+
+@dataclass(frozen=True, slots=True)
 class Origin:
     """Place of the local frame's origin. `reported` is true for GPS_GLOBAL_ORIGIN; otherwise it is
     computed from HOME_POSITION, which gives one point in both frames."""
@@ -102,6 +190,7 @@ class SystemHealth:
     prearm_ok: bool
     battery_voltage_v: float | None
     battery_remaining: float | None  # 0 .. 1
+    radio_ok: bool = False  # a remote control is present and received
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,6 +233,13 @@ class PeerChanged:
 
 
 @dataclass(frozen=True, slots=True)
+class ClockBehind:
+    """A correctly signed heartbeat whose time stamp is too old; no vehicle is found yet."""
+
+    system_id: int
+
+
+@dataclass(frozen=True, slots=True)
 class TimesyncReply:
     """TIMESYNC reply of the vehicle: the stamp of our request, and vehicle time on its arrival."""
 
@@ -163,10 +259,16 @@ Event = (
     | Heartbeat
     | ModeReport
     | OtherSender
+    | OtherCompanion
+    | CommandRequest
+    | VehicleIdentity
     | LocalPosition
     | Attitude
     | ThrustReport
     | GpsFix
+    | NoFix
+    | EstimatorReport
+    | SystemTime
     | Origin
     | SystemHealth
     | Landed
@@ -174,6 +276,7 @@ Event = (
     | StatusText
     | Parameter
     | PeerChanged
+    | ClockBehind
     | TimesyncReply
     | Rebooted
 )

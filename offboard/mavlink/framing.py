@@ -21,6 +21,8 @@ from pymavlink.dialects.v20 import ardupilotmega
 from offboard.mavlink.counters import Counters, DropReason
 
 _V2, _V1 = 0xFD, 0xFE
+# Ids of messages that are needed before they are decoded
+HEARTBEAT, COMMAND_ACK, TIMESYNC, STATUSTEXT, SETUP_SIGNING = 0, 77, 111, 253, 256
 _HEADER_V2 = struct.Struct("<BBBBBBBHB")
 _HEADER_BYTES_V2, _HEADER_BYTES_V1, _CRC_BYTES, _SIGNATURE_BYTES = 10, 6, 2, 13
 _SIGNED = 0x01
@@ -47,6 +49,11 @@ class Frame(NamedTuple):
     sequence: int
     payload: bytes
     verified: bool
+
+    @property
+    def signed(self) -> bool:
+        """It ends with a signature, whose key is not known here."""
+        return self.raw[0] == _V2 and bool(self.raw[2] & _SIGNED)
 
 
 class FrameSplitter:
@@ -110,14 +117,21 @@ class FrameSplitter:
 
 
 def pack(
-    message_id: int, payload: bytes, sequence: int, system_id: int, component_id: int
+    message_id: int,
+    payload: bytes,
+    sequence: int,
+    system_id: int,
+    component_id: int,
+    *,
+    signed: bool = False,
 ) -> bytes:
-    """An unsigned MAVLink 2 frame. Trailing zeros of the payload are cut, except its first byte."""
+    """A MAVLink 2 frame without signature; `signed`: its flags say that one follows. Trailing zeros
+    of the payload are cut, except its first byte."""
     payload = payload[:1] + payload[1:].rstrip(b"\0")
     body = _HEADER_V2.pack(
         _V2,
         len(payload),
-        0,
+        _SIGNED if signed else 0,
         0,
         sequence,
         system_id,

@@ -64,9 +64,29 @@ class CommandLong:
         return cls(21)
 
     @classmethod
+    def message(cls, message_id: int) -> CommandLong:
+        """MAV_CMD_REQUEST_MESSAGE, once."""
+        return cls(512, (float(message_id),))
+
+    @classmethod
+    def run_prearm_checks(cls) -> CommandLong:
+        """MAV_CMD_RUN_PREARM_CHECKS: the vehicle reports what fails by STATUSTEXT."""
+        return cls(401)
+
+    @classmethod
     def message_interval(cls, message_id: int, rate_hz: float) -> CommandLong:
         """MAV_CMD_SET_MESSAGE_INTERVAL; the interval is in whole microseconds."""
         return cls(511, (float(message_id), float(round(1e6 / rate_hz))))
+
+
+@dataclass(frozen=True, slots=True)
+class CommandResult:
+    """COMMAND_ACK of a command that was sent to us; `result` is a MAV_RESULT."""
+
+    command: int
+    result: int
+    system_id: int  # of its sender, as is the component
+    component_id: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,9 +98,11 @@ class ParamRead:
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """Our HEARTBEAT; `vehicle_type` is a MAV_TYPE."""
+    """Our HEARTBEAT; `vehicle_type` is a MAV_TYPE, `system_status` a MAV_STATE."""
 
     vehicle_type: int
+    system_status: int = 4  # active
+    custom_mode: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,7 +149,8 @@ class SolverRecord:
 
 @dataclass(frozen=True, slots=True)
 class ConfigurationRecord:
-    """One piece of the flight's configuration, logged as TUNNEL: at most 128 bytes."""
+    """One piece of the flight's configuration or of its inputs, logged as TUNNEL: at most 128
+    bytes."""
 
     data: bytes
     payload_type: int
@@ -137,6 +160,7 @@ Outgoing = (
     AttitudeTarget
     | PositionTarget
     | CommandLong
+    | CommandResult
     | ParamRead
     | Heartbeat
     | Timesync

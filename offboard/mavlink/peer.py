@@ -8,11 +8,11 @@ the silence is no overflow and no pause of ours: before, it hands over no foreig
 
 from __future__ import annotations
 
-from collections.abc import Hashable
+from collections.abc import Callable, Hashable
 
 from offboard.mavlink.counters import Counters
 from offboard.mavlink.decode import Address
-from offboard.mavlink.framing import FrameSplitter
+from offboard.mavlink.framing import Frame, FrameSplitter
 
 PEER_SILENT_S = 0.5  # half of `Limits.silence_s`, so that the flight can continue
 
@@ -32,12 +32,19 @@ class Peer:
     def is_foreign(self, place: Hashable) -> bool:
         return self._vehicle is not None and place != self._place
 
-    def moves_to(self, place: Hashable, datagram: bytes, now_s: float) -> bool:
-        """Whether `datagram` shows that the vehicle sends from `place` now; if so, pin it there."""
+    def moves_to(
+        self,
+        place: Hashable,
+        datagram: bytes,
+        now_s: float,
+        is_genuine: Callable[[Frame], bool] = lambda frame: frame.verified,
+    ) -> bool:
+        """Whether `datagram` shows that the vehicle sends from `place` now; if so, pin it there.
+        `is_genuine` tells whether a frame may be the vehicle's."""
         if now_s - self.heard_s <= PEER_SILENT_S or not same_host(place, self._place):
             return False
         moved = any(
-            frame.verified and Address(frame.system_id, frame.component_id) == self._vehicle
+            is_genuine(frame) and Address(frame.system_id, frame.component_id) == self._vehicle
             for frame in FrameSplitter(False, Counters()).split(datagram)
         )
         if moved:

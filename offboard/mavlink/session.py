@@ -10,50 +10,58 @@ change. Our system id is the vehicle's, which makes us one of its components.
 
 from __future__ import annotations
 
+import math
 from collections import deque
-from collections.abc import Hashable, Mapping
+from collections.abc import Hashable
 from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 from offboard.mavlink import framing
-from offboard.mavlink.counters import Counters, DropReason
+from offboard.mavlink.autopilots import AUTOPILOT_COMPONENT, Autopilots, is_companion
+from offboard.mavlink.autopilots import DIALECTS as DIALECTS
+from offboard.mavlink.counters import FORGED, Counters, DropReason
 from offboard.mavlink.decode import (
     Address,
     decode,
     decode_ack_address,
-    decode_identity,
+    decode_command,
     decode_text_chunk,
     decode_timesync,
 )
-from offboard.mavlink.dialects.ardupilot import ARDUPILOT
-from offboard.mavlink.dialects.base import TYPE_GCS, TYPE_ONBOARD_CONTROLLER, Dialect, WantedMessage
-from offboard.mavlink.dialects.px4 import PX4
+from offboard.mavlink.dialects.base import TYPE_ONBOARD_CONTROLLER, Dialect, WantedMessage
 from offboard.mavlink.encode import encode
 from offboard.mavlink.events import (
     Attitude,
+    ClockBehind,
+    CommandRequest,
     Event,
     GpsFix,
     LocalPosition,
+    ModeReport,
+    OtherCompanion,
     OtherSender,
     PeerChanged,
     Rebooted,
     TimesyncReply,
     VehicleFound,
 )
+from offboard.mavlink.events import Heartbeat as HeartbeatEvent
 from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Record, Timesync
 from offboard.mavlink.peer import Peer
+from offboard.mavlink.signing import Signing
 from offboard.mavlink.telemetry_rates import SHARE, TelemetryRates, fitted
 from offboard.mavlink.texts import TextAssembler
 from offboard.mavlink.vehicle_time import Age, LinkTime, VehicleTime
 
-DIALECTS: Mapping[str, Dialect] = MappingProxyType({d.name: d for d in (PX4, ARDUPILOT)})
+ACTIVE = 4  # MAV_STATE
 
-_HEARTBEAT, _COMMAND_ACK, _TIMESYNC, _STATUSTEXT = 0, 77, 111, 253
+_COMMANDS = (75, 76)  # COMMAND_INT, COMMAND_LONG
 # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: offset of target_system
 _SETPOINTS = MappingProxyType({82: 36, 84: 50, 86: 50})
 _ECHOES = 256  # newest frames of ours that are recognised when they come back
-_AUTOPILOT_COMPONENT = 1
-_NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
+# A link may reorder: a report of the mode this close behind a newer one says nothing new
+_REORDERED_FRAMES, _REORDERED_S = 32, 0.1
+_NOT_LOGGED = (DropReason.ECHO, *FORGED)
 _HEARTBEAT_PERIOD_S = 0.999  # 1 Hz; below 1 s, so that no rounding error delays it by a cycle
 
 
@@ -61,6 +69,7 @@ _HEARTBEAT_PERIOD_S = 0.999  # 1 Hz; below 1 s, so that no rounding error delays
 class SessionSettings:
     """How a session behaves.
 
+    `system_id` is the only system that may be the vehicle; None: the first autopilot heard.
     `record_component_id` is the sender of records, which only our log holds; each component id has
     its own sequence numbers. `stream`: serial or TCP, bytes arrive in any portions. `sends_first`:
     send heartbeats before an autopilot was heard. `extra_wanted` is telemetry besides that of the
@@ -69,6 +78,7 @@ class SessionSettings:
     and `poll` are ignored, so that nothing that is sent depends on them.
     """
 
+    system_id: int | None = None
     component_id: int = 191  # MAV_COMP_ID_ONBOARD_COMPUTER
     record_component_id: int = 191
     stream: bool = False
@@ -82,8 +92,9 @@ class SessionSettings:
 class Reception:
     """Result of one portion of bytes.
 
-    `frames` are all with a correct checksum, used or not, except those with our ids; they are for
-    the log, in which our ids mean that we sent a frame.
+    `frames` are all with a correct checksum, used or not, except those with our ids and those that
+    signing refused; they are for the log, in which our ids mean that we sent a frame. `unlogged`
+    are those that another program sent with our ids, each after the number of `frames` before it.
     `replies` answer TIMESYNC requests. They must be sent last: in lockstep, what is sent after the
     reply is applied one barrier later.
     """
@@ -91,16 +102,22 @@ class Reception:
     frames: tuple[bytes, ...] = ()
     events: tuple[Event, ...] = ()
     replies: tuple[Outgoing, ...] = ()
+    unlogged: tuple[tuple[int, bytes], ...] = ()
 
 
 class Session:
-    """See the module. `vehicle` and `dialect` are None until an autopilot was heard."""
+    """See the module. `vehicle` and `dialect` are None until an autopilot was heard. With `signing`
+    all frames are signed, and those without its signature are dropped."""
 
-    def __init__(self, settings: SessionSettings) -> None:
+    def __init__(self, settings: SessionSettings, signing: Signing | None = None) -> None:
         self.settings = settings
+        self.autopilots = Autopilots(settings.system_id)
+        self._signing = signing
+        self._greeted: Dialect | None = None  # autopilot whose clock is behind ours
         self.counters = Counters()
         self.vehicle: VehicleFound | None = None
         self.dialect: Dialect | None = None
+        self.status = (ACTIVE, 0)  # system_status and custom_mode of our heartbeat
         self._own = Address(1, settings.component_id)
         self._peer = Peer()
         self._splitter = framing.FrameSplitter(settings.stream, self.counters)
@@ -113,6 +130,7 @@ class Session:
         self._rates = TelemetryRates((), 0.0)
         self._capacity_bytes_ps = settings.capacity_bytes_ps
         self._heartbeat_sent: tuple[float, float] | None = None  # host time, link time
+        self._mode_report = (0, -math.inf)  # sequence number of the newest, and when it arrived
 
     # --- in ---
 
@@ -121,9 +139,10 @@ class Session:
         self._arrival_s = self._time.newest_s
         now_s = self._clock_s(now_s)
         frames: list[bytes] = []
+        unlogged: list[tuple[int, bytes]] = []
         events: list[Event] = []
         if self._peer.is_foreign(peer):
-            if not self._peer.moves_to(peer, datagram, now_s):
+            if not self._peer.moves_to(peer, datagram, now_s, self._is_genuine):
                 self.counters.dropped[DropReason.FOREIGN_PEER] += 1
                 return Reception()
             self._heartbeat_sent = None  # a router learns our address from it
@@ -139,9 +158,12 @@ class Session:
                 self.counters.decoded += 1
             else:
                 self.counters.ignored += 1
-            if frame.verified and outcome not in (DropReason.ECHO, DropReason.SAME_IDS):
+            secret = frame.message_id == framing.SETUP_SIGNING  # holds the key
+            if outcome is DropReason.SAME_IDS and not secret:
+                unlogged.append((len(frames), frame.raw))
+            elif frame.verified and not secret and outcome not in _NOT_LOGGED:
                 frames.append(frame.raw)
-        return Reception(tuple(frames), tuple(events), tuple(replies))
+        return Reception(tuple(frames), tuple(events), tuple(replies), tuple(unlogged))
 
     def _accept(
         self,
@@ -156,18 +178,28 @@ class Session:
         ours = sender == self._own
         if ours and frame.raw in self._sent:
             return DropReason.ECHO
+        forged = self._signing.accept(frame) if self._signing else None
+        if forged:
+            self.counters.forged += 1
+            if forged is DropReason.OLD_STAMP and self.vehicle is None:
+                self._greet(frame, events)
+            return forged
         if self.vehicle is not None and (ours or self._is_setpoint(frame)):
             events.append(OtherSender(*sender, frame.message_id))
         if ours:
             return DropReason.SAME_IDS
+        if frame.message_id in _COMMANDS and frame.verified and self.vehicle is not None:
+            return self._requested(frame, sender, events)
         foreign = self._check_sender(frame, peer, events)
         if foreign is not None:
+            if self.vehicle is not None and is_companion(frame, self._own.system_id):
+                events.append(OtherCompanion(*sender))
             return foreign
-        if self.vehicle is not None:
-            self._peer.heard_s = now_s
         if not frame.verified:
             return DropReason.UNKNOWN_ID
-        if frame.message_id == _TIMESYNC:
+        if self.vehicle is not None:
+            self._peer.heard_s = now_s
+        if frame.message_id == framing.TIMESYNC:
             tc1_ns, ts1_ns = decode_timesync(frame.payload)
             if tc1_ns == 0:
                 # a reply at time 0 would look like a request
@@ -177,6 +209,16 @@ class Session:
                 events.append(TimesyncReply(ts1_ns, tc1_ns + wrapped_ns))
             return True
         return self._interpret(frame, now_s, events)
+
+    def _requested(
+        self, frame: framing.Frame, sender: Address, events: list[Event]
+    ) -> DropReason | bool:
+        """A command on the vehicle's own link; one to all components is not for us."""
+        command, parameters, receiver = decode_command(frame.message_id, frame.payload)
+        if receiver != self._own:
+            return DropReason.NOT_FOR_US
+        events.append(CommandRequest(command, parameters, *sender))
+        return True
 
     def _is_setpoint(self, frame: framing.Frame) -> bool:
         """Whether it is a setpoint for our vehicle, or for all: routers forward those of others."""
@@ -190,34 +232,50 @@ class Session:
         self, frame: framing.Frame, peer: Hashable, events: list[Event]
     ) -> DropReason | None:
         """Why this frame is not from our vehicle; the first heartbeat of an autopilot pins it."""
+        heard = self.autopilots.note(frame)
         if self.vehicle is not None:
             if frame.system_id != self.vehicle.system_id:
                 return DropReason.FOREIGN_SYSTEM
             if frame.component_id != self.vehicle.component_id:
                 return DropReason.FOREIGN_COMPONENT
             return None
-        if frame.component_id != _AUTOPILOT_COMPONENT:
+        if frame.component_id != AUTOPILOT_COMPONENT:
             return DropReason.FOREIGN_COMPONENT
-        if frame.message_id == _TIMESYNC and frame.verified:
+        if self.settings.system_id not in (None, frame.system_id):
+            return DropReason.FOREIGN_SYSTEM
+        if frame.message_id == framing.TIMESYNC and frame.verified:
             return None  # a simulator in lockstep may need the reply before its first heartbeat
-        if frame.message_id != _HEARTBEAT or not frame.verified:
-            return DropReason.NO_VEHICLE
-        return self._pin(frame, peer, events)
-
-    def _pin(self, frame: framing.Frame, peer: Hashable, events: list[Event]) -> DropReason | None:
-        """Take the sender of this heartbeat as the vehicle, if it is a supported autopilot."""
-        identity = decode_identity(frame.payload)
-        if identity.vehicle_type == TYPE_GCS or identity.autopilot == _NO_AUTOPILOT:
-            return DropReason.NO_VEHICLE
-        dialect = next(
-            (d for d in DIALECTS.values() if d.mav_autopilot == identity.autopilot), None
-        )
-        if dialect is None:
-            return DropReason.UNSUPPORTED_AUTOPILOT
-        vehicle = VehicleFound(frame.system_id, frame.component_id, dialect.name)
+        if not isinstance(heard, Dialect):
+            return heard or DropReason.NO_VEHICLE
+        if frame.signed and self._signing is None:
+            return DropReason.NO_KEY
+        vehicle = VehicleFound(frame.system_id, frame.component_id, heard.name)
         self.adopt(vehicle, peer)
         events.append(vehicle)
         return None
+
+    def _greet(self, frame: framing.Frame, events: list[Event]) -> None:
+        """Send our heartbeat to a vehicle whose signature is right and whose clock is behind: its
+        time stamp becomes the vehicle's time, as ours would become its. It may be a replay, so that
+        nothing else is believed."""
+        heard = self.autopilots.note(frame)
+        wanted = self.settings.system_id in (None, frame.system_id)
+        if isinstance(heard, Dialect) and wanted:
+            self._greeted = heard
+            events.append(ClockBehind(frame.system_id))
+
+    def _is_genuine(self, frame: framing.Frame) -> bool:
+        """Whether this frame could be accepted from the vehicle."""
+        return frame.verified and (self._signing is None or self._signing.fault(frame) is None)
+
+    def overhear(self, datagram: bytes) -> list[int]:
+        """Systems with an autopilot that this datagram, from another address than the vehicle's, is
+        the first to show."""
+        known = len(self.autopilots.systems)
+        for frame in framing.FrameSplitter(False, Counters()).split(datagram):
+            if self._is_genuine(frame):
+                self.autopilots.note(frame)
+        return self.autopilots.systems[known:]
 
     def adopt(self, vehicle: VehicleFound, peer: Hashable) -> None:
         """Take this vehicle, which sends from `peer`, as ours."""
@@ -233,14 +291,16 @@ class Session:
     ) -> DropReason | bool:
         """Turn a frame of the vehicle into events."""
         assert self.dialect is not None
-        if frame.message_id == _STATUSTEXT:
+        if frame.message_id == framing.STATUSTEXT:
             events.extend(self._texts.add(decode_text_chunk(frame.payload), now_s))
             return True
-        if frame.message_id == _COMMAND_ACK and not self._for_us(frame.payload):
+        if frame.message_id == framing.COMMAND_ACK and not self._for_us(frame.payload):
             return DropReason.NOT_FOR_US
         event = decode(frame.message_id, frame.payload, self.dialect)
         if isinstance(event, DropReason):
             return event
+        if isinstance(event, (HeartbeatEvent, ModeReport)) and self._overtaken(frame, now_s):
+            return DropReason.STALE
         age = Age.FRESH
         if isinstance(event, (LocalPosition, Attitude, GpsFix)) and event.time_s is not None:
             event = replace(event, time_s=event.time_s + self._time.wrapped_s(event.time_s))
@@ -259,6 +319,15 @@ class Session:
             self._link_time.vehicle(event.time_s, now_s)
         events.append(event)
         return True
+
+    def _overtaken(self, frame: framing.Frame, now_s: float) -> bool:
+        """Whether this report of the mode was sent before the newest one."""
+        newest, arrived_s = self._mode_report
+        behind = (newest - frame.sequence) % 256
+        if 0 < behind <= _REORDERED_FRAMES and now_s - arrived_s < _REORDERED_S:
+            return True
+        self._mode_report = frame.sequence, now_s
+        return False
 
     def _for_us(self, ack_payload: bytes) -> bool:
         to = decode_ack_address(ack_payload)
@@ -291,7 +360,8 @@ class Session:
         """
         now_s = self._clock_s(now_s)
         self._link_time.host(now_s)
-        if self.dialect is None and not self.settings.sends_first:
+        dialect = self.dialect or self._greeted
+        if dialect is None and not self.settings.sends_first:
             return ()  # PX4 does not notice a change of the type: the first must be right
         due: list[Outgoing] = []
         link_s = self._link_time.seconds
@@ -300,8 +370,8 @@ class Session:
             >= _HEARTBEAT_PERIOD_S
         ):
             self._heartbeat_sent = (now_s, link_s)
-            kind = TYPE_ONBOARD_CONTROLLER if self.dialect is None else self.dialect.heartbeat_type
-            due.append(Heartbeat(kind))
+            kind = TYPE_ONBOARD_CONTROLLER if dialect is None else dialect.heartbeat_type
+            due.append(Heartbeat(kind, *self.status))
         requests = self._rates.due(link_s)
         return (*due, *(CommandLong.message_interval(w.message_id, w.rate_hz) for w in requests))
 
@@ -320,7 +390,12 @@ class Session:
             component_id = self.settings.record_component_id
         sequence = self._sequence_out.get(component_id, 0)
         self._sequence_out[component_id] = (sequence + 1) % 256
-        frame = framing.pack(*packed, sequence, self._own.system_id, component_id)
+        signing = None if isinstance(outgoing, Record) else self._signing
+        frame = framing.pack(
+            *packed, sequence, self._own.system_id, component_id, signed=signing is not None
+        )
+        if signing:
+            frame = signing.sign(frame)
         self._sent.append(frame)
         return frame
 
@@ -338,3 +413,8 @@ class Session:
     def rates_hz(self) -> dict[str, float]:
         """Measured rate of each wanted message over the last two seconds of `link_time_s`."""
         return self._rates.measured_hz(self._link_time.seconds)
+
+    @property
+    def wanted_bytes_ps(self) -> float:
+        """Bytes per second of the telemetry that is requested."""
+        return self._rates.bytes_ps

@@ -66,6 +66,7 @@ class LinkTime:
         self._vehicle_s: float | None = None
         self._received_s: float | None = None
         self._host_s: float | None = None
+        self._bridged_s = 0.0  # counted since the newest telemetry
 
     def vehicle(self, time_s: float, now_s: float) -> None:
         """Telemetry with the stamp `time_s` arrived at host time `now_s`. A stamp older than the
@@ -73,12 +74,18 @@ class LinkTime:
         self._received_s = now_s
         step_s = 0.0 if self._vehicle_s is None else time_s - self._vehicle_s
         if self._vehicle_s is None or step_s > 0.0 or step_s < -_REBOOT_S:
-            self.seconds += min(max(step_s, 0.0), _SILENCE_S)
+            self.seconds += max(min(step_s, _SILENCE_S) - self._bridged_s, 0.0)
+            self._bridged_s = 0.0
             self._vehicle_s = time_s
 
     def host(self, now_s: float) -> None:
-        """Host time is `now_s`; it counts once no telemetry has arrived for a second."""
-        flowing = self._received_s is not None and now_s - self._received_s <= _SILENCE_S
-        if not flowing and self._host_s is not None:
-            self.seconds += max(now_s - self._host_s, 0.0)
+        """Host time is `now_s`; once no telemetry has arrived for a second, all the time since the
+        newest counts."""
+        if self._received_s is None:
+            silent_s = self._bridged_s + (0.0 if self._host_s is None else now_s - self._host_s)
+        else:
+            silent_s = now_s - self._received_s
+        if self._received_s is None or silent_s > _SILENCE_S:
+            self.seconds += max(silent_s - self._bridged_s, 0.0)
+            self._bridged_s = max(silent_s, self._bridged_s)
         self._host_s = now_s

@@ -7,6 +7,7 @@ texts. Knows no firmware by name, no MAVLink frames, sockets or clock.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
@@ -74,7 +75,21 @@ class Commander:
     @property
     def healthy(self) -> bool:
         """The pre-arm checks pass in the intended mode."""
+        if self.rejects_velocity:
+            return False
         return self._health.passes(self.intended, self._state.time_s, latched=bool(self._latched))
+
+    @property
+    def velocity_ratio(self) -> float:
+        """Innovation ratio of the velocity in the estimator."""
+        error_mps = math.hypot(*self._state.velocity_error_ned_mps)
+        return self._firmware.health.velocity_ratio(error_mps)
+
+    @property
+    def rejects_velocity(self) -> bool:
+        """The innovation ratio of the velocity is too large to arm."""
+        most = self._firmware.health.velocity_ratio_most(self._parameters.__getitem__)
+        return most > 0.0 and self.velocity_ratio >= most
 
     @property
     def heartbeat(self) -> tuple[int, int]:
@@ -231,8 +246,11 @@ CONDITIONS: dict[str, Callable[[Commander], bool]] = {
     "mode needs position": lambda c: c.mode.needs_position,
     "mode arms": lambda c: c.mode.arms,
     "position missing": lambda c: (
-        c._requested.needs_position and "position" not in c._health.reached
+        c._requested.needs_position
+        and ("position" not in c._health.reached or c._health.position_lost)
     ),
+    "fix missing": lambda c: not c._health.has_fix(c._state.time_s) or not c._state.gps_healthy,
+    "velocity rejected": lambda c: c.rejects_velocity,
     "mission missing": lambda c: not c._guidance.mission.flyable,
     "climb requested": lambda c: c._request.takeoff_ned_m[2] <= c._guidance.home_ned_m[2],
     "climbing": lambda c: c._navigator.behaviour is Behaviour.TAKEOFF,

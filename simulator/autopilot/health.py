@@ -33,6 +33,11 @@ class Health:
             self.reached |= {event}
             yield event
 
+    @property
+    def position_lost(self) -> bool:
+        """The position estimate is lost since a fault took the fix away."""
+        return self._monitors.position_lost
+
     def has_fix(self, now_s: float) -> bool:
         """GPS has its first fix; a fault may take it away."""
         return now_s >= self._firmware.health.sensors.first_fix_s * self.boot_scale
@@ -42,6 +47,8 @@ class Health:
         firmware = self._firmware
         after_s = firmware.health.passes_without_position_after_s
         if mode.needs_position:
+            if self.position_lost:
+                return False
             after_s = firmware.health.passes_after_s
         if latched or now_s < after_s * self.boot_scale:
             return False

@@ -27,7 +27,7 @@ class Monitors:
     _heartbeat_s: float = math.nan  # last one of a ground station
     _battery_level: int = 0  # reported; of `firmware.health.battery_events`
     _worse_s: float = math.nan  # since when the level is above that
-    _fix_s: float = 0.0  # last one
+    _fix_s: float = -math.inf  # last one
 
     def ground_station_heard(self, now_s: float) -> None:
         self._heartbeat_s = now_s

@@ -78,7 +78,7 @@ AFTER_DELAY = " after delay"
 EVENTS = frozenset({
     # requests: commands, messages, faults that act for a pilot
     "mode", "takeoff", "land", "return", "loiter", "turn", "mission", "reboot",
-    "arm", "disarm", "force arm", "force disarm", "thrust not a number",
+    "arm", "disarm", "force arm", "force disarm", "checks", "thrust not a number",
     # monitoring
     "stream lost", "stream found", "position lost", "position found",
     "ground station lost", "ground station found",
@@ -199,6 +199,8 @@ class LinkRules:
     text_to_ground_stations_only: bool
     parameters_bytewise: bool  # PARAM_VALUE holds the bytes of an integer, not its value
     parameters_hashed: bool  # a list begins with _HASH_CHECK
+    accepted_unsigned: frozenset[int]  # messages that need no signature
+    stamps_follow_clock: bool  # of signatures; else they only count, and follow those of others
     parameters_numbered: bool  # PARAM_VALUE.param_index is set also outside a list
 
 
@@ -225,6 +227,8 @@ class HealthRules:
     passes_without_position_after_s: float  # the same for modes that need none
     fails_where_unarmable: bool  # pre-arm checks fail in a mode that does not arm
     position_without_fix_s: float  # until the position estimate is lost
+    velocity_ratio: Callable[[float], float]  # error of the velocity in m/s -> innovation ratio
+    velocity_ratio_most: Callable[[ReadParameter], float]  # to arm; 0: not checked
     battery_level: Callable[[BatteryState, ReadParameter], int]  # 0: good
     battery_events: tuple[str, ...]  # of levels 1 on
 

@@ -11,6 +11,7 @@ from pathlib import Path
 from simulator.link.impairment import frames
 
 _STAMP = struct.Struct(">Q")
+_NO_FRAME, _SETUP_SIGNING = -1, 256  # which holds the key
 
 
 class Recorder:
@@ -26,7 +27,7 @@ class Recorder:
             stamp + frame
             for datagram in datagrams
             for message_id, frame in frames(datagram)
-            if message_id >= 0
+            if message_id not in (_NO_FRAME, _SETUP_SIGNING)
         ]
         if not records:
             return

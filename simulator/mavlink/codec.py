@@ -17,10 +17,11 @@ from typing import Any
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import all as dialect  # also CURRENT_MODE, which common lacks
 
+from simulator.mavlink.signing import REFUSALS, SIGNATURE_LENGTH, Keyring
+
 MAGIC_V1 = 0xFE
 MAGIC_V2 = 0xFD
 SIGNED = 0x01  # incompatibility flag: 13 bytes of signature follow
-SIGNATURE_LENGTH = 13
 
 _HEADER_V2 = struct.Struct("<BBBBBBHB")  # length, flags x 2, seq, sys, comp, id (24 bit)
 _MAGIC_BYTE = bytes((MAGIC_V2,))
@@ -153,10 +154,18 @@ def name_of(message_id: int) -> str | None:
     return None if found is None else found.name
 
 
-def frame(sequence: int, system: int, component: int, message: Layout, payload: bytes) -> bytes:
-    """One unsigned MAVLink 2 frame with a packed payload."""
+def frame(
+    sequence: int,
+    system: int,
+    component: int,
+    message: Layout,
+    payload: bytes,
+    *,
+    flags: int = 0,
+) -> bytes:
+    """One MAVLink 2 frame with a packed payload, without its signature if `flags` has SIGNED."""
     low, high = message.id & 0xFFFF, message.id >> 16
-    head = _HEADER_V2.pack(len(payload), 0, 0, sequence, system, component, low, high)
+    head = _HEADER_V2.pack(len(payload), flags, 0, sequence, system, component, low, high)
     body = head + payload
     crc = mcrf4xx(body + message.extra_byte)
     return _MAGIC_BYTE + body + crc.to_bytes(2, "little")
@@ -167,10 +176,16 @@ class Decoder:
     """Datagrams -> messages. Unreadable bytes are dropped and counted by reason.
 
     A datagram holds whole frames: nothing is kept for the next one, so that garbage cannot delay
-    or hide a later command.
+    or hide a later command. A message that `keyring` refuses is dropped.
     """
 
+    keyring: Keyring | None = None
     dropped: Counter[str] = field(default_factory=Counter)
+
+    @property
+    def refused(self) -> Counter[str]:
+        """Messages that `keyring` refused, by reason."""
+        return Counter({f"message refused: {why}": self.dropped[why] for why in REFUSALS})
 
     def read(self, datagram: bytes) -> list[Message]:
         """All intact messages of `datagram`, in order, also those after garbage."""
@@ -209,6 +224,12 @@ class Decoder:
         crc = mcrf4xx(data[at + 1 : stop] + bytes((known.crc_extra,)))
         if data[stop] | data[stop + 1] << 8 != crc:
             return self._skip("checksum")
+        if self.keyring is not None:
+            signed = data[at : at + length] if flags & SIGNED else None
+            refused = self.keyring.complaint(message_id, (system, component), signed)
+            if refused:
+                self.dropped[refused] += 1
+                return length, None
         values = known.unpack(data[at + head : stop])
         return length, Message(known.name, message_id, system, component, values)
 

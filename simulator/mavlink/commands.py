@@ -97,6 +97,10 @@ class Commands:
         forced = command.params[1] == autopilot.firmware.commands.force_codes[request.event]
         return autopilot.handle(f"force {request.event}" if forced else request.event)
 
+    def _run_checks(self, _: Command) -> Result:
+        """MAV_CMD_RUN_PREARM_CHECKS: texts say what fails."""
+        return self._autopilot.handle("checks")
+
     def _takeoff(self, command: Command) -> Result:
         height_m = command.params[6]
         autopilot = self._autopilot
@@ -284,6 +288,7 @@ HANDLERS: dict[int, Callable[[Commands, Command], Result | None]] = {
     246: Commands._reboot,  # PREFLIGHT_REBOOT_SHUTDOWN
     300: Commands._start_mission,  # MISSION_START
     400: Commands._arm_disarm,  # COMPONENT_ARM_DISARM
+    401: Commands._run_checks,  # RUN_PREARM_CHECKS
     410: Commands._request_home,  # GET_HOME_POSITION
     510: Commands._get_interval,  # GET_MESSAGE_INTERVAL
     511: Commands._set_interval,  # SET_MESSAGE_INTERVAL

@@ -8,7 +8,8 @@ from __future__ import annotations
 from collections import Counter
 from dataclasses import dataclass, field
 
-from simulator.mavlink.codec import frame, layout
+from simulator.mavlink.codec import SIGNED, frame, layout
+from simulator.mavlink.signing import SIGNATURE_LENGTH, Keyring
 from simulator.mavlink.view import View
 
 MAV_COMP_ID_AUTOPILOT = 1
@@ -17,9 +18,12 @@ DATAGRAM_MAX = 1400
 
 @dataclass(slots=True)
 class Outbox:
-    """Send queue. `sequence`: number of the next frame, 0 .. 255."""
+    """Send queue. `sequence`: number of the next frame, 0 .. 255. With a key of `keyring` frames
+    are signed; `link` is the number of the link in the signature."""
 
     view: View
+    keyring: Keyring
+    link: int
     sequence: int = 0
     _frames: list[bytes] = field(default_factory=list)
     _suppressed: Counter[str] = field(default_factory=Counter)
@@ -45,7 +49,11 @@ class Outbox:
 
     def _frame(self, name: str, payload: bytes) -> None:
         numbers = (self.sequence, self.view.system, MAV_COMP_ID_AUTOPILOT)
-        self._frames.append(frame(*numbers, layout(name), payload))
+        if self.keyring.on:
+            flagged = frame(*numbers, layout(name), payload, flags=SIGNED)
+            self._frames.append(self.keyring.seal(flagged, self.link))
+        else:
+            self._frames.append(frame(*numbers, layout(name), payload))
         self.sequence = (self.sequence + 1) & 0xFF
 
     def drain(self) -> list[bytes]:
@@ -58,11 +66,12 @@ class Outbox:
 
 
 def _datagrams(frames: bytes) -> list[bytes]:
-    """Unsigned frames, cut between frames into datagrams of at most DATAGRAM_MAX bytes."""
+    """Frames, cut between frames into datagrams of at most DATAGRAM_MAX bytes."""
     datagrams: list[bytes] = []
     begin = at = 0
     while at < len(frames):
-        length = 12 + frames[at + 1]
+        signature = SIGNATURE_LENGTH if frames[at + 2] & SIGNED else 0
+        length = 12 + frames[at + 1] + signature
         if at + length - begin > DATAGRAM_MAX:
             datagrams.append(frames[begin:at])
             begin = at

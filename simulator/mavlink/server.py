@@ -18,6 +18,7 @@ from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT, Outbox
 from simulator.mavlink.parameter_transfer import HANDLERS as PARAMETER_HANDLERS
 from simulator.mavlink.parameter_transfer import ParameterTransfer
 from simulator.mavlink.schedule import Schedule
+from simulator.mavlink.signing import Keyring
 from simulator.mavlink.strict import Strict
 from simulator.mavlink.texts import Texts
 from simulator.mavlink.view import View
@@ -33,15 +34,19 @@ class Server:
     Args:
         view: contents of the messages.
         rates_hz: messages sent without a request.
+        keyring: signing, of the vehicle.
+        number: of the link.
         barrier: leave TIMESYNC requests to `send_barrier`: in lockstep they are the clock.
         strict: reports messages that the autopilot ignores.
     """
 
     view: View
     rates_hz: Mapping[str, float]
+    keyring: Keyring
+    number: int
     barrier: bool = False
     strict: Strict | None = None
-    decoder: Decoder = field(default_factory=Decoder)
+    decoder: Decoder = field(init=False)
     answered_ns: int = -1  # ts1 of the newest TIMESYNC answer
     outbox: Outbox = field(init=False)
     schedule: Schedule = field(init=False)
@@ -51,7 +56,8 @@ class Server:
     _missions: MissionTransfer = field(init=False)
 
     def __post_init__(self) -> None:
-        self.outbox = Outbox(self.view)
+        self.decoder = Decoder(self.keyring)
+        self.outbox = Outbox(self.view, self.keyring, self.number)
         clock = ("TIMESYNC",) if self.barrier else ()
         rates_hz = {name: hz for name, hz in self.rates_hz.items() if name not in clock}
         self.schedule = Schedule(self.view, rates_hz)
@@ -187,6 +193,11 @@ class Server:
         if autopilot.firmware.link.is_ground_station(0, message.system, read):
             autopilot.guidance.sticks.override(widths_us, autopilot.state.time_s)
 
+    def _setup_signing(self, message: Message) -> None:
+        """A new signing key; not while armed."""
+        if not self.view.autopilot.commander.armed:
+            self.keyring.set_up(bytes(message.secret_key), message.initial_timestamp)
+
     def _log_request_list(self, _: Message) -> None:
         """There are no logs."""
         self.outbox.send("LOG_ENTRY", 0, 0, 0, 0, 0)
@@ -216,6 +227,7 @@ HANDLERS: dict[str, Callable[[Server, Message], None]] = {
     **dict.fromkeys(PARAMETER_HANDLERS, Server._parameter),
     "RC_CHANNELS_OVERRIDE": Server._rc_channels_override,
     "MANUAL_CONTROL": Server._manual_control,
+    "SETUP_SIGNING": Server._setup_signing,
     "LOG_REQUEST_LIST": Server._log_request_list,
     "REQUEST_DATA_STREAM": Server._request_data_stream,
     "FILE_TRANSFER_PROTOCOL": Server._file_transfer,

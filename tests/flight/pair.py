@@ -92,6 +92,7 @@ class Pair:
     up: Filter = through
     at: list[tuple[Callable[[Pair], bool], Callable[[Pair], object]]] = field(default_factory=list)
     dead: bool = False
+    rate: float = 1.0  # of the vehicle's clock, against that of the host
     time_s: float = 0.0
     steps: int = 0
     sent: list[tuple[float, Phase, bytes]] = field(default_factory=list)  # by the companion
@@ -113,7 +114,7 @@ class Pair:
         """One step of the vehicle, and the turns of the companion that follow."""
         self.steps += 1
         self.time_s = self.steps * STEP_S
-        now_s = HOST_EPOCH_S + self.time_s
+        now_s = HOST_EPOCH_S + self.time_s / self.rate
         datagrams = [] if self.dead else self.down(self.time_s, self.instance.step())
         self.waiting += [Chunk(datagram, "vehicle", now_s) for datagram in datagrams]
         if now_s >= self.clock.now_s:
@@ -147,7 +148,7 @@ class Pair:
         worst = self.companion.state.ladder.worst
         if worst is not None:
             self.rungs[worst.name] = worst.rung
-        if self.clock.now_s <= HOST_EPOCH_S + self.time_s:
+        if self.clock.now_s <= HOST_EPOCH_S + self.time_s / self.rate:
             self._feed()
 
     def _feed(self) -> None:

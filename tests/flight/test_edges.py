@@ -71,6 +71,11 @@ class Flight:
     def announce(self, sentence: str) -> None:
         self.announced.append(sentence)
 
+    def on_dropped(self, frames: int) -> None:
+        self.dropped = frames
+
+    def overhear(self, datagrams: Sequence[bytes]) -> None: ...
+
     def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
         self.turns -= 1
         self.during(self.turns)
@@ -169,6 +174,7 @@ def test_what_a_turn_decided_is_dropped_when_it_became_too_old(tmp_path: Path) -
             supervisor=cast(Supervisor, Watcher()),
         ).run()
     assert sent == [setpoint(3), setpoint(1)]
+    assert flight.dropped == 1
     assert flight.announced == ["1 messages dropped: they became too old"]
     assert (directory / "flight.tlog").read_bytes().count(setpoint(2)) == 0
 

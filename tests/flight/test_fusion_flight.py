@@ -12,7 +12,7 @@ import pytest
 from pair import LEAN, Pair, in_phase, make
 
 from offboard.analysis import history
-from offboard.flight.phases import Phase
+from offboard.flight.phases import ExitCode, Phase
 from simulator.firmware.px4 import PX4
 
 LQR = "controller={law: lqr, bandwidth_radps: 5.0}"
@@ -49,6 +49,15 @@ def test_error_is_half_that_of_the_vehicles_estimate(tmp_path: Path) -> None:
     by_fusion_m, by_estimate_m = np.sqrt(np.mean(np.square(flown), axis=0))
     assert max(own for own, _ in flown) < 0.25
     assert by_fusion_m < 0.5 * by_estimate_m
+
+
+def test_a_reported_position_that_stands_still_ends_the_flight() -> None:
+    """Although fixes still arrive, with which the fused position would go on."""
+    pair = make(*FUSED, scenario="frozen_position", firmware=WITH_RECEIVER, seed=1)
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert outcome.sentence.startswith("no LOCAL_POSITION_NED for 0.")
+    assert any("own position fusion in use" in line for line in pair.companion.announced)
 
 
 def test_without_fusion_the_vehicles_estimate_is_followed(tmp_path: Path) -> None:

@@ -9,8 +9,9 @@ from pathlib import Path
 
 import pytest
 from faults import late
-from pair import Pair, in_phase, make, through
+from pair import Pair, hover, in_phase, make, through
 
+from offboard.flight.link_age import LEAST_GROWTH_S
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import ExitCode, Phase
 
@@ -72,3 +73,15 @@ def test_prompt_link_changes_nothing() -> None:
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert pair.companion.state.growth.added_s == 0.0
     assert not any("grown" in line for line in pair.companion.announced)
+
+
+@pytest.mark.parametrize("rate", [0.96, 0.99])
+def test_simulator_slower_than_real_time_is_flown_as_any_other(rate: float) -> None:
+    """PX4's simulation on a busy computer. Taken for a link that becomes later, its identified
+    delay was 50 ms too short, and below 0.95 of real time the flight was aborted."""
+    pair = hover(vehicle="px4_sih", scenario="px4_like", learning=IdentifySettings(), rate=rate)
+    assert pair.fly().exit_code == ExitCode.FLOWN
+    state = pair.companion.state
+    assert state.growth.added_s <= LEAST_GROWTH_S
+    assert state.model.tilt.delay_s == pytest.approx(0.06, abs=0.015)
+    assert not pair.rungs

@@ -8,7 +8,7 @@ from offboard.flight.recovery import LONGEST_S, Recovery
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.dialects.px4 import PX4
-from offboard.mavlink.events import CommandAck, Heartbeat
+from offboard.mavlink.events import CommandAck, Heartbeat, ModeReport
 
 STEP_S = 0.02
 FIRMWARES = pytest.mark.parametrize("dialect", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])
@@ -121,6 +121,25 @@ def test_of_a_vehicle_that_is_not_heard_hold_is_asked_three_times(dialect: Diale
     assert vehicle.survives() == f"not landed after {LONGEST_S:.0f} s"
     assert [command for _, command in vehicle.asked] == [HOLD] * 3
     assert [at_s for at_s, _ in vehicle.asked] == pytest.approx([0.0, 0.3, 0.6], abs=0.03)
+
+
+@pytest.mark.parametrize("obeys", [True, False])
+def test_a_failsafe_that_crosses_the_request_is_not_the_end(obeys: bool) -> None:
+    """PX4's own failsafe comes one second after the last setpoint, as we do. A vehicle that left it
+    for our hold would hover until its battery is empty; one that did not is left alone."""
+    recovery = Recovery(PX4, 100.0)
+    recovery.see(Heartbeat(PX4.engage_mode, True, 4), 99.6)
+    assert recovery.due(100.0) is not None
+    recovery.see(ModeReport("POSCTL"), 100.01)
+    assert recovery.due(100.02) is None
+    assert recovery.ended == ""
+    requests = []
+    for step in range(13):
+        recovery.see(ModeReport(PX4.hold_mode if obeys else "POSCTL"), 100.5 + 0.5 * step)
+        requests.append(recovery.due(100.5 + 0.5 * step))
+    commands = {request.command.command for request in requests if request}
+    assert commands == ({LAND} if obeys else set())
+    assert (recovery.ended == "") is obeys
 
 
 def test_a_refusal_is_kept_to_be_said() -> None:

@@ -6,12 +6,14 @@ both firmwares.
 
 from __future__ import annotations
 
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
+import numpy as np
 import pytest
 from faults import stop, without
-from pair import in_phase, make, on_arducopter
+from pair import SHORT, hover, in_phase, make, on_arducopter
 from watch import (
     ARM,
     BOTH,
@@ -26,7 +28,8 @@ from watch import (
     watched,
 )
 
-from offboard.flight.phases import ExitCode, Phase
+from offboard.flight.phases import ExitCode, Phase, Rung
+from simulator.config import Scenario
 
 CURRENT_MODE, DISARM_BY_FORCE = 436, 21196
 
@@ -140,7 +143,10 @@ def test_a_second_companion_of_other_ids_shows_by_what_it_does(fly: Fly) -> None
     watch = watched(pair)
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
-    assert "deg away from every recent command" in outcome.sentence
+    assert (
+        "deg away from every recent command; another companion computer, system 1 component 194, "
+        "may send setpoints, too" in outcome.sentence
+    )
     assert watch.error_m < 5.0
 
 
@@ -232,6 +238,40 @@ def test_a_reset_of_the_estimate_is_flown(fly: Fly) -> None:
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert watch.error_m < 0.7  # of which the jump is 0.5
     assert pair.rungs == {}
+
+
+@pytest.mark.parametrize("fly", [hover, partial(on_arducopter, *SHORT, reference="hover")])
+def test_the_vehicle_does_not_step_with_its_estimate(fly: Fly) -> None:
+    """A reset by 1.5 m in a hover: it moves to its place in the new frame at up to 0.5 m/s."""
+    pair = fly("reference.duration_s=8.0", scenario=jumping(1.5))
+    watch = watched(pair)
+    assert pair.fly().exit_code == ExitCode.FLOWN
+    assert said(pair, "the estimated position jumped by 1.50 m: the reference jumps with it")
+    assert pair.rungs == {}
+    hovered = np.array([m.position_ned_m[:2] for m in watch.during(Phase.TRACK, Phase.HOVER)])
+    speeds_mps = np.linalg.norm(hovered[10:] - hovered[:-10], axis=1) / 0.2
+    assert 0.3 < speeds_mps.max() < 0.65
+    assert np.linalg.norm(hovered[-1] - hovered[0]) == pytest.approx(1.5, abs=0.1)
+
+
+@pytest.mark.parametrize("fly", [hover, partial(on_arducopter, *SHORT, reference="hover")])
+def test_a_large_reset_of_the_estimate_is_left_to_the_autopilot(fly: Fly) -> None:
+    pair = fly(scenario=jumping(3.0))
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert outcome.sentence.startswith("the estimated position jumped by 3.0 m")
+    assert pair.rungs["estimator"] is Rung.HOLD
+
+
+def jumping(offset_m: float) -> Scenario:
+    return scenario_of(
+        {
+            "fault": "estimator_jump",
+            "after": "took_off",
+            "at_s": 6.0,
+            "offset_ned_m": (0.0, offset_m, 0.0),
+        }
+    )
 
 
 # -- the end ---------------------------------------------------------------------------------------

@@ -7,12 +7,13 @@ period, when it reaches the vehicle.
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import pytest
-from faults import HEARTBEAT, frame_id, without
-from pair import Bytes, HostClock, Pair, frames_of, in_phase, make, on_arducopter
+from faults import HEARTBEAT, frame_id, shuffling, without
+from pair import SHORT, Bytes, HostClock, Pair, frames_of, hover, in_phase, make, on_arducopter
 from watch import BOTH, LAND, SET_MODE, Fly, Watch, said, sent_after, watched
 
 from offboard.control.base import Controller, Decision, Situation
@@ -62,6 +63,29 @@ def test_a_link_that_becomes_late_ends_in_hold_and_landing(scenario: str, fly: F
         sum((moment.position_ned_m[:2] - began.position_ned_m[:2]) ** 2) < 2.0**2
         for moment in watch.during(Phase.HOLD, Phase.LAND)
     )
+
+
+@pytest.mark.parametrize("fly", [hover, partial(on_arducopter, *SHORT, reference="hover")])
+def test_nothing_leaves_2_5_s_after_the_last_report_of_the_mode(fly: Fly) -> None:
+    """All telemetry stops, so that the vehicle's clock stands still; setpoints would go on."""
+    pair = fly(limits={"silence_s": 5.0})
+    stopped_s: list[float] = []
+
+    def stop(flying: Pair) -> None:
+        stopped_s.append(flying.time_s)
+        flying.down = lambda time_s, datagrams: []
+
+    pair.at.append((in_phase(Phase.TRACK, 1.0), stop))
+    assert pair.fly().exit_code == ExitCode.ABORTED
+    left_s = [at_s for at_s, _, _ in pair.setpoints]
+    assert stopped_s[0] + 1.0 < left_s[-1] <= stopped_s[0] + 2.5 + 0.02
+    assert pair.commands(SET_MODE)[1:] == pair.commands(LAND) == []
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_reports_of_the_mode_that_arrive_out_of_order_end_no_flight(seed: int) -> None:
+    pair = on_arducopter(*SHORT, reference="hover", down=shuffling(seed))
+    assert pair.fly().exit_code == ExitCode.FLOWN
 
 
 @BOTH

@@ -472,9 +472,9 @@ ROWS = (
         "a jump of 9 m",
         in_track(jump(9.0)),
         4,
-        "m from the reference (limit 5.0 m)",
+        "the estimated position jumped by 9.0 m",
         Phase.DISARMED,
-        soft_landing,
+        landed,
     ),
     Row(
         "upside down",

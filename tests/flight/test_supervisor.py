@@ -8,6 +8,7 @@ from __future__ import annotations
 import os
 import signal
 import socket
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,17 +17,23 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.analysis import tlog
+from offboard.flight import clock
 from offboard.flight.connection import open_link
 from offboard.flight.log import FlightLog
-from offboard.flight.supervisor import Guard, Supervisor
+from offboard.flight.supervisor import Supervised, Supervisor, SupervisorError
+from offboard.flight.udp_link import BATCH_MAX
 from offboard.mavlink.events import VehicleFound
+from offboard.mavlink.outgoing import Heartbeat
+from offboard.mavlink.session import Session, SessionSettings
+from offboard.mavlink.signing import Signing
 
 LONG_S = 20.0
+OFFBOARD, POSCTL, LANDING = 0x00060000, 0x00030000, 0x06040000
 VEHICLE = VehicleFound(7, 1, "px4")
 OURS, ON_GROUND, NOT_OURS = (
-    Guard(VEHICLE, ours=True, flying=True),
-    Guard(VEHICLE, ours=True, flying=False),
-    Guard(VEHICLE, ours=False, flying=True),
+    Supervised(VEHICLE, ours=True, flying=True),
+    Supervised(VEHICLE, ours=True, flying=False),
+    Supervised(VEHICLE, ours=False, flying=True),
 )
 
 
@@ -46,7 +53,7 @@ class Rig:
         self.log = FlightLog(directory / "x", "", real_time=True)
         self.supervisor = Supervisor()
 
-    def beat(self, guard: Guard) -> None:
+    def beat(self, guard: Supervised) -> None:
         self.supervisor.beat(guard, self.peer, self.link, self.log.descriptor)
 
     def abandon(self) -> None:
@@ -77,11 +84,15 @@ class Rig:
                 if message.get_type() == "COMMAND_LONG":
                     return message
 
+    def report(self, place: Any, mode: int, *, armed: bool = True) -> None:
+        """The vehicle reports its mode, as custom mode of PX4, to `place`."""
+        codec = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
+        message = mavlink.MAVLink_heartbeat_message(2, 12, 129 if armed else 1, mode, 4, 3)
+        self.vehicle.sendto(message.pack(codec), place)
+
     def disarm(self) -> None:
         """The vehicle reports that it is down, which ends the supervisor."""
-        codec = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
-        message = mavlink.MAVLink_heartbeat_message(2, 12, 1, 0x06040000, 3, 3)
-        self.vehicle.sendto(message.pack(codec), self.sender)
+        self.report(self.sender, LANDING, armed=False)
 
 
 @pytest.fixture(params=["udpin", "udpout"])
@@ -124,12 +135,26 @@ def test_it_takes_over_when_the_beats_stop_and_says_so_first(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize("guard", [ON_GROUND, NOT_OURS])
-def test_a_vehicle_that_is_not_ours_or_on_the_ground_is_left_alone(guard: Guard, rig: Rig) -> None:
+def test_a_vehicle_that_is_not_ours_or_on_the_ground_is_left_alone(
+    guard: Supervised, rig: Rig
+) -> None:
     rig.beat(OURS)
     rig.beat(guard)
     rig.abandon()
     rig.await_end()
     assert rig.heard() == []
+
+
+def test_the_newest_of_what_has_waited_decides(rig: Rig) -> None:
+    """While it waited for beats the vehicle has sent more than one batch, and left for POSCTL."""
+    rig.beat(OURS)
+    place = ("127.0.0.1", rig.link.port)
+    for _ in range(BATCH_MAX + 50):
+        rig.report(place, OFFBOARD)
+    rig.report(place, POSCTL)
+    rig.abandon()
+    rig.await_end()
+    assert [each for each in rig.heard() if each.get_type() == "COMMAND_LONG"] == []
 
 
 def test_signals_do_not_end_it(rig: Rig) -> None:
@@ -141,6 +166,91 @@ def test_signals_do_not_end_it(rig: Rig) -> None:
     rig.disarm()
 
 
+# --- other links, and signing ---
+
+
+class Caller:
+    """A vehicle that connects to us over TCP."""
+
+    def __init__(self, port: int) -> None:
+        self.socket = socket.create_connection(("127.0.0.1", port))
+        self.socket.settimeout(LONG_S)
+
+    def asked(self, codec: Any) -> Any:
+        """The next COMMAND_LONG."""
+        while True:
+            data = self.socket.recv(65536)
+            assert data, "disconnected"
+            for message in codec.parse_buffer(data) or []:
+                if message.get_type() == "COMMAND_LONG":
+                    return message
+
+
+@pytest.mark.parametrize("returns", ["before", "after"])
+def test_over_tcpin_it_asks_the_vehicle_that_connected_last(returns: str, tmp_path: Path) -> None:
+    """A connection that ended, and one that begins before or after the controller ended."""
+    link = open_link("tcpin:127.0.0.1:0")
+    with socket.socket(fileno=os.dup(link.descriptors()[0])) as listener:
+        port = listener.getsockname()[1]
+    with FlightLog(tmp_path / "x", "", real_time=True) as log, Supervisor() as supervisor:
+        supervisor.await_ready()
+        first = Caller(port)
+        while len(link.descriptors()) < 2:
+            link.receive(0.02)
+        supervisor.beat(OURS, "tcp", link, log.descriptor)
+        first.socket.close()
+        while len(link.descriptors()) > 1:
+            link.receive(0.02)
+        supervisor.beat(OURS, "tcp", link, log.descriptor)
+        if returns == "before":
+            second = Caller(port)
+            while len(link.descriptors()) < 2:
+                link.receive(0.02)
+            supervisor.beat(OURS, "tcp", link, log.descriptor)
+        supervisor._channel.close()
+        link.close()
+        if returns == "after":
+            second = Caller(port)
+        assert second.asked(mavlink.MAVLink(None)).command == 176
+        second.socket.close()
+        supervisor._process.kill()
+
+
+def test_it_signs_with_stamps_that_follow_ours(tmp_path: Path) -> None:
+    key = bytes(range(32))
+    signing = Signing(key, 10**12, clock.monotonic_s)
+    ours = Session(SessionSettings(), signing)
+    ours.adopt(VEHICLE, "tcp")
+    link = open_link("tcpin:127.0.0.1:0")
+    with socket.socket(fileno=os.dup(link.descriptors()[0])) as listener:
+        vehicle = Caller(listener.getsockname()[1])
+    reader = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
+    reader.signing.secret_key, reader.signing.sign_outgoing = key, True
+    reader.signing.timestamp = 10**12
+    with FlightLog(tmp_path / "x", "", real_time=True) as log, Supervisor(signing) as supervisor:
+        supervisor.await_ready()
+        while len(link.descriptors()) < 2:
+            link.receive(0.02)
+        for _ in range(3):
+            supervisor.beat(OURS, "tcp", link, log.descriptor)
+            newest = ours.encode(Heartbeat(6))
+        assert reader.decode(bytearray(newest)).get_type() == "HEARTBEAT"
+        assert key.hex() not in str(supervisor._process.args)
+        supervisor._channel.close()
+        link.close()
+        command = vehicle.asked(reader)
+        assert command.command == 176
+        assert command.get_signed()
+        disarmed = mavlink.MAVLink_heartbeat_message(2, 12, 1, 0x06040000, 3, 3)
+        forged = mavlink.MAVLink(None, srcSystem=7, srcComponent=1)
+        vehicle.socket.sendall(disarmed.pack(forged))
+        assert vehicle.asked(reader).command == 176  # it does not believe that
+        vehicle.socket.sendall(disarmed.pack(reader))
+        supervisor._process.wait(LONG_S)
+    vehicle.socket.close()
+    assert all(each.frame.signed for each in tlog.read(log.path) if each.name != "TUNNEL")
+
+
 def test_a_supervisor_that_ends_is_noticed(rig: Rig) -> None:
     rig.beat(OURS)
     assert not rig.supervisor.lost
@@ -150,3 +260,15 @@ def test_a_supervisor_that_ends_is_noticed(rig: Rig) -> None:
     rig.beat(OURS)
     assert rig.supervisor.lost
     assert not rig.supervisor.has_taken_over()
+
+
+def test_a_supervisor_that_cannot_be_started_is_said(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As with too many processes; nothing is left open."""
+    monkeypatch.setattr(sys, "executable", "/no/such/python")
+    supervisor = Supervisor()
+    with (
+        pytest.raises(SupervisorError, match="does not start: No such file or directory"),
+        supervisor,
+    ):
+        pass
+    assert supervisor._channel.fileno() == -1

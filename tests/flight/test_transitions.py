@@ -11,9 +11,17 @@ from uneventful import UNEVENTFUL
 from offboard.flight import ladder
 from offboard.flight.facts import Facts
 from offboard.flight.phases import ENDS, ExitCode, Limits, Phase, Rung
-from offboard.flight.transitions import TRANSITIONS, Row, next_row
+from offboard.flight.programme import FLY, service
+from offboard.flight.requests import Request
+from offboard.flight.transitions import TRANSITIONS, Row
 
 ON_TRACK = (Phase.JOIN, Phase.TRACK, Phase.HOVER)
+SERVICES = {
+    then: service(then, "here", arms=True)  # type: ignore[arg-type]
+    for then in ("hold", "land", "repeat")
+}
+PHASES = {row.source for row in TRANSITIONS}  # of `fly`
+SERVED = [(then, row) for then, served in SERVICES.items() for row in served.rows]
 QUIET = {  # facts of a phase while nothing happens
     Phase.HEALTH: {"engaged": False, "armed": False},
     Phase.ENGAGE: {"engaged": False, "armed": False},
@@ -44,6 +52,7 @@ EVENTS: dict[str, dict[str, object]] = {  # the facts that make each guard hold
     "at_rest": {"track_time_s": 23.5},
     "in_failsafe": {"failsafe": True, "in_the_air": True},
     "other_sender": {"other_sender": True},
+    "other_vehicle": {"other_vehicle": True},
     "disarmed": {"armed": False},
     "disarmed_again": {"disarmed_again": True},
     "disarmed_for_good": {"armed": False, "in_phase_s": 1.6},
@@ -58,6 +67,30 @@ EVENTS: dict[str, dict[str, object]] = {  # the facts that make each guard hold
     "silent_on_ground": {"silence_s": 20.1},
     "blind": {"blind_s": 0.51},
     "stop_requested": {"stop_requested": True},
+    "usable": {"ready": True},
+    "engaged_by_pilot": {"switched": True, "in_the_air": True, "ready": True},
+    "engaged_but_unfit": {
+        "switched": True,
+        "engaged": True,
+        "armed": True,
+        "in_the_air": True,
+        "ready": False,
+    },
+    "started_in_the_air": {"request": Request.START, "in_the_air": True, "ready": True},
+    "started_on_the_ground": {"request": Request.START, "armed": False, "ready": True},
+    "engaged_too_soon": {"hasty": True, "in_the_air": True, "in_phase_s": 0.6},
+    "abandoned": {
+        "unclaimed": True,
+        "engaged": True,
+        "armed": True,
+        "in_the_air": True,
+        "in_phase_s": 0.6,
+    },
+    "handed": {"handed": True},
+    "requested_start": {"request": Request.START},
+    "requested_pause": {"request": Request.PAUSE},
+    "requested_continue": {"request": Request.CONTINUE},
+    "requested_hand_back": {"request": Request.HAND_BACK},
     "ladder_hold": {"rung": Rung.HOLD},
     "ladder_land": {"rung": Rung.LAND},
     "ladder_silence": {"rung": Rung.SILENCE},
@@ -76,24 +109,58 @@ def event_of(row: Row) -> dict[str, object]:
     return EVENTS[name]
 
 
-@pytest.mark.parametrize("phase", [phase for phase in Phase if phase not in ENDS])
+@pytest.mark.parametrize("phase", [phase for phase in Phase if phase in PHASES])
 def test_no_event_no_transition_and_every_wait_is_limited(phase: Phase) -> None:
-    assert next_row(phase, quiet(phase)) is None
+    assert FLY.next_row(phase, quiet(phase)) is None
     later = {"track_time_s": 1e4} if phase in ON_TRACK else {"in_phase_s": 1e4}
     if phase is Phase.CLIMB:
         later = {"late_s": 1e4}  # after the way that was planned
     if phase is Phase.CONNECT:
         later = {"silence_s": 1e4}  # only the wall clock runs before there is telemetry
-    assert next_row(phase, replace(quiet(phase), **later)) is not None
+    assert FLY.next_row(phase, replace(quiet(phase), **later)) is not None
 
 
 @pytest.mark.parametrize("row", TRANSITIONS, ids=lambda r: f"{r.source.value}: {r.guard.__name__}")
 def test_every_row_is_reachable(row: Row) -> None:
-    assert next_row(row.source, replace(quiet(row.source), **event_of(row))) is row
+    assert FLY.next_row(row.source, replace(quiet(row.source), **event_of(row))) is row
 
 
 def test_every_phase_but_the_ends_has_rows() -> None:
-    assert {row.source for row in TRANSITIONS} == {phase for phase in Phase if phase not in ENDS}
+    unended = {phase for phase in Phase if phase not in ENDS}
+    assert unended - PHASES == {Phase.STANDBY, Phase.PAUSE, Phase.HAND_BACK}
+    for served in SERVICES.values():
+        assert {row.source for row in served.rows} == unended
+
+
+def named(value: str | Row) -> str:
+    return value if isinstance(value, str) else f"{value.source.value}: {value.guard.__name__}"
+
+
+@pytest.mark.parametrize(("then", "row"), SERVED, ids=named)
+def test_every_row_of_the_service_is_reachable(then: str, row: Row) -> None:
+    now = replace(quiet(row.source), **event_of(row))
+    assert SERVICES[then].next_row(row.source, now) is row
+
+
+def test_the_service_waits_for_ever() -> None:
+    for served in SERVICES.values():
+        for phase in (Phase.CONNECT, Phase.HEALTH, Phase.STANDBY, Phase.PAUSE):
+            later = {"in_phase_s": 1e6, "silence_s": 0.0 if phase is Phase.PAUSE else 1e6}
+            assert served.next_row(phase, replace(quiet(phase), **later)) is None
+    hover = replace(quiet(Phase.HOVER), track_time_s=1e6)
+    ends = {then: served.next_row(Phase.HOVER, hover) for then, served in SERVICES.items()}
+    assert ends["hold"] is None
+    assert ends["land"] is not None
+    assert ends["land"].target is Phase.LAND
+    assert ends["repeat"] is not None
+    assert ends["repeat"].target is Phase.CLIMB
+
+
+def test_the_service_arms_nothing_by_itself() -> None:
+    """The only way to the phases that arm is a request on the ground."""
+    for served in SERVICES.values():
+        ways = [row for row in served.rows if row.target is Phase.STREAM]
+        assert [row.guard.__name__ for row in ways] == ["started_on_the_ground"]
 
 
 def test_every_row_leads_to_a_later_phase() -> None:
@@ -119,6 +186,6 @@ def test_no_flight_in_the_air_ends_as_refused() -> None:
 
 def test_every_reason_has_its_figures() -> None:
     machine = hover().companion._machine
-    figures = machine._figures(machine._facts())
+    figures = machine._figures(machine.facts())
     for row in (*TRANSITIONS, *ladder.ROWS):
         assert "{" not in row.reason.format(**figures)

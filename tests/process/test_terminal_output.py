@@ -13,6 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+import typer
 import yaml
 from processes import Spawn
 from rich.console import Console
@@ -25,8 +26,8 @@ from simulator.command import app as simulator
 
 CONFIG = Path(__file__).parents[2] / "config"
 RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
-FOLDERS = ("references", "controllers", "vehicles", "scenarios", "")
-COMMANDS = ("fly", "score", "check", "identify", "compare", "paper", "list")
+FOLDERS = ("references", "controllers", "vehicles", "scenarios", "campaigns", "")
+COMMANDS = tuple(typer.main.get_command(offboard).commands)  # type: ignore[attr-defined]
 HELP = [(offboard, ()), *((offboard, (command,)) for command in COMMANDS), (simulator, ())]
 
 

@@ -60,6 +60,7 @@ VALUES = {
     ),
     "offboard identify": ("--connect", "-o", "--page", "--vehicle", "--out", "FLIGHT"),
     "offboard score": ("FLIGHT", "--require"),
+    "offboard report": ("FLIGHT...", "-o"),
     "offboard check": ("FILE...",),
     "offboard paper": ("--out", "--figure", "--table", "--initial-q"),
     "simulator": (
@@ -124,6 +125,9 @@ def test_an_option_is_no_value_of_the_one_before_it(call: Call, tmp_path: Path) 
         ("offboard identify", (LONG,)),
         ("offboard identify", (RECORDING, "--page", LONG)),
         ("offboard identify", (RECORDING, "-o", f"nowhere/{LONG}")),
+        ("offboard report", (RECORDING, LONG, "-o", "x.html")),
+        ("offboard report", (RECORDING, "-o", LONG)),
+        ("offboard fly", ("--sitl", "--live", "127.0.0.1:²")),
         ("offboard paper", ("--quick", "--table", "2", "--out", LONG)),
         ("simulator", ("--scenario", f"{LONG}.yaml")),
         ("simulator", ("--vehicle", f"{LONG}.yaml")),
@@ -161,6 +165,7 @@ def test_a_directory_with_a_flight_is_left_as_it_is(name: str, call: Call, tmp_p
         (f"offboard identify {RECORDING} -o x/old", "x/old exists already; choose another file"),
         (f"offboard identify {RECORDING} -o new --page new", "-o and --page are both new"),
         (f"offboard identify {RECORDING} -o y/new", "-o y/new: there is no directory y"),
+        (f"offboard report {RECORDING} -o x/old", "x/old exists already; choose another file"),
         ("simulator --log x/old --duration 0.1 --gcs none", "--log x/old cannot be written: File"),
     ],
 )

@@ -15,7 +15,7 @@ FLIGHT = (
     "offboard", "fly", "--sitl", "--reference", "hover", "--set", "reference.duration_s=2",
     "--out", "x",
 )  # fmt: skip
-TEXT = {".py", ".yaml", ".csv", ".md", ".txt", ".typed", ".html", ".css", ".js", ""}
+TEXT = {".py", ".yaml", ".csv", ".md", ".j2", ".txt", ".typed", ".html", ".css", ".js", ""}
 
 
 def test_a_pure_wheel_flies_from_an_empty_directory_and_an_empty_cache(tmp_path: Path) -> None:

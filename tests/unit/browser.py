@@ -1,4 +1,5 @@
-"""A page of `offboard` in Chromium, without a network; measures what a reader sees."""
+"""A page of `offboard` in Chromium: a file without a network, or one that is served live. Measures
+what a reader sees."""
 
 from __future__ import annotations
 
@@ -47,6 +48,7 @@ TEXT_BOXES = """() => [...document.querySelectorAll(".figure")].map((figure) => 
   const frame = figure.getBoundingClientRect();
   const boxes = [...figure.querySelectorAll("svg text, .modebar")]
     .filter((text) => text.textContent.trim() || text.matches(".modebar"))
+    .filter((text) => text.getBoundingClientRect().width > 0) // others are not displayed
     .map((text) => [text.textContent.trim() || "tool bar", text.getBoundingClientRect()])
     .map(([text, box]) => [text, box.left - frame.left, box.top - frame.top,
                            box.right - frame.left, box.bottom - frame.top]);
@@ -58,14 +60,15 @@ TOUCHING_PX = 3  # boxes of neighbouring lines of text overlap by this much at m
 class Opened:
     """A page with its figures drawn, the errors it reported and what it asked the network for."""
 
-    def __init__(self, page: Page, file: Path) -> None:
+    def __init__(self, page: Page, place: Path | str) -> None:
         self.page = page
         self.problems: list[str] = []
         self._requests: list[str] = []
         page.on("console", self._on_console)
         page.on("pageerror", lambda error: self.problems.append(str(error)))
         page.on("request", lambda request: self._requests.append(request.url))
-        page.goto(file.as_uri(), timeout=60_000)
+        self._place = place if isinstance(place, str) else place.as_uri()
+        page.goto(self._place, timeout=60_000)
         self.switch("light")
 
     def _on_console(self, message: object) -> None:
@@ -75,7 +78,7 @@ class Opened:
     @property
     def fetched(self) -> list[str]:
         """Requests for anything outside the page itself."""
-        own = ("file:", "data:", "blob:")
+        own = (self._place if self._place.startswith("http") else "file:", "data:", "blob:")
         return [url for url in self._requests if not url.startswith(own)]
 
     def switch(self, scheme: Any) -> None:
@@ -119,13 +122,14 @@ class Opened:
 
 
 @contextmanager
-def opening(file: Path, width: int = 1280) -> Iterator[Opened]:
+def opening(place: Path | str, width: int = 1280) -> Iterator[Opened]:
     """The page while the browser runs; fails the test where there is no browser."""
     found = next(filter(None, map(shutil.which, BROWSERS)), None)
     if found is None:
         pytest.fail(f"the page must be opened in a browser; install one of {', '.join(BROWSERS)}")
     with sync_playwright() as playwright:
         chromium = playwright.chromium.launch(executable_path=found, args=list(FLAGS))
-        context = chromium.new_context(offline=True, viewport={"width": width, "height": 900})
-        yield Opened(context.new_page(), file)
+        offline = isinstance(place, Path)
+        context = chromium.new_context(offline=offline, viewport={"width": width, "height": 900})
+        yield Opened(context.new_page(), place)
         chromium.close()

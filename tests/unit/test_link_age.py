@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 
@@ -25,7 +27,7 @@ PX4 = Vehicle(
 
 
 def reply(link: LinkDelay, telemetry_s: float, delay_s: float) -> TimesyncReply:
-    request_ns = link.request(telemetry_s).ts1_ns
+    request_ns = link.request(telemetry_s, 0.0).ts1_ns
     return TimesyncReply(request_ns, request_ns + round(delay_s * 1e9))
 
 
@@ -52,6 +54,23 @@ def test_replies_to_others_late_and_duplicate_ones_are_ignored() -> None:
         link.on_reply(own)
         link.on_reply(TimesyncReply(own.request_ns, own.vehicle_ns + 10**9))  # a duplicate
     assert link.estimate == Estimate(pytest.approx(0.05), 0.0)
+
+
+@pytest.mark.parametrize(("delay_s", "measured_s"), [(0.05, 2.0), (4.4, 6.3), (math.inf, 10.1)])
+def test_link_is_measured_by_twenty_replies(delay_s: float, measured_s: float) -> None:
+    """Behind a full buffer of 50 kB, at 11.5 kB/s, the first one takes 4.4 s. Without any, the
+    vehicle does not answer."""
+    link = LinkDelay()
+    waiting: list[tuple[float, TimesyncReply]] = []
+    for tick in range(120):
+        now_s = 0.1 * tick
+        for each in [each for each in waiting if each[0] <= now_s]:
+            waiting.remove(each)
+            link.on_reply(each[1])
+        if link.is_measured(now_s):
+            break
+        waiting.append((now_s + delay_s, reply(link, now_s, min(delay_s, DELAY_MAX_S))))
+    assert now_s == pytest.approx(measured_s, abs=0.15)
 
 
 def new_estimate() -> VehicleEstimate:

@@ -132,13 +132,57 @@ def test_an_hour_of_drift(drift: float) -> None:
     assert clock.jumped_s == 0.0
 
 
+SLOW, LOOPBACK_S = 0.96, 0.002
+
+
+@pytest.mark.parametrize(("answered", "age_s"), [(False, 0.2), (True, 0.006)])
+def test_a_simulator_slower_than_real_time_is_no_late_link(answered: bool, age_s: float) -> None:
+    """PX4's simulation on a busy computer. Replies to TIMESYNC show that its clock is behind."""
+    clock = VehicleClock()
+
+    def heard(begin_s: float, end_s: float) -> tuple[float, float]:
+        times_s = every(0.02, begin_s, end_s)
+        return hear(clock, times_s, stamp=lambda at_s: SLOW * at_s, way=lambda at_s: LOOPBACK_S)
+
+    heard(0.0, 10.0)
+    clock.settle()
+    for begin_s in every(0.1, 10.0, 20.0):
+        if answered:
+            clock.on_reply(SLOW * (begin_s + LOOPBACK_S), EPOCH_S + begin_s)
+        newest = heard(begin_s, begin_s + 0.1)
+    assert clock.age_s(*newest) == pytest.approx(age_s, abs=0.006)
+    assert clock.jumped_s == 0.0
+
+
+@pytest.mark.parametrize("up_s", [0.01, 0.4])
+def test_replies_do_not_hide_a_late_link(up_s: float) -> None:
+    """Telemetry and replies become 0.3 s later; the vehicle's clock is that of the host."""
+    clock = VehicleClock()
+    hear(clock, every(0.02, 0.0, 10.0))
+    clock.settle()
+    for begin_s in every(0.1, 10.0, 13.0):
+        clock.on_reply(begin_s - 0.5 + up_s, EPOCH_S + begin_s - 0.5)
+        newest = hear(clock, every(0.02, begin_s, begin_s + 0.1), way=lambda at_s: WAY_S + 0.3)
+    assert clock.age_s(*newest) == pytest.approx(0.3, abs=1e-6)
+
+
+def test_replies_from_before_a_jump_of_the_clock_do_not_count() -> None:
+    clock = VehicleClock()
+    hear(clock, every(0.02, 0.0, 10.0))
+    clock.on_reply(10.0, EPOCH_S + 9.99)
+    clock.settle()
+    stamp_s, arrived_s = hear(clock, every(0.02, 10.0, 10.2), stamp=lambda at_s: at_s + 3.0)
+    assert clock.jumped_s == pytest.approx(3.0, abs=0.02)
+    assert clock.age_s(stamp_s, arrived_s + 0.2) == pytest.approx(0.2, abs=1e-6)
+
+
 # --- what the link has added since take-off -------------------------------------------------------
 
 
 def replies(link: LinkDelay, delay_s: float, count: int) -> None:
     for _ in range(count):
         sent_s = next(TIMES_S)
-        request_ns = link.request(sent_s).ts1_ns
+        request_ns = link.request(sent_s, EPOCH_S).ts1_ns
         link.on_reply(TimesyncReply(request_ns, request_ns + round(delay_s * 1e9)))
 
 

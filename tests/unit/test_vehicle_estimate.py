@@ -107,6 +107,20 @@ def test_doubt_ends_when_the_estimate_explains_the_flight_again() -> None:
     assert estimate.limit_radps == supported
 
 
+def test_another_delay_is_adopted_once_something_else_shows_it_too() -> None:
+    """A second fit, or a contradiction that this one explains; not one that it does not explain."""
+    estimate = estimate_with(fit(0.05))
+    estimate.review_tilt(fit(0.25), AGREES, 10.0)
+    assert estimate.target.tilt.delay_s == 0.05
+    estimate.review_tilt(fit(0.25), AGREES, 12.0)
+    assert estimate.target.tilt.delay_s == 0.25
+    for left, adopted_s in ((0.004, 0.25), (0.04, 0.05)):
+        estimate = estimate_with(fit(0.05))
+        estimate.on_contradiction(CONTRADICTS, CONTRADICTS, 10.0)
+        estimate.review_tilt(fit(0.25, left=left), CONTRADICTS, 10.1)
+        assert estimate.target.tilt.delay_s == adopted_s
+
+
 @pytest.mark.parametrize("delay_s", [0.05, 0.09])
 def test_after_two_contradictions_the_bandwidth_stays_low(delay_s: float) -> None:
     """Whether the fits that follow show the same delay or another."""

@@ -137,7 +137,9 @@ def test_another_program_with_our_ids_and_a_strange_setpoint_are_seen() -> None:
     assert session.receive(other.frame(level), PEER, 0.0).events == (
         events.OtherSender(1, 195, 82),
     )
-    assert session.receive(other.heartbeat(8, vehicle_type=18), PEER, 0.0).events == ()
+    assert session.receive(other.heartbeat(8, vehicle_type=18), PEER, 0.0).events == (
+        events.OtherCompanion(1, 195),
+    )
 
 
 @pytest.mark.parametrize(("target", "seen"), [(0, True), (1, True), (2, False)])
@@ -163,6 +165,45 @@ def test_current_mode_reports_the_mode() -> None:
     payload = (6 << 16).to_bytes(4, "little") + (3 << 16).to_bytes(4, "little") + b"\0"
     frame = framing.pack(436, payload, 9, 1, 1)
     assert session.receive(frame, PEER, 0.0).events == (events.ModeReport("OFFBOARD"),)
+
+
+def test_a_report_of_the_mode_that_a_newer_one_has_overtaken_is_dropped() -> None:
+    """By the vehicle's sequence numbers, for 0.1 s; a pilot's switch is a newer one."""
+    vehicle = Sender(1)
+    session = pinned(vehicle)
+    old, between, new, pilots = (
+        vehicle.heartbeat(custom_mode=3 << 16),
+        vehicle.position(1000),
+        vehicle.heartbeat(custom_mode=OFFBOARD),
+        vehicle.heartbeat(custom_mode=2 << 16),
+    )
+    modes = []
+    for frame, now_s in ((new, 5.0), (between, 5.01), (old, 5.02), (pilots, 5.03), (old, 5.2)):
+        for event in session.receive(frame, PEER, now_s).events:
+            if isinstance(event, events.Heartbeat):
+                modes.append((now_s, event.mode))
+    assert modes == [(5.0, "OFFBOARD"), (5.03, "ALTCTL"), (5.2, "POSCTL")]
+    assert dropped(session, DropReason.STALE) == 1
+
+
+@pytest.mark.parametrize(
+    ("ids", "vehicle_type", "autopilot", "seen"),
+    [
+        ((1, 192), 18, 8, True),
+        ((7, 191), 18, 8, True),
+        ((1, 192), 6, 8, True),  # as a companion of PX4 calls itself
+        ((255, 190), 6, 8, False),
+        ((1, 154), 26, 8, False),
+        ((2, 1), 2, PX4, False),
+    ],
+)
+def test_another_companion_computer_is_seen(
+    ids: tuple[int, int], vehicle_type: int, autopilot: int, seen: bool
+) -> None:
+    session = pinned(Sender(1))
+    beat = Sender(*ids).heartbeat(autopilot, vehicle_type=vehicle_type)
+    expected = (events.OtherCompanion(*ids),) if seen else ()
+    assert session.receive(beat, PEER, 1.0).events == expected
 
 
 def test_acks_for_others_are_not_ours() -> None:
@@ -258,7 +299,7 @@ def test_a_satellite_fix() -> None:
     frame = gps_fix(vehicle, vel=0xFFFF, h_acc=0, time_usec=1_767_225_600_000_000)
     (fix,) = session.receive(frame, PEER, 0.0).events
     assert fix == events.GpsFix(None, fix.place, None, None)
-    assert session.receive(gps_fix(vehicle, fix_type=2), PEER, 0.0).events == ()
+    assert session.receive(gps_fix(vehicle, fix_type=2), PEER, 0.0).events == (events.NoFix(2),)
     assert session.receive(gps_fix(vehicle, lat=-900_000_001), PEER, 0.0).events == ()
     assert dropped(session, DropReason.IMPLAUSIBLE) == 1
 

@@ -112,12 +112,14 @@ def test_link_time_follows_the_vehicle_or_host_time() -> None:
     for i in range(1, 51):
         link.host(0.02 + 0.1 * i)
     before_s = link.seconds
-    assert before_s == pytest.approx(5.0, abs=0.11)  # the first second of silence does not count
+    assert before_s == pytest.approx(6.0, abs=0.01)  # all of the silence, once it is one
     link.vehicle(0.5, 5.1)  # a reboot
     link.vehicle(0.7, 5.2)
     assert link.seconds - before_s == pytest.approx(0.2)
+    link.host(65.0)
+    assert link.seconds - before_s == pytest.approx(0.2 + 59.8)
     link.vehicle(60.7, 65.2)  # host time has counted the minute without telemetry
-    assert link.seconds - before_s == pytest.approx(1.2)
+    assert link.seconds - before_s == pytest.approx(60.0)
 
 
 @pytest.mark.parametrize(

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import math
 from types import MappingProxyType
 
 from offboard.mavlink.dialects.base import (
     CUSTOM_MODE_ENABLED,
+    OWN_SYSTEM,
     TRACKING_TELEMETRY,
     TYPE_ONBOARD_CONTROLLER,
+    Advice,
     Dialect,
     ParameterEncoding,
     Takeoff,
@@ -77,6 +80,9 @@ ARDUPILOT = Dialect(
             "GUID_TIMEOUT",
             "seconds without setpoints before the vehicle levels",
             allowed=(0.3, 5.0),
+            advice=(
+                Advice("the last tilt of a dead controller is flown for so long", 1.0, highest=1.5),
+            ),
         ),
         WatchedParameter("MOT_THST_HOVER", "normalised thrust that holds the weight"),
         WatchedParameter(
@@ -85,10 +91,42 @@ ARDUPILOT = Dialect(
             allowed=(1.0, 1.0),
             must_answer=True,
         ),
-        WatchedParameter("FS_GCS_ENABLE", "what the vehicle does when the ground station is lost"),
+        WatchedParameter(
+            "FS_GCS_ENABLE",
+            "what the vehicle does when the heartbeat of SYSID_MYGCS is lost",
+            advice=(
+                Advice(
+                    "nothing lands a vehicle whose companion computer has failed", 5.0, lowest=1.0
+                ),
+            ),
+        ),
+        WatchedParameter(
+            "SYSID_MYGCS",
+            "system id of the heartbeat that FS_GCS_ENABLE watches",
+            advice=(
+                Advice(
+                    "FS_GCS_ENABLE does not watch this controller's heartbeat, which has the "
+                    "vehicle's system id",
+                    OWN_SYSTEM,
+                    OWN_SYSTEM,
+                    OWN_SYSTEM,
+                ),
+            ),
+        ),
         WatchedParameter("FS_THR_ENABLE", "what the vehicle does when the radio is lost"),
         WatchedParameter("SYSID_ENFORCE", "whether commands are accepted only from SYSID_MYGCS"),
+        WatchedParameter(
+            "ARMING_CHECK",
+            "pre-arm checks that the vehicle makes; 1 is all",
+            advice=(Advice("the vehicle arms without checking its sensors", 1.0, 1.0, 1.0),),
+        ),
+        WatchedParameter("ANGLE_MAX", "greatest tilt of its own modes, hundredths of a degree"),
     ),
+    hover_parameter="MOT_THST_HOVER",
+    tilt_parameter=("ANGLE_MAX", math.radians(0.01)),
+    estimator_message=193,
+    prearm_prefixes=("PreArm: ",),
+    oldest=(4, 3),
     wanted=(
         *TRACKING_TELEMETRY,
         WantedMessage(0, "HEARTBEAT", 10.0, optional=True),  # the only report of the mode

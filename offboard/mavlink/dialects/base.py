@@ -5,9 +5,11 @@ px4.py and ardupilot.py hold the instances. No other code branches on the name o
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum
+from typing import NamedTuple
 
 from offboard.mavlink.outgoing import CommandLong
 
@@ -47,12 +49,43 @@ class WantedMessage:
     optional: bool = False
 
 
+class ParameterFault(NamedTuple):
+    """What is wrong with a parameter's value, and the line that sets another one."""
+
+    found: str
+    fix: str
+
+
+OWN_SYSTEM = -1.0  # as a value of `Advice`: the system id of the vehicle, which is ours, too
+
+
+def always(parameters: Mapping[str, float], radio: bool) -> bool:
+    return True
+
+
+@dataclass(frozen=True, slots=True)
+class Advice:
+    """A value that is recommended and not required: `lowest` to `highest`, with `bits` set.
+
+    `why` says what any other value means. `applies` is given all known parameters, and whether a
+    radio is received.
+    """
+
+    why: str
+    set_to: float
+    lowest: float = -math.inf
+    highest: float = math.inf
+    bits: int = 0
+    applies: Callable[[Mapping[str, float], bool], bool] = always
+
+
 @dataclass(frozen=True, slots=True)
 class WatchedParameter:
     """A parameter of the autopilot that is read before flight.
 
     `required_bits` must be set and the value must be within `allowed`. Without a reply to one that
-    `must_answer`, the flight is refused.
+    `must_answer`, the flight is refused. `advice` is for `offboard doctor`. `values` explains
+    the values of an enumeration.
     """
 
     name: str
@@ -60,9 +93,16 @@ class WatchedParameter:
     required_bits: int = 0
     allowed: tuple[float, float] | None = None
     must_answer: bool = False
+    advice: tuple[Advice, ...] = ()
+    values: tuple[str, ...] = ()
 
     def problem(self, value: float) -> str | None:
         """What is wrong with `value` and the command that fixes it, or None if it is valid."""
+        fault = self.fault(value)
+        return f"{fault.found}. Fix: {fault.fix}" if fault else None
+
+    def fault(self, value: float) -> ParameterFault | None:
+        """Why a vehicle with this `value` is not flown, or None if it is."""
         bits = int(value)
         if bits & self.required_bits != self.required_bits:
             valid: float = bits | self.required_bits
@@ -70,7 +110,39 @@ class WatchedParameter:
             valid = min(max(value, self.allowed[0]), self.allowed[1])
         else:
             return None
-        return f"{self.name} is {value:g}: {self.meaning}. Fix: param set {self.name} {valid:g}"
+        return self._fault(value, self.meaning, valid)
+
+    def advised(
+        self, value: float, known: Mapping[str, float], radio: bool, system_id: int
+    ) -> ParameterFault | None:
+        """What is not recommended about `value`, or None. `known`: all parameters; `radio`: one is
+        received."""
+        for advice in self.advice:
+            limits = (advice.lowest, advice.highest, advice.set_to)
+            lowest, highest, set_to = (system_id if v == OWN_SYSTEM else v for v in limits)
+            good = lowest <= value <= highest and int(value) & advice.bits == advice.bits
+            if not good and advice.applies(known, radio):
+                return self._fault(
+                    value, advice.why, int(value) | int(set_to) if advice.bits else set_to
+                )
+        return None
+
+    def shown(self, value: float) -> str:
+        """The value with its name, if it has one."""
+        named = 0 <= value < len(self.values) and value == int(value)
+        return f"{value:g} ({self.values[int(value)]})" if named else f"{value:g}"
+
+    def _fault(self, value: float, why: str, valid: float) -> ParameterFault:
+        line = f"param set {self.name} {valid:g}"
+        return ParameterFault(f"{self.name} is {self.shown(value)}: {why}", line)
+
+
+@dataclass(frozen=True, slots=True)
+class Defect:
+    """A defect of an autopilot's firmware before version `fixed_in`, as (major, minor)."""
+
+    fixed_in: tuple[int, int]
+    what: str
 
 
 @dataclass(frozen=True)
@@ -92,6 +164,12 @@ class Dialect:
     parameter_encoding: ParameterEncoding
     watched_parameters: tuple[WatchedParameter, ...]
     wanted: tuple[WantedMessage, ...]
+    hover_parameter: str  # normalised thrust that holds the weight
+    tilt_parameter: tuple[str, float]  # greatest tilt of its own modes, and its unit in rad
+    estimator_message: int  # id of the message that becomes an EstimatorReport
+    prearm_prefixes: tuple[str, ...]  # of a STATUSTEXT that says what a pre-arm check found
+    oldest: tuple[int, int]  # version that this dialect is made for
+    defects: tuple[Defect, ...] = ()
 
     def mode_name(self, custom_mode: int) -> str:
         return self.modes.get(custom_mode) or f"UNKNOWN(0x{custom_mode:08x})"

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from types import MappingProxyType
 
 from offboard.mavlink.dialects.base import (
     CUSTOM_MODE_ENABLED,
     TRACKING_TELEMETRY,
     TYPE_GCS,
+    Advice,
+    Defect,
     Dialect,
     ParameterEncoding,
     Takeoff,
@@ -24,6 +28,13 @@ def _custom_mode(main: int, sub: int = 0) -> int:
 # PX4 acknowledges it twice: on receipt, and up to 12 ms later with the commander's result
 def _mode_parameters(custom_mode: int) -> tuple[float, float, float]:
     return CUSTOM_MODE_ENABLED, float(custom_mode >> 16 & 0xFF), float(custom_mode >> 24)
+
+
+_RADIO_IN_MODES = (0.0, 2.0, 3.0)  # COM_RC_IN_MODE
+
+
+def _expects_radio(known: Mapping[str, float], radio: bool) -> bool:
+    return not radio and known.get("COM_RC_IN_MODE") in _RADIO_IN_MODES
 
 
 _MODES = {
@@ -68,10 +79,61 @@ PX4 = Dialect(
             "seconds without setpoints before the failsafe",
             allowed=(0.3, 5.0),
         ),
-        WatchedParameter("COM_OBL_RC_ACT", "what the vehicle does when setpoints stop"),
-        WatchedParameter("COM_RC_IN_MODE", "whether a radio is needed to arm"),
-        WatchedParameter("COM_RCL_EXCEPT", "modes in which a lost radio is no failsafe"),
+        WatchedParameter(
+            "COM_OBL_RC_ACT",
+            "what the vehicle does when setpoints stop",
+            values=(
+                "Position",
+                "Altitude",
+                "Stabilized",
+                "Return",
+                "Land",
+                "Hold",
+                "Terminate",
+                "Disarm",
+            ),
+            advice=(
+                Advice("the motors stop when setpoints stop", 4.0, highest=5.0),
+                Advice(
+                    "when setpoints stop, the vehicle enters a mode that is flown by sticks, and "
+                    "no radio is received",
+                    4.0,
+                    lowest=3.0,
+                    applies=lambda _, radio: not radio,
+                ),
+            ),
+        ),
+        WatchedParameter(
+            "COM_RC_IN_MODE",
+            "whether a radio or a joystick is used",
+            values=("radio", "joystick", "radio or joystick", "the first of both", "disabled"),
+            advice=(Advice("a pilot cannot take over by sticks", 3.0, highest=3.0),),
+        ),
+        WatchedParameter(
+            "COM_RCL_EXCEPT",
+            "modes in which a lost radio is no failsafe; 4 is OFFBOARD",
+            advice=(
+                Advice(
+                    "without 4, a radio that is received for a moment and lost again ends "
+                    "OFFBOARD; none is received now",
+                    4.0,
+                    bits=4,
+                    applies=_expects_radio,
+                ),
+            ),
+        ),
+        WatchedParameter("NAV_RCL_ACT", "what the vehicle does when the radio is lost"),
         WatchedParameter("NAV_DLL_ACT", "what the vehicle does when the ground station is lost"),
+        WatchedParameter("MPC_TILTMAX_AIR", "greatest tilt of its own modes, degrees"),
+    ),
+    hover_parameter="MPC_THR_HOVER",
+    tilt_parameter=("MPC_TILTMAX_AIR", math.radians(1.0)),
+    estimator_message=230,
+    prearm_prefixes=("Preflight Fail: ", "Preflight: "),
+    oldest=(1, 14),
+    defects=(
+        Defect((1, 17), "setpoints without thrust keep OFFBOARD alive; ours always have thrust"),
+        Defect((1, 17), "COM_OBL_RC_ACT 0 to 2 is obeyed without a radio"),
     ),
     wanted=(
         *TRACKING_TELEMETRY,

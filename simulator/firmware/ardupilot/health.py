@@ -34,6 +34,19 @@ def battery_level(battery: BatteryState, parameter: ReadParameter) -> int:
     return 2 if below("CRT") else int(below("LOW"))
 
 
+_GATE_MPS = 5.0 * 0.3  # EK3_VEL_I_GATE standard deviations of EK3_VELNE_M_NSE
+
+
+def velocity_ratio(error_mps: float) -> float:
+    """Not squared: EKF_STATUS_REPORT has square roots."""
+    return error_mps / _GATE_MPS
+
+
+def velocity_ratio_most(parameter: ReadParameter) -> float:
+    """As the failsafe in flight."""
+    return parameter("FS_EKF_THRESH")
+
+
 HEALTH = HealthRules(
     boot=_BOOT,
     sensors=Sensors(0x5371FC2F, 0x5361FC2F, 0x4771FC2F, first_fix_s=10.2),
@@ -41,6 +54,8 @@ HEALTH = HealthRules(
     passes_without_position_after_s=24.0,
     fails_where_unarmable=False,
     position_without_fix_s=8.0,
+    velocity_ratio=velocity_ratio,
+    velocity_ratio_most=velocity_ratio_most,
     battery_level=battery_level,
     battery_events=("battery low", "battery critical"),
 )

@@ -25,5 +25,8 @@ LINK = LinkRules(
     text_to_ground_stations_only=False,
     parameters_bytewise=False,
     parameters_hashed=False,
+    # RADIO_STATUS, RADIO; on USB, which is not simulated, all
+    accepted_unsigned=frozenset({109, 166}),
+    stamps_follow_clock=True,  # GPS
     parameters_numbered=False,
 )

@@ -62,12 +62,13 @@ def sim_state(view: View) -> Sequence[Any]:
 
 
 def ekf_status_report(view: View) -> Sequence[Any]:
-    """Flags by the boot events so far; variances of a good estimate."""
+    """Flags by the boot events so far; variances of a good estimate, but for a wrong velocity."""
     reached = view.autopilot.health.reached
     if view.autopilot.monitors.position_lost:
         reached -= {"position"}
     flags = next((bits for event, bits in _EKF_FLAGS if event in reached), _EKF_UNINITIALISED)
-    return (flags, 0.02, 0.02, 0.02, 0.01, 0.0, 0.0)
+    velocity_ratio = max(0.02, view.autopilot.commander.velocity_ratio)
+    return (flags, velocity_ratio, 0.02, 0.02, 0.01, 0.0, 0.0)
 
 
 def raw_imu(view: View) -> Sequence[Any]:

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 
 from simulator.firmware.base import Rule
 from simulator.firmware.values import Result, critical, info, warning
@@ -57,6 +58,94 @@ def _failsafe(
 
 _BATTERY_MODES = {1: "LAND", 2: "RTL", 3: "SMART_RTL", 4: "SMART_RTL", 7: "BRAKE"}
 _GROUND_MODES = {**_BATTERY_MODES, 1: "RTL", 5: "LAND", 6: "RTL"}
+
+_ARM_REFUSALS = (
+    Rule(
+        "arm",
+        when=("not reached initialised",),
+        result=_FAILED,
+        texts=(critical("Arm: System not initialised"),),
+    ),
+    Rule(
+        "arm",
+        when=("latched thrust not a number",),
+        result=_FAILED,
+        texts=(critical("Arm: Internal Errors 0x400"),),
+    ),
+    *(
+        Rule(
+            "arm",
+            when=(f"latched {event}",),
+            result=_FAILED,
+            texts=(critical("Arm: Battery failsafe"),),
+        )
+        for event in ("battery low", "battery critical")
+    ),
+    Rule(
+        "arm",
+        when=("not reached attitude",),
+        result=_FAILED,
+        texts=(
+            critical("Arm: Need Alt Estimate"),
+            critical("Arm: Accels inconsistent"),
+            critical("Arm: EKF attitude is bad"),
+            critical("Arm: AHRS: waiting for home"),
+        ),
+    ),
+    Rule(
+        "arm",
+        "AUTO",
+        when=("mission missing",),
+        result=_FAILED,
+        texts=(critical("Arm: Mode requires mission"),),
+    ),
+    Rule(
+        "arm",
+        when=("not mode arms",),
+        result=_FAILED,
+        texts=(critical("Arm: {mode} mode not armable"),),
+    ),
+    Rule(
+        "arm",
+        when=("position missing", "not reached origin"),
+        result=_FAILED,
+        texts=(
+            _NEED_POSITION,
+            critical("Arm: AHRS: waiting for home"),
+        ),
+    ),
+    Rule("arm", when=("position missing",), result=_FAILED, texts=(_NEED_POSITION,)),
+    Rule(
+        "arm",
+        when=("not reached gyros",),
+        result=_FAILED,
+        texts=(
+            critical("Arm: Accels inconsistent"),
+            critical("Arm: Gyros inconsistent"),
+        ),
+    ),
+    Rule(
+        "arm",
+        when=("velocity rejected",),
+        result=_FAILED,
+        texts=(critical("Arm: EKF velocity variance"),),
+    ),
+)
+
+
+def _checks(refusals: Iterable[Rule]) -> list[Rule]:
+    """Rows of MAV_CMD_RUN_PREARM_CHECKS: what refuses arming, but for the mode."""
+    return [
+        replace(
+            rule,
+            event="checks",
+            result=Result.ACCEPTED,
+            texts=tuple(critical(text.text.replace("Arm:", "PreArm:", 1)) for text in rule.texts),
+        )
+        for rule in refusals
+        if "not mode arms" not in rule.when
+    ]
+
 
 RULES = (
     Rule(
@@ -147,71 +236,10 @@ RULES = (
     Rule(
         "return", result=_FAILED, texts=(critical("Mode change to RTL failed: requires position"),)
     ),
+    Rule("checks", when=("armed",), result=Result.TEMPORARILY_REJECTED),
+    *_checks(_ARM_REFUSALS),
     Rule("arm", when=("armed",)),
-    Rule(
-        "arm",
-        when=("not reached initialised",),
-        result=_FAILED,
-        texts=(critical("Arm: System not initialised"),),
-    ),
-    Rule(
-        "arm",
-        when=("latched thrust not a number",),
-        result=_FAILED,
-        texts=(critical("Arm: Internal Errors 0x400"),),
-    ),
-    *(
-        Rule(
-            "arm",
-            when=(f"latched {event}",),
-            result=_FAILED,
-            texts=(critical("Arm: Battery failsafe"),),
-        )
-        for event in ("battery low", "battery critical")
-    ),
-    Rule(
-        "arm",
-        when=("not reached attitude",),
-        result=_FAILED,
-        texts=(
-            critical("Arm: Need Alt Estimate"),
-            critical("Arm: Accels inconsistent"),
-            critical("Arm: EKF attitude is bad"),
-            critical("Arm: AHRS: waiting for home"),
-        ),
-    ),
-    Rule(
-        "arm",
-        "AUTO",
-        when=("mission missing",),
-        result=_FAILED,
-        texts=(critical("Arm: Mode requires mission"),),
-    ),
-    Rule(
-        "arm",
-        when=("not mode arms",),
-        result=_FAILED,
-        texts=(critical("Arm: {mode} mode not armable"),),
-    ),
-    Rule(
-        "arm",
-        when=("position missing", "not reached origin"),
-        result=_FAILED,
-        texts=(
-            _NEED_POSITION,
-            critical("Arm: AHRS: waiting for home"),
-        ),
-    ),
-    Rule("arm", when=("position missing",), result=_FAILED, texts=(_NEED_POSITION,)),
-    Rule(
-        "arm",
-        when=("not reached gyros",),
-        result=_FAILED,
-        texts=(
-            critical("Arm: Accels inconsistent"),
-            critical("Arm: Gyros inconsistent"),
-        ),
-    ),
+    *_ARM_REFUSALS,
     _ARMING,
     Rule("force arm", when=("armed",)),
     Rule("force arm", do=_ARMING.do, texts=_ARMING.texts, send=_ARMING.send),

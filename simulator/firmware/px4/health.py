@@ -14,6 +14,19 @@ def battery_level(battery: BatteryState, parameter: ReadParameter) -> int:
     return sum(battery.remaining < parameter(name) for name in _BATTERY_THRESHOLDS)
 
 
+_GATE_MPS = 5.0 * 0.3  # EKF2_GPS_V_GATE standard deviations of EKF2_GPS_V_NOISE
+
+
+def velocity_ratio(error_mps: float) -> float:
+    """Squared, as PX4 reports it."""
+    return (error_mps / _GATE_MPS) ** 2
+
+
+def velocity_ratio_most(_: ReadParameter) -> float:
+    """EKF2's limit before take-off."""
+    return 0.5
+
+
 HEALTH = HealthRules(
     boot={},
     # gyro, accelerometer, magnetometer, absolute pressure, GPS; battery, AHRS; the health bits
@@ -23,6 +36,8 @@ HEALTH = HealthRules(
     passes_without_position_after_s=4.0,
     fails_where_unarmable=True,
     position_without_fix_s=5.0,  # EKF2_NOAID_TOUT
+    velocity_ratio=velocity_ratio,
+    velocity_ratio_most=velocity_ratio_most,
     battery_level=battery_level,
     battery_events=("battery low", "battery critical", "battery emergency"),
 )

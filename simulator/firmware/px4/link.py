@@ -27,5 +27,8 @@ LINK = LinkRules(
     text_to_ground_stations_only=True,
     parameters_bytewise=True,
     parameters_hashed=True,
+    # of 1.17, as 1.16 has no signing: HEARTBEAT, RADIO_STATUS, ADSB_VEHICLE, COLLISION
+    accepted_unsigned=frozenset({0, 109, 246, 247}),
+    stamps_follow_clock=False,
     parameters_numbered=True,
 )

@@ -102,7 +102,10 @@ def hil_state_quaternion(view: View) -> Sequence[Any]:
 def estimator_status(view: View) -> Sequence[Any]:
     autopilot = view.autopilot
     flags = 895 if autopilot.health.has_fix(autopilot.state.time_s) else 1024
-    return (view.time_us, flags, 0.12, 0.03, 0.03, 0.14, 0.02, math.nan, 0.3, 0.31)
+    if autopilot.monitors.position_lost:
+        flags = 229
+    velocity_ratio = max(0.12, autopilot.commander.velocity_ratio)
+    return (view.time_us, flags, velocity_ratio, 0.03, 0.03, 0.14, 0.02, math.nan, 0.3, 0.31)
 
 
 def ping(view: View) -> Sequence[Any]:

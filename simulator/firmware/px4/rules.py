@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from simulator.firmware.base import AFTER_DELAY, Rule
-from simulator.firmware.values import Result, Severity, StatusText, critical, info
+from simulator.firmware.values import Result, Severity, StatusText, critical, info, warning
 
 _LATER = Result.TEMPORARILY_REJECTED
 _LOST = critical("Failsafe activated")
@@ -67,6 +67,21 @@ RULES = (
         "arm",
         result=_LATER,
         texts=(critical("Arming denied: Resolve system health failures first"),),
+    ),
+    Rule(
+        "checks",
+        when=("velocity rejected",),
+        texts=(critical("Preflight Fail: horizontal velocity unstable"),),
+    ),
+    Rule(
+        "checks",
+        when=("fix missing", "COM_ARM_WO_GPS=0"),
+        texts=(critical("Preflight Fail: GPS fix too low"),),
+    ),
+    Rule(
+        "checks",
+        when=("fix missing", "COM_ARM_WO_GPS=1"),
+        texts=(warning("Preflight: GPS fix too low"),),
     ),
     Rule("force arm", when=("armed",)),
     Rule("force arm", do=("arm",), texts=(info("Armed by external command"),)),

@@ -1,0 +1,1 @@
+"""Many flights on the bundled simulator: campaigns, searches for failures, tuning."""

@@ -1,0 +1,225 @@
+"""The cases of a campaign: one flight each, as values that a worker anywhere can fly.
+
+A case has a key: the hash of all that decides its flight, beside the code.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import itertools
+import json
+import math
+import shlex
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+from scipy.stats import qmc
+
+from offboard.campaign.document import CASES_MOST, CampaignFile, Sample
+from offboard.control import catalogue
+from offboard.documents import shipped
+from offboard.documents.errors import DocumentError
+from offboard.documents.reading import override, read
+
+SCENARIO = "scenario."  # of a key of the scenario
+OWN_SCENARIOS = {"px4": "px4_like", "ardupilot": "ardupilot_like"}  # where a file names none
+FILES = ("config", "controller", "reference", "vehicle", "sim_vehicle", "scenario")
+_FOLDERS = {
+    "config": "", "controller": "controllers", "reference": "references",
+    "vehicle": "vehicles", "sim_vehicle": "vehicles", "scenario": "scenarios",
+}  # fmt: skip
+Values = tuple[tuple[str, Any], ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Case:
+    """One flight of a campaign. None: the default of `config`, or of the firmware.
+
+    `values` are what parameters and draws set, by key; `text` is the YAML of a scenario that is not
+    a file; `files` holds a hash of every file that is not shipped.
+    """
+
+    config: str
+    controller: str | None
+    reference: str | None
+    vehicle: str | None
+    sim_vehicle: str | None
+    firmware: str
+    scenario: str
+    seed: int
+    values: Values = ()
+    text: str = ""
+    files: tuple[tuple[str, str], ...] = field(default=())
+
+    @property
+    def key(self) -> str:
+        """Hash of the case, 16 hexadecimal digits."""
+        text = json.dumps(asdict(self), sort_keys=True, separators=(",", ":"))
+        return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+    @property
+    def assignments(self) -> tuple[str, ...]:
+        """What `--set` sets."""
+        return tuple(
+            f"{key}={json.dumps(value)}"
+            for key, value in self.values
+            if not key.startswith(SCENARIO)
+        )
+
+    @property
+    def scenario_file(self) -> str:
+        """Name of the file that holds `text`, by its content."""
+        digest = hashlib.sha256(self.text.encode()).hexdigest()[:10]
+        return f"scenarios/{Path(self.scenario).stem}-{digest}.yaml"
+
+    @property
+    def line(self) -> str:
+        """The command that flies the case again, from the directory of the campaign."""
+        named = {
+            "config": self.config if self.config != "flight" else None,
+            "controller": self.controller,
+            "reference": self.reference,
+            "vehicle": self.vehicle,
+            "sim-vehicle": self.sim_vehicle,
+            "firmware": self.firmware if self.firmware != "px4" else None,
+        }
+        words = ["offboard", "fly", "--sitl"]
+        for option, name in named.items():
+            words += [f"--{option}", _place(name)] if name else []
+        words += ["--scenario", self.scenario_file if self.text else _place(self.scenario)]
+        for assignment in self.assignments:
+            words += ["--set", assignment]
+        return shlex.join([*words, "--seed", str(self.seed)])
+
+    def with_values(self, values: Values, base: str | None = None) -> Case:
+        """The case with these values instead; `base` is the text of its scenario before them."""
+        text = self.text if base is None else base
+        changes = [(key, value) for key, value in values if key.startswith(SCENARIO)]
+        if changes:
+            source = f"scenario {self.scenario}"
+            raw = read(text or _scenario_text(self.scenario), source)
+            for key, value in changes:
+                raw = override(raw, f"{key.removeprefix(SCENARIO)}={json.dumps(value)}")
+            text = yaml.safe_dump(raw, sort_keys=False)
+        return replace(self, values=values, text=text)
+
+
+def expand(file: CampaignFile, source: str) -> list[Case]:
+    """All cases of a campaign, in the order of its table. Raises DocumentError."""
+    size = _size(file)
+    if size > CASES_MOST:
+        raise DocumentError(f"{source}: {size:,} flights; at most {CASES_MOST:,}")
+    draws = drawn(file.sample) if file.sample else [()]
+    cases: list[Case] = []
+    for case, grid in itertools.product(base_cases(file, source), _grid(file.parameters)):
+        for draw in draws:
+            flown = case.with_values((*grid, *draw)) if grid or draw else case
+            cases += [replace(flown, seed=seed) for seed in file.seed_values]
+    if len({case.key for case in cases}) < len(cases):
+        raise DocumentError(f"{source}: a combination is given twice; give each value once")
+    return cases
+
+
+def base_cases(file: CampaignFile, source: str) -> Iterator[Case]:
+    """Every combination of names, without parameters, with the first seed."""
+    for firmware in file.firmwares:
+        scenarios = file.scenarios or (_own_scenario(firmware, source),)
+        for reference, scenario, controller, vehicle, sim_vehicle in itertools.product(
+            file.references or (None,),
+            scenarios,
+            file.controllers or (None,),
+            file.vehicles or (None,),
+            file.sim_vehicles or (None,),
+        ):
+            inline = isinstance(scenario, dict)
+            case = Case(
+                config=file.config,
+                controller=controller,
+                reference=reference,
+                vehicle=vehicle,
+                sim_vehicle=sim_vehicle,
+                firmware=firmware,
+                scenario=str(scenario.get("name", "unnamed")) if inline else scenario,
+                seed=file.seed_values[0],
+                text=yaml.safe_dump(scenario, sort_keys=False) if inline else "",
+            )
+            try:
+                yield replace(case, files=_digests(case))
+            except DocumentError as error:
+                raise DocumentError(*(f"{source}: {each}" for each in error.problems)) from None
+
+
+def _own_scenario(firmware: str, source: str) -> str:
+    if firmware not in OWN_SCENARIOS:
+        known = ", ".join(OWN_SCENARIOS)
+        raise DocumentError(f"{source}: firmwares: {firmware!r} is not one of {known}")
+    return OWN_SCENARIOS[firmware]
+
+
+def _size(file: CampaignFile) -> int:
+    lists = (file.controllers, file.references, file.vehicles, file.sim_vehicles, file.scenarios)
+    combinations = math.prod(len(names or (None,)) for names in lists) * len(file.firmwares)
+    grid = math.prod(map(len, file.parameters.values()))
+    draws = file.sample.draws if file.sample else 1
+    return combinations * grid * draws * len(file.seed_values)
+
+
+def _grid(parameters: Mapping[str, Sequence[Any]]) -> Iterable[Values]:
+    columns = [[(key, value) for value in values] for key, values in parameters.items()]
+    return list(itertools.product(*columns))
+
+
+def drawn(sample: Sample) -> list[Values]:
+    """The points of a sample."""
+    unit = qmc.LatinHypercube(len(sample.ranges), rng=np.random.default_rng(sample.seed))
+    low, high = np.array(list(sample.ranges.values())).T
+    return [
+        tuple(zip(sample.ranges, map(rounded, point), strict=True))
+        for point in (low + unit.random(sample.draws) * (high - low)).tolist()
+    ]
+
+
+def rounded(value: float) -> float:
+    """A value with five significant digits, so that files and commands stay short."""
+    return float(f"{value:.5g}")
+
+
+def _place(name: str) -> str:
+    """A name, or the absolute path of a file."""
+    return str(Path(name).absolute()) if _is_file(name) else name
+
+
+def _is_file(name: str) -> bool:
+    return "/" in name or name.endswith((".yaml", ".yml", ".csv"))
+
+
+def _digests(case: Case) -> tuple[tuple[str, str], ...]:
+    """A hash of each file that the case names. Raises DocumentError for one that is missing."""
+    found = []
+    for part in FILES:
+        name = getattr(case, part)
+        if name is None or (part == "scenario" and case.text):
+            continue
+        if _is_file(name):
+            found.append((part, _digest(name)))
+        else:
+            kind = {"config": "configuration", "sim_vehicle": "vehicle"}.get(part, part)
+            laws = catalogue.names() if part == "controller" else ()
+            if name not in laws:
+                shipped.locate(name, _FOLDERS[part], kind, laws)
+    return tuple(found)
+
+
+@cache
+def _digest(name: str) -> str:
+    return hashlib.sha256(shipped.read_text(Path(name)).encode()).hexdigest()[:16]
+
+
+@cache
+def _scenario_text(name: str) -> str:
+    return shipped.read_text(shipped.locate(name, "scenarios", "scenario"))

@@ -1,0 +1,146 @@
+"""The file of a campaign: what is flown, as a grid, a sample of declared ranges, or both.
+
+    controllers: [pso, lqr]
+    references: [lemniscate]
+    scenarios: [calm, px4_like]
+    seeds: 5
+
+A scenario is a name, a file, or the values of a scenario file. A key of `parameters` and of ranges
+is that of `--set`; after `scenario.` it is a key of the scenario.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+
+from offboard.analysis.requirement import Requirement
+from offboard.analysis.score import FIGURES
+from offboard.campaign.margin import Promises
+from offboard.documents import shipped
+from offboard.documents.errors import UserError
+from offboard.documents.parameters import Parameters
+from offboard.documents.reading import parse
+
+FOLDER = "campaigns"
+CASES_MOST = 1_000_000
+_WORST = re.compile(r"worst ([1-9][0-9]{0,3})")
+
+
+def _key(text: str) -> str:
+    if not all(part.strip() for part in text.split(".")):
+        raise ValueError(f"{text!r} is no key.path")
+    return text
+
+
+def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
+    if not ends[0] < ends[1]:
+        raise ValueError(f"the range [{ends[0]:g}, {ends[1]:g}] is empty; give [lowest, highest]")
+    return ends
+
+
+def _requirement(text: str) -> str:
+    try:
+        Requirement.parse(text, FIGURES)
+    except UserError as error:
+        raise ValueError(str(error)) from None
+    return text
+
+
+def _kept(text: str) -> str:
+    if not _WORST.fullmatch(text):
+        raise ValueError(f"{text!r} is not understood; write for example 'worst 5'")
+    return text
+
+
+Name = Annotated[str, Field(min_length=1)]
+Names = Annotated[tuple[Name, ...], Field(min_length=1)]
+Key = Annotated[str, AfterValidator(_key)]
+Ends = Annotated[tuple[float, float], AfterValidator(_ordered)]
+Seed = Annotated[int, Field(ge=0, lt=2**32)]
+Ranges = Annotated[dict[Key, Ends], Field(min_length=1)]
+
+
+class Sample(Parameters):
+    """`draws` points of the ranges (Latin hypercube), drawn with `seed`."""
+
+    draws: int = Field(ge=1, le=100_000)
+    seed: Seed = 1
+    ranges: Ranges
+
+
+class Search(Parameters):
+    """Search for failures (`--worst`) over `ranges`: `flights` for the search, with `seed`.
+
+    `defaults` are the values of an undisturbed flight, to which a failure is reduced; without one,
+    0 if it is within the range, else its middle. A range named `seed` is that of the flight's seed:
+    noise, and the phase of gusts. `methods` take turns: our swarm, CMA-ES, random. Each failure is
+    flown again with `seeds` seeds.
+    """
+
+    ranges: Ranges
+    defaults: dict[Key, float] = Field(default_factory=dict)
+    methods: tuple[Literal["swarm", "cma", "random"], ...] = Field(
+        default=("swarm", "cma"), min_length=1
+    )
+    flights: int = Field(default=500, ge=10, le=100_000)
+    seed: Seed = 1
+    seeds: int = Field(default=5, ge=1, le=100)
+
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        for key, value in self.defaults.items():
+            if key not in self.ranges:
+                raise ValueError(f"defaults.{key} has no range")
+            low, high = self.ranges[key]
+            if not low <= value <= high:
+                raise ValueError(f"defaults.{key}: {value:g} is not within [{low:g}, {high:g}]")
+        return self
+
+
+class CampaignFile(Parameters):
+    """A campaign. Lists are combined, every combination with every draw and every seed.
+
+    Without controllers, references or vehicles, those of `config` are flown; without scenarios, the
+    firmware's own. `require` is what a flight must meet beside being completed, `promises` what the
+    margin is measured against, `keep` ("worst 5") the flights whose logs are kept.
+    """
+
+    config: Name = "flight"
+    controllers: Names | None = None
+    references: Names | None = None
+    vehicles: Names | None = None
+    sim_vehicles: Names | None = None
+    firmwares: Names = ("px4",)
+    scenarios: Annotated[tuple[Name | dict[str, Any], ...], Field(min_length=1)] | None = None
+    parameters: dict[Key, Annotated[tuple[Any, ...], Field(min_length=1)]] = Field(
+        default_factory=dict
+    )
+    sample: Sample | None = None
+    search: Search | None = None
+    seeds: (
+        Annotated[int, Field(ge=1, le=100_000)] | Annotated[tuple[Seed, ...], Field(min_length=1)]
+    ) = 1
+    require: tuple[Annotated[str, AfterValidator(_requirement)], ...] = ()
+    promises: Promises = Promises()
+    keep: Annotated[str, AfterValidator(_kept)] | None = None
+
+    @property
+    def kept(self) -> int:
+        """The number of worst flights whose logs are kept."""
+        matched = _WORST.fullmatch(self.keep or "")
+        return int(matched[1]) if matched else 0
+
+    @property
+    def seed_values(self) -> tuple[int, ...]:
+        """The seeds of each combination."""
+        return tuple(range(1, self.seeds + 1)) if isinstance(self.seeds, int) else self.seeds
+
+
+def read_campaign(name: str) -> tuple[CampaignFile, str]:
+    """A shipped campaign or a file, and its path for errors. Raises DocumentError."""
+    path = shipped.locate(name, FOLDER, "campaign") if "." not in name else Path(name)
+    return parse(shipped.read_text(path), CampaignFile, str(path)), str(path)

@@ -1,0 +1,143 @@
+"""Where flights are flown: worker processes of this computer, or a dask cluster by its address.
+
+Both are executors of `concurrent.futures`. A worker loads its code once and stays.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, CancelledError, Executor
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from dataclasses import dataclass
+from typing import Any
+
+from offboard.analysis.workers import open_worker, processors, run_all
+from offboard.campaign.flight import Job, fly_job
+from offboard.campaign.margin import NOT_FLOWN
+from offboard.campaign.results import Record
+from offboard.documents.errors import UserError
+from offboard.flight.phases import ExitCode
+
+CONNECT_S = 10.0
+QUEUED = 2  # flights per thread of a cluster, so that none waits for us
+DIED = Record(
+    ExitCode.ABORTED, "the process that flew it ended, twice", NOT_FLOWN, "crash"
+)  # as its worker cannot tell
+
+
+class SchedulerError(UserError):
+    """A dask scheduler that does not answer, or is lost."""
+
+
+@dataclass(frozen=True, slots=True)
+class Workers:
+    """An open set of workers. `check` raises SchedulerError when they are lost."""
+
+    width: int
+    open_one: Callable[[], AbstractContextManager[Executor]]
+    check: Callable[[], None] = lambda: None
+
+    def fly(self, jobs: Sequence[Job], ending: Callable[[], bool]) -> Iterator[tuple[Job, Record]]:
+        """Fly jobs and yield each with its record when it ends, in any order.
+
+        A flight whose worker dies is flown a second time; if that worker dies too, `DIED` is its
+        record. Raises WorkerError or SchedulerError; what has not ended is then lost.
+        """
+        again: list[Job] = []
+        for job, result in self._run(jobs, ending):
+            if isinstance(result, BrokenExecutor):
+                again.append(job)
+            else:
+                yield job, _record_of(result)
+        for job, result in self._run(again, ending):
+            yield job, DIED if isinstance(result, BrokenExecutor) else _record_of(result)
+
+    def _run(
+        self, jobs: Sequence[Job], ending: Callable[[], bool]
+    ) -> Iterator[tuple[Job, Record | BaseException]]:
+        def watched() -> bool:
+            self.check()
+            return ending()
+
+        for job, result in run_all(jobs, fly_job, self.open_one, self.width, watched):
+            if isinstance(result, CancelledError):  # of a cluster that is lost
+                self.check()
+            yield job, _killed(result)
+
+
+def _killed(result: Record | BaseException) -> Record | BaseException:
+    """dask's own error for a worker that died, as that of an executor."""
+    if type(result).__name__ == "KilledWorker":
+        return BrokenExecutor(str(result))
+    return result
+
+
+def _record_of(result: Record | BaseException) -> Record:
+    if isinstance(result, CancelledError):
+        raise SchedulerError("the dask scheduler was lost; finished flights are kept")
+    if isinstance(result, BaseException):
+        raise result
+    return result
+
+
+@contextmanager
+def local_workers(count: int | None) -> Iterator[Workers]:
+    """Worker processes of this computer, each opened when it is first needed. They stay, with
+    their code loaded, from one `Workers.fly` to the next."""
+    idle: list[Executor] = []
+    with ExitStack() as stack:
+
+        @contextmanager
+        def open_one() -> Iterator[Executor]:
+            idle[:] = [worker for worker in idle if _lives(worker)]
+            worker = idle.pop() if idle else stack.enter_context(open_worker())
+            yield worker
+            idle.append(worker)
+
+        yield Workers(count or processors(), open_one)
+
+
+def _lives(worker: Executor) -> bool:
+    try:
+        worker.submit(os.getpid).result()
+    except BrokenExecutor:
+        return False
+    return True
+
+
+@contextmanager
+def cluster_workers(address: str) -> Iterator[Workers]:
+    """The workers of a dask scheduler, for example at "tcp://127.0.0.1:8786".
+
+    Raises SchedulerError where none answers, or dask is not installed.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise SchedulerError(
+            "--scheduler needs dask: pip install 'pso-offboard[cluster]'"
+        ) from None
+    try:
+        client = Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, TypeError) as error:
+        reason = " ".join(str(error).split())
+        raise SchedulerError(f"no dask scheduler at {address}: {reason}") from None
+    try:
+        threads = sum(client.nthreads().values())
+        if not threads:
+            raise SchedulerError(f"the dask scheduler at {address} has no worker: start one")
+        executor = client.get_executor(pure=False)
+        yield Workers(
+            QUEUED * threads, lambda: nullcontext(executor), lambda: _check(client, address)
+        )
+    finally:
+        client.close(timeout=1.0)
+
+
+def _check(client: Any, address: str) -> None:
+    if client.status != "running":
+        raise SchedulerError(
+            f"the dask scheduler at {address} was lost; finished flights are kept: run the same "
+            "command again, with it or without"
+        )

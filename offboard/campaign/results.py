@@ -1,0 +1,99 @@
+"""The folder of results: one JSON file per finished flight, DIR/results/CODE/CASE.json.
+
+A file appears whole or not at all, so that a campaign may be killed at any time, and folders of
+several machines may be copied together.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from contextlib import suppress
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+from offboard.documents.errors import UserError
+
+
+class ResultsError(UserError):
+    """The folder cannot be used: one sentence. What is finished stays in it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Record:
+    """The end of a flight. `margin` and its smallest term are those of `campaign.margin`;
+    `figures` those of the score that no clock of this computer decides, without NaN."""
+
+    exit_code: int
+    sentence: str
+    margin: float
+    weakest: str
+    figures: dict[str, float] = field(default_factory=dict)
+    terms: dict[str, float] = field(default_factory=dict)
+
+    @property
+    def completed(self) -> bool:
+        return self.exit_code == 0
+
+
+class Results:
+    """The results of one code in a directory.
+
+    Opening them raises ResultsError where the directory cannot be written, or holds the results of
+    other code.
+    """
+
+    def __init__(self, directory: Path, code: str) -> None:
+        self.directory = directory
+        self._code = code
+        self._folder = directory / "results" / code
+        try:
+            others = [p.name for p in (directory / "results").glob("*") if p.name != code]
+        except OSError:
+            others = []
+        if others:
+            raise ResultsError(
+                f"{directory} holds results of other code ({others[0]}, this is {code}); choose "
+                "another directory with --out, or delete its folder results"
+            )
+        try:
+            self._folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise self._unwritable(error) from None
+
+    def get(self, key: str) -> Record | None:
+        """The record of a finished case, else None."""
+        try:
+            raw = json.loads((self._folder / f"{key}.json").read_text(encoding="utf-8"))
+            return Record(**raw)
+        except (OSError, ValueError, TypeError):
+            return None
+
+    def put(self, key: str, record: Record) -> None:
+        """Store a record at once. Raises ResultsError, for example when the disk is full."""
+        finite = {k: v for k, v in record.figures.items() if math.isfinite(v)}
+        text = json.dumps(asdict(record) | {"figures": finite}, sort_keys=True)
+        self.write(self._folder / f"{key}.json", text.encode())
+
+    def finished(self) -> int:
+        """The number of finished flights in the folder."""
+        return sum(1 for _ in self._folder.glob("*.json"))
+
+    def write(self, path: Path, data: bytes) -> None:
+        """Write a file of the campaign, whole or not at all. Raises ResultsError."""
+        incomplete = path.with_name(f".{path.name}.{os.getpid()}")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            incomplete.write_bytes(data)
+            incomplete.replace(path)
+        except OSError as error:
+            with suppress(OSError):
+                incomplete.unlink()
+            raise self._unwritable(error) from None
+
+    def _unwritable(self, error: OSError) -> ResultsError:
+        return ResultsError(
+            f"{self.directory} cannot be written ({error.strerror}); finished flights are kept: "
+            "run the same command again when it can"
+        )

@@ -1,0 +1,216 @@
+"""Tuning: parameters that lower a figure on training flights, judged on validation flights.
+
+    ranges:
+      controller.bandwidth_radps: [3, 9]
+    training: {scenarios: [px4_like, gusts], seeds: 3}
+    validation: {scenarios: [all_together, wind_2mps], seeds: 10}
+
+The study (optuna, journal file) and the results of all flights lie in a folder, so that an
+interrupted tuning goes on.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import yaml
+from pydantic import AfterValidator, Field
+
+from offboard.analysis.score import FIGURES
+from offboard.campaign.campaign import check
+from offboard.campaign.cases import SCENARIO, Case, Values, expand, rounded
+from offboard.campaign.document import CampaignFile, Name, Names, Ranges, Seed
+from offboard.campaign.evaluate import Evaluator
+from offboard.campaign.flight import WALL_TIMES
+from offboard.campaign.results import Record
+from offboard.campaign.verdict import Verdict, judge
+from offboard.documents.errors import DocumentError, UserError
+from offboard.documents.parameters import Parameters
+from offboard.documents.reading import override, parse, read
+from offboard.documents.shipped import locate, read_text
+from offboard.flight.configuration import FOLDERS, read_part
+from offboard.flight.request import FlightRequest
+
+STUDY = "tune"
+NO_OPTUNA = "tuning needs optuna: pip install 'pso-offboard[tune]'"
+
+
+def _figure(name: str) -> str:
+    if name not in FIGURES or name in WALL_TIMES:
+        known = ", ".join(name for name in FIGURES if name not in WALL_TIMES)
+        raise ValueError(f"{name!r} is no figure of a lockstep flight; there are {known}")
+    return name
+
+
+class Flights(Parameters):
+    """A set of flights: every reference in every scenario with every seed."""
+
+    references: Names | None = None
+    scenarios: Annotated[tuple[Name | dict[str, Any], ...], Field(min_length=1)]
+    seeds: (
+        Annotated[int, Field(ge=1, le=1000)] | Annotated[tuple[Seed, ...], Field(min_length=1)]
+    ) = 3
+
+
+class TuneFile(Parameters):
+    """A tuning. `objective` is the figure that is minimised, averaged over the flights; a flight
+    that is not completed costs `failure`."""
+
+    config: Name = "flight"
+    controller: Name | None = None
+    firmware: Name = "px4"
+    ranges: Ranges
+    training: Flights
+    validation: Flights
+    objective: Annotated[str, AfterValidator(_figure)] = "rmse_position_m"
+    failure: float = Field(default=5.0, gt=0, le=1e6)
+    sampler: Literal["tpe", "cma", "swarm"] = "tpe"
+    trials: int = Field(default=60, ge=2, le=100_000)
+    seed: Seed = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Tuned:
+    """The best parameters found, and the verdict on the validation flights."""
+
+    values: Values
+    verdict: Verdict
+
+
+def read_tune(path: str) -> TuneFile:
+    """A tuning file. Raises DocumentError."""
+    file = parse(read_text(Path(path)), TuneFile, path)
+    for key in file.ranges:
+        if key.startswith(SCENARIO):
+            raise DocumentError(f"{path}: ranges.{key}: a scenario is not tuned, the flight is")
+    return file
+
+
+class Tuning:
+    """Finds and judges parameters. Raises DocumentError for what cannot be flown."""
+
+    def __init__(self, file: TuneFile, source: str) -> None:
+        self.file = file
+        self._training = _cases(file, file.training, source)
+        self._validation = _cases(file, file.validation, source)
+        shared = len(set(self._training) & set(self._validation))
+        if shared:
+            raise DocumentError(
+                f"{source}: {shared} flights are in training and in validation; give other "
+                "scenarios, references or seeds"
+            )
+        self._defaults = _defaults(self._training[0], file, source)
+        check([self._training[0].with_values(tuple(self._defaults.items()))], source)
+
+    def run(
+        self, folder: Path, evaluator: Evaluator, progress: Callable[[int, float], None]
+    ) -> Tuned:
+        """Search, then fly the validation set with and without what was found.
+
+        `progress` gets the number of trials and the lowest cost so far. Raises UserError without
+        optuna, and what `Evaluator.fly` raises.
+        """
+        study = _study(folder, self.file)
+        if not study.trials:
+            study.enqueue_trial({k: v for k, v in self._defaults.items() if self._within(k, v)})
+        while (count := sum(trial.state.is_finished() for trial in study.trials)) < (
+            self.file.trials
+        ):
+            trial = study.ask()
+            values = tuple(
+                (key, rounded(trial.suggest_float(key, *ends)))
+                for key, ends in self.file.ranges.items()
+            )
+            costs = self._costs(evaluator, self._training, values)
+            study.tell(trial, sum(costs) / len(costs))
+            progress(count + 1, study.best_value)
+        best = tuple((key, rounded(study.best_params[key])) for key in self.file.ranges)
+        before = self._costs(evaluator, self._validation, ())
+        return Tuned(best, judge(before, self._costs(evaluator, self._validation, best)))
+
+    def _within(self, key: str, value: float) -> bool:
+        low, high = self.file.ranges[key]
+        return low <= value <= high
+
+    def _costs(self, evaluator: Evaluator, cases: Sequence[Case], values: Values) -> list[float]:
+        records = evaluator.fly([case.with_values(values) if values else case for case in cases])
+        return [self._cost(record) for record in records]
+
+    def _cost(self, record: Record) -> float:
+        if not record.completed:
+            return self.file.failure
+        return record.figures.get(self.file.objective, self.file.failure)
+
+
+def _cases(file: TuneFile, flights: Flights, source: str) -> list[Case]:
+    campaign = CampaignFile(
+        config=file.config,
+        controllers=(file.controller,) if file.controller else None,
+        references=flights.references,
+        scenarios=flights.scenarios,
+        firmwares=(file.firmware,),
+        seeds=flights.seeds,
+    )
+    return expand(campaign, source)
+
+
+def _defaults(case: Case, file: TuneFile, source: str) -> dict[str, float]:
+    """The present values of the parameters. Raises DocumentError for one that is no number."""
+    choices = {"controller": case.controller, "reference": case.reference}
+    request = FlightRequest(
+        Path(),
+        config=case.config,
+        choices={part: name for part, name in choices.items() if name},
+        sitl=True,
+        firmware=case.firmware,
+    )
+    resolved = request.resolve().model_dump(mode="json")
+    found: dict[str, float] = {}
+    for key in file.ranges:
+        value: Any = resolved
+        for part in key.split("."):
+            value = value.get(part) if isinstance(value, Mapping) else None
+        if not isinstance(value, float | int) or isinstance(value, bool):
+            raise DocumentError(f"{source}: ranges.{key} is no number of the configuration")
+        found[key] = float(value)
+    return found
+
+
+def _study(folder: Path, file: TuneFile) -> Any:
+    """The study in a folder, begun or continued."""
+    try:
+        import optuna
+        from optuna.storages import JournalStorage
+        from optuna.storages.journal import JournalFileBackend
+
+        from offboard.campaign.swarm_sampler import SwarmSampler
+    except ImportError:
+        raise UserError(NO_OPTUNA) from None
+    optuna.logging.set_verbosity(optuna.logging.ERROR)
+    samplers: dict[str, Callable[[], Any]] = {
+        "tpe": lambda: optuna.samplers.TPESampler(seed=file.seed),
+        "cma": lambda: optuna.samplers.CmaEsSampler(seed=file.seed),
+        "swarm": lambda: SwarmSampler(file.ranges, file.seed),
+    }
+    storage = JournalStorage(JournalFileBackend(str(folder / "tune.journal")))
+    return optuna.create_study(
+        storage=storage, study_name=STUDY, sampler=samplers[file.sampler](), load_if_exists=True
+    )
+
+
+def profile(file: TuneFile, tuned: Tuned) -> str:
+    """The configuration with the tuned values, as `fly --config` takes it."""
+    raw = read(read_text(locate(file.config, "", "configuration")), file.config)
+    if file.controller:
+        raw["controller"] = file.controller
+    for part, (key, _) in itertools.product(FOLDERS, tuned.values):
+        if key.startswith(f"{part}.") and isinstance(raw.get(part), str):
+            raw[part] = read_part(part, raw[part])
+    for key, value in tuned.values:
+        raw = override(raw, f"{key}={value}")
+    heading = f"# Tuned for {file.objective}: {tuned.verdict}\n"
+    return heading + yaml.safe_dump(raw, sort_keys=False)

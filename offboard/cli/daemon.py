@@ -1,0 +1,182 @@
+"""`offboard daemon`: the service that flies a vehicle whenever its pilot engages it."""
+
+from __future__ import annotations
+
+import json
+import sys
+from contextlib import closing
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from offboard.cli.fly import LINKS
+from offboard.cli.shared import (
+    DEFAULT_CONNECTION,
+    FILE,
+    FLIGHTS,
+    Assignments,
+    CommandError,
+    SigningKey,
+    System,
+    Vehicle,
+    option,
+    say,
+)
+
+if TYPE_CHECKING:
+    from offboard.service.flights import Flights
+
+LINES_MAX = 1000  # that wait for the terminal
+TERMINAL_S = 2.0  # for them, at the end
+OUT = f"Directory of the flights' directories.  [default: {FLIGHTS}]"
+
+
+class AnchorAt(StrEnum):
+    """Where the reference of an engagement is placed."""
+
+    HERE = "here"
+    ORIGIN = "origin"
+
+
+class ThenDo(StrEnum):
+    """What follows when the reference was flown."""
+
+    HOLD = "hold"
+    LAND = "land"
+    REPEAT = "repeat"
+
+
+def daemon(
+    connect: Annotated[str | None, option("LINK", LINKS)] = None,
+    config: Annotated[str, option(FILE, "Configuration.")] = "flight",
+    controller: Annotated[str | None, option(FILE, "Controller.")] = None,
+    reference: Annotated[str | None, option(FILE, "Reference; a file may also be .csv.")] = None,
+    vehicle: Vehicle = None,
+    system: System = None,
+    signing_key: SigningKey = None,
+    anchor: Annotated[
+        AnchorAt,
+        typer.Option(help="Reference: start at the vehicle, or relative to the take-off point."),
+    ] = AnchorAt.HERE,
+    then: Annotated[ThenDo, typer.Option(help="After the reference.")] = ThenDo.HOLD,
+    arms: Annotated[
+        bool, typer.Option("--arms", help="May arm and take off when it is asked to start.")
+    ] = False,
+    seed: Annotated[int | None, option("N", "Random seed.")] = None,
+    out_directory: Annotated[Path | None, option("DIR", OUT, "--out")] = None,
+    metrics: Annotated[
+        str | None, option("HOST:PORT", "Serve /metrics (Prometheus) and /health.  [default: off]")
+    ] = None,
+    log_json: Annotated[
+        bool, typer.Option("--log-json", help="Print one JSON object a line.")
+    ] = False,
+    print_unit: Annotated[
+        bool, typer.Option("--print-unit", help="Print a systemd unit with these options, and end.")
+    ] = False,
+    assignments: Assignments = None,
+) -> None:
+    """Wait for a vehicle, and fly whenever its pilot engages.
+
+    Never arms without --arms. The pilot engages by switching to OFFBOARD (PX4) or GUIDED
+    (ArduCopter) in the air, and takes the vehicle back by any other mode. Each engagement has a
+    directory of its own, as that of `fly`. A ground station may send MAV_CMD_MISSION_START,
+    MAV_CMD_DO_PAUSE_CONTINUE and MAV_CMD_DO_SET_MODE (hands back) to component 191.
+    """
+    connection = connect or DEFAULT_CONNECTION
+    if print_unit:
+        _print_unit(connection)
+        return
+    from offboard.flight.stop import StopRequests
+
+    with StopRequests() as stops, closing(_Printer(log_json)) as printer:
+        from offboard.compiled import loading
+
+        with loading():
+            from offboard.flight.request import FlightRequest
+            from offboard.service.daemon import Service, run
+            from offboard.service.lock import Locked
+        named = {"controller": controller, "reference": reference, "vehicle": vehicle}
+        request = FlightRequest(
+            directory=out_directory or FLIGHTS,
+            config=config,
+            choices={part: name for part, name in named.items() if name is not None},
+            assignments=tuple(assignments or ()),
+            seed=seed,
+            connection=connection,
+            system_id=system,
+            signing_key=signing_key,
+        )
+        wanted = Service(request, anchor.value, then.value, arms, metrics)
+        try:
+            outcome = run(wanted, stops=stops, tell=printer.tell, show=printer.show)
+        except Locked as error:
+            raise CommandError(str(error), 3) from None
+        if not outcome.exit_code:
+            printer.tell(outcome.sentence)
+    if outcome.exit_code:
+        raise CommandError(outcome.sentence, outcome.exit_code)
+
+
+def _print_unit(connection: str) -> None:
+    from offboard.service.unit import unit
+
+    after = sys.argv[sys.argv.index("daemon") + 1 :]
+    words = [word for word in after if word != "--print-unit"]
+    sys.stdout.write(unit([_absolute(word) for word in words], connection))
+
+
+def _absolute(word: str) -> str:
+    """A file is named by its whole path: the unit runs in another directory."""
+    option, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
+    is_path = "/" in value or value.endswith((".yaml", ".yml", ".csv", ".key"))
+    if not (is_path and Path(value).exists()):
+        return word
+    return f"{option}{equals}{Path(value).absolute()}"
+
+
+class _Printer:
+    """Prints lines from a thread of its own, as text or as JSON."""
+
+    def __init__(self, as_json: bool) -> None:
+        from offboard.flight.background import BackgroundWriter
+
+        self._as_json = as_json
+        self._shown = 0
+        self._writer = BackgroundWriter[str](_show_json if as_json else _show, LINES_MAX)
+
+    def tell(self, sentence: str) -> None:
+        """A sentence about the service."""
+        self._writer.put(self._line(sentence, "service", None))
+
+    def show(self, flights: Flights) -> None:
+        """What the flights have announced since the last call."""
+        new = flights.announcements - self._shown
+        if new:
+            self._shown = flights.announcements
+            for sentence in flights.announced[-new:]:
+                line = self._line(sentence, flights.phase.value, flights.state.time_s)
+                self._writer.put(line)
+
+    def _line(self, sentence: str, phase: str, time_s: float | None) -> str:
+        from offboard.flight import clock
+
+        if self._as_json:
+            entry = {"time": clock.utc(), "level": "info", "phase": phase, "event": sentence}
+            return json.dumps(entry if time_s is None else {**entry, "vehicle_time_s": time_s})
+        return sentence if time_s is None else f"{time_s:8.2f} s  {sentence}"
+
+    def close(self) -> None:
+        self._writer.close(TERMINAL_S)
+
+
+def _show(lines: list[str]) -> None:
+    for line in lines:
+        say(line, indent=12)
+    sys.stdout.flush()
+
+
+def _show_json(lines: list[str]) -> None:
+    sys.stdout.write("".join(f"{line}\n" for line in lines))
+    sys.stdout.flush()

@@ -1,0 +1,113 @@
+"""`offboard doctor`: a read-only check of a vehicle, its link and this computer."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from offboard.cli.fly import LINKS
+from offboard.cli.shared import (
+    DEFAULT_CONNECTION,
+    FILE,
+    FLIGHTS,
+    Assignments,
+    SigningKey,
+    System,
+    Vehicle,
+    option,
+    out,
+    say,
+)
+
+if TYPE_CHECKING:
+    from offboard.doctor.findings import Row
+
+REFUSED = 3
+DOCTOR_CODES = (
+    "Exit codes: 0 nothing blocks a flight; 2 usage or configuration error; 3 something blocks."
+)
+
+
+def doctor(
+    names: Annotated[
+        list[str] | None,
+        typer.Argument(metavar="CHECK...", help="Only these checks.  [default: all]"),
+    ] = None,
+    connect: Annotated[str | None, option("LINK", LINKS)] = None,
+    config: Annotated[str, option(FILE, "Configuration of the planned flight.")] = "flight",
+    controller: Annotated[str | None, option(FILE, "Controller.")] = None,
+    reference: Annotated[str | None, option(FILE, "Reference; a file may also be .csv.")] = None,
+    vehicle: Vehicle = None,
+    system: System = None,
+    signing_key: SigningKey = None,
+    assignments: Assignments = None,
+    out_directory: Annotated[
+        Path | None, option("DIR", "Where flights are recorded.  [default: flights]", "--out")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the report as JSON.")] = False,
+    listing: Annotated[bool, typer.Option("--list", help="List the checks and exit.")] = False,
+) -> None:
+    """Check vehicle, link and computer; changes nothing.
+
+    Listens for 4 to 10 s. Sends heartbeats, TIMESYNC, and requests: for parameters, for single
+    messages, for the telemetry rates of a flight, and that the vehicle runs its pre-arm checks. It
+    never sends a setpoint, arms, selects a mode or sets a parameter. To an armed vehicle it sends
+    no heartbeat, and requests no rates.
+
+    Levels: ok; warn; wait, which may clear by itself; blocks, which `offboard fly` refuses, too.
+    """
+    from offboard.doctor.table import checks
+
+    chosen = checks(names or ())
+    if listing:
+        width = max(len(check.name) for check in chosen)
+        for check in chosen:
+            say(f"{check.name:<{width}}  {check.summary}", indent=width + 2)
+        return
+    from offboard.doctor import report
+    from offboard.doctor.findings import Level, examine, worst
+    from offboard.doctor.run import observe
+    from offboard.flight.configuration import load
+
+    named = {"controller": controller, "reference": reference, "vehicle": vehicle}
+    flight = load(
+        config,
+        choices={part: name for part, name in named.items() if name is not None},
+        assignments=assignments or (),
+    )
+    seen = observe(
+        connect or DEFAULT_CONNECTION,
+        flight,
+        out_directory or FLIGHTS,
+        system_id=system,
+        signing_key=signing_key,
+    )
+    rows = examine(chosen, seen)
+    if as_json:
+        sys.stdout.write(report.as_json(rows, seen))
+    else:
+        _show(rows)
+    if worst(rows) is Level.BLOCKS:
+        raise typer.Exit(REFUSED)
+
+
+def _show(rows: list[Row]) -> None:
+    """One line for each finding, the hint below it; of a row with something to say only that."""
+    from offboard.doctor.findings import Level
+    from offboard.doctor.report import name
+
+    levels = max(len(name(level)) for level in Level)
+    width = max((len(row.check) for row in rows), default=0)
+    indent = levels + width + 4
+    for row in rows:
+        said = [f for f in row.findings if f.level is not Level.OK] or row.findings[:1]
+        for finding in said:
+            say(f"{name(finding.level):<{levels}}  {row.check:<{width}}  {finding.found}", indent)
+            if finding.hint:
+                say(f"{'':<{indent}}fix: {finding.hint}", indent + 5)
+    number = sum(row.level is not Level.OK for row in rows)
+    out.print()
+    say(f"{len(rows)} checks, {number} with something to say")

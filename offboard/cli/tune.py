@@ -1,0 +1,66 @@
+"""`offboard tune`: parameters that fly better, judged on flights that they were not tuned on."""
+
+from __future__ import annotations
+
+from contextlib import suppress
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from offboard.cli.shared import CommandError, Workers, option, out, say
+
+FILE = typer.Argument(metavar="FILE", help="Tuning file.")
+ENDED = "interrupted; finished flights are kept: run the same command again to go on"
+
+
+def tune(
+    file: Annotated[str, FILE],
+    profile: Annotated[
+        Path, option("FILE", "Flight configuration to write; a new file.", "-o", "--out")
+    ] = Path("profile.yaml"),
+    workers: Workers = None,
+) -> None:
+    """Tune parameters, and write a configuration that flies better.
+
+    Minimises a figure over training flights, then flies the validation flights with and without
+    the result. It is written only if it is better with 95 % confidence. Study and results are in a
+    folder beside it: the same command goes on.
+    """
+    if workers is not None and not 1 <= workers <= 256:
+        raise CommandError(f"--workers {workers}: give 1 .. 256")
+    if profile.exists():
+        raise CommandError(f"{profile} exists; choose another file with --out")
+    with out.status("planning"):
+        from offboard.campaign.code import code_hash
+        from offboard.campaign.evaluate import Evaluator, Interrupted
+        from offboard.campaign.execution import local_workers
+        from offboard.campaign.margin import Promises
+        from offboard.campaign.results import Results
+        from offboard.campaign.tune import Tuning, read_tune
+        from offboard.campaign.tune import profile as text_of
+        from offboard.flight.stop import StopRequests
+
+        tuning = Tuning(read_tune(file), file)
+        results = Results(profile.with_suffix(".tune"), code_hash())
+    tuned = None
+    with (
+        suppress(KeyboardInterrupt, Interrupted),
+        StopRequests() as stops,
+        local_workers(workers) as flyers,
+    ):
+        evaluator = Evaluator(results, Promises(), flyers, lambda: stops.requested)
+        tuned = tuning.run(
+            results.directory,
+            evaluator,
+            lambda number, cost: say(f"{number} of {tuning.file.trials} trials, best {cost:.4g}"),
+        )
+    if tuned is None:
+        raise CommandError(ENDED, 4)
+    for key, value in tuned.values:
+        say(f"  {key}: {value:g}")
+    say(f"validation: {tuned.verdict}")
+    if not tuned.verdict.better:
+        raise CommandError("not better with 95 % confidence: nothing is written", 1)
+    results.write(profile, text_of(tuning.file, tuned).encode())
+    say(f"written: {profile}")

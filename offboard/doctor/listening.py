@@ -1,0 +1,277 @@
+"""The listening pass: what is received and what is asked, until the observation is complete.
+
+Sans-I/O: received chunks and host times in, frames out. It only asks: it never sends a setpoint, a
+mode, an arming or a parameter. To a vehicle that is armed it sends no heartbeat either: one that
+ends could be a lost ground station for it.
+"""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Hashable, Iterable
+
+from offboard.doctor.census import Census
+from offboard.doctor.observation import FIX_3D, ClockMeasures, LinkMeasures, Observation
+from offboard.flight.link import Chunk
+from offboard.flight.link_age import LinkDelay, VehicleClock
+from offboard.flight.readiness import Readiness
+from offboard.flight.record import COMPONENT_ID
+from offboard.flight.vehicle_state import VehicleState
+from offboard.mavlink.dialects.base import WantedMessage
+from offboard.mavlink.events import (
+    Attitude,
+    CommandAck,
+    EstimatorReport,
+    Event,
+    GpsFix,
+    LocalPosition,
+    NoFix,
+    Rebooted,
+    StatusText,
+    SystemTime,
+    TimesyncReply,
+)
+from offboard.mavlink.outgoing import CommandLong, Outgoing, Timesync
+from offboard.mavlink.session import Session, SessionSettings
+from offboard.mavlink.signing import Signing
+
+NOTHING_S = 6.0  # without an autopilot
+LEAST_S, LONGEST_S = 4.0, 9.5  # with one
+ASK_EVERY_S, TRIES = 1.0, 8
+TIMESYNC_EVERY_S = 0.1
+PREARM_AFTER_S = 1.0  # PX4 sends texts only once it has noticed our heartbeat
+TEXTS_S = 1.0  # for the texts after the acknowledgement
+ENOUGH = 0.7  # of a rate, measured over two seconds
+SETTLE_S = 1.0  # until jumps of the vehicle's clock count
+RUN_PREARM_CHECKS, REQUEST_MESSAGE = 401, 512  # MAV_CMD
+VERSION, GPS, SYSTEM_TIME, TIMESYNC = 148, 24, 2, 111  # message ids
+
+
+class Listening:
+    """One pass over one link. `began_s`: host time. `system_id`: of the vehicle, if chosen.
+    `sends_first`: the vehicle learns our address from what we send."""
+
+    def __init__(
+        self,
+        began_s: float,
+        *,
+        system_id: int | None = None,
+        signing: Signing | None = None,
+        stream: bool = False,
+        capacity_bytes_ps: float | None = None,
+        sends_first: bool = False,
+    ) -> None:
+        self.peer: Hashable | None = None
+        self.vehicle = VehicleState()
+        self._began_s, self._found_s = began_s, 0.0
+        self._sends_first = sends_first
+        self._capacity_bytes_ps = capacity_bytes_ps
+        self._session = Session(
+            SessionSettings(
+                system_id=system_id,
+                component_id=COMPONENT_ID,
+                stream=stream,
+                capacity_bytes_ps=capacity_bytes_ps,
+            ),
+            signing,
+        )
+        self._census = Census(stream)
+        self._readiness, self._delay, self._clock = Readiness(), LinkDelay(), VehicleClock()
+        self._asked: dict[int, tuple[int, float]] = {}  # message or command: tries, when
+        self._settled = self._rebooted = self._requested = False
+        self._late_s = 0.0
+        self._sent_s: dict[int, float] = {}  # TIMESYNC: stamp -> when
+        self._round_trips_s: list[float] = []
+        self._timesync_s = self._foreign_timesync = 0.0
+        self._first: tuple[float, float] | None = None  # vehicle time and host time
+        self._newest: tuple[float, float] | None = None
+        self._unix_offset_s: float | None = None
+        self._fix_type: int | None = None
+        self._texts: list[str] = []
+        self._prearm_s: float | None = None  # when it was acknowledged
+        self._acknowledged: dict[int, str] = {}
+
+    # --- in ---
+
+    def take(self, chunk: Chunk, unix_less_host_s: float = 0.0) -> None:
+        """Process received bytes. `unix_less_host_s` converts host time to Unix time."""
+        self._census.receive(chunk.data, chunk.peer)
+        reception = self._session.receive(chunk.data, chunk.peer, chunk.arrived_s)
+        for event in reception.events:
+            if self.peer is None and self._session.vehicle is not None:
+                self.peer, self._found_s = chunk.peer, chunk.arrived_s
+            self.vehicle.update(event, self._session.link_time_s)
+            self._note(event, chunk.arrived_s, unix_less_host_s)
+
+    def _note(self, event: Event, at_s: float, unix_less_host_s: float) -> None:
+        match event:
+            case Attitude(time_s) | LocalPosition(time_s):
+                self._on_stamp(time_s, at_s)
+            case TimesyncReply(request_ns):
+                sent_s = self._sent_s.pop(request_ns, None)
+                if sent_s is None:
+                    self._foreign_timesync += 1
+                else:
+                    self._round_trips_s.append(at_s - sent_s)
+                    self._delay.on_reply(event)
+            case SystemTime(unix_s) if unix_s:
+                self._unix_offset_s = unix_s - at_s - unix_less_host_s
+            case NoFix(fix_type):
+                self._fix_type = fix_type
+            case GpsFix():
+                self._fix_type = FIX_3D
+            case StatusText(_, text):
+                self._texts.append(text)
+            case CommandAck(command, result):
+                self._acknowledged[command] = result
+                if command == RUN_PREARM_CHECKS and self._prearm_s is None:
+                    self._prearm_s = at_s
+            case Rebooted():
+                self._rebooted = True
+                self._first = self._newest = None
+                self._clock.reset()
+                self._delay.reset()
+
+    def _on_stamp(self, stamp_s: float, at_s: float) -> None:
+        self._late_s = max(self._late_s, self._clock.age_s(stamp_s, at_s) if self._settled else 0.0)
+        self._clock.on_telemetry(stamp_s, at_s)
+        if not self._settled and at_s - self._found_s > SETTLE_S:
+            self._settled = True
+            self._clock.settle()
+        if self._first is None:
+            self._first = stamp_s, at_s
+        if self._newest is None or stamp_s > self._newest[0]:
+            self._newest = stamp_s, at_s
+
+    # --- out ---
+
+    def due(self, now_s: float) -> list[bytes]:
+        """The frames to send at host time `now_s`; call it at least every 50 ms."""
+        return [self._session.encode(each) for each in self._questions(now_s)]
+
+    def _questions(self, now_s: float) -> Iterable[Outgoing]:
+        yield from filter(self._permitted, self._session.poll(now_s))
+        dialect, state = self._session.dialect, self.vehicle
+        if dialect is None:
+            if self._sends_first and self._may_ask(TIMESYNC, now_s):
+                yield Timesync(0, round(now_s * 1e9))
+            return
+        yield from self._readiness.due(dialect, state.parameters, now_s)
+        fix_age_s = min(state.age_s(NoFix), state.age_s(GpsFix))
+        unknown = {
+            VERSION: state.version is None,
+            GPS: fix_age_s > ASK_EVERY_S,
+            SYSTEM_TIME: self._unix_offset_s is None,
+            dialect.estimator_message: state.age_s(EstimatorReport) > ASK_EVERY_S,
+        }
+        for message_id, missing in unknown.items():
+            if missing and self._may_ask(message_id, now_s):
+                yield CommandLong.message(message_id)
+        if self._prearm_due(now_s) and self._may_ask(RUN_PREARM_CHECKS, now_s):
+            yield CommandLong.run_prearm_checks()
+        if self._newest and now_s - self._timesync_s >= TIMESYNC_EVERY_S:
+            self._timesync_s = now_s
+            yield self._timesync(self._newest[0], now_s)
+
+    def _permitted(self, outgoing: Outgoing) -> bool:
+        """Neither heartbeats nor rates for an armed vehicle, or before it is known."""
+        permitted = self.vehicle.heartbeat is not None and not self.vehicle.armed
+        self._requested |= permitted and isinstance(outgoing, CommandLong)
+        return permitted
+
+    def _prearm_due(self, now_s: float) -> bool:
+        disarmed = self.vehicle.heartbeat is not None and not self.vehicle.armed
+        return disarmed and self._prearm_s is None and now_s - self._found_s >= PREARM_AFTER_S
+
+    def _may_ask(self, number: int, now_s: float) -> bool:
+        tries, asked_s = self._asked.get(number, (0, now_s - ASK_EVERY_S))
+        if tries >= TRIES or now_s - asked_s < ASK_EVERY_S:
+            return False
+        self._asked[number] = tries + 1, now_s
+        return True
+
+    def _timesync(self, stamp_s: float, now_s: float) -> Timesync:
+        request = self._delay.request(stamp_s, now_s)
+        self._sent_s.setdefault(request.ts1_ns, now_s)
+        return request
+
+    # --- the end ---
+
+    def complete(self, now_s: float) -> bool:
+        """Everything was answered, or it takes too long."""
+        if self._session.vehicle is None or self._session.dialect is None:
+            return now_s - self._began_s >= NOTHING_S
+        state, passed_s = self.vehicle, now_s - self._found_s
+        if passed_s < LEAST_S or passed_s >= LONGEST_S:
+            return passed_s >= LONGEST_S
+        checked = state.armed or (self._prearm_s is not None and now_s - self._prearm_s >= TEXTS_S)
+        rates = self._session.rates_hz
+        return (
+            checked
+            and state.version is not None
+            and self._delay.estimate is not None
+            and self._readiness.complete(self._session.dialect, state.parameters, now_s)
+            and all(each.optional or enough(each, rates) for each in self._session.dialect.wanted)
+        )
+
+    def observation(self, now_s: float) -> Observation:
+        """What was observed until host time `now_s`."""
+        dialect, state = self._session.dialect, self.vehicle
+        names = [p.name for p in dialect.watched_parameters] if dialect else []
+        prefixes = dialect.prearm_prefixes if dialect else ()
+        told = (
+            text.removeprefix(prefix)
+            for text in self._texts
+            for prefix in prefixes
+            if text.startswith(prefix)
+        )
+        return Observation(
+            listened_s=now_s - self._began_s,
+            system_id=self._session.settings.system_id,
+            not_found=self._session.autopilots.why_none(self._session.counters),
+            senders=self._census.senders,
+            vehicle=state,
+            dialect=dialect,
+            unanswered=tuple(name for name in names if name not in state.parameters),
+            fix_type=self._fix_type,
+            prearm_texts=tuple(dict.fromkeys(told)),
+            link=self._measures(now_s),
+            clock=self._clock_measures(),
+        )
+
+    def _measures(self, now_s: float) -> LinkMeasures:
+        dialect, counters = self._session.dialect, self._census.counters
+        wanted = dialect.wanted if dialect else ()
+        passed_s = max(now_s - (self._found_s or self._began_s), 1e-3)
+        trips_s = self._round_trips_s
+        return LinkMeasures(
+            bytes_received=counters.bytes_received,
+            bytes_skipped=counters.bytes_skipped,
+            bytes_ps=counters.bytes_received / passed_s,
+            wanted_bytes_ps=self._session.wanted_bytes_ps,
+            capacity_bytes_ps=self._capacity_bytes_ps,
+            messages_bytes_ps={
+                name: number / passed_s for name, number in self._census.message_bytes.items()
+            },
+            wanted=wanted,
+            rates_hz=self._session.rates_hz,
+            requested=self._requested,
+            delay=self._delay.estimate,
+            round_trip_s=statistics.median(trips_s) if trips_s else None,
+            late_s=self._late_s,
+            foreign_timesync=int(self._foreign_timesync),
+            commands_sent=len(self._asked.keys() - {TIMESYNC}),
+            acknowledged=dict(self._acknowledged),
+        )
+
+    def _clock_measures(self) -> ClockMeasures:
+        rate = None
+        if self._first and self._newest and self._newest[1] - self._first[1] > 1.0:
+            (began_s, heard_s), (ended_s, ended_at_s) = self._first, self._newest
+            rate = (ended_s - began_s - self._clock.jumped_s) / (ended_at_s - heard_s)
+        return ClockMeasures(rate, self._clock.jumped_s, self._rebooted, self._unix_offset_s)
+
+
+def enough(wanted: WantedMessage, rates_hz: dict[str, float]) -> bool:
+    """Whether a message arrives at nearly the rate that is wanted."""
+    return rates_hz.get(wanted.name, 0.0) >= ENOUGH * wanted.rate_hz

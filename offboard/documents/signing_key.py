@@ -1,0 +1,101 @@
+"""Key files of MAVLink 2 signing: one line, with the key or with the passphrase that it comes from.
+
+    passphrase: TEXT      the key is the SHA-256 of the text, as in MAVProxy, QGroundControl and
+                          Mission Planner, which can set it on a vehicle
+    key: 64 hex digits    the 32 bytes of the key themselves
+
+Lines that begin with # are comments. The file must be readable by its owner alone. No error shows
+any of its contents.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import secrets
+import stat
+from pathlib import Path
+
+from offboard.documents.errors import UserError, abridged
+
+KEY_BYTES = 32
+PASSPHRASE_MIN = 16  # characters
+FILE_BYTES_MAX = 4096
+_OTHERS = stat.S_IRWXG | stat.S_IRWXO
+_EXPECTED = (
+    f"expected one line, 'passphrase: TEXT' with at least {PASSPHRASE_MIN} characters or "
+    "'key: ' and 64 hexadecimal digits; `offboard key` makes a file"
+)
+
+
+class KeyFileError(UserError):
+    """A key file that cannot be used: one sentence for the user."""
+
+
+def read_key(path: Path) -> bytes:
+    """The 32 bytes of the key in the file at `path`. Raises KeyFileError."""
+    shown = f"signing key {abridged(path)}"
+    try:
+        # a FIFO must not make us wait
+        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_CLOEXEC)
+        try:
+            found = os.fstat(descriptor)
+            _check(found, shown)
+            content = os.read(descriptor, FILE_BYTES_MAX + 1)
+        finally:
+            os.close(descriptor)
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the path
+        reason = getattr(error, "strerror", None) or error
+        raise KeyFileError(f"{shown} cannot be read: {reason}") from None
+    return _key_in(content, shown)
+
+
+def create_key(path: Path) -> str:
+    """Create a key file at `path` with a random passphrase, which is returned. Never replaces a
+    file. Raises KeyFileError."""
+    passphrase = secrets.token_hex(KEY_BYTES)
+    text = f"# MAVLink 2 signing key: keep it secret\npassphrase: {passphrase}\n"
+    try:
+        descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o600)
+    except FileExistsError:
+        raise KeyFileError(f"{abridged(path)} exists and is not replaced: name another") from None
+    except (OSError, ValueError) as error:
+        reason = getattr(error, "strerror", None) or error
+        raise KeyFileError(f"{abridged(path)} cannot be created: {reason}") from None
+    try:
+        with os.fdopen(descriptor, "w", encoding="ascii") as file:
+            os.fchmod(file.fileno(), 0o600)
+            file.write(text)
+            file.flush()
+            os.fsync(file.fileno())
+    except OSError as error:
+        path.unlink(missing_ok=True)
+        raise KeyFileError(f"{abridged(path)} cannot be written: {error.strerror}") from None
+    return passphrase
+
+
+def _check(found: os.stat_result, shown: str) -> None:
+    if not stat.S_ISREG(found.st_mode):
+        raise KeyFileError(f"{shown} is not a file")
+    if found.st_mode & _OTHERS:
+        raise KeyFileError(f"{shown} can be read or changed by other users: chmod 600 it")
+    if found.st_size > FILE_BYTES_MAX:
+        raise KeyFileError(f"{shown} has {found.st_size:,} bytes: that is no key file")
+
+
+def _key_in(content: bytes, shown: str) -> bytes:
+    """The key that the file's content gives."""
+    rows = [row.strip() for row in content.splitlines()]
+    rows = [row for row in rows if row and not row.startswith(b"#")]
+    kind, _, value = rows[0].partition(b":") if len(rows) == 1 else (b"", b"", b"")
+    value = value.strip()
+    if kind == b"passphrase" and len(value) >= PASSPHRASE_MIN:
+        return hashlib.sha256(value).digest()
+    if kind == b"key" and len(value) == 2 * KEY_BYTES:
+        try:
+            key = bytes.fromhex(value.decode("ascii"))
+        except ValueError:
+            key = b""
+        if len(key) == KEY_BYTES and any(key):  # all zero means no signing
+            return key
+    raise KeyFileError(f"{shown} is too short or no key file: {_EXPECTED}")

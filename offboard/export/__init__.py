@@ -1,0 +1,1 @@
+"""Export: a flight's log in the formats of other tools."""

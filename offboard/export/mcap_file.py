@@ -1,0 +1,174 @@
+"""MCAP: Foxglove's schemas in protobuf, for Foxglove, Lichtblick, Rerun and PlotJuggler.
+
+Poses, paths and velocity are in the frame `map` (ENU, metres) and the body `base_link` (FLU). Every
+series is also a channel of JSON messages with the columns of the tables, in NED, as `/table/NAME`.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from offboard.export.frames import enu, flu_in_enu
+from offboard.export.new_file import library, new_file
+from offboard.export.series import Array, Flight, Series
+
+KIND = "mcap"
+MAP, BODY = "map", "base_link"
+_NS = 1_000_000_000
+_LINE_M = 0.02  # thickness of a path
+_COLOURS = {"flown": (0.12, 0.47, 0.71, 1.0), "reference": (1.0, 0.5, 0.05, 1.0)}
+Stamped = tuple[int, str, Any]  # time in ns, topic, protobuf message or dict
+
+
+def write_mcap(flight: Flight, path: Path, *, vehicle_time: bool = False) -> None:
+    """Write an MCAP file, with Unix time or vehicle time. Raises ExportError."""
+    writers = library("mcap.writer", KIND)
+    register = library("mcap_protobuf.schema", KIND).register_schema
+    messages = sorted(_messages(flight, _Stamps(flight, vehicle_time)), key=lambda each: each[0])
+    with new_file(path) as file:
+        writer = writers.Writer(file)
+        writer.start()
+        channels: dict[str, int] = {}
+        for stamp_ns, topic, message in messages:
+            if topic not in channels:
+                channels[topic] = _channel(writer, register, flight, topic, message)
+            data = (
+                json.dumps(message).encode()
+                if isinstance(message, dict)
+                else message.SerializeToString()
+            )
+            writer.add_message(channels[topic], stamp_ns, data, stamp_ns)
+        writer.finish()
+
+
+class _Stamps:
+    """Converts vehicle time to the stamps of the file."""
+
+    def __init__(self, flight: Flight, vehicle_time: bool) -> None:
+        self._flight = flight
+        self._vehicle_time = vehicle_time
+
+    def ns(self, time_s: Array) -> list[int]:
+        stamps = time_s if self._vehicle_time else self._flight.unix_s(time_s)
+        return [max(0, round(stamp * 1e6)) * 1000 for stamp in stamps.tolist()]
+
+
+def _messages(flight: Flight, stamps: _Stamps) -> Iterator[Stamped]:
+    for series in flight.series.values():
+        yield from _rows(series, stamps)
+    yield from _poses(flight, stamps)
+    if "position" in flight.series:
+        yield from _velocities(flight.series["position"], stamps)
+    for name, topic in (("position", "flown"), ("reference", "reference")):
+        if name in flight.series:
+            yield from _path(flight.series[name], topic, stamps)
+    yield from _texts(flight, stamps)
+
+
+def _channel(writer: Any, register: Any, flight: Flight, topic: str, message: Any) -> int:
+    if not isinstance(message, dict):
+        schema, encoding = register(writer, type(message)), "protobuf"
+    else:
+        name = topic.rpartition("/")[2]
+        numbers = {column: {"type": "number"} for column in flight.series[name].columns}
+        described = {
+            "type": "object",
+            "properties": {"vehicle_time_s": {"type": "number"}} | numbers,
+        }
+        data = json.dumps(described).encode()
+        schema = writer.register_schema(name=f"offboard.{name}", encoding="jsonschema", data=data)
+        encoding = "json"
+    channel: int = writer.register_channel(topic=topic, message_encoding=encoding, schema_id=schema)
+    return channel
+
+
+# ------------------------------------------------------------------ messages
+
+
+def _rows(series: Series, stamps: _Stamps) -> Iterator[Stamped]:
+    """JSON has no NaN: what is not known is left out."""
+    times = series.time_s.tolist()
+    for stamp_ns, time_s, row in zip(
+        stamps.ns(series.time_s), times, series.values.tolist(), strict=True
+    ):
+        values = zip(series.columns, row, strict=True)
+        known = {column: value for column, value in values if math.isfinite(value)}
+        yield stamp_ns, f"/table/{series.name}", {"vehicle_time_s": time_s} | known
+
+
+def _poses(flight: Flight, stamps: _Stamps) -> Iterator[Stamped]:
+    """At each position, with the newest attitude."""
+    position, attitude = flight.series.get("position"), flight.series.get("attitude")
+    if position is None or attitude is None:
+        return
+    pose_in_frame = _message("PoseInFrame")
+    transform = _message("FrameTransform")
+    newest = np.searchsorted(attitude.time_s, position.time_s, side="right") - 1
+    quaternions = flu_in_enu(attitude.values[np.maximum(newest, 0), :4]).tolist()
+    places = enu(position.values[:, :3]).tolist()
+    for stamp_ns, place, quaternion, index in zip(
+        stamps.ns(position.time_s), places, quaternions, newest.tolist(), strict=True
+    ):
+        if index < 0:
+            continue
+        pose = pose_in_frame(frame_id=MAP)
+        _fill(
+            pose.timestamp, stamp_ns, pose.pose.position, place, pose.pose.orientation, quaternion
+        )
+        yield stamp_ns, "/pose", pose
+        frame = transform(parent_frame_id=MAP, child_frame_id=BODY)
+        _fill(frame.timestamp, stamp_ns, frame.translation, place, frame.rotation, quaternion)
+        yield stamp_ns, "/tf", frame
+
+
+def _fill(
+    timestamp: Any, stamp_ns: int, vector: Any, place: list[float], rotation: Any, q: list[float]
+) -> None:
+    timestamp.FromNanoseconds(stamp_ns)
+    vector.x, vector.y, vector.z = place
+    rotation.w, rotation.x, rotation.y, rotation.z = q
+
+
+def _velocities(position: Series, stamps: _Stamps) -> Iterator[Stamped]:
+    vector = _message("Vector3")
+    for stamp_ns, (x, y, z) in zip(
+        stamps.ns(position.time_s), enu(position.values[:, 3:6]).tolist(), strict=True
+    ):
+        yield stamp_ns, "/velocity", vector(x=x, y=y, z=z)
+
+
+def _path(series: Series, topic: str, stamps: _Stamps) -> Iterator[Stamped]:
+    """The whole path as a line, at its beginning."""
+    (first_ns,) = stamps.ns(series.time_s[:1])
+    update = _message("SceneUpdate")()
+    entity = update.entities.add(id=topic, frame_id=MAP)
+    entity.timestamp.FromNanoseconds(first_ns)
+    line = entity.lines.add(thickness=_LINE_M)
+    line.type = line.LINE_STRIP
+    line.pose.orientation.w = 1.0
+    line.color.r, line.color.g, line.color.b, line.color.a = _COLOURS[topic]
+    for x, y, z in enu(series.values[:, :3]).tolist():
+        if math.isfinite(x + y + z):
+            line.points.add(x=x, y=y, z=z)
+    yield first_ns, f"/path/{topic}", update
+
+
+def _texts(flight: Flight, stamps: _Stamps) -> Iterator[Stamped]:
+    log = _message("Log")
+    times = np.array([event.time_s for event in flight.events], dtype=np.float64)
+    for stamp_ns, event in zip(stamps.ns(times), flight.events, strict=True):
+        entry = log(level=log.INFO, message=event.what, name=event.who)
+        entry.timestamp.FromNanoseconds(stamp_ns)
+        yield stamp_ns, "/log", entry
+
+
+def _message(name: str) -> Any:
+    """A message class of Foxglove's schemas."""
+    module = library(f"foxglove_schemas_protobuf.{name}_pb2", KIND)
+    return getattr(module, name)

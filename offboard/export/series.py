@@ -1,0 +1,148 @@
+"""Series: a flight as named columns over vehicle time, with the unit in each name.
+
+The frame is NED, the body's is FRD, quaternions are w, x, y, z from NED to FRD, thrust without a
+unit is normalised.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.analysis import history, tlog
+from offboard.analysis.events import Event
+from offboard.analysis.history import History
+from offboard.analysis.tlog import Tlog
+from offboard.documents.errors import UserError
+from offboard.flight.record import FIELDS
+
+Array = NDArray[np.float64]
+_TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
+
+
+def _vectors(what: str, unit: str) -> tuple[str, ...]:
+    return tuple(f"{what}_{axis}_{unit}" for axis in ("north", "east", "down"))
+
+
+def _quaternion(what: str) -> tuple[str, ...]:
+    return tuple(f"{what}_{part}" for part in "wxyz")
+
+
+_COLUMNS = {
+    "position": (*_vectors("position", "m"), *_vectors("velocity", "mps")),
+    "attitude": (
+        *_quaternion("attitude"),
+        *(f"rate_{axis}_radps" for axis in ("roll", "pitch", "yaw")),
+    ),
+    "truth": _vectors("true_position", "m"),
+    "reference": (
+        *_vectors("reference_position", "m"),
+        *_vectors("reference_velocity", "mps"),
+        *_vectors("reference_acceleration", "mps2"),
+        "reference_course_rad",
+    ),
+    "setpoint": (*_quaternion("setpoint"), "setpoint_thrust"),
+    "decision": tuple(f"decision_{name}" for name in FIELDS),
+    "heartbeat": ("armed", "system_status"),
+}
+
+
+class ExportError(UserError):
+    """A flight that cannot be exported: one sentence for the user."""
+
+
+@dataclass(frozen=True, slots=True)
+class Series:
+    """Samples of one kind: `time_s` (N,) of vehicle time, `values` (N, len(columns))."""
+
+    name: str
+    columns: tuple[str, ...]
+    time_s: Array
+    values: Array
+
+    def column(self, name: str) -> Array:
+        """The values (N,) of one column."""
+        values: Array = self.values[:, self.columns.index(name)]
+        return values
+
+
+@dataclass(frozen=True, slots=True)
+class Flight:
+    """`series` in which something was recorded, by name; `events` in the order of time.
+
+    `unix` converts vehicle time to Unix time: stamps of telemetry, (N, 2) in s, both increasing.
+    `damage` says what of the log could not be read.
+    """
+
+    series: dict[str, Series]
+    events: tuple[Event, ...]
+    unix: Array
+    autopilot: str
+    damage: str
+
+    def unix_s(self, time_s: Array | float) -> Array:
+        """Unix time at which telemetry with this vehicle time was recorded."""
+        times = np.asarray(time_s, dtype=np.float64)
+        known, stamps = self.unix.T
+        outside = np.where(times < known[0], times - known[0], np.maximum(times - known[-1], 0.0))
+        converted: Array = np.interp(times, known, stamps) + outside
+        return converted
+
+
+def read(path: Path) -> Flight:
+    """The flight in a directory or .tlog. Raises TlogError, or ExportError without telemetry."""
+    log = tlog.read(tlog.find(path))
+    flown = history.gather(log)
+    unix = _unix(log)
+    if not len(unix):
+        raise ExportError(f"{log.path} holds no telemetry with a time stamp: nothing to export")
+    events = (*flown.phases, *flown.modes, *flown.vehicle_messages)
+    known = sorted((e for e in events if np.isfinite(e.time_s)), key=lambda event: event.time_s)
+    found = {name: _series(name, rows) for name, rows in _rows(flown).items()}
+    series = {name: each for name, each in found.items() if len(each.time_s)}
+    return Flight(series, tuple(known), unix, _autopilot(log), flown.damage)
+
+
+def _rows(flown: History) -> dict[str, Array]:
+    """Rows (N, 1 + columns) that begin with the time, by the name of the series."""
+    decisions = [flown.records[name] for name in FIELDS]
+    return {
+        "position": flown.position,
+        "attitude": flown.attitude,
+        "truth": flown.truth,
+        "reference": flown.reference,
+        "setpoint": np.delete(flown.setpoint, 1, axis=1),  # without its Unix time
+        "decision": np.column_stack((flown.record_time_s, *decisions)),
+        "heartbeat": flown.heartbeat,
+    }
+
+
+def _series(name: str, rows: Array) -> Series:
+    """Without the samples from before any telemetry, whose time is NaN."""
+    rows = rows[np.isfinite(rows[:, 0])]
+    return Series(name, _COLUMNS[name], rows[:, 0], rows[:, 1:])
+
+
+def _unix(log: Tlog) -> Array:
+    """Vehicle time and Unix time of telemetry, each newer than the one before."""
+    rows = [
+        (int.from_bytes(message.frame.payload[:4], "little") / 1e3, message.unix_us / 1e6)
+        for message in log
+        if message.frame.message_id in _TELEMETRY and message.component_id == 1
+    ]
+    stamps = np.reshape(rows, (-1, 2)).astype(np.float64)
+    if len(stamps):
+        newest = np.maximum.accumulate(stamps, axis=0)
+        stamps = newest[np.r_[True, np.diff(newest[:, 0]) > 0.0]]
+    return stamps
+
+
+def _autopilot(log: Tlog) -> str:
+    """Name of the autopilot as MAV_AUTOPILOT has it; "unknown" without a heartbeat."""
+    names = {3: "ArduPilot", 12: "PX4"}
+    heartbeats = (m for m in log if m.name == "HEARTBEAT" and m.component_id == 1)
+    first = next(heartbeats, None)
+    return names.get(first.message.autopilot, "unknown") if first else "unknown"

@@ -1,0 +1,58 @@
+"""Jumps of the reported position: resets of the vehicle's estimator.
+
+No message is needed for them (ODOMETRY.reset_counter: PX4 only): two positions some milliseconds
+apart that no motion joins show a jump, on any autopilot.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.mavlink.events import LocalPosition
+
+Array = NDArray[np.float64]
+
+LEAST_JUMP_M = 0.3  # as ObserverSettings.position_jump_m; a smaller one is corrected as an error
+ACCELERATION_MPS2 = 20.0  # that the reported velocities need not show
+LONGEST_GAP_S = 0.5  # after a longer one nothing is concluded
+RECENT_S = 10.0
+
+
+class PositionJumps:
+    """Finds the jumps between successive positions. `total_ned_m` (3,) is the sum of all."""
+
+    def __init__(self) -> None:
+        self._newest: LocalPosition | None = None
+        self._jumps: deque[tuple[float, float]] = deque()  # when, by how many metres
+        self.total_ned_m: Array = np.zeros(3)
+
+    def on_position(self, position: LocalPosition) -> Array | None:
+        """The jump (3,) from the position before to this one, NED in m; None without one."""
+        before, self._newest = self._newest, position
+        if before is None:
+            return None
+        passed_s = position.time_s - before.time_s
+        if not 0.0 < passed_s < LONGEST_GAP_S:
+            return None
+        speed_mps = 0.5 * np.add(before.velocity_ned_mps, position.velocity_ned_mps)
+        moved_m = np.subtract(position.position_ned_m, before.position_ned_m)
+        jump: Array = moved_m - passed_s * speed_mps
+        size_m = float(np.linalg.norm(jump))
+        if size_m <= LEAST_JUMP_M + 0.5 * ACCELERATION_MPS2 * passed_s**2:
+            return None
+        self._jumps.append((position.time_s, size_m))
+        self.total_ned_m = self.total_ned_m + jump
+        return jump
+
+    def recent_m(self, time_s: float) -> float:
+        """Sum of the sizes of the jumps in the last RECENT_S."""
+        while self._jumps and self._jumps[0][0] < time_s - RECENT_S:
+            self._jumps.popleft()
+        return sum(size_m for _, size_m in self._jumps)
+
+    def forget(self) -> None:
+        """What has been until now, on the ground, is no matter of the flight."""
+        self._jumps.clear()

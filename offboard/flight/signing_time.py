@@ -1,0 +1,106 @@
+"""The time stamps of a signing key, kept on disk so that they never go back.
+
+One file for each key: in $STATE_DIRECTORY (systemd), else in $XDG_STATE_HOME/offboard or
+~/.local/state/offboard. Its name comes from a hash of the key, its content is a stamp that no frame
+has had yet: about a minute ahead of the newest one, so that it holds after a crash, too. Where the
+computer's clock has gone back since, stamps continue from there.
+"""
+
+from __future__ import annotations
+
+import os
+from contextlib import suppress
+from hashlib import sha256
+from pathlib import Path
+from types import TracebackType
+
+from offboard.documents.errors import UserError
+from offboard.flight import clock
+from offboard.flight.background import BackgroundWriter
+from offboard.mavlink.signing import RESERVED, UNITS_PER_S, Signing, stamp_of_unix
+
+CLOSE_S = 2.0
+QUEUED_MAX = 1000
+CONTENT_MAX = 20  # bytes of a decimal stamp and a line end
+
+
+class SigningTimeError(UserError):
+    """The time stamp cannot be kept: one sentence for the user."""
+
+
+def state_directory() -> Path:
+    """Where this user's time stamps are kept."""
+    if named := os.environ.get("STATE_DIRECTORY"):
+        return Path(named.split(":")[0])
+    base = os.environ.get("XDG_STATE_HOME")
+    return (Path(base) if base else Path.home() / ".local" / "state") / "offboard"
+
+
+class SigningTime:
+    """Context manager that gives the `Signing` of a key and keeps its time stamps.
+
+    Entering raises SigningTimeError. A disk that fails later stops no flight: the stamps then go on
+    without being kept.
+    """
+
+    def __init__(self, key: bytes) -> None:
+        self._key = key
+        name = sha256(b"offboard signing " + key).hexdigest()[:16]
+        self._path = state_directory() / f"signing-{name}"
+
+    def __enter__(self) -> Signing:
+        first = max(stamp_of_unix(clock.unix_us()), self._kept())
+        reserved = first + RESERVED
+        try:
+            self._path.parent.mkdir(parents=True, exist_ok=True, mode=0o700)
+            self._write([reserved])
+        except OSError as error:
+            raise SigningTimeError(
+                f"the time stamp of the signing key cannot be kept in {self._path.parent}: "
+                f"{error.strerror}; set XDG_STATE_HOME to a directory that can be written"
+            ) from None
+        self._writer = BackgroundWriter[int](self._write, QUEUED_MAX)
+        return Signing(
+            self._key,
+            first - int(UNITS_PER_S * clock.monotonic_s()),
+            clock.monotonic_s,
+            self._writer.put,
+            reserved,
+        )
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._writer.close(CLOSE_S)
+
+    def _kept(self) -> int:
+        """The stamp on disk, 0 without a file."""
+        try:
+            with self._path.open("rb") as file:
+                content = file.read(CONTENT_MAX + 1)
+            return int(content) if len(content) <= CONTENT_MAX else int("too long")
+        except (FileNotFoundError, NotADirectoryError):
+            return 0
+        except OSError as error:
+            reason = error.strerror
+        except ValueError:
+            reason = "it holds no time stamp"
+        raise SigningTimeError(
+            f"the time stamp of the signing key in {self._path} cannot be read ({reason}); if this "
+            "computer's clock is right, delete the file"
+        )
+
+    def _write(self, stamps: list[int]) -> None:
+        """Keep the newest stamp, unless a newer one is kept by another process. Raises OSError."""
+        newest = stamps[-1]
+        with suppress(SigningTimeError):
+            newest = max(newest, self._kept())
+        beside = self._path.with_name(f"{self._path.name}.{os.getpid()}")
+        with beside.open("w", encoding="ascii") as file:
+            file.write(f"{newest}\n")
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(self._path)

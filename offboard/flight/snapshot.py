@@ -1,0 +1,107 @@
+"""Snapshot: what a person or a monitor wants to see of a flight at one moment.
+
+For displays outside the loop (terminal, live page, metrics): values only, safe to pass to another
+thread. `Companion.snapshot` makes one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.flight.assessment import position_error_m
+from offboard.flight.state import FlightState, Triple
+from offboard.model.command import Command
+
+NAN = float("nan")
+TEXTS_KEPT = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Snapshot:
+    """SI, NED, vehicle time; NaN or None for what is not known yet."""
+
+    time_s: float  # of the newest telemetry
+    phase: str
+    in_phase_s: float
+    track_time_s: float  # since the start of the track
+    mode: str  # that the vehicle shows
+    armed: bool
+    authority: str  # a name of `authority.Standing` in lower case; "unknown" before the first mode
+    rung: str  # of the ladder, in lower case
+    rung_reason: str
+    position_ned_m: Triple | None
+    velocity_ned_mps: Triple | None
+    attitude: tuple[float, float, float, float] | None  # quaternion (w, x, y, z), NED to FRD
+    reference_ned_m: Triple | None
+    position_error_m: float
+    thrust_mps2: float  # of the command in force, as are direction and course
+    thrust_direction_ned: Triple
+    course_rad: float
+    hover_thrust: float  # of the vehicle model in use, 0 to 1
+    telemetry_age_s: float  # beyond the least delay of the link
+    link_delay_s: float  # telemetry and setpoint together
+    link_delay_sd_s: float
+    link_growth_s: float  # since take-off
+    missed_decisions: int  # in a row
+    battery: float  # remaining, of 1
+    strangers: int  # datagrams of other senders since the start
+    forged: int  # frames that signing refused since the start
+    texts: tuple[str, ...]  # the newest announcements, oldest first
+
+
+def snapshot_of(
+    state: FlightState,
+    command: Command,
+    announced: Sequence[str],
+    strangers: int,
+    forged: int = 0,
+) -> Snapshot:
+    """The snapshot of this moment. Changes nothing."""
+    vehicle, worst = state.vehicle, state.ladder.worst
+    position, attitude = vehicle.position, vehicle.attitude
+    sample = state.plan.sample(position.time_s) if position else None
+    link = state.link.estimate
+    charge = vehicle.health.battery_remaining if vehicle.health else None
+    return Snapshot(
+        time_s=state.time_s,
+        phase=state.phase.value,
+        in_phase_s=state.in_phase_s,
+        track_time_s=state.plan.track_time_s(state.time_s),
+        mode=vehicle.mode,
+        armed=vehicle.armed,
+        authority=state.authority.standing.name.lower() if state.authority else "unknown",
+        rung=state.ladder.rung.name.lower(),
+        rung_reason=worst.name if worst else "",
+        position_ned_m=position.position_ned_m if position else None,
+        velocity_ned_mps=position.velocity_ned_mps if position else None,
+        attitude=attitude.attitude if attitude else None,
+        reference_ned_m=_triple(sample.position_ned_m) if sample else None,
+        position_error_m=position_error_m(state) if sample else NAN,
+        thrust_mps2=command.thrust_mps2,
+        thrust_direction_ned=command.thrust_direction_ned,
+        course_rad=command.course_rad,
+        hover_thrust=state.model.hover_thrust,
+        telemetry_age_s=_finite(state.telemetry_age_s(state.host_s)) if vehicle.has_state else NAN,
+        link_delay_s=link.value if link else NAN,
+        link_delay_sd_s=link.sd if link else NAN,
+        link_growth_s=state.growth.added_s,
+        missed_decisions=state.missed,
+        battery=NAN if charge is None else charge,
+        strangers=strangers,
+        forged=forged,
+        texts=tuple(announced[-TEXTS_KEPT:]),
+    )
+
+
+def _triple(values: NDArray[np.float64]) -> Triple:
+    north, east, down = values.tolist()
+    return north, east, down
+
+
+def _finite(value: float) -> float:
+    return value if math.isfinite(value) else NAN

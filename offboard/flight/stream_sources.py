@@ -1,0 +1,133 @@
+"""Where the streams of a link come from: a listening autopilot, a serial port, or our clients."""
+
+from __future__ import annotations
+
+import select
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from contextlib import suppress
+
+from offboard.flight.link import LinkError, LinkUnavailable, Strangers
+from offboard.flight.stream_link import Stream
+from offboard.mavlink.peer import PEER_SILENT_S
+
+CONNECT_S = 5.0
+RETRY_S = 0.5
+UNSENT_MAX_S = 5.0  # that nobody acknowledges: the other end is gone
+TCP_NOTSENT_LOWAT = 25  # Linux's option, which the socket module names since Python 3.12
+
+
+class Redial:
+    """Calls `open_stream` in a thread until it succeeds. It may wait, and raise OSError or
+    LinkError."""
+
+    def __init__(self, open_stream: Callable[[], Stream]) -> None:
+        self.strangers = Strangers()
+        self._open_stream = open_stream
+        self._found: list[Stream] = []  # at most one
+        self._closing = threading.Event()
+        self._thread: threading.Thread | None = None
+
+    def seek(self) -> None:
+        if self._thread is None or not self._thread.is_alive():
+            self._thread = threading.Thread(target=self._dial, daemon=True)
+            self._thread.start()
+
+    def _dial(self) -> None:
+        while not self._closing.wait(RETRY_S):
+            with suppress(OSError, LinkError):
+                stream = self._open_stream()
+                self._found.append(stream)
+                if self._closing.is_set():
+                    self._discard()
+                return
+
+    def offer(self, silent_s: float) -> Stream | None:
+        return self._found.pop() if self._found else None
+
+    def wait(self, timeout_s: float) -> None:
+        self._closing.wait(max(0.0, timeout_s))
+
+    def keep_to(self, host: str) -> None:
+        """The address is the same at each attempt."""
+
+    def descriptors(self) -> tuple[int, ...]:
+        return ()
+
+    def close(self) -> None:
+        self._closing.set()
+        self._discard()
+
+    def _discard(self) -> None:
+        with suppress(IndexError):
+            self._found.pop().close()
+
+
+class Listener:
+    """Accepts one client on `sock`. Another one takes its place when it has been silent; once the
+    vehicle was found, only from the vehicle's host."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        sock.setblocking(False)
+        self.strangers = Strangers()
+        self._socket = sock
+        self._host = ""  # of the vehicle, once it was found
+
+    def seek(self) -> None: ...
+
+    def offer(self, silent_s: float) -> Stream | None:
+        try:
+            client, address = self._socket.accept()
+        except OSError:  # nobody
+            return None
+        host, port = address[:2]
+        if silent_s <= PEER_SILENT_S or self._host not in ("", host):
+            client.close()
+            self.strangers.count(f"{host}:{port}", 1, "connection")
+            return None
+        return tcp_stream(client, host)
+
+    def wait(self, timeout_s: float) -> None:
+        select.select([self._socket], [], [], max(0.0, timeout_s))
+
+    def keep_to(self, host: str) -> None:
+        self._host = host
+
+    def descriptors(self) -> tuple[int, ...]:
+        return (self._socket.fileno(),)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+def connect(host: str, port: int) -> Stream:
+    """Connect to a listening autopilot. Raises OSError."""
+    return tcp_stream(socket.create_connection((host, port), timeout=CONNECT_S), host)
+
+
+def tcp_stream(connection: socket.socket, host: str) -> Stream:
+    """A connected socket as a stream."""
+    connection.setblocking(False)
+    with suppress(OSError):
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        # queue here, where a setpoint can be replaced
+        connection.setsockopt(socket.IPPROTO_TCP, TCP_NOTSENT_LOWAT, 1)
+        if sys.platform == "linux":
+            unsent_ms = round(1000 * UNSENT_MAX_S)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, unsent_ms)
+    return Stream(connection.fileno(), connection.close, host)
+
+
+def open_port(device: str, baud: int) -> Stream:
+    """Open a serial port with pyserial. Raises LinkUnavailable."""
+    import serial
+
+    try:
+        port = serial.Serial(device, baud, timeout=0)
+    except (serial.SerialException, ValueError, OverflowError) as error:
+        raise LinkUnavailable(
+            f"serial port {device} at {baud} baud cannot be opened: {error}"
+        ) from None
+    return Stream(port.fileno(), port.close)

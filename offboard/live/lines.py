@@ -1,0 +1,126 @@
+"""The flight as lines: for a person, on a terminal with a status line in place, or for a machine.
+
+A thread writes, so that the loop does not wait for a terminal that Ctrl-S stops or for a full pipe.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import suppress
+
+from rich.console import Console
+from rich.live import Live
+from rich.text import Text
+
+from offboard.flight import clock
+from offboard.flight.background import BackgroundWriter
+from offboard.flight.companion import Companion
+from offboard.flight.snapshot import Snapshot
+from offboard.live.values import as_dict, line
+
+LINES_MAX = 1000  # that wait to be written
+CLOSE_S = 2.0  # for them, after the flight
+STATUS_S = 0.2  # between two status lines, host time
+SNAPSHOT_S = 1.0  # between two JSON snapshots, vehicle time
+
+
+class Terminal:
+    """Prints announcements with `show_line`; below them, where the console is a terminal that can
+    do it, one status line in place."""
+
+    def __init__(self, console: Console, show_line: Callable[[str], None]) -> None:
+        in_place = console.is_terminal and not console.is_dumb_terminal
+        self._live = _status_line(console) if in_place else None
+        self._show_line = show_line
+        self._writer = BackgroundWriter[str | Snapshot](self._write, LINES_MAX)
+        self._announced = 0
+        self._due_s = -math.inf
+        self._waits = False  # a status is queued: no second one
+
+    def show(self, companion: Companion) -> None:
+        for sentence in companion.announced[self._announced :]:
+            self._writer.put(f"{companion.state.time_s:8.2f} s  {sentence}")
+        self._announced = len(companion.announced)
+        now_s = clock.monotonic_s()
+        if self._live and now_s >= self._due_s and not self._waits:
+            self._due_s, self._waits = now_s + STATUS_S, True
+            self._writer.put(companion.snapshot())
+
+    def close(self) -> None:
+        self._writer.close(CLOSE_S)
+        if self._live and self._writer.is_free():
+            with suppress(OSError, SystemExit):
+                self._live.stop()
+
+    @property
+    def lost(self) -> str:
+        dropped = 0 if self._writer.error else self._writer.dropped  # nobody misses a closed pipe
+        if not dropped:
+            return ""
+        return f"{dropped} lines of the flight are missing above: the terminal was stopped"
+
+    def _write(self, items: list[str | Snapshot]) -> None:
+        for item in items:
+            if isinstance(item, str):
+                self._show_line(item)
+            elif self._live:
+                self._live.start()
+                self._live.update(Text(status(item), no_wrap=True, overflow="ellipsis"))
+                self._live.refresh()
+                self._waits = False
+
+
+def _status_line(console: Console) -> Live:
+    return Live(
+        console=console, auto_refresh=False, transient=True, redirect_stdout=False,
+        redirect_stderr=False,
+    )  # fmt: skip
+
+
+def status(now: Snapshot) -> str:
+    """Time, phase, error, link age, mode and ladder in one line, as far as they are known."""
+    parts = [f"{now.time_s:8.2f} s  {now.phase}"]
+    if math.isfinite(now.position_error_m):
+        parts.append(f"error {now.position_error_m:.3f} m")
+    if math.isfinite(now.telemetry_age_s):
+        parts.append(f"link age {1e3 * now.telemetry_age_s:.0f} ms")
+    if now.mode:
+        parts.append(now.mode)
+    if now.rung != "fly":
+        parts.append(f"{now.rung}: {now.rung_reason}")
+    return "  ".join(parts)
+
+
+class JsonLines:
+    """Writes one JSON object a line: snapshots once a second of vehicle time, announcements."""
+
+    def __init__(self, write: Callable[[str], object]) -> None:
+        self._print = write
+        self._writer = BackgroundWriter[str](self._write, LINES_MAX)
+        self._announced = 0
+        self._due_s = -math.inf
+
+    def tell(self, sentence: str) -> None:
+        """A sentence about the preparation."""
+        self._writer.put(line("preparation", text=sentence))
+
+    def show(self, companion: Companion) -> None:
+        time_s = companion.state.time_s
+        for sentence in companion.announced[self._announced :]:
+            self._writer.put(line("announcement", time_s=round(time_s, 3), text=sentence))
+        self._announced = len(companion.announced)
+        if not self._due_s - SNAPSHOT_S <= time_s < self._due_s:  # or the clock has jumped back
+            self._due_s = math.floor(time_s / SNAPSHOT_S + 1.0) * SNAPSHOT_S
+            self._writer.put(line("snapshot", **as_dict(companion.snapshot())))
+
+    def close(self) -> None:
+        self._writer.close(CLOSE_S)
+
+    @property
+    def lost(self) -> str:
+        dropped = 0 if self._writer.error else self._writer.dropped
+        return f"{dropped} lines were not written: nobody read them" if dropped else ""
+
+    def _write(self, lines: list[str]) -> None:
+        self._print("".join(f"{each}\n" for each in lines))

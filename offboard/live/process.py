@@ -1,0 +1,98 @@
+"""Feeds a display in a process of its own, so that the loop never waits for its clients.
+
+Snapshots pass through a bounded queue and a pipe as JSON lines; what does not fit is dropped and
+counted. The process ends when the pipe closes.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import subprocess
+import sys
+from contextlib import suppress
+
+from offboard.documents.errors import UserError
+from offboard.flight import clock
+from offboard.flight.background import BackgroundWriter
+from offboard.flight.companion import Companion
+from offboard.flight.snapshot import Snapshot
+from offboard.live.values import as_dict, line
+
+PERIOD_S = 0.1  # between two snapshots, host time
+QUEUED_MAX = 50  # snapshots that wait for the pipe, which holds about as many
+CLOSE_S = 1.0  # for what is queued, and again for the end of the process
+LOCAL = "127.0.0.1"
+
+
+class LiveError(UserError):
+    """The process cannot serve its clients: one sentence for the user."""
+
+
+def split_address(option: str, address: str) -> tuple[str, int]:
+    """Host and port of HOST:PORT. Raises LiveError."""
+    host, _, port = address.rpartition(":")
+    if not port.isascii() or not port.isdigit() or int(port) > 65535:
+        raise LiveError(f"{option} {address}: give HOST:PORT, for example {LOCAL}:8014")
+    return host.strip("[]") or LOCAL, int(port)
+
+
+class LiveProcess:
+    """A display in the process `python -m MODULE HOST PORT`, started at once.
+
+    The process prints one JSON line when it listens, {"url": ...}, or says why not, {"error": ...}.
+    """
+
+    def __init__(self, module: str, option: str, address: str) -> None:
+        host, port = split_address(option, address)
+        self._option = option
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", module, host, str(port)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            bufsize=0,
+            start_new_session=True,  # signals of the terminal reach only the controller
+        )
+        self._writer = BackgroundWriter[Snapshot](self._write, QUEUED_MAX)
+        self._due_s = -math.inf
+
+    def await_ready(self) -> str:
+        """Wait until it listens; where. Raises LiveError."""
+        assert self._process.stdout is not None
+        with self._process.stdout as output:
+            said = output.readline()
+        answer = json.loads(said) if said else {"error": "its process does not start"}
+        if "error" in answer:
+            raise LiveError(f"{self._option}: {answer['error']}")
+        return str(answer["url"])
+
+    def show(self, companion: Companion) -> None:
+        now_s = clock.monotonic_s()
+        if now_s >= self._due_s or companion.has_ended():
+            self._due_s = now_s + PERIOD_S
+            self._writer.put(companion.snapshot())
+
+    def close(self) -> None:
+        self._writer.close(CLOSE_S)
+        assert self._process.stdin is not None
+        if not self._writer.is_free():  # the process does not read: free the thread
+            self._process.kill()
+        with suppress(OSError):
+            self._process.stdin.close()
+        try:
+            self._process.wait(CLOSE_S)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+    @property
+    def lost(self) -> str:
+        dropped = self._writer.dropped
+        return f"{self._option}: {dropped} snapshots dropped, they were not read" if dropped else ""
+
+    def _write(self, snapshots: list[Snapshot]) -> None:
+        assert self._process.stdin is not None
+        for each in snapshots:
+            data = memoryview(line("snapshot", **as_dict(each)).encode() + b"\n")
+            while data:
+                data = data[self._process.stdin.write(data) :]

@@ -1,0 +1,67 @@
+// Fills the page from server-sent events; draws at most twice a second.
+const KEPT = 3000;
+let rows = [], newest = null, changed = false;
+const $ = (name) => document.getElementById(name);
+const number = (value, digits, unit, scale = 1) =>
+  value === null ? "–" : `${(scale * value).toFixed(digits)} ${unit}`;
+
+function tell() {
+  $("phase").textContent = `${newest.phase}, ${number(newest.in_phase_s, 1, "s")}`;
+  $("time").textContent = number(newest.time_s, 1, "s");
+  $("mode").textContent = `${newest.mode || "unknown"}, ${newest.armed ? "armed" : "disarmed"}`;
+  $("authority").textContent = newest.authority;
+  $("ladder").textContent = newest.rung + (newest.rung_reason ? `: ${newest.rung_reason}` : "");
+  $("error").textContent = number(newest.position_error_m, 3, "m");
+  $("age").textContent = number(newest.telemetry_age_s, 0, "ms", 1e3);
+  $("delay").textContent = number(newest.link_delay_s, 0, "ms", 1e3);
+  $("missed").textContent = newest.missed_decisions;
+  $("battery").textContent = number(newest.battery, 0, "%", 100);
+  $("texts").replaceChildren(...[...newest.texts].reverse().map((text) => {
+    const item = document.createElement("li");
+    item.textContent = text;
+    return item;
+  }));
+}
+
+const column = (name, axis) => rows.map((row) => row[name]?.[axis] ?? null);
+function redraw() {
+  if (!changed || !newest) return;
+  changed = false;
+  tell();
+  const [time, down] = [rows.map((row) => row.time_s), column("position_ned_m", 2)];
+  const [north, east] = [column("position_ned_m", 0), column("position_ned_m", 1)];
+  Plotly.restyle("plan", {
+    x: [column("reference_ned_m", 1), east, east.slice(-1)],
+    y: [column("reference_ned_m", 0), north, north.slice(-1)],
+  });
+  Plotly.restyle("curves", {
+    x: [time, time, time],
+    y: [down.map((value) => value === null ? null : -value),
+        rows.map((row) => row.position_error_m),
+        rows.map((row) => row.telemetry_age_s === null ? null : 1e3 * row.telemetry_age_s)],
+  });
+}
+
+function take(message) {
+  if (message.type === "history") {
+    rows = message.rows;
+    newest = message.newest;
+  } else {
+    newest = message;
+    rows.push(message);
+    if (rows.length > KEPT) rows.shift();
+  }
+  changed = true;
+}
+
+const source = new EventSource("events");
+source.onopen = () => { $("connection").textContent = "connected"; };
+source.onerror = () => { $("connection").textContent = "connection lost"; };
+source.onmessage = (event) => take(JSON.parse(event.data));
+source.addEventListener("end", () => {
+  source.close();
+  redraw();
+  $("connection").textContent = "the flight has ended";
+});
+setInterval(redraw, 500);
+for (const query of [dark, narrow]) query.addEventListener("change", () => { changed = true; });

@@ -1,0 +1,165 @@
+"""Difference: the setpoints and commands of two runs of the same flight, side by side."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.analysis.tlog import layout, name_of
+from offboard.replay.replaying import Sent
+
+SETPOINTS = (82, 84, 86)  # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED, ..._GLOBAL_INT
+COMMANDS = (75, 76)  # COMMAND_INT, COMMAND_LONG
+ATTITUDE_TARGET = 82
+_UNSTAMPED = ("time_boot_ms", "target_system", "target_component")
+Key = tuple[float, int, bytes, int]
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """A message that differs; None on the side that has not sent it."""
+
+    expected: Sent | None
+    actual: Sent | None
+
+    @property
+    def time_s(self) -> float:
+        """Vehicle time of the newest telemetry before it."""
+        return self._either.time_s
+
+    @property
+    def name(self) -> str:
+        return name_of(self._either.message_id)
+
+    @property
+    def angle_rad(self) -> float:
+        """Between the two attitudes; NaN without two."""
+        first, second = (_attitude(each) for each in (self.expected, self.actual))
+        if first is None or second is None:
+            return math.nan
+        second = second if first @ second >= 0.0 else -second
+        return 4.0 * math.atan2(
+            float(np.linalg.norm(first - second)), float(np.linalg.norm(first + second))
+        )
+
+    @property
+    def thrust(self) -> float:
+        """Difference of normalised thrust; NaN without two."""
+        return next((d for name, *_, d in self.fields() if name == "thrust"), math.nan)
+
+    def fields(self) -> list[tuple[str, float, float, float]]:
+        """Name, expected value, actual value and difference of each field that differs."""
+        if self.expected is None or self.actual is None:
+            return []
+        before, after = _fields(self.expected), _fields(self.actual)
+        return [
+            (name, value, after[name], abs(after[name] - value))
+            for name, value in before.items()
+            if not _same(value, after[name])
+        ]
+
+    @property
+    def _either(self) -> Sent:
+        either = self.expected or self.actual
+        assert either is not None
+        return either
+
+
+@dataclass(frozen=True, slots=True)
+class Comparison:
+    """`compared` counts messages by id; `differences` are in the order of time."""
+
+    compared: Counter[int]
+    differences: tuple[Difference, ...]
+
+    @property
+    def setpoints(self) -> int:
+        return sum(self.compared[kind] for kind in SETPOINTS)
+
+    @property
+    def commands(self) -> int:
+        return sum(self.compared[kind] for kind in COMMANDS)
+
+    @property
+    def largest_angle_rad(self) -> float:
+        """0 where no pair of attitudes differs."""
+        return _largest(each.angle_rad for each in self.differences)
+
+    @property
+    def largest_thrust(self) -> float:
+        return _largest(each.thrust for each in self.differences)
+
+    def sentence(self) -> str:
+        """What was compared, and how much differs."""
+        total = f"{self.setpoints} setpoints and {self.commands} commands"
+        if not self.differences:
+            return f"{total}: all identical"
+        alone = sum(each.expected is None or each.actual is None for each in self.differences)
+        angle_deg = math.degrees(self.largest_angle_rad)
+        sentence = (
+            f"{len(self.differences)} of {total} differ; largest difference {angle_deg:.3g} deg "
+            f"and {self.largest_thrust:.3g} of thrust"
+        )
+        return f"{sentence}; {alone} were sent on one side only" if alone else sentence
+
+
+def compare(expected: Iterable[Sent], actual: Iterable[Sent]) -> Comparison:
+    """Compare the payloads of setpoints and commands. A message is compared with the one of the
+    same kind and stamp that was sent at the same vehicle time."""
+    first, second = _by_key(expected), _by_key(actual)
+    keys = sorted(first.keys() | second.keys(), key=lambda key: key[0])
+    differences = tuple(
+        Difference(first.get(key), second.get(key))
+        for key in keys
+        if key not in first or key not in second or first[key].payload != second[key].payload
+    )
+    return Comparison(Counter(key[1] for key in keys), differences)
+
+
+def _by_key(sent: Iterable[Sent]) -> dict[Key, Sent]:
+    """By vehicle time, kind, stamp of a setpoint or number of a command, and how many of them."""
+    found: dict[Key, Sent] = {}
+    counts: defaultdict[tuple[float, int, bytes], int] = defaultdict(int)
+    for each in sent:
+        if each.message_id in (*SETPOINTS, *COMMANDS):
+            at = slice(0, 4) if each.message_id in SETPOINTS else slice(28, 30)
+            key = (each.time_s, each.message_id, each.payload[at])
+            found[*key, counts[key]] = each
+            counts[key] += 1
+    return found
+
+
+def _fields(sent: Sent) -> dict[str, float]:
+    row = _row(sent)
+    names = [name for name in row.dtype.names or () if name not in _UNSTAMPED]
+    return {
+        f"{name}[{at}]" if row[name].size > 1 else name: float(value)
+        for name in names
+        for at, value in enumerate(np.atleast_1d(row[name]).ravel())
+    }
+
+
+def _attitude(sent: Sent | None) -> NDArray[np.float64] | None:
+    if sent is None or sent.message_id != ATTITUDE_TARGET:
+        return None
+    quaternion: NDArray[np.float64] = _row(sent)["q"].astype(np.float64)
+    return quaternion / np.linalg.norm(quaternion)
+
+
+def _row(sent: Sent) -> np.void:
+    kind = layout(name_of(sent.message_id))
+    row: np.void = np.frombuffer(sent.payload[: kind.itemsize].ljust(kind.itemsize, b"\0"), kind)[0]
+    return row
+
+
+def _same(first: float, second: float) -> bool:
+    return first == second or (math.isnan(first) and math.isnan(second))
+
+
+def _largest(values: Iterator[float]) -> float:
+    return max((value for value in values if not math.isnan(value)), default=0.0)

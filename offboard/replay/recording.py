@@ -1,0 +1,84 @@
+"""Recording: what a replay needs of a .tlog: the configuration, the inputs of each turn, frames."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from offboard.analysis import tlog
+from offboard.analysis.tlog import LoggedMessage, Tlog
+from offboard.documents.errors import UserError
+from offboard.flight import inputs, manifest
+from offboard.flight.inputs import SETTINGS, Call, Entry
+from offboard.flight.record import RECORD_COMPONENT_ID
+
+_TUNNEL = 385
+_LENGTH_AT, _DATA_AT = 4, 5  # TUNNEL.payload_length and .payload
+
+
+class ReplayError(UserError):
+    """A flight that cannot be replayed: one sentence for the user."""
+
+
+@dataclass(frozen=True, slots=True)
+class Recording:
+    """`settings` are those of the session: lockstep, stream, sends_first, capacity_bytes_ps."""
+
+    log: Tlog
+    configuration: str
+    settings: dict[str, object]
+    inputs: tuple[bytes, ...]  # the pieces of `flight.inputs`
+
+    @property
+    def lockstep(self) -> bool:
+        return bool(self.settings["lockstep"])
+
+    def entries(self) -> Iterator[Entry]:
+        """The inputs in order. Raises inputs.InputsError where they are damaged."""
+        return inputs.entries(self.inputs)
+
+
+def read(flight: Path) -> Recording:
+    """The recording in a flight directory or .tlog. Raises ReplayError or TlogError."""
+    path = tlog.find(flight)
+    log = tlog.read(path)
+    pieces: dict[int, list[bytes]] = {manifest.PAYLOAD_TYPE: [], inputs.PAYLOAD_TYPE: []}
+    for message in log:
+        kind = record_type(message)
+        if kind in pieces:
+            payload = message.frame.payload
+            length = payload[_LENGTH_AT]
+            data = payload[_DATA_AT : _DATA_AT + length]
+            pieces[kind].append(data.ljust(length, b"\0"))  # MAVLink 2 omits trailing zeros
+    configuration = manifest.join(pieces[manifest.PAYLOAD_TYPE])
+    if configuration is None:
+        raise ReplayError(
+            f"{path} does not hold the configuration of a flight: only logs of offboard can be "
+            "replayed"
+        )
+    recorded = tuple(pieces[inputs.PAYLOAD_TYPE])
+    if not recorded:
+        raise ReplayError(
+            f"{path} does not hold the inputs of each turn, which older versions and "
+            "`offboard daemon` do not record: it can be scored, not replayed"
+        )
+    return Recording(log, configuration, _settings(path, recorded), recorded)
+
+
+def record_type(message: LoggedMessage) -> int | None:
+    """TUNNEL.payload_type of one of our records, None for any other message."""
+    frame = message.frame
+    if frame.message_id != _TUNNEL or frame.component_id != RECORD_COMPONENT_ID:
+        return None
+    return int.from_bytes(frame.payload[:2], "little")
+
+
+def _settings(path: Path, recorded: tuple[bytes, ...]) -> dict[str, object]:
+    try:
+        first = next(inputs.entries(recorded), None)
+    except inputs.InputsError as error:
+        raise ReplayError(f"{path}: the record of the inputs is damaged: {error}") from None
+    if not isinstance(first, Call) or first.name != SETTINGS:
+        raise ReplayError(f"{path}: the record of the inputs does not begin with the settings")
+    return dict(first.arguments[0])

@@ -1,0 +1,211 @@
+"""Replaying: a companion as in the recorded flight, and its turns with the recorded inputs."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from typing import Any
+
+from offboard.analysis.tlog import LoggedMessage
+from offboard.control.base import Controller
+from offboard.flight import inputs
+from offboard.flight.companion import Companion
+from offboard.flight.configuration import flown
+from offboard.flight.inputs import (
+    Call,
+    Check,
+    FramesDropped,
+    InputsError,
+    StrangersCounted,
+    TurnInput,
+)
+from offboard.flight.link import Chunk
+from offboard.flight.one_flight import FlightParts, companion_of, session_of
+from offboard.flight.outbox import Output
+from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
+from offboard.flight.request import build_parts
+from offboard.replay.recording import Recording, ReplayError, record_type
+
+CALLS = ("request_stop", "announce", "note_autopilot")  # methods of the companion
+_OUR_FIRST_SYSTEM = 1  # our system id before a vehicle was found
+
+
+@dataclass(frozen=True, slots=True)
+class Sent:
+    """A frame that our component sent. `time_s`: vehicle time of the newest telemetry before it;
+    `turn` is None for a frame of the log."""
+
+    time_s: float
+    message_id: int
+    payload: bytes
+    turn: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Turn:
+    """One turn: its number, what it was given and what came out; None if it raised an error."""
+
+    number: int
+    given: TurnInput
+    received: tuple[LoggedMessage, ...]
+    output: Output | None
+
+
+class Replay:
+    """Replays one flight.
+
+    `turns` gives all turns in order; `recorded` and `replayed` then hold what the log says was sent
+    and what the companion has sent. `stopped` says why the replay ended before the recording;
+    empty if it did not. `wrap` may replace the controller.
+    """
+
+    def __init__(
+        self,
+        recording: Recording,
+        wrap: Callable[[Controller], Controller] = lambda controller: controller,
+    ) -> None:
+        self.config = flown(recording.configuration)
+        parts = build_parts(self.config)
+        self.companion = self._companion(recording, parts, wrap(parts.controller))
+        self.recorded: list[Sent] = []
+        self.replayed: list[Sent] = []
+        self.stopped = ""
+        self.ended_s = 0.0  # vehicle time of the newest telemetry that was replayed
+        self.lockstep = recording.lockstep
+        self._recording = recording
+        self._messages = iter(recording.log)
+        self._next: LoggedMessage | None = None
+        self._pieces = 0  # of the inputs, found among the messages
+        self._number = 0
+        self._leaving: list[Sent] = []  # by the newest turn
+        self._crc, self._checked_s = 0, 0.0
+        self._readings: Iterator[float] = iter(())
+        self._read_s = 0.0
+
+    def _companion(
+        self, recording: Recording, parts: FlightParts, controller: Controller
+    ) -> Companion:
+        observer = parts.make_observer()
+        settings: dict[str, Any] = recording.settings
+        try:
+            session = session_of(observer, **settings)
+        except TypeError:
+            raise ReplayError(
+                f"{recording.log.path}: the settings of its session are those of another version"
+            ) from None
+        parts = replace(parts, controller=controller)
+        return companion_of(parts, session, observer, self._stopwatch)
+
+    def turns(self) -> Iterator[Turn]:
+        """Replay turn by turn."""
+        try:
+            for entry in self._recording.entries():
+                match entry:
+                    case TurnInput():
+                        self._leave()
+                        turn = self._turn(entry)
+                        if turn is None:
+                            break
+                        yield turn
+                    case FramesDropped(count):
+                        del self._leaving[len(self._leaving) - count :]
+                    case StrangersCounted(total):
+                        self.companion.strangers = total
+                    case Call(name, arguments) if name in CALLS:
+                        getattr(self.companion, name)(*arguments)
+                    case Check(crc) if crc != self._crc & 0xFFFF:
+                        raise InputsError("received frames are missing or damaged")
+                    case Check():
+                        self._crc, self._checked_s = 0, self.ended_s
+        except InputsError as error:
+            self.stopped = str(error)
+        self._leave()
+        self._drain()
+        if self.stopped or not self.companion.has_ended():
+            self._cut()
+
+    # ------------------------------------------------------------------ one turn
+
+    def _turn(self, given: TurnInput) -> Turn | None:
+        chunks: list[Chunk] = []
+        received: list[LoggedMessage] = []
+        for chunk in given.chunks:
+            messages = self._take(chunk.frames)
+            if messages is None:
+                return None
+            frames = [message.frame.raw for message in messages]
+            for frame in frames:
+                self._crc = zlib.crc32(frame, self._crc)
+            for place, frame in reversed(chunk.unlogged):
+                frames.insert(place, frame)
+            chunks.append(Chunk(b"".join(frames), chunk.peer, chunk.arrived_s))
+            received += messages
+        self._readings, self._read_s = iter(given.readings_s), given.now_s
+        self._number += 1
+        output = self._output(chunks, given.now_s)
+        self.ended_s = self.companion.state.time_s
+        if output:
+            self._leaving = [self._sent(frame) for frame in output.send]
+        return Turn(self._number, given, tuple(received), output)
+
+    def _output(self, chunks: list[Chunk], now_s: float) -> Output | None:
+        try:
+            return self.companion.turn(chunks, now_s)
+        except (Exception, SystemExit):  # as the loop, which then requests the landing
+            return None
+
+    def _stopwatch(self) -> float:
+        """The next recorded reading; after the last one it stands still."""
+        self._read_s = next(self._readings, self._read_s)
+        return self._read_s
+
+    def _sent(self, frame: bytes) -> Sent:
+        message_id = int.from_bytes(frame[7:10], "little")
+        return Sent(
+            self.companion.state.time_s, message_id, frame[10 : 10 + frame[1]], self._number
+        )
+
+    def _leave(self) -> None:
+        self.replayed += self._leaving
+        self._leaving = []
+
+    # ------------------------------------------------------------------ the log
+
+    def _take(self, count: int) -> list[LoggedMessage] | None:
+        """The next received messages; None if the log ends before."""
+        taken: list[LoggedMessage] = []
+        while len(taken) < count:
+            message = next(self._messages, None)
+            if message is None:
+                return None
+            if not self._note(message):
+                taken.append(message)
+        return taken
+
+    def _note(self, message: LoggedMessage) -> bool:
+        """Note what we sent; returns whether it was ours."""
+        vehicle = self.companion.state.vehicle.found
+        system = vehicle.system_id if vehicle else _OUR_FIRST_SYSTEM
+        if message.system_id != system:
+            return False
+        if message.component_id == RECORD_COMPONENT_ID:
+            self._pieces += record_type(message) == inputs.PAYLOAD_TYPE
+            return True
+        if message.component_id != COMPONENT_ID:
+            return False
+        frame = message.frame
+        self.recorded.append(Sent(self.ended_s, frame.message_id, frame.payload))
+        return True
+
+    def _drain(self) -> None:
+        """Note what was sent by the turns that the last piece of the inputs ends."""
+        while self._pieces < len(self._recording.inputs):
+            message = next(self._messages, None)
+            if message is None or not self._note(message):
+                return
+
+    def _cut(self) -> None:
+        """The log is not complete: only what was sent before the newest check counts."""
+        for sent in (self.recorded, self.replayed):
+            sent[:] = [each for each in sent if each.time_s < self._checked_s]

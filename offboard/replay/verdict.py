@@ -1,0 +1,64 @@
+"""Verdict: a replayed flight compared with its log, and what preceded the first difference."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from offboard.replay.difference import Comparison, Difference, compare
+from offboard.replay.moment import received
+from offboard.replay.recording import Recording, ReplayError
+from offboard.replay.replaying import Replay
+
+FIELDS_MAX = 8
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """`turns` were replayed, up to the vehicle time `ended_s`; `stopped` says why not all were."""
+
+    comparison: Comparison
+    turns: int
+    ended_s: float
+    stopped: str
+
+
+def verdict(recording: Recording) -> Verdict:
+    """Replay a flight and compare it with its log. Raises ReplayError if nothing can be compared,
+    and DocumentError where its configuration cannot be flown by this version."""
+    replay = Replay(recording)
+    turns = sum(1 for _ in replay.turns())
+    comparison = compare(replay.recorded, replay.replayed)
+    if not comparison.compared.total():
+        why = replay.stopped or "the log holds no setpoint and no command"
+        raise ReplayError(f"{recording.log.path}: nothing to compare: {why}")
+    return Verdict(comparison, turns, replay.ended_s, replay.stopped)
+
+
+def explained(recording: Recording, difference: Difference) -> list[str]:
+    """What differs, field by field, and the input that preceded it; one line each."""
+    name = f"{difference.name} at {difference.time_s:.3f} s"
+    if difference.expected is None:
+        lines = [f"{name} was not sent in the recorded flight"]
+    elif difference.actual is None:
+        lines = [f"{name} was not sent in the replay"]
+    else:
+        lines = [f"{name}:"]
+        lines += [
+            f"  {field}: {before:.9g} in the log, {after:.9g} in the replay, by {by:.3g}"
+            for field, before, after, by in difference.fields()[:FIELDS_MAX]
+        ]
+    return lines + _input(recording, difference)
+
+
+def _input(recording: Recording, difference: Difference) -> list[str]:
+    """The turn that decided it: replayed once more up to there."""
+    replay = Replay(recording)
+    number = difference.actual.turn if difference.actual else None
+    for turn in replay.turns():
+        due = replay.ended_s >= difference.time_s if number is None else turn.number == number
+        if due:
+            tick = int(replay.ended_s / replay.config.period_s + 1e-6)
+            lines = [f"decided in turn {turn.number}, tick {tick}, which was given:"]
+            rows = received(turn) or [("nothing", "no message had arrived")]
+            return lines + [f"  {when}: {names}" for when, names in rows]
+    return []

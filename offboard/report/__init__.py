@@ -1,0 +1,1 @@
+"""Flights as one HTML page, from their .tlog alone."""

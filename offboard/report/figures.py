@@ -1,0 +1,295 @@
+"""Figures of a report: path, timeline and panels, of one flight or of several."""
+
+from __future__ import annotations
+
+import html
+import itertools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import plotly.graph_objects as go
+from numpy.typing import NDArray
+
+from offboard.analysis.figure import (
+    BLUE,
+    BLUE_BAND,
+    BROWN,
+    GREEN,
+    GREY,
+    INK,
+    ORANGE,
+    PINK,
+    PURPLE,
+    RED,
+    STYLE,
+    SURFACE,
+    Figure,
+    coordinates,
+    curve,
+    panels,
+)
+from offboard.analysis.verdict import begin_times
+from offboard.report import timeline
+from offboard.report.flight import Flight
+from offboard.report.panels import GROUPS, Curve, Panel
+from offboard.report.thinning import thinned
+
+# of flights that share a figure, in an order that colour-blind people can tell apart
+COLOURS = (BLUE, ORANGE, GREEN, GREY, PINK, BROWN)
+DASHES = ("solid", "dash", "dot", "dashdot")
+PATH_POINTS = 1500
+PANEL_PX = 120
+LEFT_PX = 75  # beside the panels, the same in all figures: their time axes stand below each other
+DECADES_SHOWN = 4  # numbers on a logarithmic axis
+ROW_PX = 34  # of the timeline
+_CAPTIONS = {
+    "tracking": "The reference is known from the climb to the landing.",
+    "decisions": "Zero is drawn at 1e-16. Only decisions that were sent as certified have a gap.",
+    "identification": "Bars: one standard deviation.",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Lane:
+    """A flight among those of a report: its letter, its colour and dash, and the vehicle time that
+    is zero on its axis."""
+
+    flight: Flight
+    label: str
+    colour: str
+    dash: str
+    zero_s: float
+
+
+def lanes(flights: Sequence[Flight]) -> list[Lane]:
+    """One flight keeps its vehicle time; several begin their tracks at zero."""
+    if len(flights) == 1:
+        return [Lane(flights[0], "", BLUE, "solid", 0.0)]
+    styles = itertools.cycle(zip(COLOURS, itertools.cycle(DASHES), strict=False))
+    return [
+        Lane(flight, f"{letter(place)}: {flight.name}", *style, flight.track_s)
+        for place, (flight, style) in enumerate(zip(flights, styles, strict=False))
+    ]
+
+
+def letter(place: int) -> str:
+    """A, B ... Z, then numbers."""
+    return chr(ord("A") + place) if place < 26 else str(place + 1)
+
+
+def figures(flights: Sequence[Flight]) -> dict[str, Figure]:
+    """All figures that the logs have data for, by name: path, timeline, and those of GROUPS."""
+    drawn = lanes(flights)
+    found = {"path": _path(drawn), "timeline": _timeline(drawn)}
+    for name, (title, panels_of) in GROUPS.items():
+        found[name] = _panels(
+            name, title, [(lane, panels_of(lane.flight.history)) for lane in drawn]
+        )
+    return {name: figure for name, figure in found.items() if figure is not None}
+
+
+# ---------------------------------------------------------------------- path
+
+
+def _path(drawn: Sequence[Lane]) -> Figure | None:
+    figure = go.Figure()
+    for lane in drawn:
+        flown = lane.flight.history
+        alone = not lane.label
+        parts = [("estimated", flown.position, lane.colour, "solid")]
+        if alone:
+            parts.append(("true (simulator)", flown.truth, ORANGE, "solid"))
+        if alone or lane is drawn[0]:
+            parts.append(("reference", flown.reference, INK, "dash"))
+        for name, rows, colour, dash in parts:
+            if not len(rows):
+                continue
+            label = lane.label if lane.label and name == "estimated" else name
+            figure.add_trace(_path_of(rows, label, colour, dash))
+    if not figure.data:
+        return None
+    scene = {
+        "xaxis_title": "north, m", "yaxis_title": "east, m", "zaxis_title": "height, m",
+        "aspectmode": "data",
+        "camera": {"eye": {"x": -1.8, "y": -1.5, "z": 1.0}, "center": {"x": 0, "y": 0, "z": -0.15}},
+    }  # fmt: skip
+    figure.update_layout(
+        template=STYLE, height=520, scene=scene, margin={"l": 0, "r": 0, "t": 36, "b": 40},
+        showlegend=True,
+    )  # fmt: skip
+    caption = "" if len(drawn) == 1 else f"The reference is that of flight {drawn[0].label}."
+    return Figure("Path", figure, caption)
+
+
+def _path_of(rows: NDArray[np.float64], name: str, colour: str, dash: str) -> go.Scatter3d:
+    chosen = rows[np.linspace(0, len(rows) - 1, min(len(rows), PATH_POINTS)).astype(int)]
+    north, east, down = chosen[:, 1:4].T
+    return go.Scatter3d(
+        x=coordinates(north), y=coordinates(east), z=coordinates(-down), mode="lines",
+        name=html.escape(name), line={"color": colour, "width": 4, "dash": dash},
+    )  # fmt: skip
+
+
+# ---------------------------------------------------------------------- timeline
+
+
+def _timeline(drawn: Sequence[Lane]) -> Figure | None:
+    figure = go.Figure()
+    rows: list[str] = []
+    for lane in drawn:
+        prefix = f"{lane.label.partition(':')[0]} " if lane.label else ""
+        shown = timeline.bands(lane.flight), timeline.marks(lane.flight)
+        if lane.label:  # of several flights only what differs most
+            shown = (
+                [b for b in shown[0] if b.row == "phase"],
+                [m for m in shown[1] if m.row == "ladder"],
+            )
+        own = dict.fromkeys(each.row for part in shown for each in part)
+        rows += [prefix + row for row in own]
+        for row in own:
+            _add_bands(figure, prefix + row, [b for b in shown[0] if b.row == row], lane.zero_s)
+            _add_marks(figure, prefix + row, [m for m in shown[1] if m.row == row], lane.zero_s)
+    if not rows:
+        return None
+    figure.update_layout(
+        template=STYLE, height=110 + ROW_PX * len(rows), barmode="overlay", showlegend=False,
+        bargap=0.12, uniformtext={"mode": "hide", "minsize": 10},
+        margin={"l": LEFT_PX, "t": 40, "b": 50},
+    )  # fmt: skip
+    figure.update_yaxes(
+        categoryorder="array", categoryarray=rows[::-1], fixedrange=True, showgrid=False,
+        range=[-0.6, len(rows) - 0.4], automargin=False,
+    )  # fmt: skip
+    figure.update_xaxes(title_text=_axis_title(drawn), range=_extent(drawn))
+    return Figure("Timeline", figure, "The text of a mark is shown where the pointer is on it.")
+
+
+def _add_bands(figure: go.Figure, row: str, bands: Sequence[timeline.Band], zero_s: float) -> None:
+    if not bands:
+        return
+    figure.add_trace(
+        go.Bar(
+            orientation="h", y=[row] * len(bands),
+            base=[round(band.begin_s - zero_s, 3) for band in bands],
+            x=[round(band.end_s - band.begin_s, 3) for band in bands],
+            text=[html.escape(band.label) for band in bands],
+            hovertext=[html.escape(f"{b.begin_s:.2f} s: {b.text}") for b in bands],
+            hoverinfo="text", textposition="inside", insidetextanchor="middle", textangle=0,
+            textfont={"color": INK, "size": 12},
+            marker={"color": [b.colour for b in bands], "line": {"color": SURFACE, "width": 1.5}},
+        )
+    )  # fmt: skip
+
+
+def _add_marks(figure: go.Figure, row: str, marks: Sequence[timeline.Mark], zero_s: float) -> None:
+    if not marks:
+        return
+    ladder = row.endswith("ladder")
+    figure.add_trace(
+        go.Scatter(
+            cliponaxis=False, mode="markers", x=[round(mark.time_s - zero_s, 3) for mark in marks],
+            y=[row] * len(marks), hoverinfo="text",
+            hovertext=[html.escape(f"{mark.time_s:.2f} s: {mark.text}") for mark in marks],
+            marker={
+                "size": 11 if ladder else 8, "color": RED if ladder else PURPLE,
+                "symbol": "triangle-down" if ladder else "circle-open", "line": {"width": 2},
+            },
+        )
+    )  # fmt: skip
+
+
+# ---------------------------------------------------------------------- panels
+
+
+def _panels(name: str, title: str, flown: Sequence[tuple[Lane, Sequence[Panel]]]) -> Figure | None:
+    """One group of panels, for each flight the curves that it has."""
+    by_title: dict[str, list[tuple[Lane, Panel]]] = {}
+    for lane, group in flown:
+        for panel in group:
+            shown = panel.shown()
+            if shown is not None and (not lane.label or any(c.main for c in shown.curves)):
+                by_title.setdefault(shown.title, []).append((lane, shown))
+    if not by_title:
+        return None
+    figure = panels(list(by_title), _axis_title([lane for lane, _ in flown]), PANEL_PX)
+    for place, shown_in in enumerate(by_title.values(), 1):
+        for lane, panel in shown_in:
+            for each in panel.curves:
+                if each.main or not lane.label:
+                    _draw(
+                        figure, place, each, lane, named=bool(lane.label) or len(panel.curves) > 1
+                    )
+        if shown_in[0][1].logarithmic:
+            figure.update_yaxes(_logarithmic([panel for _, panel in shown_in]), row=place)
+    for lane, _ in flown:
+        if not lane.label:
+            figure.update_layout(shapes=_phase_shapes(lane.flight))
+    figure.update_xaxes(range=_extent([lane for lane, _ in flown]))
+    figure.update_yaxes(automargin=False, exponentformat="e")
+    figure.update_layout(margin_l=LEFT_PX)
+    return Figure(title, figure, _CAPTIONS.get(name, ""))
+
+
+def _logarithmic(shown: Sequence[Panel]) -> dict[str, Any]:
+    """An axis of whole decades, few of them with a number."""
+    values = np.concatenate([curve.values for panel in shown for curve in panel.curves])
+    known = np.log10(values[np.isfinite(values) & (values > 0.0)])
+    low, high = math.floor(known.min()), math.ceil(known.max()) + 1
+    step = -(-(high - low) // DECADES_SHOWN)
+    return {"type": "log", "tickvals": [float(f"1e{n}") for n in range(low, high + 1, step)],
+            "range": [low - 0.3, high], "exponentformat": "e"}  # fmt: skip
+
+
+def _draw(figure: go.Figure, place: int, each: Curve, lane: Lane, *, named: bool) -> None:
+    chosen = thinned(each.values)
+    times, values = each.times[chosen] - lane.zero_s, each.values[chosen]
+    name, colour, dash = each.name, each.colour, each.dash
+    if lane.label:
+        name, colour, dash = lane.label, lane.colour, lane.dash
+    more: dict[str, Any] = {} if named else {"showlegend": False}
+    if each.style == "steps":
+        more["line"] = {"shape": "hv", "width": 1.1}
+    elif each.style == "dots":
+        more["mode"] = "markers"
+        more["marker"] = {"color": colour, "size": 4 if each.sd is None else 7}
+    if each.sd is not None:
+        sd = coordinates(each.sd[chosen])
+        more["error_y"] = {"type": "data", "array": sd, "color": colour, "thickness": 1.5}
+    curve(figure, place, times, values, html.escape(name), colour, dash, **more)
+
+
+def _phase_shapes(flight: Flight) -> list[dict[str, Any]]:
+    """A band where the track was flown, and a line where each phase begins."""
+    begun = begin_times(flight.history.phases)
+    known = [at for at in begun.values() if math.isfinite(at)]
+    shapes: list[dict[str, Any]] = [
+        {
+            "type": "line", "xref": "x", "yref": "paper", "x0": at, "x1": at, "y0": 0, "y1": 1,
+            "layer": "below", "opacity": 0.4, "line": {"color": GREY, "width": 1},
+        }
+        for at in known
+    ]  # fmt: skip
+    if math.isfinite(begun.get("track", math.nan)):
+        end_s = min((at for at in known if at > begun["track"]), default=flight.end_s)
+        shapes.append(
+            {
+                "type": "rect", "xref": "x", "yref": "paper", "x0": begun["track"], "x1": end_s,
+                "y0": 0, "y1": 1, "layer": "below", "fillcolor": BLUE_BAND, "opacity": 0.35,
+                "line": {"width": 0},
+            }
+        )  # fmt: skip
+    return shapes
+
+
+def _axis_title(drawn: Sequence[Lane]) -> str:
+    return "time since the track began, s" if len(drawn) > 1 else "vehicle time, s"
+
+
+def _extent(drawn: Sequence[Lane]) -> list[float]:
+    """From the first sample of all flights to the last one."""
+    begin = min(lane.flight.begin_s - lane.zero_s for lane in drawn)
+    end = max(lane.flight.end_s - lane.zero_s for lane in drawn)
+    return [round(begin, 2), round(end, 2)]

@@ -1,0 +1,90 @@
+"""The page of a report: verdict first, then path, timeline and panels, events and figures."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from offboard.analysis.page import render
+from offboard.analysis.score import FIGURES
+from offboard.analysis.score_table import summary, verdict
+from offboard.report import timeline
+from offboard.report.figures import figures, letter
+from offboard.report.flight import Flight
+
+_IN_SUMMARY = {"tracked error", "true error", "timing", "identified"}
+_SIGNS = {1.0: ("good", "✓"), 0.0: ("bad", "✗")}
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """A figure of the score, for each flight as text; `difference` of the last to the first, where
+    there are two."""
+
+    name: str
+    meaning: str
+    unit: str
+    values: tuple[str, ...]
+    difference: str = ""
+
+
+def page(flights: Sequence[Flight]) -> str:
+    """The page of one flight or of several, as the text of an HTML file."""
+    alone = len(flights) == 1
+    title = f"Flight {flights[0].name}" if alone else f"{len(flights)} flights side by side"
+    return render(
+        "report/templates/report.html",
+        title=title,
+        verdicts=[_verdict(place, flight, alone) for place, flight in enumerate(flights)],
+        figures=figures(flights),
+        rows=rows(flights),
+        letters=[] if alone else [letter(place) for place in range(len(flights))],
+        events=[
+            (f"{e.time_s:.2f}" if math.isfinite(e.time_s) else "", e.who, e.what)
+            for e in timeline.events(flights[0])
+        ]
+        if alone
+        else [],
+    )
+
+
+def _verdict(place: int, flight: Flight, alone: bool) -> dict[str, object]:
+    kind, sign = _SIGNS.get(flight.score.completed, ("unknown", "–"))
+    rows = summary(flight.score, flight.history, Path())
+    return {
+        "kind": kind,
+        "sign": sign,
+        "sentence": verdict(flight.score),
+        "name": "" if alone else f"{letter(place)}: {flight.name}",
+        "rows": [row for row in rows if row[0] in _IN_SUMMARY] + list(flight.facts.items()),
+        "missing": flight.missing,
+    }
+
+
+def rows(flights: Sequence[Flight]) -> list[Row]:
+    """Every figure that a log holds, for each flight."""
+    scores = [flight.score.figures() for flight in flights]
+    found = []
+    for name, meta in FIGURES.items():
+        values = [score[name] for score in scores]
+        if any(math.isfinite(value) for value in values):
+            difference = _difference(values) if len(values) == 2 else ""
+            shown = tuple(_text(value) for value in values)
+            found.append(Row(name, meta["meaning"], meta["unit"], shown, difference))
+    return found
+
+
+def _text(value: float) -> str:
+    return f"{value:.4g}" if math.isfinite(value) else "–"
+
+
+def _difference(values: Sequence[float]) -> str:
+    """The second value minus the first, also in percent of it."""
+    first, second = values
+    change = second - first
+    if not math.isfinite(change):
+        return "–"
+    share = f" ({100 * change / abs(first):+.0f} %)" if first and abs(change / first) < 10 else ""
+    return f"{change:+.3g}{share}" if change else "0"

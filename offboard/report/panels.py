@@ -1,0 +1,210 @@
+"""What the panels of a report show: curves of one flight over vehicle time, in groups."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from offboard.analysis.figure import BLUE, GREEN, INK, ORANGE, PINK, PURPLE
+from offboard.analysis.history import History
+from offboard.analysis.tracking import Reference, each_once
+from offboard.model.frames import euler_from_quaternion
+
+Array = NDArray[np.float64]
+
+REFERENCE_GAP_S = 0.5  # without a record of the reference for longer there is none
+LEAST_SHOWN = 1e-16  # of a logarithmic axis: zero is drawn there
+ESTIMATED, TRUE, COMMANDED = "estimated", "true (simulator)", "commanded"
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """Values (N,) at vehicle times (N,). `main` curves are also drawn where several flights share a
+    panel. `style`: "line", "steps" or "dots"; dots may have a standard deviation `sd` (N,)."""
+
+    name: str
+    times: Array
+    values: Array
+    colour: str
+    style: str = "line"
+    main: bool = True
+    dash: str = "solid"
+    sd: Array | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Panel:
+    title: str
+    curves: tuple[Curve, ...]
+    logarithmic: bool = False
+
+    def shown(self) -> Panel | None:
+        """The panel with the curves that have values; None without any."""
+        curves = tuple(curve for curve in self.curves if np.isfinite(curve.values).any())
+        return Panel(self.title, curves, self.logarithmic) if curves else None
+
+
+def tracking(flown: History) -> tuple[Panel, ...]:
+    """Distances from the reference, height and speed."""
+    flights = {ESTIMATED: flown.position, TRUE: flown.truth}
+    away = {name: _away(flown, each_once(rows)) for name, rows in flights.items() if len(rows)}
+    colours = {ESTIMATED: BLUE, TRUE: ORANGE}
+    errors = tuple(
+        Curve(name, times, np.linalg.norm(errors, axis=1), colours[name], main=name == ESTIMATED)
+        for name, (times, errors) in away.items()
+    )
+    times, by_axis = away.get(ESTIMATED, (np.zeros(0), np.zeros((0, 3))))
+    components = tuple(
+        Curve(axis, times, by_axis[:, column], colour, main=False, dash=dash)
+        for column, (axis, (colour, dash)) in enumerate(_AXES.items())
+    )
+    heights = tuple(
+        Curve(name, rows[:, 0], -rows[:, 3], colours[name], main=name == ESTIMATED)
+        for name, rows in flights.items()
+        if len(rows)
+    )
+    reference = Curve(
+        "reference", flown.reference[:, 0], -flown.reference[:, 3], INK, main=False, dash="dash"
+    )
+    speed = np.linalg.norm(flown.position[:, 4:7], axis=1)
+    return (
+        Panel("distance from the reference, m", errors),
+        Panel("estimated error by axis, m", components),
+        Panel("height, m", (*heights, reference)),
+        Panel("speed, m/s", (Curve(ESTIMATED, flown.position[:, 0], speed, BLUE),)),
+    )
+
+
+def attitude(flown: History) -> tuple[Panel, ...]:
+    """Roll, pitch and course, commanded and flown."""
+    sent = _euler_deg(flown.setpoint[:, 2:6])
+    estimated = _euler_deg(flown.attitude[:, 1:5])
+    return tuple(
+        Panel(
+            f"{title}, deg",
+            (
+                Curve(COMMANDED, flown.setpoint[:, 0], sent[:, axis], ORANGE, "steps", False),
+                Curve(ESTIMATED, flown.attitude[:, 0], estimated[:, axis], BLUE),
+            ),
+        )
+        for axis, title in enumerate(("roll", "pitch", "course"))
+    )
+
+
+def thrust(flown: History) -> tuple[Panel, ...]:
+    """Thrust commanded, and the hover thrust that the observer believes."""
+    commanded = Curve(COMMANDED, flown.setpoint[:, 0], flown.setpoint[:, 6], ORANGE, "steps")
+    hover = _recorded(flown, "hover_thrust", "hover thrust, believed", INK, main=False, dash="dash")
+    return (Panel("thrust, 0 to 1", (commanded, hover)),)
+
+
+def decisions(flown: History) -> tuple[Panel, ...]:
+    """Certificate and time of the decisions."""
+
+    def floored(name: str, label: str) -> Curve:
+        curve = _recorded(flown, name, label, BLUE, "dots")
+        return Curve(label, curve.times, np.maximum(curve.values, LEAST_SHOWN), BLUE, "dots")
+
+    return (
+        Panel("gap: cost above the exact optimum", (floored("gap", "gap"),), logarithmic=True),
+        Panel("spread of the swarm (ε, Eq. 29)", (floored("spread", "spread"),), logarithmic=True),
+        Panel(
+            "solve time, ms", (_recorded(flown, "solve_time_s", "solve time", BLUE, "dots", 1e3),)
+        ),
+    )
+
+
+def link(flown: History) -> tuple[Panel, ...]:
+    """Ages and delays of the link, and intervals of telemetry."""
+    delay = Curve(
+        "delay of the link (TIMESYNC)", flown.link_delay[:, 0], 1e3 * flown.link_delay[:, 1],
+        ORANGE, main=False,
+    )  # fmt: skip
+    age = _recorded(flown, "age_s", "telemetry at its setpoint", BLUE, "dots", 1e3)
+    late = _recorded(
+        flown, "lateness_s", "arrival to setpoint (host time)", GREEN, "dots", 1e3, main=False
+    )
+    stamps = np.unique(flown.position[:, 0])
+    gaps = Curve("positions", stamps[1:], 1e3 * np.diff(stamps), BLUE, "dots")
+    return (
+        Panel("age and delay, ms", (age, delay, late)),
+        Panel("interval between positions, ms", (gaps,)),
+    )
+
+
+def identification(flown: History) -> tuple[Panel, ...]:
+    """What was identified, with its standard deviation, and what the observer believes."""
+
+    def found(column: int, name: str, colour: str, scale: float = 1.0, main: bool = True) -> Curve:
+        rows = flown.identified[np.isfinite(flown.identified[:, column])]
+        value, sd = scale * rows[:, column], scale * rows[:, column + 1]
+        return Curve(name, rows[:, 0], value, colour, "dots", main, sd=sd)
+
+    hover = _recorded(flown, "hover_thrust", "believed", PURPLE, main=False)
+    disturbance = tuple(
+        _recorded(flown, f"disturbance_{axis}_mps2", axis, colour, main=False, dash=dash)
+        for axis, (colour, dash) in _AXES.items()
+    )
+    return (
+        Panel(
+            "identified delay, ms",
+            (found(1, "tilt", BLUE, 1e3), found(7, "yaw", ORANGE, 1e3, main=False)),
+        ),
+        Panel(
+            "identified natural frequency, rad/s",
+            (found(3, "tilt", BLUE), found(9, "yaw", ORANGE, main=False)),
+        ),
+        Panel("hover thrust, 0 to 1", (found(13, "identified", INK), hover)),
+        Panel("identified drag, 1/s", (found(19, "drag", BLUE),)),
+        Panel("believed disturbance, m/s²", disturbance),
+    )
+
+
+GROUPS: dict[str, tuple[str, Callable[[History], tuple[Panel, ...]]]] = {
+    "tracking": ("Tracking", tracking),
+    "attitude": ("Attitude commanded and flown", attitude),
+    "thrust": ("Thrust", thrust),
+    "decisions": ("Decisions", decisions),
+    "link": ("Link", link),
+    "identification": ("Identified and believed", identification),
+}
+_AXES = {"north": (GREEN, "solid"), "east": (PINK, "dash"), "down": (INK, "dot")}
+
+
+def near_reference(flown: History, times: Array) -> NDArray[np.bool_]:
+    """Whether a record of the reference is near each of the times (N,)."""
+    stamps = np.sort(flown.reference[:, 0])
+    place = np.searchsorted(stamps, times)
+    inside = (place > 0) & (place < len(stamps))
+    before, after = np.clip(place - 1, 0, None), np.clip(place, None, len(stamps) - 1)
+    near: NDArray[np.bool_] = inside & (stamps[after] - stamps[before] <= REFERENCE_GAP_S)
+    return near
+
+
+def _away(flown: History, rows: Array) -> tuple[Array, Array]:
+    """Times (N,), and position minus reference (N, 3) in m where there is a reference."""
+    if len(np.unique(flown.reference[:, 0])) < 2:
+        return np.zeros(0), np.zeros((0, 3))
+    near = near_reference(flown, rows[:, 0])
+    errors = np.full((len(rows), 3), np.nan)
+    errors[near] = rows[near, 1:4] - Reference(flown.reference).position(rows[near, 0])
+    return rows[:, 0], errors
+
+
+def _euler_deg(quaternions: Array) -> Array:
+    """Roll, pitch and course to 1e-4 deg, with a gap where one of them wraps."""
+    angles: Array = np.degrees(euler_from_quaternion(quaternions))
+    angles = np.asarray(np.round(angles, 4), np.float64)
+    angles[1:][np.abs(np.diff(angles, axis=0)) > 180.0] = np.nan
+    return angles
+
+
+def _recorded(
+    flown: History, field: str, name: str, colour: str, style: str = "line", scale: float = 1.0,
+    *, main: bool = True, dash: str = "solid",
+) -> Curve:  # fmt: skip
+    values = scale * flown.records[field]
+    return Curve(name, flown.record_time_s, values, colour, style, main, dash)

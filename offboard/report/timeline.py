@@ -1,0 +1,129 @@
+"""Bands and marks of a flight: phases, modes, authority, steps of the ladder, texts."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+from offboard.analysis.events import Event
+from offboard.analysis.figure import BLUE_BAND, GREY_BAND, ORANGE_BAND
+from offboard.flight.gate import Refusal
+from offboard.flight.phases import Phase
+from offboard.report.flight import Flight
+
+_ENDED_EARLY = {Phase.HOLD, Phase.STAND_DOWN, Phase.YIELDED, Phase.FAILED}
+_REGULAR = {("hover", "land"), ("land", "disarmed")}
+_PHASES = {phase.value for phase in Phase}
+_STEPS = {phase.value for phase in (*_ENDED_EARLY, Phase.LAND)}
+
+
+@dataclass(frozen=True, slots=True)
+class Band:
+    row: str
+    begin_s: float
+    end_s: float
+    label: str
+    text: str  # in full
+    colour: str
+
+
+@dataclass(frozen=True, slots=True)
+class Mark:
+    row: str
+    time_s: float
+    text: str
+
+
+def bands(flight: Flight) -> list[Band]:
+    """Phases of offboard, modes of the vehicle, and who has authority."""
+    phases = flight.history.phases
+    spans = _spans(phases, flight)
+    found = [
+        Band("phase", begin_s, end_s, name(event), event.what, _colour(name(event)))
+        for event, begin_s, end_s in spans
+    ]
+    for event, begin_s, end_s in _spans(flight.history.modes, flight):
+        colour = BLUE_BAND if event.what == flight.engage_mode else GREY_BAND
+        found.append(Band("mode", begin_s, end_s, event.what, f"mode {event.what}", colour))
+    return found + (_authority(flight) if phases else [])
+
+
+def marks(flight: Flight) -> list[Mark]:
+    """Steps of the ladder, and texts of both sides."""
+    flown = flight.history
+    found = [
+        Mark("ladder", event.time_s, event.what)
+        for before, event in pairwise(flown.phases)
+        if name(event) in _STEPS and (name(before), name(event)) not in _REGULAR
+    ]
+    refused = flown.records["refused"].astype(int)
+    for row in refused.nonzero()[0].tolist():
+        why = ", ".join(
+            flag.name.lower().replace("_", " ") for flag in Refusal(int(refused[row])) if flag.name
+        )
+        found.append(Mark("ladder", float(flown.record_time_s[row]), f"setpoint not sent: {why}"))
+    texts = (*flown.announcements, *flown.vehicle_messages)
+    found += [Mark("texts", event.time_s, f"{event.who}: {event.what}") for event in texts]
+    return [mark for mark in found if math.isfinite(mark.time_s)]
+
+
+def events(flight: Flight) -> list[Event]:
+    """Everything that was said or shown, in the order of time; what came before telemetry first."""
+    flown = flight.history
+    modes = (Event(event.time_s, event.who, f"mode {event.what}") for event in flown.modes)
+    every = (*flown.phases, *flown.announcements, *modes, *flown.vehicle_messages)
+    return sorted(every, key=lambda e: -math.inf if math.isnan(e.time_s) else e.time_s)
+
+
+def name(phase: Event) -> str:
+    """The phase that an event announces."""
+    return phase.what.partition(":")[0]
+
+
+def _spans(events: Sequence[Event], flight: Flight) -> list[tuple[Event, float, float]]:
+    """Each event until the next one; the first may be older than telemetry."""
+    begins = [flight.begin_s if math.isnan(e.time_s) else e.time_s for e in events]
+    ends = [*begins[1:], flight.end_s]
+    rows = zip(events, begins, ends, strict=False)  # without events there is an end too many
+    return [(event, begin_s, max(end_s, begin_s)) for event, begin_s, end_s in rows]
+
+
+def _colour(phase: str) -> str:
+    if phase == Phase.TRACK.value:
+        return BLUE_BAND
+    return ORANGE_BAND if phase in {each.value for each in _ENDED_EARLY} else GREY_BAND
+
+
+def _authority(flight: Flight) -> list[Band]:
+    """Whose the vehicle was, by the phases and the modes that it showed."""
+    times = sorted({begin_s for part in (flight.history.phases, flight.history.modes)
+                    for _, begin_s, _ in _spans(part, flight)})  # fmt: skip
+    found: list[Band] = []
+    for begin_s, end_s in pairwise((*times, flight.end_s)):
+        label, text, colour = _standing(flight, begin_s)
+        if found and found[-1].label == label:
+            begin_s = found.pop().begin_s
+        found.append(Band("authority", begin_s, end_s, label, text, colour))
+    return found
+
+
+def _standing(flight: Flight, time_s: float) -> tuple[str, str, str]:
+    """Label, text and colour at a moment."""
+
+    def newest(events: Sequence[Event]) -> Event | None:
+        begun = [event for event, begin_s, _ in _spans(events, flight) if begin_s <= time_s]
+        return begun[-1] if begun else None
+
+    begun = {name(event) for event in flight.history.phases if event.time_s <= time_s}
+    mode = newest(flight.history.modes)
+    if begun & {Phase.STAND_DOWN.value, Phase.YIELDED.value, Phase.FAILED.value}:
+        return "given up", "offboard sends nothing any more", ORANGE_BAND
+    if begun & {Phase.HOLD.value, Phase.LAND.value, Phase.DISARMED.value}:
+        return "handed over", "the vehicle is in a mode that offboard asked for", GREY_BAND
+    if Phase.ENGAGE.value not in begun:
+        return "not asked", "offboard has not asked for the vehicle", GREY_BAND
+    if mode is not None and mode.what == flight.engage_mode:
+        return "offboard", "the vehicle follows the setpoints of offboard", BLUE_BAND
+    return "asked", "offboard has asked for the vehicle", GREY_BAND

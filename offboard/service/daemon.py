@@ -1,0 +1,209 @@
+"""The service as a process: lock, monitor, configuration, link, supervisor, and the loop."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from dataclasses import dataclass
+from pathlib import Path
+
+from sdnotify import SystemdNotifier
+
+from offboard import compiled
+from offboard.documents.signing_key import read_key
+from offboard.estimation.fusion import FollowedEstimate
+from offboard.flight import clock
+from offboard.flight.companion import Outcome
+from offboard.flight.connection import open_link
+from offboard.flight.link import Link, LinkError
+from offboard.flight.loop import Loop
+from offboard.flight.one_flight import discard
+from offboard.flight.phases import ExitCode
+from offboard.flight.programme import Anchor, Then, service
+from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
+from offboard.flight.request import FlightRequest
+from offboard.flight.signing_time import SigningTime
+from offboard.flight.stop import StopRequests
+from offboard.flight.supervisor import Supervisor
+from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
+from offboard.mavlink.session import Session, SessionSettings
+from offboard.service.flights import Flights
+from offboard.service.lock import ConnectionLock
+from offboard.service.memory import VehicleFiles
+from offboard.service.monitor import Monitor
+from offboard.service.preparation import Preparation
+from offboard.service.record import Recorder
+
+LINK_FIRST_S, LINK_MOST_S = 1.0, 30.0  # between two attempts to open the link
+SHOWN_EVERY_S = 0.25
+WATCHDOG_EVERY_S = 1.0
+STOPPED_EARLY = "stopped before the link was open"
+
+
+@dataclass(frozen=True, slots=True)
+class Service:
+    """What to serve: `request` as for one flight, whose directory holds those of the flights."""
+
+    request: FlightRequest
+    anchor: Anchor = "here"
+    then: Then = "hold"
+    arms: bool = False
+    metrics: str | None = None  # HOST:PORT
+
+
+def run(
+    wanted: Service,
+    *,
+    stops: StopRequests,
+    tell: Callable[[str], None],
+    show: Callable[[Flights], None],
+) -> Outcome:
+    """Serve until a stop is requested.
+
+    `tell` is called with sentences about the preparation, `show` often, to show what the flights
+    announce; neither may wait. Raises Locked, MonitorError, DocumentError, SupervisorError or
+    LogError, all before anything is sent.
+    """
+    request = wanted.request
+    with ExitStack() as stack:
+        stack.enter_context(ConnectionLock(request.connection))
+        config = request.resolve()
+        monitor = Monitor(wanted.metrics) if wanted.metrics else None
+        if monitor:
+            stack.enter_context(closing(monitor))
+        key = read_key(request.signing_key) if request.signing_key else None
+        signing = stack.enter_context(SigningTime(key)) if key else None
+        supervisor = stack.enter_context(Supervisor(signing))
+        tell("preparing the controller")
+        compiled.prepare(tell)
+        preparation = stack.enter_context(closing(Preparation(request)))
+        supervisor.await_ready()
+        recorder = Recorder(request.directory)
+        stack.callback(recorder.close)
+        memory = stack.enter_context(closing(VehicleFiles(_vehicles(request.directory), tell)))
+        manager = Manager()
+        manager.ready()
+        link = _opened(request.connection, stops, tell, manager)
+        if link is None:
+            return Outcome(ExitCode.FLOWN, STOPPED_EARLY)
+        stack.callback(link.close)
+        fuses = config.estimate is FollowedEstimate.FUSED
+        flights = Flights(
+            session=Session(
+                SessionSettings(
+                    system_id=request.system_id,
+                    component_id=COMPONENT_ID,
+                    record_component_id=RECORD_COMPONENT_ID,
+                    stream=link.is_stream,
+                    capacity_bytes_ps=link.capacity_bytes_ps,
+                    sends_first=not request.connection.startswith("udpin"),
+                    extra_wanted=POSITIONING_TELEMETRY if fuses else (),
+                ),
+                signing,
+            ),
+            source=preparation,
+            record=recorder,
+            memory=memory,
+            programme=service(wanted.then, wanted.anchor, arms=wanted.arms),
+            stopwatch=clock.monotonic_s,
+        )
+        display = Display(flights, show, preparation, monitor, manager)
+        preparation.start()
+        discard(link)
+        tell(f"waiting for a vehicle on {request.connection}")
+        outcome = Loop(
+            flights,
+            link,
+            recorder,
+            stops=stops,
+            progress=lambda _: display.update(),
+            supervisor=supervisor,
+            lands_without_log=config.limits.log_lost == "land",
+        ).run()
+        manager.stopping()
+        flights.close()
+        return outcome
+
+
+def _vehicles(directory: Path) -> Path:
+    return directory / "vehicles"
+
+
+def _opened(
+    connection: str, stops: StopRequests, tell: Callable[[str], None], manager: Manager
+) -> Link | None:
+    """The link, when it can be opened: a port may be in use, a device not plugged in yet. None if a
+    stop was requested before. Raises LinkError for an address that nothing can be."""
+    wait_s, told = LINK_FIRST_S, ""
+    pause = threading.Event()
+    while not stops.requested:
+        try:
+            return open_link(connection)
+        except LinkError as error:
+            if not isinstance(error.__context__, OSError):  # the address itself is wrong
+                raise
+            if str(error) != told:
+                told = str(error)
+                tell(f"{error}; trying again")
+        until_s = clock.monotonic_s() + wait_s
+        wait_s = min(2.0 * wait_s, LINK_MOST_S)
+        while clock.monotonic_s() < until_s and not stops.requested:
+            manager.alive(clock.monotonic_s())
+            pause.wait(0.1)
+    return None
+
+
+class Manager:
+    """The service manager (systemd), if there is one. Nothing waits for it."""
+
+    def __init__(self) -> None:
+        self._notifier = SystemdNotifier()
+        if getattr(self._notifier, "socket", None) is not None:
+            self._notifier.socket.setblocking(False)
+        self._told_s = 0.0
+        self._status = ""
+
+    def ready(self) -> None:
+        self._notifier.notify("READY=1")
+
+    def stopping(self) -> None:
+        self._notifier.notify("STOPPING=1")
+
+    def alive(self, now_s: float, status: str = "") -> None:
+        """The loop runs; at most once a second to the watchdog."""
+        if now_s - self._told_s >= WATCHDOG_EVERY_S:
+            self._told_s = now_s
+            self._notifier.notify("WATCHDOG=1")
+        if status != self._status:
+            self._status = status
+            self._notifier.notify(f"STATUS={status}")
+
+
+class Display:
+    """What is told to user, monitor and service manager in each turn of the loop."""
+
+    def __init__(
+        self,
+        flights: Flights,
+        show: Callable[[Flights], None],
+        preparation: Preparation,
+        monitor: Monitor | None,
+        manager: Manager,
+    ) -> None:
+        self._flights = flights
+        self._show = show
+        self._preparation = preparation
+        self._monitor = monitor
+        self._manager = manager
+        self._shown_s = 0.0
+
+    def update(self) -> None:
+        now_s = clock.monotonic_s()
+        flights = self._flights
+        self._manager.alive(now_s, flights.phase.value)
+        self._preparation.allow(not (flights.in_flight or flights.state.vehicle.armed))
+        self._show(flights)
+        if self._monitor and now_s - self._shown_s >= SHOWN_EVERY_S:
+            self._shown_s = now_s
+            self._monitor.show(flights.snapshot(), flights.engagements, now_s)

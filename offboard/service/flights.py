@@ -1,0 +1,308 @@
+"""The flights of the service on one link: one waits or flies, and when it has ended the next waits.
+
+`Flights` takes the place of one companion in the loop. Each flight has a new `Companion` on the
+same session, so that authority, ladder, plan and identification are new, and what is known of
+vehicle and link stays. No I/O: a log is begun and ended at `Record`, configurations come from
+`Source`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+from offboard.flight import assessment
+from offboard.flight.companion import STOPPED, Companion, Outcome, Output
+from offboard.flight.flight_plan import FlightPlan
+from offboard.flight.link import Chunk
+from offboard.flight.one_flight import FlightParts
+from offboard.flight.phases import ENDS, FLYING, WAITING, Phase
+from offboard.flight.programme import Programme
+from offboard.flight.snapshot import Snapshot
+from offboard.flight.state import FlightState
+from offboard.identification.learned import Learned
+from offboard.mavlink.session import Session
+
+REASON_EVERY_S = 10.0  # why the vehicle cannot be flown is announced this often
+TEXTS_KEPT = 200
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """A configuration ready to fly: its parts, called once, and its text for the log."""
+
+    parts: FlightParts
+    text: str
+
+
+class Source(Protocol):
+    """Where the newest usable configuration comes from. Neither method waits."""
+
+    def newest(self) -> Prepared: ...
+    def news(self) -> list[str]:
+        """Sentences about configurations since the last call."""
+        ...
+
+
+class Record(Protocol):
+    """Where flights are recorded. No method waits."""
+
+    def begin(self, session: Session, configuration: str) -> str:
+        """A flight begins: its frames go to a log of its own. Returns its directory."""
+        ...
+
+    def end(self) -> None:
+        """It has ended: the log is closed and scored, and frames go to the rolling log."""
+        ...
+
+
+class Memory(Protocol):
+    """The vehicles that were identified, by key. No method waits."""
+
+    def get(self, key: str, prepared: Prepared) -> Learned | None: ...
+    def keep(self, key: str, prepared: Prepared, learned: Learned) -> None: ...
+    def discard(self, key: str) -> None: ...
+
+
+class Flights:
+    """See the module. `stopwatch` reads host time.
+
+    `engagements` counts the flights that have begun. `announced` has the newest sentences for the
+    user, oldest first, `announcements` how many there were.
+    """
+
+    def __init__(
+        self,
+        *,
+        session: Session,
+        source: Source,
+        record: Record,
+        memory: Memory,
+        programme: Programme,
+        stopwatch: Callable[[], float],
+        keeps_deadline: bool = True,
+    ) -> None:
+        self._session = session
+        self._source = source
+        self._record = record
+        self._memory = memory
+        self._programme = programme
+        self._stopwatch = stopwatch
+        self._keeps_deadline = keeps_deadline
+        self._stopping = False
+        self._recording = False
+        self._shown = 0  # of the present companion's announcements
+        self._told_s = -math.inf
+        self.announced: list[str] = []
+        self.announcements = 0
+        self.engagements = 0
+        self._prepared = source.newest()
+        self._learned: Learned | None = None  # of the vehicle, for the next flight
+        self._recalled: Learned | None = None  # that the present companion began with
+        self._current = self._companion(None)
+
+    # ------------------------------------------------------------------ as a companion
+
+    @property
+    def current(self) -> Companion:
+        """The flight that waits or flies."""
+        return self._current
+
+    @property
+    def state(self) -> FlightState:
+        return self._current.state
+
+    @property
+    def phase(self) -> Phase:
+        return self._current.phase
+
+    @property
+    def peer(self) -> Hashable | None:
+        """The address that the vehicle sends from."""
+        return self._current.peer
+
+    @peer.setter
+    def peer(self, place: Hashable | None) -> None:
+        self._current.peer = place
+
+    @property
+    def strangers(self) -> int:
+        """Datagrams of other senders since the start."""
+        return self._current.strangers
+
+    @strangers.setter
+    def strangers(self, number: int) -> None:
+        self._current.strangers = number
+
+    @property
+    def outcome(self) -> Outcome | None:
+        """How the newest flight ended."""
+        return self._current.outcome
+
+    def snapshot(self) -> Snapshot:
+        return self._current.snapshot()
+
+    def has_ended(self) -> bool:
+        """Whether the service was stopped, and no flight is left."""
+        return self._stopping and self._current.has_ended()
+
+    def request_stop(self, why: str = STOPPED) -> None:
+        """Stop the service, after the vehicle was handed back. For another reason than the
+        operator's, only the present flight ends."""
+        self._stopping |= why == STOPPED
+        if self._stopping or self.phase not in WAITING:
+            self._current.request_stop(why)
+
+    def announce(self, sentence: str) -> None:
+        """Report a sentence to the user, the ground station and the log."""
+        self._current.announce(sentence)
+
+    def overhear(self, datagrams: Sequence[bytes]) -> None:
+        """As `Companion.overhear`."""
+        self._current.overhear(datagrams)
+
+    def on_dropped(self, frames: int) -> None:
+        """As `Companion.on_dropped`."""
+        self._current.on_dropped(frames)
+
+    def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
+        """Process all that has arrived; begin the next flight where the last one has ended."""
+        if self._current.has_ended() and not self._stopping:
+            self._begin_next()
+        if self.phase in WAITING:
+            self._renew_if_changed()
+        before = self.phase
+        output = self._current.turn(chunks, now_s)
+        if before in WAITING and self.phase not in WAITING and self.phase not in ENDS:
+            self._begin_record()
+        if self._recording and before is not self.phase:
+            self._keep_identified()
+        if self.phase in WAITING:
+            self._explain(now_s)
+        self._collect()
+        return output
+
+    def close(self) -> None:
+        """The service ends."""
+        self._end_record()
+
+    # ------------------------------------------------------------------ one flight after another
+
+    def _begin_next(self) -> None:
+        self._end_record()
+        self._follow(self._source.newest())
+
+    def _renew_if_changed(self) -> None:
+        """Wait with the newest configuration, and with what is known of the vehicle."""
+        newest = self._source.newest()
+        changed = newest is not self._prepared or self._remembered(newest) is not self._learned
+        if changed and not self._stopping:
+            self._follow(newest)
+        for sentence in self._source.news():
+            self._current.announce(sentence)
+
+    def _follow(self, prepared: Prepared) -> None:
+        """Continue with a new companion where the present one has ended or waits."""
+        self._collect()
+        known = self._remembered(prepared)
+        self._prepared, self._learned = prepared, known
+        self._current = self._companion(self._current)
+        self._shown = 0
+
+    def _companion(self, before: Companion | None) -> Companion:
+        parts = self._prepared.parts
+        parts.controller.reset()
+        self._recalled = self._learned
+        return Companion(
+            vehicle=parts.vehicle,
+            session=self._session,
+            observer=parts.make_observer(),
+            controller=parts.controller,
+            plan=FlightPlan(parts.track),
+            limits=parts.limits,
+            period_s=parts.period_s,
+            deadline_s=parts.deadline_s if self._keeps_deadline else None,
+            stopwatch=self._stopwatch,
+            identify=parts.identify,
+            learned=self._learned,
+            programme=self._programme,
+            before=before,
+        )
+
+    # ------------------------------------------------------------------ record
+
+    def _begin_record(self) -> None:
+        self.engagements += 1
+        self._recording = True
+        directory = self._record.begin(self._session, self._prepared.text)
+        self._current.announce(f"flight {self.engagements}, recorded in {directory}")
+        known = self._recalled
+        if known:
+            self._current.announce(
+                f"this vehicle was identified before: tilt delay {1e3 * known.delay.value:.0f} ms, "
+                f"hover thrust {known.vehicle.hover_thrust:.3f}; no identification steps"
+            )
+
+    def _end_record(self) -> None:
+        if self._recording:
+            self._recording = False
+            self._keep_identified()
+            self._record.end()
+
+    # ------------------------------------------------------------------ the identified vehicle
+
+    @property
+    def _key(self) -> str:
+        """The vehicle: autopilot, system id and the hardware's number; empty where it has none."""
+        vehicle = self.state.vehicle
+        found = vehicle.found
+        return (
+            f"{found.autopilot}-{found.system_id}-{vehicle.uid:x}" if found and vehicle.uid else ""
+        )
+
+    def _remembered(self, prepared: Prepared) -> Learned | None:
+        return self._memory.get(self._key, prepared) if self._key else None
+
+    def _keep_identified(self) -> None:
+        identification = self._current.identification
+        if identification is None or not self._key:
+            return
+        if identification.contradicted:
+            if self._learned is not None:
+                self._learned = None
+                self._memory.discard(self._key)
+                self._current.announce(
+                    "what was identified of this vehicle is contradicted, and discarded: the next "
+                    "flight identifies it again"
+                )
+        elif self._learned is None:
+            found = identification.learned
+            if found is not None:
+                self._learned = found
+                self._memory.keep(self._key, self._prepared, found)
+
+    # ------------------------------------------------------------------ what the user reads
+
+    def _explain(self, now_s: float) -> None:
+        """Say from time to time what prevents that the vehicle is flown."""
+        state = self.state
+        if now_s - self._told_s < REASON_EVERY_S or state.phase is not Phase.HEALTH:
+            return
+        self._told_s = now_s
+        reasons = [*assessment.problems(state), assessment.not_ready(state, self._session)]
+        if any(reasons):
+            self._current.announce(f"waiting: {'; '.join(filter(None, reasons))}")
+
+    def _collect(self) -> None:
+        said = self._current.announced
+        new = said[self._shown :]
+        self._shown = len(said)
+        self.announcements += len(new)
+        self.announced = [*self.announced, *new][-TEXTS_KEPT:]
+
+    @property
+    def in_flight(self) -> bool:
+        """Whether the vehicle follows us, or was asked to end the flight."""
+        return self.phase in FLYING or self.phase is Phase.LAND

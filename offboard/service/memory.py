@@ -1,0 +1,96 @@
+"""What flights have identified of their vehicles: a file for each vehicle, used by later flights.
+
+`DIR/vehicles/KEY.yaml` holds the identified vehicle, the delay of its tilt, and the vehicle file
+that it was identified from: for another vehicle file it is not used.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+import yaml
+from pydantic import BaseModel, ConfigDict, Field
+
+from offboard.documents.reading import DocumentError, read, validate
+from offboard.documents.shipped import read_text
+from offboard.identification.learned import Learned
+from offboard.identification.uncertainty import Estimate
+from offboard.model.vehicle import Vehicle
+from offboard.service.flights import Prepared
+
+
+class Document(BaseModel):
+    """The content of a file."""
+
+    model_config = ConfigDict(extra="forbid")
+
+    identified_from: str  # digest of the vehicle file
+    tilt_delay_s: float = Field(ge=0, le=1)
+    tilt_delay_sd_s: float = Field(gt=0, le=1)
+    link_delay_s: float = Field(ge=0, le=10)
+    vehicle: Vehicle
+
+
+class VehicleFiles:
+    """The files in `directory`, read at the start; written by a thread. `tell` is called with
+    sentences about files that cannot be used."""
+
+    def __init__(self, directory: Path, tell: Callable[[str], None]) -> None:
+        self._directory = directory
+        self._known: dict[str, tuple[str, Learned]] = {}
+        self._clerk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="vehicles")
+        for path in sorted(directory.glob("*.yaml")) if directory.is_dir() else ():
+            try:
+                self._known[path.stem] = _load(path)
+            except (DocumentError, OSError) as error:
+                tell(f"{path} is not used: {error}")
+
+    def get(self, key: str, prepared: Prepared) -> Learned | None:
+        """What is known of this vehicle, if it was identified from the same vehicle file."""
+        source, learned = self._known.get(key, ("", None))
+        return learned if source == _digest(prepared.parts.vehicle) else None
+
+    def keep(self, key: str, prepared: Prepared, learned: Learned) -> None:
+        source = _digest(prepared.parts.vehicle)
+        self._known[key] = source, learned
+        self._clerk.submit(self._write, key, source, learned)
+
+    def discard(self, key: str) -> None:
+        self._known.pop(key, None)
+        self._clerk.submit(self._remove, key)
+
+    def close(self) -> None:
+        self._clerk.shutdown(wait=True)
+
+    def _write(self, key: str, source: str, learned: Learned) -> None:
+        document = {
+            "identified_from": source,
+            "tilt_delay_s": learned.delay.value,
+            "tilt_delay_sd_s": learned.delay.sd,
+            "link_delay_s": learned.link_s,
+            "vehicle": learned.vehicle.model_dump(mode="json"),
+        }
+        path = self._directory / f"{key}.yaml"
+        with suppress(OSError):  # then the next start identifies it again
+            self._directory.mkdir(parents=True, exist_ok=True)
+            part = path.with_suffix(".part")
+            part.write_text(yaml.safe_dump(document, sort_keys=False), encoding="utf-8")
+            part.replace(path)
+
+    def _remove(self, key: str) -> None:
+        with suppress(OSError):
+            (self._directory / f"{key}.yaml").unlink()
+
+
+def _load(path: Path) -> tuple[str, Learned]:
+    document = validate(read(read_text(path), str(path)), Document, str(path))
+    delay = Estimate(document.tilt_delay_s, document.tilt_delay_sd_s)
+    return document.identified_from, Learned(document.vehicle, delay, document.link_delay_s)
+
+
+def _digest(vehicle: Vehicle) -> str:
+    return hashlib.sha256(vehicle.model_dump_json().encode()).hexdigest()[:16]

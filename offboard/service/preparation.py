@@ -1,0 +1,85 @@
+"""The configuration of the service's next flight: read again while it waits, and made ready.
+
+A thread resolves the configuration every `EVERY_S` while no vehicle follows us. One that has
+changed is built and called once, so that nothing is compiled in flight; one that cannot be used is
+refused with a sentence, and the one before stays in use.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+
+from offboard.documents.errors import UserError
+from offboard.flight.configuration import FlightConfig, dump
+from offboard.flight.one_flight import rehearse
+from offboard.flight.request import FlightRequest, build_parts
+from offboard.service.flights import Prepared
+
+EVERY_S = 2.0
+
+
+def prepare(config: FlightConfig) -> Prepared:
+    """Build and rehearse. Raises DocumentError."""
+    parts = build_parts(config)
+    rehearse(parts, keeps_deadline=True)
+    return Prepared(parts, dump(config))
+
+
+class Preparation:
+    """A `flights.Source`. Raises DocumentError if the first configuration cannot be used."""
+
+    def __init__(self, request: FlightRequest, every_s: float = EVERY_S) -> None:
+        self._request = request
+        self._every_s = every_s
+        first = request.resolve()
+        self._estimate = first.estimate
+        self._newest = prepare(first)
+        self._seen = self._newest.text  # the newest text or error
+        self._news: deque[str] = deque()
+        self._ended, self._allowed = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True, name="configuration")
+
+    def start(self) -> None:
+        """Begin to watch."""
+        self._allowed.set()
+        self._thread.start()
+
+    def allow(self, allowed: bool) -> None:
+        """Whether the thread may work now: not while the vehicle is armed."""
+        if allowed != self._allowed.is_set():
+            (self._allowed.set if allowed else self._allowed.clear)()
+
+    def close(self) -> None:
+        self._ended.set()
+
+    def newest(self) -> Prepared:
+        return self._newest
+
+    def news(self) -> list[str]:
+        """Sentences about configurations since the last call."""
+        return [self._news.popleft() for _ in range(len(self._news))]
+
+    def _run(self) -> None:
+        while not self._ended.wait(self._every_s):
+            if self._allowed.is_set():
+                self.look()
+
+    def look(self) -> None:
+        """Read the configuration again, and use it if it has changed."""
+        try:
+            config = self._request.resolve()
+            text = dump(config)
+            if text in (self._seen, self._newest.text):
+                self._seen = text
+                return
+            self._seen = text
+            if config.estimate != self._estimate:
+                raise UserError("estimate cannot be changed while the service runs")
+            self._newest = prepare(config)
+            self._news.append("the configuration has changed: used from the next flight on")
+        except Exception as error:  # whatever a controller raises, the old configuration is kept
+            sentence = "; ".join(str(error).splitlines())
+            if sentence != self._seen:
+                self._seen = sentence
+                self._news.append(f"the configuration is refused, the old one is kept: {sentence}")

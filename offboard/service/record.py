@@ -1,0 +1,250 @@
+"""The logs of the service: one directory for each flight, and a bounded rolling log between them.
+
+The rolling log is two files of at most `ROLLING_BYTES`; when one is full, the other is begun anew.
+A flight's log begins with its configuration, with what the vehicle sends only once, and with the
+last seconds before the flight, so that it is complete by itself. Files are opened, written and
+closed by threads: the loop waits for none of them.
+"""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
+from pathlib import Path
+
+from offboard.flight import clock, manifest
+from offboard.flight.background import BackgroundWriter
+from offboard.flight.log import CLOSE_S, QUEUED_MAX, LogError, append, entry
+from offboard.mavlink.session import Session
+
+ROLLING_BYTES = 16 * 2**20
+ROLLING_NAMES = ("standby.1.tlog", "standby.2.tlog")
+BEFORE_US = 5_000_000  # of the time before a flight that its log holds
+BEFORE_MAX = 20_000  # frames of it
+SENT_ONCE = frozenset({22, 49, 148, 242})  # PARAM_VALUE, GPS_GLOBAL_ORIGIN, AUTOPILOT_VERSION, HOME
+PARAM_ID = slice(18, 34)  # in a frame of PARAM_VALUE: 10 bytes of header, 8 of payload before it
+KEPT_MAX = 100
+SCORE_S = 600.0
+LOWER_PRIORITY = 10
+
+
+class RollingLog:
+    """Two files in `directory` that are never closed, so that another process may have their
+    descriptors. Raises LogError."""
+
+    def __init__(self, directory: Path, most_bytes: int = ROLLING_BYTES) -> None:
+        flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND
+        try:
+            directory.mkdir(parents=True, exist_ok=True)
+            self._descriptors = [os.open(directory / n, flags, 0o666) for n in ROLLING_NAMES]
+        except OSError as error:
+            raise LogError(
+                f"the service cannot record in {directory}: {error.strerror}; choose a directory "
+                "that can be written with --out"
+            ) from None
+        self._most_bytes = most_bytes
+        self._written = 0
+        self._writer = BackgroundWriter[bytes](self._append, QUEUED_MAX)
+
+    @property
+    def descriptor(self) -> int:
+        """The file that is written."""
+        return self._descriptors[0]
+
+    def write(self, record: bytes) -> None:
+        self._writer.put(record)
+
+    def _append(self, records: list[bytes]) -> None:
+        size = sum(map(len, records))
+        if self._written + size > self._most_bytes:
+            self._descriptors.reverse()
+            os.ftruncate(self._descriptors[0], 0)
+            self._written = 0
+        self._written += size
+        with suppress(OSError):  # a full disk ends no service; the flights' logs report it
+            append(self._descriptors[0], records)
+
+    def close(self) -> None:
+        self._writer.close(CLOSE_S)
+        if self._writer.is_free():
+            for descriptor in self._descriptors:
+                os.close(descriptor)
+
+
+class FlightRecord:
+    """The directory of one flight; the writing thread makes it when it has the first frames."""
+
+    def __init__(self, directory: Path, configuration: str) -> None:
+        self.directory = directory
+        self._configuration = configuration
+        self.descriptor: int | None = None
+        self._writer = BackgroundWriter[bytes](self._append, QUEUED_MAX)
+
+    def write(self, record: bytes) -> None:
+        self._writer.put(record)
+
+    def _append(self, records: list[bytes]) -> None:
+        if self.descriptor is None:
+            self.descriptor = self._open()
+        append(self.descriptor, records)
+
+    def _open(self) -> int:
+        self.directory.mkdir(parents=True)
+        (self.directory / "flight.yaml").write_text(self._configuration, encoding="utf-8")
+        # appended to, since another process may continue the log
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND
+        return os.open(self.directory / "flight.tlog", flags, 0o666)
+
+    @property
+    def lost(self) -> int:
+        return self._writer.dropped
+
+    @property
+    def problem(self) -> str:
+        """What of the log is lost, and why; empty if nothing is."""
+        error = self._writer.error
+        if error is None and not self.lost:
+            return ""
+        reason = (getattr(error, "strerror", None) or error) if error else "the disk is too slow"
+        return f"the log {self.directory / 'flight.tlog'} cannot be written ({reason})"
+
+    def close(self) -> None:
+        """Write what is queued, for a bounded time."""
+        self._writer.close(CLOSE_S)
+        if self._writer.is_free() and self.descriptor is not None:
+            os.close(self.descriptor)
+
+
+def score(directory: Path) -> None:
+    """Score a flight in a process of its own, with a lower priority, and wait for its end."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "offboard", "score", str(directory)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    with suppress(OSError):
+        os.setpriority(os.PRIO_PROCESS, process.pid, LOWER_PRIORITY)
+    try:
+        process.wait(SCORE_S)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+class Recorder:
+    """The log of the loop and the `flights.Record` of the service, below `directory`."""
+
+    def __init__(
+        self,
+        directory: Path,
+        *,
+        stamp: Callable[[], str] = clock.local_stamp,
+        score: Callable[[Path], object] = score,
+        rolling_bytes: int = ROLLING_BYTES,
+    ) -> None:
+        self._directory = directory
+        self._stamp = stamp
+        self._score = score
+        self._rolling = RollingLog(directory, rolling_bytes)
+        self._flight: FlightRecord | None = None
+        self._before: deque[tuple[int, bytes]] = deque(maxlen=BEFORE_MAX)
+        self._once: dict[bytes, bytes] = {}
+        self._clerk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="record")
+        self._stamped, self._number = "", 0
+        # read once: in flight the file system may keep its caller waiting
+        self._taken = {path.name for path in directory.iterdir()} if directory.is_dir() else set()
+        self._closed = False
+
+    # ------------------------------------------------------------------ the loop's log
+
+    @property
+    def descriptor(self) -> int:
+        """The file that is written now."""
+        flight = self._flight.descriptor if self._flight else None
+        return self._rolling.descriptor if flight is None else flight
+
+    @property
+    def problem(self) -> str:
+        """What of the present flight's log is lost; the rolling log may lose what it likes."""
+        return self._flight.problem if self._flight else ""
+
+    @property
+    def lost(self) -> int:
+        return self._flight.lost if self._flight else 0
+
+    def write(self, unix_us: int, frame: bytes) -> None:
+        """Queue one frame and its Unix time."""
+        record = entry(unix_us, frame)
+        if self._flight:
+            self._flight.write(record)
+            return
+        self._rolling.write(record)
+        self._before.append((unix_us, record))
+        while not 0 <= unix_us - self._before[0][0] <= BEFORE_US:  # the wall clock may be set
+            self._before.popleft()
+        if int.from_bytes(frame[7:10], "little") in SENT_ONCE:
+            self._keep(frame, record)
+
+    def _keep(self, frame: bytes, record: bytes) -> None:
+        name = frame[7:10]
+        if name == b"\x16\0\0":
+            name += frame[PARAM_ID]
+        if name in self._once or len(self._once) < KEPT_MAX:
+            self._once[name] = record
+
+    # ------------------------------------------------------------------ flights
+
+    def begin(self, session: Session, configuration: str) -> str:
+        """A log of its own for a flight that begins. Returns its directory."""
+        directory = self._new_directory()
+        self._flight = flight = FlightRecord(directory, configuration)
+        now_us = clock.unix_us()
+        for piece in manifest.pieces(configuration):
+            flight.write(entry(now_us, session.encode(piece)))
+        earlier = {record for _, record in self._before}
+        for record in self._once.values():
+            if record not in earlier:
+                flight.write(record)
+        for _, record in self._before:
+            flight.write(record)
+        self._before.clear()
+        return str(directory)
+
+    def _new_directory(self) -> Path:
+        """Two flights of one second have different names; a directory that is there is left."""
+        stamp = self._stamp()
+        if stamp != self._stamped:
+            self._stamped, self._number = stamp, 0
+        while True:
+            self._number += 1
+            name = stamp if self._number == 1 else f"{stamp}-{self._number}"
+            if name not in self._taken:
+                self._taken.add(name)
+                return self._directory / name
+
+    def end(self) -> None:
+        """Close the flight's log and score it, in another thread."""
+        flight, self._flight = self._flight, None
+        if flight:
+            self._clerk.submit(self._finish, flight)
+
+    def _finish(self, flight: FlightRecord) -> None:
+        flight.close()
+        if flight.descriptor is not None:
+            self._score(flight.directory)
+
+    def close(self) -> None:
+        """Close all logs, after the last flight was scored."""
+        if self._closed:
+            return
+        self._closed = True
+        self.end()
+        self._clerk.shutdown(wait=True)
+        self._rolling.close()

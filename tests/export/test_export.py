@@ -1,0 +1,217 @@
+"""`offboard export`: a format, read by its own library, holds what pymavlink reads in the log."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+from pyarrow import parquet
+from pymavlink import mavutil
+from pyulog import ULog
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner, Result
+
+from offboard.cli.commands import app
+from offboard.export.frames import enu, flu_in_enu
+
+sys.path.append(str(Path(__file__).parents[1] / "flight"))
+
+from pair import UNIX_EPOCH_US, hover
+
+RECORDINGS = Path(__file__).parents[1] / "wire" / "recordings"
+REAL = RECORDINGS / "px4-1.16.1-offboard.tlog"
+OURS = (191, 192)
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    pair = hover(scenario="px4_like")
+    assert pair.fly().exit_code == 0
+    return pair.log(tmp_path_factory.mktemp("hover") / "flight").path
+
+
+@pytest.fixture(scope="module")
+def messages(flight: Path) -> dict[tuple[str, bool], list[Any]]:
+    """The messages by name, and whether they are ours, as pymavlink reads them."""
+    found: dict[tuple[str, bool], list[Any]] = {}
+    log = mavutil.mavlink_connection(str(flight))
+    while (message := log.recv_match()) is not None:
+        key = message.get_type(), message.get_srcComponent() in OURS
+        found.setdefault(key, []).append(message)
+    return found
+
+
+def run(flight: Path, kind: str, output: Path, *options: str) -> Result:
+    return CliRunner().invoke(
+        app, ["export", str(flight), "--to", kind, "-o", str(output), *options]
+    )
+
+
+def exported(flight: Path, kind: str, output: Path, *options: str) -> Path:
+    result = run(flight, kind, output, *options)
+    assert result.exit_code == 0, result.exception
+    return output
+
+
+def test_frames_against_rotation_matrices() -> None:
+    """ENU = A NED and FRD = B FLU, so that R_enu = A R_ned B."""
+    a = np.array([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
+    b = np.diag([1, -1, -1])
+    rotations = Rotation.random(50, random_state=3)
+    converted = flu_in_enu(np.roll(rotations.as_quat(), 1, axis=1))
+    expected = a @ rotations.as_matrix() @ b
+    assert Rotation.from_quat(np.roll(converted, -1, axis=1)).as_matrix() == pytest.approx(expected)
+    vectors = np.random.default_rng(3).normal(size=(50, 3))
+    assert enu(vectors) == pytest.approx(vectors @ a.T)
+
+
+def test_mcap(flight: Path, messages: dict[tuple[str, bool], list[Any]], tmp_path: Path) -> None:
+    path = exported(flight, "mcap", tmp_path / "flight.mcap", "--vehicle-time")
+    found: dict[str, list[tuple[int, Any]]] = {}
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        for schema, channel, message in reader.iter_messages():
+            if channel.message_encoding == "json":
+                value = json.loads(message.data)
+            else:
+                assert schema is not None
+                assert schema.name.startswith("foxglove.")
+                value = DecoderFactory().decoder_for("protobuf", schema)(message.data)
+            found.setdefault(channel.topic, []).append((message.log_time, value))
+    positions = messages["LOCAL_POSITION_NED", False]
+    attitudes = {m.time_boot_ms: m for m in messages["ATTITUDE_QUATERNION", False]}
+    assert len(found["/pose"]) == len(positions) > 500
+    for (stamp_ns, pose), sent in list(zip(found["/pose"], positions, strict=True))[::50]:
+        assert stamp_ns == sent.time_boot_ms * 1_000_000
+        assert pose.timestamp.ToNanoseconds() == stamp_ns
+        assert pose.frame_id == "map"
+        place = pose.pose.position
+        assert (place.x, place.y, place.z) == pytest.approx((sent.y, sent.x, -sent.z))
+        attitude = attitudes.get(sent.time_boot_ms)
+        if attitude is not None:  # course clockwise from north -> yaw anticlockwise from east
+            turned = pose.pose.orientation
+            ned = Rotation.from_quat([attitude.q2, attitude.q3, attitude.q4, attitude.q1])
+            flu = Rotation.from_quat([turned.x, turned.y, turned.z, turned.w])
+            course, yaw = ned.as_euler("ZYX")[0], flu.as_euler("ZYX")[0]
+            assert math.remainder(math.pi / 2 - course - yaw, math.tau) == pytest.approx(
+                0, abs=1e-6
+            )
+            assert flu.as_euler("ZYX")[2] == pytest.approx(ned.as_euler("ZYX")[2], abs=1e-6)
+    assert len(found["/tf"]) == len(positions)
+    (path_update,) = found["/path/flown"]
+    points = path_update[1].entities[0].lines[0].points
+    assert max(point.z for point in points) == pytest.approx(max(-m.z for m in positions), abs=1e-5)
+    assert max(max(abs(p.x), abs(p.y)) for p in points) < 0.5
+    texts = [value.message for _, value in found["/log"]]
+    assert any(text.startswith("takeoff: armed") for text in texts)
+    decisions = [m for m in messages["DEBUG_FLOAT_ARRAY", True] if m.array_id == 3]
+    assert len(found["/table/decision"]) == len(decisions) > 50
+    assert found["/table/decision"][9][1]["decision_thrust_mps2"] == pytest.approx(
+        decisions[9].data[1]
+    )
+    unix = exported(flight, "mcap", tmp_path / "unix.mcap")
+    with unix.open("rb") as file:
+        summary = make_reader(file).get_summary()
+    assert summary is not None
+    assert summary.statistics is not None
+    assert summary.statistics.message_start_time >= UNIX_EPOCH_US * 1000
+    assert summary.statistics.message_end_time < (UNIX_EPOCH_US + 60_000_000) * 1000
+
+
+def test_ulog(flight: Path, messages: dict[tuple[str, bool], list[Any]], tmp_path: Path) -> None:
+    log = ULog(str(exported(flight, "ulog", tmp_path / "flight.ulg")))
+    assert not log.file_corruption
+    assert log.msg_info_dict["sys_name"] == "PX4"
+    topics = {each.name: each.data for each in log.data_list}
+    positions = messages["LOCAL_POSITION_NED", False]
+    assert topics["vehicle_local_position"]["timestamp"].tolist() == [
+        m.time_boot_ms * 1000 for m in positions
+    ]
+    assert topics["vehicle_local_position"]["z"] == pytest.approx([m.z for m in positions])
+    assert topics["vehicle_local_position"]["vy"] == pytest.approx([m.vy for m in positions])
+    attitudes = messages["ATTITUDE_QUATERNION", False]
+    assert topics["vehicle_attitude"]["q[0]"] == pytest.approx([m.q1 for m in attitudes])
+    assert topics["vehicle_angular_velocity"]["xyz[2]"] == pytest.approx(
+        [m.yawspeed for m in attitudes]
+    )
+    setpoints = messages["SET_ATTITUDE_TARGET", True]
+    sent = topics["vehicle_attitude_setpoint"]
+    assert sent["timestamp"].tolist() == [m.time_boot_ms * 1000 for m in setpoints]
+    assert sent["thrust_body[2]"] == pytest.approx([-m.thrust for m in setpoints])
+    assert sent["q_d[3]"] == pytest.approx([m.q[3] for m in setpoints])
+    references = messages["POSITION_TARGET_LOCAL_NED", True]
+    assert topics["trajectory_setpoint"]["position[2]"] == pytest.approx([m.z for m in references])
+    armed = topics["actuator_armed"]["armed"]
+    assert set(armed.tolist()) == {0, 1}
+    assert len(topics["offboard_decision"]["gap"]) > 50
+    texts = [each.message for each in log.logged_messages]
+    assert any("takeoff: armed" in text for text in texts)
+
+
+@pytest.mark.parametrize("kind", ["csv", "parquet"])
+def test_tables(
+    kind: str, flight: Path, messages: dict[tuple[str, bool], list[Any]], tmp_path: Path
+) -> None:
+    path = exported(flight, kind, tmp_path / f"flight.{kind}")
+    if kind == "csv":
+        with path.open(newline="", encoding="utf-8") as file:
+            rows = [
+                {name: value or None for name, value in row.items()} for row in csv.DictReader(file)
+            ]
+    else:
+        rows = parquet.read_table(path).to_pylist()
+    times = [float(row["vehicle_time_s"]) for row in rows]
+    assert times == sorted(times)
+    positions = messages["LOCAL_POSITION_NED", False]
+    found = [row for row in rows if row["source"] == "position"]
+    assert len(found) == len(positions)
+    for row, sent in list(zip(found, positions, strict=True))[::100]:
+        assert float(row["vehicle_time_s"]) == sent.time_boot_ms / 1e3
+        assert float(row["unix_time_s"]) == pytest.approx(sent._timestamp, abs=1e-3)
+        assert float(row["position_down_m"]) == pytest.approx(sent.z)
+        assert float(row["velocity_north_mps"]) == pytest.approx(sent.vx)
+        assert row["setpoint_thrust"] is None
+    thrusts = [float(row["setpoint_thrust"]) for row in rows if row["source"] == "setpoint"]
+    assert thrusts == pytest.approx([m.thrust for m in messages["SET_ATTITUDE_TARGET", True]])
+    assert any("takeoff: armed" in row["event"] for row in rows if row["source"] == "event")
+    units = ("_m", "_s", "_mps", "_mps2", "_rad", "_radps", "thrust", "_w", "_x", "_y", "_z")
+    measured = [
+        n for n in rows[0] if n.startswith(("position", "velo", "att", "rate", "set", "ref"))
+    ]
+    assert len(measured) > 20
+    assert all(name.endswith(units) for name in measured)
+
+
+def test_a_log_of_another_program(tmp_path: Path) -> None:
+    """PX4's telemetry recorded without us: what it holds is exported."""
+    log = ULog(str(exported(REAL, "ulog", tmp_path / "real.ulg")))
+    names = {each.name for each in log.data_list}
+    assert {"vehicle_local_position", "vehicle_attitude", "actuator_armed"} <= names
+    assert "offboard_decision" not in names
+    stamps = next(each for each in log.data_list if each.name == "vehicle_attitude").data[
+        "timestamp"
+    ]
+    assert (np.diff(stamps.astype(np.int64)) >= 0).all()
+
+
+def test_refusals(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = tmp_path / "taken.csv"
+    taken.write_text("mine")
+    assert "exists already" in str(run(flight, "csv", taken).exception)
+    assert taken.read_text() == "mine"
+    nowhere = tmp_path / "none" / "flight.csv"
+    assert "cannot be written: No such file" in str(run(flight, "csv", nowhere).exception)
+    assert "--to mcap" in str(run(flight, "csv", tmp_path / "a.csv", "--vehicle-time").exception)
+    for kind, library in (("mcap", "mcap.writer"), ("parquet", "pyarrow")):
+        monkeypatch.setitem(sys.modules, library, None)
+        reason = str(run(flight, kind, tmp_path / f"a.{kind}").exception)
+        assert "pip install 'pso-offboard[export]'" in reason
+    assert list(tmp_path.iterdir()) == [taken]

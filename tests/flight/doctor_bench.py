@@ -1,0 +1,173 @@
+"""The doctor beside a simulated vehicle, joined byte by byte in vehicle time, without a socket."""
+
+from __future__ import annotations
+
+import re
+import struct
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+from pair import HOST_EPOCH_S, LEAN, Bytes, decode
+from pydantic import TypeAdapter
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from offboard.doctor.findings import Finding, Level, Row, examine
+from offboard.doctor.listening import Listening
+from offboard.doctor.observation import Computer, Observation
+from offboard.doctor.run import planned
+from offboard.doctor.table import checks
+from offboard.flight import configuration
+from offboard.flight.link import Chunk
+from simulator import config as simulated
+from simulator.faults import Fault
+from simulator.firmware.ardupilot import ARDUPILOT
+from simulator.firmware.base import Firmware
+from simulator.firmware.px4 import PX4
+from simulator.instance import VIRTUAL_EPOCH_US, Instance
+from simulator.start import Start
+from simulator.steps import STEP_S
+from simulator.vehicle.battery import Battery
+from simulator.vehicle.conditions import Conditions
+
+BOOT_S = {PX4.name: 6.0, ARDUPILOT.name: 5.0}
+BOOT_SCALE = {PX4.name: 1.0, ARDUPILOT.name: 0.1}
+# What a vehicle has that was set up as the doctor advises
+GOOD = {
+    PX4.name: {"COM_OBL_RC_ACT": 4.0},
+    ARDUPILOT.name: {
+        "GUID_OPTIONS": 8.0, "GUID_TIMEOUT": 1.0, "FS_GCS_ENABLE": 5.0, "SYSID_MYGCS": 1.0,
+    },
+}  # fmt: skip
+UNIX_S = VIRTUAL_EPOCH_US * 1e-6 - HOST_EPOCH_S
+PARAMETER = re.compile(r"param set (\w+) (\S+)")
+PERMITTED = {"HEARTBEAT", "TIMESYNC", "PARAM_REQUEST_READ", "COMMAND_LONG"}
+COMMANDS = {401, 511, 512}  # RUN_PREARM_CHECKS, SET_MESSAGE_INTERVAL, REQUEST_MESSAGE
+GOOD_COMPUTER = Computer(
+    free_bytes=10**11, overshoot_s=0.001, not_compiled=0, decision_s=0.001, deadline_s=0.05
+)
+
+
+@dataclass
+class Bench:
+    """`before` is called with the vehicle time at each step and returns further chunks; `down` and
+    `up` see the datagrams of each direction."""
+
+    instance: Instance
+    config: configuration.FlightConfig
+    capacity_bytes_ps: float | None = None
+    before: Callable[[float], list[Chunk]] = lambda time_s: []
+    down: Callable[[Bytes], Bytes] = lambda datagrams: datagrams
+    up: Callable[[Bytes], Bytes] = lambda frames: frames
+    has_vehicle: bool = True
+    sent: list[Any] = field(default_factory=list)
+
+    @property
+    def now_s(self) -> float:
+        return HOST_EPOCH_S + self.instance.time_s
+
+    def step(self) -> list[Chunk]:
+        datagrams = self.down(self.instance.step())
+        heard = [Chunk(datagram, ("127.0.0.1", 14580), self.now_s) for datagram in datagrams]
+        return (heard if self.has_vehicle else []) + self.before(self.instance.time_s)
+
+    def listen(self) -> Observation:
+        listening = Listening(self.now_s, capacity_bytes_ps=self.capacity_bytes_ps)
+        while not listening.complete(self.now_s):
+            for chunk in self.step():
+                listening.take(chunk, UNIX_S)
+            if self.instance.steps % 5 == 0:
+                for frame in self.up(listening.due(self.now_s)):
+                    self.sent.append(decode(frame))
+                    self.instance.feed(frame)
+        return planned(listening.observation(self.now_s), self.config)
+
+    def consult(self, *names: str) -> dict[str, Row]:
+        """The rows of a check now, by name."""
+        seen = replace(self.listen(), connection="udpin:127.0.0.1:14540", computer=GOOD_COMPUTER)
+        assert_read_only(self.sent)
+        return {row.check: row for row in examine(checks(names), seen)}
+
+    def follow(self, row: Row) -> None:
+        """Do what the hints of a row say: set the parameters that they name."""
+        lines = [line for finding in row.findings for line in PARAMETER.findall(finding.hint)]
+        assert lines, row
+        for name, value in lines:
+            self.set_parameter(name, float(value))
+
+    def set_parameter(self, name: str, value: float) -> None:
+        """PARAM_SET, as a ground station sends it."""
+        table = self.instance.autopilot.parameters
+        _, kind = table.to_wire(name)
+        bytewise = self.instance.autopilot.firmware.link.parameters_bytewise and kind != 9
+        wire = struct.unpack("<f", struct.pack("<i", int(value)))[0] if bytewise else value
+        codec = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+        message = mavlink.MAVLink_param_set_message(1, 1, name.encode(), wire, kind)
+        changes = table.changes
+        self.instance.feed_ground(message.pack(codec))
+        assert table.changes == changes + 1
+
+
+def assert_read_only(sent: Sequence[Any]) -> None:
+    """Nothing but what the command's help promises."""
+    assert {message.get_type() for message in sent} <= PERMITTED
+    commands = {message.command for message in sent if message.get_type() == "COMMAND_LONG"}
+    assert commands <= COMMANDS
+
+
+def bench(
+    firmware: Firmware = LEAN,
+    faults: Sequence[dict[str, Any]] = (),
+    start: Start | None = None,
+    charge: float = 1.0,
+    choices: dict[str, str] | None = None,
+    assignments: Sequence[str] = (),
+    parameters: dict[str, float] | None = None,
+    **options: Any,
+) -> Bench:
+    """A vehicle that has booted and that nothing is wrong with, but for what is given. Times of
+    `faults` count from the boot, see BOOT_S."""
+    conditions = Conditions(boot_scale=BOOT_SCALE[firmware.name], battery=Battery(remaining=charge))
+    instance = Instance(
+        firmware,
+        simulated.vehicle(firmware.vehicle),
+        conditions,
+        seed=7,
+        ground_link=False,
+        parameters=GOOD[firmware.name] | (parameters or {}),
+        faults=TypeAdapter(list[Fault]).validate_python(list(faults)),
+        start=start,
+    )
+    config = configuration.load("flight", choices=choices or {}, assignments=assignments)
+    made = Bench(instance, config, **options)
+    while instance.time_s < BOOT_S[firmware.name]:
+        made.step()
+    return made
+
+
+def said(rows: dict[str, Row]) -> dict[str, tuple[Finding, ...]]:
+    """The findings that are not ok, by check."""
+    return {
+        name: tuple(finding for finding in row.findings if finding.level is not Level.OK)
+        for name, row in rows.items()
+        if row.level is not Level.OK
+    }
+
+
+ELSEWHERE = ("127.0.0.1", 14999)
+
+
+def from_others(
+    message: Any, system: int, component: int, rate_hz: float = 10.0, place: Hashable = ELSEWHERE
+) -> Callable[[float], list[Chunk]]:
+    """For `Bench.before`: another sender on the link."""
+    codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+    every = round(1.0 / (rate_hz * STEP_S))
+
+    def before(time_s: float) -> list[Chunk]:
+        if round(time_s / STEP_S) % every:
+            return []
+        data = message.pack(codec) if not isinstance(message, bytes) else message
+        return [Chunk(data, place, HOST_EPOCH_S + time_s)]
+
+    return before

@@ -1,0 +1,266 @@
+"""The service and a simulated vehicle joined in memory: `Pair` with `Flights` as its companion."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from pair import HOST_EPOCH_S, LEAN, LOITER, SHORT, HostClock, Pair, decode, frames_of
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from offboard.flight import configuration as config
+from offboard.flight import request
+from offboard.flight.phases import Phase
+from offboard.flight.programme import Anchor, Then, service
+from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
+from offboard.identification.learned import Learned
+from offboard.mavlink.session import Session, SessionSettings
+from offboard.service.flights import Flights, Prepared
+from simulator import config as simulated
+from simulator.firmware.ardupilot import ARDUPILOT
+from simulator.firmware.base import Firmware
+from simulator.instance import Instance
+
+ARM, TAKEOFF, SET_MODE, LAND = 400, 22, 176, 21  # MAV_CMD
+START, PAUSE_CONTINUE = 300, 193
+NAN = float("nan")
+MODES = {  # parameters of MAV_CMD_DO_SET_MODE
+    "px4": {"engage": (1, 6, 0), "pilot": (1, 4, LOITER), "land": (1, 4, 6)},
+    "ardupilot": {"engage": (1, 4, 0), "pilot": (1, 17, 0), "land": (1, 9, 0)},
+}
+
+
+@dataclass
+class Settings:
+    """A `Source` whose configuration a test may replace."""
+
+    prepared: Prepared
+    sentences: list[str] = field(default_factory=list)
+
+    def newest(self) -> Prepared:
+        return self.prepared
+
+    def news(self) -> list[str]:
+        told, self.sentences = self.sentences, []
+        return told
+
+
+@dataclass
+class Logs:
+    """A `Record` that notes when each flight began and ended."""
+
+    clock: HostClock
+    begun: list[float] = field(default_factory=list)
+    ended: list[float] = field(default_factory=list)
+
+    def begin(self, session: Session, configuration: str) -> str:
+        self.begun.append(self.clock.now_s - HOST_EPOCH_S)
+        return f"flight-{len(self.begun)}"
+
+    def end(self) -> None:
+        self.ended.append(self.clock.now_s - HOST_EPOCH_S)
+
+
+@dataclass
+class Remembered:
+    """A `Memory` without files."""
+
+    known: dict[str, Learned] = field(default_factory=dict)
+    discarded: list[str] = field(default_factory=list)
+
+    def get(self, key: str, prepared: Prepared) -> Learned | None:
+        return self.known.get(key)
+
+    def keep(self, key: str, prepared: Prepared, learned: Learned) -> None:
+        self.known[key] = learned
+
+    def discard(self, key: str) -> None:
+        self.known.pop(key, None)
+        self.discarded.append(key)
+
+
+def prepared(*assignments: str, **choices: str) -> Prepared:
+    resolved = config.load("flight", choices=choices, assignments=assignments, seed=7)
+    return Prepared(request.build_parts(resolved), config.dump(resolved))
+
+
+def flights(source: Settings, logs: Logs, memory: Remembered, then: Then, anchor: Anchor,
+            arms: bool) -> Flights:  # fmt: skip
+    settings = SessionSettings(component_id=COMPONENT_ID, record_component_id=RECORD_COMPONENT_ID)
+    return Flights(
+        session=Session(settings),
+        source=source,
+        record=logs,
+        memory=memory,
+        programme=service(then, anchor, arms=arms),
+        stopwatch=lambda: 0.0,
+        keeps_deadline=False,
+    )
+
+
+@dataclass
+class Serving(Pair):
+    """A pair whose companion is a service. The pilot commands on a link of his own."""
+
+    firmware: str = "px4"
+    source: Any = None
+    logs: Any = None
+    memory: Any = None
+    again: Callable[[], Flights] | None = None
+
+    @property
+    def state(self) -> Any:
+        return self.service.state
+
+    @property
+    def service(self) -> Flights:
+        return self.companion  # type: ignore[return-value]
+
+    def until(self, done: Callable[[], bool], longest_s: float = 60.0) -> None:
+        """Advance until `done`."""
+        end_s = self.time_s + longest_s
+        while not done():
+            assert self.time_s < end_s, (
+                f"{self.service.phase} {self.mode}: {self.service.announced}"
+            )
+            self.advance()
+
+    def run(self, seconds: float) -> None:
+        end_s = self.time_s + seconds
+        while self.time_s < end_s:
+            self.advance()
+
+    @property
+    def phase(self) -> Phase:
+        return self.service.phase
+
+    @property
+    def mode(self) -> str:
+        return str(self.instance.autopilot.commander.mode.name)
+
+    @property
+    def place(self) -> np.ndarray:
+        return np.array(self.instance.autopilot.state.truth.position_ned_m)
+
+    def switch(self, to: str) -> None:
+        self.ground(SET_MODE, *MODES[self.firmware][to])
+
+    def fly_up(self, height_m: float = 5.0) -> None:
+        """The pilot takes off and holds; the service waits."""
+        self.until(lambda: self.phase is Phase.STANDBY)
+        commander = self.instance.autopilot.commander
+        if self.firmware == "px4":
+            self.until(lambda: self.try_arm(commander), 30.0)
+            self.instance.autopilot.parameters.set("MIS_TAKEOFF_ALT", height_m)
+            self.ground(TAKEOFF, *(NAN,) * 7)
+        else:
+            self.switch("engage")
+            self.until(lambda: self.try_arm(commander), 30.0)
+            self.ground(TAKEOFF, 0, 0, 0, 0, 0, 0, height_m)
+        self.until(lambda: -self.place[2] > 0.9 * height_m, 40.0)
+        self.run(2.0)
+        self.switch("pilot")
+        self.run(4.0)
+
+    def try_arm(self, commander: Any) -> bool:
+        if self.steps % 250 == 0:
+            self.ground(ARM, 1)
+        return bool(commander.armed)
+
+    def command(self, number: int, *params: float, system: int = 255) -> None:
+        """A command to our component, which the vehicle forwards on our link."""
+        codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=190)
+        filled = (*params, *(0.0,) * (7 - len(params)))
+        message = mavlink.MAVLink_command_long_message(1, 191, number, 0, *filled)
+        self.forwarded.append(message.pack(codec))
+
+    forwarded: list[bytes] = field(default_factory=list)
+    lost_down: bool = False
+    lost_up: bool = False
+    heard_mode_s: float = 0.0  # when a report of the mode arrived last
+
+    def deliver(self, time_s: float, datagrams: list[bytes]) -> list[bytes]:
+        """The way down: with what others send to us, unless it is lost."""
+        extra, self.forwarded = self.forwarded, []
+        if self.lost_down:
+            return []
+        for frame in (frame for datagram in datagrams for frame in frames_of(datagram)):
+            if int.from_bytes(frame[7:10], "little") in (0, 436):
+                self.heard_mode_s = time_s
+        return datagrams + extra
+
+    def send_up(self, _: float, frames: list[bytes]) -> list[bytes]:
+        return [] if self.lost_up else frames
+
+    def other_setpoint(self) -> None:
+        """A setpoint that another program sends, as a router shows it to us."""
+        codec = mavlink.MAVLink(None, srcSystem=42, srcComponent=190)
+        message = mavlink.MAVLink_set_attitude_target_message(
+            0, 1, 1, 7, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, 0.5
+        )
+        self.forwarded.append(message.pack(codec))
+
+    def restart(self) -> None:
+        """Restart the process of the service."""
+        self.companion = self.again()  # type: ignore[misc,assignment]
+
+    @property
+    def acks(self) -> list[tuple[int, int]]:
+        """Command and result of each acknowledgement that left."""
+        decoded = (decode(frame) for _, _, frame in self.sent if frame[7] == 77)
+        return [(message.command, message.result) for message in decoded]
+
+    def after(self, time_s: float, *names: str) -> list[str]:
+        """Messages of these kinds that left after `time_s`, except requests for telemetry."""
+        decoded = ((at, decode(frame)) for at, _, frame in self.sent if at > time_s)
+        return [
+            f"{at:.2f} {m.get_type()} {getattr(m, 'command', '')}"
+            for at, m in decoded
+            if m.get_type() in names and getattr(m, "command", 0) not in (511, 512)
+        ]
+
+    def said(self, words: str) -> bool:
+        return any(words in sentence for sentence in self.service.announced)
+
+
+def serve(
+    *assignments: str,
+    on: str = "px4",
+    reference: str = "hover",
+    then: Then = "hold",
+    anchor: Anchor = "here",
+    arms: bool = False,
+    scenario: str = "calm",
+    seed: int = 7,
+    memory: Remembered | None = None,
+    firmware: Firmware | None = None,
+    **options: Any,
+) -> Serving:
+    """A service with a vehicle that stands on the ground, and boots."""
+    vehicle = "px4_sih" if on == "px4" else "arducopter"
+    clock = HostClock()
+    short = SHORT if reference == "hover" else ()
+    source = Settings(prepared(*short, *assignments, reference=reference, vehicle=vehicle))
+    logs, memory = Logs(clock), memory or Remembered()
+
+    def again() -> Flights:
+        return flights(source, logs, memory, then, anchor, arms)
+
+    flown = simulated.scenario(scenario)
+    firmware = firmware or (LEAN if on == "px4" else ARDUPILOT)
+    instance = Instance(
+        firmware,
+        simulated.vehicle(firmware.vehicle),
+        flown.conditions.model_copy(update={"boot_scale": 1.0 if on == "px4" else 0.1}),
+        seed,
+        faults=flown.faults,
+        start=flown.start,
+    )
+    if on == "ardupilot":
+        instance.autopilot.parameters.set("GUID_OPTIONS", 8.0)
+    pair = Serving(again(), instance, clock, firmware=on, source=source, logs=logs,
+                   memory=memory, again=again, **options)  # fmt: skip
+    pair.down, pair.up = pair.deliver, pair.send_up
+    return pair

@@ -1,0 +1,232 @@
+"""`offboard doctor` finds what is wrong with a link, and says so of the right cause."""
+
+from __future__ import annotations
+
+import random
+from typing import Any
+
+import pytest
+from doctor_bench import Bench, bench, from_others, said
+from pair import Bytes
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from offboard.doctor.findings import Level
+from offboard.doctor.listening import LONGEST_S, NOTHING_S
+from simulator.firmware.px4 import PX4
+
+OK, WARN, WAIT, BLOCKS = Level.OK, Level.WARN, Level.WAIT, Level.BLOCKS
+GCS_HEARTBEAT = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
+AUTOPILOT_HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 12, 81, 0, 3, 3)
+SETPOINT = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, (1, 0, 0, 0), 0, 0, 0, 0.5)
+
+
+def link(**fault: Any) -> list[dict[str, Any]]:
+    """A fault of both directions, after the vehicle has booted."""
+    return [{"fault": "link", "at_s": 5.9} | fault]
+
+
+def levels(patient: Bench) -> dict[str, Level]:
+    """Levels of the rows that are not ok."""
+    return {name: findings[0].level for name, findings in said(patient.consult()).items()}
+
+
+def mended(patient: Bench, **changes: Any) -> bool:
+    """Whether nothing is said once the cause is taken away."""
+    for name, value in changes.items():
+        setattr(patient, name, value)
+    return levels(patient) == {}
+
+
+def quiet(_: float) -> list[Any]:
+    return []
+
+
+def test_nothing_is_heard() -> None:
+    patient = bench(has_vehicle=False)
+    began_s = patient.instance.time_s
+    rows = patient.consult()
+    assert patient.instance.time_s - began_s == pytest.approx(NOTHING_S, abs=0.1)
+    assert said(rows).keys() == {"vehicle"}
+    assert rows["vehicle"].findings[0].found == "nothing is heard in 6 s"
+    assert "--connect udpin:0.0.0.0" in rows["vehicle"].findings[0].hint
+    assert patient.sent == []
+    assert mended(patient, has_vehicle=True)
+
+
+@pytest.mark.parametrize(
+    ("before", "found"),
+    [
+        (from_others(random.Random(1).randbytes(300), 0, 0, 20.0), "bytes are heard that are not"),
+        (from_others(GCS_HEARTBEAT, 255, 190, 1.0), "but no autopilot: ground station 255/190"),
+        (from_others(mavlink.MAVLink_heartbeat_message(2, 4, 0, 0, 3, 3), 1, 1, 1.0),
+         "the autopilot is neither PX4 nor ArduCopter"),
+    ],
+    ids=["noise", "ground station only", "unknown autopilot"],
+)  # fmt: skip
+def test_what_is_heard_is_no_vehicle(before: Any, found: str) -> None:
+    patient = bench(has_vehicle=False, before=before)
+    rows = patient.consult()
+    assert rows["vehicle"].level is BLOCKS
+    assert found in rows["vehicle"].findings[0].found
+    assert mended(patient, has_vehicle=True, before=quiet)
+
+
+def test_second_vehicle_on_the_link() -> None:
+    patient = bench(before=from_others(AUTOPILOT_HEARTBEAT, 2, 1, 1.0))
+    rows = patient.consult()
+    assert said(rows).keys() == {"senders"}
+    assert "another vehicle is heard: autopilot 2/1, from 127.0.0.1:14999" in (
+        rows["senders"].findings[0].found
+    )
+    assert mended(patient, before=quiet)
+
+
+def test_two_vehicles_with_the_same_ids() -> None:
+    patient = bench(before=from_others(AUTOPILOT_HEARTBEAT, 1, 1, 1.0))
+    row = patient.consult("senders")["senders"]
+    assert row.level is WARN
+    assert "two programs send as vehicle 1/1: 127.0.0.1:14580, 127.0.0.1:14999" in (
+        row.findings[0].found
+    )
+    assert mended(patient, before=quiet)
+
+
+@pytest.mark.parametrize(
+    ("system", "component", "name"),
+    [(1, 194, "component 1/194"), (1, 191, "component 1/191")],
+    ids=["other ids", "our ids"],
+)
+def test_another_controller_blocks(system: int, component: int, name: str) -> None:
+    before = from_others(SETPOINT, system, component, place=("127.0.0.1", 14580))
+    patient = bench(before=before)
+    row = patient.consult("senders")["senders"]
+    assert row.level is BLOCKS
+    assert name in row.findings[0].found
+    assert mended(patient, before=quiet)
+
+
+def test_ground_station_beside_the_vehicle_is_no_finding() -> None:
+    patient = bench(before=from_others(GCS_HEARTBEAT, 255, 190, 1.0))
+    row = patient.consult("senders")["senders"]
+    assert row.level is OK
+    assert row.findings[0].found == "besides the vehicle: ground station 255/190"
+
+
+def test_second_time_master() -> None:
+    time = mavlink.MAVLink_timesync_message(0, 12345)
+    patient = bench(before=from_others(time, 255, 190, 2.0))
+    row = patient.consult("clock")["clock"]
+    assert row.level is WARN
+    assert "another time master: component 255/190" in row.findings[0].found
+    assert mended(patient, before=quiet)
+
+
+@pytest.mark.parametrize("firmware", ["px4"])
+def test_late_link_blocks_and_its_delay_is_measured(firmware: str) -> None:
+    patient = bench(faults=link(latency_s=0.3))
+    rows = patient.consult("delay", "rates")
+    assert rows["delay"].level is BLOCKS
+    delay = patient.listen().link.delay
+    assert delay is not None
+    assert delay.value == pytest.approx(0.6, abs=0.03)  # both directions
+    assert rows["rates"].level is OK
+
+
+def test_delay_that_lowers_the_bandwidth() -> None:
+    patient = bench(faults=link(latency_s=0.12))
+    row = patient.consult("configuration")["configuration"]
+    assert row.level is WARN
+    possible = row.findings[0].hint.rpartition("=")[2]
+    assert 1.0 <= float(possible) < 7.0
+    again = bench(
+        faults=link(latency_s=0.12), assignments=[f"controller.bandwidth_radps={possible}"]
+    )
+    assert again.consult("configuration")["configuration"].level is OK
+
+
+def test_jitter_blocks() -> None:
+    patient = bench(faults=link(jitter_s=0.8, direction="up"))
+    assert patient.consult("delay")["delay"].level is BLOCKS
+
+
+def test_loss_is_counted() -> None:
+    patient = bench(PX4, faults=link(loss=0.2, direction="down", for_s=9.0))
+    row = patient.consult("loss")["loss"]
+    assert row.level is WARN
+    share = float(row.findings[0].found.partition("%")[0])
+    assert share == pytest.approx(20.0, abs=3.0)
+    while patient.instance.time_s < 16.0:
+        patient.step()
+    assert patient.consult("loss")["loss"].level is OK
+
+
+def test_damaged_bytes_are_counted() -> None:
+    patient = bench(faults=link(corruption=0.2, direction="down"))
+    assert patient.consult("loss")["loss"].level is WARN
+
+
+def test_rates_that_are_too_low_block() -> None:
+    patient = bench(faults=link(message_rate_hz=5.0, direction="down", for_s=20.0))
+    began_s = patient.instance.time_s
+    row = patient.consult("rates")["rates"]
+    assert row.level is BLOCKS
+    assert "at least 10 Hz are needed" in row.findings[0].found
+    assert patient.instance.time_s - began_s < LONGEST_S + 1.1  # 15 s with the rest
+    while patient.instance.time_s < 28.0:
+        patient.step()
+    assert patient.consult("rates")["rates"].level is OK
+
+
+def test_slower_than_requested_is_a_warning() -> None:
+    patient = bench(faults=link(message_rate_hz=30.0, direction="down"))
+    row = patient.consult("rates")["rates"]
+    assert row.level is WARN
+    assert "LOCAL_POSITION_NED 29.5 of 100 Hz" in row.findings[0].found
+
+
+def test_line_that_is_too_slow_for_the_telemetry() -> None:
+    """What it asks for is thinned to fit; 38400 baud do not carry the least of it."""
+    patient = bench(capacity_bytes_ps=3840.0)
+    row = patient.consult("bandwidth")["bandwidth"]
+    assert row.level is WARN
+    baud = int(row.findings[0].hint.split()[-2])
+    assert baud == 115_200
+    patient.capacity_bytes_ps = baud / 10.0
+    assert patient.consult("bandwidth")["bandwidth"].level is OK
+
+
+def test_clock_that_jumps_and_vehicle_that_restarts() -> None:
+    jump = bench(faults=[{"fault": "clock_jump", "at_s": 9.0, "jump_s": 30.0}])
+    row = jump.consult("clock")["clock"]
+    assert row.level is BLOCKS
+    assert row.findings[0].found == "the vehicle's clock jumped by 30.0 s"
+    assert mended(jump)
+    restarted = bench(faults=[{"fault": "reboot", "at_s": 7.0, "for_s": 0.5}])
+    row = restarted.consult("clock")["clock"]
+    assert row.level is BLOCKS
+    assert "restarted" in row.findings[0].found
+
+
+def test_what_we_send_does_not_arrive() -> None:
+    def nothing(_: Bytes) -> Bytes:
+        return []
+
+    patient = bench(up=nothing)
+    rows = patient.consult()
+    assert rows["uplink"].level is BLOCKS
+    assert rows["delay"].level is WAIT
+    assert rows["parameters"].level is OK  # PX4 has none that must be answered
+    assert mended(patient, up=lambda frames: frames)
+
+
+def test_flood_of_addresses_and_ids_is_bounded() -> None:
+    generator = random.Random(3)
+
+    def before(time_s: float) -> list[Any]:
+        ids, port = generator.sample(range(1, 255), 2), generator.randrange(9999)
+        return from_others(GCS_HEARTBEAT, *ids, 250.0, ("10.0.0.1", port))(time_s)
+
+    patient = bench(before=before)
+    seen = patient.listen()
+    assert len(seen.senders) == 64
+    assert seen.vehicle.found is not None

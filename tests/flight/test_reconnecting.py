@@ -1,0 +1,238 @@
+"""Links that break and come back, on real sockets and pseudo-terminals; addresses of IPv6."""
+
+from __future__ import annotations
+
+import os
+import pty
+import socket
+import time
+import tty
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import pytest
+
+from offboard.flight.connection import open_link
+from offboard.flight.link import Link, LinkError
+from offboard.flight.stream_link import BROKEN, RENEWED
+from offboard.flight.udp_link import UdpLink
+
+LONG_S = 10.0
+TURN_S = 0.3  # for one turn of the loop, whatever the link does
+IPV6 = socket.has_ipv6 and Path("/proc/net/if_inet6").exists()
+
+
+@pytest.fixture
+def keep() -> Iterator[Callable[[Link], Link]]:
+    """Closes links after the test."""
+    kept: list[Link] = []
+
+    def one(link: Link) -> Link:
+        kept.append(link)
+        return link
+
+    yield one
+    for link in kept:
+        link.close()
+
+
+@contextmanager
+def listening(port: int = 0) -> Iterator[socket.socket]:
+    with socket.socket() as server:
+        server.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        server.bind(("127.0.0.1", port))
+        server.listen()
+        server.settimeout(LONG_S)
+        yield server
+
+
+def turns(link: Link, until: Callable[[bytes], object]) -> bytes:
+    """Turns of the loop until `until` holds for all that was received; none of them may wait."""
+    received, deadline_s = b"", time.monotonic() + LONG_S
+    while not until(received):
+        began_s = time.monotonic()
+        assert began_s < deadline_s, received
+        received += b"".join(chunk.data for chunk in link.receive(0.02))
+        link.send(b"\xfd\0\0\0\0\0\0\0\0\0\0\0", None)
+        assert time.monotonic() - began_s < TURN_S
+    return received
+
+
+def run(link: Link, seconds: float) -> None:
+    end_s = time.monotonic() + seconds
+    turns(link, lambda _: time.monotonic() > end_s)
+
+
+def broke(link: Link) -> bool:
+    """Run the link until it tells that it broke."""
+    news: list[str] = []
+
+    def told(_: bytes) -> bool:
+        news.extend(link.strangers.news())
+        return BROKEN in news
+
+    turns(link, told)
+    return True
+
+
+def test_a_tcp_peer_that_goes_and_returns_is_connected_again(
+    keep: Callable[[Link], Link],
+) -> None:
+    with listening() as server:
+        port = server.getsockname()[1]
+        link = keep(open_link(f"tcp:127.0.0.1:{port}"))
+        peer, _ = server.accept()
+        peer.sendall(b"first")
+        turns(link, lambda data: data == b"first")
+        before = link.opened
+        peer.close()
+    assert broke(link)  # nobody listens now
+    assert link.descriptors() == ()
+    run(link, 0.7)
+    with listening(port) as server:
+        server.settimeout(0.0)
+        accepted: list[socket.socket] = []
+
+        def accepts(_: bytes) -> bool:
+            try:
+                accepted.append(server.accept()[0])
+            except BlockingIOError:
+                return False
+            return True
+
+        turns(link, accepts)
+        accepted[0].sendall(b"again")
+        turns(link, lambda data: data == b"again")
+        assert link.strangers.news() == [RENEWED]
+        assert link.opened > before
+        accepted[0].settimeout(LONG_S)
+        # what was sent meanwhile was dropped, not queued
+        assert len(accepted[0].recv(65536)) < 12 * 30
+        accepted[0].close()
+
+
+def test_tcpin_takes_one_client_and_the_next_one_when_it_is_silent(
+    keep: Callable[[Link], Link],
+) -> None:
+    link = keep(open_link("tcpin:127.0.0.1:0"))
+    place = socket.socket(fileno=os.dup(link.descriptors()[0])).getsockname()
+    assert link.receive(0.01) == []
+    link.send(b"to nobody", None)
+    with socket.create_connection(place) as vehicle:
+        vehicle.sendall(b"one")
+        assert turns(link, lambda data: data == b"one")
+        link.follow("tcp")
+        with socket.create_connection(place) as other:
+            other.settimeout(LONG_S)
+
+            def busy(_: bytes) -> bool:
+                vehicle.sendall(b".")
+                return any("connection from 127.0.0.1" in each for each in link.strangers.news())
+
+            turns(link, busy)
+            assert other.recv(10) == b""  # closed
+        vehicle.settimeout(LONG_S)
+        run(link, 0.6)
+        with socket.create_connection(place) as back:  # and the first one has gone silently
+            back.sendall(b"two")
+            turns(link, lambda data: data.endswith(b"two"))
+            while vehicle.recv(65536):
+                pass
+        assert broke(link)
+
+
+def test_a_serial_device_that_is_unplugged_and_back(
+    tmp_path: Path, keep: Callable[[Link], Link]
+) -> None:
+    device = tmp_path / "ttyACM0"
+
+    def plug() -> tuple[int, int]:
+        ours, theirs = pty.openpty()
+        tty.setraw(theirs)
+        device.symlink_to(os.ttyname(theirs))
+        return ours, theirs
+
+    ours, theirs = plug()
+    link = keep(open_link(f"serial:{device}:57600"))
+    os.write(ours, b"first")
+    turns(link, lambda data: data == b"first")
+    os.close(theirs)
+    os.close(ours)
+    device.unlink()
+    assert broke(link)
+    assert link.descriptors() == ()  # else the device would come back under another name
+    ours, theirs = plug()
+    turns(link, lambda _: link.descriptors())
+    os.write(ours, b"again")
+    turns(link, lambda data: data == b"again")
+    os.close(theirs)
+    os.close(ours)
+
+
+@pytest.mark.parametrize("kind", ["tcp", "serial"])
+def test_what_is_not_there_yet_is_awaited_on_request(
+    kind: str, tmp_path: Path, keep: Callable[[Link], Link]
+) -> None:
+    with listening() as server:
+        port = server.getsockname()[1]
+    address = f"tcp:127.0.0.1:{port}" if kind == "tcp" else f"serial:{tmp_path / 'tty'}:57600"
+    with pytest.raises(LinkError):
+        open_link(address)
+    link = keep(open_link(address, waits=True))
+    run(link, 0.2)
+    if kind == "tcp":
+        with listening(port) as server:
+            turns(link, lambda _: link.descriptors())
+    else:
+        ours, theirs = pty.openpty()
+        (tmp_path / "tty").symlink_to(os.ttyname(theirs))
+        turns(link, lambda _: link.descriptors())
+        os.close(ours)
+        os.close(theirs)
+    assert RENEWED not in link.strangers.news()  # it is the first
+
+
+@pytest.mark.skipif(not IPV6, reason="this computer has no IPv6")
+@pytest.mark.parametrize("kind", ["udpin", "udpout", "tcp", "tcpin"])
+def test_ipv6_addresses(kind: str, keep: Callable[[Link], Link]) -> None:
+    stream = kind.startswith("tcp")
+    with socket.socket(
+        socket.AF_INET6, socket.SOCK_STREAM if stream else socket.SOCK_DGRAM
+    ) as other:
+        other.settimeout(LONG_S)
+        port = 0
+        if kind in ("udpout", "tcp"):
+            other.bind(("::1", 0))
+            port = other.getsockname()[1]
+        if kind == "tcp":
+            other.listen()
+        link = keep(open_link(f"{kind}:[::1]:{port}"))
+        if kind.endswith("in"):
+            with socket.socket(fileno=os.dup(link.descriptors()[0])) as ours:
+                other.connect(ours.getsockname())
+            other.send(b"hello")
+            turns(link, lambda data: data == b"hello")
+        if kind == "udpin":
+            peer = other.getsockname()
+            link.follow(peer)
+            link.send(b"answer", peer)
+            assert other.recv(100) == b"answer" or other.recv(100) == b"answer"
+            stranger = socket.socket(socket.AF_INET6, socket.SOCK_DGRAM)
+            with stranger:
+                assert isinstance(link, UdpLink)
+                stranger.sendto(b"x", ("::1", link.port))
+                turns(link, lambda _: link.strangers.total)
+            assert "1 datagram from [::1]:" in link.strangers.news()[0]
+            return
+        connection = other.accept()[0] if kind == "tcp" else other
+        connection.settimeout(LONG_S)
+        link.send(b"answer", None)
+        assert b"answer" in connection.recv(65536)
+        if kind == "tcp":
+            connection.close()
+
+
+def test_an_ipv6_address_without_brackets_is_refused() -> None:
+    with pytest.raises(LinkError, match=r"stands in brackets, as in udpin:\[::1\]:14540"):
+        open_link("udpin:::1:14540")

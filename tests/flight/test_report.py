@@ -1,0 +1,261 @@
+"""Reports of flights: pages opened in Chromium without a network, and the values that they show."""
+
+from __future__ import annotations
+
+import lzma
+import math
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from browser import Opened, opening
+from hypothesis import given
+from hypothesis import strategies as st
+from pair import Pair, hover
+from typer.testing import CliRunner
+
+from offboard.analysis import tlog
+from offboard.analysis.score import Score
+from offboard.cli.commands import app
+from offboard.flight.phases import Phase
+from offboard.report import page as report_page
+from offboard.report.flight import read
+from offboard.report.page import page
+from offboard.report.thinning import thinned
+from offboard.report.timeline import bands, marks
+
+RECORDINGS = Path(__file__).parents[1] / "wire" / "recordings"
+ARDUCOPTER = RECORDINGS / "arducopter-4.6.3-guided.tlog"
+PX4 = RECORDINGS / "px4-1.16.1-offboard.tlog"
+FIGURES = ["path", "timeline", "tracking", "attitude", "thrust", "decisions", "link"]
+MOST_BYTES = 8_000_000
+# [x, y] of a curve as the page draws it
+CURVE = """([figure, name]) => {
+  const trace = document.getElementById(figure)._fullData.find((each) => each.name === name);
+  return [Array.from(trace.x), Array.from(trace.y)];
+}"""
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Pair, Path, Score]:
+    """A flight that a pilot ends, its directory and score."""
+    pair = hover()
+    pair.at.append((lambda p: p.companion.phase is Phase.HOVER, Pair.pilot_takes_over))
+    pair.fly()
+    directory = tmp_path_factory.mktemp("flights") / "a <b>"
+    return pair, directory, pair.score(directory)
+
+
+@pytest.fixture(scope="module")
+def opened(flown: tuple[Pair, Path, Score]) -> Iterator[Opened]:
+    _, directory, _ = flown
+    file = directory / "report.html"
+    file.write_text(page([read(directory)]), encoding="utf-8")
+    with opening(file) as opened:
+        yield opened
+
+
+def test_the_page_is_readable_in_both_schemes_and_widths(opened: Opened) -> None:
+    for width in (400, 1280):
+        opened.resize(width)
+        for scheme in ("dark", "light"):
+            opened.switch(scheme)
+            assert opened.width_px() == width
+            assert opened.unreadable() == opened.colliding() == []
+    assert opened.problems == opened.fetched == []
+    drawn = opened.page.evaluate("[...document.querySelectorAll('.figure')].map(f => f.id)")
+    assert drawn == [*FIGURES, "identification"]
+    assert len(opened.page.content().encode()) < MOST_BYTES
+
+
+def test_the_verdict_comes_first(opened: Opened) -> None:
+    shown = opened.page.inner_text("main").splitlines()
+    assert shown[0] == "Flight a <b>"
+    assert "✗ not completed: pilot" in shown[1:4]
+
+
+def test_the_curves_are_those_of_the_score(opened: Opened, flown: tuple[Pair, Path, Score]) -> None:
+    pair, _, score = flown
+    begun = {phase: time_s for time_s, phase in pair.phases}
+    times, errors = map(np.array, opened.page.evaluate(CURVE, ["tracking", "estimated"]))
+    tracked = (times >= begun[Phase.TRACK]) & (times <= begun[Phase.HOVER])
+    assert errors[tracked].astype(float).max() == pytest.approx(score.max_position_m, rel=1e-4)
+    _, thrust = opened.page.evaluate(CURVE, ["thrust", "commanded"])
+    assert len(thrust) == len(pair.setpoints)
+    np.testing.assert_allclose(thrust, [m.thrust for _, _, m in pair.setpoints], atol=1e-6)
+
+
+def test_bands_are_the_phases_that_were_flown(flown: tuple[Pair, Path, Score]) -> None:
+    pair, directory, _ = flown
+    phases = [band for band in bands(read(directory)) if band.row == "phase"]
+    shown = [band for band in phases if band.end_s > band.begin_s or band is phases[-1]]
+    begun = {phase.value: time_s for time_s, phase in pair.phases}
+    assert [band.label for band in shown] == list(begun)
+    for band in shown:
+        assert band.begin_s == pytest.approx(begun[band.label], abs=0.02)
+    authority = [band.label for band in bands(read(directory)) if band.row == "authority"]
+    assert authority == ["not asked", "asked", "offboard", "given up"]
+    steps = [mark.text for mark in marks(read(directory)) if mark.row == "ladder"]
+    assert [text.partition(":")[0] for text in steps] == ["yielded"]
+
+
+def test_linked_figures_zoom_together(opened: Opened) -> None:
+    ranges = "[...document.querySelectorAll('.linked')].map(f => f.layout.xaxis.range.map(Number))"
+    before = opened.page.evaluate(ranges)
+    assert len({tuple(each) for each in before}) == 1
+    opened.page.evaluate("Plotly.relayout('attitude', {'xaxis.range': [3, 7]})")
+    opened.page.wait_for_function(f"{ranges}.every(([low, high]) => low === 3 && high === 7)")
+    opened.page.evaluate("Plotly.relayout('link', {'xaxis.range': [0, 30]})")
+    opened.page.wait_for_function(f"{ranges}.every(([low, high]) => low === 0 && high === 30)")
+
+
+def test_several_flights_have_their_differences_in_a_table(
+    opened: Opened, flown: tuple[Pair, Path, Score], tmp_path: Path
+) -> None:
+    _, directory, score = flown
+    file = tmp_path / "report.html"
+    file.write_text(page([read(directory), read(PX4), read(directory)]), encoding="utf-8")
+    several = Opened(opened.page.context.new_page(), file)
+    several.resize(400)
+    assert several.problems == several.fetched == several.colliding() == several.unreadable() == []
+    assert several.page.locator(".verdict").count() == 3
+    rows = several.page.locator("#scores tr").all_inner_texts()
+    (row,) = (each for each in rows if each.startswith("rmse_position_m"))
+    value = f"{score.rmse_position_m:.4g}"
+    assert row.split()[:4] == ["rmse_position_m", value, "–", value]
+    two = page([read(directory), read(directory)])
+    assert "<th>B − A</th>" in two
+
+
+def of_kinds(log: Path, without: set[int]) -> bytes:
+    """The log without the messages of some kinds, byte by byte."""
+    return b"".join(
+        entry.unix_us.to_bytes(8, "big") + bytes(entry.frame.raw)
+        for entry in tlog.read(log)
+        if entry.frame.message_id not in without
+    )
+
+
+def test_a_log_of_another_program_gives_what_it_holds(tmp_path: Path) -> None:
+    bare = tmp_path / "bare.tlog"
+    bare.write_bytes(of_kinds(PX4, {31, 32, 82, 83, 84}))  # ATTITUDE, GLOBAL_POSITION_INT
+    whole, flight = read(PX4), read(bare)
+    assert "no setpoints (SET_ATTITUDE_TARGET of offboard, ATTITUDE_TARGET)" in flight.missing
+    assert any("positions are of GLOBAL_POSITION_INT" in each for each in flight.missing)
+    assert math.isnan(flight.score.completed)
+    climbed = [-part.history.position[:, 3] for part in (whole, flight)]
+    assert [np.ptp(each) for each in climbed] == pytest.approx([5.0, 5.0], abs=1.5)
+    assert np.ptp(climbed[0]) == pytest.approx(np.ptp(climbed[1]), abs=0.3)
+    rolls = [part.history.attitude[:, 2].max() for part in (whole, flight)]
+    assert rolls[0] == pytest.approx(rolls[1], abs=0.01)
+    assert [m.what for m in flight.history.modes] == [m.what for m in whole.history.modes]
+    assert all(math.isfinite(m.time_s) for m in flight.history.modes[1:])
+    arducopter = read(ARDUCOPTER)
+    assert arducopter.facts["autopilot"] == "ardupilot"
+    assert "no ATTITUDE_QUATERNION: the attitude is that of ATTITUDE" in arducopter.missing
+    assert "no records of offboard" in page([arducopter])
+
+
+def test_a_damaged_log_is_shown_with_the_place_of_the_damage(tmp_path: Path) -> None:
+    data = bytearray(PX4.read_bytes())
+    at = len(data) // 2
+    data[at : at + 500] = bytes(500)
+    damaged = tmp_path / "damaged.tlog"
+    damaged.write_bytes(data[:-5])
+    flight = read(damaged)
+    (said,) = (each for each in flight.missing if each.startswith("damaged log"))
+    found = re.search(r"the first at byte (\d+), at ([0-9.]+) s", said)
+    assert found
+    assert at - 300 < int(found[1]) <= at
+    whole = read(PX4).history.position
+    expected_s = next(
+        e.message.time_boot_ms / 1e3
+        for e in reversed(list(tlog.read(cut(tmp_path, data[: int(found[1])]))))
+        if e.name in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
+    )
+    assert float(found[2]) == pytest.approx(expected_s, abs=0.01)
+    assert flight.history.position[-1, 0] == pytest.approx(whole[-1, 0], abs=0.1)
+    assert any(each.startswith("the log ends within an entry, at byte") for each in flight.missing)
+
+
+def cut(directory: Path, data: bytes) -> Path:
+    path = directory / "cut.tlog"
+    path.write_bytes(data)
+    return path
+
+
+@given(
+    st.lists(st.floats(-1e6, 1e6) | st.just(math.nan), min_size=1, max_size=300), st.integers(1, 40)
+)
+def test_thinning_keeps_peaks_and_gaps(values: list[float], bins: int) -> None:
+    array = np.array(values)
+    kept = thinned(array, bins)
+    assert (np.diff(kept) > 0).all()
+    assert len(kept) <= max(3 * bins + 2, len(values) * (len(values) <= 2 * bins))
+    known = array[np.isfinite(array)]
+    if len(known):
+        assert np.nanmax(array[kept]) == known.max()
+        assert np.nanmin(array[kept]) == known.min()
+    assert np.isnan(array[kept]).any() == (len(known) < len(array))
+
+
+def invoke(*arguments: object) -> tuple[int, str]:
+    answer = CliRunner().invoke(app, ["report", *map(str, arguments)])
+    return answer.exit_code, str(answer.exception or answer.output)
+
+
+def test_the_command_replaces_nothing_and_refuses_what_is_no_log(tmp_path: Path) -> None:
+    log = tmp_path / "x.tlog"
+    with lzma.open(RECORDINGS / "px4-1.16.1-ground.tlog.xz") as recording:
+        log.write_bytes(recording.read())
+    (tmp_path / "report.html").write_text("precious")
+    code, said = invoke(log)
+    assert (code, "report-2.html" in said) == (0, True), said
+    assert (tmp_path / "report.html").read_text() == "precious"
+    assert "<html" in (tmp_path / "report-2.html").read_text(encoding="utf-8")
+    assert "exists already; choose another file with -o" in invoke(log, "-o", log)[1]
+    for content in (b"", b"no log" * 100):
+        (tmp_path / "y.tlog").write_bytes(content)
+        assert "is not a .tlog, or empty" in invoke(tmp_path / "y.tlog")[1]
+    assert "does not exist" in invoke(tmp_path / "nothing")[1]
+    assert sorted(path.name for path in tmp_path.iterdir()) == [
+        "report-2.html", "report.html", "x.tlog", "y.tlog",
+    ]  # fmt: skip
+
+
+def test_colours_of_flights_differ_for_colour_blind_people() -> None:
+    """Distance in CIELAB of each pair of the first four, as seen with deuteranopia and protanopia
+    (Viénot, Brettel and Mollon 1999), in the light and in the dark scheme."""
+    from offboard.analysis.figure import DARK
+    from offboard.report.figures import COLOURS
+
+    for scheme in (COLOURS[:4], [DARK[colour] for colour in COLOURS[:4]]):
+        for blind in ("deuteranopia", "protanopia"):
+            seen = [lab(colour, blind) for colour in scheme]
+            for i, one in enumerate(seen):
+                for other in seen[:i]:
+                    assert np.linalg.norm(one - other) > 10.0, (scheme, blind)
+
+
+def lab(colour: str, blind: str) -> Any:
+    """CIELAB of a colour as a dichromat sees it."""
+    values = np.array([int(colour[i : i + 2], 16) for i in (1, 3, 5)]) / 255
+    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
+    lost = {
+        "deuteranopia": [[0.29275, 0.70725, 0], [0.29275, 0.70725, 0], [-0.02234, 0.02234, 1]],
+        "protanopia": [[0.11238, 0.88762, 0], [0.11238, 0.88762, 0], [0.00401, -0.00401, 1]],
+    }[blind]
+    to_xyz = [[0.4124, 0.3576, 0.1805], [0.2126, 0.7152, 0.0722], [0.0193, 0.1192, 0.9505]]
+    xyz = np.array(to_xyz) @ (np.array(lost) @ linear) / (0.9505, 1.0, 1.089)
+    f = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16 / 116)
+    return np.array([116 * f[1] - 16, 500 * (f[0] - f[1]), 200 * (f[1] - f[2])])
+
+
+def test_the_figures_on_the_page_are_those_of_the_score(flown: tuple[Pair, Path, Score]) -> None:
+    _, directory, score = flown
+    shown = {row.name: row.values[0] for row in report_page.rows([read(directory)])}
+    finite = {name: v for name, v in score.figures().items() if math.isfinite(v)}
+    assert shown == {name: f"{value:.4g}" for name, value in finite.items()}

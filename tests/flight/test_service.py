@@ -1,0 +1,320 @@
+"""The service in lockstep with both simulated autopilots: engaged, handed back, engaged again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pair import decode
+from service_wire import HOVER, Wire
+from serving import ARM, PAUSE_CONTINUE, SET_MODE, START, Remembered, Serving, serve
+
+from offboard.flight.phases import TRACKING, Phase
+
+BOTH = pytest.mark.parametrize("on", ["px4", "ardupilot"])
+SETPOINT, COMMAND = "SET_ATTITUDE_TARGET", "COMMAND_LONG"
+ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = range(4)  # MAV_RESULT
+
+
+def engaged(on: str, **options: object) -> tuple[Serving, Wire]:
+    """A service that the pilot has just engaged in the air."""
+    pair = serve(on=on, **options)
+    wire = Wire(pair)
+    pair.fly_up()
+    pair.switch("engage")
+    pair.until(lambda: pair.phase in TRACKING, 3.0)
+    return pair, wire
+
+
+def thrusts(pair: Serving, since_s: float) -> list[float]:
+    decoded = ((at_s, decode(frame)) for at_s, _, frame in pair.sent if at_s > since_s)
+    return [m.thrust for _, m in decoded if m.get_type() == SETPOINT]
+
+
+@BOTH
+def test_engaged_handed_back_and_engaged_again(on: str) -> None:
+    pair = serve(on=on)
+    wire = Wire(pair)
+    pair.fly_up()
+    standby = thrusts(pair, pair.time_s - 1.0)
+    if on == "px4":  # streams what the vehicle flies
+        assert len(standby) >= 9
+        assert max(abs(u / HOVER[on] - 1.0) for u in standby) < 0.05
+    else:
+        assert standby == []
+    for flight in (1, 2):
+        at_m, began_s, far_m = pair.place, pair.time_s, 0.0
+        pair.switch("engage")
+        while pair.phase is not Phase.HOVER:
+            pair.advance()
+            far_m = max(far_m, float(np.linalg.norm(pair.place - at_m)))
+            assert pair.time_s < began_s + 40.0
+        first = thrusts(pair, began_s)[:10]
+        assert max(abs(u / HOVER[on] - 1.0) for u in first) < 0.1
+        assert far_m < 0.1
+        assert (flight == 1) is any(
+            phase is Phase.EXCITE for at_s, phase in pair.phases if at_s > began_s
+        )
+        left_s = pair.time_s
+        pair.switch("pilot")
+        pair.run(2.0)
+        assert pair.phase is Phase.STANDBY
+        assert pair.after(left_s, COMMAND) == []
+    assert wire.unsafe == []
+    assert len(pair.logs.begun) == len(pair.logs.ended) == 2
+    assert pair.said("this vehicle was identified before")
+
+
+def test_a_contradicted_vehicle_is_identified_again() -> None:
+    """What was remembered is of another vehicle: its tilt responds three times as late."""
+    pair, _ = engaged("px4", reference="lemniscate")
+    pair.until(lambda: pair.phase is Phase.JOIN, 30.0)
+    (key,) = pair.memory.known
+    learned = pair.memory.known[key]
+    late = learned.vehicle.tilt.model_copy(update={"delay_s": 0.2, "natural_frequency_radps": 6.0})
+    memory = Remembered()
+    wrong = learned.vehicle.model_copy(update={"tilt": late})
+    memory.known[key] = type(learned)(wrong, learned.delay, learned.link_s)
+    again, _ = engaged("px4", reference="lemniscate", memory=memory)
+    again.run(14.0)
+    again.switch("pilot")
+    again.run(1.0)
+    assert memory.discarded == [key]
+    assert again.said("contradicted, and discarded")
+
+
+@BOTH
+def test_a_restarted_service_asks_for_hold_and_waits_for_the_pilot(on: str) -> None:
+    pair, wire = engaged(on)
+    if on == "px4":  # with its own failsafe later than ours
+        pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 5.0)
+    pair.run(2.0)
+    pair.restart()
+    wire.wrap()
+    began_s = pair.time_s
+    hold = pair.instance.autopilot.commander.mode.name
+    pair.until(lambda: pair.mode != hold, 4.0)
+    assert pair.mode == {"px4": "AUTO.LOITER", "ardupilot": "BRAKE"}[on]
+    pair.run(4.0)
+    assert pair.phase is Phase.STANDBY
+    assert pair.logs.begun[-1] > began_s or len(pair.logs.begun) == 1
+    pair.switch("engage")
+    pair.until(lambda: pair.phase in TRACKING, 3.0)
+    assert wire.unsafe == []
+
+
+@BOTH
+def test_engaging_a_service_that_is_not_ready_asks_for_hold_and_says_why(on: str) -> None:
+    """A restarted service has not reached standby, because a parameter must be changed first. PX4
+    accepts OFFBOARD as the setpoints of before are not older than COM_OF_LOSS_T."""
+    name, value = {"px4": ("COM_OF_LOSS_T", 60.0), "ardupilot": ("GUID_OPTIONS", 0.0)}[on]
+    pair = serve(on=on)
+    wire = Wire(pair)
+    pair.fly_up()
+    pair.instance.autopilot.parameters.set(name, value)
+    pair.restart()
+    wire.wrap()
+    pair.run(5.0)
+    assert pair.phase is Phase.HEALTH
+    engaged_s = pair.time_s
+    engaging = pair.instance.autopilot.commander
+    pair.switch("engage")
+    pair.until(lambda: engaging.mode.name in ("OFFBOARD", "GUIDED"), 0.5)
+    pair.until(lambda: pair.mode == {"px4": "AUTO.LOITER", "ardupilot": "BRAKE"}[on], 0.5)
+    assert thrusts(pair, engaged_s) == []
+    pair.run(2.0)
+    assert pair.said(f"not engaged: {name}")
+    assert len(pair.after(engaged_s, COMMAND)) == 1
+    assert pair.phase not in TRACKING
+    assert wire.unsafe == []
+
+
+def test_engaged_again_before_a_heartbeat_has_shown_the_other_mode() -> None:
+    """PX4 sends HEARTBEAT once a second, and returns to OFFBOARD by itself after a failsafe: which
+    of both it was cannot be known, and nobody flies it."""
+    pair, wire = engaged("px4")
+    pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 5.0)
+    pair.run(2.0)
+    pair.until(lambda: pair.time_s % 1.0 < 0.05)
+    pair.switch("pilot")
+    pair.until(lambda: pair.phase is Phase.STANDBY, 0.3)
+    pair.switch("engage")
+    pair.until(lambda: pair.mode == "OFFBOARD", 0.1)
+    assert not pair.state.pilot.elsewhere
+    again_s = pair.time_s
+    pair.until(lambda: pair.mode == "AUTO.LOITER", 1.0)
+    assert thrusts(pair, again_s) == []
+    assert pair.said("not engaged: OFFBOARD again before a HEARTBEAT")
+    pair.run(2.0)
+    pair.switch("engage")
+    pair.until(lambda: pair.phase in TRACKING, 1.0)
+    assert wire.unsafe == []
+
+
+@BOTH
+def test_a_reboot_between_two_flights(on: str) -> None:
+    pair, wire = engaged(on)
+    pair.switch("land")
+    commander = pair.instance.autopilot.commander
+    pair.until(lambda: not commander.armed, 40.0)
+    pair.instance.reboot(1.0)
+    pair.until(lambda: pair.said("the vehicle restarted"), 10.0)
+    pair.fly_up()
+    pair.switch("engage")
+    pair.until(lambda: pair.phase is Phase.HOVER, 40.0)
+    assert wire.unsafe == []
+
+
+@BOTH
+def test_requests_over_mavlink(on: str) -> None:
+    pair, wire = engaged(on, reference="lemniscate")
+    pair.until(lambda: pair.phase is Phase.TRACK, 30.0)
+    pair.run(3.0)
+    pair.command(PAUSE_CONTINUE, 0.0)
+    pair.run(4.0)
+    assert pair.phase is Phase.PAUSE
+    at_m = pair.place
+    pair.run(3.0)
+    assert float(np.linalg.norm(pair.place - at_m)) < 0.05
+    pair.command(PAUSE_CONTINUE, 1.0)
+    pair.until(lambda: float(np.linalg.norm(pair.place - at_m)) > 0.5, 6.0)
+    pair.command(START)
+    pair.until(lambda: pair.phase is Phase.CLIMB, 1.0)
+    pair.command(PAUSE_CONTINUE, 0.5)
+    pair.command(ARM, 1.0)
+    pair.run(0.2)
+    pair.command(SET_MODE, 1.0, 4.0, 3.0)
+    pair.until(lambda: pair.phase is Phase.STANDBY, 3.0)
+    assert pair.mode == {"px4": "AUTO.LOITER", "ardupilot": "BRAKE"}[on]
+    pair.command(SET_MODE, 1.0)
+    pair.command(START)
+    pair.run(0.2)
+    assert pair.acks == [
+        (PAUSE_CONTINUE, ACCEPTED),
+        (PAUSE_CONTINUE, ACCEPTED),
+        (START, ACCEPTED),
+        (PAUSE_CONTINUE, DENIED),
+        (ARM, UNSUPPORTED),
+        (SET_MODE, ACCEPTED),
+        (SET_MODE, DENIED),
+        (START, TEMPORARILY_REJECTED),
+    ]
+    assert wire.unsafe == []
+
+
+def test_a_resumed_stream_after_a_failsafe_does_not_engage() -> None:
+    """PX4 returns to OFFBOARD by itself when setpoints arrive again: the pilot has not switched."""
+    pair, wire = engaged("px4")
+    pair.until(lambda: pair.phase is Phase.HOVER, 30.0)
+    pair.lost_up = True
+    pair.until(lambda: pair.mode != "OFFBOARD", 4.0)
+    pair.lost_up = False
+    pair.run(8.0)
+    assert pair.phase is Phase.STANDBY
+    assert pair.mode != "OFFBOARD"
+    pair.switch("pilot")
+    pair.run(2.0)
+    pair.switch("engage")
+    pair.until(lambda: pair.phase in TRACKING, 3.0)
+    assert wire.unsafe == []
+
+
+@BOTH
+def test_a_stopped_service_hands_back_first(on: str) -> None:
+    pair, wire = engaged(on)
+    pair.run(1.0)
+    pair.service.request_stop()
+    pair.until(pair.service.has_ended, 3.0)
+    pair.run(0.5)
+    assert pair.mode == {"px4": "AUTO.LOITER", "ardupilot": "BRAKE"}[on]
+    assert pair.service.outcome is not None
+    assert pair.service.outcome.exit_code == 0
+    assert wire.unsafe == []
+
+
+def test_armed_in_offboard_on_the_ground_it_stays_there() -> None:
+    pair = serve()
+    pair.until(lambda: pair.phase is Phase.STANDBY)
+    pair.switch("engage")
+    commander = pair.instance.autopilot.commander
+    pair.until(lambda: pair.try_arm(commander), 20.0)
+    armed_s = pair.time_s
+    pair.run(6.0)
+    assert pair.phase is Phase.STANDBY
+    assert set(thrusts(pair, armed_s)) == {0.0}
+    assert -pair.place[2] < 0.05
+
+
+def test_without_arms_a_start_on_the_ground_is_denied() -> None:
+    pair = serve()
+    pair.until(lambda: pair.phase is Phase.STANDBY)
+    pair.command(START)
+    pair.run(3.0)
+    assert pair.acks == [(START, DENIED)]
+    assert pair.after(0.0, COMMAND) == []
+
+
+@BOTH
+def test_with_arms_a_start_takes_off_and_flies(on: str) -> None:
+    pair = serve(on=on, arms=True, then="land")
+    wire = Wire(pair, arms=True)
+    pair.until(lambda: pair.phase is Phase.STANDBY)
+    pair.run(10.0 if on == "px4" else 8.0)
+    pair.command(START)
+    pair.until(lambda: pair.phase is Phase.TRACK, 60.0)
+    pair.until(lambda: len(pair.logs.ended) == 1, 60.0)
+    assert pair.acks == [(START, ACCEPTED)]
+    assert pair.phase is Phase.STANDBY
+    assert not pair.instance.autopilot.commander.armed
+    assert wire.unsafe == []
+
+
+def test_another_controller_is_left_alone() -> None:
+    """Its setpoints are on the link: nothing of ours leaves, and nothing is asked for."""
+    pair = serve()
+    pair.fly_up()
+    pair.other_setpoint()
+    pair.run(0.3)
+    heard_s = pair.time_s
+    pair.switch("engage")
+    for _ in range(8):
+        pair.other_setpoint()
+        pair.run(0.3)
+    assert pair.after(heard_s, SETPOINT, COMMAND) == []
+    assert pair.phase is Phase.STANDBY
+
+
+@pytest.mark.parametrize("then", ["repeat", "land"])
+def test_what_follows_the_reference(then: str) -> None:
+    pair, wire = engaged("px4", then=then)
+    pair.until(lambda: pair.phase is Phase.HOVER, 30.0)
+    if then == "repeat":
+        pair.until(lambda: pair.phase is Phase.TRACK, 10.0)
+        assert sum(phase is Phase.TRACK for _, phase in pair.phases) == 2
+    else:
+        pair.until(lambda: not pair.instance.autopilot.commander.armed, 40.0)
+    assert wire.unsafe == []
+
+
+def test_a_new_configuration_is_used_by_the_next_flight(tmp_path: Path) -> None:
+    from serving import prepared
+
+    pair, _ = engaged("px4")
+    pair.run(1.0)
+    pair.source.prepared = prepared("reference.height_m=1.5", reference="hover", vehicle="px4_sih")
+    model = pair.service.current
+    pair.run(1.0)
+    assert pair.service.current is model
+    pair.switch("pilot")
+    pair.run(1.5)
+    assert pair.service.current is not model
+    assert float(pair.state.plan.track.sample(0.0).position_ned_m[2]) == -1.5
+
+
+def test_heartbeat_shows_standby_and_the_phase() -> None:
+    pair, _ = engaged("px4")
+    pair.run(2.0)
+    beats = [decode(frame) for _, _, frame in pair.sent if frame[7:10] == b"\0\0\0"]
+    assert (beats[3].system_status, beats[3].custom_mode) == (3, 17)
+    assert (beats[-1].system_status, beats[-1].custom_mode) in [(4, 6), (4, 14)]

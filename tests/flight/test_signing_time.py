@@ -1,0 +1,222 @@
+"""Time stamps of signing on disk, and whole flights over a signed link."""
+
+from __future__ import annotations
+
+import random
+from pathlib import Path
+from typing import Any
+
+import pytest
+from pair import Pair, hover, in_phase
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from offboard.analysis import history
+from offboard.analysis.score import score
+from offboard.flight import clock
+from offboard.flight.phases import ExitCode, Phase
+from offboard.flight.signing_time import SigningTime, SigningTimeError, state_directory
+from offboard.mavlink.autopilots import Autopilots
+from offboard.mavlink.outgoing import Heartbeat
+from offboard.mavlink.session import Session, SessionSettings
+from offboard.mavlink.signing import RESERVED, Signing
+
+KEY = bytes(range(32))
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.delenv("STATE_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    return tmp_path / "state" / "offboard"
+
+
+def stamp_of(signing: Signing) -> int:
+    return int.from_bytes(signing.sign(b"")[-12:-6], "little")
+
+
+def test_stamps_do_not_go_back_with_the_clock_or_after_a_crash(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    times_s = [1_800_000_000, 1_800_000_010, 1_700_000_000, 0, 1_900_000_000]
+    newest = 0
+    for unix_s in times_s:
+        monkeypatch.setattr(clock, "unix_us", lambda now_s=unix_s: now_s * 1_000_000)
+        kept = SigningTime(KEY)
+        signing = kept.__enter__()  # and a crash: it is never left
+        for _ in range(5):
+            stamp = stamp_of(signing)
+            assert stamp > newest
+            newest = stamp
+    assert newest >= (1_900_000_000 - 1_420_070_400) * 100_000
+
+
+def test_a_flight_of_an_hour_keeps_what_it_uses_ahead_of_using_it(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    began_s = clock.monotonic_s()
+    now_s = [began_s]
+    monkeypatch.setattr(clock, "monotonic_s", lambda: now_s[0])
+    kept = SigningTime(KEY)
+    with kept as signing:
+        signing.clock = lambda: now_s[0]
+        for second in range(3600):
+            now_s[0] = began_s + second
+            stamp = stamp_of(signing)
+    (file,) = home.iterdir()
+    assert stamp < int(file.read_text()) <= stamp + RESERVED
+
+
+def test_keys_have_files_of_their_own_that_do_not_show_them(home: Path) -> None:
+    for key in (KEY, bytes(32)):
+        with SigningTime(key):
+            pass
+    names = [file.name for file in home.iterdir()]
+    assert len(names) == 2
+    assert not any(KEY.hex()[:8] in name for name in names)
+
+
+def test_a_service_has_its_own_directory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("STATE_DIRECTORY", "/var/lib/a:/var/lib/b")
+    assert state_directory() == Path("/var/lib/a")
+
+
+@pytest.mark.parametrize("content", ["", "soon", "9" * 30, "\xff"])
+def test_a_damaged_file_is_refused(content: str, home: Path) -> None:
+    with SigningTime(KEY):
+        pass
+    (file,) = home.iterdir()
+    file.write_text(content, encoding="latin-1")
+    with pytest.raises(SigningTimeError, match="if this computer's clock is right, delete"):
+        SigningTime(KEY).__enter__()
+
+
+def test_a_directory_that_cannot_be_written_is_refused(home: Path) -> None:
+    home.parent.mkdir()
+    home.write_text("a file")
+    with pytest.raises(SigningTimeError, match="set XDG_STATE_HOME"):
+        SigningTime(KEY).__enter__()
+
+
+# --- flights ---
+
+
+def signed_hover(key: bytes = KEY, **options: Any) -> Pair:
+    """`hover` over a signed link: the vehicle's key is KEY."""
+    pair = hover(**options)
+    session: Any = pair.companion._session
+    session._signing = Signing(key)
+    pair.instance.keyring.set_up(KEY, 1)
+    return pair
+
+
+def until(pair: Pair, phase: Phase) -> Pair:
+    """The flight, up to `phase`."""
+    while pair.companion.phase is not phase:
+        assert not pair.companion.has_ended(), pair.companion.outcome
+        pair.advance()
+    return pair
+
+
+@pytest.fixture(scope="module")
+def unsigned() -> Pair:
+    """The same flight without signatures."""
+    pair = hover()
+    assert pair.fly().exit_code == ExitCode.FLOWN
+    return pair
+
+
+def test_a_signed_flight_sends_the_same_setpoints_and_can_be_scored(
+    unsigned: Pair, tmp_path: Path
+) -> None:
+    signed = signed_hover()
+    assert signed.fly().exit_code == ExitCode.FLOWN
+    assert [payload[:-13] for payload in signed.payloads] == unsigned.payloads
+    log = signed.log(tmp_path / "a")
+    sent = [each for each in log if each.component_id == 191]
+    received = [each for each in log if each.component_id == 1]
+    assert len(sent) > 300
+    assert len(received) > 1000
+    assert all(each.frame.signed for each in (*sent, *received))
+    ours = score(history.gather(log))
+    theirs = score(history.gather(unsigned.log(tmp_path / "b")))
+    assert ours.rmse_position_m == theirs.rmse_position_m
+    assert KEY not in (tmp_path / "a" / "flight.tlog").read_bytes()
+
+
+def test_forged_frames_in_flight_change_nothing_and_are_counted(
+    unsigned: Pair, tmp_path: Path
+) -> None:
+    """An attacker sends, unsigned or replayed, that the pilot has switched or the vehicle moved."""
+    stop = Session(SessionSettings()).encode(Heartbeat(2))
+    chance = random.Random(3)
+    captured: list[bytes] = []
+
+    def attack(time_s: float, datagrams: list[bytes]) -> list[bytes]:
+        captured.extend(datagrams)
+        del captured[:-200]
+        attacks = round(time_s * 250) % 4 == 0 and bool(captured)
+        return [*datagrams, stop, chance.choice(captured)] if attacks else datagrams
+
+    attacked = signed_hover(down=attack)
+    assert attacked.fly().exit_code == ExitCode.FLOWN
+    assert len(attacked.payloads) == len(unsigned.payloads)
+    shown = attacked.companion.snapshot()
+    assert shown.forged > 2000
+    assert any("frames refused by signing" in line for line in attacked.companion.announced)
+    assert attacked.score(tmp_path).strangers > 800
+    assert not attacked.rungs
+
+
+def test_the_wrong_key_is_named_when_no_vehicle_is_found() -> None:
+    pair = signed_hover(bytes(32))
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.REFUSED
+    assert "their signature does not match: it is another key's" in outcome.sentence
+    assert pair.setpoints == pair.commands(400) == pair.commands(176) == []
+
+
+def test_a_vehicle_that_signs_is_refused_without_a_key() -> None:
+    pair = hover()
+    pair.instance.keyring.set_up(KEY, 1)
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.REFUSED
+    assert "the vehicle signs its messages: give its key with --signing-key" in outcome.sentence
+
+
+def test_an_unsigned_vehicle_is_refused_with_a_key() -> None:
+    pair = signed_hover()
+    pair.instance.keyring.set_up(bytes(32), 0)
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.REFUSED
+    assert "arrive unsigned: set the key on the vehicle" in outcome.sentence
+
+
+def test_a_vehicle_that_reboots_with_its_old_stamps_is_heard_again() -> None:
+    pair = signed_hover()
+    session: Any = pair.companion._session
+    session._signing.offset = 10**12  # our clock is right, the vehicle's is years behind
+    pair.at.append((in_phase(Phase.HEALTH, 1.0), lambda p: p.instance.reboot(0.5)))
+    pair.at.append((in_phase(Phase.STREAM), lambda p: pytest.fail("it was not rebooted")))
+    while not pair.instance.view.time_us < 1e6 * (pair.time_s - 0.5):
+        pair.advance()
+    pair.at.clear()
+    until(pair, Phase.ARM)
+    assert pair.companion._session.counters.forged > 0
+
+
+def test_two_vehicles_on_one_link_are_named() -> None:
+    codec = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
+    heartbeat = bytes(mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3).pack(codec))
+
+    def both(time_s: float, datagrams: list[bytes]) -> list[bytes]:
+        return [*datagrams, heartbeat] if round(time_s * 250) % 250 == 100 else datagrams
+
+    pair = hover(down=both)
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.REFUSED
+    assert "several vehicles are heard, systems 1 and 9: choose one with --system" in (
+        outcome.sentence
+    )
+    chosen = hover(down=both)
+    chosen.companion._session.autopilots = Autopilots(1)
+    until(chosen, Phase.ARM)

@@ -1,0 +1,302 @@
+"""Campaigns: the same table however they are flown, and what goes wrong on the way."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import os
+import shlex
+import shutil
+import signal
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, nullcontext
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+import distributed
+import pyarrow.parquet
+import pytest
+from processes import Spawn, children
+
+from offboard.campaign import code, execution
+from offboard.campaign.campaign import Campaign, Shard, Summary
+from offboard.campaign.cases import Case
+from offboard.campaign.document import CampaignFile, read_campaign
+from offboard.campaign.execution import SchedulerError, Workers, cluster_workers, local_workers
+from offboard.campaign.flight import Job
+from offboard.campaign.margin import Promises
+from offboard.campaign.results import Record, Results, ResultsError
+from offboard.documents.errors import DocumentError
+
+# Three flights of a few seconds, and one whose simulated mass is out of range
+FILE = """
+controllers: [lqr]
+references: [hover]
+scenarios: [calm, px4_like]
+parameters:
+  reference.duration_s: [1]
+  reference.height_m: [1]
+  identify.excite: [false]
+sample:
+  draws: 2
+  seed: 3
+  ranges:
+    scenario.conditions.mass_scale: [4.5, 5.5]
+    controller.bandwidth_radps: [4, 5]
+"""
+FILE = FILE.replace("[4.5, 5.5]", "[0.9, 1.1]") + "require: [rmse_position_m<0.02]\n"
+TABLE = ("campaign.csv", "campaign.parquet", "campaign.html")
+INFEASIBLE = FILE.replace("scenarios: [calm, px4_like]", "scenarios: [calm]").replace(
+    "reference.height_m: [1]", "reference.height_m: [1, 400]"
+)
+
+
+def campaign(text: str, directory: Path) -> Campaign:
+    file = directory.parent / f"{directory.name}.yaml"
+    file.write_text(text)
+    return Campaign(*read_campaign(str(file)), directory)
+
+
+@contextmanager
+def inline() -> AbstractContextManager[Workers]:  # type: ignore[misc]
+    """One worker in this process, whose code is loaded."""
+    with ThreadPoolExecutor(1) as pool:
+        yield Workers(1, lambda: nullcontext(pool))
+
+
+def fly(
+    flown: Campaign,
+    open_workers: Callable[[], AbstractContextManager[Workers]] = inline,
+    shard: Shard = Shard(),  # noqa: B008
+) -> Summary:
+    return flown.fly(open_workers, shard, lambda: False, lambda case, done, planned: None)
+
+
+def table(directory: Path) -> dict[str, bytes]:
+    return {name: (directory / name).read_bytes() for name in TABLE}
+
+
+def rows(directory: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO((directory / "campaign.csv").read_text())))
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A campaign that was flown at once."""
+    directory = tmp_path_factory.mktemp("whole") / "out"
+    summary = fly(campaign(FILE, directory))
+    assert (summary.missing, summary.stopped, len(summary.rows)) == (0, "", 4)
+    return directory
+
+
+def test_every_flight_is_a_row_with_its_figures_and_its_command(whole: Path) -> None:
+    found = rows(whole)
+    assert [(row["scenario"], row["seed"], row["exit_code"]) for row in found] == [
+        (scenario, "1", "0") for scenario in ("calm", "calm", "px4_like", "px4_like")
+    ]
+    assert all(0.9 <= float(row["scenario.conditions.mass_scale"]) <= 1.1 for row in found)
+    assert [row["success"] for row in found[:2]] == ["1", "1"]  # 0.005 m, without any noise
+    assert [row["failed"].split(" is ")[0] for row in found[2:]] == ["rmse_position_m"] * 2
+    assert all((whole / path).is_file() for path in map(scenario_file, found))
+    parquet = pyarrow.parquet.read_table(whole / "campaign.parquet").to_pydict()
+    assert parquet["margin"] == [float(row["margin"]) for row in found]
+    assert not any("solve_time" in name or "lateness" in name for name in parquet)
+
+
+def scenario_file(row: dict[str, str]) -> str:
+    words = shlex.split(row["fly_again"])
+    return words[words.index("--scenario") + 1]
+
+
+def test_the_command_of_a_row_flies_it_again(whole: Path, tmp_path: Path, spawn: Spawn) -> None:
+    row = rows(whole)[2]
+    program, *arguments = shlex.split(row["fly_again"])
+    arguments[arguments.index("--scenario") + 1] = str(whole / scenario_file(row))
+    flown = spawn(program, *arguments, "--out", "again")
+    output, _ = flown.communicate(timeout=120)
+    assert flown.returncode == 0, output
+    score = json.loads((tmp_path / "again" / "score.json").read_text())
+    assert score["rmse_position_m"] == float(row["rmse_position_m"])
+
+
+def test_killed_and_continued_it_is_the_same_table(
+    whole: Path, tmp_path: Path, spawn: Spawn
+) -> None:
+    (tmp_path / "out.yaml").write_text(FILE)
+    process = spawn("offboard", "campaign", "out.yaml", "--out", "out", "--workers", 1)
+    deadline_s = time.monotonic() + 120.0
+    while not (found := list((tmp_path / "out").glob("results/*/*.json"))):
+        assert time.monotonic() < deadline_s
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    process.send_signal(signal.SIGKILL)
+    process.wait()
+    stamps = {path: path.stat().st_mtime_ns for path in found}
+    assert fly(campaign(FILE, tmp_path / "out")).missing == 0
+    assert {path: path.stat().st_mtime_ns for path in found} == stamps  # none is flown twice
+    assert table(tmp_path / "out") == table(whole)
+
+
+def test_shards_copied_together_are_the_same_table(whole: Path, tmp_path: Path) -> None:
+    for number in range(1, 5):
+        own = tmp_path / f"shard{number}"
+        summary = fly(campaign(FILE, own), shard=Shard(number, 4))
+        assert (len(summary.rows), summary.missing, summary.mine_missing) == (1, 3, 0)
+        shutil.copytree(own / "results", tmp_path / "out" / "results", dirs_exist_ok=True)
+    flown = campaign(FILE, tmp_path / "out")
+    assert fly(flown, unused).missing == 0
+    assert table(tmp_path / "out") == table(whole)
+
+
+def unused() -> AbstractContextManager[Workers]:
+    raise AssertionError("all flights are finished")
+
+
+def test_a_dask_cluster_of_two_workers_makes_the_same_table(whole: Path, tmp_path: Path) -> None:
+    with distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None,
+        scheduler_port=0, protocol="tcp",
+    ) as cluster:  # fmt: skip
+        address = cluster.scheduler_address
+        summary = fly(campaign(FILE, tmp_path / "out"), partial(cluster_workers, address))
+    assert (summary.missing, summary.stopped) == (0, "")
+    assert table(tmp_path / "out") == table(whole)
+
+
+def test_a_scheduler_that_is_lost_keeps_what_is_finished(tmp_path: Path) -> None:
+    cluster = distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None,
+        scheduler_port=0, protocol="tcp",
+    )  # fmt: skip
+    flown = campaign(FILE, tmp_path / "out")
+    summary = flown.fly(
+        partial(cluster_workers, cluster.scheduler_address),
+        Shard(),
+        lambda: False,
+        lambda case, done, planned: cluster.close() if done == 1 else None,
+    )
+    assert "the dask scheduler" in summary.stopped
+    assert "was lost" in summary.stopped
+    assert 1 <= len(summary.rows) < 4
+    assert fly(flown).missing == 0
+
+
+def test_no_scheduler_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(execution, "CONNECT_S", 0.3)
+    with (
+        pytest.raises(SchedulerError, match=r"no dask scheduler at tcp://127\.0\.0\.1:9"),
+        cluster_workers("tcp://127.0.0.1:9"),
+    ):
+        pass
+
+
+def test_an_infeasible_case_is_a_row_with_its_reason(tmp_path: Path) -> None:
+    flown = campaign(INFEASIBLE, tmp_path / "out")
+    fly(flown, shard=Shard(3, 4))  # the first at 400 m
+    (row,) = rows(tmp_path / "out")
+    assert (row["exit_code"], row["success"], row["weakest"]) == ("2", "0", "infeasible")
+    assert "landing from 400 m takes" in row["failed"]
+
+
+@pytest.mark.parametrize(
+    ("change", "sentence"),
+    [
+        (("controllers: [lqr]", "controlers: [lqr]"), "did you mean controllers?"),
+        (("controllers: [lqr]", "controllers: []"), "controllers: [] should have at least 1 item"),
+        (("[lqr]", "[lqg]"), "there is no controller named 'lqg'"),
+        (("identify.excite", "identify.exite"), "identify.exite is not a known key"),
+        (("conditions.mass_scale", "conditions.mass"), "conditions.mass is not a known key"),
+        (("[4, 5]", "[5, 4]"), "the range [5, 4] is empty"),
+        (("rmse_position_m<", "rmse<"), "there is no figure 'rmse'"),
+        (("[calm, px4_like]", "[calm, calm]"), "a combination is given twice"),
+    ],
+)
+def test_a_file_that_cannot_be_flown_is_refused(
+    change: tuple[str, str], sentence: str, tmp_path: Path
+) -> None:
+    with pytest.raises(DocumentError) as refused:
+        campaign(FILE.replace(*change), tmp_path / "out")
+    assert sentence in str(refused.value)
+    assert "out.yaml: " in str(refused.value)
+    assert not (tmp_path / "out").exists()
+
+
+def test_results_of_other_code_are_refused_and_kept(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    Results(tmp_path, "0123456789ab").put("case", Record(0, "flown and landed", 1.0, "error"))
+    with pytest.raises(ResultsError, match=f"other code .0123456789ab, this is {code.code_hash()}"):
+        campaign(FILE, tmp_path)
+    assert Results(tmp_path, "0123456789ab").finished() == 1
+
+
+def test_a_full_disk_ends_the_campaign_and_keeps_what_is_finished(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    flown = campaign(FILE, tmp_path / "out")
+    write, written = Path.write_bytes, []
+
+    def full(path: Path, data: bytes) -> int:
+        written.append(path)
+        if len(written) == 2:
+            write(path, data[:10])
+            raise OSError(28, "No space left on device")
+        return write(path, data)
+
+    with monkeypatch.context() as limited:
+        limited.setattr(Path, "write_bytes", full)
+        summary = fly(flown)
+    assert "cannot be written (No space left on device); finished flights are kept" in (
+        summary.stopped
+    )
+    assert [path.suffix for path in (tmp_path / "out" / "results").rglob("*.*")] == [".json"]
+    assert len(rows(tmp_path / "out")) == 1
+
+
+def dies(job: Job) -> Record:
+    """Ends its worker with seed 2, after a note of it."""
+    if job.case.seed == 2:
+        with (Path(job.code) / "deaths").open("a") as deaths:
+            deaths.write("died\n")
+        os._exit(1)
+    return Record(0, "flown and landed", 1.0, "error")
+
+
+def test_a_flight_whose_worker_dies_twice_is_a_row(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(execution, "fly_job", dies)
+    case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
+    jobs = [Job(replace(case, seed=seed), Promises(), str(tmp_path)) for seed in (1, 2)]
+    with local_workers(1) as workers:
+        ended = {job.case.seed: record for job, record in workers.fly(jobs, lambda: False)}
+    assert (tmp_path / "deaths").read_text() == "died\n" * 2
+    assert ended[1].exit_code == 0
+    assert (ended[2].exit_code, ended[2].sentence) == (4, "the process that flew it ended, twice")
+
+
+def test_an_interrupted_campaign_leaves_no_process(tmp_path: Path, spawn: Spawn) -> None:
+    (tmp_path / "c.yaml").write_text(FILE)
+    process = spawn("offboard", "campaign", "c.yaml", "--out", "out", "--workers", 1)
+    deadline_s = time.monotonic() + 120.0
+    while not list((tmp_path / "out").glob("results/*/*.json")):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+    workers = children(process.pid)
+    process.send_signal(signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert process.returncode == 4, (output, errors)
+    assert "run the same command again to go on" in errors
+    while any(Path(f"/proc/{pid}").exists() for pid in workers):
+        assert time.monotonic() < deadline_s
+        time.sleep(0.02)
+
+
+def test_quick_campaign_is_shipped() -> None:
+    file, _ = read_campaign("quick")
+    assert isinstance(file, CampaignFile)
+    assert file.kept == 3

@@ -1,0 +1,164 @@
+"""`offboard daemon` as a process: lock, monitoring, signals, the unit of the service manager."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import pytest
+from processes import Spawn, free_port
+from prometheus_client.parser import text_string_to_metric_families
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+from offboard.analysis import tlog
+
+NAN = float("nan")
+SET_MODE, ARM, TAKEOFF = 176, 400, 22  # MAV_CMD
+LONG_S = 60.0
+
+
+class Pilot:
+    """A ground station on the simulator's second link, which switches modes."""
+
+    def __init__(self) -> None:
+        self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self.socket.bind(("127.0.0.1", 0))
+        self.socket.settimeout(2.0)
+        self.port = self.socket.getsockname()[1]
+        self._codec = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+
+    def command(self, number: int, *params: float) -> None:
+        filled = (*params, *(0.0,) * (7 - len(params)))
+        message = mavlink.MAVLink_command_long_message(1, 1, number, 0, *filled)
+        self.socket.sendto(message.pack(self._codec), self._peer)
+
+    def until(self, done: Any, repeat: Any = None) -> None:
+        """Read until `done(message)`; calls `repeat` about once a second."""
+        deadline_s, repeated_s = time.monotonic() + LONG_S, 0.0
+        parser = mavlink.MAVLink(None)
+        parser.robust_parsing = True
+        while time.monotonic() < deadline_s:
+            data, self._peer = self.socket.recvfrom(65535)
+            if repeat and time.monotonic() > repeated_s + 1.0:
+                repeated_s = time.monotonic()
+                repeat()
+            if any(done(message) for message in parser.parse_buffer(data) or ()):
+                return
+        raise AssertionError("the vehicle did not do it")
+
+
+def shows(mode: int) -> Any:
+    return lambda m: m.get_type() == "HEARTBEAT" and m.custom_mode == mode
+
+
+def scraped(port: int) -> dict[str, float]:
+    with urllib.request.urlopen(f"http://127.0.0.1:{port}/metrics", timeout=5.0) as answer:
+        text = answer.read().decode()
+    return {
+        sample.name: sample.value
+        for family in text_string_to_metric_families(text)
+        for sample in family.samples
+    } | {"phase": _phase(text)}  # type: ignore[dict-item]
+
+
+def _phase(text: str) -> str:
+    (line,) = [each for each in text.splitlines() if each.startswith("offboard_state_info")]
+    return line.partition('phase="')[2].partition('"')[0]
+
+
+def health(port: int) -> tuple[int, dict[str, Any]]:
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{port}/health", timeout=5.0) as answer:
+            return answer.status, json.loads(answer.read())
+    except urllib.error.HTTPError as error:
+        return error.code, json.loads(error.read())
+
+
+def await_phase(port: int, *phases: str) -> None:
+    deadline_s = time.monotonic() + LONG_S
+    while True:
+        try:
+            if scraped(port)["phase"] in phases:
+                return
+        except (OSError, ValueError):
+            pass  # not served yet
+        assert time.monotonic() < deadline_s, f"never in {phases}"
+        time.sleep(0.1)
+
+
+def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> None:
+    """In real time over UDP, with monitoring, a second service, and SIGTERM in flight."""
+    port, web, pilot = free_port(), free_port(), Pilot()
+    link = f"udpin:127.0.0.1:{port}"
+    service = spawn("offboard", "daemon", "--connect", link, "--out", "out", "--log-json",
+                    "--metrics", f"127.0.0.1:{web}", "--reference", "hover",
+                    "--set", "reference.duration_s=600")  # fmt: skip
+    await_phase(web, "connect")
+    assert health(web)[0] == 503
+    second = spawn("offboard", "daemon", "--connect", link, "--out", "other")
+    assert second.wait(LONG_S) == 3
+    assert second.stderr is not None
+    assert f"process {service.pid}" in second.stderr.read()
+    busy = spawn("offboard", "daemon", "--connect", f"udpin:127.0.0.1:{free_port()}",
+                 "--metrics", f"127.0.0.1:{web}")  # fmt: skip
+    assert busy.wait(LONG_S) == 2
+    spawn("simulator", "--connect", f"udpout:127.0.0.1:{port}",
+          "--gcs", f"udpout:127.0.0.1:{pilot.port}", "--param", "MIS_TAKEOFF_ALT=3",
+          "--param", "COM_OF_LOSS_T=4")  # fmt: skip
+    await_phase(web, "standby")
+    armed = lambda m: m.get_type() == "HEARTBEAT" and m.base_mode & 128  # noqa: E731
+    pilot.until(armed, lambda: pilot.command(ARM, 1))
+    pilot.command(TAKEOFF, *(NAN,) * 7)
+    pilot.until(lambda m: m.get_type() == "GLOBAL_POSITION_INT" and m.relative_alt > 2700)
+    pilot.command(SET_MODE, 1, 4, 3)
+    pilot.until(shows(0x03040000))
+    pilot.until(shows(0x00060000), lambda: pilot.command(SET_MODE, 1, 6, 0))
+    await_phase(web, "excite", "join", "track")
+    assert scraped(web)["offboard_flights_total"] == 1.0
+    deadline_s = time.monotonic() + 2.0
+    while time.monotonic() < deadline_s:  # a client that scrapes more than any real one
+        values = scraped(web)
+    assert values["offboard_armed"] == 1.0
+    status, state = health(web)
+    assert (status, state["mode"]) == (200, "OFFBOARD")
+    service.send_signal(signal.SIGTERM)
+    pilot.until(shows(0x03040000))
+    out, error = service.communicate(timeout=LONG_S)
+    assert service.returncode == 0, error
+    lines = [json.loads(line) for line in out.splitlines()]
+    assert all({"time", "level", "event", "phase"} <= line.keys() for line in lines)
+    assert any("engaged: OFFBOARD in the air" in line["event"] for line in lines)
+    (flight,) = [path for path in (tmp_path / "out").iterdir() if (path / "flight.tlog").exists()]
+    figures = json.loads((flight / "score.json").read_text())
+    assert figures["phases"]
+    log = tlog.read(flight / "flight.tlog")
+    names = {entry.name for entry in log.messages}
+    assert {"TUNNEL", "HEARTBEAT", "PARAM_VALUE", "SET_ATTITUDE_TARGET", "STATUSTEXT"} <= names
+
+
+@pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
+def test_the_unit_is_valid(tmp_path: Path) -> None:
+    (tmp_path / "my $ %.yaml").write_text("vehicle: neutral\n")
+    printed = subprocess.run(
+        [sys.executable, "-m", "offboard", "daemon", "--connect", "serial:/dev/ttyACM0:57600",
+         "--config", "./my $ %.yaml", "--print-unit"],
+        capture_output=True, text=True, check=True, cwd=tmp_path,
+    ).stdout  # fmt: skip
+    unit = tmp_path / "offboard.service"
+    unit.write_text(printed)
+    done = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    (line,) = [each for each in printed.splitlines() if each.startswith("ExecStart=")]
+    escaped = str(tmp_path / "my $ %.yaml").replace("%", "%%").replace("$", "$$")
+    assert f'--config "{escaped}" --out %S/offboard' in line
+    assert "Type=notify" in printed
+    assert "SupplementaryGroups=dialout" in printed

@@ -1,0 +1,92 @@
+"""`offboard doctor` as a process: ports, exit codes, output."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from processes import Spawn, free_port
+from sim_peer import simulator
+
+GOOD_PX4 = ("--param", "COM_OBL_RC_ACT=4")
+
+
+def test_good_vehicle_over_udp(spawn: Spawn) -> None:
+    """Two checks of one simulator: in the first, PX4 as it is shipped."""
+    port = free_port()
+    link = f"udpin:127.0.0.1:{port}"
+    with simulator("--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", *GOOD_PX4) as process:
+        process.ready_line()
+        time.sleep(5.0)  # it boots
+        began_s = time.monotonic()
+        doctor = spawn("offboard", "doctor", "--connect", link, "--json")
+        output, errors = doctor.communicate(timeout=60)
+        took_s = time.monotonic() - began_s
+    assert errors == ""
+    report = json.loads(output)
+    rows = {row["check"]: row for row in report["rows"]}
+    of_this_machine = {"compiled", "computer", "delay", "disk"}  # which is busy with other tests
+    wrong = {name: row for name, row in rows.items() if row["level"] != "ok"}
+    assert not wrong.keys() - of_this_machine, wrong
+    assert report["vehicle"] == {"autopilot": "px4", "system_id": 1}
+    assert report["listened_s"] < 10.5
+    assert took_s < 40.0
+
+
+def test_taken_port_names_its_holder(spawn: Spawn) -> None:
+    holding = (
+        "import socket, sys; s = socket.socket(socket.AF_INET, socket.SOCK_DGRAM); "
+        "s.bind(('127.0.0.1', 0)); print(s.getsockname()[1], flush=True); sys.stdin.read()"
+    )
+    with subprocess.Popen(
+        [sys.executable, "-c", holding], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
+    ) as holder:
+        assert holder.stdout
+        port = holder.stdout.readline().strip()
+        doctor = spawn("offboard", "doctor", "port", "--connect", f"udpin:127.0.0.1:{port}")
+        output, errors = doctor.communicate(timeout=60)
+        assert (doctor.returncode, errors) == (3, "")
+        assert output.startswith("blocks  port  connection 'udpin:")
+        assert f"(pid {holder.pid})" in output
+        assert f"fix: stop {Path(sys.executable).resolve().name[:6]}" in output
+        assert holder.stdin
+        holder.stdin.close()
+    again = spawn("offboard", "doctor", "port", "--connect", f"udpin:127.0.0.1:{port}")
+    output, _ = again.communicate(timeout=60)
+    assert again.returncode == 0
+    assert output.startswith("ok      port")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "says"),
+    [
+        (("--list", "gps"), 0, "gps  GPS fix. "),
+        (("gsp",), 2, "there is no check named 'gsp'; known are port, vehicle,"),
+        (("--connect", "nowhere"), 2, "connection 'nowhere' is not understood; use udpin:"),
+        (("port", "--connect", "tcp:127.0.0.1:1"), 3, "cannot be opened: Connection refused"),
+    ],
+)
+def test_exit_codes(arguments: tuple[str, ...], code: int, says: str, spawn: Spawn) -> None:
+    doctor = spawn("offboard", "doctor", *arguments)
+    output, errors = doctor.communicate(timeout=60)
+    assert doctor.returncode == code
+    assert says in (output + errors).replace("\n", " ")
+    assert "Traceback" not in errors
+
+
+def test_silent_port_blocks(spawn: Spawn) -> None:
+    """Datagrams that are no MAVLink, from a real socket."""
+    port = free_port()
+    doctor = spawn("offboard", "doctor", "vehicle", "--connect", f"udpin:127.0.0.1:{port}")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        while doctor.poll() is None:
+            stranger.sendto(b"hello", ("127.0.0.1", port))
+            time.sleep(0.1)
+    output, _ = doctor.communicate(timeout=60)
+    assert doctor.returncode == 3
+    assert "bytes are heard that are not MAVLink" in output

@@ -1,0 +1,79 @@
+"""The simulator in this process: the same flight as over UDP, byte for byte."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from offboard.flight import in_memory
+from offboard.flight.in_memory import InMemorySimulator
+from offboard.flight.request import FlightRequest, fly_request
+from offboard.flight.sitl import SimulatorProcess
+from offboard.flight.stop import StopRequests
+
+SETPOINT, TELEMETRY = 82, (30, 31, 32, 115)
+SHORT = ("reference.duration_s=1", "reference.height_m=1", "identify.excite=false")
+
+
+def frames(log: Path, *kinds: int) -> list[bytes]:
+    """The frames of a .tlog with these message ids."""
+    data, at, found = log.read_bytes(), 0, []
+    while at < len(data):
+        frame = data[at + 8 : at + 20 + data[at + 9]]
+        if int.from_bytes(frame[7:10], "little") in kinds:
+            found.append(frame)
+        at += 8 + len(frame)
+    return found
+
+
+def request(directory: Path, scenario: str) -> FlightRequest:
+    return FlightRequest(
+        directory, sitl=True, scenario=scenario, seed=3, assignments=SHORT,
+        choices={"controller": "lqr", "reference": "hover"},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def simulator() -> Iterator[SimulatorProcess]:
+    with SimulatorProcess() as simulator:
+        yield simulator
+
+
+# with a late link, the first heartbeat comes after several barriers
+@pytest.mark.parametrize("scenario", ["delay_60ms", "strangers"])
+def test_a_flight_in_memory_is_that_over_udp(
+    scenario: str, tmp_path: Path, simulator: SimulatorProcess
+) -> None:
+    flown = {}
+    for name, vehicle in (("memory", InMemorySimulator()), ("udp", simulator)):
+        wanted = request(tmp_path / name, scenario)
+        outcome = fly_request(wanted, simulator=vehicle, stops=StopRequests())
+        assert (outcome.exit_code, outcome.sentence) == (0, "flown and landed")
+        log = tmp_path / name / "flight.tlog"
+        flown[name] = frames(log, SETPOINT), frames(log, *TELEMETRY)
+    assert len(flown["udp"][0]) > 60
+    assert len(flown["udp"][1]) > 1000
+    assert flown["memory"] == flown["udp"]
+
+
+def test_a_vehicle_that_fails_ends_the_flight_with_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Fails:
+        def __init__(self, **options: object) -> None:
+            pass
+
+        def exchange(self, frames: object) -> list[tuple[int, bytes]]:
+            raise ZeroDivisionError("division by zero")
+
+    class Point:
+        def load(self) -> type[Fails]:
+            return Fails
+
+    monkeypatch.setattr(in_memory, "registered", Point)
+    wanted = request(tmp_path / "flight", "calm")
+    outcome = fly_request(wanted, simulator=InMemorySimulator(), stops=StopRequests())
+    sentence = "the bundled simulator failed (ZeroDivisionError: division by zero)"
+    assert (outcome.exit_code, outcome.sentence) == (3, sentence)

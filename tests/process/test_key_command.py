@@ -1,0 +1,78 @@
+"""`offboard key`, and what the commands say about key files, as processes see them."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from offboard import cli
+from offboard.documents.signing_key import read_key
+from simulator.cli import main as simulator
+
+Capture = pytest.CaptureFixture[str]
+Call = Callable[..., tuple[int, str, str]]
+
+
+@pytest.fixture
+def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> Call:
+    """`call("offboard", "key")` -> exit code, stdout, stderr."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+
+    def run(command: str, *arguments: object) -> tuple[int, str, str]:
+        monkeypatch.setattr(sys, "argv", [command, *map(str, arguments)])
+        with pytest.raises(SystemExit) as ended:
+            simulator() if command == "simulator" else cli.main()
+        printed = capsys.readouterr()
+        return int(ended.value.code or 0), printed.out, printed.err
+
+    return run
+
+
+def test_a_key_is_made_once_and_explained_without_showing_it(call: Call, tmp_path: Path) -> None:
+    code, said, _ = call("offboard", "key", "my.key")
+    assert code == 0
+    assert "signing setup PASSPHRASE" in said
+    assert "offboard fly --signing-key my.key" in said
+    key = read_key(tmp_path / "my.key")
+    text = (tmp_path / "my.key").read_text()
+    assert text.split()[-1] not in said
+    code, _, complaint = call("offboard", "key", "my.key")
+    assert (code, len(complaint.splitlines())) == (2, 1)
+    assert "my.key exists and is not replaced" in complaint
+    assert read_key(tmp_path / "my.key") == key
+
+
+@pytest.mark.parametrize(
+    ("content", "mode", "expected"),
+    [
+        (None, 0, "signing key k cannot be read: No such file or directory"),
+        ("key: 12", 0o600, "signing key k is too short or no key file: expected one line"),
+        ("key: " + "ab" * 32, 0o644, "signing key k can be read or changed by other users"),
+    ],
+)
+@pytest.mark.parametrize("command", ["offboard fly", "offboard fly --sitl", "simulator"])
+def test_a_bad_key_file_is_one_sentence_before_anything_is_sent(
+    command: str, content: str | None, mode: int, expected: str, call: Call, tmp_path: Path
+) -> None:
+    if content is not None:
+        (tmp_path / "k").write_text(content)
+        (tmp_path / "k").chmod(mode)
+    files = sorted(tmp_path.iterdir())
+    code, _, complaint = call(*command.split(), "--signing-key", "k")
+    assert (code, len(complaint.splitlines())) == (2, 1)
+    assert expected in complaint
+    assert "ab" * 32 not in complaint
+    assert sorted(tmp_path.iterdir()) == files
+
+
+def test_where_no_time_stamp_can_be_kept_nothing_is_flown(call: Call, tmp_path: Path) -> None:
+    call("offboard", "key", "my.key")
+    (tmp_path / "state").write_text("a file")
+    connection = ("--connect", "udpin:127.0.0.1:0")
+    code, _, complaint = call("offboard", "fly", *connection, "--signing-key", "my.key")
+    assert code == 2
+    assert "the time stamp of the signing key cannot be kept" in complaint

@@ -1,0 +1,44 @@
+"""Each flight of the corpus, replayed, sends what is expected, byte by byte.
+
+`python tests/replay/test_corpus.py` shows what an intended change has changed, then accepts it.
+"""
+
+from __future__ import annotations
+
+import pytest
+from corpus import expected, names, replayed, unpacked, write_expected
+
+from offboard.replay.difference import compare
+from offboard.replay.verdict import explained
+
+
+@pytest.mark.parametrize("name", names())
+def test_the_flight_is_replayed_byte_by_byte(name: str) -> None:
+    with unpacked(name) as recording:
+        replay = replayed(recording)
+        comparison = compare(expected(name), replay.replayed)
+        assert not replay.stopped
+        assert comparison.setpoints > 80
+        if comparison.differences:
+            lines = explained(recording, comparison.differences[0])
+            pytest.fail("\n".join((comparison.sentence(), *lines)), pytrace=False)
+
+
+def test_the_corpus_is_there() -> None:
+    assert len(names()) >= 4
+
+
+def accept() -> None:
+    """Print what has changed since it was accepted, and expect the present answers."""
+    for name in names():
+        with unpacked(name) as recording:
+            replay = replayed(recording)
+            comparison = compare(expected(name), replay.replayed)
+            print(f"{name}: {comparison.sentence()}")
+            if comparison.differences:
+                print("\n".join(explained(recording, comparison.differences[0])))
+                write_expected(name, replay.replayed)
+
+
+if __name__ == "__main__":
+    accept()

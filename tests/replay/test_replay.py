@@ -1,0 +1,266 @@
+"""`offboard replay`: what it finds, what it refuses, and flights with unusual inputs in memory."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import pytest
+from corpus import FLIGHTS, expected, replayed, unpacked
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from typer.testing import CliRunner, Result
+
+from offboard.analysis import tlog
+from offboard.cli.commands import app
+from offboard.control.base import Controller, Decision, Situation
+from offboard.control.laws.pso import PsoLaw
+from offboard.flight import configuration, inputs, manifest
+from offboard.flight.actions import PhaseActions
+from offboard.flight.log import entry
+from offboard.flight.outbox import Output
+from offboard.flight.phases import Phase
+from offboard.mavlink.session import Session, SessionSettings
+from offboard.replay.difference import compare
+from offboard.replay.recording import ReplayError, read, record_type
+from offboard.replay.verdict import verdict
+
+sys.path.append(str(Path(__file__).parents[1] / "flight"))
+
+from pair import SHORT, UNIX_EPOCH_US, HostClock, Pair, hover, in_phase
+
+WIRE = Path(__file__).parents[1] / "wire" / "recordings"
+NEUTRAL_HOVER_THRUST = 0.42  # config/vehicles/neutral.yaml
+SMALLEST, CLIMB_BEGAN_S = "faulty-px4", 8.4
+
+
+@pytest.fixture(scope="module")
+def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    with unpacked(SMALLEST) as recording:
+        copy = tmp_path_factory.mktemp("flight") / "flight.tlog"
+        copy.write_bytes(recording.log.path.read_bytes())
+        return copy
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(app, ["replay", *map(str, arguments)], terminal_width=300)
+
+
+def reason(result: Result) -> str:
+    return str(result.exception)
+
+
+# ------------------------------------------------------------------ what it says
+
+
+def test_an_unchanged_flight_is_identical(flight: Path) -> None:
+    result = run(flight)
+    assert result.exit_code == 0
+    assert "163 setpoints and 18 commands: all identical" in result.output.replace("\n", " ")
+
+
+def test_a_changed_law_is_found_at_its_first_decision(
+    flight: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A thrust of 0.01 m/s2 more is 0.00043 of the whole, by the vehicle file's hover thrust."""
+    decide = PsoLaw.decide
+
+    def changed(self, situation):
+        decision = decide(self, situation)
+        command = decision.command
+        more = type(command)(
+            command.thrust_mps2 + 0.01, command.thrust_direction_ned, command.course_rad
+        )
+        return type(decision)(more, decision.certificate)
+
+    monkeypatch.setattr(PsoLaw, "decide", changed)
+    result = run(flight)
+    assert " of 163 setpoints and 18 commands differ; largest difference" in reason(result)
+    assert getattr(result.exception, "code", None) == 1
+    first = verdict(read(flight)).comparison.differences[0]
+    assert CLIMB_BEGAN_S <= first.time_s < CLIMB_BEGAN_S + 0.7
+    ((name, before, after, by),) = first.fields()
+    assert (name, after - before) == ("thrust", pytest.approx(by))
+    assert by == pytest.approx(0.01 * NEUTRAL_HOVER_THRUST / 9.81, rel=0.03)
+    assert f"SET_ATTITUDE_TARGET at {first.time_s:.3f} s" in result.output
+    assert "decided in turn" in result.output
+    assert "LOCAL_POSITION_NED" in result.output or "ATTITUDE_QUATERNION" in result.output
+
+
+def test_the_state_of_a_tick(flight: Path) -> None:
+    result = run(flight, "--at", 19.0)
+    assert result.exit_code == 0
+    values = dict(line.split(maxsplit=1) for line in result.output.splitlines() if line.split()[1:])
+    assert 19.0 <= float(values["time_s"]) < 19.15
+    assert values["phase"] in ("track", "8")
+    assert float(values["gap"]) < 1e-6
+    assert float(values["predicted_down_m"]) == pytest.approx(-1.0, abs=0.1)
+    assert {"silence_s", "hover_thrust", "iterations", "position_ned_m"} <= values.keys()
+    late = run(flight, "--at", 1e6)
+    assert "ends at 30." in reason(late)
+
+
+def test_the_flights_own_law_beside_itself_decides_the_same(flight: Path) -> None:
+    result = run(flight, "--controller", "pso")
+    assert result.exit_code == 0
+    lines = result.output.replace("\n  ", " ").splitlines()
+    assert lines[0].startswith("pso beside pso in ")
+    assert "largest 0 m/s2" in lines[2]
+
+
+def test_another_law_beside_it_differs_and_fails_nothing(flight: Path) -> None:
+    result = run(flight, "--controller", "pid")
+    assert result.exit_code == 0
+    lines = result.output.replace("\n  ", " ").splitlines()
+    assert lines[0].startswith("pid beside pso in ")
+    assert 0.01 < float(lines[1].split("rms ")[1].split(",")[0]) < 10.0
+    assert "differs" not in result.output
+    assert "are no attitude commands" in reason(run(flight, "--controller", "autopilot"))
+
+
+# ------------------------------------------------------------------ what it refuses
+
+
+def test_logs_that_cannot_be_replayed(flight: Path, tmp_path: Path) -> None:
+    foreign = WIRE / "px4-1.16.1-offboard.tlog"
+    assert "does not hold the configuration" in reason(run(foreign))
+    old = tmp_path / "old.tlog"
+    old.write_bytes(without(flight, lambda message: record_type(message) == inputs.PAYLOAD_TYPE))
+    assert "does not hold the inputs" in reason(run(old))
+    silent = tmp_path / "silent.tlog"
+    silent.write_bytes(without(flight, lambda message: record_type(message) is None))
+    assert "nothing to compare" in reason(run(silent))
+    for path in (foreign, old, silent):
+        assert getattr(run(path).exception, "code", 2) == 2
+
+
+def without(flight: Path, drops) -> bytes:
+    kept = [entry(m.unix_us, m.frame.raw) for m in tlog.read(flight) if not drops(m)]
+    return b"".join(kept)
+
+
+def test_a_lost_message_ends_the_comparison_before_it(tmp_path: Path) -> None:
+    """One LOCAL_POSITION_NED is missing: what was sent before is still compared."""
+    pair = short_flight()
+    whole = logged(pair, tmp_path / "whole.tlog")
+    lost_ms = 10_000
+    missing = next(
+        m
+        for m in tlog.read(whole)
+        if m.name == "LOCAL_POSITION_NED" and m.message.time_boot_ms >= lost_ms
+    )
+    damaged = tmp_path / "damaged.tlog"
+    damaged.write_bytes(without(whole, lambda m: m.frame.raw == missing.frame.raw))
+    result = verdict(read(damaged))
+    assert "missing or damaged" in result.stopped
+    assert not result.comparison.differences
+    assert 30 < result.comparison.setpoints < verdict(read(whole)).comparison.setpoints
+    assert result.ended_s == pytest.approx(lost_ms / 1e3, abs=0.3)
+
+
+# ------------------------------------------------------------------ unusual inputs
+
+
+def short_flight(**options) -> Pair:
+    resolved = configuration.load("flight", choices={"reference": "hover"}, assignments=SHORT,
+                                  known_vehicle="px4_sih")  # fmt: skip
+    pair = hover(learning=resolved.identify, deadline_s=resolved.deadline_s, **options)
+    companion, turn = pair.companion, pair.companion.turn
+
+    def guarded(chunks, now_s) -> Output:  # as the loop
+        try:
+            return turn(chunks, now_s)
+        except Exception as error:
+            companion.request_stop(str(error))
+            return Output()
+
+    companion.turn = guarded  # type: ignore[method-assign]
+    pair.fly()
+    return pair
+
+
+def logged(pair: Pair, path: Path) -> Path:
+    resolved = configuration.load("flight", choices={"reference": "hover"}, assignments=SHORT,
+                                  known_vehicle="px4_sih")  # fmt: skip
+    session = Session(SessionSettings(record_component_id=192))
+    pieces = [session.encode(piece) for piece in manifest.pieces(configuration.dump(resolved))]
+    frames = [*pieces, *pair.logged]
+    path.write_bytes(b"".join(entry(UNIX_EPOCH_US + 100 * n, f) for n, f in enumerate(frames)))
+    return path
+
+
+def check(pair: Pair, tmp_path: Path, least: int) -> None:
+    """All that the companion sent in flight is what the replay sends."""
+    replay = replayed(read(logged(pair, tmp_path / "flight.tlog")))
+    comparison = compare(replay.recorded, replay.replayed)
+    assert not replay.stopped
+    assert comparison.differences == ()
+    assert comparison.setpoints == len(pair.payloads) >= least
+    sent = [frame[10:-2] for _, _, frame in pair.sent]
+    assert [each.payload for each in replay.replayed] == sent
+    assert replay.companion.outcome == pair.companion.outcome
+
+
+def test_a_program_with_our_ids_a_stop_and_a_pause(tmp_path: Path) -> None:
+    """The flight ends by the frames of another program, which are not in the log as received."""
+    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
+    forged = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(codec)
+
+    def down(time_s: float, datagrams: list[bytes]) -> list[bytes]:
+        if 9.0 < time_s < 9.01 and datagrams:
+            return [datagrams[0] + forged + datagrams[0][:7], *datagrams[1:]]
+        return datagrams
+
+    pair = short_flight(down=down, at=[(in_phase(Phase.CLIMB, 0.5), lambda p: p.pause(0.4))])
+    assert pair.went_through(Phase.HOLD)
+    assert any("paused" in line for line in pair.companion.announced)
+    check(pair, tmp_path, least=40)
+
+
+def test_slow_decisions_a_stop_request_and_strangers(tmp_path: Path) -> None:
+    """Each ninth decision is cut short by its deadline, or too late to be sent."""
+    clock = HostClock()
+
+    def slow(law: Controller) -> Controller:
+        decide, count = law.decide, iter(range(10**9))
+
+        def decided(situation: Situation) -> Decision:
+            clock.spend(0.06 if next(count) % 9 == 8 else 0.001)
+            return decide(situation)
+
+        law.decide = decided  # type: ignore[method-assign]
+        return law
+
+    def stop(pair: Pair) -> None:
+        pair.companion.strangers = 31
+        pair.companion.announce("31 datagrams of others")
+        pair.companion.request_stop("enough")
+
+    pair = short_flight(clock=clock, wrap=slow, at=[(in_phase(Phase.TRACK, 1.0), stop)])
+    assert pair.companion.outcome is not None
+    assert "enough" in pair.companion.outcome.sentence
+    check(pair, tmp_path, least=40)
+
+
+def test_an_error_in_a_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The frames of the turn stay in the log, and the replay fails and lands in the same turn."""
+    act = PhaseActions.act
+
+    def failing(self, tick) -> None:
+        if 10.0 <= tick.time_s < 10.1:
+            raise RuntimeError("as it happens")
+        act(self, tick)
+
+    monkeypatch.setattr(PhaseActions, "act", failing)
+    pair = short_flight()
+    assert pair.companion.outcome is not None
+    assert "as it happens" in pair.companion.outcome.sentence
+    check(pair, tmp_path, least=40)
+
+
+def test_each_flight_of_the_corpus_is_small() -> None:
+    sizes = [path.stat().st_size for path in FLIGHTS.iterdir()]
+    assert max(sizes) < 300_000
+    assert sum(sizes) < 1_500_000
+    with pytest.raises(ReplayError):
+        read(WIRE / "px4-1.16.1-offboard.tlog")
+    assert len(expected(SMALLEST)) == 181

@@ -1,0 +1,234 @@
+"""Signing of the session beside pymavlink: what it makes, what it accepts, what it refuses.
+
+FORGED_FRAMES=100000 is the long form of the test with forged and replayed frames.
+"""
+
+from __future__ import annotations
+
+import os
+import random
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from vehicle_frames import OFFBOARD, PEER, PX4
+
+from offboard.mavlink import events
+from offboard.mavlink.counters import FORGED, DropReason
+from offboard.mavlink.outgoing import CommandLong, Heartbeat
+from offboard.mavlink.session import Session, SessionSettings
+from offboard.mavlink.signing import BEHIND_MAX, RESERVED, Signing, stamp_of_unix
+
+KEY, OTHER_KEY = bytes(range(32)), bytes(range(1, 33))
+NOW = stamp_of_unix(1_800_000_000_000_000)
+COUNT = int(os.environ.get("FORGED_FRAMES", "2000"))
+
+
+class Signer:
+    """A sender that pymavlink signs for."""
+
+    def __init__(
+        self, key: bytes | None = KEY, system: int = 1, component: int = 1, stamp: int = NOW
+    ) -> None:
+        self.codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+        self.codec.signing.secret_key = key
+        self.codec.signing.sign_outgoing = key is not None
+        self.codec.signing.link_id = 5
+        self.codec.signing.timestamp = stamp
+
+    def heartbeat(self) -> bytes:
+        return self.pack(mavlink.MAVLink_heartbeat_message(2, PX4, 1, OFFBOARD, 3, 3))
+
+    def position(self, time_ms: int) -> bytes:
+        values = (1.0, 2.0, -3.0, 0.1, 0.0, 0.0)
+        return self.pack(mavlink.MAVLink_local_position_ned_message(time_ms, *values))
+
+    def pack(self, message: Any) -> bytes:
+        return bytes(message.pack(self.codec))
+
+
+def session(**settings: Any) -> Session:
+    return Session(SessionSettings(**settings), Signing(KEY, NOW))
+
+
+def paired() -> tuple[Session, Signer]:
+    """A session that has found its vehicle."""
+    ours, vehicle = session(), Signer()
+    ours.receive(vehicle.heartbeat(), PEER, 0.0)
+    assert ours.vehicle == events.VehicleFound(1, 1, "px4")
+    return ours, vehicle
+
+
+def test_pymavlink_accepts_what_we_sign_and_refuses_it_a_second_time() -> None:
+    ours, _ = paired()
+    reader = Signer().codec
+    frames = [ours.encode(Heartbeat(6)), ours.encode(CommandLong(400, (1.0,)))]
+    assert [reader.decode(bytearray(each)).get_type() for each in frames] == [
+        "HEARTBEAT",
+        "COMMAND_LONG",
+    ]
+    with pytest.raises(mavlink.MAVError, match="Invalid signature"):
+        reader.decode(bytearray(frames[1]))
+
+
+def test_a_vehicle_that_pymavlink_signs_for_is_found_and_logged_with_its_signature() -> None:
+    ours, vehicle = paired()
+    frame = vehicle.position(1000)
+    reception = ours.receive(frame, PEER, 0.1)
+    assert isinstance(reception.events[0], events.LocalPosition)
+    assert reception.frames == (frame,)
+    assert ours.counters.forged == 0
+
+
+def test_none_of_many_forged_and_replayed_frames_is_accepted() -> None:
+    ours, vehicle = paired()
+    chance = random.Random(13)
+    real = [vehicle.position(1000 + 20 * number) for number in range(50)]
+    stranger, unsigned = Signer(OTHER_KEY, stamp=NOW + 10**6), Signer(None)
+    for frame in real:
+        assert ours.receive(frame, PEER, 0.1).events
+    decoded = ours.counters.decoded
+
+    def altered(byte: int, end: int) -> bytes:
+        """A captured frame with another time stamp, link id or content, and a right checksum."""
+        frame = bytearray(chance.choice(real))
+        frame[byte:end] = chance.randbytes(end - byte)
+        if byte >= 0:
+            crc = mavlink.x25crc(bytes(frame[1:-15]))
+            crc.accumulate(bytes([mavlink.MAVLink_local_position_ned_message.crc_extra]))
+            frame[-15:-13] = crc.crc.to_bytes(2, "little")
+        return bytes(frame)
+
+    forgeries: tuple[Callable[[], bytes], ...] = (
+        lambda: chance.choice(real),  # a replay
+        lambda: stranger.position(chance.randrange(2**31)),
+        lambda: unsigned.position(chance.randrange(2**31)),
+        lambda: altered(-12, -6),  # time stamp
+        lambda: altered(-13, -12),  # link id: a stream that was never heard
+        lambda: altered(10, 30),  # content
+        lambda: bytes(bytearray(real[-1][:-6]) + chance.randbytes(6)),  # signature
+    )
+    for _ in range(COUNT):
+        reception = ours.receive(chance.choice(forgeries)(), PEER, 0.2)
+        assert (reception.events, reception.frames, reception.replies) == ((), (), ())
+    # a part of the altered frames is the original, by chance: then it is a replay
+    assert (ours.counters.forged, ours.counters.decoded) == (COUNT, decoded)
+    assert all(ours.counters.dropped[each] for each in FORGED if each is not DropReason.OLD_STAMP)
+    assert ours.receive(vehicle.position(9000), PEER, 0.3).events  # and the vehicle still is
+
+
+def test_only_radio_status_is_accepted_unsigned() -> None:
+    ours, _ = paired()
+    radio = mavlink.MAVLink_radio_status_message(1, 1, 100, 0, 0, 0, 0)
+    from_radio, unsigned = Signer(None, ord("3"), ord("D")), Signer(None)
+    before = ours.counters.forged
+    ours.receive(from_radio.pack(radio), PEER, 0.0)
+    assert ours.counters.forged == before
+    for message in (
+        mavlink.MAVLink_heartbeat_message(2, PX4, 1, OFFBOARD, 3, 3),
+        mavlink.MAVLink_collision_message(0, 1, 0, 0, 0.0, 0.0, 0.0),
+    ):
+        assert ours.receive(unsigned.pack(message), PEER, 0.0).events == ()
+    assert ours.counters.dropped[DropReason.UNSIGNED] == 2
+
+
+def test_a_frame_of_mavlink_1_has_no_signature() -> None:
+    ours, _ = paired()
+    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    message = mavlink.MAVLink_heartbeat_message(2, PX4, 1, OFFBOARD, 3, 3)
+    assert ours.receive(message.pack(codec, force_mavlink1=True), PEER, 0.0).events == ()
+    assert ours.counters.dropped[DropReason.UNSIGNED] == 1
+
+
+def test_unsigned_setpoints_with_our_ids_are_no_second_sender() -> None:
+    ours, _ = paired()
+    setpoint = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, [1, 0, 0, 0], 0, 0, 0, 0.5)
+    forged, signed = Signer(None, 1, 191), Signer(component=191)
+    assert ours.receive(forged.pack(setpoint), PEER, 0.0).events == ()
+    assert isinstance(ours.receive(signed.pack(setpoint), PEER, 0.0).events[0], events.OtherSender)
+
+
+@pytest.mark.parametrize(
+    ("key", "sentence"),
+    [
+        (OTHER_KEY, "signature does not match: it is another key's"),
+        (None, "arrive unsigned: set the key on the vehicle, or omit --signing-key"),
+    ],
+)
+def test_why_no_vehicle_was_found(key: bytes | None, sentence: str) -> None:
+    ours = session()
+    assert ours.receive(Signer(key).heartbeat(), PEER, 0.0).events == ()
+    assert sentence in ours.autopilots.why_none(ours.counters)
+
+
+def test_a_vehicle_that_signs_is_not_taken_without_its_key() -> None:
+    ours = Session(SessionSettings())
+    assert ours.receive(Signer().heartbeat(), PEER, 0.0).events == ()
+    assert "give its key with --signing-key" in ours.autopilots.why_none(ours.counters)
+
+
+def test_a_vehicle_whose_clock_is_behind_hears_ours_and_is_found() -> None:
+    """PX4 begins with the stamp that came with its key, perhaps years ago."""
+    ours, vehicle = session(), Signer(stamp=NOW - 10 * BEHIND_MAX)
+    reception = ours.receive(vehicle.heartbeat(), PEER, 0.0)
+    assert reception.events == (events.ClockBehind(1),)
+    assert ours.vehicle is None
+    (heartbeat,) = ours.poll(0.0)
+    assert isinstance(heartbeat, Heartbeat)
+    assert vehicle.codec.decode(bytearray(ours.encode(heartbeat))).type == 6  # as PX4 needs it
+    ours.receive(vehicle.heartbeat(), PEER, 1.0)
+    assert ours.vehicle is not None
+
+
+def test_our_stamps_follow_a_vehicle_whose_clock_is_ahead() -> None:
+    ours, vehicle = session(), Signer(stamp=NOW + 10 * BEHIND_MAX)
+    ours.receive(vehicle.heartbeat(), PEER, 0.0)
+    frame = ours.encode(Heartbeat(6))
+    assert int.from_bytes(frame[-12:-6], "little") >= NOW + 10 * BEHIND_MAX
+
+
+def test_another_port_needs_the_signature() -> None:
+    ours, vehicle = paired()
+    other = (PEER[0], PEER[1] + 1)
+    assert ours.receive(Signer(None).position(2000), other, 5.0).events == ()
+    assert ours.receive(Signer(OTHER_KEY).position(2000), other, 5.0).events == ()
+    moved = ours.receive(vehicle.position(2000), other, 5.0).events
+    assert moved[0] == events.PeerChanged(other)
+    assert len(moved) == 2  # its check did not use up the time stamp
+
+
+def test_stamps_increase_whatever_the_clock_does_and_are_reserved_first() -> None:
+    time_s, reserved = [100.0], []
+    signing = Signing(KEY, NOW, lambda: time_s[0], reserved.append, NOW)
+    stamps = []
+    for elapsed_s in (0.0, 0.0, 10.0, -50.0, 0.0, 40.0, 40.0):
+        time_s[0] += elapsed_s
+        stamps.append(int.from_bytes(signing.sign(b"")[-12:-6], "little"))
+        assert stamps[-1] < reserved[-1]
+    assert stamps == sorted(set(stamps))
+    assert len(reserved) == 2
+    assert reserved[0] == stamps[0] + RESERVED
+
+
+def test_what_continues_has_later_stamps_and_refuses_older_ones() -> None:
+    ours, vehicle = paired()
+    frame = vehicle.position(1000)
+    ours.receive(frame, PEER, 0.0)
+    assert ours._signing is not None
+    signing = Signing.resumed(KEY, lambda: 0.0, ours._signing.state())
+    later = Session(SessionSettings(), signing)
+    later.adopt(events.VehicleFound(1, 1, "px4"), PEER)
+    assert later.receive(frame, PEER, 0.0).events == ()
+    assert later.counters.dropped[DropReason.REPLAYED] == 1
+    assert later.receive(vehicle.position(1020), PEER, 0.0).events
+    before, after = ours.encode(Heartbeat(6)), later.encode(Heartbeat(6))
+    assert before[-12:-6][::-1] < after[-12:-6][::-1]
+
+
+def test_the_key_is_not_logged_or_shown() -> None:
+    unsigned = Session(SessionSettings())
+    setup = mavlink.MAVLink_setup_signing_message(1, 1, list(KEY), NOW)
+    assert unsigned.receive(Signer(None, 255, 190).pack(setup), PEER, 0.0).frames == ()
+    assert repr(KEY)[2:-1] not in repr(Signing(KEY))
+    assert KEY.hex() not in repr(Signing(KEY))
