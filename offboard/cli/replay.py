@@ -11,8 +11,8 @@ if TYPE_CHECKING:
     from offboard.replay.recording import Recording
 
 EXIT_CODES = (
-    "Exit codes: 0 all identical; 1 a setpoint or a command differs; 2 the log cannot be replayed, "
-    "or there is nothing to compare."
+    "Exit codes: 0 all identical, or rounded differently by another computer; 1 a setpoint or a "
+    "command differs; 2 the log cannot be replayed, or there is nothing to compare."
 )
 
 
@@ -57,11 +57,11 @@ def _show_verdict(recording: Recording) -> None:
     if result.stopped:
         complain(f"replayed up to {result.ended_s:.1f} s of vehicle time: {result.stopped}")
     sentence = result.comparison.sentence()
-    if not result.comparison.differences:
+    if not result.comparison.significant:
         say(f"{sentence} ({result.turns} turns, up to {result.ended_s:.1f} s of vehicle time)")
         return
     say("the first difference:")
-    for line in explained(recording, result.comparison.differences[0]):
+    for line in explained(recording, result.comparison.significant[0]):
         say(f"  {line}", indent=6)
     raise CommandError(sentence, 1)
 

@@ -16,6 +16,9 @@ from offboard.replay.replaying import Sent
 SETPOINTS = (82, 84, 86)  # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED, ..._GLOBAL_INT
 COMMANDS = (75, 76)  # COMMAND_INT, COMMAND_LONG
 ATTITUDE_TARGET = 82
+# Of a field, relative to its value or to 1: another processor or library rounds differently, by up
+# to 1e-8 rad and 6e-8 of thrust between two x86-64 processors
+ROUNDING = 1e-6
 _UNSTAMPED = ("time_boot_ms", "target_system", "target_component")
 Key = tuple[float, int, bytes, int]
 
@@ -63,6 +66,15 @@ class Difference:
             if not _same(value, after[name])
         ]
 
+    def is_rounding(self) -> bool:
+        """Whether the same setpoint was only rounded differently, see `ROUNDING`."""
+        fields = self.fields()
+        return (
+            self._either.message_id in SETPOINTS
+            and bool(fields)
+            and all(by <= ROUNDING * max(1.0, abs(value)) for _, value, _, by in fields)
+        )
+
     @property
     def _either(self) -> Sent:
         either = self.expected or self.actual
@@ -94,6 +106,11 @@ class Comparison:
     def largest_thrust(self) -> float:
         return _largest(each.thrust for each in self.differences)
 
+    @property
+    def significant(self) -> tuple[Difference, ...]:
+        """The differences that are more than rounding."""
+        return tuple(each for each in self.differences if not each.is_rounding())
+
     def sentence(self) -> str:
         """What was compared, and how much differs."""
         total = f"{self.setpoints} setpoints and {self.commands} commands"
@@ -105,7 +122,9 @@ class Comparison:
             f"{len(self.differences)} of {total} differ; largest difference {angle_deg:.3g} deg "
             f"and {self.largest_thrust:.3g} of thrust"
         )
-        return f"{sentence}; {alone} were sent on one side only" if alone else sentence
+        if alone:
+            return f"{sentence}; {alone} were sent on one side only"
+        return sentence if self.significant else f"{sentence}: rounding of another computer"
 
 
 def compare(expected: Iterable[Sent], actual: Iterable[Sent]) -> Comparison:

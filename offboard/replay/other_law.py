@@ -24,7 +24,7 @@ def other_law(recording: Recording, name: str) -> list[str]:
     for _ in replay.turns():
         pass
     lines = []
-    differences = compare(replay.recorded, replay.replayed).differences
+    differences = compare(replay.recorded, replay.replayed).significant
     if differences:
         lines.append(
             f"the replay itself differs from {differences[0].time_s:.3f} s on: see `replay`"

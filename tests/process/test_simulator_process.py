@@ -91,7 +91,7 @@ def test_before_the_companion_is_heard_the_same_datagrams_are_repeated() -> None
 
 
 def test_a_companion_that_falls_silent_in_flight_is_noticed() -> None:
-    options = (*QUIET, "--lockstep", "--patience", "0.5", "--scenario", "calm")
+    options = (*QUIET, "--lockstep", "--patience", "2", "--scenario", "calm")
     with Peer() as peer, simulator(*to(peer), *options) as process:
         peer.listen(lambda: peer.vehicle is not None)
         peer.heartbeat()
