@@ -12,19 +12,14 @@ import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 
-import numpy as np
-
 from offboard.control.base import Adopting, Controller
-from offboard.estimation.fusion import FusedObserver
 from offboard.estimation.observer import Observer
-from offboard.flight import assessment, guards
+from offboard.flight import assessment
 from offboard.flight.actions import PhaseActions
-from offboard.flight.authority import Authority
 from offboard.flight.decide import Decider, Tick
+from offboard.flight.event_processor import EventProcessor
 from offboard.flight.facts import Facts
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.ground_contact import GroundContact
-from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.inputs import InputRecorder
 from offboard.flight.link import Chunk
 from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
@@ -35,16 +30,12 @@ from offboard.flight.phases import (
     ENDS,
     FLYING,
     PHASE_CODES,
-    TRACKING,
     WAITING,
     Limits,
     Phase,
     Rung,
 )
-from offboard.flight.position_jumps import PositionJumps
 from offboard.flight.programme import FLY, Programme
-from offboard.flight.readiness import Readiness
-from offboard.flight.requests import Circumstances, Request, Result, answer
 from offboard.flight.snapshot import Snapshot, snapshot_of
 from offboard.flight.state import FlightState, Outcome
 from offboard.flight.supervisor import Supervised
@@ -52,20 +43,11 @@ from offboard.identification.learned import Learned
 from offboard.mavlink.events import (
     Attitude,
     ClockBehind,
-    CommandRequest,
     Event,
-    GpsFix,
-    Heartbeat,
     LocalPosition,
-    ModeReport,
-    Origin,
-    OtherCompanion,
-    PeerChanged,
     Rebooted,
-    ThrustReport,
-    TimesyncReply,
 )
-from offboard.mavlink.outgoing import CommandResult, Outgoing
+from offboard.mavlink.outgoing import Outgoing
 from offboard.mavlink.session import ACTIVE, Session
 from offboard.model.vehicle import Vehicle
 
@@ -124,7 +106,6 @@ class Companion:
         # host time of the last turn, and telemetry
         self._turned_s: float = before._turned_s if before else math.nan
         self._heard_s: float = before._heard_s if before else math.nan
-        self._arrived_s = 0.0  # host time of the arrival of the newest telemetry
         self._bridged_s = 0.0
         self._received: list[bytes] = []  # frames that are not in an `Output` yet
         self._inputs = InputRecorder(session.settings, kept=not programme.serves)
@@ -155,6 +136,13 @@ class Companion:
             session=session,
             observer=observer,
             decider=decider,
+            outbox=self._outbox,
+        )
+        self._events = EventProcessor(
+            state=state,
+            session=session,
+            observer=observer,
+            identification=self._identification,
             outbox=self._outbox,
         )
 
@@ -254,7 +242,9 @@ class Companion:
             replies += reception.replies
             for event in reception.events:
                 heard |= self._is_telemetry(event)
-                self._process(self._with_own_position(event), arrived_s)
+                self._events.process(event, arrived_s, turned_s=now_s)
+                if isinstance(event, Rebooted):
+                    self._on_reboot()
         news = self._session.counters.news()
         if news:
             self._outbox.announce(news)
@@ -262,7 +252,7 @@ class Companion:
         self._session.status = self._status()
         due = self._session.poll(now_s)
         state.now_s = state.vehicle.now_s = self._session.link_time_s
-        state.host_s = self._clock_s(now_s)
+        state.host_s = self._session.clock_s(now_s)
         if heard:
             self._heard_s, state.silence_s, self._bridged_s = now_s, 0.0, 0.0
         self._act()
@@ -292,7 +282,7 @@ class Companion:
             self._turned_s = self._heard_s = now_s
         paused_s = now_s - self._turned_s
         self._turned_s = now_s
-        state.host_s = self._clock_s(now_s)
+        state.host_s = self._session.clock_s(now_s)
         state.silence_s = now_s - self._heard_s
         if paused_s > PAUSE_S and state.authority is not None and not self._lockstep:
             state.authority.doubt(now_s)
@@ -318,146 +308,7 @@ class Companion:
             return not isinstance(event, ClockBehind)
         return isinstance(event, (Attitude, LocalPosition))
 
-    # ------------------------------------------------------------------ telemetry
-
-    def _with_own_position(self, event: Event) -> Event:
-        """The event; with `estimate: fused` a position is replaced by that of our own fusion."""
-        if not isinstance(self._observer, FusedObserver):
-            return event
-        fusion = self._observer.fusion
-        match event:
-            case GpsFix(time_s, place, velocity, accuracy_m):
-                fusion.on_fix(time_s, place, velocity, accuracy_m)
-            case Origin(place, reported):
-                fusion.on_origin(place, reported)
-            case LocalPosition(time_s, position, speed):
-                event = LocalPosition(time_s, *fusion.follow(time_s, position, speed))
-        while fusion.news:
-            self._outbox.announce(fusion.news.pop(0))
-        return event
-
-    def _process(self, event: Event, arrived_s: float) -> None:
-        state = self.state
-        state.now_s = self._session.link_time_s
-        state.vehicle.update(event, state.now_s)
-        match event:
-            case Attitude(time_s, attitude, rates):
-                self._on_telemetry(time_s, arrived_s)
-                self._observer.on_attitude(time_s, attitude, rates)
-                if self._identification:
-                    self._identification.on_attitude(time_s, attitude)
-            case LocalPosition(time_s, position, velocity) if event is state.vehicle.position:
-                self._on_telemetry(time_s, arrived_s)
-                state.contact.on_position(event)
-                state.hover.on_position(time_s, state.contact.height_m, velocity[2])
-                if state.touchdown:
-                    state.touchdown.on_position(time_s, position, velocity[2])
-                self._follow_jump(event)
-                self._observer.on_position(time_s, position, velocity)
-                if self._identification:
-                    north, east, down = np.subtract(position, state.jumps.total_ned_m).tolist()
-                    self._identification.on_position(time_s, (north, east, down), velocity)
-            case ThrustReport(thrust):
-                state.hover.on_thrust(state.time_s, thrust)
-            case Heartbeat(mode) | ModeReport(mode):
-                self._on_mode(event, mode, arrived_s)
-            case TimesyncReply(vehicle_ns=vehicle_ns):
-                asked_s = state.link.on_reply(event)
-                if asked_s is not None:
-                    state.clock.on_reply(vehicle_ns * 1e-9, asked_s)
-            case CommandRequest():
-                self._answer(event)
-            case PeerChanged(peer):
-                self._outbox.announce(f"the vehicle now sends from another port: {peer}")
-            case OtherCompanion(system, component):
-                self._outbox.announce_once(
-                    f"another companion computer is on the link: system {system} component "
-                    f"{component}; only one of them may send setpoints"
-                )
-            case ClockBehind(system_id):
-                self._greet(system_id)
-            case Rebooted():
-                self._on_reboot()
-
-    def _follow_jump(self, event: LocalPosition) -> None:
-        """The vehicle does not step when its estimate does."""
-        state, jump_ned_m = self.state, self.state.jumps.on_position(event)
-        if state.phase not in TRACKING:
-            state.jumps.forget()
-        elif jump_ned_m is not None:
-            back_s = state.plan.follow_jump(event.time_s, jump_ned_m)
-            self._outbox.announce(
-                f"the estimated position jumped by {np.linalg.norm(jump_ned_m):.2f} m: the "
-                f"reference jumps with it, and returns within {back_s:.0f} s"
-            )
-
-    def _on_telemetry(self, stamp_s: float, arrived_s: float) -> None:
-        self._arrived_s = arrived_s
-        # A stream says only how early it may have arrived: after a pause of ours it would be ahead
-        host_s = self._turned_s if self._session.settings.stream else arrived_s
-        self.state.clock.on_telemetry(stamp_s, self._clock_s(host_s))
-
-    def _clock_s(self, host_s: float) -> float:
-        """Host time; in lockstep, where host time must decide nothing, the link's own seconds."""
-        return self._session.link_time_s if self._lockstep else host_s
-
-    def _answer(self, asked: CommandRequest) -> None:
-        """Acknowledge a command to us; the next tick does what it asks for."""
-        state = self.state
-        if state.programme.serves:
-            now = self.facts()
-            fit = guards.usable(now)
-            circumstances = Circumstances(
-                state.phase,
-                state.vehicle.armed,
-                state.programme.may_arm,
-                fit,
-                fit and guards.can_take_over(now),
-            )
-            result, request = answer(asked.command, asked.parameters, circumstances)
-            if request is not Request.NONE:
-                state.request = request
-                sender = f"system {asked.system_id} component {asked.component_id}"
-                self._outbox.announce(f"{request.value} requested by {sender}")
-        else:
-            result = Result.UNSUPPORTED
-        self._outbox.send(CommandResult(asked.command, result, asked.system_id, asked.component_id))
-
-    def _on_mode(self, event: Heartbeat | ModeReport, mode: str, arrived_s: float) -> None:
-        state = self.state
-        if state.authority is None:
-            state.dialect = self._session.dialect
-            assert state.dialect is not None
-            state.authority = Authority(state.dialect.engage_mode)
-        state.authority.on_mode(
-            mode, state.now_s, arrived_s=arrived_s, failsafe=state.vehicle.in_failsafe
-        )
-        ours = mode == state.authority.engage_mode
-        contact = state.contact
-        state.pilot.on_mode(
-            ours=ours, in_the_air=contact.in_the_air, certainly=contact.certainly_flies
-        )
-        if assessment.has_other_sender(state):
-            state.pilot.engaged = False  # it was not switched for us
-        if isinstance(event, Heartbeat):
-            state.pilot.on_heartbeat(ours=ours, failsafe=state.vehicle.in_failsafe)
-
-    def _greet(self, system_id: int) -> None:
-        """Its time stamps will follow ours, once it has heard us."""
-        sentence = f"the signing time of system {system_id} is behind: sending ours"
-        if sentence not in self.announced:
-            self._outbox.announce(sentence)
-
     def _on_reboot(self) -> None:
-        state = self.state
-        self._observer.reset()
-        state.link.reset()
-        state.growth.reset()
-        state.clock.reset()
-        state.contact = GroundContact(state.vehicle)
-        state.hover, state.jumps = HoverEstimate(), PositionJumps()
-        state.readiness = Readiness()
-        state.authority = None
         self._tick = -1
         self._machine.on_reboot()
 
@@ -481,7 +332,7 @@ class Companion:
                     time_s,
                     state.phase,
                     state.in_phase_s,
-                    self._arrived_s,
+                    self._events.telemetry_arrived_s,
                     missed,
                     ignored - self._recorded_strangers,
                 )

@@ -409,6 +409,10 @@ class Session:
         """Monotonic seconds that follow vehicle time, or host time while telemetry is missing."""
         return self._link_time.seconds
 
+    def clock_s(self, host_s: float) -> float:
+        """Host time; in lockstep, where host time must decide nothing, the link's own seconds."""
+        return self.link_time_s if self.settings.lockstep else host_s
+
     @property
     def rates_hz(self) -> dict[str, float]:
         """Measured rate of each wanted message over the last two seconds of `link_time_s`."""

@@ -1,0 +1,196 @@
+"""What each received message changes in the state of the flight. Sends nothing but answers."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from offboard.estimation.fusion import FusedObserver
+from offboard.estimation.observer import Observer
+from offboard.flight import assessment, guards
+from offboard.flight.authority import Authority
+from offboard.flight.ground_contact import GroundContact
+from offboard.flight.hover_estimate import HoverEstimate
+from offboard.flight.online_identification import OnlineIdentification
+from offboard.flight.outbox import Outbox
+from offboard.flight.phases import TRACKING
+from offboard.flight.position_jumps import PositionJumps
+from offboard.flight.readiness import Readiness
+from offboard.flight.requests import Circumstances, Request, Result, answer
+from offboard.flight.state import FlightState
+from offboard.mavlink.events import (
+    Attitude,
+    ClockBehind,
+    CommandRequest,
+    Event,
+    GpsFix,
+    Heartbeat,
+    LocalPosition,
+    ModeReport,
+    Origin,
+    OtherCompanion,
+    PeerChanged,
+    Rebooted,
+    ThrustReport,
+    TimesyncReply,
+)
+from offboard.mavlink.outgoing import CommandResult
+from offboard.mavlink.session import Session
+
+
+class EventProcessor:
+    """Updates `state`, observer and identification by one event after the other.
+
+    `telemetry_arrived_s` is the host time at which the newest position or attitude has arrived.
+    """
+
+    def __init__(
+        self,
+        *,
+        state: FlightState,
+        session: Session,
+        observer: Observer,
+        identification: OnlineIdentification | None,
+        outbox: Outbox,
+    ) -> None:
+        self._state = state
+        self._session = session
+        self._observer = observer
+        self._identification = identification
+        self._outbox = outbox
+        self.telemetry_arrived_s = 0.0
+
+    def process(self, event: Event, arrived_s: float, *, turned_s: float) -> None:
+        """`arrived_s` is the host time of the event's arrival, `turned_s` that of the turn."""
+        state = self._state
+        event = self._with_own_position(event)
+        state.now_s = self._session.link_time_s
+        state.vehicle.update(event, state.now_s)
+        match event:
+            case Attitude(time_s, attitude, rates):
+                self._on_telemetry(time_s, arrived_s, turned_s)
+                self._observer.on_attitude(time_s, attitude, rates)
+                if self._identification:
+                    self._identification.on_attitude(time_s, attitude)
+            case LocalPosition() if event is state.vehicle.position:
+                self._on_telemetry(event.time_s, arrived_s, turned_s)
+                self._on_position(event)
+            case ThrustReport(thrust):
+                state.hover.on_thrust(state.time_s, thrust)
+            case Heartbeat(mode) | ModeReport(mode):
+                self._on_mode(event, mode, arrived_s)
+            case TimesyncReply(vehicle_ns=vehicle_ns):
+                asked_s = state.link.on_reply(event)
+                if asked_s is not None:
+                    state.clock.on_reply(vehicle_ns * 1e-9, asked_s)
+            case CommandRequest():
+                self._answer(event)
+            case PeerChanged(peer):
+                self._outbox.announce(f"the vehicle now sends from another port: {peer}")
+            case OtherCompanion(system, component):
+                self._outbox.announce_once(
+                    f"another companion computer is on the link: system {system} component "
+                    f"{component}; only one of them may send setpoints"
+                )
+            case ClockBehind(system_id):  # its time stamps follow ours once it has heard us
+                self._outbox.announce_once(
+                    f"the signing time of system {system_id} is behind: sending ours"
+                )
+            case Rebooted():
+                self._on_reboot()
+
+    def _with_own_position(self, event: Event) -> Event:
+        """The event; with `estimate: fused` a position is replaced by that of our own fusion."""
+        if not isinstance(self._observer, FusedObserver):
+            return event
+        fusion = self._observer.fusion
+        match event:
+            case GpsFix(time_s, place, velocity, accuracy_m):
+                fusion.on_fix(time_s, place, velocity, accuracy_m)
+            case Origin(place, reported):
+                fusion.on_origin(place, reported)
+            case LocalPosition(time_s, position, speed):
+                event = LocalPosition(time_s, *fusion.follow(time_s, position, speed))
+        while fusion.news:
+            self._outbox.announce(fusion.news.pop(0))
+        return event
+
+    def _on_telemetry(self, stamp_s: float, arrived_s: float, turned_s: float) -> None:
+        self.telemetry_arrived_s = arrived_s
+        # A stream says only how early it may have arrived: after a pause of ours it would be ahead
+        host_s = turned_s if self._session.settings.stream else arrived_s
+        self._state.clock.on_telemetry(stamp_s, self._session.clock_s(host_s))
+
+    def _on_position(self, event: LocalPosition) -> None:
+        state, time_s, down_mps = self._state, event.time_s, event.velocity_ned_mps[2]
+        state.contact.on_position(event)
+        state.hover.on_position(time_s, state.contact.height_m, down_mps)
+        if state.touchdown:
+            state.touchdown.on_position(time_s, event.position_ned_m, down_mps)
+        self._follow_jump(event)
+        self._observer.on_position(time_s, event.position_ned_m, event.velocity_ned_mps)
+        if self._identification:
+            north, east, down = np.subtract(event.position_ned_m, state.jumps.total_ned_m).tolist()
+            self._identification.on_position(time_s, (north, east, down), event.velocity_ned_mps)
+
+    def _follow_jump(self, event: LocalPosition) -> None:
+        """The vehicle does not step when its estimate does."""
+        state, jump_ned_m = self._state, self._state.jumps.on_position(event)
+        if state.phase not in TRACKING:
+            state.jumps.forget()
+        elif jump_ned_m is not None:
+            back_s = state.plan.follow_jump(event.time_s, jump_ned_m)
+            self._outbox.announce(
+                f"the estimated position jumped by {np.linalg.norm(jump_ned_m):.2f} m: the "
+                f"reference jumps with it, and returns within {back_s:.0f} s"
+            )
+
+    def _on_mode(self, event: Heartbeat | ModeReport, mode: str, arrived_s: float) -> None:
+        state = self._state
+        if state.authority is None:
+            state.dialect = self._session.dialect
+            assert state.dialect is not None
+            state.authority = Authority(state.dialect.engage_mode)
+        state.authority.on_mode(
+            mode, state.now_s, arrived_s=arrived_s, failsafe=state.vehicle.in_failsafe
+        )
+        ours = mode == state.authority.engage_mode
+        contact = state.contact
+        state.pilot.on_mode(
+            ours=ours, in_the_air=contact.in_the_air, certainly=contact.certainly_flies
+        )
+        if assessment.has_other_sender(state):
+            state.pilot.engaged = False  # it was not switched for us
+        if isinstance(event, Heartbeat):
+            state.pilot.on_heartbeat(ours=ours, failsafe=state.vehicle.in_failsafe)
+
+    def _answer(self, asked: CommandRequest) -> None:
+        """Acknowledge a command to us; the next tick does what it asks for."""
+        state, result = self._state, Result.UNSUPPORTED
+        if state.programme.serves:
+            now = assessment.facts(state, self._session, self._observer, self._identification)
+            fit = guards.usable(now)
+            circumstances = Circumstances(
+                state.phase,
+                state.vehicle.armed,
+                state.programme.may_arm,
+                fit,
+                fit and guards.can_take_over(now),
+            )
+            result, request = answer(asked.command, asked.parameters, circumstances)
+            if request is not Request.NONE:
+                state.request = request
+                sender = f"system {asked.system_id} component {asked.component_id}"
+                self._outbox.announce(f"{request.value} requested by {sender}")
+        self._outbox.send(CommandResult(asked.command, result, asked.system_id, asked.component_id))
+
+    def _on_reboot(self) -> None:
+        """Nothing that was known of vehicle and link is known any more."""
+        state = self._state
+        self._observer.reset()
+        state.link.reset()
+        state.growth.reset()
+        state.clock.reset()
+        state.contact = GroundContact(state.vehicle)
+        state.hover, state.jumps = HoverEstimate(), PositionJumps()
+        state.readiness = Readiness()
+        state.authority = None
