@@ -129,6 +129,13 @@ def await_end(pid: int) -> None:
         time.sleep(0.02)
 
 
+def await_text(log: Path, text: bytes) -> None:
+    deadline_s = time.monotonic() + LONG_S
+    while text not in log.read_bytes():
+        assert time.monotonic() < deadline_s, f"the log does not hold {text!r}"
+        time.sleep(0.02)
+
+
 def story(log: tlog.Tlog) -> list[str]:
     """Commands and texts about the take-over, in order, repeated ones once."""
     told: list[str] = []
@@ -164,10 +171,7 @@ def test_a_stopped_controller_that_continues_sends_nothing(
     flight = tracking(spawn, connections(spawn, "tcp", cable))
     flight.send_signal(signal.SIGSTOP)
     path = tmp_path / "x" / "flight.tlog"
-    deadline_s = time.monotonic() + LONG_S
-    while b"hold requested" not in path.read_bytes():
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
+    await_text(path, b"hold requested")
     flight.send_signal(signal.SIGCONT)
     _, said = flight.communicate(timeout=LONG_S)
     assert flight.returncode == 4
@@ -193,13 +197,14 @@ def test_an_endless_loop_in_a_law(
         "[pso_offboard.controllers]\nhangs = law_that_hangs:Settings\n"
     )
     (tmp_path / "law_that_hangs.py").write_text(LAW_THAT_HANGS)
-    path = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH"))))
+    modules = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH"))))
     connection = connections(spawn, "serial", cable)
-    flight = tracking(spawn, connection, "--controller", "hangs", PYTHONPATH=path)
+    flight = tracking(spawn, connection, "--controller", "hangs", PYTHONPATH=modules)
     (supervisor,) = children(flight.pid)
     (tmp_path / "hang").touch()
-    await_end(supervisor)
-    assert story(tlog.read(tmp_path / "x" / "flight.tlog")) == [
-        "hold", "land", "Disarmed by landing",
-    ]  # fmt: skip
+    path = tmp_path / "x" / "flight.tlog"
+    await_text(path, b"land requested")
     assert flight.poll() is None  # it hangs for ever
+    flight.send_signal(signal.SIGSTOP)  # which needs no processor
+    await_end(supervisor)
+    assert story(tlog.read(path)) == ["hold", "land", "Disarmed by landing"]
