@@ -40,6 +40,11 @@ os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
 os.environ["OFFBOARD_REPORT"] = "0"  # flights of tests write no report
 
 
+def pytest_xdist_auto_num_workers() -> int:
+    """`-n auto`: one more than processors, since many tests wait for a vehicle in real time."""
+    return (os.cpu_count() or 1) + 1
+
+
 def pytest_sessionstart(session: pytest.Session) -> None:
     if not hasattr(session.config, "workerinput") and not session.config.option.collectonly:
         for package in PACKAGES:
