@@ -149,17 +149,6 @@ def test_identified_constants_are_announced_and_recorded():
     )
 
 
-def test_identification_is_reproducible():
-    short = ("reference.laps=1", "reference.period_s=6", "reference.half_length_m=1")
-    first, again = (
-        make(*short, vehicle="neutral", scenario="px4_like", learning=IDENTIFY) for _ in range(2)
-    )
-    for pair in (first, again):
-        assert pair.fly().exit_code == 0
-    assert len(first.payloads) > 200
-    assert first.payloads == again.payloads
-
-
 def test_switched_off_nothing_is_excited_or_adopted():
     """The bandwidth is one that supports a delay 0.13 s longer than the vehicle file's."""
     pair = neutral("hover", learning=IdentifySettings(online=False))

@@ -109,8 +109,6 @@ def undisturbed(
 @pytest.mark.parametrize(
     ("disturbance", "load"),
     [
-        ({"simulator_late_s": 0.3}, 0),
-        ({"simulator_late_s": 1.0}, 0),
         ({"simulator_late_s": 2.0}, 0),
         ({"controller_late_s": 1.0}, 0),  # the simulator repeats its first barrier
         ({"stall_s": 1.2}, 0),  # it repeats a barrier in flight
