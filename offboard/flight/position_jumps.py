@@ -6,6 +6,7 @@ apart that no motion joins show a jump, on any autopilot.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -37,13 +38,18 @@ class PositionJumps:
         passed_s = position.time_s - before.time_s
         if not 0.0 < passed_s < LONGEST_GAP_S:
             return None
-        speed_mps = 0.5 * np.add(before.velocity_ned_mps, position.velocity_ned_mps)
-        moved_m = np.subtract(position.position_ned_m, before.position_ned_m)
-        jump: Array = moved_m - passed_s * speed_mps
-        size_m = float(np.linalg.norm(jump))
+        jump_m = [  # in floats: it is computed for every position
+            here - there - passed_s * (0.5 * (speed + speed_there))
+            for here, there, speed, speed_there in zip(
+                position.position_ned_m, before.position_ned_m,
+                position.velocity_ned_mps, before.velocity_ned_mps, strict=True,
+            )
+        ]  # fmt: skip
+        size_m = math.hypot(*jump_m)
         if size_m <= LEAST_JUMP_M + 0.5 * ACCELERATION_MPS2 * passed_s**2:
             return None
         self._jumps.append((position.time_s, size_m))
+        jump = np.array(jump_m)
         self.total_ned_m = self.total_ned_m + jump
         return jump
 
