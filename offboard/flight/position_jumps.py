@@ -20,6 +20,8 @@ LEAST_JUMP_M = 0.3  # as ObserverSettings.position_jump_m; a smaller one is corr
 ACCELERATION_MPS2 = 20.0  # that the reported velocities need not show
 LONGEST_GAP_S = 0.5  # after a longer one nothing is concluded
 RECENT_S = 10.0
+NOISES = 6.0  # times the mean difference of successive positions; less is no jump, but noise
+NOISE_SHARE = 0.01  # of the newest difference in this mean
 
 
 class PositionJumps:
@@ -28,6 +30,7 @@ class PositionJumps:
     def __init__(self) -> None:
         self._newest: LocalPosition | None = None
         self._jumps: deque[tuple[float, float]] = deque()  # when, by how many metres
+        self._noise_m = 0.0  # mean distance between a position and what the one before leads to
         self.total_ned_m: Array = np.zeros(3)
 
     def on_position(self, position: LocalPosition) -> Array | None:
@@ -46,7 +49,10 @@ class PositionJumps:
             )
         ]  # fmt: skip
         size_m = math.hypot(*jump_m)
-        if size_m <= LEAST_JUMP_M + 0.5 * ACCELERATION_MPS2 * passed_s**2:
+        least_m = max(LEAST_JUMP_M, NOISES * self._noise_m)
+        least_m += 0.5 * ACCELERATION_MPS2 * passed_s**2
+        self._noise_m += NOISE_SHARE * (min(size_m, least_m) - self._noise_m)
+        if size_m <= least_m:
             return None
         self._jumps.append((position.time_s, size_m))
         jump = np.array(jump_m)
