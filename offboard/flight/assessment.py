@@ -212,9 +212,13 @@ def _shown_since_lost(state: FlightState) -> bool:
 
 
 def _disarmed_again(state: FlightState) -> bool:
+    """A HEARTBEAT that is newer than the acceptance shows it disarmed when it should be armed. On a
+    lossy link the acceptance may come long after the first request, and a HEARTBEAT be missing."""
     vehicle = state.vehicle
     accepted = vehicle.results.get(ARM) == "ACCEPTED"
-    return accepted and vehicle.disarmed and state.in_phase_s > ARMING_SHOWN_S
+    since_s = state.now_s - vehicle.answered_s.get(ARM, state.now_s)
+    shown = vehicle.disarmed and vehicle.age_s(Heartbeat) < since_s
+    return accepted and shown and since_s > ARMING_SHOWN_S
 
 
 def _from_take_off(state: FlightState) -> tuple[float, float, float]:

@@ -95,10 +95,12 @@ class VehicleClock:
 
     def now_s(self, host_s: float) -> float:
         """Vehicle time at host time `host_s`; -inf before the first telemetry."""
-        rate = self._rate
-        shown_s = max((s + rate * (host_s - a) for s, a in self._seen), default=-math.inf)
-        recent = ((v, host_s - a) for v, a in self._bounds if host_s - a <= BOUNDS_S)
-        return min(shown_s, min((v + rate * since_s for v, since_s in recent), default=math.inf))
+        rate, bounds = self._rate, self._bounds
+        while bounds and host_s - bounds[0][1] > BOUNDS_S:
+            bounds.popleft()
+        shown_s = max([s + rate * (host_s - a) for s, a in self._seen], default=-math.inf)
+        recent = [v + rate * (host_s - a) for v, a in bounds if host_s - a <= BOUNDS_S]
+        return min([shown_s, *recent])
 
     def age_s(self, stamp_s: float, host_s: float) -> float:
         """Age at `host_s` of telemetry stamped `stamp_s`, beyond the least delay of the window."""

@@ -99,7 +99,8 @@ class Loop:
         """Fly to the end. The first stop request lands, a second one exits immediately."""
         self._stops.in_flight = True
         gc.collect()
-        gc.freeze()
+        if not gc.get_freeze_count():  # by an earlier flight in this process
+            gc.freeze()
         self._succeeded_s = clock.monotonic_s()
         while not (self._companion.has_ended() or self._stops.repeated or self._ended_early):
             try:
@@ -107,7 +108,6 @@ class Loop:
                 self._succeeded_s = clock.monotonic_s()
             except BaseException as error:  # a law may even end the program
                 self._hand_back(error)
-        gc.unfreeze()  # of many flights in one process, each would leave its garbage
         self._show()
         return self._outcome()
 

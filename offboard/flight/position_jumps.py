@@ -6,6 +6,7 @@ apart that no motion joins show a jump, on any autopilot.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 
 import numpy as np
@@ -19,6 +20,8 @@ LEAST_JUMP_M = 0.3  # as ObserverSettings.position_jump_m; a smaller one is corr
 ACCELERATION_MPS2 = 20.0  # that the reported velocities need not show
 LONGEST_GAP_S = 0.5  # after a longer one nothing is concluded
 RECENT_S = 10.0
+NOISES = 6.0  # times the mean difference of successive positions; less is no jump, but noise
+NOISE_SHARE = 0.01  # of the newest difference in this mean
 
 
 class PositionJumps:
@@ -27,6 +30,7 @@ class PositionJumps:
     def __init__(self) -> None:
         self._newest: LocalPosition | None = None
         self._jumps: deque[tuple[float, float]] = deque()  # when, by how many metres
+        self._noise_m = 0.0  # mean distance between a position and what the one before leads to
         self.total_ned_m: Array = np.zeros(3)
 
     def on_position(self, position: LocalPosition) -> Array | None:
@@ -37,13 +41,21 @@ class PositionJumps:
         passed_s = position.time_s - before.time_s
         if not 0.0 < passed_s < LONGEST_GAP_S:
             return None
-        speed_mps = 0.5 * np.add(before.velocity_ned_mps, position.velocity_ned_mps)
-        moved_m = np.subtract(position.position_ned_m, before.position_ned_m)
-        jump: Array = moved_m - passed_s * speed_mps
-        size_m = float(np.linalg.norm(jump))
-        if size_m <= LEAST_JUMP_M + 0.5 * ACCELERATION_MPS2 * passed_s**2:
+        jump_m = [  # in floats: it is computed for every position
+            here - there - passed_s * (0.5 * (speed + speed_there))
+            for here, there, speed, speed_there in zip(
+                position.position_ned_m, before.position_ned_m,
+                position.velocity_ned_mps, before.velocity_ned_mps, strict=True,
+            )
+        ]  # fmt: skip
+        size_m = math.hypot(*jump_m)
+        least_m = max(LEAST_JUMP_M, NOISES * self._noise_m)
+        least_m += 0.5 * ACCELERATION_MPS2 * passed_s**2
+        self._noise_m += NOISE_SHARE * (min(size_m, least_m) - self._noise_m)
+        if size_m <= least_m:
             return None
         self._jumps.append((position.time_s, size_m))
+        jump = np.array(jump_m)
         self.total_ned_m = self.total_ned_m + jump
         return jump
 

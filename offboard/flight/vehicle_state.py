@@ -56,6 +56,7 @@ class VehicleState:
     texts: deque[str] = field(default_factory=lambda: deque(maxlen=MESSAGES_MAX))
     refusals: deque[str] = field(default_factory=lambda: deque(maxlen=MESSAGES_MAX))
     results: dict[int, str] = field(default_factory=dict)  # newest, by MAV_CMD number
+    answered_s: dict[int, float] = field(default_factory=dict)  # when it was heard, by MAV_CMD
     mode: str = "unknown"
     other_sender: OtherSender | None = None
     other_companion: OtherCompanion | None = None
@@ -156,7 +157,7 @@ class VehicleState:
             case StatusText(severity, text) if severity <= WARNING:
                 self.texts.append(text)
             case CommandAck(command, result) if command != SET_MESSAGE_INTERVAL:
-                self.results[command] = result
+                self.results[command], self.answered_s[command] = result, now_s
                 if result not in GOOD_RESULTS:
                     self.refusals.append(f"command {command} {result}")
             case Rebooted():

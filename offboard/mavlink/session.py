@@ -303,7 +303,9 @@ class Session:
             return DropReason.STALE
         age = Age.FRESH
         if isinstance(event, (LocalPosition, Attitude, GpsFix)) and event.time_s is not None:
-            event = replace(event, time_s=event.time_s + self._time.wrapped_s(event.time_s))
+            wrapped_s = self._time.wrapped_s(event.time_s)
+            if wrapped_s:
+                event = replace(event, time_s=event.time_s + wrapped_s)
         if isinstance(event, (LocalPosition, Attitude)):
             age = self._time.check(frame.message_id, event.time_s)
             if age is Age.STALE:

@@ -23,6 +23,7 @@ _WINDOW_S = 2.0
 _ENOUGH = 0.7  # of the rate wanted; a window holds few samples of a slow message
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 3.0, 30.0
 _OPTIONAL_TRIES = 2
+_UNHEARD = 0.1  # of the rate wanted: what arrives more rarely has its default rate
 _ARRIVALS_MAX = 4096  # limits the memory used when a link is flooded
 
 
@@ -69,9 +70,12 @@ class _Stream:
     def due(self, now_s: float) -> bool:
         if self.requested_s is None:
             return True
-        if now_s - self.requested_s < self.wait_s:
+        waited_s, rate_hz = now_s - self.requested_s, self.rate_hz(now_s)
+        if waited_s >= _FIRST_WAIT_S and 0.0 < rate_hz < _UNHEARD * self.wanted.rate_hz:
+            return True  # the link has lost the requests
+        if waited_s < self.wait_s:
             return False
-        if self.rate_hz(now_s) >= _ENOUGH * self.wanted.rate_hz:
+        if rate_hz >= _ENOUGH * self.wanted.rate_hz:
             self.wait_s, self.requests = _FIRST_WAIT_S, 0
             return False
         return not (self.wanted.optional and self.requests >= _OPTIONAL_TRIES)

@@ -41,7 +41,7 @@ def _ramp(x: Array, duration_s: float, direction: float) -> Array:
     u = x * (1.0 - x)
     shape = 21.0 + x * (-60.0 + x * (67.5 + x * (-35.0 + 7.0 * x)))
     slope = 126.0 + x * (-420.0 + x * (540.0 + x * (-315.0 + 70.0 * x)))
-    return np.stack(
+    return np.array(
         [
             direction * duration_s * x**6 * shape,
             x**5 * slope,
@@ -56,7 +56,7 @@ def compose_position(s: Array, path: Array) -> Array:
     """Derivatives by time (5, N, 3) of a path (5, N, 3) at s(t) (5, N) (Faa di Bruno)."""
     s1, s2, s3, s4 = s[1:, :, np.newaxis]
     p0, p1, p2, p3, p4 = path
-    return np.stack(
+    return np.array(
         [
             p0,
             p1 * s1,
@@ -70,4 +70,4 @@ def compose_position(s: Array, path: Array) -> Array:
 def compose_course(s: Array, course: Array) -> Array:
     """Course, rate and acceleration by time (3, N) of a course (3, N) at s(t) (5, N)."""
     c0, c1, c2 = course
-    return np.stack([c0, c1 * s[1], c2 * s[1] ** 2 + c1 * s[2]])
+    return np.array([c0, c1 * s[1], c2 * s[1] ** 2 + c1 * s[2]])

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from faults import stop, without
-from pair import SHORT, hover, in_phase, make, on_arducopter
+from faults import HEARTBEAT, stop, without
+from pair import SHORT, Bytes, decode, hover, in_phase, make, on_arducopter
 from watch import (
     ARM,
     BOTH,
@@ -65,6 +65,31 @@ def test_a_vehicle_that_was_disarmed_is_not_armed_again(fly: Fly) -> None:
     assert "disarmed" in outcome.sentence
     assert watch.armings == len(pair.commands(ARM)) == 1
     assert watch.top_m < 0.05
+
+
+@BOTH
+def test_an_arming_that_is_accepted_late_is_not_taken_for_a_disarming(fly: Fly) -> None:
+    """The link loses the first three requests, and every HEARTBEAT for 2.4 s from the fourth on."""
+    asked_s: list[float] = []
+
+    def up(time_s: float, frames: Bytes) -> Bytes:
+        asked_s.extend(time_s for frame in frames if is_arming(frame))
+        return [frame for frame in frames if not is_arming(frame) or len(asked_s) > 3]
+
+    def down(time_s: float, datagrams: Bytes) -> Bytes:
+        lost = len(asked_s) > 3 and time_s < asked_s[3] + 2.4
+        return without(HEARTBEAT)(time_s, datagrams) if lost else datagrams
+
+    pair = fly(up=up, down=down)
+    while not (pair.companion.phase is Phase.TAKEOFF or pair.companion.has_ended()):
+        pair.advance()
+    assert pair.companion.phase is Phase.TAKEOFF, pair.companion.outcome
+    assert len(asked_s) == 4
+
+
+def is_arming(frame: bytes) -> bool:
+    message = decode(frame)
+    return message.get_type() == "COMMAND_LONG" and message.command == ARM
 
 
 @BOTH

@@ -102,6 +102,20 @@ def test_optional_messages_are_requested_twice() -> None:
     assert requested == {"HIL_STATE_QUATERNION": 2}
 
 
+@pytest.mark.parametrize(("default_hz", "requests"), [(0.5, 10), (2.0, 2)])
+def test_an_optional_message_at_its_default_rate_is_requested_until_it_is_heard(
+    default_hz: float, requests: int
+) -> None:
+    """The link loses every request. 2 of 10 Hz is what PX4 sends on request: it was heard."""
+    rates = TelemetryRates([WantedMessage(436, "CURRENT_MODE", 10.0, optional=True)], 0.0)
+    requested = 0
+    for tick in range(300):
+        if tick % round(10.0 / default_hz) == 0:
+            rates.count(436, 0.1 * tick)
+        requested += len(rates.due(0.1 * tick))
+    assert requested == pytest.approx(requests, abs=1)
+
+
 def test_link_time_follows_the_vehicle_or_host_time() -> None:
     link = LinkTime()
     for i in range(11):  # 50 times faster, with a second stream that lags by 3 ms

@@ -41,7 +41,8 @@ class Takeoff(Enum):
 
 @dataclass(frozen=True, slots=True)
 class WantedMessage:
-    """A telemetry message and the rate to request. An optional one is requested at most twice."""
+    """A telemetry message and the rate to request. An optional one that does not arrive, or has
+    another rate than its default, is requested at most twice."""
 
     message_id: int
     name: str
