@@ -87,6 +87,7 @@ def facts(
         switched=state.pilot.engaged,
         hasty=state.pilot.hasty,
         unclaimed=state.pilot.unclaimed and vehicle.landed != "unknown",
+        left_engaged=state.left_engaged,
         handed=authority is not None and authority.standing is Standing.HANDED,
         excites=identification is not None and identification.wants_excitation,
         identified=identification is not None and identification.finished(time_s),

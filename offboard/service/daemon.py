@@ -88,6 +88,7 @@ def run(
         if link is None:
             return Outcome(ExitCode.FLOWN, STOPPED_EARLY)
         stack.callback(link.close)
+        recorder.score_earlier()  # a supervisor that still has the link also has the log
         fuses = config.estimate is FollowedEstimate.FUSED
         flights = Flights(
             session=Session(

@@ -104,6 +104,39 @@ def test_a_restarted_service_asks_for_hold_and_waits_for_the_pilot(on: str) -> N
     assert wire.unsafe == []
 
 
+@pytest.mark.parametrize(("on", "left"), [("px4", "px4-1-ff"), ("ardupilot", "")])
+def test_a_vehicle_that_the_service_has_not_engaged_is_left_alone(on: str, left: str) -> None:
+    """Another companion computer flies it, on a link that we do not hear; or a flight with another
+    vehicle was cut short."""
+    pair, wire = engaged(on)
+    if on == "px4":
+        pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 5.0)
+    pair.logs.left = left
+    pair.restart()
+    wire.wrap()
+    began_s = pair.time_s
+    pair.run(4.0)
+    assert pair.mode in ("OFFBOARD", "GUIDED")
+    assert pair.after(began_s, SETPOINT, COMMAND) == []
+    assert pair.said("in the air, and this service has not engaged it: it is left alone")
+    assert len(pair.logs.begun) == 1
+    pair.switch("pilot")
+    pair.run(2.0)
+    assert pair.logs.left == left
+    pair.switch("engage")
+    pair.until(lambda: pair.phase in TRACKING, 3.0)
+    assert wire.unsafe == []
+
+
+def test_a_vehicle_that_is_seen_on_the_ground_is_not_left_engaged_any_more() -> None:
+    """Who engages it later is another."""
+    pair = serve()
+    pair.until(lambda: pair.phase is Phase.STANDBY)
+    pair.restart()
+    pair.logs.left = "px4-1-1"
+    pair.until(lambda: pair.logs.left == "", 5.0)
+
+
 @BOTH
 def test_engaging_a_service_that_is_not_ready_asks_for_hold_and_says_why(on: str) -> None:
     """A restarted service has not reached standby, because a parameter must be changed first. PX4

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -39,7 +40,9 @@ def session() -> Session:
 
 def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
     scored: list[Path] = []
-    recorder = Recorder(tmp_path, stamp=lambda: "now", score=scored.append)
+    recorder = Recorder(
+        tmp_path, stamp=lambda: "now", score=lambda directory, closing: scored.append(directory)
+    )
     talk = session()
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     home = mavlink.MAVLink_gps_global_origin_message(1, 2, 3).pack(codec)
@@ -47,10 +50,10 @@ def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
     recorder.write(began_us, home)  # long ago
     for second in range(2, 20):
         recorder.write(began_us + second * 1_000_000, talk.encode(Heartbeat(6)))
-    first = Path(recorder.begin(talk, "vehicle: neutral\n"))
+    first = Path(recorder.begin(talk, "vehicle: neutral\n", "px4-1-7"))
     recorder.write(began_us + 20_000_000, talk.encode(Heartbeat(18)))
-    recorder.end()
-    second_flight = Path(recorder.begin(talk, "vehicle: neutral\n"))
+    recorder.end(engaged=False)
+    second_flight = Path(recorder.begin(talk, "vehicle: neutral\n", "px4-1-7"))
     recorder.write(began_us + 21_000_000, talk.encode(Heartbeat(18)))
     recorder.close()
     assert (first.name, second_flight.name) == ("now", "now-2")
@@ -67,8 +70,77 @@ def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
     assert (first / "flight.yaml").read_text() == "vehicle: neutral\n"
 
 
+def test_a_clock_that_is_set_back_ends_what_came_before(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, stamp=lambda: "now", score=lambda *_: None)
+    talk = session()
+    frames = [talk.encode(Heartbeat(6)) for _ in range(3)]
+    for unix_s, frame in zip((2000, 1000, 1001), frames, strict=True):
+        recorder.write(1_000_000 * unix_s, frame)
+    flight = Path(recorder.begin(talk, "", ""))
+    recorder.close()
+    log = (flight / "flight.tlog").read_bytes()
+    assert [frame in log for frame in frames] == [False, True, True]
+
+
+@pytest.mark.parametrize(("age_s", "left"), [(0, "px4-1-7"), (601, ""), (-601, "")])
+def test_what_a_killed_service_has_not_done(tmp_path: Path, age_s: int, left: str) -> None:
+    """The vehicle that it had engaged is known for ten minutes, its flight is scored."""
+    killed = Recorder(tmp_path, stamp=lambda: "cut", score=lambda *_: None)
+    cut = Path(killed.begin(session(), "", "px4-1-7"))
+    deadline_s = time.monotonic() + 10.0
+    while not (cut / "flight.tlog").exists():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+    changed_s = time.time() - age_s
+    os.utime(cut / "flight.tlog", (changed_s, changed_s))
+    scored: list[Path] = []
+    recorder = Recorder(
+        tmp_path, settled_s=0.01, score=lambda directory, closing: scored.append(directory)
+    )
+    assert recorder.left == left
+    recorder.score_earlier()
+    while (cut / "unscored").exists():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+    assert scored == [cut]
+    recorder.settle()
+    assert recorder.left == ""
+    recorder.close()
+    assert not (cut / "engaged").exists()
+    killed.close()
+
+
+@pytest.mark.parametrize("engaged", [True, False])
+def test_a_vehicle_is_left_engaged_until_it_was_handed_back(tmp_path: Path, engaged: bool) -> None:
+    recorder = Recorder(tmp_path, score=lambda *_: None)
+    flight = Path(recorder.begin(session(), "", "px4-1-7"))
+    recorder.end(engaged=engaged)
+    recorder.close()
+    assert recorder.left == ("px4-1-7" if engaged else "")
+    again = Recorder(tmp_path, score=lambda *_: None)
+    assert again.left == recorder.left
+    assert (flight / "engaged").exists() is engaged
+    again.close()
+
+
+def test_the_end_does_not_wait_for_the_score(tmp_path: Path) -> None:
+    """The processes that score outlive the service; the next start sees what they have done."""
+
+    def score(directory: Path, closing: threading.Event) -> None:
+        began.append(directory)
+        assert closing.wait(60.0)
+
+    began: list[Path] = []
+    recorder = Recorder(tmp_path, score=score)
+    (first, second) = [Path(recorder.begin(session(), "", "")) for _ in range(2)
+                       if recorder.end(engaged=False) is None]  # fmt: skip
+    recorder.close()
+    assert began == [first, second]
+    assert {path.parent for path in tmp_path.glob("*/unscored")} == {first, second}
+
+
 def test_the_rolling_log_is_bounded(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path, score=lambda directory: None, rolling_bytes=20_000)
+    recorder = Recorder(tmp_path, score=lambda *_: None, rolling_bytes=20_000)
     talk = session()
     written = 0
     for number in range(5000):
@@ -88,16 +160,20 @@ def test_the_rolling_log_is_bounded(tmp_path: Path) -> None:
 def test_a_flight_that_cannot_be_recorded_says_so_and_the_next_one_is(tmp_path: Path) -> None:
     names = iter([f"{ROLLING_NAMES[0]}/x", "later"])
     scored: list[Path] = []
-    recorder = Recorder(tmp_path, stamp=lambda: next(names), score=scored.append)
+    recorder = Recorder(
+        tmp_path,
+        stamp=lambda: next(names),
+        score=lambda directory, closing: scored.append(directory),
+    )
     talk = session()
-    recorder.begin(talk, "")
+    recorder.begin(talk, "", "")
     deadline_s = time.monotonic() + 10.0
     while not recorder.problem and time.monotonic() < deadline_s:
         recorder.write(1, talk.encode(Heartbeat(6)))
         time.sleep(0.01)
     assert "cannot be written (Not a directory)" in recorder.problem
-    recorder.end()
-    recorder.begin(talk, "")
+    recorder.end(engaged=False)
+    recorder.begin(talk, "", "")
     assert recorder.problem == ""
     recorder.close()
     assert scored == [tmp_path / "later"]
