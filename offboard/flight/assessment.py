@@ -142,6 +142,8 @@ def not_ready(state: FlightState, session: Session) -> str:
     vehicle, dialect, limits = state.vehicle, state.dialect, state.limits
     if not vehicle.has_state or dialect is None:
         return "no LOCAL_POSITION_NED or no ATTITUDE_QUATERNION arrives"
+    if not state.guarded:
+        return "the supervisor, which lands it if this process ends, does not run"
     rates_hz = session.rates_hz
     for name in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED"):
         if rates_hz[name] < MINIMUM_TELEMETRY_HZ:

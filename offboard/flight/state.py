@@ -72,6 +72,7 @@ class FlightState:
     now_s: float = 0.0  # `Session.link_time_s`
     host_s: float = 0.0  # monotonic time of this computer at the present turn
     silence_s: float = 0.0  # host time since the newest telemetry
+    guarded: bool = True  # a supervisor lands the vehicle if this process ends
     rebooted: bool = False
     left_engaged: bool = False  # a flight that was cut short has left the vehicle engaged
     request: Request = Request.NONE  # of the ground station, until the next tick
@@ -112,6 +113,7 @@ class FlightState:
             now_s=self.now_s,
             host_s=self.host_s,
             silence_s=self.silence_s,
+            guarded=self.guarded,
         )
         following.contact = self.contact
         following.pilot = PilotSwitch(

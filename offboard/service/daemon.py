@@ -120,7 +120,6 @@ def run(
             stops=stops,
             progress=lambda _: display.update(),
             supervisor=supervisor,
-            lands_without_log=config.limits.log_lost == "land",
         ).run()
         manager.stopping()
         flights.close()

@@ -171,10 +171,21 @@ class Flights:
         self._stopping |= why == STOPPED
         if self._stopping or self.phase not in WAITING:
             self._current.request_stop(why)
+        elif self._current.announced[-1:] != [why]:
+            self._current.announce(why)
 
     def announce(self, sentence: str) -> None:
         """Report a sentence to the user, the ground station and the log."""
         self._current.announce(sentence)
+
+    def guard(self, guarded: bool) -> None:
+        """As `Companion.guard`."""
+        self._current.guard(guarded)
+
+    @property
+    def lands_without_log(self) -> bool:
+        """As `Companion.lands_without_log`."""
+        return self._current.lands_without_log
 
     def overhear(self, datagrams: Sequence[bytes]) -> None:
         """As `Companion.overhear`."""
