@@ -371,6 +371,24 @@ def test_what_follows_the_reference(then: str) -> None:
     assert wire.unsafe == []
 
 
+def test_a_take_off_point_that_was_not_seen_is_no_origin() -> None:
+    """A service that is started in the air with --anchor origin engages after the next landing."""
+    pair, wire = engaged("ardupilot", anchor="origin")
+    assert pair.state.plan.origin_ned_m == pytest.approx((0.0, 0.0, 0.0), abs=0.1)
+    pair.switch("pilot")
+    pair.run(1.0)
+    pair.restart()
+    wire.wrap()
+    pair.run(6.0)
+    engaged_s = pair.time_s
+    pair.switch("engage")
+    pair.until(lambda: pair.mode == "GUIDED", 1.0)
+    pair.until(lambda: pair.mode == "BRAKE", 1.0)
+    assert pair.said("not engaged: its take-off point is not known")
+    assert thrusts(pair, engaged_s) == []
+    assert wire.unsafe == []
+
+
 def test_a_new_configuration_is_used_by_the_next_flight(tmp_path: Path) -> None:
     from serving import prepared
 
@@ -396,6 +414,12 @@ def test_a_new_configuration_is_used_by_the_next_flight(tmp_path: Path) -> None:
 def test_heartbeat_shows_standby_and_the_phase() -> None:
     pair, _ = engaged("px4")
     pair.run(2.0)
+    for number in range(500):
+        pair.service.announce(f"{number}")
+        pair.advance()
+    assert len(pair.service.current.announced) <= 200  # of one companion, which may wait for weeks
+    assert pair.service.announced[-1] == "499"
+    assert pair.service.announcements > 500
     beats = [decode(frame) for _, _, frame in pair.sent if frame[7:10] == b"\0\0\0"]
     assert (beats[3].system_status, beats[3].custom_mode) == (3, 17)
     assert (beats[-1].system_status, beats[-1].custom_mode) in [(4, 6), (4, 14)]

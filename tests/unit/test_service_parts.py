@@ -282,15 +282,22 @@ def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:
 
 
 def test_a_reference_that_is_placed_low_stays_clear_of_the_ground(tmp_path: Path) -> None:
-    request = FlightRequest(tmp_path, choices={"reference": "helix", "vehicle": "px4_sih"})
+    """A helix that descends by 4 m."""
+    request = FlightRequest(
+        tmp_path,
+        choices={"reference": "helix", "vehicle": "px4_sih"},
+        assignments=("reference.climb_mps=-0.4", "reference.height_m=20"),
+    )
     plan = FlightPlan(flight_request.build_parts(request.resolve()).track)
     start, times = plan.track.sample(0.0).position_ned_m, range(60)
     lowest = max(float(plan.track.sample(float(t)).position_ned_m[2]) for t in times)
     falls_m = lowest - float(start[2])
+    assert falls_m > 4.0
     assert plan.place_start((3.0, 4.0, -20.0), 0.0) == 0.0
     assert plan.origin_ned_m[2] + float(start[2]) == pytest.approx(-20.0)
     raised_m = plan.place_start((3.0, 4.0, -1.0), 0.0)
     assert raised_m == pytest.approx(max(falls_m - 1.0 + CLEAR_M, 0.0), abs=0.02)
+    assert plan.place_start((3.0, 4.0, -20.0), None) == pytest.approx(falls_m, abs=0.02)
 
 
 @pytest.mark.parametrize("certainly", [True, False])
