@@ -34,6 +34,8 @@ NOT_STARTED = "the supervisor, which lands the vehicle if this process dies, doe
 class SupervisorError(UserError):
     """The supervisor cannot be started: one sentence for the user."""
 
+    is_usage = False
+
 
 @dataclass(frozen=True, slots=True)
 class Supervised:

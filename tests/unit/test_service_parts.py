@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 import threading
@@ -16,16 +17,19 @@ from offboard.analysis import tlog
 from offboard.flight import clock, manifest
 from offboard.flight import request as flight_request
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
+from offboard.flight.link import LinkError
 from offboard.flight.pilot_switch import PilotSwitch
 from offboard.flight.request import FlightRequest
+from offboard.flight.stop import StopRequests
 from offboard.identification.learned import Learned
 from offboard.identification.uncertainty import Estimate
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
-from offboard.service import preparation
+from offboard.service import daemon, preparation
+from offboard.service.daemon import Manager
 from offboard.service.flights import Prepared
-from offboard.service.lock import ConnectionLock, Locked
+from offboard.service.lock import Locked, connection_lock, directory_lock
 from offboard.service.memory import VehicleFiles
 from offboard.service.monitor import Monitor, MonitorError
 from offboard.service.preparation import Preparation
@@ -208,9 +212,9 @@ def test_the_lock_names_its_holder_and_dies_with_it(
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     code = (
-        "from offboard.service.lock import ConnectionLock\n"
+        "from offboard.service.lock import connection_lock\n"
         "import sys\n"
-        "with ConnectionLock('udpin:127.0.0.1:1'):\n"
+        "with connection_lock('udpin:127.0.0.1:1'):\n"
         "    print('held', flush=True)\n"
         "    sys.stdin.read()\n"
     )
@@ -219,14 +223,81 @@ def test_the_lock_names_its_holder_and_dies_with_it(
     )
     assert holder.stdout is not None
     assert holder.stdout.readline() == b"held\n"
-    with ConnectionLock("udpin:127.0.0.1:2"):
+    with connection_lock("udpin:127.0.0.1:2"):
         pass
-    with pytest.raises(Locked, match=f"process {holder.pid}$"), ConnectionLock("udpin:127.0.0.1:1"):
+    with (
+        pytest.raises(Locked, match=f"process {holder.pid}$"),
+        connection_lock("udpin:127.0.0.1:1"),
+    ):
         pass
     holder.kill()
     holder.wait()
-    with ConnectionLock("udpin:127.0.0.1:1") as lock:
+    with connection_lock("udpin:127.0.0.1:1") as lock:
         assert lock.path.read_text() == f"{os.getpid()}\n"
+    with directory_lock(tmp_path / "new"):
+        again = directory_lock(tmp_path / "new")
+        with pytest.raises(Locked, match=f"has the directory {tmp_path}/new"), again:
+            pass
+
+
+def test_ports_of_another_network_namespace_are_other_ports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a container that shares the directory of the locks; a serial device is the same."""
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+
+    def locks() -> list[Path]:
+        return [connection_lock(each).path for each in ("udpin:0.0.0.0:1", "serial:/dev/x:9600")]
+
+    (port, device), stat = locks(), os.stat
+    other = os.stat_result((0, 12345, *range(8)))
+    namespace = "/proc/self/ns/net"
+    monkeypatch.setattr(os, "stat", lambda path: other if path == namespace else stat(path))
+    assert locks()[1] == device
+    assert locks()[0] != port
+
+
+def test_the_link_is_opened_when_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Port in use: said once, tried again until it is free. A wrong address is an error at once."""
+    monkeypatch.setattr(daemon, "LINK_FIRST_S", 0.01)
+    holder = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    holder.bind(("127.0.0.1", 0))
+    alive, told = [], []
+
+    class Watching(Manager):
+        def alive(self, now_s: float, status: str = "") -> None:
+            alive.append(now_s)
+            if len(alive) == 3:
+                holder.close()
+
+    address = f"udpin:127.0.0.1:{holder.getsockname()[1]}"
+    with StopRequests() as stops:
+        link = daemon.opened(address, stops, told.append, Watching())
+        assert link is not None
+        link.close()
+        assert told == [
+            f"connection '{address}' cannot be opened: Address already in use; another program "
+            "uses the port; trying again"
+        ]
+        for wrong in ("udpin:127.0.0.1", f"udpin:{'x' * 300}:14540"):
+            with pytest.raises(LinkError):
+                daemon.opened(wrong, stops, told.append, Watching())
+
+
+def test_the_service_manager_is_told_and_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It reads nothing until its queue is full."""
+    name = f"offboard-{os.getpid()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(f"\0{name}")
+        monkeypatch.setenv("NOTIFY_SOCKET", f"@{name}")
+        manager = Manager()
+        manager.ready()
+        for second in range(1, 1000):  # net.unix.max_dgram_qlen is 512 at most
+            manager.alive(float(second), f"{second}")
+        systemd.settimeout(10.0)
+        heard = [systemd.recv(100) for _ in range(4)]
+        assert heard == [b"READY=1", b"WATCHDOG=1", b"STATUS=1", b"WATCHDOG=1"]
+        manager.close()
 
 
 def test_a_changed_configuration_is_used_and_a_bad_one_refused(
