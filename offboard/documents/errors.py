@@ -18,7 +18,10 @@ Schema = Mapping[str, Any]
 
 class UserError(Exception):
     """An error that the user can fix. `str()` says what is wrong and what to do, without a
-    traceback; the commands print it and exit with code 2."""
+    traceback; the commands print it and exit with code 2. `is_usage`: what was asked for is wrong;
+    otherwise it may work another time."""
+
+    is_usage = True
 
 
 class DocumentError(UserError):

@@ -87,6 +87,7 @@ def facts(
         switched=state.pilot.engaged,
         hasty=state.pilot.hasty,
         unclaimed=state.pilot.unclaimed and vehicle.landed != "unknown",
+        left_engaged=state.left_engaged,
         handed=authority is not None and authority.standing is Standing.HANDED,
         excites=identification is not None and identification.wants_excitation,
         identified=identification is not None and identification.finished(time_s),
@@ -141,6 +142,8 @@ def not_ready(state: FlightState, session: Session) -> str:
     vehicle, dialect, limits = state.vehicle, state.dialect, state.limits
     if not vehicle.has_state or dialect is None:
         return "no LOCAL_POSITION_NED or no ATTITUDE_QUATERNION arrives"
+    if not state.guarded:
+        return "the supervisor, which lands it if this process ends, does not run"
     rates_hz = session.rates_hz
     for name in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED"):
         if rates_hz[name] < MINIMUM_TELEMETRY_HZ:
@@ -155,6 +158,8 @@ def not_ready(state: FlightState, session: Session) -> str:
         return f"no reply for parameter {', '.join(unanswered)}"
     if not state.readiness.complete(dialect, vehicle.parameters, state.now_s):
         return "its parameters are still being read"
+    if _has_no_origin(state):
+        return "its take-off point is not known, as it was not seen on the ground (--anchor origin)"
     if state.programme.serves and session.autopilots.ambiguous:
         systems = session.autopilots.named()
         return f"several vehicles are heard, systems {systems}: choose one with --system"
@@ -175,6 +180,13 @@ def not_ready(state: FlightState, session: Session) -> str:
             "(limits.link_delay_s, limits.link_jitter_s)"
         )
     return ""
+
+
+def _has_no_origin(state: FlightState) -> bool:
+    """The reference is relative to a take-off point that was not seen."""
+    programme, contact = state.programme, state.contact
+    wanted = programme.serves and programme.anchor == "origin"
+    return wanted and contact.in_the_air and contact.rest_ned_m is None
 
 
 def position_error_m(state: FlightState) -> float:

@@ -196,6 +196,17 @@ class Companion:
         self._inputs.call("announce", sentence)
         self._outbox.announce(sentence)
 
+    def guard(self, guarded: bool) -> None:
+        """Whether a supervisor would land the vehicle if this process ended."""
+        if guarded is not self.state.guarded:
+            self._inputs.call("guard", guarded)
+            self.state.guarded = guarded
+
+    @property
+    def lands_without_log(self) -> bool:
+        """Whether a log that cannot be written ends the flight."""
+        return self.state.limits.log_lost == "land"
+
     def on_dropped(self, frames: int) -> None:
         """The last frames of the newest `Output` were not sent; for the log."""
         self._inputs.dropped(frames)

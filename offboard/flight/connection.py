@@ -37,12 +37,9 @@ def open_lockstep_link() -> LockstepLink:
     return LockstepLink(sock)
 
 
-def open_link(address: str, *, waits: bool = False) -> Link:
-    """Open the link at `address`, for example "udpin:127.0.0.1:14540" (see the module).
-
-    With `waits` an autopilot that does not listen, or a serial port that is missing, is no error:
-    the link opens it as soon as it is there. Raises LinkError, which says what to change.
-    """
+def open_link(address: str) -> Link:
+    """Open the link at `address`, for example "udpin:127.0.0.1:14540" (see the module). Raises
+    LinkError, which says what to change, and LinkUnavailable where it may open later."""
     matched = _ADDRESS.fullmatch(address)
     if matched is None:
         raise LinkError(f"connection {shown(address)} is not understood; use {FORMS}")
@@ -51,8 +48,7 @@ def open_link(address: str, *, waits: bool = False) -> Link:
         if not 0 < number <= BAUD_MAX:
             raise LinkError(f"connection {shown(address)}: {number} baud is no rate of a port")
         redial = Redial(lambda: open_port(host, number))
-        port = None if waits else open_port(host, number)
-        return StreamLink(port, "serial", redial, number / BITS_OF_A_BYTE)
+        return StreamLink(open_port(host, number), "serial", redial, number / BITS_OF_A_BYTE)
     least = 0 if kind in LISTENS else 1  # 0: any free port
     if not least <= number <= PORT_MAX:
         raise LinkError(
@@ -64,21 +60,21 @@ def open_link(address: str, *, waits: bool = False) -> Link:
             f"as in {kind}:[::1]:{number}"
         )
     try:
-        return _network_link(kind, host.strip("[]"), number, waits=waits)
-    except (OSError, UnicodeError) as error:  # of a host name that is too long
-        reason = getattr(error, "strerror", None) or error
-        taken = getattr(error, "errno", None) == EADDRINUSE
+        return _network_link(kind, host.strip("[]"), number)
+    except UnicodeError as error:  # of a host name that is too long
+        raise LinkError(f"connection {shown(address)} cannot be opened: {error}") from None
+    except OSError as error:
         raise LinkUnavailable(
-            f"connection {shown(address)} cannot be opened: {reason}"
-            + ("; another program uses the port" if taken else "")
+            f"connection {shown(address)} cannot be opened: {error.strerror or error}"
+            + ("; another program uses the port" if error.errno == EADDRINUSE else "")
         ) from None
 
 
-def _network_link(kind: str, host: str, port: int, *, waits: bool) -> Link:
+def _network_link(kind: str, host: str, port: int) -> Link:
     """Raises OSError or UnicodeError."""
     if kind == "tcp":
         redial = Redial(lambda: connect(host, port))
-        return StreamLink(None if waits else connect(host, port), "tcp", redial)
+        return StreamLink(connect(host, port), "tcp", redial)
     family, place = _resolved(host, port)
     sock = socket.socket(family, socket.SOCK_STREAM) if kind == "tcpin" else udp_socket(family)
     try:

@@ -58,6 +58,7 @@ class Facts:
     switched: bool = False  # by the pilot, in the air, to the mode of setpoints
     hasty: bool = False  # the same, before a HEARTBEAT has shown the mode that it left
     unclaimed: bool = False  # found in the air in the mode of setpoints
+    left_engaged: bool = False  # there a flight of this service was cut short
     handed: bool = False  # it shows a mode that we asked for at the end
     rung: Rung = Rung.FLY  # of the ladder, which judges the other facts
     excites: bool = False  # identification steps are flown before the track

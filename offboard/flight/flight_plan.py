@@ -117,16 +117,18 @@ class FlightPlan:
             self._paused = self._planned = self._paused.resumed(time_s)
 
     def place_start(
-        self, position_ned_m: tuple[float, float, float], ground_down_m: float
+        self, position_ned_m: tuple[float, float, float], ground_down_m: float | None
     ) -> float:
         """Place the track so that it starts at this point, or as far above it as its lowest point
-        needs to stay `CLEAR_M` above the ground; returns by how much."""
+        needs to stay `CLEAR_M` above the ground, or not to be lower than this point where the
+        ground is not known (None); returns by how much."""
         times_s = np.arange(0.0, self.track.duration_s + SAMPLED_S, SAMPLED_S)
         places = self.track.sample(times_s).position_ned_m
         origin = np.array(position_ned_m) - places[0]
         lowest_m = float(origin[2]) + float(places[:, 2].max())
         # a vehicle that is lower itself decides how low is safe
-        least_m = max(ground_down_m - CLEAR_M, position_ned_m[2])
+        clear_m = -math.inf if ground_down_m is None else ground_down_m - CLEAR_M
+        least_m = max(clear_m, position_ned_m[2])
         above_m = max(lowest_m - least_m, 0.0)
         self.origin_ned_m = (float(origin[0]), float(origin[1]), float(origin[2]) - above_m)
         return above_m

@@ -25,7 +25,7 @@ class GroundContact:
     """Updated with every position; `vehicle` holds the other signs."""
 
     vehicle: VehicleState
-    rest_ned_m: Triple = (0.0, 0.0, 0.0)  # where it last rested; at first the local origin
+    rest_ned_m: Triple | None = None  # where it last rested; None if it has not been seen at rest
     _lifted: int = 0  # samples in a row
     _heights: deque[tuple[float, float]] = field(default_factory=deque)
 
@@ -44,12 +44,13 @@ class GroundContact:
 
     @property
     def rest_down_m(self) -> float:
-        """The height of the last rest, positive down, m."""
-        return self.rest_ned_m[2]
+        """The height of the last rest, positive down, m. Without one that of the local origin,
+        which autopilots set where they boot."""
+        return self.rest_ned_m[2] if self.rest_ned_m else 0.0
 
     @property
     def height_m(self) -> float:
-        """Height above the place of the last rest; 0 before the first position."""
+        """Height above `rest_down_m`; 0 before the first position."""
         position = self.vehicle.position
         return self.rest_down_m - position.position_ned_m[2] if position else 0.0
 

@@ -92,10 +92,16 @@ def engaged_too_soon(now: Facts) -> bool:
     return now.hasty and can_take_over(now) and now.in_phase_s > LISTENED_S
 
 
+def found_engaged(now: Facts) -> bool:
+    """Found in the air, in the mode of setpoints: another program may fly it."""
+    flies = now.engaged and now.armed and now.in_the_air
+    return flies and now.unclaimed and now.in_phase_s > LISTENED_S
+
+
 def abandoned(now: Facts) -> bool:
-    """Found in the air, in the mode of setpoints, without anybody who flies it."""
+    """A flight of this service was cut short there, and nobody else flies it."""
     alone = not now.other_vehicle
-    return alone and now.unclaimed and can_take_over(now) and now.in_phase_s > LISTENED_S
+    return alone and now.left_engaged and found_engaged(now) and can_take_over(now)
 
 
 def handed(now: Facts) -> bool:

@@ -14,10 +14,7 @@ OTHERS = "other addresses"
 
 
 class LinkError(UserError):
-    """A link that cannot be opened: one sentence for the user. `is_usage`: the address is wrong;
-    otherwise it may be opened another time."""
-
-    is_usage = True
+    """A link that cannot be opened: one sentence for the user."""
 
 
 class LinkUnavailable(LinkError):

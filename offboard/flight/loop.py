@@ -15,10 +15,10 @@ from typing import Any, Protocol
 from offboard.flight import clock
 from offboard.flight.companion import Outcome, Output
 from offboard.flight.link import Chunk, Link
-from offboard.flight.phases import BEFORE_FLIGHT, ExitCode, Phase
+from offboard.flight.phases import BEFORE_FLIGHT, WAITING, ExitCode, Phase
 from offboard.flight.sitl import Ending
 from offboard.flight.stop import StopRequests
-from offboard.flight.supervisor import Supervisor
+from offboard.flight.supervisor import Supervisor, SupervisorError
 
 POLL_S = 0.02
 STOPPED_S = 0.2  # from the beginning of a turn: what it decided does not leave later
@@ -29,6 +29,7 @@ OWN_FAILSAFE, SUPERVISED = (
     "the supervisor lands the vehicle",
 )
 UNGUARDED = "the supervisor ended: nobody lands the vehicle if this process dies"
+RESTART_S = 10.0  # between two attempts to start another one
 
 
 class Flown(Protocol):
@@ -47,6 +48,9 @@ class Flown(Protocol):
     def announce(self, sentence: str) -> None: ...
     def overhear(self, datagrams: Sequence[bytes]) -> None: ...
     def on_dropped(self, frames: int) -> None: ...
+    def guard(self, guarded: bool) -> None: ...
+    @property
+    def lands_without_log(self) -> bool: ...
 
 
 class Log(Protocol):
@@ -67,7 +71,7 @@ class Loop:
 
     `progress` is called often, to show the companion's announcements to the user; it must not wait.
     `simulator_ended` says how the bundled simulator ended, or None while it runs. `supervisor`
-    outlives us; None with the bundled simulator. `lands_without_log`: `Limits.log_lost`.
+    outlives us; None with the bundled simulator.
     """
 
     def __init__(
@@ -80,7 +84,6 @@ class Loop:
         progress: Callable[[Any], None],
         simulator_ended: Callable[[], Ending | None] = lambda: None,
         supervisor: Supervisor | None = None,
-        lands_without_log: bool = True,
     ) -> None:
         self._companion = companion
         self._link = link
@@ -89,9 +92,9 @@ class Loop:
         self._progress = progress
         self._simulator_ended = simulator_ended
         self._supervisor = supervisor
-        self._lands_without_log = lands_without_log
         self._warned: set[str] = set()
-        self._error = ""  # the first exception
+        self._error = ""  # the first exception of this flight
+        self._restarted_s = -RESTART_S
         self._succeeded_s = clock.monotonic_s()
         self._ended_early: Outcome | None = None
 
@@ -106,6 +109,8 @@ class Loop:
             try:
                 self._turn()
                 self._succeeded_s = clock.monotonic_s()
+                if self._companion.phase in WAITING:
+                    self._error = ""  # the flight that it ended is over
             except BaseException as error:  # a law may even end the program
                 self._hand_back(error)
         self._show()
@@ -125,6 +130,7 @@ class Loop:
         for sentence in strangers.news():
             self._companion.announce(sentence)
         self._check_log()
+        self._check_supervisor()
         self._show()
         self._check_simulator()
 
@@ -157,8 +163,24 @@ class Loop:
         if self._supervisor is None or output.supervised is None:
             return
         self._supervisor.beat(output.supervised, peer, self._link, self._log.descriptor)
-        if self._supervisor.lost:
-            self._warn(UNGUARDED)
+
+    def _check_supervisor(self) -> None:
+        """Start another one in place of one that has ended, while no flight needs this loop: it
+        waits some milliseconds for the new process."""
+        supervisor = self._supervisor
+        if supervisor is None:
+            return
+        self._companion.guard(supervisor.guards)
+        if not supervisor.lost:
+            return
+        self._warn(UNGUARDED)
+        now_s = clock.monotonic_s()
+        if self._companion.phase in WAITING and now_s - self._restarted_s >= RESTART_S:
+            self._restarted_s = now_s
+            with suppress(SupervisorError):
+                supervisor.restart()
+                self._warned.discard(UNGUARDED)
+                self._companion.announce("another supervisor is started")
 
     def _taken_over(self) -> bool:
         """Whether the supervisor has the vehicle; then wait until it is done with it."""
@@ -191,7 +213,7 @@ class Loop:
         problem = self._log.problem
         if problem:
             self._warn(problem)
-            if self._lands_without_log:
+            if self._companion.lands_without_log:
                 self._companion.request_stop(problem)
 
     def _warn(self, sentence: str) -> None:
@@ -228,7 +250,8 @@ class Loop:
             code = ExitCode.ABORTED
             sentence = sentence if self._error in sentence else f"{self._error}; {sentence}"
         if self._log.problem:
-            code = code or (ExitCode.ABORTED if self._lands_without_log else ExitCode.FLOWN)
+            lands = self._companion.lands_without_log
+            code = code or (ExitCode.ABORTED if lands else ExitCode.FLOWN)
             sentence = f"{self._log.problem}: {self._log.lost} entries lost; {sentence}"
         return Outcome(code, sentence)
 

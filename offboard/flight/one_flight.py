@@ -229,7 +229,6 @@ def fly(
             progress=progress,
             simulator_ended=bundled.simulator.ended if bundled else lambda: None,
             supervisor=supervisor,
-            lands_without_log=parts.limits.log_lost == "land",
         )
         if supervisor:
             discard(link)

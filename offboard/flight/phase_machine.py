@@ -161,17 +161,18 @@ class PhaseMachine:
     def _place_reference(self, position: LocalPosition) -> None:
         """Place the reference of a vehicle that was found in the air. A take-off point that was not
         seen is below it, at the height of its last rest."""
-        state, down_m = self._state, self._state.contact.rest_down_m
-        state.home_ned_m = (*position.position_ned_m[:2], down_m)
-        if self._state.programme.anchor == "here":
-            above_m = state.plan.place_start(position.position_ned_m, down_m)
+        state, contact = self._state, self._state.contact
+        state.home_ned_m = (*position.position_ned_m[:2], contact.rest_down_m)
+        if state.programme.anchor == "here":
+            rest = contact.rest_ned_m
+            above_m = state.plan.place_start(position.position_ned_m, rest[2] if rest else None)
             if above_m:
                 self._outbox.announce(
                     f"the reference starts {above_m:.1f} m above the vehicle: from here it would "
-                    "touch the ground"
+                    + ("touch the ground" if rest else "go lower, and the ground is not known")
                 )
-        elif self._state.programme.serves:
-            state.plan.origin_ned_m = state.contact.rest_ned_m
+        elif contact.rest_ned_m is not None and state.programme.serves:
+            state.plan.origin_ned_m = contact.rest_ned_m
         else:
             state.plan.origin_ned_m = state.home_ned_m
 

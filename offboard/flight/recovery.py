@@ -2,8 +2,9 @@
 
 Hold, and after some seconds land. Both are asked for only while the vehicle shows a mode that is
 ours or that we asked for, and at most once for each report of the mode. Any other mode is the
-decision of a pilot or of the vehicle's own failsafe, and final. One that is reported just after a
-request may have been left for it: the next report decides.
+decision of a pilot or of the vehicle's own failsafe, and final, whatever is reported after it. So
+is hold that was reported before our request, that the vehicle has not acknowledged, or that comes
+after the landing mode.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from offboard.mavlink.outgoing import CommandLong
 REPEAT_S = 0.3  # between two requests
 UNHEARD_MAX = 3  # requests to a vehicle of which nothing is heard
 HOLD_S = 5.0  # then land
+ACKNOWLEDGED_S = 1.0  # after hold is reported: an acknowledgement that comes later was lost
 FRESH_S = 2.5  # an older report of the mode is no reason for a command
 LONGEST_S = 120.0
 
@@ -41,7 +43,11 @@ class Recovery:
         self._mode: str | None = None
         self._reported_s = -math.inf
         self._armed = True
+        self._first_s = math.inf  # time of the first request
         self._asked_s = -math.inf
+        self._acknowledged = False
+        self._landing = False  # the landing mode was shown
+        self._left_for = ""  # the mode that nobody of us has asked for
         self._requests = 0
         self._held_s = math.inf  # since when it holds
         self.refusal = ""  # of the newest request
@@ -51,11 +57,25 @@ class Recovery:
         """An event of the vehicle that arrived at `at_s`, which may be before `began_s`."""
         match event:
             case Heartbeat(mode, armed):
-                self._mode, self._armed, self._reported_s = mode, armed, at_s
+                self._armed = armed
+                self._on_mode(mode, at_s)
             case ModeReport(mode):
-                self._mode, self._reported_s = mode, at_s
+                self._on_mode(mode, at_s)
             case CommandAck(_, result) if result not in ("ACCEPTED", "IN_PROGRESS"):
                 self.refusal = result
+            case CommandAck(command) if command == self._dialect.hold().command:
+                self._acknowledged |= at_s > self._first_s
+
+    def _on_mode(self, mode: str, at_s: float) -> None:
+        self._mode, self._reported_s = mode, at_s
+        ours = mode in (self._dialect.engage_mode, self._dialect.land_mode)
+        if mode == self._dialect.hold_mode and not self._landing:
+            ours = self._holding or at_s > self._first_s
+        self._landing |= mode == self._dialect.land_mode
+        if not ours:
+            self._left_for = self._left_for or mode
+        elif at_s < self._began_s:  # of the reports that have waited the newest decides
+            self._left_for = ""
 
     def due(self, now_s: float) -> Request | None:
         """What to ask for now."""
@@ -64,23 +84,26 @@ class Recovery:
             return None
         request = self._wanted(now_s)
         if request:
-            self._asked_s = now_s
+            self._first_s, self._asked_s = min(self._first_s, now_s), now_s
             self._requests += 1
         return request
 
     def _conclude(self, now_s: float) -> None:
         """Note when it holds, and when this is over."""
         holds = self._mode == self._dialect.hold_mode
-        ours = self._mode in (None, self._dialect.engage_mode, self._dialect.land_mode)
-        ours = ours or (holds and (self._holding or self._requests > 0))
-        crossed = 0.0 <= self._reported_s - self._asked_s < REPEAT_S  # the request on its way
+        self._held_s = min(self._held_s, now_s) if holds else math.inf
+        ours = self._holding or self._acknowledged
         if not self._armed:
             self.ended = "the vehicle is disarmed"
-        elif not (ours or crossed):
-            self.ended = f"the vehicle shows {self._mode}: its pilot or its failsafe has it"
+        elif self._left_for:
+            self.ended = f"the vehicle shows {self._left_for}: its pilot or its failsafe has it"
+        elif not ours and now_s - self._held_s > ACKNOWLEDGED_S:
+            self.ended = (
+                f"the vehicle shows {self._mode}, and has not acknowledged the request: its pilot "
+                "or its failsafe has it"
+            )
         elif now_s - self._began_s > LONGEST_S:
             self.ended = f"not landed after {LONGEST_S:.0f} s"
-        self._held_s = min(self._held_s, now_s) if holds else math.inf
 
     def _wanted(self, now_s: float) -> Request | None:
         if self._mode is None:

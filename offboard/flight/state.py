@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 
-from offboard.flight.authority import Authority
+from offboard.flight.authority import Authority, Standing
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
@@ -72,7 +72,9 @@ class FlightState:
     now_s: float = 0.0  # `Session.link_time_s`
     host_s: float = 0.0  # monotonic time of this computer at the present turn
     silence_s: float = 0.0  # host time since the newest telemetry
+    guarded: bool = True  # a supervisor lands the vehicle if this process ends
     rebooted: bool = False
+    left_engaged: bool = False  # a flight that was cut short has left the vehicle engaged
     request: Request = Request.NONE  # of the ground station, until the next tick
     stop_reason: str = ""  # why the flight shall end; empty while it shall not
     outcome: Outcome | None = None
@@ -111,9 +113,12 @@ class FlightState:
             now_s=self.now_s,
             host_s=self.host_s,
             silence_s=self.silence_s,
+            guarded=self.guarded,
         )
         following.contact = self.contact
-        following.pilot = PilotSwitch(showed_ours=self.pilot.showed_ours)
+        following.pilot = PilotSwitch(
+            unclaimed=self.ends_engaged, showed_ours=self.pilot.showed_ours
+        )
         if not self.has_ended:  # nothing was flown: what the pilot did before counts
             following.pilot, following.phase = self.pilot, self.phase
             following.began_s = self.began_s
@@ -127,6 +132,13 @@ class FlightState:
     @property
     def has_ended(self) -> bool:
         return self.phase in ENDS
+
+    @property
+    def ends_engaged(self) -> bool:
+        """Whether the flight ends with a vehicle that nobody has seen in another mode than that of
+        setpoints: it was not heard any more, or has rebooted."""
+        unheard = self.authority is not None and self.authority.standing is Standing.OURS
+        return unheard or (self.rebooted and self.pilot.unclaimed)
 
     @property
     def time_s(self) -> float:

@@ -34,6 +34,8 @@ NOT_STARTED = "the supervisor, which lands the vehicle if this process dies, doe
 class SupervisorError(UserError):
     """The supervisor cannot be started: one sentence for the user."""
 
+    is_usage = False
+
 
 @dataclass(frozen=True, slots=True)
 class Supervised:
@@ -90,6 +92,20 @@ class Supervisor:
         """Its sentences: why it took over, and what it did."""
         return self._lines[1:]
 
+    @property
+    def guards(self) -> bool:
+        """Whether it would take over."""
+        return bool(self._lines) and not self.lost
+
+    def restart(self) -> None:
+        """Start another process in place of one that has ended. Raises SupervisorError."""
+        self._channel.close()
+        self._process.poll()
+        self._received, self._lines = b"", []
+        self._beat = self._passed = None
+        self.__enter__()
+        self.lost = False
+
     def await_ready(self) -> None:
         """Wait until the process has loaded. Raises SupervisorError."""
         while not self._lines:
@@ -99,6 +115,8 @@ class Supervisor:
 
     def beat(self, vehicle: Supervised, peer: Hashable, link: Link, log_descriptor: int) -> None:
         """Show that the controller lives. The vehicle sends from `peer`. Never waits."""
+        if not self._lines:  # it has not loaded yet
+            return
         signing = self._signing.state() if self._signing else None
         if self._beat != (vehicle, peer, signing):
             self._beat = (vehicle, peer, signing)

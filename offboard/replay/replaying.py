@@ -27,7 +27,7 @@ from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.flight.request import build_parts
 from offboard.replay.recording import Recording, ReplayError, record_type
 
-CALLS = ("request_stop", "announce", "note_autopilot")  # methods of the companion
+CALLS = ("request_stop", "announce", "note_autopilot", "guard")  # methods of the companion
 _OUR_FIRST_SYSTEM = 1  # our system id before a vehicle was found
 
 

@@ -14,6 +14,7 @@ from offboard import compiled
 from offboard.documents.signing_key import read_key
 from offboard.estimation.fusion import FollowedEstimate
 from offboard.flight import clock
+from offboard.flight.background import BackgroundWriter
 from offboard.flight.companion import Outcome
 from offboard.flight.connection import open_link
 from offboard.flight.link import Link, LinkError
@@ -29,15 +30,16 @@ from offboard.flight.supervisor import Supervisor
 from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.service.flights import Flights
-from offboard.service.lock import ConnectionLock
+from offboard.service.lock import connection_lock, directory_lock
 from offboard.service.memory import VehicleFiles
 from offboard.service.monitor import Monitor
 from offboard.service.preparation import Preparation
 from offboard.service.record import Recorder
 
-LINK_FIRST_S, LINK_MOST_S = 1.0, 30.0  # between two attempts to open the link
+LINK_FIRST_S, LINK_MOST_S = 1.0, 5.0  # between two attempts to open the link
 SHOWN_EVERY_S = 0.25
 WATCHDOG_EVERY_S = 1.0
+NOTICES_MAX, NOTICES_S = 100, 1.0  # that wait for the service manager; for them, at the end
 STOPPED_EARLY = "stopped before the link was open"
 
 
@@ -62,13 +64,14 @@ def run(
     """Serve until a stop is requested.
 
     `tell` is called with sentences about the preparation, `show` often, to show what the flights
-    announce; neither may wait. Raises Locked, MonitorError, DocumentError, SupervisorError or
+    announce; neither may wait. Raises LockError, MonitorError, DocumentError, SupervisorError or
     LogError, all before anything is sent.
     """
     request = wanted.request
     with ExitStack() as stack:
-        stack.enter_context(ConnectionLock(request.connection))
+        stack.enter_context(connection_lock(request.connection))
         config = request.resolve()
+        stack.enter_context(directory_lock(request.directory))
         monitor = Monitor(wanted.metrics) if wanted.metrics else None
         if monitor:
             stack.enter_context(closing(monitor))
@@ -82,12 +85,13 @@ def run(
         recorder = Recorder(request.directory)
         stack.callback(recorder.close)
         memory = stack.enter_context(closing(VehicleFiles(_vehicles(request.directory), tell)))
-        manager = Manager()
+        manager = stack.enter_context(closing(Manager()))
         manager.ready()
-        link = _opened(request.connection, stops, tell, manager)
+        link = opened(request.connection, stops, tell, manager)
         if link is None:
             return Outcome(ExitCode.FLOWN, STOPPED_EARLY)
         stack.callback(link.close)
+        recorder.score_earlier()  # a supervisor that still has the link also has the log
         fuses = config.estimate is FollowedEstimate.FUSED
         flights = Flights(
             session=Session(
@@ -119,7 +123,6 @@ def run(
             stops=stops,
             progress=lambda _: display.update(),
             supervisor=supervisor,
-            lands_without_log=config.limits.log_lost == "land",
         ).run()
         manager.stopping()
         flights.close()
@@ -130,7 +133,7 @@ def _vehicles(directory: Path) -> Path:
     return directory / "vehicles"
 
 
-def _opened(
+def opened(
     connection: str, stops: StopRequests, tell: Callable[[str], None], manager: Manager
 ) -> Link | None:
     """The link, when it can be opened: a port may be in use, a device not plugged in yet. None if a
@@ -141,7 +144,7 @@ def _opened(
         try:
             return open_link(connection)
         except LinkError as error:
-            if not isinstance(error.__context__, OSError):  # the address itself is wrong
+            if error.is_usage:
                 raise
             if str(error) != told:
                 told = str(error)
@@ -155,29 +158,33 @@ def _opened(
 
 
 class Manager:
-    """The service manager (systemd), if there is one. Nothing waits for it."""
+    """The service manager (systemd), if there is one. Only a thread waits for it."""
 
     def __init__(self) -> None:
-        self._notifier = SystemdNotifier()
-        if getattr(self._notifier, "socket", None) is not None:
-            self._notifier.socket.setblocking(False)
+        notifier = SystemdNotifier()
+        self._writer = BackgroundWriter[str](
+            lambda notices: [notifier.notify(each) for each in notices], NOTICES_MAX
+        )
         self._told_s = 0.0
         self._status = ""
 
     def ready(self) -> None:
-        self._notifier.notify("READY=1")
+        self._writer.put("READY=1")
 
     def stopping(self) -> None:
-        self._notifier.notify("STOPPING=1")
+        self._writer.put("STOPPING=1")
+
+    def close(self) -> None:
+        self._writer.close(NOTICES_S)
 
     def alive(self, now_s: float, status: str = "") -> None:
         """The loop runs; at most once a second to the watchdog."""
         if now_s - self._told_s >= WATCHDOG_EVERY_S:
             self._told_s = now_s
-            self._notifier.notify("WATCHDOG=1")
+            self._writer.put("WATCHDOG=1")
         if status != self._status:
             self._status = status
-            self._notifier.notify(f"STATUS={status}")
+            self._writer.put(f"STATUS={status}")
 
 
 class Display:

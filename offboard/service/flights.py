@@ -13,7 +13,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
-from offboard.flight import assessment
+from offboard.flight import assessment, guards
 from offboard.flight.companion import STOPPED, Companion, Outcome, Output
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.link import Chunk
@@ -26,7 +26,12 @@ from offboard.identification.learned import Learned
 from offboard.mavlink.session import Session
 
 REASON_EVERY_S = 10.0  # why the vehicle cannot be flown is announced this often
+NAMED_S = 1.0  # until a vehicle has said which one it is
 TEXTS_KEPT = 200
+LEFT_ALONE = (
+    "the vehicle was found in {mode} in the air, and this service has not engaged it: it is left "
+    "alone; switch to another mode and back"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,12 +54,23 @@ class Source(Protocol):
 class Record(Protocol):
     """Where flights are recorded. No method waits."""
 
-    def begin(self, session: Session, configuration: str) -> str:
-        """A flight begins: its frames go to a log of its own. Returns its directory."""
+    @property
+    def left(self) -> str:
+        """Key of the vehicle that a flight which was cut short has left engaged; may be empty."""
         ...
 
-    def end(self) -> None:
-        """It has ended: the log is closed and scored, and frames go to the rolling log."""
+    def begin(self, session: Session, configuration: str, vehicle: str) -> str:
+        """A flight of `vehicle` begins: its frames go to a log of its own. Returns its
+        directory."""
+        ...
+
+    def end(self, *, engaged: bool) -> None:
+        """It has ended: the log is closed and scored, and frames go to the rolling log. `engaged`:
+        the vehicle may still be in the mode of setpoints."""
+        ...
+
+    def settle(self) -> None:
+        """No vehicle is left engaged any more."""
         ...
 
 
@@ -95,6 +111,7 @@ class Flights:
         self._recording = False
         self._shown = 0  # of the present companion's announcements
         self._told_s = -math.inf
+        self._told_left_alone = False
         self.announced: list[str] = []
         self.announcements = 0
         self.engagements = 0
@@ -154,10 +171,21 @@ class Flights:
         self._stopping |= why == STOPPED
         if self._stopping or self.phase not in WAITING:
             self._current.request_stop(why)
+        elif self._current.announced[-1:] != [why]:
+            self._current.announce(why)
 
     def announce(self, sentence: str) -> None:
         """Report a sentence to the user, the ground station and the log."""
         self._current.announce(sentence)
+
+    def guard(self, guarded: bool) -> None:
+        """As `Companion.guard`."""
+        self._current.guard(guarded)
+
+    @property
+    def lands_without_log(self) -> bool:
+        """As `Companion.lands_without_log`."""
+        return self._current.lands_without_log
 
     def overhear(self, datagrams: Sequence[bytes]) -> None:
         """As `Companion.overhear`."""
@@ -173,6 +201,7 @@ class Flights:
             self._begin_next()
         if self.phase in WAITING:
             self._renew_if_changed()
+            self._look_for_left()
         before = self.phase
         output = self._current.turn(chunks, now_s)
         if before in WAITING and self.phase not in WAITING and self.phase not in ENDS:
@@ -236,7 +265,7 @@ class Flights:
     def _begin_record(self) -> None:
         self.engagements += 1
         self._recording = True
-        directory = self._record.begin(self._session, self._prepared.text)
+        directory = self._record.begin(self._session, self._prepared.text, self._identity)
         self._current.announce(f"flight {self.engagements}, recorded in {directory}")
         known = self._recalled
         if known:
@@ -249,18 +278,29 @@ class Flights:
         if self._recording:
             self._recording = False
             self._keep_identified()
-            self._record.end()
+            self._record.end(engaged=self.state.ends_engaged)
+
+    def _look_for_left(self) -> None:
+        """Whether this vehicle was left engaged; not any more once it was seen in another mode, or
+        on the ground."""
+        state, left = self.state, self._record.left
+        state.left_engaged = bool(left) and left == self._identity
+        if state.left_engaged and not state.pilot.unclaimed:
+            self._record.settle()
 
     # ------------------------------------------------------------------ the identified vehicle
 
     @property
+    def _identity(self) -> str:
+        """Autopilot, system id and the hardware's number, 0 where it has none; empty until they
+        are known."""
+        found, uid = self.state.vehicle.found, self.state.vehicle.uid
+        return f"{found.autopilot}-{found.system_id}-{uid:x}" if found and uid is not None else ""
+
+    @property
     def _key(self) -> str:
-        """The vehicle: autopilot, system id and the hardware's number; empty where it has none."""
-        vehicle = self.state.vehicle
-        found = vehicle.found
-        return (
-            f"{found.autopilot}-{found.system_id}-{vehicle.uid:x}" if found and vehicle.uid else ""
-        )
+        """The vehicle; empty for one without a number, which cannot be told from others."""
+        return self._identity if self.state.vehicle.uid else ""
 
     def _remembered(self, prepared: Prepared) -> Learned | None:
         return self._memory.get(self._key, prepared) if self._key else None
@@ -288,6 +328,12 @@ class Flights:
     def _explain(self, now_s: float) -> None:
         """Say from time to time what prevents that the vehicle is flown."""
         state = self.state
+        if not state.pilot.unclaimed:
+            self._told_left_alone = False
+        elif not (self._told_left_alone or state.left_engaged) and state.in_phase_s > NAMED_S:
+            self._told_left_alone = guards.found_engaged(self._current.facts())
+            if self._told_left_alone:
+                self._current.announce(LEFT_ALONE.format(mode=state.vehicle.mode))
         if now_s - self._told_s < REASON_EVERY_S or state.phase is not Phase.HEALTH:
             return
         self._told_s = now_s
@@ -298,6 +344,7 @@ class Flights:
     def _collect(self) -> None:
         said = self._current.announced
         new = said[self._shown :]
+        del said[:-TEXTS_KEPT]  # the companion of a vehicle that waits may live for weeks
         self._shown = len(said)
         self.announcements += len(new)
         self.announced = [*self.announced, *new][-TEXTS_KEPT:]

@@ -1,4 +1,6 @@
-"""One service for each connection: a lock that its process holds, whatever becomes of it."""
+"""One service for each connection and directory: locks that its process holds, whatever becomes of
+it.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +8,21 @@ import fcntl
 import os
 import re
 import tempfile
+from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
 from offboard.documents.errors import UserError
 
 
-class Locked(UserError):
-    """Another service has the connection: one sentence that says which process."""
+class LockError(UserError):
+    """A lock file that cannot be opened: one sentence for the user."""
+
+
+class Locked(LockError):
+    """Another service has it: one sentence that says which process."""
+
+    is_usage = False
 
 
 def directory() -> Path:
@@ -25,28 +34,25 @@ def directory() -> Path:
     return Path(tempfile.gettempdir())
 
 
-class ConnectionLock:
+class Lock:
     """Context manager; entering raises Locked. The file stays, with the number of the last process:
-    the kernel releases the lock with the process."""
+    the kernel releases the lock with the process. `what` the lock is for, for the sentence."""
 
-    def __init__(self, connection: str) -> None:
-        self._connection = connection
-        name = re.sub(r"[^A-Za-z0-9.]+", "-", connection)[:100]
-        self.path = directory() / f"offboard-{os.getuid()}-{name}.lock"
+    def __init__(self, path: Path, what: str) -> None:
+        self.path = path
+        self._what = what
 
-    def __enter__(self) -> ConnectionLock:
+    def __enter__(self) -> Lock:
         try:
             self._descriptor = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         except OSError as error:
-            raise Locked(f"the lock {self.path} cannot be opened: {error.strerror}") from None
+            raise LockError(f"the lock {self.path} cannot be opened: {error.strerror}") from None
         try:
             fcntl.flock(self._descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             holder = os.read(self._descriptor, 20).decode(errors="replace").strip() or "unknown"
             os.close(self._descriptor)
-            raise Locked(
-                f"another service has the connection {self._connection}: process {holder}"
-            ) from None
+            raise Locked(f"another service has the {self._what}: process {holder}") from None
         os.ftruncate(self._descriptor, 0)
         os.write(self._descriptor, f"{os.getpid()}\n".encode())
         return self
@@ -58,3 +64,20 @@ class ConnectionLock:
         trace: TracebackType | None,
     ) -> None:
         os.close(self._descriptor)
+
+
+def connection_lock(connection: str) -> Lock:
+    """One service for each connection. Ports belong to a network namespace, as of a container."""
+    name, namespace = re.sub(r"[^A-Za-z0-9.]+", "-", connection)[:100], ""
+    if not connection.startswith("serial:"):
+        with suppress(OSError):  # Linux has them
+            namespace = f"-{os.stat('/proc/self/ns/net').st_ino}"
+    path = directory() / f"offboard-{os.getuid()}{namespace}-{name}.lock"
+    return Lock(path, f"connection {connection}")
+
+
+def directory_lock(place: Path) -> Lock:
+    """One service for each directory of flights: two would overwrite each other's rolling log."""
+    with suppress(OSError):  # opening says why
+        place.mkdir(parents=True, exist_ok=True)
+    return Lock(place / "service.lock", f"directory {place} (--out)")

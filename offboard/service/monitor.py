@@ -38,6 +38,12 @@ class MonitorError(UserError):
     """An address that cannot be served: one sentence for the user."""
 
 
+class MonitorUnavailable(MonitorError):
+    """An address that cannot be served now: another program has it, for example."""
+
+    is_usage = False
+
+
 @dataclass(frozen=True, slots=True)
 class Shown:
     """What the monitor shows. `at_s`: monotonic time when it was handed over."""
@@ -77,7 +83,8 @@ class Monitor(Collector):
             )  # fmt: skip
         except (OSError, UnicodeError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
-            raise MonitorError(f"--metrics {shown(address)} cannot be served: {reason}") from None
+            sentence = f"--metrics {shown(address)} cannot be served: {reason}"
+            raise MonitorUnavailable(sentence) from None
         self._thread = threading.Thread(target=self._server.serve_forever, daemon=True)
         self._thread.start()
 

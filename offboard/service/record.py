@@ -4,6 +4,9 @@ The rolling log is two files of at most `ROLLING_BYTES`; when one is full, the o
 A flight's log begins with its configuration, with what the vehicle sends only once, and with the
 last seconds before the flight, so that it is complete by itself. Files are opened, written and
 closed by threads: the loop waits for none of them.
+
+Two files in the directory of a flight tell the next start what a service that was killed has not
+done: `unscored`, and until the vehicle was handed back `engaged`, which holds its key.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
+import threading
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -31,6 +35,9 @@ PARAM_ID = slice(18, 34)  # in a frame of PARAM_VALUE: 10 bytes of header, 8 of 
 KEPT_MAX = 100
 SCORE_S = 600.0
 LOWER_PRIORITY = 10
+ENGAGED, UNSCORED = "engaged", "unscored"  # files of a flight, see the module
+ENGAGED_MAX_S = 600.0  # after the end of its log: a vehicle that was left longer ago has landed
+SETTLED_S = 5.0  # of a log that no supervisor writes any more
 
 
 class RollingLog:
@@ -79,8 +86,9 @@ class RollingLog:
 class FlightRecord:
     """The directory of one flight; the writing thread makes it when it has the first frames."""
 
-    def __init__(self, directory: Path, configuration: str) -> None:
+    def __init__(self, directory: Path, configuration: str, vehicle: str) -> None:
         self.directory = directory
+        self.vehicle = vehicle
         self._configuration = configuration
         self.descriptor: int | None = None
         self._writer = BackgroundWriter[bytes](self._append, QUEUED_MAX)
@@ -96,6 +104,8 @@ class FlightRecord:
     def _open(self) -> int:
         self.directory.mkdir(parents=True)
         (self.directory / "flight.yaml").write_text(self._configuration, encoding="utf-8")
+        (self.directory / ENGAGED).write_text(self.vehicle, encoding="utf-8")
+        (self.directory / UNSCORED).touch()
         # appended to, since another process may continue the log
         flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND
         return os.open(self.directory / "flight.tlog", flags, 0o666)
@@ -120,8 +130,9 @@ class FlightRecord:
             os.close(self.descriptor)
 
 
-def score(directory: Path) -> None:
-    """Score a flight in a process of its own, with a lower priority, and wait for its end."""
+def score(directory: Path, closing: threading.Event) -> None:
+    """Score a flight in a process of its own, with a lower priority, and wait for its end, or until
+    the service closes: the process outlives it."""
     process = subprocess.Popen(
         [sys.executable, "-m", "offboard", "score", str(directory)],
         stdin=subprocess.DEVNULL,
@@ -131,11 +142,10 @@ def score(directory: Path) -> None:
     )
     with suppress(OSError):
         os.setpriority(os.PRIO_PROCESS, process.pid, LOWER_PRIORITY)
-    try:
-        process.wait(SCORE_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
+    until_s = clock.monotonic_s() + SCORE_S
+    while process.poll() is None and not closing.wait(0.1):
+        if clock.monotonic_s() > until_s:
+            process.kill()
 
 
 class Recorder:
@@ -146,9 +156,11 @@ class Recorder:
         directory: Path,
         *,
         stamp: Callable[[], str] = clock.local_stamp,
-        score: Callable[[Path], object] = score,
+        score: Callable[[Path, threading.Event], object] = score,
         rolling_bytes: int = ROLLING_BYTES,
+        settled_s: float = SETTLED_S,
     ) -> None:
+        self._settled_s = settled_s
         self._directory = directory
         self._stamp = stamp
         self._score = score
@@ -157,10 +169,15 @@ class Recorder:
         self._before: deque[tuple[int, bytes]] = deque(maxlen=BEFORE_MAX)
         self._once: dict[bytes, bytes] = {}
         self._clerk = ThreadPoolExecutor(max_workers=1, thread_name_prefix="record")
+        self._scorer = ThreadPoolExecutor(max_workers=1, thread_name_prefix="score")
+        self._closing = threading.Event()
+        self._unscored = sorted(path.parent for path in directory.glob(f"*/{UNSCORED}"))
+        self._engaged = sorted(path.parent for path in directory.glob(f"*/{ENGAGED}"))
+        self._left, self._left_until_s = _left(self._engaged)
+        self._vehicle = ""
         self._stamped, self._number = "", 0
         # read once: in flight the file system may keep its caller waiting
-        self._taken = {path.name for path in directory.iterdir()} if directory.is_dir() else set()
-        self._closed = False
+        self._taken = {path.name for path in directory.iterdir()}
 
     # ------------------------------------------------------------------ the loop's log
 
@@ -201,10 +218,12 @@ class Recorder:
 
     # ------------------------------------------------------------------ flights
 
-    def begin(self, session: Session, configuration: str) -> str:
-        """A log of its own for a flight that begins. Returns its directory."""
+    def begin(self, session: Session, configuration: str, vehicle: str) -> str:
+        """A log of its own for a flight of `vehicle` that begins. Returns its directory."""
+        self.settle()
         directory = self._new_directory()
-        self._flight = flight = FlightRecord(directory, configuration)
+        self._engaged, self._vehicle = [directory], vehicle
+        self._flight = flight = FlightRecord(directory, configuration, vehicle)
         now_us = clock.unix_us()
         for piece in manifest.pieces(configuration):
             flight.write(entry(now_us, session.encode(piece)))
@@ -229,8 +248,16 @@ class Recorder:
                 self._taken.add(name)
                 return self._directory / name
 
-    def end(self) -> None:
-        """Close the flight's log and score it, in another thread."""
+    def end(self, *, engaged: bool) -> None:
+        """Close the flight's log and score it, in other threads. `engaged`: the vehicle may still
+        be in the mode of setpoints."""
+        self._close_flight()
+        if engaged:
+            self._left, self._left_until_s = self._vehicle, clock.monotonic_s() + ENGAGED_MAX_S
+        else:
+            self.settle()
+
+    def _close_flight(self) -> None:
         flight, self._flight = self._flight, None
         if flight:
             self._clerk.submit(self._finish, flight)
@@ -238,13 +265,68 @@ class Recorder:
     def _finish(self, flight: FlightRecord) -> None:
         flight.close()
         if flight.descriptor is not None:
-            self._score(flight.directory)
+            self._scorer.submit(self._score_one, flight.directory)
+
+    @property
+    def left(self) -> str:
+        """Key of the vehicle that the flight before has left engaged, as where the service was
+        killed; empty if there is none."""
+        return self._left if clock.monotonic_s() < self._left_until_s else ""
+
+    def settle(self) -> None:
+        """No vehicle is left engaged any more."""
+        files = [directory / ENGAGED for directory in self._engaged]
+        self._left, self._engaged = "", []
+        if self._closing.is_set():
+            _remove(files)
+        elif files:
+            self._clerk.submit(_remove, files)
+
+    def score_earlier(self) -> None:
+        """Score the flights that an earlier service has left unscored."""
+        for directory in self._unscored:
+            self._scorer.submit(self._score_settled, directory)
+
+    def _score_settled(self, directory: Path) -> None:
+        """Score a flight whose log a supervisor may still write."""
+        if (directory / "score.json").exists():  # by a process that outlived the service
+            _remove([directory / UNSCORED])
+            return
+        size = -1
+        while size != (size := (directory / "flight.tlog").stat().st_size):
+            if self._closing.wait(self._settled_s):
+                return
+        self._score_one(directory)
+
+    def _score_one(self, directory: Path) -> None:
+        self._score(directory, self._closing)
+        if not self._closing.is_set():
+            _remove([directory / UNSCORED])
 
     def close(self) -> None:
-        """Close all logs, after the last flight was scored."""
-        if self._closed:
+        """Close all logs. What is not scored yet is left to processes that outlive this one, or to
+        the next start."""
+        if self._closing.is_set():
             return
-        self._closed = True
-        self.end()
+        self._close_flight()
+        self._closing.set()
         self._clerk.shutdown(wait=True)
+        self._scorer.shutdown(wait=True)
         self._rolling.close()
+
+
+def _left(engaged: list[Path]) -> tuple[str, float]:
+    """The vehicle of the newest flight, and until which monotonic time it may be engaged."""
+    with suppress(IndexError, OSError, ValueError):
+        ended_us = (engaged[-1] / "flight.tlog").stat().st_mtime_ns // 1000
+        passed_s = 1e-6 * (clock.unix_us() - ended_us)
+        if abs(passed_s) < ENGAGED_MAX_S:  # the wall clock may have been set
+            vehicle = (engaged[-1] / ENGAGED).read_text(encoding="utf-8")
+            return vehicle, clock.monotonic_s() + ENGAGED_MAX_S - passed_s
+    return "", 0.0
+
+
+def _remove(paths: list[Path]) -> None:
+    for path in paths:
+        with suppress(OSError):
+            path.unlink()

@@ -175,6 +175,22 @@ def critical() -> Filter:
     return lambda _, datagrams: [b"".join(map(change, frames_of(d))) for d in datagrams]
 
 
+def restamped(less_s: float) -> Filter:
+    """A link on which positions and attitudes are stamped as by a vehicle that booted so much
+    later."""
+    codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+
+    def change(frame: bytes) -> bytes:
+        if frame_id(frame) not in (ATTITUDE, POSITION):
+            return frame
+        message = mavlink.MAVLink(None).decode(bytearray(frame))
+        message.time_boot_ms -= round(1e3 * less_s)
+        codec.seq = frame[4]
+        return bytes(message.pack(codec))
+
+    return lambda _, datagrams: [b"".join(map(change, frames_of(d))) for d in datagrams]
+
+
 # --- events ---------------------------------------------------------------------------------------
 
 

@@ -49,18 +49,24 @@ class Settings:
 
 @dataclass
 class Logs:
-    """A `Record` that notes when each flight began and ended."""
+    """A `Record` that notes when each flight began and ended. It survives a restart, as files."""
 
     clock: HostClock
     begun: list[float] = field(default_factory=list)
     ended: list[float] = field(default_factory=list)
+    left: str = ""
 
-    def begin(self, session: Session, configuration: str) -> str:
+    def begin(self, session: Session, configuration: str, vehicle: str) -> str:
         self.begun.append(self.clock.now_s - HOST_EPOCH_S)
+        self.left = vehicle
         return f"flight-{len(self.begun)}"
 
-    def end(self) -> None:
+    def end(self, *, engaged: bool) -> None:
         self.ended.append(self.clock.now_s - HOST_EPOCH_S)
+        self.left = self.left if engaged else ""
+
+    def settle(self) -> None:
+        self.left = ""
 
 
 @dataclass

@@ -22,9 +22,10 @@ from offboard.flight.companion import Companion, Outcome, Output
 from offboard.flight.connection import open_link
 from offboard.flight.link import Chunk, Link, Strangers
 from offboard.flight.log import FlightLog
-from offboard.flight.loop import Loop
+from offboard.flight.loop import UNGUARDED, Loop
+from offboard.flight.phases import Phase
 from offboard.flight.stop import StopRequests
-from offboard.flight.supervisor import Supervisor
+from offboard.flight.supervisor import Supervisor, SupervisorError
 from offboard.mavlink.counters import Counters
 from offboard.mavlink.framing import FrameSplitter, pack
 
@@ -54,6 +55,9 @@ class Flight:
     """A companion whose flight lasts `turns`, and which counts stop requests."""
 
     peer = None
+    phase = Phase.TRACK
+    lands_without_log = True
+    guarded = True
 
     def __init__(self, turns: int, during: Callable[[int], object], log: bytes = b"") -> None:
         self.turns, self.during = turns, during
@@ -75,6 +79,9 @@ class Flight:
         self.dropped = frames
 
     def overhear(self, datagrams: Sequence[bytes]) -> None: ...
+
+    def guard(self, guarded: bool) -> None:
+        self.guarded = guarded
 
     def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
         self.turns -= 1
@@ -137,8 +144,20 @@ def test_two_signals(
 class Watcher:
     """A supervisor that never takes over."""
 
-    lost = False
     said: tuple[str, ...] = ()
+
+    def __init__(self, *, lost: bool = False) -> None:
+        self.lost, self.restarts = lost, 0
+
+    @property
+    def guards(self) -> bool:
+        return not self.lost
+
+    def restart(self) -> None:
+        self.restarts += 1
+        self.lost = self.restarts < 2
+        if self.lost:
+            raise SupervisorError("no memory")
 
     def has_taken_over(self) -> bool:
         return False
@@ -206,10 +225,11 @@ def test_a_log_that_cannot_be_written_is_said_at_once(
     )
     flight = Flight(100_000, lambda left: setattr(flight, "turns", min(left, 3 * bool(left)))
                     if flight.announced else None, log=b"frame")  # fmt: skip
+    flight.lands_without_log = lands
     with FlightLog(tmp_path / "flight", "", real_time=True) as log, StopRequests() as stops_:
         outcome = Loop(
             cast(Companion, flight), Wire(), log, stops=stops_,
-            progress=lambda companion: None, lands_without_log=lands,
+            progress=lambda companion: None,
         ).run()  # fmt: skip
     assert flight.announced == [says]
     assert bool(flight.stops) is stops
@@ -234,6 +254,44 @@ def test_an_exception_lands_and_ends_with_4(error: BaseException, tmp_path: Path
     says = f"internal error: {type(error).__name__}: {error} (test_edges.py:"
     assert outcome.sentence.startswith(says)
     assert outcome.sentence.endswith("; flown and landed")
+
+
+def test_an_exception_is_over_when_the_service_waits_again(tmp_path: Path) -> None:
+    """The flight that it ended has its own exit code; that of the service is another."""
+    flight = Flight(5, failing(range(3, 5), ZeroDivisionError("no")))
+    flight.phase = Phase.STANDBY
+    assert fly(flight, tmp_path, lambda companion: None) == Outcome(0, "flown and landed")
+    assert flight.stops == 2
+
+
+@pytest.mark.parametrize(("phase", "restarts"), [(Phase.STANDBY, [4.0, 16.0]), (Phase.TRACK, [])])
+def test_another_supervisor_is_started_but_not_in_flight(
+    phase: Phase, restarts: list[float], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Every ten seconds, until it succeeds."""
+    now_s = 0.0
+    restarted_s: list[float] = []
+    monkeypatch.setattr(clock, "monotonic_s", lambda: now_s)
+
+    def later(left: int) -> None:
+        nonlocal now_s
+        now_s += 4.0
+
+    class Starting(Watcher):
+        def restart(self) -> None:
+            restarted_s.append(now_s)
+            super().restart()
+
+    flight, watcher = Flight(6, later), Starting(lost=True)
+    flight.phase = phase
+    with FlightLog(tmp_path / "flight", "") as log, StopRequests() as stops:
+        Loop(
+            cast(Companion, flight), Wire(), log, stops=stops,
+            progress=lambda companion: None, supervisor=cast(Supervisor, watcher),
+        ).run()  # fmt: skip
+    assert restarted_s == restarts
+    assert flight.guarded is bool(restarts)
+    assert flight.announced == [UNGUARDED, "another supervisor is started"][: 1 + bool(restarts)]
 
 
 def test_an_exception_in_every_turn_ends_in_silence(

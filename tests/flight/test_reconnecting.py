@@ -170,29 +170,6 @@ def test_a_serial_device_that_is_unplugged_and_back(
     os.close(ours)
 
 
-@pytest.mark.parametrize("kind", ["tcp", "serial"])
-def test_what_is_not_there_yet_is_awaited_on_request(
-    kind: str, tmp_path: Path, keep: Callable[[Link], Link]
-) -> None:
-    with listening() as server:
-        port = server.getsockname()[1]
-    address = f"tcp:127.0.0.1:{port}" if kind == "tcp" else f"serial:{tmp_path / 'tty'}:57600"
-    with pytest.raises(LinkError):
-        open_link(address)
-    link = keep(open_link(address, waits=True))
-    run(link, 0.2)
-    if kind == "tcp":
-        with listening(port) as server:
-            turns(link, lambda _: link.descriptors())
-    else:
-        ours, theirs = pty.openpty()
-        (tmp_path / "tty").symlink_to(os.ttyname(theirs))
-        turns(link, lambda _: link.descriptors())
-        os.close(ours)
-        os.close(theirs)
-    assert RENEWED not in link.strangers.news()  # it is the first
-
-
 @pytest.mark.skipif(not IPV6, reason="this computer has no IPv6")
 @pytest.mark.parametrize("kind", ["udpin", "udpout", "tcp", "tcpin"])
 def test_ipv6_addresses(kind: str, keep: Callable[[Link], Link]) -> None:

@@ -22,6 +22,7 @@ class Vehicle:
         self.dialect = dialect
         self.mode = dialect.engage_mode
         self.obeys = obeys
+        self.acknowledges = obeys
         self.armed = True
         self.heard = True
         self.land_s = land_s
@@ -46,6 +47,9 @@ class Vehicle:
             request = recovery.due(100.0 + time_s)
             if request:
                 self.asked.append((round(time_s, 2), request.command.command))
+                if self.acknowledges:
+                    ack = CommandAck(request.command.command, "ACCEPTED")
+                    recovery.see(ack, 100.0 + time_s + STEP_S)
                 if self.obeys:
                     landing = request.command.command == LAND
                     self.mode = self.dialect.land_mode if landing else self.dialect.hold_mode
@@ -123,23 +127,61 @@ def test_of_a_vehicle_that_is_not_heard_hold_is_asked_three_times(dialect: Diale
     assert [at_s for at_s, _ in vehicle.asked] == pytest.approx([0.0, 0.3, 0.6], abs=0.03)
 
 
-@pytest.mark.parametrize("obeys", [True, False])
-def test_a_failsafe_that_crosses_the_request_is_not_the_end(obeys: bool) -> None:
-    """PX4's own failsafe comes one second after the last setpoint, as we do. A vehicle that left it
-    for our hold would hover until its battery is empty; one that did not is left alone."""
+@FIRMWARES
+def test_hold_that_the_vehicle_has_not_acknowledged_is_left_alone(dialect: Dialect) -> None:
+    """The request was lost, and its pilot or its failsafe has chosen hold."""
+    vehicle = Vehicle(dialect)
+    vehicle.acknowledges = False
+    assert vehicle.survives(before=dialect.engage_mode).startswith(
+        f"the vehicle shows {dialect.hold_mode}, and has not acknowledged the request"
+    )
+    assert [command for _, command in vehicle.asked] == [HOLD]
+
+
+def asked(*reports: tuple[float, str]) -> tuple[list[int], str]:
+    """What is asked of a PX4 that acknowledges hold 0.05 s after the request at 100 s, and shows
+    these modes at these times; and how it ended."""
     recovery = Recovery(PX4, 100.0)
     recovery.see(Heartbeat(PX4.engage_mode, True, 4), 99.6)
-    assert recovery.due(100.0) is not None
-    recovery.see(ModeReport("POSCTL"), 100.01)
-    assert recovery.due(100.02) is None
-    assert recovery.ended == ""
-    requests = []
-    for step in range(13):
-        recovery.see(ModeReport(PX4.hold_mode if obeys else "POSCTL"), 100.5 + 0.5 * step)
-        requests.append(recovery.due(100.5 + 0.5 * step))
-    commands = {request.command.command for request in requests if request}
-    assert commands == ({LAND} if obeys else set())
-    assert (recovery.ended == "") is obeys
+    commands = []
+    events = [(100.05, CommandAck(HOLD, "ACCEPTED")), *((t, ModeReport(m)) for t, m in reports)]
+    for step in range(601):
+        now_s = 100.0 + STEP_S * step
+        request = recovery.due(now_s)
+        commands += [request.command.command] if request else []
+        for at_s, event in events:
+            if now_s - STEP_S < at_s <= now_s + 1e-9 or (not step and at_s <= now_s):
+                recovery.see(event, at_s)
+    return commands, recovery.ended
+
+
+HOLDS = [(100.5 + 0.5 * n, PX4.hold_mode) for n in range(22)]
+LANDS = [(105.9 + 0.5 * n, PX4.land_mode) for n in range(12)]
+
+
+@pytest.mark.parametrize("left_s", [100.01, 100.2, 100.31, 103.0])
+def test_a_pilot_who_switches_and_then_holds_is_left_alone(left_s: float) -> None:
+    """Also within 0.3 s of our request, and although the vehicle has acknowledged it."""
+    later = [(t, m) for t, m in HOLDS if t > left_s]
+    commands, ended = asked((left_s, "POSCTL"), (left_s + 0.001, PX4.hold_mode), *later)
+    assert commands == [HOLD]
+    assert ended.startswith("the vehicle shows POSCTL")
+
+
+def test_hold_of_before_the_request_is_the_pilots() -> None:
+    """It arrived before the request left, and was read after it."""
+    assert set(asked(*HOLDS)[0]) == {HOLD, LAND}
+    commands, ended = asked((99.99, PX4.hold_mode), *HOLDS)
+    assert commands == [HOLD]
+    assert ended.startswith("the vehicle shows AUTO.LOITER")
+
+
+def test_hold_after_the_landing_mode_is_the_pilots() -> None:
+    landing = [*((t, m) for t, m in HOLDS if t < 105.8), *LANDS[:3]]
+    assert asked(*landing) == ([HOLD, LAND], "")
+    commands, ended = asked(*landing, (107.5, PX4.hold_mode))
+    assert commands == [HOLD, LAND]
+    assert ended.startswith("the vehicle shows AUTO.LOITER")
 
 
 def test_a_refusal_is_kept_to_be_said() -> None:

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from faults import restamped
 from pair import decode
 from service_wire import HOVER, Wire
 from serving import ARM, PAUSE_CONTINUE, SET_MODE, START, Remembered, Serving, serve
@@ -104,6 +105,39 @@ def test_a_restarted_service_asks_for_hold_and_waits_for_the_pilot(on: str) -> N
     assert wire.unsafe == []
 
 
+@pytest.mark.parametrize(("on", "left"), [("px4", "px4-1-ff"), ("ardupilot", "")])
+def test_a_vehicle_that_the_service_has_not_engaged_is_left_alone(on: str, left: str) -> None:
+    """Another companion computer flies it, on a link that we do not hear; or a flight with another
+    vehicle was cut short."""
+    pair, wire = engaged(on)
+    if on == "px4":
+        pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 5.0)
+    pair.logs.left = left
+    pair.restart()
+    wire.wrap()
+    began_s = pair.time_s
+    pair.run(4.0)
+    assert pair.mode in ("OFFBOARD", "GUIDED")
+    assert pair.after(began_s, SETPOINT, COMMAND) == []
+    assert pair.said("in the air, and this service has not engaged it: it is left alone")
+    assert len(pair.logs.begun) == 1
+    pair.switch("pilot")
+    pair.run(2.0)
+    assert pair.logs.left == left
+    pair.switch("engage")
+    pair.until(lambda: pair.phase in TRACKING, 3.0)
+    assert wire.unsafe == []
+
+
+def test_a_vehicle_that_is_seen_on_the_ground_is_not_left_engaged_any_more() -> None:
+    """Who engages it later is another."""
+    pair = serve()
+    pair.until(lambda: pair.phase is Phase.STANDBY)
+    pair.restart()
+    pair.logs.left = "px4-1-1"
+    pair.until(lambda: pair.logs.left == "", 5.0)
+
+
 @BOTH
 def test_engaging_a_service_that_is_not_ready_asks_for_hold_and_says_why(on: str) -> None:
     """A restarted service has not reached standby, because a parameter must be changed first. PX4
@@ -149,6 +183,14 @@ def test_engaged_again_before_a_heartbeat_has_shown_the_other_mode() -> None:
     pair.run(2.0)
     pair.switch("engage")
     pair.until(lambda: pair.phase in TRACKING, 1.0)
+    pair.service.guard(False)  # its supervisor has ended, which ends no flight
+    pair.run(1.0)
+    assert pair.phase in TRACKING
+    pair.switch("pilot")
+    pair.run(2.0)
+    pair.switch("engage")
+    pair.until(lambda: pair.mode == "AUTO.LOITER", 1.0)
+    assert pair.said("not engaged: the supervisor, which lands it if this process ends")
     assert wire.unsafe == []
 
 
@@ -158,11 +200,40 @@ def test_a_reboot_between_two_flights(on: str) -> None:
     pair.switch("land")
     commander = pair.instance.autopilot.commander
     pair.until(lambda: not commander.armed, 40.0)
+    before_s = pair.state.time_s
     pair.instance.reboot(1.0)
     pair.until(lambda: pair.said("the vehicle restarted"), 10.0)
     pair.fly_up()
+    pair.until(lambda: pair.state.time_s > before_s + 0.1)  # vehicle time repeats
+    assert pair.state.hover.thrust(pair.state.time_s) == pytest.approx(HOVER[on], rel=0.05)
     pair.switch("engage")
     pair.until(lambda: pair.phase is Phase.HOVER, 40.0)
+    assert wire.unsafe == []
+
+
+def test_a_vehicle_that_reboots_in_flight_is_asked_to_hold() -> None:
+    """ArduCopter's watchdog restarts it in the air, armed and in GUIDED."""
+    pair, wire = engaged("ardupilot")
+    pair.run(1.0)
+    booted = restamped(pair.state.time_s - 1.0)
+    pair.down = lambda time_s, datagrams: booted(time_s, pair.deliver(time_s, datagrams))
+    pair.until(lambda: pair.said("the vehicle restarted in flight"), 1.0)
+    rebooted_s = pair.time_s
+    pair.until(lambda: pair.mode == "BRAKE", 6.0)
+    assert thrusts(pair, rebooted_s) == []
+    assert wire.unsafe == []
+
+
+def test_a_vehicle_that_is_not_heard_for_long_is_asked_to_hold() -> None:
+    """It has waited in GUIDED without anybody who flies it."""
+    pair, wire = engaged("ardupilot")
+    pair.run(1.0)
+    pair.lost_down = pair.lost_up = True
+    pair.run(4.0)
+    pair.lost_down = pair.lost_up = False
+    assert pair.mode == "GUIDED"
+    pair.until(lambda: pair.mode == "BRAKE", 3.0)
+    assert len(pair.logs.begun) == 2
     assert wire.unsafe == []
 
 
@@ -277,10 +348,13 @@ def test_another_controller_is_left_alone() -> None:
     pair.other_setpoint()
     pair.run(0.3)
     heard_s = pair.time_s
+    pair.instance.autopilot.parameters.set("COM_OF_LOSS_T", 60.0)  # as others reach the vehicle
     pair.switch("engage")
-    for _ in range(8):
+    for _ in range(4):
         pair.other_setpoint()
         pair.run(0.3)
+    pair.run(6.0)  # it is silent, and has not been switched for us
+    assert pair.mode == "OFFBOARD"
     assert pair.after(heard_s, SETPOINT, COMMAND) == []
     assert pair.phase is Phase.STANDBY
 
@@ -297,24 +371,55 @@ def test_what_follows_the_reference(then: str) -> None:
     assert wire.unsafe == []
 
 
+def test_a_take_off_point_that_was_not_seen_is_no_origin() -> None:
+    """A service that is started in the air with --anchor origin engages after the next landing."""
+    pair, wire = engaged("ardupilot", anchor="origin")
+    assert pair.state.plan.origin_ned_m == pytest.approx((0.0, 0.0, 0.0), abs=0.1)
+    pair.switch("pilot")
+    pair.run(1.0)
+    pair.restart()
+    wire.wrap()
+    pair.run(6.0)
+    engaged_s = pair.time_s
+    pair.switch("engage")
+    pair.until(lambda: pair.mode == "GUIDED", 1.0)
+    pair.until(lambda: pair.mode == "BRAKE", 1.0)
+    assert pair.said("not engaged: its take-off point is not known")
+    assert thrusts(pair, engaged_s) == []
+    assert wire.unsafe == []
+
+
 def test_a_new_configuration_is_used_by_the_next_flight(tmp_path: Path) -> None:
     from serving import prepared
 
     pair, _ = engaged("px4")
     pair.run(1.0)
-    pair.source.prepared = prepared("reference.height_m=1.5", reference="hover", vehicle="px4_sih")
+    assert pair.service.lands_without_log
+    pair.source.prepared = prepared(
+        "reference.height_m=1.5", "limits.log_lost=go_on", "period_s=0.2",
+        reference="hover", vehicle="px4_sih",
+    )  # fmt: skip
     model = pair.service.current
     pair.run(1.0)
     assert pair.service.current is model
     pair.switch("pilot")
-    pair.run(1.5)
+    pair.run(2.5)
     assert pair.service.current is not model
     assert float(pair.state.plan.track.sample(0.0).position_ned_m[2]) == -1.5
+    assert not pair.service.lands_without_log
+    ticks = thrusts(pair, pair.time_s - 1.0)
+    assert len(ticks) == 5  # by the new period, which counts from another tick
 
 
 def test_heartbeat_shows_standby_and_the_phase() -> None:
     pair, _ = engaged("px4")
     pair.run(2.0)
+    for number in range(500):
+        pair.service.announce(f"{number}")
+        pair.advance()
+    assert len(pair.service.current.announced) <= 200  # of one companion, which may wait for weeks
+    assert pair.service.announced[-1] == "499"
+    assert pair.service.announcements > 500
     beats = [decode(frame) for _, _, frame in pair.sent if frame[7:10] == b"\0\0\0"]
     assert (beats[3].system_status, beats[3].custom_mode) == (3, 17)
     assert (beats[-1].system_status, beats[-1].custom_mode) in [(4, 6), (4, 14)]

@@ -251,7 +251,7 @@ def test_it_signs_with_stamps_that_follow_ours(tmp_path: Path) -> None:
     assert all(each.frame.signed for each in tlog.read(log.path) if each.name != "TUNNEL")
 
 
-def test_a_supervisor_that_ends_is_noticed(rig: Rig) -> None:
+def test_a_supervisor_that_ends_is_noticed_and_another_one_takes_over(rig: Rig) -> None:
     rig.beat(OURS)
     assert not rig.supervisor.lost
     os.kill(rig.supervisor.pid, signal.SIGKILL)
@@ -260,6 +260,15 @@ def test_a_supervisor_that_ends_is_noticed(rig: Rig) -> None:
     rig.beat(OURS)
     assert rig.supervisor.lost
     assert not rig.supervisor.has_taken_over()
+    rig.supervisor.restart()
+    rig.beat(OURS)
+    assert not rig.supervisor.guards
+    rig.supervisor.await_ready()
+    assert rig.supervisor.guards
+    rig.beat(OURS)
+    assert rig.next_command().command == 176
+    assert rig.supervisor.has_taken_over()
+    rig.disarm()
 
 
 def test_a_supervisor_that_cannot_be_started_is_said(monkeypatch: pytest.MonkeyPatch) -> None:

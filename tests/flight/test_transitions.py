@@ -81,6 +81,7 @@ EVENTS: dict[str, dict[str, object]] = {  # the facts that make each guard hold
     "engaged_too_soon": {"hasty": True, "in_the_air": True, "in_phase_s": 0.6},
     "abandoned": {
         "unclaimed": True,
+        "left_engaged": True,
         "engaged": True,
         "armed": True,
         "in_the_air": True,

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -15,16 +17,19 @@ from offboard.analysis import tlog
 from offboard.flight import clock, manifest
 from offboard.flight import request as flight_request
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
+from offboard.flight.link import LinkError
 from offboard.flight.pilot_switch import PilotSwitch
 from offboard.flight.request import FlightRequest
+from offboard.flight.stop import StopRequests
 from offboard.identification.learned import Learned
 from offboard.identification.uncertainty import Estimate
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
-from offboard.service import preparation
+from offboard.service import daemon, preparation
+from offboard.service.daemon import Manager
 from offboard.service.flights import Prepared
-from offboard.service.lock import ConnectionLock, Locked
+from offboard.service.lock import Locked, connection_lock, directory_lock
 from offboard.service.memory import VehicleFiles
 from offboard.service.monitor import Monitor, MonitorError
 from offboard.service.preparation import Preparation
@@ -39,7 +44,9 @@ def session() -> Session:
 
 def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
     scored: list[Path] = []
-    recorder = Recorder(tmp_path, stamp=lambda: "now", score=scored.append)
+    recorder = Recorder(
+        tmp_path, stamp=lambda: "now", score=lambda directory, closing: scored.append(directory)
+    )
     talk = session()
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
     home = mavlink.MAVLink_gps_global_origin_message(1, 2, 3).pack(codec)
@@ -47,10 +54,10 @@ def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
     recorder.write(began_us, home)  # long ago
     for second in range(2, 20):
         recorder.write(began_us + second * 1_000_000, talk.encode(Heartbeat(6)))
-    first = Path(recorder.begin(talk, "vehicle: neutral\n"))
+    first = Path(recorder.begin(talk, "vehicle: neutral\n", "px4-1-7"))
     recorder.write(began_us + 20_000_000, talk.encode(Heartbeat(18)))
-    recorder.end()
-    second_flight = Path(recorder.begin(talk, "vehicle: neutral\n"))
+    recorder.end(engaged=False)
+    second_flight = Path(recorder.begin(talk, "vehicle: neutral\n", "px4-1-7"))
     recorder.write(began_us + 21_000_000, talk.encode(Heartbeat(18)))
     recorder.close()
     assert (first.name, second_flight.name) == ("now", "now-2")
@@ -67,8 +74,77 @@ def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
     assert (first / "flight.yaml").read_text() == "vehicle: neutral\n"
 
 
+def test_a_clock_that_is_set_back_ends_what_came_before(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path, stamp=lambda: "now", score=lambda *_: None)
+    talk = session()
+    frames = [talk.encode(Heartbeat(6)) for _ in range(3)]
+    for unix_s, frame in zip((2000, 1000, 1001), frames, strict=True):
+        recorder.write(1_000_000 * unix_s, frame)
+    flight = Path(recorder.begin(talk, "", ""))
+    recorder.close()
+    log = (flight / "flight.tlog").read_bytes()
+    assert [frame in log for frame in frames] == [False, True, True]
+
+
+@pytest.mark.parametrize(("age_s", "left"), [(0, "px4-1-7"), (601, ""), (-601, "")])
+def test_what_a_killed_service_has_not_done(tmp_path: Path, age_s: int, left: str) -> None:
+    """The vehicle that it had engaged is known for ten minutes, its flight is scored."""
+    killed = Recorder(tmp_path, stamp=lambda: "cut", score=lambda *_: None)
+    cut = Path(killed.begin(session(), "", "px4-1-7"))
+    deadline_s = time.monotonic() + 10.0
+    while not (cut / "flight.tlog").exists():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+    changed_s = time.time() - age_s
+    os.utime(cut / "flight.tlog", (changed_s, changed_s))
+    scored: list[Path] = []
+    recorder = Recorder(
+        tmp_path, settled_s=0.01, score=lambda directory, closing: scored.append(directory)
+    )
+    assert recorder.left == left
+    recorder.score_earlier()
+    while (cut / "unscored").exists():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.01)
+    assert scored == [cut]
+    recorder.settle()
+    assert recorder.left == ""
+    recorder.close()
+    assert not (cut / "engaged").exists()
+    killed.close()
+
+
+@pytest.mark.parametrize("engaged", [True, False])
+def test_a_vehicle_is_left_engaged_until_it_was_handed_back(tmp_path: Path, engaged: bool) -> None:
+    recorder = Recorder(tmp_path, score=lambda *_: None)
+    flight = Path(recorder.begin(session(), "", "px4-1-7"))
+    recorder.end(engaged=engaged)
+    recorder.close()
+    assert recorder.left == ("px4-1-7" if engaged else "")
+    again = Recorder(tmp_path, score=lambda *_: None)
+    assert again.left == recorder.left
+    assert (flight / "engaged").exists() is engaged
+    again.close()
+
+
+def test_the_end_does_not_wait_for_the_score(tmp_path: Path) -> None:
+    """The processes that score outlive the service; the next start sees what they have done."""
+
+    def score(directory: Path, closing: threading.Event) -> None:
+        began.append(directory)
+        assert closing.wait(60.0)
+
+    began: list[Path] = []
+    recorder = Recorder(tmp_path, score=score)
+    (first, second) = [Path(recorder.begin(session(), "", "")) for _ in range(2)
+                       if recorder.end(engaged=False) is None]  # fmt: skip
+    recorder.close()
+    assert began == [first, second]
+    assert {path.parent for path in tmp_path.glob("*/unscored")} == {first, second}
+
+
 def test_the_rolling_log_is_bounded(tmp_path: Path) -> None:
-    recorder = Recorder(tmp_path, score=lambda directory: None, rolling_bytes=20_000)
+    recorder = Recorder(tmp_path, score=lambda *_: None, rolling_bytes=20_000)
     talk = session()
     written = 0
     for number in range(5000):
@@ -88,16 +164,20 @@ def test_the_rolling_log_is_bounded(tmp_path: Path) -> None:
 def test_a_flight_that_cannot_be_recorded_says_so_and_the_next_one_is(tmp_path: Path) -> None:
     names = iter([f"{ROLLING_NAMES[0]}/x", "later"])
     scored: list[Path] = []
-    recorder = Recorder(tmp_path, stamp=lambda: next(names), score=scored.append)
+    recorder = Recorder(
+        tmp_path,
+        stamp=lambda: next(names),
+        score=lambda directory, closing: scored.append(directory),
+    )
     talk = session()
-    recorder.begin(talk, "")
+    recorder.begin(talk, "", "")
     deadline_s = time.monotonic() + 10.0
     while not recorder.problem and time.monotonic() < deadline_s:
         recorder.write(1, talk.encode(Heartbeat(6)))
         time.sleep(0.01)
     assert "cannot be written (Not a directory)" in recorder.problem
-    recorder.end()
-    recorder.begin(talk, "")
+    recorder.end(engaged=False)
+    recorder.begin(talk, "", "")
     assert recorder.problem == ""
     recorder.close()
     assert scored == [tmp_path / "later"]
@@ -132,9 +212,9 @@ def test_the_lock_names_its_holder_and_dies_with_it(
 ) -> None:
     monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
     code = (
-        "from offboard.service.lock import ConnectionLock\n"
+        "from offboard.service.lock import connection_lock\n"
         "import sys\n"
-        "with ConnectionLock('udpin:127.0.0.1:1'):\n"
+        "with connection_lock('udpin:127.0.0.1:1'):\n"
         "    print('held', flush=True)\n"
         "    sys.stdin.read()\n"
     )
@@ -143,14 +223,81 @@ def test_the_lock_names_its_holder_and_dies_with_it(
     )
     assert holder.stdout is not None
     assert holder.stdout.readline() == b"held\n"
-    with ConnectionLock("udpin:127.0.0.1:2"):
+    with connection_lock("udpin:127.0.0.1:2"):
         pass
-    with pytest.raises(Locked, match=f"process {holder.pid}$"), ConnectionLock("udpin:127.0.0.1:1"):
+    with (
+        pytest.raises(Locked, match=f"process {holder.pid}$"),
+        connection_lock("udpin:127.0.0.1:1"),
+    ):
         pass
     holder.kill()
     holder.wait()
-    with ConnectionLock("udpin:127.0.0.1:1") as lock:
+    with connection_lock("udpin:127.0.0.1:1") as lock:
         assert lock.path.read_text() == f"{os.getpid()}\n"
+    with directory_lock(tmp_path / "new"):
+        again = directory_lock(tmp_path / "new")
+        with pytest.raises(Locked, match=f"has the directory {tmp_path}/new"), again:
+            pass
+
+
+def test_ports_of_another_network_namespace_are_other_ports(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As in a container that shares the directory of the locks; a serial device is the same."""
+    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+
+    def locks() -> list[Path]:
+        return [connection_lock(each).path for each in ("udpin:0.0.0.0:1", "serial:/dev/x:9600")]
+
+    (port, device), stat = locks(), os.stat
+    other = os.stat_result((0, 12345, *range(8)))
+    namespace = "/proc/self/ns/net"
+    monkeypatch.setattr(os, "stat", lambda path: other if path == namespace else stat(path))
+    assert locks()[1] == device
+    assert locks()[0] != port
+
+
+def test_the_link_is_opened_when_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Port in use: said once, tried again until it is free. A wrong address is an error at once."""
+    monkeypatch.setattr(daemon, "LINK_FIRST_S", 0.01)
+    holder = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+    holder.bind(("127.0.0.1", 0))
+    alive, told = [], []
+
+    class Watching(Manager):
+        def alive(self, now_s: float, status: str = "") -> None:
+            alive.append(now_s)
+            if len(alive) == 3:
+                holder.close()
+
+    address = f"udpin:127.0.0.1:{holder.getsockname()[1]}"
+    with StopRequests() as stops:
+        link = daemon.opened(address, stops, told.append, Watching())
+        assert link is not None
+        link.close()
+        assert told == [
+            f"connection '{address}' cannot be opened: Address already in use; another program "
+            "uses the port; trying again"
+        ]
+        for wrong in ("udpin:127.0.0.1", f"udpin:{'x' * 300}:14540"):
+            with pytest.raises(LinkError):
+                daemon.opened(wrong, stops, told.append, Watching())
+
+
+def test_the_service_manager_is_told_and_not_waited_for(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It reads nothing until its queue is full."""
+    name = f"offboard-{os.getpid()}"
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as systemd:
+        systemd.bind(f"\0{name}")
+        monkeypatch.setenv("NOTIFY_SOCKET", f"@{name}")
+        manager = Manager()
+        manager.ready()
+        for second in range(1, 1000):  # net.unix.max_dgram_qlen is 512 at most
+            manager.alive(float(second), f"{second}")
+        systemd.settimeout(10.0)
+        heard = [systemd.recv(100) for _ in range(4)]
+        assert heard == [b"READY=1", b"WATCHDOG=1", b"STATUS=1", b"WATCHDOG=1"]
+        manager.close()
 
 
 def test_a_changed_configuration_is_used_and_a_bad_one_refused(
@@ -206,15 +353,22 @@ def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:
 
 
 def test_a_reference_that_is_placed_low_stays_clear_of_the_ground(tmp_path: Path) -> None:
-    request = FlightRequest(tmp_path, choices={"reference": "helix", "vehicle": "px4_sih"})
+    """A helix that descends by 4 m."""
+    request = FlightRequest(
+        tmp_path,
+        choices={"reference": "helix", "vehicle": "px4_sih"},
+        assignments=("reference.climb_mps=-0.4", "reference.height_m=20"),
+    )
     plan = FlightPlan(flight_request.build_parts(request.resolve()).track)
     start, times = plan.track.sample(0.0).position_ned_m, range(60)
     lowest = max(float(plan.track.sample(float(t)).position_ned_m[2]) for t in times)
     falls_m = lowest - float(start[2])
+    assert falls_m > 4.0
     assert plan.place_start((3.0, 4.0, -20.0), 0.0) == 0.0
     assert plan.origin_ned_m[2] + float(start[2]) == pytest.approx(-20.0)
     raised_m = plan.place_start((3.0, 4.0, -1.0), 0.0)
     assert raised_m == pytest.approx(max(falls_m - 1.0 + CLEAR_M, 0.0), abs=0.02)
+    assert plan.place_start((3.0, 4.0, -20.0), None) == pytest.approx(falls_m, abs=0.02)
 
 
 @pytest.mark.parametrize("certainly", [True, False])
