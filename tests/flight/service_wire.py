@@ -36,7 +36,7 @@ ALOFT_M = 0.3
 REPORTED_S = 0.5  # EXTENDED_SYS_STATE at 5 Hz, and what decides on it
 ANSWERED_S = 0.3  # a command of the pilot, by the vehicle
 KNOWN_S = 2.6  # age of the newest report of the mode
-OTHER_S = 3.0  # another sender is there for so long
+OTHER_S = 5.0  # another sender is there for so long
 LIKE_NOW_RAD = 0.2  # attitude of the stream in the air against the vehicle's
 TILT_RAD = math.radians(46.0)
 LEAST_SHARE, FALLING_MPS = 0.32, 3.5
@@ -132,7 +132,8 @@ class Wire:
         if mode != self.mode:
             if mode == ours:
                 self.asked.clear()
-                self.engaged = time_s - self._wish_s < ANSWERED_S and self._off_ground
+                alone = time_s - self._other_s > OTHER_S  # else it is switched for the other program
+                self.engaged = alone and time_s - self._wish_s < ANSWERED_S and self._off_ground
                 self.switches += self.engaged
             else:
                 self.engaged = False

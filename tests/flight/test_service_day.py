@@ -32,7 +32,7 @@ from offboard.service.record import ROLLING_NAMES, Recorder
 
 DAY_S = float(os.environ.get("OFFBOARD_DAY_S", "60"))  # of each autopilot
 SEED = int(os.environ.get("OFFBOARD_DAY_SEED", "1"))
-ROLLING_BYTES = 300_000
+ROLLING_BYTES = 2_000_000
 HOUR_S = 3600.0
 EVENTS = ("engage", "engage", "engage", "switch", "switch", "land", "up", "up", "reboot",
           "down lost", "up lost", "freeze", "second sender", "arm", "engage on ground", "start",
