@@ -283,6 +283,7 @@ def test_another_controller_is_left_alone() -> None:
         pair.run(0.3)
     assert pair.after(heard_s, SETPOINT, COMMAND) == []
     assert pair.phase is Phase.STANDBY
+    assert pair.said("not engaged: OFFBOARD, but another program sends setpoints")
 
 
 @pytest.mark.parametrize("then", ["repeat", "land"])
