@@ -132,7 +132,7 @@ class Wire:
         if mode != self.mode:
             if mode == ours:
                 self.asked.clear()
-                alone = time_s - self._other_s > OTHER_S  # else it is switched for the other program
+                alone = time_s - self._other_s > OTHER_S  # else it is switched for the other
                 self.engaged = alone and time_s - self._wish_s < ANSWERED_S and self._off_ground
                 self.switches += self.engaged
             else:
