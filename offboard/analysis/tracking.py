@@ -128,9 +128,10 @@ class Tracking:
         track_s = flown.records["track_time_s"][chosen]
         intervals = np.diff(track_s, prepend=self._track_s)
         intervals = intervals[np.isfinite(intervals)]
-        flowing = (intervals >= 0.0) & (intervals <= SKIPPED_S)
+        intervals = np.maximum(intervals, 0.0)  # it is flown again from its start
+        flowing = intervals <= SKIPPED_S
         self.tracked_s += float(intervals[flowing].sum())
-        self.skipped_s += float(np.abs(intervals[~flowing]).sum())
+        self.skipped_s += float(intervals[~flowing].sum())
         self._track_s = float(track_s[-1])
         attitude = flown.attitude[_nearest(flown.attitude[:, 0], ticks), 1:5]
         body = rotation_from_quaternion(attitude).swapaxes(-1, -2)
@@ -170,15 +171,17 @@ class Tracking:
 
 
 class _Clock:
-    """Time of the reference as a function of vehicle time, by the ticks of TRACK."""
+    """Time of the reference that has passed until a vehicle time, by the ticks of TRACK. It stands
+    still from the end of the reference to where it is flown again from its start."""
 
     def __init__(self, flown: History) -> None:
         chosen = _in_track(flown)
         rows = np.column_stack((flown.record_time_s, flown.records["track_time_s"]))[chosen]
-        self._rows = each_once(rows)
+        self._times, track_s = each_once(rows).T
+        self._passed_s = np.cumsum(np.maximum(np.diff(track_s, prepend=track_s[:1]), 0.0))
 
     def track_s(self, times: Array) -> Array:
-        return np.interp(times, self._rows[:, 0], self._rows[:, 1])
+        return np.interp(times, self._times, self._passed_s)
 
 
 class Reference:

@@ -33,7 +33,8 @@ class Weighted:
         self.max = math.nan
 
     def add(self, values: Array, weights: Array) -> None:
-        """Samples (N,) and their `shares` (N,)."""
+        """Samples (N,) and their `shares` (N,). Those that stand for no time do not count."""
+        values, weights = values[weights > 0.0], weights[weights > 0.0]
         if not len(values):
             return
         self._sums += weights @ np.stack((np.ones_like(values), values, values**2), axis=1)

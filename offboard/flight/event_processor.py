@@ -12,7 +12,7 @@ from offboard.flight.ground_contact import GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.outbox import Outbox
-from offboard.flight.phases import TRACKING
+from offboard.flight.phases import TRACKING, WAITING
 from offboard.flight.position_jumps import PositionJumps
 from offboard.flight.readiness import Readiness
 from offboard.flight.requests import Circumstances, Request, Result, answer
@@ -158,8 +158,10 @@ class EventProcessor:
         state.pilot.on_mode(
             ours=ours, in_the_air=contact.in_the_air, certainly=contact.certainly_flies
         )
-        if assessment.has_other_sender(state):
+        if state.pilot.engaged and assessment.has_other_sender(state):
             state.pilot.engaged = False  # it was not switched for us
+            if state.phase in WAITING:
+                self._outbox.announce(f"not engaged: {mode}, but another program sends setpoints")
         if isinstance(event, Heartbeat):
             state.pilot.on_heartbeat(ours=ours, failsafe=state.vehicle.in_failsafe)
 

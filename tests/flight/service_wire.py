@@ -1,31 +1,55 @@
-"""An independent observer of the service: what leaves, against the vehicle's true state.
+"""An independent observer of the service: what leaves, against what the vehicle and the pilot do.
 
-It reads the bytes that the service sends and the simulated vehicle itself, and nothing of the
-service. What must never happen is kept in `unsafe`.
+It decodes the bytes on the three links (vehicle to service, service to vehicle, ground station to
+vehicle) with pymavlink, looks at the simulated vehicle itself, and uses nothing of the service.
+What must never happen is kept in `unsafe`.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from pair import decode
-from serving import ARM, LAND, SET_MODE, TAKEOFF, Serving
+from pair import decode, frames_of
+from serving import ARM, LAND, MODES, SET_MODE, START, TAKEOFF, Serving
 
 from offboard.flight.companion import Output
 from offboard.flight.link import Chunk
 
-REACTION_S = 0.15  # a report of the mode at 10 Hz, and a turn
-REPORTED_S = 1.1  # PX4's HEARTBEAT, where CURRENT_MODE is lost
-SETPOINTS = {82, 84, 86}
+HEARTBEAT, COMMAND_LONG, ATTITUDE_TARGET, CURRENT_MODE = 0, 76, 82, 436
+COMMANDS, SETPOINTS = {75, COMMAND_LONG}, {ATTITUDE_TARGET, 84, 86}
+# HEARTBEAT, PARAM_REQUEST_READ, COMMAND_ACK, TIMESYNC, STATUSTEXT
+HARMLESS = {HEARTBEAT, 20, 77, 111, 253}
+QUESTIONS = {511, 512}  # MAV_CMD_SET_MESSAGE_INTERVAL, _REQUEST_MESSAGE
+US, VEHICLE = (1, 191), (1, 1)  # system and component
+CRITICAL = 5  # MAV_STATE; what is above it is worse
 ENGAGE = {"px4": "OFFBOARD", "ardupilot": "GUIDED"}
 HOLD = {"px4": "AUTO.LOITER", "ardupilot": "BRAKE"}
 LANDS = {"px4": "AUTO.LAND", "ardupilot": "LAND"}
 HOLD_PARAMETERS = {"px4": (4, 3), "ardupilot": (17, 0)}
 HOVER = {"px4": 0.489, "ardupilot": 0.366}
 ALOFT_M = 0.3
+REPORTED_S = 0.5  # EXTENDED_SYS_STATE at 5 Hz, and what decides on it
+ANSWERED_S = 0.3  # a command of the pilot, by the vehicle
+KNOWN_S = 2.6  # age of the newest report of the mode
+OTHER_S = 5.0  # another sender is there for so long
+LIKE_NOW_RAD = 0.2  # attitude of the stream in the air against the vehicle's
+TILT_RAD = math.radians(46.0)
+LEAST_SHARE, FALLING_MPS = 0.32, 3.5
+UNFLOWN_S = 2.5
+
+
+class Report(NamedTuple):
+    """The vehicle's mode as it left the vehicle."""
+
+    time_s: float
+    mode: str
+    engaged: bool  # and a pilot had switched to it, in the air
+    failsafe: bool
 
 
 @dataclass
@@ -37,91 +61,210 @@ class Wire:
     unsafe: list[str] = field(default_factory=list)
     setpoints: int = 0
     engaged_setpoints: int = 0
+    switches: int = 0  # by the pilot, in the air
     least_share: float = math.inf  # of hover thrust, in the air and in the mode of setpoints
-    gone_s: float = -math.inf  # since when the vehicle has shown another mode than ours
+    mode: str = ""  # of the vehicle
+    changed_s: float = -math.inf  # when the vehicle took it
+    engaged: bool = False  # by the pilot, and the mode was not left since
     asked: set[str] = field(default_factory=set)  # modes that the service asked for
-    mode: str = ""
+    known: Report | None = None  # the newest one that the service has got
 
     def __post_init__(self) -> None:
+        self._wish_s = self._other_s = -math.inf
+        self._sent: deque[Report] = deque()  # on their way to the service
+        self._served_s = self._apart_s = self._flying_s = self.pair.time_s
+        self._deliver = self.pair.down
+        self.pair.down = self._delivered
+        instance, on_command = self.pair.instance, self.pair.instance.feed_ground
+        instance.feed_ground = self._before(on_command)  # type: ignore[method-assign]
         self.wrap()
 
     def wrap(self) -> None:
-        """Watch the present service; again after its restart."""
+        """Watch the present service; again after its restart, which ends an engagement."""
         service = self.pair.companion
         turn = service.turn
+        self.engaged, self.known = False, None
+        self._sent.clear()
+        self.asked.clear()
 
         def watched(chunks: list[Chunk], now_s: float) -> Output:
-            self.look()
+            for chunk in chunks:
+                self._take(chunk.data)
             output = turn(chunks, now_s)
             for frame in output.send:
-                self.judge(frame)
+                self._judge(frame)
             return output
 
         service.turn = watched  # type: ignore[method-assign]
 
-    def look(self) -> None:
-        """At the vehicle's mode."""
-        mode = self.pair.mode
-        if mode == self.mode:
-            return
-        if mode == ENGAGE[self.pair.firmware]:
-            self.asked.clear()
-        elif mode not in self.asked:
-            self.gone_s = self.pair.time_s
-        self.mode = mode
+    # ------------------------------------------------------------------ to the vehicle and from it
 
-    def judge(self, frame: bytes) -> None:
+    def _before(self, feed: Callable[[bytes], None]) -> Callable[[bytes], None]:
+        """What the pilot asks of the vehicle."""
+
+        def watched(frame: bytes) -> None:
+            message = decode(frame)
+            asked = (message.command, message.param1, message.param2, message.param3)
+            if asked == (SET_MODE, *MODES[self.pair.firmware]["engage"]):
+                self._wish_s = self.pair.time_s
+            feed(frame)
+
+        return watched
+
+    def _delivered(self, time_s: float, datagrams: list[bytes]) -> list[bytes]:
+        """The vehicle at this step, and which reports of its mode are on their way."""
+        self._look(time_s)
+        arriving = self._deliver(time_s, datagrams)
+        for frame in (frame for datagram in arriving for frame in frames_of(datagram)):
+            number = int.from_bytes(frame[7:10], "little")
+            if number in (HEARTBEAT, CURRENT_MODE) and (frame[5], frame[6]) == VEHICLE:
+                failsafe = self.known is not None and self.known.failsafe
+                if self._sent:
+                    failsafe = self._sent[-1].failsafe
+                if number == HEARTBEAT:
+                    failsafe = decode(frame).system_status >= CRITICAL
+                self._sent.append(Report(time_s, self.mode, self.engaged, failsafe))
+        return arriving
+
+    def _look(self, time_s: float) -> None:
+        """At the vehicle itself."""
+        mode, ours = self.pair.mode, ENGAGE[self.pair.firmware]
+        if mode != self.mode:
+            if mode == ours:
+                self.asked.clear()
+                alone = time_s - self._other_s > OTHER_S  # else it is switched for the other
+                self.engaged = alone and time_s - self._wish_s < ANSWERED_S and self._off_ground
+                self.switches += self.engaged
+            else:
+                self.engaged = False
+                if mode not in self.asked:
+                    self.asked.clear()
+            self.mode, self.changed_s = mode, time_s
+        if not self.pair.instance.idle:
+            self._flying_s = time_s
+        joined = not (self.pair.lost_up or self.pair.lost_down or self.pair.paused)
+        if not joined or time_s - self._other_s < OTHER_S or not (self.engaged and self._aloft):
+            self._apart_s = time_s
+        elif time_s - max(self._apart_s, self._served_s, self.changed_s) > UNFLOWN_S:
+            self._note(f"nobody flies it in {mode}")
+            self._apart_s = time_s
+        if self.engaged and self.pair.steps % 25 == 0:
+            self._look_at_flight()
+
+    def _look_at_flight(self) -> None:
+        truth = self.pair.instance.autopilot.state.truth
+        if self._aloft and truth.velocity_ned_mps[2] > FALLING_MPS:
+            self._note(f"falls at {truth.velocity_ned_mps[2]:.1f} m/s")
+
+    @property
+    def _height_m(self) -> float:
+        return float(-self.pair.place[2])
+
+    @property
+    def _off_ground(self) -> bool:
+        return self._height_m > 0.05
+
+    @property
+    def _aloft(self) -> bool:
+        return self._height_m > ALOFT_M and bool(self.pair.instance.autopilot.commander.armed)
+
+    def _take(self, datagram: bytes) -> None:
+        """What the service gets."""
+        for frame in frames_of(datagram):
+            number, sender = int.from_bytes(frame[7:10], "little"), (frame[5], frame[6])
+            if sender == VEHICLE and number in (HEARTBEAT, CURRENT_MODE):
+                if self._sent:
+                    self.known = self._sent.popleft()
+            elif sender != VEHICLE and number in SETPOINTS:
+                self._other_s = self.pair.time_s
+            elif sender != VEHICLE and number == COMMAND_LONG and decode(frame).command == START:
+                starts = self.mode == ENGAGE[self.pair.firmware] and self._off_ground
+                self.engaged |= starts
+                if starts and self.known:
+                    self.known = self.known._replace(engaged=True)
+
+    # ------------------------------------------------------------------ from the service
+
+    def _judge(self, frame: bytes) -> None:
         number = int.from_bytes(frame[7:10], "little")
-        if number in SETPOINTS:
-            self._judge_setpoint(decode(frame))
-        elif number in (75, 76):
-            self._judge_command(decode(frame))
-
-    def _gone(self) -> bool:
-        """The vehicle has another mode than ours for longer than a report takes to arrive."""
-        away = self.mode != ENGAGE[self.pair.firmware] and self.mode not in self.asked
-        return away and self.pair.heard_mode_s > self.gone_s + REACTION_S
+        if number in SETPOINTS | COMMANDS:
+            if (frame[5], frame[6]) != US:
+                self._note(f"message {number} of {frame[5]}/{frame[6]}")
+            if number in SETPOINTS:
+                self._judge_setpoint(decode(frame))
+            else:
+                self._judge_command(decode(frame))
+        elif number not in HARMLESS:
+            self._note(f"message {number}")
 
     def _judge_setpoint(self, message: Any) -> None:
-        pair, on = self.pair, self.pair.firmware
+        on, known = self.pair.firmware, self.known
         self.setpoints += 1
+        self._served_s = self.pair.time_s
+        self._judge_numbers(message)
+        if self._is_unknown(known):
+            self._note("setpoint without a recent report of the mode")
+        elif known.mode == ENGAGE[on]:  # type: ignore[union-attr]
+            self._judge_engaged(message, known)  # type: ignore[arg-type]
+        elif on == "ardupilot":
+            self._note(f"setpoint in {self.mode}")
+        elif self._aloft:
+            self._judge_stream(message, known)  # type: ignore[arg-type]
+        elif message.thrust > 0.0 and self.pair.time_s - self._flying_s > REPORTED_S:
+            self._note(f"thrust {message.thrust:.3f} on the ground")
+
+    def _judge_numbers(self, message: Any) -> None:
         values = (*message.q, message.thrust)
         if not all(map(math.isfinite, values)) or abs(math.hypot(*message.q) - 1.0) > 4e-4:
             self._note(f"setpoint {message}")
-        engaged = self.mode == ENGAGE[on]
-        commander = pair.instance.autopilot.commander
-        aloft = -pair.place[2] > ALOFT_M and commander.armed
-        share = message.thrust / HOVER[on]
-        if aloft and share < 0.32:
+        if not 0.0 <= message.thrust <= 1.0 or message.type_mask != 7:
+            self._note(f"setpoint {message}")
+        _, x, y, _ = message.q
+        if 2.0 * math.asin(min(1.0, math.hypot(x, y))) > TILT_RAD:
+            self._note(f"setpoint tilted {message.q}")
+        if self._aloft and message.thrust / HOVER[self.pair.firmware] < LEAST_SHARE:
             self._note(f"thrust {message.thrust:.3f} in the air, {self.mode}")
-        if engaged and aloft:
+
+    def _judge_engaged(self, message: Any, known: Report) -> None:
+        if self._aloft:
             self.engaged_setpoints += 1
+            share = message.thrust / HOVER[self.pair.firmware]
             self.least_share = min(self.least_share, share)
-        if self._gone() and on == "ardupilot":
-            self._note(f"setpoint in {self.mode}")
-        elif self._gone() and aloft:
-            attitude = np.array(pair.instance.autopilot.state.truth.attitude)
-            angle = 2.0 * math.acos(min(1.0, abs(float(attitude @ np.array(message.q)))))
-            if angle > 0.35:
-                self._note(f"setpoint {math.degrees(angle):.0f} deg away in {self.mode}")
+        if not known.engaged and (self._aloft or message.thrust > 0.0) and not self.arms:
+            self._note(f"setpoint in {known.mode}, to which no pilot has switched in the air")
+
+    def _judge_stream(self, message: Any, known: Report) -> None:
+        """PX4's, in the air and in another mode: it must change nothing."""
+        if known.failsafe:
+            self._note(f"setpoint in {known.mode}, a failsafe")
+        if self.pair.time_s - self._other_s < OTHER_S:
+            self._note(f"setpoint in {known.mode} beside those of another program")
+        attitude = np.array(self.pair.instance.autopilot.state.truth.attitude)
+        angle = 2.0 * math.acos(min(1.0, abs(float(attitude @ np.array(message.q)))))
+        if angle > LIKE_NOW_RAD:
+            self._note(f"setpoint {math.degrees(angle):.0f} deg away in {known.mode}")
 
     def _judge_command(self, message: Any) -> None:
         on, command = self.pair.firmware, message.command
-        if (
-            command in (ARM, TAKEOFF)
-            and not self.arms
-            and not (command == ARM and not message.param1)
+        holds = command == SET_MODE and (message.param2, message.param3) == HOLD_PARAMETERS[on]
+        disarms = command == ARM and not message.param1 and not self._off_ground
+        if command in QUESTIONS or (
+            self.arms and command in (ARM, TAKEOFF, SET_MODE) and not holds
         ):
-            self._note(f"command {command} ({message.param1:g})")
-        if command not in (SET_MODE, LAND):
             return
-        hold = command == SET_MODE and (message.param2, message.param3) == HOLD_PARAMETERS[on]
-        if command == SET_MODE and not hold and not self.arms:
-            self._note(f"mode {message.param2:g} {message.param3:g} requested")
-        begins = self.arms and command == SET_MODE and not hold
-        if self._gone() and not begins:
+        if not (holds or disarms or command == LAND):
+            self._note(f"command {command} ({message.param1:g}, {message.param2:g})")
+            return
+        self._served_s = self.pair.time_s
+        if self._is_unknown(self.known):
+            self._note(f"command {command} without a recent report of the mode")
+        elif self.known.mode not in self.asked | {ENGAGE[on]}:  # type: ignore[union-attr]
             self._note(f"command {command} in {self.mode}")
-        self.asked.add(LANDS[on] if command == LAND else HOLD[on])
+        if not disarms:
+            self.asked.add(HOLD[on] if holds else LANDS[on])
+
+    def _is_unknown(self, known: Report | None) -> bool:
+        return known is None or self.pair.time_s - known.time_s > KNOWN_S
 
     def _note(self, what: str) -> None:
         self.unsafe.append(f"{self.pair.time_s:.2f} s {self.pair.phase.value}: {what}")

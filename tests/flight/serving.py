@@ -3,21 +3,33 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from pair import HOST_EPOCH_S, LEAN, LOITER, SHORT, HostClock, Pair, decode, frames_of
+from pair import (
+    HOST_EPOCH_S,
+    LEAN,
+    LOITER,
+    SHORT,
+    UNIX_EPOCH_US,
+    HostClock,
+    Pair,
+    decode,
+    frames_of,
+)
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.flight import configuration as config
 from offboard.flight import request
+from offboard.flight.companion import Output
 from offboard.flight.phases import Phase
 from offboard.flight.programme import Anchor, Then, service
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.identification.learned import Learned
 from offboard.mavlink.session import Session, SessionSettings
-from offboard.service.flights import Flights, Prepared
+from offboard.service.flights import Flights, Prepared, Record
+from offboard.service.record import Recorder
 from simulator import config as simulated
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
@@ -92,7 +104,7 @@ def prepared(*assignments: str, **choices: str) -> Prepared:
     return Prepared(request.build_parts(resolved), config.dump(resolved))
 
 
-def flights(source: Settings, logs: Logs, memory: Remembered, then: Then, anchor: Anchor,
+def flights(source: Settings, logs: Record, memory: Remembered, then: Then, anchor: Anchor,
             arms: bool) -> Flights:  # fmt: skip
     settings = SessionSettings(component_id=COMPONENT_ID, record_component_id=RECORD_COMPONENT_ID)
     return Flights(
@@ -114,7 +126,7 @@ class Serving(Pair):
     source: Any = None
     logs: Any = None
     memory: Any = None
-    again: Callable[[], Flights] | None = None
+    again: Callable[[Record], Flights] | None = None
 
     @property
     def state(self) -> Any:
@@ -145,6 +157,11 @@ class Serving(Pair):
     @property
     def mode(self) -> str:
         return str(self.instance.autopilot.commander.mode.name)
+
+    @property
+    def paused(self) -> bool:
+        """The process of the service is stopped."""
+        return self.clock.now_s > HOST_EPOCH_S + self.time_s
 
     @property
     def place(self) -> np.ndarray:
@@ -197,6 +214,17 @@ class Serving(Pair):
                 self.heard_mode_s = time_s
         return datagrams + extra
 
+    def _take(self, output: Output) -> None:
+        """What the loop does with a log; only tests without one look at what was sent."""
+        if not isinstance(self.logs, Recorder):
+            super()._take(output)
+            return
+        for frame in output.log:
+            self.logs.write(UNIX_EPOCH_US + round(1e6 * self.time_s), frame)
+        output = replace(output, log=())
+        super()._take(output)
+        self.sent.clear()
+
     def send_up(self, _: float, frames: list[bytes]) -> list[bytes]:
         return [] if self.lost_up else frames
 
@@ -210,7 +238,7 @@ class Serving(Pair):
 
     def restart(self) -> None:
         """Restart the process of the service."""
-        self.companion = self.again()  # type: ignore[misc,assignment]
+        self.companion = self.again(self.logs)  # type: ignore[misc,assignment]
 
     @property
     def acks(self) -> list[tuple[int, int]]:
@@ -242,6 +270,7 @@ def serve(
     seed: int = 7,
     memory: Remembered | None = None,
     firmware: Firmware | None = None,
+    record: Record | None = None,
     **options: Any,
 ) -> Serving:
     """A service with a vehicle that stands on the ground, and boots."""
@@ -249,9 +278,9 @@ def serve(
     clock = HostClock()
     short = SHORT if reference == "hover" else ()
     source = Settings(prepared(*short, *assignments, reference=reference, vehicle=vehicle))
-    logs, memory = Logs(clock), memory or Remembered()
+    logs, memory = record or Logs(clock), memory or Remembered()
 
-    def again() -> Flights:
+    def again(logs: Record) -> Flights:
         return flights(source, logs, memory, then, anchor, arms)
 
     flown = simulated.scenario(scenario)
@@ -266,7 +295,7 @@ def serve(
     )
     if on == "ardupilot":
         instance.autopilot.parameters.set("GUID_OPTIONS", 8.0)
-    pair = Serving(again(), instance, clock, firmware=on, source=source, logs=logs,
+    pair = Serving(again(logs), instance, clock, firmware=on, source=source, logs=logs,
                    memory=memory, again=again, **options)  # fmt: skip
     pair.down, pair.up = pair.deliver, pair.send_up
     return pair

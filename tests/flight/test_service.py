@@ -357,15 +357,20 @@ def test_another_controller_is_left_alone() -> None:
     assert pair.mode == "OFFBOARD"
     assert pair.after(heard_s, SETPOINT, COMMAND) == []
     assert pair.phase is Phase.STANDBY
+    assert pair.said("not engaged: OFFBOARD, but another program sends setpoints")
 
 
 @pytest.mark.parametrize("then", ["repeat", "land"])
-def test_what_follows_the_reference(then: str) -> None:
+def test_what_follows_the_reference(then: str, tmp_path: Path) -> None:
     pair, wire = engaged("px4", then=then)
     pair.until(lambda: pair.phase is Phase.HOVER, 30.0)
     if then == "repeat":
         pair.until(lambda: pair.phase is Phase.TRACK, 10.0)
+        pair.until(lambda: pair.phase is Phase.HOVER, 10.0)
         assert sum(phase is Phase.TRACK for _, phase in pair.phases) == 2
+        score = pair.score(tmp_path)
+        assert score.tracked_s == pytest.approx(2 * 2.9, abs=0.1)
+        assert score.max_position_m < 0.01
     else:
         pair.until(lambda: not pair.instance.autopilot.commander.armed, 40.0)
     assert wire.unsafe == []

@@ -1,44 +1,68 @@
 """The service through a day of events, in lockstep, judged by an independent observer of the wire.
 
-OFFBOARD_DAY_S=28800 makes the day eight hours instead of the default seconds.
+One vehicle, one service and one record for the whole day; Hypothesis draws the events. The default
+is a minute of each autopilot. OFFBOARD_DAY_S=28800 makes it eight hours, OFFBOARD_DAY_SEED another
+day.
 """
 
 from __future__ import annotations
 
 import gc
+import json
 import os
 import resource
+import shutil
+import threading
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
+from statistics import median
+from typing import NamedTuple
 
+import hypothesis
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from service_wire import Wire
-from serving import ARM, PAUSE_CONTINUE, SET_MODE, START, serve
+from serving import ARM, PAUSE_CONTINUE, SET_MODE, START, prepared, serve
 
+from offboard.analysis.trial import keep_score, score_flight
 from offboard.flight.phases import TRACKING
+from offboard.service.record import ROLLING_NAMES, Recorder
 
-DAY_S = float(os.environ.get("OFFBOARD_DAY_S", "120"))  # of both autopilots together
-EVENT_S = 8.0  # about the mean of an event, with what it needs before
-PER_EXAMPLE = 8 if DAY_S < 1000 else 300
-EXAMPLES = max(2, round(DAY_S / 2 / EVENT_S / PER_EXAMPLE) + 1)  # the first is a trivial one
-EVENTS = ("engage", "engage", "engage", "switch", "switch", "land", "up", "up", "reboot",
-          "down lost", "up lost", "freeze", "second sender", "arm", "engage on ground", "start",
-          "pause", "continue", "hand back", "restart")  # fmt: skip
+DAY_S = float(os.environ.get("OFFBOARD_DAY_S", "60"))  # of each autopilot
+SEED = int(os.environ.get("OFFBOARD_DAY_SEED", "1"))
+ROLLING_BYTES = 2_000_000
+HOUR_S = 3600.0
+# In this order they are the first example, and all of the default day
+EVENTS = ("engage on ground", "engage", "freeze", "kill", "engage", "second sender", "switch",
+          "up lost", "engage", "stop", "engage", "down lost", "hand back", "land", "arm", "up",
+          "start", "pause", "continue", "switch", "reboot", "configure")  # fmt: skip
+REFERENCES = ("hover", "lemniscate")
 Event = tuple[str, float]
-DAYS = st.lists(
-    st.tuples(st.sampled_from(EVENTS), st.floats(0.2, 8.0)),
-    min_size=PER_EXAMPLE,
-    max_size=PER_EXAMPLE,
-)
+DURATIONS_S = st.integers(5, 40).map(lambda fifths: fifths / 5.0)
+DAYS = st.tuples(  # every event, in any order; Hypothesis would repeat few of them
+    st.permutations(EVENTS), st.lists(DURATIONS_S, min_size=len(EVENTS), max_size=len(EVENTS))
+).map(lambda drawn: list(zip(*drawn, strict=True)))
+
+
+class Used(NamedTuple):
+    """By this process."""
+
+    time_s: float
+    memory_kb: int
+    descriptors: int
+    threads: int
 
 
 class Day:
     """One vehicle, one service, and what happens to them."""
 
-    def __init__(self, on: str) -> None:
-        self.pair = serve(on=on)
+    def __init__(self, on: str, directory: Path) -> None:
+        self.directory = directory
+        self.begun = self.scored = self.killed = 0
+        self.used: list[Used] = []
+        self.pair = serve(on=on, record=self._recorder())
         self.wire = Wire(self.pair)
         self._acts: dict[str, Callable[[float], None]] = {
             "engage": self._engage,
@@ -56,19 +80,33 @@ class Day:
             "pause": lambda for_s: self.pair.command(PAUSE_CONTINUE, 0),
             "continue": lambda for_s: self.pair.command(PAUSE_CONTINUE, 1),
             "hand back": lambda for_s: self.pair.command(SET_MODE, 1, 4, 3),
-            "restart": self._restart,
+            "stop": self._stop,
+            "kill": self._kill,
+            "configure": self._configure,
         }
+
+    def _recorder(self) -> Recorder:
+        """Flights are scored in this process, which is what differs from the daemon."""
+        self._dead = threading.Event()
+
+        dead = self._dead
+
+        def score(flight: Path) -> None:
+            if not dead.is_set():
+                keep_score(flight, *score_flight(flight))
+
+        def stamp() -> str:
+            self.begun += 1
+            return f"flight-{self.begun}"
+
+        return Recorder(self.directory, stamp=stamp, score=score, rolling_bytes=ROLLING_BYTES)
+
+    # ------------------------------------------------------------------ events
 
     def live(self, event: Event) -> None:
         name, for_s = event
         self._acts[name](for_s)
         self.pair.run(for_s)
-        self._forget()
-
-    def _forget(self) -> None:
-        """What the pair keeps for other tests."""
-        for kept in (self.pair.sent, self.pair.logged, self.pair.phases):
-            kept.clear()
 
     @property
     def _aloft(self) -> bool:
@@ -82,6 +120,7 @@ class Day:
             self.pair.switch("pilot")
             self.pair.run(1.5)
             self.pair.switch("engage")
+        self.pair.run(3.0 * for_s)
 
     def _up(self, _: float) -> None:
         commander = self.pair.instance.autopilot.commander
@@ -113,46 +152,99 @@ class Day:
             self.pair.other_setpoint()
             self.pair.run(0.5)
 
-    def _restart(self, _: float) -> None:
+    def _configure(self, _: float) -> None:
+        """The configuration is changed while it runs; what was identified is lost."""
+        self.pair.memory.known.clear()
+        vehicle = {"px4": "px4_sih", "ardupilot": "arducopter"}[self.pair.firmware]
+        reference = REFERENCES[self.begun % 2]
+        self.pair.source.prepared = prepared(reference=reference, vehicle=vehicle)
+
+    def _stop(self, _: float) -> None:
+        """SIGTERM, and started again by the service manager."""
+        self.pair.service.request_stop()
+        end_s = self.pair.time_s + 10.0
+        while not self.pair.service.has_ended() and self.pair.time_s < end_s:
+            self.pair.advance()
+        self._restart()
+
+    def _kill(self, _: float) -> None:
+        """SIGKILL, and started again by the service manager."""
+        self._dead.set()
+        self._restart()
+
+    def _restart(self) -> None:
+        self.close()
+        self.pair.logs = self._recorder()
         self.pair.restart()
         self.wire.wrap()
+
+    # ------------------------------------------------------------------ judged
+
+    def close(self) -> None:
+        """The process ends: everything is closed, and what it has flown is scored."""
+        assert self.pair.logs.problem == ""
+        self.pair.service.close()
+        self.pair.logs.close()
+        self._check_flights()
+        rolled = [(self.directory / name).stat().st_size for name in ROLLING_NAMES]
+        assert max(rolled) <= ROLLING_BYTES
+        gc.collect()
+        pages = int(Path("/proc/self/statm").read_text().split()[1])
+        memory_kb = pages * resource.getpagesize() // 1024
+        descriptors = len(os.listdir("/proc/self/fd"))
+        self.used.append(Used(self.pair.time_s, memory_kb, descriptors, threading.active_count()))
+        if DAY_S > HOUR_S:
+            print(self.begun, self.used[-1], flush=True)
+
+    def _check_flights(self) -> None:
+        """Every flight has a log and a score; that of a killed process can be scored."""
+        for flight in self.directory.glob("flight-*"):
+            assert (flight / "flight.yaml").exists()
+            if self._dead.is_set() and not (flight / "score.json").exists():
+                keep_score(flight, *score_flight(flight))
+                self.killed += 1
+            assert json.loads((flight / "score.json").read_text())["phases"]
+            shutil.rmtree(flight)
+            self.scored += 1
 
 
 @pytest.mark.parametrize("on", ["px4", "ardupilot"])
 @pytest.mark.timeout(0)
-def test_no_unsafe_state_in_a_day(on: str) -> None:
-    early: list[tuple[int, int]] = []
+def test_no_unsafe_state_in_a_day(on: str, tmp_path: Path) -> None:
+    day = Day(on, tmp_path)
+    lived: deque[tuple[float, Event]] = deque(maxlen=20)
 
+    @hypothesis.seed(SEED)
     @settings(
-        max_examples=EXAMPLES,
+        max_examples=max(10, round(DAY_S / 50.0)),
+        phases=[hypothesis.Phase.generate],
         deadline=None,
         database=None,
-        derandomize="OFFBOARD_DAY_S" not in os.environ,
         suppress_health_check=list(HealthCheck),
     )
     @given(DAYS)
     def live(events: list[Event]) -> None:
-        day = Day(on)
-        for index, event in enumerate(events):
+        for event in events:
+            if day.pair.time_s > DAY_S:
+                return
+            lived.append((day.pair.time_s, event))
             day.live(event)
-            assert day.wire.unsafe == [], events[: index + 1]
-            if not early and index >= len(events) // 2:
-                early.append(used())
-        memory_kb, descriptors = used()
-        print(
-            f"\n{on}: {day.pair.time_s:.0f} s, {len(events)} events, {len(day.pair.logs.begun)} "
-            f"flights, {day.wire.setpoints} setpoints, {day.wire.engaged_setpoints} engaged, least "
-            f"thrust {day.wire.least_share:.2f} of hover, memory {early[0][0]} -> {memory_kb} kB, "
-            f"descriptors {early[0][1]} -> {descriptors}"
-        )
-        assert memory_kb < early[0][0] + 20_000
-        assert descriptors == early[0][1]
+            assert day.wire.unsafe == [], list(lived)
 
     live()
-
-
-def used() -> tuple[int, int]:
-    """Resident memory (kB) and number of open descriptors of this process."""
-    gc.collect()
-    pages = int(Path("/proc/self/statm").read_text().split()[1])
-    return pages * resource.getpagesize() // 1024, len(os.listdir("/proc/self/fd"))
+    day.close()
+    assert day.pair.time_s > DAY_S
+    first, last = day.used[0], day.used[-1]
+    print(
+        f"\n{on}: {day.pair.time_s:.0f} s, {day.wire.switches} switches by the pilot in the air, "
+        f"{day.begun} flights, {day.scored} scored, {day.killed} killed in flight, "
+        f"{day.wire.setpoints} setpoints, {day.wire.engaged_setpoints} of them engaged, "
+        f"least thrust {day.wire.least_share:.2f} of hover, {len(day.used)} restarts\n"
+        f"{first}\n{last}"
+    )
+    assert day.scored == day.begun > 0
+    assert (last.descriptors, last.threads) == (first.descriptors, first.threads)
+    early = [used.memory_kb for used in day.used if 300.0 < used.time_s < HOUR_S]
+    late = [used.memory_kb for used in day.used if used.time_s > DAY_S - HOUR_S]
+    if DAY_S > 2.0 * HOUR_S:
+        assert median(late) < median(early) + 10_000
