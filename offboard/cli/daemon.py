@@ -18,6 +18,7 @@ from offboard.cli.shared import (
     FLIGHTS,
     Assignments,
     CommandError,
+    Report,
     SigningKey,
     System,
     Vehicle,
@@ -75,6 +76,7 @@ def daemon(
     print_unit: Annotated[
         bool, typer.Option("--print-unit", help="Print a systemd unit with these options, and end.")
     ] = False,
+    report: Report = True,
     assignments: Assignments = None,
 ) -> None:
     """Wait for a vehicle, and fly whenever its pilot engages.
@@ -108,7 +110,7 @@ def daemon(
             system_id=system,
             signing_key=signing_key,
         )
-        wanted = Service(request, anchor.value, then.value, arms, metrics)
+        wanted = Service(request, anchor.value, then.value, arms, metrics, report)
         try:
             outcome = run(wanted, stops=stops, tell=printer.tell, show=printer.show)
         except Locked as error:

@@ -19,6 +19,7 @@ from offboard.cli.shared import (
     Assignments,
     CommandError,
     Directory,
+    Report,
     Requirements,
     SigningKey,
     System,
@@ -66,10 +67,7 @@ def fly(
     out_directory: Directory = None,
     require: Requirements = None,
     assignments: Assignments = None,
-    report: Annotated[
-        bool,
-        typer.Option(envvar="OFFBOARD_REPORT", help="Write report.html after the flight."),
-    ] = True,
+    report: Report = True,
     live: Annotated[
         str | None,
         option("[HOST:PORT]", f"Show the flight on a page.  [without a value: {LIVE_PAGE}]"),

@@ -52,6 +52,9 @@ SigningKey = Annotated[
     Path | None,
     option("FILE", "Sign all messages with this key and accept no others, see `offboard key`."),
 ]
+Report = Annotated[
+    bool, typer.Option(envvar="OFFBOARD_REPORT", help="Write report.html after each flight.")
+]
 Workers = Annotated[int | None, option("N", "Processes.  [default: one per processor]")]
 Requirements = Annotated[
     list[str] | None,

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from sdnotify import SystemdNotifier
@@ -33,7 +34,7 @@ from offboard.service.lock import ConnectionLock
 from offboard.service.memory import VehicleFiles
 from offboard.service.monitor import Monitor
 from offboard.service.preparation import Preparation
-from offboard.service.record import Recorder
+from offboard.service.record import Recorder, score
 
 LINK_FIRST_S, LINK_MOST_S = 1.0, 30.0  # between two attempts to open the link
 SHOWN_EVERY_S = 0.25
@@ -50,6 +51,7 @@ class Service:
     then: Then = "hold"
     arms: bool = False
     metrics: str | None = None  # HOST:PORT
+    report: bool = True  # after each flight
 
 
 def run(
@@ -79,7 +81,7 @@ def run(
         compiled.prepare(tell)
         preparation = stack.enter_context(closing(Preparation(request)))
         supervisor.await_ready()
-        recorder = Recorder(request.directory)
+        recorder = Recorder(request.directory, score=partial(score, report=wanted.report))
         stack.callback(recorder.close)
         memory = stack.enter_context(closing(VehicleFiles(_vehicles(request.directory), tell)))
         manager = Manager()

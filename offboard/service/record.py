@@ -120,10 +120,11 @@ class FlightRecord:
             os.close(self.descriptor)
 
 
-def score(directory: Path) -> None:
-    """Score a flight in a process of its own, with a lower priority, and wait for its end."""
+def score(directory: Path, *, report: bool = False) -> None:
+    """Score a flight in a process of its own, with a lower priority, and wait for its end. It
+    writes the `report` of the flight, too."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "offboard", "score", str(directory)],
+        [sys.executable, "-m", "offboard", "report" if report else "score", str(directory)],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
