@@ -31,6 +31,11 @@ if TYPE_CHECKING:
 
 LINES_MAX = 1000  # that wait for the terminal
 TERMINAL_S = 2.0  # for them, at the end
+EXIT_CODES = (
+    "Exit codes: 0 stopped, no vehicle follows it any more; 2 usage or configuration error, "
+    "nothing sent; 3 another daemon has the connection, or stopped before a take-off; 4 ended "
+    "before the vehicle was handed back, or left armed."
+)
 OUT = f"Directory of the flights' directories.  [default: {FLIGHTS}]"
 
 

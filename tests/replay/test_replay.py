@@ -102,6 +102,7 @@ def test_the_state_of_a_tick(flight: Path) -> None:
     assert float(values["gap"]) < 1e-6
     assert float(values["predicted_down_m"]) == pytest.approx(-1.0, abs=0.1)
     assert {"silence_s", "hover_thrust", "iterations", "position_ned_m"} <= values.keys()
+    assert values["attitude"].startswith("(w,x,y,z)")
     late = run(flight, "--at", 1e6)
     assert "ends at 30." in reason(late)
 
