@@ -88,6 +88,7 @@ def run(
         manager.ready()
         link = _opened(request.connection, stops, tell, manager)
         if link is None:
+            tell(STOPPED_EARLY)
             return Outcome(ExitCode.FLOWN, STOPPED_EARLY)
         stack.callback(link.close)
         fuses = config.estimate is FollowedEstimate.FUSED

@@ -139,6 +139,7 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     lines = [json.loads(line) for line in out.splitlines()]
     assert all({"time", "level", "event", "phase"} <= line.keys() for line in lines)
     assert any("engaged: OFFBOARD in the air" in line["event"] for line in lines)
+    assert sum("stop requested" in line["event"] for line in lines) == 1
     (flight,) = [path for path in (tmp_path / "out").iterdir() if (path / "flight.tlog").exists()]
     deadline_s = time.monotonic() + LONG_S
     while not (flight / "report.html").exists() and time.monotonic() < deadline_s:
