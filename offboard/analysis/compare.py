@@ -19,6 +19,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 from offboard.analysis.workers import run_all
+from offboard.documents.plain import plain
 from offboard.documents.reading import DocumentError
 
 EQUAL_SHARE = 0.01  # medians that are closer than this share of the best are equal
@@ -212,7 +213,7 @@ def _row(key: tuple[str, str, str], results: list[Result]) -> Row:
 
 def as_json(rows: Sequence[Row]) -> str:
     """The table as JSON; what no flight gave is null."""
-    return json.dumps([_plain(asdict(row)) for row in rows], indent=2, allow_nan=False) + "\n"
+    return json.dumps(plain([asdict(row) for row in rows]), indent=2, allow_nan=False) + "\n"
 
 
 def as_csv(rows: Sequence[Row]) -> str:
@@ -235,13 +236,3 @@ def _stem(name: str) -> str:
 
 def _finite(values: Iterable[float]) -> list[float]:
     return [value for value in values if math.isfinite(value)]
-
-
-def _plain(value: object) -> object:
-    if isinstance(value, dict):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

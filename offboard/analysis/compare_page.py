@@ -12,7 +12,7 @@ from plotly.subplots import make_subplots
 
 from offboard.analysis.compare import EQUAL_SHARE, FIGURES, Row
 from offboard.analysis.compare_table import digits
-from offboard.analysis.figure import GRID, PALETTE, RED, STYLE, Figure, coordinates
+from offboard.analysis.figure import PALETTE, RED, Figure, coordinates, listed
 from offboard.analysis.page import render
 
 PANELS = {  # figure of the score: title of its panel
@@ -70,18 +70,8 @@ def _figure(rows: Sequence[Row]) -> Figure:
             figure.add_trace(_dots(own, name, colour), row=1, col=column)
     for column, (name, title) in enumerate(PANELS.items(), 1):
         figure.update_xaxes(_logarithmic(rows, name), title_text=title, col=column)
-    figure.update_yaxes(
-        tickvals=list(range(len(lines))), ticktext=[_label(line) for line in lines],
-        range=[len(lines) - 0.3, -0.7], showgrid=False, zeroline=False, fixedrange=True,
-        showline=False, ticks="", ticklabelstandoff=8,
-    )  # fmt: skip
-    for at, line in enumerate(lines):
-        if at and isinstance(line, str):
-            figure.add_hline(at - 0.5, line={"color": GRID, "width": 1}, col="all", row=1)
-    figure.update_layout(
-        template=STYLE, height=_TOP_PX + _ROW_PX * len(lines) + 10, showlegend=False,
-        margin={"t": _TOP_PX, "b": 10},
-    )  # fmt: skip
+    headed = [(_label(line), isinstance(line, str)) for line in lines]
+    listed(figure, headed, _ROW_PX, _TOP_PX)
     return Figure("Position error and excess motion", figure, CAPTION, NARROWEST_PX)
 
 

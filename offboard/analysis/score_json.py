@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
-import math
 from typing import Any
 
 from offboard.analysis.events import Event
 from offboard.analysis.history import History
 from offboard.analysis.score import Score
+from offboard.documents.plain import plain
 
 
 def as_text(score: Score, history: History) -> str:
@@ -16,7 +16,7 @@ def as_text(score: Score, history: History) -> str:
     not hold is null."""
     document = {
         "ended_by": score.ended_by,
-        **{name: _plain(value) for name, value in score.figures().items()},
+        **score.figures(),
         "phases": _events(history.phases),
         "modes": _events(history.modes),
         "vehicle_messages": _events(history.vehicle_messages),
@@ -24,12 +24,8 @@ def as_text(score: Score, history: History) -> str:
         "wall_s": history.wall_s,
         "damage": history.damage,
     }
-    return json.dumps(document, indent=2, allow_nan=False) + "\n"
-
-
-def _plain(value: float) -> float | None:
-    return value if math.isfinite(value) else None
+    return json.dumps(plain(document), indent=2, allow_nan=False) + "\n"
 
 
 def _events(events: tuple[Event, ...]) -> list[dict[str, Any]]:
-    return [{"time_s": _plain(event.time_s), "what": event.what} for event in events]
+    return [{"time_s": event.time_s, "what": event.what} for event in events]

@@ -10,7 +10,7 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from offboard.analysis.compare_table import digits
-from offboard.analysis.figure import BLUE, GRID, PALETTE, STYLE, Figure, coordinates
+from offboard.analysis.figure import BLUE, PALETTE, Figure, coordinates, listed
 from offboard.analysis.page import render
 from offboard.campaign.statistics import Group
 from offboard.campaign.table import Row
@@ -83,18 +83,8 @@ def _figure(groups: Sequence[Group]) -> Figure:
         figure.update_xaxes(title_text=PANELS[name], side="top", row=1, col=column)
     figure.update_xaxes(range=[-0.03, 1.03], tickformat=".0%", row=1, col=1)
     figure.update_xaxes(type="log", row=1, col=2)
-    figure.update_yaxes(
-        tickvals=list(range(len(lines))), ticktext=[_label(line) for line in lines],
-        range=[len(lines) - 0.4, -0.6], showgrid=False, zeroline=False, fixedrange=True,
-        showline=False, ticks="",
-    )  # fmt: skip
-    for at, line in enumerate(lines):
-        if at and isinstance(line, str):
-            figure.add_hline(at - 0.5, line={"color": GRID, "width": 1}, col="all", row=1)
-    figure.update_layout(
-        template=STYLE, height=_TOP_PX + _ROW_PX * len(lines) + 10, showlegend=False,
-        margin={"t": _TOP_PX, "b": 10},
-    )  # fmt: skip
+    headed = [(_label(line), isinstance(line, str)) for line in lines]
+    listed(figure, headed, _ROW_PX, _TOP_PX)
     return Figure("Success, error and margin", figure, CAPTION, 640)
 
 

@@ -34,7 +34,8 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )
-NAMES = shipped.overview("reference", "controller", "vehicle", "scenario")
+PARTS = ("reference", "controller", "vehicle")
+NAMES = shipped.overview(*PARTS, "scenario")
 
 
 def _version(wanted: bool) -> None:
@@ -54,7 +55,7 @@ def offboard(
 
 
 app.command(cls=Command, epilog=f"{NAMES}\n\n{EXIT_CODES}")(fly.fly)
-app.command(cls=Command, epilog=f"{NAMES}\n\n{EXIT_CODES}")(daemon.daemon)
+app.command(cls=Command, epilog=f"{shipped.overview(*PARTS)}\n\n{daemon.EXIT_CODES}")(daemon.daemon)
 app.command(cls=Command, epilog=doctor.DOCTOR_CODES)(doctor.doctor)
 app.command(cls=Command, epilog=EXIT_CODES)(score.score)
 app.command(cls=Command, epilog=EXIT_CODES)(report.report)

@@ -12,6 +12,8 @@ from offboard.cli.shared import (
     Assignments,
     CommandError,
     Directory,
+    SigningKey,
+    System,
     Vehicle,
     Workers,
     option,
@@ -32,6 +34,8 @@ def compare(
     connect: Annotated[
         str | None, option("LINK", "Fly the vehicle at this link instead of the simulator.")
     ] = None,
+    system: System = None,
+    signing_key: SigningKey = None,
     workers: Workers = None,
     out_directory: Directory = None,
     assignments: Assignments = None,
@@ -43,6 +47,8 @@ def compare(
     """
     if workers is not None and not 1 <= workers <= 256:
         raise CommandError(f"--workers {workers}: give 1 .. 256")
+    if connect is None and (system or signing_key):
+        raise CommandError("--system and --signing-key are options of --connect: add it")
     if not 1 <= seeds <= 1000:
         raise CommandError(f"--seeds {seeds}: give 1 .. 1000")
     laws = _names(controllers, shipped.names("controllers"))
@@ -69,6 +75,8 @@ def compare(
             assignments=tuple(assignments or ()),
             connection=connect or DEFAULT_CONNECTION,
             sitl=connect is None,
+            system_id=system,
+            signing_key=signing_key,
         )
         check_flyable(request, laws, references)
     problem = compare_all(

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import json
 import sys
 from contextlib import closing
 from enum import StrEnum
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 
@@ -18,18 +18,21 @@ from offboard.cli.shared import (
     FLIGHTS,
     Assignments,
     CommandError,
+    Report,
     SigningKey,
     System,
     Vehicle,
     option,
+    out,
     say,
+    write,
 )
 
-if TYPE_CHECKING:
-    from offboard.service.flights import Flights
-
-LINES_MAX = 1000  # that wait for the terminal
-TERMINAL_S = 2.0  # for them, at the end
+EXIT_CODES = (
+    "Exit codes: 0 stopped, no vehicle follows it any more; 2 usage or configuration error, "
+    "nothing sent; 3 another daemon has the connection, or stopped before a take-off; 4 ended "
+    "before the vehicle was handed back, or left armed."
+)
 OUT = f"Directory of the flights' directories.  [default: {FLIGHTS}]"
 
 
@@ -75,6 +78,7 @@ def daemon(
     print_unit: Annotated[
         bool, typer.Option("--print-unit", help="Print a systemd unit with these options, and end.")
     ] = False,
+    report: Report = True,
     assignments: Assignments = None,
 ) -> None:
     """Wait for a vehicle, and fly whenever its pilot engages.
@@ -89,8 +93,10 @@ def daemon(
         _print_unit(connection)
         return
     from offboard.flight.stop import StopRequests
+    from offboard.live.lines import JsonLog, Terminal
 
-    with StopRequests() as stops, closing(_Printer(log_json)) as printer:
+    lines = JsonLog(write) if log_json else Terminal(out, partial(say, indent=12))
+    with StopRequests() as stops, closing(lines):
         from offboard.compiled import loading
 
         with loading():
@@ -108,13 +114,11 @@ def daemon(
             system_id=system,
             signing_key=signing_key,
         )
-        wanted = Service(request, anchor.value, then.value, arms, metrics)
+        wanted = Service(request, anchor.value, then.value, arms, metrics, report)
         try:
-            outcome = run(wanted, stops=stops, tell=printer.tell, show=printer.show)
+            outcome = run(wanted, stops=stops, tell=lines.tell, show=lines.show)
         except Locked as error:
             raise CommandError(str(error), 3) from None
-        if not outcome.exit_code:
-            printer.tell(outcome.sentence)
     if outcome.exit_code:
         raise CommandError(outcome.sentence, outcome.exit_code)
 
@@ -134,49 +138,3 @@ def _absolute(word: str) -> str:
     if not (is_path and Path(value).exists()):
         return word
     return f"{option}{equals}{Path(value).absolute()}"
-
-
-class _Printer:
-    """Prints lines from a thread of its own, as text or as JSON."""
-
-    def __init__(self, as_json: bool) -> None:
-        from offboard.flight.background import BackgroundWriter
-
-        self._as_json = as_json
-        self._shown = 0
-        self._writer = BackgroundWriter[str](_show_json if as_json else _show, LINES_MAX)
-
-    def tell(self, sentence: str) -> None:
-        """A sentence about the service."""
-        self._writer.put(self._line(sentence, "service", None))
-
-    def show(self, flights: Flights) -> None:
-        """What the flights have announced since the last call."""
-        new = flights.announcements - self._shown
-        if new:
-            self._shown = flights.announcements
-            for sentence in flights.announced[-new:]:
-                line = self._line(sentence, flights.phase.value, flights.state.time_s)
-                self._writer.put(line)
-
-    def _line(self, sentence: str, phase: str, time_s: float | None) -> str:
-        from offboard.flight import clock
-
-        if self._as_json:
-            entry = {"time": clock.utc(), "level": "info", "phase": phase, "event": sentence}
-            return json.dumps(entry if time_s is None else {**entry, "vehicle_time_s": time_s})
-        return sentence if time_s is None else f"{time_s:8.2f} s  {sentence}"
-
-    def close(self) -> None:
-        self._writer.close(TERMINAL_S)
-
-
-def _show(lines: list[str]) -> None:
-    for line in lines:
-        say(line, indent=12)
-    sys.stdout.flush()
-
-
-def _show_json(lines: list[str]) -> None:
-    sys.stdout.write("".join(f"{line}\n" for line in lines))
-    sys.stdout.flush()

@@ -19,6 +19,7 @@ from offboard.cli.shared import (
     Assignments,
     CommandError,
     Directory,
+    Report,
     Requirements,
     SigningKey,
     System,
@@ -27,6 +28,7 @@ from offboard.cli.shared import (
     option,
     out,
     say,
+    write,
 )
 from offboard.documents.arguments import FOXGLOVE, LIVE_PAGE
 from offboard.documents.command_line import drop_output, explained
@@ -66,10 +68,7 @@ def fly(
     out_directory: Directory = None,
     require: Requirements = None,
     assignments: Assignments = None,
-    report: Annotated[
-        bool,
-        typer.Option(envvar="OFFBOARD_REPORT", help="Write report.html after the flight."),
-    ] = True,
+    report: Report = True,
     live: Annotated[
         str | None,
         option("[HOST:PORT]", f"Show the flight on a page.  [without a value: {LIVE_PAGE}]"),
@@ -163,18 +162,13 @@ def _displays(live: str | None, foxglove: str | None, *, json_lines: bool) -> Di
     from offboard.live.lines import JsonLines, Terminal
     from offboard.live.process import LiveProcess
 
-    lines = JsonLines(_write) if json_lines else Terminal(out, partial(say, indent=12))
+    lines = JsonLines(write) if json_lines else Terminal(out, partial(say, indent=12))
     servers = (
         ("offboard.live.server", "--live", live),
         ("offboard.live.foxglove_server", "--foxglove", foxglove),
     )
     pages = [LiveProcess(module, name, address) for module, name, address in servers if address]
     return Displays(lines, pages)
-
-
-def _write(text: str) -> None:
-    sys.stdout.write(text)
-    sys.stdout.flush()
 
 
 def _conclude(
@@ -199,7 +193,7 @@ def _conclude(
     code = outcome.exit_code or int(bool(missed))
     try:
         if json_lines:
-            _write(_result(code, outcome.sentence, results, score, directory, lost))
+            write(_result(code, outcome.sentence, results, score, directory, lost))
             raise typer.Exit(code)
         out.print()
         for sentence in lost:
@@ -227,7 +221,8 @@ def _result(
     code: int, sentence: str, requirements: str, score: Score, directory: Path, lost: list[str]
 ) -> str:
     """The last line of --json-lines."""
-    from offboard.live.values import line, plain
+    from offboard.documents.plain import plain
+    from offboard.live.values import DIGITS, line
 
     result = {
         "exit_code": code,
@@ -237,6 +232,6 @@ def _result(
         "ended_by": score.ended_by,
         "directory": str(directory),
         "lost": lost,
-        "figures": {name: plain(value) for name, value in score.figures().items()},
+        "figures": plain(score.figures(), DIGITS),
     }
     return line("result", **result) + "\n"

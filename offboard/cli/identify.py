@@ -14,6 +14,8 @@ from offboard.cli.shared import (
     FLIGHTS,
     CommandError,
     Directory,
+    SigningKey,
+    System,
     check_new,
     free_name,
     option,
@@ -37,6 +39,8 @@ def identify(
     sitl: Annotated[
         bool, typer.Option("--sitl", help="The same on the bundled simulator.")
     ] = False,
+    system: System = None,
+    signing_key: SigningKey = None,
     vehicle: Annotated[
         str | None,
         option(FILE, "Source of constants that are not identified.  [default: the flight]"),
@@ -61,10 +65,19 @@ def identify(
             check_new(chosen, name)
     if output is not None and page is not None and output.resolve() == page.resolve():
         raise CommandError(f"-o and --page are both {output}; choose two files")
+    if flight is not None and (system or signing_key):
+        raise CommandError("a log needs neither --system nor --signing-key: they are for --connect")
     if flight is None:
         flight = out_directory or FLIGHTS / f"identify-{clock.local_stamp()}"
         fly(
-            sitl, connect, reference="identify", vehicle=vehicle, out_directory=flight, report=False
+            sitl,
+            connect,
+            system,
+            signing_key,
+            reference="identify",
+            vehicle=vehicle,
+            out_directory=flight,
+            report=False,
         )
     path = tlog.find(flight)
     log = tlog.read(path)

@@ -56,13 +56,20 @@ def requirements_of(texts: list[str] | None) -> list[Requirement]:
 
 def scored(flight: Path) -> tuple[Score, History]:
     """Score a flight and keep the score in its directory. Raises TlogError."""
-    from offboard.analysis.trial import keep_score, score_flight
-    from offboard.flight.log import LogError
+    from offboard.analysis.trial import score_flight
 
     result, history = score_flight(flight)
+    keep(flight, result, history)
+    return result, history
+
+
+def keep(flight: Path, result: Score, history: History) -> None:
+    """Write score.json if `flight` is a directory. Where it cannot be written, say so."""
+    from offboard.analysis.trial import keep_score
+    from offboard.flight.log import LogError
+
     if flight.is_dir():
         try:
             keep_score(flight, result, history)
-        except LogError as error:  # the score can still be printed
+        except LogError as error:
             complain(str(error))
-    return result, history

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import os
+import sys
 from contextlib import suppress
 from errno import EEXIST
 from pathlib import Path
@@ -52,6 +53,9 @@ SigningKey = Annotated[
     Path | None,
     option("FILE", "Sign all messages with this key and accept no others, see `offboard key`."),
 ]
+Report = Annotated[
+    bool, typer.Option(envvar="OFFBOARD_REPORT", help="Write report.html after each flight.")
+]
 Workers = Annotated[int | None, option("N", "Processes.  [default: one per processor]")]
 Requirements = Annotated[
     list[str] | None,
@@ -76,6 +80,12 @@ class CommandError(UserError):
 def say(text: str, indent: int = 0) -> None:
     """Print a line to stdout, wrapped at words to the width; further lines are indented."""
     out.print(wrapped(text, out.width, indent), markup=False, soft_wrap=True)
+
+
+def write(text: str) -> None:
+    """Print text as it is, at once."""
+    sys.stdout.write(text)
+    sys.stdout.flush()
 
 
 def check_new(path: Path, option_name: str) -> None:

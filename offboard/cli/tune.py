@@ -8,10 +8,10 @@ from typing import Annotated
 
 import typer
 
+from offboard.cli.campaign import ENDED
 from offboard.cli.shared import CommandError, Workers, option, out, say
 
 FILE = typer.Argument(metavar="FILE", help="Tuning file.")
-ENDED = "interrupted; finished flights are kept: run the same command again to go on"
 
 
 def tune(

@@ -14,11 +14,10 @@ from pymavlink.dialects.v20.ardupilotmega import mavlink_map
 from offboard.doctor.observation import Sender
 from offboard.mavlink.counters import Counters
 from offboard.mavlink.decode import decode_identity
-from offboard.mavlink.framing import Frame, FrameSplitter
+from offboard.mavlink.framing import SETPOINTS, Frame, FrameSplitter
 
 _HEARTBEAT = 0
 _TIMES = frozenset({2, 111})  # SYSTEM_TIME, TIMESYNC
-_SETPOINTS = frozenset({82, 84, 86})
 _PLACES_MAX, _SENDERS_MAX = 16, 64  # a flood of addresses or ids must not use up the memory
 
 
@@ -64,7 +63,7 @@ class Census:
         self.message_bytes[message.msgname if message else str(frame.message_id)] += len(frame.raw)
         count.frames += 1
         count.places.add(_name(place))
-        count.setpoints += frame.message_id in _SETPOINTS
+        count.setpoints += frame.message_id in SETPOINTS
         count.times += frame.message_id in _TIMES
         if frame.message_id == _HEARTBEAT:
             count.vehicle_type, count.autopilot = decode_identity(frame.payload)

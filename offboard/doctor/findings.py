@@ -5,8 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import partial
 
+from offboard.doctor.bounded import within
 from offboard.doctor.observation import Observation
+from offboard.flight import clock
+
+CHECKS_S, LEAST_S = 1.0, 0.05  # for all checks; for one, when the others have used it up
+AUTHOR = "report this to whoever wrote the check"
 
 
 class Level(IntEnum):
@@ -68,19 +74,29 @@ class Row:
         return self.findings[0].level
 
 
-def examine(checks: Sequence[Check], observation: Observation) -> list[Row]:
-    """One row for each check that found something to say. A check that fails is a row, too."""
-    rows = []
+def examine(
+    checks: Sequence[Check], observation: Observation, seconds: float = CHECKS_S
+) -> list[Row]:
+    """One row for each check that found something to say. A check that fails is a row, too, or one
+    that has not ended when all of them have taken `seconds`."""
+    rows, until_s = [], clock.monotonic_s() + seconds
     for check in checks:
+        left_s = max(LEAST_S, until_s - clock.monotonic_s())
         try:
-            found = tuple(check.run(observation))
-            findings = tuple(sorted(found, key=lambda each: -each.level))
+            findings = within(left_s, partial(_findings, check.run, observation))
+        except TimeoutError:
+            findings = (warn(f"the check did not end in {left_s:.1f} s", AUTHOR),)
         except Exception as error:  # whatever a check of another package raises
             sentence = f"the check itself failed: {type(error).__name__}: {error}"
-            findings = (warn(sentence, "report this to whoever wrote the check"),)
+            findings = (warn(sentence, AUTHOR),)
         if findings:
             rows.append(Row(check.name, findings))
     return rows
+
+
+def _findings(run: Run, observation: Observation) -> tuple[Finding, ...]:
+    """The worst first."""
+    return tuple(sorted(run(observation), key=lambda each: -each.level))
 
 
 def worst(rows: Iterable[Row]) -> Level:

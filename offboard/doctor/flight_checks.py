@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable
 
 from offboard.control.delay_margin import LEAST_MARGIN_S, SDS, needed_margin, supported_bandwidth
-from offboard.doctor.findings import Finding, blocks, ok, warn
+from offboard.doctor.findings import Finding, blocks, ok, wait, warn
 from offboard.doctor.observation import Observation
 from offboard.flight.configuration import UNKNOWN_VEHICLE, FlightConfig
 from offboard.identification.adoption import with_added_delay
@@ -111,6 +111,11 @@ def compiled(seen: Observation) -> Iterable[Finding]:
 def computer(seen: Observation) -> Iterable[Finding]:
     """Whether this computer decides and wakes up in time."""
     measured = seen.computer
+    if measured.not_measured_s is not None:
+        yield wait(
+            f"reference and controller were not examined within {measured.not_measured_s:.0f} s",
+            "close other programs and check again, or `offboard check` the configuration",
+        )
     if measured.rehearsal:
         yield blocks(measured.rehearsal, "choose another controller, or a longer deadline_s")
     if measured.clock_step_s > CLOCK_STEP_S:

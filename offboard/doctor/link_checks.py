@@ -17,10 +17,23 @@ LATE_S, REAL_TIME, CLOCK_OFF_S = 0.25, 0.05, 60.0
 FOREIGN_TIMES = 3
 ALL_ADDRESSES = "listen on all addresses: --connect udpin:0.0.0.0:PORT"
 BRIDGES = {
-    "WSL": "this is WSL: on Windows, send to the address that `hostname -I` prints here; "
+    "": "if it runs elsewhere, " + ALL_ADDRESSES,
+    "WSL": "if it runs on Windows, send to the address that `hostname -I` prints here, and "
     + ALL_ADDRESSES,
-    "container": "this is a container: start it with --network host, or with -p PORT:PORT/udp and "
-    + ALL_ADDRESSES,
+    "container": "if it runs outside of this container, start it with --network host, or with "
+    "-p PORT:PORT/udp and " + ALL_ADDRESSES,
+}
+STARTED = "start the vehicle, or the router before it, and let it send to this port"
+SILENT = {  # by kind of connection: what to do when nothing is heard
+    "udpout": "start the vehicle, and check the address",
+    "tcp": "check which program listens there: it sends nothing",
+    "tcpin": STARTED,
+    "serial": "check baud rate and TX wire, and that the autopilot's port speaks MAVLink (PX4: "
+    "MAV_x_CONFIG, ArduPilot: SERIALx_PROTOCOL 2)",
+}
+CLOSED = {  # why it cannot be opened
+    "tcp": "start the vehicle, or the router, that listens there; ArduPilot's SITL listens on 5760",
+    "serial": "plug it in, and see `ls /dev/serial/by-id`; may this user read it (group dialout)?",
 }
 
 
@@ -28,7 +41,8 @@ def port(seen: Observation) -> Iterable[Finding]:
     """Whether the connection can be opened, and which other process has it."""
     others = ", ".join(seen.holders)
     if seen.link_error:
-        hint = f"stop {others}, or use another port" if others else "see `offboard doctor --help`"
+        known = CLOSED.get(_kind(seen), "check host and port, see `offboard doctor --help`")
+        hint = f"stop {others}, or use another port" if others else known
         yield blocks(seen.link_error + (f": {others}" if others else ""), hint)
     elif others:
         yield warn(f"{others} reads from {seen.connection}, too", f"stop {others}")
@@ -53,9 +67,9 @@ def vehicle(seen: Observation) -> Iterable[Finding]:
         hint = "check the baud rate, or which program sends to this port"
         yield blocks(f"{seen.link.bytes_received} bytes are heard that are not MAVLink", hint)
     else:
-        hint = BRIDGES.get(seen.surroundings, "start the vehicle, and let it send to this port")
-        if "127.0.0.1" in seen.connection and seen.connection.startswith("udpin"):
-            hint += "" if seen.surroundings else f"; if it runs elsewhere, {ALL_ADDRESSES}"
+        hint = SILENT.get(_kind(seen), STARTED)
+        if "127.0.0.1" in seen.connection and _kind(seen) == "udpin":
+            hint += f"; {BRIDGES[seen.surroundings]}"
         yield blocks(f"nothing is heard in {seen.listened_s:.0f} s", hint)
 
 
@@ -232,6 +246,10 @@ def uplink(seen: Observation) -> Iterable[Finding]:
             "check the direction to the vehicle: router, firewall, TX wire; or another program "
             "has taken the vehicle's answers",
         )
+
+
+def _kind(seen: Observation) -> str:
+    return seen.connection.partition(":")[0]
 
 
 def _limits(seen: Observation) -> Limits:

@@ -36,7 +36,8 @@ from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
 
 NOTHING_S = 6.0  # without an autopilot
-LEAST_S, LONGEST_S = 4.0, 9.5  # with one
+LEAST_S = 4.0  # with one, from when it was heard
+LONGEST_S = 9.0
 ASK_EVERY_S, TRIES = 1.0, 8
 TIMESYNC_EVERY_S = 0.1
 PREARM_AFTER_S = 1.0  # PX4 sends texts only once it has noticed our heartbeat
@@ -199,10 +200,10 @@ class Listening:
 
     def complete(self, now_s: float) -> bool:
         """Everything was answered, or it takes too long."""
+        state, passed_s = self.vehicle, now_s - self._began_s
         if self._session.vehicle is None or self._session.dialect is None:
-            return now_s - self._began_s >= NOTHING_S
-        state, passed_s = self.vehicle, now_s - self._found_s
-        if passed_s < LEAST_S or passed_s >= LONGEST_S:
+            return passed_s >= NOTHING_S
+        if now_s - self._found_s < LEAST_S or passed_s >= LONGEST_S:
             return passed_s >= LONGEST_S
         checked = state.armed or (self._prearm_s is not None and now_s - self._prearm_s >= TEXTS_S)
         rates = self._session.rates_hz

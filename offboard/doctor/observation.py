@@ -91,6 +91,7 @@ class Computer:
     deadline_s: float | None = None
     rehearsal: str = ""  # why the controller cannot be flown here
     clock_step_s: float = 0.0  # of the wall clock, while it listened
+    not_measured_s: float | None = None  # in which the measurement did not end
 
 
 @dataclass(frozen=True, slots=True)

@@ -7,10 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 from offboard.doctor import ports
+from offboard.doctor.bounded import within
 from offboard.doctor.listening import Listening
 from offboard.doctor.measure import measure
-from offboard.doctor.observation import Observation
-from offboard.documents.errors import DocumentError
+from offboard.doctor.observation import Computer, Observation
+from offboard.documents.errors import DocumentError, shown
 from offboard.documents.signing_key import read_key
 from offboard.flight import clock
 from offboard.flight.configuration import FlightConfig, build_track
@@ -21,6 +22,9 @@ from offboard.mavlink.signing import Signing
 from offboard.reference.feasibility import check
 
 POLL_S = 0.02
+# The command ends within 15 s: what takes longer is left out, and a row says so
+OPEN_S = 2.0  # to open the link, before listening
+LOOK_S = 12.5  # from the beginning to the end of the look at this computer
 
 
 def observe(
@@ -37,14 +41,18 @@ def observe(
 
     Raises LinkError for an address that is no address, KeyFileError and SigningTimeError.
     """
+    until_s = clock.monotonic_s() + LOOK_S
     key = read_key(signing_key) if signing_key else None
     holders = ports.holders(connection)
     unix_s = clock.monotonic_less_unix_s()
     error = ""
     with ExitStack() as stack:
         try:
-            link = open_link(connection)
+            link = within(OPEN_S, lambda: open_link(connection))
             stack.callback(link.close)
+        except TimeoutError:
+            error = f"connection {shown(connection)} cannot be opened in {OPEN_S:g} s"
+            seen = Observation()
         except LinkError as failure:
             if failure.is_usage:
                 raise
@@ -54,14 +62,24 @@ def observe(
             first = not connection.startswith("udpin")
             seen = _listen(link, system_id, signing, sends_first=first)
     step_s = abs(clock.monotonic_less_unix_s() - unix_s)
-    return replace(
-        planned(seen, config),
+    seen = replace(
+        seen,
         connection=connection,
         link_error=error,
         holders=holders,
         surroundings=ports.surroundings(),
-        computer=measure(config, directory, clock_step_s=step_s),
+        computer=Computer(str(directory), clock_step_s=step_s),
     )
+    left_s = until_s - clock.monotonic_s()
+    try:
+        return within(
+            left_s,
+            lambda: replace(
+                planned(seen, config), computer=measure(config, directory, clock_step_s=step_s)
+            ),
+        )
+    except TimeoutError:
+        return replace(seen, computer=replace(seen.computer, not_measured_s=left_s))
 
 
 def planned(seen: Observation, config: FlightConfig) -> Observation:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 from typer.core import TyperCommand
@@ -12,6 +13,19 @@ from offboard.documents.errors import UserError, shown
 LIVE_PAGE, FOXGLOVE = "127.0.0.1:8014", "127.0.0.1:8765"
 # options whose value may be omitted, and what they then have
 OPTIONAL_VALUES = {"--live": LIVE_PAGE, "--foxglove": FOXGLOVE}
+PORT_MAX = 65535
+LOCAL = "127.0.0.1"
+_ADDRESS = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([^:\[\]]*)):(\d{1,9})", re.ASCII)
+
+
+def split_address(option: str, address: str) -> tuple[str, int]:
+    """Host and port of HOST:PORT, the value of `option`; an IPv6 address stands in brackets, no
+    host means this computer. Raises UserError."""
+    matched = _ADDRESS.fullmatch(address)
+    if matched is None or int(matched[3]) > PORT_MAX:
+        example = f"give HOST:PORT, for example {LIVE_PAGE}"
+        raise UserError(f"{option} {shown(address)}: {example}")
+    return matched[1] or matched[2] or LOCAL, int(matched[3])
 
 
 class Command(TyperCommand):

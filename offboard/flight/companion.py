@@ -162,6 +162,11 @@ class Companion:
         """Sentences for the user, oldest first."""
         return self._outbox.announced
 
+    @property
+    def announcements(self) -> int:
+        """How many there were."""
+        return len(self.announced)
+
     def snapshot(self) -> Snapshot:
         """The flight at this moment, for displays."""
         return snapshot_of(

@@ -15,11 +15,11 @@ from typing import Protocol
 
 from offboard.flight import clock
 from offboard.flight.link import Chunk, Strangers
+from offboard.mavlink.framing import SETPOINTS
 
 READ_BYTES = 65536
 BATCH_BYTES = 1 << 20  # of one call
 QUEUED_MAX = 50  # frames
-SETPOINTS = frozenset({82, 84, 86})  # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_*
 BROKEN, RENEWED = "the connection broke: connecting again", "connected again"
 
 

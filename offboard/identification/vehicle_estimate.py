@@ -297,7 +297,9 @@ class VehicleEstimate:
         if not (news or (self._lowered_radps and not lowered_radps)):
             return []
         self._lowered_radps = lowered_radps
-        return [f"the link's delay has grown by {1e3 * added_s:.0f} ms; {self._bandwidth_text}"]
+        change_ms = round(1e3 * added_s)
+        delay = f"has grown by {change_ms} ms" if change_ms > 0 else "is no longer than at take-off"
+        return [f"the link's delay {delay}; {self._bandwidth_text}"]
 
     def without_identification(self) -> list[str]:
         """What the bandwidth is limited to with the vehicle file as it is."""

@@ -5,9 +5,11 @@ A thread writes, so that the loop does not wait for a terminal that Ctrl-S stops
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Callable
 from contextlib import suppress
+from typing import Protocol
 
 from rich.console import Console
 from rich.live import Live
@@ -15,14 +17,42 @@ from rich.text import Text
 
 from offboard.flight import clock
 from offboard.flight.background import BackgroundWriter
-from offboard.flight.companion import Companion
+from offboard.flight.phases import Phase
 from offboard.flight.snapshot import Snapshot
+from offboard.flight.state import FlightState
 from offboard.live.values import as_dict, line
 
 LINES_MAX = 1000  # that wait to be written
 CLOSE_S = 2.0  # for them, after the flight
 STATUS_S = 0.2  # between two status lines, host time
 SNAPSHOT_S = 1.0  # between two JSON snapshots, vehicle time
+
+
+class Announcing(Protocol):
+    """A companion, or the flights of a service. `announced` has the newest sentences, oldest first,
+    `announcements` counts all that there were."""
+
+    @property
+    def announced(self) -> list[str]: ...
+    @property
+    def announcements(self) -> int: ...
+    @property
+    def phase(self) -> Phase: ...
+    @property
+    def state(self) -> FlightState: ...
+    def snapshot(self) -> Snapshot: ...
+
+
+class News:
+    """Announcements, each once."""
+
+    def __init__(self) -> None:
+        self._seen = 0
+
+    def of(self, flown: Announcing) -> list[str]:
+        """Those since the last call."""
+        new, self._seen = flown.announcements - self._seen, flown.announcements
+        return flown.announced[-new:] if new else []
 
 
 class Terminal:
@@ -34,14 +64,17 @@ class Terminal:
         self._live = _status_line(console) if in_place else None
         self._show_line = show_line
         self._writer = BackgroundWriter[str | Snapshot](self._write, LINES_MAX)
-        self._announced = 0
+        self._news = News()
         self._due_s = -math.inf
         self._waits = False  # a status is queued: no second one
 
-    def show(self, companion: Companion) -> None:
-        for sentence in companion.announced[self._announced :]:
+    def tell(self, sentence: str) -> None:
+        """A sentence about the preparation."""
+        self._writer.put(sentence)
+
+    def show(self, companion: Announcing) -> None:
+        for sentence in self._news.of(companion):
             self._writer.put(f"{companion.state.time_s:8.2f} s  {sentence}")
-        self._announced = len(companion.announced)
         now_s = clock.monotonic_s()
         if self._live and now_s >= self._due_s and not self._waits:
             self._due_s, self._waits = now_s + STATUS_S, True
@@ -98,18 +131,17 @@ class JsonLines:
     def __init__(self, write: Callable[[str], object]) -> None:
         self._print = write
         self._writer = BackgroundWriter[str](self._write, LINES_MAX)
-        self._announced = 0
+        self._news = News()
         self._due_s = -math.inf
 
     def tell(self, sentence: str) -> None:
         """A sentence about the preparation."""
         self._writer.put(line("preparation", text=sentence))
 
-    def show(self, companion: Companion) -> None:
+    def show(self, companion: Announcing) -> None:
         time_s = companion.state.time_s
-        for sentence in companion.announced[self._announced :]:
+        for sentence in self._news.of(companion):
             self._writer.put(line("announcement", time_s=round(time_s, 3), text=sentence))
-        self._announced = len(companion.announced)
         if not self._due_s - SNAPSHOT_S <= time_s < self._due_s:  # or the clock has jumped back
             self._due_s = math.floor(time_s / SNAPSHOT_S + 1.0) * SNAPSHOT_S
             self._writer.put(line("snapshot", **as_dict(companion.snapshot())))
@@ -124,3 +156,20 @@ class JsonLines:
 
     def _write(self, lines: list[str]) -> None:
         self._print("".join(f"{each}\n" for each in lines))
+
+
+class JsonLog(JsonLines):
+    """Writes one JSON object a line, as log collectors read them: sentences with their UTC."""
+
+    def tell(self, sentence: str) -> None:
+        """A sentence about the service."""
+        self._put("service", sentence)
+
+    def show(self, companion: Announcing) -> None:
+        for sentence in self._news.of(companion):
+            time_s = companion.state.time_s
+            self._put(companion.phase.value, sentence, vehicle_time_s=time_s)
+
+    def _put(self, phase: str, sentence: str, **more: float) -> None:
+        entry = {"time": clock.utc(), "level": "info", "phase": phase, "event": sentence, **more}
+        self._writer.put(json.dumps(entry))

@@ -12,6 +12,7 @@ import subprocess
 import sys
 from contextlib import suppress
 
+from offboard.documents.arguments import split_address
 from offboard.documents.errors import UserError
 from offboard.flight import clock
 from offboard.flight.background import BackgroundWriter
@@ -22,19 +23,10 @@ from offboard.live.values import as_dict, line
 PERIOD_S = 0.1  # between two snapshots, host time
 QUEUED_MAX = 50  # snapshots that wait for the pipe, which holds about as many
 CLOSE_S = 1.0  # for what is queued, and again for the end of the process
-LOCAL = "127.0.0.1"
 
 
 class LiveError(UserError):
     """The process cannot serve its clients: one sentence for the user."""
-
-
-def split_address(option: str, address: str) -> tuple[str, int]:
-    """Host and port of HOST:PORT. Raises LiveError."""
-    host, _, port = address.rpartition(":")
-    if not port.isascii() or not port.isdigit() or int(port) > 65535:
-        raise LiveError(f"{option} {address}: give HOST:PORT, for example {LOCAL}:8014")
-    return host.strip("[]") or LOCAL, int(port)
 
 
 class LiveProcess:

@@ -13,6 +13,7 @@ are accepted: their payloads lack the extension fields, which are zero.
 from __future__ import annotations
 
 import struct
+from types import MappingProxyType
 from typing import NamedTuple
 
 from fastcrc import crc16
@@ -23,6 +24,8 @@ from offboard.mavlink.counters import Counters, DropReason
 _V2, _V1 = 0xFD, 0xFE
 # Ids of messages that are needed before they are decoded
 HEARTBEAT, COMMAND_ACK, TIMESYNC, STATUSTEXT, SETUP_SIGNING = 0, 77, 111, 253, 256
+# SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: offset of target_system
+SETPOINTS = MappingProxyType({82: 36, 84: 50, 86: 50})
 _HEADER_V2 = struct.Struct("<BBBBBBBHB")
 _HEADER_BYTES_V2, _HEADER_BYTES_V1, _CRC_BYTES, _SIGNATURE_BYTES = 10, 6, 2, 13
 _SIGNED = 0x01

@@ -14,7 +14,6 @@ import math
 from collections import deque
 from collections.abc import Hashable
 from dataclasses import dataclass, replace
-from types import MappingProxyType
 
 from offboard.mavlink import framing
 from offboard.mavlink.autopilots import AUTOPILOT_COMPONENT, Autopilots, is_companion
@@ -56,8 +55,6 @@ from offboard.mavlink.vehicle_time import Age, LinkTime, VehicleTime
 ACTIVE = 4  # MAV_STATE
 
 _COMMANDS = (75, 76)  # COMMAND_INT, COMMAND_LONG
-# SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: offset of target_system
-_SETPOINTS = MappingProxyType({82: 36, 84: 50, 86: 50})
 _ECHOES = 256  # newest frames of ours that are recognised when they come back
 # A link may reorder: a report of the mode this close behind a newer one says nothing new
 _REORDERED_FRAMES, _REORDERED_S = 32, 0.1
@@ -222,7 +219,7 @@ class Session:
 
     def _is_setpoint(self, frame: framing.Frame) -> bool:
         """Whether it is a setpoint for our vehicle, or for all: routers forward those of others."""
-        offset = _SETPOINTS.get(frame.message_id)
+        offset = framing.SETPOINTS.get(frame.message_id)
         if offset is None:
             return False
         target = frame.payload[offset : offset + 1]  # MAVLink 2 omits trailing zeros

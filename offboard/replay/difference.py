@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.analysis.tlog import layout, name_of
+from offboard.mavlink.framing import SETPOINTS
 from offboard.replay.replaying import Sent
 
-SETPOINTS = (82, 84, 86)  # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED, ..._GLOBAL_INT
 COMMANDS = (75, 76)  # COMMAND_INT, COMMAND_LONG
 ATTITUDE_TARGET = 82
 # Of a field, relative to its value or to 1: another processor or library rounds differently, by up

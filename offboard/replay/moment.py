@@ -13,6 +13,7 @@ from offboard.replay.recording import ReplayError
 from offboard.replay.replaying import Replay, Turn
 
 Rows = list[tuple[str, str]]
+LABELS = {"attitude": "attitude (w,x,y,z)"}
 HOST_TIMES = ("solve_time_s", "lateness_s")
 _FLOAT_ARRAY = 350
 _DATA_BYTES = 252  # of DEBUG_FLOAT_ARRAY
@@ -40,7 +41,10 @@ def _rows(replay: Replay, turn: Turn) -> dict[str, Rows]:
     snapshot, facts = companion.snapshot(), companion.facts()
     return {
         f"turn {turn.number}": received(turn),
-        "state": [(each.name, _text(getattr(snapshot, each.name))) for each in fields(snapshot)],
+        "state": [
+            (LABELS.get(each.name, each.name), _text(getattr(snapshot, each.name)))
+            for each in fields(snapshot)
+        ],
         "facts": [
             (each.name, _text(getattr(facts, each.name)))
             for each in fields(facts)

@@ -11,7 +11,7 @@ from offboard.analysis.tlog import LoggedMessage, Tlog
 from offboard.documents.errors import UserError
 from offboard.flight import inputs, manifest
 from offboard.flight.inputs import SETTINGS, Call, Entry
-from offboard.flight.record import RECORD_COMPONENT_ID
+from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 
 _TUNNEL = 385
 _LENGTH_AT, _DATA_AT = 4, 5  # TUNNEL.payload_length and .payload
@@ -33,6 +33,11 @@ class Recording:
     @property
     def lockstep(self) -> bool:
         return bool(self.settings["lockstep"])
+
+    @property
+    def signed(self) -> bool:
+        """Whether the link was signed: then what we sent is, too."""
+        return any(m.frame.signed for m in self.log if m.component_id == COMPONENT_ID)
 
     def entries(self) -> Iterator[Entry]:
         """The inputs in order. Raises inputs.InputsError where they are damaged."""
@@ -60,8 +65,8 @@ def read(flight: Path) -> Recording:
     recorded = tuple(pieces[inputs.PAYLOAD_TYPE])
     if not recorded:
         raise ReplayError(
-            f"{path} does not hold the inputs of each turn, which older versions and "
-            "`offboard daemon` do not record: it can be scored, not replayed"
+            f"{path} cannot be replayed, only scored and reported: it has no inputs of each turn; "
+            "a flight of `offboard daemon` goes on with what was received before its log begins"
         )
     return Recording(log, configuration, _settings(path, recorded), recorded)
 

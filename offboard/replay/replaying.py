@@ -9,6 +9,7 @@ from typing import Any
 
 from offboard.analysis.tlog import LoggedMessage
 from offboard.control.base import Controller
+from offboard.documents.signing_key import KEY_BYTES
 from offboard.flight import inputs
 from offboard.flight.companion import Companion
 from offboard.flight.configuration import flown
@@ -25,6 +26,8 @@ from offboard.flight.one_flight import FlightParts, companion_of, session_of
 from offboard.flight.outbox import Output
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.flight.request import build_parts
+from offboard.mavlink.framing import Frame
+from offboard.mavlink.signing import Signing
 from offboard.replay.recording import Recording, ReplayError, record_type
 
 CALLS = ("request_stop", "announce", "note_autopilot", "guard")  # methods of the companion
@@ -50,6 +53,13 @@ class Turn:
     given: TurnInput
     received: tuple[LoggedMessage, ...]
     output: Output | None
+
+
+class Accepted(Signing):
+    """The signing of a replayed flight: a log holds no key, and only frames that were accepted."""
+
+    def fault(self, frame: Frame) -> None:
+        return None
 
 
 class Replay:
@@ -88,8 +98,9 @@ class Replay:
     ) -> Companion:
         observer = parts.make_observer()
         settings: dict[str, Any] = recording.settings
+        signing = Accepted(bytes(KEY_BYTES)) if recording.signed else None
         try:
-            session = session_of(observer, **settings)
+            session = session_of(observer, signing, **settings)
         except TypeError:
             raise ReplayError(
                 f"{recording.log.path}: the settings of its session are those of another version"

@@ -6,6 +6,7 @@ import threading
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from sdnotify import SystemdNotifier
@@ -34,7 +35,7 @@ from offboard.service.lock import connection_lock, directory_lock
 from offboard.service.memory import VehicleFiles
 from offboard.service.monitor import Monitor
 from offboard.service.preparation import Preparation
-from offboard.service.record import Recorder
+from offboard.service.record import Recorder, score
 
 LINK_FIRST_S, LINK_MOST_S = 1.0, 5.0  # between two attempts to open the link
 SHOWN_EVERY_S = 0.25
@@ -52,6 +53,7 @@ class Service:
     then: Then = "hold"
     arms: bool = False
     metrics: str | None = None  # HOST:PORT
+    report: bool = True  # after each flight
 
 
 def run(
@@ -82,13 +84,14 @@ def run(
         compiled.prepare(tell)
         preparation = stack.enter_context(closing(Preparation(request)))
         supervisor.await_ready()
-        recorder = Recorder(request.directory)
+        recorder = Recorder(request.directory, score=partial(score, report=wanted.report))
         stack.callback(recorder.close)
         memory = stack.enter_context(closing(VehicleFiles(_vehicles(request.directory), tell)))
         manager = stack.enter_context(closing(Manager()))
         manager.ready()
         link = opened(request.connection, stops, tell, manager)
         if link is None:
+            tell(STOPPED_EARLY)
             return Outcome(ExitCode.FLOWN, STOPPED_EARLY)
         stack.callback(link.close)
         recorder.score_earlier()  # a supervisor that still has the link also has the log

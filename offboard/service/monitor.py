@@ -6,8 +6,6 @@ The loop hands over a value (`Monitor.show`); the server's threads read only tha
 from __future__ import annotations
 
 import json
-import math
-import re
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, fields
@@ -19,17 +17,17 @@ from prometheus_client import CollectorRegistry, make_wsgi_app
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.registry import Collector
 
+from offboard.documents.arguments import split_address
 from offboard.documents.errors import UserError, shown
+from offboard.documents.plain import plain
 from offboard.flight import clock
 from offboard.flight.snapshot import Snapshot
 
 if TYPE_CHECKING:
     from prometheus_client import Metric
 
-PORT_MAX = 65535
 STALE_S = 2.0  # the loop hands over four snapshots a second
 HEALTHY_AGE_S = 2.0  # of telemetry
-_ADDRESS = re.compile(r"(?:\[(?P<v6>[0-9A-Fa-f:.]+)\]|(?P<v4>[^:\[\]]+)):(?P<port>\d{1,9})", re.A)
 STATES = ("phase", "mode", "authority", "rung")  # texts of a snapshot that are labels
 NUMBERS = tuple(f.name for f in fields(Snapshot) if f.type in ("float", "int", "bool"))
 
@@ -65,22 +63,18 @@ class _Silent(WSGIRequestHandler):
 
 
 class Monitor(Collector):
-    """Serves `HOST:PORT` from threads of its own. Raises MonitorError."""
+    """Serves `HOST:PORT` from threads of its own. Raises UserError."""
 
     def __init__(self, address: str) -> None:
         self._shown: Shown | None = None
         registry = CollectorRegistry(auto_describe=False)
         registry.register(self)
         self._metrics = make_wsgi_app(registry)
-        matched = _ADDRESS.fullmatch(address)
-        if matched is None or not 0 <= int(matched["port"]) <= PORT_MAX:
-            raise MonitorError(f"--metrics {shown(address)} is not understood; use HOST:PORT")
-        host = matched["v6"] or matched["v4"]
+        host, port = split_address("--metrics", address)
         try:
             self._server = make_server(
-                host, int(matched["port"]), self._answer, server_class=_Server,
-                handler_class=_Silent,
-            )  # fmt: skip
+                host, port, self._answer, server_class=_Server, handler_class=_Silent
+            )
         except (OSError, UnicodeError, OverflowError) as error:
             reason = getattr(error, "strerror", None) or error
             sentence = f"--metrics {shown(address)} cannot be served: {reason}"
@@ -123,7 +117,7 @@ class Monitor(Collector):
         elif not now.snapshot.telemetry_age_s <= HEALTHY_AGE_S:
             reason = "no telemetry"
         described = asdict(now.snapshot) if now else {}
-        health = {"healthy": not reason, "reason": reason, **_finite(described)}
+        health = {"healthy": not reason, "reason": reason, **plain(described)}
         return ("503 Service Unavailable" if reason else "200 OK"), health
 
     def collect(self) -> Iterator[Metric]:
@@ -139,11 +133,3 @@ class Monitor(Collector):
             yield GaugeMetricFamily(f"offboard_{name}", f"{name} of the present flight.", value)
         states = {name: str(getattr(now.snapshot, name)) for name in STATES}
         yield InfoMetricFamily("offboard_state", "State of the present flight.", states)
-
-
-def _finite(values: dict[str, Any]) -> dict[str, object]:
-    """JSON has no NaN."""
-    return {
-        name: None if isinstance(value, float) and not math.isfinite(value) else value
-        for name, value in values.items()
-    }

@@ -130,11 +130,11 @@ class FlightRecord:
             os.close(self.descriptor)
 
 
-def score(directory: Path, closing: threading.Event) -> None:
-    """Score a flight in a process of its own, with a lower priority, and wait for its end, or until
-    the service closes: the process outlives it."""
+def score(directory: Path, closing: threading.Event, *, report: bool = False) -> None:
+    """Score a flight, and write its `report`, in a process of its own with a lower priority. Wait
+    for its end, or until the service closes: the process outlives it."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "offboard", "score", str(directory)],
+        [sys.executable, "-m", "offboard", "report" if report else "score", str(directory)],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

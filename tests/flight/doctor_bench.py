@@ -34,7 +34,7 @@ BOOT_S = {PX4.name: 6.0, ARDUPILOT.name: 5.0}
 BOOT_SCALE = {PX4.name: 1.0, ARDUPILOT.name: 0.1}
 # What a vehicle has that was set up as the doctor advises
 GOOD = {
-    PX4.name: {"COM_OBL_RC_ACT": 4.0},
+    PX4.name: {"COM_OBL_RC_ACT": 4.0, "COM_RCL_EXCEPT": 4.0},
     ARDUPILOT.name: {
         "GUID_OPTIONS": 8.0, "GUID_TIMEOUT": 1.0, "FS_GCS_ENABLE": 5.0, "SYSID_MYGCS": 1.0,
     },

@@ -39,7 +39,7 @@ def test_nothing_is_said_of_a_good_vehicle(firmware: Firmware) -> None:
         (LEAN, "COM_OBL_RC_ACT", 0.0, WARN, "param set COM_OBL_RC_ACT 4"),
         (LEAN, "COM_OBL_RC_ACT", 7.0, WARN, "param set COM_OBL_RC_ACT 4"),
         (LEAN, "COM_RC_IN_MODE", 4.0, WARN, "param set COM_RC_IN_MODE 3"),
-        (LEAN, "COM_RC_IN_MODE", 0.0, WARN, "param set COM_RCL_EXCEPT 4"),
+        (LEAN, "COM_RCL_EXCEPT", 0.0, WARN, "param set COM_RCL_EXCEPT 4"),
         (ARDUPILOT, "GUID_OPTIONS", 2.0, BLOCKS, "param set GUID_OPTIONS 10"),
         (ARDUPILOT, "GUID_TIMEOUT", 0.1, BLOCKS, "param set GUID_TIMEOUT 0.3"),
         (ARDUPILOT, "GUID_TIMEOUT", 3.0, WARN, "param set GUID_TIMEOUT 1"),

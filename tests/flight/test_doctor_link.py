@@ -181,7 +181,7 @@ def test_slower_than_requested_is_a_warning() -> None:
     patient = bench(faults=link(message_rate_hz=30.0, direction="down"))
     row = patient.consult("rates")["rates"]
     assert row.level is WARN
-    assert "LOCAL_POSITION_NED 29.5 of 100 Hz" in row.findings[0].found
+    assert "LOCAL_POSITION_NED 30.0 of 100 Hz" in row.findings[0].found
 
 
 def test_line_that_is_too_slow_for_the_telemetry() -> None:

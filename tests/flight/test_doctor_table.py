@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import json
 import re
+import threading
+import time
 from pathlib import Path
 
 import pytest
 from doctor_bench import bench
 
-from offboard.doctor import link_checks, ports
-from offboard.doctor.findings import Level, examine, worst
+from offboard.doctor import link_checks, ports, run
+from offboard.doctor.findings import Check, Level, examine, worst
 from offboard.doctor.observation import Observation
 from offboard.doctor.report import as_json
 from offboard.doctor.table import CheckError, checks
@@ -60,6 +62,32 @@ def test_broken_checks_of_other_packages_are_rows(
     assert "ModuleNotFoundError" in rows["gone"].findings[0].found
     assert "TypeError" in rows["odd"].findings[0].found
     assert "gps" not in rows  # the built-in one, which has nothing to say of nothing
+
+
+def test_a_check_that_takes_too_long_is_a_row_and_delays_nothing() -> None:
+    never, began_s = threading.Event(), time.monotonic()
+    asked = [Check("stuck", "", lambda seen: iter(never.wait, None)), *checks(["port"])]
+    rows = examine(asked, Observation(), 0.3)
+    assert time.monotonic() - began_s < 2.0
+    assert [(row.check, row.level) for row in rows] == [("stuck", Level.WARN), ("port", Level.OK)]
+    assert rows[0].findings[0].found == "the check did not end in 0.3 s"
+
+
+def test_the_command_ends_in_time_although_nothing_of_it_does(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A link that does not open, and a look at the computer without end."""
+    never = threading.Event()
+    monkeypatch.setattr(run, "OPEN_S", 0.1)
+    monkeypatch.setattr(run, "LOOK_S", 0.4)
+    monkeypatch.setattr(run, "open_link", lambda connection: never.wait())
+    monkeypatch.setattr(run, "measure", lambda *given, **named: never.wait())
+    began_s = time.monotonic()
+    seen = run.observe("tcp:10.0.0.1:5760", load("flight"), tmp_path)
+    assert time.monotonic() - began_s < 2.0
+    rows = {row.check: row for row in examine(checks(["port", "computer"]), seen)}
+    assert "cannot be opened in 0.1 s" in rows["port"].findings[0].found
+    assert rows["computer"].level is Level.WAIT
 
 
 def test_unknown_check() -> None:

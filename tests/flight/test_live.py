@@ -26,6 +26,7 @@ from browser import opening
 from pair import Pair, hover
 from rich.console import Console
 
+from offboard.documents.errors import UserError
 from offboard.live.displays import Displays
 from offboard.live.foxglove_server import attitude_enu, enu
 from offboard.live.lines import JsonLines, Terminal, status
@@ -144,7 +145,7 @@ def test_an_address_that_cannot_be_served_is_refused() -> None:
         ):
             process.await_ready()
     for wrong in ("8014x", "localhost", "127.0.0.1:99999", "127.0.0.1:²"):
-        with pytest.raises(LiveError, match="give HOST:PORT"):
+        with pytest.raises(UserError, match="give HOST:PORT"):
             LiveProcess(SERVER, "--live", wrong)
 
 

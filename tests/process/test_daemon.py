@@ -20,6 +20,8 @@ from prometheus_client.parser import text_string_to_metric_families
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.analysis import tlog
+from offboard.analysis.score_json import as_text
+from offboard.analysis.trial import score_flight
 
 NAN = float("nan")
 SET_MODE, ARM, TAKEOFF = 176, 400, 22  # MAV_CMD
@@ -101,7 +103,7 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     link = f"udpin:127.0.0.1:{port}"
     service = spawn("offboard", "daemon", "--connect", link, "--out", "out", "--log-json",
                     "--metrics", f"127.0.0.1:{web}", "--reference", "hover",
-                    "--set", "reference.duration_s=600")  # fmt: skip
+                    "--set", "reference.duration_s=600", OFFBOARD_REPORT="1")  # fmt: skip
     await_phase(web, "connect")
     assert health(web)[0] == 503
     second = spawn("offboard", "daemon", "--connect", link, "--out", "other")
@@ -137,9 +139,15 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     lines = [json.loads(line) for line in out.splitlines()]
     assert all({"time", "level", "event", "phase"} <= line.keys() for line in lines)
     assert any("engaged: OFFBOARD in the air" in line["event"] for line in lines)
+    assert sum("stop requested" in line["event"] for line in lines) == 1
     (flight,) = [path for path in (tmp_path / "out").iterdir() if (path / "flight.tlog").exists()]
-    figures = json.loads((flight / "score.json").read_text())
-    assert figures["phases"]
+    deadline_s = time.monotonic() + LONG_S
+    while not (flight / "report.html").exists() and time.monotonic() < deadline_s:
+        time.sleep(0.1)
+    assert (flight / "report.html").read_text(encoding="utf-8").endswith("</html>")
+    kept = (flight / "score.json").read_text()
+    assert json.loads(kept)["phases"]
+    assert kept == as_text(*score_flight(flight / "flight.tlog"))
     log = tlog.read(flight / "flight.tlog")
     names = {entry.name for entry in log.messages}
     assert {"TUNNEL", "HEARTBEAT", "PARAM_VALUE", "SET_ATTITUDE_TARGET", "STATUSTEXT"} <= names

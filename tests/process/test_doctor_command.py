@@ -13,7 +13,7 @@ import pytest
 from processes import Spawn, free_port
 from sim_peer import simulator
 
-GOOD_PX4 = ("--param", "COM_OBL_RC_ACT=4")
+GOOD_PX4 = ("--param", "COM_OBL_RC_ACT=4", "--param", "COM_RCL_EXCEPT=4")
 
 
 def test_good_vehicle_over_udp(spawn: Spawn) -> None:
@@ -69,6 +69,7 @@ def test_taken_port_names_its_holder(spawn: Spawn) -> None:
         (("gsp",), 2, "there is no check named 'gsp'; known are port, vehicle,"),
         (("--connect", "nowhere"), 2, "connection 'nowhere' is not understood; use udpin:"),
         (("port", "--connect", "tcp:127.0.0.1:1"), 3, "cannot be opened: Connection refused"),
+        (("port", "--connect", "tcp:127.0.0.1:1"), 3, "start the vehicle, or the router, that "),
     ],
 )
 def test_exit_codes(arguments: tuple[str, ...], code: int, says: str, spawn: Spawn) -> None:

@@ -28,9 +28,10 @@ from offboard.flight.manifest import PAYLOAD_TYPE as MANIFEST
 from offboard.flight.record import RECORD_COMPONENT_ID
 from offboard.mavlink import framing
 from offboard.mavlink.encode import encode
+from offboard.mavlink.framing import SETPOINTS
 from offboard.mavlink.outgoing import ConfigurationRecord
 from offboard.mavlink.session import Reception, SessionSettings
-from offboard.replay.difference import COMMANDS, SETPOINTS
+from offboard.replay.difference import COMMANDS
 from offboard.replay.recording import Recording, read, record_type
 from offboard.replay.replaying import CALLS, Replay, Sent
 

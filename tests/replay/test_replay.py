@@ -21,7 +21,9 @@ from offboard.flight.actions import PhaseActions
 from offboard.flight.log import entry
 from offboard.flight.outbox import Output
 from offboard.flight.phases import Phase
+from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
+from offboard.mavlink.signing import Signing
 from offboard.replay.difference import compare
 from offboard.replay.recording import ReplayError, read, record_type
 from offboard.replay.verdict import verdict
@@ -31,6 +33,7 @@ sys.path.append(str(Path(__file__).parents[1] / "flight"))
 from pair import SHORT, UNIX_EPOCH_US, HostClock, Pair, hover, in_phase
 
 WIRE = Path(__file__).parents[1] / "wire" / "recordings"
+KEY = bytes(range(32))
 NEUTRAL_HOVER_THRUST = 0.42  # config/vehicles/neutral.yaml
 SMALLEST, CLIMB_BEGAN_S = "faulty-px4", 8.4
 
@@ -99,6 +102,7 @@ def test_the_state_of_a_tick(flight: Path) -> None:
     assert float(values["gap"]) < 1e-6
     assert float(values["predicted_down_m"]) == pytest.approx(-1.0, abs=0.1)
     assert {"silence_s", "hover_thrust", "iterations", "position_ned_m"} <= values.keys()
+    assert values["attitude"].startswith("(w,x,y,z)")
     late = run(flight, "--at", 1e6)
     assert "ends at 30." in reason(late)
 
@@ -142,7 +146,7 @@ def test_logs_that_cannot_be_replayed(flight: Path, tmp_path: Path) -> None:
     assert "does not hold the configuration" in reason(run(foreign))
     old = tmp_path / "old.tlog"
     old.write_bytes(without(flight, lambda message: record_type(message) == inputs.PAYLOAD_TYPE))
-    assert "does not hold the inputs" in reason(run(old))
+    assert "has no inputs of each turn" in reason(run(old))
     silent = tmp_path / "silent.tlog"
     silent.write_bytes(without(flight, lambda message: record_type(message) is None))
     assert "nothing to compare" in reason(run(silent))
@@ -177,11 +181,14 @@ def test_a_lost_message_ends_the_comparison_before_it(tmp_path: Path) -> None:
 # ------------------------------------------------------------------ unusual inputs
 
 
-def short_flight(**options) -> Pair:
+def short_flight(key: bytes = b"", **options) -> Pair:
     resolved = configuration.load("flight", choices={"reference": "hover"}, assignments=SHORT,
                                   known_vehicle="px4_sih")  # fmt: skip
     pair = hover(learning=resolved.identify, deadline_s=resolved.deadline_s, **options)
     companion, turn = pair.companion, pair.companion.turn
+    if key:
+        companion._session._signing = Signing(key)
+        pair.instance.keyring.set_up(key, 1)
 
     def guarded(chunks, now_s) -> Output:  # as the loop
         try:
@@ -206,14 +213,16 @@ def logged(pair: Pair, path: Path) -> Path:
 
 
 def check(pair: Pair, tmp_path: Path, least: int) -> None:
-    """All that the companion sent in flight is what the replay sends."""
+    """All that the companion sent in flight is what the replay sends. Frames that signing has
+    refused are not in the log: what was said of them is not said again."""
     replay = replayed(read(logged(pair, tmp_path / "flight.tlog")))
     comparison = compare(replay.recorded, replay.replayed)
     assert not replay.stopped
     assert comparison.differences == ()
     assert comparison.setpoints == len(pair.payloads) >= least
-    sent = [frame[10:-2] for _, _, frame in pair.sent]
-    assert [each.payload for each in replay.replayed] == sent
+    texts = {253} if pair.companion.snapshot().forged else set()
+    sent = [frame[10 : 10 + frame[1]] for _, _, frame in pair.sent if frame[7] not in texts]
+    assert [each.payload for each in replay.replayed if each.message_id not in texts] == sent
     assert replay.companion.outcome == pair.companion.outcome
 
 
@@ -233,8 +242,9 @@ def test_a_program_with_our_ids_a_stop_and_a_pause(tmp_path: Path) -> None:
     check(pair, tmp_path, least=40)
 
 
-def test_slow_decisions_a_stop_request_and_strangers(tmp_path: Path) -> None:
-    """Each ninth decision is cut short by its deadline, or too late to be sent."""
+def test_slow_decisions_a_stop_request_strangers_and_a_signed_link(tmp_path: Path) -> None:
+    """Each ninth decision is cut short by its deadline, or too late to be sent. An attacker sends
+    a heartbeat every 40 ms."""
     clock = HostClock()
 
     def slow(law: Controller) -> Controller:
@@ -252,10 +262,18 @@ def test_slow_decisions_a_stop_request_and_strangers(tmp_path: Path) -> None:
         pair.companion.announce("31 datagrams of others")
         pair.companion.request_stop("enough")
 
-    pair = short_flight(clock=clock, wrap=slow, at=[(in_phase(Phase.TRACK, 1.0), stop)])
+    forged = Session(SessionSettings()).encode(Heartbeat(2))
+
+    def attack(time_s: float, datagrams: list[bytes]) -> list[bytes]:
+        return [*datagrams, forged] if round(time_s * 250) % 10 == 0 else datagrams
+
+    at = [(in_phase(Phase.TRACK, 1.0), stop)]
+    pair = short_flight(KEY, clock=clock, wrap=slow, down=attack, at=at)
     assert pair.companion.outcome is not None
     assert "enough" in pair.companion.outcome.sentence
+    assert pair.companion.snapshot().forged > 300
     check(pair, tmp_path, least=40)
+    assert KEY not in (tmp_path / "flight.tlog").read_bytes()
 
 
 def test_an_error_in_a_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

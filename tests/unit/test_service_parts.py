@@ -14,6 +14,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.analysis import tlog
+from offboard.documents.errors import UserError
 from offboard.flight import clock, manifest
 from offboard.flight import request as flight_request
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
@@ -31,7 +32,7 @@ from offboard.service.daemon import Manager
 from offboard.service.flights import Prepared
 from offboard.service.lock import Locked, connection_lock, directory_lock
 from offboard.service.memory import VehicleFiles
-from offboard.service.monitor import Monitor, MonitorError
+from offboard.service.monitor import Monitor
 from offboard.service.preparation import Preparation
 from offboard.service.record import ROLLING_NAMES, Recorder
 
@@ -330,7 +331,7 @@ def test_a_changed_configuration_is_used_and_a_bad_one_refused(
 
 @pytest.mark.parametrize("address", ["", "9464", "localhost:", "a:b", "127.0.0.1:99999", "[::1:1"])
 def test_an_address_to_serve_that_is_none(address: str) -> None:
-    with pytest.raises(MonitorError, match="use HOST:PORT"):
+    with pytest.raises(UserError, match="give HOST:PORT"):
         Monitor(address)
 
 

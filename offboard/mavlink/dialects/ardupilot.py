@@ -72,7 +72,7 @@ ARDUPILOT = Dialect(
     watched_parameters=(
         WatchedParameter(
             "GUID_OPTIONS",
-            "without bit 8 the thrust field is a climb rate",
+            "without bit 3 (value 8) the thrust field is a climb rate",
             required_bits=8,
             must_answer=True,
         ),

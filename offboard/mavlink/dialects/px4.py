@@ -30,11 +30,11 @@ def _mode_parameters(custom_mode: int) -> tuple[float, float, float]:
     return CUSTOM_MODE_ENABLED, float(custom_mode >> 16 & 0xFF), float(custom_mode >> 24)
 
 
-_RADIO_IN_MODES = (0.0, 2.0, 3.0)  # COM_RC_IN_MODE
+_NO_STICKS = 4.0  # COM_RC_IN_MODE
 
 
-def _expects_radio(known: Mapping[str, float], radio: bool) -> bool:
-    return not radio and known.get("COM_RC_IN_MODE") in _RADIO_IN_MODES
+def _misses_sticks(known: Mapping[str, float], radio: bool) -> bool:
+    return not radio and known.get("COM_RC_IN_MODE", _NO_STICKS) != _NO_STICKS
 
 
 _MODES = {
@@ -114,11 +114,11 @@ PX4 = Dialect(
             "modes in which a lost radio is no failsafe; 4 is OFFBOARD",
             advice=(
                 Advice(
-                    "without 4, a radio that is received for a moment and lost again ends "
-                    "OFFBOARD; none is received now",
+                    "without 4, a radio or joystick that is received for a moment and lost again "
+                    "ends OFFBOARD; none is received now",
                     4.0,
                     bits=4,
-                    applies=_expects_radio,
+                    applies=_misses_sticks,
                 ),
             ),
         ),

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 from offboard.analysis.figure import Figure
 from offboard.analysis.page import render
+from offboard.documents.plain import plain
 from offboard.paper.study.options import SECTIONS
 from offboard.paper.study.printed import DOI
 
@@ -44,7 +45,7 @@ class Table:
         return text.getvalue()
 
     def to_json(self) -> str:
-        rows = [{key: _finite(row.get(key)) for key in self.columns} for row in self.rows]
+        rows = [{key: plain(row.get(key)) for key in self.columns} for row in self.rows]
         document = {
             "title": self.title, "columns": dict(self.columns), "rows": rows,
             "notes": list(self.notes),
@@ -86,7 +87,3 @@ def shown(cell: Cell) -> str:
     if isinstance(cell, int) or (cell == round(cell) and abs(cell) < 1e5):
         return f"{cell:.0f}"
     return f"{cell:.4g}" if 1e-4 <= abs(cell) < 1e5 else f"{cell:.3e}"
-
-
-def _finite(cell: Cell) -> Cell:
-    return None if isinstance(cell, float) and not math.isfinite(cell) else cell
