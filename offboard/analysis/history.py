@@ -19,9 +19,9 @@ from offboard.analysis.sender import Stream, continuous_s
 from offboard.analysis.tlog import LoggedMessage, Tlog, name_of
 from offboard.analysis.truth import true_positions
 from offboard.flight import manifest
-from offboard.flight.online_identification import RECORD_NAME as IDENTIFIED_NAME
 from offboard.flight.record import (
     COMPONENT_ID,
+    IDENTIFIED_NAME,
     LAYOUTS,
     RECORD_COMPONENT_ID,
     RECORD_NAME,

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from offboard.analysis.events import Event
 from offboard.analysis.history import History
-from offboard.flight.companion import STOPPED
+from offboard.flight.phases import STOPPED
 from offboard.flight.touchdown import Touchdown
 
 Array = NDArray[np.float64]

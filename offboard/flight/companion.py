@@ -30,6 +30,7 @@ from offboard.flight.phases import (
     ENDS,
     FLYING,
     PHASE_CODES,
+    STOPPED,
     WAITING,
     Limits,
     Phase,
@@ -51,10 +52,9 @@ from offboard.mavlink.outgoing import Outgoing
 from offboard.mavlink.session import ACTIVE, Session
 from offboard.model.vehicle import Vehicle
 
-__all__ = ["Companion", "Outcome", "Output"]
+__all__ = ["STOPPED", "Companion", "Outcome", "Output"]
 
 MAV_STATE_STANDBY, MAV_STATE_CRITICAL = 3, 5
-STOPPED = "stop requested by the operator"
 BRIDGED_SHARE = 0.3  # of `Limits.silence_s`; after it, level setpoints replace the control law
 PAUSE_S = 0.3  # a longer gap between two turns: what was known before it is not known any more
 

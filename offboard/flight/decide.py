@@ -13,12 +13,17 @@ from offboard.control.base import Adopting, Controller, Decision, Situation
 from offboard.estimation.observer import Observer
 from offboard.flight.assessment import position_error_m
 from offboard.flight.gate import Refusal, Refused
-from offboard.flight.online_identification import RECORD_ID as IDENTIFIED_ID
-from offboard.flight.online_identification import RECORD_NAME as IDENTIFIED_NAME
 from offboard.flight.online_identification import Adoption, OnlineIdentification
 from offboard.flight.outbox import Outbox
 from offboard.flight.phases import PHASE_CODES, Phase
-from offboard.flight.record import RECORD_ID, RECORD_NAME, TickRecord, reference_record
+from offboard.flight.record import (
+    IDENTIFIED_ID,
+    IDENTIFIED_NAME,
+    RECORD_ID,
+    RECORD_NAME,
+    TickRecord,
+    reference_record,
+)
 from offboard.flight.state import FlightState
 from offboard.mavlink.outgoing import SolverRecord
 from offboard.model.command import Command, PositionCommand

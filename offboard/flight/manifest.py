@@ -35,6 +35,8 @@ def join(payloads: Iterable[bytes]) -> str | None:
         if len(payload) > _HEAD.size:
             index, count = _HEAD.unpack_from(payload)
             parts[index] = payload[_HEAD.size :]
+        if len(parts) == count > 0:  # they are the first entries of a log
+            break
     if not count or sorted(parts) != list(range(count)):
         return None
     try:

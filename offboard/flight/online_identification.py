@@ -31,7 +31,6 @@ from offboard.model.command import Command
 from offboard.model.frames import course_from_quaternion, thrust_direction_from_quaternion
 from offboard.model.vehicle import Vehicle
 
-RECORD_NAME, RECORD_ID = "identified", 2  # of the DEBUG_FLOAT_ARRAY in the log
 LIFTED_OFF_S = 0.5  # after this the ground has no effect on the thrust
 MOST_ROUNDS = 3  # of steps
 # Drag: when it is identified first, how often, and from how much flight.

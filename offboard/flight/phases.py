@@ -76,6 +76,7 @@ BEFORE_FLIGHT = WAITING | {Phase.STREAM, Phase.ENGAGE, Phase.ARM}
 TRACKING = frozenset({Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.PAUSE, Phase.HOVER})
 # phases in which the ladder is stepped
 FLYING = TRACKING | {Phase.TAKEOFF, Phase.HAND_BACK, Phase.HOLD}
+STOPPED = "stop requested by the operator"
 
 
 class ExitCode:

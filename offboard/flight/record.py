@@ -26,7 +26,8 @@ RECORD_NAME = "pso"
 NAN = float("nan")
 Array = NDArray[np.float64]
 RECORD_ID = 3
-LAYOUTS = {1: 28, RECORD_ID: 31}  # array_id -> number of fields; 2 is another array
+LAYOUTS = {1: 28, RECORD_ID: 31}  # array_id -> number of fields
+IDENTIFIED_NAME, IDENTIFIED_ID = "identified", 2  # of the other DEBUG_FLOAT_ARRAY in the log
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from pathlib import Path
 import pytest
 from browser import Opened, opening
 from rich.console import Console
+from typer.testing import CliRunner
 
 from offboard.analysis.compare import (
     FIGURES,
@@ -30,6 +31,7 @@ from offboard.analysis.compare_page import page
 from offboard.analysis.compare_table import show
 from offboard.analysis.comparison import compare_all
 from offboard.analysis.workers import processors
+from offboard.cli.commands import app
 from offboard.documents.reading import DocumentError
 
 LAWS = ("pso", "lqr", "an/uncommonly/long/name.yaml", "lost")
@@ -293,3 +295,21 @@ def test_without_cpu_affinity_all_processors_are_used(
         console=Console(file=io.StringIO()),
     )
     assert not problem
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("compare", "--system", "3"), "are options of --connect"),
+        (("compare", "--connect", "tcp:127.0.0.1:1", "--signing-key", "none"), "signing key none"),
+        (("identify", "x.tlog", "--system", "3"), "a log needs neither --system nor"),
+        (("identify", "--sitl", "--system", "3"), "--system is an option of --connect"),
+    ],
+)
+def test_the_vehicle_and_its_key_are_chosen_where_a_command_flies_one(
+    arguments: tuple[str, ...], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    answer = CliRunner().invoke(app, arguments)
+    assert answer.exit_code != 0
+    assert says in f"{answer.exception} {answer.output}"
