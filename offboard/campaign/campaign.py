@@ -86,10 +86,10 @@ class Campaign:
         open_workers: OpenWorkers,
         shard: Shard,
         ending: Callable[[], bool],
-        progress: Callable[[Case, int, int], None],
+        progress: Callable[[int, int], None],
     ) -> Summary:
-        """Fly what is not finished and write the table. `progress` gets each case that ends, how
-        many have ended and how many were to be flown. Raises ResultsError."""
+        """Fly what is not finished and write the table. `progress` gets how many flights have
+        ended, from 0 on, and how many were to be flown. Raises ResultsError."""
         mine = shard.of(self.cases)
         jobs = [
             Job(case, self.file.promises, code_hash())
@@ -98,11 +98,12 @@ class Campaign:
         ]
         stopped = ""
         if jobs:
+            progress(0, len(jobs))
             try:
                 with open_workers() as workers:
                     for done, (job, record) in enumerate(workers.fly(jobs, ending), 1):
                         self.results.put(job.case.key, record)
-                        progress(job.case, done, len(jobs))
+                        progress(done, len(jobs))
             except UserError as error:
                 stopped = str(error)
         return self._conclude(mine, open_workers, ending, stopped)

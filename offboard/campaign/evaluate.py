@@ -17,15 +17,22 @@ class Interrupted(Exception):
 
 
 class Evaluator:
-    """Flies cases and keeps their records. When `ending` is true, no further flight begins."""
+    """Flies cases and keeps their records. When `ending` is true, no further flight begins.
+    `progress` gets the number of records known, after each flight."""
 
     def __init__(
-        self, results: Results, promises: Promises, workers: Workers, ending: Callable[[], bool]
+        self,
+        results: Results,
+        promises: Promises,
+        workers: Workers,
+        ending: Callable[[], bool],
+        progress: Callable[[int], None] = lambda known: None,
     ) -> None:
         self._results = results
         self._promises = promises
         self._workers = workers
         self._ending = ending
+        self._progress = progress
         self.flown: dict[Case, Record] = {}
 
     def fly(self, cases: Sequence[Case]) -> list[Record]:
@@ -40,6 +47,7 @@ class Evaluator:
         for job, record in self._workers.fly(missing, self._ending):
             self._results.put(job.case.key, record)
             known[job.case] = record
+            self._progress(len(self.flown) + sum(each is not None for each in known.values()))
         found = [known[case] for case in cases]
         records = [record for record in found if record is not None]
         if len(records) < len(found):

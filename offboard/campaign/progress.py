@@ -1,4 +1,8 @@
-"""The progress of many flights: a bar on a terminal, else a line for every twentieth of them."""
+"""The progress of many flights: how many have ended, how fast, and how long the rest takes.
+
+A bar on a terminal, else lines: at the beginning, after the first `FIRST` flights, and for every
+twentieth of them.
+"""
 
 from __future__ import annotations
 
@@ -14,9 +18,9 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from offboard.campaign.cases import Case
 from offboard.flight import clock
 
+FIRST = 5  # flights after which the time is estimated first
 LINES = 20
 
 
@@ -27,12 +31,13 @@ class Counter:
         self._console = console
         self._bar = Progress(
             TextColumn("flights"), BarColumn(bar_width=20), MofNCompleteColumn(),
-            TimeElapsedColumn(), TimeRemainingColumn(),
+            TextColumn("{task.fields[rate]}"), TimeElapsedColumn(), TimeRemainingColumn(),
             console=console, transient=True, disable=not console.is_terminal,
         )  # fmt: skip
-        self._task = self._bar.add_task("flights", total=None)
+        self._task = self._bar.add_task("flights", total=None, rate="")
         self._begun_s = clock.monotonic_s()
         self._announced = False
+        self._before: int | None = None  # flights that an earlier run has flown
 
     def __enter__(self) -> Counter:
         self._bar.start()
@@ -46,16 +51,30 @@ class Counter:
     ) -> None:
         self._bar.stop()
 
-    def count(self, case: Case, done: int, planned: int) -> None:
-        """A flight has ended: the `done`-th of `planned`."""
-        self._bar.update(self._task, completed=done, total=planned)
-        if self._console.is_terminal or (done % max(1, planned // LINES) and done != planned):
+    def count(self, done: int, planned: int) -> None:
+        """`done` of at most `planned` flights have ended; 0 at the beginning."""
+        if done and self._before is None:
+            self._before = done - 1
+        own = done - (self._before or 0)
+        rate = 60.0 * own / max(1e-9, clock.monotonic_s() - self._begun_s)
+        told = f"{rate:.0f} a minute" if done else ""
+        self._bar.update(self._task, completed=done, total=planned, rate=told)
+        every = max(1, planned // LINES)
+        if self._console.is_terminal or (done % every and done != planned and own != FIRST):
             return
-        rate = 60.0 * done / max(1e-9, clock.monotonic_s() - self._begun_s)
-        self._console.print(f"{done} of {planned} flights, {rate:.0f} a minute")
+        left = f", {told}, {remaining(60.0 * (planned - done) / rate)} left" if done else ""
+        self._console.print(f"{done} of {planned} flights{left}")
 
     def announce(self, sentence: str) -> None:
         """Print a sentence, once."""
         if not self._announced:
             self._announced = True
             self._bar.console.print(sentence)
+
+
+def remaining(seconds: float) -> str:
+    """A duration in the largest unit that gives two figures."""
+    if seconds < 100.0:
+        return f"{seconds:.0f} s"
+    minutes = seconds / 60.0
+    return f"{minutes:.0f} min" if minutes < 100.0 else f"{minutes / 60.0:.1f} h"

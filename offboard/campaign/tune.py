@@ -36,6 +36,7 @@ from offboard.flight.configuration import FOLDERS, read_part
 from offboard.flight.request import FlightRequest
 
 STUDY = "tune"
+FOLDER = "tunings"
 NO_OPTUNA = "tuning needs optuna: pip install 'pso-offboard[tune]'"
 
 
@@ -81,13 +82,14 @@ class Tuned:
     verdict: Verdict
 
 
-def read_tune(path: str) -> TuneFile:
-    """A tuning file. Raises DocumentError."""
-    file = parse(read_text(Path(path)), TuneFile, path)
+def read_tune(name: str) -> tuple[TuneFile, str]:
+    """A shipped tuning or a file, and its path for errors. Raises DocumentError."""
+    path = locate(name, FOLDER, "tuning") if "." not in name else Path(name)
+    file = parse(read_text(path), TuneFile, str(path))
     for key in file.ranges:
         if key.startswith(SCENARIO):
             raise DocumentError(f"{path}: ranges.{key}: a scenario is not tuned, the flight is")
-    return file
+    return file, str(path)
 
 
 class Tuning:

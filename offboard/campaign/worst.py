@@ -72,6 +72,11 @@ class FailureSearch:
                 break
         return [self._at_seeds(failure) for failure in failures.values()]
 
+    def flights_most(self, count: int) -> int:
+        """The flights that `find` takes at most, unless it meets failures of the same kind."""
+        ranges, seeds = len(self._search.ranges), self._search.seeds
+        return self._search.flights + count * (1 + ranges + seeds)
+
     def middle(self) -> Case:
         """The case in the middle of all ranges."""
         return self._case(np.full(len(self._search.ranges), 0.5))

@@ -81,6 +81,7 @@ def _shard(text: str | None) -> Shard:
 def _search(flown: Campaign, source: str, count: int, open_workers: OpenWorkers) -> None:
     """Search for failures and print them; exits with 1 if there is one."""
     from offboard.campaign.evaluate import Evaluator, Interrupted
+    from offboard.campaign.progress import Counter
     from offboard.campaign.worst import keep, search_of
     from offboard.flight.stop import StopRequests
 
@@ -89,10 +90,19 @@ def _search(flown: Campaign, source: str, count: int, open_workers: OpenWorkers)
         suppress(KeyboardInterrupt, Interrupted),
         StopRequests() as stops,
         open_workers() as workers,
-        out.status("searching"),
+        Counter(out) as counter,
     ):
-        evaluator = Evaluator(flown.results, flown.file.promises, workers, lambda: stops.requested)
-        failures = search_of(flown, source, evaluator).find(count)
+
+        def progress(done: int) -> None:
+            counter.count(done, max(done, most))
+
+        evaluator = Evaluator(
+            flown.results, flown.file.promises, workers, lambda: stops.requested, progress
+        )
+        search = search_of(flown, source, evaluator)
+        most = search.flights_most(count)
+        counter.count(0, most)
+        failures = search.find(count)
     if failures is None:
         raise CommandError(ENDED, 4)
     table = keep(failures, flown)

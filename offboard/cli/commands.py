@@ -65,7 +65,7 @@ app.command(cls=Command, epilog=f"{NAMES}\n\n{EXIT_CODES}")(compare.compare)
 app.command(cls=Command, epilog=f"{shipped.overview('campaign')}\n\n{EXIT_CODES}")(
     campaign.campaign
 )
-app.command(cls=Command, epilog=EXIT_CODES)(tune.tune)
+app.command(cls=Command, epilog=f"{shipped.overview('tuning')}\n\n{EXIT_CODES}")(tune.tune)
 app.command(cls=Command, epilog=EXIT_CODES)(paper.paper)
 app.command(cls=Command, epilog=replay.EXIT_CODES)(replay.replay)
 app.command(cls=Command, epilog=EXIT_CODES)(export.export)

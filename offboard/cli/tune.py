@@ -11,11 +11,11 @@ import typer
 from offboard.cli.campaign import ENDED
 from offboard.cli.shared import CommandError, Workers, option, out, say
 
-FILE = typer.Argument(metavar="FILE", help="Tuning file.")
+NAME = typer.Argument(metavar="NAME|FILE", help="Tuning: a shipped name or a file.")
 
 
 def tune(
-    file: Annotated[str, FILE],
+    file: Annotated[str, NAME],
     profile: Annotated[
         Path, option("FILE", "Flight configuration to write; a new file.", "-o", "--out")
     ] = Path("profile.yaml"),
@@ -25,7 +25,7 @@ def tune(
 
     Minimises a figure over training flights, then flies the validation flights with and without
     the result. It is written only if it is better with 95 % confidence. Study and results are in a
-    folder beside it: the same command goes on.
+    folder beside it: the same command goes on. The shipped tuning shows all keys of the file.
     """
     if workers is not None and not 1 <= workers <= 256:
         raise CommandError(f"--workers {workers}: give 1 .. 256")
@@ -41,7 +41,7 @@ def tune(
         from offboard.campaign.tune import profile as text_of
         from offboard.flight.stop import StopRequests
 
-        tuning = Tuning(read_tune(file), file)
+        tuning = Tuning(*read_tune(file))
         results = Results(profile.with_suffix(".tune"), code_hash())
     tuned = None
     with (

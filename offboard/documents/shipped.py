@@ -20,6 +20,7 @@ FOLDERS = {
     "vehicle": "vehicles",
     "scenario": "scenarios",
     "campaign": "campaigns",
+    "tuning": "tunings",
     "configuration": "",
 }
 

@@ -73,7 +73,7 @@ def fly(
     open_workers: Callable[[], AbstractContextManager[Workers]] = inline,
     shard: Shard = Shard(),  # noqa: B008
 ) -> Summary:
-    return flown.fly(open_workers, shard, lambda: False, lambda case, done, planned: None)
+    return flown.fly(open_workers, shard, lambda: False, lambda done, planned: None)
 
 
 def table(directory: Path) -> dict[str, bytes]:
@@ -177,7 +177,7 @@ def test_a_scheduler_that_is_lost_keeps_what_is_finished(tmp_path: Path) -> None
         partial(cluster_workers, cluster.scheduler_address),
         Shard(),
         lambda: False,
-        lambda case, done, planned: cluster.close() if done == 1 else None,
+        lambda done, planned: cluster.close() if done == 1 else None,
     )
     assert "the dask scheduler" in summary.stopped
     assert "was lost" in summary.stopped

@@ -26,7 +26,7 @@ from simulator.command import app as simulator
 
 CONFIG = Path(__file__).parents[2] / "config"
 RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
-FOLDERS = ("references", "controllers", "vehicles", "scenarios", "campaigns", "")
+FOLDERS = ("references", "controllers", "vehicles", "scenarios", "campaigns", "tunings", "")
 COMMANDS = tuple(typer.main.get_command(offboard).commands)  # type: ignore[attr-defined]
 HELP = [(offboard, ()), *((offboard, (command,)) for command in COMMANDS), (simulator, ())]
 

@@ -55,7 +55,7 @@ def tuned(
 ) -> Tuned:
     directory.mkdir(exist_ok=True)
     (directory / "tune.yaml").write_text(text)
-    tuning = Tuning(read_tune(str(directory / "tune.yaml")), "tune.yaml")
+    tuning = Tuning(*read_tune(str(directory / "tune.yaml")))
     results = Results(directory / "study", "0123456789ab")
     flyers = workers(1, lambda: pytest.fail("not used"))
     evaluator = Evaluator(results, Promises(), flyers, ending)
@@ -95,7 +95,7 @@ def test_an_interrupted_tuning_goes_on_as_if_it_had_not_been(tmp_path: Path) -> 
 def test_the_profile_is_a_configuration_with_the_tuned_values(tmp_path: Path) -> None:
     found = tuned(tmp_path / "t")
     file = tmp_path / "profile.yaml"
-    file.write_text(profile(read_tune(str(tmp_path / "t" / "tune.yaml")), found))
+    file.write_text(profile(read_tune(str(tmp_path / "t" / "tune.yaml"))[0], found))
     config = load(str(file), known_vehicle="px4_sih").model_dump()
     shipped = load("flight", known_vehicle="px4_sih").model_dump()
     assert config["controller"]["bandwidth_radps"] == dict(found.values)[BANDWIDTH]
