@@ -181,7 +181,8 @@ class _Clock:
         self._passed_s = np.cumsum(np.maximum(np.diff(track_s, prepend=track_s[:1]), 0.0))
 
     def track_s(self, times: Array) -> Array:
-        return np.interp(times, self._times, self._passed_s)
+        passed_s: Array = np.interp(times, self._times, self._passed_s)
+        return passed_s
 
 
 class Reference:
