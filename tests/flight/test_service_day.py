@@ -1,8 +1,7 @@
 """The service through a day of events, in lockstep, judged by an independent observer of the wire.
 
 One vehicle, one service and one record for the whole day; Hypothesis draws the events. The default
-is a minute of each autopilot. OFFBOARD_DAY_S=28800 makes it eight hours, OFFBOARD_DAY_SEED another
-day.
+is 45 s of each autopilot. OFFBOARD_DAY_S=28800 makes it eight hours, OFFBOARD_DAY_SEED another day.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ from offboard.analysis.trial import keep_score, score_flight
 from offboard.flight.phases import TRACKING, WAITING
 from offboard.service.record import ENGAGED, ROLLING_NAMES, UNSCORED, Recorder
 
-DAY_S = float(os.environ.get("OFFBOARD_DAY_S", "60"))  # of each autopilot
+DAY_S = float(os.environ.get("OFFBOARD_DAY_S", "45"))  # of each autopilot
 SEED = int(os.environ.get("OFFBOARD_DAY_SEED", "1"))
 ROLLING_BYTES = 2_000_000
 HOUR_S = 3600.0
