@@ -178,7 +178,7 @@ class _Clock:
         chosen = _in_track(flown)
         rows = np.column_stack((flown.record_time_s, flown.records["track_time_s"]))[chosen]
         self._times, track_s = each_once(rows).T
-        self._passed_s = np.cumsum(np.maximum(np.diff(track_s, prepend=track_s[:1]), 0.0))
+        self._passed_s: Array = np.cumsum(np.maximum(np.diff(track_s, prepend=track_s[:1]), 0.0))
 
     def track_s(self, times: Array) -> Array:
         passed_s: Array = np.interp(times, self._times, self._passed_s)

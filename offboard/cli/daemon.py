@@ -61,7 +61,7 @@ def daemon(
     signing_key: SigningKey = None,
     anchor: Annotated[
         AnchorAt,
-        typer.Option(help="Reference: start at the vehicle, or relative to the take-off point."),
+        typer.Option(help="Reference: start where the vehicle stops, or relative to the take-off."),
     ] = AnchorAt.HERE,
     then: Annotated[ThenDo, typer.Option(help="After the reference.")] = ThenDo.HOLD,
     arms: Annotated[

@@ -155,13 +155,14 @@ class EventProcessor:
         )
         ours = mode == state.authority.engage_mode
         contact = state.contact
-        state.pilot.on_mode(
-            ours=ours, in_the_air=contact.in_the_air, certainly=contact.certainly_flies
-        )
+        flies, switched = contact.in_the_air, ours and state.pilot.elsewhere
+        state.pilot.on_mode(ours=ours, in_the_air=flies, certainly=contact.certainly_flies)
+        why = "" if state.pilot.engaged or not flies else "the vehicle may stand on the ground"
         if state.pilot.engaged and assessment.has_other_sender(state):
             state.pilot.engaged = False  # it was not switched for us
-            if state.phase in WAITING:
-                self._outbox.announce(f"not engaged: {mode}, but another program sends setpoints")
+            why = "another program sends setpoints"
+        if switched and why and state.phase in WAITING:
+            self._outbox.announce(f"not engaged: {mode}, but {why}")
         if isinstance(event, Heartbeat):
             state.pilot.on_heartbeat(ours=ours, failsafe=state.vehicle.in_failsafe)
 

@@ -11,9 +11,10 @@ from numpy.typing import NDArray
 from offboard.reference.base import FlatSample, Reference
 from offboard.reference.paused import Paused
 from offboard.reference.track import Track
-from offboard.reference.transfer import Limits, Placed, Shifted, transfer
+from offboard.reference.transfer import Limits, Placed, Shifted, stopping_place, transfer
 
 Array = NDArray[np.float64]
+Triple = tuple[float, float, float]
 SETTLED_DISTANCE_M = 0.3
 SETTLED_SPEED_MPS = 0.3
 RETURN = Limits(
@@ -117,14 +118,15 @@ class FlightPlan:
             self._paused = self._planned = self._paused.resumed(time_s)
 
     def place_start(
-        self, position_ned_m: tuple[float, float, float], ground_down_m: float | None
+        self, position_ned_m: Triple, velocity_ned_mps: Triple, ground_down_m: float | None
     ) -> float:
-        """Place the track so that it starts at this point, or as far above it as its lowest point
-        needs to stay `CLEAR_M` above the ground, or not to be lower than this point where the
-        ground is not known (None); returns by how much."""
+        """Place the track so that it starts where a vehicle at this position, with this velocity,
+        comes to rest, or as far above it as its lowest point needs to stay `CLEAR_M` above the
+        ground, or not to be lower than the vehicle where the ground is not known (None); returns by
+        how much."""
         times_s = np.arange(0.0, self.track.duration_s + SAMPLED_S, SAMPLED_S)
         places = self.track.sample(times_s).position_ned_m
-        origin = np.array(position_ned_m) - places[0]
+        origin = stopping_place(position_ned_m, velocity_ned_mps) - places[0]
         lowest_m = float(origin[2]) + float(places[:, 2].max())
         # a vehicle that is lower itself decides how low is safe
         clear_m = -math.inf if ground_down_m is None else ground_down_m - CLEAR_M

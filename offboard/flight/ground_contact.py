@@ -16,7 +16,7 @@ DETECTOR_KNOWN_S = 1.5  # EXTENDED_SYS_STATE is requested at 5 Hz
 RESTING_HEIGHT_M = 0.75  # errors of an estimate on the ground
 LIFTED_HEIGHT_M, LIFTED_CLIMB_MPS, LIFTED_SAMPLES = 0.15, 0.4, 3
 GROUND_SPEED_MPS = 0.5  # as an estimate on the ground may show
-STOOD_WITHIN_M, STOOD_HEIGHT_M = 0.1, 0.3
+STOOD_WITHIN_M, STOOD_HEIGHT_M, STOOD_S = 0.1, 0.3, 1.0
 KEPT_S, KEPT_EVERY_S = 20.0, 0.05
 
 
@@ -60,7 +60,8 @@ class GroundContact:
         vehicle may stand on the ground."""
         vehicle = self.vehicle
         known = vehicle.age_s(Landed) <= DETECTOR_KNOWN_S
-        return self.in_the_air and known and vehicle.landed not in ("on_ground", "unknown")
+        detected = known and vehicle.landed not in ("on_ground", "unknown")
+        return self.in_the_air and detected and not self.stood_for(STOOD_S)
 
     @property
     def certain(self) -> bool:

@@ -165,10 +165,12 @@ class PhaseMachine:
         state.home_ned_m = (*position.position_ned_m[:2], contact.rest_down_m)
         if state.programme.anchor == "here":
             rest = contact.rest_ned_m
-            above_m = state.plan.place_start(position.position_ned_m, rest[2] if rest else None)
+            above_m = state.plan.place_start(
+                position.position_ned_m, position.velocity_ned_mps, rest[2] if rest else None
+            )
             if above_m:
                 self._outbox.announce(
-                    f"the reference starts {above_m:.1f} m above the vehicle: from here it would "
+                    f"the reference starts {above_m:.1f} m higher: from here it would "
                     + ("touch the ground" if rest else "go lower, and the ground is not known")
                 )
         elif contact.rest_ned_m is not None and state.programme.serves:

@@ -24,7 +24,7 @@ Then = Literal["hold", "land", "repeat"]
 @dataclass(frozen=True, slots=True)
 class Programme:
     """`rows` is the phase table. `anchor`: where the reference of a flight that begins in the air
-    is placed, with its start at the vehicle (here) or relative to the take-off point (origin).
+    is placed, with its start where the vehicle stops (here) or relative to the take-off point.
     `serves`: it takes requests over MAVLink, and its flights begin where another has ended.
     `may_arm`: it may arm and take off on request."""
 

@@ -66,6 +66,20 @@ class Transfer:
         return FlatSample(*jet[:, ..., :3], *jet[:3, ..., 3])
 
 
+def stopping_place(
+    position_ned_m: Vector, velocity_ned_mps: Vector, limits: Limits = Limits()
+) -> Array:
+    """Where a vehicle at this position (3,), with this velocity (3,), NED, comes to rest if it is
+    braked smoothly within the limits."""
+    velocity = np.asarray(list(velocity_ned_mps), dtype=np.float64)
+    return np.asarray(list(position_ned_m)) + velocity * (_brake_s(velocity, limits) / 2.0)
+
+
+def _brake_s(velocity: Array, limits: Limits) -> float:
+    """Duration of a smooth stop within the limit of acceleration."""
+    return _SMOOTH_PEAK * float(np.linalg.norm(velocity)) / limits.acceleration_mps2
+
+
 def transfer(
     start_ned_m: Vector,
     target_ned_m: Vector,
@@ -100,8 +114,7 @@ def transfer(
             return Transfer(hop)
     times_s, jets = [0.0], [begin]
     if velocity.any():
-        brake_s = _SMOOTH_PEAK * float(np.linalg.norm(velocity)) / limits.acceleration_mps2
-        brake_s = max(brake_s, _BRAKE_MIN_S)
+        brake_s = max(_brake_s(velocity, limits), _BRAKE_MIN_S)
         begin = _at_rest(begin[0] + begin[1] * (brake_s / 2.0))
         times_s, jets = [*times_s, brake_s], [*jets, begin]
     hop = _shortest(begin, end, limits)

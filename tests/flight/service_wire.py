@@ -36,6 +36,7 @@ ALOFT_M = 0.3
 REPORTED_S = 0.5  # EXTENDED_SYS_STATE at 5 Hz, and what decides on it
 ANSWERED_S = 0.3  # a command of the pilot, by the vehicle
 KNOWN_S = 2.6  # age of the newest report of the mode
+TOUCHED_S = 1.5  # since it has left the ground last: it may jump
 OTHER_S = 5.0  # another sender is there for so long
 LIKE_NOW_RAD = 0.2  # attitude of the stream in the air against the vehicle's
 TILT_RAD = math.radians(46.0)
@@ -70,7 +71,7 @@ class Wire:
     known: Report | None = None  # the newest one that the service has got
 
     def __post_init__(self) -> None:
-        self._wish_s = self._other_s = -math.inf
+        self._wish_s = self._other_s = self._off_ground_s = -math.inf
         self._sent: deque[Report] = deque()  # on their way to the service
         self._served_s = self._apart_s = self._flying_s = self.pair.time_s
         self._deliver = self.pair.down
@@ -142,6 +143,8 @@ class Wire:
             self.mode, self.changed_s = mode, time_s
         if not self.pair.instance.idle:
             self._flying_s = time_s
+        if not self.pair.instance.autopilot.plant.on_ground:
+            self._off_ground_s = time_s
         joined = not (self.pair.lost_up or self.pair.lost_down or self.pair.paused)
         if not joined or time_s - self._other_s < OTHER_S or not (self.engaged and self._aloft):
             self._apart_s = time_s
@@ -162,7 +165,7 @@ class Wire:
 
     @property
     def _off_ground(self) -> bool:
-        return self._height_m > 0.05
+        return self.pair.time_s - self._off_ground_s < TOUCHED_S
 
     @property
     def _aloft(self) -> bool:

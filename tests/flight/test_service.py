@@ -317,6 +317,24 @@ def test_armed_in_offboard_on_the_ground_it_stays_there() -> None:
     assert -pair.place[2] < 0.05
 
 
+def test_switched_where_it_has_touched_down_it_stays_there() -> None:
+    """ArduCopter's land detector does not see that it stands in BRAKE."""
+    pair, wire = engaged("ardupilot")
+    pair.switch("land")
+    pair.until(lambda: -pair.place[2] < 0.01)
+    pair.switch("pilot")
+    pair.run(2.0)
+    assert pair.state.vehicle.landed == "in_air"
+    switched_s = pair.time_s
+    pair.switch("engage")
+    pair.run(1.0)
+    assert pair.mode == "GUIDED"
+    assert pair.after(switched_s, SETPOINT, COMMAND) == []
+    assert pair.phase is Phase.STANDBY
+    assert pair.said("not engaged: GUIDED, but the vehicle may stand on the ground")
+    assert wire.unsafe == []
+
+
 def test_without_arms_a_start_on_the_ground_is_denied() -> None:
     pair = serve()
     pair.until(lambda: pair.phase is Phase.STANDBY)
