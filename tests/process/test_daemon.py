@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import Spawn, free_port
+from processes import Spawn, free_port, signing
 from prometheus_client.parser import text_string_to_metric_families
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -27,7 +27,6 @@ from offboard.documents.signing_key import create_key, read_key
 NAN = float("nan")
 SET_MODE, ARM, TAKEOFF = 176, 400, 22  # MAV_CMD
 LONG_S = 60.0
-SIGNING_EPOCH_S = 1_420_070_400  # 2015-01-01
 
 
 class Pilot:
@@ -58,14 +57,6 @@ class Pilot:
             if any(done(message) for message in parser.parse_buffer(data) or ()):
                 return
         raise AssertionError("the vehicle did not do it")
-
-
-def signing(system: int, component: int, key: bytes) -> Any:
-    """A codec that signs."""
-    codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
-    codec.signing.secret_key, codec.signing.sign_outgoing = key, True
-    codec.signing.timestamp = int((time.time() - SIGNING_EPOCH_S) * 1e5)
-    return codec
 
 
 def shows(mode: int) -> Any:
