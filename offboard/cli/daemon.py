@@ -22,16 +22,20 @@ from offboard.cli.shared import (
     SigningKey,
     System,
     Vehicle,
+    complain,
     option,
     out,
     say,
     write,
 )
+from offboard.documents.errors import UserError
 
+STATE = Path("/var/lib/offboard")  # of the unit
+REFUSED = 3
 EXIT_CODES = (
     "Exit codes: 0 stopped, no vehicle follows it any more; 2 usage or configuration error, "
-    "nothing sent; 3 another daemon has the connection, or stopped before a take-off; 4 ended "
-    "before the vehicle was handed back, or left armed."
+    "nothing sent; 3 not begun for now, as another daemon has the connection, or stopped before a "
+    "take-off; 4 ended before the vehicle was handed back, or left armed."
 )
 OUT = f"Directory of the flights' directories.  [default: {FLIGHTS}]"
 
@@ -76,7 +80,11 @@ def daemon(
         bool, typer.Option("--log-json", help="Print one JSON object a line.")
     ] = False,
     print_unit: Annotated[
-        bool, typer.Option("--print-unit", help="Print a systemd unit with these options, and end.")
+        bool,
+        typer.Option(
+            "--print-unit",
+            help=f"Print a systemd unit with these options, which writes below {STATE}, and end.",
+        ),
     ] = False,
     report: Report = True,
     assignments: Assignments = None,
@@ -89,8 +97,13 @@ def daemon(
     MAV_CMD_DO_PAUSE_CONTINUE and MAV_CMD_DO_SET_MODE (hands back) to component 191.
     """
     connection = connect or DEFAULT_CONNECTION
+    named = {"controller": controller, "reference": reference, "vehicle": vehicle}
     if print_unit:
-        _print_unit(connection)
+        from offboard.flight.configuration import load
+
+        choices = {part: name for part, name in named.items() if name is not None}
+        load(config, choices=choices, assignments=assignments or ())
+        _print_unit(connection, signing_key, out_directory, [config, *choices.values()])
         return
     from offboard.flight.stop import StopRequests
     from offboard.live.lines import JsonLog, Terminal
@@ -102,8 +115,6 @@ def daemon(
         with loading():
             from offboard.flight.request import FlightRequest
             from offboard.service.daemon import Service, run
-            from offboard.service.lock import Locked
-        named = {"controller": controller, "reference": reference, "vehicle": vehicle}
         request = FlightRequest(
             directory=out_directory or FLIGHTS,
             config=config,
@@ -117,18 +128,47 @@ def daemon(
         wanted = Service(request, anchor.value, then.value, arms, metrics, report)
         try:
             outcome = run(wanted, stops=stops, tell=lines.tell, show=lines.show)
-        except Locked as error:
-            raise CommandError(str(error), 3) from None
+        except UserError as error:
+            if error.is_usage:
+                raise
+            raise CommandError(str(error), REFUSED) from None
     if outcome.exit_code:
         raise CommandError(outcome.sentence, outcome.exit_code)
 
 
-def _print_unit(connection: str) -> None:
-    from offboard.service.unit import unit
+def _print_unit(
+    connection: str, signing_key: Path | None, out_directory: Path | None, files: list[str]
+) -> None:
+    """Print the unit, and on stderr what its user cannot read. Raises CommandError and
+    KeyFileError."""
+    import offboard
+    from offboard.documents.signing_key import read_key
+    from offboard.service.unit import unit, unreadable
 
-    after = sys.argv[sys.argv.index("daemon") + 1 :]
-    words = [word for word in after if word != "--print-unit"]
-    sys.stdout.write(unit([_absolute(word) for word in words], connection))
+    if out_directory and STATE not in (out_directory, *out_directory.parents):
+        raise CommandError(
+            f"--out {out_directory}: the unit can write below {STATE} alone: omit --out, or name a "
+            "directory there"
+        )
+    if signing_key:
+        read_key(signing_key)
+    words = [word for word in sys.argv[sys.argv.index("daemon") + 1 :] if word != "--print-unit"]
+    arguments = [_absolute(word) for word in _without("--signing-key", words)]
+    sys.stdout.write(unit(arguments, connection, signing_key))
+    installed = [Path(sys.executable), Path(offboard.__path__[0])]
+    for path in (*installed, *(Path(file) for file in files if Path(file).is_file())):
+        if hidden := unreadable(path):
+            complain(hidden)
+
+
+def _without(option: str, words: list[str]) -> list[str]:
+    """The words without an option and its value."""
+    before = ["", *words]
+    return [
+        word
+        for word, previous in zip(words, before, strict=False)
+        if option not in (word, previous) and not word.startswith(f"{option}=")
+    ]
 
 
 def _absolute(word: str) -> str:

@@ -80,7 +80,7 @@ def facts(
         position_jump_m=state.jumps.recent_m(time_s),
         battery=1.0 if charge is None else charge,
         other_sender=_hears_other_sender(state),
-        other_vehicle=session.autopilots.ambiguous,
+        other_vehicle=session.autopilots.ambiguous(state.now_s),
         disarmed_again=_disarmed_again(state),
         lifted_by_command=state.takes_off_by_command,
         request=state.request,
@@ -125,7 +125,7 @@ def figures(
         "battery_percent": 100.0 * now.battery,
         "other_sender": f"system {other.system_id} component {other.component_id}" if other else "",
         "companion": _other_companion(vehicle.other_companion),
-        "systems": session.autopilots.named(),
+        "systems": session.autopilots.named(state.now_s),
         "not_found": session.autopilots.why_none(session.counters)
         or "is it running, and sending to this port?",
         "stop": state.stop_reason,
@@ -160,8 +160,8 @@ def not_ready(state: FlightState, session: Session) -> str:
         return "its parameters are still being read"
     if _has_no_origin(state):
         return "its take-off point is not known, as it was not seen on the ground (--anchor origin)"
-    if state.programme.serves and session.autopilots.ambiguous:
-        systems = session.autopilots.named()
+    if state.programme.serves and session.autopilots.ambiguous(state.now_s):
+        systems = session.autopilots.named(state.now_s)
         return f"several vehicles are heard, systems {systems}: choose one with --system"
     if not (vehicle.prearm_ok or vehicle.armed or state.programme.serves):
         return "its pre-arm checks do not pass"

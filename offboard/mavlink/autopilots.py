@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import math
+from collections.abc import Collection, Mapping
 from types import MappingProxyType
 
 from offboard.mavlink.counters import Counters, DropReason
@@ -15,39 +16,50 @@ from offboard.mavlink.framing import HEARTBEAT, Frame
 DIALECTS: Mapping[str, Dialect] = MappingProxyType({d.name: d for d in (PX4, ARDUPILOT)})
 AUTOPILOT_COMPONENT = 1
 SYSTEMS_MAX = 8  # that are remembered
+HEARD_S = 10.0  # after its newest HEARTBEAT a system is gone
+NOTED_EVERY_S = 1.0
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 
 
 class Autopilots:
     """Systems with a supported autopilot that were heard. `wanted`: the only one that may be the
-    vehicle; None: any."""
+    vehicle; None: any. Times are `Session.link_time_s`.
+
+    `systems` has when each was heard, to a second."""
 
     def __init__(self, wanted: int | None) -> None:
         self._wanted = wanted
-        self.systems: list[int] = []
+        self.systems: dict[int, float] = {}
 
-    def note(self, frame: Frame) -> Dialect | DropReason | None:
+    def note(self, frame: Frame, now_s: float) -> Dialect | DropReason | None:
         """The autopilot that a frame shows, why it is none, or None if it is no HEARTBEAT of an
         autopilot's component."""
         if frame.message_id != HEARTBEAT or frame.component_id != AUTOPILOT_COMPONENT:
             return None
         found = _dialect(frame) if frame.verified else DropReason.NO_VEHICLE
-        new = isinstance(found, Dialect) and frame.system_id not in self.systems
-        if new and len(self.systems) < SYSTEMS_MAX:
-            self.systems.append(frame.system_id)
+        if isinstance(found, Dialect):
+            self.hear(frame.system_id, now_s)
         return found
 
-    @property
-    def ambiguous(self) -> bool:
-        """Several could be the vehicle, and none was chosen."""
-        return self._wanted is None and len(self.systems) > 1
+    def hear(self, system_id: int, now_s: float) -> None:
+        """This system has an autopilot."""
+        if now_s - self.systems.get(system_id, -math.inf) < NOTED_EVERY_S:
+            return
+        self.systems.pop(system_id, None)  # the newest is the last
+        self.systems[system_id] = now_s
+        if len(self.systems) > SYSTEMS_MAX:
+            del self.systems[next(iter(self.systems))]
 
-    def named(self) -> str:
-        """The systems, for a sentence."""
-        if not self.systems:
-            return "none"
-        *others, last = map(str, sorted(self.systems))
-        return f"{', '.join(others)} and {last}" if others else last
+    def ambiguous(self, now_s: float) -> bool:
+        """Several could be the vehicle, and none was chosen."""
+        return self._wanted is None and len(self._present(now_s)) > 1
+
+    def named(self, now_s: float) -> str:
+        """The systems that are heard, for a sentence."""
+        return _listed(self._present(now_s))
+
+    def _present(self, now_s: float) -> list[int]:
+        return [each for each, at_s in self.systems.items() if now_s - at_s <= HEARD_S]
 
     def why_none(self, counters: Counters) -> str:
         """Why no vehicle was found, as far as the frames that were dropped tell; else empty."""
@@ -64,8 +76,13 @@ class Autopilots:
         if dropped[DropReason.NO_KEY]:
             return "the vehicle signs its messages: give its key with --signing-key"
         if self._wanted is not None and self.systems:
-            return f"system {self._wanted} is not heard, but {self.named()}; see --system"
+            return f"system {self._wanted} is not heard, but {_listed(self.systems)}; see --system"
         return ""
+
+
+def _listed(systems: Collection[int]) -> str:
+    *others, last = map(str, sorted(systems)) if systems else ("none",)
+    return f"{', '.join(others)} and {last}" if others else last
 
 
 def is_companion(frame: Frame, vehicle_system_id: int) -> bool:

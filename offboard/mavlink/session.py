@@ -229,7 +229,7 @@ class Session:
         self, frame: framing.Frame, peer: Hashable, events: list[Event]
     ) -> DropReason | None:
         """Why this frame is not from our vehicle; the first heartbeat of an autopilot pins it."""
-        heard = self.autopilots.note(frame)
+        heard = self.autopilots.note(frame, self.link_time_s)
         if self.vehicle is not None:
             if frame.system_id != self.vehicle.system_id:
                 return DropReason.FOREIGN_SYSTEM
@@ -255,7 +255,7 @@ class Session:
         """Send our heartbeat to a vehicle whose signature is right and whose clock is behind: its
         time stamp becomes the vehicle's time, as ours would become its. It may be a replay, so that
         nothing else is believed."""
-        heard = self.autopilots.note(frame)
+        heard = self.autopilots.note(frame, self.link_time_s)
         wanted = self.settings.system_id in (None, frame.system_id)
         if isinstance(heard, Dialect) and wanted:
             self._greeted = heard
@@ -266,13 +266,13 @@ class Session:
         return frame.verified and (self._signing is None or self._signing.fault(frame) is None)
 
     def overhear(self, datagram: bytes) -> list[int]:
-        """Systems with an autopilot that this datagram, from another address than the vehicle's, is
-        the first to show."""
-        known = len(self.autopilots.systems)
+        """Systems with an autopilot that this datagram, from another address than the vehicle's,
+        shows, each once a second."""
+        known = dict(self.autopilots.systems)
         for frame in framing.FrameSplitter(False, Counters()).split(datagram):
             if self._is_genuine(frame):
-                self.autopilots.note(frame)
-        return self.autopilots.systems[known:]
+                self.autopilots.note(frame, self.link_time_s)
+        return [each for each, _ in self.autopilots.systems.items() - known.items()]
 
     def adopt(self, vehicle: VehicleFound, peer: Hashable) -> None:
         """Take this vehicle, which sends from `peer`, as ours."""

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from faults import restamped
 from pair import decode
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from service_wire import HOVER, Wire
 from serving import ARM, PAUSE_CONTINUE, SET_MODE, START, Remembered, Serving, serve
 
@@ -336,8 +337,15 @@ def test_switched_where_it_has_touched_down_it_stays_there() -> None:
 
 
 def test_without_arms_a_start_on_the_ground_is_denied() -> None:
+    """Another vehicle passed by, which prevents standby for 10 s."""
     pair = serve()
-    pair.until(lambda: pair.phase is Phase.STANDBY)
+    codec = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
+    pair.run(0.5)
+    pair.forwarded.append(mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3).pack(codec))
+    pair.run(9.8)
+    assert pair.phase is Phase.HEALTH
+    assert pair.said("several vehicles are heard, systems 1 and 9: choose one with --system")
+    pair.until(lambda: pair.phase is Phase.STANDBY, 1.0)
     pair.command(START)
     pair.run(3.0)
     assert pair.acks == [(START, DENIED)]

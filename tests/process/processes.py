@@ -7,10 +7,15 @@ import signal
 import socket
 import subprocess
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import Any
 
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+
+SIGNING_EPOCH_S = 1_420_070_400  # 2015-01-01
 Spawn = Callable[..., subprocess.Popen[str]]
 
 
@@ -58,3 +63,11 @@ def children(pid: int) -> list[int]:
     except OSError:
         return []
     return [int(child) for child in listing.split()]
+
+
+def signing(system: int, component: int, key: bytes, *, ahead_s: float = 0.0) -> Any:
+    """A codec that signs, with stamps `ahead_s` of the computer's time."""
+    codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
+    codec.signing.secret_key, codec.signing.sign_outgoing = key, True
+    codec.signing.timestamp = int((time.time() + ahead_s - SIGNING_EPOCH_S) * 1e5)
+    return codec

@@ -15,13 +15,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import Spawn, free_port
+from processes import Spawn, free_port, signing
 from prometheus_client.parser import text_string_to_metric_families
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.analysis import tlog
 from offboard.analysis.score_json import as_text
 from offboard.analysis.trial import score_flight
+from offboard.documents.signing_key import create_key, read_key
 
 NAN = float("nan")
 SET_MODE, ARM, TAKEOFF = 176, 400, 22  # MAV_CMD
@@ -31,12 +32,12 @@ LONG_S = 60.0
 class Pilot:
     """A ground station on the simulator's second link, which switches modes."""
 
-    def __init__(self) -> None:
+    def __init__(self, key: bytes) -> None:
         self.socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self.socket.bind(("127.0.0.1", 0))
         self.socket.settimeout(2.0)
         self.port = self.socket.getsockname()[1]
-        self._codec = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+        self._codec = signing(255, 190, key)
 
     def command(self, number: int, *params: float) -> None:
         filled = (*params, *(0.0,) * (7 - len(params)))
@@ -98,12 +99,16 @@ def await_phase(port: int, *phases: str) -> None:
 
 
 def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> None:
-    """In real time over UDP, with monitoring, a second service, and SIGTERM in flight."""
-    port, web, pilot = free_port(), free_port(), Pilot()
+    """In real time over UDP, signed, with monitoring, a second service, another vehicle, and
+    SIGTERM in flight."""
+    create_key(tmp_path / "key")
+    key = read_key(tmp_path / "key")
+    port, web, pilot = free_port(), free_port(), Pilot(key)
     link = f"udpin:127.0.0.1:{port}"
     service = spawn("offboard", "daemon", "--connect", link, "--out", "out", "--log-json",
                     "--metrics", f"127.0.0.1:{web}", "--reference", "hover",
-                    "--set", "reference.duration_s=600", OFFBOARD_REPORT="1")  # fmt: skip
+                    "--system", "1", "--signing-key", "key", "--set", "reference.duration_s=600",
+                    OFFBOARD_REPORT="1", XDG_STATE_HOME=str(tmp_path))  # fmt: skip
     await_phase(web, "connect")
     assert health(web)[0] == 503
     second = spawn("offboard", "daemon", "--connect", link, "--out", "other")
@@ -111,9 +116,11 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     assert second.stderr is not None
     assert f"process {service.pid}" in second.stderr.read()
     busy = spawn("offboard", "daemon", "--connect", f"udpin:127.0.0.1:{free_port()}",
-                 "--metrics", f"127.0.0.1:{web}")  # fmt: skip
-    assert busy.wait(LONG_S) == 2
-    spawn("simulator", "--connect", f"udpout:127.0.0.1:{port}",
+                 "--out", "third", "--metrics", f"127.0.0.1:{web}")  # fmt: skip
+    assert busy.wait(LONG_S) == 3
+    other = mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 3, 3).pack(signing(9, 1, key))
+    pilot.socket.sendto(other, ("127.0.0.1", port))
+    spawn("simulator", "--signing-key", "key", "--connect", f"udpout:127.0.0.1:{port}",
           "--gcs", f"udpout:127.0.0.1:{pilot.port}", "--param", "MIS_TAKEOFF_ALT=3",
           "--param", "COM_OF_LOSS_T=4")  # fmt: skip
     await_phase(web, "standby")
@@ -148,6 +155,7 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     kept = (flight / "score.json").read_text()
     assert json.loads(kept)["phases"]
     assert kept == as_text(*score_flight(flight / "flight.tlog"))
+    assert not (flight / "engaged").exists()
     log = tlog.read(flight / "flight.tlog")
     sent_s = [1e-6 * each.unix_us for each in log.messages if each.name == "SET_ATTITUDE_TARGET"]
     assert sum(0.0 < each_s - scraped_s < 2.0 for each_s in sent_s) >= 16  # 10 Hz, on any machine
@@ -155,20 +163,43 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     assert {"TUNNEL", "HEARTBEAT", "PARAM_VALUE", "SET_ATTITUDE_TARGET", "STATUSTEXT"} <= names
 
 
+@pytest.mark.parametrize(
+    ("arguments", "sentence"),
+    [
+        (("--config", "missing.yaml"), "missing.yaml cannot be read: No such file or directory"),
+        (("--signing-key", "missing.key"), "signing key missing.key"),
+        (("--out", "here"), "--out here: the unit can write below /var/lib/offboard alone"),
+    ],
+)
+def test_a_unit_that_could_not_start_is_not_printed(
+    arguments: tuple[str, ...], sentence: str, tmp_path: Path
+) -> None:
+    command = [sys.executable, "-m", "offboard", "daemon", "--print-unit", *arguments]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
+    assert (done.returncode, done.stdout) == (2, "")
+    assert sentence in " ".join(done.stderr.split())
+
+
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")
 def test_the_unit_is_valid(tmp_path: Path) -> None:
-    (tmp_path / "my $ %.yaml").write_text("vehicle: neutral\n")
-    printed = subprocess.run(
+    (tmp_path / "my $ %.yaml").write_text("vehicle: neutral\ncontroller: lqr\nreference: hover\n")
+    create_key(tmp_path / "my %.key")
+    told = subprocess.run(
         [sys.executable, "-m", "offboard", "daemon", "--connect", "serial:/dev/ttyACM0:57600",
-         "--config", "./my $ %.yaml", "--print-unit"],
+         "--config", "./my $ %.yaml", "--signing-key", "my %.key", "--print-unit"],
         capture_output=True, text=True, check=True, cwd=tmp_path,
-    ).stdout  # fmt: skip
+    )  # fmt: skip
+    printed = told.stdout
+    assert f"the unit cannot see {tmp_path / 'my $ %.yaml'}: it has a tmp of its own" in (
+        " ".join(told.stderr.split())
+    )
     unit = tmp_path / "offboard.service"
     unit.write_text(printed)
     done = subprocess.run(["systemd-analyze", "verify", unit], capture_output=True, text=True)
     assert (done.returncode, done.stderr) == (0, "")
     (line,) = [each for each in printed.splitlines() if each.startswith("ExecStart=")]
     escaped = str(tmp_path / "my $ %.yaml").replace("%", "%%").replace("$", "$$")
-    assert f'--config "{escaped}" --out %S/offboard' in line
+    assert f'--config "{escaped}" --out %S/offboard --signing-key %d/signing-key' in line
+    assert f"LoadCredential=signing-key:{tmp_path}/my %%.key" in printed
     assert "Type=notify" in printed
     assert "SupplementaryGroups=dialout" in printed

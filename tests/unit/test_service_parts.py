@@ -28,7 +28,7 @@ from offboard.identification.uncertainty import Estimate
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
-from offboard.service import daemon, preparation
+from offboard.service import daemon, preparation, unit
 from offboard.service.daemon import Manager
 from offboard.service.flights import Prepared
 from offboard.service.lock import Locked, connection_lock, directory_lock
@@ -259,6 +259,19 @@ def test_ports_of_another_network_namespace_are_other_ports(
     monkeypatch.setattr(os, "stat", lambda path: other if path == namespace else stat(path))
     assert locks()[1] == device
     assert locks()[0] != port
+
+
+def test_what_the_user_of_the_unit_cannot_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "home" / "my.yaml"
+    file.parent.mkdir()
+    file.touch(0o644)
+    assert unit.unreadable(file).startswith(f"the unit cannot see {file}: it has a ")
+    monkeypatch.setattr(unit, "PRIVATE", ())
+    tmp_path.chmod(0o750)
+    assert unit.unreadable(file).endswith("is closed to others")
+    assert unit.unreadable(Path("/etc/passwd")) == ""
 
 
 def test_the_link_is_opened_when_it_can_be(monkeypatch: pytest.MonkeyPatch) -> None:
