@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -11,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from browser import opening
+from rich.console import Console
 
 from offboard.campaign.campaign import Campaign
 from offboard.campaign.cases import Case
@@ -20,11 +22,13 @@ from offboard.campaign.execution import Workers
 from offboard.campaign.flight import Job
 from offboard.campaign.margin import LOWEST, Promises, terms
 from offboard.campaign.page import page
+from offboard.campaign.progress import Counter
 from offboard.campaign.results import Record
 from offboard.campaign.searchers import SEARCHERS
 from offboard.campaign.statistics import groups, wilson
 from offboard.campaign.table import row_of
 from offboard.campaign.worst import as_csv, search_of
+from offboard.flight import clock
 
 SEARCH = """
 controllers: [lqr]
@@ -132,6 +136,23 @@ def test_the_interval_of_a_success_rate_is_wilsons() -> None:
     half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
     assert wilson(18, 20) == pytest.approx((middle - half, middle + half), rel=1e-8)
     assert wilson(0, 5)[0] == 0.0
+
+
+def test_the_time_left_counts_the_flights_of_this_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """100 flights, of which an earlier run has flown 40; one in 2 s."""
+    now_s = [0.0]
+    monkeypatch.setattr(clock, "monotonic_s", lambda: now_s[0])
+    told = Console(file=io.StringIO(), width=80)
+    counter = Counter(told)
+    counter.count(0, 100)
+    for done in range(41, 101):
+        now_s[0] += 2.0
+        counter.count(done, 100)
+    lines = told.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert lines[0] == "0 of 100 flights"
+    assert "45 of 100 flights, 30 a minute, 2 min left" in lines
+    assert "95 of 100 flights, 30 a minute, 10 s left" in lines
+    assert len(lines) == 13
 
 
 class Empty:
