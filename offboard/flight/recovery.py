@@ -43,21 +43,25 @@ class Recovery:
         self._mode: str | None = None
         self._reported_s = -math.inf
         self._armed = True
+        self._begun = False  # all that had waited was seen
         self._first_s = math.inf  # time of the first request
         self._asked_s = -math.inf
         self._acknowledged = False
         self._landing = False  # the landing mode was shown
         self._left_for = ""  # the mode that nobody of us has asked for
+        self._left_s = -math.inf
+        self._heartbeat_s = -math.inf
         self._requests = 0
         self._held_s = math.inf  # since when it holds
         self.refusal = ""  # of the newest request
         self.ended = ""
 
     def see(self, event: Event, at_s: float) -> None:
-        """An event of the vehicle that arrived at `at_s`, which may be before `began_s`."""
+        """An event of the vehicle that arrived at `at_s` at the latest, which may be before
+        `began_s`."""
         match event:
             case Heartbeat(mode, armed):
-                self._armed = armed
+                self._armed, self._heartbeat_s = armed, at_s
                 self._on_mode(mode, at_s)
             case ModeReport(mode):
                 self._on_mode(mode, at_s)
@@ -72,15 +76,16 @@ class Recovery:
         if mode == self._dialect.hold_mode and not self._landing:
             ours = self._holding or at_s > self._first_s
         self._landing |= mode == self._dialect.land_mode
-        if not ours:
-            self._left_for = self._left_for or mode
-        elif at_s < self._began_s:  # of the reports that have waited the newest decides
+        if not ours and not self._left_for:
+            self._left_for, self._left_s = mode, at_s
+        elif ours and not self._begun:  # of the reports that have waited the newest decides
             self._left_for = ""
 
     def due(self, now_s: float) -> Request | None:
         """What to ask for now."""
+        self._begun = True
         self._conclude(now_s)
-        if self.ended or now_s - self._asked_s < REPEAT_S:
+        if self.ended or self._left_for or now_s - self._asked_s < REPEAT_S:
             return None
         request = self._wanted(now_s)
         if request:
@@ -93,9 +98,11 @@ class Recovery:
         holds = self._mode == self._dialect.hold_mode
         self._held_s = min(self._held_s, now_s) if holds else math.inf
         ours = self._holding or self._acknowledged
+        # PX4 leaves its landing mode when it disarms, which HEARTBEAT shows later
+        shown = not self._landing or self._heartbeat_s >= self._left_s
         if not self._armed:
             self.ended = "the vehicle is disarmed"
-        elif self._left_for:
+        elif self._left_for and shown:
             self.ended = f"the vehicle shows {self._left_for}: its pilot or its failsafe has it"
         elif not ours and now_s - self._held_s > ACKNOWLEDGED_S:
             self.ended = (

@@ -128,8 +128,10 @@ class Rescue:
         for chunk in chunks:
             reception = self._session.receive(chunk.data, chunk.peer, chunk.arrived_s)
             self._record(*reception.frames)
+            # Of a stream it is only known when it arrived at the earliest
+            at_s = clock.monotonic_s() if self._link.is_stream else chunk.arrived_s
             for event in reception.events:
-                self._recovery.see(event, chunk.arrived_s)
+                self._recovery.see(event, at_s)
             self._send(*reception.replies)
         due = self._session.poll(clock.monotonic_s())
         self._send(*(message for message in due if isinstance(message, Heartbeat)))

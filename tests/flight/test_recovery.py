@@ -138,9 +138,10 @@ def test_hold_that_the_vehicle_has_not_acknowledged_is_left_alone(dialect: Diale
     assert [command for _, command in vehicle.asked] == [HOLD]
 
 
-def asked(*reports: tuple[float, str]) -> tuple[list[int], str]:
+def asked(*reports: tuple[float, str], armed: bool = True) -> tuple[list[int], str]:
     """What is asked of a PX4 that acknowledges hold 0.05 s after the request at 100 s, and shows
-    these modes at these times; and how it ended."""
+    these modes at these times, and in its next HEARTBEAT whether it is `armed`; and how it
+    ended."""
     recovery = Recovery(PX4, 100.0)
     recovery.see(Heartbeat(PX4.engage_mode, True, 4), 99.6)
     commands = []
@@ -152,6 +153,10 @@ def asked(*reports: tuple[float, str]) -> tuple[list[int], str]:
         for at_s, event in events:
             if now_s - STEP_S < at_s <= now_s + 1e-9 or (not step and at_s <= now_s):
                 recovery.see(event, at_s)
+    if not recovery.ended:
+        recovery.see(Heartbeat(reports[-1][1], armed, 4), 112.1)
+        request = recovery.due(112.1)
+        commands += [request.command.command] if request else []
     return commands, recovery.ended
 
 
@@ -179,9 +184,14 @@ def test_hold_of_before_the_request_is_the_pilots() -> None:
 def test_hold_after_the_landing_mode_is_the_pilots() -> None:
     landing = [*((t, m) for t, m in HOLDS if t < 105.8), *LANDS[:3]]
     assert asked(*landing) == ([HOLD, LAND], "")
-    commands, ended = asked(*landing, (107.5, PX4.hold_mode))
+    commands, ended = asked(*landing, *((106.92 + 0.1 * n, PX4.hold_mode) for n in range(51)))
     assert commands == [HOLD, LAND]
     assert ended.startswith("the vehicle shows AUTO.LOITER")
+
+
+def test_a_px4_that_shows_another_mode_as_it_disarms_has_landed() -> None:
+    reports = [*((t, m) for t, m in HOLDS if t < 105.8), *LANDS[:3], (107.5, PX4.hold_mode)]
+    assert asked(*reports, armed=False) == ([HOLD, LAND], "the vehicle is disarmed")
 
 
 def test_a_refusal_is_kept_to_be_said() -> None:
