@@ -18,8 +18,9 @@ from offboard.analysis import history
 from offboard.analysis.identify import identify_flight, vehicle_file
 from offboard.documents.reading import parse
 from offboard.estimation.observer import Observer, ObserverSettings
-from offboard.flight.online_identification import RECORD_ID, IdentifySettings
+from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Phase
+from offboard.flight.record import IDENTIFIED_ID
 from offboard.identification.adoption import with_link_delay
 from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.excitation import LENGTH_S, excited
@@ -144,7 +145,7 @@ def test_identified_constants_are_announced_and_recorded():
     begun = {phase: at_s for at_s, phase in pair.phases}
     assert begun[Phase.JOIN] - begun[Phase.EXCITE] == pytest.approx(LENGTH_S + 1.5, abs=0.25)
     records = [frame for frame in pair.logged if frame[7:10] == b"\x5e\x01\0"]  # 350
-    assert sum(frame[18:20] == RECORD_ID.to_bytes(2, "little") for frame in records) == len(
+    assert sum(frame[18:20] == IDENTIFIED_ID.to_bytes(2, "little") for frame in records) == len(
         announced
     )
 

@@ -14,7 +14,7 @@ from typing import Any
 import pytest
 from faults import HEARTBEAT, frame_id, shuffling, without
 from pair import SHORT, Bytes, HostClock, Pair, frames_of, hover, in_phase, make, on_arducopter
-from watch import BOTH, LAND, SET_MODE, Fly, Watch, said, sent_after, watched
+from watch import BOTH, HIGH, LAND, SET_MODE, Fly, Watch, said, sent_after, watched
 
 from offboard.control.base import Controller, Decision, Situation
 from offboard.flight.online_identification import IdentifySettings
@@ -42,7 +42,7 @@ def ages_s(pair: Pair, since_s: float = 0.0) -> list[float]:
 @BOTH
 @pytest.mark.parametrize("scenario", ["late_link", "later_and_later", "link_saturates"])
 def test_a_link_that_becomes_late_ends_in_hold_and_landing(scenario: str, fly: Fly) -> None:
-    pair = fly(scenario=scenario, deadline_s=DEADLINE_S)
+    pair = fly(HIGH, scenario=scenario, deadline_s=DEADLINE_S)
     watch = watched(pair)
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
@@ -90,7 +90,7 @@ def test_reports_of_the_mode_that_arrive_out_of_order_end_no_flight(seed: int) -
 
 @BOTH
 def test_a_saturated_link_does_no_harm(fly: Fly) -> None:
-    pair = fly(scenario="saturated_link", deadline_s=DEADLINE_S)
+    pair = fly(HIGH, scenario="saturated_link", deadline_s=DEADLINE_S)
     watch = watched(pair)
     pair.fly()
     assert watch.fall_mps < 1.5

@@ -35,7 +35,7 @@ from offboard.flight.companion import Output
 from offboard.flight.link import Chunk
 from offboard.flight.phases import ENDS, ExitCode, Phase
 
-FLIGHTS = int(os.environ.get("OFFBOARD_TAKEOVERS", "24"))
+FLIGHTS = int(os.environ.get("OFFBOARD_TAKEOVERS", "16"))
 HEARTBEAT, CURRENT_MODE = 0, 436
 MOVING = {11, 75, 76, 82, 84, 86}  # SET_MODE, COMMAND_INT, COMMAND_LONG and all setpoints
 SET_MESSAGE_INTERVAL, SET_MODE, ARM, LAND = 511, 176, 400, 21  # MAV_CMD

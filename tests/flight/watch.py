@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -16,7 +17,10 @@ from offboard.flight.phases import TRACKING, Phase
 from simulator.config import Scenario
 
 SET_MODE, LAND, ARM = 176, 21, 400  # MAV_CMD
-BOTH = pytest.mark.parametrize("fly", [make, on_arducopter], ids=["px4", "ardupilot"])
+LOW, HIGH = "reference.height_m=1.0", "reference.height_m=3.0"  # low: a short climb and landing
+BOTH = pytest.mark.parametrize(
+    "fly", [partial(make, LOW), partial(on_arducopter, LOW)], ids=["px4", "ardupilot"]
+)
 REACTION_S = 0.13  # a report of the mode at 10 Hz, and a turn
 WATCHED_STEPS = 5  # 20 ms
 
