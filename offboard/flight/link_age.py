@@ -55,11 +55,13 @@ class VehicleClock:
         self._bounds: deque[tuple[float, float]] = deque(maxlen=REPLIES_MAX)  # vehicle, host time
         self._bin_s = 0.0  # arrival of the first of the newest bin
         self._settled = False
+        self._measured = False
         self._rate = 1.0
         self.jumped_s = 0.0
 
     def settle(self) -> None:
-        """From now on the rate of a vehicle in real time is 1, and jumps of its clock count."""
+        """From now on the rate of a vehicle in real time is 1, and jumps of its clock count; both
+        once the rate was measured."""
         self._settled = True
         self.jumped_s = 0.0
 
@@ -67,7 +69,7 @@ class VehicleClock:
         """A message with the stamp `stamp_s` arrived at host time `arrived_s`."""
         ahead_s = stamp_s - self.now_s(arrived_s)
         seen = self._seen
-        if seen and ahead_s > JUMP_S:
+        if self._measured and ahead_s > JUMP_S:
             self.jumped_s += ahead_s
             self._bounds.clear()
         if seen and arrived_s - self._bin_s < BIN_S:
@@ -86,10 +88,11 @@ class VehicleClock:
         self._bounds.append((vehicle_s, asked_s))
 
     def _measure_rate(self) -> None:
-        if self._settled and self._rate == 1.0:
+        if self._settled and self._measured and self._rate == 1.0:
             return
         (first_s, began_s), (last_s, ended_s) = self._seen[0], self._seen[-1]
         if ended_s - began_s >= RATE_OVER_S:
+            self._measured = True
             rate = (last_s - first_s) / (ended_s - began_s)
             self._rate = 1.0 if abs(rate - 1.0) < REAL_TIME else max(rate, 0.0)
 
