@@ -46,7 +46,6 @@ class Results:
 
     def __init__(self, directory: Path, code: str) -> None:
         self.directory = directory
-        self._code = code
         self._folder = directory / "results" / code
         try:
             others = [p.name for p in (directory / "results").glob("*") if p.name != code]

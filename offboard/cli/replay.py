@@ -29,10 +29,11 @@ def replay(
     """Replay a flight from its .tlog and compare every setpoint.
 
     Gives the controller what it received, turn by turn, and compares what it sends now with what
-    it sent then, byte by byte. Prints the first difference, and the messages before it. With
-    --controller, the other one is asked in every situation of the flight, and what it would have
-    commanded is compared with the flight's commands; that is no test. Flights of `offboard daemon`
-    cannot be replayed: their logs do not hold what was received in standby.
+    it sent then, byte by byte; rounding of another processor is named, and is no difference.
+    Prints the first difference, and the messages before it. With --controller, the other one is
+    asked in every situation of the flight, and what it would have commanded is compared with the
+    flight's commands; that is no test. Flights of `offboard daemon` cannot be replayed: their logs
+    do not hold what was received in standby.
     """
     if at is not None and controller is not None:
         raise CommandError("--at and --controller are two questions: use one of them")

@@ -1,4 +1,4 @@
-"""The report that follows a flight: a process of its own, which nothing waits for."""
+"""The process that works on a flight after its end: of low priority, without output."""
 
 from __future__ import annotations
 
@@ -11,16 +11,21 @@ from pathlib import Path
 _NICENESS = 10  # the next flight may begin meanwhile
 
 
-def begin_report(directory: Path) -> None:
-    """Start `offboard report` on a flight directory, with low priority and without output.
-
-    It outlives this process. Where it cannot be started there is no report.
-    """
-    command = [sys.executable, "-m", "offboard", "report", str(directory.absolute())]
-    silent = subprocess.DEVNULL
+def begin(command: str, directory: Path) -> subprocess.Popen[bytes]:
+    """Start `offboard COMMAND` on a flight directory. It outlives this process. Raises OSError."""
+    process = subprocess.Popen(
+        [sys.executable, "-m", "offboard", command, str(directory.absolute())],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
     with suppress(OSError):
-        process = subprocess.Popen(
-            command, stdin=silent, stdout=silent, stderr=silent, start_new_session=True
-        )
         os.setpriority(os.PRIO_PROCESS, process.pid, _NICENESS)
-        process.returncode = 0  # nobody waits for it: no warning that it still runs
+    return process
+
+
+def begin_report(directory: Path) -> None:
+    """Start the report of a flight. Where it cannot be started there is none."""
+    with suppress(OSError):
+        begin("report", directory).returncode = 0  # nobody waits for it: no warning at the exit

@@ -76,7 +76,7 @@ def read(path: Path) -> Flight:
         "begun": f"{np.datetime64(next(iter(log)).unix_us, 'us').item():%Y-%m-%d %H:%M:%S} UTC",
         "autopilot": dialect.name if dialect else "unknown",
         **_configured(history.configuration(log)),
-        "messages": f"{flown.messages.total()} in {flown.wall_s:.1f} s",
+        "messages": f"{flown.messages.total()} in {flown.wall_s:.1f} s of computer time",
     }
     return Flight(
         path.name or path.resolve().name, flown, score(flown), facts, (*missing, *notes),

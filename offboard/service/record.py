@@ -12,8 +12,6 @@ done: `unscored`, and until the vehicle was handed back `engaged`, which holds i
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import threading
 from collections import deque
 from collections.abc import Callable
@@ -25,6 +23,7 @@ from offboard.flight import clock, manifest
 from offboard.flight.background import BackgroundWriter
 from offboard.flight.log import CLOSE_S, QUEUED_MAX, LogError, append, entry
 from offboard.mavlink.session import Session
+from offboard.report.background import begin
 
 ROLLING_BYTES = 16 * 2**20
 ROLLING_NAMES = ("standby.1.tlog", "standby.2.tlog")
@@ -34,7 +33,6 @@ SENT_ONCE = frozenset({22, 49, 148, 242})  # PARAM_VALUE, GPS_GLOBAL_ORIGIN, AUT
 PARAM_ID = slice(18, 34)  # in a frame of PARAM_VALUE: 10 bytes of header, 8 of payload before it
 KEPT_MAX = 100
 SCORE_S = 600.0
-LOWER_PRIORITY = 10
 ENGAGED, UNSCORED = "engaged", "unscored"  # files of a flight, see the module
 ENGAGED_MAX_S = 600.0  # after the end of its log: a vehicle that was left longer ago has landed
 SETTLED_S = 5.0  # of a log that no supervisor writes any more
@@ -131,17 +129,9 @@ class FlightRecord:
 
 
 def score(directory: Path, closing: threading.Event, *, report: bool = False) -> None:
-    """Score a flight, and write its `report`, in a process of its own with a lower priority. Wait
-    for its end, or until the service closes: the process outlives it."""
-    process = subprocess.Popen(
-        [sys.executable, "-m", "offboard", "report" if report else "score", str(directory)],
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
-    with suppress(OSError):
-        os.setpriority(os.PRIO_PROCESS, process.pid, LOWER_PRIORITY)
+    """Score a flight, and write its `report`, in a process of its own. Wait for its end, or until
+    the service closes: the process outlives it. Raises OSError if it cannot be started."""
+    process = begin("report" if report else "score", directory)
     until_s = clock.monotonic_s() + SCORE_S
     while process.poll() is None and not closing.wait(0.1):
         if clock.monotonic_s() > until_s:
