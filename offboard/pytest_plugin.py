@@ -19,7 +19,7 @@ import pytest
 
 if TYPE_CHECKING:
     from offboard.analysis.score import Score
-    from offboard.flight.sitl import SimulatorProcess
+    from offboard.run.sitl import SimulatorProcess
 
 FLIGHTS = pytest.StashKey[list[Path]]()
 
@@ -47,7 +47,7 @@ class Flight:
 @pytest.fixture(scope="session")
 def _simulator() -> Iterator[SimulatorProcess]:
     """The simulator process, shared by the flights of all tests."""
-    from offboard.flight.sitl import SimulatorProcess
+    from offboard.run.sitl import SimulatorProcess
 
     with SimulatorProcess() as simulator:
         yield simulator
@@ -95,7 +95,7 @@ def fly(
     ) -> Flight:
         from offboard.analysis.trial import judged, score_flight
         from offboard.documents.errors import UserError
-        from offboard.flight.request import FlightRequest, fly_request
+        from offboard.run.request import FlightRequest, fly_request
 
         named = {"reference": reference, "controller": controller, "vehicle": vehicle}
         directory = tmp_path / f"flight-{len(flown) + 1}"

@@ -13,7 +13,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from offboard.flight.clock import monotonic_s, unix_us
+from offboard.io.clock import monotonic_s, unix_us
 from simulator.instance import Instance
 from simulator.link.links import Link, wait
 from simulator.link.recorder import Recorder

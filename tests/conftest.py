@@ -16,7 +16,7 @@ from offboard.compiled import prepare
 COMPILED = (
     "offboard.control.laws.horizon",
     "offboard.control.laws.pso",
-    "offboard.flight.request",
+    "offboard.run.request",
     "offboard.paper.plant",
     "simulator.vehicle.dynamics",
 )

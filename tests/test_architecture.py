@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SHARED = ("offboard.compiled", "offboard.documents", "offboard.flight.clock", "offboard.model")
+SHARED = ("offboard.compiled", "offboard.documents", "offboard.io.clock", "offboard.model")
 PACKAGES = ("offboard", "simulator")
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 SCRIPTS = Path(sys.executable).parent
@@ -42,17 +42,26 @@ def _names(path: Path) -> set[str]:
 
 
 def test_only_the_clock_reads_the_time() -> None:
-    assert _importers("time", "datetime") == {"offboard/flight/clock.py"}
+    assert _importers("time", "datetime") == {"offboard/io/clock.py"}
 
 
 def test_only_the_edges_open_sockets() -> None:
     links = {f"simulator/link/{name}.py" for name in ("links", "tcp", "udp")}
     opening = ("connection", "stream_link", "stream_sources", "udp_link")
-    edges = {f"offboard/flight/{name}.py" for name in opening}
-    supervisor = {f"offboard/flight/{name}.py" for name in ("supervisor", "supervisor_process")}
-    pipes = {"offboard/flight/sitl.py", "simulator/pool.py"}  # between two processes
+    edges = {f"offboard/io/{name}.py" for name in opening}
+    supervisor = {f"offboard/supervisor/{name}.py" for name in ("supervisor", "process")}
+    pipes = {"offboard/run/sitl.py", "simulator/pool.py"}  # between two processes
     assert _importers("socket", "serial") <= edges | links | supervisor
     assert _importers("select") <= edges | links | supervisor | pipes
+
+
+def test_the_flight_itself_does_no_io() -> None:
+    outside = {"os", "pathlib", "select", "signal", "socket", "subprocess", "threading"}
+    for path in (ROOT / "offboard" / "flight").glob("*.py"):
+        names = _names(path)
+        assert not {name.split(".")[0] for name in names} & outside, path.name
+        io = {name for name in names if name.startswith("offboard.io")}
+        assert io <= {"offboard.io.link", "offboard.io.link.Chunk"}, path.name
 
 
 def _importers(*modules: str) -> set[str]:
@@ -73,7 +82,7 @@ def test_the_simulator_imports_only_four_parts_of_offboard() -> None:
     foreign = {
         name
         for name in shared
-        if not name.startswith(SHARED) and name not in ("offboard", "offboard.flight")
+        if not name.startswith(SHARED) and name not in ("offboard", "offboard.io")
     }
     assert foreign == set()
 

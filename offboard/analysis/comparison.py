@@ -23,9 +23,9 @@ from offboard.analysis.compare import Fly, Result, Row, Trial, as_csv, as_json, 
 from offboard.analysis.compare_page import page
 from offboard.analysis.compare_table import digits, numbered_seeds, show
 from offboard.analysis.workers import open_worker, processors
-from offboard.flight.log import LogError
 from offboard.flight.phases import ExitCode
-from offboard.flight.stop import StopRequests
+from offboard.io.log import LogError
+from offboard.io.stop import StopRequests
 
 LANDING = "interrupted: flights in the air are landed; interrupt again to exit at once"
 

@@ -138,7 +138,7 @@ def stretches(log: Tlog, messages: int = STRETCH) -> Iterator[tuple[History, flo
 
 
 def configuration(log: Tlog) -> str | None:
-    """The configuration of the flight as YAML (see `flight.configuration.flown`), None without."""
+    """The configuration of the flight as YAML (see `run.configuration.flown`), None without."""
     return manifest.join(
         bytes(entry.message.payload[: entry.message.payload_length])
         for entry in log

@@ -17,11 +17,11 @@ from offboard.analysis.score import Score, Scoring
 from offboard.analysis.score_json import as_text
 from offboard.documents.errors import UserError
 from offboard.flight.companion import STOPPED, Outcome
-from offboard.flight.configuration import build_track
-from offboard.flight.log import LogError
 from offboard.flight.phases import ExitCode
-from offboard.flight.request import FlightRequest, fly_request
-from offboard.flight.sitl import SimulatorProcess
+from offboard.io.log import LogError
+from offboard.run.configuration import build_track
+from offboard.run.request import FlightRequest, fly_request
+from offboard.run.sitl import SimulatorProcess
 
 
 def score_flight(flight: Path) -> tuple[Score, History]:

@@ -23,9 +23,9 @@ from offboard.campaign.results import Results
 from offboard.campaign.statistics import groups
 from offboard.campaign.table import Row, as_csv, as_parquet, columns, row_of
 from offboard.documents.errors import DocumentError, UserError
-from offboard.flight.configuration import build_controller, build_track
-from offboard.flight.in_memory import check_scenario_text
-from offboard.flight.request import FlightRequest
+from offboard.run.configuration import build_controller, build_track
+from offboard.run.in_memory import check_scenario_text
+from offboard.run.request import FlightRequest
 
 OpenWorkers = Callable[[], AbstractContextManager[Workers]]
 KEPT = "flights"

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from offboard.campaign.document import FOLDER
 from offboard.documents import shipped
-from offboard.flight.in_memory import registered
+from offboard.run.in_memory import registered
 
 PACKAGES = ("numpy", "scipy", "numba", "pymavlink", "daqp")
 

@@ -18,13 +18,13 @@ from offboard.campaign.margin import NOT_FLOWN, Promises, terms
 from offboard.campaign.results import Record
 from offboard.documents.errors import UserError
 from offboard.flight.companion import Outcome
-from offboard.flight.configuration import FlightConfig, dump
-from offboard.flight.in_memory import InMemorySimulator
-from offboard.flight.log import FlightLog, LogError
-from offboard.flight.one_flight import Bundled, fly
 from offboard.flight.phases import ExitCode
-from offboard.flight.request import FlightRequest, build_parts
-from offboard.flight.stop import StopRequests
+from offboard.io.log import FlightLog, LogError
+from offboard.io.stop import StopRequests
+from offboard.run.configuration import FlightConfig, dump
+from offboard.run.in_memory import InMemorySimulator
+from offboard.run.one_flight import Bundled, fly
+from offboard.run.request import FlightRequest, build_parts
 
 # figures that this computer's clock decides: they differ between two runs of one flight
 WALL_TIMES = (

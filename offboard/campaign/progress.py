@@ -18,7 +18,7 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from offboard.flight import clock
+from offboard.io import clock
 
 FIRST = 5  # flights after which the time is estimated first
 LINES = 20

@@ -32,8 +32,8 @@ from offboard.documents.errors import DocumentError, UserError
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import override, parse, read
 from offboard.documents.shipped import locate, read_text
-from offboard.flight.configuration import FOLDERS, read_part
-from offboard.flight.request import FlightRequest
+from offboard.run.configuration import FOLDERS, read_part
+from offboard.run.request import FlightRequest
 
 STUDY = "tune"
 FOLDER = "tunings"

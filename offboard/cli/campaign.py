@@ -83,7 +83,7 @@ def _search(flown: Campaign, source: str, count: int, open_workers: OpenWorkers)
     from offboard.campaign.evaluate import Evaluator, Interrupted
     from offboard.campaign.progress import Counter
     from offboard.campaign.worst import keep, search_of
-    from offboard.flight.stop import StopRequests
+    from offboard.io.stop import StopRequests
 
     failures = None
     with (
@@ -121,7 +121,7 @@ def _search(flown: Campaign, source: str, count: int, open_workers: OpenWorkers)
 
 def _fly(flown: Campaign, open_workers: OpenWorkers, part: Shard) -> Summary:
     from offboard.campaign.progress import Counter
-    from offboard.flight.stop import StopRequests
+    from offboard.io.stop import StopRequests
 
     summary: Summary | None = None
     with suppress(KeyboardInterrupt), StopRequests() as stops, Counter(out) as counter:

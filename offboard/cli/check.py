@@ -36,8 +36,8 @@ def _checked(path: Path) -> str:
     from offboard.campaign.tune import read_tune
     from offboard.documents.reading import read
     from offboard.documents.shipped import read_text
-    from offboard.flight.configuration import check_file
-    from offboard.flight.sitl import check_scenario
+    from offboard.run.configuration import check_file
+    from offboard.run.sitl import check_scenario
 
     keys = set() if path.suffix.lower() == ".csv" else set(read(read_text(path), str(path)))
     if keys & {"training", "validation"}:

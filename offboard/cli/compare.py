@@ -61,9 +61,9 @@ def compare(
     with out.status("checking that all of them can be flown"):
         from offboard.analysis.comparison import compare_all
         from offboard.analysis.trial import check_flyable, fly_trial
-        from offboard.flight import clock
-        from offboard.flight.request import FlightRequest
-        from offboard.flight.sitl import check_scenario_named
+        from offboard.io import clock
+        from offboard.run.request import FlightRequest
+        from offboard.run.sitl import check_scenario_named
 
         if connect is None:
             for name in scenarios:

@@ -99,13 +99,13 @@ def daemon(
     connection = connect or DEFAULT_CONNECTION
     named = {"controller": controller, "reference": reference, "vehicle": vehicle}
     if print_unit:
-        from offboard.flight.configuration import load
+        from offboard.run.configuration import load
 
         choices = {part: name for part, name in named.items() if name is not None}
         load(config, choices=choices, assignments=assignments or ())
         _print_unit(connection, signing_key, out_directory, [config, *choices.values()])
         return
-    from offboard.flight.stop import StopRequests
+    from offboard.io.stop import StopRequests
     from offboard.live.lines import JsonLog, Terminal
 
     lines = JsonLog(write) if log_json else Terminal(out, partial(say, indent=12))
@@ -113,7 +113,7 @@ def daemon(
         from offboard.compiled import loading
 
         with loading():
-            from offboard.flight.request import FlightRequest
+            from offboard.run.request import FlightRequest
             from offboard.service.daemon import Service, run
         request = FlightRequest(
             directory=out_directory or FLIGHTS,

@@ -70,7 +70,7 @@ def doctor(
     from offboard.doctor import report
     from offboard.doctor.findings import Level, examine, worst
     from offboard.doctor.run import observe
-    from offboard.flight.configuration import load
+    from offboard.run.configuration import load
 
     named = {"controller": controller, "reference": reference, "vehicle": vehicle}
     flight = load(

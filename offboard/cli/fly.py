@@ -101,8 +101,8 @@ def fly(
         raise CommandError("--scenario, --sim-vehicle and --firmware are options of --sitl: add it")
     named = {"controller": controller, "reference": reference, "vehicle": vehicle}
     try:
-        from offboard.flight.sitl import SimulatorProcess
-        from offboard.flight.stop import StopRequests
+        from offboard.io.stop import StopRequests
+        from offboard.run.sitl import SimulatorProcess
 
         with (
             StopRequests(_exit_at_once) as stops,
@@ -112,8 +112,8 @@ def fly(
             from offboard.compiled import loading
 
             with loading():
-                from offboard.flight import clock
-                from offboard.flight.request import FlightRequest, fly_request
+                from offboard.io import clock
+                from offboard.run.request import FlightRequest, fly_request
 
             requirements = requirements_of(require)
             directory = out_directory or FLIGHTS / clock.local_stamp()

@@ -55,8 +55,8 @@ def identify(
     from offboard.analysis import history, tlog
     from offboard.analysis.identify import identify_flight, vehicle_file
     from offboard.analysis.identify_page import page as fits
-    from offboard.flight import clock
-    from offboard.flight.configuration import flown, load
+    from offboard.io import clock
+    from offboard.run.configuration import flown, load
 
     if (flight is None) == (connect is None and not sitl):
         raise CommandError("name a FLIGHT, or fly one first with --connect or --sitl; not both")

@@ -8,9 +8,9 @@ from collections.abc import Iterable
 from offboard.control.delay_margin import LEAST_MARGIN_S, SDS, needed_margin, supported_bandwidth
 from offboard.doctor.findings import Finding, blocks, ok, wait, warn
 from offboard.doctor.observation import Observation
-from offboard.flight.configuration import UNKNOWN_VEHICLE, FlightConfig
 from offboard.identification.adoption import with_added_delay
 from offboard.identification.uncertainty import Estimate
+from offboard.run.configuration import UNKNOWN_VEHICLE, FlightConfig
 
 HOVER_FACTOR = 1.3
 LEAST_FREE_BYTES = 500_000_000  # four hours of log

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 from offboard.doctor.findings import Finding, blocks, ok, wait, warn
 from offboard.doctor.observation import Observation, Sender
 from offboard.flight.assessment import MINIMUM_TELEMETRY_HZ
-from offboard.flight.connection import BITS_OF_A_BYTE
 from offboard.flight.phases import Limits
+from offboard.io.connection import BITS_OF_A_BYTE
 from offboard.mavlink.telemetry_rates import SHARE
 
 BAUDS = (57600, 115200, 230400, 460800, 921600)

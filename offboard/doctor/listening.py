@@ -12,11 +12,11 @@ from collections.abc import Hashable, Iterable
 
 from offboard.doctor.census import Census
 from offboard.doctor.observation import FIX_3D, ClockMeasures, LinkMeasures, Observation
-from offboard.flight.link import Chunk
 from offboard.flight.link_age import LinkDelay, VehicleClock
 from offboard.flight.readiness import Readiness
 from offboard.flight.record import COMPONENT_ID
 from offboard.flight.vehicle_state import VehicleState
+from offboard.io.link import Chunk
 from offboard.mavlink.dialects.base import WantedMessage
 from offboard.mavlink.events import (
     Attitude,

@@ -10,10 +10,10 @@ from pathlib import Path
 from offboard import compiled
 from offboard.doctor.observation import Computer
 from offboard.documents.errors import DocumentError
-from offboard.flight import clock
-from offboard.flight.configuration import FlightConfig
-from offboard.flight.one_flight import rehearse
-from offboard.flight.request import build_parts
+from offboard.io import clock
+from offboard.run.configuration import FlightConfig
+from offboard.run.one_flight import rehearse
+from offboard.run.request import build_parts
 
 SLEEPS, SLEEP_S = 40, 0.01
 

@@ -9,10 +9,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from offboard.flight.configuration import FlightConfig
 from offboard.flight.vehicle_state import VehicleState
 from offboard.identification.uncertainty import Estimate
 from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage
+from offboard.run.configuration import FlightConfig
 
 NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 FIX_3D = 3  # GPS_FIX_TYPE; also stands for better ones

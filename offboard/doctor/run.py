@@ -13,13 +13,13 @@ from offboard.doctor.measure import measure
 from offboard.doctor.observation import Computer, Observation
 from offboard.documents.errors import DocumentError, shown
 from offboard.documents.signing_key import read_key
-from offboard.flight import clock
-from offboard.flight.configuration import FlightConfig, build_track
-from offboard.flight.connection import open_link
-from offboard.flight.link import Link, LinkError
-from offboard.flight.signing_time import SigningTime
+from offboard.io import clock
+from offboard.io.connection import open_link
+from offboard.io.link import Link, LinkError
+from offboard.io.signing_time import SigningTime
 from offboard.mavlink.signing import Signing
 from offboard.reference.feasibility import check
+from offboard.run.configuration import FlightConfig, build_track
 
 POLL_S = 0.02
 # The command ends within 15 s: what takes longer is left out, and a row says so

@@ -1,1 +1,1 @@
-"""One flight: phases, actions, link, log and loop. Only this package has sockets and time."""
+"""One flight, without I/O: state, phases, limits, decisions, and what leaves."""

@@ -21,7 +21,6 @@ from offboard.flight.event_processor import EventProcessor
 from offboard.flight.facts import Facts
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.inputs import InputRecorder
-from offboard.flight.link import Chunk
 from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
 from offboard.flight.outbox import Outbox, Output
 from offboard.flight.phase_machine import PhaseMachine
@@ -39,8 +38,8 @@ from offboard.flight.phases import (
 from offboard.flight.programme import FLY, Programme
 from offboard.flight.snapshot import Snapshot, snapshot_of
 from offboard.flight.state import FlightState, Outcome
-from offboard.flight.supervisor import Supervised
 from offboard.identification.learned import Learned
+from offboard.io.link import Chunk
 from offboard.mavlink.events import (
     Attitude,
     ClockBehind,
@@ -51,6 +50,7 @@ from offboard.mavlink.events import (
 from offboard.mavlink.outgoing import Outgoing
 from offboard.mavlink.session import ACTIVE, Session
 from offboard.model.vehicle import Vehicle
+from offboard.supervisor.supervisor import Supervised
 
 __all__ = ["STOPPED", "Companion", "Outcome", "Output"]
 

@@ -16,7 +16,6 @@ from offboard.flight.gate import LEVEL, Clearance, Refused, admit
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.phases import Phase
 from offboard.flight.state import FlightState
-from offboard.flight.supervisor import Supervised
 from offboard.flight.vehicle_state import GOOD_RESULTS
 from offboard.mavlink.outgoing import (
     AttitudeTarget,
@@ -28,6 +27,7 @@ from offboard.mavlink.outgoing import (
 from offboard.mavlink.session import Session
 from offboard.mavlink.texts import chunks
 from offboard.model.command import Command, PositionCommand
+from offboard.supervisor.supervisor import Supervised
 
 WARNING, INFO = 4, 6  # MAV_SEVERITY
 TEXT_ID_MAX = 65535  # STATUSTEXT.id; 0 is for texts of one chunk

@@ -15,11 +15,11 @@ from rich.console import Console
 from rich.live import Live
 from rich.text import Text
 
-from offboard.flight import clock
-from offboard.flight.background import BackgroundWriter
 from offboard.flight.phases import Phase
 from offboard.flight.snapshot import Snapshot
 from offboard.flight.state import FlightState
+from offboard.io import clock
+from offboard.io.background import BackgroundWriter
 from offboard.live.values import as_dict, line
 
 LINES_MAX = 1000  # that wait to be written

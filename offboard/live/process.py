@@ -14,10 +14,10 @@ from contextlib import suppress
 
 from offboard.documents.arguments import split_address
 from offboard.documents.errors import UserError
-from offboard.flight import clock
-from offboard.flight.background import BackgroundWriter
 from offboard.flight.companion import Companion
 from offboard.flight.snapshot import Snapshot
+from offboard.io import clock
+from offboard.io.background import BackgroundWriter
 from offboard.live.values import as_dict, line
 
 PERIOD_S = 0.1  # between two snapshots, host time

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from offboard.flight.configuration import build_controller, flown
 from offboard.replay.difference import compare
 from offboard.replay.recording import Recording, ReplayError
 from offboard.replay.replaying import Replay
 from offboard.replay.shadow import Figures, shadow
+from offboard.run.configuration import build_controller, flown
 
 
 def other_law(recording: Recording, name: str) -> list[str]:

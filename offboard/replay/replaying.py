@@ -12,7 +12,6 @@ from offboard.control.base import Controller
 from offboard.documents.signing_key import KEY_BYTES
 from offboard.flight import inputs
 from offboard.flight.companion import Companion
-from offboard.flight.configuration import flown
 from offboard.flight.inputs import (
     Call,
     Check,
@@ -21,14 +20,15 @@ from offboard.flight.inputs import (
     StrangersCounted,
     TurnInput,
 )
-from offboard.flight.link import Chunk
-from offboard.flight.one_flight import FlightParts, companion_of, session_of
 from offboard.flight.outbox import Output
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
-from offboard.flight.request import build_parts
+from offboard.io.link import Chunk
 from offboard.mavlink.framing import Frame
 from offboard.mavlink.signing import Signing
 from offboard.replay.recording import Recording, ReplayError, record_type
+from offboard.run.configuration import flown
+from offboard.run.one_flight import FlightParts, companion_of, session_of
+from offboard.run.request import build_parts
 
 CALLS = ("request_stop", "announce", "note_autopilot", "guard")  # methods of the companion
 _OUR_FIRST_SYSTEM = 1  # our system id before a vehicle was found

@@ -14,28 +14,28 @@ from sdnotify import SystemdNotifier
 from offboard import compiled
 from offboard.documents.signing_key import read_key
 from offboard.estimation.fusion import FollowedEstimate
-from offboard.flight import clock
-from offboard.flight.background import BackgroundWriter
 from offboard.flight.companion import Outcome
-from offboard.flight.connection import open_link
-from offboard.flight.link import Link, LinkError
-from offboard.flight.loop import Loop
-from offboard.flight.one_flight import discard
 from offboard.flight.phases import ExitCode
 from offboard.flight.programme import Anchor, Then, service
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
-from offboard.flight.request import FlightRequest
-from offboard.flight.signing_time import SigningTime
-from offboard.flight.stop import StopRequests
-from offboard.flight.supervisor import Supervisor
+from offboard.io import clock
+from offboard.io.background import BackgroundWriter
+from offboard.io.connection import open_link
+from offboard.io.link import Link, LinkError
+from offboard.io.signing_time import SigningTime
+from offboard.io.stop import StopRequests
 from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import Session, SessionSettings
+from offboard.run.loop import Loop
+from offboard.run.one_flight import discard
+from offboard.run.request import FlightRequest
 from offboard.service.flights import Flights
 from offboard.service.lock import connection_lock, directory_lock
 from offboard.service.memory import VehicleFiles
 from offboard.service.monitor import Monitor
 from offboard.service.preparation import Preparation
 from offboard.service.record import Recorder, score
+from offboard.supervisor.supervisor import Supervisor
 
 LINK_FIRST_S, LINK_MOST_S = 1.0, 5.0  # between two attempts to open the link
 SHOWN_EVERY_S = 0.25

@@ -16,14 +16,14 @@ from typing import Protocol
 from offboard.flight import assessment, guards
 from offboard.flight.companion import STOPPED, Companion, Outcome, Output
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.link import Chunk
-from offboard.flight.one_flight import FlightParts
 from offboard.flight.phases import ENDS, FLYING, WAITING, Phase
 from offboard.flight.programme import Programme
 from offboard.flight.snapshot import Snapshot
 from offboard.flight.state import FlightState
 from offboard.identification.learned import Learned
+from offboard.io.link import Chunk
 from offboard.mavlink.session import Session
+from offboard.run.one_flight import FlightParts
 
 REASON_EVERY_S = 10.0  # why the vehicle cannot be flown is announced this often
 NAMED_S = 1.0  # until a vehicle has said which one it is

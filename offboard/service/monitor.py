@@ -20,8 +20,8 @@ from prometheus_client.registry import Collector
 from offboard.documents.arguments import split_address
 from offboard.documents.errors import UserError, shown
 from offboard.documents.plain import plain
-from offboard.flight import clock
 from offboard.flight.snapshot import Snapshot
+from offboard.io import clock
 
 if TYPE_CHECKING:
     from prometheus_client import Metric

@@ -11,9 +11,9 @@ import threading
 from collections import deque
 
 from offboard.documents.errors import UserError
-from offboard.flight.configuration import FlightConfig, dump
-from offboard.flight.one_flight import rehearse
-from offboard.flight.request import FlightRequest, build_parts
+from offboard.run.configuration import FlightConfig, dump
+from offboard.run.one_flight import rehearse
+from offboard.run.request import FlightRequest, build_parts
 from offboard.service.flights import Prepared
 
 EVERY_S = 2.0

@@ -19,9 +19,10 @@ from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from pathlib import Path
 
-from offboard.flight import clock, manifest
-from offboard.flight.background import BackgroundWriter
-from offboard.flight.log import CLOSE_S, QUEUED_MAX, LogError, append, entry
+from offboard.flight import manifest
+from offboard.io import clock
+from offboard.io.background import BackgroundWriter
+from offboard.io.log import CLOSE_S, QUEUED_MAX, LogError, append, entry
 from offboard.mavlink.session import Session
 from offboard.report.background import begin
 

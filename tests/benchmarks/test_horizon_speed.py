@@ -11,10 +11,10 @@ import pytest
 
 from offboard.control.base import Situation
 from offboard.control.catalogue import settings_of
-from offboard.flight.configuration import load
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
 from offboard.reference.transfer import transfer
+from offboard.run.configuration import load
 
 SPHERES = [
     {"shape": "sphere", "north_m": north, "east_m": east, "height_m": 3.0, "radius_m": 0.4}

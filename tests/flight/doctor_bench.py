@@ -17,8 +17,8 @@ from offboard.doctor.listening import Listening
 from offboard.doctor.observation import Computer, Observation
 from offboard.doctor.run import planned
 from offboard.doctor.table import checks
-from offboard.flight import configuration
-from offboard.flight.link import Chunk
+from offboard.io.link import Chunk
+from offboard.run import configuration
 from simulator import config as simulated
 from simulator.faults import Fault
 from simulator.firmware.ardupilot import ARDUPILOT

@@ -21,17 +21,17 @@ from offboard.analysis import history, tlog
 from offboard.analysis.score import Score, score
 from offboard.control.base import Controller
 from offboard.estimation.fusion import FusedObserver, observer_of
-from offboard.flight import configuration as config
 from offboard.flight.companion import Companion, Outcome
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.link import Chunk
-from offboard.flight.log import FlightLog
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Phase, Rung
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
+from offboard.io.link import Chunk
+from offboard.io.log import FlightLog
 from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.model.vehicle import Vehicle
+from offboard.run import configuration as config
 from simulator import config as simulated
 from simulator.config import Scenario
 from simulator.firmware.ardupilot import ARDUPILOT

@@ -20,14 +20,14 @@ from pair import (
 )
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from offboard.flight import configuration as config
-from offboard.flight import request
 from offboard.flight.companion import Output
 from offboard.flight.phases import Phase
 from offboard.flight.programme import Anchor, Then, service
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.identification.learned import Learned
 from offboard.mavlink.session import Session, SessionSettings
+from offboard.run import configuration as config
+from offboard.run import request
 from offboard.service.flights import Flights, Prepared, Record
 from offboard.service.record import Recorder
 from simulator import config as simulated

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from offboard.analysis import tlog
-from offboard.flight import log as log_module
-from offboard.flight.background import BackgroundWriter
-from offboard.flight.log import FlightLog
+from offboard.io import log as log_module
+from offboard.io.background import BackgroundWriter
+from offboard.io.log import FlightLog
 from offboard.mavlink.framing import pack
 
 UNIX_US = 1_767_225_600_000_000

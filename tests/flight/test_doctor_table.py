@@ -16,7 +16,7 @@ from offboard.doctor.findings import Check, Level, examine, worst
 from offboard.doctor.observation import Observation
 from offboard.doctor.report import as_json
 from offboard.doctor.table import CheckError, checks
-from offboard.flight.configuration import load
+from offboard.run.configuration import load
 
 README = Path(__file__).parents[2] / "offboard" / "doctor" / "README.md"
 

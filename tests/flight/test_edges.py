@@ -16,18 +16,18 @@ from typing import Any, cast
 
 import pytest
 
-from offboard.flight import clock
-from offboard.flight import log as log_module
 from offboard.flight.companion import Companion, Outcome, Output
-from offboard.flight.connection import open_link
-from offboard.flight.link import Chunk, Link, Strangers
-from offboard.flight.log import FlightLog
-from offboard.flight.loop import UNGUARDED, Loop
 from offboard.flight.phases import Phase
-from offboard.flight.stop import StopRequests
-from offboard.flight.supervisor import Supervisor, SupervisorError
+from offboard.io import clock
+from offboard.io import log as log_module
+from offboard.io.connection import open_link
+from offboard.io.link import Chunk, Link, Strangers
+from offboard.io.log import FlightLog
+from offboard.io.stop import StopRequests
 from offboard.mavlink.counters import Counters
 from offboard.mavlink.framing import FrameSplitter, pack
+from offboard.run.loop import UNGUARDED, Loop
+from offboard.supervisor.supervisor import Supervisor, SupervisorError
 
 
 class Wire:

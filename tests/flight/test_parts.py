@@ -12,10 +12,8 @@ from pair import hover
 from offboard import compiled
 from offboard.compiled import Entry
 from offboard.control.base import Situation
-from offboard.flight import configuration as config
-from offboard.flight import manifest, request
+from offboard.flight import manifest
 from offboard.flight.gate import clamp, usable
-from offboard.flight.one_flight import rehearse
 from offboard.flight.readiness import Readiness
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.px4 import PX4
@@ -24,6 +22,9 @@ from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import Vehicle
 from offboard.reference.transfer import Hold
+from offboard.run import configuration as config
+from offboard.run import request
+from offboard.run.one_flight import rehearse
 
 NAN, INF = math.nan, math.inf
 

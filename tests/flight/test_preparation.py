@@ -10,10 +10,10 @@ from faults import failing, no_direction, raises
 
 from offboard.control.base import Certificate, Controller, Decision, Situation
 from offboard.documents.reading import DocumentError
-from offboard.flight.configuration import load
-from offboard.flight.one_flight import rehearse
-from offboard.flight.request import FlightRequest, build_parts
 from offboard.model.command import Command
+from offboard.run.configuration import load
+from offboard.run.one_flight import rehearse
+from offboard.run.request import FlightRequest, build_parts
 
 
 def without_cost(_: Situation) -> Decision:

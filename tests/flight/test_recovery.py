@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import pytest
 
-from offboard.flight.recovery import LONGEST_S, Recovery
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.events import CommandAck, Heartbeat, ModeReport
+from offboard.supervisor.recovery import LONGEST_S, Recovery
 
 STEP_S = 0.02
 FIRMWARES = pytest.mark.parametrize("dialect", [PX4, ARDUPILOT], ids=["px4", "ardupilot"])

@@ -9,9 +9,9 @@ from typing import Any
 from pair import hover, in_phase
 
 from offboard.flight.companion import Companion
-from offboard.flight.link import Chunk
 from offboard.flight.outbox import Output
 from offboard.flight.phases import Phase
+from offboard.io.link import Chunk
 
 PAUSE_S = 0.45
 

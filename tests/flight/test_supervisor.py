@@ -17,15 +17,15 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.analysis import tlog
-from offboard.flight import clock
-from offboard.flight.connection import open_link
-from offboard.flight.log import FlightLog
-from offboard.flight.supervisor import Supervised, Supervisor, SupervisorError
-from offboard.flight.udp_link import BATCH_MAX
+from offboard.io import clock
+from offboard.io.connection import open_link
+from offboard.io.log import FlightLog
+from offboard.io.udp_link import BATCH_MAX
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
+from offboard.supervisor.supervisor import Supervised, Supervisor, SupervisorError
 
 LONG_S = 20.0
 OFFBOARD, POSCTL, LANDING = 0x00060000, 0x00030000, 0x06040000

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from offboard.flight import clock
-from offboard.flight.connection import open_link
-from offboard.flight.link import Chunk, Strangers
-from offboard.flight.udp_link import LOOK_EVERY_S, UdpLink
+from offboard.io import clock
+from offboard.io.connection import open_link
+from offboard.io.link import Chunk, Strangers
+from offboard.io.udp_link import LOOK_EVERY_S, UdpLink
 from offboard.mavlink.peer import PEER_SILENT_S
 
 LOCAL = "127.0.0.1"

@@ -24,10 +24,10 @@ from offboard.analysis.score import Score, Scoring, score
 from offboard.analysis.trial import judged
 from offboard.cli.commands import app
 from offboard.flight.companion import Outcome
-from offboard.flight.log import FlightLog
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.flight.touchdown import Touchdown
+from offboard.io.log import FlightLog
 from offboard.model.frames import thrust_direction_from_quaternion
 
 WRAP_MS = 2**32

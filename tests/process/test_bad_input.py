@@ -23,9 +23,9 @@ from processes import Spawn, children
 from offboard import cli
 from offboard.analysis import history, tlog
 from offboard.analysis.trial import keep_score, score_flight
-from offboard.flight import one_flight as run
-from offboard.flight import request
-from offboard.flight.log import LogError
+from offboard.io.log import LogError
+from offboard.run import one_flight as run
+from offboard.run import request
 
 Capture = pytest.CaptureFixture[str]
 CONFIG = Path(__file__).parents[2] / "config"

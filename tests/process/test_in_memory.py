@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 
-from offboard.flight import in_memory
-from offboard.flight.in_memory import InMemorySimulator
-from offboard.flight.request import FlightRequest, fly_request
-from offboard.flight.sitl import SimulatorProcess
-from offboard.flight.stop import StopRequests
+from offboard.io.stop import StopRequests
+from offboard.run import in_memory
+from offboard.run.in_memory import InMemorySimulator
+from offboard.run.request import FlightRequest, fly_request
+from offboard.run.sitl import SimulatorProcess
 
 SETPOINT, TELEMETRY = 82, (30, 31, 32, 115)
 SHORT = ("reference.duration_s=1", "reference.height_m=1", "identify.excite=false")

@@ -13,7 +13,7 @@ import pytest
 from processes import Spawn
 
 from offboard.analysis import history, tlog
-from offboard.flight import configuration as config
+from offboard.run import configuration as config
 
 SHORT = ("--reference", "hover", "--set", "reference.duration_s=1", "--set", "reference.height_m=1")
 SCRIPTS = Path(sys.executable).parent

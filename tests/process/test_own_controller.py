@@ -16,7 +16,7 @@ from processes import Spawn
 
 import offboard.control
 from offboard.documents.reading import DocumentError
-from offboard.flight.configuration import load
+from offboard.run.configuration import load
 
 
 def documented_package(directory: Path) -> None:

@@ -19,8 +19,8 @@ from offboard.analysis import tlog
 from offboard.flight.companion import Companion
 from offboard.flight.phases import Phase
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID, RECORD_ID, TickRecord
-from offboard.flight.request import FlightRequest, fly_request
-from offboard.flight.sitl import SimulatorProcess
+from offboard.run.request import FlightRequest, fly_request
+from offboard.run.sitl import SimulatorProcess
 
 VEHICLE_COMPONENT_ID = 1
 WALL_TIMES = ("solve_time_s", "lateness_s")  # fields of TickRecord that the machine decides

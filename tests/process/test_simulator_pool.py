@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from processes import children
 
-from offboard.flight.sitl import SimulatorProcess
+from offboard.run.sitl import SimulatorProcess
 
 HELLO = 65535
 

@@ -22,10 +22,10 @@ from offboard.flight.inputs import (
     StrangersCounted,
     TurnInput,
 )
-from offboard.flight.link import Chunk
-from offboard.flight.log import entry
 from offboard.flight.manifest import PAYLOAD_TYPE as MANIFEST
 from offboard.flight.record import RECORD_COMPONENT_ID
+from offboard.io.link import Chunk
+from offboard.io.log import entry
 from offboard.mavlink import framing
 from offboard.mavlink.encode import encode
 from offboard.mavlink.framing import SETPOINTS

@@ -16,17 +16,18 @@ from offboard.analysis import tlog
 from offboard.cli.commands import app
 from offboard.control.base import Controller, Decision, Situation
 from offboard.control.laws.pso import PsoLaw
-from offboard.flight import configuration, inputs, manifest
+from offboard.flight import inputs, manifest
 from offboard.flight.actions import PhaseActions
-from offboard.flight.log import entry
 from offboard.flight.outbox import Output
 from offboard.flight.phases import Phase
+from offboard.io.log import entry
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
 from offboard.replay.difference import compare
 from offboard.replay.recording import ReplayError, read, record_type
 from offboard.replay.verdict import verdict
+from offboard.run import configuration
 
 sys.path.append(str(Path(__file__).parents[1] / "flight"))
 

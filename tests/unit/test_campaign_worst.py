@@ -28,7 +28,7 @@ from offboard.campaign.searchers import SEARCHERS
 from offboard.campaign.statistics import groups, wilson
 from offboard.campaign.table import row_of
 from offboard.campaign.worst import as_csv, search_of
-from offboard.flight import clock
+from offboard.io import clock
 
 SEARCH = """
 controllers: [lqr]

@@ -12,7 +12,7 @@ from laws import LEVEL, law_named, state_of
 from offboard.control.base import Controller, Situation
 from offboard.control.catalogue import names, settings_of
 from offboard.documents import shipped
-from offboard.flight.configuration import read_part
+from offboard.run.configuration import read_part
 
 
 def test_every_law_has_a_shipped_file_and_every_file_a_law() -> None:

@@ -9,8 +9,8 @@ import pytest
 
 from offboard.analysis import trial as trials
 from offboard.analysis.compare import Trial
-from offboard.flight.link import LinkError
-from offboard.flight.request import FlightRequest
+from offboard.io.link import LinkError
+from offboard.run.request import FlightRequest
 
 
 @pytest.mark.parametrize(

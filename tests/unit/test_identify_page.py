@@ -10,7 +10,7 @@ from browser import opening
 from offboard.analysis import history, tlog
 from offboard.analysis.identify import identify_flight, rows
 from offboard.analysis.identify_page import page
-from offboard.flight.configuration import load
+from offboard.run.configuration import load
 
 RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
 REFUSAL = "it <b>does not</b> follow its command"

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from offboard.control.base import Situation
 from offboard.control.certificate import certify
-from offboard.flight.configuration import load
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
 from offboard.paper.integral import ErrorIntegral, IntegralSettings
@@ -21,6 +20,7 @@ from offboard.paper.state_limits import LimitedBox, StateLimits
 from offboard.paper.study import extensions
 from offboard.paper.study.closed_loop import FlightTask, fly
 from offboard.reference.base import FlatSample
+from offboard.run.configuration import load
 
 Array = NDArray[np.float64]
 

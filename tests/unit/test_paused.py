@@ -7,9 +7,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from offboard.flight import configuration as config
 from offboard.reference.paused import STOP_S, Paused
 from offboard.reference.transfer import Shifted
+from offboard.run import configuration as config
 
 BEGAN_S, PAUSED_S, RESUMED_S = 100.0, 108.3, 115.0
 DERIVATIVES = ("position_ned_m", "velocity_ned_mps", "acceleration_ned_mps2", "jerk_ned_mps3",

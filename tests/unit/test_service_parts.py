@@ -16,18 +16,19 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.analysis import tlog
 from offboard.documents.errors import UserError
-from offboard.flight import clock, manifest
-from offboard.flight import request as flight_request
+from offboard.flight import manifest
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
-from offboard.flight.link import LinkError
 from offboard.flight.pilot_switch import PilotSwitch
-from offboard.flight.request import FlightRequest
-from offboard.flight.stop import StopRequests
 from offboard.identification.learned import Learned
 from offboard.identification.uncertainty import Estimate
+from offboard.io import clock
+from offboard.io.link import LinkError
+from offboard.io.stop import StopRequests
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
+from offboard.run import request as flight_request
+from offboard.run.request import FlightRequest
 from offboard.service import daemon, preparation, unit
 from offboard.service.daemon import Manager
 from offboard.service.flights import Prepared

@@ -16,7 +16,7 @@ from offboard.campaign.results import Record, Results
 from offboard.campaign.tune import Tuned, Tuning, profile, read_tune
 from offboard.campaign.verdict import judge
 from offboard.documents.errors import DocumentError
-from offboard.flight.configuration import load
+from offboard.run.configuration import load
 
 FILE = """
 ranges:

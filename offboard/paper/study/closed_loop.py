@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from offboard.control.certificate import ExactMinimum, certify
 from offboard.control.riccati import cost_to_go
-from offboard.flight.clock import monotonic_s
+from offboard.io.clock import monotonic_s
 from offboard.model.frames import quaternion_from_euler, rotation_from_quaternion
 from offboard.model.predicted_state import PredictedState
 from offboard.model.state import EULER, PHI, PSI, P, R, U, W, X, Z

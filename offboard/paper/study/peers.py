@@ -26,7 +26,7 @@ from offboard.analysis.figure import PALETTE, Figure, curve, panels
 from offboard.control.certificate import ExactMinimum, certify
 from offboard.control.cost import BoxQuadratic
 from offboard.control.swarm import QuadraticSwarm, RandomLanes, SwarmResult, SwarmSettings
-from offboard.flight.clock import monotonic_s
+from offboard.io.clock import monotonic_s
 from offboard.paper.law import PaperLaw, PaperSettings
 from offboard.paper.plant import paper_model
 from offboard.paper.study.page import Row, Table

@@ -12,9 +12,9 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Protocol, cast
 
 from offboard.documents.errors import UserError
-from offboard.flight import clock
-from offboard.flight.link import Chunk, Strangers
-from offboard.flight.sitl import Ending
+from offboard.io import clock
+from offboard.io.link import Chunk, Strangers
+from offboard.run.sitl import Ending
 
 GROUP = "pso_offboard.simulators"
 NAME = "bundled"

@@ -1,7 +1,7 @@
 """The supervisor, as the controller sees it: a process that outlives it.
 
 The loop tells it in every turn whether the vehicle is ours and in the air (`Supervised`). When
-these beats stop for `supervisor_process.SILENT_S`, or the controller ends meanwhile, the process
+these beats stop for `process.SILENT_S`, or the controller ends meanwhile, the process
 takes over the link and asks the vehicle to hold, then to land. From then on the controller must not
 send.
 
@@ -21,7 +21,7 @@ from dataclasses import asdict, dataclass
 from types import TracebackType
 
 from offboard.documents.errors import UserError
-from offboard.flight.link import Link
+from offboard.io.link import Link
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.signing import Signing
 
@@ -70,7 +70,7 @@ class Supervisor:
         with theirs:
             try:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-m", "offboard.flight.supervisor_process"],
+                    [sys.executable, "-m", "offboard.supervisor.process"],
                     stdin=theirs.fileno(),
                     stdout=subprocess.DEVNULL,
                     start_new_session=True,  # signals of the terminal reach only the controller

@@ -19,22 +19,19 @@ from offboard.control.base import Controller, Situation
 from offboard.documents.reading import DocumentError
 from offboard.estimation.fusion import FusedObserver
 from offboard.estimation.observer import Observer
-from offboard.flight import clock, manifest
+from offboard.flight import manifest
 from offboard.flight.companion import Companion, Outcome
-from offboard.flight.connection import open_link, open_lockstep_link
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.gate import usable
-from offboard.flight.in_memory import InMemorySimulator
-from offboard.flight.link import Link
-from offboard.flight.log import FlightLog
-from offboard.flight.loop import Loop
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Limits
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
-from offboard.flight.signing_time import SigningTime
-from offboard.flight.sitl import SimulatorProcess
-from offboard.flight.stop import StopRequests
-from offboard.flight.supervisor import Supervisor
+from offboard.io import clock
+from offboard.io.connection import open_link, open_lockstep_link
+from offboard.io.link import Link
+from offboard.io.log import FlightLog
+from offboard.io.signing_time import SigningTime
+from offboard.io.stop import StopRequests
 from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
 from offboard.mavlink.signing import Signing
@@ -42,6 +39,10 @@ from offboard.model.command import Command, PositionCommand
 from offboard.model.vehicle import Vehicle
 from offboard.reference.track import Track
 from offboard.reference.transfer import Hold
+from offboard.run.in_memory import InMemorySimulator
+from offboard.run.loop import Loop
+from offboard.run.sitl import SimulatorProcess
+from offboard.supervisor.supervisor import Supervisor
 
 REHEARSED_DECISIONS = 5  # the fastest counts: the machine may be busy
 DISCARDED_MAX = 20  # batches of a link

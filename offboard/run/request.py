@@ -11,7 +11,9 @@ from offboard.documents.reading import DocumentError
 from offboard.documents.signing_key import read_key
 from offboard.estimation.fusion import observer_of
 from offboard.flight.companion import Companion, Outcome
-from offboard.flight.configuration import (
+from offboard.io.log import FlightLog
+from offboard.io.stop import StopRequests
+from offboard.run.configuration import (
     FlightConfig,
     build_controller,
     build_track,
@@ -19,11 +21,9 @@ from offboard.flight.configuration import (
     load,
     read_part,
 )
-from offboard.flight.in_memory import InMemorySimulator
-from offboard.flight.log import FlightLog
-from offboard.flight.one_flight import Bundled, FlightParts, fly
-from offboard.flight.sitl import OWN_VEHICLES, SimulatorProcess, check_scenario_named
-from offboard.flight.stop import StopRequests
+from offboard.run.in_memory import InMemorySimulator
+from offboard.run.one_flight import Bundled, FlightParts, fly
+from offboard.run.sitl import OWN_VEHICLES, SimulatorProcess, check_scenario_named
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,13 +12,13 @@ from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from typing import Any, Protocol
 
-from offboard.flight import clock
 from offboard.flight.companion import Outcome, Output
-from offboard.flight.link import Chunk, Link
 from offboard.flight.phases import BEFORE_FLIGHT, WAITING, ExitCode, Phase
-from offboard.flight.sitl import Ending
-from offboard.flight.stop import StopRequests
-from offboard.flight.supervisor import Supervisor, SupervisorError
+from offboard.io import clock
+from offboard.io.link import Chunk, Link
+from offboard.io.stop import StopRequests
+from offboard.run.sitl import Ending
+from offboard.supervisor.supervisor import Supervisor, SupervisorError
 
 POLL_S = 0.02
 STOPPED_S = 0.2  # from the beginning of a turn: what it decided does not leave later

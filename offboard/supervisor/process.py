@@ -18,20 +18,20 @@ from contextlib import suppress
 from functools import partial
 from typing import Any
 
-from offboard.flight import clock
-from offboard.flight.background import BackgroundWriter
-from offboard.flight.link import Link
-from offboard.flight.log import append, entry
-from offboard.flight.recovery import Recovery
-from offboard.flight.stream_link import Nowhere, Source, Stream, StreamLink
-from offboard.flight.stream_sources import Listener
-from offboard.flight.supervisor import READY
-from offboard.flight.udp_link import UdpLink
+from offboard.io import clock
+from offboard.io.background import BackgroundWriter
+from offboard.io.link import Link
+from offboard.io.log import append, entry
+from offboard.io.stream_link import Nowhere, Source, Stream, StreamLink
+from offboard.io.stream_sources import Listener
+from offboard.io.udp_link import UdpLink
 from offboard.mavlink import texts
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat, Outgoing
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
+from offboard.supervisor.recovery import Recovery
+from offboard.supervisor.supervisor import READY
 
 SILENT_S = 0.9  # without a beat; with two polls and a busy machine less than 1 s
 POLL_S = 0.02

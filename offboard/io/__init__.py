@@ -1,0 +1,1 @@
+"""Links, log, clock and signals: everything of a flight that touches the outside."""

@@ -1,0 +1,1 @@
+"""A flight by name: configuration, parts, simulator, loop."""

@@ -1,0 +1,1 @@
+"""The process that takes over when the controller hangs or dies."""
