@@ -212,6 +212,18 @@ def test_a_reboot_between_two_flights(on: str) -> None:
     assert wire.unsafe == []
 
 
+@BOTH
+def test_a_reboot_whose_telemetry_arrives_at_once_reads_the_parameters_again(on: str) -> None:
+    pair = serve(on=on)
+    pair.run(20.0)
+    pair.instance.reboot(1.0)
+    pair.pause(8.0)  # of this computer, until the vehicle reports everything again
+    pair.until(lambda: pair.said("the vehicle restarted"), 10.0)
+    pair.fly_up()
+    pair.switch("engage")
+    pair.until(lambda: pair.phase in TRACKING, 2.0)
+
+
 def test_a_vehicle_that_reboots_in_flight_is_asked_to_hold() -> None:
     """ArduCopter's watchdog restarts it in the air, armed and in GUIDED."""
     pair, wire = engaged("ardupilot")
