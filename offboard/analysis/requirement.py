@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from offboard.analysis.score import FIGURES
 from offboard.documents.errors import UserError
 
 _OPERATORS: dict[str, Callable[[float, float], bool]] = {
@@ -29,7 +30,7 @@ class RequirementError(UserError):
 class Requirement:
     """One figure of the score compared with a number.
 
-    Example: `Requirement.parse("rmse_position_m<0.05", FIGURES).met(score.figures())`.
+    Example: `Requirement.parse("rmse_position_m<0.05").met(score.figures())`.
     """
 
     figure: str
@@ -37,8 +38,8 @@ class Requirement:
     limit: float
 
     @classmethod
-    def parse(cls, text: str, known: Mapping[str, object]) -> Requirement:
-        """Read 'FIGURE<NUMBER'. `known` has the names of all figures. Raises RequirementError."""
+    def parse(cls, text: str) -> Requirement:
+        """Read 'FIGURE<NUMBER'. Raises RequirementError."""
         match = _PATTERN.fullmatch(text)
         if match is None:
             raise RequirementError(
@@ -46,9 +47,9 @@ class Requirement:
                 "for example 'rmse_position_m<0.05' (also <=, >, >=, ==)"
             )
         figure, comparison, number = match.groups()
-        if figure not in known:
+        if figure not in FIGURES:
             raise RequirementError(
-                f"--require: there is no figure {figure!r}; there are {', '.join(known)}"
+                f"--require: there is no figure {figure!r}; there are {', '.join(FIGURES)}"
             )
         return cls(figure, comparison, float(number))
 

@@ -24,7 +24,7 @@ from offboard.io.stop import StopRequests
 from offboard.run.configuration import FlightConfig, dump
 from offboard.run.in_memory import InMemorySimulator
 from offboard.run.one_flight import Bundled, fly
-from offboard.run.request import FlightRequest, build_parts
+from offboard.run.request import build_parts
 
 # figures that this computer's clock decides: they differ between two runs of one flight
 WALL_TIMES = (
@@ -90,17 +90,7 @@ def _fly(case: Case, scratch: Path, directory: Path) -> tuple[FlightConfig, Outc
         path.parent.mkdir()
         path.write_text(case.text, encoding="utf-8")
         scenario = str(path)
-    named = ("vehicle", "controller", "reference")
-    config = FlightRequest(
-        directory,
-        config=case.config,
-        choices={part: getattr(case, part) for part in named if getattr(case, part)},
-        assignments=case.assignments,
-        seed=case.seed,
-        sitl=True,
-        firmware=case.firmware,
-        sim_vehicle=case.sim_vehicle,
-    ).resolve()
+    config = case.request(directory).resolve()
     log = FlightLog(directory, dump(config))
     outcome = fly(
         build_parts(config),

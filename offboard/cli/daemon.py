@@ -97,13 +97,14 @@ def daemon(
     MAV_CMD_DO_PAUSE_CONTINUE and MAV_CMD_DO_SET_MODE (hands back) to component 191.
     """
     connection = connect or DEFAULT_CONNECTION
-    named = {"controller": controller, "reference": reference, "vehicle": vehicle}
+    choices = {"controller": controller, "reference": reference, "vehicle": vehicle}
     if print_unit:
         from offboard.run.configuration import load
 
-        choices = {part: name for part, name in named.items() if name is not None}
         load(config, choices=choices, assignments=assignments or ())
-        _print_unit(connection, signing_key, out_directory, [config, *choices.values()])
+        _print_unit(
+            connection, signing_key, out_directory, [config, *filter(None, choices.values())]
+        )
         return
     from offboard.io.stop import StopRequests
     from offboard.live.lines import JsonLog, Terminal
@@ -118,7 +119,7 @@ def daemon(
         request = FlightRequest(
             directory=out_directory or FLIGHTS,
             config=config,
-            choices={part: name for part, name in named.items() if name is not None},
+            choices=choices,
             assignments=tuple(assignments or ()),
             seed=seed,
             connection=connection,

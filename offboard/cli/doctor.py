@@ -72,10 +72,9 @@ def doctor(
     from offboard.doctor.run import observe
     from offboard.run.configuration import load
 
-    named = {"controller": controller, "reference": reference, "vehicle": vehicle}
     flight = load(
         config,
-        choices={part: name for part, name in named.items() if name is not None},
+        choices={"controller": controller, "reference": reference, "vehicle": vehicle},
         assignments=assignments or (),
     )
     seen = observe(

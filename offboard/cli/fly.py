@@ -99,7 +99,6 @@ def fly(
         raise CommandError("--system is an option of --connect: --sitl has one vehicle")
     if not sitl and (scenario or sim_vehicle or firmware != "px4"):
         raise CommandError("--scenario, --sim-vehicle and --firmware are options of --sitl: add it")
-    named = {"controller": controller, "reference": reference, "vehicle": vehicle}
     try:
         from offboard.io.stop import StopRequests
         from offboard.run.sitl import SimulatorProcess
@@ -120,7 +119,7 @@ def fly(
             request = FlightRequest(
                 directory=directory,
                 config=config,
-                choices={part: name for part, name in named.items() if name is not None},
+                choices={"controller": controller, "reference": reference, "vehicle": vehicle},
                 assignments=tuple(assignments or ()),
                 seed=seed,
                 connection=connect or DEFAULT_CONNECTION,

@@ -49,9 +49,8 @@ def score(
 def requirements_of(texts: list[str] | None) -> list[Requirement]:
     """The requirements of --require. Raises RequirementError."""
     from offboard.analysis.requirement import Requirement
-    from offboard.analysis.score import FIGURES
 
-    return [Requirement.parse(text, FIGURES) for text in texts or ()]
+    return [Requirement.parse(text) for text in texts or ()]
 
 
 def scored(flight: Path) -> tuple[Score, History]:

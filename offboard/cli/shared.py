@@ -56,7 +56,10 @@ SigningKey = Annotated[
 Report = Annotated[
     bool, typer.Option(envvar="OFFBOARD_REPORT", help="Write report.html after each flight.")
 ]
-Workers = Annotated[int | None, option("N", "Processes.  [default: one per processor]")]
+Workers = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=1, max=256, help="Processes.  [default: one per processor]"),
+]
 Requirements = Annotated[
     list[str] | None,
     option(
