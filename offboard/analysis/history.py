@@ -43,7 +43,7 @@ _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: ground stations and companions
 _ARRAYS = {RECORD_NAME, IDENTIFIED_NAME}
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 _FLOAT_ARRAY = 350
-_TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
+TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
 _SUBSTITUTES = (30, 33)  # ATTITUDE, GLOBAL_POSITION_INT: the clock of logs without these
 # kinds of messages of which every stretch has its own, and kinds that are kept from the beginning
 _OUR_SAMPLES = {
@@ -160,7 +160,7 @@ class _Collector:
         self._unix_us = (0, 0)
         self._place = 0
         self._anchor_ms = math.nan
-        self._clocks: tuple[int, ...] = _TELEMETRY + _SUBSTITUTES
+        self._clocks: tuple[int, ...] = TELEMETRY + _SUBSTITUTES
         self.now_ms = math.nan  # stamp of the newest telemetry
         self.damage_ms = math.nan  # of the newest one before the first damage
         self._rows: dict[str, Array] = {}  # of the present stretch
@@ -178,8 +178,8 @@ class _Collector:
         if stream is not None and _is_used(entry, ours):
             stream.add(entry, self._place, self.now_ms)
         if kind in self._clocks and not ours:
-            if kind in _TELEMETRY:
-                self._clocks = _TELEMETRY
+            if kind in TELEMETRY:
+                self._clocks = TELEMETRY
             self.now_ms = float(int.from_bytes(entry.frame.payload[:4], "little"))
             if math.isnan(self._anchor_ms):
                 self._anchor_ms = self.now_ms

@@ -95,7 +95,7 @@ def test_a_signed_flight_behind_a_router_beside_a_ground_station(tmp_path: Path)
         terminal.type("param fetch COM_OF_LOSS_T")  # MAVProxy is answered, too
         terminal.expect(r"COM_OF_LOSS_T = 5")
     assert (3, 1) in heard
-    log = tlog.read(tmp_path / "flight" / "flight.tlog").messages
+    log = list(tlog.read(tmp_path / "flight" / "flight.tlog"))
     assert {each.system_id for each in log if each.component_id == 1} == {3}
     assert all(each.frame.signed for each in log if each.component_id in (1, 191))
     assert not any(each.name == "SETUP_SIGNING" for each in log)
