@@ -12,10 +12,11 @@ from pathlib import Path
 
 from pymavlink import mavutil
 from terminal import Terminal
-from vehicle_process import free_port, vehicle
+from vehicle_process import vehicle
 
 from offboard.analysis import tlog
 from offboard.documents.signing_key import create_key
+from simulator.link.links import free_ports
 
 MAVPROXY = Path(sys.executable).with_name("mavproxy.py")
 SHORT = (
@@ -37,7 +38,7 @@ LATE = ("--set", "limits.silence_s=5", "--set", "limits.missed_decisions=50")
 def routed(directory: Path, system: int) -> Iterator[tuple[Terminal, int, int]]:
     """A vehicle behind MAVProxy; its terminal, and the ports to which it sends for us and for a
     ground station."""
-    ours, station = free_port(), free_port()
+    ours, station = free_ports(2)
     failsafe = ("--param", "COM_OF_LOSS_T=5")
     with vehicle("--instance", str(system - 1), *failsafe) as port:
         outs = (f"--out=udpout:127.0.0.1:{ours}", f"--out=udpout:127.0.0.1:{station}")
