@@ -11,13 +11,15 @@ from typing import Annotated
 
 import typer
 
-from offboard.cli.fly import LINKS
 from offboard.cli.shared import (
     DEFAULT_CONNECTION,
     FILE,
     FLIGHTS,
     Assignments,
     CommandError,
+    Connect,
+    Controller,
+    Reference,
     Report,
     SigningKey,
     System,
@@ -56,10 +58,10 @@ class ThenDo(StrEnum):
 
 
 def daemon(
-    connect: Annotated[str | None, option("LINK", LINKS)] = None,
+    connect: Connect = None,
     config: Annotated[str, option(FILE, "Configuration.")] = "flight",
-    controller: Annotated[str | None, option(FILE, "Controller.")] = None,
-    reference: Annotated[str | None, option(FILE, "Reference; a file may also be .csv.")] = None,
+    controller: Controller = None,
+    reference: Reference = None,
     vehicle: Vehicle = None,
     system: System = None,
     signing_key: SigningKey = None,
