@@ -22,10 +22,6 @@ _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _PATTERN = re.compile(rf"\s*(\w+)\s*(<=|>=|==|<|>)\s*({_NUMBER})\s*")
 
 
-class RequirementError(UserError):
-    """A requirement that cannot be read; the sentence says what would be right."""
-
-
 @dataclass(frozen=True, slots=True)
 class Requirement:
     """One figure of the score compared with a number.
@@ -39,16 +35,16 @@ class Requirement:
 
     @classmethod
     def parse(cls, text: str) -> Requirement:
-        """Read 'FIGURE<NUMBER'. Raises RequirementError."""
+        """Read 'FIGURE<NUMBER'. Raises UserError."""
         match = _PATTERN.fullmatch(text)
         if match is None:
-            raise RequirementError(
+            raise UserError(
                 f"--require {text!r} is not understood; write FIGURE<NUMBER, "
                 "for example 'rmse_position_m<0.05' (also <=, >, >=, ==)"
             )
         figure, comparison, number = match.groups()
         if figure not in FIGURES:
-            raise RequirementError(
+            raise UserError(
                 f"--require: there is no figure {figure!r}; there are {', '.join(FIGURES)}"
             )
         return cls(figure, comparison, float(number))

@@ -67,7 +67,7 @@ class Summary:
 class Campaign:
     """The campaign of a file in a directory.
 
-    Raises DocumentError where nothing of it can be flown and ResultsError for a directory that
+    Raises DocumentError where nothing of it can be flown and UserError for a directory that
     cannot be used, before the first flight.
     """
 
@@ -87,7 +87,7 @@ class Campaign:
         progress: Callable[[int, int], None],
     ) -> Summary:
         """Fly what is not finished and write the table. `progress` gets how many flights have
-        ended, from 0 on, and how many were to be flown. Raises ResultsError."""
+        ended, from 0 on, and how many were to be flown. Raises UserError."""
         mine = shard.of(self.cases)
         jobs = [
             Job(case, self.file.promises, code_hash())

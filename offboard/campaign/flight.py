@@ -36,10 +36,6 @@ WALL_TIMES = (
 )
 
 
-class WorkerError(UserError):
-    """A worker that cannot fly: its disk is full, or it runs other code. No case is to blame."""
-
-
 @dataclass(frozen=True, slots=True)
 class Job:
     """A case with what its worker needs. `code` is the campaign's; `kept`: a directory for the log,
@@ -52,9 +48,9 @@ class Job:
 
 
 def fly_job(job: Job) -> Record:
-    """Fly a case. A flight that fails is a record too. Raises WorkerError."""
+    """Fly a case. A flight that fails is a record too. Raises UserError."""
     if code_hash() != job.code:
-        raise WorkerError(
+        raise UserError(
             f"a worker runs other code ({code_hash()}) than this campaign ({job.code}); install "
             "the same version there and start it again"
         )
@@ -62,7 +58,7 @@ def fly_job(job: Job) -> Record:
         with tempfile.TemporaryDirectory(prefix="offboard-") as scratch:
             return _flown(job, Path(scratch))
     except (OSError, MemoryError) as error:
-        raise WorkerError(f"a worker cannot go on: {error}") from None
+        raise UserError(f"a worker cannot go on: {error}") from None
 
 
 def _flown(job: Job, scratch: Path) -> Record:
@@ -71,7 +67,7 @@ def _flown(job: Job, scratch: Path) -> Record:
         config, outcome = _fly(job.case, scratch, directory)
         score, history = score_flight(directory)
     except LogError as error:
-        raise WorkerError(f"a worker cannot go on: {error}") from None
+        raise UserError(f"a worker cannot go on: {error}") from None
     except UserError as error:
         sentence = " ".join(str(error).split()).replace(f"{scratch}/", "")
         return Record(ExitCode.USAGE, sentence, NOT_FLOWN, "infeasible")

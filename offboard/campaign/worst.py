@@ -209,7 +209,7 @@ def as_csv(failures: Sequence[Failure]) -> str:
 
 
 def keep(failures: Sequence[Failure], campaign: Campaign) -> Path:
-    """Write worst.csv and the scenario file of every failure. Raises ResultsError."""
+    """Write worst.csv and the scenario file of every failure. Raises UserError."""
     for failure in failures:
         if failure.case.text:
             path = campaign.directory / failure.case.scenario_file

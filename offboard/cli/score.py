@@ -47,7 +47,7 @@ def score(
 
 
 def requirements_of(texts: list[str] | None) -> list[Requirement]:
-    """The requirements of --require. Raises RequirementError."""
+    """The requirements of --require. Raises UserError."""
     from offboard.analysis.requirement import Requirement
 
     return [Requirement.parse(text) for text in texts or ()]

@@ -27,7 +27,7 @@ Stamps = Callable[[Array], list[int]]  # vehicle times in s to stamps of the fil
 
 
 def write_mcap(flight: Flight, path: Path, *, vehicle_time: bool = False) -> None:
-    """Write an MCAP file, with Unix time or vehicle time. Raises ExportError."""
+    """Write an MCAP file, with Unix time or vehicle time. Raises UserError."""
     writers = library("mcap.writer", KIND)
     register = library("mcap_protobuf.schema", KIND).register_schema
 

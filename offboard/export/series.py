@@ -49,10 +49,6 @@ _COLUMNS = {
 }
 
 
-class ExportError(UserError):
-    """A flight that cannot be exported: one sentence for the user."""
-
-
 @dataclass(frozen=True, slots=True)
 class Series:
     """Samples of one kind: `time_s` (N,) of vehicle time, `values` (N, len(columns))."""
@@ -92,12 +88,12 @@ class Flight:
 
 
 def read(path: Path) -> Flight:
-    """The flight in a directory or .tlog. Raises TlogError, or ExportError without telemetry."""
+    """The flight in a directory or .tlog. Raises TlogError, or UserError without telemetry."""
     log = tlog.read(tlog.find(path))
     flown = history.gather(log)
     unix = _unix(log)
     if not len(unix):
-        raise ExportError(f"{log.path} holds no telemetry with a time stamp: nothing to export")
+        raise UserError(f"{log.path} holds no telemetry with a time stamp: nothing to export")
     events = (*flown.phases, *flown.modes, *flown.vehicle_messages)
     known = sorted((e for e in events if np.isfinite(e.time_s)), key=lambda event: event.time_s)
     found = {name: _series(name, rows) for name, rows in _rows(flown).items()}

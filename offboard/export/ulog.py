@@ -54,7 +54,7 @@ class _Topic:
 
 
 def write_ulog(flight: Flight, path: Path) -> None:
-    """Write a ULog file. Raises ExportError."""
+    """Write a ULog file. Raises UserError."""
     topics = _topics(flight)
     entries: list[tuple[int, bytes]] = []
     for number, topic in enumerate(topics):

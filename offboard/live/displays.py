@@ -20,7 +20,7 @@ class Displays:
         self._working = list(self._parts)
 
     def await_ready(self) -> list[str]:
-        """Wait until all processes listen; where. Raises LiveError."""
+        """Wait until all processes listen; where. Raises UserError."""
         return [page.await_ready() for page in self._pages]
 
     def tell(self, sentence: str) -> None:

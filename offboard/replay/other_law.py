@@ -8,10 +8,11 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from offboard.control.base import Adopting, Controller, Decision, Situation
+from offboard.documents.errors import UserError
 from offboard.model.command import Command
 from offboard.model.vehicle import Vehicle
 from offboard.replay.difference import compare
-from offboard.replay.recording import Recording, ReplayError
+from offboard.replay.recording import Recording
 from offboard.replay.replaying import Replay
 from offboard.run.configuration import build_controller, flown
 
@@ -20,7 +21,7 @@ def other_law(recording: Recording, name: str) -> list[str]:
     """Fly the recorded flight again while the controller `name` decides beside it, open loop: the
     vehicle follows the flight's own commands, and the other law has no deadline.
 
-    Returns one line for each figure. Raises ReplayError if there is nothing to compare, and
+    Returns one line for each figure. Raises UserError if there is nothing to compare, and
     DocumentError for a controller that does not exist or cannot be built.
     """
     config = flown(recording.configuration, name)
@@ -39,7 +40,7 @@ def other_law(recording: Recording, name: str) -> list[str]:
     if figures.others:
         lines.append(f"{figures.others} decisions are no attitude commands, and are not compared")
     if not figures.angle_rad:
-        raise ReplayError("; ".join(["nothing to compare", *lines]))
+        raise UserError("; ".join(["nothing to compare", *lines]))
     law, own = config.controller.law, replay.config.controller.law
     return [
         f"{law} beside {own} in {len(figures.angle_rad)} decisions, on the states of the flight",

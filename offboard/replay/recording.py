@@ -16,10 +16,6 @@ from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 _TUNNEL = 385
 
 
-class ReplayError(UserError):
-    """A flight that cannot be replayed: one sentence for the user."""
-
-
 @dataclass(frozen=True, slots=True)
 class Recording:
     """`settings` are those of the session: lockstep, stream, sends_first, capacity_bytes_ps."""
@@ -44,12 +40,12 @@ class Recording:
 
 
 def read(flight: Path) -> Recording:
-    """The recording in a flight directory or .tlog. Raises ReplayError or TlogError."""
+    """The recording in a flight directory or .tlog. Raises UserError or TlogError."""
     path = tlog.find(flight)
     log = tlog.read(path)
     configuration = history.configuration(log)
     if configuration is None:
-        raise ReplayError(
+        raise UserError(
             f"{path} does not hold the configuration of a flight: only logs of offboard can be "
             "replayed"
         )
@@ -59,7 +55,7 @@ def read(flight: Path) -> Recording:
         if record_type(entry) == inputs.PAYLOAD_TYPE
     )
     if not recorded:
-        raise ReplayError(
+        raise UserError(
             f"{path} cannot be replayed, only scored and reported: it has no inputs of each turn; "
             "a flight of `offboard daemon` goes on with what was received before its log begins"
         )
@@ -78,7 +74,7 @@ def _settings(path: Path, recorded: tuple[bytes, ...]) -> dict[str, object]:
     try:
         first = next(inputs.entries(recorded), None)
     except inputs.InputsError as error:
-        raise ReplayError(f"{path}: the record of the inputs is damaged: {error}") from None
+        raise UserError(f"{path}: the record of the inputs is damaged: {error}") from None
     if not isinstance(first, Call) or first.name != SETTINGS:
-        raise ReplayError(f"{path}: the record of the inputs does not begin with the settings")
+        raise UserError(f"{path}: the record of the inputs does not begin with the settings")
     return dict(first.arguments[0])

@@ -28,7 +28,7 @@ from rich.console import Console
 from offboard.documents.errors import UserError
 from offboard.live.displays import Displays
 from offboard.live.lines import JsonLines, Terminal, status
-from offboard.live.process import LiveError, LiveProcess
+from offboard.live.process import LiveProcess
 
 SERVER = "offboard.live.server"
 FLOOD = b"GET / HTTP/1.1\r\nHost: x\r\n\r\n" * 200
@@ -139,7 +139,7 @@ def test_an_address_that_cannot_be_served_is_refused() -> None:
         refused = f"--live: {address} cannot be listened on"
         with (
             closing(LiveProcess(SERVER, "--live", address)) as process,
-            pytest.raises(LiveError, match=refused),
+            pytest.raises(UserError, match=refused),
         ):
             process.await_ready()
     for wrong in ("8014x", "localhost", "127.0.0.1:99999", "127.0.0.1:²"):

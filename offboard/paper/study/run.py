@@ -18,7 +18,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from offboard.analysis.figure import Figure
 from offboard.analysis.workers import open_worker, processors, run_all
-from offboard.paper.study.options import PaperError, PaperOptions, check
+from offboard.documents.errors import UserError
+from offboard.paper.study.options import PaperOptions, check
 from offboard.paper.study.page import Table, page
 from offboard.paper.study.plan import Job, planned
 
@@ -41,7 +42,7 @@ def reproduce(options: PaperOptions, console: Console | None = None) -> Outcome:
     """Compute and write everything that `options` ask for, with progress on `console` (stderr).
 
     Writes table_NAME.csv and .json, figure_NAME.json, run.json and paper.html to `options.out`.
-    Raises PaperError for invalid options or an output that cannot be written. An interrupt
+    Raises UserError for invalid options or an output that cannot be written. An interrupt
     (KeyboardInterrupt) is not raised: the outcome records it.
     """
     check(options)
@@ -59,7 +60,7 @@ def reproduce(options: PaperOptions, console: Console | None = None) -> Outcome:
     except KeyboardInterrupt:
         interrupted = True
     except OSError as error:
-        raise PaperError(f"{options.out} cannot be written: {error.strerror or error}") from None
+        raise UserError(f"{options.out} cannot be written: {error.strerror or error}") from None
     return collected.finish(interrupted)
 
 
