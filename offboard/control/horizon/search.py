@@ -76,12 +76,12 @@ class Evaluator:
     @property
     def lower(self) -> Array:
         """Lower bounds of the inputs, (N, 3)."""
-        return self.scene.lower
+        return self.scene.within.lower
 
     @property
     def upper(self) -> Array:
         """Upper bounds of the inputs, (N, 3)."""
-        return self.scene.upper
+        return self.scene.within.upper
 
     def of_knots(self, base: Plan, knots: Array) -> Array:
         """Costs (n,) of knots (M, 3, n) about `base`; `plan` returns one of these plans."""
