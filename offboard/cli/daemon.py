@@ -11,13 +11,15 @@ from typing import Annotated
 
 import typer
 
-from offboard.cli.fly import LINKS
 from offboard.cli.shared import (
     DEFAULT_CONNECTION,
     FILE,
     FLIGHTS,
     Assignments,
     CommandError,
+    Connect,
+    Controller,
+    Reference,
     Report,
     SigningKey,
     System,
@@ -56,10 +58,10 @@ class ThenDo(StrEnum):
 
 
 def daemon(
-    connect: Annotated[str | None, option("LINK", LINKS)] = None,
+    connect: Connect = None,
     config: Annotated[str, option(FILE, "Configuration.")] = "flight",
-    controller: Annotated[str | None, option(FILE, "Controller.")] = None,
-    reference: Annotated[str | None, option(FILE, "Reference; a file may also be .csv.")] = None,
+    controller: Controller = None,
+    reference: Reference = None,
     vehicle: Vehicle = None,
     system: System = None,
     signing_key: SigningKey = None,
@@ -97,13 +99,14 @@ def daemon(
     MAV_CMD_DO_PAUSE_CONTINUE and MAV_CMD_DO_SET_MODE (hands back) to component 191.
     """
     connection = connect or DEFAULT_CONNECTION
-    named = {"controller": controller, "reference": reference, "vehicle": vehicle}
+    choices = {"controller": controller, "reference": reference, "vehicle": vehicle}
     if print_unit:
         from offboard.run.configuration import load
 
-        choices = {part: name for part, name in named.items() if name is not None}
         load(config, choices=choices, assignments=assignments or ())
-        _print_unit(connection, signing_key, out_directory, [config, *choices.values()])
+        _print_unit(
+            connection, signing_key, out_directory, [config, *filter(None, choices.values())]
+        )
         return
     from offboard.io.stop import StopRequests
     from offboard.live.lines import JsonLog, Terminal
@@ -118,7 +121,7 @@ def daemon(
         request = FlightRequest(
             directory=out_directory or FLIGHTS,
             config=config,
-            choices={part: name for part, name in named.items() if name is not None},
+            choices=choices,
             assignments=tuple(assignments or ()),
             seed=seed,
             connection=connection,

@@ -411,4 +411,4 @@ def test_full_disk_lands(spawn: Spawn, tmp_path: Path) -> None:
     assert "Traceback" not in process.stderr
     assert "land: the log x/flight.tlog cannot be written (File too large)" in process.stdout
     assert "by the operator" not in process.stdout
-    assert len(tlog.read(tmp_path / "x" / "flight.tlog").messages) > 1000
+    assert sum(1 for _ in tlog.read(tmp_path / "x" / "flight.tlog")) > 1000

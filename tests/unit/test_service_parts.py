@@ -70,10 +70,10 @@ def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
     raw = (first / "flight.tlog").read_bytes()
     assert home in raw
     log = tlog.read(first / "flight.tlog")
-    beats = [entry for entry in log.messages if entry.name == "HEARTBEAT"]
+    beats = [entry for entry in log if entry.name == "HEARTBEAT"]
     assert len(beats) == 7  # of the last five seconds, and of the flight
     assert beats[-1].message.type == 18
-    pieces = [entry.message for entry in log.messages if entry.name == "TUNNEL"]
+    pieces = [entry.message for entry in log if entry.name == "TUNNEL"]
     payloads = [bytes(piece.payload[: piece.payload_length]) for piece in pieces]
     assert manifest.join(payloads) == "vehicle: neutral\n"
     assert (first / "flight.yaml").read_text() == "vehicle: neutral\n"
