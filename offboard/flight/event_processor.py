@@ -91,7 +91,7 @@ class EventProcessor:
                     f"another companion computer is on the link: system {system} component "
                     f"{component}; only one of them may send setpoints"
                 )
-            case ClockBehind(system_id):  # its time stamps follow ours once it has heard us
+            case ClockBehind(system_id, _):  # its time stamps follow ours once it has heard us
                 self._outbox.announce_once(
                     f"the signing time of system {system_id} is behind: sending ours"
                 )
