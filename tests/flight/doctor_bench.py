@@ -62,6 +62,7 @@ class Bench:
     up: Callable[[Bytes], Bytes] = lambda frames: frames
     has_vehicle: bool = True
     signing: Signing | None = None
+    system_id: int | None = None
     sent: list[Any] = field(default_factory=list)
 
     @property
@@ -75,7 +76,10 @@ class Bench:
 
     def listen(self) -> Observation:
         listening = Listening(
-            self.now_s, signing=self.signing, capacity_bytes_ps=self.capacity_bytes_ps
+            self.now_s,
+            system_id=self.system_id,
+            signing=self.signing,
+            capacity_bytes_ps=self.capacity_bytes_ps,
         )
         while not listening.complete(self.now_s):
             for chunk in self.step():

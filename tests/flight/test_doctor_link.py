@@ -102,7 +102,10 @@ def test_second_vehicle_on_the_link() -> None:
     assert "another vehicle is heard: autopilot 2/1, from 127.0.0.1:14999" in (
         rows["senders"].findings[0].found
     )
-    assert mended(patient, before=quiet)
+    assert rows["senders"].findings[0].hint.startswith("choose one with --system")
+    assert mended(patient, system_id=1)
+    row = patient.consult("senders")["senders"]
+    assert row.findings[0].found == "besides the vehicle: autopilot 2/1"
 
 
 def test_two_vehicles_with_the_same_ids() -> None:

@@ -20,8 +20,8 @@ GOOD_PX4 = ("--param", "COM_OBL_RC_ACT=4", "--param", "COM_RCL_EXCEPT=4")
 
 
 def test_good_vehicle_over_udp(spawn: Spawn, tmp_path: Path) -> None:
-    """PX4 as it is shipped, but with signed messages: it begins with the time stamp of its key, which
-    is years old. Another vehicle is on the link, too."""
+    """PX4 as it is shipped, but with signed messages: its signing time begins with that of the key,
+    which is years old. Another vehicle is on the link, too."""
     port, path = free_port(), tmp_path / "key"
     link = f"udpin:127.0.0.1:{port}"
     create_key(path)
@@ -47,7 +47,8 @@ def test_good_vehicle_over_udp(spawn: Spawn, tmp_path: Path) -> None:
     rows = {row["check"]: row for row in report["rows"]}
     of_this_machine = {"compiled", "computer", "delay", "disk"}  # which is busy with other tests
     wrong = {name: row for name, row in rows.items() if row["level"] != "ok"}
-    assert wrong.keys() - of_this_machine == {"senders"}, wrong  # names the other vehicle
+    assert wrong.keys() <= of_this_machine, wrong
+    assert "autopilot 9/1" in str(rows["senders"])
     assert report["vehicle"] == {"autopilot": "px4", "system_id": 1}
     assert report["listened_s"] < 10.5
     assert took_s < 40.0
