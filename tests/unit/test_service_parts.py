@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import subprocess
@@ -15,6 +16,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.analysis import tlog
+from offboard.cli.daemon import may_pass
 from offboard.documents.errors import UserError
 from offboard.flight import manifest
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
@@ -24,6 +26,7 @@ from offboard.identification.uncertainty import Estimate
 from offboard.io import clock
 from offboard.io.link import LinkError
 from offboard.io.lock import Locked, connection_lock, directory_lock
+from offboard.io.log import LogError
 from offboard.io.stop import StopRequests
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat
@@ -247,6 +250,18 @@ def test_the_lock_names_its_holder_and_dies_with_it(tmp_path: Path) -> None:
             again,
         ):
             pass
+
+
+def test_a_full_disk_is_no_wrong_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with pytest.raises(LogError) as wrong:
+        Recorder(Path("/dev/null/flights"))
+    monkeypatch.setattr(os, "open", full)
+    with pytest.raises(LogError) as passing:
+        Recorder(tmp_path)
+    assert [may_pass(each.value) for each in (wrong, passing)] == [False, True]
 
 
 def test_what_the_user_of_the_unit_cannot_read(
