@@ -30,14 +30,15 @@ from offboard.cli.shared import (
     say,
     write,
 )
+from offboard.documents.command_line import DISK_ERRORS, explained
 from offboard.documents.errors import UserError
 
 STATE = Path("/var/lib/offboard")  # of the unit
 REFUSED = 3
 EXIT_CODES = (
     "Exit codes: 0 stopped, no vehicle follows it any more; 2 usage or configuration error, "
-    "nothing sent; 3 not begun for now, as another daemon has the connection, or stopped before a "
-    "take-off; 4 ended before the vehicle was handed back, or left armed."
+    "nothing sent; 3 not begun for now, as another daemon has the connection, the disk is full, or "
+    "stopped before a take-off; 4 ended before the vehicle was handed back, or left armed."
 )
 OUT = f"Directory of the flights' directories.  [default: {FLIGHTS}]"
 
@@ -131,12 +132,21 @@ def daemon(
         wanted = Service(request, anchor.value, then.value, arms, metrics, report)
         try:
             outcome = run(wanted, stops=stops, tell=lines.tell, show=lines.show)
-        except UserError as error:
-            if error.is_usage:
+        except (UserError, OSError) as error:
+            if not may_pass(error):
                 raise
-            raise CommandError(str(error), REFUSED) from None
+            sentence = explained(error) if isinstance(error, OSError) else str(error)
+            raise CommandError(sentence, REFUSED) from None
     if outcome.exit_code:
         raise CommandError(outcome.sentence, outcome.exit_code)
+
+
+def may_pass(error: UserError | OSError) -> bool:
+    """Whether it may work another time: nothing is wrong with what was asked for, or the disk is
+    full."""
+    cause = error if isinstance(error, OSError) else error.__context__
+    full = isinstance(cause, OSError) and cause.errno in DISK_ERRORS
+    return full or (isinstance(error, UserError) and not error.is_usage)
 
 
 def _print_unit(
