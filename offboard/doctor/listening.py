@@ -282,4 +282,4 @@ class Listening:
 
 def enough(wanted: WantedMessage, rates_hz: dict[str, float]) -> bool:
     """Whether a message arrives at nearly the rate that is wanted."""
-    return rates_hz.get(wanted.name, 0.0) >= ENOUGH * wanted.rate_hz
+    return rates_hz.get(wanted.name, 0.0) >= ENOUGH * wanted.arrives_hz

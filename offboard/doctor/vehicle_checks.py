@@ -10,6 +10,7 @@ from offboard.flight.phases import Limits
 
 LOW_BATTERY = 0.3
 SUSPICIOUS_RATIO = 0.5
+STARTED_S = 90.0  # of vehicle time: ArduCopter uses a GPS 30 s after its first 3D fix
 RELEASE = 255  # FIRMWARE_VERSION_TYPE
 KINDS = {0: "development", 64: "alpha", 128: "beta", 192: "release candidate", RELEASE: "release"}
 TAIL = 2  # texts of a vehicle that are shown with a finding
@@ -70,7 +71,8 @@ def estimator(seen: Observation) -> Iterable[Finding]:
     if ratio > 1.0:
         yield blocks(report.problem, hint)
     elif report.problem:
-        level = wait if seen.fix_type != FIX_3D else blocks
+        starting = seen.fix_type != FIX_3D or seen.vehicle.time_s < STARTED_S
+        level = wait if starting else blocks
         yield level(report.problem, hint)
     elif ratio > SUSPICIOUS_RATIO:
         yield warn(f"innovation ratio of {name} is {ratio:.2f}; above 1 it is rejected", hint)
@@ -92,6 +94,8 @@ def gps(seen: Observation) -> Iterable[Finding]:
         yield warn(
             f"{found}; the estimator still has a position", "check that it has another source"
         )
+    elif seen.fix_type == 0:
+        yield wait(found, "wait if the vehicle has just started, else connect a GPS")
     else:
         yield wait(found, "give the antenna a free sky and wait")
 

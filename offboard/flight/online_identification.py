@@ -139,6 +139,7 @@ class OnlineIdentification:
         self._limit_radps = self._estimate.limit_radps  # as adopted
         self._link = (0.0, 0.0)  # growth and change
         self._link_is_new = False  # not yet taken into account
+        self._followed_link = False  # the newest work has taken it into account
         self._work: Work | None = None
         self._sentences: list[str] = []
         self._record: tuple[float, ...] = ()
@@ -277,9 +278,17 @@ class OnlineIdentification:
     # ------------------------------------------------------------------ work, in pieces
 
     def _due(self, phase: Phase, time_s: float) -> Work | None:
-        """The work to begin now."""
-        if self._link_is_new:
-            return self._follow_link(*self._link)
+        """The work to begin now. A link that changes all the time gets every other turn."""
+        work = self._identifying(phase, time_s)
+        if self._link_is_new and (work is None or not self._followed_link):
+            work = self._follow_link(*self._link)
+            self._followed_link = True
+        else:
+            self._followed_link = False
+        return work
+
+    def _identifying(self, phase: Phase, time_s: float) -> Work | None:
+        """The identification that is due."""
         if not self._settings.online:
             return None
         if not self._identified:

@@ -33,8 +33,8 @@ def fitted(wanted: Iterable[WantedMessage], bytes_ps: float) -> tuple[WantedMess
     Messages at more than SLOW_HZ are thinned, all by the same factor, but not below SLOW_HZ: what
     needs more than that is refused later, by the rates that arrive.
     """
-    slow = [each for each in wanted if each.rate_hz <= SLOW_HZ]
-    fast = [each for each in wanted if each.rate_hz > SLOW_HZ]
+    slow = [each for each in wanted if each.arrives_hz <= SLOW_HZ]
+    fast = [each for each in wanted if each.arrives_hz > SLOW_HZ]
     left = SHARE * bytes_ps - _bytes_ps(slow)
     factor = min(max(left / _bytes_ps(fast), 0.0), 1.0) if fast else 1.0
     return (
@@ -44,7 +44,7 @@ def fitted(wanted: Iterable[WantedMessage], bytes_ps: float) -> tuple[WantedMess
 
 
 def _bytes_ps(wanted: Iterable[WantedMessage]) -> float:
-    return sum(each.rate_hz * (FRAME_BYTES + _payload_bytes(each.message_id)) for each in wanted)
+    return sum(each.arrives_hz * (FRAME_BYTES + _payload_bytes(each.message_id)) for each in wanted)
 
 
 def _payload_bytes(message_id: int) -> int:
@@ -71,11 +71,13 @@ class _Stream:
         if self.requested_s is None:
             return True
         waited_s, rate_hz = now_s - self.requested_s, self.rate_hz(now_s)
-        if waited_s >= _FIRST_WAIT_S and 0.0 < rate_hz < _UNHEARD * self.wanted.rate_hz:
+        enough_hz = _ENOUGH * self.wanted.arrives_hz
+        lost_hz = min(_UNHEARD * self.wanted.rate_hz, enough_hz)
+        if waited_s >= _FIRST_WAIT_S and 0.0 < rate_hz < lost_hz:
             return True  # the link has lost the requests
         if waited_s < self.wait_s:
             return False
-        if rate_hz >= _ENOUGH * self.wanted.rate_hz:
+        if rate_hz >= enough_hz:
             self.wait_s, self.requests = _FIRST_WAIT_S, 0
             return False
         return not (self.wanted.optional and self.requests >= _OPTIONAL_TRIES)

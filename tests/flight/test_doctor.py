@@ -9,8 +9,13 @@ from doctor_bench import GOOD, bench, said
 from pair import LEAN
 from pair import make as flight
 
-from offboard.doctor.findings import Level
+from offboard.doctor.findings import Level, examine
+from offboard.doctor.observation import FIX_3D, Observation
+from offboard.doctor.table import checks
 from offboard.flight.phases import ExitCode
+from offboard.flight.vehicle_state import VehicleState
+from offboard.mavlink.dialects.ardupilot import ARDUPILOT as ARDUPILOT_DIALECT
+from offboard.mavlink.events import Attitude, EstimatorReport
 from simulator.config import Scenario
 from simulator.faults import GpsLoss
 from simulator.firmware.ardupilot import ARDUPILOT
@@ -93,6 +98,20 @@ def test_gps_that_is_lost_waits_and_comes_back() -> None:
     while patient.instance.time_s < 15.0:
         patient.step()
     assert said(patient.consult()) == {}
+
+
+@pytest.mark.parametrize(("boot_s", "level"), [(33.0, WAIT), (300.0, BLOCKS)])
+def test_estimator_without_position_although_the_gps_has_a_fix(boot_s: float, level: Level) -> None:
+    """ArduCopter 4.6.3 reports a 3D fix 10 s after its start, and a position 42 s after it."""
+    starting = VehicleState(
+        estimator=EstimatorReport(
+            attitude_ok=True, velocity_ok=True, position_ok=False, height_ok=True, ratios=()
+        ),
+        attitude=Attitude(boot_s, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+    )
+    seen = Observation(vehicle=starting, dialect=ARDUPILOT_DIALECT, fix_type=FIX_3D)
+    (row,) = examine(checks(["estimator"]), seen)
+    assert row.level is level
 
 
 @pytest.mark.parametrize(

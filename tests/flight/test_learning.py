@@ -18,6 +18,7 @@ from offboard.analysis import history
 from offboard.analysis.identify import identify_flight, vehicle_file
 from offboard.documents.reading import parse
 from offboard.estimation.observer import Observer, ObserverSettings
+from offboard.flight.link_age import LinkGrowth
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Phase
 from offboard.flight.record import IDENTIFIED_ID
@@ -325,6 +326,22 @@ def test_delay_that_jumps_is_noticed_and_flown(tmp_path: Path):
     assert found_s == pytest.approx(0.257, abs=0.010)
     assert pair.score(tmp_path / "whole").max_position_m < 1.5
     assert second_lap_rmse_m(pair, tmp_path) < 0.15
+
+
+def test_vehicle_is_identified_on_a_link_that_changes_with_each_tick(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Seen beside a PX4 on a busy machine. To adapt the bandwidth leaves time to identify."""
+
+    def alternate(growth: LinkGrowth, time_s: float, growth_s: float) -> bool:
+        growth.added_s = 0.02 - growth.added_s
+        return True
+
+    monkeypatch.setattr(LinkGrowth, "step", alternate)
+    pair = neutral("hover", scenario="px4_like", learning=IDENTIFY)
+    assert pair.fly().exit_code == 0
+    begun = {phase: at_s for at_s, phase in pair.phases}
+    assert begun[Phase.TRACK] - begun[Phase.EXCITE] < 3.0 * LENGTH_S
 
 
 def test_delay_that_is_never_the_same_lowers_the_bandwidth(tmp_path: Path):

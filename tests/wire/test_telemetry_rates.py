@@ -8,9 +8,10 @@ import pytest
 from vehicle_frames import PEER, Sender
 
 from offboard.mavlink.dialects.base import WantedMessage
+from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.outgoing import CommandLong, Outgoing
 from offboard.mavlink.session import Session, SessionSettings
-from offboard.mavlink.telemetry_rates import TelemetryRates
+from offboard.mavlink.telemetry_rates import TelemetryRates, fitted
 from offboard.mavlink.vehicle_time import LinkTime
 
 POSITION = 32
@@ -102,18 +103,25 @@ def test_optional_messages_are_requested_twice() -> None:
     assert requested == {"HIL_STATE_QUATERNION": 2}
 
 
-@pytest.mark.parametrize(("default_hz", "requests"), [(0.5, 10), (2.0, 2)])
+@pytest.mark.parametrize(("default_hz", "requests"), [(0.5, 10), (2.0, 1)])
 def test_an_optional_message_at_its_default_rate_is_requested_until_it_is_heard(
     default_hz: float, requests: int
 ) -> None:
-    """The link loses every request. 2 of 10 Hz is what PX4 sends on request: it was heard."""
-    rates = TelemetryRates([WantedMessage(436, "CURRENT_MODE", 10.0, optional=True)], 0.0)
+    """The link loses every request. PX4 sends 2 Hz on request while the mode does not change."""
+    (wanted,) = (each for each in PX4.wanted if each.message_id == 436)
+    rates = TelemetryRates([wanted], 0.0)
     requested = 0
     for tick in range(300):
         if tick % round(10.0 / default_hz) == 0:
             rates.count(436, 0.1 * tick)
         requested += len(rates.due(0.1 * tick))
     assert requested == pytest.approx(requests, abs=1)
+
+
+def test_a_message_that_is_sent_when_it_changes_takes_little_of_a_slow_link() -> None:
+    wanted = WantedMessage(436, "CURRENT_MODE", 50.0, optional=True, unchanged_hz=2.0)
+    assert fitted([wanted, WantedMessage(31, "ATTITUDE_QUATERNION", 100.0)], 3000.0)[-1] == wanted
+    assert TelemetryRates([wanted], 0.0).bytes_ps == pytest.approx(44.0)
 
 
 def test_link_time_follows_the_vehicle_or_host_time() -> None:
@@ -138,8 +146,8 @@ def test_link_time_follows_the_vehicle_or_host_time() -> None:
 
 @pytest.mark.parametrize(
     ("baud", "attitude_hz"),
-    # 0.7 of 5,760 bytes/s less 366 for slow messages, over 84 per pair; HIL_STATE_QUATERNION too
-    [(57_600, 22.6), (115_200, 51.0), (921_600, 100.0)],
+    # 0.7 of 5,760 bytes/s less 190 for slow messages, over 84 per pair; HIL_STATE_QUATERNION too
+    [(57_600, 23.9), (115_200, 52.3), (921_600, 100.0)],
 )
 def test_rates_fit_a_serial_line(baud: int, attitude_hz: float) -> None:
     session = Session(SessionSettings(stream=True, capacity_bytes_ps=baud / 10))
@@ -147,8 +155,9 @@ def test_rates_fit_a_serial_line(baud: int, attitude_hz: float) -> None:
     asked = [m for m in session.poll(0.0) if isinstance(m, CommandLong)]
     rates_hz = {int(m.parameters[0]): 1e6 / m.parameters[1] for m in asked}
     assert rates_hz[31] == rates_hz[32] == pytest.approx(attitude_hz, rel=0.02)
-    assert rates_hz[436] == pytest.approx(10.0)
+    assert rates_hz[436] == pytest.approx(50.0)
     sizes = {31: 44 + 16, 32: 40, 83: 49, 436: 21, 245: 14, 1: 43 + 12, 115: 76}  # with extensions
+    rates_hz[436] = 2.0  # while the mode does not change
     assert sum(rate * sizes[number] for number, rate in rates_hz.items()) < 0.8 * baud / 10
 
 

@@ -42,12 +42,19 @@ class Takeoff(Enum):
 @dataclass(frozen=True, slots=True)
 class WantedMessage:
     """A telemetry message and the rate to request. An optional one that does not arrive, or has
-    another rate than its default, is requested at most twice."""
+    another rate than its default, is requested at most twice. `unchanged_hz`: one that is sent at
+    `rate_hz` only when it changes arrives at this rate."""
 
     message_id: int
     name: str
     rate_hz: float
     optional: bool = False
+    unchanged_hz: float | None = None
+
+    @property
+    def arrives_hz(self) -> float:
+        """Rate at which it arrives if it is sent as requested."""
+        return self.rate_hz if self.unchanged_hz is None else self.unchanged_hz
 
 
 class ParameterFault(NamedTuple):

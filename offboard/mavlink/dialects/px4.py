@@ -137,8 +137,8 @@ PX4 = Dialect(
     ),
     wanted=(
         *TRACKING_TELEMETRY,
-        # shows a change of the mode within 0.1 s; the rate of HEARTBEAT, 1 Hz, cannot be changed
-        WantedMessage(436, "CURRENT_MODE", 10.0, optional=True),
+        # shows a change of the mode within 0.02 s; the rate of HEARTBEAT, 1 Hz, cannot be changed
+        WantedMessage(436, "CURRENT_MODE", 50.0, optional=True, unchanged_hz=2.0),
         WantedMessage(115, "HIL_STATE_QUATERNION", 50.0, optional=True),  # simulated truth
     ),
 )
