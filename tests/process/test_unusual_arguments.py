@@ -13,11 +13,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from processes import Called
 
-from offboard import cli
 from offboard.analysis import tlog
 from offboard.analysis.compare import Result
-from simulator import cli as simulator_cli
 
 RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
 SURROGATE = os.fsdecode(b"caf\xe9")
@@ -27,20 +26,9 @@ LINK = ("--connect", "udpin:127.0.0.1:0", "--set", "limits.connect_s=0.1")
 
 
 @pytest.fixture
-def call(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Call:
+def call(called: Called) -> Call:
     """`call("offboard fly", ...)` -> (exit code, stderr)."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(command: str, *arguments: object) -> tuple[int, str]:
-        main = simulator_cli.main if command.startswith("simulator") else cli.main
-        monkeypatch.setattr(sys, "argv", [*command.split(), *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return int(ended.value.code or 0), capsys.readouterr().err
-
-    return call
+    return lambda *arguments: called(*arguments)[::2]
 
 
 def refused(answer: tuple[int, str]) -> str:
