@@ -159,6 +159,7 @@ CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3
         ("line.yaml", "laps: 5", "line.yaml: shape is missing; known are hover, line,"),
         ("path.csv", CSV.format(east="two"), "path.csv, row 4, column east_m: 'two' is not a"),
         ("path.csv", CSV.format(east=90), "reference path.csv: the reference asks for"),
+        ("path.csv", CSV.format(east=1e300), "a distance of inf m at"),
         (
             "circle.yaml",
             "shape: circle\nperiod_s: 0",

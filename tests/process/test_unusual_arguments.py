@@ -240,6 +240,16 @@ def test_of_many_errors_the_first_ten_are_printed(call: Call, tmp_path: Path) ->
             "limits.land_s (90 s); fly lower or allow more time",
         ),
         (
+            ("--set", "limits.radius_m=1.5"),
+            "reference lemniscate: it goes 2 m away from the take-off point, beyond "
+            "limits.radius_m (1.5 m); fly nearer or raise the limit",
+        ),
+        (
+            ("--set", "reference.height_m=40", "--set", "limits.ceiling_m=30"),
+            "reference lemniscate: it goes 40 m above the take-off point, beyond limits.ceiling_m "
+            "(30 m); fly nearer or raise the limit",
+        ),
+        (
             ("--set", "controller.swarm={particles: 10000, iterations: 100000}"),
             "controller.swarm: particles x iterations must be at most 500000, not 1000000000",
         ),
@@ -249,7 +259,7 @@ def test_of_many_errors_the_first_ten_are_printed(call: Call, tmp_path: Path) ->
         ),
     ],
 )
-def test_what_cannot_end_in_time_is_refused(
+def test_what_cannot_be_flown_to_its_end_is_refused(
     arguments: tuple[str, ...], says: str, call: Call, tmp_path: Path
 ) -> None:
     assert says in refused(call("offboard fly", *LINK, *arguments))
