@@ -97,13 +97,12 @@ def fly(
         from offboard.documents.errors import UserError
         from offboard.run.request import FlightRequest, fly_request
 
-        named = {"reference": reference, "controller": controller, "vehicle": vehicle}
         directory = tmp_path / f"flight-{len(flown) + 1}"
         flown.append(directory / "flight.tlog")
         request = FlightRequest(
             directory=directory,
             config=config,
-            choices={part: name for part, name in named.items() if name is not None},
+            choices={"reference": reference, "controller": controller, "vehicle": vehicle},
             assignments=tuple(settings),
             seed=seed,
             sitl=True,

@@ -1,12 +1,14 @@
 """Effects of faults: what each does to the vehicle when it begins, at every step, and at its end.
 
-What a fault is, is in `simulator.faults`; when it begins and ends, in `simulator.injection`. This
-module knows the whole vehicle.
+An effect is a generator: it begins, then yields until its end. Each yield returns True at a step of
+the vehicle, the step of its beginning among them, and False when the fault ends. What a fault is,
+is in `simulator.faults`; when it begins and ends, in `simulator.injection`. This module knows the
+whole vehicle.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from dataclasses import dataclass, field
 from random import Random
 from typing import Any, Protocol
@@ -56,229 +58,205 @@ class Running:
     random: Random
     datagrams: list[bytes] = field(default_factory=list)  # of a stranger, to be sent
     begins_s: float | None = None  # None: the moment it counts from has not come
-    begun: bool = False
+    effect: Effect | None = None  # once it has begun
     over: bool = False
-    memory: Any = None  # what a later step or its end needs
 
 
-def nothing(vehicle: Vehicle, running: Running) -> None:
-    pass
+Effect = Generator[None, bool, None]
 
 
-def _impair_link(vehicle: Vehicle, running: Running) -> None:
+def _until_the_end() -> Effect:
+    while (yield):
+        pass
+
+
+def _link(vehicle: Vehicle, running: Running) -> Effect:
     for channel in running.channels:
         channel.on = True
-
-
-def _restore_link(vehicle: Vehicle, running: Running) -> None:
+    yield from _until_the_end()
     for channel in running.channels:
         channel.on = False
 
 
-def _jump(vehicle: Vehicle, running: Running) -> None:
+def _estimator_jump(vehicle: Vehicle, running: Running) -> Effect:
     vehicle.autopilot.plant.reset_estimate(running.fault.offset_ned_m)
+    yield from ()
 
 
-def _lose_fix(vehicle: Vehicle, running: Running) -> None:
+def _gps_loss(vehicle: Vehicle, running: Running) -> Effect:
     vehicle.autopilot.state.gps_healthy = False
-    running.memory = 0.0
-
-
-def _drift(vehicle: Vehicle, running: Running) -> None:
-    step_m = running.fault.drift_mps * STEP_S * 0.5**0.5
-    running.memory += step_m
-    vehicle.autopilot.plant.drift_estimate((step_m, step_m, 0.0))
-
-
-def _restore_fix(vehicle: Vehicle, running: Running) -> None:
+    step_m, drifted_m = running.fault.drift_mps * STEP_S * 0.5**0.5, 0.0
+    while (yield):
+        drifted_m += step_m
+        vehicle.autopilot.plant.drift_estimate((step_m, step_m, 0.0))
     vehicle.autopilot.state.gps_healthy = True
-    if running.memory:
-        vehicle.autopilot.plant.reset_estimate((-running.memory, -running.memory, 0.0))
+    if drifted_m:
+        vehicle.autopilot.plant.reset_estimate((-drifted_m, -drifted_m, 0.0))
 
 
-def _stop_message(vehicle: Vehicle, running: Running) -> None:
+def _silent_message(vehicle: Vehicle, running: Running) -> Effect:
     vehicle.view.silent[running.fault.message] = running.fault.every or 0
-
-
-def _resume_message(vehicle: Vehicle, running: Running) -> None:
+    yield from _until_the_end()
     vehicle.view.silent.pop(running.fault.message, None)
 
 
-def _freeze_message(vehicle: Vehicle, running: Running) -> None:
+def _stuck_message(vehicle: Vehicle, running: Running) -> Effect:
     vehicle.view.stuck[running.fault.message] = Stuck(running.fault.stamp_runs)
-
-
-def _unfreeze_message(vehicle: Vehicle, running: Running) -> None:
+    yield from _until_the_end()
     vehicle.view.stuck.pop(running.fault.message, None)
 
 
-def _offset_velocity(vehicle: Vehicle, running: Running) -> None:
+def _velocity_error(vehicle: Vehicle, running: Running) -> Effect:
     vehicle.autopilot.state.velocity_error_ned_mps = running.fault.offset_ned_mps
-
-
-def _restore_velocity(vehicle: Vehicle, running: Running) -> None:
+    yield from _until_the_end()
     vehicle.autopilot.state.velocity_error_ned_mps = (0.0, 0.0, 0.0)
 
 
-def _report_wrongly(vehicle: Vehicle, running: Running) -> None:
+def _wrong_landed_state(vehicle: Vehicle, running: Running) -> Effect:
     on_ground = running.fault.reports is LandedState.ON_GROUND
     vehicle.view.wrong_landed_state = 1 if on_ground else 2
-
-
-def _report_rightly(vehicle: Vehicle, running: Running) -> None:
+    yield from _until_the_end()
     vehicle.view.wrong_landed_state = None
 
 
-def _detect_no_landing(vehicle: Vehicle, running: Running) -> None:
-    vehicle.autopilot.pilot.detector.reset()
+def _blind_land_detector(vehicle: Vehicle, running: Running) -> Effect:
+    while (yield):
+        vehicle.autopilot.pilot.detector.reset()
 
 
-def _cut_motors(vehicle: Vehicle, running: Running) -> None:
-    plant = vehicle.autopilot.plant
-    if running.memory is None and plant.height_m <= running.fault.below_m:
-        running.memory = _NO_THRUST
-        plant.scale_thrust(_NO_THRUST)
+def _motors_cut(vehicle: Vehicle, running: Running) -> Effect:
+    plant, cut = vehicle.autopilot.plant, False
+    while (yield):
+        if not cut and plant.height_m <= running.fault.below_m:
+            cut = True
+            plant.scale_thrust(_NO_THRUST)
+    if cut:
+        plant.scale_thrust(1.0 / _NO_THRUST)
 
 
-def _restart_motors(vehicle: Vehicle, running: Running) -> None:
-    if running.memory is not None:
-        _restore_thrust(vehicle, running)
+def _scaled_thrust(vehicle: Vehicle, factor: float) -> Effect:
+    vehicle.autopilot.plant.scale_thrust(factor)
+    yield from _until_the_end()
+    vehicle.autopilot.plant.scale_thrust(1.0 / factor)
 
 
-def _weaken_motor(vehicle: Vehicle, running: Running) -> None:
-    running.memory = (3.0 + running.fault.motor_scale) / 4.0
-    vehicle.autopilot.plant.scale_thrust(running.memory)
+def _weak_motor(vehicle: Vehicle, running: Running) -> Effect:
+    return _scaled_thrust(vehicle, (3.0 + running.fault.motor_scale) / 4.0)
 
 
-def _change_thrust(vehicle: Vehicle, running: Running) -> None:
-    running.memory = running.fault.thrust_scale
-    vehicle.autopilot.plant.scale_thrust(running.memory)
+def _thrust_change(vehicle: Vehicle, running: Running) -> Effect:
+    return _scaled_thrust(vehicle, running.fault.thrust_scale)
 
 
-def _restore_thrust(vehicle: Vehicle, running: Running) -> None:
-    vehicle.autopilot.plant.scale_thrust(1.0 / running.memory)
-
-
-def _change_mass(vehicle: Vehicle, running: Running) -> None:
+def _mass_change(vehicle: Vehicle, running: Running) -> Effect:
     vehicle.autopilot.plant.scale_mass(running.fault.mass_scale)
-
-
-def _restore_mass(vehicle: Vehicle, running: Running) -> None:
+    yield from _until_the_end()
     vehicle.autopilot.plant.scale_mass(1.0 / running.fault.mass_scale)
 
 
-def _drop_battery(vehicle: Vehicle, running: Running) -> None:
+def _battery_drop(vehicle: Vehicle, running: Running) -> Effect:
     vehicle.autopilot.plant.set_battery(running.fault.remaining)
+    yield from ()
 
 
-def _reboot(vehicle: Vehicle, running: Running) -> None:
+def _reboot(vehicle: Vehicle, running: Running) -> Effect:
     vehicle.reboot(running.fault.for_s)
+    yield from ()
 
 
-def _jump_clock(vehicle: Vehicle, running: Running) -> None:
-    vehicle.view.clock_offset_us += round(running.fault.jump_s * 1e6)
+def _clock_jump(vehicle: Vehicle, running: Running) -> Effect:
+    jump_us = round(running.fault.jump_s * 1e6)
+    vehicle.view.clock_offset_us += jump_us
+    yield from _until_the_end()
+    vehicle.view.clock_offset_us -= jump_us
 
 
-def _jump_clock_back(vehicle: Vehicle, running: Running) -> None:
-    vehicle.view.clock_offset_us -= round(running.fault.jump_s * 1e6)
-
-
-def _refuse(vehicle: Vehicle, running: Running) -> None:
+def _refusal(vehicle: Vehicle, running: Running) -> Effect:
     of = running.fault.of
     text = critical(f"{_REFUSED_TITLES[of]}: {running.fault.text}")
     for event in _REFUSED_EVENTS[of]:
         vehicle.autopilot.commander.refused[event] = text
-
-
-def _allow(vehicle: Vehicle, running: Running) -> None:
-    for event in _REFUSED_EVENTS[running.fault.of]:
+    yield from _until_the_end()
+    for event in _REFUSED_EVENTS[of]:
         vehicle.autopilot.commander.refused.pop(event, None)
 
 
-def _take_over(vehicle: Vehicle, running: Running) -> None:
+def _pilot_takes_over(vehicle: Vehicle, running: Running) -> Effect:
     """Switch as by command, and where no command may, as to a mode that needs sticks."""
     autopilot = vehicle.autopilot
     mode = autopilot.firmware.mode_named(running.fault.mode or autopilot.firmware.hold_mode)
     assert mode is not None, "simulator.config checks it"
-    running.memory = autopilot.commander.mode.name
+    before = autopilot.commander.mode.name
     autopilot.handle("mode", Request(mode.name))
     if autopilot.commander.mode is not mode:
         autopilot.commander.switch(mode.name)
+    yield from _until_the_end()
+    vehicle.autopilot.handle("mode", Request(before))
 
 
-def _hand_back(vehicle: Vehicle, running: Running) -> None:
-    vehicle.autopilot.handle("mode", Request(running.memory))
-
-
-def _disarm(vehicle: Vehicle, running: Running) -> None:
+def _pilot_disarms(vehicle: Vehicle, running: Running) -> Effect:
     vehicle.autopilot.handle("force disarm")
+    yield from ()
 
 
-def _add_sender(vehicle: Vehicle, running: Running) -> None:
-    fault = running.fault
-    running.memory = Sender(fault.system or vehicle.view.system, fault.component)
+def _sender(vehicle: Vehicle, running: Running) -> Sender:
+    return Sender(running.fault.system or vehicle.view.system, running.fault.component)
 
 
-def _add_companion(vehicle: Vehicle, running: Running) -> None:
-    _add_sender(vehicle, running)
-    fault, target = running.fault, vehicle.view.system
+def _second_sender(vehicle: Vehicle, running: Running) -> Effect:
+    fault, target, sender = running.fault, vehicle.view.system, _sender(vehicle, running)
     if fault.command is not None:
-        command = running.memory.command(target, fault.command, fault.params)
-        vehicle.companion.receive(command)
+        vehicle.companion.receive(sender.command(target, fault.command, fault.params))
+    while (yield):
+        sender.step += 1
+        for _ in sender.due(fault.setpoint_rate_hz):
+            vehicle.companion.receive(sender.level_setpoint(vehicle.view.system, fault.thrust))
+        for _ in sender.due(_HEARTBEAT_HZ):
+            vehicle.companion.outbox.forward(sender.companion_heartbeat())
 
 
-def _send_setpoints(vehicle: Vehicle, running: Running) -> None:
-    fault, sender = running.fault, running.memory
-    sender.step += 1
-    for _ in sender.due(fault.setpoint_rate_hz):
-        vehicle.companion.receive(sender.level_setpoint(vehicle.view.system, fault.thrust))
-    for _ in sender.due(_HEARTBEAT_HZ):
-        vehicle.companion.outbox.forward(sender.companion_heartbeat())
+def _second_vehicle(vehicle: Vehicle, running: Running) -> Effect:
+    sender = _sender(vehicle, running)
+    while (yield):
+        sender.step += 1
+        for _ in sender.due(running.fault.rate_hz):
+            heartbeat = sender.autopilot_heartbeat(vehicle.autopilot.firmware)
+            vehicle.companion.outbox.forward(heartbeat)
 
 
-def _send_heartbeats(vehicle: Vehicle, running: Running) -> None:
-    sender = running.memory
-    sender.step += 1
-    for _ in sender.due(running.fault.rate_hz):
-        heartbeat = sender.autopilot_heartbeat(vehicle.autopilot.firmware)
-        vehicle.companion.outbox.forward(heartbeat)
-
-
-def _send_strange_datagrams(vehicle: Vehicle, running: Running) -> None:
+def _stranger(vehicle: Vehicle, running: Running) -> Effect:
     """Datagrams that nobody fetches are limited in number."""
-    fault, sender = running.fault, running.memory
-    sender.step += 1
-    for _ in sender.due(fault.rate_hz):
-        if fault.sends is Datagrams.NOISE:
-            running.datagrams.append(running.random.randbytes(fault.size_bytes))
-        else:
-            running.datagrams.append(sender.autopilot_heartbeat(vehicle.autopilot.firmware))
-    del running.datagrams[:-_DATAGRAMS_MAX]
+    fault, sender = running.fault, _sender(vehicle, running)
+    while (yield):
+        sender.step += 1
+        for _ in sender.due(fault.rate_hz):
+            if fault.sends is Datagrams.NOISE:
+                running.datagrams.append(running.random.randbytes(fault.size_bytes))
+            else:
+                running.datagrams.append(sender.autopilot_heartbeat(vehicle.autopilot.firmware))
+        del running.datagrams[:-_DATAGRAMS_MAX]
 
 
-Effect = Callable[[Vehicle, Running], None]
-
-# By fault: what it does when it begins, at every step, and when it ends.
-EFFECTS: dict[type, tuple[Effect, Effect, Effect]] = {
-    faults.LinkFault: (_impair_link, nothing, _restore_link),
-    faults.EstimatorJump: (_jump, nothing, nothing),
-    faults.GpsLoss: (_lose_fix, _drift, _restore_fix),
-    faults.SilentMessage: (_stop_message, nothing, _resume_message),
-    faults.StuckMessage: (_freeze_message, nothing, _unfreeze_message),
-    faults.VelocityError: (_offset_velocity, nothing, _restore_velocity),
-    faults.WrongLandedState: (_report_wrongly, nothing, _report_rightly),
-    faults.BlindLandDetector: (nothing, _detect_no_landing, nothing),
-    faults.MotorsCut: (nothing, _cut_motors, _restart_motors),
-    faults.WeakMotor: (_weaken_motor, nothing, _restore_thrust),
-    faults.ThrustChange: (_change_thrust, nothing, _restore_thrust),
-    faults.MassChange: (_change_mass, nothing, _restore_mass),
-    faults.BatteryDrop: (_drop_battery, nothing, nothing),
-    faults.Reboot: (_reboot, nothing, nothing),
-    faults.ClockJump: (_jump_clock, nothing, _jump_clock_back),
-    faults.Refusal: (_refuse, nothing, _allow),
-    faults.PilotTakesOver: (_take_over, nothing, _hand_back),
-    faults.PilotDisarms: (_disarm, nothing, nothing),
-    faults.SecondSender: (_add_companion, _send_setpoints, nothing),
-    faults.SecondVehicle: (_add_sender, _send_heartbeats, nothing),
-    faults.Stranger: (_add_sender, _send_strange_datagrams, nothing),
+EFFECTS: dict[type, Callable[[Vehicle, Running], Effect]] = {
+    faults.LinkFault: _link,
+    faults.EstimatorJump: _estimator_jump,
+    faults.GpsLoss: _gps_loss,
+    faults.SilentMessage: _silent_message,
+    faults.StuckMessage: _stuck_message,
+    faults.VelocityError: _velocity_error,
+    faults.WrongLandedState: _wrong_landed_state,
+    faults.BlindLandDetector: _blind_land_detector,
+    faults.MotorsCut: _motors_cut,
+    faults.WeakMotor: _weak_motor,
+    faults.ThrustChange: _thrust_change,
+    faults.MassChange: _mass_change,
+    faults.BatteryDrop: _battery_drop,
+    faults.Reboot: _reboot,
+    faults.ClockJump: _clock_jump,
+    faults.Refusal: _refusal,
+    faults.PilotTakesOver: _pilot_takes_over,
+    faults.PilotDisarms: _pilot_disarms,
+    faults.SecondSender: _second_sender,
+    faults.SecondVehicle: _second_vehicle,
+    faults.Stranger: _stranger,
 }

@@ -12,7 +12,7 @@ from random import Random
 
 from simulator import faults
 from simulator.autopilot.autopilot import Autopilot
-from simulator.effects import EFFECTS, Running, Vehicle, nothing
+from simulator.effects import EFFECTS, Running, Vehicle
 from simulator.faults import Direction, Fault, Moment
 from simulator.firmware.values import Behaviour
 from simulator.link.impairment import Channel, Path
@@ -61,16 +61,13 @@ class Injection:
             running.begins_s = since_s + fault.at_s
         if now_s < running.begins_s:
             return
-        begin, during, end = EFFECTS[type(fault)]
-        if not running.begun:
-            running.begun = True
-            begin(vehicle, running)
-        if fault.for_s is not None and now_s >= running.begins_s + fault.for_s:
-            end(vehicle, running)
-            running.over = True
-        elif during is not nothing:
-            during(vehicle, running)
-        elif fault.for_s is None:
+        try:
+            if running.effect is None:
+                running.effect = EFFECTS[type(fault)](vehicle, running)
+                next(running.effect)
+            lasts = fault.for_s is None or now_s < running.begins_s + fault.for_s
+            running.effect.send(lasts)
+        except StopIteration:
             running.over = True
 
 

@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 
 from offboard.model.vehicle import Vehicle
 from simulator.autopilot.autopilot import Autopilot
+from simulator.autopilot.pilot import OFF
 from simulator.faults import Fault
 from simulator.firmware.base import Firmware
 from simulator.injection import prepare
@@ -22,7 +23,6 @@ from simulator.mavlink.telemetry import builders
 from simulator.mavlink.view import View
 from simulator.start import Start, take_off
 from simulator.steps import STEP_S, STEP_US
-from simulator.vehicle.attitude import Demand
 from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.plant import Plant
 
@@ -31,7 +31,6 @@ VIRTUAL_EPOCH_US = 1_767_225_600_000_000  # 2026-01-01, where virtual time begin
 BARRIER_INTERVAL_MS = 20
 RESTART_S = 1.0  # duration of a reboot by command
 _TIMESYNC = 111
-_OFF = Demand()
 
 
 class Instance:
@@ -146,7 +145,7 @@ class Instance:
         if self._injection is not None:
             self._inject()
         if self.steps <= self._back_at_step:
-            self.autopilot.plant.advance(STEP_S, _OFF)
+            self.autopilot.plant.advance(STEP_S, OFF)
             return
         self.autopilot.step()
         if self.autopilot.commander.reboot_requested:

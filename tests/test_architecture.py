@@ -47,7 +47,7 @@ def test_only_the_clock_reads_the_time() -> None:
 
 def test_only_the_edges_open_sockets() -> None:
     links = {f"simulator/link/{name}.py" for name in ("links", "tcp", "udp")}
-    opening = ("connection", "stream_link", "stream_sources", "udp_link")
+    opening = ("connection", "lock", "stream_link", "stream_sources", "udp_link")
     edges = {f"offboard/io/{name}.py" for name in opening}
     supervisor = {f"offboard/supervisor/{name}.py" for name in ("supervisor", "process")}
     pipes = {"offboard/run/sitl.py", "simulator/pool.py"}  # between two processes

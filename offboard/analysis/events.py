@@ -28,6 +28,11 @@ class Event:
     who: str
     what: str
 
+    @property
+    def phase(self) -> str:
+        """The phase that it announces."""
+        return self.what.partition(":")[0]
+
 
 def phases(texts: Stream, clock: Clock) -> tuple[Event, ...]:
     """The phases that our STATUSTEXT announce: name, colon, reason."""

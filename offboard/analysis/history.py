@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from offboard.analysis.events import Event, announcements, modes, phases, vehicle_messages
 from offboard.analysis.sender import Stream, continuous_s
-from offboard.analysis.tlog import LoggedMessage, Tlog, name_of
+from offboard.analysis.tlog import LoggedMessage, Tlog
 from offboard.analysis.truth import true_positions
 from offboard.flight import manifest
 from offboard.flight.record import (
@@ -28,7 +28,6 @@ from offboard.flight.record import (
     records_of,
 )
 from offboard.mavlink.dialects.base import Dialect
-from offboard.mavlink.framing import HEARTBEAT, TIMESYNC
 from offboard.mavlink.session import DIALECTS
 
 Array = NDArray[np.float64]
@@ -42,32 +41,19 @@ LATE_S = 3.0  # telemetry that is older when it arrives is not scored
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: ground stations and companions
 _ARRAYS = {RECORD_NAME, IDENTIFIED_NAME}
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
-_FLOAT_ARRAY = 350
-_TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
+TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
 _SUBSTITUTES = (30, 33)  # ATTITUDE, GLOBAL_POSITION_INT: the clock of logs without these
 # kinds of messages of which every stretch has its own, and kinds that are kept from the beginning
-_OUR_SAMPLES = {
-    82: "SET_ATTITUDE_TARGET",
-    84: "SET_POSITION_TARGET_LOCAL_NED",
-    85: "POSITION_TARGET_LOCAL_NED",
-    350: "DEBUG_FLOAT_ARRAY",
-}
-_SAMPLES = {
-    31: "ATTITUDE_QUATERNION",
-    32: "LOCAL_POSITION_NED",
-    108: "SIM_STATE",
-    115: "HIL_STATE_QUATERNION",
-}
-_OUR_NEWS = {111: "TIMESYNC", 253: "STATUSTEXT"}
-_NEWS = {
-    0: "HEARTBEAT",
-    49: "GPS_GLOBAL_ORIGIN",
-    77: "COMMAND_ACK",
-    111: "TIMESYNC",
-    242: "HOME_POSITION",
-    245: "EXTENDED_SYS_STATE",
-    253: "STATUSTEXT",
-}
+_OUR_SAMPLES = (
+    "SET_ATTITUDE_TARGET", "SET_POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_LOCAL_NED",
+    "DEBUG_FLOAT_ARRAY",
+)  # fmt: skip
+_SAMPLES = ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "SIM_STATE", "HIL_STATE_QUATERNION")
+_OUR_NEWS = ("TIMESYNC", "STATUSTEXT")
+_NEWS = (
+    "HEARTBEAT", "GPS_GLOBAL_ORIGIN", "COMMAND_ACK", "TIMESYNC", "HOME_POSITION",
+    "EXTENDED_SYS_STATE", "STATUSTEXT",
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,32 +140,32 @@ class _Collector:
     def __init__(self, vehicle_id: int | None, dialect: Dialect | None) -> None:
         self._vehicle_id = vehicle_id
         self._dialect = dialect
-        self._ours = {kind: Stream(name) for kind, name in (_OUR_SAMPLES | _OUR_NEWS).items()}
-        self._theirs = {kind: Stream(name) for kind, name in (_SAMPLES | _NEWS).items()}
-        self._counts: Counter[int] = Counter()
+        self._ours = {name: Stream(name) for name in (*_OUR_SAMPLES, *_OUR_NEWS)}
+        self._theirs = {name: Stream(name) for name in (*_SAMPLES, *_NEWS)}
+        self._counts: Counter[str] = Counter()
         self._unix_us = (0, 0)
         self._place = 0
         self._anchor_ms = math.nan
-        self._clocks: tuple[int, ...] = _TELEMETRY + _SUBSTITUTES
+        self._clocks: tuple[int, ...] = TELEMETRY + _SUBSTITUTES
         self.now_ms = math.nan  # stamp of the newest telemetry
         self.damage_ms = math.nan  # of the newest one before the first damage
         self._rows: dict[str, Array] = {}  # of the present stretch
         self._identified: list[Array] = []
 
     def add(self, entry: LoggedMessage) -> None:
-        kind, component = entry.frame.message_id, entry.frame.component_id
-        self._counts[kind] += 1
+        kind, component, name = entry.frame.message_id, entry.frame.component_id, entry.name
+        self._counts[name] += 1
         self._unix_us = (self._unix_us[0] or entry.unix_us, entry.unix_us)
         self._place += 1
         ours = component in OUR_COMPONENTS
         if not ours and entry.frame.system_id != self._vehicle_id:
             return
-        stream = (self._ours if ours else self._theirs).get(kind)
+        stream = (self._ours if ours else self._theirs).get(name)
         if stream is not None and _is_used(entry, ours):
             stream.add(entry, self._place, self.now_ms)
         if kind in self._clocks and not ours:
-            if kind in _TELEMETRY:
-                self._clocks = _TELEMETRY
+            if kind in TELEMETRY:
+                self._clocks = TELEMETRY
             self.now_ms = float(int.from_bytes(entry.frame.payload[:4], "little"))
             if math.isnan(self._anchor_ms):
                 self._anchor_ms = self.now_ms
@@ -193,14 +179,14 @@ class _Collector:
 
     def history(self, damage: str = "") -> History:
         """The present stretch."""
-        arrays = self._ours[_FLOAT_ARRAY].columns("time_usec array_id data")
+        arrays = self._ours["DEBUG_FLOAT_ARRAY"].columns("time_usec array_id data")
         arrays[:, 0] = self.time_s(arrays[:, 0] / 1e3)
         of_ticks = np.isin(arrays[:, 1], list(LAYOUTS))
         samples = {
-            "position": self._table(self._theirs[32], POSITION_FIELDS),
-            "attitude": self._table(self._theirs[31], ATTITUDE_FIELDS),
+            "position": self._table(self._theirs["LOCAL_POSITION_NED"], POSITION_FIELDS),
+            "attitude": self._table(self._theirs["ATTITUDE_QUATERNION"], ATTITUDE_FIELDS),
             "truth": true_positions(self._theirs, self.time_s),
-            "reference": self._table(self._ours[85], REFERENCE_FIELDS),
+            "reference": self._table(self._ours["POSITION_TARGET_LOCAL_NED"], REFERENCE_FIELDS),
             "setpoint": self._setpoints(),
             "ticks": arrays[of_ticks],
         }
@@ -209,19 +195,17 @@ class _Collector:
             for name, rows in samples.items()
         }
         self._identified.extend(np.delete(arrays[~of_ticks], 1, axis=1)[:, : 1 + IDENTIFIED_SIZE])
-        for stream in (*map(self._ours.get, _OUR_SAMPLES), *map(self._theirs.get, _SAMPLES)):
-            assert stream is not None
-            stream.clear()
+        for name in _OUR_SAMPLES:
+            self._ours[name].clear()
+        for name in _SAMPLES:
+            self._theirs[name].clear()
         return self._history(damage)
 
     def _history(self, damage: str) -> History:
         tables = dict(self._rows)
         ticks = tables.pop("ticks")
-        heartbeat = self._news(0, "base_mode system_status")
+        heartbeat = self._news("HEARTBEAT", "base_mode system_status")
         heartbeat[:, 1] = (heartbeat[:, 1].astype(np.int64) & _ARMED) > 0
-        counts: Counter[str] = Counter()
-        for kind, count in self._counts.items():
-            counts[name_of(kind)] += count
         return History(
             **tables,
             record_time_s=ticks[:, 0],
@@ -229,12 +213,14 @@ class _Collector:
             identified=np.reshape(self._identified, (-1, 1 + IDENTIFIED_SIZE)),
             link_delay=self._link_delay(),
             heartbeat=heartbeat,
-            landed=self._news(245, "landed_state"),
-            phases=phases(self._ours[253], self.time_s),
-            announcements=announcements(self._ours[253], self.time_s),
-            modes=modes(self._theirs[0], self._dialect, self.time_s),
-            vehicle_messages=vehicle_messages(self._theirs[253], self._theirs[77], self.time_s),
-            messages=counts,
+            landed=self._news("EXTENDED_SYS_STATE", "landed_state"),
+            phases=phases(self._ours["STATUSTEXT"], self.time_s),
+            announcements=announcements(self._ours["STATUSTEXT"], self.time_s),
+            modes=modes(self._theirs["HEARTBEAT"], self._dialect, self.time_s),
+            vehicle_messages=vehicle_messages(
+                self._theirs["STATUSTEXT"], self._theirs["COMMAND_ACK"], self.time_s
+            ),
+            messages=self._counts.copy(),
             wall_s=(self._unix_us[1] - self._unix_us[0]) / 1e6,
             damage=damage,
             damage_s=float(self.time_s(self.damage_ms)),
@@ -250,16 +236,17 @@ class _Collector:
         rows[:, 0] = self.time_s(rows[:, 0])
         return rows
 
-    def _news(self, kind: int, fields: str) -> Array:
+    def _news(self, name: str, fields: str) -> Array:
         """Fields of the vehicle's messages, with the time of the telemetry before as first."""
-        stream = self._theirs[kind]
+        stream = self._theirs[name]
         return np.column_stack((self.time_s(np.array(stream.now_ms)), stream.columns(fields)))
 
     # ------------------------------------------------------------------ samples
 
     def _setpoints(self) -> Array:
         """Attitude and position setpoints in the order in which they were sent."""
-        attitude, position = self._ours[82], self._ours[84]
+        attitude = self._ours["SET_ATTITUDE_TARGET"]
+        position = self._ours["SET_POSITION_TARGET_LOCAL_NED"]
         rows = np.full((len(attitude) + len(position), 7), math.nan)
         stamps = (attitude.columns("time_boot_ms"), position.columns("time_boot_ms"))
         rows[:, 0] = self.time_s(np.concatenate(stamps)[:, 0])
@@ -270,7 +257,7 @@ class _Collector:
     def _link_delay(self) -> Array:
         """From the vehicle's answers to our TIMESYNC requests."""
         requests, answers = (
-            streams[TIMESYNC].columns("ts1 tc1") for streams in (self._ours, self._theirs)
+            streams["TIMESYNC"].columns("ts1 tc1") for streams in (self._ours, self._theirs)
         )
         answered = answers[np.isin(answers[:, 0], requests[:, 0])]
         return np.column_stack((answered[:, 0], answered[:, 1] - answered[:, 0])) * 1e-9
@@ -278,12 +265,12 @@ class _Collector:
 
 def _is_used(entry: LoggedMessage, ours: bool) -> bool:
     """Whether a message of a kind that is collected is one of those that we need."""
-    kind, payload = entry.frame.message_id, entry.frame.payload
-    if kind == TIMESYNC:  # our requests, and replies of the vehicle: tc1 is 0 in a request
+    name, payload = entry.name, entry.frame.payload
+    if name == "TIMESYNC":  # our requests, and replies of the vehicle: tc1 is 0 in a request
         return any(payload[:8]) != ours
-    if kind == _FLOAT_ARRAY:
+    if name == "DEBUG_FLOAT_ARRAY":
         return payload[10:20].rstrip(b"\0").decode(errors="replace") in _ARRAYS
-    return kind != HEARTBEAT or entry.frame.component_id == 1
+    return name != "HEARTBEAT" or entry.frame.component_id == 1
 
 
 def vehicle(log: Tlog) -> tuple[int | None, Dialect | None]:

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.analysis.history import History
+from offboard.analysis.history import vehicle as vehicle_of
 from offboard.analysis.tlog import Tlog
 from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.identification.attitude_fit import ResponseFit
@@ -20,7 +21,6 @@ from offboard.identification.trace import Trace, clean
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import Identified, identify
 from offboard.mavlink.dialects.base import ThrustRule
-from offboard.mavlink.session import DIALECTS
 from offboard.model.frames import course_from_quaternion, thrust_direction_from_quaternion
 from offboard.model.vehicle import AxisResponse, Vehicle
 
@@ -48,7 +48,8 @@ def trace_of(log: Tlog, history: History) -> Trace:
     commanded = thrust_direction_from_quaternion(setpoint[:, 2:6])
     direction = thrust_direction_from_quaternion(attitude[:, 1:5])
     thrust = setpoint[:, 6]
-    if _thrust_rule(log) is ThrustRule.TILT_COMPENSATED:
+    _, dialect = vehicle_of(log)
+    if dialect and dialect.thrust_rule is ThrustRule.TILT_COMPENSATED:
         thrust = thrust / np.maximum(commanded[:, 2], 0.3)
     trace = clean(
         np.column_stack(
@@ -66,14 +67,6 @@ def _flown(history: History) -> tuple[float, float]:
     indices = [PHASE_CODES[phase] for phase in FLOWN]
     times = history.record_time_s[np.isin(history.records["phase"], indices)]
     return (times[0] + LIFTED_OFF_S, times[-1]) if len(times) else (-math.inf, math.inf)
-
-
-def _thrust_rule(log: Tlog) -> ThrustRule:
-    known = {dialect.mav_autopilot: dialect.thrust_rule for dialect in DIALECTS.values()}
-    for entry in log:
-        if entry.name == "HEARTBEAT" and entry.message.autopilot in known:
-            return known[entry.message.autopilot]
-    return ThrustRule.COLLECTIVE
 
 
 def rows(found: Identified) -> Iterator[tuple[str, Estimate | None, str, str]]:

@@ -10,17 +10,10 @@ from numpy.typing import NDArray
 from offboard.analysis.figure import BLUE, GREY, RED, Figure, curve, panels
 from offboard.analysis.identify import rows
 from offboard.analysis.page import render
+from offboard.identification.attitude_fit import tilt_signals, yaw_signals
 from offboard.identification.motion_fit import Motion, predicted_velocity
 from offboard.identification.response import second_order
-from offboard.identification.trace import (
-    COURSE,
-    NORTH,
-    SENT_AT,
-    SENT_COURSE,
-    SENT_NORTH,
-    STAMP,
-    Trace,
-)
+from offboard.identification.trace import Trace
 from offboard.identification.vehicle_fit import Identified
 from offboard.model.vehicle import AxisResponse, Vehicle
 
@@ -41,7 +34,13 @@ def page(flight: str, found: Identified, trace: Trace, prior: Vehicle) -> str:
     vehicle = found.applied_to(prior)
     last = trace.between(max(trace.begin_s, trace.end_s - SHOWN_S), trace.end_s)
     flown = not math.isnan(trace.begin_s) and len(trace.commands) > 0
-    figures = [_tilt(last, vehicle), _yaw(last, vehicle)] if flown else []
+    figures = []
+    if flown:
+        axes = ("thrust direction north", "thrust direction east")
+        figures = [
+            _response("Tilt", axes, tilt_signals(last), vehicle.tilt),
+            _response("Course", ("course, deg",), yaw_signals(last), vehicle.yaw, 180 / math.pi),
+        ]
     if len(trace.commands) and len(last.position) > 2:
         figures.append(_motion(last, vehicle))
     return render(
@@ -53,30 +52,15 @@ def page(flight: str, found: Identified, trace: Trace, prior: Vehicle) -> str:
     )
 
 
-def _tilt(trace: Trace, vehicle: Vehicle) -> Figure:
-    measured = trace.attitude[:, NORTH : NORTH + 2]
-    sent = trace.commands[:, SENT_NORTH : SENT_NORTH + 2]
-    titles = ("thrust direction north", "thrust direction east")
-    return _response("Tilt", titles, trace, measured, sent, vehicle.tilt)
-
-
-def _yaw(trace: Trace, vehicle: Vehicle) -> Figure:
-    measured = np.unwrap(trace.attitude[:, COURSE])[:, None]
-    sent = np.unwrap(trace.commands[:, SENT_COURSE])[:, None]
-    return _response("Course", ("course, deg",), trace, measured, sent, vehicle.yaw, 180 / math.pi)
-
-
 def _response(
     title: str,
     titles: tuple[str, ...],
-    trace: Trace,
-    measured: Array,
-    sent: Array,
+    signals: tuple[Array, Array, Array, Array],
     response: AxisResponse,
     scale: float = 1.0,
 ) -> Figure:
-    """Commanded, measured and modelled signals (N, axes), one panel per axis, times `scale`."""
-    times, sent_at = trace.attitude[:, STAMP], trace.commands[:, SENT_AT]
+    """Commanded, measured and modelled signals, one panel per axis, times `scale`."""
+    times, measured, sent_at, sent = signals
     constants = response.delay_s, response.natural_frequency_radps, response.damping
     modelled = second_order(times, sent_at, sent, *constants)
     shown = sent_at >= times[0]

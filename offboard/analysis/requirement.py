@@ -8,6 +8,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+from offboard.analysis.score import FIGURES
 from offboard.documents.errors import UserError
 
 _OPERATORS: dict[str, Callable[[float, float], bool]] = {
@@ -21,15 +22,11 @@ _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _PATTERN = re.compile(rf"\s*(\w+)\s*(<=|>=|==|<|>)\s*({_NUMBER})\s*")
 
 
-class RequirementError(UserError):
-    """A requirement that cannot be read; the sentence says what would be right."""
-
-
 @dataclass(frozen=True, slots=True)
 class Requirement:
     """One figure of the score compared with a number.
 
-    Example: `Requirement.parse("rmse_position_m<0.05", FIGURES).met(score.figures())`.
+    Example: `Requirement.parse("rmse_position_m<0.05").met(score.figures())`.
     """
 
     figure: str
@@ -37,18 +34,18 @@ class Requirement:
     limit: float
 
     @classmethod
-    def parse(cls, text: str, known: Mapping[str, object]) -> Requirement:
-        """Read 'FIGURE<NUMBER'. `known` has the names of all figures. Raises RequirementError."""
+    def parse(cls, text: str) -> Requirement:
+        """Read 'FIGURE<NUMBER'. Raises UserError."""
         match = _PATTERN.fullmatch(text)
         if match is None:
-            raise RequirementError(
+            raise UserError(
                 f"--require {text!r} is not understood; write FIGURE<NUMBER, "
                 "for example 'rmse_position_m<0.05' (also <=, >, >=, ==)"
             )
         figure, comparison, number = match.groups()
-        if figure not in known:
-            raise RequirementError(
-                f"--require: there is no figure {figure!r}; there are {', '.join(known)}"
+        if figure not in FIGURES:
+            raise UserError(
+                f"--require: there is no figure {figure!r}; there are {', '.join(FIGURES)}"
             )
         return cls(figure, comparison, float(number))
 

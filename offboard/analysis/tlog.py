@@ -72,11 +72,6 @@ class Tlog:
         self.damaged = self.first_damage = self.truncated = 0
 
     @property
-    def messages(self) -> tuple[LoggedMessage, ...]:
-        """All messages at once: about 400 bytes of memory for each."""
-        return tuple(self)
-
-    @property
     def damage(self) -> str:
         """One sentence on what could not be read; empty if all could."""
         if not self.damaged:

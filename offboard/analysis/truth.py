@@ -11,23 +11,22 @@ from offboard.analysis.sender import Stream
 from offboard.model.geodesy import Geodetic, origin_of, position_ned_m
 
 Array = NDArray[np.float64]
-_GPS_GLOBAL_ORIGIN, _SIM_STATE, _HIL_STATE_QUATERNION, _HOME_POSITION = 49, 108, 115, 242
 _SCALE = (1e7, 1e7, 1e3)  # of latitude, longitude and altitude
 
 
-def true_positions(streams: Mapping[int, Stream], time_s: Callable[[Array], Array]) -> Array:
+def true_positions(streams: Mapping[str, Stream], time_s: Callable[[Array], Array]) -> Array:
     """(N, 4): time, north, east, down, from the first known origin of the local frame on.
 
-    `streams`: the vehicle's messages by id. `time_s` gives the time of stamps in ms.
+    `streams`: the vehicle's messages by name. `time_s` gives the time of stamps in ms.
     """
-    hil, state = streams[_HIL_STATE_QUATERNION], streams[_SIM_STATE]
+    hil, state = streams["HIL_STATE_QUATERNION"], streams["SIM_STATE"]
     given = hil.columns("time_usec lat lon alt") / (1e3, *_SCALE)
     without_stamp = state.columns("lat_int lon_int alt") / (1e7, 1e7, 1.0)
     rows = np.vstack((given, np.insert(without_stamp, 0, 0.0, axis=1)))
     places = np.concatenate((hil.places, state.places))
     now_ms = np.concatenate((hil.now_ms, state.now_ms))
     rows[:, 0] = time_s(np.where(rows[:, 0] > 0.0, rows[:, 0], now_ms))
-    origins = _origins(streams[_GPS_GLOBAL_ORIGIN], streams[_HOME_POSITION])
+    origins = _origins(streams["GPS_GLOBAL_ORIGIN"], streams["HOME_POSITION"])
     newest = np.searchsorted([place for place, _ in origins], places)
     known = np.flatnonzero(newest)
     known = known[np.argsort(places[known])]

@@ -83,7 +83,7 @@ class Landing:
 
 def begin_times(phases: tuple[Event, ...]) -> dict[str, float]:
     """Vehicle time at which each phase began."""
-    return {event.what.partition(":")[0]: event.time_s for event in phases}
+    return {event.phase: event.time_s for event in phases}
 
 
 def judge(flown: History, landing: Landing, skipped_s: float) -> Verdict:
@@ -105,7 +105,7 @@ def judge(flown: History, landing: Landing, skipped_s: float) -> Verdict:
 
 def _ended_early(flown: History) -> str:
     """What ended the flight, by its phases; REFERENCE_OVER if they were all gone through."""
-    names = [event.what.partition(":")[0] for event in flown.phases]
+    names = [event.phase for event in flown.phases]
     for event, name, before in zip(flown.phases[1:], names[1:], names, strict=False):
         regular = (before, name) in (("hover", "land"), ("land", "disarmed"))
         if name in {"hold", "land", "stand down", *_LANDING_ENDS} and not regular:

@@ -11,7 +11,7 @@ import os
 import signal
 import threading
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import (
     FIRST_COMPLETED,
     BrokenExecutor,
@@ -85,7 +85,7 @@ def run_all(
     open_worker: Callable[[], AbstractContextManager[Executor]],
     width: int,
     ending: Callable[[], bool],
-) -> Iterator[tuple[Job, Result | BaseException]]:
+) -> Generator[tuple[Job, Result | BaseException]]:
     """Do all jobs in `width` workers; yield each with its result, or its exception, when it ends.
 
     `work` is called in a worker, so it must be picklable. When `ending` is true, no further job

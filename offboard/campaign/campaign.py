@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from offboard.analysis.requirement import Requirement
-from offboard.analysis.score import FIGURES
 from offboard.campaign.cases import Case, expand
 from offboard.campaign.code import code_hash
 from offboard.campaign.document import CampaignFile
@@ -25,7 +24,6 @@ from offboard.campaign.table import Row, as_csv, as_parquet, columns, row_of
 from offboard.documents.errors import DocumentError, UserError
 from offboard.run.configuration import build_controller, build_track
 from offboard.run.in_memory import check_scenario_text
-from offboard.run.request import FlightRequest
 
 OpenWorkers = Callable[[], AbstractContextManager[Workers]]
 KEPT = "flights"
@@ -69,7 +67,7 @@ class Summary:
 class Campaign:
     """The campaign of a file in a directory.
 
-    Raises DocumentError where nothing of it can be flown and ResultsError for a directory that
+    Raises DocumentError where nothing of it can be flown and UserError for a directory that
     cannot be used, before the first flight.
     """
 
@@ -79,7 +77,7 @@ class Campaign:
         self.cases = expand(file, source)
         check(self.cases, source)
         self.results = Results(directory, code_hash())
-        self._requirements = [Requirement.parse(text, FIGURES) for text in file.require]
+        self._requirements = [Requirement.parse(text) for text in file.require]
 
     def fly(
         self,
@@ -89,7 +87,7 @@ class Campaign:
         progress: Callable[[int, int], None],
     ) -> Summary:
         """Fly what is not finished and write the table. `progress` gets how many flights have
-        ended, from 0 on, and how many were to be flown. Raises ResultsError."""
+        ended, from 0 on, and how many were to be flown. Raises UserError."""
         mine = shard.of(self.cases)
         jobs = [
             Job(case, self.file.promises, code_hash())
@@ -203,17 +201,7 @@ def check(cases: Sequence[Case], source: str) -> None:
 
 
 def _check_one(case: Case) -> None:
-    named = ("vehicle", "controller", "reference")
-    config = FlightRequest(
-        Path(),
-        config=case.config,
-        choices={part: getattr(case, part) for part in named if getattr(case, part)},
-        assignments=case.assignments,
-        sitl=True,
-        firmware=case.firmware,
-        sim_vehicle=case.sim_vehicle,
-        scenario=None if case.text else case.scenario,
-    ).resolve()
+    config = case.request(Path(), None if case.text else case.scenario).resolve()
     if case.text:
         check_scenario_text(case.text, f"scenario {case.scenario}")
     build_track(config)

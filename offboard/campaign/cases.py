@@ -25,6 +25,7 @@ from offboard.control import catalogue
 from offboard.documents import shipped
 from offboard.documents.errors import DocumentError
 from offboard.documents.reading import override, read
+from offboard.run.request import FlightRequest
 
 SCENARIO = "scenario."  # of a key of the scenario
 OWN_SCENARIOS = {"px4": "px4_like", "ardupilot": "ardupilot_like"}  # where a file names none
@@ -95,6 +96,20 @@ class Case:
         for assignment in self.assignments:
             words += ["--set", assignment]
         return shlex.join([*words, "--seed", str(self.seed)])
+
+    def request(self, directory: Path, scenario: str | None = None) -> FlightRequest:
+        """The flight of the case, recorded in `directory`; without the scenario of the case."""
+        return FlightRequest(
+            directory,
+            config=self.config,
+            choices={part: getattr(self, part) for part in ("vehicle", "controller", "reference")},
+            assignments=self.assignments,
+            seed=self.seed,
+            sitl=True,
+            firmware=self.firmware,
+            sim_vehicle=self.sim_vehicle,
+            scenario=scenario,
+        )
 
     def with_values(self, values: Values, base: str | None = None) -> Case:
         """The case with these values instead; `base` is the text of its scenario before them."""

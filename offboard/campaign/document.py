@@ -18,7 +18,6 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import AfterValidator, Field, model_validator
 
 from offboard.analysis.requirement import Requirement
-from offboard.analysis.score import FIGURES
 from offboard.campaign.margin import Promises
 from offboard.documents import shipped
 from offboard.documents.errors import UserError
@@ -44,7 +43,7 @@ def _ordered(ends: tuple[float, float]) -> tuple[float, float]:
 
 def _requirement(text: str) -> str:
     try:
-        Requirement.parse(text, FIGURES)
+        Requirement.parse(text)
     except UserError as error:
         raise ValueError(str(error)) from None
     return text

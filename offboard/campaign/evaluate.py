@@ -36,7 +36,7 @@ class Evaluator:
         self.flown: dict[Case, Record] = {}
 
     def fly(self, cases: Sequence[Case]) -> list[Record]:
-        """The records of these cases, in their order. Raises Interrupted, ResultsError, and what
+        """The records of these cases, in their order. Raises Interrupted, UserError, and what
         the workers raise."""
         known = {case: self._results.get(case.key) for case in cases}
         missing = [

@@ -26,13 +26,9 @@ DIED = Record(
 )  # as its worker cannot tell
 
 
-class SchedulerError(UserError):
-    """A dask scheduler that does not answer, or is lost."""
-
-
 @dataclass(frozen=True, slots=True)
 class Workers:
-    """An open set of workers. `check` raises SchedulerError when they are lost."""
+    """An open set of workers. `check` raises UserError when they are lost."""
 
     width: int
     open_one: Callable[[], AbstractContextManager[Executor]]
@@ -42,7 +38,7 @@ class Workers:
         """Fly jobs and yield each with its record when it ends, in any order.
 
         A flight whose worker dies is flown a second time; if that worker dies too, `DIED` is its
-        record. Raises WorkerError or SchedulerError; what has not ended is then lost.
+        record. Raises UserError; what has not ended is then lost.
         """
         again: list[Job] = []
         for job, result in self._run(jobs, ending):
@@ -75,7 +71,7 @@ def _killed(result: Record | BaseException) -> Record | BaseException:
 
 def _record_of(result: Record | BaseException) -> Record:
     if isinstance(result, CancelledError):
-        raise SchedulerError("the dask scheduler was lost; finished flights are kept")
+        raise UserError("the dask scheduler was lost; finished flights are kept")
     if isinstance(result, BaseException):
         raise result
     return result
@@ -110,23 +106,21 @@ def _lives(worker: Executor) -> bool:
 def cluster_workers(address: str) -> Iterator[Workers]:
     """The workers of a dask scheduler, for example at "tcp://127.0.0.1:8786".
 
-    Raises SchedulerError where none answers, or dask is not installed.
+    Raises UserError where none answers, or dask is not installed.
     """
     try:
         from distributed import Client
     except ImportError:
-        raise SchedulerError(
-            "--scheduler needs dask: pip install 'pso-offboard[cluster]'"
-        ) from None
+        raise UserError("--scheduler needs dask: pip install 'pso-offboard[cluster]'") from None
     try:
         client = Client(address, timeout=CONNECT_S, set_as_default=False)
     except (OSError, ValueError, TypeError) as error:
         reason = " ".join(str(error).split())
-        raise SchedulerError(f"no dask scheduler at {address}: {reason}") from None
+        raise UserError(f"no dask scheduler at {address}: {reason}") from None
     try:
         threads = sum(client.nthreads().values())
         if not threads:
-            raise SchedulerError(f"the dask scheduler at {address} has no worker: start one")
+            raise UserError(f"the dask scheduler at {address} has no worker: start one")
         executor = client.get_executor(pure=False)
         yield Workers(
             QUEUED * threads, lambda: nullcontext(executor), lambda: _check(client, address)
@@ -137,7 +131,7 @@ def cluster_workers(address: str) -> Iterator[Workers]:
 
 def _check(client: Any, address: str) -> None:
     if client.status != "running":
-        raise SchedulerError(
+        raise UserError(
             f"the dask scheduler at {address} was lost; finished flights are kept: run the same "
             "command again, with it or without"
         )

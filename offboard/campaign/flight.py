@@ -24,7 +24,7 @@ from offboard.io.stop import StopRequests
 from offboard.run.configuration import FlightConfig, dump
 from offboard.run.in_memory import InMemorySimulator
 from offboard.run.one_flight import Bundled, fly
-from offboard.run.request import FlightRequest, build_parts
+from offboard.run.request import build_parts
 
 # figures that this computer's clock decides: they differ between two runs of one flight
 WALL_TIMES = (
@@ -34,10 +34,6 @@ WALL_TIMES = (
     "solve_time_p50_ms",
     "solve_time_p99_ms",
 )
-
-
-class WorkerError(UserError):
-    """A worker that cannot fly: its disk is full, or it runs other code. No case is to blame."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,9 +48,9 @@ class Job:
 
 
 def fly_job(job: Job) -> Record:
-    """Fly a case. A flight that fails is a record too. Raises WorkerError."""
+    """Fly a case. A flight that fails is a record too. Raises UserError."""
     if code_hash() != job.code:
-        raise WorkerError(
+        raise UserError(
             f"a worker runs other code ({code_hash()}) than this campaign ({job.code}); install "
             "the same version there and start it again"
         )
@@ -62,7 +58,7 @@ def fly_job(job: Job) -> Record:
         with tempfile.TemporaryDirectory(prefix="offboard-") as scratch:
             return _flown(job, Path(scratch))
     except (OSError, MemoryError) as error:
-        raise WorkerError(f"a worker cannot go on: {error}") from None
+        raise UserError(f"a worker cannot go on: {error}") from None
 
 
 def _flown(job: Job, scratch: Path) -> Record:
@@ -71,7 +67,7 @@ def _flown(job: Job, scratch: Path) -> Record:
         config, outcome = _fly(job.case, scratch, directory)
         score, history = score_flight(directory)
     except LogError as error:
-        raise WorkerError(f"a worker cannot go on: {error}") from None
+        raise UserError(f"a worker cannot go on: {error}") from None
     except UserError as error:
         sentence = " ".join(str(error).split()).replace(f"{scratch}/", "")
         return Record(ExitCode.USAGE, sentence, NOT_FLOWN, "infeasible")
@@ -90,17 +86,7 @@ def _fly(case: Case, scratch: Path, directory: Path) -> tuple[FlightConfig, Outc
         path.parent.mkdir()
         path.write_text(case.text, encoding="utf-8")
         scenario = str(path)
-    named = ("vehicle", "controller", "reference")
-    config = FlightRequest(
-        directory,
-        config=case.config,
-        choices={part: getattr(case, part) for part in named if getattr(case, part)},
-        assignments=case.assignments,
-        seed=case.seed,
-        sitl=True,
-        firmware=case.firmware,
-        sim_vehicle=case.sim_vehicle,
-    ).resolve()
+    config = case.request(directory).resolve()
     log = FlightLog(directory, dump(config))
     outcome = fly(
         build_parts(config),

@@ -6,8 +6,6 @@ twentieth of them.
 
 from __future__ import annotations
 
-from types import TracebackType
-
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -24,32 +22,19 @@ FIRST = 5  # flights after which the time is estimated first
 LINES = 20
 
 
-class Counter:
+class Counter(Progress):
     """Context manager that shows how many flights have ended."""
 
     def __init__(self, console: Console) -> None:
-        self._console = console
-        self._bar = Progress(
+        super().__init__(
             TextColumn("flights"), BarColumn(bar_width=20), MofNCompleteColumn(),
             TextColumn("{task.fields[rate]}"), TimeElapsedColumn(), TimeRemainingColumn(),
             console=console, transient=True, disable=not console.is_terminal,
         )  # fmt: skip
-        self._task = self._bar.add_task("flights", total=None, rate="")
+        self._task = self.add_task("flights", total=None, rate="")
         self._begun_s = clock.monotonic_s()
         self._announced = False
         self._before: int | None = None  # flights that an earlier run has flown
-
-    def __enter__(self) -> Counter:
-        self._bar.start()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        value: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        self._bar.stop()
 
     def count(self, done: int, planned: int) -> None:
         """`done` of at most `planned` flights have ended; 0 at the beginning."""
@@ -58,18 +43,18 @@ class Counter:
         own = done - (self._before or 0)
         rate = 60.0 * own / max(1e-9, clock.monotonic_s() - self._begun_s)
         told = f"{rate:.0f} a minute" if done else ""
-        self._bar.update(self._task, completed=done, total=planned, rate=told)
+        self.update(self._task, completed=done, total=planned, rate=told)
         every = max(1, planned // LINES)
-        if self._console.is_terminal or (done % every and done != planned and own != FIRST):
+        if self.console.is_terminal or (done % every and done != planned and own != FIRST):
             return
         left = f", {told}, {remaining(60.0 * (planned - done) / rate)} left" if done else ""
-        self._console.print(f"{done} of {planned} flights{left}")
+        self.console.print(f"{done} of {planned} flights{left}")
 
     def announce(self, sentence: str) -> None:
         """Print a sentence, once."""
         if not self._announced:
             self._announced = True
-            self._bar.console.print(sentence)
+            self.console.print(sentence)
 
 
 def remaining(seconds: float) -> str:

@@ -16,10 +16,6 @@ from pathlib import Path
 from offboard.documents.errors import UserError
 
 
-class ResultsError(UserError):
-    """The folder cannot be used: one sentence. What is finished stays in it."""
-
-
 @dataclass(frozen=True, slots=True)
 class Record:
     """The end of a flight. `margin` and its smallest term are those of `campaign.margin`;
@@ -40,7 +36,7 @@ class Record:
 class Results:
     """The results of one code in a directory.
 
-    Opening them raises ResultsError where the directory cannot be written, or holds the results of
+    Opening them raises UserError where the directory cannot be written, or holds the results of
     other code.
     """
 
@@ -52,7 +48,7 @@ class Results:
         except OSError:
             others = []
         if others:
-            raise ResultsError(
+            raise UserError(
                 f"{directory} holds results of other code ({others[0]}, this is {code}); choose "
                 "another directory with --out, or delete its folder results"
             )
@@ -70,7 +66,7 @@ class Results:
             return None
 
     def put(self, key: str, record: Record) -> None:
-        """Store a record at once. Raises ResultsError, for example when the disk is full."""
+        """Store a record at once. Raises UserError, for example when the disk is full."""
         finite = {k: v for k, v in record.figures.items() if math.isfinite(v)}
         text = json.dumps(asdict(record) | {"figures": finite}, sort_keys=True)
         self.write(self._folder / f"{key}.json", text.encode())
@@ -80,7 +76,7 @@ class Results:
         return sum(1 for _ in self._folder.glob("*.json"))
 
     def write(self, path: Path, data: bytes) -> None:
-        """Write a file of the campaign, whole or not at all. Raises ResultsError."""
+        """Write a file of the campaign, whole or not at all. Raises UserError."""
         incomplete = path.with_name(f".{path.name}.{os.getpid()}")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -91,8 +87,8 @@ class Results:
                 incomplete.unlink()
             raise self._unwritable(error) from None
 
-    def _unwritable(self, error: OSError) -> ResultsError:
-        return ResultsError(
+    def _unwritable(self, error: OSError) -> UserError:
+        return UserError(
             f"{self.directory} cannot be written ({error.strerror}); finished flights are kept: "
             "run the same command again when it can"
         )

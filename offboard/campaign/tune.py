@@ -20,20 +20,18 @@ from typing import Annotated, Any, Literal
 import yaml
 from pydantic import AfterValidator, Field
 
-from offboard.analysis.score import FIGURES
 from offboard.campaign.campaign import check
 from offboard.campaign.cases import SCENARIO, Case, Values, expand, rounded
 from offboard.campaign.document import CampaignFile, Name, Names, Ranges, Seed
 from offboard.campaign.evaluate import Evaluator
-from offboard.campaign.flight import WALL_TIMES
 from offboard.campaign.results import Record
+from offboard.campaign.table import FIGURE_COLUMNS
 from offboard.campaign.verdict import Verdict, judge
 from offboard.documents.errors import DocumentError, UserError
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import override, parse, read
 from offboard.documents.shipped import locate, read_text
 from offboard.run.configuration import FOLDERS, read_part
-from offboard.run.request import FlightRequest
 
 STUDY = "tune"
 FOLDER = "tunings"
@@ -41,8 +39,8 @@ NO_OPTUNA = "tuning needs optuna: pip install 'pso-offboard[tune]'"
 
 
 def _figure(name: str) -> str:
-    if name not in FIGURES or name in WALL_TIMES:
-        known = ", ".join(name for name in FIGURES if name not in WALL_TIMES)
+    if name not in FIGURE_COLUMNS:
+        known = ", ".join(FIGURE_COLUMNS)
         raise ValueError(f"{name!r} is no figure of a lockstep flight; there are {known}")
     return name
 
@@ -162,15 +160,7 @@ def _cases(file: TuneFile, flights: Flights, source: str) -> list[Case]:
 
 def _defaults(case: Case, file: TuneFile, source: str) -> dict[str, float]:
     """The present values of the parameters. Raises DocumentError for one that is no number."""
-    choices = {"controller": case.controller, "reference": case.reference}
-    request = FlightRequest(
-        Path(),
-        config=case.config,
-        choices={part: name for part, name in choices.items() if name},
-        sitl=True,
-        firmware=case.firmware,
-    )
-    resolved = request.resolve().model_dump(mode="json")
+    resolved = case.request(Path()).resolve().model_dump(mode="json")
     found: dict[str, float] = {}
     for key in file.ranges:
         value: Any = resolved

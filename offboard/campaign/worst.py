@@ -10,8 +10,6 @@ All flights go through the folder of results, so that a search that was interrup
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,6 +23,7 @@ from offboard.campaign.document import Search
 from offboard.campaign.evaluate import Evaluator
 from offboard.campaign.results import Record
 from offboard.campaign.searchers import SEARCHERS
+from offboard.campaign.table import as_csv as csv_of
 from offboard.documents.errors import DocumentError
 
 Array = NDArray[np.float64]
@@ -196,21 +195,21 @@ def search_of(campaign: Campaign, source: str, evaluator: Evaluator) -> FailureS
 
 def as_csv(failures: Sequence[Failure]) -> str:
     """The failures as CSV, the worst first."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(("margin", "weakest", "failing", "seeds", "changed", "ended", "fly_again"))
-    for failure in failures:
-        changed = " ".join(f"{key}={value:g}" for key, value in failure.changed)
-        record = failure.record
-        writer.writerow(
-            (record.margin, record.weakest, failure.failing, failure.seeds, changed,
-             record.sentence, failure.case.line)
-        )  # fmt: skip
-    return text.getvalue()
+    return csv_of(
+        {
+            "margin": [each.record.margin for each in failures],
+            "weakest": [each.record.weakest for each in failures],
+            "failing": [each.failing for each in failures],
+            "seeds": [each.seeds for each in failures],
+            "changed": [" ".join(f"{k}={v:g}" for k, v in each.changed) for each in failures],
+            "ended": [each.record.sentence for each in failures],
+            "fly_again": [each.case.line for each in failures],
+        }
+    )
 
 
 def keep(failures: Sequence[Failure], campaign: Campaign) -> Path:
-    """Write worst.csv and the scenario file of every failure. Raises ResultsError."""
+    """Write worst.csv and the scenario file of every failure. Raises UserError."""
     for failure in failures:
         if failure.case.text:
             path = campaign.directory / failure.case.scenario_file

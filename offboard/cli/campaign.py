@@ -44,8 +44,6 @@ def campaign(
     --worst searches the ranges of `search` for flights with a negative margin, reduces each to the
     fewest changed values, and lists them in worst.csv with the command that flies each again.
     """
-    if workers is not None and not 1 <= workers <= 256:
-        raise CommandError(f"--workers {workers}: give 1 .. 256")
     if worst is not None and (shard or not 1 <= worst <= 100):
         raise CommandError("--worst takes 1 .. 100, and no --shard: a search is one whole")
     if scheduler and workers:

@@ -11,13 +11,15 @@ from typing import Annotated
 
 import typer
 
-from offboard.cli.fly import LINKS
 from offboard.cli.shared import (
     DEFAULT_CONNECTION,
     FILE,
     FLIGHTS,
     Assignments,
     CommandError,
+    Connect,
+    Controller,
+    Reference,
     Report,
     SigningKey,
     System,
@@ -28,14 +30,15 @@ from offboard.cli.shared import (
     say,
     write,
 )
+from offboard.documents.command_line import DISK_ERRORS, explained
 from offboard.documents.errors import UserError
 
 STATE = Path("/var/lib/offboard")  # of the unit
 REFUSED = 3
 EXIT_CODES = (
     "Exit codes: 0 stopped, no vehicle follows it any more; 2 usage or configuration error, "
-    "nothing sent; 3 not begun for now, as another daemon has the connection, or stopped before a "
-    "take-off; 4 ended before the vehicle was handed back, or left armed."
+    "nothing sent; 3 not begun for now, as another daemon has the connection, the disk is full, or "
+    "stopped before a take-off; 4 ended before the vehicle was handed back, or left armed."
 )
 OUT = f"Directory of the flights' directories.  [default: {FLIGHTS}]"
 
@@ -56,10 +59,10 @@ class ThenDo(StrEnum):
 
 
 def daemon(
-    connect: Annotated[str | None, option("LINK", LINKS)] = None,
+    connect: Connect = None,
     config: Annotated[str, option(FILE, "Configuration.")] = "flight",
-    controller: Annotated[str | None, option(FILE, "Controller.")] = None,
-    reference: Annotated[str | None, option(FILE, "Reference; a file may also be .csv.")] = None,
+    controller: Controller = None,
+    reference: Reference = None,
     vehicle: Vehicle = None,
     system: System = None,
     signing_key: SigningKey = None,
@@ -97,13 +100,14 @@ def daemon(
     MAV_CMD_DO_PAUSE_CONTINUE and MAV_CMD_DO_SET_MODE (hands back) to component 191.
     """
     connection = connect or DEFAULT_CONNECTION
-    named = {"controller": controller, "reference": reference, "vehicle": vehicle}
+    choices = {"controller": controller, "reference": reference, "vehicle": vehicle}
     if print_unit:
         from offboard.run.configuration import load
 
-        choices = {part: name for part, name in named.items() if name is not None}
         load(config, choices=choices, assignments=assignments or ())
-        _print_unit(connection, signing_key, out_directory, [config, *choices.values()])
+        _print_unit(
+            connection, signing_key, out_directory, [config, *filter(None, choices.values())]
+        )
         return
     from offboard.io.stop import StopRequests
     from offboard.live.lines import JsonLog, Terminal
@@ -118,7 +122,7 @@ def daemon(
         request = FlightRequest(
             directory=out_directory or FLIGHTS,
             config=config,
-            choices={part: name for part, name in named.items() if name is not None},
+            choices=choices,
             assignments=tuple(assignments or ()),
             seed=seed,
             connection=connection,
@@ -128,12 +132,21 @@ def daemon(
         wanted = Service(request, anchor.value, then.value, arms, metrics, report)
         try:
             outcome = run(wanted, stops=stops, tell=lines.tell, show=lines.show)
-        except UserError as error:
-            if error.is_usage:
+        except (UserError, OSError) as error:
+            if not may_pass(error):
                 raise
-            raise CommandError(str(error), REFUSED) from None
+            sentence = explained(error) if isinstance(error, OSError) else str(error)
+            raise CommandError(sentence, REFUSED) from None
     if outcome.exit_code:
         raise CommandError(outcome.sentence, outcome.exit_code)
+
+
+def may_pass(error: UserError | OSError) -> bool:
+    """Whether it may work another time: nothing is wrong with what was asked for, or the disk is
+    full."""
+    cause = error if isinstance(error, OSError) else error.__context__
+    full = isinstance(cause, OSError) and cause.errno in DISK_ERRORS
+    return full or (isinstance(error, UserError) and not error.is_usage)
 
 
 def _print_unit(

@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from offboard.cli.fly import LINKS
 from offboard.cli.shared import (
     DEFAULT_CONNECTION,
     FILE,
     FLIGHTS,
     Assignments,
+    Connect,
+    Controller,
+    Reference,
     SigningKey,
     System,
     Vehicle,
@@ -36,10 +38,10 @@ def doctor(
         list[str] | None,
         typer.Argument(metavar="CHECK...", help="Only these checks.  [default: all]"),
     ] = None,
-    connect: Annotated[str | None, option("LINK", LINKS)] = None,
+    connect: Connect = None,
     config: Annotated[str, option(FILE, "Configuration of the planned flight.")] = "flight",
-    controller: Annotated[str | None, option(FILE, "Controller.")] = None,
-    reference: Annotated[str | None, option(FILE, "Reference; a file may also be .csv.")] = None,
+    controller: Controller = None,
+    reference: Reference = None,
     vehicle: Vehicle = None,
     system: System = None,
     signing_key: SigningKey = None,
@@ -72,10 +74,9 @@ def doctor(
     from offboard.doctor.run import observe
     from offboard.run.configuration import load
 
-    named = {"controller": controller, "reference": reference, "vehicle": vehicle}
     flight = load(
         config,
-        choices={part: name for part, name in named.items() if name is not None},
+        choices={"controller": controller, "reference": reference, "vehicle": vehicle},
         assignments=assignments or (),
     )
     seen = observe(

@@ -18,7 +18,10 @@ from offboard.cli.shared import (
     FLIGHTS,
     Assignments,
     CommandError,
+    Connect,
+    Controller,
     Directory,
+    Reference,
     Report,
     Requirements,
     SigningKey,
@@ -41,21 +44,16 @@ if TYPE_CHECKING:
 
 INTERRUPTED = "interrupted before anything was sent"
 LABEL_WIDTH = 15
-LINKS = (
-    "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD; "
-    "IPv6 in brackets.  "
-    f"[default: {DEFAULT_CONNECTION}]"
-)
 
 
 def fly(
     sitl: Annotated[bool, typer.Option("--sitl", help="Fly the bundled simulator.")] = False,
-    connect: Annotated[str | None, option("LINK", LINKS)] = None,
+    connect: Connect = None,
     system: System = None,
     signing_key: SigningKey = None,
     config: Annotated[str, option(FILE, "Configuration.")] = "flight",
-    controller: Annotated[str | None, option(FILE, "Controller.")] = None,
-    reference: Annotated[str | None, option(FILE, "Reference; a file may also be .csv.")] = None,
+    controller: Controller = None,
+    reference: Reference = None,
     vehicle: Vehicle = None,
     firmware: Annotated[str, option("NAME", "With --sitl: px4 or ardupilot.")] = "px4",
     scenario: Annotated[
@@ -99,7 +97,6 @@ def fly(
         raise CommandError("--system is an option of --connect: --sitl has one vehicle")
     if not sitl and (scenario or sim_vehicle or firmware != "px4"):
         raise CommandError("--scenario, --sim-vehicle and --firmware are options of --sitl: add it")
-    named = {"controller": controller, "reference": reference, "vehicle": vehicle}
     try:
         from offboard.io.stop import StopRequests
         from offboard.run.sitl import SimulatorProcess
@@ -120,7 +117,7 @@ def fly(
             request = FlightRequest(
                 directory=directory,
                 config=config,
-                choices={part: name for part, name in named.items() if name is not None},
+                choices={"controller": controller, "reference": reference, "vehicle": vehicle},
                 assignments=tuple(assignments or ()),
                 seed=seed,
                 connection=connect or DEFAULT_CONNECTION,

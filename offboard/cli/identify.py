@@ -85,7 +85,7 @@ def identify(
     if vehicle is None and configuration is not None:
         prior = flown(configuration).vehicle
     else:
-        prior = load("flight", choices={"vehicle": vehicle} if vehicle else {}).vehicle
+        prior = load("flight", choices={"vehicle": vehicle}).vehicle
     found, trace = identify_flight(log, history.gather(log), prior)
     text = vehicle_file(found, prior, flight.name)
     shown = page or free_name(path.with_name("identify.html"))

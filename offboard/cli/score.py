@@ -47,11 +47,10 @@ def score(
 
 
 def requirements_of(texts: list[str] | None) -> list[Requirement]:
-    """The requirements of --require. Raises RequirementError."""
+    """The requirements of --require. Raises UserError."""
     from offboard.analysis.requirement import Requirement
-    from offboard.analysis.score import FIGURES
 
-    return [Requirement.parse(text, FIGURES) for text in texts or ()]
+    return [Requirement.parse(text) for text in texts or ()]
 
 
 def scored(flight: Path) -> tuple[Score, History]:

@@ -42,6 +42,16 @@ NEW_DIRECTORY = "Directory of the results.  [default: a new one in flights]"
 FILE = "NAME|FILE"  # the name of a shipped file, or a path
 FLIGHT = typer.Argument(metavar="FLIGHT", help="Flight directory or .tlog file.")
 Directory = Annotated[Path | None, option("DIR", NEW_DIRECTORY, "--out")]
+Connect = Annotated[
+    str | None,
+    option(
+        "LINK",
+        "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD; "
+        f"IPv6 in brackets.  [default: {DEFAULT_CONNECTION}]",
+    ),
+]
+Controller = Annotated[str | None, option(FILE, "Controller.")]
+Reference = Annotated[str | None, option(FILE, "Reference; a file may also be .csv.")]
 Vehicle = Annotated[str | None, option(FILE, "Vehicle.")]
 System = Annotated[
     int | None,
@@ -56,7 +66,10 @@ SigningKey = Annotated[
 Report = Annotated[
     bool, typer.Option(envvar="OFFBOARD_REPORT", help="Write report.html after each flight.")
 ]
-Workers = Annotated[int | None, option("N", "Processes.  [default: one per processor]")]
+Workers = Annotated[
+    int | None,
+    typer.Option(metavar="N", min=1, max=256, help="Processes.  [default: one per processor]"),
+]
 Requirements = Annotated[
     list[str] | None,
     option(

@@ -27,8 +27,6 @@ def tune(
     the result. It is written only if it is better with 95 % confidence. Study and results are in a
     folder beside it: the same command goes on. The shipped tuning shows all keys of the file.
     """
-    if workers is not None and not 1 <= workers <= 256:
-        raise CommandError(f"--workers {workers}: give 1 .. 256")
     if profile.exists():
         raise CommandError(f"{profile} exists; choose another file with --out")
     with out.status("planning"):

@@ -25,22 +25,11 @@ Array = NDArray[np.float64]
 LEAST_MARGIN_S, SHARE_OF_DELAY, SDS = 0.03, 0.25, 3.0  # see `needed_margin`
 BANDWIDTH_STEP_RADPS, LEAST_BANDWIDTH_RADPS = 0.25, 1.0
 SUBSTEPS = 10
-LONGEST_S = 0.6
 STABLE = 1.0 - 1e-6
 # See ObserverSettings: noise densities of the states and of d'; standard deviations of measurements
 # by index of the state
 _LATERAL_DENSITIES, _VERTICAL_DENSITIES = (0.0, 0.2, 0.0, 0.6, 0.15), (0.0, 0.2, 0.0, 0.15)
 _LATERAL_SDS, _VERTICAL_SDS = {0: 0.002, 2: 0.001}, {0: 0.002}
-
-
-def delay_margin(vehicle: Vehicle, bandwidth_radps: float, period_s: float) -> float:
-    """The least delay of the tilt beyond the modelled one with which the lateral loop is unstable,
-    s; at most LONGEST_S."""
-    loop = _lateral_loop(vehicle, bandwidth_radps, period_s)
-    extra_s = 0.0
-    while extra_s < LONGEST_S and loop.stable(extra_s):
-        extra_s += loop.step_s
-    return extra_s
 
 
 def needed_margin(vehicle: Vehicle, delay_sd_s: float) -> float:

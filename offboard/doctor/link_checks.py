@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 
 from offboard.doctor.findings import Finding, blocks, ok, wait, warn
-from offboard.doctor.observation import Observation, Sender
+from offboard.doctor.observation import Observation
 from offboard.flight.assessment import MINIMUM_TELEMETRY_HZ
 from offboard.flight.phases import Limits
 from offboard.io.connection import BITS_OF_A_BYTE
@@ -80,8 +80,18 @@ def senders(seen: Observation) -> Iterable[Finding]:
         return
     ours = found.system_id, found.component_id
     others = [each for each in seen.senders if (each.system_id, each.component_id) != ours]
+    chosen = seen.system_id is not None  # then other vehicles are ignored in flight, too
     for sender in others:
-        yield from _other(sender, chosen=seen.system_id is not None)
+        if sender.setpoints:
+            yield blocks(
+                f"{sender.name} sends setpoints ({sender.setpoints} were heard)",
+                "stop it: two controllers of one vehicle fight each other",
+            )
+        elif sender.is_autopilot and not chosen:
+            yield blocks(
+                f"another vehicle is heard: {sender.name}, from {', '.join(sender.places)}",
+                "choose one with --system, or give each vehicle its own port",
+            )
     for sender in seen.senders:
         if (sender.system_id, sender.component_id) == ours and len(sender.places) > 1:
             places = ", ".join(sender.places)
@@ -93,22 +103,10 @@ def senders(seen: Observation) -> Iterable[Finding]:
     if intruder and not any(each.setpoints for each in others):
         name = f"system {intruder.system_id} component {intruder.component_id}"
         yield blocks(f"another program controls this vehicle: {name}", "stop it")
-    harmless = [each.name for each in others if not each.is_autopilot and not each.setpoints]
+    harmless = [
+        each.name for each in others if not each.setpoints and (chosen or not each.is_autopilot)
+    ]
     yield ok("besides the vehicle: " + (", ".join(harmless) or "nobody"))
-
-
-def _other(sender: Sender, *, chosen: bool) -> Iterable[Finding]:
-    if sender.setpoints:
-        yield blocks(
-            f"{sender.name} sends setpoints ({sender.setpoints} were heard)",
-            "stop it: two controllers of one vehicle fight each other",
-        )
-    elif sender.is_autopilot:
-        level = warn if chosen else blocks
-        yield level(
-            f"another vehicle is heard: {sender.name}, from {', '.join(sender.places)}",
-            "choose one with --system, or give each vehicle its own port",
-        )
 
 
 def delay(seen: Observation) -> Iterable[Finding]:

@@ -20,6 +20,7 @@ from offboard.io.link import Chunk
 from offboard.mavlink.dialects.base import WantedMessage
 from offboard.mavlink.events import (
     Attitude,
+    ClockBehind,
     CommandAck,
     EstimatorReport,
     Event,
@@ -80,6 +81,7 @@ class Listening:
         self._readiness, self._delay, self._clock = Readiness(), LinkDelay(), VehicleClock()
         self._asked: dict[int, tuple[int, float]] = {}  # message or command: tries, when
         self._settled = self._rebooted = self._requested = False
+        self._may_greet = False  # a disarmed vehicle, whose signing time is behind ours
         self._late_s = 0.0
         self._sent_s: dict[int, float] = {}  # TIMESYNC: stamp -> when
         self._round_trips_s: list[float] = []
@@ -99,8 +101,10 @@ class Listening:
         self._census.receive(chunk.data, chunk.peer)
         reception = self._session.receive(chunk.data, chunk.peer, chunk.arrived_s)
         for event in reception.events:
-            if self.peer is None and self._session.vehicle is not None:
-                self.peer, self._found_s = chunk.peer, chunk.arrived_s
+            if not self._found_s:
+                self.peer = chunk.peer
+            if not self._found_s and self._session.vehicle is not None:
+                self._found_s = chunk.arrived_s
             self.vehicle.update(event, self._session.link_time_s)
             self._note(event, chunk.arrived_s, unix_less_host_s)
 
@@ -121,6 +125,8 @@ class Listening:
                 self._fix_type = fix_type
             case GpsFix():
                 self._fix_type = FIX_3D
+            case ClockBehind(armed=armed):
+                self._may_greet = not armed
             case StatusText(_, text):
                 self._texts.append(text)
             case CommandAck(command, result):
@@ -176,7 +182,8 @@ class Listening:
 
     def _permitted(self, outgoing: Outgoing) -> bool:
         """Neither heartbeats nor rates for an armed vehicle, or before it is known."""
-        permitted = self.vehicle.heartbeat is not None and not self.vehicle.armed
+        known = self.vehicle.heartbeat is not None
+        permitted = not self.vehicle.armed if known else self._may_greet
         self._requested |= permitted and isinstance(outgoing, CommandLong)
         return permitted
 

@@ -17,8 +17,6 @@ from numpy.typing import NDArray
 from offboard.estimation.filtering import spread
 from offboard.estimation.observer_adaptation import Adaptation
 from offboard.estimation.observer_filter import (
-    POSITION_JUMPED,
-    VELOCITY_JUMPED,
     bound_disturbance,
     bring_forward,
     correct_by_attitude,
@@ -35,7 +33,6 @@ from offboard.estimation.observer_model import (
     start_filters,
 )
 from offboard.estimation.propagation import (
-    BIAS,
     COMMANDS_KEPT,
     COURSE,
     COURSE_RATE,
@@ -72,8 +69,6 @@ class Observer:
 
     Give it every attitude and position that arrives (`on_attitude`, `on_position`) and every
     command that is sent (`on_command`); `predict` gives the state that a decision needs.
-    `position_jumps`, `velocity_jumps` and `stale_messages` count telemetry that jumped or was
-    dropped.
 
     Args:
         vehicle: constants of the vehicle.
@@ -106,9 +101,6 @@ class Observer:
 
     def reset(self) -> None:
         """Forget the previous flight."""
-        self.position_jumps = 0
-        self.velocity_jumps = 0
-        self.stale_messages = 0
         self._frozen = False
         self._forget_commands()
         self._state[:] = 0.0
@@ -142,11 +134,6 @@ class Observer:
         take-off."""
         down = float(self._state[DISTURBANCE + 2])
         return self._vehicle.hover_thrust * (1.0 + down / self._gravity)
-
-    @property
-    def velocity_bias_ned_mps(self) -> Array:
-        """Reported less estimated velocity (3,); zero unless the source is `bias`."""
-        return self._state[BIAS : BIAS + 3].copy()
 
     def freeze(self, grounded: bool) -> None:
         """Stop estimating while the vehicle is on the ground or does not fly our commands: velocity
@@ -241,10 +228,7 @@ class Observer:
             return
         if time_s < self._time_s:
             bring_forward(self._measured, self._state, self._plant, self._time_s - time_s)
-        jumped = correct_by_position(self._record)
-        self.position_jumps += bool(jumped & POSITION_JUMPED)
-        self.velocity_jumps += bool(jumped & VELOCITY_JUMPED)
-        if jumped:
+        if correct_by_position(self._record):
             self._adaptation.interrupt()
         elif self._settings.adaptive:
             learn(self._record)
@@ -281,10 +265,7 @@ class Observer:
             self._restart()
             self._state[DISTURBANCE : DISTURBANCE + 3] = disturbance
             return True
-        if time_s < now_s - LATEST_S or (last_s is not None and time_s <= last_s):
-            self.stale_messages += 1
-            return False
-        return True
+        return time_s >= now_s - LATEST_S and (last_s is None or time_s > last_s)
 
     @property
     def _time_s(self) -> float:

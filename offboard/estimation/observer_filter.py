@@ -50,7 +50,6 @@ Array = NDArray[np.float64]
 LATERAL, VERTICAL, HEADING = 0, 1, 2  # filters
 # Their states: lateral [p v b b' d beta] per axis, vertical [p v d beta], course [psi psi'].
 LATERAL_TILT, LATERAL_DRIFT, VERTICAL_DRIFT, HEADING_COURSE = 2, 4, 2, 0
-POSITION_JUMPED, VELOCITY_JUMPED = 1, 2  # bits of a result
 
 OBSERVER = np.dtype(
     [
@@ -92,8 +91,8 @@ def correct_by_attitude(
 
 @entry(OBSERVER)
 def correct_by_position(observers: Any) -> int:
-    """Correct the state by the position and velocity in `measured`. Returns what jumped:
-    POSITION_JUMPED, VELOCITY_JUMPED, both or 0."""
+    """Correct the state by the position and velocity in `measured`. Returns 1 if one of
+    them jumped, else 0."""
     observer = observers[0]
     state, measured, adaptation = (
         observer.motion.states[NOW],
@@ -110,7 +109,7 @@ def correct_by_position(observers: Any) -> int:
             one = observer.filters[i]
             other = NOTHING if kind == 0 else one.order - 1
             if not correct_within(state, one, kind, other, measured, sd, observer.gates[kind]):
-                jumped |= 1 << kind
+                jumped = 1
                 if kind == 0:
                     anchor_position(state, one, measured, sd)
                 else:

@@ -8,29 +8,34 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from offboard.export.frames import enu, flu_in_enu
 from offboard.export.new_file import library, new_file
 from offboard.export.series import Array, Flight, Series
+from offboard.model.frames import enu, flu_in_enu
 
 KIND = "mcap"
 MAP, BODY = "map", "base_link"
-_NS = 1_000_000_000
 _LINE_M = 0.02  # thickness of a path
 _COLOURS = {"flown": (0.12, 0.47, 0.71, 1.0), "reference": (1.0, 0.5, 0.05, 1.0)}
 Stamped = tuple[int, str, Any]  # time in ns, topic, protobuf message or dict
+Stamps = Callable[[Array], list[int]]  # vehicle times in s to stamps of the file in ns
 
 
 def write_mcap(flight: Flight, path: Path, *, vehicle_time: bool = False) -> None:
-    """Write an MCAP file, with Unix time or vehicle time. Raises ExportError."""
+    """Write an MCAP file, with Unix time or vehicle time. Raises UserError."""
     writers = library("mcap.writer", KIND)
     register = library("mcap_protobuf.schema", KIND).register_schema
-    messages = sorted(_messages(flight, _Stamps(flight, vehicle_time)), key=lambda each: each[0])
+
+    def stamps(time_s: Array) -> list[int]:
+        times = time_s if vehicle_time else flight.unix_s(time_s)
+        return [max(0, round(stamp * 1e6)) * 1000 for stamp in times.tolist()]
+
+    messages = sorted(_messages(flight, stamps), key=lambda each: each[0])
     with new_file(path) as file:
         writer = writers.Writer(file)
         writer.start()
@@ -47,19 +52,7 @@ def write_mcap(flight: Flight, path: Path, *, vehicle_time: bool = False) -> Non
         writer.finish()
 
 
-class _Stamps:
-    """Converts vehicle time to the stamps of the file."""
-
-    def __init__(self, flight: Flight, vehicle_time: bool) -> None:
-        self._flight = flight
-        self._vehicle_time = vehicle_time
-
-    def ns(self, time_s: Array) -> list[int]:
-        stamps = time_s if self._vehicle_time else self._flight.unix_s(time_s)
-        return [max(0, round(stamp * 1e6)) * 1000 for stamp in stamps.tolist()]
-
-
-def _messages(flight: Flight, stamps: _Stamps) -> Iterator[Stamped]:
+def _messages(flight: Flight, stamps: Stamps) -> Iterator[Stamped]:
     for series in flight.series.values():
         yield from _rows(series, stamps)
     yield from _poses(flight, stamps)
@@ -91,18 +84,18 @@ def _channel(writer: Any, register: Any, flight: Flight, topic: str, message: An
 # ------------------------------------------------------------------ messages
 
 
-def _rows(series: Series, stamps: _Stamps) -> Iterator[Stamped]:
+def _rows(series: Series, stamps: Stamps) -> Iterator[Stamped]:
     """JSON has no NaN: what is not known is left out."""
     times = series.time_s.tolist()
     for stamp_ns, time_s, row in zip(
-        stamps.ns(series.time_s), times, series.values.tolist(), strict=True
+        stamps(series.time_s), times, series.values.tolist(), strict=True
     ):
         values = zip(series.columns, row, strict=True)
         known = {column: value for column, value in values if math.isfinite(value)}
         yield stamp_ns, f"/table/{series.name}", {"vehicle_time_s": time_s} | known
 
 
-def _poses(flight: Flight, stamps: _Stamps) -> Iterator[Stamped]:
+def _poses(flight: Flight, stamps: Stamps) -> Iterator[Stamped]:
     """At each position, with the newest attitude."""
     position, attitude = flight.series.get("position"), flight.series.get("attitude")
     if position is None or attitude is None:
@@ -113,7 +106,7 @@ def _poses(flight: Flight, stamps: _Stamps) -> Iterator[Stamped]:
     quaternions = flu_in_enu(attitude.values[np.maximum(newest, 0), :4]).tolist()
     places = enu(position.values[:, :3]).tolist()
     for stamp_ns, place, quaternion, index in zip(
-        stamps.ns(position.time_s), places, quaternions, newest.tolist(), strict=True
+        stamps(position.time_s), places, quaternions, newest.tolist(), strict=True
     ):
         if index < 0:
             continue
@@ -135,17 +128,17 @@ def _fill(
     rotation.w, rotation.x, rotation.y, rotation.z = q
 
 
-def _velocities(position: Series, stamps: _Stamps) -> Iterator[Stamped]:
+def _velocities(position: Series, stamps: Stamps) -> Iterator[Stamped]:
     vector = _message("Vector3")
     for stamp_ns, (x, y, z) in zip(
-        stamps.ns(position.time_s), enu(position.values[:, 3:6]).tolist(), strict=True
+        stamps(position.time_s), enu(position.values[:, 3:6]).tolist(), strict=True
     ):
         yield stamp_ns, "/velocity", vector(x=x, y=y, z=z)
 
 
-def _path(series: Series, topic: str, stamps: _Stamps) -> Iterator[Stamped]:
+def _path(series: Series, topic: str, stamps: Stamps) -> Iterator[Stamped]:
     """The whole path as a line, at its beginning."""
-    (first_ns,) = stamps.ns(series.time_s[:1])
+    (first_ns,) = stamps(series.time_s[:1])
     update = _message("SceneUpdate")()
     entity = update.entities.add(id=topic, frame_id=MAP)
     entity.timestamp.FromNanoseconds(first_ns)
@@ -159,10 +152,10 @@ def _path(series: Series, topic: str, stamps: _Stamps) -> Iterator[Stamped]:
     yield first_ns, f"/path/{topic}", update
 
 
-def _texts(flight: Flight, stamps: _Stamps) -> Iterator[Stamped]:
+def _texts(flight: Flight, stamps: Stamps) -> Iterator[Stamped]:
     log = _message("Log")
     times = np.array([event.time_s for event in flight.events], dtype=np.float64)
-    for stamp_ns, event in zip(stamps.ns(times), flight.events, strict=True):
+    for stamp_ns, event in zip(stamps(times), flight.events, strict=True):
         entry = log(level=log.INFO, message=event.what, name=event.who)
         entry.timestamp.FromNanoseconds(stamp_ns)
         yield stamp_ns, "/log", entry

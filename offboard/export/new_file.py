@@ -8,14 +8,14 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from offboard.export.series import ExportError
+from offboard.documents.errors import UserError
 
 INSTALL = "pip install 'pso-offboard[export]'"
 
 
 @contextmanager
 def new_file(path: Path) -> Iterator[BinaryIO]:
-    """Open a file that does not exist yet; it is removed if the block fails. Raises ExportError."""
+    """Open a file that does not exist yet; it is removed if the block fails. Raises UserError."""
     try:
         with path.open("xb") as file:
             try:
@@ -25,14 +25,14 @@ def new_file(path: Path) -> Iterator[BinaryIO]:
                     path.unlink()
                 raise
     except FileExistsError:
-        raise ExportError(f"{path} exists already; choose another file with -o") from None
+        raise UserError(f"{path} exists already; choose another file with -o") from None
     except OSError as error:
-        raise ExportError(f"{path} cannot be written: {error.strerror or error}") from None
+        raise UserError(f"{path} cannot be written: {error.strerror or error}") from None
 
 
 def library(name: str, kind: str) -> Any:
-    """Import a library of the extra. Raises ExportError with the line that installs it."""
+    """Import a library of the extra. Raises UserError with the line that installs it."""
     try:
         return import_module(name)
     except ImportError:
-        raise ExportError(f"--to {kind} needs {name.partition('.')[0]}: {INSTALL}") from None
+        raise UserError(f"--to {kind} needs {name.partition('.')[0]}: {INSTALL}") from None

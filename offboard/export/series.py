@@ -14,13 +14,12 @@ from numpy.typing import NDArray
 
 from offboard.analysis import history, tlog
 from offboard.analysis.events import Event
-from offboard.analysis.history import History
+from offboard.analysis.history import TELEMETRY, History
 from offboard.analysis.tlog import Tlog
 from offboard.documents.errors import UserError
 from offboard.flight.record import FIELDS
 
 Array = NDArray[np.float64]
-_TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
 
 
 def _vectors(what: str, unit: str) -> tuple[str, ...]:
@@ -48,10 +47,6 @@ _COLUMNS = {
     "decision": tuple(f"decision_{name}" for name in FIELDS),
     "heartbeat": ("armed", "system_status"),
 }
-
-
-class ExportError(UserError):
-    """A flight that cannot be exported: one sentence for the user."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,12 +88,12 @@ class Flight:
 
 
 def read(path: Path) -> Flight:
-    """The flight in a directory or .tlog. Raises TlogError, or ExportError without telemetry."""
+    """The flight in a directory or .tlog. Raises TlogError, or UserError without telemetry."""
     log = tlog.read(tlog.find(path))
     flown = history.gather(log)
     unix = _unix(log)
     if not len(unix):
-        raise ExportError(f"{log.path} holds no telemetry with a time stamp: nothing to export")
+        raise UserError(f"{log.path} holds no telemetry with a time stamp: nothing to export")
     events = (*flown.phases, *flown.modes, *flown.vehicle_messages)
     known = sorted((e for e in events if np.isfinite(e.time_s)), key=lambda event: event.time_s)
     found = {name: _series(name, rows) for name, rows in _rows(flown).items()}
@@ -131,7 +126,7 @@ def _unix(log: Tlog) -> Array:
     rows = [
         (int.from_bytes(message.frame.payload[:4], "little") / 1e3, message.unix_us / 1e6)
         for message in log
-        if message.frame.message_id in _TELEMETRY and message.component_id == 1
+        if message.frame.message_id in TELEMETRY and message.component_id == 1
     ]
     stamps = np.reshape(rows, (-1, 2)).astype(np.float64)
     if len(stamps):
@@ -142,7 +137,5 @@ def _unix(log: Tlog) -> Array:
 
 def _autopilot(log: Tlog) -> str:
     """Name of the autopilot as MAV_AUTOPILOT has it; "unknown" without a heartbeat."""
-    names = {3: "ArduPilot", 12: "PX4"}
-    heartbeats = (m for m in log if m.name == "HEARTBEAT" and m.component_id == 1)
-    first = next(heartbeats, None)
-    return names.get(first.message.autopilot, "unknown") if first else "unknown"
+    _, dialect = history.vehicle(log)
+    return {"px4": "PX4", "ardupilot": "ArduPilot"}[dialect.name] if dialect else "unknown"

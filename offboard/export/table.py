@@ -20,7 +20,7 @@ EVENT = "event"
 
 
 def write_csv(flight: Flight, path: Path) -> None:
-    """Write a CSV file, UTF-8, with a line of column names. Raises ExportError."""
+    """Write a CSV file, UTF-8, with a line of column names. Raises UserError."""
     columns = _columns(flight)
     with new_file(path) as file, io.TextIOWrapper(file, "utf-8", newline="") as text:
         writer = csv.writer(text)
@@ -30,7 +30,7 @@ def write_csv(flight: Flight, path: Path) -> None:
 
 
 def write_parquet(flight: Flight, path: Path) -> None:
-    """Write a Parquet file; empty cells are null. Raises ExportError."""
+    """Write a Parquet file; empty cells are null. Raises UserError."""
     arrow, parquet = library("pyarrow", "parquet"), library("pyarrow.parquet", "parquet")
     arrays = {
         name: arrow.array(values, from_pandas=True) for name, values in _columns(flight).items()

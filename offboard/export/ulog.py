@@ -15,6 +15,7 @@ import numpy as np
 
 from offboard.export.new_file import new_file
 from offboard.export.series import Array, Flight, Series
+from offboard.flight.record import FIELDS
 from offboard.model.frames import course_from_quaternion
 
 _MAGIC = b"ULog\x01\x12\x35\x01"
@@ -53,7 +54,7 @@ class _Topic:
 
 
 def write_ulog(flight: Flight, path: Path) -> None:
-    """Write a ULog file. Raises ExportError."""
+    """Write a ULog file. Raises UserError."""
     topics = _topics(flight)
     entries: list[tuple[int, bytes]] = []
     for number, topic in enumerate(topics):
@@ -80,63 +81,30 @@ def write_ulog(flight: Flight, path: Path) -> None:
 
 def _topics(flight: Flight) -> list[_Topic]:
     """The topics for which the flight has samples."""
-    ned, rates = ("x", "y", "z", "vx", "vy", "vz"), slice(4, 7)
-    rows: dict[str, list[tuple[str, tuple[tuple[str, int], ...], Callable[[Series], Array]]]] = {
-        "position": [
-            ("vehicle_local_position", tuple((name, 1) for name in ned), lambda s: s.values)
-        ],
-        "truth": [
-            (
-                "vehicle_local_position_groundtruth",
-                (("x", 1), ("y", 1), ("z", 1)),
-                lambda s: s.values,
-            )
-        ],
-        "attitude": [
-            ("vehicle_attitude", (("q", 4),), lambda s: s.values[:, :4]),
-            ("vehicle_angular_velocity", (("xyz", 3),), lambda s: s.values[:, rates]),
-        ],
-        "reference": [
-            (
-                "trajectory_setpoint",
-                (("position", 3), ("velocity", 3), ("acceleration", 3), ("yaw", 1)),
-                lambda s: s.values,
-            )
-        ],
-        "setpoint": [
-            (
-                "vehicle_attitude_setpoint",
-                (("yaw_body", 1), ("q_d", 4), ("thrust_body", 3)),
-                _attitude_setpoint,
-            )
-        ],
-        "decision": [
-            (
-                DECISION,
-                tuple((name, 1) for name in _short(flight.series.get("decision"))),
-                lambda s: s.values,
-            )
-        ],
-    }
-    topics = [
-        _Topic(name, fields, flight.series[kind], values)
-        for kind, topics in rows.items()
-        if kind in flight.series
-        for name, fields, values in topics
-    ]
-    if "heartbeat" in flight.series:
-        heartbeat = flight.series["heartbeat"]
-        topics.append(_Topic("actuator_armed", (("armed", 1),), heartbeat, _armed, "B"))
+    topics: list[_Topic] = []
+
+    def add(
+        series: str,
+        name: str,
+        fields: tuple[tuple[str, int], ...],
+        values: Callable[[Series], Array] = lambda each: each.values,
+        code: str = "f",
+    ) -> None:
+        if series in flight.series:
+            topics.append(_Topic(name, fields, flight.series[series], values, code))
+
+    ned = tuple((name, 1) for name in ("x", "y", "z", "vx", "vy", "vz"))
+    add("position", "vehicle_local_position", ned)
+    add("truth", "vehicle_local_position_groundtruth", ned[:3])
+    add("attitude", "vehicle_attitude", (("q", 4),), lambda each: each.values[:, :4])
+    add("attitude", "vehicle_angular_velocity", (("xyz", 3),), lambda each: each.values[:, 4:7])
+    motion = (("position", 3), ("velocity", 3), ("acceleration", 3), ("yaw", 1))
+    add("reference", "trajectory_setpoint", motion)
+    attitude = (("yaw_body", 1), ("q_d", 4), ("thrust_body", 3))
+    add("setpoint", "vehicle_attitude_setpoint", attitude, _attitude_setpoint)
+    add("decision", DECISION, tuple((name, 1) for name in FIELDS))
+    add("heartbeat", "actuator_armed", (("armed", 1),), lambda each: each.values[:, :1], "B")
     return topics
-
-
-def _short(decision: Series | None) -> tuple[str, ...]:
-    names = decision.columns if decision else ()
-    return tuple(name.removeprefix("decision_") for name in names)
-
-
-def _armed(heartbeat: Series) -> Array:
-    return heartbeat.values[:, :1]
 
 
 def _attitude_setpoint(setpoint: Series) -> Array:

@@ -17,6 +17,7 @@ from offboard.flight.position_jumps import PositionJumps
 from offboard.flight.readiness import Readiness
 from offboard.flight.requests import Circumstances, Request, Result, answer
 from offboard.flight.state import FlightState
+from offboard.mavlink.dialects.base import ThrustRule
 from offboard.mavlink.events import (
     Attitude,
     ClockBehind,
@@ -35,6 +36,7 @@ from offboard.mavlink.events import (
 )
 from offboard.mavlink.outgoing import CommandResult
 from offboard.mavlink.session import Session
+from offboard.model.frames import thrust_direction_from_quaternion
 
 
 class EventProcessor:
@@ -75,7 +77,7 @@ class EventProcessor:
                 self._on_telemetry(event.time_s, arrived_s, turned_s)
                 self._on_position(event)
             case ThrustReport(thrust):
-                state.hover.on_thrust(state.time_s, thrust)
+                state.hover.on_thrust(state.time_s, thrust, thrust * self._lifting_share())
             case Heartbeat(mode) | ModeReport(mode):
                 self._on_mode(event, mode, arrived_s)
             case TimesyncReply(vehicle_ns=vehicle_ns):
@@ -91,12 +93,20 @@ class EventProcessor:
                     f"another companion computer is on the link: system {system} component "
                     f"{component}; only one of them may send setpoints"
                 )
-            case ClockBehind(system_id):  # its time stamps follow ours once it has heard us
+            case ClockBehind(system_id, _):  # its time stamps follow ours once it has heard us
                 self._outbox.announce_once(
                     f"the signing time of system {system_id} is behind: sending ours"
                 )
             case Rebooted():
                 self._on_reboot()
+
+    def _lifting_share(self) -> float:
+        """Vertical part of the thrust that the autopilot reports: the cosine of the tilt, unless it
+        reports it before it is raised for the tilt."""
+        attitude, dialect = self._state.vehicle.attitude, self._state.dialect
+        if attitude is None or dialect is None or dialect.thrust_rule is not ThrustRule.COLLECTIVE:
+            return 1.0
+        return float(thrust_direction_from_quaternion(np.array(attitude.attitude))[2])
 
     def _with_own_position(self, event: Event) -> Event:
         """The event; with `estimate: fused` a position is replaced by that of our own fusion."""

@@ -26,11 +26,13 @@ class HoverEstimate:
 
     def __init__(self) -> None:
         self._thrusts: deque[tuple[float, float]] = deque()
+        self._lifts: deque[tuple[float, float]] = deque()
         self._speeds: deque[tuple[float, float]] = deque()
 
-    def on_thrust(self, time_s: float, thrust: float) -> None:
-        """The autopilot reports its collective thrust, 0 .. 1."""
+    def on_thrust(self, time_s: float, thrust: float, lift: float) -> None:
+        """The autopilot reports its collective thrust, 0 .. 1; `lift` is its vertical part."""
         _append(self._thrusts, time_s, thrust)
+        _append(self._lifts, time_s, lift)
 
     def on_position(self, time_s: float, height_m: float, down_mps: float) -> None:
         """Height above the ground, and vertical velocity, positive down."""
@@ -47,13 +49,13 @@ class HoverEstimate:
     def hover_thrust(self, vehicle: Vehicle, time_s: float) -> float | None:
         """The normalised thrust that holds the weight, from the WINDOW_S before `time_s`; None if
         too little was reported in it, or the vehicle falls. Delay, lag and drag are `vehicle`'s:
-        a_down = g (1 - u / u_h) - c v_down."""
+        a_down = g (1 - u_lift / u_h) - c v_down."""
         speeds = _within(self._speeds, time_s - WINDOW_S, time_s)
         if len(speeds) < LEAST_SPEEDS or speeds[-1, 0] - speeds[0, 0] < LEAST_S:
             return None
         late_s = vehicle.thrust_delay_s + vehicle.thrust_lag_s
-        thrusts = _within(self._thrusts, speeds[0, 0] - late_s, time_s - late_s)
-        if len(thrusts) < LEAST_THRUSTS:
+        lifts = _within(self._lifts, speeds[0, 0] - late_s, time_s - late_s)
+        if len(lifts) < LEAST_THRUSTS:
             return None
         gravity_mps2 = vehicle.gravity_mps2
         acceleration_mps2 = float(np.polyfit(speeds[:, 0] - time_s, speeds[:, 1], 1)[0])
@@ -61,7 +63,7 @@ class HoverEstimate:
         lift_mps2 = gravity_mps2 - acceleration_mps2 - drag_mps2
         if lift_mps2 < LEAST_LIFT * gravity_mps2:
             return None
-        share = float(np.mean(thrusts[:, 1])) * gravity_mps2 / lift_mps2
+        share = float(np.mean(lifts[:, 1])) * gravity_mps2 / lift_mps2
         return share if HOVER_THRUST_LIMITS[0] <= share <= HOVER_THRUST_LIMITS[1] else None
 
 

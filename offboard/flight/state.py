@@ -94,8 +94,10 @@ class FlightState:
         self, limits: Limits, plan: FlightPlan, model: Vehicle, programme: Programme
     ) -> FlightState:
         """The state of another flight with the same vehicle: what is known of vehicle and link
-        stays. It begins in STANDBY, in HEALTH while the vehicle is not known well enough."""
-        known = self.authority is not None and self.phase not in (Phase.CONNECT, Phase.HEALTH)
+        stays. It begins in STANDBY, or anew while the vehicle is not known well enough: after a
+        reboot its parameters are read again."""
+        prepared = self.phase not in (Phase.CONNECT, Phase.HEALTH) and not self.rebooted
+        known = prepared and self.authority is not None
         following = FlightState(
             limits,
             plan,

@@ -22,6 +22,7 @@ from offboard.identification.trace import (
     POSITION,
     SENT_AT,
     SENT_THRUST,
+    SPACING_S,
     STAMP,
     Trace,
     thinned,
@@ -36,8 +37,7 @@ from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
-SPACING_S = 0.018  # closer positions are left out: they show nothing more
-DRAG_SPACING_S = 0.036  # the same where only the drag is sought
+DRAG_SPACING_S = 0.036  # in place of SPACING_S where only the drag is sought
 SPEED_OVER_S = 0.5  # time over which a speed is measured
 RELATED_S = 2.0  # time over which innovations of a wandering estimator are autocorrelated
 # Steps of six seconds hold few such times: rms of the error of delay plus lag / sd, in 40 flights

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.optimize import approx_fprime, least_squares
 
 from offboard.identification.response import free_motion, second_order
-from offboard.identification.trace import thinned
+from offboard.identification.trace import SPACING_S, thinned
 from offboard.identification.uncertainty import (
     FREEDOM,
     lag_count,
@@ -37,7 +37,6 @@ STARTS = np.array(
 STEPS, ROUNDS, TOLERANCE = 10, 4, 1e-3
 FITTED = 5  # parameters and free motion, of each axis
 RELATED_S = 0.3  # time over which an attitude estimator's errors are autocorrelated
-SPACING_S = 0.018  # closer samples are left out: the responses are slower
 
 
 class ResponseProblem:

@@ -85,6 +85,9 @@ def _latest(rows: Array) -> Array:
     return kept
 
 
+SPACING_S = 0.018  # closer samples are left out: motion and responses are slower
+
+
 def thinned(stamps: Array, spacing_s: float) -> NDArray[np.intp]:
     """Indices of rows at least `spacing_s` apart."""
     kept: list[int] = []

@@ -71,7 +71,7 @@ class VehicleEstimate:
         period_s: float,
         bandwidth_radps: float,
     ) -> None:
-        self._file = vehicle
+        self._file = self._from = self.target = self.now = vehicle
         self._factor = factor
         self._blend_s = blend_s
         self._period_s = period_s
@@ -81,7 +81,6 @@ class VehicleEstimate:
 
     def reset(self) -> None:
         """Back to the vehicle file."""
-        self._from = self.target = self.now = self._file
         self._replaced: dict[str, Any] = {}  # tilt constants before the last adoption
         self._blend_began_s = -math.inf
         self._rejected_drag_ps = math.inf
@@ -94,7 +93,7 @@ class VehicleEstimate:
         self._unknown_s = self._unknown_delay_s
         self._link_radps = math.inf  # limit because the link became later
         self._lowered_radps = 0.0  # by which this was lower than the vehicle's, as announced
-        self._vehicle_radps = self.cautious_radps = self._supported(self._unknown_s)
+        self._begin_with(self._file, self._unknown_s)
         self.contradiction = ""  # why this vehicle file must not be flown with
 
     # ------------------------------------------------------------------ blending
@@ -125,26 +124,29 @@ class VehicleEstimate:
         """The estimate with the tilt constants before the last adoption."""
         return self.target.model_copy(update=self._replaced)
 
+    def _begin_with(self, vehicle: Vehicle, tilt_margin_s: float) -> None:
+        """Use `vehicle` at once, with the bandwidth that this margin of its delay allows."""
+        self._from = self.target = self.now = vehicle
+        self._vehicle_radps = self.cautious_radps = self._supported(tilt_margin_s)
+
     # ------------------------------------------------------------------ identified constants
 
     def apply_link_delay(self, link: Estimate) -> list[str]:
         """Add the link's delay, measured before the flight, to every delay of the vehicle. What
         remains unknown is the vehicle's own delay and the link's scatter."""
         added_s = link.value - DIRECT_LINK_S
-        sentences = []
+        vehicle, sentences = self.target, []
         if added_s >= LINK_S:
-            self.target = self.now = self._from = with_added_delay(self.target, added_s)
+            vehicle = with_added_delay(self.target, added_s)
             sentences = [f"link delay {_in_ms(link)}, telemetry and setpoint together"]
         self._unknown_s = self._unknown_delay_s + JUMP_SDS * link.sd
-        self._vehicle_radps = self.cautious_radps = self._supported(self._unknown_s)
+        self._begin_with(vehicle, self._unknown_s)
         return sentences
 
     def recall(self, learned: Learned) -> None:
         """Begin with what an earlier flight has identified."""
-        self.target = self.now = self._from = learned.vehicle
         self.delay = learned.delay
-        margin_s = needed_margin(self.target, self.delay.sd)
-        self._vehicle_radps = self.cautious_radps = self._supported(margin_s)
+        self._begin_with(learned.vehicle, needed_margin(learned.vehicle, learned.delay.sd))
 
     def apply_link_change(self, learned: Learned, link: Estimate) -> list[str]:
         """Adapt what was recalled to the link's delay of now."""
@@ -152,12 +154,12 @@ class VehicleEstimate:
         changed_s = max(changed_s, -self.target.tilt.delay_s, -self.target.yaw.delay_s)
         if abs(changed_s) < LINK_S:
             return []
-        self.target = self.now = self._from = with_added_delay(self.target, changed_s)
-        self.delay = Estimate(
-            learned.delay.value + changed_s, math.hypot(learned.delay.sd, link.sd)
+        vehicle, sd_s = (
+            with_added_delay(self.target, changed_s),
+            math.hypot(learned.delay.sd, link.sd),
         )
-        margin_s = needed_margin(self.target, self.delay.sd)
-        self._vehicle_radps = self.cautious_radps = self._supported(margin_s)
+        self.delay = Estimate(learned.delay.value + changed_s, sd_s)
+        self._begin_with(vehicle, needed_margin(vehicle, sd_s))
         return [f"the link delays by {1e3 * changed_s:+.0f} ms since the vehicle was identified"]
 
     def learned(self, link_s: float) -> Learned | None:

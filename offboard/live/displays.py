@@ -4,38 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import suppress
-from typing import Protocol
 
 from offboard.flight.companion import Companion
 from offboard.live.lines import JsonLines, Terminal
 from offboard.live.process import LiveProcess
 
 
-class Display(Protocol):
-    """Shows a flight. `show` is called in every turn of the loop: it must not wait."""
-
-    def show(self, companion: Companion) -> None: ...
-
-    def close(self) -> None:
-        """Show what is queued, for a bounded time."""
-
-    @property
-    def lost(self) -> str:
-        """A sentence on what was not shown; empty if all was."""
-        ...
-
-
 class Displays:
-    """The lines of a flight, and the processes that serve clients. One whose `show` raises is not
-    called again."""
+    """The lines of a flight, and the processes that serve clients. Their `show` is called in every
+    turn of the loop and must not wait; one whose `show` raises is not called again."""
 
     def __init__(self, lines: Terminal | JsonLines, pages: Sequence[LiveProcess] = ()) -> None:
         self._lines, self._pages = lines, pages
-        self._parts: list[Display] = [lines, *pages]
+        self._parts: list[Terminal | JsonLines | LiveProcess] = [lines, *pages]
         self._working = list(self._parts)
 
     def await_ready(self) -> list[str]:
-        """Wait until all processes listen; where. Raises LiveError."""
+        """Wait until all processes listen; where. Raises UserError."""
         return [page.await_ready() for page in self._pages]
 
     def tell(self, sentence: str) -> None:

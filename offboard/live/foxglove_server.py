@@ -8,37 +8,15 @@ Needs foxglove-sdk, the extra `foxglove` of this package.
 from __future__ import annotations
 
 import json
-import math
 import os
 import sys
-from collections.abc import Sequence
 from typing import Any
+
+from offboard.model.frames import Array, enu, flu_in_enu
 
 FRAME, BODY = "local", "vehicle"
 BACKLOG = 100  # messages that a client may be late; then it loses the oldest
 _NICENESS = 5
-_HALF = math.sqrt(0.5)
-_NED_TO_ENU, _FLU_TO_FRD = (0.0, _HALF, _HALF, 0.0), (0.0, 1.0, 0.0, 0.0)
-
-
-def enu(ned: Sequence[float]) -> tuple[float, float, float]:
-    """East, north, up of north, east, down."""
-    return ned[1], ned[0], -ned[2]
-
-
-def attitude_enu(quaternion: Sequence[float]) -> tuple[float, ...]:
-    """(w, x, y, z) from forward, left, up to east, north, up, of one from FRD to NED."""
-    return _product(_product(_NED_TO_ENU, quaternion), _FLU_TO_FRD)
-
-
-def _product(a: Sequence[float], b: Sequence[float]) -> tuple[float, ...]:
-    """Hamilton product of two quaternions (w, x, y, z)."""
-    return (
-        a[0] * b[0] - a[1] * b[1] - a[2] * b[2] - a[3] * b[3],
-        a[0] * b[1] + a[1] * b[0] + a[2] * b[3] - a[3] * b[2],
-        a[0] * b[2] - a[1] * b[3] + a[2] * b[0] + a[3] * b[1],
-        a[0] * b[3] + a[1] * b[2] - a[2] * b[1] + a[3] * b[0],
-    )
 
 
 class Publisher:
@@ -62,7 +40,7 @@ class Publisher:
         self._snapshot.log(snapshot)
         position, attitude = snapshot["position_ned_m"], snapshot["attitude"]
         if position and attitude:
-            at, turn = _vector(enu(position)), _quaternion(attitude_enu(attitude))
+            at, turn = _vector(enu(position)), _quaternion(flu_in_enu(attitude))
             self._vehicle.log(_pose(at, turn))
             transform = FrameTransform(
                 parent_frame_id=FRAME, child_frame_id=BODY, translation=at, rotation=turn
@@ -83,13 +61,13 @@ def _overlap(told: list[str], texts: list[str]) -> int:
     return next((n for n in range(longest, 0, -1) if told[-n:] == texts[:n]), 0)
 
 
-def _vector(values: Sequence[float]) -> Any:
+def _vector(values: Array) -> Any:
     from foxglove.messages import Vector3
 
     return Vector3(x=values[0], y=values[1], z=values[2])
 
 
-def _quaternion(values: Sequence[float]) -> Any:
+def _quaternion(values: Array | tuple[float, ...]) -> Any:
     from foxglove.messages import Quaternion
 
     return Quaternion(w=values[0], x=values[1], y=values[2], z=values[3])

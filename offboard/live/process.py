@@ -25,10 +25,6 @@ QUEUED_MAX = 50  # snapshots that wait for the pipe, which holds about as many
 CLOSE_S = 1.0  # for what is queued, and again for the end of the process
 
 
-class LiveError(UserError):
-    """The process cannot serve its clients: one sentence for the user."""
-
-
 class LiveProcess:
     """A display in the process `python -m MODULE HOST PORT`, started at once.
 
@@ -49,13 +45,13 @@ class LiveProcess:
         self._due_s = -math.inf
 
     def await_ready(self) -> str:
-        """Wait until it listens; where. Raises LiveError."""
+        """Wait until it listens; where. Raises UserError."""
         assert self._process.stdout is not None
         with self._process.stdout as output:
             said = output.readline()
         answer = json.loads(said) if said else {"error": "its process does not start"}
         if "error" in answer:
-            raise LiveError(f"{self._option}: {answer['error']}")
+            raise UserError(f"{self._option}: {answer['error']}")
         return str(answer["url"])
 
     def show(self, companion: Companion) -> None:

@@ -237,6 +237,7 @@ class ClockBehind:
     """A correctly signed heartbeat whose time stamp is too old; no vehicle is found yet."""
 
     system_id: int
+    armed: bool
 
 
 @dataclass(frozen=True, slots=True)

@@ -258,8 +258,10 @@ class Session:
         heard = self.autopilots.note(frame, self.link_time_s)
         wanted = self.settings.system_id in (None, frame.system_id)
         if isinstance(heard, Dialect) and wanted:
-            self._greeted = heard
-            events.append(ClockBehind(frame.system_id))
+            shown = decode(frame.message_id, frame.payload, heard)
+            if isinstance(shown, HeartbeatEvent):
+                self._greeted = heard
+                events.append(ClockBehind(frame.system_id, shown.armed))
 
     def _is_genuine(self, frame: framing.Frame) -> bool:
         """Whether this frame could be accepted from the vehicle."""

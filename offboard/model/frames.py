@@ -103,6 +103,20 @@ def quaternion_from_thrust_direction(direction_ned: ArrayLike, course_rad: Array
     return quaternion_from_euler(phi, theta, course)
 
 
+def enu(ned: ArrayLike) -> Array:
+    """Vectors (..., 3) in ENU (east, north, up; REP 103), from NED."""
+    north, east, down = _components(ned)
+    return _stack(east, north, -down)
+
+
+def flu_in_enu(quaternion: ArrayLike) -> Array:
+    """Quaternion (..., 4) -> that of the FLU body (forward, left, up; REP 103) in ENU: half a turn
+    about the axis between north and east before, and about the forward axis after."""
+    w, x, y, z = _components(quaternion)
+    half = math.sqrt(0.5)
+    return _stack(-half * (w + z), -half * (x + y), half * (y - x), half * (z - w))
+
+
 def _half_sine_cosine(angle_rad: Any) -> tuple[Any, Any]:
     if isinstance(angle_rad, (float, int)):
         return math.sin(0.5 * angle_rad), math.cos(0.5 * angle_rad)

@@ -8,11 +8,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 from scipy.linalg import block_diag
 
 from offboard.control.cost import BoxQuadratic
@@ -21,6 +19,7 @@ from offboard.documents.parameters import Parameters
 from offboard.paper.integral import (
     INTEGRATED,
     IntegralSettings,
+    Weight,
     augmented,
     augmented_reference,
 )
@@ -34,7 +33,6 @@ PAPER_MASS_KG = 0.4  # Table 1
 PAPER_INERTIA_KGM2 = (0.0196, 0.0196, 0.0264)  # Table 1
 PAPER_ARM_M = 0.225  # not in Table 1; Eq. 16 is reproduced only with it
 
-Weight = Annotated[float, Field(ge=0)]
 Four = tuple[float, float, float, float]
 FourWeights = tuple[Weight, Weight, Weight, Weight]
 TwelveWeights = tuple[

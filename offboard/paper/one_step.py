@@ -18,9 +18,8 @@ Array = NDArray[np.float64]
 class OneStep:
     """J(u) of Eq. 21 for one model and one set of weights; `problem` fills in the state.
 
-    dynamics A (n, n), inputs B (n, m). Weights, all symmetric but S: terminal W (n, n) of
-    x_ref(k+1) - x(k+1), energy R (m, m) of u_nom - u, rate R_du (m, m) of u - u(k-1), cross S
-    (n, m) of twice the product of x(k) - x_ref(k) and u - u_nom.
+    dynamics A (n, n), inputs B (n, m). Weights, all symmetric: terminal W (n, n) of
+    x_ref(k+1) - x(k+1), energy R (m, m) of u_nom - u, rate R_du (m, m) of u - u(k-1).
     """
 
     def __init__(
@@ -30,14 +29,12 @@ class OneStep:
         terminal: ArrayLike,
         energy: ArrayLike,
         rate: ArrayLike | None = None,
-        cross: ArrayLike | None = None,
     ) -> None:
         self._dynamics = np.array(dynamics, np.float64)
         self._inputs = np.array(inputs, np.float64)
         self._terminal = np.array(terminal, np.float64)
         self._energy = np.array(energy, np.float64)
         self._rate = np.zeros_like(self._energy) if rate is None else np.array(rate, np.float64)
-        self._cross = np.zeros_like(self._inputs) if cross is None else np.array(cross, np.float64)
         curvature = self._inputs.T @ self._terminal @ self._inputs + self._energy + self._rate
         self._hessian = curvature + curvature.T
 
@@ -55,27 +52,22 @@ class OneStep:
         lower: Array,
         upper: Array,
         *,
-        reference: Array | None = None,
         keep_constant: bool = True,
     ) -> BoxQuadratic:
         """The quadratic in u(k) from state x(k) (n,) towards reference_next x_ref(k+1) (n,).
 
-        nominal u_nom, previous u(k-1), lower and upper (Eq. 22): (m,). `reference` x_ref(k) (n,),
-        by default 0, is used by the cross weight only. The constant term does not move the
-        minimum, but its rounding limits epsilon of Eq. 29: the paper's epsilon is only reproduced
-        with it.
+        nominal u_nom, previous u(k-1), lower and upper (Eq. 22): (m,). The constant term does not
+        move the minimum, but its rounding limits epsilon of Eq. 29: the paper's epsilon is only
+        reproduced with it.
         """
         error = self._dynamics @ state - reference_next
-        off = state if reference is None else state - reference
         weighed = self._terminal @ error
         gradient = self._inputs.T @ weighed - self._energy @ nominal - self._rate @ previous
-        gradient = 2.0 * (gradient + self._cross.T @ off)
         constant = 0.0
         if keep_constant:
             constant = float(
                 error @ weighed
                 + nominal @ self._energy @ nominal
                 + previous @ self._rate @ previous
-                - 2.0 * off @ self._cross @ nominal
             )
-        return BoxQuadratic(self._hessian, gradient, constant, lower, upper)
+        return BoxQuadratic(self._hessian, 2.0 * gradient, constant, lower, upper)

@@ -6,10 +6,10 @@ import math
 from dataclasses import fields
 
 from offboard.analysis.tlog import columns
+from offboard.documents.errors import UserError
 from offboard.flight.companion import Companion
 from offboard.flight.outbox import Output
 from offboard.flight.record import FIELDS, LAYOUTS, RECORD_NAME, records_of
-from offboard.replay.recording import ReplayError
 from offboard.replay.replaying import Replay, Turn
 
 Rows = list[tuple[str, str]]
@@ -23,7 +23,7 @@ def moment_at(replay: Replay, time_s: float) -> dict[str, Rows]:
     """Replay up to the first tick at or after `time_s`, vehicle time. Returns what was received,
     the state, the facts, the ladder, the decision and what was sent, each as names and values.
 
-    Raises ReplayError where the flight ends before.
+    Raises UserError where the flight ends before.
     """
     period_s, tick = replay.config.period_s, -1
     for turn in replay.turns():
@@ -31,7 +31,7 @@ def moment_at(replay: Replay, time_s: float) -> dict[str, Rows]:
         if number > tick and replay.ended_s >= time_s - 1e-6:
             return _rows(replay, turn)
         tick = max(tick, number)
-    raise ReplayError(
+    raise UserError(
         f"--at {time_s:g}: the recorded flight ends at {replay.ended_s:.3f} s of vehicle time"
     )
 

@@ -6,19 +6,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from offboard.analysis import tlog
+from offboard.analysis import history, tlog
 from offboard.analysis.tlog import LoggedMessage, Tlog
 from offboard.documents.errors import UserError
-from offboard.flight import inputs, manifest
+from offboard.flight import inputs
 from offboard.flight.inputs import SETTINGS, Call, Entry
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 
 _TUNNEL = 385
-_LENGTH_AT, _DATA_AT = 4, 5  # TUNNEL.payload_length and .payload
-
-
-class ReplayError(UserError):
-    """A flight that cannot be replayed: one sentence for the user."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,26 +40,22 @@ class Recording:
 
 
 def read(flight: Path) -> Recording:
-    """The recording in a flight directory or .tlog. Raises ReplayError or TlogError."""
+    """The recording in a flight directory or .tlog. Raises UserError or TlogError."""
     path = tlog.find(flight)
     log = tlog.read(path)
-    pieces: dict[int, list[bytes]] = {manifest.PAYLOAD_TYPE: [], inputs.PAYLOAD_TYPE: []}
-    for message in log:
-        kind = record_type(message)
-        if kind in pieces:
-            payload = message.frame.payload
-            length = payload[_LENGTH_AT]
-            data = payload[_DATA_AT : _DATA_AT + length]
-            pieces[kind].append(data.ljust(length, b"\0"))  # MAVLink 2 omits trailing zeros
-    configuration = manifest.join(pieces[manifest.PAYLOAD_TYPE])
+    configuration = history.configuration(log)
     if configuration is None:
-        raise ReplayError(
+        raise UserError(
             f"{path} does not hold the configuration of a flight: only logs of offboard can be "
             "replayed"
         )
-    recorded = tuple(pieces[inputs.PAYLOAD_TYPE])
+    recorded = tuple(
+        bytes(entry.message.payload[: entry.message.payload_length])
+        for entry in log
+        if record_type(entry) == inputs.PAYLOAD_TYPE
+    )
     if not recorded:
-        raise ReplayError(
+        raise UserError(
             f"{path} cannot be replayed, only scored and reported: it has no inputs of each turn; "
             "a flight of `offboard daemon` goes on with what was received before its log begins"
         )
@@ -83,7 +74,7 @@ def _settings(path: Path, recorded: tuple[bytes, ...]) -> dict[str, object]:
     try:
         first = next(inputs.entries(recorded), None)
     except inputs.InputsError as error:
-        raise ReplayError(f"{path}: the record of the inputs is damaged: {error}") from None
+        raise UserError(f"{path}: the record of the inputs is damaged: {error}") from None
     if not isinstance(first, Call) or first.name != SETTINGS:
-        raise ReplayError(f"{path}: the record of the inputs does not begin with the settings")
+        raise UserError(f"{path}: the record of the inputs does not begin with the settings")
     return dict(first.arguments[0])

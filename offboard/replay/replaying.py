@@ -9,6 +9,7 @@ from typing import Any
 
 from offboard.analysis.tlog import LoggedMessage
 from offboard.control.base import Controller
+from offboard.documents.errors import UserError
 from offboard.documents.signing_key import KEY_BYTES
 from offboard.flight import inputs
 from offboard.flight.companion import Companion
@@ -25,7 +26,7 @@ from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.io.link import Chunk
 from offboard.mavlink.framing import Frame
 from offboard.mavlink.signing import Signing
-from offboard.replay.recording import Recording, ReplayError, record_type
+from offboard.replay.recording import Recording, record_type
 from offboard.run.configuration import flown
 from offboard.run.one_flight import FlightParts, companion_of, session_of
 from offboard.run.request import build_parts
@@ -102,7 +103,7 @@ class Replay:
         try:
             session = session_of(observer, signing, **settings)
         except TypeError:
-            raise ReplayError(
+            raise UserError(
                 f"{recording.log.path}: the settings of its session are those of another version"
             ) from None
         parts = replace(parts, controller=controller)

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from offboard.documents.errors import UserError
 from offboard.replay.difference import Comparison, Difference, compare
 from offboard.replay.moment import received
-from offboard.replay.recording import Recording, ReplayError
+from offboard.replay.recording import Recording
 from offboard.replay.replaying import Replay
 
 FIELDS_MAX = 8
@@ -23,14 +24,14 @@ class Verdict:
 
 
 def verdict(recording: Recording) -> Verdict:
-    """Replay a flight and compare it with its log. Raises ReplayError if nothing can be compared,
+    """Replay a flight and compare it with its log. Raises UserError if nothing can be compared,
     and DocumentError where its configuration cannot be flown by this version."""
     replay = Replay(recording)
     turns = sum(1 for _ in replay.turns())
     comparison = compare(replay.recorded, replay.replayed)
     if not comparison.compared.total():
         why = replay.stopped or "the log holds no setpoint and no command"
-        raise ReplayError(f"{recording.log.path}: nothing to compare: {why}")
+        raise UserError(f"{recording.log.path}: nothing to compare: {why}")
     return Verdict(comparison, turns, replay.ended_s, replay.stopped)
 
 

@@ -34,8 +34,7 @@ from offboard.analysis.figure import (
 from offboard.analysis.verdict import begin_times
 from offboard.report import timeline
 from offboard.report.flight import Flight
-from offboard.report.panels import GROUPS, Curve, Panel
-from offboard.report.thinning import thinned
+from offboard.report.panels import GROUPS, Curve, Panel, thinned
 
 # of flights that share a figure, in an order that colour-blind people can tell apart
 COLOURS = (BLUE, ORANGE, GREEN, GREY, PINK, BROWN)

@@ -15,6 +15,7 @@ from offboard.model.frames import euler_from_quaternion
 
 Array = NDArray[np.float64]
 
+BINS = 1500  # of a curve, see `thinned`
 REFERENCE_GAP_S = 0.5  # without a record of the reference for longer there is none
 LEAST_SHOWN = 1e-16  # of a logarithmic axis: zero is drawn there
 ESTIMATED, TRUE, COMMANDED = "estimated", "true (simulator)", "commanded"
@@ -172,6 +173,22 @@ GROUPS: dict[str, tuple[str, Callable[[History], tuple[Panel, ...]]]] = {
     "identification": ("Identified and believed", identification),
 }
 _AXES = {"north": (GREEN, "solid"), "east": (PINK, "dash"), "down": (INK, "dot")}
+
+
+def thinned(values: Array, bins: int = BINS) -> NDArray[np.intp]:
+    """Indices of `values` (N,) to draw: all, or the least and the greatest of each bin of equally
+    many samples, and its first value that is not finite, which is a gap of the curve."""
+    count = len(values)
+    if count <= 2 * bins:
+        return np.arange(count)
+    edges = np.linspace(0, count, bins + 1).astype(np.intp)[:-1]
+    of_bin = np.repeat(np.arange(bins), np.diff(np.append(edges, count)))
+    known = np.isfinite(values)
+    order = np.lexsort((values, ~known, of_bin))  # in each bin: finite ones first, ascending
+    finite = np.add.reduceat(known, edges)
+    least, greatest = order[edges], order[edges + np.maximum(finite, 1) - 1]
+    gaps = order[(edges + finite)[finite < np.diff(np.append(edges, count))]]
+    return np.unique(np.concatenate(([0, count - 1], least, greatest, gaps)))
 
 
 def near_reference(flown: History, times: Array) -> NDArray[np.bool_]:

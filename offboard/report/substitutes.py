@@ -20,8 +20,7 @@ from offboard.model.frames import quaternion_from_euler
 from offboard.model.geodesy import Geodetic, position_ned_m
 
 Array = NDArray[np.float64]
-_ATTITUDE, _GLOBAL, _TARGET = 30, 33, 83
-NAMES = {_ATTITUDE: "ATTITUDE", _GLOBAL: "GLOBAL_POSITION_INT", _TARGET: "ATTITUDE_TARGET"}
+_ATTITUDE, _GLOBAL, _TARGET = NAMES = "ATTITUDE", "GLOBAL_POSITION_INT", "ATTITUDE_TARGET"
 
 
 def completed(flown: History, log: Tlog, vehicle_id: int | None) -> tuple[History, list[str]]:
@@ -32,33 +31,32 @@ def completed(flown: History, log: Tlog, vehicle_id: int | None) -> tuple[Histor
         _GLOBAL: not len(flown.position),
         _TARGET: not len(flown.setpoint),
     }
-    wanted = {kind for kind, lacks in absent.items() if lacks}
-    if not wanted:
+    streams = {name: Stream(name) for name in NAMES if absent[name]}
+    if not streams:
         return flown, []
-    streams = {kind: Stream(NAMES[kind]) for kind in wanted}
     for place, entry in enumerate(log):
-        if entry.frame.message_id in wanted and entry.frame.system_id == vehicle_id:
-            streams[entry.frame.message_id].add(entry, place, math.nan)
+        if entry.name in streams and entry.frame.system_id == vehicle_id:
+            streams[entry.name].add(entry, place, math.nan)
     anchor_ms = 1e3 * next(
         (rows[0, 0] for rows in (flown.attitude, flown.position) if len(rows)), math.nan
     )
 
-    def rows(kind: int, fields: str) -> Array:
-        table = streams[kind].columns(f"time_boot_ms {fields}")
+    def rows(name: str, fields: str) -> Array:
+        table = streams[name].columns(f"time_boot_ms {fields}")
         table[:, 0] = continuous_s(table[:, 0], anchor_ms)
         return table
 
-    present = {kind for kind in wanted if len(streams[kind])}
+    present = {name for name, stream in streams.items() if len(stream)}
     flown = replace(
         flown,
         attitude=_attitude(rows) if _ATTITUDE in present else flown.attitude,
         position=_position(rows) if _GLOBAL in present else flown.position,
         setpoint=_setpoint(rows) if _TARGET in present else flown.setpoint,
     )
-    return flown, [_NOTES[kind][kind in present] for kind in sorted(wanted)]
+    return flown, [_NOTES[name][name in present] for name in streams]
 
 
-_Rows = Callable[[int, str], Array]
+_Rows = Callable[[str, str], Array]
 
 
 def _attitude(rows: _Rows) -> Array:

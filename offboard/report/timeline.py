@@ -15,7 +15,6 @@ from offboard.report.flight import Flight
 
 _ENDED_EARLY = {Phase.HOLD, Phase.STAND_DOWN, Phase.YIELDED, Phase.FAILED}
 _REGULAR = {("hover", "land"), ("land", "disarmed")}
-_PHASES = {phase.value for phase in Phase}
 _STEPS = {phase.value for phase in (*_ENDED_EARLY, Phase.LAND)}
 
 
@@ -41,7 +40,7 @@ def bands(flight: Flight) -> list[Band]:
     phases = flight.history.phases
     spans = _spans(phases, flight)
     found = [
-        Band("phase", begin_s, end_s, name(event), event.what, _colour(name(event)))
+        Band("phase", begin_s, end_s, event.phase, event.what, _colour(event.phase))
         for event, begin_s, end_s in spans
     ]
     for event, begin_s, end_s in _spans(flight.history.modes, flight):
@@ -56,7 +55,7 @@ def marks(flight: Flight) -> list[Mark]:
     found = [
         Mark("ladder", event.time_s, event.what)
         for before, event in pairwise(flown.phases)
-        if name(event) in _STEPS and (name(before), name(event)) not in _REGULAR
+        if event.phase in _STEPS and (before.phase, event.phase) not in _REGULAR
     ]
     refused = flown.records["refused"].astype(int)
     for row in refused.nonzero()[0].tolist():
@@ -75,11 +74,6 @@ def events(flight: Flight) -> list[Event]:
     modes = (Event(event.time_s, event.who, f"mode {event.what}") for event in flown.modes)
     every = (*flown.phases, *flown.announcements, *modes, *flown.vehicle_messages)
     return sorted(every, key=lambda e: -math.inf if math.isnan(e.time_s) else e.time_s)
-
-
-def name(phase: Event) -> str:
-    """The phase that an event announces."""
-    return phase.what.partition(":")[0]
 
 
 def _spans(events: Sequence[Event], flight: Flight) -> list[tuple[Event, float, float]]:
@@ -116,7 +110,7 @@ def _standing(flight: Flight, time_s: float) -> tuple[str, str, str]:
         begun = [event for event, begin_s, _ in _spans(events, flight) if begin_s <= time_s]
         return begun[-1] if begun else None
 
-    begun = {name(event) for event in flight.history.phases if event.time_s <= time_s}
+    begun = {event.phase for event in flight.history.phases if event.time_s <= time_s}
     mode = newest(flight.history.modes)
     if begun & {Phase.STAND_DOWN.value, Phase.YIELDED.value, Phase.FAILED.value}:
         return "given up", "offboard sends nothing any more", ORANGE_BAND

@@ -61,7 +61,7 @@ class FlightConfig(Parameters):
 def load(
     name: str,
     *,
-    choices: Mapping[str, str] | None = None,
+    choices: Mapping[str, str | None] | None = None,
     assignments: Iterable[str] = (),
     seed: int | None = None,
     known_vehicle: str | None = None,
@@ -69,15 +69,15 @@ def load(
     """Resolve a flight configuration. Raises DocumentError with every problem found.
 
     `name` is a shipped configuration or a file; `choices` replaces its vehicle, controller or
-    reference by another name or file; `assignments` are `key.path=value` of --set. `known_vehicle`
-    stands in for the file's `neutral`, of which nothing is known.
+    reference by another name or file (None: does not); `assignments` are `key.path=value` of --set.
+    `known_vehicle` stands in for the file's `neutral`, of which nothing is known.
     """
     path = locate(name, "", "configuration")
     raw = read(read_text(path), str(path))
     if known_vehicle and raw.get("vehicle") == UNKNOWN_VEHICLE:
         raw["vehicle"] = known_vehicle
     for part in FOLDERS:
-        chosen = (choices or {}).get(part, raw.get(part))
+        chosen = (choices or {}).get(part) or raw.get(part)
         if isinstance(chosen, str):
             raw[part] = read_part(part, chosen)
     options: dict[str, str] = {}

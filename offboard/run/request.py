@@ -30,7 +30,8 @@ from offboard.run.sitl import OWN_VEHICLES, SimulatorProcess, check_scenario_nam
 class FlightRequest:
     """What to fly, and where to record it.
 
-    `choices` replaces "vehicle", "controller" or "reference" of `config` by a name or a file;
+    `choices` replaces "vehicle", "controller" or "reference" of `config` by a name or a file (None:
+    that of `config`);
     `assignments` are `key.path=value`. `sitl` flies the bundled simulator with `firmware`,
     `scenario` and `sim_vehicle` (None: its default) instead of the vehicle at `connection`.
     `system_id` is that of the vehicle, where several send; `signing_key` a key file.
@@ -38,7 +39,7 @@ class FlightRequest:
 
     directory: Path
     config: str = "flight"
-    choices: Mapping[str, str] = field(default_factory=dict)
+    choices: Mapping[str, str | None] = field(default_factory=dict)
     assignments: tuple[str, ...] = ()
     seed: int | None = None
     connection: str = "udpin:127.0.0.1:14540"

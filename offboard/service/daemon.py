@@ -22,6 +22,7 @@ from offboard.io import clock
 from offboard.io.background import BackgroundWriter
 from offboard.io.connection import open_link
 from offboard.io.link import Link, LinkError
+from offboard.io.lock import connection_lock, directory_lock
 from offboard.io.signing_time import SigningTime
 from offboard.io.stop import StopRequests
 from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
@@ -30,7 +31,6 @@ from offboard.run.loop import Loop
 from offboard.run.one_flight import discard
 from offboard.run.request import FlightRequest
 from offboard.service.flights import Flights
-from offboard.service.lock import connection_lock, directory_lock
 from offboard.service.memory import VehicleFiles
 from offboard.service.monitor import Monitor
 from offboard.service.preparation import Preparation

@@ -26,6 +26,7 @@ from offboard.mavlink.session import Session
 from offboard.run.one_flight import FlightParts
 
 REASON_EVERY_S = 10.0  # why the vehicle cannot be flown is announced this often
+SETTLING_S = 3.0  # before the first time: telemetry has only just been requested
 NAMED_S = 1.0  # until a vehicle has said which one it is
 TEXTS_KEPT = 200
 LEFT_ALONE = (
@@ -334,7 +335,9 @@ class Flights:
             self._told_left_alone = guards.found_engaged(self._current.facts())
             if self._told_left_alone:
                 self._current.announce(LEFT_ALONE.format(mode=state.vehicle.mode))
-        if now_s - self._told_s < REASON_EVERY_S or state.phase is not Phase.HEALTH:
+        if state.phase is not Phase.HEALTH or state.in_phase_s < SETTLING_S:
+            return
+        if now_s - self._told_s < REASON_EVERY_S:
             return
         self._told_s = now_s
         reasons = [*assessment.problems(state), assessment.not_ready(state, self._session)]

@@ -311,9 +311,10 @@ def _left(engaged: list[Path]) -> tuple[str, float]:
     with suppress(IndexError, OSError, ValueError):
         ended_us = (engaged[-1] / "flight.tlog").stat().st_mtime_ns // 1000
         passed_s = 1e-6 * (clock.unix_us() - ended_us)
-        if abs(passed_s) < ENGAGED_MAX_S:  # the wall clock may have been set
+        if passed_s < ENGAGED_MAX_S:
             vehicle = (engaged[-1] / ENGAGED).read_text(encoding="utf-8")
-            return vehicle, clock.monotonic_s() + ENGAGED_MAX_S - passed_s
+            # negative: after a boot the wall clock is behind until it is set
+            return vehicle, clock.monotonic_s() + ENGAGED_MAX_S - max(passed_s, 0.0)
     return "", 0.0
 
 

@@ -171,7 +171,7 @@ class Pilot:
         elif self.detector.contact:
             attitude, thrust = level(estimate.yaw_rad), self._parameters.role("thrust_least")
         self._attitude = attitude
-        self.thrust_demanded = thrust
+        self.thrust_demanded = thrust * (estimate.tilt_cosine if self._boosts_thrust else 1.0)
         self._demand(Demand(True, thrust, attitude))
 
     @property

@@ -9,18 +9,13 @@ import pytest
 
 from offboard.control.certificate import ExactMinimum, certify
 from offboard.control.cost import BoxQuadratic
-from offboard.control.swarm import QuadraticSwarm, RandomLanes, Swarm, SwarmSettings, warm_up
+from offboard.control.swarm import QuadraticSwarm, RandomLanes, Swarm, SwarmSettings
 
 LOWER = np.array([-4.0, -0.2, -0.2, -0.1])  # Eq. 26
 UPPER = np.array([3.942, 0.2, 0.2, 0.1])
 MINIMISER = np.array([1.0, -0.1, 0.05, 0.02])
 HESSIAN = np.diag([1.1, 3.0, 3.0, 16.0]) + 0.1
 PROBLEM = BoxQuadratic(HESSIAN, -HESSIAN @ MINIMISER, 20.0, LOWER, UPPER)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def compiled() -> None:
-    warm_up()
 
 
 @pytest.mark.benchmark(group="one step, 4 inputs")

@@ -12,10 +12,11 @@ from pathlib import Path
 
 from pymavlink import mavutil
 from terminal import Terminal
-from vehicle_process import free_port, vehicle
+from vehicle_process import vehicle
 
 from offboard.analysis import tlog
 from offboard.documents.signing_key import create_key
+from simulator.link.links import free_ports
 
 MAVPROXY = Path(sys.executable).with_name("mavproxy.py")
 SHORT = (
@@ -37,7 +38,7 @@ LATE = ("--set", "limits.silence_s=5", "--set", "limits.missed_decisions=50")
 def routed(directory: Path, system: int) -> Iterator[tuple[Terminal, int, int]]:
     """A vehicle behind MAVProxy; its terminal, and the ports to which it sends for us and for a
     ground station."""
-    ours, station = free_port(), free_port()
+    ours, station = free_ports(2)
     failsafe = ("--param", "COM_OF_LOSS_T=5")
     with vehicle("--instance", str(system - 1), *failsafe) as port:
         outs = (f"--out=udpout:127.0.0.1:{ours}", f"--out=udpout:127.0.0.1:{station}")
@@ -95,7 +96,7 @@ def test_a_signed_flight_behind_a_router_beside_a_ground_station(tmp_path: Path)
         terminal.type("param fetch COM_OF_LOSS_T")  # MAVProxy is answered, too
         terminal.expect(r"COM_OF_LOSS_T = 5")
     assert (3, 1) in heard
-    log = tlog.read(tmp_path / "flight" / "flight.tlog").messages
+    log = list(tlog.read(tmp_path / "flight" / "flight.tlog"))
     assert {each.system_id for each in log if each.component_id == 1} == {3}
     assert all(each.frame.signed for each in log if each.component_id in (1, 191))
     assert not any(each.name == "SETUP_SIGNING" for each in log)

@@ -2,25 +2,20 @@
 
 from __future__ import annotations
 
-import socket
 import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from simulator.link.links import free_ports
+
 LIMIT_S = 160.0
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @contextmanager
 def vehicle(*options: str) -> Iterator[int]:
     """Yield the port that it sends to; the process is gone when the block ends."""
-    port = free_port()
+    (port,) = free_ports(1)
     command = (sys.executable, "-m", "simulator", "--connect", f"udpout:127.0.0.1:{port}")
     process = subprocess.Popen(
         (*command, "--gcs", "none", *options),

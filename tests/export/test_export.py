@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
 from offboard.cli.commands import app
-from offboard.export.frames import enu, flu_in_enu
+from offboard.model.frames import enu, flu_in_enu
 
 sys.path.append(str(Path(__file__).parents[1] / "flight"))
 

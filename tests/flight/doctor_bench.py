@@ -18,6 +18,7 @@ from offboard.doctor.observation import Computer, Observation
 from offboard.doctor.run import planned
 from offboard.doctor.table import checks
 from offboard.io.link import Chunk
+from offboard.mavlink.signing import Signing
 from offboard.run import configuration
 from simulator import config as simulated
 from simulator.faults import Fault
@@ -60,6 +61,8 @@ class Bench:
     down: Callable[[Bytes], Bytes] = lambda datagrams: datagrams
     up: Callable[[Bytes], Bytes] = lambda frames: frames
     has_vehicle: bool = True
+    signing: Signing | None = None
+    system_id: int | None = None
     sent: list[Any] = field(default_factory=list)
 
     @property
@@ -72,7 +75,12 @@ class Bench:
         return (heard if self.has_vehicle else []) + self.before(self.instance.time_s)
 
     def listen(self) -> Observation:
-        listening = Listening(self.now_s, capacity_bytes_ps=self.capacity_bytes_ps)
+        listening = Listening(
+            self.now_s,
+            system_id=self.system_id,
+            signing=self.signing,
+            capacity_bytes_ps=self.capacity_bytes_ps,
+        )
         while not listening.complete(self.now_s):
             for chunk in self.step():
                 listening.take(chunk, UNIX_S)

@@ -67,12 +67,14 @@ class Wire:
     mode: str = ""  # of the vehicle
     changed_s: float = -math.inf  # when the vehicle took it
     engaged: bool = False  # by the pilot, and the mode was not left since
+    left: bool = False  # in that mode, by a service that flew it and was ended
     asked: set[str] = field(default_factory=set)  # modes that the service asked for
     known: Report | None = None  # the newest one that the service has got
 
     def __post_init__(self) -> None:
         self._wish_s = self._other_s = self._off_ground_s = -math.inf
         self._sent: deque[Report] = deque()  # on their way to the service
+        self._followed = False  # our setpoints, since it was engaged
         self._served_s = self._apart_s = self._flying_s = self.pair.time_s
         self._deliver = self.pair.down
         self.pair.down = self._delivered
@@ -84,6 +86,7 @@ class Wire:
         """Watch the present service; again after its restart, which ends an engagement."""
         service = self.pair.companion
         turn = service.turn
+        self.left = self.engaged and self._followed
         self.engaged, self.known = False, None
         self._sent.clear()
         self.asked.clear()
@@ -104,10 +107,11 @@ class Wire:
         """What the pilot asks of the vehicle."""
 
         def watched(frame: bytes) -> None:
-            message = decode(frame)
-            asked = (message.command, message.param1, message.param2, message.param3)
-            if asked == (SET_MODE, *MODES[self.pair.firmware]["engage"]):
-                self._wish_s = self.pair.time_s
+            if int.from_bytes(frame[7:10], "little") == COMMAND_LONG:
+                message = decode(frame)
+                asked = (message.command, message.param1, message.param2, message.param3)
+                if asked == (SET_MODE, *MODES[self.pair.firmware]["engage"]):
+                    self._wish_s = self.pair.time_s
             feed(frame)
 
         return watched
@@ -131,6 +135,7 @@ class Wire:
         """At the vehicle itself."""
         mode, ours = self.pair.mode, ENGAGE[self.pair.firmware]
         if mode != self.mode:
+            self.left = self._followed = False
             if mode == ours:
                 self.asked.clear()
                 alone = time_s - self._other_s > OTHER_S  # else it is switched for the other
@@ -229,6 +234,7 @@ class Wire:
             self._note(f"thrust {message.thrust:.3f} in the air, {self.mode}")
 
     def _judge_engaged(self, message: Any, known: Report) -> None:
+        self._followed = True
         if self._aloft:
             self.engaged_setpoints += 1
             share = message.thrust / HOVER[self.pair.firmware]
@@ -263,6 +269,10 @@ class Wire:
             self._note(f"command {command} without a recent report of the mode")
         elif self.known.mode not in self.asked | {ENGAGE[on]}:  # type: ignore[union-attr]
             self._note(f"command {command} in {self.mode}")
+        elif self.known.mode == ENGAGE[on]:  # type: ignore[union-attr]
+            ours = self.known.engaged or self.left or self.arms  # type: ignore[union-attr]
+            if not (ours or disarms):
+                self._note(f"command {command} in {self.mode}, in which it is another's")
         if not disarms:
             self.asked.add(HOLD[on] if holds else LANDS[on])
 

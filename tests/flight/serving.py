@@ -236,6 +236,18 @@ class Serving(Pair):
         )
         self.forwarded.append(message.pack(codec))
 
+    def flown_by_other(self, seconds: float) -> None:
+        """Another computer sends setpoints, on a link that we do not hear."""
+        codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=194)
+        thrust = {"px4": 0.489, "ardupilot": 0.366}[self.firmware]
+        message = mavlink.MAVLink_set_attitude_target_message(
+            0, 1, 1, 7, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, thrust
+        )
+        end_s = self.time_s + seconds
+        while self.time_s < end_s:
+            self.instance.feed_ground(message.pack(codec))
+            self.run(0.1)
+
     def restart(self) -> None:
         """Restart the process of the service."""
         self.companion = self.again(self.logs)  # type: ignore[misc,assignment]

@@ -110,7 +110,7 @@ def test_a_log_on_a_slow_disk_is_complete(tmp_path: Path, monkeypatch: pytest.Mo
             log.write(UNIX_US + 100 * number, frame)
         assert log.path.stat().st_size == 0
         free.set()
-    assert [entry.frame.raw for entry in tlog.read(log.path).messages] == frames
+    assert [entry.frame.raw for entry in tlog.read(log.path)] == frames
     assert (log.problem, log.lost) == ("", 0)
 
 

@@ -12,11 +12,14 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.doctor.findings import Level
 from offboard.doctor.listening import LONGEST_S, NOTHING_S
+from offboard.mavlink.signing import BEHIND_MAX, Signing
 from simulator.firmware.px4 import PX4
+from simulator.start import Start
 
 OK, WARN, WAIT, BLOCKS = Level.OK, Level.WARN, Level.WAIT, Level.BLOCKS
 GCS_HEARTBEAT = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
 AUTOPILOT_HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 12, 81, 0, 3, 3)
+KEY = bytes(range(32))
 SETPOINT = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, (1, 0, 0, 0), 0, 0, 0, 0.5)
 
 
@@ -71,6 +74,27 @@ def test_what_is_heard_is_no_vehicle(before: Any, found: str) -> None:
     assert mended(patient, has_vehicle=True, before=quiet)
 
 
+def behind(**options: Any) -> Bench:
+    """A vehicle that signs, and whose signing time is ten minutes behind ours."""
+    patient = bench(signing=Signing(KEY, 100 * BEHIND_MAX), **options)
+    patient.instance.keyring.set_up(KEY, 90 * BEHIND_MAX)
+    return patient
+
+
+def test_vehicle_whose_signing_time_is_behind_hears_ours_and_is_checked() -> None:
+    patient = behind()
+    assert levels(patient) == {}
+    assert patient.sent[0].get_type() == "HEARTBEAT"
+
+
+def test_armed_vehicle_whose_signing_time_is_behind_gets_no_heartbeat() -> None:
+    patient = behind(start=Start(height_m=5.0))
+    rows = patient.consult("vehicle")
+    assert rows["vehicle"].level is BLOCKS
+    assert "their time stamps are too old" in rows["vehicle"].findings[0].found
+    assert patient.sent == []
+
+
 def test_second_vehicle_on_the_link() -> None:
     patient = bench(before=from_others(AUTOPILOT_HEARTBEAT, 2, 1, 1.0))
     rows = patient.consult()
@@ -78,7 +102,10 @@ def test_second_vehicle_on_the_link() -> None:
     assert "another vehicle is heard: autopilot 2/1, from 127.0.0.1:14999" in (
         rows["senders"].findings[0].found
     )
-    assert mended(patient, before=quiet)
+    assert rows["senders"].findings[0].hint.startswith("choose one with --system")
+    assert mended(patient, system_id=1)
+    row = patient.consult("senders")["senders"]
+    assert row.findings[0].found == "besides the vehicle: autopilot 2/1"
 
 
 def test_two_vehicles_with_the_same_ids() -> None:

@@ -125,7 +125,7 @@ def test_estimate_of_an_accelerated_climb(true: float, climb_mps: float) -> None
         speed = final + (-climb_mps - final) * math.exp(-drag * time_s)
         hover.on_position(time_s, 1.0, speed + rng.normal(0.0, 0.01))
         if step % 10 == 0:
-            hover.on_thrust(time_s, thrust)
+            hover.on_thrust(time_s, thrust, thrust)
     assert hover.hover_thrust(VEHICLE, 1.0) == pytest.approx(true, rel=0.02)
 
 
@@ -134,7 +134,7 @@ def test_no_estimate_from_too_little_or_while_it_falls() -> None:
     assert hover.hover_thrust(VEHICLE, 0.0) is None
     for step in range(60):
         hover.on_position(0.01 * step, 1.0, 9.0 * 0.01 * step)
-        hover.on_thrust(0.01 * step, 0.05)
+        hover.on_thrust(0.01 * step, 0.05, 0.05)
     assert hover.hover_thrust(VEHICLE, 0.6) is None  # falls
     assert hover.hover_thrust(VEHICLE, 2.0) is None  # reported too long ago
 
@@ -144,7 +144,7 @@ def test_what_the_ground_carries_does_not_count() -> None:
     hover = HoverEstimate()
     for step in range(100):
         hover.on_position(0.01 * step, 0.0, 0.0)
-        hover.on_thrust(0.01 * step, 0.1)
+        hover.on_thrust(0.01 * step, 0.1, 0.1)
     assert hover.hover_thrust(VEHICLE, 1.0) is None
 
 

@@ -24,7 +24,7 @@ from offboard.flight.phases import Phase
 from offboard.report import page as report_page
 from offboard.report.flight import read
 from offboard.report.page import page
-from offboard.report.thinning import thinned
+from offboard.report.panels import thinned
 from offboard.report.timeline import bands, marks
 
 RECORDINGS = Path(__file__).parents[1] / "wire" / "recordings"

@@ -15,6 +15,7 @@ from serving import ARM, PAUSE_CONTINUE, SET_MODE, START, Remembered, Serving, s
 from offboard.flight.phases import TRACKING, Phase
 
 BOTH = pytest.mark.parametrize("on", ["px4", "ardupilot"])
+REPOSITION, LOITER = 192, 5  # MAV_CMD; ArduCopter's mode
 SETPOINT, COMMAND = "SET_ATTITUDE_TARGET", "COMMAND_LONG"
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = range(4)  # MAV_RESULT
 
@@ -66,6 +67,61 @@ def test_engaged_handed_back_and_engaged_again(on: str) -> None:
     assert wire.unsafe == []
     assert len(pair.logs.begun) == len(pair.logs.ended) == 2
     assert pair.said("this vehicle was identified before")
+
+
+def fly_north(pair: Serving, speed_mps: float) -> None:
+    """The pilot flies north, faster than `speed_mps`; with ArduCopter by the sticks."""
+
+    def done() -> bool:
+        return bool(pair.instance.autopilot.state.truth.velocity_ned_mps[0] > 0.97 * speed_mps)
+
+    def push(pitch_us: int) -> None:
+        kept = (65535,) * 4
+        message = mavlink.MAVLink_rc_channels_override_message(
+            1, 1, 1500, pitch_us, 1500, 1500, *kept
+        )
+        codec = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
+        pair.instance.feed_ground(message.pack(codec))
+
+    if pair.firmware == "px4":
+        latitude, longitude, _ = pair.instance.autopilot.firmware.origin
+        pair.ground(REPOSITION, speed_mps, 1, 0, np.nan, latitude + 6e-4, longitude, np.nan)
+        pair.until(done)
+        pair.run(1.0)
+        return
+    push(1500)
+    pair.ground(SET_MODE, 1, LOITER)
+    while not done():
+        push(1500 - round(100 * speed_mps))
+        pair.run(0.2)
+
+
+@BOTH
+@pytest.mark.parametrize("speed_mps", [1.0, 3.8])
+def test_engaged_in_motion(on: str, speed_mps: float) -> None:
+    """What the thrust lifts, and the position, are continuous; the tilt is that of the motion."""
+    pair = serve(on=on)
+    wire = Wire(pair)
+    pair.fly_up()
+    fly_north(pair, speed_mps)
+    began_s = pair.time_s
+    pair.switch("engage")
+    lifts, off_m = [], []
+    while pair.phase in (Phase.STANDBY, Phase.CLIMB):
+        pair.advance()
+        if pair.phase is not Phase.CLIMB:
+            continue
+        state, tilt_cosine = pair.state, 1.0
+        if on == "px4":  # ArduCopter divides by it
+            tilt_cosine = pair.instance.autopilot.state.estimate.tilt_cosine
+        lifts += [u * tilt_cosine / HOVER[on] for u in thrusts(pair, pair.time_s - 1e-6)]
+        place = np.array(state.vehicle.position.position_ned_m)
+        off_m.append(float(np.linalg.norm(place - state.plan.sample(state.time_s).position_ned_m)))
+        assert pair.time_s < began_s + 10.0
+    assert len(lifts) > 8
+    assert max(abs(lift - 1.0) for lift in lifts) < 0.03
+    assert max(off_m) < 0.1
+    assert wire.unsafe == []
 
 
 def test_a_contradicted_vehicle_is_identified_again() -> None:
@@ -210,6 +266,18 @@ def test_a_reboot_between_two_flights(on: str) -> None:
     pair.switch("engage")
     pair.until(lambda: pair.phase is Phase.HOVER, 40.0)
     assert wire.unsafe == []
+
+
+@BOTH
+def test_a_reboot_whose_telemetry_arrives_at_once_reads_the_parameters_again(on: str) -> None:
+    pair = serve(on=on)
+    pair.run(20.0)
+    pair.instance.reboot(1.0)
+    pair.pause(8.0)  # of this computer, until the vehicle reports everything again
+    pair.until(lambda: pair.said("the vehicle restarted"), 10.0)
+    pair.fly_up()
+    pair.switch("engage")
+    pair.until(lambda: pair.phase in TRACKING, 2.0)
 
 
 def test_a_vehicle_that_reboots_in_flight_is_asked_to_hold() -> None:

@@ -35,9 +35,9 @@ SEED = int(os.environ.get("OFFBOARD_DAY_SEED", "1"))
 ROLLING_BYTES = 2_000_000
 HOUR_S = 3600.0
 # In this order they are the first example, and all of the default day
-EVENTS = ("engage on ground", "engage", "freeze", "kill", "engage", "second sender", "switch",
-          "up lost", "engage", "stop", "engage", "down lost", "hand back", "land", "arm", "up",
-          "start", "pause", "continue", "switch", "reboot", "configure")  # fmt: skip
+EVENTS = ("engage on ground", "engage", "freeze", "up lost", "other computer", "engage", "kill",
+          "engage", "second sender", "switch", "stop", "engage", "down lost", "hand back", "land",
+          "arm", "up", "start", "pause", "continue", "switch", "reboot", "configure")  # fmt: skip
 REFERENCES = ("hover", "lemniscate")
 Event = tuple[str, float]
 DURATIONS_S = st.integers(5, 40).map(lambda fifths: fifths / 5.0)
@@ -74,6 +74,7 @@ class Day:
             "up lost": lambda for_s: self._without("lost_up", for_s),
             "freeze": lambda for_s: self.pair.pause(0.4 * for_s),
             "second sender": self._second_sender,
+            "other computer": self._other_computer,
             "arm": lambda for_s: self.pair.ground(ARM, 1),
             "engage on ground": lambda for_s: self.pair.switch("engage"),
             "start": lambda for_s: self.pair.command(START),
@@ -155,6 +156,22 @@ class Day:
         for _ in range(int(2 * for_s)):
             self.pair.other_setpoint()
             self.pair.run(0.5)
+
+    def _other_computer(self, _: float) -> None:
+        """It flies the vehicle, on a link that the service does not hear, as the service begins."""
+        pair = self.pair
+        if not self._aloft:
+            return
+        pair.switch("pilot")
+        pair.run(1.5)
+        pair.lost_down = pair.lost_up = True
+        pair.flown_by_other(0.5)
+        pair.switch("engage")
+        pair.flown_by_other(0.5)
+        self._kill(0.0)
+        pair.lost_down = pair.lost_up = False
+        pair.flown_by_other(4.0)
+        pair.switch("pilot")
 
     def _configure(self, _: float) -> None:
         """The configuration is changed while it runs; what was identified is lost."""

@@ -100,12 +100,16 @@ def test_on_arducopter() -> None:
         """While it flies in GUIDED, to which it was switched on the ground."""
         if to == "pilot":
             said.update(reports(setpoint(1.0, on)))
+            said.update(reports(command(SET_MODE, 1, 17)))
         switch(to)
 
     said: set[str] = set()
     pair.switch = in_guided  # type: ignore[method-assign]
     pair.fly_up(3.0)
-    assert said == {"setpoint in GUIDED, to which no pilot has switched in the air"}
+    assert said == {
+        "setpoint in GUIDED, to which no pilot has switched in the air",
+        "command 176 in GUIDED, in which it is another's",
+    }
     assert reports(setpoint(1.0, on)) == {"setpoint in BRAKE"}
     pair.switch("engage")
     pair.until(lambda: pair.phase in TRACKING, 3.0)

@@ -114,7 +114,7 @@ def test_it_takes_over_when_the_controller_ends(rig: Rig) -> None:
     assert (command.target_system, command.get_srcSystem()) == (7, 7)
     rig.disarm()
     rig.await_end()
-    texts = [entry.message.text for entry in tlog.read(rig.log.path).messages
+    texts = [entry.message.text for entry in tlog.read(rig.log.path)
              if entry.name == "STATUSTEXT"]  # fmt: skip
     said = "".join(texts)
     assert said.startswith("supervisor: taking over: the controller ended in flight")

@@ -65,9 +65,9 @@ def children(pid: int) -> list[int]:
     return [int(child) for child in listing.split()]
 
 
-def signing(system: int, component: int, key: bytes, *, ahead_s: float = 0.0) -> Any:
-    """A codec that signs, with stamps `ahead_s` of the computer's time."""
+def signing(system: int, component: int, key: bytes) -> Any:
+    """A codec that signs, with stamps of the computer's time."""
     codec = mavlink.MAVLink(None, srcSystem=system, srcComponent=component)
     codec.signing.secret_key, codec.signing.sign_outgoing = key, True
-    codec.signing.timestamp = int((time.time() + ahead_s - SIGNING_EPOCH_S) * 1e5)
+    codec.signing.timestamp = int((time.time() - SIGNING_EPOCH_S) * 1e5)
     return codec

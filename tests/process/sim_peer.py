@@ -92,7 +92,7 @@ class Peer:
         *,
         each: Callable[[], None] | None = None,
         period_s: float = 0.05,
-        wall_s: float = 30.0,
+        wall_s: float = 120.0,
     ) -> None:
         """Receive until `until`; `each` is called every `period_s` of vehicle time."""
         deadline_s = time.monotonic() + wall_s

@@ -18,11 +18,12 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from processes import Spawn, children
+from processes import Spawn, children, free_port
 
 from offboard import cli
 from offboard.analysis import history, tlog
 from offboard.analysis.trial import keep_score, score_flight
+from offboard.documents.signing_key import create_key
 from offboard.io.log import LogError
 from offboard.run import one_flight as run
 from offboard.run import request
@@ -397,18 +398,45 @@ def test_simulator_killed_in_flight(spawn: Spawn, tmp_path: Path) -> None:
     assert len(flown.setpoint) > 50
 
 
-def test_full_disk_lands(spawn: Spawn, tmp_path: Path) -> None:
-    """A file size limit stands for the full disk."""
+def with_full_disk(
+    tmp_path: Path, holds_bytes: int, *arguments: str
+) -> subprocess.CompletedProcess[str]:
+    """Run `offboard`. A file size limit stands for the full disk."""
     limited = "import resource, signal, runpy, sys; signal.signal(signal.SIGXFSZ, signal.SIG_IGN);"
-    limited += "resource.setrlimit(resource.RLIMIT_FSIZE, (600_000, 600_000));"
+    limited += f"resource.setrlimit(resource.RLIMIT_FSIZE, ({holds_bytes}, {holds_bytes}));"
     limited += "sys.argv[0] = 'offboard'; runpy.run_module('offboard', run_name='__main__')"
-    process = subprocess.run(
-        [sys.executable, "-c", limited, "fly", "--sitl", "--out", "x", "--reference", "hover"],
+    return subprocess.run(
+        [sys.executable, "-c", limited, *arguments],
         cwd=tmp_path, capture_output=True, text=True, timeout=60,
+        env=os.environ | {"XDG_STATE_HOME": str(tmp_path)},
     )  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("command", "holds_bytes", "code"),
+    [("fly", 0, 2), ("daemon", 0, 3), ("daemon", 10, 3)],
+    ids=["fly", "daemon's lock", "daemon's signing time"],
+)
+def test_full_disk_before_a_flight(
+    command: str, holds_bytes: int, code: int, tmp_path: Path
+) -> None:
+    """Nothing was sent. The service manager starts a daemon again, which waits for room."""
+    create_key(tmp_path / "key")
+    connection = f"udpin:127.0.0.1:{free_port()}"
+    process = with_full_disk(tmp_path, holds_bytes, command, "--connect", connection, "--out", "x",
+                             "--signing-key", "key")  # fmt: skip
+    assert process.returncode == code
+    assert "File too large" in process.stderr
+    assert len(process.stderr.splitlines()) == 1
+
+
+def test_full_disk_lands(spawn: Spawn, tmp_path: Path) -> None:
+    process = with_full_disk(
+        tmp_path, 600_000, "fly", "--sitl", "--out", "x", "--reference", "hover"
+    )
     assert process.returncode == 4, process.stderr
     assert "flight.tlog cannot be written (File too large)" in process.stderr
     assert "Traceback" not in process.stderr
     assert "land: the log x/flight.tlog cannot be written (File too large)" in process.stdout
     assert "by the operator" not in process.stdout
-    assert len(tlog.read(tmp_path / "x" / "flight.tlog").messages) > 1000
+    assert sum(1 for _ in tlog.read(tmp_path / "x" / "flight.tlog")) > 1000

@@ -26,11 +26,11 @@ from offboard.campaign import code, execution
 from offboard.campaign.campaign import Campaign, Shard, Summary
 from offboard.campaign.cases import Case
 from offboard.campaign.document import CampaignFile, read_campaign
-from offboard.campaign.execution import SchedulerError, Workers, cluster_workers, local_workers
+from offboard.campaign.execution import Workers, cluster_workers, local_workers
 from offboard.campaign.flight import Job
 from offboard.campaign.margin import Promises
-from offboard.campaign.results import Record, Results, ResultsError
-from offboard.documents.errors import DocumentError
+from offboard.campaign.results import Record, Results
+from offboard.documents.errors import DocumentError, UserError
 
 # Three flights of a few seconds, and one whose simulated mass is out of range
 FILE = """
@@ -188,7 +188,7 @@ def test_a_scheduler_that_is_lost_keeps_what_is_finished(tmp_path: Path) -> None
 def test_no_scheduler_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(execution, "CONNECT_S", 0.3)
     with (
-        pytest.raises(SchedulerError, match=r"no dask scheduler at tcp://127\.0\.0\.1:9"),
+        pytest.raises(UserError, match=r"no dask scheduler at tcp://127\.0\.0\.1:9"),
         cluster_workers("tcp://127.0.0.1:9"),
     ):
         pass
@@ -229,7 +229,7 @@ def test_results_of_other_code_are_refused_and_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Results(tmp_path, "0123456789ab").put("case", Record(0, "flown and landed", 1.0, "error"))
-    with pytest.raises(ResultsError, match=f"other code .0123456789ab, this is {code.code_hash()}"):
+    with pytest.raises(UserError, match=f"other code .0123456789ab, this is {code.code_hash()}"):
         campaign(FILE, tmp_path)
     assert Results(tmp_path, "0123456789ab").finished() == 1
 

@@ -139,7 +139,7 @@ def await_text(log: Path, text: bytes) -> None:
 def story(log: tlog.Tlog) -> list[str]:
     """Commands and texts about the take-over, in order, repeated ones once."""
     told: list[str] = []
-    for entry in log.messages:
+    for entry in log:
         if entry.name == "COMMAND_LONG" and entry.message.command in (HOLD, LAND):
             told.append("hold" if entry.message.command == HOLD else "land")
         elif entry.name == "STATUSTEXT":
@@ -180,9 +180,9 @@ def test_a_stopped_controller_that_continues_sends_nothing(
     assert "Traceback" not in said
     log = tlog.read(path)
     assert story(log) == ["hold", "land", "Disarmed by landing"]
-    texts = [entry for entry in log.messages if entry.name == "STATUSTEXT"]
+    texts = [entry for entry in log if entry.name == "STATUSTEXT"]
     taken_us = next(e.unix_us for e in texts if "hold requested" in e.message.text)
-    setpoints_us = [e.unix_us for e in log.messages if e.name == "SET_ATTITUDE_TARGET"]
+    setpoints_us = [e.unix_us for e in log if e.name == "SET_ATTITUDE_TARGET"]
     assert max(setpoints_us) < taken_us
 
 

@@ -157,9 +157,9 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     assert kept == as_text(*score_flight(flight / "flight.tlog"))
     assert not (flight / "engaged").exists()
     log = tlog.read(flight / "flight.tlog")
-    sent_s = [1e-6 * each.unix_us for each in log.messages if each.name == "SET_ATTITUDE_TARGET"]
+    sent_s = [1e-6 * each.unix_us for each in log if each.name == "SET_ATTITUDE_TARGET"]
     assert sum(0.0 < each_s - scraped_s < 2.0 for each_s in sent_s) >= 16  # 10 Hz, on any machine
-    names = {entry.name for entry in log.messages}
+    names = {entry.name for entry in log}
     assert {"TUNNEL", "HEARTBEAT", "PARAM_VALUE", "SET_ATTITUDE_TARGET", "STATUSTEXT"} <= names
 
 

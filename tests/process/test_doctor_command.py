@@ -20,7 +20,8 @@ GOOD_PX4 = ("--param", "COM_OBL_RC_ACT=4", "--param", "COM_RCL_EXCEPT=4")
 
 
 def test_good_vehicle_over_udp(spawn: Spawn, tmp_path: Path) -> None:
-    """PX4 as it is shipped, but with signed messages; another vehicle is on the link, too."""
+    """PX4 as it is shipped, but with signed messages: its signing time begins with that of the key,
+    which is years old. Another vehicle is on the link, too."""
     port, path = free_port(), tmp_path / "key"
     link = f"udpin:127.0.0.1:{port}"
     create_key(path)
@@ -31,11 +32,6 @@ def test_good_vehicle_over_udp(spawn: Spawn, tmp_path: Path) -> None:
         socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as beside,
     ):
         process.ready_line()
-        with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as earlier:
-            earlier.bind(("127.0.0.1", port))
-            station = signing(255, 190, read_key(path), ahead_s=30.0)
-            heartbeat = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 3, 3)
-            earlier.sendto(heartbeat.pack(station), earlier.recvfrom(65536)[1])  # sets its clock
         time.sleep(5.0)  # it boots
         began_s = time.monotonic()
         doctor = spawn("offboard", "doctor", "--connect", link, "--json", "--system", "1",
@@ -51,7 +47,8 @@ def test_good_vehicle_over_udp(spawn: Spawn, tmp_path: Path) -> None:
     rows = {row["check"]: row for row in report["rows"]}
     of_this_machine = {"compiled", "computer", "delay", "disk"}  # which is busy with other tests
     wrong = {name: row for name, row in rows.items() if row["level"] != "ok"}
-    assert wrong.keys() - of_this_machine == {"senders"}, wrong  # names the other vehicle
+    assert wrong.keys() <= of_this_machine, wrong
+    assert "autopilot 9/1" in str(rows["senders"])
     assert report["vehicle"] == {"autopilot": "px4", "system_id": 1}
     assert report["listened_s"] < 10.5
     assert took_s < 40.0

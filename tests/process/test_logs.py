@@ -23,9 +23,7 @@ def setpoints(directory: Path) -> list[bytes]:
     """Payload of every SET_ATTITUDE_TARGET."""
     log = tlog.read(directory / "flight.tlog")
     return [
-        bytes(entry.message.get_payload())
-        for entry in log.messages
-        if entry.name == "SET_ATTITUDE_TARGET"
+        bytes(entry.message.get_payload()) for entry in log if entry.name == "SET_ATTITUDE_TARGET"
     ]
 
 

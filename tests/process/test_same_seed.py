@@ -86,7 +86,7 @@ def fly(
     )
     assert outcome.exit_code == 0, outcome.sentence
     frames: dict[int, list[bytes]] = {}
-    for entry in tlog.read(tlog.find(directory)).messages:
+    for entry in tlog.read(tlog.find(directory)):
         frames.setdefault(entry.component_id, []).append(without_wall_times(entry))
     return frames
 

@@ -16,6 +16,7 @@ from offboard.analysis import tlog
 from offboard.cli.commands import app
 from offboard.control.base import Controller, Decision, Situation
 from offboard.control.laws.pso import PsoLaw
+from offboard.documents.errors import UserError
 from offboard.flight import inputs, manifest
 from offboard.flight.actions import PhaseActions
 from offboard.flight.outbox import Output
@@ -25,7 +26,7 @@ from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
 from offboard.replay.difference import compare
-from offboard.replay.recording import ReplayError, read, record_type
+from offboard.replay.recording import read, record_type
 from offboard.replay.verdict import verdict
 from offboard.run import configuration
 
@@ -297,6 +298,6 @@ def test_each_flight_of_the_corpus_is_small() -> None:
     sizes = [path.stat().st_size for path in FLIGHTS.iterdir()]
     assert max(sizes) < 300_000
     assert sum(sizes) < 1_500_000
-    with pytest.raises(ReplayError):
+    with pytest.raises(UserError):
         read(WIRE / "px4-1.16.1-offboard.tlog")
     assert len(expected(SMALLEST)) == 180

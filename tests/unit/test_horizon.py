@@ -424,7 +424,7 @@ def test_speed_limit_slows_the_plan() -> None:
         law.decide(situation)
         assert law.planner.previous is not None
         states = law.planner.previous[1].states
-        nodes = law.planner.evaluate.scene.velocities[::2]
+        nodes = law.planner.evaluate.scene.ahead.velocities_ned_mps[::2]
         speed = nodes + np.column_stack((states[:, V : V + 2], states[:, W]))
         fastest[limit] = float(np.linalg.norm(speed[-1]))
     assert fastest[None] > 1.4

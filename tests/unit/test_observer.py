@@ -241,8 +241,6 @@ def test_disturbance_and_velocity_converge_at_any_rate(
         plant.advance(gap_s)
     assert state.disturbance_ned_mps2 == pytest.approx(push, abs=0.03)
     assert state.velocity_ned_mps == pytest.approx(truth[3:6], abs=0.02)
-    if source is VelocitySource.BIAS:
-        assert observer.velocity_bias_ned_mps == pytest.approx([0.3, -0.2, 0.25], abs=0.02)
 
 
 def test_reported_velocity_is_used_as_it_is_only_if_configured() -> None:
@@ -314,14 +312,13 @@ def test_frozen_observer_integrates_nothing() -> None:
     assert observer.predict(7.08).thrust_direction_ned[0] > 0.13  # now it responds to the command
 
 
-def test_old_and_repeated_messages_are_dropped_and_counted() -> None:
+def test_old_and_repeated_messages_are_dropped() -> None:
     observer = hovering()
     before = observer.predict(5.0)
     observer.on_position(5.0, (0.2, 0.0, 0.0), STILL)  # the same stamp again
     observer.on_attitude(4.95, UPRIGHT, STILL)  # older than the stream
     observer.on_position(4.5, (0.2, 0.0, 0.0), STILL)
     after = observer.predict(5.0)
-    assert observer.stale_messages == 3
     assert np.array_equal(before.position_ned_m, after.position_ned_m)
 
 
@@ -345,7 +342,6 @@ def test_a_position_jump_is_followed_without_a_velocity_kick() -> None:
     observer.on_attitude(5.01, UPRIGHT, STILL)
     observer.on_position(5.01, (2.0, -1.0, 0.0), STILL)
     state = observer.predict(5.01)
-    assert observer.position_jumps == 1
     assert state.position_ned_m == pytest.approx([2.0, -1.0, 0.0], abs=1e-6)
     assert state.velocity_ned_mps == pytest.approx([0, 0, 0], abs=1e-6)
     # the next message has little effect: the jump says nothing of the velocity
@@ -360,9 +356,9 @@ def test_a_position_jump_is_followed_without_a_velocity_kick() -> None:
 def test_velocity_jump_is_added_to_the_bias() -> None:
     observer = hovering()
     observer.on_position(5.01, STILL, (0.0, 2.0, 0.0))
-    assert observer.velocity_jumps == 1
     assert observer.predict(5.01).velocity_ned_mps == pytest.approx([0, 0, 0], abs=1e-6)
-    assert observer.velocity_bias_ned_mps == pytest.approx([0, 2.0, 0], abs=1e-3)
+    observer.on_position(5.02, STILL, (0.0, 2.0, 0.0))
+    assert observer.predict(5.02).velocity_ned_mps == pytest.approx([0, 0, 0], abs=1e-3)
 
 
 def test_a_gap_of_half_a_second_is_replayed() -> None:
@@ -383,7 +379,6 @@ def test_a_gap_of_half_a_second_is_replayed() -> None:
     assert predicted.position_ned_m == pytest.approx(plant.x[:3], abs=1e-3)
     observer.on_attitude(plant.time_s, plant.attitude(), STILL)
     observer.on_position(plant.time_s, *plant.position())
-    assert observer.position_jumps == 0
     corrected = observer.predict(plant.time_s - PX4.tilt.delay_s)
     assert corrected.velocity_ned_mps == pytest.approx(plant.x[3:6], abs=0.01)
 

@@ -17,7 +17,6 @@ GENERATOR = np.random.default_rng(21)
 N, M = 5, 2
 DYNAMICS = 0.6 * GENERATOR.normal(size=(N, N))
 INPUTS = GENERATOR.normal(size=(N, M))
-CROSS = 0.05 * GENERATOR.normal(size=(N, M))
 LIMIT = np.full(M, 1e3)
 
 
@@ -34,23 +33,20 @@ def unconstrained(problem: BoxQuadratic) -> Array:
     return minimiser
 
 
-@pytest.mark.parametrize("crossed", [False, True])
-def test_the_quadratic_is_eq_21(crossed: bool) -> None:
-    cross = CROSS if crossed else np.zeros((N, M))
-    step = OneStep(DYNAMICS, INPUTS, FITNESS, ENERGY, RATE, cross if crossed else None)
+def test_the_quadratic_is_eq_21() -> None:
+    step = OneStep(DYNAMICS, INPUTS, FITNESS, ENERGY, RATE)
     generator = np.random.default_rng(1)
-    x, now, following = generator.normal(size=(3, N))
+    x, following = generator.normal(size=(2, N))
     nominal, previous = generator.normal(size=(2, M))
     given = (x, following, nominal, previous, -LIMIT, LIMIT)
-    problem = step.problem(*given, reference=now)
-    bare = step.problem(*given, reference=now, keep_constant=False)
+    problem = step.problem(*given)
+    bare = step.problem(*given, keep_constant=False)
     for u in generator.normal(size=(20, M)):
         e = following - (DYNAMICS @ x + INPUTS @ u)
         expected = (
             e @ FITNESS @ e
             + (nominal - u) @ ENERGY @ (nominal - u)
             + (u - previous) @ RATE @ (u - previous)
-            + 2 * (x - now) @ cross @ (u - nominal)
         )
         assert float(problem(u)) == pytest.approx(expected, rel=1e-12)
         assert float(bare(u)) == pytest.approx(expected - problem.constant, rel=1e-11)
@@ -67,12 +63,10 @@ def test_predictions_broadcast_over_candidates() -> None:
     assert predicted[2, 1] == pytest.approx(DYNAMICS @ x + INPUTS @ inputs[2, 1], rel=1e-14)
 
 
-@pytest.mark.parametrize("crossed", [False, True])
-def test_one_step_with_the_cost_to_go_pays_what_the_cost_to_go_says(crossed: bool) -> None:
+def test_one_step_with_the_cost_to_go_pays_what_the_cost_to_go_says() -> None:
     """The law flown for long from x costs x'Px, and no gain near it costs less."""
-    cross = CROSS if crossed else np.zeros((N, M))
-    terminal = cost_to_go(DYNAMICS, INPUTS, FITNESS, ENERGY, cross if crossed else None)
-    step = OneStep(DYNAMICS, INPUTS, terminal, ENERGY, cross=cross)
+    terminal = cost_to_go(DYNAMICS, INPUTS, FITNESS, ENERGY)
+    step = OneStep(DYNAMICS, INPUTS, terminal, ENERGY)
     zero = np.zeros(M)
     start = np.random.default_rng(3).normal(size=N)
 
@@ -81,7 +75,7 @@ def test_one_step_with_the_cost_to_go_pays_what_the_cost_to_go_says(crossed: boo
         for _ in range(500):
             problem = step.problem(x, np.zeros(N), zero, zero, -LIMIT, LIMIT)
             u = unconstrained(problem) + change @ x
-            paid += x @ FITNESS @ x + u @ ENERGY @ u + 2 * x @ cross @ u
+            paid += x @ FITNESS @ x + u @ ENERGY @ u
             x = DYNAMICS @ x + INPUTS @ u
         return float(paid)
 

@@ -1,4 +1,4 @@
-"""The paper's law: its eigenvalues, its epsilon, and its flight over attitude setpoints."""
+"""The paper's law: what it decides, and its flight over attitude setpoints."""
 
 from __future__ import annotations
 
@@ -26,7 +26,6 @@ from offboard.paper.controller import (
     input_scale,
 )
 from offboard.paper.integral import IntegralSettings
-from offboard.paper.one_step import OneStep
 from offboard.reference.base import FlatSample
 
 Array = NDArray[np.float64]
@@ -87,71 +86,6 @@ def tilted(course: float) -> tuple[PredictedState, Straight]:
 
 
 # ---------------------------------------------------------------- the law on the paper's plant
-
-
-def closed_loop_eigenvalues(settings: PaperSettings, dear_inputs: bool = True) -> Array:
-    """Eigenvalues of [x, u(k-1)] under the unconstrained minimiser of Eq. 21."""
-    dynamics, inputs = sampled_matrices(PAPER, 0.1)
-    energy, rate = np.diag(settings.energy), np.diag(settings.rate)
-    step = OneStep(
-        dynamics, inputs, np.diag(settings.fitness), dear_inputs * energy, dear_inputs * rate
-    )
-    nowhere = np.full(4, np.inf)
-
-    def law(known: Array) -> Array:
-        problem = step.problem(known[:12], np.zeros(12), np.zeros(4), known[12:], -nowhere, nowhere)
-        return -np.linalg.solve(problem.hessian, problem.gradient)
-
-    gain = np.array([law(unit) for unit in np.eye(16)]).T
-    open_loop = np.zeros((16, 16))
-    open_loop[:12, :12] = dynamics
-    return np.linalg.eigvals(open_loop + np.vstack([inputs, np.eye(4)]) @ gain)
-
-
-def test_one_step_ahead_cannot_see_position() -> None:
-    """Eqs. 33-35: time constants of 39 s (x, y) and 20 s (z), with cheap inputs no less."""
-    slowest = np.sort(np.abs(closed_loop_eigenvalues(PaperSettings())))[-3:]
-    assert slowest == pytest.approx([0.9949, 0.99745, 0.99745], abs=5e-6)
-    free = np.sort(np.abs(closed_loop_eigenvalues(PaperSettings(), dear_inputs=False)))[-3:]
-    assert free == pytest.approx([0.9949, 0.99745, 0.99745], abs=1e-5)
-
-
-def flown_spreads(settings: PaperSettings) -> tuple[Array, Array]:
-    """Epsilon and distance to a reference that circles at 3 m/s, along 40 s on Eq. 14."""
-    dynamics, inputs = sampled_matrices(PAPER, 0.1)
-    lower, upper = flyable_box(PAPER, settings)
-    law = PaperLaw(dynamics, inputs, settings, lower, upper)
-    x, spreads, distances = np.zeros(12), [], []
-    for k in range(400):
-        angle = 0.15 * 0.1 * (k + 1)
-        reference = np.zeros(12)
-        reference[6:8] = 3 * np.cos(angle), 3 * np.sin(angle)
-        reference[9:11] = 20 * np.sin(angle), 20 * (1 - np.cos(angle))
-        move = law.move(x, reference)
-        x = dynamics @ x + inputs @ move.inputs
-        assert move.following == pytest.approx(x, abs=1e-12)
-        spreads.append(move.result.spread)
-        distances.append(np.linalg.norm(x[9:11] - reference[9:11]))
-    return np.array(spreads), np.array(distances)
-
-
-def test_epsilon_of_the_paper_is_the_rounding_of_j_with_its_constant() -> None:
-    """The paper: 2.8e-8 on average at lambda = 0.65, and 4.7e-11 to 1.6e-7."""
-    settings = PaperSettings()
-    with_constant, distances = flown_spreads(settings)
-    without, same = flown_spreads(settings.model_copy(update={"keep_constant": False}))
-    assert 0.5e-8 < with_constant.mean() < 1e-7
-    assert with_constant.max() < 1e-6
-    assert without.mean() < 0.6 * with_constant.mean()
-    assert distances == pytest.approx(same, abs=1e-6)
-
-
-def test_epsilon_of_the_first_configuration_is_the_papers() -> None:
-    """Lambda = 1: 1.3944 on average, 0.9380 to 2.0023."""
-    spreads, _ = flown_spreads(PaperSettings.first_configuration())
-    assert spreads.mean() == pytest.approx(1.3944, rel=0.1)
-    assert spreads.min() > 0.6
-    assert spreads.max() < 2.4
 
 
 def test_the_input_applied_last_is_what_r_du_holds_on_to() -> None:

@@ -16,8 +16,9 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from offboard.documents.errors import UserError
 from offboard.paper.study import horizon
-from offboard.paper.study.options import FIGURES, TABLES, PaperError, PaperOptions, check
+from offboard.paper.study.options import FIGURES, TABLES, PaperOptions, check
 from offboard.paper.study.run import Outcome, reproduce
 
 ROOT = Path(__file__).parents[2]
@@ -42,7 +43,7 @@ def quietly(options: PaperOptions) -> Outcome:
 def test_bad_options_are_one_sentence(
     tmp_path: Path, changes: dict[str, Any], sentence: str
 ) -> None:
-    with pytest.raises(PaperError) as caught:
+    with pytest.raises(UserError) as caught:
         check(PaperOptions(tmp_path / "never", **changes))
     assert sentence in str(caught.value)
     assert "\n" not in str(caught.value)
@@ -52,7 +53,7 @@ def test_bad_options_are_one_sentence(
 def test_an_output_that_is_a_file_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for out in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(PaperError, match="cannot be written"):
+        with pytest.raises(UserError, match="cannot be written"):
             check(PaperOptions(out))
 
 

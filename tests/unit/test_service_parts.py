@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import socket
 import subprocess
@@ -15,6 +16,7 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.analysis import tlog
+from offboard.cli.daemon import may_pass
 from offboard.documents.errors import UserError
 from offboard.flight import manifest
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
@@ -23,6 +25,8 @@ from offboard.identification.learned import Learned
 from offboard.identification.uncertainty import Estimate
 from offboard.io import clock
 from offboard.io.link import LinkError
+from offboard.io.lock import Locked, connection_lock, directory_lock
+from offboard.io.log import LogError
 from offboard.io.stop import StopRequests
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat
@@ -32,7 +36,6 @@ from offboard.run.request import FlightRequest
 from offboard.service import daemon, preparation, unit
 from offboard.service.daemon import Manager
 from offboard.service.flights import Prepared
-from offboard.service.lock import Locked, connection_lock, directory_lock
 from offboard.service.memory import VehicleFiles
 from offboard.service.monitor import Monitor
 from offboard.service.preparation import Preparation
@@ -70,10 +73,10 @@ def test_a_flight_log_begins_with_what_came_before(tmp_path: Path) -> None:
     raw = (first / "flight.tlog").read_bytes()
     assert home in raw
     log = tlog.read(first / "flight.tlog")
-    beats = [entry for entry in log.messages if entry.name == "HEARTBEAT"]
+    beats = [entry for entry in log if entry.name == "HEARTBEAT"]
     assert len(beats) == 7  # of the last five seconds, and of the flight
     assert beats[-1].message.type == 18
-    pieces = [entry.message for entry in log.messages if entry.name == "TUNNEL"]
+    pieces = [entry.message for entry in log if entry.name == "TUNNEL"]
     payloads = [bytes(piece.payload[: piece.payload_length]) for piece in pieces]
     assert manifest.join(payloads) == "vehicle: neutral\n"
     assert (first / "flight.yaml").read_text() == "vehicle: neutral\n"
@@ -91,9 +94,10 @@ def test_a_clock_that_is_set_back_ends_what_came_before(tmp_path: Path) -> None:
     assert [frame in log for frame in frames] == [False, True, True]
 
 
-@pytest.mark.parametrize(("age_s", "left"), [(0, "px4-1-7"), (700, ""), (-700, "")])
+@pytest.mark.parametrize(("age_s", "left"), [(0, "px4-1-7"), (700, ""), (-4000, "px4-1-7")])
 def test_what_a_killed_service_has_not_done(tmp_path: Path, age_s: int, left: str) -> None:
-    """The vehicle that it had engaged is known for ten minutes, its flight is scored."""
+    """The vehicle that it had engaged is known for ten minutes, its flight is scored. A log of the
+    future: this computer has booted, and its clock was not set since."""
     killed = Recorder(tmp_path, stamp=lambda: "cut", score=lambda *_: None)
     cut = Path(killed.begin(session(), "", "px4-1-7"))
     deadline_s = time.monotonic() + 10.0
@@ -212,54 +216,53 @@ def test_an_identified_vehicle_is_kept_and_used_for_the_same_file_alone(tmp_path
     assert not (tmp_path / "vehicles" / "px4-1-1.yaml").exists()
 
 
-def test_the_lock_names_its_holder_and_dies_with_it(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+def test_the_lock_names_its_holder_and_dies_with_it(tmp_path: Path) -> None:
+    """The holder is a unit, and where possible another user."""
     code = (
-        "from offboard.service.lock import connection_lock\n"
-        "import sys\n"
+        "import os, sys\n"
+        "from offboard.io.lock import connection_lock\n"
+        "if os.getuid() == 0: os.setuid(65534)\n"
         "with connection_lock('udpin:127.0.0.1:1'):\n"
         "    print('held', flush=True)\n"
         "    sys.stdin.read()\n"
     )
     holder = subprocess.Popen(
-        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE
-    )
+        [sys.executable, "-c", code], stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+        env=os.environ | {"RUNTIME_DIRECTORY": str(tmp_path)},
+    )  # fmt: skip
     assert holder.stdout is not None
     assert holder.stdout.readline() == b"held\n"
     with connection_lock("udpin:127.0.0.1:2"):
         pass
-    with (
-        pytest.raises(Locked, match=f"process {holder.pid}$"),
-        connection_lock("udpin:127.0.0.1:1"),
-    ):
-        pass
+    for _ in range(3):
+        again = connection_lock("udpin:127.0.0.1:1")
+        with pytest.raises(Locked, match=f"process {holder.pid}$"), again:
+            pass
     holder.kill()
     holder.wait()
-    with connection_lock("udpin:127.0.0.1:1") as lock:
-        assert lock.path.read_text() == f"{os.getpid()}\n"
+    with connection_lock("udpin:127.0.0.1:1"):
+        pass
     with directory_lock(tmp_path / "new"):
         again = directory_lock(tmp_path / "new")
-        with pytest.raises(Locked, match=f"has the directory {tmp_path}/new"), again:
+        with (
+            pytest.raises(
+                Locked, match=f"has the directory {tmp_path}/new.*: process {os.getpid()}$"
+            ),
+            again,
+        ):
             pass
 
 
-def test_ports_of_another_network_namespace_are_other_ports(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As in a container that shares the directory of the locks; a serial device is the same."""
-    monkeypatch.setenv("RUNTIME_DIRECTORY", str(tmp_path))
+def test_a_full_disk_is_no_wrong_option(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*_: object) -> int:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
-    def locks() -> list[Path]:
-        return [connection_lock(each).path for each in ("udpin:0.0.0.0:1", "serial:/dev/x:9600")]
-
-    (port, device), stat = locks(), os.stat
-    other = os.stat_result((0, 12345, *range(8)))
-    namespace = "/proc/self/ns/net"
-    monkeypatch.setattr(os, "stat", lambda path: other if path == namespace else stat(path))
-    assert locks()[1] == device
-    assert locks()[0] != port
+    with pytest.raises(LogError) as wrong:
+        Recorder(Path("/dev/null/flights"))
+    monkeypatch.setattr(os, "open", full)
+    with pytest.raises(LogError) as passing:
+        Recorder(tmp_path)
+    assert [may_pass(each.value) for each in (wrong, passing)] == [False, True]
 
 
 def test_what_the_user_of_the_unit_cannot_read(

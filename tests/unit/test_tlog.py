@@ -33,7 +33,7 @@ def test_columns_are_what_pymavlink_decodes(path: Path, names: str) -> None:
         decoded[message.get_type()].append(message)
     log = tlog.read(path)
     for name, messages in decoded.items():
-        ours = [entry for entry in log.messages if entry.name == name]
+        ours = [entry for entry in log if entry.name == name]
         assert len(ours) == len(messages) > 1
         size = tlog.layout(name).itemsize
         payloads = b"".join(entry.frame.payload[:size].ljust(size, b"\0") for entry in ours)
@@ -53,7 +53,7 @@ def damaged(path: Path, data: bytes) -> tlog.Tlog:
 
 def places(log: tlog.Tlog) -> list[int]:
     """Where each entry begins; the log ends where the last one does."""
-    return [0, *itertools.accumulate(8 + len(entry.frame.raw) for entry in log.messages)]
+    return [0, *itertools.accumulate(8 + len(entry.frame.raw) for entry in log)]
 
 
 @pytest.mark.parametrize(
@@ -71,12 +71,12 @@ def test_a_damaged_entry_is_skipped_and_counted(
 ) -> None:
     """The first entry, one in the middle, and the last but one."""
     data, whole = PX4.read_bytes(), tlog.read(PX4)
-    messages, at = whole.messages, places(whole)
+    messages, at = tuple(whole), places(whole)
     for number in (0, len(messages) // 2, len(messages) - 2):
         changed = bytearray(data)
         changed[at[number] + offset] ^= byte
         log = damaged(tmp_path / "x.tlog", bytes(changed))
-        assert log.messages == (*messages[:number], *messages[number + lost :])
+        assert tuple(log) == (*messages[:number], *messages[number + lost :])
         assert (log.damaged, log.first_damage, log.truncated) == (1, at[number], 0)
         assert log.damage.endswith(f"1 damaged entry was skipped, the first at byte {at[number]}")
 
@@ -85,20 +85,20 @@ def test_entries_after_garbage_and_holes_are_read(tmp_path: Path) -> None:
     """Garbage between entries, a hole that cuts two, and one that cuts the last: 4000 random bytes
     hold about 30 that could begin a frame."""
     data, whole = PX4.read_bytes(), tlog.read(PX4)
-    messages, at = whole.messages, places(whole)
+    messages, at = tuple(whole), places(whole)
     garbage = np.random.default_rng(3).bytes(4000)
     parts = data[: at[100]], garbage, data[at[100] : at[200] + 7], data[at[203] + 5 : -7]
     log = damaged(tmp_path / "x.tlog", b"".join(parts))
-    assert log.messages == (*messages[:200], *messages[204:-1])
+    assert tuple(log) == (*messages[:200], *messages[204:-1])
     assert (log.damaged, log.first_damage) == (2, at[100])
     assert log.truncated == at[-1] - at[-2] - 7
     assert "2 damaged entries were skipped" in log.damage
 
 
 def test_a_whole_log_is_read_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    whole = tlog.read(PX4).messages
+    whole = list(tlog.read(PX4))
     monkeypatch.setattr(tlog, "_BLOCK", 301)
-    assert tlog.read(PX4).messages == whole
+    assert list(tlog.read(PX4)) == whole
 
 
 def test_a_story_is_told_in_vehicle_time() -> None:

@@ -290,25 +290,6 @@ def test_takeoff_by_attitude_setpoints_alone() -> None:
     assert bench.texts()[-1] == "Takeoff detected"
 
 
-# -- determinism -----------------------------------------------------------------------------
-
-
-def scripted_bytes(seed: int) -> bytes:
-    bench = Bench(EstimatorName.PX4_LIKE, seed=seed)
-    bench.fly_offboard(height_m=3.0)
-    bench.run(2.0, bench.attitude)
-    bench.command(21)
-    bench.run(8.0)
-    return bytes(bench.raw)
-
-
-def test_the_same_seed_gives_the_same_bytes() -> None:
-    first, second, other = scripted_bytes(5), scripted_bytes(5), scripted_bytes(6)
-    assert len(first) > 200_000
-    assert first == second
-    assert first != other
-
-
 # -- going where it is told --------------------------------------------------------------------
 
 

@@ -24,7 +24,7 @@ def detours(scene: Scene, reach_m: float) -> list[Array]:
     """States (N + 1, STATE_SIZE) of all detours round the volumes that are near the reference;
     `reach_m` is the distance to keep from their surface."""
     ways = []
-    places, speeds = scene.positions[::2], scene.velocities[::2]
+    places, speeds = scene.ahead.positions_ned_m[::2], scene.ahead.velocities_ned_mps[::2]
     for volume in scene.volumes:
         half = volume[HALF : HALF + 3] + volume[ROUND]
         half[:2] += volume[RADIUS]

@@ -22,8 +22,8 @@ from offboard.control.horizon.plant import (
     INPUTS,
     MOST_STEPS,
     STATE_SIZE,
+    Scene,
     plant_of,
-    scene_of,
     start_state,
 )
 from offboard.control.horizon.quadratic import HorizonQuadratic
@@ -129,8 +129,8 @@ class Planner:
             situation.track_time_s + delay_s,
         )
         floor_down_m = situation.origin_ned_m[2] - self._settings.clearance_m
-        scene = scene_of(ahead, within, volumes, floor_down_m)
-        self.evaluate.prepare(self._plant, scene, start_state(task, scene))
+        scene = Scene(ahead, within, volumes, floor_down_m)
+        self.evaluate.prepare(self._plant, scene, start_state(task, ahead))
         return task, self.quadratic.problem(task, within)
 
     def own_plan(self, time_s: float) -> Plan:

@@ -7,7 +7,7 @@ States and inputs are deviations from the reference (`Outlook`).
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -119,33 +119,36 @@ def _axis(name: str, model: CostToGo) -> dict[str, Array]:
     }
 
 
-class Scene(NamedTuple):
-    """The outlook, the bounds and the volumes of one decision, as arrays."""
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """All that a roll-out reads of one decision: the outlook, the bounds of the inputs, the volumes
+    (V, PACKED_SIZE) where they are at the first node, and the height NED (m) below which no way
+    round a volume leads, where the reference does not."""
 
-    positions: Array  # (2 N + 1, 3)
-    velocities: Array
-    directions: Array
-    thrusts_tilt: Array  # (2 N + 1,)
-    thrusts_heave: Array
-    uprights: Array
-    feedforward: Array  # (N,): of the vertical thrust
-    lower: Array  # (N, 3)
-    upper: Array
-    volumes: Array  # (V, PACKED_SIZE), where they are at the first node
-    thrust_share: float  # true over modelled thrust, from the vertical disturbance
-    floor_down_m: float  # no way round a volume leads below, where the reference does not
+    ahead: Outlook
+    within: Bounds
+    volumes: Array
+    floor_down_m: float
 
     def fill(self, record: NDArray[np.void], volumes: Array) -> None:
         """Write all into one `SCENE` and the volumes into an array of their own."""
-        for name in ("thrust_share", "floor_down_m"):
-            record[name] = getattr(self, name)
-        for name in _PER_STEP:
-            values = getattr(self, name)
+        ahead = self.ahead
+        record["thrust_share"], record["floor_down_m"] = ahead.thrust_share, self.floor_down_m
+        for name, values in (
+            ("positions", ahead.positions_ned_m),
+            ("velocities", ahead.velocities_ned_mps),
+            ("directions", ahead.directions_ned),
+            ("thrusts_tilt", ahead.thrusts_tilt_mps2),
+            ("thrusts_heave", ahead.thrusts_heave_mps2),
+            ("uprights", ahead.uprights_heave),
+            ("feedforward", ahead.feedforward[:, 2]),
+            ("lower", self.within.lower),
+            ("upper", self.within.upper),
+        ):
             record[name][0, : len(values)] = values
         volumes[:] = self.volumes
 
 
-_PER_STEP = Scene._fields[:9]
 _NODES = 2 * MOST_STEPS + 1
 SCENE = np.dtype(
     [
@@ -167,32 +170,13 @@ SCENE = np.dtype(
 """A `Scene` of up to `MOST_STEPS` holds without its volumes, and the state to start from."""
 
 
-def scene_of(outlook: Outlook, within: Bounds, volumes: Array, floor_down_m: float) -> Scene:
-    """All that a roll-out reads: an outlook (N steps), input bounds, volumes (K, columns of
-    `keep_out`), and the ground (m, NED down)."""
-    return Scene(
-        outlook.positions_ned_m,
-        outlook.velocities_ned_mps,
-        outlook.directions_ned,
-        outlook.thrusts_tilt_mps2,
-        outlook.thrusts_heave_mps2,
-        outlook.uprights_heave,
-        np.ascontiguousarray(outlook.feedforward[:, 2]),
-        within.lower,
-        within.upper,
-        volumes,
-        outlook.thrust_share,
-        floor_down_m,
-    )
-
-
-def start_state(task: Task, scene: Scene) -> Array:
+def start_state(task: Task, ahead: Outlook) -> Array:
     """The state (STATE_SIZE,) of a task's deviations."""
     start = np.empty(STATE_SIZE)
     start[P:Z] = task.lateral.reshape(-1)
     start[Z:T] = task.vertical
-    b_n, b_e = scene.directions[0, :2]
+    b_n, b_e = ahead.directions_ned[0, :2]
     leant = upright(b_n + start[B], b_e + start[B + 1]) - upright(b_n, b_e)
-    force = scene.thrusts_heave[0] * scene.uprights[0] + start[F]
-    start[T] = force / (scene.uprights[0] + leant) - scene.thrusts_heave[0]
+    thrust, b_z = ahead.thrusts_heave_mps2[0], ahead.uprights_heave[0]
+    start[T] = (thrust * b_z + start[F]) / (b_z + leant) - thrust
     return start

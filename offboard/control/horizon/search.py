@@ -49,13 +49,8 @@ class Found:
 def knot_weights(steps: int) -> Array:
     """Weights (N, M) of M knots in each step: linear between knots, constant after the last."""
     places = sorted({round(share * (steps - 1)) for share in KNOT_SHARES})
-    weights = np.zeros((steps, len(places)))
-    for step in range(steps):
-        for m in range(len(places)):
-            unit = np.zeros(len(places))
-            unit[m] = 1.0
-            weights[step, m] = np.interp(step, places, unit)
-    return weights
+    every = np.arange(steps)
+    return np.column_stack([np.interp(every, places, unit) for unit in np.eye(len(places))])
 
 
 class Evaluator:
@@ -81,12 +76,12 @@ class Evaluator:
     @property
     def lower(self) -> Array:
         """Lower bounds of the inputs, (N, 3)."""
-        return self.scene.lower
+        return self.scene.within.lower
 
     @property
     def upper(self) -> Array:
         """Upper bounds of the inputs, (N, 3)."""
-        return self.scene.upper
+        return self.scene.within.upper
 
     def of_knots(self, base: Plan, knots: Array) -> Array:
         """Costs (n,) of knots (M, 3, n) about `base`; `plan` returns one of these plans."""

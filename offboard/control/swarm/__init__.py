@@ -6,7 +6,7 @@ compiled code. Knows no model, no reference and no clock.
 
 from offboard.control.swarm.lanes import RandomLanes
 from offboard.control.swarm.particles import Swarm
-from offboard.control.swarm.quadratic import QuadraticSwarm, warm_up
+from offboard.control.swarm.quadratic import QuadraticSwarm
 from offboard.control.swarm.settings import SwarmHistory, SwarmResult, SwarmSettings
 
 __all__ = [
@@ -16,5 +16,4 @@ __all__ = [
     "SwarmHistory",
     "SwarmResult",
     "SwarmSettings",
-    "warm_up",
 ]

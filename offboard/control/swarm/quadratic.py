@@ -16,7 +16,6 @@ from offboard.compiled import array, entry, kernel
 from offboard.control.cost import BoxQuadratic
 from offboard.control.swarm.lanes import RandomLanes, States
 from offboard.control.swarm.motion import SEARCH, move, remember, scatter, spread_about
-from offboard.control.swarm.particles import Swarm
 from offboard.control.swarm.population import Population, box
 from offboard.control.swarm.settings import SwarmHistory, SwarmResult, SwarmSettings
 
@@ -147,19 +146,6 @@ class QuadraticSwarm:
         scatter(*where)
         p.begin(seeds)
         return (*where, p.bests, p.leader, p.best_costs, p.costs, self._hessian, self._gradient)
-
-
-def warm_up() -> None:
-    """Load or compile every compiled function of the swarm, so that no measured search has to."""
-    settings = SwarmSettings(particles=2, iterations=2)
-    for dimensions in (2, 4):
-        zeros, ones = np.zeros(dimensions), np.ones(dimensions)
-        problem = BoxQuadratic(np.eye(dimensions), zeros, 0.0, -ones, ones)
-        QuadraticSwarm(settings, dimensions).minimise(problem, RandomLanes(0))
-        swarm = Swarm(-ones, ones, settings, RandomLanes(0))
-        for _ in range(settings.iterations):
-            swarm.tell(problem(swarm.ask()))
-        swarm.result()
 
 
 def _history(kept: list[tuple[Array, float, float]]) -> SwarmHistory:

@@ -31,10 +31,6 @@ TABLES, FIGURES = (
 SEEDS, QUICK_SEEDS, MOST_SEEDS = 20, 2, 10_000
 
 
-class PaperError(UserError):
-    """The run is not possible; the message is one sentence for the user."""
-
-
 @dataclass(frozen=True, slots=True)
 class PaperOptions:
     """Options of `offboard paper`.
@@ -79,16 +75,16 @@ class PaperOptions:
 
 
 def check(options: PaperOptions) -> None:
-    """Create the output directory. Raises PaperError for the first option that is not valid."""
+    """Create the output directory. Raises UserError for the first option that is not valid."""
     chosen = (("figure", options.figures, FIGURES), ("table", options.tables, TABLES))
     for kind, names, known in chosen:
         for name in names:
             if name not in known:
-                raise PaperError(f"there is no {kind} {name!r}; known are {', '.join(known)}")
+                raise UserError(f"there is no {kind} {name!r}; known are {', '.join(known)}")
     if not 1 <= options.seed_count <= MOST_SEEDS:
-        raise PaperError(f"seeds must be 1 .. {MOST_SEEDS}, not {options.seed_count}")
+        raise UserError(f"seeds must be 1 .. {MOST_SEEDS}, not {options.seed_count}")
     if options.workers is not None and options.workers < 1:
-        raise PaperError(f"workers must be 1 or more, not {options.workers}")
+        raise UserError(f"workers must be 1 or more, not {options.workers}")
     if options.initial_q is not None:
         _check_weights(options.initial_q)
     _check_output(options.out)
@@ -100,18 +96,18 @@ def _is_figure(label: str) -> bool:
 
 def _check_weights(diagonal: tuple[float, ...]) -> None:
     if len(diagonal) not in (1, 12):
-        raise PaperError(f"the initial Q takes 1 or 12 weights, not {len(diagonal)}")
+        raise UserError(f"the initial Q takes 1 or 12 weights, not {len(diagonal)}")
     for weight in diagonal:
         if not (math.isfinite(weight) and weight >= 0):
-            raise PaperError(f"the weights of the initial Q must be 0 or more, not {weight:g}")
+            raise UserError(f"the weights of the initial Q must be 0 or more, not {weight:g}")
 
 
 def _check_output(out: Path) -> None:
     try:
         out.mkdir(parents=True, exist_ok=True)
         if any(out.iterdir()):
-            raise PaperError(f"{out} is not empty; choose another directory with --out")
+            raise UserError(f"{out} is not empty; choose another directory with --out")
         with tempfile.TemporaryFile(dir=out):
             pass
     except OSError as error:
-        raise PaperError(f"{out} cannot be written: {error.strerror or error}") from None
+        raise UserError(f"{out} cannot be written: {error.strerror or error}") from None

@@ -6,11 +6,7 @@ An interrupted run keeps its finished tables and figures; the page shows them an
 from __future__ import annotations
 
 import json
-import multiprocessing
-import signal
 from collections.abc import Generator, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import closing
 from dataclasses import dataclass, field
 from importlib import metadata
@@ -21,9 +17,9 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from offboard.analysis.figure import Figure
-from offboard.analysis.workers import interrupts_deferred, processors
-from offboard.control.swarm import warm_up
-from offboard.paper.study.options import PaperError, PaperOptions, check
+from offboard.analysis.workers import open_worker, processors, run_all
+from offboard.documents.errors import UserError
+from offboard.paper.study.options import PaperOptions, check
 from offboard.paper.study.page import Table, page
 from offboard.paper.study.plan import Job, planned
 
@@ -46,7 +42,7 @@ def reproduce(options: PaperOptions, console: Console | None = None) -> Outcome:
     """Compute and write everything that `options` ask for, with progress on `console` (stderr).
 
     Writes table_NAME.csv and .json, figure_NAME.json, run.json and paper.html to `options.out`.
-    Raises PaperError for invalid options or an output that cannot be written. An interrupt
+    Raises UserError for invalid options or an output that cannot be written. An interrupt
     (KeyboardInterrupt) is not raised: the outcome records it.
     """
     check(options)
@@ -64,7 +60,7 @@ def reproduce(options: PaperOptions, console: Console | None = None) -> Outcome:
     except KeyboardInterrupt:
         interrupted = True
     except OSError as error:
-        raise PaperError(f"{options.out} cannot be written: {error.strerror or error}") from None
+        raise UserError(f"{options.out} cannot be written: {error.strerror or error}") from None
     return collected.finish(interrupted)
 
 
@@ -121,24 +117,12 @@ def _results(jobs: Sequence[Job], workers: int | None) -> Generator[tuple[Job, A
         for job in jobs:
             yield job, *_guarded(job)
         return
-    # spawn: a forked process would share compiled code and threads in unknown states
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(count, mp_context=context, initializer=_start_worker)
-    try:
-        with interrupts_deferred():  # the processes start here and inherit it
-            futures = {pool.submit(_guarded, job): job for job in jobs}
-        for future in as_completed(futures):
-            try:
-                yield futures[future], *future.result()
-            except BrokenProcessPool:
-                yield futures[future], None, "its process ended unexpectedly"
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _start_worker() -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides
-    warm_up()
+    with closing(run_all(jobs, _guarded, open_worker, count, lambda: False)) as results:
+        for job, result in results:
+            if isinstance(result, BaseException):
+                yield job, None, "its process ended unexpectedly"
+            else:
+                yield job, *result
 
 
 def _guarded(job: Job) -> tuple[Any, str]:

@@ -15,6 +15,7 @@ from offboard.paper.plant import PlantKind
 from offboard.paper.study import printed
 from offboard.paper.study.closed_loop import Flight
 from offboard.paper.study.page import Row, Table
+from offboard.paper.study.peers import LEAST_GAP
 
 MISS = 1e-6  # a relative gap above this is a missed optimum
 ORDER_ONLY = "~"
@@ -25,7 +26,6 @@ _MARKS = (
     "(Eq. 23). The path here is similar; Q is I unless chosen otherwise.",
     "+ not in the paper, which flies its linear plant and computes no exact optimum.",
 )
-_LEAST_GAP = 1e-17  # drawn for smaller gaps: a logarithmic axis has no zero
 
 Flown = Mapping[tuple[PlantKind, float], Sequence[Flight]]
 
@@ -183,7 +183,7 @@ def gap_by_damping(flown: Flown) -> Figure:
     drawing = panels(("gap to J*", "ε", "missed > 1e-6, %"), "λ")
     names = {"gap, median": (0.5, BLUE), "gap, 90 %": (0.9, ORANGE), "gap, 99 %": (0.99, RED)}
     for name, (quantile, colour) in names.items():
-        values = [max(float(np.quantile(gap, quantile)), _LEAST_GAP) for gap in gaps]
+        values = [max(float(np.quantile(gap, quantile)), LEAST_GAP) for gap in gaps]
         curve(drawing, 1, dampings, values, name, colour, mode="lines+markers")
     spreads = [np.mean([flight.spreads.mean() for flight in own]) for own in linear.values()]
     curve(drawing, 2, dampings, spreads, "ε, mean", GREY, "dash", mode="lines+markers")

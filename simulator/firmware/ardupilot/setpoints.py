@@ -8,6 +8,7 @@ from typing import Any
 
 from simulator.firmware.base import SetpointRules
 from simulator.firmware.values import (
+    NAN3,
     AttitudeSetpoint,
     MotionSetpoint,
     Quaternion,
@@ -77,7 +78,6 @@ _LOCAL_NED, _LOCAL_OFFSET_NED, _BODY_NED, _BODY_OFFSET_NED = 1, 7, 8, 9  # MAV_F
 _OFFSET = frozenset({_LOCAL_OFFSET_NED, _BODY_NED, _BODY_OFFSET_NED})
 _BODY = frozenset({_BODY_NED, _BODY_OFFSET_NED})
 _POSITION, _VELOCITY, _ACCELERATION, _FORCE, _YAW, _YAW_RATE = 0o007, 0o070, 0o700, 512, 1024, 2048
-_NOTHING: Triple = (math.nan, math.nan, math.nan)
 
 
 def in_local_frame(
@@ -111,7 +111,7 @@ def motion_setpoint(values: Mapping[str, Any]) -> MotionSetpoint | None:
 
     def given(names: tuple[str, str, str], bits: int) -> Triple:
         if mask & bits:
-            return _NOTHING
+            return NAN3
         a, b, c = (values[name] for name in names)
         return (a, b, c)
 
