@@ -56,7 +56,8 @@ class Frame(NamedTuple):
     @property
     def signed(self) -> bool:
         """It ends with a signature, whose key is not known here."""
-        return self.raw[0] == _V2 and bool(self.raw[2] & _SIGNED)
+        raw = self.raw
+        return raw[0] == _V2 and raw[2] & _SIGNED != 0
 
 
 class FrameSplitter:

@@ -31,7 +31,6 @@ LINK_ID = 1
 RESERVED = 60 * UNITS_PER_S  # so far the reservation is ahead when it is made
 _STAMP_MAX = (1 << 48) - 1
 _HASH_BYTES = 6
-_STAMP = slice(-12, -6)  # from the end of a signed frame
 
 Stream = bytes  # system id, component id, link id
 State = tuple[int, int, dict[str, int]]
@@ -46,7 +45,7 @@ def stamp_of_unix(unix_us: int) -> int:
 class Signing:
     """Signs what we send and checks what we receive, with one `key` of 32 bytes.
 
-    `clock` gives monotonic seconds, and `offset` added to it our own time in units of 10 us.
+    `clock` gives monotonic seconds, and `offset` added to it our time in units of 10 us.
     `reserve` is called with a stamp that is about a minute ahead, before a stamp is used that was
     not reserved: who keeps it knows after a crash which stamps were never used.
     """
@@ -56,7 +55,7 @@ class Signing:
     clock: Callable[[], float] = lambda: 0.0
     reserve: Callable[[int], object] = lambda stamp: None
     reserved: float = math.inf
-    sent: int = 0  # newest stamp of ours
+    newest: int = 0  # stamp of ours, or accepted of others
     streams: dict[Stream, int] = field(default_factory=dict)  # newest stamps that were accepted
     _keyed: Any = field(init=False, repr=False)  # SHA-256 of the key, to be continued
 
@@ -67,63 +66,63 @@ class Signing:
 
     def sign(self, frame: bytes) -> bytes:
         """The frame, whose flags say that it is signed, with its signature."""
-        self.sent = min(max(self.sent + 1, self.now()), _STAMP_MAX)
-        if self.sent > self.reserved - RESERVED // 2:
-            self.reserved = self.sent + RESERVED
-            self.reserve(self.sent + RESERVED)
-        stamped = frame + bytes((LINK_ID,)) + self.sent.to_bytes(6, "little")
-        return stamped + self._hash(stamped)
+        self.newest = stamp = min(max(self.newest + 1, self._clock_stamp()), _STAMP_MAX)
+        if stamp > self.reserved - RESERVED // 2:
+            self.reserved = stamp + RESERVED
+            self.reserve(stamp + RESERVED)
+        stamped = frame + bytes((LINK_ID,)) + stamp.to_bytes(6, "little")
+        hashed = self._keyed.copy()
+        hashed.update(stamped)
+        digest: bytes = hashed.digest()
+        return stamped + digest[:_HASH_BYTES]
 
     def now(self) -> int:
         """Our own time."""
+        return max(self.newest, self._clock_stamp())
+
+    def _clock_stamp(self) -> int:
         return self.offset + int(UNITS_PER_S * self.clock())
 
     # --- in ---
 
     def fault(self, frame: Frame) -> DropReason | None:
         """Why this frame must not be used. Changes nothing."""
+        return self.accept(frame, note=False)
+
+    def accept(self, frame: Frame, *, note: bool = True) -> DropReason | None:
+        """As `fault`; notes the time stamp of a frame without one. Called for each frame that
+        arrives, therefore in one piece: it takes half as long."""
         raw = frame.raw
         if not frame.signed:
             return None if frame.message_id in ALLOWED_UNSIGNED else DropReason.UNSIGNED
-        if not compare_digest(self._hash(raw[:-_HASH_BYTES]), raw[-_HASH_BYTES:]):
+        hashed = self._keyed.copy()  # a third faster than to hash the key each time
+        hashed.update(raw[:-6])
+        if not compare_digest(hashed.digest()[:6], raw[-6:]):
             return DropReason.BAD_SIGNATURE
-        stamp, before = int.from_bytes(raw[_STAMP], "little"), self.streams.get(_stream(raw))
+        stream, stamp = raw[5:7] + raw[-13:-12], int.from_bytes(raw[-12:-6], "little")
+        before = self.streams.get(stream)
         if before is None:
-            return DropReason.OLD_STAMP if stamp < self.now() - BEHIND_MAX else None
-        return DropReason.REPLAYED if stamp <= before else None
-
-    def accept(self, frame: Frame) -> DropReason | None:
-        """As `fault`; notes the time stamp of a frame without one."""
-        fault = self.fault(frame)
-        if fault is None and frame.signed:
-            raw = frame.raw
-            stamp = self.streams[_stream(raw)] = int.from_bytes(raw[_STAMP], "little")
-            if stamp > self.sent:
-                self.offset += max(0, stamp - self.now())
-        return fault
+            if stamp < self.now() - BEHIND_MAX:
+                return DropReason.OLD_STAMP
+        elif stamp <= before:
+            return DropReason.REPLAYED
+        if note:
+            self.streams[stream] = stamp
+            if stamp > self.newest:
+                self.newest = stamp
+        return None
 
     # --- for another process that continues ---
 
     def state(self) -> State:
-        """What another process needs to continue, without the key: our own time, our newest stamp,
-        and those of others by stream, in hexadecimal digits."""
-        return self.offset, self.sent, {name.hex(): each for name, each in self.streams.items()}
+        """What another process needs to continue, without the key: the offset of our clock, the
+        newest stamp, and those of others by stream, in hexadecimal digits."""
+        return self.offset, self.newest, {name.hex(): each for name, each in self.streams.items()}
 
     @classmethod
     def resumed(cls, key: bytes, clock: Callable[[], float], state: State) -> Signing:
         """Continues `state`, with stamps that are a second ahead: more may have been sent since."""
-        offset, sent, streams = state
+        offset, newest, streams = state
         known = {bytes.fromhex(name): stamp for name, stamp in streams.items()}
         ahead = UNITS_PER_S
-        return cls(key, offset + ahead, clock, sent=sent + ahead, streams=known)
-
-    def _hash(self, stamped: bytes) -> bytes:
-        hashed = self._keyed.copy()  # a third faster than to hash the key each time
-        hashed.update(stamped)
-        digest: bytes = hashed.digest()
-        return digest[:_HASH_BYTES]
-
-
-def _stream(raw: bytes) -> Stream:
-    """The stream of a signed frame."""
-    return raw[5:7] + raw[-13:-12]
+        return cls(key, offset + ahead, clock, newest=newest + ahead, streams=known)

@@ -59,7 +59,7 @@ class Turn:
 class Accepted(Signing):
     """The signing of a replayed flight: a log holds no key, and only frames that were accepted."""
 
-    def fault(self, frame: Frame) -> None:
+    def accept(self, frame: Frame, *, note: bool = True) -> None:
         return None
 
 
