@@ -78,7 +78,11 @@ class Listening:
             signing,
         )
         self._census = Census(stream)
-        self._readiness, self._delay, self._clock = Readiness(), LinkDelay(), VehicleClock()
+        self._readiness, self._delay, self._clock = (
+            Readiness(advice=True),
+            LinkDelay(),
+            VehicleClock(),
+        )
         self._asked: dict[int, tuple[int, float]] = {}  # message or command: tries, when
         self._settled = self._rebooted = self._requested = False
         self._may_greet = False  # a disarmed vehicle, whose signing time is behind ours

@@ -17,9 +17,12 @@ REPLY_TIMEOUT_S = 2.0  # for parameters that need not be answered
 
 
 class Readiness:
-    """Progress of reading one vehicle's watched parameters. Times are seconds of any one clock."""
+    """Progress of reading one vehicle's watched parameters. Times are seconds of any one clock.
 
-    def __init__(self) -> None:
+    `advice`: also those that are only for advice."""
+
+    def __init__(self, *, advice: bool = False) -> None:
+        self._advice = advice
         self._began_s = math.nan
         self._requested_s = -math.inf
 
@@ -30,14 +33,18 @@ class Readiness:
         if now_s - self._requested_s < REPEAT_S - 1e-6:
             return []
         self._requested_s = now_s
-        return [ParamRead(p.name) for p in dialect.watched_parameters if p.name not in known]
+        return [ParamRead(name) for name in self._names(dialect) if name not in known]
 
     def complete(self, dialect: Dialect, known: Mapping[str, float], now_s: float) -> bool:
         """Every parameter has a reply; those that need none may also have timed out."""
         if self.unanswered(dialect, known):
             return False
-        all_known = all(parameter.name in known for parameter in dialect.watched_parameters)
+        all_known = all(name in known for name in self._names(dialect))
         return all_known or now_s - self._began_s >= REPLY_TIMEOUT_S
+
+    def _names(self, dialect: Dialect) -> list[str]:
+        watched = dialect.watched_parameters
+        return [p.name for p in watched if self._advice or not p.advice_only]
 
     @staticmethod
     def unanswered(dialect: Dialect, known: Mapping[str, float]) -> list[str]:

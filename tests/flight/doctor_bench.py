@@ -38,6 +38,7 @@ GOOD = {
     PX4.name: {"COM_OBL_RC_ACT": 4.0, "COM_RCL_EXCEPT": 4.0},
     ARDUPILOT.name: {
         "GUID_OPTIONS": 8.0, "GUID_TIMEOUT": 1.0, "FS_GCS_ENABLE": 5.0, "SYSID_MYGCS": 1.0,
+        "PSC_JERK_XY": 10.0,
     },
 }  # fmt: skip
 UNIX_S = VIRTUAL_EPOCH_US * 1e-6 - HOST_EPOCH_S

@@ -48,6 +48,7 @@ def test_nothing_is_said_of_a_good_vehicle(firmware: Firmware) -> None:
         (ARDUPILOT, "GUID_OPTIONS", 2.0, BLOCKS, "param set GUID_OPTIONS 10"),
         (ARDUPILOT, "GUID_TIMEOUT", 0.1, BLOCKS, "param set GUID_TIMEOUT 0.3"),
         (ARDUPILOT, "GUID_TIMEOUT", 3.0, WARN, "param set GUID_TIMEOUT 1"),
+        (ARDUPILOT, "PSC_JERK_XY", 5.0, WARN, "param set PSC_JERK_XY 10"),
         (ARDUPILOT, "ATC_ANGLE_BOOST", 0.0, BLOCKS, "param set ATC_ANGLE_BOOST 1"),
         (ARDUPILOT, "FS_GCS_ENABLE", 0.0, WARN, "param set FS_GCS_ENABLE 5"),
         (ARDUPILOT, "SYSID_MYGCS", 255.0, WARN, "param set SYSID_MYGCS 1"),

@@ -113,6 +113,20 @@ ARDUPILOT = Dialect(
                 ),
             ),
         ),
+        WatchedParameter(
+            "PSC_JERK_XY",
+            "how soon BRAKE, which is asked for hold, stops the vehicle",
+            # BRAKE slows down by PSC_JERK_XY / 7.5 of the speed per second
+            advice=(
+                Advice(
+                    "BRAKE, which is asked for hold, takes 7.5 / PSC_JERK_XY metres to stop for "
+                    "each m/s",
+                    10.0,
+                    lowest=10.0,
+                ),
+            ),
+            advice_only=True,
+        ),
         WatchedParameter("FS_THR_ENABLE", "what the vehicle does when the radio is lost"),
         WatchedParameter("SYSID_ENFORCE", "whether commands are accepted only from SYSID_MYGCS"),
         WatchedParameter(

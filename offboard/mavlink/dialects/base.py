@@ -92,8 +92,8 @@ class WatchedParameter:
     """A parameter of the autopilot that is read before flight.
 
     `required_bits` must be set and the value must be within `allowed`. Without a reply to one that
-    `must_answer`, the flight is refused. `advice` is for `offboard doctor`. `values` explains
-    the values of an enumeration.
+    `must_answer`, the flight is refused. `advice` is for `offboard doctor`, and so is the whole
+    parameter if it is `advice_only`. `values` explains the values of an enumeration.
     """
 
     name: str
@@ -102,6 +102,7 @@ class WatchedParameter:
     allowed: tuple[float, float] | None = None
     must_answer: bool = False
     advice: tuple[Advice, ...] = ()
+    advice_only: bool = False
     values: tuple[str, ...] = ()
 
     def problem(self, value: float) -> str | None:

@@ -65,6 +65,7 @@ PARAMETERS = (
     _int8("MOT_HOVER_LEARN", 2, "learn the hover thrust: 1 until reboot, 2 saved"),
     _real("MOT_THST_EXPO", 0.65, "curvature of thrust over throttle, 0 linear"),
     _real("MOT_THST_HOVER", 0.39, "hover thrust, normalised"),
+    _real("PSC_JERK_XY", 5.0, "m/s^3 across the ground; without effect"),
     _real("PSC_POSXY_P", 1.0, "1/s"),
     _real("PSC_POSZ_P", 1.0, "1/s"),
     _real("PSC_VELXY_P", 2.0, "1/s"),
