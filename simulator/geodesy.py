@@ -7,8 +7,8 @@ import math
 EARTH_RADIUS_M = 6_371_000.0
 DEGREES_PER_M = math.degrees(1.0 / EARTH_RADIUS_M)  # northwards
 Origin = tuple[float, float, float]  # latitude, longitude deg, AMSL m
-# MAV_FRAME: height above sea level, above home, above the ground
-GLOBAL_FRAMES, RELATIVE_FRAMES, TERRAIN_FRAMES = map(frozenset, ((0, 5), (3, 6), (10, 11)))
+RELATIVE_FRAMES = frozenset((3, 6))  # MAV_FRAME: height above home
+TERRAIN_FRAMES = frozenset((10, 11))  # above the ground
 
 
 def to_metres(origin: Origin, latitude_deg: float, longitude_deg: float) -> tuple[float, float]:

@@ -270,7 +270,8 @@ class Companion:
         state.now_s = state.vehicle.now_s = self._session.link_time_s
         state.host_s = self._session.clock_s(now_s)
         if heard:
-            self._heard_s, state.silence_s, self._bridged_s = now_s, 0.0, 0.0
+            self._heard_s = self._session.elapsed_s(now_s)
+            state.silence_s = self._bridged_s = 0.0
         self._act()
         self._outbox.send(*due, *replies)
 
@@ -294,12 +295,13 @@ class Companion:
 
     def _begin_turn(self, now_s: float) -> None:
         state = self.state
+        elapsed_s = self._session.elapsed_s(now_s)
         if math.isnan(self._turned_s):
-            self._turned_s = self._heard_s = now_s
+            self._turned_s, self._heard_s = now_s, elapsed_s
         paused_s = now_s - self._turned_s
         self._turned_s = now_s
         state.host_s = self._session.clock_s(now_s)
-        state.silence_s = now_s - self._heard_s
+        state.silence_s = elapsed_s - self._heard_s
         if paused_s > PAUSE_S and state.authority is not None and not self._lockstep:
             state.authority.doubt(now_s)
             self._outbox.announce(

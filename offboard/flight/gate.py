@@ -16,7 +16,6 @@ from offboard.model.command import Command, PositionCommand
 from offboard.model.vehicle import Vehicle
 
 LEVEL = (0.0, 0.0, 1.0)
-FALLING_SHARE = 1.0 / 3.0  # of the hover thrust: less is sent only to a vehicle on the ground
 _LENGTH_TOLERANCE = 0.01
 
 
@@ -104,7 +103,7 @@ def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool = False) -> Com
     A direction tilted by more than `tilt_max_rad` is turned back to that tilt in its own vertical
     plane. Unless the vehicle certainly stands on the ground, thrust is at least a third of hover.
     """
-    least_mps2 = 0.0 if on_ground else FALLING_SHARE * vehicle.gravity_mps2
+    least_mps2 = 0.0 if on_ground else vehicle.thrust_min_mps2
     thrust = min(max(command.thrust_mps2, least_mps2), vehicle.thrust_max_mps2)
     north, east, down = command.thrust_direction_ned
     lateral = math.hypot(north, east)

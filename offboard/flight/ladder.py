@@ -124,7 +124,8 @@ ROWS = (
         lambda now: now.position_error_m > now.limits.position_error_m,
         0.0,
         Rung.LAND,
-        "{position_error_m:.1f} m from the reference (limit {position_error_limit_m:.1f} m)",
+        "{position_error_m:.1f} m from the reference (limit {position_error_limit_m:.1f} m)"
+        "{companion}",
     ),
     LadderRow(
         "prediction",
@@ -151,7 +152,8 @@ ROWS = (
         lambda now: now.height_m > now.limits.ceiling_m or now.distance_m > now.limits.radius_m,
         0.0,
         Rung.LAND,
-        "{height_m:.0f} m above and {distance_m:.0f} m from the take-off point",
+        "{height_m:.0f} m above and {distance_m:.0f} m from the take-off point "
+        "(limits.ceiling_m, limits.radius_m)",
     ),
     LadderRow(
         "battery",

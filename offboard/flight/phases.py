@@ -91,7 +91,8 @@ class ExitCode:
 
 class Limits(Parameters):
     """Limits of a flight. SI; seconds of vehicle time, but `connect_s`, `silence_s` and `late_s`
-    of a decision are wall time. `ladder` has what follows when one is exceeded in flight."""
+    of a decision are wall time, in lockstep simulated time. `ladder` has what follows when one is
+    exceeded in flight."""
 
     # on the ground
     connect_s: float = Field(default=20.0, gt=0, le=600)

@@ -50,7 +50,7 @@ from offboard.mavlink.peer import Peer
 from offboard.mavlink.signing import Signing
 from offboard.mavlink.telemetry_rates import SHARE, TelemetryRates, fitted
 from offboard.mavlink.texts import TextAssembler
-from offboard.mavlink.vehicle_time import Age, LinkTime, VehicleTime
+from offboard.mavlink.vehicle_time import SILENCE_S, Age, LinkTime, VehicleTime
 
 ACTIVE = 4  # MAV_STATE
 
@@ -72,7 +72,8 @@ class SessionSettings:
     send heartbeats before an autopilot was heard. `extra_wanted` is telemetry besides that of the
     dialect. `capacity_bytes_ps` of the link limits the rates of telemetry that are requested; None:
     unknown. `lockstep`: the vehicle waits for our replies, and the host times given to `receive`
-    and `poll` are ignored, so that nothing that is sent depends on them.
+    and `poll` are ignored, so that nothing that is sent depends on them. Vehicle time replaces
+    them; while telemetry is missing, its TIMESYNC requests count on.
     """
 
     system_id: int | None = None
@@ -123,6 +124,9 @@ class Session:
         self._texts = TextAssembler()
         self._time = VehicleTime()
         self._arrival_s = 0.0  # vehicle time when the newest datagram arrived
+        self._began_s: float | None = None  # stamp of the first TIMESYNC request
+        self._elapsed_s = 0.0  # from it to the newest one: in lockstep, simulated time
+        self._telemetry_s = 0.0  # `_elapsed_s` when the newest telemetry arrived
         self._link_time = LinkTime()
         self._rates = TelemetryRates((), 0.0)
         self._capacity_bytes_ps = settings.capacity_bytes_ps
@@ -199,6 +203,9 @@ class Session:
         if frame.message_id == framing.TIMESYNC:
             tc1_ns, ts1_ns = decode_timesync(frame.payload)
             if tc1_ns == 0:
+                stamp_s = ts1_ns * 1e-9
+                self._began_s = stamp_s if self._began_s is None else self._began_s
+                self._elapsed_s = stamp_s - self._began_s
                 # a reply at time 0 would look like a request
                 replies.append(Timesync(max(1, int(now_s * 1e9)), ts1_ns))
             elif self.vehicle is not None:
@@ -318,6 +325,7 @@ class Session:
                 self._restart_rates()  # a rebooted vehicle has its default rates
                 events.append(Rebooted(event.time_s))
             self._link_time.vehicle(event.time_s, now_s)
+            self._telemetry_s = self._elapsed_s
         events.append(event)
         return True
 
@@ -401,7 +409,14 @@ class Session:
         return frame
 
     def _clock_s(self, host_s: float) -> float:
-        return self._arrival_s if self.settings.lockstep else host_s
+        if not self.settings.lockstep:
+            return host_s
+        silent_s = self._elapsed_s - self._telemetry_s
+        return self._arrival_s + (silent_s if silent_s > SILENCE_S else 0.0)
+
+    def elapsed_s(self, host_s: float) -> float:
+        """Host time; in lockstep the simulated time, which goes on while telemetry is missing."""
+        return self._elapsed_s if self.settings.lockstep else host_s
 
     # --- state of the link ---
 

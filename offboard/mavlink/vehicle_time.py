@@ -9,7 +9,7 @@ from __future__ import annotations
 from enum import Enum, auto
 
 _REBOOT_S = 2.0  # a stamp older than the newest by more than this means a reboot, not reordering
-_SILENCE_S = 1.0
+SILENCE_S = 1.0
 _WRAP_S = 2**32 / 1e3
 _NEAR_S = 600.0  # a stamp this close to the newest, but for the wrap, continues it
 
@@ -46,11 +46,11 @@ class VehicleTime:
 
     def check(self, message_id: int, time_s: float) -> Age:
         """`time_s`: the stamp, continued by `wrapped_s`."""
-        if time_s < self.newest_s - _REBOOT_S:
+        last_s = self._last_s.get(message_id)
+        if time_s < self.newest_s - _REBOOT_S and time_s != last_s:  # not one that is stuck
             self.newest_s = time_s
             self._last_s = {message_id: time_s}
             return Age.REBOOTED
-        last_s = self._last_s.get(message_id)
         if last_s is not None and time_s <= last_s:
             return Age.STALE
         self._last_s[message_id] = time_s
@@ -74,7 +74,7 @@ class LinkTime:
         self._received_s = now_s
         step_s = 0.0 if self._vehicle_s is None else time_s - self._vehicle_s
         if self._vehicle_s is None or step_s > 0.0 or step_s < -_REBOOT_S:
-            self.seconds += max(min(step_s, _SILENCE_S) - self._bridged_s, 0.0)
+            self.seconds += max(min(step_s, SILENCE_S) - self._bridged_s, 0.0)
             self._bridged_s = 0.0
             self._vehicle_s = time_s
 
@@ -85,7 +85,7 @@ class LinkTime:
             silent_s = self._bridged_s + (0.0 if self._host_s is None else now_s - self._host_s)
         else:
             silent_s = now_s - self._received_s
-        if self._received_s is None or silent_s > _SILENCE_S:
+        if self._received_s is None or silent_s > SILENCE_S:
             self.seconds += max(silent_s - self._bridged_s, 0.0)
             self._bridged_s = max(silent_s, self._bridged_s)
         self._host_s = now_s

@@ -84,6 +84,11 @@ class Vehicle(Parameters):
         return self
 
     @property
+    def thrust_min_mps2(self) -> float:
+        """Least collective thrust per unit of mass that is sent in the air, a third of hover."""
+        return self.gravity_mps2 / 3.0
+
+    @property
     def thrust_max_mps2(self) -> float:
         """Collective thrust per unit of mass at full throttle, m/s^2 (linear thrust curve)."""
         return self.gravity_mps2 / self.hover_thrust

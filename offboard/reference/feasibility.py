@@ -38,6 +38,7 @@ class Envelope:
     speed_max_mps: float
     height_min_m: float
     height_max_m: float
+    radius_max_m: float  # horizontal distance from the take-off point
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,6 +84,7 @@ def check(reference: Reference, vehicle: Vehicle) -> Envelope:
         speed_max_mps=float(highest[6]),
         height_min_m=float(lowest[7]),
         height_max_m=float(highest[9]),
+        radius_max_m=float(highest[10]),
     )
 
 
@@ -114,9 +116,11 @@ def _demands(reference: Reference, vehicle: Vehicle, times: Array) -> tuple[_Dem
     speed = np.linalg.norm(sample.velocity_ned_mps, axis=-1)
     height = -sample.position_ned_m[:, 2]
     distance = np.linalg.norm(sample.position_ned_m, axis=-1)
+    radius = np.linalg.norm(sample.position_ned_m[:, :2], axis=-1)
     thrust = state.thrust_mps2
+    thrust_min = max(THRUST_SHARE_MIN * thrust_max, vehicle.thrust_min_mps2)
     return (
-        _Demand("a thrust of", "m/s^2", thrust, THRUST_SHARE_MIN * thrust_max, -1.0),
+        _Demand("a thrust of", "m/s^2", thrust, thrust_min, -1.0),
         _Demand("a thrust of", "m/s^2", thrust, THRUST_SHARE_MAX * thrust_max),
         _Demand("a tilt of", "rad", tilt, TILT_SHARE_MAX * vehicle.tilt_max_rad),
         _Demand("a roll rate of", "rad/s", rates[:, 0], rates_max[0]),
@@ -126,4 +130,5 @@ def _demands(reference: Reference, vehicle: Vehicle, times: Array) -> tuple[_Dem
         _Demand("a height of", "m", height, HEIGHT_MIN_M, -1.0, of_path=True),
         _Demand("a distance of", "m", distance, DISTANCE_MAX_M, of_path=True),
         _Demand("a height of", "m", height, math.inf, of_path=True),
+        _Demand("a distance of", "m", radius, math.inf, of_path=True),
     )

@@ -67,8 +67,8 @@ def parse(text: str, name: str) -> Table:
     for index in range(1, len(body)):
         if times[index] <= times[index - 1]:
             raise TableError(
-                f"{name}, row {body[index][0]}, column time_s: {times[index]:g} does not come "
-                f"after {times[index - 1]:g}; times must increase"
+                f"{name}, row {body[index][0]}, column time_s: {times[index]:.12g} does not "
+                f"come after {times[index - 1]:.12g}; times must increase"
             )
     down = by_name["down_m"] if "down_m" in by_name else -by_name["altitude_m"]
     course = np.unwrap(np.radians(by_name["course_deg"])) if "course_deg" in by_name else None

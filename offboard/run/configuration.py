@@ -15,6 +15,7 @@ from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 from pydantic import BaseModel, Field, SerializeAsAny, create_model, model_validator
 
@@ -31,7 +32,7 @@ from offboard.estimation.observer import ObserverSettings
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Limits
 from offboard.model.vehicle import Vehicle
-from offboard.reference.feasibility import check
+from offboard.reference.feasibility import Envelope, check
 from offboard.reference.shapes import SHAPES, FromTable, Shape
 from offboard.reference.track import Track
 
@@ -102,8 +103,9 @@ def build_track(config: FlightConfig) -> Track:
     Raises DocumentError naming time, value and limit where it cannot be flown.
     """
     try:
-        track = config.reference.track()
-        envelope = check(track, config.vehicle)
+        with np.errstate(over="ignore", invalid="ignore"):  # what overflows is beyond a limit
+            track = config.reference.track()
+            envelope = check(track, config.vehicle)
     except ValueError as error:
         raise DocumentError(f"reference {config.reference.title}: {error}") from None
     landing_s = envelope.height_max_m / DESCENT_MPS
@@ -113,10 +115,26 @@ def build_track(config: FlightConfig) -> Track:
             f"{landing_s:.4g} s at {DESCENT_MPS} m/s, longer than limits.land_s "
             f"({config.limits.land_s:g} s); fly lower or allow more time"
         )
+    _check_volume(envelope, config)
     refused = config.controller.refusal(track)
     if refused:
         raise DocumentError(f"controller: {refused}")
     return track
+
+
+def _check_volume(envelope: Envelope, config: FlightConfig) -> None:
+    """The reference must stay within the volume whose limits end a flight. Raises DocumentError."""
+    limits = config.limits
+    reached = (
+        (envelope.height_max_m, "above", "limits.ceiling_m", limits.ceiling_m),
+        (envelope.radius_max_m, "away from", "limits.radius_m", limits.radius_m),
+    )
+    for reached_m, where, limit, limit_m in reached:
+        if reached_m > limit_m:
+            raise DocumentError(
+                f"reference {config.reference.title}: it goes {reached_m:.4g} m {where} the "
+                f"take-off point, beyond {limit} ({limit_m:g} m); fly nearer or raise the limit"
+            )
 
 
 def build_controller(config: FlightConfig) -> Controller:

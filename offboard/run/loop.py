@@ -7,6 +7,7 @@ fails in it hands the vehicle back.
 from __future__ import annotations
 
 import gc
+import math
 import traceback
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
@@ -70,8 +71,9 @@ class Loop:
     """Moves bytes between one link, one companion and one log until the flight ends.
 
     `progress` is called often, to show the companion's announcements to the user; it must not wait.
-    `simulator_ended` says how the bundled simulator ended, or None while it runs. `supervisor`
-    outlives us; None with the bundled simulator.
+    `simulator_ended` says how the bundled simulator ended, or None while it runs; `patience_s` is
+    the wall time without a datagram after which the flight ends. `supervisor` outlives us; None
+    with the bundled simulator.
     """
 
     def __init__(
@@ -83,6 +85,7 @@ class Loop:
         stops: StopRequests,
         progress: Callable[[Any], None],
         simulator_ended: Callable[[], Ending | None] = lambda: None,
+        patience_s: float = math.inf,
         supervisor: Supervisor | None = None,
     ) -> None:
         self._companion = companion
@@ -91,11 +94,12 @@ class Loop:
         self._stops = stops
         self._progress = progress
         self._simulator_ended = simulator_ended
+        self._patience_s = patience_s
         self._supervisor = supervisor
         self._warned: set[str] = set()
         self._error = ""  # the first exception of this flight
         self._restarted_s = -RESTART_S
-        self._succeeded_s = clock.monotonic_s()
+        self._succeeded_s = self._heard_s = clock.monotonic_s()
         self._ended_early: Outcome | None = None
 
     def run(self) -> Outcome:
@@ -104,7 +108,7 @@ class Loop:
         gc.collect()
         if not gc.get_freeze_count():  # by an earlier flight in this process
             gc.freeze()
-        self._succeeded_s = clock.monotonic_s()
+        self._succeeded_s = self._heard_s = clock.monotonic_s()
         while not (self._companion.has_ended() or self._stops.repeated or self._ended_early):
             try:
                 self._turn()
@@ -123,6 +127,8 @@ class Loop:
             self._companion.request_stop()
         chunks = self._link.receive(POLL_S)
         began_s = clock.monotonic_s()
+        if chunks:
+            self._heard_s = began_s
         self._deliver(self._companion.turn(chunks, began_s), began_s)
         strangers = self._link.strangers
         self._companion.strangers = strangers.total
@@ -132,7 +138,7 @@ class Loop:
         self._check_log()
         self._check_supervisor()
         self._show()
-        self._check_simulator()
+        self._check_simulator(began_s - self._heard_s)
 
     def _deliver(self, output: Output, began_s: float) -> None:
         """Send and log. This process may have been stopped since the turn began: then what the turn
@@ -229,9 +235,11 @@ class Loop:
         except (Exception, SystemExit):
             self._progress = lambda companion: None
 
-    def _check_simulator(self) -> None:
+    def _check_simulator(self, silent_s: float) -> None:
         """End the flight if the bundled simulator has ended."""
         ended = None if self._companion.has_ended() else self._simulator_ended()
+        if ended is None and silent_s > self._patience_s:
+            ended = Ending(f"the bundled simulator has not answered for {silent_s:.1f} s", False)
         if ended is None:
             return
         code = ExitCode.ABORTED

@@ -229,6 +229,7 @@ def fly(
             stops=stops,
             progress=progress,
             simulator_ended=bundled.simulator.ended if bundled else lambda: None,
+            patience_s=SITL_TIMEOUT_S if bundled else math.inf,
             supervisor=supervisor,
         )
         if supervisor:
@@ -274,19 +275,15 @@ def companion_of(
     parts: FlightParts, session: Session, observer: Observer, stopwatch: Callable[[], float]
 ) -> Companion:
     """The companion of a flight with these parts. `stopwatch` reads host time."""
-    limits, lockstep = parts.limits, session.settings.lockstep
-    if lockstep:  # the simulator waits for us: silence only means that the machine is busy
-        timeouts = {"connect_s": SITL_TIMEOUT_S, "silence_s": SITL_TIMEOUT_S}
-        limits = limits.model_copy(update=timeouts)
     return Companion(
         vehicle=parts.vehicle,
         session=session,
         observer=observer,
         controller=parts.controller,
         plan=FlightPlan(parts.track),
-        limits=limits,
+        limits=parts.limits,
         period_s=parts.period_s,
-        deadline_s=None if lockstep else parts.deadline_s,
+        deadline_s=None if session.settings.lockstep else parts.deadline_s,
         stopwatch=stopwatch,
         identify=parts.identify,
     )

@@ -97,10 +97,6 @@ class Commands:
         forced = command.params[1] == autopilot.firmware.commands.force_codes[request.event]
         return autopilot.handle(f"force {request.event}" if forced else request.event)
 
-    def _run_checks(self, _: Command) -> Result:
-        """MAV_CMD_RUN_PREARM_CHECKS: texts say what fails."""
-        return self._autopilot.handle("checks")
-
     def _takeoff(self, command: Command) -> Result:
         height_m = command.params[6]
         autopilot = self._autopilot
@@ -113,12 +109,6 @@ class Commands:
         finite = (value if math.isfinite(value) else math.nan for value in (*place, down_m))
         north, east, down = finite
         return autopilot.handle("takeoff", Request(takeoff_ned_m=(north, east, down)))
-
-    def _land(self, _: Command) -> Result:
-        return self._autopilot.handle("land")
-
-    def _return(self, _: Command) -> Result:
-        return self._autopilot.handle("return")
 
     def _loiter(self, _: Command) -> Result:
         autopilot = self._autopilot
@@ -261,23 +251,18 @@ class Commands:
             return streams.request_refusal
         if name in streams.not_on_request:
             return streams.request_refusal
+        return self._send(name)
+
+    def _send(self, name: str) -> Result:
         self.outbox.send_now(name)
-        return Result.ACCEPTED
-
-    def _request_version(self, _: Command) -> Result:
-        self.outbox.send_now("AUTOPILOT_VERSION")
-        return Result.ACCEPTED
-
-    def _request_home(self, _: Command) -> Result:
-        self.outbox.send_now("HOME_POSITION")
         return Result.ACCEPTED
 
 
 # By MAV_CMD
 HANDLERS: dict[int, Callable[[Commands, Command], Result | None]] = {
     17: Commands._loiter,  # NAV_LOITER_UNLIM
-    20: Commands._return,  # NAV_RETURN_TO_LAUNCH
-    21: Commands._land,  # NAV_LAND
+    20: lambda commands, _: commands._autopilot.handle("return"),  # NAV_RETURN_TO_LAUNCH
+    21: lambda commands, _: commands._autopilot.handle("land"),  # NAV_LAND
     22: Commands._takeoff,  # NAV_TAKEOFF
     115: Commands._turn,  # CONDITION_YAW
     176: Commands._set_mode,  # DO_SET_MODE
@@ -288,12 +273,12 @@ HANDLERS: dict[int, Callable[[Commands, Command], Result | None]] = {
     246: Commands._reboot,  # PREFLIGHT_REBOOT_SHUTDOWN
     300: Commands._start_mission,  # MISSION_START
     400: Commands._arm_disarm,  # COMPONENT_ARM_DISARM
-    401: Commands._run_checks,  # RUN_PREARM_CHECKS
-    410: Commands._request_home,  # GET_HOME_POSITION
+    401: lambda commands, _: commands._autopilot.handle("checks"),  # RUN_PREARM_CHECKS
+    410: lambda commands, _: commands._send("HOME_POSITION"),  # GET_HOME_POSITION
     510: Commands._get_interval,  # GET_MESSAGE_INTERVAL
     511: Commands._set_interval,  # SET_MESSAGE_INTERVAL
     512: Commands._request_message,  # REQUEST_MESSAGE
-    520: Commands._request_version,  # REQUEST_AUTOPILOT_CAPABILITIES
+    520: lambda commands, _: commands._send("AUTOPILOT_VERSION"),  # REQUEST_AUTOPILOT_CAPABILITIES
 }
 
 

@@ -88,6 +88,7 @@ class Wire:
         turn = service.turn
         self.left = self.engaged and self._followed
         self.engaged, self.known = False, None
+        self._other_s = -math.inf  # what was sent before it began it cannot know
         self._sent.clear()
         self.asked.clear()
 

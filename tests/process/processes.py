@@ -17,6 +17,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 SIGNING_EPOCH_S = 1_420_070_400  # 2015-01-01
 Spawn = Callable[..., subprocess.Popen[str]]
+Called = Callable[..., tuple[int, str, str]]
 
 
 def free_port() -> int:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import yaml
 
 from offboard.io.stop import StopRequests
-from offboard.run import in_memory
+from offboard.run import in_memory, one_flight
 from offboard.run.in_memory import InMemorySimulator
 from offboard.run.request import FlightRequest, fly_request
 from offboard.run.sitl import SimulatorProcess
@@ -77,3 +79,48 @@ def test_a_vehicle_that_fails_ends_the_flight_with_a_sentence(
     outcome = fly_request(wanted, simulator=InMemorySimulator(), stops=StopRequests())
     sentence = "the bundled simulator failed (ZeroDivisionError: division by zero)"
     assert (outcome.exit_code, outcome.sentence) == (3, sentence)
+
+
+@pytest.mark.parametrize(
+    ("scenario", "code", "sentence"),
+    [
+        # the autopilot sends no telemetry after its restart until it is asked again
+        ({"fault": "reboot", "at_s": 30.0}, 0, "flown and landed"),
+        (
+            {"fault": "link", "direction": "down", "loss": 1.0, "after": "engaged", "at_s": 8.0},
+            4,
+            "no telemetry for 1.0 s; no telemetry for 2.0 s while landing",
+        ),
+    ],
+    ids=["restart on the ground", "telemetry lost"],
+)
+def test_time_goes_on_without_telemetry(
+    scenario: dict[str, object], code: int, sentence: str, tmp_path: Path
+) -> None:
+    file = tmp_path / "faulty.yaml"
+    file.write_text(yaml.safe_dump({"name": "faulty", "faults": [scenario]}))
+    wanted = replace(request(tmp_path / "flight", str(file)), firmware="ardupilot")
+    outcome = fly_request(wanted, simulator=InMemorySimulator(), stops=StopRequests())
+    assert (outcome.exit_code, outcome.sentence) == (code, sentence)
+
+
+def test_a_vehicle_that_hangs_ends_the_flight_with_a_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Hangs:
+        def __init__(self, **options: object) -> None:
+            pass
+
+        def exchange(self, frames: object) -> list[tuple[int, bytes]]:
+            return []
+
+    class Point:
+        def load(self) -> type[Hangs]:
+            return Hangs
+
+    monkeypatch.setattr(in_memory, "registered", Point)
+    monkeypatch.setattr(one_flight, "SITL_TIMEOUT_S", 0.1)
+    wanted = request(tmp_path / "flight", "calm")
+    outcome = fly_request(wanted, simulator=InMemorySimulator(), stops=StopRequests())
+    assert outcome.exit_code == 3
+    assert outcome.sentence.startswith("the bundled simulator has not answered for 0.")

@@ -2,37 +2,22 @@
 
 from __future__ import annotations
 
-import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from processes import Called
 
-from offboard import cli
 from offboard.documents.signing_key import read_key
-from simulator.cli import main as simulator
-
-Capture = pytest.CaptureFixture[str]
-Call = Callable[..., tuple[int, str, str]]
 
 
 @pytest.fixture
-def call(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capture) -> Call:
+def call(called: Called, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Called:
     """`call("offboard", "key")` -> exit code, stdout, stderr."""
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
-
-    def run(command: str, *arguments: object) -> tuple[int, str, str]:
-        monkeypatch.setattr(sys, "argv", [command, *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            simulator() if command == "simulator" else cli.main()
-        printed = capsys.readouterr()
-        return int(ended.value.code or 0), printed.out, printed.err
-
-    return run
+    return called
 
 
-def test_a_key_is_made_once_and_explained_without_showing_it(call: Call, tmp_path: Path) -> None:
+def test_a_key_is_made_once_and_explained_without_showing_it(call: Called, tmp_path: Path) -> None:
     code, said, _ = call("offboard", "key", "my.key")
     assert code == 0
     assert "signing setup PASSPHRASE" in said
@@ -56,7 +41,7 @@ def test_a_key_is_made_once_and_explained_without_showing_it(call: Call, tmp_pat
 )
 @pytest.mark.parametrize("command", ["offboard fly", "offboard fly --sitl", "simulator"])
 def test_a_bad_key_file_is_one_sentence_before_anything_is_sent(
-    command: str, content: str | None, mode: int, expected: str, call: Call, tmp_path: Path
+    command: str, content: str | None, mode: int, expected: str, call: Called, tmp_path: Path
 ) -> None:
     if content is not None:
         (tmp_path / "k").write_text(content)
@@ -69,7 +54,7 @@ def test_a_bad_key_file_is_one_sentence_before_anything_is_sent(
     assert sorted(tmp_path.iterdir()) == files
 
 
-def test_where_no_time_stamp_can_be_kept_nothing_is_flown(call: Call, tmp_path: Path) -> None:
+def test_where_no_time_stamp_can_be_kept_nothing_is_flown(call: Called, tmp_path: Path) -> None:
     call("offboard", "key", "my.key")
     (tmp_path / "state").write_text("a file")
     connection = ("--connect", "udpin:127.0.0.1:0")

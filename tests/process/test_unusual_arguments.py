@@ -13,11 +13,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from processes import Called
 
-from offboard import cli
 from offboard.analysis import tlog
 from offboard.analysis.compare import Result
-from simulator import cli as simulator_cli
 
 RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
 SURROGATE = os.fsdecode(b"caf\xe9")
@@ -27,20 +26,9 @@ LINK = ("--connect", "udpin:127.0.0.1:0", "--set", "limits.connect_s=0.1")
 
 
 @pytest.fixture
-def call(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> Call:
+def call(called: Called) -> Call:
     """`call("offboard fly", ...)` -> (exit code, stderr)."""
-    monkeypatch.chdir(tmp_path)
-
-    def call(command: str, *arguments: object) -> tuple[int, str]:
-        main = simulator_cli.main if command.startswith("simulator") else cli.main
-        monkeypatch.setattr(sys, "argv", [*command.split(), *map(str, arguments)])
-        with pytest.raises(SystemExit) as ended:
-            main()
-        return int(ended.value.code or 0), capsys.readouterr().err
-
-    return call
+    return lambda *arguments: called(*arguments)[::2]
 
 
 def refused(answer: tuple[int, str]) -> str:
@@ -252,6 +240,16 @@ def test_of_many_errors_the_first_ten_are_printed(call: Call, tmp_path: Path) ->
             "limits.land_s (90 s); fly lower or allow more time",
         ),
         (
+            ("--set", "limits.radius_m=1.5"),
+            "reference lemniscate: it goes 2 m away from the take-off point, beyond "
+            "limits.radius_m (1.5 m); fly nearer or raise the limit",
+        ),
+        (
+            ("--set", "reference.height_m=40", "--set", "limits.ceiling_m=30"),
+            "reference lemniscate: it goes 40 m above the take-off point, beyond limits.ceiling_m "
+            "(30 m); fly nearer or raise the limit",
+        ),
+        (
             ("--set", "controller.swarm={particles: 10000, iterations: 100000}"),
             "controller.swarm: particles x iterations must be at most 500000, not 1000000000",
         ),
@@ -261,7 +259,7 @@ def test_of_many_errors_the_first_ten_are_printed(call: Call, tmp_path: Path) ->
         ),
     ],
 )
-def test_what_cannot_end_in_time_is_refused(
+def test_what_cannot_be_flown_to_its_end_is_refused(
     arguments: tuple[str, ...], says: str, call: Call, tmp_path: Path
 ) -> None:
     assert says in refused(call("offboard fly", *LINK, *arguments))

@@ -69,7 +69,7 @@ UP = {"shape": "line", "to_north_m": 0, "speed_mps": 10, "run_out_s": 6, "height
             "3.49 rad/s",
         ),
         (UP | {"climb_m": 90, "run_in_s": 1.5}, "a thrust of", "18.6 m/s^2"),
-        (UP | {"climb_m": -60, "run_in_s": 1.6}, "a thrust of", "0.98 m/s^2"),
+        (UP | {"climb_m": -60, "run_in_s": 2.2}, "a thrust of", "3.27 m/s^2"),
     ],
 )
 def test_refused_with_time_value_and_limit(

@@ -209,6 +209,12 @@ class Bench:
     def boot(self) -> None:
         self.run(5.0)
 
+    def take_off(self) -> None:
+        """By command from the ground, until AUTO.LOITER, 2.5 m up."""
+        assert self.command(22, *(NAN,) * 7) == [0]
+        assert self.command(400, 1) == [0]
+        self.run_until(lambda: self.mode == LOITER, 15.0)
+
     def fly_offboard(self, height_m: float = 3.0) -> None:
         """Boot, stream, engage, arm and climb by position setpoints; the stream then ends."""
         self.boot()

@@ -415,6 +415,16 @@ def test_a_jump_back_is_a_reboot() -> None:
     assert session.poll(0.0) == ()
 
 
+def test_a_message_that_repeats_its_stamp_for_long_is_stale() -> None:
+    vehicle = Sender()
+    session = pinned(vehicle)
+    times(session, vehicle.attitude(60000))
+    for later_ms in range(60010, 65000, 10):
+        assert times(session, vehicle.position(later_ms), vehicle.attitude(60000)) == [
+            later_ms / 1e3
+        ]
+
+
 WRAP_MS = 2**32
 
 

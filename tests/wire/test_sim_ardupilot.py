@@ -25,9 +25,13 @@ HOVER = 0.3655
 LEVEL = (1.0, 0.0, 0.0, 0.0)
 
 
-def bench(heartbeat_type: int | None = ONBOARD, boot_scale: float = BOOT_SCALE) -> Bench:
+def bench(
+    heartbeat_type: int | None = ONBOARD,
+    boot_scale: float = BOOT_SCALE,
+    estimator: EstimatorName = EstimatorName.PERFECT,
+) -> Bench:
     return Bench(
-        EstimatorName.PERFECT,
+        estimator,
         heartbeat_type=heartbeat_type,
         firmware=ARDUPILOT,
         boot_scale=boot_scale,
@@ -56,9 +60,9 @@ def climb_mps(vehicle: Bench) -> float:
     return -float(vehicle.instance.autopilot.state.truth.velocity_ned_mps[2])
 
 
-def ready(mode: int = GUIDED) -> Bench:
+def ready(mode: int = GUIDED, estimator: EstimatorName = EstimatorName.PERFECT) -> Bench:
     """Booted and in a mode, thrust is thrust."""
-    vehicle = bench()
+    vehicle = bench(estimator=estimator)
     vehicle.run(4.5)
     set_parameter(vehicle, "GUID_OPTIONS", 8)
     assert ask_mode(vehicle, mode) == [ACCEPTED]
@@ -281,6 +285,14 @@ def test_armed_on_the_ground_it_disarms_after_ten_seconds() -> None:
     armed_s = vehicle.text_at("Arming motors")
     vehicle.run(11.0)
     assert vehicle.text_at("Disarming motors") - armed_s == pytest.approx(10.0, abs=0.05)
+
+
+def test_armed_with_a_noisy_estimate_it_stands_until_a_takeoff_is_requested() -> None:
+    vehicle = ready(estimator=EstimatorName.ARDUPILOT_LIKE)
+    assert vehicle.command(400, 1) == [ACCEPTED]
+    vehicle.run(8.0)
+    assert (vehicle.instance.view.landed_state, vehicle.height_m) == (1, pytest.approx(0.0))
+    assert vehicle.command(22, *(0.0,) * 6, 3.0) == [ACCEPTED]
 
 
 # -- takeoff and landing ---------------------------------------------------------------------

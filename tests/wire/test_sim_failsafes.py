@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import pytest
-from sim_bench import LAND, LOITER, NAN, OFFBOARD, RTL, Bench
+from sim_bench import LAND, LOITER, OFFBOARD, RTL, Bench
 
 
 def flying(parameter: str = "COM_LOW_BAT_ACT", value: float = 0) -> Bench:
@@ -11,9 +11,7 @@ def flying(parameter: str = "COM_LOW_BAT_ACT", value: float = 0) -> Bench:
     bench = Bench()
     bench.boot()
     assert bench.instance.autopilot.parameters.set(parameter, value)
-    bench.command(22, *(NAN,) * 7)
-    bench.command(400, 1)
-    bench.run_until(lambda: bench.mode == LOITER, 15.0)
+    bench.take_off()
     return bench
 
 

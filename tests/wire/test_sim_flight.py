@@ -115,9 +115,7 @@ def test_takeoff_land_and_a_second_flight() -> None:
     bench.boot()
     for _ in range(2):
         begun_s = bench.time_s
-        assert bench.command(22, *(NAN,) * 7) == [0]
-        assert bench.command(400, 1) == [0]
-        bench.run_until(lambda: bench.mode == LOITER, 12.0)
+        bench.take_off()
         bench.run(4.0)
         assert bench.height_m == pytest.approx(2.5, abs=0.2)
         landed_states = {m.landed_state for _, m in bench.of("EXTENDED_SYS_STATE", begun_s)}

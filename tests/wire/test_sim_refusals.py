@@ -17,10 +17,6 @@ def asleep(bench: Bench) -> None:
     bench.run(1.0)
 
 
-def booted(bench: Bench) -> None:
-    bench.boot()
-
-
 def streaming(bench: Bench) -> None:
     bench.boot()
     bench.run(0.6, bench.attitude)
@@ -37,29 +33,23 @@ def offboard_without_stream(bench: Bench) -> None:
 
 
 def armed(bench: Bench) -> None:
-    booted(bench)
+    bench.boot()
     bench.command(400, 1)
 
 
 def landing_mode(bench: Bench) -> None:
-    booted(bench)
+    bench.boot()
     bench.command(21)
 
 
 def posctl(bench: Bench) -> None:
-    booted(bench)
+    bench.boot()
     bench.ask_mode(POSCTL)
 
 
 def flying(bench: Bench) -> None:
     bench.boot()
-    bench.command(22, *(NAN,) * 7)
-    bench.command(400, 1)
-    bench.run_until(lambda: bench.mode == LOITER, 15.0)
-
-
-def flying_offboard(bench: Bench) -> None:
-    bench.fly_offboard()
+    bench.take_off()
 
 
 @dataclass(frozen=True)
@@ -75,7 +65,7 @@ class Row:
 
 SET_OFFBOARD, SET_HOLD = (176, 1, 6, 0), (176, 1, 4, 3)
 ROWS = [
-    Row("offboard, disarmed, no stream", booted, SET_OFFBOARD, [0, 0], OFFBOARD, False),
+    Row("offboard, disarmed, no stream", Bench.boot, SET_OFFBOARD, [0, 0], OFFBOARD, False),
     Row("offboard, disarmed, with stream", streaming, SET_OFFBOARD, [0, 0], OFFBOARD, False),
     Row("offboard, as MAVSDK asks", streaming, (176, 129, 6, 0), [0, 0], OFFBOARD, False),
     Row("arm, offboard without stream", offboard_without_stream, (400, 1), [LATER], OFFBOARD,
@@ -84,39 +74,39 @@ ROWS = [
         "Armed by external command"),
     Row("arm before health", asleep, (400, 1), [LATER], LOITER, False, DENIED_TEXT),
     Row("arm before health, forced", asleep, (400, 1, 21196), [0], LOITER, True),
-    Row("arm in hold", booted, (400, 1, NAN, NAN, NAN, NAN, NAN), [0], LOITER, True),
+    Row("arm in hold", Bench.boot, (400, 1, NAN, NAN, NAN, NAN, NAN), [0], LOITER, True),
     Row("arm in land mode", landing_mode, (400, 1), [LATER], LAND, False, DENIED_TEXT),
     Row("arm twice", armed, (400, 1), [0], LOITER, True),
-    Row("disarm when disarmed", booted, (400, 0), [0], LOITER, False),
+    Row("disarm when disarmed", Bench.boot, (400, 0), [0], LOITER, False),
     Row("disarm on the ground", armed, (400, 0), [0], LOITER, False,
         "Disarmed by external command"),
     Row("disarm in the air", flying, (400, 0), [LATER], LOITER, True,
         "Disarming denied: not landed"),
     Row("disarm in the air, forced", flying, (400, 0, 21196), [0], LOITER, False),
-    Row("arm with a strange wish", booted, (400, 2), [], LOITER, False,
+    Row("arm with a strange wish", Bench.boot, (400, 2), [], LOITER, False,
         "Unsupported ARM_DISARM param: 2.000"),
-    Row("arm with half a wish, which is rounded", booted, (400, 0.6), [0], LOITER, True),
+    Row("arm with half a wish, which is rounded", Bench.boot, (400, 0.6), [0], LOITER, True),
     Row("arm with NaN, which disarms", armed, (400, NAN), [0], LOITER, False),
     Row("offboard in the air, no stream", flying, SET_OFFBOARD, [0, LATER], LOITER, True),
     Row("position control without sticks", flying, (176, 1, 3, 0), [0, LATER], LOITER, True),
-    Row("position control, disarmed", booted, (176, 1, 3, 0), [0, 0], POSCTL, False),
-    Row("hold from offboard", flying_offboard, SET_HOLD, [0, 0], LOITER, True),
+    Row("position control, disarmed", Bench.boot, (176, 1, 3, 0), [0, 0], POSCTL, False),
+    Row("hold from offboard", Bench.fly_offboard, SET_HOLD, [0, 0], LOITER, True),
     Row("land", flying, (21, 0, 0, 0, NAN), [0], LAND, True, "Landing at current position"),
     Row("return", flying, (20,), [0], RTL, True, "Returning to launch"),
-    Row("takeoff, disarmed", booted, (22, *(NAN,) * 7)[:8], [0], TAKEOFF, False),
-    Row("unknown main mode", booted, (176, 1, 99, 0), [0, 0], LOITER, False),
-    Row("unknown auto mode", booted, (176, 1, 4, 99), [0, LATER], LOITER, False,
+    Row("takeoff, disarmed", Bench.boot, (22, *(NAN,) * 7)[:8], [0], TAKEOFF, False),
+    Row("unknown main mode", Bench.boot, (176, 1, 99, 0), [0, 0], LOITER, False),
+    Row("unknown auto mode", Bench.boot, (176, 1, 4, 99), [0, LATER], LOITER, False,
         "Unsupported auto mode"),
-    Row("mode without custom flag", booted, (176, 0, 6, 0), [0, 0], LOITER, False),
-    Row("mode of NaN", booted, (176, *(NAN,) * 7)[:8], [0, 0], LOITER, False),
+    Row("mode without custom flag", Bench.boot, (176, 0, 6, 0), [0, 0], LOITER, False),
+    Row("mode of NaN", Bench.boot, (176, *(NAN,) * 7)[:8], [0, 0], LOITER, False),
     Row("arm in position control", posctl, (400, 1), [LATER], POSCTL, False, DENIED_TEXT),
-    Row("reboot, which SITL cannot", booted, (246, 1), [DENIED], LOITER, False),
-    Row("taken and not carried out", booted, (80,), [0], LOITER, False),
-    Row("not answered", booted, (93,), [], LOITER, False),
-    Row("reposition on the ground", booted, (192, -1, 1, 0, NAN, 47.4, 8.5, 500), [0, ],
+    Row("reboot, which SITL cannot", Bench.boot, (246, 1), [DENIED], LOITER, False),
+    Row("taken and not carried out", Bench.boot, (80,), [0], LOITER, False),
+    Row("not answered", Bench.boot, (93,), [], LOITER, False),
+    Row("reposition on the ground", Bench.boot, (192, -1, 1, 0, NAN, 47.4, 8.5, 500), [0, ],
         LOITER, False),
     Row("reposition without a change of mode", flying, (192, -1, 0), [UNSUPPORTED], LOITER, True),
-    Row("unknown command", booted, (31000,), [UNSUPPORTED], LOITER, False),
+    Row("unknown command", Bench.boot, (31000,), [UNSUPPORTED], LOITER, False),
 ]  # fmt: skip
 
 

@@ -17,7 +17,11 @@ class FollowSetpoint(ActiveBehaviour):
 
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
         setpoint = self.guidance.setpoint
-        return setpoint if isinstance(setpoint, MotionSetpoint) else self.guidance.hold
+        if isinstance(setpoint, MotionSetpoint):
+            self.cannot_climb = False
+            return setpoint
+        self.cannot_climb = landed  # it stands until somebody asks for a climb
+        return self.guidance.hold
 
     @property
     def automatic(self) -> bool:

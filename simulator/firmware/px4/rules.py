@@ -123,19 +123,9 @@ RULES = (
         when=("armed", "not landed", "NAV_DLL_ACT=1"),
         to="AUTO.LOITER",
         do=("failsafe",),
-        texts=(
-            _WARNINGS["ground station lost"],
-            _LOST,
-        ),
+        texts=(_WARNINGS["ground station lost"], _LOST),
     ),
-    Rule(
-        "battery low",
-        when=("armed",),
-        texts=(
-            _WARNINGS["battery low"],
-            _LOST,
-        ),
-    ),
+    Rule("battery low", when=("armed",), texts=(_WARNINGS["battery low"], _LOST)),
     *(Rule(event, texts=(text,)) for event, text in _WARNINGS.items()),
     Rule("ground station found", texts=(_REGAINED,)),
     Rule("position lost", "OFFBOARD", when=("not motion setpoint",)),
@@ -180,10 +170,7 @@ RULES = (
         when=("landed",),
         do=("disarm",),
         to="remembered",
-        texts=(
-            info("Mission finished, landed"),
-            info("Disarmed by landing"),
-        ),
+        texts=(info("Mission finished, landed"), info("Disarmed by landing")),
     ),
     Rule("mission finished", texts=(info("Mission finished, loitering"),)),
     Rule("reboot", result=Result.DENIED),  # as SITL does, which cannot
