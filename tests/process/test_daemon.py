@@ -27,6 +27,7 @@ from offboard.documents.signing_key import create_key, read_key
 NAN = float("nan")
 SET_MODE, ARM, TAKEOFF = 176, 400, 22  # MAV_CMD
 LONG_S = 60.0
+ENGAGED = ("excite", "join", "track")
 
 
 class Pilot:
@@ -99,16 +100,17 @@ def await_phase(port: int, *phases: str) -> None:
 
 
 def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> None:
-    """In real time over UDP, signed, with monitoring, a second service, another vehicle, and
-    SIGTERM in flight."""
+    """In real time over UDP, signed, with monitoring, a second service, another vehicle, SIGTERM
+    in flight, and SIGKILL in the next one."""
     create_key(tmp_path / "key")
     key = read_key(tmp_path / "key")
     port, web, pilot = free_port(), free_port(), Pilot(key)
     link = f"udpin:127.0.0.1:{port}"
-    service = spawn("offboard", "daemon", "--connect", link, "--out", "out", "--log-json",
-                    "--metrics", f"127.0.0.1:{web}", "--reference", "hover",
-                    "--system", "1", "--signing-key", "key", "--set", "reference.duration_s=600",
-                    OFFBOARD_REPORT="1", XDG_STATE_HOME=str(tmp_path))  # fmt: skip
+    command = ("offboard", "daemon", "--connect", link, "--out", "out", "--log-json",
+               "--metrics", f"127.0.0.1:{web}", "--reference", "hover", "--system", "1",
+               "--signing-key", "key", "--set", "reference.duration_s=600")  # fmt: skip
+    variables = {"OFFBOARD_REPORT": "1", "XDG_STATE_HOME": str(tmp_path)}
+    service = spawn(*command, **variables)
     await_phase(web, "connect")
     assert health(web)[0] == 503
     second = spawn("offboard", "daemon", "--connect", link, "--out", "other")
@@ -131,7 +133,7 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     pilot.command(SET_MODE, 1, 4, 3)
     pilot.until(shows(0x03040000))
     pilot.until(shows(0x00060000), lambda: pilot.command(SET_MODE, 1, 6, 0))
-    await_phase(web, "excite", "join", "track")
+    await_phase(web, *ENGAGED)
     assert scraped(web)["offboard_flights_total"] == 1.0
     scraped_s = time.time()
     while time.time() < scraped_s + 2.0:  # a client that scrapes more than any real one
@@ -161,6 +163,15 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     assert sum(0.0 < each_s - scraped_s < 2.0 for each_s in sent_s) >= 16  # 10 Hz, on any machine
     names = {entry.name for entry in log}
     assert {"TUNNEL", "HEARTBEAT", "PARAM_VALUE", "SET_ATTITUDE_TARGET", "STATUSTEXT"} <= names
+    killed = spawn(*command, **variables)
+    await_phase(web, "standby")
+    pilot.until(shows(0x00060000), lambda: pilot.command(SET_MODE, 1, 6, 0))
+    await_phase(web, *ENGAGED)
+    killed.kill()
+    held = shows(0x03040000)
+    pilot.until(lambda m: held(m) and m.system_status == 4)  # asked by the supervisor: no failsafe
+    pilot.command(SET_MODE, 1, 4, 5)  # RTL, which ends the supervisor, too
+    pilot.until(shows(0x05040000))
 
 
 @pytest.mark.parametrize(
