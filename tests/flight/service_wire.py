@@ -147,7 +147,8 @@ class Wire:
                 if mode not in self.asked:
                     self.asked.clear()
             self.mode, self.changed_s = mode, time_s
-        if not self.pair.instance.idle:
+        unheard = self.pair.lost_down or self.pair.paused
+        if unheard or not self.pair.instance.idle:  # on the ground, as the service may know
             self._flying_s = time_s
         if not self.pair.instance.autopilot.plant.on_ground:
             self._off_ground_s = time_s
