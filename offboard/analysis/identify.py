@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from offboard.analysis.history import History
 from offboard.analysis.history import vehicle as vehicle_of
 from offboard.analysis.tlog import Tlog
-from offboard.flight.phases import PHASE_CODES, Phase
+from offboard.flight.phases import PHASE_CODES, TRACKING
 from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.trace import Trace, clean
 from offboard.identification.uncertainty import Estimate
@@ -26,7 +26,6 @@ from offboard.model.vehicle import AxisResponse, Vehicle
 
 Array = NDArray[np.float64]
 
-FLOWN = (Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.HOVER)
 LIFTED_OFF_S = 0.5  # the ground's effect on the thrust ends
 NOT_IDENTIFIED = "not identified: {sentence}"
 LINE_WIDTH = 80
@@ -64,7 +63,7 @@ def trace_of(log: Tlog, history: History) -> Trace:
 
 
 def _flown(history: History) -> tuple[float, float]:
-    indices = [PHASE_CODES[phase] for phase in FLOWN]
+    indices = [PHASE_CODES[phase] for phase in TRACKING]
     times = history.record_time_s[np.isin(history.records["phase"], indices)]
     return (times[0] + LIFTED_OFF_S, times[-1]) if len(times) else (-math.inf, math.inf)
 

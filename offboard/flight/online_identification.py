@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pydantic import Field
 
 from offboard.documents.parameters import Parameters
-from offboard.flight.phases import Phase
+from offboard.flight.phases import MOVING, Phase
 from offboard.identification.adoption import log_record
 from offboard.identification.attitude_fit import unexplained
 from offboard.identification.excitation import LENGTH_S, excited
@@ -42,7 +42,6 @@ DRAG_NEWS_PS = 0.03  # a smaller change of drag is not adopted
 # contradictions in a row the estimate is in doubt.
 COMPARE_EVERY_S, COMPARE_OVER_S, COMPARE_TIMES = 0.5, 2.0, 2
 LINK_DIGITS = 2  # of seconds: a smaller change of the link changes no bandwidth
-MOVING = (Phase.JOIN, Phase.TRACK)
 
 Work = Generator[None, None, None]
 

@@ -74,6 +74,7 @@ ENDS = frozenset({Phase.DISARMED, Phase.YIELDED, Phase.FAILED})
 WAITING = frozenset({Phase.CONNECT, Phase.HEALTH, Phase.STANDBY})
 BEFORE_FLIGHT = WAITING | {Phase.STREAM, Phase.ENGAGE, Phase.ARM}
 TRACKING = frozenset({Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.PAUSE, Phase.HOVER})
+MOVING = frozenset({Phase.JOIN, Phase.TRACK})  # along the reference
 # phases in which the ladder is stepped
 FLYING = TRACKING | {Phase.TAKEOFF, Phase.HAND_BACK, Phase.HOLD}
 STOPPED = "stop requested by the operator"

@@ -116,7 +116,7 @@ def service(then: Then, anchor: Anchor, *, arms: bool) -> Programme:
 
 def _in_service(row: Row) -> Row:
     """A stop hands back where `fly` lands; a pilot who takes the vehicle is the usual end."""
-    if row.guard is guards.stop_requested and row.source in (*STOPPABLE, Phase.PAUSE):
+    if row.guard is guards.stop_requested and row.source in TRACKING:
         return replace(row, target=Phase.HAND_BACK, exit_code=FLOWN)
     if row.guard is guards.lost and row.source in TRACKING:
         return replace(row, exit_code=FLOWN)

@@ -10,10 +10,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import Enum, IntEnum
 
-from offboard.flight.phases import TRACKING, Phase
+from offboard.flight.phases import MOVING, TRACKING, Phase
 
 START, PAUSE_CONTINUE, SET_MODE = 300, 193, 176  # MAV_CMD
-MOVING = (Phase.JOIN, Phase.TRACK)
 BEGINNING = (Phase.STREAM, Phase.ENGAGE, Phase.ARM, Phase.TAKEOFF)
 ENDING = (Phase.HAND_BACK, Phase.HOLD)
 
