@@ -121,11 +121,12 @@ def tcp_stream(connection: socket.socket, host: str) -> Stream:
 
 
 def open_port(device: str, baud: int) -> Stream:
-    """Open a serial port with pyserial. Raises LinkUnavailable."""
+    """Open a serial port with pyserial, for this process and its supervisor alone: of two readers
+    each would get a part of the bytes. Raises LinkUnavailable."""
     import serial
 
     try:
-        port = serial.Serial(device, baud, timeout=0)
+        port = serial.Serial(device, baud, timeout=0, exclusive=True)
     except (serial.SerialException, ValueError, OverflowError) as error:
         raise LinkUnavailable(
             f"serial port {device} at {baud} baud cannot be opened: {error}"

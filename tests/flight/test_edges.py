@@ -21,7 +21,7 @@ from offboard.flight.phases import Phase
 from offboard.io import clock
 from offboard.io import log as log_module
 from offboard.io.connection import open_link
-from offboard.io.link import Chunk, Link, Strangers
+from offboard.io.link import Chunk, Link, LinkUnavailable, Strangers
 from offboard.io.log import FlightLog
 from offboard.io.stop import StopRequests
 from offboard.mavlink.counters import Counters
@@ -364,6 +364,19 @@ def test_a_full_stream_does_not_block_and_sends_the_newest_setpoint(
     assert len(numbers) < count  # queued ones were replaced
     assert numbers[-2] < count - 1  # by the last one
     assert frames[-2].raw == heartbeat
+
+
+def test_a_serial_port_is_opened_once() -> None:
+    """Two readers would each get a part of the telemetry."""
+    ours, theirs = pty.openpty()
+    address = f"serial:{os.ttyname(theirs)}:57600"
+    link = open_link(address)
+    with pytest.raises(LinkUnavailable, match="exclusively lock"):
+        open_link(address)
+    link.close()
+    open_link(address).close()
+    os.close(ours)
+    os.close(theirs)
 
 
 def test_an_unplugged_serial_link_is_silent() -> None:
