@@ -54,6 +54,12 @@ TEXT_BOXES = """() => [...document.querySelectorAll(".figure")].map((figure) => 
                            box.right - frame.left, box.bottom - frame.top]);
   return [figure.id, frame.width, frame.height, boxes];
 })"""
+# Nothing has moved since the poll before: plotly draws margins and legend in several passes
+SETTLED = f"""() => {{
+  const [before, now] = [window.textBoxes, JSON.stringify(({TEXT_BOXES})())];
+  window.textBoxes = now;
+  return before === now;
+}}"""
 TOUCHING_PX = 3  # boxes of neighbouring lines of text overlap by this much at most
 
 
@@ -91,6 +97,7 @@ class Opened:
         """Change the width of the window, without a reload."""
         self.page.set_viewport_size({"width": width, "height": 900})
         self.page.wait_for_function(DRAWN, arg=self._scheme, timeout=60_000)
+        self.page.wait_for_function(SETTLED, polling=300, timeout=60_000)
 
     def unreadable(self) -> list[str]:
         """Texts on a background of the other colour scheme, or with a contrast below 4.5, the
