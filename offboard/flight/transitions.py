@@ -137,7 +137,8 @@ TRANSITIONS: tuple[Row, ...] = (
         guards.too_late_at_start,
         Phase.LAND,
         "the start of the reference was not reached: {position_error_m:.1f} m away, "
-        "{late_s:.0f} s late",
+        "{late_s:.0f} s late; is hover_thrust in the vehicle file right, and is the vehicle fast "
+        "enough for controller.bandwidth_radps?",
         ABORTED,
     ),
     *flying_rows(Phase.EXCITE),
