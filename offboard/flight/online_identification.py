@@ -24,6 +24,7 @@ from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import OUT_OF_BOUNDS, VehicleEstimate
 from offboard.identification.vehicle_fit import (
     identify_drag,
+    identify_hover,
     identify_in_pieces,
     identify_tilt,
 )
@@ -35,6 +36,7 @@ LIFTED_OFF_S = 0.5  # after this the ground has no effect on the thrust
 MOST_ROUNDS = 3  # of steps
 # Drag: when it is identified first, how often, and from how much flight.
 DRAG_FIRST_S, DRAG_EVERY_S, DRAG_OVER_S = 3.0, 0.5, 25.0
+HOVER_EVERY_S, HOVER_OVER_S = 1.0, 6.0  # hover thrust: how often, and from how much flight
 # Tilt: identified again while its delay is in doubt or its sd is greater than this.
 WELL_KNOWN_S, TILT_EVERY_S, TILT_OVER_S = 0.004, 2.0, 12.0
 DRAG_NEWS_PS = 0.03  # a smaller change of drag is not adopted
@@ -129,7 +131,7 @@ class OnlineIdentification:
         self._time_s = 0.0
         self._climb_s = self._excite_s = self._moving_s = math.nan
         self._rounds = 1
-        self._drag_at_s = self._tilt_at_s = self._compared_at_s = -math.inf
+        self._drag_at_s = self._tilt_at_s = self._compared_at_s = self._hover_at_s = -math.inf
         self._in_doubt_from_s = -math.inf
         self._contradictions = 0  # in a row
         self._identified = self._recalled is not None
@@ -303,6 +305,8 @@ class OnlineIdentification:
         moved = time_s >= self._moving_s + DRAG_FIRST_S and not estimate.in_doubt
         if moved and self._is_due(self._drag_at_s, DRAG_EVERY_S):
             return self._identify_drag()
+        if not estimate.in_doubt and self._is_due(self._hover_at_s, HOVER_EVERY_S):
+            return self._identify_hover()
         return None
 
     def _is_due(self, last_s: float, every_s: float) -> bool:
@@ -343,6 +347,18 @@ class OnlineIdentification:
         found = identify_drag(trace, self._estimate.target)
         if self._estimate.is_new_drag(found.drag_ps, DRAG_NEWS_PS):
             self._sentences += self._estimate.adopt(found, self._time_s)
+            self._record = log_record(found)
+        yield
+
+    def _identify_hover(self) -> Work:
+        """Follow the hover thrust, which a load or an empty battery changes."""
+        self._hover_at_s = self._time_s
+        begin_s = max(self._time_s - HOVER_OVER_S, self._in_doubt_from_s)
+        trace = self._recorder.trace(begin_s, self._time_s)
+        found = identify_hover(trace, self._estimate.target)
+        sentences = self._estimate.review_hover(found, self._time_s)
+        if sentences:
+            self._sentences += sentences
             self._record = log_record(found)
         yield
 

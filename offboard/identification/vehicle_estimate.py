@@ -43,6 +43,9 @@ MOST_CONTRADICTIONS, CALM_S = 2, 20.0
 # Delay and lag of the thrust that are less certain than this would cost too much bandwidth
 THRUST_SD_S = 0.02
 LINKED = ("yaw", "thrust_delay_s")  # changed with the tilt's delay where not identified themselves
+# A later hover thrust that differs by less, as a share and in sds, is not adopted: gusts of 1 m/s
+# move it by 6 %
+HOVER_NEWS, HOVER_SDS = 0.06, 3.0
 NOTICEABLE_RADPS = 1.0  # a smaller change for a later link is not announced
 OUT_OF_BOUNDS = "it is out of bounds"
 
@@ -85,6 +88,7 @@ class VehicleEstimate:
         self._blend_began_s = -math.inf
         self._rejected_drag_ps = math.inf
         self._other_delay: Estimate | None = None  # seen once, contradicts the one in use
+        self._other_hover = False  # seen once, differs from the one in use
         self._contradictions = 0
         self._calm_from_s = -math.inf  # since the last contradiction
         self.delay: Estimate | None = None  # of the tilt, once identified
@@ -209,6 +213,18 @@ class VehicleEstimate:
             return False
         known = (self.target.drag_per_mass_ps, self._rejected_drag_ps)
         return all(abs(drag.value - each) > max(least_ps, drag.sd) for each in known)
+
+    def review_hover(self, found: Identified, time_s: float) -> list[str]:
+        """Adopt a later hover thrust if it and the one before it differ from the one in use: the
+        mass or the battery has changed."""
+        hover, known = found.hover_thrust, self.target.hover_thrust
+        seen_before, self._other_hover = self._other_hover, False
+        if hover is None or within_bounds(found, self._file, self._factor)[1]:
+            return []
+        if abs(hover.value - known) <= max(HOVER_NEWS * known, HOVER_SDS * hover.sd):
+            return []
+        self._other_hover = not seen_before
+        return self.adopt(found, time_s) if seen_before else []
 
     def review_tilt(self, found: Identified, now: Unexplained, time_s: float) -> list[str]:
         """Compare a later fit of the tilt with the estimate, and adopt it if it is better. `now`

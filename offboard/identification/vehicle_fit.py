@@ -23,6 +23,7 @@ from offboard.identification.motion_fit import (
     VerticalFit,
     VerticalPrior,
     fit_drag,
+    fit_hover,
     fit_vertical,
 )
 from offboard.identification.trace import Trace
@@ -180,6 +181,15 @@ def identify_drag(trace: Trace, vehicle: Vehicle) -> Identified:
         fit = fit_drag(motion, vehicle.thrust_max_mps2 * thrust, vehicle.drag_per_mass_ps)
         drag = _accepted_drag(fit, refusals)
     return Identified(seconds, drag_ps=drag, refusals=refusals)
+
+
+def identify_hover(trace: Trace, vehicle: Vehicle) -> Identified:
+    """The hover thrust alone, given the other constants of `vehicle`."""
+    seconds = _seconds(trace)
+    if seconds < LEAST_SECONDS or not (motion := Motion(trace, DRAG_SPACING_S)).sufficient:
+        return Identified(seconds, refusals={"hover_thrust": "too few positions and commands"})
+    hover = fit_hover(motion, vehicle)
+    return Identified(seconds, hover_thrust=hover if math.isfinite(hover.sd) else None)
 
 
 def _seconds(trace: Trace) -> float:

@@ -16,7 +16,7 @@ from offboard.identification.motion_fit import Motion, Noise, PositionFilter, pr
 from offboard.identification.response import first_order, linear_recursion, second_order
 from offboard.identification.trace import Recorder, Trace, clean
 from offboard.identification.uncertainty import Estimate, long_run_covariance
-from offboard.identification.vehicle_fit import Identified, completed, identify
+from offboard.identification.vehicle_fit import Identified, completed, identify, identify_hover
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 G = 9.80665
@@ -280,6 +280,29 @@ def flown(
         np.column_stack((grid, position, velocity)),
     )
     return whole.between(0.5, seconds)  # what was commanded before is known
+
+
+@pytest.mark.parametrize("believed", [0.35, 0.5, 0.7])
+def test_hover_thrust_alone_is_identified_from_six_seconds(believed):
+    """It is 0.5, whatever was believed; the other constants are those of the vehicle."""
+    known = VEHICLE_FILE.model_copy(
+        update={
+            "hover_thrust": believed,
+            "thrust_delay_s": 0.02,
+            "thrust_lag_s": 0.05,
+            "drag_translation_npmps": (0.8 * VEHICLE_FILE.mass_kg,) * 3,
+        }
+    )
+    found = identify_hover(flown(noise=0.001).between(5.0, 11.0), known).hover_thrust
+    assert found is not None
+    assert found.value == pytest.approx(0.5, abs=max(0.002, 3.0 * found.sd))
+    assert found.sd < 0.01
+
+
+def test_hover_thrust_alone_needs_positions_and_commands():
+    found = identify_hover(flown().between(6.0, 7.0), VEHICLE_FILE)
+    assert found.hover_thrust is None
+    assert found.refusals["hover_thrust"] == "too few positions and commands"
 
 
 @pytest.mark.parametrize("noise", [0.0, 0.001])
