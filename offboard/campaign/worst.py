@@ -10,7 +10,7 @@ All flights go through the folder of results, so that a search that was interrup
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -62,14 +62,14 @@ class FailureSearch:
 
     def find(self, count: int) -> list[Failure]:
         """The `count` worst failures that differ. Raises what `Evaluator.fly` raises."""
-        points = list(self._searched())
+        found = self._candidates(list(self._searched()), CANDIDATES * count)
+        candidates = [point for point, _ in found]
         failures: dict[tuple[str, tuple[str, ...]], Failure] = {}
-        for point, _ in self._candidates(points, CANDIDATES * count):
-            failure = self._reduced(point)
-            failures.setdefault(failure.kind, failure)
-            if len(failures) == count:
-                break
-        return [self._at_seeds(failure) for failure in failures.values()]
+        while candidates and len(failures) < count:
+            together, candidates = candidates[:count], candidates[count:]
+            for failure in self._reduced(together):
+                failures.setdefault(failure.kind, failure)
+        return self._at_seeds(list(failures.values())[:count])
 
     def flights_most(self, count: int) -> int:
         """The flights that `find` takes at most, unless it meets failures of the same kind."""
@@ -120,10 +120,26 @@ class FailureSearch:
                 chosen.append((point, record))
         return chosen
 
-    # --- one failure ---
+    # --- failures ---
 
-    def _reduced(self, point: Array) -> Failure:
-        """Return values to their defaults, those that are nearest to them first."""
+    def _reduced(self, points: Sequence[Array]) -> list[Failure]:
+        """The failures at `points`, reduced side by side: one flight of each at a time."""
+        reductions = [self._reduction(point) for point in points]
+        cases = [next(reduction) for reduction in reductions]
+        failures: dict[int, Failure] = {}
+        while len(failures) < len(points):
+            active = [at for at in range(len(points)) if at not in failures]
+            records = self._evaluator.fly([cases[at] for at in active])
+            for at, record in zip(active, records, strict=True):
+                try:
+                    cases[at] = reductions[at].send(record)
+                except StopIteration as done:
+                    failures[at] = done.value
+        return [failures[at] for at in range(len(points))]
+
+    def _reduction(self, point: Array) -> Generator[Case, Record, Failure]:
+        """Return values to their defaults, those that are nearest to them first. Yields the case to
+        fly next, and takes its record."""
         chosen = dict(self._values(point))
         defaults = self._defaults()
         scale = {key: high - low for key, (low, high) in self._search.ranges.items()}
@@ -131,23 +147,33 @@ class FailureSearch:
         def change(key: str) -> float:
             return float(abs(chosen[key] - defaults[key]) / scale[key])
 
-        record = self._evaluator.fly([self._case_of(chosen)])[0]
+        record = yield self._case_of(chosen)
         for key in sorted(chosen, key=change):
             trial = {**chosen, key: defaults[key]}
-            (shorter,) = self._evaluator.fly([self._case_of(trial)])
+            shorter = yield self._case_of(trial)
             if shorter.margin < 0.0:
                 chosen, record = trial, shorter
         changed = tuple((key, v) for key, v in chosen.items() if v != defaults[key])
         return Failure(self._case_of(chosen), record, changed, 0, 0)
 
-    def _at_seeds(self, failure: Failure) -> Failure:
-        seed = failure.case.seed
-        cases = [
-            replace(failure.case, seed=seed + more) for more in range(1, self._search.seeds + 1)
+    def _at_seeds(self, failures: Sequence[Failure]) -> list[Failure]:
+        """The failures, each flown at `seeds` more seeds."""
+        seeds = self._search.seeds
+        records = self._evaluator.fly(
+            [
+                replace(each.case, seed=each.case.seed + more)
+                for each in failures
+                for more in range(1, seeds + 1)
+            ]
+        )
+        return [
+            replace(
+                failure,
+                failing=sum(r.margin < 0.0 for r in records[at * seeds : (at + 1) * seeds]),
+                seeds=seeds,
+            )
+            for at, failure in enumerate(failures)
         ]
-        records = self._evaluator.fly(cases)
-        failing = sum(record.margin < 0.0 for record in records)
-        return replace(failure, failing=failing, seeds=len(cases))
 
     # --- cases ---
 
