@@ -9,16 +9,17 @@ from numpy.typing import NDArray
 
 from offboard.analysis.history import History
 from offboard.flight.gate import Refusal
+from offboard.flight.phases import PHASE_CODES, Phase
 
 Array = NDArray[np.float64]
 _KEPT = (
     "lateness_s", "age_s", "solve_time_s", "gap", "spread", "at_bound", "cut_short",
-    "missed_ticks", "refused", "strangers", "hover_thrust",
+    "missed_ticks", "refused", "strangers", "hover_thrust", "thrust_mps2", "phase",
 )  # fmt: skip
 
 
 class Decisions:
-    """Call `add` with each stretch of a flight, then `figures`. Keeps 44 bytes of each record."""
+    """Call `add` with each stretch of a flight, then `figures`. Keeps 52 bytes of each record."""
 
     def __init__(self) -> None:
         self._portions: dict[str, list[NDArray[np.float32]]] = {name: [] for name in _KEPT}
@@ -45,6 +46,10 @@ class Decisions:
 
         late_ms, age_ms = 1e3 * known("lateness_s"), 1e3 * known("age_s")
         solve_ms, gap = 1e3 * known("solve_time_s"), known("gap")
+        # The gate, or a step, has changed a setpoint that has no certificate
+        changed = np.isnan(columns["at_bound"]) & np.isfinite(columns["thrust_mps2"])
+        limited = changed & (refused == 0) & (columns["phase"] != PHASE_CODES[Phase.EXCITE])
+        at_bound = np.where(limited, 1.0, columns["at_bound"])
         return {
             "decisions": float(len(refused)),
             "lateness_p99_ms": _percentile(late_ms, 99),
@@ -64,7 +69,7 @@ class Decisions:
             "gap_median": _percentile(gap, 50),
             "gap_max": _percentile(gap, 100),
             "spread_median": _percentile(known("spread"), 50),
-            "at_bound_share": _mean(known("at_bound")),
+            "at_bound_share": _mean(at_bound[np.isfinite(at_bound)]),
             "cut_short_share": _mean(known("cut_short")),
             "hover_thrust": float(columns["hover_thrust"][-1]),
         }

@@ -95,7 +95,7 @@ class Score:
     gap_median: float = _figure("cost above the exact optimum, median")
     gap_max: float = _figure("cost above the optimum, maximum")
     spread_median: float = _figure("epsilon of Eq. 29, median")
-    at_bound_share: float = _figure("share of decisions at a bound")
+    at_bound_share: float = _figure("share of decisions at a limit")
     cut_short_share: float = _figure("share of decisions cut by deadline")
     strangers: float = _figure("datagrams of other senders, and frames that signing refused")
     position_hz: float = _figure("LOCAL_POSITION_NED received", "Hz")

@@ -26,6 +26,8 @@ SECTIONS = {
     "delay_ms": "vehicle",
 }
 
+AT_LIMIT_SHARE = 0.2  # of the decisions, from which a summary says so
+
 
 def summary(score: Score, history: History, directory: Path) -> list[tuple[str, str]]:
     """(label, text) of what a person wants to know after a flight. Figures that the log does not
@@ -50,6 +52,9 @@ def summary(score: Score, history: History, directory: Path) -> list[tuple[str, 
                 f"{score.missed_ticks:.0f} of {score.decisions:.0f} ticks missed",
             )
         )
+    if score.at_bound_share >= AT_LIMIT_SHARE:
+        share = f"{100.0 * score.at_bound_share:.0f} % of the decisions"
+        rows.append(("at a limit", f"{share}: fly slower, or in less wind"))
     if score.strangers > 0:
         rows.append(
             ("ignored", f"{score.strangers:,.0f} datagrams of others or frames without signature")

@@ -10,7 +10,7 @@ margin is the least of them; it is at most `NOT_COMPLETED` for a flight that was
 | tilt | largest tilt while tracking | `tilt_deg` |
 | clearance | least true distance to the controller's keep-out volumes | `clearance_m` |
 | age | age of telemetry while tracking (link delay, 99th percentile) | `age_s` |
-| authority | share of decisions at a bound of the control law | `at_bound` |
+| authority | share of decisions at a limit of control law or vehicle | `at_bound` |
 | touchdown | downward speed at touch-down | `touchdown_mps` |
 """
 

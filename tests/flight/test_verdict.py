@@ -21,6 +21,7 @@ from typer.testing import CliRunner
 from offboard.analysis import history, tlog
 from offboard.analysis.history import History
 from offboard.analysis.score import Score, Scoring, score
+from offboard.analysis.score_table import summary
 from offboard.analysis.trial import judged
 from offboard.cli.commands import app
 from offboard.flight.companion import Outcome
@@ -45,6 +46,26 @@ def flight() -> Pair:
 @pytest.fixture(scope="module")
 def flown(flight: Pair, tmp_path_factory: pytest.TempPathFactory) -> History:
     return history.gather(flight.log(tmp_path_factory.mktemp("flown")))
+
+
+def test_decisions_at_the_tilt_limit_are_counted_and_reported(tmp_path: Path) -> None:
+    """The wind of `wind_light` needs more than 45 degrees of tilt, to which the gate turns back."""
+    pair = make(reference="lemniscate", vehicle="neutral", scenario="wind_light", seed=2)
+    assert pair.fly().exit_code == 0
+    flown = history.gather(pair.log(tmp_path))
+    down = thrust_direction_from_quaternion(flown.setpoint[:, 2:6])[:, 2]
+    limited = np.degrees(np.arccos(down)) > 44.9
+    assert limited.sum() > 20
+    scored = score(flown)
+    assert scored.at_bound_share >= limited.sum() / scored.decisions > 0.1
+    texts = dict(summary(scored, flown, tmp_path))
+    assert texts["at a limit"].endswith("% of the decisions: fly slower, or in less wind")
+
+
+def test_a_calm_flight_is_not_at_a_limit(flown: History, tmp_path: Path) -> None:
+    scored = score(flown)
+    assert scored.at_bound_share == 0.0
+    assert "at a limit" not in dict(summary(scored, flown, tmp_path))
 
 
 def test_a_whole_flight_is_completed(flown: History) -> None:
