@@ -165,6 +165,15 @@ ROWS = (
         "the battery holds {battery_percent:.0f} %",
     ),
     LadderRow(
+        "thrust reserve",
+        "normalised thrust that hovers now",
+        "limits.hover_thrust",
+        lambda now: now.hover_thrust > now.limits.hover_thrust,
+        2.0,
+        Rung.LAND,
+        "the vehicle needs {hover_thrust_percent:.0f} % of its thrust to hover (limits.hover_thrust)",
+    ),
+    LadderRow(
         "second sender",
         "another program sends setpoints or uses our ids on this link",
         "one frame",

@@ -123,6 +123,7 @@ class Limits(Parameters):
     position_error_m: float = Field(default=5.0, gt=0.1, le=100)
     position_jump_m: float = Field(default=2.0, gt=0.3, le=100)  # resets of the estimator in 10 s
     prediction_error_m: float = Field(default=2.0, gt=0.1, le=100)  # of the decision before
+    hover_thrust: float = Field(default=0.9, gt=0.05, le=1)  # normalised thrust that hovers
     tilt_rad: float = Field(default=1.3, gt=0.2, le=1.5)
     tilt_error_rad: float = Field(default=0.5, gt=0.1, le=3.2)  # from every recent command
     ceiling_m: float = Field(default=120.0, gt=0, le=10000)  # above the take-off point

@@ -29,6 +29,7 @@ from watch import (
     watched,
 )
 
+from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import ExitCode, Phase, Rung
 from simulator.config import Scenario
 
@@ -255,6 +256,26 @@ def test_an_empty_battery_ends_the_flight(fly: Fly) -> None:
     else:
         assert outcome.sentence.startswith("the battery holds 5 %")
         assert not pair.instance.autopilot.commander.armed
+
+
+@BOTH
+@pytest.mark.parametrize(("share", "flown"), [(0.8, True), (0.95, False)])
+def test_a_vehicle_without_thrust_reserve_is_landed(share: float, flown: bool, fly: Fly) -> None:
+    """Heavier than its file, it is identified; then a load in track, with which it hovers with this
+    share of its thrust."""
+    scale = float(np.sqrt(share / fly().companion.state.model.hover_thrust))
+    heavier = scenario_of(conditions={"mass_scale": scale})
+    pair = fly(HIGH, scenario=heavier, learning=IdentifySettings())
+    plant = pair.instance.autopilot.plant
+    pair.at.append((in_phase(Phase.TRACK, 1.0), lambda flying: plant.scale_mass(scale)))
+    outcome = pair.fly()
+    assert not pair.instance.autopilot.commander.armed
+    if flown:
+        assert outcome.exit_code == ExitCode.FLOWN
+    else:
+        assert outcome.exit_code == ExitCode.ABORTED
+        assert "of its thrust to hover (limits.hover_thrust)" in outcome.sentence
+        assert list(pair.rungs) == ["thrust reserve"]
 
 
 @BOTH
