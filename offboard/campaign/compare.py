@@ -54,10 +54,8 @@ def plan(
     changes: dict[str, Any] = {"settings": tuple(settings)}
     if vehicle:
         changes["scenario"] = CONNECTED
-    cases = [replace(case, **changes) for case in expand(file)]
-    checked: set[object] = set()
     first: dict[Path, Case] = {}
-    for case in cases:
+    for case in (replace(case, **changes) for case in expand(file)):
         stems = [Path(name).stem for name in _names(case)]
         folder = directory / "-".join((*stems, str(case.seed)))
         other = first.setdefault(folder, case)
@@ -66,6 +64,8 @@ def plan(
                 f"{_described(other)} and {_described(case)} would both be recorded in {folder}; "
                 "give files different names"
             )
+    checked: set[object] = set()
+    for folder, case in first.items():
         parts = {(case.controller, case.reference), case.scenario}
         if not parts <= checked:
             check_request(
@@ -140,16 +140,14 @@ def _line(job: Job, record: Record) -> str:
 def _claim(directory: Path) -> None:
     try:
         directory.mkdir(parents=True, exist_ok=True)
-        occupied = any(directory.iterdir())
-        if not occupied:
-            (directory / "compare.csv").touch()
+        if any(directory.iterdir()):
+            raise LogError(f"{directory} is not empty; choose another directory with --out")
+        (directory / "compare.csv").touch()
     except OSError as error:
         raise LogError(
             f"the comparison cannot be recorded in {directory}: {error.strerror}; "
             "choose a directory that can be written with --out"
         ) from None
-    if occupied:
-        raise LogError(f"{directory} is not empty; choose another directory with --out")
 
 
 def _missing(cases: Sequence[Case]) -> list[str]:

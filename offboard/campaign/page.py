@@ -47,7 +47,7 @@ CAMPAIGN = Contents(
     boxes=True,
 )
 COMPARISON = Contents(
-    "Controllers side by side",
+    "Comparison of controllers",
     {
         ERROR: ERROR_TITLE,
         "tilt_agitation_deg": "excess tilt<br>RMS [deg]",
@@ -125,7 +125,7 @@ def _figure(groups: Sequence[Group], contents: Contents) -> Figure:
         figure.update_xaxes(_axis(groups, name), title_text=title, side="top", row=1, col=column)
     headed = [(_label(line), isinstance(line, str)) for line in lines]
     listed(figure, headed, _ROW_PX, _TOP_PX)
-    return Figure(contents.title, figure, contents.caption, NARROWEST_PX)
+    return Figure("Side by side", figure, contents.caption, NARROWEST_PX)
 
 
 def _scenario(line: Group | str) -> str:
