@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 import json
+import math
 from collections.abc import Sequence
 from contextlib import AbstractContextManager, suppress
 from dataclasses import replace
@@ -133,7 +134,8 @@ def _described(case: Case) -> str:
 
 
 def _line(job: Job, record: Record) -> str:
-    end = f"{digits(record.figures[ERROR])} m" if record.completed else record.sentence
+    error_m = record.figures.get(ERROR, math.nan)
+    end = f"{digits(error_m)} m" if record.completed else record.sentence
     return f"{job.kept.name if job.kept else ''}: {end}"
 
 

@@ -63,11 +63,8 @@ def _name(group: Group) -> str:
 
 
 def _cells(group: Group, separator: str) -> list[Text]:
-    cells = [digits(group.spread(figure)[1]) for figure, _ in COLUMNS]
-    low, _, high = map(digits, group.spread(ERROR))
-    if low != high:
-        cells[0] += f"{separator}[{low}\N{EN DASH}{high}]"
-    return [Text(cell) for cell in cells]
+    medians = [digits(group.spread(figure)[1]) for figure, _ in COLUMNS[1:]]
+    return [Text(cell) for cell in (group.shown(ERROR).replace(" ", separator), *medians)]
 
 
 def numbered_seeds(seeds: Sequence[int]) -> str:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from offboard.analysis.trial import judged, keep_score, score_flight
+from offboard.analysis.flight_score import judged, keep_score, score_flight
 from offboard.campaign.cases import Case
 from offboard.campaign.code import code_hash
 from offboard.campaign.margin import NOT_FLOWN, Promises, terms

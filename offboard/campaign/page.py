@@ -54,18 +54,13 @@ COMPARISON = Contents(
         "rate_agitation_radps": "excess rates<br>RMS [rad/s]",
     },
     (
-        ERROR,
-        "max_position_m",
-        "rmse_truth_m",
-        "tilt_agitation_deg",
-        "rate_agitation_radps",
-        "rmse_course_deg",
-        "solve_time_p99_ms",
+        ERROR, "max_position_m", "rmse_truth_m", "tilt_agitation_deg", "rate_agitation_radps",
+        "rmse_course_deg", "solve_time_p99_ms",
     ),
     "lowest–highest",
     "Dot: median; line: range over the seeds. Excess: motion that the reference does not require "
     "of an ideal vehicle. Filled and bold: the best.",
-)
+)  # fmt: skip
 
 
 def page(

@@ -1,14 +1,17 @@
-"""One flight: scored and judged from its log, its score kept beside it."""
+"""The score of one flight: computed from its log, judged, and kept as JSON beside it."""
 
 from __future__ import annotations
 
+import json
 from contextlib import suppress
 from pathlib import Path
+from typing import Any
 
 from offboard.analysis import history, tlog
+from offboard.analysis.events import Event
 from offboard.analysis.history import History
 from offboard.analysis.score import Score, Scoring
-from offboard.analysis.score_json import as_text
+from offboard.documents.plain import plain
 from offboard.flight.companion import Outcome
 from offboard.flight.phases import ExitCode
 from offboard.io.log import LogError
@@ -50,3 +53,23 @@ def keep_score(directory: Path, score: Score, flown: History) -> None:
         with suppress(OSError):
             incomplete.unlink()
         raise LogError(f"{path} cannot be written ({error.strerror})") from None
+
+
+def as_text(score: Score, history: History) -> str:
+    """All figures, the events and the number of messages as JSON text; a figure that the log does
+    not hold is null."""
+    document = {
+        "ended_by": score.ended_by,
+        **score.figures(),
+        "phases": _events(history.phases),
+        "modes": _events(history.modes),
+        "vehicle_messages": _events(history.vehicle_messages),
+        "messages": dict(sorted(history.messages.items())),
+        "wall_s": history.wall_s,
+        "damage": history.damage,
+    }
+    return json.dumps(plain(document), indent=2, allow_nan=False) + "\n"
+
+
+def _events(events: tuple[Event, ...]) -> list[dict[str, Any]]:
+    return [{"time_s": event.time_s, "what": event.what} for event in events]
