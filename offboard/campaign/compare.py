@@ -89,21 +89,7 @@ def compare(
     the first flight, where `directory` cannot be written or is not empty.
     """
     _claim(directory)
-    ended: dict[Case, Record] = {}
-    stopped = ""
-    try:
-        with (
-            suppress(KeyboardInterrupt),
-            StopRequests() as stops,
-            Counter(console) as counter,
-            open_flyer as flyer,
-        ):
-            counter.count(0, len(jobs))
-            for job, record in flyer.fly(jobs, partial(counter.ending, stops)):
-                ended[job.case] = record
-                counter.count(len(ended), len(jobs), _line(job, record))
-    except UserError as error:
-        stopped = str(error)
+    ended, stopped = _flown(jobs, open_flyer, console)
     rows = [row_of(job.case, ended[job.case], ()) for job in jobs if job.case in ended]
     flown = marked(groups(rows, ends=WHOLE_RANGE))
     if flown:
@@ -123,6 +109,28 @@ def compare(
     if not unwritten:
         console.print(f"written: {directory / 'compare.html'}", markup=False, soft_wrap=True)
     return "; ".join([*problems, *unwritten])
+
+
+def _flown(
+    jobs: Sequence[Job], open_flyer: AbstractContextManager[Flyer], console: Console
+) -> tuple[dict[Case, Record], str]:
+    """The flights that have ended; and why the others were not flown, empty if by request."""
+    ended: dict[Case, Record] = {}
+    stopped = ""
+    try:
+        with (
+            suppress(KeyboardInterrupt),
+            StopRequests() as stops,
+            Counter(console) as counter,
+            open_flyer as flyer,
+        ):
+            counter.count(0, len(jobs))
+            for job, record in flyer.fly(jobs, partial(counter.ending, stops)):
+                ended[job.case] = record
+                counter.count(len(ended), len(jobs), _line(job, record))
+    except UserError as error:
+        stopped = str(error)
+    return ended, stopped
 
 
 def _names(case: Case) -> tuple[str, str, str]:

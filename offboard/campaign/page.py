@@ -159,10 +159,8 @@ def _axis(groups: Sequence[Group], name: str) -> dict[str, object]:
 def _dot(at: int, group: Group, name: str, colour: str) -> go.Scatter:
     """Success rate or median, with its interval or range."""
     low, middle, high = group.spread(name)
-    text = f"{group.name}, {group.scenario}: {group.shown(name)}"
-    if name == "success":
-        low, middle, high = group.low, group.successes / group.flights, group.high
-        text = f"{group.successes} of {group.flights}"
+    value = f"{group.successes} of {group.flights}" if name == "success" else group.shown(name)
+    text = f"{group.name}, {group.scenario}: {value}"
     return go.Scatter(
         mode="markers", x=coordinates([middle]), y=[at], hoverinfo="text", text=html.escape(text),
         marker={

@@ -65,7 +65,10 @@ class Group:
         return [r.figures[figure] for r in completed if figure in r.figures]
 
     def spread(self, figure: str) -> tuple[float, float, float]:
-        """Lower end of the range, median and upper end; NaN without values."""
+        """Lower end of the range, median and upper end; NaN without values. Of `success`: the rate
+        with its interval."""
+        if figure == "success":
+            return self.low, self.successes / self.flights, self.high
         values = self.values(figure)
         if not values:
             return math.nan, math.nan, math.nan
