@@ -30,10 +30,6 @@ from offboard.run.request import FlightRequest
 SCENARIO = "scenario."  # of a key of the scenario
 OWN_SCENARIOS = {"px4": "px4_like", "ardupilot": "ardupilot_like"}  # where a file names none
 FILES = ("config", "controller", "reference", "vehicle", "sim_vehicle", "scenario")
-_FOLDERS = {
-    "config": "", "controller": "controllers", "reference": "references",
-    "vehicle": "vehicles", "sim_vehicle": "vehicles", "scenario": "scenarios",
-}  # fmt: skip
 Values = tuple[tuple[str, Any], ...]
 
 
@@ -226,7 +222,7 @@ def _digests(case: Case) -> tuple[tuple[str, str], ...]:
             kind = {"config": "configuration", "sim_vehicle": "vehicle"}.get(part, part)
             laws = catalogue.names() if part == "controller" else ()
             if name not in laws:
-                shipped.locate(name, _FOLDERS[part], kind, laws)
+                shipped.locate(name, shipped.FOLDERS[kind], kind, laws)
     return tuple(found)
 
 

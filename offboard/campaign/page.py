@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import html
+import itertools
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -102,10 +103,8 @@ def described(row: Row) -> str:
 def _figure(groups: Sequence[Group], contents: Contents) -> Figure:
     """Panels side by side, one line per group, a heading above each scenario."""
     lines: list[Group | str] = []
-    for group in groups:
-        if not lines or group.scenario != _scenario(lines[-1]):
-            lines.append(group.scenario)
-        lines.append(group)
+    for scenario, block in itertools.groupby(groups, lambda group: group.scenario):
+        lines += [scenario, *block]
     figure = make_subplots(
         cols=len(contents.panels), shared_yaxes=True, horizontal_spacing=0.06,
         column_widths=[2 if name == ERROR else 1 for name in contents.panels],
@@ -121,10 +120,6 @@ def _figure(groups: Sequence[Group], contents: Contents) -> Figure:
     headed = [(_label(line), isinstance(line, str)) for line in lines]
     listed(figure, headed, _ROW_PX, _TOP_PX)
     return Figure("Side by side", figure, contents.caption, NARROWEST_PX)
-
-
-def _scenario(line: Group | str) -> str:
-    return line if isinstance(line, str) else line.scenario
 
 
 def _label(line: Group | str) -> str:
