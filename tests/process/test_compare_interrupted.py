@@ -36,6 +36,7 @@ def test_interrupted_it_keeps_what_landed(spawn: Spawn, tmp_path: Path) -> None:
     assert (row["controller"], row["failed"]) == ("lqr", "0")
     assert 1 <= flights <= 4
     assert f"interrupted: {SEEDS - flights} of {SEEDS} flights missing" in errors
+    assert "interrupted: flights in the air are finished" in output
     assert "not flown: hover, calm: lqr seed" in output
     assert "not flown" in (tmp_path / "x" / "compare.html").read_text(encoding="utf-8")
     kept = [path.parent for path in tmp_path.rglob("score.json")]
