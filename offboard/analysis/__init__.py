@@ -1,1 +1,1 @@
-"""Reads logs: score, identification, comparison, and their pages."""
+"""Reads logs: score, identification, and their pages."""

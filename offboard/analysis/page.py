@@ -1,6 +1,6 @@
 """HTML pages from Jinja2 templates: one self-contained file each, plotly.js inside, no network.
 
-A template is named by its path in this package: "analysis/templates/comparison.html". Templates
+A template is named by its path in this package: "campaign/templates/campaign.html". Templates
 extend "analysis/templates/page.html" and draw figures and notes with the macros of "parts.html".
 Values are escaped.
 """

@@ -88,16 +88,18 @@ def run_all(
 ) -> Generator[tuple[Job, Result | BaseException]]:
     """Do all jobs in `width` workers; yield each with its result, or its exception, when it ends.
 
-    `work` is called in a worker, so it must be picklable. When `ending` is true, no further job
-    begins. Every worker is an executor of its own: if it dies, its job yields BrokenExecutor and a
-    new worker replaces it.
+    `work` is called in a worker, so it must be picklable. `ending` is called every POLL_S; when it
+    is true, no further job begins. Every worker is an executor of its own: if it dies, its job
+    yields BrokenExecutor and a new worker replaces it.
     """
     waiting = deque(jobs)
     with ExitStack() as stack:
         idle = [stack.enter_context(open_worker()) for _ in range(min(width, len(jobs)))]
         busy: dict[Future[Result], tuple[Job, Executor]] = {}
-        while busy or (waiting and not ending()):
-            while idle and waiting and not ending():
+        while busy or waiting:
+            if ending():
+                waiting.clear()
+            while idle and waiting:
                 job, worker = waiting.popleft(), idle.pop()
                 busy[worker.submit(work, job)] = job, worker
             for done in wait(busy, POLL_S, FIRST_COMPLETED).done:

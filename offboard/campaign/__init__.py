@@ -1,1 +1,1 @@
-"""Many flights on the bundled simulator: campaigns, searches for failures, tuning."""
+"""Many flights, most on the bundled simulator: campaigns, comparisons, searches, tuning."""

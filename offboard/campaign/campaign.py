@@ -17,13 +17,14 @@ from offboard.campaign.code import code_hash
 from offboard.campaign.document import CampaignFile
 from offboard.campaign.execution import Workers
 from offboard.campaign.flight import Job
-from offboard.campaign.page import page
+from offboard.campaign.page import CAMPAIGN, page
 from offboard.campaign.results import Results
 from offboard.campaign.statistics import groups
 from offboard.campaign.table import Row, as_csv, as_parquet, columns, row_of
-from offboard.documents.errors import DocumentError, UserError
+from offboard.documents.errors import DocumentError, UserError, naming
 from offboard.run.configuration import build_controller, build_track
 from offboard.run.in_memory import check_scenario_text
+from offboard.run.request import FlightRequest
 
 OpenWorkers = Callable[[], AbstractContextManager[Workers]]
 KEPT = "flights"
@@ -74,8 +75,9 @@ class Campaign:
     def __init__(self, file: CampaignFile, source: str, directory: Path) -> None:
         self.file = file
         self.directory = directory
-        self.cases = expand(file, source)
-        check(self.cases, source)
+        with naming(source):
+            self.cases = expand(file)
+            check(self.cases)
         self.results = Results(directory, code_hash())
         self._requirements = [Requirement.parse(text) for text in file.require]
 
@@ -146,7 +148,7 @@ class Campaign:
         absent = len(self.cases) - len(rows)
         missing = [f"{absent} of {len(self.cases)} flights are not flown yet"] if absent else []
         drawn = frozenset(self.file.sample.ranges if self.file.sample else ())
-        text = page(groups(rows, drawn), missing, self._kept(rows))
+        text = page(groups(rows, drawn), CAMPAIGN, missing, self._kept(rows))
         write(self.directory / "campaign.html", text.encode())
         return [NO_PARQUET] if parquet is None else []
 
@@ -181,7 +183,7 @@ class Campaign:
         }
 
 
-def check(cases: Sequence[Case], source: str) -> None:
+def check(cases: Sequence[Case]) -> None:
     """Raise DocumentError if none of the cases can be flown, with what is wrong. A single one that
     cannot is no error: it becomes a row with its reason."""
     distinct: dict[object, Case] = {}
@@ -194,15 +196,20 @@ def check(cases: Sequence[Case], source: str) -> None:
         try:
             _check_one(case)
         except DocumentError as error:
-            problems.append(str(error))
+            problems += error.problems
         else:
             return
-    raise DocumentError(*(f"{source}: {problem}" for problem in dict.fromkeys(problems)))
+    raise DocumentError(*dict.fromkeys(problems))
 
 
 def _check_one(case: Case) -> None:
-    config = case.request(Path(), None if case.text else case.scenario).resolve()
     if case.text:
         check_scenario_text(case.text, f"scenario {case.scenario}")
+    check_request(case.request(Path(), None if case.text else case.scenario))
+
+
+def check_request(request: FlightRequest) -> None:
+    """Raise DocumentError, with what is wrong, if a flight cannot be flown."""
+    config = request.resolve()
     build_track(config)
     build_controller(config)

@@ -11,7 +11,7 @@ import json
 import math
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -30,10 +30,6 @@ from offboard.run.request import FlightRequest
 SCENARIO = "scenario."  # of a key of the scenario
 OWN_SCENARIOS = {"px4": "px4_like", "ardupilot": "ardupilot_like"}  # where a file names none
 FILES = ("config", "controller", "reference", "vehicle", "sim_vehicle", "scenario")
-_FOLDERS = {
-    "config": "", "controller": "controllers", "reference": "references",
-    "vehicle": "vehicles", "sim_vehicle": "vehicles", "scenario": "scenarios",
-}  # fmt: skip
 Values = tuple[tuple[str, Any], ...]
 
 
@@ -42,7 +38,8 @@ class Case:
     """One flight of a campaign. None: the default of `config`, or of the firmware.
 
     `values` are what parameters and draws set, by key; `text` is the YAML of a scenario that is not
-    a file; `files` holds a hash of every file that is not shipped.
+    a file; `files` holds a hash of every file that is not shipped; `settings` are `key.path=value`
+    of --set, applied before `values`.
     """
 
     config: str
@@ -55,7 +52,8 @@ class Case:
     seed: int
     values: Values = ()
     text: str = ""
-    files: tuple[tuple[str, str], ...] = field(default=())
+    files: tuple[tuple[str, str], ...] = ()
+    settings: tuple[str, ...] = ()
 
     @property
     def key(self) -> str:
@@ -66,11 +64,12 @@ class Case:
     @property
     def assignments(self) -> tuple[str, ...]:
         """What `--set` sets."""
-        return tuple(
+        values = (
             f"{key}={json.dumps(value)}"
             for key, value in self.values
             if not key.startswith(SCENARIO)
         )
+        return (*self.settings, *values)
 
     @property
     def scenario_file(self) -> str:
@@ -124,26 +123,26 @@ class Case:
         return replace(self, values=values, text=text)
 
 
-def expand(file: CampaignFile, source: str) -> list[Case]:
+def expand(file: CampaignFile) -> list[Case]:
     """All cases of a campaign, in the order of its table. Raises DocumentError."""
     size = _size(file)
     if size > CASES_MOST:
-        raise DocumentError(f"{source}: {size:,} flights; at most {CASES_MOST:,}")
+        raise DocumentError(f"{size:,} flights; at most {CASES_MOST:,}")
     draws = drawn(file.sample) if file.sample else [()]
     cases: list[Case] = []
-    for case, grid in itertools.product(base_cases(file, source), _grid(file.parameters)):
+    for case, grid in itertools.product(base_cases(file), _grid(file.parameters)):
         for draw in draws:
             flown = case.with_values((*grid, *draw)) if grid or draw else case
             cases += [replace(flown, seed=seed) for seed in file.seed_values]
     if len({case.key for case in cases}) < len(cases):
-        raise DocumentError(f"{source}: a combination is given twice; give each value once")
+        raise DocumentError("a combination is given twice; give each value once")
     return cases
 
 
-def base_cases(file: CampaignFile, source: str) -> Iterator[Case]:
+def base_cases(file: CampaignFile) -> Iterator[Case]:
     """Every combination of names, without parameters, with the first seed."""
     for firmware in file.firmwares:
-        scenarios = file.scenarios or (_own_scenario(firmware, source),)
+        scenarios = file.scenarios or (_own_scenario(firmware),)
         for reference, scenario, controller, vehicle, sim_vehicle in itertools.product(
             file.references or (None,),
             scenarios,
@@ -163,16 +162,13 @@ def base_cases(file: CampaignFile, source: str) -> Iterator[Case]:
                 seed=file.seed_values[0],
                 text=yaml.safe_dump(scenario, sort_keys=False) if inline else "",
             )
-            try:
-                yield replace(case, files=_digests(case))
-            except DocumentError as error:
-                raise DocumentError(*(f"{source}: {each}" for each in error.problems)) from None
+            yield replace(case, files=_digests(case))
 
 
-def _own_scenario(firmware: str, source: str) -> str:
+def _own_scenario(firmware: str) -> str:
     if firmware not in OWN_SCENARIOS:
         known = ", ".join(OWN_SCENARIOS)
-        raise DocumentError(f"{source}: firmwares: {firmware!r} is not one of {known}")
+        raise DocumentError(f"firmwares: {firmware!r} is not one of {known}")
     return OWN_SCENARIOS[firmware]
 
 
@@ -226,7 +222,7 @@ def _digests(case: Case) -> tuple[tuple[str, str], ...]:
             kind = {"config": "configuration", "sim_vehicle": "vehicle"}.get(part, part)
             laws = catalogue.names() if part == "controller" else ()
             if name not in laws:
-                shipped.locate(name, _FOLDERS[part], kind, laws)
+                shipped.locate(name, shipped.FOLDERS[kind], kind, laws)
     return tuple(found)
 
 

@@ -1,29 +1,44 @@
-"""Where flights are flown: worker processes of this computer, or a dask cluster by its address.
+"""Where flights are flown: worker processes of this computer, a dask cluster by its address, or one
+vehicle at a link.
 
-Both are executors of `concurrent.futures`. A worker loads its code once and stays.
+The first two are executors of `concurrent.futures`. A worker loads its code once and stays.
 """
 
 from __future__ import annotations
 
 import os
+import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Protocol
 
 from offboard.analysis.workers import open_worker, processors, run_all
-from offboard.campaign.flight import Job, fly_job
+from offboard.campaign.cases import Case
+from offboard.campaign.flight import Job, fly_job, recorded
 from offboard.campaign.margin import NOT_FLOWN
 from offboard.campaign.results import Record
 from offboard.documents.errors import UserError
+from offboard.flight.companion import STOPPED
 from offboard.flight.phases import ExitCode
+from offboard.run.request import FlightRequest, fly_request
 
 CONNECT_S = 10.0
 QUEUED = 2  # flights per thread of a cluster, so that none waits for us
 DIED = Record(
     ExitCode.ABORTED, "the process that flew it ended, twice", NOT_FLOWN, "crash"
 )  # as its worker cannot tell
+
+
+class Flyer(Protocol):
+    """Flies jobs and yields each with its record when it ends; when `ending` is true, no further
+    flight begins. Raises UserError; what has not ended is then lost."""
+
+    def fly(
+        self, jobs: Sequence[Job], ending: Callable[[], bool]
+    ) -> Iterator[tuple[Job, Record]]: ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,15 +50,14 @@ class Workers:
     check: Callable[[], None] = lambda: None
 
     def fly(self, jobs: Sequence[Job], ending: Callable[[], bool]) -> Iterator[tuple[Job, Record]]:
-        """Fly jobs and yield each with its record when it ends, in any order.
-
-        A flight whose worker dies is flown a second time; if that worker dies too, `DIED` is its
-        record. Raises UserError; what has not ended is then lost.
-        """
+        """Fly jobs, as a `Flyer` does, in any order. A flight whose worker dies is flown a second
+        time; if that worker dies too, `DIED` is its record."""
         again: list[Job] = []
         for job, result in self._run(jobs, ending):
             if isinstance(result, BrokenExecutor):
                 again.append(job)
+                if job.kept:
+                    shutil.rmtree(job.kept, ignore_errors=True)  # the log of that worker
             else:
                 yield job, _record_of(result)
         for job, result in self._run(again, ending):
@@ -75,6 +89,52 @@ def _record_of(result: Record | BaseException) -> Record:
     if isinstance(result, BaseException):
         raise result
     return result
+
+
+@dataclass(frozen=True, slots=True)
+class ConnectedVehicle:
+    """The vehicle at a link, a real one perhaps. Its flights follow each other in this process;
+    after one that was refused, aborted or ended by the pilot, nothing more is flown. Each keeps its
+    log."""
+
+    connection: str
+    system_id: int | None = None
+    signing_key: Path | None = None
+
+    def request(self, case: Case, directory: Path) -> FlightRequest:
+        """The flight of a case. Unless the case sets limits.begin_armed, an armed vehicle is
+        refused: somebody else is flying it."""
+        request = case.request(directory)
+        return replace(
+            request,
+            sitl=False,
+            assignments=("limits.begin_armed=false", *request.assignments),
+            connection=self.connection,
+            system_id=self.system_id,
+            signing_key=self.signing_key,
+        )
+
+    def fly(self, jobs: Sequence[Job], ending: Callable[[], bool]) -> Iterator[tuple[Job, Record]]:
+        """Fly jobs, as a `Flyer` does, without one that the operator stops. Raises UserError where
+        a flight is the last one, though more were planned."""
+        for job in jobs:
+            if ending():
+                return
+            record = self._record(job)
+            if record.sentence.startswith(STOPPED):
+                return  # the flight received the interrupt
+            yield job, record
+            if record.exit_code in (ExitCode.REFUSED, ExitCode.ABORTED):
+                case = job.case
+                raise UserError(
+                    f"ended with {case.controller} on {case.reference}, seed {case.seed} "
+                    f"({record.sentence})"
+                )
+
+    def _record(self, job: Job) -> Record:
+        assert job.kept is not None
+        request = self.request(job.case, job.kept)
+        return recorded(request, job.promises, lambda config, directory: fly_request(request))
 
 
 @contextmanager

@@ -1,17 +1,19 @@
 """One case flown in a worker: in memory, in lockstep, scored from its log.
 
-The flight is that of `offboard fly --sitl` with the same options, byte for byte.
+The flight is that of `offboard fly --sitl` with the same options, byte for byte. A record of any
+other flight is made in the same way (`recorded`).
 """
 
 from __future__ import annotations
 
+import math
 import tempfile
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
-from offboard.analysis.history import History
-from offboard.analysis.score import Score
-from offboard.analysis.trial import judged, keep_score, score_flight
+from offboard.analysis.flight_score import judged, keep_score, score_flight
 from offboard.campaign.cases import Case
 from offboard.campaign.code import code_hash
 from offboard.campaign.margin import NOT_FLOWN, Promises, terms
@@ -24,16 +26,7 @@ from offboard.io.stop import StopRequests
 from offboard.run.configuration import FlightConfig, dump
 from offboard.run.in_memory import InMemorySimulator
 from offboard.run.one_flight import Bundled, fly
-from offboard.run.request import build_parts
-
-# figures that this computer's clock decides: they differ between two runs of one flight
-WALL_TIMES = (
-    "setpoint_gap_wall_max_s",
-    "lateness_p99_ms",
-    "lateness_max_ms",
-    "solve_time_p50_ms",
-    "solve_time_p99_ms",
-)
+from offboard.run.request import FlightRequest, build_parts
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,37 +49,56 @@ def fly_job(job: Job) -> Record:
         )
     try:
         with tempfile.TemporaryDirectory(prefix="offboard-") as scratch:
-            return _flown(job, Path(scratch))
-    except (OSError, MemoryError) as error:
+            directory = job.kept or Path(scratch) / "flight"
+            record = recorded(
+                job.case.request(directory), job.promises, partial(_fly, job.case, Path(scratch))
+            )
+            return replace(record, sentence=record.sentence.replace(f"{scratch}/", ""))
+    except (OSError, MemoryError, LogError) as error:
         raise UserError(f"a worker cannot go on: {error}") from None
 
 
-def _flown(job: Job, scratch: Path) -> Record:
-    directory = job.kept or scratch / "flight"
+def recorded(
+    request: FlightRequest, promises: Promises, fly: Callable[[FlightConfig, Path], Outcome]
+) -> Record:
+    """The record of a flight from its log, with score.json beside the log.
+
+    `fly` flies the configuration and logs it in the directory. A flight that fails is a record too.
+    Raises LogError where it cannot be recorded.
+    """
     try:
-        config, outcome = _fly(job.case, scratch, directory)
-        score, history = score_flight(directory)
-    except LogError as error:
-        raise UserError(f"a worker cannot go on: {error}") from None
+        config = request.resolve()
+        outcome = fly(config, request.directory)
+        score, history = score_flight(request.directory)
+    except LogError:
+        raise
     except UserError as error:
-        sentence = " ".join(str(error).split()).replace(f"{scratch}/", "")
+        sentence = " ".join(str(error).split())
         return Record(ExitCode.USAGE, sentence, NOT_FLOWN, "infeasible")
     except Exception as error:
         sentence = f"{type(error).__name__}: {error}"
         return Record(ExitCode.ABORTED, sentence, NOT_FLOWN, "crash")
-    if job.kept:
-        keep_score(job.kept, score, history)
-    return _record(job.promises, config, judged(outcome, score), score, history)
+    keep_score(request.directory, score, history)
+    outcome, figures = judged(outcome, score), score.figures()
+    margins = terms(promises, figures, history, config.controller)
+    weakest = min(margins, key=lambda name: margins[name])
+    return Record(
+        outcome.exit_code,
+        outcome.sentence,
+        margins[weakest],
+        weakest,
+        {name: value for name, value in figures.items() if math.isfinite(value)},
+        margins,
+    )
 
 
-def _fly(case: Case, scratch: Path, directory: Path) -> tuple[FlightConfig, Outcome]:
+def _fly(case: Case, scratch: Path, config: FlightConfig, directory: Path) -> Outcome:
     scenario = case.scenario
     if case.text:
         path = scratch / case.scenario_file
         path.parent.mkdir()
         path.write_text(case.text, encoding="utf-8")
         scenario = str(path)
-    config = case.request(directory).resolve()
     log = FlightLog(directory, dump(config))
     outcome = fly(
         build_parts(config),
@@ -100,20 +112,4 @@ def _fly(case: Case, scratch: Path, directory: Path) -> tuple[FlightConfig, Outc
     )
     if log.problem:
         raise LogError(log.problem)
-    return config, outcome
-
-
-def _record(
-    promises: Promises, config: FlightConfig, outcome: Outcome, score: Score, history: History
-) -> Record:
-    figures = score.figures()
-    margins = terms(promises, figures, history, config.controller)
-    weakest = min(margins, key=lambda name: margins[name])
-    return Record(
-        outcome.exit_code,
-        outcome.sentence,
-        margins[weakest],
-        weakest,
-        {name: value for name, value in figures.items() if name not in WALL_TIMES},
-        margins,
-    )
+    return outcome

@@ -1,52 +1,90 @@
-"""The page of a campaign: success, distributions per scenario, worst flights."""
+"""The page of a campaign or a comparison: success, figures per scenario, a table, worst flights."""
 
 from __future__ import annotations
 
 import html
+import itertools
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from offboard.analysis.compare_table import digits
-from offboard.analysis.figure import BLUE, PALETTE, Figure, coordinates, listed
+from offboard.analysis.figure import PALETTE, RED, Figure, coordinates, listed
 from offboard.analysis.page import render
-from offboard.campaign.statistics import Group
+from offboard.campaign.statistics import BEST, ERROR, Group, digits
 from offboard.campaign.table import Row
 
 WORST_SHOWN = 20
-PANELS = {
-    "success": "success rate",
-    "rmse_position_m": "position error<br>RMSE [m]",
-    "margin": "margin",
-}
-CAPTION = (
+NARROWEST_PX = 640
+_FEW_DECADES = 2
+_MARGIN_DECADES = 0.05  # beside the outermost ticks
+_ROW_PX, _TOP_PX = 22, 120  # _TOP_PX: tool bar, titles and numbers of the axes
+
+
+@dataclass(frozen=True, slots=True)
+class Contents:
+    """What a page shows: `panels` of the figure with their titles, `figures` of the table, what the
+    `ends` of a range are; `boxes`: quartiles and single flights outside, else median and range."""
+
+    title: str
+    panels: Mapping[str, str]
+    figures: tuple[str, ...]
+    ends: str
+    caption: str
+    boxes: bool = False
+
+
+ERROR_TITLE = "position error<br>RMSE [m]"
+CAMPAIGN = Contents(
+    "Campaign",
+    {"success": "success rate", ERROR: ERROR_TITLE, "margin": "margin"},
+    (ERROR, "max_position_m", "margin"),
+    "5 %–95 %",
     "Success: completed, with every requirement met; line: 95 % interval (Wilson). Boxes: "
     "quartiles over seeds and draws; dots: single flights outside. Margin: 1 nothing of a promise "
-    "used, 0 broken, -1 not completed, -2 not flown."
+    "used, 0 broken, -1 not completed, -2 not flown.",
+    boxes=True,
 )
-_ROW_PX, _TOP_PX = 26, 110
+COMPARISON = Contents(
+    "Comparison of controllers",
+    {
+        ERROR: ERROR_TITLE,
+        "tilt_agitation_deg": "excess tilt<br>RMS [deg]",
+        "rate_agitation_radps": "excess rates<br>RMS [rad/s]",
+    },
+    (
+        ERROR, "max_position_m", "rmse_truth_m", "tilt_agitation_deg", "rate_agitation_radps",
+        "rmse_course_deg", "solve_time_p99_ms",
+    ),
+    "lowest–highest",
+    "Dot: median; line: range over the seeds. Excess: motion that the reference does not require "
+    "of an ideal vehicle. Filled and bold: the best.",
+)  # fmt: skip
 
 
 def page(
     groups: Sequence[Group],
-    missing: Sequence[str],
-    kept: Mapping[str, Mapping[str, str]],
+    contents: Contents,
+    missing: Sequence[str] = (),
+    kept: Mapping[str, Mapping[str, str]] | None = None,
 ) -> str:
-    """The page as text. `missing`: what is not flown yet. `kept`: files of kept flights, title to
-    path, by case."""
+    """The page as text. `missing`: what is not flown. `kept`: of a campaign, whose worst flights
+    are listed: files of kept flights, title to path, by case."""
     rows = [row for group in groups for row in group.rows]
     worst = sorted(rows, key=lambda row: row.severity)[:WORST_SHOWN]
     return render(
         "campaign/templates/campaign.html",
-        title="Campaign",
+        title=contents.title,
         flights=len(rows),
         successes=sum(not row.failed for row in rows),
         missing_flights=missing,
-        figure=_figure(groups) if rows else None,
+        figure=_figure(groups, contents) if rows else None,
+        contents=contents,
         groups=groups,
-        worst=worst,
+        best=BEST if any(group.best for group in groups) else "",
+        worst=worst if kept is not None else (),
         kept=kept,
         described=described,
         number=digits,
@@ -62,60 +100,79 @@ def described(row: Row) -> str:
     return ", ".join([*words, f"seed {case.seed}"])
 
 
-def _figure(groups: Sequence[Group]) -> Figure:
+def _figure(groups: Sequence[Group], contents: Contents) -> Figure:
     """Panels side by side, one line per group, a heading above each scenario."""
     lines: list[Group | str] = []
-    for group in groups:
-        if not lines or group.scenario != _scenario(lines[-1]):
-            lines.append(group.scenario)
-        lines.append(group)
+    for scenario, block in itertools.groupby(groups, lambda group: group.scenario):
+        lines += [scenario, *block]
     figure = make_subplots(
-        cols=len(PANELS), shared_yaxes=True, column_widths=(0.3, 0.4, 0.3), horizontal_spacing=0.05
-    )
+        cols=len(contents.panels), shared_yaxes=True, horizontal_spacing=0.06,
+        column_widths=[2 if name == ERROR else 1 for name in contents.panels],
+    )  # fmt: skip
     placed = [(at, line) for at, line in enumerate(lines) if isinstance(line, Group)]
-    figure.add_trace(_success(placed), row=1, col=1)
     names = list(dict.fromkeys(group.name for group in groups))
-    for column, name in enumerate(PANELS, 1):
-        if name != "success":
-            for at, group in placed:
-                colour = PALETTE[names.index(group.name) % len(PALETTE)]
-                figure.add_trace(_box(at, group, name, colour), row=1, col=column)
-        figure.update_xaxes(title_text=PANELS[name], side="top", row=1, col=column)
-    figure.update_xaxes(range=[-0.03, 1.03], tickformat=".0%", row=1, col=1)
-    figure.update_xaxes(type="log", row=1, col=2)
+    for column, (name, title) in enumerate(contents.panels.items(), 1):
+        draw = _box if contents.boxes and name != "success" else _dot
+        for at, group in placed:
+            colour = PALETTE[names.index(group.name) % len(PALETTE)]
+            figure.add_trace(draw(at, group, name, colour), row=1, col=column)
+        figure.update_xaxes(_axis(groups, name), title_text=title, side="top", row=1, col=column)
     headed = [(_label(line), isinstance(line, str)) for line in lines]
     listed(figure, headed, _ROW_PX, _TOP_PX)
-    return Figure("Success, error and margin", figure, CAPTION, 640)
-
-
-def _scenario(line: Group | str) -> str:
-    return line if isinstance(line, str) else line.scenario
+    return Figure("Side by side", figure, contents.caption, NARROWEST_PX)
 
 
 def _label(line: Group | str) -> str:
     if isinstance(line, str):
         return f"<b>{html.escape(line)}</b>"
-    return html.escape(line.name if len(line.name) <= 40 else f"{line.name[:37]}...")
+    name = html.escape(line.name if len(line.name) <= 40 else f"{line.name[:37]}...")
+    if line.failed:
+        name += f'  <span style="color: {RED}">{line.failed} of {line.flights} failed</span>'
+    return f"<b>{name}</b>" if line.best else name
 
 
-def _success(placed: Sequence[tuple[int, Group]]) -> go.Scatter:
-    rates = [group.successes / group.flights for _, group in placed]
+def _axis(groups: Sequence[Group], name: str) -> dict[str, object]:
+    """The axis of a panel. Of a figure: logarithmic, from tick to tick, 1, or 1, 2 and 5 of every
+    decade."""
+    if name == "success":
+        return {"range": [-0.03, 1.03], "tickformat": ".0%"}
+    if name == "margin":
+        return {}
+    values = [value for group in groups for value in group.values(name) if value > 0.0]
+    least, greatest = min(values, default=1.0), max(values, default=1.0)
+    low, high = math.floor(math.log10(least)), math.ceil(math.log10(greatest))
+    steps = (1, 2, 5) if high - low <= _FEW_DECADES else (1,)
+    ticks = [float(f"{step}e{power}") for power in range(low, high + 1) for step in steps]
+    first = max((at for at in ticks if at <= least), default=ticks[0])
+    last = min((at for at in ticks if at >= greatest), default=ticks[-1])
+    return {
+        "type": "log", "tickvals": ticks, "ticktext": [f"{at:g}" for at in ticks],
+        "range": [math.log10(first) - _MARGIN_DECADES, math.log10(last) + _MARGIN_DECADES],
+    }  # fmt: skip
+
+
+def _dot(at: int, group: Group, name: str, colour: str) -> go.Scatter:
+    """Success rate or median, with its interval or range."""
+    low, middle, high = group.spread(name)
+    value = f"{group.successes} of {group.flights}" if name == "success" else group.shown(name)
+    text = f"{group.name}, {group.scenario}: {value}"
     return go.Scatter(
-        mode="markers", x=coordinates(rates), y=[at for at, _ in placed], hoverinfo="text",
-        text=[f"{group.successes} of {group.flights}" for _, group in placed],
-        marker={"color": BLUE, "size": 9},
+        mode="markers", x=coordinates([middle]), y=[at], hoverinfo="text", text=html.escape(text),
+        marker={
+            "color": colour, "size": 9, "line": {"color": colour, "width": 2},
+            "symbol": "circle" if group.best or name == "success" else "circle-open",
+        },
         error_x={
-            "type": "data", "symmetric": False, "thickness": 1.5, "width": 3, "color": BLUE,
-            "array": coordinates([g.high - r for (_, g), r in zip(placed, rates, strict=True)]),
-            "arrayminus": coordinates([r - g.low for (_, g), r in zip(placed, rates, strict=True)]),
+            "type": "data", "symmetric": False, "thickness": 1.5, "width": 3, "color": colour,
+            "array": coordinates([high - middle]), "arrayminus": coordinates([middle - low]),
         },
     )  # fmt: skip
 
 
 def _box(at: int, group: Group, name: str, colour: str) -> go.Box:
-    values = [value for value in group.values(name) if math.isfinite(value)]
+    """Quartiles, and single flights outside."""
     return go.Box(
-        x=coordinates(values), y0=at, orientation="h", width=0.6, name=group.name,
+        x=coordinates(group.values(name)), y0=at, orientation="h", width=0.6, name=group.name,
         line={"color": colour, "width": 1.4}, marker={"color": colour, "size": 3},
         hoverinfo="x", boxpoints="outliers",
     )  # fmt: skip

@@ -17,7 +17,9 @@ from rich.progress import (
 )
 
 from offboard.io import clock
+from offboard.io.stop import StopRequests
 
+INTERRUPTED = "interrupted: flights in the air are finished; interrupt again to exit at once"
 FIRST = 5  # flights after which the time is estimated first
 LINES = 20
 
@@ -36,25 +38,31 @@ class Counter(Progress):
         self._announced = False
         self._before: int | None = None  # flights that an earlier run has flown
 
-    def count(self, done: int, planned: int) -> None:
-        """`done` of at most `planned` flights have ended; 0 at the beginning."""
+    def count(self, done: int, planned: int, ended: str = "") -> None:
+        """`done` of at most `planned` flights have ended; 0 at the beginning. `ended`: a sentence
+        on the last one, which is then always a line."""
         if done and self._before is None:
             self._before = done - 1
         own = done - (self._before or 0)
         rate = 60.0 * own / max(1e-9, clock.monotonic_s() - self._begun_s)
         told = f"{rate:.0f} a minute" if done else ""
         self.update(self._task, completed=done, total=planned, rate=told)
-        every = max(1, planned // LINES)
+        every = 1 if ended else max(1, planned // LINES)
         if self.console.is_terminal or (done % every and done != planned and own != FIRST):
             return
-        left = f", {told}, {remaining(60.0 * (planned - done) / rate)} left" if done else ""
-        self.console.print(f"{done} of {planned} flights{left}")
+        line = f"{done} of {planned} flights"
+        if done:
+            line += f", {told}, {remaining(60.0 * (planned - done) / rate)} left"
+        if ended:
+            line += f": {ended}"
+        self.console.print(line, markup=False, soft_wrap=True)
 
-    def announce(self, sentence: str) -> None:
-        """Print a sentence, once."""
-        if not self._announced:
+    def ending(self, stops: StopRequests) -> bool:
+        """Whether a stop was requested, which is then said, once."""
+        if stops.requested and not self._announced:
             self._announced = True
-            self.console.print(sentence)
+            self.console.print(INTERRUPTED)
+        return stops.requested
 
 
 def remaining(seconds: float) -> str:

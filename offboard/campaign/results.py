@@ -7,7 +7,6 @@ several machines may be copied together.
 from __future__ import annotations
 
 import json
-import math
 import os
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
@@ -15,11 +14,20 @@ from pathlib import Path
 
 from offboard.documents.errors import UserError
 
+# figures that this computer's clock decides: they differ between two runs of one flight
+WALL_TIMES = (
+    "setpoint_gap_wall_max_s",
+    "lateness_p99_ms",
+    "lateness_max_ms",
+    "solve_time_p50_ms",
+    "solve_time_p99_ms",
+)
+
 
 @dataclass(frozen=True, slots=True)
 class Record:
     """The end of a flight. `margin` and its smallest term are those of `campaign.margin`;
-    `figures` those of the score that no clock of this computer decides, without NaN."""
+    `figures` those of the score, without NaN."""
 
     exit_code: int
     sentence: str
@@ -66,9 +74,10 @@ class Results:
             return None
 
     def put(self, key: str, record: Record) -> None:
-        """Store a record at once. Raises UserError, for example when the disk is full."""
-        finite = {k: v for k, v in record.figures.items() if math.isfinite(v)}
-        text = json.dumps(asdict(record) | {"figures": finite}, sort_keys=True)
+        """Store a record at once, without WALL_TIMES. Raises UserError, for example when the disk
+        is full."""
+        figures = {k: v for k, v in record.figures.items() if k not in WALL_TIMES}
+        text = json.dumps(asdict(record) | {"figures": figures}, sort_keys=True)
         self.write(self._folder / f"{key}.json", text.encode())
 
     def finished(self) -> int:

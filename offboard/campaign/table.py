@@ -12,8 +12,7 @@ from typing import Any
 from offboard.analysis.requirement import Requirement
 from offboard.analysis.score import FIGURES
 from offboard.campaign.cases import Case
-from offboard.campaign.flight import WALL_TIMES
-from offboard.campaign.results import Record
+from offboard.campaign.results import WALL_TIMES, Record
 
 CASE_COLUMNS = ("controller", "reference", "scenario", "vehicle", "sim_vehicle", "firmware")
 FIGURE_COLUMNS = tuple(name for name in FIGURES if name not in WALL_TIMES)

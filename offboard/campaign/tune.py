@@ -27,7 +27,7 @@ from offboard.campaign.evaluate import Evaluator
 from offboard.campaign.results import Record
 from offboard.campaign.table import FIGURE_COLUMNS
 from offboard.campaign.verdict import Verdict, judge
-from offboard.documents.errors import DocumentError, UserError
+from offboard.documents.errors import DocumentError, UserError, naming
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import override, parse, read
 from offboard.documents.shipped import locate, read_text
@@ -95,16 +95,17 @@ class Tuning:
 
     def __init__(self, file: TuneFile, source: str) -> None:
         self.file = file
-        self._training = _cases(file, file.training, source)
-        self._validation = _cases(file, file.validation, source)
-        shared = len(set(self._training) & set(self._validation))
-        if shared:
-            raise DocumentError(
-                f"{source}: {shared} flights are in training and in validation; give other "
-                "scenarios, references or seeds"
-            )
-        self._defaults = _defaults(self._training[0], file, source)
-        check([self._training[0].with_values(tuple(self._defaults.items()))], source)
+        with naming(source):
+            self._training = _cases(file, file.training)
+            self._validation = _cases(file, file.validation)
+            shared = len(set(self._training) & set(self._validation))
+            if shared:
+                raise DocumentError(
+                    f"{shared} flights are in training and in validation; give other scenarios, "
+                    "references or seeds"
+                )
+            self._defaults = _defaults(self._training[0], file)
+            check([self._training[0].with_values(tuple(self._defaults.items()))])
 
     def run(
         self, folder: Path, evaluator: Evaluator, progress: Callable[[int, float], None]
@@ -146,7 +147,7 @@ class Tuning:
         return record.figures.get(self.file.objective, self.file.failure)
 
 
-def _cases(file: TuneFile, flights: Flights, source: str) -> list[Case]:
+def _cases(file: TuneFile, flights: Flights) -> list[Case]:
     campaign = CampaignFile(
         config=file.config,
         controllers=(file.controller,) if file.controller else None,
@@ -155,10 +156,10 @@ def _cases(file: TuneFile, flights: Flights, source: str) -> list[Case]:
         firmwares=(file.firmware,),
         seeds=flights.seeds,
     )
-    return expand(campaign, source)
+    return expand(campaign)
 
 
-def _defaults(case: Case, file: TuneFile, source: str) -> dict[str, float]:
+def _defaults(case: Case, file: TuneFile) -> dict[str, float]:
     """The present values of the parameters. Raises DocumentError for one that is no number."""
     resolved = case.request(Path()).resolve().model_dump(mode="json")
     found: dict[str, float] = {}
@@ -167,7 +168,7 @@ def _defaults(case: Case, file: TuneFile, source: str) -> dict[str, float]:
         for part in key.split("."):
             value = value.get(part) if isinstance(value, Mapping) else None
         if not isinstance(value, float | int) or isinstance(value, bool):
-            raise DocumentError(f"{source}: ranges.{key} is no number of the configuration")
+            raise DocumentError(f"ranges.{key} is no number of the configuration")
         found[key] = float(value)
     return found
 

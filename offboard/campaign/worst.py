@@ -24,7 +24,7 @@ from offboard.campaign.evaluate import Evaluator
 from offboard.campaign.results import Record
 from offboard.campaign.searchers import SEARCHERS
 from offboard.campaign.table import as_csv as csv_of
-from offboard.documents.errors import DocumentError
+from offboard.documents.errors import DocumentError, naming
 
 Array = NDArray[np.float64]
 SEED = "seed"  # a range of this name is that of the flight's seed: noise, and the phase of gusts
@@ -215,7 +215,8 @@ def search_of(campaign: Campaign, source: str, evaluator: Evaluator) -> FailureS
             "scenario, vehicle and firmware, one value of each parameter, and no sample"
         )
     found = FailureSearch(campaign.cases[0], search, evaluator)
-    check([found.middle()], source)
+    with naming(source):
+        check([found.middle()])
     return found
 
 

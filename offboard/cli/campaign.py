@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 
 NAME = typer.Argument(metavar="NAME|FILE", help="Campaign: a shipped name or a file.")
 ENDED = "interrupted; finished flights are kept: run the same command again to go on"
-INTERRUPTED = "interrupted: flights in the air are finished; interrupt again to exit at once"
 
 
 def campaign(
@@ -95,7 +94,7 @@ def _search(flown: Campaign, source: str, count: int, open_workers: OpenWorkers)
             counter.count(done, max(done, most))
 
         evaluator = Evaluator(
-            flown.results, flown.file.promises, workers, lambda: stops.requested, progress
+            flown.results, flown.file.promises, workers, partial(counter.ending, stops), progress
         )
         search = search_of(flown, source, evaluator)
         most = search.flights_most(count)
@@ -123,13 +122,7 @@ def _fly(flown: Campaign, open_workers: OpenWorkers, part: Shard) -> Summary:
 
     summary: Summary | None = None
     with suppress(KeyboardInterrupt), StopRequests() as stops, Counter(out) as counter:
-
-        def ending() -> bool:
-            if stops.requested:
-                counter.announce(INTERRUPTED)
-            return stops.requested
-
-        summary = flown.fly(open_workers, part, ending, counter.count)
+        summary = flown.fly(open_workers, part, partial(counter.ending, stops), counter.count)
     if summary is None:
         raise CommandError(ENDED, 4)
     return summary

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
+from contextlib import nullcontext
 from typing import Annotated
 
 from offboard.cli.shared import (
-    DEFAULT_CONNECTION,
     FLIGHTS,
     Assignments,
     CommandError,
@@ -57,36 +56,23 @@ def compare(
         f"seeds: {seeds}"
     )
     with out.status("checking that all of them can be flown"):
-        from offboard.analysis.comparison import compare_all
-        from offboard.analysis.trial import check_flyable, fly_trial
+        from offboard.campaign import compare as comparison
+        from offboard.campaign.document import CampaignFile
+        from offboard.campaign.execution import ConnectedVehicle, local_workers
         from offboard.io import clock
-        from offboard.run.request import FlightRequest
-        from offboard.run.sitl import check_scenario_named
 
-        if connect is None:
-            for name in scenarios:
-                check_scenario_named(name)
         directory = out_directory or FLIGHTS / f"compare-{clock.local_stamp()}"
-        request = FlightRequest(
-            directory=directory,
-            choices={"vehicle": vehicle},
-            assignments=tuple(assignments or ()),
-            connection=connect or DEFAULT_CONNECTION,
-            sitl=connect is None,
-            system_id=system,
-            signing_key=signing_key,
+        file = CampaignFile(
+            controllers=tuple(laws),
+            references=tuple(references),
+            scenarios=None if connect else tuple(scenarios),
+            vehicles=(vehicle,) if vehicle else None,
+            seeds=seeds,
         )
-        check_flyable(request, laws, references)
-    problem = compare_all(
-        partial(fly_trial, request),
-        controllers=laws,
-        references=references,
-        scenarios=scenarios,
-        seeds=range(1, seeds + 1),
-        directory=directory,
-        workers=workers if connect is None else 0,
-        console=out,
-    )
+        connected = ConnectedVehicle(connect, system, signing_key) if connect else None
+        jobs = comparison.plan(file, directory, assignments or (), connected)
+    flyer = nullcontext(connected) if connected else local_workers(workers)
+    problem = comparison.compare(jobs, flyer, directory, out)
     if problem:
         raise CommandError(problem, 4)
 

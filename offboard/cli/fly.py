@@ -179,8 +179,8 @@ def _conclude(
 ) -> None:
     """Print verdict and result. Exits with the code of the verdict. `lost`: sentences on what was
     not shown of the flight."""
+    from offboard.analysis.flight_score import judged
     from offboard.analysis.score_table import summary
-    from offboard.analysis.trial import judged
 
     score, history = scored(directory)
     outcome = judged(outcome, score)

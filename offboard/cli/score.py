@@ -27,7 +27,7 @@ def score(
     Every requirement on a flight that was not completed is missed. Writes score.json if FLIGHT is a
     directory.
     """
-    from offboard.analysis.score_json import as_text
+    from offboard.analysis.flight_score import as_text
     from offboard.analysis.score_table import show, verdict
 
     requirements = requirements_of(require)
@@ -55,7 +55,7 @@ def requirements_of(texts: list[str] | None) -> list[Requirement]:
 
 def scored(flight: Path) -> tuple[Score, History]:
     """Score a flight and keep the score in its directory. Raises TlogError."""
-    from offboard.analysis.trial import score_flight
+    from offboard.analysis.flight_score import score_flight
 
     result, history = score_flight(flight)
     keep(flight, result, history)
@@ -64,7 +64,7 @@ def scored(flight: Path) -> tuple[Score, History]:
 
 def keep(flight: Path, result: Score, history: History) -> None:
     """Write score.json if `flight` is a directory. Where it cannot be written, say so."""
-    from offboard.analysis.trial import keep_score
+    from offboard.analysis.flight_score import keep_score
     from offboard.io.log import LogError
 
     if flight.is_dir():

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -31,6 +32,15 @@ class DocumentError(UserError):
     def __init__(self, *problems: str) -> None:
         super().__init__("\n".join(problems))
         self.problems = problems
+
+
+@contextmanager
+def naming(source: str) -> Iterator[None]:
+    """Put `source`, a file's name, before every problem of a DocumentError raised in the block."""
+    try:
+        yield
+    except DocumentError as error:
+        raise DocumentError(*(f"{source}: {each}" for each in error.problems)) from None
 
 
 def sentence(detail: ErrorDetails, document: Any, schema: Schema) -> str:

@@ -19,10 +19,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner
 
 from offboard.analysis import history, tlog
+from offboard.analysis.flight_score import judged
 from offboard.analysis.history import History
 from offboard.analysis.score import Score, Scoring, score
 from offboard.analysis.score_table import summary
-from offboard.analysis.trial import judged
 from offboard.cli.commands import app
 from offboard.flight.companion import Outcome
 from offboard.flight.online_identification import IdentifySettings

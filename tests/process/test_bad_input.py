@@ -21,7 +21,7 @@ import pytest
 from processes import Called, Spawn, children, free_port
 
 from offboard.analysis import history, tlog
-from offboard.analysis.trial import keep_score, score_flight
+from offboard.analysis.flight_score import keep_score, score_flight
 from offboard.documents.signing_key import create_key
 from offboard.io.log import LogError
 from offboard.run import one_flight as run

@@ -258,8 +258,10 @@ def test_a_full_disk_ends_the_campaign_and_keeps_what_is_finished(
 
 
 def dies(job: Job) -> Record:
-    """Ends its worker with seed 2, after a note of it."""
+    """Ends its worker with seed 2, after a note of it and the beginning of a log."""
     if job.case.seed == 2:
+        assert job.kept
+        job.kept.mkdir()
         with (Path(job.code) / "deaths").open("a") as deaths:
             deaths.write("died\n")
         os._exit(1)
@@ -271,7 +273,10 @@ def test_a_flight_whose_worker_dies_twice_is_a_row(
 ) -> None:
     monkeypatch.setattr(execution, "fly_job", dies)
     case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
-    jobs = [Job(replace(case, seed=seed), Promises(), str(tmp_path)) for seed in (1, 2)]
+    jobs = [
+        Job(replace(case, seed=seed), Promises(), str(tmp_path), tmp_path / f"{seed}")
+        for seed in (1, 2)
+    ]
     with local_workers(1) as workers:
         ended = {job.case.seed: record for job, record in workers.fly(jobs, lambda: False)}
     assert (tmp_path / "deaths").read_text() == "died\n" * 2

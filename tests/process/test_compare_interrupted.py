@@ -36,9 +36,12 @@ def test_interrupted_it_keeps_what_landed(spawn: Spawn, tmp_path: Path) -> None:
     assert (row["controller"], row["failed"]) == ("lqr", "0")
     assert 1 <= flights <= 4
     assert f"interrupted: {SEEDS - flights} of {SEEDS} flights missing" in errors
+    assert "interrupted: flights in the air are finished" in output
     assert "not flown: hover, calm: lqr seed" in output
     assert "not flown" in (tmp_path / "x" / "compare.html").read_text(encoding="utf-8")
-    assert len(list(tmp_path.rglob("score.json"))) == flights
+    kept = [path.parent for path in tmp_path.rglob("score.json")]
+    assert len(kept) == flights
+    assert all("duration_s: 1.0\n" in (each / "flight.yaml").read_text() for each in kept)
 
 
 def test_interrupted_while_its_processes_load_it_ends_in_order(spawn: Spawn) -> None:

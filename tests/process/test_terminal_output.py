@@ -19,8 +19,8 @@ from processes import Spawn
 from rich.console import Console
 from typer.testing import CliRunner
 
+from offboard.analysis.flight_score import score_flight
 from offboard.analysis.score_table import show
-from offboard.analysis.trial import score_flight
 from offboard.cli.commands import app as offboard
 from simulator.command import app as simulator
 

@@ -16,7 +16,7 @@ import pytest
 from processes import Called
 
 from offboard.analysis import tlog
-from offboard.analysis.compare import Result
+from offboard.campaign.results import Record
 
 RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
 SURROGATE = os.fsdecode(b"caf\xe9")
@@ -275,12 +275,12 @@ def test_a_height_with_the_time_to_land_is_flown(call: Call, tmp_path: Path) -> 
 def test_a_comparison_on_a_full_disk_says_which_file_is_missing(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def flown(request: object, trial: object) -> Result:
+    def flown(*_: object) -> Record:
         limit = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
         resource.setrlimit(resource.RLIMIT_FSIZE, (10, limit))
-        return Result(trial, 3, "no vehicle", {})  # type: ignore[arg-type]
+        return Record(3, "no vehicle", -1.0, "completed")
 
-    monkeypatch.setattr("offboard.analysis.trial.fly_trial", flown)
+    monkeypatch.setattr("offboard.campaign.execution.recorded", flown)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         code, said = call(
@@ -398,8 +398,8 @@ def test_an_interrupted_score_is_one_sentence(tmp_path: Path) -> None:
     begin = """
 import signal
 signal.signal(signal.SIGINT, signal.default_int_handler)
-from offboard.analysis import trial
-trial.score_flight = lambda flight: signal.raise_signal(signal.SIGINT)
+from offboard.analysis import flight_score
+flight_score.score_flight = lambda flight: signal.raise_signal(signal.SIGINT)
 """
     ended = process(SCORE, tmp_path, begin)
     assert (ended.returncode, ended.stderr) == (2, "interrupted\n")

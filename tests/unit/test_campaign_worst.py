@@ -21,7 +21,7 @@ from offboard.campaign.evaluate import Evaluator, Interrupted
 from offboard.campaign.execution import Workers
 from offboard.campaign.flight import Job
 from offboard.campaign.margin import LOWEST, Promises, terms
-from offboard.campaign.page import page
+from offboard.campaign.page import CAMPAIGN, page
 from offboard.campaign.progress import Counter
 from offboard.campaign.results import Record
 from offboard.campaign.searchers import SEARCHERS
@@ -201,7 +201,7 @@ def test_the_page_shows_groups_and_worst_flights_without_a_network(tmp_path: Pat
         for seed in range(1, 7)
     ]  # fmt: skip
     file = tmp_path / "campaign.html"
-    file.write_text(page(groups(rows, frozenset()), ["2 of 14 flights"], {}), encoding="utf-8")
+    file.write_text(page(groups(rows), CAMPAIGN, ["2 of 14 flights"], {}), encoding="utf-8")
     with opening(file, width=400) as opened:
         assert opened.width_px() == 400
         assert opened.unreadable() == []

@@ -7,8 +7,8 @@ import io
 import itertools
 import json
 import math
-import os
-import signal
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 
 import pytest
@@ -16,23 +16,22 @@ from browser import Opened, opening
 from rich.console import Console
 from typer.testing import CliRunner
 
-from offboard.analysis.compare import (
-    FIGURES,
-    Failure,
-    Result,
-    Row,
-    Trial,
-    as_csv,
-    as_json,
-    table,
-    trials,
-)
-from offboard.analysis.compare_page import page
-from offboard.analysis.compare_table import show
-from offboard.analysis.comparison import compare_all
-from offboard.analysis.workers import processors
+from offboard.campaign import execution
+from offboard.campaign.cases import Case
+from offboard.campaign.compare import WHOLE_RANGE, as_csv, as_json, compare, plan
+from offboard.campaign.compare_table import show
+from offboard.campaign.document import CampaignFile
+from offboard.campaign.execution import ConnectedVehicle
+from offboard.campaign.flight import Job
+from offboard.campaign.page import COMPARISON, page
+from offboard.campaign.results import Record
+from offboard.campaign.statistics import Group, groups, marked
+from offboard.campaign.table import row_of
 from offboard.cli.commands import app
-from offboard.documents.reading import DocumentError
+from offboard.documents.errors import DocumentError
+from offboard.run.request import FlightRequest
+
+FIGURES = COMPARISON.figures
 
 LAWS = ("pso", "lqr", "an/uncommonly/long/name.yaml", "lost")
 SCENARIOS = ("calm", "all_together")
@@ -50,52 +49,55 @@ ERRORS_M = {
 WHY = "7.1 m <b>away</b>"
 
 
-def flown(trial: Trial) -> Result:
-    error_m = ERRORS_M[trial.controller, trial.scenario][trial.seed - 1]
+def record(error_m: float) -> Record:
     if math.isnan(error_m):
-        return Result(trial, 4, WHY, {})
+        return Record(4, WHY, -1.0, "completed")
     figures = {name: error_m * (1 + index) for index, name in enumerate(FIGURES)}
-    return Result(trial, 0, "flown and landed", figures)
+    return Record(0, "flown and landed", 0.9, "error", figures)
 
 
 @pytest.fixture(scope="module")
-def rows() -> list[Row]:
-    planned = trials(LAWS, ["lemniscate"], SCENARIOS, range(1, 4), Path("x"))
-    return table(map(flown, planned))
+def rows() -> list[Group]:
+    flown = [
+        row_of(Case("flight", law, "lemniscate", None, None, "px4", scenario, seed), ended, ())
+        for scenario, law in itertools.product(SCENARIOS, LAWS)
+        for seed, ended in enumerate(map(record, ERRORS_M[law, scenario]), 1)
+    ]
+    return marked(groups(flown, ends=WHOLE_RANGE))
 
 
-def row_of(rows: list[Row], law: str, scenario: str) -> Row:
-    (found,) = [row for row in rows if (row.controller, row.scenario) == (law, scenario)]
+def row_of_law(rows: list[Group], law: str, scenario: str) -> Group:
+    (found,) = [row for row in rows if (row.case.controller, row.scenario) == (law, scenario)]
     return found
 
 
-def test_best_is_the_lowest_median_of_those_that_all_flew_and_its_equals(rows: list[Row]) -> None:
-    best = {(row.controller, row.scenario) for row in rows if row.best}
+def test_best_is_the_lowest_median_of_those_that_all_flew_and_its_equals(rows: list[Group]) -> None:
+    best = {(row.case.controller, row.scenario) for row in rows if row.best}
     assert best == {(law, scenario) for law in ("pso", "lqr") for scenario in SCENARIOS}
 
 
-def test_median_and_range_are_of_the_flights_that_landed(rows: list[Row]) -> None:
-    lqr, lost = row_of(rows, "lqr", "calm"), row_of(rows, "lost", "calm")
-    ends = (lqr.lowest, lqr.median, lqr.highest)
-    assert [end["rmse_position_m"] for end in ends] == [0.0109, 0.0119, 0.0121]
-    assert (lost.flown, lost.median["rmse_position_m"]) == (2, 0.001)
-    assert lost.failures == (Failure(3, WHY),)
+def test_median_and_range_are_of_the_flights_that_landed(rows: list[Group]) -> None:
+    lqr, lost = row_of_law(rows, "lqr", "calm"), row_of_law(rows, "lost", "calm")
+    assert lqr.spread("rmse_position_m") == (0.0109, 0.0119, 0.0121)
+    assert (lost.successes, lost.spread("rmse_position_m")[1]) == (2, 0.001)
+    assert lost.reasons == [WHY]
 
 
-def test_files_hold_every_figure(rows: list[Row]) -> None:
+def test_files_hold_every_figure(rows: list[Group]) -> None:
     read = list(csv.DictReader(io.StringIO(as_csv(rows))))
     document = json.loads(as_json(rows))
     assert len(read) == len(document) == len(rows)
-    for name, which in itertools.product(FIGURES, ("median", "lowest", "highest")):
-        for row, line, entry in zip(rows, read, document, strict=True):
-            value = getattr(row, which)[name]
-            assert entry[which][name] == (value if row.flown else None)
-            assert line[f"{name}_{which}"] == (f"{value:.6g}" if row.flown else "")
+    for name, row, line, entry in (
+        (name, *each) for name in FIGURES for each in zip(rows, read, document, strict=True)
+    ):
+        for which, value in zip(("lowest", "median", "highest"), row.spread(name), strict=True):
+            assert entry[which][name] == (value if row.successes else None)
+            assert line[f"{name}_{which}"] == (str(value) if row.successes else "")
     assert document[-1]["failures"] == [{"seed": seed, "sentence": WHY} for seed in (1, 2, 3)]
 
 
 @pytest.mark.parametrize("width", [60, 80, 120, 200])
-def test_no_line_of_the_table_is_wider_than_the_window(rows: list[Row], width: int) -> None:
+def test_no_line_of_the_table_is_wider_than_the_window(rows: list[Group], width: int) -> None:
     text = io.StringIO()
     show(Console(file=text, width=width), rows)
     told = text.getvalue().splitlines()
@@ -107,14 +109,14 @@ def test_no_line_of_the_table_is_wider_than_the_window(rows: list[Row], width: i
 
 
 def test_the_page_opens_without_an_error_and_shows_every_row(
-    rows: list[Row], tmp_path: Path
+    rows: list[Group], tmp_path: Path
 ) -> None:
     file = tmp_path / "compare.html"
-    file.write_text(page(rows, ["not flown: <i>calm</i>"]), encoding="utf-8")
+    file.write_text(page(rows, COMPARISON, ["not flown: <i>calm</i>"]), encoding="utf-8")
     with opening(file) as opened:
         assert opened.problems == opened.fetched == []
         dots = opened.page.locator(".scatterlayer .point").count()
-        assert dots == 3 * sum(row.flown > 0 for row in rows)  # error, tilt, rates
+        assert dots == 3 * sum(row.successes > 0 for row in rows)  # error, tilt, rates
         assert opened.page.locator("table tr").count() == 1 + len(rows)
         assert opened.page.locator("tr.best").count() == 4
         told = opened.page.inner_text("main")
@@ -123,11 +125,11 @@ def test_the_page_opens_without_an_error_and_shows_every_row(
 
 
 def test_titles_and_numbers_of_the_axes_keep_clear_of_each_other(
-    rows: list[Row], tmp_path: Path
+    rows: list[Group], tmp_path: Path
 ) -> None:
     """In a window of 1100 pixels; every panel shows two numbers or more."""
     file = tmp_path / "compare.html"
-    file.write_text(page(rows), encoding="utf-8")
+    file.write_text(page(rows, COMPARISON), encoding="utf-8")
     axes = ("x", "x2", "x3")
     with opening(file, width=1100) as opened:
         titles = [_boxes(opened, f".g-{axis}title") for axis in axes]
@@ -139,10 +141,10 @@ def test_titles_and_numbers_of_the_axes_keep_clear_of_each_other(
 
 
 def test_the_page_follows_the_colour_scheme_and_fits_a_narrow_window(
-    rows: list[Row], tmp_path: Path
+    rows: list[Group], tmp_path: Path
 ) -> None:
     file = tmp_path / "compare.html"
-    file.write_text(page(rows, ["not flown: <i>calm</i>"]), encoding="utf-8")
+    file.write_text(page(rows, COMPARISON, ["not flown: <i>calm</i>"]), encoding="utf-8")
     with opening(file, width=400) as opened:
         assert opened.width_px() == 400
         assert opened.colliding() == []
@@ -158,27 +160,8 @@ def _boxes(opened: Opened, selector: str) -> list[tuple[float, float]]:
     return sorted((box["x"], box["x"] + box["width"]) for box in found if box)
 
 
-def dies_with_seed_2(trial: Trial) -> Result:
-    if trial.seed == 2:
-        os.kill(os.getpid(), signal.SIGKILL)
-    return Result(trial, 0, "flown and landed", dict.fromkeys(FIGURES, 1.0))
-
-
-def test_a_worker_that_dies_fails_its_own_flight_only(tmp_path: Path) -> None:
-    problem = compare_all(
-        dies_with_seed_2,
-        controllers=["pso"],
-        references=["hover"],
-        scenarios=["calm"],
-        seeds=range(1, 5),
-        directory=tmp_path / "all",
-        workers=1,
-        console=Console(file=io.StringIO()),
-    )
-    assert problem == "1 of 4 flights failed; the table says why"
-    (row,) = csv.DictReader((tmp_path / "all" / "compare.csv").open(encoding="utf-8"))
-    assert row["failed"] == "1"
-    assert row["why"] == "the process that flew it ended"
+def campaign(controllers: Sequence[str], references: Sequence[str] = ("hover",)) -> CampaignFile:
+    return CampaignFile(controllers=tuple(controllers), references=tuple(references))
 
 
 @pytest.mark.parametrize(
@@ -186,30 +169,25 @@ def test_a_worker_that_dies_fails_its_own_flight_only(tmp_path: Path) -> None:
     [(2, "pso lqr pid mpc"), (3, "pso lqr"), (4, "pso lqr")],  # a file; refused; aborted
 )
 def test_on_one_vehicle_nothing_is_flown_after_a_refused_or_aborted_flight(
-    tmp_path: Path, exit_code: int, flown: str
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exit_code: int, flown: str
 ) -> None:
     begun: list[str] = []
 
-    def fly(trial: Trial) -> Result:
-        begun.append(trial.controller)
-        if trial.controller == "lqr":
-            return Result(trial, exit_code, "left OFFBOARD for AUTO.LOITER", {})
-        return Result(trial, 0, "flown and landed", dict.fromkeys(FIGURES, 1.0))
+    def fly(request: FlightRequest, *_: object) -> Record:
+        begun.append(str(request.choices["controller"]))
+        if begun[-1] == "lqr":
+            return Record(exit_code, "left OFFBOARD for AUTO.LOITER", -1.0, "completed")
+        return record(1.0)
 
-    console = Console(file=io.StringIO())
-    problem = compare_all(
-        fly,
-        controllers=["pso", "lqr", "pid", "mpc"],
-        references=["hover"],
-        scenarios=["connected"],
-        seeds=[1],
-        directory=tmp_path,
-        workers=0,
-        console=console,
-    )
+    monkeypatch.setattr(execution, "recorded", fly)
+    vehicle = ConnectedVehicle("udpin:127.0.0.1:0")
+    jobs = plan(campaign(["pso", "lqr", "pid", "mpc"]), tmp_path, vehicle=vehicle)
+    problem = compare(jobs, nullcontext(vehicle), tmp_path, Console(file=io.StringIO()))
     assert " ".join(begun) == flown
-    rows = csv.DictReader((tmp_path / "compare.csv").open(encoding="utf-8"))
-    assert [row["controller"] for row in rows] == begun
+    lines = csv.DictReader((tmp_path / "compare.csv").open(encoding="utf-8"))
+    assert [(line["controller"], line["scenario"]) for line in lines] == [
+        (law, "connected") for law in begun
+    ]
     words = "ended with lqr on hover, seed 1 (left OFFBOARD for AUTO.LOITER)"
     failed = "1 of 2 flights failed; the table says why"
     assert (problem == f"{failed}; {words}: 2 of 4 flights missing") == (exit_code != 2)
@@ -220,27 +198,32 @@ def test_on_one_vehicle_nothing_is_flown_after_a_refused_or_aborted_flight(
     ("controllers", "references"),
     [
         (["a/fast.yaml", "b/fast.yaml"], ["hover"]),
-        (["pso", "lqr", "pso"], ["hover"]),
         (["pso"], ["a/way.yaml", "hover", "b/way.csv"]),
-        (["pso", "pso-slow"], ["slow-hover", "hover"]),
+        (["pso", "./pso-slow.yaml"], ["./slow-hover.yaml", "hover"]),
     ],
 )
-def test_flights_that_would_share_a_directory_are_refused_before_the_first(
-    tmp_path: Path, controllers: list[str], references: list[str]
+def test_flights_that_would_share_a_directory_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, controllers: list[str], references: list[str]
 ) -> None:
+    monkeypatch.chdir(tmp_path)
+    for file in (Path(name) for name in controllers + references if "." in name):
+        file.parent.mkdir(exist_ok=True)
+        file.write_text("")
     with pytest.raises(DocumentError, match="would both be recorded in") as refused:
-        compare_all(
-            flown,
-            controllers=controllers,
-            references=references,
-            scenarios=["calm"],
-            seeds=[1],
-            directory=tmp_path / "all",
-            workers=0,
-            console=Console(file=io.StringIO()),
-        )
+        plan(campaign(controllers, references), tmp_path / "all")
     assert len(refused.value.problems) == 1
-    assert not (tmp_path / "all").exists()
+
+
+class Watched:
+    """Flies without a vehicle; calls `begun` before each flight."""
+
+    def __init__(self, begun: Callable[[], None]) -> None:
+        self._begun = begun
+
+    def fly(self, jobs: Sequence[Job], ending: Callable[[], bool]) -> Iterator[tuple[Job, Record]]:
+        for job in jobs:
+            self._begun()
+            yield job, record(1.0)
 
 
 @pytest.mark.parametrize("terminal", [False, True], ids=["piped", "terminal"])
@@ -251,50 +234,14 @@ def test_progress_is_shown_before_the_first_flight_ends(
     monkeypatch.setenv("TERM", "xterm")
     text = io.StringIO()
     shown: list[str] = []
-
-    def fly(trial: Trial) -> Result:
-        shown.append(text.getvalue())
-        return lands(trial)
-
-    compare_all(
-        fly,
-        controllers=["pso", "lqr"],
-        references=["hover"],
-        scenarios=["calm"],
-        seeds=[1],
-        directory=tmp_path / "all",
-        workers=0,
-        console=Console(file=text, width=80, force_terminal=terminal),
-    )
-    assert "2 flights, 1 at a time" in shown[0]
-    assert ("0/2" in shown[0]) is terminal
-    lines = ["   1  pso-hover-calm-1: 1.00 m", "   2  lqr-hover-calm-1: 1.00 m"]
-    assert [line for line in text.getvalue().splitlines() if line in lines] == (
-        [] if terminal else lines
-    )
-
-
-def lands(trial: Trial) -> Result:
-    return Result(trial, 0, "flown and landed", dict.fromkeys(FIGURES, 1.0))
-
-
-def test_without_cpu_affinity_all_processors_are_used(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    assert processors() == len(os.sched_getaffinity(0))
-    monkeypatch.delattr(os, "sched_getaffinity")
-    assert processors() == os.cpu_count()
-    problem = compare_all(
-        lands,
-        controllers=["pso"],
-        references=["hover"],
-        scenarios=["calm"],
-        seeds=[1],
-        directory=tmp_path / "all",
-        workers=None,
-        console=Console(file=io.StringIO()),
-    )
-    assert not problem
+    flyer = Watched(lambda: shown.append(text.getvalue()))
+    jobs = plan(campaign(["pso", "lqr"]), tmp_path)
+    console = Console(file=text, width=80, force_terminal=terminal)
+    assert compare(jobs, nullcontext(flyer), tmp_path, console) == ""
+    assert ("0/" if terminal else "0 of 2 flights\n") in shown[0]
+    lines = [line for line in text.getvalue().splitlines() if " of 2 flights, " in line]
+    ended = [line.partition(" left: ")[2] for line in lines]
+    assert ended == ([] if terminal else [f"{law}-hover-px4_like-1: 1.00 m" for law in LAWS[:2]])
 
 
 @pytest.mark.parametrize(

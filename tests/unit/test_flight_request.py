@@ -7,9 +7,8 @@ from typing import Any
 
 import pytest
 
-from offboard.analysis import trial as trials
-from offboard.analysis.compare import Trial
-from offboard.io.link import LinkError
+from offboard.campaign.cases import Case
+from offboard.campaign.execution import ConnectedVehicle
 from offboard.run.request import FlightRequest
 
 
@@ -35,19 +34,9 @@ def test_vehicle_is_neutral_unless_one_is_named_or_the_simulator_flies_its_own(
     ("assignments", "allowed"), [((), False), (("limits.begin_armed=true",), True)]
 )
 def test_a_flight_that_is_compared_begins_disarmed_unless_told_otherwise(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    assignments: tuple[str, ...],
-    allowed: bool,
+    tmp_path: Path, assignments: tuple[str, ...], allowed: bool
 ) -> None:
-    flown: list[FlightRequest] = []
-
-    def refuses(order: FlightRequest, simulator: object) -> None:
-        flown.append(order)
-        raise LinkError("unused")
-
-    monkeypatch.setattr(trials, "fly_request", refuses)
-    trial = Trial("lqr", "hover", "connected", 1, tmp_path)
-    trials.fly_trial(FlightRequest(tmp_path, assignments=assignments), trial)
-    assert [order.resolve().limits.begin_armed for order in flown] == [allowed]
+    case = Case("flight", "lqr", "hover", None, None, "px4", "connected", 1, settings=assignments)
+    request = ConnectedVehicle("udpin:127.0.0.1:0").request(case, tmp_path)
+    assert request.resolve().limits.begin_armed is allowed
     assert FlightRequest(tmp_path).resolve().limits.begin_armed

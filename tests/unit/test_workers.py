@@ -9,7 +9,9 @@ import sys
 import threading
 import time
 
-from offboard.analysis.workers import interrupts_deferred
+import pytest
+
+from offboard.analysis.workers import interrupts_deferred, processors
 
 MASK = "import signal; print(signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, ()))"
 
@@ -40,3 +42,9 @@ def test_an_interrupt_is_deferred_to_the_end_of_the_block() -> None:
     finally:
         over.set()
         signal.signal(signal.SIGINT, before)
+
+
+def test_without_cpu_affinity_all_processors_are_used(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert processors() == len(os.sched_getaffinity(0))
+    monkeypatch.delattr(os, "sched_getaffinity")
+    assert processors() == os.cpu_count()
