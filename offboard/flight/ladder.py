@@ -171,7 +171,7 @@ ROWS = (
         lambda now: now.hover_thrust > now.limits.hover_thrust,
         2.0,
         Rung.LAND,
-        "the vehicle needs {hover_thrust_percent:.0f} % of its thrust to hover (limits.hover_thrust)",
+        "it needs {hover_thrust_percent:.0f} % of its thrust to hover (limits.hover_thrust)",
     ),
     LadderRow(
         "second sender",
