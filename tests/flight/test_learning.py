@@ -318,7 +318,7 @@ def test_delay_that_jumps_is_noticed_and_flown(tmp_path: Path):
     alone 0.6 to 2.0 m, by the moment of the jump, and 0.06 m in the lap that follows; by TIMESYNC
     0.2 m (`test_late_link`)."""
     furthest_m = []
-    for seed in (1, 2, 3, 4):
+    for seed in (1, 2, 3):
         pair = on_a_link_that_changes(lambda: 0.2, seed)
         assert pair.fly().exit_code == 0
         text = " | ".join(pair.companion.announced)
