@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import html
 import itertools
-import math
 from collections.abc import Sequence
 
 import plotly.graph_objects as go
@@ -12,7 +11,7 @@ from plotly.subplots import make_subplots
 
 from offboard.analysis.compare import EQUAL_SHARE, FIGURES, Row
 from offboard.analysis.compare_table import digits
-from offboard.analysis.figure import PALETTE, RED, Figure, coordinates, listed
+from offboard.analysis.figure import PALETTE, RED, Figure, coordinates, listed, logarithmic
 from offboard.analysis.page import render
 
 PANELS = {  # figure of the score: title of its panel
@@ -30,8 +29,6 @@ CAPTION = (
     f"of an ideal vehicle. Filled and bold: {BEST}"
 )
 NARROWEST_PX = 640
-_FEW_DECADES = 2
-_MARGIN_DECADES = 0.05  # beside the outermost ticks
 _ROW_PX, _TOP_PX = 18, 120  # _TOP_PX: tool bar, titles and numbers of the axes
 
 
@@ -69,7 +66,8 @@ def _figure(rows: Sequence[Row]) -> Figure:
         for column, name in enumerate(PANELS, 1):
             figure.add_trace(_dots(own, name, colour), row=1, col=column)
     for column, (name, title) in enumerate(PANELS.items(), 1):
-        figure.update_xaxes(_logarithmic(rows, name), title_text=title, col=column)
+        ends = [end for row in rows for end in (row.lowest[name], row.highest[name])]
+        figure.update_xaxes(logarithmic(ends), side="top", title_text=title, col=column)
     headed = [(_label(line), isinstance(line, str)) for line in lines]
     listed(figure, headed, _ROW_PX, _TOP_PX)
     return Figure("Position error and excess motion", figure, CAPTION, NARROWEST_PX)
@@ -94,21 +92,6 @@ def _label(line: Row | str) -> str:
         failed = f"{line.failed} of {line.flights} failed"
         name += f'  <span style="color: {RED}">{failed}</span>'
     return f"<b>{name}</b>" if line.best else name
-
-
-def _logarithmic(rows: Sequence[Row], name: str) -> dict[str, object]:
-    """A logarithmic axis above its panel, from tick to tick: 1, or 1, 2 and 5 of every decade."""
-    ends = [end for row in rows for end in (row.lowest[name], row.highest[name]) if end > 0.0]
-    least, greatest = min(ends, default=1.0), max(ends, default=1.0)
-    low, high = math.floor(math.log10(least)), math.ceil(math.log10(greatest))
-    steps = (1, 2, 5) if high - low <= _FEW_DECADES else (1,)
-    ticks = [float(f"{step}e{power}") for power in range(low, high + 1) for step in steps]
-    first = max((at for at in ticks if at <= least), default=ticks[0])
-    last = min((at for at in ticks if at >= greatest), default=ticks[-1])
-    return {
-        "type": "log", "side": "top", "tickvals": ticks, "ticktext": [f"{at:g}" for at in ticks],
-        "range": [math.log10(first) - _MARGIN_DECADES, math.log10(last) + _MARGIN_DECADES],
-    }  # fmt: skip
 
 
 def _dots(own: Sequence[tuple[Row, int]], name: str, colour: str) -> go.Scatter:

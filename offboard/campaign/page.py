@@ -10,7 +10,7 @@ import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
 from offboard.analysis.compare_table import digits
-from offboard.analysis.figure import BLUE, PALETTE, Figure, coordinates, listed
+from offboard.analysis.figure import BLUE, PALETTE, Figure, coordinates, listed, logarithmic
 from offboard.analysis.page import render
 from offboard.campaign.statistics import Group
 from offboard.campaign.table import Row
@@ -23,9 +23,10 @@ PANELS = {
 }
 CAPTION = (
     "Success: completed, with every requirement met; line: 95 % interval (Wilson). Boxes: "
-    "quartiles over seeds and draws; dots: single flights outside. Margin: 1 nothing of a promise "
-    "used, 0 broken, -1 not completed, -2 not flown."
+    "quartiles over seeds and draws; dots: single flights outside. Margin: the least distance to "
+    "a limit (promises), as a share of it; 0 at a limit, -1 not completed, -2 not flown."
 )
+NARROWEST_PX = 800
 _ROW_PX, _TOP_PX = 26, 110
 
 
@@ -70,7 +71,7 @@ def _figure(groups: Sequence[Group]) -> Figure:
             lines.append(group.scenario)
         lines.append(group)
     figure = make_subplots(
-        cols=len(PANELS), shared_yaxes=True, column_widths=(0.3, 0.4, 0.3), horizontal_spacing=0.05
+        cols=len(PANELS), shared_yaxes=True, column_widths=(0.3, 0.4, 0.3), horizontal_spacing=0.07
     )
     placed = [(at, line) for at, line in enumerate(lines) if isinstance(line, Group)]
     figure.add_trace(_success(placed), row=1, col=1)
@@ -82,10 +83,11 @@ def _figure(groups: Sequence[Group]) -> Figure:
                 figure.add_trace(_box(at, group, name, colour), row=1, col=column)
         figure.update_xaxes(title_text=PANELS[name], side="top", row=1, col=column)
     figure.update_xaxes(range=[-0.03, 1.03], tickformat=".0%", row=1, col=1)
-    figure.update_xaxes(type="log", row=1, col=2)
+    errors = [value for group in groups for value in group.values("rmse_position_m")]
+    figure.update_xaxes(logarithmic(errors), row=1, col=2)
     headed = [(_label(line), isinstance(line, str)) for line in lines]
     listed(figure, headed, _ROW_PX, _TOP_PX)
-    return Figure("Success, error and margin", figure, CAPTION, 640)
+    return Figure("Success, error and margin", figure, CAPTION, NARROWEST_PX)
 
 
 def _scenario(line: Group | str) -> str:
