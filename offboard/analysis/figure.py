@@ -6,6 +6,7 @@ Contains what the figures of several pages share, not what any of them shows.
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -32,6 +33,8 @@ DARK = {
 }  # fmt: skip
 
 _TOP_PX, _BOTTOM_PX, _PANEL_PX, _GAP_PX = 48, 90, 150, 36
+_FEW_DECADES = 2  # of a logarithmic axis with ticks at 2 and 5
+_MARGIN_DECADES = 0.05  # beside its outermost ticks
 _AXIS = {
     "gridcolor": GRID, "zerolinecolor": GRID, "linecolor": GREY, "showline": True,
     "ticks": "outside", "tickcolor": GREY, "automargin": True, "exponentformat": "power",
@@ -104,6 +107,22 @@ def listed(figure: go.Figure, lines: Sequence[tuple[str, bool]], row_px: int, to
         template=STYLE, height=top_px + row_px * len(lines) + 10, showlegend=False,
         margin={"t": top_px, "b": 10},
     )  # fmt: skip
+
+
+def logarithmic(values: Sequence[float]) -> dict[str, Any]:
+    """A logarithmic axis from tick to tick around the positive values: 1, or 1, 2 and 5 of every
+    decade."""
+    known = [value for value in values if value > 0.0]
+    least, greatest = min(known, default=1.0), max(known, default=1.0)
+    low, high = math.floor(math.log10(least)), math.ceil(math.log10(greatest))
+    steps = (1, 2, 5) if high - low <= _FEW_DECADES else (1,)
+    ticks = [float(f"{step}e{power}") for power in range(low, high + 1) for step in steps]
+    first = max((at for at in ticks if at <= least), default=ticks[0])
+    last = min((at for at in ticks if at >= greatest), default=ticks[-1])
+    return {
+        "type": "log", "tickvals": ticks, "ticktext": [f"{at:g}" for at in ticks],
+        "range": [math.log10(first) - _MARGIN_DECADES, math.log10(last) + _MARGIN_DECADES],
+    }  # fmt: skip
 
 
 def curve(

@@ -4,22 +4,20 @@ from __future__ import annotations
 
 import html
 import itertools
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import plotly.graph_objects as go
 from plotly.subplots import make_subplots
 
-from offboard.analysis.figure import PALETTE, RED, Figure, coordinates, listed
+from offboard.analysis.figure import PALETTE, RED, Figure, coordinates, listed, logarithmic
 from offboard.analysis.page import render
 from offboard.campaign.statistics import BEST, ERROR, Group, digits
 from offboard.campaign.table import Row
 
 WORST_SHOWN = 20
-NARROWEST_PX = 640
-_FEW_DECADES = 2
-_MARGIN_DECADES = 0.05  # beside the outermost ticks
+NARROWEST_PX = 800
 _ROW_PX, _TOP_PX = 22, 120  # _TOP_PX: tool bar, titles and numbers of the axes
 
 
@@ -43,8 +41,8 @@ CAMPAIGN = Contents(
     (ERROR, "max_position_m", "margin"),
     "5 %–95 %",
     "Success: completed, with every requirement met; line: 95 % interval (Wilson). Boxes: "
-    "quartiles over seeds and draws; dots: single flights outside. Margin: 1 nothing of a promise "
-    "used, 0 broken, -1 not completed, -2 not flown.",
+    "quartiles over seeds and draws; dots: single flights outside. Margin: the least distance to "
+    "a limit (promises), as a share of it; 0 at a limit, -1 not completed, -2 not flown.",
     boxes=True,
 )
 COMPARISON = Contents(
@@ -106,7 +104,7 @@ def _figure(groups: Sequence[Group], contents: Contents) -> Figure:
     for scenario, block in itertools.groupby(groups, lambda group: group.scenario):
         lines += [scenario, *block]
     figure = make_subplots(
-        cols=len(contents.panels), shared_yaxes=True, horizontal_spacing=0.06,
+        cols=len(contents.panels), shared_yaxes=True, horizontal_spacing=0.07,
         column_widths=[2 if name == ERROR else 1 for name in contents.panels],
     )  # fmt: skip
     placed = [(at, line) for at, line in enumerate(lines) if isinstance(line, Group)]
@@ -131,24 +129,13 @@ def _label(line: Group | str) -> str:
     return f"<b>{name}</b>" if line.best else name
 
 
-def _axis(groups: Sequence[Group], name: str) -> dict[str, object]:
-    """The axis of a panel. Of a figure: logarithmic, from tick to tick, 1, or 1, 2 and 5 of every
-    decade."""
+def _axis(groups: Sequence[Group], name: str) -> dict[str, Any]:
+    """The axis of a panel; logarithmic for a figure of the score."""
     if name == "success":
         return {"range": [-0.03, 1.03], "tickformat": ".0%"}
     if name == "margin":
         return {}
-    values = [value for group in groups for value in group.values(name) if value > 0.0]
-    least, greatest = min(values, default=1.0), max(values, default=1.0)
-    low, high = math.floor(math.log10(least)), math.ceil(math.log10(greatest))
-    steps = (1, 2, 5) if high - low <= _FEW_DECADES else (1,)
-    ticks = [float(f"{step}e{power}") for power in range(low, high + 1) for step in steps]
-    first = max((at for at in ticks if at <= least), default=ticks[0])
-    last = min((at for at in ticks if at >= greatest), default=ticks[-1])
-    return {
-        "type": "log", "tickvals": ticks, "ticktext": [f"{at:g}" for at in ticks],
-        "range": [math.log10(first) - _MARGIN_DECADES, math.log10(last) + _MARGIN_DECADES],
-    }  # fmt: skip
+    return logarithmic([value for group in groups for value in group.values(name)])
 
 
 def _dot(at: int, group: Group, name: str, colour: str) -> go.Scatter:

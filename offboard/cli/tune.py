@@ -9,7 +9,7 @@ from typing import Annotated
 import typer
 
 from offboard.cli.campaign import ENDED
-from offboard.cli.shared import CommandError, Workers, option, out, say
+from offboard.cli.shared import CommandError, Workers, check_new, option, out, say
 
 NAME = typer.Argument(metavar="NAME|FILE", help="Tuning: a shipped name or a file.")
 
@@ -27,8 +27,7 @@ def tune(
     the result. It is written only if it is better with 95 % confidence. Study and results are in a
     folder beside it: the same command goes on. The shipped tuning shows all keys of the file.
     """
-    if profile.exists():
-        raise CommandError(f"{profile} exists; choose another file with --out")
+    check_new(profile, "--out")
     with out.status("planning"):
         from offboard.campaign.code import code_hash
         from offboard.campaign.evaluate import Evaluator, Interrupted

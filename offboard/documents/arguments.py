@@ -28,6 +28,11 @@ def split_address(option: str, address: str) -> tuple[str, int]:
     return matched[1] or matched[2] or LOCAL, int(matched[3])
 
 
+def join_address(host: str, port: int) -> str:
+    """HOST:PORT, as a URL has it."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
 class Command(TyperCommand):
     """A command whose values are neither empty nor options nor bytes that are no text.
 

@@ -64,7 +64,7 @@ def sentence(detail: ErrorDetails, document: Any, schema: Schema) -> str:
     _, separator, allowed = detail["msg"].partition(" should ")
     where = f"{path}: " if path else ""
     if separator:
-        return f"{where}{value} should {allowed}"
+        return f"{where}{value} should {allowed.replace(' after validation', '')}"
     return f"{where}{detail['msg'].removeprefix('Value error, ')}"
 
 

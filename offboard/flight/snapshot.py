@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.flight.assessment import position_error_m
+from offboard.flight.phases import TRACKING
 from offboard.flight.state import FlightState, Triple
 from offboard.model.command import Command
 
@@ -37,7 +38,7 @@ class Snapshot:
     position_ned_m: Triple | None
     velocity_ned_mps: Triple | None
     attitude: tuple[float, float, float, float] | None  # quaternion (w, x, y, z), NED to FRD
-    reference_ned_m: Triple | None
+    reference_ned_m: Triple | None  # from the climb to the landing, as is the error
     position_error_m: float
     thrust_mps2: float  # of the command in force, as are direction and course
     thrust_direction_ned: Triple
@@ -64,7 +65,7 @@ def snapshot_of(
     """The snapshot of this moment. Changes nothing."""
     vehicle, worst = state.vehicle, state.ladder.worst
     position, attitude = vehicle.position, vehicle.attitude
-    sample = state.plan.sample(position.time_s) if position else None
+    sample = state.plan.sample(position.time_s) if position and state.phase in TRACKING else None
     link = state.link.estimate
     charge = vehicle.health.battery_remaining if vehicle.health else None
     return Snapshot(

@@ -16,6 +16,7 @@ from typing import Any
 
 from aiohttp import web
 
+from offboard.documents.arguments import join_address
 from offboard.live.values import line
 
 KEPT = 3000  # snapshots, five minutes
@@ -89,13 +90,14 @@ async def serve(host: str, port: int) -> None:
         site = web.TCPSite(runner, host, port)
         await site.start()
         bound = runner.addresses[0][1]
-        name = f"[{host}]" if ":" in host else host
-        print(json.dumps({"url": f"http://{name}:{bound}"}), flush=True)
+        print(json.dumps({"url": f"http://{join_address(host, bound)}"}), flush=True)
         await _read(broadcast)
         broadcast.end()
         await asyncio.sleep(0.1)  # the clients take their last event
     except OSError as error:
-        reason = f"{host}:{port} cannot be listened on ({os.strerror(error.errno or 0)})"
+        reason = (
+            f"{join_address(host, port)} cannot be listened on ({os.strerror(error.errno or 0)})"
+        )
         print(json.dumps({"error": f"{reason}; choose another address"}), flush=True)
     finally:
         await runner.cleanup()

@@ -44,10 +44,12 @@ PANEL_PX = 120
 LEFT_PX = 75  # beside the panels, the same in all figures: their time axes stand below each other
 DECADES_SHOWN = 4  # numbers on a logarithmic axis
 ROW_PX = 34  # of the timeline
-_CAPTIONS = {
-    "tracking": "The reference is known from the climb to the landing.",
-    "decisions": "Zero is drawn at 1e-16. Only decisions that were sent as certified have a gap.",
-    "identification": "Bars: one standard deviation.",
+_CAPTIONS = {  # by the panel that they explain
+    "distance from the reference, m": "The reference is known from the climb to the landing.",
+    "gap: cost above the exact optimum": (
+        "Zero is drawn at 1e-16. Only decisions that were sent as certified have a gap."
+    ),
+    "identified delay, ms": "Bars: one standard deviation.",
 }
 
 
@@ -84,9 +86,7 @@ def figures(flights: Sequence[Flight]) -> dict[str, Figure]:
     drawn = lanes(flights)
     found = {"path": _path(drawn), "timeline": _timeline(drawn)}
     for name, (title, panels_of) in GROUPS.items():
-        found[name] = _panels(
-            name, title, [(lane, panels_of(lane.flight.history)) for lane in drawn]
-        )
+        found[name] = _panels(title, [(lane, panels_of(lane.flight.history)) for lane in drawn])
     return {name: figure for name, figure in found.items() if figure is not None}
 
 
@@ -111,9 +111,9 @@ def _path(drawn: Sequence[Lane]) -> Figure | None:
     if not figure.data:
         return None
     scene = {
-        "xaxis_title": "north, m", "yaxis_title": "east, m", "zaxis_title": "height, m",
-        "aspectmode": "data",
-        "camera": {"eye": {"x": -1.8, "y": -1.5, "z": 1.0}, "center": {"x": 0, "y": 0, "z": -0.15}},
+        "xaxis_title": "east, m", "yaxis_title": "north, m", "zaxis_title": "height, m",
+        "aspectmode": "data", "xaxis_nticks": 5, "yaxis_nticks": 5, "zaxis_nticks": 5,
+        "camera": {"eye": {"x": -1.5, "y": -1.8, "z": 1.0}, "center": {"x": 0, "y": 0, "z": -0.15}},
     }  # fmt: skip
     figure.update_layout(
         template=STYLE, height=520, scene=scene, margin={"l": 0, "r": 0, "t": 36, "b": 40},
@@ -126,8 +126,8 @@ def _path(drawn: Sequence[Lane]) -> Figure | None:
 def _path_of(rows: NDArray[np.float64], name: str, colour: str, dash: str) -> go.Scatter3d:
     chosen = rows[np.linspace(0, len(rows) - 1, min(len(rows), PATH_POINTS)).astype(int)]
     north, east, down = chosen[:, 1:4].T
-    return go.Scatter3d(
-        x=coordinates(north), y=coordinates(east), z=coordinates(-down), mode="lines",
+    return go.Scatter3d(  # east, north, up: right-handed, as plotly draws them
+        x=coordinates(east), y=coordinates(north), z=coordinates(-down), mode="lines",
         name=html.escape(name), line={"color": colour, "width": 4, "dash": dash},
     )  # fmt: skip
 
@@ -163,7 +163,7 @@ def _timeline(drawn: Sequence[Lane]) -> Figure | None:
         range=[-0.6, len(rows) - 0.4], automargin=False,
     )  # fmt: skip
     figure.update_xaxes(title_text=_axis_title(drawn), range=_extent(drawn))
-    return Figure("Timeline", figure, "The text of a mark is shown where the pointer is on it.")
+    return Figure("Timeline", figure, "Point at a band or a mark to read its text.")
 
 
 def _add_bands(figure: go.Figure, row: str, bands: Sequence[timeline.Band], zero_s: float) -> None:
@@ -203,7 +203,7 @@ def _add_marks(figure: go.Figure, row: str, marks: Sequence[timeline.Mark], zero
 # ---------------------------------------------------------------------- panels
 
 
-def _panels(name: str, title: str, flown: Sequence[tuple[Lane, Sequence[Panel]]]) -> Figure | None:
+def _panels(title: str, flown: Sequence[tuple[Lane, Sequence[Panel]]]) -> Figure | None:
     """One group of panels, for each flight the curves that it has."""
     by_title: dict[str, list[tuple[Lane, Panel]]] = {}
     for lane, group in flown:
@@ -229,7 +229,9 @@ def _panels(name: str, title: str, flown: Sequence[tuple[Lane, Sequence[Panel]]]
     figure.update_xaxes(range=_extent([lane for lane, _ in flown]))
     figure.update_yaxes(automargin=False, exponentformat="e")
     figure.update_layout(margin_l=LEFT_PX)
-    return Figure(title, figure, _CAPTIONS.get(name, ""))
+    return Figure(
+        title, figure, " ".join(_CAPTIONS[each] for each in by_title if each in _CAPTIONS)
+    )
 
 
 def _logarithmic(shown: Sequence[Panel]) -> dict[str, Any]:

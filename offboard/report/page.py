@@ -86,5 +86,7 @@ def _difference(values: Sequence[float]) -> str:
     change = second - first
     if not math.isfinite(change):
         return "–"
+    if abs(change) < 1e-9 * abs(first):  # rounding
+        return "0"
     share = f" ({100 * change / abs(first):+.0f} %)" if first and abs(change / first) < 10 else ""
     return f"{change:+.3g}{share}" if change else "0"

@@ -96,9 +96,11 @@ def attitude(flown: History) -> tuple[Panel, ...]:
 
 
 def thrust(flown: History) -> tuple[Panel, ...]:
-    """Thrust commanded, and the hover thrust that the observer believes."""
+    """Thrust commanded, and the hover thrust that the observer estimates."""
     commanded = Curve(COMMANDED, flown.setpoint[:, 0], flown.setpoint[:, 6], ORANGE, "steps")
-    hover = _recorded(flown, "hover_thrust", "hover thrust, believed", INK, main=False, dash="dash")
+    hover = _recorded(
+        flown, "hover_thrust", "hover thrust, estimated", INK, main=False, dash="dash"
+    )
     return (Panel("thrust, 0 to 1", (commanded, hover)),)
 
 
@@ -137,14 +139,14 @@ def link(flown: History) -> tuple[Panel, ...]:
 
 
 def identification(flown: History) -> tuple[Panel, ...]:
-    """What was identified, with its standard deviation, and what the observer believes."""
+    """What was identified, with its standard deviation, and what the observer estimates."""
 
     def found(column: int, name: str, colour: str, scale: float = 1.0, main: bool = True) -> Curve:
         rows = flown.identified[np.isfinite(flown.identified[:, column])]
         value, sd = scale * rows[:, column], scale * rows[:, column + 1]
         return Curve(name, rows[:, 0], value, colour, "dots", main, sd=sd)
 
-    hover = _recorded(flown, "hover_thrust", "believed", PURPLE, main=False)
+    hover = _recorded(flown, "hover_thrust", ESTIMATED, PURPLE, main=False)
     disturbance = tuple(
         _recorded(flown, f"disturbance_{axis}_mps2", axis, colour, main=False, dash=dash)
         for axis, (colour, dash) in _AXES.items()
@@ -160,7 +162,7 @@ def identification(flown: History) -> tuple[Panel, ...]:
         ),
         Panel("hover thrust, 0 to 1", (found(13, "identified", INK), hover)),
         Panel("identified drag, 1/s", (found(19, "drag", BLUE),)),
-        Panel("believed disturbance, m/s²", disturbance),
+        Panel("estimated disturbance, m/s²", disturbance),
     )
 
 
@@ -170,7 +172,7 @@ GROUPS: dict[str, tuple[str, Callable[[History], tuple[Panel, ...]]]] = {
     "thrust": ("Thrust", thrust),
     "decisions": ("Decisions", decisions),
     "link": ("Link", link),
-    "identification": ("Identified and believed", identification),
+    "identification": ("Identified and estimated", identification),
 }
 _AXES = {"north": (GREEN, "solid"), "east": (PINK, "dash"), "down": (INK, "dot")}
 

@@ -22,6 +22,7 @@ from offboard.analysis.score import Score
 from offboard.cli.commands import app
 from offboard.flight.phases import Phase
 from offboard.report import page as report_page
+from offboard.report.figures import figures
 from offboard.report.flight import read
 from offboard.report.page import page
 from offboard.report.panels import thinned
@@ -86,6 +87,16 @@ def test_the_curves_are_those_of_the_score(opened: Opened, flown: tuple[Pair, Pa
     _, thrust = opened.page.evaluate(CURVE, ["thrust", "commanded"])
     assert len(thrust) == len(pair.setpoints)
     np.testing.assert_allclose(thrust, [m.thrust for _, _, m in pair.setpoints], atol=1e-6)
+
+
+def test_the_path_is_no_mirror_image() -> None:
+    """The axes of a scene are right-handed: east, north, up."""
+    flight = read(PX4)
+    (curve,) = figures([flight])["path"].drawing.data
+    north, east, down = flight.history.position[[0, -1], 1:4].T
+    ends = [[axis[0], axis[-1]] for axis in (curve.x, curve.y, curve.z)]
+    assert np.array(ends) == pytest.approx(np.array([east, north, -down]))
+    assert figures([flight])["tracking"].caption == ""  # which has no reference
 
 
 def test_bands_are_the_phases_that_were_flown(flown: tuple[Pair, Path, Score]) -> None:

@@ -42,6 +42,8 @@ def test_snapshots_agree_with_the_wire() -> None:
     )
     last = pair.companion.snapshot()
     assert (last.phase, last.armed) == ("disarmed", False)
+    followed = {each[1].phase for each in seen if each[1].reference_ned_m is not None}
+    assert followed == {"climb", "track", "hover"}
     assert last.texts[-1] == pair.companion.announced[-1]
 
 

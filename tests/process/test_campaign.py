@@ -206,7 +206,10 @@ def test_an_infeasible_case_is_a_row_with_its_reason(tmp_path: Path) -> None:
     ("change", "sentence"),
     [
         (("controllers: [lqr]", "controlers: [lqr]"), "did you mean controllers?"),
-        (("controllers: [lqr]", "controllers: []"), "controllers: [] should have at least 1 item"),
+        (
+            ("controllers: [lqr]", "controllers: []"),
+            "controllers: [] should have at least 1 item, not 0",
+        ),
         (("[lqr]", "[lqg]"), "there is no controller named 'lqg'"),
         (("identify.excite", "identify.exite"), "identify.exite is not a known key"),
         (("conditions.mass_scale", "conditions.mass"), "conditions.mass is not a known key"),

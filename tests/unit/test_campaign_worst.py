@@ -193,19 +193,20 @@ def test_the_page_shows_groups_and_worst_flights_without_a_network(tmp_path: Pat
             Record(
                 4 * (seed == 3), "aborted <b>here</b>" if seed == 3 else "flown and landed",
                 -1.0 if seed == 3 else 0.9, "error",
-                {"rmse_position_m": 0.01 * seed, "max_position_m": 0.02 * seed},
+                {"rmse_position_m": seed * error_m, "max_position_m": 0.02 * seed},
             ),
             (),
         )
-        for scenario in ("calm", "px4_like")
+        for scenario, error_m in (("calm", 1e-5), ("px4_like", 0.01))
         for seed in range(1, 7)
     ]  # fmt: skip
     file = tmp_path / "campaign.html"
     file.write_text(page(groups(rows), CAMPAIGN, ["2 of 14 flights"], {}), encoding="utf-8")
     with opening(file, width=400) as opened:
-        assert opened.width_px() == 400
-        assert opened.unreadable() == []
-        assert opened.problems == []
+        for width in (1280, 400):
+            opened.resize(width)
+            assert opened.width_px() == width
+            assert opened.unreadable() == opened.colliding() == opened.problems == []
         told = opened.page.inner_text("main")
     for words in ("10 of 12 flights", "5 of 6", "aborted <b>here</b>", "--seed 3", "2 of 14"):
         assert words in told, words

@@ -1,6 +1,8 @@
 // Fills the page from server-sent events; draws at most twice a second.
 const KEPT = 3000;
 let rows = [], newest = null, changed = false;
+const AUTHORITY = {free: "not asked", asked: "asked", ours: "offboard", handed: "handed over",
+  lost: "given up"}; // as on the timeline of a report
 const $ = (name) => document.getElementById(name);
 const number = (value, digits, unit, scale = 1) =>
   value === null ? "–" : `${(scale * value).toFixed(digits)} ${unit}`;
@@ -9,7 +11,7 @@ function tell() {
   $("phase").textContent = `${newest.phase}, ${number(newest.in_phase_s, 1, "s")}`;
   $("time").textContent = number(newest.time_s, 1, "s");
   $("mode").textContent = `${newest.mode || "unknown"}, ${newest.armed ? "armed" : "disarmed"}`;
-  $("authority").textContent = newest.authority;
+  $("authority").textContent = AUTHORITY[newest.authority] ?? newest.authority;
   $("ladder").textContent = newest.rung + (newest.rung_reason ? `: ${newest.rung_reason}` : "");
   $("error").textContent = number(newest.position_error_m, 3, "m");
   $("age").textContent = number(newest.telemetry_age_s, 0, "ms", 1e3);
@@ -23,7 +25,9 @@ function tell() {
   }));
 }
 
-const column = (name, axis) => rows.map((row) => row[name]?.[axis] ?? null);
+// in tenths of a millimetre: a vehicle at rest has no axis of nanometres
+const column = (name, axis) => rows.map((row) =>
+  row[name] ? Math.round(1e4 * row[name][axis]) / 1e4 : null);
 function redraw() {
   if (!changed || !newest) return;
   changed = false;
