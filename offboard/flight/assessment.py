@@ -14,15 +14,14 @@ from offboard.estimation.observer import Observer
 from offboard.flight.authority import Standing
 from offboard.flight.facts import Facts
 from offboard.flight.online_identification import OnlineIdentification
-from offboard.flight.phases import TRACKING, Phase
+from offboard.flight.phases import Phase
 from offboard.flight.state import FlightState
-from offboard.mavlink.events import Heartbeat, OtherCompanion, OtherSender, ThrustReport
+from offboard.mavlink.events import Heartbeat, OtherCompanion, OtherSender
 from offboard.mavlink.session import Session
 from offboard.model.frames import thrust_direction_from_quaternion
 
 TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
 MINIMUM_TELEMETRY_HZ = 10.0
-OTHER_SETPOINTS_S = 1.0  # age of an ATTITUDE_TARGET that counts
 OTHER_SENDER_S = 5.0  # a second sender is there for so long after its newest frame
 ARMING_SHOWN_S = 2.5  # HEARTBEAT, at 1 Hz, shows an accepted arming within this time
 READIED = (Phase.HEALTH, Phase.STANDBY)  # phases in which readiness is judged
@@ -81,7 +80,6 @@ def facts(
         position_jump_m=state.jumps.recent_m(time_s),
         battery=1.0 if charge is None else charge,
         other_sender=_hears_other_sender(state),
-        other_setpoints=_flies_other_setpoints(state),
         other_vehicle=session.autopilots.ambiguous(state.now_s),
         disarmed_again=_disarmed_again(state),
         lifted_by_command=state.takes_off_by_command,
@@ -103,11 +101,6 @@ def has_other_sender(state: FlightState) -> bool:
 
 def _hears_other_sender(state: FlightState) -> bool:
     return state.vehicle.age_s(OtherSender) < OTHER_SENDER_S
-
-
-def _flies_other_setpoints(state: FlightState) -> bool:
-    fresh = state.vehicle.age_s(ThrustReport) < OTHER_SETPOINTS_S
-    return state.other_setpoints and fresh and state.phase in TRACKING
 
 
 def figures(

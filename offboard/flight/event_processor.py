@@ -16,7 +16,7 @@ from offboard.flight.phases import TRACKING, WAITING
 from offboard.flight.position_jumps import PositionJumps
 from offboard.flight.readiness import Readiness
 from offboard.flight.requests import Circumstances, Request, Result, answer
-from offboard.flight.state import SAME_THRUST, FlightState
+from offboard.flight.state import FlightState
 from offboard.mavlink.dialects.base import ThrustRule
 from offboard.mavlink.events import (
     Attitude,
@@ -78,7 +78,6 @@ class EventProcessor:
                 self._on_position(event)
             case ThrustReport(thrust):
                 state.hover.on_thrust(state.time_s, thrust, thrust * self._lifting_share())
-                state.other_setpoints = self._is_of_other_setpoint(thrust)
             case Heartbeat(mode) | ModeReport(mode):
                 self._on_mode(event, mode, arrived_s)
             case TimesyncReply(vehicle_ns=vehicle_ns):
@@ -100,15 +99,6 @@ class EventProcessor:
                 )
             case Rebooted():
                 self._on_reboot()
-
-    def _is_of_other_setpoint(self, thrust: float) -> bool:
-        """Whether the vehicle demands a thrust that none of the newest setpoints had. ArduCopter
-        reports another thrust than it was sent."""
-        state = self._state
-        if state.dialect is None or state.dialect.thrust_rule is not ThrustRule.COLLECTIVE:
-            return False
-        full = len(state.thrusts) == state.thrusts.maxlen
-        return full and all(abs(thrust - each) > SAME_THRUST for each in state.thrusts)
 
     def _lifting_share(self) -> float:
         """Vertical part of the thrust that the autopilot reports: the cosine of the tilt, unless it

@@ -51,7 +51,6 @@ class Facts:
     position_jump_m: float = 0.0  # of the reported position, all of the last ten seconds
     battery: float = 1.0
     other_sender: bool = False
-    other_setpoints: bool = False  # in its reports, while it should follow ours
     other_vehicle: bool = False  # several vehicles were heard, and none was chosen
     disarmed_again: bool = False  # after arming was accepted
     lifted_by_command: bool = False  # the autopilot takes off on a command, without setpoints

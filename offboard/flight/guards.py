@@ -48,11 +48,6 @@ def other_sender(now: Facts) -> bool:
     return now.other_sender and not now.limits.begin_with_other_sender
 
 
-def other_setpoints(now: Facts) -> bool:
-    """The vehicle follows setpoints of another program, in the mode that we asked for."""
-    return now.engaged and now.other_setpoints and not now.limits.begin_with_other_sender
-
-
 def other_vehicle(now: Facts) -> bool:
     """Several vehicles are heard: which one is meant?"""
     return now.other_vehicle

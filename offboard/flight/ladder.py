@@ -174,15 +174,6 @@ ROWS = (
         "another program controls the vehicle on this link, too: {other_sender}",
     ),
     LadderRow(
-        "other setpoints",
-        "thrust of the setpoint that PX4 follows (ATTITUDE_TARGET): none of the newest 20 of ours",
-        "1e-5",
-        guards.other_setpoints,
-        1.5,  # longer than HEARTBEAT takes to show that a pilot has taken over
-        Rung.HOLD,
-        "the vehicle flies other setpoints than ours{companion}",
-    ),
-    LadderRow(
         "clock",
         "jump of the vehicle's clock",
         "0.5 s",

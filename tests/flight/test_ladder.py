@@ -101,17 +101,6 @@ def test_a_second_sender(allowed: bool, rung: Rung) -> None:
     assert rungs(replace(QUIET, other_sender=True, limits=limits)) == [rung]
 
 
-@pytest.mark.parametrize(
-    ("engaged", "allowed", "rung"),
-    [(True, False, Rung.HOLD), (False, False, Rung.FLY), (True, True, Rung.FLY)],
-)
-def test_other_setpoints_than_ours(engaged: bool, allowed: bool, rung: Rung) -> None:
-    """Only while the vehicle is in our mode; allowed like a second sender."""
-    limits = Limits(begin_with_other_sender=allowed)
-    now = replace(QUIET, other_setpoints=True, engaged=engaged, limits=limits)
-    assert rungs(now, *[now] * 15)[-1] == rung
-
-
 def test_time_that_steps_back_counts_for_nothing() -> None:
     ladder = Ladder()
     for time_s in (100.0, 100.1875, 100.375, 50.0, 50.125):
