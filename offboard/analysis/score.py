@@ -146,6 +146,10 @@ class Scoring:
     def score(self, flown: History) -> Score:
         """All figures. `flown`: the last stretch."""
         verdict = judge(flown, self._landing, self._tracking.skipped_s)
+        if verdict.completed == 1.0 and not self._tracked:
+            verdict = replace(
+                verdict, completed=0.0, ended_by="too short at full speed to be scored"
+            )
         values: dict[str, Any] = (
             self._tracking.figures() | self._link.figures(flown) | self._decisions.figures()
         )

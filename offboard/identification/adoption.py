@@ -23,7 +23,7 @@ BOUNDS = {
     "frequency": FREQUENCY_LIMITS_RADPS,
     "damping": DAMPING_LIMITS,
     "hover thrust": HOVER_THRUST_LIMITS,
-    "thrust lag": (0.0, 0.25),
+    "thrust lag": (0.0, 0.4),
     "thrust delay": (0.0, 0.5),
     "drag": (0.02, 3.0),
 }

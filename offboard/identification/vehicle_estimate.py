@@ -40,7 +40,8 @@ DECISIVE = ("tilt", "hover_thrust")  # out of bounds, these end the flight
 # After so many contradictions the bandwidth stays low until the estimate in use has explained the
 # flight for CALM_S.
 MOST_CONTRADICTIONS, CALM_S = 2, 20.0
-# Delay and lag of the thrust that are less certain than this would cost too much bandwidth
+# Delay and lag of the thrust that are less certain than this would cost too much bandwidth, unless
+# those in use are wrong by more
 THRUST_SD_S = 0.02
 LINKED = ("yaw", "thrust_delay_s")  # changed with the tilt's delay where not identified themselves
 # A later hover thrust that differs by less, as a share and in sds, is not adopted: gusts of 1 m/s
@@ -188,7 +189,9 @@ class VehicleEstimate:
         for name in DECISIVE:
             if getattr(found, name) is not None and getattr(within, name) is None:
                 self.contradiction = "; ".join(sentences)
-        if within.thrust_effect_s is not None and within.thrust_effect_s.sd > THRUST_SD_S:
+        effect = within.thrust_effect_s
+        in_use = Estimate(self.target.thrust_delay_s + self.target.thrust_lag_s, 0.0)
+        if effect and effect.sd > THRUST_SD_S and not _apart(effect, in_use):
             within = replace(within, thrust_lag_s=None, thrust_delay_s=None, thrust_effect_s=None)
         applied = within.applied_to(self.target)
         target = with_link_delay(within, applied, self._file)

@@ -38,6 +38,7 @@ LEAST_SECONDS = 2.0
 LEAST_SPEED_MPS, LEAST_THRUST_CHANGE = 0.4, 0.015
 # Greatest accepted standard deviations; of the hover thrust as a fraction of it.
 DRAG_SD_PS, HOVER_SD, EFFECT_SD_S = 0.2, 0.02, 0.03
+EFFECT_SD = 0.2  # or this fraction of a thrust's long delay and lag
 DRAG_PRIOR_PS = Estimate(0.6, 0.4)
 # A link adds the same to all delays. These are the sd of what remains of the delays of yaw and
 # thrust, of the thrust's lag, and of the link's delay while the tilt is not identified.
@@ -245,15 +246,16 @@ def _accepted_vertical(
         )
     thrust: Array = motion.thrust(fit.thrust_delay_s.value, fit.thrust_lag_s.value)
     moved = float(np.std(thrust)) / hover.value
+    most_s = max(EFFECT_SD_S, EFFECT_SD * fit.thrust_effect_s.value)
     if moved < LEAST_THRUST_CHANGE:
         refusals["thrust_lag_s"] = (
             f"the thrust changed by {100.0 * moved:.1f} % rms, {100.0 * LEAST_THRUST_CHANGE:.1f} % "
             "are needed: its lag shows in a climb"
         )
-    elif not fit.thrust_effect_s.sd <= EFFECT_SD_S:
+    elif not fit.thrust_effect_s.sd <= most_s:
         refusals["thrust_lag_s"] = (
             f"delay and lag of the thrust are uncertain: sd {fit.thrust_effect_s.sd:.2g} s, "
-            f"limit {EFFECT_SD_S} s"
+            f"limit {most_s:.2g} s"
         )
     else:
         names = ("thrust_lag_s", "thrust_delay_s", "thrust_effect_s")

@@ -21,6 +21,7 @@ from offboard.reference.path import Polynomial
 Array = NDArray[np.float64]
 
 ROWS_MIN = 4
+DURATION_MAX_S = 3600.0  # as that of a hover
 _NAMES = {
     "time_s": "time_s",
     "north_m": "north_m", "x": "north_m", "x_m": "north_m",
@@ -70,6 +71,10 @@ def parse(text: str, name: str) -> Table:
                 f"{name}, row {body[index][0]}, column time_s: {times[index]:.12g} does not "
                 f"come after {times[index - 1]:.12g}; times must increase"
             )
+    if times[-1] - times[0] > DURATION_MAX_S:
+        raise TableError(
+            f"{name} lasts {times[-1] - times[0]:.12g} s: at most {DURATION_MAX_S:.0f} s are flown"
+        )
     down = by_name["down_m"] if "down_m" in by_name else -by_name["altitude_m"]
     course = np.unwrap(np.radians(by_name["course_deg"])) if "course_deg" in by_name else None
     points = np.stack([by_name["north_m"], by_name["east_m"], down], axis=1)

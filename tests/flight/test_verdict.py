@@ -317,3 +317,15 @@ def test_a_flight_across_the_wrap_of_the_clock(flown: History, tmp_path: Path) -
     for rows in (again.position, again.reference, again.setpoint):
         assert np.diff(rows[:, 0]).min() >= 0.0
         assert np.diff(rows[:, 0]).max() < 1.0
+
+
+def test_stretch_that_is_too_short_to_be_scored_is_not_flown(tmp_path: Path) -> None:
+    """One tick at full speed has no figures of the tracking."""
+    table = tmp_path / "short.csv"
+    rows = "0,0,0,3\n0.7,0.1,0,3\n1.4,0,0,3\n2.04,0,0,3\n"
+    table.write_text(f"time_s,north_m,east_m,altitude_m\n{rows}")
+    pair = make(reference=str(table))
+    assert pair.fly().exit_code == 0
+    scored = pair.score(tmp_path)
+    assert math.isnan(scored.rmse_position_m)
+    assert (scored.completed, scored.ended_by) == (0.0, "too short at full speed to be scored")

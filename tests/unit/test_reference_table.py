@@ -131,3 +131,9 @@ BODY = "0,0,0,-2\n1,1,0,-2\n2,2,1,-2\n"
 def test_bad_tables_name_file_row_and_column(text: str, sentence: str) -> None:
     with pytest.raises(TableError, match=sentence):
         parse(text, "a.csv")
+
+
+def test_table_of_more_than_an_hour_is_refused():
+    rows = "".join(f"{1200.01 * i},0,0,3\n" for i in range(4))
+    with pytest.raises(TableError, match=r"^a\.csv lasts 3600\.03 s: at most 3600 s are flown$"):
+        parse("time_s,north_m,east_m,altitude_m\n" + rows, "a.csv")
