@@ -17,7 +17,7 @@ from offboard.campaign.statistics import BEST, ERROR, Group, digits
 from offboard.campaign.table import Row
 
 WORST_SHOWN = 20
-NARROWEST_PX = 800
+NARROWEST_PX = 960
 _ROW_PX, _TOP_PX = 22, 120  # _TOP_PX: tool bar, titles and numbers of the axes
 
 
@@ -104,7 +104,7 @@ def _figure(groups: Sequence[Group], contents: Contents) -> Figure:
     for scenario, block in itertools.groupby(groups, lambda group: group.scenario):
         lines += [scenario, *block]
     figure = make_subplots(
-        cols=len(contents.panels), shared_yaxes=True, horizontal_spacing=0.12,
+        cols=len(contents.panels), shared_yaxes=True, horizontal_spacing=0.07,
         column_widths=[2 if name == ERROR else 1 for name in contents.panels],
     )  # fmt: skip
     placed = [(at, line) for at, line in enumerate(lines) if isinstance(line, Group)]
