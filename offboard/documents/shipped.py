@@ -57,7 +57,7 @@ def locate(name: str, folder: str, kind: str, others: Sequence[str] = ()) -> Pat
         return Path(name)
     if name in names(folder):
         return directory() / folder / f"{name}.yaml"
-    known = sorted((*names(folder), *others))
+    known = sorted({*names(folder), *others})
     raise DocumentError(f"there is no {kind} named {shown(name)}; known are {', '.join(known)}")
 
 
