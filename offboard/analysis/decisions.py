@@ -46,9 +46,9 @@ class Decisions:
 
         late_ms, age_ms = 1e3 * known("lateness_s"), 1e3 * known("age_s")
         solve_ms, gap = 1e3 * known("solve_time_s"), known("gap")
-        # The gate, or a step, has changed a setpoint that has no certificate
+        # A setpoint without certificate was changed by the gate, in EXCITE perhaps by a step
         changed = np.isnan(columns["at_bound"]) & np.isfinite(columns["thrust_mps2"])
-        limited = changed & (refused == 0) & (columns["phase"] != PHASE_CODES[Phase.EXCITE])
+        limited = changed & (columns["phase"] != PHASE_CODES[Phase.EXCITE])
         at_bound = np.where(limited, 1.0, columns["at_bound"])
         return {
             "decisions": float(len(refused)),

@@ -115,8 +115,8 @@ class ConnectedVehicle:
         )
 
     def fly(self, jobs: Sequence[Job], ending: Callable[[], bool]) -> Iterator[tuple[Job, Record]]:
-        """Fly jobs, as a `Flyer` does, without one that the operator stops. Raises UserError where
-        a flight is the last one, though more were planned."""
+        """Fly jobs, as a `Flyer` does, without one that the operator stops. Raises UserError after
+        a flight that was refused or aborted."""
         for job in jobs:
             if ending():
                 return

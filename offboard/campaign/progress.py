@@ -39,8 +39,8 @@ class Counter(Progress):
         self._before: int | None = None  # flights that an earlier run has flown
 
     def count(self, done: int, planned: int, ended: str = "") -> None:
-        """`done` of at most `planned` flights have ended; 0 at the beginning. `ended`: a sentence
-        on the last one, which is then always a line."""
+        """`done` of at most `planned` flights have ended; 0 at the beginning. With `ended`, a
+        sentence on the last one, every flight is a line."""
         if done and self._before is None:
             self._before = done - 1
         own = done - (self._before or 0)

@@ -14,7 +14,7 @@ from offboard.estimation.observer import Observer
 from offboard.flight.authority import Standing
 from offboard.flight.facts import Facts
 from offboard.flight.online_identification import OnlineIdentification
-from offboard.flight.phases import Phase
+from offboard.flight.phases import TRACKING, Phase
 from offboard.flight.state import FlightState
 from offboard.mavlink.events import Heartbeat, OtherCompanion, OtherSender
 from offboard.mavlink.session import Session
@@ -79,7 +79,7 @@ def facts(
         clock_jump_s=state.clock.jumped_s,
         position_jump_m=state.jumps.recent_m(time_s),
         battery=1.0 if charge is None else charge,
-        hover_thrust=observer.hover_thrust_estimate,
+        hover_thrust=observer.hover_thrust_estimate if state.phase in TRACKING else math.nan,
         other_sender=_hears_other_sender(state),
         other_vehicle=session.autopilots.ambiguous(state.now_s),
         disarmed_again=_disarmed_again(state),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from offboard.flight.phases import Limits, Rung
@@ -50,7 +51,7 @@ class Facts:
     clock_jump_s: float = 0.0
     position_jump_m: float = 0.0  # of the reported position, all of the last ten seconds
     battery: float = 1.0
-    hover_thrust: float = 0.0  # normalised, as it is now
+    hover_thrust: float = math.nan  # normalised, as setpoints that are followed show it now
     other_sender: bool = False
     other_vehicle: bool = False  # several vehicles were heard, and none was chosen
     disarmed_again: bool = False  # after arming was accepted

@@ -19,7 +19,7 @@ from offboard.identification.adoption import log_record
 from offboard.identification.attitude_fit import unexplained
 from offboard.identification.excitation import LENGTH_S, excited
 from offboard.identification.learned import Learned
-from offboard.identification.trace import Recorder
+from offboard.identification.trace import Recorder, Trace
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import OUT_OF_BOUNDS, VehicleEstimate
 from offboard.identification.vehicle_fit import (
@@ -353,22 +353,22 @@ class OnlineIdentification:
     def _identify_hover(self) -> Work:
         """Follow the hover thrust, which a load or an empty battery changes."""
         self._hover_at_s = self._time_s
-        begin_s = max(self._time_s - HOVER_OVER_S, self._in_doubt_from_s)
-        trace = self._recorder.trace(begin_s, self._time_s)
-        found = identify_hover(trace, self._estimate.target)
+        found = identify_hover(self._flown(HOVER_OVER_S), self._estimate.target)
         sentences = self._estimate.review_hover(found, self._time_s)
         if sentences:
             self._sentences += sentences
             self._record = log_record(found)
         yield
 
+    def _flown(self, over_s: float) -> Trace:
+        """The last `over_s`, without the lift-off and what came before a contradiction."""
+        begin_s = max(self._climb_s + LIFTED_OFF_S, self._time_s - over_s, self._in_doubt_from_s)
+        return self._recorder.trace(begin_s, self._time_s)
+
     def _identify_tilt(self) -> Work:
         """Identify the tilt from the last seconds, and adopt it if it is better."""
         self._tilt_at_s = self._time_s
-        begin_s = max(
-            self._climb_s + LIFTED_OFF_S, self._time_s - TILT_OVER_S, self._in_doubt_from_s
-        )
-        trace = self._recorder.trace(begin_s, self._time_s)
+        trace = self._flown(TILT_OVER_S)
         found = yield from identify_tilt(trace)
         before = self._estimate.delay
         now = unexplained(trace, self._estimate.target.tilt)

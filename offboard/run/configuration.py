@@ -97,23 +97,30 @@ def load(
 
 
 def build_track(config: FlightConfig) -> Track:
-    """The configured reference, checked against the vehicle and the controller's keep-out volumes
-    before anything is sent.
+    """The configured reference, checked against the vehicle, the limits of a flight and the
+    controller's keep-out volumes before anything is sent.
 
     Raises DocumentError naming time, value and limit where it cannot be flown.
     """
+    vehicle, limits = config.vehicle, config.limits
+    if vehicle.hover_thrust > limits.hover_thrust:
+        raise DocumentError(
+            f"vehicle {vehicle.name}: hover_thrust {vehicle.hover_thrust:g} is beyond "
+            f"limits.hover_thrust ({limits.hover_thrust:g}), from which on it is landed; carry "
+            "less or raise the limit"
+        )
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # what overflows is beyond a limit
             track = config.reference.track()
-            envelope = check(track, config.vehicle)
+            envelope = check(track, vehicle)
     except ValueError as error:
         raise DocumentError(f"reference {config.reference.title}: {error}") from None
     landing_s = envelope.height_max_m / DESCENT_MPS
-    if landing_s > config.limits.land_s:
+    if landing_s > limits.land_s:
         raise DocumentError(
             f"reference {config.reference.title}: landing from {envelope.height_max_m:.4g} m takes "
             f"{landing_s:.4g} s at {DESCENT_MPS} m/s, longer than limits.land_s "
-            f"({config.limits.land_s:g} s); fly lower or allow more time"
+            f"({limits.land_s:g} s); fly lower or allow more time"
         )
     _check_volume(envelope, config)
     refused = config.controller.refusal(track)

@@ -279,6 +279,15 @@ def test_a_vehicle_without_thrust_reserve_is_landed(share: float, flown: bool, f
 
 
 @BOTH
+def test_a_load_that_is_only_believed_does_not_end_the_take_off(fly: Fly) -> None:
+    """An earlier flight has identified the vehicle with a load that it does not carry any more."""
+    file = fly().companion.state.model
+    pair = fly(believed=file.model_copy(update={"hover_thrust": 0.93}))
+    assert pair.fly().exit_code == ExitCode.FLOWN
+    assert "thrust reserve" not in pair.rungs
+
+
+@BOTH
 def test_a_reset_of_the_estimate_is_flown(fly: Fly) -> None:
     pair = fly(scenario="estimator_jump")
     watch = watched(pair)

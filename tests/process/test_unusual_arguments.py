@@ -250,6 +250,11 @@ def test_of_many_errors_the_first_ten_are_printed(call: Call, tmp_path: Path) ->
             "(30 m); fly nearer or raise the limit",
         ),
         (
+            ("--set", "vehicle.hover_thrust=0.92"),
+            "vehicle neutral: hover_thrust 0.92 is beyond limits.hover_thrust (0.9), from which on "
+            "it is landed; carry less or raise the limit",
+        ),
+        (
             ("--set", "controller.swarm={particles: 10000, iterations: 100000}"),
             "controller.swarm: particles x iterations must be at most 500000, not 1000000000",
         ),

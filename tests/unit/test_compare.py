@@ -260,3 +260,10 @@ def test_the_vehicle_and_its_key_are_chosen_where_a_command_flies_one(
     answer = CliRunner().invoke(app, arguments)
     assert answer.exit_code != 0
     assert says in f"{answer.exception} {answer.output}"
+
+
+def test_an_unknown_controller_is_answered_with_every_known_one_once(tmp_path: Path) -> None:
+    with pytest.raises(DocumentError, match="there is no controller named 'nope'") as refused:
+        plan(CampaignFile(controllers=("nope",)), tmp_path)
+    known = str(refused.value).partition("known are ")[2].split(", ")
+    assert len(known) == len(set(known)) > 5

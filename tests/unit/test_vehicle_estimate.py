@@ -10,6 +10,8 @@ from offboard.flight.online_identification import IdentifySettings, OnlineIdenti
 from offboard.flight.phases import Phase
 from offboard.identification.adoption import within_bounds
 from offboard.identification.attitude_fit import ResponseFit, Unexplained
+from offboard.identification.learned import Learned
+from offboard.identification.trace import Trace
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_estimate import VehicleEstimate
 from offboard.identification.vehicle_fit import Identified
@@ -204,3 +206,31 @@ def test_lasting_contradiction_is_announced_twice(monkeypatch: pytest.MonkeyPatc
     assert len(contradictions) == 2
     assert contradictions[1].endswith("until nothing contradicts for 20 s")
     assert taken[-1].bandwidth_limit_radps < 3.5
+
+
+def test_hover_thrust_is_not_identified_from_the_lift_off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A recalled vehicle flies no steps: its climb may be shorter than what is looked back at."""
+    begun_s: list[float] = []
+
+    def identified(trace: Trace, vehicle: Vehicle) -> Identified:
+        begun_s.append(trace.begin_s)
+        return Identified(5.0)
+
+    monkeypatch.setattr(online, "identify_hover", identified)
+    identification = OnlineIdentification(
+        FILE,
+        IdentifySettings(),
+        period_s=0.1,
+        bandwidth_radps=7.0,
+        learned=Learned(FILE, Estimate(0.04, 0.002), 0.0),
+    )
+    identification.on_phase(Phase.CLIMB, 10.0)
+    for tick in range(200):
+        time_s = 10.0 + 0.02 * tick
+        identification.on_attitude(time_s, (1.0, 0.0, 0.0, 0.0))
+        identification.on_position(time_s, (0.0, 0.0, -1.0), (0.0, 0.0, 0.0))
+    identification.on_phase(Phase.JOIN, 13.0)
+    for tick in range(20):
+        identification.learn(Phase.JOIN, 13.0 + 0.05 * tick)
+    assert begun_s
+    assert min(begun_s) == pytest.approx(10.0 + online.LIFTED_OFF_S, abs=0.021)
