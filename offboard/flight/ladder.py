@@ -171,7 +171,7 @@ ROWS = (
         lambda now: now.hover_thrust > now.limits.hover_thrust,
         2.0,
         Rung.LAND,
-        "it needs {hover_thrust_percent:.0f} % of its thrust to hover (limits.hover_thrust)",
+        "the vehicle hovers with {hover_thrust_percent:.0f} % of its thrust (limits.hover_thrust)",
     ),
     LadderRow(
         "second sender",

@@ -224,8 +224,11 @@ def fit_drag(motion: Motion, thrust_mps2: Array, start_ps: float) -> Estimate:
 
 
 def fit_hover(motion: Motion, vehicle: Vehicle) -> Estimate:
-    """Normalised hover thrust, given delay and lag of the thrust and the drag of `vehicle`. The
-    innovations are linear in its inverse, so that one step of least squares finds it."""
+    """Normalised hover thrust (0 to 1), given thrust delay, thrust lag and drag of `vehicle`.
+
+    The innovations of the vertical filter are linear in its inverse, so that one step of least
+    squares finds it. Its sd is infinite where the thrust was zero throughout.
+    """
     vertical = PositionFilter(motion.times, vehicle.drag_per_mass_ps, VERTICAL)
     thrust = motion.thrust(vehicle.thrust_delay_s, vehicle.thrust_lag_s)
     known = 1.0 / vehicle.hover_thrust

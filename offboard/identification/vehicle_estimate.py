@@ -218,8 +218,9 @@ class VehicleEstimate:
         return all(abs(drag.value - each) > max(least_ps, drag.sd) for each in known)
 
     def review_hover(self, found: Identified, time_s: float) -> list[str]:
-        """Adopt a later hover thrust if it and the one before it differ from the one in use: the
-        mass or the battery has changed."""
+        """Adopt a later hover thrust if it and the one before it differ from the one in use by more
+        than HOVER_NEWS and HOVER_SDS: the mass or the battery has changed. `time_s`: vehicle time.
+        One beyond the bounds of adoption is ignored."""
         hover, known = found.hover_thrust, self.target.hover_thrust
         seen_before, self._other_hover = self._other_hover, False
         if hover is None or within_bounds(found, self._file, self._factor)[1]:

@@ -185,7 +185,8 @@ def identify_drag(trace: Trace, vehicle: Vehicle) -> Identified:
 
 
 def identify_hover(trace: Trace, vehicle: Vehicle) -> Identified:
-    """The hover thrust alone, given the other constants of `vehicle`."""
+    """The hover thrust alone, given the other constants of `vehicle`; some milliseconds for 6 s of
+    flight. None with a reason where the trace is too short or holds too few messages."""
     seconds = _seconds(trace)
     if seconds < LEAST_SECONDS or not (motion := Motion(trace, DRAG_SPACING_S)).sufficient:
         return Identified(seconds, refusals={"hover_thrust": "too few positions and commands"})

@@ -14,7 +14,7 @@ from offboard.report import timeline
 from offboard.report.figures import figures, letter
 from offboard.report.flight import Flight
 
-_IN_SUMMARY = {"tracked error", "true error", "timing", "identified"}
+_IN_SUMMARY = {"tracked error", "true error", "timing", "at a limit", "identified"}
 _SIGNS = {1.0: ("good", "✓"), 0.0: ("bad", "✗")}
 
 

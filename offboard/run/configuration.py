@@ -105,8 +105,8 @@ def build_track(config: FlightConfig) -> Track:
     vehicle, limits = config.vehicle, config.limits
     if vehicle.hover_thrust > limits.hover_thrust:
         raise DocumentError(
-            f"vehicle {vehicle.name}: hover_thrust {vehicle.hover_thrust:g} is beyond "
-            f"limits.hover_thrust ({limits.hover_thrust:g}), from which on it is landed; carry "
+            f"vehicle {vehicle.name}: hover_thrust {vehicle.hover_thrust:g} exceeds "
+            f"limits.hover_thrust ({limits.hover_thrust:g}), beyond which a flight is ended; carry "
             "less or raise the limit"
         )
     try:

@@ -274,7 +274,7 @@ def test_a_vehicle_without_thrust_reserve_is_landed(share: float, flown: bool, f
         assert outcome.exit_code == ExitCode.FLOWN
     else:
         assert outcome.exit_code == ExitCode.ABORTED
-        assert "of its thrust to hover (limits.hover_thrust)" in outcome.sentence
+        assert "% of its thrust (limits.hover_thrust)" in outcome.sentence
         assert list(pair.rungs) == ["thrust reserve"]
 
 

@@ -251,8 +251,8 @@ def test_of_many_errors_the_first_ten_are_printed(call: Call, tmp_path: Path) ->
         ),
         (
             ("--set", "vehicle.hover_thrust=0.92"),
-            "vehicle neutral: hover_thrust 0.92 is beyond limits.hover_thrust (0.9), from which on "
-            "it is landed; carry less or raise the limit",
+            "vehicle neutral: hover_thrust 0.92 exceeds limits.hover_thrust (0.9), beyond "
+            "which a flight is ended; carry less or raise the limit",
         ),
         (
             ("--set", "controller.swarm={particles: 10000, iterations: 100000}"),
