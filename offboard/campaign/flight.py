@@ -31,8 +31,9 @@ from offboard.run.request import FlightRequest, build_parts
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A case with what its worker needs. `code` is the campaign's; `kept`: a directory for the log,
-    which is otherwise deleted."""
+    """A case with what its worker needs. `code` is the campaign's; `kept`: the directory for the
+    log, which is otherwise deleted. It appears when the flight is complete, and stays if it exists
+    already."""
 
     case: Case
     promises: Promises
@@ -48,11 +49,16 @@ def fly_job(job: Job) -> Record:
             "the same version there and start it again"
         )
     try:
-        with tempfile.TemporaryDirectory(prefix="offboard-") as scratch:
-            directory = job.kept or Path(scratch) / "flight"
+        if job.kept:
+            job.kept.parent.mkdir(parents=True, exist_ok=True)
+        place = job.kept.parent if job.kept else None
+        with tempfile.TemporaryDirectory(prefix=".offboard-", dir=place) as scratch:
+            directory = Path(scratch) / "flight"
             record = recorded(
                 job.case.request(directory), job.promises, partial(_fly, job.case, Path(scratch))
             )
+            if job.kept and directory.exists() and not job.kept.exists():
+                directory.rename(job.kept)
             return replace(record, sentence=record.sentence.replace(f"{scratch}/", ""))
     except (OSError, MemoryError, LogError) as error:
         raise UserError(f"a worker cannot go on: {error}") from None

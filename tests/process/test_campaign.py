@@ -22,7 +22,7 @@ import pyarrow.parquet
 import pytest
 from processes import Spawn, children
 
-from offboard.campaign import code, execution
+from offboard.campaign import code, execution, flight
 from offboard.campaign.campaign import Campaign, Shard, Summary
 from offboard.campaign.cases import Case
 from offboard.campaign.document import CampaignFile, read_campaign
@@ -210,6 +210,10 @@ def test_an_infeasible_case_is_a_row_with_its_reason(tmp_path: Path) -> None:
             ("controllers: [lqr]", "controllers: []"),
             "controllers: [] should have at least 1 item, not 0",
         ),
+        (
+            ("require:", "seeds: 0\nrequire:"),
+            "out.yaml: seeds: 0 should be greater than or equal to 1",
+        ),
         (("[lqr]", "[lqg]"), "there is no controller named 'lqg'"),
         (("identify.excite", "identify.exite"), "identify.exite is not a known key"),
         (("conditions.mass_scale", "conditions.mass"), "conditions.mass is not a known key"),
@@ -261,10 +265,8 @@ def test_a_full_disk_ends_the_campaign_and_keeps_what_is_finished(
 
 
 def dies(job: Job) -> Record:
-    """Ends its worker with seed 2, after a note of it and the beginning of a log."""
+    """Ends its worker with seed 2, after a note of it."""
     if job.case.seed == 2:
-        assert job.kept
-        job.kept.mkdir()
         with (Path(job.code) / "deaths").open("a") as deaths:
             deaths.write("died\n")
         os._exit(1)
@@ -285,6 +287,28 @@ def test_a_flight_whose_worker_dies_twice_is_a_row(
     assert (tmp_path / "deaths").read_text() == "died\n" * 2
     assert ended[1].exit_code == 0
     assert (ended[2].exit_code, ended[2].sentence) == (4, "the process that flew it ended, twice")
+
+
+def dies_before_its_score(job: Job) -> Record:
+    flight.keep_score = lambda *score: os._exit(1)
+    return flight.fly_job(job)
+
+
+def test_a_kept_flight_appears_when_it_is_complete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker that is killed leaves no directory that looks like a kept flight."""
+    case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
+    kept = tmp_path / "flights" / case.key
+    job = Job(case, Promises(), code.code_hash(), kept)
+    with monkeypatch.context() as dying, local_workers(1) as workers:
+        dying.setattr(execution, "fly_job", dies_before_its_score)
+        ((_, record),) = workers.fly([job], lambda: False)
+        assert record == execution.DIED
+        assert len(list(kept.parent.glob("*/flight/flight.tlog"))) == 2
+        assert not kept.exists()
+    assert flight.fly_job(job).completed
+    assert {path.name for path in kept.iterdir()} >= {"flight.tlog", "flight.yaml", "score.json"}
 
 
 def test_an_interrupted_campaign_leaves_no_process(tmp_path: Path, spawn: Spawn) -> None:
