@@ -53,6 +53,7 @@ class Facts:
     battery: float = 1.0
     hover_thrust: float = math.nan  # normalised, as setpoints that are followed show it now
     other_sender: bool = False
+    follows_others: bool = False  # setpoints of another program, by the thrust that it reports
     other_vehicle: bool = False  # several vehicles were heard, and none was chosen
     disarmed_again: bool = False  # after arming was accepted
     lifted_by_command: bool = False  # the autopilot takes off on a command, without setpoints

@@ -183,6 +183,15 @@ ROWS = (
         "another program controls the vehicle on this link, too: {other_sender}",
     ),
     LadderRow(
+        "other setpoints",
+        "thrust of the setpoint that PX4 follows (ATTITUDE_TARGET): none of our newest 40",
+        "1e-5",
+        guards.follows_others,
+        2.5,  # a pilot's change of the mode is seen within this time, or `authority` acts
+        Rung.HOLD,
+        "the vehicle follows setpoints of another program{companion}",
+    ),
+    LadderRow(
         "clock",
         "jump of the vehicle's clock",
         "0.5 s",

@@ -208,7 +208,16 @@ class Replay:
             return False
         frame = message.frame
         self.recorded.append(Sent(self.ended_s, frame.message_id, frame.payload))
+        self._note_thrust(message)
         return True
+
+    def _note_thrust(self, message: LoggedMessage) -> None:
+        """The recorded vehicle reports the thrust of recorded setpoints, whatever is sent now."""
+        thrusts = self.companion.state.thrusts
+        if message.name == "SET_ATTITUDE_TARGET":
+            thrusts.append(message.message.thrust)
+        elif message.name.startswith("SET_POSITION_TARGET"):
+            thrusts.clear()
 
     def _drain(self) -> None:
         """Note what was sent by the turns that the last piece of the inputs ends."""
