@@ -126,7 +126,7 @@ def stretches(log: Tlog, messages: int = STRETCH) -> Iterator[tuple[History, flo
 def configuration(log: Tlog) -> str | None:
     """The configuration of the flight as YAML (see `run.configuration.flown`), None without."""
     return manifest.join(
-        bytes(entry.message.payload[: entry.message.payload_length])
+        entry.tunnelled
         for entry in log
         if entry.name == "TUNNEL"
         and entry.component_id in OUR_COMPONENTS
