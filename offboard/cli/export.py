@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from offboard.cli.shared import FLIGHT, CommandError, complain, option, say
+from offboard.cli.shared import FLIGHT, CommandError, check_new, complain, option, say
 
 
 class Format(str, Enum):  # noqa: UP042 - typer shows the values of a `str`
@@ -44,8 +44,7 @@ def export(
     from offboard.export.table import write_csv, write_parquet
     from offboard.export.ulog import write_ulog
 
-    if output.exists() or output.is_symlink():
-        raise CommandError(f"{output} exists already; choose another file with -o")
+    check_new(output, "-o")
     found = read(flight)
     if to is Format.MCAP:
         write_mcap(found, output, vehicle_time=vehicle_time)

@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from offboard.export.new_file import library, new_file
+from offboard.export.extra import library
 from offboard.export.series import Array, Flight, Series
+from offboard.io.new_file import new_file
 from offboard.model.frames import enu, flu_in_enu
 
 KIND = "mcap"

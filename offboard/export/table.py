@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from offboard.export.new_file import library, new_file
+from offboard.export.extra import library
 from offboard.export.series import Array, Flight
+from offboard.io.new_file import new_file
 
 EVENT = "event"
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import resource
 import sys
 from pathlib import Path
 from typing import Any
@@ -208,10 +209,25 @@ def test_refusals(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert "exists already" in str(run(flight, "csv", taken).exception)
     assert taken.read_text() == "mine"
     nowhere = tmp_path / "none" / "flight.csv"
-    assert "cannot be written: No such file" in str(run(flight, "csv", nowhere).exception)
+    assert "there is no directory" in str(run(flight, "csv", nowhere).exception)
     assert "--to mcap" in str(run(flight, "csv", tmp_path / "a.csv", "--vehicle-time").exception)
     for kind, library in (("mcap", "mcap.writer"), ("parquet", "pyarrow")):
         monkeypatch.setitem(sys.modules, library, None)
         reason = str(run(flight, kind, tmp_path / f"a.{kind}").exception)
         assert "pip install 'pso-offboard[export]'" in reason
     assert list(tmp_path.iterdir()) == [taken]
+
+
+@pytest.mark.parametrize("kind", ["mcap", "parquet", "csv", "ulog"])
+@pytest.mark.parametrize("missing", [1, 5000])
+def test_a_full_disk_leaves_nothing(kind: str, missing: int, flight: Path, tmp_path: Path) -> None:
+    """The last bytes, which are written when the file is closed, or a few thousand."""
+    size = exported(flight, kind, tmp_path / "whole").stat().st_size
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size - missing, limits[1]))
+    try:
+        result = run(flight, kind, tmp_path / "cut")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert str(result.exception) == f"{tmp_path / 'cut'} cannot be written (File too large)"
+    assert [path.name for path in tmp_path.iterdir()] == ["whole"]
