@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,6 +96,13 @@ class History:
     wall_s: float
     damage: str = ""
     damage_s: float = math.nan
+
+    def events(self) -> list[Event]:
+        """Phases, announcements, modes and messages of the vehicle in the order of time; what came
+        before any telemetry first."""
+        modes = (replace(event, what=f"mode {event.what}") for event in self.modes)
+        every = (*self.phases, *self.announcements, *modes, *self.vehicle_messages)
+        return sorted(every, key=lambda e: -math.inf if math.isnan(e.time_s) else e.time_s)
 
 
 def gather(log: Tlog) -> History:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from rich.console import Console
@@ -29,7 +27,7 @@ SECTIONS = {
 AT_LIMIT_SHARE = 0.2  # of the decisions, from which a summary says so
 
 
-def summary(score: Score, history: History, directory: Path) -> list[tuple[str, str]]:
+def summary(score: Score, history: History) -> list[tuple[str, str]]:
     """(label, text) of what a person wants to know after a flight. Figures that the log does not
     hold are left out; without any there is no row."""
     rows = []
@@ -62,9 +60,6 @@ def summary(score: Score, history: History, directory: Path) -> list[tuple[str, 
     identified = _identified(history)
     if identified:
         rows.append(("identified", identified))
-    if rows:
-        rows.append(("log", str(directory / "flight.tlog")))
-        rows.append(("all figures", f"offboard score {directory}"))
     return rows
 
 
@@ -98,12 +93,10 @@ def show(console: Console, score: Score, history: History) -> None:
     story.add_column("t [s]", justify="right")
     story.add_column("who")
     story.add_column("what")
-    modes = (replace(event, what=f"mode {event.what}") for event in history.modes)
-    events = [*history.phases, *modes, *history.vehicle_messages]
-    for event in sorted(events, key=lambda event: np.nan_to_num(event.time_s)):
+    for event in history.events():
         stamp = "" if math.isnan(event.time_s) else f"{event.time_s:.2f}"
         story.add_row(stamp, event.who, Text(event.what))
-    if events:
+    if story.rows:
         console.print(story)
     known = {name: value for name, value in score.figures().items() if not math.isnan(value)}
     if not known:

@@ -201,7 +201,10 @@ def _conclude(
             complain(f"{outcome.sentence}; requirement missed: {results}")
         else:
             say(f"{outcome.sentence}{'; requirement met: ' if results else ''}{results}")
-        rows = summary(score, history, directory)
+        rows = summary(score, history)
+        if rows:
+            rows.append(("log", str(directory / "flight.tlog")))
+            rows.append(("all figures", f"offboard score {directory}"))
         if report:
             rows.append(("report", f"{directory / 'report.html'}, in some seconds"))
         for label, text in rows:
