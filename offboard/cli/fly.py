@@ -128,10 +128,9 @@ def fly(
                 system_id=system,
                 signing_key=signing_key,
             )
-            tell = displays.tell if json_lines else say
             for url in displays.await_ready():
-                tell(f"live: {url}")
-            outcome = fly_request(request, displays.show, tell, simulator, stops)
+                displays.tell(f"live: {url}")
+            outcome = fly_request(request, displays.show, displays.tell, simulator, stops)
     except KeyboardInterrupt:  # before the flight; in flight an interrupt lands the vehicle
         raise CommandError(INTERRUPTED) from None
     if outcome.exit_code == 2:

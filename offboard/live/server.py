@@ -95,9 +95,9 @@ async def serve(host: str, port: int) -> None:
         broadcast.end()
         await asyncio.sleep(0.1)  # the clients take their last event
     except OSError as error:
-        reason = (
-            f"{join_address(host, port)} cannot be listened on ({os.strerror(error.errno or 0)})"
-        )
+        number = error.errno or 0  # negative: of the name service
+        why = os.strerror(number) if number >= 0 else error.strerror
+        reason = f"{join_address(host, port)} cannot be listened on ({why})"
         print(json.dumps({"error": f"{reason}; choose another address"}), flush=True)
     finally:
         await runner.cleanup()
