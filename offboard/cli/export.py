@@ -32,9 +32,9 @@ def export(
     """Write a flight in the format of another tool.
 
     mcap: Foxglove's schemas (ENU) and all values as JSON, for Foxglove, Lichtblick, Rerun and
-    PlotJuggler. ulog: PX4's topics, for Flight Review and PlotJuggler; its stamps are always
-    vehicle time. parquet, csv: one row for each sample, with both times, units in the names of the
-    columns. UAV Log Viewer and MAVExplorer read the .tlog itself. mcap and parquet need the extra
+    PlotJuggler. ulog: PX4's topics, for PlotJuggler and pyulog; its stamps are always vehicle time.
+    parquet, csv: one row for each sample, with both times, units in the names of the columns. UAV
+    Log Viewer and MAVExplorer read the .tlog itself. mcap and parquet need the extra
     `pso-offboard[export]`.
     """
     if vehicle_time and to is not Format.MCAP:

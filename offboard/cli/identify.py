@@ -65,8 +65,10 @@ def identify(
             check_new(chosen, name)
     if output is not None and page is not None and output.resolve() == page.resolve():
         raise CommandError(f"-o and --page are both {output}; choose two files")
-    if flight is not None and (system or signing_key):
-        raise CommandError("a log needs neither --system nor --signing-key: they are for --connect")
+    if flight is not None and (system or signing_key or out_directory):
+        raise CommandError(
+            "a log needs no --system, --signing-key or --out: they are for --connect and --sitl"
+        )
     if flight is None:
         flight = out_directory or FLIGHTS / f"identify-{clock.local_stamp()}"
         fly(
@@ -87,9 +89,10 @@ def identify(
     else:
         prior = load("flight", choices={"vehicle": vehicle}).vehicle
     found, trace = identify_flight(log, history.gather(log), prior)
-    text = vehicle_file(found, prior, flight.name)
+    name = flight.name or flight.resolve().name
+    text = vehicle_file(found, prior, name)
     shown = page or free_name(path.with_name("identify.html"))
-    write_new(shown, fits(flight.name, found, trace, prior))
+    write_new(shown, fits(name, found, trace, prior))
     if not found.supported:
         raise CommandError(f"nothing could be identified from this flight; {shown} says why", 1)
     if output is not None:
