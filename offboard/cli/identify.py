@@ -17,6 +17,7 @@ from offboard.cli.shared import (
     SigningKey,
     System,
     check_new,
+    complain,
     free_name,
     option,
     out,
@@ -88,7 +89,10 @@ def identify(
         prior = flown(configuration).vehicle
     else:
         prior = load("flight", choices={"vehicle": vehicle}).vehicle
-    found, trace = identify_flight(log, history.gather(log), prior)
+    arrays = history.gather(log)
+    if arrays.damage:
+        complain(arrays.damage)
+    found, trace = identify_flight(log, arrays, prior)
     name = flight.name or flight.resolve().name
     text = vehicle_file(found, prior, name)
     shown = page or free_name(path.with_name("identify.html"))

@@ -222,6 +222,15 @@ def test_only_a_regular_file_is_a_log(
     )
 
 
+@pytest.mark.parametrize("command", ["score", "identify"])
+def test_a_damaged_log_is_read_and_named(command: str, call: Call, tmp_path: Path) -> None:
+    data = bytearray(RECORDING.read_bytes())
+    data[8 + 12] ^= 0x40  # payload of the first frame
+    (tmp_path / "x.tlog").write_bytes(data)
+    said = "x.tlog: 1 damaged entry was skipped, the first at byte 0\n"
+    assert call(f"offboard {command}", "x.tlog") == (0, said)
+
+
 def test_of_many_errors_the_first_ten_are_printed(call: Call, tmp_path: Path) -> None:
     keys = "".join(f"key_{number}: 1\n" for number in range(5000))
     (tmp_path / "x.yaml").write_text(f"law: pid\n{keys}")
