@@ -59,11 +59,6 @@ class Series:
     time_s: Array
     values: Array
 
-    def column(self, name: str) -> Array:
-        """The values (N,) of one column."""
-        values: Array = self.values[:, self.columns.index(name)]
-        return values
-
 
 @dataclass(frozen=True, slots=True)
 class Flight:
