@@ -202,11 +202,11 @@ def _conclude(
             say(f"{outcome.sentence}{'; requirement met: ' if results else ''}{results}")
         rows = summary(score, history)
         if rows:
-            rows.append(("log", str(directory / "flight.tlog")))
-            rows.append(("all figures", f"offboard score {directory}"))
+            rows["log"] = str(directory / "flight.tlog")
+            rows["all figures"] = f"offboard score {directory}"
         if report:
-            rows.append(("report", f"{directory / 'report.html'}, in some seconds"))
-        for label, text in rows:
+            rows["report"] = f"{directory / 'report.html'}, in some seconds"
+        for label, text in rows.items():
             say(f"  {label:<{LABEL_WIDTH}}{text}", indent=2 + LABEL_WIDTH)
         sys.stdout.flush()
     except OSError as error:  # the exit code stays that of the flight

@@ -54,7 +54,7 @@ def _verdict(place: int, flight: Flight, alone: bool) -> dict[str, object]:
         "sign": sign,
         "sentence": verdict(flight.score),
         "name": "" if alone else f"{letter(place)}: {flight.name}",
-        "rows": summary(flight.score, flight.history) + list(flight.facts.items()),
+        "rows": summary(flight.score, flight.history) | flight.facts,
         "missing": flight.missing,
     }
 

@@ -6,6 +6,7 @@ import lzma
 import math
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -168,7 +169,10 @@ def test_a_log_of_another_program_gives_what_it_holds(tmp_path: Path) -> None:
     arducopter = read(ARDUCOPTER)
     assert arducopter.facts["autopilot"] == "ardupilot"
     assert "no ATTITUDE_QUATERNION: the attitude is that of ATTITUDE" in arducopter.missing
-    assert "no records of offboard" in page([arducopter])
+    flooded = replace(arducopter, score=replace(arducopter.score, strangers=31.0))
+    shown = page([flooded])
+    assert "no records of offboard" in shown
+    assert "31 datagrams of others" in shown
 
 
 def test_a_damaged_log_is_shown_with_the_place_of_the_damage(tmp_path: Path) -> None:
