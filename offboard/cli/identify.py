@@ -92,7 +92,7 @@ def identify(
     arrays = history.gather(log)
     if arrays.damage:
         complain(arrays.damage)
-    found, trace = identify_flight(log, arrays, prior)
+    found, trace = identify_flight(arrays, prior)
     name = flight.name or flight.resolve().name
     text = vehicle_file(found, prior, name)
     shown = page or free_name(path.with_name("identify.html"))

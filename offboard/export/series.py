@@ -87,14 +87,13 @@ def read(path: Path) -> Flight:
     """The flight in a directory or .tlog. Raises TlogError, or UserError without telemetry."""
     log = tlog.read(tlog.find(path))
     flown = history.gather(log)
-    vehicle_id, dialect = history.vehicle(log)
-    unix = _unix(log, vehicle_id)
+    unix = _unix(log, flown.vehicle_id)
     if not len(unix):
         raise UserError(f"{log.path} holds no telemetry with a time stamp: nothing to export")
     events = tuple(event for event in flown.events() if np.isfinite(event.time_s))
     found = {name: _series(name, rows) for name, rows in _rows(flown).items()}
     series = {name: each for name, each in found.items() if len(each.time_s)}
-    autopilot = _AUTOPILOTS[dialect.name] if dialect else "unknown"
+    autopilot = _AUTOPILOTS[flown.dialect.name] if flown.dialect else "unknown"
     return Flight(series, events, unix, autopilot, flown.damage)
 
 
