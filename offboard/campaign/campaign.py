@@ -151,8 +151,11 @@ class Campaign:
             write(self.directory / "campaign.parquet", parquet)
         absent = len(self.cases) - len(rows)
         missing = [f"{absent} of {len(self.cases)} flights are not flown yet"] if absent else []
-        drawn = frozenset(self.file.sample.ranges if self.file.sample else ())
-        text = page(groups(rows, drawn), CAMPAIGN, missing, self._kept(rows))
+        parts = (self.file.sample, self.file.search)
+        drawn = frozenset(key for part in parts if part for key in part.ranges)
+        text = page(
+            groups(rows, drawn - self.file.parameters.keys()), CAMPAIGN, missing, self._kept(rows)
+        )
         write(self.directory / "campaign.html", text.encode())
         return [NO_PARQUET] if parquet is None else []
 

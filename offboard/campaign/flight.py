@@ -60,7 +60,7 @@ def fly_job(job: Job) -> Record:
             if job.kept and directory.exists() and not job.kept.exists():
                 directory.rename(job.kept)
             return replace(record, sentence=record.sentence.replace(f"{scratch}/", ""))
-    except (OSError, MemoryError, LogError) as error:
+    except (OSError, LogError) as error:
         raise UserError(f"a worker cannot go on: {error}") from None
 
 
@@ -70,7 +70,7 @@ def recorded(
     """The record of a flight from its log, with score.json beside the log.
 
     `fly` flies the configuration and logs it in the directory. A flight that fails is a record too.
-    Raises LogError where it cannot be recorded.
+    Raises UserError where none can be flown or recorded, for lack of memory or disk space.
     """
     try:
         config = request.resolve()
@@ -78,6 +78,8 @@ def recorded(
         score, history = score_flight(request.directory)
     except LogError:
         raise
+    except (OSError, MemoryError) as error:
+        raise UserError(f"no flight can be flown here: {str(error) or 'out of memory'}") from None
     except UserError as error:
         sentence = " ".join(str(error).split())
         return Record(ExitCode.USAGE, sentence, NOT_FLOWN, "infeasible")

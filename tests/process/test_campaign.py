@@ -24,7 +24,7 @@ from processes import Spawn, children
 
 from offboard.campaign import code, execution, flight
 from offboard.campaign.campaign import Campaign, Shard, Summary
-from offboard.campaign.cases import Case
+from offboard.campaign.cases import Case, base_cases
 from offboard.campaign.document import CampaignFile, read_campaign
 from offboard.campaign.execution import Workers, cluster_workers, local_workers
 from offboard.campaign.flight import Job
@@ -32,7 +32,7 @@ from offboard.campaign.margin import Promises
 from offboard.campaign.results import Record, Results
 from offboard.documents.errors import DocumentError, UserError
 
-# Three flights of a few seconds, and one whose simulated mass is out of range
+# Four flights of a few seconds
 FILE = """
 controllers: [lqr]
 references: [hover]
@@ -45,10 +45,11 @@ sample:
   draws: 2
   seed: 3
   ranges:
-    scenario.conditions.mass_scale: [4.5, 5.5]
+    scenario.conditions.mass_scale: [0.9, 1.1]
     controller.bandwidth_radps: [4, 5]
+require: [rmse_position_m<0.02]
 """
-FILE = FILE.replace("[4.5, 5.5]", "[0.9, 1.1]") + "require: [rmse_position_m<0.02]\n"
+CONFIG = Path(__file__).parents[2] / "config"
 TABLE = ("campaign.csv", "campaign.parquet", "campaign.html")
 INFEASIBLE = FILE.replace("scenarios: [calm, px4_like]", "scenarios: [calm]").replace(
     "reference.height_m: [1]", "reference.height_m: [1, 400]"
@@ -210,6 +211,8 @@ def test_an_infeasible_case_is_a_row_with_its_reason(tmp_path: Path) -> None:
             ("controllers: [lqr]", "controllers: []"),
             "controllers: [] should have at least 1 item, not 0",
         ),
+        (("reference.height_m", "seed"), "parameters.seed: give the seeds with seeds"),
+        (("[calm, px4_like]", "[{}, {conditions: {}}]"), "two are called 'unnamed'"),
         (
             ("require:", "seeds: 0\nrequire:"),
             "out.yaml: seeds: 0 should be greater than or equal to 1",
@@ -230,6 +233,29 @@ def test_a_file_that_cannot_be_flown_is_refused(
     assert sentence in str(refused.value)
     assert "out.yaml: " in str(refused.value)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_file_that_a_file_names_decides_the_case(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shipped = (CONFIG / "flight.yaml").read_text()
+    (tmp_path / "mine.yaml").write_text(shipped.replace("lemniscate", "./path.yaml"))
+    keys = set()
+    for height_m in (2, 3, 3):
+        (tmp_path / "path.yaml").write_text(f"shape: hover\nduration_s: 1\nheight_m: {height_m}")
+        keys.add(next(base_cases(CampaignFile(config="./mine.yaml"))).key)
+    assert len(keys) == 2
+
+
+def test_a_lack_of_memory_is_no_record_of_the_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*parts: object, **options: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(flight, "fly", full)
+    case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
+    with pytest.raises(UserError, match="no flight can be flown here: out of memory"):
+        flight.fly_job(Job(case, Promises(), code.code_hash()))
 
 
 def test_results_of_other_code_are_refused_and_kept(
