@@ -109,6 +109,13 @@ class Replay:
         parts = replace(parts, controller=controller)
         return companion_of(parts, session, observer, self._stopwatch)
 
+    @property
+    def incomplete(self) -> str:
+        """Up to where the recording was replayed, and why no further; empty if all of it was."""
+        if not self.stopped:
+            return ""
+        return f"replayed up to {self.ended_s:.1f} s of vehicle time: {self.stopped}"
+
     def turns(self) -> Iterator[Turn]:
         """Replay turn by turn."""
         try:
