@@ -34,7 +34,7 @@ _CAUSES = (
     ("the vehicle restarted", "restart"),
     ("the vehicle disarmed", "disarmed in flight"),
     ("the controller failed", "controller"),
-    ("tilt|the attitude|[0-9.]+ m (from|above)|the battery|the vehicle hovers", "limit"),
+    ("tilt|the attitude|[0-9.]+ m (from|above)|the battery|the vehicle (hovers|sinks)", "limit"),
 )
 
 

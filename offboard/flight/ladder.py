@@ -15,6 +15,7 @@ from offboard.flight.facts import Facts
 from offboard.flight.phases import Rung
 
 RECOVERY = 0.25  # speed at which a delay runs back
+SINK_MPS = 0.3  # that full thrust stops within the delay, on a vehicle that can be flown
 STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
 
 
@@ -172,6 +173,15 @@ ROWS = (
         2.0,
         Rung.LAND,
         "the vehicle hovers with {hover_thrust_percent:.0f} % of its thrust (limits.hover_thrust)",
+    ),
+    LadderRow(
+        "full thrust",
+        "downward speed while setpoints demand the full thrust",
+        f"{SINK_MPS:g} m/s",
+        lambda now: now.full_thrust_sink_mps > SINK_MPS,
+        1.0,
+        Rung.LAND,
+        "the vehicle sinks at {full_thrust_sink_mps:.1f} m/s with full thrust",
     ),
     LadderRow(
         "second sender",

@@ -101,6 +101,15 @@ def test_a_second_sender(allowed: bool, rung: Rung) -> None:
     assert rungs(replace(QUIET, other_sender=True, limits=limits)) == [rung]
 
 
+@pytest.mark.parametrize(("sink_mps", "rung"), [(0.4, Rung.LAND), (0.2, Rung.FLY)])
+def test_a_vehicle_that_sinks_with_full_thrust(sink_mps: float, rung: Rung) -> None:
+    """After a second: full thrust brakes a normal descent sooner."""
+    now = replace(QUIET, full_thrust_sink_mps=sink_mps)
+    seen = rungs(QUIET, *[now] * 9)
+    assert set(seen[:8]) == {Rung.FLY}
+    assert seen[8] == rung
+
+
 @pytest.mark.parametrize(
     ("engaged", "allowed", "rung"),
     [(True, False, Rung.HOLD), (False, False, Rung.FLY), (True, True, Rung.FLY)],

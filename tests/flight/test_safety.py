@@ -6,6 +6,7 @@ both firmwares.
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -204,6 +205,22 @@ def test_an_arducopter_that_another_flies_is_refused() -> None:
     assert "in GUIDED already" in outcome.sentence
     assert "limits.begin_engaged=true" in outcome.sentence
     assert pair.setpoints == pair.commands(SET_MODE) == []
+
+
+@BOTH
+def test_a_load_that_full_thrust_does_not_carry_is_landed(fly: Fly) -> None:
+    """Hover would need 1.1 of the thrust. Before this row a real PX4 and a real ArduCopter were
+    flown into the ground so, with 45 degrees of tilt."""
+    pair = fly(HIGH)
+    plant = pair.instance.autopilot.plant
+    scale = 1.1 / pair.companion.state.model.hover_thrust
+    pair.at.append((in_phase(Phase.TRACK, 1.0), lambda flying: plant.scale_mass(scale)))
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert re.match(r"the vehicle sinks at [1-3]\.[0-9] m/s with full thrust", outcome.sentence)
+    assert list(pair.rungs) == ["full thrust"]
+    begun_s = {phase: at_s for at_s, phase in pair.phases}
+    assert begun_s[Phase.LAND] < begun_s[Phase.TRACK] + 1.0 + 2.0
 
 
 # -- in the air ------------------------------------------------------------------------------------
