@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -34,7 +34,8 @@ DARK = {
 
 _TOP_PX, _BOTTOM_PX, _PANEL_PX, _GAP_PX = 48, 90, 150, 36
 _FEW_DECADES = 2  # of a logarithmic axis with ticks at 2 and 5
-_MARGIN_DECADES = 0.05  # beside its outermost ticks
+_MOST_DECADES = 4  # of one with a tick at each
+_MARGIN = 0.02  # of its decades, beside its outermost ticks
 _AXIS = {
     "gridcolor": GRID, "zerolinecolor": GRID, "linecolor": GREY, "showline": True,
     "ticks": "outside", "tickcolor": GREY, "automargin": True, "exponentformat": "power",
@@ -109,19 +110,21 @@ def listed(figure: go.Figure, lines: Sequence[tuple[str, bool]], row_px: int, to
     )  # fmt: skip
 
 
-def logarithmic(values: Sequence[float]) -> dict[str, Any]:
-    """A logarithmic axis from tick to tick around the positive values: 1, or 1, 2 and 5 of every
-    decade."""
-    known = [value for value in values if value > 0.0]
+def logarithmic(values: Iterable[float]) -> dict[str, Any]:
+    """A logarithmic axis around the positive values, from 1, 2 or 5 of a decade to another. Ticks
+    are there; of more decades at 1, and of many not at each."""
+    known = [value for value in values if 0.0 < value < math.inf]
     least, greatest = min(known, default=1.0), max(known, default=1.0)
     low, high = math.floor(math.log10(least)), math.ceil(math.log10(greatest))
     steps = (1, 2, 5) if high - low <= _FEW_DECADES else (1,)
     ticks = [float(f"{step}e{power}") for power in range(low, high + 1) for step in steps]
     first = max((at for at in ticks if at <= least), default=ticks[0])
     last = min((at for at in ticks if at >= greatest), default=ticks[-1])
+    margin = _MARGIN * (1 + high - low)
+    shown = ticks[:: math.ceil((high - low) / _MOST_DECADES) or 1]
     return {
-        "type": "log", "tickvals": ticks, "ticktext": [f"{at:g}" for at in ticks],
-        "range": [math.log10(first) - _MARGIN_DECADES, math.log10(last) + _MARGIN_DECADES],
+        "type": "log", "tickvals": shown, "ticktext": [f"{at:g}" for at in shown],
+        "range": [math.log10(first) - margin, math.log10(last) + margin],
     }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -73,8 +73,9 @@ class History:
 
     `records` (N,) are structured, with the fields of `flight.record.TickRecord`. `phases` and
     `announcements` are our own, `modes` and `vehicle_messages` (STATUSTEXT, refused commands) the
-    vehicle's. `damage` says what could not be read, `damage_s` is the time of the telemetry before
-    the first damage, NaN without.
+    vehicle's. `vehicle_id` is the system id of the first autopilot in the log; it and `dialect` are
+    None without one, `dialect` also for one that is not known. `damage` says what could not be
+    read, `damage_s` is the time of the telemetry before the first damage, NaN without.
     """
 
     position: Array
@@ -92,10 +93,19 @@ class History:
     announcements: tuple[Event, ...]
     modes: tuple[Event, ...]
     vehicle_messages: tuple[Event, ...]
+    vehicle_id: int | None
+    dialect: Dialect | None
     messages: Counter[str]
     wall_s: float
     damage: str = ""
     damage_s: float = math.nan
+
+    def events(self) -> list[Event]:
+        """Phases, announcements, modes and messages of the vehicle in the order of time; what came
+        before any telemetry first."""
+        modes = (replace(event, what=f"mode {event.what}") for event in self.modes)
+        every = (*self.phases, *self.announcements, *modes, *self.vehicle_messages)
+        return sorted(every, key=lambda e: -math.inf if math.isnan(e.time_s) else e.time_s)
 
 
 def gather(log: Tlog) -> History:
@@ -111,7 +121,7 @@ def stretches(log: Tlog, messages: int = STRETCH) -> Iterator[tuple[History, flo
     was complete. Events, `identified`, `link_delay`, `heartbeat` and `landed` are all since the
     beginning. The last stretch is complete up to infinity.
     """
-    collector = _Collector(*vehicle(log))
+    collector = _Collector(*_vehicle(log))
     for count, entry in enumerate(log, 1):
         if log.damaged and math.isnan(collector.damage_ms):
             collector.damage_ms = collector.now_ms
@@ -126,7 +136,7 @@ def stretches(log: Tlog, messages: int = STRETCH) -> Iterator[tuple[History, flo
 def configuration(log: Tlog) -> str | None:
     """The configuration of the flight as YAML (see `run.configuration.flown`), None without."""
     return manifest.join(
-        bytes(entry.message.payload[: entry.message.payload_length])
+        entry.tunnelled
         for entry in log
         if entry.name == "TUNNEL"
         and entry.component_id in OUR_COMPONENTS
@@ -220,6 +230,8 @@ class _Collector:
             vehicle_messages=vehicle_messages(
                 self._theirs["STATUSTEXT"], self._theirs["COMMAND_ACK"], self.time_s
             ),
+            vehicle_id=self._vehicle_id,
+            dialect=self._dialect,
             messages=self._counts.copy(),
             wall_s=(self._unix_us[1] - self._unix_us[0]) / 1e6,
             damage=damage,
@@ -273,8 +285,7 @@ def _is_used(entry: LoggedMessage, ours: bool) -> bool:
     return name != "HEARTBEAT" or entry.frame.component_id == 1
 
 
-def vehicle(log: Tlog) -> tuple[int | None, Dialect | None]:
-    """System id of the first autopilot in the log, and its dialect; None without, or if unknown."""
+def _vehicle(log: Tlog) -> tuple[int | None, Dialect | None]:
     known = {dialect.mav_autopilot: dialect for dialect in DIALECTS.values()}
     for entry in log:
         if entry.name == "HEARTBEAT" and entry.message.autopilot != _NO_AUTOPILOT:

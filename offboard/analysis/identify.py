@@ -13,8 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.analysis.history import History
-from offboard.analysis.history import vehicle as vehicle_of
-from offboard.analysis.tlog import Tlog
 from offboard.flight.phases import PHASE_CODES, TRACKING
 from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.trace import Trace, clean
@@ -31,24 +29,23 @@ NOT_IDENTIFIED = "not identified: {sentence}"
 LINE_WIDTH = 80
 
 
-def identify_flight(log: Tlog, history: History, vehicle: Vehicle) -> tuple[Identified, Trace]:
+def identify_flight(history: History, vehicle: Vehicle) -> tuple[Identified, Trace]:
     """Identify the vehicle of a log.
 
     The search starts at the constants of `vehicle`. Returns the identified constants and the part
     of the flight that they were identified from.
     """
-    trace = trace_of(log, history)
+    trace = _trace(history)
     return identify(trace, vehicle), trace
 
 
-def trace_of(log: Tlog, history: History) -> Trace:
+def _trace(history: History) -> Trace:
     """The part of a log in the air; the whole log if it has no phases of `offboard`."""
     setpoint, attitude = history.setpoint, history.attitude
     commanded = thrust_direction_from_quaternion(setpoint[:, 2:6])
     direction = thrust_direction_from_quaternion(attitude[:, 1:5])
     thrust = setpoint[:, 6]
-    _, dialect = vehicle_of(log)
-    if dialect and dialect.thrust_rule is ThrustRule.TILT_COMPENSATED:
+    if history.dialect and history.dialect.thrust_rule is ThrustRule.TILT_COMPENSATED:
         thrust = thrust / np.maximum(commanded[:, 2], 0.3)
     trace = clean(
         np.column_stack(

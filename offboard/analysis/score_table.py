@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from rich.console import Console
@@ -29,42 +27,27 @@ SECTIONS = {
 AT_LIMIT_SHARE = 0.2  # of the decisions, from which a summary says so
 
 
-def summary(score: Score, history: History, directory: Path) -> list[tuple[str, str]]:
-    """(label, text) of what a person wants to know after a flight. Figures that the log does not
-    hold are left out; without any there is no row."""
-    rows = []
+def summary(score: Score, history: History) -> dict[str, str]:
+    """By label what a person wants to know after a flight. Figures that the log does not hold are
+    left out."""
+    rows: dict[str, str] = {}
     if math.isfinite(score.rmse_position_m):
-        rows.append(
-            (
-                "tracked error",
-                f"{score.rmse_position_m:.3f} m RMSE, {score.max_position_m:.3f} m maximum, "
-                f"over {score.tracked_s:.1f} s",
-            )
-        )
+        error = f"{score.rmse_position_m:.3f} m RMSE, {score.max_position_m:.3f} m maximum"
+        rows["tracked error"] = f"{error}, over {score.tracked_s:.1f} s"
     if math.isfinite(score.rmse_truth_m):
         error = f"{score.rmse_truth_m:.3f} m RMSE, {score.max_truth_m:.3f} m maximum"
-        rows.append(("true error", f"{error} (simulated vehicle)"))
+        rows["true error"] = f"{error} (simulated vehicle)"
     if math.isfinite(score.solve_time_p99_ms):
-        rows.append(
-            (
-                "timing",
-                f"decision {score.solve_time_p99_ms:.2f} ms (99th percentile), "
-                f"{score.missed_ticks:.0f} of {score.decisions:.0f} ticks missed",
-            )
-        )
+        decision = f"decision {score.solve_time_p99_ms:.2f} ms (99th percentile)"
+        missed = f"{score.missed_ticks:.0f} of {score.decisions:.0f} ticks missed"
+        rows["timing"] = f"{decision}, {missed}"
     if score.at_bound_share >= AT_LIMIT_SHARE:
         share = f"{100.0 * score.at_bound_share:.0f} % of the decisions"
-        rows.append(("at a limit", f"{share}: fly slower, or in less wind"))
+        rows["at a limit"] = f"{share}: fly slower, or in less wind"
     if score.strangers > 0:
-        rows.append(
-            ("ignored", f"{score.strangers:,.0f} datagrams of others or frames without signature")
-        )
-    identified = _identified(history)
-    if identified:
-        rows.append(("identified", identified))
-    if rows:
-        rows.append(("log", str(directory / "flight.tlog")))
-        rows.append(("all figures", f"offboard score {directory}"))
+        rows["ignored"] = f"{score.strangers:,.0f} datagrams of others or frames without signature"
+    if identified := _identified(history):
+        rows["identified"] = identified
     return rows
 
 
@@ -98,12 +81,10 @@ def show(console: Console, score: Score, history: History) -> None:
     story.add_column("t [s]", justify="right")
     story.add_column("who")
     story.add_column("what")
-    modes = (replace(event, what=f"mode {event.what}") for event in history.modes)
-    events = [*history.phases, *modes, *history.vehicle_messages]
-    for event in sorted(events, key=lambda event: np.nan_to_num(event.time_s)):
+    for event in history.events():
         stamp = "" if math.isnan(event.time_s) else f"{event.time_s:.2f}"
         story.add_row(stamp, event.who, Text(event.what))
-    if events:
+    if story.rows:
         console.print(story)
     known = {name: value for name, value in score.figures().items() if not math.isnan(value)}
     if not known:

@@ -59,6 +59,12 @@ class LoggedMessage(NamedTuple):
         """The message decoded by pymavlink, at each access."""
         return _codec.decode(bytearray(self.frame.raw))
 
+    @property
+    def tunnelled(self) -> bytes:
+        """The data of a TUNNEL message, without the zeros that fill it up."""
+        message = self.message
+        return bytes(message.payload[: message.payload_length])
+
 
 class Tlog:
     """A log to iterate over, as often as needed: its messages in order.

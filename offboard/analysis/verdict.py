@@ -30,11 +30,11 @@ _CAUSES = (
     (STOPPED, "operator"),
     ("no telemetry|no LOCAL_POSITION_NED|no ATTITUDE_QUATERNION|no report|the delay", "link"),
     ("the vehicle left|it showed", "pilot"),
-    ("another program", "second sender"),
+    ("another program|the vehicle follows", "second sender"),
     ("the vehicle restarted", "restart"),
     ("the vehicle disarmed", "disarmed in flight"),
     ("the controller failed", "controller"),
-    ("tilt|the attitude|[0-9.]+ m (from|above)|the battery", "limit"),
+    ("tilt|the attitude|[0-9.]+ m (from|above)|the battery|the vehicle (hovers|sinks)", "limit"),
 )
 
 

@@ -89,7 +89,8 @@ class Campaign:
         progress: Callable[[int, int], None],
     ) -> Summary:
         """Fly what is not finished and write the table. `progress` gets how many flights have
-        ended, from 0 on, and how many were to be flown. Raises UserError."""
+        ended, from 0 on, and how many were to be flown. Raises UserError where no worker can be
+        had, or the table cannot be written."""
         mine = shard.of(self.cases)
         jobs = [
             Job(case, self.file.promises, code_hash())
@@ -99,13 +100,13 @@ class Campaign:
         stopped = ""
         if jobs:
             progress(0, len(jobs))
-            try:
-                with open_workers() as workers:
+            with open_workers() as workers:
+                try:
                     for done, (job, record) in enumerate(workers.fly(jobs, ending), 1):
                         self.results.put(job.case.key, record)
                         progress(done, len(jobs))
-            except UserError as error:
-                stopped = str(error)
+                except UserError as error:
+                    stopped = str(error)
         return self._conclude(mine, open_workers, ending, stopped)
 
     def _conclude(
@@ -118,7 +119,10 @@ class Campaign:
         rows = self.rows()
         notes: list[str] = []
         if len(rows) == len(self.cases) and not stopped:
-            self._keep_worst(rows, open_workers, ending)
+            try:
+                self._keep_worst(rows, open_workers, ending)
+            except UserError as error:
+                stopped = str(error)
         finished = -1
         while finished != self.results.finished():  # another shard may have ended meanwhile
             finished = self.results.finished()
@@ -147,8 +151,11 @@ class Campaign:
             write(self.directory / "campaign.parquet", parquet)
         absent = len(self.cases) - len(rows)
         missing = [f"{absent} of {len(self.cases)} flights are not flown yet"] if absent else []
-        drawn = frozenset(self.file.sample.ranges if self.file.sample else ())
-        text = page(groups(rows, drawn), CAMPAIGN, missing, self._kept(rows))
+        parts = (self.file.sample, self.file.search)
+        drawn = frozenset(key for part in parts if part for key in part.ranges)
+        text = page(
+            groups(rows, drawn - self.file.parameters.keys()), CAMPAIGN, missing, self._kept(rows)
+        )
         write(self.directory / "campaign.html", text.encode())
         return [NO_PARQUET] if parquet is None else []
 

@@ -11,6 +11,7 @@ import json
 import math
 import shlex
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -27,7 +28,9 @@ from offboard.documents.errors import DocumentError
 from offboard.documents.reading import override, read
 from offboard.run.request import FlightRequest
 
+SEED = "seed"  # a range of this name is that of the flight's seed: noise, and the phase of gusts
 SCENARIO = "scenario."  # of a key of the scenario
+UNNAMED = "unnamed"
 OWN_SCENARIOS = {"px4": "px4_like", "ardupilot": "ardupilot_like"}  # where a file names none
 FILES = ("config", "controller", "reference", "vehicle", "sim_vehicle", "scenario")
 Values = tuple[tuple[str, Any], ...]
@@ -59,7 +62,7 @@ class Case:
     def key(self) -> str:
         """Hash of the case, 16 hexadecimal digits."""
         text = json.dumps(asdict(self), sort_keys=True, separators=(",", ":"))
-        return hashlib.sha256(text.encode()).hexdigest()[:16]
+        return _hash(text)
 
     @property
     def assignments(self) -> tuple[str, ...]:
@@ -110,9 +113,9 @@ class Case:
             scenario=scenario,
         )
 
-    def with_values(self, values: Values, base: str | None = None) -> Case:
-        """The case with these values instead; `base` is the text of its scenario before them."""
-        text = self.text if base is None else base
+    def with_values(self, values: Values) -> Case:
+        """The case with these values instead."""
+        text = self.text
         changes = [(key, value) for key, value in values if key.startswith(SCENARIO)]
         if changes:
             source = f"scenario {self.scenario}"
@@ -125,6 +128,8 @@ class Case:
 
 def expand(file: CampaignFile) -> list[Case]:
     """All cases of a campaign, in the order of its table. Raises DocumentError."""
+    if SEED in file.parameters:
+        raise DocumentError("parameters.seed: give the seeds with seeds")
     size = _size(file)
     if size > CASES_MOST:
         raise DocumentError(f"{size:,} flights; at most {CASES_MOST:,}")
@@ -140,7 +145,11 @@ def expand(file: CampaignFile) -> list[Case]:
 
 
 def base_cases(file: CampaignFile) -> Iterator[Case]:
-    """Every combination of names, without parameters, with the first seed."""
+    """Every combination of names, without parameters, with the first seed. Raises DocumentError."""
+    names = [each.get("name", UNNAMED) for each in file.scenarios or () if isinstance(each, dict)]
+    for name in names:
+        if names.count(name) > 1:
+            raise DocumentError(f"scenarios: two are called {name!r}; give each its own name")
     for firmware in file.firmwares:
         scenarios = file.scenarios or (_own_scenario(firmware),)
         for reference, scenario, controller, vehicle, sim_vehicle in itertools.product(
@@ -158,7 +167,7 @@ def base_cases(file: CampaignFile) -> Iterator[Case]:
                 vehicle=vehicle,
                 sim_vehicle=sim_vehicle,
                 firmware=firmware,
-                scenario=str(scenario.get("name", "unnamed")) if inline else scenario,
+                scenario=str(scenario.get("name", UNNAMED)) if inline else scenario,
                 seed=file.seed_values[0],
                 text=yaml.safe_dump(scenario, sort_keys=False) if inline else "",
             )
@@ -210,7 +219,8 @@ def _is_file(name: str) -> bool:
 
 
 def _digests(case: Case) -> tuple[tuple[str, str], ...]:
-    """A hash of each file that the case names. Raises DocumentError for one that is missing."""
+    """A hash of each file that the case names, and of the flight that files make, which may name
+    files in turn. Raises DocumentError for one that is missing."""
     found = []
     for part in FILES:
         name = getattr(case, part)
@@ -223,12 +233,19 @@ def _digests(case: Case) -> tuple[tuple[str, str], ...]:
             laws = catalogue.names() if part == "controller" else ()
             if name not in laws:
                 shipped.locate(name, shipped.FOLDERS[kind], kind, laws)
+    if found:
+        with suppress(DocumentError):  # of a flight that cannot be flown: it becomes a row
+            found.append(("flight", _hash(case.request(Path()).resolve().model_dump_json())))
     return tuple(found)
 
 
 @cache
 def _digest(name: str) -> str:
-    return hashlib.sha256(shipped.read_text(Path(name)).encode()).hexdigest()[:16]
+    return _hash(shipped.read_text(Path(name)))
+
+
+def _hash(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 @cache

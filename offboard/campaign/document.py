@@ -45,7 +45,7 @@ def _requirement(text: str) -> str:
     try:
         Requirement.parse(text)
     except UserError as error:
-        raise ValueError(str(error)) from None
+        raise ValueError(str(error).removeprefix("--require: ")) from None
     return text
 
 
@@ -72,7 +72,8 @@ class Sample(Parameters):
 
 
 class Search(Parameters):
-    """Search for failures (`--worst`) over `ranges`: `flights` for the search, with `seed`.
+    """Search for failures (`--worst`) over `ranges`: `flights` for the search, in batches of 20,
+    with `seed`.
 
     `defaults` are the values of an undisturbed flight, to which a failure is reduced; without one,
     0 if it is within the range, else its middle. A range named `seed` is that of the flight's seed:
@@ -85,7 +86,7 @@ class Search(Parameters):
     methods: tuple[Literal["swarm", "cma", "random"], ...] = Field(
         default=("swarm", "cma"), min_length=1
     )
-    flights: int = Field(default=500, ge=10, le=100_000)
+    flights: int = Field(default=500, ge=20, le=100_000)
     seed: Seed = 1
     seeds: int = Field(default=5, ge=1, le=100)
 

@@ -7,7 +7,6 @@ The first two are executors of `concurrent.futures`. A worker loads its code onc
 from __future__ import annotations
 
 import os
-import shutil
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
@@ -56,8 +55,6 @@ class Workers:
         for job, result in self._run(jobs, ending):
             if isinstance(result, BrokenExecutor):
                 again.append(job)
-                if job.kept:
-                    shutil.rmtree(job.kept, ignore_errors=True)  # the log of that worker
             else:
                 yield job, _record_of(result)
         for job, result in self._run(again, ending):

@@ -31,8 +31,9 @@ from offboard.run.request import FlightRequest, build_parts
 
 @dataclass(frozen=True, slots=True)
 class Job:
-    """A case with what its worker needs. `code` is the campaign's; `kept`: a directory for the log,
-    which is otherwise deleted."""
+    """A case with what its worker needs. `code` is the campaign's; `kept`: the directory for the
+    log, which is otherwise deleted. It appears when the flight is complete, and stays if it exists
+    already."""
 
     case: Case
     promises: Promises
@@ -48,13 +49,18 @@ def fly_job(job: Job) -> Record:
             "the same version there and start it again"
         )
     try:
-        with tempfile.TemporaryDirectory(prefix="offboard-") as scratch:
-            directory = job.kept or Path(scratch) / "flight"
+        if job.kept:
+            job.kept.parent.mkdir(parents=True, exist_ok=True)
+        place = job.kept.parent if job.kept else None
+        with tempfile.TemporaryDirectory(prefix=".offboard-", dir=place) as scratch:
+            directory = Path(scratch) / "flight"
             record = recorded(
                 job.case.request(directory), job.promises, partial(_fly, job.case, Path(scratch))
             )
+            if job.kept and directory.exists() and not job.kept.exists():
+                directory.rename(job.kept)
             return replace(record, sentence=record.sentence.replace(f"{scratch}/", ""))
-    except (OSError, MemoryError, LogError) as error:
+    except (OSError, LogError) as error:
         raise UserError(f"a worker cannot go on: {error}") from None
 
 
@@ -64,7 +70,7 @@ def recorded(
     """The record of a flight from its log, with score.json beside the log.
 
     `fly` flies the configuration and logs it in the directory. A flight that fails is a record too.
-    Raises LogError where it cannot be recorded.
+    Raises UserError where none can be flown or recorded, for lack of memory or disk space.
     """
     try:
         config = request.resolve()
@@ -72,6 +78,8 @@ def recorded(
         score, history = score_flight(request.directory)
     except LogError:
         raise
+    except (OSError, MemoryError) as error:
+        raise UserError(f"no flight can be flown here: {str(error) or 'out of memory'}") from None
     except UserError as error:
         sentence = " ".join(str(error).split())
         return Record(ExitCode.USAGE, sentence, NOT_FLOWN, "infeasible")

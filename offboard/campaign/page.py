@@ -93,7 +93,10 @@ def page(
 def described(row: Row) -> str:
     """What a flight was: names, values, seed."""
     case = row.case
-    names = (case.controller, case.reference, case.scenario, case.vehicle, case.sim_vehicle)
+    names = (
+        case.controller, case.reference, case.scenario, case.vehicle, case.sim_vehicle,
+        case.firmware,
+    )  # fmt: skip
     words = [name for name in names if name] + [f"{key}={value}" for key, value in case.values]
     return ", ".join([*words, f"seed {case.seed}"])
 

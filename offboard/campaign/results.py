@@ -58,12 +58,14 @@ class Results:
         if others:
             raise UserError(
                 f"{directory} holds results of other code ({others[0]}, this is {code}); choose "
-                "another directory with --out, or delete its folder results"
+                "another --out, or delete its folder results"
             )
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise self._unwritable(error) from None
+            raise UserError(
+                f"{directory} cannot be written ({error.strerror}); choose another --out"
+            ) from None
 
     def get(self, key: str) -> Record | None:
         """The record of a finished case, else None."""

@@ -1,7 +1,7 @@
 """Our swarm as a sampler of optuna: trial n is particle n modulo the particles of its generation.
 
 The swarm is rebuilt from the seed and the trials of the study, so that a study goes on in another
-process as if it had not been interrupted.
+process. A trial that was interrupted, or had given values, has infinite cost for its particle.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class SwarmSampler(BaseSampler):
     ) -> dict[str, Any]:
         swarm = SEARCHERS["swarm"](len(self._ranges), PARTICLES, self._seed)
         finished = study.get_trials(deepcopy=False, states=(TrialState.COMPLETE,))
-        costs = {told.number: told.value for told in finished}
+        costs = {t.number: t.value for t in finished if "fixed_params" not in t.system_attrs}
         generation, particle = divmod(trial.number, PARTICLES)
         for done in range(generation):
             swarm.ask()

@@ -11,9 +11,12 @@ interrupted tuning goes on.
 
 from __future__ import annotations
 
+import hashlib
 import itertools
+import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -22,6 +25,7 @@ from pydantic import AfterValidator, Field
 
 from offboard.campaign.campaign import check
 from offboard.campaign.cases import SCENARIO, Case, Values, expand, rounded
+from offboard.campaign.code import code_hash
 from offboard.campaign.document import CampaignFile, Name, Names, Ranges, Seed
 from offboard.campaign.evaluate import Evaluator
 from offboard.campaign.results import Record
@@ -33,7 +37,6 @@ from offboard.documents.reading import override, parse, read
 from offboard.documents.shipped import locate, read_text
 from offboard.run.configuration import FOLDERS, read_part
 
-STUDY = "tune"
 FOLDER = "tunings"
 NO_OPTUNA = "tuning needs optuna: pip install 'pso-offboard[tune]'"
 
@@ -85,15 +88,18 @@ def read_tune(name: str) -> tuple[TuneFile, str]:
     path = locate(name, FOLDER, "tuning") if "." not in name else Path(name)
     file = parse(read_text(path), TuneFile, str(path))
     for key in file.ranges:
-        if key.startswith(SCENARIO):
-            raise DocumentError(f"{path}: ranges.{key}: a scenario is not tuned, the flight is")
+        if key.startswith((SCENARIO, "vehicle.")):
+            raise DocumentError(f"{path}: ranges.{key}: controller and flight are tuned, no other")
     return file, str(path)
 
 
 class Tuning:
-    """Finds and judges parameters. Raises DocumentError for what cannot be flown."""
+    """Finds and judges parameters. Raises DocumentError for what cannot be flown, and UserError
+    without optuna."""
 
     def __init__(self, file: TuneFile, source: str) -> None:
+        if find_spec("optuna") is None:
+            raise UserError(NO_OPTUNA)
         self.file = file
         with naming(source):
             self._training = _cases(file, file.training)
@@ -112,11 +118,11 @@ class Tuning:
     ) -> Tuned:
         """Search, then fly the validation set with and without what was found.
 
-        `progress` gets the number of trials and the lowest cost so far. Raises UserError without
-        optuna, and what `Evaluator.fly` raises.
+        `progress` gets the number of trials and the lowest cost so far. Raises what `Evaluator.fly`
+        raises.
         """
-        study = _study(folder, self.file)
-        if not study.trials:
+        study = _study(folder, self.file, self._training)
+        if not any(trial.state.is_finished() for trial in study.trials):
             study.enqueue_trial({k: v for k, v in self._defaults.items() if self._within(k, v)})
         while (count := sum(trial.state.is_finished() for trial in study.trials)) < (
             self.file.trials
@@ -173,25 +179,27 @@ def _defaults(case: Case, file: TuneFile) -> dict[str, float]:
     return found
 
 
-def _study(folder: Path, file: TuneFile) -> Any:
-    """The study in a folder, begun or continued."""
-    try:
-        import optuna
-        from optuna.storages import JournalStorage
-        from optuna.storages.journal import JournalFileBackend
+def _study(folder: Path, file: TuneFile, training: Sequence[Case]) -> Any:
+    """The study in a folder, begun or continued. Its name is the hash of all that decides a cost,
+    so that no trial of another tuning or of other code counts."""
+    import optuna
+    from optuna.storages import JournalStorage
+    from optuna.storages.journal import JournalFileBackend
 
-        from offboard.campaign.swarm_sampler import SwarmSampler
-    except ImportError:
-        raise UserError(NO_OPTUNA) from None
+    from offboard.campaign.swarm_sampler import SwarmSampler
+
     optuna.logging.set_verbosity(optuna.logging.ERROR)
     samplers: dict[str, Callable[[], Any]] = {
         "tpe": lambda: optuna.samplers.TPESampler(seed=file.seed),
         "cma": lambda: optuna.samplers.CmaEsSampler(seed=file.seed),
         "swarm": lambda: SwarmSampler(file.ranges, file.seed),
     }
+    decides = file.model_dump(mode="json", include={"ranges", "objective", "failure", "sampler"})
+    decided = [code_hash(), file.seed, decides, [case.key for case in training]]
+    name = hashlib.sha256(json.dumps(decided).encode()).hexdigest()[:16]
     storage = JournalStorage(JournalFileBackend(str(folder / "tune.journal")))
     return optuna.create_study(
-        storage=storage, study_name=STUDY, sampler=samplers[file.sampler](), load_if_exists=True
+        storage=storage, study_name=name, sampler=samplers[file.sampler](), load_if_exists=True
     )
 
 

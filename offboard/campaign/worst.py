@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.campaign.campaign import Campaign, check
-from offboard.campaign.cases import Case, Values, rounded
+from offboard.campaign.cases import SEED, Case, Values, rounded
 from offboard.campaign.document import Search
 from offboard.campaign.evaluate import Evaluator
 from offboard.campaign.results import Record
@@ -27,7 +27,6 @@ from offboard.campaign.table import as_csv as csv_of
 from offboard.documents.errors import DocumentError, naming
 
 Array = NDArray[np.float64]
-SEED = "seed"  # a range of this name is that of the flight's seed: noise, and the phase of gusts
 BATCH = 20  # flights between two answers of a searcher
 ROUND_BATCHES = 5  # at least, in a round
 ROUNDS = 4
@@ -87,11 +86,13 @@ class FailureSearch:
         batches = max(1, self._search.flights // BATCH)
         rounds = max(1, min(ROUNDS, batches // ROUND_BATCHES))
         failures: list[Array] = []
-        for number in range(rounds):
-            method = self._search.methods[number % len(self._search.methods)]
-            searcher = SEARCHERS[method](
+        searchers = [  # all before the first flight: one may need a package
+            SEARCHERS[self._search.methods[number % len(self._search.methods)]](
                 len(self._search.ranges), BATCH, self._search.seed + 1000 * number
             )
+            for number in range(rounds)
+        ]
+        for number, searcher in enumerate(searchers):
             found: list[tuple[Array, Record]] = []
             for _ in range(batches * number // rounds, batches * (number + 1) // rounds):
                 points = list(searcher.ask())
@@ -236,11 +237,7 @@ def as_csv(failures: Sequence[Failure]) -> str:
 
 
 def keep(failures: Sequence[Failure], campaign: Campaign) -> Path:
-    """Write worst.csv and the scenario file of every failure. Raises UserError."""
-    for failure in failures:
-        if failure.case.text:
-            path = campaign.directory / failure.case.scenario_file
-            campaign.results.write(path, failure.case.text.encode())
+    """Write worst.csv. Raises UserError."""
     table = campaign.directory / "worst.csv"
     campaign.results.write(table, as_csv(failures).encode())
     return table

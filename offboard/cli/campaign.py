@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import re
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -11,10 +12,16 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from offboard.cli.shared import CommandError, Workers, option, out, say
+from offboard.documents.errors import UserError
 
 if TYPE_CHECKING:
     from offboard.campaign.campaign import Campaign, OpenWorkers, Shard, Summary
 
+EXIT_CODES = (
+    "Exit codes: 0 all flights are flown and meet `require`, or --worst has found no failure; 1 a "
+    "flight failed; 2 usage or configuration error; 4 flights are missing: the same command goes "
+    "on."
+)
 NAME = typer.Argument(metavar="NAME|FILE", help="Campaign: a shipped name or a file.")
 ENDED = "interrupted; finished flights are kept: run the same command again to go on"
 
@@ -75,6 +82,15 @@ def _shard(text: str | None) -> Shard:
     return Shard(int(matched[1]), int(matched[2]))
 
 
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Exit with 4 for an error after which the same command may go on, a full disk for example."""
+    try:
+        yield
+    except UserError as error:
+        raise CommandError(str(error), 4) from None
+
+
 def _search(flown: Campaign, source: str, count: int, open_workers: OpenWorkers) -> None:
     """Search for failures and print them; exits with 1 if there is one."""
     from offboard.campaign.evaluate import Evaluator, Interrupted
@@ -99,13 +115,16 @@ def _search(flown: Campaign, source: str, count: int, open_workers: OpenWorkers)
         search = search_of(flown, source, evaluator)
         most = search.flights_most(count)
         counter.count(0, most)
-        failures = search.find(count)
+        with interruptible():
+            failures = search.find(count)
     if failures is None:
         raise CommandError(ENDED, 4)
     table = keep(failures, flown)
     flown.cases = list(evaluator.flown)
     flown.write(flown.rows())
     say(f"{len(evaluator.flown)} flights, {len(failures)} failures that differ")
+    if failures:
+        say(f"fly one again in {flown.directory}:")
     for failure in failures:
         changed = ", ".join(f"{key}={value:g}" for key, value in failure.changed)
         record = failure.record

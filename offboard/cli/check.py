@@ -32,7 +32,7 @@ def check(
 
 def _checked(path: Path) -> str:
     """Validate a file; what it is. Raises DocumentError."""
-    from offboard.campaign.document import read_campaign
+    from offboard.campaign.document import CampaignFile, read_campaign
     from offboard.campaign.tune import read_tune
     from offboard.documents.reading import read
     from offboard.documents.shipped import read_text
@@ -43,7 +43,7 @@ def _checked(path: Path) -> str:
     if keys & {"training", "validation"}:
         read_tune(str(path))
         return "tuning"
-    if keys & {"controllers", "references", "scenarios", "seeds", "search"}:
+    if keys & CampaignFile.model_fields.keys() - {"config"}:
         read_campaign(str(path))
         return "campaign"
     return check_file(path, check_scenario)

@@ -61,11 +61,11 @@ app.command(cls=Command, epilog=EXIT_CODES)(score.score)
 app.command(cls=Command, epilog=EXIT_CODES)(report.report)
 app.command(cls=Command, epilog=EXIT_CODES)(check.check)
 app.command(cls=Command, epilog=EXIT_CODES)(identify.identify)
-app.command(cls=Command, epilog=f"{NAMES}\n\n{EXIT_CODES}")(compare.compare)
-app.command(cls=Command, epilog=f"{shipped.overview('campaign')}\n\n{EXIT_CODES}")(
+app.command(cls=Command, epilog=f"{NAMES}\n\n{compare.EXIT_CODES}")(compare.compare)
+app.command(cls=Command, epilog=f"{shipped.overview('campaign')}\n\n{campaign.EXIT_CODES}")(
     campaign.campaign
 )
-app.command(cls=Command, epilog=f"{shipped.overview('tuning')}\n\n{EXIT_CODES}")(tune.tune)
+app.command(cls=Command, epilog=f"{shipped.overview('tuning')}\n\n{tune.EXIT_CODES}")(tune.tune)
 app.command(cls=Command, epilog=EXIT_CODES)(paper.paper)
 app.command(cls=Command, epilog=replay.EXIT_CODES)(replay.replay)
 app.command(cls=Command, epilog=EXIT_CODES)(export.export)

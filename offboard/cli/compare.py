@@ -21,13 +21,19 @@ from offboard.cli.shared import (
 )
 from offboard.documents import shipped
 
+EXIT_CODES = (
+    "Exit codes: 0 all flights are completed; 2 usage or configuration error; 4 a flight failed or "
+    "is missing."
+)
 NAMES = "Names or files, separated by commas"
+
+SCENARIOS = "calm,px4_like"
 
 
 def compare(
     controllers: Annotated[str, option("LIST", f"{NAMES}, or 'all'.")] = "pso,lqr,paper",
     reference: Annotated[str, option("LIST", f"{NAMES}.")] = "lemniscate",
-    scenario: Annotated[str, option("LIST", f"{NAMES}.")] = "calm,px4_like",
+    scenario: Annotated[str | None, option("LIST", f"{NAMES}.  [default: {SCENARIOS}]")] = None,
     seeds: Annotated[int, option("N", "Flights of each combination, with seeds 1 .. N.")] = 3,
     vehicle: Vehicle = None,
     connect: Annotated[
@@ -46,11 +52,13 @@ def compare(
     """
     if connect is None and (system or signing_key):
         raise CommandError("--system and --signing-key are options of --connect: add it")
+    if connect and (scenario or workers):
+        raise CommandError("--scenario and --workers are options of the simulator: omit --connect")
     if not 1 <= seeds <= 1000:
         raise CommandError(f"--seeds {seeds}: give 1 .. 1000")
-    laws = _names(controllers, shipped.names("controllers"))
-    references = _names(reference)
-    scenarios = _names(scenario) if connect is None else ["connected"]
+    laws = _names("--controllers", controllers, shipped.names("controllers"))
+    references = _names("--reference", reference)
+    scenarios = ["connected"] if connect else _names("--scenario", scenario or SCENARIOS)
     say(
         f"controllers: {len(laws)}, references: {len(references)}, scenarios: {len(scenarios)}, "
         f"seeds: {seeds}"
@@ -77,9 +85,9 @@ def compare(
         raise CommandError(problem, 4)
 
 
-def _names(text: str, known: Sequence[str] = ()) -> list[str]:
+def _names(name: str, text: str, known: Sequence[str] = ()) -> list[str]:
     """Comma-separated names, each once; 'all' stands for every known one."""
     parts = [part.strip() for part in text.split(",") if part.strip()]
     if not parts:
-        raise CommandError("an empty list of names; give at least one")
+        raise CommandError(f"{name} is an empty list of names; give at least one")
     return list(known) if parts == ["all"] and known else list(dict.fromkeys(parts))

@@ -109,6 +109,6 @@ def _show(rows: list[Row]) -> None:
             say(f"{name(finding.level):<{levels}}  {row.check:<{width}}  {finding.found}", indent)
             if finding.hint:
                 say(f"{'':<{indent}}fix: {finding.hint}", indent + 5)
-    number = sum(row.level is not Level.OK for row in rows)
+    number = sum(finding.level is not Level.OK for row in rows for finding in row.findings)
     out.print()
-    say(f"{len(rows)} checks, {number} with something to say")
+    say(f"{len(rows)} checks, {number} findings")

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from offboard.cli.shared import FLIGHT, CommandError, complain, option, say
+from offboard.cli.shared import FLIGHT, CommandError, check_new, complain, option, say
 
 
 class Format(str, Enum):  # noqa: UP042 - typer shows the values of a `str`
@@ -32,9 +32,9 @@ def export(
     """Write a flight in the format of another tool.
 
     mcap: Foxglove's schemas (ENU) and all values as JSON, for Foxglove, Lichtblick, Rerun and
-    PlotJuggler. ulog: PX4's topics, for Flight Review and PlotJuggler; its stamps are always
-    vehicle time. parquet, csv: one row for each sample, with both times, units in the names of the
-    columns. UAV Log Viewer and MAVExplorer read the .tlog itself. mcap and parquet need the extra
+    PlotJuggler. ulog: PX4's topics, for PlotJuggler and pyulog; its stamps are always vehicle time.
+    parquet, csv: one row for each sample, with both times, units in the names of the columns. UAV
+    Log Viewer and MAVExplorer read the .tlog itself. mcap and parquet need the extra
     `pso-offboard[export]`.
     """
     if vehicle_time and to is not Format.MCAP:
@@ -44,8 +44,7 @@ def export(
     from offboard.export.table import write_csv, write_parquet
     from offboard.export.ulog import write_ulog
 
-    if output.exists() or output.is_symlink():
-        raise CommandError(f"{output} exists already; choose another file with -o")
+    check_new(output, "-o")
     found = read(flight)
     if to is Format.MCAP:
         write_mcap(found, output, vehicle_time=vehicle_time)

@@ -128,10 +128,9 @@ def fly(
                 system_id=system,
                 signing_key=signing_key,
             )
-            tell = displays.tell if json_lines else say
             for url in displays.await_ready():
-                tell(f"live: {url}")
-            outcome = fly_request(request, displays.show, tell, simulator, stops)
+                displays.tell(f"live: {url}")
+            outcome = fly_request(request, displays.show, displays.tell, simulator, stops)
     except KeyboardInterrupt:  # before the flight; in flight an interrupt lands the vehicle
         raise CommandError(INTERRUPTED) from None
     if outcome.exit_code == 2:
@@ -201,10 +200,13 @@ def _conclude(
             complain(f"{outcome.sentence}; requirement missed: {results}")
         else:
             say(f"{outcome.sentence}{'; requirement met: ' if results else ''}{results}")
-        rows = summary(score, history, directory)
+        rows = summary(score, history)
+        if rows:
+            rows["log"] = str(directory / "flight.tlog")
+            rows["all figures"] = f"offboard score {directory}"
         if report:
-            rows.append(("report", f"{directory / 'report.html'}, in some seconds"))
-        for label, text in rows:
+            rows["report"] = f"{directory / 'report.html'}, in some seconds"
+        for label, text in rows.items():
             say(f"  {label:<{LABEL_WIDTH}}{text}", indent=2 + LABEL_WIDTH)
         sys.stdout.flush()
     except OSError as error:  # the exit code stays that of the flight

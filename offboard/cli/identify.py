@@ -17,6 +17,7 @@ from offboard.cli.shared import (
     SigningKey,
     System,
     check_new,
+    complain,
     free_name,
     option,
     out,
@@ -65,8 +66,10 @@ def identify(
             check_new(chosen, name)
     if output is not None and page is not None and output.resolve() == page.resolve():
         raise CommandError(f"-o and --page are both {output}; choose two files")
-    if flight is not None and (system or signing_key):
-        raise CommandError("a log needs neither --system nor --signing-key: they are for --connect")
+    if flight is not None and (system or signing_key or out_directory):
+        raise CommandError(
+            "a log needs no --system, --signing-key or --out: they are for --connect and --sitl"
+        )
     if flight is None:
         flight = out_directory or FLIGHTS / f"identify-{clock.local_stamp()}"
         fly(
@@ -86,10 +89,14 @@ def identify(
         prior = flown(configuration).vehicle
     else:
         prior = load("flight", choices={"vehicle": vehicle}).vehicle
-    found, trace = identify_flight(log, history.gather(log), prior)
-    text = vehicle_file(found, prior, flight.name)
+    arrays = history.gather(log)
+    if arrays.damage:
+        complain(arrays.damage)
+    found, trace = identify_flight(arrays, prior)
+    name = flight.name or flight.resolve().name
+    text = vehicle_file(found, prior, name)
     shown = page or free_name(path.with_name("identify.html"))
-    write_new(shown, fits(flight.name, found, trace, prior))
+    write_new(shown, fits(name, found, trace, prior))
     if not found.supported:
         raise CommandError(f"nothing could be identified from this flight; {shown} says why", 1)
     if output is not None:

@@ -42,6 +42,8 @@ def replay(
     with loading():
         from offboard.replay.recording import read
     recording = read(flight)
+    if recording.log.damage:
+        complain(recording.log.damage)
     if at is not None:
         _show_moment(recording, at)
     elif controller is not None:
@@ -54,10 +56,8 @@ def _show_verdict(recording: Recording) -> None:
     from offboard.replay.verdict import explained, verdict
 
     result = verdict(recording)
-    if recording.log.damage:
-        complain(recording.log.damage)
-    if result.stopped:
-        complain(f"replayed up to {result.ended_s:.1f} s of vehicle time: {result.stopped}")
+    if result.incomplete:
+        complain(result.incomplete)
     sentence = result.comparison.sentence()
     if not result.comparison.significant:
         say(f"{sentence} ({result.turns} turns, up to {result.ended_s:.1f} s of vehicle time)")
@@ -82,5 +82,8 @@ def _show_moment(recording: Recording, time_s: float) -> None:
 def _show_other(recording: Recording, controller: str) -> None:
     from offboard.replay.other_law import other_law
 
-    for line in other_law(recording, controller):
+    lines, incomplete = other_law(recording, controller)
+    if incomplete:
+        complain(incomplete)
+    for line in lines:
         say(line, indent=2)

@@ -7,10 +7,7 @@ wrong options are answered at once.
 from __future__ import annotations
 
 import itertools
-import os
 import sys
-from contextlib import suppress
-from errno import EEXIST
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -20,6 +17,7 @@ from rich.console import Console
 from offboard.documents.command_line import complain as complain
 from offboard.documents.command_line import wrapped
 from offboard.documents.errors import UserError
+from offboard.io.new_file import new_file
 
 out = Console(highlight=False)
 err = Console(stderr=True, highlight=False)
@@ -116,19 +114,6 @@ def free_name(path: Path) -> Path:
 
 
 def write_new(path: Path, text: str) -> None:
-    """Write a file that must not exist. It appears when it is complete. Raises CommandError."""
-    incomplete = path.with_name(f".{os.getpid()}.part")
-    try:
-        with incomplete.open("x", encoding="utf-8") as file:
-            file.write(text)
-        try:
-            os.link(incomplete, path)  # unlike a rename, refuses to replace a file
-        except PermissionError:  # a file system without links
-            if path.exists():
-                raise FileExistsError(EEXIST, os.strerror(EEXIST)) from None
-            incomplete.rename(path)
-    except OSError as error:
-        raise CommandError(f"{path} cannot be written ({error.strerror})") from None
-    finally:
-        with suppress(OSError):
-            incomplete.unlink()
+    """Write a file that must not exist. It appears when it is complete. Raises UserError."""
+    with new_file(path) as file:
+        file.write(text.encode())

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from offboard.cli.campaign import ENDED
-from offboard.cli.shared import CommandError, Workers, check_new, option, out, say
+from offboard.cli.campaign import ENDED, interruptible
+from offboard.cli.shared import CommandError, Workers, check_new, option, out, say, write_new
 
+EXIT_CODES = (
+    "Exit codes: 0 a better configuration is written; 1 none is better; 2 usage or configuration "
+    "error; 4 interrupted: the same command goes on."
+)
 NAME = typer.Argument(metavar="NAME|FILE", help="Tuning: a shipped name or a file.")
 
 
@@ -33,6 +38,7 @@ def tune(
         from offboard.campaign.evaluate import Evaluator, Interrupted
         from offboard.campaign.execution import local_workers
         from offboard.campaign.margin import Promises
+        from offboard.campaign.progress import Counter
         from offboard.campaign.results import Results
         from offboard.campaign.tune import Tuning, read_tune
         from offboard.campaign.tune import profile as text_of
@@ -45,8 +51,9 @@ def tune(
         suppress(KeyboardInterrupt, Interrupted),
         StopRequests() as stops,
         local_workers(workers) as flyers,
+        interruptible(),
     ):
-        evaluator = Evaluator(results, Promises(), flyers, lambda: stops.requested)
+        evaluator = Evaluator(results, Promises(), flyers, partial(Counter(out).ending, stops))
         tuned = tuning.run(
             results.directory,
             evaluator,
@@ -59,5 +66,5 @@ def tune(
     say(f"validation: {tuned.verdict}")
     if not tuned.verdict.better:
         raise CommandError("not better with 95 % confidence: nothing is written", 1)
-    results.write(profile, text_of(tuning.file, tuned).encode())
+    write_new(profile, text_of(tuning.file, tuned))
     say(f"written: {profile}")

@@ -12,13 +12,16 @@ import math
 import re
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import yaml
 from pydantic import BaseModel, ValidationError
 
 from offboard.documents.errors import DocumentError as DocumentError
 from offboard.documents.errors import abridged, key_path, sentence, shown
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
 
 M = TypeVar("M", bound=BaseModel)
 Json = dict[str, Any]
@@ -105,7 +108,7 @@ def validate(
         return model.model_validate_json(json.dumps(mapping), strict=True)
     except ValidationError as error:
         schema = model.model_json_schema()
-        details = error.errors(include_url=False)
+        details = _own_problems(error.errors(include_url=False), mapping)
         problems = [
             f"{_origin(key_path(detail, mapping), options, source)}: "
             f"{sentence(detail, mapping, schema)}"
@@ -114,6 +117,23 @@ def validate(
         if len(details) > PROBLEMS_MOST:
             problems.append(f"{source}: and {len(details) - PROBLEMS_MOST} more problems")
         raise DocumentError(*problems) from None
+
+
+def _own_problems(details: list[ErrorDetails], mapping: Mapping[str, Any]) -> list[ErrorDetails]:
+    """The errors without those that another one explains: a value of the right type is also refused
+    as every other type of a union, and a list is counted without its wrong items."""
+    paths = [key_path(detail, mapping) for detail in details]
+    typed = {
+        path
+        for path, detail in zip(paths, details, strict=True)
+        if not detail["type"].endswith("_type")
+    }
+    return [
+        detail
+        for path, detail in zip(paths, details, strict=True)
+        if not (detail["type"].endswith("_type") and path in typed)
+        and not (detail["type"] == "too_short" and any(p.startswith(f"{path}.") for p in paths))
+    ]
 
 
 def _origin(path: str, options: Mapping[str, str], source: str) -> str:

@@ -14,14 +14,13 @@ from typing import Any
 
 import numpy as np
 
-from offboard.export.new_file import library, new_file
+from offboard.analysis.scene import BODY, COLOURS, LINE_M, MAP
+from offboard.export.extra import library
 from offboard.export.series import Array, Flight, Series
+from offboard.io.new_file import new_file
 from offboard.model.frames import enu, flu_in_enu
 
 KIND = "mcap"
-MAP, BODY = "map", "base_link"
-_LINE_M = 0.02  # thickness of a path
-_COLOURS = {"flown": (0.12, 0.47, 0.71, 1.0), "reference": (1.0, 0.5, 0.05, 1.0)}
 Stamped = tuple[int, str, Any]  # time in ns, topic, protobuf message or dict
 Stamps = Callable[[Array], list[int]]  # vehicle times in s to stamps of the file in ns
 
@@ -142,10 +141,10 @@ def _path(series: Series, topic: str, stamps: Stamps) -> Iterator[Stamped]:
     update = _message("SceneUpdate")()
     entity = update.entities.add(id=topic, frame_id=MAP)
     entity.timestamp.FromNanoseconds(first_ns)
-    line = entity.lines.add(thickness=_LINE_M)
+    line = entity.lines.add(thickness=LINE_M)
     line.type = line.LINE_STRIP
     line.pose.orientation.w = 1.0
-    line.color.r, line.color.g, line.color.b, line.color.a = _COLOURS[topic]
+    line.color.r, line.color.g, line.color.b, line.color.a = COLOURS[topic]
     for x, y, z in enu(series.values[:, :3]).tolist():
         if math.isfinite(x + y + z):
             line.points.add(x=x, y=y, z=z)

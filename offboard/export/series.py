@@ -47,6 +47,7 @@ _COLUMNS = {
     "decision": tuple(f"decision_{name}" for name in FIELDS),
     "heartbeat": ("armed", "system_status"),
 }
+_AUTOPILOTS = {"px4": "PX4", "ardupilot": "ArduPilot"}  # as MAV_AUTOPILOT names them
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,11 +58,6 @@ class Series:
     columns: tuple[str, ...]
     time_s: Array
     values: Array
-
-    def column(self, name: str) -> Array:
-        """The values (N,) of one column."""
-        values: Array = self.values[:, self.columns.index(name)]
-        return values
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,14 +87,14 @@ def read(path: Path) -> Flight:
     """The flight in a directory or .tlog. Raises TlogError, or UserError without telemetry."""
     log = tlog.read(tlog.find(path))
     flown = history.gather(log)
-    unix = _unix(log)
+    unix = _unix(log, flown.vehicle_id)
     if not len(unix):
         raise UserError(f"{log.path} holds no telemetry with a time stamp: nothing to export")
-    events = (*flown.phases, *flown.modes, *flown.vehicle_messages)
-    known = sorted((e for e in events if np.isfinite(e.time_s)), key=lambda event: event.time_s)
+    events = tuple(event for event in flown.events() if np.isfinite(event.time_s))
     found = {name: _series(name, rows) for name, rows in _rows(flown).items()}
     series = {name: each for name, each in found.items() if len(each.time_s)}
-    return Flight(series, tuple(known), unix, _autopilot(log), flown.damage)
+    autopilot = _AUTOPILOTS[flown.dialect.name] if flown.dialect else "unknown"
+    return Flight(series, events, unix, autopilot, flown.damage)
 
 
 def _rows(flown: History) -> dict[str, Array]:
@@ -121,21 +117,15 @@ def _series(name: str, rows: Array) -> Series:
     return Series(name, _COLUMNS[name], rows[:, 0], rows[:, 1:])
 
 
-def _unix(log: Tlog) -> Array:
-    """Vehicle time and Unix time of telemetry, each newer than the one before."""
+def _unix(log: Tlog, vehicle_id: int | None) -> Array:
+    """Vehicle time and Unix time of the vehicle's telemetry, each newer than the one before."""
     rows = [
         (int.from_bytes(message.frame.payload[:4], "little") / 1e3, message.unix_us / 1e6)
         for message in log
-        if message.frame.message_id in TELEMETRY and message.component_id == 1
+        if message.frame.message_id in TELEMETRY and message.system_id == vehicle_id
     ]
     stamps = np.reshape(rows, (-1, 2)).astype(np.float64)
     if len(stamps):
         newest = np.maximum.accumulate(stamps, axis=0)
         stamps = newest[np.r_[True, np.diff(newest[:, 0]) > 0.0]]
     return stamps
-
-
-def _autopilot(log: Tlog) -> str:
-    """Name of the autopilot as MAV_AUTOPILOT has it; "unknown" without a heartbeat."""
-    _, dialect = history.vehicle(log)
-    return {"px4": "PX4", "ardupilot": "ArduPilot"}[dialect.name] if dialect else "unknown"

@@ -13,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from offboard.export.new_file import library, new_file
+from offboard.export.extra import library
 from offboard.export.series import Array, Flight
+from offboard.io.new_file import new_file
 
 EVENT = "event"
 
@@ -55,9 +56,9 @@ def _columns(flight: Flight) -> dict[str, Any]:
     }
     first = 0
     for part in parts:
-        for column in part.columns:
+        for column, samples in zip(part.columns, part.values.T, strict=True):
             values: Array = np.full(len(time_s), np.nan)
-            values[first : first + len(part.time_s)] = part.column(column)
+            values[first : first + len(part.time_s)] = samples
             columns[column] = values[order]
         first += len(part.time_s)
     columns[EVENT] = np.array([text or None for text in texts], dtype=object)[order]

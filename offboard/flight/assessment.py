@@ -16,13 +16,15 @@ from offboard.flight.facts import Facts
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.phases import TRACKING, Phase
 from offboard.flight.state import FlightState
-from offboard.mavlink.events import Heartbeat, OtherCompanion, OtherSender
+from offboard.mavlink.events import Heartbeat, OtherCompanion, OtherSender, ThrustReport
 from offboard.mavlink.session import Session
 from offboard.model.frames import thrust_direction_from_quaternion
 
 TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
 MINIMUM_TELEMETRY_HZ = 10.0
 OTHER_SENDER_S = 5.0  # a second sender is there for so long after its newest frame
+FULL_THRUST = 0.99
+THRUST_REPORT_S = 1.0  # age of a ThrustReport that counts
 ARMING_SHOWN_S = 2.5  # HEARTBEAT, at 1 Hz, shows an accepted arming within this time
 READIED = (Phase.HEALTH, Phase.STANDBY)  # phases in which readiness is judged
 ARM = 400  # MAV_CMD_COMPONENT_ARM_DISARM
@@ -80,7 +82,9 @@ def facts(
         position_jump_m=state.jumps.recent_m(time_s),
         battery=1.0 if charge is None else charge,
         hover_thrust=observer.hover_thrust_estimate if state.phase in TRACKING else math.nan,
+        full_thrust_sink_mps=_full_thrust_sink_mps(state),
         other_sender=_hears_other_sender(state),
+        follows_others=_follows_others(state),
         other_vehicle=session.autopilots.ambiguous(state.now_s),
         disarmed_again=_disarmed_again(state),
         lifted_by_command=state.takes_off_by_command,
@@ -102,6 +106,18 @@ def has_other_sender(state: FlightState) -> bool:
 
 def _hears_other_sender(state: FlightState) -> bool:
     return state.vehicle.age_s(OtherSender) < OTHER_SENDER_S
+
+
+def _full_thrust_sink_mps(state: FlightState) -> float:
+    position, thrusts = state.vehicle.position, state.thrusts
+    if state.phase not in TRACKING or position is None or not thrusts:
+        return 0.0
+    return max(position.velocity_ned_mps[2], 0.0) if thrusts[-1] >= FULL_THRUST else 0.0
+
+
+def _follows_others(state: FlightState) -> bool:
+    reported = state.vehicle.age_s(ThrustReport) < THRUST_REPORT_S
+    return state.follows_others and reported and state.phase in TRACKING
 
 
 def figures(

@@ -38,6 +38,8 @@ from offboard.mavlink.outgoing import CommandResult
 from offboard.mavlink.session import Session
 from offboard.model.frames import thrust_direction_from_quaternion
 
+SAME_THRUST = 1e-5  # of full throttle: rounding on the link
+
 
 class EventProcessor:
     """Updates `state`, observer and identification by one event after the other.
@@ -78,6 +80,7 @@ class EventProcessor:
                 self._on_position(event)
             case ThrustReport(thrust):
                 state.hover.on_thrust(state.time_s, thrust, thrust * self._lifting_share())
+                state.follows_others = self._is_of_others(thrust)
             case Heartbeat(mode) | ModeReport(mode):
                 self._on_mode(event, mode, arrived_s)
             case TimesyncReply(vehicle_ns=vehicle_ns):
@@ -99,6 +102,14 @@ class EventProcessor:
                 )
             case Rebooted():
                 self._on_reboot()
+
+    def _is_of_others(self, thrust: float) -> bool:
+        """Whether the vehicle demands a thrust that no recent setpoint of ours had. False on
+        ArduCopter, which does not report the thrust of the setpoint."""
+        state = self._state
+        if state.dialect is None or state.dialect.thrust_rule is not ThrustRule.COLLECTIVE:
+            return False
+        return bool(state.thrusts) and all(abs(thrust - t) > SAME_THRUST for t in state.thrusts)
 
     def _lifting_share(self) -> float:
         """Vertical part of the thrust that the autopilot reports: the cosine of the tilt, unless it

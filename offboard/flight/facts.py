@@ -52,7 +52,9 @@ class Facts:
     position_jump_m: float = 0.0  # of the reported position, all of the last ten seconds
     battery: float = 1.0
     hover_thrust: float = math.nan  # normalised, as setpoints that are followed show it now
+    full_thrust_sink_mps: float = 0.0  # downward speed while setpoints demand the full thrust
     other_sender: bool = False
+    follows_others: bool = False  # setpoints of another program, by the thrust that it reports
     other_vehicle: bool = False  # several vehicles were heard, and none was chosen
     disarmed_again: bool = False  # after arming was accepted
     lifted_by_command: bool = False  # the autopilot takes off on a command, without setpoints

@@ -48,6 +48,11 @@ def other_sender(now: Facts) -> bool:
     return now.other_sender and not now.limits.begin_with_other_sender
 
 
+def follows_others(now: Facts) -> bool:
+    """It follows setpoints of another program in the mode that we asked for."""
+    return now.engaged and now.follows_others and not now.limits.begin_with_other_sender
+
+
 def other_vehicle(now: Facts) -> bool:
     """Several vehicles are heard: which one is meant?"""
     return now.other_vehicle

@@ -15,6 +15,7 @@ from offboard.flight.facts import Facts
 from offboard.flight.phases import Rung
 
 RECOVERY = 0.25  # speed at which a delay runs back
+SINK_MPS = 0.3  # that full thrust stops within the delay, on a vehicle that can be flown
 STEP_MAX_S = 0.2  # what one sample counts for, also after a gap of telemetry
 
 
@@ -174,6 +175,15 @@ ROWS = (
         "the vehicle hovers with {hover_thrust_percent:.0f} % of its thrust (limits.hover_thrust)",
     ),
     LadderRow(
+        "full thrust",
+        "downward speed while setpoints demand the full thrust",
+        f"{SINK_MPS:g} m/s",
+        lambda now: now.full_thrust_sink_mps > SINK_MPS,
+        1.0,
+        Rung.LAND,
+        "the vehicle sinks at {full_thrust_sink_mps:.1f} m/s with full thrust",
+    ),
+    LadderRow(
         "second sender",
         "another program sends setpoints or uses our ids on this link",
         "one frame",
@@ -181,6 +191,15 @@ ROWS = (
         0.0,
         Rung.HOLD,
         "another program controls the vehicle on this link, too: {other_sender}",
+    ),
+    LadderRow(
+        "other setpoints",
+        "thrust of the setpoint that PX4 follows (ATTITUDE_TARGET): none of our newest 40",
+        "1e-5",
+        guards.follows_others,
+        2.5,  # a pilot's change of the mode is seen within this time, or `authority` acts
+        Rung.HOLD,
+        "the vehicle follows setpoints of another program{companion}",
     ),
     LadderRow(
         "clock",

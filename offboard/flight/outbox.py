@@ -86,6 +86,7 @@ class Outbox:
         command = admit(command, model, self._clearance(age_s, late_s))
         self.set_command(time_s, command)
         self._state.commands.append(command)
+        self._state.thrusts.append(min(command.thrust_mps2 / model.thrust_max_mps2, 1.0))
         if self._identification:
             self._identification.on_command(self._state.sent_s(time_s), command)
         self.send(
@@ -121,6 +122,7 @@ class Outbox:
         """
         command = admit(command, self._state.model, self._clearance(age_s, late_s))
         self._observer.freeze(True)
+        self._state.thrusts.clear()
         self.command = Command(self._state.model.gravity_mps2, LEVEL, command.course_rad)
         self.send(
             PositionTarget(

@@ -31,6 +31,7 @@ from offboard.model.vehicle import Vehicle
 
 Triple = tuple[float, float, float]
 COMMANDS_KEPT = 7  # as long as an attitude may take to follow
+THRUSTS_KEPT = 40  # as long as a setpoint may be on its way, or the next ones be lost
 PREDICTIONS_KEPT = 8
 POSITION_KNOWN_S = 1.0  # for the verdict of a landing
 
@@ -82,6 +83,8 @@ class FlightState:
     missed: int = 0  # decisions in a row that were not sent
     failure: str = ""  # of the newest of them
     commands: deque[Command] = field(default_factory=lambda: deque(maxlen=COMMANDS_KEPT))
+    thrusts: deque[float] = field(default_factory=lambda: deque(maxlen=THRUSTS_KEPT))
+    follows_others: bool = False  # the newest ThrustReport is of none of `thrusts`
     predictions: deque[PredictedState] = field(
         default_factory=lambda: deque(maxlen=PREDICTIONS_KEPT)
     )

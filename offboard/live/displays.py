@@ -24,9 +24,8 @@ class Displays:
         return [page.await_ready() for page in self._pages]
 
     def tell(self, sentence: str) -> None:
-        """A sentence about the preparation, as a JSON line."""
-        if isinstance(self._lines, JsonLines):
-            self._lines.tell(sentence)
+        """A sentence about the preparation."""
+        self._lines.tell(sentence)
 
     def show(self, companion: Companion) -> None:
         for part in tuple(self._working):

@@ -15,18 +15,16 @@ import threading
 from collections import deque
 from typing import Any
 
+from offboard.analysis.scene import BODY, COLOURS, LINE_M, MAP
 from offboard.documents.arguments import join_address
 from offboard.io import clock
 from offboard.live.values import json_schema
 from offboard.model.frames import Array, enu, flu_in_enu, quaternion_from_euler
 
-MAP, BODY = "map", "base_link"
 BACKLOG = 100  # messages that a client may be late; then it loses the oldest
 PATH_POINTS = 3000  # the last five minutes
 PATH_EVERY = 10  # snapshots, so that a late client has the paths after a second
 LAST_S = 0.3  # for the last messages: the server drops what it has not sent when it stops
-_LINE_M = 0.02  # thickness of a path
-_COLOURS = {"flown": (0.12, 0.47, 0.71, 1.0), "reference": (1.0, 0.5, 0.05, 1.0)}
 _NICENESS = 5
 
 
@@ -42,9 +40,9 @@ class Publisher:
         self._reference = channels.PoseInFrameChannel("/reference")
         self._frames = channels.FrameTransformChannel("/tf")
         self._texts = channels.LogChannel("/log")
-        self._paths = {name: channels.SceneUpdateChannel(f"/path/{name}") for name in _COLOURS}
+        self._paths = {name: channels.SceneUpdateChannel(f"/path/{name}") for name in COLOURS}
         self._points: dict[str, deque[Array]] = {
-            name: deque(maxlen=PATH_POINTS) for name in _COLOURS
+            name: deque(maxlen=PATH_POINTS) for name in COLOURS
         }
         self._published = 0
         self._told: list[str] = []
@@ -87,8 +85,8 @@ class Publisher:
         for name, points in self._points.items():
             line = LinePrimitive(
                 points=[Point3(x=x, y=y, z=z) for x, y, z in points],
-                thickness=_LINE_M,
-                color=Color(**dict(zip("rgba", _COLOURS[name], strict=True))),
+                thickness=LINE_M,
+                color=Color(**dict(zip("rgba", COLOURS[name], strict=True))),
             )
             entity = SceneEntity(timestamp=stamp, frame_id=MAP, id=name, lines=[line])
             self._paths[name].log(SceneUpdate(entities=[entity]), log_time=now_ns)

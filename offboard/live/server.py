@@ -35,24 +35,22 @@ class Broadcast:
         self._clients: set[asyncio.Queue[str | None]] = set()
         self._kept: deque[dict[str, Any]] = deque(maxlen=KEPT)
         self._newest: dict[str, Any] | None = None
-        self.ended = False
 
     def publish(self, text: str) -> None:
         """A snapshot as JSON text."""
         self._newest = json.loads(text)
         self._kept.append({name: self._newest[name] for name in _TRACE})
+        self._put(text)
+
+    def end(self) -> None:
+        """The flight is over."""
+        self._put(None)
+
+    def _put(self, text: str | None) -> None:
         for queue in self._clients:
             if queue.full():
                 queue.get_nowait()  # the oldest
             queue.put_nowait(text)
-
-    def end(self) -> None:
-        """The flight is over."""
-        self.ended = True
-        for queue in self._clients:
-            if queue.full():
-                queue.get_nowait()
-            queue.put_nowait(None)
 
     async def events(self, request: web.Request) -> web.StreamResponse:
         """The stream of one client, until it leaves or the flight ends."""
@@ -95,9 +93,9 @@ async def serve(host: str, port: int) -> None:
         broadcast.end()
         await asyncio.sleep(0.1)  # the clients take their last event
     except OSError as error:
-        reason = (
-            f"{join_address(host, port)} cannot be listened on ({os.strerror(error.errno or 0)})"
-        )
+        number = error.errno or 0  # negative: of the name service
+        why = os.strerror(number) if number >= 0 else error.strerror
+        reason = f"{join_address(host, port)} cannot be listened on ({why})"
         print(json.dumps({"error": f"{reason}; choose another address"}), flush=True)
     finally:
         await runner.cleanup()

@@ -23,7 +23,7 @@ def moment_at(replay: Replay, time_s: float) -> dict[str, Rows]:
     """Replay up to the first tick at or after `time_s`, vehicle time. Returns what was received,
     the state, the facts, the ladder, the decision and what was sent, each as names and values.
 
-    Raises UserError where the flight ends before.
+    Raises UserError where the flight ends before, or its log is damaged.
     """
     period_s, tick = replay.config.period_s, -1
     for turn in replay.turns():
@@ -31,9 +31,8 @@ def moment_at(replay: Replay, time_s: float) -> dict[str, Rows]:
         if number > tick and replay.ended_s >= time_s - 1e-6:
             return _rows(replay, turn)
         tick = max(tick, number)
-    raise UserError(
-        f"--at {time_s:g}: the recorded flight ends at {replay.ended_s:.3f} s of vehicle time"
-    )
+    ended = f"the recorded flight ends at {replay.ended_s:.3f} s of vehicle time"
+    raise UserError(f"--at {time_s:g}: {replay.incomplete or ended}")
 
 
 def _rows(replay: Replay, turn: Turn) -> dict[str, Rows]:

@@ -17,12 +17,12 @@ from offboard.replay.replaying import Replay
 from offboard.run.configuration import build_controller, flown
 
 
-def other_law(recording: Recording, name: str) -> list[str]:
+def other_law(recording: Recording, name: str) -> tuple[list[str], str]:
     """Fly the recorded flight again while the controller `name` decides beside it, open loop: the
     vehicle follows the flight's own commands, and the other law has no deadline.
 
-    Returns one line for each figure. Raises UserError if there is nothing to compare, and
-    DocumentError for a controller that does not exist or cannot be built.
+    Returns one line for each figure, and `Replay.incomplete`. Raises UserError if there is nothing
+    to compare, and DocumentError for a controller that does not exist or cannot be built.
     """
     config = flown(recording.configuration, name)
     other, figures = build_controller(config), Figures()
@@ -40,14 +40,15 @@ def other_law(recording: Recording, name: str) -> list[str]:
     if figures.others:
         lines.append(f"{figures.others} decisions are no attitude commands, and are not compared")
     if not figures.angle_rad:
-        raise UserError("; ".join(["nothing to compare", *lines]))
+        raise UserError("; ".join(filter(None, ["nothing to compare", replay.incomplete, *lines])))
     law, own = config.controller.law, replay.config.controller.law
-    return [
+    lines = [
         f"{law} beside {own} in {len(figures.angle_rad)} decisions, on the states of the flight",
         _line("thrust direction", np.degrees(figures.angle_rad), "deg"),
         _line("thrust", np.array(figures.thrust_mps2), "m/s2"),
         *lines,
     ]
+    return lines, replay.incomplete
 
 
 def _line(name: str, values: np.ndarray[tuple[int], np.dtype[np.float64]], unit: str) -> str:

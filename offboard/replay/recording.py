@@ -49,11 +49,7 @@ def read(flight: Path) -> Recording:
             f"{path} does not hold the configuration of a flight: only logs of offboard can be "
             "replayed"
         )
-    recorded = tuple(
-        bytes(entry.message.payload[: entry.message.payload_length])
-        for entry in log
-        if record_type(entry) == inputs.PAYLOAD_TYPE
-    )
+    recorded = tuple(m.tunnelled for m in log if record_type(m) == inputs.PAYLOAD_TYPE)
     if not recorded:
         raise UserError(
             f"{path} cannot be replayed, only scored and reported: it has no inputs of each turn; "

@@ -109,6 +109,13 @@ class Replay:
         parts = replace(parts, controller=controller)
         return companion_of(parts, session, observer, self._stopwatch)
 
+    @property
+    def incomplete(self) -> str:
+        """Up to where the recording was replayed, and why no further; empty if all of it was."""
+        if not self.stopped:
+            return ""
+        return f"replayed up to {self.ended_s:.1f} s of vehicle time: {self.stopped}"
+
     def turns(self) -> Iterator[Turn]:
         """Replay turn by turn."""
         try:
@@ -208,7 +215,16 @@ class Replay:
             return False
         frame = message.frame
         self.recorded.append(Sent(self.ended_s, frame.message_id, frame.payload))
+        self._note_thrust(message)
         return True
+
+    def _note_thrust(self, message: LoggedMessage) -> None:
+        """The recorded vehicle reports the thrust of recorded setpoints, whatever is sent now."""
+        thrusts = self.companion.state.thrusts
+        if message.name == "SET_ATTITUDE_TARGET":
+            thrusts.append(message.message.thrust)
+        elif message.name.startswith("SET_POSITION_TARGET"):
+            thrusts.clear()
 
     def _drain(self) -> None:
         """Note what was sent by the turns that the last piece of the inputs ends."""

@@ -15,12 +15,12 @@ FIELDS_MAX = 8
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """`turns` were replayed, up to the vehicle time `ended_s`; `stopped` says why not all were."""
+    """`turns` were replayed, up to the vehicle time `ended_s`; `incomplete` is that of `Replay`."""
 
     comparison: Comparison
     turns: int
     ended_s: float
-    stopped: str
+    incomplete: str
 
 
 def verdict(recording: Recording) -> Verdict:
@@ -32,7 +32,7 @@ def verdict(recording: Recording) -> Verdict:
     if not comparison.compared.total():
         why = replay.stopped or "the log holds no setpoint and no command"
         raise UserError(f"{recording.log.path}: nothing to compare: {why}")
-    return Verdict(comparison, turns, replay.ended_s, replay.stopped)
+    return Verdict(comparison, turns, replay.ended_s, replay.incomplete)
 
 
 def explained(recording: Recording, difference: Difference) -> list[str]:

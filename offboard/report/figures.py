@@ -29,6 +29,7 @@ from offboard.analysis.figure import (
     Figure,
     coordinates,
     curve,
+    logarithmic,
     panels,
 )
 from offboard.analysis.verdict import begin_times
@@ -42,7 +43,6 @@ DASHES = ("solid", "dash", "dot", "dashdot")
 PATH_POINTS = 1500
 PANEL_PX = 120
 LEFT_PX = 75  # beside the panels, the same in all figures: their time axes stand below each other
-DECADES_SHOWN = 4  # numbers on a logarithmic axis
 ROW_PX = 34  # of the timeline
 _CAPTIONS = {  # by the panel that they explain
     "distance from the reference, m": "The reference is known from the climb to the landing.",
@@ -222,7 +222,8 @@ def _panels(title: str, flown: Sequence[tuple[Lane, Sequence[Panel]]]) -> Figure
                         figure, place, each, lane, named=bool(lane.label) or len(panel.curves) > 1
                     )
         if shown_in[0][1].logarithmic:
-            figure.update_yaxes(_logarithmic([panel for _, panel in shown_in]), row=place)
+            values = [each.values for _, panel in shown_in for each in panel.curves]
+            figure.update_yaxes(logarithmic(np.concatenate(values)), row=place)
     for lane, _ in flown:
         if not lane.label:
             figure.update_layout(shapes=_phase_shapes(lane.flight))
@@ -232,16 +233,6 @@ def _panels(title: str, flown: Sequence[tuple[Lane, Sequence[Panel]]]) -> Figure
     return Figure(
         title, figure, " ".join(_CAPTIONS[each] for each in by_title if each in _CAPTIONS)
     )
-
-
-def _logarithmic(shown: Sequence[Panel]) -> dict[str, Any]:
-    """An axis of whole decades, few of them with a number."""
-    values = np.concatenate([curve.values for panel in shown for curve in panel.curves])
-    known = np.log10(values[np.isfinite(values) & (values > 0.0)])
-    low, high = math.floor(known.min()), math.ceil(known.max()) + 1
-    step = -(-(high - low) // DECADES_SHOWN)
-    return {"type": "log", "tickvals": [float(f"1e{n}") for n in range(low, high + 1, step)],
-            "range": [low - 0.3, high], "exponentformat": "e"}  # fmt: skip
 
 
 def _draw(figure: go.Figure, place: int, each: Curve, lane: Lane, *, named: bool) -> None:

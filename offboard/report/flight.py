@@ -18,6 +18,7 @@ from offboard.analysis.verdict import begin_times
 from offboard.report.substitutes import completed
 
 _PARTS = {"controller": "law", "reference": "shape", "vehicle": "name"}  # key that names each
+_NO_HEARTBEAT = "no HEARTBEAT of an autopilot: no telemetry used"
 _NO_RECORDS = (
     "no records of offboard: no reference, decisions, identification or figures of the score"
 )
@@ -58,12 +59,11 @@ class Flight:
 def read(path: Path) -> Flight:
     """Read a flight directory or a .tlog file. Raises TlogError."""
     log = tlog.read(tlog.find(path))
-    vehicle_id, dialect = history.vehicle(log)
     flown = history.gather(log)
-    missing = [] if vehicle_id is not None else ["no HEARTBEAT of an autopilot: no telemetry used"]
+    missing = [_NO_HEARTBEAT] if flown.vehicle_id is None else []
     if not len(flown.records):
         missing.append(_NO_RECORDS)
-    flown, notes = completed(flown, log, vehicle_id)
+    flown, notes = completed(flown, log)
     if flown.damage:
         at = "" if math.isnan(flown.damage_s) else f", at {flown.damage_s:.2f} s of vehicle time"
         notes.append(f"damaged log: {flown.damage}{at}")
@@ -74,13 +74,13 @@ def read(path: Path) -> Flight:
     facts = {
         "log": str(log.path),
         "begun": f"{np.datetime64(next(iter(log)).unix_us, 'us').item():%Y-%m-%d %H:%M:%S} UTC",
-        "autopilot": dialect.name if dialect else "unknown",
+        "autopilot": flown.dialect.name if flown.dialect else "unknown",
         **_configured(history.configuration(log)),
         "messages": f"{flown.messages.total()} in {flown.wall_s:.1f} s of computer time",
     }
     return Flight(
         path.name or path.resolve().name, flown, score(flown), facts, (*missing, *notes),
-        dialect.engage_mode if dialect else "",
+        flown.dialect.engage_mode if flown.dialect else "",
     )  # fmt: skip
 
 

@@ -5,16 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 from offboard.analysis.page import render
 from offboard.analysis.score import FIGURES
 from offboard.analysis.score_table import summary, verdict
-from offboard.report import timeline
 from offboard.report.figures import figures, letter
 from offboard.report.flight import Flight
 
-_IN_SUMMARY = {"tracked error", "true error", "timing", "at a limit", "identified"}
 _SIGNS = {1.0: ("good", "✓"), 0.0: ("bad", "✗")}
 
 
@@ -43,7 +40,7 @@ def page(flights: Sequence[Flight]) -> str:
         letters=[] if alone else [letter(place) for place in range(len(flights))],
         events=[
             (f"{e.time_s:.2f}" if math.isfinite(e.time_s) else "", e.who, e.what)
-            for e in timeline.events(flights[0])
+            for e in flights[0].history.events()
         ]
         if alone
         else [],
@@ -52,13 +49,12 @@ def page(flights: Sequence[Flight]) -> str:
 
 def _verdict(place: int, flight: Flight, alone: bool) -> dict[str, object]:
     kind, sign = _SIGNS.get(flight.score.completed, ("unknown", "–"))
-    rows = summary(flight.score, flight.history, Path())
     return {
         "kind": kind,
         "sign": sign,
         "sentence": verdict(flight.score),
         "name": "" if alone else f"{letter(place)}: {flight.name}",
-        "rows": [row for row in rows if row[0] in _IN_SUMMARY] + list(flight.facts.items()),
+        "rows": summary(flight.score, flight.history) | flight.facts,
         "missing": flight.missing,
     }
 

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 _ATTITUDE, _GLOBAL, _TARGET = NAMES = "ATTITUDE", "GLOBAL_POSITION_INT", "ATTITUDE_TARGET"
 
 
-def completed(flown: History, log: Tlog, vehicle_id: int | None) -> tuple[History, list[str]]:
+def completed(flown: History, log: Tlog) -> tuple[History, list[str]]:
     """The history with substitutes for telemetry that it lacks, and a sentence for each thing that
     was replaced or is missing."""
     absent = {
@@ -35,7 +35,7 @@ def completed(flown: History, log: Tlog, vehicle_id: int | None) -> tuple[Histor
     if not streams:
         return flown, []
     for place, entry in enumerate(log):
-        if entry.name in streams and entry.frame.system_id == vehicle_id:
+        if entry.name in streams and entry.frame.system_id == flown.vehicle_id:
             streams[entry.name].add(entry, place, math.nan)
     anchor_ms = 1e3 * next(
         (rows[0, 0] for rows in (flown.attitude, flown.position) if len(rows)), math.nan

@@ -68,14 +68,6 @@ def marks(flight: Flight) -> list[Mark]:
     return [mark for mark in found if math.isfinite(mark.time_s)]
 
 
-def events(flight: Flight) -> list[Event]:
-    """Everything that was said or shown, in the order of time; what came before telemetry first."""
-    flown = flight.history
-    modes = (Event(event.time_s, event.who, f"mode {event.what}") for event in flown.modes)
-    every = (*flown.phases, *flown.announcements, *modes, *flown.vehicle_messages)
-    return sorted(every, key=lambda e: -math.inf if math.isnan(e.time_s) else e.time_s)
-
-
 def _spans(events: Sequence[Event], flight: Flight) -> list[tuple[Event, float, float]]:
     """Each event until the next one; the first may be older than telemetry."""
     begins = [flight.begin_s if math.isnan(e.time_s) else e.time_s for e in events]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import resource
 import sys
 from pathlib import Path
 from typing import Any
@@ -15,11 +16,14 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 from pyarrow import parquet
 from pymavlink import mavutil
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from pyulog import ULog
 from scipy.spatial.transform import Rotation
 from typer.testing import CliRunner, Result
 
+from offboard.analysis import tlog
 from offboard.cli.commands import app
+from offboard.io.log import entry
 from offboard.model.frames import enu, flu_in_enu
 
 sys.path.append(str(Path(__file__).parents[1] / "flight"))
@@ -202,16 +206,55 @@ def test_a_log_of_another_program(tmp_path: Path) -> None:
     assert (np.diff(stamps.astype(np.int64)) >= 0).all()
 
 
+def test_our_announcements_and_a_second_vehicle(flight: Path, tmp_path: Path) -> None:
+    """Vehicle 9, whose clock is 1000 s ahead, changes no time. A text of ours is one more event."""
+    other = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
+    text = mavlink.MAVLink_statustext_message(6, b"bandwidth 5.0 rad/s")
+    data = b""
+    for number, each in enumerate(tlog.read(flight)):
+        data += entry(each.unix_us, each.frame.raw)
+        if each.name == "LOCAL_POSITION_NED":
+            position = mavlink.MAVLink_local_position_ned_message(10**6 + number, *6 * [0])
+            data += entry(each.unix_us, position.pack(other))
+    ours = mavlink.MAVLink(None, srcSystem=1, srcComponent=OURS[0])
+    two = tmp_path / "two.tlog"
+    two.write_bytes(data + entry(each.unix_us, text.pack(ours)))
+    before, after = (
+        exported(log, "csv", log.with_suffix(".csv")).read_text().splitlines()
+        for log in (flight, two)
+    )
+    (more,) = set(after) - set(before)
+    assert more.endswith(",offboard: bandwidth 5.0 rad/s")
+    assert [line for line in after if line != more] == before
+    assert any(line.endswith(",vehicle: mode OFFBOARD") for line in after)
+    assert "bandwidth 5.0 rad/s" in CliRunner().invoke(app, ["score", str(two)]).output
+
+
 def test_refusals(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     taken = tmp_path / "taken.csv"
     taken.write_text("mine")
     assert "exists already" in str(run(flight, "csv", taken).exception)
     assert taken.read_text() == "mine"
     nowhere = tmp_path / "none" / "flight.csv"
-    assert "cannot be written: No such file" in str(run(flight, "csv", nowhere).exception)
+    assert "there is no directory" in str(run(flight, "csv", nowhere).exception)
     assert "--to mcap" in str(run(flight, "csv", tmp_path / "a.csv", "--vehicle-time").exception)
     for kind, library in (("mcap", "mcap.writer"), ("parquet", "pyarrow")):
         monkeypatch.setitem(sys.modules, library, None)
         reason = str(run(flight, kind, tmp_path / f"a.{kind}").exception)
         assert "pip install 'pso-offboard[export]'" in reason
     assert list(tmp_path.iterdir()) == [taken]
+
+
+@pytest.mark.parametrize("kind", ["mcap", "parquet", "csv", "ulog"])
+@pytest.mark.parametrize("missing", [1, 5000])
+def test_a_full_disk_leaves_nothing(kind: str, missing: int, flight: Path, tmp_path: Path) -> None:
+    """The last bytes, which are written when the file is closed, or a few thousand."""
+    size = exported(flight, kind, tmp_path / "whole").stat().st_size
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (size - missing, limits[1]))
+    try:
+        result = run(flight, kind, tmp_path / "cut")
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert str(result.exception) == f"{tmp_path / 'cut'} cannot be written (File too large)"
+    assert [path.name for path in tmp_path.iterdir()] == ["whole"]

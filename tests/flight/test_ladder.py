@@ -101,6 +101,26 @@ def test_a_second_sender(allowed: bool, rung: Rung) -> None:
     assert rungs(replace(QUIET, other_sender=True, limits=limits)) == [rung]
 
 
+@pytest.mark.parametrize(("sink_mps", "rung"), [(0.4, Rung.LAND), (0.2, Rung.FLY)])
+def test_a_vehicle_that_sinks_with_full_thrust(sink_mps: float, rung: Rung) -> None:
+    """After a second: full thrust brakes a normal descent sooner."""
+    now = replace(QUIET, full_thrust_sink_mps=sink_mps)
+    seen = rungs(QUIET, *[now] * 9)
+    assert set(seen[:8]) == {Rung.FLY}
+    assert seen[8] == rung
+
+
+@pytest.mark.parametrize(
+    ("engaged", "allowed", "rung"),
+    [(True, False, Rung.HOLD), (False, False, Rung.FLY), (True, True, Rung.FLY)],
+)
+def test_a_vehicle_that_follows_other_setpoints(engaged: bool, allowed: bool, rung: Rung) -> None:
+    """Only while the vehicle is in our mode; allowed like a second sender."""
+    limits = Limits(begin_with_other_sender=allowed)
+    now = replace(QUIET, follows_others=True, engaged=engaged, limits=limits)
+    assert rungs(now, *[now] * 25)[-1] == rung
+
+
 def test_time_that_steps_back_counts_for_nothing() -> None:
     ladder = Ladder()
     for time_s in (100.0, 100.1875, 100.375, 50.0, 50.125):

@@ -80,8 +80,7 @@ def test_unseen_vehicle_is_identified_from_its_log(name, scenario, tmp_path: Pat
     true = UNSEEN[name]
     pair = neutral("identify", flies=true, scenario=scenario, learning=IDENTIFY)
     pair.track()
-    log = pair.log(tmp_path)
-    found, _ = identify_flight(log, history.gather(log), NEUTRAL)
+    found, _ = identify_flight(history.gather(pair.log(tmp_path)), NEUTRAL)
     assert found.tilt is not None
     assert found.hover_thrust is not None
     assert found.drag_ps is not None

@@ -146,6 +146,11 @@ def test_an_address_that_cannot_be_served_is_refused() -> None:
             pytest.raises(UserError, match=refused),
         ):
             process.await_ready()
+    with (
+        closing(LiveProcess(SERVER, "--live", "no.such.invalid:8014")) as process,
+        pytest.raises(UserError, match=r"listened on \((?!Unknown error)"),
+    ):
+        process.await_ready()
     for wrong in ("8014x", "localhost", "127.0.0.1:99999", "127.0.0.1:²"):
         with pytest.raises(UserError, match="give HOST:PORT"):
             LiveProcess(SERVER, "--live", wrong)
@@ -185,9 +190,7 @@ class Broken:
 def lines() -> tuple[Pair, list[str], str, str]:
     """A flight, its JSON lines, and the text of a terminal and of a pipe."""
     written: list[str] = []
-    json_lines = JsonLines(written.append)
-    json_lines.tell("preparing")
-    displays = [Displays(json_lines, [Broken()])]  # type: ignore[list-item]
+    displays = [Displays(JsonLines(written.append), [Broken()])]  # type: ignore[list-item]
     files = io.StringIO(), io.StringIO()
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("offboard.live.lines.STATUS_S", 0.0)
@@ -195,6 +198,8 @@ def lines() -> tuple[Pair, list[str], str, str]:
         for file in files:
             console = Console(file=file, force_terminal=file is files[0], width=80)
             displays.append(Displays(Terminal(console, partial(console.print, soft_wrap=True))))
+        for display in displays:
+            display.tell("preparing")
         pair = flown(*(display.show for display in displays))
         for display in displays:
             display.close()
@@ -219,6 +224,7 @@ def test_the_terminal_has_its_lines_and_one_status_in_place(
 ) -> None:
     pair, _, terminal, pipe = lines
     plain = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", terminal).replace("\r", "\n")
+    assert plain.splitlines()[0] == pipe.splitlines()[0] == "preparing"
     for sentence in pair.companion.announced:
         assert plain.count(f" s  {sentence}") == pipe.count(f" s  {sentence}") == 1
     assert "\x1b" not in pipe

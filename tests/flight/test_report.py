@@ -6,6 +6,7 @@ import lzma
 import math
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from pair import Pair, hover
 from typer.testing import CliRunner
 
 from offboard.analysis import tlog
+from offboard.analysis.figure import logarithmic
 from offboard.analysis.score import Score
 from offboard.cli.commands import app
 from offboard.flight.phases import Phase
@@ -167,7 +169,10 @@ def test_a_log_of_another_program_gives_what_it_holds(tmp_path: Path) -> None:
     arducopter = read(ARDUCOPTER)
     assert arducopter.facts["autopilot"] == "ardupilot"
     assert "no ATTITUDE_QUATERNION: the attitude is that of ATTITUDE" in arducopter.missing
-    assert "no records of offboard" in page([arducopter])
+    flooded = replace(arducopter, score=replace(arducopter.score, strangers=31.0))
+    shown = page([flooded])
+    assert "no records of offboard" in shown
+    assert "31 datagrams of others" in shown
 
 
 def test_a_damaged_log_is_shown_with_the_place_of_the_damage(tmp_path: Path) -> None:
@@ -211,6 +216,15 @@ def test_thinning_keeps_peaks_and_gaps(values: list[float], bins: int) -> None:
         assert np.nanmax(array[kept]) == known.max()
         assert np.nanmin(array[kept]) == known.min()
     assert np.isnan(array[kept]).any() == (len(known) < len(array))
+
+
+@given(st.lists(st.floats(1e-16, 1e6) | st.just(math.nan) | st.just(0.0), max_size=20))
+def test_a_logarithmic_axis_holds_all_values_and_has_few_ticks(values: list[float]) -> None:
+    axis = logarithmic(values)
+    low, high = axis["range"]
+    assert all(low < math.log10(value) < high for value in values if value > 0.0)
+    assert 1 <= sum(low < math.log10(at) < high for at in axis["tickvals"]) <= 9
+    assert len(axis["tickvals"]) <= (9 if high - low < 2.2 else 5)
 
 
 def invoke(*arguments: object) -> tuple[int, str]:

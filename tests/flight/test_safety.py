@@ -6,6 +6,7 @@ both firmwares.
 
 from __future__ import annotations
 
+import re
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -13,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 from faults import HEARTBEAT, stop, without
-from pair import SHORT, Bytes, decode, hover, in_phase, on_arducopter
+from pair import SHORT, Bytes, decode, hover, in_phase, make, on_arducopter
 from watch import (
     ARM,
     BOTH,
@@ -33,6 +34,7 @@ from watch import (
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import ExitCode, Phase, Rung
 from simulator.config import Scenario
+from simulator.firmware.px4 import PX4
 
 CURRENT_MODE, DISARM_BY_FORCE = 436, 21196
 
@@ -171,11 +173,30 @@ def test_a_second_companion_of_other_ids_shows_by_what_it_does(fly: Fly) -> None
     watch = watched(pair)
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
-    assert (
-        "deg away from every recent command; another companion computer, system 1 component 194, "
-        "may send setpoints, too" in outcome.sentence
-    )
+    px4 = engage_mode(pair) == "OFFBOARD"
+    seen = "follows setpoints of another" if px4 else "deg away from every recent command"
+    assert seen in outcome.sentence
+    named = "another companion computer, system 1 component 194, may send setpoints, too"
+    assert f"; {named}" in outcome.sentence
     assert watch.error_m < 5.0
+
+
+@pytest.mark.parametrize("rate_hz", [5.0, 10.0])
+def test_setpoints_of_another_program_show_in_what_px4_follows(rate_hz: float) -> None:
+    """Level ones, that are not on our link: unnoticed they cost 3 m."""
+    sender = {"fault": "second_sender", "setpoint_rate_hz": rate_hz, "thrust": 0.49}
+    pair = make(
+        firmware=PX4, seed=3, scenario=scenario_of({**sender, "after": "engaged", "at_s": 20.0})
+    )
+    watch = watched(pair)
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert outcome.sentence.startswith(
+        "the vehicle follows setpoints of another program; another companion computer, system 1 "
+        "component 194, may send setpoints, too"
+    )
+    assert [phase for _, phase in pair.phases][-4:-1] == [Phase.TRACK, Phase.HOLD, Phase.LAND]
+    assert watch.error_m < 3.0
 
 
 def test_an_arducopter_that_another_flies_is_refused() -> None:
@@ -185,6 +206,22 @@ def test_an_arducopter_that_another_flies_is_refused() -> None:
     assert "in GUIDED already" in outcome.sentence
     assert "limits.begin_engaged=true" in outcome.sentence
     assert pair.setpoints == pair.commands(SET_MODE) == []
+
+
+@BOTH
+def test_a_load_that_full_thrust_does_not_carry_is_landed(fly: Fly) -> None:
+    """Hover would need 1.1 of the thrust. Before this row a real PX4 and a real ArduCopter were
+    flown into the ground so, with 45 degrees of tilt."""
+    pair = fly(HIGH)
+    plant = pair.instance.autopilot.plant
+    scale = 1.1 / pair.companion.state.model.hover_thrust
+    pair.at.append((in_phase(Phase.TRACK, 1.0), lambda flying: plant.scale_mass(scale)))
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert re.match(r"the vehicle sinks at [1-3]\.[0-9] m/s with full thrust", outcome.sentence)
+    assert list(pair.rungs) == ["full thrust"]
+    begun_s = {phase: at_s for at_s, phase in pair.phases}
+    assert begun_s[Phase.LAND] < begun_s[Phase.TRACK] + 1.0 + 2.0
 
 
 # -- in the air ------------------------------------------------------------------------------------

@@ -174,6 +174,7 @@ CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3
             "storm.yaml: conditions.thrust_scale: 9 should be less than or equal to 3",
         ),
         ("storm.yaml", "name: s\nfaults: [{kind: frogs}]", "storm.yaml: faults.0"),
+        ("c.yaml", "parameters: {seed: [1]}\nrequire: [x<1]", "require.0: there is no figure 'x'"),
     ],
 )
 def test_every_kind_of_file_is_checked(

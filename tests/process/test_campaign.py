@@ -22,9 +22,9 @@ import pyarrow.parquet
 import pytest
 from processes import Spawn, children
 
-from offboard.campaign import code, execution
+from offboard.campaign import code, execution, flight
 from offboard.campaign.campaign import Campaign, Shard, Summary
-from offboard.campaign.cases import Case
+from offboard.campaign.cases import Case, base_cases
 from offboard.campaign.document import CampaignFile, read_campaign
 from offboard.campaign.execution import Workers, cluster_workers, local_workers
 from offboard.campaign.flight import Job
@@ -32,7 +32,7 @@ from offboard.campaign.margin import Promises
 from offboard.campaign.results import Record, Results
 from offboard.documents.errors import DocumentError, UserError
 
-# Three flights of a few seconds, and one whose simulated mass is out of range
+# Four flights of a few seconds
 FILE = """
 controllers: [lqr]
 references: [hover]
@@ -45,10 +45,11 @@ sample:
   draws: 2
   seed: 3
   ranges:
-    scenario.conditions.mass_scale: [4.5, 5.5]
+    scenario.conditions.mass_scale: [0.9, 1.1]
     controller.bandwidth_radps: [4, 5]
+require: [rmse_position_m<0.02]
 """
-FILE = FILE.replace("[4.5, 5.5]", "[0.9, 1.1]") + "require: [rmse_position_m<0.02]\n"
+CONFIG = Path(__file__).parents[2] / "config"
 TABLE = ("campaign.csv", "campaign.parquet", "campaign.html")
 INFEASIBLE = FILE.replace("scenarios: [calm, px4_like]", "scenarios: [calm]").replace(
     "reference.height_m: [1]", "reference.height_m: [1, 400]"
@@ -210,6 +211,12 @@ def test_an_infeasible_case_is_a_row_with_its_reason(tmp_path: Path) -> None:
             ("controllers: [lqr]", "controllers: []"),
             "controllers: [] should have at least 1 item, not 0",
         ),
+        (("reference.height_m", "seed"), "parameters.seed: give the seeds with seeds"),
+        (("[calm, px4_like]", "[{}, {conditions: {}}]"), "two are called 'unnamed'"),
+        (
+            ("require:", "seeds: 0\nrequire:"),
+            "out.yaml: seeds: 0 should be greater than or equal to 1",
+        ),
         (("[lqr]", "[lqg]"), "there is no controller named 'lqg'"),
         (("identify.excite", "identify.exite"), "identify.exite is not a known key"),
         (("conditions.mass_scale", "conditions.mass"), "conditions.mass is not a known key"),
@@ -226,6 +233,29 @@ def test_a_file_that_cannot_be_flown_is_refused(
     assert sentence in str(refused.value)
     assert "out.yaml: " in str(refused.value)
     assert not (tmp_path / "out").exists()
+
+
+def test_a_file_that_a_file_names_decides_the_case(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    shipped = (CONFIG / "flight.yaml").read_text()
+    (tmp_path / "mine.yaml").write_text(shipped.replace("lemniscate", "./path.yaml"))
+    keys = set()
+    for height_m in (2, 3, 3):
+        (tmp_path / "path.yaml").write_text(f"shape: hover\nduration_s: 1\nheight_m: {height_m}")
+        keys.add(next(base_cases(CampaignFile(config="./mine.yaml"))).key)
+    assert len(keys) == 2
+
+
+def test_a_lack_of_memory_is_no_record_of_the_case(monkeypatch: pytest.MonkeyPatch) -> None:
+    def full(*parts: object, **options: object) -> None:
+        raise MemoryError
+
+    monkeypatch.setattr(flight, "fly", full)
+    case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
+    with pytest.raises(UserError, match="no flight can be flown here: out of memory"):
+        flight.fly_job(Job(case, Promises(), code.code_hash()))
 
 
 def test_results_of_other_code_are_refused_and_kept(
@@ -261,10 +291,8 @@ def test_a_full_disk_ends_the_campaign_and_keeps_what_is_finished(
 
 
 def dies(job: Job) -> Record:
-    """Ends its worker with seed 2, after a note of it and the beginning of a log."""
+    """Ends its worker with seed 2, after a note of it."""
     if job.case.seed == 2:
-        assert job.kept
-        job.kept.mkdir()
         with (Path(job.code) / "deaths").open("a") as deaths:
             deaths.write("died\n")
         os._exit(1)
@@ -285,6 +313,28 @@ def test_a_flight_whose_worker_dies_twice_is_a_row(
     assert (tmp_path / "deaths").read_text() == "died\n" * 2
     assert ended[1].exit_code == 0
     assert (ended[2].exit_code, ended[2].sentence) == (4, "the process that flew it ended, twice")
+
+
+def dies_before_its_score(job: Job) -> Record:
+    flight.keep_score = lambda *score: os._exit(1)
+    return flight.fly_job(job)
+
+
+def test_a_kept_flight_appears_when_it_is_complete(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A worker that is killed leaves no directory that looks like a kept flight."""
+    case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
+    kept = tmp_path / "flights" / case.key
+    job = Job(case, Promises(), code.code_hash(), kept)
+    with monkeypatch.context() as dying, local_workers(1) as workers:
+        dying.setattr(execution, "fly_job", dies_before_its_score)
+        ((_, record),) = workers.fly([job], lambda: False)
+        assert record == execution.DIED
+        assert len(list(kept.parent.glob("*/flight/flight.tlog"))) == 2
+        assert not kept.exists()
+    assert flight.fly_job(job).completed
+    assert {path.name for path in kept.iterdir()} >= {"flight.tlog", "flight.yaml", "score.json"}
 
 
 def test_an_interrupted_campaign_leaves_no_process(tmp_path: Path, spawn: Spawn) -> None:

@@ -153,6 +153,7 @@ def test_a_directory_with_a_flight_is_left_as_it_is(name: str, call: Call, tmp_p
         (f"offboard identify {RECORDING} -o x/old", "x/old exists already; choose another file"),
         (f"offboard identify {RECORDING} -o new --page new", "-o and --page are both new"),
         (f"offboard identify {RECORDING} -o y/new", "-o y/new: there is no directory y"),
+        (f"offboard identify {RECORDING} --out x", "a log needs no --system, --signing-key or"),
         (f"offboard report {RECORDING} -o x/old", "x/old exists already; choose another file"),
         ("simulator --log x/old --duration 0.1 --gcs none", "--log x/old cannot be written: File"),
     ],
@@ -170,11 +171,12 @@ def test_no_command_overwrites_a_file(command: str, says: str, call: Call, tmp_p
 def test_the_page_of_a_second_identification_has_a_name_of_its_own(
     call: Call, tmp_path: Path
 ) -> None:
-    (tmp_path / "x.tlog").write_bytes(RECORDING.read_bytes())
+    """Its title is the name of the flight directory, also of the working directory."""
+    (tmp_path / "flight.tlog").write_bytes(RECORDING.read_bytes())
     (tmp_path / "identify.html").write_text("precious")
-    assert call("offboard identify", "x.tlog") == (0, "")
+    assert call("offboard identify", ".") == (0, "")
     assert (tmp_path / "identify.html").read_text() == "precious"
-    assert "<html" in (tmp_path / "identify-2.html").read_text()
+    assert f"of {tmp_path.name}</title>" in (tmp_path / "identify-2.html").read_text()
 
 
 FILES: dict[str, Callable[[Path], object]] = {
@@ -218,6 +220,15 @@ def test_only_a_regular_file_is_a_log(
     assert "x.tlog is not a regular file; name a flight directory or a .tlog file" in refused(
         call(f"offboard {command}", "x.tlog")
     )
+
+
+@pytest.mark.parametrize("command", ["score", "identify"])
+def test_a_damaged_log_is_read_and_named(command: str, call: Call, tmp_path: Path) -> None:
+    data = bytearray(RECORDING.read_bytes())
+    data[8 + 12] ^= 0x40  # payload of the first frame
+    (tmp_path / "x.tlog").write_bytes(data)
+    said = "x.tlog: 1 damaged entry was skipped, the first at byte 0\n"
+    assert call(f"offboard {command}", "x.tlog") == (0, said)
 
 
 def test_of_many_errors_the_first_ten_are_printed(call: Call, tmp_path: Path) -> None:

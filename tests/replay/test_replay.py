@@ -162,19 +162,31 @@ def without(flight: Path, drops) -> bytes:
 
 
 def test_a_lost_message_ends_the_comparison_before_it(tmp_path: Path) -> None:
-    """One LOCAL_POSITION_NED is missing: what was sent before is still compared."""
+    """One LOCAL_POSITION_NED is damaged: what was sent before is still compared, in each mode of
+    the command, and it says up to where."""
     pair = short_flight()
     whole = logged(pair, tmp_path / "whole.tlog")
     lost_ms = 10_000
-    missing = next(
+    lost = next(
         m
         for m in tlog.read(whole)
         if m.name == "LOCAL_POSITION_NED" and m.message.time_boot_ms >= lost_ms
     )
     damaged = tmp_path / "damaged.tlog"
-    damaged.write_bytes(without(whole, lambda m: m.frame.raw == missing.frame.raw))
+    data = bytearray(whole.read_bytes())
+    data[data.index(lost.frame.raw) + 12] ^= 0x40
+    damaged.write_bytes(data)
     result = verdict(read(damaged))
-    assert "missing or damaged" in result.stopped
+    ended = f"replayed up to {result.ended_s:.1f} s of vehicle time: received frames are missing"
+    assert result.incomplete.startswith(ended)
+    for options in ((), ("--controller", "lqr")):
+        answer = run(damaged, *options)
+        assert answer.exit_code == 0
+        assert "1 damaged entry was skipped" in answer.stderr
+        assert ended in answer.stderr
+    late = run(damaged, "--at", 20)
+    assert reason(late).startswith(f"--at 20: {ended}")
+    assert "1 damaged entry was skipped" in late.stderr
     assert not result.comparison.differences
     assert 30 < result.comparison.setpoints < verdict(read(whole)).comparison.setpoints
     assert result.ended_s == pytest.approx(lost_ms / 1e3, abs=0.3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -28,6 +29,7 @@ from offboard.campaign.searchers import SEARCHERS
 from offboard.campaign.statistics import groups, wilson
 from offboard.campaign.table import row_of
 from offboard.campaign.worst import as_csv, search_of
+from offboard.documents.errors import UserError
 from offboard.io import clock
 
 SEARCH = """
@@ -104,6 +106,25 @@ def test_an_interrupted_search_goes_on_and_finds_the_same(tmp_path: Path) -> Non
     assert campaign.results.finished() == 70
     parts = search_of(*_named(searched(tmp_path / "parts"))).find(2)
     assert as_csv(parts) == as_csv(whole)
+
+
+def test_a_search_without_the_package_of_its_method_flies_nothing(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    campaign, evaluator = searched(tmp_path)
+    monkeypatch.setitem(sys.modules, "cma", None)
+    with pytest.raises(UserError, match="needs the package cma"):
+        search_of(campaign, "c.yaml", evaluator).find(2)
+    assert campaign.results.finished() == 0
+
+
+def test_the_flights_of_a_search_are_one_group(tmp_path: Path) -> None:
+    campaign, evaluator = searched(tmp_path)
+    search_of(campaign, "c.yaml", evaluator).find(2)
+    campaign.cases = list(evaluator.flown)
+    campaign.write(campaign.rows())
+    shown = (tmp_path / "out" / "campaign.html").read_text()
+    assert shown.count(f"{BANDWIDTH}=") < 100  # of the worst flights alone, not of 200 groups
 
 
 def _named(made: tuple[Campaign, Evaluator]) -> tuple[Campaign, str, Evaluator]:

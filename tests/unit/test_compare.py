@@ -249,7 +249,9 @@ def test_progress_is_shown_before_the_first_flight_ends(
     [
         (("compare", "--system", "3"), "are options of --connect"),
         (("compare", "--connect", "tcp:127.0.0.1:1", "--signing-key", "none"), "signing key none"),
-        (("identify", "x.tlog", "--system", "3"), "a log needs neither --system nor"),
+        (("compare", "--connect", "tcp:1:1", "--workers", "2"), "options of the simulator"),
+        (("compare", "--scenario", ","), "--scenario is an empty list of names"),
+        (("identify", "x.tlog", "--system", "3"), "a log needs no --system,"),
         (("identify", "--sitl", "--system", "3"), "--system is an option of --connect"),
     ],
 )

@@ -51,6 +51,7 @@ class Drawing(Parameters):
     shape: Annotated[Circle | Line, Field(discriminator="kind")] | None = None
     circles: list[Circle] = Field(default=[])
     named: dict[str, Circle] = Field(default={})
+    copies: Annotated[int, Field(ge=1)] | Annotated[tuple[int, ...], Field(min_length=1)] = 1
 
     @model_validator(mode="after")
     def _blue_is_flat(self) -> Drawing:
@@ -148,10 +149,12 @@ def test_lists_become_tuples_text_an_enum_and_tags_choose_the_model() -> None:
         (
             "zzz: 3",
             [
-                "zzz is not a known key (known keys: circles, colour, corner, named, scale, shape,"
-                " tilt_rad, title, visible)"
+                "zzz is not a known key (known keys: circles, colour, copies, corner, named, scale,"
+                " shape, tilt_rad, title, visible)"
             ],
         ),
+        ("copies: 0", ["copies: 0 should be greater than or equal to 1"]),
+        ("copies: [x]", ["copies.0: 'x' should be a valid integer"]),
         ("colour: blue\ntilt_rad: 1", ["a blue drawing is not tilted"]),
         (
             "scale: 0\nvisible: maybe",
@@ -232,7 +235,7 @@ def test_override_keeps_an_equals_sign_in_the_value() -> None:
         (
             "scal=2",
             "--set: scal is not a known key, did you mean scale? (known keys: circles, colour,"
-            " corner, named, scale, shape, tilt_rad, title, visible)",
+            " copies, corner, named, scale, shape, tilt_rad, title, visible)",
         ),
         ("scale.x=2", "--set: scale: {'x': 2} should be a valid number"),
         ("corner.5=2", "--set: corner: {'5': 2} should be a valid array"),

@@ -20,8 +20,7 @@ def test_the_page_shows_every_constant_and_reads_in_both_colour_schemes(
     tmp_path: Path,
 ) -> None:
     prior = load("flight", choices={}).vehicle
-    log = tlog.read(RECORDING)
-    found, trace = identify_flight(log, history.gather(log), prior)
+    found, trace = identify_flight(history.gather(tlog.read(RECORDING)), prior)
     found = replace(found, yaw=None, refusals={**found.refusals, "yaw": REFUSAL})
     file = tmp_path / "identify.html"
     file.write_text(page("flight <1>", found, trace, prior), encoding="utf-8")

@@ -52,6 +52,7 @@ def tuned(
     text: str = FILE,
     workers: type[Bowl] = Bowl,
     ending: Callable[[], bool] = lambda: False,
+    told: Callable[[int, float], None] = lambda number, cost: None,
 ) -> Tuned:
     directory.mkdir(exist_ok=True)
     (directory / "tune.yaml").write_text(text)
@@ -59,7 +60,7 @@ def tuned(
     results = Results(directory / "study", "0123456789ab")
     flyers = workers(1, lambda: pytest.fail("not used"))
     evaluator = Evaluator(results, Promises(), flyers, ending)
-    return tuning.run(results.directory, evaluator, lambda number, cost: None)
+    return tuning.run(results.directory, evaluator, told)
 
 
 @pytest.mark.parametrize("sampler", ["swarm", "tpe", "cma"])
@@ -78,18 +79,32 @@ def test_what_is_better_only_in_training_is_refused(tmp_path: Path) -> None:
     assert not tuned(tmp_path / "t", workers=Elsewhere).verdict.better
 
 
-def test_an_interrupted_tuning_goes_on_as_if_it_had_not_been(tmp_path: Path) -> None:
-    left = [50]
+@pytest.mark.parametrize("flights", [2, 50])
+def test_an_interrupted_tuning_goes_on(flights: int, tmp_path: Path) -> None:
+    """The first trial, of four flights, has the present values also if it was interrupted."""
+    left = [flights]
 
     def ending() -> bool:
         left[0] -= 1
         return left[0] < 0
 
+    costs: list[float] = []
     with pytest.raises(Interrupted):
-        tuned(tmp_path / "parts", ending=ending)
-    parts, whole = tuned(tmp_path / "parts"), tuned(tmp_path / "whole")
-    assert dict(parts.values)[BANDWIDTH] == pytest.approx(dict(whole.values)[BANDWIDTH], abs=0.5)
-    assert parts.verdict.better
+        tuned(tmp_path / "t", ending=ending, told=lambda number, cost: costs.append(cost))
+    assert len(costs) == flights // 4
+    found = tuned(tmp_path / "t", told=lambda number, cost: costs.append(cost))
+    assert len(costs) == 40
+    assert costs[0] == pytest.approx(0.287)  # 0.26 of the present values, seeds and scenarios
+    assert dict(found.values)[BANDWIDTH] == pytest.approx(4.0, abs=1.0)
+    assert found.verdict.better
+
+
+def test_trials_of_another_tuning_do_not_count(tmp_path: Path) -> None:
+    one_range = FILE.replace(f"  {LIMIT}: [0.1, 0.5]\n", "")
+    numbers: list[int] = []
+    for text in (one_range, FILE):
+        tuned(tmp_path / "t", text, told=lambda number, cost: numbers.append(number))
+    assert numbers == [*range(1, 41)] * 2
 
 
 def test_the_profile_is_a_configuration_with_the_tuned_values(tmp_path: Path) -> None:
@@ -110,7 +125,8 @@ def test_the_profile_is_a_configuration_with_the_tuned_values(tmp_path: Path) ->
         (("feedback_limit", "feedback"), "ranges.controller.feedback is no number"),
         (("trials: 40", "objective: solve_time_p50_ms"), "is no figure of a lockstep flight"),
         (("trials: 40", "trails: 40"), "did you mean trials?"),
-        ((LIMIT, "scenario.conditions.mass_scale"), "a scenario is not tuned, the flight is"),
+        ((LIMIT, "scenario.conditions.mass_scale"), "controller and flight are tuned, no other"),
+        ((LIMIT, "vehicle.tilt.delay_s"), "controller and flight are tuned, no other"),
     ],
 )
 def test_a_file_that_cannot_be_tuned_is_refused(
