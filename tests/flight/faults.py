@@ -131,6 +131,11 @@ def noisy(_: float, datagrams: Bytes) -> Bytes:
     return [part for d in datagrams for part in (b"\xfd\x09garbage", d, b"\x00" * 7)]
 
 
+def both(first: Filter, second: Filter) -> Filter:
+    """A link with two faults."""
+    return lambda time_s, datagrams: second(time_s, first(time_s, datagrams))
+
+
 def without(*message_ids: int) -> Filter:
     """A link on which messages with these ids do not arrive."""
     return lambda _, datagrams: [

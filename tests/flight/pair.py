@@ -4,14 +4,16 @@
 test puts on the two directions. Host time runs with vehicle time but from another zero, so that
 code which mixes them up fails.
 
-The companion may take time: a law that calls `HostClock.spend`, or `Pair.pause`. Meanwhile the
-vehicle goes on, and what it sends waits, with the times of its arrival, for the next turn.
+As in `offboard.run.loop`, a turn has all datagrams that have arrived, or none after 20 ms. The
+companion may take time: a law that calls `HostClock.spend`, or `Pair.pause`. Meanwhile the vehicle
+goes on, and what it sends waits, with the times of its arrival, for the next turn.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -95,6 +97,8 @@ class Pair:
     rate: float = 1.0  # of the vehicle's clock, against that of the host
     time_s: float = 0.0
     steps: int = 0
+    turned: int = 0  # steps at the newest turn
+    apart: bool = False  # each datagram has a turn of its own
     sent: list[tuple[float, Phase, bytes]] = field(default_factory=list)  # by the companion
     logged: Bytes = field(default_factory=list)
     phases: list[tuple[float, Phase]] = field(default_factory=list)
@@ -110,8 +114,16 @@ class Pair:
         assert self.companion.outcome is not None
         return self.companion.outcome
 
+    def track(self) -> None:
+        """To the end of the reference, without the landing that follows."""
+        while self.companion.phase is not Phase.LAND:
+            outcome = self.companion.outcome
+            assert outcome is None, outcome
+            self.advance()
+        assert "land: at rest" in self.companion.announced, self.companion.announced
+
     def advance(self) -> None:
-        """One step of the vehicle, and the turns of the companion that follow."""
+        """One step of the vehicle, then a turn of the companion with all that has arrived."""
         self.steps += 1
         self.time_s = self.steps * STEP_S
         now_s = HOST_EPOCH_S + self.time_s / self.rate
@@ -120,26 +132,16 @@ class Pair:
         if now_s >= self.clock.now_s:
             self.clock.now_s = now_s
             self._feed()
-            self._turns()
+            due = self.waiting or self.steps - self.turned >= POLL_STEPS
+            if due and not self.companion.has_ended():
+                chunks, self.waiting, self.turned = self.waiting, [], self.steps
+                for batch in [[chunk] for chunk in chunks] if self.apart else [chunks]:
+                    self._take(self.companion.turn(batch, now_s))
         for moment in [moment for moment in self.at if moment[0](self)]:
             self.at.remove(moment)
             moment[1](self)
         if not self.phases or self.phases[-1][1] is not self.companion.phase:
             self.phases.append((self.time_s, self.companion.phase))
-
-    def _turns(self) -> None:
-        """A turn for each datagram that has just arrived, or one for all that have waited."""
-        now_s, chunks = self.clock.now_s, self.waiting
-        waited = bool(chunks) and chunks[0].arrived_s < now_s
-        batches = [chunks] if waited else [[chunk] for chunk in chunks]
-        self.waiting = []
-        if self.steps % POLL_STEPS == 0:
-            batches.append([])
-        for batch in batches:
-            if self.clock.now_s > now_s:
-                self.waiting += batch
-            elif not self.companion.has_ended():
-                self._take(self.companion.turn(batch, now_s))
 
     def _take(self, output: Any) -> None:
         self.logged.extend(output.log)
@@ -293,7 +295,7 @@ def make(
         flies or simulated.vehicle(firmware.vehicle),
         flown.conditions.model_copy(update={"boot_scale": boot_scale}),
         seed,
-        ground_link=firmware.name != ARDUPILOT.name,
+        ground_link=False,
         faults=flown.faults,
         start=flown.start,
     )
@@ -315,3 +317,11 @@ SHORT = ("reference.height_m=1.0", "reference.duration_s=3.0")
 def hover(*assignments: str, **options: Any) -> Pair:
     """A flight of 20 s: up to 1 m, three seconds of hover, down."""
     return make(*SHORT, *assignments, reference="hover", **options)
+
+
+@cache
+def calm_hover() -> Pair:
+    """`hover` without options, flown: for all tests that only look at it."""
+    pair = hover()
+    assert pair.fly().exit_code == 0
+    return pair

@@ -170,7 +170,7 @@ class Serving(Pair):
     def switch(self, to: str) -> None:
         self.ground(SET_MODE, *MODES[self.firmware][to])
 
-    def fly_up(self, height_m: float = 5.0) -> None:
+    def fly_up(self, height_m: float = 3.0) -> None:
         """The pilot takes off and holds; the service waits."""
         self.until(lambda: self.phase is Phase.STANDBY)
         commander = self.instance.autopilot.commander
@@ -302,6 +302,7 @@ def serve(
         simulated.vehicle(firmware.vehicle),
         flown.conditions.model_copy(update={"boot_scale": 1.0 if on == "px4" else 0.1}),
         seed,
+        ground_link=False,
         faults=flown.faults,
         start=flown.start,
     )

@@ -14,7 +14,7 @@ from pair import LEAN, Pair, make
 
 from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.online_identification import IdentifySettings
-from offboard.flight.phases import ExitCode, Phase
+from offboard.flight.phases import Phase
 from offboard.model.vehicle import Vehicle
 from simulator import config as simulated
 from simulator.firmware.ardupilot import ARDUPILOT
@@ -76,7 +76,7 @@ def test_arducopter_with_another_thrust_stays_at_its_height(factor, believed, se
     """Without, it is 8 m too high with four times the thrust of its file."""
     pair = with_thrust(factor, "arducopter", ARDUPILOT, believed=believed, seed=seed)
     heights = heights_m(pair)
-    assert pair.fly().exit_code == ExitCode.FLOWN
+    pair.track()
     assert max(heights) < HEIGHT_M + 1.0
     true = simulated.vehicle("arducopter").hover_thrust / factor
     assert taken_over_with(pair) == pytest.approx(true, rel=0.03)
@@ -84,10 +84,10 @@ def test_arducopter_with_another_thrust_stays_at_its_height(factor, believed, se
 
 def test_the_right_file_is_kept_and_without_a_report_nothing_changes() -> None:
     right = with_thrust(1.0, "arducopter", ARDUPILOT)
-    assert right.fly().exit_code == ExitCode.FLOWN
+    right.track()
     silent = with_thrust(2.0, "arducopter", ARDUPILOT)
     silent.down = without(TARGET)
-    assert silent.fly().exit_code == ExitCode.FLOWN
+    silent.track()
     assert math.isnan(taken_over_with(right))
     assert math.isnan(taken_over_with(silent))
 
@@ -96,7 +96,7 @@ def test_px4_found_in_the_air_keeps_its_height() -> None:
     """It has not found its own hover thrust yet, and climbs until it is taken over."""
     pair = with_thrust(2.0, "px4_sih", LEAN, start=Start(height_m=HEIGHT_M))
     heights = heights_m(pair)
-    assert pair.fly().exit_code == ExitCode.FLOWN
+    pair.track()
     begun_s = next(at_s for at_s, phase in pair.phases if phase is Phase.CLIMB)
     landing_s = next(at_s for at_s, phase in pair.phases if phase is Phase.LAND)
     flown = heights[round(begun_s / STEP_S) : round(landing_s / STEP_S)]
@@ -151,5 +151,5 @@ def test_what_the_ground_carries_does_not_count() -> None:
 def test_a_vehicle_that_our_setpoints_lift_keeps_its_file() -> None:
     """PX4 takes off with setpoints; the observer finds the difference out."""
     pair = with_thrust(0.8, "px4_sih", LEAN)
-    assert pair.fly().exit_code == ExitCode.FLOWN
+    pair.track()
     assert math.isnan(taken_over_with(pair))

@@ -20,6 +20,7 @@ from watch import (
     BOTH,
     HIGH,
     LAND,
+    ONE_LAP,
     REACTION_S,
     SET_MODE,
     Fly,
@@ -230,7 +231,7 @@ def test_a_load_that_full_thrust_does_not_carry_is_landed(fly: Fly) -> None:
 @pytest.mark.parametrize("scenario", ["landed_wrong", "landed_lost"])
 def test_in_the_air_it_never_falls(scenario: str, fly: Fly) -> None:
     """The land detector says ground: never less than a third of hover, never fast downwards."""
-    pair = fly(scenario=scenario)
+    pair = fly(ONE_LAP, scenario=scenario)
     watch = watched(pair)
     pair.fly()
     hover = pair.companion.state.model.hover_thrust
@@ -243,7 +244,7 @@ def test_in_the_air_it_never_falls(scenario: str, fly: Fly) -> None:
 
 @BOTH
 def test_one_sample_of_velocity_is_no_lift_off(fly: Fly) -> None:
-    pair = fly(scenario="velocity_spike")
+    pair = fly(ONE_LAP, scenario="velocity_spike")
     watch = watched(pair)
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert -watch.during(Phase.CLIMB)[0].position_ned_m[2] > 0.1
@@ -253,7 +254,7 @@ def test_one_sample_of_velocity_is_no_lift_off(fly: Fly) -> None:
 
 @BOTH
 def test_twice_the_thrust_does_not_carry_it_away(fly: Fly) -> None:
-    pair = fly(HIGH, scenario="thrust_doubled")
+    pair = fly(HIGH, ONE_LAP, scenario="thrust_doubled")
     watch = watched(pair)
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert watch.top_m < 3.0 + 1.0
@@ -302,7 +303,7 @@ def test_a_vehicle_without_thrust_reserve_is_landed(share: float, flown: bool, f
     share of its thrust."""
     scale = float(np.sqrt(share / fly().companion.state.model.hover_thrust))
     heavier = scenario_of(conditions={"mass_scale": scale})
-    pair = fly(HIGH, scenario=heavier, learning=IdentifySettings())
+    pair = fly(HIGH, ONE_LAP, scenario=heavier, learning=IdentifySettings())
     plant = pair.instance.autopilot.plant
     pair.at.append((in_phase(Phase.TRACK, 1.0), lambda flying: plant.scale_mass(scale)))
     outcome = pair.fly()
@@ -319,7 +320,7 @@ def test_a_vehicle_without_thrust_reserve_is_landed(share: float, flown: bool, f
 def test_a_load_that_is_only_believed_does_not_end_the_take_off(fly: Fly) -> None:
     """An earlier flight has identified the vehicle with a load that it does not carry any more."""
     file = fly().companion.state.model
-    pair = fly(believed=file.model_copy(update={"hover_thrust": 0.93}))
+    pair = fly(ONE_LAP, believed=file.model_copy(update={"hover_thrust": 0.93}))
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert "thrust reserve" not in pair.rungs
 
@@ -372,7 +373,7 @@ def jumping(offset_m: float) -> Scenario:
 
 @BOTH
 def test_a_fall_in_the_landing_is_not_flown(fly: Fly) -> None:
-    pair = fly(scenario="motors_cut")
+    pair = fly(ONE_LAP, scenario="motors_cut")
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
     assert "disarmed, but not landed: fell at up to" in outcome.sentence
@@ -380,7 +381,7 @@ def test_a_fall_in_the_landing_is_not_flown(fly: Fly) -> None:
 
 @BOTH
 def test_a_vehicle_that_does_not_detect_its_landing_is_disarmed_and_said(fly: Fly) -> None:
-    pair = fly(scenario="never_landed")
+    pair = fly(ONE_LAP, scenario="never_landed")
     watch = watched(pair)
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert not pair.instance.autopilot.commander.armed

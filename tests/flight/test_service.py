@@ -20,11 +20,11 @@ SETPOINT, COMMAND = "SET_ATTITUDE_TARGET", "COMMAND_LONG"
 ACCEPTED, TEMPORARILY_REJECTED, DENIED, UNSUPPORTED = range(4)  # MAV_RESULT
 
 
-def engaged(on: str, **options: object) -> tuple[Serving, Wire]:
+def engaged(on: str, height_m: float = 3.0, **options: object) -> tuple[Serving, Wire]:
     """A service that the pilot has just engaged in the air."""
     pair = serve(on=on, **options)
     wire = Wire(pair)
-    pair.fly_up()
+    pair.fly_up(height_m)
     pair.switch("engage")
     pair.until(lambda: pair.phase in TRACKING, 3.0)
     return pair, wire
@@ -345,7 +345,7 @@ def test_requests_over_mavlink(on: str) -> None:
 
 def test_a_resumed_stream_after_a_failsafe_does_not_engage() -> None:
     """PX4 returns to OFFBOARD by itself when setpoints arrive again: the pilot has not switched."""
-    pair, wire = engaged("px4")
+    pair, wire = engaged("px4", height_m=5.0)
     pair.until(lambda: pair.phase is Phase.HOVER, 30.0)
     pair.lost_up = True
     pair.until(lambda: pair.mode != "OFFBOARD", 4.0)

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from pair import Pair, hover, in_phase
+from pair import Pair, calm_hover, hover, in_phase
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.analysis import history
@@ -117,20 +117,10 @@ def until(pair: Pair, phase: Phase) -> Pair:
     return pair
 
 
-@pytest.fixture(scope="module")
-def unsigned() -> Pair:
-    """The same flight without signatures."""
-    pair = hover()
-    assert pair.fly().exit_code == ExitCode.FLOWN
-    return pair
-
-
-def test_a_signed_flight_sends_the_same_setpoints_and_can_be_scored(
-    unsigned: Pair, tmp_path: Path
-) -> None:
+def test_a_signed_flight_sends_the_same_setpoints_and_can_be_scored(tmp_path: Path) -> None:
     signed = signed_hover()
     assert signed.fly().exit_code == ExitCode.FLOWN
-    assert [payload[:-13] for payload in signed.payloads] == unsigned.payloads
+    assert [payload[:-13] for payload in signed.payloads] == calm_hover().payloads
     log = signed.log(tmp_path / "a")
     sent = [each for each in log if each.component_id == 191]
     received = [each for each in log if each.component_id == 1]
@@ -138,14 +128,12 @@ def test_a_signed_flight_sends_the_same_setpoints_and_can_be_scored(
     assert len(received) > 1000
     assert all(each.frame.signed for each in (*sent, *received))
     ours = score(history.gather(log))
-    theirs = score(history.gather(unsigned.log(tmp_path / "b")))
+    theirs = score(history.gather(calm_hover().log(tmp_path / "b")))
     assert ours.rmse_position_m == theirs.rmse_position_m
     assert KEY not in (tmp_path / "a" / "flight.tlog").read_bytes()
 
 
-def test_forged_frames_in_flight_change_nothing_and_are_counted(
-    unsigned: Pair, tmp_path: Path
-) -> None:
+def test_forged_frames_in_flight_change_nothing_and_are_counted(tmp_path: Path) -> None:
     """An attacker sends, unsigned or replayed, that the pilot has switched or the vehicle moved."""
     stop = Session(SessionSettings()).encode(Heartbeat(2))
     chance = random.Random(3)
@@ -159,7 +147,7 @@ def test_forged_frames_in_flight_change_nothing_and_are_counted(
 
     attacked = signed_hover(down=attack)
     assert attacked.fly().exit_code == ExitCode.FLOWN
-    assert len(attacked.payloads) == len(unsigned.payloads)
+    assert len(attacked.payloads) == len(calm_hover().payloads)
     shown = attacked.companion.snapshot()
     assert shown.forged > 2000
     assert any("frames refused by signing" in line for line in attacked.companion.announced)

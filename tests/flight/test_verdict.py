@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from faults import die, kill_motors, stop, take_over
-from pair import UNIX_EPOCH_US, Pair, decode, frames_of, hover, in_phase, make
+from pair import UNIX_EPOCH_US, Pair, calm_hover, decode, frames_of, hover, in_phase, make
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from typer.testing import CliRunner
 
@@ -37,21 +37,14 @@ STAMPED = {"LOCAL_POSITION_NED", "ATTITUDE_QUATERNION"}
 
 
 @pytest.fixture(scope="module")
-def flight() -> Pair:
-    pair = hover()
-    assert pair.fly().exit_code == 0
-    return pair
-
-
-@pytest.fixture(scope="module")
-def flown(flight: Pair, tmp_path_factory: pytest.TempPathFactory) -> History:
-    return history.gather(flight.log(tmp_path_factory.mktemp("flown")))
+def flown(tmp_path_factory: pytest.TempPathFactory) -> History:
+    return history.gather(calm_hover().log(tmp_path_factory.mktemp("flown")))
 
 
 def test_decisions_at_the_tilt_limit_are_counted_and_reported(tmp_path: Path) -> None:
     """The wind of `wind_light` needs more than 45 degrees of tilt, to which the gate turns back."""
     pair = make(reference="lemniscate", vehicle="neutral", scenario="wind_light", seed=2)
-    assert pair.fly().exit_code == 0
+    pair.track()
     flown = history.gather(pair.log(tmp_path))
     down = thrust_direction_from_quaternion(flown.setpoint[:, 2:6])[:, 2]
     limited = np.degrees(np.arccos(down)) > 44.9
@@ -125,10 +118,10 @@ def height_m(pair: Pair) -> float:
     return -float(pair.instance.autopilot.state.truth.position_ned_m[2])
 
 
-def test_a_requirement_on_a_cut_log_is_missed(flight: Pair, tmp_path: Path) -> None:
+def test_a_requirement_on_a_cut_log_is_missed(tmp_path: Path) -> None:
     """In the middle of the track, as after a crash of the machine; without a requirement it is
     scored."""
-    frames = flight.logged
+    frames = calm_hover().logged
     track = next(n for n, frame in enumerate(frames) if b"offboard: track" in frame)
     with FlightLog(tmp_path / "cut", "") as log:
         for number, frame in enumerate(frames[: track + 500]):
@@ -186,7 +179,7 @@ def test_the_outcome_follows_the_log(flown: History) -> None:
 def test_a_record_says_what_was_sent(tmp_path: Path) -> None:
     """Identification steps change the command after the decision: no certificate then."""
     pair = hover(scenario="px4_like", learning=IdentifySettings())
-    assert pair.fly().exit_code == 0
+    pair.track()
     flown = history.gather(pair.log(tmp_path))
     excited = flown.records["phase"] == PHASE_CODES[Phase.EXCITE]
     certified = np.isfinite(flown.records["gap"])
@@ -270,7 +263,7 @@ def test_a_jump_of_the_clock_is_not_tracked(flown: History, by_s: float) -> None
 
 def test_a_log_in_stretches_gives_the_same_score(tmp_path: Path) -> None:
     pair = make("reference.laps=1", scenario="px4_like")
-    assert pair.fly().exit_code == 0
+    pair.track()
     log = pair.log(tmp_path)
     whole, scoring = score(history.gather(log)), Scoring()
     count = 0

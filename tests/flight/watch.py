@@ -18,6 +18,7 @@ from simulator.config import Scenario
 
 SET_MODE, LAND, ARM = 176, 21, 400  # MAV_CMD
 LOW, HIGH = "reference.height_m=1.0", "reference.height_m=3.0"  # low: a short climb and landing
+ONE_LAP = "reference.laps=1"
 BOTH = pytest.mark.parametrize(
     "fly", [partial(make, LOW), partial(on_arducopter, LOW)], ids=["px4", "ardupilot"]
 )

@@ -15,6 +15,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+SHORT = ("--reference", "hover", "--set", "reference.duration_s=1", "--set", "reference.height_m=1",
+         "--set", "identify.excite=false")  # fmt: skip
 SIGNING_EPOCH_S = 1_420_070_400  # 2015-01-01
 Spawn = Callable[..., subprocess.Popen[str]]
 Called = Callable[..., tuple[int, str, str]]

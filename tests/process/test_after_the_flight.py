@@ -6,7 +6,7 @@ import json
 import time
 from pathlib import Path
 
-from processes import Spawn
+from processes import SHORT, Spawn
 
 REPORT_S = 60.0  # for the report on a busy machine
 
@@ -15,9 +15,8 @@ def test_the_report_follows_a_flight_that_does_not_wait_for_it(
     spawn: Spawn, tmp_path: Path
 ) -> None:
     process = spawn(
-        "offboard", "fly", "--sitl", "--scenario", "calm", "--out", "x", "--reference", "hover",
-        "--set", "reference.duration_s=2", "--json-lines", "--live", "127.0.0.1:0",
-        OFFBOARD_REPORT="1",
+        "offboard", "fly", "--sitl", "--scenario", "calm", "--out", "x", *SHORT,
+        "--json-lines", "--live", "127.0.0.1:0", OFFBOARD_REPORT="1",
     )  # fmt: skip
     told, errors = process.communicate(timeout=60)
     assert (process.returncode, errors) == (0, "")

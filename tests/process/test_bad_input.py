@@ -18,7 +18,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from processes import Called, Spawn, children, free_port
+from processes import SHORT, Called, Spawn, children, free_port
 
 from offboard.analysis import history, tlog
 from offboard.analysis.flight_score import keep_score, score_flight
@@ -120,7 +120,7 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
                 "--set",
                 "controller.steps=40",
                 "--set",
-                "controller.swarm.particles=10000",
+                "controller.swarm.particles=2000",
                 "--set",
                 "deadline_s=0.0006",
             ),
@@ -323,7 +323,7 @@ def test_ended_before_flight_it_leaves_no_simulator(
 
 
 def test_a_pipe_that_closes_ends_no_flight(spawn: Spawn, tmp_path: Path) -> None:
-    process = spawn("offboard", "fly", "--sitl", "--out", "x", "--reference", "hover")
+    process = spawn("offboard", "fly", "--sitl", "--out", "x", *SHORT)
     assert process.stdout is not None
     assert process.stdout.readline()
     process.stdout.close()
@@ -332,13 +332,9 @@ def test_a_pipe_that_closes_ends_no_flight(spawn: Spawn, tmp_path: Path) -> None
     assert flown.phases[-1].what.startswith("disarmed")
 
 
-def test_a_score_that_cannot_be_written_is_reported(
-    spawn: Spawn, offboard: Call, tmp_path: Path
-) -> None:
-    process = spawn("offboard", "fly", "--sitl", "--out", "x", "--reference", "hover")
-    assert process.wait(timeout=60) == 0
-    (tmp_path / "x" / "score.json").unlink()
-    (tmp_path / "x" / "score.json").mkdir()
+def test_a_score_that_cannot_be_written_is_reported(offboard: Call, tmp_path: Path) -> None:
+    (tmp_path / "x" / "score.json").mkdir(parents=True)
+    (tmp_path / "x" / "flight.tlog").write_bytes(RECORDING.read_bytes())
     assert offboard("score", "x") == (0, "x/score.json cannot be written (Is a directory)\n")
 
 
@@ -398,10 +394,8 @@ def test_full_disk_before_a_flight(
     assert len(process.stderr.splitlines()) == 1
 
 
-def test_full_disk_lands(spawn: Spawn, tmp_path: Path) -> None:
-    process = with_full_disk(
-        tmp_path, 600_000, "fly", "--sitl", "--out", "x", "--reference", "hover"
-    )
+def test_full_disk_lands(tmp_path: Path) -> None:
+    process = with_full_disk(tmp_path, 250_000, "fly", "--sitl", "--out", "x", *SHORT)
     assert process.returncode == 4, process.stderr
     assert "flight.tlog cannot be written (File too large)" in process.stderr
     assert "Traceback" not in process.stderr

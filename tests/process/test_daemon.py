@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import Spawn, free_port, signing
+from processes import Called, Spawn, free_port, signing
 from prometheus_client.parser import text_string_to_metric_families
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
@@ -182,12 +182,11 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     ],
 )
 def test_a_unit_that_could_not_start_is_not_printed(
-    arguments: tuple[str, ...], sentence: str, tmp_path: Path
+    arguments: tuple[str, ...], sentence: str, called: Called
 ) -> None:
-    command = [sys.executable, "-m", "offboard", "daemon", "--print-unit", *arguments]
-    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path)
-    assert (done.returncode, done.stdout) == (2, "")
-    assert sentence in " ".join(done.stderr.split())
+    code, unit, errors = called("offboard daemon", "--print-unit", *arguments)
+    assert (code, unit) == (2, "")
+    assert sentence in " ".join(errors.split())
 
 
 @pytest.mark.skipif(shutil.which("systemd-analyze") is None, reason="needs systemd-analyze")

@@ -1,4 +1,4 @@
-"""The .tlog of real flights over UDP: reproducible bytes, and what the usual tools read in it."""
+"""The .tlog of a real flight over UDP: what the usual tools read in it."""
 
 from __future__ import annotations
 
@@ -10,43 +10,18 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from processes import Spawn
 
 from offboard.analysis import history, tlog
 from offboard.run import configuration as config
 
-SHORT = ("--reference", "hover", "--set", "reference.duration_s=1", "--set", "reference.height_m=1")
 SCRIPTS = Path(sys.executable).parent
-
-
-def setpoints(directory: Path) -> list[bytes]:
-    """Payload of every SET_ATTITUDE_TARGET."""
-    log = tlog.read(directory / "flight.tlog")
-    return [
-        bytes(entry.message.get_payload()) for entry in log if entry.name == "SET_ATTITUDE_TARGET"
-    ]
-
-
-def test_same_seed_same_bytes_another_seed_others(spawn: Spawn, tmp_path: Path) -> None:
-    seeds = {"one": 7, "two": 7, "three": 8}
-    flights = [
-        spawn("offboard", "fly", "--sitl", "--seed", seed, "--out", name, *SHORT)
-        for name, seed in seeds.items()
-    ]
-    for flight in flights:
-        _, errors = flight.communicate(timeout=60)
-        assert (flight.returncode, errors) == (0, "")
-    one, two, three = (setpoints(tmp_path / name) for name in seeds)
-    assert len(one) > 80
-    assert one == two
-    assert one != three
 
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The directory of one bundled flight of the table below."""
     directory = tmp_path_factory.mktemp("logs")
-    rows = "".join(f"{t},{0.5 * t},0,-3\n" for t in range(9))
+    rows = "".join(f"{t},{0.5 * t},0,-1\n" for t in range(9))
     (directory / "line.csv").write_text("time_s,north_m,east_m,down_m\n" + rows)
     subprocess.run(
         [SCRIPTS / "offboard", "fly", "--sitl", "--out", "x", "--reference", "line.csv"],

@@ -41,18 +41,22 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(
-    ("controller", "reference", "damping_ps", "most_m"),
-    [("pd", "hover", 4.0, 0.03), ("my.yaml", "lemniscate", 5.0, 0.2)],
+    ("controller", "reference", "shorter", "damping_ps", "most_m"),
+    [
+        ("pd", "hover", "reference.duration_s=8", 4.0, 0.03),
+        ("my.yaml", "lemniscate", "reference.laps=1", 5.0, 0.2),
+    ],
 )
 def test_documented_controller_flies(
-    controller: str, reference: str, damping_ps: float, most_m: float,
+    controller: str, reference: str, shorter: str, damping_ps: float, most_m: float,
     site: Path, spawn: Spawn, tmp_path: Path,
 ) -> None:  # fmt: skip
     (tmp_path / "my.yaml").write_text("law: pd\ndamping_ps: 5\n")
     path = os.pathsep.join(filter(None, (str(site), os.environ.get("PYTHONPATH"))))
     flight = spawn(
         "offboard", "fly", "--sitl", "--controller", controller, "--reference", reference,
-        "--scenario", "calm", "--seed", "7", "--out", "x", PYTHONPATH=path,
+        "--set", shorter, "--set", "reference.height_m=1", "--scenario", "calm", "--seed", "7",
+        "--out", "x", PYTHONPATH=path,
     )  # fmt: skip
     output, errors = flight.communicate(timeout=170)
     assert (flight.returncode, errors) == (0, ""), output

@@ -49,15 +49,12 @@ def test_climbs(sitl, run):
 """
 )
 
-FAILS = (
-    TAKES_OFF
-    + """
+FAILS = """
 @pytest.mark.sitl(scenario="calm", speed=10)
 def test_fails(sitl):
     pathlib.Path("pid").write_text(str(sitl.process.pid))
     assert climb(sitl) < 0.0
 """
-)
 
 
 def is_running(pid: int) -> bool:
@@ -72,44 +69,53 @@ def named_logs(result: pytest.RunResult) -> list[Path]:
     return [Path(line) for line in result.outlines if line.endswith(".tlog")]
 
 
-@pytest.mark.parametrize("workers", [(), ("-n", "2")], ids=["alone", "xdist"])
-def test_a_vehicle_for_a_test(pytester: pytest.Pytester, workers: tuple[str, ...]) -> None:
+def test_vehicles_for_tests_of_two_workers(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(FLIES)
-    result = pytester.runpytest_subprocess("-q", "--strict-markers", *workers, timeout=90)
+    result = pytester.runpytest_subprocess("-q", "--strict-markers", "-n", "2", timeout=90)
     result.assert_outcomes(passed=2)
     assert named_logs(result) == []
 
 
 def test_a_failed_test_keeps_its_log_and_stops_its_vehicle(pytester: pytest.Pytester) -> None:
-    pytester.makepyfile(FAILS)
+    """Those that pass keep none."""
+    pytester.makepyfile(FLIES + FAILS)
     result = pytester.runpytest_subprocess("-q", timeout=90)
-    result.assert_outcomes(failed=1)
+    result.assert_outcomes(passed=2, failed=1)
     (log,) = named_logs(result)
     assert log.stat().st_size > 10_000
     assert not is_running(int((pytester.path / "pid").read_text()))
 
 
-WRONG = {
-    'scenario="storm"': "*there is no scenario named 'storm'; known are*",
-    "weather=3": "*pytest.mark.sitl: weather is unknown; there is scenario, firmware*",
-}
-
-
-@pytest.mark.parametrize("arguments", WRONG)
-def test_a_wrong_marker_is_one_sentence(pytester: pytest.Pytester, arguments: str) -> None:
+def test_a_wrong_marker_is_one_sentence(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(
-        f"import pytest\n@pytest.mark.sitl({arguments})\ndef test_it(sitl):\n    pass\n"
+        """
+        import pytest
+
+        @pytest.mark.sitl(scenario="storm")
+        def test_scenario(sitl):
+            pass
+
+        @pytest.mark.sitl(weather=3)
+        def test_argument(sitl):
+            pass
+        """
     )
     result = pytester.runpytest_subprocess("-q", timeout=60)
-    result.assert_outcomes(errors=1)
-    result.stdout.fnmatch_lines(WRONG[arguments])
+    result.assert_outcomes(errors=2)
+    result.stdout.fnmatch_lines(
+        [
+            "*there is no scenario named 'storm'; known are*",
+            "*pytest.mark.sitl: weather is unknown; there is scenario, firmware*",
+        ]
+    )
     assert "Traceback" not in result.stdout.str()
 
 
 def test_a_flight_in_one_call(pytester: pytest.Pytester) -> None:
+    """The log of a failed test is kept; an unknown reference is one sentence, without a flight."""
     pytester.makepyfile(
         """
-        SHORT = ("reference.duration_s=3.0", "identify.online=false")
+        SHORT = ("reference.duration_s=1.0", "reference.height_m=1.0", "identify.online=false")
 
         def test_hovers(fly):
             flight = fly(reference="hover", scenario="calm", seed=3, settings=SHORT)
@@ -119,20 +125,16 @@ def test_a_flight_in_one_call(pytester: pytest.Pytester) -> None:
         def test_fails(fly):
             flight = fly(reference="hover", scenario="calm", seed=3, settings=SHORT)
             assert flight.score.rmse_position_m < 0.0
+
+        def test_unknown(fly):
+            fly(reference="moon")
         """
     )
     result = pytester.runpytest_subprocess("-q", timeout=120)
-    result.assert_outcomes(passed=1, failed=1)
+    result.assert_outcomes(passed=1, failed=2)
     (log,) = named_logs(result)
     assert log.stat().st_size > 10_000
-
-
-def test_an_unknown_reference_is_one_sentence(pytester: pytest.Pytester) -> None:
-    pytester.makepyfile('def test_it(fly):\n    fly(reference="moon")\n')
-    result = pytester.runpytest_subprocess("-q", timeout=60)
-    result.assert_outcomes(failed=1)
     result.stdout.fnmatch_lines("nothing was flown: there is no reference named 'moon'*")
-    assert named_logs(result) == []
 
 
 def test_other_test_suites_import_nothing(pytester: pytest.Pytester) -> None:

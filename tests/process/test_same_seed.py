@@ -65,6 +65,7 @@ def fly(
     simulator_late_s: float = 0.0,
     controller_late_s: float = 0.0,
     stall_s: float = 0.0,
+    seed: int = 7,
 ) -> dict[int, list[bytes]]:
     """One short flight: its frames by component, without wall times."""
     stalls = [stall_s]
@@ -78,7 +79,7 @@ def fly(
         directory,
         choices={"reference": "hover"},
         assignments=SHORT,
-        seed=7,
+        seed=seed,
         sitl=True,
     )
     outcome = fly_request(
@@ -129,3 +130,9 @@ def test_every_frame_is_the_same(
     assert len(frames[COMPONENT_ID]) > 500
     for component, expected in undisturbed.items():
         assert frames[component] == expected
+
+
+def test_another_seed_sends_other_setpoints(
+    undisturbed: dict[int, list[bytes]], simulator: LateSimulator, tmp_path: Path
+) -> None:
+    assert fly(tmp_path / "flight", simulator, seed=8)[COMPONENT_ID] != undisturbed[COMPONENT_ID]

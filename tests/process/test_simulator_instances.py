@@ -7,6 +7,7 @@ import socket
 from contextlib import ExitStack
 
 import pytest
+from processes import Called
 from sim_peer import simulator
 
 from offboard.documents import shipped
@@ -59,16 +60,14 @@ WRONG = {
 
 
 @pytest.mark.parametrize("options", WRONG, ids=" ".join)
-def test_what_cannot_be_is_refused(options: tuple[str, ...]) -> None:
-    with simulator(*options) as process:
-        code, errors = process.finish(20.0)
+def test_what_cannot_be_is_refused(options: tuple[str, ...], called: Called) -> None:
+    code, _, errors = called("simulator", *options)
     assert code == 2
     assert WRONG[options] in errors
 
 
-def test_scenarios_are_listed_with_what_they_are() -> None:
-    with simulator("--list-scenarios") as process:
-        output, errors = process.popen.communicate(timeout=20.0)
-    assert (process.popen.returncode, errors) == (0, "")
+def test_scenarios_are_listed_with_what_they_are(called: Called) -> None:
+    code, output, errors = called("simulator", "--list-scenarios")
+    assert (code, errors) == (0, "")
     listed = dict(re.split(r"\s+", line, maxsplit=1) for line in output.splitlines())
     assert listed == shipped.descriptions("scenarios")

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 
 import pytest
+from processes import Called
 from sim_peer import OFFBOARD, Peer, simulator
 
 QUIET = ("--gcs", "none")
@@ -170,42 +171,37 @@ def test_it_can_wait_to_be_spoken_to_and_shifts_its_system() -> None:
         (("--no-such-option",), "--no-such-option"),
     ],
 )
-def test_wrong_options_are_refused(options: tuple[str, ...], says: str) -> None:
-    with simulator(*QUIET, *options) as process:
-        code, errors = process.finish(20.0)
+def test_wrong_options_are_refused(options: tuple[str, ...], says: str, called: Called) -> None:
+    code, _, errors = called("simulator", *QUIET, *options)
     assert code == 2
     assert says in errors
     assert "Traceback" not in errors
 
 
-def test_a_vehicle_that_cannot_come_down_is_told(tmp_path: Path) -> None:
+def test_a_vehicle_that_cannot_come_down_is_told(called: Called, tmp_path: Path) -> None:
     path = tmp_path / "light.yaml"
     shipped = Path(__file__).parents[2] / "config" / "vehicles" / "px4_sih.yaml"
     path.write_text(re.sub(r"hover_thrust: \S+", "hover_thrust: 0.1", shipped.read_text()))
     options = ("--vehicle", str(path), "--connect", "udpout:127.0.0.1:9", "--duration", "0.1")
-    with simulator(*QUIET, *options) as process:
-        code, errors = process.finish(20.0)
-    with simulator(*QUIET, *options, "--param", "MPC_THR_MIN=0.09") as lower:
-        assert lower.finish(20.0) == (0, "")
+    code, _, errors = called("simulator", *QUIET, *options)
+    assert called("simulator", *QUIET, *options, "--param", "MPC_THR_MIN=0.09")[::2] == (0, "")
     assert code == 0
     assert "MPC_THR_MIN is 0.12, which lifts a vehicle that hovers at 0.1" in errors
 
 
-def test_a_port_in_use_is_refused() -> None:
+def test_a_port_in_use_is_refused(called: Called) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as taken:
         taken.bind(("127.0.0.1", 0))
         port = taken.getsockname()[1]
-        with simulator("--connect", f"udpin:127.0.0.1:{port}", *QUIET) as process:
-            code, errors = process.finish(20.0)
+        code, _, errors = called("simulator", "--connect", f"udpin:127.0.0.1:{port}", *QUIET)
     assert code == 2
     assert errors == f"udpin:127.0.0.1:{port} cannot be opened: Address already in use\n"
 
 
-def test_a_wrong_scenario_file_names_key_and_range(tmp_path: Path) -> None:
+def test_a_wrong_scenario_file_names_key_and_range(called: Called, tmp_path: Path) -> None:
     path = tmp_path / "windy.yaml"
     path.write_text("name: windy\nconditions: {mass_scale: 50, wnd: 3}\n")
-    with simulator("--scenario", str(path), *QUIET) as process:
-        code, errors = process.finish(20.0)
+    code, _, errors = called("simulator", "--scenario", path, *QUIET)
     assert code == 2
     assert "conditions.mass_scale" in errors
     assert "conditions.wnd" in errors
