@@ -98,7 +98,6 @@ class Pair:
     time_s: float = 0.0
     steps: int = 0
     turned: int = 0  # steps at the newest turn
-    apart: bool = False  # each datagram has a turn of its own
     sent: list[tuple[float, Phase, bytes]] = field(default_factory=list)  # by the companion
     logged: Bytes = field(default_factory=list)
     phases: list[tuple[float, Phase]] = field(default_factory=list)
@@ -135,8 +134,7 @@ class Pair:
             due = self.waiting or self.steps - self.turned >= POLL_STEPS
             if due and not self.companion.has_ended():
                 chunks, self.waiting, self.turned = self.waiting, [], self.steps
-                for batch in [[chunk] for chunk in chunks] if self.apart else [chunks]:
-                    self._take(self.companion.turn(batch, now_s))
+                self._take(self.companion.turn(chunks, now_s))
         for moment in [moment for moment in self.at if moment[0](self)]:
             self.at.remove(moment)
             moment[1](self)

@@ -315,24 +315,23 @@ def test_a_flight_whose_worker_dies_twice_is_a_row(
     assert (ended[2].exit_code, ended[2].sentence) == (4, "the process that flew it ended, twice")
 
 
-def dies_before_its_score(job: Job) -> Record:
-    flight.keep_score = lambda *score: os._exit(1)
-    return flight.fly_job(job)
-
-
 def test_a_kept_flight_appears_when_it_is_complete(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A worker that is killed leaves no directory that looks like a kept flight."""
+    """One that ends before leaves no directory that looks like a kept flight."""
     case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
     kept = tmp_path / "flights" / case.key
     job = Job(case, Promises(), code.code_hash(), kept)
-    with monkeypatch.context() as dying, local_workers(1) as workers:
-        dying.setattr(execution, "fly_job", dies_before_its_score)
-        ((_, record),) = workers.fly([job], lambda: False)
-        assert record == execution.DIED
-        assert len(list(kept.parent.glob("*/flight/flight.tlog"))) == 2
-        assert not kept.exists()
+
+    def ends(directory: Path, *score: object) -> None:
+        assert (directory / "flight.tlog").is_file()
+        raise SystemExit
+
+    with monkeypatch.context() as ending:
+        ending.setattr(flight, "keep_score", ends)
+        with pytest.raises(SystemExit):
+            flight.fly_job(job)
+    assert not kept.exists()
     assert flight.fly_job(job).completed
     assert {path.name for path in kept.iterdir()} >= {"flight.tlog", "flight.yaml", "score.json"}
 
