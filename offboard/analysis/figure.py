@@ -111,8 +111,8 @@ def listed(figure: go.Figure, lines: Sequence[tuple[str, bool]], row_px: int, to
 
 
 def logarithmic(values: Iterable[float]) -> dict[str, Any]:
-    """A logarithmic axis around the positive values, from 1, 2 or 5 of a decade to another. Ticks
-    are there; of more decades at 1, and of many not at each."""
+    """A logarithmic axis around the positive values. Up to two decades have ticks at 1, 2 and 5;
+    more decades have about four, at powers of ten."""
     known = [value for value in values if 0.0 < value < math.inf]
     least, greatest = min(known, default=1.0), max(known, default=1.0)
     low, high = math.floor(math.log10(least)), math.ceil(math.log10(greatest))

@@ -39,14 +39,12 @@ class Requirement:
         match = _PATTERN.fullmatch(text)
         if match is None:
             raise UserError(
-                f"--require {text!r} is not understood; write FIGURE<NUMBER, "
+                f"{text!r} is not understood; write FIGURE<NUMBER, "
                 "for example 'rmse_position_m<0.05' (also <=, >, >=, ==)"
             )
         figure, comparison, number = match.groups()
         if figure not in FIGURES:
-            raise UserError(
-                f"--require: there is no figure {figure!r}; there are {', '.join(FIGURES)}"
-            )
+            raise UserError(f"there is no figure {figure!r}; there are {', '.join(FIGURES)}")
         return cls(figure, comparison, float(number))
 
     def met(self, figures: Mapping[str, float]) -> bool:

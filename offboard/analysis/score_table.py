@@ -28,8 +28,8 @@ AT_LIMIT_SHARE = 0.2  # of the decisions, from which a summary says so
 
 
 def summary(score: Score, history: History) -> dict[str, str]:
-    """By label what a person wants to know after a flight. Figures that the log does not hold are
-    left out."""
+    """What a person wants to know after a flight: text by label. Figures that the log does not hold
+    are left out."""
     rows: dict[str, str] = {}
     if math.isfinite(score.rmse_position_m):
         error = f"{score.rmse_position_m:.3f} m RMSE, {score.max_position_m:.3f} m maximum"

@@ -45,7 +45,7 @@ def _requirement(text: str) -> str:
     try:
         Requirement.parse(text)
     except UserError as error:
-        raise ValueError(str(error).removeprefix("--require: ")) from None
+        raise ValueError(str(error)) from None
     return text
 
 

@@ -89,7 +89,7 @@ def read_tune(name: str) -> tuple[TuneFile, str]:
     file = parse(read_text(path), TuneFile, str(path))
     for key in file.ranges:
         if key.startswith((SCENARIO, "vehicle.")):
-            raise DocumentError(f"{path}: ranges.{key}: controller and flight are tuned, no other")
+            raise DocumentError(f"{path}: ranges.{key}: no scenario and no vehicle is tuned")
     return file, str(path)
 
 

@@ -83,7 +83,7 @@ def _shard(text: str | None) -> Shard:
 
 
 @contextmanager
-def interruptible() -> Iterator[None]:
+def resumable() -> Iterator[None]:
     """Exit with 4 for an error after which the same command may go on, a full disk for example."""
     try:
         yield
@@ -115,7 +115,7 @@ def _search(flown: Campaign, source: str, count: int, open_workers: OpenWorkers)
         search = search_of(flown, source, evaluator)
         most = search.flights_most(count)
         counter.count(0, most)
-        with interruptible():
+        with resumable():
             failures = search.find(count)
     if failures is None:
         raise CommandError(ENDED, 4)

@@ -53,7 +53,7 @@ def compare(
     if connect is None and (system or signing_key):
         raise CommandError("--system and --signing-key are options of --connect: add it")
     if connect and (scenario or workers):
-        raise CommandError("--scenario and --workers are options of the simulator: omit --connect")
+        raise CommandError("--scenario and --workers are options of the simulator: omit them")
     if not 1 <= seeds <= 1000:
         raise CommandError(f"--seeds {seeds}: give 1 .. 1000")
     laws = _names("--controllers", controllers, shipped.names("controllers"))

@@ -111,4 +111,4 @@ def _show(rows: list[Row]) -> None:
                 say(f"{'':<{indent}}fix: {finding.hint}", indent + 5)
     number = sum(finding.level is not Level.OK for row in rows for finding in row.findings)
     out.print()
-    say(f"{len(rows)} checks, {number} findings")
+    say(f"checks: {len(rows)}, findings: {number}")

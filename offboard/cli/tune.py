@@ -9,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from offboard.cli.campaign import ENDED, interruptible
+from offboard.cli.campaign import ENDED, resumable
 from offboard.cli.shared import CommandError, Workers, check_new, option, out, say, write_new
 
 EXIT_CODES = (
@@ -51,7 +51,7 @@ def tune(
         suppress(KeyboardInterrupt, Interrupted),
         StopRequests() as stops,
         local_workers(workers) as flyers,
-        interruptible(),
+        resumable(),
     ):
         evaluator = Evaluator(results, Promises(), flyers, partial(Counter(out).ending, stops))
         tuned = tuning.run(

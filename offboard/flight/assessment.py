@@ -109,6 +109,8 @@ def _hears_other_sender(state: FlightState) -> bool:
 
 
 def _full_thrust_sink_mps(state: FlightState) -> float:
+    """Downward speed while the newest setpoint demands the full thrust, else 0. Other rows of the
+    ladder act on an old position (blind) and on missing setpoints (decisions)."""
     position, thrusts = state.vehicle.position, state.thrusts
     if state.phase not in TRACKING or position is None or not thrusts:
         return 0.0

@@ -49,7 +49,7 @@ def other_sender(now: Facts) -> bool:
 
 
 def follows_others(now: Facts) -> bool:
-    """It follows setpoints of another program in the mode that we asked for."""
+    """The vehicle follows setpoints of another program in the mode that we asked for."""
     return now.engaged and now.follows_others and not now.limits.begin_with_other_sender
 
 

@@ -122,7 +122,7 @@ class Outbox:
         """
         command = admit(command, self._state.model, self._clearance(age_s, late_s))
         self._observer.freeze(True)
-        self._state.thrusts.clear()
+        self._state.thrusts.clear()  # the autopilot chooses the thrust
         self.command = Command(self._state.model.gravity_mps2, LEVEL, command.course_rad)
         self.send(
             PositionTarget(

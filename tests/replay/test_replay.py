@@ -56,6 +56,25 @@ def reason(result: Result) -> str:
     return str(result.exception)
 
 
+def test_reports_of_the_recorded_setpoints_are_no_second_sender(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """A law that decides another thrust is replayed to the end, beside the recorded ATTITUDE_TARGET
+    of a real PX4."""
+    decide = PsoLaw.decide
+
+    def changed(law: PsoLaw, situation: Situation) -> Decision:
+        decision = decide(law, situation)
+        command = replace(decision.command, thrust_mps2=1.01 * decision.command.thrust_mps2)
+        return replace(decision, command=command)
+
+    monkeypatch.setattr(PsoLaw, "decide", changed)
+    with unpacked("real-px4") as recording:
+        replay = replayed(recording)
+    assert not any("another program" in said for said in replay.companion.announced)
+    assert replay.companion.phase is Phase.DISARMED
+
+
 # ------------------------------------------------------------------ what it says
 
 

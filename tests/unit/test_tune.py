@@ -125,8 +125,8 @@ def test_the_profile_is_a_configuration_with_the_tuned_values(tmp_path: Path) ->
         (("feedback_limit", "feedback"), "ranges.controller.feedback is no number"),
         (("trials: 40", "objective: solve_time_p50_ms"), "is no figure of a lockstep flight"),
         (("trials: 40", "trails: 40"), "did you mean trials?"),
-        ((LIMIT, "scenario.conditions.mass_scale"), "controller and flight are tuned, no other"),
-        ((LIMIT, "vehicle.tilt.delay_s"), "controller and flight are tuned, no other"),
+        ((LIMIT, "scenario.conditions.mass_scale"), "no scenario and no vehicle is tuned"),
+        ((LIMIT, "vehicle.tilt.delay_s"), "no scenario and no vehicle is tuned"),
     ],
 )
 def test_a_file_that_cannot_be_tuned_is_refused(
