@@ -60,6 +60,7 @@ def as_text(score: Score, history: History) -> str:
     not hold is null."""
     document = {
         "ended_by": score.ended_by,
+        "reason": score.reason,
         **score.figures(),
         "phases": _events(history.phases),
         "modes": _events(history.modes),

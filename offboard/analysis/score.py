@@ -29,7 +29,8 @@ class Score:
     """All figures of a flight, by the names that --require takes, and what ended it.
 
     `completed` is 1 if the whole reference was tracked, the vehicle landed by its land detector,
-    height and speed, and it was disarmed; else 0, and `ended_by` says why not.
+    height and speed, and it was disarmed; else 0, and `ended_by` says why not in a word or a few,
+    `reason` in the sentence that the flight announced.
 
     Errors are relative to the reference, during the phase TRACK: `position` as the vehicle
     estimates it (LOCAL_POSITION_NED), `truth` as it is in the simulator (HIL_STATE_QUATERNION or
@@ -47,6 +48,7 @@ class Score:
 
     completed: float = _figure("1: all tracked, landed, disarmed")
     ended_by: str = ""
+    reason: str = ""
     touchdown_mps: float = _figure("downward speed at touch-down", "m/s")
     rmse_position_m: float = _figure("position error, RMSE", "m")
     mean_position_m: float = _figure("position error, mean", "m")
@@ -111,13 +113,11 @@ class Score:
     flight_s: float = _figure("from arming to the end of the log", "s")
 
     def figures(self) -> dict[str, float]:
-        """The figures by name, without the text `ended_by`."""
-        values: dict[str, Any] = asdict(self)
-        del values["ended_by"]
-        return values
+        """The figures by name, without the texts."""
+        return {name: getattr(self, name) for name in FIGURES}
 
 
-FIGURES = {figure.name: figure.metadata for figure in fields(Score) if figure.name != "ended_by"}
+FIGURES = {figure.name: figure.metadata for figure in fields(Score) if figure.metadata}
 
 
 class Scoring:

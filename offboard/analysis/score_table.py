@@ -55,7 +55,11 @@ def verdict(score: Score) -> str:
     """Whether the flight was completed, and what ended it."""
     if math.isnan(score.completed):
         return score.ended_by
-    return "completed" if score.completed else f"not completed: {score.ended_by}"
+    if score.completed:
+        return "completed"
+    if score.reason in ("", score.ended_by):
+        return f"not completed: {score.ended_by}"
+    return f"not completed ({score.ended_by}): {score.reason}"
 
 
 def _identified(history: History) -> str:

@@ -41,11 +41,13 @@ _CAUSES = (
 @dataclass(frozen=True, slots=True)
 class Verdict:
     """`completed`: 1 or 0, NaN for a log without a flight of `offboard`. `ended_by`: a word or a
-    few. `touchdown_mps`: downward speed before the ground was reached, NaN if it was not."""
+    few. `touchdown_mps`: downward speed before the ground was reached, NaN if it was not. `reason`:
+    what the flight announced as it ended early, empty if it did not."""
 
     completed: float
     ended_by: str
     touchdown_mps: float = math.nan
+    reason: str = ""
 
 
 class Landing:
@@ -91,7 +93,7 @@ def judge(flown: History, landing: Landing, skipped_s: float) -> Verdict:
     which nothing was decided."""
     if not flown.phases:
         return Verdict(math.nan, NO_FLIGHT)
-    why = _ended_early(flown)
+    why, reason = _ended_early(flown)
     not_landed, touchdown_mps = landing.judge(flown)
     if why == REFERENCE_OVER:
         if skipped_s > 0.0:
@@ -100,20 +102,24 @@ def judge(flown: History, landing: Landing, skipped_s: float) -> Verdict:
             why = not_landed
         elif not len(flown.heartbeat) or flown.heartbeat[-1, 1]:
             why = "not disarmed"
-    return Verdict(float(why == REFERENCE_OVER), why, touchdown_mps)
+    return Verdict(float(why == REFERENCE_OVER), why, touchdown_mps, reason)
 
 
-def _ended_early(flown: History) -> str:
-    """What ended the flight, by its phases; REFERENCE_OVER if they were all gone through."""
+def _ended_early(flown: History) -> tuple[str, str]:
+    """What ended the flight, by its phases, and the sentence that announced it; REFERENCE_OVER if
+    they were all gone through."""
     names = [event.phase for event in flown.phases]
     for event, name, before in zip(flown.phases[1:], names[1:], names, strict=False):
         regular = (before, name) in (("hover", "land"), ("land", "disarmed"))
         if name in {"hold", "land", "stand down", *_LANDING_ENDS} and not regular:
-            cause = _cause(event.what.partition(": ")[2])
-            return "failsafe" if cause == "pilot" and _critical(flown, event.time_s) else cause
+            reason = event.what.partition(": ")[2]
+            cause = _cause(reason)
+            if cause == "pilot" and _critical(flown, event.time_s):
+                cause = "failsafe"
+            return cause, reason
     if names[-1] not in _LANDING_ENDS:
-        return f"the log ends in the phase {names[-1]}"
-    return REFERENCE_OVER if "track" in names else names[-1]
+        return f"the log ends in the phase {names[-1]}", ""
+    return REFERENCE_OVER if "track" in names else names[-1], ""
 
 
 def _critical(flown: History, time_s: float) -> bool:

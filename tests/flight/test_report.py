@@ -77,7 +77,7 @@ def test_the_page_is_readable_in_both_schemes_and_widths(opened: Opened) -> None
 def test_the_verdict_comes_first(opened: Opened) -> None:
     shown = opened.page.inner_text("main").splitlines()
     assert shown[0] == "Flight a <b>"
-    assert "✗ not completed: pilot" in shown[1:4]
+    assert "✗ not completed (pilot): the vehicle left OFFBOARD for AUTO.LOITER" in shown[1:4]
 
 
 def test_the_curves_are_those_of_the_score(opened: Opened, flown: tuple[Pair, Path, Score]) -> None:

@@ -22,7 +22,7 @@ from offboard.analysis import history, tlog
 from offboard.analysis.flight_score import judged
 from offboard.analysis.history import History
 from offboard.analysis.score import Score, Scoring, score
-from offboard.analysis.score_table import summary
+from offboard.analysis.score_table import summary, verdict
 from offboard.cli.commands import app
 from offboard.flight.companion import Outcome
 from offboard.flight.online_identification import IdentifySettings
@@ -93,6 +93,9 @@ def test_a_flight_that_ended_early_says_what_ended_it(
     assert pair.fly().exit_code != 0
     ended = pair.score(tmp_path)
     assert (ended.completed, ended.ended_by) == (0.0, ended_by)
+    assert ended.reason
+    assert any(line.endswith(f": {ended.reason}") for line in pair.companion.announced)
+    assert verdict(ended) == f"not completed ({ended_by}): {ended.reason}"
 
 
 @pytest.mark.parametrize("height", [1.5, 0.6])
