@@ -133,7 +133,7 @@ class Scoring:
         """Evaluate a stretch up to the vehicle time until which it is complete."""
         if until_s < self._done_s:  # the vehicle was rebooted
             self._done_s = -math.inf
-        window = self._tracking.window(flown, until_s, self._done_s)
+        window = self._tracking.window(flown, until_s)
         if window is not None:
             self._tracking.add(flown, *window)
             self._link.add_track(flown, *window, first=not self._tracked)

@@ -42,23 +42,26 @@ class Tracking:
         self._factor = np.zeros((0, _EXPLAINED + 4))  # R of a QR decomposition
         self._track_s = math.nan  # time of the reference at the newest tick
         self._before_s: dict[str, float] = {}  # newest sample of each table
+        self._done_s = -math.inf  # end of the newest window
         self.tracked_s = self.skipped_s = 0.0
         self._seen = False
 
-    def window(self, flown: History, until_s: float, done_s: float) -> tuple[float, float] | None:
-        """First and last vehicle time of TRACK between `done_s` and `until_s`; None without."""
+    def window(self, flown: History, until_s: float) -> tuple[float, float] | None:
+        """First and last vehicle time of TRACK that `add` has not evaluated, up to `until_s`; None
+        where there are not two samples of each signal."""
         times = flown.record_time_s[_in_track(flown)]
         if len(times) < 2 or len(flown.reference) < 2:
             return None
-        begin_s, end_s = max(float(times[0]), done_s), min(float(times[-1]), until_s)
-        tables = (flown.position, flown.attitude, flown.setpoint)
-        if any(((rows[:, 0] >= begin_s) & (rows[:, 0] <= end_s)).sum() < 2 for rows in tables):
-            return None
-        return begin_s, end_s
+        begin_s, end_s = max(float(times[0]), self._done_s), min(float(times[-1]), until_s)
+        tables = {
+            "position": flown.position, "attitude": flown.attitude, "setpoint": flown.setpoint
+        }  # fmt: skip
+        enough = all(len(self._rows(*table, begin_s, end_s)) > 1 for table in tables.items())
+        return (begin_s, end_s) if enough else None
 
     def add(self, flown: History, begin_s: float, end_s: float) -> None:
         """Evaluate a window: what is after `begin_s`, for the first window also what is at it."""
-        self._seen = True
+        self._seen, self._done_s = True, end_s
         reference = Reference(flown.reference)
         clock = _Clock(flown)
         self._ticks(flown, reference, begin_s, end_s)
@@ -110,11 +113,14 @@ class Tracking:
 
     def _between(self, name: str, rows: Array, begin_s: float, end_s: float) -> Array:
         """Rows of a window in the order of time, each stamp once, after the last row before."""
-        begin_s = self._before_s.get(name, begin_s)
-        once = each_once(rows[(rows[:, 0] >= begin_s) & (rows[:, 0] <= end_s)])
+        once = each_once(self._rows(name, rows, begin_s, end_s))
         if len(once):
             self._before_s[name] = once[-1, 0]
         return once
+
+    def _rows(self, name: str, rows: Array, begin_s: float, end_s: float) -> Array:
+        begin_s = self._before_s.get(name, begin_s)
+        return rows[(rows[:, 0] >= begin_s) & (rows[:, 0] <= end_s)]
 
     def _ticks(self, flown: History, reference: Reference, begin_s: float, end_s: float) -> None:
         """Time tracked, and Eqs. 31-32: velocities in the body frame, course in degrees."""
