@@ -46,6 +46,7 @@ HOST_EPOCH_S = 5000.0
 POLL_STEPS = 5
 UNIX_EPOCH_US = 1_767_225_600_000_000
 LONGEST_S = 150.0
+QUICK_LANDING = {"MPC_LAND_SPEED": 1.2, "MPC_LAND_CRWL": 0.7, "COM_DISARM_LAND": 0.5}
 LOITER = 3  # sub mode of PX4's AUTO
 
 Bytes = list[bytes]
@@ -253,13 +254,14 @@ def make(
     learning: IdentifySettings | None = None,
     believed: Vehicle | None = None,
     deadline_s: float | None = None,
-    boot_scale: float = 1.0,
+    boot_scale: float = 0.25,
     clock: HostClock | None = None,
     **options: Any,
 ) -> Pair:
     """A pair as `offboard fly --sitl` makes it. `flies` is the simulated vehicle, `believed` the
     controller's model of it, `learning` the settings of the identification. With `deadline_s` the
-    companion does not wait for slow decisions."""
+    companion does not wait for slow decisions. The vehicle starts and lands faster than by default,
+    which most tests do not look at."""
     named = {"reference": reference, "vehicle": vehicle}
     choices = {part: chosen for part, chosen in named.items() if chosen}
     clock = clock or HostClock()
@@ -297,6 +299,9 @@ def make(
         faults=flown.faults,
         start=flown.start,
     )
+    if firmware.name == "px4":
+        for parameter, value in QUICK_LANDING.items():
+            instance.autopilot.parameters.set(parameter, value)
     return Pair(companion, instance, clock, **options)
 
 

@@ -249,9 +249,9 @@ def serving_viewers() -> Iterator[tuple[LiveProcess, str]]:
 
 
 def sometimes(process: LiveProcess) -> Callable[[Any], None]:
-    """Shows every 50th step, 0.2 s of the flight: all fit into the queue."""
+    """Shows every 40th step, 0.16 s of the flight: all fit into the queue."""
     steps = count()
-    return lambda companion: next(steps) % 50 or process.show(companion)
+    return lambda companion: next(steps) % 40 or process.show(companion)
 
 
 def test_a_foxglove_viewer_decodes_the_whole_flight_in_east_north_up(

@@ -186,7 +186,7 @@ def test_setpoints_of_another_program_show_in_what_px4_follows(rate_hz: float) -
     """Level ones, that are not on our link: unnoticed they cost 3 m."""
     sender = {"fault": "second_sender", "setpoint_rate_hz": rate_hz, "thrust": 0.49}
     pair = make(
-        firmware=PX4, seed=3, scenario=scenario_of({**sender, "after": "engaged", "at_s": 20.0})
+        firmware=PX4, seed=3, scenario=scenario_of({**sender, "after": "engaged", "at_s": 16.0})
     )
     watch = watched(pair)
     outcome = pair.fly()

@@ -28,7 +28,7 @@ WATCHED_STEPS = 5  # 20 ms
 
 @dataclass(frozen=True)
 class Moment:
-    """The truth. `error_m` is the distance from the reference, NaN without one."""
+    """The truth. `error_m` is the distance from the reference while it is tracked, else NaN."""
 
     time_s: float
     phase: Phase
@@ -57,7 +57,8 @@ class Watch:
         truth, commander = autopilot.state.truth, autopilot.commander
         position = np.array(truth.position_ned_m)
         vehicle_s = autopilot.state.time_s + 1e-6 * self.pair.instance.view.clock_offset_us
-        wanted = companion.state.plan.sample(vehicle_s)
+        tracked = companion.phase in TRACKING
+        wanted = companion.state.plan.sample(vehicle_s) if tracked else None
         error = np.nan if wanted is None else np.linalg.norm(position - wanted.position_ned_m)
         return Moment(
             time_s,
