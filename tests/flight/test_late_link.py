@@ -22,9 +22,7 @@ CONFIGURED_RADPS = 7.0
 def on_a_link_that_becomes_late(direction: str, added_s: float) -> tuple[Pair, list]:
     """A lemniscate on PX4 during which the link becomes late and prompt again; returns also times
     since the change, and the bandwidth limits that began then."""
-    pair = make(
-        vehicle="px4_sih", scenario="px4_like", learning=IdentifySettings(), boot_scale=1.0
-    )
+    pair = make(vehicle="px4_sih", scenario="px4_like", learning=IdentifySettings(), boot_scale=1.0)
     begun: list[float] = []
     limits: list[tuple[float, float]] = []
 
