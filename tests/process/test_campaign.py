@@ -16,8 +16,8 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
-import distributed
 import pyarrow.parquet
 import pytest
 from processes import Spawn, children
@@ -157,11 +157,17 @@ def unused() -> AbstractContextManager[Workers]:
     raise AssertionError("all flights are finished")
 
 
-def test_a_dask_cluster_of_two_workers_makes_the_same_table(whole: Path, tmp_path: Path) -> None:
-    with distributed.LocalCluster(
-        n_workers=2, threads_per_worker=1, processes=False, dashboard_address=None,
+def dask_cluster(workers: int) -> Any:
+    from distributed import LocalCluster  # slow to import
+
+    return LocalCluster(
+        n_workers=workers, threads_per_worker=1, processes=False, dashboard_address=None,
         scheduler_port=0, protocol="tcp",
-    ) as cluster:  # fmt: skip
+    )  # fmt: skip
+
+
+def test_a_dask_cluster_of_two_workers_makes_the_same_table(whole: Path, tmp_path: Path) -> None:
+    with dask_cluster(2) as cluster:
         address = cluster.scheduler_address
         summary = fly(campaign(FILE, tmp_path / "out"), partial(cluster_workers, address))
     assert (summary.missing, summary.stopped) == (0, "")
@@ -169,10 +175,7 @@ def test_a_dask_cluster_of_two_workers_makes_the_same_table(whole: Path, tmp_pat
 
 
 def test_a_scheduler_that_is_lost_keeps_what_is_finished(tmp_path: Path) -> None:
-    cluster = distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, dashboard_address=None,
-        scheduler_port=0, protocol="tcp",
-    )  # fmt: skip
+    cluster = dask_cluster(1)
     flown = campaign(FILE, tmp_path / "out")
     summary = flown.fly(
         partial(cluster_workers, cluster.scheduler_address),
