@@ -34,8 +34,8 @@ for _number, _handler in (
 PACKAGES = (Path(__file__).parent.parent / name for name in ("offboard", "simulator"))
 
 # Tests that limit the size of files would leave truncated bytecode, on which later imports fail:
-# all bytecode is written once, at the start of the session
-sys.dont_write_bytecode = True
+# all bytecode is written before the first test
+sys.dont_write_bytecode = False
 os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
 os.environ["OFFBOARD_REPORT"] = "0"  # flights of tests write no report
 
@@ -52,3 +52,8 @@ def pytest_sessionstart(session: pytest.Session) -> None:
         for name in COMPILED:
             importlib.import_module(name)
         prepare()
+
+
+def pytest_collection_finish() -> None:
+    """The modules of the tests are imported: their bytecode is written."""
+    sys.dont_write_bytecode = True

@@ -252,7 +252,7 @@ def test_no_vehicle(offboard: Call, tmp_path: Path) -> None:
 def in_flight(spawn: Spawn, *arguments: str) -> subprocess.Popen[str]:
     """A bundled flight that hovers for an hour and has just begun to."""
     process = spawn(
-        "offboard", "fly", "--sitl", "--scenario", "calm", "--out", "x", "--reference", "hover",
+        "offboard", "fly", "--sitl", "--scenario", "calm", "--out", "x", *SHORT,
         "--set", "reference.duration_s=3600", *arguments,
     )  # fmt: skip
     assert process.stdout is not None

@@ -9,12 +9,12 @@ import subprocess
 import time
 from pathlib import Path
 
-from processes import Spawn, children
+from processes import SHORT, Spawn, children
 
 SEEDS = 12
 COMPARE = (
     "compare", "--controllers", "lqr", "--reference", "hover", "--scenario", "calm",
-    "--seeds", SEEDS, "--workers", 2, "--set", "reference.duration_s=1", "--out", "x",
+    "--seeds", SEEDS, "--workers", 2, "--out", "x", *SHORT,
 )  # fmt: skip
 
 

@@ -20,20 +20,13 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import Spawn, children, free_port
+from processes import SHORT, Spawn, children, free_port
 
 from offboard.analysis import tlog
 
 HOLD, LAND = 176, 21  # MAV_CMD
 LONG_S = 60.0
-HOVER = (
-    "--reference",
-    "hover",
-    "--set",
-    "reference.duration_s=600",
-    "--set",
-    "reference.height_m=1",
-)
+HOVER = (*SHORT, "--set", "reference.duration_s=600")
 LAW_THAT_HANGS = """
 import os
 from typing import Literal

@@ -83,7 +83,7 @@ class Plant:
 
     def __post_init__(self) -> None:
         vehicle = self.truth.vehicle
-        self.sent: list[tuple[float, ...]] = []  # time, b_n, b_e, thrust, course
+        self.sent = np.empty((0, 5))  # time, b_n, b_e, thrust, course
         if self.x[10] == 0.0:
             self.x[10] = vehicle.gravity_mps2
         self.constants = (
@@ -99,7 +99,8 @@ class Plant:
 
     def command(self, command: Command) -> None:
         north, east, _ = command.thrust_direction_ned
-        self.sent.append((self.time_s, north, east, command.thrust_mps2, command.course_rad))
+        sent = (self.time_s, north, east, command.thrust_mps2, command.course_rad)
+        self.sent = np.vstack((self.sent[-30:], sent))
 
     def advance(self, interval_s: float) -> None:
         steps = round(interval_s / STEP_S)
@@ -118,13 +119,11 @@ class Plant:
         wind = np.array(self.truth.wind_force_ned_mps2)
         _run(self.x, self.errors, rows, walks, drifts, self.constants, wind)
         self.time_s = round((self.time_s + interval_s) / STEP_S) * STEP_S
-        if len(self.sent) > 60:
-            self.sent = self.sent[-30:]
 
     def _in_force(self, times: np.ndarray) -> np.ndarray:
         """Rows of `sent` that act at `times`, the first one for ever before."""
-        sent = np.array(self.sent)
-        return sent[np.maximum(np.searchsorted(sent[:, 0], times + 1e-9, side="right") - 1, 0)]
+        rows = np.searchsorted(self.sent[:, 0], times + 1e-9, side="right") - 1
+        return self.sent[np.maximum(rows, 0)]
 
     def position(self) -> tuple[np.ndarray, np.ndarray]:
         """Position and velocity as the autopilot reports them."""
@@ -222,7 +221,7 @@ def fly(
     command = Command(believed.gravity_mps2, (0.0, 0.0, 1.0), reference.course_rad)
     plant.command(command)
     observer.on_command(0.0, command)
-    errors, rates, bounds = [], [], []
+    times, positions, rates, bounds = [], [], [], []
     next_decision_s, message = period_s, 0
     while plant.time_s < score_from_s + laps * reference.period_s:
         plant.advance(gaps_s[message % len(gaps_s)])
@@ -232,7 +231,8 @@ def fly(
         position, velocity = plant.position()
         observer.on_position(now, position, velocity)
         if now >= score_from_s:
-            errors.append(position - reference.sample(now).position_ned_m)
+            times.append(now)
+            positions.append(position)
             rates.append(plant.x[8:10].copy())
         if now >= next_decision_s - 1e-9:
             next_decision_s = (np.floor(now / period_s + 1e-6) + 1) * period_s
@@ -242,7 +242,8 @@ def fly(
             bounds.append(decision.certificate.at_bound)
             observer.on_command(now, command)
             plant.command(command)
-    distances = np.linalg.norm(errors, axis=1)
+    wanted = reference.sample(np.array(times)).position_ned_m
+    distances = np.linalg.norm(positions - wanted, axis=1)
     return Flight(
         rmse_m=float(np.sqrt(np.mean(distances**2))),
         largest_m=float(distances.max()),

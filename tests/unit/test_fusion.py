@@ -13,7 +13,6 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 from scipy.linalg import solve_continuous_are
-from scipy.spatial.transform import Rotation
 
 from offboard.estimation.fusion import Fusion
 from offboard.estimation.fusion_filter import FusionSettings
@@ -81,12 +80,10 @@ class Trial:
         pull = np.array([0.0, 0.0, G]) - acceleration - DRAG * velocity + self.push_mps2
         thrust = float(np.linalg.norm(pull))
         down = pull / thrust
-        axis = np.cross([0.0, 0.0, 1.0], down)
-        angle = math.acos(down[2])
-        turn = Rotation.from_rotvec(axis / max(np.linalg.norm(axis), 1e-12) * angle)
-        x, y, z, w = turn.as_quat()
+        # the shortest turn from down to the body's z axis: half way between the two
+        w, x, y = np.array([1.0 + down[2], -down[1], down[0]]) / math.sqrt(2.0 + 2.0 * down[2])
         self.fusion.on_command(self.time_s - STEP_S / 2, Command(thrust, (0.0, 0.0, 1.0), 0.0))
-        self.fusion.on_attitude(self.time_s, (w, x, y, z))
+        self.fusion.on_attitude(self.time_s, (w, x, y, 0.0))
         if round(self.time_s / STEP_S) % FIX_EVERY == 0:
             self._fix()
         wave = np.sin(2 * math.pi * self.time_s / np.array([7.0, 9.0, 11.0]))

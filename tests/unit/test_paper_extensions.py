@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from scipy.spatial.transform import Rotation
 
 from offboard.control.base import Situation
 from offboard.control.certificate import certify
@@ -156,6 +155,12 @@ class Point:
         return FlatSample(self._position, still, still, still, still, zero, zero, zero)
 
 
+def body_z(roll: float, pitch: float) -> Array:
+    """The axis in NED, at course 0."""
+    level = np.cos(roll)
+    return np.array([np.sin(pitch) * level, -np.sin(roll), np.cos(pitch) * level])
+
+
 def flown_over_an_attitude_loop(
     name: str, target_ned_m: Array, wind_ned_mps: Array, seconds: float
 ) -> tuple[Array, Array, Array]:
@@ -170,9 +175,8 @@ def flown_over_an_attitude_loop(
     flown: list[tuple[Array, Array, Array]] = []
     frequency, damping = vehicle.tilt.natural_frequency_radps, vehicle.tilt.damping
     for tick in range(round(10 * seconds)):
-        body = Rotation.from_euler("ZYX", [0.0, tilt[1], tilt[0]]).as_matrix()
         state = PredictedState(
-            0.1 * tick, position, velocity, body[:, 2], np.zeros(3), 0.0, 0.0,
+            0.1 * tick, position, velocity, body_z(*tilt[:2]), np.zeros(3), 0.0, 0.0,
             command.thrust_mps2, np.zeros(3), turning,
         )  # fmt: skip
         situation = Situation(0.1 * tick, state, Point(target_ned_m), command)
@@ -185,9 +189,8 @@ def flown_over_an_attitude_loop(
                 frequency**2 * (asked - tilt) - 2 * damping * frequency * turning
             )
             tilt = tilt + 0.005 * turning
-            pull = -command.thrust_mps2 * Rotation.from_euler(
-                "ZYX", [0.0, tilt[1], tilt[0]]
-            ).as_matrix()[:, 2] - vehicle.drag_per_mass_ps * (velocity - wind_ned_mps)
+            drag = vehicle.drag_per_mass_ps * (velocity - wind_ned_mps)
+            pull = -command.thrust_mps2 * body_z(*tilt[:2]) - drag
             pull[2] += vehicle.gravity_mps2
             velocity = velocity + 0.005 * pull
             position = position + 0.005 * velocity

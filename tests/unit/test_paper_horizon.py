@@ -11,7 +11,7 @@ from scipy.linalg import solve_discrete_are
 from offboard.control.riccati import cost_to_go
 from offboard.paper.law import PaperSettings
 from offboard.paper.plant import paper_model
-from offboard.paper.study.horizon import receding, study, weights_table
+from offboard.paper.study.horizon import receding, study
 
 FINAL = PaperSettings()
 Q, R, RATE = (np.diag(part) for part in (FINAL.fitness, FINAL.energy, FINAL.rate))
@@ -77,10 +77,3 @@ def test_study_names_every_horizon() -> None:
     names = [mode.name for mode in study(FINAL, PaperSettings.first_configuration())]
     assert [f"N = {n}" for n in range(1, 21)] == [n for n in names if n[4:].isdecimal()]
     assert names[-1] == "N = ∞"
-
-
-def test_unequal_weights_speed_one_step_up_and_then_break_it() -> None:
-    rows = {str(row["weights"]): row["time_constant_s"] for row in weights_table(FINAL).rows}
-    assert rows["Q_y = 1 Q_v"] == pytest.approx(39.16, rel=1e-3)
-    assert rows["Q_y = 10 Q_v"] < 4.0
-    assert rows["Q_y = 80 Q_v"] is None

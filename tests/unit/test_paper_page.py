@@ -5,13 +5,15 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from browser import Opened, opening
 from rich.console import Console
 
-from offboard.paper.study import peers
+from offboard.paper.study import peers, plan
+from offboard.paper.study.closed_loop import fly
 from offboard.paper.study.options import FIGURES, TABLES, PaperOptions
 from offboard.paper.study.run import Outcome, reproduce
 
@@ -20,8 +22,11 @@ PNG = b"\x89PNG\r\n\x1a\n"
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
-    options = PaperOptions(tmp_path_factory.mktemp("paper"), quick=True, seeds=1, workers=2)
-    return reproduce(options, Console(file=io.StringIO()))
+    """Everything, with flights of 15 s."""
+    options = PaperOptions(tmp_path_factory.mktemp("paper"), quick=True, seeds=1, workers=1)
+    with pytest.MonkeyPatch.context() as short:
+        short.setattr(plan, "fly", lambda task: fly(replace(task, steps=150)))
+        return reproduce(options, Console(file=io.StringIO()))
 
 
 @pytest.fixture(scope="module")
@@ -84,6 +89,14 @@ def test_every_table_is_there_with_its_rows(opened: Opened) -> None:
     assert rows["2"] == 24
     assert rows["4"] == 8
     assert rows["bd"] == 12
+
+
+def test_unequal_weights_speed_one_step_up_and_then_break_it(run: Outcome) -> None:
+    table = json.loads((run.page.parent / "table_weights.json").read_text(encoding="utf-8"))
+    rows = {row["weights"]: row["time_constant_s"] for row in table["rows"]}
+    assert rows["Q_y = 1 Q_v"] == pytest.approx(39.16, rel=1e-3)
+    assert rows["Q_y = 10 Q_v"] < 4.0
+    assert rows["Q_y = 80 Q_v"] is None
 
 
 def test_a_figure_is_saved_as_an_image(opened: Opened, tmp_path: Path) -> None:
