@@ -189,7 +189,7 @@ def test_a_dask_cluster_of_two_workers_makes_the_same_table(whole: Path, tmp_pat
 
 def test_a_scheduler_that_is_lost_keeps_what_is_finished(tmp_path: Path) -> None:
     cluster = dask_cluster(1)
-    flown = campaign(FILE, tmp_path / "out")
+    flown = campaign(FILE.replace("draws: 1", "draws: 2"), tmp_path / "out")
     summary = flown.fly(
         partial(cluster_workers, cluster.scheduler_address),
         Shard(),
@@ -198,7 +198,7 @@ def test_a_scheduler_that_is_lost_keeps_what_is_finished(tmp_path: Path) -> None
     )
     assert "the dask scheduler" in summary.stopped
     assert "was lost" in summary.stopped
-    assert len(summary.rows) == 1
+    assert 1 <= len(summary.rows) < 4
     assert fly(flown).missing == 0
 
 
