@@ -38,7 +38,7 @@ ATTITUDE_FIELDS = "q1 q2 q3 q4 rollspeed pitchspeed yawspeed"
 REFERENCE_FIELDS = "x y z vx vy vz afx afy afz yaw"
 STRETCH = 100_000  # messages, about five minutes of all that PX4 sends
 LATE_S = 3.0  # telemetry that is older when it arrives is not scored
-OVERLAP_S = 1.0  # longer than the interval of any signal that is interpolated between its rows
+OVERLAP_S = 1.0  # longer than the interval of signals that are interpolated, if none is lost
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: ground stations and companions
 _ARRAYS = {RECORD_NAME, IDENTIFIED_NAME}
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
@@ -119,18 +119,23 @@ def stretches(log: Tlog, messages: int = STRETCH) -> Iterator[tuple[History, flo
     """The flight in stretches of so many messages, each with the time up to which it is complete.
 
     The rows of a stretch begin OVERLAP_S before the time up to which the previous stretch was
-    complete, and with the last one before that. Events, `identified`, `link_delay`, `heartbeat` and
-    `landed` are all since the beginning. The last stretch is complete up to infinity.
+    complete, and with the last one before that; after a reboot without this overlap. Events,
+    `identified`, `link_delay`, `heartbeat` and `landed` are all since the beginning. The last
+    stretch is complete up to infinity.
     """
     collector = _Collector(*_vehicle(log))
+    complete_s = -math.inf
     for count, entry in enumerate(log, 1):
         if log.damaged and math.isnan(collector.damage_ms):
             collector.damage_ms = collector.now_ms
         collector.add(entry)
         if count % messages == 0:
             until_s = float(collector.time_s(collector.now_ms)) - LATE_S
+            if until_s < complete_s:  # the vehicle was rebooted
+                collector.drop(complete_s)
             yield collector.history(), until_s
             collector.drop(until_s - OVERLAP_S)
+            complete_s = until_s
     yield collector.history(log.damage), math.inf
 
 

@@ -47,16 +47,15 @@ class Tracking:
         self._seen = False
 
     def window(self, flown: History, until_s: float) -> tuple[float, float] | None:
-        """First and last vehicle time of TRACK that `add` has not evaluated, up to `until_s`; None
-        where there are not two samples of each signal."""
+        """First and last vehicle time of the part of TRACK that is not evaluated yet, up to
+        `until_s`; None without any. The first window has at least two samples of each signal."""
         times = flown.record_time_s[_in_track(flown)]
         if len(times) < 2 or len(flown.reference) < 2:
             return None
         begin_s, end_s = max(float(times[0]), self._done_s), min(float(times[-1]), until_s)
-        tables = {
-            "position": flown.position, "attitude": flown.attitude, "setpoint": flown.setpoint
-        }  # fmt: skip
-        enough = all(len(self._rows(*table, begin_s, end_s)) > 1 for table in tables.items())
+        tables = (flown.position, flown.attitude, flown.setpoint)
+        inside = (((rows[:, 0] >= begin_s) & (rows[:, 0] <= end_s)).sum() for rows in tables)
+        enough = begin_s < end_s if self._seen else min(inside) >= 2
         return (begin_s, end_s) if enough else None
 
     def add(self, flown: History, begin_s: float, end_s: float) -> None:
@@ -113,14 +112,11 @@ class Tracking:
 
     def _between(self, name: str, rows: Array, begin_s: float, end_s: float) -> Array:
         """Rows of a window in the order of time, each stamp once, after the last row before."""
-        once = each_once(self._rows(name, rows, begin_s, end_s))
+        begin_s = self._before_s.get(name, begin_s)
+        once = each_once(rows[(rows[:, 0] >= begin_s) & (rows[:, 0] <= end_s)])
         if len(once):
             self._before_s[name] = once[-1, 0]
         return once
-
-    def _rows(self, name: str, rows: Array, begin_s: float, end_s: float) -> Array:
-        begin_s = self._before_s.get(name, begin_s)
-        return rows[(rows[:, 0] >= begin_s) & (rows[:, 0] <= end_s)]
 
     def _ticks(self, flown: History, reference: Reference, begin_s: float, end_s: float) -> None:
         """Time tracked, and Eqs. 31-32: velocities in the body frame, course in degrees."""

@@ -42,7 +42,7 @@ _CAUSES = (
 class Verdict:
     """`completed`: 1 or 0, NaN for a log without a flight of `offboard`. `ended_by`: a word or a
     few. `touchdown_mps`: downward speed before the ground was reached, NaN if it was not. `reason`:
-    what the flight announced as it ended early, empty if it did not."""
+    what the flight announced when it left its regular phases, else empty."""
 
     completed: float
     ended_by: str

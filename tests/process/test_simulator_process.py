@@ -69,6 +69,7 @@ def test_lockstep_flights_with_one_seed_are_byte_identical() -> None:
     first = lockstep_bytes()
     assert len(first) > 100_000
     assert first == lockstep_bytes()
+    assert first.startswith(first_lockstep_bytes("3"))
     assert not first.startswith(first_lockstep_bytes("4"))
 
 
