@@ -34,7 +34,7 @@ for _number, _handler in (
 PACKAGES = (Path(__file__).parent.parent / name for name in ("offboard", "simulator"))
 
 # Tests that limit the size of files would leave truncated bytecode, on which later imports fail:
-# all bytecode is written before the first test
+# all bytecode is written before the first test, that of the test modules while they are collected
 sys.dont_write_bytecode = False
 os.environ["PYTHONDONTWRITEBYTECODE"] = "1"
 os.environ["OFFBOARD_REPORT"] = "0"  # flights of tests write no report

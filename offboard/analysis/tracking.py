@@ -44,7 +44,6 @@ class Tracking:
         self._before_s: dict[str, float] = {}  # newest sample of each table
         self._done_s = -math.inf  # end of the newest window
         self.tracked_s = self.skipped_s = 0.0
-        self._seen = False
 
     def window(self, flown: History, until_s: float) -> tuple[float, float] | None:
         """First and last vehicle time of the part of TRACK that is not evaluated yet, up to
@@ -55,12 +54,13 @@ class Tracking:
         begin_s, end_s = max(float(times[0]), self._done_s), min(float(times[-1]), until_s)
         tables = (flown.position, flown.attitude, flown.setpoint)
         inside = (((rows[:, 0] >= begin_s) & (rows[:, 0] <= end_s)).sum() for rows in tables)
-        enough = begin_s < end_s if self._seen else min(inside) >= 2
+        first = self._done_s == -math.inf
+        enough = min(inside) >= 2 if first else begin_s < end_s
         return (begin_s, end_s) if enough else None
 
     def add(self, flown: History, begin_s: float, end_s: float) -> None:
         """Evaluate a window: what is after `begin_s`, for the first window also what is at it."""
-        self._seen, self._done_s = True, end_s
+        self._done_s = end_s
         reference = Reference(flown.reference)
         clock = _Clock(flown)
         self._ticks(flown, reference, begin_s, end_s)
@@ -83,7 +83,7 @@ class Tracking:
 
     def figures(self) -> dict[str, float]:
         """Figures of a Score; empty without any window."""
-        if not self._seen:
+        if self._done_s == -math.inf:
             return {}
         fitness = {name: float(value) for name, value in zip(_FITNESS, self._fitness, strict=True)}
         count, squares = self._steps

@@ -260,8 +260,8 @@ def make(
 ) -> Pair:
     """A pair as `offboard fly --sitl` makes it. `flies` is the simulated vehicle, `believed` the
     controller's model of it, `learning` the settings of the identification. With `deadline_s` the
-    companion does not wait for slow decisions. The vehicle starts and lands faster than by default,
-    which most tests do not look at."""
+    companion does not wait for slow decisions. The vehicle starts and lands faster than by default:
+    what most tests prove depends on neither."""
     named = {"reference": reference, "vehicle": vehicle}
     choices = {part: chosen for part, chosen in named.items() if chosen}
     clock = clock or HostClock()

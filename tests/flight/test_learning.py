@@ -219,7 +219,7 @@ def test_hover_thrust_far_from_the_vehicle_file_is_identified(hover_thrust, tmp_
     pair = with_wrong_file(hover_thrust=hover_thrust)
     pair.track()
     _, _, identified = " ".join(pair.companion.announced).partition("hover thrust ")
-    assert float(identified.split()[0]) == pytest.approx(0.49, abs=0.01)
+    assert float(identified.split()[0]) == pytest.approx(0.49, abs=0.005)
     assert pair.score(tmp_path).rmse_position_m < 0.05
 
 

@@ -114,7 +114,7 @@ def scenario_file(row: dict[str, str]) -> str:
     return words[words.index("--scenario") + 1]
 
 
-def test_every_combination_is_flown_with_as_many_draws(tmp_path: Path) -> None:
+def test_every_combination_is_planned_with_as_many_draws(tmp_path: Path) -> None:
     cases = campaign(FILE.replace("draws: 1", "draws: 3"), tmp_path / "out").cases
     assert [case.scenario for case in cases] == ["calm"] * 3 + ["px4_like"] * 3
     drawn = [dict(case.values) for case in cases]

@@ -80,7 +80,7 @@ class Trial:
         pull = np.array([0.0, 0.0, G]) - acceleration - DRAG * velocity + self.push_mps2
         thrust = float(np.linalg.norm(pull))
         down = pull / thrust
-        # the shortest turn from down to the body's z axis: half way between the two
+        # quaternion of the shortest rotation from z to `down`
         w, x, y = np.array([1.0 + down[2], -down[1], down[0]]) / math.sqrt(2.0 + 2.0 * down[2])
         self.fusion.on_command(self.time_s - STEP_S / 2, Command(thrust, (0.0, 0.0, 1.0), 0.0))
         self.fusion.on_attitude(self.time_s, (w, x, y, 0.0))
