@@ -22,8 +22,6 @@ BUILT_IN = EntryPoints(
         ("lqr", "lqr:LqrSettings"),
         ("mpc", "mpc:MpcSettings"),
         ("horizon", "horizon:HorizonSettings"),
-        ("mppi", "sampling:MppiSettings"),
-        ("cem", "sampling:CemSettings"),
         ("pid", "pid:PidSettings"),
         ("autopilot", "autopilot:AutopilotSettings"),
     )

@@ -49,8 +49,7 @@ def situations() -> list[Situation]:
     ("law", "steps", "volumes"),
     [("paper", None, 0), ("pid", None, 0), ("lqr", None, 0), ("pso", None, 0), ("mpc", 10, 0),
      ("horizon", 10, 0),
-     ("horizon", 10, 1), ("horizon", 20, 1), ("horizon", 20, 3), ("mppi", 10, 0), ("mppi", 10, 1),
-     ("cem", 10, 0), ("cem", 10, 1)],
+     ("horizon", 10, 1), ("horizon", 20, 1), ("horizon", 20, 3)],
 )  # fmt: skip
 def test_decision(law: str, steps: int | None, volumes: int, benchmark: Any) -> None:
     """The 99th percentile of 1000 is printed with `-s` and kept by `--benchmark-json`; on a busy

@@ -95,7 +95,7 @@ def registered(site: Path, package: str, **laws: str) -> None:
                    "division by zero"),
         ("function", "law function of first 1.0 (json:loads) cannot be used: <function loads at"),
         ("twice", "law twice is defined twice, by first 1.0 (json:loads) and second 1.0"),
-        ("nowhere", "there is no controller named 'nowhere'; known are autopilot, cem, function,"),
+        ("nowhere", "there is no controller named 'nowhere'; known are autopilot, function,"),
     ],
 )  # fmt: skip
 def test_broken_controller_is_refused_only_when_it_is_asked_for(

@@ -269,10 +269,6 @@ def test_of_many_errors_the_first_ten_are_printed(call: Call, tmp_path: Path) ->
             ("--set", "controller.swarm={particles: 10000, iterations: 100000}"),
             "controller.swarm: particles x iterations must be at most 500000, not 1000000000",
         ),
-        (
-            ("--controller", "cem", "--set", "controller.sampling.samples=8000"),
-            "controller.sampling: samples x iterations must be at most 500000, not 560000",
-        ),
     ],
 )
 def test_what_cannot_be_flown_to_its_end_is_refused(

@@ -1,8 +1,7 @@
-"""The swarm's search for the knots of a plan, and the roll-outs that every search uses.
+"""The swarm's search for the knots of a plan, and its roll-outs.
 
 A plan is a base (inputs and the states they lead to) that the feedback of the closed form follows,
-plus a few knots interpolated over its steps. `Evaluator` runs the roll-outs; by default `horizon`,
-`mppi` and `cem` use the same number of them.
+plus a few knots interpolated over its steps. `Evaluator` runs the roll-outs.
 """
 
 from __future__ import annotations

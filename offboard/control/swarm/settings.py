@@ -40,16 +40,12 @@ class SwarmSettings(Parameters):
 
     @model_validator(mode="after")
     def _ends(self) -> Self:
-        check_evaluations("particles", self.particles, self.iterations)
+        evaluations = self.particles * self.iterations
+        if evaluations > EVALUATIONS_MOST:
+            raise ValueError(
+                f"particles x iterations must be at most {EVALUATIONS_MOST}, not {evaluations}"
+            )
         return self
-
-
-def check_evaluations(what: str, count: int, iterations: int) -> None:
-    """Raise ValueError for a search that would take longer than any period of control."""
-    if count * iterations > EVALUATIONS_MOST:
-        raise ValueError(
-            f"{what} x iterations must be at most {EVALUATIONS_MOST}, not {count * iterations}"
-        )
 
 
 @dataclass(frozen=True, slots=True)
