@@ -20,7 +20,7 @@ from offboard.campaign.flight import Job
 from offboard.campaign.page import CAMPAIGN, page
 from offboard.campaign.results import Results
 from offboard.campaign.statistics import groups
-from offboard.campaign.table import Row, as_csv, as_parquet, columns, row_of
+from offboard.campaign.table import Row, as_csv, columns, row_of
 from offboard.documents.errors import DocumentError, UserError, naming
 from offboard.run.configuration import build_controller, build_track
 from offboard.run.in_memory import check_scenario_text
@@ -29,9 +29,6 @@ from offboard.run.request import FlightRequest
 OpenWorkers = Callable[[], AbstractContextManager[Workers]]
 KEPT = "flights"
 KEPT_FILES = {"report": "report.html", "log": "flight.tlog"}
-NO_PARQUET = (
-    "campaign.parquet is not written: it needs pyarrow, pip install 'pso-offboard[campaign]'"
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +50,6 @@ class Summary:
     planned: int
     rows: Sequence[Row]
     mine_missing: int
-    notes: Sequence[str] = ()
     stopped: str = ""
 
     @property
@@ -117,7 +113,6 @@ class Campaign:
         stopped: str,
     ) -> Summary:
         rows = self.rows()
-        notes: list[str] = []
         if len(rows) == len(self.cases) and not stopped:
             try:
                 self._keep_worst(rows, open_workers, ending)
@@ -127,28 +122,24 @@ class Campaign:
         while finished != self.results.finished():  # another shard may have ended meanwhile
             finished = self.results.finished()
             rows = self.rows()
-            notes = self.write(rows)
+            self.write(rows)
         have = {row.case.key for row in rows}
         missing = sum(case.key not in have for case in mine)
-        return Summary(len(self.cases), rows, missing, notes, stopped)
+        return Summary(len(self.cases), rows, missing, stopped)
 
     def rows(self) -> list[Row]:
         """The finished flights of all shards, in the order of the plan."""
         found = ((case, self.results.get(case.key)) for case in self.cases)
         return [row_of(case, record, self._requirements) for case, record in found if record]
 
-    def write(self, rows: Sequence[Row]) -> list[str]:
-        """Write table and page; return what is not written, and why."""
+    def write(self, rows: Sequence[Row]) -> None:
+        """Write table and page."""
         for case in self.cases:
             path = self.directory / case.scenario_file
             if case.text and not path.exists():
                 self.results.write(path, case.text.encode())
-        table = columns(rows)
         write = self.results.write
-        write(self.directory / "campaign.csv", as_csv(table).encode())
-        parquet = as_parquet(table)
-        if parquet is not None:
-            write(self.directory / "campaign.parquet", parquet)
+        write(self.directory / "campaign.csv", as_csv(columns(rows)).encode())
         absent = len(self.cases) - len(rows)
         missing = [f"{absent} of {len(self.cases)} flights are not flown yet"] if absent else []
         parts = (self.file.sample, self.file.search)
@@ -157,7 +148,6 @@ class Campaign:
             groups(rows, drawn - self.file.parameters.keys()), CAMPAIGN, missing, self._kept(rows)
         )
         write(self.directory / "campaign.html", text.encode())
-        return [NO_PARQUET] if parquet is None else []
 
     def _keep_worst(
         self, rows: Sequence[Row], open_workers: OpenWorkers, ending: Callable[[], bool]

@@ -1,4 +1,4 @@
-"""The table of a campaign: one row per flight, as CSV and Parquet, the same bytes on every run."""
+"""The table of a campaign: one row per flight, as CSV, the same bytes on every run."""
 
 from __future__ import annotations
 
@@ -78,25 +78,3 @@ def as_csv(table: Mapping[str, Sequence[Any]]) -> str:
     writer.writerow(table)
     writer.writerows(zip(*table.values(), strict=True))
     return text.getvalue()
-
-
-def as_parquet(table: Mapping[str, Sequence[Any]]) -> bytes | None:
-    """The table as Parquet; None where pyarrow is not installed."""
-    try:
-        import pyarrow as arrow
-        from pyarrow import parquet
-    except ImportError:
-        return None
-    arrays = {name: _array(values, arrow) for name, values in table.items()}
-    buffer = io.BytesIO()
-    parquet.write_table(arrow.table(arrays), buffer)
-    return buffer.getvalue()
-
-
-def _array(values: Sequence[Any], arrow: Any) -> Any:
-    """A column of integers, of numbers, or of text, which it is where they are mixed."""
-    kinds = {type(value) for value in values} - {type(None)}
-    if kinds and kinds <= {int, float}:
-        return arrow.array(values, type=arrow.int64() if kinds == {int} else arrow.float64())
-    texts = [None if value is None else str(value) for value in values]
-    return arrow.array(texts, type=arrow.string())

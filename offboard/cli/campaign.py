@@ -43,7 +43,7 @@ def campaign(
 ) -> None:
     """Fly many flights and put them into one table.
 
-    DIR gets campaign.csv, campaign.parquet (with pyarrow) and campaign.html. A finished flight is
+    DIR gets campaign.csv and campaign.html. A finished flight is
     on disk at once: the same command continues what was interrupted, and a table does not depend
     on how it was flown.
 
@@ -153,8 +153,6 @@ def _conclude(summary: Summary, directory: Path) -> None:
     if summary.missing:
         flights += f", {summary.missing} not flown yet"
     say(flights)
-    for note in summary.notes:
-        say(note)
     say(f"written: {directory / 'campaign.html'}")
     if summary.stopped:
         raise CommandError(summary.stopped, 4)

@@ -13,14 +13,13 @@ from offboard.cli.shared import FLIGHT, CommandError, check_new, complain, optio
 
 class Format(str, Enum):  # noqa: UP042 - typer shows the values of a `str`
     MCAP = "mcap"
-    PARQUET = "parquet"
     CSV = "csv"
     ULOG = "ulog"
 
 
 def export(
     flight: Annotated[Path, FLIGHT],
-    to: Annotated[Format, option("FORMAT", "mcap, parquet, csv or ulog.", "--to")],
+    to: Annotated[Format, option("FORMAT", "mcap, csv or ulog.", "--to")],
     output: Annotated[Path, option("FILE", "File to write, a new one.", "-o", "--output")],
     vehicle_time: Annotated[
         bool,
@@ -33,15 +32,15 @@ def export(
 
     mcap: Foxglove's schemas (ENU) and all values as JSON, for Foxglove, Lichtblick, Rerun and
     PlotJuggler. ulog: PX4's topics, for PlotJuggler and pyulog; its stamps are always vehicle time.
-    parquet, csv: one row for each sample, with both times, units in the names of the columns. UAV
-    Log Viewer and MAVExplorer read the .tlog itself. mcap and parquet need the extra
+    csv: one row for each sample, with both times, units in the names of the columns. UAV
+    Log Viewer and MAVExplorer read the .tlog itself. mcap needs the extra
     `pso-offboard[export]`.
     """
     if vehicle_time and to is not Format.MCAP:
         raise CommandError(f"--vehicle-time is an option of --to mcap: {to.value} always has it")
     from offboard.export.mcap_file import write_mcap
     from offboard.export.series import read
-    from offboard.export.table import write_csv, write_parquet
+    from offboard.export.table import write_csv
     from offboard.export.ulog import write_ulog
 
     check_new(output, "-o")
@@ -49,7 +48,7 @@ def export(
     if to is Format.MCAP:
         write_mcap(found, output, vehicle_time=vehicle_time)
     else:
-        write = {Format.PARQUET: write_parquet, Format.CSV: write_csv, Format.ULOG: write_ulog}[to]
+        write = {Format.CSV: write_csv, Format.ULOG: write_ulog}[to]
         write(found, output)
     if found.damage:
         complain(found.damage)

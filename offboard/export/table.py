@@ -1,4 +1,4 @@
-"""Tables: CSV and Parquet. One row for each sample, in the order of vehicle time.
+"""Tables: CSV. One row for each sample, in the order of vehicle time.
 
 `source` is the name of the sample's series; columns of the other series are empty in its row. Rows
 with the source `event` have a text in the column `event`.
@@ -13,7 +13,6 @@ from typing import Any
 
 import numpy as np
 
-from offboard.export.extra import library
 from offboard.export.series import Array, Flight
 from offboard.io.new_file import new_file
 
@@ -28,16 +27,6 @@ def write_csv(flight: Flight, path: Path) -> None:
         writer.writerow(columns)
         for row in zip(*columns.values(), strict=True):
             writer.writerow([_cell(value) for value in row])
-
-
-def write_parquet(flight: Flight, path: Path) -> None:
-    """Write a Parquet file; empty cells are null. Raises UserError."""
-    arrow, parquet = library("pyarrow", "parquet"), library("pyarrow.parquet", "parquet")
-    arrays = {
-        name: arrow.array(values, from_pandas=True) for name, values in _columns(flight).items()
-    }
-    with new_file(path) as file:
-        parquet.write_table(arrow.table(arrays), file)
 
 
 def _columns(flight: Flight) -> dict[str, Any]:

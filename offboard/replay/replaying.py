@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 from offboard.analysis.tlog import LoggedMessage
-from offboard.control.base import Controller
 from offboard.documents.errors import UserError
 from offboard.documents.signing_key import KEY_BYTES
 from offboard.flight import inputs
@@ -68,17 +67,12 @@ class Replay:
 
     `turns` gives all turns in order; `recorded` and `replayed` then hold what the log says was sent
     and what the companion has sent. `stopped` says why the replay ended before the recording;
-    empty if it did not. `wrap` may replace the controller.
+    empty if it did not.
     """
 
-    def __init__(
-        self,
-        recording: Recording,
-        wrap: Callable[[Controller], Controller] = lambda controller: controller,
-    ) -> None:
+    def __init__(self, recording: Recording) -> None:
         self.config = flown(recording.configuration)
-        parts = build_parts(self.config)
-        self.companion = self._companion(recording, parts, wrap(parts.controller))
+        self.companion = self._companion(recording, build_parts(self.config))
         self.recorded: list[Sent] = []
         self.replayed: list[Sent] = []
         self.stopped = ""
@@ -94,9 +88,7 @@ class Replay:
         self._readings: Iterator[float] = iter(())
         self._read_s = 0.0
 
-    def _companion(
-        self, recording: Recording, parts: FlightParts, controller: Controller
-    ) -> Companion:
+    def _companion(self, recording: Recording, parts: FlightParts) -> Companion:
         observer = parts.make_observer()
         settings: dict[str, Any] = recording.settings
         signing = Accepted(bytes(KEY_BYTES)) if recording.signed else None
@@ -106,7 +98,6 @@ class Replay:
             raise UserError(
                 f"{recording.log.path}: the settings of its session are those of another version"
             ) from None
-        parts = replace(parts, controller=controller)
         return companion_of(parts, session, observer, self._stopwatch)
 
     @property

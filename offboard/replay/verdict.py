@@ -6,9 +6,8 @@ from dataclasses import dataclass
 
 from offboard.documents.errors import UserError
 from offboard.replay.difference import Comparison, Difference, compare
-from offboard.replay.moment import received
 from offboard.replay.recording import Recording
-from offboard.replay.replaying import Replay
+from offboard.replay.replaying import Replay, Turn
 
 FIELDS_MAX = 8
 
@@ -60,6 +59,17 @@ def _input(recording: Recording, difference: Difference) -> list[str]:
         if due:
             tick = int(replay.ended_s / replay.config.period_s + 1e-6)
             lines = [f"decided in turn {turn.number}, tick {tick}, which was given:"]
-            rows = received(turn) or [("nothing", "no message had arrived")]
+            rows = _received(turn) or [("nothing", "no message had arrived")]
             return lines + [f"  {when}: {names}" for when, names in rows]
     return []
+
+
+def _received(turn: Turn) -> list[tuple[str, str]]:
+    """The messages that a turn was given, and how long before it they arrived."""
+    frames = iter(turn.received)
+    rows: list[tuple[str, str]] = []
+    for chunk in turn.given.chunks:
+        names = [next(frames).name for _ in range(chunk.frames)]
+        age_ms = 1e3 * (turn.given.now_s - chunk.arrived_s)
+        rows.append((f"{age_ms:.3f} ms before", ", ".join(names) or "nothing that was used"))
+    return rows

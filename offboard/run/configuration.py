@@ -211,14 +211,10 @@ def dump(config: FlightConfig) -> str:
     return heading + yaml.safe_dump(document, sort_keys=False)
 
 
-def flown(text: str, controller: str | None = None) -> FlightConfig:
-    """The configuration in a log (`dump`ed then), or one with another controller, by name or file.
-    Raises DocumentError."""
+def flown(text: str) -> FlightConfig:
+    """The configuration in a log (`dump`ed then). Raises DocumentError."""
     source = "the log's configuration"
-    raw = read(text, source)
-    if controller is not None:
-        raw["controller"] = read_part("controller", controller)
-    return _validated(raw, source, {})
+    return _validated(read(text, source), source, {})
 
 
 def _validated(raw: Raw, source: str, options: Mapping[str, str]) -> FlightConfig:
