@@ -12,7 +12,7 @@ import pytest
 from browser import Opened, opening
 from rich.console import Console
 
-from offboard.paper.study import peers, plan
+from offboard.paper.study import plan
 from offboard.paper.study.closed_loop import fly
 from offboard.paper.study.options import FIGURES, TABLES, PaperOptions
 from offboard.paper.study.run import Outcome, reproduce
@@ -107,25 +107,3 @@ def test_a_figure_is_saved_as_an_image(opened: Opened, tmp_path: Path) -> None:
         figure.locator(".modebar-btn").first.click()
     download.value.save_as(tmp_path / "figure.png")
     assert (tmp_path / "figure.png").read_bytes().startswith(PNG)
-
-
-def test_absent_peers_are_listed_as_absent(run: Outcome) -> None:
-    document = json.loads((run.page.parent / "table_peers.json").read_text(encoding="utf-8"))
-    solvers = " ".join(row["solver"] for row in document["rows"])
-    for name in peers.SOLVERS:
-        assert name in solvers
-    assert solvers.count("absent") == len(peers.absent())
-
-
-def test_the_swarm_reaches_the_optimum_within_the_papers_budget() -> None:
-    measured = peers.measure("this swarm, λ = 0.65", PaperOptions(Path()).first_settings, 3)
-    assert measured[-1].budget == 6000
-    assert measured[-1].gap_p90 <= 1e-9
-    assert measured[0].gap_median > 1e-6
-
-
-def test_a_peer_whose_package_is_missing_is_left_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(peers, "_PACKAGES", {"CMA-ES": "no_such_package_anywhere"})
-    assert peers.absent() == ["CMA-ES"]
-    assert "CMA-ES" not in peers.present()
-    assert "CMA-ES: absent" in str(peers.peers_table({}).rows[0]["solver"])

@@ -25,15 +25,15 @@ from offboard.analysis.figure import (
 from offboard.control.certificate import ExactMinimum
 from offboard.control.swarm import QuadraticSwarm, RandomLanes
 from offboard.model.state import PSI, U, X
-from offboard.paper.law import PaperSettings
-from offboard.paper.plant import PlantKind
+from offboard.paper.law import PaperLaw, PaperSettings
+from offboard.paper.plant import PlantKind, paper_model
 from offboard.paper.study.closed_loop import Flight
-from offboard.paper.study.peers import problems
 from offboard.paper.study.printed import BEST_DAMPING, TABLE_2, UNDAMPED
 from offboard.paper.trajectory import PathName, sampled_path
 
 Array = NDArray[np.float64]
 
+MIDWAY = 509  # of 1000 steps
 SHOWN_ITERATIONS = (1, 5, 20, 150)  # Fig. 4 a-d
 UNDAMPED_FLIGHT = "λ = 1, first weights"
 DAMPED_FLIGHT = "λ = 0.65, first weights"
@@ -83,7 +83,13 @@ class Search:
 
 def search(settings: PaperSettings) -> Search:
     """A search of the swarm of `settings` midway along the path of Figs. 5-6."""
-    problem = problems(3, settings)[1]
+    path = sampled_path(PathName.TOUR, 1000)
+    law = PaperLaw(*paper_model(), settings)
+    state = path.tracked[0]
+    for following in path.tracked[1 : MIDWAY + 2]:
+        move = law.move(state, following)
+        state = move.following
+    problem = move.problem
     swarm = QuadraticSwarm(settings.swarm, 4)
     history = swarm.minimise(problem, RandomLanes(0), keep_history=True).history
     assert history is not None

@@ -21,7 +21,6 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "Extensions that the conclusions propose": (
         "table integral", "figure integral", "table limits", "figure limits",
     ),
-    "The swarm compared with other optimisers": ("figure peers", "table peers"),
 }  # fmt: skip
 LABELS = tuple(label for labels in SECTIONS.values() for label in labels)
 TABLES, FIGURES = (
@@ -37,7 +36,7 @@ class PaperOptions:
 
     Args:
         out: output directory; created if absent, else empty.
-        quick: fewer seeds, problems and budgets.
+        quick: fewer seeds.
         seeds: flights per row of a table; None: 20, or 2 if quick.
         initial_q: diag(Q) of the first configuration (Eq. 23, whose values are not printed):
             twelve weights, or one for all; None: the identity.

@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from offboard.analysis.figure import Figure
 from offboard.paper.law import PaperSettings
 from offboard.paper.plant import PlantKind
-from offboard.paper.study import errata, extensions, figures, horizon, peers, tables
+from offboard.paper.study import errata, extensions, figures, horizon, tables
 from offboard.paper.study.closed_loop import FlightTask, fly
 from offboard.paper.study.options import PaperOptions
 from offboard.paper.study.page import Table
@@ -84,7 +84,6 @@ def _tables(options: PaperOptions) -> dict[str, Piece]:
         "table weights": Piece({0: Job(horizon.weights_table, (final,))}, lambda made: made[0]),
         "table integral": Piece(_flights(extensions.steady_tasks()), extensions.integral_table),
         "table limits": Piece(_flights(extensions.limit_tasks()), extensions.limits_table),
-        "table peers": Piece(_peers(options), peers.peers_table),
     }
 
 
@@ -112,7 +111,6 @@ def _figures(options: PaperOptions) -> dict[str, Piece]:
         "figure laws": Piece(laws, horizon.laws_figure),
         "figure integral": Piece(_flights(extensions.steady_tasks()), extensions.integral_figure),
         "figure limits": Piece(_flights(extensions.limit_tasks()), extensions.limits_figure),
-        "figure peers": Piece(_peers(options), peers.peers_figure),
     }
     for number, (name, *_) in figures.FLOWN.items():
         flown = _flights({plant: FlightTask(settings[name], plant) for plant in PlantKind})
@@ -147,12 +145,3 @@ def _by_damping(options: PaperOptions) -> dict[tuple[PlantKind, float], list[Job
 
 def _modes(options: PaperOptions) -> dict[str, Job]:
     return {"modes": Job(horizon.study, (PaperSettings(), options.first_settings))}
-
-
-def _peers(options: PaperOptions) -> dict[str, Job]:
-    count = 3 if options.quick else 30
-    budgets = peers.FEW_BUDGETS if options.quick else peers.BUDGETS
-    return {
-        name: Job(peers.measure, (name, PaperSettings(), count, budgets))
-        for name in peers.present()
-    }
