@@ -119,6 +119,22 @@ def validate(
         raise DocumentError(*problems) from None
 
 
+def known(mapping: Mapping[str, Any], model: type[M]) -> Json:
+    """A copy of `mapping` without the keys that `model` does not have."""
+    kept: Json = json.loads(json.dumps(mapping))
+    try:
+        model.model_validate_json(json.dumps(mapping), strict=True)
+    except ValidationError as error:
+        for detail in error.errors(include_url=False):
+            if detail["type"] == "extra_forbidden":
+                *path, key = key_path(detail, mapping).split(".")
+                section: Any = kept
+                for part in path:
+                    section = section[int(part)] if isinstance(section, list) else section[part]
+                del section[key]
+    return kept
+
+
 def _own_problems(details: list[ErrorDetails], mapping: Mapping[str, Any]) -> list[ErrorDetails]:
     """The errors without those that another one explains: a value of the right type is also refused
     as every other type of a union, and a list is counted without its wrong items."""

@@ -1,4 +1,4 @@
-"""Small Kalman filters of observer and fusion, compiled: covariances and corrections.
+"""Small Kalman filters of the observer, compiled: covariances and corrections.
 
 Covariances are propagated over the actual interval between messages, so no sampling rate is
 assumed. Axes with the same model share one filter, as both lateral axes do: `places` has, for each

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from offboard.estimation.fusion import FusedObserver
 from offboard.estimation.observer import Observer
 from offboard.flight import assessment, guards
 from offboard.flight.authority import Authority
@@ -23,11 +22,9 @@ from offboard.mavlink.events import (
     ClockBehind,
     CommandRequest,
     Event,
-    GpsFix,
     Heartbeat,
     LocalPosition,
     ModeReport,
-    Origin,
     OtherCompanion,
     PeerChanged,
     Rebooted,
@@ -66,7 +63,6 @@ class EventProcessor:
     def process(self, event: Event, arrived_s: float, *, turned_s: float) -> None:
         """`arrived_s` is the host time of the event's arrival, `turned_s` that of the turn."""
         state = self._state
-        event = self._with_own_position(event)
         state.now_s = self._session.link_time_s
         state.vehicle.update(event, state.now_s)
         match event:
@@ -118,22 +114,6 @@ class EventProcessor:
         if attitude is None or dialect is None or dialect.thrust_rule is not ThrustRule.COLLECTIVE:
             return 1.0
         return float(thrust_direction_from_quaternion(np.array(attitude.attitude))[2])
-
-    def _with_own_position(self, event: Event) -> Event:
-        """The event; with `estimate: fused` a position is replaced by that of our own fusion."""
-        if not isinstance(self._observer, FusedObserver):
-            return event
-        fusion = self._observer.fusion
-        match event:
-            case GpsFix(time_s, place, velocity, accuracy_m):
-                fusion.on_fix(time_s, place, velocity, accuracy_m)
-            case Origin(place, reported):
-                fusion.on_origin(place, reported)
-            case LocalPosition(time_s, position, speed):
-                event = LocalPosition(time_s, *fusion.follow(time_s, position, speed))
-        while fusion.news:
-            self._outbox.announce(fusion.news.pop(0))
-        return event
 
     def _on_telemetry(self, stamp_s: float, arrived_s: float, turned_s: float) -> None:
         self.telemetry_arrived_s = arrived_s

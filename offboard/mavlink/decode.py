@@ -16,7 +16,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from offboard.mavlink import events
 from offboard.mavlink.counters import DropReason
 from offboard.mavlink.dialects.base import Dialect, ParameterEncoding
-from offboard.model.geodesy import Geodetic, origin_of
 
 POSITION_LIMIT_M = 1e5
 VELOCITY_LIMIT_MPS = 200.0
@@ -27,8 +26,6 @@ _RADIO = 0x10000  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER
 _EKF_ATTITUDE, _EKF_VELOCITY, _EKF_POSITION, _EKF_HEIGHT = 1, 2, 8, 32
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 _FIX_3D = 3  # GPS_FIX_TYPE
-_UNKNOWN16 = 0xFFFF
-_LONGEST_UPTIME_US = 10**15  # a larger stamp is Unix time
 _REAL32 = 9  # MAV_PARAM_TYPE
 _UNSIGNED_TYPES, _SIGNED_TYPES = (1, 3, 5), (2, 4, 6)
 _CURRENT_MODE = struct.Struct("<IIx")  # custom_mode, intended_custom_mode; not in pymavlink 2.4.50
@@ -164,46 +161,12 @@ def _thrust_report(payload: bytes, _: Dialect) -> events.Event | DropReason:
     return events.ThrustReport(min(max(thrust, 0.0), 1.0))  # ArduCopter's falls to -0.2 on landing
 
 
-def _gps_fix(payload: bytes, _: Dialect) -> events.Event | DropReason:
-    stamp_us, latitude, longitude, altitude, _, _, speed, course, fix, _, _, accuracy, *_more = (
-        _unpack(mavlink.MAVLink_gps_raw_int_message, payload)
-    )
+def _gps_fix(payload: bytes, _: Dialect) -> events.Event:
+    fields = _unpack(mavlink.MAVLink_gps_raw_int_message, payload)
+    fix, accuracy_mm = fields[8], fields[11]
     if fix < _FIX_3D:
         return events.NoFix(fix)
-    place = _place(latitude, longitude, altitude)
-    if place is None:
-        return DropReason.IMPLAUSIBLE
-    velocity = None
-    if speed < _UNKNOWN16 and course < _UNKNOWN16:
-        ahead = math.radians(course * 1e-2)
-        velocity = (speed * 1e-2 * math.cos(ahead), speed * 1e-2 * math.sin(ahead))
-    time_s = stamp_us * 1e-6 if 0 < stamp_us < _LONGEST_UPTIME_US else None
-    return events.GpsFix(time_s, place, velocity, accuracy * 1e-3 if accuracy else None)
-
-
-def _place(latitude: int, longitude: int, altitude_mm: int) -> Geodetic | None:
-    """From degrees * 1e7 and mm above mean sea level; None if out of range."""
-    if abs(latitude) > 900_000_000 or abs(longitude) > 1_800_000_000:
-        return None
-    return Geodetic(latitude * 1e-7, longitude * 1e-7, altitude_mm * 1e-3)
-
-
-def _global_origin(payload: bytes, _: Dialect) -> events.Event | DropReason:
-    latitude, longitude, altitude, *_time = _unpack(
-        mavlink.MAVLink_gps_global_origin_message, payload
-    )
-    place = _place(latitude, longitude, altitude)
-    return DropReason.IMPLAUSIBLE if place is None else events.Origin(place, reported=True)
-
-
-def _home(payload: bytes, _: Dialect) -> events.Event | DropReason:
-    latitude, longitude, altitude, x, y, z, *_more = _unpack(
-        mavlink.MAVLink_home_position_message, payload
-    )
-    place, far = _place(latitude, longitude, altitude), POSITION_LIMIT_M
-    if place is None or not (-far < x < far and -far < y < far and -far < z < far):
-        return DropReason.IMPLAUSIBLE
-    return events.Origin(origin_of(place, (x, y, z)), reported=False)
+    return events.GpsFix(accuracy_mm * 1e-3 if accuracy_mm else None)
 
 
 def _system_health(payload: bytes, _: Dialect) -> events.Event:
@@ -293,13 +256,11 @@ _DECODERS: Mapping[int, Callable[[bytes, Dialect], events.Event | DropReason | N
     31: _attitude,
     24: _gps_fix,
     32: _local_position,
-    49: _global_origin,
     77: _command_ack,
     83: _thrust_report,
     148: _version,
     193: _ardupilot_estimator,
     230: _px4_estimator,
-    242: _home,
     245: _landed,
     436: _current_mode,
 }

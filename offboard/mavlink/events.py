@@ -9,8 +9,6 @@ from __future__ import annotations
 from collections.abc import Hashable
 from dataclasses import dataclass
 
-from offboard.model.geodesy import Geodetic
-
 Triple = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]  # w, x, y, z; FRD -> NED
 
@@ -97,11 +95,8 @@ class ThrustReport:
 
 @dataclass(frozen=True, slots=True)
 class GpsFix:
-    """GPS_RAW_INT with a 3D fix; `time_s` is None if its stamp is not vehicle time."""
+    """GPS_RAW_INT with a position fix in three dimensions."""
 
-    time_s: float | None
-    place: Geodetic
-    velocity_ne_mps: tuple[float, float] | None
     accuracy_m: float | None  # horizontal, as the receiver reports it
 
 
@@ -172,15 +167,6 @@ class SystemTime:
     """SYSTEM_TIME; `unix_s` is 0 while the vehicle does not know it."""
 
     unix_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class Origin:
-    """Place of the local frame's origin. `reported` is true for GPS_GLOBAL_ORIGIN; otherwise it is
-    computed from HOME_POSITION, which gives one point in both frames."""
-
-    place: Geodetic
-    reported: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -270,7 +256,6 @@ Event = (
     | NoFix
     | EstimatorReport
     | SystemTime
-    | Origin
     | SystemHealth
     | Landed
     | CommandAck

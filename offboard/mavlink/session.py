@@ -27,14 +27,13 @@ from offboard.mavlink.decode import (
     decode_text_chunk,
     decode_timesync,
 )
-from offboard.mavlink.dialects.base import TYPE_ONBOARD_CONTROLLER, Dialect, WantedMessage
+from offboard.mavlink.dialects.base import TYPE_ONBOARD_CONTROLLER, Dialect
 from offboard.mavlink.encode import encode
 from offboard.mavlink.events import (
     Attitude,
     ClockBehind,
     CommandRequest,
     Event,
-    GpsFix,
     LocalPosition,
     ModeReport,
     OtherCompanion,
@@ -69,11 +68,11 @@ class SessionSettings:
     `system_id` is the only system that may be the vehicle; None: the first autopilot heard.
     `record_component_id` is the sender of records, which only our log holds; each component id has
     its own sequence numbers. `stream`: serial or TCP, bytes arrive in any portions. `sends_first`:
-    send heartbeats before an autopilot was heard. `extra_wanted` is telemetry besides that of the
-    dialect. `capacity_bytes_ps` of the link limits the rates of telemetry that are requested; None:
-    unknown. `lockstep`: the vehicle waits for our replies, and the host times given to `receive`
-    and `poll` are ignored, so that nothing that is sent depends on them. Vehicle time replaces
-    them; while telemetry is missing, its TIMESYNC requests count on.
+    send heartbeats before an autopilot was heard. `capacity_bytes_ps` of the link limits the rates
+    of telemetry that are requested; None: unknown. `lockstep`: the vehicle waits for our replies,
+    and the host times given to `receive` and `poll` are ignored, so that nothing that is sent
+    depends on them. Vehicle time replaces them; while telemetry is missing, its TIMESYNC requests
+    count on.
     """
 
     system_id: int | None = None
@@ -81,7 +80,6 @@ class SessionSettings:
     record_component_id: int = 191
     stream: bool = False
     sends_first: bool = False
-    extra_wanted: tuple[WantedMessage, ...] = ()
     capacity_bytes_ps: float | None = None
     lockstep: bool = False
 
@@ -308,11 +306,10 @@ class Session:
         if isinstance(event, (HeartbeatEvent, ModeReport)) and self._overtaken(frame, now_s):
             return DropReason.STALE
         age = Age.FRESH
-        if isinstance(event, (LocalPosition, Attitude, GpsFix)) and event.time_s is not None:
+        if isinstance(event, (LocalPosition, Attitude)):
             wrapped_s = self._time.wrapped_s(event.time_s)
             if wrapped_s:
                 event = replace(event, time_s=event.time_s + wrapped_s)
-        if isinstance(event, (LocalPosition, Attitude)):
             age = self._time.check(frame.message_id, event.time_s)
             if age is Age.STALE:
                 return DropReason.STALE
@@ -346,7 +343,7 @@ class Session:
 
     def _restart_rates(self) -> None:
         assert self.dialect is not None
-        wanted = (*self.dialect.wanted, *self.settings.extra_wanted)
+        wanted = self.dialect.wanted
         if self._capacity_bytes_ps is not None:
             wanted = fitted(wanted, self._capacity_bytes_ps)
         self._rates = TelemetryRates(wanted, self._link_time.seconds)

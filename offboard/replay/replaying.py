@@ -93,7 +93,7 @@ class Replay:
         settings: dict[str, Any] = recording.settings
         signing = Accepted(bytes(KEY_BYTES)) if recording.signed else None
         try:
-            session = session_of(observer, signing, **settings)
+            session = session_of(signing, **settings)
         except TypeError:
             raise UserError(
                 f"{recording.log.path}: the settings of its session are those of another version"

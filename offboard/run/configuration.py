@@ -24,10 +24,8 @@ from offboard.control.base import Controller, ControllerSettings
 from offboard.documents import shipped
 from offboard.documents.errors import abridged
 from offboard.documents.parameters import Parameters
-from offboard.documents.reading import DocumentError, override, read, validate
+from offboard.documents.reading import DocumentError, known, override, read, validate
 from offboard.documents.shipped import locate, read_text
-from offboard.estimation.fusion import FollowedEstimate
-from offboard.estimation.fusion_filter import FusionSettings
 from offboard.estimation.observer import ObserverSettings
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Limits
@@ -49,8 +47,6 @@ class FlightConfig(Parameters):
     vehicle: Vehicle
     controller: SerializeAsAny[ControllerSettings]  # the settings class of its `law`
     reference: SerializeAsAny[Shape]  # the class of its `shape`
-    estimate: FollowedEstimate = FollowedEstimate.VEHICLE
-    fusion: FusionSettings = FusionSettings()
     observer: ObserverSettings = ObserverSettings()
     limits: Limits = Limits()
     identify: IdentifySettings = IdentifySettings()
@@ -212,15 +208,20 @@ def dump(config: FlightConfig) -> str:
 
 
 def flown(text: str) -> FlightConfig:
-    """The configuration in a log (`dump`ed then). Raises DocumentError."""
+    """The configuration in a log (`dump`ed then), without settings that no longer exist. Raises
+    DocumentError."""
     source = "the log's configuration"
-    return _validated(read(text, source), source, {})
+    return _validated(read(text, source), source, {}, ignores_unknown=True)
 
 
-def _validated(raw: Raw, source: str, options: Mapping[str, str]) -> FlightConfig:
+def _validated(
+    raw: Raw, source: str, options: Mapping[str, str], *, ignores_unknown: bool = False
+) -> FlightConfig:
     """`raw` as a FlightConfig whose parts have the classes that they name."""
     parts: dict[str, Any] = {part: (_model(part, raw.get(part)), ...) for part in FOLDERS}
     model = create_model("FlightConfig", __base__=FlightConfig, **parts)
+    if ignores_unknown:
+        raw = known(raw, model)
     return FlightConfig(**dict(validate(raw, model, source, options)))
 
 

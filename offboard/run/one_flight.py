@@ -17,7 +17,6 @@ import numpy as np
 from offboard.compiled import prepare
 from offboard.control.base import Controller, Situation
 from offboard.documents.reading import DocumentError
-from offboard.estimation.fusion import FusedObserver
 from offboard.estimation.observer import Observer
 from offboard.flight import manifest
 from offboard.flight.companion import Companion, Outcome
@@ -32,7 +31,6 @@ from offboard.io.link import Link
 from offboard.io.log import FlightLog
 from offboard.io.signing_time import SigningTime
 from offboard.io.stop import StopRequests
-from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
 from offboard.mavlink.signing import Signing
 from offboard.model.command import Command, PositionCommand
@@ -212,7 +210,6 @@ def fly(
         stack.enter_context(log)
         observer = parts.make_observer()
         session = session_of(
-            observer,
             signing,
             system_id=system_id,
             stream=link.is_stream,
@@ -245,7 +242,6 @@ def discard(link: Link) -> None:
 
 
 def session_of(
-    observer: Observer,
     signing: Signing | None = None,
     *,
     system_id: int | None = None,
@@ -254,8 +250,7 @@ def session_of(
     lockstep: bool,
     sends_first: bool,
 ) -> Session:
-    """The session of a flight with this observer; see `SessionSettings`."""
-    fuses = isinstance(observer, FusedObserver)
+    """The session of a flight; see `SessionSettings`."""
     return Session(
         SessionSettings(
             system_id=system_id,
@@ -265,7 +260,6 @@ def session_of(
             capacity_bytes_ps=capacity_bytes_ps,
             lockstep=lockstep,
             sends_first=sends_first,
-            extra_wanted=POSITIONING_TELEMETRY if fuses else (),
         ),
         signing,
     )

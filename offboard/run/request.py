@@ -9,7 +9,7 @@ from pathlib import Path
 
 from offboard.documents.reading import DocumentError
 from offboard.documents.signing_key import read_key
-from offboard.estimation.fusion import observer_of
+from offboard.estimation.observer import Observer
 from offboard.flight.companion import Companion, Outcome
 from offboard.io.log import FlightLog
 from offboard.io.stop import StopRequests
@@ -78,9 +78,7 @@ def build_parts(config: FlightConfig) -> FlightParts:
     return FlightParts(
         vehicle=config.vehicle,
         controller=build_controller(config),
-        make_observer=lambda: observer_of(
-            config.estimate, config.vehicle, config.observer, config.fusion
-        ),
+        make_observer=lambda: Observer(config.vehicle, config.observer),
         track=build_track(config),
         limits=config.limits,
         period_s=config.period_s,

@@ -13,7 +13,6 @@ from sdnotify import SystemdNotifier
 
 from offboard import compiled
 from offboard.documents.signing_key import read_key
-from offboard.estimation.fusion import FollowedEstimate
 from offboard.flight.companion import Outcome
 from offboard.flight.phases import ExitCode
 from offboard.flight.programme import Anchor, Then, service
@@ -25,7 +24,6 @@ from offboard.io.link import Link, LinkError
 from offboard.io.lock import connection_lock, directory_lock
 from offboard.io.signing_time import SigningTime
 from offboard.io.stop import StopRequests
-from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.run.loop import Loop
 from offboard.run.one_flight import discard
@@ -72,7 +70,7 @@ def run(
     request = wanted.request
     with ExitStack() as stack:
         stack.enter_context(connection_lock(request.connection))
-        config = request.resolve()
+        request.resolve()  # a wrong configuration is refused before anything starts
         stack.enter_context(directory_lock(request.directory))
         monitor = Monitor(wanted.metrics) if wanted.metrics else None
         if monitor:
@@ -95,7 +93,6 @@ def run(
             return Outcome(ExitCode.FLOWN, STOPPED_EARLY)
         stack.callback(link.close)
         recorder.score_earlier()  # a supervisor that still has the link also has the log
-        fuses = config.estimate is FollowedEstimate.FUSED
         flights = Flights(
             session=Session(
                 SessionSettings(
@@ -105,7 +102,6 @@ def run(
                     stream=link.is_stream,
                     capacity_bytes_ps=link.capacity_bytes_ps,
                     sends_first=not request.connection.startswith("udpin"),
-                    extra_wanted=POSITIONING_TELEMETRY if fuses else (),
                 ),
                 signing,
             ),

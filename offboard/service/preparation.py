@@ -10,7 +10,6 @@ from __future__ import annotations
 import threading
 from collections import deque
 
-from offboard.documents.errors import UserError
 from offboard.run.configuration import FlightConfig, dump
 from offboard.run.one_flight import rehearse
 from offboard.run.request import FlightRequest, build_parts
@@ -32,9 +31,7 @@ class Preparation:
     def __init__(self, request: FlightRequest, every_s: float = EVERY_S) -> None:
         self._request = request
         self._every_s = every_s
-        first = request.resolve()
-        self._estimate = first.estimate
-        self._newest = prepare(first)
+        self._newest = prepare(request.resolve())
         self._seen = self._newest.text  # the newest text or error
         self._news: deque[str] = deque()
         self._ended, self._allowed = threading.Event(), threading.Event()
@@ -74,8 +71,6 @@ class Preparation:
                 self._seen = text
                 return
             self._seen = text
-            if config.estimate != self._estimate:
-                raise UserError("estimate cannot be changed while the service runs")
             self._newest = prepare(config)
             self._news.append("the configuration has changed: used from the next flight on")
         except Exception as error:  # whatever a controller raises, the old configuration is kept

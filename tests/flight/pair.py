@@ -22,7 +22,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from offboard.analysis import history, tlog
 from offboard.analysis.score import Score, score
 from offboard.control.base import Controller
-from offboard.estimation.fusion import FusedObserver, observer_of
+from offboard.estimation.observer import Observer
 from offboard.flight.companion import Companion, Outcome
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.online_identification import IdentifySettings
@@ -30,7 +30,6 @@ from offboard.flight.phases import Phase, Rung
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.io.link import Chunk
 from offboard.io.log import FlightLog
-from offboard.mavlink.dialects.base import POSITIONING_TELEMETRY
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.model.vehicle import Vehicle
 from offboard.run import configuration as config
@@ -270,14 +269,13 @@ def make(
     )
     believed = believed or resolved.vehicle
     controller = resolved.controller.build(believed, period_s=resolved.period_s, seed=resolved.seed)
-    observer = observer_of(resolved.estimate, believed, resolved.observer, resolved.fusion)
+    observer = Observer(believed, resolved.observer)
     companion = Companion(
         vehicle=believed,
         session=Session(
             SessionSettings(
                 component_id=COMPONENT_ID,
                 record_component_id=RECORD_COMPONENT_ID,
-                extra_wanted=POSITIONING_TELEMETRY if isinstance(observer, FusedObserver) else (),
             )
         ),
         observer=observer,

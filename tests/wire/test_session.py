@@ -269,56 +269,18 @@ def test_implausible_contents_are_dropped_but_logged(frame: Callable[[Sender], b
     assert dropped(session, DropReason.IMPLAUSIBLE) == 1
 
 
-def gps_fix(vehicle: Sender, **changed: int) -> bytes:
-    """GPS_RAW_INT near Zurich, 3 m/s to the east-south-east."""
-    fields = {
-        "time_usec": 12_340_000,
-        "fix_type": 3,
-        "lat": 473977435,
-        "lon": 85455941,
-        "alt": 489277,
-        "eph": 70,
-        "epv": 110,
-        "vel": 300,
-        "cog": 12000,
-        "satellites_visible": 10,
-        "h_acc": 900,
-    }
-    return vehicle.frame(mavlink.MAVLink_gps_raw_int_message(**fields | changed))
-
-
 def test_a_satellite_fix() -> None:
     vehicle = Sender()
     session = pinned(vehicle)
-    (fix,) = session.receive(gps_fix(vehicle), PEER, 0.0).events
-    assert isinstance(fix, events.GpsFix)
-    assert fix.time_s == pytest.approx(12.34)
-    assert fix.place == pytest.approx((47.3977435, 8.5455941, 489.277))
-    assert fix.velocity_ne_mps == pytest.approx((-1.5, 1.5 * math.sqrt(3.0)))
-    assert fix.accuracy_m == pytest.approx(0.9)
-    frame = gps_fix(vehicle, vel=0xFFFF, h_acc=0, time_usec=1_767_225_600_000_000)
-    (fix,) = session.receive(frame, PEER, 0.0).events
-    assert fix == events.GpsFix(None, fix.place, None, None)
-    assert session.receive(gps_fix(vehicle, fix_type=2), PEER, 0.0).events == (events.NoFix(2),)
-    assert session.receive(gps_fix(vehicle, lat=-900_000_001), PEER, 0.0).events == ()
-    assert dropped(session, DropReason.IMPLAUSIBLE) == 1
-
-
-def test_origin_of_the_local_frame() -> None:
-    """From GPS_GLOBAL_ORIGIN, or from HOME_POSITION, which gives one point in both frames: a
-    thousandth of a degree of latitude is 111.195 m on PX4's sphere."""
-    vehicle = Sender()
-    session = pinned(vehicle)
-    message = mavlink.MAVLink_gps_global_origin_message(473977435, 85455941, 489277)
-    (origin,) = session.receive(vehicle.frame(message), PEER, 0.0).events
-    assert origin == events.Origin(pytest.approx((47.3977435, 8.5455941, 489.277)), reported=True)
-    place = (473987435, 85455941, 491277)
-    home = mavlink.MAVLink_home_position_message(*place, 111.195, 0.0, -2.0, LEVEL, 0.0, 0.0, 0.0)
-    (origin,) = session.receive(vehicle.frame(home), PEER, 0.0).events
-    assert not origin.reported
-    assert origin.place == pytest.approx((47.3977435, 8.5455941, 489.277), abs=1e-7)
-    home = mavlink.MAVLink_home_position_message(*place, NAN, 0.0, -2.0, LEVEL, 0.0, 0.0, 0.0)
-    assert session.receive(vehicle.frame(home), PEER, 0.0).events == ()
+    fields = {"time_usec": 0, "lat": 473977435, "lon": 85455941, "alt": 489277, "eph": 70,
+              "epv": 110, "vel": 300, "cog": 12000, "satellites_visible": 10}  # fmt: skip
+    for fix_type, h_acc, expected in (
+        (3, 900, events.GpsFix(pytest.approx(0.9))),
+        (3, 0, events.GpsFix(None)),
+        (2, 900, events.NoFix(2)),
+    ):
+        fix = mavlink.MAVLink_gps_raw_int_message(**fields, fix_type=fix_type, h_acc=h_acc)
+        assert session.receive(vehicle.frame(fix), PEER, 0.0).events == (expected,)
 
 
 def test_a_quaternion_nearly_unit_is_normalised() -> None:

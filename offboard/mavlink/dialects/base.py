@@ -215,10 +215,3 @@ TRACKING_TELEMETRY = (
     WantedMessage(1, "SYS_STATUS", 2.0),
     WantedMessage(83, "ATTITUDE_TARGET", 8.0, optional=True),  # its own thrust, before ours
 )
-
-# For our own position fusion (`estimate: fused`)
-POSITIONING_TELEMETRY = (
-    WantedMessage(24, "GPS_RAW_INT", 10.0, optional=True),
-    WantedMessage(49, "GPS_GLOBAL_ORIGIN", 1.0, optional=True),
-    WantedMessage(242, "HOME_POSITION", 1.0, optional=True),
-)
