@@ -54,4 +54,4 @@ def vehicle(name: str) -> Vehicle:
 
 def _load(name: str, folder: str, kind: str, model: type[M]) -> M:
     path = locate(name, folder, kind)
-    return parse(read_text(path), model, str(path))
+    return parse(read_text(path), model, str(path), kind)

@@ -42,7 +42,7 @@ class Sitl:
         self.port, self.ground_port = free_ports(2)
         self.log = directory / "sitl.tlog"
         self.output = directory / "sitl.txt"
-        command = [sys.executable, "-m", "simulator", "--log", str(self.log)]
+        command = [sys.executable, "-P", "-m", "simulator", "--log", str(self.log)]
         command += ["--connect", f"udpout:127.0.0.1:{self.port}"]
         command += ["--gcs", f"udpout:127.0.0.1:{self.ground_port}"]
         for name, value in options.items():

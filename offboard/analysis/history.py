@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from offboard.analysis.events import Event, announcements, modes, phases, vehicle_messages
 from offboard.analysis.sender import Stream, continuous_s
-from offboard.analysis.tlog import LoggedMessage, Tlog
+from offboard.analysis.tlog import LoggedMessage, Tlog, TlogError
 from offboard.analysis.truth import true_positions
 from offboard.flight import manifest
 from offboard.flight.record import (
@@ -140,14 +140,19 @@ def stretches(log: Tlog, messages: int = STRETCH) -> Iterator[tuple[History, flo
 
 
 def configuration(log: Tlog) -> str | None:
-    """The configuration of the flight as YAML (see `run.configuration.flown`), None without."""
-    return manifest.join(
+    """The configuration of the flight as YAML (see `run.configuration.flown`), None without.
+    Raises TlogError."""
+    pieces = (
         entry.tunnelled
         for entry in log
         if entry.name == "TUNNEL"
         and entry.component_id in OUR_COMPONENTS
         and entry.message.payload_type == manifest.PAYLOAD_TYPE
     )
+    try:
+        return manifest.join(pieces)
+    except ValueError as error:
+        raise TlogError(f"{log.path}: {error}") from None
 
 
 class _Collector:

@@ -66,6 +66,7 @@ def open_worker() -> Iterator[ProcessPoolExecutor]:
     when its work is done."""
     # spawn: a forked child would share compiled code and threads in unknown states
     context = multiprocessing.get_context("spawn")
+    os.environ["PYTHONSAFEPATH"] = "1"  # of the child: as `python -P`
     pool = ProcessPoolExecutor(1, mp_context=context, initializer=_start)
     with interrupts_deferred():
         pool.submit(os.getpid)  # starts the process

@@ -143,4 +143,4 @@ class CampaignFile(Parameters):
 def read_campaign(name: str) -> tuple[CampaignFile, str]:
     """A shipped campaign or a file, and its path for errors. Raises DocumentError."""
     path = shipped.locate(name, FOLDER, "campaign") if "." not in name else Path(name)
-    return parse(shipped.read_text(path), CampaignFile, str(path)), str(path)
+    return parse(shipped.read_text(path), CampaignFile, str(path), "campaign"), str(path)

@@ -19,12 +19,15 @@ from offboard.campaign.cases import Case
 from offboard.campaign.flight import Job, fly_job, recorded
 from offboard.campaign.margin import NOT_FLOWN
 from offboard.campaign.results import Record
-from offboard.documents.errors import UserError
+from offboard.documents.arguments import join_address, split_address
+from offboard.documents.errors import UserError, shown
 from offboard.flight.companion import STOPPED
 from offboard.flight.phases import ExitCode
+from offboard.io.stream_sources import connect
 from offboard.run.request import FlightRequest, fly_request
 
-CONNECT_S = 10.0
+CONNECT_S = 5.0
+SCHEMES = ("tcp", "tls")
 QUEUED = 2  # flights per thread of a cluster, so that none waits for us
 DIED = Record(
     ExitCode.ABORTED, "the process that flew it ended, twice", NOT_FLOWN, "crash"
@@ -169,10 +172,14 @@ def cluster_workers(address: str) -> Iterator[Workers]:
         from distributed import Client
     except ImportError:
         raise UserError("--scheduler needs dask: pip install 'pso-offboard[cluster]'") from None
+    kind, host, port = _split(address)
     try:
-        client = Client(address, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, ValueError, TypeError) as error:
-        reason = " ".join(str(error).split())
+        connect(host, port).close()  # at once, where dask tries for the whole of its timeout
+        client = Client(
+            f"{kind}://{join_address(host, port)}", timeout=CONNECT_S, set_as_default=False
+        )
+    except (OSError, UnicodeError) as error:
+        reason = " ".join((getattr(error, "strerror", None) or str(error)).split())
         raise UserError(f"no dask scheduler at {address}: {reason}") from None
     try:
         threads = sum(client.nthreads().values())
@@ -184,6 +191,14 @@ def cluster_workers(address: str) -> Iterator[Workers]:
         )
     finally:
         client.close(timeout=1.0)
+
+
+def _split(address: str) -> tuple[str, str, int]:
+    """Scheme, host and port. Raises UserError."""
+    kind, separator, place = address.rpartition("://")
+    if separator and kind not in SCHEMES:
+        raise UserError(f"--scheduler {shown(address)}: give tcp://HOST:PORT, or tls://HOST:PORT")
+    return kind or SCHEMES[0], *split_address("--scheduler", place)
 
 
 def _check(client: Any, address: str) -> None:

@@ -86,7 +86,7 @@ class Tuned:
 def read_tune(name: str) -> tuple[TuneFile, str]:
     """A shipped tuning or a file, and its path for errors. Raises DocumentError."""
     path = locate(name, FOLDER, "tuning") if "." not in name else Path(name)
-    file = parse(read_text(path), TuneFile, str(path))
+    file = parse(read_text(path), TuneFile, str(path), "tuning")
     for key in file.ranges:
         if key.startswith((SCENARIO, "vehicle.")):
             raise DocumentError(f"{path}: ranges.{key}: no scenario and no vehicle is tuned")

@@ -32,18 +32,19 @@ def check(
 
 def _checked(path: Path) -> str:
     """Validate a file; what it is. Raises DocumentError."""
-    from offboard.campaign.document import CampaignFile, read_campaign
+    from offboard.campaign.document import read_campaign
     from offboard.campaign.tune import read_tune
-    from offboard.documents.reading import read
+    from offboard.documents.reading import kind_of, read
     from offboard.documents.shipped import read_text
     from offboard.run.configuration import check_file
     from offboard.run.sitl import check_scenario
 
-    keys = set() if path.suffix.lower() == ".csv" else set(read(read_text(path), str(path)))
-    if keys & {"training", "validation"}:
+    table = path.suffix.lower() == ".csv"
+    kind = "" if table else kind_of(read(read_text(path), str(path)))
+    if kind == "tuning":
         read_tune(str(path))
-        return "tuning"
-    if keys & CampaignFile.model_fields.keys() - {"config"}:
+    elif kind == "campaign":
         read_campaign(str(path))
-        return "campaign"
-    return check_file(path, check_scenario)
+    else:
+        return check_file(path, check_scenario)
+    return kind

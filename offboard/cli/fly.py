@@ -34,7 +34,7 @@ from offboard.cli.shared import (
     write,
 )
 from offboard.documents.arguments import FOXGLOVE, LIVE_PAGE
-from offboard.documents.command_line import drop_output, explained
+from offboard.documents.command_line import INTERRUPT, drop_output, explained
 
 if TYPE_CHECKING:
     from offboard.analysis.requirement import Requirement
@@ -55,7 +55,9 @@ def fly(
     controller: Controller = None,
     reference: Reference = None,
     vehicle: Vehicle = None,
-    firmware: Annotated[str, option("NAME", "With --sitl: px4 or ardupilot.")] = "px4",
+    firmware: Annotated[
+        str | None, option("NAME", "With --sitl: px4 or ardupilot.  [default: px4]")
+    ] = None,
     scenario: Annotated[
         str | None, option(FILE, "With --sitl: scenario.  [default: errors of the firmware]")
     ] = None,
@@ -95,7 +97,7 @@ def fly(
         raise CommandError("--sitl starts its own simulator: use --sitl or --connect, not both")
     if sitl and system:
         raise CommandError("--system is an option of --connect: --sitl has one vehicle")
-    if not sitl and (scenario or sim_vehicle or firmware != "px4"):
+    if not sitl and (scenario or sim_vehicle or firmware):
         raise CommandError("--scenario, --sim-vehicle and --firmware are options of --sitl: add it")
     try:
         from offboard.io.stop import StopRequests
@@ -122,7 +124,7 @@ def fly(
                 seed=seed,
                 connection=connect or DEFAULT_CONNECTION,
                 sitl=sitl,
-                firmware=firmware,
+                firmware=firmware or "px4",
                 scenario=scenario,
                 sim_vehicle=sim_vehicle,
                 system_id=system,
@@ -132,7 +134,7 @@ def fly(
                 displays.tell(f"live: {url}")
             outcome = fly_request(request, displays.show, displays.tell, simulator, stops)
     except KeyboardInterrupt:  # before the flight; in flight an interrupt lands the vehicle
-        raise CommandError(INTERRUPTED) from None
+        raise CommandError(INTERRUPTED, INTERRUPT) from None
     if outcome.exit_code == 2:
         raise CommandError(outcome.sentence)
     try:
@@ -149,7 +151,7 @@ def fly(
 def _exit_at_once() -> None:
     """Exit although code may be compiling; the simulator ends when the pipe to it closes."""
     os.write(2, f"{INTERRUPTED}\n".encode())
-    os._exit(2)
+    os._exit(INTERRUPT)
 
 
 def _displays(live: str | None, foxglove: str | None, *, json_lines: bool) -> Displays:

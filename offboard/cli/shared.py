@@ -7,6 +7,7 @@ wrong options are answered at once.
 from __future__ import annotations
 
 import itertools
+import re
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,10 +17,18 @@ from rich.console import Console
 
 from offboard.documents.command_line import complain as complain
 from offboard.documents.command_line import wrapped
-from offboard.documents.errors import UserError
+from offboard.documents.errors import UserError, shown
 from offboard.io.new_file import new_file
 
-out = Console(highlight=False)
+
+class Output(Console):
+    """A console that raises where nobody reads it any more: rich would exit with 1."""
+
+    def on_broken_pipe(self) -> None:
+        raise
+
+
+out = Output(highlight=False)
 err = Console(stderr=True, highlight=False)
 
 DEFAULT_CONNECTION = "udpin:127.0.0.1:14540"
@@ -27,13 +36,21 @@ FLIGHTS = Path("flights")  # parent of the flight directories that have no --out
 EXIT_CODES = (
     "Exit codes: 0 flown and all requirements met; 1 a requirement missed; 2 usage or "
     "configuration error, nothing sent; 3 not flown: no vehicle, refused, or stopped on the "
-    "ground; 4 aborted in flight, or left armed."
+    "ground; 4 aborted in flight, or left armed; 130 interrupted before anything was sent; 141 "
+    "nobody reads the output."
 )
 
 
-def option(metavar: str, text: str, *names: str) -> Any:
+def option(metavar: str, text: str, *names: str, **more: Any) -> Any:
     """A command-line option with a value, by default named as its parameter."""
-    return typer.Option(*names, metavar=metavar, help=text)
+    return typer.Option(*names, metavar=metavar, help=text, **more)
+
+
+def _known_port(address: str | None) -> str | None:
+    """Refuse to listen on any free port, to which nobody sends."""
+    if address and re.fullmatch(r"(udp|tcp)in:.*:0+", address):
+        raise CommandError(f"--connect {shown(address)}: give the port that the vehicle sends to")
+    return address
 
 
 NEW_DIRECTORY = "Directory of the results.  [default: a new one in flights]"
@@ -46,6 +63,7 @@ Connect = Annotated[
         "LINK",
         "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD; "
         f"IPv6 in brackets.  [default: {DEFAULT_CONNECTION}]",
+        callback=_known_port,
     ),
 ]
 Controller = Annotated[str | None, option(FILE, "Controller.")]

@@ -5,9 +5,10 @@ from __future__ import annotations
 import re
 from typing import Any
 
+from typer import BadParameter
 from typer.core import TyperCommand
 
-from offboard.documents.command_line import INTERRUPTED, interrupts_raise
+from offboard.documents.command_line import INTERRUPT, INTERRUPTED, interrupts_raise
 from offboard.documents.errors import UserError, shown
 
 LIVE_PAGE, FOXGLOVE = "127.0.0.1:8014", "127.0.0.1:8765"
@@ -33,6 +34,12 @@ def join_address(host: str, port: int) -> str:
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
+class Interrupted(UserError):
+    """The command was interrupted."""
+
+    code = INTERRUPT
+
+
 class Command(TyperCommand):
     """A command whose values are neither empty nor options nor bytes that are no text.
 
@@ -41,7 +48,12 @@ class Command(TyperCommand):
     """
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        args = _completed(args)
+        try:
+            return self._parsed(ctx, _completed(args))
+        except BadParameter as error:
+            raise UserError(f"{error.format_message()}; see `{ctx.command_path} --help`") from None
+
+    def _parsed(self, ctx: Any, args: list[str]) -> list[str]:
         given, _, parameters = self.make_parser(ctx).parse_args(list(args))
         for parameter in parameters:
             values = given.get(parameter.name)
@@ -55,7 +67,7 @@ class Command(TyperCommand):
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
-            raise UserError(INTERRUPTED) from None
+            raise Interrupted(INTERRUPTED) from None
 
 
 def _completed(args: list[str]) -> list[str]:

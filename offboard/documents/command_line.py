@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from types import FrameType
     from typing import NoReturn, TextIO
 
-USAGE = 2  # exit code
+USAGE, INTERRUPT, CLOSED_PIPE = 2, 130, 141  # exit codes; the last two as of SIGINT and SIGPIPE
 INTERRUPTED = "interrupted"
 MEMORY_LEAST_MB = 1000  # with less, numpy and the compiler end the process themselves
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
@@ -28,8 +28,9 @@ def run(load: Callable[[], Callable[[], object]]) -> NoReturn:
 
     An interrupt exits at once until the command calls `interrupts_raise`, its arguments parsed.
 
-    A UserError is printed without a traceback and exits with its `code`, 2 without one. So do an
-    interrupt, a lack of memory, and an error of a file or of the output.
+    A UserError is printed without a traceback and exits with its `code`, 2 without one. So do a
+    lack of memory, and an error of a file or of the output; an interrupt exits with 130. Where
+    nobody reads the output any more (`| head -1`), the exit code is 141 without a sentence.
     """
     interrupts_exit()
     _open_standard_files()
@@ -39,8 +40,14 @@ def run(load: Callable[[], Callable[[], object]]) -> NoReturn:
         sentence, code = "", 0
     except SystemExit as ended:
         sentence, code = "", ended.code if isinstance(ended.code, int) else 0
+        if isinstance(ended.__context__, BrokenPipeError):  # typer's exit, with 1
+            drop_output()
+            code = CLOSED_PIPE
     except KeyboardInterrupt:
-        sentence, code = INTERRUPTED, USAGE
+        sentence, code = INTERRUPTED, INTERRUPT
+    except BrokenPipeError:
+        drop_output()
+        sentence, code = "", CLOSED_PIPE
     except MemoryError:
         sentence, code = "not enough memory", USAGE
     except OSError as error:
@@ -53,7 +60,9 @@ def run(load: Callable[[], Callable[[], object]]) -> NoReturn:
         sentence, code = str(error), getattr(error, "code", USAGE)
     interrupts_raise()
     unwritten = _flushed()
-    if unwritten and not sentence:
+    if isinstance(unwritten, BrokenPipeError):
+        code = code or CLOSED_PIPE
+    elif unwritten and not sentence:
         sentence, code = explained(unwritten), code or USAGE
     try:
         if sentence:
@@ -149,7 +158,7 @@ def interrupts_raise() -> None:
 
 def _exit_at_once(number: int, frame: FrameType | None) -> None:
     os.write(2, f"{INTERRUPTED}\n".encode())
-    os._exit(USAGE)
+    os._exit(INTERRUPT)
 
 
 def _flushed() -> OSError | None:

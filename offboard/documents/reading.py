@@ -28,6 +28,20 @@ Json = dict[str, Any]
 DESCRIPTION_SIZE = 200
 PROBLEMS_MOST = 10
 
+# kind of file -> keys that no kind below has
+KINDS = {
+    "tuning": {"training", "validation"},
+    "campaign": {
+        "controllers", "references", "vehicles", "sim_vehicles", "firmwares", "scenarios",
+        "parameters", "sample", "search", "seeds", "require", "promises", "keep",
+    },
+    "scenario": {"conditions", "faults"},
+    "reference": {"shape"},
+    "controller": {"law"},
+    "vehicle": {"mass_kg"},
+    "configuration": {"vehicle", "controller", "reference"},
+}  # fmt: skip
+
 _INTEGER = re.compile(r"[-+]?[0-9]{1,400}")
 _HEXADECIMAL = re.compile(r"0x[0-9a-fA-F]{1,300}")
 _FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?")
@@ -38,12 +52,16 @@ _WORDS: dict[str, Any] = {
 }  # fmt: skip
 
 
-def parse(text: str, model: type[M], source: str) -> M:
-    """YAML `text` -> an instance of `model`. `source` names the text in errors (a file's name).
+def parse(text: str, model: type[M], source: str, kind: str = "") -> M:
+    """YAML `text` -> an instance of `model`. `source` names the text in errors (a file's name),
+    `kind` is the kind of file, one of KINDS; without one it is not checked.
 
     Raises DocumentError with the problems found.
     """
-    return validate(read(text, source), model, source)
+    raw = read(text, source)
+    if kind:
+        check_kind(raw, kind, source)
+    return validate(raw, model, source)
 
 
 def read(text: str, source: str) -> Json:
@@ -54,6 +72,18 @@ def read(text: str, source: str) -> Json:
     recorded with values that --set has changed since.
     """
     return _document(text, source)[0]
+
+
+def kind_of(raw: Mapping[str, Any]) -> str:
+    """The kind of file that a mapping is, by keys that only this kind has; empty if it has none."""
+    return next((kind for kind, keys in KINDS.items() if keys & raw.keys()), "")
+
+
+def check_kind(raw: Mapping[str, Any], wanted: str, source: str) -> None:
+    """Raise DocumentError where the file is certainly of another kind than the `wanted` one."""
+    found = kind_of(raw)
+    if found and found != wanted:
+        raise DocumentError(f"{source} is a {found} file; a {wanted} file is needed here")
 
 
 def description(text: str, source: str) -> str:

@@ -15,6 +15,7 @@ from offboard.mavlink.outgoing import ConfigurationRecord
 PAYLOAD_TYPE = 0xC0F1  # TUNNEL.payload_type; numbers above 32767 need no registration
 _HEAD = struct.Struct("<HH")  # index of the piece, number of pieces
 _PIECE_BYTES = 128 - _HEAD.size
+TEXT_MOST = 4_000_000  # bytes: eight of the longest configuration files; a log may be anybody's
 
 
 def pieces(text: str) -> list[ConfigurationRecord]:
@@ -28,7 +29,8 @@ def pieces(text: str) -> list[ConfigurationRecord]:
 
 
 def join(payloads: Iterable[bytes]) -> str | None:
-    """The text in the payloads of TUNNEL messages; None if a piece is missing or damaged."""
+    """The text in the payloads of TUNNEL messages; None if a piece is missing or damaged. Raises
+    ValueError for a text of more than TEXT_MOST bytes."""
     parts: dict[int, bytes] = {}
     count = 0
     for payload in payloads:
@@ -39,7 +41,13 @@ def join(payloads: Iterable[bytes]) -> str | None:
             break
     if not count or sorted(parts) != list(range(count)):
         return None
+    unpacked = zlib.decompressobj()
     try:
-        return zlib.decompress(b"".join(parts[index] for index in range(count))).decode("utf-8")
+        data = unpacked.decompress(b"".join(parts[index] for index in range(count)), TEXT_MOST)
+        if unpacked.eof:
+            return data.decode("utf-8")
     except (zlib.error, UnicodeDecodeError):
         return None
+    if len(data) == TEXT_MOST:
+        raise ValueError(f"its configuration unpacks to more than {TEXT_MOST // 1000} kB")
+    return None

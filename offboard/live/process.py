@@ -35,7 +35,7 @@ class LiveProcess:
         host, port = split_address(option, address)
         self._option = option
         self._process = subprocess.Popen(
-            [sys.executable, "-m", module, host, str(port)],
+            [sys.executable, "-P", "-m", module, host, str(port)],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             bufsize=0,

@@ -14,7 +14,7 @@ _NICENESS = 10  # the next flight may begin meanwhile
 def begin(command: str, directory: Path) -> subprocess.Popen[bytes]:
     """Start `offboard COMMAND` on a flight directory. It outlives this process. Raises OSError."""
     process = subprocess.Popen(
-        [sys.executable, "-m", "offboard", command, str(directory.absolute())],
+        [sys.executable, "-P", "-m", "offboard", command, str(directory.absolute())],
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,

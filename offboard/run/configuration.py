@@ -24,7 +24,15 @@ from offboard.control.base import Controller, ControllerSettings
 from offboard.documents import shipped
 from offboard.documents.errors import abridged
 from offboard.documents.parameters import Parameters
-from offboard.documents.reading import DocumentError, known, override, read, validate
+from offboard.documents.reading import (
+    DocumentError,
+    check_kind,
+    kind_of,
+    known,
+    override,
+    read,
+    validate,
+)
 from offboard.documents.shipped import locate, read_text
 from offboard.estimation.observer import ObserverSettings
 from offboard.flight.online_identification import IdentifySettings
@@ -71,6 +79,7 @@ def load(
     """
     path = locate(name, "", "configuration")
     raw = read(read_text(path), str(path))
+    check_kind(raw, "configuration", str(path))
     if known_vehicle and raw.get("vehicle") == UNKNOWN_VEHICLE:
         raw["vehicle"] = known_vehicle
     for part in FOLDERS:
@@ -163,10 +172,10 @@ def check_file(path: Path, check_scenario: Callable[[Path], None]) -> str:
     if not raw:
         raise DocumentError(f"{path} is empty")
     name = str(path if path.suffix in (".yaml", ".yml") else path.absolute())
-    if "conditions" in raw or "faults" in raw:
+    kind = kind_of(raw) or _likely_kind(raw)
+    if kind == "scenario":
         check_scenario(path)
-        return "scenario"
-    kind = _kind(raw)
+        return kind
     if kind in FOLDERS:
         validate(raw, _model(kind, raw), str(path))
         if kind == "reference":
@@ -176,13 +185,10 @@ def check_file(path: Path, check_scenario: Callable[[Path], None]) -> str:
     return kind
 
 
-def _kind(raw: Raw) -> str:
-    """What a file is meant to be: by the key that only this kind has, else by most of its keys."""
-    for kind, key in (("reference", "shape"), ("controller", "law"), ("vehicle", "mass_kg")):
-        if key in raw:
-            return kind
+def _likely_kind(raw: Raw) -> str:
+    """What a file without the key of its kind is meant to be: by most of its keys."""
     keys = {
-        "flight configuration": set(FlightConfig.model_fields),
+        "configuration": set(FlightConfig.model_fields),
         "vehicle": set(Vehicle.model_fields),
         "controller": {
             key
@@ -251,6 +257,7 @@ def read_part(part: str, name: str) -> Raw:
         return {"law": name}
     path = locate(name, FOLDERS[part], part, laws)
     raw = read(read_text(path), str(path))
+    check_kind(raw, part, str(path))
     validate(raw, _model(part, raw), str(path))
     return raw
 

@@ -47,7 +47,7 @@ def check_scenario_named(name: str) -> None:
 
 def check_scenario(path: Path) -> None:
     """Let the simulator validate a scenario file. Raises DocumentError with its errors."""
-    command = [sys.executable, "-m", "simulator", "--check", str(path)]
+    command = [sys.executable, "-P", "-m", "simulator", "--check", str(path)]
     answer = subprocess.run(command, capture_output=True, text=True, check=False)
     if answer.returncode:
         raise DocumentError(*answer.stderr.strip().splitlines())
@@ -67,7 +67,7 @@ class SimulatorProcess:
     def _open(self) -> None:
         self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - closed by `close`
         self._process = subprocess.Popen(
-            [sys.executable, "-m", "simulator.pool"],
+            [sys.executable, "-P", "-m", "simulator.pool"],
             bufsize=0,
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,

@@ -24,7 +24,7 @@ def unit(arguments: Sequence[str], connection: str, signing_key: Path | None = N
     template = Environment(undefined=StrictUndefined, keep_trailing_newline=True).from_string(
         TEMPLATE.read_text(encoding="utf-8")
     )
-    command = [sys.executable, "-m", "offboard", "daemon", *arguments]
+    command = [sys.executable, "-P", "-m", "offboard", "daemon", *arguments]
     words = [quoted(word) for word in command]
     if not any(word.startswith("--out") for word in arguments):
         words += ["--out", "%S/offboard"]

@@ -70,7 +70,7 @@ class Supervisor:
         with theirs:
             try:
                 self._process = subprocess.Popen(
-                    [sys.executable, "-m", "offboard.supervisor.process"],
+                    [sys.executable, "-P", "-m", "offboard.supervisor.process"],
                     stdin=theirs.fileno(),
                     stdout=subprocess.DEVNULL,
                     start_new_session=True,  # signals of the terminal reach only the controller

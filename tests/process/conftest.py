@@ -28,12 +28,14 @@ def spawn(tmp_path: Path) -> Iterator[Spawn]:
 def called(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> Called:
-    """`called("offboard fly", ...)`, in this process -> exit code, stdout, stderr."""
+    """`called("offboard fly", ...)`, in this process -> exit code, stdout, stderr. The word PORT
+    in an argument becomes the number of a free port."""
     monkeypatch.chdir(tmp_path)
 
     def call(command: str, *arguments: object) -> tuple[int, str, str]:
         main = simulator_cli.main if command.startswith("simulator") else cli.main
-        monkeypatch.setattr(sys, "argv", [*command.split(), *map(str, arguments)])
+        words = [str(each).replace(":PORT", f":{free_port()}") for each in arguments]
+        monkeypatch.setattr(sys, "argv", [*command.split(), *words])
         with pytest.raises(SystemExit) as ended:
             main()
         printed = capsys.readouterr()

@@ -6,6 +6,7 @@ What ends before anything is sent is called in this process; the rest are real p
 from __future__ import annotations
 
 import ctypes
+import io
 import json
 import os
 import resource
@@ -19,16 +20,21 @@ from pathlib import Path
 
 import pytest
 from processes import SHORT, Called, Spawn, children, free_port
+from pymavlink.dialects.v20 import ardupilotmega as dialect
 
 from offboard.analysis import history, tlog
 from offboard.analysis.flight_score import keep_score, score_flight
 from offboard.documents.signing_key import create_key
+from offboard.flight import manifest
+from offboard.flight.record import RECORD_COMPONENT_ID
 from offboard.io.log import LogError
 from offboard.run import one_flight as run
 from offboard.run import request
 
 CONFIG = Path(__file__).parents[2] / "config"
 RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
+CAMPAIGN, SCENARIO = CONFIG / "campaigns" / "quick.yaml", CONFIG / "scenarios" / "gusts.yaml"
+NOW_US = 1_790_000_000_000_000  # of an entry of a log
 Call = Callable[..., tuple[int, str]]
 
 
@@ -100,6 +106,7 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
             ("--require", "rmse<1"),
             "there is no figure 'rmse'; there are completed, touchdown_mps, rmse_position_m",
         ),
+        (("--connect", "udpin:127.0.0.1:0"), "give the port that the vehicle sends to"),
         (("--connect", "udpin:127.0.0.1"), "is not understood; use udpin:HOST:PORT"),
         (("--connect", "udpin:127.0.0.1:99999"), "port 99999 is not within 0 .. 65535"),
         (("--connect", "udpin:::1:14540"), "an IPv6 address stands in brackets, as in udpin:[::1]"),
@@ -109,6 +116,10 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         (("--connect", "serial:/dev/nonexistent:57600"), "cannot be opened"),
         (("--out", "/dev/null/x"), "recorded in /dev/null/x: Not a directory; choose a directory"),
         (("--out", "/proc/nowhere"), "choose a directory that can be written with --out"),
+        (("--firmware", "px4"), "--firmware are options of --sitl: add it"),
+        (("--vehicle", CAMPAIGN), "quick.yaml is a campaign file; a vehicle file is needed here"),
+        (("--config", CAMPAIGN), "is a campaign file; a configuration file is needed here"),
+        (("--controller", SCENARIO), "gusts.yaml is a scenario file; a controller file is needed"),
         (("--sitl",), "--sitl starts its own simulator: use --sitl or --connect, not both"),
         (kept_out(0, 0, 3, 0.5), "keep_out[0] (sphere) contains the start of the reference"),
         (kept_out(0, 0, 0, 0.5), "keep_out[0] (sphere) contains the take-off point with its"),
@@ -130,9 +141,9 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
     ],
 )
 def test_usage_is_refused_before_anything_is_sent(
-    arguments: tuple[str, ...], expected: str, offboard: Call, tmp_path: Path
+    arguments: tuple[object, ...], expected: str, offboard: Call, tmp_path: Path
 ) -> None:
-    code, output = offboard("fly", "--connect", "udpin:127.0.0.1:0", *arguments)
+    code, output = offboard("fly", "--connect", "udpin:127.0.0.1:PORT", *arguments)
     assert code == 2, output
     assert expected in output
     assert "Traceback" not in output
@@ -218,6 +229,23 @@ def test_foreign_log(content: bytes, expected: str, offboard: Call, tmp_path: Pa
     assert expected in output
 
 
+@pytest.mark.parametrize("command", ["report", "replay", "identify"])
+def test_a_configuration_that_unpacks_to_gigabytes_is_refused(
+    command: str, offboard: Call, tmp_path: Path
+) -> None:
+    """Here to 40 MB, by a thousand times as many as its bytes."""
+    packed = manifest.pieces(40_000_000 * " ")
+    codec = dialect.MAVLink(None, srcSystem=1, srcComponent=RECORD_COMPONENT_ID)
+    log = io.BytesIO()
+    for piece in packed:
+        data = piece.data.ljust(128, b"\0")
+        message = codec.tunnel_encode(0, 0, piece.payload_type, len(piece.data), list(data))
+        log.write(NOW_US.to_bytes(8, "big") + message.pack(codec))
+    (tmp_path / "x.tlog").write_bytes(log.getvalue() + RECORDING.read_bytes())
+    code, output = offboard(command, "x.tlog")
+    assert (code, output) == (2, "x.tlog: its configuration unpacks to more than 4000 kB\n")
+
+
 def test_nothing_identified_is_no_vehicle_file(offboard: Call, tmp_path: Path) -> None:
     still = RECORDING.with_name("arducopter-4.6.3-guided.tlog")
     code, output = offboard("identify", still, "-o", "mine.yaml", "--page", "page.html")
@@ -240,7 +268,7 @@ def test_truncated_log_is_scored_up_to_there(offboard: Call, tmp_path: Path) -> 
 
 def test_no_vehicle(offboard: Call, tmp_path: Path) -> None:
     code, output = offboard(
-        "fly", "--connect", "udpin:127.0.0.1:0", "--set", "limits.connect_s=0.3", "--out", "x"
+        "fly", "--connect", "udpin:127.0.0.1:PORT", "--set", "limits.connect_s=0.3", "--out", "x"
     )
     assert code == 3
     assert output.startswith("no vehicle heard in 0 s; is it running, and sending to this port?")
@@ -285,9 +313,9 @@ def test_interrupted_while_it_compiles_it_does_not_fly(
 ) -> None:
     monkeypatch.setattr(run, "rehearse", interrupted_while_compiling)
     code, output = offboard(
-        "fly", "--connect", "udpin:127.0.0.1:0", "--set", "limits.connect_s=0.3"
+        "fly", "--connect", "udpin:127.0.0.1:PORT", "--set", "limits.connect_s=0.3"
     )
-    assert (code, output) == (2, "interrupted before anything was sent\n")
+    assert (code, output) == (130, "interrupted before anything was sent\n")
     assert not list(tmp_path.iterdir())
 
 
@@ -296,7 +324,7 @@ def test_a_comparison_interrupted_while_it_compiles_does_not_fly(
 ) -> None:
     monkeypatch.setattr(run, "rehearse", interrupted_while_compiling)
     code, output = offboard(
-        "compare", "--connect", "udpin:127.0.0.1:0", "--controllers", "lqr", "--seeds", 2,
+        "compare", "--connect", "udpin:127.0.0.1:PORT", "--controllers", "lqr", "--seeds", 2,
         "--set", "limits.connect_s=0.3", "--out", "x",
     )  # fmt: skip
     assert (code, output) == (4, "interrupted: 2 of 2 flights missing\n")
@@ -315,7 +343,7 @@ def test_ended_before_flight_it_leaves_no_simulator(
         process.send_signal(number)
         time.sleep(1.05)  # a second one within a second is the same request
     _, output = process.communicate(timeout=60)
-    assert (process.returncode, output) == (2, "interrupted before anything was sent\n")
+    assert (process.returncode, output) == (130, "interrupted before anything was sent\n")
     deadline_s = time.monotonic() + 10.0  # hit while it started: it ends by itself, alone
     while Path(f"/proc/{simulator}").exists() and time.monotonic() < deadline_s:
         time.sleep(0.01)

@@ -199,13 +199,14 @@ def test_a_scheduler_that_is_lost_keeps_what_is_finished(tmp_path: Path) -> None
     assert fly(flown).missing == 0
 
 
-def test_no_scheduler_is_a_sentence(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(execution, "CONNECT_S", 0.3)
-    with (
-        pytest.raises(UserError, match=r"no dask scheduler at tcp://127\.0\.0\.1:9"),
-        cluster_workers("tcp://127.0.0.1:9"),
-    ):
-        pass
+@pytest.mark.parametrize("address", ["nonsense", "udp://127.0.0.1:9", "tcp://127.0.0.1:9"])
+def test_no_scheduler_is_a_sentence_at_once(address: str, spawn: Spawn) -> None:
+    begun_s = time.monotonic()
+    process = spawn("offboard", "campaign", "quick", "--out", "x", "--scheduler", address)
+    said = process.communicate(timeout=60)[1]
+    assert (process.returncode, said.count("\n")) == (2, 1), said
+    assert address in said
+    assert time.monotonic() - begun_s < 15.0  # that dask alone would wait
 
 
 def test_an_infeasible_case_is_a_row_with_its_reason(tmp_path: Path) -> None:

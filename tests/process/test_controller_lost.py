@@ -183,14 +183,15 @@ def test_an_endless_loop_in_a_law(
     spawn: Spawn, cable: Callable[[int], str], tmp_path: Path
 ) -> None:
     """It begins when the file `hang` exists."""
-    metadata = tmp_path / "hangs-1.0.dist-info"
-    metadata.mkdir()
+    site = tmp_path / "site"
+    metadata = site / "hangs-1.0.dist-info"
+    metadata.mkdir(parents=True)
     (metadata / "METADATA").write_text("Metadata-Version: 2.1\nName: hangs\nVersion: 1.0\n")
     (metadata / "entry_points.txt").write_text(
         "[pso_offboard.controllers]\nhangs = law_that_hangs:Settings\n"
     )
-    (tmp_path / "law_that_hangs.py").write_text(LAW_THAT_HANGS)
-    modules = os.pathsep.join(filter(None, (str(tmp_path), os.environ.get("PYTHONPATH"))))
+    (site / "law_that_hangs.py").write_text(LAW_THAT_HANGS)
+    modules = os.pathsep.join(filter(None, (str(site), os.environ.get("PYTHONPATH"))))
     connection = connections(spawn, "serial", cable)
     flight = tracking(spawn, connection, "--controller", "hangs", PYTHONPATH=modules)
     (supervisor,) = children(flight.pid)

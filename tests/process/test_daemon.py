@@ -194,7 +194,7 @@ def test_the_unit_is_valid(tmp_path: Path) -> None:
     (tmp_path / "my $ %.yaml").write_text("vehicle: neutral\ncontroller: lqr\nreference: hover\n")
     create_key(tmp_path / "my %.key")
     told = subprocess.run(
-        [sys.executable, "-m", "offboard", "daemon", "--connect", "serial:/dev/ttyACM0:57600",
+        [sys.executable, "-P", "-m", "offboard", "daemon", "--connect", "serial:/dev/ttyACM0:57600",
          "--config", "./my $ %.yaml", "--signing-key", "my %.key", "--print-unit"],
         capture_output=True, text=True, check=True, cwd=tmp_path,
     )  # fmt: skip

@@ -57,7 +57,7 @@ def test_a_bad_key_file_is_one_sentence_before_anything_is_sent(
 def test_where_no_time_stamp_can_be_kept_nothing_is_flown(call: Called, tmp_path: Path) -> None:
     call("offboard", "key", "my.key")
     (tmp_path / "state").write_text("a file")
-    connection = ("--connect", "udpin:127.0.0.1:0")
+    connection = ("--connect", "udpin:127.0.0.1:PORT")
     code, _, complaint = call("offboard", "fly", *connection, "--signing-key", "my.key")
     assert code == 2
     assert "the time stamp of the signing key cannot be kept" in complaint

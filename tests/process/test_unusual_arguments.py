@@ -13,7 +13,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from processes import Called
+from processes import Called, free_port
 
 from offboard.analysis import tlog
 from offboard.campaign.results import Record
@@ -22,7 +22,7 @@ RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offb
 SURROGATE = os.fsdecode(b"caf\xe9")
 LONG = 300 * "n"
 Call = Callable[..., tuple[int, str]]
-LINK = ("--connect", "udpin:127.0.0.1:0", "--set", "limits.connect_s=0.1")
+LINK = ("--connect", "udpin:127.0.0.1:PORT", "--set", "limits.connect_s=0.1")
 
 
 @pytest.fixture
@@ -120,6 +120,7 @@ def test_an_option_is_no_value_of_the_one_before_it(call: Call, tmp_path: Path) 
         ("simulator", ("--scenario", f"{LONG}.yaml")),
         ("simulator", ("--vehicle", f"{LONG}.yaml")),
         ("simulator", ("--check", f"{LONG}.yaml")),
+        ("simulator", ("--log", "/dev/full", "--duration", "0.1", "--gcs", "none")),
         ("simulator", ("--connect", f"udpin:127.0.0.1:{5000 * '9'}")),
         ("simulator", ("--connect", "udpin:a..b:14540")),
         ("simulator", ("--duration", "nan")),
@@ -132,6 +133,7 @@ def test_a_name_or_number_beyond_every_limit_is_refused(
     code, said = call(command, *arguments)
     assert (code, "Traceback" in said) == (2, False), said
     assert len(said) < 600 or "--seed" in said
+    assert said.count("\n") == 1
     assert not list(tmp_path.iterdir())
 
 
@@ -193,8 +195,8 @@ FILES: dict[str, Callable[[Path], object]] = {
     [
         "offboard check x.yaml",
         "offboard check x.csv",
-        "offboard fly --connect udpin:127.0.0.1:0 --config x.yaml",
-        "offboard fly --connect udpin:127.0.0.1:0 --reference x.csv",
+        "offboard fly --connect udpin:127.0.0.1:PORT --config x.yaml",
+        "offboard fly --connect udpin:127.0.0.1:PORT --reference x.csv",
         "offboard fly --sitl --scenario x.yaml",
         "offboard compare --controllers x.yaml",
         "simulator --check x.yaml",
@@ -308,7 +310,7 @@ def process(
     command: str, directory: Path, begin: str = "pass", **more: str
 ) -> subprocess.CompletedProcess[str]:
     """A command as its console script runs it, after `begin`."""
-    module, *arguments = command.split()
+    module, *arguments = command.replace(":PORT", f":{free_port()}").split()
     script = (
         f"import sys; sys.argv = {[module, *arguments]!r}\n{begin}\n"
         f"from {module}.cli import main\nsys.exit(main())"
@@ -320,6 +322,7 @@ def process(
 
 
 FULL = "sys.stdout = open('/dev/full', 'w')"
+CLOSED = "import os; r, w = os.pipe(); os.close(r); os.dup2(w, 1)"
 GONE = "import os; os.mkdir('gone'); os.chdir('gone'); os.rmdir('../gone')"
 LITTLE = "import resource; resource.setrlimit(resource.RLIMIT_AS, (400_000_000, 400_000_000))"
 NO_OUTPUT = f"{FULL}; sys.stderr = open('/dev/full', 'w')"
@@ -347,6 +350,15 @@ def test_a_process_that_lacks_something_says_so(
     assert says in refused((ended.returncode, ended.stderr))
 
 
+@pytest.mark.parametrize(
+    "command",
+    ["offboard list", "offboard --help", SCORE, f"{SCORE} --json", "simulator --list-scenarios"],
+)
+def test_a_pipe_that_nobody_reads_is_no_missed_requirement(command: str, tmp_path: Path) -> None:
+    ended = process(command, tmp_path, CLOSED)
+    assert (ended.returncode, ended.stderr) == (141, "")
+
+
 @pytest.mark.parametrize("command", ["offboard check no.yaml", SCORE, "offboard paper --table 99"])
 def test_without_any_output_the_exit_code_is_left(command: str, tmp_path: Path) -> None:
     ended = process(command, tmp_path, NO_OUTPUT)
@@ -364,8 +376,8 @@ def test_a_page_on_a_full_disk_leaves_no_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("command", "place"),
     [
-        ("offboard fly --connect udpin:127.0.0.1:0 --out locked/x", "locked/x"),
-        ("offboard fly --connect udpin:127.0.0.1:0 --vehicle locked/x.yaml", "locked/x.yaml"),
+        ("offboard fly --connect udpin:127.0.0.1:PORT --out locked/x", "locked/x"),
+        ("offboard fly --connect udpin:127.0.0.1:PORT --vehicle locked/x.yaml", "locked/x.yaml"),
         ("offboard score locked/x", "locked/x"),
         ("offboard identify locked/x -o y", "locked/x"),
         ("simulator --check locked/x.yaml", "locked/x.yaml"),
@@ -403,7 +415,7 @@ builtins.__import__ = imported
 """
     for at in (5, 10, 100, 400):
         ended = process(f"{module} --help", tmp_path, begin.format(module=module, at=at))
-        assert (ended.returncode, ended.stderr) == (2, "interrupted\n"), at
+        assert (ended.returncode, ended.stderr) == (130, "interrupted\n"), at
 
 
 def test_an_interrupted_score_is_one_sentence(tmp_path: Path) -> None:
@@ -414,7 +426,7 @@ from offboard.analysis import flight_score
 flight_score.score_flight = lambda flight: signal.raise_signal(signal.SIGINT)
 """
     ended = process(SCORE, tmp_path, begin)
-    assert (ended.returncode, ended.stderr) == (2, "interrupted\n")
+    assert (ended.returncode, ended.stderr) == (130, "interrupted\n")
 
 
 def test_a_flight_whose_result_cannot_be_printed_keeps_its_exit_code(tmp_path: Path) -> None:
@@ -433,7 +445,7 @@ def test_closed_standard_files_are_no_log(tmp_path: Path) -> None:
     begin = (
         "import os; [os.close(d) for d in (0, 1, 2)]; sys.stdout = sys.stderr = sys.stdin = None"
     )
-    command = "offboard fly --connect udpin:127.0.0.1:0 --set limits.connect_s=0.1 --out x"
+    command = "offboard fly --connect udpin:127.0.0.1:PORT --set limits.connect_s=0.1 --out x"
     ended = process(command, tmp_path, begin)
     assert ended.returncode == 3
     log = tlog.read(tmp_path / "x" / "flight.tlog")
