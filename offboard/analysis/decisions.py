@@ -13,7 +13,7 @@ from offboard.flight.phases import PHASE_CODES, Phase
 
 Array = NDArray[np.float64]
 _KEPT = (
-    "lateness_s", "age_s", "solve_time_s", "gap", "spread", "at_bound", "cut_short",
+    "answer_s", "age_s", "solve_time_s", "gap", "spread", "at_bound", "cut_short",
     "missed_ticks", "refused", "strangers", "hover_thrust", "thrust_mps2", "phase",
 )  # fmt: skip
 
@@ -44,7 +44,7 @@ class Decisions:
         def refusals(flag: int) -> float:
             return float(((refused & flag) != 0).sum())
 
-        late_ms, age_ms = 1e3 * known("lateness_s"), 1e3 * known("age_s")
+        answer_ms, age_ms = 1e3 * known("answer_s"), 1e3 * known("age_s")
         solve_ms, gap = 1e3 * known("solve_time_s"), known("gap")
         # A setpoint without certificate was changed by the gate, in EXCITE perhaps by a step
         changed = np.isnan(columns["at_bound"]) & np.isfinite(columns["thrust_mps2"])
@@ -52,8 +52,9 @@ class Decisions:
         at_bound = np.where(limited, 1.0, columns["at_bound"])
         return {
             "decisions": float(len(refused)),
-            "lateness_p99_ms": _percentile(late_ms, 99),
-            "lateness_max_ms": _percentile(late_ms, 100),
+            "answer_p50_ms": _percentile(answer_ms, 50),
+            "answer_p99_ms": _percentile(answer_ms, 99),
+            "answer_max_ms": _percentile(answer_ms, 100),
             "setpoint_age_p99_ms": _percentile(age_ms, 99),
             "setpoint_age_max_ms": _percentile(age_ms, 100),
             "missed_ticks": float(known("missed_ticks").sum()),

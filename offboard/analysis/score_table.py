@@ -37,10 +37,10 @@ def summary(score: Score, history: History) -> dict[str, str]:
     if math.isfinite(score.rmse_truth_m):
         error = f"{score.rmse_truth_m:.3f} m RMSE, {score.max_truth_m:.3f} m maximum"
         rows["true error"] = f"{error} (simulated vehicle)"
-    if math.isfinite(score.solve_time_p99_ms):
-        decision = f"decision {score.solve_time_p99_ms:.2f} ms (99th percentile)"
+    if math.isfinite(score.answer_p99_ms):
+        answer = f"{score.answer_p50_ms:.1f} ms (99th percentile {score.answer_p99_ms:.1f} ms)"
         missed = f"{score.missed_ticks:.0f} of {score.decisions:.0f} ticks missed"
-        rows["timing"] = f"{decision}, {missed}"
+        rows["timing"] = f"setpoint {answer} after its telemetry, {missed}"
     if score.at_bound_share >= AT_LIMIT_SHARE:
         share = f"{100.0 * score.at_bound_share:.0f} % of the decisions"
         rows["at a limit"] = f"{share}: fly slower, or in less wind"

@@ -3,7 +3,7 @@
 One turn takes all that has arrived, in order; then, if vehicle time has crossed a multiple of the
 control period, it decides once, on the newest state: `phase_machine` makes the transitions that are
 due, and `actions` does what the phase requires (`decide` while tracking). Frames are queued in
-`outbox`.
+`outbox`. What no setpoint waits for comes in `finish_turn`: records and identification.
 """
 
 from __future__ import annotations
@@ -107,13 +107,14 @@ class Companion:
         self._turned_s: float = before._turned_s if before else math.nan
         self._heard_s: float = before._heard_s if before else math.nan
         self._bridged_s = 0.0
-        self._received: list[bytes] = []  # frames that are not in an `Output` yet
+        self._logged: list[bytes] = []  # frames since the newest `finish_turn`
+        self._ticked = False  # in this turn
         self._inputs = InputRecorder(session.settings, kept=not programme.serves)
         self.strangers: int = before.strangers if before else 0
         self._recorded_strangers = self.strangers
         self._identification = _identification(vehicle, controller, period_s, identify, learned)
         self._outbox = Outbox(state, session, observer, self._identification)
-        decider = Decider(
+        self._decider = decider = Decider(
             state=state,
             controller=controller,
             observer=observer,
@@ -229,9 +230,10 @@ class Companion:
         self._session.autopilots.hear(system_id, self._session.link_time_s)
 
     def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
-        """Process all that has arrived, then act once if a tick is due.
+        """Process all that has arrived, then act once if a tick is due. Returns what to send.
 
-        Call it at least every 50 ms. `now_s` is host time.
+        Call it at least every 50 ms, and `finish_turn` after the frames were sent. `now_s` is host
+        time.
         """
         before = self._tick
         now_s = self._inputs.begin(now_s, self.strangers)
@@ -239,10 +241,21 @@ class Companion:
             self._take_and_act(chunks, now_s)
         finally:
             self._inputs.end()
-        output = self._outbox.flush(self._received, self._supervised())
-        self._received = []
-        pieces = self._inputs.pieces(all_of_it=self._tick != before or self.has_ended())
-        return replace(output, log=(*output.log, *map(self._session.encode, pieces)))
+        self._ticked = self._tick != before
+        output = self._outbox.flush(self._supervised())
+        self._logged += output.send
+        return output
+
+    def finish_turn(self, sent_s: float) -> list[bytes]:
+        """Do what no setpoint waits for: identify the vehicle, and encode the log's records.
+
+        `sent_s`: host time at which the last frame of the turn was sent. Returns the frames for the
+        log: received, sent, records. Sentences of the identification leave with the next turn.
+        """
+        self._decider.finish(sent_s)
+        pieces = self._inputs.pieces(all_of_it=self._ticked or self.has_ended())
+        logged, self._logged = self._logged, []
+        return [*logged, *self._outbox.records(), *map(self._session.encode, pieces)]
 
     def _take_and_act(self, chunks: Sequence[Chunk], now_s: float) -> None:
         self._begin_turn(now_s)
@@ -254,7 +267,7 @@ class Companion:
             self._inputs.chunk(chunk, reception)
             if reception.events:
                 self.peer = chunk.peer
-            self._received += reception.frames
+            self._logged += reception.frames
             replies += reception.replies
             for event in reception.events:
                 heard |= self._is_telemetry(event)

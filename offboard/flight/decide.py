@@ -1,7 +1,7 @@
 """Decision of one tick: predict the state, call the control law, and send its command by the gate.
 
-Then log the decision and identify the vehicle. Failures of the law are counted, never raised: the
-vehicle is in the air.
+Once the setpoint has left, log the decision and identify the vehicle. Failures of the law are
+counted, never raised: the vehicle is in the air.
 """
 
 from __future__ import annotations
@@ -79,6 +79,7 @@ class Decider:
         self._period_s = period_s
         self._deadline_s = deadline_s
         self._stopwatch = stopwatch
+        self._unfinished: tuple[Tick, Decided] | None = None
 
     def begin(self) -> None:
         """Before the first decision: limit the bandwidth until the vehicle is identified."""
@@ -87,33 +88,46 @@ class Decider:
             self._controller.adopt(self._state.model, limit_radps)
 
     def decide(self, tick: Tick) -> bool:
-        """Decide, send the setpoint, log the decision, then identify.
+        """Decide, and queue the setpoint.
 
         Returns False, and increases `missed`, if the decision failed or the gate refused it; then
         nothing is sent. Telemetry that was too old before the decision began does not count: the
         ladder has a row for it.
         """
         was_old = self._state.telemetry_is_old
-        stale = False
         try:
             decided = self._send(tick, self._decided(tick))
-            self._record(tick, decided)
-            failure = decided.failure
-            stale = was_old and decided.refused is Refusal.STALE
         except Exception as error:  # any error: the vehicle is in the air
-            failure = f"{type(error).__name__}: {error}"
-        if stale:
+            self._miss(f"{type(error).__name__}: {error}")
             return False
-        if failure:
-            self._state.missed += 1
-            self._state.failure = failure
-            self._outbox.warn(f"decision missed: {failure}")
+        self._unfinished = tick, decided
+        if was_old and decided.refused is Refusal.STALE:
             return False
-        self._state.missed = 0
+        if decided.failure:
+            self._miss(decided.failure)
+            return False
         self._state.predictions.append(decided.state)
-        if self._identification:
-            self._identify(tick, self._identification)
         return True
+
+    def finish(self, sent_s: float) -> None:
+        """After the setpoint was sent, at host time `sent_s`: log the decision and identify."""
+        if self._unfinished is None:
+            return
+        (tick, decided), self._unfinished = self._unfinished, None
+        try:
+            self._record(tick, decided, sent_s - tick.arrived_s)
+        except Exception as error:  # the certificate is the law's
+            self._miss(f"{type(error).__name__}: {error}")
+            return
+        if decided.refused is None:
+            self._state.missed = 0
+            if self._identification:
+                self._identify(tick, self._identification)
+
+    def _miss(self, failure: str) -> None:
+        self._state.missed += 1
+        self._state.failure = failure
+        self._outbox.warn(f"decision missed: {failure}")
 
     def _send(self, tick: Tick, decided: Decided) -> Decided:
         """Send the command, if the gate admits it."""
@@ -191,7 +205,7 @@ class Decider:
         for sentence in adoption.sentences:
             self._outbox.announce(sentence)
 
-    def _record(self, tick: Tick, decided: Decided) -> None:
+    def _record(self, tick: Tick, decided: Decided, answer_s: float) -> None:
         sample = self._state.plan.sample(tick.time_s)
         assert sample is not None
         self._outbox.send(reference_record(tick.time_s, sample))
@@ -201,7 +215,7 @@ class Decider:
             sent=decided.sent,
             state=decided.state,
             solve_time_s=decided.solve_time_s,
-            lateness_s=self._stopwatch() - tick.arrived_s,
+            answer_s=answer_s,
             missed_ticks=tick.missed,
             hover_thrust=self._observer.hover_thrust_estimate,
             track_time_s=self._state.plan.track_time_s(tick.time_s),

@@ -1,8 +1,8 @@
 """Outbox: the only place from which setpoints and commands leave, and the queue of all messages.
 
 A setpoint passes the gate first, and is then given to the observer and the identification, which
-predict with the commands that were sent. `flush` encodes what is queued. Decides nothing; owns no
-socket or file.
+predict with the commands that were sent. `flush` encodes what is to be sent, `records` what is only
+logged, after that. Decides nothing; owns no socket or file.
 """
 
 from __future__ import annotations
@@ -36,10 +36,9 @@ REPEAT_S = 1.0  # after this a request that was refused, or not answered, is sen
 
 @dataclass(frozen=True, slots=True)
 class Output:
-    """Result of one turn: frames to send, and all frames for the log, records included."""
+    """What one turn sends."""
 
     send: tuple[bytes, ...] = ()
-    log: tuple[bytes, ...] = ()
     supervised: Supervised | None = None  # for the supervisor; None before the vehicle is found
 
 
@@ -65,6 +64,7 @@ class Outbox:
         self._requested_s: dict[tuple[Phase, CommandLong], float] = {}
         self._text_id = 0
         self._queue: list[Outgoing] = []
+        self._records: list[Record] = []
 
     # ------------------------------------------------------------------ setpoints
 
@@ -194,11 +194,18 @@ class Outbox:
 
     def send(self, *messages: Outgoing) -> None:
         """Queue messages to send and to log; records are only logged."""
-        self._queue.extend(messages)
+        for message in messages:
+            if isinstance(message, Record):
+                self._records.append(message)
+            else:
+                self._queue.append(message)
 
-    def flush(self, received: list[bytes], supervised: Supervised | None = None) -> Output:
-        """Encode the queue. In the log, the frames `received` come first."""
+    def flush(self, supervised: Supervised | None = None) -> Output:
+        """Encode what is to be sent."""
         queue, self._queue = self._queue, []  # empty, should one of them not be encodable
-        frames = [(message, self._session.encode(message)) for message in queue]
-        send = tuple(frame for message, frame in frames if not isinstance(message, Record))
-        return Output(send, (*received, *(frame for _, frame in frames)), supervised)
+        return Output(tuple(map(self._session.encode, queue)), supervised)
+
+    def records(self) -> list[bytes]:
+        """Encode what is only logged."""
+        records, self._records = self._records, []
+        return [self._session.encode(record) for record in records]

@@ -53,7 +53,7 @@ class TickRecord:
     cut_short: float
     at_bound: float
     solve_time_s: float
-    lateness_s: float  # wall time from the arrival of the telemetry to the decision's end
+    answer_s: float  # host time from the arrival of the telemetry until the setpoint was sent
     missed_ticks: float  # ticks skipped since the previous record
     predicted_north_m: float
     predicted_east_m: float
@@ -84,7 +84,7 @@ class TickRecord:
         sent: Command | PositionCommand | None,
         state: PredictedState,
         solve_time_s: float,
-        lateness_s: float,
+        answer_s: float,
         missed_ticks: int,
         hover_thrust: float,
         track_time_s: float,
@@ -110,7 +110,7 @@ class TickRecord:
             float(certificate.cut_short) if certificate else NAN,
             float(certificate.at_bound) if certificate else NAN,
             solve_time_s,
-            lateness_s,
+            answer_s,
             float(missed_ticks),
             *_triple(state.position_ned_m),
             *_triple(state.velocity_ned_mps),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -157,6 +158,7 @@ class Replay:
         self.ended_s = self.companion.state.time_s
         if output:
             self._leaving = [self._sent(frame) for frame in output.send]
+            self.companion.finish_turn(math.nan)  # it was not sent
         return Turn(self._number, given, tuple(received), output)
 
     def _output(self, chunks: list[Chunk], now_s: float) -> Output | None:

@@ -128,7 +128,13 @@ def link(flown: History) -> tuple[Panel, ...]:
     )  # fmt: skip
     age = _recorded(flown, "age_s", "telemetry at its setpoint", BLUE, "dots", 1e3)
     late = _recorded(
-        flown, "lateness_s", "arrival to setpoint (host time)", GREEN, "dots", 1e3, main=False
+        flown,
+        "answer_s",
+        "telemetry in to setpoint out (host time)",
+        GREEN,
+        "dots",
+        1e3,
+        main=False,
     )
     stamps = np.unique(flown.position[:, 0])
     gaps = Curve("positions", stamps[1:], 1e3 * np.diff(stamps), BLUE, "dots")

@@ -44,6 +44,7 @@ class Flown(Protocol):
     @property
     def outcome(self) -> Outcome | None: ...
     def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output: ...
+    def finish_turn(self, sent_s: float) -> Sequence[bytes]: ...
     def has_ended(self) -> bool: ...
     def request_stop(self, why: str = ...) -> None: ...
     def announce(self, sentence: str) -> None: ...
@@ -129,7 +130,14 @@ class Loop:
         began_s = clock.monotonic_s()
         if chunks:
             self._heard_s = began_s
-        self._deliver(self._companion.turn(chunks, began_s), began_s)
+        output = self._companion.turn(chunks, began_s)
+        if self._taken_over():
+            return
+        dropped = self._send(output, began_s)
+        stamp = clock.unix_us()
+        for frame in self._companion.finish_turn(clock.monotonic_s()):
+            if frame not in dropped:
+                self._log.write(stamp, frame)
         strangers = self._link.strangers
         self._companion.strangers = strangers.total
         self._companion.overhear(strangers.overheard())
@@ -140,12 +148,10 @@ class Loop:
         self._show()
         self._check_simulator(began_s - self._heard_s)
 
-    def _deliver(self, output: Output, began_s: float) -> None:
-        """Send and log. This process may have been stopped since the turn began: then what the turn
-        decided is dropped."""
+    def _send(self, output: Output, began_s: float) -> list[bytes]:
+        """Send what a turn has decided. This process may have been stopped since the turn began:
+        then it is dropped, and returned."""
         peer = self._companion.peer
-        if self._taken_over():
-            return
         dropped: list[bytes] = []
         for frame in output.send:
             if self._supervisor and clock.monotonic_s() - began_s > STOPPED_S:
@@ -155,13 +161,10 @@ class Loop:
         if dropped:
             self._companion.on_dropped(len(dropped))
             self._companion.announce(f"{len(dropped)} messages dropped: they became too old")
-        stamp = clock.unix_us()
-        for frame in output.log:
-            if frame not in dropped:
-                self._log.write(stamp, frame)
         if peer is not None:
             self._link.follow(peer)
             self._beat(output, peer)
+        return dropped
 
     # --- the supervisor ---
 

@@ -214,6 +214,10 @@ class Flights:
         self._collect()
         return output
 
+    def finish_turn(self, sent_s: float) -> list[bytes]:
+        """As `Companion.finish_turn`."""
+        return self._current.finish_turn(sent_s)
+
     def close(self) -> None:
         """The service ends."""
         self._end_record()

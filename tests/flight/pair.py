@@ -142,7 +142,6 @@ class Pair:
             self.phases.append((self.time_s, self.companion.phase))
 
     def _take(self, output: Any) -> None:
-        self.logged.extend(output.log)
         self.sent.extend((self.time_s, self.companion.phase, frame) for frame in output.send)
         self.leaving += self.up(self.time_s, list(output.send))
         worst = self.companion.state.ladder.worst
@@ -150,6 +149,10 @@ class Pair:
             self.rungs[worst.name] = worst.rung
         if self.clock.now_s <= HOST_EPOCH_S + self.time_s / self.rate:
             self._feed()
+        self._keep(self.companion.finish_turn(self.clock.now_s))
+
+    def _keep(self, frames: Iterable[bytes]) -> None:
+        self.logged.extend(frames)
 
     def _feed(self) -> None:
         frames, self.leaving = self.leaving, []

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,6 @@ from pair import (
 )
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from offboard.flight.companion import Output
 from offboard.flight.phases import Phase
 from offboard.flight.programme import Anchor, Then, service
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
@@ -214,15 +213,13 @@ class Serving(Pair):
                 self.heard_mode_s = time_s
         return datagrams + extra
 
-    def _take(self, output: Output) -> None:
+    def _keep(self, frames: Iterable[bytes]) -> None:
         """What the loop does with a log; only tests without one look at what was sent."""
         if not isinstance(self.logs, Recorder):
-            super()._take(output)
+            super()._keep(frames)
             return
-        for frame in output.log:
+        for frame in frames:
             self.logs.write(UNIX_EPOCH_US + round(1e6 * self.time_s), frame)
-        output = replace(output, log=())
-        super()._take(output)
         self.sent.clear()
 
     def send_up(self, _: float, frames: list[bytes]) -> list[bytes]:

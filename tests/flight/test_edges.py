@@ -61,7 +61,7 @@ class Flight:
 
     def __init__(self, turns: int, during: Callable[[int], object], log: bytes = b"") -> None:
         self.turns, self.during = turns, during
-        self.log = (log,) if log else ()
+        self.log: Sequence[bytes] = (log,) if log else ()
         self.stops = 0
         self.outcome: Outcome | None = None
         self.announced: list[str] = []
@@ -88,7 +88,10 @@ class Flight:
         self.during(self.turns)
         if self.turns == 0:
             self.outcome = Outcome(0, "flown and landed")
-        return Output(log=self.log)
+        return Output()
+
+    def finish_turn(self, sent_s: float) -> Sequence[bytes]:
+        return self.log
 
 
 def fly(flight: Flight, directory: Path, progress: Callable[[Any], None]) -> Outcome:
@@ -179,7 +182,8 @@ def test_what_a_turn_decided_is_dropped_when_it_became_too_old(tmp_path: Path) -
             super().turn(chunks, now_s)
             if self.turns == 1:
                 time.sleep(0.25)
-            return Output(send=(frame,), log=(frame,))
+            self.log = [frame]
+            return Output(send=(frame,))
 
     flight = Deciding(3, lambda left: None)
     directory = tmp_path / "flight"

@@ -17,7 +17,7 @@ from pair import SHORT, Bytes, HostClock, Pair, frames_of, hover, in_phase, make
 from watch import BOTH, HIGH, LAND, SET_MODE, Fly, Watch, said, sent_after, watched
 
 from offboard.control.base import Controller, Decision, Situation
-from offboard.flight.online_identification import IdentifySettings
+from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
 from offboard.flight.phases import ExitCode, Phase, Rung
 from simulator import config as simulated
 
@@ -167,6 +167,36 @@ def test_a_law_that_needs_most_of_the_period_is_flown(fly: Fly) -> None:
     assert watch.error_m < 0.1
     assert pair.rungs == {}
     assert max(ages_s(pair)) < 0.1 + PERIOD_S
+
+
+def test_no_setpoint_waits_for_the_identification(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each of its pieces takes 60 ms, and the decision 2 ms."""
+    clock = HostClock()
+    identify = OnlineIdentification.learn
+
+    def slow(*arguments: Any) -> Any:
+        clock.spend(0.06)
+        return identify(*arguments)
+
+    def deciding(law: Controller) -> Controller:
+        decide = law.decide
+
+        def later(situation: Situation) -> Decision:
+            clock.spend(0.002)
+            return decide(situation)
+
+        law.decide = later  # type: ignore[method-assign]
+        return law
+
+    monkeypatch.setattr(OnlineIdentification, "learn", slow)
+    pair = hover(learning=IdentifySettings(), deadline_s=DEADLINE_S, clock=clock, wrap=deciding)
+    pair.track()
+    score = pair.score(tmp_path)
+    assert score.answer_p50_ms == pytest.approx(2.0, abs=0.01)
+    assert score.answer_max_ms < 8.0  # with a step of the simulation
+    assert score.missed_ticks == 0
 
 
 def paused(

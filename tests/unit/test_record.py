@@ -33,7 +33,7 @@ STATE = PredictedState(
 
 def record(sent: Command | None, **more: float) -> TickRecord:
     return TickRecord.of(
-        phase=8, decision=DECISION, sent=sent, state=STATE, solve_time_s=0.001, lateness_s=0.002,
+        phase=8, decision=DECISION, sent=sent, state=STATE, solve_time_s=0.001, answer_s=0.002,
         missed_ticks=0, hover_thrust=0.5, track_time_s=1.0, **more,
     )  # fmt: skip
 
