@@ -77,7 +77,8 @@ def daemon(
     seed: Annotated[int | None, option("N", "Random seed.")] = None,
     out_directory: Annotated[Path | None, option("DIR", OUT, "--out")] = None,
     metrics: Annotated[
-        str | None, option("HOST:PORT", "Serve /metrics (Prometheus) and /health.  [default: off]")
+        str | None,
+        option("HOST:PORT", "Serve /metrics, /health and a page.  [default: off]"),
     ] = None,
     log_json: Annotated[
         bool, typer.Option("--log-json", help="Print one JSON object a line.")

@@ -158,11 +158,11 @@ def _displays(live: str | None, foxglove: str | None, *, json_lines: bool) -> Di
     """What shows the flight: lines, and servers at the addresses `live` and `foxglove`."""
     from offboard.live.displays import Displays
     from offboard.live.lines import JsonLines, Terminal
-    from offboard.live.process import LiveProcess
+    from offboard.live.process import SERVER, LiveProcess
 
     lines = JsonLines(write) if json_lines else Terminal(out, partial(say, indent=12))
     servers = (
-        ("offboard.live.server", "--live", live),
+        (SERVER, "--live", live),
         ("offboard.live.foxglove_server", "--foxglove", foxglove),
     )
     pages = [LiveProcess(module, name, address) for module, name, address in servers if address]

@@ -53,6 +53,7 @@ class Snapshot:
     strangers: int  # datagrams of other senders since the start
     forged: int  # frames that signing refused since the start
     texts: tuple[str, ...]  # the newest announcements, oldest first
+    flights: int = 0  # that the service has begun
 
 
 def snapshot_of(

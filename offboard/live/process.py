@@ -11,18 +11,32 @@ import math
 import subprocess
 import sys
 from contextlib import suppress
+from typing import Protocol
 
 from offboard.documents.arguments import split_address
 from offboard.documents.errors import UserError
-from offboard.flight.companion import Companion
 from offboard.flight.snapshot import Snapshot
 from offboard.io import clock
 from offboard.io.background import BackgroundWriter
 from offboard.live.values import as_dict, line
 
+SERVER = "offboard.live.server"
 PERIOD_S = 0.1  # between two snapshots, host time
 QUEUED_MAX = 50  # snapshots that wait for the pipe, which holds about as many
 CLOSE_S = 1.0  # for what is queued, and again for the end of the process
+
+
+class NotServed(UserError):
+    """The address cannot be served now: another program has it, for example."""
+
+    is_usage = False
+
+
+class Shown(Protocol):
+    """A companion, or the flights of a service."""
+
+    def has_ended(self) -> bool: ...
+    def snapshot(self) -> Snapshot: ...
 
 
 class LiveProcess:
@@ -45,16 +59,16 @@ class LiveProcess:
         self._due_s = -math.inf
 
     def await_ready(self) -> str:
-        """Wait until it listens; where. Raises UserError."""
+        """Wait until it listens; where. Raises NotServed."""
         assert self._process.stdout is not None
         with self._process.stdout as output:
             said = output.readline()
         answer = json.loads(said) if said else {"error": "its process does not start"}
         if "error" in answer:
-            raise UserError(f"{self._option}: {answer['error']}")
+            raise NotServed(f"{self._option}: {answer['error']}")
         return str(answer["url"])
 
-    def show(self, companion: Companion) -> None:
+    def show(self, companion: Shown) -> None:
         now_s = clock.monotonic_s()
         if now_s >= self._due_s or companion.has_ended():
             self._due_s = now_s + PERIOD_S

@@ -1,13 +1,16 @@
-"""The live page: `python -m offboard.live.server HOST PORT`, snapshots as JSON lines on stdin.
+"""What serves clients: `python -m offboard.live.server HOST PORT`, snapshots as JSON on stdin.
 
-Serves the page at / and server-sent events at /events: first what was kept of the flight so far,
-then each snapshot. A client that does not read misses snapshots; it delays nobody.
+Serves the live page at /, server-sent events at /events (first what was kept of the flight so far,
+then each snapshot), /metrics and /health. A client that does not read misses snapshots; it delays
+nobody. The number of connections is limited, and so is the life of each but those of /events: slow
+or idle ones use up neither descriptors nor memory.
 """
 
 from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import os
 import sys
 from collections import deque
@@ -15,14 +18,18 @@ from contextlib import suppress
 from typing import Any
 
 from aiohttp import web
+from prometheus_client import CONTENT_TYPE_LATEST
 
 from offboard.documents.arguments import join_address
+from offboard.live.metrics import Metrics
 from offboard.live.values import line
 
 KEPT = 3000  # snapshots, five minutes
 CLIENTS_MAX = 20
 CLIENT_QUEUE = 50  # snapshots that a client may be late
 CLIENT_S = 10.0  # in which a client must take one
+CONNECTIONS_MAX = 60  # those of clients that watch included
+CONNECTION_S = 5.0  # from its beginning to its end, unless the client watches
 LINE_MAX = 1 << 20
 _NICENESS = 5
 _TRACE = ("time_s", "position_ned_m", "reference_ned_m", "position_error_m", "telemetry_age_s")
@@ -32,13 +39,16 @@ class Broadcast:
     """Passes each snapshot on to all clients, and keeps what the curves of the page need."""
 
     def __init__(self) -> None:
+        self.metrics = Metrics()
         self._clients: set[asyncio.Queue[str | None]] = set()
+        self._watching: set[web.RequestHandler] = set()
         self._kept: deque[dict[str, Any]] = deque(maxlen=KEPT)
         self._newest: dict[str, Any] | None = None
 
     def publish(self, text: str) -> None:
         """A snapshot as JSON text."""
         self._newest = json.loads(text)
+        self.metrics.show(self._newest)
         self._kept.append({name: self._newest[name] for name in _TRACE})
         self._put(text)
 
@@ -62,34 +72,81 @@ class Broadcast:
         queue: asyncio.Queue[str | None] = asyncio.Queue(CLIENT_QUEUE)
         queue.put_nowait(line("history", rows=list(self._kept), newest=self._newest))
         self._clients.add(queue)
+        self._watching.add(request.protocol)
         with suppress(ConnectionError, TimeoutError, asyncio.TimeoutError):
             await response.prepare(request)
             while (text := await queue.get()) is not None:
                 await asyncio.wait_for(response.write(f"data: {text}\n\n".encode()), CLIENT_S)
             await asyncio.wait_for(response.write(b"event: end\ndata: {}\n\n"), CLIENT_S)
         self._clients.discard(queue)
+        self._watching.discard(request.protocol)
         return response
 
+    def connection(self, server: web.Server) -> asyncio.Protocol:
+        """What handles a new connection to `server`: nothing, if there are too many."""
+        if len(server.connections) >= CONNECTIONS_MAX:
+            return _Refused()
+        handler = server()
+        asyncio.get_running_loop().call_later(CONNECTION_S, self._end, handler)
+        return handler
 
-async def serve(host: str, port: int) -> None:
-    """Serve until stdin closes."""
+    def _end(self, handler: web.RequestHandler) -> None:
+        if handler in self._watching:
+            return
+        if handler.transport is not None:
+            handler.transport.abort()
+
+
+class _Refused(asyncio.Protocol):
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        assert isinstance(transport, asyncio.Transport)
+        transport.abort()
+
+
+def application(broadcast: Broadcast) -> web.Application:
+    """The pages by their paths."""
     from offboard.live.page import page
 
-    broadcast, shown = Broadcast(), page()
+    shown = page()
 
     async def index(request: web.Request) -> web.Response:
         return web.Response(text=shown, content_type="text/html")
 
-    application = web.Application()
-    application.add_routes([web.get("/", index), web.get("/events", broadcast.events)])
-    runner = web.AppRunner(application, access_log=None, shutdown_timeout=0.5)
+    async def metrics(request: web.Request) -> web.Response:
+        text = broadcast.metrics.text()
+        return web.Response(body=text, headers={"Content-Type": CONTENT_TYPE_LATEST})
+
+    async def health(request: web.Request) -> web.Response:
+        answer = broadcast.metrics.health()
+        return web.json_response(answer, status=200 if answer["healthy"] else 503)
+
+    made = web.Application()
+    made.add_routes(
+        [
+            web.get("/", index),
+            web.get("/events", broadcast.events),
+            web.get("/metrics", metrics),
+            web.get("/health", health),
+        ]
+    )
+    return made
+
+
+async def serve(host: str, port: int) -> None:
+    """Serve until stdin closes."""
+    broadcast = Broadcast()
+    runner = web.AppRunner(application(broadcast), access_log=None, shutdown_timeout=0.5)
     await runner.setup()
+    serves = runner.server
+    assert serves is not None
     try:
-        site = web.TCPSite(runner, host, port)
-        await site.start()
-        bound = runner.addresses[0][1]
+        server = await asyncio.get_running_loop().create_server(
+            lambda: broadcast.connection(serves), host, port, backlog=CONNECTIONS_MAX
+        )
+        bound = server.sockets[0].getsockname()[1]
         print(json.dumps({"url": f"http://{join_address(host, bound)}"}), flush=True)
         await _read(broadcast)
+        server.close()
         broadcast.end()
         await asyncio.sleep(0.1)  # the clients take their last event
     except OSError as error:
@@ -112,4 +169,5 @@ async def _read(broadcast: Broadcast) -> None:
 
 if __name__ == "__main__":
     os.nice(_NICENESS)  # the controller goes first
+    logging.disable()  # what a client does wrong is no line on the terminal
     asyncio.run(serve(sys.argv[1], int(sys.argv[2])))

@@ -24,19 +24,18 @@ from offboard.io.link import Link, LinkError
 from offboard.io.lock import connection_lock, directory_lock
 from offboard.io.signing_time import SigningTime
 from offboard.io.stop import StopRequests
+from offboard.live.process import SERVER, LiveProcess
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.run.loop import Loop
 from offboard.run.one_flight import discard
 from offboard.run.request import FlightRequest
 from offboard.service.flights import Flights
 from offboard.service.memory import VehicleFiles
-from offboard.service.monitor import Monitor
 from offboard.service.preparation import Preparation
 from offboard.service.record import Recorder, score
 from offboard.supervisor.supervisor import Supervisor
 
 LINK_FIRST_S, LINK_MOST_S = 1.0, 5.0  # between two attempts to open the link
-SHOWN_EVERY_S = 0.25
 WATCHDOG_EVERY_S = 1.0
 NOTICES_MAX, NOTICES_S = 100, 1.0  # that wait for the service manager; for them, at the end
 STOPPED_EARLY = "stopped before the link was open"
@@ -64,7 +63,7 @@ def run(
     """Serve until a stop is requested.
 
     `tell` is called with sentences about the preparation, `show` often, to show what the flights
-    announce; neither may wait. Raises LockError, MonitorError, DocumentError, SupervisorError or
+    announce; neither may wait. Raises LockError, NotServed, DocumentError, SupervisorError or
     LogError, all before anything is sent.
     """
     request = wanted.request
@@ -72,9 +71,9 @@ def run(
         stack.enter_context(connection_lock(request.connection))
         request.resolve()  # a wrong configuration is refused before anything starts
         stack.enter_context(directory_lock(request.directory))
-        monitor = Monitor(wanted.metrics) if wanted.metrics else None
+        monitor = LiveProcess(SERVER, "--metrics", wanted.metrics) if wanted.metrics else None
         if monitor:
-            stack.enter_context(closing(monitor))
+            stack.enter_context(closing(monitor)).await_ready()
         key = read_key(request.signing_key) if request.signing_key else None
         signing = stack.enter_context(SigningTime(key)) if key else None
         supervisor = stack.enter_context(Supervisor(signing))
@@ -194,7 +193,7 @@ class Display:
         flights: Flights,
         show: Callable[[Flights], None],
         preparation: Preparation,
-        monitor: Monitor | None,
+        monitor: LiveProcess | None,
         manager: Manager,
     ) -> None:
         self._flights = flights
@@ -202,7 +201,6 @@ class Display:
         self._preparation = preparation
         self._monitor = monitor
         self._manager = manager
-        self._shown_s = 0.0
 
     def update(self) -> None:
         now_s = clock.monotonic_s()
@@ -210,6 +208,5 @@ class Display:
         self._manager.alive(now_s, flights.phase.value)
         self._preparation.allow(not (flights.in_flight or flights.state.vehicle.armed))
         self._show(flights)
-        if self._monitor and now_s - self._shown_s >= SHOWN_EVERY_S:
-            self._shown_s = now_s
-            self._monitor.show(flights.snapshot(), flights.engagements, now_s)
+        if self._monitor:
+            self._monitor.show(flights)

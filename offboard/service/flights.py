@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from offboard.flight import assessment, guards
@@ -160,7 +160,7 @@ class Flights:
         return self._current.outcome
 
     def snapshot(self) -> Snapshot:
-        return self._current.snapshot()
+        return replace(self._current.snapshot(), flights=self.engagements)
 
     def has_ended(self) -> bool:
         """Whether the service was stopped, and no flight is left."""

@@ -151,7 +151,7 @@ def test_an_address_that_cannot_be_served_is_refused() -> None:
         pytest.raises(UserError, match=r"listened on \((?!Unknown error)"),
     ):
         process.await_ready()
-    for wrong in ("8014x", "localhost", "127.0.0.1:99999", "127.0.0.1:²"):
+    for wrong in ("", "8014x", "localhost:", "127.0.0.1:99999", "127.0.0.1:²", "[::1:1"):
         with pytest.raises(UserError, match="give HOST:PORT"):
             LiveProcess(SERVER, "--live", wrong)
 

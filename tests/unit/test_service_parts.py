@@ -17,7 +17,6 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.analysis import tlog
 from offboard.cli.daemon import may_pass
-from offboard.documents.errors import UserError
 from offboard.flight import manifest
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
 from offboard.flight.pilot_switch import PilotSwitch
@@ -37,7 +36,6 @@ from offboard.service import daemon, preparation, unit
 from offboard.service.daemon import Manager
 from offboard.service.flights import Prepared
 from offboard.service.memory import VehicleFiles
-from offboard.service.monitor import Monitor
 from offboard.service.preparation import Preparation
 from offboard.service.record import ROLLING_NAMES, Recorder
 
@@ -344,12 +342,6 @@ def test_a_changed_configuration_is_used_and_a_bad_one_refused(
     watched.look()
     assert watched.news() == ["the configuration has changed: used from the next flight on"]
     assert "height_m: 3" in watched.newest().text
-
-
-@pytest.mark.parametrize("address", ["", "9464", "localhost:", "a:b", "127.0.0.1:99999", "[::1:1"])
-def test_an_address_to_serve_that_is_none(address: str) -> None:
-    with pytest.raises(UserError, match="give HOST:PORT"):
-        Monitor(address)
 
 
 def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:
