@@ -1,30 +1,33 @@
-"""The table of the ladder in offboard/flight/README.md is that of the code.
+"""The tables in offboard/flight/README.md are those of the code.
 
-`python tests/test_flight_readme.py` writes it.
+`python tests/test_flight_readme.py` writes them.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from offboard.flight import ladder
+from offboard.flight import ladder, programme
 
 README = Path(__file__).parents[1] / "offboard" / "flight" / "README.md"
-BEGIN, END = "<!-- ladder:begin -->\n", "<!-- ladder:end -->"
+TABLES = {"ladder": ladder.markdown, "exits": programme.markdown}
 
 
-def with_table(text: str) -> str:
-    """The same page with the table of the code between its markers."""
-    before, _, rest = text.partition(BEGIN)
-    _, _, after = rest.partition(END)
-    return f"{before}{BEGIN}{ladder.markdown()}\n{END}{after}"
+def with_tables(text: str) -> str:
+    """The same page with the tables of the code between their markers."""
+    for name, table in TABLES.items():
+        begin, end = f"<!-- {name}:begin -->\n", f"<!-- {name}:end -->"
+        before, _, rest = text.partition(begin)
+        _, _, after = rest.partition(end)
+        text = f"{before}{begin}{table()}\n{end}{after}"
+    return text
 
 
-def test_the_ladder_is_that_of_the_code() -> None:
+def test_the_tables_are_those_of_the_code() -> None:
     text = README.read_text(encoding="utf-8")
     assert len(ladder.markdown().splitlines()) == len(ladder.ROWS) + 2
-    assert text == with_table(text)
+    assert text == with_tables(text)
 
 
 if __name__ == "__main__":
-    README.write_text(with_table(README.read_text(encoding="utf-8")), encoding="utf-8")
+    README.write_text(with_tables(README.read_text(encoding="utf-8")), encoding="utf-8")

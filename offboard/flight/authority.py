@@ -112,6 +112,12 @@ class Authority:
         if self._arrived_s < self._counts_from_s:
             self.reported_s = -math.inf
 
+    def forget(self) -> None:
+        """The vehicle was rebooted: its standing is shown by the next report of the mode."""
+        self.heard_s = self.reported_s = -math.inf
+        if self.standing is Standing.HANDED:
+            self.standing = Standing.OURS
+
     def lose(self, reason: str, now_s: float) -> None:
         """The vehicle is not ours any more, for good."""
         if self.standing is not Standing.LOST:

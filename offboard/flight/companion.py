@@ -334,9 +334,11 @@ class Companion:
 
     def _is_telemetry(self, event: Event) -> bool:
         """Whether the event ends a silence. Once position and attitude are received only they do:
-        without them vehicle time stands still and nothing is decided."""
+        without them vehicle time stands still and nothing is decided. After a reboot in flight both
+        must be received again."""
         if not self.state.vehicle.has_state:
-            return not isinstance(event, ClockBehind)
+            on_ground = self.state.phase in BEFORE_FLIGHT
+            return on_ground and not isinstance(event, ClockBehind)
         return isinstance(event, (Attitude, LocalPosition))
 
     def _on_reboot(self) -> None:

@@ -11,7 +11,7 @@ from offboard.flight.ground_contact import GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.outbox import Outbox
-from offboard.flight.phases import TRACKING, WAITING
+from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, WAITING
 from offboard.flight.position_jumps import PositionJumps
 from offboard.flight.readiness import Readiness
 from offboard.flight.requests import Circumstances, Request, Result, answer
@@ -197,4 +197,8 @@ class EventProcessor:
         state.contact = GroundContact(state.vehicle)
         state.hover, state.jumps = HoverEstimate(), PositionJumps()
         state.readiness = Readiness()
-        state.authority = None
+        state.takeoff_ned_m = None  # the local frame begins elsewhere
+        if state.authority and state.phase not in BEFORE_FLIGHT:
+            state.authority.forget()
+        else:
+            state.authority = None

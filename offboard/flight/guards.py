@@ -33,6 +33,10 @@ def rebooted(now: Facts) -> bool:
     return now.rebooted
 
 
+def rebooted_disarmed(now: Facts) -> bool:
+    return now.rebooted and not now.armed and not now.landed
+
+
 def flown_by_another(now: Facts) -> bool:
     """Armed and in the mode of setpoints, before we sent one."""
     return now.engaged and now.armed and not now.limits.begin_engaged
@@ -71,6 +75,7 @@ def can_take_over(now: Facts) -> bool:
         and now.in_the_air
         and not now.failsafe
         and not other_sender(now)
+        and now.authority_known
         and not silent(now)
         and not blind(now)
     )

@@ -18,7 +18,7 @@ from offboard.flight.pilot_switch import PilotSwitch
 from offboard.flight.requests import Request
 from offboard.flight.state import FlightState, Outcome
 from offboard.flight.touchdown import Touchdown
-from offboard.flight.transitions import Row
+from offboard.flight.transitions import REBOOTED, Row
 from offboard.mavlink.events import LocalPosition
 from offboard.mavlink.session import Session
 
@@ -54,9 +54,15 @@ class PhaseMachine:
         self._state.request = Request.NONE
 
     def on_reboot(self) -> None:
-        """The vehicle was rebooted: this ends the flight, except while telemetry is awaited."""
-        self._state.rebooted = self._state.phase not in (Phase.CONNECT, Phase.HEALTH)
-        self._state.pilot = PilotSwitch(unclaimed=self._state.programme.serves)
+        """The vehicle was rebooted: this ends the flight, except while telemetry is awaited. A
+        landing goes on, but the flight is none that was flown to its end."""
+        state = self._state
+        state.rebooted = state.phase not in (Phase.CONNECT, Phase.HEALTH)
+        state.pilot = PilotSwitch(unclaimed=state.programme.serves)
+        if state.phase is Phase.LAND:
+            state.touchdown = Touchdown(None)
+            if state.outcome is None:
+                state.outcome = Outcome(ExitCode.ABORTED, f"{REBOOTED} while landing")
         self.advance()
 
     def facts(self) -> Facts:

@@ -44,7 +44,7 @@ class Rung(IntEnum):
     LEVEL = 1  # this tick: level, with the estimated hover thrust, instead of the decision
     HOLD = 2  # the autopilot is asked to hold, after `Limits.hold_s` to land
     LAND = 3  # the autopilot is asked to land
-    SILENCE = 4  # nothing is sent any more
+    SILENCE = 4  # nothing is sent until the mode is reported again, then land
 
 
 # The number of a phase in logs. Never reuse a number: old logs must stay readable.

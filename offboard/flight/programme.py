@@ -12,8 +12,8 @@ from typing import Literal
 
 from offboard.flight import guards
 from offboard.flight.facts import Facts
-from offboard.flight.guards import longer_than, requested
-from offboard.flight.phases import TRACKING, ExitCode, Phase
+from offboard.flight.guards import Guard, longer_than, requested
+from offboard.flight.phases import ENDS, FLYING, TRACKING, ExitCode, Phase
 from offboard.flight.requests import Request
 from offboard.flight.transitions import REBOOTED, TRANSITIONS, Row, flying_rows
 
@@ -112,6 +112,52 @@ def service(then: Then, anchor: Anchor, *, arms: bool) -> Programme:
     ]
     rows = (*_WAITING_ROWS, *_HAND_BACK_ROWS, *kept, *_REQUEST_ROWS, *_THEN[then])
     return Programme(rows, anchor, serves=True, may_arm=arms)
+
+
+_ASKED = {Phase.HAND_BACK: "hold", Phase.HOLD: "hold, then land", Phase.LAND: "land"}
+_PILOT, _ON_GROUND = "nothing: a pilot or a failsafe has it", "nothing: it is disarmed"
+_UNASKED: dict[Guard, str] = {
+    guards.lost: _PILOT,
+    guards.lost_armed: _PILOT,
+    guards.disarmed: _ON_GROUND,
+    guards.rebooted_disarmed: _ON_GROUND,
+    guards.disarmed_elsewhere: _ON_GROUND,
+    guards.landed: _ON_GROUND,
+}
+IN_THE_AIR = FLYING | {Phase.LAND}
+
+
+def asked(row: Row) -> str:
+    """What is asked of the autopilot where `row` leaves a phase in the air; empty: nothing, and
+    without a reason."""
+    before = _ASKED.get(row.source)
+    return (
+        _ASKED.get(row.target)
+        or _UNASKED.get(row.guard)
+        or (f"{before}, in this phase" if before else "")
+    )
+
+
+def exits(programme: Programme) -> list[Row]:
+    """The rows that leave the air, or the phases that fly by setpoints for those that end it."""
+    leaving = ENDS | _ASKED.keys()
+    return [row for row in programme.rows if row.source in IN_THE_AIR and row.target in leaving]
+
+
+def markdown() -> str:
+    """The table of all exits from the air, for the README of `flight/`."""
+    lines = ["| condition | in the phases | then | asked of the autopilot |", "|---|---|---|---|"]
+    sources: dict[tuple[str, str, str], list[str]] = {}
+    for row in dict.fromkeys((*exits(FLY), *exits(service("land", "here", arms=True)))):
+        condition = row.guard.__name__.replace("_", " ")
+        phases = sources.setdefault((condition, row.target.value, asked(row)), [])
+        if row.source.value not in phases:
+            phases.append(row.source.value)
+    every = [phase.value for phase in Phase if phase in FLYING]
+    for (condition, target, request), phases in sources.items():
+        within = "all that fly" if set(phases) >= set(every) else ", ".join(phases)
+        lines.append(f"| {condition} | {within} | {target} | {request} |")
+    return "\n".join(lines)
 
 
 def _in_service(row: Row) -> Row:

@@ -74,10 +74,10 @@ def _streaming_rows(source: Phase) -> tuple[Row, ...]:
 def flying_rows(source: Phase, when: str = "in flight") -> tuple[Row, ...]:
     """What ends a phase in the air early."""
     return (
-        Row(source, guards.rebooted, Phase.FAILED, f"{REBOOTED} {when}", ABORTED),
+        Row(source, guards.rebooted, Phase.LAND, f"{REBOOTED} {when}", ABORTED),
         Row(source, guards.disarmed, Phase.FAILED, f"the vehicle disarmed {when}", ABORTED),
         Row(source, guards.lost, Phase.YIELDED, "{lost}", ABORTED),
-        Row(source, guards.at_rung(Rung.SILENCE), Phase.YIELDED, "{ladder}", ABORTED),
+        Row(source, guards.at_rung(Rung.SILENCE), Phase.LAND, "{ladder}", ABORTED),
         Row(source, guards.at_rung(Rung.LAND), Phase.LAND, "{ladder}", ABORTED),
         Row(source, guards.stop_requested, Phase.LAND, "{stop}", ABORTED),
         Row(source, guards.at_rung(Rung.HOLD), Phase.HOLD, "{ladder}", ABORTED),
@@ -101,8 +101,9 @@ TRANSITIONS: tuple[Row, ...] = (
     *_streaming_rows(Phase.STREAM),
     Row(Phase.STREAM, guards.needs_no_stream, Phase.ENGAGE, "the autopilot takes off by itself"),
     Row(Phase.STREAM, guards.streamed, Phase.ENGAGE, "setpoints stream"),
-    *_streaming_rows(Phase.ENGAGE),
+    # first: from then on it is ours, and whatever ends the flight must ask for hold or land
     Row(Phase.ENGAGE, guards.engaged_in_the_air, Phase.CLIMB, "{mode} in the air"),
+    *_streaming_rows(Phase.ENGAGE),
     Row(Phase.ENGAGE, guards.engaged, Phase.ARM, "the vehicle shows {mode}"),
     _too_long(Phase.ENGAGE, "engage_s", Phase.FAILED, _NOT_ENGAGED, REFUSED),
     Row(Phase.ARM, guards.rebooted, Phase.FAILED, REBOOTED, REFUSED),
@@ -160,8 +161,8 @@ TRANSITIONS: tuple[Row, ...] = (
     _too_long(
         Phase.HOLD, "hold_s", Phase.LAND, "the autopilot held for {in_phase_s:.0f} s", ABORTED
     ),
-    Row(Phase.LAND, guards.rebooted, Phase.FAILED, f"{REBOOTED} while landing", ABORTED),
     Row(Phase.LAND, guards.landed, Phase.DISARMED, _DISARMED),
+    Row(Phase.LAND, guards.rebooted_disarmed, Phase.FAILED, f"{REBOOTED} and is disarmed", ABORTED),
     Row(
         Phase.LAND,
         guards.disarmed_elsewhere,

@@ -187,10 +187,12 @@ class VehicleState:
         return self.time_s - max(newest.time_s, self.resumed_s)
 
     def _reset(self) -> None:
-        """After a reboot nothing is known of the vehicle."""
-        self.heartbeat = self.health = self.estimator = self.position = self.attitude = None
+        """After a reboot nothing is known of the vehicle, but that it was armed, until HEARTBEAT
+        says otherwise."""
+        self.health = self.estimator = self.position = self.attitude = None
         self.landed = self.mode = "unknown"
         self.heard_s.clear()
+        self.results.clear()
         self.resumed_s = -math.inf
         self.parameters.clear()
 

@@ -8,7 +8,10 @@ from __future__ import annotations
 
 from enum import Enum, auto
 
-_REBOOT_S = 2.0  # a stamp older than the newest by more than this means a reboot, not reordering
+# Stamps older than the newest by more than _REBOOT_S are late, unless they go on so: so many in a
+# row, over so long, each within _GAP_S of the one before, are a new epoch
+_REBOOT_S = 2.0
+_EPOCH_STAMPS, _EPOCH_S, _GAP_S = 3, 0.1, 10.0
 SILENCE_S = 1.0
 _WRAP_S = 2**32 / 1e3
 _NEAR_S = 600.0  # a stamp this close to the newest, but for the wrap, continues it
@@ -23,7 +26,8 @@ class Age(Enum):
 
 
 class VehicleTime:
-    """Checks time stamps: those of one message id must increase, none may be far behind the newest.
+    """Checks time stamps: those of one message id must increase. One that is far behind the newest
+    is late; a reboot is several of them in a row that go on from each other.
 
     `newest_s` is the newest stamp of any message.
     """
@@ -31,6 +35,7 @@ class VehicleTime:
     def __init__(self) -> None:
         self.newest_s = 0.0
         self._last_s: dict[int, float] = {}
+        self._older: list[tuple[int, float]] = []  # far behind the newest, in a row: id and stamp
 
     def wrapped_s(self, time_s: float) -> float:
         """Seconds to add to a stamp to continue the newest one across the wrap of `time_boot_ms`;
@@ -47,15 +52,27 @@ class VehicleTime:
     def check(self, message_id: int, time_s: float) -> Age:
         """`time_s`: the stamp, continued by `wrapped_s`."""
         last_s = self._last_s.get(message_id)
-        if time_s < self.newest_s - _REBOOT_S and time_s != last_s:  # not one that is stuck
-            self.newest_s = time_s
-            self._last_s = {message_id: time_s}
-            return Age.REBOOTED
+        if time_s < self.newest_s - _REBOOT_S:
+            stuck = time_s == last_s
+            return Age.STALE if stuck else self._check_older(message_id, time_s)
+        self._older.clear()
         if last_s is not None and time_s <= last_s:
             return Age.STALE
         self._last_s[message_id] = time_s
         self.newest_s = max(self.newest_s, time_s)
         return Age.FRESH
+
+    def _check_older(self, message_id: int, time_s: float) -> Age:
+        repeated = any(each == message_id and time_s <= at_s for each, at_s in self._older)
+        if repeated or (self._older and abs(time_s - self._older[-1][1]) > _GAP_S):
+            self._older.clear()
+        self._older.append((message_id, time_s))
+        if len(self._older) < _EPOCH_STAMPS or time_s - self._older[0][1] < _EPOCH_S:
+            return Age.STALE
+        self._last_s = dict(self._older)
+        self.newest_s = max(self._last_s.values())
+        self._older.clear()
+        return Age.REBOOTED
 
 
 class LinkTime:

@@ -108,7 +108,8 @@ def repeating(again_s: float) -> Filter:
 
 
 def shuffling(seed: int = 5) -> Filter:
-    """A link that delays one datagram in five by 20 ms and duplicates another one in five."""
+    """A link that delays one datagram in five by 20 ms, some that have a time stamp by 2.5 s, and
+    duplicates another one in five."""
     chance = random.Random(seed)
     late: list[tuple[float, bytes]] = []
 
@@ -118,7 +119,8 @@ def shuffling(seed: int = 5) -> Filter:
         for datagram in datagrams:
             draw = chance.random()
             if draw < 0.2:
-                late.append((time_s + 0.02, datagram))
+                straggles = draw < 0.01 and frame_id(datagram) in (ATTITUDE, POSITION)
+                late.append((time_s + (2.5 if straggles else 0.02), datagram))
             else:
                 arriving.extend([datagram] * (2 if draw < 0.4 else 1))
         return arriving

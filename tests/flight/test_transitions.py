@@ -11,7 +11,7 @@ from uneventful import UNEVENTFUL
 from offboard.flight import ladder
 from offboard.flight.facts import Facts
 from offboard.flight.phases import ENDS, ExitCode, Limits, Phase, Rung
-from offboard.flight.programme import FLY, service
+from offboard.flight.programme import FLY, IN_THE_AIR, Programme, asked, exits, service
 from offboard.flight.requests import Request
 from offboard.flight.transitions import TRANSITIONS, Row
 
@@ -37,6 +37,7 @@ EVENTS: dict[str, dict[str, object]] = {  # the facts that make each guard hold
     "armed_by_another": {"armed": True, "limits": Limits(begin_armed=False)},
     "flown_by_another": {"engaged": True, "armed": True},
     "rebooted": {"rebooted": True},
+    "rebooted_disarmed": {"rebooted": True, "armed": False, "landed": False},
     "needs_no_stream": {"lifted_by_command": True},
     "streamed": {"in_phase_s": 1.0},
     "engaged": {"engaged": True},
@@ -177,6 +178,23 @@ def test_every_abnormal_end_has_an_exit_code() -> None:
             assert ways_in
             assert None not in ways_in
     assert {row.exit_code for row in TRANSITIONS} == {None, ExitCode.REFUSED, ExitCode.ABORTED}
+
+
+@pytest.mark.parametrize("programme", [FLY, *SERVICES.values()], ids=["fly", *SERVICES])
+def test_no_way_out_of_the_air_leaves_the_vehicle_unasked(programme: Programme) -> None:
+    """Each row that ends a flight in the air is in a phase that asks for hold or land, or leads to
+    one; or the vehicle is disarmed, or not ours any more. From the moment when it is ours, it is
+    in such a phase."""
+    rows = exits(programme)
+    assert {row.source for row in rows} == IN_THE_AIR & {row.source for row in programme.rows}
+    assert [(row.source, row.guard) for row in rows if not asked(row)] == []
+    ours = replace(UNEVENTFUL, engaged=True, armed=True, in_the_air=True)
+    for row in programme.rows:
+        if row.source in (Phase.STREAM, Phase.ENGAGE) and row.target in ENDS:
+            now = replace(ours, **event_of(row) | {"engaged": True, "armed": True})
+            taken = programme.next_row(Phase.ENGAGE, now)
+            assert taken is not None
+            assert taken.target in IN_THE_AIR
 
 
 def test_no_flight_in_the_air_ends_as_refused() -> None:

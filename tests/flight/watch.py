@@ -16,7 +16,7 @@ from pair import Bytes, Filter, Pair, decode, make, on_arducopter, through
 from offboard.flight.phases import TRACKING, Phase
 from simulator.config import Scenario
 
-SET_MODE, LAND, ARM = 176, 21, 400  # MAV_CMD
+SET_MODE, LAND, ARM, SET_MESSAGE_INTERVAL = 176, 21, 400, 511  # MAV_CMD
 LOW, HIGH = "reference.height_m=1.0", "reference.height_m=3.0"  # low: a short climb and landing
 ONE_LAP = "reference.laps=1"
 BOTH = pytest.mark.parametrize(
@@ -112,12 +112,13 @@ def engage_mode(pair: Pair) -> str:
 
 
 def sent_after(pair: Pair, time_s: float) -> list[str]:
-    """Setpoints and commands that left after `time_s`."""
+    """Setpoints and commands, but requests for telemetry, that left after `time_s`."""
     frames = [(at_s, decode(frame)) for at_s, _, frame in pair.sent if at_s > time_s]
     return [
         f"{message.get_type()} at {at_s:.2f}"
         for at_s, message in frames
         if message.get_type() in ("COMMAND_LONG", "SET_ATTITUDE_TARGET")
+        and getattr(message, "command", None) != SET_MESSAGE_INTERVAL
     ]
 
 

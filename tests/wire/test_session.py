@@ -369,12 +369,26 @@ def test_a_jump_back_is_a_reboot() -> None:
     session = pinned(vehicle)
     times(session, vehicle.position(60000), vehicle.attitude(60000))
     assert session.poll(0.0) == ()
-    reception = session.receive(vehicle.position(500), PEER, 0.0)
-    assert reception.events[0] == events.Rebooted(0.5)
+    assert times(session, vehicle.position(500), vehicle.attitude(510)) == []
+    reception = session.receive(vehicle.position(650), PEER, 0.0)
+    assert reception.events[0] == events.Rebooted(0.65)
     assert isinstance(reception.events[1], events.LocalPosition)
     assert len(session.poll(0.0)) > 4  # the intervals are requested again
-    assert times(session, vehicle.attitude(510), vehicle.position(510)) == [0.51, 0.51]
+    assert times(session, vehicle.attitude(660), vehicle.position(660)) == [0.66, 0.66]
     assert session.poll(0.0) == ()
+
+
+def test_a_stamp_that_is_late_is_dropped() -> None:
+    """However late: neither one datagram, nor several between those of the present."""
+    vehicle = Sender()
+    session = pinned(vehicle)
+    times(session, vehicle.position(60000), vehicle.attitude(60000))
+    late = vehicle.position(50000) + vehicle.attitude(50001) + vehicle.position(50010)
+    assert session.receive(late, PEER, 0.0).events == ()
+    for later_ms in range(10, 500, 10):
+        frames = [vehicle.position(60000 + later_ms), vehicle.position(57000 + later_ms)]
+        assert times(session, *frames) == [60.0 + later_ms / 1e3]
+    assert dropped(session, DropReason.STALE) == 3 + 49
 
 
 def test_a_message_that_repeats_its_stamp_for_long_is_stale() -> None:
@@ -418,9 +432,10 @@ def test_a_reboot_after_the_wrap_is_a_reboot() -> None:
     vehicle = Sender()
     session = pinned(vehicle)
     times(session, vehicle.position(WRAP_MS - 10), vehicle.position(60_000))
-    reception = session.receive(vehicle.position(500), PEER, 0.0)
+    assert times(session, vehicle.position(500), vehicle.position(510)) == []
+    reception = session.receive(vehicle.position(650), PEER, 0.0)
     assert isinstance(reception.events[0], events.Rebooted)
-    assert len(session.receive(vehicle.position(510), PEER, 0.0).events) == 1
+    assert len(session.receive(vehicle.position(660), PEER, 0.0).events) == 1
 
 
 # --- STATUSTEXT ---
