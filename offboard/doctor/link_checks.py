@@ -9,6 +9,7 @@ from offboard.doctor.observation import Observation
 from offboard.flight.assessment import MINIMUM_TELEMETRY_HZ
 from offboard.flight.phases import Limits
 from offboard.io.connection import BITS_OF_A_BYTE
+from offboard.mavlink.autopilots import unfit_type
 from offboard.mavlink.telemetry_rates import SHARE
 
 BAUDS = (57600, 115200, 230400, 460800, 921600)
@@ -56,6 +57,11 @@ def vehicle(seen: Observation) -> Iterable[Finding]:
     if seen.link_error:
         return
     if found:
+        shown = seen.vehicle.heartbeat
+        helicopter = seen.config is not None and seen.config.vehicle.airframe == "helicopter"
+        unfit = unfit_type(shown.vehicle_type, helicopter=helicopter) if shown else ""
+        if unfit:
+            yield blocks(unfit, "fly it with its own autopilot; is MAV_TYPE or FRAME_CLASS right?")
         yield ok(f"{found.autopilot}, system {found.system_id}")
     elif any(sender.is_autopilot for sender in seen.senders):
         yield blocks(seen.not_found or "the autopilot is neither PX4 nor ArduCopter")

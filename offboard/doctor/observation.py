@@ -11,10 +11,11 @@ from dataclasses import dataclass, field
 
 from offboard.flight.vehicle_state import VehicleState
 from offboard.identification.uncertainty import Estimate
+from offboard.mavlink.autopilots import is_vehicle
+from offboard.mavlink.decode import Identity
 from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage
 from offboard.run.configuration import FlightConfig
 
-NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
 FIX_3D = 3  # GPS_FIX_TYPE; also stands for better ones
 
 
@@ -39,7 +40,9 @@ class Sender:
 
     @property
     def is_autopilot(self) -> bool:
-        return self.autopilot not in (None, NO_AUTOPILOT) and not self.is_ground_station
+        if self.vehicle_type is None or self.autopilot is None:
+            return False
+        return is_vehicle(Identity(self.vehicle_type, self.autopilot))
 
     @property
     def name(self) -> str:

@@ -16,6 +16,7 @@ from offboard.flight.facts import Facts
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.phases import TRACKING, Phase
 from offboard.flight.state import FlightState
+from offboard.mavlink.autopilots import unfit_type
 from offboard.mavlink.events import Heartbeat, OtherCompanion, OtherSender, ThrustReport
 from offboard.mavlink.session import Session
 from offboard.model.frames import thrust_direction_from_quaternion
@@ -50,6 +51,7 @@ def facts(
         found=vehicle.found is not None,
         ready=state.phase in READIED and not not_ready(state, session),
         misconfigured=state.phase in READIED and bool(problems(state)),
+        unfit_type=state.phase in READIED and bool(_unfit_type(state)),
         rebooted=state.rebooted,
         engaged=authority is not None and authority.mode == authority.engage_mode,
         lost=authority is not None and authority.standing is Standing.LOST,
@@ -229,10 +231,19 @@ def _other_companion(other: OtherCompanion | None) -> str:
 
 
 def problems(state: FlightState) -> list[str]:
-    """What is wrong with the vehicle's parameters: one sentence for each."""
+    """What speaks against flying this vehicle: its type, or its parameters. A sentence for each."""
     if state.dialect is None:
         return []
+    unfit = _unfit_type(state)
+    if unfit:
+        return [unfit]
     return state.readiness.problems(state.dialect, state.vehicle.parameters)
+
+
+def _unfit_type(state: FlightState) -> str:
+    """Why a vehicle of its type is not flown; empty if it is."""
+    heartbeat, helicopter = state.vehicle.heartbeat, state.model.airframe == "helicopter"
+    return unfit_type(heartbeat.vehicle_type, helicopter=helicopter) if heartbeat else ""
 
 
 def _shown_since_lost(state: FlightState) -> bool:

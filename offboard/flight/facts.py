@@ -46,6 +46,7 @@ class Facts:
     stop_requested: bool
     missed_decisions: int  # in a row
     contradicted: bool  # telemetry contradicts the vehicle file
+    unfit_type: bool = False  # no multirotor: none of its modes means what we know
     telemetry_age_s: float = 0.0  # beyond the least delay of the link
     link_growth_s: float = 0.0
     clock_jump_s: float = 0.0

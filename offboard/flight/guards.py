@@ -76,6 +76,7 @@ def can_take_over(now: Facts) -> bool:
         and not now.failsafe
         and not other_sender(now)
         and now.authority_known
+        and not now.unfit_type
         and not silent(now)
         and not blind(now)
     )

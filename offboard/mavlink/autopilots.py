@@ -6,8 +6,10 @@ import math
 from collections.abc import Collection, Mapping
 from types import MappingProxyType
 
+from pymavlink.dialects.v20.ardupilotmega import enums
+
 from offboard.mavlink.counters import Counters, DropReason
-from offboard.mavlink.decode import decode_identity
+from offboard.mavlink.decode import Identity, decode_identity
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.base import TYPE_GCS, TYPE_ONBOARD_CONTROLLER, Dialect
 from offboard.mavlink.dialects.px4 import PX4
@@ -19,6 +21,12 @@ SYSTEMS_MAX = 8  # that are remembered
 HEARD_S = 10.0  # after its newest HEARTBEAT a system is gone
 NOTED_EVERY_S = 1.0
 _NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
+# MAV_TYPE: quadrotor, coaxial, hexarotor, octorotor, tricopter, dodecarotor, decarotor, any number
+MULTIROTORS = frozenset({2, 3, 13, 14, 15, 29, 35, 43})
+HELICOPTER = 4
+# MAV_TYPE of what is no vehicle, whatever autopilot it names: antenna tracker, ground station,
+# onboard controller, gimbal, ADS-B, camera, and the peripherals from charging station to GPS
+_NO_VEHICLES = frozenset({5, 6, 18, 26, 27, 30, 31, 32, 33, 34, *range(36, 43), 44})
 
 
 class Autopilots:
@@ -98,9 +106,30 @@ def is_companion(frame: Frame, vehicle_system_id: int) -> bool:
     )
 
 
+def is_vehicle(identity: Identity) -> bool:
+    """Whether this HEARTBEAT is of a vehicle with an autopilot, of any kind."""
+    return identity.vehicle_type not in _NO_VEHICLES and identity.autopilot != _NO_AUTOPILOT
+
+
+def unfit_type(vehicle_type: int, *, helicopter: bool) -> str:
+    """Why a vehicle of this MAV_TYPE is not flown, in one sentence; empty if it is. `helicopter`:
+    the vehicle file is that of a helicopter."""
+    if vehicle_type in ({HELICOPTER} if helicopter else MULTIROTORS):
+        return ""
+    known = enums["MAV_TYPE"].get(vehicle_type)
+    name = known.name.removeprefix("MAV_TYPE_") if known else f"MAV_TYPE {vehicle_type}"
+    if helicopter:
+        return f"the vehicle is a {name}; its vehicle file says airframe: helicopter"
+    hint = " (airframe: helicopter in its vehicle file flies it)"
+    return (
+        f"the vehicle is a {name}; offboard flies multirotors"
+        f"{hint if vehicle_type == HELICOPTER else ''}"
+    )
+
+
 def _dialect(heartbeat: Frame) -> Dialect | DropReason:
     identity = decode_identity(heartbeat.payload)
-    if identity.vehicle_type == TYPE_GCS or identity.autopilot == _NO_AUTOPILOT:
+    if not is_vehicle(identity):
         return DropReason.NO_VEHICLE
     fitting = (d for d in DIALECTS.values() if d.mav_autopilot == identity.autopilot)
     return next(fitting, DropReason.UNSUPPORTED_AUTOPILOT)

@@ -121,8 +121,8 @@ def decode_text_chunk(payload: bytes) -> TextChunk:
 
 
 def _heartbeat(payload: bytes, dialect: Dialect) -> events.Event:
-    custom_mode, _, _, base_mode, status, _ = _unpack(mavlink.MAVLink_heartbeat_message, payload)
-    return events.Heartbeat(dialect.mode_name(custom_mode), bool(base_mode & _ARMED), status)
+    custom_mode, kind, _, base_mode, status, _ = _unpack(mavlink.MAVLink_heartbeat_message, payload)
+    return events.Heartbeat(dialect.mode_name(custom_mode), bool(base_mode & _ARMED), status, kind)
 
 
 def _current_mode(payload: bytes, dialect: Dialect) -> events.Event:

@@ -29,6 +29,7 @@ class Heartbeat:
     mode: str  # the dialect's name of custom_mode: "OFFBOARD", "AUTO.LOITER", ...
     armed: bool
     system_status: int  # MAV_STATE: 3 standby, 4 active, 5 critical, 6 emergency
+    vehicle_type: int  # MAV_TYPE
 
 
 @dataclass(frozen=True, slots=True)

@@ -6,7 +6,7 @@ simulated vehicle is made from one too, which may be another. No file is read he
 
 from __future__ import annotations
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
@@ -43,7 +43,8 @@ class AxisResponse(Parameters):
 
 
 class Vehicle(Parameters):
-    """Parameters of one multirotor. SI units, body axes FRD.
+    """Parameters of one multirotor, or, as far as setpoints serve it, of one helicopter. SI units,
+    body axes FRD.
 
     A tracking law needs `hover_thrust`, `tilt`, `yaw`, the thrust's delay and lag, the drag and
     the limits; identification in flight refines them. Inertia and `arm_m` serve the simulator and
@@ -52,6 +53,7 @@ class Vehicle(Parameters):
     """
 
     name: str = Field(min_length=1, max_length=40)
+    airframe: Literal["multirotor", "helicopter"] = "multirotor"  # MAV_TYPEs that are flown
     mass_kg: float = Field(gt=0.01, le=200)
     gravity_mps2: float = Field(default=9.80665, gt=9.7, lt=9.9)
     inertia_kgm2: PositiveTriple

@@ -167,15 +167,19 @@ def upside_down() -> Filter:
 
 def critical() -> Filter:
     """A link on which every heartbeat shows MAV_STATE_CRITICAL, as with a low battery."""
+    return heartbeats(system_status=5)
+
+
+def heartbeats(**changed: int) -> Filter:
+    """A link on which these fields of every heartbeat have other values."""
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
 
     def change(frame: bytes) -> bytes:
         if frame_id(frame) != HEARTBEAT:
             return frame
-        told = mavlink.MAVLink(None).decode(bytearray(frame))
-        message = mavlink.MAVLink_heartbeat_message(
-            told.type, told.autopilot, told.base_mode, told.custom_mode, 5, 3
-        )
+        message = mavlink.MAVLink(None).decode(bytearray(frame))
+        for name, value in changed.items():
+            setattr(message, name, value)
         codec.seq = frame[4]
         return bytes(message.pack(codec))
 

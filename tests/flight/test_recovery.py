@@ -33,7 +33,7 @@ class Vehicle:
         """Run to the end of the recovery, which has heard the mode `before` it began."""
         recovery = Recovery(self.dialect, 100.0, holding=holding)
         if before:
-            recovery.see(Heartbeat(before, True, 4), 99.6)
+            recovery.see(Heartbeat(before, True, 4, 2), 99.6)
         landing_s = 0.0
         for step in range(round(200.0 / STEP_S)):
             time_s = step * STEP_S
@@ -43,7 +43,7 @@ class Vehicle:
                 landing_s += STEP_S
             self.armed = landing_s < self.land_s
             if self.heard and step % 50 == 25:
-                recovery.see(Heartbeat(self.mode, self.armed, 4), 100.0 + time_s)
+                recovery.see(Heartbeat(self.mode, self.armed, 4, 2), 100.0 + time_s)
             request = recovery.due(100.0 + time_s)
             if request:
                 self.asked.append((round(time_s, 2), request.command.command))
@@ -143,7 +143,7 @@ def asked(*reports: tuple[float, str], armed: bool = True) -> tuple[list[int], s
     these modes at these times, and in its next HEARTBEAT whether it is `armed`; and how it
     ended."""
     recovery = Recovery(PX4, 100.0)
-    recovery.see(Heartbeat(PX4.engage_mode, True, 4), 99.6)
+    recovery.see(Heartbeat(PX4.engage_mode, True, 4, 2), 99.6)
     commands = []
     events = [(100.05, CommandAck(HOLD, "ACCEPTED")), *((t, ModeReport(m)) for t, m in reports)]
     for step in range(601):
@@ -154,7 +154,7 @@ def asked(*reports: tuple[float, str], armed: bool = True) -> tuple[list[int], s
             if now_s - STEP_S < at_s <= now_s + 1e-9 or (not step and at_s <= now_s):
                 recovery.see(event, at_s)
     if not recovery.ended:
-        recovery.see(Heartbeat(reports[-1][1], armed, 4), 112.1)
+        recovery.see(Heartbeat(reports[-1][1], armed, 4, 2), 112.1)
         request = recovery.due(112.1)
         commands += [request.command.command] if request else []
     return commands, recovery.ended

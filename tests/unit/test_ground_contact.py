@@ -19,7 +19,7 @@ class Standing:
         self.position(0.0)
 
     def heartbeat(self, now_s: float, *, armed: bool) -> None:
-        self.vehicle.update(Heartbeat("POSCTL", armed, 4), now_s)
+        self.vehicle.update(Heartbeat("POSCTL", armed, 4, 2), now_s)
 
     def detector(self, now_s: float, state: str) -> None:
         self.vehicle.update(Landed(state), now_s)
@@ -76,7 +76,7 @@ def test_a_land_detector_that_is_not_heard_any_more_proves_nothing() -> None:
 
 def test_armed_without_a_position_it_is_in_the_air() -> None:
     vehicle = VehicleState()
-    vehicle.update(Heartbeat("POSCTL", True, 4), 0.0)
+    vehicle.update(Heartbeat("POSCTL", True, 4, 2), 0.0)
     vehicle.update(Landed("on_ground"), 0.0)
     assert GroundContact(vehicle).in_the_air
 
@@ -129,7 +129,7 @@ def test_stood_for_fifteen_seconds(
 ) -> None:
     vehicle = VehicleState()
     contact = GroundContact(vehicle)
-    vehicle.update(Heartbeat("LAND", True, 4), 0.0)
+    vehicle.update(Heartbeat("LAND", True, 4, 2), 0.0)
     for number in range(round(10 * for_s) + 1):
         height = height_m + wander_m * (number % 2)
         event = LocalPosition(0.1 * number, (0.0, 0.0, -height), (0.0, 0.0, 0.0))

@@ -30,7 +30,7 @@ def test_the_first_autopilot_heard_is_the_vehicle() -> None:
     reception = session.receive(Sender(42).heartbeat(), PEER, 0.0)
     assert reception.events == (
         events.VehicleFound(42, 1, "px4"),
-        events.Heartbeat("OFFBOARD", False, 3),
+        events.Heartbeat("OFFBOARD", False, 3, 2),
     )
     assert session.dialect is not None
     assert session.dialect.name == "px4"
@@ -334,7 +334,7 @@ def test_name_of_an_unknown_mode() -> None:
     vehicle = Sender()
     session = pinned(vehicle)
     reception = session.receive(vehicle.heartbeat(custom_mode=0x12345678), PEER, 0.0)
-    assert reception.events == (events.Heartbeat("UNKNOWN(0x12345678)", False, 3),)
+    assert reception.events == (events.Heartbeat("UNKNOWN(0x12345678)", False, 3, 2),)
 
 
 # --- time ---
@@ -632,4 +632,4 @@ def test_mode_bits() -> None:
     session = pinned(vehicle)
     frame = vehicle.frame(mavlink.MAVLink_heartbeat_message(2, PX4, 128 | 1, OFFBOARD, 4, 3))
     reception = session.receive(frame, PEER, 0.0)
-    assert reception.events == (events.Heartbeat("OFFBOARD", True, 4),)
+    assert reception.events == (events.Heartbeat("OFFBOARD", True, 4, 2),)

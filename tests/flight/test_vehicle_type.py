@@ -1,0 +1,82 @@
+"""Which vehicles are flown, by the MAV_TYPE in their HEARTBEAT: by `fly`, by the service, and what
+`doctor` says of them."""
+
+from __future__ import annotations
+
+import pytest
+from doctor_bench import bench
+from faults import heartbeats
+from pair import hover, in_phase
+from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from serving import serve
+
+from offboard.doctor.findings import Level
+from offboard.flight.phases import ExitCode, Phase
+from offboard.mavlink.session import Session, SessionSettings
+from offboard.model.vehicle import Vehicle
+
+FIXED_WING, HELICOPTER, HEXAROTOR, TRACKER = 1, 4, 13, 5
+NOT_FLOWN = "the vehicle is a FIXED_WING; offboard flies multirotors"
+
+
+def heli() -> Vehicle:
+    return hover().companion.state.model.model_copy(update={"airframe": "helicopter"})
+
+
+@pytest.mark.parametrize(
+    ("kind", "believed", "says"),
+    [
+        (FIXED_WING, None, NOT_FLOWN),
+        (99, None, "the vehicle is a MAV_TYPE 99; offboard flies multirotors"),
+        (HELICOPTER, None, "(airframe: helicopter in its vehicle file flies it)"),
+        (HEXAROTOR, heli(), "the vehicle is a HEXAROTOR; its vehicle file says airframe"),
+        (HEXAROTOR, None, ""),
+        (HELICOPTER, heli(), ""),
+    ],
+)
+def test_only_multirotors_are_flown(kind: int, believed: Vehicle | None, says: str) -> None:
+    pair = hover(
+        down=heartbeats(type=kind),
+        believed=believed,
+        at=[(in_phase(Phase.STREAM, 0.1), lambda flying: flying.companion.request_stop())],
+    )
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.REFUSED
+    assert pair.went_through(Phase.STREAM) is not bool(says)
+    assert says in outcome.sentence
+    assert not says or {m.command for m in pair.commands(176) + pair.commands(400)} == set()
+    assert not says or pair.setpoints == []
+
+
+def test_the_service_leaves_another_vehicle_alone() -> None:
+    """The modes of a plane have other numbers: what looks like OFFBOARD or GUIDED is none."""
+    pair, plane = serve(on="ardupilot"), heartbeats(type=FIXED_WING)
+    pair.fly_up()
+    pair.down = lambda time_s, datagrams: plane(time_s, pair.deliver(time_s, datagrams))
+    pair.restart()
+    pair.run(5.0)
+    pair.switch("engage")
+    pair.run(3.0)
+    assert pair.phase is Phase.HEALTH
+    assert pair.said(f"waiting: {NOT_FLOWN}")
+    assert pair.mode == "GUIDED"
+
+
+def test_doctor_names_the_type() -> None:
+    filtered = heartbeats(type=FIXED_WING)
+    (finding, _) = (
+        bench(down=lambda datagrams: filtered(0.0, datagrams))
+        .consult("vehicle")["vehicle"]
+        .findings
+    )
+    assert (finding.level, finding.found) == (Level.BLOCKS, NOT_FLOWN)
+
+
+@pytest.mark.parametrize("kind", [TRACKER, 6, 18, 26, 27, 30])
+def test_what_is_no_vehicle_is_never_taken_for_one(kind: int) -> None:
+    """Also where it names an autopilot and has its component id."""
+    codec = mavlink.MAVLink(None, srcSystem=2, srcComponent=1)
+    session = Session(SessionSettings())
+    frame = mavlink.MAVLink_heartbeat_message(kind, 3, 0, 0, 4, 3).pack(codec)
+    assert session.receive(frame, "link", 0.0).events == ()
+    assert session.autopilots.systems == {}
