@@ -70,7 +70,7 @@ def doctor(
             say(f"{check.name:<{width}}  {check.summary}", indent=width + 2)
         return
     from offboard.doctor import report
-    from offboard.doctor.findings import Level, examine, worst
+    from offboard.doctor.findings import Level, examine, verdict, worst
     from offboard.doctor.run import observe
     from offboard.run.configuration import load
 
@@ -87,16 +87,18 @@ def doctor(
         signing_key=signing_key,
     )
     rows = examine(chosen, seen)
+    sentence = verdict(rows, complete=not names)
     if as_json:
-        sys.stdout.write(report.as_json(rows, seen))
+        sys.stdout.write(report.as_json(rows, seen, sentence))
     else:
-        _show(rows)
+        _show(rows, sentence)
     if worst(rows) is Level.BLOCKS:
         raise typer.Exit(REFUSED)
 
 
-def _show(rows: list[Row]) -> None:
-    """One line for each finding, the hint below it; of a row with something to say only that."""
+def _show(rows: list[Row], verdict: str) -> None:
+    """One line for each finding, the hint below it; of a row with something to say only that. At
+    the end the verdict."""
     from offboard.doctor.findings import Level
     from offboard.doctor.report import name
 
@@ -109,6 +111,5 @@ def _show(rows: list[Row]) -> None:
             say(f"{name(finding.level):<{levels}}  {row.check:<{width}}  {finding.found}", indent)
             if finding.hint:
                 say(f"{'':<{indent}}fix: {finding.hint}", indent + 5)
-    number = sum(finding.level is not Level.OK for row in rows for finding in row.findings)
     out.print()
-    say(f"checks: {len(rows)}, findings: {number}")
+    say(verdict)

@@ -35,9 +35,9 @@ DEFAULT_CONNECTION = "udpin:127.0.0.1:14540"
 FLIGHTS = Path("flights")  # parent of the flight directories that have no --out
 EXIT_CODES = (
     "Exit codes: 0 flown and all requirements met; 1 a requirement missed; 2 usage or "
-    "configuration error, nothing sent; 3 not flown: no vehicle, refused, or stopped on the "
-    "ground; 4 aborted in flight, or left armed; 130 interrupted before anything was sent; 141 "
-    "nobody reads the output."
+    "configuration error, nothing sent; 3 not flown: no vehicle or connection, refused, or stopped "
+    "on the ground; 4 aborted in flight, or left armed; 130 interrupted before anything was sent; "
+    "141 nobody reads the output."
 )
 
 

@@ -32,6 +32,13 @@ class _Count:
     times: int = 0
     sequence: int | None = None
 
+    def follow(self, sequence: int) -> None:
+        """The next frame has this sequence number."""
+        if self.sequence is not None:
+            gap = (sequence - self.sequence - 1) % 256
+            self.lost += gap if gap < 128 else 0  # more: out of order
+        self.sequence = sequence
+
 
 class Census:
     """Counts what arrives. `stream`: bytes arrive in any portions."""
@@ -40,6 +47,7 @@ class Census:
         self._stream = stream
         self._splitters: dict[Hashable, FrameSplitter] = {}
         self._counts: dict[tuple[int, int], _Count] = {}
+        self._together: dict[int, _Count] = {}  # the components of a system as one sender
         self.counters = Counters()
         self.message_bytes: Counter[str] = Counter()
 
@@ -67,10 +75,8 @@ class Census:
         count.times += frame.message_id in _TIMES
         if frame.message_id == _HEARTBEAT:
             count.vehicle_type, count.autopilot = decode_identity(frame.payload)
-        if count.sequence is not None:
-            gap = (frame.sequence - count.sequence - 1) % 256
-            count.lost += gap if gap < 128 else 0  # more: out of order
-        count.sequence = frame.sequence
+        count.follow(frame.sequence)
+        self._together.setdefault(frame.system_id, _Count()).follow(frame.sequence)
 
     @property
     def senders(self) -> tuple[Sender, ...]:
@@ -82,7 +88,8 @@ class Census:
                 count.autopilot,
                 tuple(sorted(count.places)),
                 count.frames,
-                count.lost,
+                # components that share a link of an autopilot may share its sequence numbers
+                min(count.lost, self._together[ids[0]].lost),
                 count.setpoints,
                 count.times,
             )

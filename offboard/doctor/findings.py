@@ -27,27 +27,28 @@ class Level(IntEnum):
 @dataclass(frozen=True, slots=True)
 class Finding:
     """`found` is what was observed, `hint` what to do about it: apart, so that a program can use
-    either."""
+    either. `about`: a parameter, where it is not only the check."""
 
     level: Level
     found: str
     hint: str = ""
+    about: str = ""
 
 
 def ok(found: str) -> Finding:
     return Finding(Level.OK, found)
 
 
-def warn(found: str, hint: str = "") -> Finding:
-    return Finding(Level.WARN, found, hint)
+def warn(found: str, hint: str = "", about: str = "") -> Finding:
+    return Finding(Level.WARN, found, hint, about)
 
 
 def wait(found: str, hint: str = "") -> Finding:
     return Finding(Level.WAIT, found, hint)
 
 
-def blocks(found: str, hint: str = "") -> Finding:
-    return Finding(Level.BLOCKS, found, hint)
+def blocks(found: str, hint: str = "", about: str = "") -> Finding:
+    return Finding(Level.BLOCKS, found, hint, about)
 
 
 Run = Callable[[Observation], Iterable[Finding]]
@@ -101,3 +102,19 @@ def _findings(run: Run, observation: Observation) -> tuple[Finding, ...]:
 
 def worst(rows: Iterable[Row]) -> Level:
     return max((row.level for row in rows), default=Level.OK)
+
+
+def verdict(rows: Iterable[Row], *, complete: bool) -> str:
+    """One sentence: whether this vehicle can be flown now. `complete`: all checks were made."""
+    found = [(each.level, each.about or row.check) for row in rows for each in row.findings]
+
+    def named(level: Level) -> list[str]:
+        return list(dict.fromkeys(name for at, name in found if at is level))
+
+    blocking, waiting, warning = map(named, (Level.BLOCKS, Level.WAIT, Level.WARN))
+    if blocking:
+        return f"{len(blocking)} block{'s' * (len(blocking) == 1)}: {', '.join(blocking)}"
+    if waiting:
+        return f"not ready yet: {', '.join(waiting)}"
+    ready = "ready to fly" if complete else "nothing blocks in these checks"
+    return f"{ready}; warnings: {', '.join(warning)}" if warning else ready

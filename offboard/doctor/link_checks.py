@@ -138,10 +138,10 @@ def delay(seen: Observation) -> Iterable[Finding]:
 def loss(seen: Observation) -> Iterable[Finding]:
     """Frames that are lost, and bytes that are damaged."""
     found = seen.vehicle.found
-    ours = [s for s in seen.senders if found and s.system_id == found.system_id]
-    if not ours:
+    ours = (found.system_id, found.component_id) if found else None
+    sender = next((s for s in seen.senders if (s.system_id, s.component_id) == ours), None)
+    if sender is None:
         return
-    sender = max(ours, key=lambda each: each.frames)
     share = sender.lost / (sender.frames + sender.lost)
     damaged = seen.link.bytes_skipped / max(seen.link.bytes_received, 1)
     figures = f"{share:.1%} of the frames lost, {damaged:.1%} of the bytes damaged"
@@ -189,10 +189,7 @@ def rates(seen: Observation) -> Iterable[Finding]:
         for each in link.wanted
         if not each.optional and link.rates_hz.get(each.name, 0.0) < ENOUGH * each.rate_hz
     ]
-    hint = (
-        "another ground station may set the rates (MAVProxy: `set streamrate -1`), or the link is "
-        "full"
-    )
+    hint = seen.dialect.slow_hint if seen.dialect else ""
     if not link.requested:
         yield ok(f"{figures}; not requested, since the vehicle is armed")
     elif "LOCAL_POSITION_NED" in too_slow and not link.rates_hz.get("LOCAL_POSITION_NED"):

@@ -9,11 +9,12 @@ from offboard.doctor.findings import Finding, Level, Row, worst
 from offboard.doctor.observation import Observation
 
 
-def as_json(rows: Sequence[Row], seen: Observation) -> str:
-    """One object with the worst level, what was observed where, and a list of rows."""
+def as_json(rows: Sequence[Row], seen: Observation, verdict: str) -> str:
+    """One object with the worst level, the verdict, what was observed where, and a list of rows."""
     found, version = seen.vehicle.found, seen.vehicle.version
     document = {
         "level": name(worst(rows)),
+        "verdict": verdict,
         "connection": seen.connection,
         "listened_s": round(seen.listened_s, 2),
         "vehicle": found and {"autopilot": found.autopilot, "system_id": found.system_id},

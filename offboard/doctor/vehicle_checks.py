@@ -156,15 +156,15 @@ def parameters(seen: Observation) -> Iterable[Finding]:
         fault = parameter.fault(value)
         advised = parameter.advised(value, known, radio, vehicle.found.system_id)
         if fault:
-            yield blocks(*fault)
+            yield blocks(*fault, about=parameter.name)
         elif advised:
-            yield warn(*advised)
+            yield warn(*advised, about=parameter.name)
         else:
             good.append(f"{parameter.name} {parameter.shown(value)}")
     needed = {p.name for p in dialect.watched_parameters if p.must_answer}
     for name in seen.unanswered:
         if name in needed:
-            yield blocks(f"no reply for {name}", "check the link to the vehicle")
+            yield blocks(f"no reply for {name}", "check the link to the vehicle", name)
     unanswered = [name for name in seen.unanswered if name not in needed]
     note = f"; no reply for {', '.join(unanswered)}" if unanswered else ""
     yield ok(", ".join(good) + note)

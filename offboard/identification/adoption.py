@@ -46,7 +46,7 @@ def within_bounds(
         if low <= value <= high:
             return False
         sentences.append(
-            f"{what} {value:.3g} contradicts the vehicle file's {expected:.3g} "
+            f"{what} {value:.3g} contradicts the {expected:.3g} of vehicle {vehicle_file.name} "
             f"({low:.3g} to {high:.3g} allowed), not adopted"
         )
         return True

@@ -321,7 +321,8 @@ class VehicleEstimate:
         self._lowered_radps = lowered_radps
         change_ms = round(1e3 * added_s)
         delay = f"has grown by {change_ms} ms" if change_ms > 0 else "is no longer than at take-off"
-        return [f"the link's delay {delay}; {self._bandwidth_text}"]
+        known = f"identified is {_in_ms(self.delay)}" if self.delay else "none is identified yet"
+        return [f"the link's delay {delay}, {known}; {self._bandwidth_text}"]
 
     def without_identification(self) -> list[str]:
         """What the bandwidth is limited to with the vehicle file as it is."""

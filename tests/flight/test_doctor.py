@@ -9,7 +9,7 @@ from doctor_bench import GOOD, bench, said
 from pair import LEAN
 from pair import make as flight
 
-from offboard.doctor.findings import Level, examine
+from offboard.doctor.findings import Level, examine, verdict
 from offboard.doctor.observation import FIX_3D, Observation
 from offboard.doctor.table import checks
 from offboard.flight.phases import ExitCode
@@ -39,14 +39,14 @@ def test_nothing_is_said_of_a_good_vehicle(firmware: Firmware) -> None:
 @pytest.mark.parametrize(
     ("firmware", "name", "value", "level", "line"),
     [
-        (LEAN, "COM_OF_LOSS_T", 0.0, BLOCKS, "param set COM_OF_LOSS_T 0.3"),
-        (LEAN, "COM_OF_LOSS_T", 30.0, BLOCKS, "param set COM_OF_LOSS_T 5"),
+        (LEAN, "COM_OF_LOSS_T", 0.0, BLOCKS, "param set COM_OF_LOSS_T 1"),
+        (LEAN, "COM_OF_LOSS_T", 30.0, BLOCKS, "param set COM_OF_LOSS_T 1"),
         (LEAN, "COM_OBL_RC_ACT", 0.0, WARN, "param set COM_OBL_RC_ACT 4"),
-        (LEAN, "COM_OBL_RC_ACT", 7.0, WARN, "param set COM_OBL_RC_ACT 4"),
+        (LEAN, "COM_OBL_RC_ACT", 7.0, BLOCKS, "param set COM_OBL_RC_ACT 4"),
         (LEAN, "COM_RC_IN_MODE", 4.0, WARN, "param set COM_RC_IN_MODE 3"),
         (LEAN, "COM_RCL_EXCEPT", 0.0, WARN, "param set COM_RCL_EXCEPT 4"),
         (ARDUPILOT, "GUID_OPTIONS", 2.0, BLOCKS, "param set GUID_OPTIONS 10"),
-        (ARDUPILOT, "GUID_TIMEOUT", 0.1, BLOCKS, "param set GUID_TIMEOUT 0.3"),
+        (ARDUPILOT, "GUID_TIMEOUT", 0.1, BLOCKS, "param set GUID_TIMEOUT 1"),
         (ARDUPILOT, "GUID_TIMEOUT", 3.0, WARN, "param set GUID_TIMEOUT 1"),
         (ARDUPILOT, "PSC_JERK_XY", 5.0, WARN, "param set PSC_JERK_XY 10"),
         (ARDUPILOT, "ATC_ANGLE_BOOST", 0.0, BLOCKS, "param set ATC_ANGLE_BOOST 1"),
@@ -63,6 +63,8 @@ def test_line_for_a_parameter_mends_it(
     row = patient.consult("parameters")["parameters"]
     assert row.level is level
     assert row.findings[0].hint == line
+    named = f"1 blocks: {name}" if level is BLOCKS else "ready to fly; warnings: "
+    assert verdict([row], complete=True).startswith(named)
     assert (
         f"{line.split()[2]} is {value if line.split()[2] == name else 0:g}" in row.findings[0].found
     )

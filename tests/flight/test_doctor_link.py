@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 from doctor_bench import Bench, bench, from_others, said
-from pair import Bytes
+from pair import Bytes, decode, frames_of
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.doctor.findings import Level
@@ -19,6 +19,8 @@ from simulator.start import Start
 OK, WARN, WAIT, BLOCKS = Level.OK, Level.WARN, Level.WAIT, Level.BLOCKS
 GCS_HEARTBEAT = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3)
 AUTOPILOT_HEARTBEAT = mavlink.MAVLink_heartbeat_message(2, 12, 81, 0, 3, 3)
+CAMERA_HEARTBEAT = mavlink.MAVLink_heartbeat_message(30, 8, 0, 0, 4, 3)
+COUNTED = mavlink.MAVLink(None, srcSystem=1)
 KEY = bytes(range(32))
 SETPOINT = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, (1, 0, 0, 0), 0, 0, 0, 0.5)
 
@@ -192,12 +194,30 @@ def test_damaged_bytes_are_counted() -> None:
     assert patient.consult("loss")["loss"].level is WARN
 
 
+def shared_counter(datagrams: Bytes) -> Bytes:
+    """Each frame of the vehicle is followed by one of its camera, with the next sequence number."""
+    sent = []
+    for frame in (each for datagram in datagrams for each in frames_of(datagram)):
+        known = [] if decode(frame).get_type().startswith("UNKNOWN") else [(decode(frame), 1)]
+        for message, component in (*known, (CAMERA_HEARTBEAT, 100)):
+            COUNTED.srcComponent, COUNTED.seq = component, (COUNTED.seq + 1) % 256
+            sent.append(message.pack(COUNTED))
+    return sent
+
+
+def test_frames_of_other_components_are_no_loss() -> None:
+    """Half of the vehicle's sequence numbers are its camera's, and no frame is lost."""
+    row = bench(down=shared_counter).consult("loss")["loss"]
+    assert row.findings[0].found.startswith("0.0% of the frames lost")
+
+
 def test_rates_that_are_too_low_block() -> None:
     patient = bench(faults=link(message_rate_hz=5.0, direction="down", for_s=20.0))
     began_s = patient.instance.time_s
     row = patient.consult("rates")["rates"]
     assert row.level is BLOCKS
     assert "at least 10 Hz are needed" in row.findings[0].found
+    assert "MAV_x_RATE" in row.findings[0].hint
     assert patient.instance.time_s - began_s < LONGEST_S + 1.1  # 15 s with the rest
     while patient.instance.time_s < 28.0:
         patient.step()

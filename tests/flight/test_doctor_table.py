@@ -12,7 +12,7 @@ import pytest
 from doctor_bench import bench
 
 from offboard.doctor import link_checks, ports, run
-from offboard.doctor.findings import Check, Level, examine, worst
+from offboard.doctor.findings import Check, Level, examine, verdict, worst
 from offboard.doctor.observation import Observation
 from offboard.doctor.report import as_json
 from offboard.doctor.table import CheckError, checks
@@ -100,8 +100,10 @@ def test_report_as_json() -> None:
     seen = patient.listen()
     rows = examine(checks(["gps", "parameters"]), seen)
     assert worst(rows) is Level.WARN
-    report = json.loads(as_json(rows, seen))
-    assert report["level"] == "warn"
+    report = json.loads(as_json(rows, seen, verdict(rows, complete=True)))
+    assert (report["level"], report["verdict"]) == (
+        "warn", "ready to fly; warnings: COM_OBL_RC_ACT"
+    )  # fmt: skip
     assert report["vehicle"] == {"autopilot": "px4", "system_id": 1}
     assert report["version"] == [1, 16, 1]
     assert [row["check"] for row in report["rows"]] == ["gps", "parameters"]

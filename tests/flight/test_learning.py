@@ -197,8 +197,8 @@ def with_wrong_file(**wrong: object) -> Pair:
 @pytest.mark.parametrize(
     ("frequency", "sentence"),
     [
-        (2.5, " contradicts the vehicle file's 2.5 (0.625 to 10 allowed)"),
-        (50.0, " contradicts the vehicle file's 50 (12.5 to 60 allowed)"),
+        (2.5, " contradicts the 2.5 of vehicle px4_sih (0.625 to 10 allowed)"),
+        (50.0, " contradicts the 50 of vehicle px4_sih (12.5 to 60 allowed)"),
     ],
 )
 def test_vehicle_file_that_telemetry_contradicts_ends_the_flight(frequency, sentence):
@@ -228,7 +228,7 @@ def test_constants_out_of_bounds_end_the_flight():
     outcome = pair.fly()
     assert outcome.exit_code == 4
     assert "hover thrust 0.49" in outcome.sentence
-    assert "contradicts the vehicle file's 0.42 (0.4 to 0.441 allowed)" in outcome.sentence
+    assert "contradicts the 0.42 of vehicle neutral (0.4 to 0.441 allowed)" in outcome.sentence
 
 
 def test_bandwidth_that_the_delay_does_not_support_is_limited():

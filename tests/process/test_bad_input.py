@@ -110,10 +110,7 @@ def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
         (("--connect", "udpin:127.0.0.1"), "is not understood; use udpin:HOST:PORT"),
         (("--connect", "udpin:127.0.0.1:99999"), "port 99999 is not within 0 .. 65535"),
         (("--connect", "udpin:::1:14540"), "an IPv6 address stands in brackets, as in udpin:[::1]"),
-        (("--connect", "tcpin:192.0.2.1:14540"), "cannot be opened: Cannot assign requested"),
         (("--signing-key", "/dev/null"), "signing key /dev/null is not a file"),
-        (("--connect", "tcp:127.0.0.1:1"), "cannot be opened: Connection refused"),
-        (("--connect", "serial:/dev/nonexistent:57600"), "cannot be opened"),
         (("--out", "/dev/null/x"), "recorded in /dev/null/x: Not a directory; choose a directory"),
         (("--out", "/proc/nowhere"), "choose a directory that can be written with --out"),
         (("--firmware", "px4"), "--firmware are options of --sitl: add it"),
@@ -149,6 +146,26 @@ def test_usage_is_refused_before_anything_is_sent(
     assert "Traceback" not in output
     assert len(output.strip().splitlines()) == 1
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(
+    ("address", "expected"),
+    [
+        ("tcpin:192.0.2.1:14540", "cannot be opened: Cannot assign requested"),
+        ("tcp:127.0.0.1:1", "cannot be opened: Connection refused"),
+        ("serial:/dev/nonexistent:57600", "cannot be opened"),
+    ],
+)
+def test_a_vehicle_that_cannot_be_reached_is_the_same_to_every_command(
+    address: str, expected: str, offboard: Call, called: Called
+) -> None:
+    code, output = offboard("fly", "--connect", address)
+    assert (code, output.count("\n")) == (3, 1)
+    assert expected in output
+    code, told, _ = called("offboard doctor port", "--connect", address)
+    assert code == 3
+    assert expected in " ".join(told.split())
+    assert told.endswith("\n1 blocks: port\n")
 
 
 CSV = "time_s,north_m,east_m,altitude_m\n0,0,0,3\n3,2,0,3\n6,2,{east},4\n9,0,0,3\n"
@@ -209,7 +226,7 @@ def test_port_in_use(offboard: Call) -> None:
         other.bind(("127.0.0.1", 0))
         port = other.getsockname()[1]
         code, output = offboard("fly", "--connect", f"udpin:127.0.0.1:{port}")
-    assert code == 2
+    assert code == 3
     assert f"'udpin:127.0.0.1:{port}' cannot be opened" in output
     assert "another program uses the port" in output
 

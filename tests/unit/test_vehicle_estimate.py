@@ -78,7 +78,7 @@ def test_a_hover_thrust_that_no_file_may_have_is_not_adopted(hover_thrust: float
     found = Identified(10.0, hover_thrust=Estimate(hover_thrust, 0.001))
     kept, (sentence,) = within_bounds(found, FILE, 1000.0)
     assert kept.hover_thrust is None
-    assert "contradicts the vehicle file's 0.42 (0.02 to 0.95 allowed)" in sentence
+    assert "contradicts the 0.42 of vehicle file (0.02 to 0.95 allowed)" in sentence
 
 
 def test_doubt_ends_with_a_fit_that_explains_the_flight() -> None:

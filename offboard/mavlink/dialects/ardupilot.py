@@ -80,6 +80,7 @@ ARDUPILOT = Dialect(
             "GUID_TIMEOUT",
             "seconds without setpoints before the vehicle levels",
             allowed=(0.3, 5.0),
+            default=1.0,  # not ArduCopter's 3, see the advice
             advice=(
                 Advice("the last tilt of a dead controller is flown for so long", 1.0, highest=1.5),
             ),
@@ -89,6 +90,7 @@ ARDUPILOT = Dialect(
             "ATC_ANGLE_BOOST",
             "the autopilot must divide thrust by the cosine of the tilt",
             allowed=(1.0, 1.0),
+            default=1.0,
             must_answer=True,
         ),
         WatchedParameter(
@@ -139,6 +141,8 @@ ARDUPILOT = Dialect(
     hover_parameter="MOT_THST_HOVER",
     tilt_parameter=("ANGLE_MAX", math.radians(0.01)),
     estimator_message=193,
+    slow_hint="another ground station may set the rates (MAVProxy: `set streamrate -1`), or the "
+    "link is full",
     prearm_prefixes=("PreArm: ",),
     oldest=(4, 3),
     wanted=(

@@ -91,15 +91,17 @@ class Advice:
 class WatchedParameter:
     """A parameter of the autopilot that is read before flight.
 
-    `required_bits` must be set and the value must be within `allowed`. Without a reply to one that
-    `must_answer`, the flight is refused. `advice` is for `offboard doctor`, and so is the whole
-    parameter if it is `advice_only`. `values` explains the values of an enumeration.
+    `required_bits` must be set and the value must be within `allowed`, else `default` is suggested.
+    Without a reply to one that `must_answer`, the flight is refused. `advice` is for `offboard
+    doctor`, and so is the whole parameter if it is `advice_only`. `values` explains the values of
+    an enumeration.
     """
 
     name: str
     meaning: str
     required_bits: int = 0
     allowed: tuple[float, float] | None = None
+    default: float = math.nan
     must_answer: bool = False
     advice: tuple[Advice, ...] = ()
     advice_only: bool = False
@@ -116,7 +118,7 @@ class WatchedParameter:
         if bits & self.required_bits != self.required_bits:
             valid: float = bits | self.required_bits
         elif self.allowed is not None and not self.allowed[0] <= value <= self.allowed[1]:
-            valid = min(max(value, self.allowed[0]), self.allowed[1])
+            valid = self.default
         else:
             return None
         return self._fault(value, self.meaning, valid)
@@ -176,6 +178,7 @@ class Dialect:
     hover_parameter: str  # normalised thrust that holds the weight
     tilt_parameter: tuple[str, float]  # greatest tilt of its own modes, and its unit in rad
     estimator_message: int  # id of the message that becomes an EstimatorReport
+    slow_hint: str  # what to do where telemetry comes slower than it was requested
     prearm_prefixes: tuple[str, ...]  # of a STATUSTEXT that says what a pre-arm check found
     oldest: tuple[int, int]  # version that this dialect is made for
     defects: tuple[Defect, ...] = ()

@@ -78,10 +78,13 @@ PX4 = Dialect(
             "COM_OF_LOSS_T",
             "seconds without setpoints before the failsafe",
             allowed=(0.3, 5.0),
+            default=1.0,
         ),
         WatchedParameter(
             "COM_OBL_RC_ACT",
-            "what the vehicle does when setpoints stop",
+            "what the vehicle does when setpoints stop; 6 and 7 stop the motors",
+            allowed=(0.0, 5.0),
+            default=4.0,  # not PX4's 0, which needs sticks
             values=(
                 "Position",
                 "Altitude",
@@ -93,7 +96,6 @@ PX4 = Dialect(
                 "Disarm",
             ),
             advice=(
-                Advice("the motors stop when setpoints stop", 4.0, highest=5.0),
                 Advice(
                     "when setpoints stop, the vehicle enters a mode that is flown by sticks, and "
                     "no radio is received",
@@ -129,6 +131,7 @@ PX4 = Dialect(
     hover_parameter="MPC_THR_HOVER",
     tilt_parameter=("MPC_TILTMAX_AIR", math.radians(1.0)),
     estimator_message=230,
+    slow_hint="raise MAV_x_RATE of this link, in bytes/s: PX4 slows all messages down to it",
     prearm_prefixes=("Preflight Fail: ", "Preflight: "),
     oldest=(1, 14),
     defects=(
