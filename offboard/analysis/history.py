@@ -27,7 +27,10 @@ from offboard.flight.record import (
     RECORD_NAME,
     records_of,
 )
+from offboard.mavlink.autopilots import is_vehicle
+from offboard.mavlink.decode import Address, decode_identity
 from offboard.mavlink.dialects.base import Dialect
+from offboard.mavlink.framing import HEARTBEAT
 from offboard.mavlink.session import DIALECTS
 
 Array = NDArray[np.float64]
@@ -39,7 +42,7 @@ REFERENCE_FIELDS = "x y z vx vy vz afx afy afz yaw"
 STRETCH = 100_000  # messages, about five minutes of all that PX4 sends
 LATE_S = 3.0  # telemetry that is older when it arrives is not scored
 OVERLAP_S = 1.0  # longer than the interval of signals that are interpolated, if none is lost
-_NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID: ground stations and companions
+_TUNNEL = 385  # message id
 _ARRAYS = {RECORD_NAME, IDENTIFIED_NAME}
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
@@ -74,8 +77,9 @@ class History:
 
     `records` (N,) are structured, with the fields of `flight.record.TickRecord`. `phases` and
     `announcements` are our own, `modes` and `vehicle_messages` (STATUSTEXT, refused commands) the
-    vehicle's. `vehicle_id` is the system id of the first autopilot in the log; it and `dialect` are
-    None without one, `dialect` also for one that is not known. `damage` says what could not be
+    vehicle's. `vehicle` is the one that was flown, as the log's manifest says; in an older log the
+    first autopilot that was heard. Only its messages, and ours, are used. It and `dialect` are None
+    without one, `dialect` also for one that is not known. `damage` says what could not be
     read, `damage_s` is the time of the telemetry before the first damage, NaN without.
     """
 
@@ -94,7 +98,7 @@ class History:
     announcements: tuple[Event, ...]
     modes: tuple[Event, ...]
     vehicle_messages: tuple[Event, ...]
-    vehicle_id: int | None
+    vehicle: Address | None
     dialect: Dialect | None
     messages: Counter[str]
     wall_s: float
@@ -156,10 +160,10 @@ def configuration(log: Tlog) -> str | None:
 
 
 class _Collector:
-    """Collects the messages of the vehicle with this system id and of `offboard`."""
+    """Collects the messages of this vehicle and those of `offboard`, which has its system id."""
 
-    def __init__(self, vehicle_id: int | None, dialect: Dialect | None) -> None:
-        self._vehicle_id = vehicle_id
+    def __init__(self, vehicle: Address | None, dialect: Dialect | None) -> None:
+        self._vehicle = vehicle
         self._dialect = dialect
         self._ours = {name: Stream(name) for name in (*_OUR_SAMPLES, *_OUR_NEWS)}
         self._theirs = {name: Stream(name) for name in (*_SAMPLES, *_NEWS)}
@@ -174,12 +178,16 @@ class _Collector:
         self._identified: list[Array] = []
 
     def add(self, entry: LoggedMessage) -> None:
-        kind, component, name = entry.frame.message_id, entry.frame.component_id, entry.name
+        kind, name = entry.frame.message_id, entry.name
         self._counts[name] += 1
         self._unix_us = (self._unix_us[0] or entry.unix_us, entry.unix_us)
         self._place += 1
-        ours = component in OUR_COMPONENTS
-        if not ours and entry.frame.system_id != self._vehicle_id:
+        ours = entry.component_id in OUR_COMPONENTS
+        if ours:
+            theirs = self._vehicle is not None and entry.system_id != self._vehicle.system_id
+        else:
+            theirs = (entry.system_id, entry.component_id) != self._vehicle
+        if theirs:  # of another system or component
             return
         stream = (self._ours if ours else self._theirs).get(name)
         if stream is not None and _is_used(entry, ours):
@@ -241,7 +249,7 @@ class _Collector:
             vehicle_messages=vehicle_messages(
                 self._theirs["STATUSTEXT"], self._theirs["COMMAND_ACK"], self.time_s
             ),
-            vehicle_id=self._vehicle_id,
+            vehicle=self._vehicle,
             dialect=self._dialect,
             messages=self._counts.copy(),
             wall_s=(self._unix_us[1] - self._unix_us[0]) / 1e6,
@@ -293,12 +301,24 @@ def _is_used(entry: LoggedMessage, ours: bool) -> bool:
         return any(payload[:8]) != ours
     if name == "DEBUG_FLOAT_ARRAY":
         return payload[10:20].rstrip(b"\0").decode(errors="replace") in _ARRAYS
-    return name != "HEARTBEAT" or entry.frame.component_id == 1
+    return True
 
 
-def _vehicle(log: Tlog) -> tuple[int | None, Dialect | None]:
+def _vehicle(log: Tlog) -> tuple[Address | None, Dialect | None]:
+    """The vehicle that the manifest names, else the first autopilot that was heard."""
     known = {dialect.mav_autopilot: dialect for dialect in DIALECTS.values()}
+    first: tuple[Address | None, Dialect | None] = (None, None)
     for entry in log:
-        if entry.name == "HEARTBEAT" and entry.message.autopilot != _NO_AUTOPILOT:
-            return entry.system_id, known.get(entry.message.autopilot)
-    return None, None
+        kind = entry.frame.message_id
+        if kind == HEARTBEAT and first[0] is None:
+            identity = decode_identity(entry.frame.payload)
+            if is_vehicle(identity):
+                heard = Address(entry.system_id, entry.component_id)
+                first = heard, known.get(identity.autopilot)
+        elif kind == _TUNNEL and entry.component_id in OUR_COMPONENTS:
+            is_ours = entry.message.payload_type == manifest.VEHICLE_TYPE
+            flown = manifest.vehicle_of(entry.tunnelled) if is_ours else None
+            if flown and flown.system_id == entry.system_id:
+                found = Address(flown.system_id, flown.component_id)
+                return found, DIALECTS.get(flown.autopilot)
+    return first

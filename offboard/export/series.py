@@ -18,6 +18,7 @@ from offboard.analysis.history import TELEMETRY, History
 from offboard.analysis.tlog import Tlog
 from offboard.documents.errors import UserError
 from offboard.flight.record import FIELDS
+from offboard.mavlink.decode import Address
 
 Array = NDArray[np.float64]
 
@@ -87,7 +88,7 @@ def read(path: Path) -> Flight:
     """The flight in a directory or .tlog. Raises TlogError, or UserError without telemetry."""
     log = tlog.read(tlog.find(path))
     flown = history.gather(log)
-    unix = _unix(log, flown.vehicle_id)
+    unix = _unix(log, flown.vehicle)
     if not len(unix):
         raise UserError(f"{log.path} holds no telemetry with a time stamp: nothing to export")
     events = tuple(event for event in flown.events() if np.isfinite(event.time_s))
@@ -117,12 +118,13 @@ def _series(name: str, rows: Array) -> Series:
     return Series(name, _COLUMNS[name], rows[:, 0], rows[:, 1:])
 
 
-def _unix(log: Tlog, vehicle_id: int | None) -> Array:
+def _unix(log: Tlog, vehicle: Address | None) -> Array:
     """Vehicle time and Unix time of the vehicle's telemetry, each newer than the one before."""
     rows = [
         (int.from_bytes(message.frame.payload[:4], "little") / 1e3, message.unix_us / 1e6)
         for message in log
-        if message.frame.message_id in TELEMETRY and message.system_id == vehicle_id
+        if message.frame.message_id in TELEMETRY
+        and (message.system_id, message.component_id) == vehicle
     ]
     stamps = np.reshape(rows, (-1, 2)).astype(np.float64)
     if len(stamps):

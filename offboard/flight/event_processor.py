@@ -9,6 +9,7 @@ from offboard.flight import assessment, guards
 from offboard.flight.authority import Authority
 from offboard.flight.ground_contact import GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
+from offboard.flight.manifest import vehicle_record
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.outbox import Outbox
 from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, WAITING
@@ -30,6 +31,7 @@ from offboard.mavlink.events import (
     Rebooted,
     ThrustReport,
     TimesyncReply,
+    VehicleFound,
 )
 from offboard.mavlink.outgoing import CommandResult
 from offboard.mavlink.session import Session
@@ -85,6 +87,8 @@ class EventProcessor:
                     state.clock.on_reply(vehicle_ns * 1e-9, asked_s)
             case CommandRequest():
                 self._answer(event)
+            case VehicleFound():
+                self._outbox.send(vehicle_record(event))
             case PeerChanged(peer):
                 self._outbox.announce(f"the vehicle now sends from another port: {peer}")
             case OtherCompanion(system, component):

@@ -1,4 +1,5 @@
-"""The manifest: the configuration of a flight inside its log, compressed and in numbered pieces.
+"""The manifest: the configuration of a flight inside its log, compressed and in numbered pieces,
+and which vehicle it flew.
 
 The pieces are TUNNEL messages of our record component, the first entries of the .tlog. `pieces`
 splits a text, `join` restores it.
@@ -6,16 +7,33 @@ splits a text, `join` restores it.
 
 from __future__ import annotations
 
+import json
 import struct
 import zlib
 from collections.abc import Iterable
+from dataclasses import asdict
 
+from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import ConfigurationRecord
 
 PAYLOAD_TYPE = 0xC0F1  # TUNNEL.payload_type; numbers above 32767 need no registration
+VEHICLE_TYPE = 0xC0F3  # TUNNEL.payload_type of the vehicle
 _HEAD = struct.Struct("<HH")  # index of the piece, number of pieces
 _PIECE_BYTES = 128 - _HEAD.size
 TEXT_MOST = 4_000_000  # bytes: eight of the longest configuration files; a log may be anybody's
+
+
+def vehicle_record(vehicle: VehicleFound) -> ConfigurationRecord:
+    """The record that says which vehicle is flown."""
+    return ConfigurationRecord(json.dumps(asdict(vehicle)).encode(), VEHICLE_TYPE)
+
+
+def vehicle_of(payload: bytes) -> VehicleFound | None:
+    """The vehicle in the payload of such a record; None if it is damaged."""
+    try:
+        return VehicleFound(**json.loads(payload))
+    except (ValueError, TypeError):
+        return None
 
 
 def pieces(text: str) -> list[ConfigurationRecord]:

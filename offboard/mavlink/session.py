@@ -90,7 +90,8 @@ class Reception:
 
     `frames` are all with a correct checksum, used or not, except those with our ids and those that
     signing refused; they are for the log, in which our ids mean that we sent a frame. `unlogged`
-    are those that another program sent with our ids, each after the number of `frames` before it.
+    are those that another program sent with our ids or those of our records, each after the number
+    of `frames` before it.
     `replies` answer TIMESYNC requests. They must be sent last: in lockstep, what is sent after the
     reply is applied one barrier later.
     """
@@ -157,10 +158,11 @@ class Session:
                 self.counters.decoded += 1
             else:
                 self.counters.ignored += 1
-            secret = frame.message_id == framing.SETUP_SIGNING  # holds the key
-            if outcome is DropReason.SAME_IDS and not secret:
+            if outcome in _NOT_LOGGED or frame.message_id == framing.SETUP_SIGNING:
+                continue  # the latter holds the key
+            if self._has_our_ids(frame):
                 unlogged.append((len(frames), frame.raw))
-            elif frame.verified and not secret and outcome not in _NOT_LOGGED:
+            elif frame.verified:
                 frames.append(frame.raw)
         return Reception(tuple(frames), tuple(events), tuple(replies), tuple(unlogged))
 
@@ -211,6 +213,11 @@ class Session:
                 events.append(TimesyncReply(ts1_ns, tc1_ns + wrapped_ns))
             return True
         return self._interpret(frame, now_s, events)
+
+    def _has_our_ids(self, frame: framing.Frame) -> bool:
+        """Whether it has the ids of what we send, or of our records."""
+        ours = (self.settings.component_id, self.settings.record_component_id)
+        return frame.system_id == self._own.system_id and frame.component_id in ours
 
     def _requested(
         self, frame: framing.Frame, sender: Address, events: list[Event]

@@ -60,7 +60,7 @@ def read(path: Path) -> Flight:
     """Read a flight directory or a .tlog file. Raises TlogError."""
     log = tlog.read(tlog.find(path))
     flown = history.gather(log)
-    missing = [_NO_HEARTBEAT] if flown.vehicle_id is None else []
+    missing = [_NO_HEARTBEAT] if flown.vehicle is None else []
     if not len(flown.records):
         missing.append(_NO_RECORDS)
     flown, notes = completed(flown, log)

@@ -35,7 +35,7 @@ def completed(flown: History, log: Tlog) -> tuple[History, list[str]]:
     if not streams:
         return flown, []
     for place, entry in enumerate(log):
-        if entry.name in streams and entry.frame.system_id == flown.vehicle_id:
+        if entry.name in streams and (entry.system_id, entry.component_id) == flown.vehicle:
             streams[entry.name].add(entry, place, math.nan)
     anchor_ms = 1e3 * next(
         (rows[0, 0] for rows in (flown.attitude, flown.position) if len(rows)), math.nan

@@ -216,7 +216,9 @@ class Recorder:
         self._engaged, self._vehicle = [directory], vehicle
         self._flight = flight = FlightRecord(directory, configuration, vehicle)
         now_us = clock.unix_us()
-        for piece in manifest.pieces(configuration):
+        assert session.vehicle is not None
+        found = manifest.vehicle_record(session.vehicle)
+        for piece in (*manifest.pieces(configuration), found):
             flight.write(entry(now_us, session.encode(piece)))
         earlier = {record for _, record in self._before}
         for record in self._once.values():

@@ -258,6 +258,7 @@ def make(
     deadline_s: float | None = None,
     boot_scale: float = 0.25,
     clock: HostClock | None = None,
+    system_id: int | None = None,
     **options: Any,
 ) -> Pair:
     """A pair as `offboard fly --sitl` makes it. `flies` is the simulated vehicle, `believed` the
@@ -277,6 +278,7 @@ def make(
         vehicle=believed,
         session=Session(
             SessionSettings(
+                system_id=system_id,
                 component_id=COMPONENT_ID,
                 record_component_id=RECORD_COMPONENT_ID,
             )

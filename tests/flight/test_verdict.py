@@ -98,6 +98,33 @@ def test_a_flight_that_ended_early_says_what_ended_it(
     assert verdict(ended) == f"not completed ({ended_by}): {ended.reason}"
 
 
+def test_others_on_the_link_have_no_effect(flown: History, tmp_path: Path) -> None:
+    """Another autopilot, heard first, its companion with our component id, and a camera of the same
+    system: none of them is what `--system 1` flies."""
+    battery = mavlink.MAVLink_sys_status_message(0, 0, 0, 0, 9000, 0, 5, 0, 0, 0, 0, 0, 0)
+    text = b"offboard: land: the battery holds 9 %"
+    others = [
+        (2, 1, mavlink.MAVLink_heartbeat_message(2, 3, 0, 4, 4, 3)),
+        (2, 1, mavlink.MAVLink_local_position_ned_message(10, 9, 9, -9, 9, 9, 9)),
+        (2, 191, mavlink.MAVLink_statustext_message(4, text)),
+        (1, 100, mavlink.MAVLink_statustext_message(4, text)),
+        (1, 100, mavlink.MAVLink_heartbeat_message(30, 8, 128, 0, 5, 3)),
+        (1, 100, mavlink.MAVLink_local_position_ned_message(10, 9, 9, -9, 9, 9, 9)),
+        (1, 100, mavlink.MAVLink_extended_sys_state_message(0, 2)),
+        (1, 100, battery),
+        (1, 192, mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)),
+        (1, 192, mavlink.MAVLink_statustext_message(4, text)),
+    ]
+    frames = [each.pack(mavlink.MAVLink(None, *ids)) for *ids, each in others]
+    pair = hover(system_id=1, down=lambda _, heard: [*frames, *heard] if heard else [])
+    assert pair.fly() == calm_hover().companion.outcome
+    assert pair.rungs == {}
+    among = score(history.gather(pair.log(tmp_path)))
+    alone = score(flown)
+    assert (among.completed, among.ended_by) == (1.0, "reference over")
+    assert among.rmse_position_m == alone.rmse_position_m
+
+
 @pytest.mark.parametrize("height", [1.5, 0.6])
 def test_a_fall_is_no_landing(height: float, tmp_path: Path) -> None:
     """The motors are cut above the ground while it lands: all phases are gone through."""
