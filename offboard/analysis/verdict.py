@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from offboard.analysis.events import Event
 from offboard.analysis.history import History
 from offboard.flight.phases import STOPPED
-from offboard.flight.touchdown import Touchdown
+from offboard.flight.position_jumps import PositionJumps
+from offboard.flight.touchdown import Touchdown, Triple, moved
+from offboard.mavlink.events import LocalPosition
 
 Array = NDArray[np.float64]
 
@@ -54,25 +56,34 @@ class Landing:
     """Judges the landing from the samples of a flight, which may come in stretches."""
 
     def __init__(self) -> None:
-        self._takeoff: Array | None = None
+        self._jumps = PositionJumps()
+        self._takeoff: Triple | None = None
         self._touchdown: Touchdown | None = None
         self._done_s = -math.inf
 
     def add(self, flown: History, until_s: float) -> None:
         """Evaluate the positions up to `until_s`."""
         begun = begin_times(flown.phases)
-        position = flown.position[np.argsort(flown.position[:, 0], kind="stable")]
-        if self._takeoff is None and "takeoff" in begun:
-            before = position[position[:, 0] <= begun["takeoff"]]
-            self._takeoff = before[-1, 1:4] if len(before) else None
-        if "land" not in begun:
+        takes_off_s, lands_s = (begun.get(phase, math.inf) for phase in ("takeoff", "land"))
+        rows = flown.position[np.argsort(flown.position[:, 0], kind="stable")]
+        rows = rows[(rows[:, 0] > self._done_s) & (rows[:, 0] <= until_s)]
+        for row in rows.tolist():
+            self._add(LocalPosition(row[0], tuple(row[1:4]), tuple(row[4:7])), takes_off_s, lands_s)
+        self._done_s = until_s
+
+    def _add(self, position: LocalPosition, takes_off_s: float, lands_s: float) -> None:
+        jump_ned_m, place = self._jumps.on_position(position), position.position_ned_m
+        if position.time_s <= takes_off_s:
+            self._takeoff = place
+        elif jump_ned_m is not None and self._takeoff is not None:
+            self._takeoff = moved(self._takeoff, jump_ned_m.tolist())
+        if position.time_s <= lands_s:
             return
         if self._touchdown is None:
-            self._touchdown = Touchdown(tuple(self._takeoff) if self._takeoff is not None else None)
-        begin_s, self._done_s = max(self._done_s, begun["land"]), until_s
-        rows = position[(position[:, 0] > begin_s) & (position[:, 0] <= until_s)]
-        for row in rows.tolist():
-            self._touchdown.on_position(row[0], (row[1], row[2], row[3]), row[6])
+            self._touchdown = Touchdown(self._takeoff if takes_off_s < math.inf else None)
+        elif jump_ned_m is not None:
+            self._touchdown.on_jump(jump_ned_m.tolist())
+        self._touchdown.on_position(position.time_s, place, position.velocity_ned_mps[2])
 
     def judge(self, flown: History) -> tuple[str, float]:
         """Why it has not landed, empty if it has; and the downward speed at touch-down."""

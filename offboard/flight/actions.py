@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from offboard.estimation.observer import Observer
-from offboard.flight.assessment import has_other_sender
+from offboard.flight.assessment import STILL_ARMED, has_other_sender
 from offboard.flight.decide import Decider, Tick
 from offboard.flight.gate import LEVEL
+from offboard.flight.ground_contact import STANDING_S
 from offboard.flight.outbox import Outbox
 from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, Phase
 from offboard.flight.state import FlightState
@@ -21,9 +22,10 @@ AUTOPILOT_VERSION = 148  # message id
 FIT_EVERY_S = 4.0  # between two reductions of the telemetry: a backlog must drain first
 SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
 SPOOL_MAX = 2.0
+SPOOL_UNSEEN = 0.9  # without a new position nothing must lift off, or climb
+POSITION_KNOWN_S = 0.2  # age of a position that shows the height
 TAKEOFF_HEIGHT_M = 3.0  # of an autopilot's own take-off, which setpoints replace on the way
 LAND_STREAM_S = 3.0  # if the landing is refused, setpoints stop and the autopilot's failsafe lands
-STANDING_S = 15.0  # in the landing mode at one height: on the ground, whatever the detector says
 
 
 class PhaseActions:
@@ -85,19 +87,21 @@ class PhaseActions:
             if self._outbox.request(dialect.hold() if holds else dialect.land()):
                 authority.request(mode)
         elif not holds:
-            self._disarm_if_standing(tick)
+            self._disarm_if_standing()
         if steers and authority.mode == authority.engage_mode and tick.in_phase_s < LAND_STREAM_S:
             self._outbox.send_level(tick.time_s, self._level())
 
-    def _disarm_if_standing(self, tick: Tick) -> None:
-        """A land detector that gusts deceive would keep the motors running on the ground."""
-        stood = self._state.contact.stood_for(STANDING_S)
-        if (
-            stood
-            and tick.in_phase_s > 2.0 * STANDING_S
-            and self._outbox.request(CommandLong.disarm(force=True))
-        ):
-            self._outbox.announce(
+    def _disarm_if_standing(self) -> None:
+        """Ask a vehicle that stands, and does not disarm by itself, to disarm. It is never forced
+        to: by its own land detector the autopilot refuses in the air. While that detector says so,
+        only the user can disarm."""
+        contact = self._state.contact
+        if not contact.stands:
+            return
+        if contact.detects_flight:
+            self._outbox.announce_once(STILL_ARMED)
+        elif self._outbox.request(CommandLong.disarm()):
+            self._outbox.announce_once(
                 f"disarming: {STANDING_S:.0f} s without motion on the ground, and the vehicle "
                 "does not disarm by itself"
             )
@@ -179,7 +183,11 @@ class PhaseActions:
         if self._state.takes_off_by_command:
             self._request_takeoff(tick.time_s)
             return
-        spool = min(SPOOL_MAX, SPOOL_UP_PER_S * tick.in_phase_s)
+        age_s, most = self._state.vehicle.position_age_s, SPOOL_MAX
+        rising_s = tick.in_phase_s
+        if age_s > POSITION_KNOWN_S:
+            rising_s, most = rising_s - age_s, SPOOL_UNSEEN
+        spool = min(most, max(0.0, SPOOL_UP_PER_S * rising_s))
         thrust_mps2 = spool * self._state.model.gravity_mps2
         course_rad = self._outbox.command.course_rad
         self._outbox.send_level(tick.time_s, Command(thrust_mps2, LEVEL, course_rad))
@@ -195,9 +203,13 @@ class PhaseActions:
         self._outbox.set_command(time_s, Command(gravity_mps2, LEVEL, course_rad))
 
     def _level(self) -> Command:
-        """Level, with the thrust that hovers; before lift-off with the thrust reached."""
+        """Level, with the thrust that hovers. Before lift-off is seen, with the thrust reached, but
+        less than lifts."""
         flying, command = self._state.plan.reference is not None, self._outbox.command
-        thrust_mps2 = self._outbox.hover_mps2() if flying else command.thrust_mps2
+        least_mps2 = SPOOL_UNSEEN * self._state.model.gravity_mps2
+        thrust_mps2 = min(command.thrust_mps2, least_mps2)
+        if flying:
+            thrust_mps2 = self._outbox.hover_mps2()
         return Command(thrust_mps2, LEVEL, command.course_rad)
 
     @property

@@ -13,6 +13,7 @@ import numpy as np
 from offboard.estimation.observer import Observer
 from offboard.flight.authority import Standing
 from offboard.flight.facts import Facts
+from offboard.flight.ground_contact import STANDING_S
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.phases import TRACKING, Phase
 from offboard.flight.state import FlightState
@@ -29,6 +30,10 @@ THRUST_REPORT_S = 1.0  # age of a ThrustReport that counts
 ARMING_SHOWN_S = 2.5  # HEARTBEAT, at 1 Hz, shows an accepted arming within this time
 READIED = (Phase.HEALTH, Phase.STANDBY)  # phases in which readiness is judged
 ARM = 400  # MAV_CMD_COMPONENT_ARM_DISARM
+STILL_ARMED = (
+    f"it has stood still for {STANDING_S:.0f} s and is armed: its land detector reports that it "
+    "flies; disarm it with the transmitter or a ground station"
+)
 
 
 def facts(
@@ -154,6 +159,7 @@ def figures(
         "failure": state.failure,
         "contradiction": identification.contradiction if identification else "",
         "not_landed": state.not_landed(),
+        "still_armed": f"; {STILL_ARMED}" if state.contact.stands and vehicle.armed else "",
         "problems": "; ".join(problems(state)),
         "not_ready": not_ready(state, session),
     }

@@ -270,8 +270,8 @@ class Companion:
             self._logged += reception.frames
             replies += reception.replies
             for event in reception.events:
-                heard |= self._is_telemetry(event)
                 self._events.process(event, arrived_s, turned_s=now_s)
+                heard |= self._is_telemetry(event)
                 if isinstance(event, Rebooted):
                     self._on_reboot()
         news = self._session.counters.news()
@@ -336,10 +336,11 @@ class Companion:
         """Whether the event ends a silence. Once position and attitude are received only they do:
         without them vehicle time stands still and nothing is decided. After a reboot in flight both
         must be received again."""
-        if not self.state.vehicle.has_state:
+        vehicle = self.state.vehicle
+        if not vehicle.has_state:
             on_ground = self.state.phase in BEFORE_FLIGHT
             return on_ground and not isinstance(event, ClockBehind)
-        return isinstance(event, (Attitude, LocalPosition))
+        return isinstance(event, (Attitude, LocalPosition)) and not vehicle.repeated
 
     def _on_reboot(self) -> None:
         self._tick = -1

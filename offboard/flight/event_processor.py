@@ -68,12 +68,12 @@ class EventProcessor:
         state.now_s = self._session.link_time_s
         state.vehicle.update(event, state.now_s)
         match event:
-            case Attitude(time_s, attitude, rates):
+            case Attitude(time_s, attitude, rates) if not state.vehicle.repeated:
                 self._on_telemetry(time_s, arrived_s, turned_s)
                 self._observer.on_attitude(time_s, attitude, rates)
                 if self._identification:
                     self._identification.on_attitude(time_s, attitude)
-            case LocalPosition() if event is state.vehicle.position:
+            case LocalPosition() if not state.vehicle.repeated:
                 self._on_telemetry(event.time_s, arrived_s, turned_s)
                 self._on_position(event)
             case ThrustReport(thrust):
@@ -127,11 +127,11 @@ class EventProcessor:
 
     def _on_position(self, event: LocalPosition) -> None:
         state, time_s, down_mps = self._state, event.time_s, event.velocity_ned_mps[2]
+        self._follow_jump(event)
         state.contact.on_position(event)
         state.hover.on_position(time_s, state.contact.height_m, down_mps)
         if state.touchdown:
             state.touchdown.on_position(time_s, event.position_ned_m, down_mps)
-        self._follow_jump(event)
         self._observer.on_position(time_s, event.position_ned_m, event.velocity_ned_mps)
         if self._identification:
             north, east, down = np.subtract(event.position_ned_m, state.jumps.total_ned_m).tolist()
@@ -140,6 +140,8 @@ class EventProcessor:
     def _follow_jump(self, event: LocalPosition) -> None:
         """The vehicle does not step when its estimate does."""
         state, jump_ned_m = self._state, self._state.jumps.on_position(event)
+        if jump_ned_m is not None:
+            state.move_ground(jump_ned_m.tolist())
         if state.phase not in TRACKING:
             state.jumps.forget()
         elif jump_ned_m is not None:

@@ -18,6 +18,8 @@ LIFTED_HEIGHT_M, LIFTED_CLIMB_MPS, LIFTED_SAMPLES = 0.15, 0.4, 3
 GROUND_SPEED_MPS = 0.5  # as an estimate on the ground may show
 STOOD_WITHIN_M, STOOD_HEIGHT_M, STOOD_S = 0.1, 0.3, 1.0
 KEPT_S, KEPT_EVERY_S = 20.0, 0.05
+STANDING_S = 15.0  # at one height: it stands, and does not hover
+POSITION_KNOWN_S = 1.0  # age of a position that shows where it is
 
 
 @dataclass(slots=True)
@@ -55,13 +57,26 @@ class GroundContact:
         return self.rest_down_m - position.position_ned_m[2] if position else 0.0
 
     @property
+    def alive(self) -> bool:
+        """Positions arrive, so that the height is known."""
+        return self.vehicle.position_age_s < POSITION_KNOWN_S
+
+    @property
+    def stands(self) -> bool:
+        """It has stood for so long, by positions that still arrive, that it does not hover."""
+        return self.alive and self.stood_for(STANDING_S)
+
+    @property
+    def detects_flight(self) -> bool:
+        """The land detector reports that the vehicle is not on the ground."""
+        known = self.vehicle.age_s(Landed) <= DETECTOR_KNOWN_S
+        return known and self.vehicle.landed not in ("on_ground", "unknown")
+
+    @property
     def certainly_flies(self) -> bool:
         """Every sign says that the vehicle flies. In doubt a pilot's switch does not engage: the
         vehicle may stand on the ground."""
-        vehicle = self.vehicle
-        known = vehicle.age_s(Landed) <= DETECTOR_KNOWN_S
-        detected = known and vehicle.landed not in ("on_ground", "unknown")
-        return self.in_the_air and detected and not self.stood_for(STOOD_S)
+        return self.in_the_air and self.detects_flight and not self.stood_for(STOOD_S)
 
     @property
     def certain(self) -> bool:

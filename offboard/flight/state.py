@@ -7,6 +7,7 @@ with the time when it was heard. What follows from them is in `facts`.
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from offboard.flight.authority import Authority, Standing
@@ -21,7 +22,7 @@ from offboard.flight.position_jumps import PositionJumps
 from offboard.flight.programme import FLY, Programme
 from offboard.flight.readiness import Readiness
 from offboard.flight.requests import Request
-from offboard.flight.touchdown import Touchdown
+from offboard.flight.touchdown import Touchdown, moved
 from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.dialects.base import Dialect, Takeoff
 from offboard.mavlink.events import Landed
@@ -33,7 +34,6 @@ Triple = tuple[float, float, float]
 COMMANDS_KEPT = 7  # as long as an attitude may take to follow
 THRUSTS_KEPT = 40  # as long as a setpoint may be on its way, or the next ones be lost
 PREDICTIONS_KEPT = 8
-POSITION_KNOWN_S = 1.0  # for the verdict of a landing
 
 
 @dataclass(frozen=True, slots=True)
@@ -169,10 +169,21 @@ class FlightState:
         vehicle = self.vehicle
         if self.touchdown is None:
             return "it was not told to land"
-        if not vehicle.position_age_s < POSITION_KNOWN_S:
+        if not self.contact.alive:
             return "no LOCAL_POSITION_NED shows it"
         on_ground = vehicle.landed == "on_ground" and vehicle.age_s(Landed) < DETECTOR_KNOWN_S
         return self.touchdown.not_landed(on_ground=on_ground)
+
+    def move_ground(self, jump_ned_m: Iterable[float]) -> None:
+        """The reported position has jumped by this (3,), not the vehicle: so has the ground."""
+        jump = tuple(jump_ned_m)
+        self.home_ned_m = moved(self.home_ned_m, jump)
+        if self.takeoff_ned_m is not None:
+            self.takeoff_ned_m = moved(self.takeoff_ned_m, jump)
+        if self.contact.rest_ned_m is not None:
+            self.contact.rest_ned_m = moved(self.contact.rest_ned_m, jump)
+        if self.touchdown is not None:
+            self.touchdown.on_jump(jump)
 
     @property
     def link_growth_s(self) -> float:

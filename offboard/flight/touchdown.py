@@ -6,7 +6,9 @@ Used in flight and by the score, so that both give the same verdict. No clock, n
 from __future__ import annotations
 
 import math
+import operator
 from collections import deque
+from collections.abc import Iterable
 
 Triple = tuple[float, float, float]
 
@@ -19,8 +21,15 @@ ABOVE_TAKEOFF_M = 1.5  # for the drift of the estimated height
 SLOPE = 0.1  # of the terrain
 
 
+def moved(point_ned_m: Triple, jump_ned_m: Iterable[float]) -> Triple:
+    """A place on the ground after the reported position has jumped by `jump_ned_m` (3,)."""
+    north, east, down = map(operator.add, point_ned_m, jump_ned_m)
+    return north, east, down
+
+
 class Touchdown:
-    """One landing. Give it each position from the beginning of the landing on.
+    """One landing. Give it each position from the beginning of the landing on, and each jump of the
+    reported position (`position_jumps`) before it: they move the ground as well.
 
     `takeoff_ned_m` is the take-off point; None if unknown, then the height is not judged.
     `speed_mps` is the largest downward speed within a second before the vehicle came to rest where
@@ -31,11 +40,15 @@ class Touchdown:
         self._takeoff_ned_m = takeoff_ned_m
         self._newest: deque[tuple[float, float, float]] = deque()  # time, down, downward speed
         self._position_ned_m: Triple = (math.nan,) * 3
+        self._reported: tuple[Triple, float] | None = None
         self._rest_down_m = math.nan
         self.speed_mps = math.nan
 
     def on_position(self, time_s: float, position_ned_m: Triple, down_mps: float) -> None:
         """A position, and the downward component of the velocity."""
+        if (position_ned_m, down_mps) == self._reported:
+            return  # no estimator reports the same twice: it has stopped
+        self._reported = position_ned_m, down_mps
         self._position_ned_m, down_m = position_ned_m, position_ned_m[2]
         newest = self._newest
         newest.append((time_s, down_m, down_mps))
@@ -48,6 +61,14 @@ class Touchdown:
             self._rest_down_m = down_m
         elif abs(down_m - self._rest_down_m) > BOUNCE_M:
             self.speed_mps = math.nan
+
+    def on_jump(self, jump_ned_m: Iterable[float]) -> None:
+        """The reported position has jumped by this (3,), and with it all places on the ground."""
+        jump = tuple(jump_ned_m)
+        self._rest_down_m += jump[2]
+        self._newest = deque((at_s, down + jump[2], mps) for at_s, down, mps in self._newest)
+        if self._takeoff_ned_m is not None:
+            self._takeoff_ned_m = moved(self._takeoff_ned_m, jump)
 
     def _rests(self, time_s: float) -> bool:
         downs = [down for at_s, down, _ in self._newest if at_s >= time_s - REST_S]

@@ -176,7 +176,7 @@ TRANSITIONS: tuple[Row, ...] = (
         Phase.LAND,
         "land_s",
         Phase.FAILED,
-        "not landed and disarmed after {in_phase_s:.0f} s",
+        "not landed and disarmed after {in_phase_s:.0f} s{still_armed}",
         ABORTED,
     ),
     Row(Phase.STAND_DOWN, guards.rebooted, Phase.FAILED, REBOOTED, REFUSED),

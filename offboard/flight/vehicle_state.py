@@ -64,6 +64,8 @@ class VehicleState:
     resumed_s: float = -math.inf  # vehicle time of the first telemetry after an outage
     now_s: float = 0.0
     heard_s: dict[type, float] = field(default_factory=dict)  # by type of event
+    repeated: bool = False  # the newest event repeats the one of its kind before: no measurement
+    _was_armed: bool = False
 
     @property
     def time_s(self) -> float:
@@ -124,6 +126,9 @@ class VehicleState:
     def update(self, event: Event, now_s: float) -> None:
         """Store what one event reports."""
         self.now_s = now_s
+        self.repeated = self._was_armed and self._repeats(event)
+        if self.repeated:
+            return
         self.heard_s[type(event)] = now_s
         if isinstance(event, (LocalPosition, Attitude)):
             self._detect_outage(event.time_s)
@@ -132,13 +137,14 @@ class VehicleState:
                 if armed != self.armed:
                     self.armed_changed_s = now_s
                 self.heartbeat, self.mode = event, mode
+                self._was_armed |= armed
             case ModeReport(mode):
                 self.mode = mode
             case OtherSender():
                 self.other_sender = event
             case OtherCompanion():
                 self.other_companion = event
-            case LocalPosition() if not self._repeats(event):
+            case LocalPosition():
                 self.position = event
             case Attitude():
                 self.attitude = event
@@ -163,16 +169,23 @@ class VehicleState:
             case Rebooted():
                 self._reset()
 
-    def _repeats(self, event: LocalPosition) -> bool:
-        """Whether it reports a motion, and nothing has changed: it is not new, whatever its
-        stamp."""
-        newest = self.position
-        return (
-            newest is not None
-            and event.position_ned_m == newest.position_ned_m
-            and event.velocity_ned_mps == newest.velocity_ned_mps
-            and any(event.velocity_ned_mps)
-        )
+    def _repeats(self, event: Event) -> bool:
+        """Whether a position or an attitude is that of the message before, whatever its stamp. No
+        estimator repeats itself once motors have run, not even on the ground."""
+        match event:
+            case LocalPosition(_, position, velocity):
+                newest = self.position
+                return newest is not None and (position, velocity) == (
+                    newest.position_ned_m,
+                    newest.velocity_ned_mps,
+                )
+            case Attitude(_, attitude, rates):
+                before = self.attitude
+                return before is not None and (attitude, rates) == (
+                    before.attitude,
+                    before.rates_frd_radps,
+                )
+        return False
 
     def _detect_outage(self, time_s: float) -> None:
         """After an outage, a new one is accepted only once both streams have resumed: a slow

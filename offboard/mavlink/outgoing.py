@@ -55,9 +55,9 @@ class CommandLong:
         return cls(400, (1.0,))
 
     @classmethod
-    def disarm(cls, *, force: bool = False) -> CommandLong:
-        """`force`: also a vehicle whose own land detector says that it flies."""
-        return cls(400, (0.0, 21196.0) if force else (0.0,))
+    def disarm(cls) -> CommandLong:
+        """Refused by an autopilot whose own land detector says that it flies."""
+        return cls(400, (0.0,))
 
     @classmethod
     def land(cls) -> CommandLong:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import re
 from functools import partial
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -33,10 +34,11 @@ from watch import (
 
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import ExitCode, Phase, Rung
+from offboard.flight.state import Outcome
 from simulator.config import Scenario
 from simulator.firmware.px4 import PX4
 
-CURRENT_MODE, DISARM_BY_FORCE = 436, 21196
+CURRENT_MODE = 436
 
 
 # -- authority -------------------------------------------------------------------------------------
@@ -357,6 +359,23 @@ def test_a_large_reset_of_the_estimate_is_left_to_the_autopilot(fly: Fly) -> Non
     assert pair.rungs["estimator"] is Rung.HOLD
 
 
+@pytest.mark.parametrize("fly", [hover, partial(on_arducopter, *SHORT, reference="hover")])
+@pytest.mark.parametrize(
+    ("climbs_m", "moment"),
+    [(1.9, {"after": "took_off", "at_s": 6.0}), (3.0, {"after": "landing", "at_s": 0.5})],
+    ids=["in flight", "in landing"],
+)
+def test_a_landing_is_judged_by_the_ground_where_a_reset_has_moved_it(
+    climbs_m: float, moment: dict[str, Any], fly: Fly, tmp_path: Path
+) -> None:
+    """The estimated height jumps up, and with it the ground: for the flight and for the score."""
+    reset = {"fault": "estimator_jump", "offset_ned_m": (0.0, 0.0, -climbs_m), **moment}
+    pair = fly(scenario=scenario_of(reset))
+    assert pair.fly() == Outcome(ExitCode.FLOWN, "flown and landed")
+    assert pair.companion.state.contact.height_m == pytest.approx(0.0, abs=0.1)
+    assert pair.score(tmp_path).ended_by == "reference over"
+
+
 def jumping(offset_m: float) -> Scenario:
     return scenario_of(
         {
@@ -380,13 +399,24 @@ def test_a_fall_in_the_landing_is_not_flown(fly: Fly) -> None:
 
 
 @BOTH
-def test_a_vehicle_that_does_not_detect_its_landing_is_disarmed_and_said(fly: Fly) -> None:
-    pair = fly(ONE_LAP, scenario="never_landed")
-    watch = watched(pair)
+def test_a_vehicle_that_does_not_detect_its_landing_is_left_to_the_user(fly: Fly) -> None:
+    """Only its land detector says whether it flies: it is not disarmed, and the user is told."""
+    pair = fly(ONE_LAP, scenario="never_landed", limits={"land_s": 30.0})
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    still_armed = (
+        "it has stood still for 15 s and is armed: its land detector reports that it flies"
+    )
+    assert f"not landed and disarmed after 30 s; {still_armed}" in outcome.sentence
+    assert said(pair, still_armed)
+    assert pair.instance.autopilot.commander.armed
+    assert [m.param1 for m in pair.commands(ARM)] == [1.0]
+
+
+def test_a_vehicle_that_does_not_disarm_by_itself_is_disarmed() -> None:
+    """Its land detector knows the ground. It is asked without force."""
+    pair = hover(firmware=PX4)
+    pair.instance.autopilot.parameters.set("COM_DISARM_LAND", 0.0)
     assert pair.fly().exit_code == ExitCode.FLOWN
-    assert not pair.instance.autopilot.commander.armed
-    disarmed = [m for m in pair.commands(ARM) if (m.param1, m.param2) == (0.0, DISARM_BY_FORCE)]
-    assert len(disarmed) == 1
+    assert [(m.param1, m.param2) for m in pair.commands(ARM)] == [(1.0, 0.0), (0.0, 0.0)]
     assert said(pair, "15 s without motion on the ground, and the vehicle does not disarm")
-    on_ground = [m for m in watch.moments if m.phase is Phase.LAND and m.position_ned_m[2] > -0.05]
-    assert watch.moments[-1].time_s - on_ground[0].time_s > 15.0

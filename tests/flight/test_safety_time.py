@@ -6,6 +6,7 @@ period, when it reaches the vehicle.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,20 @@ from typing import Any
 import pytest
 from faults import HEARTBEAT, frame_id, shuffling, without
 from pair import SHORT, Bytes, HostClock, Pair, frames_of, hover, in_phase, make, on_arducopter
-from watch import BOTH, HIGH, LAND, SET_MODE, Fly, Watch, said, sent_after, watched
+from watch import (
+    ARM,
+    BOTH,
+    HIGH,
+    LAND,
+    ONE_LAP,
+    SET_MODE,
+    Fly,
+    Watch,
+    said,
+    scenario_of,
+    sent_after,
+    watched,
+)
 
 from offboard.control.base import Controller, Decision, Situation
 from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
@@ -98,15 +112,41 @@ def test_a_saturated_link_does_no_harm(fly: Fly) -> None:
     assert not pair.instance.autopilot.commander.armed
 
 
+POSITION, ATTITUDE = "LOCAL_POSITION_NED", "ATTITUDE_QUATERNION"
+ARMED, IN_FLIGHT = {"after": "armed", "at_s": 0.1}, {"after": "engaged", "at_s": 16.0}
+STUCK = {
+    "armed": (ARMED, [POSITION], "no LOCAL_POSITION_NED for 0.[56] s"),
+    "track": (IN_FLIGHT, [POSITION], "no LOCAL_POSITION_NED for 0.[56] s"),
+    "landing": (
+        {"after": "landing", "at_s": 0.5},
+        [POSITION],
+        "disarmed, but not landed: no LOCAL_POSITION_NED shows it",
+    ),
+    "attitude": (IN_FLIGHT, [ATTITUDE], "no ATTITUDE_QUATERNION for 0.[56] s"),
+    "both": (IN_FLIGHT, [POSITION, ATTITUDE], "no telemetry for 1.0 s"),
+}
+
+
 @BOTH
-def test_a_position_that_stands_still_with_new_stamps_is_not_followed(fly: Fly) -> None:
-    pair = fly(scenario="frozen_position")
+@pytest.mark.parametrize("case", STUCK)
+def test_telemetry_that_repeats_itself_is_none(case: str, fly: Fly) -> None:
+    """With new stamps and for good, on the ground with a velocity of zero. Thrust is twice what the
+    file says; the vehicle stays within 3 m of the height that was seen last, and is never disarmed
+    in the air."""
+    moment, messages, says = STUCK[case]
+    faults = [{"fault": "stuck_message", "message": each, **moment} for each in messages]
+    pair = fly(HIGH, ONE_LAP, scenario=scenario_of(*faults, conditions={"thrust_scale": 2.0}))
     watch = watched(pair)
+    seen_m: list[float] = []  # the last true height
+    begins = (lambda flying: flying.instance.view.stuck, lambda _: seen_m.append(watch.height_m))
+    pair.at.append(begins)
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
-    assert outcome.sentence.startswith("no LOCAL_POSITION_NED for 0.6 s")
-    assert watch.error_m < 0.1
-    assert not pair.instance.autopilot.commander.armed
+    assert re.match(says, outcome.sentence)
+    begun_s = next(at_s for at_s, phase in pair.phases if phase is Phase.LAND)
+    assert max(-m.position_ned_m[2] for m in watch.moments if m.time_s > begun_s) < seen_m[0] + 3.0
+    assert all(m.armed for m in watch.during(Phase.LAND) if m.position_ned_m[2] < -0.1)
+    assert [m.param1 for m in pair.commands(ARM)] == [1.0]
 
 
 @BOTH

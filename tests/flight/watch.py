@@ -83,6 +83,11 @@ class Watch:
         return max(-moment.position_ned_m[2] for moment in self.moments)
 
     @property
+    def height_m(self) -> float:
+        """The newest."""
+        return -float(self.moments[-1].position_ned_m[2])
+
+    @property
     def fall_mps(self) -> float:
         """Largest downward speed."""
         return max(moment.down_mps for moment in self.moments)
