@@ -37,7 +37,7 @@ from pair import SHORT, UNIX_EPOCH_US, HostClock, Pair, hover, in_phase
 WIRE = Path(__file__).parents[1] / "wire" / "recordings"
 KEY = bytes(range(32))
 NEUTRAL_HOVER_THRUST = 0.42  # config/vehicles/neutral.yaml
-SMALLEST, CLIMB_BEGAN_S = "faulty-px4", 9.1
+SMALLEST, CLIMB_BEGAN_S = "faulty-px4", 9.0
 
 
 @pytest.fixture(scope="module")
