@@ -52,8 +52,9 @@ P = ParamSpec("P")
 R = TypeVar("R")
 F = TypeVar("F", bound=Callable[..., Any])
 
-Parameter = type[int] | type[float] | np.dtype[Any] | tuple[int, np.dtype[Any]]
-"""A number, the dtype of an array of one record, or the dimensions and dtype of an array."""
+Parameter = type[int | float | np.random.Generator] | np.dtype[Any] | tuple[int, np.dtype[Any]]
+"""A number, a random generator, the dtype of an array of one record, or the dimensions and dtype of
+an array."""
 
 ENTRIES_PER_PROCESS = 3  # starting a process costs as much as compiling one of them
 UNUSED_S = 30 * 86400.0  # machine code that was not used for so long is deleted
@@ -75,7 +76,7 @@ def array(dimensions: int, dtype: str | np.dtype[Any] = "f8") -> Parameter:
 
 def entry(*parameters: Parameter) -> Callable[[Callable[P, R]], Entry[P, R]]:
     """Decorator of a function that Python calls. There is one parameter per argument: `int`,
-    `float`, `array(dimensions)`, or a dtype for an array of one record."""
+    `float`, `np.random.Generator`, `array(dimensions)`, or a dtype for an array of one record."""
     return lambda function: Entry(function, parameters)
 
 
@@ -141,10 +142,11 @@ def loading() -> Iterator[None]:
 
 
 def _numba_type(parameter: Parameter) -> Any:
-    from numba import float64, from_dtype, int64, types
+    from numba import float64, from_dtype, int64, typeof, types
 
     if isinstance(parameter, type):
-        return {int: int64, float: float64}[parameter]
+        generator = typeof(np.random.default_rng())
+        return {int: int64, float: float64, np.random.Generator: generator}[parameter]
     dimensions, dtype = parameter if isinstance(parameter, tuple) else (1, parameter)
     return types.Array(from_dtype(dtype), dimensions, "C")
 

@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.swarm import RandomLanes, Swarm, SwarmSettings
+from offboard.control.swarm import Swarm, SwarmSettings
 from offboard.documents.errors import UserError
 
 Array = NDArray[np.float64]
@@ -32,7 +32,7 @@ class _Swarm:
     def __init__(self, dimensions: int, batch: int, seed: int) -> None:
         settings = SwarmSettings(particles=batch, damping=DAMPING)
         zeros, ones = np.zeros(dimensions), np.ones(dimensions)
-        self._swarm = Swarm(zeros, ones, settings, RandomLanes(seed))
+        self._swarm = Swarm(settings, zeros, ones, np.random.default_rng(seed))
 
     def ask(self) -> Array:
         return self._swarm.ask()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from offboard.control.base import Certificate
 from offboard.control.cost import BoxQuadratic
-from offboard.control.swarm.settings import SwarmResult
+from offboard.control.swarm import SwarmResult
 
 Array = NDArray[np.float64]
 

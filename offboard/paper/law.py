@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
 from offboard.control.cost import BoxQuadratic
-from offboard.control.swarm import QuadraticSwarm, RandomLanes, SwarmResult, SwarmSettings
+from offboard.control.swarm import SwarmResult, SwarmSettings, minimise
 from offboard.documents.parameters import Parameters
 from offboard.paper.integral import (
     INTEGRATED,
@@ -125,8 +125,8 @@ class PaperLaw:
             dynamics, inputs, weight, np.diag(settings.energy), np.diag(settings.rate)
         )
         self._keep_constant = settings.keep_constant
-        self._swarm = QuadraticSwarm(settings.swarm, len(self._lower))
-        self._lanes = RandomLanes(seed)
+        self._swarm, self._seed = settings.swarm, seed
+        self._rng = np.random.default_rng(seed)
         self._hover = np.zeros(len(self._lower))
         self._previous = self._hover
 
@@ -143,7 +143,7 @@ class PaperLaw:
         """u(k) for the state x(k) (12,) towards x_ref(k+1) (12,), Eq. 27.
 
         `integral` (4,) is the summed error xi(k), used where the settings weigh it; `nominal` (4,)
-        is u_nom, by default hover. See `QuadraticSwarm.minimise` for the other arguments.
+        is u_nom, by default hover. See `swarm.minimise` for the other arguments.
         """
         lower, upper = self._lower, self._upper
         if self._limits:
@@ -157,8 +157,8 @@ class PaperLaw:
             whole, reference_next, self._hover if nominal is None else nominal, self._previous,
             lower, upper, keep_constant=self._keep_constant,
         )  # fmt: skip
-        result = self._swarm.minimise(
-            problem, self._lanes, remaining_s=remaining_s, keep_history=keep_history
+        result = minimise(
+            self._swarm, problem, self._rng, remaining_s=remaining_s, keep_history=keep_history
         )
         self._previous = result.best
         following = self._step.predict(whole, result.best)[: len(state)]
@@ -167,4 +167,4 @@ class PaperLaw:
     def reset(self) -> None:
         """Forget the last input and start the random stream anew."""
         self._previous = self._hover
-        self._lanes.reset()
+        self._rng = np.random.default_rng(self._seed)

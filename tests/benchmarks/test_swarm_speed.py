@@ -9,7 +9,7 @@ import pytest
 
 from offboard.control.certificate import ExactMinimum, certify
 from offboard.control.cost import BoxQuadratic
-from offboard.control.swarm import QuadraticSwarm, RandomLanes, Swarm, SwarmSettings
+from offboard.control.swarm import Swarm, SwarmSettings, minimise
 
 LOWER = np.array([-4.0, -0.2, -0.2, -0.1])  # Eq. 26
 UPPER = np.array([3.942, 0.2, 0.2, 0.1])
@@ -20,24 +20,23 @@ PROBLEM = BoxQuadratic(HESSIAN, -HESSIAN @ MINIMISER, 20.0, LOWER, UPPER)
 
 @pytest.mark.benchmark(group="one step, 4 inputs")
 def test_compiled_swarm_40_by_150(benchmark: Any) -> None:
-    swarm, lanes = QuadraticSwarm(SwarmSettings(), 4), RandomLanes(1)
-    result = benchmark(swarm.minimise, PROBLEM, lanes)
+    result = benchmark(minimise, SwarmSettings(), PROBLEM, np.random.default_rng(1))
     assert result.best == pytest.approx(MINIMISER, abs=1e-4)
 
 
 @pytest.mark.benchmark(group="one step, 4 inputs")
 def test_compiled_swarm_with_a_deadline(benchmark: Any) -> None:
-    swarm, lanes = QuadraticSwarm(SwarmSettings(), 4), RandomLanes(1)
-    result = benchmark(swarm.minimise, PROBLEM, lanes, (), lambda: 1.0)
+    rng = np.random.default_rng(1)
+    result = benchmark(minimise, SwarmSettings(), PROBLEM, rng, (), lambda: 1.0)
     assert result.best == pytest.approx(MINIMISER, abs=1e-4)
 
 
 @pytest.mark.benchmark(group="one step, 4 inputs")
 def test_ask_tell_40_by_150(benchmark: Any) -> None:
-    settings, lanes = SwarmSettings(), RandomLanes(1)
+    settings, rng = SwarmSettings(), np.random.default_rng(1)
 
     def search() -> Any:
-        swarm = Swarm(LOWER, UPPER, settings, lanes)
+        swarm = Swarm(settings, LOWER, UPPER, rng)
         for _ in range(settings.iterations):
             swarm.tell(PROBLEM(swarm.ask()))
         return swarm.result()
@@ -54,5 +53,5 @@ def test_exact_minimum_by_daqp(benchmark: Any) -> None:
 @pytest.mark.benchmark(group="one step, 4 inputs")
 def test_certificate(benchmark: Any) -> None:
     exact = ExactMinimum(4)
-    result = QuadraticSwarm(SwarmSettings(), 4).minimise(PROBLEM, RandomLanes(1))
+    result = minimise(SwarmSettings(), PROBLEM, np.random.default_rng(1))
     assert benchmark(certify, PROBLEM, result, exact).gap < 1e-9

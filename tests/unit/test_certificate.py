@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from offboard.control.certificate import ExactMinimum, at_bound, certify
 from offboard.control.cost import BoxQuadratic
-from offboard.control.swarm import QuadraticSwarm, RandomLanes, SwarmResult, SwarmSettings
+from offboard.control.swarm import SwarmResult, SwarmSettings, minimise
 
 Array = NDArray[np.float64]
 
@@ -98,7 +98,7 @@ def test_the_gap_of_the_minimum_itself_is_never_negative() -> None:
 
 def test_the_gap_stays_meaningful_where_the_minimum_costs_nothing() -> None:
     problem = BoxQuadratic(np.eye(4), np.zeros(4), 0.0, -np.ones(4), np.ones(4))
-    result = QuadraticSwarm(SwarmSettings(), 4).minimise(problem, RandomLanes(4))
+    result = minimise(SwarmSettings(), problem, np.random.default_rng(4))
     assert certify(problem, result).gap < 1e-9
     half = certify(problem, answer(problem, np.full(4, 0.5)))
     assert half.optimal_cost == 0.0
@@ -111,8 +111,8 @@ def test_the_gap_stays_meaningful_where_the_minimum_costs_nothing() -> None:
 def test_the_default_swarm_is_at_the_minimum(constant: float) -> None:
     """Lambda = 0.65, 40 x 150: median gap of some 1e-16."""
     generator = np.random.default_rng(5)
-    exact, lanes = ExactMinimum(4), RandomLanes(5)
-    swarm = QuadraticSwarm(SwarmSettings(), 4)
+    exact, rng = ExactMinimum(4), np.random.default_rng(5)
+    settings = SwarmSettings()
     gaps = []
     for _ in range(300):
         root = generator.normal(size=(4, 4))
@@ -120,7 +120,7 @@ def test_the_default_swarm_is_at_the_minimum(constant: float) -> None:
             root @ root.T + 2 * np.eye(4), 4 * generator.normal(size=4), constant,
             -np.ones(4), np.ones(4),
         )  # fmt: skip
-        gaps.append(certify(problem, swarm.minimise(problem, lanes), exact).gap)
+        gaps.append(certify(problem, minimise(settings, problem, rng), exact).gap)
     assert np.median(gaps) <= 1e-9
     assert np.percentile(gaps, 99) <= 1e-6
 
@@ -128,12 +128,12 @@ def test_the_default_swarm_is_at_the_minimum(constant: float) -> None:
 def test_a_frozen_swarm_is_told_apart_by_its_gap_not_by_its_spread() -> None:
     """Lambda = 0.3: epsilon of 1e-13 and less, and far from the minimum."""
     generator = np.random.default_rng(6)
-    exact, lanes = ExactMinimum(4), RandomLanes(6)
-    swarm = QuadraticSwarm(SwarmSettings(damping=0.3), 4)
+    exact, rng = ExactMinimum(4), np.random.default_rng(6)
+    settings = SwarmSettings(damping=0.3)
     certificates = []
     for _ in range(100):
         problem = coupled_problem(generator)
-        certificates.append(certify(problem, swarm.minimise(problem, lanes), exact))
+        certificates.append(certify(problem, minimise(settings, problem, rng), exact))
     assert np.median([c.spread for c in certificates]) < 1e-12
     assert np.median([c.gap for c in certificates]) > 1e-4
 

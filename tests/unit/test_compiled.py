@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from offboard.control.swarm.motion import SEARCH, scatter
+from offboard.control.swarm import SEARCH, remember
 from offboard.estimation.filtering import FILTER
 
 ROOT = Path(__file__).parents[2]
@@ -224,15 +224,20 @@ def test_machine_code_unused_for_thirty_days_is_deleted(package: Path, tmp_path:
 
 @pytest.mark.parametrize(
     "wrong",
-    [np.zeros((2, 6))[:, ::2], np.zeros(3), np.zeros((2, 3), "f4"), np.zeros((2, 3)).T],
+    [
+        np.zeros((3, 2, 8))[..., ::2],
+        np.zeros(3),
+        np.zeros((3, 2, 4), "f4"),
+        np.zeros((4, 2, 3)).T,
+    ],
     ids=["strided", "one dimension", "single precision", "transposed"],
 )
 def test_arguments_of_other_types_are_refused(wrong: np.ndarray) -> None:
-    lanes, box, right = np.ones(3, np.uint64), np.ones(2), np.zeros((2, 3))
+    bounds, best = np.zeros((2, 2)), np.ones(2)
     with pytest.raises(TypeError, match="No matching definition"):
-        scatter(np.zeros(1, SEARCH), lanes, box, box, right, wrong)
+        remember(np.zeros(1, SEARCH), bounds, wrong, best)
     with pytest.raises(TypeError, match="No matching definition"):
-        scatter(np.zeros(1, FILTER), lanes, box, box, right, right)
+        remember(np.zeros(1, FILTER), bounds, np.zeros((3, 2, 4)), best)
 
 
 def test_importing_a_flight_does_not_import_numba() -> None:

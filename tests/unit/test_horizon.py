@@ -17,7 +17,7 @@ from offboard.control.horizon.plant import STATE_SIZE, B, P, T, V, W, Z
 from offboard.control.horizon.search import Evaluator, Plan, swarm
 from offboard.control.laws.horizon import HorizonLaw, HorizonSettings
 from offboard.control.laws.mpc import MpcLaw, MpcSettings
-from offboard.control.swarm import RandomLanes, SwarmSettings
+from offboard.control.swarm import SwarmSettings
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
 from offboard.reference.transfer import Hold
@@ -280,12 +280,12 @@ def test_the_search_alone_beats_a_random_search(volume: dict[str, object]) -> No
     """2800 roll-outs each about the same base, no other seed and no polish: cheaper in sum and in
     the median."""
     law = horizon(keep_out=[volume])
-    drawn, lanes = np.random.default_rng(7), RandomLanes(7)
+    drawn, rng = np.random.default_rng(7), np.random.default_rng(7)
     settings = SwarmSettings(particles=20, iterations=140, damping=0.8)
     paid = []
     for situation in situations(30, 0.3, seed=7):
         _, _, evaluate = prepared(law, situation)
-        found = swarm(evaluate, closed_form(evaluate), reach(evaluate), settings, lanes, None)
+        found = swarm(evaluate, closed_form(evaluate), reach(evaluate), settings, rng, None)
         paid.append((found.plan.cost, random_search(evaluate, drawn)))
     ours, theirs = np.array(paid).T
     assert ours.sum() < theirs.sum()

@@ -10,9 +10,13 @@ from numpy.typing import NDArray
 from pydantic import ValidationError
 
 from offboard.control.cost import BoxQuadratic
-from offboard.control.swarm import QuadraticSwarm, RandomLanes, Swarm, SwarmResult, SwarmSettings
+from offboard.control.swarm import Swarm, SwarmResult, SwarmSettings, minimise
 
 Array = NDArray[np.float64]
+
+
+def rng(seed: int) -> np.random.Generator:
+    return np.random.default_rng(seed)
 
 
 def sphere(u: Array) -> Array:
@@ -35,7 +39,7 @@ def search(
     seed: int = 1,
     seeds: tuple[Array, ...] = (),
 ) -> SwarmResult:
-    swarm = Swarm(lower, upper, settings, RandomLanes(seed), seeds)
+    swarm = Swarm(settings, lower, upper, rng(seed), seeds)
     for _ in range(settings.iterations):
         swarm.tell(objective(swarm.ask()))
     return swarm.result()
@@ -98,12 +102,11 @@ def diagonal_problem(generator: np.random.Generator) -> tuple[BoxQuadratic, Arra
 def furthest_misses(settings: SwarmSettings, searches: int) -> Array:
     """Largest distance from the closed form per search, as a fraction of the range."""
     generator = np.random.default_rng(2)
-    lanes = RandomLanes(2)
-    swarm = QuadraticSwarm(settings, 4)
+    drawn = rng(2)
     misses = np.empty(searches)
     for i in range(searches):
         problem, minimiser = diagonal_problem(generator)
-        off = np.abs(swarm.minimise(problem, lanes).best - minimiser)
+        off = np.abs(minimise(settings, problem, drawn).best - minimiser)
         misses[i] = np.max(off / (problem.upper - problem.lower))
     return misses
 
@@ -123,12 +126,12 @@ def test_without_rebound_some_searches_stay_beside_a_minimum_on_the_bounds() -> 
 def test_a_swarm_damped_to_0_3_freezes_away_from_the_minimum_however_small_its_spread() -> None:
     """Small epsilon is not quality: why lambda is 0.65 and why decisions carry a certificate."""
     generator = np.random.default_rng(3)
-    lanes = RandomLanes(3)
-    swarm = QuadraticSwarm(SwarmSettings(damping=0.3), 4)
+    drawn = rng(3)
+    settings = SwarmSettings(damping=0.3)
     missed = 0
     for _ in range(100):
         problem, minimiser = diagonal_problem(generator)
-        result = swarm.minimise(problem, lanes)
+        result = minimise(settings, problem, drawn)
         assert result.spread < 1e-9
         off = np.abs(result.best - minimiser) / (problem.upper - problem.lower)
         missed += bool(off.max() > 1e-3)
@@ -139,35 +142,33 @@ def test_an_undamped_swarm_does_not_contract() -> None:
     """Lambda = 1 is Eq. 19; the paper saw epsilon 1.3944, 0.94 to 2.00, in the box of Eq. 26."""
     bound = np.array([4.0, 0.2, 0.2, 0.1])
     problem = BoxQuadratic(np.eye(4), np.zeros(4), 0.0, -bound, bound)
-    swarm = QuadraticSwarm(SwarmSettings(damping=1.0, rebound=0.0), 4)
-    lanes = RandomLanes(4)
-    spreads = [swarm.minimise(problem, lanes).spread for _ in range(50)]
+    settings = SwarmSettings(damping=1.0, rebound=0.0)
+    drawn = rng(4)
+    spreads = [minimise(settings, problem, drawn).spread for _ in range(50)]
     assert 1.2 < np.mean(spreads) < 1.6
 
 
-def test_a_seed_repeats_a_search_and_the_stream_goes_on_until_it_is_reset() -> None:
+def test_a_seed_repeats_a_search_and_the_stream_goes_on() -> None:
     problem, _ = diagonal_problem(np.random.default_rng(5))
-    swarm = QuadraticSwarm(SwarmSettings(iterations=5), 4)
-    lanes, same, other = RandomLanes(5), RandomLanes(5), RandomLanes(6)
-    first, second = (swarm.minimise(problem, lanes).best for _ in range(2))
-    assert np.array_equal(swarm.minimise(problem, same).best, first)
-    assert np.array_equal(swarm.minimise(problem, same).best, second)
+    settings = SwarmSettings(iterations=5)
+    drawn, same, other = rng(5), rng(5), rng(6)
+    first, second = (minimise(settings, problem, drawn).best for _ in range(2))
+    assert np.array_equal(minimise(settings, problem, same).best, first)
+    assert np.array_equal(minimise(settings, problem, same).best, second)
     assert not np.array_equal(first, second)
-    assert not np.array_equal(swarm.minimise(problem, other).best, first)
-    lanes.reset()
-    assert np.array_equal(swarm.minimise(problem, lanes).best, first)
+    assert not np.array_equal(minimise(settings, problem, other).best, first)
 
 
 def test_seed_particles_bound_the_answer_and_are_put_inside_the_box() -> None:
     minimiser = np.array([0.3, -0.4, 0.2, 0.1])
     problem = BoxQuadratic(np.eye(4), -minimiser, 0.0, -np.ones(4), np.ones(4))
-    swarm = QuadraticSwarm(SwarmSettings(iterations=1), 4)
+    settings = SwarmSettings(iterations=1)
     unusable = np.full(4, np.nan)
-    result = swarm.minimise(problem, RandomLanes(7), seeds=(unusable, minimiser))
+    result = minimise(settings, problem, rng(7), seeds=(unusable, minimiser))
     assert np.array_equal(result.best, minimiser)
     assert np.isfinite(result.spread)
     corner = BoxQuadratic(np.eye(4), -9 * np.ones(4), 0.0, -np.ones(4), np.ones(4))
-    result = swarm.minimise(corner, RandomLanes(7), seeds=(9 * np.ones(4),))
+    result = minimise(settings, corner, rng(7), seeds=(9 * np.ones(4),))
     assert np.array_equal(result.best, np.ones(4))
     told = search(sphere, -np.ones(4), np.ones(4), SwarmSettings(iterations=1), 7, (np.zeros(4),))
     assert told.cost == 0.0
@@ -176,7 +177,7 @@ def test_seed_particles_bound_the_answer_and_are_put_inside_the_box() -> None:
 def test_a_fixed_dimension_stays_where_it_is() -> None:
     lower, upper = np.array([-1.0, 0.25, -1.0, -1.0]), np.array([1.0, 0.25, 1.0, 1.0])
     problem = BoxQuadratic(np.eye(4), np.zeros(4), 0.0, lower, upper)
-    result = QuadraticSwarm(SwarmSettings(), 4).minimise(problem, RandomLanes(8))
+    result = minimise(SwarmSettings(), problem, rng(8))
     assert result.best == pytest.approx([0.0, 0.25, 0.0, 0.0], abs=1e-6)
     assert result.best[1] == 0.25
 
@@ -198,7 +199,7 @@ def test_costs_that_are_not_finite_are_counted_and_never_win() -> None:
 
 def test_a_quadratic_that_is_not_finite_gives_a_point_of_the_box_at_infinite_cost() -> None:
     problem = BoxQuadratic(np.full((4, 4), np.nan), np.zeros(4), 0.0, -np.ones(4), np.ones(4))
-    result = QuadraticSwarm(SwarmSettings(), 4).minimise(problem, RandomLanes(9))
+    result = minimise(SwarmSettings(), problem, rng(9))
     assert result.cost == np.inf
     assert np.all(np.abs(result.best) <= 1)
 
@@ -206,31 +207,31 @@ def test_a_quadratic_that_is_not_finite_gives_a_point_of_the_box_at_infinite_cos
 def test_the_answer_comes_when_the_time_is_up() -> None:
     problem, minimiser = diagonal_problem(np.random.default_rng(10))
     left = iter([0.002, 0.001, 0.0])
-    swarm = QuadraticSwarm(SwarmSettings(iterations=1000), 4)
-    result = swarm.minimise(problem, RandomLanes(10), remaining_s=lambda: next(left))
+    settings = SwarmSettings(iterations=1000)
+    result = minimise(settings, problem, rng(10), remaining_s=lambda: next(left))
     assert result.cut_short
     assert result.iterations == 75
     assert np.abs(result.best - minimiser).max() < 1e-3
-    unhurried = swarm.minimise(problem, RandomLanes(10), remaining_s=lambda: 1.0)
+    unhurried = minimise(settings, problem, rng(10), remaining_s=lambda: 1.0)
     assert not unhurried.cut_short
     assert unhurried.iterations == 1000
 
 
 def test_time_up_at_the_last_iteration_cuts_nothing_short() -> None:
     problem, _ = diagonal_problem(np.random.default_rng(11))
-    swarm = QuadraticSwarm(SwarmSettings(iterations=25), 4)
-    assert not swarm.minimise(problem, RandomLanes(11), remaining_s=lambda: 0.0).cut_short
+    settings = SwarmSettings(iterations=25)
+    assert not minimise(settings, problem, rng(11), remaining_s=lambda: 0.0).cut_short
 
 
 def test_a_spread_below_the_tolerance_ends_the_search() -> None:
     problem, minimiser = diagonal_problem(np.random.default_rng(12))
     settings = SwarmSettings(tolerance=1e-5, iterations=1000)
-    result = QuadraticSwarm(settings, 4).minimise(problem, RandomLanes(12))
+    result = minimise(settings, problem, rng(12))
     assert result.spread <= 1e-5
     assert result.iterations < 200
     assert not result.cut_short
     assert np.abs(result.best - minimiser).max() < 1e-3
-    swarm = Swarm(problem.lower, problem.upper, settings, RandomLanes(12))
+    swarm = Swarm(settings, problem.lower, problem.upper, rng(12))
     swarm.tell(problem(swarm.ask()))
     count = 1
     while swarm.spread > settings.tolerance:
@@ -241,9 +242,9 @@ def test_a_spread_below_the_tolerance_ends_the_search() -> None:
 
 def test_history_ends_where_the_answer_is() -> None:
     problem, _ = diagonal_problem(np.random.default_rng(13))
-    swarm = QuadraticSwarm(SwarmSettings(), 4)
-    plain = swarm.minimise(problem, RandomLanes(13))
-    result = swarm.minimise(problem, RandomLanes(13), keep_history=True)
+    settings = SwarmSettings()
+    plain = minimise(settings, problem, rng(13))
+    result = minimise(settings, problem, rng(13), keep_history=True)
     assert plain.history is None
     assert result.history is not None
     assert result.history.positions.shape == (150, 40, 4)
@@ -261,11 +262,11 @@ def test_history_ends_where_the_answer_is() -> None:
 )
 def test_bounds_that_make_no_box_are_refused(lower: list[float], upper: list[float]) -> None:
     with pytest.raises(ValueError, match="bounds must be"):
-        Swarm(lower, upper, SwarmSettings(), RandomLanes(0))
+        Swarm(SwarmSettings(), lower, upper, rng(0))
 
 
 def test_misuse_of_ask_and_tell_is_refused() -> None:
-    swarm = Swarm([-1.0], [1.0], SwarmSettings(particles=3), RandomLanes(0))
+    swarm = Swarm(SwarmSettings(particles=3), [-1.0], [1.0], rng(0))
     assert np.array_equal(swarm.ask(), swarm.ask())
     with pytest.raises(ValueError, match="particles"):
         swarm.tell(np.zeros(4))
@@ -274,15 +275,65 @@ def test_misuse_of_ask_and_tell_is_refused() -> None:
         swarm.tell(np.zeros(3))
 
 
-def test_a_problem_of_another_dimension_is_refused() -> None:
-    problem = BoxQuadratic(np.eye(2), np.zeros(2), 0.0, -np.ones(2), np.ones(2))
-    with pytest.raises(ValueError, match="2 inputs for a swarm of 4"):
-        QuadraticSwarm(SwarmSettings(), 4).minimise(problem, RandomLanes(0))
-
-
 @pytest.mark.parametrize(
     ("key", "value"), [("particles", 1), ("damping", 0.0), ("iterations", 0), ("inertia", np.nan)]
 )
 def test_settings_out_of_range_are_refused(key: str, value: float) -> None:
     with pytest.raises(ValidationError, match=key):
         SwarmSettings.model_validate({key: value})
+
+
+def test_one_move_is_eq_30_then_eq_20_then_the_box() -> None:
+    """Against the equations in NumPy, with the same random numbers."""
+    settings = SwarmSettings(social=1.4, rebound=0.25, initial_velocity=1.0)
+    lower, upper = -np.array([0.6, 0.8, 1.0]), np.array([0.7, 0.5, 0.9])
+    swarm, drawn = Swarm(settings, lower, upper, rng(1)), rng(1)
+    start = lower + (upper - lower) * drawn.random((3, 40)).T
+    velocity = (upper - lower) * drawn.uniform(-1, 1, (3, 40)).T
+    assert swarm.ask() == pytest.approx(start, abs=1e-15)
+    costs = rng(2).random(40)
+    best = start[np.argmin(costs)]
+    swarm.tell(costs)
+    r1, r2 = drawn.random((3, 40, 2)).transpose(2, 1, 0)
+    velocity = 0.65 * (
+        0.9298 * velocity + 1.4986 * r1 * (start - start) + 1.4 * r2 * (best - start)
+    )
+    moved = np.clip(start + velocity, lower, upper)
+    assert swarm.ask() == pytest.approx(moved, abs=1e-14)
+    assert np.any((moved == lower) | (moved == upper))
+    swarm.tell(costs + 1.0)  # no new best
+    r1, r2 = drawn.random((3, 40, 2)).transpose(2, 1, 0)
+    clamped = (start + velocity < lower) | (start + velocity > upper)
+    velocity = np.where(clamped, -0.25 * velocity, velocity)
+    pull = 1.4986 * r1 * (start - moved) + 1.4 * r2 * (best - moved)
+    moved = np.clip(moved + 0.65 * (0.9298 * velocity + pull), lower, upper)
+    assert swarm.ask() == pytest.approx(moved, abs=1e-14)
+
+
+def test_particles_start_all_over_the_box() -> None:
+    lower, upper = np.array([-1.0, 10.0]), np.array([1.0, 14.0])
+    swarm = Swarm(SwarmSettings(particles=4000, iterations=1), lower, upper, rng(2))
+    place = (swarm.ask() - lower) / (upper - lower)
+    for axis in place.T:
+        counts, _ = np.histogram(axis, 10, (0, 1))
+        assert counts.sum() == 4000
+        assert np.sum((counts - 400) ** 2 / 400) < 27.9  # chi squared, 9 degrees, 0.1 %
+    assert abs(np.corrcoef(place.T)[0, 1]) < 0.05
+
+
+@pytest.mark.parametrize("dimensions", [1, 4, 6])
+def test_compiled_and_ask_tell_move_the_same_particles(dimensions: int) -> None:
+    generator = rng(dimensions)
+    root = generator.normal(size=(dimensions, dimensions))
+    half = generator.uniform(0.1, 1, dimensions)
+    hessian, gradient = root @ root.T + np.eye(dimensions), generator.normal(size=dimensions)
+    problem = BoxQuadratic(np.asfortranarray(hessian), gradient, 2.0, -half, half)
+    compiled = minimise(SwarmSettings(), problem, rng(3), keep_history=True)
+    assert compiled.history is not None
+    swarm = Swarm(SwarmSettings(), -half, half, rng(3))
+    for positions in compiled.history.positions:
+        asked = swarm.ask()
+        assert asked == pytest.approx(positions, abs=1e-5)  # equal costs but for rounding
+        swarm.tell(problem(asked))
+    assert swarm.result().best == pytest.approx(compiled.best, abs=1e-6)
+    assert swarm.result().cost == pytest.approx(compiled.cost, rel=1e-12)

@@ -17,7 +17,7 @@ from offboard.control.horizon.keep_out import PACKED_SIZE
 from offboard.control.horizon.limits import VOLUME, excesses, limits_of, share_of
 from offboard.control.horizon.plant import INPUTS, PLANT, SCENE, STATE_SIZE, Scene
 from offboard.control.horizon.roll_out import roll_out
-from offboard.control.swarm import RandomLanes, Swarm, SwarmSettings
+from offboard.control.swarm import Swarm, SwarmSettings
 
 Array = NDArray[np.float64]
 Remaining = Callable[[], float] | None
@@ -159,13 +159,13 @@ def swarm(
     base: Plan,
     reach: Array,
     settings: SwarmSettings,
-    lanes: RandomLanes,
+    rng: np.random.Generator,
     remaining_s: Remaining,
 ) -> Found:
     """The best plan whose knots are within +-reach (M, 3) about `base`. The first particle starts
     at the base, so the answer is never worse."""
     limit = reach.ravel()
-    particles = Swarm(-limit, limit, settings, lanes, _graded(limit, settings.particles))
+    particles = Swarm(settings, -limit, limit, rng, _graded(limit, settings.particles))
     shape = (*reach.shape, settings.particles)
     best, cut_short = base, False
     for iteration in range(settings.iterations):

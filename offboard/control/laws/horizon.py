@@ -21,7 +21,7 @@ from offboard.control.horizon.planner import Planner, RollOutSettings, cost_of, 
 from offboard.control.horizon.plant import INPUTS
 from offboard.control.horizon.polish import Ended, polish
 from offboard.control.horizon.search import Found, Plan, Remaining, swarm
-from offboard.control.swarm import RandomLanes, SwarmSettings
+from offboard.control.swarm import SwarmSettings
 from offboard.model.vehicle import Vehicle
 
 RIVALS = 2  # plans of other origin that are searched about too
@@ -54,7 +54,8 @@ class HorizonLaw:
         self.planner = Planner(vehicle, settings, period_s)
         self._vehicle = vehicle
         self._settings = settings
-        self._lanes = RandomLanes(seed)
+        self._seed = seed
+        self._rng = np.random.default_rng(seed)
 
     def decide(self, situation: Situation) -> Decision:
         task, linear = self.planner.prepare(situation)
@@ -68,7 +69,7 @@ class HorizonLaw:
 
     def reset(self) -> None:
         self.planner.previous = None
-        self._lanes.reset()
+        self._rng = np.random.default_rng(self._seed)
         self.adopt(self._vehicle)
 
     def adopt(
@@ -106,7 +107,7 @@ class HorizonLaw:
         shared = settings.swarm.model_copy(update={"iterations": share})
         answers = []
         for base in bases:
-            found = swarm(evaluate, base, reach, shared, self._lanes, remaining_s)
+            found = swarm(evaluate, base, reach, shared, self._rng, remaining_s)
             better, ended = polish(evaluate, found.plan, settings.polish_steps, remaining_s)
             late = found.cut_short or ended is Ended.LATE
             answers.append(replace(found, plan=better, cut_short=late))

@@ -5,9 +5,11 @@ from __future__ import annotations
 import math
 from typing import Literal
 
+import numpy as np
+
 from offboard.control.base import Decision, Situation
 from offboard.control.certificate import ExactMinimum, certify
-from offboard.control.swarm import QuadraticSwarm, RandomLanes, SwarmSettings
+from offboard.control.swarm import SwarmSettings, minimise
 from offboard.control.tracking import OneDecisionSettings, Tracking, decision
 from offboard.model.vehicle import Vehicle
 
@@ -31,17 +33,17 @@ class PsoLaw:
         self.bandwidth_radps = settings.bandwidth_radps
         self.tracking = Tracking(vehicle, settings, period_s, settings.feedforward)
         self._vehicle = vehicle
-        self._swarm = QuadraticSwarm(settings.swarm, 4)
-        self._lanes = RandomLanes(seed)
+        self._swarm, self._seed = settings.swarm, seed
+        self._rng = np.random.default_rng(seed)
         self._exact = ExactMinimum(4)
 
     def decide(self, situation: Situation) -> Decision:
         problem = self.tracking.task(situation).problem
-        result = self._swarm.minimise(problem, self._lanes, (), situation.remaining_s)
+        result = minimise(self._swarm, problem, self._rng, remaining_s=situation.remaining_s)
         return decision(result.best, certify(problem, result, self._exact))
 
     def reset(self) -> None:
-        self._lanes.reset()
+        self._rng = np.random.default_rng(self._seed)
         self.adopt(self._vehicle)
 
     def adopt(

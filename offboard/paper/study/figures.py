@@ -23,7 +23,7 @@ from offboard.analysis.figure import (
     panels,
 )
 from offboard.control.certificate import ExactMinimum
-from offboard.control.swarm import QuadraticSwarm, RandomLanes
+from offboard.control.swarm import minimise
 from offboard.model.state import PSI, U, X
 from offboard.paper.law import PaperLaw, PaperSettings
 from offboard.paper.plant import PlantKind, paper_model
@@ -90,8 +90,8 @@ def search(settings: PaperSettings) -> Search:
         move = law.move(state, following)
         state = move.following
     problem = move.problem
-    swarm = QuadraticSwarm(settings.swarm, 4)
-    history = swarm.minimise(problem, RandomLanes(0), keep_history=True).history
+    rng = np.random.default_rng(0)
+    history = minimise(settings.swarm, problem, rng, keep_history=True).history
     assert history is not None
     picked = np.minimum(SHOWN_ITERATIONS, len(history.positions)) - 1
     optimum = ExactMinimum(4).minimise(problem)
