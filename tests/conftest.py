@@ -14,8 +14,8 @@ import pytest
 from offboard.compiled import prepare
 
 COMPILED = (
-    "offboard.control.laws.horizon",
-    "offboard.control.laws.pso",
+    "offboard.control.horizon.law",
+    "offboard.control.pso",
     "offboard.run.request",
     "offboard.paper.plant",
     "simulator.vehicle.dynamics",

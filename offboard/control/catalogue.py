@@ -16,12 +16,12 @@ from offboard.documents.reading import DocumentError
 GROUP = "pso_offboard.controllers"
 
 BUILT_IN = EntryPoints(
-    EntryPoint(law, f"offboard.control.laws.{settings}", GROUP)
+    EntryPoint(law, f"offboard.control.{settings}", GROUP)
     for law, settings in (
         ("pso", "pso:PsoSettings"),
         ("lqr", "lqr:LqrSettings"),
         ("mpc", "mpc:MpcSettings"),
-        ("horizon", "horizon:HorizonSettings"),
+        ("horizon", "horizon.law:HorizonSettings"),
         ("pid", "pid:PidSettings"),
         ("autopilot", "autopilot:AutopilotSettings"),
     )

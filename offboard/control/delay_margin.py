@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_discrete_are
 
-from offboard.control.riccati import lateral_cost_to_go, vertical_cost_to_go
+from offboard.control.gains import lateral_gain, vertical_gain
 from offboard.model.axes import LinearModel, lateral_model, vertical_model
 from offboard.model.vehicle import Vehicle
 
@@ -77,13 +77,13 @@ def supported_bandwidth(
 
 
 def _lateral_loop(vehicle: Vehicle, bandwidth_radps: float, period_s: float) -> _Loop:
-    gain = lateral_cost_to_go(vehicle, bandwidth_radps, period_s).gain
+    gain = lateral_gain(vehicle, bandwidth_radps, period_s).gain
     model, delay_s = lateral_model(vehicle), vehicle.tilt.delay_s
     return _Loop(model, gain, delay_s, _LATERAL_DENSITIES, _LATERAL_SDS, period_s)
 
 
 def _vertical_loop(vehicle: Vehicle, bandwidth_radps: float, period_s: float) -> _Loop:
-    gain = vertical_cost_to_go(vehicle, bandwidth_radps, period_s).gain
+    gain = vertical_gain(vehicle, bandwidth_radps, period_s).gain
     model, delay_s = vertical_model(vehicle), vehicle.thrust_delay_s
     return _Loop(model, gain, delay_s, _VERTICAL_DENSITIES, _VERTICAL_SDS, period_s)
 

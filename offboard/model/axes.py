@@ -12,7 +12,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import expm
 
 from offboard.compiled import kernel
 from offboard.model.vehicle import AxisResponse, Vehicle
@@ -32,11 +31,12 @@ class LinearModel:
 
     def sampled(self, period_s: float) -> LinearModel:
         """x(k+1) = A_d x(k) + B_d u(k) with u held for `period_s` (zero-order hold, Eq. 14)."""
+        import control  # takes a second: only where something is designed
+
         size, count = self.input_map.shape
-        flow = np.zeros((size + count, size + count))
-        flow[:size, :size], flow[:size, size:] = self.dynamics, self.input_map
-        step = expm(period_s * flow)
-        return LinearModel(step[:size, :size], step[:size, size:])
+        plant = control.ss(self.dynamics, self.input_map, np.eye(size), np.zeros((size, count)))
+        held = control.c2d(plant, period_s)
+        return LinearModel(held.A, held.B)
 
 
 def lateral_model(vehicle: Vehicle) -> LinearModel:

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.control.base import ControllerSettings, Decision, DecisionError, Situation
-from offboard.control.certificate import ExactMinimum, certify
+from offboard.control.quadratic import ExactMinimum
+from offboard.control.swarm import certify
 from offboard.model.command import Command
 from offboard.model.frames import wrap_pi
 from offboard.model.linear import sampled_matrices

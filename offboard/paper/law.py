@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from offboard.control.cost import BoxQuadratic
+from offboard.control.quadratic import BoxQuadratic
 from offboard.control.swarm import SwarmResult, SwarmSettings, minimise
 from offboard.documents.parameters import Parameters
 from offboard.paper.integral import (

@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from offboard.control.cost import BoxQuadratic
+from offboard.control.quadratic import BoxQuadratic
 
 Array = NDArray[np.float64]
 

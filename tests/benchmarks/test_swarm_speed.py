@@ -7,9 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from offboard.control.certificate import ExactMinimum, certify
-from offboard.control.cost import BoxQuadratic
-from offboard.control.swarm import Swarm, SwarmSettings, minimise
+from offboard.control.quadratic import BoxQuadratic, ExactMinimum
+from offboard.control.swarm import Swarm, SwarmSettings, certify, minimise
 
 LOWER = np.array([-4.0, -0.2, -0.2, -0.1])  # Eq. 26
 UPPER = np.array([3.942, 0.2, 0.2, 0.1])

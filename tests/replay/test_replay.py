@@ -15,7 +15,7 @@ from typer.testing import CliRunner, Result
 from offboard.analysis import tlog
 from offboard.cli.commands import app
 from offboard.control.base import Controller, Decision, Situation
-from offboard.control.laws.pso import PsoLaw
+from offboard.control.pso import PsoLaw
 from offboard.documents.errors import UserError
 from offboard.flight import inputs, manifest
 from offboard.flight.actions import PhaseActions

@@ -9,8 +9,8 @@ from attitude_plant import Lemniscate
 
 from offboard.control.base import Controller
 from offboard.control.catalogue import names, settings_of
-from offboard.control.laws.lqr import LqrLaw, LqrSettings
-from offboard.control.laws.pso import PsoLaw, PsoSettings
+from offboard.control.lqr import LqrLaw, LqrSettings
+from offboard.control.pso import PsoLaw, PsoSettings
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import AxisResponse, Vehicle

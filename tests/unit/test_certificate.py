@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from offboard.control.certificate import ExactMinimum, at_bound, certify
-from offboard.control.cost import BoxQuadratic
-from offboard.control.swarm import SwarmResult, SwarmSettings, minimise
+from offboard.control.quadratic import BoxQuadratic, ExactMinimum, at_bound
+from offboard.control.swarm import SwarmResult, SwarmSettings, certify, minimise
 
 Array = NDArray[np.float64]
 

@@ -7,7 +7,7 @@ import pytest
 from attitude_plant import Flight, Lemniscate, Truth, fly
 
 from offboard.control.delay_margin import needed_margin, supported_bandwidth
-from offboard.control.laws.lqr import LqrLaw, LqrSettings
+from offboard.control.lqr import LqrLaw, LqrSettings
 from offboard.estimation.observer import ObserverSettings
 from offboard.model.vehicle import AxisResponse, Vehicle
 

@@ -10,7 +10,7 @@ from attitude_plant import Lemniscate, Truth, fly
 from laws import PX4, G, at, lqr
 from scipy.integrate import solve_ivp
 
-from offboard.control.riccati import thrust_ripple, tilt_ripple
+from offboard.control.gains import thrust_ripple, tilt_ripple
 from offboard.reference.base import FlatSample
 
 PERIOD_S = 0.1

@@ -12,11 +12,11 @@ from laws import LEVEL, PX4, G, lqr, state_of
 from scipy.integrate import solve_ivp
 
 from offboard.control.base import Situation
+from offboard.control.horizon.law import HorizonLaw, HorizonSettings
 from offboard.control.horizon.planner import STEPS_AROUND, Dynamics
 from offboard.control.horizon.plant import STATE_SIZE, B, P, T, V, W, Z
 from offboard.control.horizon.search import Evaluator, Plan, swarm
-from offboard.control.laws.horizon import HorizonLaw, HorizonSettings
-from offboard.control.laws.mpc import MpcLaw, MpcSettings
+from offboard.control.mpc import MpcLaw, MpcSettings
 from offboard.control.swarm import SwarmSettings
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
@@ -322,10 +322,11 @@ def counted(law: HorizonLaw) -> list[int]:
 
 @pytest.mark.parametrize("volume", [IN_THE_WAY, WALL])
 def test_answers_are_local_minima(volume: dict[str, object]) -> None:
-    """No small change of the plan, of 400 at random, is cheaper by more than a thousandth."""
+    """No small change of the plan, of 400 at random, is cheaper by more than a ten thousandth in
+    three of four situations, and by more than two thousandths in nine of ten."""
     law, rng = horizon(keep_out=[volume], polish_steps=30), np.random.default_rng(5)
     better = []
-    for situation in situations(12, 0.2):
+    for situation in situations(36, 0.2):
         law.planner.previous = None
         cost = law.decide(situation).certificate.cost
         assert law.planner.previous is not None
@@ -334,7 +335,8 @@ def test_answers_are_local_minima(volume: dict[str, object]) -> None:
         sizes = rng.choice([1e-3, 1e-2, 5e-2], 400)
         tried = inputs + sizes * rng.normal(size=(*inputs.shape[:2], 400))
         better.append(1.0 - evaluate.of_inputs(np.ascontiguousarray(tried)).min() / cost)
-    assert np.percentile(better, 90) < 1e-3
+    assert np.percentile(better, 75) < 1e-4
+    assert np.percentile(better, 90) < 2e-3
 
 
 def test_searches_only_where_something_is_left_to_find() -> None:

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from offboard.control.cost import BoxQuadratic
-from offboard.control.riccati import cost_to_go
+from offboard.control.gains import riccati
+from offboard.control.quadratic import BoxQuadratic
 from offboard.paper.one_step import OneStep
 
 Array = NDArray[np.float64]
@@ -64,7 +64,7 @@ def test_predictions_broadcast_over_candidates() -> None:
 
 def test_one_step_with_the_cost_to_go_pays_what_the_cost_to_go_says() -> None:
     """The law flown for long from x costs x'Px, and no gain near it costs less."""
-    terminal = cost_to_go(DYNAMICS, INPUTS, FITNESS, ENERGY)
+    terminal = riccati(DYNAMICS, INPUTS, FITNESS, ENERGY)
     step = OneStep(DYNAMICS, INPUTS, terminal, ENERGY)
     zero = np.zeros(M)
     start = np.random.default_rng(3).normal(size=N)
@@ -85,7 +85,7 @@ def test_one_step_with_the_cost_to_go_pays_what_the_cost_to_go_says() -> None:
 
 
 def test_one_step_with_the_cost_to_go_is_the_lqr() -> None:
-    terminal = cost_to_go(DYNAMICS, INPUTS, FITNESS, ENERGY)
+    terminal = riccati(DYNAMICS, INPUTS, FITNESS, ENERGY)
     left = np.zeros((N, N))  # the least cost of the last 500 steps, by dynamic programming
     for _ in range(500):
         gain = np.linalg.solve(ENERGY + INPUTS.T @ left @ INPUTS, INPUTS.T @ left @ DYNAMICS)
@@ -102,4 +102,4 @@ def test_one_step_with_the_cost_to_go_is_the_lqr() -> None:
 
 def test_no_cost_to_go_where_no_input_reaches_an_unstable_state() -> None:
     with pytest.raises(np.linalg.LinAlgError):
-        cost_to_go(np.diag([1.1, 0.5]), [[0.0], [1.0]], np.eye(2), np.eye(1))
+        riccati(np.diag([1.1, 0.5]), [[0.0], [1.0]], np.eye(2), np.eye(1))

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.linalg import solve_discrete_are
 
-from offboard.control.riccati import cost_to_go
+from offboard.control.gains import riccati
 from offboard.paper.law import PaperSettings
 from offboard.paper.plant import paper_model
 from offboard.paper.study.horizon import receding, study
@@ -38,7 +38,7 @@ def test_cost_to_go_without_rate_is_lqr() -> None:
     a, b = paper_model()
     p = solve_discrete_are(a, b, Q, R)
     lqr = a - b @ np.linalg.solve(R + b.T @ p @ b, b.T @ p @ a)
-    found = receding(a, b, Q, R, NONE, 1, cost_to_go(a, b, Q, R))
+    found = receding(a, b, Q, R, NONE, 1, riccati(a, b, Q, R))
     expected = np.sort(np.abs(np.linalg.eigvals(lqr)))[::-1]
     np.testing.assert_allclose(np.abs(found)[:12], expected, rtol=1e-6)
 

@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 from pydantic import ValidationError
 
-from offboard.control.cost import BoxQuadratic
+from offboard.control.quadratic import BoxQuadratic
 from offboard.control.swarm import Swarm, SwarmResult, SwarmSettings, minimise
 
 Array = NDArray[np.float64]

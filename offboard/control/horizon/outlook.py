@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.control.base import Situation
-from offboard.control.riccati import held_lead
-from offboard.control.tracking import Task, Tracking, heave_of
+from offboard.control.gains import held_lead
+from offboard.control.law import Task, Tracking, heave_of
 from offboard.reference.flatness import flat_state
 
 Array = NDArray[np.float64]

@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from offboard.control.base import Certificate, Decision, DecisionError, Situation
-from offboard.control.certificate import ExactMinimum, certify
-from offboard.control.cost import BoxQuadratic
+from offboard.control.gains import lateral_gain
 from offboard.control.horizon.keep_out import KeepOut, pack, placed_at, refusal
 from offboard.control.horizon.outlook import bounds, look_ahead
 from offboard.control.horizon.plant import (
@@ -28,9 +27,9 @@ from offboard.control.horizon.plant import (
 )
 from offboard.control.horizon.quadratic import HorizonQuadratic
 from offboard.control.horizon.search import Evaluator, Found, Plan
-from offboard.control.riccati import lateral_cost_to_go
-from offboard.control.swarm import SwarmResult
-from offboard.control.tracking import Task, Tracking, TrackingSettings, decision
+from offboard.control.law import Task, Tracking, TrackingSettings, decision
+from offboard.control.quadratic import BoxQuadratic, ExactMinimum
+from offboard.control.swarm import SwarmResult, certify
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import Reference
 
@@ -103,7 +102,7 @@ class Planner:
         self.quadratic = HorizonQuadratic(tracking, settings.planned)
         self._plant = plant_of(
             tracking,
-            half=lateral_cost_to_go(vehicle, bandwidth, 0.5 * tracking.period_s),
+            half=lateral_gain(vehicle, bandwidth, 0.5 * tracking.period_s),
             nonlinear=settings.dynamics is Dynamics.NONLINEAR,
             speed_limit_mps=settings.speed_limit_mps or math.inf,
             clearance_m=settings.reach_m,

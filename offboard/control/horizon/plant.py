@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.control.gains import CostToGo
 from offboard.control.horizon.outlook import Bounds, Outlook
-from offboard.control.riccati import CostToGo
-from offboard.control.tracking import Task, Tracking
+from offboard.control.law import Task, Tracking
 from offboard.model.axes import SHORTEST_THRUST_LAG_S, upright
 
 Array = NDArray[np.float64]

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import block_diag
 
-from offboard.control.cost import BoxQuadratic
+from offboard.control.gains import CostToGo
 from offboard.control.horizon.outlook import Bounds
-from offboard.control.riccati import CostToGo
-from offboard.control.tracking import Task, Tracking
+from offboard.control.law import Task, Tracking
+from offboard.control.quadratic import BoxQuadratic
 
 Array = NDArray[np.float64]
 

@@ -12,8 +12,9 @@ from enum import StrEnum
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.certificate import ExactMinimum, certify
-from offboard.control.riccati import cost_to_go
+from offboard.control.gains import riccati
+from offboard.control.quadratic import ExactMinimum
+from offboard.control.swarm import certify
 from offboard.io.clock import monotonic_s
 from offboard.model.frames import quaternion_from_euler, rotation_from_quaternion
 from offboard.model.predicted_state import PredictedState
@@ -134,7 +135,7 @@ class _Controller:
         self._terminal = None
         if task.law is LawName.COST_TO_GO:
             weights = np.diag(settings.fitness), np.diag(settings.energy)
-            self._terminal = cost_to_go(self._dynamics, self._inputs, *weights)
+            self._terminal = riccati(self._dynamics, self._inputs, *weights)
         self._law = PaperLaw(
             self._dynamics, self._inputs, settings, lower, upper, self._terminal, seed=task.seed
         )

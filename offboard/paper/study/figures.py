@@ -22,7 +22,7 @@ from offboard.analysis.figure import (
     curve,
     panels,
 )
-from offboard.control.certificate import ExactMinimum
+from offboard.control.quadratic import ExactMinimum
 from offboard.control.swarm import minimise
 from offboard.model.state import PSI, U, X
 from offboard.paper.law import PaperLaw, PaperSettings

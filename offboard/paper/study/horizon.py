@@ -17,7 +17,7 @@ from scipy.linalg import block_diag
 from scipy.optimize import differential_evolution
 
 from offboard.analysis.figure import BLUE, GREY, INK, RED, Figure, curve, panels
-from offboard.control.riccati import cost_to_go
+from offboard.control.gains import riccati
 from offboard.model.state import PHI, TAU_X, P, V, Y
 from offboard.paper.law import PAPER_STEP_S, PaperSettings
 from offboard.paper.plant import PlantKind, paper_model
@@ -87,7 +87,7 @@ class _Problem:
 
     def endless(self) -> Array:
         """The cost to go of an infinite horizon."""
-        return cost_to_go(self.a, self.b, self.weight, self.control_weight, self.cross)
+        return riccati(self.a, self.b, self.weight, self.control_weight, self.cross)
 
     def eigenvalues(self, to_go: Array) -> Complexes:
         """Eigenvalues of the closed loop with this cost-to-go, largest magnitude first."""
@@ -128,7 +128,7 @@ def study(settings: PaperSettings, first: PaperSettings) -> list[Modes]:
         Modes("one step, first weights", receding(a, b, q0, r0, s0, 1)),
         Modes("one step, Eqs. 33-35", receding(a, b, q, r, s, 1)),
         Modes("one step, Eq. 33, R = R_Δu = 0", receding(a, b, q, 0 * r, 0 * s, 1)),
-        Modes("cost-to-go, Eqs. 33-35", receding(a, b, q, r, s, 1, cost_to_go(a, b, q, r))),
+        Modes("cost-to-go, Eqs. 33-35", receding(a, b, q, r, s, 1, riccati(a, b, q, r))),
     ]
     modes += [Modes(f"N = {n}", receding(a, b, q, r, s, n)) for n in range(1, LONGEST + 1)]
     return [*modes, Modes("N = ∞", receding(a, b, q, r, s))]

@@ -1,10 +1,29 @@
-"""What the tracking laws share: target, deviations, cost and bounds of one decision.
+"""The tracking law. Every law of this package decides
 
-A tracking law chooses u = [T, b_cx, b_cy, course]: thrust per unit of mass, north and east of the
-commanded thrust direction, commanded heading. The cost of one decision is a convex quadratic in u:
-the stage cost while u is held plus the Riccati solution of the state that it leads to, both in
-deviations from the reference. Each law (`offboard.control.laws`) composes a `Tracking` and differs
-in how it answers the `Task`. Knows no autopilot and no clock.
+    u = clip(u_ff - K (x_predicted - x_ref))
+
+or, where the bounds or a horizon couple the inputs, the u that minimises the same cost J.
+
+    u            [T, b_cx, b_cy, course]: thrust per unit of mass, north and east of the commanded
+                 thrust direction (third body axis, NED), commanded heading
+    x_predicted  the state at the time when this command will begin to act: the observer's, carried
+                 there by replaying the commands already sent (`offboard.estimation`)
+    x_ref        what the reference asks for at that time, by differential flatness from its
+                 position and derivatives, drag and the estimated disturbance (`Tracking.target`)
+    u_ff         what follows the reference without an error: half a period later, because a command
+                 is held for one period and acts on average in its middle, and led through the
+                 response of attitude and thrust, so that these arrive in time
+    K            gain of the linear-quadratic regulator of each axis for one bandwidth (`gains`)
+    clip         thrust, tilt, and the feedback about u_ff (`Tracking._box`)
+
+In NED, acceleration = g e3 - T b - c v + d: written in b, the lateral axes [p, v, b, b'], the
+vertical [z, v_z, T b_z] and the course decouple, and no heading frame is needed.
+
+    J(u) = x'Qx + u'Ru + x(k+1)'P x(k+1) = 1/2 u'Hu + f'u + c,  lower <= u <= upper
+
+H is diagonal, so that u = clip(-f / H) is its exact minimum. `lqr` computes just that; `pso` lets
+the swarm search, which needs neither a diagonal nor a quadratic; `mpc` and `horizon` minimise the
+sum over N decisions; `pid` replaces K by the gains of two cascades. Knows no autopilot, no clock.
 """
 
 from __future__ import annotations
@@ -24,14 +43,14 @@ from offboard.control.base import (
     DecisionError,
     Situation,
 )
-from offboard.control.cost import BoxQuadratic
-from offboard.control.riccati import (
+from offboard.control.gains import (
     held_lead,
-    lateral_cost_to_go,
+    lateral_gain,
     thrust_ripple,
     tilt_ripple,
-    vertical_cost_to_go,
+    vertical_gain,
 )
+from offboard.control.quadratic import BoxQuadratic
 from offboard.model.axes import lead
 from offboard.model.command import Command
 from offboard.model.frames import wrap_pi
@@ -83,7 +102,7 @@ class OneDecisionSettings(TrackingSettings):
 @dataclass(frozen=True, slots=True)
 class Target:
     """State and input that the reference asks for when the command acts. NED, SI; the ripple of
-    held commands (`riccati.hold_ripple`) is included.
+    held commands (`gains.hold_ripple`) is included.
 
     Lateral, each (2,), north and east, at the time of the predicted state: position_ne_m,
     velocity_ne_mps, thrust direction direction_ne and its rate direction_rate_ne_ps. Vertical, at
@@ -157,8 +176,8 @@ class Tracking:
         self._thrust_ripple = thrust_ripple(vehicle, self.period_s)
         if gains:
             bandwidth = min(self.settings.bandwidth_radps, bandwidth_limit_radps)
-            self.lateral = lateral_cost_to_go(vehicle, bandwidth, self.period_s)
-            self.vertical = vertical_cost_to_go(vehicle, bandwidth, self.period_s)
+            self.lateral = lateral_gain(vehicle, bandwidth, self.period_s)
+            self.vertical = vertical_gain(vehicle, bandwidth, self.period_s)
 
     @property
     def tilt_limit(self) -> float:

@@ -13,10 +13,10 @@ import numpy as np
 from pydantic import Field
 
 from offboard.control.base import Certificate, Decision, DecisionError, Situation
-from offboard.control.certificate import ExactMinimum, at_bound
 from offboard.control.horizon.outlook import bounds, look_ahead
 from offboard.control.horizon.quadratic import HorizonQuadratic
-from offboard.control.tracking import Tracking, TrackingSettings, decision
+from offboard.control.law import Tracking, TrackingSettings, decision
+from offboard.control.quadratic import ExactMinimum, at_bound
 from offboard.model.vehicle import Vehicle
 
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from offboard.control.base import Certificate, Decision, Situation
-from offboard.control.certificate import at_bound
-from offboard.control.tracking import OneDecisionSettings, Tracking, decision
+from offboard.control.law import OneDecisionSettings, Tracking, decision
+from offboard.control.quadratic import at_bound
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]

@@ -12,9 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.control.base import Certificate, Decision, Situation
-from offboard.control.certificate import at_bound
-from offboard.control.cost import BoxQuadratic
-from offboard.control.tracking import OneDecisionSettings, Tracking, decision
+from offboard.control.law import OneDecisionSettings, Tracking, decision
+from offboard.control.quadratic import at_bound, closed_form
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
@@ -51,8 +50,3 @@ class LqrLaw:
         self, vehicle: Vehicle, bandwidth_limit_radps: float = math.inf, *, gains: bool = True
     ) -> None:
         self.tracking.adopt(vehicle, bandwidth_limit_radps, gains=gains)
-
-
-def closed_form(problem: BoxQuadratic) -> Array:
-    """The exact minimiser (n,) of a quadratic whose Hessian is diagonal."""
-    return problem.clip(-problem.gradient / np.diag(problem.hessian))

@@ -15,12 +15,12 @@ import numpy as np
 from pydantic import Field
 
 from offboard.control.base import Decision, Situation
-from offboard.control.cost import BoxQuadratic
 from offboard.control.horizon.detour import detours
 from offboard.control.horizon.planner import Planner, RollOutSettings, cost_of, lowest_cost
 from offboard.control.horizon.plant import INPUTS
 from offboard.control.horizon.polish import Ended, polish
 from offboard.control.horizon.search import Found, Plan, Remaining, swarm
+from offboard.control.quadratic import BoxQuadratic
 from offboard.control.swarm import SwarmSettings
 from offboard.model.vehicle import Vehicle
 

@@ -8,9 +8,9 @@ from typing import Literal
 import numpy as np
 
 from offboard.control.base import Decision, Situation
-from offboard.control.certificate import ExactMinimum, certify
-from offboard.control.swarm import SwarmSettings, minimise
-from offboard.control.tracking import OneDecisionSettings, Tracking, decision
+from offboard.control.law import OneDecisionSettings, Tracking, decision
+from offboard.control.quadratic import ExactMinimum
+from offboard.control.swarm import SwarmSettings, certify, minimise
 from offboard.model.vehicle import Vehicle
 
 

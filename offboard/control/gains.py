@@ -1,0 +1,121 @@
+"""Gains of the tracking law: linear-quadratic regulators of its axes, by python-control.
+
+Each axis (`offboard.model.axes`) is sampled with a zero-order hold (`control.c2d`) and given the
+gain that minimises the sum of x' Q x + R u^2 over all decisions (`control.dlqr`). Knows no
+reference, no measurement and no search.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import control
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from offboard.model.axes import LinearModel, lateral_model, lead, vertical_model
+from offboard.model.vehicle import AxisResponse, Vehicle
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class CostToGo:
+    """One sampled axis, its gain, and the cost of one held input with all that follows it.
+
+    J(u; x) = x' Q x + R u^2 + x(k+1)' P x(k+1)
+            = 1/2 curvature u^2 + (coupling x) u + 1/2 x' state_cost x, minimal at u = -gain x,
+    in deviations from the reference. transition A (n, n), input_map B (n, 1); stage (n + 1, n + 1)
+    is diag(Q, R); terminal P (n, n); coupling and gain K (n,).
+    """
+
+    transition: Array
+    input_map: Array
+    stage: Array
+    terminal: Array
+    curvature: float
+    coupling: Array
+    state_cost: Array
+    gain: Array
+
+
+def lateral_gain(vehicle: Vehicle, bandwidth_radps: float, period_s: float) -> CostToGo:
+    """Weights 1 on position and g^2 / wc^4 on b_c, for a bandwidth wc."""
+    effort = vehicle.gravity_mps2**2 / bandwidth_radps**4
+    return _regulator(lateral_model(vehicle), effort, period_s)
+
+
+def vertical_gain(vehicle: Vehicle, bandwidth_radps: float, period_s: float) -> CostToGo:
+    """Weights 1 on height and 1 / wc^4 on the vertical thrust."""
+    return _regulator(vertical_model(vehicle), bandwidth_radps**-4, period_s)
+
+
+def _regulator(model: LinearModel, effort: float, period_s: float) -> CostToGo:
+    """Weights 1 on the first state and `effort` on the input, per second."""
+    held = model.sampled(period_s)
+    a, b = held.dynamics, held.input_map
+    stage = period_s * np.diag([1.0] + [0.0] * (len(a) - 1) + [effort])
+    q, r = stage[:-1, :-1], stage[-1:, -1:]
+    gain, terminal, _ = control.dlqr(a, b, q, r)
+    return CostToGo(
+        transition=a,
+        input_map=b,
+        stage=stage,
+        terminal=terminal,
+        curvature=2.0 * float((r + b.T @ terminal @ b)[0, 0]),
+        coupling=2.0 * (b.T @ terminal @ a)[0],
+        state_cost=2.0 * (q + a.T @ terminal @ a),
+        gain=gain[0],
+    )
+
+
+def riccati(dynamics: ArrayLike, inputs: ArrayLike, fitness: ArrayLike, energy: ArrayLike,
+            cross: ArrayLike | None = None) -> Array:  # fmt: skip
+    """The stabilising solution P (n, n) of the discrete Riccati equation; x'Px is the optimal cost
+    from x on.
+
+    x(k+1) = A x + B u with dynamics A (n, n) and inputs B (n, m); stage cost
+    x'Qx + u'Ru + 2 x'Su with fitness Q, energy R, cross S (n, m). Raises numpy.linalg.LinAlgError
+    where no stabilising solution exists.
+    """
+    given = [np.asarray(matrix, np.float64) for matrix in (dynamics, inputs, fitness, energy)]
+    solution: Array = control.dare(*given, S=cross)[0]
+    return solution
+
+
+def tilt_ripple(vehicle: Vehicle, period_s: float) -> Array:
+    """`hold_ripple` (2,) of [b, b'] for a slope of b_c of 1 per second."""
+    whole = lateral_model(vehicle)
+    return hold_ripple(LinearModel(whole.dynamics[2:, 2:], whole.input_map[2:]), period_s)
+
+
+def thrust_ripple(vehicle: Vehicle, period_s: float) -> float:
+    """`hold_ripple` of T b_z for a slope of f_c of 1 m/s^3."""
+    whole = vertical_model(vehicle)
+    return float(hold_ripple(LinearModel(whole.dynamics[2:, 2:], whole.input_map[2:]), period_s)[0])
+
+
+def hold_ripple(model: LinearModel, period_s: float) -> Array:
+    """How much the state (n,) of a stable model driven by held inputs differs from its response to
+    the ramp u = t, at the times when the input changes.
+
+    The held inputs equal the ramp in the middle of each hold. A sampled law decides exactly at
+    these times: without this difference in its target it would try to remove the ripple of its own
+    hold, which no held input can.
+    """
+    held = model.sampled(period_s)
+    # Response to the ramp: slope t + smooth; to held inputs, when they change: slope t + stepped
+    slope = -np.linalg.solve(model.dynamics, model.input_map[:, 0])
+    smooth = np.linalg.solve(model.dynamics, slope)
+    pushed = (0.5 * held.input_map[:, 0] - slope) * period_s
+    stepped = np.linalg.solve(np.eye(len(pushed)) - held.dynamics, pushed)
+    return np.asarray(stepped - smooth, np.float64)
+
+
+def held_lead(
+    value: Array, rate: Array, acceleration: Array, response: AxisResponse, period_s: float
+) -> Array:
+    """`axes.lead` in the middle of a hold, less the second-order difference between a curved
+    command and its mean over the hold. Arguments and result have one common shape."""
+    led: Array = lead(value, rate, acceleration, response) - period_s**2 / 24.0 * acceleration
+    return led
