@@ -9,7 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from offboard.control.base import Situation
-from offboard.control.certificate import certify
+from offboard.control.swarm import certify
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
 from offboard.paper.integral import ErrorIntegral, IntegralSettings
