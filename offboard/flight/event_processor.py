@@ -81,10 +81,10 @@ class EventProcessor:
                 state.follows_others = self._is_of_others(thrust)
             case Heartbeat(mode) | ModeReport(mode):
                 self._on_mode(event, mode, arrived_s)
-            case TimesyncReply(vehicle_ns=vehicle_ns):
+            case TimesyncReply(request_ns, vehicle_ns):
                 asked_s = state.link.on_reply(event)
                 if asked_s is not None:
-                    state.clock.on_reply(vehicle_ns * 1e-9, asked_s)
+                    state.clock.on_reply(request_ns * 1e-9, vehicle_ns * 1e-9, asked_s)
             case CommandRequest():
                 self._answer(event)
             case VehicleFound():

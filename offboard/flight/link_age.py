@@ -8,8 +8,8 @@ Two measures, on the vehicle's clock:
   of both directions together. The clock of this computer and the way of the reply do not matter.
 - `VehicleClock`, by the arrival of telemetry: the vehicle time now, as far as the least delayed
   telemetry of the last seconds shows. Newest telemetry that is older has been delayed more than
-  usual, by a backlog or a stop of this process. The replies to TIMESYNC bound it from above, so
-  that a simulator slower than real time is not taken for a late link.
+  usual, by a backlog or a stop of this process. Replies to TIMESYNC show the rate of the clock: a
+  simulator slower than real time is no late link.
 
 `LinkGrowth` keeps what both show the link to have added since take-off.
 """
@@ -30,20 +30,66 @@ DELAY_MAX_S = 10.0  # a larger difference belongs to another clock
 REQUESTS_MAX = 100  # of DELAY_MAX_S
 NORMAL = 1.4826  # standard deviation of a normal distribution / median absolute deviation
 WINDOW_S, BIN_S = 5.0, 0.1
-RATE_OVER_S = 1.0  # the least stretch from which the rate of the clock is taken
+RATE_OVER_S, RATE_EVERY_S = 1.0, 1.0  # the rate: from how much at least, and how often
 REAL_TIME = 0.05  # a rate that differs from 1 by less is that of a vehicle in real time
 BOUNDS_S = 1.0  # a reply to an older request bounds the vehicle time no more
 LEAST_GROWTH_S, STEADY_S = 0.01, 5.0  # see `LinkGrowth`
 JUMP_S = 0.5  # a stamp further ahead of the vehicle time now shows a jump of the clock
 
 
-class VehicleClock:
-    """Vehicle time as a function of host time.
+class Edge:
+    """Points of host and vehicle time, over WINDOW_S of host time: of each BIN_S the one that is
+    most ahead, or with `sign` -1 the one that is most behind."""
 
-    The rate is 1 for a real vehicle; that of a simulator in faster or slower time is measured until
-    `settle`, and from then on followed only if it is not 1: a delay that grows must not look like a
-    slower clock. What a reply to TIMESYNC shows does not depend on the delay: when we asked, the
-    vehicle's clock was at most at the time in the reply.
+    def __init__(self, sign: float) -> None:
+        self._sign = sign
+        self._points: deque[tuple[float, float]] = deque()
+        self._bin_s = 0.0  # host time of the first of the newest bin
+
+    def add(self, host_s: float, vehicle_s: float, rate: float) -> None:
+        points = self._points
+        if points and host_s - self._bin_s < BIN_S:
+            ahead_s = vehicle_s - points[-1][1] - rate * (host_s - points[-1][0])
+            if self._sign * ahead_s > 0.0:
+                points[-1] = host_s, vehicle_s
+        else:
+            points.append((host_s, vehicle_s))
+            self._bin_s = host_s
+        while points[0][0] < host_s - WINDOW_S:
+            points.popleft()
+
+    def clear(self) -> None:
+        self._points.clear()
+
+    def at(self, host_s: float, rate: float, over_s: float = math.inf) -> float | None:
+        """Vehicle time at `host_s` by the point that is most ahead, or behind, of those that are at
+        most `over_s` old; None without any."""
+        times_s = [v + rate * (host_s - h) for h, v in self._points if host_s - h <= over_s]
+        return self._sign * max(self._sign * each for each in times_s) if times_s else None
+
+    @property
+    def rate(self) -> float | None:
+        """Slope of the least-squares line; None for less than RATE_OVER_S."""
+        points = self._points
+        if not points or points[-1][0] - points[0][0] < RATE_OVER_S:
+            return None
+        return statistics.linear_regression(*zip(*points, strict=True)).slope
+
+
+class VehicleClock:
+    """Vehicle time as a function of host time: a line, whose offset and rate are estimated together
+    (one without the other would take a slow clock for a link that becomes later).
+
+    Two edges enclose it. Telemetry arrives after the time of its stamp: the least delayed of the
+    last seconds shows what the vehicle's clock has at least reached. A request of TIMESYNC arrives
+    after it was sent: the vehicle's clock was then at most at the time in the reply. Between them
+    is the delay of both directions, which each reply measures on the vehicle's clock alone.
+
+    - Offset: by the telemetry edge. A reply shows how much later than the least that telemetry may
+      be; it bounds the offset from above.
+    - Rate: both edges run at the rate of the clock, unless the delay of one direction changes: the
+      rate lies between theirs, and there it stays where it was. From a vehicle without replies a
+      slower clock cannot be told from a link that becomes later: within REAL_TIME its rate is 1.
     """
 
     def __init__(self) -> None:
@@ -51,59 +97,54 @@ class VehicleClock:
 
     def reset(self) -> None:
         """The vehicle was rebooted."""
-        self._seen: deque[tuple[float, float]] = deque()  # stamp, arrival: the freshest of a bin
-        self._bounds: deque[tuple[float, float]] = deque(maxlen=REPLIES_MAX)  # vehicle, host time
-        self._bin_s = 0.0  # arrival of the first of the newest bin
+        self._telemetry, self._replies = Edge(1.0), Edge(-1.0)
+        self._least_s = math.inf  # delay of both directions
         self._settled = False
-        self._measured = False
+        self._measured_s = -math.inf  # host time of the newest measurement of the rate
         self._rate = 1.0
         self.jumped_s = 0.0
 
     def settle(self) -> None:
-        """From now on the rate of a vehicle in real time is 1, and jumps of its clock count; both
-        once the rate was measured."""
+        """From now on jumps of the clock count, once its rate was measured, and the rate of a
+        vehicle without replies stays 1 if it is."""
         self._settled = True
         self.jumped_s = 0.0
 
     def on_telemetry(self, stamp_s: float, arrived_s: float) -> None:
         """A message with the stamp `stamp_s` arrived at host time `arrived_s`."""
         ahead_s = stamp_s - self.now_s(arrived_s)
-        seen = self._seen
-        if self._measured and ahead_s > JUMP_S:
+        if math.isfinite(self._measured_s) and ahead_s > JUMP_S:
             self.jumped_s += ahead_s
-            self._bounds.clear()
-        if seen and arrived_s - self._bin_s < BIN_S:
-            if ahead_s > 0.0:
-                seen[-1] = stamp_s, arrived_s
-        else:
-            seen.append((stamp_s, arrived_s))
-            self._bin_s = arrived_s
-        while seen[0][1] < arrived_s - WINDOW_S:
-            seen.popleft()
-        self._measure_rate()
+            self._telemetry.clear()
+            self._replies.clear()
+        self._telemetry.add(arrived_s, stamp_s, self._rate)
+        if arrived_s - self._measured_s >= RATE_EVERY_S:
+            self._measure_rate(arrived_s)
 
-    def on_reply(self, vehicle_s: float, asked_s: float) -> None:
-        """A request that we sent at host time `asked_s` or later arrived at vehicle time
-        `vehicle_s`."""
-        self._bounds.append((vehicle_s, asked_s))
+    def on_reply(self, stamp_s: float, vehicle_s: float, asked_s: float) -> None:
+        """A request that was sent at host time `asked_s` or later, when the newest telemetry had
+        the stamp `stamp_s`, arrived at vehicle time `vehicle_s`."""
+        self._least_s = min(self._least_s, vehicle_s - stamp_s)
+        self._replies.add(asked_s, vehicle_s, self._rate)
 
-    def _measure_rate(self) -> None:
-        if self._settled and self._measured and self._rate == 1.0:
+    def _measure_rate(self, host_s: float) -> None:
+        down, up = self._telemetry.rate, self._replies.rate
+        if down is None:
             return
-        (first_s, began_s), (last_s, ended_s) = self._seen[0], self._seen[-1]
-        if ended_s - began_s >= RATE_OVER_S:
-            self._measured = True
-            rate = (last_s - first_s) / (ended_s - began_s)
-            self._rate = 1.0 if abs(rate - 1.0) < REAL_TIME else max(rate, 0.0)
+        first, self._measured_s = math.isinf(self._measured_s), host_s
+        if up is not None:
+            self._rate = max(min(max(self._rate, min(down, up)), max(down, up)), 0.0)
+        elif first or not self._settled or self._rate != 1.0:
+            self._rate = 1.0 if abs(down - 1.0) < REAL_TIME else max(down, 0.0)
 
     def now_s(self, host_s: float) -> float:
-        """Vehicle time at host time `host_s`; -inf before the first telemetry."""
-        rate, bounds = self._rate, self._bounds
-        while bounds and host_s - bounds[0][1] > BOUNDS_S:
-            bounds.popleft()
-        shown_s = max([s + rate * (host_s - a) for s, a in self._seen], default=-math.inf)
-        recent = [v + rate * (host_s - a) for v, a in bounds if host_s - a <= BOUNDS_S]
-        return min([shown_s, *recent])
+        """Stamp of telemetry that would arrive at host time `host_s` with the least delay; -inf
+        before the first telemetry."""
+        shown_s = self._telemetry.at(host_s, self._rate)
+        bound_s = self._replies.at(host_s, self._rate, BOUNDS_S)
+        if shown_s is None:
+            return -math.inf
+        return shown_s if bound_s is None else min(shown_s, bound_s - self._least_s)
 
     def age_s(self, stamp_s: float, host_s: float) -> float:
         """Age at `host_s` of telemetry stamped `stamp_s`, beyond the least delay of the window."""

@@ -94,7 +94,8 @@ class Pair:
     up: Filter = through
     at: list[tuple[Callable[[Pair], bool], Callable[[Pair], object]]] = field(default_factory=list)
     dead: bool = False
-    rate: float = 1.0  # of the vehicle's clock, against that of the host
+    rate: float = 1.0  # of the vehicle's clock, against that of the host; see `slow_down`
+    epoch_s: float = HOST_EPOCH_S  # host time at vehicle time 0
     time_s: float = 0.0
     steps: int = 0
     turned: int = 0  # steps at the newest turn
@@ -125,7 +126,7 @@ class Pair:
         """One step of the vehicle, then a turn of the companion with all that has arrived."""
         self.steps += 1
         self.time_s = self.steps * STEP_S
-        now_s = HOST_EPOCH_S + self.time_s / self.rate
+        now_s = self.host_s
         datagrams = [] if self.dead else self.down(self.time_s, self.instance.step())
         self.waiting += [Chunk(datagram, "vehicle", now_s) for datagram in datagrams]
         if now_s >= self.clock.now_s:
@@ -147,7 +148,7 @@ class Pair:
         worst = self.companion.state.ladder.worst
         if worst is not None:
             self.rungs[worst.name] = worst.rung
-        if self.clock.now_s <= HOST_EPOCH_S + self.time_s / self.rate:
+        if self.clock.now_s <= self.host_s:
             self._feed()
         self._keep(self.companion.finish_turn(self.clock.now_s))
 
@@ -171,6 +172,16 @@ class Pair:
 
     def pilot_takes_over(self) -> None:
         self.ground(176, 1, 4, LOITER)
+
+    @property
+    def host_s(self) -> float:
+        """Host time."""
+        return self.epoch_s + self.time_s / self.rate
+
+    def slow_down(self, rate: float) -> None:
+        """From now on the vehicle's clock runs at this rate."""
+        self.epoch_s = self.host_s - self.time_s / rate
+        self.rate = rate
 
     def pause(self, seconds: float) -> None:
         """The process of the companion is stopped, as by SIGSTOP."""
