@@ -14,6 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from offboard.io.clock import monotonic_s, unix_us
+from offboard.io.repeated import Repeated
 from simulator.instance import Instance
 from simulator.link.links import Link, wait
 from simulator.link.recorder import Recorder
@@ -27,6 +28,7 @@ FREE_RUN_S = 60.0  # vehicle time without the companion
 WARM_UP_S = 0.2  # every fast message is due in it
 SPIN_S = 50e-6  # poll without sleeping: most answers arrive sooner than a core wakes up
 POLL_S = 0.05  # longest wait, so that a stop is noticed
+BEHIND = "the simulator was {most:.1f} s behind real time{times}: not catching up"
 BEHIND_S = 0.5
 
 
@@ -170,6 +172,7 @@ class Runner:
         gc.collect()
         gc.freeze()
         epoch_s = monotonic_s() - instance.time_s / speed
+        behind = Repeated(BEHIND)
         while not self._over():
             deadline_s = epoch_s + (instance.time_s + STEP_S) / speed
             self._serve_until(deadline_s)
@@ -179,8 +182,10 @@ class Runner:
             behind_s = monotonic_s() - deadline_s
             self.punctuality.note(behind_s, STEP_S / speed)
             if behind_s > BEHIND_S:  # suspended or overloaded: do not catch up
-                self._report(f"{behind_s:.1f} s behind at {instance.time_s:.1f} s: not catching up")
+                behind.add(behind_s)
                 epoch_s += behind_s
+            if news := behind.news(monotonic_s()):
+                self._report(news)
         return Outcome(0)
 
     def _stagger(self) -> None:

@@ -15,6 +15,7 @@ Array = NDArray[np.float64]
 _KEPT = (
     "answer_s", "age_s", "solve_time_s", "gap", "spread", "at_bound", "cut_short",
     "missed_ticks", "refused", "strangers", "hover_thrust", "thrust_mps2", "phase",
+    "pause_s",
 )  # fmt: skip
 
 
@@ -58,6 +59,8 @@ class Decisions:
             "setpoint_age_p99_ms": _percentile(age_ms, 99),
             "setpoint_age_max_ms": _percentile(age_ms, 100),
             "missed_ticks": float(known("missed_ticks").sum()),
+            "skipped_ticks": float(columns["missed_ticks"][columns["pause_s"] > 0.0].sum()),
+            "pause_max_s": float(columns["pause_s"].max()),
             "refused_setpoints": float((refused != 0).sum()),
             "refused_late": refusals(Refusal.LATE),
             "refused_stale": refusals(Refusal.STALE),

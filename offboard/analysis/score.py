@@ -86,6 +86,8 @@ class Score:
     setpoint_age_p99_ms: float = _figure("telemetry at its setpoint, 99th perc.", "ms")
     setpoint_age_max_ms: float = _figure("telemetry at its setpoint, maximum", "ms")
     missed_ticks: float = _figure("control periods without telemetry")
+    skipped_ticks: float = _figure("of these, in pauses of this process")
+    pause_max_s: float = _figure("longest pause of this process", "s")
     refused_setpoints: float = _figure("setpoints not sent")
     refused_late: float = _figure("setpoints decided too late")
     refused_stale: float = _figure("setpoints of too old telemetry")

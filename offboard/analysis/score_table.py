@@ -11,6 +11,7 @@ from rich.text import Text
 
 from offboard.analysis.history import History
 from offboard.analysis.score import FIGURES, Score
+from offboard.flight.busyness import too_busy
 
 # the figure that begins a section -> its title
 SECTIONS = {
@@ -41,7 +42,10 @@ def summary(score: Score, history: History) -> dict[str, str]:
         answer = f"{score.answer_p50_ms:.1f} ms (99th percentile {score.answer_p99_ms:.1f} ms)"
         missed = f"{score.missed_ticks:.0f} of {score.decisions:.0f} ticks missed"
         rows["timing"] = f"setpoint {answer} after its telemetry, {missed}"
-    if score.at_bound_share >= AT_LIMIT_SHARE:
+    ticks = score.decisions + score.missed_ticks
+    if busy := too_busy(score.skipped_ticks, ticks, score.pause_max_s):
+        rows["computer"] = busy
+    elif score.at_bound_share >= AT_LIMIT_SHARE:
         share = f"{100.0 * score.at_bound_share:.0f} % of the decisions"
         rows["at a limit"] = f"{share}: fly slower, or in less wind"
     if score.strangers > 0:

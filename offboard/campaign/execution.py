@@ -21,6 +21,7 @@ from offboard.campaign.margin import NOT_FLOWN
 from offboard.campaign.results import Record
 from offboard.documents.arguments import join_address, split_address
 from offboard.documents.errors import UserError, shown
+from offboard.documents.extras import install
 from offboard.flight.companion import STOPPED
 from offboard.flight.phases import ExitCode
 from offboard.io.stream_sources import connect
@@ -171,7 +172,7 @@ def cluster_workers(address: str) -> Iterator[Workers]:
     try:
         from distributed import Client
     except ImportError:
-        raise UserError("--scheduler needs dask: pip install 'pso-offboard[cluster]'") from None
+        raise UserError(f"--scheduler needs dask: {install('cluster')}") from None
     kind, host, port = _split(address)
     try:
         connect(host, port).close()  # at once, where dask tries for the whole of its timeout

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from offboard.control.swarm import Swarm, SwarmSettings
 from offboard.documents.errors import UserError
+from offboard.documents.extras import install
 
 Array = NDArray[np.float64]
 DAMPING = 0.85  # lambda of Eq. 30: slower than for control, where the cost is quadratic
@@ -47,8 +48,8 @@ class _CmaEs:
             import cma
         except ImportError:
             raise UserError(
-                "the search method cma needs the package cma: "
-                "pip install 'pso-offboard[campaign]', or set search.methods: [swarm]"
+                f"the search method cma needs the package cma: {install('campaign')}, or set "
+                "search.methods: [swarm]"
             ) from None
         options = {
             "bounds": [0.0, 1.0], "popsize": batch, "seed": seed + 1, "verbose": -9,

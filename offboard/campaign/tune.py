@@ -32,13 +32,13 @@ from offboard.campaign.results import Record
 from offboard.campaign.table import FIGURE_COLUMNS
 from offboard.campaign.verdict import Verdict, judge
 from offboard.documents.errors import DocumentError, UserError, naming
+from offboard.documents.extras import install
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import override, parse, read
 from offboard.documents.shipped import locate, read_text
 from offboard.run.configuration import FOLDERS, read_part
 
 FOLDER = "tunings"
-NO_OPTUNA = "tuning needs optuna: pip install 'pso-offboard[tune]'"
 
 
 def _figure(name: str) -> str:
@@ -99,7 +99,7 @@ class Tuning:
 
     def __init__(self, file: TuneFile, source: str) -> None:
         if find_spec("optuna") is None:
-            raise UserError(NO_OPTUNA)
+            raise UserError(f"tuning needs optuna: {install('tune')}")
         self.file = file
         with naming(source):
             self._training = _cases(file, file.training)

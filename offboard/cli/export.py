@@ -33,8 +33,7 @@ def export(
     mcap: Foxglove's schemas (ENU) and all values as JSON, for Foxglove, Lichtblick, Rerun and
     PlotJuggler. ulog: PX4's topics, for PlotJuggler and pyulog; its stamps are always vehicle time.
     csv: one row for each sample, with both times, units in the names of the columns. UAV
-    Log Viewer and MAVExplorer read the .tlog itself. mcap needs the extra
-    `pso-offboard[export]`.
+    Log Viewer and MAVExplorer read the .tlog itself. mcap needs the extra `export`.
     """
     if vehicle_time and to is not Format.MCAP:
         raise CommandError(f"--vehicle-time is an option of --to mcap: {to.value} always has it")

@@ -6,8 +6,7 @@ from importlib import import_module
 from typing import Any
 
 from offboard.documents.errors import UserError
-
-INSTALL = "pip install 'pso-offboard[export]'"
+from offboard.documents.extras import install
 
 
 def library(name: str, kind: str) -> Any:
@@ -15,4 +14,5 @@ def library(name: str, kind: str) -> Any:
     try:
         return import_module(name)
     except ImportError:
-        raise UserError(f"--to {kind} needs {name.partition('.')[0]}: {INSTALL}") from None
+        line = install("export")
+        raise UserError(f"--to {kind} needs {name.partition('.')[0]}: {line}") from None

@@ -108,7 +108,7 @@ class PhaseActions:
 
     def _prepare(self, tick: Tick) -> None:
         if tick.phase is Phase.HEALTH:
-            self._request_parameters()
+            self.request_parameters()
             self._fit_telemetry(tick.in_phase_s)
             return
         if tick.phase is Phase.STANDBY:
@@ -154,7 +154,8 @@ class PhaseActions:
         thrust_mps2 = (1.0 if share is None else share / model.hover_thrust) * model.gravity_mps2
         return Command(thrust_mps2, (north, east, down), state.vehicle.course_rad)
 
-    def _request_parameters(self) -> None:
+    def request_parameters(self) -> None:
+        """In HEALTH: ask what decides whether the vehicle can be flown; it needs no telemetry."""
         state = self._state
         due = state.readiness.due(self._dialect, state.vehicle.parameters, state.now_s)
         self._outbox.send(*due)

@@ -169,7 +169,13 @@ def not_ready(state: FlightState, session: Session) -> str:
     """Why the vehicle cannot be engaged yet; empty if it can."""
     vehicle, dialect, limits = state.vehicle, state.dialect, state.limits
     if not vehicle.has_state or dialect is None:
-        return "no LOCAL_POSITION_NED or no ATTITUDE_QUATERNION arrives"
+        telemetry = {
+            "LOCAL_POSITION_NED": vehicle.position,
+            "ATTITUDE_QUATERNION": vehicle.attitude,
+        }
+        missing = [name for name, newest in telemetry.items() if newest is None]
+        problem = vehicle.estimator.problem if vehicle.estimator else ""
+        return f"no {' and no '.join(missing)} arrives{problem and f': {problem}'}"
     if not state.guarded:
         return "the supervisor, which lands it if this process ends, does not run"
     rates_hz = session.rates_hz
@@ -192,7 +198,7 @@ def not_ready(state: FlightState, session: Session) -> str:
         systems = session.autopilots.named(state.now_s)
         return f"several vehicles are heard, systems {systems}: choose one with --system"
     if not (vehicle.prearm_ok or vehicle.armed or state.programme.serves):
-        return "its pre-arm checks do not pass"
+        return f"its pre-arm checks do not pass in {vehicle.mode}{vehicle.explanation()}"
     if vehicle.estimator and vehicle.estimator.problem:
         return vehicle.estimator.problem
     charge = vehicle.health.battery_remaining if vehicle.health else None

@@ -16,11 +16,13 @@ from offboard.control.base import Adopting, Controller
 from offboard.estimation.observer import Observer
 from offboard.flight import assessment
 from offboard.flight.actions import PhaseActions
+from offboard.flight.busyness import PAUSE_S, Busyness
 from offboard.flight.decide import Decider, Tick
 from offboard.flight.event_processor import EventProcessor
 from offboard.flight.facts import Facts
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.inputs import InputRecorder
+from offboard.flight.news import News
 from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
 from offboard.flight.outbox import Outbox, Output
 from offboard.flight.phase_machine import PhaseMachine
@@ -56,7 +58,6 @@ __all__ = ["STOPPED", "Companion", "Outcome", "Output"]
 
 MAV_STATE_STANDBY, MAV_STATE_CRITICAL = 3, 5
 BRIDGED_SHARE = 0.3  # of `Limits.silence_s`; after it, level setpoints replace the control law
-PAUSE_S = 0.3  # a longer gap between two turns: what was known before it is not known any more
 
 
 class Companion:
@@ -100,6 +101,7 @@ class Companion:
         else:
             state = before.state.next_flight(limits, plan, model, programme)
         self.state: FlightState = state
+        state.busyness = Busyness(period_s)
         self.peer: Hashable | None = before.peer if before else None
         same_period = before is not None and before._period_s == period_s
         self._tick: int = before._tick if before and same_period else -1
@@ -109,6 +111,7 @@ class Companion:
         self._bridged_s = 0.0
         self._logged: list[bytes] = []  # frames since the newest `finish_turn`
         self._ticked = False  # in this turn
+        self._news = News()
         self._inputs = InputRecorder(session.settings, kept=not programme.serves)
         self.strangers: int = before.strangers if before else 0
         self._recorded_strangers = self.strangers
@@ -214,8 +217,9 @@ class Companion:
         return self.state.limits.log_lost == "land"
 
     def on_dropped(self, frames: int) -> None:
-        """The last frames of the newest `Output` were not sent; for the log."""
+        """The last frames of the newest `Output` were not sent: they became too old."""
         self._inputs.dropped(frames)
+        self._news.dropped.add(frames)
 
     def overhear(self, datagrams: Sequence[bytes]) -> None:
         """Datagrams from other addresses than the vehicle's: on the ground, they may show that
@@ -286,6 +290,8 @@ class Companion:
             self._heard_s = self._session.elapsed_s(now_s)
             state.silence_s = self._bridged_s = 0.0
         self._act()
+        for sentence in self._news.due(state, self._session, now_s):
+            self._outbox.announce(sentence)
         self._outbox.send(*due, *replies)
 
     def _supervised(self) -> Supervised | None:
@@ -317,9 +323,9 @@ class Companion:
         state.silence_s = elapsed_s - self._heard_s
         if paused_s > PAUSE_S and state.authority is not None and not self._lockstep:
             state.authority.doubt(now_s)
-            self._outbox.announce(
-                f"this computer paused for {paused_s:.2f} s: waiting for the vehicle's mode"
-            )
+            self._news.paused.add(paused_s)
+        if not self._lockstep:
+            state.busyness.on_turn(paused_s)
 
     def _act(self) -> None:
         """What is due after everything that arrived was processed."""
@@ -329,6 +335,8 @@ class Companion:
         timeout_s = min(state.limits.silence_s, state.limits.connect_s)
         if not state.vehicle.has_state or state.stop_reason or silence_s > timeout_s:
             self._machine.advance()
+        if not state.vehicle.has_state and state.phase is Phase.HEALTH:
+            self._actions.request_parameters()
         if not state.has_ended and silence_s > BRIDGED_SHARE * state.limits.silence_s:
             self._bridge(silence_s)
 
@@ -356,6 +364,7 @@ class Companion:
             return
         missed = number - self._tick - 1 if self._tick >= 0 else 0
         self._tick = number
+        pause_s = state.busyness.on_tick(missed, flying=state.phase in FLYING)
         self._machine.advance()
         if state.phase in FLYING:
             self._follow_link(time_s)
@@ -369,6 +378,7 @@ class Companion:
                     self._events.telemetry_arrived_s,
                     missed,
                     ignored - self._recorded_strangers,
+                    pause_s,
                 )
             )
             self._recorded_strangers = ignored

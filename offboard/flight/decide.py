@@ -40,6 +40,7 @@ class Tick:
     arrived_s: float  # host time of the arrival of the telemetry that caused the tick
     missed: int = 0  # ticks skipped since the previous one
     strangers: int = 0  # datagrams of other senders since the previous one
+    pause_s: float = 0.0  # of this process, since the previous one
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,5 +223,6 @@ class Decider:
             age_s=decided.age_s,
             refused=decided.refused or 0,
             strangers=tick.strangers,
+            pause_s=tick.pause_s,
         )
         self._outbox.send(SolverRecord(tick.time_s, record.data(), RECORD_ID, RECORD_NAME))

@@ -25,8 +25,8 @@ RECORD_COMPONENT_ID = 192
 RECORD_NAME = "pso"
 NAN = float("nan")
 Array = NDArray[np.float64]
-RECORD_ID = 3
-LAYOUTS = {1: 28, RECORD_ID: 31}  # array_id -> number of fields
+RECORD_ID = 4
+LAYOUTS = {1: 28, 3: 31, RECORD_ID: 32}  # array_id -> number of fields
 IDENTIFIED_NAME, IDENTIFIED_ID = "identified", 2  # of the other DEBUG_FLOAT_ARRAY in the log
 
 
@@ -70,6 +70,7 @@ class TickRecord:
     age_s: float = NAN  # of the telemetry when the setpoint was sent, vehicle time
     refused: float = 0.0  # flags of `gate.Refusal`; 0 for a setpoint that was sent
     strangers: float = 0.0  # datagrams of other senders since the previous record
+    pause_s: float = 0.0  # longest pause of this process since the previous tick; 0 below a period
 
     def data(self) -> tuple[float, ...]:
         """The values in the order of DEBUG_FLOAT_ARRAY.data."""
@@ -91,6 +92,7 @@ class TickRecord:
         age_s: float = NAN,
         refused: int = 0,
         strangers: int = 0,
+        pause_s: float = 0.0,
     ) -> TickRecord:
         """The record of `decision`, made for the predicted `state`, and of the setpoint `sent`
         instead of it or because of it; None if none was."""
@@ -121,6 +123,7 @@ class TickRecord:
             age_s,
             float(refused),
             float(strangers),
+            pause_s,
         )
 
 

@@ -49,6 +49,8 @@ class Snapshot:
     link_delay_sd_s: float
     link_growth_s: float  # since take-off
     missed_decisions: int  # in a row
+    skipped_ticks: int  # in pauses of this process, since take-off
+    computer: str  # that it is too busy; empty if it keeps up
     battery: float  # remaining, of 1
     strangers: int  # datagrams of other senders since the start
     forged: int  # frames that signing refused since the start
@@ -93,6 +95,8 @@ def snapshot_of(
         link_delay_sd_s=link.sd if link else NAN,
         link_growth_s=state.growth.added_s,
         missed_decisions=state.missed,
+        skipped_ticks=state.busyness.skipped,
+        computer=state.busyness.sentence,
         battery=NAN if charge is None else charge,
         strangers=strangers,
         forged=forged,

@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from offboard.flight.authority import Authority, Standing
+from offboard.flight.busyness import Busyness
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
@@ -80,6 +81,7 @@ class FlightState:
     stop_reason: str = ""  # why the flight shall end; empty while it shall not
     outcome: Outcome | None = None
 
+    busyness: Busyness = field(init=False)  # of this computer
     missed: int = 0  # decisions in a row that were not sent
     failure: str = ""  # of the newest of them
     commands: deque[Command] = field(default_factory=lambda: deque(maxlen=COMMANDS_KEPT))

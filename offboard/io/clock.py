@@ -10,6 +10,11 @@ def monotonic_s() -> float:
     return time.monotonic()
 
 
+def thread_s() -> float:
+    """Seconds for which this thread has had a processor."""
+    return time.thread_time()
+
+
 def monotonic_less_unix_s() -> float:
     """What converts Unix seconds to `monotonic_s`. A pause between the two readings makes it too
     small: a stamp converted with it is then too old, never too new."""

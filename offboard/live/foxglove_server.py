@@ -17,6 +17,7 @@ from typing import Any
 
 from offboard.analysis.scene import BODY, COLOURS, LINE_M, MAP
 from offboard.documents.arguments import join_address
+from offboard.documents.extras import install
 from offboard.io import clock
 from offboard.live.values import json_schema
 from offboard.model.frames import Array, enu, flu_in_enu, quaternion_from_euler
@@ -129,7 +130,7 @@ def main(host: str, port: int) -> None:
     try:
         import foxglove
     except ImportError:
-        _answer(error="foxglove-sdk is missing: pip install 'pso-offboard[foxglove]'")
+        _answer(error=f"foxglove-sdk is missing: {install('foxglove')}")
         return
     foxglove.set_log_level("ERROR")  # a client that is refused is no line on the terminal
     try:

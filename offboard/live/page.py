@@ -20,6 +20,7 @@ VALUES = {
     "link age": "age",
     "link delay": "delay",
     "missed decisions": "missed",
+    "computer": "computer",
     "battery": "battery",
 }
 

@@ -160,7 +160,6 @@ class Loop:
                 self._link.send(frame, peer)
         if dropped:
             self._companion.on_dropped(len(dropped))
-            self._companion.announce(f"{len(dropped)} messages dropped: they became too old")
         if peer is not None:
             self._link.follow(peer)
             self._beat(output, peer)

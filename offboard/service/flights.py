@@ -8,12 +8,11 @@ vehicle and link stays. No I/O: a log is begun and ended at `Record`, configurat
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
-from offboard.flight import assessment, guards
+from offboard.flight import guards
 from offboard.flight.companion import STOPPED, Companion, Outcome, Output
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.phases import ENDS, FLYING, WAITING, Phase
@@ -25,8 +24,6 @@ from offboard.io.link import Chunk
 from offboard.mavlink.session import Session
 from offboard.run.one_flight import FlightParts
 
-REASON_EVERY_S = 10.0  # why the vehicle cannot be flown is announced this often
-SETTLING_S = 3.0  # before the first time: telemetry has only just been requested
 NAMED_S = 1.0  # until a vehicle has said which one it is
 TEXTS_KEPT = 200
 LEFT_ALONE = (
@@ -111,7 +108,6 @@ class Flights:
         self._stopping = False
         self._recording = False
         self._shown = 0  # of the present companion's announcements
-        self._told_s = -math.inf
         self._told_left_alone = False
         self.announced: list[str] = []
         self.announcements = 0
@@ -210,7 +206,7 @@ class Flights:
         if self._recording and before is not self.phase:
             self._keep_identified()
         if self.phase in WAITING:
-            self._explain(now_s)
+            self._explain()
         self._collect()
         return output
 
@@ -330,8 +326,8 @@ class Flights:
 
     # ------------------------------------------------------------------ what the user reads
 
-    def _explain(self, now_s: float) -> None:
-        """Say from time to time what prevents that the vehicle is flown."""
+    def _explain(self) -> None:
+        """Say what the service does not touch."""
         state = self.state
         if not state.pilot.unclaimed:
             self._told_left_alone = False
@@ -339,14 +335,6 @@ class Flights:
             self._told_left_alone = guards.found_engaged(self._current.facts())
             if self._told_left_alone:
                 self._current.announce(LEFT_ALONE.format(mode=state.vehicle.mode))
-        if state.phase is not Phase.HEALTH or state.in_phase_s < SETTLING_S:
-            return
-        if now_s - self._told_s < REASON_EVERY_S:
-            return
-        self._told_s = now_s
-        reasons = [*assessment.problems(state), assessment.not_ready(state, self._session)]
-        if any(reasons):
-            self._current.announce(f"waiting: {'; '.join(filter(None, reasons))}")
 
     def _collect(self) -> None:
         said = self._current.announced

@@ -231,7 +231,8 @@ def test_refusals(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert "--to mcap" in str(run(flight, "csv", tmp_path / "a.csv", "--vehicle-time").exception)
     monkeypatch.setitem(sys.modules, "mcap.writer", None)
     reason = str(run(flight, "mcap", tmp_path / "a.mcap").exception)
-    assert "pip install 'pso-offboard[export]'" in reason
+    assert "'mcap>=1.2'" in reason
+    assert "pso-offboard" not in reason  # which no index has
     assert list(tmp_path.iterdir()) == [taken]
 
 

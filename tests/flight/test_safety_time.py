@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,9 @@ from watch import (
     watched,
 )
 
+from offboard.analysis import history
+from offboard.analysis.score import score
+from offboard.analysis.score_table import summary
 from offboard.control.base import Controller, Decision, Situation
 from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
 from offboard.flight.phases import ExitCode, Phase, Rung
@@ -233,10 +237,10 @@ def test_no_setpoint_waits_for_the_identification(
     monkeypatch.setattr(OnlineIdentification, "learn", slow)
     pair = hover(learning=IdentifySettings(), deadline_s=DEADLINE_S, clock=clock, wrap=deciding)
     pair.track()
-    score = pair.score(tmp_path)
-    assert score.answer_p50_ms == pytest.approx(2.0, abs=0.01)
-    assert score.answer_max_ms < 8.0  # with a step of the simulation
-    assert score.missed_ticks == 0
+    result = pair.score(tmp_path)
+    assert result.answer_p50_ms == pytest.approx(2.0, abs=0.01)
+    assert result.answer_max_ms < 8.0  # with a step of the simulation
+    assert result.missed_ticks == 0
 
 
 def paused(
@@ -271,7 +275,32 @@ def test_after_a_pause_one_setpoint_leaves(seconds: float, fly: Fly, tmp_path: P
     assert max(ages_s(pair)) < 0.03
     assert said(pair, f"this computer paused for {seconds:.2f} s")
     assert watch.error_m < 0.8  # the last attitude is kept meanwhile
-    assert pair.score(tmp_path).missed_ticks == round(seconds / PERIOD_S) - 1
+    flown = history.gather(pair.log(tmp_path))
+    skipped = round(seconds / PERIOD_S) - 1
+    assert score(flown).missed_ticks == skipped
+    told = summary(replace(score(flown), at_bound_share=0.5), flown)
+    assert "at a limit" not in told  # whose cause is this computer
+    for busy in (told["computer"], pair.companion.snapshot().computer):
+        assert busy.startswith(f"this computer was too busy: {skipped} of ")
+        assert busy.endswith(f" ticks were skipped, pauses up to {seconds:.2f} s")
+
+
+def test_what_happens_often_is_told_once_a_second_and_summed_up() -> None:
+    """Ten times within 1.3 s messages are dropped, and this process pauses three times."""
+    pair = make(*QUICK, deadline_s=DEADLINE_S)
+    for number in range(10):
+        when = in_phase(Phase.TRACK, 2.0 + 0.13 * number)
+        pair.at.append((when, lambda pair: pair.companion.on_dropped(2)))
+    for number in range(3):
+        pair.at.append((in_phase(Phase.TRACK, 2.0 + 0.4 * number), lambda pair: pair.pause(0.32)))
+    pair.fly()
+    said = pair.companion.announced
+    dropped = [each for each in said if "of our messages to the vehicle dropped" in each]
+    pauses = [each for each in said if each.startswith("this computer paused")]
+    assert sum(int(each.split()[0]) for each in dropped) == 20
+    assert len(dropped) <= 3
+    assert len(pauses) == 2
+    assert "(the longest of 2)" in pauses[1]
 
 
 def test_after_three_seconds_nothing_leaves_to_a_px4_in_its_failsafe() -> None:

@@ -76,6 +76,12 @@ def nothing_sent(pair: Pair) -> Checks:
     yield not pair.commands(ARM_DISARM)
 
 
+def says_what_it_waits_for(pair: Pair) -> Checks:
+    yield from nothing_sent(pair)
+    yield "waiting: no LOCAL_POSITION_NED arrives" in pair.companion.announced
+    yield len([each for each in pair.companion.announced if each.startswith("waiting:")]) <= 3
+
+
 def disarmed_by_us(pair: Pair) -> Checks:
     yield from never_armed(pair)
     yield pair.commands(ARM_DISARM)[-1].param1 == 0.0
@@ -310,10 +316,11 @@ ROWS = (
     ),
     Row(
         "parameter wrong",
-        lambda: hover(firmware=with_default("COM_OF_LOSS_T", 30.0)),
+        # said before the vehicle has a position
+        lambda: hover(firmware=with_default("COM_OF_LOSS_T", 30.0), down=without(POSITION)),
         3,
         "COM_OF_LOSS_T is 30: seconds without setpoints before the failsafe. "
-        "Fix: param set COM_OF_LOSS_T 5",
+        "Fix: param set COM_OF_LOSS_T 1",
         Phase.FAILED,
         nothing_sent,
     ),
@@ -329,9 +336,9 @@ ROWS = (
         "no position",
         lambda: hover(down=without(POSITION), limits={"health_s": 8}),
         3,
-        "not ready: no LOCAL_POSITION_NED or no ATTITUDE_QUATERNION arrives",
+        "not ready: no LOCAL_POSITION_NED arrives",
         Phase.FAILED,
-        nothing_sent,
+        says_what_it_waits_for,
     ),
     Row(
         "telemetry too slow",

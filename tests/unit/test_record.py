@@ -57,7 +57,7 @@ def test_a_record_of_an_older_log_has_no_age() -> None:
     """The wire fills what a record does not use with zeros."""
     written = record(COMMAND, age_s=0.03, refused=Refusal.LATE, strangers=4).data()
     rows = [(*written[:count], *(0.0,) * (58 - count)) for count in LAYOUTS.values()]
-    old, new = records_of(np.array(rows), np.array(list(LAYOUTS)))
+    old, _, new = records_of(np.array(rows), np.array(list(LAYOUTS)))
     assert (old["seed_cost"], new["seed_cost"], old["phase"]) == (3.0, 3.0, 8.0)
     assert math.isnan(old["age_s"])
     assert (old["refused"], old["strangers"]) == (0.0, 0.0)

@@ -17,6 +17,7 @@ function tell() {
   $("age").textContent = number(newest.telemetry_age_s, 0, "ms", 1e3);
   $("delay").textContent = number(newest.link_delay_s, 0, "ms", 1e3);
   $("missed").textContent = newest.missed_decisions;
+  $("computer").textContent = newest.computer || "keeps up";
   $("battery").textContent = number(newest.battery, 0, "%", 100);
   $("texts").replaceChildren(...[...newest.texts].reverse().map((text) => {
     const item = document.createElement("li");

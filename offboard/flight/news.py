@@ -1,0 +1,75 @@
+"""What the user is told beside the phases: what is waited for, and a computer that is late."""
+
+from __future__ import annotations
+
+import math
+import re
+
+from offboard.flight import assessment
+from offboard.flight.phases import Phase
+from offboard.flight.state import FlightState
+from offboard.io.repeated import Repeated
+from offboard.mavlink.session import Session
+
+PAUSED = "this computer paused for {most:.2f} s{times}: waiting for the vehicle's mode"
+DROPPED = (
+    "{total:.0f} of our messages to the vehicle dropped: this computer was too busy, and they "
+    "became too old"
+)
+FIRST_S = 2.5  # in a phase: telemetry has only just been requested
+CHANGED_S = 1.0  # between two reasons
+AGAIN_S = 10.0  # the same reason, in other figures too
+
+
+class Waiting:
+    """Says why the flight does not begin: a new reason at most once a second, the same one every
+    ten. A service that hears no vehicle says so once."""
+
+    def __init__(self) -> None:
+        self._kind = ""  # of the newest reason: without its figures
+        self._said_s = -math.inf
+
+    def news(self, state: FlightState, session: Session, now_s: float) -> str:
+        """A sentence to say at `now_s`, of any clock; empty without one."""
+        if state.phase not in (Phase.CONNECT, Phase.HEALTH):
+            self._kind = ""
+            return ""
+        if state.in_phase_s < FIRST_S or now_s - self._said_s < CHANGED_S:
+            return ""
+        reason = _unheard(session) if state.phase is Phase.CONNECT else _unready(state, session)
+        kind = re.sub(r"[0-9]+", "", reason)
+        alone = state.programme.serves and state.phase is Phase.CONNECT
+        if not reason or (kind == self._kind and (alone or now_s - self._said_s < AGAIN_S)):
+            return ""
+        self._kind, self._said_s = kind, now_s
+        return f"waiting: {reason}"
+
+
+class News:
+    """All that is told of one flight, each kind at most once a second."""
+
+    def __init__(self) -> None:
+        self.paused, self.dropped = Repeated(PAUSED), Repeated(DROPPED)
+        self._waiting = Waiting()
+
+    def due(self, state: FlightState, session: Session, now_s: float) -> list[str]:
+        """The sentences to announce now, at host time `now_s`."""
+        late = [each.news(now_s) for each in (self.paused, self.dropped)]
+        ended = state.busyness.sentence if state.has_ended and state.programme.serves else ""
+        return list(filter(None, [*late, self._waiting.news(state, session, state.now_s), ended]))
+
+
+def _unready(state: FlightState, session: Session) -> str:
+    reasons = [*assessment.problems(state), assessment.not_ready(state, session)]
+    return "; ".join(filter(None, reasons))
+
+
+def _unheard(session: Session) -> str:
+    """What is heard instead of a vehicle."""
+    counters = session.counters
+    if not counters.bytes_received:
+        return "nothing is heard on this link"
+    if not counters.frames:
+        return f"{counters.bytes_received} bytes are heard that are not MAVLink"
+    known = session.autopilots.why_none(counters)
+    return known or "MAVLink is heard, but no heartbeat of an autopilot"
