@@ -81,7 +81,7 @@ class Score:
     setpoint_gap_max_s: float = _figure("longest gap of setpoints", "s")
     setpoint_gap_wall_max_s: float = _figure("longest gap of setpoints, wall time", "s")
     answer_p50_ms: float = _figure("telemetry in to setpoint out, median", "ms")
-    answer_p99_ms: float = _figure("telemetry in to setpoint out, 99th perc.", "ms")
+    answer_p99_ms: float = _figure("telemetry in to setpoint out, 99th p.", "ms")
     answer_max_ms: float = _figure("telemetry in to setpoint out, maximum", "ms")
     setpoint_age_p99_ms: float = _figure("telemetry at its setpoint, 99th perc.", "ms")
     setpoint_age_max_ms: float = _figure("telemetry at its setpoint, maximum", "ms")

@@ -22,6 +22,7 @@ from typer.testing import CliRunner, Result
 
 from offboard.analysis import tlog
 from offboard.cli.commands import app
+from offboard.flight.record import RECORD_ID
 from offboard.io.log import entry
 from offboard.model.frames import enu, flu_in_enu
 
@@ -115,7 +116,7 @@ def test_mcap(flight: Path, messages: dict[tuple[str, bool], list[Any]], tmp_pat
     assert max(max(abs(p.x), abs(p.y)) for p in points) < 0.5
     texts = [value.message for _, value in found["/log"]]
     assert any(text.startswith("takeoff: armed") for text in texts)
-    decisions = [m for m in messages["DEBUG_FLOAT_ARRAY", True] if m.array_id == 3]
+    decisions = [m for m in messages["DEBUG_FLOAT_ARRAY", True] if m.array_id == RECORD_ID]
     assert len(found["/table/decision"]) == len(decisions) > 50
     assert found["/table/decision"][9][1]["decision_thrust_mps2"] == pytest.approx(
         decisions[9].data[1]
