@@ -1,4 +1,4 @@
-"""Compilation by numba: two decorators, when functions are compiled, where machine code is kept.
+"""Compilation by numba: two decorators, and when functions are compiled.
 
     PAIR = np.dtype([("total", "f8"), ("count", "i8")], align=True)
 
@@ -17,9 +17,10 @@
     add(np.zeros(1, PAIR), np.ones(3))
 
 A kernel is called by compiled functions; called from Python it runs as Python. An entry is called
-from Python: the first call loads it from disk, or compiles it and its kernels, for seconds. Before
-anything that must not wait, `prepare` compiles the entries of all modules that are imported.
-Importing a module neither compiles nor imports numba.
+from Python: the first call loads it from disk, or compiles it, for up to a second. Before anything
+that must not wait, `prepare` loads the entries of all modules that are imported. Importing a module
+neither compiles nor imports numba. With NUMBA_DISABLE_JIT=1 everything runs as Python, slowly, and
+a debugger can step through it.
 
 numba recompiles an entry when its source file has changed, but not when that of a kernel has. So
 machine code is kept in a directory that is named after all compiled sources.
@@ -27,21 +28,15 @@ machine code is kept in a directory that is named after all compiled sources.
 
 from __future__ import annotations
 
-import atexit
-import fcntl
 import functools
 import gc
 import hashlib
-import importlib
 import os
 import re
-import shutil
-import stat
-import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Generic, ParamSpec, TypeVar, cast
@@ -55,9 +50,6 @@ F = TypeVar("F", bound=Callable[..., Any])
 Parameter = type[int | float | np.random.Generator] | np.dtype[Any] | tuple[int, np.dtype[Any]]
 """A number, a random generator, the dtype of an array of one record, or the dimensions and dtype of
 an array."""
-
-ENTRIES_PER_PROCESS = 3  # starting a process costs as much as compiling one of them
-UNUSED_S = 30 * 86400.0  # machine code that was not used for so long is deleted
 
 defined: list[Entry[Any, Any]] = []  # the entries of the modules imported so far
 _kernels: list[Callable[..., Any]] = []  # not yet registered with numba
@@ -96,35 +88,38 @@ class Entry(Generic[P, R]):
 
     @property
     def is_compiled(self) -> bool:
-        """Whether its machine code is on disk."""
-        mark = directory() / self.name
-        return mark.exists() and mark.stat().st_size > 0
+        """Whether its machine code is on disk, or none is needed."""
+        return self.machine_code is not None or (directory() / self.name).exists()
 
-    def load(self, wait: bool = True) -> Callable[P, R]:
-        """The machine code, from disk or compiled now. Raises BlockingIOError while another process
-        compiles it, unless it may `wait` for that."""
-        with (directory() / self.name).open("a") as mark:  # not empty once it is compiled
-            fcntl.flock(mark, fcntl.LOCK_EX if wait else fcntl.LOCK_EX | fcntl.LOCK_NB)
-            with loading():
-                code = self.machine_code = self._compile()
-            if mark.tell() == 0:
-                mark.write("compiled\n")
-        return code
-
-    def _compile(self) -> Callable[P, R]:
+    def load(self) -> Callable[P, R]:
+        """The machine code, from disk or compiled now."""
         import numba
         from numba.extending import register_jitable
 
-        while _kernels:
-            register_jitable(error_model="numpy")(_kernels.pop())
-        signature = tuple(map(_numba_type, self._parameters))
         config: Any = numba.config
-        others, config.CACHE_DIR = config.CACHE_DIR, str(directory())
-        try:
-            jitted = numba.njit(signature, cache=True, error_model="numpy")(self._function)
-        finally:
-            config.CACHE_DIR = others
-        return cast(Callable[P, R], jitted)
+        if config.DISABLE_JIT:
+            self.machine_code = self._interpreted
+            return self._interpreted
+        with loading():
+            while _kernels:
+                register_jitable(error_model="numpy")(_kernels.pop())
+            signature = tuple(map(_numba_type, self._parameters))
+            others, config.CACHE_DIR = config.CACHE_DIR, str(directory())
+            try:
+                jitted = numba.njit(signature, cache=True, error_model="numpy")(self._function)
+            finally:
+                config.CACHE_DIR = others
+        (directory() / self.name).touch()
+        self.machine_code = cast(Callable[P, R], jitted)
+        return self.machine_code
+
+    def _interpreted(self, *args: P.args, **kwargs: P.kwargs) -> R:
+        """The function as Python: a record has its fields as attributes there, too."""
+        views: Any = (
+            each.view(np.recarray) if isinstance(each, np.ndarray) and each.dtype.names else each
+            for each in args
+        )
+        return self._function(*views, **kwargs)
 
 
 @contextmanager
@@ -152,75 +147,29 @@ def _numba_type(parameter: Parameter) -> Any:
 
 
 def prepare(tell: Callable[[str], None] = lambda sentence: None) -> None:
-    """Compile the entries of all imported modules, if they are not on disk, with one process per
-    processor. `tell` is called with a sentence for the user before it takes long."""
-    missing = [each for each in defined if not each.is_compiled]
-    if not missing:
-        return
-    tell("first run on this machine: compiling, about 15 s")
-    modules = sorted({each.__module__ for each in missing})
-    command = (sys.executable, "-P", "-m", "offboard.compiled", *modules)
-    ours = {
-        "NUMBA_CACHE_DIR": str(directory().parents[1]),
-        "PYTHONPATH": os.pathsep.join(sys.path),
-    }
-    silent = subprocess.DEVNULL
-    others = [
-        subprocess.Popen(command, env=os.environ | ours, stdin=silent, stdout=silent, stderr=silent)
-        for _ in range(1, min(os.cpu_count() or 1, len(missing) // ENTRIES_PER_PROCESS))
-    ]
-    _compile_free(missing)
-    for process in others:
-        process.wait()
-
-
-def _compile_free(entries: Iterable[Entry[Any, Any]]) -> None:
-    """Compile the entries that are not on disk and that no other process is compiling."""
-    for each in entries:
-        if not each.is_compiled:
-            with suppress(BlockingIOError):
-                each.load(wait=False)
-
-
-def main(modules: Sequence[str]) -> None:
-    """`python -m offboard.compiled MODULE...`: compile the entries that these modules import."""
-    for name in modules:
-        importlib.import_module(name)
-    _compile_free(defined)
+    """Load the entries of all imported modules. `tell` is called with a sentence for the user
+    before they are compiled."""
+    if not all(each.is_compiled for each in defined):
+        tell("first run on this machine: compiling, about 10 s")
+    for each in defined:
+        if each.machine_code is None:
+            each.load()
 
 
 @functools.cache
 def directory() -> Path:
-    """Where machine code of these sources is kept: below the first of NUMBA_CACHE_DIR,
-    XDG_CACHE_HOME and ~/.cache that is absolute and in which only this user can write, otherwise
-    in a temporary directory of this process."""
-    given = [os.environ.get(name, "") for name in ("NUMBA_CACHE_DIR", "XDG_CACHE_HOME")]
+    """Where machine code of these sources is kept: below NUMBA_CACHE_DIR, XDG_CACHE_HOME or
+    ~/.cache, or in a temporary directory where none of them can be written."""
+    given = (os.environ.get("NUMBA_CACHE_DIR", ""), os.environ.get("XDG_CACHE_HOME", ""))
     for cache in filter(os.path.isabs, (*given, os.path.expanduser("~/.cache"))):
-        versions = Path(cache) / "pso-offboard"
-        if _is_private(versions) and _is_private(versions / _digest()):
-            place = versions / _digest()
-            os.utime(place)
-            for each in versions.iterdir():  # every start touches the one that it uses
-                if each.stat().st_mtime < place.stat().st_mtime - UNUSED_S:
-                    shutil.rmtree(each, ignore_errors=True)
-            return place
-    temporary = tempfile.mkdtemp()
-    atexit.register(shutil.rmtree, temporary, ignore_errors=True)
-    place = Path(temporary) / "pso-offboard" / _digest()
-    place.mkdir(mode=0o700, parents=True)
-    return place
-
-
-def _is_private(place: Path) -> bool:
-    """Make the directory; whether only this user can write in it: machine code is executed."""
-    try:
-        place.mkdir(mode=0o700, parents=True, exist_ok=True)
-        tempfile.TemporaryFile(dir=place).close()
-        status = place.lstat()
-    except OSError:
-        return False
-    ours = stat.S_ISDIR(status.st_mode) and status.st_uid == os.getuid()
-    return ours and not status.st_mode & 0o022
+        place = Path(cache) / "pso-offboard" / _digest()
+        try:
+            place.mkdir(mode=0o700, parents=True, exist_ok=True)
+            tempfile.TemporaryFile(dir=place).close()
+        except OSError:
+            continue
+        return place
+    return Path(tempfile.mkdtemp())
 
 
 _COMPILED = re.compile(rb"^@(?:entry|kernel)\b", re.M)
@@ -250,9 +199,3 @@ def _digest() -> str:
     for name in sorted(taken):
         digest.update(name.encode() + b"\0" + sources[name])
     return digest.hexdigest()[:16]
-
-
-if __name__ == "__main__":
-    from offboard.compiled import main as compile_modules  # where the entries register themselves
-
-    compile_modules(sys.argv[1:])

@@ -142,10 +142,13 @@ def _remember(search: Any, costs: Array, particles: Array, best: Array) -> None:
             search.rejected += 1
         elif cost < costs[1, i]:
             costs[1, i] = cost
-            particles[2, :, i] = particles[0, :, i]
-            if cost < search.cost:
+            is_best = cost < search.cost
+            if is_best:
                 search.cost = cost
-                best[:] = particles[0, :, i]
+            for j in range(len(best)):
+                particles[2, j, i] = particles[0, j, i]
+                if is_best:
+                    best[j] = particles[0, j, i]
     search.iterations += 1
 
 
@@ -154,7 +157,10 @@ def _spread(particles: Array, best: Array) -> float:
     """Mean distance of all particles from the best position, Eqs. 28-29."""
     total = 0.0
     for i in range(particles.shape[2]):
-        total += np.sqrt(np.sum((best - particles[0, :, i]) ** 2))
+        squared = 0.0
+        for j in range(len(best)):
+            squared += (best[j] - particles[0, j, i]) ** 2
+        total += np.sqrt(squared)
     return float(total / particles.shape[2])
 
 
