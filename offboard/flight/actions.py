@@ -43,6 +43,7 @@ class PhaseActions:
         self._state = state
         self._session = session
         self._fitted_s = 0.0  # in the phase HEALTH
+        self._waits = False  # for a vehicle that is not heard
         self._observer = observer
         self._decider = decider
         self._outbox = outbox
@@ -82,6 +83,8 @@ class PhaseActions:
         dialect, authority = self._dialect, self._state.authority
         assert authority is not None
         holds = tick.phase is not Phase.LAND
+        if not holds:
+            self._await_link()
         mode = dialect.hold_mode if holds else dialect.land_mode
         if authority.mode != mode:
             if self._outbox.request(dialect.hold() if holds else dialect.land()):
@@ -90,6 +93,22 @@ class PhaseActions:
             self._disarm_if_standing()
         if steers and authority.mode == authority.engage_mode and tick.in_phase_s < LAND_STREAM_S:
             self._outbox.send_level(tick.time_s, self._level())
+
+    def _await_link(self) -> None:
+        """Say once what is waited for; when the vehicle is heard again, what was asked of it counts
+        for nothing."""
+        unreached_s, limits = self._state.unreached_s, self._state.limits
+        waited, self._waits = self._waits, unreached_s > 2.0 * limits.silence_s
+        if self._waits and not waited:
+            silent = self._state.silence_s > limits.silence_s
+            missing = "telemetry" if silent else "report of the mode"
+            self._outbox.announce(
+                f"no {missing} for {unreached_s:.1f} s: waiting for the link, "
+                "then landing is asked again"
+            )
+        elif waited and not self._waits:
+            self._outbox.renew()
+            self._outbox.announce(f"heard again: the vehicle shows {self._state.vehicle.mode}")
 
     def _disarm_if_standing(self) -> None:
         """Ask a vehicle that stands, and does not disarm by itself, to disarm. It is never forced

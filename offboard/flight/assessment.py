@@ -62,6 +62,8 @@ def facts(
         lost=authority is not None and authority.standing is Standing.LOST,
         shown_since=_shown_since_lost(state),
         authority_known=authority is not None and authority.heard(state.now_s),
+        own_failsafe=authority is not None and authority.standing is Standing.FAILSAFE,
+        unreached_s=state.unreached_s,
         failsafe=vehicle.in_failsafe,
         armed=vehicle.armed,
         in_the_air=state.contact.in_the_air,
@@ -145,6 +147,8 @@ def figures(
         "lost": authority.lost_reason if authority else "",
         "authority_age_s": state.now_s - authority.heard_s if authority else math.inf,
         "blind_to": "LOCAL_POSITION_NED" if older else "ATTITUDE_QUATERNION",
+        "last_known": f"last known: {'armed' if vehicle.armed else 'disarmed'} in {vehicle.mode}, "
+        f"{now.height_m:.1f} m above the take-off point",
         "position_error_limit_m": state.limits.position_error_m,
         "tilt_deg": math.degrees(now.tilt_rad),
         "tilt_error_deg": math.degrees(now.tilt_error_rad),
@@ -177,7 +181,7 @@ def not_ready(state: FlightState, session: Session) -> str:
         problem = vehicle.estimator.problem if vehicle.estimator else ""
         return f"no {' and no '.join(missing)} arrives{problem and f': {problem}'}"
     if not state.guarded:
-        return "the supervisor, which lands it if this process ends, does not run"
+        return "the supervisor, which lands it if this process ends, does not answer"
     rates_hz = session.rates_hz
     for name in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED"):
         if rates_hz[name] < MINIMUM_TELEMETRY_HZ:

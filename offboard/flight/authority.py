@@ -3,6 +3,9 @@
 It is ours from the moment when it shows the mode that we asked for until it shows another one that
 we did not ask for; that is final. What a pilot, a ground station or a failsafe has chosen is never
 changed. A report has an age: without a recent one nothing is sent.
+
+One mode is nobody's choice: that of the autopilot's own failsafe for setpoints that did not arrive.
+The vehicle may be asked to land from it, unless sticks are received.
 """
 
 from __future__ import annotations
@@ -10,6 +13,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, replace
 from enum import Enum
+
+from offboard.mavlink.dialects.base import NEVER, SetpointLoss
 
 JUST_S = 0.6  # PX4 sends CURRENT_MODE twice a second, and at once when the mode changes
 KNOWN_S = 2.5  # longest age of a report; HEARTBEAT comes at 1 Hz
@@ -21,6 +26,7 @@ class Standing(Enum):
     FREE = "not asked for yet"
     ASKED = "asked for"
     OURS = "follows our setpoints"
+    FAILSAFE = "in the failsafe for setpoints that did not arrive"
     HANDED = "in a mode that we asked for as the end of the flight"
     LOST = "taken by another"
 
@@ -49,17 +55,32 @@ class Authority:
     reported_s: float = -math.inf  # time of the newest report that counts
     lost_reason: str = ""
     lost_s: float = math.inf  # time of the loss
+    loss: SetpointLoss = NEVER  # what the autopilot does without setpoints
+    arrived_s: float = -math.inf  # host time of the arrival of the newest report
     _asked_in: str = ""  # the mode shown when we asked
     _requested: list[str] = field(default_factory=list)  # as the end; without those left behind
-    _arrived_s: float = -math.inf  # host time of the arrival of the newest report
+    _failsafe_shown: bool = False  # a HEARTBEAT shows what `Standing.FAILSAFE` supposes
     _counts_from_s: float = -math.inf  # host time: what arrived before it is not evidence
 
     def on_mode(
-        self, mode: str, now_s: float, *, arrived_s: float = math.inf, failsafe: bool = False
+        self,
+        mode: str,
+        now_s: float,
+        *,
+        arrived_s: float = math.inf,
+        failsafe: bool = False,
+        heartbeat: bool = True,
+        starved: bool = False,
+        sticks: bool = False,
     ) -> None:
-        """The vehicle reports `mode`. A failsafe may interrupt a landing that we asked for."""
+        """The vehicle reports `mode`. A failsafe may interrupt a landing that we asked for.
+
+        `failsafe`: the newest HEARTBEAT shows one; `heartbeat`: it is this report. `starved`: it
+        may have been without setpoints for so long that its failsafe acts; `sticks`: it receives
+        those of a pilot, who may fly it in that failsafe.
+        """
         before, self.mode = self.mode, mode
-        self.heard_s, self._arrived_s = now_s, arrived_s
+        self.heard_s, self.arrived_s = now_s, arrived_s
         if arrived_s >= self._counts_from_s:
             self.reported_s = now_s
         if self.standing is Standing.ASKED:
@@ -67,9 +88,13 @@ class Authority:
                 self.standing = Standing.OURS
             elif mode != self._asked_in:
                 self.lose(f"it showed {mode} after {self.engage_mode} was asked for", now_s)
-        elif self.standing is Standing.OURS and mode != self.engage_mode:
-            if mode in self._requested:
+        elif self.standing in (Standing.OURS, Standing.FAILSAFE):
+            if mode == self.engage_mode:  # PX4 returns to it when setpoints arrive again
+                self.standing = Standing.OURS
+            elif mode in self._requested:
                 self._hand_over(mode)
+            elif mode in self.loss.modes and (starved or self.standing is Standing.FAILSAFE):
+                self._on_failsafe(mode, now_s, failsafe, heartbeat=heartbeat, sticks=sticks)
             else:
                 self.lose(f"the vehicle left {self.engage_mode} for {mode}", now_s)
         elif self.standing is Standing.HANDED:
@@ -77,6 +102,19 @@ class Authority:
                 self._hand_over(mode)
             elif not failsafe:
                 self.lose(f"the vehicle left {before} for {mode}", now_s)
+
+    def _on_failsafe(
+        self, mode: str, now_s: float, failsafe: bool, *, heartbeat: bool, sticks: bool
+    ) -> None:
+        """It shows a mode of its failsafe. Only HEARTBEAT tells that from a pilot's choice."""
+        left = f"the vehicle left {self.engage_mode} for {mode}"
+        if heartbeat and not failsafe:
+            self.lose(left, now_s)
+        elif sticks:
+            self.lose(f"{left} as setpoints were missing, and receives a pilot's sticks", now_s)
+        else:
+            shown = self.standing is Standing.FAILSAFE and self._failsafe_shown
+            self.standing, self._failsafe_shown = Standing.FAILSAFE, shown or heartbeat
 
     def _hand_over(self, mode: str) -> None:
         """It shows a mode that we asked for: one that we asked for before would be a step back."""
@@ -109,13 +147,13 @@ class Authority:
         """After a gap of our own that ended at `host_s`: only reports that arrive later, or have
         arrived just before, count."""
         self._counts_from_s = host_s - JUST_S
-        if self._arrived_s < self._counts_from_s:
+        if self.arrived_s < self._counts_from_s:
             self.reported_s = -math.inf
 
     def forget(self) -> None:
         """The vehicle was rebooted: its standing is shown by the next report of the mode."""
         self.heard_s = self.reported_s = -math.inf
-        if self.standing is Standing.HANDED:
+        if self.is_ours:
             self.standing = Standing.OURS
 
     def lose(self, reason: str, now_s: float) -> None:
@@ -140,4 +178,10 @@ class Authority:
     def permits_command(self, now_s: float) -> bool:
         """Whether a command may leave."""
         handed = self.standing is Standing.HANDED and self.mode in self._requested
-        return self.permits_setpoint(now_s) or (self.known(now_s) and handed)
+        fallen = self.standing is Standing.FAILSAFE and self._failsafe_shown
+        return self.permits_setpoint(now_s) or (self.known(now_s) and (handed or fallen))
+
+    @property
+    def is_ours(self) -> bool:
+        """Nobody else has chosen its mode since it followed us, however old the report is."""
+        return self.standing in (Standing.OURS, Standing.FAILSAFE, Standing.HANDED)

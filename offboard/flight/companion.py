@@ -42,6 +42,7 @@ from offboard.flight.snapshot import Snapshot, snapshot_of
 from offboard.flight.state import FlightState, Outcome
 from offboard.identification.learned import Learned
 from offboard.io.link import Chunk
+from offboard.mavlink.dialects.base import NEVER
 from offboard.mavlink.events import (
     Attitude,
     ClockBehind,
@@ -263,6 +264,7 @@ class Companion:
 
     def _take_and_act(self, chunks: Sequence[Chunk], now_s: float) -> None:
         self._begin_turn(now_s)
+        before_s = self.state.now_s
         replies: list[Outgoing] = []
         heard = False
         for chunk in chunks:
@@ -285,6 +287,8 @@ class Companion:
         self._session.status = self._status()
         due = self._session.poll(now_s)
         state.now_s = state.vehicle.now_s = self._session.link_time_s
+        if state.phase is Phase.LAND and state.unreached_s:
+            state.began_s += state.now_s - before_s  # a landing that is not seen takes no time
         state.host_s = self._session.clock_s(now_s)
         if heard:
             self._heard_s = self._session.elapsed_s(now_s)
@@ -299,8 +303,17 @@ class Companion:
         state, vehicle = self.state, self._session.vehicle
         if vehicle is None:
             return None
-        ours = state.phase not in BEFORE_FLIGHT and not state.has_ended and state.may_command
-        return Supervised(vehicle, ours, state.vehicle.armed, holding=state.phase is Phase.HOLD)
+        health, authority = state.vehicle.health, state.authority
+        flies = state.phase not in BEFORE_FLIGHT and not state.has_ended
+        return Supervised(
+            vehicle,
+            ours=flies and authority is not None and authority.is_ours,
+            flying=state.vehicle.armed,
+            reported_s=authority.arrived_s if authority else -math.inf,
+            holding=state.phase is Phase.HOLD,
+            loss=authority.loss if authority else NEVER,
+            sticks=health is not None and health.radio_ok,
+        )
 
     def _status(self) -> tuple[int, int]:
         """MAV_STATE and custom_mode of our heartbeat."""
@@ -321,6 +334,7 @@ class Companion:
         self._turned_s = now_s
         state.host_s = self._session.clock_s(now_s)
         state.silence_s = elapsed_s - self._heard_s
+        state.note_starvation()
         if paused_s > PAUSE_S and state.authority is not None and not self._lockstep:
             state.authority.doubt(now_s)
             self._news.paused.add(paused_s)

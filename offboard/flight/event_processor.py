@@ -157,8 +157,17 @@ class EventProcessor:
             state.dialect = self._session.dialect
             assert state.dialect is not None
             state.authority = Authority(state.dialect.engage_mode)
+        assert state.dialect is not None
+        vehicle = state.vehicle
+        state.authority.loss = state.dialect.setpoint_loss(vehicle.parameters)
         state.authority.on_mode(
-            mode, state.now_s, arrived_s=arrived_s, failsafe=state.vehicle.in_failsafe
+            mode,
+            state.now_s,
+            arrived_s=arrived_s,
+            failsafe=vehicle.in_failsafe,
+            heartbeat=isinstance(event, Heartbeat),
+            starved=state.starved,
+            sticks=vehicle.health is not None and vehicle.health.radio_ok,
         )
         ours = mode == state.authority.engage_mode
         contact = state.contact

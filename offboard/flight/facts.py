@@ -25,6 +25,8 @@ class Facts:
     lost: bool  # the vehicle is not ours any more
     shown_since: bool  # and a HEARTBEAT has come since then
     authority_known: bool
+    own_failsafe: bool  # setpoints were missing, and the autopilot's failsafe flies it
+    unreached_s: float  # without telemetry, or without a report of the mode; 0 while both arrive
     failsafe: bool  # the vehicle shows a failsafe or an emergency
     armed: bool
     in_the_air: bool

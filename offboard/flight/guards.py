@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 
 from offboard.flight.facts import Facts
-from offboard.flight.phases import Rung
+from offboard.flight.phases import OUTAGE_MAX_S, Rung
 from offboard.flight.requests import Request
 
 Guard = Callable[[Facts], bool]
@@ -226,6 +226,20 @@ def silent(now: Facts) -> bool:
 
 def silent_for_long(now: Facts) -> bool:
     return now.silence_s > 2.0 * now.limits.silence_s
+
+
+def in_own_failsafe(now: Facts) -> bool:
+    """Setpoints were missing, and the autopilot's failsafe flies the vehicle."""
+    return now.own_failsafe
+
+
+def unheard_on_ground(now: Facts) -> bool:
+    """It has landed, and no HEARTBEAT shows whether it is armed."""
+    return now.landed and not now.authority_known
+
+
+def out_of_reach(now: Facts) -> bool:
+    return now.unreached_s > OUTAGE_MAX_S
 
 
 def silent_on_ground(now: Facts) -> bool:

@@ -40,7 +40,7 @@ ROWS = (
         "2.5 s",
         guards.authority_unknown,
         0.0,
-        Rung.SILENCE,
+        Rung.LAND,  # of which nothing is asked before the mode is known again
         "no report of the mode for {authority_age_s:.1f} s: another may control the vehicle",
     ),
     LadderRow(

@@ -86,6 +86,7 @@ class Outbox:
         command = admit(command, model, self._clearance(age_s, late_s))
         self.set_command(time_s, command)
         self._state.commands.append(command)
+        self._state.setpoint_s = self._state.now_s
         self._state.thrusts.append(min(command.thrust_mps2 / model.thrust_max_mps2, 1.0))
         if self._identification:
             self._identification.on_command(self._state.sent_s(time_s), command)
@@ -122,6 +123,7 @@ class Outbox:
         """
         command = admit(command, self._state.model, self._clearance(age_s, late_s))
         self._observer.freeze(True)
+        self._state.setpoint_s = self._state.now_s
         self._state.thrusts.clear()  # the autopilot chooses the thrust
         self.command = Command(self._state.model.gravity_mps2, LEVEL, command.course_rad)
         self.send(
@@ -172,6 +174,10 @@ class Outbox:
         state.vehicle.results.pop(request.command, None)
         self.send(request)
         return True
+
+    def renew(self) -> None:
+        """After an outage of the link every request may be sent once more."""
+        self._requested_s.clear()
 
     def announce(self, sentence: str, title: str = "") -> None:
         """Report to the user, and to the ground station with `title` before the sentence."""

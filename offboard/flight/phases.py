@@ -44,7 +44,6 @@ class Rung(IntEnum):
     LEVEL = 1  # this tick: level, with the estimated hover thrust, instead of the decision
     HOLD = 2  # the autopilot is asked to hold, after `Limits.hold_s` to land
     LAND = 3  # the autopilot is asked to land
-    SILENCE = 4  # nothing is sent until the mode is reported again, then land
 
 
 # The number of a phase in logs. Never reuse a number: old logs must stay readable.
@@ -77,6 +76,7 @@ TRACKING = frozenset({Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.
 MOVING = frozenset({Phase.JOIN, Phase.TRACK})  # along the reference
 # phases in which the ladder is stepped
 FLYING = TRACKING | {Phase.TAKEOFF, Phase.HAND_BACK, Phase.HOLD}
+OUTAGE_MAX_S = 300.0  # so long a vehicle that was asked to land, and is not heard, is waited for
 STOPPED = "stop requested by the operator"
 
 

@@ -6,6 +6,7 @@ with the time when it was heard. What follows from them is in `facts`.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -26,7 +27,7 @@ from offboard.flight.requests import Request
 from offboard.flight.touchdown import Touchdown, moved
 from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.dialects.base import Dialect, Takeoff
-from offboard.mavlink.events import Landed
+from offboard.mavlink.events import Landed, TimesyncReply
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import Vehicle
@@ -35,6 +36,8 @@ Triple = tuple[float, float, float]
 COMMANDS_KEPT = 7  # as long as an attitude may take to follow
 THRUSTS_KEPT = 40  # as long as a setpoint may be on its way, or the next ones be lost
 PREDICTIONS_KEPT = 8
+STARVED_EARLY_S = 0.3  # before the time of its failsafe: a setpoint is on its way, or was lost
+STARVED_KNOWN_S = 3.0  # HEARTBEAT, at 1 Hz, shows the failsafe
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,6 +77,8 @@ class FlightState:
     now_s: float = 0.0  # `Session.link_time_s`
     host_s: float = 0.0  # monotonic time of this computer at the present turn
     silence_s: float = 0.0  # host time since the newest telemetry
+    setpoint_s: float = math.inf  # when the newest setpoint left
+    starved_s: float = -math.inf  # when setpoints may have been missing for long
     guarded: bool = True  # a supervisor lands the vehicle if this process ends
     rebooted: bool = False
     left_engaged: bool = False  # a flight that was cut short has left the vehicle engaged
@@ -156,6 +161,33 @@ class FlightState:
     def takes_off_by_command(self) -> bool:
         """The autopilot takes off on a command, without setpoints."""
         return self.dialect is not None and self.dialect.takeoff is Takeoff.COMMAND
+
+    @property
+    def unreached_s(self) -> float:
+        """For how long no telemetry, or no report of the mode, has arrived; 0 while both do."""
+        silent_s = self.silence_s if self.silence_s > self.limits.silence_s else 0.0
+        authority = self.authority
+        known = authority is None or authority.heard(self.now_s)
+        return max(silent_s, 0.0 if known or authority is None else self.now_s - authority.heard_s)
+
+    def note_starvation(self) -> None:
+        """Note when the vehicle may have been without setpoints for so long that its failsafe acts:
+        none was sent, nothing was heard, or no TIMESYNC was answered."""
+        if self.authority is None:
+            return
+        unanswered_s = self.vehicle.age_s(TimesyncReply)
+        gap_s = max(
+            self.now_s - self.setpoint_s,
+            self.silence_s,
+            unanswered_s if math.isfinite(unanswered_s) else 0.0,
+        )
+        if gap_s > self.authority.loss.after_s - STARVED_EARLY_S:
+            self.starved_s = self.now_s
+
+    @property
+    def starved(self) -> bool:
+        """Within the last seconds, as `note_starvation` has it."""
+        return self.now_s - self.starved_s < STARVED_KNOWN_S
 
     @property
     def ours(self) -> bool:

@@ -33,6 +33,9 @@ class Row:
 _SILENT = "no telemetry for {silence_s:.1f} s"
 _BLIND = "no {blind_to} for {blind_s:.1f} s"
 _UNKNOWN = "no report of the mode for {authority_age_s:.1f} s"
+_STARVED = "setpoints did not arrive, and the vehicle's own failsafe flies it, in {mode}"
+_OUT_OF_REACH = "not heard for {unreached_s:.0f} s while landing; {last_known}"
+_UNHEARD = "it stands on the ground, and no HEARTBEAT shows whether it is disarmed"
 REBOOTED = "the vehicle restarted"
 _ARMED_ALREADY = "the vehicle is armed already, by another controller or a pilot"
 _DISARMED = "disarmed on the ground"
@@ -77,7 +80,7 @@ def flying_rows(source: Phase, when: str = "in flight") -> tuple[Row, ...]:
         Row(source, guards.rebooted, Phase.LAND, f"{REBOOTED} {when}", ABORTED),
         Row(source, guards.disarmed, Phase.FAILED, f"the vehicle disarmed {when}", ABORTED),
         Row(source, guards.lost, Phase.YIELDED, "{lost}", ABORTED),
-        Row(source, guards.at_rung(Rung.SILENCE), Phase.LAND, "{ladder}", ABORTED),
+        Row(source, guards.in_own_failsafe, Phase.LAND, _STARVED, ABORTED),
         Row(source, guards.at_rung(Rung.LAND), Phase.LAND, "{ladder}", ABORTED),
         Row(source, guards.stop_requested, Phase.LAND, "{stop}", ABORTED),
         Row(source, guards.at_rung(Rung.HOLD), Phase.HOLD, "{ladder}", ABORTED),
@@ -170,8 +173,9 @@ TRANSITIONS: tuple[Row, ...] = (
         "disarmed, but not landed: {not_landed}",
         ABORTED,
     ),
-    Row(Phase.LAND, guards.silent_for_long, Phase.FAILED, f"{_SILENT} while landing", ABORTED),
     Row(Phase.LAND, guards.lost_armed, Phase.YIELDED, "{lost}", ABORTED),
+    Row(Phase.LAND, guards.unheard_on_ground, Phase.FAILED, _UNHEARD, ABORTED),
+    Row(Phase.LAND, guards.out_of_reach, Phase.FAILED, _OUT_OF_REACH, ABORTED),
     _too_long(
         Phase.LAND,
         "land_s",

@@ -30,6 +30,8 @@ OWN_FAILSAFE, SUPERVISED = (
     "the supervisor lands the vehicle",
 )
 UNGUARDED = "the supervisor ended: nobody lands the vehicle if this process dies"
+UNANSWERED = "the supervisor does not answer: nobody lands the vehicle if this process dies"
+ANSWERS = "the supervisor answers again"
 RESTART_S = 10.0  # between two attempts to start another one
 
 
@@ -178,7 +180,13 @@ class Loop:
         supervisor = self._supervisor
         if supervisor is None:
             return
-        self._companion.guard(supervisor.guards)
+        guarded = supervisor.guards
+        self._companion.guard(guarded)
+        if guarded and UNANSWERED in self._warned:
+            self._warned.discard(UNANSWERED)
+            self._companion.announce(ANSWERS)
+        elif not (guarded or supervisor.lost):
+            self._warn(UNANSWERED)
         if not supervisor.lost:
             return
         self._warn(UNGUARDED)
@@ -187,7 +195,7 @@ class Loop:
             self._restarted_s = now_s
             with suppress(SupervisorError):
                 supervisor.restart()
-                self._warned.discard(UNGUARDED)
+                self._warned -= {UNGUARDED, UNANSWERED}
                 self._companion.announce("another supervisor is started")
 
     def _taken_over(self) -> bool:

@@ -26,6 +26,7 @@ from offboard.io.stream_link import Nowhere, Source, Stream, StreamLink
 from offboard.io.stream_sources import Listener
 from offboard.io.udp_link import UdpLink
 from offboard.mavlink import texts
+from offboard.mavlink.dialects.base import SetpointLoss
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat, Outgoing
 from offboard.mavlink.session import Session, SessionSettings
@@ -33,14 +34,13 @@ from offboard.mavlink.signing import Signing
 from offboard.supervisor.recovery import Recovery
 from offboard.supervisor.supervisor import READY
 
-SILENT_S = 0.9  # without a beat; with two polls and a busy machine less than 1 s
 POLL_S = 0.02
 PAUSE_MAX_S = 0.1  # of a turn that counts as the controller's silence: the rest was a pause of ours
 BACKLOG_MAX = 20  # batches of the link that are read before the first request
 CLOSE_S = 2.0
 WARNING = 4  # MAV_SEVERITY
 DIED = "the controller ended in flight"
-HANGS = f"the controller has not answered for {SILENT_S:g} s"
+HANGS = "the controller has not answered for {silent_s:g} s"
 
 
 class Watch:
@@ -57,16 +57,28 @@ class Watch:
         self.ended = False
 
     def turn(self, elapsed_s: float) -> str:
-        """Read what has arrived. Why to take over; empty if there is no reason."""
+        """Read what has arrived, and answer it. Why to take over; empty if there is no reason."""
         self._silent_s += min(elapsed_s, PAUSE_MAX_S)
         with suppress(BlockingIOError, ConnectionResetError):
             while not self.ended:
                 self._read()
+        if not self._silent_s:
+            self._answer()
         if not (self.newest.get("ours") and self.newest.get("flying")):
             return ""
         if self.ended:
             return DIED
-        return HANGS if self._silent_s >= SILENT_S else ""
+        silent_s: float = self.newest["silent_s"]
+        return HANGS.format(silent_s=silent_s) if self._silent_s >= silent_s else ""
+
+    @property
+    def beat_s(self) -> float:
+        """When the newest beat was read, at the latest."""
+        return clock.monotonic_s() - self._silent_s
+
+    def _answer(self) -> None:
+        with suppress(OSError):  # it is stopped, or has ended
+            self._channel.send(b'""\n')
 
     def _read(self) -> None:
         data, descriptors, _, _ = socket.recv_fds(self._channel, 65536, 8)
@@ -106,8 +118,15 @@ class Rescue:
         self._session = Session(SessionSettings(stream=beat["stream"]), signing or None)
         self._session.adopt(VehicleFound(**beat["vehicle"]), self._peer)
         assert self._session.dialect is not None
-        began_s = clock.monotonic_s()
-        self._recovery = Recovery(self._session.dialect, began_s, holding=beat["holding"])
+        self._recovery = Recovery(
+            self._session.dialect,
+            clock.monotonic_s(),
+            holding=beat["holding"],
+            reported_s=beat["reported_s"],
+            beat_s=watch.beat_s,
+            loss=SetpointLoss(beat["loss"]["after_s"], tuple(beat["loss"]["modes"])),
+            sticks=beat["sticks"],
+        )
         self._text_id = 0
 
     def run(self, reason: str) -> None:
@@ -148,6 +167,9 @@ class Rescue:
         if self._recovery.refusal:
             self._say(f"the vehicle answers {self._recovery.refusal}")
             self._recovery.refusal = ""
+        if self._recovery.notice:
+            self._say(self._recovery.notice)
+            self._recovery.notice = ""
 
     def _say(self, sentence: str) -> None:
         """To the controller or its terminal, to the ground station and to the log."""

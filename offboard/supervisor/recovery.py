@@ -5,6 +5,10 @@ ours or that we asked for, and at most once for each report of the mode. Any oth
 decision of a pilot or of the vehicle's own failsafe, and final, whatever is reported after it. So
 is hold that was reported before our request, that the vehicle has not acknowledged, or that comes
 after the landing mode.
+
+One failsafe decides nothing: that for missing setpoints, which stopped with the controller. It
+shows by its mode, by its time and by HEARTBEAT.system_status, which a pilot's choice clears. In it
+the vehicle is watched, and asked to land if it does not; not while it receives a pilot's sticks.
 """
 
 from __future__ import annotations
@@ -12,8 +16,15 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from offboard.mavlink.dialects.base import Dialect
-from offboard.mavlink.events import CommandAck, Event, Heartbeat, ModeReport
+from offboard.mavlink.dialects.base import NEVER, Dialect, SetpointLoss
+from offboard.mavlink.events import (
+    CommandAck,
+    Event,
+    Heartbeat,
+    LocalPosition,
+    ModeReport,
+    SystemHealth,
+)
 from offboard.mavlink.outgoing import CommandLong
 
 REPEAT_S = 0.3  # between two requests
@@ -21,7 +32,11 @@ UNHEARD_MAX = 3  # requests to a vehicle of which nothing is heard
 HOLD_S = 5.0  # then land
 ACKNOWLEDGED_S = 1.0  # after hold is reported: an acknowledgement that comes later was lost
 FRESH_S = 2.5  # an older report of the mode is no reason for a command
-LONGEST_S = 120.0
+LONGEST_S = 300.0
+EARLY_S = 0.3  # the newest setpoint left before the newest beat, and may have been lost
+CRITICAL = 5  # MAV_STATE: a failsafe
+SINK_MPS = 0.2  # downward speed of a vehicle that lands, within SINK_S
+SINK_S = 3.0  # COM_DISARM_LAND is 2 s
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,15 +48,35 @@ class Request:
 
 
 class Recovery:
-    """Begins at `began_s`; `holding`: the vehicle was asked to hold before. `ended` says how it
-    ended; empty until then."""
+    """Begins at `began_s`; the newest beat of the controller was at `beat_s`. As it knew them:
+    `holding`: the vehicle was asked to hold; `reported_s`: time of the newest report of a mode that
+    was ours; `loss`: what follows when setpoints stop; `sticks`: those of a pilot are received.
 
-    def __init__(self, dialect: Dialect, began_s: float, *, holding: bool = False) -> None:
+    `ended` says how it ended, empty until then; `refusal` and `notice` have news for the user."""
+
+    def __init__(
+        self,
+        dialect: Dialect,
+        began_s: float,
+        *,
+        holding: bool = False,
+        reported_s: float = math.inf,
+        beat_s: float = math.inf,
+        loss: SetpointLoss = NEVER,
+        sticks: bool = False,
+    ) -> None:
         self._dialect = dialect
         self._holding = holding
         self._began_s = began_s
+        self._loss = loss
+        self._loses_s = min(beat_s, began_s) + loss.after_s - EARLY_S
+        self._sticks = sticks
         self._mode: str | None = None
-        self._reported_s = -math.inf
+        self._before: str | None = None  # the mode before it
+        self._reported_s = reported_s
+        self._fallen_s = math.inf  # since when its own failsafe flies it
+        self._fallen_shown = False  # by HEARTBEAT
+        self._sank_s = -math.inf  # when it was last seen to sink
         self._armed = True
         self._begun = False  # all that had waited was seen
         self._first_s = math.inf  # time of the first request
@@ -54,32 +89,60 @@ class Recovery:
         self._requests = 0
         self._held_s = math.inf  # since when it holds
         self.refusal = ""  # of the newest request
+        self.notice = ""
         self.ended = ""
 
     def see(self, event: Event, at_s: float) -> None:
         """An event of the vehicle that arrived at `at_s` at the latest, which may be before
         `began_s`."""
         match event:
-            case Heartbeat(mode, armed):
+            case Heartbeat(mode, armed, status):
                 self._armed, self._heartbeat_s = armed, at_s
-                self._on_mode(mode, at_s)
+                self._on_mode(mode, at_s, failsafe=status >= CRITICAL)
             case ModeReport(mode):
-                self._on_mode(mode, at_s)
+                self._on_mode(mode, at_s, failsafe=None)
+            case SystemHealth(radio_ok=received):
+                self._sticks = received
+            case LocalPosition(velocity_ned_mps=(_, _, down_mps)) if down_mps > SINK_MPS:
+                self._sank_s = at_s
             case CommandAck(_, result) if result not in ("ACCEPTED", "IN_PROGRESS"):
                 self.refusal = result
             case CommandAck(command) if command == self._dialect.hold().command:
                 self._acknowledged |= at_s > self._first_s
 
-    def _on_mode(self, mode: str, at_s: float) -> None:
+    def _on_mode(self, mode: str, at_s: float, *, failsafe: bool | None) -> None:
+        """`failsafe` None: the report does not say."""
+        if mode != self._mode:
+            self._before = self._mode
         self._mode, self._reported_s = mode, at_s
         ours = mode in (self._dialect.engage_mode, self._dialect.land_mode)
         if mode == self._dialect.hold_mode and not self._landing:
             ours = self._holding or at_s > self._first_s
         self._landing |= mode == self._dialect.land_mode
+        if failsafe is not False and self._explains(mode, at_s) and (failsafe or not ours):
+            self._fall(mode, at_s, shown=bool(failsafe))
+            return
+        self._fallen_s, self._fallen_shown = math.inf, False
         if not ours and not self._left_for:
             self._left_for, self._left_s = mode, at_s
         elif ours and not self._begun:  # of the reports that have waited the newest decides
             self._left_for = ""
+
+    def _explains(self, mode: str, at_s: float) -> bool:
+        """Whether the autopilot may have chosen this mode because setpoints are missing."""
+        fell = self._fallen_s < math.inf
+        followed = fell or self._before in (None, self._dialect.engage_mode)
+        missing = followed and not self._acknowledged and at_s >= self._loses_s
+        if missing and mode in self._loss.modes and self._sticks:
+            self.notice = f"{mode} for missing setpoints, and it receives a pilot's sticks"
+        lands = mode == self._dialect.land_mode
+        return missing and mode in self._loss.modes and not lands and not self._sticks
+
+    def _fall(self, mode: str, at_s: float, *, shown: bool) -> None:
+        self._fallen_s = min(self._fallen_s, at_s)
+        if shown and not self._fallen_shown:
+            self._fallen_shown = True
+            self.notice = f"its own failsafe flies it, in {mode}: watching that it lands"
 
     def due(self, now_s: float) -> Request | None:
         """What to ask for now."""
@@ -95,7 +158,7 @@ class Recovery:
 
     def _conclude(self, now_s: float) -> None:
         """Note when it holds, and when this is over."""
-        holds = self._mode == self._dialect.hold_mode
+        holds = self._mode == self._dialect.hold_mode and self._fallen_s == math.inf
         self._held_s = min(self._held_s, now_s) if holds else math.inf
         ours = self._holding or self._acknowledged
         # PX4 leaves its landing mode when it disarms, which HEARTBEAT shows later
@@ -113,9 +176,14 @@ class Recovery:
             self.ended = f"not landed after {LONGEST_S:.0f} s"
 
     def _wanted(self, now_s: float) -> Request | None:
+        fresh = now_s - self._reported_s < FRESH_S
         if self._mode is None:
-            return self._hold() if self._requests < UNHEARD_MAX else None
-        answered = self._reported_s > self._asked_s and now_s - self._reported_s < FRESH_S
+            return self._hold() if fresh and self._requests < UNHEARD_MAX else None
+        answered = self._reported_s > self._asked_s and fresh
+        if self._fallen_s < math.inf:
+            lands = self._mode == self._dialect.return_mode or now_s - self._sank_s < SINK_S
+            due = self._fallen_shown and now_s - self._fallen_s >= HOLD_S
+            return self._land() if answered and due and not lands else None
         if not answered or self._mode == self._dialect.land_mode:
             return None
         if self._mode == self._dialect.engage_mode:

@@ -1,16 +1,18 @@
 """The supervisor, as the controller sees it: a process that outlives it.
 
 The loop tells it in every turn whether the vehicle is ours and in the air (`Supervised`). When
-these beats stop for `process.SILENT_S`, or the controller ends meanwhile, the process
+these beats stop for `Supervised.silent_s`, or the controller ends meanwhile, the process
 takes over the link and asks the vehicle to hold, then to land. From then on the controller must not
 send.
 
-Beats are JSON lines on a socket pair. The descriptors of link and log go along when they change.
+Beats are JSON lines on a socket pair, and so are the answers; an empty one says that it has read
+what we sent. The descriptors of link and log go along when they change.
 """
 
 from __future__ import annotations
 
 import json
+import math
 import select
 import socket
 import subprocess
@@ -21,12 +23,18 @@ from dataclasses import asdict, dataclass
 from types import TracebackType
 
 from offboard.documents.errors import UserError
+from offboard.io import clock
 from offboard.io.link import Link
+from offboard.mavlink.dialects.base import NEVER, SetpointLoss
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.signing import Signing
 
 START_S = 20.0  # on a busy machine
 END_S = 1.0
+ANSWER_S = 1.0  # a beat that was not answered for so long: it is stopped
+# Without beats it acts after this time: before the autopilot's own failsafe, so that only one of
+# them does, if that gives a busy computer time enough
+EARLIER_S, SILENT_MIN_S, SILENT_MAX_S = 0.4, 0.4, 0.9
 READY = "ready"
 NOT_STARTED = "the supervisor, which lands the vehicle if this process dies, does not start"
 
@@ -40,13 +48,23 @@ class SupervisorError(UserError):
 @dataclass(frozen=True, slots=True)
 class Supervised:
     """What the supervisor must know before it may act: the vehicle, whether it is `ours`, in the
-    mode of our setpoints or in one that we asked for, whether it may be `flying`, and whether it
-    was asked to hold (`holding`): then this mode is ours, too."""
+    mode of our setpoints or in one that we asked for, by a report that arrived at `reported_s`
+    (`clock.monotonic_s`), of which the supervisor judges the age; whether it may be `flying`, and
+    whether it was asked to hold (`holding`): then this mode is ours, too. `loss`: what its
+    autopilot does without setpoints; `sticks`: it receives those of a pilot."""
 
     vehicle: VehicleFound
     ours: bool
     flying: bool
+    reported_s: float = -math.inf
     holding: bool = False
+    loss: SetpointLoss = NEVER
+    sticks: bool = False
+
+    @property
+    def silent_s(self) -> float:
+        """Time without a beat after which the supervisor acts."""
+        return min(max(self.loss.after_s - EARLIER_S, SILENT_MIN_S), SILENT_MAX_S)
 
 
 class Supervisor:
@@ -63,6 +81,7 @@ class Supervisor:
         self._beat: object = None  # what the newest line says
         self._line = b""
         self._passed: object = None  # the descriptors that it has
+        self._unanswered_s = math.inf  # time of the first beat since the newest answer
 
     def __enter__(self) -> Supervisor:
         self._channel, theirs = socket.socketpair()
@@ -94,8 +113,9 @@ class Supervisor:
 
     @property
     def guards(self) -> bool:
-        """Whether it would take over."""
-        return bool(self._lines) and not self.lost
+        """Whether it would take over: it runs, and has answered within the last second."""
+        waited_s = clock.monotonic_s() - self._unanswered_s
+        return bool(self._lines) and not self.lost and waited_s < ANSWER_S
 
     def restart(self) -> None:
         """Start another process in place of one that has ended. Raises SupervisorError."""
@@ -103,6 +123,7 @@ class Supervisor:
         self._process.poll()
         self._received, self._lines = b"", []
         self._beat = self._passed = None
+        self._unanswered_s = math.inf
         self.__enter__()
         self.lost = False
 
@@ -122,11 +143,13 @@ class Supervisor:
             self._beat = (vehicle, peer, signing)
             message = {
                 **asdict(vehicle),
+                "silent_s": vehicle.silent_s,
                 "peer": peer,
                 "stream": link.is_stream,
                 "signing": signing,
             }
             self._line = json.dumps(message).encode() + b"\n"
+        self._unanswered_s = min(self._unanswered_s, clock.monotonic_s())
         descriptors = [*link.descriptors(), log_descriptor]
         passed = (link.opened, descriptors)
         try:
@@ -151,7 +174,10 @@ class Supervisor:
         except OSError:
             return False
         *lines, self._received = (self._received + data).split(b"\n")
-        self._lines += [json.loads(line) for line in lines]
+        said = [json.loads(line) for line in lines]
+        if said:
+            self._unanswered_s = math.inf
+        self._lines += filter(None, said)
         self.lost = not data and len(self._lines) <= 1
         return bool(data)
 

@@ -44,7 +44,7 @@ from simulator.steps import STEP_S
 HOST_EPOCH_S = 5000.0
 POLL_STEPS = 5
 UNIX_EPOCH_US = 1_767_225_600_000_000
-LONGEST_S = 150.0
+LONGEST_S = 350.0  # of which a vehicle that is not heard any more is awaited for 300 s
 QUICK_LANDING = {"MPC_LAND_SPEED": 1.2, "MPC_LAND_CRWL": 0.7, "COM_DISARM_LAND": 0.5}
 LOITER = 3  # sub mode of PX4's AUTO
 

@@ -1,7 +1,7 @@
 """The ladder: how long a condition must hold, how it is forgotten, and which row counts.
 
 Steps of 1/8 s, which add up exactly. Row "link" takes HOLD after 0.5 s, "tilt error" LAND after
-0.5 s, "battery" LAND after 2 s; "authority" takes SILENCE at once.
+0.5 s, "battery" LAND after 2 s; "authority" takes LAND at once.
 """
 
 from __future__ import annotations
@@ -65,11 +65,12 @@ def test_the_worst_active_row_counts() -> None:
     assert rungs(QUIET, *[TILT_ERROR] * 2, *[LINK] * 3)[-1] is Rung.FLY
 
 
-def test_without_a_report_of_the_mode_everything_else_is_silent() -> None:
+def test_of_rows_of_one_rung_the_report_of_the_mode_is_named() -> None:
+    """Without it no other row has an effect."""
     unknown = replace(LINK, authority_known=False, tilt_rad=1.4, battery=0.0)
     ladder = Ladder()
     ladder.step(unknown, 0.0)
-    assert ladder.rung is Rung.SILENCE
+    assert ladder.rung is Rung.LAND
     assert ladder.worst is not None
     assert ladder.worst.name == "authority"
 

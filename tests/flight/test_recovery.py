@@ -35,7 +35,7 @@ class Vehicle:
         if before:
             recovery.see(Heartbeat(before, True, 4, 2), 99.6)
         landing_s = 0.0
-        for step in range(round(200.0 / STEP_S)):
+        for step in range(round((LONGEST_S + 1.0) / STEP_S)):
             time_s = step * STEP_S
             if self.pilot and time_s >= self.pilot[0]:
                 self.mode = self.pilot[1]

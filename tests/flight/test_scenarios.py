@@ -439,7 +439,12 @@ ROWS = (
         flown,
     ),
     Row(
-        "dies in flight", in_track(die), 4, "no telemetry for 1.0 s", Phase.FAILED, held_then_silent
+        "dies in flight",
+        in_track(die),
+        4,
+        "not heard for 300 s while landing; last known: armed in OFFBOARD, ",
+        Phase.FAILED,
+        held_then_silent,
     ),
     Row(
         "restart in flight",
@@ -461,7 +466,7 @@ ROWS = (
         "position and attitude stop, heartbeats go on",
         in_track(downlink(without(POSITION, ATTITUDE))),
         4,
-        "no telemetry for 1.0 s; no telemetry for 2.0 s while landing",
+        "no telemetry for 1.0 s; disarmed, but not landed: no LOCAL_POSITION_NED shows it",
         Phase.FAILED,
         landing_requested,
     ),

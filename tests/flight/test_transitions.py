@@ -65,6 +65,9 @@ EVENTS: dict[str, dict[str, object]] = {  # the facts that make each guard hold
     "authority_unknown": {"authority_known": False},
     "silent": {"silence_s": 1.01},
     "silent_for_long": {"silence_s": 2.01},
+    "in_own_failsafe": {"own_failsafe": True},
+    "unheard_on_ground": {"authority_known": False},
+    "out_of_reach": {"unreached_s": 300.1},
     "silent_on_ground": {"silence_s": 20.1},
     "blind": {"blind_s": 0.51},
     "stop_requested": {"stop_requested": True},
@@ -95,7 +98,6 @@ EVENTS: dict[str, dict[str, object]] = {  # the facts that make each guard hold
     "requested_hand_back": {"request": Request.HAND_BACK},
     "ladder_hold": {"rung": Rung.HOLD},
     "ladder_land": {"rung": Rung.LAND},
-    "ladder_silence": {"rung": Rung.SILENCE},
 }
 
 

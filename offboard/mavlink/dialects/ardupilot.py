@@ -63,6 +63,7 @@ ARDUPILOT = Dialect(
     # in LOITER the throttle stick sets the climb rate: without a radio the vehicle descends
     hold_mode="BRAKE",
     land_mode="LAND",
+    return_mode="RTL",
     takeoff=Takeoff.COMMAND,
     unused_parameter=0.0,  # NaN stops its SITL with a floating point exception
     thrust_rule=ThrustRule.TILT_COMPENSATED,  # ATC_ANGLE_BOOST 1
@@ -145,6 +146,7 @@ ARDUPILOT = Dialect(
     "link is full",
     prearm_prefixes=("PreArm: ",),
     oldest=(4, 3),
+    loss_time=("GUID_TIMEOUT", 3.0),
     wanted=(
         *TRACKING_TELEMETRY,
         WantedMessage(0, "HEARTBEAT", 10.0, optional=True),  # the only report of the mode

@@ -149,6 +149,18 @@ class WatchedParameter:
 
 
 @dataclass(frozen=True, slots=True)
+class SetpointLoss:
+    """What an autopilot does by itself when setpoints stop: after `after_s` it shows one of
+    `modes` as a failsafe (HEARTBEAT.system_status). Without `modes` it levels in the same mode."""
+
+    after_s: float
+    modes: tuple[str, ...] = ()
+
+
+NEVER = SetpointLoss(math.inf)
+
+
+@dataclass(frozen=True, slots=True)
 class Defect:
     """A defect of an autopilot's firmware before version `fixed_in`, as (major, minor)."""
 
@@ -168,6 +180,7 @@ class Dialect:
     engage_mode: str
     hold_mode: str
     land_mode: str
+    return_mode: str
     takeoff: Takeoff
     unused_parameter: float  # of a COMMAND_LONG: "not given" to this autopilot
     thrust_rule: ThrustRule
@@ -181,6 +194,11 @@ class Dialect:
     slow_hint: str  # what to do where telemetry comes slower than it was requested
     prearm_prefixes: tuple[str, ...]  # of a STATUSTEXT that says what a pre-arm check found
     oldest: tuple[int, int]  # version that this dialect is made for
+    # what follows when setpoints stop: the parameter of the time, its default, the parameter of the
+    # mode, and the modes by its value
+    loss_time: tuple[str, float]
+    loss_action: str = ""
+    loss_modes: tuple[str, ...] = ()
     defects: tuple[Defect, ...] = ()
 
     def mode_name(self, custom_mode: int) -> str:
@@ -194,6 +212,15 @@ class Dialect:
         raise ValueError(
             f"{self.name} has no mode {name!r}; it has {', '.join(self.modes.values())}"
         )
+
+    def setpoint_loss(self, parameters: Mapping[str, float]) -> SetpointLoss:
+        """What the vehicle with these `parameters` does; without one, any of its modes."""
+        name, usual_s = self.loss_time
+        action = parameters.get(self.loss_action)
+        modes = self.loss_modes
+        if action is not None:
+            modes = modes[int(action) : int(action) + 1] if action >= 0 else ()
+        return SetpointLoss(parameters.get(name, usual_s), modes)
 
     def engage(self) -> CommandLong:
         return self.set_mode(self.engage_mode)

@@ -67,6 +67,7 @@ PX4 = Dialect(
     engage_mode="OFFBOARD",
     hold_mode="AUTO.LOITER",
     land_mode="AUTO.LAND",
+    return_mode="AUTO.RTL",
     takeoff=Takeoff.SETPOINT,
     unused_parameter=float("nan"),  # 0 would be a latitude
     thrust_rule=ThrustRule.COLLECTIVE,
@@ -134,6 +135,9 @@ PX4 = Dialect(
     slow_hint="raise MAV_x_RATE of this link, in bytes/s: PX4 slows all messages down to it",
     prearm_prefixes=("Preflight Fail: ", "Preflight: "),
     oldest=(1, 14),
+    loss_time=("COM_OF_LOSS_T", 1.0),
+    loss_action="COM_OBL_RC_ACT",
+    loss_modes=("POSCTL", "ALTCTL", "STABILIZED", "AUTO.RTL", "AUTO.LAND", "AUTO.LOITER"),
     defects=(
         Defect((1, 17), "setpoints without thrust keep OFFBOARD alive; ours always have thrust"),
         Defect((1, 17), "COM_OBL_RC_ACT 0 to 2 is obeyed without a radio"),
