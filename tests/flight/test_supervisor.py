@@ -9,7 +9,9 @@ import os
 import signal
 import socket
 import sys
+import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +39,11 @@ OURS, ON_GROUND, NOT_OURS = (
 )
 
 
+def now(guard: Supervised) -> Supervised:
+    """The vehicle has just reported its mode."""
+    return replace(guard, reported_s=clock.monotonic_s())
+
+
 class Rig:
     """A supervisor with the link to a vehicle, which is a socket, and with a log."""
 
@@ -54,7 +61,7 @@ class Rig:
         self.supervisor = Supervisor()
 
     def beat(self, guard: Supervised) -> None:
-        self.supervisor.beat(guard, self.peer, self.link, self.log.descriptor)
+        self.supervisor.beat(now(guard), self.peer, self.link, self.log.descriptor)
 
     def abandon(self) -> None:
         """End as a process that is killed: the kernel closes its descriptors."""
@@ -134,6 +141,40 @@ def test_it_takes_over_when_the_beats_stop_and_says_so_first(rig: Rig) -> None:
     assert not rig.supervisor.lost
 
 
+def test_one_that_is_stopped_is_noticed_within_a_second_and_when_it_returns(rig: Rig) -> None:
+    def await_guard(guards: bool) -> float:
+        began_s = clock.monotonic_s()
+        while rig.supervisor.guards is not guards:
+            rig.beat(OURS)
+            assert not rig.supervisor.has_taken_over()
+            time.sleep(0.02)
+            assert clock.monotonic_s() - began_s < LONG_S
+        return clock.monotonic_s() - began_s
+
+    await_guard(True)
+    os.kill(rig.supervisor.pid, signal.SIGSTOP)
+    assert 0.8 < await_guard(False) < 2.0
+    os.kill(rig.supervisor.pid, signal.SIGCONT)
+    await_guard(True)
+    assert rig.next_command().command == 176  # as the beats stop
+    rig.disarm()
+
+
+def test_the_report_of_the_mode_may_be_old_and_is_awaited_then(rig: Rig) -> None:
+    """As after a pause of the controller, or in an outage: nothing is asked of a vehicle of which
+    no report is fresh, and hold as soon as it shows our mode."""
+    old = replace(OURS, reported_s=clock.monotonic_s() - 3.0)
+    rig.supervisor.beat(old, rig.peer, rig.link, rig.log.descriptor)
+    rig.abandon()
+    rig.vehicle.settimeout(1.0)
+    with pytest.raises(TimeoutError):
+        rig.next_command()
+    rig.vehicle.settimeout(LONG_S)
+    rig.report(rig.sender, OFFBOARD)
+    assert rig.next_command().command == 176
+    rig.disarm()
+
+
 @pytest.mark.parametrize("guard", [ON_GROUND, NOT_OURS])
 def test_a_vehicle_that_is_not_ours_or_on_the_ground_is_left_alone(
     guard: Supervised, rig: Rig
@@ -197,16 +238,16 @@ def test_over_tcpin_it_asks_the_vehicle_that_connected_last(returns: str, tmp_pa
         first = Caller(port)
         while len(link.descriptors()) < 2:
             link.receive(0.02)
-        supervisor.beat(OURS, "tcp", link, log.descriptor)
+        supervisor.beat(now(OURS), "tcp", link, log.descriptor)
         first.socket.close()
         while len(link.descriptors()) > 1:
             link.receive(0.02)
-        supervisor.beat(OURS, "tcp", link, log.descriptor)
+        supervisor.beat(now(OURS), "tcp", link, log.descriptor)
         if returns == "before":
             second = Caller(port)
             while len(link.descriptors()) < 2:
                 link.receive(0.02)
-            supervisor.beat(OURS, "tcp", link, log.descriptor)
+            supervisor.beat(now(OURS), "tcp", link, log.descriptor)
         supervisor._channel.close()
         link.close()
         if returns == "after":
@@ -232,7 +273,7 @@ def test_it_signs_with_stamps_that_follow_ours(tmp_path: Path) -> None:
         while len(link.descriptors()) < 2:
             link.receive(0.02)
         for _ in range(3):
-            supervisor.beat(OURS, "tcp", link, log.descriptor)
+            supervisor.beat(now(OURS), "tcp", link, log.descriptor)
             newest = ours.encode(Heartbeat(6))
         assert reader.decode(bytearray(newest)).get_type() == "HEARTBEAT"
         assert key.hex() not in str(supervisor._process.args)
