@@ -1,6 +1,7 @@
 """The verdict on a flight, from its log alone: was all of it flown, and what ended it.
 
-A flight is completed if the whole reference was tracked, the vehicle landed, and it was disarmed.
+A flight is completed if the whole reference was tracked, the vehicle landed, and it was disarmed;
+one of the service also if the vehicle was given back at the end of the reference.
 """
 
 from __future__ import annotations
@@ -25,12 +26,17 @@ REFERENCE_OVER = "reference over"
 NO_FLIGHT = "no flight of offboard in this log"
 _ON_GROUND = 1  # MAV_LANDED_STATE
 _CRITICAL = 5  # MAV_STATE
+_TAKEN_OVER = "supervisor: taking over"
 _LANDING_ENDS = {"disarmed", "failed", "yielded"}
 # what begins the reason of the phase that ended a flight early -> the word for it; any other reason
 # stands for itself
 _CAUSES = (
     (STOPPED, "operator"),
-    ("no telemetry|no LOCAL_POSITION_NED|no ATTITUDE_QUATERNION|no report|the delay", "link"),
+    (
+        "no telemetry|no LOCAL_POSITION_NED|no ATTITUDE_QUATERNION|no report|the delay|telemetry"
+        " was|setpoints did not arrive",
+        "link",
+    ),
     ("the vehicle left|it showed", "pilot"),
     ("another program|the vehicle follows", "second sender"),
     ("the vehicle restarted", "restart"),
@@ -102,6 +108,7 @@ def begin_times(phases: tuple[Event, ...]) -> dict[str, float]:
 def judge(flown: History, landing: Landing, skipped_s: float) -> Verdict:
     """The verdict on a flight. `flown`: its last stretch. `skipped_s`: time of the reference for
     which nothing was decided."""
+    names = [event.phase for event in flown.phases]
     if not flown.phases:
         return Verdict(math.nan, NO_FLIGHT)
     why, reason = _ended_early(flown)
@@ -109,6 +116,8 @@ def judge(flown: History, landing: Landing, skipped_s: float) -> Verdict:
     if why == REFERENCE_OVER:
         if skipped_s > 0.0:
             why = f"{skipped_s:.1f} s of the reference were not tracked"
+        elif _given_back(names):
+            pass
         elif not_landed:
             why = not_landed
         elif not len(flown.heartbeat) or flown.heartbeat[-1, 1]:
@@ -120,17 +129,28 @@ def _ended_early(flown: History) -> tuple[str, str]:
     """What ended the flight, by its phases, and the sentence that announced it; REFERENCE_OVER if
     they were all gone through."""
     names = [event.phase for event in flown.phases]
+    served = _given_back(names)
     for event, name, before in zip(flown.phases[1:], names[1:], names, strict=False):
-        regular = (before, name) in (("hover", "land"), ("land", "disarmed"))
+        regular = (before, name) in (("hover", "land"), ("land", "disarmed")) or served
         if name in {"hold", "land", "stand down", *_LANDING_ENDS} and not regular:
             reason = event.what.partition(": ")[2]
             cause = _cause(reason)
             if cause == "pilot" and _critical(flown, event.time_s):
                 cause = "failsafe"
             return cause, reason
+    took_over = [e.what for e in flown.announcements if e.what.startswith(_TAKEN_OVER)]
+    if took_over:
+        return "supervisor", took_over[0]
     if names[-1] not in _LANDING_ENDS:
         return f"the log ends in the phase {names[-1]}", ""
     return REFERENCE_OVER if "track" in names else names[-1], ""
+
+
+def _given_back(names: list[str]) -> bool:
+    """A flight of the service that the pilot engaged in the air, and took or was given back as it
+    hovered at the end of the reference."""
+    ends = (["hover", "yielded"], ["hover", "hand back", "yielded"])
+    return "engage" not in names and any(names[-len(end) :] == end for end in ends)
 
 
 def _critical(flown: History, time_s: float) -> bool:

@@ -59,6 +59,7 @@ class Authority:
     arrived_s: float = -math.inf  # host time of the arrival of the newest report
     _asked_in: str = ""  # the mode shown when we asked
     _requested: list[str] = field(default_factory=list)  # as the end; without those left behind
+    _forgot_s: float = -math.inf  # time of a reboot
     _failsafe_shown: bool = False  # a HEARTBEAT shows what `Standing.FAILSAFE` supposes
     _counts_from_s: float = -math.inf  # host time: what arrived before it is not evidence
 
@@ -150,9 +151,10 @@ class Authority:
         if self.arrived_s < self._counts_from_s:
             self.reported_s = -math.inf
 
-    def forget(self) -> None:
+    def forget(self, now_s: float) -> None:
         """The vehicle was rebooted: its standing is shown by the next report of the mode."""
         self.heard_s = self.reported_s = -math.inf
+        self._forgot_s = now_s
         if self.is_ours:
             self.standing = Standing.OURS
 
@@ -168,6 +170,10 @@ class Authority:
     def heard(self, now_s: float) -> bool:
         """Whether reports arrive, even if none counts yet."""
         return now_s - self.heard_s <= KNOWN_S
+
+    def unheard_s(self, now_s: float) -> float:
+        """Time since the newest report, if that is longer than usual; else 0."""
+        return 0.0 if self.heard(now_s) else now_s - max(self.heard_s, self._forgot_s)
 
     def permits_setpoint(self, now_s: float) -> bool:
         """Whether a setpoint may leave: to a vehicle that follows it, or as the stream that PX4

@@ -29,6 +29,8 @@ from offboard.mavlink.outgoing import SolverRecord
 from offboard.model.command import Command, PositionCommand
 from offboard.model.predicted_state import PredictedState
 
+_FAILED, _TOO_OLD = "the controller failed", "telemetry was too old for a setpoint"
+
 
 @dataclass(frozen=True, slots=True)
 class Tick:
@@ -99,13 +101,15 @@ class Decider:
         try:
             decided = self._send(tick, self._decided(tick))
         except Exception as error:  # any error: the vehicle is in the air
-            self._miss(f"{type(error).__name__}: {error}")
+            self._miss(f"{type(error).__name__}: {error}", _FAILED)
             return False
         self._unfinished = tick, decided
         if was_old and decided.refused is Refusal.STALE:
             return False
         if decided.failure:
-            self._miss(decided.failure)
+            in_time = decided.solve_time_s <= self._period_s
+            aged = decided.refused is Refusal.STALE and in_time
+            self._miss(decided.failure, _TOO_OLD if aged else _FAILED)
             return False
         self._state.predictions.append(decided.state)
         return True
@@ -118,16 +122,16 @@ class Decider:
         try:
             self._record(tick, decided, sent_s - tick.arrived_s)
         except Exception as error:  # the certificate is the law's
-            self._miss(f"{type(error).__name__}: {error}")
+            self._miss(f"{type(error).__name__}: {error}", _FAILED)
             return
         if decided.refused is None:
             self._state.missed = 0
             if self._identification:
                 self._identify(tick, self._identification)
 
-    def _miss(self, failure: str) -> None:
+    def _miss(self, failure: str, by: str) -> None:
         self._state.missed += 1
-        self._state.failure = failure
+        self._state.failure = f"{by}: {failure}"
         self._outbox.warn(f"decision missed: {failure}")
 
     def _send(self, tick: Tick, decided: Decided) -> Decided:

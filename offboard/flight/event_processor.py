@@ -214,6 +214,6 @@ class EventProcessor:
         state.readiness = Readiness()
         state.takeoff_ned_m = None  # the local frame begins elsewhere
         if state.authority and state.phase not in BEFORE_FLIGHT:
-            state.authority.forget()
+            state.authority.forget(state.now_s)
         else:
             state.authority = None

@@ -89,7 +89,7 @@ ROWS = (
         lambda now: now.missed_decisions > 0,
         0.0,
         Rung.LEVEL,
-        "decision missed: {failure}",
+        "{failure}",
     ),
     LadderRow(
         "decisions",
@@ -98,7 +98,7 @@ ROWS = (
         lambda now: now.missed_decisions >= now.limits.missed_decisions,
         0.0,
         Rung.LAND,
-        "the controller failed: {failure}",
+        "{failure}",
     ),
     LadderRow(
         "tilt",

@@ -47,11 +47,19 @@ class PhaseMachine:
         """Make every transition whose guard holds."""
         while not self._state.has_ended:
             now = self.facts()
+            self._note_failsafe(now)
             row = self._state.programme.next_row(self._state.phase, now)
             if row is None:
                 break
             self._enter(row, row.reason.format(**self._figures(now)))
         self._state.request = Request.NONE
+
+    def _note_failsafe(self, now: Facts) -> None:
+        """A landing by the vehicle's own failsafe is awaited, but it is not ours."""
+        state = self._state
+        if now.own_failsafe and state.phase is Phase.LAND and state.outcome is None:
+            sentence = f"the vehicle's own failsafe lands it, in {state.vehicle.mode}"
+            state.outcome = Outcome(ExitCode.ABORTED, sentence + state.vehicle.explanation())
 
     def on_reboot(self) -> None:
         """The vehicle was rebooted: this ends the flight, except while telemetry is awaited. A

@@ -88,7 +88,7 @@ class FlightState:
 
     busyness: Busyness = field(init=False)  # of this computer
     missed: int = 0  # decisions in a row that were not sent
-    failure: str = ""  # of the newest of them
+    failure: str = ""  # what prevented the newest of them
     commands: deque[Command] = field(default_factory=lambda: deque(maxlen=COMMANDS_KEPT))
     thrusts: deque[float] = field(default_factory=lambda: deque(maxlen=THRUSTS_KEPT))
     follows_others: bool = False  # the newest ThrustReport is of none of `thrusts`
@@ -166,9 +166,7 @@ class FlightState:
     def unreached_s(self) -> float:
         """For how long no telemetry, or no report of the mode, has arrived; 0 while both do."""
         silent_s = self.silence_s if self.silence_s > self.limits.silence_s else 0.0
-        authority = self.authority
-        known = authority is None or authority.heard(self.now_s)
-        return max(silent_s, 0.0 if known or authority is None else self.now_s - authority.heard_s)
+        return max(silent_s, self.authority.unheard_s(self.now_s) if self.authority else 0.0)
 
     def note_starvation(self) -> None:
         """Note when the vehicle may have been without setpoints for so long that its failsafe acts:

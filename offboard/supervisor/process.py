@@ -12,10 +12,12 @@ import select
 import signal
 import socket
 import stat
+import subprocess
 import sys
 from collections.abc import Hashable
 from contextlib import suppress
 from functools import partial
+from pathlib import Path
 from typing import Any
 
 from offboard.io import clock
@@ -248,6 +250,22 @@ def main() -> None:
         _announce(channel, tell, f"taking over: {reason}")
         Rescue(watch, tell).run(reason)
         tell.close(CLOSE_S)
+        if watch.ended:
+            _score(watch.descriptors[-1])
+
+
+def _score(log: int) -> None:
+    """In place of the controller. Its service does that when it starts again."""
+    with suppress(OSError):
+        path = Path(f"/proc/self/fd/{log}").readlink()
+        if path.name == "flight.tlog" and not (path.parent / "unscored").exists():
+            subprocess.Popen(
+                [sys.executable, "-P", "-m", "offboard", "score", str(path.parent)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.DEVNULL,
+                start_new_session=True,
+            )
 
 
 def _announce(channel: socket.socket, tell: BackgroundWriter[str], sentence: str) -> None:

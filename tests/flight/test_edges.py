@@ -182,8 +182,8 @@ def test_what_a_turn_decided_is_dropped_when_it_became_too_old(tmp_path: Path) -
             super().turn(chunks, now_s)
             if self.turns == 1:
                 time.sleep(0.25)
-            self.log = [frame]
-            return Output(send=(frame,))
+            self.log = [frame, said(self.turns)]
+            return Output(send=(frame, said(self.turns)))
 
     flight = Deciding(3, lambda left: None)
     directory = tmp_path / "flight"
@@ -196,10 +196,11 @@ def test_what_a_turn_decided_is_dropped_when_it_became_too_old(tmp_path: Path) -
             progress=lambda companion: None,
             supervisor=cast(Supervisor, Watcher()),
         ).run()
-    assert sent == [setpoint(3), setpoint(1)]
-    assert flight.dropped == 1
+    assert sent == [setpoint(3), said(3), setpoint(1), said(1)]
+    assert flight.dropped == 2
     assert flight.announced == []  # the companion sums them up
-    assert (directory / "flight.tlog").read_bytes().count(setpoint(2)) == 0
+    logged = (directory / "flight.tlog").read_bytes()
+    assert (logged.count(setpoint(2)), logged.count(said(2))) == (0, 1)
 
 
 def test_an_ignored_sighup_stays_ignored(tmp_path: Path) -> None:
@@ -317,6 +318,10 @@ def test_an_exception_in_every_turn_ends_in_silence(
 
 def setpoint(number: int) -> bytes:
     return pack(82, number.to_bytes(4, "little") + bytes(33) + b"\1\1", number % 256, 1, 191)
+
+
+def said(number: int) -> bytes:
+    return pack(253, number.to_bytes(1, "little") + bytes(53), number % 256, 1, 191)
 
 
 @contextmanager

@@ -38,8 +38,6 @@ from offboard.flight.state import Outcome
 from simulator.config import Scenario
 from simulator.firmware.px4 import PX4
 
-
-
 # -- authority -------------------------------------------------------------------------------------
 
 
@@ -99,7 +97,7 @@ def is_arming(frame: bytes) -> bool:
 
 
 def test_current_mode_shows_the_pilot_without_heartbeats() -> None:
-    """Of ArduCopter HEARTBEAT is the only report: see test_outages."""
+    """ArduCopter has no other report: see test_outages."""
     pair = make(HIGH, scenario="lost_heartbeat")
     watch = watched(pair)
     outcome = pair.fly()

@@ -452,7 +452,7 @@ def test_another_controller_is_left_alone() -> None:
     assert pair.said("not engaged: OFFBOARD, but another program sends setpoints")
 
 
-@pytest.mark.parametrize("then", ["repeat", "land"])
+@pytest.mark.parametrize("then", ["repeat", "land", "hold"])
 def test_what_follows_the_reference(then: str, tmp_path: Path) -> None:
     pair, wire = engaged("px4", then=then)
     pair.until(lambda: pair.phase is Phase.HOVER, 30.0)
@@ -463,6 +463,12 @@ def test_what_follows_the_reference(then: str, tmp_path: Path) -> None:
         score = pair.score(tmp_path)
         assert score.tracked_s == pytest.approx(2 * 2.9, abs=0.1)
         assert score.max_position_m < 0.01
+    elif then == "hold":
+        pair.run(2.0)
+        pair.switch("pilot")
+        pair.until(lambda: pair.phase is Phase.STANDBY, 5.0)
+        score = pair.score(tmp_path)
+        assert (score.completed, score.ended_by) == (1.0, "reference over")
     else:
         pair.until(lambda: not pair.instance.autopilot.commander.armed, 40.0)
     assert wire.unsafe == []

@@ -6,6 +6,7 @@ vehicle; the simulated autopilot, which is another program, that it obeyed and l
 
 from __future__ import annotations
 
+import json
 import os
 import pty
 import select
@@ -156,6 +157,14 @@ def test_a_killed_controller_is_survived(
     assert said.splitlines()[-1] == "offboard supervisor: the vehicle is disarmed"
     log = tlog.read(tmp_path / "x" / "flight.tlog")
     assert story(log) == ["hold", "land", "Disarmed by landing"]
+    kept = tmp_path / "x" / "score.json"  # by a process that the supervisor begins
+    deadline_s = time.monotonic() + LONG_S
+    while not kept.exists():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.05)
+    score = json.loads(kept.read_text())
+    assert (score["completed"], score["ended_by"]) == (0.0, "supervisor")
+    assert score["reason"] == "supervisor: taking over: the controller ended in flight"
 
 
 def test_a_stopped_controller_that_continues_sends_nothing(
