@@ -178,12 +178,12 @@ def test_what_a_turn_decided_is_dropped_when_it_became_too_old(tmp_path: Path) -
 
     class Deciding(Flight):
         def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
-            frame = setpoint(self.turns)
+            frame, text = setpoint(self.turns), said(self.turns)
             super().turn(chunks, now_s)
             if self.turns == 1:
                 time.sleep(0.25)
-            self.log = [frame, said(self.turns)]
-            return Output(send=(frame, said(self.turns)))
+            self.log = [frame, text]
+            return Output(send=(frame, text))
 
     flight = Deciding(3, lambda left: None)
     directory = tmp_path / "flight"
