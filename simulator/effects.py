@@ -212,7 +212,7 @@ def _second_sender(vehicle: Vehicle, running: Running) -> Effect:
         for _ in sender.due(fault.setpoint_rate_hz):
             vehicle.companion.receive(sender.level_setpoint(vehicle.view.system, fault.thrust))
         for _ in sender.due(_HEARTBEAT_HZ):
-            vehicle.companion.outbox.forward(sender.companion_heartbeat())
+            vehicle.companion.outbox.forward(sender.companion_heartbeat(fault.custom_mode))
 
 
 def _second_vehicle(vehicle: Vehicle, running: Running) -> Effect:

@@ -226,12 +226,14 @@ class SecondSender(Timed):
     """Another companion or ground station sends to the vehicle, which obeys any source.
 
     Level attitude setpoints at `setpoint_rate_hz` with this thrust, heading north, and a command
-    when it begins. Its HEARTBEAT reaches the companion once a second, as an autopilot forwards it.
+    when it begins. Its HEARTBEAT with `custom_mode`, which is the phase of an `offboard`, reaches
+    the companion once a second, as an autopilot forwards it.
     """
 
     fault: Literal["second_sender"]
     system: int = Field(default=1, ge=1, le=255)
     component: int = Field(default=194, ge=1, le=255)
+    custom_mode: int = Field(default=0, ge=0, le=255)
     setpoint_rate_hz: float = Field(default=10.0, ge=0, le=250)
     thrust: float = Field(default=0.5, ge=0, le=1)
     command: int | None = Field(default=None, ge=0, le=65535)  # MAV_CMD

@@ -29,9 +29,9 @@ class Sender:
         before, now = (math.floor(n * rate_hz * STEP_S + 1e-9) for n in (self.step - 1, self.step))
         return range(now - before)
 
-    def companion_heartbeat(self) -> bytes:
+    def companion_heartbeat(self, custom_mode: int) -> bytes:
         """HEARTBEAT of a companion computer."""
-        values = (_ONBOARD_CONTROLLER, _NO_AUTOPILOT, 0, 0, _ACTIVE, _MAVLINK)
+        values = (_ONBOARD_CONTROLLER, _NO_AUTOPILOT, 0, custom_mode, _ACTIVE, _MAVLINK)
         return self._frame("HEARTBEAT", *values)
 
     def autopilot_heartbeat(self, firmware: Firmware) -> bytes:

@@ -54,10 +54,10 @@ def doctor(
 ) -> None:
     """Check vehicle, link and computer; changes nothing.
 
-    Listens for 4 to 9 s, and ends within 15 s: what takes longer is a row. Sends heartbeats,
-    TIMESYNC, and requests: for parameters, for single messages, for the telemetry rates of a
-    flight, and that the vehicle runs its pre-arm checks. It never sends a setpoint, arms, selects a
-    mode or sets a parameter. To an armed vehicle it sends no heartbeat, and requests no rates.
+    Listens for 4 to 9 s, and ends within 15 s: what takes longer is a row. Sends TIMESYNC and
+    requests: for parameters, for single messages, for the telemetry rates of a flight, and that the
+    vehicle runs its pre-arm checks. It never sends a heartbeat or a setpoint, arms, selects a mode
+    or sets a parameter. Of an armed vehicle it requests no rates.
 
     Levels: ok; warn; wait, which may clear by itself; blocks, which `offboard fly` refuses, too.
     """

@@ -1,8 +1,8 @@
 """The listening pass: what is received and what is asked, until the observation is complete.
 
 Sans-I/O: received chunks and host times in, frames out. It only asks: it never sends a setpoint, a
-mode, an arming or a parameter. To a vehicle that is armed it sends no heartbeat either: one that
-ends could be a lost ground station for it.
+mode, an arming or a parameter, and no heartbeat: the vehicle may count on one, and says without it
+what it says when no program of ours runs. Its component id is not that of a flight.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from offboard.doctor.census import Census
 from offboard.doctor.observation import FIX_3D, ClockMeasures, LinkMeasures, Observation
 from offboard.flight.link_age import LinkDelay, VehicleClock
 from offboard.flight.readiness import Readiness
-from offboard.flight.record import COMPONENT_ID
 from offboard.flight.vehicle_state import VehicleState
 from offboard.io.link import Chunk
 from offboard.mavlink.dialects.base import WantedMessage
@@ -36,12 +35,13 @@ from offboard.mavlink.outgoing import CommandLong, Outgoing, Timesync
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
 
+DOCTOR_ID = 193  # MAV_COMP_ID_ONBOARD_COMPUTER3
 NOTHING_S = 6.0  # without an autopilot
 LEAST_S = 4.0  # with one, from when it was heard
 LONGEST_S = 9.0
 ASK_EVERY_S, TRIES = 1.0, 8
 TIMESYNC_EVERY_S = 0.1
-PREARM_AFTER_S = 1.0  # PX4 sends texts only once it has noticed our heartbeat
+PREARM_AFTER_S = 1.0  # what is asked before may be lost: the link has just been opened
 TEXTS_S = 1.0  # for the texts after the acknowledgement
 ENOUGH = 0.7  # of a rate, measured over two seconds
 SETTLE_S = 1.0  # until jumps of the vehicle's clock count
@@ -71,7 +71,7 @@ class Listening:
         self._session = Session(
             SessionSettings(
                 system_id=system_id,
-                component_id=COMPONENT_ID,
+                component_id=DOCTOR_ID,
                 stream=stream,
                 capacity_bytes_ps=capacity_bytes_ps,
             ),
@@ -164,7 +164,7 @@ class Listening:
         yield from filter(self._permitted, self._session.poll(now_s))
         dialect, state = self._session.dialect, self.vehicle
         if dialect is None:
-            if self._sends_first and self._may_ask(TIMESYNC, now_s):
+            if (self._sends_first or self._may_greet) and self._may_ask(TIMESYNC, now_s):
                 yield Timesync(0, round(now_s * 1e9))
             return
         yield from self._readiness.due(dialect, state.parameters, now_s)
@@ -185,10 +185,10 @@ class Listening:
             yield self._timesync(self._newest[0], now_s)
 
     def _permitted(self, outgoing: Outgoing) -> bool:
-        """Neither heartbeats nor rates for an armed vehicle, or before it is known."""
+        """No heartbeats, and no rates for an armed vehicle, or before it is known."""
         known = self.vehicle.heartbeat is not None
-        permitted = not self.vehicle.armed if known else self._may_greet
-        self._requested |= permitted and isinstance(outgoing, CommandLong)
+        permitted = known and not self.vehicle.armed and isinstance(outgoing, CommandLong)
+        self._requested |= permitted
         return permitted
 
     def _prearm_due(self, now_s: float) -> bool:

@@ -117,12 +117,13 @@ def prearm(seen: Observation) -> Iterable[Finding]:
         yield wait("SYS_STATUS does not arrive: it is unknown whether the vehicle can arm")
     else:
         hold = seen.dialect.hold_mode
-        hint = "ask the ground station why"
+        hint = seen.dialect.unsaid
+        found = f"pre-arm checks do not pass in {vehicle.mode}"
+        if vehicle.health.unhealthy:
+            found += f"; unhealthy by SYS_STATUS: {', '.join(vehicle.health.unhealthy)}"
         if vehicle.mode == seen.dialect.engage_mode:
             hint = f"it may only miss setpoints in {vehicle.mode}: select {hold} and check again"
-        yield wait(
-            f"pre-arm checks do not pass in {vehicle.mode}; the vehicle does not say why", hint
-        )
+        yield wait(found, hint)
 
 
 def battery(seen: Observation) -> Iterable[Finding]:
@@ -154,7 +155,7 @@ def parameters(seen: Observation) -> Iterable[Finding]:
             continue
         value = known[parameter.name]
         fault = parameter.fault(value)
-        advised = parameter.advised(value, known, radio, vehicle.found.system_id)
+        advised = parameter.advised(value, known, radio)
         if fault:
             yield blocks(*fault, about=parameter.name)
         elif advised:

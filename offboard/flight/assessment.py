@@ -202,7 +202,9 @@ def not_ready(state: FlightState, session: Session) -> str:
         systems = session.autopilots.named(state.now_s)
         return f"several vehicles are heard, systems {systems}: choose one with --system"
     if not (vehicle.prearm_ok or vehicle.armed or state.programme.serves):
-        return f"its pre-arm checks do not pass in {vehicle.mode}{vehicle.explanation()}"
+        unsaid = f"{vehicle.unhealthy()} ({dialect.unsaid})"
+        told = vehicle.explanation(unsaid) if vehicle.texts else unsaid
+        return f"its pre-arm checks do not pass in {vehicle.mode}{told}"
     if vehicle.estimator and vehicle.estimator.problem:
         return vehicle.estimator.problem
     charge = vehicle.health.battery_remaining if vehicle.health else None

@@ -185,8 +185,9 @@ ROWS = (
     ),
     LadderRow(
         "second sender",
-        "another program sends setpoints or uses our ids on this link",
-        "one frame",
+        "another program sends setpoints or commands modes on this link, or says in its HEARTBEAT "
+        "that it flies the vehicle",
+        "one message",
         guards.other_sender,
         0.0,
         Rung.HOLD,

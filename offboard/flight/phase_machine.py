@@ -59,7 +59,7 @@ class PhaseMachine:
         state = self._state
         if now.own_failsafe and state.phase is Phase.LAND and state.outcome is None:
             sentence = f"the vehicle's own failsafe lands it, in {state.vehicle.mode}"
-            state.outcome = Outcome(ExitCode.ABORTED, sentence + state.vehicle.explanation())
+            state.outcome = Outcome(ExitCode.ABORTED, sentence + self._explanation())
 
     def on_reboot(self) -> None:
         """The vehicle was rebooted: this ends the flight, except while telemetry is awaited. A
@@ -126,12 +126,16 @@ class PhaseMachine:
         state = self._state
         if row.exit_code is not None:
             if state.outcome is None:
-                state.outcome = Outcome(row.exit_code, reason + state.vehicle.explanation())
+                state.outcome = Outcome(row.exit_code, reason + self._explanation())
             else:
                 sentence = f"{state.outcome.sentence}; {reason}"
                 state.outcome = Outcome(max(state.outcome.exit_code, row.exit_code), sentence)
         elif row.target is Phase.DISARMED and state.outcome is None:
             state.outcome = Outcome(ExitCode.FLOWN, "flown and landed")
+
+    def _explanation(self) -> str:
+        dialect = self._state.dialect
+        return self._state.vehicle.explanation(dialect.unsaid if dialect else "")
 
     def _begin_engaging(self) -> None:
         """Here, not with the request: a vehicle that shows the mode already passes without one."""

@@ -72,6 +72,8 @@ PHASE_CODES: Mapping[Phase, int] = {
 ENDS = frozenset({Phase.DISARMED, Phase.YIELDED, Phase.FAILED})
 WAITING = frozenset({Phase.CONNECT, Phase.HEALTH, Phase.STANDBY})
 BEFORE_FLIGHT = WAITING | {Phase.STREAM, Phase.ENGAGE, Phase.ARM}
+# codes of the phases in which an `offboard` has or takes the vehicle, in its HEARTBEAT
+CONTROLLING = frozenset(code for each, code in PHASE_CODES.items() if each not in WAITING | ENDS)
 TRACKING = frozenset({Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.PAUSE, Phase.HOVER})
 MOVING = frozenset({Phase.JOIN, Phase.TRACK})  # along the reference
 # phases in which the ladder is stepped

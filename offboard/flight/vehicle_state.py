@@ -9,6 +9,8 @@ import math
 from collections import deque
 from dataclasses import dataclass, field
 
+from offboard.flight.phases import CONTROLLING
+from offboard.flight.record import COMPONENT_ID
 from offboard.mavlink.events import (
     Attitude,
     CommandAck,
@@ -28,6 +30,7 @@ from offboard.mavlink.events import (
     VehicleFound,
     VehicleIdentity,
 )
+from offboard.mavlink.framing import HEARTBEAT
 from offboard.model.frames import course_from_quaternion
 
 ARMED_KNOWN_S = 3.0  # PX4 reports it in HEARTBEAT alone, at 1 Hz
@@ -142,8 +145,11 @@ class VehicleState:
                 self.mode = mode
             case OtherSender():
                 self.other_sender = event
-            case OtherCompanion():
+            case OtherCompanion(system, component, phase):
                 self.other_companion = event
+                if component == COMPONENT_ID and phase in CONTROLLING:
+                    self.other_sender = OtherSender(system, component, HEARTBEAT)
+                    self.heard_s[OtherSender] = now_s
             case LocalPosition():
                 self.position = event
             case Attitude():
@@ -209,10 +215,18 @@ class VehicleState:
         self.resumed_s = -math.inf
         self.parameters.clear()
 
-    def explanation(self) -> str:
-        """The newest texts or refusals of the vehicle, to end a sentence with; may be empty."""
+    def explanation(self, unsaid: str) -> str:
+        """The newest texts of the vehicle, or its refusals and what SYS_STATUS says, to end a
+        sentence with; may be empty. `unsaid`: where the reason of a refusal is found."""
         messages = list(dict.fromkeys(self.texts or self.refusals))[-3:]
-        return "; the vehicle said: " + " | ".join(messages) if messages else ""
+        said = "; the vehicle said: " + " | ".join(messages) if messages else ""
+        refused = messages and not self.texts
+        return f"{said}{self.unhealthy()} ({unsaid})" if refused else said
+
+    def unhealthy(self) -> str:
+        """What SYS_STATUS reports as not healthy, to end a sentence with; may be empty."""
+        names = self.health.unhealthy if self.health else ()
+        return f"; unhealthy by SYS_STATUS: {', '.join(names)}" if names else ""
 
     def clear_messages(self) -> None:
         """Forget texts and acknowledgements: they do not explain what happens later."""

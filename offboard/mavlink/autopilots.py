@@ -95,7 +95,7 @@ def _listed(systems: Collection[int]) -> str:
 
 def is_companion(frame: Frame, vehicle_system_id: int) -> bool:
     """Whether it is the HEARTBEAT of a companion computer. On PX4 some of them call themselves a
-    ground station, as we do, but with the system id of the vehicle."""
+    ground station, but with the system id of the vehicle."""
     if frame.message_id != HEARTBEAT or not frame.verified:
         return False
     identity = decode_identity(frame.payload)

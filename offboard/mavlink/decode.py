@@ -22,6 +22,10 @@ VELOCITY_LIMIT_MPS = 200.0
 RATE_LIMIT_RADPS = 100.0
 _PREARM_CHECK = 0x10000000  # MAV_SYS_STATUS_PREARM_CHECK
 _RADIO = 0x10000  # MAV_SYS_STATUS_SENSOR_RC_RECEIVER
+_SENSORS = {
+    bit: sensor.name.removeprefix("MAV_SYS_STATUS_").removeprefix("SENSOR_")
+    for bit, sensor in mavlink.enums["MAV_SYS_STATUS_SENSOR"].items()
+}
 # ESTIMATOR_STATUS_FLAGS and EKF_STATUS_FLAGS have the same bits
 _EKF_ATTITUDE, _EKF_VELOCITY, _EKF_POSITION, _EKF_HEIGHT = 1, 2, 8, 32
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
@@ -101,6 +105,11 @@ def decode_identity(payload: bytes) -> Identity:
     return Identity(vehicle_type, autopilot)
 
 
+def decode_custom_mode(payload: bytes) -> int:
+    """HEARTBEAT.custom_mode."""
+    return int.from_bytes(payload[:4], "little")
+
+
 def decode_ack_address(payload: bytes) -> Address:
     """Receiver of a COMMAND_ACK; 0 means all."""
     *_, system_id, component_id = _unpack(mavlink.MAVLink_command_ack_message, payload)
@@ -171,12 +180,14 @@ def _gps_fix(payload: bytes, _: Dialect) -> events.Event:
 
 def _system_health(payload: bytes, _: Dialect) -> events.Event:
     fields = _unpack(mavlink.MAVLink_sys_status_message, payload)
-    present, health, millivolts, percent = fields[0], fields[2], fields[4], fields[12]
+    present, enabled, health, _, millivolts = fields[:5]
+    percent, failed = fields[12], enabled & ~health & ~_PREARM_CHECK
     return events.SystemHealth(
         prearm_ok=bool(health & _PREARM_CHECK),
         battery_voltage_v=millivolts * 1e-3 if millivolts != 0xFFFF else None,
         battery_remaining=percent * 1e-2 if 0 <= percent <= 100 else None,
         radio_ok=bool(present & health & _RADIO),
+        unhealthy=tuple(name for bit, name in _SENSORS.items() if failed & bit),
     )
 
 

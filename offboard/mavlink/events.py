@@ -42,7 +42,7 @@ class ModeReport:
 @dataclass(frozen=True, slots=True)
 class OtherSender:
     """A frame that shows a second controller of our vehicle on this link: a setpoint that is not
-    ours, or a frame with our own ids that we did not send."""
+    ours, or a command for its mode from its own system, as ours are."""
 
     system_id: int
     component_id: int
@@ -51,10 +51,11 @@ class OtherSender:
 
 @dataclass(frozen=True, slots=True)
 class OtherCompanion:
-    """HEARTBEAT of another companion computer of our vehicle."""
+    """HEARTBEAT of another companion computer of our vehicle, which may use our own ids."""
 
     system_id: int
     component_id: int
+    custom_mode: int  # of an `offboard` its phase
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,6 +179,7 @@ class SystemHealth:
     battery_voltage_v: float | None
     battery_remaining: float | None  # 0 .. 1
     radio_ok: bool = False  # a remote control is present and received
+    unhealthy: tuple[str, ...] = ()  # MAV_SYS_STATUS_SENSOR that are enabled and not healthy
 
 
 @dataclass(frozen=True, slots=True)

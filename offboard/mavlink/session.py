@@ -24,6 +24,7 @@ from offboard.mavlink.decode import (
     decode,
     decode_ack_address,
     decode_command,
+    decode_custom_mode,
     decode_text_chunk,
     decode_timesync,
 )
@@ -54,6 +55,8 @@ from offboard.mavlink.vehicle_time import SILENCE_S, Age, LinkTime, VehicleTime
 ACTIVE = 4  # MAV_STATE
 
 _COMMANDS = (75, 76)  # COMMAND_INT, COMMAND_LONG
+# MAV_CMD: return, land, take off, set the mode, go to a place, begin a mission, arm or disarm
+_MODE_COMMANDS = frozenset({20, 21, 22, 176, 192, 300, 400})
 _ECHOES = 256  # newest frames of ours that are recognised when they come back
 # A link may reorder: a report of the mode this close behind a newer one says nothing new
 _REORDERED_FRAMES, _REORDERED_S = 32, 0.1
@@ -130,6 +133,7 @@ class Session:
         self._rates = TelemetryRates((), 0.0)
         self._capacity_bytes_ps = settings.capacity_bytes_ps
         self._heartbeat_sent: tuple[float, float] | None = None  # host time, link time
+        self._status_sent = self.status
         self._mode_report = (0, -math.inf)  # sequence number of the newest, and when it arrived
 
     # --- in ---
@@ -185,16 +189,18 @@ class Session:
             if forged is DropReason.OLD_STAMP and self.vehicle is None:
                 self._greet(frame, events)
             return forged
-        if self.vehicle is not None and (ours or self._is_setpoint(frame)):
+        if self.vehicle is not None and (self._is_setpoint(frame) or self._sets_mode(frame)):
             events.append(OtherSender(*sender, frame.message_id))
         if ours:
+            if self.vehicle is not None and is_companion(frame, self._own.system_id):
+                events.append(OtherCompanion(*sender, decode_custom_mode(frame.payload)))
             return DropReason.SAME_IDS
         if frame.message_id in _COMMANDS and frame.verified and self.vehicle is not None:
             return self._requested(frame, sender, events)
         foreign = self._check_sender(frame, peer, events)
         if foreign is not None:
             if self.vehicle is not None and is_companion(frame, self._own.system_id):
-                events.append(OtherCompanion(*sender))
+                events.append(OtherCompanion(*sender, decode_custom_mode(frame.payload)))
             return foreign
         if not frame.verified:
             return DropReason.UNKNOWN_ID
@@ -236,6 +242,17 @@ class Session:
             return False
         target = frame.payload[offset : offset + 1]  # MAVLink 2 omits trailing zeros
         return not target or target[0] in (0, self._own.system_id)
+
+    def _sets_mode(self, frame: framing.Frame) -> bool:
+        """Whether it commands the mode of our vehicle, from its own system, as we do: that of a
+        ground station is the pilot's."""
+        if not frame.verified or frame.system_id != self._own.system_id:
+            return False
+        if frame.message_id not in _COMMANDS or frame.component_id == AUTOPILOT_COMPONENT:
+            return False
+        command, _, receiver = decode_command(frame.message_id, frame.payload)
+        for_vehicle = receiver.system_id in (0, self._own.system_id) and receiver != self._own
+        return command in _MODE_COMMANDS and for_vehicle
 
     def _check_sender(
         self, frame: framing.Frame, peer: Hashable, events: list[Event]
@@ -294,7 +311,7 @@ class Session:
         self.vehicle = vehicle
         self._peer.pin(peer, Address(vehicle.system_id, vehicle.component_id))
         self._own = Address(vehicle.system_id, self.settings.component_id)
-        self._heartbeat_sent = None  # the dialect may need another type: send it at once
+        self._heartbeat_sent = None  # send it at once, with the vehicle's system id
         self._restart_rates()
 
     def _interpret(
@@ -368,23 +385,25 @@ class Session:
     def poll(self, now_s: float) -> tuple[Outgoing, ...]:
         """Messages that are due at `now_s`; call it at least every 50 ms.
 
-        They are our heartbeat, at 1 Hz of host or vehicle time, whichever is faster, and requests
-        for telemetry that is missing or too slow.
+        They are our heartbeat, at 1 Hz of host or vehicle time, whichever is faster, and where its
+        custom_mode has changed, so that another program learns at once who flies; and requests for
+        telemetry that is missing or too slow.
         """
         now_s = self._clock_s(now_s)
         self._link_time.host(now_s)
         dialect = self.dialect or self._greeted
         if dialect is None and not self.settings.sends_first:
-            return ()  # PX4 does not notice a change of the type: the first must be right
+            return ()
         due: list[Outgoing] = []
         link_s = self._link_time.seconds
-        if self._heartbeat_sent is None or (
-            max(now_s - self._heartbeat_sent[0], link_s - self._heartbeat_sent[1])
+        if (
+            self._heartbeat_sent is None
+            or self.status[1] != self._status_sent[1]
+            or max(now_s - self._heartbeat_sent[0], link_s - self._heartbeat_sent[1])
             >= _HEARTBEAT_PERIOD_S
         ):
-            self._heartbeat_sent = (now_s, link_s)
-            kind = TYPE_ONBOARD_CONTROLLER if dialect is None else dialect.heartbeat_type
-            due.append(Heartbeat(kind, *self.status))
+            self._heartbeat_sent, self._status_sent = (now_s, link_s), self.status
+            due.append(Heartbeat(TYPE_ONBOARD_CONTROLLER, *self.status))
         requests = self._rates.due(link_s)
         return (*due, *(CommandLong.message_interval(w.message_id, w.rate_hz) for w in requests))
 

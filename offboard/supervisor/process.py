@@ -31,7 +31,7 @@ from offboard.mavlink import texts
 from offboard.mavlink.dialects.base import SetpointLoss
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat, Outgoing
-from offboard.mavlink.session import Session, SessionSettings
+from offboard.mavlink.session import ACTIVE, Session, SessionSettings
 from offboard.mavlink.signing import Signing
 from offboard.supervisor.recovery import Recovery
 from offboard.supervisor.supervisor import READY
@@ -41,6 +41,7 @@ PAUSE_MAX_S = 0.1  # of a turn that counts as the controller's silence: the rest
 BACKLOG_MAX = 20  # batches of the link that are read before the first request
 CLOSE_S = 2.0
 WARNING = 4  # MAV_SEVERITY
+LANDING = 10  # custom_mode, `flight.phases.PHASE_CODES`: no other `offboard` begins a flight now
 DIED = "the controller ended in flight"
 HANGS = "the controller has not answered for {silent_s:g} s"
 
@@ -119,6 +120,7 @@ class Rescue:
         signing = watch.key and Signing.resumed(watch.key, clock.monotonic_s, beat["signing"])
         self._session = Session(SessionSettings(stream=beat["stream"]), signing or None)
         self._session.adopt(VehicleFound(**beat["vehicle"]), self._peer)
+        self._session.status = ACTIVE, LANDING
         assert self._session.dialect is not None
         self._recovery = Recovery(
             self._session.dialect,

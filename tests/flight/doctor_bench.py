@@ -37,13 +37,13 @@ BOOT_SCALE = {PX4.name: 1.0, ARDUPILOT.name: 0.1}
 GOOD = {
     PX4.name: {"COM_OBL_RC_ACT": 4.0, "COM_RCL_EXCEPT": 4.0},
     ARDUPILOT.name: {
-        "GUID_OPTIONS": 8.0, "GUID_TIMEOUT": 1.0, "FS_GCS_ENABLE": 5.0, "SYSID_MYGCS": 1.0,
-        "PSC_JERK_XY": 10.0,
+        "GUID_OPTIONS": 8.0, "GUID_TIMEOUT": 1.0, "PSC_JERK_XY": 10.0,
     },
 }  # fmt: skip
 UNIX_S = VIRTUAL_EPOCH_US * 1e-6 - HOST_EPOCH_S
 PARAMETER = re.compile(r"param set (\w+) (\S+)")
-PERMITTED = {"HEARTBEAT", "TIMESYNC", "PARAM_REQUEST_READ", "COMMAND_LONG"}
+PERMITTED = {"TIMESYNC", "PARAM_REQUEST_READ", "COMMAND_LONG"}
+DOCTOR_ID = 193  # not that of a flight
 COMMANDS = {401, 511, 512}  # RUN_PREARM_CHECKS, SET_MESSAGE_INTERVAL, REQUEST_MESSAGE
 GOOD_COMPUTER = Computer(
     free_bytes=10**11, overshoot_s=0.001, not_compiled=0, decision_s=0.001, deadline_s=0.05
@@ -120,6 +120,7 @@ class Bench:
 def assert_read_only(sent: Sequence[Any]) -> None:
     """Nothing but what the command's help promises."""
     assert {message.get_type() for message in sent} <= PERMITTED
+    assert {message.get_srcComponent() for message in sent} <= {DOCTOR_ID}
     commands = {message.command for message in sent if message.get_type() == "COMMAND_LONG"}
     assert commands <= COMMANDS
 

@@ -86,10 +86,10 @@ def behind(**options: Any) -> Bench:
 def test_vehicle_whose_signing_time_is_behind_hears_ours_and_is_checked() -> None:
     patient = behind()
     assert levels(patient) == {}
-    assert patient.sent[0].get_type() == "HEARTBEAT"
+    assert patient.sent[0].get_type() == "TIMESYNC"
 
 
-def test_armed_vehicle_whose_signing_time_is_behind_gets_no_heartbeat() -> None:
+def test_armed_vehicle_whose_signing_time_is_behind_hears_nothing() -> None:
     patient = behind(start=Start(height_m=5.0))
     rows = patient.consult("vehicle")
     assert rows["vehicle"].level is BLOCKS

@@ -14,8 +14,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from faults import HEARTBEAT, stop, without
-from pair import SHORT, Bytes, decode, hover, in_phase, make, on_arducopter
+from faults import HEARTBEAT, frame_id, stop, without
+from pair import SHORT, Bytes, Pair, decode, hover, in_phase, make, on_arducopter
 from watch import (
     ARM,
     BOTH,
@@ -33,7 +33,7 @@ from watch import (
 )
 
 from offboard.flight.online_identification import IdentifySettings
-from offboard.flight.phases import ExitCode, Phase, Rung
+from offboard.flight.phases import PHASE_CODES, ExitCode, Phase, Rung
 from offboard.flight.state import Outcome
 from simulator.config import Scenario
 from simulator.firmware.px4 import PX4
@@ -121,8 +121,9 @@ def test_a_failsafe_is_not_taken_over(fly: Fly) -> None:
 
 
 def another_companion(**fault: Any) -> Any:
-    """A second `offboard fly`: our own ids."""
-    return scenario_of({"fault": "second_sender", "system": 1, "component": 191, **fault})
+    """A second `offboard fly` that tracks: our own ids."""
+    tracks = {"system": 1, "component": 191, "custom_mode": PHASE_CODES[Phase.TRACK]}
+    return scenario_of({"fault": "second_sender", **tracks, **fault})
 
 
 @BOTH
@@ -147,6 +148,54 @@ def test_a_second_sender_is_noticed_in_flight(fly: Fly) -> None:
     assert [phase for _, phase in pair.phases][-4:-1] == [Phase.TRACK, Phase.HOLD, Phase.LAND]
     assert watch.error_m < 0.3
     assert not pair.instance.autopilot.commander.armed
+
+
+class Beside:
+    """The place of a second companion on the link of a pair: it hears the vehicle and the first
+    companion's HEARTBEAT, and the first one hears its own."""
+
+    def __init__(self, first: Pair) -> None:
+        self._first, self._heard, self._told = first, list[bytes](), list[bytes]()
+        first.down, first.up = self._down, self._up
+
+    def _down(self, _: float, datagrams: Bytes) -> Bytes:
+        told, self._told = self._told, []
+        self._heard += datagrams
+        return [*datagrams, *told]
+
+    def _up(self, _: float, frames: Bytes) -> Bytes:
+        self._heard += [frame for frame in frames if frame_id(frame) == HEARTBEAT]
+        return frames
+
+    def step(self) -> Bytes:
+        heard, self._heard = self._heard, []
+        return heard
+
+    def feed(self, frame: bytes) -> None:
+        self._told += [frame] if frame_id(frame) == HEARTBEAT else []
+        self._first.instance.feed(frame)
+
+
+@BOTH
+@pytest.mark.parametrize("moment", [in_phase(Phase.ENGAGE), in_phase(Phase.TRACK, 1.0)])
+def test_a_second_flight_is_refused_and_the_first_flies_on(moment: Any, fly: Fly) -> None:
+    """By mistake, on another port: it has our ids. It is refused before it sends a setpoint or a
+    command that changes the vehicle."""
+    first, second = fly(ONE_LAP), fly()
+    while not moment(first):
+        first.advance()
+    second.instance = Beside(first)  # type: ignore[assignment]
+    while not first.companion.has_ended():
+        first.advance()
+        if not second.companion.has_ended():
+            second.advance()
+    assert first.companion.outcome == Outcome(ExitCode.FLOWN, "flown and landed")
+    assert said(first, "another companion computer is on the link: system 1 component 191")
+    refused = second.companion.outcome
+    assert refused is not None
+    assert refused.exit_code == ExitCode.REFUSED
+    assert "another" in refused.sentence
+    assert sent_after(second, 0.0) == []
 
 
 @BOTH
@@ -272,7 +321,7 @@ def test_an_empty_battery_ends_the_flight(fly: Fly) -> None:
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
     if engage_mode(pair) == "OFFBOARD":
-        assert "Emergency battery level" in outcome.sentence
+        assert outcome.sentence.startswith("the vehicle left OFFBOARD for AUTO.")
         assert sent_after(pair, watch.left_s("OFFBOARD") + REACTION_S) == []
     else:
         assert outcome.sentence.startswith("the battery holds 5 %")

@@ -298,7 +298,9 @@ ROWS = (
         "arming refused",
         lambda: hover(firmware=refusing("arm", "Arming denied: no joystick"), limits={"arm_s": 3}),
         3,
-        "the vehicle did not arm in 3 s; the vehicle said: Arming denied: no joystick",
+        "the vehicle did not arm in 3 s; the vehicle said: command 400 TEMPORARILY_REJECTED; "
+        "unhealthy by SYS_STATUS: RC_RECEIVER (PX4 says why to ground stations alone: see "
+        "QGroundControl)",
         Phase.FAILED,
         never_armed,
     ),
@@ -310,7 +312,7 @@ ROWS = (
         ),
         3,
         "the vehicle did not enter OFFBOARD in 3 s (it shows AUTO.LOITER); "
-        "the vehicle said: Switching to Offboard is not available",
+        "the vehicle said: command 176 TEMPORARILY_REJECTED; unhealthy by SYS_STATUS: RC_",
         Phase.FAILED,
         never_armed,
     ),

@@ -69,8 +69,8 @@ def test_a_whole_flight_is_completed(flown: History) -> None:
 
 
 def our_ids(pair: Pair) -> None:
-    """Another program sends with our ids: the autopilot is asked to hold, then to land."""
-    frame = mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3).pack(mavlink.MAVLink(None, 1, 191))
+    """Another program says that it tracks: the autopilot is asked to hold, then to land."""
+    frame = mavlink.MAVLink_heartbeat_message(18, 8, 0, 8, 4, 3).pack(mavlink.MAVLink(None, 1, 191))
     pair.down = lambda _, datagrams: [*datagrams, frame]
 
 

@@ -227,7 +227,7 @@ def check(pair: Pair, tmp_path: Path, least: int) -> None:
 def test_a_program_with_our_ids_a_stop_and_a_pause(tmp_path: Path) -> None:
     """The flight ends by the frames of another program, which are not in the log as received."""
     codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
-    forged = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(codec)
+    forged = mavlink.MAVLink_heartbeat_message(18, 8, 0, 8, 4, 3).pack(codec)
 
     def down(time_s: float, datagrams: list[bytes]) -> list[bytes]:
         if 9.0 < time_s < 9.01 and datagrams:

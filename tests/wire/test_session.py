@@ -92,7 +92,7 @@ def test_the_vehicle_may_move_to_another_port_after_a_silence() -> None:
     moved, position = reception.events
     assert moved == events.PeerChanged(RESTARTED)
     assert isinstance(position, events.LocalPosition)
-    assert Heartbeat(6) in session.poll(10.51)  # at once, 0.51 s after the last one
+    assert Heartbeat(18) in session.poll(10.51)  # at once, 0.51 s after the last one
     assert session.receive(vehicle.position(1060), PEER, 10.53).events == ()  # the old one is back
 
 
@@ -126,19 +126,30 @@ def test_our_own_frames_are_ignored_and_not_logged() -> None:
 
 
 def test_another_program_with_our_ids_and_a_strange_setpoint_are_seen() -> None:
-    """Another companion that uses our ids, and one that sends setpoints as another component."""
+    """Another companion that uses our ids, and one that sends setpoints as another component. A
+    controller is who sends setpoints or commands a mode, from the vehicle's own system; a request
+    for a parameter or a rate is none."""
     session = pinned(Sender())
     twin, other = Sender(1, 191), Sender(1, 195)
-    assert session.receive(twin.heartbeat(8, vehicle_type=18), PEER, 0.0).events == (
-        events.OtherSender(1, 191, 0),
+    assert session.receive(twin.heartbeat(8, 7, vehicle_type=18), PEER, 0.0).events == (
+        events.OtherCompanion(1, 191, 7),
     )
-    assert dropped(session, DropReason.SAME_IDS) == 1
+    land, rate = (mavlink.MAVLink_command_long_message(1, 1, n, 0, *[0] * 7) for n in (21, 511))
+    for sender in (twin, other):
+        assert session.receive(sender.frame(land), PEER, 0.0).events[:1] == (
+            events.OtherSender(*sender.ids, 76),
+        )
+        assert session.receive(sender.frame(rate), PEER, 0.0).events == ()
+    read = mavlink.MAVLink_param_request_read_message(1, 1, b"MPC_THR_HOVER", -1)
+    assert session.receive(twin.frame(read), PEER, 0.0).events == ()
+    assert session.receive(Sender(255, 190).frame(land), PEER, 0.0).events == ()  # the pilot's
+    assert dropped(session, DropReason.SAME_IDS) == 4
     level = mavlink.MAVLink_set_attitude_target_message(0, 1, 1, 7, [1, 0, 0, 0], 0, 0, 0, 0.5)
     assert session.receive(other.frame(level), PEER, 0.0).events == (
         events.OtherSender(1, 195, 82),
     )
-    assert session.receive(other.heartbeat(8, vehicle_type=18), PEER, 0.0).events == (
-        events.OtherCompanion(1, 195),
+    assert session.receive(other.heartbeat(8, 0, vehicle_type=18), PEER, 0.0).events == (
+        events.OtherCompanion(1, 195, 0),
     )
 
 
@@ -202,7 +213,7 @@ def test_another_companion_computer_is_seen(
 ) -> None:
     session = pinned(Sender(1))
     beat = Sender(*ids).heartbeat(autopilot, vehicle_type=vehicle_type)
-    expected = (events.OtherCompanion(*ids),) if seen else ()
+    expected = (events.OtherCompanion(*ids, 0x00060000),) if seen else ()
     assert session.receive(beat, PEER, 1.0).events == expected
 
 
@@ -555,23 +566,21 @@ def beats(messages: tuple[Outgoing, ...]) -> list[int]:
     return [message.vehicle_type for message in messages if isinstance(message, Heartbeat)]
 
 
-@pytest.mark.parametrize(("autopilot", "vehicle_type"), [(PX4, 6), (ARDUPILOT, 18)])
-def test_heartbeats_at_1_hz_of_the_type_the_autopilot_needs(
-    autopilot: int, vehicle_type: int
-) -> None:
+@pytest.mark.parametrize("autopilot", [PX4, ARDUPILOT])
+def test_heartbeats_at_1_hz_of_an_onboard_controller(autopilot: int) -> None:
     session = Session(SessionSettings())
     session.receive(Sender().heartbeat(autopilot), PEER, 0.0)
     sent = [(0.1 * i, kind) for i in range(100) for kind in beats(session.poll(0.1 * i))]
-    assert [kind for _, kind in sent] == [vehicle_type] * 10
+    assert [kind for _, kind in sent] == [18] * 10
     assert [t for t, _ in sent] == pytest.approx(list(range(10)))
-    assert understood(session.encode(Heartbeat(vehicle_type))).type == vehicle_type
 
 
-def test_heartbeat_of_the_right_type_at_once_when_found() -> None:
+def test_heartbeat_with_the_system_id_of_the_vehicle_at_once_when_found() -> None:
     session = Session(SessionSettings(sends_first=True))
     assert beats(session.poll(0.0)) == [18]
-    session.receive(Sender().heartbeat(PX4), PEER, 0.1)
-    assert beats(session.poll(0.1)) == [6]
+    session.receive(Sender(7).heartbeat(PX4), PEER, 0.1)
+    (beat, *_) = session.poll(0.1)
+    assert session.encode(beat)[5:7] == bytes([7, 191])
 
 
 def test_heartbeat_follows_vehicle_time_when_that_is_faster() -> None:
@@ -600,7 +609,7 @@ def test_intervals_are_requested_at_once() -> None:
     session = Session(SessionSettings())
     session.receive(Sender().heartbeat(), PEER, 0.0)
     heartbeat, *requests = session.poll(0.0)
-    assert heartbeat == Heartbeat(6)
+    assert heartbeat == Heartbeat(18)
     assert all(isinstance(m, CommandLong) and m.command == 511 for m in requests)
     sent = [understood(session.encode(request)) for request in requests]
     intervals_us = {int(m.param1): m.param2 for m in sent}

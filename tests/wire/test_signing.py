@@ -176,7 +176,7 @@ def test_a_vehicle_whose_clock_is_behind_hears_ours_and_is_found() -> None:
     assert ours.vehicle is None
     (heartbeat,) = ours.poll(0.0)
     assert isinstance(heartbeat, Heartbeat)
-    assert vehicle.codec.decode(bytearray(ours.encode(heartbeat))).type == 6  # as PX4 needs it
+    assert vehicle.codec.decode(bytearray(ours.encode(heartbeat))).type == 18
     ours.receive(vehicle.heartbeat(), PEER, 1.0)
     assert ours.vehicle is not None
 

@@ -23,6 +23,7 @@ class Sender:
     """One component on the network, with its own sequence numbers."""
 
     def __init__(self, system_id: int = 1, component_id: int = 1) -> None:
+        self.ids = system_id, component_id
         self._link = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
 
     def frame(self, message: Any, mavlink1: bool = False) -> bytes:

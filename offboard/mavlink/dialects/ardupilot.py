@@ -7,9 +7,7 @@ from types import MappingProxyType
 
 from offboard.mavlink.dialects.base import (
     CUSTOM_MODE_ENABLED,
-    OWN_SYSTEM,
     TRACKING_TELEMETRY,
-    TYPE_ONBOARD_CONTROLLER,
     Advice,
     Dialect,
     ParameterEncoding,
@@ -56,7 +54,6 @@ _MODES = {
 ARDUPILOT = Dialect(
     name="ardupilot",
     mav_autopilot=3,
-    heartbeat_type=TYPE_ONBOARD_CONTROLLER,
     modes=MappingProxyType(_MODES),
     mode_parameters=_mode_parameters,
     engage_mode="GUIDED",
@@ -83,7 +80,13 @@ ARDUPILOT = Dialect(
             allowed=(0.3, 5.0),
             default=1.0,  # not ArduCopter's 3, see the advice
             advice=(
-                Advice("the last tilt of a dead controller is flown for so long", 1.0, highest=1.5),
+                Advice(
+                    "where setpoints stop, as with a lost link, the last tilt is flown for so "
+                    "long; then the vehicle levels, holds its height and drifts: it does not land, "
+                    "and does not say so",
+                    1.0,
+                    highest=1.5,
+                ),
             ),
         ),
         WatchedParameter("MOT_THST_HOVER", "normalised thrust that holds the weight"),
@@ -97,25 +100,8 @@ ARDUPILOT = Dialect(
         WatchedParameter(
             "FS_GCS_ENABLE",
             "what the vehicle does when the heartbeat of SYSID_MYGCS is lost",
-            advice=(
-                Advice(
-                    "nothing lands a vehicle whose companion computer has failed", 5.0, lowest=1.0
-                ),
-            ),
         ),
-        WatchedParameter(
-            "SYSID_MYGCS",
-            "system id of the heartbeat that FS_GCS_ENABLE watches",
-            advice=(
-                Advice(
-                    "FS_GCS_ENABLE does not watch this controller's heartbeat, which has the "
-                    "vehicle's system id",
-                    OWN_SYSTEM,
-                    OWN_SYSTEM,
-                    OWN_SYSTEM,
-                ),
-            ),
-        ),
+        WatchedParameter("SYSID_MYGCS", "system id of the heartbeat that FS_GCS_ENABLE watches"),
         WatchedParameter(
             "PSC_JERK_XY",
             "how soon BRAKE, which is asked for hold, stops the vehicle",
@@ -145,6 +131,7 @@ ARDUPILOT = Dialect(
     slow_hint="another ground station may set the rates (MAVProxy: `set streamrate -1`), or the "
     "link is full",
     prearm_prefixes=("PreArm: ",),
+    unsaid="see the ground station",
     oldest=(4, 3),
     loss_time=("GUID_TIMEOUT", 3.0),
     wanted=(

@@ -64,9 +64,6 @@ class ParameterFault(NamedTuple):
     fix: str
 
 
-OWN_SYSTEM = -1.0  # as a value of `Advice`: the system id of the vehicle, which is ours, too
-
-
 def always(parameters: Mapping[str, float], radio: bool) -> bool:
     return True
 
@@ -124,18 +121,16 @@ class WatchedParameter:
         return self._fault(value, self.meaning, valid)
 
     def advised(
-        self, value: float, known: Mapping[str, float], radio: bool, system_id: int
+        self, value: float, known: Mapping[str, float], radio: bool
     ) -> ParameterFault | None:
         """What is not recommended about `value`, or None. `known`: all parameters; `radio`: one is
         received."""
         for advice in self.advice:
-            limits = (advice.lowest, advice.highest, advice.set_to)
-            lowest, highest, set_to = (system_id if v == OWN_SYSTEM else v for v in limits)
-            good = lowest <= value <= highest and int(value) & advice.bits == advice.bits
+            within = advice.lowest <= value <= advice.highest
+            good = within and int(value) & advice.bits == advice.bits
             if not good and advice.applies(known, radio):
-                return self._fault(
-                    value, advice.why, int(value) | int(set_to) if advice.bits else set_to
-                )
+                set_to = int(value) | int(advice.set_to) if advice.bits else advice.set_to
+                return self._fault(value, advice.why, set_to)
         return None
 
     def shown(self, value: float) -> str:
@@ -174,7 +169,6 @@ class Dialect:
 
     name: str
     mav_autopilot: int
-    heartbeat_type: int  # MAV_TYPE of our own heartbeat
     modes: Mapping[int, str]
     mode_parameters: Callable[[int], tuple[float, float, float]]  # custom_mode -> MAV_CMD 176
     engage_mode: str
@@ -193,6 +187,7 @@ class Dialect:
     estimator_message: int  # id of the message that becomes an EstimatorReport
     slow_hint: str  # what to do where telemetry comes slower than it was requested
     prearm_prefixes: tuple[str, ...]  # of a STATUSTEXT that says what a pre-arm check found
+    unsaid: str  # where a reason is found that no STATUSTEXT tells us
     oldest: tuple[int, int]  # version that this dialect is made for
     # what follows when setpoints stop: the parameter of the time, its default, the parameter of the
     # mode, and the modes by its value

@@ -9,7 +9,6 @@ from types import MappingProxyType
 from offboard.mavlink.dialects.base import (
     CUSTOM_MODE_ENABLED,
     TRACKING_TELEMETRY,
-    TYPE_GCS,
     Advice,
     Defect,
     Dialect,
@@ -60,8 +59,6 @@ _MODES = {
 PX4 = Dialect(
     name="px4",
     mav_autopilot=12,
-    # PX4 sends STATUSTEXT only on links with a heartbeat of a ground station
-    heartbeat_type=TYPE_GCS,
     modes=MappingProxyType(_MODES),
     mode_parameters=_mode_parameters,
     engage_mode="OFFBOARD",
@@ -134,6 +131,9 @@ PX4 = Dialect(
     estimator_message=230,
     slow_hint="raise MAV_x_RATE of this link, in bytes/s: PX4 slows all messages down to it",
     prearm_prefixes=("Preflight Fail: ", "Preflight: "),
+    # is_gcs_connected of the link: only while a HEARTBEAT of type GCS arrives on it, which ours is
+    # not: it would hide a lost ground station from NAV_DLL_ACT
+    unsaid="PX4 says why to ground stations alone: see QGroundControl",
     oldest=(1, 14),
     loss_time=("COM_OF_LOSS_T", 1.0),
     loss_action="COM_OBL_RC_ACT",
