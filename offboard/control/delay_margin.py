@@ -11,6 +11,7 @@ within the unit circle.
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,6 +89,28 @@ def _vertical_loop(vehicle: Vehicle, bandwidth_radps: float, period_s: float) ->
     return _Loop(model, gain, delay_s, _VERTICAL_DENSITIES, _VERTICAL_SDS, period_s)
 
 
+@lru_cache(maxsize=32)  # of the vehicle alone: the same for all bandwidths and delays
+def _observer(
+    dynamics: bytes,
+    input_map: bytes,
+    densities: tuple[float, ...],
+    sds: tuple[tuple[int, float], ...],
+    step_s: float,
+) -> tuple[Array, Array, Array]:
+    """Transition (n, n), input (n, 1) and correction (n, m) of the observer, per substep."""
+    size = len(densities)
+    flow = np.frombuffer(dynamics).reshape(size, size)
+    step = LinearModel(flow, np.frombuffer(input_map).reshape(size, 1)).sampled(step_s)
+    measures = np.eye(size)[[index for index, _ in sds]]
+    noise = np.diag(np.square(densities) * step_s)
+    noise[0, 0] += 1e-12
+    noise[2, 2] += 1e-12
+    errors = np.diag(np.square([sd for _, sd in sds]))
+    prior = solve_discrete_are(step.dynamics.T, measures.T, noise, errors)
+    spread = measures @ prior @ measures.T + errors
+    return step.dynamics, step.input_map, prior @ measures.T @ np.linalg.inv(spread)
+
+
 class _Loop:
     """One axis, SUBSTEPS samples per period: the plant `model`, [p v b b'] or [z v f], and the
     observer, which has a disturbance d of v' beside that."""
@@ -104,20 +127,14 @@ class _Loop:
         self.step_s = period_s / SUBSTEPS
         self._delay_s = delay_s
         self._size = size = len(model.dynamics)
+        self._measured = list(sds)
+        self._measures = np.eye(size + 1)[self._measured]
         dynamics = np.zeros((size + 1, size + 1))
         dynamics[:size, :size], dynamics[1, size] = model.dynamics, 1.0
-        step = LinearModel(dynamics, np.vstack((model.input_map, [0.0]))).sampled(self.step_s)
-        self._flow, self._push = step.dynamics, step.input_map
-        self._measured = list(sds)
-        measures = np.eye(size + 1)[self._measured]
-        noise = np.diag(np.square(densities) * self.step_s)
-        noise[0, 0] += 1e-12
-        noise[2, 2] += 1e-12
-        errors = np.diag(np.square(list(sds.values())))
-        prior = solve_discrete_are(self._flow.T, measures.T, noise, errors)
-        spread = measures @ prior @ measures.T + errors
-        self._correction = prior @ measures.T @ np.linalg.inv(spread)
-        self._measures = measures
+        inputs = np.append(model.input_map, 0.0)
+        self._flow, self._push, self._correction = _observer(
+            dynamics.tobytes(), inputs.tobytes(), densities, tuple(sds.items()), self.step_s
+        )
         # The target compensates the disturbance: with v' = -k b + d, b_r = b_ff = d / k
         self._gain = np.append(gain, (1.0 + gain[2]) / model.dynamics[1, 2])[None, :]
 

@@ -8,6 +8,7 @@ reference, no measurement and no search.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 
 import control
 import numpy as np
@@ -52,6 +53,16 @@ def vertical_gain(vehicle: Vehicle, bandwidth_radps: float, period_s: float) -> 
 
 def _regulator(model: LinearModel, effort: float, period_s: float) -> CostToGo:
     """Weights 1 on the first state and `effort` on the input, per second."""
+    return _solved(model.dynamics.tobytes(), model.input_map.tobytes(), effort, period_s)
+
+
+# A take-over, and each limit of the bandwidth, need the gains of the same few bandwidths again,
+# 5 ms each: they are known since the ground, as no delay changes them
+@lru_cache(maxsize=256)
+def _solved(dynamics: bytes, input_map: bytes, effort: float, period_s: float) -> CostToGo:
+    inputs = np.frombuffer(input_map)
+    states = len(inputs)
+    model = LinearModel(np.frombuffer(dynamics).reshape(states, states), inputs.reshape(states, 1))
     held = model.sampled(period_s)
     a, b = held.dynamics, held.input_map
     stage = period_s * np.diag([1.0] + [0.0] * (len(a) - 1) + [effort])

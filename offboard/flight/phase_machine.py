@@ -98,9 +98,10 @@ class PhaseMachine:
         if row.source in BEFORE_FLIGHT and row.target in FLYING:
             state.link.settle()
             state.clock.settle()
-        if self._identification:
-            if row.target is Phase.CLIMB:
+            if self._identification:
                 self._identification.on_link_delay(state.link.estimate)
+            self._decider.begin()  # on the ground, where the time that it takes does no harm
+        if self._identification:
             self._identification.on_phase(row.target, state.time_s)
         if row.source in WAITING and row.target in FLYING and state.authority:
             state.authority.ask()  # it shows the mode already
