@@ -13,8 +13,9 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import control
 import pytest
-from faults import HEARTBEAT, frame_id, shuffling, without
+from faults import HEARTBEAT, frame_id, late, shuffling, without
 from pair import SHORT, Bytes, HostClock, Pair, frames_of, hover, in_phase, make, on_arducopter
 from watch import (
     ARM,
@@ -241,6 +242,33 @@ def test_no_setpoint_waits_for_the_identification(
     assert result.answer_p50_ms == pytest.approx(2.0, abs=0.01)
     assert result.answer_max_ms < 8.0  # with a step of the simulation
     assert result.missed_ticks == 0
+
+
+def test_at_lift_off_no_gain_is_computed_any_more(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On the ground a turn may take long. The vehicle's drag is one that no other test has, so that
+    nothing is known of it before."""
+    computed = [0]
+    dlqr = control.dlqr
+
+    def counted(*arguments: Any) -> Any:
+        computed[-1] += 1
+        return dlqr(*arguments)
+
+    monkeypatch.setattr(control, "dlqr", counted)
+    drag_npmps = (0.777, 0.777, 0.777)
+    believed = simulated.vehicle("px4_sih").model_copy(
+        update={"drag_translation_npmps": drag_npmps}
+    )
+    link = {"down": late(0.03), "up": late(0.03)}
+    pair = hover(learning=IdentifySettings(), believed=believed, **link)
+    while not in_phase(Phase.TAKEOFF, 0.5)(pair):
+        pair.advance()
+    computed.append(0)
+    while pair.companion.phase is not Phase.EXCITE:
+        pair.advance()
+    before, at_lift_off = computed
+    assert before > 0
+    assert at_lift_off == 0
 
 
 def paused(
