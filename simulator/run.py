@@ -13,8 +13,8 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from offboard.documents.repeated import Repeated
 from offboard.io.clock import monotonic_s, unix_us
-from offboard.io.repeated import Repeated
 from simulator.instance import Instance
 from simulator.link.links import Link, wait
 from simulator.link.recorder import Recorder

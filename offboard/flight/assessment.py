@@ -179,7 +179,8 @@ def not_ready(state: FlightState, session: Session) -> str:
         }
         missing = [name for name, newest in telemetry.items() if newest is None]
         problem = vehicle.estimator.problem if vehicle.estimator else ""
-        return f"no {' and no '.join(missing)} arrives{problem and f': {problem}'}"
+        why = (problem and f": {problem}") + vehicle.explanation(dialect.unsaid if dialect else "")
+        return f"no {' and no '.join(missing)} arrives{why}"
     if not state.guarded:
         return "the supervisor, which lands it if this process ends, does not answer"
     rates_hz = session.rates_hz

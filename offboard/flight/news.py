@@ -5,10 +5,10 @@ from __future__ import annotations
 import math
 import re
 
+from offboard.documents.repeated import Repeated
 from offboard.flight import assessment
 from offboard.flight.phases import Phase
 from offboard.flight.state import FlightState
-from offboard.io.repeated import Repeated
 from offboard.mavlink.session import Session
 
 PAUSED = "this computer paused for {most:.2f} s{times}: waiting for the vehicle's mode"
