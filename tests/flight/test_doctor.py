@@ -41,6 +41,7 @@ def test_nothing_is_said_of_a_good_vehicle(firmware: Firmware) -> None:
     [
         (LEAN, "COM_OF_LOSS_T", 0.0, BLOCKS, "param set COM_OF_LOSS_T 1"),
         (LEAN, "COM_OF_LOSS_T", 30.0, BLOCKS, "param set COM_OF_LOSS_T 1"),
+        (LEAN, "COM_OF_LOSS_T", 0.5, WARN, "param set COM_OF_LOSS_T 1"),
         (LEAN, "COM_OBL_RC_ACT", 0.0, WARN, "param set COM_OBL_RC_ACT 4"),
         (LEAN, "COM_OBL_RC_ACT", 7.0, BLOCKS, "param set COM_OBL_RC_ACT 4"),
         (LEAN, "COM_RC_IN_MODE", 4.0, WARN, "param set COM_RC_IN_MODE 3"),

@@ -203,6 +203,42 @@ def test_what_a_turn_decided_is_dropped_when_it_became_too_old(tmp_path: Path) -
     assert (logged.count(setpoint(2)), logged.count(said(2))) == (0, 1)
 
 
+def test_what_a_turn_decided_does_not_leave_after_a_take_over(tmp_path: Path) -> None:
+    """The process was stopped within the turn, and the supervisor has the vehicle."""
+    sent: list[bytes] = []
+
+    class Recording(Wire):
+        def send(self, data: bytes, peer: object) -> None:
+            sent.append(data)
+
+    class Taking(Watcher):
+        said = ("taking over: the controller has not answered for 0.6 s", "it is disarmed")
+        taken = False
+
+        def has_taken_over(self) -> bool:
+            return self.taken
+
+        def await_end(self, timeout_s: float) -> bool:
+            return True
+
+    watcher = Taking()
+
+    class Deciding(Flight):
+        def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
+            super().turn(chunks, now_s)
+            watcher.taken = self.turns == 1
+            return Output(send=(setpoint(self.turns),))
+
+    flight = Deciding(3, lambda left: None)
+    with FlightLog(tmp_path / "flight", "") as log, StopRequests() as stops:
+        outcome = Loop(
+            cast(Companion, flight), cast(Link, Recording()), log, stops=stops,
+            progress=lambda companion: None, supervisor=cast(Supervisor, watcher),
+        ).run()  # fmt: skip
+    assert sent == [setpoint(2)]
+    assert outcome == Outcome(4, f"supervisor: {'; '.join(watcher.said)}")
+
+
 def test_an_ignored_sighup_stays_ignored(tmp_path: Path) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:

@@ -326,6 +326,18 @@ def test_a_lateness_that_is_unknown_is_late(late_s: float) -> None:
     assert refused.value.why is Refusal.LATE
 
 
+@pytest.mark.parametrize(("age_s", "refused"), [(0.25, False), (0.2501, True), (math.nan, True)])
+def test_the_age_of_telemetry_is_limited_exactly(age_s: float, refused: bool) -> None:
+    clearance = Clearance(ours=True, on_ground=False, age_s=age_s, age_limit_s=0.25)
+    command = Command(9.8, (0.0, 0.0, 1.0), 0.0)
+    if not refused:
+        assert admit(command, VEHICLE, clearance) == command
+        return
+    with pytest.raises(Refused) as reason:
+        admit(command, VEHICLE, clearance)
+    assert reason.value.why is Refusal.STALE
+
+
 def test_straight_up_with_the_smallest_lateral_part_is_turned_back_to_the_limit() -> None:
     """The length of (5e-324, 5e-324) is rounded to 5e-324: two whole parts instead of one."""
     command = Command(9.8, (5e-324, 5e-324, -1.0), 0.0)
@@ -338,9 +350,15 @@ def test_straight_up_with_the_smallest_lateral_part_is_turned_back_to_the_limit(
     [
         Command(9.8, (0.0, 0.0, 1.0), 1e39),
         PositionCommand((0.0, 1e39, 0.0), (0.0,) * 3, (0.0,) * 3, 0.0, 0.0),
+        Command(math.nan, (0.0, 0.0, 1.0), 0.0),
+        Command(9.8, (0.0, math.nan, 1.0), 0.0),
+        Command(9.8, (0.0, 0.0, 1.0), math.nan),
+        PositionCommand((0.0,) * 3, (0.0, 0.0, math.nan), (0.0,) * 3, 0.0, 0.0),
     ],
 )
-def test_a_number_too_large_for_the_wire_is_refused(command: Command | PositionCommand) -> None:
+def test_a_number_that_is_none_or_too_large_for_the_wire_is_refused(
+    command: Command | PositionCommand,
+) -> None:
     """Encoding it would raise, after the gate."""
     with pytest.raises(Refused) as refused:
         admit(command, VEHICLE, Clearance(ours=True, on_ground=False))

@@ -170,6 +170,10 @@ def bridged(pair: Pair) -> Checks:
     yield from flown(pair)
     texts = [frame for _, _, frame in pair.sent if b"decision missed" in frame]
     yield len(texts) == 4
+    missed_s = [at_s for at_s, _, frame in pair.sent if b"decision missed" in frame]
+    bridges = [s for at_s, _, s in pair.setpoints if at_s in missed_s]
+    yield len(bridges) == 4  # level, and not the setpoint before
+    yield all(abs(s.q[1]) + abs(s.q[2]) < 1e-6 for s in bridges)
 
 
 def stayed_down(pair: Pair) -> Checks:

@@ -156,6 +156,14 @@ def test_one_that_is_stopped_is_noticed_within_a_second_and_when_it_returns(rig:
     assert 0.8 < await_guard(False) < 2.0
     os.kill(rig.supervisor.pid, signal.SIGCONT)
     await_guard(True)
+    time.sleep(0.1)  # it has read all beats
+    os.kill(rig.supervisor.pid, signal.SIGSTOP)  # with the controller, as a computer that sleeps
+    time.sleep(1.2)
+    os.kill(rig.supervisor.pid, signal.SIGCONT)
+    time.sleep(0.2)  # the controller wakes up later: that pause was not its silence
+    rig.beat(OURS)
+    await_guard(True)
+    assert not rig.supervisor.has_taken_over()
     assert rig.next_command().command == 176  # as the beats stop
     rig.disarm()
 

@@ -87,6 +87,11 @@ ARDUPILOT = Dialect(
                     1.0,
                     highest=1.5,
                 ),
+                Advice(
+                    "it levels before the supervisor, which lands it if we stop, acts",
+                    1.0,
+                    lowest=0.6,
+                ),
             ),
         ),
         WatchedParameter("MOT_THST_HOVER", "normalised thrust that holds the weight"),

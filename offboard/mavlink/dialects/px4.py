@@ -77,6 +77,13 @@ PX4 = Dialect(
             "seconds without setpoints before the failsafe",
             allowed=(0.3, 5.0),
             default=1.0,
+            advice=(
+                Advice(
+                    "its failsafe acts before the supervisor, which lands it if we stop",
+                    1.0,
+                    lowest=0.6,
+                ),
+            ),
         ),
         WatchedParameter(
             "COM_OBL_RC_ACT",
