@@ -269,6 +269,8 @@ class Wire:
         self._served_s = self.pair.time_s
         if self._is_unknown(self.known):
             self._note(f"command {command} without a recent report of the mode")
+        elif command == LAND and self._starved:
+            pass  # its own failsafe for missing setpoints flies it, and nobody else
         elif self.known.mode not in self.asked | {ENGAGE[on]}:  # type: ignore[union-attr]
             self._note(f"command {command} in {self.mode}")
         elif self.known.mode == ENGAGE[on]:  # type: ignore[union-attr]
@@ -277,6 +279,11 @@ class Wire:
                 self._note(f"command {command} in {self.mode}, in which it is another's")
         if not disarms:
             self.asked.add(HOLD[on] if holds else LANDS[on])
+
+    @property
+    def _starved(self) -> bool:
+        commander = self.pair.instance.autopilot.commander
+        return commander.failsafe and commander._cause == "stream lost"
 
     def _is_unknown(self, known: Report | None) -> bool:
         return known is None or self.pair.time_s - known.time_s > KNOWN_S
