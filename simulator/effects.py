@@ -85,8 +85,10 @@ def _estimator_jump(vehicle: Vehicle, running: Running) -> Effect:
 
 def _gps_loss(vehicle: Vehicle, running: Running) -> Effect:
     vehicle.autopilot.state.gps_healthy = False
-    step_m, drifted_m = running.fault.drift_mps * STEP_S * 0.5**0.5, 0.0
+    speed_mps, drifted_m = running.fault.drift_mps, 0.0
     while (yield):
+        step_m = speed_mps * STEP_S * 0.5**0.5
+        speed_mps += running.fault.drift_mps2 * STEP_S
         drifted_m += step_m
         vehicle.autopilot.plant.drift_estimate((step_m, step_m, 0.0))
     vehicle.autopilot.state.gps_healthy = True

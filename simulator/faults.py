@@ -107,10 +107,12 @@ class EstimatorJump(Timed):
 
 
 class GpsLoss(Timed):
-    """No GPS fix: the position estimate drifts to the north-east, and jumps back with the fix."""
+    """No GPS fix: the position estimate drifts to the north-east, faster and faster with
+    `drift_mps2`, and jumps back with the fix."""
 
     fault: Literal["gps_loss"]
     drift_mps: float = Field(default=0.0, ge=0, le=10)
+    drift_mps2: float = Field(default=0.0, ge=0, le=10)
 
 
 class SilentMessage(Timed):

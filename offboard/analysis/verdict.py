@@ -32,6 +32,7 @@ _LANDING_ENDS = {"disarmed", "failed", "yielded"}
 # stands for itself
 _CAUSES = (
     (STOPPED, "operator"),
+    ("GPS|no GPS|its estimat|no report of its estimator", "positioning"),
     (
         "no telemetry|no LOCAL_POSITION_NED|no ATTITUDE_QUATERNION|no report|the delay|telemetry"
         " was|setpoints did not arrive",

@@ -53,6 +53,7 @@ class Facts:
     link_growth_s: float = 0.0
     clock_jump_s: float = 0.0
     position_jump_m: float = 0.0  # of the reported position, all of the last ten seconds
+    positioning_lost: bool = False  # what the estimate was made of when the flight began
     battery: float = 1.0
     hover_thrust: float = math.nan  # normalised, as setpoints that are followed show it now
     full_thrust_sink_mps: float = 0.0  # downward speed while setpoints demand the full thrust

@@ -147,6 +147,15 @@ ROWS = (
         "the estimated position jumped by {position_jump_m:.1f} m",
     ),
     LadderRow(
+        "positioning",
+        "GPS fix, validity and accuracy of the estimate, their messages: lost since take-off",
+        "limits.gps_s, limits.accuracy_m",
+        lambda now: now.positioning_lost,
+        0.5,
+        Rung.LAND,
+        "{positioning}",
+    ),
+    LadderRow(
         "volume",
         "height and distance from the take-off point",
         "limits.ceiling_m, limits.radius_m",

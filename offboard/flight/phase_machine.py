@@ -98,6 +98,9 @@ class PhaseMachine:
         if row.source in BEFORE_FLIGHT and row.target in FLYING:
             state.link.settle()
             state.clock.settle()
+            dialect = self._session.dialect
+            assert dialect is not None
+            state.positioning.begin(state.vehicle, self._session.rates_hz, dialect.estimator_name)
             if self._identification:
                 self._identification.on_link_delay(state.link.estimate)
             self._decider.begin()  # on the ground, where the time that it takes does no harm

@@ -123,6 +123,8 @@ class Limits(Parameters):
     link_growth_s: float = Field(default=0.3, gt=0, le=2)  # of the link's delay since take-off
     missed_decisions: int = Field(default=3, ge=1, le=100)  # in a row
     position_error_m: float = Field(default=5.0, gt=0.1, le=100)
+    gps_s: float = Field(default=1.0, ge=0.5, le=600)  # without the fix of the take-off
+    accuracy_m: float = Field(default=3.0, gt=0.5, le=100)  # of the position, as the vehicle says
     position_jump_m: float = Field(default=2.0, gt=0.3, le=100)  # resets of the estimator in 10 s
     prediction_error_m: float = Field(default=2.0, gt=0.1, le=100)  # of the decision before
     hover_thrust: float = Field(default=0.9, gt=0.05, le=1)  # normalised thrust that hovers

@@ -21,6 +21,7 @@ from offboard.flight.link_age import LinkDelay, LinkGrowth, VehicleClock
 from offboard.flight.phases import ENDS, Limits, Phase
 from offboard.flight.pilot_switch import PilotSwitch
 from offboard.flight.position_jumps import PositionJumps
+from offboard.flight.positioning import Positioning
 from offboard.flight.programme import FLY, Programme
 from offboard.flight.readiness import Readiness
 from offboard.flight.requests import Request
@@ -63,6 +64,7 @@ class FlightState:
     hover: HoverEstimate = field(default_factory=HoverEstimate)
     jumps: PositionJumps = field(default_factory=PositionJumps)
     readiness: Readiness = field(default_factory=Readiness)
+    positioning: Positioning = field(default_factory=Positioning)
     ladder: Ladder = field(default_factory=Ladder)
     contact: GroundContact = field(init=False)
     pilot: PilotSwitch = field(default_factory=PilotSwitch)

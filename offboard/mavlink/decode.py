@@ -192,11 +192,12 @@ def _system_health(payload: bytes, _: Dialect) -> events.Event:
 
 
 def _px4_estimator(payload: bytes, _: Dialect) -> events.Event:
-    _, velocity, position, height, mag, hagl, airspeed, _, _, flags = _unpack(
+    _, velocity, position, height, mag, hagl, airspeed, accuracy_m, _, flags = _unpack(
         mavlink.MAVLink_estimator_status_message, payload
     )
     ratios = {"GPS velocity": velocity, "GPS position": position, "height": height, "heading": mag}
-    return _estimator(flags, ratios | {"height above ground": hagl, "airspeed": airspeed})
+    ratios |= {"height above ground": hagl, "airspeed": airspeed}
+    return _estimator(flags, ratios, accuracy_m if math.isfinite(accuracy_m) else None)
 
 
 def _ardupilot_estimator(payload: bytes, _: Dialect) -> events.Event:
@@ -207,13 +208,16 @@ def _ardupilot_estimator(payload: bytes, _: Dialect) -> events.Event:
     return _estimator(flags, ratios | {"compass": compass, "terrain": terrain, "air": airspeed})
 
 
-def _estimator(flags: int, ratios: dict[str, float]) -> events.EstimatorReport:
+def _estimator(
+    flags: int, ratios: dict[str, float], accuracy_m: float | None = None
+) -> events.EstimatorReport:
     return events.EstimatorReport(
         attitude_ok=bool(flags & _EKF_ATTITUDE),
         velocity_ok=bool(flags & _EKF_VELOCITY),
         position_ok=bool(flags & _EKF_POSITION),
         height_ok=bool(flags & _EKF_HEIGHT),
         ratios=tuple((name, ratio) for name, ratio in ratios.items() if math.isfinite(ratio)),
+        accuracy_m=accuracy_m,
     )
 
 

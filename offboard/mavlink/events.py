@@ -122,6 +122,21 @@ class EstimatorReport:
     position_ok: bool  # horizontal, relative to the origin
     height_ok: bool
     ratios: tuple[tuple[str, float], ...]
+    accuracy_m: float | None = None  # horizontal, one standard deviation; None on ArduPilot
+
+    @property
+    def valid(self) -> frozenset[str]:
+        """The parts of the estimate that are valid."""
+        return frozenset(name for name, valid in self._parts.items() if valid)
+
+    @property
+    def _parts(self) -> dict[str, bool]:
+        return {
+            "attitude": self.attitude_ok,
+            "horizontal velocity": self.velocity_ok,
+            "horizontal position": self.position_ok,
+            "height": self.height_ok,
+        }
 
     @property
     def worst(self) -> tuple[str, float]:
@@ -131,13 +146,7 @@ class EstimatorReport:
     @property
     def problem(self) -> str:
         """Why nobody can fly by this estimate; empty if somebody can."""
-        parts = {
-            "attitude": self.attitude_ok,
-            "horizontal velocity": self.velocity_ok,
-            "horizontal position": self.position_ok,
-            "height": self.height_ok,
-        }
-        missing = [name for name, valid in parts.items() if not valid]
+        missing = [name for name, valid in self._parts.items() if not valid]
         if missing:
             return f"its estimator has no valid {', '.join(missing)}"
         name, ratio = self.worst

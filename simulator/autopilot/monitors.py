@@ -32,6 +32,10 @@ class Monitors:
     def ground_station_heard(self, now_s: float) -> None:
         self._heartbeat_s = now_s
 
+    def without_fix_s(self, now_s: float) -> float:
+        """Time since the last GPS fix."""
+        return now_s - self._fix_s
+
     def step(self, now_s: float, armed: bool, battery: BatteryState, has_fix: bool) -> list[str]:
         """Events since the last step."""
         if has_fix:

@@ -406,6 +406,57 @@ def test_a_landing_is_judged_by_the_ground_where_a_reset_has_moved_it(
     assert pair.score(tmp_path).ended_by == "reference over"
 
 
+GPS_LOST = {"fault": "gps_loss", "after": "engaged", "at_s": 16.0, "drift_mps": 0.45}
+SILENT_GPS = {
+    "fault": "silent_message", "message": "GPS_RAW_INT", "after": "engaged", "at_s": 16.0
+}  # fmt: skip
+ON_PX4, ON_ARDUCOPTER = partial(make, HIGH, firmware=PX4), partial(on_arducopter, HIGH)
+ONLY_ESTIMATOR = partial(ON_PX4, limits={"gps_s": 600.0})
+
+
+@pytest.mark.parametrize(
+    ("fly", "faults", "says", "within_s", "error_m"),
+    [
+        (ON_PX4, [GPS_LOST], "GPS has no fix for 1.5 s", 2.0, 1.2),
+        (ON_ARDUCOPTER, [GPS_LOST], "GPS has no fix for 1.5 s", 2.0, 1.2),
+        (ON_PX4, [GPS_LOST, SILENT_GPS], "no GPS_RAW_INT for 2.5 s", 3.0, 1.6),
+        (ONLY_ESTIMATOR, [GPS_LOST], "its estimator has no valid horizontal position", 8.0, 4.0),
+    ],
+)
+def test_a_position_that_is_lost_in_flight_is_landed(
+    fly: Fly,
+    faults: list[dict[str, Any]],
+    says: str,
+    within_s: float,
+    error_m: float,
+    tmp_path: Path,
+) -> None:
+    """PX4 does not intervene, and ArduCopter late: its estimate drifts away meanwhile."""
+    pair = fly(scenario=scenario_of(*faults))
+    watch = watched(pair)
+    lost_s: list[float] = []
+    state = pair.instance.autopilot.state
+    pair.at.append((lambda _: not state.gps_healthy, lambda _: lost_s.append(pair.time_s)))
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    assert outcome.sentence.startswith(says)
+    lands_s = next(at_s for at_s, phase in pair.phases if phase is Phase.LAND)
+    assert lands_s < lost_s[0] + within_s
+    assert watch.error_m < error_m
+    assert pair.commands(LAND)
+    assert pair.score(tmp_path).ended_by == "positioning"
+
+
+@pytest.mark.parametrize("never", [True, False], ids=["never had", "for a moment"])
+def test_a_position_that_needs_no_gps_is_flown(never: bool) -> None:
+    """By motion capture, without GPS messages; and with a gap of 0.7 s in the fixes."""
+    silent = {"fault": "silent_message", "message": "GPS_RAW_INT"}
+    moment = silent if never else {**GPS_LOST, "for_s": 0.7}
+    pair = make(HIGH, ONE_LAP, firmware=PX4, scenario=scenario_of(moment))
+    assert pair.fly().exit_code == ExitCode.FLOWN
+    assert pair.rungs == {}
+
+
 def jumping(offset_m: float) -> Scenario:
     return scenario_of(
         {

@@ -185,6 +185,7 @@ class Dialect:
     hover_parameter: str  # normalised thrust that holds the weight
     tilt_parameter: tuple[str, float]  # greatest tilt of its own modes, and its unit in rad
     estimator_message: int  # id of the message that becomes an EstimatorReport
+    estimator_name: str  # of this message
     slow_hint: str  # what to do where telemetry comes slower than it was requested
     prearm_prefixes: tuple[str, ...]  # of a STATUSTEXT that says what a pre-arm check found
     unsaid: str  # where a reason is found that no STATUSTEXT tells us
@@ -239,4 +240,5 @@ TRACKING_TELEMETRY = (
     WantedMessage(245, "EXTENDED_SYS_STATE", 5.0),
     WantedMessage(1, "SYS_STATUS", 2.0),
     WantedMessage(83, "ATTITUDE_TARGET", 8.0, optional=True),  # its own thrust, before ours
+    WantedMessage(24, "GPS_RAW_INT", 5.0, optional=True),
 )

@@ -136,6 +136,7 @@ PX4 = Dialect(
     hover_parameter="MPC_THR_HOVER",
     tilt_parameter=("MPC_TILTMAX_AIR", math.radians(1.0)),
     estimator_message=230,
+    estimator_name="ESTIMATOR_STATUS",
     slow_hint="raise MAV_x_RATE of this link, in bytes/s: PX4 slows all messages down to it",
     prearm_prefixes=("Preflight Fail: ", "Preflight: "),
     # is_gcs_connected of the link: only while a HEARTBEAT of type GCS arrives on it, which ours is
@@ -153,6 +154,7 @@ PX4 = Dialect(
         *TRACKING_TELEMETRY,
         # shows a change of the mode within 0.02 s; the rate of HEARTBEAT, 1 Hz, cannot be changed
         WantedMessage(436, "CURRENT_MODE", 50.0, optional=True, unchanged_hz=2.0),
+        WantedMessage(230, "ESTIMATOR_STATUS", 5.0, optional=True),
         WantedMessage(115, "HIL_STATE_QUATERNION", 50.0, optional=True),  # simulated truth
     ),
 )

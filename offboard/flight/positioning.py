@@ -1,0 +1,60 @@
+"""Positioning: what the vehicle's estimate was made of when the flight began, and has lost since.
+
+PX4 goes on under attitude setpoints when its GPS is lost, and reports a position that drifts away:
+0.5 m in the first second, 10 m in fifteen. What was not there at the beginning is not missed: a
+vehicle may fly by motion capture or optical flow.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from offboard.flight.phases import Limits
+from offboard.flight.vehicle_state import VehicleState
+from offboard.mavlink.events import EstimatorReport, GpsFix, NoFix
+
+KNOWN_S = 2.5  # age of a report that counts when the flight begins
+SILENT_S = 2.0  # without a message that came regularly; both are requested at 5 Hz
+REGULAR_HZ = 3.0  # what comes more rarely may be lost for so long by chance
+WORSE = 2.0  # times the accuracy of the beginning, where that was no better than the limit
+
+
+@dataclass(slots=True)
+class Positioning:
+    """What was there when the flight began; nothing before it."""
+
+    had_fix: bool = False
+    had_valid: frozenset[str] = frozenset()  # parts of the estimate
+    accuracy_m: float = 0.0
+    fixes_hz: float = 0.0
+    reports_hz: float = 0.0
+
+    def begin(self, vehicle: VehicleState, rates_hz: Mapping[str, float], estimator: str) -> None:
+        """The flight begins. `rates_hz` of the messages that arrive, `estimator` the name of the
+        one that becomes an EstimatorReport."""
+        self.had_fix = vehicle.age_s(GpsFix) < KNOWN_S
+        self.fixes_hz = rates_hz.get("GPS_RAW_INT", 0.0)
+        report = vehicle.estimator
+        if report is not None and vehicle.age_s(EstimatorReport) < KNOWN_S:
+            self.had_valid, self.accuracy_m = report.valid, report.accuracy_m or 0.0
+            self.reports_hz = rates_hz.get(estimator, 0.0)
+
+    def lost(self, vehicle: VehicleState, limits: Limits) -> str:
+        """What is lost, as a sentence; empty if nothing is."""
+        fix_age_s, report = vehicle.age_s(GpsFix), vehicle.estimator
+        if self.had_fix and fix_age_s > limits.gps_s and vehicle.age_s(NoFix) < fix_age_s:
+            return f"GPS has no fix for {fix_age_s:.1f} s"
+        if self.had_fix and self.fixes_hz >= REGULAR_HZ and fix_age_s > max(SILENT_S, limits.gps_s):
+            return f"no GPS_RAW_INT for {fix_age_s:.1f} s"
+        if report is None:
+            return ""
+        missing = sorted(self.had_valid - report.valid)
+        if missing:
+            return f"its estimator has no valid {', '.join(missing)} any more"
+        least_m = max(limits.accuracy_m, WORSE * self.accuracy_m)
+        if report.accuracy_m is not None and self.had_valid and report.accuracy_m > least_m:
+            return f"its estimated position is only accurate to {report.accuracy_m:.1f} m"
+        if self.reports_hz >= REGULAR_HZ and vehicle.age_s(EstimatorReport) > SILENT_S:
+            return "no report of its estimator"
+        return ""
