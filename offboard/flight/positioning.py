@@ -7,6 +7,7 @@ vehicle may fly by motion capture or optical flow.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -15,8 +16,7 @@ from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.events import EstimatorReport, GpsFix, NoFix
 
 KNOWN_S = 2.5  # age of a report that counts when the flight begins
-SILENT_S = 2.0  # without a message that came regularly; both are requested at 5 Hz
-REGULAR_HZ = 3.0  # what comes more rarely may be lost for so long by chance
+SILENT_S, SILENT_MESSAGES = 2.0, 10.0  # missing in a row: no loss of the link
 WORSE = 2.0  # times the accuracy of the beginning, where that was no better than the limit
 
 
@@ -45,7 +45,7 @@ class Positioning:
         fix_age_s, report = vehicle.age_s(GpsFix), vehicle.estimator
         if self.had_fix and fix_age_s > limits.gps_s and vehicle.age_s(NoFix) < fix_age_s:
             return f"GPS has no fix for {fix_age_s:.1f} s"
-        if self.had_fix and self.fixes_hz >= REGULAR_HZ and fix_age_s > max(SILENT_S, limits.gps_s):
+        if self.had_fix and fix_age_s > max(_silent_s(self.fixes_hz), limits.gps_s):
             return f"no GPS_RAW_INT for {fix_age_s:.1f} s"
         if report is None:
             return ""
@@ -55,6 +55,10 @@ class Positioning:
         least_m = max(limits.accuracy_m, WORSE * self.accuracy_m)
         if report.accuracy_m is not None and self.had_valid and report.accuracy_m > least_m:
             return f"its estimated position is only accurate to {report.accuracy_m:.1f} m"
-        if self.reports_hz >= REGULAR_HZ and vehicle.age_s(EstimatorReport) > SILENT_S:
+        if vehicle.age_s(EstimatorReport) > _silent_s(self.reports_hz):
             return "no report of its estimator"
         return ""
+
+
+def _silent_s(rate_hz: float) -> float:
+    return max(SILENT_S, SILENT_MESSAGES / rate_hz) if rate_hz else math.inf

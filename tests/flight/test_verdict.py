@@ -169,7 +169,7 @@ def touchdown(fall_m: float, *, rests_s: float, noise_mps: float = 0.0) -> Touch
     landing, rng = Touchdown((0.0, 0.0, 0.0)), np.random.default_rng(5)
     time_s, height, down_mps, end_s = 0.0, 3.0, 0.7, math.inf
     while time_s < end_s:
-        noise = rng.normal(0.0, noise_mps) if noise_mps else 0.0
+        noise = rng.normal(0.0, max(noise_mps, 1e-4))  # no estimator repeats itself
         landing.on_position(time_s, (0.0, 0.0, -height), down_mps + noise)
         time_s += 0.02
         if height > 0.0:
@@ -192,8 +192,12 @@ def test_landings_and_falls() -> None:
     assert hard.not_landed(on_ground=True) == f"fell at up to {hard.speed_mps:.1f} m/s"
     hovering = Touchdown((0.0, 0.0, 0.0))
     for tick in range(100):
-        hovering.on_position(0.02 * tick, (3.0, 4.0, -2.8), 0.0)
+        hovering.on_position(0.02 * tick, (3.0, 4.0, -2.8), 1e-4 * (tick % 2))
     assert hovering.not_landed(on_ground=True) == "2.8 m above the take-off point"
+    frozen = Touchdown((0.0, 0.0, 0.0))
+    for tick in range(100):
+        frozen.on_position(0.02 * tick, (3.0, 4.0, -0.8), 0.7)
+    assert frozen.not_landed(on_ground=True) == "it has not come to rest"
 
 
 def test_the_outcome_follows_the_log(flown: History) -> None:

@@ -37,7 +37,9 @@ from offboard.replay.replaying import CALLS, Replay, Sent
 
 FLIGHTS = Path(__file__).parent / "recordings"
 # Messages that the session decodes or whose rate it counts; the others only fill the log
-USED = frozenset((0, 1, 22, 24, 31, 32, 49, 77, 83, 108, 111, 115, 242, 245, 253, 436, *SETPOINTS))
+USED = frozenset(
+    (0, 1, 22, 24, 31, 32, 49, 77, 83, 108, 111, 115, 193, 230, 242, 245, 253, 436, *SETPOINTS)
+)
 COMPARED = frozenset((*SETPOINTS, *COMMANDS))
 
 

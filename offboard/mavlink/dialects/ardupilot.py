@@ -143,7 +143,7 @@ ARDUPILOT = Dialect(
     wanted=(
         *TRACKING_TELEMETRY,
         WantedMessage(0, "HEARTBEAT", 10.0, optional=True),  # the only report of the mode
-        WantedMessage(193, "EKF_STATUS_REPORT", 5.0, optional=True),
+        WantedMessage(193, "EKF_STATUS_REPORT", 2.0, optional=True),
         WantedMessage(108, "SIM_STATE", 50.0, optional=True),  # simulated truth
     ),
 )

@@ -154,7 +154,7 @@ PX4 = Dialect(
         *TRACKING_TELEMETRY,
         # shows a change of the mode within 0.02 s; the rate of HEARTBEAT, 1 Hz, cannot be changed
         WantedMessage(436, "CURRENT_MODE", 50.0, optional=True, unchanged_hz=2.0),
-        WantedMessage(230, "ESTIMATOR_STATUS", 5.0, optional=True),
+        WantedMessage(230, "ESTIMATOR_STATUS", 2.0, optional=True),
         WantedMessage(115, "HIL_STATE_QUATERNION", 50.0, optional=True),  # simulated truth
     ),
 )
