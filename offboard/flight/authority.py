@@ -144,10 +144,11 @@ class Authority:
         """We ask for `mode` as the end of the flight."""
         self._requested.append(mode)
 
-    def doubt(self, host_s: float) -> None:
-        """After a gap of our own that ended at `host_s`: only reports that arrive later, or have
-        arrived just before, count."""
-        self._counts_from_s = host_s - JUST_S
+    def doubt(self, host_s: float, paused_s: float) -> None:
+        """After a pause of our own of `paused_s` that ended at `host_s`: only reports that arrive
+        later count, or that have arrived just before if the pause was too short for the vehicle's
+        failsafe to have acted in it."""
+        self._counts_from_s = host_s - (JUST_S if paused_s < self.loss.after_s else 0.0)
         if self.arrived_s < self._counts_from_s:
             self.reported_s = -math.inf
 

@@ -336,7 +336,7 @@ class Companion:
         state.silence_s = elapsed_s - self._heard_s
         state.note_starvation()
         if paused_s > PAUSE_S and state.authority is not None and not self._lockstep:
-            state.authority.doubt(now_s)
+            state.authority.doubt(now_s, paused_s)
             self._news.paused.add(paused_s)
         if not self._lockstep:
             state.busyness.on_turn(paused_s)

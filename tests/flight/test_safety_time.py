@@ -28,7 +28,6 @@ from watch import (
     Watch,
     said,
     scenario_of,
-    sent_after,
     watched,
 )
 
@@ -331,14 +330,14 @@ def test_what_happens_often_is_told_once_a_second_and_summed_up() -> None:
     assert "(the longest of 2)" in pauses[1]
 
 
-def test_after_three_seconds_nothing_leaves_to_a_px4_in_its_failsafe() -> None:
-    pair, watch, end_s = paused(make, 3.0)
+def test_after_three_seconds_a_px4_in_its_failsafe_is_landed_without_a_setpoint() -> None:
+    pair, _, end_s = paused(make, 3.0)
     outcome = pair.companion.outcome
     assert outcome is not None
     assert outcome.exit_code == ExitCode.ABORTED
-    assert "the vehicle left OFFBOARD for POSCTL" in outcome.sentence
-    assert watch.moments[-1].mode == "POSCTL"
-    assert sent_after(pair, end_s - 3.0 + 0.01) == []
+    assert "the vehicle's own failsafe flies it, in POSCTL" in outcome.sentence
+    assert pair.went_through(Phase.DISARMED)
+    assert [at_s for at_s, _, _ in pair.setpoints if at_s > end_s - 3.0 + 0.01] == []
 
 
 def test_after_three_seconds_an_arducopter_gets_nothing_old() -> None:
