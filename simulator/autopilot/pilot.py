@@ -19,6 +19,7 @@ from simulator.steps import LOOP_S
 from simulator.vehicle.attitude import Demand
 
 _TILT_COSINE_MIN = 0.1  # the tilt raises the thrust to no more than ten times
+_HIGHER_M = 0.01  # a demanded place on the ground; less is the noise of the estimate
 OFF = Demand()
 
 
@@ -201,7 +202,7 @@ class Pilot:
         if navigator.trajectory is not None:
             return navigator.trajectory.climbs
         return (
-            motion.position_ned_m[2] < estimate.position_ned_m[2]
+            motion.position_ned_m[2] < estimate.position_ned_m[2] - _HIGHER_M
             or motion.velocity_ned_mps[2] < 0.0
             or motion.acceleration_ned_mps2[2] < 0.0
         )

@@ -143,8 +143,9 @@ def held_then_silent(pair: Pair) -> Checks:
 
 
 def landing_requested(pair: Pair) -> Checks:
-    """Level setpoints without telemetry; the first follows within 0.5 s."""
-    yield pair.instance.autopilot.commander.mode.name == "AUTO.LAND"
+    """Level setpoints without telemetry; the first follows within 0.5 s. The vehicle lands."""
+    yield not pair.instance.autopilot.commander.armed
+    yield abs(pair.instance.autopilot.plant.height_m) < 0.05
     blind_s = pair.heard_s
     after = [(at_s, s) for at_s, _, s in pair.setpoints if at_s > blind_s + 0.2]
     yield len(after) >= 5 and after[0][0] < blind_s + 0.5

@@ -26,6 +26,7 @@ from processes import SHORT, Spawn, children, free_port
 from offboard.analysis import tlog
 
 HOLD, LAND = 176, 21  # MAV_CMD
+ARMED = 128  # MAV_MODE_FLAG_SAFETY_ARMED
 LONG_S = 60.0
 HOVER = (*SHORT, "--set", "reference.duration_s=600")
 LAW_THAT_HANGS = """
@@ -131,15 +132,17 @@ def await_text(log: Path, text: bytes) -> None:
 
 
 def story(log: tlog.Tlog) -> list[str]:
-    """Commands and texts about the take-over, in order, repeated ones once."""
+    """Commands and texts about the take-over, and that the vehicle disarmed, in order, each once."""
     told: list[str] = []
     for entry in log:
         if entry.name == "COMMAND_LONG" and entry.message.command in (HOLD, LAND):
             told.append("hold" if entry.message.command == HOLD else "land")
         elif entry.name == "STATUSTEXT":
             told.append(entry.message.text.strip())
+        elif entry.name == "HEARTBEAT" and entry.frame.component_id == 1:
+            told += [] if entry.message.base_mode & ARMED else ["disarmed"]
     begun = next(i for i, text in enumerate(told) if text.startswith("supervisor: taking over"))
-    kept = [text for text in told[begun - 1 :] if text in ("hold", "land", "Disarmed by landing")]
+    kept = [text for text in told[begun - 1 :] if text in ("hold", "land", "disarmed")]
     return [text for text, before in zip(kept, ["", *kept], strict=False) if text != before]
 
 
@@ -156,7 +159,7 @@ def test_a_killed_controller_is_survived(
     )
     assert said.splitlines()[-1] == "offboard supervisor: the vehicle is disarmed"
     log = tlog.read(tmp_path / "x" / "flight.tlog")
-    assert story(log) == ["hold", "land", "Disarmed by landing"]
+    assert story(log) == ["hold", "land", "disarmed"]
     kept = tmp_path / "x" / "score.json"  # by a process that the supervisor begins
     deadline_s = time.monotonic() + LONG_S
     while not kept.exists():
@@ -181,7 +184,7 @@ def test_a_stopped_controller_that_continues_sends_nothing(
     assert "; land requested; the vehicle is disarmed" in said
     assert "Traceback" not in said
     log = tlog.read(path)
-    assert story(log) == ["hold", "land", "Disarmed by landing"]
+    assert story(log) == ["hold", "land", "disarmed"]
     texts = [entry for entry in log if entry.name == "STATUSTEXT"]
     taken_us = next(e.unix_us for e in texts if "hold requested" in e.message.text)
     setpoints_us = [e.unix_us for e in log if e.name == "SET_ATTITUDE_TARGET"]
@@ -210,4 +213,4 @@ def test_an_endless_loop_in_a_law(
     assert flight.poll() is None  # it hangs for ever
     flight.send_signal(signal.SIGSTOP)  # which needs no processor
     await_end(supervisor)
-    assert story(tlog.read(path)) == ["hold", "land", "Disarmed by landing"]
+    assert story(tlog.read(path)) == ["hold", "land", "disarmed"]

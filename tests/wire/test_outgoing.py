@@ -233,5 +233,5 @@ def test_problem_of_a_parameter_names_the_command_that_fixes_it() -> None:
     assert options.problem(10.0) is None
     assert str(options.problem(2.0)).endswith("param set GUID_OPTIONS 10")
     assert watched["COM_OF_LOSS_T"].problem(1.0) is None
-    assert str(watched["COM_OF_LOSS_T"].problem(0.0)).endswith("param set COM_OF_LOSS_T 0.3")
+    assert str(watched["COM_OF_LOSS_T"].problem(0.0)).endswith("param set COM_OF_LOSS_T 1")
     assert str(watched["ATC_ANGLE_BOOST"].problem(0.0)).endswith("param set ATC_ANGLE_BOOST 1")
