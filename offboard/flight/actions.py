@@ -6,6 +6,7 @@ import numpy as np
 
 from offboard.estimation.observer import Observer
 from offboard.flight.assessment import STILL_ARMED, has_other_sender
+from offboard.flight.authority import Standing
 from offboard.flight.decide import Decider, Tick
 from offboard.flight.gate import LEVEL
 from offboard.flight.ground_contact import STANDING_S
@@ -23,7 +24,7 @@ FIT_EVERY_S = 4.0  # between two reductions of the telemetry: a backlog must dra
 SPOOL_UP_PER_S = 0.7  # thrust ramp before lift-off, in units of gravity
 SPOOL_MAX = 2.0
 SPOOL_UNSEEN = 0.9  # without a new position nothing must lift off, or climb
-POSITION_KNOWN_S = 0.2  # age of a position that shows the height
+SPOOL_KNOWN_S = 0.2  # age of a position that shows the height
 TAKEOFF_HEIGHT_M = 3.0  # of an autopilot's own take-off, which setpoints replace on the way
 LAND_STREAM_S = 3.0  # if the landing is refused, setpoints stop and the autopilot's failsafe lands
 
@@ -86,12 +87,16 @@ class PhaseActions:
         if not holds:
             self._await_link()
         mode = dialect.hold_mode if holds else dialect.land_mode
+        fails = authority.standing is Standing.FAILSAFE
+        if fails and authority.mode == dialect.return_mode:
+            return  # the owner's choice for missing setpoints: it lands where it took off
         if authority.mode != mode:
             if self._outbox.request(dialect.hold() if holds else dialect.land()):
                 authority.request(mode)
         elif not holds:
             self._disarm_if_standing()
-        if steers and authority.mode == authority.engage_mode and tick.in_phase_s < LAND_STREAM_S:
+        streams = steers and not self._waits and tick.in_phase_s < LAND_STREAM_S
+        if streams and authority.mode == authority.engage_mode:
             self._outbox.send_level(tick.time_s, self._level())
 
     def _await_link(self) -> None:
@@ -205,7 +210,7 @@ class PhaseActions:
             return
         age_s, most = self._state.vehicle.position_age_s, SPOOL_MAX
         rising_s = tick.in_phase_s
-        if age_s > POSITION_KNOWN_S:
+        if age_s > SPOOL_KNOWN_S:
             rising_s, most = rising_s - age_s, SPOOL_UNSEEN
         spool = min(most, max(0.0, SPOOL_UP_PER_S * rising_s))
         thrust_mps2 = spool * self._state.model.gravity_mps2

@@ -165,7 +165,7 @@ def figures(
         "contradiction": identification.contradiction if identification else "",
         "not_landed": state.not_landed(),
         "positioning": state.positioning.lost(vehicle, state.limits),
-        "still_armed": f"; {STILL_ARMED}" if state.contact.stands and vehicle.armed else "",
+        "still_armed": _still_armed(state),
         "problems": "; ".join(problems(state)),
         "not_ready": not_ready(state, session),
     }
@@ -223,6 +223,12 @@ def not_ready(state: FlightState, session: Session) -> str:
             "(limits.link_delay_s, limits.link_jitter_s)"
         )
     return ""
+
+
+def _still_armed(state: FlightState) -> str:
+    contact = state.contact
+    shows = contact.stands and contact.detects_flight and state.vehicle.armed
+    return f"; {STILL_ARMED}" if shows else ""
 
 
 def _has_no_origin(state: FlightState) -> bool:

@@ -54,7 +54,7 @@ class Authority:
     heard_s: float = -math.inf  # time of the newest report
     reported_s: float = -math.inf  # time of the newest report that counts
     lost_reason: str = ""
-    lost_s: float = math.inf  # time of the loss
+    lost_s: float = math.inf  # time of the loss; -inf if HEARTBEAT, which shows armed too, told it
     loss: SetpointLoss = NEVER  # what the autopilot does without setpoints
     arrived_s: float = -math.inf  # host time of the arrival of the newest report
     _asked_in: str = ""  # the mode shown when we asked
@@ -72,13 +72,13 @@ class Authority:
         failsafe: bool = False,
         heartbeat: bool = True,
         starved: bool = False,
-        sticks: bool = False,
+        sticks: bool | None = False,
     ) -> None:
         """The vehicle reports `mode`. A failsafe may interrupt a landing that we asked for.
 
         `failsafe`: the newest HEARTBEAT shows one; `heartbeat`: it is this report. `starved`: it
         may have been without setpoints for so long that its failsafe acts; `sticks`: it receives
-        those of a pilot, who may fly it in that failsafe.
+        those of a pilot, who may fly it in that failsafe, None: that is not known.
         """
         before, self.mode = self.mode, mode
         self.heard_s, self.arrived_s = now_s, arrived_s
@@ -88,34 +88,40 @@ class Authority:
             if mode == self.engage_mode:
                 self.standing = Standing.OURS
             elif mode != self._asked_in:
-                self.lose(f"it showed {mode} after {self.engage_mode} was asked for", now_s)
+                self.lose(
+                    f"it showed {mode} after {self.engage_mode} was asked for", now_s, heartbeat
+                )
         elif self.standing in (Standing.OURS, Standing.FAILSAFE):
             if mode == self.engage_mode:  # PX4 returns to it when setpoints arrive again
                 self.standing = Standing.OURS
             elif mode in self._requested:
                 self._hand_over(mode)
             elif mode in self.loss.modes and (starved or self.standing is Standing.FAILSAFE):
-                self._on_failsafe(mode, now_s, failsafe, heartbeat=heartbeat, sticks=sticks)
+                self._on_failsafe(before, now_s, failsafe, heartbeat=heartbeat, sticks=sticks)
             else:
-                self.lose(f"the vehicle left {self.engage_mode} for {mode}", now_s)
+                self.lose(f"the vehicle left {self.engage_mode} for {mode}", now_s, heartbeat)
         elif self.standing is Standing.HANDED:
             if mode in self._requested:
                 self._hand_over(mode)
             elif not failsafe:
-                self.lose(f"the vehicle left {before} for {mode}", now_s)
+                self.lose(f"the vehicle left {before} for {mode}", now_s, heartbeat)
 
     def _on_failsafe(
-        self, mode: str, now_s: float, failsafe: bool, *, heartbeat: bool, sticks: bool
+        self, before: str, now_s: float, failsafe: bool, *, heartbeat: bool, sticks: bool | None
     ) -> None:
-        """It shows a mode of its failsafe. Only HEARTBEAT tells that from a pilot's choice."""
-        left = f"the vehicle left {self.engage_mode} for {mode}"
+        """It shows a mode of its failsafe, after the mode `before`. Only HEARTBEAT tells that from
+        a pilot's choice."""
+        left = f"the vehicle left {self.engage_mode} for {self.mode}"
         if heartbeat and not failsafe:
-            self.lose(left, now_s)
+            self.lose(left, now_s, heartbeat)
         elif sticks:
-            self.lose(f"{left} as setpoints were missing, and receives a pilot's sticks", now_s)
+            flown = f"{left} as setpoints were missing, and receives a pilot's sticks"
+            self.lose(flown, now_s, heartbeat)
         else:
-            shown = self.standing is Standing.FAILSAFE and self._failsafe_shown
-            self.standing, self._failsafe_shown = Standing.FAILSAFE, shown or heartbeat
+            stays = self.standing is Standing.FAILSAFE and self.mode == before
+            shown = stays and self._failsafe_shown
+            self.standing = Standing.FAILSAFE
+            self._failsafe_shown = shown or (heartbeat and sticks is not None)
 
     def _hand_over(self, mode: str) -> None:
         """It shows a mode that we asked for: one that we asked for before would be a step back."""
@@ -159,10 +165,11 @@ class Authority:
         if self.is_ours:
             self.standing = Standing.OURS
 
-    def lose(self, reason: str, now_s: float) -> None:
-        """The vehicle is not ours any more, for good."""
+    def lose(self, reason: str, now_s: float, heartbeat: bool = True) -> None:
+        """The vehicle is not ours any more, for good; `heartbeat`: HEARTBEAT shows it."""
         if self.standing is not Standing.LOST:
-            self.standing, self.lost_reason, self.lost_s = Standing.LOST, reason, now_s
+            self.standing, self.lost_reason = Standing.LOST, reason
+            self.lost_s = -math.inf if heartbeat else now_s
 
     def known(self, now_s: float) -> bool:
         """Whether the newest report that counts is recent enough to act on."""

@@ -16,6 +16,7 @@ from offboard.control.base import Adopting, Controller
 from offboard.estimation.observer import Observer
 from offboard.flight import assessment
 from offboard.flight.actions import PhaseActions
+from offboard.flight.authority import Standing
 from offboard.flight.busyness import PAUSE_S, Busyness
 from offboard.flight.decide import Decider, Tick
 from offboard.flight.event_processor import EventProcessor
@@ -313,6 +314,8 @@ class Companion:
             holding=state.phase is Phase.HOLD,
             loss=authority.loss if authority else NEVER,
             sticks=health is not None and health.radio_ok,
+            starved=state.starved
+            or (authority is not None and authority.standing is Standing.FAILSAFE),
         )
 
     def _status(self) -> tuple[int, int]:

@@ -167,7 +167,7 @@ class EventProcessor:
             failsafe=vehicle.in_failsafe,
             heartbeat=isinstance(event, Heartbeat),
             starved=state.starved,
-            sticks=vehicle.health is not None and vehicle.health.radio_ok,
+            sticks=vehicle.sticks,
         )
         ours = mode == state.authority.engage_mode
         contact = state.contact

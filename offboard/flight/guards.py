@@ -48,7 +48,7 @@ def in_failsafe(now: Facts) -> bool:
 
 
 def other_sender(now: Facts) -> bool:
-    """Another program sends setpoints on the link, or uses our ids."""
+    """Another program controls the vehicle: it sends setpoints or mode commands, or says so."""
     return now.other_sender and not now.limits.begin_with_other_sender
 
 

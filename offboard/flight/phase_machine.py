@@ -58,7 +58,7 @@ class PhaseMachine:
         """A landing by the vehicle's own failsafe is awaited, but it is not ours."""
         state = self._state
         if now.own_failsafe and state.phase is Phase.LAND and state.outcome is None:
-            sentence = f"the vehicle's own failsafe lands it, in {state.vehicle.mode}"
+            sentence = f"the vehicle's own failsafe flew it, in {state.vehicle.mode}"
             state.outcome = Outcome(ExitCode.ABORTED, sentence + self._explanation())
 
     def on_reboot(self) -> None:
@@ -103,7 +103,8 @@ class PhaseMachine:
             state.positioning.begin(state.vehicle, self._session.rates_hz, dialect.estimator_name)
             if self._identification:
                 self._identification.on_link_delay(state.link.estimate)
-            self._decider.begin()  # on the ground, where the time that it takes does no harm
+            if row.source is Phase.ARM:  # on the ground the time that it takes does no harm
+                self._decider.begin()
         if self._identification:
             self._identification.on_phase(row.target, state.time_s)
         if row.source in WAITING and row.target in FLYING and state.authority:

@@ -33,6 +33,7 @@ from offboard.mavlink.events import (
 from offboard.mavlink.framing import HEARTBEAT
 from offboard.model.frames import course_from_quaternion
 
+HEALTH_S = 1.5  # SYS_STATUS is requested at 2 Hz
 ARMED_KNOWN_S = 3.0  # PX4 reports it in HEARTBEAT alone, at 1 Hz
 OUTAGE_S = 0.3  # a longer gap of all telemetry is an outage of the link
 MESSAGES_MAX = 12  # texts and refusals kept for the sentence that explains a failure
@@ -109,6 +110,11 @@ class VehicleState:
     def in_failsafe(self) -> bool:
         """HEARTBEAT shows a failsafe or an emergency."""
         return self.heartbeat is not None and self.heartbeat.system_status >= FAILSAFE_STATUS
+
+    @property
+    def sticks(self) -> bool | None:
+        """Whether it receives a pilot's sticks; None while that is not known."""
+        return self.health.radio_ok if self.health and self.age_s(SystemHealth) < HEALTH_S else None
 
     @property
     def has_state(self) -> bool:

@@ -248,7 +248,7 @@ class TimesyncReply:
 
 @dataclass(frozen=True, slots=True)
 class Rebooted:
-    """Vehicle time decreased by more than reordering explains: the vehicle was rebooted."""
+    """Several stamps in a row are of a new epoch: the vehicle was rebooted."""
 
     time_s: float
 

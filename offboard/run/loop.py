@@ -186,7 +186,7 @@ class Loop:
         if guarded and UNANSWERED in self._warned:
             self._warned.discard(UNANSWERED)
             self._companion.announce(ANSWERS)
-        elif not (guarded or supervisor.lost):
+        elif supervisor.loaded and not (guarded or supervisor.lost):
             self._warn(UNANSWERED)
         if not supervisor.lost:
             return

@@ -130,6 +130,7 @@ class Rescue:
             beat_s=watch.beat_s,
             loss=SetpointLoss(beat["loss"]["after_s"], tuple(beat["loss"]["modes"])),
             sticks=beat["sticks"],
+            starved=beat["starved"],
         )
         self._text_id = 0
 

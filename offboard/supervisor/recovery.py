@@ -50,7 +50,8 @@ class Request:
 class Recovery:
     """Begins at `began_s`; the newest beat of the controller was at `beat_s`. As it knew them:
     `holding`: the vehicle was asked to hold; `reported_s`: time of the newest report of a mode that
-    was ours; `loss`: what follows when setpoints stop; `sticks`: those of a pilot are received.
+    was ours; `loss`: what follows when setpoints stop; `sticks`: those of a pilot are received;
+    `starved`: setpoints were missing before, or its own failsafe for that flew it.
 
     `ended` says how it ended, empty until then; `refusal` and `notice` have news for the user."""
 
@@ -64,12 +65,14 @@ class Recovery:
         beat_s: float = math.inf,
         loss: SetpointLoss = NEVER,
         sticks: bool = False,
+        starved: bool = False,
     ) -> None:
         self._dialect = dialect
         self._holding = holding
         self._began_s = began_s
         self._loss = loss
-        self._loses_s = min(beat_s, began_s) + loss.after_s - EARLY_S
+        missing_s = min(beat_s, began_s) + loss.after_s - EARLY_S
+        self._loses_s = -math.inf if starved else missing_s
         self._sticks = sticks
         self._mode: str | None = None
         self._before: str | None = None  # the mode before it
@@ -119,7 +122,11 @@ class Recovery:
         if mode == self._dialect.hold_mode and not self._landing:
             ours = self._holding or at_s > self._first_s
         self._landing |= mode == self._dialect.land_mode
-        if failsafe is not False and self._explains(mode, at_s) and (failsafe or not ours):
+        if (
+            failsafe is not False
+            and self._explains(mode, at_s)
+            and (failsafe or not ours or self._fallen_s < math.inf)
+        ):
             self._fall(mode, at_s, shown=bool(failsafe))
             return
         self._fallen_s, self._fallen_shown = math.inf, False

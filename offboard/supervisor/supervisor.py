@@ -51,7 +51,8 @@ class Supervised:
     mode of our setpoints or in one that we asked for, by a report that arrived at `reported_s`
     (`clock.monotonic_s`), of which the supervisor judges the age; whether it may be `flying`, and
     whether it was asked to hold (`holding`): then this mode is ours, too. `loss`: what its
-    autopilot does without setpoints; `sticks`: it receives those of a pilot."""
+    autopilot does without setpoints; `sticks`: it receives those of a pilot; `starved`: setpoints
+    were missing already, or its failsafe for that flies it."""
 
     vehicle: VehicleFound
     ours: bool
@@ -60,6 +61,7 @@ class Supervised:
     holding: bool = False
     loss: SetpointLoss = NEVER
     sticks: bool = False
+    starved: bool = False
 
     @property
     def silent_s(self) -> float:
@@ -110,6 +112,11 @@ class Supervisor:
     def said(self) -> list[str]:
         """Its sentences: why it took over, and what it did."""
         return self._lines[1:]
+
+    @property
+    def loaded(self) -> bool:
+        """Whether the process has begun to watch."""
+        return bool(self._lines)
 
     @property
     def guards(self) -> bool:

@@ -59,7 +59,6 @@ RECORD = np.dtype(
         ("white_sds", "f8", WHITE_COUNT),
         # the satellite receiver: position NED and velocity NE
         ("fix_sds", "f8", 5),
-        ("fix_offset", "f8", 3),
         # the attitude loop
         ("row", "f8", ROW_WIDTH),
         ("history", "f8", (_HISTORY_ROWS, ROW_WIDTH)),
@@ -127,7 +126,7 @@ def receive_fix(plants: Any) -> None:
     for i in range(5):
         plant.fix[i] *= plant.fix_sds[i]
     for i in range(3):
-        plant.fix[i] += plant.body[10 + i] + plant.fix_offset[i]
+        plant.fix[i] += plant.body[10 + i]
     for i in range(2):
         plant.fix[3 + i] += plant.body[7 + i]
 

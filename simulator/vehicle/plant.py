@@ -187,10 +187,6 @@ class Plant:
         fix = self.record["fix"][0].copy()
         return Fix(fix[:3], fix[3:])
 
-    def shift_fixes(self, offset_ned_m: Triple) -> None:
-        """Offset the GPS fixes; offsets add up."""
-        self.record["fix_offset"][0] += offset_ned_m
-
     def motion(self) -> list[float]:
         """The true motion as floats: attitude wxyz, rates FRD, then NED velocity, position and
         acceleration."""

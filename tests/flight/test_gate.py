@@ -109,7 +109,7 @@ def replayed(history: list[Occurrence], *, failsafes: bool = True) -> tuple[Auth
         elif each.kind == "request":
             authority.request(each.mode)
         elif each.kind == "pause":
-            authority.doubt(now_s)
+            authority.doubt(now_s, 0.9)
         else:
             authority.lose("by a test", now_s)
     return authority, now_s

@@ -375,7 +375,7 @@ ROWS = (
         "landing refused",
         lambda: hover(firmware=refusing("land", "No.")),
         4,
-        "the vehicle's own failsafe lands it, in POSCTL; the vehicle said: ",
+        "the vehicle's own failsafe flew it, in POSCTL; the vehicle said: ",
         Phase.DISARMED,
         landed_by_failsafe,
     ),

@@ -128,10 +128,15 @@ def test_in_a_race_with_the_failsafe_it_is_landed(after_s: float, fallback: int)
     assert not stopped.armed
 
 
-@pytest.mark.parametrize(("fallback", "asks"), [(POSCTL, False), (LOITER, True)])
-def test_in_the_failsafe_it_is_watched_and_landed_if_it_does_not(fallback: int, asks: bool) -> None:
+@pytest.mark.parametrize(
+    ("fallback", "silent_s", "asks"),
+    [(POSCTL, 1.2, False), (LOITER, 1.2, True), (LOITER, 0.6, True)],
+)
+def test_in_the_failsafe_it_is_watched_and_landed_if_it_does_not(
+    fallback: int, silent_s: float, asks: bool
+) -> None:
     """Every request to hold is lost. POSCTL without sticks sinks by itself."""
-    stopped = Stopped(fallback, silent_s=1.2)
+    stopped = Stopped(fallback, silent_s=silent_s)
     feed = stopped.feed
     stopped.feed = lambda frame: None if decode(frame).command == 176 else feed(frame)
     assert stopped.run() == "the vehicle is disarmed"

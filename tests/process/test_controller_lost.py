@@ -132,7 +132,7 @@ def await_text(log: Path, text: bytes) -> None:
 
 
 def story(log: tlog.Tlog) -> list[str]:
-    """Commands and texts about the take-over, and that the vehicle disarmed, in order, each once."""
+    """What was asked about the take-over, and that the vehicle disarmed, in order, each once."""
     told: list[str] = []
     for entry in log:
         if entry.name == "COMMAND_LONG" and entry.message.command in (HOLD, LAND):

@@ -194,7 +194,8 @@ class Dialect:
     # mode, and the modes by its value
     loss_time: tuple[str, float]
     loss_action: str = ""
-    loss_modes: tuple[str, ...] = ()
+    loss_modes: tuple[str, ...] = ()  # by the value of `loss_action`
+    loss_order: tuple[str, ...] = ()  # if it cannot enter the chosen one, it enters one behind it
     defects: tuple[Defect, ...] = ()
 
     def mode_name(self, custom_mode: int) -> str:
@@ -215,7 +216,8 @@ class Dialect:
         action = parameters.get(self.loss_action)
         modes = self.loss_modes
         if action is not None:
-            modes = modes[int(action) : int(action) + 1] if action >= 0 else ()
+            chosen = modes[int(action) : int(action) + 1] if action >= 0 else ()
+            modes = self.loss_order[self.loss_order.index(chosen[0]) :] if chosen else ()
         return SetpointLoss(parameters.get(name, usual_s), modes)
 
     def engage(self) -> CommandLong:

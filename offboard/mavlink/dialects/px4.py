@@ -146,6 +146,7 @@ PX4 = Dialect(
     loss_time=("COM_OF_LOSS_T", 1.0),
     loss_action="COM_OBL_RC_ACT",
     loss_modes=("POSCTL", "ALTCTL", "STABILIZED", "AUTO.RTL", "AUTO.LAND", "AUTO.LOITER"),
+    loss_order=("POSCTL", "ALTCTL", "STABILIZED", "AUTO.LOITER", "AUTO.RTL", "AUTO.LAND"),
     defects=(
         Defect((1, 17), "setpoints without thrust keep OFFBOARD alive; ours always have thrust"),
         Defect((1, 17), "COM_OBL_RC_ACT 0 to 2 is obeyed without a radio"),
