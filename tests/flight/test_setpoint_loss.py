@@ -13,7 +13,7 @@ from watch import scenario_of
 from offboard.flight.phases import Phase
 from offboard.mavlink.dialects.px4 import PX4
 from offboard.mavlink.events import VehicleFound
-from offboard.mavlink.outgoing import AttitudeTarget
+from offboard.mavlink.outgoing import AttitudeTarget, CommandLong
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.supervisor.recovery import Recovery
 from offboard.supervisor.supervisor import Supervised
@@ -49,6 +49,7 @@ class Stopped:
         self.session.adopt(VEHICLE, "vehicle")
         self.recovery: Recovery | None = None
         self.feed = self.instance.feed
+        self.feed(self.session.encode(CommandLong.message_interval(436, 50.0)))  # CURRENT_MODE
         self.now_s = -STREAM_S  # since the newest setpoint
         self.asked: list[tuple[float, int, float]] = []  # time, MAV_CMD, height
         self.modes: list[str] = []
