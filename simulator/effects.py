@@ -57,7 +57,7 @@ class Running:
     channels: list[Channel]
     random: Random
     datagrams: list[bytes] = field(default_factory=list)  # of a stranger, to be sent
-    begins_s: float | None = None  # None: the moment it counts from has not come
+    begins_s: float | None = None  # None until the event that starts its delay
     effect: Effect | None = None  # once it has begun
     over: bool = False
 
@@ -184,7 +184,7 @@ def _refusal(vehicle: Vehicle, running: Running) -> Effect:
 
 
 def _pilot_takes_over(vehicle: Vehicle, running: Running) -> Effect:
-    """Switch as by command, and where no command may, as to a mode that needs sticks."""
+    """Switch the mode as a command would; a mode that needs sticks is entered as by the pilot."""
     autopilot = vehicle.autopilot
     mode = autopilot.firmware.mode_named(running.fault.mode or autopilot.firmware.hold_mode)
     assert mode is not None, "simulator.config checks it"
@@ -227,7 +227,7 @@ def _second_vehicle(vehicle: Vehicle, running: Running) -> Effect:
 
 
 def _stranger(vehicle: Vehicle, running: Running) -> Effect:
-    """Datagrams that nobody fetches are limited in number."""
+    """Send datagrams of another sender; those that wait to be sent are limited in number."""
     fault, sender = running.fault, _sender(vehicle, running)
     while (yield):
         sender.step += 1

@@ -108,7 +108,7 @@ def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool = False) -> Com
     north, east, down = command.thrust_direction_ned
     lateral = math.hypot(north, east)
     if math.atan2(lateral, down) > vehicle.tilt_max_rad:
-        # an upright vector has no vertical plane of its own: atan2 takes the north's
+        # a direction that is exactly vertical is tilted to the north (atan2 of zeros)
         towards_rad, scale = math.atan2(east, north), math.sin(vehicle.tilt_max_rad)
         north, east = scale * math.cos(towards_rad), scale * math.sin(towards_rad)
         down = math.cos(vehicle.tilt_max_rad)

@@ -18,7 +18,8 @@ class PilotSwitch:
     `engaged`: from there it was switched to the mode of setpoints, in the air. `unclaimed`: since
     the service began, or the vehicle rebooted, it has shown the mode of setpoints only, in the air.
     `hasty`: it left that mode and returned, in the air, before a HEARTBEAT could show the other one
-    without a failsafe. `showed_ours`: the report before; None if a failsafe may have changed it.
+    without a failsafe. `showed_ours`: whether the report before this one showed that mode; None if
+    a failsafe may have changed it.
     """
 
     elsewhere: bool = False

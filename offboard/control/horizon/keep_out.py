@@ -146,7 +146,7 @@ def clearances(
     volumes: Sequence[Sphere | Cylinder | Box], times_s: Array, positions_ned_m: Array
 ) -> Array:
     """Distance to the nearest volume, (n,), at times (n,) since the start of the reference and
-    positions (n, 3) relative to the take-off point; infinite without volumes."""
+    positions (n, 3) relative to the take-off point. It is inf where no volumes are given."""
     packed, origin = pack(volumes), np.zeros(3)
     nearest = np.full(len(times_s), np.inf)
     for i, (time_s, position) in enumerate(zip(times_s, positions_ned_m, strict=True)):

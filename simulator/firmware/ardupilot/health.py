@@ -38,7 +38,7 @@ _GATE_MPS = 5.0 * 0.3  # EK3_VEL_I_GATE standard deviations of EK3_VELNE_M_NSE
 
 
 def velocity_ratio(error_mps: float) -> float:
-    """Not squared: EKF_STATUS_REPORT has square roots."""
+    """The ratio as EKF_STATUS_REPORT has it: the square root of the squared test ratio."""
     return error_mps / _GATE_MPS
 
 
