@@ -104,7 +104,9 @@ class Authority:
             if mode in self._requested:
                 self._hand_over(mode)
             elif not failsafe:
-                self.lose(f"the vehicle left {before} for {mode}", now_s, heartbeat)
+                kept = f"a pilot keeps it in {mode}"
+                left = f"the vehicle left {before} for {mode}"
+                self.lose(kept if mode == before else left, now_s, heartbeat)
 
     def _on_failsafe(
         self, before: str, now_s: float, failsafe: bool, *, heartbeat: bool, sticks: bool | None
@@ -121,7 +123,8 @@ class Authority:
             stays = self.standing is Standing.FAILSAFE and self.mode == before
             shown = stays and self._failsafe_shown
             self.standing = Standing.FAILSAFE
-            self._failsafe_shown = shown or (heartbeat and sticks is not None)
+            counts = self.arrived_s >= self._counts_from_s
+            self._failsafe_shown = shown or (heartbeat and counts and sticks is not None)
 
     def _hand_over(self, mode: str) -> None:
         """It shows a mode that we asked for: one that we asked for before would be a step back."""
@@ -155,6 +158,7 @@ class Authority:
         later count, or that have arrived just before if the pause was too short for the vehicle's
         failsafe to have acted in it."""
         self._counts_from_s = host_s - (JUST_S if paused_s < self.loss.after_s else 0.0)
+        self._failsafe_shown = False
         if self.arrived_s < self._counts_from_s:
             self.reported_s = -math.inf
 

@@ -114,6 +114,8 @@ class VehicleClock:
         """A message with the stamp `stamp_s` arrived at host time `arrived_s`."""
         ahead_s = stamp_s - self.now_s(arrived_s)
         if math.isfinite(self._measured_s) and ahead_s > JUMP_S:
+            if not self._settled:
+                self.reset()  # before the flight the rate is measured anew
             self.jumped_s += ahead_s
             self._telemetry.clear()
             self._replies.clear()

@@ -160,13 +160,14 @@ class Outbox:
         """Send a command if the vehicle is ours; returns whether it was sent.
 
         In one phase it is sent once. Only one that was refused, or that nothing has answered, is
-        sent again, after a second.
+        sent again, after a second and a new report of the mode: a pilot may have changed it.
         """
         state = self._state
         key = state.phase, request
         result = state.vehicle.results.get(request.command)
         requested_s = self._requested_s.get(key, -math.inf)
-        waits = state.now_s - requested_s < REPEAT_S - 1e-6
+        heard_s = state.authority.heard_s if state.authority else -math.inf
+        waits = state.now_s - requested_s < REPEAT_S - 1e-6 or heard_s < requested_s
         done = math.isfinite(requested_s) and result in GOOD_RESULTS
         if waits or done or not state.may_command:
             return False

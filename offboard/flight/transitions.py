@@ -170,7 +170,7 @@ TRANSITIONS: tuple[Row, ...] = (
         Phase.LAND,
         guards.disarmed_elsewhere,
         Phase.FAILED,
-        "disarmed, but not landed: {not_landed}",
+        "disarmed, landing not confirmed: {not_landed}",
         ABORTED,
     ),
     Row(Phase.LAND, guards.lost_armed, Phase.YIELDED, "{lost}", ABORTED),

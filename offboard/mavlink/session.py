@@ -264,7 +264,10 @@ class Session:
                 return DropReason.FOREIGN_SYSTEM
             if frame.component_id != self.vehicle.component_id:
                 return DropReason.FOREIGN_COMPONENT
-            return None
+            if isinstance(heard, DropReason):
+                return heard  # a HEARTBEAT with its ids that is no autopilot's
+            other = heard is not None and heard.name != self.vehicle.autopilot
+            return DropReason.FOREIGN_COMPONENT if other else None
         if frame.component_id != AUTOPILOT_COMPONENT:
             return DropReason.FOREIGN_COMPONENT
         if self.settings.system_id not in (None, frame.system_id):

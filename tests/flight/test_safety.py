@@ -476,7 +476,7 @@ def test_a_fall_in_the_landing_is_not_flown(fly: Fly) -> None:
     pair = fly(ONE_LAP, scenario="motors_cut")
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
-    assert "disarmed, but not landed: fell at up to" in outcome.sentence
+    assert "disarmed, landing not confirmed: fell at up to" in outcome.sentence
 
 
 @BOTH

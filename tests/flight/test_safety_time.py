@@ -124,7 +124,7 @@ STUCK = {
     "landing": (
         {"after": "landing", "at_s": 0.5},
         [POSITION],
-        "disarmed, but not landed: no LOCAL_POSITION_NED shows it",
+        "disarmed, landing not confirmed: no LOCAL_POSITION_NED shows it",
     ),
     "attitude": (IN_FLIGHT, [ATTITUDE], "no ATTITUDE_QUATERNION for 0.[56] s"),
     "both": (IN_FLIGHT, [POSITION, ATTITUDE], "no telemetry for 1.0 s"),
