@@ -9,6 +9,7 @@ import pytest
 
 from offboard.flight import authority as module
 from offboard.flight.authority import Authority, Standing
+from offboard.mavlink.dialects.base import SetpointLoss
 
 
 def shown(*modes: str, asked_after: int = 1) -> Authority:
@@ -134,6 +135,21 @@ def test_a_report_from_before_the_pause_still_shows_a_take_over() -> None:
     authority.doubt(50.0, 0.9)
     authority.on_mode("POSCTL", 7.0, arrived_s=47.0)
     assert authority.standing is Standing.LOST
+
+
+def test_a_failsafe_that_was_shown_within_a_pause_permits_nothing() -> None:
+    """A pilot may have taken it since, in the same mode."""
+    authority = shown("POSCTL", "OFFBOARD")
+    authority.loss = SetpointLoss(1.0, ("POSCTL",))
+    authority.doubt(50.0, 1.3)
+    for heartbeat, arrived_s in ((True, 49.8), (False, 50.3)):
+        authority.on_mode(
+            "POSCTL", 7.0, arrived_s=arrived_s, failsafe=True, heartbeat=heartbeat, starved=True
+        )
+    assert authority.standing is Standing.FAILSAFE
+    assert not authority.permits_command(7.0)
+    authority.on_mode("POSCTL", 7.5, arrived_s=50.8, failsafe=True, starved=True)
+    assert authority.permits_command(7.5)
 
 
 def test_the_first_loss_is_the_one_that_is_told() -> None:

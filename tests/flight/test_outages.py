@@ -87,6 +87,23 @@ def test_a_pilot_who_takes_over_in_an_outage_keeps_it(vehicle: str) -> None:
     assert pair.companion.phase is Phase.YIELDED
 
 
+def test_landing_is_not_asked_again_of_a_vehicle_that_is_not_heard() -> None:
+    """What it sends is lost for 4 s, and a pilot takes it after the first request."""
+    asked = in_phase(Phase.LAND, 0.6)
+    pair = arducopter(at=[(in_phase(Phase.TRACK, 1.0), lambda flying: deaf(flying, 4.0))])
+    commander = pair.instance.autopilot.commander
+    pair.at.append((asked, lambda _: commander.switch("LOITER")))
+    assert "left GUIDED for LOITER" in pair.fly().sentence
+    assert len(pair.commands(LAND)) == 1
+    assert commander.mode.name == "LOITER"
+
+
+def deaf(pair: Pair, for_s: float) -> None:
+    """From now on nothing of the vehicle arrives."""
+    ends_s = pair.time_s + for_s
+    pair.down = lambda time_s, datagrams: [] if time_s < ends_s else datagrams
+
+
 @pytest.mark.parametrize("pilot", [False, True])
 @pytest.mark.parametrize("vehicle", ["px4, which holds", "arducopter"])
 def test_without_reports_of_the_mode_it_listens_and_lands_it_later(

@@ -6,7 +6,7 @@ from __future__ import annotations
 import pytest
 from doctor_bench import bench
 from faults import heartbeats
-from pair import hover, in_phase
+from pair import Pair, hover, in_phase
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from serving import serve
 
@@ -46,6 +46,18 @@ def test_only_multirotors_are_flown(kind: int, believed: Vehicle | None, says: s
     assert says in outcome.sentence
     assert not says or {m.command for m in pair.commands(176) + pair.commands(400)} == set()
     assert not says or pair.setpoints == []
+
+
+def test_a_heartbeat_with_the_vehicles_ids_that_is_no_autopilots_counts_for_nothing() -> None:
+    """A gimbal that is set to component 1. Its mode was taken for the pilot's."""
+    gimbal = mavlink.MAVLink(None, srcSystem=1, srcComponent=1)
+    beat = mavlink.MAVLink_heartbeat_message(26, 8, 0, 0, 4, 3).pack(gimbal)
+
+    def spoil(flying: Pair) -> None:
+        flying.down = lambda time_s, datagrams: [*datagrams, beat]
+
+    pair = hover(at=[(in_phase(Phase.TRACK, 0.5), spoil)])
+    assert pair.fly().exit_code == ExitCode.FLOWN
 
 
 def test_the_service_leaves_another_vehicle_alone() -> None:
