@@ -148,6 +148,7 @@ class Watcher:
     """A supervisor that never takes over."""
 
     said: tuple[str, ...] = ()
+    loaded = True
 
     def __init__(self, *, lost: bool = False) -> None:
         self.lost, self.restarts = lost, 0

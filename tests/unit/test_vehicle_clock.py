@@ -88,17 +88,6 @@ def test_a_jump_forward_is_measured(jump_s: float, shown_s: float) -> None:
     assert clock.jumped_s == pytest.approx(shown_s, abs=0.001)
 
 
-def test_a_jump_before_the_flight_leaves_no_wrong_rate() -> None:
-    """Of a vehicle that boots while it is heard: its first 2 s are missing."""
-    clock = VehicleClock()
-    hear(clock, every(0.02, 0.0, 1.0))
-    newest = hear(clock, every(0.02, 1.0, 4.0), stamp=lambda at_s: max(at_s - 2.0, 0.0) + 3.0)
-    clock.settle()
-    newest = hear(clock, every(0.02, 4.0, 9.0), stamp=lambda at_s: at_s + 1.0)
-    assert clock.jumped_s == 0.0
-    assert clock.age_s(*newest) == pytest.approx(0.0, abs=0.001)
-
-
 def test_after_a_reboot_everything_begins_anew() -> None:
     clock = VehicleClock()
     hear(clock, every(0.02, 0.0, 10.0), stamp=lambda at_s: 4.0 * at_s)
