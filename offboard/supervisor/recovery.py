@@ -3,8 +3,8 @@
 Hold, and after some seconds land. Both are asked for only while the vehicle shows a mode that is
 ours or that we asked for, and at most once for each report of the mode. Any other mode is the
 decision of a pilot or of the vehicle's own failsafe, and final, whatever is reported after it. So
-is hold that was reported before our request, that the vehicle has not acknowledged, or that comes
-after the landing mode.
+is hold that was reported before our request, that the vehicle has not acknowledged though asked
+again, or that comes after the landing mode.
 
 One failsafe decides nothing: that for missing setpoints, which stopped with the controller. It
 shows by its mode, by its time and by HEARTBEAT.system_status, which a pilot's choice clears. In it
@@ -30,7 +30,7 @@ from offboard.mavlink.outgoing import CommandLong
 REPEAT_S = 0.3  # between two requests
 UNHEARD_MAX = 3  # requests to a vehicle of which nothing is heard
 HOLD_S = 5.0  # then land
-ACKNOWLEDGED_S = 1.0  # after hold is reported: an acknowledgement that comes later was lost
+ACKNOWLEDGED_S = 3.0  # after hold is reported; it is asked for again until then
 FRESH_S = 2.5  # an older report of the mode is no reason for a command
 LONGEST_S = 300.0
 EARLY_S = 0.3  # the newest setpoint left before the newest beat, and may have been lost
@@ -195,6 +195,8 @@ class Recovery:
             return None
         if self._mode == self._dialect.engage_mode:
             return self._hold() if now_s - self._began_s < HOLD_S else self._land()
+        if not (self._holding or self._acknowledged):
+            return self._hold()  # it holds, but the acknowledgement may have been lost
         return self._land() if now_s - self._held_s >= HOLD_S else None
 
     def _hold(self) -> Request:

@@ -23,6 +23,7 @@ class Vehicle:
         self.mode = dialect.engage_mode
         self.obeys = obeys
         self.acknowledges = obeys
+        self.loses = 0  # acknowledgements, on the link
         self.armed = True
         self.heard = True
         self.land_s = land_s
@@ -47,7 +48,8 @@ class Vehicle:
             request = recovery.due(100.0 + time_s)
             if request:
                 self.asked.append((round(time_s, 2), request.command.command))
-                if self.acknowledges:
+                self.loses -= 1
+                if self.acknowledges and self.loses < 0:
                     ack = CommandAck(request.command.command, "ACCEPTED")
                     recovery.see(ack, 100.0 + time_s + STEP_S)
                 if self.obeys:
@@ -129,13 +131,24 @@ def test_of_a_vehicle_that_is_not_heard_hold_is_asked_three_times(dialect: Diale
 
 @FIRMWARES
 def test_hold_that_the_vehicle_has_not_acknowledged_is_left_alone(dialect: Dialect) -> None:
-    """The request was lost, and its pilot or its failsafe has chosen hold."""
+    """Every request was lost, and its pilot or its failsafe has chosen hold: nothing but hold is
+    asked."""
     vehicle = Vehicle(dialect)
     vehicle.acknowledges = False
     assert vehicle.survives(before=dialect.engage_mode).startswith(
         f"the vehicle shows {dialect.hold_mode}, and has not acknowledged the request"
     )
-    assert [command for _, command in vehicle.asked] == [HOLD]
+    assert {command for _, command in vehicle.asked} == {HOLD}
+    assert len(vehicle.asked) <= 5
+
+
+@FIRMWARES
+def test_a_lost_acknowledgement_of_hold_does_not_leave_the_vehicle_there(dialect: Dialect) -> None:
+    """As on a real PX4: the controller continued, and read the acknowledgement."""
+    vehicle = Vehicle(dialect)
+    vehicle.loses = 1
+    assert vehicle.survives(before=dialect.engage_mode) == "the vehicle is disarmed"
+    assert [command for _, command in vehicle.asked] == [HOLD, HOLD, LAND]
 
 
 def asked(*reports: tuple[float, str], armed: bool = True) -> tuple[list[int], str]:
