@@ -88,9 +88,10 @@ def health(port: int) -> tuple[int, dict[str, Any]]:
         return error.code, json.loads(error.read())
 
 
-def await_phase(port: int, *phases: str) -> None:
+def await_phase(service: subprocess.Popen[str], port: int, *phases: str) -> None:
     deadline_s = time.monotonic() + LONG_S
     while True:
+        assert service.poll() is None, service.communicate()
         try:
             if scraped(port)["phase"] in phases:
                 return
@@ -124,7 +125,7 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
                "--signing-key", "key", "--set", "reference.duration_s=600")  # fmt: skip
     variables = {"OFFBOARD_REPORT": "1", "XDG_STATE_HOME": str(tmp_path)}
     service = spawn(*command, **variables)
-    await_phase(web, "connect")
+    await_phase(service, web, "connect")
     assert health(web)[0] == 503
     second = spawn("offboard", "daemon", "--connect", link, "--out", "other")
     assert second.wait(LONG_S) == 3
@@ -138,7 +139,7 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     spawn("simulator", "--signing-key", "key", "--connect", f"udpout:127.0.0.1:{port}",
           "--gcs", f"udpout:127.0.0.1:{pilot.port}", "--param", "MIS_TAKEOFF_ALT=3",
           "--param", "COM_OF_LOSS_T=4")  # fmt: skip
-    await_phase(web, "standby")
+    await_phase(service, web, "standby")
     strangers = many_strangers(web, service.pid)
     armed = lambda m: m.get_type() == "HEARTBEAT" and m.base_mode & 128  # noqa: E731
     pilot.until(armed, lambda: pilot.command(ARM, 1))
@@ -147,7 +148,7 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     pilot.command(SET_MODE, 1, 4, 3)
     pilot.until(shows(0x03040000))
     pilot.until(shows(0x00060000), lambda: pilot.command(SET_MODE, 1, 6, 0))
-    await_phase(web, *ENGAGED)
+    await_phase(service, web, *ENGAGED)
     for stranger in strangers:  # all were left or refused before a client was served
         stranger.close()
     assert scraped(web)["offboard_flights_total"] == 1.0
@@ -180,9 +181,9 @@ def test_a_pilot_engages_and_a_stop_hands_back(spawn: Spawn, tmp_path: Path) -> 
     names = {entry.name for entry in log}
     assert {"TUNNEL", "HEARTBEAT", "PARAM_VALUE", "SET_ATTITUDE_TARGET", "STATUSTEXT"} <= names
     killed = spawn(*command, **variables)
-    await_phase(web, "standby")
+    await_phase(killed, web, "standby")
     pilot.until(shows(0x00060000), lambda: pilot.command(SET_MODE, 1, 6, 0))
-    await_phase(web, *ENGAGED)
+    await_phase(killed, web, *ENGAGED)
     killed.kill()
     held = shows(0x03040000)
     pilot.until(lambda m: held(m) and m.system_status == 4)  # asked by the supervisor: no failsafe
