@@ -131,7 +131,7 @@ def simulate(
     with loading():
         from offboard.documents.reading import DocumentError
         from offboard.documents.signing_key import read_key
-        from offboard.io.clock import unix_us
+        from offboard.link.clock import unix_us
         from simulator import config
         from simulator.firmware.catalogue import FIRMWARES
         from simulator.instance import VIRTUAL_EPOCH_US, Instance

@@ -14,7 +14,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from offboard.documents.repeated import Repeated
-from offboard.io.clock import monotonic_s, unix_us
+from offboard.link.clock import monotonic_s, unix_us
 from simulator.instance import Instance
 from simulator.link.links import Link, wait
 from simulator.link.recorder import Recorder

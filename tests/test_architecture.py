@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-SHARED = ("offboard.compiled", "offboard.documents", "offboard.io.clock", "offboard.model")
+SHARED = ("offboard.compiled", "offboard.documents", "offboard.link.clock", "offboard.model")
 PACKAGES = ("offboard", "simulator")
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 SCRIPTS = Path(sys.executable).parent
@@ -42,13 +42,13 @@ def _names(path: Path) -> set[str]:
 
 
 def test_only_the_clock_reads_the_time() -> None:
-    assert _importers("time", "datetime") == {"offboard/io/clock.py"}
+    assert _importers("time", "datetime") == {"offboard/link/clock.py"}
 
 
 def test_only_the_edges_open_sockets() -> None:
     links = {f"simulator/link/{name}.py" for name in ("links", "tcp", "udp")}
-    opening = ("connection", "lock", "stream_link", "stream_sources", "udp_link")
-    edges = {f"offboard/io/{name}.py" for name in opening}
+    opening = ("connection", "lock", "stream", "stream_sources", "udp")
+    edges = {f"offboard/link/{name}.py" for name in opening}
     supervisor = {f"offboard/supervisor/{name}.py" for name in ("supervisor", "process")}
     pipes = {"offboard/run/sitl.py", "simulator/pool.py"}  # between two processes
     assert _importers("socket", "serial") <= edges | links | supervisor
@@ -60,8 +60,8 @@ def test_the_flight_itself_does_no_io() -> None:
     for path in (ROOT / "offboard" / "flight").glob("*.py"):
         names = _names(path)
         assert not {name.split(".")[0] for name in names} & outside, path.name
-        io = {name for name in names if name.startswith("offboard.io")}
-        assert io <= {"offboard.io.link", "offboard.io.link.Chunk"}, path.name
+        links = {name for name in names if name.startswith("offboard.link")}
+        assert links <= {"offboard.link.interface", "offboard.link.interface.Chunk"}, path.name
 
 
 def _importers(*modules: str) -> set[str]:
@@ -82,7 +82,7 @@ def test_the_simulator_imports_only_four_parts_of_offboard() -> None:
     foreign = {
         name
         for name in shared
-        if not name.startswith(SHARED) and name not in ("offboard", "offboard.io")
+        if not name.startswith(SHARED) and name not in ("offboard", "offboard.link")
     }
     assert foreign == set()
 

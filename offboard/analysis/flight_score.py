@@ -14,7 +14,7 @@ from offboard.analysis.score import Score, Scoring
 from offboard.documents.plain import plain
 from offboard.flight.companion import Outcome
 from offboard.flight.phases import ExitCode
-from offboard.io.log import LogError
+from offboard.link.log import LogError
 
 
 def score_flight(flight: Path) -> tuple[Score, History]:

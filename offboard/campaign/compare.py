@@ -33,8 +33,8 @@ from offboard.campaign.table import as_csv as csv_of
 from offboard.campaign.table import row_of
 from offboard.documents.errors import DocumentError, UserError
 from offboard.documents.plain import plain
-from offboard.io.log import LogError
-from offboard.io.stop import StopRequests
+from offboard.link.log import LogError
+from offboard.link.stop import StopRequests
 
 CONNECTED = "connected"  # the scenario of a connected vehicle
 WHOLE_RANGE = (0.0, 100.0)

@@ -24,7 +24,7 @@ from offboard.documents.errors import UserError, shown
 from offboard.documents.extras import install
 from offboard.flight.companion import STOPPED
 from offboard.flight.phases import ExitCode
-from offboard.io.stream_sources import connect
+from offboard.link.stream_sources import connect
 from offboard.run.request import FlightRequest, fly_request
 
 CONNECT_S = 5.0

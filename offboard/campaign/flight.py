@@ -21,8 +21,8 @@ from offboard.campaign.results import Record
 from offboard.documents.errors import UserError
 from offboard.flight.companion import Outcome
 from offboard.flight.phases import ExitCode
-from offboard.io.log import FlightLog, LogError
-from offboard.io.stop import StopRequests
+from offboard.link.log import FlightLog, LogError
+from offboard.link.stop import StopRequests
 from offboard.run.configuration import FlightConfig, dump
 from offboard.run.in_memory import InMemorySimulator
 from offboard.run.one_flight import Bundled, fly

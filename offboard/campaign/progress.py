@@ -16,8 +16,8 @@ from rich.progress import (
     TimeRemainingColumn,
 )
 
-from offboard.io import clock
-from offboard.io.stop import StopRequests
+from offboard.link import clock
+from offboard.link.stop import StopRequests
 
 INTERRUPTED = "interrupted: flights in the air are finished; interrupt again to exit at once"
 FIRST = 5  # flights after which the time is estimated first

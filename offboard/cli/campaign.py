@@ -96,7 +96,7 @@ def _search(flown: Campaign, source: str, count: int, open_workers: OpenWorkers)
     from offboard.campaign.evaluate import Evaluator, Interrupted
     from offboard.campaign.progress import Counter
     from offboard.campaign.worst import keep, search_of
-    from offboard.io.stop import StopRequests
+    from offboard.link.stop import StopRequests
 
     failures = None
     with (
@@ -137,7 +137,7 @@ def _search(flown: Campaign, source: str, count: int, open_workers: OpenWorkers)
 
 def _fly(flown: Campaign, open_workers: OpenWorkers, part: Shard) -> Summary:
     from offboard.campaign.progress import Counter
-    from offboard.io.stop import StopRequests
+    from offboard.link.stop import StopRequests
 
     summary: Summary | None = None
     with suppress(KeyboardInterrupt), StopRequests() as stops, Counter(out) as counter:

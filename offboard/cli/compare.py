@@ -67,7 +67,7 @@ def compare(
         from offboard.campaign import compare as comparison
         from offboard.campaign.document import CampaignFile
         from offboard.campaign.execution import ConnectedVehicle, local_workers
-        from offboard.io import clock
+        from offboard.link import clock
 
         directory = out_directory or FLIGHTS / f"compare-{clock.local_stamp()}"
         file = CampaignFile(

@@ -110,7 +110,7 @@ def daemon(
             connection, signing_key, out_directory, [config, *filter(None, choices.values())]
         )
         return
-    from offboard.io.stop import StopRequests
+    from offboard.link.stop import StopRequests
     from offboard.live.lines import JsonLog, Terminal
 
     lines = JsonLog(write) if log_json else Terminal(out, partial(say, indent=12))

@@ -100,7 +100,7 @@ def fly(
     if not sitl and (scenario or sim_vehicle or firmware):
         raise CommandError("--scenario, --sim-vehicle and --firmware are options of --sitl: add it")
     try:
-        from offboard.io.stop import StopRequests
+        from offboard.link.stop import StopRequests
         from offboard.run.sitl import SimulatorProcess
 
         with (
@@ -111,7 +111,7 @@ def fly(
             from offboard.compiled import loading
 
             with loading():
-                from offboard.io import clock
+                from offboard.link import clock
                 from offboard.run.request import FlightRequest, fly_request
 
             requirements = requirements_of(require)

@@ -56,7 +56,7 @@ def identify(
     from offboard.analysis import history, tlog
     from offboard.analysis.identify import identify_flight, vehicle_file
     from offboard.analysis.identify_page import page as fits
-    from offboard.io import clock
+    from offboard.link import clock
     from offboard.run.configuration import flown, load
 
     if (flight is None) == (connect is None and not sitl):

@@ -21,7 +21,7 @@ def paper(
     workers: Workers = None,
 ) -> None:
     """Reproduce tables 2-4 and figures 4-17 of the paper on one page."""
-    from offboard.io import clock
+    from offboard.link import clock
     from offboard.paper.study.options import PaperOptions
     from offboard.paper.study.run import reproduce
 

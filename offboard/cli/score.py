@@ -65,7 +65,7 @@ def scored(flight: Path) -> tuple[Score, History]:
 def keep(flight: Path, result: Score, history: History) -> None:
     """Write score.json if `flight` is a directory. Where it cannot be written, say so."""
     from offboard.analysis.flight_score import keep_score
-    from offboard.io.log import LogError
+    from offboard.link.log import LogError
 
     if flight.is_dir():
         try:

@@ -18,7 +18,7 @@ from rich.console import Console
 from offboard.documents.command_line import complain as complain
 from offboard.documents.command_line import wrapped
 from offboard.documents.errors import UserError, shown
-from offboard.io.new_file import new_file
+from offboard.link.new_file import new_file
 
 
 class Output(Console):

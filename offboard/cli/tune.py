@@ -42,7 +42,7 @@ def tune(
         from offboard.campaign.results import Results
         from offboard.campaign.tune import Tuning, read_tune
         from offboard.campaign.tune import profile as text_of
-        from offboard.io.stop import StopRequests
+        from offboard.link.stop import StopRequests
 
         tuning = Tuning(*read_tune(file))
         results = Results(profile.with_suffix(".tune"), code_hash())

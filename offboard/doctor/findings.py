@@ -9,7 +9,7 @@ from functools import partial
 
 from offboard.doctor.bounded import within
 from offboard.doctor.observation import Observation
-from offboard.io import clock
+from offboard.link import clock
 
 CHECKS_S, LEAST_S = 1.0, 0.05  # for all checks; for one, when the others have used it up
 AUTHOR = "report this to whoever wrote the check"

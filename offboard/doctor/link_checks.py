@@ -8,7 +8,7 @@ from offboard.doctor.findings import Finding, blocks, ok, wait, warn
 from offboard.doctor.observation import Observation
 from offboard.flight.assessment import MINIMUM_TELEMETRY_HZ
 from offboard.flight.phases import Limits
-from offboard.io.connection import BITS_OF_A_BYTE
+from offboard.link.connection import BITS_OF_A_BYTE
 from offboard.mavlink.autopilots import unfit_type
 from offboard.mavlink.telemetry_rates import SHARE
 

@@ -15,7 +15,7 @@ from offboard.doctor.observation import FIX_3D, ClockMeasures, LinkMeasures, Obs
 from offboard.flight.link_age import LinkDelay, VehicleClock
 from offboard.flight.readiness import Readiness
 from offboard.flight.vehicle_state import VehicleState
-from offboard.io.link import Chunk
+from offboard.link.interface import Chunk
 from offboard.mavlink.dialects.base import WantedMessage
 from offboard.mavlink.events import (
     Attitude,

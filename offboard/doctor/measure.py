@@ -10,7 +10,7 @@ from pathlib import Path
 from offboard import compiled
 from offboard.doctor.observation import Computer
 from offboard.documents.errors import DocumentError
-from offboard.io import clock
+from offboard.link import clock
 from offboard.run.configuration import FlightConfig
 from offboard.run.one_flight import rehearse
 from offboard.run.request import build_parts

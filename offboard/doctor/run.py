@@ -13,10 +13,10 @@ from offboard.doctor.measure import measure
 from offboard.doctor.observation import Computer, Observation
 from offboard.documents.errors import DocumentError, shown
 from offboard.documents.signing_key import read_key
-from offboard.io import clock
-from offboard.io.connection import open_link
-from offboard.io.link import Link, LinkError
-from offboard.io.signing_time import SigningTime
+from offboard.link import clock
+from offboard.link.connection import open_link
+from offboard.link.interface import Link, LinkError
+from offboard.link.signing_time import SigningTime
 from offboard.mavlink.signing import Signing
 from offboard.reference.feasibility import check
 from offboard.run.configuration import FlightConfig, build_track

@@ -17,7 +17,7 @@ import numpy as np
 from offboard.analysis.scene import BODY, COLOURS, LINE_M, MAP
 from offboard.export.extra import library
 from offboard.export.series import Array, Flight, Series
-from offboard.io.new_file import new_file
+from offboard.link.new_file import new_file
 from offboard.model.frames import enu, flu_in_enu
 
 KIND = "mcap"

@@ -42,7 +42,7 @@ from offboard.flight.programme import FLY, Programme
 from offboard.flight.snapshot import Snapshot, snapshot_of
 from offboard.flight.state import FlightState, Outcome
 from offboard.identification.learned import Learned
-from offboard.io.link import Chunk
+from offboard.link.interface import Chunk
 from offboard.mavlink.dialects.base import NEVER
 from offboard.mavlink.events import (
     Attitude,

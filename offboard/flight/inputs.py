@@ -18,7 +18,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from offboard.io.link import Chunk
+from offboard.link.interface import Chunk
 from offboard.mavlink.outgoing import ConfigurationRecord
 from offboard.mavlink.session import Reception, SessionSettings
 

@@ -18,7 +18,7 @@ from typing import Any
 from offboard.analysis.scene import BODY, COLOURS, LINE_M, MAP
 from offboard.documents.arguments import join_address
 from offboard.documents.extras import install
-from offboard.io import clock
+from offboard.link import clock
 from offboard.live.values import json_schema
 from offboard.model.frames import Array, enu, flu_in_enu, quaternion_from_euler
 

@@ -18,8 +18,8 @@ from rich.text import Text
 from offboard.flight.phases import Phase
 from offboard.flight.snapshot import Snapshot
 from offboard.flight.state import FlightState
-from offboard.io import clock
-from offboard.io.background import BackgroundWriter
+from offboard.link import clock
+from offboard.link.background import BackgroundWriter
 from offboard.live.values import as_dict, line
 
 LINES_MAX = 1000  # that wait to be written

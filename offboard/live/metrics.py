@@ -12,7 +12,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoM
 from prometheus_client.registry import Collector
 
 from offboard.flight.snapshot import Snapshot
-from offboard.io import clock
+from offboard.link import clock
 
 if TYPE_CHECKING:
     from prometheus_client import Metric

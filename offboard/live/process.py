@@ -16,8 +16,8 @@ from typing import Protocol
 from offboard.documents.arguments import split_address
 from offboard.documents.errors import UserError
 from offboard.flight.snapshot import Snapshot
-from offboard.io import clock
-from offboard.io.background import BackgroundWriter
+from offboard.link import clock
+from offboard.link.background import BackgroundWriter
 from offboard.live.values import as_dict, line
 
 SERVER = "offboard.live.server"

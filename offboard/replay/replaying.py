@@ -23,7 +23,7 @@ from offboard.flight.inputs import (
 )
 from offboard.flight.outbox import Output
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
-from offboard.io.link import Chunk
+from offboard.link.interface import Chunk
 from offboard.mavlink.framing import Frame
 from offboard.mavlink.signing import Signing
 from offboard.replay.recording import Recording, record_type

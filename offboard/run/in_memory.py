@@ -12,8 +12,8 @@ from importlib.metadata import EntryPoint, entry_points
 from typing import Protocol, cast
 
 from offboard.documents.errors import UserError
-from offboard.io import clock
-from offboard.io.link import Chunk, Strangers
+from offboard.link import clock
+from offboard.link.interface import Chunk, Strangers
 from offboard.run.sitl import Ending
 
 GROUP = "pso_offboard.simulators"

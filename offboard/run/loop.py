@@ -15,9 +15,9 @@ from typing import Any, Protocol
 
 from offboard.flight.companion import Outcome, Output
 from offboard.flight.phases import BEFORE_FLIGHT, WAITING, ExitCode, Phase
-from offboard.io import clock
-from offboard.io.link import Chunk, Link
-from offboard.io.stop import StopRequests
+from offboard.link import clock
+from offboard.link.interface import Chunk, Link
+from offboard.link.stop import StopRequests
 from offboard.run.sitl import Ending
 from offboard.supervisor.supervisor import Supervisor, SupervisorError
 

@@ -25,12 +25,12 @@ from offboard.flight.gate import usable
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Limits
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
-from offboard.io import clock
-from offboard.io.connection import open_link, open_lockstep_link
-from offboard.io.link import Link
-from offboard.io.log import FlightLog
-from offboard.io.signing_time import SigningTime
-from offboard.io.stop import StopRequests
+from offboard.link import clock
+from offboard.link.connection import open_link, open_lockstep_link
+from offboard.link.interface import Link
+from offboard.link.log import FlightLog
+from offboard.link.signing_time import SigningTime
+from offboard.link.stop import StopRequests
 from offboard.mavlink.session import DIALECTS, Session, SessionSettings
 from offboard.mavlink.signing import Signing
 from offboard.model.command import Command, PositionCommand

@@ -11,8 +11,8 @@ from offboard.documents.reading import DocumentError
 from offboard.documents.signing_key import read_key
 from offboard.estimation.observer import Observer
 from offboard.flight.companion import Companion, Outcome
-from offboard.io.log import FlightLog
-from offboard.io.stop import StopRequests
+from offboard.link.log import FlightLog
+from offboard.link.stop import StopRequests
 from offboard.run.configuration import (
     FlightConfig,
     build_controller,

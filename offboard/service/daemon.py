@@ -17,13 +17,13 @@ from offboard.flight.companion import Outcome
 from offboard.flight.phases import ExitCode
 from offboard.flight.programme import Anchor, Then, service
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
-from offboard.io import clock
-from offboard.io.background import BackgroundWriter
-from offboard.io.connection import open_link
-from offboard.io.link import Link, LinkError
-from offboard.io.lock import connection_lock, directory_lock
-from offboard.io.signing_time import SigningTime
-from offboard.io.stop import StopRequests
+from offboard.link import clock
+from offboard.link.background import BackgroundWriter
+from offboard.link.connection import open_link
+from offboard.link.interface import Link, LinkError
+from offboard.link.lock import connection_lock, directory_lock
+from offboard.link.signing_time import SigningTime
+from offboard.link.stop import StopRequests
 from offboard.live.process import SERVER, LiveProcess
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.run.loop import Loop

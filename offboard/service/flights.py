@@ -20,7 +20,7 @@ from offboard.flight.programme import Programme
 from offboard.flight.snapshot import Snapshot
 from offboard.flight.state import FlightState
 from offboard.identification.learned import Learned
-from offboard.io.link import Chunk
+from offboard.link.interface import Chunk
 from offboard.mavlink.session import Session
 from offboard.run.one_flight import FlightParts
 

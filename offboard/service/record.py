@@ -20,9 +20,9 @@ from contextlib import suppress
 from pathlib import Path
 
 from offboard.flight import manifest
-from offboard.io import clock
-from offboard.io.background import BackgroundWriter
-from offboard.io.log import CLOSE_S, QUEUED_MAX, LogError, append, entry
+from offboard.link import clock
+from offboard.link.background import BackgroundWriter
+from offboard.link.log import CLOSE_S, QUEUED_MAX, LogError, append, entry
 from offboard.mavlink.session import Session
 from offboard.report.background import begin
 

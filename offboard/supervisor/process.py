@@ -20,13 +20,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from offboard.io import clock
-from offboard.io.background import BackgroundWriter
-from offboard.io.link import Link
-from offboard.io.log import append, entry
-from offboard.io.stream_link import Nowhere, Source, Stream, StreamLink
-from offboard.io.stream_sources import Listener
-from offboard.io.udp_link import UdpLink
+from offboard.link import clock
+from offboard.link.background import BackgroundWriter
+from offboard.link.interface import Link
+from offboard.link.log import append, entry
+from offboard.link.stream import Nowhere, Source, Stream, StreamLink
+from offboard.link.stream_sources import Listener
+from offboard.link.udp import UdpLink
 from offboard.mavlink import texts
 from offboard.mavlink.dialects.base import SetpointLoss
 from offboard.mavlink.events import VehicleFound

@@ -23,8 +23,8 @@ from dataclasses import asdict, dataclass
 from types import TracebackType
 
 from offboard.documents.errors import UserError
-from offboard.io import clock
-from offboard.io.link import Link
+from offboard.link import clock
+from offboard.link.interface import Link
 from offboard.mavlink.dialects.base import NEVER, SetpointLoss
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.signing import Signing

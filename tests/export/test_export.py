@@ -23,7 +23,7 @@ from typer.testing import CliRunner, Result
 from offboard.analysis import tlog
 from offboard.cli.commands import app
 from offboard.flight.record import RECORD_ID
-from offboard.io.log import entry
+from offboard.link.log import entry
 from offboard.model.frames import enu, flu_in_enu
 
 sys.path.append(str(Path(__file__).parents[1] / "flight"))

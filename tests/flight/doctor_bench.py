@@ -17,7 +17,7 @@ from offboard.doctor.listening import Listening
 from offboard.doctor.observation import Computer, Observation
 from offboard.doctor.run import planned
 from offboard.doctor.table import checks
-from offboard.io.link import Chunk
+from offboard.link.interface import Chunk
 from offboard.mavlink.signing import Signing
 from offboard.run import configuration
 from simulator import config as simulated

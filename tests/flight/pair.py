@@ -28,8 +28,8 @@ from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Phase, Rung
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
-from offboard.io.link import Chunk
-from offboard.io.log import FlightLog
+from offboard.link.interface import Chunk
+from offboard.link.log import FlightLog
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.model.vehicle import Vehicle
 from offboard.run import configuration as config

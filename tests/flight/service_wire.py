@@ -18,7 +18,7 @@ from pair import decode, frames_of
 from serving import ARM, LAND, MODES, SET_MODE, START, TAKEOFF, Serving
 
 from offboard.flight.companion import Output
-from offboard.io.link import Chunk
+from offboard.link.interface import Chunk
 
 HEARTBEAT, COMMAND_LONG, ATTITUDE_TARGET, CURRENT_MODE = 0, 76, 82, 436
 COMMANDS, SETPOINTS = {75, COMMAND_LONG}, {ATTITUDE_TARGET, 84, 86}

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 
 from offboard.analysis import tlog
-from offboard.io import log as log_module
-from offboard.io.background import BackgroundWriter
-from offboard.io.log import FlightLog
+from offboard.link import log as log_module
+from offboard.link.background import BackgroundWriter
+from offboard.link.log import FlightLog
 from offboard.mavlink.framing import pack
 
 UNIX_US = 1_767_225_600_000_000

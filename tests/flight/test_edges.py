@@ -18,12 +18,12 @@ import pytest
 
 from offboard.flight.companion import Companion, Outcome, Output
 from offboard.flight.phases import Phase
-from offboard.io import clock
-from offboard.io import log as log_module
-from offboard.io.connection import open_link
-from offboard.io.link import Chunk, Link, LinkUnavailable, Strangers
-from offboard.io.log import FlightLog
-from offboard.io.stop import StopRequests
+from offboard.link import clock
+from offboard.link import log as log_module
+from offboard.link.connection import open_link
+from offboard.link.interface import Chunk, Link, LinkUnavailable, Strangers
+from offboard.link.log import FlightLog
+from offboard.link.stop import StopRequests
 from offboard.mavlink.counters import Counters
 from offboard.mavlink.framing import FrameSplitter, pack
 from offboard.run.loop import UNGUARDED, Loop

@@ -13,10 +13,10 @@ from pathlib import Path
 
 import pytest
 
-from offboard.io.connection import open_link
-from offboard.io.link import Link, LinkError
-from offboard.io.stream_link import BROKEN, RENEWED
-from offboard.io.udp_link import UdpLink
+from offboard.link.connection import open_link
+from offboard.link.interface import Link, LinkError
+from offboard.link.stream import BROKEN, RENEWED
+from offboard.link.udp import UdpLink
 
 LONG_S = 10.0
 TURN_S = 0.3  # for one turn of the loop, whatever the link does

@@ -13,8 +13,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from offboard.analysis import history
 from offboard.analysis.score import score
 from offboard.flight.phases import ExitCode, Phase
-from offboard.io import clock
-from offboard.io.signing_time import SigningTime, SigningTimeError, state_directory
+from offboard.link import clock
+from offboard.link.signing_time import SigningTime, SigningTimeError, state_directory
 from offboard.mavlink.autopilots import Autopilots
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings

@@ -11,7 +11,7 @@ from pair import hover, in_phase
 from offboard.flight.companion import Companion
 from offboard.flight.outbox import Output
 from offboard.flight.phases import Phase
-from offboard.io.link import Chunk
+from offboard.link.interface import Chunk
 
 PAUSE_S = 0.45
 

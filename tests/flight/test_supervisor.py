@@ -19,10 +19,10 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.analysis import tlog
-from offboard.io import clock
-from offboard.io.connection import open_link
-from offboard.io.log import FlightLog
-from offboard.io.udp_link import BATCH_MAX
+from offboard.link import clock
+from offboard.link.connection import open_link
+from offboard.link.log import FlightLog
+from offboard.link.udp import BATCH_MAX
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings

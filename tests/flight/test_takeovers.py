@@ -33,7 +33,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from offboard.flight.authority import Standing
 from offboard.flight.companion import Output
 from offboard.flight.phases import ENDS, ExitCode, Phase
-from offboard.io.link import Chunk
+from offboard.link.interface import Chunk
 
 FLIGHTS = int(os.environ.get("OFFBOARD_TAKEOVERS", "16"))
 HEARTBEAT, CURRENT_MODE = 0, 436

@@ -8,10 +8,10 @@ from collections.abc import Iterator
 
 import pytest
 
-from offboard.io import clock
-from offboard.io.connection import open_link
-from offboard.io.link import Chunk, Strangers
-from offboard.io.udp_link import LOOK_EVERY_S, UdpLink
+from offboard.link import clock
+from offboard.link.connection import open_link
+from offboard.link.interface import Chunk, Strangers
+from offboard.link.udp import LOOK_EVERY_S, UdpLink
 from offboard.mavlink.peer import PEER_SILENT_S
 
 LOCAL = "127.0.0.1"

@@ -28,7 +28,7 @@ from offboard.flight.companion import Outcome
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.flight.touchdown import Touchdown
-from offboard.io.log import FlightLog
+from offboard.link.log import FlightLog
 from offboard.model.frames import thrust_direction_from_quaternion
 
 WRAP_MS = 2**32

@@ -27,7 +27,7 @@ from offboard.analysis.flight_score import keep_score, score_flight
 from offboard.documents.signing_key import create_key
 from offboard.flight import manifest
 from offboard.flight.record import RECORD_COMPONENT_ID
-from offboard.io.log import LogError
+from offboard.link.log import LogError
 from offboard.run import one_flight as run
 from offboard.run import request
 

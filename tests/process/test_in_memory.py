@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from offboard.io.stop import StopRequests
+from offboard.link.stop import StopRequests
 from offboard.run import in_memory, one_flight
 from offboard.run.in_memory import InMemorySimulator
 from offboard.run.request import FlightRequest, fly_request

@@ -24,8 +24,8 @@ from offboard.flight.inputs import (
 )
 from offboard.flight.manifest import PAYLOAD_TYPE as MANIFEST
 from offboard.flight.record import RECORD_COMPONENT_ID
-from offboard.io.link import Chunk
-from offboard.io.log import entry
+from offboard.link.interface import Chunk
+from offboard.link.log import entry
 from offboard.mavlink import framing
 from offboard.mavlink.encode import encode
 from offboard.mavlink.framing import SETPOINTS

@@ -19,7 +19,7 @@ from offboard.flight.inputs import (
     TurnInput,
     entries,
 )
-from offboard.io.link import Chunk
+from offboard.link.interface import Chunk
 from offboard.mavlink.session import Reception, SessionSettings
 
 PEERS = (("127.0.0.1", 14580), ("::1", 14580, 0, 0), "serial")

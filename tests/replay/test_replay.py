@@ -21,7 +21,7 @@ from offboard.flight import inputs, manifest
 from offboard.flight.actions import PhaseActions
 from offboard.flight.outbox import Output
 from offboard.flight.phases import Phase
-from offboard.io.log import entry
+from offboard.link.log import entry
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing

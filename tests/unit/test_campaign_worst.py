@@ -30,7 +30,7 @@ from offboard.campaign.statistics import groups, wilson
 from offboard.campaign.table import row_of
 from offboard.campaign.worst import as_csv, search_of
 from offboard.documents.errors import UserError
-from offboard.io import clock
+from offboard.link import clock
 
 SEARCH = """
 controllers: [lqr]

@@ -22,11 +22,11 @@ from offboard.flight.flight_plan import CLEAR_M, FlightPlan
 from offboard.flight.pilot_switch import PilotSwitch
 from offboard.identification.learned import Learned
 from offboard.identification.uncertainty import Estimate
-from offboard.io import clock
-from offboard.io.link import LinkError
-from offboard.io.lock import Locked, connection_lock, directory_lock
-from offboard.io.log import LogError
-from offboard.io.stop import StopRequests
+from offboard.link import clock
+from offboard.link.interface import LinkError
+from offboard.link.lock import Locked, connection_lock, directory_lock
+from offboard.link.log import LogError
+from offboard.link.stop import StopRequests
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
@@ -218,7 +218,7 @@ def test_the_lock_names_its_holder_and_dies_with_it(tmp_path: Path) -> None:
     """The holder is a unit, and where possible another user."""
     code = (
         "import os, sys\n"
-        "from offboard.io.lock import connection_lock\n"
+        "from offboard.link.lock import connection_lock\n"
         "if os.getuid() == 0: os.setuid(65534)\n"
         "with connection_lock('udpin:127.0.0.1:1'):\n"
         "    print('held', flush=True)\n"

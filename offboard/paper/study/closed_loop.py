@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from offboard.control.gains import riccati
 from offboard.control.quadratic import ExactMinimum
 from offboard.control.swarm import certify
-from offboard.io.clock import monotonic_s
+from offboard.link.clock import monotonic_s
 from offboard.model.frames import quaternion_from_euler, rotation_from_quaternion
 from offboard.model.predicted_state import PredictedState
 from offboard.model.state import EULER, PHI, PSI, P, R, U, W, X, Z

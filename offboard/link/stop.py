@@ -10,7 +10,7 @@ import signal
 from collections.abc import Callable
 from types import FrameType, TracebackType
 
-from offboard.io import clock
+from offboard.link import clock
 
 AGAIN_S = 1.0  # `timeout` signals its child and the group: within this time it is one request
 

@@ -15,8 +15,8 @@ import sys
 from collections.abc import Hashable
 from contextlib import suppress
 
-from offboard.io import clock
-from offboard.io.link import Chunk, Strangers
+from offboard.link import clock
+from offboard.link.interface import Chunk, Strangers
 from offboard.mavlink.framing import TIMESYNC, frame_size
 from offboard.mavlink.peer import PEER_SILENT_S, same_host
 

@@ -18,10 +18,10 @@ from errno import EADDRINUSE
 from typing import Any
 
 from offboard.documents.errors import shown
-from offboard.io.link import Link, LinkError, LinkUnavailable
-from offboard.io.stream_link import StreamLink
-from offboard.io.stream_sources import Listener, Redial, connect, open_port
-from offboard.io.udp_link import LockstepLink, UdpLink, udp_socket
+from offboard.link.interface import Link, LinkError, LinkUnavailable
+from offboard.link.stream import StreamLink
+from offboard.link.stream_sources import Listener, Redial, connect, open_port
+from offboard.link.udp import LockstepLink, UdpLink, udp_socket
 
 FORMS = "udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT, tcpin:HOST:PORT or serial:DEVICE:BAUD"
 PORT_MAX, BAUD_MAX = 65535, 100_000_000

@@ -13,8 +13,8 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Protocol
 
-from offboard.io import clock
-from offboard.io.link import Chunk, Strangers
+from offboard.link import clock
+from offboard.link.interface import Chunk, Strangers
 from offboard.mavlink.framing import SETPOINTS
 
 READ_BYTES = 65536

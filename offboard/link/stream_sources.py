@@ -9,8 +9,8 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 
-from offboard.io.link import LinkError, LinkUnavailable, Strangers
-from offboard.io.stream_link import Stream
+from offboard.link.interface import LinkError, LinkUnavailable, Strangers
+from offboard.link.stream import Stream
 from offboard.mavlink.peer import PEER_SILENT_S
 
 CONNECT_S = 5.0

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import TracebackType
 
 from offboard.documents.errors import UserError
-from offboard.io.background import BackgroundWriter
+from offboard.link.background import BackgroundWriter
 
 _STAMP = struct.Struct(">Q")
 QUEUED_MAX = 100_000  # entries, minutes of a flight

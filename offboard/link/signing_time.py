@@ -15,8 +15,8 @@ from pathlib import Path
 from types import TracebackType
 
 from offboard.documents.errors import UserError
-from offboard.io import clock
-from offboard.io.background import BackgroundWriter
+from offboard.link import clock
+from offboard.link.background import BackgroundWriter
 from offboard.mavlink.signing import RESERVED, UNITS_PER_S, Signing, stamp_of_unix
 
 CLOSE_S = 2.0
