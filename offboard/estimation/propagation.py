@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.compiled import entry, kernel
-from offboard.model.axes import upright
+from offboard.model.axes import acceleration, upright
 
 Array = NDArray[np.float64]
 
@@ -93,12 +93,15 @@ def _differentiate(
 ) -> None:
     """Right-hand side at collective thrust `thrust` and the commands now in force."""
     b_n, b_e = state[TILT], state[TILT + 1]
-    pull = (-thrust * b_n, -thrust * b_e, plant[GRAVITY] - thrust * upright(b_n, b_e))
+    gravity = (0.0, 0.0, plant[GRAVITY])
+    direction = (b_n, b_e, upright(b_n, b_e))
     for axis in range(3):
-        rate[POSITION + axis] = state[VELOCITY + axis]
-        rate[VELOCITY + axis] = (
-            pull[axis] - plant[DRAG] * state[VELOCITY + axis] + state[DISTURBANCE + axis]
-        )
+        velocity = state[VELOCITY + axis]
+        rate[POSITION + axis] = velocity
+        rate[VELOCITY + axis] = acceleration(
+            gravity[axis], thrust * direction[axis], plant[DRAG], velocity,
+            state[DISTURBANCE + axis],
+        )  # fmt: skip
         rate[DISTURBANCE + axis] = 0.0
         rate[BIAS + axis] = -state[BIAS + axis] / plant[BIAS_TIME_CONSTANT]
     stiffness = plant[TILT_FREQUENCY] ** 2

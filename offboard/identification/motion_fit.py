@@ -33,6 +33,7 @@ from offboard.identification.uncertainty import (
     long_run_covariance,
     sandwich,
 )
+from offboard.model.axes import acceleration
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
@@ -106,8 +107,10 @@ class Motion:
 def predicted_velocity(motion: Motion, vehicle: Vehicle) -> Array:
     """Velocity (3, N) from thrust, attitude and drag alone; its mean is that of the positions."""
     thrust = vehicle.thrust_max_mps2 * motion.thrust(vehicle.thrust_delay_s, vehicle.thrust_lag_s)
-    down = vehicle.gravity_mps2 - thrust * motion.upright
-    push = np.vstack((-thrust * motion.direction_ne, down))
+    gravity = np.array([[0.0], [0.0], [vehicle.gravity_mps2]])
+    push = acceleration(
+        gravity, thrust * np.vstack((motion.direction_ne, motion.upright)), 0.0, 0.0, 0.0
+    )
     push -= push.mean(axis=1, keepdims=True)  # a constant disturbance
     drag_ps, steps_s = vehicle.drag_per_mass_ps, np.diff(motion.times)
     travelled = motion.positions[:, -1] - motion.positions[:, 0]

@@ -1,14 +1,16 @@
-"""The linear axes of a vehicle that is sent attitude setpoints: its attitude loop is in the model.
+"""The motion of a vehicle that is sent attitude setpoints, and its linear axes: the attitude loop
+is in the model.
 
-Written in the thrust direction b, acceleration = g e3 - T b - c v + d: the two lateral axes, the
-vertical and the course decouple, and no heading frame is needed. The delay is not part of these
-models: the observer predicts through it.
+Written in the thrust direction b, a = g e3 - T b - c v + d (`acceleration`): the two lateral axes,
+the vertical and the heading decouple, and no heading frame is needed. The delay is not part of
+these models: the observer predicts through it.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +22,17 @@ Array = NDArray[np.float64]
 
 # Stands in for a lag of zero, which would make the input a state; far below every period.
 SHORTEST_THRUST_LAG_S = 1e-3
+
+
+@kernel
+def acceleration(gravity: Any, thrust: Any, drag_ps: Any, velocity: Any, disturbance: Any) -> Any:
+    """a = g e3 - T b - c v + d, m/s^2: one axis of NED, or arrays that broadcast.
+
+    `gravity` is g e3 along the axis (0 for north and east), `thrust` T b per unit of mass,
+    `drag_ps` c, `velocity` v in m/s, `disturbance` d. The same function solves for the thrust:
+    T b = g e3 - a - c v + d, with a in place of T b.
+    """
+    return gravity - thrust - drag_ps * velocity + disturbance
 
 
 @dataclass(frozen=True, slots=True)

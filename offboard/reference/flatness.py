@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.model.axes import acceleration
 from offboard.reference.base import FlatSample
 
 Array = NDArray[np.float64]
@@ -55,9 +56,10 @@ def flat_state(
     """The full state and input of a sample; the disturbance (3,) is constant in time.
 
     Always finite: where f vanishes (free fall) b is (0, 0, 1)."""
-    drag = drag_per_mass_ps
-    f = disturbance_ned_mps2 - sample.acceleration_ned_mps2 - drag * sample.velocity_ned_mps
-    f[..., 2] += gravity_mps2
+    drag, gravity = drag_per_mass_ps, np.array([0.0, 0.0, gravity_mps2])
+    f = acceleration(
+        gravity, sample.acceleration_ned_mps2, drag, sample.velocity_ned_mps, disturbance_ned_mps2
+    )
     f1 = -sample.jerk_ned_mps3 - drag * sample.acceleration_ned_mps2
     f2 = -sample.snap_ned_mps4 - drag * sample.jerk_ned_mps3
     thrust = np.sqrt(_dot(f, f))
