@@ -89,6 +89,10 @@ class Link(Protocol):
     capacity_bytes_ps: float | None
     strangers: Strangers
 
+    def wait(self, timeout_s: float) -> None:
+        """Wait at most `timeout_s` until something has arrived. Reads nothing."""
+        ...
+
     def receive(self, timeout_s: float) -> list[Chunk]:
         """What has arrived, oldest first and bounded, after waiting at most `timeout_s` for it."""
         ...

@@ -141,13 +141,17 @@ class StreamLink:
 
     # --- in ---
 
+    def wait(self, timeout_s: float) -> None:
+        if self._stream is None:
+            self._source.wait(timeout_s)
+        elif not self._readable(0.0):
+            self._readable(timeout_s)
+
     def receive(self, timeout_s: float) -> list[Chunk]:
         self._renew()
         self._flush()
-        if self._stream is None:
-            self._source.wait(timeout_s)
-            return []
-        if not self._readable(0.0) and not self._readable(timeout_s):
+        self.wait(timeout_s)
+        if not self._readable(0.0):
             return []
         arrived_s, data = self._empty_s, b""
         with suppress(BlockingIOError):

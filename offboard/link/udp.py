@@ -107,9 +107,12 @@ class UdpLink:
 
     # --- in ---
 
-    def receive(self, timeout_s: float) -> list[Chunk]:
+    def wait(self, timeout_s: float) -> None:
         awaited = [inbox.socket for inbox in self._awaited()]
         select.select(awaited, [], [], max(0.0, timeout_s))
+
+    def receive(self, timeout_s: float) -> list[Chunk]:
+        self.wait(timeout_s)
         chunks = self._vehicle.drain(BATCH_MAX) if self._vehicle else []
         if self._listening:
             if self._vehicle is None:

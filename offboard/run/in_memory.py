@@ -40,6 +40,8 @@ class InMemoryLink:
         self._vehicle = vehicle
         self._sent: list[bytes] = []
 
+    def wait(self, timeout_s: float) -> None: ...
+
     def receive(self, timeout_s: float) -> list[Chunk]:
         """All datagrams up to the next barrier. Never waits."""
         frames, self._sent = self._sent, []

@@ -125,11 +125,14 @@ class Loop:
         return self._outcome()
 
     def _turn(self) -> None:
+        """This process may have been stopped at any time, most likely while it waited: nothing is
+        read before it knows whether the supervisor, which reads the same link, has the vehicle."""
+        self._link.wait(POLL_S)
         if self._taken_over():
             return
         if self._stops.requested:
             self._companion.request_stop()
-        chunks = self._link.receive(POLL_S)
+        chunks = self._link.receive(0.0)
         began_s = clock.monotonic_s()
         if chunks:
             self._heard_s = began_s

@@ -38,6 +38,8 @@ class Wire:
     def __init__(self) -> None:
         self.strangers = Strangers()
 
+    def wait(self, timeout_s: float) -> None: ...
+
     def receive(self, timeout_s: float) -> list[Chunk]:
         return []
 

@@ -5,12 +5,15 @@ Flights that it saves are in tests/process/test_controller_lost.py.
 
 from __future__ import annotations
 
+import itertools
 import os
+import select
 import signal
 import socket
 import sys
+import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -19,18 +22,23 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.analysis import tlog
+from offboard.flight.outbox import Output
+from offboard.flight.phases import Phase
 from offboard.link import clock
 from offboard.link.connection import open_link
+from offboard.link.interface import Chunk
 from offboard.link.log import FlightLog
+from offboard.link.stop import StopRequests
 from offboard.link.udp import BATCH_MAX
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
+from offboard.run.loop import Loop
 from offboard.supervisor.supervisor import Supervised, Supervisor, SupervisorError
 
 LONG_S = 20.0
-OFFBOARD, POSCTL, LANDING = 0x00060000, 0x00030000, 0x06040000
+OFFBOARD, POSCTL, LANDING, HOLDING = 0x00060000, 0x00030000, 0x06040000, 0x03040000
 VEHICLE = VehicleFound(7, 1, "px4")
 OURS, ON_GROUND, NOT_OURS = (
     Supervised(VEHICLE, ours=True, flying=True),
@@ -97,6 +105,11 @@ class Rig:
         message = mavlink.MAVLink_heartbeat_message(2, 12, 129 if armed else 1, mode, 4, 3)
         self.vehicle.sendto(message.pack(codec), place)
 
+    def acknowledge(self, place: Any) -> None:
+        """The vehicle accepts the change of its mode."""
+        ack = mavlink.MAVLink_command_ack_message(176, 0)
+        self.vehicle.sendto(ack.pack(mavlink.MAVLink(None, srcSystem=7, srcComponent=1)), place)
+
     def disarm(self) -> None:
         """The vehicle reports that it is down, which ends the supervisor."""
         self.report(self.sender, LANDING, armed=False)
@@ -139,6 +152,64 @@ def test_it_takes_over_when_the_beats_stop_and_says_so_first(rig: Rig) -> None:
         pass
     assert rig.supervisor.said[-1] == "the vehicle is disarmed"
     assert not rig.supervisor.lost
+
+
+class Beating:
+    """A companion whose vehicle is ours; counts what the loop read for it."""
+
+    phase, outcome, announced = Phase.TRACK, None, ()
+    strangers = read = 0
+
+    def __init__(self, peer: Any) -> None:
+        self.peer = peer
+
+    def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
+        self.read += len(chunks)
+        return Output(supervised=now(OURS))
+
+    def has_ended(self) -> bool:
+        return False
+
+    def __getattr__(self, name: str) -> Any:  # no other call returns anything
+        return lambda *arguments: ()
+
+
+def test_a_stopped_controller_leaves_the_answers_to_the_supervisor(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It is stopped while it waits for telemetry. Both processes read the same link, and the
+    acknowledgement of hold arrives before it continues: it must not read it."""
+    wait, turns = select.select, itertools.count()
+
+    def holds() -> None:
+        time.sleep(0.2)
+        os.kill(rig.supervisor.pid, signal.SIGCONT)
+        for _ in range(10):
+            rig.report(rig.sender, HOLDING)
+            time.sleep(0.1)
+        rig.disarm()
+
+    vehicle = threading.Thread(target=holds)
+
+    def stops(*arguments: Any) -> Any:
+        ready = wait(*arguments)
+        if next(turns) == 30:
+            assert rig.next_command().command == 176
+            os.kill(rig.supervisor.pid, signal.SIGSTOP)  # the controller continues first
+            rig.acknowledge(rig.sender)
+            vehicle.start()
+        return ready
+
+    monkeypatch.setattr(select, "select", stops)
+    flown: Any = Beating(rig.peer)
+    with StopRequests() as requested:
+        outcome = Loop(
+            flown, rig.link, rig.log, stops=requested, progress=print, supervisor=rig.supervisor
+        ).run()
+    assert outcome.sentence.endswith("hold requested; the vehicle is disarmed")
+    assert flown.read == 0
+    vehicle.join()
+    assert "COMMAND_LONG" not in [each.get_type() for each in rig.heard()]
 
 
 def test_one_that_is_stopped_is_noticed_within_a_second_and_when_it_returns(rig: Rig) -> None:
