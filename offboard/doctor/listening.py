@@ -12,8 +12,8 @@ from collections.abc import Hashable, Iterable
 
 from offboard.doctor.census import Census
 from offboard.doctor.observation import FIX_3D, ClockMeasures, LinkMeasures, Observation
-from offboard.flight.link_age import LinkDelay, VehicleClock
 from offboard.flight.readiness import Readiness
+from offboard.flight.vehicle_clock import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.link.interface import Chunk
 from offboard.mavlink.dialects.base import WantedMessage
@@ -78,11 +78,7 @@ class Listening:
             signing,
         )
         self._census = Census(stream)
-        self._readiness, self._delay, self._clock = (
-            Readiness(advice=True),
-            LinkDelay(),
-            VehicleClock(),
-        )
+        self._readiness, self._clock = Readiness(advice=True), VehicleClock()
         self._asked: dict[int, tuple[int, float]] = {}  # message or command: tries, when
         self._settled = self._rebooted = self._requested = False
         self._may_greet = False  # a disarmed vehicle, whose signing time is behind ours
@@ -122,7 +118,7 @@ class Listening:
                     self._foreign_timesync += 1
                 else:
                     self._round_trips_s.append(at_s - sent_s)
-                    self._delay.on_reply(event)
+                    self._clock.on_reply(event)
             case SystemTime(unix_s) if unix_s:
                 self._unix_offset_s = unix_s - at_s - unix_less_host_s
             case NoFix(fix_type):
@@ -141,7 +137,6 @@ class Listening:
                 self._rebooted = True
                 self._first = self._newest = None
                 self._clock.reset()
-                self._delay.reset()
 
     def _on_stamp(self, stamp_s: float, at_s: float) -> None:
         self._late_s = max(self._late_s, self._clock.age_s(stamp_s, at_s) if self._settled else 0.0)
@@ -203,7 +198,7 @@ class Listening:
         return True
 
     def _timesync(self, stamp_s: float, now_s: float) -> Timesync:
-        request = self._delay.request(stamp_s, now_s)
+        request = self._clock.request(stamp_s, now_s)
         self._sent_s.setdefault(request.ts1_ns, now_s)
         return request
 
@@ -221,7 +216,7 @@ class Listening:
         return (
             checked
             and state.version is not None
-            and self._delay.estimate is not None
+            and self._clock.delay is not None
             and self._readiness.complete(self._session.dialect, state.parameters, now_s)
             and all(each.optional or enough(each, rates) for each in self._session.dialect.wanted)
         )
@@ -268,7 +263,7 @@ class Listening:
             wanted=wanted,
             rates_hz=self._session.rates_hz,
             requested=self._requested,
-            delay=self._delay.estimate,
+            delay=self._clock.delay,
             round_trip_s=statistics.median(trips_s) if trips_s else None,
             late_s=self._late_s,
             foreign_timesync=int(self._foreign_timesync),

@@ -194,13 +194,13 @@ class PhaseActions:
     def _fit_telemetry(self, in_phase_s: float) -> None:
         """Request less telemetry while the link delays by more than can be flown: it may be
         saturated."""
-        link, limits = self._state.link.estimate, self._state.limits
+        link, limits = self._state.clock.delay, self._state.limits
         if in_phase_s - self._fitted_s < FIT_EVERY_S or link is None:
             return
         if link.value > limits.link_delay_s or link.sd > limits.link_jitter_s:
             self._fitted_s = in_phase_s
             if self._session.thin_telemetry():
-                self._state.link.reset()
+                self._state.clock.measure_delay_again()
                 delay = f"{1e3 * link.value:.0f} +- {1e3 * link.sd:.0f} ms"
                 self._outbox.announce(f"the link delays by {delay}: less telemetry is requested")
 

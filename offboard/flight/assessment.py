@@ -213,9 +213,9 @@ def not_ready(state: FlightState, session: Session) -> str:
     charge = vehicle.health.battery_remaining if vehicle.health else None
     if charge is not None and charge < limits.battery:
         return f"its battery has {charge:.0%} left, limits.battery is {limits.battery:.0%}"
-    if not state.link.is_measured(state.host_s):
+    if not state.clock.delay_is_measured(state.host_s):
         return "the delay of the link is being measured"
-    link = state.link.estimate
+    link = state.clock.delay
     if link and (link.value > limits.link_delay_s or link.sd > limits.link_jitter_s):
         return (
             f"the link delays by {1e3 * link.value:.0f} +- {1e3 * link.sd:.0f} ms, at most "

@@ -399,10 +399,10 @@ class Companion:
                 )
             )
             self._recorded_strangers = ignored
-            self._outbox.send(state.link.request(time_s, state.host_s))
+            self._outbox.send(state.clock.request(time_s, state.host_s))
 
     def _follow_link(self, time_s: float) -> None:
-        growth = self.state.growth
+        growth = self.state.clock.growth
         if growth.step(time_s, self.state.link_growth_s) and self._identification:
             self._identification.on_link_growth(growth.added_s, growth.changed_s)
 

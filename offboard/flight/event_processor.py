@@ -81,10 +81,8 @@ class EventProcessor:
                 state.follows_others = self._is_of_others(thrust)
             case Heartbeat(mode) | ModeReport(mode):
                 self._on_mode(event, mode, arrived_s)
-            case TimesyncReply(request_ns, vehicle_ns):
-                asked_s = state.link.on_reply(event)
-                if asked_s is not None:
-                    state.clock.on_reply(request_ns * 1e-9, vehicle_ns * 1e-9, asked_s)
+            case TimesyncReply():
+                state.clock.on_reply(event)
             case CommandRequest():
                 self._answer(event)
             case VehicleFound():
@@ -206,8 +204,6 @@ class EventProcessor:
         """Nothing that was known of vehicle and link is known any more."""
         state = self._state
         self._observer.reset()
-        state.link.reset()
-        state.growth.reset()
         state.clock.reset()
         state.contact = GroundContact(state.vehicle)
         state.hover, state.jumps = HoverEstimate(), PositionJumps()

@@ -96,13 +96,12 @@ class PhaseMachine:
         state.began_s = state.now_s
         self._outbox.announce(f"{row.target.value}: {reason}", title="offboard: ")
         if row.source in BEFORE_FLIGHT and row.target in FLYING:
-            state.link.settle()
             state.clock.settle()
             dialect = self._session.dialect
             assert dialect is not None
             state.positioning.begin(state.vehicle, self._session.rates_hz, dialect.estimator_name)
             if self._identification:
-                self._identification.on_link_delay(state.link.estimate)
+                self._identification.on_link_delay(state.clock.delay)
             if row.source is Phase.ARM:  # on the ground the time that it takes does no harm
                 self._decider.begin()
         if self._identification:

@@ -69,7 +69,7 @@ def snapshot_of(
     vehicle, worst = state.vehicle, state.ladder.worst
     position, attitude = vehicle.position, vehicle.attitude
     sample = state.plan.sample(position.time_s) if position and state.phase in TRACKING else None
-    link = state.link.estimate
+    link = state.clock.delay
     charge = vehicle.health.battery_remaining if vehicle.health else None
     return Snapshot(
         time_s=state.time_s,
@@ -93,7 +93,7 @@ def snapshot_of(
         telemetry_age_s=_finite(state.telemetry_age_s(state.host_s)) if vehicle.has_state else NAN,
         link_delay_s=link.value if link else NAN,
         link_delay_sd_s=link.sd if link else NAN,
-        link_growth_s=state.growth.added_s,
+        link_growth_s=state.clock.growth.added_s,
         missed_decisions=state.missed,
         skipped_ticks=state.busyness.skipped,
         computer=state.busyness.sentence,

@@ -1,7 +1,7 @@
 """Flight state: all that one flight knows. `Companion` owns it; the other modules take it.
 
-Facts come in by `VehicleState`, `Authority`, `GroundContact`, `VehicleClock` and `LinkDelay`, each
-with the time when it was heard. What follows from them is in `facts`.
+Facts come in by `VehicleState`, `Authority`, `GroundContact` and `VehicleClock`, each with the
+time when it was heard. What follows from them is in `facts`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,6 @@ from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.ladder import Ladder
-from offboard.flight.link_age import LinkDelay, LinkGrowth, VehicleClock
 from offboard.flight.phases import ENDS, Limits, Phase
 from offboard.flight.pilot_switch import PilotSwitch
 from offboard.flight.position_jumps import PositionJumps
@@ -26,6 +25,7 @@ from offboard.flight.programme import FLY, Programme
 from offboard.flight.readiness import Readiness
 from offboard.flight.requests import Request
 from offboard.flight.touchdown import Touchdown, moved
+from offboard.flight.vehicle_clock import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.dialects.base import Dialect, Takeoff
 from offboard.mavlink.events import Landed, TimesyncReply
@@ -59,8 +59,6 @@ class FlightState:
     programme: Programme = FLY
     vehicle: VehicleState = field(default_factory=VehicleState)
     clock: VehicleClock = field(default_factory=VehicleClock)
-    link: LinkDelay = field(default_factory=LinkDelay)
-    growth: LinkGrowth = field(default_factory=LinkGrowth)
     hover: HoverEstimate = field(default_factory=HoverEstimate)
     jumps: PositionJumps = field(default_factory=PositionJumps)
     readiness: Readiness = field(default_factory=Readiness)
@@ -117,7 +115,6 @@ class FlightState:
             programme,
             vehicle=self.vehicle,
             clock=self.clock,
-            link=self.link,
             hover=self.hover,
             readiness=self.readiness,
             dialect=self.dialect,
@@ -129,6 +126,7 @@ class FlightState:
             silence_s=self.silence_s,
             guarded=self.guarded,
         )
+        following.clock.growth.reset()
         following.contact = self.contact
         following.pilot = PilotSwitch(
             unclaimed=self.ends_engaged, showed_ours=self.pilot.showed_ours
@@ -223,12 +221,12 @@ class FlightState:
     def link_growth_s(self) -> float:
         """What the link's delay has grown by since take-off."""
         age_s = self.telemetry_age_s(self.host_s) if self.vehicle.has_state else 0.0
-        return max(self.link.growth_s, age_s)
+        return max(self.clock.delay_growth_s, age_s)
 
     def sent_s(self, time_s: float) -> float:
         """The vehicle time from which the vehicle model's delays run for a command of the tick
         `time_s`: later by what the link has added to its delay since take-off."""
-        return time_s + self.growth.added_s
+        return time_s + self.clock.growth.added_s
 
     def telemetry_age_s(self, host_s: float) -> float:
         """Age of the newest telemetry at `host_s`, beyond the least delay of the link."""

@@ -11,9 +11,9 @@ import pytest
 from faults import late
 from pair import Pair, in_phase, make, through
 
-from offboard.flight.link_age import LEAST_GROWTH_S
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Phase
+from offboard.flight.vehicle_clock import LEAST_GROWTH_S
 
 CHANGED_S, BACK_S = 2.0, 8.0  # in track
 CONFIGURED_RADPS = 7.0
@@ -74,7 +74,7 @@ def test_prompt_link_changes_nothing() -> None:
     """What is sent is the same as without any TIMESYNC reply."""
     pair, _ = on_a_link_that_becomes_late("down", 0.0)
     pair.track()
-    assert pair.companion.state.growth.added_s == 0.0
+    assert pair.companion.state.clock.growth.added_s == 0.0
     assert not any("grown" in line for line in pair.companion.announced)
 
 
@@ -93,7 +93,11 @@ def flown_at(
     pair.track()
     assert not pair.rungs
     rmse_m = pair.score(directory).rmse_position_m
-    return rmse_m, pair.companion.state.model.tilt.delay_s, pair.companion.state.growth.added_s
+    return (
+        rmse_m,
+        pair.companion.state.model.tilt.delay_s,
+        pair.companion.state.clock.growth.added_s,
+    )
 
 
 @pytest.mark.parametrize(

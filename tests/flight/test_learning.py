@@ -18,10 +18,10 @@ from offboard.analysis import history
 from offboard.analysis.identify import identify_flight, vehicle_file
 from offboard.documents.reading import parse
 from offboard.estimation.observer import Observer, ObserverSettings
-from offboard.flight.link_age import LinkGrowth
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Phase
 from offboard.flight.record import IDENTIFIED_ID
+from offboard.flight.vehicle_clock import LinkGrowth
 from offboard.identification.adoption import with_link_delay
 from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.excitation import LENGTH_S, excited

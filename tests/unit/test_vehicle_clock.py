@@ -1,14 +1,23 @@
-"""The vehicle's clock as telemetry shows it: its rate, the age of telemetry, and jumps."""
+"""The vehicle's clock: its rate, the age of telemetry, jumps, and the delay of the link."""
 
 from __future__ import annotations
 
 import math
 import random
 from collections.abc import Callable, Iterable
+from typing import Any
 
+import numpy as np
 import pytest
 
-from offboard.flight.link_age import LinkDelay, VehicleClock
+from offboard.flight.vehicle_clock import (
+    DELAY_MAX_S,
+    LEAST_GROWTH_S,
+    STEADY_S,
+    LinkGrowth,
+    VehicleClock,
+)
+from offboard.identification.uncertainty import Estimate
 from offboard.mavlink.events import TimesyncReply
 
 EPOCH_S = 7000.0  # of host time: not that of the vehicle
@@ -31,6 +40,12 @@ def hear(
         newest = stamp(at_s), EPOCH_S + at_s + way(at_s)
         clock.on_telemetry(*newest)
     return newest
+
+
+def answer(clock: VehicleClock, stamp_s: float, delay_s: float) -> bool:
+    """The reply to the request with this stamp; it arrived `delay_s` after it."""
+    request_ns = round(stamp_s * 1e9)
+    return clock.on_reply(TimesyncReply(request_ns, request_ns + round(delay_s * 1e9)))
 
 
 @pytest.mark.parametrize("rate", [1.0, 0.25, 4.0])
@@ -144,7 +159,7 @@ def exchange(
     """Telemetry at 50 Hz, a request of TIMESYNC with the newest at 10 Hz, and its reply.
 
     Returns the greatest age of telemetry on its arrival, in seconds of the vehicle."""
-    arriving = []
+    arriving: list[Any] = []
     for number, at_s in enumerate(every(0.02, begin_s, end_s)):
         arrived_s = EPOCH_S + at_s + down(at_s)
         arriving.append((arrived_s, stamp(at_s)))
@@ -152,11 +167,14 @@ def exchange(
             asked_s = at_s + down(at_s)
             there_s = asked_s + up(asked_s)
             back_s = EPOCH_S + there_s + down(there_s)
-            arriving.append((back_s, stamp(at_s), stamp(there_s), EPOCH_S + asked_s))
+            arriving.append((EPOCH_S + asked_s, stamp(at_s), "asked"))
+            arriving.append((back_s, stamp(at_s), "answered", stamp(there_s)))
     oldest_s = 0.0
     for arrived_s, stamp_s, *reply in sorted(arriving):
-        if reply:
-            clock.on_reply(stamp_s, reply[0], reply[1])
+        if reply and reply[0] == "asked":
+            clock.request(stamp_s, arrived_s)
+        elif reply:
+            answer(clock, stamp_s, float(reply[1]) - stamp_s)
         else:
             clock.on_telemetry(stamp_s, arrived_s)
             oldest_s = max(oldest_s, clock.age_s(stamp_s, arrived_s))
@@ -223,47 +241,120 @@ def test_without_replies_a_clock_a_little_slow_looks_late(rate: float, age_s: fl
 def test_replies_from_before_a_jump_of_the_clock_do_not_count() -> None:
     clock = VehicleClock()
     hear(clock, every(0.02, 0.0, 10.0))
-    clock.on_reply(9.94, 10.04, EPOCH_S + 9.99)
+    clock.request(9.94, EPOCH_S + 9.99)
+    answer(clock, 9.94, 0.1)
     clock.settle()
     stamp_s, arrived_s = hear(clock, every(0.02, 10.0, 10.2), stamp=lambda at_s: at_s + 3.0)
     assert clock.jumped_s == pytest.approx(3.0, abs=0.02)
     assert clock.age_s(stamp_s, arrived_s + 0.2) == pytest.approx(0.2, abs=1e-6)
 
 
+# --- the delay of both directions ---
+
+
+def reply(link: VehicleClock, telemetry_s: float, delay_s: float) -> TimesyncReply:
+    request_ns = link.request(telemetry_s, 0.0).ts1_ns
+    return TimesyncReply(request_ns, request_ns + round(delay_s * 1e9))
+
+
+def test_median_and_spread_of_the_replies() -> None:
+    link, rng = VehicleClock(), np.random.default_rng(3)
+    for number, delay_s in enumerate(rng.normal(0.12, 0.01, 40)):
+        link.on_reply(reply(link, 5.0 + 0.1 * number, delay_s))
+    assert link.delay is not None
+    assert link.delay.value == pytest.approx(0.12, abs=0.005)
+    assert link.delay.sd == pytest.approx(0.01, rel=0.4)
+    link.reset()
+    assert link.delay is None
+
+
+def test_replies_to_others_late_and_duplicate_ones_are_ignored() -> None:
+    link = VehicleClock()
+    for number in range(5):
+        at_s = float(number)
+        own = reply(link, at_s, 0.05)
+        link.on_reply(TimesyncReply(own.request_ns + 1, own.vehicle_ns))  # another sender's request
+        link.on_reply(reply(link, at_s + 0.2, -0.01))  # other clocks
+        link.on_reply(reply(link, at_s + 0.4, DELAY_MAX_S + 0.01))
+        assert link.delay is None
+        link.on_reply(own)
+        link.on_reply(TimesyncReply(own.request_ns, own.vehicle_ns + 10**9))  # a duplicate
+    assert link.delay == Estimate(pytest.approx(0.05), 0.0)
+
+
+@pytest.mark.parametrize(("delay_s", "measured_s"), [(0.05, 2.0), (4.4, 6.3), (math.inf, 10.1)])
+def test_link_delay_is_measured_by_twenty_replies(delay_s: float, measured_s: float) -> None:
+    """Behind a full buffer of 50 kB, at 11.5 kB/s, the first one takes 4.4 s. Without any, the
+    vehicle does not answer."""
+    link = VehicleClock()
+    waiting: list[tuple[float, TimesyncReply]] = []
+    for tick in range(120):
+        now_s = 0.1 * tick
+        for each in [each for each in waiting if each[0] <= now_s]:
+            waiting.remove(each)
+            link.on_reply(each[1])
+        if link.delay_is_measured(now_s):
+            break
+        waiting.append((now_s + delay_s, reply(link, now_s, min(delay_s, DELAY_MAX_S))))
+    assert now_s == pytest.approx(measured_s, abs=0.15)
+
+
 # --- what the link has added since take-off -------------------------------------------------------
 
 
-def replies(link: LinkDelay, delay_s: float, count: int) -> None:
+def replies(link: VehicleClock, delay_s: float, count: int) -> None:
     for _ in range(count):
         sent_s = next(TIMES_S)
-        request_ns = link.request(sent_s, EPOCH_S).ts1_ns
-        link.on_reply(TimesyncReply(request_ns, request_ns + round(delay_s * 1e9)))
+        link.request(sent_s, EPOCH_S)
+        answer(link, sent_s, delay_s)
 
 
 TIMES_S = iter(0.1 * n for n in range(1, 10_000))
 
 
 def test_growth_is_that_of_the_median_of_five_replies() -> None:
-    link = LinkDelay()
+    link = VehicleClock()
     replies(link, 0.05, 40)
-    assert link.growth_s == 0.0  # not settled
+    assert link.delay_growth_s == 0.0  # not settled
     link.settle()
     replies(link, 0.35, 2)
-    assert link.growth_s == pytest.approx(0.0)  # two late ones may be chance
+    assert link.delay_growth_s == pytest.approx(0.0)  # two late ones may be chance
     replies(link, 0.35, 1)
-    assert link.growth_s == pytest.approx(0.30)
+    assert link.delay_growth_s == pytest.approx(0.30)
     replies(link, 0.01, 5)
-    assert link.growth_s == pytest.approx(-0.04)
+    assert link.delay_growth_s == pytest.approx(-0.04)
 
 
 def test_growth_is_unknown_without_replies_and_after_a_reboot() -> None:
-    link = LinkDelay()
+    link = VehicleClock()
     replies(link, 0.05, 4)
     link.settle()
     replies(link, 0.95, 10)
-    assert link.growth_s == 0.0  # nothing to compare with
+    assert link.delay_growth_s == 0.0  # nothing to compare with
     link.settle()
     replies(link, 1.25, 5)
-    assert link.growth_s == pytest.approx(0.3)
+    assert link.delay_growth_s == pytest.approx(0.3)
     link.reset()
-    assert link.growth_s == 0.0
+    assert link.delay_growth_s == 0.0
+
+
+def test_growth_is_followed_and_unsteady_until_it_has_lasted() -> None:
+    growth = LinkGrowth()
+    assert not growth.step(1.0, 0.9 * LEAST_GROWTH_S)
+    assert growth.step(2.0, 0.2)
+    assert (growth.added_s, growth.changed_s) == (0.2, 0.2)
+    assert not growth.step(2.1, 0.2 + 0.9 * LEAST_GROWTH_S)
+    assert not growth.step(1.9 + STEADY_S, 0.2)
+    assert growth.step(2.0 + STEADY_S, 0.2)
+    assert (growth.added_s, growth.changed_s) == (0.2, 0.0)
+    assert growth.step(10.0, 0.0)
+    assert (growth.added_s, growth.changed_s) == (0.0, 0.2)
+    assert growth.step(10.0 + STEADY_S, 0.0)
+    assert (growth.added_s, growth.changed_s) == (0.0, 0.0)
+
+
+def test_growth_that_comes_and_goes_stays_unsteady() -> None:
+    growth = LinkGrowth()
+    for tick in range(200):
+        growth.step(0.1 * tick, 0.15 if tick // 10 % 2 else 0.05)
+        assert tick < 10 or growth.changed_s >= 0.0999

@@ -1,0 +1,233 @@
+"""The vehicle's clock: the time on it now, the age of telemetry, and the delay of the link.
+
+It is a line over host time, whose offset and rate are estimated together (one without the other
+would take a slow clock for a link that becomes later). Two measures enclose it:
+
+- Telemetry arrives after the time of its stamp: the least delayed of the last seconds shows what
+  the vehicle's clock has at least reached. Newest telemetry that is older has been delayed more
+  than usual, by a backlog or a stop of this process.
+- A request of TIMESYNC is stamped with the vehicle time of the newest telemetry and sent with a
+  setpoint; the reply holds this stamp and the vehicle time at which the request arrived. The
+  difference is the delay of both directions together, whatever the clock of this computer and the
+  way of the reply; and when the request was sent, the vehicle's clock was at most at that time.
+
+Both run at the rate of the clock, unless the delay of one direction changes: the rate lies between
+theirs, and there it stays where it was. From a vehicle without replies a slower clock cannot be
+told from a link that becomes later: within REAL_TIME its rate is 1.
+"""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections import deque
+
+from offboard.identification.uncertainty import Estimate
+from offboard.mavlink.events import TimesyncReply
+from offboard.mavlink.outgoing import Timesync
+
+REPLIES_MIN, REPLIES_MAX, REPLIES_NEWEST = 5, 40, 5
+REPLIES_MEASURED = 20  # two seconds: a link that saturates has shown it
+DELAY_MAX_S = 10.0  # a larger difference belongs to another clock
+REQUESTS_MAX = 100  # of DELAY_MAX_S
+NORMAL = 1.4826  # standard deviation of a normal distribution / median absolute deviation
+WINDOW_S, BIN_S = 5.0, 0.1
+RATE_OVER_S, RATE_EVERY_S = 1.0, 1.0  # the rate: from how much at least, and how often
+REAL_TIME = 0.05  # a rate that differs from 1 by less is that of a vehicle in real time
+BOUNDS_S = 1.0  # a reply to an older request bounds the vehicle time no more
+LEAST_GROWTH_S, STEADY_S = 0.01, 5.0  # see `LinkGrowth`
+JUMP_S = 0.5  # a stamp further ahead of the vehicle time now shows a jump of the clock
+
+
+class VehicleClock:
+    """See the module. All stamps are vehicle time, all `host_s` monotonic time of this computer.
+
+    `jumped_s` is by how much the clock has jumped forward since `settle`; `growth` is what the link
+    has added to its delay since then.
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """The vehicle was rebooted."""
+        self.growth = LinkGrowth()
+        self._requests: deque[tuple[int, float]] = deque(maxlen=REQUESTS_MAX)  # ts1, host time
+        self._reset_line()
+        self.measure_delay_again()
+
+    def _reset_line(self) -> None:
+        self._telemetry, self._replies = Edge(1.0), Edge(-1.0)
+        self._least_s = math.inf  # delay of both directions
+        self._settled = False
+        self._measured_s = -math.inf  # host time of the newest measurement of the rate
+        self._rate = 1.0
+        self.jumped_s = 0.0
+
+    def measure_delay_again(self) -> None:
+        """The link is loaded otherwise from now on: forget its delay."""
+        self._requests.clear()
+        self._delays_s: deque[float] = deque(maxlen=REPLIES_MAX)
+        self._began_s = math.inf  # host time of the first request
+        self._settled_delay_s = math.nan
+
+    def settle(self) -> None:
+        """The flight begins: its control law takes the present delay into account. From now on
+        jumps of the clock count, once its rate was measured, and the rate of a vehicle without
+        replies stays 1 if it is."""
+        delay = self.delay
+        self._settled_delay_s = delay.value if delay else math.nan
+        self._settled = True
+        self.jumped_s = 0.0
+
+    # --- what arrives ---
+
+    def on_telemetry(self, stamp_s: float, arrived_s: float) -> None:
+        """A message with the stamp `stamp_s` arrived at host time `arrived_s`."""
+        ahead_s = stamp_s - self.now_s(arrived_s)
+        if math.isfinite(self._measured_s) and ahead_s > JUMP_S:
+            if not self._settled:
+                self._reset_line()  # before the flight the rate is measured anew
+            self.jumped_s += ahead_s
+            self._telemetry.clear()
+            self._replies.clear()
+        self._telemetry.add(arrived_s, stamp_s, self._rate)
+        if arrived_s - self._measured_s >= RATE_EVERY_S:
+            self._measure_rate(arrived_s)
+
+    def request(self, stamp_s: float, host_s: float) -> Timesync:
+        """The request to send with a setpoint at host time `host_s`. `stamp_s`: of the newest
+        telemetry."""
+        stamp_ns = round(stamp_s * 1e9)
+        self._requests.append((stamp_ns, host_s))
+        self._began_s = min(self._began_s, host_s)
+        return Timesync(0, stamp_ns)
+
+    def on_reply(self, reply: TimesyncReply) -> bool:
+        """Evaluate a reply; returns whether its request was ours."""
+        asked = next((each for each in self._requests if each[0] == reply.request_ns), None)
+        if asked is None:
+            return False
+        self._requests.remove(asked)  # a duplicate must not count again
+        delay_s = (reply.vehicle_ns - reply.request_ns) * 1e-9
+        if 0.0 <= delay_s <= DELAY_MAX_S:
+            self._delays_s.append(delay_s)
+            self._least_s = min(self._least_s, delay_s)
+            self._replies.add(asked[1], reply.vehicle_ns * 1e-9, self._rate)
+        return True
+
+    def _measure_rate(self, host_s: float) -> None:
+        down, up = self._telemetry.rate, self._replies.rate
+        if down is None:
+            return
+        first, self._measured_s = math.isinf(self._measured_s), host_s
+        if up is not None:
+            self._rate = max(min(max(self._rate, min(down, up)), max(down, up)), 0.0)
+        elif first or not self._settled or self._rate != 1.0:
+            self._rate = 1.0 if abs(down - 1.0) < REAL_TIME else max(down, 0.0)
+
+    # --- time and age ---
+
+    def now_s(self, host_s: float) -> float:
+        """Stamp of telemetry that would arrive at host time `host_s` with the least delay; -inf
+        before the first telemetry."""
+        shown_s = self._telemetry.at(host_s, self._rate)
+        bound_s = self._replies.at(host_s, self._rate, BOUNDS_S)
+        if shown_s is None:
+            return -math.inf
+        return shown_s if bound_s is None else min(shown_s, bound_s - self._least_s)
+
+    def age_s(self, stamp_s: float, host_s: float) -> float:
+        """Age at `host_s` of telemetry stamped `stamp_s`, beyond the least delay of the window."""
+        return max(self.now_s(host_s) - stamp_s, 0.0)
+
+    # --- delay of both directions ---
+
+    @property
+    def delay(self) -> Estimate | None:
+        """Median and standard deviation (s) of the newest replies, or None before five."""
+        if len(self._delays_s) < REPLIES_MIN:
+            return None
+        median_s = statistics.median(self._delays_s)
+        deviation_s = statistics.median(abs(each - median_s) for each in self._delays_s)
+        return Estimate(median_s, NORMAL * deviation_s)
+
+    def delay_is_measured(self, host_s: float) -> bool:
+        """Whether `delay` is reliable at host time `host_s`, or the vehicle answers nothing."""
+        unanswered = not self._delays_s and host_s - self._began_s > DELAY_MAX_S
+        return len(self._delays_s) >= REPLIES_MEASURED or unanswered
+
+    @property
+    def delay_growth_s(self) -> float:
+        """Median of the newest replies less the delay at `settle`; 0 while either is unknown."""
+        newest = list(self._delays_s)[-REPLIES_NEWEST:]
+        if math.isnan(self._settled_delay_s) or len(newest) < REPLIES_NEWEST:
+            return 0.0
+        return statistics.median(newest) - self._settled_delay_s
+
+
+class LinkGrowth:
+    """What the link has added to its delay since take-off, for prediction and bandwidth.
+
+    `added_s` follows changes of more than LEAST_GROWTH_S. `changed_s` is by how much it changed
+    within the last STEADY_S: a delay that changes is not known better than that.
+    """
+
+    def __init__(self) -> None:
+        self.reset()
+
+    def reset(self) -> None:
+        """Nothing was added."""
+        self.added_s = self.changed_s = 0.0
+        self._history: deque[tuple[float, float]] = deque(((-math.inf, 0.0),))  # from when, added_s
+
+    def step(self, time_s: float, growth_s: float) -> bool:
+        """Take the growth at vehicle time `time_s`; returns whether anything changed."""
+        before = self.added_s, self.changed_s
+        if abs(growth_s - self.added_s) > LEAST_GROWTH_S:
+            self.added_s = growth_s
+            self._history.append((time_s, growth_s))
+        while len(self._history) > 1 and self._history[1][0] <= time_s - STEADY_S:
+            self._history.popleft()
+        values_s = [added_s for _, added_s in self._history]
+        self.changed_s = max(values_s) - min(values_s)
+        return before != (self.added_s, self.changed_s)
+
+
+class Edge:
+    """Points of host and vehicle time, over WINDOW_S of host time: of each BIN_S the one that is
+    most ahead, or with `sign` -1 the one that is most behind."""
+
+    def __init__(self, sign: float) -> None:
+        self._sign = sign
+        self._points: deque[tuple[float, float]] = deque()
+        self._bin_s = 0.0  # host time of the first of the newest bin
+
+    def add(self, host_s: float, vehicle_s: float, rate: float) -> None:
+        points = self._points
+        if points and host_s - self._bin_s < BIN_S:
+            ahead_s = vehicle_s - points[-1][1] - rate * (host_s - points[-1][0])
+            if self._sign * ahead_s > 0.0:
+                points[-1] = host_s, vehicle_s
+        else:
+            points.append((host_s, vehicle_s))
+            self._bin_s = host_s
+        while points[0][0] < host_s - WINDOW_S:
+            points.popleft()
+
+    def clear(self) -> None:
+        self._points.clear()
+
+    def at(self, host_s: float, rate: float, over_s: float = math.inf) -> float | None:
+        """Vehicle time at `host_s` by the point that is most ahead, or behind, of those that are at
+        most `over_s` old; None without any."""
+        times_s = [v + rate * (host_s - h) for h, v in self._points if host_s - h <= over_s]
+        return self._sign * max(self._sign * each for each in times_s) if times_s else None
+
+    @property
+    def rate(self) -> float | None:
+        """Slope of the least-squares line; None for less than RATE_OVER_S."""
+        points = self._points
+        if not points or points[-1][0] - points[0][0] < RATE_OVER_S:
+            return None
+        return statistics.linear_regression(*zip(*points, strict=True)).slope
