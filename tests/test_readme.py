@@ -39,10 +39,10 @@ def test_the_readme_is_short() -> None:
     assert len(README.splitlines()) <= LINES_MAX
 
 
-def test_ci_runs_exactly_the_test_command() -> None:
+def test_ci_runs_the_test_command_unchanged() -> None:
     command = _commands()[1]
     assert command.endswith("pytest -n auto")
-    assert (ROOT / ".ci" / "run").read_text().splitlines()[-1] == command
+    assert command in (ROOT / ".ci" / "run").read_text().splitlines()
 
 
 def test_the_workflow_leaves_out_only_tests_that_exist() -> None:

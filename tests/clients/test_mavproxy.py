@@ -62,6 +62,7 @@ def _reach_five_metres(proxy: Terminal) -> None:
     raise AssertionError(proxy.shown)
 
 
+@pytest.mark.slow
 def test_a_session_with_two_flights(proxy: Terminal) -> None:
     proxy.expect("Detected vehicle 1:1")
     # over FTP first, in vain: without a refusal that takes 12 s
