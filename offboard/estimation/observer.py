@@ -1,43 +1,58 @@
-"""Position, velocity and disturbance of the vehicle, now and when a command sent now takes effect.
+"""The observer: the state of the vehicle, now and when a command sent now takes effect.
+
+    predict   x(t + h) = f(x(t), commands sent)      `propagation`, with the delay of each axis
+              P <- F P F' + Q                        `kalman.predict`, F linearised about hover
+    update    x <- x + K (z - H x)                   by each attitude and position that arrives
+    reset     on the ground, after a long gap, and after a jump of the vehicle's own estimate
+
+The state x (indices in `propagation`, NED, SI) is position, velocity, thrust direction b and its
+rate, disturbance acceleration d, bias of the reported velocity, thrust, course and its rate. d
+stands for wind and for errors of thrust and mass, so that it contains the hover thrust. Three
+filters share x, since their axes decouple: north and east (one covariance), down, course.
 
 The velocity that an autopilot reports need not be the derivative of the position that it reports
-(PX4: wrong by 0.2 to 0.3 m/s for seconds), so velocity is estimated from the position and from the
-commands *sent*, replayed through the attitude response; the reported velocity is used with a bias
-or not at all. A disturbance acceleration stands for wind and for errors of thrust and mass. All
-times are vehicle time.
+(PX4: wrong by 0.2 to 0.3 m/s for seconds), so velocity comes from the position and from the
+commands *sent*; the reported velocity is used with a bias that changes slowly. All times are
+vehicle time.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.estimation.filtering import spread
-from offboard.estimation.observer_adaptation import Adaptation
-from offboard.estimation.observer_filter import (
-    bound_disturbance,
-    bring_forward,
-    correct_by_attitude,
-    correct_by_position,
-    learn,
-)
-from offboard.estimation.observer_model import (
-    ObserverSettings,
-    VelocitySource,
-    new_record,
-    predicted_heave,
-    predicted_state,
-    set_vehicle,
-    start_filters,
+from offboard.compiled import entry, kernel
+from offboard.estimation import kalman
+from offboard.estimation.kalman import (
+    ADAPTATION,
+    AT_ATTITUDE,
+    AT_POSITION,
+    AT_VELOCITY,
+    FILTER,
+    LATERAL,
+    VERTICAL,
+    adapt,
+    innovation_variance,
+    interrupt,
+    measurement_variance,
+    reset_bias,
+    reset_position,
+    update,
 )
 from offboard.estimation.propagation import (
+    BIAS,
     COMMANDS_KEPT,
     COURSE,
     COURSE_RATE,
     DISTURBANCE,
+    DRAG,
+    GRAVITY,
     LATER,
+    MOTION,
     NOW,
     POSITION,
     SENT_AT,
@@ -46,15 +61,19 @@ from offboard.estimation.propagation import (
     TILT,
     TILT_RATE,
     VELOCITY,
+    plant_vector,
     replay,
+    wrapped,
 )
-from offboard.model.axes import upright
+from offboard.model.axes import acceleration, lateral_model, upright
 from offboard.model.command import Command
-from offboard.model.frames import course_from_quaternion, thrust_direction_from_quaternion
-from offboard.model.predicted_state import PredictedState
+from offboard.model.frames import (
+    course_from_quaternion,
+    thrust_direction_from_quaternion,
+    wrap_pi,
+)
+from offboard.model.predicted_state import PredictedHeave, PredictedState
 from offboard.model.vehicle import Vehicle
-
-__all__ = ["Observer", "ObserverSettings", "VelocitySource"]
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]
@@ -62,6 +81,180 @@ Quaternion = tuple[float, float, float, float]
 
 LATEST_S = 0.1  # telemetry that is older than this when newer has arrived is dropped
 LONGEST_GAP_S = 1.0  # a longer gap or a step back in time restarts; a gap keeps the disturbance
+# A measurement is a jump of the vehicle's estimate if it is further off than so many standard
+# deviations of its innovation and a distance: position (m), velocity (m/s)
+GATE_SDS, GATES = 3.0, (0.3, 0.5)
+DISTURBANCE_LIMIT_MPS2 = 8.0
+BIAS_TIME_CONSTANT_S = 10.0
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """Q by densities per root second, R by standard deviations. These were flown on PX4 and
+    ArduCopter; half or twice the values made no visible difference. Noise of position and velocity
+    and drift of the disturbance are estimated in flight too, and never less than these; the drift
+    at most `disturbance_limit_mps2`."""
+
+    acceleration_mps: float = 0.2
+    disturbance_mps2: float = 0.15
+    disturbance_limit_mps2: float = 1.0
+    tilt_radps: float = 0.6
+    course_radps: float = 0.6
+    bias_mps: float = 0.08
+    position_sd_m: float = 0.002
+    velocity_sd_mps: float = 0.005
+    attitude_sd_rad: float = 0.001
+
+
+# ---------------------------------------------------------------------- filters
+
+HEADING = 2  # after LATERAL and VERTICAL
+# Their states: indices in x for each axis
+PLACES: tuple[list[tuple[int, ...]], ...] = (
+    [
+        (POSITION + i, VELOCITY + i, TILT + i, TILT_RATE + i, DISTURBANCE + i, BIAS + i)
+        for i in (0, 1)
+    ],
+    [(POSITION + 2, VELOCITY + 2, DISTURBANCE + 2, BIAS + 2)],
+    [(COURSE, COURSE_RATE)],
+)
+LATERAL_DISTURBANCE, VERTICAL_DISTURBANCE = 4, 2
+# H: the states of which each measurement is the sum, by row
+MEASURED: tuple[dict[int, tuple[int, ...]], ...] = (
+    {AT_POSITION: (0,), AT_VELOCITY: (1, 5), AT_ATTITUDE: (2,)},
+    {AT_POSITION: (0,), AT_VELOCITY: (1, 3)},
+    {AT_ATTITUDE: (0,)},
+)
+# Standard deviations at the first telemetry, which sets position, velocity and attitude;
+# disturbance and bias start at zero
+START_SDS = ((0.1, 0.3, 0.02, 0.3, 1.0, 0.3), (0.1, 0.3, 1.5, 0.3), (0.05, 0.3))
+
+OBSERVER = np.dtype(
+    [
+        ("time_s", "f8"),  # vehicle time of the state
+        ("motion", MOTION),
+        ("filters", FILTER, 3),
+        ("adaptation", ADAPTATION),
+        ("attitude_variance", "f8"),
+        ("measured", "f8", 6),  # position and velocity, with the indices of the state
+        ("residual", "f8", 6),  # scratch
+    ],
+    align=True,
+)
+"""Record of one observer."""
+
+
+def models(vehicle: Vehicle, noise: Noise) -> tuple[tuple[Array, Array], ...]:
+    """Dynamics (n, n) of x' = A x, so that F = exp(A h), and noise densities (n,), Q per second, of
+    the lateral, vertical and course filters: linearised about hover, where the acceleration per
+    error of the thrust direction is g."""
+    motion, drift, bias = noise.acceleration_mps, noise.disturbance_mps2, noise.bias_mps
+    forgetting = -1.0 / BIAS_TIME_CONSTANT_S
+    lateral = np.zeros((6, 6))
+    lateral[:4, :4] = lateral_model(vehicle).dynamics
+    lateral[1, 4], lateral[5, 5] = 1.0, forgetting
+    vertical = np.zeros((4, 4))
+    vertical[0, 1] = vertical[1, 2] = 1.0
+    vertical[1, 1], vertical[3, 3] = -vehicle.drag_per_mass_ps, forgetting
+    heading = np.zeros((2, 2))
+    frequency = vehicle.yaw.natural_frequency_radps
+    heading[0, 1] = 1.0
+    heading[1] = -(frequency**2), -2.0 * vehicle.yaw.damping * frequency
+    return (
+        (lateral, np.array([0.0, motion, 0.0, noise.tilt_radps, drift, bias])),
+        (vertical, np.array([0.0, motion, drift, bias])),
+        (heading, np.array([0.0, noise.course_radps])),
+    )
+
+
+@entry(OBSERVER, float, float, float, float)
+def update_by_attitude(
+    observers: Any, time_s: float, north: float, east: float, course: float
+) -> None:
+    """Update by an attitude measured at `time_s`, not later than the state: thrust direction (north
+    and east components) and course (rad). `observers` is one OBSERVER (1,)."""
+    observer = observers[0]
+    state, late_s = observer.motion.states[NOW], observer.time_s - time_s
+    lateral, heading = observer.filters[LATERAL], observer.filters[HEADING]
+    lateral.innovation[0] = north - state[TILT] + late_s * state[TILT_RATE]
+    lateral.innovation[1] = east - state[TILT + 1] + late_s * state[TILT_RATE + 1]
+    heading.innovation[0] = wrapped(course - state[COURSE] + late_s * state[COURSE_RATE])
+    update(state, lateral, AT_ATTITUDE, observer.attitude_variance)
+    update(state, heading, AT_ATTITUDE, observer.attitude_variance)
+    bound_disturbance(state)
+
+
+@entry(OBSERVER, float)
+def update_by_position(observers: Any, time_s: float) -> None:
+    """Update by the position and velocity in `measured`, which are of `time_s`, not later than the
+    state. One that jumped resets position or bias and leaves the rest."""
+    observer = observers[0]
+    noted, measured = observer.adaptation, observer.measured
+    state = observer.motion.states[NOW]
+    _bring_forward(measured, state, observer.motion.plant[:], observer.time_s - time_s)
+    _missed(state, measured, noted.innovation)
+    jumped = False
+    for kind in range(2):
+        variance = measurement_variance(noted, kind)
+        for i in range(2):
+            one = observer.filters[i]
+            furthest = 0.0
+            for axis in range(one.axes):
+                innovation = measured[one.places[axis, kind]]
+                for j in range(one.order):
+                    innovation -= one.measures[kind, j] * state[one.places[axis, j]]
+                one.innovation[axis] = innovation
+                furthest = max(furthest, abs(innovation))
+            sd = math.sqrt(innovation_variance(one, kind, variance))
+            if furthest <= GATES[kind] + GATE_SDS * sd:
+                update(state, one, kind, variance)
+                continue
+            jumped = True
+            if kind == AT_POSITION:
+                reset_position(state, one, measured, variance)
+            else:
+                reset_bias(state, one, variance)
+    bound_disturbance(state)
+    if jumped:
+        interrupt(noted)
+        return
+    _missed(state, measured, observer.residual)
+    adapt(noted, observer.time_s, observer.residual[:])
+    observer.filters[LATERAL].densities[LATERAL_DISTURBANCE] = noted.density[LATERAL]
+    observer.filters[VERTICAL].densities[VERTICAL_DISTURBANCE] = noted.density[VERTICAL]
+
+
+@kernel
+def _missed(state: Array, measured: Array, missed: Array) -> None:
+    """Fill `missed` (6,) with measured less estimated position and reported velocity."""
+    for i in range(3):
+        missed[i] = measured[POSITION + i] - state[POSITION + i]
+        missed[3 + i] = measured[VELOCITY + i] - state[VELOCITY + i] - state[BIAS + i]
+
+
+@kernel
+def _bring_forward(measured: Array, state: Array, plant: Array, late_s: float) -> None:
+    """Propagate position and velocity `measured` (6,) by `late_s`, to the time of the state."""
+    if late_s <= 0.0:
+        return
+    direction = (state[TILT], state[TILT + 1], upright(state[TILT], state[TILT + 1]))
+    gravity = (0.0, 0.0, plant[GRAVITY])
+    for i in range(3):
+        speed = state[VELOCITY + i]
+        measured[POSITION + i] += late_s * speed
+        measured[VELOCITY + i] += late_s * acceleration(
+            gravity[i], state[THRUST] * direction[i], plant[DRAG], speed, state[DISTURBANCE + i]
+        )
+
+
+@kernel
+def bound_disturbance(state: Array) -> None:
+    """Limit each axis of the disturbance, in place."""
+    for i in range(DISTURBANCE, DISTURBANCE + 3):
+        state[i] = min(max(state[i], -DISTURBANCE_LIMIT_MPS2), DISTURBANCE_LIMIT_MPS2)
+
+
+# ---------------------------------------------------------------------- observer
 
 
 class Observer:
@@ -72,56 +265,60 @@ class Observer:
 
     Args:
         vehicle: constants of the vehicle.
-        settings: noise of telemetry and disturbance.
+        noise: of telemetry and disturbance.
     """
 
-    def __init__(self, vehicle: Vehicle, settings: ObserverSettings) -> None:
-        self._settings = settings
-        self._record = new_record(settings)
-        self._time = self._record["time_s"]
-        self._motion = self._record["motion"]
-        self._filters = self._record["filters"][0]
-        self._measured: Array = self._record["measured"][0]
-        self._plant: Array = self._motion["plant"][0]
+    def __init__(self, vehicle: Vehicle, noise: Noise | None = None) -> None:
+        self._noise = noise = noise or Noise()
+        self._record = record = np.zeros(1, OBSERVER)
+        record["attitude_variance"] = noise.attitude_sd_rad**2
+        self._motion = record["motion"]
+        self._filters = record["filters"][0]
+        self._adaptation = record["adaptation"]
+        self._time = record["time_s"]
+        self._measured: Array = record["measured"][0]
         self._states: Array = self._motion["states"][0]
         self._state: Array = self._states[NOW]
         self._history: Array = self._motion["history"][0]
         self._position_at: float | None
         self._attitude_at: float | None
         self._sent: int
-        self._adaptation = Adaptation(
-            self._record["adaptation"],
-            settings.position_sd_m,
-            settings.velocity_sd_mps,
-            settings.disturbance_density_mps2,
-            settings.disturbance_density_limit_mps2,
-        )
-        self._adopt(vehicle)
+        for one, places, measured in zip(self._filters, PLACES, MEASURED, strict=True):
+            one["order"], one["axes"] = len(places[0]), len(places)
+            one["places"][: len(places), : len(places[0])] = places
+            for row, summed in measured.items():
+                one["measures"][row, list(summed)] = 1.0
+        self._set_vehicle(vehicle)
         self.reset()
 
     def reset(self) -> None:
         """Forget the previous flight."""
+        noise, noted = self._noise, self._adaptation
         self._frozen = False
         self._forget_commands()
         self._state[:] = 0.0
         self._rates = np.zeros(3)
-        self._adaptation.reset()
+        noted[:] = np.zeros_like(noted)
+        noted["least"] = np.square((noise.position_sd_m, noise.velocity_sd_mps))
+        noted["bounds"] = noted["density"] = noise.disturbance_mps2
+        self._permit_drift(LATERAL)
         self._restart()
 
     def adopt(self, vehicle: Vehicle) -> None:
-        """Continue with newly identified constants. Thrust is sent as a ratio to the hover thrust,
-        so commands sent are rescaled, and the disturbance loses what the new hover thrust and drag
-        explain."""
-        ratio = self._vehicle.hover_thrust / vehicle.hover_thrust
-        self._history[:, SENT_THRUST] *= ratio
-        self._state[THRUST] *= ratio
-        down = (self._gravity + self._state[DISTURBANCE + 2]) * ratio - vehicle.gravity_mps2
+        """Continue with another vehicle model, as identified in flight: thrust and disturbance
+        change to what they mean with it, the motion does not. From now on the vertical drift is
+        estimated too: before the thrust is identified, an error of its delay looks like drift, and
+        a faster correction would make the vehicle oscillate."""
+        scale = self._vehicle.hover_thrust / vehicle.hover_thrust
+        self._history[:, SENT_THRUST] *= scale
+        self._state[THRUST] *= scale
+        down = (self._gravity + self._state[DISTURBANCE + 2]) * scale - vehicle.gravity_mps2
         slowed = vehicle.drag_per_mass_ps - self._vehicle.drag_per_mass_ps
-        self._adopt(vehicle)
-        self._adaptation.trust_thrust()
+        self._set_vehicle(vehicle)
+        self._permit_drift(VERTICAL)
         self._state[DISTURBANCE + 2] = down
         self._state[DISTURBANCE : DISTURBANCE + 3] += slowed * self._state[VELOCITY : VELOCITY + 3]
-        bound_disturbance(self._state, self._settings.disturbance_limit_mps2)
+        bound_disturbance(self._state)
 
     @property
     def ready(self) -> bool:
@@ -135,12 +332,25 @@ class Observer:
         down = float(self._state[DISTURBANCE + 2])
         return self._vehicle.hover_thrust * (1.0 + down / self._gravity)
 
+    @property
+    def noise_sds(self) -> tuple[float, float]:
+        """Noise of position (m) and reported velocity (m/s), as estimated."""
+        noted = self._adaptation[0]
+        position, velocity = np.sqrt(np.maximum(noted["variance"], noted["least"]))
+        return float(position), float(velocity)
+
+    @property
+    def drift_densities_mps2(self) -> tuple[float, float]:
+        """Drift of the disturbance per root second, lateral and vertical, as estimated."""
+        lateral, vertical = self._adaptation["density"][0]
+        return float(lateral), float(vertical)
+
     def freeze(self, grounded: bool) -> None:
         """Stop estimating while the vehicle is on the ground or does not fly our commands: velocity
         as reported, thrust direction as measured, no disturbance. After that the filters start
         from there."""
         if grounded != self._frozen:
-            self._start_filters()
+            self._reset_filters()
         self._frozen = grounded
 
     def on_command(self, time_s: float, command: Command) -> None:
@@ -153,8 +363,7 @@ class Observer:
         if sent and time_s < history[sent - 1, SENT_AT]:
             time_s = history[sent - 1, SENT_AT]
         history[sent] = time_s, north, east, command.thrust_mps2, command.course_rad
-        self._sent = sent + 1
-        self._motion["sent"] = self._sent
+        self._motion["sent"] = self._sent = sent + 1
 
     def on_attitude(self, time_s: float, q: Quaternion, rates: Triple) -> None:
         """Attitude quaternion (FRD to NED, w first) and body rates (rad/s, FRD) at `time_s`."""
@@ -172,7 +381,7 @@ class Observer:
             self._time_s = max(self._time_s, time_s)
         else:
             self._go_to(time_s, complete=self._position_at is not None)
-            correct_by_attitude(self._record, time_s, north, east, course)
+            update_by_attitude(self._record, time_s, north, east, course)
         self._attitude_at = time_s
 
     def on_position(self, time_s: float, position_ned_m: Triple, velocity_ned_mps: Triple) -> None:
@@ -186,7 +395,7 @@ class Observer:
         else:
             self._go_to(time_s, complete=self._attitude_at is not None)
             self._measured[:] = *position_ned_m, *velocity_ned_mps
-            self._correct_by_position(time_s)
+            update_by_position(self._record, time_s)
         self._position_at = time_s
 
     def predict(self, time_s: float) -> PredictedState:
@@ -195,8 +404,30 @@ class Observer:
         Valid once `ready`."""
         tilt_s = time_s + self._vehicle.tilt.delay_s
         thrust_s = time_s + self._vehicle.thrust_delay_s
-        heave = predicted_heave(thrust_s, self._propagated(thrust_s))
-        return predicted_state(tilt_s, self._propagated(tilt_s), self._rates.copy(), heave)
+        numbers = self._propagated(thrust_s).tolist()
+        heave = PredictedHeave(
+            time_s=thrust_s,
+            position_down_m=numbers[POSITION + 2],
+            velocity_down_mps=numbers[VELOCITY + 2],
+            thrust_down_mps2=numbers[THRUST] * upright(numbers[TILT], numbers[TILT + 1]),
+        )
+        state = self._propagated(tilt_s)
+        north, east, rate_n, rate_e = state[TILT : TILT_RATE + 2].tolist()
+        down = upright(north, east)
+        rate_d = -(north * rate_n + east * rate_e) / down
+        return PredictedState(
+            time_s=tilt_s,
+            position_ned_m=state[POSITION : POSITION + 3],
+            velocity_ned_mps=state[VELOCITY : VELOCITY + 3],
+            thrust_direction_ned=np.array([north, east, down]),
+            thrust_direction_rate_ned_ps=np.array([rate_n, rate_e, rate_d]),
+            course_rad=wrap_pi(float(state[COURSE])),
+            course_rate_radps=float(state[COURSE_RATE]),
+            thrust_mps2=float(state[THRUST]),
+            disturbance_ned_mps2=state[DISTURBANCE : DISTURBANCE + 3],
+            rates_frd_radps=self._rates.copy(),
+            heave=heave,
+        )
 
     def _propagated(self, time_s: float) -> Array:
         """A copy of the state, replayed forward to `time_s`."""
@@ -211,36 +442,37 @@ class Observer:
         return later
 
     def _go_to(self, time_s: float, *, complete: bool) -> None:
-        """Propagate the state to `time_s`, or leave it if it is newer. `complete`: position and
-        attitude have arrived, so that the commands can be replayed."""
+        """Propagate state and covariances to `time_s`, or leave them if they are newer. `complete`:
+        position and attitude have arrived, so that the commands can be replayed."""
         start_s = self._time_s
         if time_s <= start_s:
             return
         if complete:
             replay(self._motion, NOW, start_s, time_s)
-            spread(self._filters, time_s - start_s)
+            kalman.predict(self._filters, time_s - start_s, self._longest_s)
         self._time_s = time_s
 
-    def _correct_by_position(self, time_s: float) -> None:
-        """Correct by the position and velocity in `_measured`, which are of `time_s`."""
-        if self._settings.velocity is VelocitySource.REPORTED:
-            self._state[: VELOCITY + 3] = self._measured
-            return
-        if time_s < self._time_s:
-            bring_forward(self._measured, self._state, self._plant, self._time_s - time_s)
-        if correct_by_position(self._record):
-            self._adaptation.interrupt()
-        elif self._settings.adaptive:
-            learn(self._record)
-
-    def _adopt(self, vehicle: Vehicle) -> None:
+    def _set_vehicle(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
         self._gravity = vehicle.gravity_mps2
-        set_vehicle(self._record, vehicle, self._settings)
+        self._motion["plant"] = plant_vector(vehicle, BIAS_TIME_CONSTANT_S)
+        frequency = max(vehicle.tilt.natural_frequency_radps, vehicle.yaw.natural_frequency_radps)
+        damping = max(vehicle.tilt.damping, vehicle.yaw.damping, 0.5)
+        self._longest_s = min(0.02, 0.25 / (2.0 * damping * frequency))
+        for one, (dynamics, densities) in zip(
+            self._filters, models(vehicle, self._noise), strict=True
+        ):
+            one["dynamics"][: len(densities), : len(densities)] = dynamics
+            one["densities"][: len(densities)] = densities
+
+    def _permit_drift(self, group: int) -> None:
+        """Let the drift density of this group grow up to the limit."""
+        noise = self._noise
+        limit_mps2 = max(noise.disturbance_mps2, noise.disturbance_limit_mps2)
+        self._adaptation["bounds"][0, group, 1] = limit_mps2
 
     def _forget_commands(self) -> None:
-        self._sent = 0
-        self._motion["sent"] = 0
+        self._motion["sent"] = self._sent = 0
 
     def _restart(self) -> None:
         """Take the next attitude and position as they are."""
@@ -248,11 +480,14 @@ class Observer:
         self._position_at = None
         self._attitude_at = None
         self._state[THRUST] = self._gravity
-        self._start_filters()
+        self._reset_filters()
 
-    def _start_filters(self) -> None:
-        start_filters(self._record, self._settings)
-        self._adaptation.interrupt()
+    def _reset_filters(self) -> None:
+        """Covariances, disturbance and bias as at the first message."""
+        for one, sds in zip(self._filters, START_SDS, strict=True):
+            one["covariance"][: len(sds), : len(sds)] = np.diag(np.square(sds))
+        self._state[DISTURBANCE : BIAS + 3] = 0.0
+        interrupt(self._adaptation.view(np.recarray)[0])
 
     def _is_new(self, time_s: float, last_s: float | None) -> bool:
         """Whether to use a message of `time_s`, the last of its kind having been of `last_s`;

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from offboard.compiled import entry, kernel
 from offboard.model.axes import acceleration, upright
+from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
@@ -67,6 +68,19 @@ MOTION = np.dtype(
 
 LONGEST_STEP_S = 0.01
 SAME_TIME_S = 1e-9
+
+
+def plant_vector(vehicle: Vehicle, bias_time_constant_s: float) -> Array:
+    """The constants (PLANT_SIZE,) of `vehicle`."""
+    plant = np.empty(PLANT_SIZE)
+    plant[GRAVITY], plant[DRAG] = vehicle.gravity_mps2, vehicle.drag_per_mass_ps
+    plant[THRUST_DELAY], plant[THRUST_LAG] = vehicle.thrust_delay_s, vehicle.thrust_lag_s
+    tilt, yaw = vehicle.tilt, vehicle.yaw
+    plant[TILT_DELAY], plant[YAW_DELAY] = tilt.delay_s, yaw.delay_s
+    plant[TILT_FREQUENCY], plant[TILT_DAMPING] = tilt.natural_frequency_radps, tilt.damping
+    plant[YAW_FREQUENCY], plant[YAW_DAMPING] = yaw.natural_frequency_radps, yaw.damping
+    plant[BIAS_TIME_CONSTANT] = bias_time_constant_s
+    return plant
 
 
 @kernel

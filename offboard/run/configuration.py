@@ -34,7 +34,6 @@ from offboard.documents.reading import (
     validate,
 )
 from offboard.documents.shipped import locate, read_text
-from offboard.estimation.observer import ObserverSettings
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Limits
 from offboard.model.vehicle import Vehicle
@@ -55,7 +54,6 @@ class FlightConfig(Parameters):
     vehicle: Vehicle
     controller: SerializeAsAny[ControllerSettings]  # the settings class of its `law`
     reference: SerializeAsAny[Shape]  # the class of its `shape`
-    observer: ObserverSettings = ObserverSettings()
     limits: Limits = Limits()
     identify: IdentifySettings = IdentifySettings()
     period_s: float = Field(default=0.1, ge=0.01, le=0.5)  # control period, vehicle time

@@ -78,7 +78,7 @@ def build_parts(config: FlightConfig) -> FlightParts:
     return FlightParts(
         vehicle=config.vehicle,
         controller=build_controller(config),
-        make_observer=lambda: Observer(config.vehicle, config.observer),
+        make_observer=lambda: Observer(config.vehicle),
         track=build_track(config),
         limits=config.limits,
         period_s=config.period_s,

@@ -284,7 +284,7 @@ def make(
     )
     believed = believed or resolved.vehicle
     controller = resolved.controller.build(believed, period_s=resolved.period_s, seed=resolved.seed)
-    observer = Observer(believed, resolved.observer)
+    observer = Observer(believed)
     companion = Companion(
         vehicle=believed,
         session=Session(

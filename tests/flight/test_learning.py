@@ -17,7 +17,7 @@ from scipy.interpolate import CubicHermiteSpline
 from offboard.analysis import history
 from offboard.analysis.identify import identify_flight, vehicle_file
 from offboard.documents.reading import parse
-from offboard.estimation.observer import Observer, ObserverSettings
+from offboard.estimation.observer import Observer
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Phase
 from offboard.flight.record import IDENTIFIED_ID
@@ -434,7 +434,7 @@ def test_observer_goes_on_smoothly_with_another_drag():
     """The predicted acceleration stays the same: the disturbance changes with the drag."""
     before = NEUTRAL
     after = NEUTRAL.model_copy(update={"drag_translation_npmps": (1.4, 1.4, 1.4)})
-    observer = Observer(before, ObserverSettings())
+    observer = Observer(before)
     level = (1.0, 0.0, 0.0, 0.0)
     for step in range(300):
         time_s = 0.01 * step

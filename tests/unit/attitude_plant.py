@@ -13,7 +13,7 @@ import numba
 import numpy as np
 
 from offboard.control.base import Controller, Situation
-from offboard.estimation.observer import Observer, ObserverSettings
+from offboard.estimation.observer import Noise, Observer
 from offboard.model.command import Command
 from offboard.model.frames import quaternion_from_thrust_direction
 from offboard.model.vehicle import Vehicle
@@ -206,7 +206,7 @@ def fly(
     believed: Vehicle,
     reference: Lemniscate,
     seed: int,
-    settings: ObserverSettings | None = None,
+    noise: Noise | None = None,
     laps: float = 2.0,
     period_s: float = 0.1,
     score_from_s: float = 8.0,
@@ -217,7 +217,7 @@ def fly(
     plant = Plant(truth, np.random.default_rng(seed))
     plant.x[:3] = reference.sample(0.0).position_ned_m + np.array(offset_ned_m)
     plant.x[10] = believed.gravity_mps2
-    observer = Observer(believed, settings or ObserverSettings())
+    observer = Observer(believed, noise)
     command = Command(believed.gravity_mps2, (0.0, 0.0, 1.0), reference.course_rad)
     plant.command(command)
     observer.on_command(0.0, command)

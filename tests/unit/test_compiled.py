@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from offboard.control.swarm import SEARCH, remember
-from offboard.estimation.filtering import FILTER
+from offboard.estimation.kalman import FILTER
 
 ROOT = Path(__file__).parents[2]
 OFFSET = "OFFSET = 1.0\n"

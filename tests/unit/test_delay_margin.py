@@ -8,7 +8,7 @@ from attitude_plant import Flight, Lemniscate, Truth, fly
 
 from offboard.control.delay_margin import needed_margin, supported_bandwidth
 from offboard.control.lqr import LqrLaw, LqrSettings
-from offboard.estimation.observer import ObserverSettings
+from offboard.estimation.observer import Noise
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 PX4 = Vehicle(
@@ -46,7 +46,7 @@ def flown(believed: Vehicle, bandwidth: float, extra_s: float) -> Flight:
     truth = Truth(believed.model_copy(update={"tilt": late}), noisy=False)
     law = LqrLaw(believed, LqrSettings(bandwidth_radps=bandwidth))
     return fly(
-        truth, law, believed, Lemniscate(15.0), 1, ObserverSettings(velocity="position"),
+        truth, law, believed, Lemniscate(15.0), 1, Noise(velocity_sd_mps=1.0),
         score_from_s=12.0, laps=1.0, offset_ned_m=(0.05, 0.05, 0.0),
     )  # fmt: skip
 
@@ -104,7 +104,7 @@ def test_bandwidth_allows_for_an_uncertain_delay_of_the_thrust(wrong_s):
         law = LqrLaw(believed, LqrSettings(bandwidth_radps=bandwidth))
         return fly(
             truth, law, believed, Lemniscate(15.0, heave_m=0.3), 1,
-            ObserverSettings(velocity="position"), score_from_s=12.0, laps=1.0,
+            Noise(velocity_sd_mps=1.0), score_from_s=12.0, laps=1.0,
         ).rmse_m  # fmt: skip
 
     assert rmse_m(lowered) < 0.05

@@ -11,8 +11,7 @@ import pytest
 from attitude_plant import Plant, Truth
 from scipy.integrate import solve_ivp
 
-from offboard.estimation.observer import Observer, ObserverSettings, VelocitySource
-from offboard.estimation.observer_model import plant_vector
+from offboard.estimation.observer import BIAS_TIME_CONSTANT_S, Noise, Observer
 from offboard.estimation.propagation import (
     COMMAND_SIZE,
     LATER,
@@ -20,6 +19,7 @@ from offboard.estimation.propagation import (
     NOW,
     STATE_SIZE,
     THRUST,
+    plant_vector,
     replay,
 )
 from offboard.model.command import Command
@@ -51,10 +51,10 @@ def command(north: float, east: float, thrust: float = G, course: float = 0.0) -
 
 
 def hovering(
-    settings: ObserverSettings | None = None, until_s: float = 5.0, vehicle: Vehicle = NO_DELAY
+    noise: Noise | None = None, until_s: float = 5.0, vehicle: Vehicle = NO_DELAY
 ) -> Observer:
     """An observer after a perfect hover with telemetry every 10 ms."""
-    observer = Observer(vehicle, settings or ObserverSettings())
+    observer = Observer(vehicle, noise)
     observer.on_command(0.0, LEVEL)
     for i in range(round(until_s / 0.01) + 1):
         observer.on_attitude(0.01 * i, UPRIGHT, STILL)
@@ -101,11 +101,11 @@ def follow(
 def test_steady_gains_equal_those_flown_on_px4() -> None:
     """Per 10 ms with the velocity ignored (its sd 1 m/s): p .36, v 7.87, d 5.97 from position;
     b .62, b' 28.2 from b. Found by disturbing one message by a little."""
-    settings = ObserverSettings(velocity_sd_mps=1.0)
+    noise = Noise(velocity_sd_mps=1.0)
     small = 1e-5
 
     def after(position: float, tilt: float) -> PredictedState:
-        observer = hovering(settings, until_s=20.0)
+        observer = hovering(noise, until_s=20.0)
         direction = np.array([tilt, 0.0, math.sqrt(1 - tilt**2)])
         observer.on_attitude(20.01, quaternion_from_thrust_direction(direction, 0.0), STILL)
         observer.on_position(20.01, (position, 0.0, 0.0), STILL)
@@ -159,7 +159,7 @@ def test_replay_agrees_with_scipy(damping: float) -> None:
         x = solve_ivp(rate, (a, b), x, "DOP853", args=(u,), rtol=1e-11, atol=1e-12).y[:, -1]
     motion = np.zeros(1, MOTION)
     motion["states"][0, NOW] = start
-    motion["plant"] = plant_vector(vehicle, ObserverSettings())
+    motion["plant"] = plant_vector(vehicle, BIAS_TIME_CONSTANT_S)
     motion["history"][0, :5], motion["sent"] = sent, 5
     replay(motion, LATER, 0.0, 1.0)
     assert motion["states"][0, LATER] == pytest.approx(x, abs=3e-6)
@@ -172,7 +172,7 @@ def test_prediction_is_exact_on_a_matching_plant(about_rad: float) -> None:
     plant = Plant(Truth(PX4, noisy=False), np.random.default_rng(0))
     plant.x[11] = about_rad
     plant.command(replace(LEVEL, course_rad=about_rad))
-    observer = Observer(PX4, ObserverSettings())
+    observer = Observer(PX4)
     observer.on_command(0.0, replace(LEVEL, course_rad=about_rad))
     pairs = follow(plant, observer, 6.0, seed=5, about_rad=about_rad)[20:]
     assert len(pairs) > 30
@@ -199,7 +199,7 @@ def test_command_changes_the_prediction_only_after_its_delay() -> None:
 
 def test_vertical_is_predicted_to_the_time_when_the_thrust_acts() -> None:
     """Falling at 2 m/s with thrust delay 15 ms, tilt delay 57 ms: two times, two heights."""
-    observer = Observer(PX4, ObserverSettings())
+    observer = Observer(PX4)
     thrust = G - 1.02 * 2.0
     observer.on_command(0.0, command(0.0, 0.0, thrust))
     for i in range(301):
@@ -219,13 +219,13 @@ def test_vertical_is_predicted_to_the_time_when_the_thrust_acts() -> None:
 
 
 @pytest.mark.parametrize("gap_s", [0.01, 0.033, 0.05])
-@pytest.mark.parametrize("source", [VelocitySource.BIAS, VelocitySource.POSITION])
+@pytest.mark.parametrize("velocity_sd_mps", [0.005, 1.0])
 def test_disturbance_and_velocity_converge_at_any_rate(
-    gap_s: float, source: VelocitySource
+    gap_s: float, velocity_sd_mps: float
 ) -> None:
     push = (0.8, -0.5, 0.4)
     plant = Plant(Truth(PX4, wind_force_ned_mps2=push, noisy=False), np.random.default_rng(0))
-    observer = Observer(PX4, ObserverSettings(velocity=source))
+    observer = Observer(PX4, Noise(velocity_sd_mps=velocity_sd_mps))
     rng = np.random.default_rng(1)
     for i in range(round(12.0 / gap_s)):
         now = plant.time_s
@@ -243,21 +243,11 @@ def test_disturbance_and_velocity_converge_at_any_rate(
     assert state.velocity_ned_mps == pytest.approx(truth[3:6], abs=0.02)
 
 
-def test_reported_velocity_is_used_as_it_is_only_if_configured() -> None:
-    wrong = (0.3, 0.0, -0.2)
-    raw = hovering(ObserverSettings(velocity=VelocitySource.REPORTED))
-    raw.on_position(5.01, STILL, wrong)
-    assert raw.predict(5.01).velocity_ned_mps == pytest.approx(wrong, abs=1e-9)
-    ours = hovering(ObserverSettings(velocity=VelocitySource.POSITION))
-    ours.on_position(5.01, STILL, wrong)
-    assert ours.predict(5.01).velocity_ned_mps == pytest.approx([0, 0, 0], abs=1e-9)
-
-
 @pytest.mark.parametrize("scale", [0.85, 1.15])
 def test_hover_thrust_is_estimated_from_the_disturbance(scale: float) -> None:
     """The vehicle file has a hover thrust of u_h, the plant u_h / scale: u_h (1 + d_z / g)."""
     plant = Plant(Truth(PX4, thrust_scale=scale, noisy=False), np.random.default_rng(0))
-    observer = Observer(PX4, ObserverSettings())
+    observer = Observer(PX4)
     sent = command(0.0, 0.0, G / scale)
     plant.x[10] = G
     plant.command(sent)
@@ -278,13 +268,13 @@ def test_hover_thrust_is_estimated_from_the_disturbance(scale: float) -> None:
 
 
 def test_disturbance_is_bounded() -> None:
-    observer = Observer(NO_DELAY, ObserverSettings(disturbance_limit_mps2=2.0))
+    observer = Observer(NO_DELAY)
     observer.on_command(0.0, LEVEL)
     for i in range(300):
         time_s = 0.01 * i
         observer.on_attitude(time_s, UPRIGHT, STILL)
-        observer.on_position(time_s, (3.0 * time_s**2, 0.0, 0.0), (6.0 * time_s, 0.0, 0.0))
-    assert observer.predict(3.0).disturbance_ned_mps2[0] == pytest.approx(2.0)
+        observer.on_position(time_s, (6.0 * time_s**2, 0.0, 0.0), (12.0 * time_s, 0.0, 0.0))
+    assert observer.predict(3.0).disturbance_ned_mps2[0] == pytest.approx(8.0)
 
 
 # ---------------------------------------------------------------- ground, gaps, jumps
@@ -324,7 +314,7 @@ def test_old_and_repeated_messages_are_dropped() -> None:
 
 def test_position_older_than_the_attitude_is_used_at_its_own_time() -> None:
     """Position stamped 8 ms before the newest attitude, at 3 m/s: no error of 24 mm."""
-    observer = Observer(NO_DELAY, ObserverSettings())
+    observer = Observer(NO_DELAY)
     observer.on_command(0.0, command(-1.02 * 3.0 / G, 0.0))
     tilt = -1.02 * 3.0 / G
     b = quaternion_from_thrust_direction(np.array([tilt, 0.0, math.sqrt(1 - tilt**2)]), 0.0)
@@ -364,7 +354,7 @@ def test_velocity_jump_is_added_to_the_bias() -> None:
 def test_a_gap_of_half_a_second_is_replayed() -> None:
     """No telemetry while a tilt command acts: the predicted position is that of the plant."""
     plant = Plant(Truth(PX4, noisy=False), np.random.default_rng(0))
-    observer = Observer(PX4, ObserverSettings())
+    observer = Observer(PX4)
     plant.command(LEVEL)
     observer.on_command(0.0, LEVEL)
     for _ in range(300):
@@ -384,7 +374,7 @@ def test_a_gap_of_half_a_second_is_replayed() -> None:
 
 
 def test_restart_after_a_long_gap_keeps_the_disturbance() -> None:
-    observer = Observer(NO_DELAY, ObserverSettings())
+    observer = Observer(NO_DELAY)
     observer.on_command(0.0, LEVEL)
     assert not observer.ready
     for i in range(600):
@@ -415,7 +405,7 @@ def test_restart_after_a_reboot_of_the_vehicle() -> None:
 def test_state_is_finite_under_any_telemetry() -> None:
     """Irregular, repeated and decreasing stamps, random values."""
     rng = np.random.default_rng(11)
-    observer = Observer(PX4, ObserverSettings())
+    observer = Observer(PX4)
     time_s = 0.0
     for _ in range(3000):
         time_s += rng.choice([0.0, 0.001, 0.01, 0.05, 0.4, -0.02, -0.3, 1.5, -2.0])
@@ -439,6 +429,6 @@ def test_two_observers_agree_to_the_bit() -> None:
     for _ in range(2):
         plant = Plant(Truth(PX4), np.random.default_rng(9))
         plant.command(LEVEL)
-        observer = Observer(PX4, ObserverSettings())
+        observer = Observer(PX4)
         states.append([pair[0].velocity_ned_mps for pair in follow(plant, observer, 2.0, seed=2)])
     assert np.array_equal(states[0], states[1])

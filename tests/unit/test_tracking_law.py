@@ -20,7 +20,6 @@ from offboard.control.base import Controller, DecisionError, Situation
 from offboard.control.lqr import closed_form
 from offboard.control.pso import PsoLaw
 from offboard.control.swarm import SwarmSettings
-from offboard.estimation.observer import ObserverSettings, VelocitySource
 from offboard.model.axes import lateral_model, lead, vertical_model
 from offboard.model.command import Command
 from offboard.model.vehicle import Vehicle
@@ -279,7 +278,6 @@ def flight(
     bandwidth: float = 5.0,
     period_s: float = 15.0,
     seed: int = 1,
-    velocity: VelocitySource = VelocitySource.BIAS,
     truth: Truth | None = None,
     vehicle: Vehicle = PX4,
     laps: float = 1.0,
@@ -288,10 +286,9 @@ def flight(
     **more: object,
 ) -> Flight:
     law = make(bandwidth, vehicle, feedback_limit=feedback_limit)
-    observer = ObserverSettings(velocity=velocity)
     truth = truth or Truth(vehicle)
     reference = more.pop("reference", None) or Lemniscate(period_s)
-    return fly(truth, law, vehicle, reference, seed, observer, laps, **more)
+    return fly(truth, law, vehicle, reference, seed, laps=laps, **more)
 
 
 def test_without_noise_the_reference_is_flown_to_a_millimetre() -> None:
@@ -316,13 +313,6 @@ def test_px4s_estimator_is_tracked_to_centimetres(
 def test_the_swarm_flies_like_the_closed_form() -> None:
     ours, exact = flight(make=pso, laps=0.3), flight(laps=0.3)
     assert ours.rmse_m == pytest.approx(exact.rmse_m, abs=1e-5)
-
-
-def test_reported_velocity_fed_back_is_several_times_worse() -> None:
-    """[.24 against .052 at wc 3, .13 against .031 at wc 7]"""
-    raw = flight(3.0, velocity=VelocitySource.REPORTED, laps=2.0).rmse_m
-    assert raw > 0.1
-    assert flight(3.0, velocity=VelocitySource.POSITION, laps=2.0).rmse_m < 0.35 * raw
 
 
 @dataclass

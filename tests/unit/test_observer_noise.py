@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from offboard.estimation.observer import Observer, ObserverSettings
-from offboard.estimation.observer_adaptation import DOWN, NORTH_EAST, Adaptation
+from offboard.estimation.observer import Noise, Observer
 from offboard.model.command import Command
 from offboard.model.vehicle import AxisResponse, Vehicle
 
@@ -27,7 +26,8 @@ VEHICLE = Vehicle(
     tilt=AxisResponse(delay_s=0.0, natural_frequency_radps=11.4, damping=0.56),
     yaw=AxisResponse(delay_s=0.148, natural_frequency_radps=3.1, damping=0.4),
 )
-SETTINGS = ObserverSettings()
+NOISE = Noise()
+FIXED_DRIFT = Noise(disturbance_limit_mps2=NOISE.disturbance_mps2)
 
 
 @dataclass(frozen=True)
@@ -58,14 +58,14 @@ def hover(seconds: float, gap_s: float, seed: int, drift: float = 0.0, kicks: fl
 
 def observe(
     flown: Hover,
-    settings: ObserverSettings = SETTINGS,
+    noise: Noise = NOISE,
     white: tuple[float, float] = (0.0, 0.0),
     adopted: bool = True,
 ) -> tuple[Observer, Array, Array]:
     """An observer after telemetry of `flown` with white noise on position and velocity; estimated
     positions and disturbances (N, 3)."""
     rng = np.random.default_rng(99)
-    observer = Observer(VEHICLE, settings)
+    observer = Observer(VEHICLE, noise)
     observer.on_command(0.0, Command(G, (0.0, 0.0, 1.0), 0.0))
     positions, disturbances = np.empty_like(flown.positions), np.empty_like(flown.positions)
     if adopted:
@@ -81,10 +81,6 @@ def observe(
     return observer, positions, disturbances
 
 
-def adaptation(observer: Observer) -> Adaptation:
-    return observer._adaptation
-
-
 def rms(errors: Array, share: float = 0.5) -> float:
     """The RMS of the last `share` of the rows, per axis."""
     return float(np.sqrt(np.mean(errors[-round(share * len(errors)) :] ** 2)))
@@ -95,18 +91,15 @@ def test_white_noise_is_measured(gap_s: float) -> None:
     """2 cm and 5 cm/s on a drifting hover, at 125, 50 and 20 Hz: estimated within a quarter."""
     flown = hover(25.0, gap_s, seed=1, drift=0.1)
     observer, _, _ = observe(flown, white=(0.02, 0.05))
-    assert adaptation(observer).position_sd_m == pytest.approx(0.02, rel=0.25)
-    assert adaptation(observer).velocity_sd_mps == pytest.approx(0.05, rel=0.25)
+    assert observer.noise_sds[0] == pytest.approx(0.02, rel=0.25)
+    assert observer.noise_sds[1] == pytest.approx(0.05, rel=0.25)
 
 
 def test_white_noise_is_filtered() -> None:
-    """Noise of 2 cm per sample leaves less than 0.6 cm; with the configured constants it leaves at
-    least half as much again."""
+    """Noise of 2 cm per sample leaves less than 0.6 cm; with R as configured, 2 mm, 1 cm."""
     flown = hover(20.0, 0.01, seed=2, drift=0.05)
     _, adapted, _ = observe(flown, white=(0.02, 0.02))
-    _, fixed, _ = observe(flown, SETTINGS.model_copy(update={"adaptive": False}), (0.02, 0.02))
     assert rms(adapted - flown.positions) < 0.006
-    assert rms(fixed - flown.positions) > 1.5 * rms(adapted - flown.positions)
 
 
 def test_estimate_that_wanders_is_neither_noise_nor_gusts() -> None:
@@ -114,10 +107,10 @@ def test_estimate_that_wanders_is_neither_noise_nor_gusts() -> None:
     sample to sample: nothing is changed, on three seeds."""
     for seed in (3, 4, 5):
         observer, _, _ = observe(hover(20.0, 0.008, seed=seed, kicks=0.2))
-        assert adaptation(observer).position_sd_m < 1.1 * SETTINGS.position_sd_m
-        assert adaptation(observer).velocity_sd_mps < 1.5 * SETTINGS.velocity_sd_mps
-        floor = SETTINGS.disturbance_density_mps2
-        assert adaptation(observer).densities_mps2 == pytest.approx([floor, floor], rel=0.3)
+        assert observer.noise_sds[0] < 1.1 * NOISE.position_sd_m
+        assert observer.noise_sds[1] < 1.5 * NOISE.velocity_sd_mps
+        floor = NOISE.disturbance_mps2
+        assert observer.drift_densities_mps2 == pytest.approx([floor, floor], rel=0.3)
 
 
 def test_gusts_are_followed_faster() -> None:
@@ -125,29 +118,29 @@ def test_gusts_are_followed_faster() -> None:
     disturbance has less than 0.7 of the error that the configured density gives."""
     flown = hover(20.0, 0.01, seed=6, drift=0.7)
     observer, _, adapted = observe(flown)
-    _, _, fixed = observe(flown, SETTINGS.model_copy(update={"adaptive": False}))
-    assert min(adaptation(observer).densities_mps2) > 0.5
+    _, _, fixed = observe(flown, FIXED_DRIFT)
+    assert min(observer.drift_densities_mps2) > 0.5
     assert rms(adapted - flown.disturbances) < 0.7 * rms(fixed - flown.disturbances)
 
 
 def test_density_falls_after_the_gusts() -> None:
     gusts = hover(15.0, 0.01, seed=7, drift=0.7)
     observer, _, _ = observe(gusts)
-    grown = adaptation(observer).densities_mps2.copy()
+    grown = observer.drift_densities_mps2
     for i in range(2000):
         time_s = 15.0 + 0.01 * i
         observer.on_attitude(time_s, UPRIGHT, STILL)
         observer.on_position(time_s, tuple(gusts.positions[-1]), STILL)
-    assert grown[NORTH_EAST] > 0.5
-    assert adaptation(observer).densities_mps2 == pytest.approx([0.15, 0.15])
+    assert grown[0] > 0.5
+    assert observer.drift_densities_mps2 == pytest.approx([0.15, 0.15])
 
 
 def test_vertical_density_is_fixed_until_the_thrust_is_identified() -> None:
     """Until then an error of the thrust's delay looks like drift."""
     flown = hover(15.0, 0.01, seed=8, drift=0.7)
     observer, _, _ = observe(flown, adopted=False)
-    assert adaptation(observer).densities_mps2[DOWN] == SETTINGS.disturbance_density_mps2
-    assert adaptation(observer).densities_mps2[NORTH_EAST] > 0.5
+    assert observer.drift_densities_mps2[1] == NOISE.disturbance_mps2
+    assert observer.drift_densities_mps2[0] > 0.5
 
 
 def test_jumps_are_not_noise_and_do_not_hide_gusts() -> None:
@@ -155,8 +148,8 @@ def test_jumps_are_not_noise_and_do_not_hide_gusts() -> None:
     flown = hover(15.0, 0.01, seed=9, drift=0.7)
     jumps = 2.0 * np.cumsum(np.arange(len(flown.times)) % 100 == 50)[:, None]
     observer, _, _ = observe(Hover(flown.times, flown.positions + jumps, *[flown.velocities] * 2))
-    assert adaptation(observer).position_sd_m == SETTINGS.position_sd_m
-    assert adaptation(observer).densities_mps2[NORTH_EAST] > 0.5
+    assert observer.noise_sds[0] == NOISE.position_sd_m
+    assert observer.drift_densities_mps2[0] > 0.5
 
 
 def test_one_wrong_position_has_little_effect() -> None:
@@ -164,14 +157,14 @@ def test_one_wrong_position_has_little_effect() -> None:
     flown = hover(5.0, 0.01, seed=11, drift=0.05)
     flown.positions[-3] += 0.2
     observer, _, _ = observe(flown)
-    assert adaptation(observer).position_sd_m < 1.5 * SETTINGS.position_sd_m
+    assert observer.noise_sds[0] < 1.5 * NOISE.position_sd_m
 
 
 def test_estimates_are_bounded_and_cleared_by_a_reset() -> None:
-    settings = SETTINGS.model_copy(update={"disturbance_density_limit_mps2": 0.4})
-    observer, _, _ = observe(hover(15.0, 0.01, seed=10, drift=2.0), settings, (0.05, 0.0))
-    assert adaptation(observer).position_sd_m > 0.03
-    assert max(adaptation(observer).densities_mps2) <= 0.4
+    noise = replace(NOISE, disturbance_limit_mps2=0.4)
+    observer, _, _ = observe(hover(15.0, 0.01, seed=10, drift=2.0), noise, (0.05, 0.0))
+    assert observer.noise_sds[0] > 0.03
+    assert max(observer.drift_densities_mps2) <= 0.4
     observer.reset()
-    assert adaptation(observer).position_sd_m == SETTINGS.position_sd_m
-    assert adaptation(observer).densities_mps2 == pytest.approx([0.15, 0.15])
+    assert observer.noise_sds[0] == NOISE.position_sd_m
+    assert observer.drift_densities_mps2 == pytest.approx([0.15, 0.15])
