@@ -27,7 +27,7 @@ LEAST_MARGIN_S, SHARE_OF_DELAY, SDS = 0.03, 0.25, 3.0  # see `needed_margin`
 BANDWIDTH_STEP_RADPS, LEAST_BANDWIDTH_RADPS = 0.25, 1.0
 SUBSTEPS = 10
 STABLE = 1.0 - 1e-6
-# See ObserverSettings: noise densities of the states and of d'; standard deviations of measurements
+# See `observer.Noise`: noise densities of the states and of d'; standard deviations of measurements
 # by index of the state
 _LATERAL_DENSITIES, _VERTICAL_DENSITIES = (0.0, 0.2, 0.0, 0.6, 0.15), (0.0, 0.2, 0.0, 0.15)
 _LATERAL_SDS, _VERTICAL_SDS = {0: 0.002, 2: 0.001}, {0: 0.002}
