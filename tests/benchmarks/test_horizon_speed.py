@@ -16,6 +16,7 @@ from offboard.model.predicted_state import PredictedState
 from offboard.reference.transfer import transfer
 from offboard.run.configuration import load
 
+pytestmark = pytest.mark.slow
 SPHERES = [
     {"shape": "sphere", "north_m": north, "east_m": east, "height_m": 3.0, "radius_m": 0.4}
     for north, east in ((1.5, 0.3), (3.0, 1.3), (4.5, 1.2))

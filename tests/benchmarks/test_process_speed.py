@@ -18,6 +18,7 @@ import pytest
 from fastcrc.crc16 import mcrf4xx
 from pymavlink.dialects.v20 import common as mavlink
 
+pytestmark = pytest.mark.slow
 TIMESYNC, TIMESYNC_EXTRA = 111, 34
 COMMAND_LONG, COMMAND_LONG_EXTRA = 76, 152
 ARM, TAKE_OFF = 400, 22

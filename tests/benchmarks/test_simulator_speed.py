@@ -18,6 +18,8 @@ from simulator.instance import Instance
 from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.sensors import EstimatorName
 
+pytestmark = pytest.mark.slow
+
 
 def _fly(instance: Instance, duration_s: float) -> int:
     """Bytes sent at the barriers of so much flight."""

@@ -10,6 +10,7 @@ import pytest
 from offboard.control.quadratic import BoxQuadratic, ExactMinimum
 from offboard.control.swarm import Swarm, SwarmSettings, certify, minimise
 
+pytestmark = pytest.mark.slow
 LOWER = np.array([-4.0, -0.2, -0.2, -0.1])  # Eq. 26
 UPPER = np.array([3.942, 0.2, 0.2, 0.1])
 MINIMISER = np.array([1.0, -0.1, 0.05, 0.02])

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import pytest
 from pymavlink import mavutil
 from terminal import Terminal
 from vehicle_process import vehicle
@@ -69,6 +70,7 @@ def fly(port: int, directory: Path, key: Path, meanwhile: Callable[[], object]) 
     return text
 
 
+@pytest.mark.slow
 def test_a_signed_flight_behind_a_router_beside_a_ground_station(tmp_path: Path) -> None:
     """MAVProxy gives the vehicle its key, as `offboard key` says, and forwards. The station hears
     the vehicle, and acknowledgements reach who asked."""

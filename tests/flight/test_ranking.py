@@ -9,6 +9,7 @@ from __future__ import annotations
 from pathlib import Path
 from statistics import mean
 
+import pytest
 from pair import make
 
 SEEDS = (1, 2)
@@ -35,6 +36,7 @@ def rmse_m(directory: Path, bandwidth_radps: int, *assignments: str) -> float:
     return mean(flown)
 
 
+@pytest.mark.slow
 def test_ranking_of_laws(tmp_path: Path) -> None:
     slow, knee, fast = (rmse_m(tmp_path, bandwidth) for bandwidth in (3, 5, 7))
     assert fast < 0.95 * knee < 0.95**2 * slow

@@ -241,6 +241,7 @@ class Day:
 
 
 @pytest.mark.parametrize("on", ["px4", "ardupilot"])
+@pytest.mark.slow
 @pytest.mark.timeout(0)
 def test_no_unsafe_state_in_a_day(on: str, tmp_path: Path) -> None:
     day = Day(on, tmp_path)

@@ -8,6 +8,7 @@ import sys
 import zipfile
 from pathlib import Path
 
+import pytest
 from processes import Spawn
 
 ROOT = Path(__file__).parents[2]
@@ -17,6 +18,7 @@ HOVER = ("--reference", "hover", "--set", "reference.duration_s=2", "--set", "re
 COMPILING = "first run on this machine: compiling"
 
 
+@pytest.mark.slow
 def test_a_pure_wheel_flies_in_two_terminals_and_in_one(
     spawn: Spawn, port: int, tmp_path: Path
 ) -> None:
