@@ -83,9 +83,6 @@ def simulate(
     signing_key: Annotated[
         Path | None, _option("FILE", "Sign and require signatures, see `offboard key`.")
     ] = None,
-    strict: Annotated[
-        bool, typer.Option("--strict", help="Report messages that the autopilot ignores silently.")
-    ] = False,
     log: Annotated[
         Path | None, _option("FILE", "Record the companion link as a .tlog; a new file.")
     ] = None,
@@ -194,7 +191,6 @@ def simulate(
                 parameters=parameters,
                 faults=flown.faults,
                 start=flown.start,
-                strict=strict,
                 signing_key=key,
             )
             strangers = tuple(open_beside(companion) for _ in vehicle_flown.strangers)

@@ -18,7 +18,6 @@ from simulator.injection import prepare
 from simulator.link.impairment import frames
 from simulator.mavlink.server import Server
 from simulator.mavlink.signing import Keyring
-from simulator.mavlink.strict import Strict
 from simulator.mavlink.telemetry import builders
 from simulator.mavlink.view import View
 from simulator.start import Start, take_off
@@ -48,7 +47,6 @@ class Instance:
         parameters: of the autopilot, in place of its defaults.
         faults: what goes wrong, and when (`simulator.faults`).
         start: the vehicle is in the air when its links open; None: it boots on the ground.
-        strict: report messages that the autopilot ignores or misreads (`complaints`).
         signing_key: 32 bytes; the vehicle signs what it sends, and accepts only what is signed.
 
     Example:
@@ -76,7 +74,6 @@ class Instance:
         parameters: Mapping[str, float] | None = None,
         faults: Sequence[Fault] = (),
         start: Start | None = None,
-        strict: bool = False,
         signing_key: bytes = b"",
     ) -> None:
         self.autopilot = Autopilot(
@@ -90,7 +87,6 @@ class Instance:
         clock_us = round(conditions.clock_start_s * 1e6)
         self.view = View(self.autopilot, system, epoch_us - clock_us, builders(firmware))
         self.view.clock_offset_us = clock_us
-        self._strict = Strict(system, self.autopilot.parameters) if strict else None
         self.keyring = Keyring(
             firmware.link.accepted_unsigned,
             self._unix_us if firmware.link.stamps_follow_clock else None,
@@ -103,9 +99,8 @@ class Instance:
             self.keyring,
             number=0,
             barrier=lockstep,
-            strict=self._strict,
         )
-        self.ground = Server(self.view, rates_hz, self.keyring, number=1, strict=self._strict)
+        self.ground = Server(self.view, rates_hz, self.keyring, number=1)
         self.steps = 0
         self._injection = prepare(faults, seed)
         self._arrived: list[bytes] = []
@@ -120,9 +115,8 @@ class Instance:
 
     @property
     def complaints(self) -> Mapping[str, int]:
-        """Number of messages by complaint: those that signing refused, and with `strict` others."""
-        refused = self.companion.decoder.refused + self.ground.decoder.refused
-        return refused + self._strict.counts if self._strict else refused
+        """Number of messages that signing refused, by reason."""
+        return self.companion.decoder.refused + self.ground.decoder.refused
 
     def _unix_us(self) -> int:
         """The vehicle's clock, as in SYSTEM_TIME."""

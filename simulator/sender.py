@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from simulator.firmware.base import Firmware
-from simulator.mavlink.codec import frame, layout
+from simulator.mavlink.codec import Encoder, message_of
 from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT
 from simulator.steps import STEP_S
 
@@ -22,7 +22,10 @@ class Sender:
     system: int
     component: int
     step: int = -1
-    sequence: int = 0
+    _encoder: Encoder = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._encoder = Encoder(self.system, self.component)
 
     def due(self, rate_hz: float) -> range:
         """As many numbers as messages of this rate are due in this step; the first is at once."""
@@ -44,10 +47,7 @@ class Sender:
         """SET_ATTITUDE_TARGET of a level attitude that heads north."""
         head = (0, target, MAV_COMP_ID_AUTOPILOT, _ATTITUDE_AND_THRUST)
         values = (*head, (1.0, 0.0, 0.0, 0.0), 0.0, 0.0, 0.0, thrust)
-        has_extension = (
-            "thrust_body" in layout("SET_ATTITUDE_TARGET").fields
-        )  # not in each pymavlink
-        return self._frame("SET_ATTITUDE_TARGET", *values, *[(0.0,) * 3] * has_extension)
+        return self._frame("SET_ATTITUDE_TARGET", *values)
 
     def command(self, target: int, number: int, params: tuple[float, ...]) -> bytes:
         """COMMAND_LONG; parameters that are not given are 0."""
@@ -55,6 +55,4 @@ class Sender:
         return self._frame("COMMAND_LONG", target, MAV_COMP_ID_AUTOPILOT, number, 0, *filled)
 
     def _frame(self, name: str, *values: object) -> bytes:
-        message, number = layout(name), self.sequence
-        self.sequence = (number + 1) & 0xFF
-        return frame(number, self.system, self.component, message, message.pack(values))
+        return self._encoder.frame(message_of(name, values))

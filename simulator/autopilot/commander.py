@@ -229,12 +229,6 @@ class Commander:
     def _reboot(self) -> None:
         self.reboot_requested = True
 
-    # -- values of texts ---------------------------------------------------------------------
-
-    def _target_amsl_m(self) -> float:
-        home_amsl_m = self._firmware.origin[2] - self._guidance.home_ned_m[2]
-        return home_amsl_m + self._navigator.target_height_m
-
 
 CONDITIONS: dict[str, Callable[[Commander], bool]] = {
     "armed": lambda c: c.armed,
@@ -275,10 +269,6 @@ ACTIONS: dict[str, Callable[[Commander], None]] = {
 
 TEXT_VALUES: dict[str, Callable[[Commander], float | str]] = {
     "mode": lambda c: c._requested.title,
-    "takeoff_m": lambda c: c._parameters.role("takeoff_height_m"),
-    "climb_m": lambda c: c._guidance.mission.climb_m,
-    "target_m": lambda c: c._navigator.target_height_m,
-    "target_amsl_m": Commander._target_amsl_m,
     "battery_v": lambda c: c._state.truth.battery.voltage_v,
     "used_mah": lambda c: c._state.truth.battery.used_mah,
     "delay_s": lambda c: c._parameters.role("failsafe_delay_s"),

@@ -12,7 +12,6 @@ from simulator.autopilot.mission import Mission
 from simulator.autopilot.parameters import ParameterTable
 from simulator.autopilot.state import StateEstimate
 from simulator.autopilot.sticks import Sticks
-from simulator.autopilot.trajectory import Trajectory
 from simulator.firmware.base import Firmware
 from simulator.firmware.values import AttitudeSetpoint, MotionSetpoint, Triple
 
@@ -22,15 +21,14 @@ ORIGIN: Triple = (0.0, 0.0, 0.0)
 class Guidance:
     """Home, the place to hold, the setpoint in force and the speed limit of one autopilot.
 
-    `sticks` is None for a firmware whose sticks are not simulated (PX4), `trajectory` for one that
-    plans none (ArduCopter). `events` are reported to the commander at each step.
+    `sticks` is None for a firmware whose sticks are not simulated (PX4). `events` are reported to
+    the commander at each step.
     """
 
     def __init__(self, firmware: Firmware, parameters: ParameterTable, mission: Mission) -> None:
         self.firmware, self.parameters, self.mission = firmware, parameters, mission
         self.events = mission.events
-        limits, sticks = firmware.flight.path_limits, firmware.flight.sticks
-        self.trajectory = None if limits is None else Trajectory(limits, parameters)
+        sticks = firmware.flight.sticks
         self.sticks = None if sticks is None else Sticks(sticks)
         self.setpoint: AttitudeSetpoint | MotionSetpoint | None = None  # the newest of a client
         self.hold = MotionSetpoint(ORIGIN)
@@ -55,7 +53,5 @@ class Guidance:
 
     def stopping_place_ned_m(self, estimate: StateEstimate) -> Triple:
         """Where the vehicle stops when it brakes now."""
-        if self.trajectory is not None:
-            return self.trajectory.stop_ned_m(estimate)
         (x, y, z), (vx, vy, vz) = estimate.position_ned_m, estimate.velocity_ned_mps
         return (x + 0.5 * vx, y + 0.5 * vy, z + 0.2 * vz)

@@ -52,10 +52,7 @@ class Mission:
     finished: bool = False
     under_way: bool = False
     speed_mps: float = math.inf
-    climb_m: float = math.nan  # height above home of the climb with which it begins
     events: list[str] = field(default_factory=list)
-    previous_ned_m: Triple = NAN3  # place before the current one; NaN: none
-    following_ned_m: Triple = NAN3  # place after the current one, reached without a stop
     _climb_down_m: float = math.nan  # on the ground: first climb vertically to this height
     _since_s: float = math.nan  # when the current place was reached
     _target_ned_m: Triple = NAN3
@@ -90,7 +87,6 @@ class Mission:
         if not 0 <= number < len(self.items):
             return False
         self.current, self.finished, self._since_s = number, False, math.nan
-        self.previous_ned_m = NAN3
         return True
 
     def pause(self) -> None:
@@ -115,7 +111,7 @@ class Mission:
         if not math.isnan(self._climb_down_m):
             self._target_ned_m = (*self._target_ned_m[:2], self._climb_down_m)
             if estimate.position_ned_m[2] < self._climb_down_m + _ACCEPTANCE_HEIGHT_M:
-                self._climb_down_m, self.previous_ned_m = math.nan, self._target_ned_m
+                self._climb_down_m = math.nan
             return MotionSetpoint(self._target_ned_m)
         self._run_settings()
         if not self._has_item:
@@ -123,7 +119,6 @@ class Mission:
         item = self.items[self.current]
         if item.command in _PLACES:
             self._target_ned_m = self._target(item, estimate.position_ned_m, home_ned_m)
-            self.following_ned_m = self._following(item, home_ned_m)
         self._progress(item, estimate, landed)
         self._run_settings()
         return MotionSetpoint(self._target_ned_m, yaw_rad=self._yaw_rad(item), faces_way=True)
@@ -131,17 +126,14 @@ class Mission:
     def _begin(self, here_ned_m: Triple, home_ned_m: Triple, landed: bool) -> None:
         """Start, or continue where it was paused; a finished one starts again."""
         self.under_way = True
-        self.events.append("mission begun")
         if self.finished:
             self.go_to(self.first)
         self.speed_mps = self._speed_before_pause if self.rules.keeps_speed else math.inf
-        self._target_ned_m, self.previous_ned_m = here_ned_m, NAN3
+        self._target_ned_m = here_ned_m
         self._since_s = self._climb_down_m = math.nan
         first = next((item for item in self.items[self.current :] if item.command in _PLACES), None)
         if landed and first is not None and first.command != Kind.LAND:
             self._climb_down_m = self._position(first, home_ned_m)[2]
-            self.climb_m = home_ned_m[2] - self._climb_down_m
-            self.events.append("mission climbs")
 
     @property
     def _speed_before_pause(self) -> float:
@@ -186,8 +178,6 @@ class Mission:
 
     def _advance(self) -> None:
         """Go to the next item, or finish."""
-        if self.items[self.current].command in _PLACES:
-            self.previous_ned_m = self._target_ned_m
         self._since_s = math.nan
         if self.current + 1 < len(self.items):
             self.current += 1
@@ -224,27 +214,11 @@ class Mission:
             down = here_ned_m[2] if self.landing else self._target_ned_m[2]
         return north, east, down
 
-    def _following(self, item: MissionItem, home_ned_m: Triple) -> Triple:
-        """The place after an item at which it does not stop; NaN: none."""
-        later = self.items[self.current + 1 :]
-        following = next((other for other in later if other.command in _PLACES), None)
-        if following is None or self._stay_s(item) > 0.0:
-            return NAN3
-        return self._position(following, home_ned_m)
-
-    @property
-    def acceptance_m(self) -> float:
-        """Acceptance radius of the current item; NaN: the default."""
-        if self.current < len(self.items):
-            item = self.items[self.current]
-            if item.command == Kind.WAYPOINT and item.params[1] > 0:
-                return item.params[1]
-        return math.nan
-
     def _near(self, item: MissionItem, here_ned_m: Triple) -> bool:
         if item.command not in _PLACES:
             return True
-        radius_m = _ACCEPTANCE_M if math.isnan(self.acceptance_m) else self.acceptance_m
+        has_radius = item.command == Kind.WAYPOINT and item.params[1] > 0
+        radius_m = item.params[1] if has_radius else _ACCEPTANCE_M
         north, east, down = self._target_ned_m
         x, y, z = here_ned_m
         return math.hypot(x - north, y - east) < radius_m and abs(z - down) < _ACCEPTANCE_HEIGHT_M

@@ -1,8 +1,7 @@
 """The navigator: which motion the vehicle flies, by the behaviour of its mode.
 
-Holds the behaviour in force and plans the trajectory to its goal where the firmware has one. Knows
-position and time; knows no modes by name, no thrust and no attitude loop: the pilot
-(`simulator.autopilot.pilot`) flies the motion.
+Knows position and time; knows no modes by name, no thrust and no attitude loop: the position
+controller flies the motion.
 """
 
 from __future__ import annotations
@@ -13,7 +12,6 @@ from simulator.autopilot.behaviours import BEHAVIOURS, ActiveBehaviour
 from simulator.autopilot.guidance import Guidance
 from simulator.autopilot.position_loop import level
 from simulator.autopilot.state import StateEstimate
-from simulator.autopilot.trajectory import Trajectory
 from simulator.firmware.values import NAN3, AttitudeSetpoint, Behaviour, MotionSetpoint, Triple
 
 
@@ -39,8 +37,6 @@ class Navigator:
             guidance.cruise_mps = math.inf
         self.active.leave()
         self.behaviour, self.active = behaviour, BEHAVIOURS[behaviour](guidance)
-        if guidance.trajectory is not None and not self.active.planned:
-            guidance.trajectory.active = False
         self._entered, self._place_ned_m = False, place_ned_m
 
     def arm(self, estimate: StateEstimate) -> None:
@@ -49,8 +45,6 @@ class Navigator:
         guidance.home_ned_m, guidance.home_yaw_rad = estimate.position_ned_m, estimate.yaw_rad
         guidance.hold = MotionSetpoint(estimate.position_ned_m)
         guidance.mission.pause()
-        if guidance.trajectory is not None:
-            guidance.trajectory.active = False
 
     def follow(self, setpoint: AttitudeSetpoint | MotionSetpoint) -> None:
         """Take a client's setpoint. Where setpoints are flown as automatic flight (ArduCopter), a
@@ -85,17 +79,6 @@ class Navigator:
         return not all(map(math.isnan, rates))
 
     @property
-    def target_height_m(self) -> float:
-        """Height above home of the place that it holds or climbs to."""
-        return self.guidance.home_ned_m[2] - self.guidance.hold_ned_m[2]
-
-    @property
-    def trajectory(self) -> Trajectory | None:
-        """The trajectory that is flown; its motion keeps all limits."""
-        trajectory = self.guidance.trajectory
-        return trajectory if trajectory is not None and trajectory.active else None
-
-    @property
     def cruise_mps(self) -> float:
         """Horizontal speed limit."""
         guidance, automatic = self.guidance, self.active.automatic
@@ -104,18 +87,12 @@ class Navigator:
             limit_mps = min(limit_mps, guidance.cruise_mps)
         return min(limit_mps, self.active.speed_mps)
 
-    def motion(self, estimate: StateEstimate, *, landed: bool, on_ground: bool) -> MotionSetpoint:
-        """Motion of this period. `on_ground`: the vehicle may not lift off yet."""
-        guidance, active = self.guidance, self.active
+    def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
+        """Motion of this period."""
         if not self._entered:
             self._entered = True
-            active.enter(estimate, self._place_ned_m, landed=landed)
-        goal = active.motion(estimate, landed=landed)
-        if guidance.trajectory is None or not active.planned:
-            return goal
-        height_m = guidance.home_ned_m[2] - estimate.position_ned_m[2]
-        leg = active.leg(self.cruise_mps, height_m)
-        return guidance.trajectory.follow(goal, leg, estimate, on_ground=on_ground)
+            self.active.enter(estimate, self._place_ned_m, landed=landed)
+        return self.active.motion(estimate, landed=landed)
 
 
 def _kind(setpoint: AttitudeSetpoint | MotionSetpoint | None) -> tuple[bool, ...]:

@@ -57,11 +57,6 @@ class ParameterTable:
         self._store(spec, value)
         return True
 
-    def in_range(self, name: str, wire: float) -> bool:
-        """The parameter exists and this param_value is in its range."""
-        spec = self._specs.get(name)
-        return spec is not None and spec.minimum <= self._from_wire(spec, wire) <= spec.maximum
-
     def set_from_wire(self, name: str, wire: float, kind: int) -> bool:
         """Set from PARAM_SET, also out of range; False where it is not answered.
 

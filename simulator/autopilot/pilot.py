@@ -155,8 +155,7 @@ class Pilot:
         lifts_off = navigator.active.lifts_off
         if self.landed and ramp.spooling and lifts_off:
             navigator.guidance.hold = MotionSetpoint(estimate.position_ned_m)
-        on_ground = not (ramp.flying or ramp.lifting)
-        self.motion = navigator.motion(estimate, landed=self.landed, on_ground=on_ground)
+        self.motion = navigator.motion(estimate, landed=self.landed)
         ramp.step(climb_demanded=lifts_off and self._climb_demanded(estimate))
         still = estimate.on_ground and (ramp.lifting or self.landed)
         on_ramp = ramp.lifting and self._firmware.flight.integrates_on_ramp
@@ -179,19 +178,18 @@ class Pilot:
     def _limits(self) -> Limits:
         """Limits of the motion by behaviour and takeoff ramp."""
         role, navigator, gains = self._parameters.role, self._navigator, self.loop.gains
-        planned, automatic = navigator.trajectory is not None, navigator.active.automatic
+        automatic = navigator.active.automatic
         up_mps = self._ramp.climb_limit_mps(gains.velocity_z[0])
-        if navigator.active.climbing and not planned:
+        if navigator.active.climbing:
             up_mps = min(up_mps, role("takeoff_speed_mps"))
         turn_radps = self.motion.turn_radps
         return Limits(
             hover_thrust=role("hover_thrust"),
             thrust_least=0.0 if self._ramp.lifting else role("thrust_least"),
-            across_mps=math.inf if planned else navigator.cruise_mps,
+            across_mps=navigator.cruise_mps,
             up_mps=up_mps,
-            down_mps=gains.follows_down_mps if planned else gains.speed_down_mps,
             turn_radps=min(turn_radps, gains.turn_radps) if automatic else turn_radps,
-            smooth=automatic and not planned,
+            smooth=automatic,
         )
 
     def _climb_demanded(self, estimate: StateEstimate) -> bool:
@@ -199,8 +197,6 @@ class Pilot:
         motion, navigator = self.motion, self._navigator
         if navigator.active.cannot_climb:
             return False
-        if navigator.trajectory is not None:
-            return navigator.trajectory.climbs
         return (
             motion.position_ned_m[2] < estimate.position_ned_m[2] - _HIGHER_M
             or motion.velocity_ned_mps[2] < 0.0

@@ -30,7 +30,6 @@ class Limits:
     thrust_least: float = 0.0
     across_mps: float = math.inf
     up_mps: float = math.inf  # below 0 it is a descent
-    down_mps: float = math.nan  # replaces the limit of the gains; NaN: theirs
     turn_radps: float = math.inf
     smooth: bool = False  # accelerate and brake as in automatic flight
 
@@ -127,9 +126,7 @@ class PositionLoop:
             north, east = north * (most / speed), east * (most / speed)
         if not math.isnan(down):
             up_mps = min(limits.up_mps, gains.speed_up_mps)
-            default = math.isnan(limits.down_mps)
-            down_mps = gains.speed_down_mps if default else limits.down_mps
-            down = max(-up_mps, min(down_mps, down))
+            down = max(-up_mps, min(gains.speed_down_mps, down))
         return north, east, down
 
     def _smooth_mps(self, speed_mps: float, motion: MotionSetpoint, velocity: Triple) -> float:

@@ -84,9 +84,8 @@ EVENTS = frozenset({
     "ground station lost", "ground station found",
     "battery low", "battery critical", "battery emergency",
     # flight
-    "took off", "landed", "settled", "idle", "climbed", "default height", "already higher",
-    "return begun", "return lands", "item reached",
-    "mission begun", "mission climbs", "mission progress", "mission return", "mission finished",
+    "took off", "landed", "settled", "idle", "climbed", "already higher", "item reached",
+    "mission progress", "mission return", "mission finished",
 })  # fmt: skip
 """Events of every firmware; `HealthRules.boot` has those of the start."""
 
@@ -247,7 +246,6 @@ class PositionGains:
     speed_xy_mps: float
     speed_up_mps: float
     speed_down_mps: float
-    follows_down_mps: float  # in place of speed_down_mps behind a smoothed trajectory
     tilt_max_rad: float
     thrust_max: float
     derivative_cutoff_hz: float
@@ -256,26 +254,6 @@ class PositionGains:
     speeding_mps2: float
     braking_mps2: float
     facing_mps: float  # wanted across the ground, from which on it faces the direction of flight
-
-
-@dataclass(frozen=True, slots=True)
-class PathLimits:
-    """Limits of a smoothed trajectory (`simulator.autopilot.trajectory`)."""
-
-    jerk_mps3: float
-    across_mps2: float
-    up_mps2: float
-    down_mps2: float
-    speed_across_mps: float
-    speed_up_mps: float
-    speed_down_mps: float
-    lift_mps: float  # of a takeoff below `lift_below_m` above home
-    lift_mps2: float
-    lift_below_m: float
-    corner_share: float  # of across_mps2 in a corner
-    accepted_m: float  # from a goal, across and in height
-    accepted_height_m: float
-    behind_max_m: float  # the trajectory waits for a vehicle further behind
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,7 +287,6 @@ class FlightRules:
     """Automatic flight of a firmware."""
 
     gains: Callable[[ReadParameter], PositionGains]
-    path_limits: Callable[[ReadParameter], PathLimits] | None  # None: no smoothed trajectories
     integrates_on_ramp: bool  # position loop, in a takeoff that still stands on the ground
     landing: Landing
     descend_speed_mps: float  # in a manual mode without stick input

@@ -15,8 +15,7 @@ from simulator.autopilot.mission import ITEMS_MAX, Kind, Mission
 from simulator.firmware.base import MissionRules
 from simulator.firmware.values import MissionItem, Severity, StatusText
 from simulator.mavlink.codec import Message
-from simulator.mavlink.outbox import Outbox
-from simulator.mavlink.texts import Texts
+from simulator.mavlink.outbox import Outbox, Texts
 
 REPEAT_S, GIVE_UP_S = 0.25, 5.0
 CHECK_S = 0.03  # from the last item until a strict firmware has checked the mission

@@ -1,41 +1,52 @@
-"""Send queue of one link: messages framed, numbered and joined to datagrams.
+"""Send queue of one link: messages framed, numbered and joined to datagrams; and its STATUSTEXTs.
 
-Knows the view that fills messages and the link's sequence numbers; knows no client and no rate.
+Knows the view that fills messages, the link's sequence numbers, and when a ground station was last
+heard on this link; knows no client and no rate.
 """
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from dataclasses import dataclass, field
 
-from simulator.mavlink.codec import SIGNED, frame, layout
-from simulator.mavlink.signing import SIGNATURE_LENGTH, Keyring
+from simulator.firmware.values import StatusText
+from simulator.mavlink.codec import Encoder, message_of
+from simulator.mavlink.signing import Keyring
 from simulator.mavlink.view import View
 
 MAV_COMP_ID_AUTOPILOT = 1
 DATAGRAM_MAX = 1400
+HELD_US = 5_000_000
+TEXT_LENGTH = 50  # STATUSTEXT.text
 
 
 @dataclass(slots=True)
 class Outbox:
-    """Send queue. `sequence`: number of the next frame, 0 .. 255. With a key of `keyring` frames
-    are signed; `link` is the number of the link in the signature."""
+    """Send queue. `keyring`: of the vehicle; `link`: number of the link in signatures."""
 
     view: View
     keyring: Keyring
     link: int
-    sequence: int = 0
     _frames: list[bytes] = field(default_factory=list)
     _suppressed: Counter[str] = field(default_factory=Counter)
+    _encoder: Encoder = field(init=False)
+
+    def __post_init__(self) -> None:
+        self._encoder = Encoder(self.view.system, MAV_COMP_ID_AUTOPILOT, self.keyring, self.link)
+
+    def restart(self) -> None:
+        """As after boot: frames are numbered from 0."""
+        self._encoder.restart()
 
     def send(self, name: str, *values: object) -> None:
         """Queue one message; `values` in the field order of the XML."""
-        self._frame(name, layout(name).pack(values))
+        self._frames.append(self._encoder.frame(message_of(name, values)))
 
     def send_now(self, name: str) -> None:
         """Queue a message with its contents of now, filled by the view, unless a fault stops it."""
         if name not in self.view.silent or self._passes(name):
-            self._frame(name, self.view.payload(name))
+            self._frames.append(self._encoder.frame(self.view.message(name)))
 
     def forward(self, frame: bytes) -> None:
         """Queue a frame of another sender."""
@@ -47,33 +58,63 @@ class Outbox:
         self._suppressed[name] += 1
         return every > 0 and self._suppressed[name] % every == 0
 
-    def _frame(self, name: str, payload: bytes) -> None:
-        numbers = (self.sequence, self.view.system, MAV_COMP_ID_AUTOPILOT)
-        if self.keyring.on:
-            flagged = frame(*numbers, layout(name), payload, flags=SIGNED)
-            self._frames.append(self.keyring.seal(flagged, self.link))
-        else:
-            self._frames.append(frame(*numbers, layout(name), payload))
-        self.sequence = (self.sequence + 1) & 0xFF
-
     def drain(self) -> list[bytes]:
-        """Remove everything queued, as datagrams of whole frames."""
-        if not self._frames:
-            return []
-        together = self._frames[0] if len(self._frames) == 1 else b"".join(self._frames)
+        """Remove everything queued, as datagrams of whole frames, at most DATAGRAM_MAX bytes."""
+        datagrams: list[bytes] = []
+        waiting: list[bytes] = []
+        size = 0
+        for frame in self._frames:
+            if size + len(frame) > DATAGRAM_MAX:
+                datagrams.append(b"".join(waiting))
+                waiting, size = [], 0
+            waiting.append(frame)
+            size += len(frame)
         self._frames.clear()
-        return [together] if len(together) <= DATAGRAM_MAX else _datagrams(together)
+        return [*datagrams, b"".join(waiting)] if waiting else datagrams
 
 
-def _datagrams(frames: bytes) -> list[bytes]:
-    """Frames, cut between frames into datagrams of at most DATAGRAM_MAX bytes."""
-    datagrams: list[bytes] = []
-    begin = at = 0
-    while at < len(frames):
-        signature = SIGNATURE_LENGTH if frames[at + 2] & SIGNED else 0
-        length = 12 + frames[at + 1] + signature
-        if at + length - begin > DATAGRAM_MAX:
-            datagrams.append(frames[begin:at])
-            begin = at
-        at += length
-    return [*datagrams, frames[begin:]]
+@dataclass(slots=True)
+class Texts:
+    """STATUSTEXTs of one link: cut into chunks and, by PX4, held back until a ground station is
+    there. `connected`: anything was received on the link."""
+
+    outbox: Outbox
+    connected: bool = False
+    _ground_station_us: float = -math.inf  # its last heartbeat
+    _held: list[tuple[int, StatusText]] = field(default_factory=list)
+    _number: int = 0
+
+    def restart(self) -> None:
+        """Reset as after boot; texts already sent are not repeated."""
+        self._ground_station_us, self._held, self._number = -math.inf, [], 0
+
+    def send(self, text: StatusText) -> None:
+        """Queue a text, or hold it back until a ground station is there (PX4)."""
+        link = self.outbox.view.autopilot.firmware.link
+        if link.text_to_ground_stations_only and not self._has_ground_station:
+            self._held.append((self._now_us, text))
+            return
+        if not self.connected:
+            return
+        encoded = (text.text + link.text_suffix).encode("ascii", "replace")
+        for chunk, at in enumerate(range(0, len(encoded), TEXT_LENGTH)):
+            piece = encoded[at : at + TEXT_LENGTH]
+            self.outbox.send("STATUSTEXT", int(text.severity), piece, self._number, chunk)
+        self._number = (self._number + 1) & 0xFFFF
+
+    def note_ground_station(self) -> None:
+        """A ground station sent a heartbeat: send the texts held back for at most HELD_US."""
+        self._ground_station_us = self._now_us
+        held, self._held = self._held, []
+        for at_us, text in held:
+            if self._now_us - at_us < HELD_US:
+                self.send(text)
+
+    @property
+    def _has_ground_station(self) -> bool:
+        stays_us = self.outbox.view.autopilot.firmware.link.ground_station_stays_s * 1e6
+        return self._now_us - self._ground_station_us <= stays_us
+
+    @property
+    def _now_us(self) -> int:
+        return self.outbox.view.autopilot.state.time_us

@@ -14,13 +14,11 @@ from simulator.mavlink.codec import Decoder, Message
 from simulator.mavlink.commands import Command, Commands
 from simulator.mavlink.mission_transfer import HANDLERS as MISSION_HANDLERS
 from simulator.mavlink.mission_transfer import MissionTransfer
-from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT, Outbox
+from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT, Outbox, Texts
 from simulator.mavlink.parameter_transfer import HANDLERS as PARAMETER_HANDLERS
 from simulator.mavlink.parameter_transfer import ParameterTransfer
 from simulator.mavlink.schedule import Schedule
 from simulator.mavlink.signing import Keyring
-from simulator.mavlink.strict import Strict
-from simulator.mavlink.texts import Texts
 from simulator.mavlink.view import View
 
 _ITEMS, _GUIDED = ("MISSION_ITEM", "MISSION_ITEM_INT"), 2  # `current` of an item
@@ -37,7 +35,6 @@ class Server:
         keyring: signing, of the vehicle.
         number: of the link.
         barrier: leave TIMESYNC requests to `send_barrier`: in lockstep they are the clock.
-        strict: reports messages that the autopilot ignores.
     """
 
     view: View
@@ -45,7 +42,6 @@ class Server:
     keyring: Keyring
     number: int
     barrier: bool = False
-    strict: Strict | None = None
     decoder: Decoder = field(init=False)
     answered_ns: int = -1  # ts1 of the newest TIMESYNC answer
     outbox: Outbox = field(init=False)
@@ -74,7 +70,7 @@ class Server:
 
     def restart(self) -> None:
         """Reset as after boot: default rates, no known client."""
-        self.outbox.sequence = 0
+        self.outbox.restart()
         self.schedule.restart()
         self.texts.restart()
         self._begin_transfers()
@@ -98,17 +94,9 @@ class Server:
         """Handle all messages of one datagram; no bytes make this raise."""
         for message in self.decoder.read(datagram):
             self.texts.connected = True
-            if self.strict is not None:
-                self._check(message)
             handler = HANDLERS.get(message.name)
             if handler is not None and self._is_for_us(message):
                 handler(self, message)
-
-    def _check(self, message: Message) -> None:
-        assert self.strict is not None
-        text = self.strict.complaint(message, self.view.autopilot.state.time_us * 1e-6)
-        if text is not None:
-            self.view.autopilot.commander.texts.append(text)
 
     def _is_for_us(self, message: Message) -> bool:
         """Whether its target is this system and its autopilot, or all."""

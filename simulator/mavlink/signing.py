@@ -50,11 +50,10 @@ class Keyring:
         self.newest = self.stored
         self.heard.clear()
 
-    def seal(self, frame: bytes, link: int) -> bytes:
-        """The frame with its signature; its flags must announce one."""
+    def next_stamp(self) -> int:
+        """Time stamp of the next frame."""
         self.newest = min(max(self.newest + 1, self._clock()), LATEST)
-        frame += link.to_bytes(1, "little") + self.newest.to_bytes(6, "little")
-        return frame + self._digest(frame)
+        return self.newest
 
     def complaint(self, message_id: int, sender: tuple[int, int], frame: bytes | None) -> str:
         """Why a received message is refused, empty if it is not. `frame` with its signature; None

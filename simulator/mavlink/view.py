@@ -1,6 +1,6 @@
 """Contents of all messages of one vehicle: its autopilot, with the faults that change telemetry.
 
-Packs each message once per step for all links. Knows no links, rates or sequence numbers.
+Builds each message once per step for all links. Knows no links, rates or sequence numbers.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from typing import Any
 
 from simulator.autopilot.autopilot import Autopilot
 from simulator.geodesy import DEGREES_PER_M, east_degrees_per_m, wrapped_deg
-from simulator.mavlink.codec import layout
+from simulator.mavlink.codec import message_of
 from simulator.mavlink.fields import fit
 
 _GPS, _PREARM = 0x20, 0x10000000  # MAV_SYS_STATUS_SENSOR
@@ -48,7 +48,7 @@ class View:
     wrong_landed_state: int | None = None  # reported in place of the true one
     stuck: dict[str, Stuck] = field(default_factory=dict)
     east_degrees_per_m: float = field(init=False)
-    _payloads: dict[str, bytes] = field(default_factory=dict)
+    _messages: dict[str, Any] = field(default_factory=dict)
     _at_step: int = -1
 
     def __post_init__(self) -> None:
@@ -60,18 +60,18 @@ class View:
         event = autopilot.firmware.streams.withheld_until.get(name)
         return event is not None and event not in autopilot.health.reached
 
-    def payload(self, name: str) -> bytes:
-        """Packed payload of message `name` now; built once per step for all links."""
+    def message(self, name: str) -> Any:
+        """Message `name` of now; built once per step for all links."""
         if self._at_step != self.autopilot.state.steps:
             self._at_step = self.autopilot.state.steps
-            self._payloads.clear()
-        packed = self._payloads.get(name)
-        if packed is None:
+            self._messages.clear()
+        message = self._messages.get(name)
+        if message is None:
             values = self.builders[name](self)
             if name in self.stuck:
                 values = self.stuck[name].instead_of(values)
-            packed = self._payloads[name] = layout(name).pack(values)
-        return packed
+            message = self._messages[name] = message_of(name, values)
+        return message
 
     def restart(self, autopilot: Autopilot) -> None:
         """Show another autopilot, after a reboot."""

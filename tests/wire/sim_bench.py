@@ -59,7 +59,6 @@ class Bench:
             ground_link=ground_link,
             faults=() if scenario is None else scenario.faults,
             start=None if scenario is None else scenario.start,
-            strict=strict,
         )
         self.system = system
         self.codec = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)

@@ -106,5 +106,5 @@ def _lasting(side: Rows, kind: str) -> list[tuple[float, str]]:
 
 def _without_figures(text: str) -> str:
     """Heights and charges are estimates, and a metre more or less."""
-    estimated = text.startswith(("RTL: start", "Battery 1 is"))
+    estimated = text.startswith("Battery 1 is")
     return re.sub(r"\d+(\.\d+)?", "#", text).strip() if estimated else text.strip()

@@ -1,4 +1,4 @@
-"""The simulator's codec against pymavlink's, message by message, and against arbitrary bytes."""
+"""The simulator's decoder: messages of pymavlink, and arbitrary bytes."""
 
 from __future__ import annotations
 
@@ -12,15 +12,7 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import common as mavlink
 
 from simulator.mavlink import codec
-from simulator.mavlink.telemetry import BUILDERS
 
-ANSWERS = (
-    "COMMAND_ACK",
-    "STATUSTEXT",
-    "PARAM_VALUE",
-    "MESSAGE_INTERVAL",
-    "FILE_TRANSFER_PROTOCOL",
-)
 ASKED = (
     "COMMAND_LONG",
     "COMMAND_INT",
@@ -64,26 +56,6 @@ def _number(field_type: str, rng: random.Random) -> float | int:
     return struct.unpack("<f", struct.pack("<f", rng.uniform(-1e6, 1e6)))[0]
 
 
-@pytest.mark.parametrize("name", [*BUILDERS, *ANSWERS, *ASKED])
-def test_frames_equal_those_of_pymavlink(name: str) -> None:
-    rng = random.Random(name)
-    layout = codec.layout(name)
-    for sequence in range(40):
-        values = random_values(name, rng)
-        theirs = mavlink.MAVLink(None, srcSystem=9, srcComponent=4)
-        theirs.seq = sequence
-        expected = bytes(message_class(name)(*values).pack(theirs))
-        assert codec.frame(sequence, 9, 4, layout, layout.pack(values)) == expected
-
-
-def test_too_few_and_too_many_values_are_refused_by_name() -> None:
-    layout = codec.layout("EXTENDED_SYS_STATE")
-    with pytest.raises(TypeError, match=r"^EXTENDED_SYS_STATE\(\) missing .* 'landed_state'$"):
-        layout.pack((0,))
-    with pytest.raises(TypeError, match=r"^EXTENDED_SYS_STATE\(\) takes 2 .* 3 were given$"):
-        layout.pack((0, 1, 2))
-
-
 @pytest.mark.parametrize("name", ASKED)
 def test_decodes_frames_of_pymavlink(name: str) -> None:
     rng = random.Random(name)
@@ -94,8 +66,7 @@ def test_decodes_frames_of_pymavlink(name: str) -> None:
         assert (message.name, message.system, message.component) == (name, 3, 7)
         known = mavlink.MAVLink(None).parse_buffer(sent.get_msgbuf())[0].to_dict()
         known.pop("mavpackettype")
-        ours = {k: list(v) if isinstance(v, tuple) else v for k, v in message.values.items()}
-        assert ours == known
+        assert {k: v for k, v in message.values.items() if k in known} == known
     assert not decoder.dropped
 
 

@@ -125,7 +125,6 @@ def test_takeoff_land_and_a_second_flight() -> None:
         bench.run(1.0)
         assert bench.texts(begun_s) == [
             "Armed by external command",
-            "Using default takeoff altitude: 2.5 m",
             "Takeoff detected",
             "Landing at current position",
             "Landing detected",

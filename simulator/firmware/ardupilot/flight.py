@@ -21,7 +21,6 @@ def gains(parameter: ReadParameter) -> PositionGains:
         speed_xy_mps=speed_mps,
         speed_up_mps=2.5,
         speed_down_mps=2.5,
-        follows_down_mps=2.5,
         tilt_max_rad=math.radians(parameter("ANGLE_MAX") * 0.01),
         thrust_max=1.0,
         derivative_cutoff_hz=5.0,
@@ -57,7 +56,6 @@ _STICKS = StickFlight(
 
 FLIGHT = FlightRules(
     gains=gains,
-    path_limits=None,
     integrates_on_ramp=False,
     landing=Landing(
         low_thrust_share=1.0,

@@ -8,15 +8,10 @@ from simulator.vehicle.battery import BatteryState
 
 # Boot events, seconds after boot
 _BOOT = {
-    "barometer": 1.94,
     "initialised": 2.47,
-    "estimator": 4.45,
     "aligning": 5.40,
-    "tilt": 5.80,
     "attitude": 5.90,
-    "gps": 9.83,
     "origin": 20.02,
-    "other origin": 20.21,
     "gyros": 24.0,
     "reminder": 30.45,
     "position": 41.61,

@@ -148,72 +148,19 @@ def _checks(refusals: Iterable[Rule]) -> list[Rule]:
 
 
 RULES = (
-    Rule(
-        "barometer",
-        texts=(
-            info("Barometer 1 calibration complete"),
-            info("Barometer 2 calibration complete"),
-        ),
-    ),
     # A mode requested before was acknowledged and is lost
     Rule(
         "initialised",
         to="STABILIZE",
-        texts=(
-            info("ArduPilot Ready"),
-            info("AHRS: DCM active"),
-        ),
+        texts=(info("ArduPilot Ready"),),
     ),
-    Rule(
-        "estimator",
-        texts=(
-            info("EKF3 IMU0 initialised"),
-            info("EKF3 IMU1 initialised"),
-            info("AHRS: EKF3 active"),
-        ),
-    ),
-    Rule(
-        "tilt",
-        texts=(
-            info("EKF3 IMU0 tilt alignment complete"),
-            info("EKF3 IMU1 tilt alignment complete"),
-        ),
-    ),
-    Rule(
-        "attitude",
-        texts=(
-            info("EKF3 IMU0 MAG0 initial yaw alignment complete"),
-            info("EKF3 IMU1 MAG0 initial yaw alignment complete"),
-        ),
-    ),
-    Rule(
-        "gps",
-        texts=(
-            info("GPS 1: probing for u-blox at 230400 baud"),
-            info("GPS 1: detected u-blox"),
-        ),
-    ),
-    Rule(
-        "origin",
-        texts=(
-            info("EKF3 IMU0 origin set"),
-            info("Field Elevation Set: 584m"),
-        ),
-        send=_ORIGIN_AND_HOME,
-    ),
-    Rule("other origin", texts=(info("EKF3 IMU1 origin set"),)),
+    Rule("origin", send=_ORIGIN_AND_HOME),
     Rule(
         "reminder",
         when=("not armed", "position missing"),
         texts=(critical("PreArm: Need Position Estimate"),),
     ),
-    Rule(
-        "position",
-        texts=(
-            info("EKF3 IMU0 is using GPS"),
-            info("EKF3 IMU1 is using GPS"),
-        ),
-    ),
+    Rule("position", texts=(info("EKF3 IMU0 is using GPS"), info("EKF3 IMU1 is using GPS"))),
     # A heartbeat follows a mode change at once
     Rule("mode", when=("not armed",), to="requested", send=_HEARTBEAT),
     Rule("mode", when=("not position missing",), to="requested", send=_HEARTBEAT),

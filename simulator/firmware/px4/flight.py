@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from simulator.firmware.base import FlightRules, Landing, PathLimits, PositionGains
+from simulator.firmware.base import FlightRules, Landing, PositionGains
 from simulator.firmware.values import ReadParameter, ReturnYaw
 
 
@@ -20,35 +20,14 @@ def gains(parameter: ReadParameter) -> PositionGains:
         speed_xy_mps=parameter("MPC_XY_VEL_MAX"),
         speed_up_mps=parameter("MPC_Z_VEL_MAX_UP"),
         speed_down_mps=parameter("MPC_Z_VEL_MAX_DN"),
-        follows_down_mps=max(parameter("MPC_Z_VEL_MAX_DN"), 1.2 * parameter("MPC_Z_V_AUTO_DN")),
         tilt_max_rad=math.radians(parameter("MPC_TILTMAX_AIR")),
         thrust_max=parameter("MPC_THR_MAX"),
         derivative_cutoff_hz=5.0,
         turn_radps=math.radians(parameter("MPC_YAWRAUTO_MAX")),
-        speeding_mps2=parameter("MPC_ACC_HOR"),  # outside smoothed trajectories
-        braking_mps2=parameter("MPC_ACC_HOR"),
+        # jerk is limited in the real one (MPC_JERK_AUTO), which lowers both on average
+        speeding_mps2=0.7 * parameter("MPC_ACC_HOR"),
+        braking_mps2=0.5 * parameter("MPC_ACC_HOR"),
         facing_mps=parameter("MPC_XY_P") * parameter("NAV_ACC_RAD"),
-    )
-
-
-def path_limits(parameter: ReadParameter) -> PathLimits:
-    """Limits of smoothed trajectories."""
-    lift_mps, ramp_s = parameter("MPC_TKO_SPEED"), parameter("MPC_TKO_RAMP_T")
-    return PathLimits(
-        jerk_mps3=parameter("MPC_JERK_AUTO"),
-        across_mps2=parameter("MPC_ACC_HOR"),
-        up_mps2=parameter("MPC_ACC_UP_MAX"),
-        down_mps2=parameter("MPC_ACC_DOWN_MAX"),
-        speed_across_mps=parameter("MPC_XY_VEL_MAX"),
-        speed_up_mps=parameter("MPC_Z_V_AUTO_UP"),
-        speed_down_mps=parameter("MPC_Z_V_AUTO_DN"),
-        lift_mps=lift_mps,
-        lift_mps2=lift_mps / max(ramp_s, 1e-3),
-        lift_below_m=parameter("MPC_LAND_ALT1"),
-        corner_share=parameter("MPC_XY_TRAJ_P"),
-        accepted_m=parameter("NAV_ACC_RAD"),
-        accepted_height_m=parameter("NAV_MC_ALT_RAD"),
-        behind_max_m=parameter("MPC_XY_ERR_MAX"),
     )
 
 
@@ -71,7 +50,6 @@ def return_yaw(distance_m: float, parameter: ReadParameter) -> ReturnYaw:
 
 FLIGHT = FlightRules(
     gains=gains,
-    path_limits=path_limits,
     integrates_on_ramp=True,
     landing=Landing(
         low_thrust_share=0.95,  # of estimates that wander on the ground, too

@@ -132,15 +132,7 @@ RULES = (
     Rule("position lost", when=("armed", "not landed"), to=_LAND, do=("failsafe",), texts=(_LOST,)),
     Rule("position found", when=("since position lost",), to="remembered", do=("recover",)),
     Rule("climbed", "AUTO.TAKEOFF", to="AUTO.LOITER"),
-    Rule("default height", texts=(info("Using default takeoff altitude: {takeoff_m:.1f} m"),)),
     Rule("already higher", texts=(critical("Already higher than takeoff altitude"),)),
-    Rule(
-        "return begun",
-        texts=(
-            info("RTL: start return at {target_amsl_m:.0f} m ({target_m:.0f} m above destination)"),
-        ),
-    ),
-    Rule("return lands", texts=(info("RTL: land at destination"),)),
     Rule(
         "mission",
         when=("mission missing",),
@@ -160,8 +152,6 @@ RULES = (
         result=_LATER,
         texts=(critical("Switching to Mission is currently not available"),),
     ),
-    Rule("mission begun", texts=(info("Executing Mission"),)),
-    Rule("mission climbs", texts=(info("Climb to {climb_m:.1f} meters above home"),)),
     Rule("mission progress", send=("MISSION_CURRENT",)),
     Rule("item reached", send=("MISSION_ITEM_REACHED",)),
     Rule("mission return", "AUTO.MISSION", to="AUTO.RTL", texts=(info("Returning to launch"),)),

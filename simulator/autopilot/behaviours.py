@@ -1,0 +1,322 @@
+"""What the vehicle does in its modes: one class per behaviour, and the table of them.
+
+A behaviour demands a motion in each period and answers a few questions about itself. To add one: a
+member of `simulator.firmware.values.Behaviour`, a class here, a row in BEHAVIOURS, and a row in the
+mode table of a firmware. NED, SI.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from enum import Enum
+from typing import ClassVar
+
+from simulator.autopilot.guidance import Guidance
+from simulator.autopilot.state import StateEstimate
+from simulator.firmware.values import Behaviour, MotionSetpoint, ReturnYaw, Triple
+
+_FLATTEST = 1000.0  # takeoff: m across per m of climb
+_STILL_MPS = 0.05  # sticks: a slower demand holds the place
+
+
+class Control(Enum):
+    """What the position controller does in a behaviour."""
+
+    MOTION = "flies the motion that the behaviour demands"
+    LEVEL = "level attitude at the least throttle of the sticks"
+    UNCHANGED = "the last demand stays in force"
+
+
+class ActiveBehaviour:
+    """One behaviour; a new object each time that its mode is entered.
+
+    The defaults are those of automatic flight that starts in the air and does not end by itself.
+    """
+
+    control: ClassVar[Control] = Control.MOTION
+    lifts_off: ClassVar[bool] = False  # may leave the ground
+    continues: ClassVar[bool] = False  # a request for its mode does not start it again
+    cannot_climb = False  # a takeoff whose target is not above the vehicle
+
+    def __init__(self, guidance: Guidance) -> None:
+        self.guidance = guidance
+
+    def enter(self, estimate: StateEstimate, place_ned_m: Triple, *, landed: bool) -> None:
+        """Begin, before the first `motion`. `place_ned_m`: where a takeoff climbs to; NaN where it
+        is not specified."""
+
+    def leave(self) -> None:
+        """End: another behaviour begins."""
+
+    def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
+        """Motion demanded in this period; by default `guidance.hold`."""
+        return self.guidance.hold
+
+    def keeps_place(self, following: Behaviour) -> bool:
+        """The behaviour that follows holds the same place; else it holds where it stops."""
+        return False
+
+    @property
+    def landing(self) -> bool:
+        """In the final descent."""
+        return False
+
+    @property
+    def climbing(self) -> bool:
+        """In an automatic takeoff."""
+        return False
+
+    @property
+    def automatic(self) -> bool:
+        """Speeds and turn rates are those of automatic flight."""
+        return True
+
+    @property
+    def speed_mps(self) -> float:
+        """Horizontal speed limit of this behaviour."""
+        return math.inf
+
+
+class Hold(ActiveBehaviour):
+    """PX4 AUTO.LOITER; ArduCopter BRAKE and CIRCLE: stay, or fly to the place a client named."""
+
+    def keeps_place(self, following: Behaviour) -> bool:
+        """A repeated request does not stop a vehicle that flies to a named place."""
+        return following is Behaviour.HOLD and self.guidance.hold.faces_way
+
+
+class Takeoff(ActiveBehaviour):
+    """PX4 AUTO.TAKEOFF; ArduCopter GUIDED after MAV_CMD_NAV_TAKEOFF. Reports "climbed"."""
+
+    lifts_off = True
+    climbing = True
+    _climbed = False
+
+    def enter(self, estimate: StateEstimate, place_ned_m: Triple, *, landed: bool) -> None:
+        """Choose the height. Neither a descent nor, on the ground, a nearly flat leg is flown."""
+        (x, y, z), (north, east, target_z) = estimate.position_ned_m, place_ned_m
+        if math.isnan(target_z):
+            target_z = z - self.guidance.parameters.role("takeoff_height_m")
+        elif target_z > z:
+            target_z, self.cannot_climb = z, landed
+            self.guidance.events.append("already higher")
+        if landed and math.hypot(north - x, east - y) > _FLATTEST * (z - target_z):
+            self.cannot_climb = True
+        self._place_ned_m = (north, east, target_z)
+
+    def keeps_place(self, following: Behaviour) -> bool:
+        return self._climbed and following in (Behaviour.HOLD, Behaviour.SETPOINT)
+
+    def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
+        guidance = self.guidance
+        north, east, target_z = self._place_ned_m
+        if math.isnan(north + east):
+            north, east = guidance.hold_ned_m[:2]
+        within_m = guidance.parameters.role("climbed_within_m")
+        if not (self._climbed or landed) and estimate.position_ned_m[2] < target_z + within_m:
+            self._climbed = True
+            guidance.events.append("climbed")
+        guidance.hold = MotionSetpoint((north, east, target_z))
+        return guidance.hold
+
+
+class Land(ActiveBehaviour):
+    """PX4 AUTO.LAND; ArduCopter LAND: descend vertically, slower near the ground."""
+
+    landing = True
+
+    def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
+        guidance = self.guidance
+        return descent(guidance.hold_ned_m, land_speed_mps(estimate, guidance))
+
+
+def descent(place_ned_m: Triple, speed_mps: float, yaw_rad: float = math.nan) -> MotionSetpoint:
+    """Vertically down at this speed."""
+    north, east, _ = place_ned_m
+    velocity = (math.nan, math.nan, speed_mps)
+    return MotionSetpoint((north, east, math.nan), velocity, yaw_rad=yaw_rad)
+
+
+def land_speed_mps(estimate: StateEstimate, guidance: Guidance) -> float:
+    """Descent speed: slower towards home's height, slowest where the range finder sees the ground
+    (PX4 MPC_LAND_SPEED, MPC_LAND_CRWL; ArduCopter LAND_SPEED)."""
+    role = guidance.parameters.role
+    slow = role("land_speed_mps")
+    if estimate.ground_m <= role("crawl_below_m"):
+        return min(slow, role("crawl_speed_mps"))
+    fast = max(slow, role("descent_speed_mps"))
+    slow_below_m, fast_above_m = role("slow_below_m"), role("fast_above_m")
+    height_m = guidance.home_ned_m[2] - estimate.position_ned_m[2]
+    share = (height_m - slow_below_m) / max(fast_above_m - slow_below_m, 1e-3)
+    return slow + min(1.0, max(0.0, share)) * (fast - slow)
+
+
+class Stage(Enum):
+    """Stages of a return, in order."""
+
+    CLIMB, FLY, DESCEND, WAIT, LAND = range(5)
+
+
+class Return(ActiveBehaviour):
+    """PX4 AUTO.RTL; ArduCopter RTL: climb, fly home, descend, wait, land."""
+
+    _stage = Stage.CLIMB
+    _wait_until_s = math.inf
+    _yaw: ReturnYaw | None = None
+
+    def enter(self, estimate: StateEstimate, place_ned_m: Triple, *, landed: bool) -> None:
+        """Choose the height of the return and its yaw."""
+        guidance, (x, y, z) = self.guidance, estimate.position_ned_m
+        read, flight = guidance.parameters.__getitem__, guidance.firmware.flight
+        distance_m = self._distance_home_m(estimate)
+        height_m = flight.return_height_m(distance_m, read)
+        self._yaw = flight.return_yaw(distance_m, read)
+        guidance.hold = MotionSetpoint((x, y, min(z, guidance.home_ned_m[2] - height_m)))
+
+    @property
+    def landing(self) -> bool:
+        return self._stage is Stage.LAND
+
+    def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
+        self._advance(estimate)
+        yaw_rad = math.nan
+        if self._yaw is ReturnYaw.AS_AT_HOME and self._stage is not Stage.CLIMB:
+            yaw_rad = self.guidance.home_yaw_rad
+        if self._stage is Stage.LAND:
+            speed_mps = land_speed_mps(estimate, self.guidance)
+            return descent(self.guidance.hold_ned_m, speed_mps, yaw_rad)
+        along = self._yaw is ReturnYaw.ALONG_PATH
+        return MotionSetpoint(self.guidance.hold_ned_m, yaw_rad=yaw_rad, faces_way=along)
+
+    def _advance(self, estimate: StateEstimate) -> None:
+        """Go through the stages that are complete."""
+        guidance, z = self.guidance, estimate.position_ned_m[2]
+        home_x, home_y, home_z = guidance.home_ned_m
+        role, target_z = guidance.parameters.role, guidance.hold_ned_m[2]
+        height_within_m, wait_s = role("return_height_within_m"), role("return_waits_s")
+        if self._stage is Stage.CLIMB and z < target_z + height_within_m:
+            guidance.hold = MotionSetpoint((home_x, home_y, target_z))
+            self._stage = Stage.FLY
+        if self._stage is Stage.FLY and self._distance_home_m(estimate) < role("return_within_m"):
+            target_z = max(target_z, home_z - role("return_descends_to_m"))
+            guidance.hold = MotionSetpoint((home_x, home_y, target_z))
+            self._stage = Stage.LAND if wait_s == 0.0 else Stage.DESCEND
+        if self._stage is Stage.DESCEND and z > target_z - height_within_m:
+            if wait_s >= 0.0:
+                self._wait_until_s = estimate.time_s + wait_s + role("return_settles_s")
+            self._stage = Stage.WAIT
+        if self._stage is Stage.WAIT and estimate.time_s >= self._wait_until_s:
+            self._stage = Stage.LAND
+        if self._yaw is not None and self._stage.value > Stage.FLY.value:
+            self._yaw = ReturnYaw.AS_AT_HOME
+
+    def _distance_home_m(self, estimate: StateEstimate) -> float:
+        return math.dist(estimate.position_ned_m[:2], self.guidance.home_ned_m[:2])
+
+
+class FlyMission(ActiveBehaviour):
+    """PX4 AUTO.MISSION; ArduCopter AUTO: the items of `simulator.autopilot.mission`, in order."""
+
+    lifts_off = True
+    continues = True
+
+    def leave(self) -> None:
+        self.guidance.mission.pause()
+
+    def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
+        guidance = self.guidance
+        motion = guidance.mission.fly(estimate, guidance.home_ned_m, landed=landed)
+        if not self.landing:
+            return motion
+        return descent(motion.position_ned_m, land_speed_mps(estimate, guidance))
+
+    @property
+    def landing(self) -> bool:
+        return self.guidance.mission.landing
+
+    @property
+    def climbing(self) -> bool:
+        return self.guidance.mission.climbing
+
+    @property
+    def speed_mps(self) -> float:
+        return self.guidance.mission.speed_mps
+
+
+class FlyBySticks(ActiveBehaviour):
+    """ArduCopter LOITER, ALT_HOLD and POSHOLD; PX4 POSCTL and ALTCTL, which have no stick input
+    here: the vehicle descends slowly."""
+
+    lifts_off = True
+
+    def enter(self, estimate: StateEstimate, place_ned_m: Triple, *, landed: bool) -> None:
+        if self.guidance.sticks is not None:
+            self.guidance.sticks.begin()
+
+    def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
+        """The velocity demanded; an axis without a demand holds its place."""
+        guidance = self.guidance
+        descend = descent(guidance.hold_ned_m, guidance.firmware.flight.descend_speed_mps)
+        if guidance.sticks is None:
+            return descend
+        demand = guidance.sticks.demand(estimate.time_s, estimate.yaw_rad)
+        velocity, acceleration, climb_mps, turn_radps = demand
+        if landed and climb_mps <= 0.0:
+            return descend
+        (x, y, z), stop = guidance.hold_ned_m, guidance.stopping_place_ned_m(estimate)
+        moves = math.hypot(*velocity) > _STILL_MPS
+        x, y = stop[:2] if moves else (x, y)
+        guidance.hold = MotionSetpoint((x, y, stop[2] if climb_mps else z))
+        none = (math.nan, math.nan)
+        return MotionSetpoint(
+            (*(none if moves else (x, y)), math.nan if climb_mps else z),
+            (*(velocity if moves else none), -climb_mps or math.nan),
+            (*(acceleration if moves else none), math.nan),
+            yaw_rate_radps=turn_radps or math.nan,
+        )
+
+
+class LevelAtLeastThrottle(ActiveBehaviour):
+    """ArduCopter STABILIZE: level, with the throttle stick down."""
+
+    control = Control.LEVEL
+
+
+class LastDemand(ActiveBehaviour):
+    """PX4 STABILIZED without sticks: the last demand stays in force."""
+
+    control = Control.UNCHANGED
+
+
+class FollowSetpoint(ActiveBehaviour):
+    """PX4 OFFBOARD, ArduCopter GUIDED: follow a motion setpoint; hold where there is none. The
+    position controller flies an attitude setpoint without asking for a motion."""
+
+    lifts_off = True
+    continues = True
+
+    def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
+        setpoint = self.guidance.setpoint
+        if isinstance(setpoint, MotionSetpoint):
+            self.cannot_climb = False
+            return setpoint
+        self.cannot_climb = landed  # it stands until somebody asks for a climb
+        return self.guidance.hold
+
+    @property
+    def automatic(self) -> bool:
+        return self.guidance.firmware.setpoints.as_automatic
+
+
+BEHAVIOURS: Mapping[Behaviour, type[ActiveBehaviour]] = {
+    Behaviour.HOLD: Hold,
+    Behaviour.TAKEOFF: Takeoff,
+    Behaviour.LAND: Land,
+    Behaviour.RETURN: Return,
+    Behaviour.MISSION: FlyMission,
+    Behaviour.DESCEND: FlyBySticks,
+    Behaviour.LEVEL: LevelAtLeastThrottle,
+    Behaviour.COAST: LastDemand,
+    Behaviour.SETPOINT: FollowSetpoint,
+}
