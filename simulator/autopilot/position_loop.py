@@ -55,7 +55,7 @@ class PositionLoop:
         self._integral_mps2 = [0.0, 0.0, 0.0]
         self._acceleration_mps2 = [0.0, 0.0, 0.0]  # of the estimate, filtered
         self._velocity_mps = NAN3  # of the estimate in the last period
-        self._across_mps = math.nan  # setpoint of the last period under `smooth`
+        self._across_mps = self._down_mps = math.nan  # setpoint of the last period under `smooth`
 
     def step(
         self,
@@ -125,8 +125,11 @@ class PositionLoop:
         if speed > most:
             north, east = north * (most / speed), east * (most / speed)
         if not math.isnan(down):
+            if limits.smooth:
+                down = self._smooth_down_mps(down, velocity[2])
             up_mps = min(limits.up_mps, gains.speed_up_mps)
             down = max(-up_mps, min(gains.speed_down_mps, down))
+            self._down_mps = down if limits.smooth else math.nan
         return north, east, down
 
     def _smooth_mps(self, speed_mps: float, motion: MotionSetpoint, velocity: Triple) -> float:
@@ -141,6 +144,12 @@ class PositionLoop:
             squared = 2.0 * self.gains.braking_mps2 * speed_mps / gain_ps
             most = min(most, math.sqrt(squared)) if squared >= 0.0 else most
         return most
+
+    def _smooth_down_mps(self, down_mps: float, velocity_mps: float) -> float:
+        """The vertical speed with limited acceleration since the last period."""
+        before_mps = velocity_mps if math.isnan(self._down_mps) else self._down_mps
+        most = self.gains.vertical_mps2 * LOOP_S
+        return min(before_mps + most, max(before_mps - most, down_mps))
 
     def _acceleration(self, motion: MotionSetpoint, setpoint: Triple, velocity: Triple) -> Triple:
         """PID on the velocity error plus the demanded acceleration; D acts on the estimate."""

@@ -253,6 +253,7 @@ class PositionGains:
     turn_radps: float
     speeding_mps2: float
     braking_mps2: float
+    vertical_mps2: float
     facing_mps: float  # wanted across the ground, from which on it faces the direction of flight
 
 

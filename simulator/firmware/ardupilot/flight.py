@@ -27,6 +27,7 @@ def gains(parameter: ReadParameter) -> PositionGains:
         turn_radps=math.radians(parameter("ATC_SLEW_YAW") * 0.01),
         speeding_mps2=parameter("WPNAV_ACCEL") * 0.01,
         braking_mps2=0.5 * parameter("WPNAV_ACCEL") * 0.01,  # as the jerk is limited
+        vertical_mps2=2.5,
         facing_mps=0.05 * speed_mps if parameter("WP_YAW_BEHAVIOR") else math.inf,
     )
 
