@@ -19,13 +19,14 @@ from offboard.cli.shared import (
     SigningKey,
     System,
     Vehicle,
+    err,
     option,
     out,
     say,
 )
 
 if TYPE_CHECKING:
-    from offboard.doctor.findings import Row
+    from offboard.doctor.table import Row
 
 REFUSED = 3
 DOCTOR_CODES = (
@@ -69,9 +70,10 @@ def doctor(
         for check in chosen:
             say(f"{check.name:<{width}}  {check.summary}", indent=width + 2)
         return
-    from offboard.doctor import report
-    from offboard.doctor.findings import Level, examine, verdict, worst
     from offboard.doctor.run import observe
+    from offboard.doctor.table import as_json as report
+    from offboard.doctor.table import examine, verdict, worst
+    from offboard.flight.preflight import Level
     from offboard.run.configuration import load
 
     flight = load(
@@ -79,17 +81,19 @@ def doctor(
         choices={"controller": controller, "reference": reference, "vehicle": vehicle},
         assignments=assignments or (),
     )
-    seen = observe(
-        connect or DEFAULT_CONNECTION,
-        flight,
-        out_directory or FLIGHTS,
-        system_id=system,
-        signing_key=signing_key,
-    )
+    with err.status("opening the link") as status:  # a line on a terminal, nothing elsewhere
+        seen = observe(
+            connect or DEFAULT_CONNECTION,
+            flight,
+            out_directory or FLIGHTS,
+            system_id=system,
+            signing_key=signing_key,
+            tell=status.update,
+        )
     rows = examine(chosen, seen)
     sentence = verdict(rows, complete=not names)
     if as_json:
-        sys.stdout.write(report.as_json(rows, seen, sentence))
+        sys.stdout.write(report(rows, seen, sentence))
     else:
         _show(rows, sentence)
     if worst(rows) is Level.BLOCKS:
@@ -99,16 +103,18 @@ def doctor(
 def _show(rows: list[Row], verdict: str) -> None:
     """One line for each finding, the hint below it; of a row with something to say only that. At
     the end the verdict."""
-    from offboard.doctor.findings import Level
-    from offboard.doctor.report import name
+    from offboard.flight.preflight import Level
 
-    levels = max(len(name(level)) for level in Level)
+    levels = max(len(level.name) for level in Level)
     width = max((len(row.check) for row in rows), default=0)
     indent = levels + width + 4
     for row in rows:
         said = [f for f in row.findings if f.level is not Level.OK] or row.findings[:1]
         for finding in said:
-            say(f"{name(finding.level):<{levels}}  {row.check:<{width}}  {finding.found}", indent)
+            say(
+                f"{finding.level.name.lower():<{levels}}  {row.check:<{width}}  {finding.found}",
+                indent,
+            )
             if finding.hint:
                 say(f"{'':<{indent}}fix: {finding.hint}", indent + 5)
     out.print()

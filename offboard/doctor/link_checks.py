@@ -1,20 +1,19 @@
-"""Checks of the link: the port, who sends on it, delay, loss, load and clocks."""
+"""Checks of the link beyond the preflight list: the port, who sends on it, delay, loss, load and
+clocks. A check is a function of an `Observation`; it returns nothing where there is nothing to
+say."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
 
-from offboard.doctor.findings import Finding, blocks, ok, wait, warn
 from offboard.doctor.observation import Observation
-from offboard.flight.assessment import MINIMUM_TELEMETRY_HZ
-from offboard.flight.phases import Limits
+from offboard.flight.preflight import TELEMETRY, Finding, Level
 from offboard.link.connection import BITS_OF_A_BYTE
-from offboard.mavlink.autopilots import unfit_type
 from offboard.mavlink.telemetry_rates import SHARE
 
 BAUDS = (57600, 115200, 230400, 460800, 921600)
 LOST_SHARE, FULL_SHARE, ENOUGH = 0.02, 0.9, 0.7
-LATE_S, REAL_TIME, CLOCK_OFF_S = 0.25, 0.05, 60.0
+LATE_S, REAL_TIME = 0.25, 0.05
 FOREIGN_TIMES = 3
 ALL_ADDRESSES = "listen on all addresses: --connect udpin:0.0.0.0:PORT"
 BRIDGES = {
@@ -38,6 +37,22 @@ CLOSED = {  # why it cannot be opened
 }
 
 
+def ok(found: str) -> Finding:
+    return Finding(Level.OK, found)
+
+
+def warn(found: str, hint: str = "", about: str = "") -> Finding:
+    return Finding(Level.WARN, found, hint, about)
+
+
+def wait(found: str, hint: str = "") -> Finding:
+    return Finding(Level.WAIT, found, hint)
+
+
+def blocks(found: str, hint: str = "") -> Finding:
+    return Finding(Level.BLOCKS, found, hint)
+
+
 def port(seen: Observation) -> Iterable[Finding]:
     """Whether the connection can be opened, and which other process has it."""
     others = ", ".join(seen.holders)
@@ -52,16 +67,11 @@ def port(seen: Observation) -> Iterable[Finding]:
 
 
 def vehicle(seen: Observation) -> Iterable[Finding]:
-    """Whether an autopilot is heard, and what is heard if none is."""
-    found = seen.vehicle.found
+    """Whether an autopilot that can be flown is heard, and what is heard if none is."""
+    found, kind = seen.vehicle.found, _kind(seen)
     if seen.link_error:
         return
     if found:
-        shown = seen.vehicle.heartbeat
-        helicopter = seen.config is not None and seen.config.vehicle.airframe == "helicopter"
-        unfit = unfit_type(shown.vehicle_type, helicopter=helicopter) if shown else ""
-        if unfit:
-            yield blocks(unfit, "fly it with its own autopilot; is MAV_TYPE or FRAME_CLASS right?")
         yield ok(f"{found.autopilot}, system {found.system_id}")
     elif any(sender.is_autopilot for sender in seen.senders):
         yield blocks(seen.not_found or "the autopilot is neither PX4 nor ArduCopter")
@@ -73,8 +83,8 @@ def vehicle(seen: Observation) -> Iterable[Finding]:
         hint = "check the baud rate, or which program sends to this port"
         yield blocks(f"{seen.link.bytes_received} bytes are heard that are not MAVLink", hint)
     else:
-        hint = SILENT.get(_kind(seen), STARTED)
-        if "127.0.0.1" in seen.connection and _kind(seen) == "udpin":
+        hint = SILENT.get(kind, STARTED)
+        if "127.0.0.1" in seen.connection and kind == "udpin":
             hint += f"; {BRIDGES[seen.surroundings]}"
         yield blocks(f"nothing is heard in {seen.listened_s:.0f} s", hint)
 
@@ -85,51 +95,46 @@ def senders(seen: Observation) -> Iterable[Finding]:
     if found is None:
         return
     ours = found.system_id, found.component_id
-    others = [each for each in seen.senders if (each.system_id, each.component_id) != ours]
-    chosen = seen.system_id is not None  # then other vehicles are ignored in flight, too
-    for sender in others:
-        if sender.setpoints:
-            yield blocks(
-                f"{sender.name} sends setpoints ({sender.setpoints} were heard)",
-                "stop it: two controllers of one vehicle fight each other",
-            )
-        elif sender.is_autopilot and not chosen:
-            yield blocks(
-                f"another vehicle is heard: {sender.name}, from {', '.join(sender.places)}",
-                "choose one with --system, or give each vehicle its own port",
-            )
+    others = []
     for sender in seen.senders:
-        if (sender.system_id, sender.component_id) == ours and len(sender.places) > 1:
-            places = ", ".join(sender.places)
+        places = ", ".join(sorted(sender.places))
+        if (sender.system_id, sender.component_id) != ours:
+            others.append(f"{sender.name}, from {places}" if sender.is_autopilot else sender.name)
+        elif len(sender.places) > 1:
             yield warn(
                 f"two programs send as vehicle {ours[0]}/{ours[1]}: {places}",
                 "give each vehicle its own system id (MAV_SYS_ID, SYSID_THISMAV) and port",
             )
-    intruder = seen.vehicle.other_sender
-    if intruder and not any(each.setpoints for each in others):
-        name = f"system {intruder.system_id} component {intruder.component_id}"
-        yield blocks(f"another program controls this vehicle: {name}", "stop it")
-    harmless = [
-        each.name for each in others if not each.setpoints and (chosen or not each.is_autopilot)
-    ]
-    yield ok("besides the vehicle: " + (", ".join(harmless) or "nobody"))
+    yield ok("besides the vehicle: " + ("; ".join(others) or "nobody"))
+
+
+def uplink(seen: Observation) -> Iterable[Finding]:
+    """Whether what we send reaches the vehicle: it acknowledges commands without effect."""
+    if seen.vehicle.found is None or not seen.link.commands_sent:
+        return
+    if seen.link.acknowledged:
+        yield ok("the vehicle acknowledges our commands, so that heartbeat and texts reach it")
+    elif seen.vehicle.parameters:
+        yield warn("parameters are answered, but no command is acknowledged")
+    else:
+        yield blocks(
+            "the vehicle answers nothing: what is sent to it does not arrive",
+            "check the direction to the vehicle: router, firewall, TX wire; or another program "
+            "has taken the vehicle's answers",
+        )
 
 
 def delay(seen: Observation) -> Iterable[Finding]:
     """Delay and jitter of the link by TIMESYNC, and telemetry that comes late."""
-    limits, link = _limits(seen), seen.link
+    link = seen.link
     if seen.vehicle.found is None:
         return
     if link.delay is None:
         yield wait("TIMESYNC is not answered: the delay of the link is unknown")
         return
-    value, sd = link.delay.value, link.delay.sd
     trip = "" if link.round_trip_s is None else f", round trip {1e3 * link.round_trip_s:.0f} ms"
-    figures = f"delay {1e3 * value:.0f} +- {1e3 * sd:.0f} ms{trip}"
-    if value > limits.link_delay_s or sd > limits.link_jitter_s:
-        most = f"{1e3 * limits.link_delay_s:.0f} +- {1e3 * limits.link_jitter_s:.0f} ms"
-        yield blocks(f"{figures}; at most {most} can be flown", "use a faster link")
-    elif link.late_s > LATE_S:
+    figures = f"delay {1e3 * link.delay.value:.0f} +- {1e3 * link.delay.sd:.0f} ms{trip}"
+    if link.late_s > LATE_S:
         yield warn(f"{figures}, but telemetry came up to {1e3 * link.late_s:.0f} ms late")
     else:
         yield ok(figures)
@@ -179,24 +184,19 @@ def bandwidth(seen: Observation) -> Iterable[Finding]:
 
 def rates(seen: Observation) -> Iterable[Finding]:
     """Rates of the telemetry that a flight needs."""
-    link, needed = seen.link, ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
+    link = seen.link
     if seen.vehicle.found is None:
         return
-    figures = ", ".join(f"{name} {link.rates_hz.get(name, 0.0):.0f} Hz" for name in needed)
-    too_slow = [n for n in needed if link.rates_hz.get(n, 0.0) < MINIMUM_TELEMETRY_HZ]
+    figures = ", ".join(f"{name} {link.rates_hz.get(name, 0.0):.0f} Hz" for name in TELEMETRY)
     slow = [
         f"{each.name} {link.rates_hz.get(each.name, 0.0):.1f} of {each.rate_hz:g} Hz"
         for each in link.wanted
         if not each.optional and link.rates_hz.get(each.name, 0.0) < ENOUGH * each.rate_hz
     ]
-    hint = seen.dialect.slow_hint if seen.dialect else ""
     if not link.requested:
         yield ok(f"{figures}; not requested, since the vehicle is armed")
-    elif "LOCAL_POSITION_NED" in too_slow and not link.rates_hz.get("LOCAL_POSITION_NED"):
-        yield wait("LOCAL_POSITION_NED does not arrive", "wait until the vehicle has a position")
-    elif too_slow:
-        yield blocks(f"{figures}; at least {MINIMUM_TELEMETRY_HZ:.0f} Hz are needed", hint)
     elif slow:
+        hint = seen.dialect.slow_hint if seen.dialect else ""
         yield warn(f"slower than requested: {', '.join(slow)}", hint)
     else:
         yield ok(figures)
@@ -208,50 +208,22 @@ def clock(seen: Observation) -> Iterable[Finding]:
     if found is None:
         return
     if measured.rebooted:
-        yield blocks(
-            "the vehicle restarted while it was observed", "find out why, then check again"
-        )
+        hint = "find out why, then check again"
+        yield blocks("the vehicle restarted while it was observed", hint)
     if measured.jumped_s:
         yield blocks(f"the vehicle's clock jumped by {measured.jumped_s:.1f} s")
-    if measured.rate is not None and abs(measured.rate - 1.0) > REAL_TIME:
-        yield warn(f"the vehicle's clock runs {measured.rate:.2f} times as fast as this computer's")
     masters = [s.name for s in seen.senders if s.times and s.system_id != found.system_id]
     if seen.link.foreign_timesync > FOREIGN_TIMES:
         masters.append(
-            f"somebody whose {seen.link.foreign_timesync} TIMESYNC replies are sent here"
+            f"the sender of {seen.link.foreign_timesync} requests that are answered here"
         )
     if masters:
         hint = "let one program alone exchange TIMESYNC with the vehicle"
         yield warn(f"another time master: {', '.join(masters)}", hint)
-    offset_s = measured.unix_offset_s
-    if offset_s is not None and abs(offset_s) > CLOCK_OFF_S:
-        yield warn(
-            f"the vehicle's date differs from this computer's by {offset_s:.0f} s",
-            "only log files are affected; set this computer's clock",
-        )
     if measured.rate is not None:
-        yield ok(f"the vehicle's clock runs {measured.rate:.3f} times as fast as this computer's")
-
-
-def uplink(seen: Observation) -> Iterable[Finding]:
-    """Whether what we send reaches the vehicle: it acknowledges commands without effect."""
-    if seen.vehicle.found is None or not seen.link.commands_sent:
-        return
-    if seen.link.acknowledged:
-        yield ok("the vehicle acknowledges our commands, so that heartbeat and texts reach it")
-    elif seen.vehicle.parameters:
-        yield warn("parameters are answered, but no command is acknowledged")
-    else:
-        yield blocks(
-            "the vehicle answers nothing: what is sent to it does not arrive",
-            "check the direction to the vehicle: router, firewall, TX wire; or another program "
-            "has taken the vehicle's answers",
-        )
+        figures = f"the vehicle's clock runs {measured.rate:.3f} times as fast as this computer's"
+        yield warn(figures) if abs(measured.rate - 1.0) > REAL_TIME else ok(figures)
 
 
 def _kind(seen: Observation) -> str:
     return seen.connection.partition(":")[0]
-
-
-def _limits(seen: Observation) -> Limits:
-    return seen.config.limits if seen.config else Limits()

@@ -10,9 +10,9 @@ from __future__ import annotations
 import statistics
 from collections.abc import Hashable, Iterable
 
-from offboard.doctor.census import Census
-from offboard.doctor.observation import FIX_3D, ClockMeasures, LinkMeasures, Observation
-from offboard.flight.readiness import Readiness
+from offboard.doctor.observation import ClockMeasures, LinkMeasures, Observation
+from offboard.doctor.senders import Senders
+from offboard.flight.preflight import FIX_3D, ParameterReading
 from offboard.flight.vehicle_clock import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.link.interface import Chunk
@@ -27,8 +27,6 @@ from offboard.mavlink.events import (
     LocalPosition,
     NoFix,
     Rebooted,
-    StatusText,
-    SystemTime,
     TimesyncReply,
 )
 from offboard.mavlink.outgoing import CommandLong, Outgoing, Timesync
@@ -46,7 +44,7 @@ TEXTS_S = 1.0  # for the texts after the acknowledgement
 ENOUGH = 0.7  # of a rate, measured over two seconds
 SETTLE_S = 1.0  # until jumps of the vehicle's clock count
 RUN_PREARM_CHECKS, REQUEST_MESSAGE = 401, 512  # MAV_CMD
-VERSION, GPS, SYSTEM_TIME, TIMESYNC = 148, 24, 2, 111  # message ids
+VERSION, GPS, TIMESYNC = 148, 24, 111  # message ids
 
 
 class Listening:
@@ -77,8 +75,9 @@ class Listening:
             ),
             signing,
         )
-        self._census = Census(stream)
-        self._readiness, self._clock = Readiness(advice=True), VehicleClock()
+        self._senders = Senders(stream)
+        self._parameters = ParameterReading(advice=True)
+        self._clock = VehicleClock()
         self._asked: dict[int, tuple[int, float]] = {}  # message or command: tries, when
         self._settled = self._rebooted = self._requested = False
         self._may_greet = False  # a disarmed vehicle, whose signing time is behind ours
@@ -88,17 +87,17 @@ class Listening:
         self._timesync_s = self._foreign_timesync = 0.0
         self._first: tuple[float, float] | None = None  # vehicle time and host time
         self._newest: tuple[float, float] | None = None
-        self._unix_offset_s: float | None = None
         self._fix_type: int | None = None
-        self._texts: list[str] = []
         self._prearm_s: float | None = None  # when it was acknowledged
         self._acknowledged: dict[int, str] = {}
 
     # --- in ---
 
-    def take(self, chunk: Chunk, unix_less_host_s: float = 0.0) -> None:
-        """Process received bytes. `unix_less_host_s` converts host time to Unix time."""
-        self._census.receive(chunk.data, chunk.peer)
+    def take(self, chunk: Chunk) -> None:
+        """Process received bytes."""
+        self._senders.receive(chunk.data, chunk.peer)
+        if self.peer not in (None, chunk.peer):  # another vehicle, perhaps
+            self._session.overhear(chunk.data)
         reception = self._session.receive(chunk.data, chunk.peer, chunk.arrived_s)
         for event in reception.events:
             if not self._found_s:
@@ -106,9 +105,9 @@ class Listening:
             if not self._found_s and self._session.vehicle is not None:
                 self._found_s = chunk.arrived_s
             self.vehicle.update(event, self._session.link_time_s)
-            self._note(event, chunk.arrived_s, unix_less_host_s)
+            self._note(event, chunk.arrived_s)
 
-    def _note(self, event: Event, at_s: float, unix_less_host_s: float) -> None:
+    def _note(self, event: Event, at_s: float) -> None:
         match event:
             case Attitude(time_s) | LocalPosition(time_s):
                 self._on_stamp(time_s, at_s)
@@ -119,16 +118,12 @@ class Listening:
                 else:
                     self._round_trips_s.append(at_s - sent_s)
                     self._clock.on_reply(event)
-            case SystemTime(unix_s) if unix_s:
-                self._unix_offset_s = unix_s - at_s - unix_less_host_s
             case NoFix(fix_type):
                 self._fix_type = fix_type
             case GpsFix():
                 self._fix_type = FIX_3D
             case ClockBehind(armed=armed):
                 self._may_greet = not armed
-            case StatusText(_, text):
-                self._texts.append(text)
             case CommandAck(command, result):
                 self._acknowledged[command] = result
                 if command == RUN_PREARM_CHECKS and self._prearm_s is None:
@@ -162,12 +157,11 @@ class Listening:
             if (self._sends_first or self._may_greet) and self._may_ask(TIMESYNC, now_s):
                 yield Timesync(0, round(now_s * 1e9))
             return
-        yield from self._readiness.due(dialect, state.parameters, now_s)
+        yield from self._parameters.due(dialect, state.parameters, now_s)
         fix_age_s = min(state.age_s(NoFix), state.age_s(GpsFix))
         unknown = {
             VERSION: state.version is None,
             GPS: fix_age_s > ASK_EVERY_S,
-            SYSTEM_TIME: self._unix_offset_s is None,
             dialect.estimator_message: state.age_s(EstimatorReport) > ASK_EVERY_S,
         }
         for message_id, missing in unknown.items():
@@ -217,37 +211,28 @@ class Listening:
             checked
             and state.version is not None
             and self._clock.delay is not None
-            and self._readiness.complete(self._session.dialect, state.parameters, now_s)
+            and self._parameters.complete(self._session.dialect, state.parameters, now_s)
             and all(each.optional or enough(each, rates) for each in self._session.dialect.wanted)
         )
 
     def observation(self, now_s: float) -> Observation:
         """What was observed until host time `now_s`."""
-        dialect, state = self._session.dialect, self.vehicle
-        names = [p.name for p in dialect.watched_parameters] if dialect else []
-        prefixes = dialect.prearm_prefixes if dialect else ()
-        told = (
-            text.removeprefix(prefix)
-            for text in self._texts
-            for prefix in prefixes
-            if text.startswith(prefix)
-        )
+        session, autopilots = self._session, self._session.autopilots
+        several = autopilots.ambiguous(session.link_time_s)
         return Observation(
             listened_s=now_s - self._began_s,
-            system_id=self._session.settings.system_id,
-            not_found=self._session.autopilots.why_none(self._session.counters),
-            senders=self._census.senders,
-            vehicle=state,
-            dialect=dialect,
-            unanswered=tuple(name for name in names if name not in state.parameters),
+            not_found=autopilots.why_none(session.counters),
+            senders=self._senders.found,
+            systems=autopilots.named(session.link_time_s) if several else "",
+            vehicle=self.vehicle,
+            dialect=session.dialect,
             fix_type=self._fix_type,
-            prearm_texts=tuple(dict.fromkeys(told)),
             link=self._measures(now_s),
             clock=self._clock_measures(),
         )
 
     def _measures(self, now_s: float) -> LinkMeasures:
-        dialect, counters = self._session.dialect, self._census.counters
+        dialect, counters = self._session.dialect, self._senders.counters
         wanted = dialect.wanted if dialect else ()
         passed_s = max(now_s - (self._found_s or self._began_s), 1e-3)
         trips_s = self._round_trips_s
@@ -258,12 +243,13 @@ class Listening:
             wanted_bytes_ps=self._session.wanted_bytes_ps,
             capacity_bytes_ps=self._capacity_bytes_ps,
             messages_bytes_ps={
-                name: number / passed_s for name, number in self._census.message_bytes.items()
+                name: number / passed_s for name, number in self._senders.message_bytes.items()
             },
             wanted=wanted,
             rates_hz=self._session.rates_hz,
             requested=self._requested,
             delay=self._clock.delay,
+            measures_delay=not self._clock.delay_is_measured(now_s),
             round_trip_s=statistics.median(trips_s) if trips_s else None,
             late_s=self._late_s,
             foreign_timesync=int(self._foreign_timesync),
@@ -276,7 +262,7 @@ class Listening:
         if self._first and self._newest and self._newest[1] - self._first[1] > 1.0:
             (began_s, heard_s), (ended_s, ended_at_s) = self._first, self._newest
             rate = (ended_s - began_s - self._clock.jumped_s) / (ended_at_s - heard_s)
-        return ClockMeasures(rate, self._clock.jumped_s, self._rebooted, self._unix_offset_s)
+        return ClockMeasures(rate, self._clock.jumped_s, self._rebooted)
 
 
 def enough(wanted: WantedMessage, rates_hz: dict[str, float]) -> bool:

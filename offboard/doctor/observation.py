@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from offboard.flight.phases import Limits
+from offboard.flight.preflight import Ground
 from offboard.flight.vehicle_state import VehicleState
 from offboard.identification.uncertainty import Estimate
 from offboard.mavlink.autopilots import is_vehicle
@@ -16,27 +18,20 @@ from offboard.mavlink.decode import Identity
 from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage
 from offboard.run.configuration import FlightConfig
 
-FIX_3D = 3  # GPS_FIX_TYPE; also stands for better ones
 
-
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class Sender:
     """One MAVLink sender. `vehicle_type` and `autopilot` are those of its HEARTBEAT, None without
     one; `places` are the addresses that it sends from."""
 
     system_id: int
     component_id: int
-    vehicle_type: int | None
-    autopilot: int | None
-    places: tuple[str, ...]
-    frames: int
-    lost: int  # by gaps of its sequence numbers
-    setpoints: int  # SET_ATTITUDE_TARGET and SET_POSITION_TARGET_*
-    times: int  # TIMESYNC and SYSTEM_TIME
-
-    @property
-    def is_ground_station(self) -> bool:
-        return self.vehicle_type == TYPE_GCS
+    vehicle_type: int | None = None
+    autopilot: int | None = None
+    places: set[str] = field(default_factory=set)
+    frames: int = 0
+    lost: int = 0  # by gaps of its sequence numbers
+    times: int = 0  # TIMESYNC and SYSTEM_TIME
 
     @property
     def is_autopilot(self) -> bool:
@@ -46,7 +41,7 @@ class Sender:
 
     @property
     def name(self) -> str:
-        kind = "ground station" if self.is_ground_station else "component"
+        kind = "ground station" if self.vehicle_type == TYPE_GCS else "component"
         kind = "autopilot" if self.is_autopilot else kind
         return f"{kind} {self.system_id}/{self.component_id}"
 
@@ -65,6 +60,7 @@ class LinkMeasures:
     rates_hz: Mapping[str, float] = field(default_factory=dict)
     requested: bool = False  # the rates were requested
     delay: Estimate | None = None  # s: telemetry and setpoint together
+    measures_delay: bool = False  # it is not measured well enough
     round_trip_s: float | None = None  # of TIMESYNC, median
     late_s: float = 0.0  # greatest age of telemetry beyond the least
     foreign_timesync: int = 0  # replies of the vehicle to requests that are not ours
@@ -79,7 +75,6 @@ class ClockMeasures:
     rate: float | None = None  # seconds of vehicle time per second
     jumped_s: float = 0.0
     rebooted: bool = False
-    unix_offset_s: float | None = None  # its Unix time less that of this computer
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,19 +103,39 @@ class Observation:
     connection: str = ""
     listened_s: float = 0.0
     link_error: str = ""
-    system_id: int | None = None  # of the vehicle, where it was chosen
     not_found: str = ""  # why no vehicle was found, as far as dropped frames tell
     holders: tuple[str, ...] = ()  # other processes that have the port
     surroundings: str = ""  # "WSL", "container" or empty
-    senders: tuple[Sender, ...] = ()
+    senders: tuple[Sender, ...] = ()  # the most talkative first
+    systems: str = ""  # of several vehicles, none of which was chosen
     vehicle: VehicleState = field(default_factory=VehicleState)
     dialect: Dialect | None = None
-    unanswered: tuple[str, ...] = ()  # parameters
     fix_type: int | None = None  # GPS_FIX_TYPE
-    prearm_texts: tuple[str, ...] = ()
     link: LinkMeasures = field(default_factory=LinkMeasures)
     clock: ClockMeasures = field(default_factory=ClockMeasures)
     computer: Computer = field(default_factory=Computer)
     config: FlightConfig | None = None
     config_problem: str = ""
     tilt_rad: float | None = None  # greatest tilt of the reference
+
+    @property
+    def limits(self) -> Limits:
+        return self.config.limits if self.config else Limits()
+
+    @property
+    def ground(self) -> Ground:
+        """What the preflight list judges."""
+        vehicle, link = self.vehicle, self.link
+        return Ground(
+            vehicle,
+            self.limits,
+            self.dialect,
+            helicopter=self.config is not None and self.config.vehicle.airframe == "helicopter",
+            rates_hz=link.rates_hz if link.requested else None,
+            delay=link.delay,
+            measures_delay=link.measures_delay,
+            systems=self.systems,
+            other_sender=vehicle.other_sender is not None,
+            in_the_air=vehicle.armed,
+            fix_type=self.fix_type,
+        )

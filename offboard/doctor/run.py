@@ -1,30 +1,49 @@
-"""A whole check: open the link, listen, measure this computer, and give it all to the checks."""
+"""A whole check: open the link, listen, and look at this computer."""
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
+from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
-from offboard.doctor import ports
-from offboard.doctor.bounded import within
-from offboard.doctor.listening import Listening
-from offboard.doctor.measure import measure
+from offboard.doctor.computer import holders, measure, surroundings
+from offboard.doctor.listening import LONGEST_S, Listening
 from offboard.doctor.observation import Computer, Observation
 from offboard.documents.errors import DocumentError, shown
 from offboard.documents.signing_key import read_key
 from offboard.link import clock
 from offboard.link.connection import open_link
-from offboard.link.interface import Link, LinkError
+from offboard.link.interface import Link, LinkUnavailable
 from offboard.link.signing_time import SigningTime
 from offboard.mavlink.signing import Signing
 from offboard.reference.feasibility import check
 from offboard.run.configuration import FlightConfig, build_track
 
+Result = TypeVar("Result")
+Tell = Callable[[str], None]
 POLL_S = 0.02
 # The command ends within 15 s: what takes longer is left out, and a row says so
 OPEN_S = 2.0  # to open the link, before listening
 LOOK_S = 12.5  # from the beginning to the end of the look at this computer
+
+
+def within(seconds: float, call: Callable[[], Result]) -> Result:
+    """What `call` returns or raises, from a thread of its own. Raises TimeoutError after `seconds`:
+    the thread is left alone, and the process does not wait for it at its end."""
+    future: Future[Result] = Future()
+
+    def run() -> None:
+        try:
+            future.set_result(call())
+        except BaseException as error:
+            future.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    return future.result(max(0.0, seconds))
 
 
 def observe(
@@ -34,43 +53,43 @@ def observe(
     *,
     system_id: int | None = None,
     signing_key: Path | None = None,
+    tell: Tell = lambda sentence: None,
 ) -> Observation:
     """Observe the vehicle at `connection`, the link to it and this computer, for a flight of
     `config` that is recorded in `directory`. Sends nothing that changes the vehicle. `system_id`
-    is that of the vehicle, where several send; `signing_key` a key file.
+    is that of the vehicle, where several send; `signing_key` a key file. `tell` is called with
+    sentences about the progress.
 
     Raises LinkError for an address that is no address, KeyFileError and SigningTimeError.
     """
     until_s = clock.monotonic_s() + LOOK_S
     key = read_key(signing_key) if signing_key else None
-    holders = ports.holders(connection)
+    others = holders(connection)
     unix_s = clock.monotonic_less_unix_s()
-    error = ""
+    seen, error = Observation(), ""
     with ExitStack() as stack:
         try:
             link = within(OPEN_S, lambda: open_link(connection))
-            stack.callback(link.close)
         except TimeoutError:
             error = f"connection {shown(connection)} cannot be opened in {OPEN_S:g} s"
-            seen = Observation()
-        except LinkError as failure:
-            if failure.is_usage:
-                raise
-            error, seen = str(failure), Observation()
+        except LinkUnavailable as failure:
+            error = str(failure)
         else:
+            stack.callback(link.close)
             signing = stack.enter_context(SigningTime(key)) if key else None
             first = not connection.startswith("udpin")
-            seen = _listen(link, system_id, signing, sends_first=first)
+            seen = _listen(link, system_id, signing, tell, sends_first=first)
     step_s = abs(clock.monotonic_less_unix_s() - unix_s)
     seen = replace(
         seen,
         connection=connection,
         link_error=error,
-        holders=holders,
-        surroundings=ports.surroundings(),
+        holders=others,
+        surroundings=surroundings(),
         computer=Computer(str(directory), clock_step_s=step_s),
     )
     left_s = until_s - clock.monotonic_s()
+    tell("looking at this computer")
     try:
         return within(
             left_s,
@@ -93,10 +112,11 @@ def planned(seen: Observation, config: FlightConfig) -> Observation:
 
 
 def _listen(
-    link: Link, system_id: int | None, signing: Signing | None, *, sends_first: bool
+    link: Link, system_id: int | None, signing: Signing | None, tell: Tell, *, sends_first: bool
 ) -> Observation:
+    began_s = clock.monotonic_s()
     listening = Listening(
-        clock.monotonic_s(),
+        began_s,
         system_id=system_id,
         signing=signing,
         stream=link.is_stream,
@@ -105,7 +125,10 @@ def _listen(
     )
     while not listening.complete(clock.monotonic_s()):
         for chunk in link.receive(POLL_S):
-            listening.take(chunk, -clock.monotonic_less_unix_s())
+            listening.take(chunk)
         for frame in listening.due(clock.monotonic_s()):
             link.send(frame, listening.peer)
+        heard = listening.vehicle.found.autopilot if listening.vehicle.found else "no vehicle yet"
+        passed_s = clock.monotonic_s() - began_s
+        tell(f"listening, {passed_s:.0f} s of at most {LONGEST_S:.0f} s: {heard}")
     return listening.observation(clock.monotonic_s())

@@ -1,19 +1,27 @@
-"""Checks of the vehicle: firmware, state, estimator, GPS, pre-arm checks, battery, parameters."""
+"""Checks of the vehicle, the planned flight and this computer, beyond the preflight list."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable
 
-from offboard.doctor.findings import Finding, blocks, ok, wait, warn
-from offboard.doctor.observation import FIX_3D, Observation
-from offboard.flight.phases import Limits
+from offboard.control.delay_margin import LEAST_MARGIN_S, SDS, needed_margin, supported_bandwidth
+from offboard.doctor.link_checks import blocks, ok, wait, warn
+from offboard.doctor.observation import Observation
+from offboard.flight.preflight import FIX_3D, Finding
+from offboard.identification.adoption import with_added_delay
+from offboard.identification.uncertainty import Estimate
+from offboard.run.configuration import UNKNOWN_VEHICLE, FlightConfig
 
 LOW_BATTERY = 0.3
 SUSPICIOUS_RATIO = 0.5
-STARTED_S = 90.0  # of vehicle time: ArduCopter uses a GPS 30 s after its first 3D fix
 RELEASE = 255  # FIRMWARE_VERSION_TYPE
 KINDS = {0: "development", 64: "alpha", 128: "beta", 192: "release candidate", RELEASE: "release"}
-TAIL = 2  # texts of a vehicle that are shown with a finding
+TEXTS = 2  # of the vehicle that are shown
+HOVER_FACTOR = 1.3
+LEAST_FREE_BYTES = 500_000_000  # four hours of log
+OVERSHOOT_S, CLOCK_STEP_S = 0.02, 0.05
+MARGIN = 0.5  # of the deadline
 
 
 def firmware(seen: Observation) -> Iterable[Finding]:
@@ -38,25 +46,15 @@ def firmware(seen: Observation) -> Iterable[Finding]:
 
 def state(seen: Observation) -> Iterable[Finding]:
     """Whether the vehicle is free: disarmed, in no failsafe, flown by nobody else."""
-    vehicle, limits = seen.vehicle, _limits(seen)
+    vehicle = seen.vehicle
     if vehicle.heartbeat is None:
         return
-    engaged = seen.dialect is not None and vehicle.mode == seen.dialect.engage_mode
-    shown = f"{'armed' if vehicle.armed else 'disarmed'}, in {vehicle.mode}"
-    if vehicle.armed and engaged and not limits.begin_engaged:
-        yield blocks(f"{shown}: another controller flies it", "stop that controller")
-    elif vehicle.armed and vehicle.in_failsafe and not limits.begin_in_failsafe:
-        yield blocks(f"{shown}: a failsafe flies it", "let the pilot take over first")
-    elif vehicle.in_failsafe:
-        yield wait(f"{shown}, in a failsafe")
-    elif vehicle.armed and not limits.begin_armed:
-        yield blocks(f"{shown} (limits.begin_armed is false)", "disarm the vehicle")
-    elif vehicle.armed and vehicle.landed == "unknown":
-        yield blocks(f"{shown}, and does not report whether it flies (EXTENDED_SYS_STATE)")
+    if vehicle.in_failsafe and not vehicle.armed:
+        yield wait(f"disarmed, in {vehicle.mode}, in a failsafe")
     elif vehicle.armed:
-        yield ok(f"{shown}: pre-arm checks were not run, rates not requested")
+        yield ok(f"armed, in {vehicle.mode}: pre-arm checks were not run, rates not requested")
     else:
-        yield ok(shown)
+        yield ok(f"disarmed, in {vehicle.mode}")
 
 
 def estimator(seen: Observation) -> Iterable[Finding]:
@@ -67,17 +65,9 @@ def estimator(seen: Observation) -> Iterable[Finding]:
             yield wait("the vehicle does not report its estimator")
         return
     name, ratio = report.worst
-    hint = "wait for a GPS fix, keep the vehicle still, keep it away from metal; then calibrate"
-    if ratio > 1.0:
-        yield blocks(report.problem, hint)
-    elif report.problem:
-        starting = seen.fix_type != FIX_3D or seen.vehicle.time_s < STARTED_S
-        level = wait if starting else blocks
-        yield level(report.problem, hint)
-    elif ratio > SUSPICIOUS_RATIO:
-        yield warn(f"innovation ratio of {name} is {ratio:.2f}; above 1 it is rejected", hint)
-    else:
-        yield ok(f"valid; largest innovation ratio {ratio:.2f} ({name})")
+    if SUSPICIOUS_RATIO < ratio <= 1.0:
+        yield warn(f"innovation ratio of {name} is {ratio:.2f}; above 1 it is rejected")
+    yield ok(f"largest innovation ratio {ratio:.2f} ({name})")
 
 
 def gps(seen: Observation) -> Iterable[Finding]:
@@ -91,9 +81,8 @@ def gps(seen: Observation) -> Iterable[Finding]:
     found = names.get(seen.fix_type, f"fix type {seen.fix_type}")
     report = seen.vehicle.estimator
     if report and report.position_ok and not report.problem:
-        yield warn(
-            f"{found}; the estimator still has a position", "check that it has another source"
-        )
+        hint = "check that it has another source"
+        yield warn(f"{found}; the estimator still has a position", hint)
     elif seen.fix_type == 0:
         yield wait(found, "wait if the vehicle has just started, else connect a GPS")
     else:
@@ -103,40 +92,21 @@ def gps(seen: Observation) -> Iterable[Finding]:
 def prearm(seen: Observation) -> Iterable[Finding]:
     """The vehicle's own pre-arm checks, in its words (MAV_CMD_RUN_PREARM_CHECKS)."""
     vehicle = seen.vehicle
-    if seen.dialect is None or vehicle.armed:
+    if seen.dialect is None or vehicle.armed or not vehicle.prearm_ok:
         return
-    texts = seen.prearm_texts
-    if vehicle.prearm_ok:
-        for text in texts[:TAIL]:
-            yield warn(f"reported while it was observed: {text}")
-        yield ok(f"pre-arm checks pass in {vehicle.mode}")
-    elif texts:
-        for text in texts:
-            yield wait(text)
-    elif vehicle.health is None:
-        yield wait("SYS_STATUS does not arrive: it is unknown whether the vehicle can arm")
-    else:
-        hold = seen.dialect.hold_mode
-        hint = seen.dialect.unsaid
-        found = f"pre-arm checks do not pass in {vehicle.mode}"
-        if vehicle.health.unhealthy:
-            found += f"; unhealthy by SYS_STATUS: {', '.join(vehicle.health.unhealthy)}"
-        if vehicle.mode == seen.dialect.engage_mode:
-            hint = f"it may only miss setpoints in {vehicle.mode}: select {hold} and check again"
-        yield wait(found, hint)
+    for text in list(dict.fromkeys(vehicle.texts))[-TEXTS:]:
+        yield warn(f"the vehicle said while it was observed: {text}")
+    yield ok(f"pre-arm checks pass in {vehicle.mode}")
 
 
 def battery(seen: Observation) -> Iterable[Finding]:
     """Remaining charge."""
-    health, limits = seen.vehicle.health, _limits(seen)
+    health = seen.vehicle.health
     if health is None:
         return
     charge = health.battery_remaining
     if charge is None:
         yield ok("remaining charge is not reported")
-    elif charge < limits.battery:
-        limit = f"limits.battery is {limits.battery:.0%}"
-        yield blocks(f"{charge:.0%} left, {limit}", "charge the battery")
     elif charge < LOW_BATTERY:
         yield warn(f"{charge:.0%} left", "charge the battery")
     else:
@@ -149,27 +119,129 @@ def parameters(seen: Observation) -> Iterable[Finding]:
     if dialect is None or vehicle.found is None:
         return
     known, radio = vehicle.parameters, vehicle.health is not None and vehicle.health.radio_ok
-    good = []
+    good, unanswered = [], []
     for parameter in dialect.watched_parameters:
-        if parameter.name not in known:
+        name, value = parameter.name, known.get(parameter.name)
+        if value is None:
+            unanswered.append(name)
             continue
-        value = known[parameter.name]
-        fault = parameter.fault(value)
         advised = parameter.advised(value, known, radio)
-        if fault:
-            yield blocks(*fault, about=parameter.name)
-        elif advised:
-            yield warn(*advised, about=parameter.name)
-        else:
-            good.append(f"{parameter.name} {parameter.shown(value)}")
-    needed = {p.name for p in dialect.watched_parameters if p.must_answer}
-    for name in seen.unanswered:
-        if name in needed:
-            yield blocks(f"no reply for {name}", "check the link to the vehicle", name)
-    unanswered = [name for name in seen.unanswered if name not in needed]
+        if parameter.fault(value) is None and advised:
+            yield warn(*advised, about=name)
+        elif advised is None:
+            good.append(f"{name} {parameter.shown(value)}")
     note = f"; no reply for {', '.join(unanswered)}" if unanswered else ""
     yield ok(", ".join(good) + note)
 
 
-def _limits(seen: Observation) -> Limits:
-    return seen.config.limits if seen.config else Limits()
+def configuration(seen: Observation) -> Iterable[Finding]:
+    """The planned flight against this vehicle: hover thrust, tilt, reference, bandwidth."""
+    config = seen.config
+    if config is None:
+        return
+    if seen.config_problem:
+        yield blocks(seen.config_problem, "change the reference or the vehicle file")
+    yield from _hover(seen, config)
+    yield from _tilt(seen)
+    if seen.link.delay:
+        yield from _bandwidth(seen.link.delay, config)
+    yield ok(f"{config.reference.title} by {config.controller.law}, vehicle {config.vehicle.name}")
+
+
+def _hover(seen: Observation, config: FlightConfig) -> Iterable[Finding]:
+    dialect, assumed = seen.dialect, config.vehicle.hover_thrust
+    if dialect is None or config.vehicle.name == UNKNOWN_VEHICLE:
+        return
+    told = seen.vehicle.parameters.get(dialect.hover_parameter)
+    if told and not 1.0 / HOVER_FACTOR < assumed / told < HOVER_FACTOR:
+        yield warn(
+            f"vehicle {config.vehicle.name} has hover_thrust {assumed:.3g}, the autopilot has "
+            f"{dialect.hover_parameter} {told:.3g}",
+            f"use the file of this vehicle, --vehicle {UNKNOWN_VEHICLE} to have it identified, or "
+            f"param set {dialect.hover_parameter} {assumed:.3g}",
+        )
+
+
+def _tilt(seen: Observation) -> Iterable[Finding]:
+    dialect, needed = seen.dialect, seen.tilt_rad
+    if dialect is None or needed is None:
+        return
+    name, unit = dialect.tilt_parameter
+    value = seen.vehicle.parameters.get(name)
+    if value is not None and needed > value * unit:
+        enough = math.ceil(math.degrees(needed) + 1.0) * math.radians(1.0) / unit
+        yield warn(
+            f"the reference tilts by {math.degrees(needed):.0f} deg, the autopilot's own modes by "
+            f"at most {math.degrees(value * unit):.0f} deg ({name})",
+            f"fly slower, or param set {name} {enough:g}",
+        )
+
+
+def _bandwidth(delay: Estimate, config: FlightConfig) -> Iterable[Finding]:
+    wanted = getattr(config.controller, "bandwidth_radps", None)
+    if wanted is None:
+        return
+    vehicle = with_added_delay(config.vehicle, delay.value)
+    possible = supported_bandwidth(
+        vehicle,
+        wanted,
+        config.period_s,
+        tilt_margin_s=needed_margin(vehicle, delay.sd),
+        thrust_margin_s=max(LEAST_MARGIN_S, SDS * delay.sd),
+    )
+    if possible < wanted:
+        yield warn(
+            f"with a delay of {1e3 * delay.value:.0f} +- {1e3 * delay.sd:.0f} ms the link bears a "
+            f"bandwidth of {possible:g} rad/s, {wanted:g} is configured",
+            f"the flight lowers it by itself; or --set controller.bandwidth_radps={possible:g}",
+        )
+
+
+def disk(seen: Observation) -> Iterable[Finding]:
+    """Free space for the log of a flight."""
+    free, place = seen.computer.free_bytes, seen.computer.directory
+    if free is None:
+        return
+    figures = f"{free / 1e9:.1f} GB free in {place}"
+    if free < LEAST_FREE_BYTES:
+        yield warn(f"{figures}; a flight lands when its log cannot be written", "free some space")
+    else:
+        yield ok(figures)
+
+
+def compiled(seen: Observation) -> Iterable[Finding]:
+    """Whether the compiled functions are ready."""
+    missing = seen.computer.not_compiled
+    if missing is None:
+        return
+    if missing:
+        found = f"{missing} functions are not compiled yet: the first flight begins late"
+        yield warn(found, "run `offboard fly --sitl` once")
+    else:
+        yield ok("all functions are compiled")
+
+
+def computer(seen: Observation) -> Iterable[Finding]:
+    """Whether this computer decides and wakes up in time."""
+    measured = seen.computer
+    if measured.not_measured_s is not None:
+        yield wait(
+            f"reference and controller were not examined within {measured.not_measured_s:.0f} s",
+            "close other programs and check again, or `offboard check` the configuration",
+        )
+    if measured.rehearsal:
+        yield blocks(measured.rehearsal, "choose another controller, or a longer deadline_s")
+    if measured.clock_step_s > CLOCK_STEP_S:
+        yield warn(
+            f"this computer's clock was set by {measured.clock_step_s:.2f} s while it listened",
+            "let the clock settle (chrony, ntp); logs have wrong times",
+        )
+    if measured.decision_s is not None and measured.deadline_s:
+        took_ms, most_ms = 1e3 * measured.decision_s, 1e3 * measured.deadline_s
+        figures = f"a decision takes {took_ms:.1f} ms of {most_ms:.0f} ms"
+        late = took_ms > MARGIN * most_ms and not measured.rehearsal
+        yield warn(figures, "close other programs, or plan fewer steps") if late else ok(figures)
+    if measured.overshoot_s is not None:
+        figures = f"this computer wakes up at most {1e3 * measured.overshoot_s:.1f} ms late"
+        hint = "close other programs; use the performance governor of the processor"
+        yield warn(figures, hint) if measured.overshoot_s > OVERSHOOT_S else ok(figures)

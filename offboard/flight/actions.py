@@ -181,7 +181,7 @@ class PhaseActions:
     def request_parameters(self) -> None:
         """In HEALTH: ask what decides whether the vehicle can be flown; it needs no telemetry."""
         state = self._state
-        due = state.readiness.due(self._dialect, state.vehicle.parameters, state.now_s)
+        due = state.reading.due(self._dialect, state.vehicle.parameters, state.now_s)
         self._outbox.send(*due)
         if state.programme.serves:
             if state.vehicle.uid is None:

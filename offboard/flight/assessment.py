@@ -11,19 +11,19 @@ from dataclasses import fields
 import numpy as np
 
 from offboard.estimation.observer import Observer
+from offboard.flight import preflight
 from offboard.flight.authority import Standing
 from offboard.flight.facts import Facts
 from offboard.flight.ground_contact import STANDING_S
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.phases import TRACKING, Phase
+from offboard.flight.preflight import Ground
 from offboard.flight.state import FlightState
-from offboard.mavlink.autopilots import unfit_type
 from offboard.mavlink.events import Heartbeat, OtherCompanion, OtherSender, ThrustReport
 from offboard.mavlink.session import Session
 from offboard.model.frames import thrust_direction_from_quaternion
 
 TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
-MINIMUM_TELEMETRY_HZ = 10.0
 OTHER_SENDER_S = 5.0  # a second sender is there for so long after its newest frame
 FULL_THRUST = 0.99
 THRUST_REPORT_S = 1.0  # age of a ThrustReport that counts
@@ -48,15 +48,16 @@ def facts(
     charge = vehicle.health.battery_remaining if vehicle.health else None
     age_s = state.telemetry_age_s(state.host_s) if vehicle.has_state else 0.0
     north_m, east_m, height_m = _from_take_off(state)
+    judged = ground(state, session)
     return Facts(
         limits=state.limits,
         in_phase_s=state.in_phase_s,
         silence_s=state.silence_s,
         blind_s=max(vehicle.position_age_s, vehicle.attitude_age_s),
         found=vehicle.found is not None,
-        ready=state.phase in READIED and not not_ready(state, session),
-        misconfigured=state.phase in READIED and bool(problems(state)),
-        unfit_type=state.phase in READIED and bool(_unfit_type(state)),
+        ready=state.phase in READIED and not preflight.not_ready(judged),
+        refused=state.phase in READIED and bool(preflight.refusals(judged)),
+        unfit_type=state.phase in READIED and bool(preflight.unfit_type(judged)),
         rebooted=state.rebooted,
         engaged=authority is not None and authority.mode == authority.engage_mode,
         lost=authority is not None and authority.standing is Standing.LOST,
@@ -142,6 +143,7 @@ def figures(
     what explains them."""
     vehicle, authority, other = state.vehicle, state.authority, state.vehicle.other_sender
     older = vehicle.position_age_s >= vehicle.attitude_age_s
+    judged = ground(state, session)
     return {each.name: getattr(now, each.name) for each in fields(now)} | {
         "mode": vehicle.mode,
         "mode_wanted": authority.engage_mode if authority else "offboard mode",
@@ -166,76 +168,39 @@ def figures(
         "not_landed": state.not_landed(),
         "positioning": state.positioning.lost(vehicle, state.limits),
         "still_armed": _still_armed(state),
-        "problems": "; ".join(problems(state)),
-        "not_ready": not_ready(state, session),
+        "refusals": "; ".join(preflight.refusals(judged)),
+        "not_ready": preflight.not_ready(judged),
     }
 
 
-def not_ready(state: FlightState, session: Session) -> str:
-    """Why the vehicle cannot be engaged yet; empty if it can."""
-    vehicle, dialect, limits = state.vehicle, state.dialect, state.limits
-    if not vehicle.has_state or dialect is None:
-        telemetry = {
-            "LOCAL_POSITION_NED": vehicle.position,
-            "ATTITUDE_QUATERNION": vehicle.attitude,
-        }
-        missing = [name for name, newest in telemetry.items() if newest is None]
-        problem = vehicle.estimator.problem if vehicle.estimator else ""
-        why = (problem and f": {problem}") + vehicle.explanation(dialect.unsaid if dialect else "")
-        return f"no {' and no '.join(missing)} arrives{why}"
-    if not state.guarded:
-        return "the supervisor, which lands it if this process ends, does not answer"
-    rates_hz = session.rates_hz
-    for name in ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED"):
-        if rates_hz[name] < MINIMUM_TELEMETRY_HZ:
-            return (
-                f"{name} arrives at {rates_hz[name]:.1f} Hz, "
-                f"at least {MINIMUM_TELEMETRY_HZ:.0f} Hz are needed"
-            )
-    if vehicle.armed and vehicle.landed == "unknown":
-        return "it is armed and does not report whether it flies (EXTENDED_SYS_STATE)"
-    unanswered = state.readiness.unanswered(dialect, vehicle.parameters)
-    if unanswered:
-        return f"no reply for parameter {', '.join(unanswered)}"
-    if not state.readiness.complete(dialect, vehicle.parameters, state.now_s):
-        return "its parameters are still being read"
-    if _has_no_origin(state):
-        return "its take-off point is not known, as it was not seen on the ground (--anchor origin)"
-    if state.programme.serves and session.autopilots.ambiguous(state.now_s):
-        systems = session.autopilots.named(state.now_s)
-        return f"several vehicles are heard, systems {systems}: choose one with --system"
-    if not (vehicle.prearm_ok or vehicle.armed or state.programme.serves):
-        unsaid = f"{vehicle.unhealthy()} ({dialect.unsaid})"
-        told = vehicle.explanation(unsaid) if vehicle.texts else unsaid
-        return f"its pre-arm checks do not pass in {vehicle.mode}{told}"
-    if vehicle.estimator and vehicle.estimator.problem:
-        return vehicle.estimator.problem
-    charge = vehicle.health.battery_remaining if vehicle.health else None
-    if charge is not None and charge < limits.battery:
-        return f"its battery has {charge:.0%} left, limits.battery is {limits.battery:.0%}"
-    if not state.clock.delay_is_measured(state.host_s):
-        return "the delay of the link is being measured"
-    link = state.clock.delay
-    if link and (link.value > limits.link_delay_s or link.sd > limits.link_jitter_s):
-        return (
-            f"the link delays by {1e3 * link.value:.0f} +- {1e3 * link.sd:.0f} ms, at most "
-            f"{1e3 * limits.link_delay_s:.0f} +- {1e3 * limits.link_jitter_s:.0f} ms can be flown "
-            "(limits.link_delay_s, limits.link_jitter_s)"
-        )
-    return ""
+def ground(state: FlightState, session: Session) -> Ground:
+    """What the preflight list judges."""
+    programme, contact, autopilots = state.programme, state.contact, session.autopilots
+    vehicle, dialect = state.vehicle, state.dialect
+    read = dialect and state.reading.complete(dialect, vehicle.parameters, state.now_s)
+    from_origin = programme.serves and programme.anchor == "origin"
+    return Ground(
+        vehicle,
+        state.limits,
+        dialect,
+        helicopter=state.model.airframe == "helicopter",
+        rates_hz=session.rates_hz,
+        delay=state.clock.delay,
+        measures_delay=not state.clock.delay_is_measured(state.host_s),
+        reads_parameters=not read,
+        systems=autopilots.named(state.now_s) if autopilots.ambiguous(state.now_s) else "",
+        other_sender=_hears_other_sender(state),
+        in_the_air=contact.in_the_air,
+        guarded=state.guarded,
+        origin_missing=from_origin and contact.in_the_air and contact.rest_ned_m is None,
+        serves=programme.serves,
+    )
 
 
 def _still_armed(state: FlightState) -> str:
     contact = state.contact
     shows = contact.stands and contact.detects_flight and state.vehicle.armed
     return f"; {STILL_ARMED}" if shows else ""
-
-
-def _has_no_origin(state: FlightState) -> bool:
-    """The reference is relative to a take-off point that was not seen."""
-    programme, contact = state.programme, state.contact
-    wanted = programme.serves and programme.anchor == "origin"
-    return wanted and contact.in_the_air and contact.rest_ned_m is None
 
 
 def position_error_m(state: FlightState) -> float:
@@ -255,22 +220,6 @@ def _other_companion(other: OtherCompanion | None) -> str:
         f"; another companion computer, system {other.system_id} component {other.component_id}, "
         "may send setpoints, too"
     )
-
-
-def problems(state: FlightState) -> list[str]:
-    """What speaks against flying this vehicle: its type, or its parameters. A sentence for each."""
-    if state.dialect is None:
-        return []
-    unfit = _unfit_type(state)
-    if unfit:
-        return [unfit]
-    return state.readiness.problems(state.dialect, state.vehicle.parameters)
-
-
-def _unfit_type(state: FlightState) -> str:
-    """Why a vehicle of its type is not flown; empty if it is."""
-    heartbeat, helicopter = state.vehicle.heartbeat, state.model.airframe == "helicopter"
-    return unfit_type(heartbeat.vehicle_type, helicopter=helicopter) if heartbeat else ""
 
 
 def _shown_since_lost(state: FlightState) -> bool:

@@ -14,7 +14,7 @@ from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.outbox import Outbox
 from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, WAITING
 from offboard.flight.position_jumps import PositionJumps
-from offboard.flight.readiness import Readiness
+from offboard.flight.preflight import ParameterReading
 from offboard.flight.requests import Circumstances, Request, Result, answer
 from offboard.flight.state import FlightState
 from offboard.mavlink.dialects.base import ThrustRule
@@ -207,7 +207,7 @@ class EventProcessor:
         state.clock.reset()
         state.contact = GroundContact(state.vehicle)
         state.hover, state.jumps = HoverEstimate(), PositionJumps()
-        state.readiness = Readiness()
+        state.reading = ParameterReading()
         state.takeoff_ned_m = None  # the local frame begins elsewhere
         if state.authority and state.phase not in BEFORE_FLIGHT:
             state.authority.forget(state.now_s)

@@ -18,8 +18,8 @@ class Facts:
     silence_s: float  # host time since the last telemetry
     blind_s: float  # age of the older of position and attitude, vehicle time
     found: bool
-    ready: bool  # telemetry flows, parameters were read, pre-arm checks pass
-    misconfigured: bool
+    ready: bool  # by the preflight list, nothing is to be waited for
+    refused: bool  # by the preflight list, whatever is waited for
     rebooted: bool  # after its telemetry was complete
     engaged: bool  # the vehicle shows the mode in which it follows setpoints
     lost: bool  # the vehicle is not ours any more

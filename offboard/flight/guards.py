@@ -21,8 +21,8 @@ def ready(now: Facts) -> bool:
     return now.ready
 
 
-def misconfigured(now: Facts) -> bool:
-    return now.misconfigured
+def refused(now: Facts) -> bool:
+    return now.refused
 
 
 def armed_by_another(now: Facts) -> bool:
@@ -35,16 +35,6 @@ def rebooted(now: Facts) -> bool:
 
 def rebooted_disarmed(now: Facts) -> bool:
     return now.rebooted and not now.armed and not now.landed
-
-
-def flown_by_another(now: Facts) -> bool:
-    """Armed and in the mode of setpoints, before we sent one."""
-    return now.engaged and now.armed and not now.limits.begin_engaged
-
-
-def in_failsafe(now: Facts) -> bool:
-    """A failsafe flies the vehicle."""
-    return now.failsafe and now.in_the_air and not now.limits.begin_in_failsafe
 
 
 def other_sender(now: Facts) -> bool:
@@ -64,7 +54,7 @@ def other_vehicle(now: Facts) -> bool:
 
 def usable(now: Facts) -> bool:
     """Nothing speaks against flying it."""
-    return now.ready and not now.misconfigured
+    return now.ready and not now.refused
 
 
 def can_take_over(now: Facts) -> bool:

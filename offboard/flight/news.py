@@ -6,7 +6,7 @@ import math
 import re
 
 from offboard.documents.repeated import Repeated
-from offboard.flight import assessment
+from offboard.flight import assessment, preflight
 from offboard.flight.phases import Phase
 from offboard.flight.state import FlightState
 from offboard.mavlink.session import Session
@@ -60,8 +60,8 @@ class News:
 
 
 def _unready(state: FlightState, session: Session) -> str:
-    reasons = [*assessment.problems(state), assessment.not_ready(state, session)]
-    return "; ".join(filter(None, reasons))
+    ground = assessment.ground(state, session)
+    return "; ".join(filter(None, [*preflight.refusals(ground), preflight.not_ready(ground)]))
 
 
 def _unheard(session: Session) -> str:

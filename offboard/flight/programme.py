@@ -43,7 +43,7 @@ STOPPABLE = (Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.HOVER)
 FLOWN = ExitCode.FLOWN
 _WANTED_BACK = "handed back on request"
 _ABANDONED = "{mode} in the air, and nobody flies the vehicle: a flight was cut short"
-_UNFIT = "not engaged: {problems}{not_ready}"
+_UNFIT = "not engaged: {refusals}{not_ready}"
 _TOO_SOON = "not engaged: {mode} again before a HEARTBEAT has shown another mode; switch again"
 _WAITING_ROWS = (
     Row(Phase.CONNECT, guards.stop_requested, Phase.FAILED, "{stop}", FLOWN),

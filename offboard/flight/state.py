@@ -21,8 +21,8 @@ from offboard.flight.phases import ENDS, Limits, Phase
 from offboard.flight.pilot_switch import PilotSwitch
 from offboard.flight.position_jumps import PositionJumps
 from offboard.flight.positioning import Positioning
+from offboard.flight.preflight import ParameterReading
 from offboard.flight.programme import FLY, Programme
-from offboard.flight.readiness import Readiness
 from offboard.flight.requests import Request
 from offboard.flight.touchdown import Touchdown, moved
 from offboard.flight.vehicle_clock import VehicleClock
@@ -61,7 +61,7 @@ class FlightState:
     clock: VehicleClock = field(default_factory=VehicleClock)
     hover: HoverEstimate = field(default_factory=HoverEstimate)
     jumps: PositionJumps = field(default_factory=PositionJumps)
-    readiness: Readiness = field(default_factory=Readiness)
+    reading: ParameterReading = field(default_factory=ParameterReading)
     positioning: Positioning = field(default_factory=Positioning)
     ladder: Ladder = field(default_factory=Ladder)
     contact: GroundContact = field(init=False)
@@ -116,7 +116,7 @@ class FlightState:
             vehicle=self.vehicle,
             clock=self.clock,
             hover=self.hover,
-            readiness=self.readiness,
+            reading=self.reading,
             dialect=self.dialect,
             authority=self.authority.renewed() if self.authority else None,
             phase=Phase.STANDBY if known else Phase.CONNECT,

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from offboard.flight import guards
 from offboard.flight.guards import Guard, longer_than
 from offboard.flight.phases import ExitCode, Phase, Rung
+from offboard.flight.preflight import ARMED_ALREADY, OTHER_SENDER, SEVERAL
 
 REFUSED, ABORTED = ExitCode.REFUSED, ExitCode.ABORTED
 
@@ -31,43 +32,27 @@ class Row:
 
 
 _SILENT = "no telemetry for {silence_s:.1f} s"
+_STOPPED = "{stop} before take-off"
 _BLIND = "no {blind_to} for {blind_s:.1f} s"
 _UNKNOWN = "no report of the mode for {authority_age_s:.1f} s"
 _STARVED = "setpoints did not arrive, and the vehicle's own failsafe flies it, in {mode}"
 _OUT_OF_REACH = "not heard for {unreached_s:.0f} s while landing; {last_known}"
 _UNHEARD = "it stands on the ground, and no HEARTBEAT shows whether it is disarmed"
 REBOOTED = "the vehicle restarted"
-_ARMED_ALREADY = "the vehicle is armed already, by another controller or a pilot"
 _DISARMED = "disarmed on the ground"
 _NOT_FOUND = "no vehicle heard in {silence_s:.0f} s; {not_found}"
-_SEVERAL = "several vehicles are heard, systems {systems}: choose one with --system"
 _NO_LIFT_OFF = "no lift-off in {in_phase_s:.0f} s; is hover_thrust in the vehicle file right?"
-_NOT_OURS = (
-    "the vehicle is armed and in {mode_wanted} already: another controller flies it "
-    "(limits.begin_engaged=true takes it over)"
-)
-_FAILSAFE = "a failsafe flies the vehicle, in {mode} (limits.begin_in_failsafe=true takes it over)"
-_OTHER_SENDER = (
-    "another program controls the vehicle on this link, too: {other_sender} "
-    "(limits.begin_with_other_sender=true flies all the same)"
-)
 _NOT_ENGAGED = "the vehicle did not enter {mode_wanted} in {in_phase_s:.0f} s (it shows {mode})"
-
-
-def _ground_rows(source: Phase) -> tuple[Row, ...]:
-    return (
-        Row(source, guards.armed_by_another, Phase.FAILED, _ARMED_ALREADY, REFUSED),
-        Row(source, guards.silent_on_ground, Phase.FAILED, _SILENT, REFUSED),
-        Row(source, guards.stop_requested, Phase.FAILED, "{stop} before take-off", REFUSED),
-        Row(source, guards.other_sender, Phase.FAILED, _OTHER_SENDER, REFUSED),
-        Row(source, guards.other_vehicle, Phase.FAILED, _SEVERAL, REFUSED),
-    )
 
 
 def _streaming_rows(source: Phase) -> tuple[Row, ...]:
     return (
         Row(source, guards.rebooted, Phase.FAILED, REBOOTED, REFUSED),
-        *_ground_rows(source),
+        Row(source, guards.armed_by_another, Phase.FAILED, ARMED_ALREADY, REFUSED),
+        Row(source, guards.silent_on_ground, Phase.FAILED, _SILENT, REFUSED),
+        Row(source, guards.stop_requested, Phase.FAILED, _STOPPED, REFUSED),
+        Row(source, guards.other_sender, Phase.FAILED, OTHER_SENDER, REFUSED),
+        Row(source, guards.other_vehicle, Phase.FAILED, SEVERAL, REFUSED),
         Row(source, guards.blind, Phase.FAILED, _BLIND, REFUSED),
         Row(source, guards.authority_unknown, Phase.FAILED, _UNKNOWN, REFUSED),
         Row(source, guards.lost, Phase.FAILED, "{lost}", REFUSED),
@@ -95,10 +80,9 @@ TRANSITIONS: tuple[Row, ...] = (
     Row(Phase.CONNECT, guards.stop_requested, Phase.FAILED, "{stop}", REFUSED),
     Row(Phase.CONNECT, guards.vehicle_found, Phase.HEALTH, "vehicle found"),
     Row(Phase.CONNECT, guards.silent_on_ground, Phase.FAILED, _NOT_FOUND, REFUSED),
-    *_ground_rows(Phase.HEALTH),
-    Row(Phase.HEALTH, guards.flown_by_another, Phase.FAILED, _NOT_OURS, REFUSED),
-    Row(Phase.HEALTH, guards.in_failsafe, Phase.FAILED, _FAILSAFE, REFUSED),
-    Row(Phase.HEALTH, guards.misconfigured, Phase.FAILED, "{problems}", REFUSED),
+    Row(Phase.HEALTH, guards.silent_on_ground, Phase.FAILED, _SILENT, REFUSED),
+    Row(Phase.HEALTH, guards.stop_requested, Phase.FAILED, _STOPPED, REFUSED),
+    Row(Phase.HEALTH, guards.refused, Phase.FAILED, "{refusals}", REFUSED),
     Row(Phase.HEALTH, guards.ready, Phase.STREAM, "telemetry flows and the vehicle can arm"),
     _too_long(Phase.HEALTH, "health_s", Phase.FAILED, "not ready: {not_ready}", REFUSED),
     *_streaming_rows(Phase.STREAM),

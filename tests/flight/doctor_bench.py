@@ -12,11 +12,11 @@ from pair import HOST_EPOCH_S, LEAN, Bytes, decode
 from pydantic import TypeAdapter
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from offboard.doctor.findings import Finding, Level, Row, examine
 from offboard.doctor.listening import Listening
 from offboard.doctor.observation import Computer, Observation
 from offboard.doctor.run import planned
-from offboard.doctor.table import checks
+from offboard.doctor.table import Row, checks, examine
+from offboard.flight.preflight import Finding, Level
 from offboard.link.interface import Chunk
 from offboard.mavlink.signing import Signing
 from offboard.run import configuration
@@ -25,7 +25,7 @@ from simulator.faults import Fault
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
 from simulator.firmware.px4 import PX4
-from simulator.instance import VIRTUAL_EPOCH_US, Instance
+from simulator.instance import Instance
 from simulator.start import Start
 from simulator.steps import STEP_S
 from simulator.vehicle.battery import Battery
@@ -40,7 +40,6 @@ GOOD = {
         "GUID_OPTIONS": 8.0, "GUID_TIMEOUT": 1.0, "PSC_JERK_XY": 10.0,
     },
 }  # fmt: skip
-UNIX_S = VIRTUAL_EPOCH_US * 1e-6 - HOST_EPOCH_S
 PARAMETER = re.compile(r"param set (\w+) (\S+)")
 PERMITTED = {"TIMESYNC", "PARAM_REQUEST_READ", "COMMAND_LONG"}
 DOCTOR_ID = 193  # not that of a flight
@@ -84,7 +83,7 @@ class Bench:
         )
         while not listening.complete(self.now_s):
             for chunk in self.step():
-                listening.take(chunk, UNIX_S)
+                listening.take(chunk)
             if self.instance.steps % 5 == 0:
                 for frame in self.up(listening.due(self.now_s)):
                     self.sent.append(decode(frame))

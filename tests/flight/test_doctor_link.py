@@ -10,8 +10,8 @@ from doctor_bench import Bench, bench, from_others, said
 from pair import Bytes, decode, frames_of
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from offboard.doctor.findings import Level
 from offboard.doctor.listening import LONGEST_S, NOTHING_S
+from offboard.flight.preflight import Level
 from offboard.mavlink.signing import BEHIND_MAX, Signing
 from simulator.firmware.px4 import PX4
 from simulator.start import Start
@@ -101,13 +101,13 @@ def test_second_vehicle_on_the_link() -> None:
     patient = bench(before=from_others(AUTOPILOT_HEARTBEAT, 2, 1, 1.0))
     rows = patient.consult()
     assert said(rows).keys() == {"senders"}
-    assert "another vehicle is heard: autopilot 2/1, from 127.0.0.1:14999" in (
-        rows["senders"].findings[0].found
-    )
-    assert rows["senders"].findings[0].hint.startswith("choose one with --system")
+    several, heard = rows["senders"].findings
+    assert several.level is BLOCKS
+    assert several.found == "several vehicles are heard, systems 1 and 2: choose one with --system"
+    assert heard.found == "besides the vehicle: autopilot 2/1, from 127.0.0.1:14999"
     assert mended(patient, system_id=1)
     row = patient.consult("senders")["senders"]
-    assert row.findings[0].found == "besides the vehicle: autopilot 2/1"
+    assert row.findings[0].found.startswith("besides the vehicle: autopilot 2/1")
 
 
 def test_two_vehicles_with_the_same_ids() -> None:
@@ -122,7 +122,7 @@ def test_two_vehicles_with_the_same_ids() -> None:
 
 @pytest.mark.parametrize(
     ("system", "component", "name"),
-    [(1, 194, "component 1/194"), (1, 191, "component 1/191")],
+    [(1, 194, "system 1 component 194"), (1, 191, "system 1 component 191")],
     ids=["other ids", "our ids"],
 )
 def test_another_controller_blocks(system: int, component: int, name: str) -> None:

@@ -14,9 +14,12 @@ from offboard.compiled import Entry
 from offboard.control.base import Situation
 from offboard.flight import manifest
 from offboard.flight.gate import clamp, usable
-from offboard.flight.readiness import Readiness
+from offboard.flight.phases import Limits
+from offboard.flight.preflight import Ground, ParameterReading, not_ready, refusals
+from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.px4 import PX4
+from offboard.mavlink.events import Attitude, LocalPosition, SystemHealth
 from offboard.mavlink.outgoing import CommandLong
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
@@ -70,7 +73,7 @@ def test_clamp_changes_only_what_exceeds_the_limits(vehicle: Vehicle) -> None:
 
 
 def test_parameters_are_requested_until_they_are_answered() -> None:
-    readiness, known = Readiness(), {"MPC_THR_HOVER": 0.5}
+    readiness, known = ParameterReading(), {"MPC_THR_HOVER": 0.5}
     first = [request.name for request in readiness.due(PX4, known, 10.0)]
     assert first == [p.name for p in PX4.watched_parameters if p.name not in known]
     assert readiness.due(PX4, known, 10.4) == []
@@ -82,13 +85,22 @@ def test_parameters_are_requested_until_they_are_answered() -> None:
 
 
 def test_arducopter_is_not_flown_without_a_reply_for_guid_options() -> None:
-    readiness = Readiness()
-    readiness.due(ARDUPILOT, {}, 0.0)
-    assert readiness.unanswered(ARDUPILOT, {}) == ["GUID_OPTIONS", "ATC_ANGLE_BOOST"]
-    assert not readiness.complete(ARDUPILOT, {}, 100.0)
-    (problem,) = readiness.problems(ARDUPILOT, {"GUID_OPTIONS": 0.0, "ATC_ANGLE_BOOST": 1.0})
+    boosts = {"ATC_ANGLE_BOOST": 1.0}
+
+    def ground(parameters: dict[str, float]) -> Ground:
+        attitude = Attitude(1.0, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        position = LocalPosition(1.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        health = SystemHealth(True, None, 1.0)
+        vehicle = VehicleState(
+            position=position, attitude=attitude, health=health, parameters=parameters
+        )
+        return Ground(vehicle, Limits(), ARDUPILOT, rates_hz=None)
+
+    assert not_ready(ground(boosts)) == "no reply for parameter GUID_OPTIONS"
+    (problem,) = refusals(ground(boosts | {"GUID_OPTIONS": 0.0}))
     assert problem.endswith("Fix: param set GUID_OPTIONS 8")
-    assert readiness.complete(ARDUPILOT, {"GUID_OPTIONS": 8.0, "ATC_ANGLE_BOOST": 1.0}, 2.1)
+    assert not_ready(ground(boosts | {"GUID_OPTIONS": 8.0})) == ""
+    assert refusals(ground(boosts | {"GUID_OPTIONS": 8.0})) == []
 
 
 def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(

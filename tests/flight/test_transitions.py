@@ -33,9 +33,8 @@ QUIET = {  # facts of a phase while nothing happens
 EVENTS: dict[str, dict[str, object]] = {  # the facts that make each guard hold
     "vehicle_found": {"found": True},
     "ready": {"ready": True},
-    "misconfigured": {"misconfigured": True},
+    "refused": {"refused": True},
     "armed_by_another": {"armed": True, "limits": Limits(begin_armed=False)},
-    "flown_by_another": {"engaged": True, "armed": True},
     "rebooted": {"rebooted": True},
     "rebooted_disarmed": {"rebooted": True, "armed": False, "landed": False},
     "needs_no_stream": {"lifted_by_command": True},
@@ -51,7 +50,6 @@ EVENTS: dict[str, dict[str, object]] = {  # the facts that make each guard hold
     "at_full_speed": {"track_time_s": 4.0},
     "track_over": {"track_time_s": 20.0},
     "at_rest": {"track_time_s": 23.5},
-    "in_failsafe": {"failsafe": True, "in_the_air": True},
     "other_sender": {"other_sender": True},
     "other_vehicle": {"other_vehicle": True},
     "disarmed": {"armed": False},

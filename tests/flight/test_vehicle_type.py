@@ -10,8 +10,8 @@ from pair import Pair, hover, in_phase
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from serving import serve
 
-from offboard.doctor.findings import Level
 from offboard.flight.phases import ExitCode, Phase
+from offboard.flight.preflight import Level
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.model.vehicle import Vehicle
 

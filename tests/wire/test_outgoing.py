@@ -229,9 +229,9 @@ def test_what_is_not_finite_is_refused(value: CommandLong | PositionTarget) -> N
 def test_problem_of_a_parameter_names_the_command_that_fixes_it() -> None:
     watched = {p.name: p for d in (PX4_DIALECT, ARDUPILOT_DIALECT) for p in d.watched_parameters}
     options = watched["GUID_OPTIONS"]
-    assert options.problem(8.0) is None
-    assert options.problem(10.0) is None
-    assert str(options.problem(2.0)).endswith("param set GUID_OPTIONS 10")
-    assert watched["COM_OF_LOSS_T"].problem(1.0) is None
-    assert str(watched["COM_OF_LOSS_T"].problem(0.0)).endswith("param set COM_OF_LOSS_T 1")
-    assert str(watched["ATC_ANGLE_BOOST"].problem(0.0)).endswith("param set ATC_ANGLE_BOOST 1")
+    assert options.fault(8.0) is None
+    assert options.fault(10.0) is None
+    assert str(options.fault(2.0)).endswith("fix='param set GUID_OPTIONS 10')")
+    assert watched["COM_OF_LOSS_T"].fault(1.0) is None
+    assert str(watched["COM_OF_LOSS_T"].fault(0.0)).endswith("fix='param set COM_OF_LOSS_T 1')")
+    assert str(watched["ATC_ANGLE_BOOST"].fault(0.0)).endswith("param set ATC_ANGLE_BOOST 1')")

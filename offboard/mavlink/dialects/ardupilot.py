@@ -136,7 +136,6 @@ ARDUPILOT = Dialect(
     estimator_name="EKF_STATUS_REPORT",
     slow_hint="another ground station may set the rates (MAVProxy: `set streamrate -1`), or the "
     "link is full",
-    prearm_prefixes=("PreArm: ",),
     unsaid="see the ground station",
     oldest=(4, 3),
     loss_time=("GUID_TIMEOUT", 3.0),

@@ -104,11 +104,6 @@ class WatchedParameter:
     advice_only: bool = False
     values: tuple[str, ...] = ()
 
-    def problem(self, value: float) -> str | None:
-        """What is wrong with `value` and the command that fixes it, or None if it is valid."""
-        fault = self.fault(value)
-        return f"{fault.found}. Fix: {fault.fix}" if fault else None
-
     def fault(self, value: float) -> ParameterFault | None:
         """Why a vehicle with this `value` is not flown, or None if it is."""
         bits = int(value)
@@ -187,7 +182,6 @@ class Dialect:
     estimator_message: int  # id of the message that becomes an EstimatorReport
     estimator_name: str  # of this message
     slow_hint: str  # what to do where telemetry comes slower than it was requested
-    prearm_prefixes: tuple[str, ...]  # of a STATUSTEXT that says what a pre-arm check found
     unsaid: str  # where a reason is found that no STATUSTEXT tells us
     oldest: tuple[int, int]  # version that this dialect is made for
     # what follows when setpoints stop: the parameter of the time, its default, the parameter of the

@@ -138,7 +138,6 @@ PX4 = Dialect(
     estimator_message=230,
     estimator_name="ESTIMATOR_STATUS",
     slow_hint="raise MAV_x_RATE of this link, in bytes/s: PX4 slows all messages down to it",
-    prearm_prefixes=("Preflight Fail: ", "Preflight: "),
     # is_gcs_connected of the link: only while a HEARTBEAT of type GCS arrives on it, which ours is
     # not: it would hide a lost ground station from NAV_DLL_ACT
     unsaid="PX4 says why to ground stations alone: see QGroundControl",

@@ -1,20 +1,32 @@
-"""Which other processes have a port or a serial device, and where this one runs. Reads /proc.
+"""This computer: which other processes have a port or a serial device, where this one runs; disk,
+compiled functions, time of a decision, late waking up.
 
-Without /proc (macOS) nothing is known, and nothing is said.
+Without /proc (macOS) nothing is known of ports, and nothing is said.
 """
 
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
+import shutil
+import threading
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from pathlib import Path
+
+from offboard import compiled
+from offboard.doctor.observation import Computer
+from offboard.documents.errors import DocumentError
+from offboard.link import clock
+from offboard.run.configuration import FlightConfig
+from offboard.run.one_flight import rehearse
+from offboard.run.request import build_parts
 
 PROC = Path("/proc")
 TABLES = {"udpin": ("udp", "udp6"), "tcpin": ("tcp", "tcp6")}
 # States of a socket that has a port: UDP bound or connected, TCP listening
 STATES = {"udp": ("07", "01"), "tcp": ("0A",)}
 CONTAINER_MARKS = ("/.dockerenv", "/run/.containerenv")
+SLEEPS, SLEEP_S = 40, 0.01
 
 
 def holders(connection: str) -> tuple[str, ...]:
@@ -68,9 +80,50 @@ def _descriptors() -> Iterator[tuple[int, str]]:
                         yield int(process.name), os.readlink(descriptor)
 
 
-def _names(pids: Iterator[int]) -> Iterator[str]:
+def _names(pids: Iterable[int]) -> Iterator[str]:
     for pid in dict.fromkeys(pids):
         name = "a program"
         with suppress(OSError):
             name = (PROC / str(pid) / "comm").read_text().strip()
         yield f"{name} (pid {pid})"
+
+
+def measure(config: FlightConfig, directory: Path, *, clock_step_s: float) -> Computer:
+    """Measure this computer for a flight of `config` that is recorded in `directory`."""
+    decision_s, rehearsal = None, ""
+    missing = sum(not each.is_compiled for each in compiled.defined)
+    if not missing:  # compiling takes longer than the whole check
+        parts = None
+        with suppress(DocumentError):  # a reference that cannot be flown is another check
+            parts = build_parts(config)
+        try:
+            decision_s = rehearse(parts, keeps_deadline=True) if parts else None
+        except DocumentError as error:
+            rehearsal = str(error)
+    return Computer(
+        directory=str(directory),
+        free_bytes=_free_bytes(directory),
+        overshoot_s=_overshoot_s(),
+        not_compiled=missing,
+        decision_s=decision_s,
+        deadline_s=config.deadline_s,
+        rehearsal=rehearsal,
+        clock_step_s=clock_step_s,
+    )
+
+
+def _free_bytes(directory: Path) -> int | None:
+    with suppress(OSError):
+        places = (directory.absolute(), *directory.absolute().parents)
+        return shutil.disk_usage(next(each for each in places if each.exists())).free
+    return None
+
+
+def _overshoot_s() -> float:
+    """By how much the longest of some short sleeps was too long."""
+    longest_s = 0.0
+    for _ in range(SLEEPS):
+        began_s = clock.monotonic_s()
+        threading.Event().wait(SLEEP_S)
+        longest_s = max(longest_s, clock.monotonic_s() - began_s - SLEEP_S)
+    return longest_s

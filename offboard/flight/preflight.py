@@ -1,0 +1,385 @@
+"""The preflight list: what must be true of a vehicle before it is flown, one row a condition.
+
+`fly` and `daemon` decide by it on the ground, `doctor` prints it. Sans-I/O: a row is a function of
+a `Ground`. What an autopilot requires of its parameters is in its dialect; each is a row too.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from functools import partial
+
+from offboard.flight.phases import Limits
+from offboard.flight.vehicle_state import VehicleState
+from offboard.identification.uncertainty import Estimate
+from offboard.mavlink import autopilots
+from offboard.mavlink.dialects.base import Dialect, WatchedParameter
+from offboard.mavlink.outgoing import ParamRead
+
+TELEMETRY = ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
+MINIMUM_TELEMETRY_HZ = 10.0
+FIX_3D = 3  # GPS_FIX_TYPE; also stands for better ones
+STARTING_S = 90.0  # of vehicle time: ArduCopter uses a GPS 30 s after its first 3D fix
+REPEAT_S = 0.5  # between two requests for a parameter
+REPLY_TIMEOUT_S = 2.0  # for parameters
+
+
+class Level(IntEnum):
+    """From harmless to severe. `WAIT` may clear by itself; `BLOCKS`: `offboard fly` refuses it."""
+
+    OK = 0
+    WARN = 1
+    WAIT = 2
+    BLOCKS = 3
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """`found` is what was observed, `hint` what to do about it: apart, so that a program can use
+    either. `about`: a parameter, where it is not only the check."""
+
+    level: Level
+    found: str
+    hint: str = ""
+    about: str = ""
+
+    @property
+    def sentence(self) -> str:
+        """What is wrong and what to do."""
+        return f"{self.found}. Fix: {self.hint}" if self.hint else self.found
+
+
+@dataclass(frozen=True, slots=True)
+class Ground:
+    """What is known of a vehicle before its flight."""
+
+    vehicle: VehicleState
+    limits: Limits
+    dialect: Dialect | None = None
+    helicopter: bool = False  # by its vehicle file
+    rates_hz: Mapping[str, float] | None = field(default_factory=dict)  # None: were not requested
+    delay: Estimate | None = None  # of telemetry and setpoint together, s
+    measures_delay: bool = False  # replies are still awaited
+    reads_parameters: bool = False  # replies are still awaited
+    systems: str = ""  # of several vehicles, none of which was chosen
+    other_sender: bool = False  # another program controls it
+    in_the_air: bool = False
+    fix_type: int | None = None  # GPS_FIX_TYPE
+    guarded: bool = True  # a supervisor lands it if this process ends
+    origin_missing: bool = False  # the reference is relative to a take-off point that is not known
+    serves: bool = False  # for `daemon`, whose pilot arms it and engages
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One condition: `problem` says what is wrong, empty if nothing is, `fix` what to do.
+
+    `at_once`: `fly` does not wait `limits.health_s` for it to clear. `fly_only`: `daemon`, which
+    waits for its pilot, does not judge it. `about`: the parameter."""
+
+    check: str
+    level: Level
+    problem: Callable[[Ground], str]
+    fix: str | Callable[[Ground], str] = ""
+    at_once: bool = False
+    fly_only: bool = False
+    about: str = ""
+
+    def finding(self, ground: Ground) -> Finding | None:
+        """What is wrong; None if nothing is."""
+        found = "" if self.fly_only and ground.serves else self.problem(ground)
+        if not found:
+            return None
+        fix = self.fix if isinstance(self.fix, str) else self.fix(ground)
+        return Finding(self.level, found, fix, self.about)
+
+
+def findings(ground: Ground) -> Iterator[tuple[Row, Finding]]:
+    """The rows whose condition is not met, in the order of the list."""
+    dialect = ground.dialect
+    parameters = dialect.watched_parameters if dialect else ()
+    rows = (*PREFLIGHT, *(row for each in parameters for row in _parameter_rows(each)))
+    return ((row, found) for row in rows if (found := row.finding(ground)))
+
+
+def refusals(ground: Ground) -> list[str]:
+    """Why this vehicle is not flown, whatever else changes: a sentence for each reason."""
+    return [found.sentence for row, found in findings(ground) if row.at_once]
+
+
+def not_ready(ground: Ground) -> str:
+    """Why it cannot be flown yet, in one sentence; empty if nothing is to be waited for."""
+    waiting = (found.sentence for row, found in findings(ground) if not row.at_once)
+    return next(waiting, "")
+
+
+# --- conditions ---
+
+# what may also come up later on the ground
+ARMED_ALREADY = "the vehicle is armed already, by another controller or a pilot"
+OTHER_SENDER = (
+    "another program controls the vehicle on this link, too: {other_sender} "
+    "(limits.begin_with_other_sender=true flies all the same)"
+)
+SEVERAL = "several vehicles are heard, systems {systems}: choose one with --system"
+
+
+def unfit_type(ground: Ground) -> str:
+    """Why a vehicle of its type is not flown, none of whose modes we know; empty if it is."""
+    heartbeat = ground.vehicle.heartbeat
+    if heartbeat is None or ground.dialect is None:
+        return ""
+    return autopilots.unfit_type(heartbeat.vehicle_type, helicopter=ground.helicopter)
+
+
+def _armed_already(ground: Ground) -> str:
+    armed = ground.vehicle.armed and not ground.limits.begin_armed
+    return ARMED_ALREADY if armed else ""
+
+
+def _flown_by_another(ground: Ground) -> str:
+    vehicle, dialect = ground.vehicle, ground.dialect
+    engaged = vehicle.armed and dialect is not None and vehicle.mode == dialect.engage_mode
+    if not engaged or ground.limits.begin_engaged:
+        return ""
+    return (
+        f"the vehicle is armed and in {vehicle.mode} already: another controller flies it "
+        "(limits.begin_engaged=true takes it over)"
+    )
+
+
+def _flown_by_failsafe(ground: Ground) -> str:
+    flown = ground.vehicle.in_failsafe and ground.in_the_air
+    if not flown or ground.limits.begin_in_failsafe:
+        return ""
+    return (
+        f"a failsafe flies the vehicle, in {ground.vehicle.mode} "
+        "(limits.begin_in_failsafe=true takes it over)"
+    )
+
+
+def _other_sender(ground: Ground) -> str:
+    other = ground.vehicle.other_sender
+    if not ground.other_sender or other is None or ground.limits.begin_with_other_sender:
+        return ""
+    return OTHER_SENDER.format(
+        other_sender=f"system {other.system_id} component {other.component_id}"
+    )
+
+
+def _several_vehicles(ground: Ground) -> str:
+    return SEVERAL.format(systems=ground.systems) if ground.systems else ""
+
+
+def _no_telemetry(ground: Ground) -> str:
+    vehicle, dialect = ground.vehicle, ground.dialect
+    newest = {"LOCAL_POSITION_NED": vehicle.position, "ATTITUDE_QUATERNION": vehicle.attitude}
+    missing = [name for name, value in newest.items() if value is None]
+    if not missing:
+        return ""
+    problem = vehicle.estimator.problem if vehicle.estimator else ""
+    why = (problem and f": {problem}") + vehicle.explanation(dialect.unsaid if dialect else "")
+    return f"no {' and no '.join(missing)} arrives{why}"
+
+
+def _unguarded(ground: Ground) -> str:
+    if ground.guarded:
+        return ""
+    return "the supervisor, which lands it if this process ends, does not answer"
+
+
+def _slow(ground: Ground) -> str:
+    rates_hz = ground.rates_hz
+    if rates_hz is None or not ground.vehicle.has_state:
+        return ""
+    for name in TELEMETRY:
+        if rates_hz.get(name, 0.0) < MINIMUM_TELEMETRY_HZ:
+            return (
+                f"{name} arrives at {rates_hz.get(name, 0.0):.1f} Hz, "
+                f"at least {MINIMUM_TELEMETRY_HZ:.0f} Hz are needed"
+            )
+    return ""
+
+
+def _may_fly(ground: Ground) -> str:
+    unknown = ground.vehicle.armed and ground.vehicle.landed == "unknown"
+    sentence = "it is armed and does not report whether it flies (EXTENDED_SYS_STATE)"
+    return sentence if unknown else ""
+
+
+def _reading(ground: Ground) -> str:
+    return "its parameters are still being read" if ground.reads_parameters else ""
+
+
+def _origin(ground: Ground) -> str:
+    unseen = "its take-off point is not known, as it was not seen on the ground (--anchor origin)"
+    return unseen if ground.origin_missing else ""
+
+
+def _prearm(ground: Ground) -> str:
+    vehicle, dialect = ground.vehicle, ground.dialect
+    if vehicle.prearm_ok or vehicle.armed or dialect is None:
+        return ""
+    if vehicle.health is None:
+        return "SYS_STATUS does not arrive: it is unknown whether the vehicle can arm"
+    unsaid = f"{vehicle.unhealthy()} ({dialect.unsaid})"
+    told = vehicle.explanation(unsaid) if vehicle.texts else unsaid
+    return f"its pre-arm checks do not pass in {vehicle.mode}{told}"
+
+
+def _leave_mode(ground: Ground) -> str:
+    dialect = ground.dialect
+    if dialect is None or ground.vehicle.mode != dialect.engage_mode:
+        return ""
+    return f"it may only miss setpoints in {dialect.engage_mode}: select {dialect.hold_mode}"
+
+
+def _rejected(ground: Ground) -> str:
+    report = ground.vehicle.estimator
+    return report.problem if report and report.worst[1] > 1.0 else ""
+
+
+def _no_estimate(ground: Ground, *, starting: bool) -> str:
+    vehicle = ground.vehicle
+    report = vehicle.estimator
+    if report is None or report.worst[1] > 1.0:
+        return ""
+    starts = ground.fix_type != FIX_3D or vehicle.time_s < STARTING_S
+    return report.problem if starts == starting else ""
+
+
+def _empty_battery(ground: Ground) -> str:
+    health, least = ground.vehicle.health, ground.limits.battery
+    charge = health.battery_remaining if health else None
+    if charge is None or charge >= least:
+        return ""
+    return f"its battery has {charge:.0%} left, limits.battery is {least:.0%}"
+
+
+def _measuring(ground: Ground) -> str:
+    return "the delay of the link is being measured" if ground.measures_delay else ""
+
+
+def _late(ground: Ground) -> str:
+    delay, limits = ground.delay, ground.limits
+    if delay is None or (delay.value <= limits.link_delay_s and delay.sd <= limits.link_jitter_s):
+        return ""
+    return (
+        f"the link delays by {1e3 * delay.value:.0f} +- {1e3 * delay.sd:.0f} ms, at most "
+        f"{1e3 * limits.link_delay_s:.0f} +- {1e3 * limits.link_jitter_s:.0f} ms can be flown "
+        "(limits.link_delay_s, limits.link_jitter_s)"
+    )
+
+
+_ESTIMATOR = "wait for a GPS fix, keep the vehicle still and away from metal; then calibrate"
+_LINK = "use a faster link"
+
+
+def _slow_hint(ground: Ground) -> str:
+    return ground.dialect.slow_hint if ground.dialect else ""
+
+
+PREFLIGHT = (
+    Row(
+        "vehicle",
+        Level.BLOCKS,
+        unfit_type,
+        "fly it with its own autopilot; is MAV_TYPE or FRAME_CLASS right?",
+        at_once=True,
+    ),
+    Row(
+        "state",
+        Level.BLOCKS,
+        _flown_by_another,
+        "stop that controller",
+        at_once=True,
+        fly_only=True,
+    ),
+    Row(
+        "state",
+        Level.BLOCKS,
+        _flown_by_failsafe,
+        "let the pilot take over first",
+        at_once=True,
+        fly_only=True,
+    ),
+    Row("state", Level.BLOCKS, _armed_already, "disarm it", at_once=True, fly_only=True),
+    Row("senders", Level.BLOCKS, _other_sender, "stop it", at_once=True, fly_only=True),
+    Row(
+        "senders",
+        Level.BLOCKS,
+        _several_vehicles,
+        "or give each vehicle its own port",
+        at_once=True,
+    ),
+    Row("rates", Level.WAIT, _no_telemetry),
+    Row("supervisor", Level.WAIT, _unguarded),
+    Row("rates", Level.BLOCKS, _slow, _slow_hint),
+    Row("state", Level.BLOCKS, _may_fly),
+    Row("parameters", Level.WAIT, _reading),
+    Row("origin", Level.WAIT, _origin),
+    Row("prearm", Level.WAIT, _prearm, _leave_mode, fly_only=True),
+    Row("estimator", Level.BLOCKS, _rejected, _ESTIMATOR),
+    Row("estimator", Level.WAIT, partial(_no_estimate, starting=True), _ESTIMATOR),
+    Row("estimator", Level.BLOCKS, partial(_no_estimate, starting=False), _ESTIMATOR),
+    Row("battery", Level.BLOCKS, _empty_battery, "charge the battery"),
+    Row("delay", Level.WAIT, _measuring),
+    Row("delay", Level.BLOCKS, _late, _LINK),
+)
+
+
+# --- parameters ---
+
+
+def _parameter_rows(parameter: WatchedParameter) -> tuple[Row, ...]:
+    """What the autopilot requires of a parameter, and of a reply."""
+    name = parameter.name
+
+    def wrong(ground: Ground) -> str:
+        value = ground.vehicle.parameters.get(name)
+        fault = None if value is None else parameter.fault(value)
+        return fault.found if fault else ""
+
+    def line(ground: Ground) -> str:
+        fault = parameter.fault(ground.vehicle.parameters[name])
+        return fault.fix if fault else ""
+
+    def unanswered(ground: Ground) -> str:
+        missing = parameter.must_answer and name not in ground.vehicle.parameters
+        return f"no reply for parameter {name}" if missing else ""
+
+    return (
+        Row("parameters", Level.BLOCKS, wrong, line, at_once=True, about=name),
+        Row("parameters", Level.BLOCKS, unanswered, about=name),
+    )
+
+
+class ParameterReading:
+    """Progress of reading one vehicle's watched parameters. Times are seconds of any one clock.
+
+    `advice`: also those that are only for the advice of `doctor`."""
+
+    def __init__(self, *, advice: bool = False) -> None:
+        self._advice = advice
+        self._began_s = math.nan
+        self._requested_s = -math.inf
+
+    def due(self, dialect: Dialect, known: Mapping[str, float], now_s: float) -> list[ParamRead]:
+        """Requests to send now, for every watched parameter without a reply."""
+        if math.isnan(self._began_s):
+            self._began_s = now_s
+        if now_s - self._requested_s < REPEAT_S - 1e-6:
+            return []
+        self._requested_s = now_s
+        return [ParamRead(p.name) for p in self._wanted(dialect) if p.name not in known]
+
+    def complete(self, dialect: Dialect, known: Mapping[str, float], now_s: float) -> bool:
+        """Every parameter has a reply, or had time enough for one."""
+        answered = all(each.name in known for each in self._wanted(dialect))
+        return answered or now_s - self._began_s >= REPLY_TIMEOUT_S
+
+    def _wanted(self, dialect: Dialect) -> list[WatchedParameter]:
+        return [p for p in dialect.watched_parameters if self._advice or not p.advice_only]
