@@ -34,7 +34,7 @@ DARK = {
 
 _TOP_PX, _BOTTOM_PX, _PANEL_PX, _GAP_PX = 48, 90, 150, 36
 _FEW_DECADES = 2  # of a logarithmic axis with ticks at 2 and 5
-_MOST_DECADES = 4  # of one with a tick at each
+_MOST_DECADES = 3  # of one with a tick at each
 _MARGIN = 0.02  # of its decades, beside its outermost ticks
 _AXIS = {
     "gridcolor": GRID, "zerolinecolor": GRID, "linecolor": GREY, "showline": True,
@@ -112,7 +112,7 @@ def listed(figure: go.Figure, lines: Sequence[tuple[str, bool]], row_px: int, to
 
 def logarithmic(values: Iterable[float]) -> dict[str, Any]:
     """A logarithmic axis around the positive values. Up to two decades have ticks at 1, 2 and 5;
-    more decades have about four, at powers of ten."""
+    more decades have about three, at powers of ten."""
     known = [value for value in values if 0.0 < value < math.inf]
     least, greatest = min(known, default=1.0), max(known, default=1.0)
     low, high = math.floor(math.log10(least)), math.ceil(math.log10(greatest))

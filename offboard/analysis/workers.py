@@ -67,6 +67,8 @@ def open_worker() -> Iterator[ProcessPoolExecutor]:
     # spawn: a forked child would share compiled code and threads in unknown states
     context = multiprocessing.get_context("spawn")
     os.environ["PYTHONSAFEPATH"] = "1"  # of the child: as `python -P`
+    # of multiprocessing's tracker: it deletes the semaphores of a killed process, and warns of it
+    os.environ.setdefault("PYTHONWARNINGS", "ignore::UserWarning:multiprocessing.resource_tracker")
     pool = ProcessPoolExecutor(1, mp_context=context, initializer=_start)
     with interrupts_deferred():
         pool.submit(os.getpid)  # starts the process

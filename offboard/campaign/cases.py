@@ -31,6 +31,7 @@ from offboard.run.request import FlightRequest
 SEED = "seed"  # a range of this name is that of the flight's seed: noise, and the phase of gusts
 SCENARIO = "scenario."  # of a key of the scenario
 UNNAMED = "unnamed"
+CONNECTED = "connected"  # the scenario of the vehicle at a link
 OWN_SCENARIOS = {"px4": "px4_like", "ardupilot": "ardupilot_like"}  # where a file names none
 FILES = ("config", "controller", "reference", "vehicle", "sim_vehicle", "scenario")
 Values = tuple[tuple[str, Any], ...]
@@ -41,8 +42,8 @@ class Case:
     """One flight of a campaign. None: the default of `config`, or of the firmware.
 
     `values` are what parameters and draws set, by key; `text` is the YAML of a scenario that is not
-    a file; `files` holds a hash of every file that is not shipped; `settings` are `key.path=value`
-    of --set, applied before `values`.
+    a file; `files` holds a hash of every file that is not shipped. With `link` (an address), the
+    vehicle at it is flown instead of the simulator.
     """
 
     config: str
@@ -56,7 +57,7 @@ class Case:
     values: Values = ()
     text: str = ""
     files: tuple[tuple[str, str], ...] = ()
-    settings: tuple[str, ...] = ()
+    link: str | None = None
 
     @property
     def key(self) -> str:
@@ -67,16 +68,24 @@ class Case:
     @property
     def assignments(self) -> tuple[str, ...]:
         """What `--set` sets."""
-        values = (
+        return tuple(
             f"{key}={json.dumps(value)}"
             for key, value in self.values
             if not key.startswith(SCENARIO)
         )
-        return (*self.settings, *values)
+
+    @property
+    def folder(self) -> str:
+        """Name of the directory of its log, for example "pso-lemniscate-calm-1-3f9a1c2b"."""
+        names = (self.controller, self.reference, self.scenario)
+        stems = [Path(name).stem for name in names if name]
+        return "-".join((*stems, str(self.seed), self.key[:8]))
 
     @property
     def scenario_file(self) -> str:
-        """Name of the file that holds `text`, by its content."""
+        """Name of the file that holds `text`, by its content; empty without one."""
+        if not self.text:
+            return ""
         digest = hashlib.sha256(self.text.encode()).hexdigest()[:10]
         return f"scenarios/{Path(self.scenario).stem}-{digest}.yaml"
 
@@ -91,27 +100,35 @@ class Case:
             "sim-vehicle": self.sim_vehicle,
             "firmware": self.firmware if self.firmware != "px4" else None,
         }
-        words = ["offboard", "fly", "--sitl"]
+        words = ["offboard", "fly", *(("--connect", self.link) if self.link else ("--sitl",))]
         for option, name in named.items():
             words += [f"--{option}", _place(name)] if name else []
-        words += ["--scenario", self.scenario_file if self.text else _place(self.scenario)]
+        if not self.link:
+            words += ["--scenario", self.scenario_file or _place(self.scenario)]
         for assignment in self.assignments:
             words += ["--set", assignment]
         return shlex.join([*words, "--seed", str(self.seed)])
 
     def request(self, directory: Path, scenario: str | None = None) -> FlightRequest:
-        """The flight of the case, recorded in `directory`; without the scenario of the case."""
-        return FlightRequest(
+        """The flight of the case, recorded in `directory`. The scenario of the case, which may be
+        no file yet, is not taken.
+
+        At a link, an armed vehicle is refused unless a value sets limits.begin_armed: somebody else
+        is flying it.
+        """
+        disarmed = ("limits.begin_armed=false",) if self.link else ()
+        request = FlightRequest(
             directory,
             config=self.config,
             choices={part: getattr(self, part) for part in ("vehicle", "controller", "reference")},
-            assignments=self.assignments,
+            assignments=(*disarmed, *self.assignments),
             seed=self.seed,
-            sitl=True,
+            sitl=self.link is None,
             firmware=self.firmware,
             sim_vehicle=self.sim_vehicle,
             scenario=scenario,
         )
+        return replace(request, connection=self.link) if self.link else request
 
     def with_values(self, values: Values) -> Case:
         """The case with these values instead."""
@@ -126,8 +143,9 @@ class Case:
         return replace(self, values=values, text=text)
 
 
-def expand(file: CampaignFile) -> list[Case]:
-    """All cases of a campaign, in the order of its table. Raises DocumentError."""
+def expand(file: CampaignFile, link: str | None = None) -> list[Case]:
+    """All cases of a campaign, in the order of its table; with `link`, at that address. Raises
+    DocumentError."""
     if SEED in file.parameters:
         raise DocumentError("parameters.seed: give the seeds with seeds")
     size = _size(file)
@@ -136,6 +154,8 @@ def expand(file: CampaignFile) -> list[Case]:
     draws = drawn(file.sample) if file.sample else [()]
     cases: list[Case] = []
     for case, grid in itertools.product(base_cases(file), _grid(file.parameters)):
+        if link:
+            case = replace(case, scenario=CONNECTED, link=link)
         for draw in draws:
             flown = case.with_values((*grid, *draw)) if grid or draw else case
             cases += [replace(flown, seed=seed) for seed in file.seed_values]

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
@@ -26,6 +26,7 @@ from offboard.documents.reading import parse
 
 FOLDER = "campaigns"
 CASES_MOST = 1_000_000
+ALL = "all"
 _WORST = re.compile(r"worst ([1-9][0-9]{0,3})")
 
 
@@ -50,8 +51,8 @@ def _requirement(text: str) -> str:
 
 
 def _kept(text: str) -> str:
-    if not _WORST.fullmatch(text):
-        raise ValueError(f"{text!r} is not understood; write for example 'worst 5'")
+    if text != ALL and not _WORST.fullmatch(text):
+        raise ValueError(f"{text!r} is not understood; write for example 'worst 5', or 'all'")
     return text
 
 
@@ -72,20 +73,15 @@ class Sample(Parameters):
 
 
 class Search(Parameters):
-    """Search for failures (`--worst`) over `ranges`: `flights` for the search, in batches of 20,
-    with `seed`.
+    """Search for failures (`--worst`) over `ranges`: `flights` for the search, with `seed`.
 
     `defaults` are the values of an undisturbed flight, to which a failure is reduced; without one,
     0 if it is within the range, else its middle. A range named `seed` is that of the flight's seed:
-    noise, and the phase of gusts. `methods` take turns: our swarm, CMA-ES, random. Each failure is
-    flown again with `seeds` seeds.
+    noise, and the phase of gusts. Each failure is flown again with `seeds` seeds.
     """
 
     ranges: Ranges
     defaults: dict[Key, float] = Field(default_factory=dict)
-    methods: tuple[Literal["swarm", "cma", "random"], ...] = Field(
-        default=("swarm", "cma"), min_length=1
-    )
     flights: int = Field(default=500, ge=20, le=100_000)
     seed: Seed = 1
     seeds: int = Field(default=5, ge=1, le=100)
@@ -106,7 +102,7 @@ class CampaignFile(Parameters):
 
     Without controllers, references or vehicles, those of `config` are flown; without scenarios, the
     firmware's own. `require` is what a flight must meet beside being completed, `promises` what the
-    margin is measured against, `keep` ("worst 5") the flights whose logs are kept.
+    margin is measured against, `keep` ("worst 5", or "all") the flights whose logs are kept.
     """
 
     config: Name = "flight"
@@ -130,7 +126,7 @@ class CampaignFile(Parameters):
 
     @property
     def kept(self) -> int:
-        """The number of worst flights whose logs are kept."""
+        """The number of worst flights that are flown again, with their logs."""
         matched = _WORST.fullmatch(self.keep or "")
         return int(matched[1]) if matched else 0
 

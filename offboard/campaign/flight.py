@@ -15,9 +15,8 @@ from pathlib import Path
 
 from offboard.analysis.flight_score import judged, keep_score, score_flight
 from offboard.campaign.cases import Case
-from offboard.campaign.code import code_hash
 from offboard.campaign.margin import NOT_FLOWN, Promises, terms
-from offboard.campaign.results import Record
+from offboard.campaign.results import Record, code_hash
 from offboard.documents.errors import UserError
 from offboard.flight.companion import Outcome
 from offboard.flight.phases import ExitCode

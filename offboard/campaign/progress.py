@@ -25,37 +25,42 @@ LINES = 20
 
 
 class Counter(Progress):
-    """Context manager that shows how many flights have ended."""
+    """Context manager that shows how many of at most `planned` flights have ended. With `each`,
+    every flight is a line."""
 
-    def __init__(self, console: Console) -> None:
+    def __init__(self, console: Console, planned: int = 0, *, each: bool = False) -> None:
         super().__init__(
             TextColumn("flights"), BarColumn(bar_width=20), MofNCompleteColumn(),
             TextColumn("{task.fields[rate]}"), TimeElapsedColumn(), TimeRemainingColumn(),
             console=console, transient=True, disable=not console.is_terminal,
         )  # fmt: skip
-        self._task = self.add_task("flights", total=None, rate="")
+        self.planned = planned
+        self._each = each
+        self._task = self.add_task("flights", total=planned, rate="")
         self._begun_s = clock.monotonic_s()
         self._announced = False
-        self._before: int | None = None  # flights that an earlier run has flown
+        self._known = self._flown = 0
 
-    def count(self, done: int, planned: int, ended: str = "") -> None:
-        """`done` of at most `planned` flights have ended; 0 at the beginning. With `ended`, a
-        sentence on the last one, every flight is a line."""
-        if done and self._before is None:
-            self._before = done - 1
-        own = done - (self._before or 0)
-        rate = 60.0 * own / max(1e-9, clock.monotonic_s() - self._begun_s)
-        told = f"{rate:.0f} a minute" if done else ""
-        self.update(self._task, completed=done, total=planned, rate=told)
-        every = 1 if ended else max(1, planned // LINES)
-        if self.console.is_terminal or (done % every and done != planned and own != FIRST):
-            return
-        line = f"{done} of {planned} flights"
-        if done:
-            line += f", {told}, {remaining(60.0 * (planned - done) / rate)} left"
-        if ended:
-            line += f": {ended}"
-        self.console.print(line, markup=False, soft_wrap=True)
+    def begin(self, known: int) -> None:
+        """`known` further flights have been flown by an earlier run."""
+        self._known += known
+        self._update("")
+        if not self._flown:
+            already = f", {self._known} already flown" if self._known else ""
+            self._say(f"{self.planned} flights{already}")
+
+    def ended(self, sentence: str) -> None:
+        """A flight has ended; `sentence` says how."""
+        self._flown += 1
+        done = self._known + self._flown
+        self.planned = max(self.planned, done)
+        rate = 60.0 * self._flown / max(1e-9, clock.monotonic_s() - self._begun_s)
+        self._update(f"{rate:.0f} a minute")
+        every = 1 if self._each else max(1, self.planned // LINES)
+        if done % every == 0 or done == self.planned or self._flown == FIRST:
+            left = remaining(60.0 * (self.planned - done) / rate)
+            line = f"{done} of {self.planned} flights, {rate:.0f} a minute, {left} left"
+            self._say(f"{line}: {sentence}" if self._each else line)
 
     def ending(self, stops: StopRequests) -> bool:
         """Whether a stop was requested, which is then said, once."""
@@ -63,6 +68,14 @@ class Counter(Progress):
             self._announced = True
             self.console.print(INTERRUPTED)
         return stops.requested
+
+    def _update(self, rate: str) -> None:
+        done = self._known + self._flown
+        self.update(self._task, completed=done, total=self.planned, rate=rate)
+
+    def _say(self, line: str) -> None:
+        if not self.console.is_terminal:
+            self.console.print(line, markup=False, soft_wrap=True)
 
 
 def remaining(seconds: float) -> str:

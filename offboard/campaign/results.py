@@ -1,28 +1,29 @@
-"""The folder of results: one JSON file per finished flight, DIR/results/CODE/CASE.json.
+"""The results of a campaign: one JSON file per finished flight, DIR/results/CODE/CASE.json.
 
-A file appears whole or not at all, so that a campaign may be killed at any time, and folders of
-several machines may be copied together.
+CODE is a hash of the code that flies: results of other code are never mixed with ours. A file
+appears whole or not at all, so that a campaign may be killed at any time, and folders of several
+machines may be copied together.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
+import platform
 from contextlib import suppress
 from dataclasses import asdict, dataclass, field
+from functools import cache
+from importlib.metadata import version
+from importlib.util import find_spec
 from pathlib import Path
 
+from offboard.campaign.document import FOLDER
+from offboard.documents import shipped
 from offboard.documents.errors import UserError
+from offboard.run.in_memory import registered
 
-# figures that this computer's clock decides: they differ between two runs of one flight
-WALL_TIMES = (
-    "setpoint_gap_wall_max_s",
-    "answer_p50_ms",
-    "answer_p99_ms",
-    "answer_max_ms",
-    "solve_time_p50_ms",
-    "solve_time_p99_ms",
-)
+PACKAGES = ("numpy", "scipy", "numba", "pymavlink", "daqp", "control")
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,10 +78,8 @@ class Results:
             return None
 
     def put(self, key: str, record: Record) -> None:
-        """Store a record at once, without WALL_TIMES. Raises UserError, for example when the disk
-        is full."""
-        figures = {k: v for k, v in record.figures.items() if k not in WALL_TIMES}
-        text = json.dumps(asdict(record) | {"figures": figures}, sort_keys=True)
+        """Store a record at once. Raises UserError, for example when the disk is full."""
+        text = json.dumps(asdict(record), sort_keys=True)
         self.write(self._folder / f"{key}.json", text.encode())
 
     def finished(self) -> int:
@@ -101,6 +100,26 @@ class Results:
 
     def _unwritable(self, error: OSError) -> UserError:
         return UserError(
-            f"{self.directory} cannot be written ({error.strerror}); finished flights are kept: "
-            "run the same command again when it can"
+            f"{self.directory} cannot be written ({error.strerror}); finished flights are kept"
         )
+
+
+@cache
+def code_hash() -> str:
+    """Hash of the sources of controller and simulator, of the shipped configuration and of the
+    versions of what computes; 12 hexadecimal digits."""
+    digest = hashlib.sha256(platform.python_version().encode())
+    for package in PACKAGES:
+        digest.update(f" {package} {version(package)}".encode())
+    for folder, pattern in _sources():
+        for path in sorted(folder.rglob(pattern)):
+            if FOLDER not in path.relative_to(folder).parts:  # they are hashed case by case
+                digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:12]
+
+
+def _sources() -> list[tuple[Path, str]]:
+    packages = ("offboard", registered().module.partition(".")[0])
+    specs = [find_spec(package) for package in packages]
+    folders = [Path(spec.origin).parent for spec in specs if spec and spec.origin]
+    return [*((folder, "*.py") for folder in folders), (shipped.directory(), "*.yaml")]

@@ -1,21 +1,65 @@
-"""The table of a campaign: one row per flight, as CSV, the same bytes on every run."""
+"""The table of a campaign: one row per flight as CSV, and groups of flights for page and terminal.
+
+The CSV has no figure that a clock decides: it is the same bytes however the flights were flown.
+A group is the flights of one combination: they differ in seed and draw only.
+"""
 
 from __future__ import annotations
 
 import csv
 import io
+import itertools
 import json
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+import math
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table
+from rich.text import Text
+from scipy import stats
 
 from offboard.analysis.requirement import Requirement
 from offboard.analysis.score import FIGURES
 from offboard.campaign.cases import Case
-from offboard.campaign.results import WALL_TIMES, Record
+from offboard.campaign.results import Record
 
+# figures that this computer's clock decides: they differ between two runs of one flight
+WALL_TIMES = (
+    "setpoint_gap_wall_max_s",
+    "answer_p50_ms",
+    "answer_p99_ms",
+    "answer_max_ms",
+    "solve_time_p50_ms",
+    "solve_time_p99_ms",
+)
 CASE_COLUMNS = ("controller", "reference", "scenario", "vehicle", "sim_vehicle", "firmware")
 FIGURE_COLUMNS = tuple(name for name in FIGURES if name not in WALL_TIMES)
+CONFIDENCE = 0.95
+ERROR = "rmse_position_m"
+EQUAL_SHARE = 0.01  # medians that are closer than this share of the best are equal
+BEST = (
+    "* best: lowest median RMSE of its block; or a median within the range of the best, or within "
+    f"{EQUAL_SHARE:.0%} of its median."
+)
+# figure of the score, its title in the terminal
+SHOWN = (
+    (ERROR, "RMSE\n[m]"),
+    ("max_position_m", "maximum\n[m]"),
+    ("tilt_agitation_deg", "tilt\n[deg]"),
+    ("rate_agitation_radps", "rates\n[rad/s]"),
+    ("solve_time_p99_ms", "decision\n[ms]"),
+)
+DEFAULT_WIDTH = 80  # of a terminal
+NARROW = 3  # figures that are shown where it is narrower
+LEGEND = (
+    "RMSE, maximum: position error, medians of all flights [lowest\N{EN DASH}highest]. "
+    "tilt, rates: motion beside the reference's, RMS. decision: 99th percentile of its time.",
+    BEST,
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,3 +122,150 @@ def as_csv(table: Mapping[str, Sequence[Any]]) -> str:
     writer.writerow(table)
     writer.writerows(zip(*table.values(), strict=True))
     return text.getvalue()
+
+
+@dataclass(frozen=True, slots=True)
+class Group:
+    """Flights of one combination: `name` is controller and values, `block` the rest. `low` and
+    `high` are Wilson's interval of the success rate; `best`: see `groups`."""
+
+    name: str
+    block: str
+    rows: tuple[Row, ...]
+    low: float
+    high: float
+    best: bool = False
+
+    @property
+    def flights(self) -> int:
+        return len(self.rows)
+
+    @property
+    def successes(self) -> int:
+        return sum(not row.failed for row in self.rows)
+
+    @property
+    def failed(self) -> int:
+        return self.flights - self.successes
+
+    @property
+    def reasons(self) -> dict[str, list[int]]:
+        """Why flights failed, with their seeds."""
+        found: dict[str, list[int]] = {}
+        for row in self.rows:
+            if row.failed:
+                found.setdefault(row.failed, []).append(row.case.seed)
+        return found
+
+    def values(self, figure: str) -> list[float]:
+        """One figure of every completed flight; `margin` of every flight."""
+        if figure == "margin":
+            return [row.record.margin for row in self.rows]
+        completed = (row.record for row in self.rows if row.record.completed)
+        return [r.figures[figure] for r in completed if figure in r.figures]
+
+    def spread(self, figure: str) -> tuple[float, float, float]:
+        """Lowest, median and highest value; NaN without values. Of `success`: the rate with its
+        interval."""
+        if figure == "success":
+            return self.low, self.successes / self.flights, self.high
+        values = self.values(figure)
+        if not values:
+            return math.nan, math.nan, math.nan
+        return min(values), float(np.median(values)), max(values)
+
+    def shown(self, figure: str) -> str:
+        """Median and range of a figure as text, empty without values."""
+        low, middle, high = map(digits, self.spread(figure))
+        return middle if low == high else f"{middle} [{low}\N{EN DASH}{high}]"
+
+
+def groups(rows: Sequence[Row], drawn: frozenset[str] = frozenset()) -> list[Group]:
+    """The groups in the order of the table, with the best of each block marked. Their names have
+    the values that differ, without those `drawn` (keys of a sample).
+
+    The best have no failed flight, and their median position error is the lowest, or within the
+    range of that one's flights, or within EQUAL_SHARE of its median.
+    """
+    blocks: dict[str, dict[str, list[Row]]] = {}
+    distinct = set(itertools.chain.from_iterable(_values(row.case) for row in rows))
+    differ = {key for key, number in Counter(key for key, _ in distinct).items() if number > 1}
+    for row in rows:
+        own = blocks.setdefault(_block(row.case), {})
+        own.setdefault(_name(row.case, differ - drawn), []).append(row)
+    found: list[Group] = []
+    for block, members in blocks.items():
+        made = [
+            Group(name, block, tuple(rows), *wilson(sum(not r.failed for r in rows), len(rows)))
+            for name, rows in members.items()
+        ]
+        errors = [_error(group) for group in made]
+        median, highest = min(errors)
+        bound = max(highest, (1.0 + EQUAL_SHARE) * median)
+        found += [
+            replace(group, best=math.isfinite(error) and error <= bound)
+            for group, (error, _) in zip(made, errors, strict=True)
+        ]
+    return found
+
+
+def _error(group: Group) -> tuple[float, float]:
+    """Median and highest position error, infinite where a flight failed."""
+    _, median, highest = group.spread(ERROR)
+    return (math.inf, math.inf) if group.failed or math.isnan(median) else (median, highest)
+
+
+def _block(case: Case) -> str:
+    firmware = "" if case.firmware == "px4" else case.firmware
+    names = (case.reference, case.scenario, case.vehicle, case.sim_vehicle, firmware)
+    return ", ".join(name for name in names if name)
+
+
+def _name(case: Case, named: Collection[str]) -> str:
+    values = [f"{key}={value}" for key, value in _values(case) if key in named]
+    return " ".join((case.controller or case.config, *values))
+
+
+def _values(case: Case) -> list[tuple[str, Any]]:
+    return [(key, _scalar(value)) for key, value in case.values]
+
+
+def wilson(successes: int, flights: int) -> tuple[float, float]:
+    """The interval of a success rate, Wilson's score, CONFIDENCE."""
+    interval = stats.binomtest(successes, flights).proportion_ci(CONFIDENCE, method="wilson")
+    return float(interval.low), float(interval.high)
+
+
+def digits(value: float) -> str:
+    """Three significant digits, empty for what is not finite."""
+    if not math.isfinite(value):
+        return ""
+    value = float(f"{value:.3g}")
+    size = math.floor(math.log10(abs(value))) if value else 0
+    return f"{value:.2e}" if size < -4 else f"{value:.{max(0, 2 - size)}f}"
+
+
+def show(console: Console, flown: Sequence[Group]) -> None:
+    """Print the groups, a block below each other, the legend and why flights failed."""
+    shown = SHOWN if console.width >= DEFAULT_WIDTH else SHOWN[:NARROW]
+    table = Table(box=None, pad_edge=False)
+    separator = " " if console.width > DEFAULT_WIDTH else "\n"
+    table.add_column("controller", overflow="fold")
+    for _, title in shown:
+        table.add_column(Text(title), justify="right", no_wrap=True)
+    for block, members in itertools.groupby(flown, lambda group: group.block):
+        table.add_row(Text(f"\n{block}", "bold"))
+        for group in members:
+            mark, style = ("*", "bold") if group.best else (" ", "" if group.successes else "red")
+            part = f" ({group.successes} of {group.flights})" if group.failed else ""
+            medians = [digits(group.spread(figure)[1]) for figure, _ in shown[1:]]
+            cells = (group.shown(ERROR).replace(" ", separator), *medians)
+            table.add_row(Text(f"{mark} {group.name}{part}"), *map(Text, cells), style=style)
+    console.print(table)
+    console.print()
+    for line in LEGEND:
+        console.print(Text(line, "dim"))
+    for group in flown:
+        for reason, seeds in group.reasons.items():
+            where = f"{group.name}, {group.block}, seed {', '.join(map(str, seeds))}"
+            console.print(Text(f"failed: {where}: {reason}", "red"))

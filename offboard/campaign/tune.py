@@ -5,40 +5,38 @@
     training: {scenarios: [px4_like, gusts], seeds: 3}
     validation: {scenarios: [all_together, wind_2mps], seeds: 10}
 
-The study (optuna, journal file) and the results of all flights lie in a folder, so that an
-interrupted tuning goes on.
+The results of all flights lie in a folder, so that an interrupted tuning goes on. It is judged by
+paired flights (same scenario, same seed) with confidence.
 """
 
 from __future__ import annotations
 
-import hashlib
 import itertools
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
+import numpy as np
 import yaml
 from pydantic import AfterValidator, Field
+from scipy import stats
 
-from offboard.campaign.campaign import check
-from offboard.campaign.cases import SCENARIO, Case, Values, expand, rounded
-from offboard.campaign.code import code_hash
+from offboard.campaign.cases import SCENARIO, Case, Values, expand
 from offboard.campaign.document import CampaignFile, Name, Names, Ranges, Seed
-from offboard.campaign.evaluate import Evaluator
 from offboard.campaign.results import Record
-from offboard.campaign.table import FIGURE_COLUMNS
-from offboard.campaign.verdict import Verdict, judge
-from offboard.documents.errors import DocumentError, UserError, naming
-from offboard.documents.extras import install
+from offboard.campaign.run import check
+from offboard.campaign.search import Fly, Study
+from offboard.campaign.table import CONFIDENCE, FIGURE_COLUMNS
+from offboard.documents.errors import DocumentError, naming
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import override, parse, read
 from offboard.documents.shipped import locate, read_text
 from offboard.run.configuration import FOLDERS, read_part
 
 FOLDER = "tunings"
+RESAMPLES = 9999
+BOOTSTRAP_SEED = 1
 
 
 def _figure(name: str) -> str:
@@ -70,9 +68,53 @@ class TuneFile(Parameters):
     validation: Flights
     objective: Annotated[str, AfterValidator(_figure)] = "rmse_position_m"
     failure: float = Field(default=5.0, gt=0, le=1e6)
-    sampler: Literal["tpe", "cma", "swarm"] = "tpe"
     trials: int = Field(default=60, ge=2, le=100_000)
     seed: Seed = 1
+
+
+@dataclass(frozen=True, slots=True)
+class Verdict:
+    """Costs of the same flights with both: means, and the difference, candidate less base.
+
+    `low` and `high` are the bootstrap interval (percentile, 95 %) of the mean difference,
+    `p_value` that of Wilcoxon's signed-rank test, one-sided.
+    """
+
+    flights: int
+    base: float
+    candidate: float
+    low: float
+    high: float
+    p_value: float
+
+    @property
+    def better(self) -> bool:
+        """Both the interval and the test say so."""
+        return self.high < 0.0 and self.p_value < 1.0 - CONFIDENCE
+
+    def __str__(self) -> str:
+        return (
+            f"mean cost {self.base:.4g} before, {self.candidate:.4g} after, difference "
+            f"{self.low:.2g} .. {self.high:.2g} (95 %), p = {self.p_value:.2g}, "
+            f"{self.flights} flights each"
+        )
+
+
+def judge(base: Sequence[float], candidate: Sequence[float]) -> Verdict:
+    """Compare costs of paired flights (same scenario, same seed)."""
+    before, after = np.asarray(base, float), np.asarray(candidate, float)
+    difference = after - before
+    low = high = float(difference.mean())
+    if len(difference) > 1:
+        interval = stats.bootstrap(
+            (difference,), np.mean, confidence_level=CONFIDENCE, n_resamples=RESAMPLES,
+            method="percentile", random_state=np.random.default_rng(BOOTSTRAP_SEED),
+        ).confidence_interval  # fmt: skip
+        low, high = float(interval.low), float(interval.high)
+    p_value = 1.0
+    if np.any(difference != 0.0):
+        p_value = float(stats.wilcoxon(after, before, alternative="less").pvalue)
+    return Verdict(len(before), float(before.mean()), float(after.mean()), low, high, p_value)
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,9 +140,8 @@ class Tuning:
     without optuna."""
 
     def __init__(self, file: TuneFile, source: str) -> None:
-        if find_spec("optuna") is None:
-            raise UserError(f"tuning needs optuna: {install('tune')}")
         self.file = file
+        self._study = Study(file.ranges, file.seed)
         with naming(source):
             self._training = _cases(file, file.training)
             self._validation = _cases(file, file.validation)
@@ -113,38 +154,28 @@ class Tuning:
             self._defaults = _defaults(self._training[0], file)
             check([self._training[0].with_values(tuple(self._defaults.items()))])
 
-    def run(
-        self, folder: Path, evaluator: Evaluator, progress: Callable[[int, float], None]
-    ) -> Tuned:
+    @property
+    def flights(self) -> int:
+        """The flights that a tuning takes."""
+        return self.file.trials * len(self._training) + 2 * len(self._validation)
+
+    def run(self, fly: Fly, progress: Callable[[int, float], None]) -> Tuned:
         """Search, then fly the validation set with and without what was found.
 
-        `progress` gets the number of trials and the lowest cost so far. Raises what `Evaluator.fly`
-        raises.
+        `progress` gets the number of trials and the lowest cost so far. Raises what `fly` raises.
         """
-        study = _study(folder, self.file, self._training)
-        if not any(trial.state.is_finished() for trial in study.trials):
-            study.enqueue_trial({k: v for k, v in self._defaults.items() if self._within(k, v)})
-        while (count := sum(trial.state.is_finished() for trial in study.trials)) < (
-            self.file.trials
-        ):
-            trial = study.ask()
-            values = tuple(
-                (key, rounded(trial.suggest_float(key, *ends)))
-                for key, ends in self.file.ranges.items()
-            )
-            costs = self._costs(evaluator, self._training, values)
-            study.tell(trial, sum(costs) / len(costs))
-            progress(count + 1, study.best_value)
-        best = tuple((key, rounded(study.best_params[key])) for key in self.file.ranges)
-        before = self._costs(evaluator, self._validation, ())
-        return Tuned(best, judge(before, self._costs(evaluator, self._validation, best)))
+        self._study.first(self._defaults)
+        for number in range(1, self.file.trials + 1):
+            (values,) = self._study.ask()
+            costs = self._costs(fly, self._training, values)
+            self._study.tell([sum(costs) / len(costs)])
+            best, cost = self._study.best
+            progress(number, cost)
+        before = self._costs(fly, self._validation, ())
+        return Tuned(best, judge(before, self._costs(fly, self._validation, best)))
 
-    def _within(self, key: str, value: float) -> bool:
-        low, high = self.file.ranges[key]
-        return low <= value <= high
-
-    def _costs(self, evaluator: Evaluator, cases: Sequence[Case], values: Values) -> list[float]:
-        records = evaluator.fly([case.with_values(values) if values else case for case in cases])
+    def _costs(self, fly: Fly, cases: Sequence[Case], values: Values) -> list[float]:
+        records = fly([case.with_values(values) if values else case for case in cases])
         return [self._cost(record) for record in records]
 
     def _cost(self, record: Record) -> float:
@@ -177,30 +208,6 @@ def _defaults(case: Case, file: TuneFile) -> dict[str, float]:
             raise DocumentError(f"ranges.{key} is no number of the configuration")
         found[key] = float(value)
     return found
-
-
-def _study(folder: Path, file: TuneFile, training: Sequence[Case]) -> Any:
-    """The study in a folder, begun or continued. Its name is the hash of all that decides a cost,
-    so that no trial of another tuning or of other code counts."""
-    import optuna
-    from optuna.storages import JournalStorage
-    from optuna.storages.journal import JournalFileBackend
-
-    from offboard.campaign.swarm_sampler import SwarmSampler
-
-    optuna.logging.set_verbosity(optuna.logging.ERROR)
-    samplers: dict[str, Callable[[], Any]] = {
-        "tpe": lambda: optuna.samplers.TPESampler(seed=file.seed),
-        "cma": lambda: optuna.samplers.CmaEsSampler(seed=file.seed),
-        "swarm": lambda: SwarmSampler(file.ranges, file.seed),
-    }
-    decides = file.model_dump(mode="json", include={"ranges", "objective", "failure", "sampler"})
-    decided = [code_hash(), file.seed, decides, [case.key for case in training]]
-    name = hashlib.sha256(json.dumps(decided).encode()).hexdigest()[:16]
-    storage = JournalStorage(JournalFileBackend(str(folder / "tune.journal")))
-    return optuna.create_study(
-        storage=storage, study_name=name, sampler=samplers[file.sampler](), load_if_exists=True
-    )
 
 
 def profile(file: TuneFile, tuned: Tuned) -> str:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from offboard.cli.shared import CommandError, Workers, option, out, say
-from offboard.documents.errors import UserError
 
 if TYPE_CHECKING:
-    from offboard.campaign.campaign import Campaign, OpenWorkers, Shard, Summary
+    from offboard.campaign.run import Campaign, Shard, Summary
+    from offboard.campaign.workers import OpenFlyer
 
 EXIT_CODES = (
     "Exit codes: 0 all flights are flown and meet `require`, or --worst has found no failure; 1 a "
@@ -23,7 +23,7 @@ EXIT_CODES = (
     "on."
 )
 NAME = typer.Argument(metavar="NAME|FILE", help="Campaign: a shipped name or a file.")
-ENDED = "interrupted; finished flights are kept: run the same command again to go on"
+GROUPS_SHOWN = 30  # of a table in the terminal
 
 
 def campaign(
@@ -55,27 +55,27 @@ def campaign(
     if scheduler and workers:
         raise CommandError("--scheduler has its own workers: use it or --workers, not both")
     with out.status("planning"):
-        from offboard.campaign.campaign import Campaign
         from offboard.campaign.document import read_campaign
-        from offboard.campaign.execution import cluster_workers, local_workers
+        from offboard.campaign.run import Campaign
+        from offboard.campaign.workers import cluster_workers, local_workers
 
         part = _shard(shard)
         content, source = read_campaign(file)
         flown = Campaign(content, source, out_directory)
-    open_workers: OpenWorkers = (
+    open_workers: OpenFlyer = (
         partial(cluster_workers, scheduler) if scheduler else partial(local_workers, workers)
     )
     if worst is None:
-        _conclude(_fly(flown, open_workers, part), out_directory)
+        conclude(flown.fly(open_workers, out, part), flown)
     else:
         _search(flown, source, worst, open_workers)
 
 
 def _shard(text: str | None) -> Shard:
-    from offboard.campaign.campaign import Shard
+    from offboard.campaign.run import WHOLE, Shard
 
     if text is None:
-        return Shard()
+        return WHOLE
     matched = re.fullmatch(r"([0-9]{1,6})/([0-9]{1,6})", text)
     if not matched or not 1 <= int(matched[1]) <= int(matched[2]):
         raise CommandError(f"--shard {text}: give I/N with I from 1 to N, for example 2/4")
@@ -84,45 +84,50 @@ def _shard(text: str | None) -> Shard:
 
 @contextmanager
 def resumable() -> Iterator[None]:
-    """Exit with 4 for an error after which the same command may go on, a full disk for example."""
+    """Exit with 4 where the same command may go on: interrupted, a full disk for example."""
+    from offboard.campaign.run import Incomplete
+
     try:
         yield
-    except UserError as error:
-        raise CommandError(str(error), 4) from None
+    except (Incomplete, KeyboardInterrupt) as reason:
+        ended = str(reason) or "interrupted; finished flights are kept"
+        raise CommandError(f"{ended}: run the same command again to go on", 4) from None
 
 
-def _search(flown: Campaign, source: str, count: int, open_workers: OpenWorkers) -> None:
-    """Search for failures and print them; exits with 1 if there is one."""
-    from offboard.campaign.evaluate import Evaluator, Interrupted
-    from offboard.campaign.progress import Counter
-    from offboard.campaign.worst import keep, search_of
-    from offboard.link.stop import StopRequests
+def conclude(summary: Summary, flown: Campaign) -> None:
+    """Print what was flown; exits with 1 if a flight failed, 4 if some are missing."""
+    from offboard.campaign.table import groups, show
 
-    failures = None
-    with (
-        suppress(KeyboardInterrupt, Interrupted),
-        StopRequests() as stops,
-        open_workers() as workers,
-        Counter(out) as counter,
-    ):
-
-        def progress(done: int) -> None:
-            counter.count(done, max(done, most))
-
-        evaluator = Evaluator(
-            flown.results, flown.file.promises, workers, partial(counter.ending, stops), progress
+    directory = flown.directory
+    found = groups(summary.rows, flown.drawn)
+    if 0 < len(found) <= GROUPS_SHOWN:
+        out.print()
+        show(out, found)
+    flights = f"{len(summary.rows)} flights, {summary.failed} failed"
+    say(f"{flights}, {summary.missing} not flown yet" if summary.missing else flights)
+    if summary.kept:
+        say(f"kept: {len(summary.kept)} flights; `offboard report {summary.kept[0]}` shows one")
+    say(f"written: {directory / 'campaign.csv'} and campaign.html")
+    if summary.stopped or summary.mine_missing:
+        why = summary.stopped or "interrupted"
+        missing = f"{summary.mine_missing} of {summary.planned} flights are missing"
+        raise CommandError(
+            f"{why}: {missing}; go on with the same command and --out {directory}", 4
         )
-        search = search_of(flown, source, evaluator)
-        most = search.flights_most(count)
-        counter.count(0, most)
-        with resumable():
-            failures = search.find(count)
-    if failures is None:
-        raise CommandError(ENDED, 4)
-    table = keep(failures, flown)
-    flown.cases = list(evaluator.flown)
-    flown.write(flown.rows())
-    say(f"{len(evaluator.flown)} flights, {len(failures)} failures that differ")
+    if summary.failed:
+        raise CommandError(f"{summary.failed} flights failed; the table says why", 1)
+
+
+def _search(flown: Campaign, source: str, count: int, open_workers: OpenFlyer) -> None:
+    """Search for failures and print them; exits with 1 if there is one."""
+    from offboard.campaign.progress import Counter
+    from offboard.campaign.search import find, search_of
+
+    search = search_of(flown, source)
+    counter = Counter(out, search.flights_most(count))
+    with resumable(), flown.runner(open_workers, counter) as runner:
+        failures = find(flown, search, count, runner)
+    say(f"{len(flown.cases)} flights, {len(failures)} failures that differ")
     if failures:
         say(f"fly one again in {flown.directory}:")
     for failure in failures:
@@ -130,33 +135,6 @@ def _search(flown: Campaign, source: str, count: int, open_workers: OpenWorkers)
         record = failure.record
         say(f"  {record.margin:.2f} {record.weakest}: {changed or 'nothing changed'}", indent=4)
         say(f"    {failure.failing} of {failure.seeds} other seeds fail: {failure.case.line}", 4)
-    say(f"written: {table}")
+    say(f"written: {flown.directory / 'worst.csv'} and campaign.html")
     if failures:
         raise CommandError(f"{len(failures)} kinds of flights break a promise", 1)
-
-
-def _fly(flown: Campaign, open_workers: OpenWorkers, part: Shard) -> Summary:
-    from offboard.campaign.progress import Counter
-    from offboard.link.stop import StopRequests
-
-    summary: Summary | None = None
-    with suppress(KeyboardInterrupt), StopRequests() as stops, Counter(out) as counter:
-        summary = flown.fly(open_workers, part, partial(counter.ending, stops), counter.count)
-    if summary is None:
-        raise CommandError(ENDED, 4)
-    return summary
-
-
-def _conclude(summary: Summary, directory: Path) -> None:
-    """Print what was flown; exits with 1 if a flight failed, 4 if some are missing."""
-    flights = f"{len(summary.rows)} flights, {summary.failed} failed"
-    if summary.missing:
-        flights += f", {summary.missing} not flown yet"
-    say(flights)
-    say(f"written: {directory / 'campaign.html'}")
-    if summary.stopped:
-        raise CommandError(summary.stopped, 4)
-    if summary.mine_missing:
-        raise CommandError("interrupted: run the same command again to go on", 4)
-    if summary.failed:
-        raise CommandError(f"{summary.failed} flights failed; the table says why", 1)

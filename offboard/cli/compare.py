@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import nullcontext
-from typing import Annotated
+from functools import partial
+from typing import TYPE_CHECKING, Annotated, Any
 
+from offboard.cli.campaign import conclude
 from offboard.cli.shared import (
     FLIGHTS,
     Assignments,
@@ -21,9 +23,12 @@ from offboard.cli.shared import (
 )
 from offboard.documents import shipped
 
+if TYPE_CHECKING:
+    from offboard.campaign.workers import OpenFlyer
+
 EXIT_CODES = (
-    "Exit codes: 0 all flights are completed; 2 usage or configuration error; 4 a flight failed or "
-    "is missing."
+    "Exit codes: 0 all flights are completed; 1 a flight failed; 2 usage or configuration error; 4 "
+    "flights are missing: the same command with --out DIR goes on."
 )
 NAMES = "Names or files, separated by commas"
 
@@ -47,8 +52,9 @@ def compare(
 ) -> None:
     """Fly several controllers and compare them in one table.
 
-    Every controller flies every reference in every scenario with every seed. The table has medians
-    and ranges; the directory holds it as compare.csv, compare.json and compare.html.
+    Every controller flies every reference in every scenario with every seed: a campaign whose
+    flights keep their logs. The table has medians and ranges; the directory gets campaign.csv and
+    campaign.html. The same command with --out DIR continues what was interrupted.
     """
     if connect is None and (system or signing_key):
         raise CommandError("--system and --signing-key are options of --connect: add it")
@@ -64,25 +70,38 @@ def compare(
         f"seeds: {seeds}"
     )
     with out.status("checking that all of them can be flown"):
-        from offboard.campaign import compare as comparison
         from offboard.campaign.document import CampaignFile
-        from offboard.campaign.execution import ConnectedVehicle, local_workers
+        from offboard.campaign.run import Campaign
+        from offboard.campaign.workers import ConnectedVehicle, local_workers
         from offboard.link import clock
 
-        directory = out_directory or FLIGHTS / f"compare-{clock.local_stamp()}"
         file = CampaignFile(
             controllers=tuple(laws),
             references=tuple(references),
             scenarios=None if connect else tuple(scenarios),
             vehicles=(vehicle,) if vehicle else None,
+            parameters=dict(map(_parameter, assignments or ())),
             seeds=seeds,
+            keep="all",
         )
-        connected = ConnectedVehicle(connect, system, signing_key) if connect else None
-        jobs = comparison.plan(file, directory, assignments or (), connected)
-    flyer = nullcontext(connected) if connected else local_workers(workers)
-    problem = comparison.compare(jobs, flyer, directory, out)
-    if problem:
-        raise CommandError(problem, 4)
+        directory = out_directory or FLIGHTS / f"compare-{clock.local_stamp()}"
+        flown = Campaign(file, "compare", directory, link=connect, whole=True)
+    vehicle_at_link = ConnectedVehicle(system, signing_key)
+    open_flyer: OpenFlyer = (
+        (lambda: nullcontext(vehicle_at_link)) if connect else partial(local_workers, workers)
+    )
+    conclude(flown.fly(open_flyer, out, each=True), flown)
+
+
+def _parameter(assignment: str) -> tuple[str, tuple[Any]]:
+    """Key and value of `key.path=value`, as a campaign's parameter. Raises DocumentError."""
+    from offboard.documents.reading import override
+
+    value: Any = override({}, assignment)
+    key = assignment.partition("=")[0]
+    for part in key.split("."):
+        value = value[part.strip()]
+    return key, (value,)
 
 
 def _names(name: str, text: str, known: Sequence[str] = ()) -> list[str]:

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from offboard.cli.campaign import ENDED, resumable
+from offboard.cli.campaign import resumable
 from offboard.cli.shared import CommandError, Workers, check_new, option, out, say, write_new
 
 EXIT_CODES = (
@@ -29,38 +28,30 @@ def tune(
     """Tune parameters, and write a configuration that flies better.
 
     Minimises a figure over training flights, then flies the validation flights with and without
-    the result. It is written only if it is better with 95 % confidence. Study and results are in a
+    the result. It is written only if it is better with 95 % confidence. The flights are in a
     folder beside it: the same command goes on. The shipped tuning shows all keys of the file.
     """
     check_new(profile, "--out")
     with out.status("planning"):
-        from offboard.campaign.code import code_hash
-        from offboard.campaign.evaluate import Evaluator, Interrupted
-        from offboard.campaign.execution import local_workers
         from offboard.campaign.margin import Promises
         from offboard.campaign.progress import Counter
-        from offboard.campaign.results import Results
+        from offboard.campaign.results import Results, code_hash
+        from offboard.campaign.run import Runner
         from offboard.campaign.tune import Tuning, read_tune
         from offboard.campaign.tune import profile as text_of
-        from offboard.link.stop import StopRequests
+        from offboard.campaign.workers import local_workers
 
         tuning = Tuning(*read_tune(file))
         results = Results(profile.with_suffix(".tune"), code_hash())
-    tuned = None
+    counter = Counter(out, tuning.flights)
     with (
-        suppress(KeyboardInterrupt, Interrupted),
-        StopRequests() as stops,
-        local_workers(workers) as flyers,
         resumable(),
+        Runner(results, Promises(), partial(local_workers, workers), counter) as runner,
     ):
-        evaluator = Evaluator(results, Promises(), flyers, partial(Counter(out).ending, stops))
         tuned = tuning.run(
-            results.directory,
-            evaluator,
+            runner.fly,
             lambda number, cost: say(f"{number} of {tuning.file.trials} trials, best {cost:.4g}"),
         )
-    if tuned is None:
-        raise CommandError(ENDED, 4)
     for key, value in tuned.values:
         say(f"  {key}: {value:g}")
     say(f"validation: {tuned.verdict}")

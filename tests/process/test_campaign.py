@@ -9,6 +9,7 @@ import os
 import shlex
 import shutil
 import signal
+import subprocess
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -19,16 +20,17 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import Spawn, children
+from processes import SHORT, Spawn, children
+from rich.console import Console
 
-from offboard.campaign import code, execution, flight
-from offboard.campaign.campaign import Campaign, Shard, Summary
+from offboard.campaign import flight, workers
 from offboard.campaign.cases import Case, base_cases
 from offboard.campaign.document import CampaignFile, read_campaign
-from offboard.campaign.execution import Workers, cluster_workers, local_workers
 from offboard.campaign.flight import Job
 from offboard.campaign.margin import Promises
-from offboard.campaign.results import Record, Results
+from offboard.campaign.results import Record, Results, code_hash
+from offboard.campaign.run import WHOLE, Campaign, Shard, Summary
+from offboard.campaign.workers import Workers, cluster_workers, local_workers
 from offboard.documents.errors import DocumentError, UserError
 
 # Two flights of a few seconds
@@ -71,9 +73,9 @@ def inline() -> AbstractContextManager[Workers]:  # type: ignore[misc]
 def fly(
     flown: Campaign,
     open_workers: Callable[[], AbstractContextManager[Workers]] = inline,
-    shard: Shard = Shard(),  # noqa: B008
+    shard: Shard = WHOLE,
 ) -> Summary:
-    return flown.fly(open_workers, shard, lambda: False, lambda done, planned: None)
+    return flown.fly(open_workers, Console(file=io.StringIO()), shard)
 
 
 def table(directory: Path) -> dict[str, bytes]:
@@ -134,18 +136,25 @@ def test_the_command_of_a_row_flies_it_again(whole: Path, tmp_path: Path, spawn:
     assert score["rmse_position_m"] == float(row["rmse_position_m"])
 
 
+def await_flights(process: subprocess.Popen[str], directory: Path, count: int) -> list[Path]:
+    """The results below `directory` when there are `count` of them."""
+    deadline_s = time.monotonic() + 120.0
+    while len(found := list(directory.glob("*/results/*/*.json"))) < count:
+        assert time.monotonic() < deadline_s
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.02)
+    return found
+
+
 def test_killed_and_continued_it_is_the_same_table(
     whole: Path, tmp_path: Path, spawn: Spawn
 ) -> None:
     (tmp_path / "out.yaml").write_text(FILE)
     process = spawn("offboard", "campaign", "out.yaml", "--out", "out", "--workers", 1)
-    deadline_s = time.monotonic() + 120.0
-    while not (found := list((tmp_path / "out").glob("results/*/*.json"))):
-        assert time.monotonic() < deadline_s
-        assert process.poll() is None, process.communicate()
-        time.sleep(0.02)
+    found = await_flights(process, tmp_path, 1)
     process.send_signal(signal.SIGKILL)
-    process.wait()
+    _, errors = process.communicate()
+    assert errors == ""  # not even a warning of semaphores
     stamps = {path: path.stat().st_mtime_ns for path in found}
     assert fly(campaign(FILE, tmp_path / "out")).missing == 0
     assert {path: path.stat().st_mtime_ns for path in found} == stamps  # none is flown twice
@@ -184,19 +193,21 @@ def test_a_dask_cluster_of_two_workers_makes_the_same_table(whole: Path, tmp_pat
     assert table(tmp_path / "out") == table(whole)
 
 
-def test_a_scheduler_that_is_lost_keeps_what_is_finished(tmp_path: Path) -> None:
-    cluster = dask_cluster(1)
-    flown = campaign(FILE.replace("draws: 1", "draws: 2"), tmp_path / "out")
-    summary = flown.fly(
-        partial(cluster_workers, cluster.scheduler_address),
-        Shard(),
-        lambda: False,
-        lambda done, planned: cluster.close() if done == 1 else None,
-    )
-    assert "the dask scheduler" in summary.stopped
-    assert "was lost" in summary.stopped
-    assert 1 <= len(summary.rows) < 4
-    assert fly(flown).missing == 0
+def test_a_scheduler_that_is_lost_is_one_sentence_and_keeps_what_is_finished(
+    tmp_path: Path, spawn: Spawn
+) -> None:
+    (tmp_path / "out.yaml").write_text(FILE.replace("draws: 1", "draws: 3"))
+    with dask_cluster(1) as cluster:
+        process = spawn(
+            "offboard", "campaign", "out.yaml", "--out", "out",
+            "--scheduler", cluster.scheduler_address,
+        )  # fmt: skip
+        await_flights(process, tmp_path, 1)
+    _, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors.count("\n")) == (4, 1), errors
+    assert errors.startswith("the dask scheduler at ")
+    assert " was lost: " in errors
+    assert 1 <= len(rows(tmp_path / "out")) < 6
 
 
 @pytest.mark.parametrize("address", ["nonsense", "udp://127.0.0.1:9", "tcp://127.0.0.1:9"])
@@ -269,14 +280,14 @@ def test_a_lack_of_memory_is_no_record_of_the_case(monkeypatch: pytest.MonkeyPat
     monkeypatch.setattr(flight, "fly", full)
     case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
     with pytest.raises(UserError, match="no flight can be flown here: out of memory"):
-        flight.fly_job(Job(case, Promises(), code.code_hash()))
+        flight.fly_job(Job(case, Promises(), code_hash()))
 
 
 def test_results_of_other_code_are_refused_and_kept(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     Results(tmp_path, "0123456789ab").put("case", Record(0, "flown and landed", 1.0, "error"))
-    with pytest.raises(UserError, match=f"other code .0123456789ab, this is {code.code_hash()}"):
+    with pytest.raises(UserError, match=f"other code .0123456789ab, this is {code_hash()}"):
         campaign(FILE, tmp_path)
     assert Results(tmp_path, "0123456789ab").finished() == 1
 
@@ -316,14 +327,14 @@ def dies(job: Job) -> Record:
 def test_a_flight_whose_worker_dies_twice_is_a_row(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(execution, "fly_job", dies)
+    monkeypatch.setattr(workers, "fly_job", dies)
     case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
     jobs = [
         Job(replace(case, seed=seed), Promises(), str(tmp_path), tmp_path / f"{seed}")
         for seed in (1, 2)
     ]
-    with local_workers(1) as workers:
-        ended = {job.case.seed: record for job, record in workers.fly(jobs, lambda: False)}
+    with local_workers(1) as opened:
+        ended = {job.case.seed: record for job, record in opened.fly(jobs, lambda: False)}
     assert (tmp_path / "deaths").read_text() == "died\n" * 2
     assert ended[1].exit_code == 0
     assert (ended[2].exit_code, ended[2].sentence) == (4, "the process that flew it ended, twice")
@@ -335,7 +346,7 @@ def test_a_kept_flight_appears_when_it_is_complete(
     """One that ends before leaves no directory that looks like a kept flight."""
     case = campaign(FILE, tmp_path / "out").cases[0]
     kept = tmp_path / "flights" / case.key
-    job = Job(case, Promises(), code.code_hash(), kept)
+    job = Job(case, Promises(), code_hash(), kept)
 
     def ends(directory: Path, *score: object) -> None:
         assert (directory / "flight.tlog").is_file()
@@ -350,21 +361,53 @@ def test_a_kept_flight_appears_when_it_is_complete(
     assert {path.name for path in kept.iterdir()} >= {"flight.tlog", "flight.yaml", "score.json"}
 
 
-def test_an_interrupted_campaign_leaves_no_process(tmp_path: Path, spawn: Spawn) -> None:
-    (tmp_path / "c.yaml").write_text(FILE.replace("draws: 1", "draws: 9"))
-    process = spawn("offboard", "campaign", "c.yaml", "--out", "out", "--workers", 1)
-    deadline_s = time.monotonic() + 120.0
-    while not list((tmp_path / "out").glob("results/*/*.json")):
-        assert time.monotonic() < deadline_s
-        time.sleep(0.02)
-    workers = children(process.pid)
-    process.send_signal(signal.SIGINT)
+def test_an_interrupted_comparison_keeps_what_landed_and_goes_on(
+    spawn: Spawn, tmp_path: Path
+) -> None:
+    """As a terminal interrupts: the whole group of processes."""
+    command = (
+        "offboard", "compare", "--controllers", "lqr", "--reference", "hover", "--scenario", "calm",
+        "--seeds", 6, "--workers", 2, "--out", "x", *SHORT,
+    )  # fmt: skip
+    process = spawn(*command)
+    await_flights(process, tmp_path, 1)
+    started = children(process.pid)
+    os.killpg(process.pid, signal.SIGINT)
     output, errors = process.communicate(timeout=60)
-    assert process.returncode == 4, (output, errors)
-    assert "run the same command again to go on" in errors
-    while any(Path(f"/proc/{pid}").exists() for pid in workers):
+    assert process.returncode == 4
+    assert (errors.count("\n"), "Traceback" in errors) == (1, False)
+    assert "interrupted: flights in the air are finished" in output
+    flown = rows(tmp_path / "x")
+    assert 1 <= len(flown) <= 4
+    assert f"interrupted: {6 - len(flown)} of 6 flights are missing; go on with" in errors
+    assert "not flown yet" in (tmp_path / "x" / "campaign.html").read_text(encoding="utf-8")
+    assert len(list((tmp_path / "x" / "flights").glob("lqr-hover-calm-*/score.json"))) == len(flown)
+    deadline_s = time.monotonic() + 30.0
+    while any(Path(f"/proc/{pid}").exists() for pid in started):
         assert time.monotonic() < deadline_s
         time.sleep(0.02)
+    process = spawn(*command)
+    output, errors = process.communicate(timeout=120)
+    assert (process.returncode, errors) == (0, "")
+    assert f"6 flights, {len(flown)} already flown\n" in output
+    assert "kept: 6 flights; `offboard report x/flights/lqr-hover-calm-" in output
+    again = rows(tmp_path / "x")
+    assert len(again) == 6
+    assert all(row in again for row in flown)
+
+
+def test_interrupted_while_its_processes_load_it_ends_in_order(
+    spawn: Spawn, tmp_path: Path
+) -> None:
+    (tmp_path / "c.yaml").write_text(FILE.replace("draws: 1", "draws: 9"))
+    process = spawn("offboard", "campaign", "c.yaml", "--out", "out", "--workers", 2)
+    while process.poll() is None and len(children(process.pid)) < 3:  # a tracker, two of ours
+        time.sleep(0.01)
+    os.killpg(process.pid, signal.SIGINT)
+    output, errors = process.communicate(timeout=60)
+    assert (process.returncode, errors.count("\n")) == (4, 1), errors
+    assert "the process that flew it ended" not in output
+    assert "flights are missing" in errors
 
 
 def test_quick_campaign_is_shipped() -> None:

@@ -286,15 +286,15 @@ def test_a_height_with_the_time_to_land_is_flown(call: Call, tmp_path: Path) -> 
     assert (code, "no vehicle heard" in said) == (3, True)
 
 
-def test_a_comparison_on_a_full_disk_says_which_file_is_missing(
+def test_a_comparison_on_a_full_disk_says_what_cannot_be_written(
     call: Call, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def flown(*_: object) -> Record:
         limit = resource.getrlimit(resource.RLIMIT_FSIZE)[1]
         resource.setrlimit(resource.RLIMIT_FSIZE, (10, limit))
-        return Record(3, "no vehicle", -1.0, "completed")
+        return Record(4, "no vehicle", -1.0, "completed")
 
-    monkeypatch.setattr("offboard.campaign.execution.recorded", flown)
+    monkeypatch.setattr("offboard.campaign.workers.recorded", flown)
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         code, said = call(
@@ -303,7 +303,7 @@ def test_a_comparison_on_a_full_disk_says_which_file_is_missing(
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert (code, said.count("\n")) == (4, 1)
-    assert said.endswith("; x/compare.csv cannot be written (File too large)\n")
+    assert said.startswith("x cannot be written (File too large); ")
 
 
 def process(

@@ -6,6 +6,8 @@ The first two are executors of `concurrent.futures`. A worker loads its code onc
 
 from __future__ import annotations
 
+import itertools
+import logging
 import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor
@@ -15,7 +17,6 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from offboard.analysis.workers import open_worker, processors, run_all
-from offboard.campaign.cases import Case
 from offboard.campaign.flight import Job, fly_job, recorded
 from offboard.campaign.margin import NOT_FLOWN
 from offboard.campaign.results import Record
@@ -25,7 +26,7 @@ from offboard.documents.extras import install
 from offboard.flight.companion import STOPPED
 from offboard.flight.phases import ExitCode
 from offboard.link.stream_sources import connect
-from offboard.run.request import FlightRequest, fly_request
+from offboard.run.request import fly_request
 
 CONNECT_S = 5.0
 SCHEMES = ("tcp", "tls")
@@ -42,6 +43,9 @@ class Flyer(Protocol):
     def fly(
         self, jobs: Sequence[Job], ending: Callable[[], bool]
     ) -> Iterator[tuple[Job, Record]]: ...
+
+
+OpenFlyer = Callable[[], AbstractContextManager[Flyer]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,7 +90,7 @@ def _killed(result: Record | BaseException) -> Record | BaseException:
 
 def _record_of(result: Record | BaseException) -> Record:
     if isinstance(result, CancelledError):
-        raise UserError("the dask scheduler was lost; finished flights are kept")
+        raise UserError("the dask scheduler was lost")
     if isinstance(result, BaseException):
         raise result
     return result
@@ -94,48 +98,47 @@ def _record_of(result: Record | BaseException) -> Record:
 
 @dataclass(frozen=True, slots=True)
 class ConnectedVehicle:
-    """The vehicle at a link, a real one perhaps. Its flights follow each other in this process;
-    after one that was refused, aborted or ended by the pilot, nothing more is flown. Each keeps its
-    log."""
+    """The vehicle at the link of its cases, a real one perhaps. Its flights follow each other in
+    this process; after one that was refused, aborted or ended by the pilot, nothing more is flown.
+    """
 
-    connection: str
     system_id: int | None = None
     signing_key: Path | None = None
 
-    def request(self, case: Case, directory: Path) -> FlightRequest:
-        """The flight of a case. Unless the case sets limits.begin_armed, an armed vehicle is
-        refused: somebody else is flying it."""
-        request = case.request(directory)
-        return replace(
-            request,
-            sitl=False,
-            assignments=("limits.begin_armed=false", *request.assignments),
-            connection=self.connection,
-            system_id=self.system_id,
-            signing_key=self.signing_key,
-        )
-
     def fly(self, jobs: Sequence[Job], ending: Callable[[], bool]) -> Iterator[tuple[Job, Record]]:
-        """Fly jobs, as a `Flyer` does, without one that the operator stops. Raises UserError after
-        a flight that was refused or aborted."""
+        """Fly jobs, as a `Flyer` does. A flight that the operator stops, or the vehicle refuses,
+        has no record, and is flown by the next run. Raises UserError after one that was refused or
+        aborted."""
         for job in jobs:
             if ending():
                 return
             record = self._record(job)
             if record.sentence.startswith(STOPPED):
                 return  # the flight received the interrupt
-            yield job, record
+            if record.exit_code != ExitCode.REFUSED:
+                yield job, record
             if record.exit_code in (ExitCode.REFUSED, ExitCode.ABORTED):
                 case = job.case
                 raise UserError(
                     f"ended with {case.controller} on {case.reference}, seed {case.seed} "
-                    f"({record.sentence})"
+                    f"({record.sentence}); nothing more was flown"
                 )
 
     def _record(self, job: Job) -> Record:
         assert job.kept is not None
-        request = self.request(job.case, job.kept)
+        _move_aside(job.kept)
+        request = replace(
+            job.case.request(job.kept), system_id=self.system_id, signing_key=self.signing_key
+        )
         return recorded(request, job.promises, lambda config, directory: fly_request(request))
+
+
+def _move_aside(directory: Path) -> None:
+    """Rename the log of a flight that has no record, so that it can be flown again."""
+    numbers = itertools.count(1)
+    aside = (directory.with_name(f"{directory.name}-before-{number}") for number in numbers)
+    if directory.exists():
+        directory.rename(next(path for path in aside if not path.exists()))
 
 
 @contextmanager
@@ -173,6 +176,8 @@ def cluster_workers(address: str) -> Iterator[Workers]:
         from distributed import Client
     except ImportError:
         raise UserError(f"--scheduler needs dask: {install('cluster')}") from None
+    for logger in ("distributed", "distributed.client"):  # a scheduler that is lost is our sentence
+        logging.getLogger(logger).setLevel(logging.CRITICAL)
     kind, host, port = _split(address)
     try:
         connect(host, port).close()  # at once, where dask tries for the whole of its timeout
@@ -204,7 +209,4 @@ def _split(address: str) -> tuple[str, str, int]:
 
 def _check(client: Any, address: str) -> None:
     if client.status != "running":
-        raise UserError(
-            f"the dask scheduler at {address} was lost; finished flights are kept: run the same "
-            "command again, with it or without"
-        )
+        raise UserError(f"the dask scheduler at {address} was lost")

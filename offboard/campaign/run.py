@@ -1,0 +1,320 @@
+"""A campaign flown: plan, fly what is not finished, write table and page.
+
+The table is made of the folder of results alone, in the order of the plan. So it is the same
+whether the flights were flown at once, in shards, on a cluster, or after an interruption.
+`compare`, `--worst` and `tune` fly their cases in the same way (`Runner`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from rich.console import Console
+
+from offboard.analysis.requirement import Requirement
+from offboard.campaign.cases import Case, expand
+from offboard.campaign.document import ALL, CampaignFile
+from offboard.campaign.flight import Job
+from offboard.campaign.margin import Promises
+from offboard.campaign.page import page
+from offboard.campaign.progress import Counter
+from offboard.campaign.results import Record, Results, code_hash
+from offboard.campaign.table import ERROR, Row, as_csv, columns, digits, groups, row_of
+from offboard.campaign.workers import Flyer, OpenFlyer
+from offboard.documents.errors import DocumentError, UserError, naming
+from offboard.link import clock
+from offboard.link.stop import StopRequests
+from offboard.run.configuration import build_controller, build_track
+from offboard.run.in_memory import check_scenario_text
+from offboard.run.request import FlightRequest
+
+KEPT = "flights"
+KEPT_FILES = {"report": "report.html", "log": "flight.tlog"}
+FIRST_TABLE_S = 5.0  # from the first flight to the first table
+TABLE_SHARE = 0.02  # of the time is for tables while it flies
+
+
+class Incomplete(Exception):
+    """No further flight begins. `str()` says why, empty by request."""
+
+
+class Runner:
+    """Context manager that flies cases: what is in the folder of results is not flown again.
+
+    `open_flyer` is entered when the first case is missing. With `keep`, a directory, the log of
+    each flight is kept in it. `written` is called after each flight.
+    """
+
+    def __init__(
+        self,
+        results: Results,
+        promises: Promises,
+        open_flyer: OpenFlyer,
+        counter: Counter,
+        *,
+        keep: Path | None = None,
+        written: Callable[[], None] = lambda: None,
+    ) -> None:
+        self._results = results
+        self._promises = promises
+        self._open_flyer = open_flyer
+        self._counter = counter
+        self._keep = keep
+        self._written = written
+        self._stack = ExitStack()
+        self._flyer: Flyer | None = None
+        self.flown: dict[str, Case] = {}  # by key, in order
+
+    def __enter__(self) -> Self:
+        stops = self._stack.enter_context(StopRequests())
+        self._ending = partial(self._counter.ending, stops)
+        self._stack.enter_context(self._counter)
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        value: BaseException | None,
+        trace: TracebackType | None,
+    ) -> bool | None:
+        return self._stack.__exit__(kind, value, trace)
+
+    def fly(self, cases: Sequence[Case]) -> list[Record]:
+        """The records of these cases, in their order. Raises Incomplete when one is missing, and
+        UserError where no flight can begin."""
+        known = {case.key: self._results.get(case.key) for case in cases}
+        missing = [case for case in cases if known[case.key] is None]
+        new = {case.key: case for case in cases if case.key not in self.flown}
+        self._counter.begin(sum(known[key] is not None for key in new))
+        for job, record in self._fly(missing, self._keep):
+            known[job.case.key] = record
+            try:
+                self._results.put(job.case.key, record)
+                self._written()
+            except UserError as error:
+                raise Incomplete(str(error)) from None
+            self._counter.ended(_line(job, record))
+        found = [known[case.key] for case in cases]
+        records = [record for record in found if record is not None]
+        if len(records) < len(found):
+            raise Incomplete
+        self.flown |= new
+        return records
+
+    def keep(self, cases: Sequence[Case], directory: Path) -> None:
+        """Fly cases again, with their logs: the same seed gives the same flight."""
+        missing = [case for case in cases if not (directory / case.folder).exists()]
+        for _ in self._fly(missing, directory):
+            pass
+
+    def _fly(self, cases: Sequence[Case], keep: Path | None) -> Iterator[tuple[Job, Record]]:
+        if not cases:
+            return
+        if self._flyer is None:
+            self._flyer = self._stack.enter_context(self._open_flyer())
+        folder = keep.absolute() if keep else None
+        jobs = [
+            Job(case, self._promises, code_hash(), folder / case.folder if folder else None)
+            for case in cases
+        ]
+        try:
+            yield from self._flyer.fly(jobs, self._ending)
+        except UserError as error:
+            raise Incomplete(str(error)) from None
+
+
+def _line(job: Job, record: Record) -> str:
+    error_m = record.figures.get(ERROR, math.nan)
+    end = f"{digits(error_m)} m" if record.completed else record.sentence
+    return f"{job.case.folder.rpartition('-')[0]}: {end}"
+
+
+@dataclass(frozen=True, slots=True)
+class Shard:
+    """The part of the cases that one of several computers flies: `number` of `count`."""
+
+    number: int = 1
+    count: int = 1
+
+    def of(self, cases: Sequence[Case]) -> list[Case]:
+        """Every `count`-th case."""
+        return list(cases[self.number - 1 :: self.count])
+
+
+WHOLE = Shard()
+
+
+@dataclass(frozen=True, slots=True)
+class Summary:
+    """The state of a campaign. `mine_missing` of this shard; `stopped`: why flights are missing, if
+    not by request; `kept`: the directories of the flights whose logs are kept."""
+
+    planned: int
+    rows: Sequence[Row]
+    mine_missing: int
+    stopped: str
+    kept: Sequence[Path]
+
+    @property
+    def missing(self) -> int:
+        return self.planned - len(self.rows)
+
+    @property
+    def failed(self) -> int:
+        return sum(bool(row.failed) for row in self.rows)
+
+
+class Campaign:
+    """The campaign of a file in a directory, on the simulator or at `link`.
+
+    Raises DocumentError where nothing of it can be flown (with `whole`: where a combination cannot)
+    and UserError for a directory that cannot be used, before the first flight.
+    """
+
+    def __init__(
+        self,
+        file: CampaignFile,
+        source: str,
+        directory: Path,
+        *,
+        link: str | None = None,
+        whole: bool = False,
+    ) -> None:
+        self.file = file
+        self.directory = directory
+        with naming(source):
+            self.cases = expand(file, link)
+            check(self.cases, whole=whole)
+        self.results = Results(directory, code_hash())
+        self._requirements = [Requirement.parse(text) for text in file.require]
+        self._next_table_s = math.inf
+
+    def runner(self, open_flyer: OpenFlyer, counter: Counter) -> Runner:
+        """What flies the cases of this campaign, and writes table and page while it does."""
+        keep = self.directory / KEPT if self.file.keep == ALL else None
+        return Runner(
+            self.results, self.file.promises, open_flyer, counter, keep=keep, written=self._written
+        )
+
+    def fly(
+        self, open_flyer: OpenFlyer, console: Console, shard: Shard = WHOLE, *, each: bool = False
+    ) -> Summary:
+        """Fly what is not finished and write the table. With `each`, a line for each flight. Raises
+        UserError where no worker can be had."""
+        mine = shard.of(self.cases)
+        stopped = ""
+        try:
+            with self.runner(open_flyer, Counter(console, len(mine), each=each)) as runner:
+                runner.fly(mine)
+                if len(rows := self.rows()) == len(self.cases):
+                    runner.keep(self._worst(rows), self.directory / KEPT)
+        except Incomplete as reason:
+            stopped = str(reason)
+        except KeyboardInterrupt:
+            pass
+        finished = -1
+        try:
+            while finished != self.results.finished():  # another shard may have ended meanwhile
+                finished = self.results.finished()
+                rows = self.rows()
+                self.write(rows, stopped)
+        except UserError as error:
+            stopped = stopped or str(error)
+        have = {row.case.key for row in rows}
+        missing = sum(case.key not in have for case in mine)
+        folders = (self.directory / KEPT / row.case.folder for row in rows)
+        kept = [path for path in folders if path.exists()]
+        return Summary(len(self.cases), rows, missing, stopped, kept)
+
+    def _worst(self, rows: Sequence[Row]) -> list[Case]:
+        flown = (row for row in rows if row.record.figures)
+        return [row.case for row in sorted(flown, key=lambda row: row.severity)[: self.file.kept]]
+
+    def rows(self) -> list[Row]:
+        """The finished flights of all shards, in the order of the plan."""
+        found = ((case, self.results.get(case.key)) for case in self.cases)
+        return [row_of(case, record, self._requirements) for case, record in found if record]
+
+    @property
+    def drawn(self) -> frozenset[str]:
+        """The keys whose values are drawn or searched: they make no groups."""
+        parts = (self.file.sample, self.file.search)
+        keys = frozenset(key for part in parts if part for key in part.ranges)
+        return keys - self.file.parameters.keys()
+
+    def write(self, rows: Sequence[Row], stopped: str = "") -> None:
+        """Write table and page."""
+        write = self.results.write
+        for case in self.cases:
+            if case.text and not (path := self.directory / case.scenario_file).exists():
+                write(path, case.text.encode())
+        write(self.directory / "campaign.csv", as_csv(columns(rows)).encode())
+        absent = len(self.cases) - len(rows)
+        missing = [f"{absent} of {len(self.cases)} flights are not flown yet"] if absent else []
+        missing += [stopped] if stopped else []
+        text = page(groups(rows, self.drawn), missing, self._kept(rows))
+        write(self.directory / "campaign.html", text.encode())
+
+    def _written(self) -> None:
+        """Write what is known, rarely enough that it does not delay the flights."""
+        now_s = clock.monotonic_s()
+        if self._next_table_s == math.inf:
+            self._next_table_s = now_s + FIRST_TABLE_S
+        if now_s >= self._next_table_s:
+            self.write(self.rows())
+            took_s = clock.monotonic_s() - now_s
+            self._next_table_s = now_s + max(FIRST_TABLE_S, took_s / TABLE_SHARE)
+
+    def _kept(self, rows: Sequence[Row]) -> dict[str, dict[str, str]]:
+        """Files of kept flights by case, relative to the page."""
+        if not self.file.keep:
+            return {}
+        return {
+            row.case.key: {
+                name: f"{KEPT}/{row.case.folder}/{file}"
+                for name, file in KEPT_FILES.items()
+                if (self.directory / KEPT / row.case.folder / file).exists()
+            }
+            for row in rows
+        }
+
+
+def check(cases: Sequence[Case], *, whole: bool = False) -> None:
+    """Raise DocumentError if none of the cases can be flown, with what is wrong. A single one that
+    cannot is no error: it becomes a row with its reason; with `whole` it is one."""
+    distinct: dict[object, Case] = {}
+    for case in cases:
+        names = (case.config, case.controller, case.reference, case.vehicle, case.firmware)
+        keys = tuple(key for key, _ in case.values)
+        distinct.setdefault((*names, case.sim_vehicle, case.scenario, keys), case)
+    problems: list[str] = []
+    for case in distinct.values():
+        try:
+            _check_one(case)
+        except DocumentError as error:
+            problems += error.problems
+        else:
+            if not whole:
+                return
+    if problems:
+        raise DocumentError(*dict.fromkeys(problems))
+
+
+def _check_one(case: Case) -> None:
+    if case.text:
+        check_scenario_text(case.text, f"scenario {case.scenario}")
+    check_request(case.request(Path(), None if case.text or case.link else case.scenario))
+
+
+def check_request(request: FlightRequest) -> None:
+    """Raise DocumentError, with what is wrong, if a flight cannot be flown."""
+    config = request.resolve()
+    build_track(config)
+    build_controller(config)

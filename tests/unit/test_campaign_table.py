@@ -1,0 +1,314 @@
+"""Campaigns against known answers: groups, best, margin, table, page, progress, one vehicle."""
+
+from __future__ import annotations
+
+import csv
+import io
+import itertools
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from pathlib import Path
+
+import numpy as np
+import pytest
+from browser import Opened, opening
+from rich.console import Console
+from typer.testing import CliRunner
+
+from offboard.campaign import workers
+from offboard.campaign.cases import Case
+from offboard.campaign.document import CampaignFile
+from offboard.campaign.margin import LOWEST, Promises, terms
+from offboard.campaign.page import FIGURES, page
+from offboard.campaign.progress import Counter
+from offboard.campaign.results import Record
+from offboard.campaign.run import Campaign
+from offboard.campaign.table import Group, groups, row_of, show, wilson
+from offboard.campaign.workers import ConnectedVehicle
+from offboard.cli.commands import app
+from offboard.documents.errors import DocumentError
+from offboard.link import clock
+from offboard.run.request import FlightRequest
+
+LAWS = ("pso", "lqr", "an/uncommonly/long/name.yaml", "lost")
+SCENARIOS = ("calm", "all_together")
+# Position RMSE in m of seeds 1, 2, 3
+ERRORS_M = {
+    ("pso", "calm"): (0.010, 0.012, 0.011),
+    ("lqr", "calm"): (0.0109, 0.0119, 0.0121),  # within the range of pso's flights
+    (LAWS[2], "calm"): (0.0125, 0.0125, 0.0125),
+    ("lost", "calm"): (0.001, 0.001, math.nan),  # the lowest, but one failed
+    ("pso", "all_together"): (0.2, 0.2, 0.2),
+    ("lqr", "all_together"): (0.201, 0.201, 0.201),  # within one per cent
+    (LAWS[2], "all_together"): (0.21, 0.19, 0.21),
+    ("lost", "all_together"): (math.nan,) * 3,
+}
+WHY = "7.1 m <b>away</b>"
+
+
+def record(error_m: float) -> Record:
+    if math.isnan(error_m):
+        return Record(4, WHY, -1.0, "completed")
+    figures = {name: error_m * (1 + index) for index, name in enumerate(FIGURES)}
+    return Record(0, "flown and landed", 0.9, "error", figures)
+
+
+@pytest.fixture(scope="module")
+def flown() -> list[Group]:
+    rows = [
+        row_of(Case("flight", law, "lemniscate", None, None, "px4", scenario, seed), ended, ())
+        for scenario, law in itertools.product(SCENARIOS, LAWS)
+        for seed, ended in enumerate(map(record, ERRORS_M[law, scenario]), 1)
+    ]
+    return groups(rows)
+
+
+def group_of(flown: list[Group], law: str, scenario: str) -> Group:
+    (found,) = [g for g in flown if (g.name, g.block) == (law, f"lemniscate, {scenario}")]
+    return found
+
+
+def test_best_is_the_lowest_median_of_those_that_all_flew_and_its_equals(
+    flown: list[Group],
+) -> None:
+    best = {(group.name, group.block.rpartition(" ")[2]) for group in flown if group.best}
+    assert best == {(law, scenario) for law in ("pso", "lqr") for scenario in SCENARIOS}
+
+
+def test_median_and_range_are_of_the_flights_that_landed(flown: list[Group]) -> None:
+    lqr, lost = group_of(flown, "lqr", "calm"), group_of(flown, "lost", "calm")
+    assert lqr.spread("rmse_position_m") == (0.0109, 0.0119, 0.0121)
+    assert (lost.successes, lost.spread("rmse_position_m")[1]) == (2, 0.001)
+    assert lost.reasons == {WHY: [3]}
+
+
+def test_a_value_names_a_group_where_it_differs() -> None:
+    def name(drawn: frozenset[str]) -> list[str]:
+        case = Case("flight", "lqr", "hover", None, None, "px4", "calm", 1)
+        rows = [
+            row_of(case.with_values((("a.b", 1), ("a.c", value))), record(0.1), ())
+            for value in (2, 3)
+        ]
+        return [group.name for group in groups(rows, drawn)]
+
+    assert name(frozenset()) == ["lqr a.c=2", "lqr a.c=3"]
+    assert name(frozenset({"a.c"})) == ["lqr"]
+
+
+@pytest.mark.parametrize("width", [60, 80, 120, 200])
+def test_no_line_of_the_table_is_wider_than_the_window(flown: list[Group], width: int) -> None:
+    text = io.StringIO()
+    show(Console(file=text, width=width), flown)
+    told = text.getvalue().splitlines()
+    assert max(map(len, told)) <= width
+    whole = "\n".join(told)
+    for words in (*LAWS[:2], *SCENARIOS, "[0.0109\N{EN DASH}0.0121]", "0.0119", "lost (2 of 3)"):
+        assert words in whole, words
+    assert [line.split()[1] for line in told if line.startswith("* ")][:4] == ["pso", "lqr"] * 2
+    assert f"seed 1, 2, 3: {WHY}" in " ".join(whole.split())
+
+
+def test_the_page_shows_every_group_and_the_worst_flights_without_a_network(
+    flown: list[Group], tmp_path: Path
+) -> None:
+    file = tmp_path / "campaign.html"
+    file.write_text(page(flown, ["not flown: <i>calm</i>"]), encoding="utf-8")
+    with opening(file, width=1280) as opened:
+        assert opened.problems == opened.fetched == opened.colliding() == []
+        assert opened.page.locator("article").first.locator(".boxlayer .trace").count() > 0
+        assert opened.page.locator("table").first.locator("tr").count() == 1 + len(flown)
+        assert opened.page.locator("tr.best").count() == 4
+        axes = ("x", "x2", "x3", "x4", "x5")
+        titles = [_boxes(opened, f".g-{axis}title") for axis in axes]
+        numbers = [_boxes(opened, f".{axis}tick text") for axis in axes]
+        assert min(map(len, numbers)) >= 2
+        for panels in (titles, numbers):
+            for (_, right), (left, _) in itertools.pairwise(itertools.chain.from_iterable(panels)):
+                assert right < left
+        told = opened.page.inner_text("main")
+        opened.resize(400)
+        assert opened.width_px() == 400
+        for scheme in ("light", "dark"):
+            opened.switch(scheme)
+            assert opened.unreadable() == opened.problems == []
+    for words in (*LAWS, *SCENARIOS, WHY, "3 of 3 failed", "<i>calm</i>", "--seed 3"):
+        assert words in told, words
+
+
+def _boxes(opened: Opened, selector: str) -> list[tuple[float, float]]:
+    """Left and right edges in pixels, from left to right."""
+    found = [each.bounding_box() for each in opened.page.locator(selector).all()]
+    return sorted((box["x"], box["x"] + box["width"]) for box in found if box)
+
+
+def test_the_interval_of_a_success_rate_is_wilsons() -> None:
+    z, n, p = 1.959963985, 20, 18 / 20
+    middle = (p + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * math.sqrt(p * (1 - p) / n + z * z / (4 * n * n))
+    assert wilson(18, 20) == pytest.approx((middle - half, middle + half), rel=1e-8)
+    assert wilson(0, 5)[0] == 0.0
+
+
+def test_the_time_left_counts_the_flights_of_this_run(monkeypatch: pytest.MonkeyPatch) -> None:
+    """100 flights, of which an earlier run has flown 40; one in 2 s."""
+    now_s = [0.0]
+    monkeypatch.setattr(clock, "monotonic_s", lambda: now_s[0])
+    told = Console(file=io.StringIO(), width=80)
+    counter = Counter(told, 100)
+    counter.begin(40)
+    for _ in range(60):
+        now_s[0] += 2.0
+        counter.ended("0.1 m")
+    lines = told.file.getvalue().splitlines()  # type: ignore[attr-defined]
+    assert lines[0] == "100 flights, 40 already flown"
+    assert "45 of 100 flights, 30 a minute, 2 min left" in lines
+    assert "95 of 100 flights, 30 a minute, 10 s left" in lines
+    assert len(lines) == 13
+
+
+@pytest.mark.parametrize("terminal", [False, True], ids=["piped", "terminal"])
+def test_progress_is_shown_before_the_first_flight_ends(
+    tmp_path: Path, terminal: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Piped, a line for each flight; on a terminal, a bar that is gone at the end."""
+    monkeypatch.setenv("TERM", "xterm")
+    text, shown = io.StringIO(), []
+
+    @contextmanager
+    def open_flyer() -> Iterator[ConnectedVehicle]:
+        shown.append(text.getvalue())
+        yield ConnectedVehicle()
+
+    monkeypatch.setattr(workers, "recorded", lambda *_: record(1.0))
+    console = Console(file=text, width=80, force_terminal=terminal)
+    file = CampaignFile(controllers=("pso", "lqr"), references=("hover",), keep="all")
+    summary = Campaign(file, "x", tmp_path, link="udpin::0").fly(open_flyer, console, each=True)
+    assert (summary.missing, summary.failed, summary.stopped) == (0, 0, "")
+    assert ("0/2" if terminal else "2 flights\n") in shown[0]
+    lines = [line for line in text.getvalue().splitlines() if " of 2 flights, " in line]
+    ended = [line.partition(" left: ")[2] for line in lines]
+    assert ended == ([] if terminal else [f"{law}-hover-connected-1: 1.00 m" for law in LAWS[:2]])
+
+
+@pytest.mark.parametrize(
+    ("exit_code", "begun", "rows"),
+    [
+        (2, "pso lqr pid mpc", "pso lqr pid mpc"),  # a file that cannot be flown
+        (3, "pso lqr", "pso"),  # refused: flown by the next run
+        (4, "pso lqr", "pso lqr"),  # aborted
+    ],
+)
+def test_on_one_vehicle_nothing_is_flown_after_a_refused_or_aborted_flight(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, exit_code: int, begun: str, rows: str
+) -> None:
+    flown: list[str] = []
+
+    def fly(request: FlightRequest, *_: object) -> Record:
+        assert (request.sitl, request.connection) == (False, "udpin:127.0.0.1:0")
+        flown.append(str(request.choices["controller"]))
+        request.directory.mkdir(parents=True)
+        if flown[-1] == "lqr":
+            return Record(exit_code, "left OFFBOARD for AUTO.LOITER", -1.0, "completed")
+        return record(1.0)
+
+    monkeypatch.setattr(workers, "recorded", fly)
+    laws = ("pso", "lqr", "pid", "mpc")
+    file = CampaignFile(controllers=laws, references=("hover",), keep="all")
+
+    def again() -> str:
+        campaign = Campaign(file, "x", tmp_path, link="udpin:127.0.0.1:0")
+        summary = campaign.fly(lambda: nullcontext(ConnectedVehicle()), Console(file=io.StringIO()))
+        return summary.stopped
+
+    stopped = again()
+    lines = list(csv.DictReader((tmp_path / "campaign.csv").open(encoding="utf-8")))
+    assert " ".join(flown) == begun
+    assert [(line["controller"], line["scenario"]) for line in lines] == [
+        (law, "connected") for law in rows.split()
+    ]
+    assert "--connect udpin:127.0.0.1:0" in lines[0]["fly_again"]
+    words = "ended with lqr on hover, seed 1 (left OFFBOARD for AUTO.LOITER)"
+    assert (words in stopped) == (exit_code != 2)
+    assert (words in (tmp_path / "campaign.html").read_text(encoding="utf-8")) == (exit_code != 2)
+    if exit_code == 3:
+        again()
+        assert " ".join(flown) == "pso lqr lqr"
+        folders = [path.name for path in (tmp_path / "flights").glob("lqr*")]
+        assert len(folders) == 2, "the log of the refused flight stays"
+
+
+class Empty:
+    """A flight without positions, and a law without keep-out volumes."""
+
+    phases = ()
+    truth = position = np.empty((0, 4))
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({}, ("touchdown", 0.75)),
+        ({"max_position_m": 0.6}, ("error", -0.2)),
+        ({"tilt_max_deg": 54.0}, ("tilt", 0.1)),
+        ({"link_delay_p99_ms": 450.0}, ("age", 0.1)),
+        ({"at_bound_share": 0.75}, ("authority", -0.5)),
+        ({"completed": 0.0}, ("completed", -1.0)),
+        ({"max_position_m": 500.0}, ("error", LOWEST)),
+        ({"max_position_m": math.nan}, ("touchdown", 0.75)),
+    ],
+)
+def test_margin(changes: dict[str, float], expected: tuple[str, float]) -> None:
+    figures = {
+        "max_position_m": 0.0, "tilt_max_deg": 0.0, "link_delay_p99_ms": 0.0,
+        "at_bound_share": 0.0, "touchdown_mps": 0.5, "completed": 1.0, **changes,
+    }  # fmt: skip
+    found = terms(Promises(), figures, Empty(), None)  # type: ignore[arg-type]
+    weakest = min(found, key=lambda name: found[name])
+    assert (weakest, found[weakest]) == (expected[0], pytest.approx(expected[1]))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (("compare", "--system", "3"), "are options of --connect"),
+        (("compare", "--connect", "tcp:127.0.0.1:1", "--signing-key", "none"), "signing key none"),
+        (("compare", "--connect", "tcp:1:1", "--workers", "2"), "options of the simulator"),
+        (("compare", "--scenario", ","), "--scenario is an empty list of names"),
+        (("compare", "--set", "controller"), "expected key.path=value"),
+        (("compare", "--set", "limits.nope=3"), "limits.nope is not a known key"),
+        (("compare", "--controllers", "pso,nope"), "there is no controller named 'nope'"),
+        (("identify", "x.tlog", "--system", "3"), "a log needs no --system,"),
+        (("identify", "--sitl", "--system", "3"), "--system is an option of --connect"),
+    ],
+)
+def test_what_a_command_cannot_fly_is_refused(
+    arguments: tuple[str, ...], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    answer = CliRunner().invoke(app, arguments)
+    assert answer.exit_code != 0
+    assert says in f"{answer.exception} {answer.output}"
+
+
+def test_an_unknown_controller_is_answered_with_every_known_one_once(tmp_path: Path) -> None:
+    with pytest.raises(DocumentError, match="there is no controller named 'nope'") as refused:
+        Campaign(CampaignFile(controllers=("nope",)), "x", tmp_path)
+    known = str(refused.value).partition("known are ")[2].split(", ")
+    assert len(known) == len(set(known)) > 5
+
+
+def test_a_connected_flight_begins_disarmed_unless_told_otherwise(tmp_path: Path) -> None:
+    case = Case("flight", "lqr", "hover", None, None, "px4", "connected", 1, link="udpin::0")
+    assert not case.request(tmp_path).resolve().limits.begin_armed
+    armed = case.with_values((("limits.begin_armed", True),))
+    assert armed.request(tmp_path).resolve().limits.begin_armed
+    assert FlightRequest(tmp_path).resolve().limits.begin_armed
+
+
+def test_flights_of_files_with_one_name_have_directories_of_their_own() -> None:
+    names = ("a/fast.yaml", "b/fast.yaml")
+    cases = [Case("flight", name, "hover", None, None, "px4", "calm", 1) for name in names]
+    folders = {case.folder for case in cases}
+    assert len(folders) == 2
+    assert all(folder.startswith("fast-hover-calm-1-") for folder in folders)
