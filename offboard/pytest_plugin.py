@@ -95,23 +95,23 @@ def fly(
     ) -> Flight:
         from offboard.analysis.flight_score import judged, score_flight
         from offboard.documents.errors import UserError
-        from offboard.run.request import FlightRequest, fly_request
+        from offboard.run.configuration import load
+        from offboard.run.flight import Simulated, fly
 
         directory = tmp_path / f"flight-{len(flown) + 1}"
         flown.append(directory / "flight.tlog")
-        request = FlightRequest(
-            directory=directory,
-            config=config,
-            choices={"reference": reference, "controller": controller, "vehicle": vehicle},
-            assignments=tuple(settings),
-            seed=seed,
-            sitl=True,
-            firmware=firmware,
-            scenario=scenario,
-        )
         problem, outcome = "", None
         try:
-            outcome = fly_request(request, simulator=_simulator)
+            simulated = Simulated(firmware, scenario)
+            simulated.check()
+            flown_config = load(
+                config,
+                choices={"reference": reference, "controller": controller, "vehicle": vehicle},
+                assignments=settings,
+                seed=seed,
+                known_vehicle=simulated.known_vehicle,
+            )
+            outcome = fly(flown_config, directory, simulated, simulator=_simulator)
         except UserError as error:
             problem = str(error)
         if outcome is None:

@@ -16,7 +16,7 @@ from offboard.compiled import prepare
 COMPILED = (
     "offboard.control.horizon.law",
     "offboard.control.pso",
-    "offboard.run.request",
+    "offboard.run.flight",
     "offboard.paper.plant",
     "simulator.vehicle.dynamics",
 )

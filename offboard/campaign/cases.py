@@ -26,7 +26,8 @@ from offboard.control import catalogue
 from offboard.documents import shipped
 from offboard.documents.errors import DocumentError
 from offboard.documents.reading import override, read
-from offboard.run.request import FlightRequest
+from offboard.run.configuration import FlightConfig, load
+from offboard.run.flight import Simulated
 
 SEED = "seed"  # a range of this name is that of the flight's seed: noise, and the phase of gusts
 SCENARIO = "scenario."  # of a key of the scenario
@@ -109,26 +110,21 @@ class Case:
             words += ["--set", assignment]
         return shlex.join([*words, "--seed", str(self.seed)])
 
-    def request(self, directory: Path, scenario: str | None = None) -> FlightRequest:
-        """The flight of the case, recorded in `directory`. The scenario of the case, which may be
-        no file yet, is not taken.
-
-        At a link, an armed vehicle is refused unless a value sets limits.begin_armed: somebody else
-        is flying it.
-        """
+    def load(self) -> FlightConfig:
+        """What is flown. At a link, an armed vehicle is refused unless a value sets
+        limits.begin_armed: somebody else is flying it. Raises DocumentError."""
         disarmed = ("limits.begin_armed=false",) if self.link else ()
-        request = FlightRequest(
-            directory,
-            config=self.config,
+        return load(
+            self.config,
             choices={part: getattr(self, part) for part in ("vehicle", "controller", "reference")},
             assignments=(*disarmed, *self.assignments),
             seed=self.seed,
-            sitl=self.link is None,
-            firmware=self.firmware,
-            sim_vehicle=self.sim_vehicle,
-            scenario=scenario,
+            known_vehicle=None if self.link else self.simulated().known_vehicle,
         )
-        return replace(request, connection=self.link) if self.link else request
+
+    def simulated(self, scenario: str | None = None) -> Simulated:
+        """The simulated vehicle of the case, in `scenario`. Raises DocumentError."""
+        return Simulated(self.firmware, scenario, self.sim_vehicle)
 
     def with_values(self, values: Values) -> Case:
         """The case with these values instead."""
@@ -255,7 +251,7 @@ def _digests(case: Case) -> tuple[tuple[str, str], ...]:
                 shipped.locate(name, shipped.FOLDERS[kind], kind, laws)
     if found:
         with suppress(DocumentError):  # of a flight that cannot be flown: it becomes a row
-            found.append(("flight", _hash(case.request(Path()).resolve().model_dump_json())))
+            found.append(("flight", _hash(case.load().model_dump_json())))
     return tuple(found)
 
 

@@ -20,12 +20,11 @@ from offboard.campaign.results import Record, code_hash
 from offboard.documents.errors import UserError
 from offboard.flight.companion import Outcome
 from offboard.flight.phases import ExitCode
-from offboard.link.log import FlightLog, LogError
+from offboard.link.log import LogError
 from offboard.link.stop import StopRequests
-from offboard.run.configuration import FlightConfig, dump
+from offboard.run.configuration import FlightConfig
+from offboard.run.flight import fly
 from offboard.run.in_memory import InMemorySimulator
-from offboard.run.one_flight import Bundled, fly
-from offboard.run.request import FlightRequest, build_parts
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +53,7 @@ def fly_job(job: Job) -> Record:
         with tempfile.TemporaryDirectory(prefix=".offboard-", dir=place) as scratch:
             directory = Path(scratch) / "flight"
             record = recorded(
-                job.case.request(directory), job.promises, partial(_fly, job.case, Path(scratch))
+                job.case.load, directory, job.promises, partial(_fly, job.case, Path(scratch))
             )
             if job.kept and directory.exists() and not job.kept.exists():
                 directory.rename(job.kept)
@@ -64,17 +63,21 @@ def fly_job(job: Job) -> Record:
 
 
 def recorded(
-    request: FlightRequest, promises: Promises, fly: Callable[[FlightConfig, Path], Outcome]
+    load: Callable[[], FlightConfig],
+    directory: Path,
+    promises: Promises,
+    fly: Callable[[FlightConfig, Path], Outcome],
 ) -> Record:
     """The record of a flight from its log, with score.json beside the log.
 
-    `fly` flies the configuration and logs it in the directory. A flight that fails is a record too.
-    Raises UserError where none can be flown or recorded, for lack of memory or disk space.
+    `fly` flies the configuration that `load` returns, and logs it in `directory`. A flight that
+    fails is a record too. Raises UserError where none can be flown or recorded, for lack of memory
+    or disk space.
     """
     try:
-        config = request.resolve()
-        outcome = fly(config, request.directory)
-        score, history = score_flight(request.directory)
+        config = load()
+        outcome = fly(config, directory)
+        score, history = score_flight(directory)
     except LogError:
         raise
     except (OSError, MemoryError) as error:
@@ -85,7 +88,7 @@ def recorded(
     except Exception as error:
         sentence = f"{type(error).__name__}: {error}"
         return Record(ExitCode.ABORTED, sentence, NOT_FLOWN, "crash")
-    keep_score(request.directory, score, history)
+    keep_score(directory, score, history)
     outcome, figures = judged(outcome, score), score.figures()
     margins = terms(promises, figures, history, config.controller)
     weakest = min(margins, key=lambda name: margins[name])
@@ -106,17 +109,13 @@ def _fly(case: Case, scratch: Path, config: FlightConfig, directory: Path) -> Ou
         path.parent.mkdir()
         path.write_text(case.text, encoding="utf-8")
         scenario = str(path)
-    log = FlightLog(directory, dump(config))
     outcome = fly(
-        build_parts(config),
-        log,
-        connection="",
-        bundled=Bundled(
-            InMemorySimulator(), scenario, config.seed, case.sim_vehicle, case.firmware
-        ),
+        config,
+        directory,
+        case.simulated(scenario),
+        simulator=InMemorySimulator(),
         stops=StopRequests(),  # not entered: signals are the main process's
-        progress=lambda companion: None,
     )
-    if log.problem:
-        raise LogError(log.problem)
+    if outcome.log_problem:
+        raise LogError(outcome.log_problem)
     return outcome

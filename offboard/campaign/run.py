@@ -33,7 +33,6 @@ from offboard.link import clock
 from offboard.link.stop import StopRequests
 from offboard.run.configuration import build_controller, build_track
 from offboard.run.in_memory import check_scenario_text
-from offboard.run.request import FlightRequest
 
 KEPT = "flights"
 KEPT_FILES = {"report": "report.html", "log": "flight.tlog"}
@@ -310,11 +309,7 @@ def check(cases: Sequence[Case], *, whole: bool = False) -> None:
 def _check_one(case: Case) -> None:
     if case.text:
         check_scenario_text(case.text, f"scenario {case.scenario}")
-    check_request(case.request(Path(), None if case.text or case.link else case.scenario))
-
-
-def check_request(request: FlightRequest) -> None:
-    """Raise DocumentError, with what is wrong, if a flight cannot be flown."""
-    config = request.resolve()
+    case.simulated(None if case.text or case.link else case.scenario).check()
+    config = case.load()
     build_track(config)
     build_controller(config)

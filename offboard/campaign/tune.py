@@ -198,7 +198,7 @@ def _cases(file: TuneFile, flights: Flights) -> list[Case]:
 
 def _defaults(case: Case, file: TuneFile) -> dict[str, float]:
     """The present values of the parameters. Raises DocumentError for one that is no number."""
-    resolved = case.request(Path()).resolve().model_dump(mode="json")
+    resolved = case.load().model_dump(mode="json")
     found: dict[str, float] = {}
     for key in file.ranges:
         value: Any = resolved

@@ -12,7 +12,7 @@ import os
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import BrokenExecutor, CancelledError, Executor
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -26,7 +26,7 @@ from offboard.documents.extras import install
 from offboard.flight.companion import STOPPED
 from offboard.flight.phases import ExitCode
 from offboard.link.stream_sources import connect
-from offboard.run.request import fly_request
+from offboard.run.flight import Connection, fly
 
 CONNECT_S = 5.0
 SCHEMES = ("tcp", "tls")
@@ -127,10 +127,11 @@ class ConnectedVehicle:
     def _record(self, job: Job) -> Record:
         assert job.kept is not None
         _move_aside(job.kept)
-        request = replace(
-            job.case.request(job.kept), system_id=self.system_id, signing_key=self.signing_key
+        assert job.case.link is not None
+        vehicle = Connection(job.case.link, self.system_id, self.signing_key)
+        return recorded(
+            job.case.load, job.kept, job.promises, lambda config, place: fly(config, place, vehicle)
         )
-        return recorded(request, job.promises, lambda config, directory: fly_request(request))
 
 
 def _move_aside(directory: Path) -> None:

@@ -118,21 +118,22 @@ def daemon(
         from offboard.compiled import loading
 
         with loading():
-            from offboard.run.request import FlightRequest
-            from offboard.service.daemon import Service, run
-        request = FlightRequest(
-            directory=out_directory or FLIGHTS,
-            config=config,
-            choices=choices,
-            assignments=tuple(assignments or ()),
-            seed=seed,
-            connection=connection,
-            system_id=system,
-            signing_key=signing_key,
-        )
-        wanted = Service(request, anchor.value, then.value, arms, metrics, report)
+            from offboard.flight.programme import service
+            from offboard.run.configuration import load
+            from offboard.run.flight import Connection
+            from offboard.service.daemon import run
         try:
-            outcome = run(wanted, stops=stops, tell=lines.tell, show=lines.show)
+            outcome = run(
+                partial(load, config, choices=choices, assignments=assignments or (), seed=seed),
+                Connection(connection, system, signing_key),
+                out_directory or FLIGHTS,
+                programme=service(then.value, anchor.value, arms=arms),
+                metrics=metrics,
+                report=report,
+                stops=stops,
+                tell=lines.tell,
+                show=lines.show,
+            )
         except (UserError, OSError) as error:
             if not may_pass(error):
                 raise

@@ -112,27 +112,36 @@ def fly(
 
             with loading():
                 from offboard.link import clock
-                from offboard.run.request import FlightRequest, fly_request
+                from offboard.run.configuration import load
+                from offboard.run.flight import Connection, Simulated
+                from offboard.run.flight import fly as fly_once
 
             requirements = requirements_of(require)
             directory = out_directory or FLIGHTS / clock.local_stamp()
-            request = FlightRequest(
-                directory=directory,
-                config=config,
+            flown: Connection | Simulated
+            if sitl:
+                flown = Simulated(firmware or "px4", scenario, sim_vehicle, signing_key)
+                flown.check()
+            else:
+                flown = Connection(connect or DEFAULT_CONNECTION, system, signing_key)
+            flight = load(
+                config,
                 choices={"controller": controller, "reference": reference, "vehicle": vehicle},
-                assignments=tuple(assignments or ()),
+                assignments=assignments or (),
                 seed=seed,
-                connection=connect or DEFAULT_CONNECTION,
-                sitl=sitl,
-                firmware=firmware or "px4",
-                scenario=scenario,
-                sim_vehicle=sim_vehicle,
-                system_id=system,
-                signing_key=signing_key,
+                known_vehicle=flown.known_vehicle,
             )
             for url in displays.await_ready():
                 displays.tell(f"live: {url}")
-            outcome = fly_request(request, displays.show, displays.tell, simulator, stops)
+            outcome = fly_once(
+                flight,
+                directory,
+                flown,
+                simulator=simulator,
+                stops=stops,
+                progress=displays.show,
+                tell=displays.tell,
+            )
     except KeyboardInterrupt:  # before the flight; in flight an interrupt lands the vehicle
         raise CommandError(INTERRUPTED, INTERRUPT) from None
     if outcome.exit_code == 2:

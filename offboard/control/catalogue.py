@@ -11,7 +11,7 @@ from __future__ import annotations
 from importlib.metadata import EntryPoint, EntryPoints, entry_points
 
 from offboard.control.base import ControllerSettings
-from offboard.documents.reading import DocumentError
+from offboard.documents.errors import DocumentError, located
 
 GROUP = "pso_offboard.controllers"
 
@@ -49,7 +49,7 @@ def settings_of(law: str) -> type[ControllerSettings]:
     try:
         loaded = entry.load()
     except Exception as error:  # whatever another package raises while it is imported
-        raise _unusable(entry, f"{type(error).__name__}: {error}") from error
+        raise _unusable(entry, located(error)) from error
     if not (isinstance(loaded, type) and issubclass(loaded, ControllerSettings)):
         raise _unusable(entry, f"{loaded!r} is not a subclass of ControllerSettings")
     return loaded

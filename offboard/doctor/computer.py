@@ -18,8 +18,7 @@ from offboard.doctor.observation import Computer
 from offboard.documents.errors import DocumentError
 from offboard.link import clock
 from offboard.run.configuration import FlightConfig
-from offboard.run.one_flight import rehearse
-from offboard.run.request import build_parts
+from offboard.run.flight import build, rehearse
 
 PROC = Path("/proc")
 TABLES = {"udpin": ("udp", "udp6"), "tcpin": ("tcp", "tcp6")}
@@ -93,11 +92,11 @@ def measure(config: FlightConfig, directory: Path, *, clock_step_s: float) -> Co
     decision_s, rehearsal = None, ""
     missing = sum(not each.is_compiled for each in compiled.defined)
     if not missing:  # compiling takes longer than the whole check
-        parts = None
+        prepared = None
         with suppress(DocumentError):  # a reference that cannot be flown is another check
-            parts = build_parts(config)
+            prepared = build(config)
         try:
-            decision_s = rehearse(parts, keeps_deadline=True) if parts else None
+            decision_s = rehearse(prepared, keeps_deadline=True) if prepared else None
         except DocumentError as error:
             rehearsal = str(error)
     return Computer(

@@ -7,14 +7,18 @@ A sentence names the key, the offending value and what is allowed, in pydantic's
 from __future__ import annotations
 
 import difflib
+import sysconfig
+import traceback
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
 
 Schema = Mapping[str, Any]
+_PACKAGE, _STANDARD = str(Path(__file__).parents[1]), sysconfig.get_path("stdlib")
 
 
 class UserError(Exception):
@@ -32,6 +36,23 @@ class DocumentError(UserError):
     def __init__(self, *problems: str) -> None:
         super().__init__("\n".join(problems))
         self.problems = problems
+
+
+def located(error: BaseException) -> str:
+    """An exception of code from outside, such as a controller, in one sentence with file and line
+    of the mistake: of the innermost call in the folder that was called from here."""
+    calls = [call for call in traceback.extract_tb(error.__traceback__) if _is_file(call.filename)]
+    outside = [call for call in calls if not call.filename.startswith(_PACKAGE)]
+    folder = str(Path(outside[0].filename).parent) if outside else ""
+    theirs = [call for call in outside if call.filename.startswith(folder)] or calls
+    place = f" ({theirs[-1].filename}:{theirs[-1].lineno})" if theirs else ""
+    return " ".join(f"{type(error).__name__}: {error}{place}".split())
+
+
+def _is_file(name: str) -> bool:
+    """Whether it is neither of the standard library nor of no file."""
+    standard = name.startswith(_STANDARD) and "site-packages" not in name
+    return not (standard or name.startswith("<"))
 
 
 @contextmanager

@@ -43,10 +43,12 @@ STARVED_KNOWN_S = 3.0  # HEARTBEAT, at 1 Hz, shows the failsafe
 
 @dataclass(frozen=True, slots=True)
 class Outcome:
-    """How a flight ended: an exit code of `phases.ExitCode`, and one sentence."""
+    """How a flight ended: an exit code of `phases.ExitCode`, and one sentence. `log_problem`: what
+    of its log is lost; empty if nothing is."""
 
     exit_code: int
     sentence: str
+    log_problem: str = ""
 
 
 @dataclass(slots=True)

@@ -28,8 +28,7 @@ from offboard.mavlink.framing import Frame
 from offboard.mavlink.signing import Signing
 from offboard.replay.recording import Recording, record_type
 from offboard.run.configuration import flown
-from offboard.run.one_flight import FlightParts, companion_of, session_of
-from offboard.run.request import build_parts
+from offboard.run.flight import Prepared, build, session_of
 
 CALLS = ("request_stop", "announce", "note_autopilot", "guard")  # methods of the companion
 _OUR_FIRST_SYSTEM = 1  # our system id before a vehicle was found
@@ -73,7 +72,7 @@ class Replay:
 
     def __init__(self, recording: Recording) -> None:
         self.config = flown(recording.configuration)
-        self.companion = self._companion(recording, build_parts(self.config))
+        self.companion = self._companion(recording, build(self.config))
         self.recorded: list[Sent] = []
         self.replayed: list[Sent] = []
         self.stopped = ""
@@ -89,8 +88,7 @@ class Replay:
         self._readings: Iterator[float] = iter(())
         self._read_s = 0.0
 
-    def _companion(self, recording: Recording, parts: FlightParts) -> Companion:
-        observer = parts.make_observer()
+    def _companion(self, recording: Recording, prepared: Prepared) -> Companion:
         settings: dict[str, Any] = recording.settings
         signing = Accepted(bytes(KEY_BYTES)) if recording.signed else None
         try:
@@ -99,7 +97,7 @@ class Replay:
             raise UserError(
                 f"{recording.log.path}: the settings of its session are those of another version"
             ) from None
-        return companion_of(parts, session, observer, self._stopwatch)
+        return prepared.companion(session, self._stopwatch)
 
     @property
     def incomplete(self) -> str:

@@ -22,7 +22,7 @@ from pydantic import BaseModel, Field, SerializeAsAny, create_model, model_valid
 from offboard.control import catalogue
 from offboard.control.base import Controller, ControllerSettings
 from offboard.documents import shipped
-from offboard.documents.errors import abridged
+from offboard.documents.errors import abridged, located
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import (
     DocumentError,
@@ -153,8 +153,8 @@ def build_controller(config: FlightConfig) -> Controller:
     try:
         return settings.build(config.vehicle, period_s=config.period_s, seed=config.seed)
     except Exception as error:  # of a controller from outside, anything
-        kind = "" if isinstance(error, ValueError) else f"{type(error).__name__}: "
-        raise DocumentError(f"controller {settings.law}: {kind}{error}") from error
+        why = str(error) if isinstance(error, ValueError) else located(error)
+        raise DocumentError(f"controller {settings.law}: {why}") from error
 
 
 def check_file(path: Path, check_scenario: Callable[[Path], None]) -> str:

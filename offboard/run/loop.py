@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import gc
 import math
-import traceback
 from collections.abc import Callable, Hashable, Sequence
 from contextlib import suppress
 from typing import Any, Protocol
 
+from offboard.documents.errors import located
 from offboard.flight.companion import Outcome, Output
 from offboard.flight.phases import BEFORE_FLIGHT, WAITING, ExitCode, Phase
 from offboard.link import clock
@@ -220,9 +220,7 @@ class Loop:
 
     def _hand_back(self, error: BaseException) -> None:
         """Land, if the companion still can. Otherwise end: silence, and the supervisor."""
-        where = traceback.extract_tb(error.__traceback__)[-1]
-        place = f"{where.filename.rpartition('/')[2]}:{where.lineno}"
-        sentence = f"internal error: {type(error).__name__}: {error} ({place})"
+        sentence = f"internal error: {located(error)}"
         self._error = self._error or sentence
         with suppress(BaseException):
             self._companion.request_stop(self._error)
@@ -275,7 +273,7 @@ class Loop:
             lands = self._companion.lands_without_log
             code = code or (ExitCode.ABORTED if lands else ExitCode.FLOWN)
             sentence = f"{self._log.problem}: {self._log.lost} entries lost; {sentence}"
-        return Outcome(code, sentence)
+        return Outcome(code, sentence, self._log.problem)
 
     def _interrupted(self) -> Outcome:
         return Outcome(ExitCode.ABORTED, TWICE + (SUPERVISED if self._supervisor else OWN_FAILSAFE))

@@ -5,30 +5,25 @@ from __future__ import annotations
 import threading
 from collections.abc import Callable
 from contextlib import ExitStack, closing
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 from sdnotify import SystemdNotifier
 
 from offboard import compiled
-from offboard.documents.signing_key import read_key
 from offboard.flight.companion import Outcome
 from offboard.flight.phases import ExitCode
-from offboard.flight.programme import Anchor, Then, service
-from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
+from offboard.flight.programme import Programme
 from offboard.link import clock
 from offboard.link.background import BackgroundWriter
 from offboard.link.connection import open_link
 from offboard.link.interface import Link, LinkError
 from offboard.link.lock import connection_lock, directory_lock
-from offboard.link.signing_time import SigningTime
 from offboard.link.stop import StopRequests
 from offboard.live.process import SERVER, LiveProcess
-from offboard.mavlink.session import Session, SessionSettings
+from offboard.run.configuration import FlightConfig
+from offboard.run.flight import Connection, discard
 from offboard.run.loop import Loop
-from offboard.run.one_flight import discard
-from offboard.run.request import FlightRequest
 from offboard.service.flights import Flights
 from offboard.service.memory import VehicleFiles
 from offboard.service.preparation import Preparation
@@ -41,79 +36,62 @@ NOTICES_MAX, NOTICES_S = 100, 1.0  # that wait for the service manager; for them
 STOPPED_EARLY = "stopped before the link was open"
 
 
-@dataclass(frozen=True, slots=True)
-class Service:
-    """What to serve: `request` as for one flight, whose directory holds those of the flights."""
-
-    request: FlightRequest
-    anchor: Anchor = "here"
-    then: Then = "hold"
-    arms: bool = False
-    metrics: str | None = None  # HOST:PORT
-    report: bool = True  # after each flight
-
-
 def run(
-    wanted: Service,
+    load: Callable[[], FlightConfig],
+    vehicle: Connection,
+    directory: Path,
     *,
+    programme: Programme,
+    metrics: str | None = None,
+    report: bool = True,
     stops: StopRequests,
     tell: Callable[[str], None],
     show: Callable[[Flights], None],
 ) -> Outcome:
     """Serve until a stop is requested.
 
-    `tell` is called with sentences about the preparation, `show` often, to show what the flights
-    announce; neither may wait. Raises LockError, NotServed, DocumentError, SupervisorError or
-    LogError, all before anything is sent.
+    `load` resolves the configuration, which is read again between flights; `directory` holds those
+    of the flights. `metrics`: HOST:PORT; `report`: write one after each flight. `tell` is called
+    with sentences about the preparation, `show` often, to show what the flights announce; neither
+    may wait. Raises LockError, NotServed, DocumentError, SupervisorError or LogError, all before
+    anything is sent.
     """
-    request = wanted.request
     with ExitStack() as stack:
-        stack.enter_context(connection_lock(request.connection))
-        request.resolve()  # a wrong configuration is refused before anything starts
-        stack.enter_context(directory_lock(request.directory))
-        monitor = LiveProcess(SERVER, "--metrics", wanted.metrics) if wanted.metrics else None
+        stack.enter_context(connection_lock(vehicle.address))
+        load()  # a wrong configuration is refused before anything starts
+        stack.enter_context(directory_lock(directory))
+        monitor = LiveProcess(SERVER, "--metrics", metrics) if metrics else None
         if monitor:
             stack.enter_context(closing(monitor)).await_ready()
-        key = read_key(request.signing_key) if request.signing_key else None
-        signing = stack.enter_context(SigningTime(key)) if key else None
+        signing = vehicle.signing(stack)
         supervisor = stack.enter_context(Supervisor(signing))
         tell("preparing the controller")
         compiled.prepare(tell)
-        preparation = stack.enter_context(closing(Preparation(request)))
+        preparation = stack.enter_context(closing(Preparation(load)))
         supervisor.await_ready()
-        recorder = Recorder(request.directory, score=partial(score, report=wanted.report))
+        recorder = Recorder(directory, score=partial(score, report=report))
         stack.callback(recorder.close)
-        memory = stack.enter_context(closing(VehicleFiles(_vehicles(request.directory), tell)))
+        memory = stack.enter_context(closing(VehicleFiles(directory / "vehicles", tell)))
         manager = stack.enter_context(closing(Manager()))
         manager.ready()
-        link = opened(request.connection, stops, tell, manager)
+        link = opened(vehicle.address, stops, tell, manager)
         if link is None:
             tell(STOPPED_EARLY)
             return Outcome(ExitCode.FLOWN, STOPPED_EARLY)
         stack.callback(link.close)
         recorder.score_earlier()  # a supervisor that still has the link also has the log
         flights = Flights(
-            session=Session(
-                SessionSettings(
-                    system_id=request.system_id,
-                    component_id=COMPONENT_ID,
-                    record_component_id=RECORD_COMPONENT_ID,
-                    stream=link.is_stream,
-                    capacity_bytes_ps=link.capacity_bytes_ps,
-                    sends_first=not request.connection.startswith("udpin"),
-                ),
-                signing,
-            ),
+            session=vehicle.session(link, signing),
             source=preparation,
             record=recorder,
             memory=memory,
-            programme=service(wanted.then, wanted.anchor, arms=wanted.arms),
+            programme=programme,
             stopwatch=clock.monotonic_s,
         )
         display = Display(flights, show, preparation, monitor, manager)
         preparation.start()
         discard(link)
-        tell(f"waiting for a vehicle on {request.connection}")
+        tell(f"waiting for a vehicle on {vehicle.address}")
         outcome = Loop(
             flights,
             link,
@@ -125,10 +103,6 @@ def run(
         manager.stopping()
         flights.close()
         return outcome
-
-
-def _vehicles(directory: Path) -> Path:
-    return directory / "vehicles"
 
 
 def opened(

@@ -9,12 +9,11 @@ vehicle and link stays. No I/O: a log is begun and ended at `Record`, configurat
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Protocol
 
 from offboard.flight import guards
 from offboard.flight.companion import STOPPED, Companion, Outcome, Output
-from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.phases import ENDS, FLYING, WAITING, Phase
 from offboard.flight.programme import Programme
 from offboard.flight.snapshot import Snapshot
@@ -22,7 +21,7 @@ from offboard.flight.state import FlightState
 from offboard.identification.learned import Learned
 from offboard.link.interface import Chunk
 from offboard.mavlink.session import Session
-from offboard.run.one_flight import FlightParts
+from offboard.run.flight import Prepared
 
 NAMED_S = 1.0  # until a vehicle has said which one it is
 TEXTS_KEPT = 200
@@ -30,14 +29,6 @@ LEFT_ALONE = (
     "the vehicle was found in {mode} in the air, and this service has not engaged it: it is left "
     "alone; switch to another mode and back"
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Prepared:
-    """A configuration ready to fly: its parts, called once, and its text for the log."""
-
-    parts: FlightParts
-    text: str
 
 
 class Source(Protocol):
@@ -242,20 +233,12 @@ class Flights:
         self._shown = 0
 
     def _companion(self, before: Companion | None) -> Companion:
-        parts = self._prepared.parts
-        parts.controller.reset()
+        self._prepared.controller.reset()
         self._recalled = self._learned
-        return Companion(
-            vehicle=parts.vehicle,
-            session=self._session,
-            observer=parts.make_observer(),
-            controller=parts.controller,
-            plan=FlightPlan(parts.track),
-            limits=parts.limits,
-            period_s=parts.period_s,
-            deadline_s=parts.deadline_s if self._keeps_deadline else None,
-            stopwatch=self._stopwatch,
-            identify=parts.identify,
+        return self._prepared.companion(
+            self._session,
+            self._stopwatch,
+            keeps_deadline=self._keeps_deadline,
             learned=self._learned,
             programme=self._programme,
             before=before,

@@ -20,7 +20,7 @@ from offboard.documents.shipped import read_text
 from offboard.identification.learned import Learned
 from offboard.identification.uncertainty import Estimate
 from offboard.model.vehicle import Vehicle
-from offboard.service.flights import Prepared
+from offboard.run.flight import Prepared
 
 
 class Document(BaseModel):
@@ -52,10 +52,10 @@ class VehicleFiles:
     def get(self, key: str, prepared: Prepared) -> Learned | None:
         """What is known of this vehicle, if it was identified from the same vehicle file."""
         source, learned = self._known.get(key, ("", None))
-        return learned if source == _digest(prepared.parts.vehicle) else None
+        return learned if source == _digest(prepared.config.vehicle) else None
 
     def keep(self, key: str, prepared: Prepared, learned: Learned) -> None:
-        source = _digest(prepared.parts.vehicle)
+        source = _digest(prepared.config.vehicle)
         self._known[key] = source, learned
         self._clerk.submit(self._write, key, source, learned)
 

@@ -9,29 +9,29 @@ from __future__ import annotations
 
 import threading
 from collections import deque
+from collections.abc import Callable
 
 from offboard.run.configuration import FlightConfig, dump
-from offboard.run.one_flight import rehearse
-from offboard.run.request import FlightRequest, build_parts
-from offboard.service.flights import Prepared
+from offboard.run.flight import Prepared, build, rehearse
 
 EVERY_S = 2.0
 
 
 def prepare(config: FlightConfig) -> Prepared:
     """Build and rehearse. Raises DocumentError."""
-    parts = build_parts(config)
-    rehearse(parts, keeps_deadline=True)
-    return Prepared(parts, dump(config))
+    prepared = build(config)
+    rehearse(prepared, keeps_deadline=True)
+    return prepared
 
 
 class Preparation:
-    """A `flights.Source`. Raises DocumentError if the first configuration cannot be used."""
+    """A `flights.Source` of what `load` returns. Raises DocumentError if the first configuration
+    cannot be used."""
 
-    def __init__(self, request: FlightRequest, every_s: float = EVERY_S) -> None:
-        self._request = request
+    def __init__(self, load: Callable[[], FlightConfig], every_s: float = EVERY_S) -> None:
+        self._load = load
         self._every_s = every_s
-        self._newest = prepare(request.resolve())
+        self._newest = prepare(load())
         self._seen = self._newest.text  # the newest text or error
         self._news: deque[str] = deque()
         self._ended, self._allowed = threading.Event(), threading.Event()
@@ -65,7 +65,7 @@ class Preparation:
     def look(self) -> None:
         """Read the configuration again, and use it if it has changed."""
         try:
-            config = self._request.resolve()
+            config = self._load()
             text = dump(config)
             if text in (self._seen, self._newest.text):
                 self._seen = text

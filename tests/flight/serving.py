@@ -26,8 +26,8 @@ from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.identification.learned import Learned
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.run import configuration as config
-from offboard.run import request
-from offboard.service.flights import Flights, Prepared, Record
+from offboard.run.flight import Prepared, build
+from offboard.service.flights import Flights, Record
 from offboard.service.record import Recorder
 from simulator import config as simulated
 from simulator.firmware.ardupilot import ARDUPILOT
@@ -100,7 +100,7 @@ class Remembered:
 
 def prepared(*assignments: str, **choices: str) -> Prepared:
     resolved = config.load("flight", choices=choices, assignments=assignments, seed=7)
-    return Prepared(request.build_parts(resolved), config.dump(resolved))
+    return build(resolved)
 
 
 def flights(source: Settings, logs: Record, memory: Remembered, then: Then, anchor: Anchor,

@@ -295,7 +295,7 @@ def test_an_exception_lands_and_ends_with_4(error: BaseException, tmp_path: Path
     flight = Flight(5, failing(range(3, 5), error))
     outcome = fly(flight, tmp_path, lambda companion: None)
     assert (flight.turns, flight.stops, outcome.exit_code) == (0, 2, 4)
-    says = f"internal error: {type(error).__name__}: {error} (test_edges.py:"
+    says = " ".join(f"internal error: {type(error).__name__}: {error} ({__file__}:".split())
     assert outcome.sentence.startswith(says)
     assert outcome.sentence.endswith("; flown and landed")
 

@@ -26,8 +26,7 @@ from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import Vehicle
 from offboard.reference.transfer import Hold
 from offboard.run import configuration as config
-from offboard.run import request
-from offboard.run.one_flight import rehearse
+from offboard.run.flight import build, rehearse
 
 NAN, INF = math.nan, math.inf
 
@@ -109,7 +108,7 @@ def test_what_a_horizon_calls_near_a_volume_was_loaded_at_the_rehearsal(
     """Or it might be compiled in flight, for seconds."""
     volume = "{shape: sphere, north_m: 6, east_m: 0.5, height_m: 3, radius_m: 0.4}"
     chosen = {"controller": "horizon", "reference": "line"}
-    parts = request.build_parts(
+    parts = build(
         config.load("flight", choices=chosen, assignments=(f"controller.keep_out=[{volume}]",))
     )
     loaded: list[str] = []

@@ -12,8 +12,7 @@ from offboard.control.base import Certificate, Controller, Decision, Situation
 from offboard.documents.reading import DocumentError
 from offboard.model.command import Command
 from offboard.run.configuration import load
-from offboard.run.one_flight import rehearse
-from offboard.run.request import FlightRequest, build_parts
+from offboard.run.flight import Simulated, build, rehearse
 
 
 def without_cost(_: Situation) -> Decision:
@@ -30,16 +29,14 @@ def without_cost(_: Situation) -> Decision:
     ],
 )
 def test_a_law_that_fails_is_found_before_the_flight(fail: object, says: str) -> None:
-    parts = build_parts(load("flight", known_vehicle="px4_sih"))
-    law: Controller = failing(fail, after=0)(parts.controller)  # type: ignore[arg-type]
+    prepared = build(load("flight", known_vehicle="px4_sih"))
+    law: Controller = failing(fail, after=0)(prepared.controller)  # type: ignore[arg-type]
     with pytest.raises(DocumentError, match=says):
-        rehearse(replace(parts, controller=law), keeps_deadline=False)
+        rehearse(replace(prepared, controller=law), keeps_deadline=False)
 
 
-def test_a_wrong_scenario_leaves_no_directory(tmp_path: Path) -> None:
+def test_a_wrong_scenario_is_found_before_the_flight(tmp_path: Path) -> None:
     scenario = tmp_path / "bad.yaml"
     scenario.write_text("conditions: {wind_ned_mps: [1, 2]}\n")
-    request = FlightRequest(tmp_path / "flight", sitl=True, scenario=str(scenario))
     with pytest.raises(DocumentError, match="wind_ned_mps"):
-        request.resolve()
-    assert not (tmp_path / "flight").exists()
+        Simulated(scenario=str(scenario)).check()

@@ -28,8 +28,7 @@ from offboard.documents.signing_key import create_key
 from offboard.flight import manifest
 from offboard.flight.record import RECORD_COMPONENT_ID
 from offboard.link.log import LogError
-from offboard.run import one_flight as run
-from offboard.run import request
+from offboard.run import flight as run
 
 CONFIG = Path(__file__).parents[2] / "config"
 RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
@@ -62,7 +61,7 @@ def kept_out(north_m: float, east_m: float, height_m: float, radius_m: float) ->
 def test_what_the_simulator_cannot_fly_is_refused_before_anything_is_built(
     arguments: tuple[str, ...], expected: str, offboard: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(request, "build_parts", pytest.fail)
+    monkeypatch.setattr(run, "build", pytest.fail)
     code, output = offboard("fly", "--sitl", *arguments)
     assert (code, len(output.splitlines())) == (2, 1)
     assert expected in output

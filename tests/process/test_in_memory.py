@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import yaml
 
+from offboard.flight.companion import Outcome
 from offboard.link.stop import StopRequests
-from offboard.run import in_memory, one_flight
+from offboard.run import flight, in_memory
+from offboard.run.configuration import load
+from offboard.run.flight import Simulated, fly
 from offboard.run.in_memory import InMemorySimulator
-from offboard.run.request import FlightRequest, fly_request
 from offboard.run.sitl import SimulatorProcess
 
 SETPOINT, TELEMETRY = 82, (30, 31, 32, 115)
@@ -30,11 +31,14 @@ def frames(log: Path, *kinds: int) -> list[bytes]:
     return found
 
 
-def request(directory: Path, scenario: str) -> FlightRequest:
-    return FlightRequest(
-        directory, sitl=True, scenario=scenario, seed=3, assignments=SHORT,
-        choices={"controller": "lqr", "reference": "hover"},
+def flown(
+    directory: Path, simulated: Simulated, simulator: SimulatorProcess | InMemorySimulator
+) -> Outcome:
+    config = load(
+        "flight", choices={"controller": "lqr", "reference": "hover"}, assignments=SHORT, seed=3,
+        known_vehicle=simulated.known_vehicle,
     )  # fmt: skip
+    return fly(config, directory, simulated, simulator=simulator, stops=StopRequests())
 
 
 @pytest.fixture(scope="module")
@@ -48,16 +52,15 @@ def simulator() -> Iterator[SimulatorProcess]:
 def test_a_flight_in_memory_is_that_over_udp(
     scenario: str, tmp_path: Path, simulator: SimulatorProcess
 ) -> None:
-    flown = {}
+    sent = {}
     for name, vehicle in (("memory", InMemorySimulator()), ("udp", simulator)):
-        wanted = request(tmp_path / name, scenario)
-        outcome = fly_request(wanted, simulator=vehicle, stops=StopRequests())
+        outcome = flown(tmp_path / name, Simulated(scenario=scenario), vehicle)
         assert (outcome.exit_code, outcome.sentence) == (0, "flown and landed")
         log = tmp_path / name / "flight.tlog"
-        flown[name] = frames(log, SETPOINT), frames(log, *TELEMETRY)
-    assert len(flown["udp"][0]) > 60
-    assert len(flown["udp"][1]) > 1000
-    assert flown["memory"] == flown["udp"]
+        sent[name] = frames(log, SETPOINT), frames(log, *TELEMETRY)
+    assert len(sent["udp"][0]) > 60
+    assert len(sent["udp"][1]) > 1000
+    assert sent["memory"] == sent["udp"]
 
 
 def test_a_vehicle_that_fails_ends_the_flight_with_a_sentence(
@@ -75,8 +78,7 @@ def test_a_vehicle_that_fails_ends_the_flight_with_a_sentence(
             return Fails
 
     monkeypatch.setattr(in_memory, "registered", Point)
-    wanted = request(tmp_path / "flight", "calm")
-    outcome = fly_request(wanted, simulator=InMemorySimulator(), stops=StopRequests())
+    outcome = flown(tmp_path / "flight", Simulated(scenario="calm"), InMemorySimulator())
     sentence = "the bundled simulator failed (ZeroDivisionError: division by zero)"
     assert (outcome.exit_code, outcome.sentence) == (3, sentence)
 
@@ -99,8 +101,7 @@ def test_time_goes_on_without_telemetry(
 ) -> None:
     file = tmp_path / "faulty.yaml"
     file.write_text(yaml.safe_dump({"name": "faulty", "faults": [scenario]}))
-    wanted = replace(request(tmp_path / "flight", str(file)), firmware="ardupilot")
-    outcome = fly_request(wanted, simulator=InMemorySimulator(), stops=StopRequests())
+    outcome = flown(tmp_path / "flight", Simulated("ardupilot", str(file)), InMemorySimulator())
     assert outcome.exit_code == code
     assert outcome.sentence.startswith(sentence)
 
@@ -120,8 +121,7 @@ def test_a_vehicle_that_hangs_ends_the_flight_with_a_sentence(
             return Hangs
 
     monkeypatch.setattr(in_memory, "registered", Point)
-    monkeypatch.setattr(one_flight, "SITL_TIMEOUT_S", 0.1)
-    wanted = request(tmp_path / "flight", "calm")
-    outcome = fly_request(wanted, simulator=InMemorySimulator(), stops=StopRequests())
+    monkeypatch.setattr(flight, "SITL_TIMEOUT_S", 0.1)
+    outcome = flown(tmp_path / "flight", Simulated(scenario="calm"), InMemorySimulator())
     assert outcome.exit_code == 3
     assert outcome.sentence.startswith("the bundled simulator has not answered for 0.")

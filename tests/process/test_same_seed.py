@@ -19,7 +19,8 @@ from offboard.analysis import tlog
 from offboard.flight.companion import Companion
 from offboard.flight.phases import Phase
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID, RECORD_ID, TickRecord
-from offboard.run.request import FlightRequest, fly_request
+from offboard.run import flight
+from offboard.run.configuration import load
 from offboard.run.sitl import SimulatorProcess
 
 VEHICLE_COMPONENT_ID = 1
@@ -75,15 +76,16 @@ def fly(
             time.sleep(stalls.pop())
 
     simulator.late_s = simulator_late_s
-    request = FlightRequest(
-        directory,
-        choices={"reference": "hover"},
-        assignments=SHORT,
-        seed=seed,
-        sitl=True,
+    config = load(
+        "flight", choices={"reference": "hover", "vehicle": "px4_sih"}, assignments=SHORT, seed=seed
     )
-    outcome = fly_request(
-        request, progress, lambda sentence: time.sleep(controller_late_s), simulator
+    outcome = flight.fly(
+        config,
+        directory,
+        flight.Simulated(),
+        simulator=simulator,
+        progress=progress,
+        tell=lambda sentence: time.sleep(controller_late_s),
     )
     assert outcome.exit_code == 0, outcome.sentence
     frames: dict[int, list[bytes]] = {}

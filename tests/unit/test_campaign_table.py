@@ -6,8 +6,9 @@ import csv
 import io
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,7 @@ from offboard.campaign.workers import ConnectedVehicle
 from offboard.cli.commands import app
 from offboard.documents.errors import DocumentError
 from offboard.link import clock
-from offboard.run.request import FlightRequest
+from offboard.run.configuration import FlightConfig
 
 LAWS = ("pso", "lqr", "an/uncommonly/long/name.yaml", "lost")
 SCENARIOS = ("calm", "all_together")
@@ -204,10 +205,9 @@ def test_on_one_vehicle_nothing_is_flown_after_a_refused_or_aborted_flight(
 ) -> None:
     flown: list[str] = []
 
-    def fly(request: FlightRequest, *_: object) -> Record:
-        assert (request.sitl, request.connection) == (False, "udpin:127.0.0.1:0")
-        flown.append(str(request.choices["controller"]))
-        request.directory.mkdir(parents=True)
+    def fly(load: Callable[[], FlightConfig], directory: Path, *_: object) -> Record:
+        flown.append(load().controller.law)
+        directory.mkdir(parents=True)
         if flown[-1] == "lqr":
             return Record(exit_code, "left OFFBOARD for AUTO.LOITER", -1.0, "completed")
         return record(1.0)
@@ -298,12 +298,12 @@ def test_an_unknown_controller_is_answered_with_every_known_one_once(tmp_path: P
     assert len(known) == len(set(known)) > 5
 
 
-def test_a_connected_flight_begins_disarmed_unless_told_otherwise(tmp_path: Path) -> None:
+def test_a_connected_flight_begins_disarmed_unless_told_otherwise() -> None:
     case = Case("flight", "lqr", "hover", None, None, "px4", "connected", 1, link="udpin::0")
-    assert not case.request(tmp_path).resolve().limits.begin_armed
+    assert not case.load().limits.begin_armed
     armed = case.with_values((("limits.begin_armed", True),))
-    assert armed.request(tmp_path).resolve().limits.begin_armed
-    assert FlightRequest(tmp_path).resolve().limits.begin_armed
+    assert armed.load().limits.begin_armed
+    assert replace(case, link=None).load().limits.begin_armed
 
 
 def test_flights_of_files_with_one_name_have_directories_of_their_own() -> None:

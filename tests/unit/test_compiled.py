@@ -201,5 +201,5 @@ def test_arguments_of_other_types_are_refused(wrong: np.ndarray) -> None:
 
 
 def test_importing_a_flight_does_not_import_numba() -> None:
-    code = "import sys, offboard.run.request, simulator.run; print('numba' in sys.modules)"
+    code = "import sys, offboard.run.flight, simulator.run; print('numba' in sys.modules)"
     assert answer(ROOT, code) == "False"

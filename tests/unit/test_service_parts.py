@@ -9,6 +9,7 @@ import subprocess
 import sys
 import threading
 import time
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -30,11 +31,10 @@ from offboard.link.stop import StopRequests
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
-from offboard.run import request as flight_request
-from offboard.run.request import FlightRequest
+from offboard.run.configuration import load
+from offboard.run.flight import build
 from offboard.service import daemon, preparation, unit
 from offboard.service.daemon import Manager
-from offboard.service.flights import Prepared
 from offboard.service.memory import VehicleFiles
 from offboard.service.preparation import Preparation
 from offboard.service.record import ROLLING_NAMES, Recorder
@@ -191,10 +191,8 @@ def test_a_flight_that_cannot_be_recorded_says_so_and_the_next_one_is(tmp_path: 
 
 
 def test_an_identified_vehicle_is_kept_and_used_for_the_same_file_alone(tmp_path: Path) -> None:
-    request = FlightRequest(tmp_path, choices={"vehicle": "px4_sih"})
-    parts = flight_request.build_parts(request.resolve())
-    known = Prepared(parts, "")
-    found = parts.vehicle.model_copy(update={"hover_thrust": 0.51})
+    known = build(load("flight", choices={"vehicle": "px4_sih"}))
+    found = known.config.vehicle.model_copy(update={"hover_thrust": 0.51})
     learned = Learned(found, Estimate(0.056, 0.002), 0.008)
     files = VehicleFiles(tmp_path / "vehicles", print)
     files.keep("px4-1-1", known, learned)
@@ -207,8 +205,8 @@ def test_an_identified_vehicle_is_kept_and_used_for_the_same_file_alone(tmp_path
     assert again.get("px4-2-1", known) is None
     assert len(told) == 1
     assert "bad.yaml is not used" in told[0]
-    other = FlightRequest(tmp_path, choices={"vehicle": "arducopter"}).resolve()
-    assert again.get("px4-1-1", Prepared(flight_request.build_parts(other), "")) is None
+    other = build(load("flight", choices={"vehicle": "arducopter"}))
+    assert again.get("px4-1-1", other) is None
     again.discard("px4-1-1")
     again.close()
     assert not (tmp_path / "vehicles" / "px4-1-1.yaml").exists()
@@ -326,7 +324,7 @@ def test_a_changed_configuration_is_used_and_a_bad_one_refused(
     file = tmp_path / "my.yaml"
     good = "vehicle: px4_sih\ncontroller: lqr\nreference: {shape: hover, height_m: %s}\n"
     file.write_text(good % 2)
-    watched = Preparation(FlightRequest(tmp_path, config=str(file)))
+    watched = Preparation(partial(load, str(file)))
     first = watched.newest()
     watched.look()
     assert watched.newest() is first
@@ -362,14 +360,14 @@ def test_a_switch_counts_in_the_air_from_a_mode_without_failsafe() -> None:
     assert not shows(ours=True)  # took off in this mode
 
 
-def test_a_reference_that_is_placed_low_stays_clear_of_the_ground(tmp_path: Path) -> None:
+def test_a_reference_that_is_placed_low_stays_clear_of_the_ground() -> None:
     """A helix that descends by 4 m."""
-    request = FlightRequest(
-        tmp_path,
+    config = load(
+        "flight",
         choices={"reference": "helix", "vehicle": "px4_sih"},
         assignments=("reference.climb_mps=-0.4", "reference.height_m=20"),
     )
-    plan = FlightPlan(flight_request.build_parts(request.resolve()).track)
+    plan = FlightPlan(build(config).track)
     start, times = plan.track.sample(0.0).position_ned_m, range(60)
     lowest = max(float(plan.track.sample(float(t)).position_ned_m[2]) for t in times)
     falls_m = lowest - float(start[2])
@@ -382,13 +380,11 @@ def test_a_reference_that_is_placed_low_stays_clear_of_the_ground(tmp_path: Path
 
 
 @pytest.mark.parametrize("speed_mps", [0.3, 1.0, 1.5, 4.0])
-def test_a_moving_vehicle_is_stopped_where_the_reference_starts(
-    tmp_path: Path, speed_mps: float
-) -> None:
+def test_a_moving_vehicle_is_stopped_where_the_reference_starts(speed_mps: float) -> None:
     """Without a way back. A smooth stop with at most 2 m/s2 needs 35/32 of a stop with a constant
     1 m/s2."""
-    request = FlightRequest(tmp_path, choices={"reference": "hover", "vehicle": "px4_sih"})
-    plan = FlightPlan(flight_request.build_parts(request.resolve()).track)
+    config = load("flight", choices={"reference": "hover", "vehicle": "px4_sih"})
+    plan = FlightPlan(build(config).track)
     velocity = (0.6 * speed_mps, -0.8 * speed_mps, 0.0)
     assert plan.place_start((3.0, 4.0, -20.0), velocity, 0.0) == 0.0
     plan.start_climb(5.0, np.array((3.0, 4.0, -20.0)), np.array(velocity), 0.0)

@@ -1,0 +1,369 @@
+"""One flight: a `FlightConfig` made ready, a vehicle to connect to, a directory for the log.
+
+Everything slow (compilation, start of a simulator) happens before telemetry is read.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import astuple, dataclass, replace
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from offboard.compiled import prepare
+from offboard.control.base import Controller, Situation
+from offboard.documents.errors import DocumentError, located
+from offboard.documents.signing_key import read_key
+from offboard.estimation.observer import Observer
+from offboard.flight import manifest
+from offboard.flight.companion import Companion, Outcome
+from offboard.flight.flight_plan import FlightPlan
+from offboard.flight.gate import usable
+from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
+from offboard.link import clock
+from offboard.link.connection import open_link, open_lockstep_link
+from offboard.link.interface import Link
+from offboard.link.log import FlightLog
+from offboard.link.signing_time import SigningTime
+from offboard.link.stop import StopRequests
+from offboard.mavlink.session import DIALECTS, Session, SessionSettings
+from offboard.mavlink.signing import Signing
+from offboard.model.command import Command, PositionCommand
+from offboard.reference.track import Track
+from offboard.reference.transfer import Hold
+from offboard.run.configuration import (
+    FlightConfig,
+    build_controller,
+    build_track,
+    dump,
+    read_part,
+)
+from offboard.run.in_memory import InMemorySimulator
+from offboard.run.loop import Loop
+from offboard.run.sitl import OWN_VEHICLES, SimulatorProcess, check_scenario_named
+from offboard.supervisor.supervisor import Supervisor
+
+REHEARSED_DECISIONS = 5  # the fastest counts: the machine may be busy
+DISCARDED_MAX = 20  # batches of a link
+SITL_TIMEOUT_S = 180.0  # for simulator and companion in lockstep: either may compile, or be slow
+
+
+@dataclass(frozen=True, slots=True)
+class Connection:
+    """A vehicle at a link. `system_id`: its own, where several send; `signing_key`: a key file."""
+
+    address: str = "udpin:127.0.0.1:14540"
+    system_id: int | None = None
+    signing_key: Path | None = None
+
+    known_vehicle: ClassVar[None] = None  # which vehicle it is, nobody has said
+
+    @property
+    def sends_first(self) -> bool:
+        """The vehicle learns our address from what we send."""
+        return not self.address.startswith("udpin")
+
+    def signing(self, stack: ExitStack) -> Signing | None:
+        """Signing with the kept time; closed with `stack`. Raises KeyFileError and
+        SigningTimeError."""
+        if self.signing_key is None:
+            return None
+        return stack.enter_context(SigningTime(read_key(self.signing_key)))
+
+    def session(self, link: Link, signing: Signing | None) -> Session:
+        """The session over `link`."""
+        return session_of(
+            signing,
+            system_id=self.system_id,
+            stream=link.is_stream,
+            capacity_bytes_ps=link.capacity_bytes_ps,
+            lockstep=False,
+            sends_first=self.sends_first,
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class Simulated:
+    """A vehicle of the bundled simulator, in lockstep. `scenario` and `vehicle` None: the defaults
+    of the firmware."""
+
+    firmware: str = "px4"
+    scenario: str | None = None
+    vehicle: str | None = None
+    signing_key: Path | None = None
+
+    def check(self) -> None:
+        """Check the names and files, before anything is compiled. Raises DocumentError."""
+        if self.firmware not in OWN_VEHICLES:
+            known = ", ".join(OWN_VEHICLES)
+            raise DocumentError(f"--firmware {self.firmware}: unknown; there is {known}")
+        if self.scenario is not None:
+            check_scenario_named(self.scenario)
+        if self.vehicle is not None:
+            read_part("vehicle", self.vehicle)
+
+    @property
+    def known_vehicle(self) -> str:
+        """The vehicle file of the firmware's default vehicle, for `configuration.load`."""
+        return OWN_VEHICLES[self.firmware]
+
+    def signing(self, stack: ExitStack) -> Signing | None:
+        """Without a kept time: in lockstep no stamp depends on the clock."""
+        return Signing(read_key(self.signing_key)) if self.signing_key else None
+
+    def session(self, link: Link, signing: Signing | None) -> Session:
+        """The session over `link`."""
+        return session_of(
+            signing,
+            stream=link.is_stream,
+            capacity_bytes_ps=None,
+            lockstep=True,
+            sends_first=False,
+        )
+
+    def open_link(self, simulator: SimulatorProcess | InMemorySimulator, seed: int) -> Link:
+        """Start the vehicle and return the link to it."""
+        if isinstance(simulator, InMemorySimulator):
+            return simulator.open_link(
+                firmware=self.firmware,
+                scenario=self.scenario,
+                vehicle=self.vehicle,
+                seed=seed,
+                parameters=self._parameters(),
+            )
+        link = open_lockstep_link()
+        simulator.launch(self.options(link.port, seed))
+        return link
+
+    def options(self, port: int, seed: int) -> list[str]:
+        """Options of the `simulator` command, for a vehicle that sends to our local `port`."""
+        return [
+            *("--connect", f"udpout:127.0.0.1:{port}", "--gcs", "none", "--lockstep"),
+            *("--patience", f"{SITL_TIMEOUT_S:g}"),
+            *("--seed", str(seed), "--firmware", self.firmware),
+            *(("--scenario", self.scenario) if self.scenario else ()),
+            *(("--vehicle", self.vehicle) if self.vehicle else ()),
+            *(("--signing-key", str(self.signing_key.absolute())) if self.signing_key else ()),
+            *(f"--param={name}={value:g}" for name, value in self._parameters().items()),
+        ]
+
+    def _parameters(self) -> dict[str, float]:
+        """Parameters that a user must set once on this autopilot."""
+        watched = DIALECTS[self.firmware].watched_parameters
+        return {p.name: float(p.required_bits) for p in watched if p.required_bits}
+
+
+def session_of(
+    signing: Signing | None = None,
+    *,
+    system_id: int | None = None,
+    stream: bool,
+    capacity_bytes_ps: float | None,
+    lockstep: bool,
+    sends_first: bool,
+) -> Session:
+    """The session of a flight; see `SessionSettings`."""
+    return Session(
+        SessionSettings(
+            system_id=system_id,
+            component_id=COMPONENT_ID,
+            record_component_id=RECORD_COMPONENT_ID,
+            stream=stream,
+            capacity_bytes_ps=capacity_bytes_ps,
+            lockstep=lockstep,
+            sends_first=sends_first,
+        ),
+        signing,
+    )
+
+
+# --- a configuration made ready ---
+
+
+@dataclass(frozen=True, slots=True)
+class Prepared:
+    """A configuration with what it builds; `text` is that of flight.yaml."""
+
+    config: FlightConfig
+    controller: Controller
+    track: Track
+    text: str
+
+    def observer(self) -> Observer:
+        """A new observer."""
+        return Observer(self.config.vehicle)
+
+    def companion(
+        self,
+        session: Session,
+        stopwatch: Callable[[], float],
+        *,
+        keeps_deadline: bool = True,
+        **more: Any,
+    ) -> Companion:
+        """The companion of a flight over `session`. `stopwatch` reads host time; `more`: see
+        `Companion`."""
+        config = self.config
+        keeps_deadline &= not session.settings.lockstep
+        return Companion(
+            vehicle=config.vehicle,
+            session=session,
+            observer=self.observer(),
+            controller=self.controller,
+            plan=FlightPlan(self.track),
+            limits=config.limits,
+            period_s=config.period_s,
+            deadline_s=config.deadline_s if keeps_deadline else None,
+            stopwatch=stopwatch,
+            identify=config.identify,
+            **more,
+        )
+
+
+def build(config: FlightConfig) -> Prepared:
+    """Build the controller and the reference. Raises DocumentError if it cannot be flown."""
+    return Prepared(config, build_controller(config), build_track(config), dump(config))
+
+
+def rehearse(prepared: Prepared, *, keeps_deadline: bool) -> float:
+    """Call every code path of observer and controller, so that nothing is compiled in flight.
+
+    A pause of seconds at the first decision in flight is a crash. Returns the wall time of the
+    shortest possible decision, measured with `keeps_deadline`. Raises DocumentError if the control
+    law fails or, with `keeps_deadline`, if a decision cannot meet the deadline.
+    """
+    config, controller, observer = prepared.config, prepared.controller, prepared.observer()
+    reference = Hold((0.0, 0.0, -2.0), 0.1)
+    previous = Command(config.vehicle.gravity_mps2, (0.0, 0.0, 1.0), 0.0)
+    observer.freeze(True)
+    for step in range(60):
+        time_s = 0.01 * step
+        if step == 20:
+            observer.freeze(False)
+        observer.on_attitude(time_s, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+        observer.on_position(time_s, (0.0, 0.0, -2.0), (0.0, 0.0, 0.0))
+        if step >= 20 and step % 10 == 0:
+            state = observer.predict(time_s)
+            situation = Situation(time_s, state, reference, previous, lambda: config.deadline_s)
+            command = _decided(controller, situation)
+            if isinstance(command, Command):
+                previous = command
+                observer.on_command(time_s, command)
+    least_s = math.nan
+    if keeps_deadline:
+        cut_short = replace(situation, remaining_s=lambda: 0.0)
+        least_s = _check_deadline(controller, cut_short, config.deadline_s)
+    prepared.track.sample(np.array([0.0, 1.0]))
+    controller.reset()
+    return least_s
+
+
+def _decided(controller: Controller, situation: Situation) -> Command | PositionCommand:
+    """The command of a decision. Raises DocumentError if the law fails: better here than in
+    flight."""
+    try:
+        decision = controller.decide(situation)
+        command = decision.command
+        [float(figure) for figure in astuple(decision.certificate)]  # as the log will have them
+    except Exception as error:
+        raise DocumentError(f"controller: {located(error)}") from error
+    if not usable(command):
+        raise DocumentError(f"controller: it decides {command}, which cannot be sent")
+    return command
+
+
+def _check_deadline(controller: Controller, cut_short: Situation, deadline_s: float) -> float:
+    """The shortest possible decision must meet the deadline; returns its time."""
+    least_s = needed_s = math.inf
+    for _ in range(REHEARSED_DECISIONS):
+        began_s, computed_s = clock.monotonic_s(), clock.thread_s()
+        controller.decide(cut_short)
+        least_s = min(least_s, clock.monotonic_s() - began_s)
+        needed_s = min(needed_s, clock.thread_s() - computed_s)
+    if least_s > deadline_s >= needed_s:
+        raise DocumentError(
+            f"this computer is too busy: a decision needs {1e3 * needed_s:.1f} ms of its processor "
+            f"and takes {1e3 * least_s:.1f} ms; close other programs"
+        )
+    if least_s > deadline_s:
+        raise DocumentError(
+            f"controller: a decision takes at least {1e3 * least_s:.1f} ms here, longer than "
+            f"deadline_s ({1e3 * deadline_s:.1f} ms); plan fewer steps or allow more time"
+        )
+    return least_s
+
+
+# --- the flight ---
+
+
+def fly(
+    config: FlightConfig,
+    directory: Path,
+    vehicle: Connection | Simulated,
+    *,
+    simulator: SimulatorProcess | InMemorySimulator | None = None,
+    stops: StopRequests | None = None,
+    progress: Callable[[Companion], None] = lambda companion: None,
+    tell: Callable[[str], None] = lambda sentence: None,
+) -> Outcome:
+    """Fly once, and log it in `directory`.
+
+    `progress` is called often in flight, `tell` with sentences about the preparation. `simulator`
+    and `stops` may be shared by several flights; without them this flight makes its own.
+
+    Example: `fly(load("flight"), Path("flights/1"), Simulated()).exit_code` is 0 if the flight was
+    flown and landed.
+
+    Raises DocumentError, KeyFileError, LinkError, SupervisorError, SigningTimeError or LogError
+    before anything is sent, and KeyboardInterrupt if a stop was requested meanwhile. The log is
+    created last: a flight that cannot begin leaves no directory.
+    """
+    simulated = isinstance(vehicle, Simulated)
+    with ExitStack() as stack:
+        stops = stops or stack.enter_context(StopRequests())
+        prepared = build(config)
+        log = FlightLog(directory, prepared.text, real_time=not simulated)
+        log.check()
+        signing = vehicle.signing(stack)
+        if isinstance(vehicle, Simulated):
+            simulator = simulator or stack.enter_context(SimulatorProcess())
+            link = vehicle.open_link(simulator, config.seed)
+            stack.callback(simulator.recall)
+        else:
+            link = open_link(vehicle.address)
+        stack.callback(link.close)
+        supervisor = None if simulated else stack.enter_context(Supervisor(signing))
+        tell("preparing the controller")
+        prepare(tell)
+        rehearse(prepared, keeps_deadline=not simulated)
+        if supervisor:
+            supervisor.await_ready()
+        stops.check()
+        stack.enter_context(log)
+        session = vehicle.session(link, signing)
+        for piece in manifest.pieces(prepared.text):
+            log.begin(clock.unix_us(), session.encode(piece))
+        loop = Loop(
+            prepared.companion(session, clock.monotonic_s),
+            link,
+            log,
+            stops=stops,
+            progress=progress,
+            simulator_ended=simulator.ended if simulated and simulator else lambda: None,
+            patience_s=SITL_TIMEOUT_S if simulated else math.inf,
+            supervisor=supervisor,
+        )
+        if supervisor:
+            discard(link)
+        return loop.run()
+
+
+def discard(link: Link) -> None:
+    """Drop the telemetry that arrived during the preparation: it is too old to use."""
+    for _ in range(DISCARDED_MAX):
+        if not link.receive(0.0):
+            return
