@@ -12,22 +12,15 @@ from typing import Annotated
 import typer
 
 from offboard.cli.shared import (
-    DEFAULT_CONNECTION,
-    FILE,
     FLIGHTS,
-    Assignments,
     CommandError,
-    Connect,
-    Controller,
-    Reference,
+    FlightOptions,
     Report,
-    SigningKey,
-    System,
-    Vehicle,
     complain,
     option,
     out,
     say,
+    with_flight_options,
     write,
 )
 from offboard.documents.command_line import DISK_ERRORS, explained
@@ -58,14 +51,9 @@ class ThenDo(StrEnum):
     REPEAT = "repeat"
 
 
+@with_flight_options
 def daemon(
-    connect: Connect = None,
-    config: Annotated[str, option(FILE, "Configuration.")] = "flight",
-    controller: Controller = None,
-    reference: Reference = None,
-    vehicle: Vehicle = None,
-    system: System = None,
-    signing_key: SigningKey = None,
+    options: FlightOptions,
     anchor: Annotated[
         AnchorAt,
         typer.Option(help="Reference: start where the vehicle stops, or relative to the take-off."),
@@ -91,7 +79,6 @@ def daemon(
         ),
     ] = False,
     report: Report = True,
-    assignments: Assignments = None,
 ) -> None:
     """Wait for a vehicle, and fly whenever its pilot engages.
 
@@ -100,15 +87,9 @@ def daemon(
     directory of its own, as that of `fly`. A ground station may send MAV_CMD_MISSION_START,
     MAV_CMD_DO_PAUSE_CONTINUE and MAV_CMD_DO_SET_MODE (hands back) to component 191.
     """
-    connection = connect or DEFAULT_CONNECTION
-    choices = {"controller": controller, "reference": reference, "vehicle": vehicle}
     if print_unit:
-        from offboard.run.configuration import load
-
-        load(config, choices=choices, assignments=assignments or ())
-        _print_unit(
-            connection, signing_key, out_directory, [config, *filter(None, choices.values())]
-        )
+        options.load()
+        _print_unit(options, out_directory)
         return
     from offboard.link.stop import StopRequests
     from offboard.live.lines import JsonLog, Terminal
@@ -119,13 +100,11 @@ def daemon(
 
         with loading():
             from offboard.flight.programme import service
-            from offboard.run.configuration import load
-            from offboard.run.flight import Connection
             from offboard.service.daemon import run
         try:
             outcome = run(
-                partial(load, config, choices=choices, assignments=assignments or (), seed=seed),
-                Connection(connection, system, signing_key),
+                partial(options.load, seed),
+                options.connection(),
                 out_directory or FLIGHTS,
                 programme=service(then.value, anchor.value, arms=arms),
                 metrics=metrics,
@@ -151,9 +130,7 @@ def may_pass(error: UserError | OSError) -> bool:
     return full or (isinstance(error, UserError) and not error.is_usage)
 
 
-def _print_unit(
-    connection: str, signing_key: Path | None, out_directory: Path | None, files: list[str]
-) -> None:
+def _print_unit(options: FlightOptions, out_directory: Path | None) -> None:
     """Print the unit, and on stderr what its user cannot read. Raises CommandError and
     KeyFileError."""
     import offboard
@@ -165,13 +142,15 @@ def _print_unit(
             f"--out {out_directory}: the unit can write below {STATE} alone: omit --out, or name a "
             "directory there"
         )
-    if signing_key:
-        read_key(signing_key)
+    if options.signing_key:
+        read_key(options.signing_key)
     words = [word for word in sys.argv[sys.argv.index("daemon") + 1 :] if word != "--print-unit"]
     arguments = [_absolute(word) for word in _without("--signing-key", words)]
-    sys.stdout.write(unit(arguments, connection, signing_key))
+    sys.stdout.write(unit(arguments, options.connection().address, options.signing_key))
     installed = [Path(sys.executable), Path(offboard.__path__[0])]
-    for path in (*installed, *(Path(file) for file in files if Path(file).is_file())):
+    files = (options.config, options.controller, options.reference, options.vehicle)
+    named = [Path(file) for file in files if file and Path(file).is_file()]
+    for path in (*installed, *named):
         if hidden := unreadable(path):
             complain(hidden)
 

@@ -9,20 +9,13 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from offboard.cli.shared import (
-    DEFAULT_CONNECTION,
-    FILE,
     FLIGHTS,
-    Assignments,
-    Connect,
-    Controller,
-    Reference,
-    SigningKey,
-    System,
-    Vehicle,
+    FlightOptions,
     err,
     option,
     out,
     say,
+    with_flight_options,
 )
 
 if TYPE_CHECKING:
@@ -34,19 +27,13 @@ DOCTOR_CODES = (
 )
 
 
+@with_flight_options
 def doctor(
+    options: FlightOptions,
     names: Annotated[
         list[str] | None,
         typer.Argument(metavar="CHECK...", help="Only these checks.  [default: all]"),
     ] = None,
-    connect: Connect = None,
-    config: Annotated[str, option(FILE, "Configuration of the planned flight.")] = "flight",
-    controller: Controller = None,
-    reference: Reference = None,
-    vehicle: Vehicle = None,
-    system: System = None,
-    signing_key: SigningKey = None,
-    assignments: Assignments = None,
     out_directory: Annotated[
         Path | None, option("DIR", "Where flights are recorded.  [default: flights]", "--out")
     ] = None,
@@ -74,20 +61,13 @@ def doctor(
     from offboard.doctor.table import as_json as report
     from offboard.doctor.table import examine, verdict, worst
     from offboard.flight.preflight import Level
-    from offboard.run.configuration import load
 
-    flight = load(
-        config,
-        choices={"controller": controller, "reference": reference, "vehicle": vehicle},
-        assignments=assignments or (),
-    )
+    flight = options.load()
     with err.status("opening the link") as status:  # a line on a terminal, nothing elsewhere
         seen = observe(
-            connect or DEFAULT_CONNECTION,
+            options.connection(),
             flight,
             out_directory or FLIGHTS,
-            system_id=system,
-            signing_key=signing_key,
             tell=status.update,
         )
     rows = examine(chosen, seen)

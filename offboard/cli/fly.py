@@ -13,24 +13,18 @@ import typer
 
 from offboard.cli.score import requirements_of, scored
 from offboard.cli.shared import (
-    DEFAULT_CONNECTION,
     FILE,
     FLIGHTS,
-    Assignments,
     CommandError,
-    Connect,
-    Controller,
     Directory,
-    Reference,
+    FlightOptions,
     Report,
     Requirements,
-    SigningKey,
-    System,
-    Vehicle,
     complain,
     option,
     out,
     say,
+    with_flight_options,
     write,
 )
 from offboard.documents.arguments import FOXGLOVE, LIVE_PAGE
@@ -46,15 +40,10 @@ INTERRUPTED = "interrupted before anything was sent"
 LABEL_WIDTH = 15
 
 
+@with_flight_options
 def fly(
+    options: FlightOptions,
     sitl: Annotated[bool, typer.Option("--sitl", help="Fly the bundled simulator.")] = False,
-    connect: Connect = None,
-    system: System = None,
-    signing_key: SigningKey = None,
-    config: Annotated[str, option(FILE, "Configuration.")] = "flight",
-    controller: Controller = None,
-    reference: Reference = None,
-    vehicle: Vehicle = None,
     firmware: Annotated[
         str | None, option("NAME", "With --sitl: px4 or ardupilot.  [default: px4]")
     ] = None,
@@ -67,7 +56,6 @@ def fly(
     seed: Annotated[int | None, option("N", "Random seed, also of the simulator.")] = None,
     out_directory: Directory = None,
     require: Requirements = None,
-    assignments: Assignments = None,
     report: Report = True,
     live: Annotated[
         str | None,
@@ -93,9 +81,9 @@ def fly(
     phase or another text), snapshot (once a second of vehicle time; SI, NED, null for what is not
     known) or, as the last one, result.
     """
-    if sitl and connect:
+    if sitl and options.connect:
         raise CommandError("--sitl starts its own simulator: use --sitl or --connect, not both")
-    if sitl and system:
+    if sitl and options.system:
         raise CommandError("--system is an option of --connect: --sitl has one vehicle")
     if not sitl and (scenario or sim_vehicle or firmware):
         raise CommandError("--scenario, --sim-vehicle and --firmware are options of --sitl: add it")
@@ -112,7 +100,6 @@ def fly(
 
             with loading():
                 from offboard.link import clock
-                from offboard.run.configuration import load
                 from offboard.run.flight import Connection, Simulated
                 from offboard.run.flight import fly as fly_once
 
@@ -120,17 +107,11 @@ def fly(
             directory = out_directory or FLIGHTS / clock.local_stamp()
             flown: Connection | Simulated
             if sitl:
-                flown = Simulated(firmware or "px4", scenario, sim_vehicle, signing_key)
+                flown = Simulated(firmware or "px4", scenario, sim_vehicle, options.signing_key)
                 flown.check()
             else:
-                flown = Connection(connect or DEFAULT_CONNECTION, system, signing_key)
-            flight = load(
-                config,
-                choices={"controller": controller, "reference": reference, "vehicle": vehicle},
-                assignments=assignments or (),
-                seed=seed,
-                known_vehicle=flown.known_vehicle,
-            )
+                flown = options.connection()
+            flight = options.load(seed, flown.known_vehicle)
             for url in displays.await_ready():
                 displays.tell(f"live: {url}")
             outcome = fly_once(

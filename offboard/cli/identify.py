@@ -73,10 +73,10 @@ def identify(
     if flight is None:
         flight = out_directory or FLIGHTS / f"identify-{clock.local_stamp()}"
         fly(
-            sitl,
-            connect,
-            system,
-            signing_key,
+            sitl=sitl,
+            connect=connect,
+            system=system,
+            signing_key=signing_key,
             reference="identify",
             vehicle=vehicle,
             out_directory=flight,

@@ -6,11 +6,15 @@ wrong options are answered at once.
 
 from __future__ import annotations
 
+import functools
+import inspect
 import itertools
 import re
 import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -19,6 +23,10 @@ from offboard.documents.command_line import complain as complain
 from offboard.documents.command_line import wrapped
 from offboard.documents.errors import UserError, shown
 from offboard.link.new_file import new_file
+
+if TYPE_CHECKING:
+    from offboard.run.configuration import FlightConfig
+    from offboard.run.flight import Connection
 
 
 class Output(Console):
@@ -66,8 +74,6 @@ Connect = Annotated[
         callback=_known_port,
     ),
 ]
-Controller = Annotated[str | None, option(FILE, "Controller.")]
-Reference = Annotated[str | None, option(FILE, "Reference; a file may also be .csv.")]
 Vehicle = Annotated[str | None, option(FILE, "Vehicle.")]
 System = Annotated[
     int | None,
@@ -96,6 +102,55 @@ Assignments = Annotated[
     list[str] | None,
     option("KEY.PATH=VALUE", "Change one configuration value; repeatable.", "--set"),
 ]
+
+
+@dataclass(frozen=True, slots=True)
+class FlightOptions:
+    """The options of a flight, the same for every command that flies or checks one."""
+
+    connect: Connect = None
+    system: System = None
+    signing_key: SigningKey = None
+    config: Annotated[str, option(FILE, "Configuration.")] = "flight"
+    controller: Annotated[str | None, option(FILE, "Controller.")] = None
+    reference: Annotated[str | None, option(FILE, "Reference; a file may also be .csv.")] = None
+    vehicle: Vehicle = None
+    assignments: Assignments = None
+
+    def load(self, seed: int | None = None, known_vehicle: str | None = None) -> FlightConfig:
+        """The configuration, see `configuration.load`. Raises DocumentError."""
+        from offboard.run.configuration import load
+
+        return load(
+            self.config,
+            choices={part: getattr(self, part) for part in ("controller", "reference", "vehicle")},
+            assignments=self.assignments or (),
+            seed=seed,
+            known_vehicle=known_vehicle,
+        )
+
+    def connection(self) -> Connection:
+        """The vehicle at a link."""
+        from offboard.run.flight import Connection
+
+        return Connection(self.connect or DEFAULT_CONNECTION, self.system, self.signing_key)
+
+
+def with_flight_options(command: Callable[..., None]) -> Callable[..., None]:
+    """A command whose first parameter is a `FlightOptions`, with each of its fields as an option
+    before its own."""
+    shared = inspect.signature(FlightOptions, eval_str=True).parameters
+    _, *own = inspect.signature(command, eval_str=True).parameters.values()
+
+    @functools.wraps(command)
+    def run(**given: Any) -> None:
+        options = FlightOptions(**{name: given.pop(name) for name in shared if name in given})
+        command(options, **given)
+
+    signature = inspect.Signature([*shared.values(), *own])
+    run.__signature__ = signature  # type: ignore[attr-defined]
+    run.__annotations__ = {each.name: each.annotation for each in signature.parameters.values()}
+    return run
 
 
 class CommandError(UserError):

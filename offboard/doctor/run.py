@@ -14,14 +14,13 @@ from offboard.doctor.computer import holders, measure, surroundings
 from offboard.doctor.listening import LONGEST_S, Listening
 from offboard.doctor.observation import Computer, Observation
 from offboard.documents.errors import DocumentError, shown
-from offboard.documents.signing_key import read_key
 from offboard.link import clock
 from offboard.link.connection import open_link
 from offboard.link.interface import Link, LinkUnavailable
-from offboard.link.signing_time import SigningTime
 from offboard.mavlink.signing import Signing
 from offboard.reference.feasibility import check
 from offboard.run.configuration import FlightConfig, build_track
+from offboard.run.flight import Connection
 
 Result = TypeVar("Result")
 Tell = Callable[[str], None]
@@ -47,27 +46,24 @@ def within(seconds: float, call: Callable[[], Result]) -> Result:
 
 
 def observe(
-    connection: str,
+    vehicle: Connection,
     config: FlightConfig,
     directory: Path,
     *,
-    system_id: int | None = None,
-    signing_key: Path | None = None,
     tell: Tell = lambda sentence: None,
 ) -> Observation:
-    """Observe the vehicle at `connection`, the link to it and this computer, for a flight of
-    `config` that is recorded in `directory`. Sends nothing that changes the vehicle. `system_id`
-    is that of the vehicle, where several send; `signing_key` a key file. `tell` is called with
-    sentences about the progress.
+    """Observe the `vehicle`, the link to it and this computer, for a flight of `config` that is
+    recorded in `directory`. Sends nothing that changes the vehicle. `tell` is called with sentences
+    about the progress.
 
     Raises LinkError for an address that is no address, KeyFileError and SigningTimeError.
     """
-    until_s = clock.monotonic_s() + LOOK_S
-    key = read_key(signing_key) if signing_key else None
+    until_s, connection = clock.monotonic_s() + LOOK_S, vehicle.address
     others = holders(connection)
     unix_s = clock.monotonic_less_unix_s()
     seen, error = Observation(), ""
     with ExitStack() as stack:
+        signing = vehicle.signing(stack)
         try:
             link = within(OPEN_S, lambda: open_link(connection))
         except TimeoutError:
@@ -76,9 +72,7 @@ def observe(
             error = str(failure)
         else:
             stack.callback(link.close)
-            signing = stack.enter_context(SigningTime(key)) if key else None
-            first = not connection.startswith("udpin")
-            seen = _listen(link, system_id, signing, tell, sends_first=first)
+            seen = _listen(link, vehicle, signing, tell)
     step_s = abs(clock.monotonic_less_unix_s() - unix_s)
     seen = replace(
         seen,
@@ -111,17 +105,15 @@ def planned(seen: Observation, config: FlightConfig) -> Observation:
     return replace(seen, config=config, config_problem=problem, tilt_rad=tilt_rad)
 
 
-def _listen(
-    link: Link, system_id: int | None, signing: Signing | None, tell: Tell, *, sends_first: bool
-) -> Observation:
+def _listen(link: Link, vehicle: Connection, signing: Signing | None, tell: Tell) -> Observation:
     began_s = clock.monotonic_s()
     listening = Listening(
         began_s,
-        system_id=system_id,
+        system_id=vehicle.system_id,
         signing=signing,
         stream=link.is_stream,
         capacity_bytes_ps=link.capacity_bytes_ps,
-        sends_first=sends_first,
+        sends_first=vehicle.sends_first,
     )
     while not listening.complete(clock.monotonic_s()):
         for chunk in link.receive(POLL_S):

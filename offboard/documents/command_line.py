@@ -19,7 +19,6 @@ if TYPE_CHECKING:
 
 USAGE, INTERRUPT, CLOSED_PIPE = 2, 130, 141  # exit codes; the last two as of SIGINT and SIGPIPE
 INTERRUPTED = "interrupted"
-MEMORY_LEAST_MB = 1000  # with less, numpy and the compiler end the process themselves
 DISK_ERRORS = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO)
 
 
@@ -33,9 +32,9 @@ def run(load: Callable[[], Callable[[], object]]) -> NoReturn:
     nobody reads the output any more (`| head -1`), the exit code is 141 without a sentence.
     """
     interrupts_exit()
-    _open_standard_files()
+    if sys.stdout is not None:  # text that the encoding of the output does not have is escaped
+        sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
     try:
-        _check_process()
         load()()
         sentence, code = "", 0
     except SystemExit as ended:
@@ -64,11 +63,8 @@ def run(load: Callable[[], Callable[[], object]]) -> NoReturn:
         code = code or CLOSED_PIPE
     elif unwritten and not sentence:
         sentence, code = explained(unwritten), code or USAGE
-    try:
-        if sentence:
-            complain(sentence)
-    except OSError:  # stderr cannot be written either: the exit code is all that is left
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stderr.fileno())
+    if sentence:
+        complain(sentence)
     raise SystemExit(code)
 
 
@@ -111,36 +107,6 @@ def explained(error: OSError) -> str:
     if error.errno in DISK_ERRORS:
         return f"the output cannot be written: {reason}"
     return f"refused by the operating system: {reason}"
-
-
-def _open_standard_files() -> None:
-    """Open /dev/null for standard files that are closed, else a log would become one of them. Text
-    that the encoding of the output does not have is escaped."""
-    for descriptor, name in enumerate(("stdin", "stdout", "stderr")):
-        if getattr(sys, name) is None:
-            os.open(os.devnull, os.O_RDWR)  # the lowest free descriptor
-            setattr(sys, name, open(descriptor, "r" if descriptor == 0 else "w"))  # noqa: SIM115
-    reconfigure = getattr(sys.stdout, "reconfigure", None)
-    if reconfigure is not None:
-        reconfigure(errors="backslashreplace")
-
-
-def _check_process() -> None:
-    """Raise UserError where the working directory is gone or memory is limited too much."""
-    import resource
-
-    from offboard.documents.errors import UserError
-
-    try:
-        os.getcwd()
-    except FileNotFoundError:
-        raise UserError("the working directory does not exist any more; change to one") from None
-    limit_mb = resource.getrlimit(resource.RLIMIT_AS)[0] / 1e6
-    if 0 <= limit_mb < MEMORY_LEAST_MB:
-        raise UserError(
-            f"address space is limited to {limit_mb:.0f} MB; at least {MEMORY_LEAST_MB} MB are "
-            "needed (ulimit -v)"
-        )
 
 
 def interrupts_exit() -> None:

@@ -2,23 +2,27 @@
 
 Every configuration file goes through `parse`: text in, frozen pydantic value out. Scalars follow
 YAML 1.2 (`1e-3` is a number, `no` and `12:30` are text) and are checked strictly (no text for
-numbers, no true for 1); duplicate keys, aliases and tags are refused. Opens no file.
+numbers, no true for 1); duplicate keys, aliases and tags are refused. A problem names the line and
+column of its key, the value and what is allowed, in pydantic's words:
+
+    flight.yaml, line 4, column 1: period_s: 7 should be less than or equal to 0.5
 """
 
 from __future__ import annotations
 
+import difflib
 import json
 import math
 import re
 from collections.abc import Mapping
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
 
 from offboard.documents.errors import DocumentError as DocumentError
-from offboard.documents.errors import abridged, key_path, sentence, shown
+from offboard.documents.errors import abridged, shown
 
 if TYPE_CHECKING:
     from pydantic_core import ErrorDetails
@@ -50,6 +54,14 @@ _WORDS: dict[str, Any] = {
     "true": True, "True": True, "TRUE": True, "false": False, "False": False, "FALSE": False,
     ".inf": math.inf, "+.inf": math.inf, "-.inf": -math.inf, ".nan": math.nan,
 }  # fmt: skip
+
+
+class Section(dict[str, Any]):
+    """A mapping of a file. `places`: where each of its keys stands, for errors."""
+
+    def __init__(self, values: Mapping[str, Any], places: Mapping[str, str] | None = None) -> None:
+        super().__init__(values)
+        self.places = dict(places or getattr(values, "places", {}))
 
 
 def parse(text: str, model: type[M], source: str, kind: str = "") -> M:
@@ -137,11 +149,9 @@ def validate(
         # as JSON: strict about scalars, yet a list may become a tuple and text an enum
         return model.model_validate_json(json.dumps(mapping), strict=True)
     except ValidationError as error:
-        schema = model.model_json_schema()
         details = _own_problems(error.errors(include_url=False), mapping)
         problems = [
-            f"{_origin(key_path(detail, mapping), options, source)}: "
-            f"{sentence(detail, mapping, schema)}"
+            f"{_origin(detail, mapping, options, source)}: {_sentence(detail, mapping, model)}"
             for detail in details[:PROBLEMS_MOST]
         ]
         if len(details) > PROBLEMS_MOST:
@@ -157,7 +167,7 @@ def known(mapping: Mapping[str, Any], model: type[M]) -> Json:
     except ValidationError as error:
         for detail in error.errors(include_url=False):
             if detail["type"] == "extra_forbidden":
-                *path, key = key_path(detail, mapping).split(".")
+                *path, key = _key_path(detail, mapping).split(".")
                 section: Any = kept
                 for part in path:
                     section = section[int(part)] if isinstance(section, list) else section[part]
@@ -168,7 +178,7 @@ def known(mapping: Mapping[str, Any], model: type[M]) -> Json:
 def _own_problems(details: list[ErrorDetails], mapping: Mapping[str, Any]) -> list[ErrorDetails]:
     """The errors without those that another one explains: a value of the right type is also refused
     as every other type of a union, and a list is counted without its wrong items."""
-    paths = [key_path(detail, mapping) for detail in details]
+    paths = [_key_path(detail, mapping) for detail in details]
     typed = {
         path
         for path, detail in zip(paths, details, strict=True)
@@ -182,30 +192,102 @@ def _own_problems(details: list[ErrorDetails], mapping: Mapping[str, Any]) -> li
     ]
 
 
-def _origin(path: str, options: Mapping[str, str], source: str) -> str:
-    """The last option that set the value at `path`, else `source`."""
-    problem = path.split(".")
+def _origin(
+    detail: ErrorDetails, mapping: Mapping[str, Any], options: Mapping[str, str], source: str
+) -> str:
+    """What set the value: the last option that did, else the place of its key in a file."""
+    problem = _key_path(detail, mapping).split(".")
     for assigned, option in reversed(list(options.items())):
         keys = [key.strip() for key in assigned.split(".")]
         if all(mine == theirs for mine, theirs in zip(keys, problem, strict=False)):
             return option
+    value: Any = mapping
+    for key in problem:
+        source = getattr(value, "places", {}).get(key, source)
+        if isinstance(value, Mapping):
+            value = value.get(key)
+        elif isinstance(value, list) and key in map(str, range(len(value))):
+            value = value[int(key)]
     return source
+
+
+def _sentence(detail: ErrorDetails, document: Any, model: type[BaseModel]) -> str:
+    """The sentence for one error of pydantic."""
+    path = abridged(_key_path(detail, document))
+    kind, context = detail["type"], detail.get("ctx", {})
+    if kind == "extra_forbidden":
+        return _unknown_key(path, _model_at(model, detail["loc"][:-1]))
+    if kind == "missing":
+        return f"{path} is missing"
+    if kind.startswith("union_tag"):
+        key = f"{path}.{context['discriminator'].strip(chr(39))}"
+        if "tag" not in context:
+            return f"{key} is missing"
+        return f"{key}: {context['tag']!r} is not one of {context['expected_tags']}"
+    _, separator, allowed = detail["msg"].partition(" should ")
+    where = f"{path}: " if path else ""
+    if separator:
+        value = shown(detail["input"])
+        return f"{where}{value} should {allowed.replace(' after validation', '')}"
+    return f"{where}{detail['msg'].removeprefix('Value error, ')}"
+
+
+def _unknown_key(path: str, model: type[BaseModel] | None) -> str:
+    if model is None:
+        return f"{path} is not a known key"
+    known = sorted(model.model_fields)
+    near = difflib.get_close_matches(path.rpartition(".")[2], known, n=1)
+    hint = f", did you mean {near[0]}?" if near else ""
+    return f"{path} is not a known key{hint} (known keys: {', '.join(known)})"
+
+
+def _model_at(model: type[BaseModel], location: tuple[int | str, ...]) -> type[BaseModel] | None:
+    """The class of a section; None for a member of a union, or of a mapping."""
+    found: type[BaseModel] | None = model
+    for key in location:
+        field = found.model_fields.get(str(key)) if found else None
+        members = [field.annotation, *get_args(field.annotation)] if field else []
+        models = [m for m in members if isinstance(m, type) and issubclass(m, BaseModel)]
+        found = models[0] if len(models) == 1 else None
+    return found
+
+
+def _key_path(detail: ErrorDetails, document: Any) -> str:
+    """The dotted path of the key that an error of pydantic is about.
+
+    pydantic's location also holds the names of union members; these are no keys of `document`.
+    """
+    keys: list[str] = []
+    value = document
+    for part in detail["loc"]:
+        has_key = isinstance(value, Mapping) and part in value
+        has_index = isinstance(value, list) and isinstance(part, int) and part < len(value)
+        if has_key or has_index:
+            value = value[part]
+            keys.append(str(part))
+    if detail["type"] == "missing":
+        keys.append(str(detail["loc"][-1]))
+    return ".".join(keys)
 
 
 def _loaded(text: str, source: str) -> Any:
     try:
         root = yaml.compose(text, Loader=yaml.BaseLoader)
-        return None if root is None else _value(root, set())
+        return None if root is None else _value(root, set(), source)
     except yaml.YAMLError as error:
         mark = getattr(error, "problem_mark", None)
-        place = f"{source}, line {mark.line + 1}, column {mark.column + 1}" if mark else source
+        place = _at(mark, source) if mark else source
         problem = getattr(error, "problem", None) or " ".join(str(error).split())
         raise DocumentError(f"{place}: {problem}") from None
     except RecursionError:
         raise DocumentError(f"{source}: nested too deeply") from None
 
 
-def _value(node: yaml.Node, seen: set[int]) -> Any:
+def _at(mark: yaml.Mark, source: str) -> str:
+    return f"{source}, line {mark.line + 1}, column {mark.column + 1}"
+
+
+def _value(node: yaml.Node, seen: set[int], source: str) -> Any:
     """A YAML node -> plain Python, with the scalars of YAML 1.2."""
     if id(node) in seen:
         raise _refusal("a value is used twice: aliases are not allowed", node)
@@ -213,16 +295,17 @@ def _value(node: yaml.Node, seen: set[int]) -> Any:
     if node.tag not in _PLAIN_TAGS:
         raise _refusal("tags are not allowed", node)
     if isinstance(node, yaml.MappingNode):
-        mapping: Json = {}
+        mapping = Section({})
         for key, value in node.value:
             if not isinstance(key, yaml.ScalarNode):
                 raise _refusal("a key must be a single word", key)
             if key.value in mapping:
                 raise _refusal(f"the key {key.value!r} is given twice", key)
-            mapping[key.value] = _value(value, seen)
+            mapping[key.value] = _value(value, seen, source)
+            mapping.places[key.value] = _at(key.start_mark, source)
         return mapping
     if isinstance(node, yaml.SequenceNode):
-        return [_value(item, seen) for item in node.value]
+        return [_value(item, seen, source) for item in node.value]
     plain = getattr(node, "style", None) is None
     return _scalar(node.value) if plain else node.value
 
@@ -252,5 +335,9 @@ def _with(value: Any, keys: list[str], new: Any) -> Any:
     if isinstance(value, list) and key in map(str, range(len(value))):
         index = int(key)
         return [*value[:index], _with(value[index], rest, new), *value[index + 1 :]]
-    section = dict(value) if isinstance(value, Mapping) else {}
-    return {**section, key: _with(section.get(key), rest, new)}
+    section = Section(value if isinstance(value, Mapping) else {})
+    before = section.get(key)
+    section[key] = _with(before, rest, new)
+    if not rest or type(before) is not type(section[key]):
+        section.places.pop(key, None)  # not of the file any more
+    return section

@@ -16,6 +16,7 @@ from offboard.doctor.observation import Observation
 from offboard.doctor.table import CheckError, as_json, checks, examine, verdict, worst
 from offboard.flight.preflight import Level
 from offboard.run.configuration import load
+from offboard.run.flight import Connection
 
 README = Path(__file__).parents[2] / "offboard" / "doctor" / "README.md"
 
@@ -73,7 +74,7 @@ def test_the_command_ends_in_time_although_nothing_of_it_does(
     monkeypatch.setattr(run, "open_link", lambda connection: never.wait())
     monkeypatch.setattr(run, "measure", lambda *given, **named: never.wait())
     began_s = time.monotonic()
-    seen = run.observe("tcp:10.0.0.1:5760", load("flight"), tmp_path)
+    seen = run.observe(Connection("tcp:10.0.0.1:5760"), load("flight"), tmp_path)
     assert time.monotonic() - began_s < 2.0
     rows = {row.check: row for row in examine(checks(["port", "computer"]), seen)}
     assert "cannot be opened in 0.1 s" in rows["port"].findings[0].found
