@@ -27,11 +27,10 @@ from offboard.flight.record import (
     RECORD_NAME,
     records_of,
 )
-from offboard.mavlink.autopilots import is_vehicle
 from offboard.mavlink.decode import Address, decode_identity
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.framing import HEARTBEAT
-from offboard.mavlink.session import DIALECTS
+from offboard.mavlink.senders import DIALECTS, is_vehicle
 
 Array = NDArray[np.float64]
 IDENTIFIED_SIZE = 20

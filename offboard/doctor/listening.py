@@ -217,13 +217,13 @@ class Listening:
 
     def observation(self, now_s: float) -> Observation:
         """What was observed until host time `now_s`."""
-        session, autopilots = self._session, self._session.autopilots
-        several = autopilots.ambiguous(session.link_time_s)
+        session, senders = self._session, self._session.senders
+        several = senders.ambiguous(session.link_time_s)
         return Observation(
             listened_s=now_s - self._began_s,
-            not_found=autopilots.why_none(session.counters),
+            not_found=senders.why_none(session.counters),
             senders=self._senders.found,
-            systems=autopilots.named(session.link_time_s) if several else "",
+            systems=senders.named(session.link_time_s) if several else "",
             vehicle=self.vehicle,
             dialect=session.dialect,
             fix_type=self._fix_type,

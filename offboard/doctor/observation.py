@@ -13,9 +13,9 @@ from offboard.flight.phases import Limits
 from offboard.flight.preflight import Ground
 from offboard.flight.vehicle_state import VehicleState
 from offboard.identification.uncertainty import Estimate
-from offboard.mavlink.autopilots import is_vehicle
 from offboard.mavlink.decode import Identity
 from offboard.mavlink.dialects.base import TYPE_GCS, Dialect, WantedMessage
+from offboard.mavlink.senders import is_vehicle
 from offboard.run.configuration import FlightConfig
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Hashable
 
-from pymavlink.dialects.v20.ardupilotmega import mavlink_map
+from pymavlink.dialects.v20.all import mavlink_map
 
 from offboard.doctor.observation import Sender
 from offboard.mavlink.counters import Counters

@@ -96,7 +96,7 @@ def facts(
         full_thrust_sink_mps=_full_thrust_sink_mps(state),
         other_sender=_hears_other_sender(state),
         follows_others=_follows_others(state),
-        other_vehicle=session.autopilots.ambiguous(state.now_s),
+        other_vehicle=session.senders.ambiguous(state.now_s),
         disarmed_again=_disarmed_again(state),
         lifted_by_command=state.takes_off_by_command,
         request=state.request,
@@ -159,8 +159,8 @@ def figures(
         "hover_thrust_percent": 100.0 * now.hover_thrust,
         "other_sender": f"system {other.system_id} component {other.component_id}" if other else "",
         "companion": _other_companion(vehicle.other_companion),
-        "systems": session.autopilots.named(state.now_s),
-        "not_found": session.autopilots.why_none(session.counters)
+        "systems": session.senders.named(state.now_s),
+        "not_found": session.senders.why_none(session.counters)
         or "is it running, and sending to this port?",
         "stop": state.stop_reason,
         "failure": state.failure,
@@ -175,7 +175,7 @@ def figures(
 
 def ground(state: FlightState, session: Session) -> Ground:
     """What the preflight list judges."""
-    programme, contact, autopilots = state.programme, state.contact, session.autopilots
+    programme, contact, senders = state.programme, state.contact, session.senders
     vehicle, dialect = state.vehicle, state.dialect
     read = dialect and state.reading.complete(dialect, vehicle.parameters, state.now_s)
     from_origin = programme.serves and programme.anchor == "origin"
@@ -188,7 +188,7 @@ def ground(state: FlightState, session: Session) -> Ground:
         delay=state.clock.delay,
         measures_delay=not state.clock.delay_is_measured(state.host_s),
         reads_parameters=not read,
-        systems=autopilots.named(state.now_s) if autopilots.ambiguous(state.now_s) else "",
+        systems=senders.named(state.now_s) if senders.ambiguous(state.now_s) else "",
         other_sender=_hears_other_sender(state),
         in_the_air=contact.in_the_air,
         guarded=state.guarded,

@@ -233,7 +233,7 @@ class Companion:
 
     def note_autopilot(self, system_id: int) -> None:
         """Another address shows the autopilot of this system, for a replay."""
-        self._session.autopilots.hear(system_id, self._session.link_time_s)
+        self._session.senders.hear(system_id, self._session.link_time_s)
 
     def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
         """Process all that has arrived, then act once if a tick is due. Returns what to send.

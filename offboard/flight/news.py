@@ -71,5 +71,5 @@ def _unheard(session: Session) -> str:
         return "nothing is heard on this link"
     if not counters.frames:
         return f"{counters.bytes_received} bytes are heard that are not MAVLink"
-    known = session.autopilots.why_none(counters)
+    known = session.senders.why_none(counters)
     return known or "MAVLink is heard, but no heartbeat of an autopilot"

@@ -11,7 +11,7 @@ from contextlib import suppress
 
 from offboard.link.interface import LinkError, LinkUnavailable, Strangers
 from offboard.link.stream import Stream
-from offboard.mavlink.peer import PEER_SILENT_S
+from offboard.mavlink.senders import PEER_SILENT_S
 
 CONNECT_S = 5.0
 RETRY_S = 0.5

@@ -18,7 +18,7 @@ from contextlib import suppress
 from offboard.link import clock
 from offboard.link.interface import Chunk, Strangers
 from offboard.mavlink.framing import TIMESYNC, frame_size
-from offboard.mavlink.peer import PEER_SILENT_S, same_host
+from offboard.mavlink.senders import PEER_SILENT_S, same_host
 
 DATAGRAM_SIZE = 65535
 BUFFER_BYTES = 1 << 20

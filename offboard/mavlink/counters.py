@@ -68,6 +68,17 @@ class Counters:
     forged: int = 0  # frames that signing refused
     _reported_next: int = 1  # number of them in the next of `news`
 
+    def count(self, outcome: DropReason | bool) -> None:
+        """A frame was dropped, decoded (True) or ignored (False)."""
+        self.frames += 1
+        if isinstance(outcome, DropReason):
+            self.dropped[outcome] += 1
+            self.forged += outcome in FORGED
+        elif outcome:
+            self.decoded += 1
+        else:
+            self.ignored += 1
+
     @property
     def dropped_frames(self) -> int:
         return sum(n for reason, n in self.dropped.items() if reason not in NOT_A_FRAME)

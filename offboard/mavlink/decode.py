@@ -1,21 +1,21 @@
-"""Decoding: payloads of verified frames become events in NED, FRD and SI, or are refused.
+"""Decoding: messages, as pymavlink has decoded them, become events in NED, FRD and SI.
 
-Every field is checked here to be finite and in range. Knows no sequence numbers, no addresses and
-no clock. pymavlink's dialect classes supply ids and layouts.
+Every field is checked here to be finite and in range, else the message is refused. `_DECODERS` is
+the table by message id. Knows no sequence numbers, no addresses and no clock.
 """
 
 from __future__ import annotations
 
 import math
-import struct
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from offboard.mavlink import events
 from offboard.mavlink.counters import DropReason
 from offboard.mavlink.dialects.base import Dialect, ParameterEncoding
+from offboard.mavlink.framing import Frame, payload_of
 
 POSITION_LIMIT_M = 1e5
 VELOCITY_LIMIT_MPS = 200.0
@@ -32,7 +32,6 @@ _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 _FIX_3D = 3  # GPS_FIX_TYPE
 _REAL32 = 9  # MAV_PARAM_TYPE
 _UNSIGNED_TYPES, _SIGNED_TYPES = (1, 3, 5), (2, 4, 6)
-_CURRENT_MODE = struct.Struct("<IIx")  # custom_mode, intended_custom_mode; not in pymavlink 2.4.50
 _LANDED = ("unknown", "on_ground", "in_air", "takeoff", "landing")  # MAV_LANDED_STATE
 _RESULTS = (  # MAV_RESULT
     "ACCEPTED",
@@ -73,139 +72,123 @@ class TextChunk(NamedTuple):
     last: bool
 
 
-def _unpack(message: Any, payload: bytes) -> tuple[Any, ...]:
-    """Fields in wire order, after adding the trailing zeros that MAVLink 2 omits."""
-    layout: struct.Struct = message.unpacker
-    return layout.unpack_from(payload.ljust(layout.size, b"\0"))
+def decode(frame: Frame, dialect: Dialect) -> events.Event | DropReason | None:
+    """The event in a verified frame, IMPLAUSIBLE, or None for a message without decoder."""
+    decoder = _DECODERS.get(frame.message_id)
+    return None if decoder is None else decoder(frame.message, dialect)
 
 
-def decode(message_id: int, payload: bytes, dialect: Dialect) -> events.Event | DropReason | None:
-    """The event in a payload, IMPLAUSIBLE, or None for a message without decoder."""
-    decoder = _DECODERS.get(message_id)
-    return None if decoder is None else decoder(payload, dialect)
-
-
-def decode_command(message_id: int, payload: bytes) -> tuple[int, tuple[float, ...], Address]:
-    """Command, parameters and receiver of a COMMAND_LONG (76) or a COMMAND_INT (75), whose
-    parameters 5 to 7, a place, are left out."""
-    if message_id == mavlink.MAVLINK_MSG_ID_COMMAND_LONG:
-        *parameters, command, system_id, component_id, _ = _unpack(
-            mavlink.MAVLink_command_long_message, payload
-        )
-    else:
-        *parameters, _, _, _, command, system_id, component_id, _, _, _ = _unpack(
-            mavlink.MAVLink_command_int_message, payload
-        )
-    return command, tuple(parameters), Address(system_id, component_id)
+def decode_command(message: Any) -> tuple[int, tuple[float, ...], Address]:
+    """Command, parameters and receiver of a COMMAND_LONG or a COMMAND_INT, whose parameters 5 to 7,
+    a place, are left out."""
+    parameters = [message.param1, message.param2, message.param3, message.param4]
+    if message.id == mavlink.MAVLINK_MSG_ID_COMMAND_LONG:
+        parameters += [message.param5, message.param6, message.param7]
+    return (
+        message.command,
+        tuple(parameters),
+        Address(message.target_system, message.target_component),
+    )
 
 
 def decode_identity(payload: bytes) -> Identity:
-    """MAV_TYPE and MAV_AUTOPILOT of a HEARTBEAT."""
-    _, vehicle_type, autopilot, *_ = _unpack(mavlink.MAVLink_heartbeat_message, payload)
-    return Identity(vehicle_type, autopilot)
-
-
-def decode_custom_mode(payload: bytes) -> int:
-    """HEARTBEAT.custom_mode."""
-    return int.from_bytes(payload[:4], "little")
-
-
-def decode_ack_address(payload: bytes) -> Address:
-    """Receiver of a COMMAND_ACK; 0 means all."""
-    *_, system_id, component_id = _unpack(mavlink.MAVLink_command_ack_message, payload)
-    return Address(system_id, component_id)
-
-
-def decode_timesync(payload: bytes) -> tuple[int, int]:
-    """TIMESYNC (tc1, ts1) in nanoseconds; tc1 is 0 in a request."""
-    tc1, ts1 = _unpack(mavlink.MAVLink_timesync_message, payload)
-    return tc1, ts1
+    """MAV_TYPE and MAV_AUTOPILOT in the payload of a HEARTBEAT."""
+    padded = payload.ljust(6, b"\0")  # MAVLink 2 omits trailing zeros
+    return Identity(padded[4], padded[5])
 
 
 def decode_text_chunk(payload: bytes) -> TextChunk:
-    """One STATUSTEXT."""
-    severity, text, text_id, chunk = _unpack(mavlink.MAVLink_statustext_message, payload)
+    """The payload of a STATUSTEXT, whose text is UTF-8, which pymavlink does not decode."""
+    layout = mavlink.MAVLink_statustext_message.unpacker
+    severity, text, text_id, chunk = layout.unpack_from(payload.ljust(layout.size, b"\0"))
     data, terminator, _ = text.partition(b"\0")
     return TextChunk(severity, data, text_id, chunk, bool(terminator))
 
 
-def _heartbeat(payload: bytes, dialect: Dialect) -> events.Event:
-    custom_mode, kind, _, base_mode, status, _ = _unpack(mavlink.MAVLink_heartbeat_message, payload)
-    return events.Heartbeat(dialect.mode_name(custom_mode), bool(base_mode & _ARMED), status, kind)
+def _heartbeat(message: Any, dialect: Dialect) -> events.Event:
+    armed = bool(message.base_mode & _ARMED)
+    mode = dialect.mode_name(message.custom_mode)
+    return events.Heartbeat(mode, armed, message.system_status, message.type)
 
 
-def _current_mode(payload: bytes, dialect: Dialect) -> events.Event:
-    custom_mode, _ = _CURRENT_MODE.unpack_from(payload.ljust(_CURRENT_MODE.size, b"\0"))
-    return events.ModeReport(dialect.mode_name(custom_mode))
+def _current_mode(message: Any, dialect: Dialect) -> events.Event:
+    return events.ModeReport(dialect.mode_name(message.custom_mode))
 
 
-def _local_position(payload: bytes, _: Dialect) -> events.Event | DropReason:
-    boot_ms, x, y, z, vx, vy, vz = _unpack(mavlink.MAVLink_local_position_ned_message, payload)
+def _local_position(message: Any, _: Dialect) -> events.Event | DropReason:
+    x, y, z = position = message.x, message.y, message.z
+    vx, vy, vz = velocity = message.vx, message.vy, message.vz
     far, fast = POSITION_LIMIT_M, VELOCITY_LIMIT_MPS
     # comparisons with NaN are false: these refuse what is not finite, too
     if not (-far < x < far and -far < y < far and -far < z < far):
         return DropReason.IMPLAUSIBLE
     if not (-fast < vx < fast and -fast < vy < fast and -fast < vz < fast):
         return DropReason.IMPLAUSIBLE
-    return events.LocalPosition(boot_ms / 1000.0, (x, y, z), (vx, vy, vz))
+    return events.LocalPosition(message.time_boot_ms / 1000.0, position, velocity)
 
 
-def _attitude(payload: bytes, _: Dialect) -> events.Event | DropReason:
-    boot_ms, w, x, y, z, p, q, r, *_offset = _unpack(
-        mavlink.MAVLink_attitude_quaternion_message, payload
-    )
+def _attitude(message: Any, _: Dialect) -> events.Event | DropReason:
+    w, x, y, z = message.q1, message.q2, message.q3, message.q4
+    p, q, r = rates = message.rollspeed, message.pitchspeed, message.yawspeed
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     if not 0.9 < norm < 1.1:
         return DropReason.IMPLAUSIBLE
     limit = RATE_LIMIT_RADPS
     if not (-limit < p < limit and -limit < q < limit and -limit < r < limit):
         return DropReason.IMPLAUSIBLE
-    return events.Attitude(boot_ms / 1000.0, (w / norm, x / norm, y / norm, z / norm), (p, q, r))
+    unit = (w / norm, x / norm, y / norm, z / norm)
+    return events.Attitude(message.time_boot_ms / 1000.0, unit, rates)
 
 
-def _thrust_report(payload: bytes, _: Dialect) -> events.Event | DropReason:
-    *_state, thrust, _mask = _unpack(mavlink.MAVLink_attitude_target_message, payload)
-    if not math.isfinite(thrust):
+def _thrust_report(message: Any, _: Dialect) -> events.Event | DropReason:
+    if not math.isfinite(message.thrust):
         return DropReason.IMPLAUSIBLE
-    return events.ThrustReport(min(max(thrust, 0.0), 1.0))  # ArduCopter's falls to -0.2 on landing
+    # ArduCopter's falls to -0.2 on landing
+    return events.ThrustReport(min(max(message.thrust, 0.0), 1.0))
 
 
-def _gps_fix(payload: bytes, _: Dialect) -> events.Event:
-    fields = _unpack(mavlink.MAVLink_gps_raw_int_message, payload)
-    fix, accuracy_mm = fields[8], fields[11]
-    if fix < _FIX_3D:
-        return events.NoFix(fix)
-    return events.GpsFix(accuracy_mm * 1e-3 if accuracy_mm else None)
+def _gps_fix(message: Any, _: Dialect) -> events.Event:
+    if message.fix_type < _FIX_3D:
+        return events.NoFix(message.fix_type)
+    return events.GpsFix(message.h_acc * 1e-3 if message.h_acc else None)
 
 
-def _system_health(payload: bytes, _: Dialect) -> events.Event:
-    fields = _unpack(mavlink.MAVLink_sys_status_message, payload)
-    present, enabled, health, _, millivolts = fields[:5]
-    percent, failed = fields[12], enabled & ~health & ~_PREARM_CHECK
+def _system_health(message: Any, _: Dialect) -> events.Event:
+    health, percent = message.onboard_control_sensors_health, message.battery_remaining
+    failed = message.onboard_control_sensors_enabled & ~health & ~_PREARM_CHECK
+    millivolts = message.voltage_battery
     return events.SystemHealth(
         prearm_ok=bool(health & _PREARM_CHECK),
         battery_voltage_v=millivolts * 1e-3 if millivolts != 0xFFFF else None,
         battery_remaining=percent * 1e-2 if 0 <= percent <= 100 else None,
-        radio_ok=bool(present & health & _RADIO),
+        radio_ok=bool(message.onboard_control_sensors_present & health & _RADIO),
         unhealthy=tuple(name for bit, name in _SENSORS.items() if failed & bit),
     )
 
 
-def _px4_estimator(payload: bytes, _: Dialect) -> events.Event:
-    _, velocity, position, height, mag, hagl, airspeed, accuracy_m, _, flags = _unpack(
-        mavlink.MAVLink_estimator_status_message, payload
-    )
-    ratios = {"GPS velocity": velocity, "GPS position": position, "height": height, "heading": mag}
-    ratios |= {"height above ground": hagl, "airspeed": airspeed}
-    return _estimator(flags, ratios, accuracy_m if math.isfinite(accuracy_m) else None)
+def _px4_estimator(message: Any, _: Dialect) -> events.Event:
+    ratios = {
+        "GPS velocity": message.vel_ratio,
+        "GPS position": message.pos_horiz_ratio,
+        "height": message.pos_vert_ratio,
+        "heading": message.mag_ratio,
+        "height above ground": message.hagl_ratio,
+        "airspeed": message.tas_ratio,
+    }
+    accuracy_m = message.pos_horiz_accuracy
+    return _estimator(message.flags, ratios, accuracy_m if math.isfinite(accuracy_m) else None)
 
 
-def _ardupilot_estimator(payload: bytes, _: Dialect) -> events.Event:
-    velocity, position, height, compass, terrain, flags, airspeed = _unpack(
-        mavlink.MAVLink_ekf_status_report_message, payload
-    )
-    ratios = {"GPS velocity": velocity, "GPS position": position, "height": height}
-    return _estimator(flags, ratios | {"compass": compass, "terrain": terrain, "air": airspeed})
+def _ardupilot_estimator(message: Any, _: Dialect) -> events.Event:
+    ratios = {
+        "GPS velocity": message.velocity_variance,
+        "GPS position": message.pos_horiz_variance,
+        "height": message.pos_vert_variance,
+        "compass": message.compass_variance,
+        "terrain": message.terrain_alt_variance,
+        "air": message.airspeed_variance,
+    }
+    return _estimator(message.flags, ratios)
 
 
 def _estimator(
@@ -221,40 +204,40 @@ def _estimator(
     )
 
 
-def _version(payload: bytes, _: Dialect) -> events.Event:
-    _, uid, number, *more = _unpack(mavlink.MAVLink_autopilot_version_message, payload)
-    uid = uid or int.from_bytes(bytes(more[-18:]), "little")  # uid2, the only one of ArduPilot
-    return events.VehicleIdentity(uid, events.FirmwareVersion(*number.to_bytes(4, "big")))
+def _version(message: Any, _: Dialect) -> events.Event:
+    # uid2 is the only one of ArduPilot
+    uid = message.uid or int.from_bytes(bytes(message.uid2), "little")
+    version = events.FirmwareVersion(*message.flight_sw_version.to_bytes(4, "big"))
+    return events.VehicleIdentity(uid, version)
 
 
-def _system_time(payload: bytes, _: Dialect) -> events.Event:
-    unix_us, _ = _unpack(mavlink.MAVLink_system_time_message, payload)
-    return events.SystemTime(unix_us * 1e-6)
+def _system_time(message: Any, _: Dialect) -> events.Event:
+    return events.SystemTime(message.time_unix_usec * 1e-6)
 
 
-def _landed(payload: bytes, _: Dialect) -> events.Event:
-    _, state = _unpack(mavlink.MAVLink_extended_sys_state_message, payload)
+def _landed(message: Any, _: Dialect) -> events.Event:
+    state = message.landed_state
     return events.Landed(_LANDED[state] if state < len(_LANDED) else _LANDED[0])
 
 
-def _command_ack(payload: bytes, _: Dialect) -> events.Event:
-    command, result, *_address = _unpack(mavlink.MAVLink_command_ack_message, payload)
-    return events.CommandAck(
-        command, _RESULTS[result] if result < len(_RESULTS) else f"UNKNOWN({result})"
-    )
+def _command_ack(message: Any, _: Dialect) -> events.Event:
+    result = message.result
+    name = _RESULTS[result] if result < len(_RESULTS) else f"UNKNOWN({result})"
+    return events.CommandAck(message.command, name)
 
 
-def _parameter(payload: bytes, dialect: Dialect) -> events.Event | DropReason:
-    value, _, _, name, kind = _unpack(mavlink.MAVLink_param_value_message, payload)
+def _parameter(message: Any, dialect: Dialect) -> events.Event | DropReason:
+    value, kind = message.param_value, message.param_type
     if dialect.parameter_encoding is ParameterEncoding.BYTEWISE and kind != _REAL32:
-        # from the bytes: as a float they may be a signalling NaN, which Python changes
         if kind not in _UNSIGNED_TYPES + _SIGNED_TYPES:
             return DropReason.IMPLAUSIBLE
-        value = int.from_bytes(payload[:4].ljust(4, b"\0"), "little", signed=kind in _SIGNED_TYPES)
+        # from the bytes: as a float they may be a signalling NaN, which Python changes
+        first = payload_of(bytes(message.get_msgbuf()))[:4].ljust(4, b"\0")
+        value = int.from_bytes(first, "little", signed=kind in _SIGNED_TYPES)
     if not math.isfinite(value):
         return DropReason.IMPLAUSIBLE
-    text = printable(name.partition(b"\0")[0])
-    return events.Parameter(text, float(value)) if text else DropReason.IMPLAUSIBLE
+    name = printable(message.param_id.encode())
+    return events.Parameter(name, float(value)) if name else DropReason.IMPLAUSIBLE
 
 
 def printable(data: bytes) -> str:
@@ -263,7 +246,7 @@ def printable(data: bytes) -> str:
     return "".join(c if c.isprintable() else " " for c in text).strip()
 
 
-_DECODERS: Mapping[int, Callable[[bytes, Dialect], events.Event | DropReason | None]] = {
+_DECODERS: Mapping[int, Callable[[Any, Dialect], events.Event | DropReason | None]] = {
     0: _heartbeat,
     1: _system_health,
     2: _system_time,

@@ -1,16 +1,16 @@
-"""Encoding: values of outgoing.py become message ids and payloads: units, quaternion, thrust.
+"""Encoding: values of outgoing.py become messages of pymavlink: units, quaternion, thrust.
 
 The last check before the vehicle: ValueError for what is not finite or out of range. Knows no
-sequence numbers, no addresses and no clock. pymavlink's dialect classes supply the layouts.
+sequence numbers, no addresses and no clock.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from pymavlink.dialects.v20 import all as mavlink
 
 from offboard.mavlink import events
 from offboard.mavlink.decode import Address
@@ -32,18 +32,12 @@ from offboard.mavlink.outgoing import (
 from offboard.model import frames
 
 _LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
+Message = Any  # of pymavlink, to be packed
 FLOAT32_MAX = 3.4028234663852886e38
 
 
-class Packed(NamedTuple):
-    """A message without its frame."""
-
-    message_id: int
-    payload: bytes
-
-
-def encode(outgoing: Outgoing, target: Address | None, dialect: Dialect | None) -> Packed:
-    """Message id and payload of `outgoing`, sent to `target`.
+def encode(outgoing: Outgoing, target: Address | None, dialect: Dialect | None) -> Message:
+    """The message of `outgoing`, sent to `target`.
 
     Raises ValueError for a value that is not finite or out of range, and for a message to the
     vehicle while `target` or `dialect` is None.
@@ -56,8 +50,7 @@ def encode(outgoing: Outgoing, target: Address | None, dialect: Dialect | None) 
         case CommandLong():
             return _command(outgoing, **_to(target, dialect))
         case ParamRead(name):
-            return _pack(
-                mavlink.MAVLink_param_request_read_message,
+            return mavlink.MAVLink_param_request_read_message(
                 **_to(target, dialect),
                 param_id=_param_name(name),
                 param_index=-1,
@@ -69,8 +62,7 @@ def encode(outgoing: Outgoing, target: Address | None, dialect: Dialect | None) 
         case ConfigurationRecord():
             return _configuration(outgoing)
         case CommandResult(command, result, system_id, component_id):
-            return _pack(
-                mavlink.MAVLink_command_ack_message,
+            return mavlink.MAVLink_command_ack_message(
                 command=command,
                 result=result,
                 progress=0,
@@ -79,8 +71,7 @@ def encode(outgoing: Outgoing, target: Address | None, dialect: Dialect | None) 
                 target_component=component_id,
             )
         case Heartbeat(vehicle_type, system_status, custom_mode):
-            return _pack(
-                mavlink.MAVLink_heartbeat_message,
+            return mavlink.MAVLink_heartbeat_message(
                 type=vehicle_type,
                 autopilot=mavlink.MAV_AUTOPILOT_INVALID,
                 base_mode=0,
@@ -89,10 +80,9 @@ def encode(outgoing: Outgoing, target: Address | None, dialect: Dialect | None) 
                 mavlink_version=3,
             )
         case Timesync(tc1_ns, ts1_ns):
-            return _pack(mavlink.MAVLink_timesync_message, tc1=tc1_ns, ts1=ts1_ns)
+            return mavlink.MAVLink_timesync_message(tc1_ns, ts1_ns)
         case StatusTextOut(severity, data, text_id, chunk):
-            return _pack(
-                mavlink.MAVLink_statustext_message,
+            return mavlink.MAVLink_statustext_message(
                 severity=severity,
                 text=data,
                 id=text_id,
@@ -110,18 +100,6 @@ def _to(target: Address | None, dialect: Dialect | None) -> dict[str, int]:
     """The fields that hold the receiver."""
     address, _ = _vehicle(target, dialect)
     return {"target_system": address.system_id, "target_component": address.component_id}
-
-
-def _pack(message: Any, **fields: Any) -> Packed:
-    """Payload in wire order, arrays flattened."""
-    ordered: list[Any] = []
-    for name in message.ordered_fieldnames:
-        value = fields[name]
-        if isinstance(value, tuple):
-            ordered.extend(value)
-        else:
-            ordered.append(value)
-    return Packed(message.id, message.unpacker.pack(*ordered))
 
 
 def _boot_ms(time_s: float) -> int:
@@ -166,9 +144,8 @@ def _attitude_quaternion(target: AttitudeTarget) -> events.Quaternion:
     return w, x, y, z
 
 
-def _attitude_target(value: AttitudeTarget, target: Address, dialect: Dialect) -> Packed:
-    return _pack(
-        mavlink.MAVLink_set_attitude_target_message,
+def _attitude_target(value: AttitudeTarget, target: Address, dialect: Dialect) -> Message:
+    return mavlink.MAVLink_set_attitude_target_message(
         time_boot_ms=_boot_ms(value.time_s),
         q=_attitude_quaternion(value),
         body_roll_rate=0.0,
@@ -180,7 +157,7 @@ def _attitude_target(value: AttitudeTarget, target: Address, dialect: Dialect) -
     )
 
 
-def _position_target(value: PositionTarget | ReferenceRecord, **to: int) -> Packed:
+def _position_target(value: PositionTarget | ReferenceRecord, **to: int) -> Message:
     """SET_POSITION_TARGET_LOCAL_NED, or POSITION_TARGET_LOCAL_NED, which has no receiver."""
     command = mavlink.MAVLink_set_position_target_local_ned_message
     message = command if to else mavlink.MAVLink_position_target_local_ned_message
@@ -192,8 +169,7 @@ def _position_target(value: PositionTarget | ReferenceRecord, **to: int) -> Pack
         "yaw_rate": value.course_rate_radps,
     }
     _finite("a position target", *numbers.values())
-    return _pack(
-        message,
+    return message(
         time_boot_ms=_boot_ms(value.time_s),
         coordinate_frame=_LOCAL_NED,
         type_mask=0,
@@ -202,13 +178,12 @@ def _position_target(value: PositionTarget | ReferenceRecord, **to: int) -> Pack
     )
 
 
-def _command(value: CommandLong, **to: int) -> Packed:
+def _command(value: CommandLong, **to: int) -> Message:
     parameters = value.parameters + (0.0,) * (7 - len(value.parameters))
     if len(parameters) != 7:
         raise ValueError(f"COMMAND_LONG has seven parameters, not {len(parameters)}")
     _finite("a command parameter", *(p for p in parameters if not math.isnan(p)))
-    return _pack(
-        mavlink.MAVLink_command_long_message,
+    return mavlink.MAVLink_command_long_message(
         command=value.command,
         confirmation=value.confirmation,
         **{f"param{i}": p for i, p in enumerate(parameters, start=1)},
@@ -231,12 +206,11 @@ def _capacity(message: Any, field: str, count: int) -> int:
     return capacity
 
 
-def _solver(value: SolverRecord) -> Packed:
+def _solver(value: SolverRecord) -> Message:
     message = mavlink.MAVLink_debug_float_array_message
     capacity = _capacity(message, "data", len(value.data))
     data = tuple(_float32(v) for v in value.data) + (0.0,) * (capacity - len(value.data))
-    return _pack(
-        message,
+    return message(
         time_usec=_boot_ms(value.time_s) * 1000,
         name=value.name.encode("ascii", errors="replace")[:10],
         array_id=value.array_id,
@@ -249,11 +223,10 @@ def _float32(value: float) -> float:
     return value if not abs(value) > FLOAT32_MAX else math.copysign(math.inf, value)
 
 
-def _configuration(value: ConfigurationRecord) -> Packed:
+def _configuration(value: ConfigurationRecord) -> Message:
     message = mavlink.MAVLink_tunnel_message
     capacity = _capacity(message, "payload", len(value.data))
-    return _pack(
-        message,
+    return message(
         target_system=0,
         target_component=0,
         payload_type=value.payload_type,

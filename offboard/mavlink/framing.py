@@ -1,63 +1,56 @@
-"""Framing: frames are found in received bytes and packed for sending. Knows no message fields.
+"""Framing: where frames are in received bytes. What is in them is decoded by pymavlink.
 
-A frame of a known message needs a correct checksum. After bytes that are no frame the search
-continues one byte later, so that a damaged length cannot hide a good frame. Nothing here raises,
-whatever the input.
+pymavlink's own `parse_buffer` drops as many bytes after a damaged frame as its length says, and
+good frames with them: where a serial line loses one byte in a thousand it loses a tenth of the
+frames, this search a twentieth. After bytes that are no frame it continues one byte later, so that
+a damaged length cannot hide a good frame. Nothing here raises, whatever the input.
 
-MAVLink 2 serialisation: 0xFD, length, incompatibility flags, compatibility flags, sequence, system,
-component, 24-bit id, payload without its trailing zeros, CRC-16/MCRF4XX seeded with the message's
-CRC_EXTRA, and 13 bytes of signature when incompatibility flag 1 is set. MAVLink 1 frames (0xFE)
-are accepted: their payloads lack the extension fields, which are zero.
+MAVLink 1 frames (0xFE) are accepted: their payloads lack the extension fields, which are zero.
 """
 
 from __future__ import annotations
 
-import struct
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from fastcrc import crc16
-from pymavlink.dialects.v20 import ardupilotmega
+# `all` also holds CURRENT_MODE, which PX4 sends and `ardupilotmega` lacks
+from pymavlink.dialects.v20 import all as mavlink
 
 from offboard.mavlink.counters import Counters, DropReason
 
-_V2, _V1 = 0xFD, 0xFE
+mavlink.MAVLINK_IGNORE_CRC = 0  # MAV_IGNORE_CRC of the environment must not switch checksums off
+
+V2, V1 = 0xFD, 0xFE  # first byte of a frame of MAVLink 2 and 1
 # Ids of messages that are needed before they are decoded
 HEARTBEAT, COMMAND_ACK, TIMESYNC, STATUSTEXT, SETUP_SIGNING = 0, 77, 111, 253, 256
 # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: offset of target_system
 SETPOINTS = MappingProxyType({82: 36, 84: 50, 86: 50})
-_HEADER_V2 = struct.Struct("<BBBBBBBHB")
-_HEADER_BYTES_V2, _HEADER_BYTES_V1, _CRC_BYTES, _SIGNATURE_BYTES = 10, 6, 2, 13
-_SIGNED = 0x01
-_crc = crc16.mcrf4xx
-
-# ardupilotmega holds all of common; the last five are sent by PX4 1.16 and missing in pymavlink
-# 2.4.50: LINK_NODE_STATUS, TIME_ESTIMATE_TO_TARGET, EVENT, CURRENT_EVENT_SEQUENCE, CURRENT_MODE.
-_CRC_EXTRA: dict[int, bytes] = {
-    message_id: bytes([extra])
-    for message_id, extra in (
-        {i: c.crc_extra for i, c in ardupilotmega.mavlink_map.items()}
-        | {8: 117, 380: 232, 410: 160, 411: 106, 436: 193}
-    ).items()
-}
+_CRC_BYTES = 2
+_HEADER_BYTES_V2, _HEADER_BYTES_V1, _SIGNATURE_BYTES = 10, 6, 13
+_SIGNED = 0x01  # incompatibility flag
 
 
 class Frame(NamedTuple):
-    """`verified`: the checksum is correct. False only if the CRC_EXTRA of the id is unknown."""
+    """`verified`: the checksum is correct. False only if pymavlink does not know the id. `message`:
+    decoded by pymavlink; None for an unknown id, and in a log."""
 
     raw: bytes
     message_id: int
     system_id: int
     component_id: int
     sequence: int
-    payload: bytes
     verified: bool
+    message: Any = None
+
+    @property
+    def payload(self) -> bytes:
+        """The payload as it is on the wire: MAVLink 2 omits trailing zeros."""
+        return payload_of(self.raw)
 
     @property
     def signed(self) -> bool:
         """It ends with a signature, whose key is not known here."""
-        raw = self.raw
-        return raw[0] == _V2 and raw[2] & _SIGNED != 0
+        return self.raw[0] == V2 and self.raw[2] & _SIGNED != 0
 
 
 class FrameSplitter:
@@ -67,23 +60,21 @@ class FrameSplitter:
     def __init__(self, stream: bool, counters: Counters) -> None:
         self._stream = stream
         self._counters = counters
+        self._mavlink = mavlink.MAVLink(None)
         self._rest = b""
         self._aligned = True  # nothing was skipped since the last frame
 
     def split(self, data: bytes) -> list[Frame]:
         counters = self._counters
         counters.bytes_received += len(data)
-        if self._rest:
-            data = self._rest + data
+        data = self._rest + data
         frames: list[Frame] = []
         at, end = 0, len(data)
         while at < end:
-            start = _next_magic(data, at)
+            start = _next_marker(data, at)
             self._skip(start - at)
             at = start
-            if at == end:
-                break
-            outcome = self._parse_at(data, at)
+            outcome = self._frame_at(data, at) if at < end else None
             if outcome is None:
                 break
             if isinstance(outcome, DropReason):
@@ -104,93 +95,79 @@ class FrameSplitter:
             self._counters.bytes_skipped += count
             self._aligned = False
 
-    def _parse_at(self, data: bytes, at: int) -> Frame | DropReason | None:
+    def _frame_at(self, data: bytes, at: int) -> Frame | DropReason | None:
         """The frame at `at`, why there is none, or None if more bytes are needed."""
         size = frame_size(data, at)
         if size is None or at + size > len(data):
             return None if self._stream else DropReason.TRUNCATED
-        frame = parse(data, at, at + size)
-        if isinstance(frame, DropReason) or frame.verified:
-            return frame
+        raw = data[at : at + size]
+        if _is_incompatible(raw):
+            return DropReason.INCOMPATIBLE
+        try:
+            message = self._mavlink.decode(bytearray(raw))
+        except mavlink.MAVError:
+            return DropReason.BAD_CRC
+        if not isinstance(message, mavlink.MAVLink_unknown):
+            return Frame(raw, *_header(raw), True, message)
         # without a known checksum a frame must fill the space between two others
         if not self._aligned:
             return DropReason.BAD_CRC
+        frame = Frame(raw, *_header(raw), False)
         if at + size == len(data):
             return None if self._stream else frame
-        return frame if data[at + size] in (_V2, _V1) else DropReason.BAD_CRC
-
-
-def pack(
-    message_id: int,
-    payload: bytes,
-    sequence: int,
-    system_id: int,
-    component_id: int,
-    *,
-    signed: bool = False,
-) -> bytes:
-    """A MAVLink 2 frame without signature; `signed`: its flags say that one follows. Trailing zeros
-    of the payload are cut, except its first byte."""
-    payload = payload[:1] + payload[1:].rstrip(b"\0")
-    body = _HEADER_V2.pack(
-        _V2,
-        len(payload),
-        _SIGNED if signed else 0,
-        0,
-        sequence,
-        system_id,
-        component_id,
-        message_id & 0xFFFF,
-        message_id >> 16,
-    )
-    body += payload
-    crc = _crc(_CRC_EXTRA[message_id], _crc(body[1:]))
-    return body + crc.to_bytes(2, "little")
-
-
-def _next_magic(data: bytes, at: int) -> int:
-    """Index of the next start byte of a frame, or the length of `data`."""
-    if data[at] == _V2:
-        return at
-    candidates = [i for i in (data.find(_V2, at), data.find(_V1, at)) if i >= 0]
-    return min(candidates, default=len(data))
+        return frame if data[at + size] in (V2, V1) else DropReason.BAD_CRC
 
 
 def frame_size(data: bytes, at: int) -> int | None:
     """Frame length given by the header at `at`; None if the header is incomplete."""
     if at + 3 > len(data):
         return None
-    if data[at] == _V1:
-        return _HEADER_BYTES_V1 + data[at + 1] + _CRC_BYTES
-    signature = _SIGNATURE_BYTES if data[at + 2] & _SIGNED else 0
-    return _HEADER_BYTES_V2 + data[at + 1] + _CRC_BYTES + signature
+    signed = data[at] == V2 and data[at + 2] & _SIGNED
+    signature_bytes = _SIGNATURE_BYTES if signed else 0
+    return _header_bytes(data, at) + data[at + 1] + _CRC_BYTES + signature_bytes
 
 
 def parse(data: bytes, at: int, end: int) -> Frame | DropReason:
-    """The frame in data[at:end], which `frame_size` has measured, or why it is refused."""
-    if data[at] == _V1:
-        _, length, sequence, system, component, message_id = data[at : at + _HEADER_BYTES_V1]
-        payload_at = at + _HEADER_BYTES_V1
-    else:
-        _, length, flags, _, sequence, system, component, low, high = _HEADER_V2.unpack_from(
-            data, at
-        )
-        if flags & ~_SIGNED:
-            return DropReason.INCOMPATIBLE
-        message_id = low | high << 16
-        payload_at = at + _HEADER_BYTES_V2
-    crc_at = payload_at + length
-    extra = _CRC_EXTRA.get(message_id)
-    if extra is not None:
-        crc = _crc(extra, _crc(data[at + 1 : crc_at]))
-        if crc != data[crc_at] | data[crc_at + 1] << 8:
+    """The frame of a log in data[at:end], which `frame_size` has measured, or why it is refused.
+    Its message is not decoded: a log of hours holds millions."""
+    raw = data[at:end]
+    if _is_incompatible(raw):
+        return DropReason.INCOMPATIBLE
+    header = _header(raw)
+    known = mavlink.mavlink_map.get(header[0])
+    if known is not None:
+        crc_at = _header_bytes(raw) + raw[1]
+        crc = mavlink.x25crc(raw[1:crc_at] + bytes((known.crc_extra,))).crc
+        if crc != raw[crc_at] | raw[crc_at + 1] << 8:
             return DropReason.BAD_CRC
-    return Frame(
-        data[at:end],
-        message_id,
-        system,
-        component,
-        sequence,
-        data[payload_at:crc_at],
-        extra is not None,
-    )
+    return Frame(raw, *header, known is not None)
+
+
+def payload_of(raw: bytes) -> bytes:
+    """The payload of a frame, as in `Frame`."""
+    at = _header_bytes(raw)
+    return raw[at : at + raw[1]]
+
+
+def _next_marker(data: bytes, at: int) -> int:
+    """Index of the next start byte of a frame, or the length of `data`."""
+    if data[at] == V2:
+        return at
+    candidates = [i for i in (data.find(V2, at), data.find(V1, at)) if i >= 0]
+    return min(candidates, default=len(data))
+
+
+def _header_bytes(data: bytes, at: int = 0) -> int:
+    return _HEADER_BYTES_V1 if data[at] == V1 else _HEADER_BYTES_V2
+
+
+def _header(raw: bytes) -> tuple[int, int, int, int]:
+    """Message id, system, component and sequence number."""
+    if raw[0] == V1:
+        return raw[5], raw[3], raw[4], raw[2]
+    return raw[7] | raw[8] << 8 | raw[9] << 16, raw[5], raw[6], raw[4]
+
+
+def _is_incompatible(raw: bytes) -> bool:
+    """Flags say that it cannot be understood without a later version of MAVLink."""
+    return raw[0] == V2 and raw[2] & ~_SIGNED != 0

@@ -3,63 +3,33 @@
 Bytes and `now_s` (monotonic host seconds) are arguments. Events, frames for the log and messages to
 send are returned. No socket, no file, no clock. Nothing that arrives can raise.
 
-The first autopilot heard is the vehicle, known by system id, component id and network address. From
-then on every other sender is dropped and counted; `Peer` says when the vehicle's address may
-change. Our system id is the vehicle's, which makes us one of its components.
+`senders` says whose a frame is. Our system id is the vehicle's, which makes us one of its
+components.
 """
 
 from __future__ import annotations
 
-import math
 from collections import deque
 from collections.abc import Hashable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
+
+from pymavlink.dialects.v20 import all as mavlink
 
 from offboard.mavlink import framing
-from offboard.mavlink.autopilots import AUTOPILOT_COMPONENT, Autopilots, is_companion
-from offboard.mavlink.autopilots import DIALECTS as DIALECTS
 from offboard.mavlink.counters import FORGED, Counters, DropReason
-from offboard.mavlink.decode import (
-    Address,
-    decode,
-    decode_ack_address,
-    decode_command,
-    decode_custom_mode,
-    decode_text_chunk,
-    decode_timesync,
-)
+from offboard.mavlink.decode import Address
 from offboard.mavlink.dialects.base import TYPE_ONBOARD_CONTROLLER, Dialect
 from offboard.mavlink.encode import encode
-from offboard.mavlink.events import (
-    Attitude,
-    ClockBehind,
-    CommandRequest,
-    Event,
-    LocalPosition,
-    ModeReport,
-    OtherCompanion,
-    OtherSender,
-    PeerChanged,
-    Rebooted,
-    TimesyncReply,
-    VehicleFound,
-)
-from offboard.mavlink.events import Heartbeat as HeartbeatEvent
+from offboard.mavlink.events import Attitude, Event, LocalPosition, PeerChanged, VehicleFound
 from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Record, Timesync
-from offboard.mavlink.peer import Peer
+from offboard.mavlink.senders import COMMANDS, Senders
 from offboard.mavlink.signing import Signing
-from offboard.mavlink.telemetry_rates import SHARE, TelemetryRates, fitted
-from offboard.mavlink.texts import TextAssembler
-from offboard.mavlink.vehicle_time import SILENCE_S, Age, LinkTime, VehicleTime
+from offboard.mavlink.telemetry import Telemetry
+from offboard.mavlink.vehicle_time import LockstepTime
 
 ACTIVE = 4  # MAV_STATE
 
-_COMMANDS = (75, 76)  # COMMAND_INT, COMMAND_LONG
-# MAV_CMD: return, land, take off, set the mode, go to a place, begin a mission, arm or disarm
-_MODE_COMMANDS = frozenset({20, 21, 22, 176, 192, 300, 400})
 _ECHOES = 256  # newest frames of ours that are recognised when they come back
-# A link may reorder: a report of the mode this close behind a newer one says nothing new
-_REORDERED_FRAMES, _REORDERED_S = 32, 0.1
 _NOT_LOGGED = (DropReason.ECHO, *FORGED)
 _HEARTBEAT_PERIOD_S = 0.999  # 1 Hz; below 1 s, so that no rounding error delays it by a cycle
 
@@ -105,283 +75,180 @@ class Reception:
     unlogged: tuple[tuple[int, bytes], ...] = ()
 
 
+@dataclass(slots=True)
+class _Arrival:
+    """A datagram, or a portion of a stream, and what is found in it."""
+
+    place: Hashable
+    now_s: float
+    events: list[Event] = field(default_factory=list)
+    replies: list[Outgoing] = field(default_factory=list)
+
+
 class Session:
     """See the module. `vehicle` and `dialect` are None until an autopilot was heard. With `signing`
-    all frames are signed, and those without its signature are dropped."""
+    all frames are signed, and those without its signature are dropped. `status` is system_status
+    and custom_mode of our heartbeat."""
 
     def __init__(self, settings: SessionSettings, signing: Signing | None = None) -> None:
         self.settings = settings
-        self.autopilots = Autopilots(settings.system_id)
+        self.senders = Senders(
+            settings.system_id, settings.component_id, has_key=signing is not None
+        )
+        self.counters = Counters()
+        self.status = (ACTIVE, 0)
         self._signing = signing
         self._greeted: Dialect | None = None  # autopilot whose clock is behind ours
-        self.counters = Counters()
-        self.vehicle: VehicleFound | None = None
-        self.dialect: Dialect | None = None
-        self.status = (ACTIVE, 0)  # system_status and custom_mode of our heartbeat
-        self._own = Address(1, settings.component_id)
-        self._peer = Peer()
         self._splitter = framing.FrameSplitter(settings.stream, self.counters)
-        self._sequence_out: dict[int, int] = {}
+        self._sending = mavlink.MAVLink(None, srcComponent=settings.component_id)
+        self._recording = mavlink.MAVLink(None, srcComponent=settings.record_component_id)
         self._sent: deque[bytes] = deque(maxlen=_ECHOES)
-        self._texts = TextAssembler()
-        self._time = VehicleTime()
-        self._arrival_s = 0.0  # vehicle time when the newest datagram arrived
-        self._began_s: float | None = None  # stamp of the first TIMESYNC request
-        self._elapsed_s = 0.0  # from it to the newest one: in lockstep, simulated time
-        self._telemetry_s = 0.0  # `_elapsed_s` when the newest telemetry arrived
-        self._link_time = LinkTime()
-        self._rates = TelemetryRates((), 0.0)
-        self._capacity_bytes_ps = settings.capacity_bytes_ps
+        self._telemetry = Telemetry(settings.capacity_bytes_ps)
+        self._lockstep = LockstepTime() if settings.lockstep else None
         self._heartbeat_sent: tuple[float, float] | None = None  # host time, link time
         self._status_sent = self.status
-        self._mode_report = (0, -math.inf)  # sequence number of the newest, and when it arrived
+
+    @property
+    def vehicle(self) -> VehicleFound | None:
+        return self.senders.vehicle
+
+    @property
+    def dialect(self) -> Dialect | None:
+        return self.senders.dialect
 
     # --- in ---
 
     def receive(self, datagram: bytes, peer: Hashable, now_s: float) -> Reception:
         """Process a datagram, or any portion of a stream, that came from `peer`. Never raises."""
-        self._arrival_s = self._time.newest_s
-        now_s = self._clock_s(now_s)
-        frames: list[bytes] = []
-        unlogged: list[tuple[int, bytes]] = []
-        events: list[Event] = []
-        if self._peer.is_foreign(peer):
-            if not self._peer.moves_to(peer, datagram, now_s, self._is_genuine):
+        if self._lockstep:
+            self._lockstep.on_datagram(self._telemetry.time.newest_s)
+        arrival = _Arrival(peer, self._now_s(now_s))
+        if self.senders.is_foreign(peer):
+            if not self._moves(datagram, arrival):
                 self.counters.dropped[DropReason.FOREIGN_PEER] += 1
                 return Reception()
             self._heartbeat_sent = None  # a router learns our address from it
-            events.append(PeerChanged(peer))
-        replies: list[Outgoing] = []
-        events.extend(self._texts.expire(now_s))
+            arrival.events.append(PeerChanged(peer))
+        frames: list[bytes] = []
+        unlogged: list[tuple[int, bytes]] = []
+        arrival.events.extend(self._telemetry.texts.expire(arrival.now_s))
         for frame in self._splitter.split(datagram):
-            self.counters.frames += 1
-            outcome = self._accept(frame, peer, now_s, events, replies)
-            if isinstance(outcome, DropReason):
-                self.counters.dropped[outcome] += 1
-            elif outcome:
-                self.counters.decoded += 1
-            else:
-                self.counters.ignored += 1
+            outcome = self._accept(frame, arrival)
+            self.counters.count(outcome)
             if outcome in _NOT_LOGGED or frame.message_id == framing.SETUP_SIGNING:
                 continue  # the latter holds the key
             if self._has_our_ids(frame):
                 unlogged.append((len(frames), frame.raw))
             elif frame.verified:
                 frames.append(frame.raw)
-        return Reception(tuple(frames), tuple(events), tuple(replies), tuple(unlogged))
+        return Reception(
+            tuple(frames), tuple(arrival.events), tuple(arrival.replies), tuple(unlogged)
+        )
 
-    def _accept(
-        self,
-        frame: framing.Frame,
-        peer: Hashable,
-        now_s: float,
-        events: list[Event],
-        replies: list[Outgoing],
-    ) -> DropReason | bool:
+    def _accept(self, frame: framing.Frame, arrival: _Arrival) -> DropReason | bool:
         """Why the frame was dropped, or whether it was decoded."""
-        sender = Address(frame.system_id, frame.component_id)
-        ours = sender == self._own
-        if ours and frame.raw in self._sent:
+        if frame.raw in self._sent and self._has_our_ids(frame):
             return DropReason.ECHO
-        forged = self._signing.accept(frame) if self._signing else None
+        forged = self._signing.refusal(frame) if self._signing else None
         if forged:
-            self.counters.forged += 1
             if forged is DropReason.OLD_STAMP and self.vehicle is None:
-                self._greet(frame, events)
+                self._greet(frame, arrival)
             return forged
-        if self.vehicle is not None and (self._is_setpoint(frame) or self._sets_mode(frame)):
-            events.append(OtherSender(*sender, frame.message_id))
-        if ours:
-            if self.vehicle is not None and is_companion(frame, self._own.system_id):
-                events.append(OtherCompanion(*sender, decode_custom_mode(frame.payload)))
-            return DropReason.SAME_IDS
-        if frame.message_id in _COMMANDS and frame.verified and self.vehicle is not None:
-            return self._requested(frame, sender, events)
-        foreign = self._check_sender(frame, peer, events)
+        was_found = self.vehicle is not None
+        foreign = self.senders.judge(frame, arrival.place, self.link_time_s, arrival.events)
         if foreign is not None:
-            if self.vehicle is not None and is_companion(frame, self._own.system_id):
-                events.append(OtherCompanion(*sender, decode_custom_mode(frame.payload)))
             return foreign
         if not frame.verified:
             return DropReason.UNKNOWN_ID
-        if self.vehicle is not None:
-            self._peer.heard_s = now_s
-        if frame.message_id == framing.TIMESYNC:
-            tc1_ns, ts1_ns = decode_timesync(frame.payload)
-            if tc1_ns == 0:
-                stamp_s = ts1_ns * 1e-9
-                self._began_s = stamp_s if self._began_s is None else self._began_s
-                self._elapsed_s = stamp_s - self._began_s
-                # a reply at time 0 would look like a request
-                replies.append(Timesync(max(1, int(now_s * 1e9)), ts1_ns))
-            elif self.vehicle is not None:
-                wrapped_ns = round(self._time.wrapped_s(tc1_ns / 1e9) * 1e9)
-                events.append(TimesyncReply(ts1_ns, tc1_ns + wrapped_ns))
+        if was_found and frame.message_id in COMMANDS:
             return True
-        return self._interpret(frame, now_s, events)
+        if self.vehicle is not None and not was_found:
+            self._begin()
+        if self.vehicle is not None:
+            self.senders.heard_s = arrival.now_s
+        if frame.message_id == framing.TIMESYNC:
+            return self._synchronise(frame, arrival)
+        return self._interpret(frame, arrival)
+
+    def _synchronise(self, frame: framing.Frame, arrival: _Arrival) -> bool:
+        """TIMESYNC: tc1 is 0 in a request."""
+        tc1_ns, ts1_ns = frame.message.tc1, frame.message.ts1
+        if tc1_ns == 0:
+            if self._lockstep:
+                self._lockstep.on_request(ts1_ns * 1e-9)
+            # a reply at time 0 would look like a request
+            arrival.replies.append(Timesync(max(1, int(arrival.now_s * 1e9)), ts1_ns))
+        elif self.vehicle is not None:
+            arrival.events.append(self._telemetry.timesync_reply(tc1_ns, ts1_ns))
+        return True
+
+    def _interpret(self, frame: framing.Frame, arrival: _Arrival) -> DropReason | bool:
+        """Turn a frame of the vehicle into events."""
+        assert self.dialect is not None
+        if frame.message_id == framing.COMMAND_ACK and not self.senders.is_for_us(frame):
+            return DropReason.NOT_FOR_US
+        found = self._telemetry.interpret(frame, self.dialect, arrival.now_s)
+        if isinstance(found, DropReason):
+            return found
+        if self._lockstep and any(isinstance(e, (LocalPosition, Attitude)) for e in found or ()):
+            self._lockstep.on_telemetry()
+        arrival.events.extend(found or ())
+        return found is not None
 
     def _has_our_ids(self, frame: framing.Frame) -> bool:
         """Whether it has the ids of what we send, or of our records."""
         ours = (self.settings.component_id, self.settings.record_component_id)
-        return frame.system_id == self._own.system_id and frame.component_id in ours
+        return frame.system_id == self.senders.own.system_id and frame.component_id in ours
 
-    def _requested(
-        self, frame: framing.Frame, sender: Address, events: list[Event]
-    ) -> DropReason | bool:
-        """A command on the vehicle's own link; one to all components is not for us."""
-        command, parameters, receiver = decode_command(frame.message_id, frame.payload)
-        if receiver != self._own:
-            return DropReason.NOT_FOR_US
-        events.append(CommandRequest(command, parameters, *sender))
-        return True
+    # --- the vehicle ---
 
-    def _is_setpoint(self, frame: framing.Frame) -> bool:
-        """Whether it is a setpoint for our vehicle, or for all: routers forward those of others."""
-        offset = framing.SETPOINTS.get(frame.message_id)
-        if offset is None:
+    def adopt(self, vehicle: VehicleFound, peer: Hashable) -> None:
+        """Take this vehicle, which sends from `peer`, as ours."""
+        self.senders.adopt(vehicle, peer)
+        self._begin()
+
+    def _begin(self) -> None:
+        assert self.dialect is not None
+        self._heartbeat_sent = None  # send it at once, with the vehicle's system id
+        self._telemetry.request_from(self.dialect)
+
+    def _moves(self, datagram: bytes, arrival: _Arrival) -> bool:
+        """Whether a datagram shows that the vehicle sends from another address now."""
+        if not self.senders.may_move_to(arrival.place, arrival.now_s):
             return False
-        target = frame.payload[offset : offset + 1]  # MAVLink 2 omits trailing zeros
-        return not target or target[0] in (0, self._own.system_id)
+        return any(self.senders.moves_to(arrival.place, each) for each in self._genuine(datagram))
 
-    def _sets_mode(self, frame: framing.Frame) -> bool:
-        """Whether it commands the mode of our vehicle, from its own system, as we do: that of a
-        ground station is the pilot's."""
-        if not frame.verified or frame.system_id != self._own.system_id:
-            return False
-        if frame.message_id not in _COMMANDS or frame.component_id == AUTOPILOT_COMPONENT:
-            return False
-        command, _, receiver = decode_command(frame.message_id, frame.payload)
-        for_vehicle = receiver.system_id in (0, self._own.system_id) and receiver != self._own
-        return command in _MODE_COMMANDS and for_vehicle
-
-    def _check_sender(
-        self, frame: framing.Frame, peer: Hashable, events: list[Event]
-    ) -> DropReason | None:
-        """Why this frame is not from our vehicle; the first heartbeat of an autopilot pins it."""
-        heard = self.autopilots.note(frame, self.link_time_s)
-        if self.vehicle is not None:
-            if frame.system_id != self.vehicle.system_id:
-                return DropReason.FOREIGN_SYSTEM
-            if frame.component_id != self.vehicle.component_id:
-                return DropReason.FOREIGN_COMPONENT
-            if isinstance(heard, DropReason):
-                return heard  # a HEARTBEAT with its ids that is no autopilot's
-            other = heard is not None and heard.name != self.vehicle.autopilot
-            return DropReason.FOREIGN_COMPONENT if other else None
-        if frame.component_id != AUTOPILOT_COMPONENT:
-            return DropReason.FOREIGN_COMPONENT
-        if self.settings.system_id not in (None, frame.system_id):
-            return DropReason.FOREIGN_SYSTEM
-        if frame.message_id == framing.TIMESYNC and frame.verified:
-            return None  # a simulator in lockstep may need the reply before its first heartbeat
-        if not isinstance(heard, Dialect):
-            return heard or DropReason.NO_VEHICLE
-        if frame.signed and self._signing is None:
-            return DropReason.NO_KEY
-        vehicle = VehicleFound(frame.system_id, frame.component_id, heard.name)
-        self.adopt(vehicle, peer)
-        events.append(vehicle)
-        return None
-
-    def _greet(self, frame: framing.Frame, events: list[Event]) -> None:
-        """Send our heartbeat to a vehicle whose signature is right and whose clock is behind: its
-        time stamp becomes the vehicle's time, as ours would become its. It may be a replay, so that
-        nothing else is believed."""
-        heard = self.autopilots.note(frame, self.link_time_s)
-        wanted = self.settings.system_id in (None, frame.system_id)
-        if isinstance(heard, Dialect) and wanted:
-            shown = decode(frame.message_id, frame.payload, heard)
-            if isinstance(shown, HeartbeatEvent):
-                self._greeted = heard
-                events.append(ClockBehind(frame.system_id, shown.armed))
-
-    def _is_genuine(self, frame: framing.Frame) -> bool:
-        """Whether this frame could be accepted from the vehicle."""
-        return frame.verified and (self._signing is None or self._signing.fault(frame) is None)
+    def _genuine(self, datagram: bytes) -> list[framing.Frame]:
+        """The frames that could be accepted from the vehicle. Counts nothing, and uses up no time
+        stamp."""
+        found = framing.FrameSplitter(False, Counters()).split(datagram)
+        signing = self._signing
+        return [
+            frame
+            for frame in found
+            if frame.verified and not (signing and signing.refusal(frame, note=False))
+        ]
 
     def overhear(self, datagram: bytes) -> list[int]:
         """Systems with an autopilot that this datagram, from another address than the vehicle's,
         shows, each once a second."""
-        known = dict(self.autopilots.systems)
-        for frame in framing.FrameSplitter(False, Counters()).split(datagram):
-            if self._is_genuine(frame):
-                self.autopilots.note(frame, self.link_time_s)
-        return [each for each, _ in self.autopilots.systems.items() - known.items()]
+        known = dict(self.senders.systems)
+        for frame in self._genuine(datagram):
+            self.senders.note(frame, self.link_time_s)
+        return [each for each, _ in self.senders.systems.items() - known.items()]
 
-    def adopt(self, vehicle: VehicleFound, peer: Hashable) -> None:
-        """Take this vehicle, which sends from `peer`, as ours."""
-        self.dialect = DIALECTS[vehicle.autopilot]
-        self.vehicle = vehicle
-        self._peer.pin(peer, Address(vehicle.system_id, vehicle.component_id))
-        self._own = Address(vehicle.system_id, self.settings.component_id)
-        self._heartbeat_sent = None  # send it at once, with the vehicle's system id
-        self._restart_rates()
-
-    def _interpret(
-        self, frame: framing.Frame, now_s: float, events: list[Event]
-    ) -> DropReason | bool:
-        """Turn a frame of the vehicle into events."""
-        assert self.dialect is not None
-        if frame.message_id == framing.STATUSTEXT:
-            events.extend(self._texts.add(decode_text_chunk(frame.payload), now_s))
-            return True
-        if frame.message_id == framing.COMMAND_ACK and not self._for_us(frame.payload):
-            return DropReason.NOT_FOR_US
-        event = decode(frame.message_id, frame.payload, self.dialect)
-        if isinstance(event, DropReason):
-            return event
-        if isinstance(event, (HeartbeatEvent, ModeReport)) and self._overtaken(frame, now_s):
-            return DropReason.STALE
-        age = Age.FRESH
-        if isinstance(event, (LocalPosition, Attitude)):
-            wrapped_s = self._time.wrapped_s(event.time_s)
-            if wrapped_s:
-                event = replace(event, time_s=event.time_s + wrapped_s)
-            age = self._time.check(frame.message_id, event.time_s)
-            if age is Age.STALE:
-                return DropReason.STALE
-        # after the check of the stamp: duplicates must not raise the measured rate
-        self._rates.count(frame.message_id, self._link_time.seconds)
-        if event is None:
-            return False
-        if isinstance(event, (LocalPosition, Attitude)):
-            if age is Age.REBOOTED:
-                self._restart_rates()  # a rebooted vehicle has its default rates
-                events.append(Rebooted(event.time_s))
-            self._link_time.vehicle(event.time_s, now_s)
-            self._telemetry_s = self._elapsed_s
-        events.append(event)
-        return True
-
-    def _overtaken(self, frame: framing.Frame, now_s: float) -> bool:
-        """Whether this report of the mode was sent before the newest one."""
-        newest, arrived_s = self._mode_report
-        behind = (newest - frame.sequence) % 256
-        if 0 < behind <= _REORDERED_FRAMES and now_s - arrived_s < _REORDERED_S:
-            return True
-        self._mode_report = frame.sequence, now_s
-        return False
-
-    def _for_us(self, ack_payload: bytes) -> bool:
-        to = decode_ack_address(ack_payload)
-        return to.system_id in (0, self._own.system_id) and (
-            to.component_id in (0, self._own.component_id)
-        )
-
-    def _restart_rates(self) -> None:
-        assert self.dialect is not None
-        wanted = self.dialect.wanted
-        if self._capacity_bytes_ps is not None:
-            wanted = fitted(wanted, self._capacity_bytes_ps)
-        self._rates = TelemetryRates(wanted, self._link_time.seconds)
+    def _greet(self, frame: framing.Frame, arrival: _Arrival) -> None:
+        """Send our heartbeat to a vehicle whose signing time is behind: it follows ours then."""
+        greeted = self.senders.greeted(frame, self.link_time_s)
+        if greeted:
+            self._greeted, behind = greeted
+            arrival.events.append(behind)
 
     def thin_telemetry(self) -> bool:
         """Request half of the telemetry from now on: the link is saturated. False if the rates are
         the lowest already."""
-        before = self._rates.bytes_ps
-        self._capacity_bytes_ps = 0.5 * before / SHARE
-        self._restart_rates()
-        return self._rates.bytes_ps < 0.99 * before
+        assert self.dialect is not None
+        return self._telemetry.thin(self.dialect)
 
     # --- out ---
 
@@ -392,13 +259,13 @@ class Session:
         custom_mode has changed, so that another program learns at once who flies; and requests for
         telemetry that is missing or too slow.
         """
-        now_s = self._clock_s(now_s)
-        self._link_time.host(now_s)
+        now_s = self._now_s(now_s)
+        self._telemetry.time.on_host(now_s)
         dialect = self.dialect or self._greeted
         if dialect is None and not self.settings.sends_first:
             return ()
         due: list[Outgoing] = []
-        link_s = self._link_time.seconds
+        link_s = self.link_time_s
         if (
             self._heartbeat_sent is None
             or self.status[1] != self._status_sent[1]
@@ -407,7 +274,7 @@ class Session:
         ):
             self._heartbeat_sent, self._status_sent = (now_s, link_s), self.status
             due.append(Heartbeat(TYPE_ONBOARD_CONTROLLER, *self.status))
-        requests = self._rates.due(link_s)
+        requests = self._telemetry.rates.due(link_s)
         return (*due, *(CommandLong.message_interval(w.message_id, w.rate_hz) for w in requests))
 
     def encode(self, outgoing: Outgoing) -> bytes:
@@ -416,51 +283,43 @@ class Session:
         Raises ValueError if a value is not finite or out of range, or if the message is for the
         vehicle and none was found.
         """
-        target = None
-        if self.vehicle is not None:
-            target = Address(self.vehicle.system_id, self.vehicle.component_id)
-        packed = encode(outgoing, target, self.dialect)
-        component_id = self.settings.component_id
-        if isinstance(outgoing, Record):
-            component_id = self.settings.record_component_id
-        sequence = self._sequence_out.get(component_id, 0)
-        self._sequence_out[component_id] = (sequence + 1) % 256
-        signing = None if isinstance(outgoing, Record) else self._signing
-        frame = framing.pack(
-            *packed, sequence, self._own.system_id, component_id, signed=signing is not None
-        )
-        if signing:
-            frame = signing.sign(frame)
+        vehicle = self.vehicle
+        target = Address(vehicle.system_id, vehicle.component_id) if vehicle else None
+        message = encode(outgoing, target, self.dialect)
+        sender = self._recording if isinstance(outgoing, Record) else self._sending
+        sender.srcSystem = self.senders.own.system_id
+        if self._signing and sender is self._sending:
+            frame = self._signing.pack(message, sender)
+        else:
+            frame = bytes(message.pack(sender))
+        sender.seq = (sender.seq + 1) % 256
         self._sent.append(frame)
         return frame
 
-    def _clock_s(self, host_s: float) -> float:
-        if not self.settings.lockstep:
-            return host_s
-        silent_s = self._elapsed_s - self._telemetry_s
-        return self._arrival_s + (silent_s if silent_s > SILENCE_S else 0.0)
+    # --- time and rates ---
+
+    def _now_s(self, host_s: float) -> float:
+        return self._lockstep.now_s if self._lockstep else host_s
 
     def elapsed_s(self, host_s: float) -> float:
         """Host time; in lockstep the simulated time, which goes on while telemetry is missing."""
-        return self._elapsed_s if self.settings.lockstep else host_s
+        return self._lockstep.elapsed_s if self._lockstep else host_s
 
-    # --- state of the link ---
+    def clock_s(self, host_s: float) -> float:
+        """Host time; in lockstep, where host time must decide nothing, the link's own seconds."""
+        return self.link_time_s if self._lockstep else host_s
 
     @property
     def link_time_s(self) -> float:
         """Monotonic seconds that follow vehicle time, or host time while telemetry is missing."""
-        return self._link_time.seconds
-
-    def clock_s(self, host_s: float) -> float:
-        """Host time; in lockstep, where host time must decide nothing, the link's own seconds."""
-        return self.link_time_s if self.settings.lockstep else host_s
+        return self._telemetry.time.seconds
 
     @property
     def rates_hz(self) -> dict[str, float]:
         """Measured rate of each wanted message over the last two seconds of `link_time_s`."""
-        return self._rates.measured_hz(self._link_time.seconds)
+        return self._telemetry.rates.measured_hz(self.link_time_s)
 
     @property
     def wanted_bytes_ps(self) -> float:
         """Bytes per second of the telemetry that is requested."""
-        return self._rates.bytes_ps
+        return self._telemetry.rates.bytes_ps

@@ -1,6 +1,6 @@
 """Telemetry rates: which messages are needed, how fast they arrive, when to request them again.
 
-Rates are per second of `vehicle_time.LinkTime`, so that they mean the same in real time, at higher
+Rates are per second of `Session.link_time_s`, so that they mean the same in real time, at higher
 speed and in lockstep. A ground station may change the rates that we requested: therefore they are
 measured, and requested again. Knows message ids, sizes and times, no bytes.
 """
@@ -11,14 +11,13 @@ from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
 
-from pymavlink.dialects.v20.ardupilotmega import mavlink_map
+from pymavlink.dialects.v20.all import mavlink_map
 
 from offboard.mavlink.dialects.base import WantedMessage
 
 SLOW_HZ = 20.0
 SHARE = 0.68  # of a link's capacity; the rest is for what is not requested
 FRAME_BYTES = 12  # of a MAVLink 2 frame besides its payload
-UNKNOWN_BYTES = 10  # of a payload that pymavlink does not know: CURRENT_MODE has 9
 _WINDOW_S = 2.0
 _ENOUGH = 0.7  # of the rate wanted; a window holds few samples of a slow message
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 3.0, 30.0
@@ -48,8 +47,8 @@ def _bytes_ps(wanted: Iterable[WantedMessage]) -> float:
 
 
 def _payload_bytes(message_id: int) -> int:
-    message = mavlink_map.get(message_id)
-    return message.unpacker.size if message else UNKNOWN_BYTES
+    size: int = mavlink_map[message_id].unpacker.size
+    return size
 
 
 @dataclass(slots=True)
@@ -90,7 +89,7 @@ class _Stream:
 
 
 class TelemetryRates:
-    """Measured rates of the wanted messages. All times are `LinkTime.seconds`."""
+    """Measured rates of the wanted messages. All times are `Session.link_time_s`."""
 
     def __init__(self, wanted: Iterable[WantedMessage], began_s: float) -> None:
         self._streams = {w.message_id: _Stream(w, began_s) for w in wanted}

@@ -1,7 +1,8 @@
 """Vehicle time: which time stamps of telemetry are valid, and the seconds that the session counts.
 
 Vehicle time is `time_boot_ms` in seconds, continued where its 32 bits begin again at zero, after
-49.7 days. Host time is any monotonic clock, given as an argument.
+49.7 days. Host time is any monotonic clock, given as an argument. How old telemetry is, and how
+late the link, is in `flight.vehicle_clock`.
 """
 
 from __future__ import annotations
@@ -29,13 +30,21 @@ class VehicleTime:
     """Checks time stamps: those of one message id must increase. One that is far behind the newest
     is late; a reboot is several of them in a row that go on from each other.
 
-    `newest_s` is the newest stamp of any message.
+    `newest_s` is the newest stamp of any message. `seconds` are monotonic and follow vehicle time,
+    or host time while telemetry is missing.
     """
 
     def __init__(self) -> None:
         self.newest_s = 0.0
+        self.seconds = 0.0
         self._last_s: dict[int, float] = {}
         self._older: list[tuple[int, float]] = []  # far behind the newest, in a row: id and stamp
+        self._counted_s: float | None = None  # the newest stamp that `seconds` has followed
+        self._received_s: float | None = None
+        self._host_s: float | None = None
+        self._bridged_s = 0.0  # counted since the newest telemetry
+
+    # --- stamps ---
 
     def wrapped_s(self, time_s: float) -> float:
         """Seconds to add to a stamp to continue the newest one across the wrap of `time_boot_ms`;
@@ -74,28 +83,19 @@ class VehicleTime:
         self._older.clear()
         return Age.REBOOTED
 
+    # --- seconds ---
 
-class LinkTime:
-    """Monotonic `seconds` that follow vehicle time, or host time while telemetry is missing."""
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-        self._vehicle_s: float | None = None
-        self._received_s: float | None = None
-        self._host_s: float | None = None
-        self._bridged_s = 0.0  # counted since the newest telemetry
-
-    def vehicle(self, time_s: float, now_s: float) -> None:
-        """Telemetry with the stamp `time_s` arrived at host time `now_s`. A stamp older than the
-        newest changes nothing: messages of several streams may arrive out of order."""
+    def on_telemetry(self, time_s: float, now_s: float) -> None:
+        """Telemetry with the valid stamp `time_s` arrived at host time `now_s`. A stamp older than
+        the newest adds nothing: messages of several streams may arrive out of order."""
         self._received_s = now_s
-        step_s = 0.0 if self._vehicle_s is None else time_s - self._vehicle_s
-        if self._vehicle_s is None or step_s > 0.0 or step_s < -_REBOOT_S:
+        step_s = 0.0 if self._counted_s is None else time_s - self._counted_s
+        if self._counted_s is None or step_s > 0.0 or step_s < -_REBOOT_S:
             self.seconds += max(min(step_s, SILENCE_S) - self._bridged_s, 0.0)
             self._bridged_s = 0.0
-            self._vehicle_s = time_s
+            self._counted_s = time_s
 
-    def host(self, now_s: float) -> None:
+    def on_host(self, now_s: float) -> None:
         """Host time is `now_s`; once no telemetry has arrived for a second, all the time since the
         newest counts."""
         if self._received_s is None:
@@ -106,3 +106,31 @@ class LinkTime:
             self.seconds += max(silent_s - self._bridged_s, 0.0)
             self._bridged_s = max(silent_s, self._bridged_s)
         self._host_s = now_s
+
+
+class LockstepTime:
+    """Time of a vehicle in lockstep, which waits for our replies to its TIMESYNC requests: vehicle
+    time, so that nothing that is sent depends on host time; while telemetry is missing, the
+    requests count on. `elapsed_s` is simulated time since the first request."""
+
+    def __init__(self) -> None:
+        self.elapsed_s = 0.0
+        self._began_s: float | None = None  # stamp of the first request
+        self._telemetry_s = 0.0  # `elapsed_s` when the newest telemetry arrived
+        self._arrival_s = 0.0  # vehicle time when the newest datagram arrived
+
+    def on_datagram(self, newest_s: float) -> None:
+        """A datagram arrives; the newest stamp of telemetry is `newest_s`."""
+        self._arrival_s = newest_s
+
+    def on_request(self, stamp_s: float) -> None:
+        self._began_s = stamp_s if self._began_s is None else self._began_s
+        self.elapsed_s = stamp_s - self._began_s
+
+    def on_telemetry(self) -> None:
+        self._telemetry_s = self.elapsed_s
+
+    @property
+    def now_s(self) -> float:
+        silent_s = self.elapsed_s - self._telemetry_s
+        return self._arrival_s + (silent_s if silent_s > SILENCE_S else 0.0)

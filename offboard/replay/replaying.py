@@ -58,7 +58,7 @@ class Turn:
 class Accepted(Signing):
     """The signing of a replayed flight: a log holds no key, and only frames that were accepted."""
 
-    def accept(self, frame: Frame, *, note: bool = True) -> None:
+    def refusal(self, frame: Frame, *, note: bool = True) -> None:
         return None
 
 

@@ -30,7 +30,8 @@ from offboard.link.interface import Link
 from offboard.link.log import FlightLog
 from offboard.link.signing_time import SigningTime
 from offboard.link.stop import StopRequests
-from offboard.mavlink.session import DIALECTS, Session, SessionSettings
+from offboard.mavlink.senders import DIALECTS
+from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import Signing
 from offboard.model.command import Command, PositionCommand
 from offboard.reference.track import Track

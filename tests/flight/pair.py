@@ -31,6 +31,7 @@ from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.link.interface import Chunk
 from offboard.link.log import FlightLog
 from offboard.mavlink.session import Session, SessionSettings
+from offboard.mavlink.signing import Signing
 from offboard.model.vehicle import Vehicle
 from offboard.run import configuration as config
 from simulator import config as simulated
@@ -270,6 +271,7 @@ def make(
     boot_scale: float = 0.25,
     clock: HostClock | None = None,
     system_id: int | None = None,
+    key: bytes = b"",
     **options: Any,
 ) -> Pair:
     """A pair as `offboard fly --sitl` makes it. `flies` is the simulated vehicle, `believed` the
@@ -292,7 +294,8 @@ def make(
                 system_id=system_id,
                 component_id=COMPONENT_ID,
                 record_component_id=RECORD_COMPONENT_ID,
-            )
+            ),
+            Signing(key) if key else None,
         ),
         observer=observer,
         controller=wrap(controller),

@@ -6,12 +6,12 @@ import threading
 from pathlib import Path
 
 import pytest
+from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.analysis import tlog
 from offboard.link import log as log_module
 from offboard.link.background import BackgroundWriter
 from offboard.link.log import FlightLog
-from offboard.mavlink.framing import pack
 
 UNIX_US = 1_767_225_600_000_000
 LONG_S = 20.0
@@ -104,7 +104,11 @@ def test_a_log_on_a_slow_disk_is_complete(tmp_path: Path, monkeypatch: pytest.Mo
         right(descriptor, entries)
 
     monkeypatch.setattr(log_module, "append", slow)
-    frames = [pack(0, bytes(9), number % 256, 1, 191) for number in range(3000)]
+    beat, sender = mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3), mavlink.MAVLink(None, 1, 1)
+    frames = []
+    for number in range(3000):
+        sender.seq = number % 256
+        frames.append(bytes(beat.pack(sender)))
     with FlightLog(tmp_path / "x", "", real_time=True) as log:
         for number, frame in enumerate(frames):
             log.write(UNIX_US + 100 * number, frame)

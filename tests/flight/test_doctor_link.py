@@ -12,7 +12,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.doctor.listening import LONGEST_S, NOTHING_S
 from offboard.flight.preflight import Level
-from offboard.mavlink.signing import BEHIND_MAX, Signing
+from offboard.mavlink.signing import UNITS_PER_S, Signing
 from simulator.firmware.px4 import PX4
 from simulator.start import Start
 
@@ -78,8 +78,8 @@ def test_what_is_heard_is_no_vehicle(before: Any, found: str) -> None:
 
 def behind(**options: Any) -> Bench:
     """A vehicle that signs, and whose signing time is ten minutes behind ours."""
-    patient = bench(signing=Signing(KEY, 100 * BEHIND_MAX), **options)
-    patient.instance.keyring.set_up(KEY, 90 * BEHIND_MAX)
+    patient = bench(signing=Signing(KEY, 100 * 60 * UNITS_PER_S), **options)
+    patient.instance.keyring.set_up(KEY, 90 * 60 * UNITS_PER_S)
     return patient
 
 

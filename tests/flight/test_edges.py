@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import pytest
+from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.flight.companion import Companion, Outcome, Output
 from offboard.flight.phases import Phase
@@ -25,7 +26,7 @@ from offboard.link.interface import Chunk, Link, LinkUnavailable, Strangers
 from offboard.link.log import FlightLog
 from offboard.link.stop import StopRequests
 from offboard.mavlink.counters import Counters
-from offboard.mavlink.framing import FrameSplitter, pack
+from offboard.mavlink.framing import FrameSplitter
 from offboard.run.loop import UNGUARDED, Loop
 from offboard.supervisor.supervisor import Supervisor, SupervisorError
 
@@ -355,12 +356,19 @@ def test_an_exception_in_every_turn_ends_in_silence(
     assert outcome.sentence.endswith("; setpoints stopped")
 
 
+def framed(message: mavlink.MAVLink_message, number: int) -> bytes:
+    sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)
+    sender.seq = number % 256
+    return bytes(message.pack(sender))
+
+
 def setpoint(number: int) -> bytes:
-    return pack(82, number.to_bytes(4, "little") + bytes(33) + b"\1\1", number % 256, 1, 191)
+    message = mavlink.MAVLink_set_attitude_target_message(number, 1, 1, 7, [0] * 4, 0, 0, 0, 0)
+    return framed(message, number)
 
 
 def said(number: int) -> bytes:
-    return pack(253, number.to_bytes(1, "little") + bytes(53), number % 256, 1, 191)
+    return framed(mavlink.MAVLink_statustext_message(number, b""), number)
 
 
 @contextmanager
@@ -396,7 +404,7 @@ def cable() -> Iterator[tuple[Link, Callable[[], bytes]]]:
 def test_a_full_stream_does_not_block_and_sends_the_newest_setpoint(
     ends: Callable[[], AbstractContextManager[tuple[Link, Callable[[], bytes]]]], count: int
 ) -> None:
-    heartbeat = pack(0, b"\1" * 9, 7, 1, 191)
+    heartbeat = framed(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3), 7)
     with ends() as (link, read):
         for number in range(count):
             link.send(setpoint(number), None)

@@ -15,8 +15,8 @@ from offboard.analysis.score import score
 from offboard.flight.phases import ExitCode, Phase
 from offboard.link import clock
 from offboard.link.signing_time import SigningTime, SigningTimeError, state_directory
-from offboard.mavlink.autopilots import Autopilots
 from offboard.mavlink.outgoing import Heartbeat
+from offboard.mavlink.senders import Senders
 from offboard.mavlink.session import Session, SessionSettings
 from offboard.mavlink.signing import RESERVED, Signing
 
@@ -31,7 +31,8 @@ def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def stamp_of(signing: Signing) -> int:
-    return int.from_bytes(signing.sign(b"")[-12:-6], "little")
+    beat = mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3)
+    return int.from_bytes(signing.pack(beat, mavlink.MAVLink(None))[-12:-6], "little")
 
 
 def test_stamps_do_not_go_back_with_the_clock_or_after_a_crash(
@@ -102,9 +103,7 @@ def test_a_directory_that_cannot_be_written_is_refused(home: Path) -> None:
 
 def signed_hover(key: bytes = KEY, **options: Any) -> Pair:
     """`hover` over a signed link: the vehicle's key is KEY."""
-    pair = hover(**options)
-    session: Any = pair.companion._session
-    session._signing = Signing(key)
+    pair = hover(key=key, **options)
     pair.instance.keyring.set_up(KEY, 1)
     return pair
 
@@ -210,5 +209,5 @@ def test_two_vehicles_on_one_link_are_named() -> None:
         outcome.sentence
     )
     chosen = hover(down=both)
-    chosen.companion._session.autopilots = Autopilots(1)
+    chosen.companion._session.senders = Senders(1, 191, has_key=False)
     until(chosen, Phase.ARM)

@@ -12,7 +12,7 @@ from offboard.link import clock
 from offboard.link.connection import open_link
 from offboard.link.interface import Chunk, Strangers
 from offboard.link.udp import LOOK_EVERY_S, UdpLink
-from offboard.mavlink.peer import PEER_SILENT_S
+from offboard.mavlink.senders import PEER_SILENT_S
 
 LOCAL = "127.0.0.1"
 

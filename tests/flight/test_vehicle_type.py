@@ -91,4 +91,4 @@ def test_what_is_no_vehicle_is_never_taken_for_one(kind: int) -> None:
     session = Session(SessionSettings())
     frame = mavlink.MAVLink_heartbeat_message(kind, 3, 0, 0, 4, 3).pack(codec)
     assert session.receive(frame, "link", 0.0).events == ()
-    assert session.autopilots.systems == {}
+    assert session.senders.systems == {}

@@ -14,6 +14,8 @@ from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from pymavlink.dialects.v20 import common as mavlink
+
 from offboard.analysis.tlog import LoggedMessage
 from offboard.flight.inputs import (
     Call,
@@ -26,7 +28,6 @@ from offboard.flight.manifest import PAYLOAD_TYPE as MANIFEST
 from offboard.flight.record import RECORD_COMPONENT_ID
 from offboard.link.interface import Chunk
 from offboard.link.log import entry
-from offboard.mavlink import framing
 from offboard.mavlink.encode import encode
 from offboard.mavlink.framing import SETPOINTS
 from offboard.mavlink.outgoing import ConfigurationRecord
@@ -106,8 +107,8 @@ def thinned(recording: Recording, turns: dict[int, tuple[LoggedMessage, ...]]) -
         if message.frame.message_id in kinds or record_type(message) == MANIFEST:
             kept.append(entry(message.unix_us, message.frame.raw))
     records = inputs_of(recording, turns)
-    packed = (encode(record, None, None) for record in records)
-    frames = (framing.pack(*one, 0, 1, RECORD_COMPONENT_ID) for one in packed)
+    sender = mavlink.MAVLink(None, srcSystem=1, srcComponent=RECORD_COMPONENT_ID)
+    frames = (bytes(encode(record, None, None).pack(sender)) for record in records)
     return b"".join([*kept, *(entry(message.unix_us, frame) for frame in frames)])
 
 

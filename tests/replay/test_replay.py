@@ -24,7 +24,6 @@ from offboard.flight.phases import Phase
 from offboard.link.log import entry
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
-from offboard.mavlink.signing import Signing
 from offboard.replay.difference import compare
 from offboard.replay.recording import read, record_type
 from offboard.replay.verdict import verdict
@@ -181,10 +180,9 @@ def test_a_lost_message_ends_the_comparison_before_it(tmp_path: Path) -> None:
 def short_flight(key: bytes = b"", **options) -> Pair:
     resolved = configuration.load("flight", choices={"reference": "hover"}, assignments=SHORT,
                                   known_vehicle="px4_sih")  # fmt: skip
-    pair = hover(learning=resolved.identify, deadline_s=resolved.deadline_s, **options)
+    pair = hover(learning=resolved.identify, deadline_s=resolved.deadline_s, key=key, **options)
     companion, turn = pair.companion, pair.companion.turn
     if key:
-        companion._session._signing = Signing(key)
         pair.instance.keyring.set_up(key, 1)
 
     def guarded(chunks, now_s) -> Output:  # as the loop

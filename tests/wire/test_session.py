@@ -7,9 +7,10 @@ from collections.abc import Callable
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
+from pymavlink.dialects.v20 import development
 from vehicle_frames import ARDUPILOT, OFFBOARD, PEER, PX4, Sender, pinned, understood
 
-from offboard.mavlink import events, framing
+from offboard.mavlink import events
 from offboard.mavlink.counters import DropReason
 from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Timesync
 from offboard.mavlink.session import Session, SessionSettings
@@ -173,8 +174,8 @@ def test_a_setpoint_for_another_vehicle_on_the_link_is_not_ours(
 
 def test_current_mode_reports_the_mode() -> None:
     session = pinned(Sender())
-    payload = (6 << 16).to_bytes(4, "little") + (3 << 16).to_bytes(4, "little") + b"\0"
-    frame = framing.pack(436, payload, 9, 1, 1)
+    message = development.MAVLink_current_mode_message(0, 6 << 16, 3 << 16)
+    frame = Sender().frame(message)
     assert session.receive(frame, PEER, 0.0).events == (events.ModeReport("OFFBOARD"),)
 
 

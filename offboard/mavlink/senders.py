@@ -1,0 +1,280 @@
+"""Who sends on the link: which sender is the vehicle, who else controls it, and who may be ignored.
+
+The first autopilot heard is the vehicle, known by system id, component id and network address. From
+then on every other sender is dropped and counted; setpoints and modes that another one sends to our
+vehicle are reported, as are other companion computers. mavlink-router and MAVProxy send from
+another port after a restart: the address changes to another port of its host that sends the
+vehicle's frames, after the known one was silent. The link checks that the silence is no overflow
+and no pause of ours: before, it hands over no datagram of another address.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Hashable, Mapping
+from types import MappingProxyType
+
+from pymavlink.dialects.v20.all import enums
+
+from offboard.mavlink.counters import Counters, DropReason
+from offboard.mavlink.decode import Address, Identity, decode, decode_command, decode_identity
+from offboard.mavlink.dialects.ardupilot import ARDUPILOT
+from offboard.mavlink.dialects.base import TYPE_GCS, TYPE_ONBOARD_CONTROLLER, Dialect
+from offboard.mavlink.dialects.px4 import PX4
+from offboard.mavlink.events import (
+    ClockBehind,
+    CommandRequest,
+    Event,
+    Heartbeat,
+    OtherCompanion,
+    OtherSender,
+    VehicleFound,
+)
+from offboard.mavlink.framing import HEARTBEAT, SETPOINTS, TIMESYNC, Frame
+
+DIALECTS: Mapping[str, Dialect] = MappingProxyType({d.name: d for d in (PX4, ARDUPILOT)})
+AUTOPILOT_COMPONENT = 1
+COMMANDS = (75, 76)  # COMMAND_INT, COMMAND_LONG
+# MAV_CMD: return, land, take off, set the mode, go to a place, begin a mission, arm or disarm
+_MODE_COMMANDS = frozenset({20, 21, 22, 176, 192, 300, 400})
+PEER_SILENT_S = 0.5  # half of `Limits.silence_s`, so that the flight can continue
+SYSTEMS_MAX = 8  # that are remembered
+HEARD_S = 10.0  # after its newest HEARTBEAT a system is gone
+NOTED_EVERY_S = 1.0
+_NO_AUTOPILOT = 8  # MAV_AUTOPILOT_INVALID
+# MAV_TYPE: quadrotor, coaxial, hexarotor, octorotor, tricopter, dodecarotor, decarotor, any number
+MULTIROTORS = frozenset({2, 3, 13, 14, 15, 29, 35, 43})
+HELICOPTER = 4
+# MAV_TYPE of what is no vehicle, whatever autopilot it names: antenna tracker, ground station,
+# onboard controller, gimbal, ADS-B, camera, and the peripherals from charging station to GPS
+_NO_VEHICLES = frozenset({5, 6, 18, 26, 27, 30, 31, 32, 33, 34, *range(36, 43), 44})
+
+
+class Senders:
+    """See the module. `vehicle` and `dialect` are None until the vehicle was found; `wanted` is the
+    only system that may be the vehicle, None: any; without `has_key` it must not sign. `own` are
+    our ids, of which the system is the vehicle's. `systems` has when each autopilot was heard, to a
+    second. Times are `Session.link_time_s` but for `heard_s`, host time of the vehicle's newest
+    frame.
+    """
+
+    def __init__(self, wanted: int | None, component_id: int, *, has_key: bool) -> None:
+        self.own = Address(1, component_id)
+        self.vehicle: VehicleFound | None = None
+        self.dialect: Dialect | None = None
+        self.systems: dict[int, float] = {}
+        self.heard_s = 0.0
+        self._wanted = wanted
+        self._has_key = has_key
+        self._place: Hashable | None = None  # the vehicle's address
+
+    def adopt(self, vehicle: VehicleFound, place: Hashable) -> None:
+        """Take this vehicle, which sends from `place`, as ours."""
+        self.vehicle, self.dialect, self._place = vehicle, DIALECTS[vehicle.autopilot], place
+        self.own = Address(vehicle.system_id, self.own.component_id)
+
+    # --- addresses ---
+
+    def is_foreign(self, place: Hashable) -> bool:
+        """Whether the vehicle sends from another address."""
+        return self.vehicle is not None and place != self._place
+
+    def may_move_to(self, place: Hashable, now_s: float) -> bool:
+        """Whether the vehicle may send from `place` now; `moves_to` if one of its frames does."""
+        return now_s - self.heard_s > PEER_SILENT_S and same_host(place, self._place)
+
+    def moves_to(self, place: Hashable, frame: Frame) -> bool:
+        """Take `place` as the vehicle's address if this genuine frame is the vehicle's."""
+        vehicle = self.vehicle
+        ids = frame.system_id, frame.component_id
+        moves = vehicle is not None and ids == (vehicle.system_id, vehicle.component_id)
+        if moves:
+            self._place = place
+        return moves
+
+    # --- frames ---
+
+    def judge(
+        self, frame: Frame, place: Hashable, now_s: float, events: list[Event]
+    ) -> DropReason | None:
+        """Why this frame is not one of our vehicle, nor a command to us. Adds to `events` the
+        vehicle when it is found, commands to us, and others that control the vehicle."""
+        sender = Address(frame.system_id, frame.component_id)
+        if self.vehicle is None:
+            return self._find(frame, place, now_s, events)
+        if self._controls(frame):
+            events.append(OtherSender(*sender, frame.message_id))
+        if sender != self.own and frame.message_id in COMMANDS and frame.verified:
+            command, parameters, receiver = decode_command(frame.message)
+            if receiver != self.own:
+                return DropReason.NOT_FOR_US
+            events.append(CommandRequest(command, parameters, *sender))
+            return None
+        foreign = DropReason.SAME_IDS if sender == self.own else self._foreign(frame, now_s)
+        if foreign is not None and self._is_companion(frame):
+            events.append(OtherCompanion(*sender, frame.message.custom_mode))
+        return foreign
+
+    def _find(
+        self, frame: Frame, place: Hashable, now_s: float, events: list[Event]
+    ) -> DropReason | None:
+        """The first heartbeat of an autopilot makes it the vehicle."""
+        heard = self.note(frame, now_s)
+        if (frame.system_id, frame.component_id) == self.own:
+            return DropReason.SAME_IDS
+        if frame.component_id != AUTOPILOT_COMPONENT:
+            return DropReason.FOREIGN_COMPONENT
+        if self._wanted not in (None, frame.system_id):
+            return DropReason.FOREIGN_SYSTEM
+        if frame.message_id == TIMESYNC and frame.verified:
+            return None  # a simulator in lockstep may need the reply before its first heartbeat
+        if not isinstance(heard, Dialect):
+            return heard or DropReason.NO_VEHICLE
+        if frame.signed and not self._has_key:
+            return DropReason.NO_KEY
+        vehicle = VehicleFound(frame.system_id, frame.component_id, heard.name)
+        self.adopt(vehicle, place)
+        events.append(vehicle)
+        return None
+
+    def _foreign(self, frame: Frame, now_s: float) -> DropReason | None:
+        heard = self.note(frame, now_s)
+        assert self.vehicle is not None
+        if frame.system_id != self.vehicle.system_id:
+            return DropReason.FOREIGN_SYSTEM
+        if frame.component_id != self.vehicle.component_id:
+            return DropReason.FOREIGN_COMPONENT
+        if isinstance(heard, DropReason):
+            return heard  # a HEARTBEAT with its ids that is no autopilot's
+        other = heard is not None and heard.name != self.vehicle.autopilot
+        return DropReason.FOREIGN_COMPONENT if other else None
+
+    def _controls(self, frame: Frame) -> bool:
+        """Whether it is a setpoint for our vehicle or for all (routers forward those of others), or
+        commands the mode from the vehicle's own system, as we do: that of a ground station is the
+        pilot's."""
+        offset = SETPOINTS.get(frame.message_id)
+        if offset is not None:
+            target = frame.payload[offset : offset + 1]  # MAVLink 2 omits trailing zeros
+            return not target or target[0] in (0, self.own.system_id)
+        if frame.message_id not in COMMANDS or not frame.verified:
+            return False
+        if frame.system_id != self.own.system_id or frame.component_id == AUTOPILOT_COMPONENT:
+            return False
+        command, _, receiver = decode_command(frame.message)
+        for_vehicle = receiver.system_id in (0, self.own.system_id) and receiver != self.own
+        return command in _MODE_COMMANDS and for_vehicle
+
+    def _is_companion(self, frame: Frame) -> bool:
+        """Whether it is the HEARTBEAT of a companion computer. On PX4 some of them call themselves
+        a ground station, but with the system id of the vehicle."""
+        if frame.message_id != HEARTBEAT or not frame.verified:
+            return False
+        kind = frame.message.type
+        on_vehicle = kind == TYPE_GCS and frame.system_id == self.own.system_id
+        companion = kind == TYPE_ONBOARD_CONTROLLER or on_vehicle
+        return companion and frame.message.autopilot == _NO_AUTOPILOT
+
+    def note(self, frame: Frame, now_s: float) -> Dialect | DropReason | None:
+        """The autopilot that a frame shows, why it is none, or None if it is no HEARTBEAT of an
+        autopilot's component."""
+        if frame.message_id != HEARTBEAT or frame.component_id != AUTOPILOT_COMPONENT:
+            return None
+        found = _dialect(frame) if frame.verified else DropReason.NO_VEHICLE
+        if isinstance(found, Dialect):
+            self.hear(frame.system_id, now_s)
+        return found
+
+    def hear(self, system_id: int, now_s: float) -> None:
+        """This system has an autopilot."""
+        if now_s - self.systems.get(system_id, -math.inf) < NOTED_EVERY_S:
+            return
+        self.systems.pop(system_id, None)  # the newest is the last
+        self.systems[system_id] = now_s
+        if len(self.systems) > SYSTEMS_MAX:
+            del self.systems[next(iter(self.systems))]
+
+    def greeted(self, frame: Frame, now_s: float) -> tuple[Dialect, ClockBehind] | None:
+        """The autopilot whose heartbeat has a right signature and a clock that is behind. It may be
+        a replay, so that nothing else is believed."""
+        heard = self.note(frame, now_s)
+        if not isinstance(heard, Dialect) or self._wanted not in (None, frame.system_id):
+            return None
+        beat = decode(frame, heard)
+        assert isinstance(beat, Heartbeat)
+        return heard, ClockBehind(frame.system_id, beat.armed)
+
+    def is_for_us(self, ack: Frame) -> bool:
+        """Whether a COMMAND_ACK is for us, or for all."""
+        system_id, component_id = ack.message.target_system, ack.message.target_component
+        return system_id in (0, self.own.system_id) and component_id in (0, self.own.component_id)
+
+    # --- what to say ---
+
+    def ambiguous(self, now_s: float) -> bool:
+        """Several could be the vehicle, and none was chosen."""
+        return self._wanted is None and len(self._present(now_s)) > 1
+
+    def named(self, now_s: float) -> str:
+        """The systems that are heard, for a sentence."""
+        return _listed(self._present(now_s))
+
+    def _present(self, now_s: float) -> list[int]:
+        return [each for each, at_s in self.systems.items() if now_s - at_s <= HEARD_S]
+
+    def why_none(self, counters: Counters) -> str:
+        """Why no vehicle was found, as far as the frames that were dropped tell; else empty."""
+        dropped = counters.dropped
+        if dropped[DropReason.BAD_SIGNATURE]:
+            return "frames arrive, but their signature does not match: it is another key's"
+        if dropped[DropReason.OLD_STAMP] or dropped[DropReason.REPLAYED]:
+            return (
+                "signed frames arrive, but their time stamps are too old: the vehicle does not "
+                "take ours; is the link one-way?"
+            )
+        if dropped[DropReason.UNSIGNED]:
+            return "frames arrive unsigned: set the key on the vehicle, or omit --signing-key"
+        if dropped[DropReason.NO_KEY]:
+            return "the vehicle signs its messages: give its key with --signing-key"
+        if self._wanted is not None and self.systems:
+            return f"system {self._wanted} is not heard, but {_listed(self.systems)}; see --system"
+        return ""
+
+
+def _listed(systems: Collection[int]) -> str:
+    *others, last = map(str, sorted(systems)) if systems else ("none",)
+    return f"{', '.join(others)} and {last}" if others else last
+
+
+def same_host(place: Hashable, other: Hashable) -> bool:
+    """Whether two UDP addresses (host, port) have the same host."""
+    return isinstance(place, tuple) and isinstance(other, tuple) and place[0] == other[0]
+
+
+def is_vehicle(identity: Identity) -> bool:
+    """Whether this HEARTBEAT is of a vehicle with an autopilot, of any kind."""
+    return identity.vehicle_type not in _NO_VEHICLES and identity.autopilot != _NO_AUTOPILOT
+
+
+def unfit_type(vehicle_type: int, *, helicopter: bool) -> str:
+    """Why a vehicle of this MAV_TYPE is not flown, in one sentence; empty if it is. `helicopter`:
+    the vehicle file is that of a helicopter."""
+    if vehicle_type in ({HELICOPTER} if helicopter else MULTIROTORS):
+        return ""
+    known = enums["MAV_TYPE"].get(vehicle_type)
+    name = known.name.removeprefix("MAV_TYPE_") if known else f"MAV_TYPE {vehicle_type}"
+    if helicopter:
+        return f"the vehicle is a {name}; its vehicle file says airframe: helicopter"
+    hint = " (airframe: helicopter in its vehicle file flies it)"
+    return (
+        f"the vehicle is a {name}; offboard flies multirotors"
+        f"{hint if vehicle_type == HELICOPTER else ''}"
+    )
+
+
+def _dialect(heartbeat: Frame) -> Dialect | DropReason:
+    identity = decode_identity(heartbeat.payload)
+    if not is_vehicle(identity):
+        return DropReason.NO_VEHICLE
+    fitting = (d for d in DIALECTS.values() if d.mav_autopilot == identity.autopilot)
+    return next(fitting, DropReason.UNSUPPORTED_AUTOPILOT)

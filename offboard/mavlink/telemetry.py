@@ -1,0 +1,104 @@
+"""Telemetry: frames of the vehicle become events, in the order and at the rates that are needed.
+
+What is late, repeated or implausible is refused. Rates and time are counted by what is accepted.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+from offboard.mavlink.counters import DropReason
+from offboard.mavlink.decode import decode, decode_text_chunk
+from offboard.mavlink.dialects.base import Dialect
+from offboard.mavlink.events import (
+    Attitude,
+    Event,
+    Heartbeat,
+    LocalPosition,
+    ModeReport,
+    Rebooted,
+    TimesyncReply,
+)
+from offboard.mavlink.framing import STATUSTEXT, Frame
+from offboard.mavlink.telemetry_rates import SHARE, TelemetryRates, fitted
+from offboard.mavlink.texts import TextAssembler
+from offboard.mavlink.vehicle_time import Age, VehicleTime
+
+# A link may reorder: a report of the mode this close behind a newer one says nothing new
+_REORDERED_FRAMES, _REORDERED_S = 32, 0.1
+
+
+class Telemetry:
+    """Telemetry of one vehicle. `capacity_bytes_ps` of the link limits the rates that are
+    requested; None: unknown. `time.seconds` are the session's."""
+
+    def __init__(self, capacity_bytes_ps: float | None) -> None:
+        self.time = VehicleTime()
+        self.texts = TextAssembler()
+        self.rates = TelemetryRates((), 0.0)
+        self._capacity_bytes_ps = capacity_bytes_ps
+        self._mode_report = (0, -math.inf)  # sequence number of the newest, and when it arrived
+
+    def interpret(
+        self, frame: Frame, dialect: Dialect, now_s: float
+    ) -> tuple[Event, ...] | DropReason | None:
+        """The events of a verified frame of the vehicle, None for a message without decoder; or why
+        it is dropped. `now_s`: its arrival."""
+        if frame.message_id == STATUSTEXT:
+            return tuple(self.texts.add(decode_text_chunk(frame.payload), now_s))
+        event = decode(frame, dialect)
+        if isinstance(event, DropReason):
+            return event
+        if isinstance(event, (LocalPosition, Attitude)):
+            return self._stamped(event, frame.message_id, dialect, now_s)
+        if isinstance(event, (Heartbeat, ModeReport)) and self._overtaken(frame, now_s):
+            return DropReason.STALE
+        self.rates.count(frame.message_id, self.time.seconds)
+        return None if event is None else (event,)
+
+    def _stamped(
+        self, event: LocalPosition | Attitude, message_id: int, dialect: Dialect, now_s: float
+    ) -> tuple[Event, ...] | DropReason:
+        wrapped_s = self.time.wrapped_s(event.time_s)
+        if wrapped_s:
+            event = replace(event, time_s=event.time_s + wrapped_s)
+        age = self.time.check(message_id, event.time_s)
+        if age is Age.STALE:
+            return DropReason.STALE
+        # after the check of the stamp: duplicates must not raise the measured rate
+        self.rates.count(message_id, self.time.seconds)
+        if age is Age.REBOOTED:
+            self.request_from(dialect)  # a rebooted vehicle has its default rates
+        self.time.on_telemetry(event.time_s, now_s)
+        return (Rebooted(event.time_s), event) if age is Age.REBOOTED else (event,)
+
+    def _overtaken(self, frame: Frame, now_s: float) -> bool:
+        """Whether this report of the mode was sent before the newest one."""
+        newest, arrived_s = self._mode_report
+        behind = (newest - frame.sequence) % 256
+        if 0 < behind <= _REORDERED_FRAMES and now_s - arrived_s < _REORDERED_S:
+            return True
+        self._mode_report = frame.sequence, now_s
+        return False
+
+    def timesync_reply(self, tc1_ns: int, ts1_ns: int) -> TimesyncReply:
+        """A reply of the vehicle, whose clock is put on that of the stamps."""
+        wrapped_ns = round(self.time.wrapped_s(tc1_ns / 1e9) * 1e9)
+        return TimesyncReply(ts1_ns, tc1_ns + wrapped_ns)
+
+    # --- rates ---
+
+    def request_from(self, dialect: Dialect) -> None:
+        """Request all messages that are wanted of this autopilot."""
+        wanted = dialect.wanted
+        if self._capacity_bytes_ps is not None:
+            wanted = fitted(wanted, self._capacity_bytes_ps)
+        self.rates = TelemetryRates(wanted, self.time.seconds)
+
+    def thin(self, dialect: Dialect) -> bool:
+        """Request half of it from now on. False if the rates are the lowest already."""
+        before = self.rates.bytes_ps
+        self._capacity_bytes_ps = 0.5 * before / SHARE
+        self.request_from(dialect)
+        return self.rates.bytes_ps < 0.99 * before
