@@ -15,7 +15,7 @@ from functools import partial
 from offboard.flight.phases import Limits
 from offboard.flight.vehicle_state import VehicleState
 from offboard.identification.uncertainty import Estimate
-from offboard.mavlink import autopilots
+from offboard.mavlink import senders
 from offboard.mavlink.dialects.base import Dialect, WatchedParameter
 from offboard.mavlink.outgoing import ParamRead
 
@@ -132,7 +132,7 @@ def unfit_type(ground: Ground) -> str:
     heartbeat = ground.vehicle.heartbeat
     if heartbeat is None or ground.dialect is None:
         return ""
-    return autopilots.unfit_type(heartbeat.vehicle_type, helicopter=ground.helicopter)
+    return senders.unfit_type(heartbeat.vehicle_type, helicopter=ground.helicopter)
 
 
 def _armed_already(ground: Ground) -> str:
