@@ -7,10 +7,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from offboard.flight import ladder, programme
+from offboard.flight import failsafe, transitions
 
 README = Path(__file__).parents[1] / "offboard" / "flight" / "README.md"
-TABLES = {"ladder": ladder.markdown, "exits": programme.markdown}
+TABLES = {"failsafe": failsafe.markdown, "exits": transitions.markdown}
 
 
 def with_tables(text: str) -> str:
@@ -25,7 +25,7 @@ def with_tables(text: str) -> str:
 
 def test_the_tables_are_those_of_the_code() -> None:
     text = README.read_text(encoding="utf-8")
-    assert len(ladder.markdown().splitlines()) == len(ladder.ROWS) + 2
+    assert len(failsafe.markdown().splitlines()) == len(failsafe.ROWS) + 2
     assert text == with_tables(text)
 
 

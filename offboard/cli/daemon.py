@@ -99,14 +99,14 @@ def daemon(
         from offboard.compiled import loading
 
         with loading():
-            from offboard.flight.programme import service
+            from offboard.flight.phases import ServiceOptions
             from offboard.service.daemon import run
         try:
             outcome = run(
                 partial(options.load, seed),
                 options.connection(),
                 out_directory or FLIGHTS,
-                programme=service(then.value, anchor.value, arms=arms),
+                options=ServiceOptions(anchor.value, then.value, arms),
                 metrics=metrics,
                 report=report,
                 stops=stops,

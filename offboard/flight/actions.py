@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 
 from offboard.estimation.observer import Observer
-from offboard.flight.assessment import STILL_ARMED, has_other_sender
 from offboard.flight.authority import Standing
 from offboard.flight.decide import Decider, Tick
 from offboard.flight.gate import LEVEL
-from offboard.flight.ground_contact import STANDING_S
+from offboard.flight.ground_contact import STANDING_S, STILL_ARMED
 from offboard.flight.outbox import Outbox
 from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, Phase
+from offboard.flight.rows import other_sender
 from offboard.flight.state import FlightState
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.outgoing import CommandLong
@@ -157,7 +157,7 @@ class PhaseActions:
         state = self._state
         on_ground, vehicle = state.contact.certain, state.vehicle
         command = Command(0.0, LEVEL, vehicle.course_rad) if on_ground else self._flown()
-        quiet = state.takes_off_by_command or state.telemetry_is_old or has_other_sender(state)
+        quiet = state.takes_off_by_command or state.telemetry_is_old or other_sender(state)
         if on_ground:
             quiet |= vehicle.armed and vehicle.in_failsafe
         else:
@@ -183,7 +183,7 @@ class PhaseActions:
         state = self._state
         due = state.reading.due(self._dialect, state.vehicle.parameters, state.now_s)
         self._outbox.send(*due)
-        if state.programme.serves:
+        if state.service:
             if state.vehicle.uid is None:
                 self._outbox.request(CommandLong.message(AUTOPILOT_VERSION))
             return

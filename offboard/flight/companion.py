@@ -10,17 +10,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import replace
 
 from offboard.control.base import Adopting, Controller
 from offboard.estimation.observer import Observer
-from offboard.flight import assessment
 from offboard.flight.actions import PhaseActions
 from offboard.flight.authority import Standing
 from offboard.flight.busyness import PAUSE_S, Busyness
 from offboard.flight.decide import Decider, Tick
 from offboard.flight.event_processor import EventProcessor
-from offboard.flight.facts import Facts
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.inputs import InputRecorder
 from offboard.flight.news import News
@@ -34,11 +31,11 @@ from offboard.flight.phases import (
     PHASE_CODES,
     STOPPED,
     WAITING,
+    Action,
     Limits,
     Phase,
-    Rung,
+    ServiceOptions,
 )
-from offboard.flight.programme import FLY, Programme
 from offboard.flight.snapshot import Snapshot, snapshot_of
 from offboard.flight.state import FlightState, Outcome
 from offboard.identification.learned import Learned
@@ -88,7 +85,7 @@ class Companion:
         stopwatch: Callable[[], float],
         identify: IdentifySettings | None = None,
         learned: Learned | None = None,
-        programme: Programme = FLY,
+        service: ServiceOptions | None = None,
         before: Companion | None = None,
     ) -> None:
         self._session = session
@@ -98,11 +95,12 @@ class Companion:
         model = learned.vehicle if learned else vehicle
         if learned:
             observer.adopt(model)
-        if before is None:
-            state = FlightState(limits, plan, model, programme)
-        else:
-            state = before.state.next_flight(limits, plan, model, programme)
-        self.state: FlightState = state
+        self._identification = _identification(vehicle, controller, period_s, identify, learned)
+        self.state = state = FlightState(
+            limits, plan, model, session, observer, self._identification, service
+        )
+        if before is not None:
+            state.follow(before.state)
         state.busyness = Busyness(period_s)
         self.peer: Hashable | None = before.peer if before else None
         same_period = before is not None and before._period_s == period_s
@@ -114,10 +112,9 @@ class Companion:
         self._logged: list[bytes] = []  # frames since the newest `finish_turn`
         self._ticked = False  # in this turn
         self._news = News()
-        self._inputs = InputRecorder(session.settings, kept=not programme.serves)
+        self._inputs = InputRecorder(session.settings, kept=service is None)
         self.strangers: int = before.strangers if before else 0
         self._recorded_strangers = self.strangers
-        self._identification = _identification(vehicle, controller, period_s, identify, learned)
         self._outbox = Outbox(state, session, observer, self._identification)
         self._decider = decider = Decider(
             state=state,
@@ -182,11 +179,6 @@ class Companion:
             self.strangers,
             self._session.counters.forged,
         )
-
-    def facts(self) -> Facts:
-        """The facts of this moment, with the rung of the ladder that is in force."""
-        now = assessment.facts(self.state, self._session, self._observer, self._identification)
-        return replace(now, rung=self.state.ladder.rung)
 
     def has_ended(self) -> bool:
         return self.state.has_ended
@@ -320,9 +312,9 @@ class Companion:
 
     def _status(self) -> tuple[int, int]:
         """MAV_STATE and custom_mode of our heartbeat."""
-        phase, ladder = self.state.phase, self.state.ladder
+        phase, failsafe = self.state.phase, self.state.failsafe
         calm = phase in WAITING or phase in ENDS
-        critical = phase in FLYING and ladder.rung >= Rung.HOLD
+        critical = phase in FLYING and failsafe.action >= Action.HOLD
         status = MAV_STATE_CRITICAL if critical else MAV_STATE_STANDBY if calm else ACTIVE
         return status, PHASE_CODES[phase]
 

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 from offboard.control.base import Adopting, Controller, Decision, Situation
 from offboard.estimation.observer import Observer
-from offboard.flight.assessment import position_error_m
 from offboard.flight.gate import Refusal, Refused
 from offboard.flight.online_identification import Adoption, OnlineIdentification
 from offboard.flight.outbox import Outbox
@@ -95,7 +94,7 @@ class Decider:
 
         Returns False, and increases `missed`, if the decision failed or the gate refused it; then
         nothing is sent. Telemetry that was too old before the decision began does not count: the
-        ladder has a row for it.
+        failsafe has a row for it.
         """
         was_old = self._state.telemetry_is_old
         try:
@@ -196,7 +195,7 @@ class Decider:
     def _excited(self, command: Command, tick: Tick) -> Command:
         if self._identification is None or tick.phase is not Phase.EXCITE:
             return command
-        return self._identification.excited(command, tick.time_s, position_error_m(self._state))
+        return self._identification.excited(command, tick.time_s, self._state.position_error_m)
 
     def _adopt(self, time_s: float, adoption: Adoption) -> None:
         assert isinstance(self._controller, Adopting)

@@ -5,17 +5,18 @@ from __future__ import annotations
 import numpy as np
 
 from offboard.estimation.observer import Observer
-from offboard.flight import assessment, guards
 from offboard.flight.authority import Authority
 from offboard.flight.ground_contact import GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.manifest import vehicle_record
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.outbox import Outbox
-from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, WAITING
+from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, WAITING, Phase
 from offboard.flight.position_jumps import PositionJumps
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.requests import Circumstances, Request, Result, answer
+from offboard.flight.rows import other_sender
+from offboard.flight.starting import can_take_over, usable
 from offboard.flight.state import FlightState
 from offboard.mavlink.dialects.base import ThrustRule
 from offboard.mavlink.events import (
@@ -172,7 +173,7 @@ class EventProcessor:
         flies, switched = contact.in_the_air, ours and state.pilot.elsewhere
         state.pilot.on_mode(ours=ours, in_the_air=flies, certainly=contact.certainly_flies)
         why = "" if state.pilot.engaged or not flies else "the vehicle may stand on the ground"
-        if state.pilot.engaged and assessment.has_other_sender(state):
+        if state.pilot.engaged and other_sender(state):
             state.pilot.engaged = False  # it was not switched for us
             why = "another program sends setpoints"
         if switched and why and state.phase in WAITING:
@@ -183,15 +184,14 @@ class EventProcessor:
     def _answer(self, asked: CommandRequest) -> None:
         """Acknowledge a command to us; the next tick does what it asks for."""
         state, result = self._state, Result.UNSUPPORTED
-        if state.programme.serves:
-            now = assessment.facts(state, self._session, self._observer, self._identification)
-            fit = guards.usable(now)
+        if state.service:
+            fit = state.phase is Phase.STANDBY and usable(state)
             circumstances = Circumstances(
                 state.phase,
                 state.vehicle.armed,
-                state.programme.may_arm,
+                state.service.arms,
                 fit,
-                fit and guards.can_take_over(now),
+                fit and can_take_over(state),
             )
             result, request = answer(asked.command, asked.parameters, circumstances)
             if request is not Request.NONE:

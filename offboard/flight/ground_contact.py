@@ -20,6 +20,10 @@ STOOD_WITHIN_M, STOOD_HEIGHT_M, STOOD_S = 0.1, 0.3, 1.0
 KEPT_S, KEPT_EVERY_S = 20.0, 0.05
 STANDING_S = 15.0  # at one height: it stands, and does not hover
 POSITION_KNOWN_S = 1.0  # age of a position that shows where it is
+STILL_ARMED = (
+    f"it has stood still for {STANDING_S:.0f} s and is armed: its land detector reports that it "
+    "flies; disarm it with the transmitter or a ground station"
+)
 
 
 @dataclass(slots=True)

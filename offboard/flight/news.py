@@ -6,8 +6,9 @@ import math
 import re
 
 from offboard.documents.repeated import Repeated
-from offboard.flight import assessment, preflight
+from offboard.flight import preflight
 from offboard.flight.phases import Phase
+from offboard.flight.starting import ground_of
 from offboard.flight.state import FlightState
 from offboard.mavlink.session import Session
 
@@ -36,9 +37,9 @@ class Waiting:
             return ""
         if state.in_phase_s < FIRST_S or now_s - self._said_s < CHANGED_S:
             return ""
-        reason = _unheard(session) if state.phase is Phase.CONNECT else _unready(state, session)
+        reason = _unheard(session) if state.phase is Phase.CONNECT else _unready(state)
         kind = re.sub(r"[0-9]+", "", reason)
-        alone = state.programme.serves and state.phase is Phase.CONNECT
+        alone = state.service is not None and state.phase is Phase.CONNECT
         if not reason or (kind == self._kind and (alone or now_s - self._said_s < AGAIN_S)):
             return ""
         self._kind, self._said_s = kind, now_s
@@ -55,12 +56,12 @@ class News:
     def due(self, state: FlightState, session: Session, now_s: float) -> list[str]:
         """The sentences to announce now, at host time `now_s`."""
         late = [each.news(now_s) for each in (self.paused, self.dropped)]
-        ended = state.busyness.sentence if state.has_ended and state.programme.serves else ""
+        ended = state.busyness.sentence if state.has_ended and state.service else ""
         return list(filter(None, [*late, self._waiting.news(state, session, state.now_s), ended]))
 
 
-def _unready(state: FlightState, session: Session) -> str:
-    ground = assessment.ground(state, session)
+def _unready(state: FlightState) -> str:
+    ground = ground_of(state)
     return "; ".join(filter(None, [*preflight.refusals(ground), preflight.not_ready(ground)]))
 
 

@@ -1,24 +1,23 @@
-"""Phase machine: applies the ladder and the phase table, and starts what begins with a phase."""
+"""Phase machine: applies the failsafe and the phase table, and starts what begins with a phase."""
 
 from __future__ import annotations
-
-from dataclasses import replace
 
 import numpy as np
 
 from offboard.estimation.observer import Observer
-from offboard.flight import assessment
+from offboard.flight import failsafe
 from offboard.flight.decide import Decider
-from offboard.flight.facts import Facts
+from offboard.flight.flying import in_own_failsafe
 from offboard.flight.hover_estimate import DIFFERENT, SETTLED, differs
 from offboard.flight.online_identification import OnlineIdentification
 from offboard.flight.outbox import Outbox
 from offboard.flight.phases import BEFORE_FLIGHT, FLYING, WAITING, ExitCode, Phase
 from offboard.flight.pilot_switch import PilotSwitch
 from offboard.flight.requests import Request
+from offboard.flight.rows import REBOOTED, Transition, why
 from offboard.flight.state import FlightState, Outcome
 from offboard.flight.touchdown import Touchdown
-from offboard.flight.transitions import REBOOTED, Row
+from offboard.flight.transitions import next_row
 from offboard.mavlink.events import LocalPosition
 from offboard.mavlink.session import Session
 
@@ -45,19 +44,22 @@ class PhaseMachine:
 
     def advance(self) -> None:
         """Make every transition whose guard holds."""
-        while not self._state.has_ended:
-            now = self.facts()
-            self._note_failsafe(now)
-            row = self._state.programme.next_row(self._state.phase, now)
+        flight = self._state
+        while not flight.has_ended:
+            if flight.phase in FLYING:
+                failsafe.judge(flight)
+            self._note_failsafe()
+            row = next_row(flight)
             if row is None:
                 break
-            self._enter(row, row.reason.format(**self._figures(now)))
-        self._state.request = Request.NONE
+            self._enter(row, why(row.reason, flight))
+        flight.request = Request.NONE
 
-    def _note_failsafe(self, now: Facts) -> None:
+    def _note_failsafe(self) -> None:
         """A landing by the vehicle's own failsafe is awaited, but it is not ours."""
         state = self._state
-        if now.own_failsafe and state.phase is Phase.LAND and state.outcome is None:
+        fallen = state.phase is Phase.LAND and in_own_failsafe(state)
+        if fallen and state.outcome is None:
             sentence = f"the vehicle's own failsafe flew it, in {state.vehicle.mode}"
             state.outcome = Outcome(ExitCode.ABORTED, sentence + self._explanation())
 
@@ -66,47 +68,34 @@ class PhaseMachine:
         landing goes on, but the flight is none that was flown to its end."""
         state = self._state
         state.rebooted = state.phase not in (Phase.CONNECT, Phase.HEALTH)
-        state.pilot = PilotSwitch(unclaimed=state.programme.serves)
+        state.pilot = PilotSwitch(unclaimed=state.service is not None)
         if state.phase is Phase.LAND:
             state.touchdown = Touchdown(None)
             if state.outcome is None:
                 state.outcome = Outcome(ExitCode.ABORTED, f"{REBOOTED} while landing")
         self.advance()
 
-    def facts(self) -> Facts:
-        """The facts of this moment, with the rung of the ladder that they lead to."""
+    def _enter(self, row: Transition, reason: str) -> None:
         state = self._state
-        now = assessment.facts(state, self._session, self._observer, self._identification)
-        if state.phase not in FLYING:
-            return now
-        state.ladder.step(now, state.now_s)
-        return replace(now, rung=state.ladder.rung)
-
-    def _figures(self, now: Facts) -> dict[str, object]:
-        figures = assessment.figures(self._state, self._session, now, self._identification)
-        worst = self._state.ladder.worst
-        return figures | {"ladder": worst.reason.format(**figures) if worst else ""}
-
-    def _enter(self, row: Row, reason: str) -> None:
-        state = self._state
+        source = state.phase
         self._conclude(row, reason)
         state.vehicle.clear_messages()
         state.request = Request.NONE
         state.phase = row.target
         state.began_s = state.now_s
         self._outbox.announce(f"{row.target.value}: {reason}", title="offboard: ")
-        if row.source in BEFORE_FLIGHT and row.target in FLYING:
+        if source in BEFORE_FLIGHT and row.target in FLYING:
             state.clock.settle()
             dialect = self._session.dialect
             assert dialect is not None
             state.positioning.begin(state.vehicle, self._session.rates_hz, dialect.estimator_name)
             if self._identification:
                 self._identification.on_link_delay(state.clock.delay)
-            if row.source is Phase.ARM:  # on the ground the time that it takes does no harm
+            if source is Phase.ARM:  # on the ground the time that it takes does no harm
                 self._decider.begin()
         if self._identification:
             self._identification.on_phase(row.target, state.time_s)
-        if row.source in WAITING and row.target in FLYING and state.authority:
+        if source in WAITING and row.target in FLYING and state.authority:
             state.authority.ask()  # it shows the mode already
         if row.target is Phase.ENGAGE:
             self._begin_engaging()
@@ -115,17 +104,17 @@ class PhaseMachine:
         elif row.target is Phase.TAKEOFF:
             self._begin_takeoff()
         elif row.target is Phase.CLIMB:
-            self._begin_climb(row.source)
+            self._begin_climb(source)
         elif row.target is Phase.JOIN:
             state.plan.start_track(state.time_s)
         elif row.target is Phase.PAUSE:
             state.plan.pause(state.time_s)
-        elif row.source is Phase.PAUSE and row.target is Phase.TRACK:
+        elif source is Phase.PAUSE and row.target is Phase.TRACK:
             state.plan.resume(state.time_s)
         elif row.target is Phase.LAND:
             state.touchdown = Touchdown(state.takeoff_ned_m)
 
-    def _conclude(self, row: Row, reason: str) -> None:
+    def _conclude(self, row: Transition, reason: str) -> None:
         """The most severe exit code counts; later reasons are added to the first sentence."""
         state = self._state
         if row.exit_code is not None:
@@ -185,7 +174,7 @@ class PhaseMachine:
         seen is below it, at the height of its last rest."""
         state, contact = self._state, self._state.contact
         state.home_ned_m = (*position.position_ned_m[:2], contact.rest_down_m)
-        if state.programme.anchor == "here":
+        if state.service and state.service.anchor == "here":
             rest = contact.rest_ned_m
             above_m = state.plan.place_start(
                 position.position_ned_m, position.velocity_ned_mps, rest[2] if rest else None
@@ -195,7 +184,7 @@ class PhaseMachine:
                     f"the reference starts {above_m:.1f} m higher: from here it would "
                     + ("touch the ground" if rest else "go lower, and the ground is not known")
                 )
-        elif contact.rest_ned_m is not None and state.programme.serves:
+        elif contact.rest_ned_m is not None and state.service:
             state.plan.origin_ned_m = contact.rest_ned_m
         else:
             state.plan.origin_ned_m = state.home_ned_m

@@ -1,8 +1,9 @@
-"""Phases of a flight, rungs of the ladder, exit codes, and the limits of time and state."""
+"""Phases of a flight, actions of the failsafe, exit codes, limits, and options of the service."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from enum import Enum, IntEnum
 from typing import Literal
 
@@ -13,7 +14,7 @@ from offboard.documents.parameters import Parameters
 
 class Phase(Enum):
     """In the order of a flight; the last three end it. STANDBY, PAUSE and HAND_BACK occur in
-    flights of the service alone (`programme`)."""
+    flights of the service alone."""
 
     CONNECT = "connect"
     HEALTH = "health"
@@ -37,8 +38,8 @@ class Phase(Enum):
     FAILED = "failed"
 
 
-class Rung(IntEnum):
-    """What follows when a limit is exceeded in flight, from mild to severe (see `ladder`)."""
+class Action(IntEnum):
+    """What follows when a limit is exceeded in flight, from mild to severe (see `failsafe`)."""
 
     FLY = 0
     LEVEL = 1  # this tick: level, with the estimated hover thrust, instead of the decision
@@ -76,7 +77,7 @@ BEFORE_FLIGHT = WAITING | {Phase.STREAM, Phase.ENGAGE, Phase.ARM}
 CONTROLLING = frozenset(code for each, code in PHASE_CODES.items() if each not in WAITING | ENDS)
 TRACKING = frozenset({Phase.CLIMB, Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.PAUSE, Phase.HOVER})
 MOVING = frozenset({Phase.JOIN, Phase.TRACK})  # along the reference
-# phases in which the ladder is stepped
+# phases in which the failsafe judges
 FLYING = TRACKING | {Phase.TAKEOFF, Phase.HAND_BACK, Phase.HOLD}
 OUTAGE_MAX_S = 300.0  # so long a vehicle that was asked to land, and is not heard, is waited for
 STOPPED = "stop requested by the operator"
@@ -92,9 +93,25 @@ class ExitCode:
     ABORTED = 4
 
 
+Anchor = Literal["here", "origin"]
+Then = Literal["hold", "land", "repeat"]
+
+
+@dataclass(frozen=True, slots=True)
+class ServiceOptions:
+    """How the service flies. `anchor`: where the reference of a flight that begins in the air is
+    placed: its start where the vehicle stops (here), or relative to the take-off point (origin).
+    `then`: what follows when the reference was flown. `arms`: it may arm and take off on request.
+    """
+
+    anchor: Anchor = "here"
+    then: Then = "hold"
+    arms: bool = False
+
+
 class Limits(Parameters):
     """Limits of a flight. SI; seconds of vehicle time, but `connect_s`, `silence_s` and `late_s`
-    of a decision are wall time, in lockstep simulated time. `ladder` has what follows when one is
+    of a decision are wall time, in lockstep simulated time. `failsafe` has what follows when one is
     exceeded in flight."""
 
     # on the ground

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.flight.assessment import position_error_m
 from offboard.flight.phases import TRACKING
 from offboard.flight.state import FlightState, Triple
 from offboard.model.command import Command
@@ -33,8 +32,8 @@ class Snapshot:
     mode: str  # that the vehicle shows
     armed: bool
     authority: str  # a name of `authority.Standing` in lower case; "unknown" before the first mode
-    rung: str  # of the ladder, in lower case
-    rung_reason: str
+    rung: str  # action of the failsafe, in lower case
+    rung_reason: str  # the row that it follows from
     position_ned_m: Triple | None
     velocity_ned_mps: Triple | None
     attitude: tuple[float, float, float, float] | None  # quaternion (w, x, y, z), NED to FRD
@@ -66,7 +65,7 @@ def snapshot_of(
     forged: int = 0,
 ) -> Snapshot:
     """The snapshot of this moment. Changes nothing."""
-    vehicle, worst = state.vehicle, state.ladder.worst
+    vehicle = state.vehicle
     position, attitude = vehicle.position, vehicle.attitude
     sample = state.plan.sample(position.time_s) if position and state.phase in TRACKING else None
     link = state.clock.delay
@@ -75,17 +74,17 @@ def snapshot_of(
         time_s=state.time_s,
         phase=state.phase.value,
         in_phase_s=state.in_phase_s,
-        track_time_s=state.plan.track_time_s(state.time_s),
+        track_time_s=state.track_time_s,
         mode=vehicle.mode,
         armed=vehicle.armed,
         authority=state.authority.standing.name.lower() if state.authority else "unknown",
-        rung=state.ladder.rung.name.lower(),
-        rung_reason=worst.name if worst else "",
+        rung=state.failsafe.action.name.lower(),
+        rung_reason=state.failsafe.row,
         position_ned_m=position.position_ned_m if position else None,
         velocity_ned_mps=position.velocity_ned_mps if position else None,
         attitude=attitude.attitude if attitude else None,
         reference_ned_m=_triple(sample.position_ned_m) if sample else None,
-        position_error_m=position_error_m(state) if sample else NAN,
+        position_error_m=state.position_error_m if sample else NAN,
         thrust_mps2=command.thrust_mps2,
         thrust_direction_ned=command.thrust_direction_ned,
         course_rad=command.course_rad,

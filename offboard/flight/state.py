@@ -1,34 +1,38 @@
 """Flight state: all that one flight knows. `Companion` owns it; the other modules take it.
 
 Facts come in by `VehicleState`, `Authority`, `GroundContact` and `VehicleClock`, each with the
-time when it was heard. What follows from them is in `facts`.
+time when it was heard. What follows from them is in `transitions` and `failsafe`.
 """
 
 from __future__ import annotations
 
 import math
+import operator
 from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 
+import numpy as np
+
+from offboard.estimation.observer import Observer
 from offboard.flight.authority import Authority, Standing
 from offboard.flight.busyness import Busyness
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
-from offboard.flight.ladder import Ladder
-from offboard.flight.phases import ENDS, Limits, Phase
+from offboard.flight.online_identification import OnlineIdentification
+from offboard.flight.phases import ENDS, Action, Limits, Phase, ServiceOptions
 from offboard.flight.pilot_switch import PilotSwitch
 from offboard.flight.position_jumps import PositionJumps
 from offboard.flight.positioning import Positioning
 from offboard.flight.preflight import ParameterReading
-from offboard.flight.programme import FLY, Programme
 from offboard.flight.requests import Request
 from offboard.flight.touchdown import Touchdown, moved
 from offboard.flight.vehicle_clock import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.dialects.base import Dialect, Takeoff
 from offboard.mavlink.events import Landed, TimesyncReply
+from offboard.mavlink.session import Session
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import Vehicle
@@ -51,21 +55,52 @@ class Outcome:
     log_problem: str = ""
 
 
+# of the flight before, with the same vehicle
+KEPT = (
+    "vehicle",
+    "contact",
+    "clock",
+    "hover",
+    "reading",
+    "dialect",
+    "now_s",
+    "host_s",
+    "silence_s",
+    "guarded",
+)
+
+
+@dataclass(slots=True)
+class Failsafe:
+    """For how long the conditions of `failsafe.ROWS` have held, by the name of the row, and the
+    worst row that is active."""
+
+    held_s: dict[str, float] = field(default_factory=dict)
+    judged_s: float | None = None  # when, on `Session.link_time_s`
+    row: str = ""
+    action: Action = Action.FLY
+
+
 @dataclass(slots=True)
 class FlightState:
-    """One flight. `model` is the vehicle model in use: it scales the thrust of setpoints."""
+    """One flight. `model` is the vehicle model in use: it scales the thrust of setpoints.
+    `identification` is None with a controller that cannot use it, `service` in a flight of `fly`.
+    """
 
     limits: Limits
     plan: FlightPlan
     model: Vehicle
-    programme: Programme = FLY
+    session: Session
+    observer: Observer
+    identification: OnlineIdentification | None = None
+    service: ServiceOptions | None = None
     vehicle: VehicleState = field(default_factory=VehicleState)
     clock: VehicleClock = field(default_factory=VehicleClock)
     hover: HoverEstimate = field(default_factory=HoverEstimate)
     jumps: PositionJumps = field(default_factory=PositionJumps)
     reading: ParameterReading = field(default_factory=ParameterReading)
     positioning: Positioning = field(default_factory=Positioning)
-    ladder: Ladder = field(default_factory=Ladder)
+    failsafe: Failsafe = field(default_factory=Failsafe)
     contact: GroundContact = field(init=False)
     pilot: PilotSwitch = field(default_factory=PilotSwitch)
     takeoff_ned_m: Triple | None = None  # None for a vehicle that was found in the air
@@ -100,43 +135,26 @@ class FlightState:
 
     def __post_init__(self) -> None:
         self.contact = GroundContact(self.vehicle)
-        self.pilot.unclaimed = self.programme.serves
+        self.pilot.unclaimed = self.service is not None
 
-    def next_flight(
-        self, limits: Limits, plan: FlightPlan, model: Vehicle, programme: Programme
-    ) -> FlightState:
-        """The state of another flight with the same vehicle: what is known of vehicle and link
+    def follow(self, before: FlightState) -> None:
+        """Continue after another flight with the same vehicle: what is known of vehicle and link
         stays. It begins in STANDBY, or anew while the vehicle is not known well enough: after a
         reboot its parameters are read again."""
-        prepared = self.phase not in (Phase.CONNECT, Phase.HEALTH) and not self.rebooted
-        known = prepared and self.authority is not None
-        following = FlightState(
-            limits,
-            plan,
-            model,
-            programme,
-            vehicle=self.vehicle,
-            clock=self.clock,
-            hover=self.hover,
-            reading=self.reading,
-            dialect=self.dialect,
-            authority=self.authority.renewed() if self.authority else None,
-            phase=Phase.STANDBY if known else Phase.CONNECT,
-            began_s=self.now_s,
-            now_s=self.now_s,
-            host_s=self.host_s,
-            silence_s=self.silence_s,
-            guarded=self.guarded,
+        for name in KEPT:
+            setattr(self, name, getattr(before, name))
+        self.clock.growth.reset()
+        if before.authority:
+            self.authority = before.authority.renewed()
+        if not before.has_ended:  # nothing was flown: what the pilot did before counts
+            self.pilot, self.phase, self.began_s = before.pilot, before.phase, before.began_s
+            return
+        prepared = before.phase not in (Phase.CONNECT, Phase.HEALTH) and not before.rebooted
+        self.phase = Phase.STANDBY if prepared and before.authority else Phase.CONNECT
+        self.began_s = before.now_s
+        self.pilot = PilotSwitch(
+            unclaimed=before.ends_engaged, showed_ours=before.pilot.showed_ours
         )
-        following.clock.growth.reset()
-        following.contact = self.contact
-        following.pilot = PilotSwitch(
-            unclaimed=self.ends_engaged, showed_ours=self.pilot.showed_ours
-        )
-        if not self.has_ended:  # nothing was flown: what the pilot did before counts
-            following.pilot, following.phase = self.pilot, self.phase
-            following.began_s = self.began_s
-        return following
 
     @property
     def in_phase_s(self) -> float:
@@ -146,6 +164,35 @@ class FlightState:
     @property
     def has_ended(self) -> bool:
         return self.phase in ENDS
+
+    @property
+    def engaged(self) -> bool:
+        """The vehicle shows the mode in which it follows setpoints."""
+        return self.authority is not None and self.authority.mode == self.authority.engage_mode
+
+    @property
+    def track_time_s(self) -> float:
+        """Time since the start of the track, without pauses; NaN before it."""
+        return self.plan.track_time_s(self.time_s)
+
+    @property
+    def from_takeoff_m(self) -> Triple:
+        """North, east and height of the newest position relative to the take-off point; 0 without
+        a reference."""
+        position = self.vehicle.position
+        if position is None or self.plan.reference is None:
+            return 0.0, 0.0, 0.0
+        north, east, down = map(operator.sub, position.position_ned_m, self.home_ned_m)
+        return north, east, -down
+
+    @property
+    def position_error_m(self) -> float:
+        """Distance of the reported position from the reference; 0 without a reference."""
+        position = self.vehicle.position
+        sample = self.plan.sample(position.time_s) if position else None
+        if position is None or sample is None:
+            return 0.0
+        return float(np.linalg.norm(np.array(position.position_ned_m) - sample.position_ned_m))
 
     @property
     def ends_engaged(self) -> bool:
@@ -222,13 +269,18 @@ class FlightState:
     @property
     def link_growth_s(self) -> float:
         """What the link's delay has grown by since take-off."""
-        age_s = self.telemetry_age_s(self.host_s) if self.vehicle.has_state else 0.0
-        return max(self.clock.delay_growth_s, age_s)
+        return max(self.clock.delay_growth_s, self.age_s)
 
     def sent_s(self, time_s: float) -> float:
         """The vehicle time from which the vehicle model's delays run for a command of the tick
         `time_s`: later by what the link has added to its delay since take-off."""
         return time_s + self.clock.growth.added_s
+
+    @property
+    def age_s(self) -> float:
+        """Age of the newest telemetry at the present turn, beyond the least delay of the link; 0
+        before the first."""
+        return self.telemetry_age_s(self.host_s) if self.vehicle.has_state else 0.0
 
     def telemetry_age_s(self, host_s: float) -> float:
         """Age of the newest telemetry at `host_s`, beyond the least delay of the link."""

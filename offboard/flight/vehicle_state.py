@@ -117,6 +117,12 @@ class VehicleState:
         return self.health.radio_ok if self.health and self.age_s(SystemHealth) < HEALTH_S else None
 
     @property
+    def battery(self) -> float:
+        """Remaining charge, of 1; 1 while it is not known."""
+        charge = self.health.battery_remaining if self.health else None
+        return 1.0 if charge is None else charge
+
+    @property
     def has_state(self) -> bool:
         """Position and attitude have been received."""
         return self.position is not None and self.attitude is not None

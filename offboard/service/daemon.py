@@ -12,8 +12,7 @@ from sdnotify import SystemdNotifier
 
 from offboard import compiled
 from offboard.flight.companion import Outcome
-from offboard.flight.phases import ExitCode
-from offboard.flight.programme import Programme
+from offboard.flight.phases import ExitCode, ServiceOptions
 from offboard.link import clock
 from offboard.link.background import BackgroundWriter
 from offboard.link.connection import open_link
@@ -41,7 +40,7 @@ def run(
     vehicle: Connection,
     directory: Path,
     *,
-    programme: Programme,
+    options: ServiceOptions,
     metrics: str | None = None,
     report: bool = True,
     stops: StopRequests,
@@ -85,7 +84,7 @@ def run(
             source=preparation,
             record=recorder,
             memory=memory,
-            programme=programme,
+            options=options,
             stopwatch=clock.monotonic_s,
         )
         display = Display(flights, show, preparation, monitor, manager)

@@ -1,7 +1,7 @@
 """The flights of the service on one link: one waits or flies, and when it has ended the next waits.
 
 `Flights` takes the place of one companion in the loop. Each flight has a new `Companion` on the
-same session, so that authority, ladder, plan and identification are new, and what is known of
+same session, so that authority, failsafe, plan and identification are new, and what is known of
 vehicle and link stays. No I/O: a log is begun and ended at `Record`, configurations come from
 `Source`.
 """
@@ -12,11 +12,10 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from typing import Protocol
 
-from offboard.flight import guards
 from offboard.flight.companion import STOPPED, Companion, Outcome, Output
-from offboard.flight.phases import ENDS, FLYING, WAITING, Phase
-from offboard.flight.programme import Programme
+from offboard.flight.phases import ENDS, FLYING, WAITING, Phase, ServiceOptions
 from offboard.flight.snapshot import Snapshot
+from offboard.flight.starting import found_engaged
 from offboard.flight.state import FlightState
 from offboard.identification.learned import Learned
 from offboard.link.interface import Chunk
@@ -85,7 +84,7 @@ class Flights:
         source: Source,
         record: Record,
         memory: Memory,
-        programme: Programme,
+        options: ServiceOptions,
         stopwatch: Callable[[], float],
         keeps_deadline: bool = True,
     ) -> None:
@@ -93,7 +92,7 @@ class Flights:
         self._source = source
         self._record = record
         self._memory = memory
-        self._programme = programme
+        self._options = options
         self._stopwatch = stopwatch
         self._keeps_deadline = keeps_deadline
         self._stopping = False
@@ -240,7 +239,7 @@ class Flights:
             self._stopwatch,
             keeps_deadline=self._keeps_deadline,
             learned=self._learned,
-            programme=self._programme,
+            service=self._options,
             before=before,
         )
 
@@ -315,7 +314,7 @@ class Flights:
         if not state.pilot.unclaimed:
             self._told_left_alone = False
         elif not (self._told_left_alone or state.left_engaged) and state.in_phase_s > NAMED_S:
-            self._told_left_alone = guards.found_engaged(self._current.facts())
+            self._told_left_alone = found_engaged(state)
             if self._told_left_alone:
                 self._current.announce(LEFT_ALONE.format(mode=state.vehicle.mode))
 

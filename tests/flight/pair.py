@@ -26,7 +26,7 @@ from offboard.estimation.observer import Observer
 from offboard.flight.companion import Companion, Outcome
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.online_identification import IdentifySettings
-from offboard.flight.phases import Phase, Rung
+from offboard.flight.phases import Action, Phase
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.link.interface import Chunk
 from offboard.link.log import FlightLog
@@ -103,7 +103,7 @@ class Pair:
     sent: list[tuple[float, Phase, bytes]] = field(default_factory=list)  # by the companion
     logged: Bytes = field(default_factory=list)
     phases: list[tuple[float, Phase]] = field(default_factory=list)
-    rungs: dict[str, Rung] = field(default_factory=dict)  # rows of the ladder that were active
+    failsafes: dict[str, Action] = field(default_factory=dict)  # rows that were active
     waiting: list[Chunk] = field(default_factory=list)  # that the companion has not read yet
     leaving: Bytes = field(default_factory=list)  # what the turn in progress sends at its end
 
@@ -146,9 +146,9 @@ class Pair:
     def _take(self, output: Any) -> None:
         self.sent.extend((self.time_s, self.companion.phase, frame) for frame in output.send)
         self.leaving += self.up(self.time_s, list(output.send))
-        worst = self.companion.state.ladder.worst
-        if worst is not None:
-            self.rungs[worst.name] = worst.rung
+        failsafe = self.companion.state.failsafe
+        if failsafe.row:
+            self.failsafes[failsafe.row] = failsafe.action
         if self.clock.now_s <= self.host_s:
             self._feed()
         self._keep(self.companion.finish_turn(self.clock.now_s))

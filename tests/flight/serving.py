@@ -20,8 +20,7 @@ from pair import (
 )
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from offboard.flight.phases import Phase
-from offboard.flight.programme import Anchor, Then, service
+from offboard.flight.phases import Anchor, Phase, ServiceOptions, Then
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.identification.learned import Learned
 from offboard.mavlink.session import Session, SessionSettings
@@ -111,7 +110,7 @@ def flights(source: Settings, logs: Record, memory: Remembered, then: Then, anch
         source=source,
         record=logs,
         memory=memory,
-        programme=service(then, anchor, arms=arms),
+        options=ServiceOptions(anchor, then, arms),
         stopwatch=lambda: 0.0,
         keeps_deadline=False,
     )

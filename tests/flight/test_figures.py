@@ -13,7 +13,7 @@ from pair import calm_hover, make
 from offboard.analysis import history
 from offboard.analysis.score import score
 from offboard.flight.online_identification import IdentifySettings
-from offboard.flight.phases import Phase, Rung
+from offboard.flight.phases import Action, Phase
 from simulator import config as simulated
 
 
@@ -41,7 +41,7 @@ def test_default_flight(scenario: str, most_m: float, tmp_path: Path) -> None:
     assert score.setpoint_gap_max_s <= 0.12
     assert score.missed_ticks == 0
     assert score.gap_median <= 1e-9
-    assert max(pair.rungs.values(), default=Rung.FLY) <= Rung.LEVEL
+    assert max(pair.failsafes.values(), default=Action.FLY) <= Action.LEVEL
     assert abs(pair.instance.autopilot.state.truth.position_ned_m[2]) < 0.05
     assert not pair.instance.autopilot.commander.armed
 

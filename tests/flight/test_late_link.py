@@ -91,7 +91,7 @@ def flown_at(
         slow_down = (in_phase(Phase.EXCITE), lambda flying: flying.slow_down(slower_in_flight))
         pair.at.append(slow_down)
     pair.track()
-    assert not pair.rungs
+    assert not pair.failsafes
     rmse_m = pair.score(directory).rmse_position_m
     return (
         rmse_m,

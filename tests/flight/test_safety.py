@@ -33,7 +33,7 @@ from watch import (
 )
 
 from offboard.flight.online_identification import IdentifySettings
-from offboard.flight.phases import PHASE_CODES, ExitCode, Phase, Rung
+from offboard.flight.phases import PHASE_CODES, Action, ExitCode, Phase
 from offboard.flight.state import Outcome
 from simulator.config import Scenario
 from simulator.firmware.px4 import PX4
@@ -251,7 +251,7 @@ def test_a_load_that_full_thrust_does_not_carry_is_landed(fly: Fly) -> None:
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
     assert re.match(r"the vehicle sinks at [1-3]\.[0-9] m/s with full thrust", outcome.sentence)
-    assert list(pair.rungs) == ["full thrust"]
+    assert list(pair.failsafes) == ["full thrust"]
     begun_s = {phase: at_s for at_s, phase in pair.phases}
     assert begun_s[Phase.LAND] < begun_s[Phase.TRACK] + 1.0 + 2.0
 
@@ -306,7 +306,7 @@ def test_the_volume_is_kept(limits: dict[str, float], says: str, fly: Fly) -> No
     assert outcome.exit_code == ExitCode.ABORTED
     assert says in outcome.sentence
     assert "the take-off point" in outcome.sentence
-    assert list(pair.rungs) == ["volume"]
+    assert list(pair.failsafes) == ["volume"]
     far_m = max(float((m.position_ned_m[:2] ** 2).sum() ** 0.5) for m in watch.moments)
     assert watch.top_m < limits.get("ceiling_m", 3.0) + 1.0
     assert far_m < limits.get("radius_m", 0.1) + 1.5
@@ -345,7 +345,7 @@ def test_a_vehicle_without_thrust_reserve_is_landed(share: float, flown: bool, f
     else:
         assert outcome.exit_code == ExitCode.ABORTED
         assert "% of its thrust (limits.hover_thrust)" in outcome.sentence
-        assert list(pair.rungs) == ["thrust reserve"]
+        assert list(pair.failsafes) == ["thrust reserve"]
 
 
 @BOTH
@@ -354,7 +354,7 @@ def test_a_load_that_is_only_believed_does_not_end_the_take_off(fly: Fly) -> Non
     file = fly().companion.state.model
     pair = fly(ONE_LAP, believed=file.model_copy(update={"hover_thrust": 0.93}))
     assert pair.fly().exit_code == ExitCode.FLOWN
-    assert "thrust reserve" not in pair.rungs
+    assert "thrust reserve" not in pair.failsafes
 
 
 @BOTH
@@ -363,7 +363,7 @@ def test_a_reset_of_the_estimate_is_flown(fly: Fly) -> None:
     watch = watched(pair)
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert watch.error_m < 0.7  # of which the jump is 0.5
-    assert pair.rungs == {}
+    assert pair.failsafes == {}
 
 
 @pytest.mark.parametrize("fly", [hover, partial(on_arducopter, *SHORT, reference="hover")])
@@ -373,7 +373,7 @@ def test_the_vehicle_does_not_step_with_its_estimate(fly: Fly) -> None:
     watch = watched(pair)
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert said(pair, "the estimated position jumped by 1.50 m: the reference jumps with it")
-    assert pair.rungs == {}
+    assert pair.failsafes == {}
     hovered = np.array([m.position_ned_m[:2] for m in watch.during(Phase.TRACK, Phase.HOVER)])
     speeds_mps = np.linalg.norm(hovered[10:] - hovered[:-10], axis=1) / 0.2
     assert 0.3 < speeds_mps.max() < 0.65
@@ -386,7 +386,7 @@ def test_a_large_reset_of_the_estimate_is_left_to_the_autopilot(fly: Fly) -> Non
     outcome = pair.fly()
     assert outcome.exit_code == ExitCode.ABORTED
     assert outcome.sentence.startswith("the estimated position jumped by 3.0 m")
-    assert pair.rungs["estimator"] is Rung.HOLD
+    assert pair.failsafes["estimator"] is Action.HOLD
 
 
 @pytest.mark.parametrize("fly", [hover, partial(on_arducopter, *SHORT, reference="hover")])
@@ -454,7 +454,7 @@ def test_a_position_that_needs_no_gps_is_flown(never: bool) -> None:
     moment = silent if never else {**GPS_LOST, "for_s": 0.7}
     pair = make(HIGH, ONE_LAP, firmware=PX4, scenario=scenario_of(moment))
     assert pair.fly().exit_code == ExitCode.FLOWN
-    assert pair.rungs == {}
+    assert pair.failsafes == {}
 
 
 def jumping(offset_m: float) -> Scenario:

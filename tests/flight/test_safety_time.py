@@ -36,7 +36,7 @@ from offboard.analysis.score import score
 from offboard.analysis.score_table import summary
 from offboard.control.base import Controller, Decision, Situation
 from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
-from offboard.flight.phases import ExitCode, Phase, Rung
+from offboard.flight.phases import Action, ExitCode, Phase
 from simulator import config as simulated
 
 DEADLINE_S, PERIOD_S = 0.05, 0.1
@@ -68,7 +68,7 @@ def test_a_link_that_becomes_late_ends_in_hold_and_landing(scenario: str, fly: F
     assert [phase for _, phase in pair.phases][-4:] == [
         Phase.TRACK, Phase.HOLD, Phase.LAND, Phase.DISARMED,
     ]  # fmt: skip
-    assert pair.rungs == {"age": Rung.LEVEL, "link": Rung.HOLD}
+    assert pair.failsafes == {"age": Action.LEVEL, "link": Action.HOLD}
     dialect = pair.companion.state.dialect
     assert dialect is not None
     hold = dialect.hold().parameters[1:3]
@@ -160,7 +160,7 @@ def test_thin_telemetry_is_flown(fly: Fly) -> None:
     watch = watched(pair)
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert watch.error_m < 0.3
-    assert pair.rungs == {}
+    assert pair.failsafes == {}
 
 
 # -- this computer ---------------------------------------------------------------------------------
@@ -198,7 +198,7 @@ def test_a_slow_law_is_late_and_then_landed(seconds: float, why: str, fly: Fly) 
     assert outcome.exit_code == ExitCode.ABORTED
     assert outcome.sentence.startswith("the controller failed: decided ")
     assert why in outcome.sentence
-    assert pair.rungs == {"decision": Rung.LEVEL, "decisions": Rung.LAND}
+    assert pair.failsafes == {"decision": Action.LEVEL, "decisions": Action.LAND}
     assert len([True for frame in pair.logged if b"decision missed: decided" in frame]) == 3
     assert watch.error_m < 0.5
     assert not pair.instance.autopilot.commander.armed
@@ -209,7 +209,7 @@ def test_a_law_that_needs_most_of_the_period_is_flown(fly: Fly) -> None:
     pair, watch = with_slow_law(fly, 0.08)
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert watch.error_m < 0.1
-    assert pair.rungs == {}
+    assert pair.failsafes == {}
     assert max(ages_s(pair)) < 0.1 + PERIOD_S
 
 
@@ -394,7 +394,7 @@ def test_a_clock_that_wraps_is_flown(fly: Fly) -> None:
     watch = watched(pair)
     assert pair.fly().exit_code == ExitCode.FLOWN
     assert watch.error_m < 0.05
-    assert pair.rungs == {}
+    assert pair.failsafes == {}
     stamps_ms = [m.time_boot_ms for _, _, m in pair.setpoints]
     assert max(stamps_ms) > 2**32 - 1000
     assert min(stamps_ms) < 1000
@@ -405,7 +405,7 @@ def test_a_clock_that_wraps_is_flown(fly: Fly) -> None:
 
 @BOTH
 @pytest.mark.parametrize("scenario", HARSH)
-def test_a_normal_flight_stays_off_the_ladder(scenario: str, fly: Fly) -> None:
+def test_a_normal_flight_needs_no_failsafe(scenario: str, fly: Fly) -> None:
     """As `offboard fly` does it: nothing known of the vehicle, identified in flight. Milder
     scenarios are in test_figures.py."""
     pair = fly(
@@ -418,4 +418,4 @@ def test_a_normal_flight_stays_off_the_ladder(scenario: str, fly: Fly) -> None:
     )
     outcome = pair.fly()
     assert (outcome.exit_code, outcome.sentence) == (ExitCode.FLOWN, "flown and landed")
-    assert max(pair.rungs.values(), default=Rung.FLY) <= Rung.LEVEL
+    assert max(pair.failsafes.values(), default=Action.FLY) <= Action.LEVEL

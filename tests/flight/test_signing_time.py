@@ -151,7 +151,7 @@ def test_forged_frames_in_flight_change_nothing_and_are_counted(tmp_path: Path) 
     assert shown.forged > 2000
     assert any("frames refused by signing" in line for line in attacked.companion.announced)
     assert attacked.score(tmp_path).strangers > 800
-    assert not attacked.rungs
+    assert not attacked.failsafes
 
 
 def test_the_wrong_key_is_named_when_no_vehicle_is_found() -> None:

@@ -118,7 +118,7 @@ def test_others_on_the_link_have_no_effect(flown: History, tmp_path: Path) -> No
     frames = [each.pack(mavlink.MAVLink(None, *ids)) for *ids, each in others]
     pair = hover(system_id=1, down=lambda _, heard: [*frames, *heard] if heard else [])
     assert pair.fly() == calm_hover().companion.outcome
-    assert pair.rungs == {}
+    assert pair.failsafes == {}
     among = score(history.gather(pair.log(tmp_path)))
     alone = score(flown)
     assert (among.completed, among.ended_by) == (1.0, "reference over")

@@ -1,46 +1,106 @@
-"""The facts of a moment in which nothing happens."""
+"""The state of a flight in which nothing happens, for tests of its tables."""
 
 from __future__ import annotations
 
-import math
+from types import SimpleNamespace
+from typing import Any
 
-from offboard.flight.facts import Facts
-from offboard.flight.phases import Limits
+import numpy as np
 
-UNEVENTFUL = Facts(
-    limits=Limits(),
-    in_phase_s=0.0,
-    silence_s=0.0,
-    blind_s=0.0,
-    found=False,
-    ready=False,
-    refused=False,
-    rebooted=False,
-    engaged=True,
-    lost=False,
-    shown_since=False,
-    authority_known=True,
-    own_failsafe=False,
-    unreached_s=0.0,
-    failsafe=False,
-    armed=True,
-    in_the_air=False,
-    landed=True,
-    disarmed_s=0.0,
-    lifted_off=False,
-    at_start=False,
-    late_s=math.nan,
-    track_time_s=math.nan,
-    track_start_s=4.0,
-    track_end_s=20.0,
-    rest_time_s=23.5,
-    position_error_m=0.0,
-    prediction_error_m=0.0,
-    tilt_rad=0.0,
-    tilt_error_rad=0.0,
-    height_m=1.0,
-    distance_m=2.0,
-    stop_requested=False,
-    missed_decisions=0,
-    contradicted=False,
-)
+from offboard.flight.authority import Authority
+from offboard.flight.flight_plan import FlightPlan
+from offboard.flight.phases import Limits, Phase, ServiceOptions
+from offboard.flight.state import FlightState
+from offboard.flight.touchdown import Touchdown
+from offboard.mavlink.dialects.px4 import PX4
+from offboard.mavlink.events import Attitude, Event, Heartbeat, Landed, LocalPosition
+from offboard.run import configuration
+
+NOW_S = 100.0
+CONFIG = configuration.load("flight")
+TRACK = configuration.build_track(CONFIG)
+TRACK_TIME_S = {
+    Phase.JOIN: 0.0,
+    Phase.TRACK: TRACK.track_start_s,
+    Phase.PAUSE: TRACK.track_start_s,
+    Phase.HOVER: TRACK.track_end_s,
+}
+DISARMED = (Phase.HEALTH, Phase.STANDBY, Phase.STREAM, Phase.ENGAGE, Phase.ARM)
+ELSEWHERE = (Phase.HEALTH, Phase.STANDBY, Phase.STREAM, Phase.ENGAGE)
+
+
+def hear(flight: FlightState, event: Event) -> None:
+    """The vehicle reports this now."""
+    flight.vehicle.update(event, flight.now_s)
+
+
+def heartbeat(flight: FlightState, *, armed: bool, mode: str = "OFFBOARD", status: int = 4) -> None:
+    hear(flight, Heartbeat(mode, armed, status, 2))
+    if flight.authority:
+        flight.authority.on_mode(mode, flight.now_s)
+
+
+def position(flight: FlightState, down_m: float, down_mps: float = 0.0) -> None:
+    reported = LocalPosition(flight.now_s, (0.0, 0.0, down_m), (0.0, 0.0, down_mps))
+    hear(flight, reported)
+    flight.contact.on_position(reported)
+
+
+def lift(flight: FlightState) -> None:
+    """The vehicle flies, by every sign."""
+    heartbeat(flight, armed=True)
+    hear(flight, Landed("in_air"))
+
+
+def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None) -> FlightState:
+    """In `phase`, which has just begun. A vehicle that stands on the ground, so that it can lift
+    off, land or be taken over."""
+    session: Any = SimpleNamespace(
+        senders=SimpleNamespace(
+            ambiguous=lambda now_s: False, named=lambda now_s: "1, 2", why_none=lambda counted: ""
+        ),
+        counters=None,
+        rates_hz={"ATTITUDE_QUATERNION": 50.0, "LOCAL_POSITION_NED": 30.0},
+    )
+    observer: Any = SimpleNamespace(
+        hover_thrust_estimate=0.4,
+        predict=lambda time_s: SimpleNamespace(velocity_ned_mps=np.zeros(3)),
+    )
+    identification: Any = SimpleNamespace(
+        contradiction="", wants_excitation=False, finished=lambda time_s: False
+    )
+    flight = FlightState(
+        Limits(),
+        FlightPlan(TRACK),
+        CONFIG.vehicle,
+        session,
+        observer,
+        identification,
+        service,
+        phase=phase,
+        now_s=NOW_S,
+        began_s=NOW_S,
+    )
+    flight.vehicle.now_s = NOW_S
+    flight.pilot.unclaimed = False
+    if phase is Phase.CONNECT:
+        return flight
+    flight.dialect = PX4
+    flight.authority = Authority("OFFBOARD")
+    hear(flight, Attitude(NOW_S, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0)))
+    hear(flight, Landed("on_ground"))
+    position(flight, 0.0)
+    flight.vehicle.resumed_s = -np.inf
+    if phase not in ELSEWHERE:
+        flight.authority.ask()
+    mode = "AUTO.LOITER" if phase in ELSEWHERE else "OFFBOARD"
+    heartbeat(flight, armed=phase not in DISARMED, mode=mode)
+    if phase in TRACK_TIME_S:
+        flight.plan.start_track(NOW_S - TRACK_TIME_S[phase])
+    elif phase is Phase.CLIMB:
+        flight.plan.start_climb(NOW_S, np.array([0.0, 0.0, 0.0]), np.zeros(3), 0.0)
+    elif phase is Phase.LAND:
+        flight.touchdown = Touchdown(None)
+        for step in range(11):
+            flight.touchdown.on_position(NOW_S + 0.1 * step, (0.0, 0.0, 0.0), 1e-3 * step)
+    return flight

@@ -1,0 +1,294 @@
+"""The phase table in the air: from lift-off to the disarmed vehicle."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from offboard.flight import failsafe
+from offboard.flight.authority import Standing
+from offboard.flight.ground_contact import STILL_ARMED
+from offboard.flight.phases import OUTAGE_MAX_S, TRACKING, Action, ExitCode, Phase
+from offboard.flight.requests import Request
+from offboard.flight.rows import (
+    REBOOTED,
+    STOP,
+    Condition,
+    Transition,
+    longer_than,
+    lost,
+    lost_armed,
+    mode_unknown,
+    rebooted,
+    stands,
+    stop_requested,
+    why_lost,
+)
+from offboard.flight.state import FlightState
+
+TAKE_OVER_HEIGHT_M = 1.0  # where setpoints replace the autopilot's own take-off
+DETECTOR_S = 1.0  # EXTENDED_SYS_STATE is requested at 5 Hz
+REST_S = 0.5  # after the end of the reference
+
+
+def lifted_off(flight: FlightState) -> bool:
+    if flight.takes_off_by_command:
+        return flight.contact.height_m > TAKE_OVER_HEIGHT_M
+    return flight.contact.lifted_off
+
+
+def at_start(flight: FlightState) -> bool:
+    """The vehicle hovers at the start of the reference."""
+    position, time_s = flight.vehicle.position, flight.time_s
+    if position is None or not flight.plan.late_s(time_s) >= 0.0:
+        return False
+    velocity_ned_mps = flight.observer.predict(time_s).velocity_ned_mps
+    return flight.plan.at_start(time_s, np.array(position.position_ned_m), velocity_ned_mps)
+
+
+def at_start_to_excite(flight: FlightState) -> bool:
+    identification = flight.identification
+    wanted = identification is not None and identification.wants_excitation
+    return wanted and at_start(flight)
+
+
+def too_late_at_start(flight: FlightState) -> bool:
+    return flight.plan.late_s(flight.time_s) > flight.limits.late_s
+
+
+def _start_not_reached(flight: FlightState) -> str:
+    return (
+        f"the start of the reference was not reached: {flight.position_error_m:.1f} m away, "
+        f"{flight.plan.late_s(flight.time_s):.0f} s late; is hover_thrust in the vehicle file "
+        "right, and is the vehicle fast enough for controller.bandwidth_radps?"
+    )
+
+
+def identified(flight: FlightState) -> bool:
+    return flight.identification is not None and flight.identification.finished(flight.time_s)
+
+
+def at_full_speed(flight: FlightState) -> bool:
+    return flight.track_time_s >= flight.plan.track.track_start_s
+
+
+def track_over(flight: FlightState) -> bool:
+    return flight.track_time_s >= flight.plan.track.track_end_s
+
+
+def at_rest(flight: FlightState) -> bool:
+    return flight.track_time_s >= flight.plan.track.duration_s + REST_S
+
+
+def _rebooted_in_flight(flight: FlightState) -> str:
+    return f"{REBOOTED} {_when(flight)}"
+
+
+def disarmed(flight: FlightState) -> bool:
+    return not flight.vehicle.armed
+
+
+def _disarmed_in_flight(flight: FlightState) -> str:
+    return f"the vehicle disarmed {_when(flight)}"
+
+
+def _when(flight: FlightState) -> str:
+    return "before lift-off" if flight.phase is Phase.TAKEOFF else "in flight"
+
+
+def in_own_failsafe(flight: FlightState) -> bool:
+    """Setpoints were missing, and the autopilot's failsafe flies the vehicle."""
+    return stands(flight, Standing.FAILSAFE)
+
+
+def handed(flight: FlightState) -> bool:
+    """It shows a mode that we asked for at the end."""
+    return stands(flight, Standing.HANDED)
+
+
+def failsafe_land(flight: FlightState) -> bool:
+    return flight.failsafe.action is Action.LAND
+
+
+def failsafe_hold(flight: FlightState) -> bool:
+    return flight.failsafe.action is Action.HOLD
+
+
+def landed(flight: FlightState) -> bool:
+    return not flight.vehicle.armed and not flight.not_landed()
+
+
+def rebooted_disarmed(flight: FlightState) -> bool:
+    return flight.rebooted and not flight.vehicle.armed and bool(flight.not_landed())
+
+
+def disarmed_elsewhere(flight: FlightState) -> bool:
+    """Disarmed, but not landed; the land detector has had time to report."""
+    return flight.vehicle.disarmed_s > DETECTOR_S and bool(flight.not_landed())
+
+
+def unheard_on_ground(flight: FlightState) -> bool:
+    """It has landed, and no HEARTBEAT shows whether it is armed."""
+    return mode_unknown(flight) and not flight.not_landed()
+
+
+def out_of_reach(flight: FlightState) -> bool:
+    return flight.unreached_s > OUTAGE_MAX_S
+
+
+def _out_of_reach(flight: FlightState) -> str:
+    vehicle, height_m = flight.vehicle, flight.from_takeoff_m[2]
+    return (
+        f"not heard for {flight.unreached_s:.0f} s while landing; last known: "
+        f"{'armed' if vehicle.armed else 'disarmed'} in {vehicle.mode}, "
+        f"{height_m:.1f} m above the take-off point"
+    )
+
+
+def _not_disarmed(flight: FlightState) -> str:
+    contact = flight.contact
+    shows = contact.stands and contact.detects_flight and flight.vehicle.armed
+    return f"not landed and disarmed after {flight.in_phase_s:.0f} s" + (
+        f"; {STILL_ARMED}" if shows else ""
+    )
+
+
+def requested(request: Request) -> Condition:
+    """Holds when the ground station has asked for this."""
+
+    def wanted(flight: FlightState) -> bool:
+        return flight.request is request
+
+    wanted.__name__ = f"requested_{request.name.lower()}"
+    return wanted
+
+
+# ---------------------------------------------------------------------- rows
+
+REFUSED, ABORTED, FLOWN = ExitCode.REFUSED, ExitCode.ABORTED, ExitCode.FLOWN
+ON_REFERENCE = tuple(phase for phase in Phase if phase in TRACKING)
+
+
+def ends_early(phases: tuple[Phase, ...], serves: bool) -> tuple[Transition, ...]:
+    """What ends `phases` in the air early. In the service a stop hands back where `fly` lands, and
+    a pilot who takes the vehicle is the usual end."""
+    followed = ON_REFERENCE if serves else ()
+    others = tuple(phase for phase in phases if phase not in followed)
+    stopped = tuple(phase for phase in others if phase is not Phase.HAND_BACK)
+    held = tuple(phase for phase in phases if phase not in (Phase.HAND_BACK, Phase.HOLD))
+    rows = (
+        Transition(phases, rebooted, Phase.LAND, _rebooted_in_flight, ABORTED),
+        Transition(phases, disarmed, Phase.FAILED, _disarmed_in_flight, ABORTED),
+        Transition(followed, lost, Phase.YIELDED, why_lost, FLOWN),
+        Transition(others, lost, Phase.YIELDED, why_lost, ABORTED),
+        Transition(
+            phases,
+            in_own_failsafe,
+            Phase.LAND,
+            "setpoints did not arrive, and the vehicle's own failsafe flies it, in "
+            "{flight.vehicle.mode}",
+            ABORTED,
+        ),
+        Transition(phases, failsafe_land, Phase.LAND, failsafe.reason, ABORTED),
+        Transition(followed, stop_requested, Phase.HAND_BACK, STOP, FLOWN),
+        Transition(stopped, stop_requested, Phase.LAND, STOP, ABORTED),
+        Transition(held, failsafe_hold, Phase.HOLD, failsafe.reason, ABORTED),
+    )
+    return tuple(row for row in rows if row.phases)
+
+
+TO_THE_END = (
+    Transition((Phase.TAKEOFF,), lifted_off, Phase.CLIMB, "lifted off"),
+    Transition(
+        (Phase.TAKEOFF,),
+        longer_than("lift_off_s"),
+        Phase.LAND,
+        "no lift-off in {flight.in_phase_s:.0f} s; is hover_thrust in the vehicle file right?",
+        ABORTED,
+    ),
+    Transition((Phase.CLIMB,), at_start_to_excite, Phase.EXCITE, "identification steps"),
+    Transition((Phase.CLIMB,), at_start, Phase.JOIN, "hovers at the start of the reference"),
+    Transition((Phase.CLIMB,), too_late_at_start, Phase.LAND, _start_not_reached, ABORTED),
+    Transition((Phase.EXCITE,), identified, Phase.JOIN, "hovers at the start of the reference"),
+    Transition(
+        (Phase.EXCITE,),
+        longer_than("excite_s"),
+        Phase.LAND,
+        "identification did not converge in {flight.in_phase_s:.0f} s",
+        ABORTED,
+    ),
+    Transition((Phase.JOIN,), at_full_speed, Phase.TRACK, "on the reference at full speed"),
+    Transition((Phase.TRACK,), track_over, Phase.HOVER, "the reference was flown"),
+    Transition(
+        (Phase.HOLD,),
+        longer_than("hold_s"),
+        Phase.LAND,
+        "the autopilot held for {flight.in_phase_s:.0f} s",
+        ABORTED,
+    ),
+    Transition((Phase.LAND,), landed, Phase.DISARMED, "disarmed on the ground"),
+    Transition(
+        (Phase.LAND,), rebooted_disarmed, Phase.FAILED, f"{REBOOTED} and is disarmed", ABORTED
+    ),
+    Transition(
+        (Phase.LAND,),
+        disarmed_elsewhere,
+        Phase.FAILED,
+        lambda flight: f"disarmed, landing not confirmed: {flight.not_landed()}",
+        ABORTED,
+    ),
+    Transition((Phase.LAND,), lost_armed, Phase.YIELDED, why_lost, ABORTED),
+    Transition(
+        (Phase.LAND,),
+        unheard_on_ground,
+        Phase.FAILED,
+        "it stands on the ground, and no HEARTBEAT shows whether it is disarmed",
+        ABORTED,
+    ),
+    Transition((Phase.LAND,), out_of_reach, Phase.FAILED, _out_of_reach, ABORTED),
+    Transition((Phase.LAND,), longer_than("land_s"), Phase.FAILED, _not_disarmed, ABORTED),
+)
+HAND_BACK_ENDS = (
+    Transition(
+        (Phase.HAND_BACK,),
+        longer_than("hand_back_s"),
+        Phase.LAND,
+        "the vehicle did not hold in {flight.in_phase_s:.0f} s",
+        ABORTED,
+    ),
+)
+REQUESTED = (
+    Transition(
+        tuple(phase for phase in Phase if phase in TRACKING | {Phase.TAKEOFF}),
+        requested(Request.HAND_BACK),
+        Phase.HAND_BACK,
+        "handed back on request",
+        FLOWN,
+    ),
+    Transition(
+        (Phase.STREAM, Phase.ENGAGE),
+        requested(Request.HAND_BACK),
+        Phase.FAILED,
+        "stopped on request",
+        FLOWN,
+    ),
+    Transition(
+        (Phase.ARM,),
+        requested(Request.HAND_BACK),
+        Phase.STAND_DOWN,
+        "stopped on request",
+        FLOWN,
+    ),
+    Transition(
+        (Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.PAUSE, Phase.HOVER),
+        requested(Request.START),
+        Phase.CLIMB,
+        "start requested",
+    ),
+    Transition((Phase.JOIN, Phase.TRACK), requested(Request.PAUSE), Phase.PAUSE, "pause requested"),
+    Transition((Phase.PAUSE,), requested(Request.CONTINUE), Phase.TRACK, "continue requested"),
+)
+AT_REST = {
+    "hold": (),
+    "land": (Transition((Phase.HOVER,), at_rest, Phase.LAND, "at rest"),),
+    "repeat": (Transition((Phase.HOVER,), at_rest, Phase.CLIMB, "once more"),),
+}

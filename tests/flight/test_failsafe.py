@@ -1,0 +1,285 @@
+"""The failsafe: how long a condition must hold, how it is forgotten, and which row counts.
+
+Steps of 1/8 s, which add up exactly. Row "link" holds after 0.5 s, "tilt error" lands after 0.5 s,
+"battery" after 2 s; "authority" lands at once.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from uneventful import NOW_S, hear, uneventful
+
+from offboard.flight import failsafe
+from offboard.flight.failsafe import ROWS, Row, judge
+from offboard.flight.phases import Action, Limits, Phase
+from offboard.flight.rows import why
+from offboard.flight.state import FlightState
+from offboard.mavlink.events import (
+    EstimatorReport,
+    GpsFix,
+    LocalPosition,
+    OtherSender,
+    SystemHealth,
+    ThrustReport,
+)
+from offboard.model.command import Command
+
+STEP_S = 0.125
+BY_NAME = {row.name: row for row in ROWS}
+
+
+def actions(*moments: Sequence[str], rows: Sequence[Row] = ROWS) -> list[Action]:
+    """The action at each moment, of which each has the names of the rows whose condition holds."""
+    holding: set[str] = set()
+    driven = [replace(row, condition=lambda _, name=row.name: name in holding) for row in rows]
+    flight, seen = uneventful(), []
+    for number, names in enumerate(moments):
+        holding.clear()
+        holding.update(names)
+        flight.now_s = NOW_S + STEP_S * number
+        judge(flight, driven)
+        seen.append(flight.failsafe.action)
+    return seen
+
+
+NOTHING, LINK, TILT, BATTERY = (), ("link",), ("tilt error",), ("battery",)
+FLY, HOLD, LAND = Action.FLY, Action.HOLD, Action.LAND
+
+
+def test_a_condition_counts_for_as_long_as_it_holds() -> None:
+    assert set(actions(*[NOTHING] * 100)) == {FLY}
+    assert actions(*[LINK] * 6) == [FLY] * 4 + [HOLD] * 2
+    assert actions(NOTHING, *[BATTERY] * 17)[-3:] == [FLY, LAND, LAND]
+    assert actions(*[LINK] * 5, NOTHING)[-2:] == [HOLD, FLY]
+
+
+@pytest.mark.parametrize(("pause", "again"), [(1, 1), (4, 1), (8, 2), (16, 4), (100, 4)])
+def test_it_is_forgotten_at_a_quarter_of_the_speed(pause: int, again: int) -> None:
+    """Four steps of condition, `pause` of none; then it takes `again` steps to be active."""
+    seen = actions(NOTHING, *[LINK] * 4, *[NOTHING] * pause, *[LINK] * 8)
+    assert seen[5 + pause :].index(HOLD) + 1 == again
+
+
+def test_a_condition_that_comes_and_goes() -> None:
+    """Half of the time it gains 3/32 s in two steps: active in the fifth; a fifth: never."""
+    assert actions(NOTHING, *[LINK, NOTHING] * 40).index(HOLD) == 9
+    assert HOLD not in actions(NOTHING, *[LINK, *[NOTHING] * 4] * 100)
+
+
+def test_the_worst_active_row_counts() -> None:
+    both = (*LINK, *TILT)
+    assert actions(NOTHING, *[both] * 4)[-1] is LAND
+    assert actions(NOTHING, *[both] * 4, *[LINK] * 2)[-1] is HOLD
+    assert actions(NOTHING, *[TILT] * 2, *[LINK] * 3)[-1] is FLY
+
+
+def test_of_equally_bad_rows_the_report_of_the_mode_is_named() -> None:
+    """Without it no other row has an effect."""
+    flight = uneventful()
+    assert flight.authority is not None
+    flight.authority.heard_s = -np.inf
+    flight.silence_s = flight.missed = 10
+    judge(flight)
+    assert (flight.failsafe.action, flight.failsafe.row) == (LAND, "authority")
+    assert failsafe.reason(flight).startswith("no report of the mode")
+
+
+@pytest.mark.parametrize(("last", "action"), [(50.125, HOLD), (50.0625, FLY)])
+def test_time_that_steps_back_counts_for_nothing(last: float, action: Action) -> None:
+    flight = uneventful()
+    held = [replace(BY_NAME["link"], condition=lambda _: True)]
+    for flight.now_s in (100.0, 100.1875, 100.375, 50.0, last):
+        judge(flight, held)
+    assert flight.failsafe.action is action
+
+
+def test_one_sample_after_a_gap_of_telemetry_is_no_condition_that_has_held() -> None:
+    flight = uneventful()
+    flight.now_s = 100.0
+    judge(flight, [replace(BY_NAME["tilt error"], condition=lambda _: False)])
+    flight.now_s = 100.8
+    judge(flight, [replace(BY_NAME["tilt error"], condition=lambda _: True)])
+    assert flight.failsafe.action is FLY
+
+
+def _set(**values: object) -> Callable[[FlightState], None]:
+    def apply(flight: FlightState) -> None:
+        for name, value in values.items():
+            setattr(flight, name, value)
+
+    return apply
+
+
+def _fly_at(flight: FlightState, north_m: float, down_m: float, down_mps: float = 0.0) -> None:
+    place, velocity = (north_m, 0.0, down_m), (0.0, 0.0, down_mps)
+    flight.vehicle.position = LocalPosition(NOW_S, place, velocity)
+
+
+def _near_reference(flight: FlightState, away_m: float) -> None:
+    sample = flight.plan.sample(NOW_S)
+    assert sample is not None
+    north, east, down = sample.position_ned_m.tolist()
+    flight.vehicle.position = LocalPosition(NOW_S, (north + away_m, east, down), (0.0, 0.0, 0.0))
+
+
+def _tilt(flight: FlightState, angle_rad: float) -> None:
+    assert flight.vehicle.attitude is not None
+    half = (np.cos(angle_rad / 2), np.sin(angle_rad / 2), 0.0, 0.0)
+    flight.vehicle.attitude = replace(flight.vehicle.attitude, attitude=half)
+
+
+def _tilt_error(flight: FlightState, angle_rad: float) -> None:
+    flight.commands.extend([Command(9.8, (0.0, 0.0, 1.0), 0.0)] * 7)
+    _tilt(flight, angle_rad)
+
+
+def _clock(flight: FlightState, **values: object) -> None:
+    clock: Any = SimpleNamespace(
+        age_s=lambda stamp_s, host_s: 0.0, delay_growth_s=0.0, jumped_s=0.0
+    )
+    vars(clock).update(values)
+    flight.clock = clock
+
+
+def _aged(flight: FlightState, age_s: float) -> None:
+    _clock(flight, age_s=lambda stamp_s, host_s: age_s)
+
+
+def _unheard(flight: FlightState, age_s: float) -> None:
+    assert flight.authority is not None
+    flight.authority.heard_s = NOW_S - age_s
+
+
+def _blind(flight: FlightState, age_s: float) -> None:
+    assert flight.vehicle.attitude is not None
+    flight.vehicle.attitude = replace(flight.vehicle.attitude, time_s=NOW_S - age_s)
+
+
+def _predicted(flight: FlightState, away_m: float) -> None:
+    predicted: Any = SimpleNamespace(
+        time_s=NOW_S, position_ned_m=np.array([0.0, 0.0, away_m]), velocity_ned_mps=np.zeros(3)
+    )
+    flight.predictions.append(predicted)
+
+
+def _accuracy(flight: FlightState, accuracy_m: float) -> None:
+    flight.positioning.begin(flight.vehicle, {}, "ESTIMATOR_STATUS")
+    good = EstimatorReport(True, True, True, True, (), 0.5)
+    hear(flight, good)
+    flight.positioning.begin(flight.vehicle, {"ESTIMATOR_STATUS": 1.0}, "ESTIMATOR_STATUS")
+    hear(flight, replace(good, accuracy_m=accuracy_m))
+
+
+def _no_fix(flight: FlightState, for_s: float) -> None:
+    hear(flight, GpsFix(1.0))
+    flight.positioning.begin(flight.vehicle, {"GPS_RAW_INT": 5.0}, "")
+    flight.vehicle.heard_s[GpsFix] = NOW_S - for_s
+
+
+def _sinks(flight: FlightState, sink_mps: float) -> None:
+    _fly_at(flight, 0.0, -1.0, sink_mps)
+    flight.thrusts.append(1.0)
+
+
+def _follows(flight: FlightState, mode: str) -> None:
+    assert flight.authority is not None
+    hear(flight, ThrustReport(0.3))
+    flight.authority.mode = mode
+    flight.follows_others = True
+
+
+LIMITS = Limits()
+# row: how to set what it measures, a value that it allows, and one that it does not
+MEASURED: list[tuple[str, Callable[[FlightState, Any], None], Any, Any]] = [
+    ("authority", _unheard, 2.5, 2.6),
+    ("silence", lambda flight, value: _set(silence_s=value)(flight), 1.0, 1.1),
+    ("blind", _blind, 0.5, 0.51),
+    ("age", _aged, LIMITS.setpoint_age_s, 0.26),
+    ("link", lambda flight, value: _clock(flight, delay_growth_s=value), 0.3, 0.31),
+    ("link", _aged, LIMITS.setpoint_age_s, 0.26),
+    ("decision", lambda flight, value: _set(missed=value)(flight), 0, 1),
+    ("decisions", lambda flight, value: _set(missed=value)(flight), 2, 3),
+    ("tilt", _tilt, 1.29, 1.31),
+    ("tilt error", _tilt_error, 0.49, 0.51),
+    ("position error", _near_reference, 4.99, 5.01),
+    ("prediction", _predicted, 2.0, 2.01),
+    (
+        "estimator",
+        lambda flight, value: _set(jumps=SimpleNamespace(recent_m=lambda time_s: value))(flight),
+        2.0,
+        2.1,
+    ),
+    ("positioning", _accuracy, 3.0, 3.1),
+    ("positioning", _no_fix, 1.0, 2.1),
+    ("volume", lambda flight, value: _fly_at(flight, 0.0, -value), 120.0, 120.1),
+    ("volume", lambda flight, value: _fly_at(flight, value, -1.0), 1000.0, 1000.1),
+    (
+        "battery",
+        lambda flight, value: hear(flight, SystemHealth(True, None, value)),
+        0.1,
+        0.09,
+    ),
+    (
+        "thrust reserve",
+        lambda flight, value: _set(observer=SimpleNamespace(hover_thrust_estimate=value))(flight),
+        0.9,
+        0.91,
+    ),
+    ("full thrust", _sinks, 0.3, 0.31),
+    (
+        "second sender",
+        lambda flight, value: flight.vehicle.heard_s.update({OtherSender: NOW_S - value}),
+        5.0,
+        4.9,
+    ),
+    ("other setpoints", _follows, "POSCTL", "OFFBOARD"),
+    ("clock", lambda flight, value: _clock(flight, jumped_s=value), 0.0, 0.6),
+    (
+        "contradiction",
+        lambda flight, value: _set(identification=SimpleNamespace(contradiction=value))(flight),
+        "",
+        "out of bounds",
+    ),
+]
+
+
+@pytest.mark.parametrize(
+    ("name", "measure", "allowed", "exceeded"), MEASURED, ids=[each[0] for each in MEASURED]
+)
+def test_every_row_at_its_limit(
+    name: str, measure: Callable[[FlightState, Any], None], allowed: Any, exceeded: Any
+) -> None:
+    row = BY_NAME[name]
+    for value, expected in ((allowed, False), (exceeded, True)):
+        flight = uneventful()
+        measure(flight, value)
+        assert row.condition(flight) is expected
+        assert "{" not in why(row.reason, flight)
+    assert {each[0] for each in MEASURED} == set(BY_NAME)
+
+
+@pytest.mark.parametrize("name", ["second sender", "other setpoints"])
+def test_another_program_may_be_allowed(name: str) -> None:
+    flight = uneventful()
+    hear(flight, OtherSender(1, 190, 82))
+    _follows(flight, "OFFBOARD")
+    assert BY_NAME[name].condition(flight)
+    flight.limits = Limits(begin_with_other_sender=True)
+    assert not BY_NAME[name].condition(flight)
+
+
+def test_what_only_our_setpoints_show_is_not_measured_in_other_phases() -> None:
+    for name in ("thrust reserve", "full thrust", "other setpoints"):
+        flight = uneventful(Phase.HOLD)
+        _sinks(flight, 5.0)
+        _follows(flight, "OFFBOARD")
+        _set(observer=SimpleNamespace(hover_thrust_estimate=1.0))(flight)
+        assert not BY_NAME[name].condition(flight)
+        flight.phase = Phase.TRACK
+        assert BY_NAME[name].condition(flight)

@@ -1,0 +1,290 @@
+"""The phase table: complete, bounded, without cycles, every row and reason usable."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from functools import partial
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+from uneventful import NOW_S, TRACK, hear, heartbeat, lift, position, uneventful
+
+from offboard.flight import preflight, starting
+from offboard.flight.authority import Standing
+from offboard.flight.phases import (
+    ENDS,
+    FLYING,
+    OUTAGE_MAX_S,
+    Action,
+    ExitCode,
+    Limits,
+    Phase,
+    ServiceOptions,
+)
+from offboard.flight.requests import Request
+from offboard.flight.rows import Transition, why
+from offboard.flight.state import FlightState
+from offboard.flight.transitions import IN_THE_AIR, SERVICE_ONLY, asked, exits, next_row, table
+from offboard.mavlink.dialects.base import Takeoff
+from offboard.mavlink.events import Attitude, CommandAck, Landed, OtherSender, VehicleFound
+
+ON_TRACK = (Phase.JOIN, Phase.TRACK, Phase.HOVER)
+SERVICES = {then: ServiceOptions(then=then) for then in ("hold", "land", "repeat")}  # type: ignore[arg-type]
+TABLES: dict[str, ServiceOptions | None] = {"fly": None, **SERVICES}
+BOTH = pytest.mark.parametrize("service", TABLES.values(), ids=TABLES)
+Setup = Callable[[FlightState], object]
+
+
+def _set(**values: object) -> Setup:
+    def apply(flight: FlightState) -> None:
+        for name, value in values.items():
+            setattr(flight, name, value)
+
+    return apply
+
+
+def _stand(standing: Standing, armed: bool | None = None) -> Setup:
+    def apply(flight: FlightState) -> None:
+        if armed is not None:
+            heartbeat(flight, armed=armed)
+        assert flight.authority is not None
+        flight.authority.standing = standing
+        flight.authority.lost_s = NOW_S - 1.0
+
+    return apply
+
+
+def _disarm(flight: FlightState, for_s: float = 1.6, landed: str = "on_ground") -> None:
+    heartbeat(flight, armed=False)
+    hear(flight, Landed(landed))
+    flight.began_s = flight.vehicle.armed_changed_s = NOW_S - for_s
+
+
+def _engage(flight: FlightState, **pilot: bool) -> None:
+    lift(flight)
+    flight.began_s = NOW_S - 0.6
+    for name, value in pilot.items():
+        setattr(flight.pilot, name, value)
+
+
+def _fit(flight: FlightState) -> None:
+    vars(flight.session)["ready"] = True
+
+
+def _all(*setups: Setup) -> Setup:
+    return lambda flight: [setup(flight) for setup in setups]
+
+
+def _unhear_mode(flight: FlightState) -> None:
+    assert flight.authority is not None
+    flight.authority.heard_s = -math.inf
+
+
+def _age_attitude(flight: FlightState) -> None:
+    flight.vehicle.attitude = Attitude(NOW_S - 0.51, (1.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+
+
+def _reach_start(flight: FlightState) -> None:
+    plan: Any = SimpleNamespace(
+        late_s=lambda time_s: 1.0, at_start=lambda *_: True, sample=lambda time_s: None
+    )
+    plan.track, plan.reference, plan.track_time_s = TRACK, None, lambda time_s: math.nan
+    flight.plan = plan
+
+
+def _climb_late(flight: FlightState) -> None:
+    _reach_start(flight)
+    plan: Any = flight.plan
+    plan.late_s, plan.at_start = lambda time_s: 90.1, lambda *_: False
+
+
+def _refuse_arming(flight: FlightState) -> None:
+    hear(flight, CommandAck(400, "ACCEPTED"))
+    flight.vehicle.answered_s[400] = NOW_S - 2.6
+    heartbeat(flight, armed=False)
+
+
+def _be_several(flight: FlightState) -> None:
+    flight.session.senders.ambiguous = lambda now_s: True  # type: ignore[method-assign]
+
+
+def _lift_off(flight: FlightState) -> None:
+    for step in range(4):
+        flight.now_s = NOW_S + 0.1 * step
+        position(flight, -0.3 - 0.01 * step)
+
+
+def _track_for(seconds: float) -> Setup:
+    return lambda flight: flight.plan.start_track(NOW_S - seconds)
+
+
+def _identify(**values: Any) -> Setup:
+    return lambda flight: vars(flight.identification).update(values)
+
+
+# what makes each condition hold
+EVENTS: dict[str, Setup] = {
+    "vehicle_found": lambda flight: hear(flight, VehicleFound(1, 1, "px4")),
+    "ready": _fit,
+    "usable": _fit,
+    "refused": lambda flight: vars(flight.session).update(refusals=["no multirotor"]),
+    "armed_by_another": _all(
+        partial(heartbeat, armed=True, mode="POSCTL"), _set(limits=Limits(begin_armed=False))
+    ),
+    "rebooted": _set(rebooted=True),
+    "rebooted_disarmed": _all(_set(rebooted=True), partial(_disarm, for_s=0.0, landed="in_air")),
+    "needs_no_stream": _set(dialect=SimpleNamespace(takeoff=Takeoff.COMMAND)),
+    "streamed": _set(began_s=NOW_S - 1.0),
+    "engaged": partial(heartbeat, armed=False),
+    "engaged_in_the_air": lift,
+    "armed": partial(heartbeat, armed=True),
+    "too_late_at_start": _climb_late,
+    "lifted_off": _lift_off,
+    "at_start": _reach_start,
+    "at_start_to_excite": _all(_reach_start, _identify(wants_excitation=True)),
+    "identified": _identify(finished=lambda time_s: True),
+    "at_full_speed": _track_for(TRACK.track_start_s),
+    "track_over": _track_for(TRACK.track_end_s),
+    "at_rest": _track_for(TRACK.duration_s + 0.5),
+    "other_sender": lambda flight: hear(flight, OtherSender(1, 190, 82)),
+    "other_vehicle": _be_several,
+    "disarmed": partial(_disarm, for_s=0.0),
+    "disarmed_again": _refuse_arming,
+    "disarmed_for_good": _disarm,
+    "landed": _disarm,
+    "disarmed_elsewhere": partial(_disarm, landed="in_air"),
+    "lost": _stand(Standing.LOST),
+    "lost_armed": _stand(Standing.LOST, armed=True),
+    "lost_disarmed": _stand(Standing.LOST, armed=False),
+    "mode_unknown": _unhear_mode,
+    "silent": _set(silence_s=1.01),
+    "silent_for_long": _set(silence_s=2.01),
+    "in_own_failsafe": _stand(Standing.FAILSAFE),
+    "unheard_on_ground": _unhear_mode,
+    "out_of_reach": _set(silence_s=OUTAGE_MAX_S + 0.1),
+    "silent_on_ground": _set(silence_s=20.1),
+    "blind": _age_attitude,
+    "stop_requested": _set(stop_reason="stop requested"),
+    "engaged_by_pilot": _all(partial(_engage, engaged=True), _fit),
+    "engaged_but_unfit": partial(_engage, engaged=True),
+    "started_in_the_air": _all(lift, _fit, _set(request=Request.START)),
+    "started_on_the_ground": _all(_fit, _set(request=Request.START)),
+    "engaged_too_soon": partial(_engage, hasty=True),
+    "abandoned": _all(partial(_engage, unclaimed=True), _set(left_engaged=True)),
+    "handed": _stand(Standing.HANDED),
+    "failsafe_hold": lambda flight: setattr(flight.failsafe, "action", Action.HOLD),
+    "failsafe_land": lambda flight: setattr(flight.failsafe, "action", Action.LAND),
+    **{f"requested_{each.name.lower()}": _set(request=each) for each in Request},
+}
+
+
+@pytest.fixture(autouse=True)
+def preflight_list(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The preflight list finds what `EVENTS` says."""
+    monkeypatch.setattr(starting, "ground_of", lambda flight: vars(flight.session))
+    monkeypatch.setattr(
+        preflight, "not_ready", lambda known: "" if known.get("ready") else "not yet"
+    )
+    monkeypatch.setattr(preflight, "refusals", lambda known: known.get("refusals", []))
+    monkeypatch.setattr(preflight, "unfit_type", lambda known: "")
+
+
+def event_of(row: Transition) -> Setup:
+    name = row.condition.__name__
+    if name.startswith("longer_than_"):
+        limit_s = getattr(Limits(), name.removeprefix("longer_than_"))
+        return _set(began_s=NOW_S - limit_s - 0.1)
+    return EVENTS[name]
+
+
+@BOTH
+def test_every_row_is_taken_when_its_condition_holds(service: ServiceOptions | None) -> None:
+    """In each of its phases: no row before it takes all of its cases. Its reason is complete."""
+    for row in table(service):
+        for phase in row.phases:
+            flight = uneventful(phase, service)
+            assert next_row(flight) is None, phase
+            event_of(row)(flight)
+            assert next_row(flight) is row, (phase, row.condition.__name__)
+            assert "{" not in why(row.reason, flight)
+
+
+def test_every_wait_is_limited() -> None:
+    for phase in {phase for row in table() for phase in row.phases}:
+        flight = uneventful(phase)
+        later = _track_for(1e4) if phase in ON_TRACK else _set(began_s=NOW_S - 1e4)
+        if phase is Phase.CLIMB:
+            later = _climb_late  # after the way that was planned
+        if phase is Phase.CONNECT:
+            later = _set(silence_s=1e4)  # only the wall clock runs before there is telemetry
+        later(flight)
+        assert next_row(flight) is not None
+
+
+def test_every_phase_but_the_ends_has_rows() -> None:
+    unended = {phase for phase in Phase if phase not in ENDS}
+    assert {phase for row in table() for phase in row.phases} == unended - SERVICE_ONLY
+    for service in SERVICES.values():
+        assert {phase for row in table(service) for phase in row.phases} == unended
+
+
+def test_the_service_waits_for_ever() -> None:
+    for service in SERVICES.values():
+        for phase in (Phase.CONNECT, Phase.HEALTH, Phase.STANDBY, Phase.PAUSE):
+            flight = uneventful(phase, service)
+            flight.began_s, flight.silence_s = -1e6, 0.0 if phase is Phase.PAUSE else 1e6
+            assert next_row(flight) is None
+    targets: dict[str, Phase | None] = {}
+    for then, service in SERVICES.items():
+        flight = uneventful(Phase.HOVER, service)
+        flight.plan.start_track(NOW_S - 1e6)
+        row = next_row(flight)
+        targets[then] = row.target if row else None
+    assert targets == {"hold": None, "land": Phase.LAND, "repeat": Phase.CLIMB}
+
+
+def test_the_service_arms_nothing_by_itself() -> None:
+    """The only way to the phases that arm is a request on the ground."""
+    for service in SERVICES.values():
+        ways = [row for row in table(service) if row.target is Phase.STREAM]
+        assert [row.condition.__name__ for row in ways] == ["started_on_the_ground"]
+
+
+def test_every_row_leads_to_a_later_phase() -> None:
+    order = {phase: index for index, phase in enumerate(Phase)}
+    for row in table():
+        assert all(order[row.target] > order[phase] for phase in row.phases)
+
+
+def test_every_abnormal_end_has_an_exit_code() -> None:
+    """Its own, or that of each way into its phase. No flight in the air ends as refused."""
+    rows = table()
+    for row in rows:
+        if row.target in (Phase.FAILED, Phase.YIELDED) and row.exit_code is None:
+            ways_in = [way.exit_code for way in rows if way.target in row.phases]
+            assert ways_in
+            assert None not in ways_in
+        if row.exit_code == ExitCode.REFUSED:
+            assert not IN_THE_AIR & set(row.phases)
+    assert {row.exit_code for row in rows} == {None, ExitCode.REFUSED, ExitCode.ABORTED}
+
+
+@BOTH
+def test_no_way_out_of_the_air_leaves_the_vehicle_unasked(service: ServiceOptions | None) -> None:
+    """Each row that ends a flight in the air is in a phase that asks for hold or land, or leads to
+    one; or the vehicle is disarmed, or not ours any more. From the moment when it is ours, it is
+    in such a phase."""
+    left = exits(service)
+    flown = {phase for row in table(service) for phase in row.phases} & (FLYING | {Phase.LAND})
+    assert {phase for _, phase in left} == flown
+    assert [(phase, row.condition) for row, phase in left if not asked(row, phase)] == []
+    for row in table(service):
+        if set(row.phases) & {Phase.STREAM, Phase.ENGAGE} and row.target in ENDS:
+            flight = uneventful(Phase.ENGAGE, service)
+            event_of(row)(flight)
+            lift(flight)
+            taken = next_row(flight)
+            assert taken is not None
+            assert taken.target in IN_THE_AIR
