@@ -7,6 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.analysis.estimator_noise import estimator_noise
 from offboard.analysis.figure import BLUE, GREY, RED, Figure, curve, panels
 from offboard.analysis.identify import rows
 from offboard.analysis.page import render
@@ -47,7 +48,7 @@ def page(flight: str, found: Identified, trace: Trace, prior: Vehicle) -> str:
         "analysis/templates/identification.html",
         title=f"Identified from {found.seconds:.1f} s of {flight}",
         rows=rows(found),
-        noise=found.noise,
+        noise=estimator_noise(trace) if found.seconds else None,
         figures=figures,
     )
 

@@ -9,7 +9,6 @@ from offboard.control.delay_margin import LEAST_MARGIN_S, SDS, needed_margin, su
 from offboard.doctor.link_checks import blocks, ok, wait, warn
 from offboard.doctor.observation import Observation
 from offboard.flight.preflight import FIX_3D, Finding
-from offboard.identification.adoption import with_added_delay
 from offboard.identification.uncertainty import Estimate
 from offboard.run.configuration import UNKNOWN_VEHICLE, FlightConfig
 
@@ -181,7 +180,7 @@ def _bandwidth(delay: Estimate, config: FlightConfig) -> Iterable[Finding]:
     wanted = getattr(config.controller, "bandwidth_radps", None)
     if wanted is None:
         return
-    vehicle = with_added_delay(config.vehicle, delay.value)
+    vehicle = config.vehicle.later_by(delay.value)
     possible = supported_bandwidth(
         vehicle,
         wanted,

@@ -38,7 +38,7 @@ from offboard.flight.phases import (
 )
 from offboard.flight.snapshot import Snapshot, snapshot_of
 from offboard.flight.state import FlightState, Outcome
-from offboard.identification.learned import Learned
+from offboard.identification.learner import Learned
 from offboard.link.interface import Chunk
 from offboard.mavlink.dialects.base import NEVER
 from offboard.mavlink.events import (
@@ -95,7 +95,7 @@ class Companion:
         model = learned.vehicle if learned else vehicle
         if learned:
             observer.adopt(model)
-        self._identification = _identification(vehicle, controller, period_s, identify, learned)
+        self._identification = _identification(vehicle, controller, identify, learned)
         self.state = state = FlightState(
             limits, plan, model, session, observer, self._identification, service
         )
@@ -411,14 +411,10 @@ class Companion:
 def _identification(
     vehicle: Vehicle,
     controller: Controller,
-    period_s: float,
     settings: IdentifySettings | None,
     learned: Learned | None,
 ) -> OnlineIdentification | None:
     """None for a controller that cannot adopt another vehicle model."""
     if settings is None or not isinstance(controller, Adopting):
         return None
-    bandwidth = controller.bandwidth_radps
-    return OnlineIdentification(
-        vehicle, settings, period_s=period_s, bandwidth_radps=bandwidth, learned=learned
-    )
+    return OnlineIdentification(vehicle, settings, learned=learned)

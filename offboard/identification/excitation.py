@@ -17,20 +17,22 @@ EAST_S = ((1.2, 0.3), (3.2, 0.2))
 THRUST_S = ((0.2, 0.3), (2.2, 0.3))
 COURSE_S = ((0.0, 1.0),)
 LENGTH_S = 4.0
+TILT_RAD = math.radians(2.0)
+THRUST_SHARE = 0.05
 
 
-def excited(command: Command, time_s: float, tilt_rad: float, thrust_share: float) -> Command:
-    """`command` with the steps at `time_s` since their beginning: tilt by `tilt_rad`, course by
-    twice that, thrust by `thrust_share` of itself. A command tilted by more than 64 degrees is
-    returned as it is."""
+def excited(command: Command, time_s: float) -> Command:
+    """`command` with the steps at `time_s` since their beginning: tilt by TILT_RAD, course by twice
+    that, thrust by THRUST_SHARE of itself. A command tilted by more than 64 degrees is returned as
+    it is."""
     north, east, _ = command.thrust_direction_ned
-    north += math.sin(tilt_rad) * _step_sign(time_s, NORTH_S)
-    east += math.sin(tilt_rad) * _step_sign(time_s, EAST_S)
+    north += math.sin(TILT_RAD) * _step_sign(time_s, NORTH_S)
+    east += math.sin(TILT_RAD) * _step_sign(time_s, EAST_S)
     lateral = math.hypot(north, east)
     if lateral >= 0.9:
         return command
-    thrust = command.thrust_mps2 * (1.0 + thrust_share * _step_sign(time_s, THRUST_S))
-    course = command.course_rad + 2.0 * tilt_rad * _step_sign(time_s, COURSE_S)
+    thrust = command.thrust_mps2 * (1.0 + THRUST_SHARE * _step_sign(time_s, THRUST_S))
+    course = command.course_rad + 2.0 * TILT_RAD * _step_sign(time_s, COURSE_S)
     return Command(
         thrust, (north, east, math.sqrt(1.0 - lateral * lateral)), float(wrap_pi(course))
     )

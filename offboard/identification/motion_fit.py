@@ -226,35 +226,6 @@ def fit_drag(motion: Motion, thrust_mps2: Array, start_ps: float) -> Estimate:
     return Estimate(float(found.x[0]), math.sqrt(max(variance, 0.0)))
 
 
-def fit_hover(motion: Motion, vehicle: Vehicle) -> Estimate:
-    """Normalised hover thrust (0 to 1), given thrust delay, thrust lag and drag of `vehicle`.
-
-    The innovations of the vertical filter are linear in its inverse, so that one step of least
-    squares finds it. Its sd is infinite where the thrust was zero throughout.
-    """
-    vertical = PositionFilter(motion.times, vehicle.drag_per_mass_ps, VERTICAL)
-    thrust = motion.thrust(vehicle.thrust_delay_s, vehicle.thrust_lag_s)
-    known = 1.0 / vehicle.hover_thrust
-    effect = -vehicle.gravity_mps2 * thrust * motion.upright  # of the inverse
-
-    def innovations(positions: Array, accelerations: Array) -> Array:
-        drag_ps = vehicle.drag_per_mass_ps
-        found: Array = vertical.innovations(positions, accelerations[None], drag_ps)[0]
-        return found
-
-    left = innovations(motion.positions[2:], vehicle.gravity_mps2 + known * effect)
-    slope = innovations(np.zeros((1, len(motion.times))), effect)
-    curvature = float(slope @ slope)
-    if curvature <= 0.0:
-        return Estimate(vehicle.hover_thrust, math.inf)
-    change = -float(slope @ left) / curvature
-    lags = lag_count(RELATED_S, motion.spacing_s, len(left))
-    scores = (slope * (left + change * slope))[:, None]
-    variance = float(long_run_covariance(scores, lags)[0, 0]) / curvature**2
-    hover_thrust = 1.0 / max(known + change, 1.0)
-    return Estimate(hover_thrust, math.sqrt(max(variance, 0.0)) * hover_thrust**2)
-
-
 @dataclass(frozen=True, slots=True)
 class VerticalPrior:
     """What is known beforehand: where the search for the hover thrust begins, and thrust delay,

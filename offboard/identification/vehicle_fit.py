@@ -15,7 +15,6 @@ from typing import Any, TypeVar
 import numpy as np
 
 from offboard.identification.attitude_fit import ResponseFit, fit_tilt, fit_yaw
-from offboard.identification.estimator_noise import EstimatorNoise, estimator_noise
 from offboard.identification.motion_fit import (
     DRAG_SPACING_S,
     DRAG_UPPER_PS,
@@ -23,12 +22,18 @@ from offboard.identification.motion_fit import (
     VerticalFit,
     VerticalPrior,
     fit_drag,
-    fit_hover,
     fit_vertical,
 )
 from offboard.identification.trace import Trace
 from offboard.identification.uncertainty import Array, Estimate
-from offboard.model.vehicle import AxisResponse, Vehicle
+from offboard.model.vehicle import (
+    DAMPING_LIMITS,
+    DELAY_LIMITS_S,
+    FREQUENCY_LIMITS_RADPS,
+    HOVER_THRUST_LIMITS,
+    AxisResponse,
+    Vehicle,
+)
 
 Result = TypeVar("Result")
 Pieces = Generator[None, None, Result]
@@ -62,7 +67,6 @@ class Identified:
     thrust_delay_s: Estimate | None = None
     thrust_effect_s: Estimate | None = None
     drag_ps: Estimate | None = None
-    noise: EstimatorNoise | None = None
     refusals: Mapping[str, str] = field(default_factory=dict)
 
     @property
@@ -102,15 +106,14 @@ def identify(trace: Trace, vehicle: Vehicle) -> Identified:
             delays of tilt, yaw and thrust differ from each other.
 
     Returns:
-        The constants with standard deviations, the reasons for those that are missing, and the
-        noise of the vehicle's estimator. Nothing is raised, whatever the flight contains.
+        The constants with standard deviations, and the reasons for those that are missing. Nothing
+        is raised, whatever the flight contains.
 
     Example:
         found = identify(clean(commands, attitude, position), vehicle)
         better = found.applied_to(vehicle)
     """
-    found = completed(identify_in_pieces(trace, vehicle))
-    return replace(found, noise=estimator_noise(trace)) if found.seconds else found
+    return completed(identify_in_pieces(trace, vehicle))
 
 
 def completed(pieces: Pieces[Result]) -> Result:
@@ -124,7 +127,7 @@ def completed(pieces: Pieces[Result]) -> Result:
 
 
 def identify_in_pieces(trace: Trace, vehicle: Vehicle) -> Pieces[Identified]:
-    """`identify` without the estimator's noise, some milliseconds of work at each step."""
+    """`identify`, some milliseconds of work at each step."""
     refusals: dict[str, str] = {}
     seconds = _seconds(trace)
     if seconds < LEAST_SECONDS:
@@ -182,16 +185,6 @@ def identify_drag(trace: Trace, vehicle: Vehicle) -> Identified:
         fit = fit_drag(motion, vehicle.thrust_max_mps2 * thrust, vehicle.drag_per_mass_ps)
         drag = _accepted_drag(fit, refusals)
     return Identified(seconds, drag_ps=drag, refusals=refusals)
-
-
-def identify_hover(trace: Trace, vehicle: Vehicle) -> Identified:
-    """The hover thrust alone, given the other constants of `vehicle`; some milliseconds for 6 s of
-    flight. None with a reason where the trace is too short or holds too few messages."""
-    seconds = _seconds(trace)
-    if seconds < LEAST_SECONDS or not (motion := Motion(trace, DRAG_SPACING_S)).sufficient:
-        return Identified(seconds, refusals={"hover_thrust": "too few positions and commands"})
-    hover = fit_hover(motion, vehicle)
-    return Identified(seconds, hover_thrust=hover if math.isfinite(hover.sd) else None)
 
 
 def _seconds(trace: Trace) -> float:
@@ -262,3 +255,115 @@ def _accepted_vertical(
         names = ("thrust_lag_s", "thrust_delay_s", "thrust_effect_s")
         accepted |= {name: getattr(fit, name) for name in names}
     return accepted
+
+
+# ---------------------------------------------------------------------- bounds and texts
+
+# Least and greatest value of each constant, whatever the vehicle file says.
+BOUNDS = {
+    "delay": DELAY_LIMITS_S,
+    "frequency": FREQUENCY_LIMITS_RADPS,
+    "damping": DAMPING_LIMITS,
+    "hover thrust": HOVER_THRUST_LIMITS,
+    "thrust lag": (0.0, 0.4),
+    "thrust delay": (0.0, 0.5),
+    "drag": (0.02, 3.0),
+}
+DELAY_SLACK_S = 0.4  # allowed in addition to the factor: a link may be slow
+LINK_S = 0.03  # a smaller difference of delays is the vehicle's own, not the link's
+
+
+def within_bounds(
+    found: Identified, vehicle_file: Vehicle, factor: float
+) -> tuple[Identified, list[str]]:
+    """`found` without constants that are outside BOUNDS or differ from the vehicle file's by more
+    than `factor`, and a sentence about each of those."""
+    sentences: list[str] = []
+    rejected: dict[str, Any] = {}
+
+    def outside(what: str, value: float, expected: float, kind: str, slack: float = 0.0) -> bool:
+        low, high = BOUNDS[kind]
+        low = max(low, expected / factor - slack)
+        high = min(high, expected * factor + slack)
+        if low <= value <= high:
+            return False
+        sentences.append(
+            f"{what} {value:.3g} contradicts the {expected:.3g} of vehicle {vehicle_file.name} "
+            f"({low:.3g} to {high:.3g} allowed), not adopted"
+        )
+        return True
+
+    for name in ("tilt", "yaw"):
+        fit, axis = getattr(found, name), getattr(vehicle_file, name)
+        if fit is None:
+            continue
+        assert isinstance(axis, AxisResponse)
+        frequency = axis.natural_frequency_radps
+        if (
+            outside(f"{name} delay", fit.delay_s.value, axis.delay_s, "delay", DELAY_SLACK_S)
+            or outside(
+                f"{name} frequency", fit.natural_frequency_radps.value, frequency, "frequency"
+            )
+            or outside(f"{name} damping", fit.damping.value, axis.damping, "damping")
+        ):
+            rejected[name] = None
+    for name, what, expected, slack in (
+        ("hover_thrust", "hover thrust", vehicle_file.hover_thrust, 0.0),
+        ("thrust_lag_s", "thrust lag", vehicle_file.thrust_lag_s, DELAY_SLACK_S),
+        ("thrust_delay_s", "thrust delay", vehicle_file.thrust_delay_s, DELAY_SLACK_S),
+        ("drag_ps", "drag", vehicle_file.drag_per_mass_ps, 0.0),
+    ):
+        estimate: Estimate | None = getattr(found, name)
+        if estimate is not None and outside(what, estimate.value, expected, what, slack):
+            rejected[name] = None
+    return (replace(found, **rejected) if rejected else found), sentences
+
+
+def with_link_delay(found: Identified, target: Vehicle, vehicle_file: Vehicle) -> Vehicle:
+    """`target`, its delays of thrust and course increased by what the link adds to the tilt's,
+    unless they were identified themselves."""
+    if found.tilt is None:
+        return target
+    added_s = found.tilt.delay_s.value - vehicle_file.tilt.delay_s
+    if added_s < LINK_S:
+        return target
+    update: dict[str, Any] = {}
+    thrust_delay_s = vehicle_file.thrust_delay_s + added_s
+    if target.thrust_delay_s < thrust_delay_s - LINK_S and found.thrust_delay_s is None:
+        update["thrust_delay_s"] = thrust_delay_s
+    yaw_delay_s = vehicle_file.yaw.delay_s + added_s
+    if found.yaw is None and target.yaw.delay_s < yaw_delay_s - LINK_S:
+        delay_s = min(yaw_delay_s, DELAY_LIMITS_S[1])
+        update["yaw"] = target.yaw.model_copy(update={"delay_s": delay_s})
+    return target.model_copy(update=update)
+
+
+def summary(found: Identified) -> str:
+    """The identified constants in one line for the user."""
+    parts = []
+    for name, fit in (("tilt", found.tilt), ("yaw", found.yaw)):
+        if fit is not None:
+            parts.append(
+                f"{name} delay {1e3 * fit.delay_s.value:.0f} +- {1e3 * fit.delay_s.sd:.0f} ms, "
+                f"{fit.natural_frequency_radps.value:.1f} rad/s, damping {fit.damping.value:.2f}"
+            )
+    if found.hover_thrust is not None:
+        parts.append(f"hover thrust {found.hover_thrust.value:.3f}")
+    if found.thrust_lag_s is not None:
+        parts.append(f"thrust lag {1e3 * found.thrust_lag_s.value:.0f} ms")
+    if found.drag_ps is not None:
+        parts.append(f"drag {found.drag_ps.value:.2f} +- {found.drag_ps.sd:.2f} 1/s")
+    return "identified " + "; ".join(parts)
+
+
+def log_record(found: Identified) -> tuple[float, ...]:
+    """Value and sd of each constant, for the log: tilt (delay, frequency, damping), yaw, hover
+    thrust, thrust lag, thrust delay, drag; NaN for what was not identified."""
+    estimates: list[Estimate | None] = []
+    for fit in (found.tilt, found.yaw):
+        estimates += (fit.delay_s, fit.natural_frequency_radps, fit.damping) if fit else (None,) * 3
+    estimates += [found.hover_thrust, found.thrust_lag_s, found.thrust_delay_s, found.drag_ps]
+    numbers: list[float] = []
+    for each in estimates:
+        numbers += (each.value, each.sd) if each else (math.nan, math.nan)
+    return tuple(numbers)

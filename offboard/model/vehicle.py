@@ -6,6 +6,7 @@ simulated vehicle is made from one too, which may be another. No file is read he
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
@@ -70,6 +71,18 @@ class Vehicle(Parameters):
     angular_acceleration_limit_radps2: PositiveTriple = (50.0, 50.0, 20.0)
     tilt_max_rad: float = Field(default=0.7, gt=0.05, lt=1.4)
 
+    def later_by(self, delay_s: float) -> Vehicle:
+        """This vehicle behind a link that adds `delay_s` to each of its delays."""
+        most_s = DELAY_LIMITS_S[1]
+
+        def axis(response: AxisResponse) -> AxisResponse:
+            later_s = min(response.delay_s + delay_s, most_s)
+            return response.model_copy(update={"delay_s": later_s})
+
+        thrust_delay_s = min(self.thrust_delay_s + delay_s, most_s)
+        axes = {"tilt": axis(self.tilt), "yaw": axis(self.yaw)}
+        return self.model_copy(update={**axes, "thrust_delay_s": thrust_delay_s})
+
     @property
     def drag_per_mass_ps(self) -> float:
         """Lateral linear drag per unit of mass, 1/s: c of acceleration = ... - c v."""
@@ -94,3 +107,25 @@ class Vehicle(Parameters):
     def thrust_max_mps2(self) -> float:
         """Collective thrust per unit of mass at full throttle, m/s^2 (linear thrust curve)."""
         return self.gravity_mps2 / self.hover_thrust
+
+
+@dataclass(frozen=True, slots=True)
+class DelayUncertainty:
+    """What is not known of a vehicle's delays, s.
+
+    `tilt_s` and `thrust_s`: by how much the true delay may differ; three standard deviations of an
+    identified one. `link_s`: what the link adds to all delays since take-off, which is known and
+    compensated by prediction.
+    """
+
+    tilt_s: float = 0.0
+    thrust_s: float = 0.0
+    link_s: float = 0.0
+
+    def exceeds(self, other: DelayUncertainty) -> bool:
+        """Whether less is known of any delay than in `other`."""
+        return (
+            self.tilt_s > other.tilt_s
+            or self.thrust_s > other.thrust_s
+            or self.link_s > other.link_s
+        )

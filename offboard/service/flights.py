@@ -17,7 +17,7 @@ from offboard.flight.phases import ENDS, FLYING, WAITING, Phase, ServiceOptions
 from offboard.flight.snapshot import Snapshot
 from offboard.flight.starting import found_engaged
 from offboard.flight.state import FlightState
-from offboard.identification.learned import Learned
+from offboard.identification.learner import Learned
 from offboard.link.interface import Chunk
 from offboard.mavlink.session import Session
 from offboard.run.flight import Prepared

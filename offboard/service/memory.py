@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from offboard.documents.reading import DocumentError, read, validate
 from offboard.documents.shipped import read_text
-from offboard.identification.learned import Learned
+from offboard.identification.learner import Learned
 from offboard.identification.uncertainty import Estimate
 from offboard.model.vehicle import Vehicle
 from offboard.run.flight import Prepared

@@ -15,6 +15,7 @@ from pair import LEAN, Pair, make
 from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Phase
+from offboard.identification import learner
 from offboard.model.vehicle import Vehicle
 from simulator import config as simulated
 from simulator.firmware.ardupilot import ARDUPILOT
@@ -25,6 +26,12 @@ from simulator.steps import STEP_S
 
 HEIGHT_M = 3.0
 HOVER = (f"reference.height_m={HEIGHT_M}", "reference.duration_s=3.0")
+
+
+@pytest.fixture(autouse=True)
+def _any_hover_thrust(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Four times the thrust of the file would end the flight."""
+    monkeypatch.setattr(learner, "FACTOR", 10.0)
 
 
 def with_thrust(
@@ -40,8 +47,7 @@ def with_thrust(
     wrong by `believed`."""
     vehicle = simulated.vehicle(name)
     file = vehicle.model_copy(update={"hover_thrust": vehicle.hover_thrust * believed})
-    learning = IdentifySettings(factor=10.0)
-    pair = make(*HOVER, reference="hover", seed=seed, believed=file, learning=learning)
+    pair = make(*HOVER, reference="hover", seed=seed, believed=file, learning=IdentifySettings())
     conditions = simulated.scenario("thrust_doubled").conditions.model_copy(
         update={"boot_scale": 0.1, "thrust_scale": factor}
     )

@@ -22,12 +22,11 @@ from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Phase
 from offboard.flight.record import IDENTIFIED_ID
 from offboard.flight.vehicle_clock import LinkGrowth
-from offboard.identification.adoption import with_link_delay
+from offboard.identification import learner
 from offboard.identification.attitude_fit import ResponseFit
-from offboard.identification.excitation import LENGTH_S, excited
+from offboard.identification.excitation import LENGTH_S, TILT_RAD, excited
 from offboard.identification.uncertainty import Estimate
-from offboard.identification.vehicle_estimate import VehicleEstimate
-from offboard.identification.vehicle_fit import Identified
+from offboard.identification.vehicle_fit import Identified, with_link_delay
 from offboard.model.command import Command
 from offboard.model.vehicle import AxisResponse, Vehicle
 from simulator import config as simulated
@@ -223,8 +222,9 @@ def test_hover_thrust_far_from_the_vehicle_file_is_identified(hover_thrust, tmp_
     assert pair.score(tmp_path).rmse_position_m < 0.05
 
 
-def test_constants_out_of_bounds_end_the_flight():
-    pair = neutral("hover", scenario="px4_like", learning=IdentifySettings(factor=1.05))
+def test_constants_out_of_bounds_end_the_flight(monkeypatch: pytest.MonkeyPatch):
+    monkeypatch.setattr(learner, "FACTOR", 1.05)
+    pair = neutral("hover", scenario="px4_like", learning=IDENTIFY)
     outcome = pair.fly()
     assert outcome.exit_code == 4
     assert "hover thrust 0.49" in outcome.sentence
@@ -243,39 +243,19 @@ def test_bandwidth_that_the_delay_does_not_support_is_limited():
     pair.track()
     limited = "bandwidth limited to "
     (line,) = (line for line in pair.companion.announced if line.startswith(limited))
-    assert "rad/s (configured 10.0) by the identified delay, 2" in line
+    assert "rad/s (configured 10.0): identified delay, 2" in line
     assert 4.0 < float(line.removeprefix(limited).split()[0]) < 9.0
-
-
-def test_identified_constants_are_blended_in_over_a_second():
-    estimate = VehicleEstimate(
-        NEUTRAL, factor=4.0, blend_s=1.0, unknown_delay_s=0.28, period_s=0.1, bandwidth_radps=7.0
-    )
-    fit = ResponseFit(Estimate(0.09, 0.002), Estimate(14.0, 0.1), Estimate(1.1, 0.01), 0.0, 0.1)
-    found = Identified(4.0, tilt=fit, hover_thrust=Estimate(0.5, 0.01), drag_ps=Estimate(1.2, 0.1))
-    estimate.adopt(found, 10.0)
-    way = [NEUTRAL]
-    for tick in range(12):
-        estimate.step(10.0 + 0.1 * tick)
-        way.append(estimate.now)
-    numbers = np.array(
-        [[v.drag_per_mass_ps, v.hover_thrust, *v.tilt.model_dump().values()] for v in way]
-    )
-    share = (numbers - numbers[0]) / (np.array([1.2, 0.5, 0.09, 14.0, 1.1]) - numbers[0])
-    expected = np.minimum(0.1 * np.arange(13), 1.0)
-    assert share == pytest.approx(np.tile(expected[:, None], 5), abs=1e-9)
 
 
 def test_steps_end_where_they_began():
     """Twice integrated, the added tilt leaves neither speed nor displacement."""
     level = Command(9.8, (0.0, 0.0, 1.0), 0.3)
     times = np.arange(0.0, LENGTH_S + 0.5, 0.01)
-    size = math.radians(2.0)
-    flown = [excited(level, float(time_s), size, 0.05) for time_s in times]
+    flown = [excited(level, float(time_s)) for time_s in times]
     for axis in (0, 1):
         added = np.array([command.thrust_direction_ned[axis] for command in flown])
         speed = np.cumsum(added) * 0.01
-        assert np.abs(added).max() == pytest.approx(math.sin(size))
+        assert np.abs(added).max() == pytest.approx(math.sin(TILT_RAD))
         assert abs(speed[-1]) < 1e-4
         assert abs(np.sum(speed) * 0.01) < 1e-3
     for command in flown:
@@ -387,8 +367,8 @@ def test_attitude_loop_that_slows_is_noticed_and_flown(scenario, most_m, tmp_pat
     text = " | ".join(pair.companion.announced)
     doubt = text.index("the identified vehicle contradicts telemetry")
     known = text.index("identified tilt delay", doubt)
-    assert "bandwidth limited to 2.8 rad/s" in text[doubt:known]
-    assert float(text[known:].split()[5]) == pytest.approx(5.0, abs=0.2)
+    assert "bandwidth limited to 3.0 rad/s" in text[doubt:known]
+    assert float(text[known:].split()[7]) == pytest.approx(5.0, abs=0.2)
     assert "bandwidth 7.0 rad/s as configured" in text[known:]
     assert "contradicts" not in text[known:]
     assert pair.score(tmp_path).max_position_m < most_m

@@ -91,10 +91,10 @@ def test_sixty_ms_each_way_cause_a_limit_cycle_unless_identified(tmp_path: Path)
         known = sixty_ms_each_way(10, seed, IdentifySettings())
         score = known.score(tmp_path / str(seed))
         lines = [line for line in known.companion.announced if line.startswith("bandwidth")]
-        sentence = next(line for line in lines if "by the identified delay" in line)
+        sentence = next(line for line in lines if "identified delay" in line)
         used_radps = float(sentence.removeprefix("bandwidth limited to ").split()[0])
         assert 6.0 < used_radps < 10.0
-        assert f"(configured 10.0) by the identified delay, {score.delay_ms:.0f} " in sentence
+        assert f"(configured 10.0): identified delay, {score.delay_ms:.0f} " in sentence
         errors_m.append(score.rmse_position_m)
         assert score.delay_ms == pytest.approx(PLAIN_DELAY_MS + 120.0, abs=10.0)
     assert mean(errors_m) < 0.06  # 0.043 to 0.069

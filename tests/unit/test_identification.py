@@ -10,13 +10,14 @@ from scipy import signal
 from scipy.integrate import solve_ivp
 from scipy.linalg import expm
 
+from offboard.analysis.estimator_noise import estimator_noise
 from offboard.identification import attitude_fit
 from offboard.identification.attitude_fit import ResponseFit
 from offboard.identification.motion_fit import Motion, Noise, PositionFilter, predicted_velocity
 from offboard.identification.response import first_order, linear_recursion, second_order
 from offboard.identification.trace import Recorder, Trace, clean
 from offboard.identification.uncertainty import Estimate, long_run_covariance
-from offboard.identification.vehicle_fit import Identified, completed, identify, identify_hover
+from offboard.identification.vehicle_fit import Identified, completed, identify
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 G = 9.80665
@@ -276,29 +277,6 @@ def flown(
     return whole.between(0.5, seconds)  # what was commanded before is known
 
 
-@pytest.mark.parametrize("believed", [0.35, 0.5, 0.7])
-def test_hover_thrust_alone_is_identified_from_six_seconds(believed):
-    """It is 0.5, whatever was believed; the other constants are those of the vehicle."""
-    known = VEHICLE_FILE.model_copy(
-        update={
-            "hover_thrust": believed,
-            "thrust_delay_s": 0.02,
-            "thrust_lag_s": 0.05,
-            "drag_translation_npmps": (0.8 * VEHICLE_FILE.mass_kg,) * 3,
-        }
-    )
-    found = identify_hover(flown(noise=0.001).between(5.0, 11.0), known).hover_thrust
-    assert found is not None
-    assert found.value == pytest.approx(0.5, abs=max(0.002, 3.0 * found.sd))
-    assert found.sd < 0.01
-
-
-def test_hover_thrust_alone_needs_positions_and_commands():
-    found = identify_hover(flown().between(6.0, 7.0), VEHICLE_FILE)
-    assert found.hover_thrust is None
-    assert found.refusals["hover_thrust"] == "too few positions and commands"
-
-
 @pytest.mark.parametrize("noise", [0.0, 0.001])
 def test_every_constant_is_identified(noise):
     found = identify(flown(noise=noise), VEHICLE_FILE)
@@ -335,10 +313,12 @@ def test_reported_velocity_is_not_used():
     )
     assert misled.drag_ps == right.drag_ps
     assert misled.hover_thrust == right.hover_thrust
-    assert right.noise is not None
-    assert misled.noise is not None
-    assert right.noise.velocity_contradiction_mps < 0.002
-    assert 0.2 < misled.noise.velocity_contradiction_mps < 0.4
+    contradictions = [
+        estimator_noise(Trace(true.commands, true.attitude, each)).velocity_contradiction_mps
+        for each in (true.position, wrong)
+    ]
+    assert contradictions[0] < 0.002
+    assert 0.2 < contradictions[1] < 0.4
 
 
 def test_predicted_velocity_is_that_of_the_flight():
@@ -366,8 +346,7 @@ def test_predicted_velocity_is_that_of_the_flight():
 
 def test_white_noise_of_the_estimator_is_measured():
     trace = flown(noise=0.004)
-    noise = identify(trace, VEHICLE_FILE).noise
-    assert noise is not None
+    noise = estimator_noise(trace)
     assert noise.position_m == pytest.approx(0.004, rel=0.1)
     assert noise.attitude_rad == pytest.approx(0.0008, rel=0.15)
     assert noise.velocity_mps < 1e-4

@@ -21,7 +21,7 @@ from offboard.cli.daemon import may_pass
 from offboard.flight import manifest
 from offboard.flight.flight_plan import CLEAR_M, FlightPlan
 from offboard.flight.pilot_switch import PilotSwitch
-from offboard.identification.learned import Learned
+from offboard.identification.learner import Learned
 from offboard.identification.uncertainty import Estimate
 from offboard.link import clock
 from offboard.link.interface import LinkError
