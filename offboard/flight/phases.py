@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum, IntEnum
-from typing import Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -112,16 +112,21 @@ class ServiceOptions:
 class Limits(Parameters):
     """Limits of a flight. SI; seconds of vehicle time, but `connect_s`, `silence_s` and `late_s`
     of a decision are wall time, in lockstep simulated time. `failsafe` has what follows when one is
-    exceeded in flight."""
+    exceeded in flight. The class variables are no settings: no vehicle, link or site needed
+    another value."""
+
+    stream_s: ClassVar[float] = 1.0  # PX4 wants setpoints for 0.5 s before OFFBOARD
+    engage_s: ClassVar[float] = 10.0  # HEARTBEAT, at 1 Hz, may be the only report of the mode
+    arm_s: ClassVar[float] = 15.0  # refusals are asked again: checks may still be running
+    lift_off_s: ClassVar[float] = 8.0  # setpoints ramp to hover thrust in less than 2 s
+    disarm_s: ClassVar[float] = 5.0  # asked for again each second
+    late_s: ClassVar[float] = 90.0  # after the planned end of the climb: a strong head wind
+    excite_s: ClassVar[float] = 30.0  # three rounds of identification steps end within it
+    hand_back_s: ClassVar[float] = 3.0  # from the request to hold, to land
 
     # on the ground
     connect_s: float = Field(default=20.0, gt=0, le=600)
     health_s: float = Field(default=90.0, gt=0, le=600)
-    stream_s: float = Field(default=1.0, ge=0.6, le=10)
-    engage_s: float = Field(default=10.0, gt=0, le=60)
-    arm_s: float = Field(default=15.0, gt=0, le=60)
-    lift_off_s: float = Field(default=8.0, gt=0, le=30)
-    disarm_s: float = Field(default=5.0, ge=2, le=60)
     begin_armed: bool = True  # false: refuse a vehicle that is armed already
     begin_engaged: bool = False  # true: fly one that another controller has in the mode already
     begin_in_failsafe: bool = False  # true: take one over from its failsafe
@@ -129,10 +134,7 @@ class Limits(Parameters):
     link_delay_s: float = Field(default=0.4, gt=0, le=2)  # telemetry and setpoint together
     link_jitter_s: float = Field(default=0.15, gt=0, le=2)  # standard deviation of the delay
     # in flight
-    late_s: float = Field(default=90.0, gt=0, le=600)  # after the planned end of the climb
-    excite_s: float = Field(default=30.0, gt=5, le=600)
     hold_s: float = Field(default=2.0, ge=0.5, le=60)  # from hold to land
-    hand_back_s: float = Field(default=3.0, ge=1, le=60)  # from the request to hold, to land
     land_s: float = Field(default=90.0, gt=0, le=600)
     silence_s: float = Field(default=1.0, ge=0.2, le=60)  # no telemetry
     blind_s: float = Field(default=0.5, ge=0.15, le=10)  # no position, or no attitude
