@@ -45,12 +45,11 @@ from offboard.estimation.kalman import (
 )
 from offboard.estimation.propagation import (
     BIAS,
+    BIAS_TIME_CONSTANT_S,
     COMMANDS_KEPT,
     COURSE,
     COURSE_RATE,
     DISTURBANCE,
-    DRAG,
-    GRAVITY,
     LATER,
     MOTION,
     NOW,
@@ -61,7 +60,7 @@ from offboard.estimation.propagation import (
     TILT,
     TILT_RATE,
     VELOCITY,
-    plant_vector,
+    plant_of,
     replay,
     wrapped,
 )
@@ -85,7 +84,6 @@ LONGEST_GAP_S = 1.0  # a longer gap or a step back in time restarts; a gap keeps
 # deviations of its innovation and a distance: position (m), velocity (m/s)
 GATE_SDS, GATES = 3.0, (0.3, 0.5)
 DISTURBANCE_LIMIT_MPS2 = 8.0
-BIAS_TIME_CONSTANT_S = 10.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,7 +189,7 @@ def update_by_position(observers: Any, time_s: float) -> None:
     observer = observers[0]
     noted, measured = observer.adaptation, observer.measured
     state = observer.motion.states[NOW]
-    _bring_forward(measured, state, observer.motion.plant[:], observer.time_s - time_s)
+    _bring_forward(measured, state, observer.motion.plant, observer.time_s - time_s)
     _missed(state, measured, noted.innovation)
     jumped = False
     for kind in range(2):
@@ -233,17 +231,17 @@ def _missed(state: Array, measured: Array, missed: Array) -> None:
 
 
 @kernel
-def _bring_forward(measured: Array, state: Array, plant: Array, late_s: float) -> None:
+def _bring_forward(measured: Array, state: Array, plant: Any, late_s: float) -> None:
     """Propagate position and velocity `measured` (6,) by `late_s`, to the time of the state."""
     if late_s <= 0.0:
         return
     direction = (state[TILT], state[TILT + 1], upright(state[TILT], state[TILT + 1]))
-    gravity = (0.0, 0.0, plant[GRAVITY])
+    gravity = (0.0, 0.0, plant.gravity)
     for i in range(3):
         speed = state[VELOCITY + i]
         measured[POSITION + i] += late_s * speed
         measured[VELOCITY + i] += late_s * acceleration(
-            gravity[i], state[THRUST] * direction[i], plant[DRAG], speed, state[DISTURBANCE + i]
+            gravity[i], state[THRUST] * direction[i], plant.drag_ps, speed, state[DISTURBANCE + i]
         )
 
 
@@ -455,7 +453,7 @@ class Observer:
     def _set_vehicle(self, vehicle: Vehicle) -> None:
         self._vehicle = vehicle
         self._gravity = vehicle.gravity_mps2
-        self._motion["plant"] = plant_vector(vehicle, BIAS_TIME_CONSTANT_S)
+        self._motion["plant"] = plant_of(vehicle)
         frequency = max(vehicle.tilt.natural_frequency_radps, vehicle.yaw.natural_frequency_radps)
         damping = max(vehicle.tilt.damping, vehicle.yaw.damping, 0.5)
         self._longest_s = min(0.02, 0.25 / (2.0 * damping * frequency))

@@ -31,19 +31,18 @@ COURSE = 17
 COURSE_RATE = 18
 STATE_SIZE = 19
 
-# Indices of the plant vector.
-GRAVITY = 0
-DRAG = 1
-TILT_FREQUENCY = 2
-TILT_DAMPING = 3
-TILT_DELAY = 4
-THRUST_LAG = 5
-THRUST_DELAY = 6
-YAW_FREQUENCY = 7
-YAW_DAMPING = 8
-YAW_DELAY = 9
-BIAS_TIME_CONSTANT = 10
-PLANT_SIZE = 11
+PLANT = np.dtype(
+    [
+        (name, "f8")
+        for name in (
+            "gravity", "drag_ps", "thrust_delay_s", "thrust_lag_s",
+            "tilt_delay_s", "tilt_frequency", "tilt_damping",
+            "yaw_delay_s", "yaw_frequency", "yaw_damping",
+        )
+    ],
+    align=True,
+)  # fmt: skip
+"""The constants of a vehicle that its motion needs."""
 
 # Columns of the command history, oldest row first.
 SENT_AT = 0
@@ -57,7 +56,7 @@ NOW, LATER = 0, 1  # rows of the states
 MOTION = np.dtype(
     [
         ("states", "f8", (2, STATE_SIZE)),
-        ("plant", "f8", PLANT_SIZE),
+        ("plant", PLANT),
         ("history", "f8", (COMMANDS_KEPT, COMMAND_SIZE)),
         ("sent", "i8"),  # rows of the history that are in use
         ("slopes", "f8", (5, STATE_SIZE)),  # scratch
@@ -67,20 +66,19 @@ MOTION = np.dtype(
 """States, the constants of the plant and the commands sent."""
 
 LONGEST_STEP_S = 0.01
+BIAS_TIME_CONSTANT_S = 10.0  # with which the bias of the reported velocity is forgotten
 SAME_TIME_S = 1e-9
 
 
-def plant_vector(vehicle: Vehicle, bias_time_constant_s: float) -> Array:
-    """The constants (PLANT_SIZE,) of `vehicle`."""
-    plant = np.empty(PLANT_SIZE)
-    plant[GRAVITY], plant[DRAG] = vehicle.gravity_mps2, vehicle.drag_per_mass_ps
-    plant[THRUST_DELAY], plant[THRUST_LAG] = vehicle.thrust_delay_s, vehicle.thrust_lag_s
+def plant_of(vehicle: Vehicle) -> tuple[float, ...]:
+    """The PLANT of `vehicle`, in the order of its fields."""
     tilt, yaw = vehicle.tilt, vehicle.yaw
-    plant[TILT_DELAY], plant[YAW_DELAY] = tilt.delay_s, yaw.delay_s
-    plant[TILT_FREQUENCY], plant[TILT_DAMPING] = tilt.natural_frequency_radps, tilt.damping
-    plant[YAW_FREQUENCY], plant[YAW_DAMPING] = yaw.natural_frequency_radps, yaw.damping
-    plant[BIAS_TIME_CONSTANT] = bias_time_constant_s
-    return plant
+    return (
+        vehicle.gravity_mps2, vehicle.drag_per_mass_ps,
+        vehicle.thrust_delay_s, vehicle.thrust_lag_s,
+        tilt.delay_s, tilt.natural_frequency_radps, tilt.damping,
+        yaw.delay_s, yaw.natural_frequency_radps, yaw.damping,
+    )  # fmt: skip
 
 
 @kernel
@@ -102,24 +100,24 @@ def _differentiate(
     tilt_n: float,
     tilt_e: float,
     course: float,
-    plant: Array,
+    plant: Any,
     rate: Array,
 ) -> None:
     """Right-hand side at collective thrust `thrust` and the commands now in force."""
     b_n, b_e = state[TILT], state[TILT + 1]
-    gravity = (0.0, 0.0, plant[GRAVITY])
+    gravity = (0.0, 0.0, plant.gravity)
     direction = (b_n, b_e, upright(b_n, b_e))
     for axis in range(3):
         velocity = state[VELOCITY + axis]
         rate[POSITION + axis] = velocity
         rate[VELOCITY + axis] = acceleration(
-            gravity[axis], thrust * direction[axis], plant[DRAG], velocity,
+            gravity[axis], thrust * direction[axis], plant.drag_ps, velocity,
             state[DISTURBANCE + axis],
         )  # fmt: skip
         rate[DISTURBANCE + axis] = 0.0
-        rate[BIAS + axis] = -state[BIAS + axis] / plant[BIAS_TIME_CONSTANT]
-    stiffness = plant[TILT_FREQUENCY] ** 2
-    damping = 2.0 * plant[TILT_DAMPING] * plant[TILT_FREQUENCY]
+        rate[BIAS + axis] = -state[BIAS + axis] / BIAS_TIME_CONSTANT_S
+    stiffness = plant.tilt_frequency**2
+    damping = 2.0 * plant.tilt_damping * plant.tilt_frequency
     rate[TILT] = state[TILT_RATE]
     rate[TILT + 1] = state[TILT_RATE + 1]
     rate[TILT_RATE] = stiffness * (tilt_n - b_n) - damping * state[TILT_RATE]
@@ -127,8 +125,8 @@ def _differentiate(
     rate[THRUST] = 0.0
     rate[COURSE] = state[COURSE_RATE]
     rate[COURSE_RATE] = (
-        plant[YAW_FREQUENCY] ** 2 * (course - state[COURSE])
-        - 2.0 * plant[YAW_DAMPING] * plant[YAW_FREQUENCY] * state[COURSE_RATE]
+        plant.yaw_frequency**2 * (course - state[COURSE])
+        - 2.0 * plant.yaw_damping * plant.yaw_frequency * state[COURSE_RATE]
     )
 
 
@@ -153,11 +151,11 @@ def _step(
     tilt_e: float,
     thrust: float,
     course: float,
-    plant: Array,
+    plant: Any,
     slopes: Array,
 ) -> None:
     """One Runge-Kutta step of fourth order; the thrust's lag is integrated exactly."""
-    lag = plant[THRUST_LAG]
+    lag = plant.thrust_lag_s
     middle = _lagged(state[THRUST], thrust, lag, 0.5 * h)
     end = _lagged(state[THRUST], thrust, lag, h)
     start = state[THRUST] if lag > 0.0 else thrust
@@ -182,15 +180,15 @@ def replay(motions: Any, row: int, start_s: float, end_s: float) -> None:
     Until the first command takes effect, tilt, thrust and course keep their values.
     """
     motion = motions[0]
-    state, history, plant = motion.states[row], motion.history, motion.plant[:]
+    state, history, plant = motion.states[row], motion.history, motion.plant
     for i in range(STATE_SIZE):
         state[i] = motion.states[NOW, i]
-    longest = min(LONGEST_STEP_S, 0.2 / plant[TILT_FREQUENCY], 0.2 / plant[YAW_FREQUENCY])
+    longest = min(LONGEST_STEP_S, 0.2 / plant.tilt_frequency, 0.2 / plant.yaw_frequency)
     time = start_s
     while end_s - time > SAME_TIME_S:
-        tilt_row, tilt_next = _in_force(motion, time, plant[TILT_DELAY])
-        thrust_row, thrust_next = _in_force(motion, time, plant[THRUST_DELAY])
-        course_row, course_next = _in_force(motion, time, plant[YAW_DELAY])
+        tilt_row, tilt_next = _in_force(motion, time, plant.tilt_delay_s)
+        thrust_row, thrust_next = _in_force(motion, time, plant.thrust_delay_s)
+        course_row, course_next = _in_force(motion, time, plant.yaw_delay_s)
         until = min(end_s, min(tilt_next, min(thrust_next, course_next)))
         steps = max(1, math.ceil((until - time) / longest - 1e-6))
         h = (until - time) / steps

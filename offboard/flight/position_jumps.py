@@ -12,11 +12,12 @@ from collections import deque
 import numpy as np
 from numpy.typing import NDArray
 
+from offboard.estimation.observer import GATES
 from offboard.mavlink.events import LocalPosition
 
 Array = NDArray[np.float64]
 
-LEAST_JUMP_M = 0.3  # as `observer.GATES`; a smaller one is corrected as an error
+LEAST_JUMP_M = GATES[0]  # a smaller one is corrected as an error
 ACCELERATION_MPS2 = 20.0  # that the reported velocities need not show
 LONGEST_GAP_S = 0.5  # after a longer one nothing is concluded
 RECENT_S = 10.0

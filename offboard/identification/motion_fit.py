@@ -164,10 +164,10 @@ class PositionFilter:
         steps = zip(self._steps_s, motion_transitions(self._steps_s, drag_ps), strict=True)
         for i, (step_s, transition) in enumerate(steps):
             covariance = transition @ covariance @ transition.T + growth * step_s
-            spread = covariance[0, 0] + variance
-            gain = covariance[0] / spread
+            innovation_variance = covariance[0, 0] + variance
+            gain = covariance[0] / innovation_variance
             covariance = covariance - gain[:, None] * covariance[0]
-            self._gains[i], self._sds[i] = gain, math.sqrt(spread)
+            self._gains[i], self._sds[i] = gain, math.sqrt(innovation_variance)
 
     def innovations(self, positions: Array, accelerations: Array, drag_ps: float) -> Array:
         """Normalised innovations (axes, N - 1) for `positions` (axes, N) under `accelerations`
@@ -283,12 +283,12 @@ def fit_vertical(motion: Motion, gravity_mps2: float, prior: VerticalPrior) -> V
     scores_covariance = long_run_covariance(found.jac[:rows] * found.fun[:rows, None], lags)
     scores_covariance += found.jac[rows:].T @ found.jac[rows:]
     covariance = sandwich(found.jac.T @ found.jac, scores_covariance)
-    spread = np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    found_sds = np.sqrt(np.maximum(np.diag(covariance), 0.0))
     effect_sd_s = FEW_RELATED * math.sqrt(max(float(np.sum(covariance[1:3, 1:3])), 0.0))
     return VerticalFit(
-        hover_thrust=Estimate(float(1.0 / inverse), float(spread[0] / inverse**2)),
-        thrust_lag_s=Estimate(float(lag_s), float(spread[2])),
-        thrust_delay_s=Estimate(float(delay_s), float(spread[1])),
+        hover_thrust=Estimate(float(1.0 / inverse), float(found_sds[0] / inverse**2)),
+        thrust_lag_s=Estimate(float(lag_s), float(found_sds[2])),
+        thrust_delay_s=Estimate(float(delay_s), float(found_sds[1])),
         thrust_effect_s=Estimate(float(delay_s + lag_s), effect_sd_s),
-        drag_ps=Estimate(float(drag_ps), float(spread[3])),
+        drag_ps=Estimate(float(drag_ps), float(found_sds[3])),
     )

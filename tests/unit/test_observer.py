@@ -11,7 +11,7 @@ import pytest
 from attitude_plant import Plant, Truth
 from scipy.integrate import solve_ivp
 
-from offboard.estimation.observer import BIAS_TIME_CONSTANT_S, Noise, Observer
+from offboard.estimation.observer import Noise, Observer
 from offboard.estimation.propagation import (
     COMMAND_SIZE,
     LATER,
@@ -19,7 +19,7 @@ from offboard.estimation.propagation import (
     NOW,
     STATE_SIZE,
     THRUST,
-    plant_vector,
+    plant_of,
     replay,
 )
 from offboard.model.command import Command
@@ -159,7 +159,7 @@ def test_replay_agrees_with_scipy(damping: float) -> None:
         x = solve_ivp(rate, (a, b), x, "DOP853", args=(u,), rtol=1e-11, atol=1e-12).y[:, -1]
     motion = np.zeros(1, MOTION)
     motion["states"][0, NOW] = start
-    motion["plant"] = plant_vector(vehicle, BIAS_TIME_CONSTANT_S)
+    motion["plant"] = plant_of(vehicle)
     motion["history"][0, :5], motion["sent"] = sent, 5
     replay(motion, LATER, 0.0, 1.0)
     assert motion["states"][0, LATER] == pytest.approx(x, abs=3e-6)
