@@ -132,8 +132,8 @@ def simulate(
         from simulator import config
         from simulator.firmware.catalogue import FIRMWARES
         from simulator.instance import VIRTUAL_EPOCH_US, Instance
-        from simulator.link.links import LinkError, open_beside, open_link, shifted
         from simulator.link.recorder import Recorder
+        from simulator.link.sockets import LinkError, open_beside, open_link, shifted
         from simulator.run import Endpoint, Runner, warm_up
 
     personality = FIRMWARES.get(firmware)

@@ -11,10 +11,10 @@ from collections.abc import Mapping, Sequence
 
 from offboard.model.vehicle import Vehicle
 from simulator.autopilot.autopilot import Autopilot
-from simulator.autopilot.pilot import OFF
+from simulator.autopilot.position_controller import OFF
 from simulator.faults import Fault
+from simulator.faults.injection import prepare
 from simulator.firmware.base import Firmware
-from simulator.injection import prepare
 from simulator.link.impairment import frames
 from simulator.mavlink.server import Server
 from simulator.mavlink.signing import Keyring
@@ -88,14 +88,14 @@ class Instance:
         self.view = View(self.autopilot, system, epoch_us - clock_us, builders(firmware))
         self.view.clock_offset_us = clock_us
         self.keyring = Keyring(
-            firmware.link.accepted_unsigned,
-            self._unix_us if firmware.link.stamps_follow_clock else None,
+            firmware.accepted_unsigned,
+            self._unix_us if firmware.stamps_follow_clock else None,
             signing_key,
         )
-        rates_hz = firmware.streams.ground_rates_hz if ground_link else {}
+        rates_hz = firmware.ground_rates_hz if ground_link else {}
         self.companion = Server(
             self.view,
-            firmware.streams.companion_rates_hz,
+            firmware.companion_rates_hz,
             self.keyring,
             number=0,
             barrier=lockstep,
@@ -105,7 +105,7 @@ class Instance:
         self._injection = prepare(faults, seed)
         self._arrived: list[bytes] = []
         self._barrier_ms = 0
-        self._position_interval_ms = firmware.streams.position_grid_steps * STEP_MS
+        self._position_interval_ms = firmware.position_grid_steps * STEP_MS
         self._back_at_step = 0
 
     @property
@@ -131,7 +131,7 @@ class Instance:
     @property
     def idle(self) -> bool:
         """Disarmed and on the ground."""
-        return not self.autopilot.commander.armed and self.autopilot.pilot.landed
+        return not self.autopilot.commander.armed and self.autopilot.position_controller.landed
 
     def advance(self) -> None:
         """Simulate one step of STEP_S; telemetry waits in the links until `drain`."""
@@ -225,7 +225,7 @@ class Instance:
         self.autopilot = Autopilot(
             old.firmware, old.plant, old.parameters, old.mission, boot_scale=old.health.boot_scale
         )
-        self.autopilot.pilot.detector.set_landed(old.plant.on_ground)
+        self.autopilot.position_controller.detector.set_landed(old.plant.on_ground)
         self.view.restart(self.autopilot)
         self.keyring.restart()
         self.companion.restart()

@@ -36,7 +36,7 @@ class Sitl:
     """
 
     def __init__(self, directory: Path, options: dict[str, Any]) -> None:
-        from simulator.link.links import free_ports
+        from simulator.link.sockets import free_ports
 
         self.scenario = options.get("scenario")
         self.port, self.ground_port = free_ports(2)

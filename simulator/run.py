@@ -16,8 +16,8 @@ from dataclasses import dataclass
 from offboard.documents.repeated import Repeated
 from offboard.link.clock import monotonic_s, unix_us
 from simulator.instance import Instance
-from simulator.link.links import Link, wait
 from simulator.link.recorder import Recorder
+from simulator.link.sockets import Link, wait
 from simulator.steps import STEP_S
 
 RESEND_S = 0.05  # of a barrier, until the companion first sends something

@@ -10,7 +10,7 @@ from offboard.documents.errors import DocumentError
 from offboard.documents.parameters import Parameters
 from simulator.autopilot.autopilot import Autopilot
 from simulator.autopilot.commander import Request
-from simulator.faults import ModeName
+from simulator.faults.base import ModeName
 
 CLIMB_S = 60.0  # for the climb
 SETTLE_S = 2.0
@@ -34,7 +34,7 @@ def take_off(autopilot: Autopilot, start: Start) -> None:
     Raises:
         DocumentError: the vehicle does not reach the height.
     """
-    ready_s = autopilot.firmware.health.passes_after_s * autopilot.health.boot_scale + SETTLE_S
+    ready_s = autopilot.firmware.passes_after_s * autopilot.health.boot_scale + SETTLE_S
     while autopilot.state.time_s < ready_s:
         autopilot.step()
     _climb(autopilot, start.height_m)
@@ -56,7 +56,7 @@ def _climb(autopilot: Autopilot, height_m: float) -> None:
     A firmware that does not take off in its mode is given the one in which it does.
     """
     request = Request(takeoff_ned_m=(math.nan, math.nan, -height_m))
-    autopilot.handle("mode", Request(autopilot.firmware.commands.reposition_mode))
+    autopilot.handle("mode", Request(autopilot.firmware.reposition_mode))
     autopilot.handle("arm")
     autopilot.handle("takeoff", request)
 

@@ -1,8 +1,8 @@
 """One autopilot on one plant, step by step: it controls the plant and then handles events.
 
-The commander decides about modes, the navigator chooses the motion, the pilot flies it, health and
-monitors report what changes without a request. Knows no MAVLink frames, sockets or clock: its time
-is the plant's.
+The commander decides about modes, the navigator chooses the motion, the position controller flies
+it, health and monitors report what changes without a request. Knows no MAVLink frames, sockets or
+clock: its time is the plant's.
 """
 
 from __future__ import annotations
@@ -12,12 +12,11 @@ from typing import Any
 
 from simulator.autopilot.commander import NO_REQUEST, Commander, Request
 from simulator.autopilot.guidance import Guidance
-from simulator.autopilot.health import Health
+from simulator.autopilot.health import MONITOR_STEPS, Health, Monitors
 from simulator.autopilot.mission import Mission
-from simulator.autopilot.monitors import MONITOR_STEPS, Monitors
 from simulator.autopilot.navigator import Navigator
 from simulator.autopilot.parameters import ParameterTable
-from simulator.autopilot.pilot import Pilot
+from simulator.autopilot.position_controller import PositionController
 from simulator.autopilot.setpoints import ATTITUDE, SetpointStream
 from simulator.autopilot.state import VehicleState
 from simulator.firmware.base import Firmware
@@ -47,15 +46,17 @@ class Autopilot:
     ) -> None:
         self.firmware, self.plant = firmware, plant
         self.parameters = parameters or ParameterTable(firmware)
-        self.mission = mission or Mission(firmware.origin, firmware.missions)
+        self.mission = mission or Mission(firmware)
         self.state = VehicleState(plant)
         self.monitors = Monitors(firmware, self.parameters)
         self.stream = SetpointStream(firmware, self.parameters)
         self.guidance = Guidance(firmware, self.parameters, self.mission)
         self.health = Health(self.guidance, self.stream, self.monitors, boot_scale)
         self.navigator = Navigator(self.guidance)
-        self.pilot = Pilot(self.navigator, self.state)
-        self.commander = Commander(self.navigator, self.pilot, self.state, self.health)
+        self.position_controller = PositionController(self.navigator, self.state)
+        self.commander = Commander(
+            self.navigator, self.position_controller, self.state, self.health
+        )
 
     def handle(self, event: str, request: Request = NO_REQUEST) -> Result:
         """Handle an event from outside; returns the acknowledgement."""
@@ -68,7 +69,7 @@ class Autopilot:
         accepted = mode.behaviour is Behaviour.SETPOINT
         if message != ATTITUDE:
             accepted = accepted and mode.needs_position
-        if not (accepted or self.firmware.setpoints.outlive_modes):
+        if not (accepted or self.firmware.setpoints_outlive_modes):
             return
         home_down_m = self.guidance.home_ned_m[2]
         setpoint, refusal = self.stream.read(message, values, self.state.estimate, home_down_m)
@@ -93,19 +94,20 @@ class Autopilot:
         """End the takeoff of a mode that follows setpoints."""
         behaviour = self.commander.mode.behaviour
         if self.navigator.behaviour is not behaviour:
-            self.pilot.enter(behaviour)
+            self.position_controller.enter(behaviour)
 
     def step(self) -> None:
         """Fly STEP_S, then handle the events of the step."""
-        was_landed = self.pilot.landed
-        self.plant.advance(STEP_S, self.pilot.step(self.commander.armed))
+        was_landed = self.position_controller.landed
+        self.plant.advance(STEP_S, self.position_controller.step(self.commander.armed))
         self.state.step()
         for event in self._events(was_landed):
             self.commander.handle(event)
 
     def _events(self, was_landed: bool) -> Iterator[str]:
         """Events of this step; each is handled before the next one is looked for."""
-        commander, pilot, now_s = self.commander, self.pilot, self.state.time_s
+        commander, now_s = self.commander, self.state.time_s
+        controller = self.position_controller
         yield from self.health.boot_events(now_s)
         follows = commander.mode.behaviour is Behaviour.SETPOINT
         if commander.failsafe or follows:
@@ -115,11 +117,11 @@ class Autopilot:
             elif commander.armed and follows and not alive:
                 yield "stream lost"
         if commander.armed:
-            yield from commander.flight_time.step(now_s, was_landed, pilot.landed)
+            yield from commander.flight_time.step(now_s, was_landed, controller.landed)
             while self.guidance.events:
                 yield self.guidance.events.pop(0)
         if commander.armed:
-            yield from commander.flight_time.timeout(now_s, pilot.landed)
+            yield from commander.flight_time.timeout(now_s, controller.landed)
         if self.state.steps % MONITOR_STEPS == 0:
             battery, has_fix = self.state.truth.battery, self.state.gps_healthy
             yield from self.monitors.step(now_s, commander.armed, battery, has_fix)

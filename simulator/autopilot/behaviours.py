@@ -168,10 +168,10 @@ class Return(ActiveBehaviour):
     def enter(self, estimate: StateEstimate, place_ned_m: Triple, *, landed: bool) -> None:
         """Choose the height of the return and its yaw."""
         guidance, (x, y, z) = self.guidance, estimate.position_ned_m
-        read, flight = guidance.parameters.__getitem__, guidance.firmware.flight
+        read, firmware = guidance.parameters.__getitem__, guidance.firmware
         distance_m = self._distance_home_m(estimate)
-        height_m = flight.return_height_m(distance_m, read)
-        self._yaw = flight.return_yaw(distance_m, read)
+        height_m = firmware.return_height_m(distance_m, read)
+        self._yaw = firmware.return_yaw(distance_m, read)
         guidance.hold = MotionSetpoint((x, y, min(z, guidance.home_ned_m[2] - height_m)))
 
     @property
@@ -257,7 +257,7 @@ class FlyBySticks(ActiveBehaviour):
     def motion(self, estimate: StateEstimate, *, landed: bool) -> MotionSetpoint:
         """The velocity demanded; an axis without a demand holds its place."""
         guidance = self.guidance
-        descend = descent(guidance.hold_ned_m, guidance.firmware.flight.descend_speed_mps)
+        descend = descent(guidance.hold_ned_m, guidance.firmware.descend_speed_mps)
         if guidance.sticks is None:
             return descend
         demand = guidance.sticks.demand(estimate.time_s, estimate.yaw_rad)
@@ -306,7 +306,7 @@ class FollowSetpoint(ActiveBehaviour):
 
     @property
     def automatic(self) -> bool:
-        return self.guidance.firmware.setpoints.as_automatic
+        return self.guidance.firmware.setpoints_as_automatic
 
 
 BEHAVIOURS: Mapping[Behaviour, type[ActiveBehaviour]] = {

@@ -12,10 +12,9 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 from simulator.autopilot.behaviours import BEHAVIOURS
-from simulator.autopilot.health import Health
-from simulator.autopilot.monitors import FlightTime
+from simulator.autopilot.health import FlightTime, Health
 from simulator.autopilot.navigator import Navigator
-from simulator.autopilot.pilot import Pilot
+from simulator.autopilot.position_controller import PositionController
 from simulator.autopilot.state import VehicleState
 from simulator.autopilot.state_table import StateTable, fields_of
 from simulator.firmware.base import AFTER_DELAY, Rule
@@ -50,9 +49,17 @@ class Commander:
     """
 
     def __init__(
-        self, navigator: Navigator, pilot: Pilot, state: VehicleState, health: Health
+        self,
+        navigator: Navigator,
+        controller: PositionController,
+        state: VehicleState,
+        health: Health,
     ) -> None:
-        self._navigator, self._pilot, self._guidance = navigator, pilot, navigator.guidance
+        self._navigator, self._controller, self._guidance = (
+            navigator,
+            controller,
+            navigator.guidance,
+        )
         self._firmware, self._parameters = self._guidance.firmware, self._guidance.parameters
         self._state, self._health = state, health
         firmware = self._firmware
@@ -83,12 +90,12 @@ class Commander:
     def velocity_ratio(self) -> float:
         """Innovation ratio of the velocity in the estimator."""
         error_mps = math.hypot(*self._state.velocity_error_ned_mps)
-        return self._firmware.health.velocity_ratio(error_mps)
+        return self._firmware.velocity_ratio(error_mps)
 
     @property
     def rejects_velocity(self) -> bool:
         """The innovation ratio of the velocity is too large to arm."""
-        most = self._firmware.health.velocity_ratio_most(self._parameters.__getitem__)
+        most = self._firmware.velocity_ratio_most(self._parameters.__getitem__)
         return most > 0.0 and self.velocity_ratio >= most
 
     @property
@@ -98,7 +105,7 @@ class Commander:
             mode=self.mode,
             reached=self._health.reached,
             armed=self.armed,
-            landed=self._pilot.landed,
+            landed=self._controller.landed,
             healthy=self.healthy,
             failsafe=self.failsafe,
             faulty=bool(self._latched),
@@ -184,18 +191,18 @@ class Commander:
             self._intended = name
             if mode.remembered:
                 self._remembered = name
-        if mode is not self.mode and not self._firmware.setpoints.outlive_modes:
+        if mode is not self.mode and not self._firmware.setpoints_outlive_modes:
             self._guidance.setpoint = None
         if mode is not self.mode or not BEHAVIOURS[mode.behaviour].continues:
-            self._pilot.enter(mode.behaviour, self._request.takeoff_ned_m)
+            self._controller.enter(mode.behaviour, self._request.takeoff_ned_m)
         self.mode = mode
 
     # -- actions -----------------------------------------------------------------------------
 
     def _arm(self) -> None:
         self.armed = True
-        self.flight_time.arm(self._state.time_s, self._pilot.landed)
-        self._pilot.arm()
+        self.flight_time.arm(self._state.time_s, self._controller.landed)
+        self._controller.arm()
 
     def _disarm(self) -> None:
         self.armed, self._delayed = False, None
@@ -217,11 +224,11 @@ class Commander:
 
     def _take_off(self) -> None:
         self._guidance.setpoint = None
-        self._pilot.enter(Behaviour.TAKEOFF, self._request.takeoff_ned_m)
+        self._controller.enter(Behaviour.TAKEOFF, self._request.takeoff_ned_m)
 
     def _hold(self) -> None:
         self._guidance.setpoint = None
-        self._pilot.enter(self.mode.behaviour)
+        self._controller.enter(self.mode.behaviour)
 
     def _latch(self) -> None:
         self._latched |= {self._event}
@@ -232,7 +239,7 @@ class Commander:
 
 CONDITIONS: dict[str, Callable[[Commander], bool]] = {
     "armed": lambda c: c.armed,
-    "landed": lambda c: c._pilot.landed,
+    "landed": lambda c: c._controller.landed,
     "action delayed": lambda c: c._delayed is not None,
     "ready": lambda c: c.healthy and c.mode.arms,
     "mode can run": lambda c: c._health.can_run(c._requested, c._state.time_s),
@@ -260,9 +267,9 @@ ACTIONS: dict[str, Callable[[Commander], None]] = {
     "delay": Commander._delay,
     "recover": Commander._recover,
     "take off": Commander._take_off,
-    "return": lambda c: c._pilot.enter(Behaviour.RETURN),
+    "return": lambda c: c._controller.enter(Behaviour.RETURN),
     "hold": Commander._hold,
-    "level": lambda c: c._pilot.level_off(),
+    "level": lambda c: c._controller.level_off(),
     "latch": Commander._latch,
     "reboot": Commander._reboot,
 }

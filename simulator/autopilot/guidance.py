@@ -28,7 +28,7 @@ class Guidance:
     def __init__(self, firmware: Firmware, parameters: ParameterTable, mission: Mission) -> None:
         self.firmware, self.parameters, self.mission = firmware, parameters, mission
         self.events = mission.events
-        sticks = firmware.flight.sticks
+        sticks = firmware.sticks
         self.sticks = None if sticks is None else Sticks(sticks)
         self.setpoint: AttitudeSetpoint | MotionSetpoint | None = None  # the newest of a client
         self.hold = MotionSetpoint(ORIGIN)

@@ -1,6 +1,6 @@
 """A mission: its items, its progress, and the place to fly to.
 
-Fences and rally points are stored and have no effect. What it reaches (an item, its end, an item
+What it reaches (an item, its end, an item
 that returns home) is an event. Knows positions and time; knows no modes, no links and no protocol
 (`simulator.mavlink.mission_transfer`).
 """
@@ -12,9 +12,9 @@ from dataclasses import dataclass, field
 from enum import IntEnum
 
 from simulator.autopilot.state import StateEstimate
-from simulator.firmware.base import MissionRules
+from simulator.firmware.base import Firmware
 from simulator.firmware.values import NAN3, MissionItem, MotionSetpoint, Triple
-from simulator.geodesy import Origin, down_m, to_metres
+from simulator.geodesy import down_m, to_metres
 
 ITEMS_MAX = 500
 _ACCEPTANCE_M, _ACCEPTANCE_HEIGHT_M = 2.0, 0.8  # NAV_ACC_RAD of multicopters, NAV_MC_ALT_RAD
@@ -43,10 +43,8 @@ _TIMED = frozenset({Kind.WAYPOINT, Kind.LOITER_TIME, Kind.DELAY})  # param1: s t
 class Mission:
     """Items and progress of one vehicle's mission. The commander takes its `events`."""
 
-    origin: Origin
-    rules: MissionRules
+    firmware: Firmware
     items: tuple[MissionItem, ...] = ()
-    other_items: dict[int, tuple[MissionItem, ...]] = field(default_factory=dict)  # by kind
     current: int = 0
     reached: int = -1
     finished: bool = False
@@ -61,7 +59,7 @@ class Mission:
     @property
     def first(self) -> int:
         """Number of the item with which it begins."""
-        return int(self.rules.home_first)
+        return int(self.firmware.home_item_first)
 
     @property
     def flyable(self) -> bool:
@@ -69,15 +67,8 @@ class Mission:
         flown = _PLACES | {Kind.RETURN}
         return any(item.command in flown for item in self.items[self.first :])
 
-    def items_of(self, kind: int) -> tuple[MissionItem, ...]:
-        """Items of this MAV_MISSION_TYPE."""
-        return self.other_items.get(kind, ()) if kind else self.items
-
-    def store(self, kind: int, items: tuple[MissionItem, ...]) -> None:
-        """Replace the items of this MAV_MISSION_TYPE; a mission starts from its beginning."""
-        if kind:
-            self.other_items[kind] = items
-            return
+    def store(self, items: tuple[MissionItem, ...]) -> None:
+        """Replace the items; the mission starts from its beginning."""
         self.items = items
         self.current, self.reached, self.finished = self.first, -1, False
         self._since_s = math.nan
@@ -128,7 +119,7 @@ class Mission:
         self.under_way = True
         if self.finished:
             self.go_to(self.first)
-        self.speed_mps = self._speed_before_pause if self.rules.keeps_speed else math.inf
+        self.speed_mps = self._speed_before_pause if self.firmware.mission_keeps_speed else math.inf
         self._target_ned_m = here_ned_m
         self._since_s = self._climb_down_m = math.nan
         first = next((item for item in self.items[self.current :] if item.command in _PLACES), None)
@@ -153,7 +144,7 @@ class Mission:
         lands = item.command == Kind.LAND
         if math.isnan(self._since_s) and self._near(item, estimate.position_ned_m):
             self._since_s = estimate.time_s
-            if lands and self.rules.reached_above_landing and self._approaching:
+            if lands and self.firmware.reached_above_landing and self._approaching:
                 self._report_reached()
         self._approaching = math.isnan(self._since_s)
         if self._approaching:
@@ -201,10 +192,10 @@ class Mission:
 
     def _position(self, item: MissionItem, home_ned_m: Triple) -> Triple:
         """NED; an item without coordinates keeps the present ones."""
-        north, east = to_metres(self.origin, item.x * 1e-7, item.y * 1e-7)
+        north, east = to_metres(self.firmware.origin, item.x * 1e-7, item.y * 1e-7)
         if item.x == 0 and item.y == 0:
             north, east = self._target_ned_m[:2]
-        return north, east, down_m(item.z, item.frame, self.origin, home_ned_m[2])
+        return north, east, down_m(item.z, item.frame, self.firmware.origin, home_ned_m[2])
 
     def _target(self, item: MissionItem, here_ned_m: Triple, home_ned_m: Triple) -> Triple:
         north, east, down = self._position(item, home_ned_m)
@@ -232,6 +223,6 @@ class Mission:
     def _yaw_rad(self, item: MissionItem) -> float:
         """NaN: face the direction of flight."""
         yaw_deg = item.params[3]
-        if item.command in self.rules.turning and math.isfinite(yaw_deg):
+        if item.command in self.firmware.turning_items and math.isfinite(yaw_deg):
             return math.remainder(math.radians(yaw_deg), 2.0 * math.pi)
         return math.nan

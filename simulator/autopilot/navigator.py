@@ -51,7 +51,7 @@ class Navigator:
         setpoint of another kind resets the requested speed."""
         guidance = self.guidance
         changes = _kind(setpoint) != _kind(guidance.setpoint)
-        if changes and guidance.firmware.setpoints.as_automatic:
+        if changes and guidance.firmware.setpoints_as_automatic:
             guidance.cruise_mps = math.inf
         guidance.setpoint = setpoint
 

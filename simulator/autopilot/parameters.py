@@ -26,7 +26,7 @@ class ParameterTable:
         self._specs = {spec.name: spec for spec in firmware.parameters}
         self._values = {spec.name: spec.default for spec in firmware.parameters}
         self._roles: Mapping[str, Role] = firmware.parameter_roles
-        self._bytewise = firmware.link.parameters_bytewise
+        self._bytewise = firmware.parameters_bytewise
         self.names = tuple(self._specs)
         self.changes = 0
 

@@ -31,7 +31,7 @@ class SetpointStream:
 
     def alive(self, now_s: float) -> bool:
         """The stream is not lost; the firmware notices a loss some time after its time-out."""
-        age_s = now_s - self.newest_s - self.firmware.setpoints.reaction_s
+        age_s = now_s - self.newest_s - self.firmware.stream_reaction_s
         return age_s <= self.parameters.role("stream_timeout_s")
 
     def read(
@@ -45,27 +45,27 @@ class SetpointStream:
             estimate: of the vehicle's state.
             home_down_m: down coordinate (NED) of home, to which heights may be relative.
         """
-        rules = self.firmware.setpoints
+        firmware = self.firmware
         if message == ATTITUDE:
-            return rules.attitude(values, self.parameters.__getitem__), None
+            return firmware.attitude_setpoint(values, self.parameters.__getitem__), None
         frame = values["coordinate_frame"]
         if message == LOCAL:
-            local = rules.in_local_frame(values, estimate.position_ned_m, estimate.attitude)
-        elif _has_position(values) and frame not in rules.global_frames:
-            return None, rules.rejection(message, frame)
+            local = firmware.in_local_frame(values, estimate.position_ned_m, estimate.attitude)
+        elif _has_position(values) and frame not in firmware.global_frames:
+            return None, firmware.setpoint_rejection(message, frame)
         else:
             local = self._in_metres(values, home_down_m)
-        setpoint = rules.motion(local)
+        setpoint = firmware.motion_setpoint(local)
         if setpoint is not None:
             return setpoint, None
         frame = local["coordinate_frame"]
-        return None, rules.rejection(message, None if frame == _LOCAL_NED else frame)
+        return None, firmware.setpoint_rejection(message, None if frame == _LOCAL_NED else frame)
 
     def _in_metres(self, values: Mapping[str, Any], home_down_m: float) -> Mapping[str, Any]:
         """Fields of GLOBAL as those of LOCAL in MAV_FRAME 1; a position is whole or ignored."""
         origin, frame, mask = self.firmware.origin, values["coordinate_frame"], values["type_mask"]
         x, y = to_metres(origin, values["lat_int"] * 1e-7, values["lon_int"] * 1e-7)
-        home_down_m *= -1.0 if self.firmware.setpoints.home_mirrored else 1.0
+        home_down_m *= -1.0 if self.firmware.home_mirrored else 1.0
         z = down_m(values["alt"], frame, origin, home_down_m)
         if frame in TERRAIN_FRAMES:
             z = -values["alt"]

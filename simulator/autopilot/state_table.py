@@ -36,7 +36,7 @@ class StateTable:
         self._firmware, self._conditions = firmware, conditions
         self._actions, self._text_values = actions, text_values
         delayed = (event + AFTER_DELAY for event in EVENTS)
-        events = EVENTS.union(delayed, firmware.health.boot)
+        events = EVENTS.union(delayed, firmware.boot_events_s)
         self._rows: dict[str, list[Rule]] = {event: [] for event in events}
         faults = [
             f"{firmware.name} rule {number} ({rule.event!r}): unknown {fault}"
@@ -83,7 +83,7 @@ class StateTable:
         if kind in ("since", "latched"):
             return event in EVENTS
         if kind == "reached":
-            return event in self._firmware.health.boot
+            return event in self._firmware.boot_events_s
         return condition in self._conditions
 
 

@@ -1,12 +1,13 @@
-"""What a firmware consists of: data and small functions that the rest of the simulator runs on.
+"""What a firmware consists of: data as fields, and how it reads and answers as methods.
 
-The autopilot and the MAVLink server never ask which firmware they run; they read one `Firmware`
-value. `px4` and `ardupilot` are folders with the same files, one for each part below. Another
-firmware is one more folder. Knows no simulator core, no message builder and no socket.
+The autopilot and the MAVLink server never ask which firmware they run; they read one `Firmware`.
+`simulator.firmware.px4` and `simulator.firmware.ardupilot` are its two subclasses. Knows no
+autopilot, no message builder and no socket.
 """
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -28,8 +29,6 @@ from simulator.firmware.values import (
 )
 from simulator.vehicle.battery import BatteryState
 
-# -- parameters --------------------------------------------------------------------------------
-
 Role = str | float | tuple[str, float]
 """Where a value comes from: a parameter, a constant, or a parameter and the factor to SI."""
 
@@ -44,32 +43,6 @@ class ParameterSpec:
     minimum: float
     maximum: float
     meaning: str
-
-
-# -- setpoints ---------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class SetpointRules:
-    """How a firmware reads setpoint messages, and when it obeys them."""
-
-    attitude: Callable[[Mapping[str, Any], ReadParameter], AttitudeSetpoint | MotionSetpoint | None]
-    motion: Callable[[Mapping[str, Any]], MotionSetpoint | None]
-    # fields in another local frame, position and attitude -> the same fields in MAV_FRAME 1
-    in_local_frame: Callable[[Mapping[str, Any], Triple, Quaternion], Mapping[str, Any]]
-    home_mirrored: bool  # in heights above home, home's own height enters with the wrong sign
-    global_frames: frozenset[int]  # MAV_FRAME accepted in SET_POSITION_TARGET_GLOBAL_INT
-    # text about this message in an unknown MAV_FRAME, or (None) without any demand
-    rejection: Callable[[str, int | None], StatusText | None]
-    mode_needs_stream: bool  # pre-arm checks of the setpoint mode fail without a stream
-    as_automatic: bool  # flown with the speeds and turn rates of automatic flight
-    outlive_modes: bool  # taken in any mode and kept; else in the setpoint mode only
-    imply_flight: bool  # any thrust counts as flight; the land detector does not run
-    spool_s: float  # from arming until the thrust of a setpoint acts
-    reaction_s: float  # from the time-out of the stream until it counts as lost
-
-
-# -- state table -----------------------------------------------------------------
 
 
 AFTER_DELAY = " after delay"
@@ -87,7 +60,7 @@ EVENTS = frozenset({
     "took off", "landed", "settled", "idle", "climbed", "already higher", "item reached",
     "mission progress", "mission return", "mission finished",
 })  # fmt: skip
-"""Events of every firmware; `HealthRules.boot` has those of the start."""
+"""Events of every firmware; `Firmware.boot_events_s` has those of the start."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,124 +88,6 @@ class Rule:
     result: Result = Result.ACCEPTED
     texts: tuple[StatusText, ...] = ()
     send: tuple[str, ...] = ()
-
-
-# -- commands ----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class CommandRules:
-    """How a firmware reads commands and acknowledges them."""
-
-    mode: Callable[[tuple[float, ...]], ModeRequest]  # params of MAV_CMD_DO_SET_MODE
-    mode_acked_twice: bool  # by the receiver before the commander does
-    set_mode: Callable[[int, int], ModeRequest]  # SET_MODE: base_mode, custom_mode
-    set_mode_acked_as: int | None  # MAV_CMD in the acknowledgement of SET_MODE; None: there is none
-    arm: Callable[[float], ArmRequest]  # param1 of MAV_CMD_COMPONENT_ARM_DISARM
-    force_codes: Mapping[str, float]  # its param2: arm, disarm
-    takeoff_above_home: bool  # height of MAV_CMD_NAV_TAKEOFF; else above mean sea level
-    reposition_mode: str  # mode for MAV_CMD_DO_REPOSITION
-    repositions_strictly: bool  # it needs a frame and a place; yaw and speed are ignored
-    speed_refusal: Result  # of MAV_CMD_DO_CHANGE_SPEED without a speed
-    # MAV_CMD acknowledged and not carried out: result, None: no acknowledgement. Any other command
-    # without a handler is UNSUPPORTED
-    answers: Mapping[int, Result | None]
-
-
-# -- missions ----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class MissionRules:
-    """What a firmware takes of missions, fences and rally points, and how it sends them back."""
-
-    strict: bool  # downloads in order only; items are requested in the kind that came last
-    home_first: bool  # item 0 of a mission is home
-    guided_items: bool  # an item with current = 2 is a place to fly to now
-    # MAV_MISSION_TYPE and item -> MAV_MISSION_RESULT and text of a refusal
-    refusal: Callable[[int, MissionItem], tuple[int, StatusText | None] | None]
-    unknown_kind: int  # MAV_MISSION_RESULT for an unknown MAV_MISSION_TYPE
-    texts: Mapping[int, StatusText]  # after an upload, by MAV_MISSION_TYPE
-    frame_shown: Callable[[MissionItem, bool], int]  # in whole 1e-7 degrees, or in degrees
-    without_autocontinue: frozenset[int]  # MAV_MISSION_TYPE
-    turning: frozenset[int]  # MAV_CMD whose fourth parameter is a yaw
-    reached_above_landing: bool  # also a landing is "item reached" above its place
-    keeps_speed: bool  # of a change-speed item across a pause
-
-
-# -- link --------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Streams:
-    """Messages that a firmware sends periodically and on request."""
-
-    companion_rates_hz: Mapping[str, float]  # without a request, by link
-    ground_rates_hz: Mapping[str, float]
-    # message -> builder, beside `simulator.mavlink.telemetry.BUILDERS` or in place of one
-    messages: Mapping[str, Callable[[Any], Sequence[Any]]]
-    withheld_until: Mapping[str, str]  # message -> boot event before which it is not sent
-    # message -> version of its content: a message that is due waits until it is a new one
-    versions: Mapping[str, Callable[[Any], Hashable]]
-    position_grid_steps: int  # the estimator's position is new at every such step
-    fixed: frozenset[str]  # messages whose interval cannot be changed
-    not_on_request: frozenset[str]
-    never_sent: frozenset[int]  # ids of which an interval is accepted
-    groups: Mapping[int, tuple[str, ...]]  # REQUEST_DATA_STREAM: MAV_DATA_STREAM -> messages
-    rate_max_hz: float
-    refusal: Result  # of an interval
-    refusal_text: str  # may name {id}; "": none
-    too_fast_text: str
-    request_refusal: Result  # of MAV_CMD_REQUEST_MESSAGE
-
-
-@dataclass(frozen=True, slots=True)
-class LinkRules:
-    """Link behaviour of a firmware."""
-
-    is_ground_station: Callable[[int, int, ReadParameter], bool]  # MAV_TYPE, system of a heartbeat
-    ground_station_stays_s: float  # after its last heartbeat
-    obeys_system: Callable[[int, int, ReadParameter], bool]  # sender, own
-    target_component_checked: bool
-    text_suffix: str
-    text_to_ground_stations_only: bool
-    parameters_bytewise: bool  # PARAM_VALUE holds the bytes of an integer, not its value
-    parameters_hashed: bool  # a list begins with _HASH_CHECK
-    accepted_unsigned: frozenset[int]  # messages that need no signature
-    stamps_follow_clock: bool  # of signatures; else they only count, and follow those of others
-    parameters_numbered: bool  # PARAM_VALUE.param_index is set also outside a list
-
-
-# -- health ------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Sensors:
-    """SYS_STATUS: MAV_SYS_STATUS_SENSOR bits once GPS has a fix, and when that is."""
-
-    present: int
-    enabled: int
-    health: int
-    first_fix_s: float
-
-
-@dataclass(frozen=True, slots=True)
-class HealthRules:
-    """How a firmware starts, when its checks pass, and when it fails."""
-
-    boot: Mapping[str, float]  # events of the start, s of vehicle time
-    sensors: Sensors
-    passes_after_s: float  # boot until the pre-arm checks pass
-    passes_without_position_after_s: float  # the same for modes that need none
-    fails_where_unarmable: bool  # pre-arm checks fail in a mode that does not arm
-    position_without_fix_s: float  # until the position estimate is lost
-    velocity_ratio: Callable[[float], float]  # error of the velocity in m/s -> innovation ratio
-    velocity_ratio_most: Callable[[ReadParameter], float]  # to arm; 0: not checked
-    battery_level: Callable[[BatteryState, ReadParameter], int]  # 0: good
-    battery_events: tuple[str, ...]  # of levels 1 on
-
-
-# -- flight ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,25 +138,9 @@ class StickFlight:
     braking_after_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class FlightRules:
-    """Automatic flight of a firmware."""
-
-    gains: Callable[[ReadParameter], PositionGains]
-    integrates_on_ramp: bool  # position loop, in a takeoff that still stands on the ground
-    landing: Landing
-    descend_speed_mps: float  # in a manual mode without stick input
-    sticks: StickFlight | None  # None: not flown by sticks
-    return_height_m: Callable[[float, ReadParameter], float]  # above home, by the distance to it
-    return_yaw: Callable[[float, ReadParameter], ReturnYaw | None]  # likewise; None: unchanged
-
-
-# -- the whole ---------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Firmware:
-    """One firmware. `parameter_roles` maps what the simulator needs to parameters."""
+@dataclass(frozen=True, kw_only=True)
+class Firmware(ABC):
+    """One firmware. A method's `parameter` reads a parameter by name."""
 
     name: str
     vehicle: str  # default vehicle and scenario
@@ -313,19 +152,164 @@ class Firmware:
     modes: Mapping[str, Mode]
     boot_mode: str
     hold_mode: str  # in which the vehicle stops and holds its position
-    heartbeat: Callable[[Condition], tuple[int, int]]  # base_mode but the armed bit, MAV_STATE
     rules: tuple[Rule, ...]
     parameters: tuple[ParameterSpec, ...]
-    parameter_roles: Mapping[str, Role]
+    parameter_roles: Mapping[str, Role]  # what the simulator needs -> where it comes from
     system_parameter: str  # holds the system id
-    commands: CommandRules
-    setpoints: SetpointRules
-    missions: MissionRules
-    streams: Streams
-    link: LinkRules
-    health: HealthRules
-    flight: FlightRules
+
+    # commands
+    mode_acked_twice: bool  # by the receiver before the commander does
+    set_mode_acked_as: int | None  # MAV_CMD in the acknowledgement of SET_MODE; None: there is none
+    force_codes: Mapping[str, float]  # param2 of MAV_CMD_COMPONENT_ARM_DISARM: arm, disarm
+    takeoff_above_home: bool  # height of MAV_CMD_NAV_TAKEOFF; else above mean sea level
+    reposition_mode: str  # mode for MAV_CMD_DO_REPOSITION
+    repositions_strictly: bool  # it needs a frame and a place; yaw and speed are ignored
+    speed_refusal: Result  # of MAV_CMD_DO_CHANGE_SPEED without a speed
+    # MAV_CMD acknowledged and not carried out: result, None: no acknowledgement. Any other command
+    # without a handler is UNSUPPORTED
+    command_answers: Mapping[int, Result | None]
+
+    # setpoints
+    home_mirrored: bool  # in heights above home, home's own height enters with the wrong sign
+    global_frames: frozenset[int]  # MAV_FRAME accepted in SET_POSITION_TARGET_GLOBAL_INT
+    setpoint_mode_needs_stream: bool  # its pre-arm checks fail without a stream
+    setpoints_as_automatic: bool  # flown with the speeds and turn rates of automatic flight
+    setpoints_outlive_modes: bool  # taken in any mode and kept; else in the setpoint mode only
+    setpoints_imply_flight: bool  # any thrust counts as flight; the land detector does not run
+    setpoint_spool_s: float  # from arming until the thrust of a setpoint acts
+    stream_reaction_s: float  # from the time-out of the stream until it counts as lost
+
+    # missions
+    strict_missions: bool  # downloads in order only; items are requested in the kind that came last
+    home_item_first: bool  # item 0 of a mission is home
+    guided_items: bool  # an item with current = 2 is a place to fly to now
+    mission_text: StatusText | None  # after an upload
+    turning_items: frozenset[int]  # MAV_CMD whose fourth parameter is a yaw
+    reached_above_landing: bool  # also a landing is "item reached" above its place
+    mission_keeps_speed: bool  # of a change-speed item across a pause
+
+    # telemetry
+    companion_rates_hz: Mapping[str, float]  # without a request, by link
+    ground_rates_hz: Mapping[str, float]
+    # message -> builder, beside `simulator.mavlink.messages` or in place of one
+    messages: Mapping[str, Callable[[Any], Sequence[Any]]]
+    withheld_until: Mapping[str, str]  # message -> boot event before which it is not sent
+    # message -> version of its content: a message that is due waits until it is a new one
+    message_versions: Mapping[str, Callable[[Any], Hashable]]
+    position_grid_steps: int  # the estimator's position is new at every such step
+    fixed_streams: frozenset[str]  # messages whose interval cannot be changed
+    not_on_request: frozenset[str]
+    never_sent: frozenset[int]  # ids of which an interval is accepted
+    stream_groups: Mapping[int, tuple[str, ...]]  # REQUEST_DATA_STREAM: MAV_DATA_STREAM -> messages
+    rate_max_hz: float
+    interval_refusal: Result
+    interval_refusal_text: str  # may name {id}; "": none
+    too_fast_text: str
+    request_refusal: Result  # of MAV_CMD_REQUEST_MESSAGE
+
+    # link
+    ground_station_stays_s: float  # after its last heartbeat
+    target_component_checked: bool
+    text_suffix: str
+    text_to_ground_stations_only: bool
+    parameters_bytewise: bool  # PARAM_VALUE holds the bytes of an integer, not its value
+    parameters_hashed: bool  # a list begins with _HASH_CHECK
+    parameters_numbered: bool  # PARAM_VALUE.param_index is set also outside a list
+    accepted_unsigned: frozenset[int]  # messages that need no signature
+    stamps_follow_clock: bool  # of signatures; else they only count, and follow those of others
+
+    # health
+    boot_events_s: Mapping[str, float]  # events of the start, s of vehicle time
+    sensor_bits: tuple[int, int, int]  # SYS_STATUS with a fix: present, enabled, healthy
+    first_fix_s: float  # of GPS
+    passes_after_s: float  # boot until the pre-arm checks pass
+    passes_without_position_after_s: float  # the same for modes that need none
+    fails_where_unarmable: bool  # pre-arm checks fail in a mode that does not arm
+    position_without_fix_s: float  # until the position estimate is lost
+    battery_events: tuple[str, ...]  # of battery levels 1 on
+
+    # flight
+    integrates_on_ramp: bool  # position loop, in a takeoff that still stands on the ground
+    landing: Landing
+    descend_speed_mps: float  # in a manual mode without stick input
+    sticks: StickFlight | None  # None: not flown by sticks
 
     def mode_named(self, name: str) -> Mode | None:
         """Mode by its name, of which "AUTO." may be left out; None where there is none."""
         return self.modes.get(name) or self.modes.get(f"AUTO.{name}")
+
+    @abstractmethod
+    def heartbeat(self, now: Condition) -> tuple[int, int]:
+        """base_mode without the armed bit, and MAV_STATE."""
+
+    @abstractmethod
+    def command_mode(self, params: tuple[float, ...]) -> ModeRequest:
+        """The request of MAV_CMD_DO_SET_MODE (176)."""
+
+    @abstractmethod
+    def set_mode(self, base_mode: int, custom_mode: int) -> ModeRequest:
+        """The request of SET_MODE, the deprecated message."""
+
+    @abstractmethod
+    def arm_request(self, param: float) -> ArmRequest:
+        """The request of MAV_CMD_COMPONENT_ARM_DISARM with this param1."""
+
+    @abstractmethod
+    def attitude_setpoint(
+        self, values: Mapping[str, Any], parameter: ReadParameter
+    ) -> AttitudeSetpoint | MotionSetpoint | None:
+        """SET_ATTITUDE_TARGET as the firmware reads it; None: ignored without an answer."""
+
+    @abstractmethod
+    def motion_setpoint(self, values: Mapping[str, Any]) -> MotionSetpoint | None:
+        """SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME 1; None where nothing is demanded."""
+
+    @abstractmethod
+    def in_local_frame(
+        self, values: Mapping[str, Any], position_ned_m: Triple, attitude: Quaternion
+    ) -> Mapping[str, Any]:
+        """Fields of SET_POSITION_TARGET_LOCAL_NED in another frame, as those in MAV_FRAME 1."""
+
+    @abstractmethod
+    def setpoint_rejection(self, message: str, frame: int | None) -> StatusText | None:
+        """Text about this message in an unknown MAV_FRAME, or (None) without any demand."""
+
+    @abstractmethod
+    def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
+        """MAV_MISSION_RESULT and text with which an item is refused; None: it is taken."""
+
+    @abstractmethod
+    def mission_frame(self, item: MissionItem, whole: bool) -> int:
+        """MAV_FRAME in which an item is sent back, in whole 1e-7 degrees or in degrees."""
+
+    @abstractmethod
+    def is_ground_station(self, kind: int, system: int, parameter: ReadParameter) -> bool:
+        """Whether a heartbeat with this MAV_TYPE and system id is a ground station's."""
+
+    @abstractmethod
+    def obeys_system(self, sender: int, own: int, parameter: ReadParameter) -> bool:
+        """Whether messages of this system id are handled."""
+
+    @abstractmethod
+    def velocity_ratio(self, error_mps: float) -> float:
+        """Innovation ratio of the velocity, as the firmware reports it."""
+
+    @abstractmethod
+    def velocity_ratio_most(self, parameter: ReadParameter) -> float:
+        """Its limit to arm; 0: not checked."""
+
+    @abstractmethod
+    def battery_level(self, battery: BatteryState, parameter: ReadParameter) -> int:
+        """0: good; each further level has an event in `battery_events`."""
+
+    @abstractmethod
+    def gains(self, parameter: ReadParameter) -> PositionGains:
+        """Gains and limits of the position loop."""
+
+    @abstractmethod
+    def return_height_m(self, distance_m: float, parameter: ReadParameter) -> float:
+        """Height of a return above home, by the distance to it."""
+
+    @abstractmethod
+    def return_yaw(self, distance_m: float, parameter: ReadParameter) -> ReturnYaw | None:
+        """Yaw of a return, likewise; None: unchanged."""

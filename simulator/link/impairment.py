@@ -141,8 +141,8 @@ class Channel:
         return b"".join(kept)
 
 
-class Path:
-    """One direction through any number of channels in series."""
+class LinkDirection:
+    """One direction of a link: any number of channels in series."""
 
     def __init__(self, channels: tuple[Channel, ...] = ()) -> None:
         self.channels = channels

@@ -17,7 +17,7 @@ from simulator.firmware.values import Behaviour, ModeRequest, Result, Triple, in
 from simulator.geodesy import down_m, to_metres
 from simulator.mavlink.codec import id_of, name_of
 from simulator.mavlink.outbox import Outbox
-from simulator.mavlink.schedule import Schedule
+from simulator.mavlink.telemetry import Schedule
 
 _HEIGHT_MAX_M = 83_000.0  # of home: ArduPilot's LOCATION_ALT_MAX_M
 _CHANGE_MODE = 1.0  # MAV_DO_REPOSITION_FLAGS
@@ -49,7 +49,7 @@ class Commands:
 
     def run(self, command: Command) -> None:
         """Carry out a command and acknowledge it on the same link."""
-        answers = self._autopilot.firmware.commands.answers
+        answers = self._autopilot.firmware.command_answers
         result: Result | None
         if command.number in answers:
             result = answers[command.number]
@@ -63,10 +63,10 @@ class Commands:
     def set_mode(self, base_mode: int, custom_mode: int, sender: tuple[int, int]) -> None:
         """SET_MODE, the deprecated message."""
         firmware = self._autopilot.firmware
-        request = firmware.commands.set_mode(base_mode, custom_mode)
+        request = firmware.set_mode(base_mode, custom_mode)
         result = self._request(request, sender[1] == _MISSION_PLANNER)
-        if firmware.commands.set_mode_acked_as is not None:
-            self._acknowledge(Command(firmware.commands.set_mode_acked_as, (), *sender), result)
+        if firmware.set_mode_acked_as is not None:
+            self._acknowledge(Command(firmware.set_mode_acked_as, (), *sender), result)
 
     def _acknowledge(self, command: Command, result: Result) -> None:
         self.outbox.send(
@@ -75,10 +75,10 @@ class Commands:
 
     def _set_mode(self, command: Command) -> Result:
         autopilot = self._autopilot
-        if autopilot.firmware.commands.mode_acked_twice:
+        if autopilot.firmware.mode_acked_twice:
             self._acknowledge(command, Result.ACCEPTED)
         by_ground_station = command.component == _MISSION_PLANNER
-        return self._request(autopilot.firmware.commands.mode(command.params), by_ground_station)
+        return self._request(autopilot.firmware.command_mode(command.params), by_ground_station)
 
     def _request(self, request: ModeRequest, by_ground_station: bool) -> Result:
         autopilot = self._autopilot
@@ -90,18 +90,18 @@ class Commands:
 
     def _arm_disarm(self, command: Command) -> Result | None:
         autopilot = self._autopilot
-        request = autopilot.firmware.commands.arm(command.params[0])
+        request = autopilot.firmware.arm_request(command.params[0])
         if not request.event:
             autopilot.commander.texts += () if request.text is None else (request.text,)
             return request.refusal
-        forced = command.params[1] == autopilot.firmware.commands.force_codes[request.event]
+        forced = command.params[1] == autopilot.firmware.force_codes[request.event]
         return autopilot.handle(f"force {request.event}" if forced else request.event)
 
     def _takeoff(self, command: Command) -> Result:
         height_m = command.params[6]
         autopilot = self._autopilot
         home_down_m = autopilot.guidance.home_ned_m[2]
-        if autopilot.firmware.commands.takeoff_above_home:
+        if autopilot.firmware.takeoff_above_home:
             down_m = home_down_m - height_m
             return autopilot.handle("takeoff", Request(takeoff_ned_m=(math.nan, math.nan, down_m)))
         place = to_metres(autopilot.firmware.origin, *command.params[4:6])
@@ -135,7 +135,7 @@ class Commands:
             return Result.UNSUPPORTED
         autopilot = self._autopilot
         yaw_rad, latitude, longitude, height_m = command.params[3:7]
-        strict = autopilot.firmware.commands.repositions_strictly
+        strict = autopilot.firmware.repositions_strictly
         speed_mps = math.inf if strict or not command.params[0] > 0.0 else command.params[0]
         if strict:
             if command.frame is None:
@@ -143,7 +143,7 @@ class Commands:
             if not (latitude or longitude):
                 return Result.DENIED
             yaw_rad = math.nan
-        result = autopilot.handle("mode", Request(autopilot.firmware.commands.reposition_mode))
+        result = autopilot.handle("mode", Request(autopilot.firmware.reposition_mode))
         if result is Result.ACCEPTED and autopilot.commander.armed:
             yaw_rad = yaw_rad if math.isfinite(yaw_rad) else math.nan
             place = self._place(latitude, longitude, height_m, command.frame or 0)
@@ -183,7 +183,7 @@ class Commands:
             return Result.ACCEPTED
         known = 0.0 < speed_mps < math.inf
         autopilot.guidance.cruise_mps = speed_mps if known else math.inf
-        return Result.ACCEPTED if known else autopilot.firmware.commands.speed_refusal
+        return Result.ACCEPTED if known else autopilot.firmware.speed_refusal
 
     def _turn(self, command: Command) -> Result:
         """MAV_CMD_CONDITION_YAW: to a yaw, or relative to the present one; degrees."""
@@ -219,23 +219,23 @@ class Commands:
 
     def _set_interval(self, command: Command) -> Result:
         number, interval_us = command.params[:2]
-        streams = self._autopilot.firmware.streams
+        firmware = self._autopilot.firmware
         name = message_name(number)
-        if 0 < interval_us < 1e6 / streams.rate_max_hz:
-            return self._refuse_interval(number, streams.too_fast_text)
-        if number in streams.never_sent and math.isfinite(interval_us):
+        if 0 < interval_us < 1e6 / firmware.rate_max_hz:
+            return self._refuse_interval(number, firmware.too_fast_text)
+        if number in firmware.never_sent and math.isfinite(interval_us):
             return Result.ACCEPTED
         if name is None or not math.isfinite(interval_us):
-            return self._refuse_interval(number, streams.refusal_text)
+            return self._refuse_interval(number, firmware.interval_refusal_text)
         if not self.schedule.set_interval(name, interval_us):
-            return self._refuse_interval(number, streams.refusal_text)
+            return self._refuse_interval(number, firmware.interval_refusal_text)
         return Result.ACCEPTED
 
     def _refuse_interval(self, number: float, text: str) -> Result:
         autopilot = self._autopilot
         if text and math.isfinite(number):
             autopilot.commander.texts.append(info(text.format(id=int(number))))
-        return autopilot.firmware.streams.refusal
+        return autopilot.firmware.interval_refusal
 
     def _get_interval(self, command: Command) -> Result:
         name = message_name(command.params[0])
@@ -246,11 +246,11 @@ class Commands:
 
     def _request_message(self, command: Command) -> Result:
         name = message_name(command.params[0])
-        streams = self._autopilot.firmware.streams
+        firmware = self._autopilot.firmware
         if name not in self.outbox.view.builders or self.outbox.view.withheld(name):
-            return streams.request_refusal
-        if name in streams.not_on_request:
-            return streams.request_refusal
+            return firmware.request_refusal
+        if name in firmware.not_on_request:
+            return firmware.request_refusal
         return self._send(name)
 
     def _send(self, name: str) -> Result:

@@ -1,32 +1,31 @@
 """Mission protocol of one link: upload, download, clear and current item.
 
-Missions, fences and rally points are transferred alike. Knows messages and items; the flight of a
-mission is in `simulator.autopilot.mission`, and which items a firmware takes in its `MissionRules`.
+Knows messages and items; the flight of a mission is in `simulator.autopilot.mission`, and which
+items a firmware takes in its `mission_refusal`. Fences and rally points are refused; there are none
+to download.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 
 from simulator.autopilot.mission import ITEMS_MAX, Kind, Mission
-from simulator.firmware.base import MissionRules
-from simulator.firmware.values import MissionItem, Severity, StatusText
+from simulator.firmware.base import Firmware
+from simulator.firmware.values import MissionItem, critical
 from simulator.mavlink.codec import Message
 from simulator.mavlink.outbox import Outbox, Texts
 
 REPEAT_S, GIVE_UP_S = 0.25, 5.0
 CHECK_S = 0.03  # from the last item until a strict firmware has checked the mission
-_ANY_TYPE = 255
-_KINDS = frozenset({0, 1, 2})  # MAV_MISSION_TYPE: mission, fence, rally points
+Peer = tuple[int, int]  # system, component
 
-
-_UNEXPECTED = StatusText(Severity.CRITICAL, "WPM: REJ. CMD: Req. WP was unexpected")
-_BUSY = StatusText(Severity.CRITICAL, "WPM: IGN MISSION_COUNT: Busy")
-_TIMEOUT = StatusText(Severity.CRITICAL, "Operation timeout")
-_NOT_REQUESTED = StatusText(Severity.CRITICAL, "IGN MISSION_ITEM: No transfer")
+_UNEXPECTED = critical("WPM: REJ. CMD: Req. WP was unexpected")
+_BUSY = critical("WPM: IGN MISSION_COUNT: Busy")
+_TIMEOUT = critical("Operation timeout")
+_NOT_REQUESTED = critical("IGN MISSION_ITEM: No transfer")
 
 
 class Ack(IntEnum):
@@ -42,10 +41,9 @@ class Ack(IntEnum):
 
 @dataclass(slots=True)
 class Upload:
-    """An upload in progress: sender, items received, time of the last request."""
+    """An upload in progress: sender, items received, times of the last progress and request."""
 
-    peer: tuple[int, int]
-    kind: int
+    peer: Peer
     count: int
     items: list[MissionItem]
     begun_s: float
@@ -56,25 +54,28 @@ class Upload:
 class Download:
     """A download in progress: receiver and next item."""
 
-    peer: tuple[int, int]
-    kind: int
+    peer: Peer
     active_s: float
     due: int = 0
 
 
 @dataclass(slots=True)
 class MissionTransfer:
-    """Mission transfers of one link."""
+    """Mission transfers of one link; `texts`: of this link."""
 
     outbox: Outbox
-    texts: Texts  # of this link
-    mission: Mission
-    rules: MissionRules
+    texts: Texts
+    mission: Mission = field(init=False)
+    _firmware: Firmware = field(init=False)
     _upload: Upload | None = None
     _download: Download | None = None
-    _taken: tuple[int, int] = (0, 0)  # count and kind of the last upload
+    _taken: int = 0  # count of the last upload
     _unchecked: tuple[tuple[MissionItem, ...], float] | None = None  # a mission; arrival time
     _whole: bool = False  # the peer uses the _INT messages, in 1e-7 degrees
+
+    def __post_init__(self) -> None:
+        autopilot = self.outbox.view.autopilot
+        self.mission, self._firmware = autopilot.mission, autopilot.firmware
 
     @property
     def under_way(self) -> bool:
@@ -89,22 +90,21 @@ class MissionTransfer:
     def _check(self, now_s: float) -> None:
         """Replace the vehicle's mission by the uploaded one once it has been checked."""
         if self._unchecked is not None and now_s - self._unchecked[1] >= CHECK_S:
-            self.mission.store(0, self._unchecked[0])
+            self.mission.store(self._unchecked[0])
             self._unchecked = None
 
     def step(self, now_s: float) -> None:
         """Request a missing item again, and give up after a while."""
         self._check(now_s)
-        download = self._download
-        if download is not None and now_s - download.active_s > GIVE_UP_S:
+        if self._download is not None and now_s - self._download.active_s > GIVE_UP_S:
             self._download = None
-            if self.rules.strict:
+            if self._firmware.strict_missions:
                 self.texts.send(_TIMEOUT)
         upload = self._upload
         if upload is None:
             return
         if now_s - upload.begun_s > GIVE_UP_S:
-            self._acknowledge(upload.peer, Ack.CANCELLED, upload.kind)
+            self._acknowledge(upload.peer, Ack.CANCELLED)
             self._upload = None
         elif now_s - upload.requested_s > REPEAT_S:
             self._request_item(upload, now_s)
@@ -112,42 +112,41 @@ class MissionTransfer:
     # -- up ----------------------------------------------------------------------------------
 
     def _count(self, message: Message, now_s: float) -> None:
-        peer = (message.system, message.component)
-        kind = message.mission_type
-        if self.rules.strict and self._download is not None:
-            self._acknowledge(peer, Ack.ERROR, self._download.kind)
+        peer = _sender(message)
+        if self._firmware.strict_missions and self._download is not None:
+            self._acknowledge(peer, Ack.ERROR)
             self.texts.send(_BUSY)
-        elif kind not in _KINDS:
-            self._acknowledge(peer, self.rules.unknown_kind, kind)
+        elif message.mission_type:
+            self._acknowledge(peer, Ack.UNSUPPORTED, message.mission_type)
         elif message.count > ITEMS_MAX:
-            self._acknowledge(peer, Ack.NO_SPACE, kind)
+            self._acknowledge(peer, Ack.NO_SPACE)
         elif message.count == 0:
-            self.mission.store(kind, ())
-            self._acknowledge(peer, Ack.ACCEPTED, kind)
+            self.mission.store(())
+            self._acknowledge(peer, Ack.ACCEPTED)
         else:
-            self._upload = Upload(peer, kind, message.count, [], now_s, now_s)
+            self._upload = Upload(peer, message.count, [], now_s, now_s)
             self._request_item(self._upload, now_s)
 
     def _request_item(self, upload: Upload, now_s: float) -> None:
         upload.requested_s = now_s
-        whole = self._whole and self.rules.strict
+        whole = self._whole and self._firmware.strict_missions
         name = "MISSION_REQUEST_INT" if whole else "MISSION_REQUEST"
-        self.outbox.send(name, *upload.peer, len(upload.items), upload.kind)
+        self.outbox.send(name, *upload.peer, len(upload.items), 0)
 
     def _item(self, message: Message, now_s: float) -> None:
         self._whole = message.name == "MISSION_ITEM_INT"
-        upload, peer = self._upload, (message.system, message.component)
-        if self.rules.strict and upload is None and self._download is None:
+        upload, peer = self._upload, _sender(message)
+        if self._firmware.strict_missions and upload is None and self._download is None:
             self._take_late(message, peer)
         if upload is None or upload.peer != peer:
             return
         if message.seq != len(upload.items):  # a duplicate
             return
         item = _read(message)
-        refused = self.rules.refusal(upload.kind, item)
+        refused = self._firmware.mission_refusal(item)
         if refused is not None:
             result, text = refused
-            self._acknowledge(upload.peer, result, upload.kind)
+            self._acknowledge(upload.peer, result)
             if text is not None:
                 self.texts.send(text)
             self._upload = None
@@ -156,27 +155,31 @@ class MissionTransfer:
         upload.begun_s = now_s
         if len(upload.items) < upload.count:
             self._request_item(upload, now_s)
-            return
-        if self.rules.strict and upload.kind == 0:
+        else:
+            self._take(upload, now_s)
+
+    def _take(self, upload: Upload, now_s: float) -> None:
+        """The upload is complete."""
+        if self._firmware.strict_missions:
             self._unchecked = (tuple(upload.items), now_s)
         else:
-            self.mission.store(upload.kind, tuple(upload.items))
-        self._upload, self._taken = None, (upload.count, upload.kind)
-        self._acknowledge(upload.peer, Ack.ACCEPTED, upload.kind)
-        if upload.kind in self.rules.texts:
-            self.texts.send(self.rules.texts[upload.kind])
+            self.mission.store(tuple(upload.items))
+        self._upload, self._taken = None, upload.count
+        self._acknowledge(upload.peer, Ack.ACCEPTED)
+        if self._firmware.mission_text is not None:
+            self.texts.send(self._firmware.mission_text)
 
-    def _take_late(self, message: Message, peer: tuple[int, int]) -> None:
+    def _take_late(self, message: Message, peer: Peer) -> None:
         """An item without an upload: the last one repeated, or one that was not requested."""
-        if (message.seq + 1, message.mission_type) == self._taken:
-            self._acknowledge(peer, Ack.ACCEPTED, message.mission_type)
+        if message.seq + 1 == self._taken and not message.mission_type:
+            self._acknowledge(peer, Ack.ACCEPTED)
             return
         self._acknowledge(peer, Ack.ERROR, message.mission_type)
         self.texts.send(_NOT_REQUESTED)
 
     def _ack(self, message: Message, now_s: float) -> None:
         """MISSION_ACK of the peer: it wants the other kind of request, or cancels."""
-        peer, upload = (message.system, message.component), self._upload
+        peer, upload = _sender(message), self._upload
         if self._download is not None and self._download.peer == peer:
             self._download = None
         if upload is None or upload.peer != peer:
@@ -187,36 +190,36 @@ class MissionTransfer:
         elif message.type == Ack.CANCELLED:
             self._upload = None
 
-    def _acknowledge(self, peer: tuple[int, int], ack: int, kind: int) -> None:
-        self.outbox.send("MISSION_ACK", *peer, int(ack), kind)
+    def _acknowledge(self, peer: Peer, ack: int, mission_type: int = 0) -> None:
+        self.outbox.send("MISSION_ACK", *peer, int(ack), mission_type)
 
     # -- down, and the rest ------------------------------------------------------------------
 
     def _list(self, message: Message, now_s: float) -> None:
-        kind, peer = message.mission_type, (message.system, message.component)
-        self._download = Download(peer, kind, now_s)
-        self.outbox.send("MISSION_COUNT", *peer, len(self.mission.items_of(kind)), kind)
+        mission_type, peer = message.mission_type, _sender(message)
+        count = 0 if mission_type else len(self.mission.items)
+        if not mission_type:
+            self._download = Download(peer, now_s)
+        self.outbox.send("MISSION_COUNT", *peer, count, mission_type)
 
     def _request(self, message: Message, now_s: float) -> None:
-        peer, kind = (message.system, message.component), message.mission_type
+        peer, items = _sender(message), self.mission.items
         self._whole = whole = message.name == "MISSION_REQUEST_INT"
-        items = self.mission.items_of(kind)
-        is_home = self.rules.home_first and kind == 0 and message.seq == 0
-        exists = is_home or message.seq < len(items)
-        if self.rules.strict and not self._is_due(peer, kind, message.seq, exists):
+        is_home = self._firmware.home_item_first and message.seq == 0
+        exists = not message.mission_type and (is_home or message.seq < len(items))
+        if self._firmware.strict_missions and not self._is_due(peer, message.seq, exists):
             return
         if self._download is not None:
             self._download.active_s = now_s
         if not exists:
-            self._acknowledge(peer, Ack.INVALID_SEQUENCE, kind)
+            self._acknowledge(peer, Ack.INVALID_SEQUENCE, message.mission_type)
             return
         item = self._home() if is_home else items[message.seq]
         places = (item.x, item.y) if whole else (item.x * 1e-7, item.y * 1e-7)
-        current = int(not kind and message.seq == self.mission.current)
-        autocontinue = int(kind not in self.rules.without_autocontinue)
-        head = (*peer, message.seq, self.rules.frame_shown(item, whole), item.command)
+        current = int(message.seq == self.mission.current)
+        head = (*peer, message.seq, self._firmware.mission_frame(item, whole), item.command)
         name = "MISSION_ITEM_INT" if whole else "MISSION_ITEM"
-        self.outbox.send(name, *head, current, autocontinue, *item.params, *places, item.z, kind)
+        self.outbox.send(name, *head, current, 1, *item.params, *places, item.z, 0)
 
     def _home(self) -> MissionItem:
         """Home as an item of a mission."""
@@ -225,28 +228,31 @@ class MissionTransfer:
         place = view.geodetic(north_m, east_m)
         return MissionItem(0, Kind.WAYPOINT, (0.0,) * 4, *place, view.altitude_mm(down_m) * 1e-3)
 
-    def _is_due(self, peer: tuple[int, int], kind: int, number: int, exists: bool) -> bool:
+    def _is_due(self, peer: Peer, number: int, exists: bool) -> bool:
         """Whether it is the next item or the last one again; any other ends the download."""
         download = self._download
-        if download is None or (download.peer, download.kind) != (peer, kind):
+        if download is None or download.peer != peer:
             return False
         if not exists or number not in (download.due - 1, download.due):
             self._download = None
-            self._acknowledge(peer, Ack.ERROR, kind)
+            self._acknowledge(peer, Ack.ERROR)
             self.texts.send(_UNEXPECTED)
             return False
         download.due = number + 1
         return True
 
     def _clear(self, message: Message, _: float) -> None:
-        asked = message.mission_type
-        for kind in _KINDS if asked == _ANY_TYPE else _KINDS & {asked}:
-            self.mission.store(kind, ())
-        self._acknowledge((message.system, message.component), Ack.ACCEPTED, asked)
+        if message.mission_type in (0, 255):  # the mission, or all
+            self.mission.store(())
+        self._acknowledge(_sender(message), Ack.ACCEPTED, message.mission_type)
 
     def _set_current(self, message: Message, _: float) -> None:
         if self.mission.go_to(message.seq):
             self.outbox.send_now("MISSION_CURRENT")
+
+
+def _sender(message: Message) -> Peer:
+    return message.system, message.component
 
 
 def _read(message: Message) -> MissionItem:

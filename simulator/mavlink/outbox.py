@@ -90,13 +90,13 @@ class Texts:
 
     def send(self, text: StatusText) -> None:
         """Queue a text, or hold it back until a ground station is there (PX4)."""
-        link = self.outbox.view.autopilot.firmware.link
-        if link.text_to_ground_stations_only and not self._has_ground_station:
+        firmware = self.outbox.view.autopilot.firmware
+        if firmware.text_to_ground_stations_only and not self._has_ground_station:
             self._held.append((self._now_us, text))
             return
         if not self.connected:
             return
-        encoded = (text.text + link.text_suffix).encode("ascii", "replace")
+        encoded = (text.text + firmware.text_suffix).encode("ascii", "replace")
         for chunk, at in enumerate(range(0, len(encoded), TEXT_LENGTH)):
             piece = encoded[at : at + TEXT_LENGTH]
             self.outbox.send("STATUSTEXT", int(text.severity), piece, self._number, chunk)
@@ -112,7 +112,7 @@ class Texts:
 
     @property
     def _has_ground_station(self) -> bool:
-        stays_us = self.outbox.view.autopilot.firmware.link.ground_station_stays_s * 1e6
+        stays_us = self.outbox.view.autopilot.firmware.ground_station_stays_s * 1e6
         return self._now_us - self._ground_station_us <= stays_us
 
     @property

@@ -46,7 +46,7 @@ class ParameterTransfer:
             return
         value, kind = autopilot.parameters.to_wire(name)
         names = autopilot.parameters.names
-        numbered = listed or autopilot.firmware.link.parameters_numbered
+        numbered = listed or autopilot.firmware.parameters_numbered
         index = names.index(name) if numbered else NO_INDEX
         self.outbox.send("PARAM_VALUE", name.encode(), value, kind, len(names), index)
 
@@ -59,7 +59,7 @@ class ParameterTransfer:
             self._answer(message.param_id)
 
     def _is_hash(self, name: str) -> bool:
-        return name == HASH and self.outbox.view.autopilot.firmware.link.parameters_hashed
+        return name == HASH and self.outbox.view.autopilot.firmware.parameters_hashed
 
     def _list(self, _: Message) -> None:
         hashed = (HASH,) if self._is_hash(HASH) and not self._due else ()

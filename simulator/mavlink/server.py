@@ -17,8 +17,8 @@ from simulator.mavlink.mission_transfer import MissionTransfer
 from simulator.mavlink.outbox import MAV_COMP_ID_AUTOPILOT, Outbox, Texts
 from simulator.mavlink.parameter_transfer import HANDLERS as PARAMETER_HANDLERS
 from simulator.mavlink.parameter_transfer import ParameterTransfer
-from simulator.mavlink.schedule import Schedule
 from simulator.mavlink.signing import Keyring
+from simulator.mavlink.telemetry import Schedule
 from simulator.mavlink.view import View
 
 _ITEMS, _GUIDED = ("MISSION_ITEM", "MISSION_ITEM_INT"), 2  # `current` of an item
@@ -62,11 +62,8 @@ class Server:
         self._begin_transfers()
 
     def _begin_transfers(self) -> None:
-        autopilot = self.view.autopilot
         self._parameters = ParameterTransfer(self.outbox)
-        self._missions = MissionTransfer(
-            self.outbox, self.texts, autopilot.mission, autopilot.firmware.missions
-        )
+        self._missions = MissionTransfer(self.outbox, self.texts)
 
     def restart(self) -> None:
         """Reset as after boot: default rates, no known client."""
@@ -102,18 +99,16 @@ class Server:
         """Whether its target is this system and its autopilot, or all."""
         system = message.values.get("target_system", 0)
         component = message.values.get("target_component", 0)
-        checked = self.view.autopilot.firmware.link.target_component_checked
+        checked = self.view.autopilot.firmware.target_component_checked
         for_autopilot = component in (0, MAV_COMP_ID_AUTOPILOT) or not checked
         read = self.view.autopilot.parameters.__getitem__
-        obeyed = self.view.autopilot.firmware.link.obeys_system(
-            message.system, self.view.system, read
-        )
+        obeyed = self.view.autopilot.firmware.obeys_system(message.system, self.view.system, read)
         return system in (0, self.view.system) and for_autopilot and obeyed
 
     def _heartbeat(self, message: Message) -> None:
         autopilot = self.view.autopilot
         read = autopilot.parameters.__getitem__
-        if autopilot.firmware.link.is_ground_station(message.type, message.system, read):
+        if autopilot.firmware.is_ground_station(message.type, message.system, read):
             autopilot.monitors.ground_station_heard(autopilot.state.time_s)
             self.texts.note_ground_station()
 
@@ -138,8 +133,8 @@ class Server:
         self._parameters.handle(message)
 
     def _mission(self, message: Message) -> None:
-        rules = self.view.autopilot.firmware.missions
-        if rules.guided_items and message.name in _ITEMS and message.current == _GUIDED:
+        guided = self.view.autopilot.firmware.guided_items
+        if guided and message.name in _ITEMS and message.current == _GUIDED:
             self._guided_item(message)
             return
         self._missions.handle(message, self.view.autopilot.state.time_us * 1e-6)
@@ -178,7 +173,7 @@ class Server:
         read = autopilot.parameters.__getitem__
         if autopilot.guidance.sticks is None:
             return
-        if autopilot.firmware.link.is_ground_station(0, message.system, read):
+        if autopilot.firmware.is_ground_station(0, message.system, read):
             autopilot.guidance.sticks.override(widths_us, autopilot.state.time_s)
 
     def _setup_signing(self, message: Message) -> None:

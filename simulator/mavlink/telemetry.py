@@ -1,21 +1,22 @@
-"""Messages that a vehicle sends, by name, with the function that builds each.
+"""Telemetry: which messages a firmware can send, and when those of one link are due.
 
-Builders for every firmware are in `simulator.mavlink.motion_messages` and
-`simulator.mavlink.status_messages`, those for one firmware in its `messages.py`. A public function
-there builds the message of its name; nothing else has to list it.
+Knows no client and no frame; `simulator.mavlink.outbox` fills and frames what is due.
 """
 
 from __future__ import annotations
 
 import inspect
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Hashable, Mapping, Sequence
+from dataclasses import dataclass, field
 from types import ModuleType
 from typing import Any
 
 from simulator.firmware.base import Firmware
-from simulator.mavlink import motion_messages, status_messages
+from simulator.mavlink import messages
 from simulator.mavlink.codec import id_of
 from simulator.mavlink.view import View
+from simulator.steps import STEP_US
 
 Builder = Callable[[View], Sequence[Any]]
 
@@ -23,6 +24,7 @@ ON_POSITION_GRID = frozenset(
     {"LOCAL_POSITION_NED", "ODOMETRY", "GLOBAL_POSITION_INT", "HIL_STATE_QUATERNION"}
 )
 LEAST_INTERVAL_US = {"GPS_RAW_INT": 125_000.0}  # a receiver gives eight fixes a second
+INTERVAL_MAX_US = 2.0**31 - 1  # MESSAGE_INTERVAL.interval_us is an int32
 
 
 def builders_in(module: ModuleType) -> dict[str, Builder]:
@@ -44,22 +46,119 @@ def builders_in(module: ModuleType) -> dict[str, Builder]:
     return found
 
 
-BUILDERS = {**builders_in(motion_messages), **builders_in(status_messages)}
-
-
 def builders(firmware: Firmware) -> dict[str, Builder]:
     """All messages of this firmware, with their builders.
 
     Raises:
         ValueError: a stream of the firmware has no builder, or a message that it never sends has.
     """
-    streams = firmware.streams
-    known = {**BUILDERS, **streams.messages}
-    named = {*streams.companion_rates_hz, *streams.ground_rates_hz, *streams.withheld_until}
-    missing = sorted(named.union(streams.fixed, *streams.groups.values()).difference(known))
+    known = {**builders_in(messages), **firmware.messages}
+    named = {*firmware.companion_rates_hz, *firmware.ground_rates_hz, *firmware.withheld_until}
+    grouped = firmware.stream_groups.values()
+    missing = sorted(named.union(firmware.fixed_streams, *grouped).difference(known))
     if missing:
         raise ValueError(f"{firmware.name} streams: no builder for {', '.join(missing)}")
-    unsent = sorted(name for name in known if id_of(name) in streams.never_sent)
+    unsent = sorted(name for name in known if id_of(name) in firmware.never_sent)
     if unsent:
         raise ValueError(f"{firmware.name} streams: remove from never_sent: {', '.join(unsent)}")
     return known
+
+
+@dataclass(slots=True)
+class Stream:
+    """One message sent periodically: interval and next time, microseconds of vehicle time.
+
+    It is sent at multiples of `grid_us` only.
+    """
+
+    interval_us: int
+    due_us: int
+    grid_us: int
+    version: Hashable = None  # of the content sent last, for messages that wait for a new one
+
+    def next_after(self, now_us: int) -> None:
+        """Due at the next multiple of the interval, so that the mean rate is exact."""
+        self.due_at((now_us // self.interval_us + 1) * self.interval_us)
+
+    def due_at(self, time_us: int) -> None:
+        """Due at this time, or at the next grid point."""
+        self.due_us = -(-time_us // self.grid_us) * self.grid_us
+
+
+@dataclass(slots=True)
+class Schedule:
+    """Streams of one link. `rates_hz`: what is sent without being requested."""
+
+    view: View
+    rates_hz: Mapping[str, float]
+    streams: dict[str, Stream] = field(default_factory=dict)
+    _next_us: float = 0.0  # no stream is due before
+
+    def __post_init__(self) -> None:
+        self.restart()
+
+    def restart(self) -> None:
+        """As after boot."""
+        self.streams.clear()
+        for name, rate_hz in self.rates_hz.items():
+            self._start(name, round(1e6 / rate_hz)).due_at(STEP_US)
+
+    def _start(self, name: str, interval_us: int) -> Stream:
+        """A stream of message `name`; in its old place if there was one."""
+        steps = self.view.autopilot.firmware.position_grid_steps
+        grid_us = STEP_US * (steps if name in ON_POSITION_GRID else 1)
+        version = self.streams[name].version if name in self.streams else None
+        self.streams[name] = stream = Stream(interval_us, 0, grid_us, version)
+        self._next_us = 0.0
+        return stream
+
+    def take_due(self) -> list[str]:
+        """Names of the messages due now, in the order of the streams; each is due again later."""
+        view, now_us = self.view, self.view.autopilot.state.time_us
+        if now_us < self._next_us:
+            return []
+        due: list[str] = []
+        next_us = math.inf
+        for name, stream in self.streams.items():
+            if now_us >= stream.due_us and self._is_new(name, stream):
+                stream.next_after(now_us)
+                if not view.withheld(name):
+                    due.append(name)
+            if stream.due_us < next_us:
+                next_us = stream.due_us
+        self._next_us = next_us
+        return due
+
+    def _is_new(self, name: str, stream: Stream) -> bool:
+        """Whether the message has a content that was not sent yet; most always have."""
+        version = self.view.autopilot.firmware.message_versions.get(name)
+        if version is None:
+            return True
+        newest = version(self.view)
+        new, stream.version = newest != stream.version, newest
+        return new
+
+    def set_interval(self, name: str, interval_us: float) -> bool:
+        """0 restores the default, < 0 stops; False when the message has no settable rate."""
+        if name not in self.view.builders or name in self.view.autopilot.firmware.fixed_streams:
+            return False
+        if interval_us == 0:
+            rate_hz = self.rates_hz.get(name)
+            interval_us = -1.0 if rate_hz is None else 1e6 / rate_hz
+        if interval_us < 0:
+            self.streams.pop(name, None)
+            return True
+        least_us = LEAST_INTERVAL_US.get(name, 1.0)
+        interval_us = round(min(INTERVAL_MAX_US, max(least_us, interval_us)))
+        self._start(name, interval_us).next_after(self.view.autopilot.state.time_us)
+        return True
+
+    def interval_us(self, name: str) -> int:
+        """Interval of a message; -1 when it is not sent periodically."""
+        stream = self.streams.get(name)
+        return -1 if stream is None else stream.interval_us
+
+    def set_group(self, group: int, rate_hz: float) -> None:
+        """REQUEST_DATA_STREAM of a MAV_DATA_STREAM, which is not acknowledged; 0 stops it."""
+        for name in self.view.autopilot.firmware.stream_groups.get(group, ()):
+            self.set_interval(name, 1e6 / rate_hz if rate_hz else -1.0)

@@ -57,7 +57,7 @@ class View:
     def withheld(self, name: str) -> bool:
         """Whether the vehicle cannot send this message yet, whatever its rate."""
         autopilot = self.autopilot
-        event = autopilot.firmware.streams.withheld_until.get(name)
+        event = autopilot.firmware.withheld_until.get(name)
         return event is not None and event not in autopilot.health.reached
 
     def message(self, name: str) -> Any:
@@ -89,8 +89,7 @@ class View:
     def sensor_bits(self) -> tuple[int, int, int]:
         """MAV_SYS_STATUS_SENSOR: present, enabled, healthy."""
         autopilot = self.autopilot
-        sensors = autopilot.firmware.health.sensors
-        present, enabled, health = sensors.present, sensors.enabled, sensors.health
+        present, enabled, health = autopilot.firmware.sensor_bits
         if not autopilot.health.has_fix(autopilot.state.time_s):
             present, enabled, health = present & ~_GPS, enabled & ~_GPS, health & ~_GPS
         elif not self.has_fix:
@@ -105,7 +104,7 @@ class View:
         if self.wrong_landed_state is not None:
             return self.wrong_landed_state
         behaviour = self.autopilot.navigator.active
-        if self.autopilot.pilot.landed:
+        if self.autopilot.position_controller.landed:
             return 1
         if behaviour.landing:
             return 4

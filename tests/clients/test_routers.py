@@ -17,7 +17,7 @@ from vehicle_process import vehicle
 
 from offboard.analysis import tlog
 from offboard.documents.signing_key import create_key
-from simulator.link.links import free_ports
+from simulator.link.sockets import free_ports
 
 MAVPROXY = Path(sys.executable).with_name("mavproxy.py")
 SHORT = (

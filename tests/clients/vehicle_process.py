@@ -7,7 +7,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from simulator.link.links import free_ports
+from simulator.link.sockets import free_ports
 
 LIMIT_S = 160.0
 

@@ -107,7 +107,7 @@ class Bench:
         """PARAM_SET, as a ground station sends it."""
         table = self.instance.autopilot.parameters
         _, kind = table.to_wire(name)
-        bytewise = self.instance.autopilot.firmware.link.parameters_bytewise and kind != 9
+        bytewise = self.instance.autopilot.firmware.parameters_bytewise and kind != 9
         wire = struct.unpack("<f", struct.pack("<i", int(value)))[0] if bytewise else value
         codec = mavlink.MAVLink(None, srcSystem=255, srcComponent=190)
         message = mavlink.MAVLink_param_set_message(1, 1, name.encode(), wire, kind)

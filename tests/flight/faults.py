@@ -42,12 +42,10 @@ def with_default(name: str, value: float) -> Firmware:
 def slow(rate_hz: float) -> Firmware:
     """A vehicle that sends position and attitude at `rate_hz`, whatever rate is requested."""
     state = ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
-    asked = LEAN.streams.companion_rates_hz
+    asked = LEAN.companion_rates_hz
     rates = {name: rate_hz if name in state else hz for name, hz in asked.items()}
-    streams = replace(
-        LEAN.streams, companion_rates_hz=rates, fixed=LEAN.streams.fixed | frozenset(state)
-    )
-    return replace(LEAN, streams=streams)
+    fixed = LEAN.fixed_streams | frozenset(state)
+    return replace(LEAN, companion_rates_hz=rates, fixed_streams=fixed)
 
 
 # --- links ----------------------------------------------------------------------------------------

@@ -54,11 +54,11 @@ Filter = Callable[[float, Bytes], Bytes]
 
 # What the flight needs and no more: a third of the default traffic
 LEAN_RATES_HZ = {
-    name: PX4.streams.companion_rates_hz[name]
+    name: PX4.companion_rates_hz[name]
     for name in ("HEARTBEAT", "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "SYS_STATUS",
                  "EXTENDED_SYS_STATE", "HOME_POSITION")
 }  # fmt: skip
-LEAN = replace(PX4, streams=replace(PX4.streams, companion_rates_hz=LEAN_RATES_HZ))
+LEAN = replace(PX4, companion_rates_hz=LEAN_RATES_HZ)
 
 
 def through(_: float, datagrams: Bytes) -> Bytes:

@@ -90,7 +90,7 @@ def disarmed_by_us(pair: Pair) -> Checks:
 def landed(pair: Pair) -> Checks:
     autopilot = pair.instance.autopilot
     yield not autopilot.commander.armed
-    yield autopilot.pilot.landed
+    yield autopilot.position_controller.landed
     yield len(pair.commands(LAND)) >= 1
 
 
@@ -214,7 +214,7 @@ def already_flying() -> Pair:
     while instance.time_s < 17.0:
         instance.step()
     assert instance.autopilot.commander.mode.name == "AUTO.LOITER"
-    assert not instance.autopilot.pilot.landed
+    assert not instance.autopilot.position_controller.landed
     return pair
 
 

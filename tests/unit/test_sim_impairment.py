@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from simulator.link.impairment import Channel, Impairment, Path, frames
+from simulator.link.impairment import Channel, Impairment, LinkDirection, frames
 
 STEP_US = 4000
 
@@ -154,7 +154,9 @@ def test_a_stalled_link_delivers_what_its_queue_holds_when_it_ends() -> None:
 
 
 def test_two_channels_in_a_row_add_their_delays() -> None:
-    path = Path(tuple(Channel(Impairment(latency_s=0.02), Random(seed)) for seed in (1, 2)))
+    path = LinkDirection(
+        tuple(Channel(Impairment(latency_s=0.02), Random(seed)) for seed in (1, 2))
+    )
     assert path.carry([b"x"], 0) == []
     assert path.carry([], 20_000) == []
     assert path.carry([], 40_000) == [b"x"]

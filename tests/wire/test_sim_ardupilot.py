@@ -327,7 +327,7 @@ def test_a_stream_without_thrust_cancels_the_takeoff() -> None:
     assert vehicle.command(22, *(0.0,) * 6, 5.0) == [ACCEPTED]
     vehicle.run(8.0, lambda: vehicle.attitude(thrust=0.0))
     assert vehicle.height_m < 0.01
-    assert vehicle.instance.autopilot.pilot.landed
+    assert vehicle.instance.autopilot.position_controller.landed
 
 
 def test_takeoff_by_setpoints_alone() -> None:

@@ -124,7 +124,7 @@ def test_intervals_of_messages_never_sent_and_requests_of_event_messages(
     firmware: Firmware, idle: tuple[int, ...], refused: tuple[int, ...]
 ) -> None:
     bench = Bench(firmware=firmware)
-    refusal = firmware.streams.request_refusal
+    refusal = firmware.request_refusal
     assert [bench.command(INTERVAL, number, 20_000) for number in idle] == [[ACCEPTED]] * len(idle)
     assert [bench.command(REQUEST, number) for number in refused] == [[refusal]] * len(refused)
 

@@ -343,5 +343,5 @@ def test_a_landing_is_detected_three_stages_after_ground_contact() -> None:
     bench.command(21)
     plant = bench.instance.autopilot.plant
     touched_s = bench.run_until(lambda: plant.on_ground, 10.0)
-    bench.run_until(lambda: bench.instance.autopilot.pilot.landed, 5.0)
+    bench.run_until(lambda: bench.instance.autopilot.position_controller.landed, 5.0)
     assert bench.time_s - touched_s == pytest.approx(3.1, abs=0.15)

@@ -58,7 +58,7 @@ def test_a_normal_flight_afterwards() -> None:
     assault(bench.instance, 6, COUNT // 2)
     autopilot = bench.instance.autopilot
     bench.command(21)
-    bench.run_until(lambda: autopilot.pilot.landed, 1000.0)
+    bench.run_until(lambda: autopilot.position_controller.landed, 1000.0)
     bench.command(400, 0, 21196)
     for spec in PX4.parameters:
         autopilot.parameters.set(spec.name, spec.default)

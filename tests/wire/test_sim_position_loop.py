@@ -14,7 +14,7 @@ from simulator.autopilot.state import StateEstimate
 from simulator.firmware.px4 import PX4
 from simulator.firmware.values import NAN3, MotionSetpoint, Quaternion, Triple
 
-GAINS = PX4.flight.gains(ParameterTable(PX4).__getitem__)
+GAINS = PX4.gains(ParameterTable(PX4).__getitem__)
 HOVER = Limits(hover_thrust=0.5)
 ZERO = (0.0, 0.0, 0.0)
 ESTIMATE = StateEstimate(0.0, ZERO, ZERO, (1.0, 0.0, 0.0, 0.0), ZERO, False, 0, 1.0)

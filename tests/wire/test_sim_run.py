@@ -15,8 +15,7 @@ from simulator import run
 from simulator.faults import Stranger
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
-from simulator.link.links import LinkError, free_ports, open_beside, open_link
-from simulator.link.udp import UdpLink
+from simulator.link.sockets import LinkError, UdpLink, free_ports, open_beside, open_link
 from simulator.run import Endpoint, Outcome, Runner
 from simulator.vehicle.conditions import Conditions
 

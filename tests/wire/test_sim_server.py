@@ -15,7 +15,7 @@ from pymavlink.dialects.v20 import common as mavlink
 from sim_bench import LOITER, NAN, OFFBOARD, Bench
 
 from simulator.firmware.px4 import PX4
-from simulator.firmware.px4.streams import COMPANION_RATES_HZ, GROUND_RATES_HZ
+from simulator.firmware.px4_messages import COMPANION_RATES_HZ, GROUND_RATES_HZ
 from simulator.mavlink.outbox import DATAGRAM_MAX
 from simulator.vehicle.sensors import EstimatorName
 
@@ -376,7 +376,7 @@ def test_hostile_frames_and_then_a_normal_flight(seed: int) -> None:
         if count % 10 == 0:
             bench.run(0.02)
     bench.command(21)
-    bench.run_until(lambda: bench.instance.autopilot.pilot.landed, 300.0)
+    bench.run_until(lambda: bench.instance.autopilot.position_controller.landed, 300.0)
     bench.command(400, 0, 21196)
     autopilot = bench.instance.autopilot
     for spec in PX4.parameters:

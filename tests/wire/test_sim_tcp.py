@@ -8,8 +8,15 @@ from collections.abc import Iterator
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from simulator.link.links import LinkError, open_link, shifted, wait
-from simulator.link.tcp import UNSENT_MAX, TcpLink, whole_frames
+from simulator.link.sockets import (
+    UNSENT_MAX,
+    LinkError,
+    TcpLink,
+    open_link,
+    shifted,
+    wait,
+    whole_frames,
+)
 
 CODEC = mavlink.MAVLink(None, srcSystem=255)
 HEARTBEAT = mavlink.MAVLink_heartbeat_message(6, 8, 0, 0, 4, 3).pack(CODEC)

@@ -58,7 +58,7 @@ def test_positions_are_sent_on_the_grid_of_the_estimator_whatever_their_rate() -
         for datagram in instance.step():
             messages = Decoder().read(datagram)
             stamps += [m.time_boot_ms for m in messages if m.name == "LOCAL_POSITION_NED"]
-    grid_ms = 4 * PX4.streams.position_grid_steps
+    grid_ms = 4 * PX4.position_grid_steps
     assert stamps == list(range(grid_ms, 1001, grid_ms))
 
 
@@ -98,15 +98,13 @@ def test_every_message_is_read_by_pymavlink(firmware: Firmware) -> None:
 
 
 def test_a_stream_without_a_builder_is_refused() -> None:
-    streams = replace(PX4.streams, companion_rates_hz={"HEARTBEAT": 1.0, "ATITUDE": 10.0})
     with pytest.raises(ValueError, match=r"^px4 streams: no builder for ATITUDE$"):
-        builders(replace(PX4, streams=streams))
+        builders(replace(PX4, companion_rates_hz={"ATITUDE": 10.0}))
 
 
 def test_message_with_a_builder_that_is_never_sent_is_refused() -> None:
-    streams = replace(PX4.streams, never_sent=frozenset({74}))
     with pytest.raises(ValueError, match=r"^px4 streams: remove from never_sent: VFR_HUD$"):
-        builders(replace(PX4, streams=streams))
+        builders(replace(PX4, never_sent=frozenset({74})))
 
 
 def test_a_builder_that_is_not_called_like_a_message_is_refused() -> None:

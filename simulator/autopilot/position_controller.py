@@ -1,4 +1,4 @@
-"""The pilot: flies the navigator's motion or an attitude setpoint.
+"""The position controller: flies the navigator's motion or an attitude setpoint.
 
 Motion and estimate in, demand on the attitude loop out; takeoff ramp and land detector. Knows time
 and parameters; knows no modes by name, no rules and no MAVLink. The commander
@@ -23,7 +23,7 @@ _HIGHER_M = 0.01  # a demanded place on the ground; less is the noise of the est
 OFF = Demand()
 
 
-class Pilot:
+class PositionController:
     """Flies one vehicle from arming to disarming."""
 
     def __init__(self, navigator: Navigator, state: VehicleState) -> None:
@@ -31,8 +31,8 @@ class Pilot:
         self._firmware, self._parameters = firmware, parameters
         self._navigator, self._state = navigator, state
         self._tuned = parameters.changes
-        self.loop = PositionLoop(firmware.flight.gains(parameters.__getitem__))
-        self.detector = LandDetector(firmware.flight.landing, parameters)
+        self.loop = PositionLoop(firmware.gains(parameters.__getitem__))
+        self.detector = LandDetector(firmware.landing, parameters)
         self._ramp = TakeoffRamp(parameters)
         self.demand = OFF  # in force
         self.thrust_demanded = 0.0  # before it is raised for the tilt
@@ -93,7 +93,7 @@ class Pilot:
         """One period of the position loop."""
         if self._tuned != self._parameters.changes:
             self._tuned = self._parameters.changes
-            self.loop.tune(self._firmware.flight.gains(self._parameters.__getitem__))
+            self.loop.tune(self._firmware.gains(self._parameters.__getitem__))
         control = self._navigator.active.control
         if control is Control.LEVEL:
             thrust = self._parameters.role("stick_thrust_least")
@@ -130,7 +130,7 @@ class Pilot:
     def _fly_attitude(self, setpoint: AttitudeSetpoint) -> None:
         """Its attitude or rates, and its thrust, raised for the tilt where the firmware does so."""
         thrust = setpoint.thrust if setpoint.climb_mps is None else self._climb_thrust
-        if self._armed_for_s < self._firmware.setpoints.spool_s:
+        if self._armed_for_s < self._firmware.setpoint_spool_s:
             thrust = 0.0
         self.thrust_demanded = thrust
         if self._boosts_thrust:
@@ -158,7 +158,7 @@ class Pilot:
         self.motion = navigator.motion(estimate, landed=self.landed)
         ramp.step(climb_demanded=lifts_off and self._climb_demanded(estimate))
         still = estimate.on_ground and (ramp.lifting or self.landed)
-        on_ramp = ramp.lifting and self._firmware.flight.integrates_on_ramp
+        on_ramp = ramp.lifting and self._firmware.integrates_on_ramp
         attitude, thrust, velocity_ned_mps = self.loop.step(
             self.motion, self._limits, estimate, integrate=not still or on_ramp
         )
@@ -207,7 +207,7 @@ class Pilot:
 
     def _detect_landing(self, setpoint: AttitudeSetpoint | None, estimate: StateEstimate) -> None:
         was_landed, by_motion = self.landed, setpoint is None
-        if not by_motion and self._firmware.setpoints.imply_flight:
+        if not by_motion and self._firmware.setpoints_imply_flight:
             self.detector.reset()
             if self.thrust_demanded > 0.0:
                 self.detector.set_landed(False)
@@ -222,7 +222,7 @@ class Pilot:
     @property
     def _descent_demanded(self) -> bool:
         """A descent is demanded, or a place below where that counts as one."""
-        landing = self._firmware.flight.landing
+        landing = self._firmware.landing
         if self.motion.velocity_ned_mps[2] >= landing.sinking_mps:
             return True
         return landing.place_below_is_descent and self._velocity_down_mps > landing.sinking_mps

@@ -1,4 +1,4 @@
-"""Builders of messages that only ArduPilot sends; fields in the order of the XML."""
+"""Telemetry of ArduCopter: rates, and builders of messages that only it sends."""
 
 from __future__ import annotations
 
@@ -11,6 +11,24 @@ import numpy as np
 from offboard.model.frames import euler_from_quaternion, rotation_from_quaternion
 from simulator.autopilot.position_loop import GRAVITY_MPS2
 from simulator.mavlink.view import View
+
+COMPANION_RATES_HZ = GROUND_RATES_HZ = {"HEARTBEAT": 1.0, "TIMESYNC": 0.1}
+
+# MAV_DATA_STREAM
+GROUPS = {
+    1: ("SCALED_PRESSURE",),
+    2: ("SYS_STATUS", "MISSION_CURRENT", "GPS_RAW_INT", "NAV_CONTROLLER_OUTPUT"),
+    3: ("RC_CHANNELS",),
+    6: ("GLOBAL_POSITION_INT", "LOCAL_POSITION_NED"),
+    10: ("ATTITUDE",),
+    11: ("VFR_HUD",),
+    12: ("SYSTEM_TIME", "BATTERY_STATUS", "EKF_STATUS_REPORT", "VIBRATION"),
+}
+NEVER_SENT = frozenset({
+    22, 26, 27, 34, 35, 36, 87, 100, 105, 116, 124, 125, 127, 128, 129, 132, 133, 136, 137,
+    143, 152, 162, 163, 164, 165, 168, 173, 178, 180, 191, 192, 194, 195, 225, 226, 235, 246,
+    259, 260, 262, 269, 271, 277, 280, 281, 285, 286, 295, 301, 373, 376, 9005,
+})  # fmt: skip
 
 # EKF_STATUS_FLAGS from a boot event on
 _EKF_FLAGS = (("position", 831), ("attitude", 167), ("aligning", 0))
@@ -66,10 +84,10 @@ def rc_channels(view: View) -> Sequence[Any]:
 
 def nav_controller_output(view: View) -> Sequence[Any]:
     """Demanded attitude in degrees; distance and bearing to the position setpoint."""
-    nav, pilot = view.autopilot.state.estimate, view.autopilot.pilot
-    wanted = pilot.demand.attitude or (1.0, 0.0, 0.0, 0.0)
+    nav, controller = view.autopilot.state.estimate, view.autopilot.position_controller
+    wanted = controller.demand.attitude or (1.0, 0.0, 0.0, 0.0)
     roll, pitch, yaw = np.degrees(euler_from_quaternion(np.array(wanted))).tolist()
-    place = pilot.motion.position_ned_m
+    place = controller.motion.position_ned_m
     left = [there - here for there, here in zip(place, nav.position_ned_m, strict=True)]
     north, east, down = (value if math.isfinite(value) else 0.0 for value in left)
     distance_m = round(min(65535.0, math.hypot(north, east)))

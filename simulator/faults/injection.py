@@ -1,8 +1,4 @@
-"""Fault injection: begins and ends each fault of a scenario at its time, on one vehicle.
-
-What a fault is, is in `simulator.faults`; what it does, in `simulator.effects`; link faults are in
-`simulator.link.impairment`.
-"""
+"""Fault injection: begins and ends each fault of a scenario at its time, on one vehicle."""
 
 from __future__ import annotations
 
@@ -10,12 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from random import Random
 
-from simulator import faults
 from simulator.autopilot.autopilot import Autopilot
-from simulator.effects import EFFECTS, Running, Vehicle
-from simulator.faults import Direction, Fault, Moment
+from simulator.faults import Fault
+from simulator.faults.base import Direction, Moment, Running, Vehicle
+from simulator.faults.messages import LinkFault
+from simulator.faults.senders import Stranger
 from simulator.firmware.values import Behaviour
-from simulator.link.impairment import Channel, Path
+from simulator.link.impairment import Channel, LinkDirection
 
 
 @dataclass(slots=True)
@@ -23,8 +20,8 @@ class Injection:
     """All faults of one flight. `down` and `up`: directions of the companion link; `strangers`:
     datagrams that wait to be sent to the companion, each list from a port of its own."""
 
-    down: Path
-    up: Path
+    down: LinkDirection
+    up: LinkDirection
     strangers: list[list[bytes]]
     _waiting: list[Running]
     _moments: dict[Moment, float] = field(default_factory=dict)
@@ -39,15 +36,19 @@ class Injection:
             self._waiting = [running for running in self._waiting if not running.over]
 
     def _note_moments(self, now_s: float, autopilot: Autopilot) -> None:
-        self._flown = self._flown or not autopilot.pilot.landed
+        landed = autopilot.position_controller.landed
+        self._flown = self._flown or not landed
         by_setpoint = autopilot.commander.mode.behaviour is Behaviour.SETPOINT
         for moment, reached in (
             (Moment.BOOT, True),
             (Moment.ARMED, autopilot.commander.armed),
-            (Moment.TOOK_OFF, not autopilot.pilot.landed),
+            (Moment.TOOK_OFF, not landed),
             (Moment.ENGAGED, by_setpoint and autopilot.commander.armed),
-            (Moment.LANDING, autopilot.navigator.active.landing and not autopilot.pilot.landed),
-            (Moment.LANDED, self._flown and autopilot.pilot.landed),
+            (
+                Moment.LANDING,
+                autopilot.navigator.active.landing and not landed,
+            ),
+            (Moment.LANDED, self._flown and landed),
         ):
             if reached:
                 self._moments.setdefault(moment, now_s)
@@ -63,7 +64,7 @@ class Injection:
             return
         try:
             if running.effect is None:
-                running.effect = EFFECTS[type(fault)](vehicle, running)
+                running.effect = fault.effect(vehicle, running)
                 next(running.effect)
             lasts = fault.for_s is None or now_s < running.begins_s + fault.for_s
             running.effect.send(lasts)
@@ -80,11 +81,11 @@ def prepare(scenario: Sequence[Fault], seed: int) -> Injection | None:
     for number, fault in enumerate(scenario):
         channels = []
         for direction, path in paths.items():
-            if isinstance(fault, faults.LinkFault) and fault.direction in (direction, "both"):
+            if isinstance(fault, LinkFault) and fault.direction in (direction, "both"):
                 channels.append(Channel(fault, Random(f"{seed} {number} {direction}")))
                 channels[-1].on = False
                 path.append(channels[-1])
         waiting.append(Running(fault, channels, Random(f"{seed} {number}")))
-    down, up = (Path(tuple(path)) for path in paths.values())
-    strangers = [one.datagrams for one in waiting if isinstance(one.fault, faults.Stranger)]
+    down, up = (LinkDirection(tuple(path)) for path in paths.values())
+    strangers = [one.datagrams for one in waiting if isinstance(one.fault, Stranger)]
     return Injection(down, up, strangers, waiting)

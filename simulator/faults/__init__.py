@@ -1,0 +1,50 @@
+"""Faults of a flight, part of a scenario file: what goes wrong, when, and for how long.
+
+One class is one fault: its keys, and what it does to the vehicle. A new one is listed in `Fault`.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from pydantic import Field
+
+from simulator.faults.base import Direction
+from simulator.faults.estimator import (
+    BlindLandDetector,
+    EstimatorJump,
+    GpsLoss,
+    VelocityError,
+    WrongLandedState,
+)
+from simulator.faults.messages import ClockJump, LinkFault, SilentMessage, StuckMessage
+from simulator.faults.pilot import PilotDisarms, PilotTakesOver, Reboot, Refusal
+from simulator.faults.power import BatteryDrop, MassChange, MotorsCut, ThrustChange, WeakMotor
+from simulator.faults.senders import SecondSender, SecondVehicle, Stranger
+
+__all__ = ["Direction", "Fault", "GpsLoss", "PilotTakesOver", "Stranger", "VelocityError"]
+
+Fault = Annotated[
+    LinkFault
+    | EstimatorJump
+    | GpsLoss
+    | SilentMessage
+    | StuckMessage
+    | VelocityError
+    | WrongLandedState
+    | BlindLandDetector
+    | WeakMotor
+    | MotorsCut
+    | ThrustChange
+    | MassChange
+    | BatteryDrop
+    | Reboot
+    | ClockJump
+    | Refusal
+    | PilotTakesOver
+    | PilotDisarms
+    | SecondSender
+    | SecondVehicle
+    | Stranger,
+    Field(discriminator="fault"),
+]

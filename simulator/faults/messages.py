@@ -1,0 +1,81 @@
+"""Faults of the companion link and of what the vehicle sends on it."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+from pydantic import Field, model_validator
+
+from simulator.faults.base import (
+    Direction,
+    Effect,
+    MessageName,
+    Running,
+    Timed,
+    Vehicle,
+    until_the_end,
+)
+from simulator.link.impairment import Impairment
+from simulator.mavlink.view import Stuck
+
+
+class LinkFault(Timed, Impairment):
+    """A bad companion link; each direction by itself, so `both` doubles the round trip.
+
+    It does not apply to the TIMESYNC exchange of lockstep, which is the simulation's clock.
+    """
+
+    fault: Literal["link"]
+    direction: Direction = Direction.BOTH
+
+    @model_validator(mode="after")
+    def _ends(self) -> LinkFault:
+        if self.stalled and self.for_s is None:
+            raise ValueError("a stalled link needs for_s: what waits arrives when the fault ends")
+        return self
+
+    def effect(self, vehicle: Vehicle, running: Running) -> Effect:
+        for channel in running.channels:
+            channel.on = True
+        yield from until_the_end()
+        for channel in running.channels:
+            channel.on = False
+
+
+class SilentMessage(Timed):
+    """A message that is no longer sent, on any link; with `every`, every so many are still sent."""
+
+    fault: Literal["silent_message"]
+    message: MessageName
+    every: int | None = Field(default=None, ge=2, le=1000)
+
+    def effect(self, vehicle: Vehicle, running: Running) -> Effect:
+        vehicle.view.silent[self.message] = self.every or 0
+        yield from until_the_end()
+        vehicle.view.silent.pop(self.message, None)
+
+
+class StuckMessage(Timed):
+    """A message that repeats its content; with `stamp_runs` its time stamp increases."""
+
+    fault: Literal["stuck_message"]
+    message: MessageName
+    stamp_runs: bool = True
+
+    def effect(self, vehicle: Vehicle, running: Running) -> Effect:
+        vehicle.view.stuck[self.message] = Stuck(self.stamp_runs)
+        yield from until_the_end()
+        vehicle.view.stuck.pop(self.message, None)
+
+
+class ClockJump(Timed):
+    """All time stamps of the vehicle jump by `jump_s`."""
+
+    fault: Literal["clock_jump"]
+    jump_s: float = Field(ge=-1e7, le=1e7)
+
+    def effect(self, vehicle: Vehicle, running: Running) -> Effect:
+        jump_us = round(self.jump_s * 1e6)
+        vehicle.view.clock_offset_us += jump_us
+        yield from until_the_end()
+        vehicle.view.clock_offset_us -= jump_us

@@ -1,0 +1,389 @@
+"""ArduCopter 4.6: how it reads commands and setpoints, checks, fails and flies.
+
+Measured on ArduCopter 4.6.3 SITL where MAVLink shows it. Modes and parameters are in
+`simulator.firmware.ardupilot_tables`, the state table in `simulator.firmware.ardupilot_rules`,
+telemetry in `simulator.firmware.ardupilot_messages`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+from simulator.firmware import ardupilot_messages as telemetry
+from simulator.firmware.ardupilot_rules import RULES
+from simulator.firmware.ardupilot_tables import BY_HAND, BY_POSITION, MODES, PARAMETERS, ROLES
+from simulator.firmware.base import Firmware, Landing, PositionGains, StickFlight
+from simulator.firmware.values import (
+    NAN3,
+    ArmRequest,
+    AttitudeSetpoint,
+    Condition,
+    MissionItem,
+    ModeRequest,
+    MotionSetpoint,
+    Quaternion,
+    ReadParameter,
+    Result,
+    ReturnYaw,
+    StatusText,
+    Triple,
+    info,
+    warning,
+)
+from simulator.mavlink.telemetry import builders_in
+from simulator.vehicle.battery import BatteryState
+
+_CUSTOM_MODE_ENABLED = 1
+_BY_NUMBER = {mode.custom_mode: mode.name for mode in MODES.values()}
+# Modes that it has and does not enter in the simulator
+_NOT_ENTERED = {
+    14: "FLIP failed: init failed",
+    15: "AUTOTUNE failed: init failed",
+    22: "FLOWHOLD failed: init failed",
+    23: "FOLLOW failed: init failed",
+    25: "SYSTEMID failed: init failed",
+    27: "AUTO RTL failed: No return path or landing sequence found",
+    28: "TURTLE failed: init failed",
+}
+# MAV_CMD accepted without an effect that the simulator shows, and failed without their devices
+_TAKEN = (181, 195, 197, 203, 206, 207, 208, 2001, 5300, 42001, 42003, 42424)
+_FAILED = (84, 183, 184, 189, 193, 205, 211, 218, 500, 2000, 2500)
+
+_CENTI = 0.01
+_RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b111, 64, 128  # type_mask
+_POSITION, _VELOCITY, _ACCELERATION, _FORCE, _YAW, _YAW_RATE = 0o007, 0o070, 0o700, 512, 1024, 2048
+_NORM_TOLERANCE = 0.0005
+_THRUST_IS_THRUST = 8  # GUID_OPTIONS
+_STOP = MotionSetpoint(velocity_ned_mps=(0.0, 0.0, 0.0))
+_RATE_LEAD_S = 0.175  # rates beside an attitude: 0.3 rad/s move the equilibrium by 3 degrees
+_LOCAL_NED, _LOCAL_OFFSET_NED, _BODY_NED, _BODY_OFFSET_NED = 1, 7, 8, 9  # MAV_FRAME
+_OFFSET = frozenset({_LOCAL_OFFSET_NED, _BODY_NED, _BODY_OFFSET_NED})
+_BODY = frozenset({_BODY_NED, _BODY_OFFSET_NED})
+
+_UNSUPPORTED_FRAME = 2  # MAV_MISSION_RESULT
+_SHOWN = {5: 0, 6: 3, 11: 10}  # MAV_FRAME: without INT
+_PLACE_FRAMES = frozenset({0, 3, 5, 6, 10, 11})
+_PLACES = frozenset({16, 17, 18, 19, 21, 22, 31, 82, 201})  # MAV_CMD of missions that have a place
+
+_GATE_MPS = 5.0 * 0.3  # EK3_VEL_I_GATE standard deviations of EK3_VELNE_M_NSE
+_RETURN_LEAST_M = 2.0  # RTL_ALT_MIN
+
+
+class ArduCopter(Firmware):
+    """ArduCopter 4.6."""
+
+    def heartbeat(self, now: Condition) -> tuple[int, int]:
+        """base_mode and MAV_STATE: 1 booting, 3 on the ground, 4 in the air, 5 in trouble."""
+        if "initialised" not in now.reached:
+            return BY_POSITION, 1
+        base_mode = BY_HAND if isinstance(now.setpoint, AttitudeSetpoint) else now.mode.base_mode
+        if now.faulty or now.failsafe:
+            return base_mode, 5
+        return base_mode, 4 if now.armed and not now.landed else 3
+
+    def command_mode(self, params: tuple[float, ...]) -> ModeRequest:
+        """MAV_CMD_DO_SET_MODE (176): param1 base mode, param2 the mode's number."""
+        base, number = (int(p) if math.isfinite(p) else 0 for p in params[:2])
+        if not base & _CUSTOM_MODE_ENABLED:
+            return ModeRequest(None, Result.DENIED)
+        known = _BY_NUMBER.get(number)
+        text = f"No such mode {number}"
+        if number in _NOT_ENTERED:
+            text = f"Mode change to {_NOT_ENTERED[number]}"
+        return ModeRequest(known, Result.FAILED, None if known else warning(text))
+
+    def set_mode(self, base_mode: int, custom_mode: int) -> ModeRequest:
+        """SET_MODE: the mode's number is custom_mode."""
+        return self.command_mode((base_mode, custom_mode))
+
+    def arm_request(self, param: float) -> ArmRequest:
+        """1 arms, 0 disarms, anything else is not supported."""
+        if param in (0.0, 1.0):
+            return ArmRequest("arm" if param else "disarm")
+        return ArmRequest(refusal=Result.UNSUPPORTED)
+
+    def attitude_setpoint(
+        self, values: Mapping[str, Any], parameter: ReadParameter
+    ) -> AttitudeSetpoint | MotionSetpoint | None:
+        """SET_ATTITUDE_TARGET as ArduCopter reads it; None: ignored without an answer.
+
+        Ignored: a message without thrust, a quaternion that is not of unit length. With some of
+        the rates ignored the vehicle holds its position. A thrust that is NaN counts as zero, and
+        latches an internal error (the real SITL stops at a NaN quaternion; a flight controller
+        ignores it).
+        """
+        mask = values["type_mask"]
+        ignored = mask & _RATES_IGNORED
+        if mask & _THRUST_IGNORED:
+            return None
+        if ignored not in (0, _RATES_IGNORED):
+            return _STOP
+        given = (values["body_roll_rate"], values["body_pitch_rate"], values["body_yaw_rate"])
+        rates: Triple = (0.0, 0.0, 0.0) if ignored else given
+        if not all(map(math.isfinite, rates)):
+            return None
+        thrust, climb_mps, event = _vertical(values["thrust"], parameter)
+        if mask & _ATTITUDE_IGNORED:
+            return AttitudeSetpoint(None, rates, thrust, climb_mps, event)
+        w, x, y, z = values["q"]
+        norm = math.sqrt(w * w + x * x + y * y + z * z)
+        if not abs(norm - 1.0) <= _NORM_TOLERANCE:
+            return None
+        p, q, r = (0.5 * _RATE_LEAD_S * rate for rate in rates)
+        ahead = (
+            w - x * p - y * q - z * r,
+            x + w * p + y * r - z * q,
+            y + w * q + z * p - x * r,
+            z + w * r + x * q - y * p,
+        )
+        return AttitudeSetpoint(ahead, None, thrust, climb_mps, event)
+
+    def motion_setpoint(self, values: Mapping[str, Any]) -> MotionSetpoint | None:
+        """A vector with one ignored component is ignored.
+
+        The vehicle stops at a setpoint that it cannot fly: an unknown frame, no demand, a position
+        with an acceleration and no velocity, a velocity that is not finite. None (ignored without
+        an answer): a force, and other values that are not finite.
+        """
+        mask = values["type_mask"]
+
+        def given(names: tuple[str, str, str], bits: int) -> Triple:
+            if mask & bits:
+                return NAN3
+            a, b, c = (values[name] for name in names)
+            return (a, b, c)
+
+        position = given(("x", "y", "z"), _POSITION)
+        velocity = given(("vx", "vy", "vz"), _VELOCITY)
+        acceleration = given(("afx", "afy", "afz"), _ACCELERATION)
+        if mask & _FORCE and not mask & _ACCELERATION:
+            return None
+        by_velocity, by_acceleration = not mask & _VELOCITY, not mask & _ACCELERATION
+        unflyable = not by_velocity and bool(mask & _POSITION) is not by_acceleration
+        if values["coordinate_frame"] != _LOCAL_NED or unflyable:
+            return _STOP
+        if by_velocity and not all(map(math.isfinite, velocity)):
+            return _STOP
+        yaw = math.nan if mask & _YAW else values["yaw"]
+        yaw_rate = math.nan if mask & _YAW_RATE else values["yaw_rate"]
+        numbers = (*position, *velocity, *acceleration)
+        if any(map(math.isinf, (*numbers, yaw, yaw_rate))) or all(map(math.isnan, numbers)):
+            return None
+        along = bool(mask & _YAW and mask & _YAW_RATE)
+        return MotionSetpoint(position, velocity, acceleration, yaw, yaw_rate, along)
+
+    def in_local_frame(
+        self, values: Mapping[str, Any], position_ned_m: Triple, attitude: Quaternion
+    ) -> Mapping[str, Any]:
+        """Offset frames are relative to the position; body frames also to the yaw."""
+        frame = values["coordinate_frame"]
+        if frame not in _OFFSET:
+            return values
+        w, x, y, z = attitude
+        yaw_rad = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        turn_rad = yaw_rad if frame in _BODY else 0.0
+        cos_yaw, sin_yaw = math.cos(turn_rad), math.sin(turn_rad)
+        local = {**values, "coordinate_frame": _LOCAL_NED, "yaw": turn_rad + values["yaw"]}
+        for north, east in (("x", "y"), ("vx", "vy"), ("afx", "afy")):
+            local[north] = cos_yaw * values[north] - sin_yaw * values[east]
+            local[east] = sin_yaw * values[north] + cos_yaw * values[east]
+        for name, here_m in zip("xyz", position_ned_m, strict=True):
+            local[name] += here_m
+        return local
+
+    def setpoint_rejection(self, message: str, frame: int | None) -> None:
+        """No text."""
+
+    def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
+        if item.command in _PLACES and not (item.frame in _PLACE_FRAMES and math.isfinite(item.z)):
+            return _UNSUPPORTED_FRAME, None
+        return None
+
+    def mission_frame(self, item: MissionItem, whole: bool) -> int:
+        """Frames without _INT; 0 for an item without a place."""
+        return _SHOWN.get(item.frame, item.frame) if item.command in _PLACES else 0
+
+    def is_ground_station(self, kind: int, system: int, parameter: ReadParameter) -> bool:
+        """By system id, whatever the MAV_TYPE."""
+        return system == parameter("SYSID_MYGCS")
+
+    def obeys_system(self, sender: int, own: int, parameter: ReadParameter) -> bool:
+        """All systems; with SYSID_ENFORCE the ground station and its own components only."""
+        return not parameter("SYSID_ENFORCE") or sender in (own, parameter("SYSID_MYGCS"))
+
+    def velocity_ratio(self, error_mps: float) -> float:
+        """The ratio as EKF_STATUS_REPORT has it: the square root of the squared test ratio."""
+        return error_mps / _GATE_MPS
+
+    def velocity_ratio_most(self, parameter: ReadParameter) -> float:
+        """As the failsafe in flight."""
+        return parameter("FS_EKF_THRESH")
+
+    def battery_level(self, battery: BatteryState, parameter: ReadParameter) -> int:
+        """By voltage or by remaining charge; a threshold of 0 disables the check."""
+
+        def below(kind: str) -> bool:
+            left_mah = battery.remaining * parameter("BATT_CAPACITY")
+            by_voltage = battery.voltage_v < parameter(f"BATT_{kind}_VOLT")
+            return by_voltage or left_mah < parameter(f"BATT_{kind}_MAH")
+
+        return 2 if below("CRT") else int(below("LOW"))
+
+    def gains(self, parameter: ReadParameter) -> PositionGains:
+        """Gains and limits of the position loop."""
+        speed_mps = parameter("WPNAV_SPEED") * 0.01
+        return PositionGains(
+            position_xy_ps=parameter("PSC_POSXY_P"),
+            position_z_ps=parameter("PSC_POSZ_P"),
+            velocity_xy=(parameter("PSC_VELXY_P"), 1.0, 0.25),
+            velocity_z=(5.0, 10.0, 0.0),
+            speed_xy_mps=speed_mps,
+            speed_up_mps=2.5,
+            speed_down_mps=2.5,
+            tilt_max_rad=math.radians(parameter("ANGLE_MAX") * 0.01),
+            thrust_max=1.0,
+            derivative_cutoff_hz=5.0,
+            turn_radps=math.radians(parameter("ATC_SLEW_YAW") * 0.01),
+            speeding_mps2=parameter("WPNAV_ACCEL") * 0.01,
+            braking_mps2=0.5 * parameter("WPNAV_ACCEL") * 0.01,  # as the jerk is limited
+            vertical_mps2=2.5,
+            facing_mps=0.05 * speed_mps if parameter("WP_YAW_BEHAVIOR") else math.inf,
+        )
+
+    def return_height_m(self, distance_m: float, parameter: ReadParameter) -> float:
+        """Height of a return above home: under a cone near home (RTL_CONE_SLOPE)."""
+        highest_m, slope = parameter("RTL_ALT") * 0.01, parameter("RTL_CONE_SLOPE")
+        return min(highest_m, max(distance_m * slope, _RETURN_LEAST_M)) if slope > 0 else highest_m
+
+    def return_yaw(self, distance_m: float, parameter: ReadParameter) -> ReturnYaw | None:
+        """Unchanged by default."""
+        return ReturnYaw.ALONG_PATH if parameter("WP_YAW_BEHAVIOR") in (1.0, 3.0) else None
+
+
+def _vertical(thrust: float, parameter: ReadParameter) -> tuple[float, float | None, str]:
+    """Thrust, climb rate (None: the field is a thrust) and the event of a NaN."""
+    by_thrust = int(parameter("GUID_OPTIONS")) & _THRUST_IS_THRUST
+    event = ""
+    if math.isnan(thrust):
+        thrust, event = 0.0 if by_thrust else 0.5, "thrust not a number"
+    thrust = min(1.0, max(-1.0, thrust))
+    if by_thrust:
+        return max(0.0, thrust), None, event
+    up = parameter("WPNAV_SPEED_UP") if thrust > 0.5 else parameter("WPNAV_SPEED_DN")
+    return 0.0, (max(0.0, thrust) - 0.5) / 0.5 * up * _CENTI, event
+
+
+ARDUPILOT = ArduCopter(
+    name="ardupilot",
+    vehicle="arducopter",
+    scenario="ardupilot_like",
+    mav_autopilot=3,
+    version=0x040603FF,  # 4.6.3, release
+    capabilities=64495,
+    origin=(-35.3632621, 149.1652374, 584.09),
+    modes=MODES,
+    boot_mode="STABILIZE",
+    hold_mode="BRAKE",
+    rules=RULES,
+    parameters=PARAMETERS,
+    parameter_roles=ROLES,
+    system_parameter="SYSID_THISMAV",
+    mode_acked_twice=False,
+    set_mode_acked_as=None,
+    force_codes={"arm": 2989.0, "disarm": 21196.0},
+    takeoff_above_home=True,
+    reposition_mode="GUIDED",
+    repositions_strictly=True,
+    speed_refusal=Result.FAILED,
+    command_answers={
+        **dict.fromkeys(_TAKEN, Result.ACCEPTED),
+        **dict.fromkeys(_FAILED, Result.FAILED),
+        532: Result.DENIED,
+    },
+    home_mirrored=False,
+    global_frames=frozenset({0, 3, 5, 6, 10, 11}),
+    setpoint_mode_needs_stream=False,
+    setpoints_as_automatic=True,
+    setpoints_outlive_modes=False,
+    setpoints_imply_flight=True,
+    setpoint_spool_s=2.8,
+    stream_reaction_s=0.0,
+    strict_missions=False,
+    home_item_first=True,
+    guided_items=True,
+    mission_text=info("Flight plan received"),
+    turning_items=frozenset(),
+    reached_above_landing=False,
+    mission_keeps_speed=False,
+    companion_rates_hz=telemetry.COMPANION_RATES_HZ,
+    ground_rates_hz=telemetry.GROUND_RATES_HZ,
+    messages=builders_in(telemetry),
+    withheld_until={
+        "LOCAL_POSITION_NED": "position",
+        "GPS_GLOBAL_ORIGIN": "origin",
+        "HOME_POSITION": "origin",
+    },
+    message_versions={},
+    position_grid_steps=1,
+    fixed_streams=frozenset({"TIMESYNC"}),
+    not_on_request=frozenset({"TIMESYNC"}),
+    never_sent=telemetry.NEVER_SENT,
+    stream_groups={
+        0: tuple(name for names in telemetry.GROUPS.values() for name in names),
+        **telemetry.GROUPS,
+    },
+    rate_max_hz=200.0,
+    interval_refusal=Result.DENIED,
+    interval_refusal_text="No ap_message for mavlink id ({id})",
+    too_fast_text="Requested rate for message ID {id} too fast. Increase SCHED_LOOP_RATE",
+    request_refusal=Result.FAILED,
+    ground_station_stays_s=0.0,
+    target_component_checked=False,
+    text_suffix="",
+    text_to_ground_stations_only=False,
+    parameters_bytewise=False,
+    parameters_hashed=False,
+    parameters_numbered=False,
+    # RADIO_STATUS, RADIO; on USB, which is not simulated, all
+    accepted_unsigned=frozenset({109, 166}),
+    stamps_follow_clock=True,  # GPS
+    boot_events_s={
+        "initialised": 2.47,
+        "aligning": 5.40,
+        "attitude": 5.90,
+        "origin": 20.02,
+        "gyros": 24.0,
+        "reminder": 30.45,
+        "position": 41.61,
+    },
+    sensor_bits=(0x5371FC2F, 0x5361FC2F, 0x4771FC2F),
+    first_fix_s=10.2,
+    passes_after_s=42.5,
+    passes_without_position_after_s=24.0,
+    fails_where_unarmable=False,
+    position_without_fix_s=8.0,
+    battery_events=("battery low", "battery critical"),
+    integrates_on_ramp=False,
+    landing=Landing(
+        low_thrust_share=1.0,
+        idle_thrust_share=math.inf,
+        sinking_mps=0.1,
+        speed_down_mps=math.inf,
+        speed_across_mps=math.inf,
+        rate_radps=math.inf,
+        place_below_is_descent=True,
+    ),
+    descend_speed_mps=2.4,
+    sticks=StickFlight(
+        # throttle down; mode switch and other channels as SITL has them
+        default_pulses_us=(1500, 1500, 1000, 1500, 1800, 1000, 1000, 1800),
+        climb_mps=2.5,  # PILOT_SPEED_UP
+        turn_radps=math.radians(202.5),  # PILOT_Y_RATE
+        speed_mps=12.5,  # LOIT_SPEED
+        acceleration_mps2=3.57,  # of two thirds of ANGLE_MAX
+        braking_mps2=2.5,  # LOIT_BRK_ACCEL
+        braking_after_s=1.0,  # LOIT_BRK_DELAY
+    ),
+)

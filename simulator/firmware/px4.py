@@ -1,0 +1,384 @@
+"""PX4 1.16 multicopter: how it reads commands and setpoints, checks, fails and flies.
+
+Measured on PX4 1.16.1 SITL where MAVLink shows it, including messages that it should refuse.
+Modes and parameters are in `simulator.firmware.px4_tables`, the state table in
+`simulator.firmware.px4_rules`, telemetry in `simulator.firmware.px4_messages`.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from offboard.model.frames import rotation_from_quaternion
+from simulator.firmware import px4_messages as telemetry
+from simulator.firmware.base import Firmware, Landing, PositionGains
+from simulator.firmware.px4_rules import RULES
+from simulator.firmware.px4_tables import MODES, OFFBOARD, PARAMETERS, RATES, ROLES
+from simulator.firmware.values import (
+    ArmRequest,
+    AttitudeSetpoint,
+    Behaviour,
+    Condition,
+    MissionItem,
+    ModeRequest,
+    MotionSetpoint,
+    Quaternion,
+    ReadParameter,
+    Result,
+    ReturnYaw,
+    StatusText,
+    Triple,
+    critical,
+)
+from simulator.mavlink.telemetry import builders_in
+from simulator.vehicle.battery import BatteryState
+
+# PX4_CUSTOM_MAIN_MODE, PX4_CUSTOM_SUB_MODE_AUTO
+_MAIN = {1: "MANUAL", 2: "ALTCTL", 3: "POSCTL", 5: "ACRO", 6: "OFFBOARD", 7: "STABILIZED"}
+_AUTO_SUB = {
+    2: "AUTO.TAKEOFF",
+    3: "AUTO.LOITER",
+    4: "AUTO.MISSION",
+    5: "AUTO.RTL",
+    6: "AUTO.LAND",
+    8: "AUTO.FOLLOW",
+    9: "AUTO.PRECLAND",
+}
+_CUSTOM_MODE_ENABLED = 1
+_MAV_TYPE_GCS = 6
+_NO_AUTO_MODE = critical("Unsupported auto mode")
+
+# MAV_CMD accepted without an effect that the simulator shows, and not acknowledged at all
+_TAKEN = (80, 187, 191, 195, 197, 201, 519, 525, 528)
+_UNANSWERED = (
+    1, 93, 203, 204, 205, 206, 214, 220, 242, 243, 260, 310, 420, 500, 521, 530, 531, 532, 3000
+)  # fmt: skip
+
+_RATES_IGNORED, _THRUST_IGNORED, _ATTITUDE_IGNORED = 0b011, 64, 128  # type_mask
+_YAW_IGNORED, _YAW_RATE_IGNORED = 1024, 2048
+_LOCAL_NED, _BODY_NED = 1, 8  # MAV_FRAME
+
+_UNSUPPORTED_FRAME, _UNSUPPORTED = 2, 3  # MAV_MISSION_RESULT
+_COMMAND_FRAME = 2  # MAV_FRAME_MISSION: no place
+_IN_WHOLE_DEGREES = {0: 5, 3: 6}  # MAV_FRAME: GLOBAL, GLOBAL_RELATIVE_ALT -> the same _INT
+_IN_DEGREES = {whole: frame for frame, whole in _IN_WHOLE_DEGREES.items()}
+_INVALID = critical("IGN MISSION_ITEM: Invalid item")
+# MAV_CMD of missions with a place, and without one
+_PLACES = frozenset({16, 17, 19, 21, 22, 31, 80, 84, 85, 195, 201, 4501})
+_ACTS = frozenset({
+    20, 80, 93, 112, 114, 177, 178, 179, 187, 189, 196, 197, 200, 201, 203, 204, 205, 206, 211, 214,
+    260, 530, 532, 534, 1000, 1001, 2000, 2001, 2003, 2500, 2501, 3000, 42600,
+})  # fmt: skip
+
+_BATTERY_THRESHOLDS = ("BAT_LOW_THR", "BAT_CRIT_THR", "BAT_EMERGEN_THR")
+_GATE_MPS = 5.0 * 0.3  # EKF2_GPS_V_GATE standard deviations of EKF2_GPS_V_NOISE
+
+
+class Px4(Firmware):
+    """PX4 1.16."""
+
+    def heartbeat(self, now: Condition) -> tuple[int, int]:
+        """base_mode and MAV_STATE. In Offboard base_mode shows which control loops run: none before
+        the first setpoint, the rate loop only for rate setpoints."""
+        base_mode = now.mode.base_mode
+        if now.mode.behaviour is Behaviour.SETPOINT:
+            attitude = now.setpoint if isinstance(now.setpoint, AttitudeSetpoint) else None
+            rates_alone = attitude is not None and attitude.rates_frd_radps is not None
+            base_mode = RATES if now.setpoint is None or rates_alone else OFFBOARD
+        if now.armed:
+            return base_mode, 5 if now.failsafe else 4
+        return base_mode, 3 if now.healthy else 0
+
+    def command_mode(self, params: tuple[float, ...]) -> ModeRequest:
+        """MAV_CMD_DO_SET_MODE (176): param1 base mode, param2 main mode, param3 sub mode of AUTO.
+
+        An unknown main mode, or a base mode alone, is accepted and changes nothing.
+        """
+        base, main, sub = (int(p) if math.isfinite(p) else 0 for p in params[:3])
+        if not base & _CUSTOM_MODE_ENABLED:
+            return ModeRequest(None, Result.ACCEPTED)
+        if main == 4:
+            known = _AUTO_SUB.get(sub)
+            text = None if known else _NO_AUTO_MODE
+            return ModeRequest(known, Result.TEMPORARILY_REJECTED, text)
+        return ModeRequest(_MAIN.get(main), Result.ACCEPTED)
+
+    def set_mode(self, base_mode: int, custom_mode: int) -> ModeRequest:
+        """SET_MODE: main mode in the third byte of custom_mode, sub mode in the fourth."""
+        return self.command_mode((base_mode, custom_mode >> 16 & 0xFF, custom_mode >> 24))
+
+    def arm_request(self, param: float) -> ArmRequest:
+        """param1 rounded; one that is not finite disarms."""
+        number = math.floor(param + 0.5) if math.isfinite(param) else 0
+        if number in (0, 1):
+            return ArmRequest("arm" if number else "disarm")
+        text = f"Unsupported ARM_DISARM param: {param:.3f}"
+        return ArmRequest(text=critical(text))
+
+    def attitude_setpoint(
+        self, values: Mapping[str, Any], parameter: ReadParameter
+    ) -> AttitudeSetpoint | None:
+        """SET_ATTITUDE_TARGET as PX4 reads it; None when it demands nothing (mask 135).
+
+        Only the roll and pitch bits of type_mask ignore the rates. A thrust that is ignored or NaN
+        is zero thrust. A quaternion may have any length; one without direction keeps the last
+        attitude.
+        """
+        mask = values["type_mask"]
+        attitude_given = not mask & _ATTITUDE_IGNORED
+        rates_given = not mask & _RATES_IGNORED
+        if not attitude_given and not rates_given:
+            return None
+        thrust = 0.0 if mask & _THRUST_IGNORED else values["thrust"]
+        thrust = min(1.0, max(0.0, thrust)) if not math.isnan(thrust) else 0.0
+        if attitude_given:
+            w, x, y, z = values["q"]
+            norm = math.sqrt(w * w + x * x + y * y + z * z)
+            if not (math.isfinite(norm) and norm > 1e-6):
+                return AttitudeSetpoint(None, None, thrust)
+            return AttitudeSetpoint((w / norm, x / norm, y / norm, z / norm), None, thrust)
+        rates = (values["body_roll_rate"], values["body_pitch_rate"], values["body_yaw_rate"])
+        finite: Triple = (
+            rates[0] if math.isfinite(rates[0]) else 0.0,
+            rates[1] if math.isfinite(rates[1]) else 0.0,
+            rates[2] if math.isfinite(rates[2]) else 0.0,
+        )
+        return AttitudeSetpoint(None, finite, thrust)
+
+    def motion_setpoint(self, values: Mapping[str, Any]) -> MotionSetpoint | None:
+        """SET_POSITION_TARGET_LOCAL_NED in MAV_FRAME 1; None when nothing is demanded."""
+        if values["coordinate_frame"] != _LOCAL_NED:
+            return None
+        mask = values["type_mask"]
+
+        def triple(names: tuple[str, str, str], shift: int) -> Triple:
+            a, b, c = (
+                math.nan if mask >> (shift + i) & 1 or math.isinf(values[name]) else values[name]
+                for i, name in enumerate(names)
+            )
+            return (a, b, c)
+
+        position = triple(("x", "y", "z"), 0)
+        velocity = triple(("vx", "vy", "vz"), 3)
+        acceleration = triple(("afx", "afy", "afz"), 6)
+        if all(math.isnan(value) for value in (*position, *velocity, *acceleration)):
+            return None
+        yaw, yaw_rate = values["yaw"], values["yaw_rate"]
+        return MotionSetpoint(
+            position,
+            velocity,
+            acceleration,
+            math.nan if mask & _YAW_IGNORED or math.isinf(yaw) else yaw,
+            math.nan if mask & _YAW_RATE_IGNORED or math.isinf(yaw_rate) else yaw_rate,
+        )
+
+    def in_local_frame(
+        self, values: Mapping[str, Any], position_ned_m: Triple, attitude: Quaternion
+    ) -> Mapping[str, Any]:
+        """BODY_NED: velocity rotated by yaw, acceleration by attitude, no position.
+
+        A vector with one ignored component is ignored.
+        """
+        if values["coordinate_frame"] != _BODY_NED:
+            return values
+        w, x, y, z = attitude
+        yaw = math.atan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))
+        forward, right = values["vx"], values["vy"]
+        given = (values["afx"], values["afy"], values["afz"])
+        finite = all(map(math.isfinite, given))
+        turned = rotation_from_quaternion(np.array(attitude)) @ given if finite else given
+        mask = values["type_mask"] | 0b111
+        mask |= 0b111_000 if mask & 0b111_000 else 0
+        mask |= 0b111_000_000 if mask & 0b111_000_000 else 0
+        return {
+            **values,
+            "coordinate_frame": _LOCAL_NED,
+            "type_mask": mask,
+            "vx": math.cos(yaw) * forward - math.sin(yaw) * right,
+            "vy": math.sin(yaw) * forward + math.cos(yaw) * right,
+            "afx": float(turned[0]),
+            "afy": float(turned[1]),
+            "afz": float(turned[2]),
+        }
+
+    def setpoint_rejection(self, message: str, frame: int | None) -> StatusText:
+        """Text about a setpoint in an unknown frame, or (None) one that demands nothing."""
+        if frame is None:
+            return critical(f"{message} invalid")
+        if message.endswith("GLOBAL_INT"):
+            return critical(f"{message} invalid coordinate frame {frame}")
+        return critical(f"{message} coordinate frame {frame} unsupported")
+
+    def mission_refusal(self, item: MissionItem) -> tuple[int, StatusText | None] | None:
+        by_place = item.frame in _IN_WHOLE_DEGREES or item.frame in _IN_DEGREES
+        if not by_place and item.frame != _COMMAND_FRAME:
+            return _UNSUPPORTED_FRAME, _INVALID
+        if item.command not in (_PLACES if by_place else _ACTS):
+            return _UNSUPPORTED, _INVALID
+        if by_place and not math.isfinite(item.z):
+            return _UNSUPPORTED_FRAME, _INVALID
+        return None
+
+    def mission_frame(self, item: MissionItem, whole: bool) -> int:
+        """The frame of the kind of message that is requested, whatever the upload used."""
+        return (_IN_WHOLE_DEGREES if whole else _IN_DEGREES).get(item.frame, item.frame)
+
+    def is_ground_station(self, kind: int, system: int, parameter: ReadParameter) -> bool:
+        """By MAV_TYPE, whatever the system id."""
+        return kind == _MAV_TYPE_GCS
+
+    def obeys_system(self, sender: int, own: int, parameter: ReadParameter) -> bool:
+        """All systems."""
+        return True
+
+    def velocity_ratio(self, error_mps: float) -> float:
+        """Squared, as PX4 reports it."""
+        return (error_mps / _GATE_MPS) ** 2
+
+    def velocity_ratio_most(self, parameter: ReadParameter) -> float:
+        """EKF2's limit before take-off."""
+        return 0.5
+
+    def battery_level(self, battery: BatteryState, parameter: ReadParameter) -> int:
+        """By the remaining share."""
+        return sum(battery.remaining < parameter(name) for name in _BATTERY_THRESHOLDS)
+
+    def gains(self, parameter: ReadParameter) -> PositionGains:
+        """Gains and limits of the position loop."""
+        across = tuple(parameter(f"MPC_XY_VEL_{term}_ACC") for term in "PID")
+        up = tuple(parameter(f"MPC_Z_VEL_{term}_ACC") for term in "PID")
+        return PositionGains(
+            position_xy_ps=parameter("MPC_XY_P"),
+            position_z_ps=parameter("MPC_Z_P"),
+            velocity_xy=(across[0], across[1], across[2]),
+            velocity_z=(up[0], up[1], up[2]),
+            speed_xy_mps=parameter("MPC_XY_VEL_MAX"),
+            speed_up_mps=parameter("MPC_Z_VEL_MAX_UP"),
+            speed_down_mps=parameter("MPC_Z_VEL_MAX_DN"),
+            tilt_max_rad=math.radians(parameter("MPC_TILTMAX_AIR")),
+            thrust_max=parameter("MPC_THR_MAX"),
+            derivative_cutoff_hz=5.0,
+            turn_radps=math.radians(parameter("MPC_YAWRAUTO_MAX")),
+            # jerk is limited in the real one (MPC_JERK_AUTO), which lowers both on average
+            speeding_mps2=0.7 * parameter("MPC_ACC_HOR"),
+            braking_mps2=0.5 * parameter("MPC_ACC_HOR"),
+            vertical_mps2=0.5 * parameter("MPC_ACC_DOWN_MAX"),
+            facing_mps=parameter("MPC_XY_P") * parameter("NAV_ACC_RAD"),
+        )
+
+    def return_height_m(self, distance_m: float, parameter: ReadParameter) -> float:
+        """Height of a return above home: under a cone near home (RTL_CONE_ANG)."""
+        highest_m, accepted_m = parameter("RTL_RETURN_ALT"), parameter("NAV_ACC_RAD")
+        if distance_m <= accepted_m:
+            return min(2.0 * distance_m, highest_m)
+        height_m = highest_m
+        if distance_m <= parameter("RTL_MIN_DIST"):
+            cone_rad = math.radians(min(89.0, max(1.0, parameter("RTL_CONE_ANG"))))
+            height_m = min(distance_m / math.tan(cone_rad), highest_m)
+        return min(max(height_m, 2.0 * accepted_m), highest_m)
+
+    def return_yaw(self, distance_m: float, parameter: ReadParameter) -> ReturnYaw:
+        """Far away in the direction of flight, near home as at home."""
+        return (
+            ReturnYaw.AS_AT_HOME if distance_m < parameter("RTL_MIN_DIST") else ReturnYaw.ALONG_PATH
+        )
+
+
+PX4 = Px4(
+    name="px4",
+    vehicle="px4_sih",
+    scenario="px4_like",
+    mav_autopilot=12,
+    version=0x011001FF,  # 1.16.1, release
+    # float parameters, missions and commands in integers, bytewise parameters, targets of attitude,
+    # local and global position, MAVLink 2
+    capabilities=0x21DE,
+    origin=(47.397742, 8.545594, 489.4),
+    modes=MODES,
+    boot_mode="AUTO.LOITER",
+    hold_mode="AUTO.LOITER",
+    rules=RULES,
+    parameters=PARAMETERS,
+    parameter_roles=ROLES,
+    system_parameter="MAV_SYS_ID",
+    mode_acked_twice=True,
+    set_mode_acked_as=176,
+    force_codes={"arm": 21196.0, "disarm": 21196.0},
+    takeoff_above_home=False,
+    reposition_mode="AUTO.LOITER",
+    repositions_strictly=False,
+    speed_refusal=Result.ACCEPTED,
+    command_answers={
+        **dict.fromkeys(_TAKEN, Result.ACCEPTED),
+        **dict.fromkeys(_UNANSWERED),
+        189: Result.CANCELLED,
+        211: Result.DENIED,
+        224: Result.UNSUPPORTED,  # MISSION_SET_CURRENT does it
+    },
+    home_mirrored=True,
+    global_frames=frozenset({5, 6, 11}),
+    setpoint_mode_needs_stream=True,
+    setpoints_as_automatic=False,
+    setpoints_outlive_modes=True,
+    setpoints_imply_flight=False,
+    setpoint_spool_s=0.0,
+    stream_reaction_s=0.036,
+    strict_missions=True,
+    home_item_first=False,
+    guided_items=False,
+    mission_text=None,
+    turning_items=frozenset({16, 17, 19, 21}),
+    reached_above_landing=True,
+    mission_keeps_speed=True,
+    companion_rates_hz=telemetry.COMPANION_RATES_HZ,
+    ground_rates_hz=telemetry.GROUND_RATES_HZ,
+    messages=builders_in(telemetry),
+    withheld_until={},
+    message_versions=telemetry.VERSIONS,
+    position_grid_steps=2,
+    fixed_streams=telemetry.ON_EVENT | {"HEARTBEAT"},
+    not_on_request=telemetry.ON_EVENT,
+    never_sent=telemetry.NEVER_SENT,
+    stream_groups={},
+    rate_max_hz=math.inf,
+    interval_refusal=Result.FAILED,
+    interval_refusal_text="",
+    too_fast_text="",
+    request_refusal=Result.DENIED,
+    ground_station_stays_s=2.5,
+    target_component_checked=True,
+    text_suffix="\t",
+    text_to_ground_stations_only=True,
+    parameters_bytewise=True,
+    parameters_hashed=True,
+    parameters_numbered=True,
+    # of 1.17, as 1.16 has no signing: HEARTBEAT, RADIO_STATUS, ADSB_VEHICLE, COLLISION
+    accepted_unsigned=frozenset({0, 109, 246, 247}),
+    stamps_follow_clock=False,
+    boot_events_s={},
+    # gyro, accelerometer, magnetometer, absolute pressure, GPS; battery, AHRS; the health bits
+    # include the geofence, or MAVProxy reports a breach
+    sensor_bits=(0x0300402F, 0x0301402F, 0x0330C83F),
+    first_fix_s=3.0,
+    passes_after_s=4.0,
+    passes_without_position_after_s=4.0,
+    fails_where_unarmable=True,
+    position_without_fix_s=5.0,  # EKF2_NOAID_TOUT
+    battery_events=("battery low", "battery critical", "battery emergency"),
+    integrates_on_ramp=True,
+    landing=Landing(
+        low_thrust_share=0.95,  # of estimates that wander on the ground, too
+        idle_thrust_share=0.1,
+        sinking_mps=0.09,
+        speed_down_mps=0.2,
+        speed_across_mps=1.5,  # LNDMC_XY_VEL_MAX
+        rate_radps=math.radians(20.0),  # LNDMC_ROT_MAX
+        place_below_is_descent=False,
+    ),
+    descend_speed_mps=0.6,
+    sticks=None,
+)

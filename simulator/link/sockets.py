@@ -1,0 +1,308 @@
+"""Sockets of the simulator's links, and waiting for datagrams. Bytes only; no MAVLink.
+
+udpout:HOST:PORT sends to that address from the start, udpin:HOST:PORT answers every address that
+sends to it, and tcpin:HOST:PORT accepts connections, as ArduPilot's SITL does. A TCP stream may cut
+a frame anywhere; `receive` returns whole MAVLink frames, as a datagram does.
+"""
+
+from __future__ import annotations
+
+import select
+import selectors
+import socket
+from collections import deque
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from typing import Protocol
+
+from offboard.documents.errors import abridged
+
+PEERS_MAX = 16
+DATAGRAM_MAX = 65535
+Address = tuple[str, int]
+CLIENTS_MAX = 16
+READ_BYTES = 65536
+UNSENT_MAX = 1 << 20  # bytes; a client that does not read more is disconnected
+_MAGIC_V1, _MAGIC_V2, _SIGNED, _SIGNATURE_BYTES = 0xFE, 0xFD, 0x01, 13
+# Distance between the ports of two instances, as PX4 and ArduPilot have it
+_PORTS_APART = {"udpout": 1, "udpin": 1, "tcpin": 10}
+
+
+class LinkError(Exception):
+    """An address that cannot be used; the message is one sentence."""
+
+
+class Link(Protocol):
+    """One end of a link with any number of peers. No method blocks."""
+
+    @property
+    def port(self) -> int: ...
+    def fileno(self) -> int: ...
+    def send(self, datagrams: Iterable[bytes]) -> None: ...
+    def receive(self) -> bytes | None: ...
+    def close(self) -> None: ...
+
+
+class UdpLink:
+    """One socket and its peers. Send errors lose datagrams and are otherwise ignored."""
+
+    def __init__(self, sock: socket.socket, target: Address | None) -> None:
+        self._socket = sock
+        self._target = target
+        self._peers: dict[Address, None] = {} if target is None else {target: None}
+
+    def beside(self) -> UdpLink:
+        """A link with another port of the same host, and the same peers."""
+        sock = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        sock.setblocking(False)
+        sock.bind((self._socket.getsockname()[0], 0))
+        other = UdpLink(sock, None)
+        other._peers = self._peers
+        return other
+
+    def fileno(self) -> int:
+        return self._socket.fileno()
+
+    @property
+    def port(self) -> int:
+        """The local port."""
+        return int(self._socket.getsockname()[1])
+
+    def send(self, datagrams: Iterable[bytes]) -> None:
+        """Send each datagram to every peer."""
+        for datagram in datagrams:
+            for peer in self._peers:
+                try:
+                    self._socket.sendto(datagram, peer)
+                except OSError:  # refused, unreachable or full: telemetry may be lost
+                    continue
+
+    def receive(self) -> bytes | None:
+        """One datagram, or None."""
+        while True:
+            try:
+                datagram, sender = self._socket.recvfrom(DATAGRAM_MAX)
+            except ConnectionError:
+                continue  # ICMP error for a datagram sent earlier
+            except OSError:
+                return None
+            if sender not in self._peers:
+                self._add_peer(sender)
+            return datagram
+
+    def _add_peer(self, sender: Address) -> None:
+        if len(self._peers) >= PEERS_MAX:
+            oldest = next(peer for peer in self._peers if peer != self._target)
+            del self._peers[oldest]
+        self._peers[sender] = None
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@dataclass(slots=True)
+class Client:
+    """One connection: bytes received of an incomplete frame, and bytes not sent yet."""
+
+    socket: socket.socket
+    arrived: bytearray = field(default_factory=bytearray)
+    unsent: bytearray = field(default_factory=bytearray)
+
+
+class TcpLink:
+    """A listening socket and its clients. A client that disconnects or does not read is dropped."""
+
+    def __init__(self, listener: socket.socket) -> None:
+        self._listener = listener
+        self._clients: list[Client] = []
+        self._selector = selectors.DefaultSelector()
+        self._selector.register(listener, selectors.EVENT_READ)
+        self._frames: deque[bytes] = deque()
+
+    def fileno(self) -> int:
+        """File descriptor for select; it covers the listener and all clients."""
+        fileno = getattr(self._selector, "fileno", self._listener.fileno)
+        return int(fileno())
+
+    @property
+    def port(self) -> int:
+        """The local port."""
+        return int(self._listener.getsockname()[1])
+
+    def send(self, datagrams: Iterable[bytes]) -> None:
+        """Send all datagrams to every client."""
+        together = b"".join(datagrams)
+        for client in tuple(self._clients):
+            client.unsent += together
+            if client.unsent:
+                self._flush(client)
+
+    def _flush(self, client: Client) -> None:
+        try:
+            del client.unsent[: client.socket.send(client.unsent)]
+        except BlockingIOError:
+            pass
+        except OSError:
+            self._disconnect(client)
+        if len(client.unsent) > UNSENT_MAX:
+            self._disconnect(client)
+
+    def receive(self) -> bytes | None:
+        """Whole frames of one read from one client, or None."""
+        if not self._frames:
+            for key, _ in self._selector.select(0):
+                if key.fileobj is self._listener:
+                    self._accept()
+                else:
+                    self._read_client(key.data)
+        return self._frames.popleft() if self._frames else None
+
+    def _accept(self) -> None:
+        try:
+            sock, _ = self._listener.accept()
+        except OSError:
+            return
+        if len(self._clients) >= CLIENTS_MAX:
+            self._disconnect(self._clients[0])
+        sock.setblocking(False)
+        sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        client = Client(sock)
+        self._clients.append(client)
+        self._selector.register(sock, selectors.EVENT_READ, client)
+
+    def _read_client(self, client: Client) -> None:
+        try:
+            piece = client.socket.recv(READ_BYTES)
+        except BlockingIOError:
+            return
+        except OSError:
+            piece = b""
+        if not piece:
+            self._disconnect(client)
+            return
+        client.arrived += piece
+        whole = whole_frames(client.arrived)
+        if whole:
+            self._frames.append(bytes(client.arrived[:whole]))
+            del client.arrived[:whole]
+
+    def _disconnect(self, client: Client) -> None:
+        if client in self._clients:
+            self._clients.remove(client)
+            self._selector.unregister(client.socket)
+            client.socket.close()
+
+    def close(self) -> None:
+        for client in tuple(self._clients):
+            self._disconnect(client)
+        self._selector.close()
+        self._listener.close()
+
+
+def whole_frames(data: bytes | bytearray) -> int:
+    """Number of bytes before the first incomplete frame; bytes outside frames count too."""
+    at = 0
+    while at < len(data):
+        length = 1
+        if data[at] in (_MAGIC_V1, _MAGIC_V2):
+            if len(data) - at < 3:
+                return at
+            length = data[at + 1] + (8 if data[at] == _MAGIC_V1 else 12)
+            if data[at] == _MAGIC_V2 and data[at + 2] & _SIGNED:
+                length += _SIGNATURE_BYTES
+            if at + length > len(data):
+                return at
+        at += length
+    return at
+
+
+def free_ports(count: int) -> list[int]:
+    """UDP ports on 127.0.0.1 that are free now."""
+    sockets = [socket.socket(socket.AF_INET, socket.SOCK_DGRAM) for _ in range(count)]
+    try:
+        for sock in sockets:
+            sock.bind(("127.0.0.1", 0))
+        return [int(sock.getsockname()[1]) for sock in sockets]
+    finally:
+        for sock in sockets:
+            sock.close()
+
+
+def wait(links: Sequence[Link], timeout_s: float) -> list[Link]:
+    """Links with a datagram to receive; returns with the first one, or after `timeout_s`."""
+    return select.select(links, [], [], max(0.0, timeout_s))[0]
+
+
+def open_link(url: str, preferred_port: int) -> Link:
+    """Open a link.
+
+    Args:
+        url: `udpout:HOST:PORT`, `udpin:HOST:PORT` or `tcpin:HOST:PORT`.
+        preferred_port: local port of `udpout`; any other if it is in use.
+
+    Raises:
+        LinkError: the address is malformed, unknown or in use.
+    """
+    kind, host, port = _split(url)
+    address = _resolve(url, host, port)
+    by_stream = kind == "tcpin"
+    sock = socket.socket(socket.AF_INET, socket.SOCK_STREAM if by_stream else socket.SOCK_DGRAM)
+    sock.setblocking(False)
+    try:
+        if by_stream:
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+            sock.bind(address)
+            sock.listen()
+            return TcpLink(sock)
+        if kind == "udpin":
+            sock.bind(address)
+            return UdpLink(sock, None)
+        local = "127.0.0.1" if address[0].startswith("127.") else ""
+        try:
+            sock.bind((local, preferred_port))
+        except OSError:
+            sock.bind((local, 0))
+    except OSError as error:
+        sock.close()
+        raise LinkError(f"{url} cannot be opened: {error.strerror or error}") from None
+    return UdpLink(sock, address)
+
+
+def open_beside(link: Link) -> Link:
+    """Open a link with a port of its own and the same peers, for a sender beside the vehicle.
+
+    Raises:
+        LinkError: the link is a connection, in which nobody else can send.
+    """
+    if not isinstance(link, UdpLink):
+        raise LinkError("fault stranger: it needs a UDP link, where another port can send")
+    return link.beside()
+
+
+def shifted(url: str, by: int) -> str:
+    """URL of the same link for the instance `by` numbers later. Raises LinkError."""
+    kind, host, port = _split(url)
+    return f"{kind}:{host}:{port + by * _PORTS_APART[kind]}"
+
+
+def _split(url: str) -> tuple[str, str, int]:
+    parts = url.split(":")
+    usable = len(parts) == 3 and parts[0] in _PORTS_APART and parts[1] != ""
+    number = parts[-1].isascii() and parts[-1].isdigit() and len(parts[-1]) <= 5
+    if not (usable and number and 0 < int(parts[2]) < 65536):
+        raise LinkError(
+            f"{abridged(url)} is not a link: give udpout:, udpin: or tcpin:HOST:PORT, "
+            "port 1 .. 65535"
+        )
+    return parts[0], parts[1], int(parts[2])
+
+
+def _resolve(url: str, host: str, port: int) -> Address:
+    try:
+        found = socket.getaddrinfo(host, port, socket.AF_INET, socket.SOCK_DGRAM)
+    except (OSError, UnicodeError):
+        raise LinkError(
+            f"{abridged(url)} cannot be opened: no address known for {abridged(host)}"
+        ) from None
+    address = found[0][4]
+    return (str(address[0]), int(address[1]))
