@@ -3,28 +3,20 @@
 from __future__ import annotations
 
 import math
-import os
-import signal
 import sys
 from importlib.metadata import version
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn
+from typing import Annotated, Any, NoReturn
 
 import typer
 
 from offboard.documents import shipped
 from offboard.documents.arguments import Command
-from offboard.documents.command_line import complain, tell
+from offboard.documents.command_line import tell
 from offboard.documents.errors import UserError
+from simulator.options import COMPANION_PORT, NO_LINK, Options, Stop
 
-if TYPE_CHECKING:
-    from simulator.firmware.base import Firmware
-    from simulator.instance import Instance
-
-COMPANION_PORT, GROUND_PORT = 14540, 14550
-LOCAL_COMPANION_PORT, LOCAL_GROUND_PORT = 14580, 18570  # as PX4 SITL
-ANY_PORT = 0
-NO_LINK = "none"
+GROUND_PORT = 14550
 SYSTEM_MAX = 250
 FILE = "NAME|FILE"  # the name of a shipped file, or a path
 
@@ -109,113 +101,33 @@ def simulate(
         _list_scenarios()
     if check is not None:
         _check(check)
-    if lockstep and speed is not None:
-        _refuse("--speed and --lockstep exclude each other: lockstep has no speed")
-    if speed is not None and not 0.1 <= speed <= 1000.0:
-        _refuse(f"--speed {speed:g}: must be 0.1 .. 1000")
-    for option, seconds in (("--duration", duration), ("--patience", patience)):
+    for seconds, option in ((duration, "--duration"), (patience, "--patience")):
         if seconds is not None and math.isnan(seconds):
             _refuse(f"{option} nan: must be a number")
-    if lockstep and instances > 1:
-        _refuse("--lockstep and --instances exclude each other: time waits for one companion")
-    if instance + instances > SYSTEM_MAX:
-        _refuse(f"--instance {instance} --instances {instances}: system ids end at {SYSTEM_MAX}")
+    _check_speed(speed, lockstep=lockstep)
+    _check_numbers(instance, instances, lockstep=lockstep)
     stopping = Stop()
+    options = Options(
+        connect=connect,
+        gcs=gcs,
+        firmware=firmware,
+        speed=1.0 if speed is None else speed,
+        lockstep=lockstep,
+        seed=seed,
+        scenario=scenario,
+        vehicle=vehicle,
+        parameters=tuple(param or ()),
+        duration_s=duration,
+        numbers=range(instance, instance + instances),
+        patience_s=patience,
+        signing_key=signing_key,
+        log=log,
+    )
+    from offboard.compiled import loading
 
-    # imported late, so that a wrong option is answered at once
-    from offboard.compiled import loading, prepare
-
-    with loading():
-        from offboard.documents.reading import DocumentError
-        from offboard.documents.signing_key import read_key
-        from offboard.link.clock import unix_us
-        from simulator import config
-        from simulator.firmware.catalogue import FIRMWARES
-        from simulator.instance import VIRTUAL_EPOCH_US, Instance
-        from simulator.link.recorder import Recorder
-        from simulator.link.sockets import LinkError, open_beside, open_link, shifted
-        from simulator.run import Endpoint, Runner, warm_up
-
-    personality = FIRMWARES.get(firmware)
-    if personality is None:
-        _refuse(f"--firmware {firmware}: unknown; there is {', '.join(FIRMWARES)}")
-
-    key = read_key(signing_key) if signing_key else b""
-
-    # the local ports of PX4 SITL only by default: a real PX4 beside us may use them
-    own_ports = connect is None
-    connect = connect or f"udpout:127.0.0.1:{COMPANION_PORT + instance}"
-    numbers = range(instance, instance + instances)
-    try:
-        flown = config.scenario(scenario or personality.scenario)
-        config.check_for(flown, personality, lockstep=lockstep)
-        flyer = config.vehicle(vehicle or personality.vehicle)
-        companions = [
-            open_link(
-                shifted(connect, number - instance),
-                LOCAL_COMPANION_PORT + number if own_ports else ANY_PORT,
-            )
-            for number in numbers
-        ]
-        grounds = [
-            None if gcs == NO_LINK else open_link(gcs, LOCAL_GROUND_PORT + number)
-            for number in numbers
-        ]
-    except (DocumentError, LinkError) as error:
-        _refuse(str(error))
-
-    parameters = _parameters(personality, param or [])
-    recorder = None
-    if log is not None:
-        try:
-            recorder = Recorder(log)
-        except OSError as error:
-            _refuse(f"--log {log} cannot be written: {error.strerror}")
-
-    prepare(_warn)
-    warm_up(Instance(personality, flyer, flown.conditions, seed, lockstep=True))
-
-    epoch_us = VIRTUAL_EPOCH_US if lockstep else unix_us()
-    endpoints = []
-    try:
-        for number, companion, ground in zip(numbers, companions, grounds, strict=True):
-            vehicle_flown = Instance(
-                personality,
-                flyer,
-                flown.conditions,
-                seed + number - instance,
-                system=number + 1,
-                lockstep=lockstep,
-                ground_link=ground is not None,
-                epoch_us=epoch_us,
-                parameters=parameters,
-                faults=flown.faults,
-                start=flown.start,
-                signing_key=key,
-            )
-            strangers = tuple(open_beside(companion) for _ in vehicle_flown.strangers)
-            endpoints.append(Endpoint(vehicle_flown, companion, ground, recorder, strangers))
-    except (DocumentError, LinkError) as error:
-        _refuse(str(error))
-    _warn_if_it_cannot_land(endpoints[0].instance, flyer.hover_thrust)
-    purpose = "waiting at" if connect.startswith("udpin:") else "sending to"
-    for number in numbers:
-        place = shifted(connect, number - instance).partition(":")[2]
-        _print(
-            f"{firmware} vehicle {flyer.name}, system {number + 1}, scenario {flown.name},"
-            f" seed {seed + number - instance}: {purpose} {place}"
-        )
-    stopping.running = True
-    runner = Runner(endpoints, stopping=stopping, report=_warn, duration_s=duration)
-    outcome = runner.lockstep(patience) if lockstep else runner.real_time(speed or 1.0)
-    if outcome.sentence:
-        _warn(outcome.sentence)
-    if instances > 1:
-        _print(f"{instances} vehicles: {runner.punctuality}")
-    for endpoint in endpoints:
-        for sentence, count in endpoint.instance.complaints.items():
-            _print(f"{count} x {sentence}")
-    raise typer.Exit(outcome.code)
+    with loading():  # imported late, so that a wrong option is answered at once
+        from simulator.launch import launch
+    raise typer.Exit(launch(options, stopping))
 
 
 def _check(path: Path) -> NoReturn:
@@ -226,66 +138,25 @@ def _check(path: Path) -> NoReturn:
         config.scenario(str(path if path.suffix in (".yaml", ".yml") else path.absolute()))
     except DocumentError as error:
         _refuse(str(error))
-    _print(f"{path}: scenario, valid")
+    tell(f"{path}: scenario, valid", sys.stdout)
     raise typer.Exit(0)
 
 
 def _list_scenarios() -> NoReturn:
     for name, text in shipped.descriptions("scenarios").items():
-        _print(f"{name:16}  {text}")
+        tell(f"{name:16}  {text}", sys.stdout)
     raise typer.Exit(0)
 
 
-def _parameters(firmware: Firmware, assignments: list[str]) -> dict[str, float]:
-    """Values by parameter name. Exits where a name is unknown or a value out of range."""
-    known = {spec.name: spec for spec in firmware.parameters}
-    values: dict[str, float] = {}
-    for text in assignments:
-        name, _, number = text.partition("=")
-        if name not in known:
-            _refuse(f"--param {text}: {firmware.name} has no parameter {name}")
-        spec = known[name]
-        try:
-            values[name] = float(number)
-        except ValueError:
-            _refuse(f"--param {text}: give NAME=NUMBER")
-        if not spec.minimum <= values[name] <= spec.maximum:
-            _refuse(f"--param {text}: must be {spec.minimum:g} .. {spec.maximum:g}")
-    return values
+def _check_speed(speed: float | None, *, lockstep: bool) -> None:
+    if lockstep and speed is not None:
+        _refuse("--speed and --lockstep exclude each other: lockstep has no speed")
+    if speed is not None and not 0.1 <= speed <= 1000.0:
+        _refuse(f"--speed {speed:g}: must be 0.1 .. 1000")
 
 
-def _warn_if_it_cannot_land(instance: Instance, hover_thrust: float) -> None:
-    """Warn where the lowest thrust of the autopilot exceeds the vehicle's weight."""
-    firmware, parameters = instance.autopilot.firmware, instance.autopilot.parameters
-    least, name = parameters.role("thrust_least"), firmware.parameter_roles["thrust_least"]
-    if least >= hover_thrust:
-        _warn(
-            f"{name} is {least:.3g}, which lifts a vehicle that hovers at {hover_thrust:g}: it"
-            f" cannot land; change it with --param {name}=VALUE"
-        )
-
-
-def _warn(sentence: str) -> None:
-    complain(f"simulator: {sentence}")
-
-
-def _print(text: str) -> None:
-    tell(text, sys.stdout)
-
-
-class Stop:
-    """Whether SIGTERM or SIGINT was received. While the simulator starts, they end the process."""
-
-    def __init__(self) -> None:
-        self.running = False
-        self._noted = False
-        for number in (signal.SIGTERM, signal.SIGINT):
-            signal.signal(number, self._note)
-
-    def _note(self, number: int, frame: object) -> None:
-        self._noted = True
-        if not self.running:
-            os._exit(0)  # no file or flight has begun
-
-    def __call__(self) -> bool:
-        return self._noted
+def _check_numbers(instance: int, instances: int, *, lockstep: bool) -> None:
+    if lockstep and instances > 1:
+        _refuse("--lockstep and --instances exclude each other: time waits for one companion")
+    if instance + instances > SYSTEM_MAX:
+        _refuse(f"--instance {instance} --instances {instances}: system ids end at {SYSTEM_MAX}")

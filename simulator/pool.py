@@ -64,12 +64,12 @@ def _run(options: list[str]) -> NoReturn:
 
 def _load() -> None:
     """Import all modules of the simulator and load its compiled functions."""
-    from simulator import config, run
+    from simulator import config, launch
     from simulator.firmware.catalogue import FIRMWARES
     from simulator.instance import Instance
     from simulator.vehicle.conditions import Conditions
 
-    assert run
+    assert launch
     prepare()
     for firmware in FIRMWARES.values():
         vehicle = config.vehicle(firmware.vehicle)

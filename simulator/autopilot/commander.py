@@ -1,8 +1,8 @@
 """The commander: mode, arming and failsafe, and the texts about them.
 
 Whatever happens (a command, a lost stream, a landing) is an event. A row of the firmware's table
-(`simulator.autopilot.state_table`) decides the next mode, the actions, the acknowledgement and the
-texts. Knows no firmware by name, no MAVLink frames, sockets or clock.
+decides the next mode, the actions, the acknowledgement and the texts: the first row of the event
+whose mode and conditions fit. Knows no firmware by name, no MAVLink frames, sockets or clock.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from simulator.autopilot.health import FlightTime, Health
 from simulator.autopilot.navigator import Navigator
 from simulator.autopilot.position_controller import PositionController
 from simulator.autopilot.state import VehicleState
-from simulator.autopilot.state_table import StateTable, fields_of
 from simulator.firmware.base import AFTER_DELAY, Rule
 from simulator.firmware.values import (
     NAN3,
@@ -63,7 +62,9 @@ class Commander:
         self._firmware, self._parameters = self._guidance.firmware, self._guidance.parameters
         self._state, self._health = state, health
         firmware = self._firmware
-        self._table = StateTable(firmware, CONDITIONS, ACTIONS, TEXT_VALUES)
+        self._rows: dict[str, list[Rule]] = {}
+        for rule in firmware.rules:
+            self._rows.setdefault(rule.event, []).append(rule)
         self.flight_time = FlightTime(self._parameters)
         self.mode: Mode = firmware.modes[firmware.boot_mode]
         self._intended = self._remembered = firmware.boot_mode
@@ -121,7 +122,7 @@ class Commander:
 
     def knows(self, event: str) -> bool:
         """The firmware has rules for an event."""
-        return self._table.knows(event)
+        return event in self._rows
 
     # -- events ------------------------------------------------------------------------------
 
@@ -131,7 +132,7 @@ class Commander:
         if self.refused and (text := self.refused.get(self._refusal_name)) is not None:
             self.texts.append(text)
             return Result.TEMPORARILY_REJECTED
-        rule = self._table.row(event, self.mode.name, self._holds)
+        rule = self._row(event)
         if rule is None:
             return Result.ACCEPTED
         self._apply(rule)
@@ -159,6 +160,13 @@ class Commander:
         offboard = self._event == "mode" and self._requested.behaviour is Behaviour.SETPOINT
         return "offboard" if offboard else self._event
 
+    def _row(self, event: str) -> Rule | None:
+        """The row that decides about an event; None: nothing happens."""
+        for rule in self._rows.get(event, ()):
+            if rule.mode in ("*", self.mode.name) and all(map(self._holds, rule.when)):
+                return rule
+        return None
+
     def _holds(self, condition: str) -> bool:
         if condition.startswith("not "):
             return not self._holds(condition[4:])
@@ -180,7 +188,7 @@ class Commander:
         if rule.to != "*":
             self._enter(target.get(rule.to, rule.to), by_failsafe="failsafe" in rule.do)
         for text in rule.texts:
-            values = {name: TEXT_VALUES[name](self) for name in fields_of(text.text)}
+            values = {name: value(self) for name, value in TEXT_VALUES.items()}
             self.texts.append(StatusText(text.severity, text.text.format(**values)))
         self.announcements += rule.send
 

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
-
-import numpy as np
 
 from offboard.model.frames import euler_from_quaternion, rotation_from_quaternion
 from simulator.autopilot.position_loop import GRAVITY_MPS2
@@ -17,7 +14,7 @@ COMPANION_RATES_HZ = GROUND_RATES_HZ = {"HEARTBEAT": 1.0, "TIMESYNC": 0.1}
 # MAV_DATA_STREAM
 GROUPS = {
     1: ("SCALED_PRESSURE",),
-    2: ("SYS_STATUS", "MISSION_CURRENT", "GPS_RAW_INT", "NAV_CONTROLLER_OUTPUT"),
+    2: ("SYS_STATUS", "MISSION_CURRENT", "GPS_RAW_INT"),
     3: ("RC_CHANNELS",),
     6: ("GLOBAL_POSITION_INT", "LOCAL_POSITION_NED"),
     10: ("ATTITUDE",),
@@ -25,7 +22,7 @@ GROUPS = {
     12: ("SYSTEM_TIME", "BATTERY_STATUS", "EKF_STATUS_REPORT", "VIBRATION"),
 }
 NEVER_SENT = frozenset({
-    22, 26, 27, 34, 35, 36, 87, 100, 105, 116, 124, 125, 127, 128, 129, 132, 133, 136, 137,
+    22, 26, 27, 34, 35, 36, 62, 87, 100, 105, 116, 124, 125, 127, 128, 129, 132, 133, 136, 137,
     143, 152, 162, 163, 164, 165, 168, 173, 178, 180, 191, 192, 194, 195, 225, 226, 235, 246,
     259, 260, 262, 269, 271, 277, 280, 281, 285, 286, 295, 301, 373, 376, 9005,
 })  # fmt: skip
@@ -80,19 +77,6 @@ def rc_channels(view: View) -> Sequence[Any]:
     sticks, now_s = view.autopilot.guidance.sticks, view.autopilot.state.time_s
     widths_us = () if sticks is None else sticks.pulses_us(now_s)
     return (view.time_ms, len(widths_us), *widths_us, *(0,) * (18 - len(widths_us)), 255)
-
-
-def nav_controller_output(view: View) -> Sequence[Any]:
-    """Demanded attitude in degrees; distance and bearing to the position setpoint."""
-    nav, controller = view.autopilot.state.estimate, view.autopilot.position_controller
-    wanted = controller.demand.attitude or (1.0, 0.0, 0.0, 0.0)
-    roll, pitch, yaw = np.degrees(euler_from_quaternion(np.array(wanted))).tolist()
-    place = controller.motion.position_ned_m
-    left = [there - here for there, here in zip(place, nav.position_ned_m, strict=True)]
-    north, east, down = (value if math.isfinite(value) else 0.0 for value in left)
-    distance_m = round(min(65535.0, math.hypot(north, east)))
-    bearing_deg = round(math.degrees(math.atan2(east, north))) if distance_m else 0
-    return (roll, pitch, round(yaw), bearing_deg, distance_m, -down, 0.0, 0.0)
 
 
 _NO_MISSION, _NOT_STARTED, _ACTIVE, _PAUSED, _COMPLETE = range(1, 6)  # MISSION_STATE

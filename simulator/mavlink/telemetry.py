@@ -14,7 +14,6 @@ from typing import Any
 
 from simulator.firmware.base import Firmware
 from simulator.mavlink import messages
-from simulator.mavlink.codec import id_of
 from simulator.mavlink.view import View
 from simulator.steps import STEP_US
 
@@ -28,40 +27,19 @@ INTERVAL_MAX_US = 2.0**31 - 1  # MESSAGE_INTERVAL.interval_us is an int32
 
 
 def builders_in(module: ModuleType) -> dict[str, Builder]:
-    """The public functions of a module, by the message that each builds.
-
-    Raises:
-        ValueError: a public function is not called like a MAVLink message.
-    """
-    found: dict[str, Builder] = {
+    """The public functions of a module, by the message that each builds."""
+    return {
         name.upper(): function
         for name, function in vars(module).items()
         if inspect.isfunction(function)
         and function.__module__ == module.__name__
         and not name.startswith("_")
     }
-    unknown = sorted(name for name in found if id_of(name) is None)
-    if unknown:
-        raise ValueError(f"{module.__name__}: not a MAVLink message: {', '.join(unknown)}")
-    return found
 
 
 def builders(firmware: Firmware) -> dict[str, Builder]:
-    """All messages of this firmware, with their builders.
-
-    Raises:
-        ValueError: a stream of the firmware has no builder, or a message that it never sends has.
-    """
-    known = {**builders_in(messages), **firmware.messages}
-    named = {*firmware.companion_rates_hz, *firmware.ground_rates_hz, *firmware.withheld_until}
-    grouped = firmware.stream_groups.values()
-    missing = sorted(named.union(firmware.fixed_streams, *grouped).difference(known))
-    if missing:
-        raise ValueError(f"{firmware.name} streams: no builder for {', '.join(missing)}")
-    unsent = sorted(name for name in known if id_of(name) in firmware.never_sent)
-    if unsent:
-        raise ValueError(f"{firmware.name} streams: remove from never_sent: {', '.join(unsent)}")
-    return known
+    """All messages of this firmware, with their builders."""
+    return {**builders_in(messages), **firmware.messages}
 
 
 @dataclass(slots=True)

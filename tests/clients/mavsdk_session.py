@@ -1,6 +1,7 @@
 """A pilot's session by MAVSDK: connect, two flights, one row of JSON per step on stdout.
 
 Knows no simulator: `python mavsdk_session.py udpin://127.0.0.1:14540` flies a real PX4 SITL too.
+With `--short` it only takes off and lands.
 """
 
 from __future__ import annotations
@@ -183,7 +184,7 @@ class Session:
         await self.down()
 
 
-async def main(url: str) -> None:
+async def main(url: str, *, short: bool) -> None:
     configuration = Configuration.create_with_component_type(ComponentType.GROUND_STATION)
     async with Mavsdk(configuration) as mavsdk:
         await mavsdk.add_any_connection(url)
@@ -192,10 +193,12 @@ async def main(url: str) -> None:
         await session.become_healthy()
         await session.parameters()
         await session.take_off()
-        await session.fly_offboard()
+        if not short:
+            await session.fly_offboard()
         await session.land()
-        await session.fly_mission()
+        if not short:
+            await session.fly_mission()
 
 
 if __name__ == "__main__":
-    asyncio.run(main(sys.argv[1]))
+    asyncio.run(main(sys.argv[1], short="--short" in sys.argv))

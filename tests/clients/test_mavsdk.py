@@ -39,12 +39,11 @@ STEPS = [
 ]
 
 
-@pytest.fixture(scope="module")
-def session() -> list[dict[str, Any]]:
+def flown(*options: str, simulated: tuple[str, ...] = ()) -> list[dict[str, Any]]:
     """The rows of one session with the default scenario."""
-    with vehicle() as port:
+    with vehicle(*simulated) as port:
         done = subprocess.run(
-            (sys.executable, str(SESSION), f"udpin://127.0.0.1:{port}"),
+            (sys.executable, str(SESSION), f"udpin://127.0.0.1:{port}", *options),
             capture_output=True,
             text=True,
             timeout=LIMIT_S,
@@ -53,10 +52,22 @@ def session() -> list[dict[str, Any]]:
     return [json.loads(line) for line in done.stdout.splitlines() if line.startswith("{")]
 
 
+@pytest.fixture(scope="module")
+def session() -> list[dict[str, Any]]:
+    return flown()
+
+
 def named(row: dict[str, Any]) -> str:
     return f"mode {row['values'][0]}" if row["step"] == "mode" else row["step"]
 
 
+def test_it_takes_off_and_lands() -> None:
+    """Three times as fast as real time."""
+    rows = flown("--short", simulated=("--speed", "3"))
+    assert [named(row) for row in rows] == [*STEPS[:7], *STEPS[15:17]]
+
+
+@pytest.mark.slow
 def test_every_step_is_done(session: list[dict[str, Any]]) -> None:
     assert [named(row) for row in session] == STEPS
 
@@ -78,6 +89,7 @@ ROWS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", ROWS)
 def test_the_vehicle_does_what_px4_did(session: list[dict[str, Any]], step: str) -> None:
     values, off = ROWS[step]

@@ -6,7 +6,7 @@ import math
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from sim_bench import LOITER, NAN, OFFBOARD, Bench
+from sim_bench import NAN, Bench
 
 from simulator.firmware.ardupilot import ARDUPILOT
 from simulator.firmware.base import Firmware
@@ -102,38 +102,3 @@ def test_arducopter_turns_to_a_yaw_and_by_an_angle() -> None:
     assert bench.command(TURN, 30, 20, -1, 1) == [ACCEPTED]
     bench.run(4.0)
     assert yaw_rad(bench) == pytest.approx(math.pi / 3, abs=0.03)
-
-
-def test_px4_explains_a_refused_mode_to_ground_station_components_only() -> None:
-    bench = flying(PX4)
-    count = len(bench.texts())
-    assert bench.ask_mode(OFFBOARD) == [ACCEPTED, LATER]
-    assert len(bench.texts()) == count
-    bench.codec.srcComponent = 190
-    assert bench.ask_mode(OFFBOARD) == [ACCEPTED, LATER]
-    bench.run(0.02)
-    assert bench.texts()[count:] == ["Switching to Offboard is currently not available"]
-    assert bench.mode == LOITER
-
-
-@pytest.mark.parametrize(
-    ("firmware", "idle", "refused"),
-    [(PX4, (132, 375, 65), (42, 46)), (ARDUPILOT, (22, 26), (111,))],
-)
-def test_intervals_of_messages_never_sent_and_requests_of_event_messages(
-    firmware: Firmware, idle: tuple[int, ...], refused: tuple[int, ...]
-) -> None:
-    bench = Bench(firmware=firmware)
-    refusal = firmware.request_refusal
-    assert [bench.command(INTERVAL, number, 20_000) for number in idle] == [[ACCEPTED]] * len(idle)
-    assert [bench.command(REQUEST, number) for number in refused] == [[refusal]] * len(refused)
-
-
-@pytest.mark.parametrize(("firmware", "answers"), [(PX4, 1), (ARDUPILOT, 0)])
-def test_answers_to_ping(firmware: Firmware, answers: int) -> None:
-    bench = Bench(firmware=firmware)
-    for target in ((0, 0), (1, 1)):
-        bench.send(mavlink.MAVLink_ping_message(123, 7, *target))
-    bench.run(0.02)
-    answered = [m for _, m in bench.of("PING") if m.target_system == 1]
-    assert [(m.time_usec, m.seq, m.target_component) for m in answered] == [(123, 7, 191)] * answers

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
-from types import ModuleType
 
 import numpy as np
 import pytest
@@ -17,7 +15,7 @@ from simulator.firmware.catalogue import FIRMWARES
 from simulator.firmware.px4 import PX4
 from simulator.instance import Instance
 from simulator.mavlink.codec import Decoder
-from simulator.mavlink.telemetry import builders, builders_in
+from simulator.mavlink.telemetry import builders
 from simulator.vehicle.conditions import Conditions
 from simulator.vehicle.sensors import EstimatorName
 
@@ -95,21 +93,3 @@ def test_every_message_is_read_by_pymavlink(firmware: Firmware) -> None:
         bench.instance.companion.outbox.send_now(name)
     bench.run(0.1)
     assert {message.get_type() for _, message in bench.received} >= set(names)
-
-
-def test_a_stream_without_a_builder_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"^px4 streams: no builder for ATITUDE$"):
-        builders(replace(PX4, companion_rates_hz={"ATITUDE": 10.0}))
-
-
-def test_message_with_a_builder_that_is_never_sent_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"^px4 streams: remove from never_sent: VFR_HUD$"):
-        builders(replace(PX4, never_sent=frozenset({74})))
-
-
-def test_a_builder_that_is_not_called_like_a_message_is_refused() -> None:
-    module = ModuleType("messages")
-    exec("def atitude(view): return ()", vars(module))
-    vars(module)["atitude"].__module__ = "messages"
-    with pytest.raises(ValueError, match=r"^messages: not a MAVLink message: ATITUDE$"):
-        builders_in(module)

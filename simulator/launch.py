@@ -1,0 +1,179 @@
+"""A run of the `simulator` command: its vehicles, links and files, made from its options."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import NoReturn
+
+from offboard.compiled import prepare
+from offboard.documents.command_line import complain, tell
+from offboard.documents.errors import UserError
+from offboard.documents.reading import DocumentError
+from offboard.documents.signing_key import read_key
+from offboard.link.clock import unix_us
+from offboard.model.vehicle import Vehicle
+from simulator import config
+from simulator.firmware.base import Firmware
+from simulator.firmware.catalogue import FIRMWARES
+from simulator.instance import VIRTUAL_EPOCH_US, Instance
+from simulator.link.recorder import Recorder
+from simulator.link.sockets import Link, LinkError, open_beside, open_link, shifted
+from simulator.options import COMPANION_PORT, NO_LINK, Options, Stop
+from simulator.run import Endpoint, Runner, warm_up
+
+LOCAL_COMPANION_PORT, LOCAL_GROUND_PORT = 14580, 18570  # as PX4 SITL
+ANY_PORT = 0
+
+
+def launch(options: Options, stopping: Stop) -> int:
+    """Run the vehicles until they are stopped; the exit code.
+
+    Raises:
+        UserError: an option cannot be used.
+    """
+    firmware = FIRMWARES.get(options.firmware)
+    if firmware is None:
+        _refuse(f"--firmware {options.firmware}: unknown; there is {', '.join(FIRMWARES)}")
+    try:
+        flown = config.scenario(options.scenario or firmware.scenario)
+        config.check_for(flown, firmware, lockstep=options.lockstep)
+        vehicle = config.vehicle(options.vehicle or firmware.vehicle)
+        links = [_links(options, number) for number in options.numbers]
+        parameters = _parameters(firmware, options.parameters)
+        recorder = _recorder(options)
+        prepare(_warn)
+        warm_up(Instance(firmware, vehicle, flown.conditions, options.seed, lockstep=True))
+        make = _maker(options, firmware, vehicle, flown, parameters)
+        endpoints = []
+        for number, (companion, ground) in zip(options.numbers, links, strict=True):
+            instance = make(number, ground is not None)
+            strangers = tuple(open_beside(companion) for _ in instance.strangers)
+            endpoints.append(Endpoint(instance, companion, ground, recorder, strangers))
+    except (DocumentError, LinkError) as error:
+        _refuse(str(error))
+    _warn_if_it_cannot_land(endpoints[0].instance, vehicle.hover_thrust)
+    _announce(options, f"{options.firmware} vehicle {vehicle.name}", flown.name)
+    stopping.running = True
+    runner = Runner(endpoints, stopping=stopping, report=_warn, duration_s=options.duration_s)
+    by_lockstep = options.lockstep
+    outcome = (
+        runner.lockstep(options.patience_s) if by_lockstep else runner.real_time(options.speed)
+    )
+    if outcome.sentence:
+        _warn(outcome.sentence)
+    if len(options.numbers) > 1:
+        _print(f"{len(options.numbers)} vehicles: {runner.punctuality}")
+    for endpoint in endpoints:
+        for sentence, count in endpoint.instance.complaints.items():
+            _print(f"{count} x {sentence}")
+    return outcome.code
+
+
+def _companion_link(options: Options) -> str:
+    """Of the first instance."""
+    return options.connect or f"udpout:127.0.0.1:{COMPANION_PORT + options.numbers[0]}"
+
+
+def _links(options: Options, number: int) -> tuple[Link, Link | None]:
+    """Companion and ground station link of an instance.
+
+    The local ports of PX4 SITL only by default: a real PX4 beside us may use them.
+    """
+    port = ANY_PORT if options.connect else LOCAL_COMPANION_PORT + number
+    companion = open_link(shifted(_companion_link(options), number - options.numbers[0]), port)
+    if options.gcs == NO_LINK:
+        return companion, None
+    return companion, open_link(options.gcs, LOCAL_GROUND_PORT + number)
+
+
+def _maker(
+    options: Options,
+    firmware: Firmware,
+    vehicle: Vehicle,
+    flown: config.Scenario,
+    parameters: dict[str, float],
+) -> Callable[[int, bool], Instance]:
+    """Function that makes the instance with a number, with or without a ground station."""
+    key = read_key(options.signing_key) if options.signing_key else b""
+    epoch_us = VIRTUAL_EPOCH_US if options.lockstep else unix_us()
+
+    def make(number: int, ground_link: bool) -> Instance:
+        return Instance(
+            firmware,
+            vehicle,
+            flown.conditions,
+            options.seed + number - options.numbers[0],
+            system=number + 1,
+            lockstep=options.lockstep,
+            ground_link=ground_link,
+            epoch_us=epoch_us,
+            parameters=parameters,
+            faults=flown.faults,
+            start=flown.start,
+            signing_key=key,
+        )
+
+    return make
+
+
+def _recorder(options: Options) -> Recorder | None:
+    if options.log is None:
+        return None
+    try:
+        return Recorder(options.log)
+    except OSError as error:
+        _refuse(f"--log {options.log} cannot be written: {error.strerror}")
+
+
+def _announce(options: Options, what: str, scenario: str) -> None:
+    """A line for each vehicle."""
+    link, first = _companion_link(options), options.numbers[0]
+    purpose = "waiting at" if link.startswith("udpin:") else "sending to"
+    for number in options.numbers:
+        place = shifted(link, number - first).partition(":")[2]
+        _print(
+            f"{what}, system {number + 1}, scenario {scenario},"
+            f" seed {options.seed + number - first}: {purpose} {place}"
+        )
+
+
+def _parameters(firmware: Firmware, assignments: tuple[str, ...]) -> dict[str, float]:
+    """Values by parameter name. Exits where a name is unknown or a value out of range."""
+    known = {spec.name: spec for spec in firmware.parameters}
+    values: dict[str, float] = {}
+    for text in assignments:
+        name, _, number = text.partition("=")
+        if name not in known:
+            _refuse(f"--param {text}: {firmware.name} has no parameter {name}")
+        spec = known[name]
+        try:
+            values[name] = float(number)
+        except ValueError:
+            _refuse(f"--param {text}: give NAME=NUMBER")
+        if not spec.minimum <= values[name] <= spec.maximum:
+            _refuse(f"--param {text}: must be {spec.minimum:g} .. {spec.maximum:g}")
+    return values
+
+
+def _warn_if_it_cannot_land(instance: Instance, hover_thrust: float) -> None:
+    """Warn where the lowest thrust of the autopilot exceeds the vehicle's weight."""
+    firmware, parameters = instance.autopilot.firmware, instance.autopilot.parameters
+    least, name = parameters.role("thrust_least"), firmware.parameter_roles["thrust_least"]
+    if least >= hover_thrust:
+        _warn(
+            f"{name} is {least:.3g}, which lifts a vehicle that hovers at {hover_thrust:g}: it"
+            f" cannot land; change it with --param {name}=VALUE"
+        )
+
+
+def _refuse(sentence: str) -> NoReturn:
+    raise UserError(sentence)
+
+
+def _warn(sentence: str) -> None:
+    complain(f"simulator: {sentence}")
+
+
+def _print(text: str) -> None:
+    tell(text, sys.stdout)
