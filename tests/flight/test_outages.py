@@ -126,7 +126,7 @@ def test_without_reports_of_the_mode_it_listens_and_lands_it_later(
     (began_s,) = began
     assert outcome.exit_code == ExitCode.ABORTED
     assert outcome.sentence.startswith("no report of the mode for 2.")
-    assert sent_after(pair, began_s + 2.6) == sent_after(pair, began_s + 9.0)
+    assert sent_after(pair, began_s + 2.6) == sent_after(pair, began_s + 8.99)
     assert commander.armed is pilot
     assert bool(pair.commands(LAND)) is not pilot
     assert pair.companion.phase is (Phase.YIELDED if pilot else Phase.DISARMED)

@@ -86,7 +86,7 @@ def test_vehicles_far_from_the_believed_hover_thrust_hold_and_land(hover_thrust:
     bench.run(8.0, lambda: bench.position(0, 0, -2))
     assert bench.height_m == pytest.approx(2.0, abs=0.02)
     bench.command(21)
-    bench.run_until(lambda: not bench.armed, 15.0)
+    bench.run_until(lambda: not bench.armed, 16.0)
 
 
 def test_a_least_thrust_that_lifts_never_lands() -> None:
