@@ -1,12 +1,13 @@
 """Encoding: values of outgoing.py become messages of pymavlink: units, quaternion, thrust.
 
-The last check before the vehicle: ValueError for what is not finite or out of range. Knows no
-sequence numbers, no addresses and no clock.
+The last check before the vehicle: ValueError for what is not finite or out of range. `Encoder`
+numbers the frames, and has them signed.
 """
 
 from __future__ import annotations
 
 import math
+from collections import deque
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from pymavlink.dialects.v20 import all as mavlink
 from offboard.mavlink import events
 from offboard.mavlink.decode import Address
 from offboard.mavlink.dialects.base import Dialect, ThrustRule
+from offboard.mavlink.framing import Frame
 from offboard.mavlink.outgoing import (
     AttitudeTarget,
     CommandLong,
@@ -24,16 +26,56 @@ from offboard.mavlink.outgoing import (
     Outgoing,
     ParamRead,
     PositionTarget,
+    Record,
     ReferenceRecord,
     SolverRecord,
     StatusTextOut,
     Timesync,
 )
+from offboard.mavlink.signing import Signing
 from offboard.model import frames
 
 _LOCAL_NED = 1  # MAV_FRAME_LOCAL_NED
 Message = Any  # of pymavlink, to be packed
+_ECHOES = 256  # newest frames of ours that are recognised when they come back
 FLOAT32_MAX = 3.4028234663852886e38
+
+
+class Encoder:
+    """Frames of what we send and record, each component id with its own sequence numbers. With
+    `signing` all but records are signed."""
+
+    def __init__(
+        self, component_id: int, record_component_id: int, signing: Signing | None
+    ) -> None:
+        self._sending = mavlink.MAVLink(None, srcComponent=component_id)
+        self._recording = mavlink.MAVLink(None, srcComponent=record_component_id)
+        self._signing = signing
+        self._sent: deque[bytes] = deque(maxlen=_ECHOES)
+
+    def frame(
+        self,
+        outgoing: Outgoing,
+        system_id: int,
+        target: Address | None,
+        dialect: Dialect | None,
+    ) -> bytes:
+        """The frame of a message from our system `system_id`; see `encode`."""
+        message = encode(outgoing, target, dialect)
+        recorded = isinstance(outgoing, Record)
+        sender = self._recording if recorded else self._sending
+        sender.srcSystem = system_id
+        if self._signing and not recorded:
+            frame = self._signing.pack(message, sender)
+        else:
+            frame = bytes(message.pack(sender))
+        sender.seq = (sender.seq + 1) % 256
+        self._sent.append(frame)
+        return frame
+
+    def is_echo(self, frame: Frame) -> bool:
+        """Whether a frame is one of ours that came back."""
+        return frame.component_id == self._sending.srcComponent and frame.raw in self._sent
 
 
 def encode(outgoing: Outgoing, target: Address | None, dialect: Dialect | None) -> Message:

@@ -11,7 +11,7 @@ and no pause of ours: before, it hands over no datagram of another address.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Hashable, Mapping
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping
 from types import MappingProxyType
 
 from pymavlink.dialects.v20.all import enums
@@ -62,6 +62,7 @@ class Senders:
         self.own = Address(1, component_id)
         self.vehicle: VehicleFound | None = None
         self.dialect: Dialect | None = None
+        self.greeted = False  # an autopilot whose clock is behind ours was heard
         self.systems: dict[int, float] = {}
         self.heard_s = 0.0
         self._wanted = wanted
@@ -79,15 +80,17 @@ class Senders:
         """Whether the vehicle sends from another address."""
         return self.vehicle is not None and place != self._place
 
-    def may_move_to(self, place: Hashable, now_s: float) -> bool:
-        """Whether the vehicle may send from `place` now; `moves_to` if one of its frames does."""
-        return now_s - self.heard_s > PEER_SILENT_S and same_host(place, self._place)
-
-    def moves_to(self, place: Hashable, frame: Frame) -> bool:
-        """Take `place` as the vehicle's address if this genuine frame is the vehicle's."""
+    def moves_to(
+        self, place: Hashable, now_s: float, genuine: Callable[[], Iterable[Frame]]
+    ) -> bool:
+        """Take `place` as the vehicle's address if one of the `genuine` frames from it shows that
+        the vehicle sends from there now."""
+        if now_s - self.heard_s <= PEER_SILENT_S or not same_host(place, self._place):
+            return False
         vehicle = self.vehicle
-        ids = frame.system_id, frame.component_id
-        moves = vehicle is not None and ids == (vehicle.system_id, vehicle.component_id)
+        assert vehicle is not None
+        ids = vehicle.system_id, vehicle.component_id
+        moves = any((frame.system_id, frame.component_id) == ids for frame in genuine())
         if moves:
             self._place = place
         return moves
@@ -185,6 +188,13 @@ class Senders:
             self.hear(frame.system_id, now_s)
         return found
 
+    def overhear(self, frames: Iterable[Frame], now_s: float) -> list[int]:
+        """Systems with an autopilot that these frames show, each once a second."""
+        known = dict(self.systems)
+        for frame in frames:
+            self.note(frame, now_s)
+        return [each for each, _ in self.systems.items() - known.items()]
+
     def hear(self, system_id: int, now_s: float) -> None:
         """This system has an autopilot."""
         if now_s - self.systems.get(system_id, -math.inf) < NOTED_EVERY_S:
@@ -194,15 +204,16 @@ class Senders:
         if len(self.systems) > SYSTEMS_MAX:
             del self.systems[next(iter(self.systems))]
 
-    def greeted(self, frame: Frame, now_s: float) -> tuple[Dialect, ClockBehind] | None:
-        """The autopilot whose heartbeat has a right signature and a clock that is behind. It may be
-        a replay, so that nothing else is believed."""
+    def greet(self, frame: Frame, now_s: float, events: list[Event]) -> None:
+        """Greet the autopilot whose frame has a right signature and a clock that is behind: its
+        clock follows ours with our heartbeat. The frame may be a replay: nothing else is
+        believed."""
         heard = self.note(frame, now_s)
-        if not isinstance(heard, Dialect) or self._wanted not in (None, frame.system_id):
-            return None
-        beat = decode(frame, heard)
-        assert isinstance(beat, Heartbeat)
-        return heard, ClockBehind(frame.system_id, beat.armed)
+        if isinstance(heard, Dialect) and self._wanted in (None, frame.system_id):
+            beat = decode(frame, heard)
+            assert isinstance(beat, Heartbeat)
+            self.greeted = True
+            events.append(ClockBehind(frame.system_id, beat.armed))
 
     def is_for_us(self, ack: Frame) -> bool:
         """Whether a COMMAND_ACK is for us, or for all."""

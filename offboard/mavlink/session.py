@@ -9,27 +9,23 @@ components.
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Hashable
 from dataclasses import dataclass, field
-
-from pymavlink.dialects.v20 import all as mavlink
+from functools import partial
 
 from offboard.mavlink import framing
 from offboard.mavlink.counters import FORGED, Counters, DropReason
 from offboard.mavlink.decode import Address
 from offboard.mavlink.dialects.base import TYPE_ONBOARD_CONTROLLER, Dialect
-from offboard.mavlink.encode import encode
-from offboard.mavlink.events import Attitude, Event, LocalPosition, PeerChanged, VehicleFound
-from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Record, Timesync
+from offboard.mavlink.encode import Encoder
+from offboard.mavlink.events import Event, PeerChanged, VehicleFound
+from offboard.mavlink.outgoing import CommandLong, Heartbeat, Outgoing, Timesync
 from offboard.mavlink.senders import COMMANDS, Senders
-from offboard.mavlink.signing import Signing
+from offboard.mavlink.signing import Signing, genuine
 from offboard.mavlink.telemetry import Telemetry
-from offboard.mavlink.vehicle_time import LockstepTime
 
 ACTIVE = 4  # MAV_STATE
 
-_ECHOES = 256  # newest frames of ours that are recognised when they come back
 _NOT_LOGGED = (DropReason.ECHO, *FORGED)
 _HEARTBEAT_PERIOD_S = 0.999  # 1 Hz; below 1 s, so that no rounding error delays it by a cycle
 
@@ -98,13 +94,10 @@ class Session:
         self.counters = Counters()
         self.status = (ACTIVE, 0)
         self._signing = signing
-        self._greeted: Dialect | None = None  # autopilot whose clock is behind ours
         self._splitter = framing.FrameSplitter(settings.stream, self.counters)
-        self._sending = mavlink.MAVLink(None, srcComponent=settings.component_id)
-        self._recording = mavlink.MAVLink(None, srcComponent=settings.record_component_id)
-        self._sent: deque[bytes] = deque(maxlen=_ECHOES)
-        self._telemetry = Telemetry(settings.capacity_bytes_ps)
-        self._lockstep = LockstepTime() if settings.lockstep else None
+        self._encoder = Encoder(settings.component_id, settings.record_component_id, signing)
+        self._telemetry = Telemetry(settings.capacity_bytes_ps, lockstep=settings.lockstep)
+        self._time = self._telemetry.time
         self._heartbeat_sent: tuple[float, float] | None = None  # host time, link time
         self._status_sent = self.status
 
@@ -120,11 +113,11 @@ class Session:
 
     def receive(self, datagram: bytes, peer: Hashable, now_s: float) -> Reception:
         """Process a datagram, or any portion of a stream, that came from `peer`. Never raises."""
-        if self._lockstep:
-            self._lockstep.on_datagram(self._telemetry.time.newest_s)
-        arrival = _Arrival(peer, self._now_s(now_s))
+        self._time.on_datagram()
+        arrival = _Arrival(peer, self._time.now_s(now_s))
         if self.senders.is_foreign(peer):
-            if not self._moves(datagram, arrival):
+            frames_of = partial(genuine, datagram, self._signing)
+            if not self.senders.moves_to(peer, arrival.now_s, frames_of):
                 self.counters.dropped[DropReason.FOREIGN_PEER] += 1
                 return Reception()
             self._heartbeat_sent = None  # a router learns our address from it
@@ -147,12 +140,12 @@ class Session:
 
     def _accept(self, frame: framing.Frame, arrival: _Arrival) -> DropReason | bool:
         """Why the frame was dropped, or whether it was decoded."""
-        if frame.raw in self._sent and self._has_our_ids(frame):
+        if self._encoder.is_echo(frame):
             return DropReason.ECHO
         forged = self._signing.refusal(frame) if self._signing else None
         if forged:
             if forged is DropReason.OLD_STAMP and self.vehicle is None:
-                self._greet(frame, arrival)
+                self.senders.greet(frame, self.link_time_s, arrival.events)
             return forged
         was_found = self.vehicle is not None
         foreign = self.senders.judge(frame, arrival.place, self.link_time_s, arrival.events)
@@ -174,8 +167,7 @@ class Session:
         """TIMESYNC: tc1 is 0 in a request."""
         tc1_ns, ts1_ns = frame.message.tc1, frame.message.ts1
         if tc1_ns == 0:
-            if self._lockstep:
-                self._lockstep.on_request(ts1_ns * 1e-9)
+            self._time.on_request(ts1_ns * 1e-9)
             # a reply at time 0 would look like a request
             arrival.replies.append(Timesync(max(1, int(arrival.now_s * 1e9)), ts1_ns))
         elif self.vehicle is not None:
@@ -190,8 +182,6 @@ class Session:
         found = self._telemetry.interpret(frame, self.dialect, arrival.now_s)
         if isinstance(found, DropReason):
             return found
-        if self._lockstep and any(isinstance(e, (LocalPosition, Attitude)) for e in found or ()):
-            self._lockstep.on_telemetry()
         arrival.events.extend(found or ())
         return found is not None
 
@@ -212,37 +202,10 @@ class Session:
         self._heartbeat_sent = None  # send it at once, with the vehicle's system id
         self._telemetry.request_from(self.dialect)
 
-    def _moves(self, datagram: bytes, arrival: _Arrival) -> bool:
-        """Whether a datagram shows that the vehicle sends from another address now."""
-        if not self.senders.may_move_to(arrival.place, arrival.now_s):
-            return False
-        return any(self.senders.moves_to(arrival.place, each) for each in self._genuine(datagram))
-
-    def _genuine(self, datagram: bytes) -> list[framing.Frame]:
-        """The frames that could be accepted from the vehicle. Counts nothing, and uses up no time
-        stamp."""
-        found = framing.FrameSplitter(False, Counters()).split(datagram)
-        signing = self._signing
-        return [
-            frame
-            for frame in found
-            if frame.verified and not (signing and signing.refusal(frame, note=False))
-        ]
-
     def overhear(self, datagram: bytes) -> list[int]:
         """Systems with an autopilot that this datagram, from another address than the vehicle's,
         shows, each once a second."""
-        known = dict(self.senders.systems)
-        for frame in self._genuine(datagram):
-            self.senders.note(frame, self.link_time_s)
-        return [each for each, _ in self.senders.systems.items() - known.items()]
-
-    def _greet(self, frame: framing.Frame, arrival: _Arrival) -> None:
-        """Send our heartbeat to a vehicle whose signing time is behind: it follows ours then."""
-        greeted = self.senders.greeted(frame, self.link_time_s)
-        if greeted:
-            self._greeted, behind = greeted
-            arrival.events.append(behind)
+        return self.senders.overhear(genuine(datagram, self._signing), self.link_time_s)
 
     def thin_telemetry(self) -> bool:
         """Request half of the telemetry from now on: the link is saturated. False if the rates are
@@ -259,10 +222,9 @@ class Session:
         custom_mode has changed, so that another program learns at once who flies; and requests for
         telemetry that is missing or too slow.
         """
-        now_s = self._now_s(now_s)
-        self._telemetry.time.on_host(now_s)
-        dialect = self.dialect or self._greeted
-        if dialect is None and not self.settings.sends_first:
+        now_s = self._time.now_s(now_s)
+        self._time.on_host(now_s)
+        if not (self.dialect or self.senders.greeted or self.settings.sends_first):
             return ()
         due: list[Outgoing] = []
         link_s = self.link_time_s
@@ -283,36 +245,24 @@ class Session:
         Raises ValueError if a value is not finite or out of range, or if the message is for the
         vehicle and none was found.
         """
-        vehicle = self.vehicle
+        vehicle, system_id = self.vehicle, self.senders.own.system_id
         target = Address(vehicle.system_id, vehicle.component_id) if vehicle else None
-        message = encode(outgoing, target, self.dialect)
-        sender = self._recording if isinstance(outgoing, Record) else self._sending
-        sender.srcSystem = self.senders.own.system_id
-        if self._signing and sender is self._sending:
-            frame = self._signing.pack(message, sender)
-        else:
-            frame = bytes(message.pack(sender))
-        sender.seq = (sender.seq + 1) % 256
-        self._sent.append(frame)
-        return frame
+        return self._encoder.frame(outgoing, system_id, target, self.dialect)
 
     # --- time and rates ---
 
-    def _now_s(self, host_s: float) -> float:
-        return self._lockstep.now_s if self._lockstep else host_s
-
     def elapsed_s(self, host_s: float) -> float:
         """Host time; in lockstep the simulated time, which goes on while telemetry is missing."""
-        return self._lockstep.elapsed_s if self._lockstep else host_s
+        return self._time.lockstep_s if self.settings.lockstep else host_s
 
     def clock_s(self, host_s: float) -> float:
         """Host time; in lockstep, where host time must decide nothing, the link's own seconds."""
-        return self.link_time_s if self._lockstep else host_s
+        return self.link_time_s if self.settings.lockstep else host_s
 
     @property
     def link_time_s(self) -> float:
         """Monotonic seconds that follow vehicle time, or host time while telemetry is missing."""
-        return self._telemetry.time.seconds
+        return self._time.seconds
 
     @property
     def rates_hz(self) -> dict[str, float]:

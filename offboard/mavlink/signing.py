@@ -19,8 +19,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import all as mavlink
 
-from offboard.mavlink.counters import DropReason
-from offboard.mavlink.framing import Frame
+from offboard.mavlink.counters import Counters, DropReason
+from offboard.mavlink.framing import Frame, FrameSplitter
 
 UNITS_PER_S = 100_000
 EPOCH_UNIX_S = 1_420_070_400  # 2015-01-01 UTC
@@ -117,3 +117,13 @@ class Signing:
         signing._signing.timestamp = newest + UNITS_PER_S
         signing._signing.stream_timestamps = {(a, b, c): at for a, b, c, at in streams}
         return signing
+
+
+def genuine(datagram: bytes, signing: Signing | None) -> list[Frame]:
+    """The frames of a datagram that could be accepted. Counts nothing, uses up no time stamp."""
+    found = FrameSplitter(False, Counters()).split(datagram)
+    return [
+        frame
+        for frame in found
+        if frame.verified and not (signing and signing.refusal(frame, note=False))
+    ]

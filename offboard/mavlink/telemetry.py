@@ -33,8 +33,8 @@ class Telemetry:
     """Telemetry of one vehicle. `capacity_bytes_ps` of the link limits the rates that are
     requested; None: unknown. `time.seconds` are the session's."""
 
-    def __init__(self, capacity_bytes_ps: float | None) -> None:
-        self.time = VehicleTime()
+    def __init__(self, capacity_bytes_ps: float | None, *, lockstep: bool) -> None:
+        self.time = VehicleTime(lockstep)
         self.texts = TextAssembler()
         self.rates = TelemetryRates((), 0.0)
         self._capacity_bytes_ps = capacity_bytes_ps

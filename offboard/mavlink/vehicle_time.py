@@ -32,9 +32,18 @@ class VehicleTime:
 
     `newest_s` is the newest stamp of any message. `seconds` are monotonic and follow vehicle time,
     or host time while telemetry is missing.
+
+    With `lockstep` the vehicle waits for our replies to its TIMESYNC requests, and nothing that is
+    sent may depend on host time: vehicle time replaces it, and while telemetry is missing, the
+    requests count on. `lockstep_s` is simulated time since the first request.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, lockstep: bool = False) -> None:
+        self.lockstep_s = 0.0
+        self._lockstep = lockstep
+        self._began_s: float | None = None  # stamp of the first request
+        self._telemetry_s = 0.0  # `lockstep_s` when the newest telemetry arrived
+        self._arrival_s = 0.0  # vehicle time when the newest datagram arrived
         self.newest_s = 0.0
         self.seconds = 0.0
         self._last_s: dict[int, float] = {}
@@ -88,7 +97,7 @@ class VehicleTime:
     def on_telemetry(self, time_s: float, now_s: float) -> None:
         """Telemetry with the valid stamp `time_s` arrived at host time `now_s`. A stamp older than
         the newest adds nothing: messages of several streams may arrive out of order."""
-        self._received_s = now_s
+        self._received_s, self._telemetry_s = now_s, self.lockstep_s
         step_s = 0.0 if self._counted_s is None else time_s - self._counted_s
         if self._counted_s is None or step_s > 0.0 or step_s < -_REBOOT_S:
             self.seconds += max(min(step_s, SILENCE_S) - self._bridged_s, 0.0)
@@ -107,30 +116,19 @@ class VehicleTime:
             self._bridged_s = max(silent_s, self._bridged_s)
         self._host_s = now_s
 
+    # --- in lockstep ---
 
-class LockstepTime:
-    """Time of a vehicle in lockstep, which waits for our replies to its TIMESYNC requests: vehicle
-    time, so that nothing that is sent depends on host time; while telemetry is missing, the
-    requests count on. `elapsed_s` is simulated time since the first request."""
-
-    def __init__(self) -> None:
-        self.elapsed_s = 0.0
-        self._began_s: float | None = None  # stamp of the first request
-        self._telemetry_s = 0.0  # `elapsed_s` when the newest telemetry arrived
-        self._arrival_s = 0.0  # vehicle time when the newest datagram arrived
-
-    def on_datagram(self, newest_s: float) -> None:
-        """A datagram arrives; the newest stamp of telemetry is `newest_s`."""
-        self._arrival_s = newest_s
+    def on_datagram(self) -> None:
+        self._arrival_s = self.newest_s
 
     def on_request(self, stamp_s: float) -> None:
+        """A TIMESYNC request with this stamp."""
         self._began_s = stamp_s if self._began_s is None else self._began_s
-        self.elapsed_s = stamp_s - self._began_s
+        self.lockstep_s = stamp_s - self._began_s
 
-    def on_telemetry(self) -> None:
-        self._telemetry_s = self.elapsed_s
-
-    @property
-    def now_s(self) -> float:
-        silent_s = self.elapsed_s - self._telemetry_s
+    def now_s(self, host_s: float) -> float:
+        """Host time, or what replaces it."""
+        if not self._lockstep:
+            return host_s
+        silent_s = self.lockstep_s - self._telemetry_s
         return self._arrival_s + (silent_s if silent_s > SILENCE_S else 0.0)
