@@ -13,6 +13,8 @@ from __future__ import annotations
 from types import MappingProxyType
 from typing import Any, NamedTuple
 
+from fastcrc import crc16
+
 # `all` also holds CURRENT_MODE, which PX4 sends and `ardupilotmega` lacks
 from pymavlink.dialects.v20 import all as mavlink
 
@@ -26,6 +28,8 @@ HEARTBEAT, COMMAND_ACK, TIMESYNC, STATUSTEXT, SETUP_SIGNING = 0, 77, 111, 253, 2
 # SET_ATTITUDE_TARGET, SET_POSITION_TARGET_LOCAL_NED and _GLOBAL_INT: offset of target_system
 SETPOINTS = MappingProxyType({82: 36, 84: 50, 86: 50})
 _CRC_BYTES = 2
+_CRC_EXTRA = {i: bytes((each.crc_extra,)) for i, each in mavlink.mavlink_map.items()}
+_crc = crc16.mcrf4xx
 _HEADER_BYTES_V2, _HEADER_BYTES_V1, _SIGNATURE_BYTES = 10, 6, 13
 _SIGNED = 0x01  # incompatibility flag
 
@@ -101,18 +105,19 @@ class FrameSplitter:
         if size is None or at + size > len(data):
             return None if self._stream else DropReason.TRUNCATED
         raw = data[at : at + size]
-        if _is_incompatible(raw):
+        header = _header(raw)
+        if header is None:
             return DropReason.INCOMPATIBLE
         try:
             message = self._mavlink.decode(bytearray(raw))
         except mavlink.MAVError:
             return DropReason.BAD_CRC
-        if not isinstance(message, mavlink.MAVLink_unknown):
-            return Frame(raw, *_header(raw), True, message)
+        if header[0] in mavlink.mavlink_map:
+            return Frame(raw, *header, True, message)
         # without a known checksum a frame must fill the space between two others
         if not self._aligned:
             return DropReason.BAD_CRC
-        frame = Frame(raw, *_header(raw), False)
+        frame = Frame(raw, *header, False)
         if at + size == len(data):
             return None if self._stream else frame
         return frame if data[at + size] in (V2, V1) else DropReason.BAD_CRC
@@ -131,16 +136,15 @@ def parse(data: bytes, at: int, end: int) -> Frame | DropReason:
     """The frame of a log in data[at:end], which `frame_size` has measured, or why it is refused.
     Its message is not decoded: a log of hours holds millions."""
     raw = data[at:end]
-    if _is_incompatible(raw):
-        return DropReason.INCOMPATIBLE
     header = _header(raw)
-    known = mavlink.mavlink_map.get(header[0])
-    if known is not None:
-        crc_at = _header_bytes(raw) + raw[1]
-        crc = mavlink.x25crc(raw[1:crc_at] + bytes((known.crc_extra,))).crc
-        if crc != raw[crc_at] | raw[crc_at + 1] << 8:
+    if header is None:
+        return DropReason.INCOMPATIBLE
+    extra = _CRC_EXTRA.get(header[0])
+    if extra is not None:
+        crc_at = (_HEADER_BYTES_V1 if raw[0] == V1 else _HEADER_BYTES_V2) + raw[1]
+        if _crc(extra, _crc(raw[1:crc_at])) != raw[crc_at] | raw[crc_at + 1] << 8:
             return DropReason.BAD_CRC
-    return Frame(raw, *header, known is not None)
+    return Frame(raw, *header, extra is not None)
 
 
 def payload_of(raw: bytes) -> bytes:
@@ -161,13 +165,11 @@ def _header_bytes(data: bytes, at: int = 0) -> int:
     return _HEADER_BYTES_V1 if data[at] == V1 else _HEADER_BYTES_V2
 
 
-def _header(raw: bytes) -> tuple[int, int, int, int]:
-    """Message id, system, component and sequence number."""
+def _header(raw: bytes) -> tuple[int, int, int, int] | None:
+    """Message id, system, component and sequence number; None where incompatibility flags say that
+    the frame cannot be understood without a later version of MAVLink."""
     if raw[0] == V1:
         return raw[5], raw[3], raw[4], raw[2]
+    if raw[2] & ~_SIGNED:
+        return None
     return raw[7] | raw[8] << 8 | raw[9] << 16, raw[5], raw[6], raw[4]
-
-
-def _is_incompatible(raw: bytes) -> bool:
-    """Flags say that it cannot be understood without a later version of MAVLink."""
-    return raw[0] == V2 and raw[2] & ~_SIGNED != 0
