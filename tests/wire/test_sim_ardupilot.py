@@ -235,17 +235,6 @@ def test_takeoff_by_setpoints_alone() -> None:
     assert weak.armed
 
 
-def test_landed_by_setpoints_it_counts_as_flying_until_land_mode() -> None:
-    vehicle = flying(2.0)
-    vehicle.run(12.0, lambda: vehicle.attitude(thrust=0.3))
-    assert vehicle.height_m < 0.02
-    assert vehicle.armed
-    assert vehicle.instance.view.landed_state == 2
-    assert vehicle.command(21) == [ACCEPTED]
-    vehicle.run(4.0)
-    assert not vehicle.armed
-
-
 # -- setpoints -------------------------------------------------------------------------------
 
 
@@ -277,20 +266,6 @@ def test_rates_beside_an_attitude_are_added() -> None:
     vehicle = flying()
     vehicle.run(1.5, lambda: vehicle.attitude(roll(8.0), HOVER, 0, (0.3, 0.0, 0.0)))
     assert roll_deg(vehicle) == pytest.approx(11.0, abs=0.5)
-
-
-@pytest.mark.parametrize("tilt_deg", [20.0, 30.0])
-def test_hover_thrust_holds_the_height_at_any_tilt(tilt_deg: float) -> None:
-    """ATC_ANGLE_BOOST divides by the body's tilt; without it -.35 and -.72 m/s after 1 s."""
-    lost = []
-    for boost in (1.0, 0.0):
-        vehicle = flying()
-        vehicle.run(0.4, lambda v=vehicle: v.attitude(LEVEL, HOVER))
-        set_parameter(vehicle, "ATC_ANGLE_BOOST", boost)
-        vehicle.run(1.0, lambda v=vehicle: v.attitude(roll(tilt_deg), HOVER))
-        lost.append(climb_mps(vehicle))
-    assert lost[0] == pytest.approx(0.0, abs=0.06)
-    assert lost[1] == pytest.approx({20.0: -0.35, 30.0: -0.72}[tilt_deg], abs=0.25)
 
 
 @pytest.mark.parametrize(
@@ -411,28 +386,6 @@ def test_a_mission_of_home_alone_cannot_start() -> None:
     assert (vehicle.height_m, vehicle.armed) == (0.0, True)
     vehicle.run(9.0)
     assert vehicle.texts()[-1] == "Disarming motors"
-
-
-def test_a_mission_begins_with_the_item_after_home() -> None:
-    vehicle = ready()
-    latitude, longitude = (round(degrees * 1e7) for degrees in ARDUPILOT.origin[:2])
-    ahead = latitude + round(math.degrees(6.0 / 6_371_000) * 1e7)
-    rows = ((16, latitude, 0.0), (22, latitude, 4.0), (16, ahead, 4.0), (21, ahead, 0.0))
-    vehicle.send(mavlink.MAVLink_mission_count_message(1, 1, len(rows)))
-    for seq, (command, where, up_m) in enumerate(rows):
-        vehicle.run(0.02)
-        assert vehicle.of("MISSION_REQUEST")[-1][1].seq == seq
-        vehicle.send(
-            mavlink.MAVLink_mission_item_int_message(
-                1, 1, seq, 6, command, 0, 1, 0, 0, 0, NAN, where, longitude, up_m
-            )
-        )
-    assert vehicle.command(400, 1) == [ACCEPTED]
-    assert vehicle.command(300) == [ACCEPTED]
-    vehicle.run_until(lambda: not vehicle.armed, 60.0)
-    assert vehicle.texts()[-1] == "Disarming motors"
-    assert [m.seq for _, m in vehicle.of("MISSION_ITEM_REACHED")] == [1, 2, 3]
-    assert vehicle.instance.autopilot.state.truth.position_ned_m[0] == pytest.approx(6.0, abs=0.3)
 
 
 def test_parameters_carry_values_whatever_their_type() -> None:

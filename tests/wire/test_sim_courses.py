@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
-from sim_bench import LOITER, NAN, RTL, Bench
+from sim_bench import LOITER, NAN, Bench
 from sim_courses import copter, course_deg, place, velocity
 
 from simulator.geodesy import EARTH_RADIUS_M
@@ -173,19 +173,6 @@ def test_px4_faces_its_goal_and_then_takes_the_requested_yaw() -> None:
     assert reposition(bench, 1.0, 30.0, amsl_m, ABSOLUTE) == ACCEPTED  # nearer than NAV_ACC_RAD
     bench.run(4.0)
     assert off_deg(bench, -45.0) < 3.0
-
-
-def test_px4_returns_facing_home_and_lands_with_the_yaw_of_home() -> None:
-    bench = px4()
-    home_deg = course_deg(bench)
-    amsl_m = bench.instance.autopilot.firmware.origin[2] + 3.0
-    reposition(bench, 0.0, 30.0, amsl_m, ABSOLUTE)
-    bench.run(14.0)
-    bench.ask_mode(RTL)
-    bench.run_until(lambda: place(bench)[1] < 15.0, 40.0)
-    assert off_deg(bench, -90.0) < 5.0
-    bench.run_until(lambda: bench.height_m < 20.0, 30.0)
-    assert off_deg(bench, home_deg) < 5.0
 
 
 def test_px4_repositions_with_the_given_speed() -> None:

@@ -148,31 +148,6 @@ def test_thrust_outside_its_range_is_clipped_or_zero(
     assert low < climb_rate_after(bench, 0.6, **setpoint) < high
 
 
-def test_sixty_degrees_of_roll_are_flown() -> None:
-    bench = offboard_attitude()
-    half = math.radians(30.0)
-    bench.run(0.8, lambda: bench.attitude((math.cos(half), math.sin(half), 0, 0)))
-    assert math.degrees(bench.of("ATTITUDE")[-1][1].roll) == pytest.approx(60.0, abs=7.0)
-
-
-@pytest.mark.parametrize("to", [(1, 0), (0, 0), (0, 1)])
-def test_setpoints_to_all_are_obeyed(to: tuple[int, int]) -> None:
-    bench = offboard_attitude()
-    bench.run(1.5, lambda: bench.attitude(to=to))
-    assert bench.mode == OFFBOARD
-
-
-def test_takeoff_by_attitude_setpoints_alone() -> None:
-    bench = Bench()
-    bench.boot()
-    bench.run(0.6, bench.attitude)
-    bench.ask_mode(OFFBOARD)
-    bench.command(400, 1)
-    bench.run(2.0, lambda: bench.attitude(thrust=1.1 * HOVER))
-    assert bench.height_m > 0.3
-    assert bench.texts()[-1] == "Takeoff detected"
-
-
 # -- going where it is told --------------------------------------------------------------------
 
 

@@ -22,7 +22,7 @@ from simulator.instance import Instance
 from simulator.mavlink.codec import Decoder
 from simulator.vehicle.conditions import Conditions
 
-COUNT = int(os.environ.get("FUZZ_DATAGRAMS", "20000"))
+COUNT = int(os.environ.get("FUZZ_DATAGRAMS", "5000"))
 PER_STEP = 20
 
 
@@ -51,6 +51,7 @@ def test_nothing_raises_and_every_answer_is_well_formed(firmware: Firmware) -> N
     assert {"checksum", "truncated", "not a frame", "unknown message"} <= set(dropped)
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(3000)
 def test_a_normal_flight_afterwards() -> None:
     bench = Bench(ground_link=True)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
-import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import NAN, Bench
 
@@ -28,75 +27,11 @@ def global_target(
     )
 
 
-def body_velocity(ahead: float, aside: float, frame: int = BODY) -> object:
-    return mavlink.MAVLink_set_position_target_local_ned_message(
-        0, 1, 1, frame, VELOCITY | 1024, 0, 0, 0, ahead, aside, 0, 0, 0, 0, 0, 0
-    )
-
-
 def flown(send: Callable[[Bench], None], duration_s: float) -> Bench:
     bench = Bench()
     bench.fly_offboard()
     bench.run(duration_s, lambda: send(bench))
     return bench
-
-
-@pytest.mark.parametrize(
-    ("frame", "altitude_m"), [(GLOBAL, PX4.origin[2] + UP), (RELATIVE, UP), (TERRAIN, UP)]
-)
-def test_a_global_position_is_flown_to(frame: int, altitude_m: float) -> None:
-    bench = flown(lambda b: b.send(global_target(frame, altitude_m)), 10.0)
-    _, here = bench.of("LOCAL_POSITION_NED")[-1]
-    assert (here.x, here.y, here.z) == pytest.approx((NORTH, EAST, -UP), abs=0.1)
-
-
-def test_a_global_velocity_needs_no_position() -> None:
-    mask = VELOCITY & ~0b111 | 0b001  # one coordinate ignored: PX4 ignores the place
-    bench = flown(lambda b: b.send(global_target(99, UP, mask, 1.0)), 4.0)
-    _, here = bench.of("LOCAL_POSITION_NED")[-1]
-    assert here.vx == pytest.approx(0.9, abs=0.15)
-
-
-def test_a_body_velocity_is_rotated_by_yaw() -> None:
-    bench = Bench()
-    bench.fly_offboard()
-    turn = mavlink.MAVLink_set_position_target_local_ned_message(
-        0, 1, 1, 1, YAWED_POSITION & ~1024, 0, 0, -3, *(0.0,) * 6, math.radians(120.0), 0
-    )
-    bench.run(5.0, lambda: bench.send(turn))
-    bench.run(4.0, lambda: bench.send(body_velocity(1.0, 0.5)))
-    _, here = bench.of("LOCAL_POSITION_NED")[-1]
-    c, s = math.cos(math.radians(120.0)), math.sin(math.radians(120.0))
-    assert (here.vx, here.vy) == pytest.approx((c - 0.5 * s, s + 0.5 * c), rel=0.25)
-    assert here.vy / here.vx == pytest.approx((s + 0.5 * c) / (c - 0.5 * s), rel=0.05)
-
-
-@pytest.mark.parametrize(
-    ("message", "text"),
-    [
-        (
-            body_velocity(1, 0, 9),
-            "SET_POSITION_TARGET_LOCAL_NED coordinate frame 9 unsupported",
-        ),
-        (
-            global_target(1, 3.0),
-            "SET_POSITION_TARGET_GLOBAL_INT invalid coordinate frame 1",
-        ),
-        (
-            mavlink.MAVLink_set_position_target_local_ned_message(0, 1, 1, 1, 0xFFF, *(0.0,) * 11),
-            "SET_POSITION_TARGET_LOCAL_NED invalid",
-        ),
-    ],
-)
-def test_other_frames_are_refused_with_a_text_and_keep_no_stream(
-    message: object, text: str
-) -> None:
-    bench = Bench()
-    bench.boot()
-    bench.send(message)
-    bench.run(0.1)
-    assert bench.texts() == [text]
-    assert not bench.instance.autopilot.stream.alive(bench.time_s)
 
 
 def test_nan_coordinates_are_not_demanded() -> None:

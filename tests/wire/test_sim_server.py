@@ -226,15 +226,6 @@ def test_parameters_take_any_value_and_are_obeyed_within_their_range() -> None:
     assert table["COM_OBL_RC_ACT"] == 4
 
 
-def test_an_unknown_parameter_is_not_answered() -> None:
-    bench = Bench()
-    bench.send(mavlink.MAVLink_param_request_read_message(1, 1, b"NO_SUCH", -1))
-    bench.send(mavlink.MAVLink_param_request_read_message(1, 1, b"", 999))
-    bench.send(mavlink.MAVLink_param_set_message(1, 1, b"NO_SUCH", 1.0, 9))
-    bench.run(0.1)
-    assert bench.of("PARAM_VALUE") == []
-
-
 # -- truth -----------------------------------------------------------------------------------
 
 
