@@ -34,7 +34,6 @@ class Severity(IntEnum):
     CRITICAL = 2
     WARNING = 4
     INFO = 6
-    DEBUG = 7
 
 
 @dataclass(frozen=True, slots=True)
