@@ -7,10 +7,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from offboard.analysis import history, tlog
+from offboard.analysis import tlog
 from offboard.analysis.events import Event
-from offboard.analysis.history import History
-from offboard.analysis.score import Score, Scoring
+from offboard.analysis.history import History, gather
+from offboard.analysis.score import Score, score
 from offboard.documents.plain import plain
 from offboard.flight.companion import Outcome
 from offboard.flight.phases import ExitCode
@@ -20,19 +20,16 @@ from offboard.link.log import LogError
 def score_flight(flight: Path) -> tuple[Score, History]:
     """Score a flight from its log alone.
 
-    `flight` is a flight directory or a .tlog file. Returns the figures and the events. The arrays
-    of the history are those of the last minutes of a long flight; `history.gather` gives all of
-    them. Raises TlogError.
+    `flight` is a flight directory or a .tlog file. Returns the values, and columns and events of
+    the log. Raises TlogError.
 
     Example:
 
         score, history = score_flight(Path("flights/20261121-093000"))
         print(score.rmse_position_m, history.phases)
     """
-    scored = Scoring()
-    for flown, until_s in history.stretches(tlog.read(tlog.find(flight))):
-        scored.add(flown, until_s)
-    return scored.score(flown), flown
+    flown = gather(tlog.read(tlog.find(flight)))
+    return score(flown), flown
 
 
 def judged(outcome: Outcome, score: Score) -> Outcome:

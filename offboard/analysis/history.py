@@ -1,4 +1,4 @@
-"""One flight as arrays and events, from its .tlog alone: whole, or in stretches of bounded memory.
+"""One flight as columns and events, read once from its .tlog.
 
 Times are vehicle time in seconds, continued where `time_boot_ms` begins again at zero. Positions
 are NED in metres relative to the estimator's origin.
@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -38,25 +37,25 @@ OUR_COMPONENTS = (COMPONENT_ID, RECORD_COMPONENT_ID)
 POSITION_FIELDS = "x y z vx vy vz"
 ATTITUDE_FIELDS = "q1 q2 q3 q4 rollspeed pitchspeed yawspeed"
 REFERENCE_FIELDS = "x y z vx vy vz afx afy afz yaw"
-STRETCH = 100_000  # messages, about five minutes of all that PX4 sends
-LATE_S = 3.0  # telemetry that is older when it arrives is not scored
-OVERLAP_S = 1.0  # longer than the interval of signals that are interpolated, if none is lost
 _TUNNEL = 385  # message id
 _ARRAYS = {RECORD_NAME, IDENTIFIED_NAME}
 _ARMED = 0x80  # MAV_MODE_FLAG_SAFETY_ARMED
 TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
 _SUBSTITUTES = (30, 33)  # ATTITUDE, GLOBAL_POSITION_INT: the clock of logs without these
-# kinds of messages of which every stretch has its own, and kinds that are kept from the beginning
-_OUR_SAMPLES = (
+_OURS = (
     "SET_ATTITUDE_TARGET", "SET_POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_LOCAL_NED",
-    "DEBUG_FLOAT_ARRAY",
+    "DEBUG_FLOAT_ARRAY", "TIMESYNC", "STATUSTEXT",
 )  # fmt: skip
-_SAMPLES = ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "SIM_STATE", "HIL_STATE_QUATERNION")
-_OUR_NEWS = ("TIMESYNC", "STATUSTEXT")
-_NEWS = (
-    "HEARTBEAT", "GPS_GLOBAL_ORIGIN", "COMMAND_ACK", "TIMESYNC", "HOME_POSITION",
-    "EXTENDED_SYS_STATE", "STATUSTEXT",
+_THEIRS = (
+    "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "SIM_STATE", "HIL_STATE_QUATERNION", "HEARTBEAT",
+    "GPS_GLOBAL_ORIGIN", "COMMAND_ACK", "TIMESYNC", "HOME_POSITION", "EXTENDED_SYS_STATE",
+    "STATUSTEXT",
 )  # fmt: skip
+# frequent kinds whose own stamps are used: their place and time in the log are not kept
+_STAMPED = {
+    "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "POSITION_TARGET_LOCAL_NED", "DEBUG_FLOAT_ARRAY",
+}  # fmt: skip
+_BLOCK = 20_000  # records that are converted at once
 
 
 @dataclass(frozen=True, slots=True)
@@ -114,32 +113,12 @@ class History:
 
 def gather(log: Tlog) -> History:
     """Sort a log's messages into a History. A log without a vehicle gives empty arrays."""
-    *_, (history, _) = stretches(log, messages=2**62)
-    return history
-
-
-def stretches(log: Tlog, messages: int = STRETCH) -> Iterator[tuple[History, float]]:
-    """The flight in stretches of so many messages, each with the time up to which it is complete.
-
-    The rows of a stretch begin OVERLAP_S before the time up to which the previous stretch was
-    complete, and with the last one before that; after a reboot without this overlap. Events,
-    `identified`, `link_delay`, `heartbeat` and `landed` are all since the beginning. The last
-    stretch is complete up to infinity.
-    """
     collector = _Collector(*_vehicle(log))
-    complete_s = -math.inf
-    for count, entry in enumerate(log, 1):
+    for entry in log:
         if log.damaged and math.isnan(collector.damage_ms):
             collector.damage_ms = collector.now_ms
         collector.add(entry)
-        if count % messages == 0:
-            until_s = float(collector.time_s(collector.now_ms)) - LATE_S
-            if until_s < complete_s:  # the vehicle was rebooted
-                collector.drop(complete_s)
-            yield collector.history(), until_s
-            collector.drop(until_s - OVERLAP_S)
-            complete_s = until_s
-    yield collector.history(log.damage), math.inf
+    return collector.history(log.damage)
 
 
 def configuration(log: Tlog) -> str | None:
@@ -164,8 +143,8 @@ class _Collector:
     def __init__(self, vehicle: Address | None, dialect: Dialect | None) -> None:
         self._vehicle = vehicle
         self._dialect = dialect
-        self._ours = {name: Stream(name) for name in (*_OUR_SAMPLES, *_OUR_NEWS)}
-        self._theirs = {name: Stream(name) for name in (*_SAMPLES, *_NEWS)}
+        self._ours = {name: Stream(name, placed=name not in _STAMPED) for name in _OURS}
+        self._theirs = {name: Stream(name, placed=name not in _STAMPED) for name in _THEIRS}
         self._counts: Counter[str] = Counter()
         self._unix_us = (0, 0)
         self._place = 0
@@ -173,8 +152,6 @@ class _Collector:
         self._clocks: tuple[int, ...] = TELEMETRY + _SUBSTITUTES
         self.now_ms = math.nan  # stamp of the newest telemetry
         self.damage_ms = math.nan  # of the newest one before the first damage
-        self._rows: dict[str, Array] = {}  # of the present stretch
-        self._identified: list[Array] = []
 
     def add(self, entry: LoggedMessage) -> None:
         kind, name = entry.frame.message_id, entry.name
@@ -198,47 +175,20 @@ class _Collector:
             if math.isnan(self._anchor_ms):
                 self._anchor_ms = self.now_ms
 
-    def drop(self, until_s: float) -> None:
-        """Forget the samples before the last one that is not newer than `until_s`."""
-        for name, rows in self._rows.items():
-            newest = np.maximum.accumulate(rows[:, 0])
-            first = np.searchsorted(newest, until_s, side="right") - 1
-            self._rows[name] = rows[max(first, 0) :].copy()
-
-    def history(self, damage: str = "") -> History:
-        """The present stretch."""
-        arrays = self._ours["DEBUG_FLOAT_ARRAY"].columns("time_usec array_id data")
-        arrays[:, 0] = self.time_s(arrays[:, 0] / 1e3)
-        of_ticks = np.isin(arrays[:, 1], list(LAYOUTS))
-        samples = {
-            "position": self._table(self._theirs["LOCAL_POSITION_NED"], POSITION_FIELDS),
-            "attitude": self._table(self._theirs["ATTITUDE_QUATERNION"], ATTITUDE_FIELDS),
-            "truth": true_positions(self._theirs, self.time_s),
-            "reference": self._table(self._ours["POSITION_TARGET_LOCAL_NED"], REFERENCE_FIELDS),
-            "setpoint": self._setpoints(),
-            "ticks": arrays[of_ticks],
-        }
-        self._rows = {
-            name: np.vstack((self._rows[name], rows)) if name in self._rows else rows
-            for name, rows in samples.items()
-        }
-        self._identified.extend(np.delete(arrays[~of_ticks], 1, axis=1)[:, : 1 + IDENTIFIED_SIZE])
-        for name in _OUR_SAMPLES:
-            self._ours[name].clear()
-        for name in _SAMPLES:
-            self._theirs[name].clear()
-        return self._history(damage)
-
-    def _history(self, damage: str) -> History:
-        tables = dict(self._rows)
-        ticks = tables.pop("ticks")
+    def history(self, damage: str) -> History:
+        """All that was added. Frees what it was made of, so that a long log fits in memory."""
+        record_time_s, records, identified = self._arrays(self._ours.pop("DEBUG_FLOAT_ARRAY"))
         heartbeat = self._news("HEARTBEAT", "base_mode system_status")
         heartbeat[:, 1] = (heartbeat[:, 1].astype(np.int64) & _ARMED) > 0
         return History(
-            **tables,
-            record_time_s=ticks[:, 0],
-            records=records_of(ticks[:, 2:], ticks[:, 1]),
-            identified=np.reshape(self._identified, (-1, 1 + IDENTIFIED_SIZE)),
+            attitude=self._table(self._theirs.pop("ATTITUDE_QUATERNION"), ATTITUDE_FIELDS),
+            position=self._table(self._theirs.pop("LOCAL_POSITION_NED"), POSITION_FIELDS),
+            truth=true_positions(self._theirs, self.time_s),
+            reference=self._table(self._ours.pop("POSITION_TARGET_LOCAL_NED"), REFERENCE_FIELDS),
+            setpoint=self._setpoints(),
+            record_time_s=record_time_s,
+            records=records,
+            identified=identified,
             link_delay=self._link_delay(),
             heartbeat=heartbeat,
             landed=self._news("EXTENDED_SYS_STATE", "landed_state"),
@@ -250,11 +200,24 @@ class _Collector:
             ),
             vehicle=self._vehicle,
             dialect=self._dialect,
-            messages=self._counts.copy(),
+            messages=self._counts,
             wall_s=(self._unix_us[1] - self._unix_us[0]) / 1e6,
             damage=damage,
             damage_s=float(self.time_s(self.damage_ms)),
         )
+
+    def _arrays(self, stream: Stream) -> tuple[Array, NDArray[np.void], Array]:
+        """Times and records of the ticks; and what was identified."""
+        stamps = stream.columns("time_usec array_id")
+        times, of_ticks = self.time_s(stamps[:, 0] / 1e3), np.isin(stamps[:, 1], list(LAYOUTS))
+        found: list[Array] = []
+        records: list[NDArray[np.void]] = []
+        for first in range(0, max(len(stream), 1), _BLOCK):
+            block = slice(first, first + _BLOCK)
+            data, ticks = stream.columns("data", block), of_ticks[block]
+            records.append(records_of(data[ticks], stamps[block, 1][ticks]))
+            found.append(np.column_stack((times[block][~ticks], data[~ticks, :IDENTIFIED_SIZE])))
+        return times[of_ticks], np.concatenate(records), np.vstack(found)
 
     # ------------------------------------------------------------------ time
 

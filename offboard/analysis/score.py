@@ -10,11 +10,11 @@ import math
 from dataclasses import asdict, dataclass, field, fields, replace
 from typing import Any
 
-from offboard.analysis.decisions import Decisions
+from offboard.analysis.decisions import decision_figures
 from offboard.analysis.history import History
-from offboard.analysis.link_figures import Link
-from offboard.analysis.tracking import Tracking
-from offboard.analysis.verdict import Landing, judge
+from offboard.analysis.link_figures import link_figures
+from offboard.analysis.tracking import passed_s, tracking_figures, window_of
+from offboard.analysis.verdict import judge
 
 NAN = math.nan
 
@@ -123,44 +123,14 @@ class Score:
 FIGURES = {figure.name: figure.metadata for figure in fields(Score) if figure.metadata}
 
 
-class Scoring:
-    """Scores a flight stretch by stretch (`history.stretches`), in little memory."""
-
-    def __init__(self) -> None:
-        self._tracking, self._link = Tracking(), Link()
-        self._decisions, self._landing = Decisions(), Landing()
-        self._done_s = -math.inf
-        self._tracked = False
-
-    def add(self, flown: History, until_s: float = math.inf) -> None:
-        """Evaluate a stretch up to the vehicle time until which it is complete."""
-        if until_s < self._done_s:  # the vehicle was rebooted
-            self._done_s = -math.inf
-        window = self._tracking.window(flown, until_s)
-        if window is not None:
-            self._tracking.add(flown, *window)
-            self._link.add_track(flown, *window, first=not self._tracked)
-            self._tracked = True
-        self._link.add(flown, self._done_s, until_s)
-        self._decisions.add(flown, self._done_s, until_s)
-        self._landing.add(flown, until_s)
-        self._done_s = until_s
-
-    def score(self, flown: History) -> Score:
-        """All figures. `flown`: the last stretch."""
-        verdict = judge(flown, self._landing, self._tracking.skipped_s)
-        if verdict.completed == 1.0 and not self._tracked:
-            verdict = replace(
-                verdict, completed=0.0, ended_by="too short at full speed to be scored"
-            )
-        values: dict[str, Any] = (
-            self._tracking.figures() | self._link.figures(flown) | self._decisions.figures()
-        )
-        return replace(Score(**values), **asdict(verdict))
-
-
-def score(history: History) -> Score:
-    """Compute all figures of a whole flight from its arrays."""
-    scoring = Scoring()
-    scoring.add(history)
-    return scoring.score(history)
+def score(flown: History) -> Score:
+    """Compute all values of a flight from its columns."""
+    window = window_of(flown)
+    skipped_s = passed_s(flown, window)[1] if window else 0.0
+    verdict = judge(flown, skipped_s)
+    if verdict.completed == 1.0 and window is None:
+        verdict = replace(verdict, completed=0.0, ended_by="too short at full speed to be scored")
+    values: dict[str, Any] = link_figures(flown, window) | decision_figures(flown)
+    if window:
+        values |= tracking_figures(flown, window)
+    return replace(Score(**values), **asdict(verdict))

@@ -18,35 +18,34 @@ WRAP_MS = 2**32
 class Stream:
     """The messages of one kind from one sender, in the order of arrival.
 
-    For each also its place in the log, its Unix time, and the vehicle time in ms of the newest
-    telemetry before it (NaN without).
+    With `placed`, for each also its place in the log, its Unix time, and the vehicle time in ms of
+    the newest telemetry before it (NaN without).
     """
 
-    def __init__(self, name: str) -> None:
+    def __init__(self, name: str, *, placed: bool = True) -> None:
         self._name = name
         self._size = layout(name).itemsize
         self._payloads = bytearray()
+        self._placed = placed
         self.places, self.unix_us, self.now_ms = array("q"), array("q"), array("d")
 
     def __len__(self) -> int:
-        return len(self.places)
+        return len(self._payloads) // self._size
 
     def add(self, entry: LoggedMessage, place: int, now_ms: float) -> None:
         self._payloads += entry.frame.payload[: self._size].ljust(self._size, b"\0")
-        self.places.append(place)
-        self.unix_us.append(entry.unix_us)
-        self.now_ms.append(now_ms)
+        if self._placed:
+            self.places.append(place)
+            self.unix_us.append(entry.unix_us)
+            self.now_ms.append(now_ms)
 
-    def columns(self, fields: str) -> Array:
-        """(N, columns): the fields of all messages, separated by spaces."""
-        return columns(self._name, self._payloads, fields)
+    def columns(self, fields: str, rows: slice = slice(None)) -> Array:
+        """(N, columns): the fields of all messages, or of some `rows`, separated by spaces."""
+        return columns(self._name, self._payloads, fields, rows)
 
     def payloads(self) -> Iterator[bytes]:
         for at in range(0, len(self._payloads), self._size):
             yield bytes(self._payloads[at : at + self._size])
-
-    def clear(self) -> None:
-        self.__init__(self._name)  # type: ignore[misc]
 
 
 def continuous_s(stamps_ms: Array, anchor_ms: float) -> Array:

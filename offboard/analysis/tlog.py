@@ -189,19 +189,22 @@ def name_of(message_id: int) -> str:
     return kind.msgname if kind else f"UNKNOWN_{message_id}"
 
 
-def columns(name: str, payloads: bytes | bytearray, fields: str) -> NDArray[np.float64]:
-    """Fields of messages named `name` as rows (N, columns).
+def columns(
+    name: str, payloads: bytes | bytearray, fields: str, chosen: slice = slice(None)
+) -> NDArray[np.float64]:
+    """Fields of messages named `name` as rows (N, columns); of the `chosen` messages only.
 
     `payloads` are the N payloads one after the other, each with all the zeros that MAVLink 2 omits
     (see `layout`). `fields` are separated by spaces; an array field fills as many columns as it has
     elements.
     """
-    rows = np.frombuffer(bytes(payloads), layout(name))
-    parts = []
-    for field in fields.split():
-        width = math.prod(rows.dtype[field].shape)
-        parts.append(rows[field].reshape(len(rows), width).astype(np.float64))
-    return np.hstack(parts)
+    rows = np.frombuffer(payloads, layout(name))[chosen]
+    names = fields.split()
+    widths = [math.prod(rows.dtype[field].shape) for field in names]
+    found = np.empty((len(rows), sum(widths)))
+    for field, width, end in zip(names, widths, np.cumsum(widths).tolist(), strict=True):
+        found[:, end - width : end] = rows[field].reshape(len(rows), width)
+    return found
 
 
 @cache

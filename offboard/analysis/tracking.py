@@ -1,6 +1,6 @@
-"""Figures of the phase TRACK, collected stretch by stretch: errors, fitness, activity, truth.
+"""Metrics of the phase TRACK: errors, fitness, activity, truth.
 
-Errors and motion are weighted by the time of the reference (see `weighted`): a figure depends
+Errors and motion are weighted by the time of the reference (see `weighted`): a metric depends
 neither on the rate of the telemetry nor on jumps of the vehicle's clock. Sums of the paper's
 fitness are over the control ticks, as in its Eq. 32.
 """
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.interpolate import BPoly
 
 from offboard.analysis.history import History
-from offboard.analysis.weighted import Weighted, shares
+from offboard.analysis.weighted import Weighted, shares, weighted
 from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.model.frames import (
     course_from_quaternion,
@@ -27,149 +27,122 @@ Array = NDArray[np.float64]
 
 SKIPPED_S = 1.5  # without a decision for longer, the reference was not tracked meanwhile
 _EXPLAINED = 7  # regressors of the agitation: velocity, acceleration, jerk (north, east), and 1
+_BLOCK = 10_000  # samples
 _FITNESS = ("e_u", "e_v", "e_w", "e_x", "e_y", "e_z", "e_psi")
 
 
-class Tracking:
-    """Call `add` with each stretch of a flight, then `figures`."""
+def window_of(flown: History) -> tuple[float, float] | None:
+    """First and last vehicle time of TRACK; None where a signal has less than two samples in it."""
+    times = flown.record_time_s[_in_track(flown)]
+    if len(times) < 2 or len(flown.reference) < 2:
+        return None
+    begin_s, end_s = float(times[0]), float(times[-1])
+    tables = (flown.position, flown.attitude, flown.setpoint)
+    inside = (((rows[:, 0] >= begin_s) & (rows[:, 0] <= end_s)).sum() for rows in tables)
+    return (begin_s, end_s) if min(inside) >= 2 else None
 
-    def __init__(self) -> None:
-        self._position, self._velocity = Weighted(distribution=True), Weighted(distribution=True)
-        self._course, self._truth, self._tilt = Weighted(), Weighted(), Weighted()
-        self._roll_rate, self._pitch_rate, self._thrust = Weighted(), Weighted(), Weighted()
-        self._fitness = np.zeros(len(_FITNESS))
-        self._steps = np.zeros(2)  # number, sum of squares in deg2
-        self._factor = np.zeros((0, _EXPLAINED + 4))  # R of a QR decomposition
-        self._track_s = math.nan  # time of the reference at the newest tick
-        self._before_s: dict[str, float] = {}  # newest sample of each table
-        self._done_s = -math.inf  # end of the newest window
-        self.tracked_s = self.skipped_s = 0.0
 
-    def window(self, flown: History, until_s: float) -> tuple[float, float] | None:
-        """First and last vehicle time of the part of TRACK that is not evaluated yet, up to
-        `until_s`; None without any. The first window has at least two samples of each signal."""
-        times = flown.record_time_s[_in_track(flown)]
-        if len(times) < 2 or len(flown.reference) < 2:
-            return None
-        begin_s, end_s = max(float(times[0]), self._done_s), min(float(times[-1]), until_s)
-        tables = (flown.position, flown.attitude, flown.setpoint)
-        inside = (((rows[:, 0] >= begin_s) & (rows[:, 0] <= end_s)).sum() for rows in tables)
-        first = self._done_s == -math.inf
-        enough = min(inside) >= 2 if first else begin_s < end_s
-        return (begin_s, end_s) if enough else None
+def passed_s(flown: History, window: tuple[float, float]) -> tuple[float, float]:
+    """Time of the reference that was tracked, and that for which nothing was decided, in s."""
+    track_s = flown.records["track_time_s"][_ticks(flown, window)]
+    intervals = np.diff(track_s)
+    intervals = np.maximum(intervals[np.isfinite(intervals)], 0.0)  # flown again from its start
+    flowing = intervals <= SKIPPED_S
+    return float(intervals[flowing].sum()), float(intervals[~flowing].sum())
 
-    def add(self, flown: History, begin_s: float, end_s: float) -> None:
-        """Evaluate a window: what is after `begin_s`, for the first window also what is at it."""
-        self._done_s = end_s
-        reference = Reference(flown.reference)
-        clock = _Clock(flown)
-        self._ticks(flown, reference, begin_s, end_s)
-        position = self._between("position", flown.position, begin_s, end_s)
-        times, weights = position[:, 0], shares(clock.track_s(position[:, 0]))
-        error_m = np.linalg.norm(position[:, 1:4] - reference.position(times), axis=1)
-        slip_mps = np.linalg.norm(position[:, 4:7] - reference.position(times, 1), axis=1)
-        self._position.add(error_m, weights)
-        self._velocity.add(slip_mps, weights)
-        truth = self._between("truth", flown.truth, begin_s, end_s)
-        error_m = np.linalg.norm(truth[:, 1:4] - reference.position(truth[:, 0]), axis=1)
-        self._truth.add(error_m, shares(clock.track_s(truth[:, 0])))
-        attitude = self._between("attitude", flown.attitude, begin_s, end_s)
-        self._motion(reference, attitude, shares(clock.track_s(attitude[:, 0])))
-        setpoint = self._between("setpoint", flown.setpoint, begin_s, end_s)
-        self._thrust.add(setpoint[:, 6], shares(clock.track_s(setpoint[:, 0])))
-        commanded = thrust_direction_from_quaternion(setpoint[:, 2:6])
-        steps = np.degrees(np.linalg.norm(np.diff(commanded, axis=0), axis=1))
-        self._steps += (len(steps), (steps**2).sum())
 
-    def figures(self) -> dict[str, float]:
-        """Figures of a Score; empty without any window."""
-        if self._done_s == -math.inf:
-            return {}
-        fitness = {name: float(value) for name, value in zip(_FITNESS, self._fitness, strict=True)}
-        count, squares = self._steps
-        return {
-            "rmse_position_m": self._position.rms,
-            "mean_position_m": self._position.mean,
-            "p95_position_m": self._position.percentile(95),
-            "max_position_m": self._position.max,
-            "rmse_truth_m": self._truth.rms,
-            "max_truth_m": self._truth.max,
-            "rmse_velocity_mps": self._velocity.rms,
-            "p95_velocity_mps": self._velocity.percentile(95),
-            "max_velocity_mps": self._velocity.max,
-            "rmse_course_deg": self._course.rms,
-            "max_course_deg": self._course.max,
-            **fitness,
-            "mu_e": sum(fitness.values()),
-            "tracked_s": self.tracked_s,
-            "thrust_sd": self._thrust.sd,
-            "tilt_command_step_deg": math.sqrt(squares / count) if count else math.nan,
-            "tilt_max_deg": self._tilt.max,
-            "roll_rate_sd_radps": self._roll_rate.sd,
-            "pitch_rate_sd_radps": self._pitch_rate.sd,
-            **self._agitation(),
-        }
+def tracking_figures(flown: History, window: tuple[float, float]) -> dict[str, float]:
+    """Values of a Score, of the samples in the window."""
+    reference, clock = Reference(flown.reference), _Clock(flown)
 
-    def _between(self, name: str, rows: Array, begin_s: float, end_s: float) -> Array:
-        """Rows of a window in the order of time, each stamp once, after the last row before."""
-        begin_s = self._before_s.get(name, begin_s)
-        once = each_once(rows[(rows[:, 0] >= begin_s) & (rows[:, 0] <= end_s)])
-        if len(once):
-            self._before_s[name] = once[-1, 0]
-        return once
+    def of(rows: Array, values: Array) -> Weighted:
+        return weighted(values, shares(clock.track_s(rows[:, 0])))
 
-    def _ticks(self, flown: History, reference: Reference, begin_s: float, end_s: float) -> None:
-        """Time tracked, and Eqs. 31-32: velocities in the body frame, course in degrees."""
-        after = flown.record_time_s > self._before_s.get("ticks", -math.inf)
-        inside = (flown.record_time_s >= begin_s) & (flown.record_time_s <= end_s)
-        chosen = _in_track(flown) & after & inside
-        ticks = flown.record_time_s[chosen]
-        if not len(ticks):
-            return
-        self._before_s["ticks"] = float(ticks[-1])
-        track_s = flown.records["track_time_s"][chosen]
-        intervals = np.diff(track_s, prepend=self._track_s)
-        intervals = intervals[np.isfinite(intervals)]
-        intervals = np.maximum(intervals, 0.0)  # it is flown again from its start
-        flowing = intervals <= SKIPPED_S
-        self.tracked_s += float(intervals[flowing].sum())
-        self.skipped_s += float(intervals[~flowing].sum())
-        self._track_s = float(track_s[-1])
-        attitude = flown.attitude[_nearest(flown.attitude[:, 0], ticks), 1:5]
-        body = rotation_from_quaternion(attitude).swapaxes(-1, -2)
-        at_tick = _at(flown.position, ticks)
-        slip = np.einsum("nij,nj->ni", body, reference.position(ticks, 1) - at_tick[:, 3:6])
-        away = reference.position(ticks) - at_tick[:, 0:3]
-        turn = np.degrees(wrap_pi(reference.course(ticks) - course_from_quaternion(attitude)))
-        self._fitness += (np.column_stack((slip, away, turn)) ** 2).sum(axis=0)
+    def away(rows: Array, columns: slice, derivative: int = 0) -> Weighted:
+        difference = rows[:, columns] - reference.position(rows[:, 0], derivative)
+        return of(rows, np.linalg.norm(difference, axis=1))
 
-    def _motion(self, reference: Reference, attitude: Array, weights: Array) -> None:
-        times, quaternion = attitude[:, 0], attitude[:, 1:5]
-        turn = wrap_pi(course_from_quaternion(quaternion) - reference.course(times))
-        self._course.add(np.abs(np.degrees(turn)), weights)
-        direction = thrust_direction_from_quaternion(quaternion)
-        self._tilt.add(np.degrees(np.arccos(np.clip(direction[:, 2], -1, 1))), weights)
-        self._roll_rate.add(attitude[:, 5], weights)
-        self._pitch_rate.add(attitude[:, 6], weights)
+    rows, truth, setpoint, attitude = (
+        _within(each, window)
+        for each in (flown.position, flown.truth, flown.setpoint, flown.attitude)
+    )
+    position, velocity = away(rows, slice(1, 4)), away(rows, slice(4, 7), 1)
+    true = away(truth, slice(1, 4))
+    commanded = thrust_direction_from_quaternion(setpoint[:, 2:6])
+    steps = np.degrees(np.linalg.norm(np.diff(commanded, axis=0), axis=1))
+    fitness = _fitness(flown, reference, window)
+    turn = course_from_quaternion(attitude[:, 1:5]) - reference.course(attitude[:, 0])
+    course = of(attitude, np.abs(np.degrees(wrap_pi(turn))))
+    direction = thrust_direction_from_quaternion(attitude[:, 1:5])
+    tilt = of(attitude, np.degrees(np.arccos(np.clip(direction[:, 2], -1, 1))))
+    return {
+        "rmse_position_m": position.rms,
+        "mean_position_m": position.mean,
+        "p95_position_m": position.p95,
+        "max_position_m": position.max,
+        "rmse_truth_m": true.rms,
+        "max_truth_m": true.max,
+        "rmse_velocity_mps": velocity.rms,
+        "p95_velocity_mps": velocity.p95,
+        "max_velocity_mps": velocity.max,
+        "rmse_course_deg": course.rms,
+        "max_course_deg": course.max,
+        **fitness,
+        "mu_e": sum(fitness.values()),
+        "tracked_s": passed_s(flown, window)[0],
+        "thrust_sd": of(setpoint, setpoint[:, 6]).sd,
+        "tilt_command_step_deg": math.sqrt((steps**2).mean()) if len(steps) else math.nan,
+        "tilt_max_deg": tilt.max,
+        "roll_rate_sd_radps": of(attitude, attitude[:, 5]).sd,
+        "pitch_rate_sd_radps": of(attitude, attitude[:, 6]).sd,
+        **_agitation(reference, attitude, shares(clock.track_s(attitude[:, 0]))),
+    }
+
+
+def _fitness(flown: History, reference: Reference, window: tuple[float, float]) -> dict[str, float]:
+    """Eqs. 31-32: velocities in the body frame, course in degrees."""
+    ticks = flown.record_time_s[_ticks(flown, window)]
+    attitude = flown.attitude[_nearest(flown.attitude[:, 0], ticks), 1:5]
+    body = rotation_from_quaternion(attitude).swapaxes(-1, -2)
+    at_tick = _at(flown.position, ticks)
+    slip = np.einsum("nij,nj->ni", body, reference.position(ticks, 1) - at_tick[:, 3:6])
+    away = reference.position(ticks) - at_tick[:, 0:3]
+    turn = np.degrees(wrap_pi(reference.course(ticks) - course_from_quaternion(attitude)))
+    squares = (np.column_stack((slip, away, turn)) ** 2).sum(axis=0)
+    return {name: float(value) for name, value in zip(_FITNESS, squares, strict=True)}
+
+
+def _agitation(reference: Reference, attitude: Array, weights: Array) -> dict[str, float]:
+    """Motion beside that of the reference: thrust direction and rates minus their linear fit by
+    the reference's velocity, acceleration and jerk. The fit needs no model of drag and lag.
+
+    The factor R of the samples has the same residuals as the samples; made of blocks, it takes
+    little memory.
+    """
+    factor = np.zeros((0, _EXPLAINED + 4))
+    for first in range(0, len(attitude), _BLOCK):
+        rows, share = attitude[first : first + _BLOCK], weights[first : first + _BLOCK]
+        times, direction = rows[:, 0], thrust_direction_from_quaternion(rows[:, 1:5])
         explained = [reference.position(times, order)[:, :2] for order in (1, 2, 3)]
-        rows = np.hstack((*explained, np.ones((len(times), 1)), direction[:, :2], attitude[:, 5:7]))
-        weighted = np.sqrt(weights)[:, None] * rows
-        factor: Array = np.linalg.qr(np.vstack((self._factor, weighted)), mode="r")  # type: ignore[assignment]
-        self._factor = factor
+        block = np.hstack((*explained, np.ones((len(times), 1)), direction[:, :2], rows[:, 5:7]))
+        stacked = np.vstack((factor, np.sqrt(share)[:, None] * block))
+        factor = np.linalg.qr(stacked, mode="r")  # type: ignore[assignment]
+    regressors, motion = factor[:, :_EXPLAINED], factor[:, _EXPLAINED:]
+    fit, *_ = np.linalg.lstsq(regressors, motion, rcond=None)
+    squares = ((motion - regressors @ fit) ** 2).sum(axis=0)
+    total = (factor[:, _EXPLAINED - 1] ** 2).sum()  # of the weights, from the column of 1
+    tilt, rate = np.sqrt(np.array([squares[:2].sum(), squares[2:].sum()]) / total)
+    return {
+        "tilt_agitation_deg": float(np.degrees(tilt)),
+        "rate_agitation_radps": float(rate),
+    }
 
-    def _agitation(self) -> dict[str, float]:
-        """Motion beside that of the reference: thrust direction and rates minus their linear fit by
-        the reference's velocity, acceleration and jerk. The fit needs no model of drag and lag. The
-        factor R of all samples has the same residuals as the samples."""
-        regressors, motion = self._factor[:, :_EXPLAINED], self._factor[:, _EXPLAINED:]
-        fit, *_ = np.linalg.lstsq(regressors, motion, rcond=None)
-        squares = ((motion - regressors @ fit) ** 2).sum(axis=0)
-        total = (self._factor[:, _EXPLAINED - 1] ** 2).sum()  # of the weights, from the column of 1
-        tilt, rate = np.sqrt(np.array([squares[:2].sum(), squares[2:].sum()]) / total)
-        return {
-            "tilt_agitation_deg": float(np.degrees(tilt)),
-            "rate_agitation_radps": float(rate),
-        }
+
+def _ticks(flown: History, window: tuple[float, float]) -> NDArray[np.bool_]:
+    """The ticks of TRACK in the window."""
+    times = flown.record_time_s
+    chosen: NDArray[np.bool_] = _in_track(flown) & (times >= window[0]) & (times <= window[1])
+    return chosen
 
 
 class _Clock:
@@ -209,9 +182,18 @@ class Reference:
 
 def each_once(rows: Array) -> Array:
     """Rows (N, columns) sorted by time (the first column), the first one of equal times."""
+    if (np.diff(rows[:, 0]) > 0.0).all():
+        return rows
     _, first = np.unique(rows[:, 0], return_index=True)
     once: Array = rows[first]
     return once
+
+
+def _within(rows: Array, window: tuple[float, float]) -> Array:
+    """Rows of a window, sorted, each time once."""
+    once = each_once(rows)
+    begin, end = np.searchsorted(once[:, 0], (window[0], np.nextafter(window[1], math.inf)))
+    return once[begin:end]
 
 
 def _in_track(flown: History) -> NDArray[np.bool_]:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,13 +18,14 @@ from offboard.analysis.events import Event
 from offboard.analysis.history import History
 from offboard.flight.phases import STOPPED
 from offboard.flight.position_jumps import PositionJumps
-from offboard.flight.touchdown import Touchdown, Triple, moved
+from offboard.flight.touchdown import Touchdown, moved
 from offboard.mavlink.events import LocalPosition
 
 Array = NDArray[np.float64]
 
 REFERENCE_OVER = "reference over"
 NO_FLIGHT = "no flight of offboard in this log"
+_BLOCK = 10_000  # positions
 _ON_GROUND = 1  # MAV_LANDED_STATE
 _CRITICAL = 5  # MAV_STATE
 _TAKEN_OVER = "supervisor: taking over"
@@ -59,46 +61,37 @@ class Verdict:
     reason: str = ""
 
 
-class Landing:
-    """Judges the landing from the samples of a flight, which may come in stretches."""
-
-    def __init__(self) -> None:
-        self._jumps = PositionJumps()
-        self._takeoff: Triple | None = None
-        self._touchdown: Touchdown | None = None
-        self._done_s = -math.inf
-
-    def add(self, flown: History, until_s: float) -> None:
-        """Evaluate the positions up to `until_s`."""
-        begun = begin_times(flown.phases)
-        takes_off_s, lands_s = (begun.get(phase, math.inf) for phase in ("takeoff", "land"))
-        rows = flown.position[np.argsort(flown.position[:, 0], kind="stable")]
-        rows = rows[(rows[:, 0] > self._done_s) & (rows[:, 0] <= until_s)]
-        for row in rows.tolist():
-            self._add(LocalPosition(row[0], tuple(row[1:4]), tuple(row[4:7])), takes_off_s, lands_s)
-        self._done_s = until_s
-
-    def _add(self, position: LocalPosition, takes_off_s: float, lands_s: float) -> None:
-        jump_ned_m, place = self._jumps.on_position(position), position.position_ned_m
+def landing(flown: History) -> tuple[str, float]:
+    """Why the vehicle has not landed, empty if it has; and the downward speed at touch-down."""
+    begun = begin_times(flown.phases)
+    takes_off_s, lands_s = (begun.get(phase, math.inf) for phase in ("takeoff", "land"))
+    jumps, takeoff, touchdown = PositionJumps(), None, None
+    for position in _positions(flown):
+        jump_ned_m, place = jumps.on_position(position), position.position_ned_m
         if position.time_s <= takes_off_s:
-            self._takeoff = place
-        elif jump_ned_m is not None and self._takeoff is not None:
-            self._takeoff = moved(self._takeoff, jump_ned_m.tolist())
+            takeoff = place
+        elif jump_ned_m is not None and takeoff is not None:
+            takeoff = moved(takeoff, jump_ned_m.tolist())
         if position.time_s <= lands_s:
-            return
-        if self._touchdown is None:
-            self._touchdown = Touchdown(self._takeoff if takes_off_s < math.inf else None)
+            continue
+        if touchdown is None:
+            touchdown = Touchdown(takeoff if takes_off_s < math.inf else None)
         elif jump_ned_m is not None:
-            self._touchdown.on_jump(jump_ned_m.tolist())
-        self._touchdown.on_position(position.time_s, place, position.velocity_ned_mps[2])
+            touchdown.on_jump(jump_ned_m.tolist())
+        touchdown.on_position(position.time_s, place, position.velocity_ned_mps[2])
+    if touchdown is None:
+        return "not landed", math.nan
+    since = flown.landed[flown.landed[:, 0] >= begun["land"]]
+    on_ground = bool(len(since)) and bool(since[-1, 1] == _ON_GROUND)
+    return touchdown.not_landed(on_ground=on_ground), touchdown.speed_mps
 
-    def judge(self, flown: History) -> tuple[str, float]:
-        """Why it has not landed, empty if it has; and the downward speed at touch-down."""
-        if self._touchdown is None:
-            return "not landed", math.nan
-        since = flown.landed[flown.landed[:, 0] >= begin_times(flown.phases)["land"]]
-        on_ground = bool(len(since)) and bool(since[-1, 1] == _ON_GROUND)
-        return self._touchdown.not_landed(on_ground=on_ground), self._touchdown.speed_mps
+
+def _positions(flown: History) -> Iterator[LocalPosition]:
+    """In the order of time."""
+    order = np.argsort(flown.position[:, 0], kind="stable")
+    for first in range(0, len(order), _BLOCK):
+        for row in flown.position[order[first : first + _BLOCK]].tolist():
+            yield LocalPosition(row[0], tuple(row[1:4]), tuple(row[4:7]))
 
 
 def begin_times(phases: tuple[Event, ...]) -> dict[str, float]:
@@ -106,14 +99,13 @@ def begin_times(phases: tuple[Event, ...]) -> dict[str, float]:
     return {event.phase: event.time_s for event in phases}
 
 
-def judge(flown: History, landing: Landing, skipped_s: float) -> Verdict:
-    """The verdict on a flight. `flown`: its last stretch. `skipped_s`: time of the reference for
-    which nothing was decided."""
+def judge(flown: History, skipped_s: float) -> Verdict:
+    """The verdict on a flight. `skipped_s`: time of the reference for which nothing was decided."""
     names = [event.phase for event in flown.phases]
     if not flown.phases:
         return Verdict(math.nan, NO_FLIGHT)
     why, reason = _ended_early(flown)
-    not_landed, touchdown_mps = landing.judge(flown)
+    not_landed, touchdown_mps = landing(flown)
     if why == REFERENCE_OVER:
         if skipped_s > 0.0:
             why = f"{skipped_s:.1f} s of the reference were not tracked"

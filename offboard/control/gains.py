@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 
-import control
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
@@ -67,6 +66,8 @@ def _solved(dynamics: bytes, input_map: bytes, effort: float, period_s: float) -
     a, b = held.dynamics, held.input_map
     stage = period_s * np.diag([1.0] + [0.0] * (len(a) - 1) + [effort])
     q, r = stage[:-1, :-1], stage[-1:, -1:]
+    import control  # takes a second: only where a gain is designed
+
     gain, terminal, _ = control.dlqr(a, b, q, r)
     return CostToGo(
         transition=a,
@@ -90,6 +91,8 @@ def riccati(dynamics: ArrayLike, inputs: ArrayLike, fitness: ArrayLike, energy: 
     where no stabilising solution exists.
     """
     given = [np.asarray(matrix, np.float64) for matrix in (dynamics, inputs, fitness, energy)]
+    import control
+
     solution: Array = control.dare(*given, S=cross)[0]
     return solution
 

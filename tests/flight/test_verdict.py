@@ -1,7 +1,6 @@
 """The verdict of the score: completed only if all was tracked, landed and disarmed; else why not.
 
-Also what the score must not depend on: the rate of the telemetry, jumps and the wrap of its clock,
-and the length of the stretches in which a log is read.
+Also what the score must not depend on: the rate of the telemetry, jumps and the wrap of its clock.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from typer.testing import CliRunner
 from offboard.analysis import history, tlog
 from offboard.analysis.flight_score import judged
 from offboard.analysis.history import History
-from offboard.analysis.score import Score, Scoring, score
+from offboard.analysis.score import Score, score
 from offboard.analysis.score_table import summary, verdict
 from offboard.cli.commands import app
 from offboard.flight.companion import Outcome
@@ -293,24 +292,6 @@ def test_a_jump_of_the_clock_is_not_tracked(flown: History, by_s: float) -> None
     steady = score(jumped(flown, by_s, reference_too=False))
     assert (steady.completed, steady.tracked_s) == (1.0, whole.tracked_s)
     assert steady.rmse_position_m == pytest.approx(whole.rmse_position_m, rel=0.01)
-
-
-def test_a_log_in_stretches_gives_the_same_score(tmp_path: Path) -> None:
-    """Wherever they end: also within a few samples of the beginning and end of the track."""
-    pair = make("reference.laps=1", scenario="px4_like")
-    pair.track()
-    log = pair.log(tmp_path)
-    whole = score(history.gather(log))
-    for messages in (319, *range(560, 600, 5), 629):
-        scoring, count = Scoring(), 0
-        for stretch, until_s in history.stretches(log, messages=messages):
-            scoring.add(stretch, until_s)
-            assert len(stretch.position) < 900
-            count += 1
-        assert count > 8
-        in_stretches = scoring.score(stretch)
-        assert in_stretches.ended_by == whole.ended_by
-        assert in_stretches.figures() == pytest.approx(whole.figures(), rel=1e-6, nan_ok=True)
 
 
 def later(by_ms: int) -> Callable[[float, list[bytes]], list[bytes]]:
