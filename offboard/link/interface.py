@@ -37,8 +37,8 @@ class Chunk:
     arrived_s: float
 
 
-class Strangers:
-    """Counts what other addresses than the vehicle's send, and keeps what the link has to tell."""
+class LinkReport:
+    """What a link tells: what other addresses than the vehicle's send, counted, and breaks."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
@@ -46,7 +46,8 @@ class Strangers:
         self._overheard: list[bytes] = []
 
     @property
-    def total(self) -> int:
+    def ignored(self) -> int:
+        """Datagrams and connections of others."""
         return self._counts.total()
 
     def count(self, sender: str, number: int, noun: str = "datagram") -> None:
@@ -87,7 +88,7 @@ class Link(Protocol):
     is_stream: bool
     opened: int
     capacity_bytes_ps: float | None
-    strangers: Strangers
+    report: LinkReport
 
     def wait(self, timeout_s: float) -> None:
         """Wait at most `timeout_s` until something has arrived. Reads nothing."""

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from offboard.link import clock
-from offboard.link.interface import Chunk, Strangers
+from offboard.link.interface import Chunk, LinkReport
 from offboard.mavlink.framing import SETPOINTS
 
 READ_BYTES = 65536
@@ -35,7 +35,7 @@ class Stream:
 class Source(Protocol):
     """Where streams come from. Nothing waits but `wait`."""
 
-    strangers: Strangers
+    report: LinkReport
 
     def seek(self) -> None:
         """A new stream is needed."""
@@ -65,7 +65,7 @@ class Nowhere:
     """No source: a stream that breaks is lost."""
 
     def __init__(self) -> None:
-        self.strangers = Strangers()
+        self.report = LinkReport()
 
     def seek(self) -> None: ...
 
@@ -99,7 +99,7 @@ class StreamLink:
     ) -> None:
         self.capacity_bytes_ps = capacity_bytes_ps
         self.opened = 0  # how often a stream began or broke
-        self.strangers = source.strangers
+        self.report = source.report
         self._stream = stream
         self._name = name
         self._source = source
@@ -121,7 +121,7 @@ class StreamLink:
         if self._stream:
             self._drop()
         if self._connected:
-            self.strangers.tell(RENEWED)
+            self.report.tell(RENEWED)
         self._stream, self._connected = stream, True
         self._empty_s = self._heard_s = clock.monotonic_s()
         self.opened += 1
@@ -136,7 +136,7 @@ class StreamLink:
 
     def _break(self) -> None:
         self._drop()
-        self.strangers.tell(BROKEN)
+        self.report.tell(BROKEN)
         self._source.seek()
 
     # --- in ---

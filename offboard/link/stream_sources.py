@@ -9,7 +9,7 @@ import threading
 from collections.abc import Callable
 from contextlib import suppress
 
-from offboard.link.interface import LinkError, LinkUnavailable, Strangers
+from offboard.link.interface import LinkError, LinkReport, LinkUnavailable
 from offboard.link.stream import Stream
 from offboard.mavlink.senders import PEER_SILENT_S
 
@@ -24,7 +24,7 @@ class Redial:
     LinkError."""
 
     def __init__(self, open_stream: Callable[[], Stream]) -> None:
-        self.strangers = Strangers()
+        self.report = LinkReport()
         self._open_stream = open_stream
         self._found: list[Stream] = []  # at most one
         self._closing = threading.Event()
@@ -71,7 +71,7 @@ class Listener:
 
     def __init__(self, sock: socket.socket) -> None:
         sock.setblocking(False)
-        self.strangers = Strangers()
+        self.report = LinkReport()
         self._socket = sock
         self._host = ""  # of the vehicle, once it was found
 
@@ -85,7 +85,7 @@ class Listener:
         host, port = address[:2]
         if silent_s <= PEER_SILENT_S or self._host not in ("", host):
             client.close()
-            self.strangers.count(f"{host}:{port}", 1, "connection")
+            self.report.count(f"{host}:{port}", 1, "connection")
             return None
         return tcp_stream(client, host)
 

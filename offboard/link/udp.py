@@ -16,7 +16,7 @@ from collections.abc import Hashable
 from contextlib import suppress
 
 from offboard.link import clock
-from offboard.link.interface import Chunk, Strangers
+from offboard.link.interface import Chunk, LinkReport
 from offboard.mavlink.framing import TIMESYNC, frame_size
 from offboard.mavlink.senders import PEER_SILENT_S, same_host
 
@@ -97,7 +97,7 @@ class UdpLink:
 
     def __init__(self, listening: socket.socket | None, vehicle: socket.socket | None) -> None:
         self.opened = 0
-        self.strangers = Strangers()
+        self.report = LinkReport()
         self._listening = _Inbox(listening) if listening else None
         self._vehicle = _Inbox(vehicle) if vehicle else None
         self._place: Hashable = vehicle.getpeername() if vehicle else None
@@ -143,14 +143,14 @@ class UdpLink:
             others = [chunk for chunk in others if not same_host(chunk.peer, self._place)]
         if others:
             self._count(others, listening.dropped)
-            self.strangers.keep(chunk.data for chunk in others)
+            self.report.keep(chunk.data for chunk in others)
         return ours
 
     def _count(self, others: list[Chunk], dropped: int) -> None:
         for sender, number in _by_sender(others).items():
-            self.strangers.count(sender, number)
+            self.report.count(sender, number)
         if dropped > self._dropped:  # most of the others by far: the vehicle has its own buffer
-            self.strangers.count(_name(others[-1].peer), dropped - self._dropped)
+            self.report.count(_name(others[-1].peer), dropped - self._dropped)
             self._dropped = dropped
 
     # --- out ---

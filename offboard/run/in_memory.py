@@ -13,7 +13,7 @@ from typing import Protocol, cast
 
 from offboard.documents.errors import UserError
 from offboard.link import clock
-from offboard.link.interface import Chunk, Strangers
+from offboard.link.interface import Chunk, LinkReport
 from offboard.run.sitl import Ending
 
 GROUP = "pso_offboard.simulators"
@@ -35,7 +35,7 @@ class InMemoryLink:
     opened = 0
 
     def __init__(self, vehicle: InMemoryVehicle) -> None:
-        self.strangers = Strangers()
+        self.report = LinkReport()
         self.problem: Exception | None = None
         self._vehicle = vehicle
         self._sent: list[bytes] = []

@@ -144,10 +144,10 @@ class Loop:
         for frame in self._companion.finish_turn(clock.monotonic_s()):
             if frame not in dropped:
                 self._log.write(stamp, frame)
-        strangers = self._link.strangers
-        self._companion.strangers = strangers.total
-        self._companion.overhear(strangers.overheard())
-        for sentence in strangers.news():
+        report = self._link.report
+        self._companion.strangers = report.ignored
+        self._companion.overhear(report.overheard())
+        for sentence in report.news():
             self._companion.announce(sentence)
         self._check_log()
         self._check_supervisor()

@@ -22,7 +22,7 @@ from offboard.flight.phases import Phase
 from offboard.link import clock
 from offboard.link import log as log_module
 from offboard.link.connection import open_link
-from offboard.link.interface import Chunk, Link, LinkUnavailable, Strangers
+from offboard.link.interface import Chunk, Link, LinkReport, LinkUnavailable
 from offboard.link.log import FlightLog
 from offboard.link.stop import StopRequests
 from offboard.mavlink.counters import Counters
@@ -37,7 +37,7 @@ class Wire:
     is_stream = False
 
     def __init__(self) -> None:
-        self.strangers = Strangers()
+        self.report = LinkReport()
 
     def wait(self, timeout_s: float) -> None: ...
 
@@ -405,9 +405,10 @@ def test_a_full_stream_does_not_block_and_sends_the_newest_setpoint(
     ends: Callable[[], AbstractContextManager[tuple[Link, Callable[[], bytes]]]], count: int
 ) -> None:
     heartbeat = framed(mavlink.MAVLink_heartbeat_message(18, 8, 0, 0, 4, 3), 7)
-    with ends() as (link, read):
-        for number in range(count):
-            link.send(setpoint(number), None)
+    setpoints = [setpoint(number) for number in range(count)]
+    with ends() as (link, read):  # TCP breaks 5 s after the first byte that nobody reads
+        for each in setpoints:
+            link.send(each, None)
         link.send(heartbeat, None)
         link.send(setpoint(count), None)
         splitter, frames = FrameSplitter(True, Counters()), []

@@ -69,7 +69,7 @@ def broke(link: Link) -> bool:
     news: list[str] = []
 
     def told(_: bytes) -> bool:
-        news.extend(link.strangers.news())
+        news.extend(link.report.news())
         return BROKEN in news
 
     turns(link, told)
@@ -104,7 +104,7 @@ def test_a_tcp_peer_that_goes_and_returns_is_connected_again(
         turns(link, accepts)
         accepted[0].sendall(b"again")
         turns(link, lambda data: data == b"again")
-        assert link.strangers.news() == [RENEWED]
+        assert link.report.news() == [RENEWED]
         assert link.opened > before
         accepted[0].settimeout(LONG_S)
         # what was sent meanwhile was dropped, not queued
@@ -128,7 +128,7 @@ def test_tcpin_takes_one_client_and_the_next_one_when_it_is_silent(
 
             def busy(_: bytes) -> bool:
                 vehicle.sendall(b".")
-                return any("connection from 127.0.0.1" in each for each in link.strangers.news())
+                return any("connection from 127.0.0.1" in each for each in link.report.news())
 
             turns(link, busy)
             assert other.recv(10) == b""  # closed
@@ -199,8 +199,8 @@ def test_ipv6_addresses(kind: str, keep: Callable[[Link], Link]) -> None:
             with stranger:
                 assert isinstance(link, UdpLink)
                 stranger.sendto(b"x", ("::1", link.port))
-                turns(link, lambda _: link.strangers.total)
-            assert "1 datagram from [::1]:" in link.strangers.news()[0]
+                turns(link, lambda _: link.report.ignored)
+            assert "1 datagram from [::1]:" in link.report.news()[0]
             return
         connection = other.accept()[0] if kind == "tcp" else other
         connection.settimeout(LONG_S)

@@ -10,7 +10,7 @@ import pytest
 
 from offboard.link import clock
 from offboard.link.connection import open_link
-from offboard.link.interface import Chunk, Strangers
+from offboard.link.interface import Chunk, LinkReport
 from offboard.link.udp import LOOK_EVERY_S, UdpLink
 from offboard.mavlink.senders import PEER_SILENT_S
 
@@ -111,7 +111,7 @@ def test_other_senders_are_counted_and_neither_delay_nor_displace_the_vehicle(
     assert data(heard) == [b"v1", b"v2", b"v3"]
     assert [chunk.arrived_s for chunk in heard] == sorted(chunk.arrived_s for chunk in heard)
     looks = 0
-    while link.strangers.total < 20_001:  # the last one tells how many did not fit
+    while link.report.ignored < 20_001:  # the last one tells how many did not fit
         stranger.send(b"more")
         vehicle.send(b"v")
         time.sleep(LOOK_EVERY_S)
@@ -119,10 +119,10 @@ def test_other_senders_are_counted_and_neither_delay_nor_displace_the_vehicle(
         looks += 1
     assert looks < 300
     name = f"{LOCAL}:{stranger.place[1]}"
-    news = link.strangers.news()
+    news = link.report.news()
     assert f"1 datagram from {name}, which is not the vehicle, was ignored" in news or len(news) > 1
     assert all(name in sentence for sentence in news)
-    assert link.strangers.news() == []
+    assert link.report.news() == []
 
 
 def test_frames_reach_the_vehicle_before_and_after_it_is_followed(
@@ -218,15 +218,15 @@ def test_a_refused_datagram_does_not_cost_the_next_one() -> None:
 
 
 def test_senders_are_named_at_powers_of_ten_and_bounded_in_number() -> None:
-    strangers = Strangers()
+    report = LinkReport()
     for _ in range(100):
-        strangers.count("a:1", 1)
-    assert [sentence.split(" from")[0] for sentence in strangers.news()] == [
+        report.count("a:1", 1)
+    assert [sentence.split(" from")[0] for sentence in report.news()] == [
         "1 datagram", "10 datagrams", "100 datagrams",
     ]  # fmt: skip
-    strangers.count("b:2", 78_000)
-    assert strangers.news() == ["78,000 datagrams from b:2, which is not the vehicle, were ignored"]
+    report.count("b:2", 78_000)
+    assert report.news() == ["78,000 datagrams from b:2, which is not the vehicle, were ignored"]
     for port in range(1000):
-        strangers.count(f"c:{port}", 1)
-    assert len(strangers.news()) == 6 + 3  # six more names, then 1, 10 and 100 others
-    assert strangers.total == 100 + 78_000 + 1000
+        report.count(f"c:{port}", 1)
+    assert len(report.news()) == 6 + 3  # six more names, then 1, 10 and 100 others
+    assert report.ignored == 100 + 78_000 + 1000
