@@ -15,7 +15,7 @@ from typing import Protocol, runtime_checkable
 from offboard.documents.parameters import Parameters
 from offboard.model.command import Command, PositionCommand
 from offboard.model.predicted_state import PredictedState
-from offboard.model.vehicle import Vehicle
+from offboard.model.vehicle import DelayUncertainty, Vehicle
 from offboard.reference.base import Reference
 
 
@@ -145,16 +145,16 @@ class Adopting(Protocol):
     """A controller that can continue with the constants identified in flight. Optional."""
 
     @property
-    def bandwidth_radps(self) -> float:
+    def configured_radps(self) -> float:
         """The configured bandwidth, rad/s."""
         ...
 
-    def adopt(
-        self, vehicle: Vehicle, bandwidth_limit_radps: float = ..., *, gains: bool = ...
-    ) -> None:
-        """Use `vehicle` from the next decision on, at no more than `bandwidth_limit_radps`.
+    @property
+    def bandwidth_radps(self) -> float:
+        """The bandwidth in use, rad/s: at most the configured one."""
+        ...
 
-        With `gains` False only the feed-forward changes. The flight changes the vehicle in small
-        steps at successive ticks, and to compute the gains at each of them would take too long.
-        """
+    def adopt(self, vehicle: Vehicle, uncertainty: DelayUncertainty) -> None:
+        """Use `vehicle` from the next decision on, at no more than the bandwidth that its delays
+        and their `uncertainty` support (`control.bandwidth`). Called when a setpoint has left."""
         ...

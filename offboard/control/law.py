@@ -29,13 +29,13 @@ sum over N decisions; `pid` replaces K by the gains of two cascades. Knows no au
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
-from typing import Annotated
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
+from offboard.control.bandwidth import supported_bandwidth
 from offboard.control.base import (
     Certificate,
     ControllerSettings,
@@ -55,8 +55,8 @@ from offboard.model.axes import lead
 from offboard.model.command import Command
 from offboard.model.frames import wrap_pi
 from offboard.model.predicted_state import PredictedHeave, PredictedState
-from offboard.model.vehicle import Vehicle
-from offboard.reference.base import FlatSample, Reference
+from offboard.model.vehicle import DelayUncertainty, Vehicle
+from offboard.reference.base import Reference
 from offboard.reference.flatness import flat_state
 
 Array = NDArray[np.float64]
@@ -70,7 +70,7 @@ class TrackingSettings(ControllerSettings):
     1 / wc^4 on the vertical thrust.
 
     On PX4 and ArduCopter the error falls quickly up to 5 rad/s and slowly beyond. More than 5 rad/s
-    needs a known delay: until it is identified in flight, `delay_margin` lowers the bandwidth.
+    needs a known delay: until it is identified in flight, `supported_bandwidth` is lower.
 
     `feedback_limit` bounds each lateral component of b_c about its feed-forward: a swing from one
     tilt limit to the other would run into the acceleration limit of the attitude loop and end in a
@@ -82,21 +82,6 @@ class TrackingSettings(ControllerSettings):
     feedback_limit: float = Field(default=0.3, gt=0, le=1)
     tilt_limit: float = Field(default=0.7, gt=0, le=0.7)
     thrust_floor: float = Field(default=0.2, ge=0, lt=1)
-
-
-def _share(value: object) -> object:
-    return float(value) if isinstance(value, bool) else value
-
-
-class OneDecisionSettings(TrackingSettings):
-    """Settings of the laws that look at a single moment of the reference.
-
-    `feedforward`, a fraction or false and true, scales the velocity and the higher derivatives of
-    the reference from which attitude and thrust are fed forward. The disturbance is always
-    compensated in full.
-    """
-
-    feedforward: Annotated[float, BeforeValidator(_share), Field(ge=0, le=1)] = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -148,41 +133,49 @@ class Task:
         return inputs
 
 
-class Tracking:
-    """Makes the `Task` of each decision, for one vehicle and one bandwidth; `adopt` sets both.
+class TrackingLaw:
+    """Base class of the laws: makes the `Task` of each decision, for the vehicle and the bandwidth
+    in use, which `adopt` sets.
 
-    `vehicle` is the vehicle in use; `lateral` and `vertical` are the models of its axes with the
-    optimal cost that follows one held input.
+    `limits` are the settings, `vehicle` is the vehicle in use; `lateral` and `vertical` are the
+    models of its axes with the optimal cost that follows one held input.
     """
 
-    def __init__(
-        self,
-        vehicle: Vehicle,
-        settings: TrackingSettings,
-        period_s: float,
-        feedforward: float = 1.0,
-    ) -> None:
-        self.settings = settings
+    def __init__(self, vehicle: Vehicle, settings: TrackingSettings, period_s: float) -> None:
         self.period_s = period_s
-        self._feedforward = feedforward
+        self.configured_radps = self.bandwidth_radps = settings.bandwidth_radps
+        self.limits, self._file = settings, vehicle
+        self._delays: object = None  # and their uncertainty, that the bandwidth was found for
         self.adopt(vehicle)
 
-    def adopt(
-        self, vehicle: Vehicle, bandwidth_limit_radps: float = math.inf, *, gains: bool = True
-    ) -> None:
-        """See `base.Adopting.adopt`."""
+    def reset(self) -> None:
+        """Return to the vehicle file and the configured bandwidth."""
+        self.adopt(self._file)
+
+    def adopt(self, vehicle: Vehicle, uncertainty: DelayUncertainty | None = None) -> None:
+        """See `base.Adopting.adopt`; without an uncertainty the bandwidth is the configured one."""
         self.vehicle = vehicle
         self._tilt_ripple = tilt_ripple(vehicle, self.period_s)
         self._thrust_ripple = thrust_ripple(vehicle, self.period_s)
-        if gains:
-            bandwidth = min(self.settings.bandwidth_radps, bandwidth_limit_radps)
-            self.lateral = lateral_gain(vehicle, bandwidth, self.period_s)
-            self.vertical = vertical_gain(vehicle, bandwidth, self.period_s)
+        delays = vehicle.tilt, vehicle.thrust_delay_s, vehicle.thrust_lag_s, uncertainty
+        bandwidth = self.bandwidth_radps
+        if uncertainty is None:
+            bandwidth = self.configured_radps
+        elif delays != self._delays:  # a drag alone, adopted while it is fast, changes no bandwidth
+            configured = self.configured_radps
+            bandwidth = supported_bandwidth(vehicle, uncertainty, self.period_s, configured)
+        self._delays = delays
+        self._use_gains(bandwidth)
+
+    def _use_gains(self, bandwidth_radps: float) -> None:
+        self.bandwidth_radps = bandwidth_radps
+        self.lateral = lateral_gain(self.vehicle, bandwidth_radps, self.period_s)
+        self.vertical = vertical_gain(self.vehicle, bandwidth_radps, self.period_s)
 
     @property
     def tilt_limit(self) -> float:
         """Bound of each lateral component of b_c."""
-        return min(self.settings.tilt_limit, math.sin(self.vehicle.tilt_max_rad))
+        return min(self.limits.tilt_limit, math.sin(self.vehicle.tilt_max_rad))
 
     def task(self, situation: Situation) -> Task:
         """The task of this tick. Raises DecisionError where its cost is not finite."""
@@ -205,7 +198,7 @@ class Tracking:
         times = [state.time_s, state.time_s + half_s, heave_s, heave_s + half_s, course_s]
         sample = reference.sample(np.array(times))
         flat = flat_state(
-            _scaled(sample, self._feedforward),
+            sample,
             vehicle.gravity_mps2,
             vehicle.drag_per_mass_ps,
             state.disturbance_ned_mps2,
@@ -259,7 +252,7 @@ class Tracking:
     def _box(self, nominal: Array) -> tuple[Array, Array]:
         """Lower and upper (4,): thrust, |b_c| and |b_c - b_ff| per axis, course about its
         feed-forward. A feed-forward beyond the tilt limit counts as being at the limit."""
-        settings, vehicle, limit = self.settings, self.vehicle, self.tilt_limit
+        settings, vehicle, limit = self.limits, self.vehicle, self.tilt_limit
         centre = np.clip(nominal[1:3], -limit, limit)
         lower, upper = np.empty(4), np.empty(4)
         lower[0], upper[0] = settings.thrust_floor * vehicle.gravity_mps2, vehicle.thrust_max_mps2
@@ -267,19 +260,6 @@ class Tracking:
         upper[1:3] = np.minimum(centre + settings.feedback_limit, limit)
         lower[3], upper[3] = nominal[3] - COURSE_BOX_RAD, nominal[3] + COURSE_BOX_RAD
         return lower, upper
-
-
-def _scaled(sample: FlatSample, share: float) -> FlatSample:
-    """The sample with velocity and higher derivatives of position times `share`."""
-    if share == 1.0:
-        return sample
-    return replace(
-        sample,
-        velocity_ned_mps=share * sample.velocity_ned_mps,
-        acceleration_ned_mps2=share * sample.acceleration_ned_mps2,
-        jerk_ned_mps3=share * sample.jerk_ned_mps3,
-        snap_ned_mps4=share * sample.snap_ned_mps4,
-    )
 
 
 def deviations(state: PredictedState, target: Target) -> tuple[Array, Array]:

@@ -6,16 +6,14 @@ volume.
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
 import numpy as np
 from pydantic import Field
 
 from offboard.control.base import Certificate, Decision, DecisionError, Situation
-from offboard.control.horizon.outlook import bounds, look_ahead
-from offboard.control.horizon.quadratic import HorizonQuadratic
-from offboard.control.law import Tracking, TrackingSettings, decision
+from offboard.control.horizon.outlook import HorizonQuadratic, bounds, look_ahead
+from offboard.control.law import TrackingLaw, TrackingSettings, decision
 from offboard.control.quadratic import ExactMinimum, at_bound
 from offboard.model.vehicle import Vehicle
 
@@ -30,21 +28,18 @@ class MpcSettings(TrackingSettings):
         return MpcLaw(vehicle, self, period_s=period_s)
 
 
-class MpcLaw:
+class MpcLaw(TrackingLaw):
     """Linear model predictive control."""
 
     def __init__(self, vehicle: Vehicle, settings: MpcSettings, *, period_s: float = 0.1) -> None:
-        self.bandwidth_radps = settings.bandwidth_radps
-        self.tracking = Tracking(vehicle, settings, period_s)
-        self._vehicle = vehicle
         self._steps = settings.steps
+        super().__init__(vehicle, settings, period_s)
         self._exact = ExactMinimum(3 * self._steps)
-        self._quadratic = HorizonQuadratic(self.tracking, self._steps)
 
     def decide(self, situation: Situation) -> Decision:
-        task = self.tracking.task(situation)
-        ahead = look_ahead(self.tracking, situation, self._steps)
-        planned = self._quadratic.problem(task, bounds(ahead, task, self.tracking))
+        task = self.task(situation)
+        ahead = look_ahead(self, situation, self._steps)
+        planned = self._quadratic.problem(task, bounds(ahead, task, self))
         best = self._exact.minimise(planned)
         if not np.isfinite(best).all():
             raise DecisionError("the quadratic over the horizon has no solution")
@@ -55,12 +50,6 @@ class MpcLaw:
         inputs = task.inputs(self._quadratic.plan(best)[0])
         return decision(task.problem.clip(inputs), certificate)
 
-    def reset(self) -> None:
-        self.adopt(self._vehicle)
-
-    def adopt(
-        self, vehicle: Vehicle, bandwidth_limit_radps: float = math.inf, *, gains: bool = True
-    ) -> None:
-        self.tracking.adopt(vehicle, bandwidth_limit_radps, gains=gains)
-        if gains:
-            self._quadratic = HorizonQuadratic(self.tracking, self._steps)
+    def _use_gains(self, bandwidth_radps: float) -> None:
+        super()._use_gains(bandwidth_radps)
+        self._quadratic = HorizonQuadratic(self, self._steps)

@@ -6,7 +6,6 @@ out what the estimated disturbance leaves.
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
 import numpy as np
@@ -14,14 +13,14 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from offboard.control.base import Certificate, Decision, Situation
-from offboard.control.law import OneDecisionSettings, Tracking, decision
+from offboard.control.law import TrackingLaw, TrackingSettings, decision
 from offboard.control.quadratic import at_bound
 from offboard.model.vehicle import Vehicle
 
 Array = NDArray[np.float64]
 
 
-class PidSettings(OneDecisionSettings):
+class PidSettings(TrackingSettings):
     """Settings of the law `pid`: the gains of the two cascades, the best of a grid on the PX4-like
     vehicle.
 
@@ -44,19 +43,16 @@ class PidSettings(OneDecisionSettings):
         return PidLaw(vehicle, self, period_s=period_s)
 
 
-class PidLaw:
+class PidLaw(TrackingLaw):
     """Proportional, integral and derivative action on the position error."""
 
     def __init__(self, vehicle: Vehicle, settings: PidSettings, *, period_s: float = 0.1) -> None:
-        self.bandwidth_radps = settings.bandwidth_radps
-        self.tracking = Tracking(vehicle, settings, period_s, settings.feedforward)
-        self._vehicle = vehicle
+        super().__init__(vehicle, settings, period_s)
         self._gains = settings
-        self._slower = 1.0  # factor on the gains, for the delay
         self._integral = np.zeros(3)  # m/s^2, NED
 
     def decide(self, situation: Situation) -> Decision:
-        task, gains, slower = self.tracking.task(situation), self._gains, self._slower
+        task, gains, slower = self.task(situation), self._gains, self._slower
         lateral, vertical = task.lateral, task.vertical
         north_east_mps = lateral[1] + slower * gains.position_gain_ps * lateral[0]
         climb_mps = vertical[1] + slower * gains.height_gain_ps * vertical[0]
@@ -64,7 +60,7 @@ class PidLaw:
         asked[:2] = slower * gains.velocity_gain_ps * north_east_mps
         asked[2] = slower * gains.climb_gain_ps * climb_mps
         asked += self._integral
-        asked[:2] /= self.tracking.vehicle.gravity_mps2  # as tilt
+        asked[:2] /= self.vehicle.gravity_mps2  # as tilt
         inputs = task.inputs(asked)
         clipped = task.problem.clip(inputs)
         self._integrate(np.append(lateral[0], vertical[0]), (clipped == inputs)[[1, 2, 0]])
@@ -72,21 +68,19 @@ class PidLaw:
         return decision(clipped, Certificate(cost, at_bound=on_bound))
 
     def reset(self) -> None:
+        super().reset()
         self._integral = np.zeros(3)
-        self.adopt(self._vehicle)
 
-    def adopt(
-        self, vehicle: Vehicle, bandwidth_limit_radps: float = math.inf, *, gains: bool = True
-    ) -> None:
-        self.tracking.adopt(vehicle, bandwidth_limit_radps, gains=gains)
-        if gains:
-            self._slower = min(1.0, bandwidth_limit_radps / self.bandwidth_radps)
+    @property
+    def _slower(self) -> float:
+        """Factor on the gains, for the delay."""
+        return self.bandwidth_radps / self.configured_radps
 
     def _integrate(self, off_ned_m: Array, free: NDArray[np.bool_]) -> None:
         """Add the error of the axes whose command is not at its bound: no wind-up."""
         gains = self._gains
         rates = np.array([gains.integral_gain_ps3] * 2 + [gains.height_integral_gain_ps3])
-        step = self._slower**3 * self.tracking.period_s * rates * off_ned_m
+        step = self._slower**3 * self.period_s * rates * off_ned_m
         limit = gains.integral_limit_mps2
         self._integral = np.clip(
             np.where(free, self._integral + step, self._integral), -limit, limit

@@ -5,11 +5,12 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 
-from offboard.control.delay_margin import LEAST_MARGIN_S, SDS, needed_margin, supported_bandwidth
+from offboard.control.bandwidth import SDS, supported_bandwidth
 from offboard.doctor.link_checks import blocks, ok, wait, warn
 from offboard.doctor.observation import Observation
 from offboard.flight.preflight import FIX_3D, Finding
 from offboard.identification.uncertainty import Estimate
+from offboard.model.vehicle import DelayUncertainty
 from offboard.run.configuration import UNKNOWN_VEHICLE, FlightConfig
 
 LOW_BATTERY = 0.3
@@ -180,14 +181,8 @@ def _bandwidth(delay: Estimate, config: FlightConfig) -> Iterable[Finding]:
     wanted = getattr(config.controller, "bandwidth_radps", None)
     if wanted is None:
         return
-    vehicle = config.vehicle.later_by(delay.value)
-    possible = supported_bandwidth(
-        vehicle,
-        wanted,
-        config.period_s,
-        tilt_margin_s=needed_margin(vehicle, delay.sd),
-        thrust_margin_s=max(LEAST_MARGIN_S, SDS * delay.sd),
-    )
+    uncertainty = DelayUncertainty(SDS * delay.sd, SDS * delay.sd, link_s=delay.value)
+    possible = supported_bandwidth(config.vehicle, uncertainty, config.period_s, wanted)
     if possible < wanted:
         yield warn(
             f"with a delay of {1e3 * delay.value:.0f} +- {1e3 * delay.sd:.0f} ms the link bears a "

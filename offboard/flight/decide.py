@@ -11,7 +11,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from offboard.control.base import Adopting, Controller, Decision, Situation
-from offboard.control.delay_margin import LEAST_MARGIN_S, needed_margin, supported_bandwidth
 from offboard.estimation.observer import Observer
 from offboard.flight.gate import Refusal, Refused
 from offboard.flight.online_identification import Adoption, OnlineIdentification
@@ -29,7 +28,6 @@ from offboard.flight.state import FlightState
 from offboard.mavlink.outgoing import SolverRecord
 from offboard.model.command import Command, PositionCommand
 from offboard.model.predicted_state import PredictedState
-from offboard.model.vehicle import DelayUncertainty, Vehicle
 
 NOTICEABLE_RADPS = 0.5  # a smaller change of the bandwidth is not announced
 _FAILED, _TOO_OLD = "the controller failed", "telemetry was too old for a setpoint"
@@ -86,15 +84,13 @@ class Decider:
         self._deadline_s = deadline_s
         self._stopwatch = stopwatch
         self._unfinished: tuple[Tick, Decided] | None = None
-        self.bandwidth_radps = math.nan  # in use, of a controller that adopts
-        self._announced_radps = math.nan  # the same, as the user knows it
-        self._delays: object = None  # and their uncertainty, that it was found for
+        self._announced_radps = math.nan  # bandwidth in use, as the user knows it
 
     def begin(self) -> None:
         """Before the first decision: the vehicle is not identified yet."""
         if self._identification and isinstance(self._controller, Adopting):
-            self._hand_over(self._state.model, self._identification.uncertainty)
-            self._announced_radps = self._controller.bandwidth_radps
+            self._controller.adopt(self._state.model, self._identification.uncertainty)
+            self._announced_radps = self._controller.configured_radps
 
     def decide(self, tick: Tick) -> bool:
         """Decide, and queue the setpoint.
@@ -208,38 +204,19 @@ class Decider:
 
     def _adopt(self, time_s: float, adoption: Adoption) -> None:
         assert isinstance(self._controller, Adopting)
-        used_radps = self._hand_over(adoption.vehicle, adoption.uncertainty)
+        self._controller.adopt(adoption.vehicle, adoption.uncertainty)
         if adoption.vehicle != self._state.model:
             self._observer.adopt(adoption.vehicle)
             self._state.model = adoption.vehicle
         if adoption.record:
             record = SolverRecord(time_s, adoption.record, IDENTIFIED_ID, IDENTIFIED_NAME)
             self._outbox.send(record)
-        configured_radps = self._controller.bandwidth_radps
-        for sentence in self._with_bandwidth(adoption, used_radps, configured_radps):
+        for sentence in self._with_bandwidth(adoption, self._controller):
             self._outbox.announce(sentence)
 
-    def _hand_over(self, vehicle: Vehicle, uncertainty: DelayUncertainty) -> float:
-        """Give the controller the vehicle; returns the bandwidth that it uses now."""
-        assert isinstance(self._controller, Adopting)
-        delays = vehicle.tilt, vehicle.thrust_delay_s, vehicle.thrust_lag_s, uncertainty
-        if delays != self._delays:  # a drag alone, adopted while it is fast, changes no bandwidth
-            self._delays = delays
-            behind = vehicle.later_by(uncertainty.link_s)
-            self.bandwidth_radps = supported_bandwidth(
-                behind,
-                self._controller.bandwidth_radps,
-                self._period_s,
-                tilt_margin_s=max(needed_margin(behind, 0.0), uncertainty.tilt_s),
-                thrust_margin_s=max(LEAST_MARGIN_S, uncertainty.thrust_s),
-            )
-        self._controller.adopt(vehicle, self.bandwidth_radps)
-        return self.bandwidth_radps
-
-    def _with_bandwidth(
-        self, adoption: Adoption, used_radps: float, configured_radps: float
-    ) -> tuple[str, ...]:
+    def _with_bandwidth(self, adoption: Adoption, controller: Adopting) -> tuple[str, ...]:
         """The sentences for the user, and the bandwidth in use if it has changed noticeably."""
+        used_radps, configured_radps = controller.bandwidth_radps, controller.configured_radps
         changed_radps = abs(used_radps - self._announced_radps)
         as_configured = used_radps == configured_radps
         if not changed_radps or (changed_radps < NOTICEABLE_RADPS and not as_configured):

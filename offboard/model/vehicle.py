@@ -121,11 +121,3 @@ class DelayUncertainty:
     tilt_s: float = 0.0
     thrust_s: float = 0.0
     link_s: float = 0.0
-
-    def exceeds(self, other: DelayUncertainty) -> bool:
-        """Whether less is known of any delay than in `other`."""
-        return (
-            self.tilt_s > other.tilt_s
-            or self.thrust_s > other.thrust_s
-            or self.link_s > other.link_s
-        )

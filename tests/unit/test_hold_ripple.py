@@ -58,7 +58,7 @@ class Jerking:
 def test_the_target_ripples_as_the_staircase_does() -> None:
     """At a jerk of 1 m/s^3 b_c is a ramp of -1 / g per second, T one of -1 m/s^2 per second."""
     without_drag = PX4.model_copy(update={"drag_translation_npmps": (0.0,) * 3})
-    law = lqr(vehicle=without_drag).tracking
+    law = lqr(vehicle=without_drag)
     off = _after(held=True) - _after(held=False)
     level = at((0.0, 0.0, 0.0), 0.0)
     target = law.target(Jerking((1.0, -1.0, 0.0)), 0.0, level)

@@ -38,7 +38,7 @@ from offboard.reference.base import FlatSample
 def test_gains_are_those_flown_on_px4(
     bandwidth: float, lateral: list[float], vertical: list[float]
 ) -> None:
-    law = lqr(bandwidth).tracking
+    law = lqr(bandwidth)
     digits = [2, 3, 3, 3]
     assert [round(k, d) for k, d in zip(law.lateral.gain, digits, strict=True)] == lateral
     digits = [1, 2, 2]
@@ -49,7 +49,7 @@ def test_gains_are_those_flown_on_px4(
 def test_cost_is_the_sum_it_stands_for(vehicle: Vehicle) -> None:
     """J(u; x) against 30 s of flight in steps of 1 ms: u held for one period, then -K x; error and
     input count at each decision."""
-    law = lqr(vehicle=vehicle).tracking
+    law = lqr(vehicle=vehicle)
     rng = np.random.default_rng(4)
     pairs = [
         (lateral_model(vehicle), law.lateral, G**2 / 5.0**4),
@@ -83,33 +83,9 @@ def test_lead_inverts_the_second_order_response() -> None:
     assert commanded == pytest.approx((np.exp(s * t) / response).imag)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.5, 1.0])
-def test_feed_forward_is_of_a_share_of_the_motion(share: float) -> None:
-    """What is fed forward is that of half the path, flown in the same time; the place to be and
-    the course stay the reference's."""
-    reference, state = Lemniscate(8.0), state_of(np.random.default_rng(3), Lemniscate(8.0), 0.3)
-
-    class Smaller:
-        duration_s = reference.duration_s
-
-        def sample(self, time_s: np.ndarray) -> FlatSample:
-            whole = reference.sample(time_s)
-            moved = {name: share * getattr(whole, name) for name in FlatSample.__slots__[:5]}
-            return replace(whole, **moved)
-
-    target = lqr(feedforward=share).tracking.target(reference, 5.0, state)
-    small = lqr().tracking.target(Smaller(), 5.0, state)
-    for name in ("tilt_feedforward", "direction_ne", "direction_rate_ne_ps"):
-        assert getattr(target, name) == pytest.approx(getattr(small, name), abs=1e-12)
-    assert target.thrust_down_feedforward_mps2 == small.thrust_down_feedforward_mps2
-    sample = reference.sample(state.time_s)
-    assert target.position_ne_m == pytest.approx(sample.position_ned_m[:2])
-    assert target.velocity_ne_mps == pytest.approx(sample.velocity_ned_mps[:2])
-
-
 def test_unconstrained_minimiser_is_the_lqr_law() -> None:
     """u* = -f / h: b_c = b_ff - K [p, v, b, b'], T b_z = f_ff - Kz [z, v_z, f_z]; course led."""
-    law, rng, reference = lqr().tracking, np.random.default_rng(1), Lemniscate(15.0)
+    law, rng, reference = lqr(), np.random.default_rng(1), Lemniscate(15.0)
     for _ in range(20):
         state = state_of(rng, reference, 0.3)
         task = law.task(Situation(5.0, state, reference, LEVEL))
@@ -139,7 +115,7 @@ def test_unconstrained_minimiser_is_the_lqr_law() -> None:
 
 
 def test_cost_vanishes_on_the_reference_and_never_goes_below_zero() -> None:
-    law, rng, reference = lqr().tracking, np.random.default_rng(2), Lemniscate(15.0)
+    law, rng, reference = lqr(), np.random.default_rng(2), Lemniscate(15.0)
     for size in (0.0, 0.1, 1.0):
         state = state_of(rng, reference, size)
         task = law.task(Situation(5.0, state, reference, LEVEL))
@@ -167,7 +143,7 @@ def test_bounds_hold_and_the_feedback_is_limited(size: float, least: int, most: 
     touched, limit = 0, math.sin(PX4.tilt_max_rad)
     for _ in range(50):
         state = state_of(rng, reference, size)
-        target = law.tracking.target(reference, 5.0, state)
+        target = law.target(reference, 5.0, state)
         decision = law.decide(Situation(5.0, state, reference, LEVEL))
         tilt = np.array(decision.command.thrust_direction_ned)
         fed_forward = np.clip(target.tilt_feedforward, -limit, limit)
@@ -200,7 +176,7 @@ def test_swarm_finds_the_closed_form() -> None:
 def test_closed_form_is_no_worse_than_any_point_of_the_box() -> None:
     rng, reference = np.random.default_rng(6), Lemniscate(8.0)
     state = state_of(rng, reference, 2.0)
-    problem = lqr().tracking.task(Situation(5.0, state, reference, LEVEL)).problem
+    problem = lqr().task(Situation(5.0, state, reference, LEVEL)).problem
     anywhere = rng.uniform(problem.lower, problem.upper, (10_000, 4))
     assert problem(closed_form(problem)) <= problem(anywhere).min()
 

@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 
 from offboard.control.gains import CostToGo
 from offboard.control.horizon.outlook import Bounds, Outlook
-from offboard.control.law import Task, Tracking
-from offboard.model.axes import SHORTEST_THRUST_LAG_S, upright
+from offboard.control.law import Task, TrackingLaw
+from offboard.model.axes import SHORTEST_THRUST_LAG_S, lateral_model, upright
 
 Array = NDArray[np.float64]
 
@@ -39,7 +39,6 @@ PLANT = np.dtype(
         ("vertical_terminal", "f8", (3, 3)),
         ("vertical_gain", "f8", 3),
         ("tilt_half", "f8", (2, 3)),  # b and b' after half a hold, of [b, b', input]
-        ("nonlinear", "i8"),
         ("hold_s", "f8"),
         ("gravity_mps2", "f8"),
         # share of a thrust error that is left after half a hold and a whole one
@@ -62,33 +61,26 @@ PLANT = np.dtype(
 """Constants of one vehicle and period."""
 
 
-def plant_of(
-    tracking: Tracking,
-    *,
-    half: CostToGo,
-    nonlinear: bool,
-    speed_limit_mps: float,
-    clearance_m: float,
-) -> NDArray[np.void]:
-    """One `PLANT`; `half` is the lateral model sampled at half the period."""
-    vehicle, period_s = tracking.vehicle, tracking.period_s
+def plant_of(law: TrackingLaw, *, speed_limit_mps: float, clearance_m: float) -> NDArray[np.void]:
+    """One `PLANT`, for the vehicle and the gains of `law`."""
+    vehicle, period_s = law.vehicle, law.period_s
+    half = lateral_model(vehicle).sampled(0.5 * period_s)
     lag_s = max(vehicle.thrust_lag_s, SHORTEST_THRUST_LAG_S)
     constants = {
-        "tilt_half": np.column_stack((half.transition[2:, 2:], half.input_map[2:, 0])),
-        "nonlinear": nonlinear,
+        "tilt_half": np.column_stack((half.dynamics[2:, 2:], half.input_map[2:, 0])),
         "hold_s": period_s,
         "gravity_mps2": vehicle.gravity_mps2,
         "lag_half": math.exp(-0.5 * period_s / lag_s),
         "lag_full": math.exp(-period_s / lag_s),
-        "thrust_least_mps2": tracking.settings.thrust_floor * vehicle.gravity_mps2,
+        "thrust_least_mps2": law.limits.thrust_floor * vehicle.gravity_mps2,
         "thrust_most_mps2": vehicle.thrust_max_mps2,
         "tilt_most": math.sin(vehicle.tilt_max_rad),
         "speed_most_mps": speed_limit_mps,
         "clearance_m": clearance_m,
     }
     constants |= _pushes(vehicle.drag_per_mass_ps, period_s)
-    constants |= _axis("lateral", tracking.lateral)
-    constants |= _axis("vertical", tracking.vertical)
+    constants |= _axis("lateral", law.lateral)
+    constants |= _axis("vertical", law.vertical)
     plant = np.zeros(1, PLANT)
     for name, value in constants.items():
         plant[name] = value

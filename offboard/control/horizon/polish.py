@@ -2,8 +2,8 @@
 
 The roll-outs give the gradient of the cost and the derivatives of the states by each input, from
 which the curvature follows. Each limit and volume is a half-space with a slack variable and the
-penalty of `limits`, so that a step ends on its surface. A line search on the roll-outs takes a step
-only where it lowers the cost.
+penalty of `roll_out`, so that a step ends on its surface. A line search on the roll-outs takes a
+step only where it lowers the cost.
 """
 
 from __future__ import annotations
@@ -15,12 +15,13 @@ import daqp
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.horizon.limits import CURVATURE, SLOPE
 from offboard.control.horizon.plant import INPUTS, B, F, P, R, V, W, Z
+from offboard.control.horizon.roll_out import CURVATURE, SLOPE
 from offboard.control.horizon.search import Evaluator, Plan, Remaining, sequences
 
 Array = NDArray[np.float64]
 
+MOST_POLISH_STEPS = 8  # by then the gain is negligible, or the time is over
 DIFFERENCE = 1e-6  # of the finite differences, towards the middle of the bounds
 STRIDES = 2.0 ** -np.arange(0.0, 12.0)
 TRUSTED, LEAST_TRUSTED = 0.5, 1e-2  # trust region as a fraction of the bounds: first and least
@@ -39,14 +40,12 @@ class Ended(Enum):
     LATE = "no time is left"
 
 
-def polish(
-    evaluate: Evaluator, plan: Plan, most: int, remaining_s: Remaining
-) -> tuple[Plan, Ended]:
-    """Take at most `most` steps from `plan`. The trust region shrinks where only a part of a step
-    lowers the cost, and grows where the whole step does."""
+def polish(evaluate: Evaluator, plan: Plan, remaining_s: Remaining) -> tuple[Plan, Ended]:
+    """Take at most MOST_POLISH_STEPS steps from `plan`. The trust region shrinks where only a part
+    of a step lowers the cost, and grows where the whole step does."""
     lower, upper = evaluate.lower.T.ravel(), evaluate.upper.T.ravel()
     width, local = TRUSTED, None
-    for _ in range(most):
+    for _ in range(MOST_POLISH_STEPS):
         if remaining_s is not None and remaining_s() <= 0:
             return plan, Ended.LATE
         here = plan.inputs.T.ravel()

@@ -13,10 +13,21 @@ from functools import cache
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.horizon.keep_out import PACKED_SIZE
-from offboard.control.horizon.limits import VOLUME, excesses, limits_of, share_of
-from offboard.control.horizon.plant import INPUTS, PLANT, SCENE, STATE_SIZE, Scene
-from offboard.control.horizon.roll_out import roll_out
+from offboard.control.horizon.keep_out import CENTRE, HALF, PACKED_SIZE, RADIUS, ROUND
+from offboard.control.horizon.plant import (
+    INPUTS,
+    PLANT,
+    SCENE,
+    STATE_SIZE,
+    P,
+    Scene,
+    V,
+    W,
+    Z,
+    start_state,
+)
+from offboard.control.horizon.roll_out import VOLUME, excesses, limits_of, roll_out, share_of
+from offboard.control.law import Task
 from offboard.control.swarm import Swarm, SwarmSettings
 
 Array = NDArray[np.float64]
@@ -24,6 +35,10 @@ Remaining = Callable[[], float] | None
 
 # Places of the knots as fractions of the plan: dense at its start, which is what is commanded
 KNOT_SHARES = (0.0, 0.15, 0.4, 0.8)
+NEAR_M = 1.0  # volumes whose clearance is further from the reference need no detour
+# Axis NED and sign: a detour never passes below a volume
+SIDES = ((0, 1.0), (0, -1.0), (1, 1.0), (1, -1.0), (2, -1.0))
+ROWS = ((P, V), (P + 1, V + 1), (Z, W))  # position and velocity of each axis in a state
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,13 +79,13 @@ class Evaluator:
         self._each_step = np.eye(steps)
         self._batches: dict[int, _Batch] = {}
 
-    def prepare(self, plant: NDArray[np.void], scene: Scene, start: Array) -> None:
-        """Set the situation of the next roll-outs: one `PLANT`, the scene, and the state
-        (STATE_SIZE,) that they start from."""
+    def prepare(self, plant: NDArray[np.void], scene: Scene, task: Task) -> None:
+        """Set the situation of the next roll-outs: one `PLANT`, the scene, and the task whose
+        state they start from."""
         self.scene = scene
         self.plant[:] = plant
         scene.fill(self._record, self._volumes)
-        self._record["start"] = start
+        self._record["start"] = start_state(task, scene.ahead)
 
     @property
     def lower(self) -> Array:
@@ -199,3 +214,28 @@ def sequences(stacked: Array) -> Array:
     """Inputs (3 N, n) in the order of `HorizonQuadratic` as (N, 3, n)."""
     size, count = stacked.shape
     return stacked.reshape(INPUTS, size // INPUTS, count).transpose(1, 0, 2)
+
+
+def detours(scene: Scene, reach_m: float) -> list[Array]:
+    """Ways round the volumes that are near the reference, one past each side of each, as states
+    (N + 1, STATE_SIZE) that the closed form follows. A way need not be good, the search improves
+    it; but the search alone would not find the other side of a wide volume. `reach_m` is the
+    distance to keep from the surface of a volume."""
+    ways = []
+    places, speeds = scene.ahead.positions_ned_m[::2], scene.ahead.velocities_ned_mps[::2]
+    for volume in scene.volumes:
+        half = volume[HALF : HALF + 3] + volume[ROUND]
+        half[:2] += volume[RADIUS]
+        centre = volume[CENTRE : CENTRE + 3]
+        off = np.abs(places - centre) - half - reach_m
+        if not bool((off < NEAR_M).all(axis=1).any()):
+            continue
+        for axis, sign in SIDES:
+            way = np.zeros((len(places), STATE_SIZE))
+            beside = centre[axis] + sign * (half[axis] + reach_m)
+            past = sign * (beside - places[:, axis]) > 0.0
+            position, velocity = ROWS[axis]
+            way[past, position] = beside - places[past, axis]
+            way[past, velocity] = -speeds[past, axis]
+            ways.append(way)
+    return ways

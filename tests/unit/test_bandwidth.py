@@ -6,10 +6,10 @@ from __future__ import annotations
 import pytest
 from attitude_plant import Flight, Lemniscate, Truth, fly
 
-from offboard.control.delay_margin import needed_margin, supported_bandwidth
+from offboard.control.bandwidth import LEAST_MARGIN_S, SHARE_OF_DELAY, supported_bandwidth
 from offboard.control.lqr import LqrLaw, LqrSettings
 from offboard.estimation.observer import Noise
-from offboard.model.vehicle import AxisResponse, Vehicle
+from offboard.model.vehicle import AxisResponse, DelayUncertainty, Vehicle
 
 PX4 = Vehicle(
     name="px4",
@@ -31,12 +31,12 @@ def delayed(delay_s: float) -> Vehicle:
 
 
 def delay_margin(vehicle: Vehicle, bandwidth: float, period_s: float) -> float:
-    """The least further delay of the tilt, in steps of 10 ms, that lowers the bandwidth."""
+    """The least further delay of the tilt, in steps of 10 ms, that lowers the bandwidth; at least
+    what is always allowed for."""
 
     def suffices(extra_s: float) -> bool:
-        return bandwidth == supported_bandwidth(
-            vehicle, bandwidth, period_s, tilt_margin_s=extra_s, thrust_margin_s=0.0
-        )
+        uncertainty = DelayUncertainty(tilt_s=extra_s)
+        return bandwidth == supported_bandwidth(vehicle, uncertainty, period_s, bandwidth)
 
     return next((step / 100 for step in range(60) if not suffices(step / 100)), 0.6)
 
@@ -69,10 +69,8 @@ def test_margins_of_the_flights_on_a_real_px4():
 
 
 def supported(vehicle: Vehicle, bandwidth: float, sd_s: float, thrust_sd_s: float = 0.0) -> float:
-    return supported_bandwidth(
-        vehicle, bandwidth, 0.1,
-        tilt_margin_s=needed_margin(vehicle, sd_s), thrust_margin_s=max(0.03, 3.0 * thrust_sd_s),
-    )  # fmt: skip
+    uncertainty = DelayUncertainty(3.0 * sd_s, 3.0 * thrust_sd_s)
+    return supported_bandwidth(vehicle, uncertainty, 0.1, bandwidth)
 
 
 def test_bandwidth_is_kept_where_the_delay_bears_it():
@@ -86,7 +84,7 @@ def test_bandwidth_is_lowered_until_the_margin_suffices(delay_s, sd_s):
     vehicle = delayed(delay_s)
     lowered = supported(vehicle, 7.0, sd_s)
     assert 1.0 <= lowered < 7.0
-    needed_s = needed_margin(vehicle, sd_s)
+    needed_s = max(LEAST_MARGIN_S, SHARE_OF_DELAY * vehicle.tilt.delay_s, 3.0 * sd_s)
     assert delay_margin(vehicle, lowered, 0.1) >= needed_s - 0.01
     assert delay_margin(vehicle, lowered + 0.5, 0.1) <= needed_s + 0.02
 
