@@ -16,7 +16,6 @@ from __future__ import annotations
 import math
 from functools import lru_cache
 
-import control
 import numpy as np
 from numpy.typing import NDArray
 
@@ -134,6 +133,8 @@ def _observer(
     step_s: float,
 ) -> tuple[LinearModel, Array]:
     """The model of the observer, sampled per substep, and its correction (n, m)."""
+    import control  # takes a second: only where something is designed
+
     size = len(densities)
     flow = np.frombuffer(dynamics).reshape(size, size)
     step = LinearModel(flow, np.frombuffer(input_map).reshape(size, 1)).sampled(step_s)
