@@ -128,7 +128,7 @@ def _ended_early(flown: History) -> tuple[str, str]:
         if name in {"hold", "land", "stand down", *_LANDING_ENDS} and not regular:
             reason = event.what.partition(": ")[2]
             cause = _cause(reason)
-            if cause == "pilot" and _critical(flown, event.time_s):
+            if cause == "pilot" and _critical(flown):
                 cause = "failsafe"
             return cause, reason
     took_over = [e.what for e in flown.announcements if e.what.startswith(_TAKEN_OVER)]
@@ -146,10 +146,10 @@ def _given_back(names: list[str]) -> bool:
     return "engage" not in names and any(names[-len(end) :] == end for end in ends)
 
 
-def _critical(flown: History, time_s: float) -> bool:
-    """Whether the newest HEARTBEAT showed a failsafe or an emergency."""
-    before = flown.heartbeat[flown.heartbeat[:, 0] <= time_s]
-    return bool(len(before)) and bool(before[-1, 2] >= _CRITICAL)
+def _critical(flown: History) -> bool:
+    """Whether the newest HEARTBEAT shows a failsafe or an emergency. A flight whose vehicle was
+    taken ends with the first HEARTBEAT since."""
+    return bool(len(flown.heartbeat)) and bool(flown.heartbeat[-1, 2] >= _CRITICAL)
 
 
 def _cause(reason: str) -> str:

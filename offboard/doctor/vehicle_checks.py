@@ -234,7 +234,11 @@ def computer(seen: Observation) -> Iterable[Finding]:
         took_ms, most_ms = 1e3 * measured.decision_s, 1e3 * measured.deadline_s
         figures = f"a decision takes {took_ms:.1f} ms of {most_ms:.0f} ms"
         late = took_ms > MARGIN * most_ms and not measured.rehearsal
-        yield warn(figures, "close other programs, or plan fewer steps") if late else ok(figures)
+        yield (
+            warn(figures, "close other programs, or allow more time (deadline_s)")
+            if late
+            else ok(figures)
+        )
     if measured.overshoot_s is not None:
         figures = f"this computer wakes up at most {1e3 * measured.overshoot_s:.1f} ms late"
         hint = "close other programs; use the performance governor of the processor"

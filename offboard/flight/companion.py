@@ -181,7 +181,9 @@ class Companion:
         )
 
     def has_ended(self) -> bool:
-        return self.state.has_ended
+        """Whether the flight is over. After another has taken the vehicle, its next HEARTBEAT is
+        awaited, as the log must have what it shows; nothing is sent to it any more."""
+        return self.state.has_ended and not self.state.awaits_heartbeat
 
     @property
     def identification(self) -> OnlineIdentification | None:
@@ -348,6 +350,8 @@ class Companion:
             self._actions.request_parameters()
         if not state.has_ended and silence_s > BRIDGED_SHARE * state.limits.silence_s:
             self._bridge(silence_s)
+        if self.has_ended():
+            self._machine.name_failsafe()
 
     def _is_telemetry(self, event: Event) -> bool:
         """Whether the event ends a silence. Once position and attitude are received only they do:

@@ -21,6 +21,8 @@ from offboard.flight.transitions import next_row
 from offboard.mavlink.events import LocalPosition
 from offboard.mavlink.session import Session
 
+TAKEN = "a failsafe of the vehicle has it, as its HEARTBEAT shows"
+
 
 class PhaseMachine:
     """Changes `phase`, `began_s` and `outcome` of the state."""
@@ -62,6 +64,16 @@ class PhaseMachine:
         if fallen and state.outcome is None:
             sentence = f"the vehicle's own failsafe flew it, in {state.vehicle.mode}"
             state.outcome = Outcome(ExitCode.ABORTED, sentence + self._explanation())
+
+    def name_failsafe(self) -> None:
+        """Say that a failsafe, and no pilot, has taken the vehicle: its newest HEARTBEAT shows
+        one."""
+        state = self._state
+        if state.taken and state.vehicle.in_failsafe and state.outcome is not None:
+            sentence = TAKEN + self._explanation()
+            self._outbox.announce_once(sentence)
+            before = state.outcome
+            state.outcome = Outcome(before.exit_code, f"{before.sentence}; {sentence}")
 
     def on_reboot(self) -> None:
         """The vehicle was rebooted: this ends the flight, except while telemetry is awaited. A

@@ -26,7 +26,7 @@ class Positioning:
 
     had_fix: bool = False
     had_valid: frozenset[str] = frozenset()  # parts of the estimate
-    accuracy_m: float = 0.0
+    accuracy_m: float | None = None
     fixes_hz: float = 0.0
     reports_hz: float = 0.0
 
@@ -37,7 +37,7 @@ class Positioning:
         self.fixes_hz = rates_hz.get("GPS_RAW_INT", 0.0)
         report = vehicle.estimator
         if report is not None and vehicle.age_s(EstimatorReport) < KNOWN_S:
-            self.had_valid, self.accuracy_m = report.valid, report.accuracy_m or 0.0
+            self.had_valid, self.accuracy_m = report.valid, report.accuracy_m
             self.reports_hz = rates_hz.get(estimator, 0.0)
 
     def lost(self, vehicle: VehicleState, limits: Limits) -> str:
@@ -52,9 +52,11 @@ class Positioning:
         missing = sorted(self.had_valid - report.valid)
         if missing:
             return f"its estimator has no valid {', '.join(missing)} any more"
-        least_m = max(limits.accuracy_m, WORSE * self.accuracy_m)
-        if report.accuracy_m is not None and self.had_valid and report.accuracy_m > least_m:
-            return f"its estimated position is only accurate to {report.accuracy_m:.1f} m"
+        if self.accuracy_m is not None and self.had_valid:
+            if report.accuracy_m is None:
+                return "its estimator reports no accuracy of the position any more"
+            if report.accuracy_m > max(limits.accuracy_m, WORSE * self.accuracy_m):
+                return f"its estimated position is only accurate to {report.accuracy_m:.1f} m"
         if vehicle.age_s(EstimatorReport) > _silent_s(self.reports_hz):
             return "no report of its estimator"
         return ""

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from offboard.flight.authority import Standing
 from offboard.flight.phases import Phase
 from offboard.flight.state import FlightState
-from offboard.mavlink.events import Heartbeat, OtherSender
+from offboard.mavlink.events import OtherSender
 
 Condition = Callable[[FlightState], bool]
 Reason = str | Callable[[FlightState], str]
@@ -112,19 +112,11 @@ def why_lost(flight: FlightState) -> str:
 
 def lost_armed(flight: FlightState) -> bool:
     """A pilot has changed the mode of a vehicle that stays armed."""
-    return _shown_since_lost(flight) and flight.vehicle.armed
+    return lost(flight) and flight.shown_since_lost and flight.vehicle.armed
 
 
 def lost_disarmed(flight: FlightState) -> bool:
-    return _shown_since_lost(flight) and not flight.vehicle.armed
-
-
-def _shown_since_lost(flight: FlightState) -> bool:
-    """A HEARTBEAT has come since the vehicle was lost. PX4 leaves its landing mode when it disarms,
-    and CURRENT_MODE shows that before HEARTBEAT shows the vehicle disarmed."""
-    authority = flight.authority
-    heard_s = flight.now_s - flight.vehicle.age_s(Heartbeat)
-    return authority is not None and lost(flight) and heard_s > authority.lost_s
+    return lost(flight) and flight.shown_since_lost and not flight.vehicle.armed
 
 
 def stands(flight: FlightState, standing: Standing) -> bool:

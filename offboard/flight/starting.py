@@ -205,6 +205,16 @@ def disarmed_again(flight: FlightState) -> bool:
     return accepted and shown and since_s > ARMING_SHOWN_S
 
 
+def stop_requested_on_ground(flight: FlightState) -> bool:
+    """Every sign says that the vehicle stands there."""
+    stands = flight.vehicle.armed and not flight.contact.in_the_air
+    return stop_requested(flight) and stands and not lost(flight)
+
+
+def rises(flight: FlightState) -> bool:
+    return flight.contact.lifted_off
+
+
 def disarmed_for_good(flight: FlightState) -> bool:
     return not flight.vehicle.armed and flight.in_phase_s > DISARMED_SHOWN_S
 
@@ -331,6 +341,16 @@ def starting(before: tuple[Phase, ...]) -> tuple[Transition, ...]:
             Phase.STAND_DOWN,
             "the vehicle did not arm in {flight.in_phase_s:.0f} s",
             REFUSED,
+        ),
+        Transition(
+            (Phase.TAKEOFF,),
+            stop_requested_on_ground,
+            Phase.STAND_DOWN,
+            "{flight.stop_reason} before lift-off",
+            REFUSED,
+        ),
+        Transition(
+            (Phase.STAND_DOWN,), rises, Phase.LAND, "it lifted off as it was to disarm", ABORTED
         ),
         Transition((Phase.STAND_DOWN,), rebooted, Phase.FAILED, REBOOTED, REFUSED),
         Transition((Phase.STAND_DOWN,), silent_for_long, Phase.FAILED, no_telemetry, REFUSED),

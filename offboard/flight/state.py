@@ -31,7 +31,7 @@ from offboard.flight.touchdown import Touchdown, moved
 from offboard.flight.vehicle_clock import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.dialects.base import Dialect, Takeoff
-from offboard.mavlink.events import Landed, TimesyncReply
+from offboard.mavlink.events import Heartbeat, Landed, TimesyncReply
 from offboard.mavlink.session import Session
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
@@ -42,6 +42,7 @@ COMMANDS_KEPT = 7  # as long as an attitude may take to follow
 THRUSTS_KEPT = 40  # as long as a setpoint may be on its way, or the next ones be lost
 PREDICTIONS_KEPT = 8
 STARVED_EARLY_S = 0.3  # before the time of its failsafe: a setpoint is on its way, or was lost
+SHOWN_S = 1.2  # HEARTBEAT comes at 1 Hz
 STARVED_KNOWN_S = 3.0  # HEARTBEAT, at 1 Hz, shows the failsafe
 
 
@@ -153,7 +154,10 @@ class FlightState:
         self.phase = Phase.STANDBY if prepared and before.authority else Phase.CONNECT
         self.began_s = before.now_s
         self.pilot = PilotSwitch(
-            unclaimed=before.ends_engaged, showed_ours=before.pilot.showed_ours
+            elsewhere=before.pilot.elsewhere,
+            unclaimed=before.ends_engaged,
+            hasty=before.pilot.hasty,
+            showed_ours=before.pilot.showed_ours,
         )
 
     @property
@@ -193,6 +197,28 @@ class FlightState:
         if position is None or sample is None:
             return 0.0
         return float(np.linalg.norm(np.array(position.position_ned_m) - sample.position_ned_m))
+
+    @property
+    def taken(self) -> bool:
+        """Another has chosen the vehicle's mode, which ended the flight in the air."""
+        lost = self.authority is not None and self.authority.standing is Standing.LOST
+        return lost and self.phase is Phase.YIELDED
+
+    @property
+    def shown_since_lost(self) -> bool:
+        """A HEARTBEAT has come since the vehicle was lost: only it shows whether a failsafe took
+        it, and whether it is armed. PX4 shows the mode by CURRENT_MODE up to a second earlier, and
+        leaves its landing mode when it disarms."""
+        heard_s = self.now_s - self.vehicle.age_s(Heartbeat)
+        return self.authority is not None and heard_s > self.authority.lost_s
+
+    @property
+    def awaits_heartbeat(self) -> bool:
+        """The vehicle was taken, and no HEARTBEAT has shown since by whom. Not while it shows the
+        mode of setpoints again: that may be a pilot who wants the next flight."""
+        if not self.taken or self.engaged:
+            return False
+        return not self.shown_since_lost and self.in_phase_s < SHOWN_S
 
     @property
     def ends_engaged(self) -> bool:

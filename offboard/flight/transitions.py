@@ -58,7 +58,12 @@ def _by_phase(service: ServiceOptions | None) -> dict[Phase, tuple[Transition, .
 
 # ---------------------------------------------------------------------- its documentation
 
-_ASKED = {Phase.HAND_BACK: "hold", Phase.HOLD: "hold, then land", Phase.LAND: "land"}
+_ASKED = {
+    Phase.HAND_BACK: "hold",
+    Phase.HOLD: "hold, then land",
+    Phase.LAND: "land",
+    Phase.STAND_DOWN: "to disarm: it stands on the ground",
+}
 _PILOT, _ON_GROUND = "nothing: a pilot or a failsafe has it", "nothing: it is disarmed"
 _UNASKED: dict[Condition, str] = {
     lost: _PILOT,

@@ -122,7 +122,9 @@ class EstimatorReport:
     position_ok: bool  # horizontal, relative to the origin
     height_ok: bool
     ratios: tuple[tuple[str, float], ...]
-    accuracy_m: float | None = None  # horizontal, one standard deviation; None on ArduPilot
+    accuracy_m: float | None = (
+        None  # horizontal, one standard deviation; None: not reported, or not finite
+    )
 
     @property
     def valid(self) -> frozenset[str]:

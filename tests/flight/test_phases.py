@@ -116,6 +116,18 @@ def _lift_off(flight: FlightState) -> None:
         position(flight, -0.3 - 0.01 * step)
 
 
+def _stop(flight: FlightState) -> None:
+    flight.stop_reason = "stop requested"
+    if flight.phase is Phase.TAKEOFF:
+        hear(flight, Landed("in_air"))
+
+
+def _rest(flight: FlightState) -> None:
+    heartbeat(flight, armed=True)
+    hear(flight, Landed("on_ground"))
+    position(flight, 0.0)
+
+
 def _track_for(seconds: float) -> Setup:
     return lambda flight: flight.plan.start_track(NOW_S - seconds)
 
@@ -166,7 +178,9 @@ EVENTS: dict[str, Setup] = {
     "out_of_reach": _set(silence_s=OUTAGE_MAX_S + 0.1),
     "silent_on_ground": _set(silence_s=20.1),
     "blind": _age_attitude,
-    "stop_requested": _set(stop_reason="stop requested"),
+    "stop_requested": _stop,
+    "stop_requested_on_ground": _all(_rest, _set(stop_reason="stop requested")),
+    "rises": _lift_off,
     "engaged_by_pilot": _all(partial(_engage, engaged=True), _fit),
     "engaged_but_unfit": partial(_engage, engaged=True),
     "started_in_the_air": _all(lift, _fit, _set(request=Request.START)),
@@ -267,7 +281,7 @@ def test_every_abnormal_end_has_an_exit_code() -> None:
             assert ways_in
             assert None not in ways_in
         if row.exit_code == ExitCode.REFUSED:
-            assert not IN_THE_AIR & set(row.phases)
+            assert row.target is Phase.STAND_DOWN or not IN_THE_AIR & set(row.phases)
     assert {row.exit_code for row in rows} == {None, ExitCode.REFUSED, ExitCode.ABORTED}
 
 

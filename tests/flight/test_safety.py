@@ -7,6 +7,7 @@ both firmwares.
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from pathlib import Path
@@ -33,8 +34,11 @@ from watch import (
 )
 
 from offboard.flight.online_identification import IdentifySettings
-from offboard.flight.phases import PHASE_CODES, Action, ExitCode, Phase
+from offboard.flight.phases import PHASE_CODES, Action, ExitCode, Limits, Phase
+from offboard.flight.positioning import Positioning
 from offboard.flight.state import Outcome
+from offboard.flight.vehicle_state import VehicleState
+from offboard.mavlink.events import EstimatorReport
 from simulator.config import Scenario
 from simulator.firmware.px4 import PX4
 
@@ -313,16 +317,27 @@ def test_the_volume_is_kept(limits: dict[str, float], says: str, fly: Fly) -> No
     assert not pair.instance.autopilot.commander.armed
 
 
-@BOTH
-def test_an_empty_battery_ends_the_flight(fly: Fly) -> None:
-    """ArduCopter without a battery failsafe is landed; PX4's own failsafe is not overridden."""
-    pair = fly(scenario="empty_battery")
+RETURNS = {"BATT_LOW_MAH": 1000.0, "BATT_LOW_TIMER": 1.0, "BATT_FS_LOW_ACT": 2.0}
+
+
+@pytest.mark.parametrize(
+    ("on", "then"), [("px4", "AUTO.LOITER"), ("ardupilot", "RTL"), ("ardupilot", "")]
+)
+def test_an_empty_battery_ends_the_flight(on: str, then: str, tmp_path: Path) -> None:
+    """ArduCopter without a battery failsafe is landed; the vehicle's own failsafe has it, and is
+    named, though on PX4 the HEARTBEAT that shows it comes after CURRENT_MODE."""
+    pair = {"px4": make, "ardupilot": on_arducopter}[on](scenario="empty_battery")
+    if on == "ardupilot" and then:
+        for name, value in RETURNS.items():
+            pair.instance.autopilot.parameters.set(name, value)
     watch = watched(pair)
-    outcome = pair.fly()
+    outcome, engages = pair.fly(), engage_mode(pair)
     assert outcome.exit_code == ExitCode.ABORTED
-    if engage_mode(pair) == "OFFBOARD":
-        assert outcome.sentence.startswith("the vehicle left OFFBOARD for AUTO.")
-        assert sent_after(pair, watch.left_s("OFFBOARD") + REACTION_S) == []
+    if then:
+        assert outcome.sentence.startswith(f"the vehicle left {engages} for {then}")
+        assert "; a failsafe of the vehicle has it" in outcome.sentence
+        assert sent_after(pair, watch.left_s(engages) + REACTION_S) == []
+        assert pair.score(tmp_path).ended_by == "failsafe"
     else:
         assert outcome.sentence.startswith("the battery holds 5 %")
         assert not pair.instance.autopilot.commander.armed
@@ -412,6 +427,23 @@ SILENT_GPS = {
 }  # fmt: skip
 ON_PX4, ON_ARDUCOPTER = partial(make, HIGH, firmware=PX4), partial(on_arducopter, HIGH)
 ONLY_ESTIMATOR = partial(ON_PX4, limits={"gps_s": 600.0})
+
+
+def test_an_accuracy_that_is_not_reported_any_more_is_lost() -> None:
+    """PX4 reports NaN. One that was never reported is not missed."""
+    vehicle, valid = VehicleState(), EstimatorReport(True, True, True, True, (), 0.5)
+    unknown = replace(valid, accuracy_m=None)
+    for began, now, says in (
+        (valid, valid, ""),
+        (valid, replace(valid, accuracy_m=9.0), "its estimated position is only accurate to 9.0 m"),
+        (valid, unknown, "its estimator reports no accuracy of the position any more"),
+        (unknown, unknown, ""),
+    ):
+        positioning = Positioning()
+        vehicle.update(began, 1.0)
+        positioning.begin(vehicle, {}, "ESTIMATOR_STATUS")
+        vehicle.update(now, 2.0)
+        assert positioning.lost(vehicle, Limits()) == says
 
 
 @pytest.mark.parametrize(

@@ -44,7 +44,7 @@ from faults import (
 from pair import Pair, calm_hover, decode, hover, in_phase, make
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from offboard.flight.phases import BEFORE_FLIGHT, Phase
+from offboard.flight.phases import Phase
 
 SET_MODE, LAND, ARM_DISARM = 176, 21, 400
 FLOWN = "flown and landed"
@@ -178,11 +178,15 @@ def bridged(pair: Pair) -> Checks:
 
 
 def stayed_down(pair: Pair) -> Checks:
-    """Stopped before lift-off: no setpoint asks for more thrust than there was."""
-    yield from landed(pair)
+    """Stopped before lift-off: disarmed at once, and no setpoint asks for more thrust."""
+    yield not pair.instance.autopilot.commander.armed
+    yield pair.commands(LAND) == []
+    yield [each.param1 for each in pair.commands(ARM_DISARM)] == [1.0, 0.0]
     reached = [s.thrust for _, phase, s in pair.setpoints if phase is Phase.TAKEOFF][-1]
-    yield reached < 0.3
-    yield all(s.thrust <= reached for _, phase, s in pair.setpoints if phase is Phase.LAND)
+    yield 0.0 < reached < 0.3
+    yield all(s.thrust == 0.0 for _, phase, s in pair.setpoints if phase is Phase.STAND_DOWN)
+    began_s = next(at_s for at_s, phase in pair.phases if phase is Phase.STAND_DOWN)
+    yield pair.time_s - began_s < 2.5
 
 
 def landed_by_failsafe(pair: Pair) -> Checks:
@@ -248,7 +252,7 @@ def silent_vehicle() -> Pair:
 
 def stopped(phase: Phase, for_s: float, end: Phase, checks: Callable[[Pair], Checks]) -> Row:
     flight = lambda: hover(at=[(in_phase(phase, for_s), stop)])  # noqa: E731
-    code = 3 if phase in BEFORE_FLIGHT else 4
+    code = 3 if end is Phase.FAILED else 4
     says = "stop requested by the operator"
     return Row(f"stop in {phase.value}", flight, code, says, end, checks)
 
@@ -291,7 +295,7 @@ ROWS = (
         Phase.FAILED,
         lambda pair: iter([pair.instance.autopilot.commander.armed]),
     ),
-    stopped(Phase.TAKEOFF, 0.3, Phase.DISARMED, stayed_down),
+    stopped(Phase.TAKEOFF, 0.3, Phase.FAILED, stayed_down),
     stopped(Phase.TAKEOFF, 1.5, Phase.DISARMED, landed),
     stopped(Phase.CLIMB, 0.5, Phase.DISARMED, landed),
     stopped(Phase.TRACK, 1.0, Phase.DISARMED, landed),

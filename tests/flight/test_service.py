@@ -229,7 +229,7 @@ def test_engaged_again_before_a_heartbeat_has_shown_the_other_mode() -> None:
     pair.run(2.0)
     pair.until(lambda: pair.time_s % 1.0 < 0.05)
     pair.switch("pilot")
-    pair.until(lambda: pair.phase is Phase.STANDBY, 0.3)
+    pair.until(lambda: pair.phase is Phase.YIELDED, 0.3)
     pair.switch("engage")
     pair.until(lambda: pair.mode == "OFFBOARD", 0.1)
     assert not pair.state.pilot.elsewhere
