@@ -69,8 +69,12 @@ def test_any_bytes(portions: list[bytes], stream: bool, autopilot: int) -> None:
         check(session)
 
 
-@given(st.binary(max_size=255), st.sampled_from(sorted(mavlink.mavlink_map)), st.booleans())
-@settings(max_examples=500, deadline=None, derandomize=True)
+DECODED = [0, 1, 2, 22, 24, 31, 32, 75, 76, 77, 83, 111, 148, 193, 230, 245, 253]
+IDS = st.sampled_from(DECODED) | st.sampled_from(sorted(mavlink.mavlink_map))
+
+
+@given(st.binary(max_size=255), IDS, st.booleans())
+@settings(max_examples=2000, deadline=None, derandomize=True)
 def test_any_payload_with_a_correct_checksum(payload: bytes, message_id: int, px4: bool) -> None:
     """Any length: a shorter payload is padded, a longer one belongs to a later MAVLink version."""
     session = pinned(Sender(), PX4 if px4 else ARDUPILOT)
@@ -81,28 +85,10 @@ def test_any_payload_with_a_correct_checksum(payload: bytes, message_id: int, px
     crc.accumulate(bytes([mavlink.mavlink_map[message_id].crc_extra]))
     frame = b"\xfd" + body + payload + struct.pack("<H", crc.crc)
     reception = session.receive(frame, PEER, 0.0)
-    assert reception.frames == (frame,)
+    logged = message_id != 256  # SETUP_SIGNING, which holds a key
+    assert reception.frames == ((frame,) if logged else ())
     check_events(reception)
     check(session)
-
-
-WANTED = [0, 1, 22, 31, 32, 77, 111, 245, 253]
-
-
-@pytest.mark.parametrize("message_id", WANTED)
-def test_random_payloads_of_decoded_messages(message_id: int) -> None:
-    generator = np.random.default_rng(message_id)
-    size = mavlink.mavlink_map[message_id].unpacker.size
-    session = pinned(Sender(), PX4)
-    for _ in range(300):
-        payload = generator.bytes(size)
-        body = struct.pack("<BBBBBBHB", size, 0, 0, 7, 1, 1, message_id, 0)
-        crc = mavlink.x25crc(body + payload)
-        crc.accumulate(bytes([mavlink.mavlink_map[message_id].crc_extra]))
-        frame = b"\xfd" + body + payload + struct.pack("<H", crc.crc)
-        check_events(session.receive(frame, PEER, 0.0))
-    check(session)
-    assert session.counters.frames == 301
 
 
 @pytest.mark.parametrize("stream", [False, True])
