@@ -11,6 +11,7 @@ from collections import deque
 
 import numpy as np
 
+from offboard.model.axes import acceleration
 from offboard.model.vehicle import HOVER_THRUST_LIMITS, Vehicle
 
 WINDOW_S, KEPT_S = 0.5, 1.5
@@ -58,9 +59,11 @@ class HoverEstimate:
         if len(lifts) < LEAST_THRUSTS:
             return None
         gravity_mps2 = vehicle.gravity_mps2
-        acceleration_mps2 = float(np.polyfit(speeds[:, 0] - time_s, speeds[:, 1], 1)[0])
-        drag_mps2 = vehicle.drag_per_mass_ps * float(np.mean(speeds[:, 1]))
-        lift_mps2 = gravity_mps2 - acceleration_mps2 - drag_mps2
+        a_down_mps2 = float(np.polyfit(speeds[:, 0] - time_s, speeds[:, 1], 1)[0])
+        down_mps = float(np.mean(speeds[:, 1]))
+        lift_mps2 = acceleration(
+            gravity_mps2, a_down_mps2, vehicle.drag_per_mass_ps, down_mps, 0.0
+        )  # solved for the thrust
         if lift_mps2 < LEAST_LIFT * gravity_mps2:
             return None
         share = float(np.mean(lifts[:, 1])) * gravity_mps2 / lift_mps2
