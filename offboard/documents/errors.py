@@ -31,12 +31,14 @@ class DocumentError(UserError):
 
 def located(error: BaseException) -> str:
     """An exception of code from outside, such as a controller, in one sentence with file and line
-    of the mistake: of the innermost call in the folder that was called from here."""
-    calls = [call for call in traceback.extract_tb(error.__traceback__) if _is_file(call.filename)]
-    outside = [call for call in calls if not call.filename.startswith(_PACKAGE)]
-    folder = str(Path(outside[0].filename).parent) if outside else ""
-    theirs = [call for call in outside if call.filename.startswith(folder)] or calls
-    place = f" ({theirs[-1].filename}:{theirs[-1].lineno})" if theirs else ""
+    of the mistake: of the innermost call in the folder that was called from here. Reads no file."""
+    walked = traceback.walk_tb(error.__traceback__)
+    calls = [(frame.f_code.co_filename, line) for frame, line in walked]
+    calls = [(file, line) for file, line in calls if _is_file(file)]
+    outside = [(file, line) for file, line in calls if not file.startswith(_PACKAGE)]
+    folder = str(Path(outside[0][0]).parent) if outside else ""
+    theirs = [(file, line) for file, line in outside if file.startswith(folder)] or calls
+    place = " ({}:{})".format(*theirs[-1]) if theirs else ""
     return " ".join(f"{type(error).__name__}: {error}{place}".split())
 
 

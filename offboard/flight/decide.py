@@ -11,6 +11,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from offboard.control.base import Adopting, Controller, Decision, Situation
+from offboard.documents.errors import located
 from offboard.estimation.observer import Observer
 from offboard.flight.gate import Refusal, Refused
 from offboard.flight.online_identification import Adoption, OnlineIdentification
@@ -103,7 +104,7 @@ class Decider:
         try:
             decided = self._send(tick, self._decided(tick))
         except Exception as error:  # any error: the vehicle is in the air
-            self._miss(f"{type(error).__name__}: {error}", _FAILED)
+            self._miss(located(error), _FAILED)
             return False
         self._unfinished = tick, decided
         if was_old and decided.refused is Refusal.STALE:
@@ -124,7 +125,7 @@ class Decider:
         try:
             self._record(tick, decided, sent_s - tick.arrived_s)
         except Exception as error:  # the certificate is the law's
-            self._miss(f"{type(error).__name__}: {error}", _FAILED)
+            self._miss(located(error), _FAILED)
             return
         if decided.refused is None:
             self._state.missed = 0
@@ -171,7 +172,7 @@ class Decider:
                 self._adopt(tick.time_s, adoption)
         except Exception as error:  # the flight continues with the present vehicle model
             identification.give_up()
-            self._outbox.warn(f"identification stopped: {error}")
+            self._outbox.warn(f"identification stopped: {located(error)}")
 
     def _decided(self, tick: Tick) -> Decided:
         plan = self._state.plan

@@ -55,10 +55,7 @@ class FlightLog:
     def __enter__(self) -> FlightLog:
         try:
             self.directory.mkdir(parents=True, exist_ok=True)
-            # appended to, since another process may continue the log
-            flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND
-            self.descriptor = os.open(self.path, flags, 0o666)
-            self._write_configuration()
+            self._open()
         except FileExistsError as error:
             raise self._taken(Path(error.filename).name) from None
         except OSError as error:
@@ -66,11 +63,13 @@ class FlightLog:
         self._writer = BackgroundWriter[bytes](self._append, QUEUED_MAX, waits=not self._real_time)
         return self
 
-    def _write_configuration(self) -> None:
+    def _open(self) -> None:
+        # appended to, since another process may continue the log
+        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND
+        self.descriptor = os.open(self.path, flags, 0o666)
         try:
-            text = self.configuration
             with (self.directory / "flight.yaml").open("x", encoding="utf-8") as file:
-                file.write(text)
+                file.write(self.configuration)
         except OSError:
             os.close(self.descriptor)
             self.path.unlink()  # the empty log of a flight that does not begin
@@ -103,7 +102,10 @@ class FlightLog:
         self._closed = True
         self._writer.close(CLOSE_S)
         if self._writer.is_free():  # else the descriptor is still in use
-            os.close(self.descriptor)
+            self._close_file()
+
+    def _close_file(self) -> None:
+        os.close(self.descriptor)
 
     @property
     def problem(self) -> str:

@@ -22,7 +22,7 @@ from pathlib import Path
 from offboard.flight import manifest
 from offboard.link import clock
 from offboard.link.background import BackgroundWriter
-from offboard.link.log import CLOSE_S, QUEUED_MAX, LogError, append, entry
+from offboard.link.log import CLOSE_S, QUEUED_MAX, FlightLog, LogError, append, entry
 from offboard.mavlink.session import Session
 from offboard.report.background import begin
 
@@ -82,51 +82,32 @@ class RollingLog:
                 os.close(descriptor)
 
 
-class FlightRecord:
-    """The directory of one flight; the writing thread makes it when it has the first frames."""
+class FlightRecord(FlightLog):
+    """The log of one flight of `vehicle`. The writing thread makes its directory when it has the
+    first entries: the loop waits for no disk."""
 
     def __init__(self, directory: Path, configuration: str, vehicle: str) -> None:
-        self.directory = directory
+        super().__init__(directory, configuration, real_time=True)
         self.vehicle = vehicle
-        self._configuration = configuration
-        self.descriptor: int | None = None
+        self.opened = False
         self._writer = BackgroundWriter[bytes](self._append, QUEUED_MAX)
 
-    def write(self, record: bytes) -> None:
+    def put(self, record: bytes) -> None:
+        """Queue an entry."""
         self._writer.put(record)
 
-    def _append(self, records: list[bytes]) -> None:
-        if self.descriptor is None:
-            self.descriptor = self._open()
-        append(self.descriptor, records)
+    def _append(self, entries: list[bytes]) -> None:
+        if not self.opened:
+            self.directory.mkdir(parents=True)
+            (self.directory / ENGAGED).write_text(self.vehicle, encoding="utf-8")
+            (self.directory / UNSCORED).touch()
+            self._open()
+            self.opened = True
+        super()._append(entries)
 
-    def _open(self) -> int:
-        self.directory.mkdir(parents=True)
-        (self.directory / "flight.yaml").write_text(self._configuration, encoding="utf-8")
-        (self.directory / ENGAGED).write_text(self.vehicle, encoding="utf-8")
-        (self.directory / UNSCORED).touch()
-        # appended to, since another process may continue the log
-        flags = os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_APPEND
-        return os.open(self.directory / "flight.tlog", flags, 0o666)
-
-    @property
-    def lost(self) -> int:
-        return self._writer.dropped
-
-    @property
-    def problem(self) -> str:
-        """What of the log is lost, and why; empty if nothing is."""
-        error = self._writer.error
-        if error is None and not self.lost:
-            return ""
-        reason = (getattr(error, "strerror", None) or error) if error else "the disk is too slow"
-        return f"the log {self.directory / 'flight.tlog'} cannot be written ({reason})"
-
-    def close(self) -> None:
-        """Write what is queued, for a bounded time."""
-        self._writer.close(CLOSE_S)
-        if self._writer.is_free() and self.descriptor is not None:
-            os.close(self.descriptor)
+    def _close_file(self) -> None:
+        if self.opened:
+            super()._close_file()
 
 
 def score(directory: Path, closing: threading.Event, *, report: bool = False) -> None:
@@ -175,8 +156,8 @@ class Recorder:
     @property
     def descriptor(self) -> int:
         """The file that is written now."""
-        flight = self._flight.descriptor if self._flight else None
-        return self._rolling.descriptor if flight is None else flight
+        flight = self._flight
+        return flight.descriptor if flight and flight.opened else self._rolling.descriptor
 
     @property
     def problem(self) -> str:
@@ -191,7 +172,7 @@ class Recorder:
         """Queue one frame and its Unix time."""
         record = entry(unix_us, frame)
         if self._flight:
-            self._flight.write(record)
+            self._flight.put(record)
             return
         self._rolling.write(record)
         self._before.append((unix_us, record))
@@ -219,13 +200,13 @@ class Recorder:
         assert session.vehicle is not None
         found = manifest.vehicle_record(session.vehicle)
         for piece in (*manifest.pieces(configuration), found):
-            flight.write(entry(now_us, session.encode(piece)))
+            flight.write(now_us, session.encode(piece))
         earlier = {record for _, record in self._before}
         for record in self._once.values():
             if record not in earlier:
-                flight.write(record)
+                flight.put(record)
         for _, record in self._before:
-            flight.write(record)
+            flight.put(record)
         self._before.clear()
         return str(directory)
 
@@ -257,7 +238,7 @@ class Recorder:
 
     def _finish(self, flight: FlightRecord) -> None:
         flight.close()
-        if flight.descriptor is not None:
+        if flight.opened:
             self._scorer.submit(self._score_one, flight.directory)
 
     @property
