@@ -24,7 +24,9 @@ def export(
     vehicle_time: Annotated[
         bool,
         typer.Option(
-            "--vehicle-time", help="mcap: seconds since the vehicle's start, not Unix time."
+            "--vehicle-time",
+            help="mcap: seconds since the vehicle's start, not Unix time; always of a lockstep "
+            "flight.",
         ),
     ] = False,
 ) -> None:
@@ -45,7 +47,7 @@ def export(
     check_new(output, "-o")
     found = read(flight)
     if to is Format.MCAP:
-        write_mcap(found, output, vehicle_time=vehicle_time)
+        write_mcap(found, output, vehicle_time=vehicle_time or not found.in_real_time)
     else:
         write = {Format.CSV: write_csv, Format.ULOG: write_ulog}[to]
         write(found, output)

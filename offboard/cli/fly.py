@@ -27,7 +27,7 @@ from offboard.cli.shared import (
     with_flight_options,
     write,
 )
-from offboard.documents.arguments import FOXGLOVE, LIVE_PAGE
+from offboard.documents.arguments import LIVE_PAGE
 from offboard.documents.command_line import INTERRUPT, drop_output, explained
 
 if TYPE_CHECKING:
@@ -61,10 +61,6 @@ def fly(
         str | None,
         option("[HOST:PORT]", f"Show the flight on a page.  [without a value: {LIVE_PAGE}]"),
     ] = None,
-    foxglove: Annotated[
-        str | None,
-        option("[HOST:PORT]", f"Serve Foxglove and Lichtblick.  [without a value: {FOXGLOVE}]"),
-    ] = None,
     json_lines: Annotated[
         bool,
         typer.Option("--json-lines", help="One JSON object a line on stdout, for machines."),
@@ -94,7 +90,7 @@ def fly(
         with (
             StopRequests(_exit_at_once) as stops,
             SimulatorProcess() if sitl else nullcontext() as simulator,  # loads in the background
-            closing(_displays(live, foxglove, json_lines=json_lines)) as displays,
+            closing(_displays(live, json_lines=json_lines)) as displays,
         ):
             from offboard.compiled import loading
 
@@ -144,19 +140,14 @@ def _exit_at_once() -> None:
     os._exit(INTERRUPT)
 
 
-def _displays(live: str | None, foxglove: str | None, *, json_lines: bool) -> Displays:
-    """What shows the flight: lines, and servers at the addresses `live` and `foxglove`."""
+def _displays(live: str | None, *, json_lines: bool) -> Displays:
+    """What shows the flight: lines, and a server of the page at the address `live`."""
     from offboard.live.displays import Displays
     from offboard.live.lines import JsonLines, Terminal
     from offboard.live.process import SERVER, LiveProcess
 
     lines = JsonLines(write) if json_lines else Terminal(out, partial(say, indent=12))
-    servers = (
-        (SERVER, "--live", live),
-        ("offboard.live.foxglove_server", "--foxglove", foxglove),
-    )
-    pages = [LiveProcess(module, name, address) for module, name, address in servers if address]
-    return Displays(lines, pages)
+    return Displays(lines, [LiveProcess(SERVER, "--live", live)] if live else [])
 
 
 def _conclude(

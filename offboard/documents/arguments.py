@@ -11,9 +11,9 @@ from typer.core import TyperCommand
 from offboard.documents.command_line import INTERRUPT, INTERRUPTED, interrupts_raise
 from offboard.documents.errors import UserError, shown
 
-LIVE_PAGE, FOXGLOVE = "127.0.0.1:8014", "127.0.0.1:8765"
+LIVE_PAGE = "127.0.0.1:8014"
 # options whose value may be omitted, and what they then have
-OPTIONAL_VALUES = {"--live": LIVE_PAGE, "--foxglove": FOXGLOVE}
+OPTIONAL_VALUES = {"--live": LIVE_PAGE}
 PORT_MAX = 65535
 LOCAL = "127.0.0.1"
 _ADDRESS = re.compile(r"(?:\[([0-9A-Fa-f:.]+)\]|([^:\[\]]*)):(\d{1,9})", re.ASCII)

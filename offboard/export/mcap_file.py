@@ -14,13 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from offboard.analysis.scene import BODY, COLOURS, LINE_M, MAP
 from offboard.export.extra import library
 from offboard.export.series import Array, Flight, Series
 from offboard.link.new_file import new_file
 from offboard.model.frames import enu, flu_in_enu
 
 KIND = "mcap"
+MAP, BODY = "map", "base_link"  # frames: east, north, up; and forward, left, up
+LINE_M = 0.02  # thickness of a path
+COLOURS = {"flown": (0.12, 0.47, 0.71, 1.0), "reference": (1.0, 0.5, 0.05, 1.0)}  # by path, RGBA
 Stamped = tuple[int, str, Any]  # time in ns, topic, protobuf message or dict
 Stamps = Callable[[Array], list[int]]  # vehicle times in s to stamps of the file in ns
 

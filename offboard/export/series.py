@@ -48,6 +48,7 @@ _COLUMNS = {
     "decision": tuple(f"decision_{name}" for name in FIELDS),
     "heartbeat": ("armed", "system_status"),
 }
+LOCKSTEP_SHARE = 0.05  # of the vehicle's time, by which a flight in real time differs at most
 _AUTOPILOTS = {"px4": "PX4", "ardupilot": "ArduPilot"}  # as MAV_AUTOPILOT names them
 
 
@@ -74,6 +75,12 @@ class Flight:
     unix: Array
     autopilot: str
     damage: str
+
+    @property
+    def in_real_time(self) -> bool:
+        """Whether vehicle time and Unix time passed alike: not so in lockstep."""
+        vehicle_s, unix_s = np.ptp(self.unix, axis=0).tolist()
+        return bool(abs(unix_s - vehicle_s) <= LOCKSTEP_SHARE * vehicle_s)
 
     def unix_s(self, time_s: Array | float) -> Array:
         """Unix time at which telemetry with this vehicle time was recorded."""

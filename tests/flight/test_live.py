@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import asyncio
 import io
 import json
 import os
 import re
 import signal
 import socket
-import struct
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
@@ -20,14 +18,10 @@ from typing import Any
 from urllib.parse import urlsplit
 from urllib.request import urlopen
 
-import aiohttp
-import numpy as np
 import pytest
 from browser import opening
-from foxglove_viewer import PROTOCOL, viewing
 from pair import Pair, hover
 from rich.console import Console
-from scipy.spatial.transform import Rotation
 
 from offboard.documents.errors import UserError
 from offboard.live.displays import Displays
@@ -238,132 +232,3 @@ def test_a_status_leaves_out_what_is_not_known() -> None:
     assert status(now).strip() == "0.00 s  connect  unknown"
     later = replace(now, phase="track", position_error_m=12.3456, rung="hold", rung_reason="link")
     assert status(later).strip() == "0.00 s  track  error 12.346 m  unknown  hold: link"
-
-
-@contextmanager
-def serving_viewers() -> Iterator[tuple[LiveProcess, str]]:
-    process = LiveProcess("offboard.live.foxglove_server", "--foxglove", "127.0.0.1:0")
-    with closing(process):
-        yield process, process.await_ready()
-    assert process.lost == ""
-
-
-def sometimes(process: LiveProcess) -> Callable[[Any], None]:
-    """Shows every 40th step, 0.16 s of the flight: all fit into the queue."""
-    steps = count()
-    return lambda companion: next(steps) % 40 or process.show(companion)
-
-
-def test_a_foxglove_viewer_decodes_the_whole_flight_in_east_north_up(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr("offboard.live.process.PERIOD_S", 0.0)
-    monkeypatch.setattr("offboard.live.process.QUEUED_MAX", 1000)
-    began_ns = time.time_ns()
-    with serving_viewers() as (process, url), viewing(url) as viewer:
-        pair = flown(sometimes(process))
-        process.show(pair.companion)
-        viewer.wait_for("/log", lambda entry: entry.message.startswith("disarmed"))
-        process.close()
-    received = viewer.received
-    snapshots = dict(received["/snapshot"])
-    schema = json.loads(viewer.channels["/snapshot"]["schema"])
-    assert all(set(each) == set(schema["properties"]) for each in snapshots.values())
-    assert len(snapshots) > 100
-    for topic in ("/pose", "/reference", "/tf", "/log"):
-        stamps = [stamp_ns for stamp_ns, _ in received[topic]]
-        assert stamps == [message.timestamp.ToNanoseconds() for _, message in received[topic]]
-        assert began_ns - 1e6 <= stamps[0] <= stamps[-1] <= time.time_ns()
-        assert stamps == sorted(stamps)
-        assert set(stamps) <= set(snapshots)
-    to_enu = Rotation.from_matrix([[0, 1, 0], [1, 0, 0], [0, 0, -1]])
-    to_frd = Rotation.from_euler("x", np.pi)
-    for (stamp_ns, pose), (_, frame) in zip(received["/pose"], received["/tf"], strict=True):
-        north, east, down = snapshots[stamp_ns]["position_ned_m"]
-        assert xyz(pose.pose.position) == xyz(frame.translation) == [east, north, -down]
-        w, *vector = snapshots[stamp_ns]["attitude"]
-        wanted = to_enu * Rotation.from_quat([*vector, w]) * to_frd
-        for turn in (pose.pose.orientation, frame.rotation):
-            assert (Rotation.from_quat([*xyz(turn), turn.w]) * wanted.inv()).magnitude() < 1e-6
-        assert (pose.frame_id, frame.parent_frame_id, frame.child_frame_id) == (
-            "map", "map", "base_link"
-        )  # fmt: skip
-    for stamp_ns, pose in received["/reference"]:
-        north, east, down = snapshots[stamp_ns]["reference_ned_m"]
-        assert xyz(pose.pose.position) == [east, north, -down]
-        nose = Rotation.from_quat([*xyz(pose.pose.orientation), pose.pose.orientation.w])
-        course_rad = snapshots[stamp_ns]["course_rad"]
-        towards = [np.sin(course_rad), np.cos(course_rad), 0.0]
-        assert nose.apply([1.0, 0.0, 0.0]) == pytest.approx(towards, abs=1e-6)
-    for path, poses in (("/path/flown", "/pose"), ("/path/reference", "/reference")):
-        (entity,) = received[path][-1][1].entities
-        drawn = [xyz(point) for point in entity.lines[0].points]
-        assert len(drawn) > 20
-        assert drawn == [xyz(pose.pose.position) for _, pose in received[poses]][: len(drawn)]
-        assert entity.frame_id == "map"
-    assert [entry.message for _, entry in received["/log"]] == pair.companion.announced
-
-
-def xyz(vector: Any) -> list[float]:
-    return [vector.x, vector.y, vector.z]
-
-
-def test_no_foxglove_viewer_changes_a_setpoint(undisturbed: list[bytes]) -> None:
-    """Nor does it take anything from another viewer; one that comes late has the whole path."""
-    handshake = (
-        "GET / HTTP/1.1\r\nHost: x\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-        "Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n"
-        f"Sec-WebSocket-Protocol: {PROTOCOL}\r\n\r\n"
-    ).encode()
-    subscriptions = [{"id": number, "channelId": number} for number in range(1, 8)]
-    wanted = json.dumps({"op": "subscribe", "subscriptions": subscriptions}).encode()
-    subscribe = b"\x81\xfe" + struct.pack(">HI", len(wanted), 0) + wanted  # masked with zeros
-    with serving_viewers() as (process, url):
-        address = (urlsplit(url).hostname, urlsplit(url).port)
-        deaf = socket.create_connection(address)
-        deaf.sendall(handshake + subscribe)  # and reads nothing
-        flooding = socket.create_connection(address)
-        flooding.sendall(handshake)
-        flooding.setblocking(False)
-        steps = count()
-
-        def disturb(_: object) -> None:
-            step = next(steps)
-            if step % 50 == 0:
-                with suppress(BlockingIOError, ConnectionError):
-                    flooding.send(subscribe * 100)
-            if step % 500 == 0:
-                with socket.create_connection(address) as leaving:
-                    leaving.sendall((handshake + subscribe)[: 37 * (step // 500)])
-
-        with viewing(url) as viewer:
-            pair = flown(process.show, disturb)
-            with viewing(url) as late:
-                for _ in range(10):
-                    process.show(pair.companion)
-                for each in (viewer, late):
-                    each.wait_for("/snapshot", lambda snapshot: snapshot["phase"] == "disarmed")
-                    each.wait_for("/path/flown", lambda _: True)
-                process.close()
-        deaf.close()
-        flooding.close()
-    assert pair.payloads == undisturbed
-    for each in (viewer, late):
-        (entity,) = each.received["/path/flown"][-1][1].entities
-        assert max(point.z for point in entity.lines[0].points) == pytest.approx(1.0, abs=0.1)
-
-
-def test_a_viewer_of_the_old_protocol_is_refused_and_an_ipv6_address_is_served() -> None:
-    process = LiveProcess("offboard.live.foxglove_server", "--foxglove", "[::1]:0")
-    with closing(process):
-        url = process.await_ready()
-        assert re.fullmatch(r"ws://\[::1\]:\d+", url)
-        with viewing(url):
-            with pytest.raises(aiohttp.WSServerHandshakeError, match="400"):
-                asyncio.run(refused(url))
-            process.close()
-
-
-async def refused(url: str) -> None:
-    async with aiohttp.ClientSession() as session:
-        await session.ws_connect(url, protocols=("foxglove.websocket.v1",))
