@@ -22,7 +22,7 @@ FILE = "NAME|FILE"  # the name of a shipped file, or a path
 
 GROUND_LINK = f"udpout:127.0.0.1:{GROUND_PORT}"
 LINKS = (
-    "Companion link: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT.  "
+    "Flight link: udpout:HOST:PORT, udpin:HOST:PORT or tcpin:HOST:PORT.  "
     f"[default: udpout:127.0.0.1:{COMPANION_PORT}]"
 )
 PATIENCE = (

@@ -8,8 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.analysis.history import History
-from offboard.flight.gate import Refusal
 from offboard.flight.phases import PHASE_CODES, Phase
+from offboard.flight.setpoint import Refusal
 
 Array = NDArray[np.float64]
 

@@ -12,7 +12,7 @@ from offboard.analysis.events import Event
 from offboard.analysis.history import History, gather
 from offboard.analysis.score import Score, score
 from offboard.documents.plain import plain
-from offboard.flight.companion import Outcome
+from offboard.flight.flight import Outcome
 from offboard.flight.phases import ExitCode
 from offboard.link.log import LogError
 

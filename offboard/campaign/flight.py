@@ -18,7 +18,7 @@ from offboard.campaign.cases import Case
 from offboard.campaign.margin import NOT_FLOWN, Promises, terms
 from offboard.campaign.results import Record, code_hash
 from offboard.documents.errors import UserError
-from offboard.flight.companion import Outcome
+from offboard.flight.flight import Outcome
 from offboard.flight.phases import ExitCode
 from offboard.link.log import LogError
 from offboard.link.stop import StopRequests

@@ -23,7 +23,7 @@ from offboard.campaign.results import Record
 from offboard.documents.arguments import join_address, split_address
 from offboard.documents.errors import UserError, shown
 from offboard.documents.extras import install
-from offboard.flight.companion import STOPPED
+from offboard.flight.flight import STOPPED
 from offboard.flight.phases import ExitCode
 from offboard.link.stream_sources import connect
 from offboard.run.flight import Connection, fly

@@ -33,7 +33,7 @@ from offboard.documents.command_line import INTERRUPT, drop_output, explained
 if TYPE_CHECKING:
     from offboard.analysis.requirement import Requirement
     from offboard.analysis.score import Score
-    from offboard.flight.companion import Outcome
+    from offboard.flight.flight import Outcome
     from offboard.live.displays import Displays
 
 INTERRUPTED = "interrupted before anything was sent"

@@ -1,8 +1,8 @@
-"""Inputs of the companion, recorded so that `offboard replay` can give it the same ones again.
+"""Inputs of a flight, recorded so that `offboard replay` can give it the same ones again.
 
 The log holds every frame that was received. What else a turn depends on is recorded here: its host
 time, which frames arrived together, when and from whom, each reading of the stopwatch, and what the
-loop requested. Host times are whole microseconds, rounded before the companion sees them, so that
+loop requested. Host times are whole microseconds, rounded before the flight sees them, so that
 the record is exact. In lockstep nothing depends on host time, and none is recorded.
 
 The record is a sequence of entries in TUNNEL messages of our record component. Numbers are
@@ -30,7 +30,7 @@ SETTINGS = "settings"  # the first call: how the session was set
 
 
 class InputRecorder:
-    """Records the inputs of one `Companion`; see the module. With `kept` False nothing: a flight of
+    """Records the inputs of one `Flight`; see the module. With `kept` False nothing: a flight of
     a service goes on with what was known before, which its log does not hold."""
 
     def __init__(self, settings: SessionSettings, *, kept: bool = True) -> None:
@@ -107,7 +107,7 @@ class InputRecorder:
                 self._data += _varint(len(self._readings)) + b"".join(self._readings)
 
     def call(self, name: str, *arguments: object) -> None:
-        """A method of the companion was called between two turns."""
+        """A method of the flight was called between two turns."""
         text = json.dumps([name, *arguments]).encode()
         self._data += bytes([_CALL]) + _varint(len(text)) + text
 
@@ -168,7 +168,7 @@ class TurnInput:
 
 @dataclass(frozen=True, slots=True)
 class Call:
-    """A call of the companion's method `name` between two turns."""
+    """A call of the method `name` between two turns."""
 
     name: str
     arguments: tuple[Any, ...]

@@ -1,13 +1,12 @@
 """Snapshot: what a person or a monitor wants to see of a flight at one moment.
 
 For displays outside the loop (terminal, live page, metrics): values only, safe to pass to another
-thread. `Companion.snapshot` makes one.
+thread. `Flight.snapshot` makes one.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,7 +14,6 @@ from numpy.typing import NDArray
 
 from offboard.flight.phases import TRACKING
 from offboard.flight.state import FlightState, Triple
-from offboard.model.command import Command
 
 NAN = float("nan")
 TEXTS_KEPT = 8
@@ -57,14 +55,9 @@ class Snapshot:
     flights: int = 0  # that the service has begun
 
 
-def snapshot_of(
-    state: FlightState,
-    command: Command,
-    announced: Sequence[str],
-    strangers: int,
-    forged: int = 0,
-) -> Snapshot:
+def snapshot_of(state: FlightState, strangers: int) -> Snapshot:
     """The snapshot of this moment. Changes nothing."""
+    command = state.command
     vehicle = state.vehicle
     position, attitude = vehicle.position, vehicle.attitude
     sample = state.plan.sample(position.time_s) if position and state.phase in TRACKING else None
@@ -98,8 +91,8 @@ def snapshot_of(
         computer=state.busyness.sentence,
         battery=NAN if charge is None else charge,
         strangers=strangers,
-        forged=forged,
-        texts=tuple(announced[-TEXTS_KEPT:]),
+        forged=state.session.counters.forged,
+        texts=tuple(state.announced[-TEXTS_KEPT:]),
     )
 
 

@@ -1,4 +1,5 @@
-"""Flight state: all that one flight knows. `Companion` owns it; the other modules take it.
+"""Flight state: all that one flight knows. `Flight` owns it; the functions of the other
+modules take it.
 
 Facts come in by `VehicleState`, `Authority`, `GroundContact` and `VehicleClock`, each with the
 time when it was heard. What follows from them is in `transitions` and `failsafe`.
@@ -9,11 +10,12 @@ from __future__ import annotations
 import math
 import operator
 from collections import deque
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from offboard.control.base import Controller, Decision
 from offboard.estimation.observer import Observer
 from offboard.flight.authority import Authority, Standing
 from offboard.flight.busyness import Busyness
@@ -32,12 +34,14 @@ from offboard.flight.vehicle_clock import VehicleClock
 from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.dialects.base import Dialect, Takeoff
 from offboard.mavlink.events import Heartbeat, Landed, TimesyncReply
+from offboard.mavlink.outgoing import CommandLong, Outgoing, Record
 from offboard.mavlink.session import Session
-from offboard.model.command import Command
+from offboard.model.command import Command, PositionCommand
 from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import Vehicle
 
 Triple = tuple[float, float, float]
+LEVEL = (0.0, 0.0, 1.0)  # thrust direction
 COMMANDS_KEPT = 7  # as long as an attitude may take to follow
 THRUSTS_KEPT = 40  # as long as a setpoint may be on its way, or the next ones be lost
 PREDICTIONS_KEPT = 8
@@ -67,8 +71,35 @@ KEPT = (
     "now_s",
     "host_s",
     "silence_s",
+    "heard_s",
     "guarded",
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """One control tick."""
+
+    time_s: float = 0.0  # vehicle time
+    arrived_s: float = 0.0  # host time of the arrival of the telemetry that caused it
+    missed: int = 0  # ticks skipped since the previous one
+    strangers: int = 0  # datagrams of other senders since the previous one
+    pause_s: float = 0.0  # of this process, since the previous one
+
+
+@dataclass(frozen=True, slots=True)
+class Decided:
+    """A decision, the predicted state it was made for, and what became of it."""
+
+    tick: Tick
+    phase: Phase
+    state: PredictedState
+    decision: Decision
+    solve_time_s: float
+    sent: Command | PositionCommand | None = None
+    age_s: float = 0.0  # of its telemetry, when it was checked
+    refused: int = 0  # flags of `setpoint.Refusal`
+    failure: str = ""  # why it was refused
 
 
 @dataclass(slots=True)
@@ -85,7 +116,9 @@ class Failsafe:
 @dataclass(slots=True)
 class FlightState:
     """One flight. `model` is the vehicle model in use: it scales the thrust of setpoints.
-    `identification` is None with a controller that cannot use it, `service` in a flight of `fly`.
+    `stopwatch` reads host time. `deadline_s` is the wall time that one decision may take, None
+    where the vehicle waits for each decision, so that nothing can be late or old. `identification`
+    is None with a controller that cannot use it, `service` in a flight of `fly`.
     """
 
     limits: Limits
@@ -93,6 +126,10 @@ class FlightState:
     model: Vehicle
     session: Session
     observer: Observer
+    controller: Controller
+    period_s: float
+    stopwatch: Callable[[], float]
+    deadline_s: float | None = None
     identification: OnlineIdentification | None = None
     service: ServiceOptions | None = None
     vehicle: VehicleState = field(default_factory=VehicleState)
@@ -125,16 +162,31 @@ class FlightState:
     outcome: Outcome | None = None
 
     busyness: Busyness = field(init=False)  # of this computer
+    heard_s: float = math.nan  # host time of the newest telemetry, as `Session.elapsed_s`
+    telemetry_arrived_s: float = 0.0  # host time at which it arrived
+    bridged_s: float = 0.0  # silence at the newest setpoint that needs no telemetry
+    tick: Tick = field(default_factory=Tick)  # the newest
+    command: Command = field(default_factory=lambda: Command(0.0, LEVEL, 0.0))  # in force
+    decided: Decided | None = None  # in this turn
+    announced_radps: float = math.nan  # bandwidth in use, as the user knows it
     missed: int = 0  # decisions in a row that were not sent
     failure: str = ""  # what prevented the newest of them
     commands: deque[Command] = field(default_factory=lambda: deque(maxlen=COMMANDS_KEPT))
     thrusts: deque[float] = field(default_factory=lambda: deque(maxlen=THRUSTS_KEPT))
+    announced: list[str] = field(default_factory=list)  # sentences for the user, oldest first
+    queue: list[Outgoing] = field(default_factory=list)  # to be sent
+    records: list[Record] = field(default_factory=list)  # to be logged
+    requested_s: dict[tuple[Phase, CommandLong], float] = field(default_factory=dict)
+    text_id: int = 0
+    thinned_s: float = 0.0  # when less telemetry was requested, since the phase HEALTH began
+    awaits_link: bool = False  # while landing
     follows_others: bool = False  # the newest ThrustReport is of none of `thrusts`
     predictions: deque[PredictedState] = field(
         default_factory=lambda: deque(maxlen=PREDICTIONS_KEPT)
     )
 
     def __post_init__(self) -> None:
+        self.busyness = Busyness(self.period_s)
         self.contact = GroundContact(self.vehicle)
         self.pilot.unclaimed = self.service is not None
 

@@ -1,5 +1,5 @@
 """The phase table: which condition leads from which phases to which. The first row that holds is
-taken; `phase_machine` has what begins with a phase, `actions` what is sent in it.
+taken, and begins its phase. `actions` has what is sent in a phase.
 
 `fly` goes once from the ground to the ground. A flight of the service waits in STANDBY until the
 pilot engages it in the air, and hands back instead of landing when it is stopped; the service
@@ -10,11 +10,28 @@ from __future__ import annotations
 
 from functools import cache
 
-from offboard.flight import flying, starting
-from offboard.flight.phases import ENDS, FLYING, Phase, ServiceOptions
-from offboard.flight.rows import SHOWS, Condition, Transition, lost, lost_armed
-from offboard.flight.state import FlightState
+import numpy as np
 
+from offboard.flight import decision, failsafe, flying, outbox, starting
+from offboard.flight.flying import in_own_failsafe
+from offboard.flight.hover_estimate import DIFFERENT, SETTLED, differs
+from offboard.flight.phases import (
+    BEFORE_FLIGHT,
+    ENDS,
+    FLYING,
+    WAITING,
+    ExitCode,
+    Phase,
+    ServiceOptions,
+)
+from offboard.flight.pilot_switch import PilotSwitch
+from offboard.flight.requests import Request
+from offboard.flight.rows import REBOOTED, SHOWS, Condition, Transition, lost, lost_armed, why
+from offboard.flight.state import FlightState, Outcome
+from offboard.flight.touchdown import Touchdown
+from offboard.mavlink.events import LocalPosition
+
+TAKEN = "a failsafe of the vehicle has it, as its HEARTBEAT shows"
 SERVICE_ONLY = frozenset({Phase.STANDBY, Phase.PAUSE, Phase.HAND_BACK})
 
 
@@ -54,6 +71,187 @@ def next_row(flight: FlightState) -> Transition | None:
 def _by_phase(service: ServiceOptions | None) -> dict[Phase, tuple[Transition, ...]]:
     rows = table(service)
     return {phase: tuple(row for row in rows if phase in row.phases) for phase in Phase}
+
+
+# ---------------------------------------------------------------------- its application
+
+
+def advance(flight: FlightState) -> None:
+    """Make every transition whose guard holds."""
+    flight = flight
+    while not flight.has_ended:
+        if flight.phase in FLYING:
+            failsafe.judge(flight)
+        _note_failsafe(flight)
+        row = next_row(flight)
+        if row is None:
+            break
+        _enter(flight, row, why(row.reason, flight))
+    flight.request = Request.NONE
+
+
+def _note_failsafe(flight: FlightState) -> None:
+    """A landing by the vehicle's own failsafe is awaited, but it is not ours."""
+    fallen = flight.phase is Phase.LAND and in_own_failsafe(flight)
+    if fallen and flight.outcome is None:
+        sentence = f"the vehicle's own failsafe flew it, in {flight.vehicle.mode}"
+        flight.outcome = Outcome(ExitCode.ABORTED, sentence + _explanation(flight))
+
+
+def name_failsafe(flight: FlightState) -> None:
+    """Say that a failsafe, and no pilot, has taken the vehicle: its newest HEARTBEAT shows one."""
+    before = flight.outcome
+    if flight.taken and flight.vehicle.in_failsafe and before is not None:
+        sentence = TAKEN + _explanation(flight)
+        outbox.announce_once(flight, sentence)
+        flight.outcome = Outcome(before.exit_code, f"{before.sentence}; {sentence}")
+
+
+def on_reboot(flight: FlightState) -> None:
+    """The vehicle was rebooted: this ends the flight, except while telemetry is awaited. A
+    landing goes on, but the flight is none that was flown to its end."""
+    flight.rebooted = flight.phase not in (Phase.CONNECT, Phase.HEALTH)
+    flight.pilot = PilotSwitch(unclaimed=flight.service is not None)
+    if flight.phase is Phase.LAND:
+        flight.touchdown = Touchdown(None)
+        if flight.outcome is None:
+            flight.outcome = Outcome(ExitCode.ABORTED, f"{REBOOTED} while landing")
+    advance(flight)
+
+
+def _enter(flight: FlightState, row: Transition, reason: str) -> None:
+    source = flight.phase
+    _conclude(flight, row, reason)
+    flight.vehicle.clear_messages()
+    flight.request = Request.NONE
+    flight.phase = row.target
+    flight.began_s = flight.now_s
+    outbox.announce(flight, f"{row.target.value}: {reason}", title="offboard: ")
+    if source in BEFORE_FLIGHT and row.target in FLYING:
+        flight.clock.settle()
+        dialect = flight.session.dialect
+        assert dialect is not None
+        flight.positioning.begin(flight.vehicle, flight.session.rates_hz, dialect.estimator_name)
+        if flight.identification:
+            flight.identification.on_link_delay(flight.clock.delay)
+        if source is Phase.ARM:  # on the ground the time that it takes does no harm
+            decision.begin(flight)
+    if flight.identification:
+        flight.identification.on_phase(row.target, flight.time_s)
+    if source in WAITING and row.target in FLYING and flight.authority:
+        flight.authority.ask()  # it shows the mode already
+    if row.target is Phase.ENGAGE:
+        _begin_engaging(flight)
+    elif row.target is Phase.STANDBY:
+        flight.pilot.engaged = False  # the pilot switched to one that was not ready
+    elif row.target is Phase.TAKEOFF:
+        _begin_takeoff(flight)
+    elif row.target is Phase.CLIMB:
+        _begin_climb(flight, source)
+    elif row.target is Phase.JOIN:
+        flight.plan.start_track(flight.time_s)
+    elif row.target is Phase.PAUSE:
+        flight.plan.pause(flight.time_s)
+    elif source is Phase.PAUSE and row.target is Phase.TRACK:
+        flight.plan.resume(flight.time_s)
+    elif row.target is Phase.LAND:
+        flight.touchdown = Touchdown(flight.takeoff_ned_m)
+
+
+def _conclude(flight: FlightState, row: Transition, reason: str) -> None:
+    """The most severe exit code counts; later reasons are added to the first sentence."""
+    if row.exit_code is not None:
+        if flight.outcome is None:
+            flight.outcome = Outcome(row.exit_code, reason + _explanation(flight))
+        else:
+            sentence = f"{flight.outcome.sentence}; {reason}"
+            flight.outcome = Outcome(max(flight.outcome.exit_code, row.exit_code), sentence)
+    elif row.target is Phase.DISARMED and flight.outcome is None:
+        flight.outcome = Outcome(ExitCode.FLOWN, "flown and landed")
+
+
+def _explanation(flight: FlightState) -> str:
+    dialect = flight.dialect
+    return flight.vehicle.explanation(dialect.unsaid if dialect else "")
+
+
+def _begin_engaging(flight: FlightState) -> None:
+    """Here, not with the request: a vehicle that shows the mode already passes without one."""
+    assert flight.authority is not None
+    flight.authority.ask()
+    _adopt_hover_thrust(flight)
+
+
+def _begin_takeoff(flight: FlightState) -> None:
+    position = flight.vehicle.position
+    assert position is not None
+    flight.takeoff_ned_m = flight.plan.origin_ned_m = position.position_ned_m
+    flight.home_ned_m = flight.takeoff_ned_m
+
+
+def _begin_climb(flight: FlightState, source: Phase) -> None:
+    """To the start of the reference, after the take-off, in the air, or once more."""
+    position = flight.vehicle.position
+    assert position is not None
+    flown = flight.plan.sample(flight.time_s)
+    if flown is not None:  # from where the reference is: the vehicle follows it
+        course_rad = float(flown.course_rad)
+        flight.plan.start_climb(
+            flight.time_s, flown.position_ned_m, flown.velocity_ned_mps, course_rad
+        )
+        return
+    in_the_air = source is not Phase.TAKEOFF
+    if in_the_air:
+        _place_reference(flight, position)
+    if in_the_air or flight.takes_off_by_command:
+        _adopt_hover_thrust(flight, SETTLED if source is Phase.STANDBY else DIFFERENT)
+    flight.observer.freeze(False)
+    decision.begin(flight)
+    flight.plan.start_climb(
+        flight.time_s,
+        np.array(position.position_ned_m),
+        np.array(position.velocity_ned_mps),
+        flight.vehicle.course_rad,
+    )
+
+
+def _place_reference(flight: FlightState, position: LocalPosition) -> None:
+    """Place the reference of a vehicle that was found in the air. A take-off point that was not
+    seen is below it, at the height of its last rest."""
+    contact = flight.contact
+    flight.home_ned_m = (*position.position_ned_m[:2], contact.rest_down_m)
+    if flight.service and flight.service.anchor == "here":
+        rest = contact.rest_ned_m
+        above_m = flight.plan.place_start(
+            position.position_ned_m, position.velocity_ned_mps, rest[2] if rest else None
+        )
+        if above_m:
+            outbox.announce(
+                flight,
+                f"the reference starts {above_m:.1f} m higher: from here it would "
+                + ("touch the ground" if rest else "go lower, and the ground is not known"),
+            )
+    elif contact.rest_ned_m is not None and flight.service:
+        flight.plan.origin_ned_m = contact.rest_ned_m
+    else:
+        flight.plan.origin_ned_m = flight.home_ned_m
+
+
+def _adopt_hover_thrust(flight: FlightState, least: float = DIFFERENT) -> None:
+    """Fly with the hover thrust that the autopilot's own flight shows, if it is another."""
+    model = flight.model
+    shown = flight.hover.hover_thrust(model, flight.time_s)
+    if shown is None or not differs(shown, model, least):
+        return
+    flight.model = model.model_copy(update={"hover_thrust": shown})
+    flight.observer.adopt(flight.model)
+    if flight.identification:
+        flight.identification.on_hover_thrust(shown)
+    outbox.announce(
+        flight,
+        f"hover thrust {shown:.3f} by thrust and acceleration before the take-over, "
+        f"not {model.hover_thrust:.3f}",
+    )
 
 
 # ---------------------------------------------------------------------- its documentation

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import suppress
 
-from offboard.flight.companion import Companion
+from offboard.flight.flight import Flight
 from offboard.live.lines import JsonLines, Terminal
 from offboard.live.process import LiveProcess
 
@@ -27,7 +27,7 @@ class Displays:
         """A sentence about the preparation."""
         self._lines.tell(sentence)
 
-    def show(self, companion: Companion) -> None:
+    def show(self, companion: Flight) -> None:
         for part in tuple(self._working):
             try:
                 part.show(companion)

@@ -12,7 +12,7 @@ from offboard.analysis.tlog import LoggedMessage
 from offboard.documents.errors import UserError
 from offboard.documents.signing_key import KEY_BYTES
 from offboard.flight import inputs
-from offboard.flight.companion import Companion
+from offboard.flight.flight import Flight, Output
 from offboard.flight.inputs import (
     Call,
     Check,
@@ -21,7 +21,6 @@ from offboard.flight.inputs import (
     StrangersCounted,
     TurnInput,
 )
-from offboard.flight.outbox import Output
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
 from offboard.link.interface import Chunk
 from offboard.mavlink.framing import Frame
@@ -88,7 +87,7 @@ class Replay:
         self._readings: Iterator[float] = iter(())
         self._read_s = 0.0
 
-    def _companion(self, recording: Recording, prepared: Prepared) -> Companion:
+    def _companion(self, recording: Recording, prepared: Prepared) -> Flight:
         settings: dict[str, Any] = recording.settings
         signing = Accepted(bytes(KEY_BYTES)) if recording.signed else None
         try:

@@ -20,10 +20,10 @@ from offboard.documents.errors import DocumentError, located
 from offboard.documents.signing_key import read_key
 from offboard.estimation.observer import Observer
 from offboard.flight import manifest
-from offboard.flight.companion import Companion, Outcome
+from offboard.flight.flight import Flight, Outcome
 from offboard.flight.flight_plan import FlightPlan
-from offboard.flight.gate import usable
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID
+from offboard.flight.setpoint import usable
 from offboard.link import clock
 from offboard.link.connection import open_link, open_lockstep_link
 from offboard.link.interface import Link
@@ -205,12 +205,12 @@ class Prepared:
         *,
         keeps_deadline: bool = True,
         **more: Any,
-    ) -> Companion:
+    ) -> Flight:
         """The companion of a flight over `session`. `stopwatch` reads host time; `more`: see
-        `Companion`."""
+        `Flight`."""
         config = self.config
         keeps_deadline &= not session.settings.lockstep
-        return Companion(
+        return Flight(
             vehicle=config.vehicle,
             session=session,
             observer=self.observer(),
@@ -308,7 +308,7 @@ def fly(
     *,
     simulator: SimulatorProcess | InMemorySimulator | None = None,
     stops: StopRequests | None = None,
-    progress: Callable[[Companion], None] = lambda companion: None,
+    progress: Callable[[Flight], None] = lambda companion: None,
     tell: Callable[[str], None] = lambda sentence: None,
 ) -> Outcome:
     """Fly once, and log it in `directory`.

@@ -13,7 +13,7 @@ from contextlib import suppress
 from typing import Any, Protocol
 
 from offboard.documents.errors import located
-from offboard.flight.companion import Outcome, Output
+from offboard.flight.flight import Outcome, Output
 from offboard.flight.phases import BEFORE_FLIGHT, WAITING, ExitCode, Phase
 from offboard.link import clock
 from offboard.link.interface import Chunk, Link

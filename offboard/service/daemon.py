@@ -11,7 +11,7 @@ from pathlib import Path
 from sdnotify import SystemdNotifier
 
 from offboard import compiled
-from offboard.flight.companion import Outcome
+from offboard.flight.flight import Outcome
 from offboard.flight.phases import ExitCode, ServiceOptions
 from offboard.link import clock
 from offboard.link.background import BackgroundWriter

@@ -1,6 +1,6 @@
 """The flights of the service on one link: one waits or flies, and when it has ended the next waits.
 
-`Flights` takes the place of one companion in the loop. Each flight has a new `Companion` on the
+`Flights` takes the place of one companion in the loop. Each flight has a new `Flight` on the
 same session, so that authority, failsafe, plan and identification are new, and what is known of
 vehicle and link stays. No I/O: a log is begun and ended at `Record`, configurations come from
 `Source`.
@@ -12,7 +12,7 @@ from collections.abc import Callable, Hashable, Sequence
 from dataclasses import replace
 from typing import Protocol
 
-from offboard.flight.companion import STOPPED, Companion, Outcome, Output
+from offboard.flight.flight import STOPPED, Flight, Outcome, Output
 from offboard.flight.phases import ENDS, FLYING, WAITING, Phase, ServiceOptions
 from offboard.flight.snapshot import Snapshot
 from offboard.flight.starting import found_engaged
@@ -110,7 +110,7 @@ class Flights:
     # ------------------------------------------------------------------ as a companion
 
     @property
-    def current(self) -> Companion:
+    def current(self) -> Flight:
         """The flight that waits or flies."""
         return self._current
 
@@ -166,20 +166,20 @@ class Flights:
         self._current.announce(sentence)
 
     def guard(self, guarded: bool) -> None:
-        """As `Companion.guard`."""
+        """As `Flight.guard`."""
         self._current.guard(guarded)
 
     @property
     def lands_without_log(self) -> bool:
-        """As `Companion.lands_without_log`."""
+        """As `Flight.lands_without_log`."""
         return self._current.lands_without_log
 
     def overhear(self, datagrams: Sequence[bytes]) -> None:
-        """As `Companion.overhear`."""
+        """As `Flight.overhear`."""
         self._current.overhear(datagrams)
 
     def on_dropped(self, frames: int) -> None:
-        """As `Companion.on_dropped`."""
+        """As `Flight.on_dropped`."""
         self._current.on_dropped(frames)
 
     def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
@@ -201,7 +201,7 @@ class Flights:
         return output
 
     def finish_turn(self, sent_s: float) -> list[bytes]:
-        """As `Companion.finish_turn`."""
+        """As `Flight.finish_turn`."""
         return self._current.finish_turn(sent_s)
 
     def close(self) -> None:
@@ -231,7 +231,7 @@ class Flights:
         self._current = self._companion(self._current)
         self._shown = 0
 
-    def _companion(self, before: Companion | None) -> Companion:
+    def _companion(self, before: Flight | None) -> Flight:
         self._prepared.controller.reset()
         self._recalled = self._learned
         return self._prepared.companion(

@@ -30,7 +30,7 @@ def frame(number: int, extra: int, payload: bytes) -> bytes:
     return b"\xfd" + body + mcrf4xx(body + bytes((extra,))).to_bytes(2, "little")
 
 
-class Companion:
+class Flight:
     """A socket, the vehicle that sends to it, and how far that has come."""
 
     def __init__(self, *options: str) -> None:
@@ -69,8 +69,8 @@ class Companion:
 
 
 @contextmanager
-def companion(*options: str) -> Iterator[Companion]:
-    peer = Companion(*options)
+def companion(*options: str) -> Iterator[Flight]:
+    peer = Flight(*options)
     try:
         yield peer
     finally:

@@ -1,4 +1,4 @@
-"""Companion and simulated vehicle joined byte by byte in vehicle time, without socket or clock.
+"""Flight and simulated vehicle joined byte by byte in vehicle time, without socket or clock.
 
 `Pair.fly` steps the vehicle by 4 ms and hands every datagram over at once, through faults that a
 test puts on the two directions. Host time runs with vehicle time but from another zero, so that
@@ -23,7 +23,7 @@ from offboard.analysis import history, tlog
 from offboard.analysis.score import Score, score
 from offboard.control.base import Controller
 from offboard.estimation.observer import Observer
-from offboard.flight.companion import Companion, Outcome
+from offboard.flight.flight import Flight, Outcome
 from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import Action, Phase
@@ -88,7 +88,7 @@ class Pair:
     arrive. With `dead` set the vehicle's process is gone while time goes on.
     """
 
-    companion: Companion
+    companion: Flight
     instance: Instance
     clock: HostClock = field(default_factory=HostClock)
     down: Filter = through
@@ -287,7 +287,7 @@ def make(
     believed = believed or resolved.vehicle
     controller = resolved.controller.build(believed, period_s=resolved.period_s, seed=resolved.seed)
     observer = Observer(believed)
-    companion = Companion(
+    companion = Flight(
         vehicle=believed,
         session=Session(
             SessionSettings(

@@ -17,7 +17,7 @@ import numpy as np
 from pair import decode, frames_of
 from serving import ARM, LAND, MODES, SET_MODE, START, TAKEOFF, Serving
 
-from offboard.flight.companion import Output
+from offboard.flight.flight import Output
 from offboard.link.interface import Chunk
 
 HEARTBEAT, COMMAND_LONG, ATTITUDE_TARGET, CURRENT_MODE = 0, 76, 82, 436

@@ -17,7 +17,7 @@ from typing import Any, cast
 import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
-from offboard.flight.companion import Companion, Outcome, Output
+from offboard.flight.flight import Flight, Outcome, Output
 from offboard.flight.phases import Phase
 from offboard.link import clock
 from offboard.link import log as log_module
@@ -54,7 +54,7 @@ class Wire:
     def close(self) -> None: ...
 
 
-class Flight:
+class Brief:
     """A companion whose flight lasts `turns`, and which counts stop requests."""
 
     peer = None
@@ -97,9 +97,9 @@ class Flight:
         return self.log
 
 
-def fly(flight: Flight, directory: Path, progress: Callable[[Any], None]) -> Outcome:
+def fly(flight: Brief, directory: Path, progress: Callable[[Any], None]) -> Outcome:
     with FlightLog(directory / "flight", "") as log, StopRequests() as stops:
-        companion = cast(Companion, flight)
+        companion = cast(Flight, flight)
         return Loop(companion, Wire(), log, stops=stops, progress=progress).run()
 
 
@@ -112,7 +112,7 @@ def test_a_closed_terminal_does_not_end_the_flight(tmp_path: Path, failure: Base
         shown += 1
         raise failure
 
-    flight = Flight(5, lambda left: None)
+    flight = Brief(5, lambda left: None)
     assert fly(flight, tmp_path, progress).sentence == "flown and landed"
     assert (flight.turns, shown, flight.stops) == (0, 1, 0)
 
@@ -140,7 +140,7 @@ def test_two_signals(
             os.kill(os.getpid(), number)
             now_s += apart_s
 
-    flight = Flight(5, signalled)
+    flight = Brief(5, signalled)
     outcome = fly(flight, tmp_path, lambda companion: None)
     assert flight.turns == turns_left
     assert flight.stops
@@ -180,7 +180,7 @@ def test_what_a_turn_decided_is_dropped_when_it_became_too_old(tmp_path: Path) -
         def send(self, data: bytes, peer: object) -> None:
             sent.append(data)
 
-    class Deciding(Flight):
+    class Deciding(Brief):
         def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
             frame, text = setpoint(self.turns), said(self.turns)
             super().turn(chunks, now_s)
@@ -193,7 +193,7 @@ def test_what_a_turn_decided_is_dropped_when_it_became_too_old(tmp_path: Path) -
     directory = tmp_path / "flight"
     with FlightLog(directory, "") as log, StopRequests() as stops:
         Loop(
-            cast(Companion, flight),
+            cast(Flight, flight),
             cast(Link, Recording()),
             log,
             stops=stops,
@@ -227,7 +227,7 @@ def test_what_a_turn_decided_does_not_leave_after_a_take_over(tmp_path: Path) ->
 
     watcher = Taking()
 
-    class Deciding(Flight):
+    class Deciding(Brief):
         def turn(self, chunks: Sequence[Chunk], now_s: float) -> Output:
             super().turn(chunks, now_s)
             watcher.taken = self.turns == 1
@@ -236,7 +236,7 @@ def test_what_a_turn_decided_does_not_leave_after_a_take_over(tmp_path: Path) ->
     flight = Deciding(3, lambda left: None)
     with FlightLog(tmp_path / "flight", "") as log, StopRequests() as stops:
         outcome = Loop(
-            cast(Companion, flight), cast(Link, Recording()), log, stops=stops,
+            cast(Flight, flight), cast(Link, Recording()), log, stops=stops,
             progress=lambda companion: None, supervisor=cast(Supervisor, watcher),
         ).run()  # fmt: skip
     assert sent == [setpoint(2)]
@@ -246,7 +246,7 @@ def test_what_a_turn_decided_does_not_leave_after_a_take_over(tmp_path: Path) ->
 def test_an_ignored_sighup_stays_ignored(tmp_path: Path) -> None:
     before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
     try:
-        flight = Flight(5, lambda left: os.kill(os.getpid(), signal.SIGHUP))
+        flight = Brief(5, lambda left: os.kill(os.getpid(), signal.SIGHUP))
         assert fly(flight, tmp_path, lambda companion: None).exit_code == 0
     finally:
         signal.signal(signal.SIGHUP, before)
@@ -268,12 +268,12 @@ def test_a_log_that_cannot_be_written_is_said_at_once(
     says = (
         f"the log {tmp_path / 'flight' / 'flight.tlog'} cannot be written (No space left on device)"
     )
-    flight = Flight(100_000, lambda left: setattr(flight, "turns", min(left, 3 * bool(left)))
+    flight = Brief(100_000, lambda left: setattr(flight, "turns", min(left, 3 * bool(left)))
                     if flight.announced else None, log=b"frame")  # fmt: skip
     flight.lands_without_log = lands
     with FlightLog(tmp_path / "flight", "", real_time=True) as log, StopRequests() as stops_:
         outcome = Loop(
-            cast(Companion, flight), Wire(), log, stops=stops_,
+            cast(Flight, flight), Wire(), log, stops=stops_,
             progress=lambda companion: None,
         ).run()  # fmt: skip
     assert flight.announced == [says]
@@ -293,7 +293,7 @@ def failing(turns: range, error: BaseException) -> Callable[[int], None]:
 
 @pytest.mark.parametrize("error", [ZeroDivisionError("no"), SystemExit(3), MemoryError()])
 def test_an_exception_lands_and_ends_with_4(error: BaseException, tmp_path: Path) -> None:
-    flight = Flight(5, failing(range(3, 5), error))
+    flight = Brief(5, failing(range(3, 5), error))
     outcome = fly(flight, tmp_path, lambda companion: None)
     assert (flight.turns, flight.stops, outcome.exit_code) == (0, 2, 4)
     says = " ".join(f"internal error: {type(error).__name__}: {error} ({__file__}:".split())
@@ -303,7 +303,7 @@ def test_an_exception_lands_and_ends_with_4(error: BaseException, tmp_path: Path
 
 def test_an_exception_is_over_when_the_service_waits_again(tmp_path: Path) -> None:
     """The flight that it ended has its own exit code; that of the service is another."""
-    flight = Flight(5, failing(range(3, 5), ZeroDivisionError("no")))
+    flight = Brief(5, failing(range(3, 5), ZeroDivisionError("no")))
     flight.phase = Phase.STANDBY
     assert fly(flight, tmp_path, lambda companion: None) == Outcome(0, "flown and landed")
     assert flight.stops == 2
@@ -327,11 +327,11 @@ def test_another_supervisor_is_started_but_not_in_flight(
             restarted_s.append(now_s)
             super().restart()
 
-    flight, watcher = Flight(6, later), Starting(lost=True)
+    flight, watcher = Brief(6, later), Starting(lost=True)
     flight.phase = phase
     with FlightLog(tmp_path / "flight", "") as log, StopRequests() as stops:
         Loop(
-            cast(Companion, flight), Wire(), log, stops=stops,
+            cast(Flight, flight), Wire(), log, stops=stops,
             progress=lambda companion: None, supervisor=cast(Supervisor, watcher),
         ).run()  # fmt: skip
     assert restarted_s == restarts
@@ -350,7 +350,7 @@ def test_an_exception_in_every_turn_ends_in_silence(
         now_s += 0.04
         raise ValueError("again")
 
-    flight = Flight(1000, fails)
+    flight = Brief(1000, fails)
     outcome = fly(flight, tmp_path, lambda companion: None)
     assert (1000 - flight.turns, outcome.exit_code) == (8, 4)  # 0.3 s
     assert outcome.sentence.endswith("; setpoints stopped")

@@ -12,6 +12,7 @@ import math
 import os
 import re
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
@@ -19,7 +20,7 @@ from hypothesis import HealthCheck, assume, example, given, settings
 from hypothesis import strategies as st
 
 from offboard.flight.authority import Authority
-from offboard.flight.gate import Clearance, Refusal, Refused, admit
+from offboard.flight.setpoint import Refusal, Refused, admit
 from offboard.model.command import Command, PositionCommand
 from simulator import config
 
@@ -282,7 +283,16 @@ def test_flights_of_one_tick(
     assume(not is_on_the_edge(command))
     authority, end_s = replayed(history)
     ours = authority.permits_setpoint(end_s + later_s)
-    clearance = Clearance(ours, on_ground, age_s, age_limit_s, late_s)
+    admitted = partial(
+        admit,
+        command,
+        VEHICLE,
+        ours=ours,
+        on_ground=on_ground,
+        age_s=age_s,
+        age_limit_s=age_limit_s,
+        late_s=late_s,
+    )
     reasons = {
         Refusal.NOT_OURS: not (may_set(history) and is_fresh(history, later_s)),
         Refusal.STALE: not age_s <= age_limit_s,
@@ -291,10 +301,10 @@ def test_flights_of_one_tick(
     }
     if any(reasons.values()):
         with pytest.raises(Refused) as refused:
-            admit(command, VEHICLE, clearance)
+            admitted()
         assert reasons[refused.value.why]
         return
-    sent = admit(command, VEHICLE, clearance)
+    sent = admitted()
     if isinstance(command, PositionCommand):
         assert sent == command
         return
@@ -320,28 +330,30 @@ def test_a_command_needs_authority(history: list[Occurrence], later_s: float) ->
 
 @pytest.mark.parametrize("late_s", [math.nan, 1e-9, math.inf])
 def test_a_lateness_that_is_unknown_is_late(late_s: float) -> None:
-    clearance = Clearance(ours=True, on_ground=False, late_s=late_s)
+    command = Command(9.8, (0.0, 0.0, 1.0), 0.0)
     with pytest.raises(Refused) as refused:
-        admit(Command(9.8, (0.0, 0.0, 1.0), 0.0), VEHICLE, clearance)
+        admit(command, VEHICLE, ours=True, on_ground=False, late_s=late_s)
     assert refused.value.why is Refusal.LATE
 
 
 @pytest.mark.parametrize(("age_s", "refused"), [(0.25, False), (0.2501, True), (math.nan, True)])
 def test_the_age_of_telemetry_is_limited_exactly(age_s: float, refused: bool) -> None:
-    clearance = Clearance(ours=True, on_ground=False, age_s=age_s, age_limit_s=0.25)
     command = Command(9.8, (0.0, 0.0, 1.0), 0.0)
+    admitted = partial(
+        admit, command, VEHICLE, ours=True, on_ground=False, age_s=age_s, age_limit_s=0.25
+    )
     if not refused:
-        assert admit(command, VEHICLE, clearance) == command
+        assert admitted() == command
         return
     with pytest.raises(Refused) as reason:
-        admit(command, VEHICLE, clearance)
+        admitted()
     assert reason.value.why is Refusal.STALE
 
 
 def test_straight_up_with_the_smallest_lateral_part_is_turned_back_to_the_limit() -> None:
     """The length of (5e-324, 5e-324) is rounded to 5e-324: two whole parts instead of one."""
     command = Command(9.8, (5e-324, 5e-324, -1.0), 0.0)
-    sent = admit(command, VEHICLE, Clearance(ours=True, on_ground=False))
+    sent = admit(command, VEHICLE, ours=True, on_ground=False)
     assert tilt_of(sent) == pytest.approx(VEHICLE.tilt_max_rad, abs=1e-12)
 
 
@@ -361,5 +373,5 @@ def test_a_number_that_is_none_or_too_large_for_the_wire_is_refused(
 ) -> None:
     """Encoding it would raise, after the gate."""
     with pytest.raises(Refused) as refused:
-        admit(command, VEHICLE, Clearance(ours=True, on_ground=False))
+        admit(command, VEHICLE, ours=True, on_ground=False)
     assert refused.value.why is Refusal.UNUSABLE

@@ -32,7 +32,7 @@ def on_a_link_that_becomes_late(direction: str, added_s: float) -> tuple[Pair, l
 
     def note(flying: Pair) -> bool:
         if begun:
-            limit = flying.companion._decider._controller.bandwidth_radps
+            limit = flying.companion.state.controller.bandwidth_radps
             if not limits or limits[-1][1] != limit:
                 limits.append((flying.time_s - begun[0], limit))
         return False

@@ -12,10 +12,10 @@ from pair import calm_hover, hover
 from offboard import compiled
 from offboard.compiled import Entry
 from offboard.control.base import Situation
-from offboard.flight import manifest
-from offboard.flight.gate import clamp, usable
+from offboard.flight import manifest, outbox
 from offboard.flight.phases import Limits
 from offboard.flight.preflight import Ground, ParameterReading, not_ready, refusals
+from offboard.flight.setpoint import clamp, usable
 from offboard.flight.vehicle_state import VehicleState
 from offboard.mavlink.dialects.ardupilot import ARDUPILOT
 from offboard.mavlink.dialects.px4 import PX4
@@ -166,9 +166,9 @@ def test_records_are_not_sent_and_no_sequence_has_a_gap() -> None:
 
 def test_a_message_that_cannot_be_encoded_does_not_stop_the_later_ones() -> None:
     """Here a command without a vehicle. The loop then asks for a landing."""
-    outbox = hover().companion._outbox
-    outbox.send(CommandLong.arm())
+    flight = hover().companion.state
+    outbox.send(flight, CommandLong.arm())
     with pytest.raises(ValueError, match="no vehicle"):
-        outbox.flush([])
-    outbox.announce("later")
-    assert len(outbox.flush([]).send) == 1
+        outbox.flush(flight)
+    outbox.announce(flight, "later")
+    assert len(outbox.flush(flight)) == 1

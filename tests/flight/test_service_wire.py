@@ -10,7 +10,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from service_wire import HOVER, Wire
 from serving import ARM, SET_MODE, TAKEOFF, Serving, serve
 
-from offboard.flight.companion import Output
+from offboard.flight.flight import Output
 from offboard.flight.phases import TRACKING, Phase
 
 CODEC = mavlink.MAVLink(None, srcSystem=1, srcComponent=191)

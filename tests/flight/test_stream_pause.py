@@ -8,8 +8,7 @@ from typing import Any
 
 from pair import hover, in_phase
 
-from offboard.flight.companion import Companion
-from offboard.flight.outbox import Output
+from offboard.flight.flight import Flight, Output
 from offboard.flight.phases import Phase
 from offboard.link.interface import Chunk
 
@@ -20,8 +19,8 @@ class Paused:
     """The companion, which from `begin` on takes no turn for a pause, with a link that is a
     stream: what arrives meanwhile may have arrived at any time since the turn before."""
 
-    def __init__(self, companion: Companion) -> None:
-        session = companion._session
+    def __init__(self, companion: Flight) -> None:
+        session = companion.state.session
         session.settings = replace(session.settings, stream=True)
         self._companion = companion
         self._waiting: list[Chunk] = []

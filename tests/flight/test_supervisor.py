@@ -22,7 +22,7 @@ import pytest
 from pymavlink.dialects.v20 import common as mavlink
 
 from offboard.analysis import tlog
-from offboard.flight.outbox import Output
+from offboard.flight.flight import Output
 from offboard.flight.phases import Phase
 from offboard.link import clock
 from offboard.link.connection import open_link

@@ -31,7 +31,7 @@ from pair import (
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from offboard.flight.authority import Standing
-from offboard.flight.companion import Output
+from offboard.flight.flight import Output
 from offboard.flight.phases import ENDS, ExitCode, Phase
 from offboard.link.interface import Chunk
 

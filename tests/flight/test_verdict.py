@@ -23,7 +23,7 @@ from offboard.analysis.history import History
 from offboard.analysis.score import Score, score
 from offboard.analysis.score_table import summary, verdict
 from offboard.cli.commands import app
-from offboard.flight.companion import Outcome
+from offboard.flight.flight import Outcome
 from offboard.flight.online_identification import IdentifySettings
 from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.flight.touchdown import Touchdown

@@ -69,14 +69,18 @@ def uneventful(phase: Phase = Phase.TRACK, service: ServiceOptions | None = None
     identification: Any = SimpleNamespace(
         contradiction="", wants_excitation=False, finished=lambda time_s: False
     )
+    controller: Any = None
     flight = FlightState(
         Limits(),
         FlightPlan(TRACK),
         CONFIG.vehicle,
         session,
         observer,
-        identification,
-        service,
+        controller,
+        CONFIG.period_s,
+        lambda: 0.0,
+        identification=identification,
+        service=service,
         phase=phase,
         now_s=NOW_S,
         began_s=NOW_S,

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from offboard.flight.companion import Outcome
+from offboard.flight.flight import Outcome
 from offboard.link.stop import StopRequests
 from offboard.run import flight, in_memory
 from offboard.run.configuration import load

@@ -16,7 +16,7 @@ from threading import Timer
 import pytest
 
 from offboard.analysis import tlog
-from offboard.flight.companion import Companion
+from offboard.flight.flight import Flight
 from offboard.flight.phases import Phase
 from offboard.flight.record import COMPONENT_ID, RECORD_COMPONENT_ID, RECORD_ID, TickRecord
 from offboard.run import flight
@@ -71,7 +71,7 @@ def fly(
     """One short flight: its frames by component, without wall times."""
     stalls = [stall_s]
 
-    def progress(companion: Companion) -> None:
+    def progress(companion: Flight) -> None:
         if companion.phase is Phase.TRACK and stalls:
             time.sleep(stalls.pop())
 

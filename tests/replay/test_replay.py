@@ -17,10 +17,10 @@ from offboard.cli.commands import app
 from offboard.control.base import Controller, Decision, Situation
 from offboard.control.pso import PsoLaw
 from offboard.documents.errors import UserError
-from offboard.flight import inputs, manifest
-from offboard.flight.actions import PhaseActions
-from offboard.flight.outbox import Output
+from offboard.flight import actions, inputs, manifest
+from offboard.flight.flight import Output
 from offboard.flight.phases import Phase
+from offboard.flight.state import FlightState
 from offboard.link.log import entry
 from offboard.mavlink.outgoing import Heartbeat
 from offboard.mavlink.session import Session, SessionSettings
@@ -273,14 +273,14 @@ def test_slow_decisions_a_stop_request_strangers_and_a_signed_link(tmp_path: Pat
 
 def test_an_error_in_a_turn(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """The frames of the turn stay in the log, and the replay fails and lands in the same turn."""
-    act = PhaseActions.act
+    act = actions.act
 
-    def failing(self, tick) -> None:
-        if 10.0 <= tick.time_s < 10.1:
+    def failing(flight: FlightState) -> None:
+        if 10.0 <= flight.time_s < 10.1:
             raise RuntimeError("as it happens")
-        act(self, tick)
+        act(flight)
 
-    monkeypatch.setattr(PhaseActions, "act", failing)
+    monkeypatch.setattr(actions, "act", failing)
     pair = short_flight()
     assert pair.companion.outcome is not None
     assert "as it happens" in pair.companion.outcome.sentence

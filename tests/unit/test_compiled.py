@@ -148,7 +148,7 @@ def test_without_compilation_the_same_functions_run_as_python(
         ("offboard/model/state.py", True),  # the sizes of states
         ("simulator/steps.py", True),  # the length of a step
         ("offboard/documents/reading.py", False),
-        ("offboard/flight/companion.py", False),
+        ("offboard/flight/flight.py", False),
     ],
 )
 def test_the_directory_is_named_after_compiled_sources(

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from offboard.control.base import Certificate, Decision
-from offboard.flight.gate import Refusal
 from offboard.flight.record import LAYOUTS, TickRecord, records_of
+from offboard.flight.setpoint import Refusal
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
 

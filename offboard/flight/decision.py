@@ -1,0 +1,212 @@
+"""The decision of one tick: predict the state, call the control law, and send its command.
+
+Once the setpoint has left, log the decision and identify the vehicle. Failures of the law are
+counted, never raised: the vehicle is in the air.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from offboard.control.base import Adopting, Situation
+from offboard.documents.errors import located
+from offboard.flight import outbox
+from offboard.flight.online_identification import Adoption, OnlineIdentification
+from offboard.flight.phases import PHASE_CODES, Phase
+from offboard.flight.record import (
+    IDENTIFIED_ID,
+    IDENTIFIED_NAME,
+    RECORD_ID,
+    RECORD_NAME,
+    TickRecord,
+    reference_record,
+)
+from offboard.flight.setpoint import Refusal, Refused, send_command, send_position
+from offboard.flight.state import Decided, FlightState
+from offboard.mavlink.outgoing import SolverRecord
+from offboard.model.command import Command, PositionCommand
+
+NOTICEABLE_RADPS = 0.5  # a smaller change of the bandwidth is not announced
+_FAILED, _TOO_OLD = "the controller failed", "telemetry was too old for a setpoint"
+
+
+def begin(flight: FlightState) -> None:
+    """Before the first decision: the vehicle is not identified yet."""
+    if flight.identification and isinstance(flight.controller, Adopting):
+        flight.controller.adopt(flight.model, flight.identification.uncertainty)
+        flight.announced_radps = flight.controller.configured_radps
+
+
+def decide(flight: FlightState) -> bool:
+    """Decide, and queue the setpoint.
+
+    Returns False, and increases `missed`, if the decision failed or was refused; then
+    nothing is sent. Telemetry that was too old before the decision began does not count: the
+    failsafe has a row for it.
+    """
+    was_old = flight.telemetry_is_old
+    try:
+        decided = _send(flight, _decided(flight))
+    except Exception as error:  # any error: the vehicle is in the air
+        _miss(flight, located(error), _FAILED)
+        return False
+    flight.decided = decided
+    if was_old and decided.refused == Refusal.STALE:
+        return False
+    if decided.failure:
+        in_time = decided.solve_time_s <= flight.period_s
+        aged = decided.refused == Refusal.STALE and in_time
+        _miss(flight, decided.failure, _TOO_OLD if aged else _FAILED)
+        return False
+    flight.predictions.append(decided.state)
+    return True
+
+
+def finish(flight: FlightState, sent_s: float) -> None:
+    """After the setpoint was sent, at host time `sent_s`: log the decision and identify."""
+    decided, flight.decided = flight.decided, None
+    if decided is None:
+        return
+    try:
+        _record(flight, decided, sent_s - decided.tick.arrived_s)
+    except Exception as error:  # the certificate is the law's
+        _miss(flight, located(error), _FAILED)
+        return
+    if not decided.refused:
+        flight.missed = 0
+        if flight.identification:
+            _identify(flight, decided, flight.identification)
+
+
+def _miss(flight: FlightState, failure: str, by: str) -> None:
+    flight.missed += 1
+    flight.failure = f"{by}: {failure}"
+    outbox.warn(flight, f"decision missed: {failure}")
+
+
+def _send(flight: FlightState, decided: Decided) -> Decided:
+    """Send the command, if it is admitted."""
+    age_s, late_s = _age_and_lateness(flight)
+    try:
+        sent = _sent(flight, decided, age_s, late_s)
+    except Refused as refused:
+        return replace(decided, age_s=age_s, refused=refused.why, failure=str(refused))
+    return replace(decided, age_s=age_s, sent=sent)
+
+
+def _sent(
+    flight: FlightState, decided: Decided, age_s: float, late_s: float
+) -> Command | PositionCommand:
+    command, time_s = decided.decision.command, flight.tick.time_s
+    if not isinstance(command, Command):
+        return send_position(flight, time_s, command, age_s=age_s, late_s=late_s)
+    excited = _excited(flight, command)
+    body_z_down = float(decided.state.thrust_direction_ned[2])
+    return send_command(flight, time_s, excited, body_z_down, age_s=age_s, late_s=late_s)
+
+
+def _age_and_lateness(flight: FlightState) -> tuple[float, float]:
+    """Age of the telemetry, and time since the end of the tick; both now, in host time."""
+    if flight.deadline_s is None:
+        return 0.0, 0.0
+    host_s = flight.stopwatch()
+    return flight.telemetry_age_s(host_s), host_s - flight.tick.arrived_s - flight.period_s
+
+
+def _identify(flight: FlightState, decided: Decided, identification: OnlineIdentification) -> None:
+    try:
+        adoption = identification.learn(
+            decided.phase, decided.tick.time_s, flight.observer.hover_thrust_estimate
+        )
+        if adoption is not None:
+            _adopt(flight, decided.tick.time_s, adoption)
+    except Exception as error:  # the flight continues with the present vehicle model
+        identification.give_up()
+        outbox.warn(flight, f"identification stopped: {located(error)}")
+
+
+def _decided(flight: FlightState) -> Decided:
+    plan = flight.plan
+    assert plan.reference is not None
+    sent_s = flight.sent_s(flight.tick.time_s)
+    state = flight.observer.predict(sent_s)
+    began_s = flight.stopwatch()
+    situation = Situation(
+        sent_s,
+        state,
+        plan.reference,
+        previous=flight.command,
+        remaining_s=_remaining(flight, began_s),
+        origin_ned_m=plan.origin_ned_m,
+        track_time_s=plan.track_time_s(sent_s),
+    )
+    decision = flight.controller.decide(situation)
+    return Decided(flight.tick, flight.phase, state, decision, flight.stopwatch() - began_s)
+
+
+def _remaining(flight: FlightState, began_s: float) -> Callable[[], float] | None:
+    deadline_s = flight.deadline_s
+    if deadline_s is None:
+        return None
+    return lambda: deadline_s - (flight.stopwatch() - began_s)
+
+
+def _excited(flight: FlightState, command: Command) -> Command:
+    if flight.identification is None or flight.phase is not Phase.EXCITE:
+        return command
+    return flight.identification.excited(command, flight.tick.time_s, flight.position_error_m)
+
+
+def _adopt(flight: FlightState, time_s: float, adoption: Adoption) -> None:
+    assert isinstance(flight.controller, Adopting)
+    flight.controller.adopt(adoption.vehicle, adoption.uncertainty)
+    if adoption.vehicle != flight.model:
+        flight.observer.adopt(adoption.vehicle)
+        flight.model = adoption.vehicle
+    if adoption.record:
+        record = SolverRecord(time_s, adoption.record, IDENTIFIED_ID, IDENTIFIED_NAME)
+        outbox.send(flight, record)
+    for sentence in _with_bandwidth(flight, adoption, flight.controller):
+        outbox.announce(flight, sentence)
+
+
+def _with_bandwidth(
+    flight: FlightState, adoption: Adoption, controller: Adopting
+) -> tuple[str, ...]:
+    """The sentences for the user, and the bandwidth in use if it has changed noticeably."""
+    used_radps, configured_radps = controller.bandwidth_radps, controller.configured_radps
+    changed_radps = abs(used_radps - flight.announced_radps)
+    as_configured = used_radps == configured_radps
+    if not changed_radps or (changed_radps < NOTICEABLE_RADPS and not as_configured):
+        return adoption.sentences
+    flight.announced_radps = used_radps
+    text = f"bandwidth limited to {used_radps:.1f} rad/s (configured {configured_radps:.1f})"
+    if as_configured:
+        text = f"bandwidth {used_radps:.1f} rad/s as configured"
+    if adoption.cause:
+        return (*adoption.sentences, f"{text}: {adoption.cause}")
+    return ("; ".join((*adoption.sentences, text)),)
+
+
+def _record(flight: FlightState, decided: Decided, answer_s: float) -> None:
+    tick = decided.tick
+    sample = flight.plan.sample(tick.time_s)
+    assert sample is not None
+    outbox.send(flight, reference_record(tick.time_s, sample))
+    record = TickRecord.of(
+        phase=PHASE_CODES[decided.phase],
+        decision=decided.decision,
+        sent=decided.sent,
+        state=decided.state,
+        solve_time_s=decided.solve_time_s,
+        answer_s=answer_s,
+        missed_ticks=tick.missed,
+        hover_thrust=flight.observer.hover_thrust_estimate,
+        track_time_s=flight.plan.track_time_s(tick.time_s),
+        age_s=decided.age_s,
+        refused=decided.refused,
+        strangers=tick.strangers,
+        pause_s=tick.pause_s,
+    )
+    outbox.send(flight, SolverRecord(tick.time_s, record.data(), RECORD_ID, RECORD_NAME))

@@ -1,0 +1,242 @@
+"""Setpoints: the last check before they are sent, and the only place from which they leave.
+
+PX4 flies any setpoint it receives. Every setpoint passes `admit`, which is independent of the
+control laws and of their limits, and is then given to the observer and the identification, which
+predict with the commands that were sent.
+"""
+
+from __future__ import annotations
+
+import math
+from contextlib import suppress
+from enum import IntFlag
+from typing import overload
+
+from offboard.flight import outbox
+from offboard.flight.state import LEVEL, FlightState
+from offboard.mavlink.encode import FLOAT32_MAX
+from offboard.mavlink.outgoing import AttitudeTarget, PositionTarget
+from offboard.model.command import Command, PositionCommand
+from offboard.model.vehicle import Vehicle
+
+_LENGTH_TOLERANCE = 0.01
+
+
+class Refusal(IntFlag):
+    """Why a setpoint was not sent, as the log has it."""
+
+    LATE = 1  # decided after its deadline
+    STALE = 2  # the telemetry that it was made for is too old
+    NOT_OURS = 4  # the vehicle does not, or may not, follow us
+    UNUSABLE = 8  # not finite, or beyond the numbers of the wire
+
+
+class Refused(Exception):
+    """A setpoint that must not leave; the message is the reason, `why` its number."""
+
+    def __init__(self, why: Refusal, reason: str) -> None:
+        super().__init__(reason)
+        self.why = why
+
+
+@overload
+def admit(
+    command: Command,
+    vehicle: Vehicle,
+    *,
+    ours: bool,
+    on_ground: bool,
+    age_s: float = ...,
+    age_limit_s: float = ...,
+    late_s: float = ...,
+) -> Command: ...
+@overload
+def admit(
+    command: PositionCommand,
+    vehicle: Vehicle,
+    *,
+    ours: bool,
+    on_ground: bool,
+    age_s: float = ...,
+    age_limit_s: float = ...,
+    late_s: float = ...,
+) -> PositionCommand: ...
+def admit(
+    command: Command | PositionCommand,
+    vehicle: Vehicle,
+    *,
+    ours: bool,
+    on_ground: bool,
+    age_s: float = 0.0,
+    age_limit_s: float = math.inf,
+    late_s: float = 0.0,
+) -> Command | PositionCommand:
+    """The setpoint that may leave: `command` within the limits of `vehicle`.
+
+    Args:
+        ours: the vehicle is ours to command (`Authority.permits_setpoint`).
+        on_ground: it certainly stands on the ground (`GroundContact.certain`).
+        age_s: age of the telemetry that the setpoint was computed from, beyond the known delay of
+            the link; 0 for a setpoint that needs none.
+        age_limit_s: the greatest age that may leave.
+        late_s: time by which the decision missed its deadline; 0 if it did not.
+
+    Raises Refused if the vehicle is not ours, the telemetry was too old, the decision too late, or
+    a value cannot be sent.
+    """
+    if not ours:
+        raise Refused(Refusal.NOT_OURS, "the vehicle is not ours")
+    if not age_s <= age_limit_s:
+        raise Refused(Refusal.STALE, f"decided on telemetry that is {age_s:.2f} s old")
+    if not late_s <= 0.0:
+        raise Refused(Refusal.LATE, f"decided {late_s:.2f} s too late")
+    if not usable(command):
+        raise Refused(Refusal.UNUSABLE, f"unusable {command}")
+    if isinstance(command, PositionCommand):
+        return command
+    return clamp(command, vehicle, on_ground=on_ground)
+
+
+def usable(command: Command | PositionCommand) -> bool:
+    """Whether all values can be sent, as float32, and the thrust direction is a unit vector."""
+    if isinstance(command, PositionCommand):
+        vectors = (
+            command.position_ned_m,
+            command.velocity_ned_mps,
+            command.acceleration_ned_mps2,
+            (command.course_rad, command.course_rate_radps),
+        )
+        return all(abs(value) <= FLOAT32_MAX for vector in vectors for value in vector)
+    values = (command.thrust_mps2, *command.thrust_direction_ned, command.course_rad)
+    if not all(abs(value) <= FLOAT32_MAX for value in values):
+        return False
+    return abs(math.hypot(*command.thrust_direction_ned) - 1.0) <= _LENGTH_TOLERANCE
+
+
+def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool = False) -> Command:
+    """`command` limited to the vehicle's thrust and tilt.
+
+    A direction tilted by more than `tilt_max_rad` is turned back to that tilt in its own vertical
+    plane. Unless the vehicle certainly stands on the ground, thrust is at least a third of hover.
+    """
+    least_mps2 = 0.0 if on_ground else vehicle.thrust_min_mps2
+    thrust = min(max(command.thrust_mps2, least_mps2), vehicle.thrust_max_mps2)
+    north, east, down = command.thrust_direction_ned
+    lateral = math.hypot(north, east)
+    if math.atan2(lateral, down) > vehicle.tilt_max_rad:
+        # a direction that is exactly vertical is tilted to the north (atan2 of zeros)
+        towards_rad, scale = math.atan2(east, north), math.sin(vehicle.tilt_max_rad)
+        north, east = scale * math.cos(towards_rad), scale * math.sin(towards_rad)
+        down = math.cos(vehicle.tilt_max_rad)
+    return Command(thrust, (north, east, down), command.course_rad)
+
+
+# ---------------------------------------------------------------------- sending
+
+
+def send_command(
+    flight: FlightState,
+    time_s: float,
+    command: Command,
+    body_z_down: float | None = None,
+    *,
+    age_s: float = 0.0,
+    late_s: float = 0.0,
+) -> Command:
+    """Send an attitude setpoint and return it as it was sent.
+
+    `age_s` and `late_s` are those of the decision (see `admit`), `body_z_down` is
+    described in `AttitudeTarget`. Raises Refused; then nothing is sent.
+    """
+    model = flight.model
+    command = _admitted(flight, command, age_s, late_s)
+    set_command(flight, time_s, command)
+    flight.commands.append(command)
+    flight.setpoint_s = flight.now_s
+    flight.thrusts.append(min(command.thrust_mps2 / model.thrust_max_mps2, 1.0))
+    if flight.identification:
+        flight.identification.on_command(flight.sent_s(time_s), command)
+    outbox.send(
+        flight,
+        AttitudeTarget(
+            time_s=time_s,
+            thrust_mps2=command.thrust_mps2,
+            thrust_direction_ned=command.thrust_direction_ned,
+            course_rad=command.course_rad,
+            hover_thrust=model.hover_thrust,
+            gravity_mps2=model.gravity_mps2,
+            body_z_down=body_z_down,
+        ),
+    )
+    return command
+
+
+def send_level(flight: FlightState, time_s: float, command: Command) -> None:
+    """Send a setpoint that no decision was needed for, if the vehicle is ours."""
+    with suppress(Refused):
+        send_command(flight, time_s, command)
+
+
+def set_command(flight: FlightState, time_s: float, command: Command) -> None:
+    """Note the command in force without sending it, for example the autopilot's own."""
+    flight.command = command
+    flight.observer.on_command(flight.sent_s(time_s), command)
+
+
+def send_position(
+    flight: FlightState,
+    time_s: float,
+    command: PositionCommand,
+    *,
+    age_s: float = 0.0,
+    late_s: float = 0.0,
+) -> PositionCommand:
+    """Send a setpoint for the autopilot's position loop; see `send_command`.
+
+    The attitude that this loop commands is unknown, therefore the observer stops predicting
+    with commands.
+    """
+    command = _admitted(flight, command, age_s, late_s)
+    flight.observer.freeze(True)
+    flight.setpoint_s = flight.now_s
+    flight.thrusts.clear()  # the autopilot chooses the thrust
+    flight.command = Command(flight.model.gravity_mps2, LEVEL, command.course_rad)
+    outbox.send(
+        flight,
+        PositionTarget(
+            time_s,
+            command.position_ned_m,
+            command.velocity_ned_mps,
+            command.acceleration_ned_mps2,
+            command.course_rad,
+            command.course_rate_radps,
+        ),
+    )
+    return command
+
+
+def hover_mps2(flight: FlightState) -> float:
+    """Thrust that holds the weight, by the observer's estimate of the hover thrust."""
+    model = flight.model
+    share = flight.observer.hover_thrust_estimate / model.hover_thrust
+    return (share if math.isfinite(share) else 1.0) * model.gravity_mps2
+
+
+@overload
+def _admitted(flight: FlightState, command: Command, age_s: float, late_s: float) -> Command: ...
+@overload
+def _admitted(
+    flight: FlightState, command: PositionCommand, age_s: float, late_s: float
+) -> PositionCommand: ...
+def _admitted(
+    flight: FlightState, command: Command | PositionCommand, age_s: float, late_s: float
+) -> Command | PositionCommand:
+    return admit(
+        command,
+        flight.model,
+        ours=flight.ours,
+        on_ground=flight.contact.certain,
+        age_s=age_s,
+        age_limit_s=flight.limits.setpoint_age_s,
+        late_s=late_s,
+    )

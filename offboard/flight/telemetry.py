@@ -1,0 +1,198 @@
+"""What each received message changes in a flight. Sends nothing but answers."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from offboard.flight import outbox
+from offboard.flight.authority import Authority
+from offboard.flight.ground_contact import GroundContact
+from offboard.flight.hover_estimate import HoverEstimate
+from offboard.flight.manifest import vehicle_record
+from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, WAITING, Phase
+from offboard.flight.position_jumps import PositionJumps
+from offboard.flight.preflight import ParameterReading
+from offboard.flight.requests import Circumstances, Request, Result, answer
+from offboard.flight.rows import other_sender
+from offboard.flight.starting import can_take_over, usable
+from offboard.flight.state import FlightState
+from offboard.mavlink.dialects.base import ThrustRule
+from offboard.mavlink.events import (
+    Attitude,
+    ClockBehind,
+    CommandRequest,
+    Event,
+    Heartbeat,
+    LocalPosition,
+    ModeReport,
+    OtherCompanion,
+    PeerChanged,
+    Rebooted,
+    ThrustReport,
+    TimesyncReply,
+    VehicleFound,
+)
+from offboard.mavlink.outgoing import CommandResult
+from offboard.model.frames import thrust_direction_from_quaternion
+
+SAME_THRUST = 1e-5  # of full throttle: rounding on the link
+
+
+def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: float) -> None:
+    """`arrived_s` is the host time of the event's arrival, `turned_s` that of the turn."""
+    flight.now_s = flight.session.link_time_s
+    flight.vehicle.update(event, flight.now_s)
+    match event:
+        case Attitude(time_s, attitude, rates) if not flight.vehicle.repeated:
+            _on_telemetry(flight, time_s, arrived_s, turned_s)
+            flight.observer.on_attitude(time_s, attitude, rates)
+            if flight.identification:
+                flight.identification.on_attitude(time_s, attitude)
+        case LocalPosition() if not flight.vehicle.repeated:
+            _on_telemetry(flight, event.time_s, arrived_s, turned_s)
+            _on_position(flight, event)
+        case ThrustReport(thrust):
+            flight.hover.on_thrust(flight.time_s, thrust, thrust * _lifting_share(flight))
+            flight.follows_others = _is_of_others(flight, thrust)
+        case Heartbeat(mode) | ModeReport(mode):
+            _on_mode(flight, event, mode, arrived_s)
+        case TimesyncReply():
+            flight.clock.on_reply(event)
+        case CommandRequest():
+            _answer(flight, event)
+        case VehicleFound():
+            outbox.send(flight, vehicle_record(event))
+        case PeerChanged(peer):
+            outbox.announce(flight, f"the vehicle now sends from another port: {peer}")
+        case OtherCompanion(system, component):
+            outbox.announce_once(
+                flight,
+                f"another companion computer is on the link: system {system} component "
+                f"{component}; only one of them may send setpoints",
+            )
+        case ClockBehind(system_id, _):  # its time stamps follow ours once it has heard us
+            outbox.announce_once(
+                flight, f"the signing time of system {system_id} is behind: sending ours"
+            )
+        case Rebooted():
+            _on_reboot(flight)
+
+
+def _is_of_others(flight: FlightState, thrust: float) -> bool:
+    """Whether the vehicle demands a thrust that no recent setpoint of ours had. False on
+    ArduCopter, which does not report the thrust of the setpoint."""
+    if flight.dialect is None or flight.dialect.thrust_rule is not ThrustRule.COLLECTIVE:
+        return False
+    return bool(flight.thrusts) and all(abs(thrust - t) > SAME_THRUST for t in flight.thrusts)
+
+
+def _lifting_share(flight: FlightState) -> float:
+    """Vertical part of the thrust that the autopilot reports: the cosine of the tilt, unless it
+    reports it before it is raised for the tilt."""
+    attitude, dialect = flight.vehicle.attitude, flight.dialect
+    if attitude is None or dialect is None or dialect.thrust_rule is not ThrustRule.COLLECTIVE:
+        return 1.0
+    return float(thrust_direction_from_quaternion(np.array(attitude.attitude))[2])
+
+
+def _on_telemetry(flight: FlightState, stamp_s: float, arrived_s: float, turned_s: float) -> None:
+    flight.telemetry_arrived_s = arrived_s
+    # A stream says only how early it may have arrived: after a pause of ours it would be ahead
+    host_s = turned_s if flight.session.settings.stream else arrived_s
+    flight.clock.on_telemetry(stamp_s, flight.session.clock_s(host_s))
+
+
+def _on_position(flight: FlightState, event: LocalPosition) -> None:
+    time_s, down_mps = event.time_s, event.velocity_ned_mps[2]
+    _follow_jump(flight, event)
+    flight.contact.on_position(event)
+    flight.hover.on_position(time_s, flight.contact.height_m, down_mps)
+    if flight.touchdown:
+        flight.touchdown.on_position(time_s, event.position_ned_m, down_mps)
+    flight.observer.on_position(time_s, event.position_ned_m, event.velocity_ned_mps)
+    if flight.identification:
+        north, east, down = np.subtract(event.position_ned_m, flight.jumps.total_ned_m).tolist()
+        flight.identification.on_position(time_s, (north, east, down), event.velocity_ned_mps)
+
+
+def _follow_jump(flight: FlightState, event: LocalPosition) -> None:
+    """The vehicle does not step when its estimate does."""
+    jump_ned_m = flight.jumps.on_position(event)
+    if jump_ned_m is not None:
+        flight.move_ground(jump_ned_m.tolist())
+    if flight.phase not in TRACKING:
+        flight.jumps.forget()
+    elif jump_ned_m is not None:
+        back_s = flight.plan.follow_jump(event.time_s, jump_ned_m)
+        outbox.announce(
+            flight,
+            f"the estimated position jumped by {np.linalg.norm(jump_ned_m):.2f} m: the "
+            f"reference jumps with it, and returns within {back_s:.0f} s",
+        )
+
+
+def _on_mode(
+    flight: FlightState, event: Heartbeat | ModeReport, mode: str, arrived_s: float
+) -> None:
+    if flight.authority is None:
+        flight.dialect = flight.session.dialect
+        assert flight.dialect is not None
+        flight.authority = Authority(flight.dialect.engage_mode)
+    assert flight.dialect is not None
+    vehicle = flight.vehicle
+    flight.authority.loss = flight.dialect.setpoint_loss(vehicle.parameters)
+    flight.authority.on_mode(
+        mode,
+        flight.now_s,
+        arrived_s=arrived_s,
+        failsafe=vehicle.in_failsafe,
+        heartbeat=isinstance(event, Heartbeat),
+        starved=flight.starved,
+        sticks=vehicle.sticks,
+    )
+    ours = mode == flight.authority.engage_mode
+    contact = flight.contact
+    flies, switched = contact.in_the_air, ours and flight.pilot.elsewhere
+    flight.pilot.on_mode(ours=ours, in_the_air=flies, certainly=contact.certainly_flies)
+    why = "" if flight.pilot.engaged or not flies else "the vehicle may stand on the ground"
+    if flight.pilot.engaged and other_sender(flight):
+        flight.pilot.engaged = False  # it was not switched for us
+        why = "another program sends setpoints"
+    if switched and why and flight.phase in WAITING:
+        outbox.announce(flight, f"not engaged: {mode}, but {why}")
+    if isinstance(event, Heartbeat):
+        flight.pilot.on_heartbeat(ours=ours, failsafe=flight.vehicle.in_failsafe)
+
+
+def _answer(flight: FlightState, asked: CommandRequest) -> None:
+    """Acknowledge a command to us; the next tick does what it asks for."""
+    result = Result.UNSUPPORTED
+    if flight.service:
+        fit = flight.phase is Phase.STANDBY and usable(flight)
+        circumstances = Circumstances(
+            flight.phase,
+            flight.vehicle.armed,
+            flight.service.arms,
+            fit,
+            fit and can_take_over(flight),
+        )
+        result, request = answer(asked.command, asked.parameters, circumstances)
+        if request is not Request.NONE:
+            flight.request = request
+            sender = f"system {asked.system_id} component {asked.component_id}"
+            outbox.announce(flight, f"{request.value} requested by {sender}")
+    outbox.send(flight, CommandResult(asked.command, result, asked.system_id, asked.component_id))
+
+
+def _on_reboot(flight: FlightState) -> None:
+    """Nothing that was known of vehicle and link is known any more."""
+    flight.observer.reset()
+    flight.clock.reset()
+    flight.contact = GroundContact(flight.vehicle)
+    flight.hover, flight.jumps = HoverEstimate(), PositionJumps()
+    flight.reading = ParameterReading()
+    flight.takeoff_ned_m = None  # the local frame begins elsewhere
+    if flight.authority and flight.phase not in BEFORE_FLIGHT:
+        flight.authority.forget(flight.now_s)
+    else:
+        flight.authority = None
