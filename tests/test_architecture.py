@@ -30,7 +30,7 @@ def test_only_the_clock_reads_the_time() -> None:
 
 
 def test_only_the_edges_open_sockets() -> None:
-    links = {f"simulator/link/{name}.py" for name in ("links", "tcp", "udp")}
+    links = {f"simulator/link/{name}.py" for name in ("links", "sockets")}
     opening = ("connection", "lock", "stream", "stream_sources", "udp")
     edges = {f"offboard/link/{name}.py" for name in opening}
     supervisor = {f"offboard/supervisor/{name}.py" for name in ("supervisor", "process")}
@@ -98,7 +98,7 @@ def test_top_level_holds_only_what_the_layout_names() -> None:
 
 # Words that hide what is meant; a domain thing has its standard term (CONTRIBUTING.md, "Words")
 UNWANTED = re.compile(
-    r"\b(Hangar|Berth|Crew|sortie|Duties|Emission|Belief|Learner|Happening|earthbound|manners)\b"
+    r"\b(Hangar|Berth|Crew|sortie|Duties|Emission|Belief|Happening|earthbound|manners)\b"
     r'|^\s*"""Of ',
     re.I | re.M,
 )

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any, TypeVar, get_args
 
 import yaml
 from pydantic import BaseModel, ValidationError
+from yaml.representer import SafeRepresenter
 
 from offboard.documents.errors import DocumentError as DocumentError
 from offboard.documents.errors import abridged, shown
@@ -62,6 +63,9 @@ class Section(dict[str, Any]):
     def __init__(self, values: Mapping[str, Any], places: Mapping[str, str] | None = None) -> None:
         super().__init__(values)
         self.places = dict(places or getattr(values, "places", {}))
+
+
+yaml.add_representer(Section, SafeRepresenter.represent_dict, Dumper=yaml.SafeDumper)
 
 
 def parse(text: str, model: type[M], source: str, kind: str = "") -> M:
