@@ -71,7 +71,7 @@ def launch(options: Options, stopping: Stop) -> int:
 
 
 def _companion_link(options: Options) -> str:
-    """Of the first instance."""
+    """Ports of the first instance."""
     return options.connect or f"udpout:127.0.0.1:{COMPANION_PORT + options.numbers[0]}"
 
 

@@ -55,7 +55,7 @@ def _longest_s(stamps: Array) -> float:
 
 
 def _setpoints(flown: History) -> dict[str, float]:
-    """Of the setpoints up to the landing."""
+    """Figures of the setpoints up to the landing."""
     end_s = begin_times(flown.phases).get("land", math.inf)
     rows = flown.setpoint[flown.setpoint[:, 0] < end_s, :2]
     if len(rows) < 2:

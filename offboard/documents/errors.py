@@ -43,9 +43,9 @@ def located(error: BaseException) -> str:
 
 
 def _is_file(name: str) -> bool:
-    """Whether it is neither of the standard library nor of no file."""
+    """Whether it is neither of the standard library, or of its backport, nor of no file."""
     standard = name.startswith(_STANDARD) and "site-packages" not in name
-    return not (standard or name.startswith("<"))
+    return not (standard or name.startswith("<") or "importlib_metadata" in name)
 
 
 @contextmanager

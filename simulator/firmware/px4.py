@@ -266,7 +266,7 @@ class Px4(Firmware):
             # jerk is limited in the real one (MPC_JERK_AUTO), which lowers both on average
             speeding_mps2=0.7 * parameter("MPC_ACC_HOR"),
             braking_mps2=0.5 * parameter("MPC_ACC_HOR"),
-            vertical_mps2=0.7 * parameter("MPC_ACC_DOWN_MAX"),
+            vertical_mps2=0.5 * parameter("MPC_ACC_DOWN_MAX"),
             facing_mps=parameter("MPC_XY_P") * parameter("NAV_ACC_RAD"),
         )
 

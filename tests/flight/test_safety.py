@@ -312,7 +312,8 @@ def test_the_volume_is_kept(limits: dict[str, float], says: str, fly: Fly) -> No
     assert "the take-off point" in outcome.sentence
     assert list(pair.failsafes) == ["volume"]
     far_m = max(float((m.position_ned_m[:2] ** 2).sum() ** 0.5) for m in watch.moments)
-    assert watch.top_m < limits.get("ceiling_m", 3.0) + 1.0
+    # the autopilot brakes the climb with 2.5 m/s2 after it was asked to land
+    assert watch.top_m < limits.get("ceiling_m", 3.0) + 1.25
     assert far_m < limits.get("radius_m", 0.1) + 1.5
     assert not pair.instance.autopilot.commander.armed
 

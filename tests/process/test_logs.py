@@ -16,6 +16,8 @@ from offboard.run import configuration as config
 
 SCRIPTS = Path(sys.executable).parent
 
+ALL = ("--dialect", "all")  # the default one of these tools lacks CURRENT_MODE
+
 
 @pytest.fixture(scope="module")
 def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
@@ -50,7 +52,7 @@ def scored(flight: Path) -> dict[str, object]:
 
 
 def test_mavlogdump_counts_the_same_messages(flight: Path, scored: dict[str, object]) -> None:
-    dumped = tool("mavlogdump.py", "--format", "standard", str(flight / "flight.tlog"))
+    dumped = tool("mavlogdump.py", *ALL, "--format", "standard", str(flight / "flight.tlog"))
     counted = Counter(re.findall(r"^\d{4}-\d\d-\d\d [\d:.]+: (\w+) \{", dumped, re.MULTILINE))
     assert counted == scored["messages"]
 
@@ -64,8 +66,7 @@ def test_mavflightmodes_shows_the_same_modes(flight: Path, scored: dict[str, obj
 
 
 def test_mavloss_shows_no_loss(flight: Path) -> None:
-    dialect = ("--dialect", "all")  # its default one lacks CURRENT_MODE
-    shown = tool("mavloss.py", *dialect, str(flight / "flight.tlog"))
+    shown = tool("mavloss.py", *ALL, str(flight / "flight.tlog"))
     assert re.search(r"Total: \d+ packets, 0 lost 0\.0%", shown)
 
 
