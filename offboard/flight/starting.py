@@ -212,7 +212,9 @@ def stop_requested_on_ground(flight: FlightState) -> bool:
 
 
 def rises(flight: FlightState) -> bool:
-    return flight.contact.lifted_off
+    """Positions or the land detector show flight: an autopilot refuses to disarm then. PX4's
+    detector leaves the ground while the thrust is still well below hover."""
+    return flight.contact.lifted_off or flight.contact.detects_flight
 
 
 def disarmed_for_good(flight: FlightState) -> bool:
@@ -350,7 +352,11 @@ def starting(before: tuple[Phase, ...]) -> tuple[Transition, ...]:
             REFUSED,
         ),
         Transition(
-            (Phase.STAND_DOWN,), rises, Phase.LAND, "it lifted off as it was to disarm", ABORTED
+            (Phase.STAND_DOWN,),
+            rises,
+            Phase.LAND,
+            "flight is detected as it was to disarm",
+            ABORTED,
         ),
         Transition((Phase.STAND_DOWN,), rebooted, Phase.FAILED, REBOOTED, REFUSED),
         Transition((Phase.STAND_DOWN,), silent_for_long, Phase.FAILED, no_telemetry, REFUSED),

@@ -296,6 +296,8 @@ ROWS = (
         lambda pair: iter([pair.instance.autopilot.commander.armed]),
     ),
     stopped(Phase.TAKEOFF, 0.3, Phase.FAILED, stayed_down),
+    # its land detector reports flight before it lifts off
+    stopped(Phase.TAKEOFF, 0.5, Phase.DISARMED, landed),
     stopped(Phase.TAKEOFF, 1.5, Phase.DISARMED, landed),
     stopped(Phase.CLIMB, 0.5, Phase.DISARMED, landed),
     stopped(Phase.TRACK, 1.0, Phase.DISARMED, landed),

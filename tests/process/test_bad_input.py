@@ -448,7 +448,7 @@ def test_full_disk_before_a_flight(
 
 
 def test_full_disk_lands(tmp_path: Path) -> None:
-    process = with_full_disk(tmp_path, 250_000, "fly", "--sitl", "--out", "x", *SHORT)
+    process = with_full_disk(tmp_path, 380_000, "fly", "--sitl", "--out", "x", *SHORT)
     assert process.returncode == 4, process.stderr
     assert "flight.tlog cannot be written (File too large)" in process.stderr
     assert "Traceback" not in process.stderr
