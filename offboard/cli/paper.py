@@ -6,24 +6,24 @@ from typing import Annotated
 
 import typer
 
-from offboard.cli.shared import FLIGHTS, CommandError, Directory, Workers, err, option, say
+from offboard.cli.shared import FLIGHTS, CommandError, Directory, err, option, say
 
 
 def paper(
     out_directory: Directory = None,
-    quick: Annotated[bool, typer.Option("--quick", help="Fewer seeds; takes seconds.")] = False,
+    quick: Annotated[
+        bool, typer.Option("--quick", help="One seed; about 20 s instead of 4 minutes.")
+    ] = False,
     seeds: Annotated[int | None, option("N", "Flights per row.  [default: 20]")] = None,
     initial_q: Annotated[
         str | None, option("LIST", "diag(Q) of Eq. 23: 1 or 12 weights, separated by commas.")
     ] = None,
     figure: Annotated[list[str] | None, option("NAME", "Only this figure; repeatable.")] = None,
     table: Annotated[list[str] | None, option("NAME", "Only this table; repeatable.")] = None,
-    workers: Workers = None,
 ) -> None:
     """Reproduce tables 2-4 and figures 4-17 of the paper on one page."""
     from offboard.link import clock
-    from offboard.paper.study.options import PaperOptions
-    from offboard.paper.study.run import reproduce
+    from offboard.paper.study import PaperOptions, reproduce
 
     try:
         weights = None if initial_q is None else tuple(float(w) for w in initial_q.split(","))
@@ -38,10 +38,8 @@ def paper(
         initial_q=weights,
         figures=tuple(figure or ()),
         tables=tuple(table or ()),
-        workers=workers,
     )
     outcome = reproduce(options, err)
     say(f"written: {outcome.page}", indent=2)
     if outcome.missing:
-        parts = "; ".join(f"{label}: {why}" for label, why in outcome.missing.items())
-        raise CommandError(f"missing: {parts}", 1)
+        raise CommandError(f"interrupted; missing: {', '.join(outcome.missing)}", 1)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from offboard.model.axes import LinearModel, lateral_model, lead, vertical_model
 from offboard.model.vehicle import AxisResponse, Vehicle
@@ -79,22 +79,6 @@ def _solved(dynamics: bytes, input_map: bytes, effort: float, period_s: float) -
         state_cost=2.0 * (q + a.T @ terminal @ a),
         gain=gain[0],
     )
-
-
-def riccati(dynamics: ArrayLike, inputs: ArrayLike, fitness: ArrayLike, energy: ArrayLike,
-            cross: ArrayLike | None = None) -> Array:  # fmt: skip
-    """The stabilising solution P (n, n) of the discrete Riccati equation; x'Px is the optimal cost
-    from x on.
-
-    x(k+1) = A x + B u with dynamics A (n, n) and inputs B (n, m); stage cost
-    x'Qx + u'Ru + 2 x'Su with fitness Q, energy R, cross S (n, m). Raises numpy.linalg.LinAlgError
-    where no stabilising solution exists.
-    """
-    given = [np.asarray(matrix, np.float64) for matrix in (dynamics, inputs, fitness, energy)]
-    import control
-
-    solution: Array = control.dare(*given, S=cross)[0]
-    return solution
 
 
 def tilt_ripple(vehicle: Vehicle, period_s: float) -> Array:

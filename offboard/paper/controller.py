@@ -21,7 +21,7 @@ from offboard.model.linear import sampled_matrices
 from offboard.model.predicted_state import PredictedState
 from offboard.model.state import PHI, PSI, THETA, THRUST, P, R, U, W, X, Z
 from offboard.model.vehicle import Vehicle
-from offboard.paper.integral import ErrorIntegral
+from offboard.paper.extensions import ErrorIntegral
 from offboard.paper.law import (
     PAPER_ARM_M,
     PAPER_INERTIA_KGM2,
@@ -73,9 +73,8 @@ class PaperController:
             step_s=step_s,
             seed=seed,
         )
-        self._integral = ErrorIntegral(settings.integral, step_s) if settings.integral else None
-        self._held = False  # whether the last input was at its bound: the integral waits
         self._exact = ExactMinimum(len(lower))
+        self.reset()
 
     def decide(self, situation: Situation) -> Decision:
         target = situation.reference.sample(situation.state.time_s + self._step_s)
@@ -92,10 +91,10 @@ class PaperController:
         return Decision(self._command(move, state, float(target.course_rad)), certificate)
 
     def reset(self) -> None:
+        integral = self._settings.integral
         self._law.reset()
-        self._held = False
-        if self._integral:
-            self._integral.reset()
+        self._integral = ErrorIntegral(integral, self._step_s) if integral else None
+        self._held = False  # whether the last input was at its bound: the integral waits
 
     def _summed(self, situation: Situation) -> Array | None:
         """The integral (4,) in the heading frame; summed in NED, where a wind is constant."""

@@ -1,7 +1,9 @@
 """The paper's law on any plant of Eq. 14: settings, and one input u(k) per state and reference.
 
-Beyond the paper, and off by default: an integral term in the cost and limits on the state, which
-its conclusions propose. Knows no vehicle and no autopilot.
+J(u) = e'Qe + (u_nom - u)'R(u_nom - u) + (u - u(k-1))'R_du(u - u(k-1)),  e = x_ref(k+1) - A x - B u
+
+is Eq. 21, a quadratic in u; the swarm searches its minimum within the bounds of Eq. 22. Knows no
+vehicle and no autopilot.
 """
 
 from __future__ import annotations
@@ -16,15 +18,14 @@ from scipy.linalg import block_diag
 from offboard.control.quadratic import BoxQuadratic
 from offboard.control.swarm import SwarmResult, SwarmSettings, minimise
 from offboard.documents.parameters import Parameters
-from offboard.paper.integral import (
+from offboard.paper.extensions import (
     INTEGRATED,
     IntegralSettings,
+    LimitedBox,
+    StateLimits,
     Weight,
-    augmented,
-    augmented_reference,
+    with_error_sum,
 )
-from offboard.paper.one_step import OneStep
-from offboard.paper.state_limits import LimitedBox, StateLimits
 
 Array = NDArray[np.float64]
 
@@ -92,9 +93,9 @@ class PaperLaw:
     """The law on any plant of Eq. 14: dynamics (12, 12), inputs (12, 4), lower and upper (4,).
 
     Remembers the last input (for R_du) and the random stream; `reset` forgets both. `terminal`
-    (12, 12) replaces diag(Q), for instance by `cost_to_go` of the same weights. The integral is
-    summed by the caller, who knows the frame (`ErrorIntegral`). Raises ValueError where this plant
-    cannot keep the limits of the settings.
+    (12, 12) replaces diag(Q): with the Riccati solution of the same weights the minimum is optimal
+    over an infinite horizon. The integral is summed by the caller, who knows the frame
+    (`ErrorIntegral`). Raises ValueError where this plant cannot keep the limits of the settings.
     """
 
     def __init__(
@@ -108,27 +109,30 @@ class PaperLaw:
         step_s: float = PAPER_STEP_S,
         seed: int = 0,
     ) -> None:
-        weight = np.diag(settings.fitness) if terminal is None else terminal
-        self._step_s = step_s
+        self._settings, self._seed = settings, seed
         self._lower = np.array(settings.lower if lower is None else lower, np.float64)
         self._upper = np.array(settings.upper if upper is None else upper, np.float64)
+        weight = np.diag(settings.fitness) if terminal is None else terminal
         self._limits = (
             LimitedBox(dynamics, inputs, settings.limits, self._lower, self._upper)
             if settings.limits
             else None
         )
-        self._integral = settings.integral
+        self._extend_reference: Array | None = None
         if settings.integral:
-            dynamics, inputs = augmented(dynamics, inputs, step_s)
+            dynamics, inputs, self._extend_reference = with_error_sum(dynamics, inputs, step_s)
             weight = block_diag(weight, np.diag(settings.integral.weights))
-        self._step = OneStep(
-            dynamics, inputs, weight, np.diag(settings.energy), np.diag(settings.rate)
-        )
-        self._keep_constant = settings.keep_constant
-        self._swarm, self._seed = settings.swarm, seed
-        self._rng = np.random.default_rng(seed)
+        self._dynamics, self._inputs, self._weight = dynamics, inputs, weight
+        self._energy, self._rate = np.diag(settings.energy), np.diag(settings.rate)
+        curvature = inputs.T @ weight @ inputs + self._energy + self._rate
+        self._hessian = curvature + curvature.T
         self._hover = np.zeros(len(self._lower))
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the last input and start the random stream anew."""
         self._previous = self._hover
+        self._rng = np.random.default_rng(self._seed)
 
     def move(
         self,
@@ -138,33 +142,33 @@ class PaperLaw:
         *,
         integral: Array | None = None,
         nominal: Array | None = None,
-        keep_history: bool = False,
     ) -> Move:
         """u(k) for the state x(k) (12,) towards x_ref(k+1) (12,), Eq. 27.
 
         `integral` (4,) is the summed error xi(k), used where the settings weigh it; `nominal` (4,)
-        is u_nom, by default hover. See `swarm.minimise` for the other arguments.
+        is u_nom, by default hover; `remaining_s` as in `swarm.minimise`.
         """
-        lower, upper = self._lower, self._upper
-        if self._limits:
-            lower, upper = self._limits.narrow(state)
+        bounds = self._limits.narrow(state) if self._limits else (self._lower, self._upper)
         whole = state
-        if self._integral:
+        if self._extend_reference is not None:
             summed = np.zeros(len(INTEGRATED)) if integral is None else integral
             whole = np.concatenate([state, summed])
-            reference_next = augmented_reference(reference_next, self._step_s)
-        problem = self._step.problem(
-            whole, reference_next, self._hover if nominal is None else nominal, self._previous,
-            lower, upper, keep_constant=self._keep_constant,
-        )  # fmt: skip
-        result = minimise(
-            self._swarm, problem, self._rng, remaining_s=remaining_s, keep_history=keep_history
-        )
+            reference_next = self._extend_reference @ reference_next
+        nominal = self._hover if nominal is None else nominal
+        problem = BoxQuadratic(self._hessian, *self._slope(whole, reference_next, nominal), *bounds)
+        result = minimise(self._settings.swarm, problem, self._rng, remaining_s=remaining_s)
         self._previous = result.best
-        following = self._step.predict(whole, result.best)[: len(state)]
-        return Move(result.best, following, problem, result)
+        following = whole @ self._dynamics.T + result.best @ self._inputs.T
+        return Move(result.best, following[: len(state)], problem, result)
 
-    def reset(self) -> None:
-        """Forget the last input and start the random stream anew."""
-        self._previous = self._hover
-        self._rng = np.random.default_rng(self._seed)
+    def _slope(self, state: Array, reference_next: Array, nominal: Array) -> tuple[Array, float]:
+        """Gradient (4,) and constant of Eq. 21 at u = 0. The constant does not move the minimum,
+        but its rounding limits epsilon of Eq. 29: only with it is epsilon the paper's."""
+        previous = self._previous
+        error = self._dynamics @ state - reference_next
+        weighed = self._weight @ error
+        gradient = self._inputs.T @ weighed - self._energy @ nominal - self._rate @ previous
+        if not self._settings.keep_constant:
+            return 2.0 * gradient, 0.0
+        constant = error @ weighed + nominal @ self._energy @ nominal
+        return 2.0 * gradient, float(constant + previous @ self._rate @ previous)

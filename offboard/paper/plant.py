@@ -116,12 +116,6 @@ def follow(
         rk4_into(derivative_into, state, inputs, wind_ned, parameters, step_s, scratch, state)
 
 
-PLANTS: dict[PlantKind, type[LinearPlant | NonlinearPlant]] = {
-    PlantKind.LINEAR: LinearPlant,
-    PlantKind.NONLINEAR: NonlinearPlant,
-}
-
-
 def _delivered(inputs: Array, thrust_loss: float) -> Array:
     """Inputs (4,) that the rotors deliver: a fraction of the total thrust is missing."""
     delivered = inputs.copy()

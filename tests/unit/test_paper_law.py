@@ -25,8 +25,9 @@ from offboard.paper.controller import (
     heading_frame,
     input_scale,
 )
-from offboard.paper.integral import IntegralSettings
+from offboard.paper.extensions import ErrorIntegral, IntegralSettings
 from offboard.reference.base import FlatSample
+from offboard.run.configuration import load
 
 Array = NDArray[np.float64]
 
@@ -315,3 +316,77 @@ def test_every_decision_carries_its_certificate() -> None:
     assert certificate.cost == pytest.approx(certificate.optimal_cost, rel=1e-9)
     assert 0 < certificate.spread < 1e-6
     assert not certificate.at_bound
+
+
+def test_integral_sums_holds_and_stays_within_its_limits() -> None:
+    integral = ErrorIntegral(IntegralSettings(limits=(1.0, 1.0, 1.0, 1.0)), 0.1)
+    np.testing.assert_allclose(integral.add(np.array([1.0, -2.0, 0.0, 0.5])), [0.1, -0.2, 0, 0.05])
+    np.testing.assert_allclose(integral.add(np.ones(4), held=True), [0.1, -0.2, 0, 0.05])
+    np.testing.assert_allclose(integral.add(np.full(4, np.nan)), [0.1, -0.2, 0, 0.05])
+    np.testing.assert_allclose(integral.add(np.array([1e3, -1e3, 0, 0])), [1, -1, 0, 0.05])
+
+
+def body_z(roll: float, pitch: float) -> Array:
+    """The axis in NED, at course 0."""
+    level = np.cos(roll)
+    return np.array([np.sin(pitch) * level, -np.sin(roll), np.cos(pitch) * level])
+
+
+def flown_over_an_attitude_loop(
+    name: str, target_ned_m: Array, wind_ned_mps: Array, seconds: float
+) -> tuple[Array, Array, Array]:
+    """A shipped controller on the PX4 vehicle file: a point mass with drag behind a second-order
+    attitude loop. Positions, velocities and commanded thrust directions per decision, each (K, 3).
+    """
+    config = load("paper", choices={"controller": name})
+    vehicle = config.vehicle
+    controller = config.controller.build(vehicle, period_s=0.1, seed=1)
+    position, velocity, tilt, turning = (np.zeros(3) for _ in range(4))
+    command = Command(vehicle.gravity_mps2, (0.0, 0.0, 1.0), 0.0)
+    flown: list[tuple[Array, Array, Array]] = []
+    frequency, damping = vehicle.tilt.natural_frequency_radps, vehicle.tilt.damping
+    for tick in range(round(10 * seconds)):
+        state = PredictedState(
+            0.1 * tick, position, velocity, body_z(*tilt[:2]), np.zeros(3), 0.0, 0.0,
+            command.thrust_mps2, np.zeros(3), turning,
+        )  # fmt: skip
+        situation = Situation(0.1 * tick, state, Straight(target_ned_m, np.zeros(3), 0.0), command)
+        command = controller.decide(situation).command
+        north, east, down = command.thrust_direction_ned
+        asked = np.array([-np.arcsin(east), np.arctan2(north, down), 0.0])
+        flown.append((position, velocity, np.array(command.thrust_direction_ned)))
+        for _ in range(20):
+            turning = turning + 0.005 * (
+                frequency**2 * (asked - tilt) - 2 * damping * frequency * turning
+            )
+            tilt = tilt + 0.005 * turning
+            drag = vehicle.drag_per_mass_ps * (velocity - wind_ned_mps)
+            pull = -command.thrust_mps2 * body_z(*tilt[:2]) - drag
+            pull[2] += vehicle.gravity_mps2
+            velocity = velocity + 0.005 * pull
+            position = position + 0.005 * velocity
+    positions, velocities, directions = (np.array(part) for part in zip(*flown, strict=True))
+    return positions, velocities, directions
+
+
+def test_the_integral_holds_a_point_in_wind_over_an_attitude_loop() -> None:
+    wind = np.array([1.0, -0.5, 0.0])
+    ends = {
+        name: np.linalg.norm(flown_over_an_attitude_loop(name, np.zeros(3), wind, 150.0)[0][-1])
+        for name in ("paper", "paper_integral")
+    }
+    assert ends["paper_integral"] < 1e-3
+    assert ends["paper"] > 0.1
+
+
+def test_the_limited_law_keeps_speed_and_tilt_over_an_attitude_loop() -> None:
+    far = np.array([150.0, 80.0, -10.0])
+    limits = load("paper", choices={"controller": "paper_limited"}).controller.limits
+    _, fast, steep = flown_over_an_attitude_loop("paper", far, np.zeros(3), 20.0)
+    _, slow, level = flown_over_an_attitude_loop("paper_limited", far, np.zeros(3), 20.0)
+    assert np.abs(fast[:, :2]).max() > limits.speed_mps
+    assert np.abs(slow[:, :2]).max() <= limits.speed_mps
+    assert np.abs(slow[:, 2]).max() <= limits.climb_mps
+    tilts = np.abs([np.arcsin(level[:, 1]), np.arctan2(level[:, 0], level[:, 2])])
+    assert tilts.max() <= limits.tilt_rad
+    assert np.abs(np.arctan2(steep[:, 0], steep[:, 2])).max() > limits.tilt_rad

@@ -7,9 +7,7 @@ closed loop gives the time an error lasts.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,14 +15,12 @@ from scipy.linalg import block_diag
 from scipy.optimize import differential_evolution
 
 from offboard.analysis.figure import BLUE, GREY, INK, RED, Figure, curve, panels
-from offboard.control.gains import riccati
 from offboard.model.state import PHI, TAU_X, P, V, Y
+from offboard.paper.closed_loop import Flights, FlightTask, LawName, PathName, cost_to_go
+from offboard.paper.figures import position_error
 from offboard.paper.law import PAPER_STEP_S, PaperSettings
 from offboard.paper.plant import PlantKind, paper_model
-from offboard.paper.study.closed_loop import FlightTask, LawName
-from offboard.paper.study.figures import position_error
-from offboard.paper.study.page import Row, Table
-from offboard.paper.trajectory import PathName
+from offboard.paper.tables import Row, Table
 
 Array = NDArray[np.float64]
 Complexes = NDArray[np.complex128]
@@ -62,40 +58,6 @@ class Modes:
         }
 
 
-class _Problem:
-    """The stage cost of Eq. 21 on [x, u(k-1)] (n + m), because R_du weighs u(k) - u(k-1).
-
-    J = z'Qz + u'(R + R_du)u + 2 z'Su with z = [x, u(k-1)], Q = diag(fitness, R_du), S = [0, -R_du].
-    """
-
-    def __init__(
-        self, dynamics: Array, inputs: Array, fitness: Array, energy: Array, rate: Array
-    ) -> None:
-        count = inputs.shape[1]
-        self.a = block_diag(dynamics, np.zeros((count, count)))
-        self.b = np.vstack([inputs, np.eye(count)])
-        self.weight = block_diag(fitness, rate)
-        self.control_weight = energy + rate
-        self.cross = np.vstack([np.zeros_like(inputs), -rate])
-
-    def step(self, to_go: Array) -> tuple[Array, Array]:
-        """The feedback gain (m, n + m) for the cost to go after the step, and the one before it."""
-        curvature = self.control_weight + self.b.T @ to_go @ self.b
-        gain = np.linalg.solve(curvature, self.b.T @ to_go @ self.a + self.cross.T)
-        before = self.weight + self.a.T @ to_go @ self.a - gain.T @ curvature @ gain
-        return gain, 0.5 * (before + before.T)
-
-    def endless(self) -> Array:
-        """The cost to go of an infinite horizon."""
-        return riccati(self.a, self.b, self.weight, self.control_weight, self.cross)
-
-    def eigenvalues(self, to_go: Array) -> Complexes:
-        """Eigenvalues of the closed loop with this cost-to-go, largest magnitude first."""
-        gain, _ = self.step(to_go)
-        found = np.asarray(np.linalg.eigvals(self.a - self.b @ gain), np.complex128)
-        return found[np.argsort(-np.abs(found), kind="stable")]
-
-
 def receding(
     dynamics: Array,
     inputs: Array,
@@ -105,36 +67,50 @@ def receding(
     steps: int | None = None,
     terminal: Array | None = None,
 ) -> Complexes:
-    """Eigenvalues of the loop closed by the first input of the optimum over `steps` steps.
+    """Eigenvalues of the loop closed by the first input of the optimum over `steps` steps, largest
+    magnitude first.
 
     Eq. 21 at each step: fitness (n, n) weighs x(k+1) ... x(k+N), `terminal` replaces it at the
-    last; energy, rate (m, m). Without `steps` the horizon is infinite (Riccati).
+    last; energy, rate (m, m). Without `steps` the horizon is infinite. The state is z = [x, u(k-1)]
+    because R_du weighs u(k) - u(k-1): a stage costs z'Wz + u'(R + R_du)u + 2 z'Su.
     """
-    problem = _Problem(dynamics, inputs, fitness, energy, rate)
+    n, m = inputs.shape
+    a, b = block_diag(dynamics, np.zeros((m, m))), np.vstack([inputs, np.eye(m)])
+    weight, effort = block_diag(fitness, rate), energy + rate
+    cross = np.vstack([np.zeros((n, m)), -rate])
     if steps is None:
-        return problem.eigenvalues(problem.endless())
-    to_go = block_diag(fitness if terminal is None else terminal, np.zeros_like(rate))
-    for _ in range(steps - 1):
-        _, to_go = problem.step(to_go)
-    return problem.eigenvalues(to_go)
+        import control  # takes a second: only where something is designed
+
+        to_go = control.dlqr(a, b, weight, effort, cross)[1]
+    else:
+        to_go = block_diag(fitness if terminal is None else terminal, np.zeros((m, m)))
+    for remaining in range(steps or 1, 0, -1):
+        curvature = effort + b.T @ to_go @ b
+        gain = np.linalg.solve(curvature, b.T @ to_go @ a + cross.T)
+        if remaining > 1:
+            before = weight + a.T @ to_go @ a - gain.T @ curvature @ gain
+            to_go = 0.5 * (before + before.T)
+    found = np.asarray(np.linalg.eigvals(a - b @ gain), np.complex128)
+    return found[np.argsort(-np.abs(found), kind="stable")]
 
 
-def study(settings: PaperSettings, first: PaperSettings) -> list[Modes]:
+def modes_by_law(first: PaperSettings) -> list[Modes]:
     """One step with both of the paper's weights, without R and R_du, cost-to-go, N = 1 ... 20."""
+    final = PaperSettings()
     a, b = paper_model()
-    q, r, s = (np.diag(part) for part in (settings.fitness, settings.energy, settings.rate))
+    q, r, s = (np.diag(part) for part in (final.fitness, final.energy, final.rate))
     q0, r0, s0 = (np.diag(part) for part in (first.fitness, first.energy, first.rate))
     modes = [
         Modes("one step, first weights", receding(a, b, q0, r0, s0, 1)),
         Modes("one step, Eqs. 33-35", receding(a, b, q, r, s, 1)),
         Modes("one step, Eq. 33, R = R_Δu = 0", receding(a, b, q, 0 * r, 0 * s, 1)),
-        Modes("cost-to-go, Eqs. 33-35", receding(a, b, q, r, s, 1, riccati(a, b, q, r))),
+        Modes("cost-to-go, Eqs. 33-35", receding(a, b, q, r, s, 1, cost_to_go(final))),
     ]
     modes += [Modes(f"N = {n}", receding(a, b, q, r, s, n)) for n in range(1, LONGEST + 1)]
     return [*modes, Modes("N = ∞", receding(a, b, q, r, s))]
 
 
-def horizon_table(modes: Sequence[Modes]) -> Table:
+def horizon_table(flights: Flights) -> Table:
     """Slowest eigenvalues and time constants of the closed loops."""
     rows = [
         {
@@ -142,7 +118,7 @@ def horizon_table(modes: Sequence[Modes]) -> Table:
             **mode.row(),
             "four_slowest": ", ".join(map(_text, mode.eigenvalues[:4])),
         }
-        for mode in modes
+        for mode in modes_by_law(flights.first)
     ]
     notes = (
         "Position is four integrations from torque: in one step of 0.1 s a newton moves it by "
@@ -153,9 +129,9 @@ def horizon_table(modes: Sequence[Modes]) -> Table:
     return Table("Closed loop by objective and horizon", columns, rows, notes)
 
 
-def horizon_figure(modes: Sequence[Modes]) -> Figure:
+def horizon_figure(flights: Flights) -> Figure:
     """Slowest time constant over the horizon."""
-    by_name = {mode.name: mode.time_constant_s for mode in modes}
+    by_name = {mode.name: mode.time_constant_s for mode in modes_by_law(flights.first)}
     steps = list(range(1, LONGEST + 1))
     drawing = panels(("slowest time constant, s",), "horizon N, steps of 0.1 s", panel_px=300)
     values = [by_name[f"N = {n}"] for n in steps]
@@ -169,27 +145,22 @@ def horizon_figure(modes: Sequence[Modes]) -> Figure:
     return Figure("Slowest time constant of the closed loop", drawing, caption)
 
 
-def law_tasks() -> dict[tuple[str, LawName, PlantKind], FlightTask]:
-    """(offset or tour, law, plant) -> hover from 1 m off, or the path of Figs. 5-6."""
-    tasks: dict[tuple[str, LawName, PlantKind], FlightTask] = {}
-    for law in LawName:
-        for plant in PlantKind:
-            tasks["tour", law, plant] = FlightTask(PaperSettings(), plant, law=law)
-            tasks["offset", law, plant] = FlightTask(
-                PaperSettings(), plant, PathName.HOVER, law, start_offset_m=(1.0, 0.0, 0.0)
-            )
-    return tasks
-
-
-def laws_figure(results: Mapping[Any, Any]) -> Figure:
-    """Both laws flown: position errors over time of `law_tasks`; "modes" is the `study`."""
+def laws_figure(flights: Flights) -> Figure:
+    """Both laws flown, from 1 m off at hover and along the path of Figs. 5-6: position errors."""
     titles = {"offset": "1 m off at hover: position error, m", "tour": "tour: position error, m"}
     drawing = panels(list(titles.values()), "t, s", panel_px=240)
     for panel, kind in enumerate(titles, 1):
         for law, colour in ((LawName.ONE_STEP, RED), (LawName.COST_TO_GO, BLUE)):
             for plant in PlantKind:
-                position_error(drawing, panel, results[kind, law, plant], law, plant, colour)
-    (slow_s,) = (m.time_constant_s for m in results["modes"] if m.name == "one step, Eqs. 33-35")
+                task = FlightTask(PaperSettings(), plant, law=law)
+                if kind == "offset":
+                    task = replace(task, path=PathName.HOVER, start_offset_m=(1.0, 0.0, 0.0))
+                position_error(drawing, panel, flights(task), law, plant, colour)
+    (slow_s,) = (
+        modes.time_constant_s
+        for modes in modes_by_law(flights.first)
+        if modes.name == "one step, Eqs. 33-35"
+    )
     times = np.linspace(0.0, 100.0, 50)
     curve(
         drawing, 1, times, np.exp(-times / slow_s), f"model: e^(-t / {slow_s:.1f} s)", GREY, "dash"
@@ -202,8 +173,9 @@ def laws_figure(results: Mapping[Any, Any]) -> Figure:
     return Figure("One step and cost-to-go, flown", drawing, caption)
 
 
-def weights_table(settings: PaperSettings) -> Table:
+def weights_table(_: Flights) -> Table:
     """What diagonal weights alone achieve in one step: the lateral loop with y over v 1 to 80."""
+    settings = PaperSettings()
     a, b = paper_model()
     a, b = a[np.ix_(_LATERAL, _LATERAL)], b[_LATERAL, TAU_X : TAU_X + 1]
     fitness = np.array(settings.fitness)[_LATERAL]

@@ -1,0 +1,214 @@
+"""`offboard paper`: every table and figure of the study, written one after another, and their page.
+
+The run is serial; each table and figure takes its flights from one `Flights`, which flies each
+flight once. An interrupted run keeps what it has written; the page shows it and names the rest.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import tempfile
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import partial
+from importlib import metadata
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+from offboard.analysis.figure import Figure
+from offboard.analysis.page import render
+from offboard.documents.errors import UserError
+from offboard.paper import errata, figures, horizon, tables
+from offboard.paper.closed_loop import Flights
+from offboard.paper.law import PaperSettings
+from offboard.paper.printed import DOI
+from offboard.paper.tables import Table, shown
+
+PAGE = "paper.html"
+TITLE = "Linear controller design with PSO for UAV trajectory tracking: printed and computed"
+# Section of the page -> its tables and figures in reading order, and what makes each
+SECTIONS: dict[str, dict[str, Callable[[Flights], Table | Figure]]] = {
+    "Tables of the paper": {
+        "table 2": tables.table_2, "figure gap": figures.gap_by_damping,
+        "table 3": tables.table_3, "table 4": tables.table_4,
+    },
+    "Figures of the paper": {
+        "figure 4": figures.search_motion, "figure 5": figures.reference_states,
+        "figure 6": figures.reference_path,
+        **{f"figure {number}": partial(figures.flown_figure, number) for number in figures.FLOWN},
+    },
+    "Errata, with computed evidence": {
+        "table errata": errata.errata_table, "table bd": errata.bd_table,
+    },
+    "One step compared with longer horizons": {
+        "table horizon": horizon.horizon_table, "figure horizon": horizon.horizon_figure,
+        "figure laws": horizon.laws_figure, "table weights": horizon.weights_table,
+    },
+    "Extensions that the conclusions propose": {
+        "table integral": tables.integral_table, "figure integral": figures.integral_figure,
+        "table limits": tables.limits_table, "figure limits": figures.limits_figure,
+    },
+}  # fmt: skip
+MAKERS = {label: make for pieces in SECTIONS.values() for label, make in pieces.items()}
+SEEDS, QUICK_SEEDS, MOST_SEEDS = 20, 1, 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class PaperOptions:
+    """Options of `offboard paper`.
+
+    Args:
+        out: output directory; created if absent, else empty.
+        quick: one seed, and the nonlinear plant of Table 2 at three lambdas only.
+        seeds: flights per row of a table; None: 20, or 1 if quick.
+        initial_q: diag(Q) of the first configuration (Eq. 23, whose values are not printed):
+            twelve weights, or one for all; None: the identity.
+        figures, tables: names as in "figure 4", "table bd"; both empty: everything.
+    """
+
+    out: Path
+    quick: bool = False
+    seeds: int | None = None
+    initial_q: tuple[float, ...] | None = None
+    figures: tuple[str, ...] = ()
+    tables: tuple[str, ...] = ()
+
+    @property
+    def seed_count(self) -> int:
+        return self.seeds if self.seeds is not None else QUICK_SEEDS if self.quick else SEEDS
+
+    @property
+    def first_settings(self) -> PaperSettings:
+        """The first configuration (section 4.1), at lambda = 1."""
+        first = PaperSettings.first_configuration()
+        if self.initial_q is None:
+            return first
+        diagonal = self.initial_q * 12 if len(self.initial_q) == 1 else self.initial_q
+        return first.model_copy(update={"fitness": diagonal})
+
+    @property
+    def labels(self) -> tuple[str, ...]:
+        """The tables and figures to make ("table 2", "figure gap"), tables first."""
+        chosen = [f"table {name}" for name in self.tables]
+        chosen += [f"figure {name}" for name in self.figures]
+        return tuple(dict.fromkeys(chosen)) or (*known("table"), *known("figure"))
+
+
+@dataclass(slots=True)
+class Outcome:
+    """The page, and label -> table or figure; `missing` are the labels that an interrupt left."""
+
+    page: Path
+    made: dict[str, Table | Figure] = field(default_factory=dict)
+    missing: tuple[str, ...] = ()
+
+
+def known(kind: str) -> list[str]:
+    """The labels of all tables or figures."""
+    return [label for label in MAKERS if label.startswith(kind)]
+
+
+def check(options: PaperOptions) -> None:
+    """Create the output directory. Raises UserError for the first option that is not valid."""
+    for kind, names in (("figure", options.figures), ("table", options.tables)):
+        for name in names:
+            if f"{kind} {name}" not in MAKERS:
+                all_names = ", ".join(label.split()[1] for label in known(kind))
+                raise UserError(f"there is no {kind} {name!r}; known are {all_names}")
+    if not 1 <= options.seed_count <= MOST_SEEDS:
+        raise UserError(f"seeds must be 1 .. {MOST_SEEDS}, not {options.seed_count}")
+    diagonal = options.initial_q or (1.0,)
+    if len(diagonal) not in (1, 12):
+        raise UserError(f"the initial Q takes 1 or 12 weights, not {len(diagonal)}")
+    for weight in diagonal:
+        if not (math.isfinite(weight) and weight >= 0):
+            raise UserError(f"the weights of the initial Q must be 0 or more, not {weight:g}")
+    try:
+        options.out.mkdir(parents=True, exist_ok=True)
+        if any(options.out.iterdir()):
+            raise UserError(f"{options.out} is not empty; choose another directory with --out")
+        with tempfile.TemporaryFile(dir=options.out):
+            pass
+    except OSError as error:
+        raise _not_written(options.out, error) from None
+
+
+def reproduce(options: PaperOptions, console: Console | None = None) -> Outcome:
+    """Compute and write everything that `options` ask for, with progress on `console` (stderr).
+
+    Writes table_NAME.csv and .json, figure_NAME.json, run.json and paper.html to `options.out`.
+    Raises UserError for invalid options or an output that cannot be written. After an interrupt
+    (KeyboardInterrupt) the page is written nevertheless.
+    """
+    check(options)
+    outcome = Outcome(options.out / PAGE)
+    columns = TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn()
+    progress = Progress(*columns, TimeElapsedColumn(), console=console or Console(stderr=True))
+    bar = progress.add_task("paper", total=len(options.labels))
+    count = 0
+
+    def on_flight() -> None:
+        nonlocal count
+        count += 1
+        progress.update(bar, description=f"{label}: flight {count}")
+
+    flights = Flights(options.first_settings, options.seed_count, options.quick, on_flight)
+    try:
+        with progress:
+            for label in options.labels:
+                progress.update(bar, description=label)
+                outcome.made[label] = MAKERS[label](flights)
+                _write(options.out, label, outcome.made[label])
+                progress.advance(bar)
+    except KeyboardInterrupt:
+        outcome.missing = tuple(label for label in options.labels if label not in outcome.made)
+    except OSError as error:
+        raise _not_written(options.out, error) from None
+    facts = _facts(options)
+    outcome.page.write_text(page(outcome.made, outcome.missing, facts), encoding="utf-8")
+    document = json.dumps({"run": facts, "missing": outcome.missing}, indent=1) + "\n"
+    (options.out / "run.json").write_text(document, encoding="utf-8")
+    return outcome
+
+
+def page(
+    made: Mapping[str, Table | Figure], missing: tuple[str, ...], facts: Mapping[str, str]
+) -> str:
+    """The page as text: tables and figures by label, and what describes the run."""
+    sections = {
+        title: {label: made[label] for label in pieces if label in made}
+        for title, pieces in SECTIONS.items()
+    }
+    return render(
+        "paper/page.html",
+        title=TITLE,
+        doi=DOI,
+        facts=facts,
+        missing=[f"{label}: interrupted before it was finished" for label in missing],
+        sections={title: pieces for title, pieces in sections.items() if pieces},
+        shown=shown,
+    )
+
+
+def _write(out: Path, label: str, made: Table | Figure) -> None:
+    stem = out / label.replace(" ", "_")
+    stem.with_suffix(".json").write_text(made.to_json(), encoding="utf-8")
+    if isinstance(made, Table):
+        stem.with_suffix(".csv").write_text(made.to_csv(), encoding="utf-8")
+
+
+def _not_written(out: Path, error: OSError) -> UserError:
+    return UserError(f"{out} cannot be written: {error.strerror or error}")
+
+
+def _facts(options: PaperOptions) -> dict[str, str]:
+    diagonal = options.first_settings.fitness
+    return {
+        "pso-offboard": metadata.version("pso-offboard"),
+        "seeds per row": str(options.seed_count),
+        "quick": "yes" if options.quick else "no",
+        "diag Q of the first configuration": ", ".join(f"{weight:g}" for weight in diagonal),
+    }

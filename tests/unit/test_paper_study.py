@@ -1,0 +1,431 @@
+"""The study of the paper: printed numbers, independent oracles, and the page without a network."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import control
+import numpy as np
+import pytest
+from browser import Opened, opening
+from numpy.typing import NDArray
+from rich.console import Console
+from scipy.linalg import solve_discrete_are
+
+from offboard.control.swarm import certify
+from offboard.documents.errors import UserError
+from offboard.paper import closed_loop, errata, horizon, printed, study, tables
+from offboard.paper.closed_loop import Flight, Flights, FlightTask, LawName, PathName, fly
+from offboard.paper.extensions import LimitedBox, StateLimits
+from offboard.paper.horizon import receding
+from offboard.paper.law import PaperLaw, PaperSettings
+from offboard.paper.plant import (
+    LinearPlant,
+    NonlinearPlant,
+    PlantKind,
+    paper_model,
+    paper_vehicle,
+)
+from offboard.paper.study import Outcome, PaperOptions, check, reproduce
+from offboard.run.configuration import load
+
+Array = NDArray[np.float64]
+
+FINAL = PaperSettings()
+Q, R, RATE = (np.diag(part) for part in (FINAL.fitness, FINAL.energy, FINAL.rate))
+BOX = np.array(FINAL.lower), np.array(FINAL.upper)
+TIGHT = StateLimits(
+    tilt_rad=0.2, tilt_rate_radps=0.3, yaw_rate_radps=0.5, speed_mps=1.2, climb_mps=0.4
+)
+FLIGHTS = Flights(seeds=2)
+
+
+def flown(damping: float, keep_constant: bool = True) -> list[Flight]:
+    settings = FLIGHTS.damped(damping).model_copy(update={"keep_constant": keep_constant})
+    return FLIGHTS.by_seed(settings)
+
+
+def mean_spread(flights: list[Flight]) -> float:
+    return float(np.mean([flight.spreads for flight in flights]))
+
+
+def rows(table: tables.Table, key: str) -> dict[Any, dict[str, Any]]:
+    return {row[key]: row for row in table.rows}
+
+
+# ---------------------------------------------------------------- the law and its model
+
+
+def test_the_cost_is_eq_21() -> None:
+    """The quadratic that the swarm gets, against Eq. 21 as printed."""
+    a, b = paper_model()
+    rng = np.random.default_rng(1)
+    for keep_constant in (True, False):
+        law = PaperLaw(a, b, FINAL.model_copy(update={"keep_constant": keep_constant}))
+        previous = law.move(0.1 * rng.normal(size=12), np.zeros(12)).inputs
+        x, target, nominal = rng.normal(size=12), rng.normal(size=12), rng.normal(size=4)
+        problem = law.move(x, target, nominal=nominal).problem
+
+        def eq_21(u: Array) -> float:
+            e = target - (a @ x + b @ u)  # noqa: B023
+            off, change = nominal - u, u - previous  # noqa: B023
+            return float(e @ Q @ e + off @ R @ off + change @ RATE @ change)
+
+        lost = 0.0 if keep_constant else eq_21(np.zeros(4))
+        for u in rng.normal(size=(20, 4)):
+            assert float(problem(u)) == pytest.approx(eq_21(u) - lost, rel=1e-10)
+
+
+def test_the_cost_to_go_makes_one_step_the_lqr() -> None:
+    a, b = paper_model()
+    gain, _, poles = control.dlqr(a, b, Q, R)
+    free = FINAL.model_copy(update={"rate": (0,) * 4, "lower": (-1e3,) * 4, "upper": (1e3,) * 4})
+    law = PaperLaw(a, b, free, terminal=closed_loop.cost_to_go(free))
+    x = 0.1 * np.random.default_rng(5).normal(size=12)
+    problem = law.move(x, np.zeros(12)).problem
+    best = -np.linalg.solve(problem.hessian, problem.gradient)
+    assert best == pytest.approx(-gain @ x, rel=1e-9)
+    p = solve_discrete_are(a, b, Q, R)
+    found = receding(a, b, Q, R, 0 * RATE, 1, p)
+    np.testing.assert_allclose(np.abs(found)[:12], np.sort(np.abs(poles))[::-1], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("steps", "time_constant_s"), [(1, 39.16), (5, 5.46), (10, 1.69), (20, 1.07)]
+)
+def test_time_constant_by_horizon(steps: int, time_constant_s: float) -> None:
+    slowest = abs(receding(*paper_model(), Q, R, RATE, steps)[0])
+    assert -0.1 / math.log(slowest) == pytest.approx(time_constant_s, rel=5e-3)
+
+
+def test_two_steps_against_least_squares() -> None:
+    """The first input of the stacked two-step problem, solved without a recursion."""
+    a, b = paper_model()
+    root_q, root_r, root_s = np.sqrt(Q), np.sqrt(R), np.sqrt(RATE)
+    zero = np.zeros((4, 4))
+    rows = np.vstack(
+        [
+            np.hstack([root_q @ b, np.zeros((12, 4))]),
+            np.hstack([root_q @ a @ b, root_q @ b]),
+            np.hstack([root_r, zero]),
+            np.hstack([zero, root_r]),
+            np.hstack([root_s, zero]),
+            np.hstack([-root_s, root_s]),
+        ]
+    )
+    from_state = np.vstack([root_q @ a, root_q @ a @ a, np.zeros((16, 12))])
+    from_held = np.zeros((40, 4))
+    from_held[32:36] = -root_s
+    first = -np.linalg.pinv(rows)[:4] @ np.hstack([from_state, from_held])
+    closed = np.block([[a + b @ first[:, :12], b @ first[:, 12:]], [first]])
+    expected = np.sort(np.abs(np.linalg.eigvals(closed)))[::-1]
+    found = np.abs(receding(a, b, Q, R, RATE, 2))
+    np.testing.assert_allclose(found[:8], expected[:8], rtol=1e-6)
+
+
+def test_a_long_horizon_is_the_infinite_one() -> None:
+    long, endless = receding(*paper_model(), Q, R, RATE, 300), receding(*paper_model(), Q, R, RATE)
+    np.testing.assert_allclose(np.abs(long)[:6], np.abs(endless)[:6], rtol=1e-4)
+
+
+def test_one_step_decays_as_its_eigenvalue_says() -> None:
+    task = FlightTask(PaperSettings(), path=PathName.HOVER, start_offset_m=(1.0, 0.0, 0.0))
+    errors = fly(task).position_errors_m
+    assert errors[700] / errors[300] == pytest.approx(np.exp(-40.0 / 39.16), rel=2e-3)
+
+
+@pytest.mark.parametrize("plant", PlantKind)
+def test_cost_to_go_tracks_a_hundred_times_closer(plant: PlantKind) -> None:
+    one, best = (
+        fly(FlightTask(PaperSettings(), plant, law=law, steps=600)).position_errors_m.max()
+        for law in LawName
+    )
+    assert one > 1.0
+    assert best < 0.01 * one
+
+
+def test_both_plants_settle_alike_in_wind_and_with_weak_thrust() -> None:
+    """A level vehicle reaches the wind's velocity, and sinks at the rate that its drag allows."""
+    vehicle = paper_vehicle()
+    sink = 0.1 * vehicle.mass_kg * vehicle.gravity_mps2 / vehicle.drag_translation_npmps[2]
+    wind = np.array([1.5, -0.5, 0.2])
+    for kind in (LinearPlant, NonlinearPlant):
+        blown, weak = np.zeros(12), np.zeros(12)
+        for _ in range(200):
+            blown = kind(wind).next_state(blown, np.zeros(4))
+            weak = kind(np.zeros(3), 0.1).next_state(weak, np.zeros(4))
+        np.testing.assert_allclose(blown[6:9], wind, atol=1e-6)
+        assert weak[8] == pytest.approx(sink, rel=1e-6)
+
+
+# ---------------------------------------------------------------- the printed tables
+
+
+def test_undamped_epsilon_is_the_papers() -> None:
+    flights = flown(1.0)
+    assert 0.9 < mean_spread(flights) < 1.7  # printed 1.3944
+    assert min(flight.spreads.min() for flight in flights) > 0.5  # printed 0.9380
+    assert max(flight.spreads.max() for flight in flights) < 3.0  # printed 2.0023
+
+
+def test_damped_epsilon_is_the_papers_only_with_the_constant_term() -> None:
+    kept, dropped = mean_spread(flown(0.65)), mean_spread(flown(0.65, keep_constant=False))
+    assert 2.77e-9 < kept < 2.77e-7  # printed 2.7744e-08
+    assert dropped < 0.03 * kept
+
+
+def test_damped_inputs_do_not_depend_on_the_constant_term() -> None:
+    for kept, dropped in zip(flown(0.65), flown(0.65, keep_constant=False), strict=True):
+        np.testing.assert_allclose(kept.errors, dropped.errors, rtol=1e-4)
+
+
+def test_least_damping_gains_least_and_the_rest_gain_alike() -> None:
+    costs = {
+        d: np.mean([flight.costs.sum() for flight in flown(d)]) for d in (0.3, 0.4, 0.5, 0.65, 0.8)
+    }
+    assert costs[0.3] == max(costs.values())
+    assert costs[0.3] > 1.02 * costs[0.5]
+    assert costs[0.65] == pytest.approx(costs[0.8], rel=1e-5)  # printed 1.3914e4 and 1.3913e4
+
+
+def test_damping_quietens_the_signals() -> None:
+    loud, quiet = (np.mean([f.signal_costs.sum() for f in flown(d)]) for d in (1.0, 0.65))
+    assert quiet < 0.5 * loud
+
+
+def test_the_exact_optimum_is_met_at_the_best_damping_and_missed_beside_it() -> None:
+    missed = {
+        d: float(np.mean([flight.gaps > 1e-6 for flight in flown(d)])) for d in (0.3, 0.65, 1.0)
+    }
+    assert np.median([flight.gaps for flight in flown(0.65)]) <= 1e-9
+    assert missed[0.65] == 0.0
+    assert missed[0.3] > 0.2
+    assert missed[1.0] > 0.4
+    assert mean_spread(flown(0.3)) < 1e-2 * mean_spread(flown(0.65))  # small, and worth nothing
+
+
+def test_reweighting_takes_nearly_all_of_the_error() -> None:
+    before = np.mean([flight.errors[-1] for flight in flown(0.65)])
+    after = np.mean([flight.errors[-1] for flight in FLIGHTS.by_seed(FINAL)])
+    assert after < 0.05 * before  # printed ratio 0.0163
+    assert 1e6 < before < 3e7  # printed 5.3519e6
+
+
+def test_printed_tables_are_consistent_where_they_can_be() -> None:
+    for row in (printed.ERRORS_UNDAMPED, printed.ERRORS_DAMPED, printed.ERRORS_REWEIGHTED):
+        assert sum(row[:-1]) == pytest.approx(row[-1], rel=1e-4)
+
+
+def test_every_printed_entry_of_eq_16_is_reproduced_at_a_tenth_of_a_second_only() -> None:
+    rows = [row for row in errata.bd_table(FLIGHTS).rows if row["printed"] is not None]
+    assert len(rows) == 11
+    for row in rows:
+        assert abs(abs(row["ts_100ms_arm"]) - abs(row["printed"])) <= 0.5e-4, row["entry"]
+        assert str(row["reproduced_by"]).startswith("0.1 s, arm"), row["entry"]
+        if abs(row["printed"]) > 1e-3:
+            assert abs(row["ts_50ms_arm"]) < 0.6 * abs(row["printed"]), row["entry"]
+    flipped = [row["entry"] for row in rows if "other sign" in str(row["reproduced_by"])]
+    assert flipped == ["B_d[v, tau_x]"]
+
+
+def test_errata_name_their_numbers() -> None:
+    evidence = {
+        key: row["shown_by"] for key, row in rows(errata.errata_table(FLIGHTS), "where").items()
+    }
+    assert "-0.076 N" in evidence["Eq. 26"]
+    assert "0.8992 with the arm, 3.9963 without" in evidence["Eq. 16, arm"]
+    assert "λ = 0.65: 0 %" in evidence["Table 2, small ε"]
+
+
+def test_unequal_weights_speed_one_step_up_and_then_break_it() -> None:
+    found = rows(horizon.weights_table(FLIGHTS), "weights")
+    assert found["Q_y = 1 Q_v"]["time_constant_s"] == pytest.approx(39.16, rel=1e-3)
+    assert found["Q_y = 10 Q_v"]["time_constant_s"] < 4.0
+    assert found["Q_y = 80 Q_v"]["time_constant_s"] is None
+
+
+# ---------------------------------------------------------------- integral term, state limits
+
+
+def test_integral_removes_the_steady_error() -> None:
+    for row in tables.integral_table(FLIGHTS).rows:
+        if row["law"] == "integral":
+            assert row["steady_m"] < 1e-3, row
+        else:  # with the weights alone it stays
+            assert row["steady_m"] > 0.1, row
+
+
+def test_limits_hold_in_every_sample_of_the_path() -> None:
+    for row in tables.limits_table(FLIGHTS).rows:
+        if row["law"] == "limited":
+            assert row["greatest"] <= row["limit"] * (1 + 1e-9), row
+        if row["state"] in ("tilt_rad", "speed_mps"):
+            free = row["law"] == "free"
+            assert row["greatest"] > (1.2 if free else 0.8) * row["limit"], row
+
+
+def test_flight_and_study_fly_the_same_extensions() -> None:
+    law = load("paper", choices={"controller": "paper_integral"}).controller
+    assert (law.fitness, law.integral) == (tables.INTEGRAL.fitness, tables.INTEGRAL.integral)
+    limits = load("paper", choices={"controller": "paper_limited"}).controller.limits
+    assert limits.margin >= tables.MARGIN
+    assert limits.model_copy(update={"margin": 0.0}) == tables.LIMITS
+
+
+def test_limits_hold_whatever_is_done_within_the_narrowed_box() -> None:
+    """Bang-bang by chance: the corner of the box, drawn anew now and then, for 3000 steps."""
+    dynamics, inputs = paper_model()
+    box = LimitedBox(dynamics, inputs, TIGHT, *BOX)
+    rng = np.random.default_rng(1)
+    state, corner, greatest = np.zeros(12), np.zeros(4), np.zeros(12)
+    for k in range(3000):
+        if k % 7 == 0:
+            corner = rng.choice([0.0, 1.0], 4)
+        lower, upper = box.narrow(state)
+        assert (lower <= upper).all()
+        state = dynamics @ state + inputs @ (lower + corner * (upper - lower))
+        greatest = np.maximum(greatest, np.abs(state))
+    for index, limit in TIGHT.per_state().items():
+        assert greatest[index] <= limit * (1 + 1e-9)
+        assert greatest[index] > 0.9 * limit
+
+
+def test_outside_the_limits_the_vehicle_brakes_and_comes_back() -> None:
+    dynamics, inputs = paper_model()
+    box = LimitedBox(dynamics, inputs, TIGHT, *BOX)
+    state = np.zeros(12)
+    state[6] = 2.0 * TIGHT.speed_mps  # a gust
+    for _ in range(60):
+        lower, upper = box.narrow(state)
+        assert (lower <= upper).all()
+        state = dynamics @ state + inputs @ lower
+    assert abs(state[6]) <= TIGHT.speed_mps
+
+
+def test_the_certificate_is_of_the_narrowed_box() -> None:
+    settings = PaperSettings(limits=TIGHT)
+    law = PaperLaw(*paper_model(), settings)
+    target = np.zeros(12)
+    target[9:] = 50.0
+    state = np.zeros(12)
+    for _ in range(40):
+        move = law.move(state, target)
+        certificate = certify(move.problem, move.result)
+        assert certificate.gap <= 1e-9
+        state = move.following
+    assert certificate.at_bound
+    assert abs(state[6]) <= TIGHT.speed_mps * (1 + 1e-9)
+
+
+def test_coupled_axes_are_refused() -> None:
+    dynamics, inputs = (matrix.copy() for matrix in paper_model())
+    inputs[3, 2] = 0.1
+    with pytest.raises(ValueError, match="axes that do not couple"):
+        LimitedBox(dynamics, inputs, TIGHT, *BOX)
+
+
+# ---------------------------------------------------------------- the run and its page
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Outcome:
+    """Everything, with flights of 5 s."""
+    options = PaperOptions(tmp_path_factory.mktemp("paper"), quick=True)
+    with pytest.MonkeyPatch.context() as short:
+        short.setattr(closed_loop, "fly", lambda task: fly(replace(task, steps=50)))
+        return reproduce(options, Console(file=io.StringIO()))
+
+
+def test_the_page_opens_without_a_network_and_shows_everything(run: Outcome) -> None:
+    assert list(run.made) == list(PaperOptions(run.page).labels)
+    assert not run.missing
+    with opening(run.page) as opened:
+        drawn = _drawn(opened)
+        assert opened.fetched == []
+        for scheme in ("dark", "light"):
+            opened.switch(scheme)
+            assert opened.unreadable() == []
+        opened.resize(400)
+        assert opened.width_px() == 400
+        assert opened.colliding() == []
+        shown = opened.page.evaluate(
+            "[...document.querySelectorAll('article[id^=table]')]"
+            ".map(a => [a.id.replace('_', ' '), a.querySelectorAll('tr').length - 1])"
+        )
+        assert opened.problems == []
+    assert {f"figure {name}" for name, *_ in drawn} == set(study.known("figure"))
+    for name, svg, marks, height in drawn:
+        assert svg, name
+        assert marks > 0, name
+        assert height > 300, name
+    assert {name for name, _ in shown} == set(study.known("table"))
+    for name, count in shown:
+        table = run.made[name]
+        assert isinstance(table, tables.Table)
+        assert count == len(table.rows)
+
+
+def _drawn(opened: Opened) -> list[tuple[str, bool, int, int]]:
+    found: list[tuple[str, bool, int, int]] = opened.page.evaluate(
+        "[...document.querySelectorAll('.figure')].map(f => [f.id.replace('figure_', ''), "
+        "!!f.querySelector('.main-svg'), "
+        "f.querySelectorAll('.scatterlayer .trace path, .scatterlayer .trace').length "
+        "+ f.querySelectorAll('.gl-container canvas').length, f.clientHeight])"
+    )
+    return found
+
+
+def test_csv_and_json_say_the_same(run: Outcome) -> None:
+    out = run.page.parent
+    lines = list(csv.DictReader((out / "table_horizon.csv").open(encoding="utf-8")))
+    document = json.loads((out / "table_horizon.json").read_text(encoding="utf-8"))
+    assert [row["law"] for row in lines] == [row["law"] for row in document["rows"]]
+    assert float(lines[1]["time_constant_s"]) == document["rows"][1]["time_constant_s"]
+
+
+@pytest.mark.parametrize(
+    ("changes", "sentence"),
+    [
+        ({"figures": ("3",)}, "there is no figure '3'; known are gap, 4, 5"),
+        ({"tables": ("1",)}, "there is no table '1'; known are 2, 3, 4, errata"),
+        ({"seeds": 0}, "seeds must be 1 .. 10000, not 0"),
+        ({"initial_q": (1.0, 2.0)}, "the initial Q takes 1 or 12 weights, not 2"),
+        ({"initial_q": (float("nan"),)}, "must be 0 or more, not nan"),
+    ],
+)
+def test_bad_options_are_one_sentence(
+    tmp_path: Path, changes: dict[str, Any], sentence: str
+) -> None:
+    with pytest.raises(UserError) as caught:
+        check(PaperOptions(tmp_path / "never", **changes))
+    assert sentence in str(caught.value)
+    assert not (tmp_path / "never").exists()
+
+
+def test_an_output_that_is_a_file_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match="cannot be written"):
+        check(PaperOptions(tmp_path / "file" / "below"))
+
+
+def test_an_interrupt_keeps_what_is_finished_and_names_the_rest(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(closed_loop, "fly", interrupted)
+    options = PaperOptions(tmp_path, initial_q=(2.0,), figures=("11",), tables=("bd",))
+    assert options.first_settings.fitness == (2.0,) * 12
+    outcome = reproduce(options, Console(file=io.StringIO()))
+    assert list(outcome.made) == ["table bd"]
+    assert outcome.missing == ("figure 11",)
+    assert "figure 11: interrupted" in outcome.page.read_text(encoding="utf-8")
+    names = {path.name for path in tmp_path.iterdir()}
+    assert names == {"table_bd.csv", "table_bd.json", "paper.html", "run.json"}
