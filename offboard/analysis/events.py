@@ -1,14 +1,17 @@
-"""Events of a flight in vehicle time: phases of `offboard`, modes and texts of the vehicle."""
+"""Events of a flight in vehicle time: those of `offboard`, by their records in the log; modes and
+texts of the vehicle."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
 from offboard.analysis.sender import Stream
+from offboard.flight.phases import PHASE_CODES
+from offboard.mavlink import event_record
 from offboard.mavlink.decode import decode_text_chunk
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.texts import TextAssembler
@@ -17,41 +20,48 @@ Array = NDArray[np.float64]
 Clock = Callable[[Array], Array]  # stamps in ms to vehicle time in s
 _Text = tuple[int, float, str]  # place in the log, stamp of the telemetry before it in ms, text
 
-OUR_PREFIX = "offboard: "  # of the texts that announce a phase
+_PHASES: dict[int | None, str] = {code: phase.value for phase, code in PHASE_CODES.items()}
+_TITLE = "offboard: "  # of the texts that announce a phase
 
 
 @dataclass(frozen=True, slots=True)
 class Event:
-    """A phase, a mode or a text: vehicle time (NaN before telemetry), sender, and what."""
+    """A phase, a mode or a text: vehicle time (NaN before telemetry), sender, and what. `phase`:
+    the one that begins, empty for another event; `cause`: a word for what caused it, or empty."""
 
     time_s: float
     who: str
     what: str
+    phase: str = ""
+    cause: str = ""
 
     @property
-    def phase(self) -> str:
-        """The phase that it announces."""
-        return self.what.partition(":")[0]
+    def reason(self) -> str:
+        """Why its phase begins."""
+        return self.what.removeprefix(f"{self.phase}: ")
 
 
-def phases(texts: Stream, clock: Clock) -> tuple[Event, ...]:
-    """The phases that our STATUSTEXT announce: name, colon, reason."""
-    announced = (
-        (place, now_ms, text.removeprefix(OUR_PREFIX))
-        for place, now_ms, text in _texts(texts)
-        if text.startswith(OUR_PREFIX)
+def ours(records: Stream, texts: Stream, clock: Clock) -> tuple[Event, ...]:
+    """Our events, from their records. A log without them is an older one: its phases are in our
+    texts, without a word for the cause."""
+    if not len(records):
+        return tuple(map(_announced, _events(clock, "offboard", _texts(texts))))
+    payloads = (bytes(payload[5 : 5 + payload[4]]) for payload in records.payloads())
+    return tuple(
+        Event(
+            _time_s(clock, records.now_ms[row]),
+            "offboard",
+            event.text,
+            _PHASES.get(event.phase, ""),
+            event.cause,
+        )
+        for row, event in event_record.join(payloads)
     )
-    return _events(clock, "offboard", announced)
 
 
-def announcements(texts: Stream, clock: Clock) -> tuple[Event, ...]:
-    """Our other texts: what was identified or limited, and decisions that were missed."""
-    others = (
-        (place, now_ms, text)
-        for place, now_ms, text in _texts(texts)
-        if not text.startswith(OUR_PREFIX)
-    )
-    return _events(clock, "offboard", others)
+def _announced(text: Event) -> Event:
+    what = text.what.removeprefix(_TITLE)
+    return text if what == text.what else replace(text, what=what, phase=what.partition(":")[0])
 
 
 def modes(heartbeats: Stream, dialect: Dialect | None, clock: Clock) -> tuple[Event, ...]:
@@ -79,9 +89,11 @@ def vehicle_messages(texts: Stream, acks: Stream, clock: Clock) -> tuple[Event, 
 
 
 def _events(clock: Clock, who: str, texts: Iterable[_Text]) -> tuple[Event, ...]:
-    return tuple(
-        Event(float(clock(np.array(now_ms))), who, what) for _, now_ms, what in sorted(texts)
-    )
+    return tuple(Event(_time_s(clock, now_ms), who, what) for _, now_ms, what in sorted(texts))
+
+
+def _time_s(clock: Clock, now_ms: float) -> float:
+    return float(clock(np.array(now_ms)))
 
 
 def _texts(stream: Stream) -> list[_Text]:

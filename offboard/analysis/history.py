@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.analysis.events import Event, announcements, modes, phases, vehicle_messages
+from offboard.analysis.events import Event, modes, ours, vehicle_messages
 from offboard.analysis.sender import Stream, continuous_s
 from offboard.analysis.tlog import LoggedMessage, Tlog, TlogError
 from offboard.analysis.truth import true_positions
@@ -26,6 +26,7 @@ from offboard.flight.record import (
     RECORD_NAME,
     records_of,
 )
+from offboard.mavlink import event_record
 from offboard.mavlink.decode import Address, decode_identity
 from offboard.mavlink.dialects.base import Dialect
 from offboard.mavlink.framing import HEARTBEAT
@@ -44,7 +45,7 @@ TELEMETRY = (31, 32)  # ATTITUDE_QUATERNION, LOCAL_POSITION_NED
 _SUBSTITUTES = (30, 33)  # ATTITUDE, GLOBAL_POSITION_INT: the clock of logs without these
 _OURS = (
     "SET_ATTITUDE_TARGET", "SET_POSITION_TARGET_LOCAL_NED", "POSITION_TARGET_LOCAL_NED",
-    "DEBUG_FLOAT_ARRAY", "TIMESYNC", "STATUSTEXT",
+    "DEBUG_FLOAT_ARRAY", "TIMESYNC", "STATUSTEXT", "TUNNEL",
 )  # fmt: skip
 _THEIRS = (
     "ATTITUDE_QUATERNION", "LOCAL_POSITION_NED", "SIM_STATE", "HIL_STATE_QUATERNION", "HEARTBEAT",
@@ -74,11 +75,12 @@ class History:
     landed: t, MAV_LANDED_STATE (EXTENDED_SYS_STATE)
 
     `records` (N,) are structured, with the fields of `flight.record.TickRecord`. `phases` and
-    `announcements` are our own, `modes` and `vehicle_messages` (STATUSTEXT, refused commands) the
-    vehicle's. `vehicle` is the one that was flown, as the log's manifest says; in an older log the
-    first autopilot that was heard. Only its messages, and ours, are used. It and `dialect` are None
-    without one, `dialect` also for one that is not known. `damage` says what could not be
-    read, `damage_s` is the time of the telemetry before the first damage, NaN without.
+    `announcements` are our own, by their records; `modes` and `vehicle_messages` (STATUSTEXT,
+    refused commands) the vehicle's. `vehicle` is the one that was flown, as the log's manifest
+    says; in an older log the first autopilot that was heard. Only its messages, and ours, are used.
+    It and `dialect` are None without one, `dialect` also for one that is not known. `damage` says
+    what could not be read, `damage_s` is the time of the telemetry before the first damage, NaN
+    without.
     """
 
     position: Array
@@ -180,6 +182,7 @@ class _Collector:
         record_time_s, records, identified = self._arrays(self._ours.pop("DEBUG_FLOAT_ARRAY"))
         heartbeat = self._news("HEARTBEAT", "base_mode system_status")
         heartbeat[:, 1] = (heartbeat[:, 1].astype(np.int64) & _ARMED) > 0
+        events = ours(self._ours["TUNNEL"], self._ours["STATUSTEXT"], self.time_s)
         return History(
             attitude=self._table(self._theirs.pop("ATTITUDE_QUATERNION"), ATTITUDE_FIELDS),
             position=self._table(self._theirs.pop("LOCAL_POSITION_NED"), POSITION_FIELDS),
@@ -192,8 +195,8 @@ class _Collector:
             link_delay=self._link_delay(),
             heartbeat=heartbeat,
             landed=self._news("EXTENDED_SYS_STATE", "landed_state"),
-            phases=phases(self._ours["STATUSTEXT"], self.time_s),
-            announcements=announcements(self._ours["STATUSTEXT"], self.time_s),
+            phases=tuple(event for event in events if event.phase),
+            announcements=tuple(event for event in events if not event.phase),
             modes=modes(self._theirs["HEARTBEAT"], self._dialect, self.time_s),
             vehicle_messages=vehicle_messages(
                 self._theirs["STATUSTEXT"], self._theirs["COMMAND_ACK"], self.time_s
@@ -263,6 +266,8 @@ def _is_used(entry: LoggedMessage, ours: bool) -> bool:
         return any(payload[:8]) != ours
     if name == "DEBUG_FLOAT_ARRAY":
         return payload[10:20].rstrip(b"\0").decode(errors="replace") in _ARRAYS
+    if name == "TUNNEL":
+        return int.from_bytes(payload[:2], "little") == event_record.PAYLOAD_TYPE
     return True
 
 

@@ -7,7 +7,6 @@ one of the service also if the vehicle was given back at the end of the referenc
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 
@@ -16,9 +15,9 @@ from numpy.typing import NDArray
 
 from offboard.analysis.events import Event
 from offboard.analysis.history import History
-from offboard.flight.phases import STOPPED
 from offboard.flight.position_jumps import PositionJumps
 from offboard.flight.touchdown import Touchdown, moved
+from offboard.mavlink.event_record import SUPERVISOR
 from offboard.mavlink.events import LocalPosition
 
 Array = NDArray[np.float64]
@@ -28,25 +27,7 @@ NO_FLIGHT = "no flight of offboard in this log"
 _BLOCK = 10_000  # positions
 _ON_GROUND = 1  # MAV_LANDED_STATE
 _CRITICAL = 5  # MAV_STATE
-_TAKEN_OVER = "supervisor: taking over"
 _LANDING_ENDS = {"disarmed", "failed", "yielded"}
-# what begins the reason of the phase that ended a flight early -> the word for it; any other reason
-# stands for itself
-_CAUSES = (
-    (STOPPED, "operator"),
-    ("GPS|no GPS|its estimat|no report of its estimator", "positioning"),
-    (
-        "no telemetry|no LOCAL_POSITION_NED|no ATTITUDE_QUATERNION|no report|the delay|telemetry"
-        " was|setpoints did not arrive",
-        "link",
-    ),
-    ("the vehicle left|it showed", "pilot"),
-    ("another program|the vehicle follows", "second sender"),
-    ("the vehicle restarted", "restart"),
-    ("the vehicle disarmed", "disarmed in flight"),
-    ("the controller failed", "controller"),
-    ("tilt|the attitude|[0-9.]+ m (from|above)|the battery|the vehicle (hovers|sinks)", "limit"),
-)
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,14 +107,11 @@ def _ended_early(flown: History) -> tuple[str, str]:
     for event, name, before in zip(flown.phases[1:], names[1:], names, strict=False):
         regular = (before, name) in (("hover", "land"), ("land", "disarmed")) or served
         if name in {"hold", "land", "stand down", *_LANDING_ENDS} and not regular:
-            reason = event.what.partition(": ")[2]
-            cause = _cause(reason)
-            if cause == "pilot" and _critical(flown):
-                cause = "failsafe"
-            return cause, reason
-    took_over = [e.what for e in flown.announcements if e.what.startswith(_TAKEN_OVER)]
+            taken = event.cause == "pilot" and _critical(flown)
+            return "failsafe" if taken else event.cause or event.reason, event.reason
+    took_over = [event.what for event in flown.announcements if event.cause == SUPERVISOR]
     if took_over:
-        return "supervisor", took_over[0]
+        return SUPERVISOR, took_over[0]
     if names[-1] not in _LANDING_ENDS:
         return f"the log ends in the phase {names[-1]}", ""
     return REFERENCE_OVER if "track" in names else names[-1], ""
@@ -150,7 +128,3 @@ def _critical(flown: History) -> bool:
     """Whether the newest HEARTBEAT shows a failsafe or an emergency. A flight whose vehicle was
     taken ends with the first HEARTBEAT since."""
     return bool(len(flown.heartbeat)) and bool(flown.heartbeat[-1, 2] >= _CRITICAL)
-
-
-def _cause(reason: str) -> str:
-    return next((word for begin, word in _CAUSES if re.match(begin, reason)), reason)

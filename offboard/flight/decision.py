@@ -28,7 +28,8 @@ from offboard.mavlink.outgoing import SolverRecord
 from offboard.model.command import Command, PositionCommand
 
 NOTICEABLE_RADPS = 0.5  # a smaller change of the bandwidth is not announced
-_FAILED, _TOO_OLD = "the controller failed", "telemetry was too old for a setpoint"
+# in a word -> what a missed decision is ascribed to
+_BY = {"controller": "the controller failed", "link": "telemetry was too old for a setpoint"}
 
 
 def begin(flight: FlightState) -> None:
@@ -49,7 +50,7 @@ def decide(flight: FlightState) -> bool:
     try:
         decided = _send(flight, _decided(flight))
     except Exception as error:  # any error: the vehicle is in the air
-        _miss(flight, located(error), _FAILED)
+        _miss(flight, located(error), "controller")
         return False
     flight.decided = decided
     if was_old and decided.refused == Refusal.STALE:
@@ -57,7 +58,7 @@ def decide(flight: FlightState) -> bool:
     if decided.failure:
         in_time = decided.solve_time_s <= flight.period_s
         aged = decided.refused == Refusal.STALE and in_time
-        _miss(flight, decided.failure, _TOO_OLD if aged else _FAILED)
+        _miss(flight, decided.failure, "link" if aged else "controller")
         return False
     flight.predictions.append(decided.state)
     return True
@@ -71,7 +72,7 @@ def finish(flight: FlightState, sent_s: float) -> None:
     try:
         _record(flight, decided, sent_s - decided.tick.arrived_s)
     except Exception as error:  # the certificate is the law's
-        _miss(flight, located(error), _FAILED)
+        _miss(flight, located(error), "controller")
         return
     if not decided.refused:
         flight.missed = 0
@@ -79,9 +80,9 @@ def finish(flight: FlightState, sent_s: float) -> None:
             _identify(flight, decided, flight.identification)
 
 
-def _miss(flight: FlightState, failure: str, by: str) -> None:
+def _miss(flight: FlightState, failure: str, cause: str) -> None:
     flight.missed += 1
-    flight.failure = f"{by}: {failure}"
+    flight.failure, flight.failure_cause = f"{_BY[cause]}: {failure}", cause
     outbox.warn(flight, f"decision missed: {failure}")
 
 

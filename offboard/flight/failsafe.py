@@ -135,8 +135,8 @@ def _contradiction(flight: FlightState) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Row:
-    """`action` is taken when `condition` has held for `held_s`; `reason` then says why.
-    `measured` and `limit` are for the documentation."""
+    """`action` is taken when `condition` has held for `held_s`; `reason` then says why, `cause` in
+    a word: empty without one. `measured` and `limit` are for the documentation."""
 
     name: str
     measured: str
@@ -145,6 +145,7 @@ class Row:
     held_s: float
     action: Action
     reason: Reason
+    cause: Reason = "limit"
 
 
 ROWS = (
@@ -156,6 +157,7 @@ ROWS = (
         0.0,
         Action.LAND,  # of which nothing is asked before the mode is known again
         lambda flight: f"{no_mode_report(flight)}: another may control the vehicle",
+        "link",
     ),
     Row(
         "silence",
@@ -165,6 +167,7 @@ ROWS = (
         0.0,
         Action.LAND,
         no_telemetry,
+        "link",
     ),
     Row(
         "blind",
@@ -174,6 +177,7 @@ ROWS = (
         0.0,
         Action.LAND,
         no_position_or_attitude,
+        "link",
     ),
     Row(
         "age",
@@ -183,6 +187,7 @@ ROWS = (
         0.0,
         Action.LEVEL,
         "telemetry is {flight.age_s:.2f} s old",
+        "link",
     ),
     Row(
         "link",
@@ -192,6 +197,7 @@ ROWS = (
         0.5,
         Action.HOLD,
         "the delay of the link has grown by {flight.link_growth_s:.2f} s",
+        "link",
     ),
     Row(
         "decision",
@@ -201,6 +207,7 @@ ROWS = (
         0.0,
         Action.LEVEL,
         "{flight.failure}",
+        "{flight.failure_cause}",
     ),
     Row(
         "decisions",
@@ -210,6 +217,7 @@ ROWS = (
         0.0,
         Action.LAND,
         "{flight.failure}",
+        "{flight.failure_cause}",
     ),
     Row(
         "tilt",
@@ -263,6 +271,7 @@ ROWS = (
         lambda flight: (
             f"the estimated position jumped by {flight.jumps.recent_m(flight.time_s):.1f} m"
         ),
+        "",
     ),
     Row(
         "positioning",
@@ -272,6 +281,7 @@ ROWS = (
         0.5,
         Action.LAND,
         lambda flight: flight.positioning.lost(flight.vehicle, flight.limits),
+        "positioning",
     ),
     Row(
         "volume",
@@ -325,6 +335,7 @@ ROWS = (
         lambda flight: (
             f"another program controls the vehicle on this link, too: {other_sender_name(flight)}"
         ),
+        "second sender",
     ),
     Row(
         "other setpoints",
@@ -336,6 +347,7 @@ ROWS = (
         lambda flight: (
             f"the vehicle follows setpoints of another program{_other_companion(flight)}"
         ),
+        "second sender",
     ),
     Row(
         "clock",
@@ -345,6 +357,7 @@ ROWS = (
         0.0,
         Action.LAND,
         "the clock of the vehicle jumped by {flight.clock.jumped_s:.1f} s",
+        "",
     ),
     Row(
         "contradiction",
@@ -354,6 +367,7 @@ ROWS = (
         0.0,
         Action.LAND,
         _contradiction,
+        "",
     ),
 )
 
@@ -380,6 +394,11 @@ def judge(flight: FlightState, rows: Sequence[Row] = ROWS) -> None:
 def reason(flight: FlightState) -> str:
     """Why the action is taken; empty while none is."""
     return next((why(row.reason, flight) for row in ROWS if row.name == flight.failsafe.row), "")
+
+
+def cause(flight: FlightState) -> str:
+    """`reason` in a word; empty without one."""
+    return next((why(row.cause, flight) for row in ROWS if row.name == flight.failsafe.row), "")
 
 
 def markdown() -> str:

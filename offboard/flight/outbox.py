@@ -8,8 +8,11 @@ from __future__ import annotations
 
 import math
 
+from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.flight.state import FlightState
 from offboard.flight.vehicle_state import GOOD_RESULTS
+from offboard.mavlink import event_record
+from offboard.mavlink.event_record import EventRecord
 from offboard.mavlink.outgoing import CommandLong, Outgoing, Record
 from offboard.mavlink.texts import chunks
 
@@ -43,10 +46,17 @@ def renew(flight: FlightState) -> None:
     flight.requested_s.clear()
 
 
-def announce(flight: FlightState, sentence: str, title: str = "") -> None:
-    """Report to the user, and to the ground station with `title` before the sentence."""
+def announce(flight: FlightState, sentence: str) -> None:
+    """Report to the user, the ground station and the log."""
     flight.announced.append(sentence)
-    _send_text(flight, INFO, title + sentence)
+    _say(flight, INFO, EventRecord(sentence))
+
+
+def announce_phase(flight: FlightState, phase: Phase, reason: str, cause: str) -> None:
+    """Report that a phase begins; `cause` is a word for the log, empty without one."""
+    sentence = f"{phase.value}: {reason}"
+    flight.announced.append(sentence)
+    _say(flight, INFO, EventRecord(sentence, PHASE_CODES[phase], cause), title="offboard: ")
 
 
 def announce_once(flight: FlightState, sentence: str) -> None:
@@ -57,13 +67,14 @@ def announce_once(flight: FlightState, sentence: str) -> None:
 
 def warn(flight: FlightState, sentence: str) -> None:
     """Report to the ground station and the log."""
-    _send_text(flight, WARNING, sentence)
+    _say(flight, WARNING, EventRecord(sentence))
 
 
-def _send_text(flight: FlightState, severity: int, sentence: str) -> None:
+def _say(flight: FlightState, severity: int, event: EventRecord, title: str = "") -> None:
+    """To the ground station with `title` before the text; to the log as a record."""
     flight.text_id = flight.text_id % TEXT_ID_MAX + 1
-    for chunk in chunks(severity, sentence, flight.text_id):
-        send(flight, chunk)
+    send(flight, *chunks(severity, title + event.text, flight.text_id))
+    send(flight, *event_record.pieces(event))
 
 
 def send(flight: FlightState, *messages: Outgoing) -> None:

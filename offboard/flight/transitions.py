@@ -19,6 +19,7 @@ from offboard.flight.phases import (
     BEFORE_FLIGHT,
     ENDS,
     FLYING,
+    STOPPED,
     WAITING,
     ExitCode,
     Phase,
@@ -26,7 +27,22 @@ from offboard.flight.phases import (
 )
 from offboard.flight.pilot_switch import PilotSwitch
 from offboard.flight.requests import Request
-from offboard.flight.rows import REBOOTED, SHOWS, Condition, Transition, lost, lost_armed, why
+from offboard.flight.rows import (
+    REBOOTED,
+    SHOWS,
+    Condition,
+    Transition,
+    blind,
+    lost,
+    lost_armed,
+    lost_disarmed,
+    mode_unknown,
+    other_sender,
+    rebooted,
+    silent,
+    stop_requested,
+    why,
+)
 from offboard.flight.state import FlightState, Outcome
 from offboard.flight.touchdown import Touchdown
 from offboard.mavlink.events import LocalPosition
@@ -73,12 +89,41 @@ def _by_phase(service: ServiceOptions | None) -> dict[Phase, tuple[Transition, .
     return {phase: tuple(row for row in rows if phase in row.phases) for phase in Phase}
 
 
+# ---------------------------------------------------------------------- what caused a transition
+
+_CAUSES: dict[Condition, str] = {
+    rebooted: "restart",
+    flying.rebooted_disarmed: "restart",
+    flying.disarmed: "disarmed in flight",
+    lost: "pilot",
+    lost_armed: "pilot",
+    lost_disarmed: "pilot",
+    silent: "link",
+    starting.silent_on_ground: "link",
+    starting.silent_for_long: "link",
+    blind: "link",
+    mode_unknown: "link",
+    in_own_failsafe: "link",
+    other_sender: "second sender",
+}
+_STOPS = (stop_requested, starting.stop_requested_on_ground)
+
+
+def cause(flight: FlightState, row: Transition) -> str:
+    """A word for what caused this transition, empty without one: who or what ended a flight that
+    it ends (see `analysis.verdict`)."""
+    if row.condition in (flying.failsafe_land, flying.failsafe_hold):
+        return failsafe.cause(flight)
+    if row.condition in _STOPS:
+        return "operator" if flight.stop_reason == STOPPED else ""
+    return _CAUSES.get(row.condition, "")
+
+
 # ---------------------------------------------------------------------- its application
 
 
 def advance(flight: FlightState) -> None:
     """Make every transition whose guard holds."""
-    flight = flight
     while not flight.has_ended:
         if flight.phase in FLYING:
             failsafe.judge(flight)
@@ -86,7 +131,7 @@ def advance(flight: FlightState) -> None:
         row = next_row(flight)
         if row is None:
             break
-        _enter(flight, row, why(row.reason, flight))
+        _enter(flight, row, why(row.reason, flight), cause(flight, row))
     flight.request = Request.NONE
 
 
@@ -119,14 +164,14 @@ def on_reboot(flight: FlightState) -> None:
     advance(flight)
 
 
-def _enter(flight: FlightState, row: Transition, reason: str) -> None:
+def _enter(flight: FlightState, row: Transition, reason: str, because: str) -> None:
     source = flight.phase
     _conclude(flight, row, reason)
     flight.vehicle.clear_messages()
     flight.request = Request.NONE
     flight.phase = row.target
     flight.began_s = flight.now_s
-    outbox.announce(flight, f"{row.target.value}: {reason}", title="offboard: ")
+    outbox.announce_phase(flight, row.target, reason, because)
     if source in BEFORE_FLIGHT and row.target in FLYING:
         flight.clock.settle()
         dialect = flight.session.dialect

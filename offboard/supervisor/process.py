@@ -27,8 +27,9 @@ from offboard.link.log import append, entry
 from offboard.link.stream import Nowhere, Source, Stream, StreamLink
 from offboard.link.stream_sources import Listener
 from offboard.link.udp import UdpLink
-from offboard.mavlink import texts
+from offboard.mavlink import event_record, texts
 from offboard.mavlink.dialects.base import SetpointLoss
+from offboard.mavlink.event_record import SUPERVISOR, EventRecord
 from offboard.mavlink.events import VehicleFound
 from offboard.mavlink.outgoing import Heartbeat, Outgoing
 from offboard.mavlink.session import ACTIVE, Session, SessionSettings
@@ -182,8 +183,12 @@ class Rescue:
         self._text(sentence)
 
     def _text(self, sentence: str) -> None:
+        """To the ground station, and to the log as a record."""
         self._text_id += 1
-        self._send(*texts.chunks(WARNING, f"supervisor: {sentence}", self._text_id))
+        text = f"supervisor: {sentence}"
+        self._send(*texts.chunks(WARNING, text, self._text_id))
+        for piece in event_record.pieces(EventRecord(text, cause=SUPERVISOR)):
+            self._record(self._session.encode(piece))
 
     def _send(self, *messages: Outgoing) -> None:
         for message in messages:

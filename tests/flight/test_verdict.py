@@ -19,7 +19,7 @@ from typer.testing import CliRunner
 
 from offboard.analysis import history, tlog
 from offboard.analysis.flight_score import judged
-from offboard.analysis.history import History
+from offboard.analysis.history import OUR_COMPONENTS, History
 from offboard.analysis.score import Score, score
 from offboard.analysis.score_table import summary, verdict
 from offboard.cli.commands import app
@@ -67,6 +67,36 @@ def test_a_whole_flight_is_completed(flown: History) -> None:
     assert 0.3 < whole.touchdown_mps < 1.2  # MPC_LAND_CRWL is 0.7
 
 
+def judged_by(pair: Pair, directory: Path) -> tuple[object, ...]:
+    """Verdict, touch-down and events of the log."""
+    flown = history.gather(pair.log(directory))
+    judged = score(flown)
+    rows = [repr(event) for event in flown.events()]  # a NaN does not equal itself
+    return judged.completed, judged.ended_by, judged.reason, repr(judged.touchdown_mps), rows
+
+
+def judged_without_texts(pair: Pair, directory: Path) -> tuple[object, ...]:
+    """The same of the log without any STATUSTEXT of ours."""
+    ours = [
+        frame
+        for frame in pair.logged
+        if frame[7:10] == b"\xfd\0\0" and decode(frame).get_srcComponent() in OUR_COMPONENTS
+    ]
+    assert len(ours) > 5
+    return judged_by(replace(pair, logged=[f for f in pair.logged if f not in ours]), directory)
+
+
+def test_the_verdict_needs_no_texts(tmp_path: Path) -> None:
+    muted = judged_without_texts(calm_hover(), tmp_path / "mute")
+    assert muted == judged_by(calm_hover(), tmp_path / "log")
+    assert muted[:2] == (1.0, "reference over")
+    begun = [
+        event.phase for event in history.gather(tlog.read(tlog.find(tmp_path / "mute"))).phases
+    ]
+    assert (begun[0], begun[-1]) == ("health", "disarmed")
+    assert {"arm", "takeoff", "track", "hover", "land"} < set(begun)
+
+
 def our_ids(pair: Pair) -> None:
     """Another program says that it tracks: the autopilot is asked to hold, then to land."""
     frame = mavlink.MAVLink_heartbeat_message(18, 8, 0, 8, 4, 3).pack(mavlink.MAVLink(None, 1, 191))
@@ -92,6 +122,7 @@ def test_a_flight_that_ended_early_says_what_ended_it(
     assert pair.fly().exit_code != 0
     ended = pair.score(tmp_path)
     assert (ended.completed, ended.ended_by) == (0.0, ended_by)
+    assert judged_without_texts(pair, tmp_path / "mute") == judged_by(pair, tmp_path / "log")
     assert ended.reason
     assert any(line.endswith(f": {ended.reason}") for line in pair.companion.announced)
     assert verdict(ended) == f"not completed ({ended_by}): {ended.reason}"
