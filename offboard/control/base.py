@@ -54,7 +54,7 @@ class Certificate:
     Attributes:
         cost: Cost J of the chosen input or plan.
         optimal_cost: Cost J* of the exact minimiser within the same bounds (by daqp).
-        gap: Relative difference (J - J*) / max(|J*|, floor); see `certificate.certify`.
+        gap: Relative difference (J - J*) / max(|J*|, floor); see `swarm.certify`.
         spread: Mean distance of the particles from the best one, epsilon of Eq. 29.
         iterations: Iterations of the search.
         cut_short: Whether the search stopped because no time was left.

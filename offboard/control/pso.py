@@ -36,7 +36,7 @@ class PsoLaw(TrackingLaw):
 
     def decide(self, situation: Situation) -> Decision:
         problem = self.task(situation).problem
-        result = minimise(self._swarm, problem, self._rng, remaining_s=situation.remaining_s)
+        result = minimise(self._swarm, problem, self._rng, situation.remaining_s)
         return decision(result.best, certify(problem, result, self._exact))
 
     def reset(self) -> None:

@@ -13,7 +13,7 @@ reference and no clock.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, Self
 
@@ -30,6 +30,7 @@ Array = NDArray[np.float64]
 Generator = np.random.Generator
 
 EVALUATIONS_MOST = 500_000  # a search of 0.5 s with `pso`, of some seconds with `horizon`
+FIRST_VELOCITY = 0.5  # bound of the first velocities, times the distance between the bounds
 GAP_FLOOR = 1e-6  # of `certify`, times the variation of the cost within the bounds
 CHUNK_ITERATIONS = 25  # of `minimise` between two looks at the time that is left, about 0.1 ms
 
@@ -41,9 +42,6 @@ class SwarmSettings(Parameters):
     gives Eq. 19). `rebound` is the share of the velocity with which a particle is reflected at a
     bound: with 0 one search in a hundred misses a minimum on the bounds, with 0.5 one in ten
     thousand (40 x 150); but only with 0 epsilon at lambda = 1 equals the paper's.
-    `initial_velocity` bounds the first velocities, as a fraction of the distance between the
-    bounds. The search ends early when the spread (Eq. 29) falls to `tolerance`, in the unit of the
-    inputs; never, if that is 0.
     """
 
     particles: int = Field(default=40, ge=2, le=10_000)
@@ -53,8 +51,6 @@ class SwarmSettings(Parameters):
     social: float = Field(default=1.4986, ge=0, le=4)
     damping: float = Field(default=0.65, gt=0, le=1)
     rebound: float = Field(default=0.5, ge=0, le=1)
-    initial_velocity: float = Field(default=0.5, ge=0, le=1)
-    tolerance: float = Field(default=0.0, ge=0)
 
     @model_validator(mode="after")
     def _ends(self) -> Self:
@@ -67,25 +63,12 @@ class SwarmSettings(Parameters):
 
 
 @dataclass(frozen=True, slots=True)
-class SwarmHistory:
-    """Every iteration of one search, for plots.
-
-    positions (iterations, particles, n); costs (iterations,) of the best so far; spreads
-    (iterations,), Eq. 29.
-    """
-
-    positions: Array
-    costs: Array
-    spreads: Array
-
-
-@dataclass(frozen=True, slots=True)
 class SwarmResult:
     """The result of one search.
 
     `best` (n,) is always finite and within the bounds; `cost` is inf if no particle had a finite
     cost. `spread` is epsilon of Eq. 29 in the last iteration, `cut_short` whether the time ran
-    out, `rejected` how many costs were not finite.
+    out.
     """
 
     best: Array
@@ -93,17 +76,14 @@ class SwarmResult:
     spread: float
     iterations: int
     cut_short: bool = False
-    rejected: int = 0
-    history: SwarmHistory | None = None
 
 
 SEARCH = np.dtype(
-    [(name, "f8") for name in ("inertia", "personal", "social", "damping", "rebound", "cost")]
-    + [("spread", "f8"), ("iterations", "i8"), ("rejected", "i8")],
+    [(name, "f8") for name in ("inertia", "personal", "social", "damping", "rebound")]
+    + [("iterations", "i8"), ("done", "i8"), ("cost", "f8"), ("spread", "f8")],
     align=True,
 )
-"""Settings and progress of one search: cost of the best, spread (Eqs. 28-29), iterations done, and
-costs that were not finite."""
+"""Settings and progress of one search: iterations done, cost of the best, spread (Eqs. 28-29)."""
 
 # Compiled: the particles are (3, n, particles), their positions, velocities and personal bests;
 # `bounds` (2, n) lower and upper; `best` (n,) the best position of all; `costs` (2, particles) the
@@ -133,14 +113,12 @@ def _move(search: Any, rng: Generator, bounds: Array, particles: Array, best: Ar
 
 
 @kernel
-def _remember(search: Any, costs: Array, particles: Array, best: Array) -> None:
-    """Update the bests from the newest costs. Of equal costs the first one found stays the best; a
-    cost that is not finite is rejected."""
+def _remember(search: Any, particles: Array, best: Array, costs: Array) -> None:
+    """Update the bests from the newest costs, then the spread. Of equal costs the first one found
+    stays the best; a cost that is not finite never becomes a best."""
     for i in range(costs.shape[1]):
         cost = costs[0, i]
-        if not np.isfinite(cost):
-            search.rejected += 1
-        elif cost < costs[1, i]:
+        if np.isfinite(cost) and cost < costs[1, i]:
             costs[1, i] = cost
             is_best = cost < search.cost
             if is_best:
@@ -149,39 +127,31 @@ def _remember(search: Any, costs: Array, particles: Array, best: Array) -> None:
                 particles[2, j, i] = particles[0, j, i]
                 if is_best:
                     best[j] = particles[0, j, i]
-    search.iterations += 1
-
-
-@kernel
-def _spread(particles: Array, best: Array) -> float:
-    """Mean distance of all particles from the best position, Eqs. 28-29."""
     total = 0.0
-    for i in range(particles.shape[2]):
+    for i in range(costs.shape[1]):
         squared = 0.0
         for j in range(len(best)):
             squared += (best[j] - particles[0, j, i]) ** 2
         total += np.sqrt(squared)
-    return float(total / particles.shape[2])
+    search.spread = total / costs.shape[1]
+    search.done += 1
 
 
-@entry(SEARCH, Generator, array(2), array(3), array(1))
-def move(searches: Any, rng: Generator, bounds: Array, particles: Array, best: Array) -> None:
-    """Move all particles once."""
-    _move(searches[0], rng, bounds, particles, best)
-
-
-@entry(SEARCH, array(2), array(3), array(1))
-def remember(searches: Any, costs: Array, particles: Array, best: Array) -> None:
-    """Take over the newest costs."""
+@entry(SEARCH, Generator, array(2), array(3), array(1), array(2))
+def iterate(
+    searches: Any, rng: Generator, bounds: Array, particles: Array, best: Array, costs: Array
+) -> None:
+    """End an iteration with the newest costs, and move the particles for the next one."""
     search = searches[0]
-    _remember(search, costs, particles, best)
-    search.spread = _spread(particles, best)
+    _remember(search, particles, best, costs)
+    if search.done < search.iterations:
+        _move(search, rng, bounds, particles, best)
 
 
 @entry(
     SEARCH, Generator, array(2), array(3), array(1), array(2), array(2), array(1), float, int
 )  # fmt: skip
-def search_quadratic(
+def iterate_quadratic(
     searches: Any,
     rng: Generator,
     bounds: Array,
@@ -191,29 +161,27 @@ def search_quadratic(
     hessian: Array,
     gradient: Array,
     constant: float,
-    iterations: int,
+    until: int,
 ) -> None:
-    """Iterate on J = 1/2 u'Hu + f'u + c until `iterations` are done. The first one evaluates the
-    particles where they start."""
-    search, size = searches[0], len(gradient)
-    while search.iterations < iterations:
-        if search.iterations > 0:
-            _move(search, rng, bounds, particles, best)
+    """`iterate` with the costs J = 1/2 u'Hu + f'u + c, until `until` iterations are done."""
+    search = searches[0]
+    while search.done < until:
         for i in range(costs.shape[1]):
             costs[0, i] = constant
-            for j in range(size):
+            for j in range(len(gradient)):
                 slope = gradient[j] + 0.5 * hessian[j, j] * particles[0, j, i]
                 for k in range(j):
                     slope += hessian[j, k] * particles[0, k, i]
                 costs[0, i] += particles[0, j, i] * slope
-        _remember(search, costs, particles, best)
-    search.spread = _spread(particles, best)
+        _remember(search, particles, best, costs)
+        if search.done < search.iterations:
+            _move(search, rng, bounds, particles, best)
 
 
 class Swarm:
     """One search within `lower` and `upper`, each (n,); equal bounds fix a dimension. The first
-    particles start from `seeds`, (n,) each, clamped to the bounds: the answer is never worse than
-    the best of them. Seeds that are not finite, and more seeds than particles, are ignored.
+    particles start from `seeds` (k, n), within the bounds: the answer is never worse than the best
+    of them.
 
     Raises ValueError for bounds that are not finite and ordered vectors of one length.
     """
@@ -224,83 +192,60 @@ class Swarm:
         lower: ArrayLike,
         upper: ArrayLike,
         rng: Generator,
-        seeds: Sequence[ArrayLike] = (),
+        seeds: Array | None = None,
     ) -> None:
-        self._settings, self._rng = settings, rng
+        self._rng = rng
         self._bounds = bounds = _bounds(lower, upper)
         width = (bounds[1] - bounds[0])[:, None]
         shape = (bounds.shape[1], settings.particles)
         self._particles = np.empty((3, *shape))
-        self._particles[0] = np.minimum(
-            bounds[0][:, None] + width * rng.random(shape), bounds[1:].T
-        )
-        self._particles[1] = settings.initial_velocity * width * rng.uniform(-1.0, 1.0, shape)
-        vectors = (np.asarray(seed, np.float64) for seed in seeds)
-        usable = [seed for seed in vectors if np.isfinite(seed).all()]
-        for i, seed in enumerate(usable[: settings.particles]):
-            self._particles[0, :, i] = np.clip(seed, *bounds)
-        self._particles[2] = self._particles[0]
-        self._best = self._particles[0, :, 0].copy()
+        positions, velocities, bests = self._particles
+        positions[:] = np.minimum(bounds[0][:, None] + width * rng.random(shape), bounds[1:].T)
+        velocities[:] = FIRST_VELOCITY * width * rng.uniform(-1.0, 1.0, shape)
+        if seeds is not None:
+            positions[:, : len(seeds)] = np.clip(seeds, *bounds).T
+        bests[:] = positions
+        self._best = positions[:, 0].copy()
         self._costs = np.full((2, settings.particles), np.inf)
         self._search = np.zeros(1, SEARCH)
-        for name in ("inertia", "personal", "social", "damping", "rebound"):
+        for name in ("inertia", "personal", "social", "damping", "rebound", "iterations"):
             self._search[name] = getattr(settings, name)
         self._search["cost"] = self._search["spread"] = np.inf
-        self._told = False
 
     def ask(self) -> Array:
         """Inputs to evaluate, (particles, n); the same until `tell` is called."""
-        if self._told:
-            move(self._search, self._rng, self._bounds, self._particles, self._best)
-            self._told = False
-        return self.positions
-
-    @property
-    def positions(self) -> Array:
-        """Where the particles are, (particles, n)."""
         positions: Array = self._particles[0].T.copy()
         return positions
 
     def tell(self, costs: ArrayLike) -> None:
         """Give the costs (particles,) of the inputs returned by `ask`; NaN and -inf count as +inf.
 
-        Raises ValueError for another shape, or where `ask` was not called since the last `tell`.
+        Raises ValueError for another shape.
         """
         values = np.asarray(costs, np.float64)
-        if self._told:
-            raise ValueError("tell without ask: these inputs already have their costs")
         if values.shape != self._costs.shape[1:]:
             raise ValueError(f"{values.shape} costs for {self._costs.shape[1]} particles")
         self._costs[0] = values
-        remember(self._search, self._costs, self._particles, self._best)
-        self._told = True
+        iterate(self._search, self._rng, self._bounds, self._particles, self._best, self._costs)
 
-    def iterate(self, problem: BoxQuadratic, iterations: int) -> None:
-        """`ask` and `tell` with the costs of `problem` until `iterations` are done."""
-        search_quadratic(
+    def tell_all(self, problem: BoxQuadratic, until: int) -> None:
+        """`tell` the costs of `problem` until `until` iterations are done."""
+        iterate_quadratic(
             self._search, self._rng, self._bounds, self._particles, self._best, self._costs,
             np.ascontiguousarray(problem.hessian, np.float64),
             np.ascontiguousarray(problem.gradient, np.float64),
-            float(problem.constant), iterations,
+            float(problem.constant), until,
         )  # fmt: skip
-        self._told = True
 
-    @property
-    def spread(self) -> float:
-        """Epsilon of Eq. 29 after the last iteration."""
-        return float(self._search["spread"][0])
-
-    def result(self, cut_short: bool = False, history: SwarmHistory | None = None) -> SwarmResult:
+    def result(self, cut_short: bool = False) -> SwarmResult:
         """The best input so far."""
-        found = self._search[0]
+        search = self._search[0]
         return SwarmResult(
             self._best.copy(),
-            cost=float(found["cost"]),
-            spread=self.spread,
-            iterations=int(found["iterations"]),
+            cost=float(search["cost"]),
+            spread=float(search["spread"]),
+            iterations=int(search["done"]),
             cut_short=cut_short,
-            rejected=int(found["rejected"]),
-            history=history,
         )
 
 
@@ -308,36 +253,24 @@ def minimise(
     settings: SwarmSettings,
     problem: BoxQuadratic,
     rng: Generator,
-    seeds: Sequence[ArrayLike] = (),
     remaining_s: Callable[[], float] | None = None,
-    keep_history: bool = False,
 ) -> SwarmResult:
     """The best input found within the bounds of a quadratic.
 
     `remaining_s` returns how many seconds are left; when none are, the search ends with the best so
-    far, after one chunk of iterations at the earliest. `keep_history` keeps every iteration. Raises
-    ValueError for bounds that are not finite and ordered.
+    far, after one chunk of iterations at the earliest. Raises ValueError for bounds that are not
+    finite and ordered.
     """
-    swarm = Swarm(settings, problem.lower, problem.upper, rng, seeds)
-    limit, tolerance = settings.iterations, settings.tolerance
-    watched = remaining_s is not None or tolerance > 0
-    chunk = 1 if keep_history else CHUNK_ITERATIONS if watched else limit
-    kept: list[tuple[Array, float, float]] = []
-    cut_short = False
-    for done in range(chunk, limit + chunk, chunk):
-        swarm.iterate(problem, min(done, limit))
-        if keep_history:
-            now = swarm.result()
-            kept.append((swarm.positions, now.cost, now.spread))
-        if tolerance > 0 and swarm.spread <= tolerance:
-            break
-        if done < limit and remaining_s is not None and remaining_s() <= 0:
-            cut_short = True
-            break
-    if not keep_history:
-        return swarm.result(cut_short)
-    positions, costs, spreads = (np.array(each) for each in zip(*kept, strict=True))
-    return swarm.result(cut_short, SwarmHistory(positions, costs, spreads))
+    swarm, limit = Swarm(settings, problem.lower, problem.upper, rng), settings.iterations
+    if remaining_s is None:
+        swarm.tell_all(problem, limit)
+        return swarm.result()
+    for until in range(CHUNK_ITERATIONS, limit, CHUNK_ITERATIONS):
+        swarm.tell_all(problem, until)
+        if remaining_s() <= 0:
+            return swarm.result(cut_short=True)
+    swarm.tell_all(problem, limit)
+    return swarm.result()
 
 
 def _bounds(lower: ArrayLike, upper: ArrayLike) -> Array:

@@ -24,7 +24,7 @@ from offboard.analysis.figure import (
     panels,
 )
 from offboard.control.quadratic import ExactMinimum
-from offboard.control.swarm import minimise
+from offboard.control.swarm import Swarm
 from offboard.model.state import PSI, U, X
 from offboard.paper.closed_loop import Flight, Flights, FlightTask, PathName, sampled_path
 from offboard.paper.law import PaperLaw, PaperSettings
@@ -101,11 +101,12 @@ def search(settings: PaperSettings) -> Search:
         state = move.following
     problem = move.problem
     rng = np.random.default_rng(0)
-    history = minimise(settings.swarm, problem, rng, keep_history=True).history
-    assert history is not None
-    picked = np.minimum(SHOWN_ITERATIONS, len(history.positions)) - 1
+    swarm, positions = Swarm(settings.swarm, problem.lower, problem.upper, rng), []
+    for iteration in SHOWN_ITERATIONS:
+        swarm.tell_all(problem, min(iteration, settings.swarm.iterations) - 1)
+        positions.append(swarm.ask())
     optimum = ExactMinimum(4).minimise(problem)
-    return Search(history.positions[picked], problem.lower, problem.upper, optimum)
+    return Search(np.array(positions), problem.lower, problem.upper, optimum)
 
 
 def search_motion(flights: Flights) -> Figure:

@@ -27,7 +27,7 @@ def test_compiled_swarm_40_by_150(benchmark: Any) -> None:
 @pytest.mark.benchmark(group="one step, 4 inputs")
 def test_compiled_swarm_with_a_deadline(benchmark: Any) -> None:
     rng = np.random.default_rng(1)
-    result = benchmark(minimise, SwarmSettings(), PROBLEM, rng, (), lambda: 1.0)
+    result = benchmark(minimise, SwarmSettings(), PROBLEM, rng, lambda: 1.0)
     assert result.best == pytest.approx(MINIMISER, abs=1e-4)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from offboard.control.swarm import SEARCH, remember
+from offboard.control.swarm import SEARCH, iterate
 from offboard.estimation.kalman import FILTER
 
 ROOT = Path(__file__).parents[2]
@@ -193,11 +193,11 @@ def test_a_relative_directory_is_not_used(package: Path, tmp_path: Path) -> None
     ids=["strided", "one dimension", "single precision", "transposed"],
 )
 def test_arguments_of_other_types_are_refused(wrong: np.ndarray) -> None:
-    bounds, best = np.zeros((2, 2)), np.ones(2)
+    bounds, best, rng = np.zeros((2, 2)), np.ones(2), np.random.default_rng(0)
     with pytest.raises(TypeError, match="No matching definition"):
-        remember(np.zeros(1, SEARCH), bounds, wrong, best)
+        iterate(np.zeros(1, SEARCH), rng, bounds, wrong, best, bounds)
     with pytest.raises(TypeError, match="No matching definition"):
-        remember(np.zeros(1, FILTER), bounds, np.zeros((3, 2, 4)), best)
+        iterate(np.zeros(1, FILTER), rng, bounds, np.zeros((3, 2, 4)), best, bounds)
 
 
 def test_importing_a_flight_does_not_import_numba() -> None:

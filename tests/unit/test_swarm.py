@@ -37,7 +37,7 @@ def search(
     upper: Array,
     settings: SwarmSettings,
     seed: int = 1,
-    seeds: tuple[Array, ...] = (),
+    seeds: Array | None = None,
 ) -> SwarmResult:
     swarm = Swarm(settings, lower, upper, rng(seed), seeds)
     for _ in range(settings.iterations):
@@ -160,18 +160,12 @@ def test_a_seed_repeats_a_search_and_the_stream_goes_on() -> None:
 
 
 def test_seed_particles_bound_the_answer_and_are_put_inside_the_box() -> None:
-    minimiser = np.array([0.3, -0.4, 0.2, 0.1])
-    problem = BoxQuadratic(np.eye(4), -minimiser, 0.0, -np.ones(4), np.ones(4))
-    settings = SwarmSettings(iterations=1)
-    unusable = np.full(4, np.nan)
-    result = minimise(settings, problem, rng(7), seeds=(unusable, minimiser))
-    assert np.array_equal(result.best, minimiser)
-    assert np.isfinite(result.spread)
-    corner = BoxQuadratic(np.eye(4), -9 * np.ones(4), 0.0, -np.ones(4), np.ones(4))
-    result = minimise(settings, corner, rng(7), seeds=(9 * np.ones(4),))
-    assert np.array_equal(result.best, np.ones(4))
-    told = search(sphere, -np.ones(4), np.ones(4), SwarmSettings(iterations=1), 7, (np.zeros(4),))
-    assert told.cost == 0.0
+    settings, seeds = SwarmSettings(iterations=1), np.array([[0.3, -0.4], [9.0, 9.0]])
+    at_seed = search(lambda u: sphere(u - seeds[0]), -np.ones(2), np.ones(2), settings, 7, seeds)
+    assert np.array_equal(at_seed.best, seeds[0])
+    assert at_seed.cost == 0.0
+    in_corner = search(lambda u: -u.sum(axis=-1), -np.ones(2), np.ones(2), settings, 7, seeds)
+    assert np.array_equal(in_corner.best, np.ones(2))
 
 
 def test_a_fixed_dimension_stays_where_it_is() -> None:
@@ -182,7 +176,7 @@ def test_a_fixed_dimension_stays_where_it_is() -> None:
     assert result.best[1] == 0.25
 
 
-def test_costs_that_are_not_finite_are_counted_and_never_win() -> None:
+def test_costs_that_are_not_finite_never_win() -> None:
     def holed(u: Array) -> Array:
         return np.where(u[:, 0] > 0, sphere(u - 0.5), np.array([np.nan, np.inf, -np.inf, 1e308])[
             np.arange(len(u)) % 4
@@ -190,10 +184,8 @@ def test_costs_that_are_not_finite_are_counted_and_never_win() -> None:
 
     result = search(holed, -np.ones(2), np.ones(2), SwarmSettings())
     assert result.best == pytest.approx([0.5, 0.5], abs=1e-6)
-    assert 10 < result.rejected < 40 * 150
     hopeless = search(lambda u: np.full(len(u), np.nan), -np.ones(2), np.ones(2), SwarmSettings())
     assert hopeless.cost == np.inf
-    assert hopeless.rejected == 40 * 150
     assert np.all(np.abs(hopeless.best) <= 1)
 
 
@@ -223,37 +215,16 @@ def test_time_up_at_the_last_iteration_cuts_nothing_short() -> None:
     assert not minimise(settings, problem, rng(11), remaining_s=lambda: 0.0).cut_short
 
 
-def test_a_spread_below_the_tolerance_ends_the_search() -> None:
-    problem, minimiser = diagonal_problem(np.random.default_rng(12))
-    settings = SwarmSettings(tolerance=1e-5, iterations=1000)
-    result = minimise(settings, problem, rng(12))
-    assert result.spread <= 1e-5
-    assert result.iterations < 200
-    assert not result.cut_short
-    assert np.abs(result.best - minimiser).max() < 1e-3
-    swarm = Swarm(settings, problem.lower, problem.upper, rng(12))
-    swarm.tell(problem(swarm.ask()))
-    count = 1
-    while swarm.spread > settings.tolerance:
-        swarm.tell(problem(swarm.ask()))
-        count += 1
-    assert result.iterations - 25 < count <= result.iterations
-
-
-def test_history_ends_where_the_answer_is() -> None:
+def test_the_spread_is_the_mean_distance_of_the_last_positions_from_the_best() -> None:
     problem, _ = diagonal_problem(np.random.default_rng(13))
-    settings = SwarmSettings()
-    plain = minimise(settings, problem, rng(13))
-    result = minimise(settings, problem, rng(13), keep_history=True)
-    assert plain.history is None
-    assert result.history is not None
-    assert result.history.positions.shape == (150, 40, 4)
-    assert np.array_equal(result.best, plain.best)
-    assert np.all(np.diff(result.history.costs) <= 0)
-    assert result.history.costs[-1] == result.cost
-    distance = np.linalg.norm(result.history.positions[-1] - result.best, axis=1)  # Eqs. 28-29
-    assert result.spread == pytest.approx(distance.mean(), rel=1e-12)
-    assert result.history.spreads[-1] == result.spread
+    swarm = Swarm(SwarmSettings(iterations=20), problem.lower, problem.upper, rng(13))
+    for until in range(1, 21):
+        asked = swarm.ask()
+        swarm.tell_all(problem, until)
+        result = swarm.result()
+        distance = np.linalg.norm(asked - result.best, axis=1)  # Eqs. 28-29
+        assert result.spread == pytest.approx(distance.mean(), rel=1e-12)
+        assert (result.iterations, result.cost <= problem(asked).min() + 1e-12) == (until, True)
 
 
 @pytest.mark.parametrize(
@@ -265,14 +236,11 @@ def test_bounds_that_make_no_box_are_refused(lower: list[float], upper: list[flo
         Swarm(SwarmSettings(), lower, upper, rng(0))
 
 
-def test_misuse_of_ask_and_tell_is_refused() -> None:
+def test_asking_again_gives_the_same_and_costs_of_another_number_are_refused() -> None:
     swarm = Swarm(SwarmSettings(particles=3), [-1.0], [1.0], rng(0))
     assert np.array_equal(swarm.ask(), swarm.ask())
     with pytest.raises(ValueError, match="particles"):
         swarm.tell(np.zeros(4))
-    swarm.tell(np.zeros(3))
-    with pytest.raises(ValueError, match="tell without ask"):
-        swarm.tell(np.zeros(3))
 
 
 @pytest.mark.parametrize(
@@ -285,19 +253,17 @@ def test_settings_out_of_range_are_refused(key: str, value: float) -> None:
 
 def test_one_move_is_eq_30_then_eq_20_then_the_box() -> None:
     """Against the equations in NumPy, with the same random numbers."""
-    settings = SwarmSettings(social=1.4, rebound=0.25, initial_velocity=1.0)
+    settings = SwarmSettings(social=1.4, rebound=0.25, inertia=1.9)
     lower, upper = -np.array([0.6, 0.8, 1.0]), np.array([0.7, 0.5, 0.9])
     swarm, drawn = Swarm(settings, lower, upper, rng(1)), rng(1)
     start = lower + (upper - lower) * drawn.random((3, 40)).T
-    velocity = (upper - lower) * drawn.uniform(-1, 1, (3, 40)).T
+    velocity = 0.5 * (upper - lower) * drawn.uniform(-1, 1, (3, 40)).T
     assert swarm.ask() == pytest.approx(start, abs=1e-15)
     costs = rng(2).random(40)
     best = start[np.argmin(costs)]
     swarm.tell(costs)
     r1, r2 = drawn.random((3, 40, 2)).transpose(2, 1, 0)
-    velocity = 0.65 * (
-        0.9298 * velocity + 1.4986 * r1 * (start - start) + 1.4 * r2 * (best - start)
-    )
+    velocity = 0.65 * (1.9 * velocity + 1.4986 * r1 * (start - start) + 1.4 * r2 * (best - start))
     moved = np.clip(start + velocity, lower, upper)
     assert swarm.ask() == pytest.approx(moved, abs=1e-14)
     assert np.any((moved == lower) | (moved == upper))
@@ -306,7 +272,7 @@ def test_one_move_is_eq_30_then_eq_20_then_the_box() -> None:
     clamped = (start + velocity < lower) | (start + velocity > upper)
     velocity = np.where(clamped, -0.25 * velocity, velocity)
     pull = 1.4986 * r1 * (start - moved) + 1.4 * r2 * (best - moved)
-    moved = np.clip(moved + 0.65 * (0.9298 * velocity + pull), lower, upper)
+    moved = np.clip(moved + 0.65 * (1.9 * velocity + pull), lower, upper)
     assert swarm.ask() == pytest.approx(moved, abs=1e-14)
 
 
@@ -328,12 +294,14 @@ def test_compiled_and_ask_tell_move_the_same_particles(dimensions: int) -> None:
     half = generator.uniform(0.1, 1, dimensions)
     hessian, gradient = root @ root.T + np.eye(dimensions), generator.normal(size=dimensions)
     problem = BoxQuadratic(np.asfortranarray(hessian), gradient, 2.0, -half, half)
-    compiled = minimise(SwarmSettings(), problem, rng(3), keep_history=True)
-    assert compiled.history is not None
+    compiled = Swarm(SwarmSettings(), -half, half, rng(3))
     swarm = Swarm(SwarmSettings(), -half, half, rng(3))
-    for positions in compiled.history.positions:
+    for until in range(1, SwarmSettings().iterations + 1):
         asked = swarm.ask()
-        assert asked == pytest.approx(positions, abs=1e-5)  # equal costs but for rounding
+        assert asked == pytest.approx(compiled.ask(), abs=1e-5)  # equal costs but for rounding
         swarm.tell(problem(asked))
-    assert swarm.result().best == pytest.approx(compiled.best, abs=1e-6)
-    assert swarm.result().cost == pytest.approx(compiled.cost, rel=1e-12)
+        compiled.tell_all(problem, until)
+    ours, theirs = swarm.result(), compiled.result()
+    assert ours.best == pytest.approx(theirs.best, abs=1e-6)
+    assert ours.cost == pytest.approx(theirs.cost, rel=1e-12)
+    assert np.array_equal(minimise(SwarmSettings(), problem, rng(3)).best, theirs.best)

@@ -180,7 +180,8 @@ def swarm(
     """The best plan whose knots are within +-reach (M, 3) about `base`. The first particle starts
     at the base, so the answer is never worse."""
     limit = reach.ravel()
-    particles = Swarm(settings, -limit, limit, rng, _graded(limit, settings.particles))
+    starts = _starts(settings.particles, len(limit)) * limit
+    particles = Swarm(settings, -limit, limit, rng, starts)
     shape = (*reach.shape, settings.particles)
     best, cut_short = base, False
     for iteration in range(settings.iterations):
@@ -197,14 +198,11 @@ def swarm(
     return Found(best, result.spread, result.iterations, cut_short)
 
 
-def _graded(limit: Array, count: int) -> list[Array]:
-    """Where the particles start, (n,) each: the first at the base, the others scattered about it,
-    each wider than the one before. Equal in all decisions; their motion is random."""
-    return list(_directions(count, len(limit)) * limit)
-
-
 @cache
-def _directions(count: int, size: int) -> Array:
+def _starts(count: int, size: int) -> Array:
+    """Where the particles start, (count, size), as fractions of their bounds: the first at the
+    base, the others scattered about it, each wider than the one before. Equal in all decisions;
+    their motion is random."""
     drawn = np.random.default_rng(count).uniform(-1.0, 1.0, (count, size))
     widened: Array = np.linspace(0.0, 1.0, count)[:, None] * drawn
     return widened
