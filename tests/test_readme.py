@@ -12,6 +12,8 @@ from textwrap import dedent
 import numpy as np
 import pytest
 
+from offboard import cli
+
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
 SCRIPTS = Path(sys.executable).parent
@@ -90,7 +92,13 @@ def _path(picture: str) -> np.ndarray:
     return np.array([pair.split(",") for pair in points.split()], dtype=float)
 
 
-@pytest.mark.parametrize("readme", _examples())
+@pytest.mark.parametrize(
+    "readme",
+    [
+        pytest.param(name, marks=[] if name == "README.md" else pytest.mark.slow)
+        for name in _examples()
+    ],
+)
 def test_python_examples_run(readme: str, tmp_path: Path) -> None:
     blocks = _examples()[readme]
     for number, block in enumerate(blocks):
@@ -129,15 +137,15 @@ def test_links_lead_to_files() -> None:
             assert (readme.parent / target).exists(), f"{readme.relative_to(ROOT)}: {target}"
 
 
-def test_scenario_example_is_valid(tmp_path: Path) -> None:
+def test_scenario_example_is_valid(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     text = (ROOT / "config" / "README.md").read_text()
     (block,) = re.findall(r"```yaml\n(.*?)```", text, re.DOTALL)
     (tmp_path / "example.yaml").write_text(dedent(block))
-    done = subprocess.run(
-        (SCRIPTS / "offboard", "check", "example.yaml"),
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        timeout=60,
-    )
-    assert done.stdout == "example.yaml: scenario, valid\n", done.stderr
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["offboard", "check", "example.yaml"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert not ended.value.code
+    assert capsys.readouterr().out == "example.yaml: scenario, valid\n"

@@ -22,10 +22,10 @@ from simulator import config as simulated
     [
         ("calm", 0.01),
         ("px4_like", 0.04),
-        ("noise", 0.04),
-        ("thrust_minus_15", 0.02),
+        pytest.param("noise", 0.04, marks=pytest.mark.slow),
+        pytest.param("thrust_minus_15", 0.02, marks=pytest.mark.slow),
         ("mass_plus_20", 0.03),
-        ("wind_2mps", 0.03),
+        pytest.param("wind_2mps", 0.03, marks=pytest.mark.slow),
         ("gusts", 0.06),
     ],
 )

@@ -99,7 +99,7 @@ def flown_at(
 
 
 @pytest.mark.parametrize(
-    ("rates", "way_s"), [((0.9, 0.95, 0.985, 1.05), 0.06), ((0.95,), 0.0)], ids=["late", "prompt"]
+    ("rates", "way_s"), [((0.9, 1.05), 0.06), ((0.95,), 0.0)], ids=["late", "prompt"]
 )
 def test_simulator_slower_than_real_time_is_flown_as_any_other(
     rates: tuple[float, ...], way_s: float, tmp_path: Path

@@ -95,7 +95,9 @@ def nearest_m(volumes: list[dict[str, Any]], times: np.ndarray, places: np.ndarr
     return float(clearances(keep_out, times, places).min())
 
 
-@pytest.mark.parametrize("volumes", [[CROSSING], [AT_THE_TOP, TOWER], [SHED]])
+@pytest.mark.parametrize(
+    "volumes", [[CROSSING], [AT_THE_TOP, TOWER], pytest.param([SHED], marks=pytest.mark.slow)]
+)
 def test_volumes_are_kept_clear_of(volumes: list[dict[str, Any]], tmp_path: Path) -> None:
     keep_out = f"controller.keep_out={json.dumps(volumes)}"
     times, places, rmse_m = flown("horizon", tmp_path, keep_out)
@@ -103,7 +105,7 @@ def test_volumes_are_kept_clear_of(volumes: list[dict[str, Any]], tmp_path: Path
     assert rmse_m < 0.4  # and back to the reference behind them
 
 
-@pytest.mark.parametrize("law", ["lqr", "mpc"])
+@pytest.mark.parametrize("law", ["lqr", pytest.param("mpc", marks=pytest.mark.slow)])
 def test_others_fly_through(law: str, tmp_path: Path) -> None:
     times, places, _ = flown(law, tmp_path)
     for volume in (AT_THE_TOP, CROSSING, TOWER, SHED):

@@ -70,8 +70,8 @@ UNSEEN = {
     ("name", "scenario"),
     [
         ("slow", "px4_like"),
-        ("like PX4", "px4_like"),
-        ("late and draggy", "px4_like"),
+        pytest.param("like PX4", "px4_like", marks=pytest.mark.slow),
+        pytest.param("late and draggy", "px4_like", marks=pytest.mark.slow),
         ("late and draggy", "calm"),
     ],
 )
@@ -113,12 +113,16 @@ def like_arducopter(**options: Any) -> Pair:
     return on_arducopter(scenario="ardupilot_like", **options)
 
 
+SEEDS = pytest.mark.parametrize("seeds", [(1,), pytest.param((1, 2), marks=pytest.mark.slow)])
+
+
+@SEEDS
 @pytest.mark.parametrize("like", [like_px4, like_arducopter])
-def test_second_lap_is_as_good_as_with_the_true_constants(like, tmp_path: Path):
-    """Within 20 %, mean of two seeds; over ten seeds it is within 2 %. The file alone, without the
+def test_second_lap_is_as_good_as_with_the_true_constants(like, seeds, tmp_path: Path):
+    """Within 20 %; over ten seeds it is within 2 %. The file alone, without the
     hover thrust that ArduCopter shows before the take-over, is much worse."""
     true, identified, neutral_file = [], [], []
-    for seed in (1, 2):
+    for seed in seeds:
         flights = (
             (true, like(seed=seed)),
             (identified, like(seed=seed, believed=NEUTRAL, learning=IDENTIFY)),
@@ -135,7 +139,7 @@ def test_second_lap_is_as_good_as_with_the_true_constants(like, tmp_path: Path):
     assert np.mean(neutral_file) > 1.6 * np.mean(true)
 
 
-@pytest.mark.parametrize("lag_s", [0.3, 0.5])
+@pytest.mark.parametrize("lag_s", [pytest.param(0.3, marks=pytest.mark.slow), 0.5])
 def test_slow_thrust_is_identified(lag_s: float, tmp_path: Path):
     """From the steps, though they leave it uncertain. Otherwise it is 0.5 to 1.2 m off."""
     flies = simulated.vehicle("px4_sih").model_copy(update={"thrust_lag_s": lag_s})
@@ -302,12 +306,13 @@ def on_a_link_that_changes(extra_s: Callable[[], float], seed: int = 1) -> Pair:
     return pair
 
 
-def test_delay_that_jumps_is_noticed_and_flown(tmp_path: Path):
+@SEEDS
+def test_delay_that_jumps_is_noticed_and_flown(seeds, tmp_path: Path):
     """Unnoticed, 0.2 s more take the vehicle 3.8 m off at this bandwidth; noticed by the motion
     alone 0.6 to 2.0 m, by the moment of the jump, and 0.06 m in the lap that follows; by TIMESYNC
     0.2 m (`test_late_link`)."""
     furthest_m = []
-    for seed in (1, 2):
+    for seed in seeds:
         pair = on_a_link_that_changes(lambda: 0.2, seed)
         pair.track()
         text = " | ".join(pair.companion.announced)

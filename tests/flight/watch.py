@@ -22,6 +22,18 @@ ONE_LAP = "reference.laps=1"
 BOTH = pytest.mark.parametrize(
     "fly", [partial(make, LOW), partial(on_arducopter, LOW)], ids=["px4", "ardupilot"]
 )
+
+
+def alternately(*cases: Any) -> list[Any]:
+    """Arguments (case, fly): each case is flown on one of the firmwares, in turn."""
+    flown = [(partial(make, LOW), "px4"), (partial(on_arducopter, LOW), "ardupilot")]
+    each = ((case, *flown[index % 2]) for index, case in enumerate(cases))
+    return [
+        pytest.param(case, fly, id=f"{index}-{name}")
+        for index, (case, fly, name) in enumerate(each)
+    ]
+
+
 REACTION_S = 0.13  # a report of the mode at 10 Hz, and a turn
 WATCHED_STEPS = 5  # 20 ms
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from processes import SHORT, Spawn, children
+from processes import SHORT, Called, Spawn, children
 from rich.console import Console
 
 from offboard.campaign import flight, workers
@@ -125,13 +125,12 @@ def test_every_combination_is_planned_with_as_many_draws(tmp_path: Path) -> None
         assert all(least <= float(values[key]) <= most for values in drawn)
 
 
-def test_the_command_of_a_row_flies_it_again(whole: Path, tmp_path: Path, spawn: Spawn) -> None:
+def test_the_command_of_a_row_flies_it_again(whole: Path, tmp_path: Path, called: Called) -> None:
     row = rows(whole)[1]
     program, *arguments = shlex.split(row["fly_again"])
     arguments[arguments.index("--scenario") + 1] = str(whole / scenario_file(row))
-    flown = spawn(program, *arguments, "--out", "again")
-    output, _ = flown.communicate(timeout=120)
-    assert flown.returncode == 0, output
+    code, output, _ = called(program, *arguments, "--out", "again")
+    assert code == 0, output
     score = json.loads((tmp_path / "again" / "score.json").read_text())
     assert score["rmse_position_m"] == float(row["rmse_position_m"])
 
@@ -193,6 +192,7 @@ def test_a_dask_cluster_of_two_workers_makes_the_same_table(whole: Path, tmp_pat
     assert table(tmp_path / "out") == table(whole)
 
 
+@pytest.mark.slow
 def test_a_scheduler_that_is_lost_is_one_sentence_and_keeps_what_is_finished(
     tmp_path: Path, spawn: Spawn
 ) -> None:
@@ -210,6 +210,7 @@ def test_a_scheduler_that_is_lost_is_one_sentence_and_keeps_what_is_finished(
     assert 1 <= len(rows(tmp_path / "out")) < 6
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("address", ["nonsense", "udp://127.0.0.1:9", "tcp://127.0.0.1:9"])
 def test_no_scheduler_is_a_sentence_at_once(address: str, spawn: Spawn) -> None:
     begun_s = time.monotonic()
@@ -396,6 +397,7 @@ def test_an_interrupted_comparison_keeps_what_landed_and_goes_on(
     assert all(row in again for row in flown)
 
 
+@pytest.mark.slow
 def test_interrupted_while_its_processes_load_it_ends_in_order(
     spawn: Spawn, tmp_path: Path
 ) -> None:

@@ -88,10 +88,11 @@ def test_a_vehicle_that_fails_ends_the_flight_with_a_sentence(
     [
         # the autopilot sends no telemetry after its restart until it is asked again
         ({"fault": "reboot", "at_s": 30.0}, 0, "flown and landed"),
-        (
+        pytest.param(
             {"fault": "link", "direction": "down", "loss": 1.0, "after": "engaged", "at_s": 8.0},
             4,
             "no telemetry for 1.0 s; not heard for 300 s while landing; last known: armed in ",
+            marks=pytest.mark.slow,  # 300 s
         ),
     ],
     ids=["restart on the ground", "telemetry lost"],

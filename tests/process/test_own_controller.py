@@ -44,7 +44,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     ("controller", "reference", "shorter", "damping_ps", "most_m"),
     [
         ("pd", "hover", "reference.duration_s=8", 4.0, 0.03),
-        ("my.yaml", "lemniscate", "reference.laps=1", 5.0, 0.2),
+        pytest.param("my.yaml", "lemniscate", "reference.laps=1", 5.0, 0.2, marks=pytest.mark.slow),
     ],
 )
 def test_documented_controller_flies(

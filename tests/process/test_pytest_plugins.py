@@ -69,6 +69,7 @@ def named_logs(result: pytest.RunResult) -> list[Path]:
     return [Path(line) for line in result.outlines if line.endswith(".tlog")]
 
 
+@pytest.mark.slow
 def test_vehicles_for_tests_of_two_workers(pytester: pytest.Pytester) -> None:
     pytester.makepyfile(FLIES)
     result = pytester.runpytest_subprocess("-q", "--strict-markers", "-n", "2", timeout=90)

@@ -112,10 +112,10 @@ def undisturbed(
 @pytest.mark.parametrize(
     ("disturbance", "load"),
     [
-        ({"simulator_late_s": 2.0}, 0),
-        ({"controller_late_s": 1.0}, 0),  # the simulator repeats its first barrier
-        ({"stall_s": 1.2}, 0),  # it repeats a barrier in flight
-        ({"simulator_late_s": 0.1}, 2),
+        # the simulator repeats its first barrier, and one in flight
+        ({"simulator_late_s": 0.1, "controller_late_s": 1.0, "stall_s": 1.2}, 0),
+        pytest.param({"simulator_late_s": 2.0}, 0, marks=pytest.mark.slow),
+        pytest.param({"simulator_late_s": 0.1}, 2, marks=pytest.mark.slow),
     ],
     ids=str,
 )

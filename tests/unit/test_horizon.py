@@ -219,7 +219,9 @@ WALL = {"shape": "box", "north_m": 0.6, "east_m": -0.5, "height_m": 3.0, "size_n
 PASSING = IN_THE_WAY | {"east_m": -1.4, "velocity_east_mps": 1.4}
 
 
-@pytest.mark.parametrize("volume", [IN_THE_WAY, WALL, PASSING])
+@pytest.mark.parametrize(
+    "volume", [PASSING, *(pytest.param(v, marks=pytest.mark.slow) for v in (IN_THE_WAY, WALL))]
+)
 def test_law_finds_cheaper_plans_than_a_random_search(volume: dict[str, object]) -> None:
     """Each decision from the closed form, for no more roll-outs than 2800 plans drawn about it:
     every one cheaper, most cost less than half."""
@@ -257,7 +259,7 @@ def test_a_way_below_the_clearance_to_the_ground_costs() -> None:
     assert low.cost - high.cost == pytest.approx(paid, rel=1e-9)
 
 
-@pytest.mark.parametrize("volume", [IN_THE_WAY, WALL])
+@pytest.mark.parametrize("volume", [IN_THE_WAY, pytest.param(WALL, marks=pytest.mark.slow)])
 def test_the_search_alone_beats_a_random_search(volume: dict[str, object]) -> None:
     """2800 roll-outs each about the same base, no other seed and no polish: cheaper in sum and in
     the median."""
@@ -302,7 +304,7 @@ def counted(law: HorizonLaw) -> list[int]:
     return batches
 
 
-@pytest.mark.parametrize("volume", [IN_THE_WAY, WALL])
+@pytest.mark.parametrize("volume", [pytest.param(IN_THE_WAY, marks=pytest.mark.slow), WALL])
 def test_answers_are_local_minima(
     volume: dict[str, object], monkeypatch: pytest.MonkeyPatch
 ) -> None:

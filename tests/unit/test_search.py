@@ -187,7 +187,7 @@ def test_what_is_better_only_in_training_is_refused(tmp_path: Path) -> None:
     assert not tuned(tmp_path / "t", record=lambda case: bowl(case, 0.5)).verdict.better
 
 
-@pytest.mark.parametrize("flights", [2, 50])
+@pytest.mark.parametrize("flights", [2, pytest.param(50, marks=pytest.mark.slow)])
 def test_an_interrupted_tuning_goes_on_and_finds_the_same(flights: int, tmp_path: Path) -> None:
     """The first trial, of four flights, has the present values also if it was interrupted."""
     costs: list[float] = []
