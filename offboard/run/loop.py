@@ -32,7 +32,6 @@ OWN_FAILSAFE, SUPERVISED = (
 UNGUARDED = "the supervisor ended: nobody lands the vehicle if this process dies"
 UNANSWERED = "the supervisor does not answer: nobody lands the vehicle if this process dies"
 ANSWERS = "the supervisor answers again"
-MESSAGE_ID, STATUSTEXT = slice(7, 10), (253).to_bytes(3, "little")  # of a frame
 RESTART_S = 10.0  # between two attempts to start another one
 
 
@@ -156,7 +155,7 @@ class Loop:
 
     def _send(self, output: Output, began_s: float) -> list[bytes]:
         """Send what a turn has decided. This process may have been stopped since the turn began:
-        then it is dropped, and returned but for our texts: the log says what was announced."""
+        then it is dropped, and returned."""
         peer = self._companion.peer
         dropped: list[bytes] = []
         for frame in output.send:
@@ -169,7 +168,7 @@ class Loop:
         if peer is not None:
             self._link.follow(peer)
             self._beat(output, peer)
-        return [frame for frame in dropped if frame[MESSAGE_ID] != STATUSTEXT]
+        return dropped
 
     # --- the supervisor ---
 
