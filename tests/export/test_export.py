@@ -24,6 +24,7 @@ from offboard.analysis import tlog
 from offboard.cli.commands import app
 from offboard.flight.record import RECORD_ID
 from offboard.link.log import entry
+from offboard.mavlink import event_record
 from offboard.model.frames import enu, flu_in_enu
 
 sys.path.append(str(Path(__file__).parents[1] / "flight"))
@@ -200,18 +201,20 @@ def test_a_log_of_another_program(tmp_path: Path) -> None:
 
 
 def test_our_announcements_and_a_second_vehicle(flight: Path, tmp_path: Path) -> None:
-    """Vehicle 9, whose clock is 1000 s ahead, changes no time. A text of ours is one more event."""
+    """Vehicle 9, whose clock is 1000 s ahead, changes no time. A record of an event is one more."""
     other = mavlink.MAVLink(None, srcSystem=9, srcComponent=1)
-    text = mavlink.MAVLink_statustext_message(6, b"bandwidth 5.0 rad/s")
+    (event,) = event_record.pieces(event_record.EventRecord("bandwidth 5.0 rad/s"))
+    padded = event.data.ljust(128, b"\0")
+    record = mavlink.MAVLink_tunnel_message(0, 0, event.payload_type, len(event.data), padded)
     data = b""
     for number, each in enumerate(tlog.read(flight)):
         data += entry(each.unix_us, each.frame.raw)
         if each.name == "LOCAL_POSITION_NED":
             position = mavlink.MAVLink_local_position_ned_message(10**6 + number, *6 * [0])
             data += entry(each.unix_us, position.pack(other))
-    ours = mavlink.MAVLink(None, srcSystem=1, srcComponent=OURS[0])
+    ours = mavlink.MAVLink(None, srcSystem=1, srcComponent=OURS[1])
     two = tmp_path / "two.tlog"
-    two.write_bytes(data + entry(each.unix_us, text.pack(ours)))
+    two.write_bytes(data + entry(each.unix_us, record.pack(ours)))
     before, after = (
         exported(log, "csv", log.with_suffix(".csv")).read_text().splitlines()
         for log in (flight, two)
