@@ -57,7 +57,8 @@ class News:
         """The sentences to announce now, at host time `now_s`."""
         late = [each.news(now_s) for each in (self.paused, self.dropped)]
         ended = state.busyness.sentence if state.has_ended and state.service else ""
-        return list(filter(None, [*late, self._waiting.news(state, session, state.now_s), ended]))
+        told = [*late, self._waiting.news(state, session, state.now_s)]
+        return list(filter(None, [*told, "" if ended in state.announced else ended]))
 
 
 def _unready(state: FlightState) -> str:

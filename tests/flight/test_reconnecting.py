@@ -2,17 +2,23 @@
 
 from __future__ import annotations
 
+import fcntl
 import os
 import pty
 import socket
+import sys
+import termios
+import threading
 import time
 import tty
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from pathlib import Path
 
 import pytest
 
+from offboard.link import clock
 from offboard.link.connection import open_link
 from offboard.link.interface import Link, LinkError
 from offboard.link.stream import BROKEN, RENEWED
@@ -168,6 +174,52 @@ def test_a_serial_device_that_is_unplugged_and_back(
     turns(link, lambda data: data == b"again")
     os.close(theirs)
     os.close(ours)
+
+
+@pytest.mark.parametrize("kind", ["tcp", "serial", "udp"])
+def test_what_arrives_while_it_waits_is_not_read(kind: str, keep: Callable[[Link], Link]) -> None:
+    """The supervisor has the same descriptors, and must find what the controller has waited for."""
+    with ExitStack() as ends:
+        link, send = joined(kind, ends)
+        descriptor = keep(link).descriptors()[-1]
+        assert waiting_bytes(descriptor) == 0
+        began_s = clock.monotonic_s()
+        later = threading.Timer(0.1, send, [b"\xfd while it waits"])
+        later.start()
+        link.wait(LONG_S)
+        waited_s = clock.monotonic_s() - began_s
+        later.join()
+        assert 0.09 < waited_s < 0.09 + TURN_S
+        assert waiting_bytes(descriptor) == 16
+        link.wait(LONG_S)  # returns at once
+        (chunk,) = link.receive(0.0)
+        assert chunk.data == b"\xfd while it waits"
+        assert began_s - 0.01 < chunk.arrived_s < clock.monotonic_s()
+        assert link.receive(0.0) == []
+
+
+def joined(kind: str, ends: ExitStack) -> tuple[Link, Callable[[bytes], object]]:
+    """A link, and what sends on its other end."""
+    if kind == "serial":
+        ours, theirs = pty.openpty()
+        tty.setraw(theirs)
+        ends.callback(os.close, ours)
+        ends.callback(os.close, theirs)
+        return open_link(f"serial:{os.ttyname(theirs)}:57600"), partial(os.write, ours)
+    if kind == "tcp":
+        server = ends.enter_context(listening())
+        link = open_link(f"tcp:127.0.0.1:{server.getsockname()[1]}")
+        return link, ends.enter_context(server.accept()[0]).sendall
+    link = open_link("udpin:127.0.0.1:0")
+    other = ends.enter_context(socket.socket(socket.AF_INET, socket.SOCK_DGRAM))
+    assert isinstance(link, UdpLink)
+    other.connect(("127.0.0.1", link.port))
+    return link, other.send
+
+
+def waiting_bytes(descriptor: int) -> int:
+    """That nobody has read yet."""
+    return int.from_bytes(fcntl.ioctl(descriptor, termios.FIONREAD, bytes(4)), sys.byteorder)
 
 
 @pytest.mark.skipif(not IPV6, reason="this computer has no IPv6")

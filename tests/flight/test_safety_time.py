@@ -36,6 +36,7 @@ from offboard.analysis import history
 from offboard.analysis.score import score
 from offboard.analysis.score_table import summary
 from offboard.control.base import Controller, Decision, Situation
+from offboard.estimation.observer import Observer
 from offboard.flight.online_identification import IdentifySettings, OnlineIdentification
 from offboard.flight.phases import Action, ExitCode, Phase
 from simulator import config as simulated
@@ -196,7 +197,9 @@ def with_slow_law(fly: Fly, seconds: float) -> tuple[Pair, Watch]:
 @pytest.mark.parametrize(
     ("case", "fly"), alternately((0.15, "0.05 s too late"), (0.3, "0.30 s old"))
 )
-def test_a_slow_law_is_late_and_then_landed(case: tuple[float, str], fly: Fly) -> None:
+def test_a_slow_law_is_late_and_then_landed(
+    case: tuple[float, str], fly: Fly, tmp_path: Path
+) -> None:
     seconds, why = case
     pair, watch = with_slow_law(fly, seconds)
     outcome = pair.fly()
@@ -204,9 +207,33 @@ def test_a_slow_law_is_late_and_then_landed(case: tuple[float, str], fly: Fly) -
     assert outcome.sentence.startswith("the controller failed: decided ")
     assert why in outcome.sentence
     assert pair.failsafes == {"decision": Action.LEVEL, "decisions": Action.LAND}
+    assert pair.score(tmp_path).ended_by == "controller"
     texts = [frame for frame in pair.logged if frame[7:10] == b"\xfd\0\0"]  # STATUSTEXT
     assert sum(b"decision missed: decided" in frame for frame in texts) == 3
     assert watch.error_m < 0.5
+    assert not pair.instance.autopilot.commander.armed
+
+
+@BOTH
+def test_a_slow_prediction_is_no_failure_of_the_law(
+    fly: Fly, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The telemetry becomes too old before the law is asked, which then decides at once."""
+    clock = HostClock()
+    predict = Observer.predict
+
+    def slow(*arguments: Any) -> Any:
+        clock.spend(0.28)
+        return predict(*arguments)
+
+    pair = fly(*QUICK, deadline_s=DEADLINE_S, clock=clock)
+    pair.at.append((IN_TRACK, lambda _: monkeypatch.setattr(Observer, "predict", slow)))
+    outcome = pair.fly()
+    assert outcome.exit_code == ExitCode.ABORTED
+    old = r"telemetry was too old for a setpoint: decided on telemetry that is 0\.2[89] s old"
+    assert re.fullmatch(old, outcome.sentence)
+    assert pair.failsafes == {"decision": Action.LEVEL, "decisions": Action.LAND}
+    assert pair.score(tmp_path).ended_by == "link"
     assert not pair.instance.autopilot.commander.armed
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,8 @@ def thrusts(pair: Serving, since_s: float) -> list[float]:
 
 @BOTH
 def test_engaged_handed_back_and_engaged_again(on: str) -> None:
+    """In the first flight the process of the service is stopped for half a second: the sentence
+    after it counts the ticks of 0.1 s."""
     pair = serve(on=on)
     wire = Wire(pair)
     pair.fly_up()
@@ -59,11 +62,20 @@ def test_engaged_handed_back_and_engaged_again(on: str) -> None:
         assert (flight == 1) is any(
             phase is Phase.EXCITE for at_s, phase in pair.phases if at_s > began_s
         )
+        if flight == 1:
+            pair.pause(0.52)
+            pair.run(1.0)
         left_s = pair.time_s
         pair.switch("pilot")
         pair.run(2.0)
         assert pair.phase is Phase.STANDBY
         assert pair.after(left_s, COMMAND) == []
+        busy = [said for said in pair.service.announced if "too busy" in said]
+        assert len(busy) == 1  # of the first flight
+        if flight == 1:
+            ticks = round((left_s - began_s) / 0.1)
+            counted = rf"this computer was too busy: [45] of ({ticks}|{ticks + 1}) ticks were "
+            assert re.fullmatch(rf"{counted}skipped, pauses up to 0\.5[0-9] s", busy[0])
     assert wire.unsafe == []
     assert len(pair.logs.begun) == len(pair.logs.ended) == 2
     assert pair.said("this vehicle was identified before")

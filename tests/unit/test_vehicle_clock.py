@@ -196,6 +196,40 @@ def test_a_clock_of_any_rate_is_no_late_link(rate: float, way_s: float) -> None:
     assert clock.jumped_s == 0.0
 
 
+BOOTS: dict[str, tuple[Callable[[float], float], float]] = {  # stamps, and when it is engaged
+    "set before its rate is known": (lambda at_s: at_s + 30.0 * (at_s > 0.5), 9.0),
+    "set later": (lambda at_s: at_s + 30.0 * (at_s > 3.0), 4.0),
+    "slow": (lambda at_s: 0.3 * min(at_s, 3.0) + max(at_s - 3.0, 0.0), 9.0),
+    "stands still": (lambda at_s: min(at_s, 1.0) + max(at_s - 3.0, 0.0), 9.0),
+    "fast": (lambda at_s: 5.0 * min(at_s, 3.0) + max(at_s - 3.0, 0.0), 9.0),
+    "becomes slow": (lambda at_s: min(at_s, 3.0) + 0.5 * max(at_s - 3.0, 0.0), 9.0),
+    "slow, then set": (lambda at_s: 0.3 * at_s if at_s < 3.0 else at_s + 30.0, 3.5),
+}
+
+
+@pytest.mark.parametrize("boot", BOOTS)
+@pytest.mark.parametrize("answers", [True, False])
+def test_what_the_clock_did_at_boot_is_over(boot: str, answers: bool) -> None:
+    """When the flight begins its rate is the present one, and no jump counts."""
+    stamp, engaged_s = BOOTS[boot]
+    clock = VehicleClock()
+    goes_on = exchange if answers else listen
+    goes_on(clock, 0.0, engaged_s, stamp=stamp)
+    clock.settle()
+    arrived_s = EPOCH_S + engaged_s + WAY_S
+    assert clock.now_s(arrived_s + 1.0) == pytest.approx(stamp(engaged_s + 1.0), abs=1e-6)
+    assert goes_on(clock, engaged_s, engaged_s + 10.0, stamp=stamp) < 1e-6
+    assert clock.jumped_s == 0.0
+
+
+def listen(
+    clock: VehicleClock, begin_s: float, end_s: float, *, stamp: Callable[[float], float]
+) -> float:
+    """As `exchange`, with a vehicle that answers no request."""
+    heard = (hear(clock, [at_s], stamp=stamp) for at_s in every(0.02, begin_s, end_s))
+    return max(clock.age_s(*newest) for newest in heard)
+
+
 @pytest.mark.parametrize(("before", "after"), [(1.0, 0.93), (0.93, 1.0)])
 def test_a_clock_that_changes_its_rate_is_no_late_link(before: float, after: float) -> None:
     """The load of the computer changes in flight. What remains is the change within one reply."""
