@@ -144,7 +144,7 @@ def _stand_by(flight: FlightState, time_s: float) -> None:
     PX4 would return to OFFBOARD, or it flies setpoints of others."""
     on_ground, vehicle = flight.contact.certain, flight.vehicle
     command = Command(0.0, LEVEL, vehicle.course_rad) if on_ground else _flown(flight)
-    quiet = flight.takes_off_by_command or flight.telemetry_is_old or other_sender(flight)
+    quiet = flight.takes_off_by_command or flight.telemetry_is_old or bool(other_sender(flight))
     if on_ground:
         quiet |= vehicle.armed and vehicle.in_failsafe
     else:

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 
-from offboard.flight import failsafe
 from offboard.flight.authority import Standing
 from offboard.flight.ground_contact import STILL_ARMED
 from offboard.flight.phases import OUTAGE_MAX_S, TRACKING, Action, ExitCode, Phase
 from offboard.flight.requests import Request
 from offboard.flight.rows import (
     REBOOTED,
-    STOP,
     Condition,
     Transition,
     longer_than,
@@ -21,7 +19,6 @@ from offboard.flight.rows import (
     rebooted,
     stands,
     stop_requested,
-    why_lost,
 )
 from offboard.flight.state import FlightState
 
@@ -51,11 +48,9 @@ def at_start_to_excite(flight: FlightState) -> bool:
     return wanted and at_start(flight)
 
 
-def too_late_at_start(flight: FlightState) -> bool:
-    return flight.plan.late_s(flight.time_s) > flight.limits.late_s
-
-
-def _start_not_reached(flight: FlightState) -> str:
+def too_late_at_start(flight: FlightState) -> str:
+    if not flight.plan.late_s(flight.time_s) > flight.limits.late_s:
+        return ""
     return (
         f"the start of the reference was not reached: {flight.position_error_m:.1f} m away, "
         f"{flight.plan.late_s(flight.time_s):.0f} s late; is hover_thrust in the vehicle file "
@@ -79,30 +74,29 @@ def at_rest(flight: FlightState) -> bool:
     return flight.track_time_s >= flight.plan.track.duration_s + REST_S
 
 
-def _rebooted_in_flight(flight: FlightState) -> str:
-    return f"{REBOOTED} {_when(flight)}"
+def rebooted_in_flight(flight: FlightState) -> str:
+    return f"{REBOOTED} {_when(flight)}" if rebooted(flight) else ""
 
 
-def disarmed(flight: FlightState) -> bool:
-    return not flight.vehicle.armed
-
-
-def _disarmed_in_flight(flight: FlightState) -> str:
-    return f"the vehicle disarmed {_when(flight)}"
+def disarmed(flight: FlightState) -> str:
+    return "" if flight.vehicle.armed else f"the vehicle disarmed {_when(flight)}"
 
 
 def _when(flight: FlightState) -> str:
     return "before lift-off" if flight.phase is Phase.TAKEOFF else "in flight"
 
 
-def in_own_failsafe(flight: FlightState) -> bool:
+def in_own_failsafe(flight: FlightState) -> str:
     """Setpoints were missing, and the autopilot's failsafe flies the vehicle."""
-    return stands(flight, Standing.FAILSAFE)
+    if not stands(flight, Standing.FAILSAFE):
+        return ""
+    mode = flight.vehicle.mode
+    return f"setpoints did not arrive, and the vehicle's own failsafe flies it, in {mode}"
 
 
-def handed(flight: FlightState) -> bool:
+def handed(flight: FlightState) -> str:
     """It shows a mode that we asked for at the end."""
-    return stands(flight, Standing.HANDED)
+    return f"the vehicle shows {flight.vehicle.mode}" if stands(flight, Standing.HANDED) else ""
 
 
 def failsafe_land(flight: FlightState) -> bool:
@@ -121,21 +115,20 @@ def rebooted_disarmed(flight: FlightState) -> bool:
     return flight.rebooted and not flight.vehicle.armed and bool(flight.not_landed())
 
 
-def disarmed_elsewhere(flight: FlightState) -> bool:
+def disarmed_elsewhere(flight: FlightState) -> str:
     """Disarmed, but not landed; the land detector has had time to report."""
-    return flight.vehicle.disarmed_s > DETECTOR_S and bool(flight.not_landed())
+    missing = flight.not_landed() if flight.vehicle.disarmed_s > DETECTOR_S else ""
+    return f"disarmed, landing not confirmed: {missing}" if missing else ""
 
 
 def unheard_on_ground(flight: FlightState) -> bool:
     """It has landed, and no HEARTBEAT shows whether it is armed."""
-    return mode_unknown(flight) and not flight.not_landed()
+    return bool(mode_unknown(flight)) and not flight.not_landed()
 
 
-def out_of_reach(flight: FlightState) -> bool:
-    return flight.unreached_s > OUTAGE_MAX_S
-
-
-def _out_of_reach(flight: FlightState) -> str:
+def out_of_reach(flight: FlightState) -> str:
+    if flight.unreached_s <= OUTAGE_MAX_S:
+        return ""
     vehicle, height_m = flight.vehicle, flight.from_takeoff_m[2]
     return (
         f"not heard for {flight.unreached_s:.0f} s while landing; last known: "
@@ -144,7 +137,9 @@ def _out_of_reach(flight: FlightState) -> str:
     )
 
 
-def _not_disarmed(flight: FlightState) -> str:
+def not_disarmed(flight: FlightState) -> str:
+    if flight.in_phase_s <= flight.limits.land_s:
+        return ""
     contact = flight.contact
     shows = contact.stands and contact.detects_flight and flight.vehicle.armed
     return f"not landed and disarmed after {flight.in_phase_s:.0f} s" + (
@@ -165,7 +160,11 @@ def requested(request: Request) -> Condition:
 # ---------------------------------------------------------------------- rows
 
 REFUSED, ABORTED, FLOWN = ExitCode.REFUSED, ExitCode.ABORTED, ExitCode.FLOWN
+OPERATOR = "{flight.stop_cause}"
+FAILSAFE = ("{flight.failsafe.cause}", "{flight.failsafe.reason}")
 ON_REFERENCE = tuple(phase for phase in Phase if phase in TRACKING)
+CLIMB, EXCITE, LAND = (Phase.CLIMB,), (Phase.EXCITE,), (Phase.LAND,)
+AT_START = "hovers at the start of the reference"
 
 
 def ends_early(phases: tuple[Phase, ...], serves: bool) -> tuple[Transition, ...]:
@@ -176,119 +175,112 @@ def ends_early(phases: tuple[Phase, ...], serves: bool) -> tuple[Transition, ...
     stopped = tuple(phase for phase in others if phase is not Phase.HAND_BACK)
     held = tuple(phase for phase in phases if phase not in (Phase.HAND_BACK, Phase.HOLD))
     rows = (
-        Transition(phases, rebooted, Phase.LAND, _rebooted_in_flight, ABORTED),
-        Transition(phases, disarmed, Phase.FAILED, _disarmed_in_flight, ABORTED),
-        Transition(followed, lost, Phase.YIELDED, why_lost, FLOWN),
-        Transition(others, lost, Phase.YIELDED, why_lost, ABORTED),
-        Transition(
-            phases,
-            in_own_failsafe,
-            Phase.LAND,
-            "setpoints did not arrive, and the vehicle's own failsafe flies it, in "
-            "{flight.vehicle.mode}",
-            ABORTED,
-        ),
-        Transition(phases, failsafe_land, Phase.LAND, failsafe.reason, ABORTED),
-        Transition(followed, stop_requested, Phase.HAND_BACK, STOP, FLOWN),
-        Transition(stopped, stop_requested, Phase.LAND, STOP, ABORTED),
-        Transition(held, failsafe_hold, Phase.HOLD, failsafe.reason, ABORTED),
+        Transition(phases, rebooted_in_flight, Phase.LAND, ABORTED, "restart"),
+        Transition(phases, disarmed, Phase.FAILED, ABORTED, "disarmed in flight"),
+        Transition(followed, lost, Phase.YIELDED, FLOWN, "pilot"),
+        Transition(others, lost, Phase.YIELDED, ABORTED, "pilot"),
+        Transition(phases, in_own_failsafe, Phase.LAND, ABORTED, "link"),
+        Transition(phases, failsafe_land, Phase.LAND, ABORTED, *FAILSAFE),
+        Transition(followed, stop_requested, Phase.HAND_BACK, FLOWN, OPERATOR),
+        Transition(stopped, stop_requested, Phase.LAND, ABORTED, OPERATOR),
+        Transition(held, failsafe_hold, Phase.HOLD, ABORTED, *FAILSAFE),
     )
     return tuple(row for row in rows if row.phases)
 
 
 TO_THE_END = (
-    Transition((Phase.TAKEOFF,), lifted_off, Phase.CLIMB, "lifted off"),
+    Transition((Phase.TAKEOFF,), lifted_off, Phase.CLIMB, reason="lifted off"),
     Transition(
         (Phase.TAKEOFF,),
         longer_than("lift_off_s"),
         Phase.LAND,
-        "no lift-off in {flight.in_phase_s:.0f} s; is hover_thrust in the vehicle file right?",
         ABORTED,
+        reason="no lift-off in {flight.in_phase_s:.0f} s; "
+        "is hover_thrust in the vehicle file right?",
     ),
-    Transition((Phase.CLIMB,), at_start_to_excite, Phase.EXCITE, "identification steps"),
-    Transition((Phase.CLIMB,), at_start, Phase.JOIN, "hovers at the start of the reference"),
-    Transition((Phase.CLIMB,), too_late_at_start, Phase.LAND, _start_not_reached, ABORTED),
-    Transition((Phase.EXCITE,), identified, Phase.JOIN, "hovers at the start of the reference"),
+    Transition(CLIMB, at_start_to_excite, Phase.EXCITE, reason="identification steps"),
+    Transition(CLIMB, at_start, Phase.JOIN, reason=AT_START),
+    Transition(CLIMB, too_late_at_start, Phase.LAND, ABORTED),
+    Transition(EXCITE, identified, Phase.JOIN, reason=AT_START),
     Transition(
-        (Phase.EXCITE,),
+        EXCITE,
         longer_than("excite_s"),
         Phase.LAND,
-        "identification did not converge in {flight.in_phase_s:.0f} s",
         ABORTED,
+        reason="identification did not converge in {flight.in_phase_s:.0f} s",
     ),
-    Transition((Phase.JOIN,), at_full_speed, Phase.TRACK, "on the reference at full speed"),
-    Transition((Phase.TRACK,), track_over, Phase.HOVER, "the reference was flown"),
+    Transition((Phase.JOIN,), at_full_speed, Phase.TRACK, reason="on the reference at full speed"),
+    Transition((Phase.TRACK,), track_over, Phase.HOVER, reason="the reference was flown"),
     Transition(
         (Phase.HOLD,),
         longer_than("hold_s"),
         Phase.LAND,
-        "the autopilot held for {flight.in_phase_s:.0f} s",
         ABORTED,
+        reason="the autopilot held for {flight.in_phase_s:.0f} s",
     ),
-    Transition((Phase.LAND,), landed, Phase.DISARMED, "disarmed on the ground"),
+    Transition(LAND, landed, Phase.DISARMED, reason="disarmed on the ground"),
     Transition(
-        (Phase.LAND,), rebooted_disarmed, Phase.FAILED, f"{REBOOTED} and is disarmed", ABORTED
+        LAND, rebooted_disarmed, Phase.FAILED, ABORTED, "restart", f"{REBOOTED} and is disarmed"
     ),
+    Transition(LAND, disarmed_elsewhere, Phase.FAILED, ABORTED),
+    Transition(LAND, lost_armed, Phase.YIELDED, ABORTED, "pilot"),
     Transition(
-        (Phase.LAND,),
-        disarmed_elsewhere,
-        Phase.FAILED,
-        lambda flight: f"disarmed, landing not confirmed: {flight.not_landed()}",
-        ABORTED,
-    ),
-    Transition((Phase.LAND,), lost_armed, Phase.YIELDED, why_lost, ABORTED),
-    Transition(
-        (Phase.LAND,),
+        LAND,
         unheard_on_ground,
         Phase.FAILED,
-        "it stands on the ground, and no HEARTBEAT shows whether it is disarmed",
         ABORTED,
+        reason="it stands on the ground, and no HEARTBEAT shows whether it is disarmed",
     ),
-    Transition((Phase.LAND,), out_of_reach, Phase.FAILED, _out_of_reach, ABORTED),
-    Transition((Phase.LAND,), longer_than("land_s"), Phase.FAILED, _not_disarmed, ABORTED),
+    Transition(LAND, out_of_reach, Phase.FAILED, ABORTED),
+    Transition(LAND, not_disarmed, Phase.FAILED, ABORTED),
 )
-HAND_BACK_ENDS = (
+SERVICE_ENDS = (
     Transition(
         (Phase.HAND_BACK,),
         longer_than("hand_back_s"),
         Phase.LAND,
-        "the vehicle did not hold in {flight.in_phase_s:.0f} s",
         ABORTED,
+        reason="the vehicle did not hold in {flight.in_phase_s:.0f} s",
     ),
-)
-REQUESTED = (
     Transition(
-        tuple(phase for phase in Phase if phase in TRACKING | {Phase.TAKEOFF}),
+        (Phase.TAKEOFF, *ON_REFERENCE),
         requested(Request.HAND_BACK),
         Phase.HAND_BACK,
-        "handed back on request",
         FLOWN,
+        reason="handed back on request",
     ),
     Transition(
         (Phase.STREAM, Phase.ENGAGE),
         requested(Request.HAND_BACK),
         Phase.FAILED,
-        "stopped on request",
         FLOWN,
+        reason="stopped on request",
     ),
     Transition(
         (Phase.ARM,),
         requested(Request.HAND_BACK),
         Phase.STAND_DOWN,
-        "stopped on request",
         FLOWN,
+        reason="stopped on request",
     ),
     Transition(
         (Phase.EXCITE, Phase.JOIN, Phase.TRACK, Phase.PAUSE, Phase.HOVER),
         requested(Request.START),
         Phase.CLIMB,
-        "start requested",
+        reason="start requested",
     ),
-    Transition((Phase.JOIN, Phase.TRACK), requested(Request.PAUSE), Phase.PAUSE, "pause requested"),
-    Transition((Phase.PAUSE,), requested(Request.CONTINUE), Phase.TRACK, "continue requested"),
+    Transition(
+        (Phase.JOIN, Phase.TRACK),
+        requested(Request.PAUSE),
+        Phase.PAUSE,
+        reason="pause requested",
+    ),
+    Transition(
+        (Phase.PAUSE,), requested(Request.CONTINUE), Phase.TRACK, reason="continue requested"
+    ),
 )
 AT_REST = {
     "hold": (),
-    "land": (Transition((Phase.HOVER,), at_rest, Phase.LAND, "at rest"),),
-    "repeat": (Transition((Phase.HOVER,), at_rest, Phase.CLIMB, "once more"),),
+    "land": (Transition((Phase.HOVER,), at_rest, Phase.LAND, reason="at rest"),),
+    "repeat": (Transition((Phase.HOVER,), at_rest, Phase.CLIMB, reason="once more"),),
 }

@@ -121,7 +121,7 @@ def not_ready(ground: Ground) -> str:
 # what may also come up later on the ground
 ARMED_ALREADY = "the vehicle is armed already, by another controller or a pilot"
 OTHER_SENDER = (
-    "another program controls the vehicle on this link, too: {other_sender} "
+    "another program controls the vehicle on this link, too: {flight.vehicle.other_sender_name} "
     "(limits.begin_with_other_sender=true flies all the same)"
 )
 SEVERAL = "several vehicles are heard, systems {systems}: choose one with --system"
@@ -162,12 +162,8 @@ def _flown_by_failsafe(ground: Ground) -> str:
 
 
 def _other_sender(ground: Ground) -> str:
-    other = ground.vehicle.other_sender
-    if not ground.other_sender or other is None or ground.limits.begin_with_other_sender:
-        return ""
-    return OTHER_SENDER.format(
-        other_sender=f"system {other.system_id} component {other.component_id}"
-    )
+    counts = ground.other_sender and not ground.limits.begin_with_other_sender
+    return OTHER_SENDER.format(flight=ground) if counts else ""
 
 
 def _several_vehicles(ground: Ground) -> str:

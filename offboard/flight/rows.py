@@ -1,6 +1,7 @@
-"""What a row of the phase table and of the failsafe is made of, and the conditions of both.
+"""Conditions of the phase table and of the failsafe, and what a row of the phase table is.
 
-Conditions and reasons are functions of the flight. They change nothing.
+A condition is a function of the flight that changes nothing: false (or an empty text) while it does
+not hold; a text says why it holds.
 """
 
 from __future__ import annotations
@@ -14,12 +15,9 @@ from offboard.flight.phases import Phase
 from offboard.flight.state import FlightState
 from offboard.mavlink.events import OtherSender
 
-Condition = Callable[[FlightState], bool]
-Reason = str | Callable[[FlightState], str]
+Condition = Callable[[FlightState], str | bool]
 
 REBOOTED = "the vehicle restarted"
-STOP = "{flight.stop_reason}"
-SHOWS = "the vehicle shows {flight.vehicle.mode}"
 OTHER_SENDER_S = 5.0  # a second sender is there for so long after its newest frame
 
 
@@ -28,103 +26,98 @@ class Transition:
     """A row of the phase table: from each of `phases`, when `condition` holds, to `target`.
 
     `exit_code` is set if this row decides the result; a later row can only make it more severe.
+    `cause` is a word for what ended a flight that the row ends (see `analysis.verdict`). `reason`
+    is the sentence, where the condition does not say it. Both may have values of the flight in
+    braces.
     """
 
     phases: tuple[Phase, ...]
     condition: Condition
     target: Phase
-    reason: Reason
     exit_code: int | None = None
+    cause: str = ""
+    reason: str = ""
 
-
-def why(reason: Reason, flight: FlightState) -> str:
-    """The reason as a sentence: a function of the flight, or a text with its values in braces."""
-    return reason.format(flight=flight) if isinstance(reason, str) else reason(flight)
+    def why(self, flight: FlightState) -> str:
+        """The sentence that says why the row is taken, while its condition holds."""
+        return self.reason.format(flight=flight) or str(self.condition(flight))
 
 
 # ---------------------------------------------------------------------- what is heard
 
 
-def silent(flight: FlightState) -> bool:
-    return flight.silence_s > flight.limits.silence_s
+def silent(flight: FlightState) -> str:
+    return silent_for(flight, flight.limits.silence_s)
 
 
-def no_telemetry(flight: FlightState) -> str:
-    return f"no telemetry for {flight.silence_s:.1f} s"
+def silent_for(flight: FlightState, limit_s: float) -> str:
+    return f"no telemetry for {flight.silence_s:.1f} s" if flight.silence_s > limit_s else ""
 
 
-def blind(flight: FlightState) -> bool:
-    return _blind_s(flight) > flight.limits.blind_s
-
-
-def no_position_or_attitude(flight: FlightState) -> str:
+def blind(flight: FlightState) -> str:
+    """Position or attitude is missing, by vehicle time."""
     vehicle = flight.vehicle
-    older = vehicle.position_age_s >= vehicle.attitude_age_s
-    name = "LOCAL_POSITION_NED" if older else "ATTITUDE_QUATERNION"
-    return f"no {name} for {_blind_s(flight):.1f} s"
+    age_s, name = max(
+        (vehicle.position_age_s, "LOCAL_POSITION_NED"),
+        (vehicle.attitude_age_s, "ATTITUDE_QUATERNION"),
+        key=lambda each: each[0],
+    )
+    return f"no {name} for {age_s:.1f} s" if age_s > flight.limits.blind_s else ""
 
 
-def _blind_s(flight: FlightState) -> float:
-    """Age of the older of position and attitude, vehicle time."""
-    return max(flight.vehicle.position_age_s, flight.vehicle.attitude_age_s)
-
-
-def mode_unknown(flight: FlightState) -> bool:
-    return flight.authority is None or not flight.authority.heard(flight.now_s)
-
-
-def no_mode_report(flight: FlightState) -> str:
+def mode_unknown(flight: FlightState) -> str:
+    if flight.authority is not None and flight.authority.heard(flight.now_s):
+        return ""
     heard_s = flight.authority.heard_s if flight.authority else -math.inf
     return f"no report of the mode for {flight.now_s - heard_s:.1f} s"
 
 
-def other_sender(flight: FlightState) -> bool:
+def other_sender(flight: FlightState) -> str:
     """Another program controls the vehicle on this link, and that counts: it sends setpoints or
     mode commands, or says so."""
-    heard = flight.vehicle.age_s(OtherSender) < OTHER_SENDER_S
-    return heard and not flight.limits.begin_with_other_sender
-
-
-def other_sender_name(flight: FlightState) -> str:
-    other = flight.vehicle.other_sender
-    return f"system {other.system_id} component {other.component_id}" if other else ""
+    if flight.limits.begin_with_other_sender:
+        return ""
+    if not flight.vehicle.age_s(OtherSender) < OTHER_SENDER_S:
+        return ""
+    name = flight.vehicle.other_sender_name
+    return f"another program controls the vehicle on this link, too: {name}"
 
 
 # ---------------------------------------------------------------------- who has the vehicle
 
 
-def rebooted(flight: FlightState) -> bool:
-    return flight.rebooted
+def rebooted(flight: FlightState) -> str:
+    return REBOOTED if flight.rebooted else ""
 
 
-def engaged_in_the_air(flight: FlightState) -> bool:
-    return flight.engaged and flight.contact.in_the_air
+def engaged_in_the_air(flight: FlightState) -> str:
+    """The vehicle flies in the mode in which it follows setpoints."""
+    flies = flight.engaged and flight.contact.in_the_air
+    return f"{flight.vehicle.mode} in the air" if flies else ""
 
 
-def lost(flight: FlightState) -> bool:
+def lost(flight: FlightState) -> str:
     """The vehicle is not ours any more."""
-    return stands(flight, Standing.LOST)
+    if flight.authority is None or flight.authority.standing is not Standing.LOST:
+        return ""
+    return flight.authority.lost_reason or Standing.LOST.value
 
 
-def why_lost(flight: FlightState) -> str:
-    return flight.authority.lost_reason if flight.authority else ""
-
-
-def lost_armed(flight: FlightState) -> bool:
+def lost_armed(flight: FlightState) -> str:
     """A pilot has changed the mode of a vehicle that stays armed."""
-    return lost(flight) and flight.shown_since_lost and flight.vehicle.armed
+    return lost(flight) if flight.shown_since_lost and flight.vehicle.armed else ""
 
 
-def lost_disarmed(flight: FlightState) -> bool:
-    return lost(flight) and flight.shown_since_lost and not flight.vehicle.armed
+def lost_disarmed(flight: FlightState) -> str:
+    return lost(flight) if flight.shown_since_lost and not flight.vehicle.armed else ""
 
 
 def stands(flight: FlightState, standing: Standing) -> bool:
     return flight.authority is not None and flight.authority.standing is standing
 
 
-def stop_requested(flight: FlightState) -> bool:
-    return bool(flight.stop_reason)
+def stop_requested(flight: FlightState) -> str:
+    return flight.stop_reason
 
 
 def longer_than(limit: str) -> Condition:

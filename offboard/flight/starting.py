@@ -7,9 +7,6 @@ from offboard.flight.phases import ExitCode, Phase
 from offboard.flight.preflight import ARMED_ALREADY, OTHER_SENDER, SEVERAL, Ground
 from offboard.flight.requests import Request
 from offboard.flight.rows import (
-    REBOOTED,
-    SHOWS,
-    STOP,
     Transition,
     blind,
     engaged_in_the_air,
@@ -18,54 +15,49 @@ from offboard.flight.rows import (
     lost_armed,
     lost_disarmed,
     mode_unknown,
-    no_mode_report,
-    no_position_or_attitude,
-    no_telemetry,
     other_sender,
-    other_sender_name,
     rebooted,
     silent,
+    silent_for,
     stop_requested,
-    why_lost,
 )
 from offboard.flight.state import FlightState
 from offboard.mavlink.events import Heartbeat
 
-ARM = 400  # MAV_CMD_COMPONENT_ARM_DISARM
+ARM_DISARM = 400  # MAV_CMD_COMPONENT_ARM_DISARM
 ARMING_SHOWN_S = 2.5  # HEARTBEAT, at 1 Hz, shows an accepted arming within this time
 DISARMED_SHOWN_S = 1.5  # longer than a period of HEARTBEAT: arming may have been in progress
 LISTENED_S = 0.5  # to hear another sender: PX4 leaves OFFBOARD below 2 Hz
 
 
-def vehicle_found(flight: FlightState) -> bool:
-    return flight.vehicle.found is not None
+def vehicle_found(flight: FlightState) -> str:
+    return "vehicle found" if flight.vehicle.found is not None else ""
 
 
-def _not_found(flight: FlightState) -> str:
+def not_found(flight: FlightState) -> str:
+    if not silent_on_ground(flight):
+        return ""
     senders, counters = flight.session.senders, flight.session.counters
     why = senders.why_none(counters) or "is it running, and sending to this port?"
     return f"no vehicle heard in {flight.silence_s:.0f} s; {why}"
 
 
-def silent_on_ground(flight: FlightState) -> bool:
-    return flight.silence_s > flight.limits.connect_s
+def silent_on_ground(flight: FlightState) -> str:
+    return silent_for(flight, flight.limits.connect_s)
 
 
-def silent_for_long(flight: FlightState) -> bool:
-    return flight.silence_s > 2.0 * flight.limits.silence_s
+def silent_for_long(flight: FlightState) -> str:
+    return silent_for(flight, 2.0 * flight.limits.silence_s)
 
 
-def armed_by_another(flight: FlightState) -> bool:
-    return flight.vehicle.armed and not flight.limits.begin_armed
+def armed_by_another(flight: FlightState) -> str:
+    return ARMED_ALREADY if flight.vehicle.armed and not flight.limits.begin_armed else ""
 
 
-def _mode_wanted(flight: FlightState) -> str:
-    return flight.authority.engage_mode if flight.authority else "offboard mode"
-
-
-def other_vehicle(flight: FlightState) -> bool:
+def other_vehicle(flight: FlightState) -> str:
     """Several vehicles are heard: which one is meant?"""
-    return flight.session.senders.ambiguous(flight.now_s)
+    senders, now_s = flight.session.senders, flight.now_s
+    return SEVERAL.format(systems=senders.named(now_s)) if senders.ambiguous(now_s) else ""
 
 
 def ground_of(flight: FlightState) -> Ground:
@@ -84,7 +76,7 @@ def ground_of(flight: FlightState) -> Ground:
         measures_delay=not flight.clock.delay_is_measured(flight.host_s),
         reads_parameters=not read,
         systems=senders.named(flight.now_s) if senders.ambiguous(flight.now_s) else "",
-        other_sender=other_sender(flight),
+        other_sender=bool(other_sender(flight)),
         in_the_air=contact.in_the_air,
         guarded=flight.guarded,
         origin_missing=from_origin and contact.in_the_air and contact.rest_ned_m is None,
@@ -92,22 +84,23 @@ def ground_of(flight: FlightState) -> Ground:
     )
 
 
-def refused(flight: FlightState) -> bool:
+def refused(flight: FlightState) -> str:
     """By the preflight list, whatever is waited for."""
-    return bool(preflight.refusals(ground_of(flight)))
-
-
-def _refusals(flight: FlightState) -> str:
     return "; ".join(preflight.refusals(ground_of(flight)))
 
 
-def ready(flight: FlightState) -> bool:
-    """By the preflight list, nothing is to be waited for."""
-    return not preflight.not_ready(ground_of(flight))
-
-
-def _not_ready(flight: FlightState) -> str:
+def not_ready(flight: FlightState) -> str:
+    """What is to be waited for, by the preflight list."""
     return preflight.not_ready(ground_of(flight))
+
+
+def ready(flight: FlightState) -> bool:
+    return not not_ready(flight)
+
+
+def not_ready_in_time(flight: FlightState) -> str:
+    waited = flight.in_phase_s > flight.limits.health_s
+    return f"not ready: {not_ready(flight)}" if waited else ""
 
 
 def usable(flight: FlightState) -> bool:
@@ -120,14 +113,11 @@ def usable(flight: FlightState) -> bool:
 
 def can_take_over(flight: FlightState) -> bool:
     """It flies in the mode of setpoints, and nobody else has it."""
-    return (
-        engaged_in_the_air(flight)
-        and not flight.vehicle.in_failsafe
-        and not other_sender(flight)
-        and not mode_unknown(flight)
-        and not preflight.unfit_type(ground_of(flight))
-        and not silent(flight)
-        and not blind(flight)
+    if flight.vehicle.in_failsafe or not engaged_in_the_air(flight):
+        return False
+    prevented = (other_sender, mode_unknown, silent, blind)
+    return not any(each(flight) for each in prevented) and not preflight.unfit_type(
+        ground_of(flight)
     )
 
 
@@ -135,12 +125,9 @@ def engaged_by_pilot(flight: FlightState) -> bool:
     return flight.pilot.engaged and can_take_over(flight) and usable(flight)
 
 
-def engaged_but_unfit(flight: FlightState) -> bool:
-    return flight.pilot.engaged and can_take_over(flight) and not usable(flight)
-
-
-def _unfit(flight: FlightState) -> str:
-    return f"not engaged: {_refusals(flight)}{_not_ready(flight)}"
+def engaged_but_unfit(flight: FlightState) -> str:
+    unfit = flight.pilot.engaged and can_take_over(flight) and not usable(flight)
+    return f"not engaged: {refused(flight)}{not_ready(flight)}" if unfit else ""
 
 
 def engaged_too_soon(flight: FlightState) -> bool:
@@ -152,7 +139,7 @@ def engaged_too_soon(flight: FlightState) -> bool:
 def found_engaged(flight: FlightState) -> bool:
     """Found in the air, in the mode of setpoints: another program may fly it."""
     unclaimed = flight.pilot.unclaimed and flight.vehicle.landed != "unknown"
-    return unclaimed and engaged_in_the_air(flight) and flight.in_phase_s > LISTENED_S
+    return unclaimed and flight.in_phase_s > LISTENED_S and bool(engaged_in_the_air(flight))
 
 
 def abandoned(flight: FlightState) -> bool:
@@ -172,35 +159,38 @@ def started_on_the_ground(flight: FlightState) -> bool:
 # ---------------------------------------------------------------------- to the air
 
 
-def streamed(flight: FlightState) -> bool:
-    return flight.in_phase_s >= flight.limits.stream_s
+def streamed(flight: FlightState) -> str:
+    return "setpoints stream" if flight.in_phase_s >= flight.limits.stream_s else ""
 
 
-def needs_no_stream(flight: FlightState) -> bool:
-    return flight.takes_off_by_command
+def needs_no_stream(flight: FlightState) -> str:
+    return "the autopilot takes off by itself" if flight.takes_off_by_command else ""
 
 
-def engaged(flight: FlightState) -> bool:
-    return flight.engaged
+def engaged(flight: FlightState) -> str:
+    return f"the vehicle shows {flight.vehicle.mode}" if flight.engaged else ""
 
 
-def _not_engaged(flight: FlightState) -> str:
+def not_engaged(flight: FlightState) -> str:
+    if flight.in_phase_s <= flight.limits.engage_s:
+        return ""
+    wanted = flight.authority.engage_mode if flight.authority else "offboard mode"
     return (
-        f"the vehicle did not enter {_mode_wanted(flight)} in {flight.in_phase_s:.0f} s "
+        f"the vehicle did not enter {wanted} in {flight.in_phase_s:.0f} s "
         f"(it shows {flight.vehicle.mode})"
     )
 
 
-def armed(flight: FlightState) -> bool:
-    return flight.vehicle.armed and flight.engaged
+def armed(flight: FlightState) -> str:
+    return "armed" if flight.vehicle.armed and flight.engaged else ""
 
 
 def disarmed_again(flight: FlightState) -> bool:
     """A HEARTBEAT that is newer than the acceptance shows it disarmed when it should be armed. On a
     lossy link the acceptance may come long after the first request, and a HEARTBEAT be missing."""
     vehicle = flight.vehicle
-    accepted = vehicle.results.get(ARM) == "ACCEPTED"
-    since_s = flight.now_s - vehicle.answered_s.get(ARM, flight.now_s)
+    accepted = vehicle.results.get(ARM_DISARM) == "ACCEPTED"
+    since_s = flight.now_s - vehicle.answered_s.get(ARM_DISARM, flight.now_s)
     shown = vehicle.disarmed and vehicle.age_s(Heartbeat) < since_s
     return accepted and shown and since_s > ARMING_SHOWN_S
 
@@ -208,7 +198,7 @@ def disarmed_again(flight: FlightState) -> bool:
 def stop_requested_on_ground(flight: FlightState) -> bool:
     """Every sign says that the vehicle stands there."""
     stands = flight.vehicle.armed and not flight.contact.in_the_air
-    return stop_requested(flight) and stands and not lost(flight)
+    return bool(stop_requested(flight)) and stands and not lost(flight)
 
 
 def rises(flight: FlightState) -> bool:
@@ -224,6 +214,11 @@ def disarmed_for_good(flight: FlightState) -> bool:
 # ---------------------------------------------------------------------- rows
 
 REFUSED, ABORTED, FLOWN = ExitCode.REFUSED, ExitCode.ABORTED, ExitCode.FLOWN
+CONNECT, HEALTH, STANDBY = (Phase.CONNECT,), (Phase.HEALTH,), (Phase.STANDBY,)
+WAITS, STREAMING = HEALTH + STANDBY, (Phase.STREAM, Phase.ENGAGE)
+ENGAGE, ARM, STAND_DOWN = (Phase.ENGAGE,), (Phase.ARM,), (Phase.STAND_DOWN,)
+FAILED = Phase.FAILED
+OPERATOR = "{flight.stop_cause}"
 _ABANDONED = (
     "{flight.vehicle.mode} in the air, and nobody flies the vehicle: a flight was cut short"
 )
@@ -231,37 +226,41 @@ _TOO_SOON = (
     "not engaged: {flight.vehicle.mode} again before a HEARTBEAT has shown another mode; "
     "switch again"
 )
-STREAMING = (Phase.STREAM, Phase.ENGAGE)
 
 FLY_BEGINS = (
-    Transition((Phase.CONNECT,), stop_requested, Phase.FAILED, STOP, REFUSED),
-    Transition((Phase.CONNECT,), vehicle_found, Phase.HEALTH, "vehicle found"),
-    Transition((Phase.CONNECT,), silent_on_ground, Phase.FAILED, _not_found, REFUSED),
+    Transition(CONNECT, stop_requested, FAILED, REFUSED, OPERATOR),
+    Transition(CONNECT, vehicle_found, Phase.HEALTH),
+    Transition(CONNECT, not_found, FAILED, REFUSED, "link"),
+)
+FLY_IS_READY = (
+    Transition(HEALTH, refused, FAILED, REFUSED),
+    Transition(HEALTH, ready, Phase.STREAM, reason="telemetry flows and the vehicle can arm"),
+    Transition(HEALTH, not_ready_in_time, FAILED, REFUSED),
 )
 SERVICE_WAITS = (
-    Transition((Phase.CONNECT,), stop_requested, Phase.FAILED, STOP, FLOWN),
-    Transition((Phase.CONNECT,), vehicle_found, Phase.HEALTH, "vehicle found"),
-    Transition((Phase.STANDBY,), rebooted, Phase.FAILED, REBOOTED, FLOWN),
-    Transition((Phase.HEALTH, Phase.STANDBY), stop_requested, Phase.FAILED, STOP, FLOWN),
-    Transition((Phase.HEALTH, Phase.STANDBY), abandoned, Phase.HAND_BACK, _ABANDONED, FLOWN),
+    Transition(CONNECT, stop_requested, FAILED, FLOWN, OPERATOR),
+    Transition(CONNECT, vehicle_found, Phase.HEALTH),
+    Transition(STANDBY, rebooted, FAILED, FLOWN, "restart"),
+    Transition(WAITS, stop_requested, FAILED, FLOWN, OPERATOR),
+    Transition(WAITS, abandoned, Phase.HAND_BACK, FLOWN, reason=_ABANDONED),
     Transition(
-        (Phase.STANDBY,),
+        STANDBY,
         engaged_by_pilot,
         Phase.CLIMB,
-        "engaged: {flight.vehicle.mode} in the air",
         FLOWN,
+        reason="engaged: {flight.vehicle.mode} in the air",
     ),
-    Transition((Phase.HEALTH, Phase.STANDBY), engaged_but_unfit, Phase.HAND_BACK, _unfit, REFUSED),
-    Transition((Phase.HEALTH,), usable, Phase.STANDBY, "telemetry flows"),
-    Transition((Phase.STANDBY,), engaged_too_soon, Phase.HAND_BACK, _TOO_SOON, REFUSED),
+    Transition(WAITS, engaged_but_unfit, Phase.HAND_BACK, REFUSED),
+    Transition(HEALTH, usable, Phase.STANDBY, reason="telemetry flows"),
+    Transition(STANDBY, engaged_too_soon, Phase.HAND_BACK, REFUSED, reason=_TOO_SOON),
     Transition(
-        (Phase.STANDBY,),
+        STANDBY,
         started_in_the_air,
         Phase.CLIMB,
-        "start requested, {flight.vehicle.mode}",
         FLOWN,
+        reason="start requested, {flight.vehicle.mode}",
     ),
-    Transition((Phase.STANDBY,), started_on_the_ground, Phase.STREAM, "start requested"),
+    Transition(STANDBY, started_on_the_ground, Phase.STREAM, reason="start requested"),
 )
 
 
@@ -269,116 +268,74 @@ def starting(before: tuple[Phase, ...]) -> tuple[Transition, ...]:
     """From the ground to lift-off. `before`: the phases in which a flight is refused."""
     return (
         # first: from then on it is ours, and whatever ends the flight must ask for hold or land
-        Transition(
-            (Phase.ENGAGE,),
-            engaged_in_the_air,
-            Phase.CLIMB,
-            "{flight.vehicle.mode} in the air",
-        ),
-        Transition(STREAMING, rebooted, Phase.FAILED, REBOOTED, REFUSED),
-        Transition(
-            STREAMING,
-            armed_by_another,
-            Phase.FAILED,
-            ARMED_ALREADY,
-            REFUSED,
-        ),
-        Transition(before, silent_on_ground, Phase.FAILED, no_telemetry, REFUSED),
+        Transition(ENGAGE, engaged_in_the_air, Phase.CLIMB),
+        Transition(STREAMING, rebooted, FAILED, REFUSED, "restart"),
+        Transition(STREAMING, armed_by_another, FAILED, REFUSED),
+        Transition(before, silent_on_ground, FAILED, REFUSED, "link"),
         Transition(
             before,
             stop_requested,
-            Phase.FAILED,
+            FAILED,
+            REFUSED,
+            OPERATOR,
             "{flight.stop_reason} before take-off",
-            REFUSED,
         ),
+        Transition(STREAMING, other_sender, FAILED, REFUSED, "second sender", OTHER_SENDER),
+        Transition(STREAMING, other_vehicle, FAILED, REFUSED),
+        Transition(STREAMING, blind, FAILED, REFUSED, "link"),
+        Transition(STREAMING, mode_unknown, FAILED, REFUSED, "link"),
+        Transition(STREAMING, lost, FAILED, REFUSED, "pilot"),
+        Transition((Phase.STREAM,), needs_no_stream, Phase.ENGAGE),
+        Transition((Phase.STREAM,), streamed, Phase.ENGAGE),
+        Transition(ENGAGE, engaged, Phase.ARM),
+        Transition(ENGAGE, not_engaged, FAILED, REFUSED),
+        Transition(ARM, rebooted, FAILED, REFUSED, "restart"),
         Transition(
-            STREAMING,
-            other_sender,
-            Phase.FAILED,
-            lambda flight: OTHER_SENDER.format(other_sender=other_sender_name(flight)),
-            REFUSED,
-        ),
-        Transition(
-            STREAMING,
-            other_vehicle,
-            Phase.FAILED,
-            lambda flight: SEVERAL.format(systems=flight.session.senders.named(flight.now_s)),
-            REFUSED,
-        ),
-        Transition(STREAMING, blind, Phase.FAILED, no_position_or_attitude, REFUSED),
-        Transition(STREAMING, mode_unknown, Phase.FAILED, no_mode_report, REFUSED),
-        Transition(STREAMING, lost, Phase.FAILED, why_lost, REFUSED),
-        Transition(
-            (Phase.STREAM,),
-            needs_no_stream,
-            Phase.ENGAGE,
-            "the autopilot takes off by itself",
-        ),
-        Transition((Phase.STREAM,), streamed, Phase.ENGAGE, "setpoints stream"),
-        Transition((Phase.ENGAGE,), engaged, Phase.ARM, SHOWS),
-        Transition((Phase.ENGAGE,), longer_than("engage_s"), Phase.FAILED, _not_engaged, REFUSED),
-        Transition((Phase.ARM,), rebooted, Phase.FAILED, REBOOTED, REFUSED),
-        Transition(
-            (Phase.ARM,),
+            ARM,
             lost_armed,
             Phase.YIELDED,
-            lambda flight: f"{why_lost(flight)} as it armed",
             ABORTED,
+            "pilot",
+            "{flight.authority.lost_reason} as it armed",
         ),
-        Transition((Phase.ARM,), lost_disarmed, Phase.FAILED, why_lost, REFUSED),
-        Transition((Phase.ARM,), silent, Phase.STAND_DOWN, no_telemetry, REFUSED),
-        Transition((Phase.ARM,), blind, Phase.STAND_DOWN, no_position_or_attitude, REFUSED),
-        Transition((Phase.ARM,), stop_requested, Phase.STAND_DOWN, STOP, REFUSED),
-        Transition((Phase.ARM,), armed, Phase.TAKEOFF, "armed"),
+        Transition(ARM, lost_disarmed, FAILED, REFUSED, "pilot"),
+        Transition(ARM, silent, Phase.STAND_DOWN, REFUSED, "link"),
+        Transition(ARM, blind, Phase.STAND_DOWN, REFUSED, "link"),
+        Transition(ARM, stop_requested, Phase.STAND_DOWN, REFUSED, OPERATOR),
+        Transition(ARM, armed, Phase.TAKEOFF),
         Transition(
-            (Phase.ARM,),
+            ARM,
             disarmed_again,
-            Phase.FAILED,
-            "the vehicle was disarmed just after it had armed",
+            FAILED,
             REFUSED,
+            reason="the vehicle was disarmed just after it had armed",
         ),
         Transition(
-            (Phase.ARM,),
+            ARM,
             longer_than("arm_s"),
             Phase.STAND_DOWN,
-            "the vehicle did not arm in {flight.in_phase_s:.0f} s",
             REFUSED,
+            reason="the vehicle did not arm in {flight.in_phase_s:.0f} s",
         ),
         Transition(
             (Phase.TAKEOFF,),
             stop_requested_on_ground,
             Phase.STAND_DOWN,
-            "{flight.stop_reason} before lift-off",
             REFUSED,
+            OPERATOR,
+            "{flight.stop_reason} before lift-off",
         ),
         Transition(
-            (Phase.STAND_DOWN,),
-            rises,
-            Phase.LAND,
-            "flight is detected as it was to disarm",
-            ABORTED,
+            STAND_DOWN, rises, Phase.LAND, ABORTED, reason="flight is detected as it was to disarm"
         ),
-        Transition((Phase.STAND_DOWN,), rebooted, Phase.FAILED, REBOOTED, REFUSED),
-        Transition((Phase.STAND_DOWN,), silent_for_long, Phase.FAILED, no_telemetry, REFUSED),
-        Transition((Phase.STAND_DOWN,), disarmed_for_good, Phase.FAILED, "disarmed on the ground"),
+        Transition(STAND_DOWN, rebooted, FAILED, REFUSED, "restart"),
+        Transition(STAND_DOWN, silent_for_long, FAILED, REFUSED, "link"),
+        Transition(STAND_DOWN, disarmed_for_good, FAILED, reason="disarmed on the ground"),
         Transition(
-            (Phase.STAND_DOWN,),
+            STAND_DOWN,
             longer_than("disarm_s"),
-            Phase.FAILED,
-            "still armed after {flight.in_phase_s:.0f} s",
+            FAILED,
             ABORTED,
+            reason="still armed after {flight.in_phase_s:.0f} s",
         ),
     )
-
-
-FLY_IS_READY = (
-    Transition((Phase.HEALTH,), refused, Phase.FAILED, _refusals, REFUSED),
-    Transition((Phase.HEALTH,), ready, Phase.STREAM, "telemetry flows and the vehicle can arm"),
-    Transition(
-        (Phase.HEALTH,),
-        longer_than("health_s"),
-        Phase.FAILED,
-        lambda flight: f"not ready: {_not_ready(flight)}",
-        REFUSED,
-    ),
-)

@@ -23,7 +23,7 @@ from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.online_identification import OnlineIdentification
-from offboard.flight.phases import ENDS, Action, Limits, Phase, ServiceOptions
+from offboard.flight.phases import ENDS, STOPPED, Action, Limits, Phase, ServiceOptions
 from offboard.flight.pilot_switch import PilotSwitch
 from offboard.flight.position_jumps import PositionJumps
 from offboard.flight.positioning import Positioning
@@ -111,6 +111,8 @@ class Failsafe:
     judged_s: float | None = None  # when, on `Session.link_time_s`
     row: str = ""
     action: Action = Action.FLY
+    reason: str = ""  # why the action is taken, as a sentence, and its cause in a word
+    cause: str = ""
 
 
 @dataclass(slots=True)
@@ -221,6 +223,11 @@ class FlightState:
     @property
     def has_ended(self) -> bool:
         return self.phase in ENDS
+
+    @property
+    def stop_cause(self) -> str:
+        """Who wants the flight to end, in a word; empty for another reason than the operator's."""
+        return "operator" if self.stop_reason == STOPPED else ""
 
     @property
     def engaged(self) -> bool:

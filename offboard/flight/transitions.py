@@ -19,7 +19,6 @@ from offboard.flight.phases import (
     BEFORE_FLIGHT,
     ENDS,
     FLYING,
-    STOPPED,
     WAITING,
     ExitCode,
     Phase,
@@ -27,22 +26,7 @@ from offboard.flight.phases import (
 )
 from offboard.flight.pilot_switch import PilotSwitch
 from offboard.flight.requests import Request
-from offboard.flight.rows import (
-    REBOOTED,
-    SHOWS,
-    Condition,
-    Transition,
-    blind,
-    lost,
-    lost_armed,
-    lost_disarmed,
-    mode_unknown,
-    other_sender,
-    rebooted,
-    silent,
-    stop_requested,
-    why,
-)
+from offboard.flight.rows import REBOOTED, Transition
 from offboard.flight.state import FlightState, Outcome
 from offboard.flight.touchdown import Touchdown
 from offboard.mavlink.events import LocalPosition
@@ -68,11 +52,10 @@ def table(service: ServiceOptions | None = None) -> tuple[Transition, ...]:
     return (
         *starting.SERVICE_WAITS,
         *starting.starting(starting.STREAMING),
-        Transition((Phase.HAND_BACK,), flying.handed, Phase.YIELDED, SHOWS),
+        Transition((Phase.HAND_BACK,), flying.handed, Phase.YIELDED),
         *flying.ends_early(phases, serves=True),
         *flying.TO_THE_END,
-        *flying.HAND_BACK_ENDS,
-        *flying.REQUESTED,
+        *flying.SERVICE_ENDS,
         *flying.AT_REST[service.then],
     )
 
@@ -89,36 +72,6 @@ def _by_phase(service: ServiceOptions | None) -> dict[Phase, tuple[Transition, .
     return {phase: tuple(row for row in rows if phase in row.phases) for phase in Phase}
 
 
-# ---------------------------------------------------------------------- what caused a transition
-
-_CAUSES: dict[Condition, str] = {
-    rebooted: "restart",
-    flying.rebooted_disarmed: "restart",
-    flying.disarmed: "disarmed in flight",
-    lost: "pilot",
-    lost_armed: "pilot",
-    lost_disarmed: "pilot",
-    silent: "link",
-    starting.silent_on_ground: "link",
-    starting.silent_for_long: "link",
-    blind: "link",
-    mode_unknown: "link",
-    in_own_failsafe: "link",
-    other_sender: "second sender",
-}
-_STOPS = (stop_requested, starting.stop_requested_on_ground)
-
-
-def cause(flight: FlightState, row: Transition) -> str:
-    """A word for what caused this transition, empty without one: who or what ended a flight that
-    it ends (see `analysis.verdict`)."""
-    if row.condition in (flying.failsafe_land, flying.failsafe_hold):
-        return failsafe.cause(flight)
-    if row.condition in _STOPS:
-        return "operator" if flight.stop_reason == STOPPED else ""
-    return _CAUSES.get(row.condition, "")
-
-
 # ---------------------------------------------------------------------- its application
 
 
@@ -131,7 +84,7 @@ def advance(flight: FlightState) -> None:
         row = next_row(flight)
         if row is None:
             break
-        _enter(flight, row, why(row.reason, flight), cause(flight, row))
+        _enter(flight, row)
     flight.request = Request.NONE
 
 
@@ -164,14 +117,14 @@ def on_reboot(flight: FlightState) -> None:
     advance(flight)
 
 
-def _enter(flight: FlightState, row: Transition, reason: str, because: str) -> None:
-    source = flight.phase
+def _enter(flight: FlightState, row: Transition) -> None:
+    source, reason, cause = flight.phase, row.why(flight), row.cause.format(flight=flight)
     _conclude(flight, row, reason)
     flight.vehicle.clear_messages()
     flight.request = Request.NONE
     flight.phase = row.target
     flight.began_s = flight.now_s
-    outbox.announce_phase(flight, row.target, reason, because)
+    outbox.announce_phase(flight, row.target, reason, cause)
     if source in BEFORE_FLIGHT and row.target in FLYING:
         flight.clock.settle()
         dialect = flight.session.dialect
@@ -307,27 +260,26 @@ _ASKED = {
     Phase.LAND: "land",
     Phase.STAND_DOWN: "to disarm: it stands on the ground",
 }
-_PILOT, _ON_GROUND = "nothing: a pilot or a failsafe has it", "nothing: it is disarmed"
-_UNASKED: dict[Condition, str] = {
-    lost: _PILOT,
-    lost_armed: _PILOT,
-    flying.disarmed: _ON_GROUND,
-    flying.rebooted_disarmed: _ON_GROUND,
-    flying.disarmed_elsewhere: _ON_GROUND,
-    flying.landed: _ON_GROUND,
-}
+_DISARMED = (
+    flying.disarmed,
+    flying.rebooted_disarmed,
+    flying.disarmed_elsewhere,
+    flying.landed,
+)
 IN_THE_AIR = FLYING | {Phase.LAND}
 
 
 def asked(row: Transition, source: Phase) -> str:
     """What is asked of the autopilot where `row` leaves the phase `source`, in the air; empty:
     nothing, and without a reason."""
+    if row.target in _ASKED:
+        return _ASKED[row.target]
+    if row.cause == "pilot":
+        return "nothing: a pilot or a failsafe has it"
+    if row.condition in _DISARMED:
+        return "nothing: it is disarmed"
     before = _ASKED.get(source)
-    return (
-        _ASKED.get(row.target)
-        or _UNASKED.get(row.condition)
-        or (f"{before}, in this phase" if before else "")
-    )
+    return f"{before}, in this phase" if before else ""
 
 
 def exits(service: ServiceOptions | None) -> list[tuple[Transition, Phase]]:

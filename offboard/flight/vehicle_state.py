@@ -117,6 +117,12 @@ class VehicleState:
         return self.health.radio_ok if self.health and self.age_s(SystemHealth) < HEALTH_S else None
 
     @property
+    def other_sender_name(self) -> str:
+        """The program that controls the vehicle, too; empty without one."""
+        other = self.other_sender
+        return f"system {other.system_id} component {other.component_id}" if other else ""
+
+    @property
     def battery(self) -> float:
         """Remaining charge, of 1; 1 while it is not known."""
         charge = self.health.battery_remaining if self.health else None

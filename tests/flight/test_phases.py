@@ -24,7 +24,7 @@ from offboard.flight.phases import (
     ServiceOptions,
 )
 from offboard.flight.requests import Request
-from offboard.flight.rows import Transition, why
+from offboard.flight.rows import Transition
 from offboard.flight.state import FlightState
 from offboard.flight.transitions import IN_THE_AIR, SERVICE_ONLY, asked, exits, next_row, table
 from offboard.mavlink.dialects.base import Takeoff
@@ -146,6 +146,7 @@ EVENTS: dict[str, Setup] = {
         partial(heartbeat, armed=True, mode="POSCTL"), _set(limits=Limits(begin_armed=False))
     ),
     "rebooted": _set(rebooted=True),
+    "rebooted_in_flight": _set(rebooted=True),
     "rebooted_disarmed": _all(_set(rebooted=True), partial(_disarm, for_s=0.0, landed="in_air")),
     "needs_no_stream": _set(dialect=SimpleNamespace(takeoff=Takeoff.COMMAND)),
     "streamed": _set(began_s=NOW_S - 1.0),
@@ -177,6 +178,10 @@ EVENTS: dict[str, Setup] = {
     "unheard_on_ground": _unhear_mode,
     "out_of_reach": _set(silence_s=OUTAGE_MAX_S + 0.1),
     "silent_on_ground": _set(silence_s=20.1),
+    "not_found": _set(silence_s=20.1),
+    "not_ready_in_time": _set(began_s=NOW_S - Limits().health_s - 0.1),
+    "not_engaged": _set(began_s=NOW_S - Limits.engage_s - 0.1),
+    "not_disarmed": _set(began_s=NOW_S - Limits().land_s - 0.1),
     "blind": _age_attitude,
     "stop_requested": _stop,
     "stop_requested_on_ground": _all(_rest, _set(stop_reason="stop requested")),
@@ -222,7 +227,8 @@ def test_every_row_is_taken_when_its_condition_holds(service: ServiceOptions | N
             assert next_row(flight) is None, phase
             event_of(row)(flight)
             assert next_row(flight) is row, (phase, row.condition.__name__)
-            assert "{" not in why(row.reason, flight)
+            assert row.why(flight)
+            assert "{" not in row.why(flight) + row.cause.format(flight=flight)
 
 
 def test_every_wait_is_limited() -> None:
