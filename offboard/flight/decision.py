@@ -7,25 +7,24 @@ counted, never raised: the vehicle is in the air.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 from offboard.control.base import Adopting, Situation
 from offboard.documents.errors import located
-from offboard.flight import outbox
+from offboard.flight import outbox, setpoint
 from offboard.flight.online_identification import Adoption, OnlineIdentification
-from offboard.flight.phases import PHASE_CODES, Phase
+from offboard.flight.phases import Phase
 from offboard.flight.record import (
     IDENTIFIED_ID,
     IDENTIFIED_NAME,
     RECORD_ID,
     RECORD_NAME,
-    TickRecord,
+    Decided,
     reference_record,
 )
-from offboard.flight.setpoint import Refusal, Refused, send_command, send_position
-from offboard.flight.state import Decided, FlightState
+from offboard.flight.setpoint import Refusal, Refused
+from offboard.flight.state import FlightState
 from offboard.mavlink.outgoing import SolverRecord
-from offboard.model.command import Command, PositionCommand
+from offboard.model.command import Command
 
 NOTICEABLE_RADPS = 0.5  # a smaller change of the bandwidth is not announced
 # in a word -> what a missed decision is ascribed to
@@ -48,7 +47,8 @@ def decide(flight: FlightState) -> bool:
     """
     was_old = flight.telemetry_is_old
     try:
-        decided = _send(flight, _decided(flight))
+        decided = _decided(flight)
+        _send(flight, decided)
     except Exception as error:  # any error: the vehicle is in the air
         _miss(flight, located(error), "controller")
         return False
@@ -86,33 +86,24 @@ def _miss(flight: FlightState, failure: str, cause: str) -> None:
     outbox.warn(flight, f"decision missed: {failure}")
 
 
-def _send(flight: FlightState, decided: Decided) -> Decided:
-    """Send the command, if it is admitted."""
-    age_s, late_s = _age_and_lateness(flight)
-    try:
-        sent = _sent(flight, decided, age_s, late_s)
-    except Refused as refused:
-        return replace(decided, age_s=age_s, refused=refused.why, failure=str(refused))
-    return replace(decided, age_s=age_s, sent=sent)
-
-
-def _sent(
-    flight: FlightState, decided: Decided, age_s: float, late_s: float
-) -> Command | PositionCommand:
-    command, time_s = decided.decision.command, flight.tick.time_s
-    if not isinstance(command, Command):
-        return send_position(flight, time_s, command, age_s=age_s, late_s=late_s)
-    excited = _excited(flight, command)
+def _send(flight: FlightState, decided: Decided) -> None:
+    """Send the command, if it is admitted; age and lateness are measured now, in host time."""
+    command, late_s = decided.decision.command, 0.0
+    if flight.deadline_s is not None:
+        host_s = flight.stopwatch()
+        decided.age_s = flight.telemetry_age_s(host_s)
+        late_s = host_s - flight.tick.arrived_s - flight.period_s
+    if flight.identification and flight.phase is Phase.EXCITE and isinstance(command, Command):
+        command = flight.identification.excited(
+            command, flight.tick.time_s, flight.position_error_m
+        )
     body_z_down = float(decided.state.thrust_direction_ned[2])
-    return send_command(flight, time_s, excited, body_z_down, age_s=age_s, late_s=late_s)
-
-
-def _age_and_lateness(flight: FlightState) -> tuple[float, float]:
-    """Age of the telemetry, and time since the end of the tick; both now, in host time."""
-    if flight.deadline_s is None:
-        return 0.0, 0.0
-    host_s = flight.stopwatch()
-    return flight.telemetry_age_s(host_s), host_s - flight.tick.arrived_s - flight.period_s
+    try:
+        decided.sent = setpoint.send(
+            flight, flight.tick.time_s, command, body_z_down, age_s=decided.age_s, late_s=late_s
+        )
+    except Refused as refused:
+        decided.refused, decided.failure = refused.why, str(refused)
 
 
 def _identify(flight: FlightState, decided: Decided, identification: OnlineIdentification) -> None:
@@ -153,12 +144,6 @@ def _remaining(flight: FlightState, began_s: float) -> Callable[[], float] | Non
     return lambda: deadline_s - (flight.stopwatch() - began_s)
 
 
-def _excited(flight: FlightState, command: Command) -> Command:
-    if flight.identification is None or flight.phase is not Phase.EXCITE:
-        return command
-    return flight.identification.excited(command, flight.tick.time_s, flight.position_error_m)
-
-
 def _adopt(flight: FlightState, time_s: float, adoption: Adoption) -> None:
     assert isinstance(flight.controller, Adopting)
     flight.controller.adopt(adoption.vehicle, adoption.uncertainty)
@@ -191,23 +176,13 @@ def _with_bandwidth(
 
 
 def _record(flight: FlightState, decided: Decided, answer_s: float) -> None:
-    tick = decided.tick
-    sample = flight.plan.sample(tick.time_s)
+    time_s = decided.tick.time_s
+    sample = flight.plan.sample(time_s)
     assert sample is not None
-    outbox.send(flight, reference_record(tick.time_s, sample))
-    record = TickRecord.of(
-        phase=PHASE_CODES[decided.phase],
-        decision=decided.decision,
-        sent=decided.sent,
-        state=decided.state,
-        solve_time_s=decided.solve_time_s,
+    outbox.send(flight, reference_record(time_s, sample))
+    record = decided.record(
         answer_s=answer_s,
-        missed_ticks=tick.missed,
         hover_thrust=flight.observer.hover_thrust_estimate,
-        track_time_s=flight.plan.track_time_s(tick.time_s),
-        age_s=decided.age_s,
-        refused=decided.refused,
-        strangers=tick.strangers,
-        pause_s=tick.pause_s,
+        track_time_s=flight.plan.track_time_s(time_s),
     )
-    outbox.send(flight, SolverRecord(tick.time_s, record.data(), RECORD_ID, RECORD_NAME))
+    outbox.send(flight, SolverRecord(time_s, record.data(), RECORD_ID, RECORD_NAME))

@@ -32,8 +32,9 @@ from offboard.flight.phases import (
     Phase,
     ServiceOptions,
 )
+from offboard.flight.record import Tick
 from offboard.flight.snapshot import Snapshot, snapshot_of
-from offboard.flight.state import FlightState, Outcome, Tick
+from offboard.flight.state import FlightState, Outcome
 from offboard.identification.learner import Learned
 from offboard.link.interface import Chunk
 from offboard.mavlink.dialects.base import NEVER

@@ -7,12 +7,13 @@ analysis reads the log with the same class. The array_id says how many of the fi
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
+from dataclasses import astuple, dataclass, fields
 
 import numpy as np
 from numpy.typing import NDArray
 
-from offboard.control.base import Decision
+from offboard.control.base import Certificate, Decision
+from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.mavlink.outgoing import ReferenceRecord
 from offboard.model.command import Command, PositionCommand
 from offboard.model.predicted_state import PredictedState
@@ -24,6 +25,7 @@ COMPONENT_ID = 191  # MAV_COMP_ID_ONBOARD_COMPUTER: the sender of frames
 RECORD_COMPONENT_ID = 192
 RECORD_NAME = "pso"
 NAN = float("nan")
+CERTIFIED = len(fields(Certificate))
 Array = NDArray[np.float64]
 RECORD_ID = 4
 LAYOUTS = {1: 28, 3: 31, RECORD_ID: 32}  # array_id -> number of fields
@@ -76,56 +78,6 @@ class TickRecord:
         """The values in the order of DEBUG_FLOAT_ARRAY.data."""
         return tuple(getattr(self, each.name) for each in fields(self))
 
-    @classmethod
-    def of(
-        cls,
-        *,
-        phase: int,
-        decision: Decision,
-        sent: Command | PositionCommand | None,
-        state: PredictedState,
-        solve_time_s: float,
-        answer_s: float,
-        missed_ticks: int,
-        hover_thrust: float,
-        track_time_s: float,
-        age_s: float = NAN,
-        refused: int = 0,
-        strangers: int = 0,
-        pause_s: float = 0.0,
-    ) -> TickRecord:
-        """The record of `decision`, made for the predicted `state`, and of the setpoint `sent`
-        instead of it or because of it; None if none was."""
-        # with a position setpoint, the autopilot chooses thrust and direction
-        attitude = sent if isinstance(sent, Command) else None
-        certificate = decision.certificate if sent == decision.command else None
-        return cls(
-            float(phase),
-            attitude.thrust_mps2 if attitude else NAN,
-            *(attitude.thrust_direction_ned if attitude else (NAN, NAN, NAN)),
-            sent.course_rad if sent else NAN,
-            certificate.cost if certificate else NAN,
-            certificate.optimal_cost if certificate else NAN,
-            certificate.gap if certificate else NAN,
-            certificate.spread if certificate else NAN,
-            float(certificate.iterations) if certificate else NAN,
-            float(certificate.cut_short) if certificate else NAN,
-            float(certificate.at_bound) if certificate else NAN,
-            solve_time_s,
-            answer_s,
-            float(missed_ticks),
-            *_triple(state.position_ned_m),
-            *_triple(state.velocity_ned_mps),
-            *_triple(state.disturbance_ned_mps2),
-            hover_thrust,
-            track_time_s,
-            certificate.seed_cost if certificate else NAN,
-            age_s,
-            float(refused),
-            float(strangers),
-            pause_s,
-        )
-
 
 FIELDS = tuple(field.name for field in fields(TickRecord))
 
@@ -141,6 +93,62 @@ def records_of(data: Array, array_ids: Array) -> NDArray[np.void]:
     for column, name in enumerate(FIELDS):
         records[name] = values[:, column]
     return records
+
+
+@dataclass(frozen=True, slots=True)
+class Tick:
+    """One control tick."""
+
+    time_s: float = 0.0  # vehicle time
+    arrived_s: float = 0.0  # host time of the arrival of the telemetry that caused it
+    missed: int = 0  # ticks skipped since the previous one
+    strangers: int = 0  # datagrams of other senders since the previous one
+    pause_s: float = 0.0  # of this process, since the previous one
+
+
+@dataclass(slots=True)
+class Decided:
+    """A decision, the predicted state it was made for, and what became of it."""
+
+    tick: Tick
+    phase: Phase
+    state: PredictedState
+    decision: Decision
+    solve_time_s: float
+    sent: Command | PositionCommand | None = None
+    age_s: float = 0.0  # of its telemetry, when it was checked
+    refused: int = 0  # flags of `setpoint.Refusal`
+    failure: str = ""  # why it was refused
+
+    def record(self, *, answer_s: float, hover_thrust: float, track_time_s: float) -> TickRecord:
+        """The record of the tick. The certificate counts if the setpoint was sent as decided."""
+        sent, state, tick = self.sent, self.state, self.tick
+        # with a position setpoint, the autopilot chooses thrust and direction
+        attitude = sent if isinstance(sent, Command) else None
+        certified = sent == self.decision.command
+        figures = astuple(self.decision.certificate) if certified else (NAN,) * CERTIFIED
+        *certificate, seed_cost = map(float, figures)
+        values = (
+            float(PHASE_CODES[self.phase]),
+            attitude.thrust_mps2 if attitude else NAN,
+            *(attitude.thrust_direction_ned if attitude else (NAN, NAN, NAN)),
+            sent.course_rad if sent else NAN,
+            *certificate,
+            self.solve_time_s,
+            answer_s,
+            float(tick.missed),
+            *_triple(state.position_ned_m),
+            *_triple(state.velocity_ned_mps),
+            *_triple(state.disturbance_ned_mps2),
+            hover_thrust,
+            track_time_s,
+            seed_cost,
+            self.age_s,
+            float(self.refused),
+            float(tick.strangers),
+            tick.pause_s,
+        )
+        return TickRecord(*values)
 
 
 def reference_record(time_s: float, sample: FlatSample) -> ReferenceRecord:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from contextlib import suppress
 from enum import IntFlag
-from typing import overload
 
 from offboard.flight import outbox
 from offboard.flight.state import LEVEL, FlightState
@@ -39,28 +38,6 @@ class Refused(Exception):
         self.why = why
 
 
-@overload
-def admit(
-    command: Command,
-    vehicle: Vehicle,
-    *,
-    ours: bool,
-    on_ground: bool,
-    age_s: float = ...,
-    age_limit_s: float = ...,
-    late_s: float = ...,
-) -> Command: ...
-@overload
-def admit(
-    command: PositionCommand,
-    vehicle: Vehicle,
-    *,
-    ours: bool,
-    on_ground: bool,
-    age_s: float = ...,
-    age_limit_s: float = ...,
-    late_s: float = ...,
-) -> PositionCommand: ...
 def admit(
     command: Command | PositionCommand,
     vehicle: Vehicle,
@@ -134,25 +111,55 @@ def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool = False) -> Com
 # ---------------------------------------------------------------------- sending
 
 
-def send_command(
+def send(
     flight: FlightState,
     time_s: float,
-    command: Command,
+    command: Command | PositionCommand,
     body_z_down: float | None = None,
     *,
     age_s: float = 0.0,
     late_s: float = 0.0,
-) -> Command:
-    """Send an attitude setpoint and return it as it was sent.
+) -> Command | PositionCommand:
+    """Send a setpoint and return it as it was sent.
 
     `age_s` and `late_s` are those of the decision (see `admit`), `body_z_down` is
     described in `AttitudeTarget`. Raises Refused; then nothing is sent.
     """
+    admitted = admit(
+        command,
+        flight.model,
+        ours=flight.ours,
+        on_ground=flight.contact.certain,
+        age_s=age_s,
+        age_limit_s=flight.limits.setpoint_age_s,
+        late_s=late_s,
+    )
+    if isinstance(admitted, Command):
+        _send_attitude(flight, time_s, admitted, body_z_down)
+    else:
+        _send_position(flight, time_s, admitted)
+    flight.setpoint_s = flight.now_s
+    return admitted
+
+
+def send_level(flight: FlightState, time_s: float, command: Command) -> None:
+    """Send a setpoint that no decision was needed for, if the vehicle is ours."""
+    with suppress(Refused):
+        send(flight, time_s, command)
+
+
+def set_command(flight: FlightState, time_s: float, command: Command) -> None:
+    """Note the command in force without sending it, for example the autopilot's own."""
+    flight.command = command
+    flight.observer.on_command(flight.sent_s(time_s), command)
+
+
+def _send_attitude(
+    flight: FlightState, time_s: float, command: Command, body_z_down: float | None
+) -> None:
     model = flight.model
-    command = _admitted(flight, command, age_s, late_s)
     set_command(flight, time_s, command)
     flight.commands.append(command)
-    flight.setpoint_s = flight.now_s
     flight.thrusts.append(min(command.thrust_mps2 / model.thrust_max_mps2, 1.0))
     if flight.identification:
         flight.identification.on_command(flight.sent_s(time_s), command)
@@ -168,37 +175,12 @@ def send_command(
             body_z_down=body_z_down,
         ),
     )
-    return command
 
 
-def send_level(flight: FlightState, time_s: float, command: Command) -> None:
-    """Send a setpoint that no decision was needed for, if the vehicle is ours."""
-    with suppress(Refused):
-        send_command(flight, time_s, command)
-
-
-def set_command(flight: FlightState, time_s: float, command: Command) -> None:
-    """Note the command in force without sending it, for example the autopilot's own."""
-    flight.command = command
-    flight.observer.on_command(flight.sent_s(time_s), command)
-
-
-def send_position(
-    flight: FlightState,
-    time_s: float,
-    command: PositionCommand,
-    *,
-    age_s: float = 0.0,
-    late_s: float = 0.0,
-) -> PositionCommand:
-    """Send a setpoint for the autopilot's position loop; see `send_command`.
-
-    The attitude that this loop commands is unknown, therefore the observer stops predicting
-    with commands.
-    """
-    command = _admitted(flight, command, age_s, late_s)
+def _send_position(flight: FlightState, time_s: float, command: PositionCommand) -> None:
+    """The attitude that the autopilot's position loop commands is unknown, therefore the observer
+    stops predicting with commands."""
     flight.observer.freeze(True)
-    flight.setpoint_s = flight.now_s
     flight.thrusts.clear()  # the autopilot chooses the thrust
     flight.command = Command(flight.model.gravity_mps2, LEVEL, command.course_rad)
     outbox.send(
@@ -212,7 +194,6 @@ def send_position(
             command.course_rate_radps,
         ),
     )
-    return command
 
 
 def hover_mps2(flight: FlightState) -> float:
@@ -220,23 +201,3 @@ def hover_mps2(flight: FlightState) -> float:
     model = flight.model
     share = flight.observer.hover_thrust_estimate / model.hover_thrust
     return (share if math.isfinite(share) else 1.0) * model.gravity_mps2
-
-
-@overload
-def _admitted(flight: FlightState, command: Command, age_s: float, late_s: float) -> Command: ...
-@overload
-def _admitted(
-    flight: FlightState, command: PositionCommand, age_s: float, late_s: float
-) -> PositionCommand: ...
-def _admitted(
-    flight: FlightState, command: Command | PositionCommand, age_s: float, late_s: float
-) -> Command | PositionCommand:
-    return admit(
-        command,
-        flight.model,
-        ours=flight.ours,
-        on_ground=flight.contact.certain,
-        age_s=age_s,
-        age_limit_s=flight.limits.setpoint_age_s,
-        late_s=late_s,
-    )

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from offboard.control.base import Controller, Decision
+from offboard.control.base import Controller
 from offboard.estimation.observer import Observer
 from offboard.flight.authority import Authority, Standing
 from offboard.flight.busyness import Busyness
@@ -28,6 +28,7 @@ from offboard.flight.pilot_switch import PilotSwitch
 from offboard.flight.position_jumps import PositionJumps
 from offboard.flight.positioning import Positioning
 from offboard.flight.preflight import ParameterReading
+from offboard.flight.record import Decided, Tick
 from offboard.flight.requests import Request
 from offboard.flight.touchdown import Touchdown, moved
 from offboard.flight.vehicle_clock import VehicleClock
@@ -36,7 +37,7 @@ from offboard.mavlink.dialects.base import Dialect, Takeoff
 from offboard.mavlink.events import Heartbeat, Landed, TimesyncReply
 from offboard.mavlink.outgoing import CommandLong, Outgoing, Record
 from offboard.mavlink.session import Session
-from offboard.model.command import Command, PositionCommand
+from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
 from offboard.model.vehicle import Vehicle
 
@@ -74,32 +75,6 @@ KEPT = (
     "heard_s",
     "guarded",
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Tick:
-    """One control tick."""
-
-    time_s: float = 0.0  # vehicle time
-    arrived_s: float = 0.0  # host time of the arrival of the telemetry that caused it
-    missed: int = 0  # ticks skipped since the previous one
-    strangers: int = 0  # datagrams of other senders since the previous one
-    pause_s: float = 0.0  # of this process, since the previous one
-
-
-@dataclass(frozen=True, slots=True)
-class Decided:
-    """A decision, the predicted state it was made for, and what became of it."""
-
-    tick: Tick
-    phase: Phase
-    state: PredictedState
-    decision: Decision
-    solve_time_s: float
-    sent: Command | PositionCommand | None = None
-    age_s: float = 0.0  # of its telemetry, when it was checked
-    refused: int = 0  # flags of `setpoint.Refusal`
-    failure: str = ""  # why it was refused
 
 
 @dataclass(slots=True)

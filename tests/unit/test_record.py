@@ -8,11 +8,13 @@ from dataclasses import replace
 import numpy as np
 
 from offboard.control.base import Certificate, Decision
-from offboard.flight.record import LAYOUTS, TickRecord, records_of
+from offboard.flight.phases import Phase
+from offboard.flight.record import LAYOUTS, Decided, Tick, TickRecord, records_of
 from offboard.flight.setpoint import Refusal
 from offboard.model.command import Command
 from offboard.model.predicted_state import PredictedState
 
+TICK = Tick(5.0)
 COMMAND = Command(9.0, (0.6, 0.0, 0.8), 0.3)
 DECISION = Decision(COMMAND, Certificate(2.0, 1.5, 0.25, 0.1, 40, True, True, 3.0))
 CERTIFIED = ("cost", "optimal_cost", "gap", "spread", "iterations", "cut_short", "at_bound",
@@ -31,11 +33,9 @@ STATE = PredictedState(
 )
 
 
-def record(sent: Command | None, **more: float) -> TickRecord:
-    return TickRecord.of(
-        phase=8, decision=DECISION, sent=sent, state=STATE, solve_time_s=0.001, answer_s=0.002,
-        missed_ticks=0, hover_thrust=0.5, track_time_s=1.0, **more,
-    )  # fmt: skip
+def record(sent: Command | None, tick: Tick = TICK, **more: float) -> TickRecord:
+    decided = Decided(tick, Phase.TRACK, STATE, DECISION, 0.001, sent, **more)
+    return decided.record(answer_s=0.002, hover_thrust=0.5, track_time_s=1.0)
 
 
 def certificate(of: TickRecord) -> list[float]:
@@ -55,7 +55,7 @@ def test_the_certificate_is_of_what_was_sent() -> None:
 
 def test_a_record_of_an_older_log_has_no_age() -> None:
     """The wire fills what a record does not use with zeros."""
-    written = record(COMMAND, age_s=0.03, refused=Refusal.LATE, strangers=4).data()
+    written = record(COMMAND, Tick(5.0, strangers=4), age_s=0.03, refused=Refusal.LATE).data()
     rows = [(*written[:count], *(0.0,) * (58 - count)) for count in LAYOUTS.values()]
     old, _, new = records_of(np.array(rows), np.array(list(LAYOUTS)))
     assert (old["seed_cost"], new["seed_cost"], old["phase"]) == (3.0, 3.0, 8.0)
