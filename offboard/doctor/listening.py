@@ -43,7 +43,7 @@ PREARM_AFTER_S = 1.0  # what is asked before may be lost: the link has just been
 TEXTS_S = 1.0  # for the texts after the acknowledgement
 ENOUGH = 0.7  # of a rate, measured over two seconds
 SETTLE_S = 1.0  # until jumps of the vehicle's clock count
-RUN_PREARM_CHECKS, REQUEST_MESSAGE = 401, 512  # MAV_CMD
+RUN_PREARM_CHECKS = 401  # MAV_CMD
 VERSION, GPS, TIMESYNC = 148, 24, 111  # message ids
 
 

@@ -108,10 +108,6 @@ class Recorder:
         self._attitude = _Rows(rows, ATTITUDE_WIDTH)
         self._position = _Rows(rows, POSITION_WIDTH)
 
-    def clear(self) -> None:
-        for rows in (self._commands, self._attitude, self._position):
-            rows.clear()
-
     def on_command(
         self, time_s: float, direction_ne: tuple[float, float], thrust: float, course_rad: float
     ) -> None:
@@ -152,9 +148,6 @@ class _Rows:
     def kept(self) -> Array:
         kept: Array = self._rows[: self._count]
         return kept
-
-    def clear(self) -> None:
-        self._count = 0
 
     def add(self, row: tuple[float, ...]) -> None:
         if self._count == len(self._rows):

@@ -28,12 +28,10 @@ class Redial:
         self._open_stream = open_stream
         self._found: list[Stream] = []  # at most one
         self._closing = threading.Event()
-        self._thread: threading.Thread | None = None
 
     def seek(self) -> None:
-        if self._thread is None or not self._thread.is_alive():
-            self._thread = threading.Thread(target=self._dial, daemon=True)
-            self._thread.start()
+        # always: the thread before has found its stream, although it may not have ended yet
+        threading.Thread(target=self._dial, daemon=True).start()
 
     def _dial(self) -> None:
         while not self._closing.wait(RETRY_S):

@@ -19,7 +19,7 @@ class VehicleFound:
 
     system_id: int
     component_id: int
-    autopilot: str  # a key of session.DIALECTS: "px4", "ardupilot"
+    autopilot: str  # a key of senders.DIALECTS: "px4", "ardupilot"
 
 
 @dataclass(frozen=True, slots=True)

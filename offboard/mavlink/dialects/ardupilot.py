@@ -5,6 +5,8 @@ from __future__ import annotations
 import math
 from types import MappingProxyType
 
+from pymavlink.dialects.v20.all import enums
+
 from offboard.mavlink.dialects.base import (
     CUSTOM_MODE_ENABLED,
     TRACKING_TELEMETRY,
@@ -23,32 +25,9 @@ def _mode_parameters(custom_mode: int) -> tuple[float, float, float]:
 
 
 _MODES = {
-    0: "STABILIZE",
-    1: "ACRO",
-    2: "ALT_HOLD",
-    3: "AUTO",
-    4: "GUIDED",
-    5: "LOITER",
-    6: "RTL",
-    7: "CIRCLE",
-    9: "LAND",
-    11: "DRIFT",
-    13: "SPORT",
-    14: "FLIP",
-    15: "AUTOTUNE",
-    16: "POSHOLD",
-    17: "BRAKE",
-    18: "THROW",
-    19: "AVOID_ADSB",
-    20: "GUIDED_NOGPS",
-    21: "SMART_RTL",
-    22: "FLOWHOLD",
-    23: "FOLLOW",
-    24: "ZIGZAG",
-    25: "SYSTEMID",
-    26: "AUTOROTATE",
-    27: "AUTO_RTL",
-    28: "TURTLE",
+    number: mode.name.removeprefix("COPTER_MODE_")
+    for number, mode in enums["COPTER_MODE"].items()
+    if mode.name.startswith("COPTER_MODE_")
 }
 
 ARDUPILOT = Dialect(
