@@ -27,7 +27,7 @@ def _mode_parameters(custom_mode: int) -> tuple[float, float, float]:
 _MODES = {
     number: mode.name.removeprefix("COPTER_MODE_")
     for number, mode in enums["COPTER_MODE"].items()
-    if mode.name.startswith("COPTER_MODE_")
+    if not mode.name.endswith("ENUM_END")
 }
 
 ARDUPILOT = Dialect(
