@@ -372,12 +372,3 @@ def judge(flight: FlightState, rows: Sequence[Row] = ROWS) -> None:
             known.action, known.row = row.action, row.name
             known.reason = row.reason.format(flight=flight) or str(holds)
             known.cause = row.cause.format(flight=flight)
-
-
-def markdown() -> str:
-    """The table for the README of `flight/`."""
-    lines = ["| row | what is measured | limit | held for | then |", "|---|---|---|---|---|"]
-    for row in ROWS:
-        then = row.action.name.lower()
-        lines.append(f"| {row.name} | {row.measured} | {row.limit} | {row.held_s:g} s | {then} |")
-    return "\n".join(lines)

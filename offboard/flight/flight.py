@@ -33,7 +33,7 @@ from offboard.flight.phases import (
     ServiceOptions,
 )
 from offboard.flight.record import Tick
-from offboard.flight.snapshot import Snapshot, snapshot_of
+from offboard.flight.snapshot import Snapshot
 from offboard.flight.state import FlightState, Outcome
 from offboard.identification.learner import Learned
 from offboard.link.interface import Chunk
@@ -326,9 +326,9 @@ class Flight:
         """How many there were."""
         return len(self.announced)
 
-    def snapshot(self) -> Snapshot:
-        """The flight at this moment, for displays."""
-        return snapshot_of(self.state, self.strangers)
+    def snapshot(self, flights: int = 0) -> Snapshot:
+        """The flight at this moment, for displays; `flights` that the service has begun."""
+        return Snapshot(self.state, self.strangers, flights)
 
     @property
     def lands_without_log(self) -> bool:

@@ -6,8 +6,7 @@ import numpy as np
 
 from offboard.flight.authority import Standing
 from offboard.flight.ground_contact import STILL_ARMED
-from offboard.flight.phases import OUTAGE_MAX_S, TRACKING, Action, ExitCode, Phase
-from offboard.flight.requests import Request
+from offboard.flight.phases import OUTAGE_MAX_S, TRACKING, Action, ExitCode, Phase, Request
 from offboard.flight.rows import (
     REBOOTED,
     Condition,

@@ -47,6 +47,16 @@ class Action(IntEnum):
     LAND = 3  # the autopilot is asked to land
 
 
+class Request(Enum):
+    """What a ground station has asked for, and is to be done at the next tick (see `requests`)."""
+
+    NONE = "nothing"
+    START = "start"
+    PAUSE = "pause"
+    CONTINUE = "continue"
+    HAND_BACK = "hand back"
+
+
 # The number of a phase in logs. Never reuse a number: old logs must stay readable.
 PHASE_CODES: Mapping[Phase, int] = {
     Phase.CONNECT: 0,

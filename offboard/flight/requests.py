@@ -6,25 +6,18 @@ continues it, MAV_CMD_DO_SET_MODE (176), with any parameters, hands the vehicle 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
-from enum import Enum, IntEnum
+from enum import IntEnum
 
-from offboard.flight.phases import MOVING, TRACKING, Phase
+from offboard.flight import outbox
+from offboard.flight.phases import MOVING, TRACKING, Phase, Request
+from offboard.flight.starting import can_take_over, usable
+from offboard.flight.state import FlightState
+from offboard.mavlink.events import CommandRequest
+from offboard.mavlink.outgoing import CommandResult
 
 START, PAUSE_CONTINUE, SET_MODE = 300, 193, 176  # MAV_CMD
 BEGINNING = (Phase.STREAM, Phase.ENGAGE, Phase.ARM, Phase.TAKEOFF)
 ENDING = (Phase.HAND_BACK, Phase.HOLD)
-
-
-class Request(Enum):
-    """What is to be done at the next tick."""
-
-    NONE = "nothing"
-    START = "start"
-    PAUSE = "pause"
-    CONTINUE = "continue"
-    HAND_BACK = "hand back"
 
 
 class Result(IntEnum):
@@ -36,16 +29,16 @@ class Result(IntEnum):
     UNSUPPORTED = 3
 
 
-@dataclass(frozen=True, slots=True)
-class Circumstances:
-    """What the answer depends on. `may_arm`: the service runs with --arms. `can_take_over`: the
-    vehicle flies in the mode of setpoints, and nothing prevents that we fly it."""
-
-    phase: Phase
-    armed: bool
-    may_arm: bool
-    ready: bool
-    can_take_over: bool
+def answer(flight: FlightState, asked: CommandRequest) -> None:
+    """Acknowledge a command to us; the next tick does what it asks for."""
+    result = Result.UNSUPPORTED
+    if flight.service:
+        result, request = _judged(flight, asked.command, asked.parameters)
+        if request is not Request.NONE:
+            flight.request = request
+            sender = f"system {asked.system_id} component {asked.component_id}"
+            outbox.announce(flight, f"{request.value} requested by {sender}")
+    outbox.send(flight, CommandResult(asked.command, result, asked.system_id, asked.component_id))
 
 
 Answer = tuple[Result, Request]
@@ -54,45 +47,39 @@ NOT_NOW: Answer = (Result.TEMPORARILY_REJECTED, Request.NONE)
 DENIED: Answer = (Result.DENIED, Request.NONE)
 
 
-def answer(command: int, parameters: tuple[float, ...], now: Circumstances) -> Answer:
+def _judged(flight: FlightState, command: int, parameters: tuple[float, ...]) -> Answer:
     """The result to acknowledge `command` with, and what is to be done."""
-    answered = _ANSWERS.get(command)
-    return answered(parameters, now) if answered else (Result.UNSUPPORTED, Request.NONE)
+    if command == START:
+        return _start(flight)
+    if command == PAUSE_CONTINUE:
+        return _pause_or_continue(flight.phase, parameters[0])
+    if command == SET_MODE:
+        if flight.phase in TRACKING or flight.phase in BEGINNING:
+            return Result.ACCEPTED, Request.HAND_BACK
+        return NOTHING_TO_DO if flight.phase in ENDING else DENIED
+    return Result.UNSUPPORTED, Request.NONE
 
 
-def _start(_: tuple[float, ...], now: Circumstances) -> Answer:
-    if now.phase in TRACKING:
+def _start(flight: FlightState) -> Answer:
+    if flight.phase in TRACKING:
         return Result.ACCEPTED, Request.START
-    if now.phase in BEGINNING:
+    if flight.phase in BEGINNING:
         return NOTHING_TO_DO
-    if now.phase is not Phase.STANDBY:
+    if flight.phase is not Phase.STANDBY:
         return NOT_NOW
-    if now.armed:
-        return (Result.ACCEPTED, Request.START) if now.can_take_over else NOT_NOW
-    if not now.may_arm:
+    armed = flight.vehicle.armed
+    if not armed and not (flight.service and flight.service.arms):
         return DENIED
-    return (Result.ACCEPTED, Request.START) if now.ready else NOT_NOW
+    fit = usable(flight) and (not armed or can_take_over(flight))
+    return (Result.ACCEPTED, Request.START) if fit else NOT_NOW
 
 
-def _pause_or_continue(parameters: tuple[float, ...], now: Circumstances) -> Answer:
-    wanted = {0.0: Request.PAUSE, 1.0: Request.CONTINUE}.get(parameters[0])
+def _pause_or_continue(phase: Phase, parameter: float) -> Answer:
+    wanted = {0.0: Request.PAUSE, 1.0: Request.CONTINUE}.get(parameter)
     if wanted is None:
         return DENIED
-    if now.phase in MOVING:
+    if phase in MOVING:
         return (Result.ACCEPTED, wanted) if wanted is Request.PAUSE else NOTHING_TO_DO
-    if now.phase is Phase.PAUSE:
+    if phase is Phase.PAUSE:
         return (Result.ACCEPTED, wanted) if wanted is Request.CONTINUE else NOTHING_TO_DO
-    return NOTHING_TO_DO if now.phase is Phase.HOVER else NOT_NOW
-
-
-def _hand_back(_: tuple[float, ...], now: Circumstances) -> Answer:
-    if now.phase in TRACKING or now.phase in BEGINNING:
-        return Result.ACCEPTED, Request.HAND_BACK
-    return NOTHING_TO_DO if now.phase in ENDING else DENIED
-
-
-_ANSWERS: Mapping[int, Callable[[tuple[float, ...], Circumstances], Answer]] = {
-    START: _start,
-    PAUSE_CONTINUE: _pause_or_continue,
-    SET_MODE: _hand_back,
-}
+    return NOTHING_TO_DO if phase is Phase.HOVER else NOT_NOW

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from offboard.flight import preflight
-from offboard.flight.phases import ExitCode, Phase
+from offboard.flight.phases import ExitCode, Phase, Request
 from offboard.flight.preflight import ARMED_ALREADY, OTHER_SENDER, SEVERAL, Ground
-from offboard.flight.requests import Request
 from offboard.flight.rows import (
     Transition,
     blind,

@@ -23,13 +23,12 @@ from offboard.flight.flight_plan import FlightPlan
 from offboard.flight.ground_contact import DETECTOR_KNOWN_S, GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.online_identification import OnlineIdentification
-from offboard.flight.phases import ENDS, STOPPED, Action, Limits, Phase, ServiceOptions
+from offboard.flight.phases import ENDS, STOPPED, Action, Limits, Phase, Request, ServiceOptions
 from offboard.flight.pilot_switch import PilotSwitch
 from offboard.flight.position_jumps import PositionJumps
 from offboard.flight.positioning import Positioning
 from offboard.flight.preflight import ParameterReading
 from offboard.flight.record import Decided, Tick
-from offboard.flight.requests import Request
 from offboard.flight.touchdown import Touchdown, moved
 from offboard.flight.vehicle_clock import VehicleClock
 from offboard.flight.vehicle_state import VehicleState

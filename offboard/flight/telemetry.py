@@ -4,17 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from offboard.flight import outbox
+from offboard.flight import outbox, requests
 from offboard.flight.authority import Authority
 from offboard.flight.ground_contact import GroundContact
 from offboard.flight.hover_estimate import HoverEstimate
 from offboard.flight.manifest import vehicle_record
-from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, WAITING, Phase
+from offboard.flight.phases import BEFORE_FLIGHT, TRACKING, WAITING
 from offboard.flight.position_jumps import PositionJumps
 from offboard.flight.preflight import ParameterReading
-from offboard.flight.requests import Circumstances, Request, Result, answer
 from offboard.flight.rows import other_sender
-from offboard.flight.starting import can_take_over, usable
 from offboard.flight.state import FlightState
 from offboard.mavlink.dialects.base import ThrustRule
 from offboard.mavlink.events import (
@@ -32,7 +30,6 @@ from offboard.mavlink.events import (
     TimesyncReply,
     VehicleFound,
 )
-from offboard.mavlink.outgoing import CommandResult
 from offboard.model.frames import thrust_direction_from_quaternion
 
 SAME_THRUST = 1e-5  # of full throttle: rounding on the link
@@ -59,7 +56,7 @@ def update(flight: FlightState, event: Event, arrived_s: float, *, turned_s: flo
         case TimesyncReply():
             flight.clock.on_reply(event)
         case CommandRequest():
-            _answer(flight, event)
+            requests.answer(flight, event)
         case VehicleFound():
             outbox.send(flight, vehicle_record(event))
         case PeerChanged(peer):
@@ -162,26 +159,6 @@ def _on_mode(
         outbox.announce(flight, f"not engaged: {mode}, but {why}")
     if isinstance(event, Heartbeat):
         flight.pilot.on_heartbeat(ours=ours, failsafe=flight.vehicle.in_failsafe)
-
-
-def _answer(flight: FlightState, asked: CommandRequest) -> None:
-    """Acknowledge a command to us; the next tick does what it asks for."""
-    result = Result.UNSUPPORTED
-    if flight.service:
-        fit = flight.phase is Phase.STANDBY and usable(flight)
-        circumstances = Circumstances(
-            flight.phase,
-            flight.vehicle.armed,
-            flight.service.arms,
-            fit,
-            fit and can_take_over(flight),
-        )
-        result, request = answer(asked.command, asked.parameters, circumstances)
-        if request is not Request.NONE:
-            flight.request = request
-            sender = f"system {asked.system_id} component {asked.component_id}"
-            outbox.announce(flight, f"{request.value} requested by {sender}")
-    outbox.send(flight, CommandResult(asked.command, result, asked.system_id, asked.component_id))
 
 
 def _on_reboot(flight: FlightState) -> None:

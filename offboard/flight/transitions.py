@@ -17,15 +17,14 @@ from offboard.flight.flying import in_own_failsafe
 from offboard.flight.hover_estimate import DIFFERENT, SETTLED, differs
 from offboard.flight.phases import (
     BEFORE_FLIGHT,
-    ENDS,
     FLYING,
     WAITING,
     ExitCode,
     Phase,
+    Request,
     ServiceOptions,
 )
 from offboard.flight.pilot_switch import PilotSwitch
-from offboard.flight.requests import Request
 from offboard.flight.rows import REBOOTED, Transition
 from offboard.flight.state import FlightState, Outcome
 from offboard.flight.touchdown import Touchdown
@@ -250,55 +249,3 @@ def _adopt_hover_thrust(flight: FlightState, least: float = DIFFERENT) -> None:
         f"hover thrust {shown:.3f} by thrust and acceleration before the take-over, "
         f"not {model.hover_thrust:.3f}",
     )
-
-
-# ---------------------------------------------------------------------- its documentation
-
-_ASKED = {
-    Phase.HAND_BACK: "hold",
-    Phase.HOLD: "hold, then land",
-    Phase.LAND: "land",
-    Phase.STAND_DOWN: "to disarm: it stands on the ground",
-}
-_DISARMED = (
-    flying.disarmed,
-    flying.rebooted_disarmed,
-    flying.disarmed_elsewhere,
-    flying.landed,
-)
-IN_THE_AIR = FLYING | {Phase.LAND}
-
-
-def asked(row: Transition, source: Phase) -> str:
-    """What is asked of the autopilot where `row` leaves the phase `source`, in the air; empty:
-    nothing, and without a reason."""
-    if row.target in _ASKED:
-        return _ASKED[row.target]
-    if row.cause == "pilot":
-        return "nothing: a pilot or a failsafe has it"
-    if row.condition in _DISARMED:
-        return "nothing: it is disarmed"
-    before = _ASKED.get(source)
-    return f"{before}, in this phase" if before else ""
-
-
-def exits(service: ServiceOptions | None) -> list[tuple[Transition, Phase]]:
-    """The rows that leave the air, or the phases that fly by setpoints for those that end it, with
-    each phase that they leave."""
-    leaving = ENDS | _ASKED.keys()
-    rows = [row for row in table(service) if row.target in leaving]
-    return [(row, phase) for row in rows for phase in row.phases if phase in IN_THE_AIR]
-
-
-def markdown() -> str:
-    """The table of all exits from the air, for the README of `flight/`."""
-    lines = ["| condition | in the phases | then | asked of the autopilot |", "|---|---|---|---|"]
-    sources: dict[tuple[str, str, str], set[Phase]] = {}
-    for row, phase in (*exits(None), *exits(ServiceOptions(then="land"))):
-        condition = row.condition.__name__.replace("_", " ")
-        sources.setdefault((condition, row.target.value, asked(row, phase)), set()).add(phase)
-    for (condition, target, request), phases in sources.items():
-        names = ", ".join(phase.value for phase in Phase if phase in phases)
-        within = "all that fly" if phases >= FLYING else names
-        lines.append(f"| {condition} | {within} | {target} | {request} |")
-    return "\n".join(lines)

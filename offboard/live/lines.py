@@ -112,7 +112,7 @@ def _status_line(console: Console) -> Live:
 
 
 def status(now: Snapshot) -> str:
-    """Time, phase, error, link age, mode and ladder in one line, as far as they are known."""
+    """Time, phase, error, link age, mode and failsafe in one line, as far as they are known."""
     parts = [f"{now.time_s:8.2f} s  {now.phase}"]
     if math.isfinite(now.position_error_m):
         parts.append(f"error {now.position_error_m:.3f} m")
@@ -120,8 +120,8 @@ def status(now: Snapshot) -> str:
         parts.append(f"link age {1e3 * now.telemetry_age_s:.0f} ms")
     if now.mode:
         parts.append(now.mode)
-    if now.rung != "fly":
-        parts.append(f"{now.rung}: {now.rung_reason}")
+    if now.failsafe != "fly":
+        parts.append(f"{now.failsafe}: {now.failsafe_row}")
     return "  ".join(parts)
 
 

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import fields
 from typing import TYPE_CHECKING, Any
 
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, InfoMetricFamily
 from prometheus_client.registry import Collector
 
-from offboard.flight.snapshot import Snapshot
 from offboard.link import clock
 
 if TYPE_CHECKING:
@@ -19,9 +17,8 @@ if TYPE_CHECKING:
 
 STALE_S = 2.0  # the loop hands over ten snapshots a second
 HEALTHY_AGE_S = 2.0  # of telemetry
-STATES = ("phase", "mode", "authority", "rung")  # texts of a snapshot that are labels
+STATES = ("phase", "mode", "authority", "failsafe")  # texts of a snapshot that are labels
 COUNTER = "flights"
-NUMBERS = {f.name for f in fields(Snapshot) if f.type in ("float", "int", "bool")} - {COUNTER}
 
 
 class Metrics(Collector):
@@ -57,8 +54,9 @@ class Metrics(Collector):
         age_s = clock.monotonic_s() - self._shown_s
         yield GaugeMetricFamily("offboard_snapshot_age_seconds", "Age of these values.", age_s)
         yield CounterMetricFamily("offboard_flights", "Flights begun.", now[COUNTER])
-        for name in sorted(NUMBERS):
-            value = math.nan if now[name] is None else float(now[name])
-            yield GaugeMetricFamily(f"offboard_{name}", f"{name} of the present flight.", value)
+        for name, value in sorted(now.items()):
+            if isinstance(value, int | float) and name != COUNTER:  # which are known
+                told = f"{name} of the present flight."
+                yield GaugeMetricFamily(f"offboard_{name}", told, float(value))
         states = {name: str(now[name]) for name in STATES}
         yield InfoMetricFamily("offboard_state", "State of the present flight.", states)

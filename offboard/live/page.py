@@ -15,7 +15,7 @@ VALUES = {
     "time": "time",
     "mode": "mode",
     "authority": "authority",
-    "ladder": "ladder",
+    "failsafe": "failsafe",
     "position error": "error",
     "link age": "age",
     "link delay": "delay",

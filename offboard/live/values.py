@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict
 from typing import Any
 
 from offboard.documents.plain import plain
@@ -14,7 +13,7 @@ DIGITS = 9  # of a float
 
 def as_dict(snapshot: Snapshot) -> dict[str, Any]:
     """The fields of a snapshot; what is not known (NaN) is None."""
-    values: dict[str, Any] = plain(asdict(snapshot), DIGITS)
+    values: dict[str, Any] = plain(vars(snapshot), DIGITS)
     return values
 
 

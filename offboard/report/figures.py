@@ -144,7 +144,7 @@ def _timeline(drawn: Sequence[Lane]) -> Figure | None:
         if lane.label:  # of several flights only what differs most
             shown = (
                 [b for b in shown[0] if b.row == "phase"],
-                [m for m in shown[1] if m.row == "ladder"],
+                [m for m in shown[1] if m.row == "failsafe"],
             )
         own = dict.fromkeys(each.row for part in shown for each in part)
         rows += [prefix + row for row in own]
@@ -186,15 +186,15 @@ def _add_bands(figure: go.Figure, row: str, bands: Sequence[timeline.Band], zero
 def _add_marks(figure: go.Figure, row: str, marks: Sequence[timeline.Mark], zero_s: float) -> None:
     if not marks:
         return
-    ladder = row.endswith("ladder")
+    failsafe = row.endswith("failsafe")
     figure.add_trace(
         go.Scatter(
             cliponaxis=False, mode="markers", x=[round(mark.time_s - zero_s, 3) for mark in marks],
             y=[row] * len(marks), hoverinfo="text",
             hovertext=[html.escape(f"{mark.time_s:.2f} s: {mark.text}") for mark in marks],
             marker={
-                "size": 11 if ladder else 8, "color": RED if ladder else PURPLE,
-                "symbol": "triangle-down" if ladder else "circle-open", "line": {"width": 2},
+                "size": 11 if failsafe else 8, "color": RED if failsafe else PURPLE,
+                "symbol": "triangle-down" if failsafe else "circle-open", "line": {"width": 2},
             },
         )
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Bands and marks of a flight: phases, modes, authority, steps of the ladder, texts."""
+"""Bands and marks of a flight: phases, modes, authority, steps of the failsafe, texts."""
 
 from __future__ import annotations
 
@@ -50,10 +50,10 @@ def bands(flight: Flight) -> list[Band]:
 
 
 def marks(flight: Flight) -> list[Mark]:
-    """Steps of the ladder, and texts of both sides."""
+    """Steps of the failsafe, and texts of both sides."""
     flown = flight.history
     found = [
-        Mark("ladder", event.time_s, event.what)
+        Mark("failsafe", event.time_s, event.what)
         for before, event in pairwise(flown.phases)
         if event.phase in _STEPS and (before.phase, event.phase) not in _REGULAR
     ]
@@ -62,7 +62,7 @@ def marks(flight: Flight) -> list[Mark]:
         why = ", ".join(
             flag.name.lower().replace("_", " ") for flag in Refusal(int(refused[row])) if flag.name
         )
-        found.append(Mark("ladder", float(flown.record_time_s[row]), f"setpoint not sent: {why}"))
+        found.append(Mark("failsafe", float(flown.record_time_s[row]), f"setpoint not sent: {why}"))
     texts = (*flown.announcements, *flown.vehicle_messages)
     found += [Mark("texts", event.time_s, f"{event.who}: {event.what}") for event in texts]
     return [mark for mark in found if math.isfinite(mark.time_s)]

@@ -9,7 +9,6 @@ vehicle and link stays. No I/O: a log is begun and ended at `Record`, configurat
 from __future__ import annotations
 
 from collections.abc import Callable, Hashable, Sequence
-from dataclasses import replace
 from typing import Protocol
 
 from offboard.flight.flight import STOPPED, Flight, Outcome, Output
@@ -146,7 +145,7 @@ class Flights:
         return self._current.outcome
 
     def snapshot(self) -> Snapshot:
-        return replace(self._current.snapshot(), flights=self.engagements)
+        return self._current.snapshot(self.engagements)
 
     def has_ended(self) -> bool:
         """Whether the service was stopped, and no flight is left."""

@@ -11,7 +11,6 @@ import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import replace
 from functools import partial
 from itertools import count
 from typing import Any
@@ -230,5 +229,6 @@ def test_the_terminal_has_its_lines_and_one_status_in_place(
 def test_a_status_leaves_out_what_is_not_known() -> None:
     now = hover().companion.snapshot()
     assert status(now).strip() == "0.00 s  connect  unknown"
-    later = replace(now, phase="track", position_error_m=12.3456, rung="hold", rung_reason="link")
-    assert status(later).strip() == "0.00 s  track  error 12.346 m  unknown  hold: link"
+    shown = {"phase": "track", "position_error_m": 12.3456}
+    vars(now).update(shown, failsafe="hold", failsafe_row="link")
+    assert status(now).strip() == "0.00 s  track  error 12.346 m  unknown  hold: link"

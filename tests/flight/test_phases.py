@@ -9,6 +9,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
+from flight_tables import IN_THE_AIR, README, asked, exits, with_tables
 from uneventful import NOW_S, TRACK, hear, heartbeat, lift, position, uneventful
 
 from offboard.flight import preflight, starting
@@ -21,12 +22,12 @@ from offboard.flight.phases import (
     ExitCode,
     Limits,
     Phase,
+    Request,
     ServiceOptions,
 )
-from offboard.flight.requests import Request
 from offboard.flight.rows import Transition
 from offboard.flight.state import FlightState
-from offboard.flight.transitions import IN_THE_AIR, SERVICE_ONLY, asked, exits, next_row, table
+from offboard.flight.transitions import SERVICE_ONLY, next_row, table
 from offboard.mavlink.dialects.base import Takeoff
 from offboard.mavlink.events import Attitude, CommandAck, Landed, OtherSender, VehicleFound
 
@@ -308,3 +309,9 @@ def test_no_way_out_of_the_air_leaves_the_vehicle_unasked(service: ServiceOption
             taken = next_row(flight)
             assert taken is not None
             assert taken.target in IN_THE_AIR
+
+
+def test_the_tables_of_the_readme_are_those_of_the_code() -> None:
+    text = README.read_text(encoding="utf-8")
+    assert text.count("\n| position error |") == text.count("\n| rebooted in flight |") == 1
+    assert text == with_tables(text)

@@ -36,7 +36,7 @@ def test_snapshots_agree_with_the_wire() -> None:
             math.dist(shown.position_ned_m, shown.reference_ned_m), abs=1e-9
         )
         assert (shown.mode, shown.armed, shown.authority) == ("OFFBOARD", True, "ours")
-        assert shown.rung == "fly"
+        assert shown.failsafe == "fly"
     assert [tracked[0][1].track_time_s, tracked[-1][1].track_time_s] == pytest.approx(
         [0.0, 3.0], abs=0.2
     )

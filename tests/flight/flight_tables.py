@@ -1,0 +1,87 @@
+"""The tables in offboard/flight/README.md: the failsafe, and all exits from the air.
+
+`python tests/flight/flight_tables.py` writes them.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from offboard.flight import flying
+from offboard.flight.failsafe import ROWS
+from offboard.flight.phases import ENDS, FLYING, Phase, ServiceOptions
+from offboard.flight.rows import Transition
+from offboard.flight.transitions import table
+
+README = Path(__file__).parents[2] / "offboard" / "flight" / "README.md"
+_ASKED = {
+    Phase.HAND_BACK: "hold",
+    Phase.HOLD: "hold, then land",
+    Phase.LAND: "land",
+    Phase.STAND_DOWN: "to disarm: it stands on the ground",
+}
+_DISARMED = (
+    flying.disarmed,
+    flying.rebooted_disarmed,
+    flying.disarmed_elsewhere,
+    flying.landed,
+)
+IN_THE_AIR = FLYING | {Phase.LAND}
+
+
+def asked(row: Transition, source: Phase) -> str:
+    """What is asked of the autopilot where `row` leaves the phase `source`, in the air; empty:
+    nothing, and without a reason."""
+    if row.target in _ASKED:
+        return _ASKED[row.target]
+    if row.cause == "pilot":
+        return "nothing: a pilot or a failsafe has it"
+    if row.condition in _DISARMED:
+        return "nothing: it is disarmed"
+    before = _ASKED.get(source)
+    return f"{before}, in this phase" if before else ""
+
+
+def exits(service: ServiceOptions | None) -> list[tuple[Transition, Phase]]:
+    """The rows that leave the air, or the phases that fly by setpoints for those that end it, with
+    each phase that they leave."""
+    leaving = ENDS | _ASKED.keys()
+    rows = [row for row in table(service) if row.target in leaving]
+    return [(row, phase) for row in rows for phase in row.phases if phase in IN_THE_AIR]
+
+
+def exits_markdown() -> str:
+    """The table of all exits from the air, for the README of `flight/`."""
+    lines = ["| condition | in the phases | then | asked of the autopilot |", "|---|---|---|---|"]
+    sources: dict[tuple[str, str, str], set[Phase]] = {}
+    for row, phase in (*exits(None), *exits(ServiceOptions(then="land"))):
+        condition = row.condition.__name__.replace("_", " ")
+        sources.setdefault((condition, row.target.value, asked(row, phase)), set()).add(phase)
+    for (condition, target, request), phases in sources.items():
+        names = ", ".join(phase.value for phase in Phase if phase in phases)
+        within = "all that fly" if phases >= FLYING else names
+        lines.append(f"| {condition} | {within} | {target} | {request} |")
+    return "\n".join(lines)
+
+
+def failsafe_markdown() -> str:
+    """The table for the README of `flight/`."""
+    lines = ["| row | what is measured | limit | held for | then |", "|---|---|---|---|---|"]
+    for row in ROWS:
+        then = row.action.name.lower()
+        lines.append(f"| {row.name} | {row.measured} | {row.limit} | {row.held_s:g} s | {then} |")
+    return "\n".join(lines)
+
+
+def with_tables(text: str) -> str:
+    """The same page with the tables of the code between their markers."""
+    for name, rows in (("failsafe", failsafe_markdown()), ("exits", exits_markdown())):
+        begin, end = f"<!-- {name}:begin -->\n", f"<!-- {name}:end -->"
+        before, _, rest = text.partition(begin)
+        _, _, after = rest.partition(end)
+        text = f"{before}{begin}{rows}\n{end}{after}"
+    return text
+
+
+if __name__ == "__main__":
+    README.write_text(with_tables(README.read_text(encoding="utf-8")), encoding="utf-8")
