@@ -122,4 +122,4 @@ def test_a_pool_that_was_lost_is_replaced() -> None:
 def test_leaving_it_ends_what_still_flies() -> None:
     with SimulatorProcess() as simulator, flying(simulator):
         (vehicle,) = vehicles(simulator)
-    assert not Path(f"/proc/{vehicle}/exe").exists()
+    assert gone(vehicle)
