@@ -16,7 +16,7 @@ from offboard.flight.phases import Limits
 from offboard.flight.vehicle_state import VehicleState
 from offboard.identification.uncertainty import Estimate
 from offboard.mavlink import senders
-from offboard.mavlink.dialects.base import Dialect, WatchedParameter
+from offboard.mavlink.dialects.base import Dialect, Takeoff, WatchedParameter
 from offboard.mavlink.outgoing import ParamRead
 
 TELEMETRY = ("ATTITUDE_QUATERNION", "LOCAL_POSITION_NED")
@@ -221,16 +221,26 @@ def _prearm(ground: Ground) -> str:
         return ""
     if vehicle.health is None:
         return "SYS_STATUS does not arrive: it is unknown whether the vehicle can arm"
+    if _needs_setpoints(ground):
+        said = vehicle.explanation("") if vehicle.texts else ""
+        return f"its pre-arm checks pass in {vehicle.mode} only while setpoints arrive{said}"
     unsaid = f"{vehicle.unhealthy()} ({dialect.unsaid})"
     told = vehicle.explanation(unsaid) if vehicle.texts else unsaid
     return f"its pre-arm checks do not pass in {vehicle.mode}{told}"
 
 
-def _leave_mode(ground: Ground) -> str:
+def _needs_setpoints(ground: Ground) -> bool:
+    """It is in the mode of setpoints, in which PX4 does not arm without them."""
     dialect = ground.dialect
-    if dialect is None or ground.vehicle.mode != dialect.engage_mode:
+    if dialect is None or dialect.takeoff is not Takeoff.SETPOINT:
+        return False
+    return ground.vehicle.mode == dialect.engage_mode
+
+
+def _leave_mode(ground: Ground) -> str:
+    if ground.dialect is None or not _needs_setpoints(ground):
         return ""
-    return f"it may only miss setpoints in {dialect.engage_mode}: select {dialect.hold_mode}"
+    return f"select {ground.dialect.hold_mode}, where they can pass"
 
 
 def _rejected(ground: Ground) -> str:

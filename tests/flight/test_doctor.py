@@ -158,6 +158,17 @@ def test_arducopter_says_itself_why_it_cannot_arm() -> None:
     assert rows["prearm"].level is WAIT
 
 
+def test_px4_in_offboard_without_setpoints() -> None:
+    """It is not blamed on the radio, which nobody needs, and passes in the mode that is named."""
+    patient = bench()
+    patient.instance.autopilot.commander.switch("OFFBOARD")
+    (finding,) = patient.consult("prearm")["prearm"].findings
+    assert finding.found == "its pre-arm checks pass in OFFBOARD only while setpoints arrive"
+    assert finding.hint == "select AUTO.LOITER, where they can pass"
+    patient.instance.autopilot.commander.switch("AUTO.LOITER")
+    assert said(patient.consult("prearm")) == {}
+
+
 def test_empty_battery() -> None:
     assert bench(charge=0.05).consult("battery")["battery"].level is BLOCKS
     assert bench(charge=0.2).consult("battery")["battery"].level is WARN
