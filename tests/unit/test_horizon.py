@@ -67,6 +67,15 @@ def test_roll_outs_near_a_hover_cost_what_the_quadratic_says() -> None:
         assert costs == pytest.approx(problem(tried), rel=1e-3)
 
 
+def test_a_plan_whose_cost_is_not_finite_never_wins() -> None:
+    _, _, evaluate = prepared(horizon(), situations(1, 0.3)[0])
+    tried = np.zeros((STEPS, 3, 2))
+    tried[0, :, 0] = np.nan
+    costs = evaluate.of_inputs(tried)
+    assert int(np.argmin(costs)) == 1
+    assert costs[0] == math.inf
+
+
 def test_the_quadratic_without_bounds_leaves_the_cost_to_go() -> None:
     """N optimal inputs and P behind them cost x'Px, whatever N; the first is -K x."""
     law = horizon()

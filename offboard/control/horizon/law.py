@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
+from operator import attrgetter
 from typing import Literal
 
 import numpy as np
@@ -35,6 +36,7 @@ VERTICAL_REACH_MPS2 = 3.0  # of the knots of the vertical thrust
 PLANNED_MARGIN_M = 0.05  # beyond the clearance: for tracking errors, and because it is a soft limit
 RIVALS = 2  # plans of other origin that are searched about too
 MET_M = 0.3  # a plan that stays further than this outside every clearance needs no search
+COST = attrgetter("cost")  # the order of plans: infinite where a roll-out is not finite
 
 
 class HorizonSettings(TrackingSettings):
@@ -108,7 +110,7 @@ class HorizonLaw(TrackingLaw):
         task, exact = self._prepare(situation)
         own, others = self._own_plan(situation.time_s), self._other_plans(exact)
         seed_cost = _lowest_cost([own, *others])
-        rivals = sorted((plan for plan in others if plan.cost < own.cost), key=_cost_of)
+        rivals = sorted((plan for plan in others if plan.cost < own.cost), key=COST)
         found = self._polished([own, *rivals], situation.remaining_s)
         if found is None:
             found = self._searched([own, *rivals[:RIVALS]], situation.remaining_s)
@@ -152,7 +154,7 @@ class HorizonLaw(TrackingLaw):
             if 0 <= gone < steps:
                 inputs[: steps - gone] = before.inputs[gone:]
                 states[: steps - gone + 1] = before.states[gone:]
-                plan = min(plan, self.evaluate.follow(inputs, states), key=_cost_of)
+                plan = min(plan, self.evaluate.follow(inputs, states), key=COST)
         return plan
 
     def _other_plans(self, exact: Array) -> list[Plan]:
@@ -170,7 +172,7 @@ class HorizonLaw(TrackingLaw):
         the convex problem that remains is solved."""
         if any(self.evaluate.is_near(plan, MET_M) for plan in seeds):
             return None
-        best, ended = polish(self.evaluate, min(seeds, key=_cost_of), remaining_s)
+        best, ended = polish(self.evaluate, min(seeds, key=COST), remaining_s)
         return Found(best, math.nan, 0, False) if ended is Ended.CONVERGED else None
 
     def _searched(self, bases: list[Plan], remaining_s: Remaining) -> Found:
@@ -185,7 +187,7 @@ class HorizonLaw(TrackingLaw):
             better, ended = polish(evaluate, found.plan, remaining_s)
             late = found.cut_short or ended is Ended.LATE
             answers.append(replace(found, plan=better, cut_short=late))
-        return min(answers, key=lambda found: found.plan.cost)
+        return min(answers, key=attrgetter("plan.cost"))
 
 
 def _lowest_cost(plans: Sequence[Plan]) -> float:
@@ -194,8 +196,3 @@ def _lowest_cost(plans: Sequence[Plan]) -> float:
     if not math.isfinite(lowest):
         raise DecisionError("no plan over the horizon has a finite cost")
     return lowest
-
-
-def _cost_of(plan: Plan) -> float:
-    """The cost, infinite where it is not finite: the order of plans."""
-    return plan.cost if math.isfinite(plan.cost) else math.inf

@@ -103,7 +103,7 @@ def _add_terminal_cost(plant: Any, last: Array, costs: Array) -> None:
         for i in range(3):
             for j in range(3):
                 cost += s[i, j] * last[Z + i, n] * last[Z + j, n]
-        costs[n] = cost
+        costs[n] = cost if math.isfinite(cost) else math.inf  # a NaN would win an argmin
 
 
 @kernel

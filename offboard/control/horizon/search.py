@@ -187,7 +187,7 @@ def swarm(
     for iteration in range(settings.iterations):
         knots = particles.ask().T.reshape(shape)
         costs = evaluate.of_knots(base, knots)
-        first = int(np.argmin(np.where(np.isfinite(costs), costs, np.inf)))
+        first = int(np.argmin(costs))
         if costs[first] < best.cost:
             best = evaluate.plan(settings.particles, first)
         particles.tell(costs)
