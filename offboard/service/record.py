@@ -267,9 +267,13 @@ class Recorder:
             _remove([directory / UNSCORED])
             return
         size = -1
-        while size != (size := (directory / "flight.tlog").stat().st_size):
-            if self._closing.wait(self._settled_s):
-                return
+        try:
+            while size != (size := (directory / "flight.tlog").stat().st_size):
+                if self._closing.wait(self._settled_s):
+                    return
+        except OSError:  # killed before it was begun, or removed: there is nothing to score
+            _remove([directory / UNSCORED])
+            return
         self._score_one(directory)
 
     def _score_one(self, directory: Path) -> None:

@@ -118,6 +118,16 @@ def test_what_a_killed_service_has_not_done(tmp_path: Path, age_s: int, left: st
     assert not (cut / "engaged").exists()
 
 
+def test_a_flight_whose_log_is_gone_is_not_scored_at_every_start(tmp_path: Path) -> None:
+    (tmp_path / "cut").mkdir()
+    (tmp_path / "cut" / "unscored").touch()
+    scored: list[Path] = []
+    recorder = Recorder(tmp_path, score=lambda directory, closing: scored.append(directory))
+    recorder.score_earlier()
+    recorder.close()
+    assert (scored, list((tmp_path / "cut").iterdir())) == ([], [])
+
+
 @pytest.mark.parametrize("engaged", [True, False])
 def test_a_vehicle_is_left_engaged_until_it_was_handed_back(tmp_path: Path, engaged: bool) -> None:
     recorder = Recorder(tmp_path, score=lambda *_: None)
