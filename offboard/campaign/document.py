@@ -24,7 +24,6 @@ from offboard.documents.errors import UserError
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import parse
 
-FOLDER = "campaigns"
 CASES_MOST = 1_000_000
 ALL = "all"
 _WORST = re.compile(r"worst ([1-9][0-9]{0,3})")
@@ -138,5 +137,6 @@ class CampaignFile(Parameters):
 
 def read_campaign(name: str) -> tuple[CampaignFile, str]:
     """A shipped campaign or a file, and its path for errors. Raises DocumentError."""
-    path = shipped.locate(name, FOLDER, "campaign") if "." not in name else Path(name)
+    folder = shipped.FOLDERS["campaign"]
+    path = shipped.locate(name, folder, "campaign") if "." not in name else Path(name)
     return parse(shipped.read_text(path), CampaignFile, str(path), "campaign"), str(path)

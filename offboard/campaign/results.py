@@ -18,11 +18,12 @@ from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
 
-from offboard.campaign.document import FOLDER
 from offboard.documents import shipped
 from offboard.documents.errors import UserError
 from offboard.run.in_memory import registered
 
+# of plans, whose flights are hashed case by case
+PLANS = {shipped.FOLDERS["campaign"], shipped.FOLDERS["tuning"]}
 PACKAGES = ("numpy", "scipy", "numba", "pymavlink", "daqp", "control")
 
 
@@ -113,7 +114,7 @@ def code_hash() -> str:
         digest.update(f" {package} {version(package)}".encode())
     for folder, pattern in _sources():
         for path in sorted(folder.rglob(pattern)):
-            if FOLDER not in path.relative_to(folder).parts:  # they are hashed case by case
+            if PLANS.isdisjoint(path.relative_to(folder).parts):
                 digest.update(str(path.relative_to(folder)).encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:12]
 

@@ -28,13 +28,13 @@ from offboard.campaign.results import Record
 from offboard.campaign.run import check
 from offboard.campaign.search import Fly, Study
 from offboard.campaign.table import CONFIDENCE, FIGURE_COLUMNS
+from offboard.documents import shipped
 from offboard.documents.errors import DocumentError, naming
 from offboard.documents.parameters import Parameters
 from offboard.documents.reading import override, parse, read
 from offboard.documents.shipped import locate, read_text
 from offboard.run.configuration import FOLDERS, read_part
 
-FOLDER = "tunings"
 RESAMPLES = 9999
 BOOTSTRAP_SEED = 1
 
@@ -127,7 +127,7 @@ class Tuned:
 
 def read_tune(name: str) -> tuple[TuneFile, str]:
     """A shipped tuning or a file, and its path for errors. Raises DocumentError."""
-    path = locate(name, FOLDER, "tuning") if "." not in name else Path(name)
+    path = locate(name, shipped.FOLDERS["tuning"], "tuning") if "." not in name else Path(name)
     file = parse(read_text(path), TuneFile, str(path), "tuning")
     for key in file.ranges:
         if key.startswith((SCENARIO, "vehicle.")):
