@@ -97,7 +97,7 @@ class Observation:
     """Everything that the checks know.
 
     `vehicle` has the newest telemetry; its `found` is None if no autopilot was heard. `config` is
-    the flight that is planned; `config_problem` says why it cannot be flown by any vehicle.
+    the planned flight; `config_problem` says why its reference cannot be flown by its vehicle.
     """
 
     connection: str = ""

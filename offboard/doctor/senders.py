@@ -11,6 +11,7 @@ from collections.abc import Hashable
 from pymavlink.dialects.v20.all import mavlink_map
 
 from offboard.doctor.observation import Sender
+from offboard.documents.arguments import join_address
 from offboard.mavlink.counters import Counters
 from offboard.mavlink.decode import decode_identity
 from offboard.mavlink.framing import HEARTBEAT, Frame, FrameSplitter
@@ -73,4 +74,4 @@ class Senders:
 
 
 def _name(place: Hashable) -> str:
-    return ":".join(map(str, place[:2])) if isinstance(place, tuple) else str(place)
+    return join_address(*place[:2]) if isinstance(place, tuple) else str(place)

@@ -111,10 +111,11 @@ def test_second_vehicle_on_the_link() -> None:
 
 
 def test_two_vehicles_with_the_same_ids() -> None:
-    patient = bench(before=from_others(AUTOPILOT_HEARTBEAT, 1, 1, 1.0))
+    place = ("::1", 14999, 0, 0)
+    patient = bench(before=from_others(AUTOPILOT_HEARTBEAT, 1, 1, 1.0, place))
     row = patient.consult("senders")["senders"]
     assert row.level is WARN
-    assert "two programs send as vehicle 1/1: 127.0.0.1:14580, 127.0.0.1:14999" in (
+    assert "two programs send as vehicle 1/1: 127.0.0.1:14580, [::1]:14999" in (
         row.findings[0].found
     )
     assert mended(patient, before=quiet)
