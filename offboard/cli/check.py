@@ -9,6 +9,8 @@ import typer
 
 from offboard.cli.shared import CommandError, say
 
+EXIT_CODES = "Exit codes: 0 all files are valid; 2 one is not, or usage error."
+
 
 def check(
     files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="Configuration files.")],

@@ -54,19 +54,19 @@ def offboard(
     """Fly a trajectory over MAVLink with a particle-swarm receding-horizon law, and score it."""
 
 
-app.command(cls=Command, epilog=f"{NAMES}\n\n{EXIT_CODES}")(fly.fly)
+app.command(cls=Command, epilog=f"{NAMES}\n\n{fly.EXIT_CODES}")(fly.fly)
 app.command(cls=Command, epilog=f"{shipped.overview(*PARTS)}\n\n{daemon.EXIT_CODES}")(daemon.daemon)
-app.command(cls=Command, epilog=doctor.DOCTOR_CODES)(doctor.doctor)
-app.command(cls=Command, epilog=EXIT_CODES)(score.score)
+app.command(cls=Command, epilog=doctor.EXIT_CODES)(doctor.doctor)
+app.command(cls=Command, epilog=score.EXIT_CODES)(score.score)
 app.command(cls=Command, epilog=EXIT_CODES)(report.report)
-app.command(cls=Command, epilog=EXIT_CODES)(check.check)
-app.command(cls=Command, epilog=EXIT_CODES)(identify.identify)
+app.command(cls=Command, epilog=check.EXIT_CODES)(check.check)
+app.command(cls=Command, epilog=identify.EXIT_CODES)(identify.identify)
 app.command(cls=Command, epilog=f"{NAMES}\n\n{compare.EXIT_CODES}")(compare.compare)
 app.command(cls=Command, epilog=f"{shipped.overview('campaign')}\n\n{campaign.EXIT_CODES}")(
     campaign.campaign
 )
 app.command(cls=Command, epilog=f"{shipped.overview('tuning')}\n\n{tune.EXIT_CODES}")(tune.tune)
-app.command(cls=Command, epilog=EXIT_CODES)(paper.paper)
+app.command(cls=Command, epilog=paper.EXIT_CODES)(paper.paper)
 app.command(cls=Command, epilog=replay.EXIT_CODES)(replay.replay)
 app.command(cls=Command, epilog=EXIT_CODES)(export.export)
 app.command(cls=Command, epilog=EXIT_CODES)(key.key)

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from offboard.doctor.table import Row
 
 REFUSED = 3
-DOCTOR_CODES = (
+EXIT_CODES = (
     "Exit codes: 0 nothing blocks a flight; 2 usage or configuration error; 3 something blocks."
 )
 

@@ -39,6 +39,13 @@ if TYPE_CHECKING:
 INTERRUPTED = "interrupted before anything was sent"
 LABEL_WIDTH = 15
 
+EXIT_CODES = (
+    "Exit codes: 0 flown and all requirements met; 1 a requirement missed; 2 usage or "
+    "configuration error, nothing sent; 3 not flown: no vehicle or connection, refused, or stopped "
+    "on the ground; 4 aborted in flight, or left armed; 130 interrupted before anything was sent; "
+    "141 nobody reads the output."
+)
+
 
 @with_flight_options
 def fly(

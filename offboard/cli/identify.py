@@ -25,6 +25,11 @@ from offboard.cli.shared import (
     write_new,
 )
 
+EXIT_CODES = (
+    "Exit codes: 0 identified; 1 nothing could be identified; 2 usage or configuration error, or "
+    "the log cannot be read. If the flight with --connect or --sitl fails: those of `offboard fly`."
+)
+
 
 def identify(
     flight: Annotated[Path | None, FLIGHT] = None,

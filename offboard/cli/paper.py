@@ -8,6 +8,8 @@ import typer
 
 from offboard.cli.shared import FLIGHTS, CommandError, Directory, err, option, say
 
+EXIT_CODES = "Exit codes: 0 all written; 1 interrupted, some are missing; 2 usage error."
+
 
 def paper(
     out_directory: Directory = None,

@@ -15,6 +15,11 @@ if TYPE_CHECKING:
     from offboard.analysis.requirement import Requirement
     from offboard.analysis.score import Score
 
+EXIT_CODES = (
+    "Exit codes: 0 scored and all requirements met; 1 a requirement missed; 2 usage error, or the "
+    "log cannot be read."
+)
+
 
 def score(
     flight: Annotated[Path, FLIGHT],

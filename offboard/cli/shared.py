@@ -41,12 +41,7 @@ err = Console(stderr=True, highlight=False)
 
 DEFAULT_CONNECTION = "udpin:127.0.0.1:14540"
 FLIGHTS = Path("flights")  # parent of the flight directories that have no --out
-EXIT_CODES = (
-    "Exit codes: 0 flown and all requirements met; 1 a requirement missed; 2 usage or "
-    "configuration error, nothing sent; 3 not flown: no vehicle or connection, refused, or stopped "
-    "on the ground; 4 aborted in flight, or left armed; 130 interrupted before anything was sent; "
-    "141 nobody reads the output."
-)
+EXIT_CODES = "Exit codes: 0 done; 2 usage error, or a file that cannot be read or written."
 
 
 def option(metavar: str, text: str, *names: str, **more: Any) -> Any:

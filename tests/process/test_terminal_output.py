@@ -6,6 +6,7 @@ import io
 import json
 import os
 import pty
+import re
 import subprocess
 import sys
 import time
@@ -29,6 +30,10 @@ CONFIG = Path(__file__).parents[2] / "config"
 RECORDING = Path(__file__).parents[1] / "wire" / "recordings" / "px4-1.16.1-offboard.tlog"
 FOLDERS = ("references", "controllers", "vehicles", "scenarios", "campaigns", "tunings", "")
 COMMANDS = tuple(typer.main.get_command(offboard).commands)  # type: ignore[attr-defined]
+CODES = {"fly": "0 1 2 3 4 130 141", "daemon": "0 2 3 4", "doctor": "0 2 3", "list": "",
+         **dict.fromkeys(("check", "report", "export", "key"), "0 2"),
+         **dict.fromkeys(("score", "identify", "paper", "replay"), "0 1 2"),
+         **dict.fromkeys(("campaign", "compare", "tune"), "0 1 2 4")}  # fmt: skip
 HELP = [(offboard, ()), *((offboard, (command,)) for command in COMMANDS), (simulator, ())]
 
 
@@ -44,6 +49,13 @@ def test_help_fits(columns: int) -> None:
         assert max(map(len, answer.output.splitlines())) <= columns
         cut_off = [line for line in answer.output.splitlines()[1:] if line.endswith("...")]
         assert columns < 80 or not cut_off
+
+
+def test_help_has_the_exit_codes_of_its_command() -> None:
+    for command in COMMANDS:
+        text = CliRunner().invoke(offboard, [command, "--help"], terminal_width=80).output
+        codes = re.findall(r"(?:codes:|;)\s+(\d+)\s", text.partition("Exit")[2])
+        assert " ".join(codes) == CODES[command], command
 
 
 @pytest.mark.parametrize(
