@@ -150,7 +150,7 @@ def prepare(tell: Callable[[str], None] = lambda sentence: None) -> None:
     """Load the entries of all imported modules. `tell` is called with a sentence for the user
     before they are compiled."""
     if not all(each.is_compiled for each in defined):
-        tell("first run on this machine: compiling, about 10 s")
+        tell("first flight with this code: compiling it to machine code once, about 10 s")
     for each in defined:
         if each.machine_code is None:
             each.load()

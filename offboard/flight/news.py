@@ -23,8 +23,8 @@ AGAIN_S = 10.0  # the same reason, in other figures too
 
 
 class Waiting:
-    """Says why the flight does not begin: a new reason at most once a second, the same one every
-    ten. A service that hears no vehicle says so once."""
+    """Says why the flight does not begin: a new reason at most once a second. One that a found
+    vehicle has is repeated every ten, with its figures; that none is heard is said once."""
 
     def __init__(self) -> None:
         self._kind = ""  # of the newest reason: without its figures
@@ -39,8 +39,8 @@ class Waiting:
             return ""
         reason = _unheard(session) if state.phase is Phase.CONNECT else _unready(state)
         kind = re.sub(r"[0-9]+", "", reason)
-        alone = state.service is not None and state.phase is Phase.CONNECT
-        if not reason or (kind == self._kind and (alone or now_s - self._said_s < AGAIN_S)):
+        again = state.phase is Phase.HEALTH and now_s - self._said_s >= AGAIN_S
+        if not reason or (kind == self._kind and not again):
             return ""
         self._kind, self._said_s = kind, now_s
         return f"waiting: {reason}"

@@ -74,7 +74,7 @@ class Terminal:
 
     def show(self, companion: Announcing) -> None:
         for sentence in self._news.of(companion):
-            self._writer.put(f"{companion.state.time_s:8.2f} s  {sentence}")
+            self._writer.put(f"{_stamp(companion.state.time_s)}  {sentence}")
         now_s = clock.monotonic_s()
         if self._live and now_s >= self._due_s and not self._waits:
             self._due_s, self._waits = now_s + STATUS_S, True
@@ -113,7 +113,7 @@ def _status_line(console: Console) -> Live:
 
 def status(now: Snapshot) -> str:
     """Time, phase, error, link age, mode and failsafe in one line, as far as they are known."""
-    parts = [f"{now.time_s:8.2f} s  {now.phase}"]
+    parts = [f"{_stamp(now.time_s)}  {now.phase}"]
     if math.isfinite(now.position_error_m):
         parts.append(f"error {now.position_error_m:.3f} m")
     if math.isfinite(now.telemetry_age_s):
@@ -123,6 +123,11 @@ def status(now: Snapshot) -> str:
     if now.failsafe != "fly":
         parts.append(f"{now.failsafe}: {now.failsafe_row}")
     return "  ".join(parts)
+
+
+def _stamp(time_s: float) -> str:
+    """Vehicle time; 0 before the first telemetry."""
+    return f"{time_s:8.2f} s" if time_s else f"{'--':>8} s"
 
 
 class JsonLines:

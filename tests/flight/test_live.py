@@ -228,7 +228,7 @@ def test_the_terminal_has_its_lines_and_one_status_in_place(
 
 def test_a_status_leaves_out_what_is_not_known() -> None:
     now = hover().companion.snapshot()
-    assert status(now).strip() == "0.00 s  connect  unknown"
+    assert status(now).strip() == "-- s  connect  unknown"
     shown = {"phase": "track", "position_error_m": 12.3456}
     vars(now).update(shown, failsafe="hold", failsafe_row="link")
-    assert status(now).strip() == "0.00 s  track  error 12.346 m  unknown  hold: link"
+    assert status(now).strip() == "-- s  track  error 12.346 m  unknown  hold: link"

@@ -82,6 +82,11 @@ def says_what_it_waits_for(pair: Pair) -> Checks:
     yield len([each for each in pair.companion.announced if each.startswith("waiting:")]) <= 3
 
 
+def says_once_that_nothing_is_heard(pair: Pair) -> Checks:
+    yield from nothing_sent(pair)
+    yield pair.companion.announced[:-1] == ["waiting: nothing is heard on this link"]
+
+
 def disarmed_by_us(pair: Pair) -> Checks:
     yield from never_armed(pair)
     yield pair.commands(ARM_DISARM)[-1].param1 == 0.0
@@ -247,7 +252,7 @@ def already_armed_on_ground() -> Pair:
 
 
 def silent_vehicle() -> Pair:
-    return hover(dead=True, limits={"connect_s": 3.0})
+    return hover(dead=True, limits={"connect_s": 14.0})
 
 
 def stopped(phase: Phase, for_s: float, end: Phase, checks: Callable[[Pair], Checks]) -> Row:
@@ -303,7 +308,14 @@ ROWS = (
     stopped(Phase.TRACK, 1.0, Phase.DISARMED, landed),
     stopped(Phase.HOVER, 0.2, Phase.DISARMED, landed),
     # the vehicle refuses or is not there
-    Row("no vehicle", silent_vehicle, 3, "no vehicle heard in 3 s", Phase.FAILED, nothing_sent),
+    Row(
+        "no vehicle",
+        silent_vehicle,
+        3,
+        "no vehicle heard in 14 s",
+        Phase.FAILED,
+        says_once_that_nothing_is_heard,
+    ),
     Row(
         "arming refused",
         lambda: hover(firmware=refusing("arm", "Arming denied: no joystick")),
