@@ -203,9 +203,9 @@ class Learner:
             return
         self._link = added_s, changed_s
         change_ms = round(1e3 * added_s)
-        delay = f"has grown by {change_ms} ms" if change_ms > 0 else "is no longer than at take-off"
-        known = f"identified is {_in_ms(self.delay)}" if self.delay else "none is identified yet"
-        self.cause = f"the link's delay {delay}, {known}"
+        of_link = f"has grown by {change_ms} ms" if change_ms > 0 else "is that of take-off"
+        of_tilt = f"is {_in_ms(self.delay)}" if self.delay else "is not identified yet"
+        self.cause = f"the link's delay {of_link}, the tilt's {of_tilt}"
 
     def set_hover_thrust(self, hover_thrust: float) -> None:
         """The hover thrust that the vehicle showed before the take-over."""

@@ -15,7 +15,7 @@ ROOT = Path(__file__).parents[2]
 BUILD = (sys.executable, "-m", "hatchling", "build", "--target", "wheel", "--directory")
 TEXT = {".py", ".yaml", ".csv", ".md", ".j2", ".txt", ".typed", ".html", ".css", ".js", ""}
 HOVER = ("--reference", "hover", "--set", "reference.duration_s=2", "--set", "reference.height_m=1")
-COMPILING = "first run on this machine: compiling"
+COMPILING = "first flight with this code: compiling"
 
 
 @pytest.mark.slow

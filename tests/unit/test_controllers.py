@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 
 import numpy as np
 import pytest
@@ -12,7 +13,12 @@ from laws import LEVEL, law_named, state_of
 from offboard.control.base import Controller, Situation
 from offboard.control.catalogue import names, settings_of
 from offboard.documents import shipped
-from offboard.run.configuration import read_part
+from offboard.documents.reading import read
+from offboard.flight.online_identification import IdentifySettings
+from offboard.flight.phases import Limits
+from offboard.run.configuration import FlightConfig, read_part
+
+ENDS = ("minimum", "exclusiveMinimum", "maximum")  # of a JSON schema
 
 
 def test_every_law_has_a_shipped_file_and_every_file_a_law() -> None:
@@ -25,6 +31,18 @@ def test_shipped_file_states_the_defaults(law: str) -> None:
     settings = settings_of(law)
     given = settings.model_validate_json(json.dumps(read_part("controller", law)), strict=True)
     assert given == settings(law=law)
+
+
+def test_flight_yaml_states_every_setting_with_its_default_and_range() -> None:
+    text = shipped.read_text(shipped.directory() / "flight.yaml")
+    raw = read(text, "flight.yaml")
+    assert raw.keys() == FlightConfig.model_fields.keys()
+    for section, settings in (("limits", Limits()), ("identify", IdentifySettings())):
+        assert raw[section] == settings.model_dump()
+        for name, schema in settings.model_json_schema()["properties"].items():
+            ends = [f"{schema[key]:g}" for key in ENDS if key in schema]
+            (line,) = re.findall(rf"^  {name}: .*", text, re.MULTILINE)
+            assert " .. ".join(ends) in line
 
 
 @pytest.mark.parametrize("law", names())
