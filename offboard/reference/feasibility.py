@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import Reference
 from offboard.reference.flatness import flat_state
+from offboard.reference.track import Track
 
 Array = NDArray[np.float64]
 
@@ -67,7 +68,7 @@ def check(reference: Reference, vehicle: Vehicle) -> Envelope:
 
     The reference, relative to the take-off point, is sampled every 10 ms. Raises
     InfeasibleReference for a path that is too low or too far away, otherwise for the limit that is
-    exceeded first.
+    exceeded first; of a track it names the path's own time, as a table has it.
     """
     count = int(np.ceil(reference.duration_s / _STEP_S)) + 1
     times = np.linspace(0.0, reference.duration_s, count)
@@ -98,10 +99,13 @@ def _envelope(reference: Reference, vehicle: Vehicle, times: Array) -> list[floa
             broken.append((int(np.argmin(within)), demand))
     if broken:
         index, demand = min(broken, key=lambda item: (not item[1].of_path, item[0]))
+        worst_s, first_s = float(times[demand.worst]), float(times[index])
+        if isinstance(reference, Track):
+            worst_s, first_s = map(reference.path_time_s, (worst_s, first_s))
         raise InfeasibleReference(
             f"the reference asks for {demand.what} {demand.extreme:.3g} {demand.unit} at "
-            f"{times[demand.worst]:.2f} s, beyond the limit of {demand.limit:.3g} {demand.unit} "
-            f"(first at {times[index]:.2f} s)"
+            f"{worst_s:.2f} s, beyond the limit of {demand.limit:.3g} {demand.unit} "
+            f"(first at {first_s:.2f} s)"
         )
     return [demand.extreme for demand in demands]
 

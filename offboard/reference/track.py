@@ -83,6 +83,11 @@ class Track:
     def duration_s(self) -> float:
         return self.run_in_s + self.cruise_s + self.run_out_s
 
+    def path_time_s(self, time_s: float) -> float:
+        """The path's own time at `time_s`: of a table, the time in its rows, from the first."""
+        runs = self.run_in_s, self.cruise_s, self.run_out_s
+        return float(warp(np.array([time_s]), *runs)[0, 0])
+
     def sample(self, time_s: float | Array) -> FlatSample:
         """Flat outputs at `time_s`, a scalar or an array of any shape; at rest outside [0, end]."""
         time = np.asarray(time_s, dtype=np.float64)

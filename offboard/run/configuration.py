@@ -174,12 +174,17 @@ def check_file(path: Path, check_scenario: Callable[[Path], None]) -> str:
     if kind == "scenario":
         check_scenario(path)
         return kind
-    if kind in FOLDERS:
-        validate(raw, _model(kind, raw), str(path))
+    try:
+        if kind in FOLDERS:
+            validate(raw, _model(kind, raw), str(path))
         if kind == "reference":
             build_track(load("flight", choices={kind: name}))
-    else:
-        build_track(load(name))
+        elif kind == "configuration":
+            build_track(load(name))
+    except DocumentError as error:
+        if kind_of(raw):
+            raise
+        raise DocumentError(f"{error}\n{path} was taken for a {kind} file") from None
     return kind
 
 
