@@ -20,8 +20,8 @@ from offboard.analysis.truth import true_positions
 from offboard.flight import manifest
 from offboard.flight.record import (
     COMPONENT_ID,
+    IDENTIFIED_ID,
     IDENTIFIED_NAME,
-    LAYOUTS,
     RECORD_COMPONENT_ID,
     RECORD_NAME,
     records_of,
@@ -212,7 +212,7 @@ class _Collector:
     def _arrays(self, stream: Stream) -> tuple[Array, NDArray[np.void], Array]:
         """Times and records of the ticks; and what was identified."""
         stamps = stream.columns("time_usec array_id")
-        times, of_ticks = self.time_s(stamps[:, 0] / 1e3), np.isin(stamps[:, 1], list(LAYOUTS))
+        times, of_ticks = self.time_s(stamps[:, 0] / 1e3), stamps[:, 1] != IDENTIFIED_ID
         found: list[Array] = []
         records: list[NDArray[np.void]] = []
         for first in range(0, max(len(stream), 1), _BLOCK):

@@ -12,7 +12,7 @@ from offboard.flight.starting import ground_of
 from offboard.flight.state import FlightState
 from offboard.mavlink.session import Session
 
-PAUSED = "this computer paused for {most:.2f} s{times}: waiting for the vehicle's mode"
+PAUSED = "this computer paused for {most:.2f} s{times}: no setpoint before the mode is reported"
 DROPPED = (
     "{total:.0f} of our messages to the vehicle dropped: this computer was too busy, and they "
     "became too old"

@@ -1,8 +1,8 @@
 """The log's record of one control tick: state, command, cost and times, as floats.
 
 The fields of `TickRecord` are the layout of DEBUG_FLOAT_ARRAY.data (name "pso") in the .tlog; the
-analysis reads the log with the same class. The array_id says how many of the fields are in use:
-`LAYOUTS` has those of older logs, which lack the last fields.
+analysis reads the log with the same class. The array_id is the number of fields, so that the log
+of an older version, which lacks the last ones, stays readable.
 """
 
 from __future__ import annotations
@@ -27,8 +27,7 @@ RECORD_NAME = "pso"
 NAN = float("nan")
 CERTIFIED = len(fields(Certificate))
 Array = NDArray[np.float64]
-RECORD_ID = 4
-LAYOUTS = {1: 28, 3: 31, RECORD_ID: 32}  # array_id -> number of fields
+_COUNTS = {1: 28, 3: 31, 4: 32}  # number of fields by the array_id of logs before 0.1
 IDENTIFIED_NAME, IDENTIFIED_ID = "identified", 2  # of the other DEBUG_FLOAT_ARRAY in the log
 
 
@@ -80,15 +79,16 @@ class TickRecord:
 
 
 FIELDS = tuple(field.name for field in fields(TickRecord))
+RECORD_ID = len(FIELDS)
 
 
 def records_of(data: Array, array_ids: Array) -> NDArray[np.void]:
     """Records (N,) as a structured array with the fields of `TickRecord`, from DEBUG_FLOAT_ARRAY:
-    `data` (N, 58) and `array_ids` (N,), all in LAYOUTS. What an older log lacks has its default."""
+    `data` (N, 58) and `array_ids` (N,). What an older log lacks has its default."""
     values = data[:, : len(FIELDS)].copy()
-    for array_id, count in LAYOUTS.items():
-        older = array_ids == array_id
-        values[older, count:] = TickRecord(*(NAN,) * count).data()[count:]
+    for array_id in np.unique(array_ids).astype(int).tolist():
+        count = min(_COUNTS.get(array_id, array_id), len(FIELDS))
+        values[array_ids == array_id, count:] = TickRecord(*(NAN,) * count).data()[count:]
     records = np.empty(len(values), [(name, np.float64) for name in FIELDS])
     for column, name in enumerate(FIELDS):
         records[name] = values[:, column]
