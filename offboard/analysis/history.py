@@ -66,7 +66,7 @@ class History:
     position: t, north, east, down, v_north, v_east, v_down (LOCAL_POSITION_NED)
     attitude: t, w, x, y, z, p, q, r (ATTITUDE_QUATERNION)
     truth: t, north, east, down (HIL_STATE_QUATERNION or SIM_STATE; empty without)
-    reference: t, position 3, velocity 3, acceleration 3, course (POSITION_TARGET_LOCAL_NED)
+    reference: t, position 3, velocity 3, acceleration 3, heading (POSITION_TARGET_LOCAL_NED)
     setpoint: t, wall time s, w, x, y, z, thrust (SET_ATTITUDE_TARGET); NaN from the third on for a
         setpoint of the autopilot's own position loop (SET_POSITION_TARGET_LOCAL_NED)
     identified: t, then value and sd of each constant as in `identification.adoption.record_of`

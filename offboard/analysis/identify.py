@@ -19,7 +19,7 @@ from offboard.identification.trace import Trace, clean
 from offboard.identification.uncertainty import Estimate
 from offboard.identification.vehicle_fit import Identified, identify
 from offboard.mavlink.dialects.base import ThrustRule
-from offboard.model.frames import course_from_quaternion, thrust_direction_from_quaternion
+from offboard.model.frames import heading_from_quaternion, thrust_direction_from_quaternion
 from offboard.model.vehicle import AxisResponse, Vehicle
 
 Array = NDArray[np.float64]
@@ -49,10 +49,10 @@ def _trace(history: History) -> Trace:
         thrust = thrust / np.maximum(commanded[:, 2], 0.3)
     trace = clean(
         np.column_stack(
-            (setpoint[:, 0], commanded[:, :2], thrust, course_from_quaternion(setpoint[:, 2:6]))
+            (setpoint[:, 0], commanded[:, :2], thrust, heading_from_quaternion(setpoint[:, 2:6]))
         ),
         np.column_stack(
-            (attitude[:, 0], direction[:, :2], course_from_quaternion(attitude[:, 1:5]))
+            (attitude[:, 0], direction[:, :2], heading_from_quaternion(attitude[:, 1:5]))
         ),
         history.position,
     )

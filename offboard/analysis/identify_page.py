@@ -40,7 +40,7 @@ def page(flight: str, found: Identified, trace: Trace, prior: Vehicle) -> str:
         axes = ("thrust direction north", "thrust direction east")
         figures = [
             _response("Tilt", axes, tilt_signals(last), vehicle.tilt),
-            _response("Course", ("course, deg",), yaw_signals(last), vehicle.yaw, 180 / math.pi),
+            _response("Heading", ("heading, deg",), yaw_signals(last), vehicle.yaw, 180 / math.pi),
         ]
     if len(trace.commands) and len(last.position) > 2:
         figures.append(_motion(last, vehicle))

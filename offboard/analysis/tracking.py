@@ -17,7 +17,7 @@ from offboard.analysis.history import History
 from offboard.analysis.weighted import Weighted, shares, weighted
 from offboard.flight.phases import PHASE_CODES, Phase
 from offboard.model.frames import (
-    course_from_quaternion,
+    heading_from_quaternion,
     rotation_from_quaternion,
     thrust_direction_from_quaternion,
     wrap_pi,
@@ -71,8 +71,8 @@ def tracking_figures(flown: History, window: tuple[float, float]) -> dict[str, f
     commanded = thrust_direction_from_quaternion(setpoint[:, 2:6])
     steps = np.degrees(np.linalg.norm(np.diff(commanded, axis=0), axis=1))
     fitness = _fitness(flown, reference, window)
-    turn = course_from_quaternion(attitude[:, 1:5]) - reference.course(attitude[:, 0])
-    course = of(attitude, np.abs(np.degrees(wrap_pi(turn))))
+    turn = heading_from_quaternion(attitude[:, 1:5]) - reference.heading(attitude[:, 0])
+    heading = of(attitude, np.abs(np.degrees(wrap_pi(turn))))
     direction = thrust_direction_from_quaternion(attitude[:, 1:5])
     tilt = of(attitude, np.degrees(np.arccos(np.clip(direction[:, 2], -1, 1))))
     return {
@@ -85,8 +85,8 @@ def tracking_figures(flown: History, window: tuple[float, float]) -> dict[str, f
         "rmse_velocity_mps": velocity.rms,
         "p95_velocity_mps": velocity.p95,
         "max_velocity_mps": velocity.max,
-        "rmse_course_deg": course.rms,
-        "max_course_deg": course.max,
+        "rmse_heading_deg": heading.rms,
+        "max_heading_deg": heading.max,
         **fitness,
         "mu_e": sum(fitness.values()),
         "tracked_s": passed_s(flown, window)[0],
@@ -100,14 +100,14 @@ def tracking_figures(flown: History, window: tuple[float, float]) -> dict[str, f
 
 
 def _fitness(flown: History, reference: Reference, window: tuple[float, float]) -> dict[str, float]:
-    """Eqs. 31-32: velocities in the body frame, course in degrees."""
+    """Eqs. 31-32: velocities in the body frame, heading in degrees."""
     ticks = flown.record_time_s[_ticks(flown, window)]
     attitude = flown.attitude[_nearest(flown.attitude[:, 0], ticks), 1:5]
     body = rotation_from_quaternion(attitude).swapaxes(-1, -2)
     at_tick = _at(flown.position, ticks)
     slip = np.einsum("nij,nj->ni", body, reference.position(ticks, 1) - at_tick[:, 3:6])
     away = reference.position(ticks) - at_tick[:, 0:3]
-    turn = np.degrees(wrap_pi(reference.course(ticks) - course_from_quaternion(attitude)))
+    turn = np.degrees(wrap_pi(reference.heading(ticks) - heading_from_quaternion(attitude)))
     squares = (np.column_stack((slip, away, turn)) ** 2).sum(axis=0)
     return {name: float(value) for name, value in zip(_FITNESS, squares, strict=True)}
 
@@ -168,7 +168,7 @@ class Reference:
         newest = np.maximum.accumulate(rows[:, 0])
         rows = rows[np.concatenate(([True], rows[1:, 0] > newest[:-1]))]
         knots = np.stack((rows[:, 1:4], rows[:, 4:7], rows[:, 7:10]), axis=1)
-        self._times, self._course = rows[:, 0], np.unwrap(rows[:, 10])
+        self._times, self._heading = rows[:, 0], np.unwrap(rows[:, 10])
         self._curve = BPoly.from_derivatives(self._times, knots)
 
     def position(self, times: Array, derivative: int = 0) -> Array:
@@ -176,8 +176,8 @@ class Reference:
         values: Array = self._curve.derivative(derivative)(times)
         return values
 
-    def course(self, times: Array) -> Array:
-        return np.interp(times, self._times, self._course)
+    def heading(self, times: Array) -> Array:
+        return np.interp(times, self._times, self._heading)
 
 
 def each_once(rows: Array) -> Array:

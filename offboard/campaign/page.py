@@ -32,7 +32,7 @@ LINEAR = ("success", "margin")
 # of the table
 FIGURES = (
     ERROR, "max_position_m", "margin", "rmse_truth_m", "tilt_agitation_deg",
-    "rate_agitation_radps", "rmse_course_deg",
+    "rate_agitation_radps", "rmse_heading_deg",
 )  # fmt: skip
 CAPTION = (
     "Success: completed, with every requirement met; line: 95 % interval (Wilson). Boxes: "

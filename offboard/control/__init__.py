@@ -50,7 +50,7 @@ both into a package and register the settings class as an entry point:
             # acceleration = gravity - thrust * direction + disturbance
             push = self.gravity_ned_mps2 + state.disturbance_ned_mps2 - acceleration
             thrust = float(np.linalg.norm(push))
-            return Decision(Command(thrust, tuple(push / thrust), float(target.course_rad)))
+            return Decision(Command(thrust, tuple(push / thrust), float(target.heading_rad)))
 
         def reset(self) -> None:
             pass

@@ -37,7 +37,7 @@ class AutopilotLaw:
     def decide(self, situation: Situation) -> Decision:
         sample = situation.reference.sample(situation.time_s + self._ahead_s)
         vectors = (sample.position_ned_m, sample.velocity_ned_mps, sample.acceleration_ned_mps2)
-        if not (np.isfinite(vectors).all() and math.isfinite(float(sample.course_rad))):
+        if not (np.isfinite(vectors).all() and math.isfinite(float(sample.heading_rad))):
             raise DecisionError("the reference is not finite")
         position, velocity, acceleration = (
             (float(vector[0]), float(vector[1]), float(vector[2])) for vector in vectors
@@ -47,8 +47,8 @@ class AutopilotLaw:
                 position,
                 velocity,
                 acceleration,
-                wrap_pi(float(sample.course_rad)),
-                float(sample.course_rate_radps),
+                wrap_pi(float(sample.heading_rad)),
+                float(sample.heading_rate_radps),
             )
         )
 

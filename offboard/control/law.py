@@ -4,7 +4,7 @@
 
 or, where the bounds or a horizon couple the inputs, the u that minimises the same cost J.
 
-    u            [T, b_cx, b_cy, course]: thrust per unit of mass, north and east of the commanded
+    u            [T, b_cx, b_cy, heading]: thrust per unit of mass, north and east of the commanded
                  thrust direction (third body axis, NED), commanded heading
     x_predicted  the state at the time when this command will begin to act: the observer's, carried
                  there by replaying the commands already sent (`offboard.estimation`)
@@ -17,7 +17,7 @@ or, where the bounds or a horizon couple the inputs, the u that minimises the sa
     clip         thrust, tilt, and the feedback about u_ff (`Tracking._box`)
 
 In NED, acceleration = g e3 - T b - c v + d: written in b, the lateral axes [p, v, b, b'], the
-vertical [z, v_z, T b_z] and the course decouple, and no heading frame is needed.
+vertical [z, v_z, T b_z] and the heading decouple, and no heading frame is needed.
 
     J(u) = x'Qx + u'Ru + x(k+1)'P x(k+1) = 1/2 u'Hu + f'u + c,  lower <= u <= upper
 
@@ -61,8 +61,8 @@ from offboard.reference.flatness import flat_state
 
 Array = NDArray[np.float64]
 
-COURSE_BOX_RAD = 0.5  # about the feed-forward: the autopilot closes the yaw loop
-COURSE_CURVATURE = 1.0
+HEADING_BOX_RAD = 0.5  # about the feed-forward: the autopilot closes the yaw loop
+HEADING_CURVATURE = 1.0
 
 
 class TrackingSettings(ControllerSettings):
@@ -92,7 +92,7 @@ class Target:
     Lateral, each (2,), north and east, at the time of the predicted state: position_ne_m,
     velocity_ne_mps, thrust direction direction_ne and its rate direction_rate_ne_ps. Vertical, at
     the time when the thrust acts: position_down_m, velocity_down_mps and T b_z, thrust_down_mps2.
-    Feed-forward of tilt (2,), vertical thrust and course, each taken half a period after its own
+    Feed-forward of tilt (2,), vertical thrust and heading, each taken half a period after its own
     delay and led through its own response.
     """
 
@@ -105,7 +105,7 @@ class Target:
     thrust_down_mps2: float
     tilt_feedforward: Array
     thrust_down_feedforward_mps2: float
-    course_feedforward_rad: float
+    heading_feedforward_rad: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -129,7 +129,7 @@ class Task:
         inputs = np.empty(4)
         inputs[0] = (self.target.thrust_down_feedforward_mps2 + deviation[2]) / self.upright
         inputs[1:3] = self.target.tilt_feedforward + deviation[:2]
-        inputs[3] = self.target.course_feedforward_rad
+        inputs[3] = self.target.heading_feedforward_rad
         return inputs
 
 
@@ -194,8 +194,8 @@ class TrackingLaw:
         vehicle, period_s = self.vehicle, self.period_s
         half_s = 0.5 * period_s
         heave_s = heave_of(state).time_s
-        course_s = time_s + vehicle.yaw.delay_s + half_s
-        times = [state.time_s, state.time_s + half_s, heave_s, heave_s + half_s, course_s]
+        heading_s = time_s + vehicle.yaw.delay_s + half_s
+        times = [state.time_s, state.time_s + half_s, heave_s, heave_s + half_s, heading_s]
         sample = reference.sample(np.array(times))
         flat = flat_state(
             sample,
@@ -209,10 +209,10 @@ class TrackingLaw:
         thrust_slope = flat.thrust_rate_mps3[2] * b[2, 2] + flat.thrust_mps2[2] * b1[2, 2]
         thrust_down = flat.thrust_mps2[2] * b[2, 2] + self._thrust_ripple * thrust_slope
         led_thrust = flat.thrust_mps2[3] + vehicle.thrust_lag_s * flat.thrust_rate_mps3[3]
-        course = lead(
-            sample.course_rad[4],
-            sample.course_rate_radps[4],
-            sample.course_acceleration_radps2[4],
+        heading = lead(
+            sample.heading_rad[4],
+            sample.heading_rate_radps[4],
+            sample.heading_acceleration_radps2[4],
             vehicle.yaw,
         )
         return Target(
@@ -225,7 +225,7 @@ class TrackingLaw:
             thrust_down_mps2=float(thrust_down),
             tilt_feedforward=held_lead(b[1, :2], b1[1, :2], b2[1, :2], vehicle.tilt, period_s),
             thrust_down_feedforward_mps2=float(led_thrust * b[3, 2]),  # T lags, not T b_z
-            course_feedforward_rad=float(course),
+            heading_feedforward_rad=float(heading),
         )
 
     def _problem(
@@ -234,11 +234,11 @@ class TrackingLaw:
         nominal = np.empty(4)
         nominal[0] = target.thrust_down_feedforward_mps2 / upright
         nominal[1:3] = target.tilt_feedforward
-        nominal[3] = target.course_feedforward_rad
+        nominal[3] = target.heading_feedforward_rad
         curvature = np.empty(4)
         curvature[0] = self.vertical.curvature * upright**2
         curvature[1:3] = self.lateral.curvature
-        curvature[3] = COURSE_CURVATURE
+        curvature[3] = HEADING_CURVATURE
         slope = np.zeros(4)  # of J at the nominal input
         slope[0] = upright * (self.vertical.coupling @ vertical)
         slope[1:3] = self.lateral.coupling @ lateral
@@ -250,7 +250,7 @@ class TrackingLaw:
         return BoxQuadratic(np.diag(curvature), gradient, float(constant), lower, upper)
 
     def _box(self, nominal: Array) -> tuple[Array, Array]:
-        """Lower and upper (4,): thrust, |b_c| and |b_c - b_ff| per axis, course about its
+        """Lower and upper (4,): thrust, |b_c| and |b_c - b_ff| per axis, heading about its
         feed-forward. A feed-forward beyond the tilt limit counts as being at the limit."""
         settings, vehicle, limit = self.limits, self.vehicle, self.tilt_limit
         centre = np.clip(nominal[1:3], -limit, limit)
@@ -258,7 +258,7 @@ class TrackingLaw:
         lower[0], upper[0] = settings.thrust_floor * vehicle.gravity_mps2, vehicle.thrust_max_mps2
         lower[1:3] = np.maximum(centre - settings.feedback_limit, -limit)
         upper[1:3] = np.minimum(centre + settings.feedback_limit, limit)
-        lower[3], upper[3] = nominal[3] - COURSE_BOX_RAD, nominal[3] + COURSE_BOX_RAD
+        lower[3], upper[3] = nominal[3] - HEADING_BOX_RAD, nominal[3] + HEADING_BOX_RAD
         return lower, upper
 
 
@@ -292,9 +292,9 @@ def heave_of(state: PredictedState) -> PredictedHeave:
 
 def decision(inputs: Array, certificate: Certificate) -> Decision:
     """The decision for u (4,)."""
-    thrust, north, east, course = (float(value) for value in inputs)
+    thrust, north, east, heading = (float(value) for value in inputs)
     down = math.sqrt(1.0 - north * north - east * east)
-    return Decision(Command(thrust, (north, east, down), wrap_pi(course)), certificate)
+    return Decision(Command(thrust, (north, east, down), wrap_pi(heading)), certificate)
 
 
 def _finite(problem: BoxQuadratic) -> bool:

@@ -6,9 +6,9 @@
     reset     on the ground, after a long gap, and after a jump of the vehicle's own estimate
 
 The state x (indices in `propagation`, NED, SI) is position, velocity, thrust direction b and its
-rate, disturbance acceleration d, bias of the reported velocity, thrust, course and its rate. d
+rate, disturbance acceleration d, bias of the reported velocity, thrust, heading and its rate. d
 stands for wind and for errors of thrust and mass, so that it contains the hover thrust. Three
-filters share x, since their axes decouple: north and east (one covariance), down, course.
+filters share x, since their axes decouple: north and east (one covariance), down, heading.
 
 The velocity that an autopilot reports need not be the derivative of the position that it reports
 (PX4: wrong by 0.2 to 0.3 m/s for seconds), so velocity comes from the position and from the
@@ -47,9 +47,9 @@ from offboard.estimation.propagation import (
     BIAS,
     BIAS_TIME_CONSTANT_S,
     COMMANDS_KEPT,
-    COURSE,
-    COURSE_RATE,
     DISTURBANCE,
+    HEADING,
+    HEADING_RATE,
     LATER,
     MOTION,
     NOW,
@@ -67,7 +67,7 @@ from offboard.estimation.propagation import (
 from offboard.model.axes import acceleration, lateral_model, upright
 from offboard.model.command import Command
 from offboard.model.frames import (
-    course_from_quaternion,
+    heading_from_quaternion,
     thrust_direction_from_quaternion,
     wrap_pi,
 )
@@ -97,7 +97,7 @@ class Noise:
     disturbance_mps2: float = 0.15
     disturbance_limit_mps2: float = 1.0
     tilt_radps: float = 0.6
-    course_radps: float = 0.6
+    heading_radps: float = 0.6
     bias_mps: float = 0.08
     position_sd_m: float = 0.002
     velocity_sd_mps: float = 0.005
@@ -106,7 +106,7 @@ class Noise:
 
 # ---------------------------------------------------------------------- filters
 
-HEADING = 2  # after LATERAL and VERTICAL
+YAW = 2  # after LATERAL and VERTICAL
 # Their states: indices in x for each axis
 PLACES: tuple[list[tuple[int, ...]], ...] = (
     [
@@ -114,7 +114,7 @@ PLACES: tuple[list[tuple[int, ...]], ...] = (
         for i in (0, 1)
     ],
     [(POSITION + 2, VELOCITY + 2, DISTURBANCE + 2, BIAS + 2)],
-    [(COURSE, COURSE_RATE)],
+    [(HEADING, HEADING_RATE)],
 )
 LATERAL_DISTURBANCE, VERTICAL_DISTURBANCE = 4, 2
 # H: the states of which each measurement is the sum, by row
@@ -144,7 +144,7 @@ OBSERVER = np.dtype(
 
 def models(vehicle: Vehicle, noise: Noise) -> tuple[tuple[Array, Array], ...]:
     """Dynamics (n, n) of x' = A x, so that F = exp(A h), and noise densities (n,), Q per second, of
-    the lateral, vertical and course filters: linearised about hover, where the acceleration per
+    the lateral, vertical and heading filters: linearised about hover, where the acceleration per
     error of the thrust direction is g."""
     motion, drift, bias = noise.acceleration_mps, noise.disturbance_mps2, noise.bias_mps
     forgetting = -1.0 / BIAS_TIME_CONSTANT_S
@@ -161,24 +161,24 @@ def models(vehicle: Vehicle, noise: Noise) -> tuple[tuple[Array, Array], ...]:
     return (
         (lateral, np.array([0.0, motion, 0.0, noise.tilt_radps, drift, bias])),
         (vertical, np.array([0.0, motion, drift, bias])),
-        (heading, np.array([0.0, noise.course_radps])),
+        (heading, np.array([0.0, noise.heading_radps])),
     )
 
 
 @entry(OBSERVER, float, float, float, float)
 def update_by_attitude(
-    observers: Any, time_s: float, north: float, east: float, course: float
+    observers: Any, time_s: float, north: float, east: float, heading: float
 ) -> None:
     """Update by an attitude measured at `time_s`, not later than the state: thrust direction (north
-    and east components) and course (rad). `observers` is one OBSERVER (1,)."""
+    and east components) and heading (rad). `observers` is one OBSERVER (1,)."""
     observer = observers[0]
     state, late_s = observer.motion.states[NOW], observer.time_s - time_s
-    lateral, heading = observer.filters[LATERAL], observer.filters[HEADING]
+    lateral, yaw = observer.filters[LATERAL], observer.filters[YAW]
     lateral.innovation[0] = north - state[TILT] + late_s * state[TILT_RATE]
     lateral.innovation[1] = east - state[TILT + 1] + late_s * state[TILT_RATE + 1]
-    heading.innovation[0] = wrapped(course - state[COURSE] + late_s * state[COURSE_RATE])
+    yaw.innovation[0] = wrapped(heading - state[HEADING] + late_s * state[HEADING_RATE])
     update(state, lateral, AT_ATTITUDE, observer.attitude_variance)
-    update(state, heading, AT_ATTITUDE, observer.attitude_variance)
+    update(state, yaw, AT_ATTITUDE, observer.attitude_variance)
     bound_disturbance(state)
 
 
@@ -360,7 +360,7 @@ class Observer:
             sent -= 1
         if sent and time_s < history[sent - 1, SENT_AT]:
             time_s = history[sent - 1, SENT_AT]
-        history[sent] = time_s, north, east, command.thrust_mps2, command.course_rad
+        history[sent] = time_s, north, east, command.thrust_mps2, command.heading_rad
         self._motion["sent"] = self._sent = sent + 1
 
     def on_attitude(self, time_s: float, q: Quaternion, rates: Triple) -> None:
@@ -368,18 +368,18 @@ class Observer:
         if not self._is_new(time_s, self._attitude_at):
             return
         north, east, _ = thrust_direction_from_quaternion(q).tolist()
-        course = float(course_from_quaternion(q))
+        heading = float(heading_from_quaternion(q))
         self._rates = np.array(rates, dtype=np.float64)
         if self._attitude_at is None or self._frozen:
             state = self._state
             state[TILT : TILT + 2] = north, east
             state[TILT_RATE : TILT_RATE + 2] = 0.0
-            state[COURSE], state[COURSE_RATE] = course, 0.0
+            state[HEADING], state[HEADING_RATE] = heading, 0.0
             state[THRUST] = self._gravity / upright(north, east)
             self._time_s = max(self._time_s, time_s)
         else:
             self._go_to(time_s, complete=self._position_at is not None)
-            update_by_attitude(self._record, time_s, north, east, course)
+            update_by_attitude(self._record, time_s, north, east, heading)
         self._attitude_at = time_s
 
     def on_position(self, time_s: float, position_ned_m: Triple, velocity_ned_mps: Triple) -> None:
@@ -419,8 +419,8 @@ class Observer:
             velocity_ned_mps=state[VELOCITY : VELOCITY + 3],
             thrust_direction_ned=np.array([north, east, down]),
             thrust_direction_rate_ned_ps=np.array([rate_n, rate_e, rate_d]),
-            course_rad=wrap_pi(float(state[COURSE])),
-            course_rate_radps=float(state[COURSE_RATE]),
+            heading_rad=wrap_pi(float(state[HEADING])),
+            heading_rate_radps=float(state[HEADING_RATE]),
             thrust_mps2=float(state[THRUST]),
             disturbance_ned_mps2=state[DISTURBANCE : DISTURBANCE + 3],
             rates_frd_radps=self._rates.copy(),

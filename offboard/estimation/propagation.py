@@ -2,8 +2,8 @@
 
 A state has `STATE_SIZE` numbers at the indices below (NED, SI): position, velocity, thrust
 direction b (north and east) and its rate, disturbance, bias of the reported velocity, collective
-thrust after its lag, course and its rate. Motion is integrated with Runge-Kutta steps that end when
-a command takes effect. States are changed in place.
+thrust after its lag, heading and its rate. Motion is integrated with Runge-Kutta steps that end
+when a command takes effect. States are changed in place.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ TILT_RATE = 8
 DISTURBANCE = 10
 BIAS = 13
 THRUST = 16
-COURSE = 17
-COURSE_RATE = 18
+HEADING = 17
+HEADING_RATE = 18
 STATE_SIZE = 19
 
 PLANT = np.dtype(
@@ -48,7 +48,7 @@ PLANT = np.dtype(
 SENT_AT = 0
 SENT_TILT = 1
 SENT_THRUST = 3
-SENT_COURSE = 4
+SENT_HEADING = 4
 COMMAND_SIZE = 5
 
 COMMANDS_KEPT = 128
@@ -99,7 +99,7 @@ def _differentiate(
     thrust: float,
     tilt_n: float,
     tilt_e: float,
-    course: float,
+    heading: float,
     plant: Any,
     rate: Array,
 ) -> None:
@@ -123,10 +123,10 @@ def _differentiate(
     rate[TILT_RATE] = stiffness * (tilt_n - b_n) - damping * state[TILT_RATE]
     rate[TILT_RATE + 1] = stiffness * (tilt_e - b_e) - damping * state[TILT_RATE + 1]
     rate[THRUST] = 0.0
-    rate[COURSE] = state[COURSE_RATE]
-    rate[COURSE_RATE] = (
-        plant.yaw_frequency**2 * (course - state[COURSE])
-        - 2.0 * plant.yaw_damping * plant.yaw_frequency * state[COURSE_RATE]
+    rate[HEADING] = state[HEADING_RATE]
+    rate[HEADING_RATE] = (
+        plant.yaw_frequency**2 * (heading - state[HEADING])
+        - 2.0 * plant.yaw_damping * plant.yaw_frequency * state[HEADING_RATE]
     )
 
 
@@ -150,7 +150,7 @@ def _step(
     tilt_n: float,
     tilt_e: float,
     thrust: float,
-    course: float,
+    heading: float,
     plant: Any,
     slopes: Array,
 ) -> None:
@@ -160,13 +160,13 @@ def _step(
     end = _lagged(state[THRUST], thrust, lag, h)
     start = state[THRUST] if lag > 0.0 else thrust
     k1, k2, k3, k4, moved = slopes[0], slopes[1], slopes[2], slopes[3], slopes[4]
-    _differentiate(state, start, tilt_n, tilt_e, course, plant, k1)
+    _differentiate(state, start, tilt_n, tilt_e, heading, plant, k1)
     _move(state, 0.5 * h, k1, moved)
-    _differentiate(moved, middle, tilt_n, tilt_e, course, plant, k2)
+    _differentiate(moved, middle, tilt_n, tilt_e, heading, plant, k2)
     _move(state, 0.5 * h, k2, moved)
-    _differentiate(moved, middle, tilt_n, tilt_e, course, plant, k3)
+    _differentiate(moved, middle, tilt_n, tilt_e, heading, plant, k3)
     _move(state, h, k3, moved)
-    _differentiate(moved, end, tilt_n, tilt_e, course, plant, k4)
+    _differentiate(moved, end, tilt_n, tilt_e, heading, plant, k4)
     for i in range(STATE_SIZE):
         state[i] += h / 6.0 * (k1[i] + 2.0 * k2[i] + 2.0 * k3[i] + k4[i])
     state[THRUST] = end
@@ -177,7 +177,7 @@ def replay(motions: Any, row: int, start_s: float, end_s: float) -> None:
     """Propagate the state NOW from `start_s` to `end_s` under the commands sent, each axis with its
     own delay, and write it to `row`, NOW or LATER. `motions` is one MOTION (1,).
 
-    Until the first command takes effect, tilt, thrust and course keep their values.
+    Until the first command takes effect, tilt, thrust and heading keep their values.
     """
     motion = motions[0]
     state, history, plant = motion.states[row], motion.history, motion.plant
@@ -188,19 +188,20 @@ def replay(motions: Any, row: int, start_s: float, end_s: float) -> None:
     while end_s - time > SAME_TIME_S:
         tilt_row, tilt_next = _in_force(motion, time, plant.tilt_delay_s)
         thrust_row, thrust_next = _in_force(motion, time, plant.thrust_delay_s)
-        course_row, course_next = _in_force(motion, time, plant.yaw_delay_s)
-        until = min(end_s, min(tilt_next, min(thrust_next, course_next)))
+        heading_row, heading_next = _in_force(motion, time, plant.yaw_delay_s)
+        until = min(end_s, min(tilt_next, min(thrust_next, heading_next)))
         steps = max(1, math.ceil((until - time) / longest - 1e-6))
         h = (until - time) / steps
-        tilt_n, tilt_e, thrust, course = state[TILT], state[TILT + 1], state[THRUST], state[COURSE]
+        tilt_n, tilt_e = state[TILT], state[TILT + 1]
+        thrust, heading = state[THRUST], state[HEADING]
         if tilt_row >= 0:
             tilt_n, tilt_e = history[tilt_row, SENT_TILT], history[tilt_row, SENT_TILT + 1]
         if thrust_row >= 0:
             thrust = history[thrust_row, SENT_THRUST]
-        if course_row >= 0:
-            course += wrapped(history[course_row, SENT_COURSE] - state[COURSE])
+        if heading_row >= 0:
+            heading += wrapped(history[heading_row, SENT_HEADING] - state[HEADING])
         for _ in range(steps):
-            _step(state, h, tilt_n, tilt_e, thrust, course, plant, motion.slopes[:])
+            _step(state, h, tilt_n, tilt_e, thrust, heading, plant, motion.slopes[:])
         time = until
 
 

@@ -42,7 +42,7 @@ _COLUMNS = {
         *_vectors("reference_position", "m"),
         *_vectors("reference_velocity", "mps"),
         *_vectors("reference_acceleration", "mps2"),
-        "reference_course_rad",
+        "reference_heading_rad",
     ),
     "setpoint": (*_quaternion("setpoint"), "setpoint_thrust"),
     "decision": tuple(f"decision_{name}" for name in FIELDS),

@@ -16,7 +16,7 @@ import numpy as np
 from offboard.export.series import Array, Flight, Series
 from offboard.flight.record import FIELDS
 from offboard.link.new_file import new_file
-from offboard.model.frames import course_from_quaternion
+from offboard.model.frames import heading_from_quaternion
 
 _MAGIC = b"ULog\x01\x12\x35\x01"
 _FLAG_BITS, _FORMAT, _INFO, _SUBSCRIBE, _DATA, _TEXT = b"BFIADL"
@@ -110,7 +110,7 @@ def _topics(flight: Flight) -> list[_Topic]:
 def _attitude_setpoint(setpoint: Series) -> Array:
     """Thrust is along the body's -z axis, as PX4 has it."""
     attitude, thrust = setpoint.values[:, :4], setpoint.values[:, 4]
-    yaw = course_from_quaternion(attitude)
+    yaw = heading_from_quaternion(attitude)
     nothing = np.zeros_like(thrust)
     return np.column_stack((yaw, attitude, nothing, nothing, -thrust))
 

@@ -57,8 +57,8 @@ def hold(flight: FlightState, time_s: float) -> None:
     elif phase is Phase.STAND_DOWN:
         outbox.request(flight, CommandLong.disarm())
         if steers:
-            course_rad = flight.command.course_rad
-            setpoint.send_level(flight, time_s, Command(0.0, LEVEL, course_rad))
+            heading_rad = flight.command.heading_rad
+            setpoint.send_level(flight, time_s, Command(0.0, LEVEL, heading_rad))
 
 
 def _end(flight: FlightState, time_s: float, *, steers: bool) -> None:
@@ -134,7 +134,7 @@ def _prepare(flight: FlightState, time_s: float) -> None:
     if flight.takes_off_by_command and not flying:
         return
     thrust_mps2 = setpoint.hover_mps2(flight) if flying else 0.0
-    command = Command(thrust_mps2, LEVEL, flight.vehicle.course_rad)
+    command = Command(thrust_mps2, LEVEL, flight.vehicle.heading_rad)
     setpoint.send_level(flight, time_s, command)
 
 
@@ -143,7 +143,7 @@ def _stand_by(flight: FlightState, time_s: float) -> None:
     ground no thrust; in the air what the vehicle flies, unless a failsafe flies it, after which
     PX4 would return to OFFBOARD, or it flies setpoints of others."""
     on_ground, vehicle = flight.contact.certain, flight.vehicle
-    command = Command(0.0, LEVEL, vehicle.course_rad) if on_ground else _flown(flight)
+    command = Command(0.0, LEVEL, vehicle.heading_rad) if on_ground else _flown(flight)
     quiet = flight.takes_off_by_command or flight.telemetry_is_old or bool(other_sender(flight))
     if on_ground:
         quiet |= vehicle.armed and vehicle.in_failsafe
@@ -163,7 +163,7 @@ def _flown(flight: FlightState) -> Command:
     north, east, down = direction.tolist()
     model = flight.model
     thrust_mps2 = (1.0 if share is None else share / model.hover_thrust) * model.gravity_mps2
-    return Command(thrust_mps2, (north, east, down), flight.vehicle.course_rad)
+    return Command(thrust_mps2, (north, east, down), flight.vehicle.heading_rad)
 
 
 def request_parameters(flight: FlightState) -> None:
@@ -203,8 +203,8 @@ def _take_off(flight: FlightState, time_s: float) -> None:
         rising_s, most = rising_s - age_s, SPOOL_UNSEEN
     spool = min(most, max(0.0, SPOOL_UP_PER_S * rising_s))
     thrust_mps2 = spool * flight.model.gravity_mps2
-    course_rad = flight.command.course_rad
-    setpoint.send_level(flight, time_s, Command(thrust_mps2, LEVEL, course_rad))
+    heading_rad = flight.command.heading_rad
+    setpoint.send_level(flight, time_s, Command(thrust_mps2, LEVEL, heading_rad))
 
 
 def _request_takeoff(flight: FlightState, time_s: float) -> None:
@@ -214,8 +214,8 @@ def _request_takeoff(flight: FlightState, time_s: float) -> None:
     """
     outbox.request(flight, _dialect(flight).take_off(TAKEOFF_HEIGHT_M))
     gravity_mps2 = flight.model.gravity_mps2
-    course_rad = flight.vehicle.course_rad
-    setpoint.set_command(flight, time_s, Command(gravity_mps2, LEVEL, course_rad))
+    heading_rad = flight.vehicle.heading_rad
+    setpoint.set_command(flight, time_s, Command(gravity_mps2, LEVEL, heading_rad))
 
 
 def _level(flight: FlightState) -> Command:
@@ -226,7 +226,7 @@ def _level(flight: FlightState) -> Command:
     thrust_mps2 = min(command.thrust_mps2, least_mps2)
     if flying:
         thrust_mps2 = setpoint.hover_mps2(flight)
-    return Command(thrust_mps2, LEVEL, command.course_rad)
+    return Command(thrust_mps2, LEVEL, command.heading_rad)
 
 
 def _dialect(flight: FlightState) -> Dialect:

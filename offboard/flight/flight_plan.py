@@ -71,15 +71,15 @@ class FlightPlan:
         return Offset(self._planned, self._offset)
 
     def start_climb(
-        self, time_s: float, position: Array, velocity: Array, course_rad: float
+        self, time_s: float, position: Array, velocity: Array, heading_rad: float
     ) -> None:
         """Fly from this position and velocity (3,) to rest at the start of the track."""
         start = self._placed().sample(0.0)
         climb = transfer(
             position,
             start.position_ned_m,
-            course_rad,
-            float(start.course_rad),
+            heading_rad,
+            float(start.heading_rad),
             start_velocity_ned_mps=velocity,
         )
         self._track_began_s, self._paused = math.nan, None

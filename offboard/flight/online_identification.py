@@ -25,7 +25,7 @@ from offboard.identification.learner import (
 )
 from offboard.identification.uncertainty import Estimate
 from offboard.model.command import Command
-from offboard.model.frames import course_from_quaternion, thrust_direction_from_quaternion
+from offboard.model.frames import heading_from_quaternion, thrust_direction_from_quaternion
 from offboard.model.vehicle import DelayUncertainty, Vehicle
 
 MOST_ROUNDS = 3  # of steps
@@ -91,8 +91,8 @@ class OnlineIdentification:
         """An attitude received (ATTITUDE_QUATERNION: body to NED, w first)."""
         if self._learner.records:
             north, east, _ = thrust_direction_from_quaternion(q)
-            course = float(course_from_quaternion(q))
-            self._learner.recorder.on_attitude(time_s, (float(north), float(east)), course)
+            heading = float(heading_from_quaternion(q))
+            self._learner.recorder.on_attitude(time_s, (float(north), float(east)), heading)
 
     def on_position(
         self,
@@ -108,7 +108,7 @@ class OnlineIdentification:
         """A command sent; its thrust was scaled with the vehicle adopted last."""
         north, east, _ = command.thrust_direction_ned
         share = command.thrust_mps2 / self._adopted[0].thrust_max_mps2
-        self._learner.recorder.on_command(time_s, (north, east), share, command.course_rad)
+        self._learner.recorder.on_command(time_s, (north, east), share, command.heading_rad)
 
     def on_link_delay(self, link: Estimate | None) -> None:
         """The link's delay, measured before lift-off; None if the vehicle did not answer."""

@@ -35,7 +35,7 @@ IDENTIFIED_NAME, IDENTIFIED_ID = "identified", 2  # of the other DEBUG_FLOAT_ARR
 class TickRecord:
     """All floats, SI, NED, vehicle time; NaN for what the control law does not have.
 
-    Thrust, direction and course are those of the setpoint that was sent. The certificate, from
+    Thrust, direction and heading are those of the setpoint that was sent. The certificate, from
     `cost` to `at_bound` and `seed_cost`, is of this setpoint too: NaN where it is not the one that
     the control law certified, because excitation or the limits changed it or it was not sent.
     """
@@ -45,7 +45,7 @@ class TickRecord:
     thrust_direction_north: float
     thrust_direction_east: float
     thrust_direction_down: float
-    course_rad: float
+    heading_rad: float
     cost: float
     optimal_cost: float
     gap: float
@@ -132,7 +132,7 @@ class Decided:
             float(PHASE_CODES[self.phase]),
             attitude.thrust_mps2 if attitude else NAN,
             *(attitude.thrust_direction_ned if attitude else (NAN, NAN, NAN)),
-            sent.course_rad if sent else NAN,
+            sent.heading_rad if sent else NAN,
             *certificate,
             self.solve_time_s,
             answer_s,
@@ -158,8 +158,8 @@ def reference_record(time_s: float, sample: FlatSample) -> ReferenceRecord:
         position_ned_m=_triple(sample.position_ned_m),
         velocity_ned_mps=_triple(sample.velocity_ned_mps),
         acceleration_ned_mps2=_triple(sample.acceleration_ned_mps2),
-        course_rad=float(sample.course_rad),
-        course_rate_radps=float(sample.course_rate_radps),
+        heading_rad=float(sample.heading_rad),
+        heading_rate_radps=float(sample.heading_rate_radps),
     )
 
 

@@ -81,10 +81,10 @@ def usable(command: Command | PositionCommand) -> bool:
             command.position_ned_m,
             command.velocity_ned_mps,
             command.acceleration_ned_mps2,
-            (command.course_rad, command.course_rate_radps),
+            (command.heading_rad, command.heading_rate_radps),
         )
         return all(abs(value) <= FLOAT32_MAX for vector in vectors for value in vector)
-    values = (command.thrust_mps2, *command.thrust_direction_ned, command.course_rad)
+    values = (command.thrust_mps2, *command.thrust_direction_ned, command.heading_rad)
     if not all(abs(value) <= FLOAT32_MAX for value in values):
         return False
     return abs(math.hypot(*command.thrust_direction_ned) - 1.0) <= _LENGTH_TOLERANCE
@@ -105,7 +105,7 @@ def clamp(command: Command, vehicle: Vehicle, *, on_ground: bool = False) -> Com
         towards_rad, scale = math.atan2(east, north), math.sin(vehicle.tilt_max_rad)
         north, east = scale * math.cos(towards_rad), scale * math.sin(towards_rad)
         down = math.cos(vehicle.tilt_max_rad)
-    return Command(thrust, (north, east, down), command.course_rad)
+    return Command(thrust, (north, east, down), command.heading_rad)
 
 
 # ---------------------------------------------------------------------- sending
@@ -169,7 +169,7 @@ def _send_attitude(
             time_s=time_s,
             thrust_mps2=command.thrust_mps2,
             thrust_direction_ned=command.thrust_direction_ned,
-            course_rad=command.course_rad,
+            heading_rad=command.heading_rad,
             hover_thrust=model.hover_thrust,
             gravity_mps2=model.gravity_mps2,
             body_z_down=body_z_down,
@@ -182,7 +182,7 @@ def _send_position(flight: FlightState, time_s: float, command: PositionCommand)
     stops predicting with commands."""
     flight.observer.freeze(True)
     flight.thrusts.clear()  # the autopilot chooses the thrust
-    flight.command = Command(flight.model.gravity_mps2, LEVEL, command.course_rad)
+    flight.command = Command(flight.model.gravity_mps2, LEVEL, command.heading_rad)
     outbox.send(
         flight,
         PositionTarget(
@@ -190,8 +190,8 @@ def _send_position(flight: FlightState, time_s: float, command: PositionCommand)
             command.position_ned_m,
             command.velocity_ned_mps,
             command.acceleration_ned_mps2,
-            command.course_rad,
-            command.course_rate_radps,
+            command.heading_rad,
+            command.heading_rate_radps,
         ),
     )
 

@@ -45,7 +45,7 @@ class Snapshot:
         self.position_error_m = state.position_error_m if sample else NAN
         self.thrust_mps2 = command.thrust_mps2  # of the command in force, as are the next two
         self.thrust_direction_ned = command.thrust_direction_ned
-        self.course_rad = command.course_rad
+        self.heading_rad = command.heading_rad
         self.hover_thrust = state.model.hover_thrust  # of the vehicle model in use, 0 to 1
         # beyond the least delay of the link
         self.telemetry_age_s = age_s if math.isfinite(age_s) else NAN

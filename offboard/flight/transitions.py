@@ -192,9 +192,9 @@ def _begin_climb(flight: FlightState, source: Phase) -> None:
     assert position is not None
     flown = flight.plan.sample(flight.time_s)
     if flown is not None:  # from where the reference is: the vehicle follows it
-        course_rad = float(flown.course_rad)
+        heading_rad = float(flown.heading_rad)
         flight.plan.start_climb(
-            flight.time_s, flown.position_ned_m, flown.velocity_ned_mps, course_rad
+            flight.time_s, flown.position_ned_m, flown.velocity_ned_mps, heading_rad
         )
         return
     in_the_air = source is not Phase.TAKEOFF
@@ -208,7 +208,7 @@ def _begin_climb(flight: FlightState, source: Phase) -> None:
         flight.time_s,
         np.array(position.position_ned_m),
         np.array(position.velocity_ned_mps),
-        flight.vehicle.course_rad,
+        flight.vehicle.heading_rad,
     )
 
 

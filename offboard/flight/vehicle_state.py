@@ -31,7 +31,7 @@ from offboard.mavlink.events import (
     VehicleIdentity,
 )
 from offboard.mavlink.framing import HEARTBEAT
-from offboard.model.frames import course_from_quaternion
+from offboard.model.frames import heading_from_quaternion
 
 HEALTH_S = 1.5  # SYS_STATUS is requested at 2 Hz
 ARMED_KNOWN_S = 3.0  # PX4 reports it in HEARTBEAT alone, at 1 Hz
@@ -134,10 +134,10 @@ class VehicleState:
         return self.position is not None and self.attitude is not None
 
     @property
-    def course_rad(self) -> float:
+    def heading_rad(self) -> float:
         """Heading of the nose in the newest attitude, which must have been received."""
         assert self.attitude is not None
-        return float(course_from_quaternion(self.attitude.attitude))
+        return float(heading_from_quaternion(self.attitude.attitude))
 
     @property
     def prearm_ok(self) -> bool:

@@ -19,10 +19,10 @@ from scipy.optimize import approx_fprime, least_squares
 
 from offboard.identification.response import free_motion, second_order
 from offboard.identification.trace import (
-    COURSE,
+    HEADING,
     NORTH,
     SENT_AT,
-    SENT_COURSE,
+    SENT_HEADING,
     SENT_NORTH,
     SPACING_S,
     STAMP,
@@ -122,9 +122,9 @@ def tilt_signals(trace: Trace) -> tuple[Array, Array, Array, Array]:
 
 
 def yaw_signals(trace: Trace) -> tuple[Array, Array, Array, Array]:
-    """Times (N,), courses (N, 1), and when (M,) which (M, 1) were commanded; rad, unwrapped."""
-    signals = np.unwrap(trace.attitude[:, COURSE])[:, None]
-    commands = np.unwrap(trace.commands[:, SENT_COURSE])[:, None]
+    """Times (N,), headings (N, 1), and when (M,) which (M, 1) were commanded; rad, unwrapped."""
+    signals = np.unwrap(trace.attitude[:, HEADING])[:, None]
+    commands = np.unwrap(trace.commands[:, SENT_HEADING])[:, None]
     return trace.attitude[:, STAMP], signals, trace.commands[:, SENT_AT], commands
 
 
@@ -137,7 +137,7 @@ def fit_tilt(trace: Trace, refusals: dict[str, str]) -> Generator[None, None, Re
 def fit_yaw(
     trace: Trace, refusals: dict[str, str], delay: Estimate
 ) -> Generator[None, None, ResponseFit | None]:
-    """The course, as `fit_tilt`; `delay` is what is known of its delay beforehand."""
+    """The heading, as `fit_tilt`; `delay` is what is known of its delay beforehand."""
     return (yield from _fit_axis(YAW, yaw_signals(trace), refusals, delay))
 
 
@@ -242,7 +242,7 @@ def fit_response(
 class ResponseProblem:
     """Least-squares problem of the measured `signals` (N, axes) under `commands` (M, axes).
 
-    With `wanders` the errors of the measurement are a random walk, as those of an estimated course
+    With `wanders` the errors of the measurement are a random walk, as those of an estimated heading
     are: their steps are independent, and take the place of the residuals.
     """
 

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 
 # Columns.
-SENT_AT, SENT_NORTH, SENT_EAST, SENT_THRUST, SENT_COURSE, COMMAND_WIDTH = 0, 1, 2, 3, 4, 5
-STAMP, NORTH, EAST, COURSE, ATTITUDE_WIDTH = 0, 1, 2, 3, 4
+SENT_AT, SENT_NORTH, SENT_EAST, SENT_THRUST, SENT_HEADING, COMMAND_WIDTH = 0, 1, 2, 3, 4, 5
+STAMP, NORTH, EAST, HEADING, ATTITUDE_WIDTH = 0, 1, 2, 3, 4
 POSITION, VELOCITY, POSITION_WIDTH = slice(1, 4), slice(4, 7), 7
 
 
@@ -25,8 +25,8 @@ class Trace:
     """Commands and telemetry of a stretch of flight.
 
     `commands` (M, 5): stamp, thrust direction north and east, collective thrust along the body
-    axis as a fraction of full throttle, course (rad). `attitude` (N, 4): stamp, thrust direction
-    north and east, course (rad). `position` (N, 7): stamp, position (m), reported velocity (m/s).
+    axis as a fraction of full throttle, heading (rad). `attitude` (N, 4): stamp, thrust direction
+    north and east, heading (rad). `position` (N, 7): stamp, position (m), reported velocity (m/s).
     """
 
     commands: Array
@@ -109,15 +109,15 @@ class Recorder:
         self._position = _Rows(rows, POSITION_WIDTH)
 
     def on_command(
-        self, time_s: float, direction_ne: tuple[float, float], thrust: float, course_rad: float
+        self, time_s: float, direction_ne: tuple[float, float], thrust: float, heading_rad: float
     ) -> None:
         """A command sent; `thrust` along the body axis, as a fraction of full throttle."""
-        self._commands.add((time_s, *direction_ne, thrust, course_rad))
+        self._commands.add((time_s, *direction_ne, thrust, heading_rad))
 
     def on_attitude(
-        self, time_s: float, direction_ne: tuple[float, float], course_rad: float
+        self, time_s: float, direction_ne: tuple[float, float], heading_rad: float
     ) -> None:
-        self._attitude.add((time_s, *direction_ne, course_rad))
+        self._attitude.add((time_s, *direction_ne, heading_rad))
 
     def on_position(
         self,

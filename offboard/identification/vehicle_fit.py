@@ -320,7 +320,7 @@ def within_bounds(
 
 
 def with_link_delay(found: Identified, target: Vehicle, vehicle_file: Vehicle) -> Vehicle:
-    """`target`, its delays of thrust and course increased by what the link adds to the tilt's,
+    """`target`, its delays of thrust and heading increased by what the link adds to the tilt's,
     unless they were identified themselves."""
     if found.tilt is None:
         return target

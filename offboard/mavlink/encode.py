@@ -174,11 +174,11 @@ def _normalised_thrust(target: AttitudeTarget, rule: ThrustRule) -> float:
 
 def _attitude_quaternion(target: AttitudeTarget) -> events.Quaternion:
     direction = np.asarray(target.thrust_direction_ned, dtype=np.float64)
-    _finite("thrust direction and course", *direction, target.course_rad)
+    _finite("thrust direction and heading", *direction, target.heading_rad)
     norm = float(np.linalg.norm(direction))
     if not 0.9 < norm < 1.1:
         raise ValueError(f"thrust direction must be a unit vector; its length is {norm:g}")
-    quaternion = frames.quaternion_from_thrust_direction(direction / norm, target.course_rad)
+    quaternion = frames.quaternion_from_thrust_direction(direction / norm, target.heading_rad)
     # last of all: ArduCopter drops a quaternion whose length differs from 1 by 0.0005
     quaternion = quaternion / np.linalg.norm(quaternion)
     w, x, y, z = (float(c) for c in (quaternion if quaternion[0] >= 0.0 else -quaternion))
@@ -207,8 +207,8 @@ def _position_target(value: PositionTarget | ReferenceRecord, **to: int) -> Mess
         **dict(zip(("x", "y", "z"), value.position_ned_m, strict=True)),
         **dict(zip(("vx", "vy", "vz"), value.velocity_ned_mps, strict=True)),
         **dict(zip(("afx", "afy", "afz"), value.acceleration_ned_mps2, strict=True)),
-        "yaw": value.course_rad,
-        "yaw_rate": value.course_rate_radps,
+        "yaw": value.heading_rad,
+        "yaw_rate": value.heading_rate_radps,
     }
     _finite("a position target", *numbers.values())
     return message(

@@ -16,7 +16,7 @@ class AttitudeTarget:
     """SET_ATTITUDE_TARGET, attitude and thrust.
 
     `thrust_mps2` is thrust per unit of mass, `thrust_direction_ned` the commanded third body axis
-    (unit), `course_rad` the commanded heading. `hover_thrust` is the normalised thrust that holds
+    (unit), `heading_rad` the commanded heading. `hover_thrust` is the normalised thrust that holds
     the weight. `body_z_down` is the third component of the body's own third axis when the command
     acts, for autopilots that divide by it; None: that of `thrust_direction_ned`.
     """
@@ -24,7 +24,7 @@ class AttitudeTarget:
     time_s: float
     thrust_mps2: float
     thrust_direction_ned: Triple
-    course_rad: float
+    heading_rad: float
     hover_thrust: float
     gravity_mps2: float = 9.81
     body_z_down: float | None = None
@@ -38,8 +38,8 @@ class PositionTarget:
     position_ned_m: Triple
     velocity_ned_mps: Triple
     acceleration_ned_mps2: Triple
-    course_rad: float
-    course_rate_radps: float
+    heading_rad: float
+    heading_rate_radps: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,8 +132,8 @@ class ReferenceRecord:
     position_ned_m: Triple
     velocity_ned_mps: Triple
     acceleration_ned_mps2: Triple
-    course_rad: float
-    course_rate_radps: float
+    heading_rad: float
+    heading_rate_radps: float
 
 
 @dataclass(frozen=True, slots=True)

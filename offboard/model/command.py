@@ -18,7 +18,7 @@ class Command:
         thrust_direction_ned: Direction of the body's down axis (third axis, FRD) in NED, a unit
             vector; (0, 0, 1) is level. The thrust acts against it: acceleration =
             gravity - thrust_mps2 * thrust_direction_ned.
-        course_rad: Heading of the nose, rad, 0 = north, positive clockwise seen from above.
+        heading_rad: Heading of the nose, rad, 0 = north, positive clockwise seen from above.
 
     Example:
         Command(9.81, (0.0, 0.0, 1.0), 0.0)  # level hover, nose to the north
@@ -26,7 +26,7 @@ class Command:
 
     thrust_mps2: float
     thrust_direction_ned: tuple[float, float, float]
-    course_rad: float
+    heading_rad: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,5 +40,5 @@ class PositionCommand:
     position_ned_m: tuple[float, float, float]
     velocity_ned_mps: tuple[float, float, float]
     acceleration_ned_mps2: tuple[float, float, float]
-    course_rad: float
-    course_rate_radps: float
+    heading_rad: float
+    heading_rate_radps: float

@@ -59,7 +59,7 @@ def euler_from_quaternion(quaternion: ArrayLike) -> Array:
     return _stack(wrap_pi(half_sum - half_difference), theta, wrap_pi(half_sum + half_difference))
 
 
-def course_from_quaternion(quaternion: ArrayLike) -> Any:
+def heading_from_quaternion(quaternion: ArrayLike) -> Any:
     """Quaternion (..., 4) -> heading of the nose (...), Euler psi in [-pi, pi] rad, 0 = north."""
     w, x, y, z = _components(quaternion)
     return wrap_pi(np.arctan2(x + z, w - y) + np.arctan2(z - x, w + y))
@@ -82,25 +82,25 @@ def thrust_direction_from_quaternion(quaternion: ArrayLike) -> Array:
     return _stack(2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y))
 
 
-def quaternion_from_thrust_direction(direction_ned: ArrayLike, course_rad: ArrayLike) -> Array:
-    """Third body axis b (..., 3) of any length and course psi (...) -> quaternion (..., 4).
+def quaternion_from_thrust_direction(direction_ned: ArrayLike, heading_rad: ArrayLike) -> Array:
+    """Third body axis b (..., 3) of any length and heading psi (...) -> quaternion (..., 4).
 
-    The body y axis is normal to the plane of b and the course, hence Euler psi is the course
-    (also upside down). Defined for every input: for b along the y axis of the course the roll is
-    +-pi/2, b zero or not finite counts as level, a course that is not finite as north.
+    The body y axis is normal to the plane of b and the heading, hence Euler psi is the heading
+    (also upside down). Defined for every input: for b along the y axis of the heading the roll is
+    +-pi/2, b zero or not finite counts as level, a heading that is not finite as north.
     """
     north, east, down = _components(direction_ned)
-    course: Any = np.where(np.isfinite(course_rad), course_rad, 0.0)[()]
+    heading: Any = np.where(np.isfinite(heading_rad), heading_rad, 0.0)[()]
     usable = np.isfinite(north + east + down)
     north, east = np.where(usable, north, 0.0)[()], np.where(usable, east, 0.0)[()]
     level = ~usable | ((north == 0.0) & (east == 0.0) & (down == 0.0))
     down = np.where(level, 1.0, down)[()]
-    ahead = north * np.cos(course) + east * np.sin(course)
-    right = east * np.cos(course) - north * np.sin(course)
+    ahead = north * np.cos(heading) + east * np.sin(heading)
+    right = east * np.cos(heading) - north * np.sin(heading)
     upright = np.copysign(1.0, down)
     phi = np.arctan2(-right, upright * np.hypot(ahead, down))
     theta = np.arctan2(upright * ahead, upright * down)
-    return quaternion_from_euler(phi, theta, course)
+    return quaternion_from_euler(phi, theta, heading)
 
 
 def enu(ned: ArrayLike) -> Array:

@@ -33,8 +33,8 @@ class PredictedState:
         velocity_ned_mps: (3,).
         thrust_direction_ned: (3,), unit vector b: the body's down axis in NED, (0, 0, 1) if level.
         thrust_direction_rate_ned_ps: (3,), derivative of b, 1/s.
-        course_rad: Heading of the nose, 0 = north, clockwise, -pi .. pi.
-        course_rate_radps: Its derivative.
+        heading_rad: Heading of the nose, 0 = north, clockwise, -pi .. pi.
+        heading_rate_radps: Its derivative.
         thrust_mps2: Thrust per unit of mass T that acts, after its lag.
         disturbance_ned_mps2: (3,), estimated d: wind, wrong mass or hover thrust.
         rates_frd_radps: (3,), body rates p, q, r.
@@ -48,8 +48,8 @@ class PredictedState:
     velocity_ned_mps: Array
     thrust_direction_ned: Array
     thrust_direction_rate_ned_ps: Array
-    course_rad: float
-    course_rate_radps: float
+    heading_rad: float
+    heading_rate_radps: float
     thrust_mps2: float
     disturbance_ned_mps2: Array
     rates_frd_radps: Array

@@ -33,7 +33,7 @@ from offboard.paper.plant import (
 )
 from offboard.reference.base import FlatSample, Reference
 from offboard.reference.flatness import flat_state
-from offboard.reference.shapes import CourseMode, Hover, Waypoints
+from offboard.reference.shapes import HeadingMode, Hover, Waypoints
 from offboard.reference.waypoints import Smoothness
 
 Array = NDArray[np.float64]
@@ -55,14 +55,14 @@ class PathName(StrEnum):
 
 @cache
 def reference(name: PathName) -> Reference:
-    """Position NED, velocity and course over vehicle time from 0."""
+    """Position NED, velocity and heading over vehicle time from 0."""
     if name is PathName.HOVER:
         return Hover(height_m=2.0, duration_s=60.0).track()
     return Waypoints(
         points_m=POINTS_M,
         speed_mps=SPEED_MPS,
         minimise=Smoothness.SNAP,
-        course=CourseMode.ALONG_VELOCITY,
+        course=HeadingMode.ALONG_VELOCITY,
     ).track()
 
 
@@ -85,7 +85,7 @@ def sampled_path(name: PathName, steps: int) -> SampledPath:
     times_s: Array = PAPER_STEP_S * np.arange(steps + 1, dtype=np.float64)
     samples = reference(name).sample(times_s)
     tracked = np.zeros((steps + 1, 12))
-    tracked[:, PSI] = samples.course_rad
+    tracked[:, PSI] = samples.heading_rad
     tracked[:, U : W + 1] = samples.velocity_ned_mps
     tracked[:, X : Z + 1] = samples.position_ned_m
     return SampledPath(times_s, tracked, samples)
@@ -95,12 +95,12 @@ def linear_states(samples: FlatSample, vehicle: Vehicle) -> Array:
     """All states (..., 12) of the linear model when it follows the reference exactly."""
     gravity, drag = vehicle.gravity_mps2, vehicle.drag_per_mass_ps
     v, a, j = samples.velocity_ned_mps, samples.acceleration_ned_mps2, samples.jerk_ned_mps3
-    states = np.zeros((*samples.course_rad.shape, 12))
+    states = np.zeros((*samples.heading_rad.shape, 12))
     lean = (a + drag * v) / gravity  # u' = -g theta - c u, v' = g phi - c v
     lean_rate = (j + drag * a) / gravity
     states[..., PHI], states[..., THETA] = lean[..., 1], -lean[..., 0]
     states[..., P], states[..., P + 1] = lean_rate[..., 1], -lean_rate[..., 0]
-    states[..., PSI], states[..., R] = samples.course_rad, samples.course_rate_radps
+    states[..., PSI], states[..., R] = samples.heading_rad, samples.heading_rate_radps
     states[..., U : W + 1] = v
     states[..., X : Z + 1] = samples.position_ned_m
     return states
@@ -108,13 +108,13 @@ def linear_states(samples: FlatSample, vehicle: Vehicle) -> Array:
 
 def heading_states(samples: FlatSample, vehicle: Vehicle) -> Array:
     """The same (..., 12) for the nonlinear plant (flatness), in the heading frame of each sample;
-    course and position are relative to the sample, hence 0."""
+    heading and position are relative to the sample, hence 0."""
     flat = flat_state(samples, vehicle.gravity_mps2, vehicle.drag_per_mass_ps)
-    cosine, sine = np.cos(samples.course_rad), np.sin(samples.course_rad)
+    cosine, sine = np.cos(samples.heading_rad), np.sin(samples.heading_rad)
     b, v = flat.thrust_direction_ned, samples.velocity_ned_mps
     along = cosine * b[..., 0] + sine * b[..., 1]
     across = cosine * b[..., 1] - sine * b[..., 0]
-    states = np.zeros((*samples.course_rad.shape, 12))
+    states = np.zeros((*samples.heading_rad.shape, 12))
     states[..., PHI], states[..., THETA] = np.arcsin(-across), np.arctan2(along, b[..., 2])
     states[..., P : R + 1] = flat.rates_frd_radps
     states[..., U] = cosine * v[..., 0] + sine * v[..., 1]

@@ -88,7 +88,7 @@ class PaperController:
             raise DecisionError("the cost of this decision is not finite")
         certificate = certify(move.problem, move.result, self._exact)
         self._held = certificate.at_bound
-        return Decision(self._command(move, state, float(target.course_rad)), certificate)
+        return Decision(self._command(move, state, float(target.heading_rad)), certificate)
 
     def reset(self) -> None:
         integral = self._settings.integral
@@ -101,19 +101,19 @@ class PaperController:
         if not self._integral:
             return None
         state, now = situation.state, situation.reference.sample(situation.state.time_s)
-        course = wrap_pi(state.course_rad - float(now.course_rad))
-        error = np.append(state.position_ned_m - now.position_ned_m, course)
+        heading = wrap_pi(state.heading_rad - float(now.heading_rad))
+        error = np.append(state.position_ned_m - now.position_ned_m, heading)
         summed = self._integral.add(error, self._held).copy()
-        summed[:3] = _turn(-state.course_rad) @ summed[:3]
+        summed[:3] = _turn(-state.heading_rad) @ summed[:3]
         return summed
 
-    def _command(self, move: Move, state: Array, target_course_rad: float) -> Command:
+    def _command(self, move: Move, state: Array, target_heading_rad: float) -> Command:
         gravity, limit = self._vehicle.gravity_mps2, self._vehicle.thrust_max_mps2
         thrust = gravity + float(move.inputs[THRUST]) / PAPER_MASS_KG
         phi, theta, psi = (float(angle) for angle in self._attitude(state, move.following))
-        course = target_course_rad + psi
+        heading = target_heading_rad + psi
         return Command(
-            min(max(thrust, 0.0), limit), _thrust_direction(phi, theta, course), wrap_pi(course)
+            min(max(thrust, 0.0), limit), _thrust_direction(phi, theta, heading), wrap_pi(heading)
         )
 
     def _attitude(self, state: Array, following: Array) -> Array:
@@ -153,16 +153,16 @@ def flyable_box(vehicle: Vehicle, settings: PaperSettings) -> tuple[Array, Array
 def heading_frame(state: PredictedState, target: FlatSample) -> tuple[Array, Array]:
     """State and reference (12,) of Eqs. 5 and 27, rotated by -psi and relative to the target.
 
-    The hover model is valid for a course of north only; in axes along and across the nose it is
-    valid for every course. Positions and course are relative to the target; velocities stay
+    The hover model is valid for a heading of north only; in axes along and across the nose it is
+    valid for every heading. Positions and heading are relative to the target; velocities stay
     absolute because drag acts on them.
     """
-    to_heading = _turn(-state.course_rad)
+    to_heading = _turn(-state.heading_rad)
     direction = to_heading @ state.thrust_direction_ned
     vector = np.zeros(12)
     vector[PHI] = math.asin(min(max(-direction[1], -1.0), 1.0))
     vector[THETA] = math.atan2(direction[0], direction[2])
-    vector[PSI] = wrap_pi(state.course_rad - float(target.course_rad))
+    vector[PSI] = wrap_pi(state.heading_rad - float(target.heading_rad))
     vector[P : R + 1] = state.rates_frd_radps
     vector[U : W + 1] = to_heading @ state.velocity_ned_mps
     vector[X : Z + 1] = to_heading @ (state.position_ned_m - target.position_ned_m)
@@ -172,7 +172,7 @@ def heading_frame(state: PredictedState, target: FlatSample) -> tuple[Array, Arr
 
 
 def _usable(state: PredictedState) -> bool:
-    return math.isfinite(state.course_rad) and all(
+    return math.isfinite(state.heading_rad) and all(
         np.isfinite(part).all()
         for part in (
             state.position_ned_m,

@@ -24,7 +24,7 @@ Weight = Annotated[float, Field(ge=0)]
 Limit = Annotated[float, Field(gt=0)]
 
 INTEGRATED = (X, X + 1, Z, PSI)  # indices in Eq. 5
-_MOVING = [PHI, THETA, P, Q, R, U, V, W]  # in the hover model independent of position and course
+_MOVING = [PHI, THETA, P, Q, R, U, V, W]  # in the hover model independent of position and heading
 _LOOK_AHEAD = 80  # steps of the regulator, after which all motion has ended
 _SLIGHT = 1e-9  # of an input's greatest influence on any condition: counts as none
 _REACH = 3.0  # the regulator uses a third of the input bounds at the limit of a state

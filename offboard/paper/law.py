@@ -53,7 +53,7 @@ class PaperSettings(Parameters):
     which the autopilot's attitude loop follows this prediction; without, a slow or well damped loop
     realises only a fraction of the torques.
 
-    `integral` adds the summed position and course error to the cost, `limits` keeps tilt, rates
+    `integral` adds the summed position and heading error to the cost, `limits` keeps tilt, rates
     and speeds within bounds; without them the law is the paper's.
     """
 

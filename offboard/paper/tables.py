@@ -245,7 +245,7 @@ def _errors_table(
         "ratio": "ratio", "ratio_sd": "± over seeds", "mark": "comparable?",
     }  # fmt: skip
     notes = (
-        "Sums over 1000 steps; velocities in m²/s², positions in m², course in degrees squared "
+        "Sums over 1000 steps; velocities in m²/s², positions in m², heading in degrees squared "
         "(radians could not give the printed magnitude). All on the linear plant. " + _MARKS[1],
         remark,
     )
@@ -316,9 +316,9 @@ def limited_states(flight: Flight, plant: PlantKind) -> dict[str, Array]:
     """Field of `StateLimits` -> greatest magnitude of the states that it limits, (K + 1,)."""
     states = flight.states
     north, east = states[:, U], states[:, V]
-    course = states[:, PSI] if plant is PlantKind.NONLINEAR else np.zeros(len(states))
-    along = np.cos(course) * north + np.sin(course) * east
-    across = np.cos(course) * east - np.sin(course) * north
+    heading = states[:, PSI] if plant is PlantKind.NONLINEAR else np.zeros(len(states))
+    along = np.cos(heading) * north + np.sin(heading) * east
+    across = np.cos(heading) * east - np.sin(heading) * north
     return {
         "tilt_rad": np.abs(states[:, PHI:PSI]).max(axis=1),
         "tilt_rate_radps": np.abs(states[:, P : P + 2]).max(axis=1),

@@ -1,1 +1,1 @@
-"""Trajectories to follow: time -> position, course and their derivatives -> state and input."""
+"""Trajectories to follow: time -> position, heading and their derivatives -> state and input."""

@@ -1,4 +1,4 @@
-"""The contract of every reference: position and course with their derivatives (flat outputs)."""
+"""The contract of every reference: position and heading with their derivatives (flat outputs)."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class FlatSample:
 
     Attributes:
         position_ned_m ... snap_ned_mps4: (..., 3), position and its first four derivatives.
-        course_rad: (...), heading of the nose: 0 = north, clockwise. Continuous along a reference,
+        heading_rad: (...), heading of the nose: 0 = north, clockwise. Continuous along a reference,
             so it may leave -pi .. pi.
-        course_rate_radps, course_acceleration_radps2: (...), its derivatives.
+        heading_rate_radps, heading_acceleration_radps2: (...), its derivatives.
     """
 
     position_ned_m: Array
@@ -27,9 +27,9 @@ class FlatSample:
     acceleration_ned_mps2: Array
     jerk_ned_mps3: Array
     snap_ned_mps4: Array
-    course_rad: Array
-    course_rate_radps: Array
-    course_acceleration_radps2: Array
+    heading_rad: Array
+    heading_rate_radps: Array
+    heading_acceleration_radps2: Array
 
 
 class Reference(Protocol):

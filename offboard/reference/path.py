@@ -1,7 +1,7 @@
 """Geometric paths: what a shape has to provide, and the two kinds that there are.
 
 A path maps its own time s (seconds at full speed) to a position and its derivatives with respect
-to s. Starting and stopping is added by `track`, where the nose points by `course`.
+to s. Starting and stopping is added by `track`, where the nose points by `heading`.
 """
 
 from __future__ import annotations

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.reference.base import FlatSample, Reference
-from offboard.reference.warp import compose_course, compose_position, warp
+from offboard.reference.warp import compose_heading, compose_position, warp
 
 Array = NDArray[np.float64]
 
@@ -72,13 +72,15 @@ class Paused:
                 ]
             ),
         )
-        course = compose_course(
+        heading = compose_heading(
             own,
-            np.stack([inner.course_rad, inner.course_rate_radps, inner.course_acceleration_radps2]),
+            np.stack(
+                [inner.heading_rad, inner.heading_rate_radps, inner.heading_acceleration_radps2]
+            ),
         )
         return FlatSample(
             *(derivative.reshape(*time.shape, 3) for derivative in position),
-            *(derivative.reshape(time.shape) for derivative in course),
+            *(derivative.reshape(time.shape) for derivative in heading),
         )
 
     def _own(self, time_s: Array) -> Array:

@@ -18,7 +18,7 @@ from pydantic import Field, model_validator
 
 from offboard.documents.parameters import Parameters
 from offboard.reference import table, waypoints
-from offboard.reference.course import Course, Fixed, Tabulated, along_velocity
+from offboard.reference.heading import Fixed, Heading, Tabulated, along_velocity
 from offboard.reference.path import Harmonic, Path
 from offboard.reference.track import Track, path_end_s
 
@@ -32,8 +32,8 @@ Speed = Annotated[float, Field(gt=0.05, le=30)]
 Climb = Annotated[float, Field(ge=-5, le=5)]
 
 
-class CourseMode(StrEnum):
-    """Where the nose points: a fixed course, along the horizontal velocity, as in the table."""
+class HeadingMode(StrEnum):
+    """Where the nose points: a fixed heading, along the horizontal velocity, as in the table."""
 
     FIXED = "fixed"
     ALONG_VELOCITY = "along_velocity"
@@ -42,7 +42,7 @@ class CourseMode(StrEnum):
 
 class Shape(Parameters, ABC):
     """What every shape has. Its origin is `height_m` above the ground, and north and east of the
-    take-off point; `course_deg` is the fixed course, clockwise from north.
+    take-off point; `course_deg` is the fixed heading, clockwise from north.
 
     Speed is gained within `run_in_s` and lost within `run_out_s`; see `Track`.
     """
@@ -51,7 +51,7 @@ class Shape(Parameters, ABC):
     height_m: Height = 3.0
     origin_north_m: Coordinate = 0.0
     origin_east_m: Coordinate = 0.0
-    course: Literal[CourseMode.FIXED, CourseMode.ALONG_VELOCITY] = CourseMode.FIXED
+    course: Literal[HeadingMode.FIXED, HeadingMode.ALONG_VELOCITY] = HeadingMode.FIXED
     course_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
     run_in_s: Seconds = 4.0
     run_out_s: Seconds = 3.0
@@ -68,16 +68,16 @@ class Shape(Parameters, ABC):
         where the runs do not fit (see `Track`)."""
         path = self.path()
         origin_ned_m = (self.origin_north_m, self.origin_east_m, -float(self.height_m))
-        return Track(path, self._course(path), self.run_in_s, self.run_out_s, origin_ned_m)
+        return Track(path, self._heading(path), self.run_in_s, self.run_out_s, origin_ned_m)
 
     @property
     def title(self) -> str:
         """What errors call it."""
         return self.shape
 
-    def _course(self, path: Path) -> Course:
+    def _heading(self, path: Path) -> Heading:
         fixed_rad = math.radians(self.course_deg)
-        if self.course is CourseMode.ALONG_VELOCITY:
+        if self.course is HeadingMode.ALONG_VELOCITY:
             return along_velocity(path, path_end_s(path, self.run_in_s, self.run_out_s), fixed_rad)
         return Fixed(fixed_rad)
 
@@ -210,7 +210,7 @@ class FromTable(Shape):
     text: str | None = None
     height_m: Literal[0] = 0
     knot_spacing_s: Annotated[float, Field(ge=0, le=60)] = 0.0
-    course: CourseMode = CourseMode.TABLE  # type: ignore[assignment]  # one more choice
+    course: HeadingMode = HeadingMode.TABLE  # type: ignore[assignment]  # one more choice
     run_in_s: Seconds = 2.0
     run_out_s: Seconds = 2.0
 
@@ -222,11 +222,11 @@ class FromTable(Shape):
         rows = self._rows()
         return table.interpolate(rows.times_s, rows.points_ned_m, self.knot_spacing_s)
 
-    def _course(self, path: Path) -> Course:
-        if self.course is CourseMode.TABLE and (rows := self._rows()).course_rad is not None:
-            column = rows.course_rad[:, np.newaxis]
+    def _heading(self, path: Path) -> Heading:
+        if self.course is HeadingMode.TABLE and (rows := self._rows()).heading_rad is not None:
+            column = rows.heading_rad[:, np.newaxis]
             return Tabulated(table.interpolate(rows.times_s, column, self.knot_spacing_s))
-        return super()._course(path)
+        return super()._heading(path)
 
     def _rows(self) -> table.Table:
         if self.text is None:

@@ -2,7 +2,7 @@
 
 Columns of a table, named in the first row, in any order: `time_s`; `north_m` or `x`, `x_m`;
 `east_m` or `y`, `y_m`; `down_m` or `z`, `z_m` (positive down), or `altitude_m` (positive up);
-optionally `course_deg` (heading of the nose, clockwise from north). Other columns are refused.
+optionally `course_deg` (heading, clockwise from north). Other columns are refused.
 """
 
 from __future__ import annotations
@@ -40,11 +40,11 @@ class TableError(ValueError):
 
 @dataclass(frozen=True, slots=True)
 class Table:
-    """The rows: times_s (N,) from 0, points_ned_m (N, 3), course_rad (N,) unwrapped, or None."""
+    """The rows: times_s (N,) from 0, points_ned_m (N, 3), heading_rad (N,) unwrapped, or None."""
 
     times_s: Array
     points_ned_m: Array
-    course_rad: Array | None
+    heading_rad: Array | None
 
 
 def parse(text: str, name: str) -> Table:
@@ -76,9 +76,9 @@ def parse(text: str, name: str) -> Table:
             f"{name} lasts {times[-1] - times[0]:.12g} s: at most {DURATION_MAX_S:.0f} s are flown"
         )
     down = by_name["down_m"] if "down_m" in by_name else -by_name["altitude_m"]
-    course = np.unwrap(np.radians(by_name["course_deg"])) if "course_deg" in by_name else None
+    heading = np.unwrap(np.radians(by_name["course_deg"])) if "course_deg" in by_name else None
     points = np.stack([by_name["north_m"], by_name["east_m"], down], axis=1)
-    return Table(times - times[0], points, course)
+    return Table(times - times[0], points, heading)
 
 
 def interpolate(times_s: Array, values: Array, knot_spacing_s: float = 0.0) -> Polynomial:

@@ -14,9 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from offboard.reference.base import FlatSample
-from offboard.reference.course import Course
+from offboard.reference.heading import Heading
 from offboard.reference.path import Path
-from offboard.reference.warp import compose_course, compose_position, warp
+from offboard.reference.warp import compose_heading, compose_position, warp
 
 Array = NDArray[np.float64]
 
@@ -25,8 +25,8 @@ _REST_SPEED_MPS = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class Track:
-    """A `Reference` from rest to rest, continuous to snap in position and to acceleration in course
-    (without a run, at that end, as continuous as the path is there).
+    """A `Reference` from rest to rest, continuous to snap in position and to acceleration in
+    heading (without a run, at that end, as continuous as the path is there).
 
     Time 0 is the start of the run-in; positions are NED relative to the take-off point. Raises
     ValueError where the runs do not fit in a bounded path, or a run is zero and the path moves at
@@ -34,7 +34,7 @@ class Track:
     """
 
     path: Path
-    course: Course
+    heading: Heading
     run_in_s: float
     run_out_s: float
     origin_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -96,10 +96,10 @@ class Track:
         path_jet = self.path.jet(s[0])
         position = compose_position(s, path_jet)
         position[0] += self.origin_ned_m
-        course = compose_course(s, self.course.jet(s[0], path_jet))
+        heading = compose_heading(s, self.heading.jet(s[0], path_jet))
         return FlatSample(
             *(derivative.reshape(*shape, 3) for derivative in position),
-            *(derivative.reshape(shape) for derivative in course),
+            *(derivative.reshape(shape) for derivative in heading),
         )
 
 

@@ -35,7 +35,7 @@ class Limits:
 
     speed_mps: float = 1.5
     acceleration_mps2: float = 2.0
-    course_rate_radps: float = 0.8
+    heading_rate_radps: float = 0.8
     # Constant speed of a long transfer between its run-in and run-out (PX4: MPC_XY_CRUISE 5 m/s,
     # MPC_Z_V_AUTO_DN 1.5 m/s)
     cruise_mps: float = 4.0
@@ -44,9 +44,9 @@ class Limits:
 
 @dataclass(frozen=True, slots=True)
 class Transfer:
-    """Polynomials of degree 9 in position and course; at rest, to snap, at their end.
+    """Polynomials of degree 9 in position and heading; at rest, to snap, at their end.
 
-    `polynomial` has the columns north, east, down (m) and course (rad). Before time 0 it rests
+    `polynomial` has the columns north, east, down (m) and heading (rad). Before time 0 it rests
     at its start, after `duration_s` at its target.
     """
 
@@ -83,15 +83,15 @@ def _brake_s(velocity: Array, limits: Limits) -> float:
 def transfer(
     start_ned_m: Vector,
     target_ned_m: Vector,
-    start_course_rad: float,
-    target_course_rad: float,
+    start_heading_rad: float,
+    target_heading_rad: float,
     limits: Limits = Limits(),
     *,
     start_velocity_ned_mps: Vector = (0.0, 0.0, 0.0),
 ) -> Transfer:
     """From a start (3,), NED, to rest at a target (3,), about as fast as the limits allow.
 
-    The course turns the short way: it ends at `target_course_rad` plus the whole turns that are
+    The heading turns the short way: it ends at `target_heading_rad` plus the whole turns that are
     nearest to the start. A start that is too fast, or does not move towards the target, is first
     braked to rest in the direction of its motion (the ground is not considered). A long transfer is
     flown straight, at constant speed between gaining and losing it. Raises ValueError for anything
@@ -101,11 +101,11 @@ def transfer(
         np.asarray(list(vector), dtype=np.float64)
         for vector in (start_ned_m, target_ned_m, start_velocity_ned_mps)
     )
-    turn_rad = math.remainder(target_course_rad - start_course_rad, 2.0 * math.pi)
+    turn_rad = math.remainder(target_heading_rad - start_heading_rad, 2.0 * math.pi)
     begin, end = np.zeros((5, 4)), np.zeros((5, 4))
-    begin[0] = *start, start_course_rad
+    begin[0] = *start, start_heading_rad
     begin[1, :3] = velocity
-    end[0] = *target, start_course_rad + turn_rad
+    end[0] = *target, start_heading_rad + turn_rad
     if not (np.all(np.isfinite(begin)) and np.all(np.isfinite(end))):
         raise ValueError("a transfer needs a finite start and a finite target")
     if _moves_well(begin, end, limits):
@@ -148,7 +148,7 @@ def _shortest(begin: Array, end: Array, limits: Limits) -> Polynomial:
     turn_rad = abs(float(end[0, 3] - begin[0, 3]))
     # no polynomial is faster than the mean speed or turn rate
     duration_s = max(
-        _DURATION_MIN_S, distance_m / limits.speed_mps, turn_rad / limits.course_rate_radps
+        _DURATION_MIN_S, distance_m / limits.speed_mps, turn_rad / limits.heading_rate_radps
     )
     while True:
         candidate = _through([0.0, duration_s], [begin, end])
@@ -158,8 +158,8 @@ def _shortest(begin: Array, end: Array, limits: Limits) -> Polynomial:
 
 
 def _cruise(start: Array, target: Array, limits: Limits) -> list[tuple[float, Array]]:
-    """Duration and end of three legs from rest to rest, (4,) in position and course: gaining speed,
-    keeping it, losing it."""
+    """Duration and end of three legs from rest to rest, (4,) in position and heading: gaining
+    speed, keeping it, losing it."""
     way = target - start
     speed_mps = _cruise_mps(way, limits)
     ramp_s = _SMOOTH_PEAK * speed_mps / limits.acceleration_mps2
@@ -176,12 +176,12 @@ def _length_m(way: Array) -> float:
 
 
 def _cruise_mps(way: Array, limits: Limits) -> float:
-    """Speed along a way (4,) in position and course; a short one is mostly ramps."""
+    """Speed along a way (4,) in position and heading; a short one is mostly ramps."""
     distance_m = _length_m(way)
     return min(
         max(limits.cruise_mps, limits.speed_mps),
         limits.cruise_vertical_mps * distance_m / max(abs(float(way[2])), 1e-6),
-        limits.course_rate_radps * distance_m / max(abs(float(way[3])), 1e-6),
+        limits.heading_rate_radps * distance_m / max(abs(float(way[3])), 1e-6),
         math.sqrt(_RAMPS_SHARE * distance_m * limits.acceleration_mps2 / _SMOOTH_PEAK),
     )
 
@@ -200,16 +200,16 @@ def _excess(polynomial: Polynomial, limits: Limits) -> float:
     return max(
         float(np.linalg.norm(jet[1, :, :3], axis=-1).max()) / limits.speed_mps,
         float(np.linalg.norm(jet[2, :, :3], axis=-1).max()) / limits.acceleration_mps2,
-        float(np.abs(jet[1, :, 3]).max()) / limits.course_rate_radps,
+        float(np.abs(jet[1, :, 3]).max()) / limits.heading_rate_radps,
     )
 
 
 @dataclass(frozen=True, slots=True)
 class Hold:
-    """Rest at a point (NED, m) with a course (rad)."""
+    """Rest at a point (NED, m) with a heading (rad)."""
 
     position_ned_m: tuple[float, float, float]
-    course_rad: float
+    heading_rad: float
     duration_s: float = 0.0
 
     def sample(self, time_s: float | Array) -> FlatSample:
@@ -217,9 +217,9 @@ class Hold:
         shape = np.shape(time_s)
         vectors = np.zeros((5, *shape, 3))
         vectors[0] = self.position_ned_m
-        course = np.zeros((3, *shape))
-        course[0] = self.course_rad
-        return FlatSample(*vectors, *(derivative.reshape(shape) for derivative in course))
+        heading = np.zeros((3, *shape))
+        heading[0] = self.heading_rad
+        return FlatSample(*vectors, *(derivative.reshape(shape) for derivative in heading))
 
 
 @dataclass(frozen=True, slots=True)

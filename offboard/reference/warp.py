@@ -67,7 +67,7 @@ def compose_position(s: Array, path: Array) -> Array:
     )
 
 
-def compose_course(s: Array, course: Array) -> Array:
-    """Course, rate and acceleration by time (3, N) of a course (3, N) at s(t) (5, N)."""
-    c0, c1, c2 = course
+def compose_heading(s: Array, heading: Array) -> Array:
+    """Heading, rate and acceleration by time (3, N) of a heading (3, N) at s(t) (5, N)."""
+    c0, c1, c2 = heading
     return np.array([c0, c1 * s[1], c2 * s[1] ** 2 + c1 * s[2]])

@@ -80,7 +80,7 @@ def tracking(flown: History) -> tuple[Panel, ...]:
 
 
 def attitude(flown: History) -> tuple[Panel, ...]:
-    """Roll, pitch and course, commanded and flown."""
+    """Roll, pitch and heading, commanded and flown."""
     sent = _euler_deg(flown.setpoint[:, 2:6])
     estimated = _euler_deg(flown.attitude[:, 1:5])
     return tuple(
@@ -91,7 +91,7 @@ def attitude(flown: History) -> tuple[Panel, ...]:
                 Curve(ESTIMATED, flown.attitude[:, 0], estimated[:, axis], BLUE),
             ),
         )
-        for axis, title in enumerate(("roll", "pitch", "course"))
+        for axis, title in enumerate(("roll", "pitch", "heading"))
     )
 
 
@@ -220,7 +220,7 @@ def _away(flown: History, rows: Array) -> tuple[Array, Array]:
 
 
 def _euler_deg(quaternions: Array) -> Array:
-    """Roll, pitch and course to 1e-4 deg, with a gap where one of them wraps."""
+    """Roll, pitch and heading to 1e-4 deg, with a gap where one of them wraps."""
     angles: Array = np.degrees(euler_from_quaternion(quaternions))
     angles = np.asarray(np.round(angles, 4), np.float64)
     angles[1:][np.abs(np.diff(angles, axis=0)) > 180.0] = np.nan

@@ -101,12 +101,12 @@ def test_mcap(flight: Path, messages: dict[tuple[str, bool], list[Any]], tmp_pat
         place = pose.pose.position
         assert (place.x, place.y, place.z) == pytest.approx((sent.y, sent.x, -sent.z))
         attitude = attitudes.get(sent.time_boot_ms)
-        if attitude is not None:  # course clockwise from north -> yaw anticlockwise from east
+        if attitude is not None:  # heading clockwise from north -> yaw anticlockwise from east
             turned = pose.pose.orientation
             ned = Rotation.from_quat([attitude.q2, attitude.q3, attitude.q4, attitude.q1])
             flu = Rotation.from_quat([turned.x, turned.y, turned.z, turned.w])
-            course, yaw = ned.as_euler("ZYX")[0], flu.as_euler("ZYX")[0]
-            assert math.remainder(math.pi / 2 - course - yaw, math.tau) == pytest.approx(
+            heading, yaw = ned.as_euler("ZYX")[0], flu.as_euler("ZYX")[0]
+            assert math.remainder(math.pi / 2 - heading - yaw, math.tau) == pytest.approx(
                 0, abs=1e-6
             )
             assert flu.as_euler("ZYX")[2] == pytest.approx(ned.as_euler("ZYX")[2], abs=1e-6)

@@ -191,10 +191,10 @@ THRUST = st.one_of(st.floats(-5.0, 50.0), ANY)
 ANGLE = st.floats(-math.pi, math.pi)
 
 
-def leaning(tilt_rad: float, course_rad: float, length: float) -> tuple[float, float, float]:
+def leaning(tilt_rad: float, heading_rad: float, length: float) -> tuple[float, float, float]:
     lateral = length * math.sin(tilt_rad)
     down = length * math.cos(tilt_rad)
-    return lateral * math.cos(course_rad), lateral * math.sin(course_rad), down
+    return lateral * math.cos(heading_rad), lateral * math.sin(heading_rad), down
 
 
 LENGTH = st.one_of(st.sampled_from([0.988, 1.012]), st.floats(0.98, 1.02), st.floats(0.0, 1e200))
@@ -228,10 +228,10 @@ LATER = st.one_of(SOON, st.floats(0.0, 4.0))
 
 def numbers(command: Command | PositionCommand) -> np.ndarray:
     if isinstance(command, Command):
-        fields = (command.thrust_mps2, *command.thrust_direction_ned, command.course_rad)
+        fields = (command.thrust_mps2, *command.thrust_direction_ned, command.heading_rad)
     else:
         vectors = command.position_ned_m, command.velocity_ned_mps, command.acceleration_ned_mps2
-        fields = (*np.ravel(vectors), command.course_rad, command.course_rate_radps)
+        fields = (*np.ravel(vectors), command.heading_rad, command.heading_rate_radps)
     return np.array(fields, dtype=np.float64)
 
 
@@ -314,7 +314,7 @@ def test_flights_of_one_tick(
         float(np.clip(command.thrust_mps2, least_mps2, MOST_MPS2)), abs=1e-12
     )
     assert is_usable(sent)
-    assert sent.course_rad == command.course_rad
+    assert sent.heading_rad == command.heading_rad
     assert tilt_of(sent) <= VEHICLE.tilt_max_rad + 1e-9
     if tilt_of(command) <= VEHICLE.tilt_max_rad - 1e-9:
         assert sent.thrust_direction_ned == command.thrust_direction_ned

@@ -31,17 +31,17 @@ def test_turning_through_all_headings(climb_mps: float, height_m: float, tmp_pat
     pair.track()
     score = pair.score(tmp_path)
     assert score.rmse_position_m < 0.01
-    assert score.rmse_course_deg < 2.0
+    assert score.rmse_heading_deg < 2.0
 
 
-@pytest.mark.parametrize("course_deg", [-90.0, 90.0, 180.0])
-def test_facing_every_way(course_deg: float, tmp_path: Path) -> None:
+@pytest.mark.parametrize("heading_deg", [-90.0, 90.0, 180.0])
+def test_facing_every_way(heading_deg: float, tmp_path: Path) -> None:
     """At 180 degrees the reported heading jumps between both sides of the wrap."""
-    pair = make(f"reference.course_deg={course_deg}", "reference.laps=1", scenario="px4_like")
+    pair = make(f"reference.course_deg={heading_deg}", "reference.laps=1", scenario="px4_like")
     pair.track()
     score = pair.score(tmp_path)
     assert score.rmse_position_m < 0.05
-    assert score.rmse_course_deg < 2.0
+    assert score.rmse_heading_deg < 2.0
 
 
 def swapped(monkeypatch: pytest.MonkeyPatch, sign: Callable[[AttitudeTarget], Any]) -> Pair:
@@ -62,7 +62,7 @@ def test_a_swapped_lean_is_stopped(signs: Triple, monkeypatch: pytest.MonkeyPatc
     assert "deg away from every recent command" in outcome.sentence
 
 
-def test_a_swapped_course_is_scored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    pair = swapped(monkeypatch, lambda target: replace(target, course_rad=-target.course_rad))
+def test_a_swapped_heading_is_scored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    pair = swapped(monkeypatch, lambda target: replace(target, heading_rad=-target.heading_rad))
     pair.track()  # b does not depend on it
-    assert pair.score(tmp_path).rmse_course_deg > 60.0
+    assert pair.score(tmp_path).rmse_heading_deg > 60.0

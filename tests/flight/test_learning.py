@@ -436,7 +436,7 @@ def test_observer_goes_on_smoothly_with_another_drag():
 @pytest.mark.parametrize(
     ("tilt_s", "thrust_s", "yaw_s"), [(0.24, 0.21, 0.4), (0.06, 0.01, 0.2), (0.02, 0.01, 0.2)]
 )
-def test_delay_that_the_link_adds_to_tilt_is_added_to_thrust_and_course(tilt_s, thrust_s, yaw_s):
+def test_delay_that_the_link_adds_to_tilt_is_added_to_thrust_and_heading(tilt_s, thrust_s, yaw_s):
     """The vehicle file's are 0.04, 0.01 and 0.2 s; a small difference is the vehicle's own."""
     fit = ResponseFit(Estimate(tilt_s, 0.002), Estimate(11.0, 0.1), Estimate(0.8, 0.01), 0.0, 0.1)
     found = Identified(4.0, tilt=fit)

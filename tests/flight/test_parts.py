@@ -63,7 +63,7 @@ def test_clamp_changes_only_what_exceeds_the_limits(vehicle: Vehicle) -> None:
         assert np.linalg.norm(given) == pytest.approx(1.0)
         assert given[2] >= math.cos(vehicle.tilt_max_rad) - 1e-9
         assert 0.0 <= clamped.thrust_mps2 <= vehicle.thrust_max_mps2
-        assert clamped.course_rad == 0.3
+        assert clamped.heading_rad == 0.3
         across = direction[0] * given[1] - direction[1] * given[0]
         assert across == pytest.approx(0.0, abs=1e-9)
         assert direction[:2] @ given[:2] > 0.0

@@ -119,9 +119,9 @@ def test_free_fall_is_half_g_t_squared(dragless: Vehicle, chart: Chart) -> None:
 
 
 @CHARTS
-def test_hover_is_an_equilibrium_at_every_course(lopsided: Vehicle, chart: Chart) -> None:
-    for course in np.linspace(-3.0, 3.0, 7):
-        state = as_chart(np.array([0, 0, course, 0, 0, 0, 0, 0, 0, 5.0, -7.0, -3.0]), chart)
+def test_hover_is_an_equilibrium_at_every_heading(lopsided: Vehicle, chart: Chart) -> None:
+    for heading in np.linspace(-3.0, 3.0, 7):
+        state = as_chart(np.array([0, 0, heading, 0, 0, 0, 0, 0, 0, 5.0, -7.0, -3.0]), chart)
         assert_allclose(derivative(state, hover_input(lopsided), pack(lopsided)), 0, atol=1e-15)
 
 

@@ -142,14 +142,14 @@ def test_crash_upside_down_at_speed_is_survived_and_ends_level():
     assert np.abs(truth.velocity_ned_mps).max() < 1e-12
 
 
-def test_course_survives_standing_on_the_ground():
+def test_heading_survives_standing_on_the_ground():
     plant = hovering(PX4)
     plant.advance(4.0, Demand(True, PX4.hover_thrust, attitude(yaw_deg=70.0)))
-    course = euler_from_quaternion(plant.truth.attitude)[2]
+    heading = euler_from_quaternion(plant.truth.attitude)[2]
     plant.advance(6.0, Demand(False))
     assert plant.truth.on_ground
-    assert euler_from_quaternion(plant.truth.attitude)[2] == pytest.approx(course, abs=0.05)
-    assert math.degrees(course) == pytest.approx(70.0, abs=2.0)
+    assert euler_from_quaternion(plant.truth.attitude)[2] == pytest.approx(heading, abs=0.05)
+    assert math.degrees(heading) == pytest.approx(70.0, abs=2.0)
 
 
 @pytest.mark.parametrize(("thrust_scale", "mass_scale"), [(0.85, 1.0), (1.0, 1.2), (0.85, 1.2)])

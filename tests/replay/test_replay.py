@@ -99,7 +99,7 @@ def test_a_changed_law_is_found_at_its_first_decision(
         decision = decide(self, situation)
         command = decision.command
         more = type(command)(
-            command.thrust_mps2 + 0.01, command.thrust_direction_ned, command.course_rad
+            command.thrust_mps2 + 0.01, command.thrust_direction_ned, command.heading_rad
         )
         return type(decision)(more, decision.certificate)
 

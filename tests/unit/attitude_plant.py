@@ -49,7 +49,7 @@ class Truth:
 @numba.njit(cache=True)
 def _run(x, errors, commands, walks, drifts, constants, wind):
     """x = [p (3), v (3), b_est (2), b_est' (2), T, psi, psi'], commands (n, 4) = [b_n, b_e, T,
-    course], one row per step; errors (3, 3) as DRIFTS; walks (n, 3, 3) their increments."""
+    heading], one row per step; errors (3, 3) as DRIFTS; walks (n, 3, 3) their increments."""
     g, c, wn, z, lag, wy, zy, limit = constants
     h = STEP_S
     for i in range(len(commands)):
@@ -83,7 +83,7 @@ class Plant:
 
     def __post_init__(self) -> None:
         vehicle = self.truth.vehicle
-        self.sent = np.empty((0, 5))  # time, b_n, b_e, thrust, course
+        self.sent = np.empty((0, 5))  # time, b_n, b_e, thrust, heading
         if self.x[10] == 0.0:
             self.x[10] = vehicle.gravity_mps2
         self.constants = (
@@ -99,7 +99,7 @@ class Plant:
 
     def command(self, command: Command) -> None:
         north, east, _ = command.thrust_direction_ned
-        sent = (self.time_s, north, east, command.thrust_mps2, command.course_rad)
+        sent = (self.time_s, north, east, command.thrust_mps2, command.heading_rad)
         self.sent = np.vstack((self.sent[-30:], sent))
 
     def advance(self, interval_s: float) -> None:
@@ -145,7 +145,7 @@ class Lemniscate:
 
     period_s: float
     run_in_s: float = 4.0
-    course_rad: float = 0.0
+    heading_rad: float = 0.0
     heave_m: float = 0.0
 
     @property
@@ -164,7 +164,7 @@ class Lemniscate:
         for order in range(5):
             derivatives.append(np.stack([north[order], east[order], down[order]], axis=-1))
         zero = np.zeros_like(time)
-        return FlatSample(*derivatives, zero + self.course_rad, zero, zero)
+        return FlatSample(*derivatives, zero + self.heading_rad, zero, zero)
 
 
 def _run_in(time: np.ndarray, run_in_s: float) -> list[np.ndarray]:
@@ -218,7 +218,7 @@ def fly(
     plant.x[:3] = reference.sample(0.0).position_ned_m + np.array(offset_ned_m)
     plant.x[10] = believed.gravity_mps2
     observer = Observer(believed, noise)
-    command = Command(believed.gravity_mps2, (0.0, 0.0, 1.0), reference.course_rad)
+    command = Command(believed.gravity_mps2, (0.0, 0.0, 1.0), reference.heading_rad)
     plant.command(command)
     observer.on_command(0.0, command)
     times, positions, rates, bounds = [], [], [], []

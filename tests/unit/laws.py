@@ -60,8 +60,8 @@ def state_of(rng: np.random.Generator, reference: Lemniscate, size: float) -> Pr
         velocity_ned_mps=sample.velocity_ned_mps + size * rng.normal(size=3),
         thrust_direction_ned=np.array([*tilt, math.sqrt(1 - tilt @ tilt)]),
         thrust_direction_rate_ned_ps=np.array([*(0.2 * size * rng.normal(size=2)), 0.0]),
-        course_rad=0.0,
-        course_rate_radps=0.0,
+        heading_rad=0.0,
+        heading_rate_radps=0.0,
         thrust_mps2=G + 0.3 * size * rng.normal(),
         disturbance_ned_mps2=0.3 * size * rng.normal(size=3),
         rates_frd_radps=np.zeros(3),
@@ -73,9 +73,9 @@ def law_named(name: str) -> Controller:
     return settings_of(name)(law=name, **chosen).build(PX4, period_s=0.1, seed=7)
 
 
-def at(position: tuple[float, float, float], course_rad: float) -> PredictedState:
+def at(position: tuple[float, float, float], heading_rad: float) -> PredictedState:
     """At rest and level."""
     return PredictedState(
         0.057, np.array(position), np.zeros(3), np.array([0.0, 0.0, 1.0]), np.zeros(3),
-        course_rad, 0.0, G, np.zeros(3), np.zeros(3),
+        heading_rad, 0.0, G, np.zeros(3), np.zeros(3),
     )  # fmt: skip

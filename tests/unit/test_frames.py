@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from offboard.model.frames import (
-    course_from_quaternion,
     euler_from_quaternion,
+    heading_from_quaternion,
     quaternion_from_euler,
     quaternion_from_thrust_direction,
     rotation_from_quaternion,
@@ -65,9 +65,9 @@ def test_euler_angles_survive_gimbal_lock(nose: float, short_of_it: float) -> No
     assert angle_between(quaternion, again) < 1e-13
 
 
-def test_course_is_the_heading_of_the_nose() -> None:
+def test_heading_is_the_heading_of_the_nose() -> None:
     nose = RANDOM.apply([1.0, 0.0, 0.0])
-    assert_allclose(course_from_quaternion(QUATERNIONS), np.arctan2(nose[:, 1], nose[:, 0]))
+    assert_allclose(heading_from_quaternion(QUATERNIONS), np.arctan2(nose[:, 1], nose[:, 0]))
 
 
 def test_rotation_matrix_is_scipys() -> None:
@@ -82,17 +82,17 @@ def test_thrust_direction_is_the_third_body_axis() -> None:
 
 @given(angles, st.floats(0, math.pi), angles, st.floats(0.01, 100))
 def test_attitude_from_thrust_direction_has_both(
-    azimuth: float, tilt: float, course: float, length: float
+    azimuth: float, tilt: float, heading: float, length: float
 ) -> None:
-    """Any direction, also upside down: the third axis is b, the nose points along the course."""
+    """Any direction, also upside down: the third axis is b, the nose points along the heading."""
     direction = np.array(
         [math.sin(tilt) * math.cos(azimuth), math.sin(tilt) * math.sin(azimuth), math.cos(tilt)]
     )
-    attitude = scipy_rotation(quaternion_from_thrust_direction(length * direction, course))
+    attitude = scipy_rotation(quaternion_from_thrust_direction(length * direction, heading))
     assert_allclose(attitude.apply([0, 0, 1]), direction, atol=1e-14)
     nose = attitude.apply([1, 0, 0])
-    across = nose[1] * math.cos(course) - nose[0] * math.sin(course)
-    ahead = nose[0] * math.cos(course) + nose[1] * math.sin(course)
+    across = nose[1] * math.cos(heading) - nose[0] * math.sin(heading)
+    ahead = nose[0] * math.cos(heading) + nose[1] * math.sin(heading)
     assert abs(across) < 1e-14
     assert ahead > -1e-14
 
@@ -101,23 +101,25 @@ def test_attitude_from_thrust_direction_is_the_textbooks_frame() -> None:
     """y_C = (-sin psi, cos psi, 0), x_b = y_C x z_b normalised, y_b = z_b x x_b."""
     generator = np.random.default_rng(6)
     direction = generator.normal(size=(200, 3)) * [1, 1, 0] + [0, 0, 1.2]
-    course = generator.uniform(-np.pi, np.pi, 200)
+    heading = generator.uniform(-np.pi, np.pi, 200)
     z_b = direction / np.linalg.norm(direction, axis=1, keepdims=True)
-    x_b = np.cross(np.stack([-np.sin(course), np.cos(course), 0 * course], axis=1), z_b)
+    x_b = np.cross(np.stack([-np.sin(heading), np.cos(heading), 0 * heading], axis=1), z_b)
     x_b /= np.linalg.norm(x_b, axis=1, keepdims=True)
     expected = np.stack([x_b, np.cross(z_b, x_b), z_b], axis=2)
-    attitude = scipy_rotation(quaternion_from_thrust_direction(direction, course))
+    attitude = scipy_rotation(quaternion_from_thrust_direction(direction, heading))
     assert_allclose(attitude.as_matrix(), expected, atol=1e-14)
 
 
-@pytest.mark.parametrize("course", [0.0, 0.7, -2.5])
+@pytest.mark.parametrize("heading", [0.0, 0.7, -2.5])
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_thrust_sideways_keeps_the_course(course: float, side: float) -> None:
-    """b along the course's own y axis leaves the nose undetermined by the cross product."""
-    direction = side * np.array([-math.sin(course), math.cos(course), 0.0])
-    attitude = scipy_rotation(quaternion_from_thrust_direction(direction, course))
+def test_thrust_sideways_keeps_the_heading(heading: float, side: float) -> None:
+    """b along the heading's own y axis leaves the nose undetermined by the cross product."""
+    direction = side * np.array([-math.sin(heading), math.cos(heading), 0.0])
+    attitude = scipy_rotation(quaternion_from_thrust_direction(direction, heading))
     assert_allclose(attitude.apply([0, 0, 1]), direction, atol=1e-15)
-    assert_allclose(attitude.apply([1, 0, 0]), [math.cos(course), math.sin(course), 0], atol=1e-15)
+    assert_allclose(
+        attitude.apply([1, 0, 0]), [math.cos(heading), math.sin(heading), 0], atol=1e-15
+    )
 
 
 @pytest.mark.parametrize(
@@ -131,17 +133,17 @@ def test_no_usable_thrust_direction_is_level(direction: tuple[float, float, floa
 
 @given(any_float, any_float, any_float, any_float)
 def test_an_attitude_is_finite_and_unit_whatever_is_asked(
-    north: float, east: float, down: float, course: float
+    north: float, east: float, down: float, heading: float
 ) -> None:
-    quaternion = quaternion_from_thrust_direction((north, east, down), course)
+    quaternion = quaternion_from_thrust_direction((north, east, down), heading)
     assert np.linalg.norm(quaternion) == pytest.approx(1.0, abs=1e-15)
 
 
-@pytest.mark.parametrize("course", [math.nan, math.inf, -math.inf])
-def test_a_course_that_is_none_is_north(course: float) -> None:
+@pytest.mark.parametrize("heading", [math.nan, math.inf, -math.inf])
+def test_a_heading_that_is_none_is_north(heading: float) -> None:
     direction = [0.1, -0.2, 0.9]
     assert_array_equal(
-        quaternion_from_thrust_direction(direction, course),
+        quaternion_from_thrust_direction(direction, heading),
         quaternion_from_thrust_direction(direction, 0.0),
     )
 
@@ -169,12 +171,12 @@ def test_leading_axes_broadcast_and_single_values_agree() -> None:
     other = QUATERNIONS[:100]
     angle = euler_from_quaternion(many)
     direction = thrust_direction_from_quaternion(many)
-    course = course_from_quaternion(other)
+    heading = heading_from_quaternion(other)
     results = {
         "euler": (angle, lambda i, j: euler_from_quaternion(many[i, j])),
-        "course": (
-            course_from_quaternion(many),
-            lambda i, j: np.asarray(course_from_quaternion(many[i, j])),
+        "heading": (
+            heading_from_quaternion(many),
+            lambda i, j: np.asarray(heading_from_quaternion(many[i, j])),
         ),
         "matrix": (
             rotation_from_quaternion(many),
@@ -182,8 +184,8 @@ def test_leading_axes_broadcast_and_single_values_agree() -> None:
         ),
         "direction": (direction, lambda i, j: thrust_direction_from_quaternion(many[i, j])),
         "attitude": (
-            quaternion_from_thrust_direction(direction, course),
-            lambda i, j: quaternion_from_thrust_direction(direction[i, j], course[j]),
+            quaternion_from_thrust_direction(direction, heading),
+            lambda i, j: quaternion_from_thrust_direction(direction[i, j], heading[j]),
         ),
         "from euler": (
             quaternion_from_euler(angle[..., 0], angle[..., 1], 0.5),

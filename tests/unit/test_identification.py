@@ -154,7 +154,7 @@ def test_standard_deviations_agree_with_repeated_fits():
 
 
 @pytest.mark.parametrize("white", [0.0, 0.001])
-def test_standard_deviations_of_a_course_whose_errors_wander(white):
+def test_standard_deviations_of_a_heading_whose_errors_wander(white):
     """Sixty stretches of 5.4 s with one double step, as in the phase EXCITE; errors of PX4's
     estimate, 16 mrad per root second. The residuals themselves would claim 40 % of the delay's."""
     true = np.array([0.15, 3.1, 0.4])
@@ -167,9 +167,9 @@ def test_standard_deviations_of_a_course_whose_errors_wander(white):
     for seed in range(60):
         generator = np.random.default_rng(seed)
         walk = np.cumsum(generator.normal(size=len(times))) * 0.016 * math.sqrt(0.02)
-        course = (exact + walk + white * generator.normal(size=len(times)))[:, None]
+        heading = (exact + walk + white * generator.normal(size=len(times)))[:, None]
         fit = completed(
-            attitude_fit.fit_response(times, course, sent_at, values[:, None], wanders=True)
+            attitude_fit.fit_response(times, heading, sent_at, values[:, None], wanders=True)
         )
         found = (fit.delay_s, fit.natural_frequency_radps, fit.damping)
         away.append([(each.value - t) / each.sd for each, t in zip(found, true, strict=True)])
@@ -242,19 +242,19 @@ def test_first_order_response_equals_scipys_integration():
 
 
 def flown(
-    *, tilt=0.25, course=0.1, heave=0.06, hover=0.5, drag=0.8, noise=0.0, seconds=12.0, seed=1
+    *, tilt=0.25, heading=0.1, heave=0.06, hover=0.5, drag=0.8, noise=0.0, seconds=12.0, seed=1
 ) -> Trace:
     """A vehicle that swings under open-loop commands, integrated by SciPy. Delay, natural frequency
-    and damping: tilt .06, 12, .7, course .1, 4, .6; thrust: delay .02, lag .05."""
+    and damping: tilt .06, 12, .7, heading .1, 4, .6; thrust: delay .02, lag .05."""
     sent_at = np.arange(0.0, seconds, 0.1)
     generator = np.random.default_rng(seed)
     swing = tilt * np.sin(1.6 * sent_at), tilt * np.cos(2.3 * sent_at)
     tilts = [each + 0.1 * tilt * generator.choice([-1, 0, 1], len(sent_at)) for each in swing]
     thrust = hover * (1.0 + heave * np.sign(np.sin(2.0 * sent_at)))
-    courses = course * np.sign(np.sin(1.1 * sent_at))
+    headings = heading * np.sign(np.sin(1.1 * sent_at))
     grid = np.arange(0.0, seconds, 0.01)
     b = [simulated(each, sent_at, 0.06, 12.0, 0.7, grid) for each in tilts]
-    turned = simulated(courses, sent_at, 0.1, 4.0, 0.6, grid)
+    turned = simulated(headings, sent_at, 0.1, 4.0, 0.6, grid)
 
     def rate(t, x):
         row = max(int(np.searchsorted(sent_at + 0.02, t + 1e-12, side="right")) - 1, 0)
@@ -270,7 +270,7 @@ def flown(
     velocity = solved.y[3:6].T
     direction = np.array(b).T + 0.2 * noise * generator.normal(size=(len(grid), 2))
     whole = Trace(
-        np.column_stack((sent_at, *tilts, thrust, courses)),
+        np.column_stack((sent_at, *tilts, thrust, headings)),
         np.column_stack((grid, direction, turned)),
         np.column_stack((grid, position, velocity)),
     )
@@ -352,7 +352,7 @@ def test_white_noise_of_the_estimator_is_measured():
     assert noise.velocity_mps < 1e-4
 
 
-HOVER = {"tilt": 0.0, "course": 0.0, "heave": 0.0}
+HOVER = {"tilt": 0.0, "heading": 0.0, "heave": 0.0}
 
 
 @pytest.mark.parametrize(

@@ -38,8 +38,8 @@ class Swapped:
                 command = replace(command, thrust_direction_ned=(north, -east, down))
             case "thrust":
                 command = replace(command, thrust_mps2=2 * G - command.thrust_mps2)
-            case "course":
-                command = replace(command, course_rad=-command.course_rad)
+            case "heading":
+                command = replace(command, heading_rad=-command.heading_rad)
         return replace(decision, command=command)
 
     def reset(self) -> None:
@@ -51,7 +51,7 @@ class Leaving:
     """From rest with a constant acceleration, turning at a constant rate."""
 
     acceleration_ned_mps2: tuple[float, float, float]
-    course_rad: float
+    heading_rad: float
     turn_radps: float = 0.0
     duration_s = 3600.0
 
@@ -59,9 +59,9 @@ class Leaving:
         time = np.asarray(time_s, dtype=np.float64)[..., None]
         a = np.array(self.acceleration_ned_mps2) + 0.0 * time
         none = np.zeros_like(a)
-        course = self.course_rad + self.turn_radps * time[..., 0]
-        turn = self.turn_radps + 0.0 * course
-        return FlatSample(0.5 * time**2 * a, time * a, a, none, none, course, turn, 0.0 * course)
+        heading = self.heading_rad + self.turn_radps * time[..., 0]
+        turn = self.turn_radps + 0.0 * heading
+        return FlatSample(0.5 * time**2 * a, time * a, a, none, none, heading, turn, 0.0 * heading)
 
 
 def answers(law: Controller, situation: Situation) -> Command:
@@ -71,15 +71,15 @@ def answers(law: Controller, situation: Situation) -> Command:
     return command
 
 
-def push_back(law: Controller, course: float) -> None:
+def push_back(law: Controller, heading: float) -> None:
     """b points where the vehicle came from: north of the target, or moving north of it, it leans
-    north. Above the target, or climbing, the thrust is less than hover's. The course commanded is
+    north. Above the target, or climbing, the thrust is less than hover's. The heading commanded is
     the target's, across the wrap."""
-    reference = Hold((1.0, 2.0, -3.0), course)
+    reference = Hold((1.0, 2.0, -3.0), heading)
     for axis, sign, moving in itertools.product(range(3), (1.0, -1.0), (False, True)):
         off = np.zeros(3)
         off[axis] = 0.1 * sign
-        rest = at((1.0, 2.0, -3.0), wrap_pi(course + 0.2))
+        rest = at((1.0, 2.0, -3.0), wrap_pi(heading + 0.2))
         state = (
             replace(rest, velocity_ned_mps=3.0 * off)
             if moving
@@ -89,16 +89,18 @@ def push_back(law: Controller, course: float) -> None:
         pushed = np.array([*command.thrust_direction_ned[:2], (command.thrust_mps2 - G) / G])
         assert sign * pushed[axis] > 0.05
         assert np.abs(np.delete(pushed, axis)).max() < 0.01
-        assert wrap_pi(command.course_rad - course) == pytest.approx(0.0, abs=1e-3)
+        assert wrap_pi(command.heading_rad - heading) == pytest.approx(0.0, abs=1e-3)
 
 
-def go_along(law: Controller, course: float) -> None:
+def go_along(law: Controller, heading: float) -> None:
     """A reference that leaves to the north, on which the vehicle is, is followed leaning south,
-    one that climbs with more thrust, one that turns with its course ahead, through the wrap."""
+    one that climbs with more thrust, one that turns with its heading ahead, through the wrap."""
     for axis, sign in itertools.product(range(3), (1.0, -1.0)):
         acceleration = [0.0, 0.0, 0.0]
         acceleration[axis] = sign
-        reference = Leaving((acceleration[0], acceleration[1], acceleration[2]), course, 0.4 * sign)
+        reference = Leaving(
+            (acceleration[0], acceleration[1], acceleration[2]), heading, 0.4 * sign
+        )
         sample = reference.sample(0.057)
         pull = (
             np.array([0.0, 0.0, G])
@@ -107,7 +109,7 @@ def go_along(law: Controller, course: float) -> None:
         )
         thrust = float(np.linalg.norm(pull))
         state = replace(
-            at((0, 0, 0), wrap_pi(float(sample.course_rad))),
+            at((0, 0, 0), wrap_pi(float(sample.heading_rad))),
             position_ned_m=sample.position_ned_m,
             velocity_ned_mps=sample.velocity_ned_mps,
             thrust_direction_ned=pull / thrust,
@@ -117,7 +119,7 @@ def go_along(law: Controller, course: float) -> None:
         led = np.array([*command.thrust_direction_ned[:2], (command.thrust_mps2 - G) / G])
         assert -sign * led[axis] > 0.08
         assert np.abs(np.delete(led, axis)).max() < 0.02
-        assert 0.1 < sign * wrap_pi(command.course_rad - course) < 0.3
+        assert 0.1 < sign * wrap_pi(command.heading_rad - heading) < 0.3
 
 
 CHECKS = (push_back, go_along)
@@ -149,22 +151,22 @@ def test_an_error_that_stays_is_answered_ever_more_by_the_integral(axis: int, si
 
 @pytest.mark.parametrize("name", TRACKING)
 def test_each_sign_swapped_is_seen(name: str) -> None:
-    for output, check in itertools.product(("north", "east", "thrust", "course"), CHECKS):
+    for output, check in itertools.product(("north", "east", "thrust", "heading"), CHECKS):
         with pytest.raises(AssertionError):
             check(Swapped(law_named(name), output), math.radians(90.0))
 
 
 def test_the_autopilots_loop_is_given_the_reference() -> None:
     heading_deg = -179.9
-    law, course = law_named("autopilot"), math.radians(heading_deg)
-    reference = Lemniscate(8.0, course_rad=course, heave_m=0.3)
-    command = law.decide(Situation(6.0, at((0, 0, -3), course), reference, LEVEL)).command
+    law, heading = law_named("autopilot"), math.radians(heading_deg)
+    reference = Lemniscate(8.0, heading_rad=heading, heave_m=0.3)
+    command = law.decide(Situation(6.0, at((0, 0, -3), heading), reference, LEVEL)).command
     assert isinstance(command, PositionCommand)
     sample = reference.sample(6.05)  # the middle of the time it is held for
     assert command.position_ned_m == pytest.approx(tuple(sample.position_ned_m))
     assert command.velocity_ned_mps == pytest.approx(tuple(sample.velocity_ned_mps))
     assert command.acceleration_ned_mps2 == pytest.approx(tuple(sample.acceleration_ned_mps2))
-    assert command.course_rad == pytest.approx(course)
+    assert command.heading_rad == pytest.approx(heading)
 
 
 # pso and lqr decide alike where no bound is met
@@ -176,7 +178,7 @@ FLIGHTS = [("lqr", heading_deg) for heading_deg in HEADINGS_DEG[:-1]] + [
 @pytest.mark.parametrize(("name", "heading_deg"), FLIGHTS)
 def test_climbing_and_descending_flights_at_all_headings(name: str, heading_deg: float) -> None:
     """Half a lap, heaving by 0.4 m, without noise: the laws agree to centimetres."""
-    reference = Lemniscate(8.0, course_rad=math.radians(heading_deg), heave_m=0.4)
+    reference = Lemniscate(8.0, heading_rad=math.radians(heading_deg), heave_m=0.4)
     flown = fly(Truth(PX4, noisy=False), law_named(name), PX4, reference, 1, laps=0.5)
     assert flown.rmse_m < 0.03
 
@@ -185,7 +187,7 @@ def test_climbing_and_descending_flights_at_all_headings(name: str, heading_deg:
 @pytest.mark.parametrize("name", ["pso", pytest.param("horizon", marks=pytest.mark.slow)])
 def test_one_sign_swapped_is_seen(name: str, output: str) -> None:
     """What the flights above would show."""
-    reference = Lemniscate(8.0, course_rad=math.radians(90.0), heave_m=0.4)
+    reference = Lemniscate(8.0, heading_rad=math.radians(90.0), heave_m=0.4)
     law = Swapped(law_named(name), output)
     flown = fly(Truth(PX4, noisy=False), law, PX4, reference, 1, laps=0.1)
     assert flown.rmse_m > 0.3

@@ -199,7 +199,7 @@ def test_a_link_is_in_every_delay_and_its_changes_make_them_uncertain() -> None:
     learner.on_link_growth(0.2, 0.15)
     uncertainty = learner.uncertainty
     assert (uncertainty.tilt_s, uncertainty.link_s) == (0.15, 0.2)
-    assert learner.cause.startswith("the link's delay has grown by 200 ms, identified is 160")
+    assert learner.cause.startswith("the link's delay has grown by 200 ms, the tilt's is 160")
     learner.on_link_growth(0.2, 0.0)  # a delay that stays is compensated
     assert learner.uncertainty.tilt_s == pytest.approx(KNOWN_S)
 

@@ -46,8 +46,8 @@ PX4 = Vehicle(
 NO_DELAY = PX4.model_copy(update={"tilt": PX4.tilt.model_copy(update={"delay_s": 0.0})})
 
 
-def command(north: float, east: float, thrust: float = G, course: float = 0.0) -> Command:
-    return Command(thrust, (north, east, math.sqrt(1 - north**2 - east**2)), course)
+def command(north: float, east: float, thrust: float = G, heading: float = 0.0) -> Command:
+    return Command(thrust, (north, east, math.sqrt(1 - north**2 - east**2)), heading)
 
 
 def hovering(
@@ -70,7 +70,7 @@ def follow(
     gap_s: float = 0.01,
     about_rad: float = 0.0,
 ) -> list[tuple[PredictedState, np.ndarray]]:
-    """Random tilt, and course `about_rad`, at 10 Hz to both; predictions and what the plant then
+    """Random tilt, and heading `about_rad`, at 10 Hz to both; predictions and what the plant then
     was."""
     rng = np.random.default_rng(seed)
     pairs, pending = [], []
@@ -80,10 +80,10 @@ def follow(
         observer.on_position(now, *plant.position())
         if i % round(0.1 / gap_s) == 0:
             pending.append(observer.predict(now))
-            course = about_rad + rng.uniform(-0.5, 0.5)
-            sent = command(*rng.uniform(-0.15, 0.15, 2), G + 0.1, course)
+            heading = about_rad + rng.uniform(-0.5, 0.5)
+            sent = command(*rng.uniform(-0.15, 0.15, 2), G + 0.1, heading)
             plant.command(sent)
-            observer.on_command(now, replace(sent, course_rad=math.remainder(course, math.tau)))
+            observer.on_command(now, replace(sent, heading_rad=math.remainder(heading, math.tau)))
         # the plant is at multiples of 1 ms, so is the delay
         target = pending[-1].time_s if pending else math.inf
         if now < target <= now + gap_s + 1e-9:
@@ -167,13 +167,13 @@ def test_replay_agrees_with_scipy(damping: float) -> None:
 
 @pytest.mark.parametrize("about_rad", [0.0, math.pi, -math.pi])
 def test_prediction_is_exact_on_a_matching_plant(about_rad: float) -> None:
-    """Facing south, course, its telemetry and its commands are now on one side of the wrap, now on
+    """Facing south, heading, its telemetry and its commands are now on one side of the wrap, now on
     the other."""
     plant = Plant(Truth(PX4, noisy=False), np.random.default_rng(0))
     plant.x[11] = about_rad
-    plant.command(replace(LEVEL, course_rad=about_rad))
+    plant.command(replace(LEVEL, heading_rad=about_rad))
     observer = Observer(PX4)
-    observer.on_command(0.0, replace(LEVEL, course_rad=about_rad))
+    observer.on_command(0.0, replace(LEVEL, heading_rad=about_rad))
     pairs = follow(plant, observer, 6.0, seed=5, about_rad=about_rad)[20:]
     assert len(pairs) > 30
     for state, truth in pairs:
@@ -181,8 +181,8 @@ def test_prediction_is_exact_on_a_matching_plant(about_rad: float) -> None:
         assert state.velocity_ned_mps == pytest.approx(truth[3:6], abs=3e-3)
         assert state.thrust_direction_ned[:2] == pytest.approx(truth[6:8], abs=1e-3)
         assert state.thrust_direction_rate_ned_ps[:2] == pytest.approx(truth[8:10], abs=1e-2)
-        assert abs(state.course_rad) <= math.pi
-        apart = math.remainder(state.course_rad - truth[11], math.tau)
+        assert abs(state.heading_rad) <= math.pi
+        apart = math.remainder(state.heading_rad - truth[11], math.tau)
         assert apart == pytest.approx(0.0, abs=1e-3)
 
 
@@ -293,7 +293,7 @@ def test_frozen_observer_integrates_nothing() -> None:
     assert state.position_ned_m == pytest.approx([1.0 + 0.2 * 0.057, 2.0, -0.1 - 0.1 * 0.057])
     assert state.velocity_ned_mps == pytest.approx([0.2, 0.0, -0.1])
     assert state.thrust_direction_ned == pytest.approx([0.1, 0.0, math.sqrt(0.99)])
-    assert state.course_rad == pytest.approx(0.5)
+    assert state.heading_rad == pytest.approx(0.5)
     assert np.all(state.disturbance_ned_mps2 == 0.0)
     observer.freeze(False)
     for message in (1, 2, 3):
@@ -419,7 +419,7 @@ def test_state_is_finite_under_any_telemetry() -> None:
         parts = [state.position_ned_m, state.velocity_ned_mps, state.thrust_direction_ned,
                  state.thrust_direction_rate_ned_ps, state.disturbance_ned_mps2]  # fmt: skip
         assert all(np.isfinite(part).all() for part in parts)
-        assert math.isfinite(state.course_rad)
+        assert math.isfinite(state.heading_rad)
         assert math.isfinite(state.thrust_mps2)
         assert np.linalg.norm(state.thrust_direction_ned[:2]) < 10
 

@@ -41,15 +41,15 @@ class Straight:
 
     duration_s = 1e6
 
-    def __init__(self, position: Array, velocity: Array, course: float) -> None:
-        self.position, self.velocity, self.course = position, velocity, course
+    def __init__(self, position: Array, velocity: Array, heading: float) -> None:
+        self.position, self.velocity, self.heading = position, velocity, heading
 
     def sample(self, time_s: float | Array) -> FlatSample:
         zero = np.zeros(3)
         now = self.position + self.velocity * time_s
         still = np.zeros(())
         return FlatSample(
-            now, self.velocity, zero, zero, zero, np.float64(self.course) + still, still, still
+            now, self.velocity, zero, zero, zero, np.float64(self.heading) + still, still, still
         )
 
 
@@ -63,8 +63,8 @@ def state_at(
         velocity_ned_mps=velocity,
         thrust_direction_ned=attitude[:, 2],
         thrust_direction_rate_ned_ps=np.zeros(3),
-        course_rad=psi,
-        course_rate_radps=0.0,
+        heading_rad=psi,
+        heading_rate_radps=0.0,
         thrust_mps2=9.81,
         disturbance_ned_mps2=np.zeros(3),
         rates_frd_radps=rates,
@@ -74,15 +74,15 @@ def state_at(
 HOVER = Command(9.81, (0.0, 0.0, 1.0), 0.0)
 
 
-def tilted(course: float) -> tuple[PredictedState, Straight]:
-    """The same situation, seen from the vehicle, at any course."""
-    turn = Rotation.from_euler("Z", course)
+def tilted(heading: float) -> tuple[PredictedState, Straight]:
+    """The same situation, seen from the vehicle, at any heading."""
+    turn = Rotation.from_euler("Z", heading)
     state = state_at(
-        turn.apply([1.0, -2.0, 0.5]), turn.apply([0.8, 0.3, -0.2]), 0.08, -0.05, course,
+        turn.apply([1.0, -2.0, 0.5]), turn.apply([0.8, 0.3, -0.2]), 0.08, -0.05, heading,
         np.array([0.1, -0.2, 0.05]),
     )  # fmt: skip
     velocity = turn.apply([1.0, 0.5, -0.1])
-    goal_rad = np.remainder(course + 0.1 + np.pi, 2 * np.pi) - np.pi  # across the wrap at 3.1
+    goal_rad = np.remainder(heading + 0.1 + np.pi, 2 * np.pi) - np.pi  # across the wrap at 3.1
     return state, Straight(turn.apply([1.5, -1.0, 0.2]), velocity, float(goal_rad))
 
 
@@ -114,7 +114,7 @@ def test_the_final_energy_weights_are_a_tenth_of_the_first() -> None:
 # ---------------------------------------------------------------- over attitude setpoints
 
 
-def test_the_heading_frame_is_eq_5_at_course_north() -> None:
+def test_the_heading_frame_is_eq_5_at_heading_north() -> None:
     state, reference = tilted(0.0)
     vector, target = heading_frame(state, reference.sample(0.1))
     expected = [0.08, -0.05, -0.1, 0.1, -0.2, 0.05, 0.8, 0.3, -0.2]
@@ -131,24 +131,24 @@ SUMMED = IntegralSettings(weights=(80.0, 80.0, 15.0, 50.0))
     [PaperSettings(attitude_lead=False), PaperSettings(attitude_lead=True),
      PaperSettings(integral=SUMMED)],
 )  # fmt: skip
-@pytest.mark.parametrize("course", [0.7, 2.0, -2.9, 3.1])
-def test_the_law_is_the_same_at_every_course(course: float, settings: PaperSettings) -> None:
+@pytest.mark.parametrize("heading", [0.7, 2.0, -2.9, 3.1])
+def test_the_law_is_the_same_at_every_heading(heading: float, settings: PaperSettings) -> None:
     """With the sum of three decisions, where there is one."""
     controller = PaperController(PAPER, settings)
     commands = []
-    for heading in (0.0, course):
+    for seen_from in (0.0, heading):
         controller.reset()
-        state, reference = tilted(heading)
+        state, reference = tilted(seen_from)
         for _ in range(3):
             decision = controller.decide(Situation(0.0, state, reference, HOVER))
         commands.append(decision.command)
     north, turned = commands
-    direction = Rotation.from_euler("Z", course).apply(north.thrust_direction_ned)
+    direction = Rotation.from_euler("Z", heading).apply(north.thrust_direction_ned)
     assert turned.thrust_direction_ned == pytest.approx(direction, abs=1e-6)
     assert turned.thrust_mps2 == pytest.approx(north.thrust_mps2, abs=1e-6)
-    apart = turned.course_rad - north.course_rad - course
+    apart = turned.heading_rad - north.heading_rad - heading
     assert np.sin(apart / 2) == pytest.approx(0.0, abs=1e-6)
-    assert abs(turned.course_rad) <= np.pi
+    assert abs(turned.heading_rad) <= np.pi
 
 
 def test_what_is_sent_is_the_attitude_of_the_next_state() -> None:
@@ -159,10 +159,10 @@ def test_what_is_sent_is_the_attitude_of_the_next_state() -> None:
     law = PaperLaw(dynamics, inputs, settings, *flyable_box(PAPER, settings))
     move = law.move(*heading_frame(state, reference.sample(0.1)))
     following = dynamics @ heading_frame(state, reference.sample(0.1))[0] + inputs @ move.inputs
-    phi, theta, psi = following[:3] + np.array([0.0, 0.0, reference.course])
+    phi, theta, psi = following[:3] + np.array([0.0, 0.0, reference.heading])
     attitude = Rotation.from_euler("ZYX", [psi, theta, phi]).as_matrix()
     assert command.thrust_direction_ned == pytest.approx(attitude[:, 2], abs=1e-9)
-    assert command.course_rad == pytest.approx(psi, abs=1e-9)
+    assert command.heading_rad == pytest.approx(psi, abs=1e-9)
     assert command.thrust_mps2 == pytest.approx(9.81 + move.inputs[0] / 0.4, abs=1e-9)
 
 
@@ -173,7 +173,7 @@ def test_the_lead_makes_the_attitude_loop_follow_the_prediction() -> None:
         PaperController(PAPER, PaperSettings(attitude_lead=lead)) for lead in (False, True)
     )
     situation = Situation(0.0, state, reference, HOVER)
-    course, asked = (c.decide(situation).command.course_rad for c in (plain, ahead))
+    heading, asked = (c.decide(situation).command.heading_rad for c in (plain, ahead))
     dynamics, inputs = sampled_matrices(PAPER, 0.1)
     settings = PaperSettings()
     move = PaperLaw(dynamics, inputs, settings, *flyable_box(PAPER, settings)).move(
@@ -181,7 +181,7 @@ def test_the_lead_makes_the_attitude_loop_follow_the_prediction() -> None:
     )
     rate = move.following[5]
     wn, z = PAPER.yaw.natural_frequency_radps, PAPER.yaw.damping
-    acceleration = wn**2 * (asked - course) - 2 * z * wn * rate
+    acceleration = wn**2 * (asked - heading) - 2 * z * wn * rate
     assert acceleration == pytest.approx((rate - 0.05) / 0.1, abs=1e-6)
 
 
@@ -200,7 +200,7 @@ def test_an_input_accelerates_every_vehicle_as_it_does_the_papers(vehicle: Vehic
 
 
 def settled_flight(vehicle: Vehicle, lead: bool, seconds: float) -> tuple[Array, Array]:
-    """Distance and course per decision, from (1, 0.5, -0.5) m and 0.3 rad off a point at course
+    """Distance and heading per decision, from (1, 0.5, -0.5) m and 0.3 rad off a point at heading
     2 rad, over an attitude loop of the vehicle's and a point mass with its drag."""
     controller = PaperController(vehicle, PaperSettings(attitude_lead=lead))
     reference = Straight(np.zeros(3), np.zeros(3), 2.0)
@@ -212,11 +212,11 @@ def settled_flight(vehicle: Vehicle, lead: bool, seconds: float) -> tuple[Array,
         np.array([getattr(x, k) for x in loops]) for k in ("natural_frequency_radps", "damping")
     )
     command = HOVER
-    distances, courses = [], []
+    distances, headings = [], []
     for tick in range(round(seconds / 0.1)):
         state = replace(state_at(position, velocity, *attitude, rates=rates), time_s=0.1 * tick)
         command = controller.decide(Situation(0.1 * tick, state, reference, command)).command
-        b, psi = np.array(command.thrust_direction_ned), command.course_rad
+        b, psi = np.array(command.thrust_direction_ned), command.heading_rad
         aligned = Rotation.from_euler("Z", -psi).apply(b)
         sent = np.array([-np.arcsin(aligned[1]), np.arctan2(aligned[0], aligned[2]), psi])
         for _ in range(10):
@@ -227,25 +227,25 @@ def settled_flight(vehicle: Vehicle, lead: bool, seconds: float) -> tuple[Array,
             velocity = velocity + h * (pull - vehicle.drag_per_mass_ps * velocity)
             position = position + h * velocity
         distances.append(np.linalg.norm(position))
-        courses.append(attitude[2])
-    return np.array(distances), np.array(courses)
+        headings.append(attitude[2])
+    return np.array(distances), np.array(headings)
 
 
 @pytest.mark.parametrize("lead", [False, True])
 @pytest.mark.parametrize("vehicle", VEHICLES.values(), ids=VEHICLES.keys())
 def test_it_flies_and_creeps_towards_its_point(vehicle: Vehicle, lead: bool) -> None:
     """39 s horizontally: what one step ahead can do, and why there is a cost-to-go."""
-    distances, courses = settled_flight(vehicle, lead, 30.0)
+    distances, headings = settled_flight(vehicle, lead, 30.0)
     assert np.all(np.diff(distances[20:]) < 0)
     assert distances[-1] / distances[99] == pytest.approx(np.exp(-20 / 37), rel=0.08)
-    assert courses[-1] == pytest.approx(2.0, abs=0.01)
+    assert headings[-1] == pytest.approx(2.0, abs=0.01)
 
 
 def test_a_turn_goes_the_short_way_round() -> None:
     state = state_at(np.zeros(3), np.zeros(3), 0.0, 0.0, 3.1, np.zeros(3))
     reference = Straight(np.zeros(3), np.zeros(3), -3.1)
     command = PaperController(PAPER).decide(Situation(0.0, state, reference, HOVER)).command
-    assert 3.1 < command.course_rad <= np.pi
+    assert 3.1 < command.heading_rad <= np.pi
 
 
 def test_full_deflection_stays_within_what_the_vehicle_can() -> None:
@@ -327,7 +327,7 @@ def test_integral_sums_holds_and_stays_within_its_limits() -> None:
 
 
 def body_z(roll: float, pitch: float) -> Array:
-    """The axis in NED, at course 0."""
+    """The axis in NED, at heading 0."""
     level = np.cos(roll)
     return np.array([np.sin(pitch) * level, -np.sin(roll), np.cos(pitch) * level])
 

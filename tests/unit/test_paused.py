@@ -28,8 +28,8 @@ def test_each_derivative_is_that_of_the_one_before(paused: Paused) -> None:
     for below, above in pairwise(DERIVATIVES):
         slope = np.gradient(getattr(sample, below), times_s, axis=0)[5:-5]
         np.testing.assert_allclose(slope, getattr(sample, above)[5:-5], atol=2e-4)
-    turned = np.gradient(sample.course_rad, times_s)[5:-5]
-    np.testing.assert_allclose(turned, sample.course_rate_radps[5:-5], atol=1e-4)
+    turned = np.gradient(sample.heading_rad, times_s)[5:-5]
+    np.testing.assert_allclose(turned, sample.heading_rate_radps[5:-5], atol=1e-4)
 
 
 def test_it_rests_on_the_path_and_continues_from_there(paused: Paused) -> None:

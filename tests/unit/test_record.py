@@ -25,8 +25,8 @@ STATE = PredictedState(
     velocity_ned_mps=np.zeros(3),
     thrust_direction_ned=np.array([0.0, 0.0, 1.0]),
     thrust_direction_rate_ned_ps=np.zeros(3),
-    course_rad=0.0,
-    course_rate_radps=0.0,
+    heading_rad=0.0,
+    heading_rate_radps=0.0,
     thrust_mps2=9.81,
     disturbance_ned_mps2=np.zeros(3),
     rates_frd_radps=np.zeros(3),
@@ -49,7 +49,7 @@ def test_the_certificate_is_of_what_was_sent() -> None:
     assert limited.thrust_mps2 == 8.0
     assert np.isnan(certificate(limited)).all()
     withheld = record(None, refused=Refusal.STALE | Refusal.LATE)
-    assert np.isnan([*certificate(withheld), withheld.thrust_mps2, withheld.course_rad]).all()
+    assert np.isnan([*certificate(withheld), withheld.thrust_mps2, withheld.heading_rad]).all()
     assert withheld.refused == 3.0
 
 

@@ -100,8 +100,8 @@ def test_the_earliest_time_is_named() -> None:
             position, velocity = zero.copy(), zero.copy()
             position[..., 2] = self.start_down_m + time
             velocity[..., 0] = 2.0 * time
-            course = np.zeros(time.shape)
-            return FlatSample(position, velocity, zero, zero, zero, course, course, course)
+            heading = np.zeros(time.shape)
+            return FlatSample(position, velocity, zero, zero, zero, heading, heading, heading)
 
     with pytest.raises(
         InfeasibleReference, match=r"a height of -5 m at 10.00 s, .* 0.3 m \(first at 4.7[01] s"

@@ -13,7 +13,7 @@ from scipy.spatial.transform import Rotation
 from offboard.model.frames import quaternion_from_thrust_direction
 from offboard.reference.base import FlatSample
 from offboard.reference.flatness import FlatState, flat_state
-from offboard.reference.shapes import SHAPES, Circle, CourseMode, Hover
+from offboard.reference.shapes import SHAPES, Circle, HeadingMode, Hover
 from offboard.reference.track import Track
 
 Array = NDArray[np.float64]
@@ -30,11 +30,11 @@ SETTINGS: dict[str, dict[str, object]] = {
     "waypoints": {"points_m": POINTS, "speed_mps": 1.5},
 }
 every_shape = pytest.mark.parametrize("shape", SETTINGS)
-every_course = pytest.mark.parametrize("course", ["fixed", "along_velocity"])
+every_heading = pytest.mark.parametrize("heading", ["fixed", "along_velocity"])
 
 
-def track_of(shape: str, course: str) -> Track:
-    return SHAPES[shape](**{"course": course} | SETTINGS[shape]).track()
+def track_of(shape: str, heading: str) -> Track:
+    return SHAPES[shape](**{"course": heading} | SETTINGS[shape]).track()
 
 
 def state_of(track: Track, time_s: float | Array) -> FlatState:
@@ -62,26 +62,26 @@ def test_thrust_along_b_flies_the_trajectory(shape: str) -> None:
 
 
 @every_shape
-@every_course
-def test_rates_turn_the_attitude(shape: str, course: str) -> None:
+@every_heading
+def test_rates_turn_the_attitude(shape: str, heading: str) -> None:
     """Body rates are the rotation vector from one attitude to the next, by SciPy; b is its z."""
-    track = track_of(shape, course)
+    track = track_of(shape, heading)
     times = np.linspace(0.1, track.duration_s - 0.1, 400)
     half = 1e-4
     middle, before, after = (state_of(track, times + shift) for shift in (0.0, -half, half))
-    courses = [track.sample(times + shift).course_rad for shift in (0.0, -half, half)]
+    headings = [track.sample(times + shift).heading_rad for shift in (0.0, -half, half)]
     attitude, earlier, later = (
         Rotation.from_quat(
-            quaternion_from_thrust_direction(state.thrust_direction_ned, course_rad),
+            quaternion_from_thrust_direction(state.thrust_direction_ned, heading_rad),
             scalar_first=True,
         )
-        for state, course_rad in zip((middle, before, after), courses, strict=True)
+        for state, heading_rad in zip((middle, before, after), headings, strict=True)
     )
     np.testing.assert_allclose(
         attitude.apply([0.0, 0.0, 1.0]), middle.thrust_direction_ned, atol=1e-12
     )
     nose = attitude.apply([1.0, 0.0, 0.0])
-    off = np.arctan2(nose[:, 1], nose[:, 0]) - courses[0]
+    off = np.arctan2(nose[:, 1], nose[:, 0]) - headings[0]
     np.testing.assert_allclose(np.sin(off), 0.0, atol=1e-9)
     assert np.all(np.cos(off) > 0.0)
     turn = earlier.inv() * later
@@ -109,7 +109,7 @@ def test_a_level_circle_by_hand() -> None:
     """Steady circle without drag: T = hypot(g, v^2/r), tilt atan(v^2 / (r g)) inwards, and with
     the nose along the velocity p = 0, q and r the parts of the turn about the vertical."""
     radius, period = 2.0, 8.0
-    track = Circle(course=CourseMode.ALONG_VELOCITY).track()
+    track = Circle(course=HeadingMode.ALONG_VELOCITY).track()
     omega = 2 * math.pi / period
     inward = omega**2 * radius
     flat = flat_state(track.sample(9.3), GRAVITY, 0.0)

@@ -28,16 +28,16 @@ def test_columns_in_any_order_and_by_any_name() -> None:
     rows = parse(text, "a.csv")
     np.testing.assert_allclose(rows.times_s, [0, 1, 2.5, 4])
     np.testing.assert_allclose(rows.points_ned_m[:2], [[3, 1, -2], [6, 4, -5]])
-    assert rows.course_rad is not None
-    np.testing.assert_allclose(np.degrees(rows.course_rad), [350, 370, 390, 360])
+    assert rows.heading_rad is not None
+    np.testing.assert_allclose(np.degrees(rows.heading_rad), [350, 370, 390, 360])
 
 
-def test_passes_through_every_row_with_its_course() -> None:
+def test_passes_through_every_row_with_its_heading() -> None:
     times = np.linspace(0, 12, 25)
-    course = (300 + 15 * times) % 360
+    heading = (300 + 15 * times) % 360
     rows = "".join(
         f"{t},{2 * math.sin(0.5 * t)},{math.cos(0.5 * t)},{3 + 0.1 * t},{c}\n"
-        for t, c in zip(times, course, strict=True)
+        for t, c in zip(times, heading, strict=True)
     )
     track = table_track("time_s,x,y,altitude_m,course_deg\n" + rows)
     # half of the run-in is spent on the path: rows lie 1 s later, inside the full-speed part
@@ -46,8 +46,8 @@ def test_passes_through_every_row_with_its_course() -> None:
     t = times[inner]
     expected = np.stack([2 * np.sin(0.5 * t), np.cos(0.5 * t), -3 - 0.1 * t], -1)
     np.testing.assert_allclose(sample.position_ned_m, expected, atol=1e-9)
-    np.testing.assert_allclose(np.degrees(sample.course_rad), 300 + 15 * t, atol=1e-8)
-    np.testing.assert_allclose(np.degrees(sample.course_rate_radps), 15, atol=1e-6)
+    np.testing.assert_allclose(np.degrees(sample.heading_rad), 300 + 15 * t, atol=1e-8)
+    np.testing.assert_allclose(np.degrees(sample.heading_rate_radps), 15, atol=1e-6)
     middle = np.abs(t - 6.0) < 3.0
     expected_acceleration = -0.25 * np.stack([2 * np.sin(0.5 * t), np.cos(0.5 * t)], -1)
     np.testing.assert_allclose(
@@ -90,9 +90,9 @@ def test_four_rows_are_enough_and_continuous_to_the_fourth_derivative() -> None:
         np.testing.assert_allclose(jet[:, 0], jet[:, 1], atol=1e-6)
 
 
-def test_a_table_without_course_takes_the_configured_one() -> None:
+def test_a_table_without_heading_takes_the_configured_one() -> None:
     track = table_track(GOOD, course_deg=90.0, run_in_s=1.0, run_out_s=1.0)
-    assert float(track.sample(2.0).course_rad) == math.radians(90.0)
+    assert float(track.sample(2.0).heading_rad) == math.radians(90.0)
 
 
 def test_an_unread_table_is_a_mistake_of_the_caller() -> None:

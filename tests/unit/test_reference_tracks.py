@@ -17,8 +17,8 @@ from pydantic import ValidationError
 from offboard.documents.reading import parse, read
 from offboard.model.vehicle import Vehicle
 from offboard.reference.base import FlatSample
-from offboard.reference.course import HOLD_SPEED_MPS, AlongVelocity, Fixed, along_velocity
 from offboard.reference.feasibility import check
+from offboard.reference.heading import HOLD_SPEED_MPS, AlongVelocity, Fixed, along_velocity
 from offboard.reference.path import Harmonic
 from offboard.reference.path import Path as FlatPath
 from offboard.reference.shapes import SHAPES, Line
@@ -39,8 +39,8 @@ NEEDED: dict[str, dict[str, object]] = {
 SHIPPED = sorted(path.stem for path in (CONFIG / "references").glob("*.yaml"))
 
 
-def track_of(shape: str, course: str, **settings: object) -> Track:
-    values: dict[str, object] = {"course": course, "course_deg": 30.0}
+def track_of(shape: str, heading: str, **settings: object) -> Track:
+    values: dict[str, object] = {"course": heading, "course_deg": 30.0}
     return SHAPES[shape](**values | NEEDED.get(shape, {}) | settings).track()
 
 
@@ -51,7 +51,7 @@ def shipped(name: str) -> Track:
 
 
 CASES = [(shape, "fixed") for shape in SHAPES] + [(shape, "along_velocity") for shape in SHAPES]
-TRACKS = {f"{shape}-{course}": track_of(shape, course) for shape, course in CASES}
+TRACKS = {f"{shape}-{heading}": track_of(shape, heading) for shape, heading in CASES}
 TRACKS["table-table"] = track_of("table", "table")
 TRACKS["waypoints-jerk"] = track_of("waypoints", "along_velocity", minimise="jerk")
 every_track = pytest.mark.parametrize("track", TRACKS.values(), ids=TRACKS.keys())
@@ -62,7 +62,7 @@ def stacked(sample: FlatSample) -> list[Array]:
 
 
 def orders(sample: FlatSample) -> tuple[Array, Array]:
-    """Position to snap (5, ..., 3) and course to its acceleration (3, ...)."""
+    """Position to snap (5, ..., 3) and heading to its acceleration (3, ...)."""
     values = stacked(sample)
     return np.stack(values[:5]), np.stack(values[5:])
 
@@ -71,8 +71,8 @@ def joints(track: Track) -> Array:
     """Times at which one formula hands over to another."""
     ends = [0.0, track.run_in_s, track.run_in_s + track.cruise_s, track.duration_s]
     inner: list[float] = list(getattr(track.path, "breaks_s", ()))
-    if isinstance(track.course, AlongVelocity):
-        inner += list(track.course.slow_s.ravel())
+    if isinstance(track.heading, AlongVelocity):
+        inner += list(track.heading.slow_s.ravel())
     grid = np.linspace(0.0, track.duration_s, 20001)
     travelled = along_path(track, grid)
     return np.unique(np.concatenate([ends, np.interp(inner, travelled, grid)]).round(9))
@@ -107,8 +107,8 @@ def test_derivatives_are_those_of_the_position(track: Track) -> None:
     assert centres.size >= 5
     for centre in centres:
         nodes = centre + width * np.cos(np.pi * (np.arange(12) + 0.5) / 12)
-        position, course = orders(track.sample(nodes))
-        exact_position, exact_course = orders(track.sample(float(centre)))
+        position, heading = orders(track.sample(nodes))
+        exact_position, exact_heading = orders(track.sample(float(centre)))
         domain = (centre - width, centre + width)
         for axis in range(3):
             fit = Chebyshev.fit(nodes, position[0, :, axis], 11, domain=domain)
@@ -116,13 +116,13 @@ def test_derivatives_are_those_of_the_position(track: Track) -> None:
                 numeric = fit.deriv(order)(centre)
                 exact = exact_position[order, axis]
                 assert abs(numeric - exact) <= tolerance * max(1.0, abs(exact)), (centre, order)
-        fit = Chebyshev.fit(nodes, course[0], 11, domain=domain)
-        assert exact_course[1] == pytest.approx(fit.deriv(1)(centre), abs=2e-4)
-        assert exact_course[2] == pytest.approx(fit.deriv(2)(centre), abs=2e-2)
+        fit = Chebyshev.fit(nodes, heading[0], 11, domain=domain)
+        assert exact_heading[1] == pytest.approx(fit.deriv(1)(centre), abs=2e-4)
+        assert exact_heading[2] == pytest.approx(fit.deriv(2)(centre), abs=2e-2)
 
 
 @every_track
-def test_continuous_to_snap_and_course_acceleration_everywhere(track: Track) -> None:
+def test_continuous_to_snap_and_heading_acceleration_everywhere(track: Track) -> None:
     # a jump does not shrink with the step; what is continuous does. Sampled across every joint.
     for joint in joints(track):
         for step, allowance in ((1e-4, 0.35), (1e-6, 0.02)):
@@ -137,12 +137,12 @@ def test_continuous_to_snap_and_course_acceleration_everywhere(track: Track) -> 
 @every_track
 def test_rests_before_and_after(track: Track) -> None:
     for inside, outside in ((0.0, -3.0), (track.duration_s, track.duration_s + 100.0)):
-        position, course = orders(track.sample(outside))
+        position, heading = orders(track.sample(outside))
         assert np.all(position[1:] == 0.0)
-        assert np.all(course[1:] == 0.0)
-        edge_position, edge_course = orders(track.sample(inside))
+        assert np.all(heading[1:] == 0.0)
+        edge_position, edge_heading = orders(track.sample(inside))
         np.testing.assert_allclose(edge_position, position, atol=1e-9)
-        np.testing.assert_allclose(edge_course, course, atol=1e-9)
+        np.testing.assert_allclose(edge_heading, heading, atol=1e-9)
 
 
 @every_track
@@ -150,11 +150,11 @@ def test_array_equals_loop(track: Track) -> None:
     times = np.linspace(-1.0, track.duration_s + 1.0, 30).reshape(2, 3, 5)
     batch = track.sample(times)
     assert batch.position_ned_m.shape == (2, 3, 5, 3)
-    assert batch.course_rad.shape == (2, 3, 5)
+    assert batch.heading_rad.shape == (2, 3, 5)
     for index in np.ndindex(times.shape):
         single = track.sample(float(times[index]))
         assert single.position_ned_m.shape == (3,)
-        assert single.course_rad.shape == ()
+        assert single.heading_rad.shape == ()
         for many, one in zip(stacked(batch), stacked(single), strict=True):
             np.testing.assert_allclose(many[index], one, rtol=1e-13, atol=1e-13)
 
@@ -204,31 +204,31 @@ def test_shipped_references_are_feasible(name: str, vehicle: str) -> None:
     assert envelope.height_min_m == pytest.approx(5.0 if name == "lemniscate_4mps" else 3.0)
 
 
-def test_course_along_velocity_points_along_it_and_unwraps() -> None:
+def test_heading_along_velocity_points_along_it_and_unwraps() -> None:
     track = track_of("circle", "along_velocity", laps=3)
     times = np.linspace(0.0, track.duration_s, 2301)
     sample = track.sample(times)
     moving = np.linalg.norm(sample.velocity_ned_mps, axis=-1) > 1e-6
     direction = sample.velocity_ned_mps[..., :2][moving]
-    nose = np.stack([np.cos(sample.course_rad), np.sin(sample.course_rad)], -1)[moving]
+    nose = np.stack([np.cos(sample.heading_rad), np.sin(sample.heading_rad)], -1)[moving]
     cross = nose[:, 0] * direction[:, 1] - nose[:, 1] * direction[:, 0]
     np.testing.assert_allclose(cross, 0.0, atol=1e-9)
     assert np.all(np.sum(nose * direction, axis=-1) > 0.0)
     # clockwise round three laps and the runs: through +-pi without a jump, 3 turns and 3.5 s more
-    assert np.abs(np.diff(sample.course_rad)).max() < 0.011
-    turned = sample.course_rad[-1] - sample.course_rad[0]
+    assert np.abs(np.diff(sample.heading_rad)).max() < 0.011
+    turned = sample.heading_rad[-1] - sample.heading_rad[0]
     assert turned == pytest.approx(2 * np.pi * (3 + 3.5 / 8.0), abs=1e-9)
 
 
-def test_course_holds_where_the_path_stands_still() -> None:
+def test_heading_holds_where_the_path_stands_still() -> None:
     track = track_of("waypoints", "along_velocity")
-    course, path = track.course, track.path
-    assert isinstance(course, AlongVelocity)
-    assert course.slow_s.shape == (2, 2)  # at both ends
-    start, end = course.slow_s[0]
+    heading, path = track.heading, track.path
+    assert isinstance(heading, AlongVelocity)
+    assert heading.slow_s.shape == (2, 2)  # at both ends
+    start, end = heading.slow_s[0]
     assert start == 0.0
     ends = np.array([0.0, path.length_s])
-    np.testing.assert_allclose(course.jet(ends, path.jet(ends))[1:], 0.0, atol=1e-9)
+    np.testing.assert_allclose(heading.jet(ends, path.jet(ends))[1:], 0.0, atol=1e-9)
     speed = np.linalg.norm(path.jet(np.array([end]))[1, 0, :2])
     assert HOLD_SPEED_MPS <= speed < 2 * HOLD_SPEED_MPS
     position, jet = orders(track.sample(np.linspace(-1, track.duration_s + 1, 3000)))
@@ -237,24 +237,24 @@ def test_course_holds_where_the_path_stands_still() -> None:
     assert np.abs(jet[1]).max() < 1.0
 
 
-def test_course_turns_smoothly_through_an_inner_stop() -> None:
+def test_heading_turns_smoothly_through_an_inner_stop() -> None:
     # out and back: the direction of motion jumps by pi where the path turns round
     back_and_forth = Harmonic(
         length_s=10.0, bounded=True, amplitude_ned_m=(2.0, 0, 0), omega_ned_radps=(0.5, 0, 0)
     )
-    course = along_velocity(back_and_forth, 10.0)
+    heading = along_velocity(back_and_forth, 10.0)
     s = np.linspace(0.0, 10.0, 100_001)
-    jet = course.jet(s, back_and_forth.jet(s))
+    jet = heading.jet(s, back_and_forth.jet(s))
     assert np.all(np.isfinite(jet))
     assert abs(abs(jet[0, -1] - jet[0, 0]) - 2 * np.pi) < 1e-9 or abs(jet[0, -1] - jet[0, 0]) < 1e-9
     np.testing.assert_allclose(np.gradient(jet[0], s)[2:-2], jet[1, 2:-2], atol=0.01)
     assert np.abs(np.diff(jet[0])).max() < 0.01
 
 
-def test_a_path_without_horizontal_motion_keeps_its_course() -> None:
+def test_a_path_without_horizontal_motion_keeps_its_heading() -> None:
     climb = Line(to_north_m=0, climb_m=5, speed_mps=1).path()
     assert along_velocity(climb, 5.0, 0.7) == Fixed(0.7)
-    assert float(track_of("hover", "along_velocity").sample(3.0).course_rad) == math.radians(30.0)
+    assert float(track_of("hover", "along_velocity").sample(3.0).heading_rad) == math.radians(30.0)
 
 
 def test_waypoints_are_passed_at_their_times() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from offboard.reference.base import FlatSample
-from offboard.reference.shapes import Circle, CourseMode
+from offboard.reference.shapes import Circle, HeadingMode
 from offboard.reference.transfer import Hold, Limits, Placed, Shifted, Transfer, transfer
 
 
@@ -18,7 +18,7 @@ def peaks(flown: Transfer) -> tuple[float, float, float]:
     return (
         float(np.linalg.norm(sample.velocity_ned_mps, axis=-1).max()),
         float(np.linalg.norm(sample.acceleration_ned_mps2, axis=-1).max()),
-        float(np.abs(sample.course_rate_radps).max()),
+        float(np.abs(sample.heading_rate_radps).max()),
     )
 
 
@@ -29,12 +29,12 @@ def test_rest_to_rest_is_the_smoothstep_of_degree_nine() -> None:
     sample = flown.sample(x * flown.duration_s)
     np.testing.assert_allclose(sample.position_ned_m[:, 2], -3.0 * smoothstep, atol=1e-10)
     np.testing.assert_allclose(sample.position_ned_m[:, :2], [[1.0, 2.0]] * 21, atol=1e-12)
-    np.testing.assert_allclose(sample.course_rad, 0.3, atol=1e-12)
+    np.testing.assert_allclose(sample.heading_rad, 0.3, atol=1e-12)
 
 
 @pytest.mark.parametrize("distance_m", [0.0, 0.2, 3.0, 10.0])
 def test_as_fast_as_the_limits_allow(distance_m: float) -> None:
-    limits = Limits(speed_mps=2.0, acceleration_mps2=1.5, course_rate_radps=0.5)
+    limits = Limits(speed_mps=2.0, acceleration_mps2=1.5, heading_rate_radps=0.5)
     flown = transfer((0, 0, -3), (distance_m, 0, -3), 0.0, 1.0, limits)
     speed, acceleration, rate = peaks(flown)
     ratio = max(speed / 2.0, acceleration / 1.5, rate / 0.5)
@@ -53,8 +53,8 @@ def test_moving_start_is_taken_over_and_ends_at_rest() -> None:
     for name in ("velocity_ned_mps", "acceleration_ned_mps2", "jerk_ned_mps3", "snap_ned_mps4"):
         np.testing.assert_allclose(getattr(end, name), 0.0, atol=1e-8)
     # the short way through pi
-    assert float(start.course_rad) == pytest.approx(3.0)
-    assert float(end.course_rad) == pytest.approx(2 * math.pi - 3.0)
+    assert float(start.heading_rad) == pytest.approx(3.0)
+    assert float(end.heading_rad) == pytest.approx(2 * math.pi - 3.0)
     assert peaks(flown)[0] <= 3.001
 
 
@@ -79,7 +79,7 @@ def test_a_long_way_is_flown_at_constant_speed(
     start, end = flown.sample(0.0), flown.sample(flown.duration_s)
     np.testing.assert_allclose(start.velocity_ned_mps, velocity, atol=1e-9)
     np.testing.assert_allclose(end.position_ned_m, target, atol=1e-6)
-    assert float(end.course_rad) == pytest.approx(2 * math.pi - 3.0)
+    assert float(end.heading_rad) == pytest.approx(2 * math.pi - 3.0)
     for name in ("velocity_ned_mps", "acceleration_ned_mps2", "jerk_ned_mps3", "snap_ned_mps4"):
         np.testing.assert_allclose(getattr(end, name), 0.0, atol=1e-6)
         for knot_s in flown.polynomial.breaks_s[1:-1]:  # no kink between the pieces
@@ -123,7 +123,7 @@ def test_derivatives_are_those_of_the_position() -> None:
     h = 1e-4
     names = FlatSample.__slots__
     for lower, upper in itertools.pairwise(names):
-        if upper == "course_rad":  # snap and course: no derivative of one another
+        if upper == "heading_rad":  # snap and heading: no derivative of one another
             continue
         slope = (
             getattr(flown.sample(times + h), lower) - getattr(flown.sample(times - h), lower)
@@ -132,7 +132,7 @@ def test_derivatives_are_those_of_the_position() -> None:
 
 
 def test_shifted_placed_and_held() -> None:
-    track = Circle(course=CourseMode.ALONG_VELOCITY).track()
+    track = Circle(course=HeadingMode.ALONG_VELOCITY).track()
     moved = Placed(Shifted(track, 100.0), (10.0, -5.0, 2.0))
     assert moved.duration_s == track.duration_s + 100.0
     times = np.array([[90.0, 101.0], [110.0, 200.0]])
@@ -148,5 +148,5 @@ def test_shifted_placed_and_held() -> None:
         sample = hold.sample(time_s)
         assert sample.position_ned_m.shape == (*np.shape(time_s), 3)
         np.testing.assert_array_equal(sample.position_ned_m[..., 2], -3.0)
-        np.testing.assert_array_equal(sample.course_rad, np.full(np.shape(time_s), 0.4))
+        np.testing.assert_array_equal(sample.heading_rad, np.full(np.shape(time_s), 0.4))
         assert np.all(sample.velocity_ned_mps == 0.0)

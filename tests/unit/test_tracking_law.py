@@ -84,7 +84,7 @@ def test_lead_inverts_the_second_order_response() -> None:
 
 
 def test_unconstrained_minimiser_is_the_lqr_law() -> None:
-    """u* = -f / h: b_c = b_ff - K [p, v, b, b'], T b_z = f_ff - Kz [z, v_z, f_z]; course led."""
+    """u* = -f / h: b_c = b_ff - K [p, v, b, b'], T b_z = f_ff - Kz [z, v_z, f_z]; heading led."""
     law, rng, reference = lqr(), np.random.default_rng(1), Lemniscate(15.0)
     for _ in range(20):
         state = state_of(rng, reference, 0.3)
@@ -107,7 +107,7 @@ def test_unconstrained_minimiser_is_the_lqr_law() -> None:
         force = target.thrust_down_feedforward_mps2 - law.vertical.gain @ vertical
         assert minimiser[1:3] == pytest.approx(expected_tilt, abs=1e-9)
         assert minimiser[0] == pytest.approx(force / upright, abs=1e-9)
-        assert minimiser[3] == pytest.approx(target.course_feedforward_rad)
+        assert minimiser[3] == pytest.approx(target.heading_feedforward_rad)
         # what an optimal law has left to pay is x' P x
         left = np.sum(np.array(off) * (law.lateral.terminal @ np.array(off)))
         left += vertical @ law.vertical.terminal @ np.array(vertical)
@@ -131,7 +131,7 @@ def test_cost_vanishes_on_the_reference_and_never_goes_below_zero() -> None:
         thrust_mps2=target.thrust_down_mps2 / upright,
     )
     nominal = [target.thrust_down_feedforward_mps2 / upright,
-               *target.tilt_feedforward, target.course_feedforward_rad]  # fmt: skip
+               *target.tilt_feedforward, target.heading_feedforward_rad]  # fmt: skip
     problem = law.task(Situation(5.0, on_it, reference, LEVEL)).problem
     cost = float(problem(np.array(nominal)))
     assert cost == pytest.approx(0.0, abs=1e-9)
@@ -167,7 +167,7 @@ def test_swarm_finds_the_closed_form() -> None:
         assert ours.command.thrust_direction_ned == pytest.approx(
             exact.command.thrust_direction_ned, abs=1e-6
         )
-        assert ours.command.course_rad == pytest.approx(exact.command.course_rad, abs=1e-6)
+        assert ours.command.heading_rad == pytest.approx(exact.command.heading_rad, abs=1e-6)
         assert ours.certificate.gap < 1e-6
         assert exact.certificate.gap == 0.0
         assert ours.certificate.optimal_cost == pytest.approx(exact.certificate.cost, rel=1e-6)
@@ -181,20 +181,20 @@ def test_closed_form_is_no_worse_than_any_point_of_the_box() -> None:
     assert problem(closed_form(problem)) <= problem(anywhere).min()
 
 
-def test_same_error_north_east_south_west_course_same_tilt() -> None:
-    """The law lives in NED: the course turns the quaternion, never the thrust direction. An error
+def test_same_error_north_east_south_west_heading_same_tilt() -> None:
+    """The law lives in NED: the heading turns the quaternion, never the thrust direction. An error
     to the north is answered by thrust to the south (b_n > 0), one to the east by b_e > 0."""
     law = lqr()
     tilts = []
-    for course in np.radians([0.0, 90.0, 180.0, 270.0]):
-        reference = Lemniscate(15.0, run_in_s=1e9, course_rad=float(course))
+    for heading in np.radians([0.0, 90.0, 180.0, 270.0]):
+        reference = Lemniscate(15.0, run_in_s=1e9, heading_rad=float(heading))
         home = reference.sample(5.057).position_ned_m
         rest = state_of(np.random.default_rng(0), reference, 0.0)
         state = replace(rest, position_ned_m=home + np.array([0.1, 0.05, 0.0]),
-                        velocity_ned_mps=np.zeros(3), course_rad=float(course))  # fmt: skip
+                        velocity_ned_mps=np.zeros(3), heading_rad=float(heading))  # fmt: skip
         command = law.decide(Situation(5.0, state, reference, LEVEL)).command
         tilts.append(command.thrust_direction_ned)
-        assert math.cos(command.course_rad - course) == pytest.approx(1.0)
+        assert math.cos(command.heading_rad - heading) == pytest.approx(1.0)
     assert tilts[0][:2] == pytest.approx((0.187, 0.0937), abs=1e-3)
     for tilt in tilts[1:]:
         assert tilt == pytest.approx(tilts[0], abs=1e-12)
@@ -368,24 +368,24 @@ def test_limited_feedback_cures_the_limit_cycle() -> None:
 
 @dataclass
 class Turning(Lemniscate):
-    """The course swings by half a radian."""
+    """The heading swings by half a radian."""
 
     def sample(self, time_s: float | np.ndarray) -> FlatSample:
         sample, t = super().sample(time_s), np.asarray(time_s)
         w = 0.8
         return replace(
             sample,
-            course_rad=0.5 * np.sin(w * t),
-            course_rate_radps=0.5 * w * np.cos(w * t),
-            course_acceleration_radps2=-0.5 * w * w * np.sin(w * t),
+            heading_rad=0.5 * np.sin(w * t),
+            heading_rate_radps=0.5 * w * np.cos(w * t),
+            heading_acceleration_radps2=-0.5 * w * w * np.sin(w * t),
         )
 
 
-def test_a_turning_course_is_led_and_does_not_leak_into_position() -> None:
+def test_a_turning_heading_is_led_and_does_not_leak_into_position() -> None:
     reference = Turning(15.0)
     result = flight(truth=Truth(PX4, noisy=False), reference=reference)
     assert result.rmse_m < 0.0005
     state = result.observer.predict(result.end_s - PX4.tilt.delay_s)
-    assert state.course_rad == pytest.approx(
-        float(reference.sample(result.end_s).course_rad), abs=0.01
+    assert state.heading_rad == pytest.approx(
+        float(reference.sample(result.end_s).heading_rad), abs=0.01
     )

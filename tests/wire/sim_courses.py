@@ -21,7 +21,7 @@ def copter() -> Bench:
     return bench
 
 
-def course_deg(bench: Bench) -> float:
+def heading_deg(bench: Bench) -> float:
     return math.degrees(bench.instance.autopilot.state.estimate.yaw_rad)
 
 

@@ -11,7 +11,7 @@ from vehicle_frames import ARDUPILOT, PX4, Sender, pinned, understood
 
 from offboard.mavlink.outgoing import AttitudeTarget
 
-COURSES_RAD = [0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi]
+HEADINGS_RAD = [0.0, 0.5 * math.pi, math.pi, -0.5 * math.pi]
 HOVER, GRAVITY = 0.489, 9.81
 
 
@@ -20,7 +20,7 @@ def target(**changes: object) -> AttitudeTarget:
         "time_s": 12.345,
         "thrust_mps2": GRAVITY,
         "thrust_direction_ned": (0.0, 0.0, 1.0),
-        "course_rad": 0.0,
+        "heading_rad": 0.0,
         "hover_thrust": HOVER,
         "gravity_mps2": GRAVITY,
     }
@@ -40,35 +40,35 @@ def tilted(north: float, east: float) -> tuple[float, float, float]:
     return north, east, math.sqrt(1.0 - north * north - east * east)
 
 
-@pytest.mark.parametrize("course_rad", COURSES_RAD)
+@pytest.mark.parametrize("heading_rad", HEADINGS_RAD)
 @pytest.mark.parametrize("lean", [(0.3, 0.0), (-0.3, 0.0), (0.0, 0.3), (0.0, -0.3), (0.2, -0.4)])
 def test_body_axes_have_the_commanded_direction(
-    course_rad: float, lean: tuple[float, float]
+    heading_rad: float, lean: tuple[float, float]
 ) -> None:
     direction = tilted(*lean)
-    attitude = rotation(sent(target(thrust_direction_ned=direction, course_rad=course_rad)))
+    attitude = rotation(sent(target(thrust_direction_ned=direction, heading_rad=heading_rad)))
     np.testing.assert_allclose(attitude.apply([0.0, 0.0, 1.0]), direction, atol=1e-6)
     nose = attitude.apply([1.0, 0.0, 0.0])
-    heading_error = math.atan2(nose[1], nose[0]) - course_rad
+    heading_error = math.atan2(nose[1], nose[0]) - heading_rad
     assert math.remainder(heading_error, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-6)
 
 
 @pytest.mark.parametrize(
-    ("course_rad", "roll_rad", "pitch_rad"),
+    ("heading_rad", "roll_rad", "pitch_rad"),
     [
-        # acceleration is -T b: b to the south accelerates north; seen from each course
-        (COURSES_RAD[0], 0.0, -0.2),  # nose north: nose down
-        (COURSES_RAD[1], -0.2, 0.0),  # nose east: roll left
-        (COURSES_RAD[2], 0.0, 0.2),  # nose south: nose up
-        (COURSES_RAD[3], 0.2, 0.0),  # nose west: roll right
+        # acceleration is -T b: b to the south accelerates north; seen from each heading
+        (HEADINGS_RAD[0], 0.0, -0.2),  # nose north: nose down
+        (HEADINGS_RAD[1], -0.2, 0.0),  # nose east: roll left
+        (HEADINGS_RAD[2], 0.0, 0.2),  # nose south: nose up
+        (HEADINGS_RAD[3], 0.2, 0.0),  # nose west: roll right
     ],
 )
-def test_tilt_that_accelerates_north(course_rad: float, roll_rad: float, pitch_rad: float) -> None:
+def test_tilt_that_accelerates_north(heading_rad: float, roll_rad: float, pitch_rad: float) -> None:
     direction = (-math.sin(0.2), 0.0, math.cos(0.2))
-    message = sent(target(thrust_direction_ned=direction, course_rad=course_rad))
+    message = sent(target(thrust_direction_ned=direction, heading_rad=heading_rad))
     yaw, pitch, roll = rotation(message).as_euler("ZYX")
     assert (roll, pitch) == pytest.approx((roll_rad, pitch_rad), abs=1e-6)
-    assert math.remainder(yaw - course_rad, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-6)
+    assert math.remainder(yaw - heading_rad, 2.0 * math.pi) == pytest.approx(0.0, abs=1e-6)
 
 
 def test_fields() -> None:
@@ -90,7 +90,7 @@ def test_quaternion_has_unit_length_and_positive_w(seed: int) -> None:
     message = sent(
         target(
             thrust_direction_ned=tuple(direction),
-            course_rad=generator.uniform(-20.0, 20.0),
+            heading_rad=generator.uniform(-20.0, 20.0),
         ),
         ARDUPILOT,
     )
@@ -131,7 +131,7 @@ def test_thrust_rules(
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize(
-    "field", ["time_s", "thrust_mps2", "course_rad", "hover_thrust", "gravity_mps2", "body_z_down"]
+    "field", ["time_s", "thrust_mps2", "heading_rad", "hover_thrust", "gravity_mps2", "body_z_down"]
 )
 def test_what_is_not_finite_is_refused(field: str, bad: float) -> None:
     session = pinned(Sender(), ARDUPILOT)

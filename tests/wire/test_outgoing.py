@@ -119,8 +119,8 @@ def position_target(**changes: object) -> PositionTarget:
         "position_ned_m": (1.0, 2.0, -3.0),
         "velocity_ned_mps": (0.1, 0.2, 0.3),
         "acceleration_ned_mps2": (0.4, 0.5, 0.6),
-        "course_rad": 0.5,
-        "course_rate_radps": 0.25,
+        "heading_rad": 0.5,
+        "heading_rate_radps": 0.25,
     }
     return PositionTarget(**(values | changes))  # type: ignore[arg-type]
 
@@ -217,7 +217,7 @@ def test_a_message_to_the_vehicle_needs_a_vehicle() -> None:
         CommandLong(22, (math.inf,)),
         CommandLong(22, (1e39,)),
         position_target(position_ned_m=(0.0, math.nan, 0.0)),
-        position_target(course_rad=math.nan),
+        position_target(heading_rad=math.nan),
         position_target(time_s=-1.0),
     ],
 )

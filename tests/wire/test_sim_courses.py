@@ -11,7 +11,7 @@ from collections.abc import Callable
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import LOITER, NAN, Bench
-from sim_courses import copter, course_deg, place, velocity
+from sim_courses import copter, heading_deg, place, velocity
 
 from simulator.geodesy import EARTH_RADIUS_M
 
@@ -70,7 +70,7 @@ def reposition(
 
 
 def off_deg(bench: Bench, wanted_deg: float) -> float:
-    return abs(math.remainder(course_deg(bench) - wanted_deg, 360.0))
+    return abs(math.remainder(heading_deg(bench) - wanted_deg, 360.0))
 
 
 def fastest_mps(bench: Bench, duration_s: float) -> float:
@@ -102,7 +102,7 @@ def test_a_turn_has_the_requested_rate(
     params: tuple[float, ...], wanted_deg: float, took_s: float
 ) -> None:
     bench = copter()
-    begun_s, begun_deg = bench.time_s, course_deg(bench)
+    begun_s, begun_deg = bench.time_s, heading_deg(bench)
     assert bench.command(115, *params) == [ACCEPTED]
     from_deg = begun_deg if len(params) == 4 else 0.0
     done_s = bench.run_until(lambda: off_deg(bench, from_deg + wanted_deg) < 3.0, 12.0)

@@ -344,7 +344,7 @@ def test_without_a_mission_the_start_is_refused() -> None:
 
 
 def test_arducopter_faces_its_direction_of_flight_and_returns_within_its_mission() -> None:
-    """The fourth parameter is no course there; the mode is AUTO until it has landed, and after."""
+    """The fourth parameter is no heading there; the mode is AUTO until it has landed, and after."""
     bench = Bench(firmware=ARDUPILOT, boot_scale=0.1)
     bench.run(4.5)
     rows = [
@@ -371,8 +371,8 @@ def test_arducopter_faces_its_direction_of_flight_and_returns_within_its_mission
     assert bench.command(400, 1) == [0]
     assert bench.command(300) == [0]
     bench.run_until(lambda: bench.instance.autopilot.mission.finished, 30.0)
-    course_deg = math.degrees(bench.instance.autopilot.state.estimate.yaw_rad)
-    assert course_deg == pytest.approx(90.0, abs=6.0)
+    heading_deg = math.degrees(bench.instance.autopilot.state.estimate.yaw_rad)
+    assert heading_deg == pytest.approx(90.0, abs=6.0)
     bench.run_until(lambda: not bench.armed, 70.0)
     assert bench.mode == 3
     x, y, _ = bench.instance.autopilot.state.truth.position_ned_m.tolist()
@@ -386,8 +386,8 @@ def test_px4_takes_the_yaw_of_an_item() -> None:
     bench.command(300)
     bench.run_until(lambda: bench.instance.autopilot.mission.reached == 1, 30.0)
     bench.run(2.0)
-    course_deg = math.degrees(bench.instance.autopilot.state.estimate.yaw_rad)
-    assert course_deg == pytest.approx(-90.0, abs=5.0)
+    heading_deg = math.degrees(bench.instance.autopilot.state.estimate.yaw_rad)
+    assert heading_deg == pytest.approx(-90.0, abs=5.0)
 
 
 def test_px4_checks_a_mission_before_it_can_start() -> None:

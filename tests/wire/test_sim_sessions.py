@@ -162,7 +162,7 @@ SESSIONS = [
             ("mission MISSION_ITEM_REACHED", 3.0),
         ),
     ),
-    # By place, speed, acceleration, course and its rate, in every frame that there is; by rates
+    # By place, speed, acceleration, heading and its rate, in every frame that there is; by rates
     Session(
         "setpoints",
         seed=2,
@@ -195,7 +195,7 @@ SESSIONS = [
             ("state 89 0x9 5", 6.6),
         ),
     ),
-    # By place, speed, acceleration, course and its rate, in every frame; by rates; SYSID_ENFORCE
+    # By place, speed, acceleration, heading and its rate, in every frame; by rates; SYSID_ENFORCE
     Session(
         "setpoints",
         seed=2,

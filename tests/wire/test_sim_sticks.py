@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 from sim_bench import Bench
-from sim_courses import copter, course_deg, place, velocity
+from sim_courses import copter, heading_deg, place, velocity
 
 LOITER = 5
 KEEP = 65535
@@ -86,13 +86,13 @@ def test_roll_flies_sideways_also_by_manual_control() -> None:
 
 def test_yaw_turns_and_then_keeps_its_angle() -> None:
     bench = loitering()
-    before = course_deg(bench)
+    before = heading_deg(bench)
     pushed(bench, 2.0, 1500, 1500, 1500, 1600)
     pushed(bench, 2.0, *MIDDLE)
-    turned = course_deg(bench) - before
+    turned = heading_deg(bench) - before
     assert 30.0 < turned < 110.0
     pushed(bench, 1.0, *MIDDLE)
-    assert course_deg(bench) - before == pytest.approx(turned, abs=3.0)
+    assert heading_deg(bench) - before == pytest.approx(turned, abs=3.0)
 
 
 def test_only_the_ground_station_may_send_sticks_and_zero_releases_them() -> None:

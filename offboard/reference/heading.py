@@ -1,6 +1,6 @@
 """Where the nose points along a path: fixed, given by a table, or along the horizontal velocity.
 
-A course is a function of the path's time s, like the path itself. The derivative of position by s
+A heading is a function of the path's time s, like the path itself. The derivative of position by s
 has the direction of the velocity, so that a start from rest needs no special case. Only where the
 path itself is slower than `HOLD_SPEED_MPS` the direction is interpolated.
 """
@@ -24,11 +24,11 @@ _STEP_S = 0.02
 _NODES_MAX = 200_000
 
 
-class Course(Protocol):
+class Heading(Protocol):
     """Where the nose points along a path."""
 
     def jet(self, path_time_s: Array, path_jet: Array) -> Array:
-        """Course (unwrapped), its first and second derivative by s, shape (3, N), rad and s.
+        """Heading (unwrapped), its first and second derivative by s, shape (3, N), rad and s.
 
         path_time_s (N,); path_jet (5, N, 3) is the path at the same times."""
         ...
@@ -36,19 +36,19 @@ class Course(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class Fixed:
-    """A constant course."""
+    """A constant heading."""
 
-    course_rad: float
+    heading_rad: float
 
     def jet(self, path_time_s: Array, path_jet: Array) -> Array:
         result = np.zeros((3, path_time_s.size))
-        result[0] = self.course_rad
+        result[0] = self.heading_rad
         return result
 
 
 @dataclass(frozen=True, slots=True)
 class Tabulated:
-    """The course column of a table: a polynomial with one column, in radians."""
+    """The heading column of a table: a polynomial with one column, in radians."""
 
     polynomial: Polynomial
 
@@ -60,10 +60,10 @@ class Tabulated:
 class AlongVelocity:
     """The direction of the horizontal velocity, unwrapped from the start of the path.
 
-    nodes_rad (K,): the unwrapped course every `step_s` from s = 0; it tells how many whole turns
+    nodes_rad (K,): the unwrapped heading every `step_s` from s = 0; it tells how many whole turns
     are added to a direction. slow_s (M, 2): intervals in which the horizontal speed is below
     `HOLD_SPEED_MPS`. There the direction is replaced by a quintic, slow_coefficients (M, 6) in
-    powers of s - slow_s[:, 0], which continues course, rate and acceleration at both ends of the
+    powers of s - slow_s[:, 0], which continues heading, rate and acceleration at both ends of the
     interval, turns the short way, and comes to rest where the path begins or ends.
     """
 
@@ -88,10 +88,10 @@ class AlongVelocity:
         return jet
 
 
-def along_velocity(path: Path, length_s: float, standstill_rad: float = 0.0) -> Course:
-    """The course along the horizontal velocity of a path, for s in [0, length_s].
+def along_velocity(path: Path, length_s: float, standstill_rad: float = 0.0) -> Heading:
+    """The heading along the horizontal velocity of a path, for s in [0, length_s].
 
-    A path that never moves horizontally has the fixed course `standstill_rad`.
+    A path that never moves horizontally has the fixed heading `standstill_rad`.
     """
     count = int(np.clip(np.ceil(length_s / _STEP_S), 50, _NODES_MAX)) + 1
     nodes_s = np.linspace(0.0, length_s, count)
@@ -101,7 +101,7 @@ def along_velocity(path: Path, length_s: float, standstill_rad: float = 0.0) -> 
         return Fixed(standstill_rad)
     direction = direction_jet(path_jet)
     held = direction[0].copy()
-    # a slow node takes the course of the next fast one, so that unwrapping works across it
+    # a slow node takes the heading of the next fast one, so that unwrapping works across it
     fast_index = np.flatnonzero(fast)
     nearest = fast_index[
         np.clip(np.searchsorted(fast_index, np.arange(count)), 0, fast_index.size - 1)
